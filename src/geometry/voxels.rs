@@ -1,0 +1,102 @@
+//! The occupied voxels of one octree level.
+
+use super::morton;
+
+/// The occupied voxels of one level, in Morton order.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Voxels {
+    depth: u8,
+    keys: Vec<u64>,
+}
+
+impl Voxels {
+    /// Sorts and merges `keys`, which address level `depth`.
+    ///
+    /// # Panics
+    /// If a key lies outside the level: keys are the caller's own, never a file's.
+    pub fn new(depth: u8, mut keys: Vec<u64>) -> Self {
+        keys.sort_unstable();
+        keys.dedup();
+        Self::from_sorted(depth, keys)
+    }
+
+    /// Takes keys that are already ascending and unique.
+    ///
+    /// # Panics
+    /// If the last key lies outside the level, or (debug only) the keys are not strictly ascending.
+    pub fn from_sorted(depth: u8, keys: Vec<u64>) -> Self {
+        assert!(
+            depth <= morton::MAX_DEPTH,
+            "octree level {depth} is deeper than 21"
+        );
+        assert!(
+            keys.last().is_none_or(|&last| last >> (3 * depth) == 0),
+            "a key lies outside level {depth}"
+        );
+        debug_assert!(keys.windows(2).all(|w| w[0] < w[1]));
+        Voxels { depth, keys }
+    }
+
+    /// The octree level: coordinates are below `2^depth`.
+    pub fn depth(&self) -> u8 {
+        self.depth
+    }
+
+    /// Morton keys, strictly ascending.
+    pub fn keys(&self) -> &[u64] {
+        &self.keys
+    }
+
+    /// How many voxels.
+    pub fn len(&self) -> usize {
+        self.keys.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.keys.is_empty()
+    }
+
+    /// Coordinates of voxel `i`.
+    pub fn coordinate(&self, i: usize) -> [u32; 3] {
+        morton::decode(self.keys[i])
+    }
+
+    /// The occupied voxels one level up; none for level 0's parent, so `depth` must be above 0.
+    pub fn parents(&self) -> Voxels {
+        let mut keys: Vec<u64> = self.keys.iter().map(|k| k >> 3).collect();
+        keys.dedup();
+        Voxels::from_sorted(self.depth - 1, keys)
+    }
+
+    /// For every voxel the index of its parent in [`Voxels::parents`].
+    pub fn parent_indices(&self) -> Vec<u32> {
+        let mut index = 0u32;
+        let mut last = self.keys.first().map_or(0, |k| k >> 3);
+        self.keys
+            .iter()
+            .map(|k| {
+                if k >> 3 != last {
+                    last = k >> 3;
+                    index += 1;
+                }
+                index
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parents_and_indices_agree() {
+        let voxels = Voxels::new(2, vec![63, 0, 1, 8, 9, 9]);
+        assert_eq!(voxels.keys(), [0, 1, 8, 9, 63]);
+        let parents = voxels.parents();
+        for (key, &parent) in voxels.keys().iter().zip(&voxels.parent_indices()) {
+            assert_eq!(parents.keys()[parent as usize], key >> 3);
+        }
+    }
+}

@@ -1,0 +1,22 @@
+//! Bits-to-Photon on a plain CPU.
+//!
+//! A coloured point cloud is coded as a scalable stream: an octree, then latent features per octree level. The stream decodes
+//! straight to 3D Gaussians, and those to pictures, without a GPU.
+//!
+//! ```text
+//! bytes → bitstream → geometry → entropy → network → gaussians → projection → tiles → pixels
+//!         ╰─────────── exact: bit-equal everywhere ──────╯╰──── close: bounded error ──────╯
+//! ```
+//!
+//! A stage imports only from the stages to its left, the `b2p-kernels` crate, and the commons ([`error`], [`limits`], [`placement`]).
+#![forbid(unsafe_code)]
+
+pub mod error;
+pub mod gaussians;
+pub mod geometry;
+pub mod limits;
+pub mod placement;
+
+pub use error::{Error, Result};
+pub use limits::Limits;
+pub use placement::Placement;

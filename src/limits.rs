@@ -1,0 +1,61 @@
+//! How much an input may ask for.
+
+use crate::error::{Error, Result};
+
+/// Bounds that are checked before memory is reserved. Finite by default.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Limits {
+    /// Voxels of any one level, and points of any one cloud.
+    pub max_points: u64,
+    /// Octree levels.
+    pub max_depth: u8,
+    /// Pixels of one picture.
+    pub max_pixels: u64,
+    /// Bytes that one input may make the library reserve, estimated from its counts.
+    pub max_bytes: u64,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Limits {
+            max_points: 1 << 26,
+            max_depth: 21,
+            max_pixels: 1 << 28,
+            max_bytes: 2 << 30,
+        }
+    }
+}
+
+impl Limits {
+    /// Fails with [`Error::LimitExceeded`] if `count` points are more than allowed.
+    pub fn check_points(&self, what: &'static str, count: u64) -> Result<()> {
+        check(what, count, self.max_points, "max_points")
+    }
+
+    /// Fails with [`Error::LimitExceeded`] if `depth` levels are more than allowed.
+    pub fn check_depth(&self, what: &'static str, depth: u8) -> Result<()> {
+        check(what, depth.into(), self.max_depth.into(), "max_depth")
+    }
+
+    /// Fails with [`Error::LimitExceeded`] if `count` pixels are more than allowed.
+    pub fn check_pixels(&self, what: &'static str, count: u64) -> Result<()> {
+        check(what, count, self.max_pixels, "max_pixels")
+    }
+
+    /// Fails with [`Error::LimitExceeded`] if `bytes` are more than allowed.
+    pub fn check_bytes(&self, what: &'static str, bytes: u64) -> Result<()> {
+        check(what, bytes, self.max_bytes, "max_bytes")
+    }
+}
+
+fn check(what: &'static str, needed: u64, limit: u64, option: &'static str) -> Result<()> {
+    if needed <= limit {
+        return Ok(());
+    }
+    Err(Error::LimitExceeded {
+        what,
+        needed,
+        limit,
+        option,
+    })
+}

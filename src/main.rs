@@ -1,0 +1,4 @@
+//! The `b2p` program.
+#![forbid(unsafe_code)]
+
+fn main() {}
