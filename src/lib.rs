@@ -15,6 +15,7 @@ pub mod error;
 pub mod gaussians;
 pub mod geometry;
 pub mod limits;
+pub mod output;
 pub mod placement;
 
 pub use error::{Error, Result};
