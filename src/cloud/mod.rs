@@ -1,0 +1,3 @@
+//! Point clouds: in from files, onto the voxel grid.
+
+pub mod ply;
