@@ -1,8 +1,10 @@
 //! Which voxels are occupied, at every octree level.
 
 pub mod morton;
-pub mod neighbours;
+mod neighbours;
+mod octree;
 mod voxels;
 
 pub use neighbours::KernelMap;
+pub use octree::{MAX_VOXELS, Octree};
 pub use voxels::Voxels;

@@ -1,8 +1,15 @@
 //! Kernel maps: for every voxel, which of its neighbours are occupied and where they are.
+//!
+//! A kernel map is built from the one of the level above, so nothing is searched or hashed: the neighbour of a child lies in its
+//! parent or in one of its parent's 26 neighbours, whose children are found from its occupancy by counting bits. The 3³ neighbours
+//! of up to eight siblings together fill a window of 4³ positions around them; the window is looked up once per parent.
+
+use rayon::prelude::*;
 
 /// The neighbours of every voxel under a 3³ or 2³ kernel.
 ///
-/// Row `i` holds `volume` indices of input voxels in the kernel's offset order (x fastest), [`KernelMap::ABSENT`] where none is.
+/// Row `i` holds `volume` indices of input voxels in the kernel's offset order (x fastest), [`KernelMap::ABSENT`] where none is:
+/// offsets −1, 0, 1 along each axis for 3³, `k = (dx+1) + 3(dy+1) + 9(dz+1)`; 0, 1 for 2³, `k = dx + 2dy + 4dz`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KernelMap {
     volume: usize,
@@ -12,11 +19,56 @@ pub struct KernelMap {
 impl KernelMap {
     /// Marks an unoccupied neighbour.
     pub const ABSENT: u32 = u32::MAX;
+    /// The place of the voxel itself in a 3³ row.
+    pub const CENTRE: usize = 13;
 
     /// Wraps rows of `volume` indices each.
     pub fn new(volume: usize, rows: Vec<u32>) -> Self {
         assert_eq!(rows.len() % volume, 0, "kernel map rows must be whole");
         KernelMap { volume, rows }
+    }
+
+    /// The 3³ map of level 0: one voxel, alone.
+    pub fn root() -> Self {
+        let mut rows = vec![Self::ABSENT; 27];
+        rows[Self::CENTRE] = 0;
+        KernelMap { volume: 27, rows }
+    }
+
+    /// The 3³ map of the voxels that arise when *every* voxel of this 3³ map's level has all eight children: the child in octant
+    /// `o` of voxel `i` has index `8i + o`.
+    ///
+    /// # Panics
+    /// If this is not a 3³ map, or of more than 2²⁹ − 1 voxels.
+    pub fn generated_children(&self) -> Self {
+        assert_eq!(self.volume, 27, "children come from a 3³ map");
+        assert!(self.len() < 1 << 29, "child indices must fit 32 bits");
+        let mut rows = vec![Self::ABSENT; self.len() * 8 * 27];
+        rows.par_chunks_mut(BLOCK * 8 * 27)
+            .zip(self.rows.par_chunks(BLOCK * 27))
+            .for_each(|(rows, parents)| {
+                for (rows, parent) in rows.chunks_exact_mut(8 * 27).zip(parents.chunks_exact(27)) {
+                    let window = window(parent, |q, octant| q << 3 | octant);
+                    for (octant, row) in rows.chunks_exact_mut(27).enumerate() {
+                        copy_row(&window, octant, row);
+                    }
+                }
+            });
+        KernelMap { volume: 27, rows }
+    }
+
+    /// The 2³ map of the same voxels.
+    ///
+    /// # Panics
+    /// If this is not a 3³ map.
+    pub fn forward(&self) -> Self {
+        assert_eq!(self.volume, 27, "a 2³ map is part of a 3³ map");
+        let rows = self
+            .rows
+            .par_chunks_exact(27)
+            .flat_map_iter(|row| [13, 14, 16, 17, 22, 23, 25, 26].map(|k| row[k]))
+            .collect();
+        KernelMap { volume: 8, rows }
     }
 
     /// Number of kernel offsets: 27, 8 or 1.
@@ -42,5 +94,157 @@ impl KernelMap {
     /// All rows, one after the other.
     pub fn rows(&self) -> &[u32] {
         &self.rows
+    }
+}
+
+/// Parents that one task handles.
+const BLOCK: usize = 1024;
+
+/// The 3³ map of the children of the voxels of `map`, which have these occupancies and first children.
+///
+/// # Panics
+/// If `map` is not a 3³ map, or not of as many voxels.
+pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]) -> KernelMap {
+    assert_eq!(map.volume, 27, "children come from a 3³ map");
+    assert_eq!(map.len(), occupancy.len(), "one occupancy per voxel");
+    assert_eq!(map.len(), first_child.len(), "one first child per voxel");
+    let count = |masks: &[u8]| masks.iter().map(|m| m.count_ones() as usize).sum::<usize>();
+    let mut rows = vec![KernelMap::ABSENT; count(occupancy) * 27];
+
+    let mut tasks = Vec::with_capacity(map.len().div_ceil(BLOCK));
+    let mut rest = rows.as_mut_slice();
+    for (parents, masks) in map.rows.chunks(BLOCK * 27).zip(occupancy.chunks(BLOCK)) {
+        let (block, after) = rest.split_at_mut(count(masks) * 27);
+        tasks.push((parents, masks, block));
+        rest = after;
+    }
+    tasks.into_par_iter().for_each(|(parents, masks, block)| {
+        let mut rows = block.chunks_exact_mut(27);
+        for (parent, &mask) in parents.chunks_exact(27).zip(masks) {
+            let window = window(parent, |q, octant| {
+                let mask = u32::from(occupancy[q as usize]);
+                let before = (mask & ((1 << octant) - 1)).count_ones();
+                if mask >> octant & 1 == 1 {
+                    first_child[q as usize] + before
+                } else {
+                    KernelMap::ABSENT
+                }
+            });
+            let occupied = (0..8).filter(|octant| mask >> octant & 1 == 1);
+            for (octant, row) in occupied.zip(&mut rows) {
+                copy_row(&window, octant, row);
+            }
+        }
+    });
+    KernelMap { volume: 27, rows }
+}
+
+/// For every position of the 4³ window around a voxel's children, x fastest: the parent's neighbour it lies in and its octant there.
+const WINDOW: [(u8, u8); 64] = {
+    let mut window = [(0, 0); 64];
+    let mut i = 0;
+    while i < 64 {
+        // Window position 0..4 along an axis is child coordinate −1..2: parent offset −1, 0, 0, 1 and octant bit 1, 0, 1, 0.
+        let (x, y, z) = (i & 3, i >> 2 & 3, i >> 4);
+        window[i] = (
+            ((x + 1) / 2 + 3 * ((y + 1) / 2) + 9 * ((z + 1) / 2)) as u8,
+            ((x + 1) % 2 + 2 * ((y + 1) % 2) + 4 * ((z + 1) % 2)) as u8,
+        );
+        i += 1;
+    }
+    window
+};
+
+/// The indices of the voxels in the window around the children of the voxel whose neighbours are `parents`.
+fn window(parents: &[u32], child: impl Fn(u32, u32) -> u32) -> [u32; 64] {
+    WINDOW.map(
+        |(neighbour, octant)| match parents[usize::from(neighbour)] {
+            KernelMap::ABSENT => KernelMap::ABSENT,
+            q => child(q, octant.into()),
+        },
+    )
+}
+
+/// The 3³ part of the window that is centred on the child in `octant`.
+fn copy_row(window: &[u32; 64], octant: usize, row: &mut [u32]) {
+    let corner = (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2);
+    for (line, run) in row.chunks_exact_mut(3).enumerate() {
+        let start = corner + 4 * (line % 3) + 16 * (line / 3);
+        run.copy_from_slice(&window[start..start + 3]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Octree, Voxels, morton};
+    use proptest::prelude::*;
+
+    /// The definition, by binary search.
+    fn searched(voxels: &Voxels, offsets: std::ops::RangeInclusive<i64>) -> KernelMap {
+        let width = offsets.clone().count();
+        let side = 1i64 << voxels.depth();
+        let mut rows = Vec::new();
+        for i in 0..voxels.len() {
+            let [x, y, z] = voxels.coordinate(i).map(i64::from);
+            for dz in offsets.clone() {
+                for dy in offsets.clone() {
+                    for dx in offsets.clone() {
+                        let at = [x + dx, y + dy, z + dz];
+                        let inside = at.iter().all(|c| (0..side).contains(c));
+                        let key = morton::encode(at.map(|c| c as u32));
+                        let found = voxels.keys().binary_search(&key).ok();
+                        rows.push(match found {
+                            Some(index) if inside => index as u32,
+                            _ => KernelMap::ABSENT,
+                        });
+                    }
+                }
+            }
+        }
+        KernelMap::new(width * width * width, rows)
+    }
+
+    fn check(voxels: Voxels) {
+        let octree = Octree::new(voxels).unwrap();
+        for level in 0..=octree.depth() {
+            let map = octree.kernel_map(level);
+            let voxels = octree.level(level);
+            assert_eq!(map, searched(voxels, -1..=1));
+            assert_eq!(map.forward(), searched(voxels, 0..=1));
+            if voxels.depth() < morton::MAX_DEPTH {
+                let all = voxels.keys().iter().flat_map(|k| k << 3..=k << 3 | 7);
+                let all = Voxels::from_sorted(voxels.depth() + 1, all.collect());
+                assert_eq!(map.generated_children(), searched(&all, -1..=1));
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn the_map_from_above_is_what_searching_finds(
+            keys in prop::collection::vec(0u64..1 << 12, 1..300)
+        ) {
+            check(Voxels::new(4, keys));
+        }
+    }
+
+    #[test]
+    fn the_map_holds_for_full_empty_and_far_apart() {
+        check(Voxels::new(0, vec![0]));
+        check(Voxels::new(3, (0..512).collect()));
+        check(Voxels::new(21, vec![0, (1 << 63) - 1]));
+        check(Voxels::new(21, vec![1 << 62, (1 << 62) - 1]));
+    }
+
+    #[test]
+    fn many_blocks_join_without_a_seam() {
+        let bowl = (0..1u32 << 14).map(|i| {
+            let [x, y] = [i % 128, i / 128];
+            morton::encode([x, y, (x * x + y * y) / 256])
+        });
+        let octree = Octree::new(Voxels::new(7, bowl.collect())).unwrap();
+        assert!(octree.level(6).len() > 2 * BLOCK);
+        assert_eq!(octree.kernel_map(7), searched(octree.level(7), -1..=1));
     }
 }
