@@ -1,3 +1,12 @@
-//! Point clouds: in from files, onto the voxel grid.
+//! Point clouds: in from PLY files, onto the voxel grid, and out again.
+//!
+//! A cloud is read whatever its number types and the order of its properties. [`voxelise`] then gives the
+//! octree's finest level: as it stands if the coordinates already are a voxel grid's, else fitted to one.
 
 pub mod ply;
+mod points;
+mod voxelise;
+mod write;
+
+pub use points::{Hints, PointCloud};
+pub use voxelise::{ColouredVoxels, voxelise};

@@ -1,0 +1,265 @@
+//! Coloured points as a file has them.
+
+use std::path::Path;
+
+use super::ply::{Column, Ply, Scalar, Values};
+use crate::error::{Error, Result, Stage};
+use crate::limits::Limits;
+use crate::placement::Placement;
+
+/// Coloured points, and what the file says of their grid.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PointCloud {
+    /// Coordinates, finite.
+    pub positions: Vec<[f64; 3]>,
+    /// sRGB colours, one per point.
+    pub colours: Vec<[u8; 3]>,
+    /// What the comments say.
+    pub hints: Hints,
+}
+
+/// What a file's comments say of the voxel grid: `bits B`, `unit U`, `origin X Y Z`, `shift X Y Z`.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Hints {
+    /// The bit depth `B`, 1 to 21.
+    pub bits: Option<u8>,
+    /// Where the grid lies: voxel `v` is centred on `(v + ½ − shift)·unit + origin`. Present if unit and origin are.
+    pub placement: Option<Placement>,
+}
+
+impl PointCloud {
+    /// Reads a PLY file.
+    pub fn open(path: impl AsRef<Path>, limits: &Limits) -> Result<Self> {
+        let path = path.as_ref();
+        let failed = |source| Error::Io {
+            path: path.to_owned(),
+            source,
+        };
+        let size = std::fs::metadata(path).map_err(failed)?.len();
+        limits.check_bytes("size of the PLY file", size)?;
+        Self::from_ply(&std::fs::read(path).map_err(failed)?, limits)
+    }
+
+    /// Reads a whole PLY file in memory.
+    ///
+    /// Wants `x y z` of any number type and `red green blue`, each `uchar`, `ushort` (0 to 65535) or `float`/`double` (0 to 1).
+    /// Fails with [`Error::Malformed`] if one is absent, there are no points, a coordinate is not finite or a colour out of range.
+    pub fn from_ply(bytes: &[u8], limits: &Limits) -> Result<Self> {
+        let ply = Ply::open(bytes)?;
+        let names = ["x", "y", "z", "red", "green", "blue"];
+        let columns = ply.vertex_columns(&names, limits)?;
+        let count = columns[0].len();
+        if count == 0 {
+            let field = "count of element vertex";
+            return Err(malformed("header", field, 0, "at least one point"));
+        }
+        let memory = std::mem::size_of::<([f64; 3], [u8; 3])>() as u64;
+        limits.check_bytes("bytes of the point cloud", count as u64 * memory)?;
+
+        let mut positions = vec![[0.0; 3]; count];
+        let mut colours = vec![[0; 3]; count];
+        for (axis, (name, column)) in names.iter().zip(&columns).enumerate() {
+            match axis {
+                0..3 => fill_axis(&mut positions, axis, name, column)?,
+                _ => fill_channel(&mut colours, axis - 3, name, column)?,
+            }
+        }
+        Ok(PointCloud {
+            positions,
+            colours,
+            hints: Hints::from_comments(&ply.header.comments),
+        })
+    }
+}
+
+fn fill_axis(positions: &mut [[f64; 3]], axis: usize, name: &str, column: &Column) -> Result<()> {
+    for (row, position) in positions.iter_mut().enumerate() {
+        let value = column.get(row);
+        if !value.is_finite() {
+            let at = format!("vertex {row}");
+            return Err(malformed(
+                at,
+                format!("property {name}"),
+                value,
+                "a finite number",
+            ));
+        }
+        position[axis] = value;
+    }
+    Ok(())
+}
+
+fn fill_channel(
+    colours: &mut [[u8; 3]],
+    channel: usize,
+    name: &str,
+    column: &Column,
+) -> Result<()> {
+    let scale = match column.scalar {
+        Scalar::U8 => 1.0,
+        Scalar::U16 => 255.0 / 65535.0,
+        Scalar::F32 | Scalar::F64 => 255.0,
+        other => {
+            let expected = "uchar, ushort, float or double";
+            return Err(malformed(
+                "header",
+                format!("type of property {name}"),
+                other,
+                expected,
+            ));
+        }
+    };
+    if let Values::U8(values) = &column.values {
+        for (colour, &value) in colours.iter_mut().zip(values) {
+            colour[channel] = value;
+        }
+        return Ok(());
+    }
+    for (row, colour) in colours.iter_mut().enumerate() {
+        let value = column.get(row);
+        let byte = (value * scale).round();
+        if !(0.0..=255.0).contains(&byte) {
+            let at = format!("vertex {row}");
+            return Err(malformed(
+                at,
+                format!("property {name}"),
+                value,
+                "a number from 0 to 1",
+            ));
+        }
+        colour[channel] = byte as u8;
+    }
+    Ok(())
+}
+
+impl Hints {
+    /// Comments are free text, so what cannot be understood is passed over.
+    fn from_comments(comments: &[String]) -> Self {
+        let mut bits = None;
+        let (mut unit, mut origin, mut shift) = (None, None, [0.0; 3]);
+        for comment in comments {
+            let mut words = comment.split_ascii_whitespace();
+            let Some(key) = words.next() else { continue };
+            let values: Option<Vec<f64>> = words.take(4).map(number).collect();
+            match (key, values.as_deref()) {
+                ("bits", Some(&[b])) if b.fract() == 0.0 && (1.0..=21.0).contains(&b) => {
+                    bits = Some(b as u8);
+                }
+                ("unit", Some(&[u])) => unit = Some(u),
+                ("origin", Some(&[x, y, z])) => origin = Some([x, y, z]),
+                ("shift", Some(&[x, y, z])) => shift = [x, y, z],
+                _ => {}
+            }
+        }
+        let placement = unit.zip(origin).map(|(unit, origin)| Placement {
+            origin: std::array::from_fn(|i| origin[i] - shift[i] * unit),
+            voxel_size: unit,
+        });
+        Hints {
+            bits,
+            placement: placement.filter(Placement::is_valid),
+        }
+    }
+}
+
+/// A number of a comment; Python may have wrapped it in `np.float64( )`.
+fn number(word: &str) -> Option<f64> {
+    let bare = word
+        .strip_prefix("np.float64(")
+        .and_then(|w| w.strip_suffix(')'));
+    bare.unwrap_or(word).parse().ok()
+}
+
+fn malformed(
+    at: impl ToString,
+    field: impl ToString,
+    value: impl ToString,
+    expected: impl ToString,
+) -> Error {
+    Error::malformed(Stage::Cloud, at, field, value, expected)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(types: &str, rows: &str) -> Result<PointCloud> {
+        let mut text = "ply\nformat ascii 1.0\nelement vertex ".to_owned();
+        text += &format!("{}\n", rows.lines().count());
+        for (name, scalar) in ["blue", "z", "x", "green", "y", "red"]
+            .iter()
+            .zip(types.split(' '))
+        {
+            text += &format!("property {scalar} {name}\n");
+        }
+        text += "end_header\n";
+        text += rows;
+        PointCloud::from_ply(text.as_bytes(), &Limits::default())
+    }
+
+    #[test]
+    fn columns_are_found_by_name_and_colours_brought_to_bytes() {
+        let types = "uchar float double ushort int float";
+        let cloud = read(types, "7 1.5 -2.25 65535 9 0.5\n0 0 0 128 0 1\n").unwrap();
+        assert_eq!(cloud.positions, [[-2.25, 9.0, 1.5], [0.0; 3]]);
+        assert_eq!(cloud.colours, [[128, 255, 7], [255, 0, 0]]);
+        assert_eq!(cloud.hints, Hints::default());
+    }
+
+    #[test]
+    fn what_is_no_cloud_is_refused_by_name_and_row() {
+        let types = "uchar float float uchar float float";
+        let error = |types: &str, rows: &str| read(types, rows).unwrap_err().to_string();
+        let text = error(types, "1 2 3 4 5 0.5\n1 2 3 4 nan 0.5\n");
+        assert_eq!(
+            text,
+            "cloud: at vertex 1: property y is NaN, expected a finite number"
+        );
+        let text = error(types, "1 2 3 4 5 1.1\n");
+        assert!(text.contains("vertex 0: property red is 1.1"), "{text}");
+        assert!(error(types, "1 2 3 4 5 nan\n").contains("property red"));
+        assert!(error(types, "").contains("at least one point"));
+        let text = error("uchar float float uchar float int", "1 2 3 4 5 6\n");
+        assert!(text.contains("type of property red is int"), "{text}");
+        let bare = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n";
+        let text = PointCloud::from_ply(bare, &Limits::default())
+            .unwrap_err()
+            .to_string();
+        assert!(text.contains("property of vertex red is absent"), "{text}");
+    }
+
+    #[test]
+    fn comments_tell_the_grid_and_free_text_does_not_disturb() {
+        let hints = |lines: &[&str]| {
+            Hints::from_comments(&lines.iter().map(|l| l.to_string()).collect::<Vec<_>>())
+        };
+        let grid = [
+            "bits 11",
+            "unit np.float64(0.5)",
+            "origin 1 2 3",
+            "shift 4 0 0",
+        ];
+        let placement = Placement {
+            origin: [-1.0, 2.0, 3.0],
+            voxel_size: 0.5,
+        };
+        assert_eq!(hints(&grid).bits, Some(11));
+        assert_eq!(hints(&grid).placement, Some(placement));
+        let text = [
+            "bits and pieces",
+            "bits 22",
+            "unit 1 2",
+            "origin Stanford",
+            "",
+            "unit -1",
+            "origin 0 0 0",
+        ];
+        assert_eq!(hints(&text), Hints::default());
+    }
+
+    #[test]
+    fn a_missing_file_is_named() {
+        let error = PointCloud::open("no/such/cloud.ply", &Limits::default()).unwrap_err();
+        assert!(error.to_string().starts_with("no/such/cloud.ply: "));
+    }
+}
