@@ -147,8 +147,8 @@ const WINDOW: [(u8, u8); 64] = {
         // Window position 0..4 along an axis is child coordinate −1..2: parent offset −1, 0, 0, 1 and octant bit 1, 0, 1, 0.
         let (x, y, z) = (i & 3, i >> 2 & 3, i >> 4);
         window[i] = (
-            ((x + 1) / 2 + 3 * ((y + 1) / 2) + 9 * ((z + 1) / 2)) as u8,
-            ((x + 1) % 2 + 2 * ((y + 1) % 2) + 4 * ((z + 1) % 2)) as u8,
+            (((x + 1) >> 1) + 3 * ((y + 1) >> 1) + 9 * ((z + 1) >> 1)) as u8,
+            (((x + 1) & 1) + 2 * ((y + 1) & 1) + 4 * ((z + 1) & 1)) as u8,
         );
         i += 1;
     }

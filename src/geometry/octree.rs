@@ -221,10 +221,10 @@ mod tests {
                 let (parents, children) = (octree.level(level), octree.level(level + 1));
                 prop_assert_eq!(parents, &children.parents());
                 for (i, &parent) in parents.keys().iter().enumerate() {
-                    let mut child = octree.first_child(level)[i] as usize;
-                    for octant in (0..8).filter(|o| octree.occupancy(level)[i] >> o & 1 == 1) {
-                        prop_assert_eq!(children.keys()[child], parent << 3 | octant);
-                        child += 1;
+                    let octants = (0..8).filter(|o| octree.occupancy(level)[i] >> o & 1 == 1);
+                    let first = octree.first_child(level)[i] as usize;
+                    for (octant, &child) in octants.zip(&children.keys()[first..]) {
+                        prop_assert_eq!(child, parent << 3 | octant);
                     }
                 }
             }
