@@ -1,0 +1,361 @@
+"""The network of Bits-to-Photon (arXiv 2406.05915, appendix tables), float, for training.
+
+Roles: 3 = finest input level, 2, 1, 0 = coarsest coded level. A `Crop` holds one cloud's coordinates and kernel maps for all roles.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+import ops
+
+SIGMA_MIN, SIGMA_MAX = 0.11, 64.0
+LIKELIHOOD_MIN = 1e-9
+
+
+@dataclass
+class Crop:
+    """coords[r] int32 [n_r, 3]; kernel3[r]; first[r] = first child (in role r + 1) of each voxel, n_r + 1 entries;
+    descent[r] maps role r - 1 to r; corners = 2x2x2 map of role 2; children, children3 = generated level of role 1."""
+
+    coords: list
+    kernel3: list
+    first: list
+    descent: dict
+    corners: ops.Map
+    children: torch.Tensor
+    children3: ops.Map
+
+    @property
+    def points(self):
+        return self.coords[3].shape[0]
+
+    def to(self, device):
+        if device == "cpu":
+            return self
+        return Crop([c.to(device) for c in self.coords], [k.to(device) for k in self.kernel3], [f.to(device) for f in self.first],
+                    {r: m.to(device) for r, m in self.descent.items()}, self.corners.to(device), self.children.to(device),
+                    self.children3.to(device))
+
+
+def make_crop(coords, parents):
+    """coords: four int32 tensors, role 0 .. 3, Morton-sorted; parents[r] (r = 1..3): row of each voxel's parent in role r - 1."""
+    first = []
+    for r in range(3):
+        counts = torch.bincount(parents[r + 1].long(), minlength=coords[r].shape[0])
+        first.append(torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)]).int())
+    children = ops.all_children(coords[1])
+    return Crop(coords, [ops.neighbours(c) for c in coords], first,
+                {r: ops.descent(coords[r], parents[r], coords[r - 1].shape[0]) for r in (1, 2)},
+                ops.corners(coords[2]), children, ops.neighbours(children))
+
+
+class Conv(nn.Module):
+    """Sparse convolution of `taps` taps; taps = 1 is a linear layer. Weight [taps, c_in, c_out]."""
+
+    def __init__(self, cin, cout, taps=27, scale=1.0):
+        super().__init__()
+        bound = scale * math.sqrt(3.0 / (cin * min(taps, 12)))  # about 12 of the 27 taps of a surface are active
+        self.weight = nn.Parameter(torch.empty(taps, cin, cout).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(cout))
+        self.taps = taps
+
+    def forward(self, x, kmap=None, relu=False):
+        if self.taps == 1:
+            y = torch.addmm(self.bias, x, self.weight[0])
+            return torch.relu_(y) if relu else y
+        return ops.conv(x, self.weight, self.bias, kmap, relu)
+
+
+class NormConv(nn.Module):
+    """Geometry-invariant convolution (paper section 4): the response is divided by the L2 norm of the active weights of each
+    output channel; a gain and a bias follow."""
+
+    def __init__(self, cin, cout, taps=27, gain=1.0):
+        super().__init__()
+        bound = math.sqrt(3.0 / (cin * min(taps, 12)))
+        self.weight = nn.Parameter(torch.empty(taps, cin, cout).uniform_(-bound, bound))
+        self.gain = nn.Parameter(torch.full((cout,), gain))
+        self.bias = nn.Parameter(torch.zeros(cout))
+        self.taps = taps
+
+    def forward(self, x, kmap=None, relu=False):
+        if self.taps == 1:
+            w = self.weight[0]
+            y = torch.addmm(self.bias, x, w * (self.gain * torch.rsqrt((w * w).sum(0) + 1e-8)))
+            return torch.relu_(y) if relu else y
+        return ops.norm_conv(x, self.weight, self.gain, self.bias, kmap, relu)
+
+
+class Inception(nn.Module):
+    def __init__(self, c, relu, norm=False, branch=0.3):
+        super().__init__()
+        self.relu = relu
+        if norm:
+            make = lambda i, o, taps, last: NormConv(i, o, taps, branch if last else 1.0)
+        else:
+            make = lambda i, o, taps, last: Conv(i, o, taps, branch if last else 1.0)
+        self.a1 = make(c, c // 4, 27, False)
+        self.a2 = make(c // 4, c // 2, 27, True)
+        self.b1 = make(c, c // 4, 1, False)
+        self.b2 = make(c // 4, c // 4, 27, False)
+        self.b3 = make(c // 4, c // 2, 1, True)
+
+    def forward(self, x, kmap):
+        a = self.a2(self.a1(x, kmap, True), kmap)
+        b = self.b3(self.b2(self.b1(x, kmap, True), kmap, True), kmap)
+        y = torch.cat([a, b], 1) + x
+        return torch.relu_(y) if self.relu else y
+
+
+class ResBlock(nn.Module):
+    def __init__(self, c, relu, branch=0.1):
+        super().__init__()
+        self.relu = relu
+        self.c1 = Conv(c, c, 27)
+        self.c2 = Conv(c, c, 27, branch)
+
+    def forward(self, x, kmap):
+        y = self.c2(self.c1(x, kmap, True), kmap) + x
+        return torch.relu_(y) if self.relu else y
+
+
+class FeatureConvert(nn.Module):
+    def __init__(self, cfg, cin):
+        super().__init__()
+        c = cfg["channels"]
+        self.conv_in = NormConv(cin, c)
+        self.blocks = nn.ModuleList(Inception(c, cfg["inception_relu"]) for _ in range(cfg["fc_blocks"]))
+        self.conv_out = NormConv(c, c)
+
+    def forward(self, x, kmap):
+        x = self.conv_in(x, kmap)
+        for b in self.blocks:
+            x = b(x, kmap)
+        return self.conv_out(x, kmap)
+
+
+class FeatureSqueeze(nn.Module):
+    def __init__(self, cfg, context):
+        super().__init__()
+        c = cfg["channels"]
+        self.lin1 = Conv(2 * c if context else c, c, 1)
+        self.lin2 = Conv(c, cfg["latents"], 1)
+
+    def forward(self, f, c):
+        x = f if c is None else torch.cat([f, c], 1)
+        return self.lin2(self.lin1(x, relu=True))
+
+
+class Entropy(nn.Module):
+    """Predictive entropy model: mean and log standard deviation of each latent, from the context alone."""
+
+    def __init__(self, cfg):
+        super().__init__()
+        c = cfg["channels"]
+        self.conv_in = NormConv(c, c)
+        self.blocks = nn.ModuleList(Inception(c, cfg["inception_relu"], norm=True) for _ in range(cfg["pem_blocks"]))
+        self.mu = Conv(c, cfg["latents"], 1, 0.1)
+        self.sigma = Conv(c, cfg["latents"], 1, 0.1)
+        nn.init.constant_(self.sigma.bias, 1.0)
+
+    def forward(self, c, kmap):
+        x = self.conv_in(c, kmap, True)
+        for b in self.blocks:
+            x = b(x, kmap)
+        return self.mu(x), self.sigma(x)
+
+
+class Reconstruct(nn.Module):
+    def __init__(self, cfg, context):
+        super().__init__()
+        c, k = cfg["channels"], cfg["latents"]
+        self.lin1 = Conv(k + c if context else k, c, 1)
+        with torch.no_grad():  # latents have a standard deviation of 2 to 4, features of about 1
+            self.lin1.weight[:, :k] = torch.randn(1, k, c) * (0.3 / math.sqrt(k) if context else 0.4 / math.sqrt(k))
+        self.blocks = nn.ModuleList(Inception(c, cfg["inception_relu"]) for _ in range(cfg["fr_blocks"]))
+        self.lin2 = Conv(c, c, 1)
+
+    def forward(self, y, c, kmap):
+        x = self.lin1(y if c is None else torch.cat([y, c], 1), relu=True)
+        for b in self.blocks:
+            x = b(x, kmap)
+        return self.lin2(x)
+
+
+class Generate(nn.Module):
+    """3D Gaussian generation: 14 raw numbers per generated voxel."""
+
+    def __init__(self, cfg, gg):
+        super().__init__()
+        c, relu = gg["channels"], cfg["resblock_relu"]
+        self.fanout = gg["children"]
+        self.conv_in = NormConv(cfg["channels"], c)
+        self.before = nn.ModuleList(ResBlock(c, relu) for _ in range(gg["blocks_before"]))
+        if self.fanout == 8:
+            self.layer4 = Conv(c, c, 8)
+            with torch.no_grad():
+                self.layer4.weight.uniform_(-math.sqrt(3 / c), math.sqrt(3 / c))
+        else:
+            self.layer4 = NormConv(c, c, 8)
+        self.after = nn.ModuleList(ResBlock(c, relu) for _ in range(gg["blocks_after"]))
+        self.conv_out = NormConv(c, 14, 27, 0.15)
+
+    def forward(self, g, crop, role):
+        kmap = crop.kernel3[role]
+        x = self.conv_in(g, kmap, True)
+        for b in self.before:
+            x = b(x, kmap)
+        if self.fanout == 8:
+            w = self.layer4.weight.permute(1, 0, 2).reshape(x.shape[1], -1)
+            x = (x @ w).view(8 * x.shape[0], -1) + self.layer4.bias
+            kmap = crop.children3
+        else:
+            x = self.layer4(x, crop.corners)
+        for b in self.after:
+            x = b(x, kmap)
+        return self.conv_out(x, kmap)
+
+
+class Prior(nn.Module):
+    """Factorised prior of role 0: per channel a mixture of three Gaussians, integrated over the rounding bin."""
+
+    def __init__(self, k):
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(k, 3))
+        self.mean = nn.Parameter(torch.tensor([[-2.0, 0.0, 2.0]]).repeat(k, 1))
+        self.log_sigma = nn.Parameter(torch.full((k, 3), 0.7))
+
+    def forward(self, y):
+        w = torch.softmax(self.weight, 1)
+        return (w * bin_mass(y[:, :, None], self.mean, bounded_sigma(self.log_sigma))).sum(2)
+
+
+class _Bound(torch.autograd.Function):
+    """Clamp whose gradient passes at a bound when it leads back inside."""
+
+    @staticmethod
+    def forward(ctx, x, lo, hi):
+        ctx.save_for_backward(x)
+        ctx.lo, ctx.hi = lo, hi
+        return x.clamp(lo, hi)
+
+    @staticmethod
+    def backward(ctx, g):
+        (x,) = ctx.saved_tensors
+        stop = ((x < ctx.lo) & (g > 0)) | ((x > ctx.hi) & (g < 0))
+        return g.masked_fill(stop, 0), None, None
+
+
+def bounded_sigma(log_sigma):
+    return torch.exp(_Bound.apply(log_sigma, math.log(SIGMA_MIN), math.log(SIGMA_MAX)))
+
+
+def bin_mass(y, mu, sigma):
+    """Mass of N(mu, sigma) in [y - 1/2, y + 1/2], computed in the lower tail, where erfc keeps its precision."""
+    d = (y - mu).abs()
+    s = 1 / (sigma * math.sqrt(2))
+    return 0.5 * (torch.erfc((d - 0.5) * s) - torch.erfc((d + 0.5) * s))
+
+
+def bits(mass):
+    return -torch.log2(_Bound.apply(mass, LIKELIHOOD_MIN, 2.0)).sum()
+
+
+def gaussians(raw, coords, unit, cfg, opaque):
+    """Gaussians of voxels `coords` whose size is `unit` finest voxels: mean, covariance, opacity, colour in finest-voxel units."""
+    offset, scale, rotation, opacity, colour = raw.split([3, 3, 4, 1, 3], 1)
+    mean = (coords.to(raw.dtype) + 0.5 + torch.tanh(offset) * cfg["offset_range"]) * unit
+    sigma = F.softplus(scale + cfg["scale_bias"]) * (cfg["scale_range"] * unit)
+    rotation = F.normalize(rotation + torch.tensor([1.0, 0, 0, 0], device=raw.device, dtype=raw.dtype), dim=1)
+    alpha = torch.ones_like(opacity[:, 0]) if opaque else torch.sigmoid(opacity[:, 0] + cfg["opacity_bias"])
+    return mean, ops.covariance(sigma, rotation), alpha, _Bound.apply(0.5 + colour, 0.0, 1.0)
+
+
+class B2P(nn.Module):
+    def __init__(self, cfg):
+        super().__init__()
+        self.cfg = cfg
+        c = cfg["channels"]
+        self.fc = nn.ModuleList(FeatureConvert(cfg, 3 if r == 3 else c) for r in range(4))
+        self.fs = nn.ModuleList(FeatureSqueeze(cfg, r > 0) for r in range(3))
+        self.fr = nn.ModuleList(Reconstruct(cfg, r > 0) for r in range(3))
+        self.pem = nn.ModuleDict({str(r): Entropy(cfg) for r in (1, 2)})
+        self.gg = nn.ModuleDict({str(g["role"]): Generate(cfg, g) for g in cfg["gg"]})
+        self.prior = Prior(cfg["latents"])
+        self.up = nn.ModuleDict()
+        if cfg["upsample"] == "learned":
+            for r in (1, 2):
+                up = Conv(c, c, 8)
+                with torch.no_grad():
+                    up.weight.copy_(torch.eye(c) + torch.randn(8, c, c) * 0.3 / math.sqrt(c))
+                self.up[str(r)] = up
+
+    def analyse(self, crop, rgb):
+        """Encoder features f_r for roles 2, 1, 0. rgb: float [n_3, 3] in 0..1."""
+        x, out = rgb - 0.5, {}
+        for r in (3, 2, 1, 0):
+            x = self.fc[r](x, crop.kernel3[r])
+            if r < 3:
+                out[r] = x
+            if r > 0:
+                x = ops.pool(x, crop.first[r - 1])
+        return out
+
+    def context(self, g, crop, r):
+        if r == 0:
+            return None
+        d = crop.descent[r]
+        if self.cfg["upsample"] == "learned":
+            return self.up[str(r)](g, d)
+        return g[d.table.max(0).values.long()]
+
+    def code(self, crop, features, top, mode):
+        """Runs roles 0 .. top. mode: 'noise' (noise for rate and distortion), 'mixed' (noise for rate, straight-through rounding for
+        distortion), 'round'. Returns g of role `top`, bits per role and the latents per role."""
+        g, rates, latents, limit = None, [], [], float(self.cfg["latent_max"])
+        for r in range(top + 1):
+            c = self.context(g, crop, r)
+            y = self.fs[r](features[r], c).clamp(-limit, limit)
+            rounded = y + (torch.round(y) - y).detach()
+            noisy = rounded if mode == "round" else y + torch.rand_like(y) - 0.5
+            if r == 0:
+                mass = self.prior(noisy)
+            else:
+                mu, log_sigma = self.pem[str(r)](c, crop.kernel3[r])
+                mass = bin_mass(noisy, mu, bounded_sigma(log_sigma))
+            rates.append(bits(mass))
+            latents.append(y)
+            g = self.fr[r](noisy if mode == "noise" else rounded, c, crop.kernel3[r])
+        return g, rates, latents
+
+    def generate(self, g, crop, role):
+        """Gaussians of head `role`, in finest-voxel units."""
+        head = self.gg[str(role)]
+        raw = head(g, crop, role)
+        coords = crop.children if head.fanout == 8 else crop.coords[role]
+        return gaussians(raw, coords, 2.0, self.cfg, opaque=role == 2), raw
+
+    @torch.no_grad()
+    def calibrate(self, crop, rgb, target=3.0):
+        """Scales the latents to the wanted standard deviation and centres them, on one crop."""
+        features, g = self.analyse(crop, rgb), None
+        for r in range(3):
+            c = self.context(g, crop, r)
+            lin = self.fs[r].lin2
+            y = self.fs[r](features[r], c)
+            s = target / y.std(0).clamp_min(1e-6)
+            lin.weight.mul_(s)
+            lin.bias.copy_((lin.bias - y.mean(0)) * s)
+            g = self.fr[r](torch.round(self.fs[r](features[r], c)), c, crop.kernel3[r])
+
+
+def groups(model, lr_conv, lr_linear):
+    """Parameter groups: geometry-invariant and other convolutions move at lr_conv, everything else at lr_linear."""
+    conv, other = [], []
+    for name, p in model.named_parameters():
+        (conv if p.ndim == 3 and p.shape[0] > 1 else other).append(p)
+    return [{"params": conv, "base": lr_conv}, {"params": other, "base": lr_linear}]

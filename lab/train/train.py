@@ -1,0 +1,299 @@
+"""Trains the codec. See README.md; `python train.py --help` lists the options."""
+
+import argparse
+import json
+import math
+import os
+import random
+import signal
+import sys
+import time
+
+import torch
+import torch.nn.functional as F
+
+import data
+import ops
+from model import B2P, groups
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Loss
+
+
+def window(size, sigma=1.5, width=11):
+    """Matrix [size - width + 1, size] that convolves a row with a Gaussian window."""
+    t = torch.arange(width, dtype=torch.float32) - (width - 1) / 2
+    g = torch.exp(-t * t / (2 * sigma * sigma))
+    g /= g.sum()
+    m = torch.zeros(size - width + 1, size)
+    for i in range(m.shape[0]):
+        m[i, i:i + width] = g
+    return m
+
+
+_windows = {}
+
+
+def ssim(a, b):
+    """Structural similarity of pictures [V, 3, H, W] in 0..1."""
+    h, w = a.shape[2:]
+    for s in (h, w):
+        if (s, a.device) not in _windows:
+            _windows[s, a.device] = window(s).to(a.device)
+    mh, mw = _windows[h, a.device], _windows[w, a.device].T
+    ma, mb, saa, sbb, sab = (mh @ torch.cat([a, b, a * a, b * b, a * b]) @ mw).chunk(5)
+    c1, c2 = 0.01**2, 0.03**2
+    va, vb, cov = saa - ma * ma, sbb - mb * mb, sab - ma * mb
+    return (((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma * ma + mb * mb + c1) * (va + vb + c2))).mean()
+
+
+CHROMA = torch.tensor([[0.5, -0.5, 0.0], [-0.25, -0.25, 0.5]])
+
+
+def distortion(image, truth, pyramid):
+    """D = 3 L1 + 0.2 (1 - SSIM), at the drawn size and at its 2x2 average, which is what evaluation looks at, plus `pyramid` times an
+    L1 over coarser averages, luma and chroma, where blotches show."""
+    total = 0
+    for level in range(2):
+        if level:
+            image, truth = F.avg_pool2d(image, 2), F.avg_pool2d(truth, 2)
+        total = total + (1, 2)[level] / 3 * (3 * (image - truth).abs().mean() + 0.2 * (1 - ssim(image, truth)))
+    if pyramid > 0:
+        e = image - truth
+        matrix = CHROMA.to(e.device)
+        for _ in range(3):
+            e = F.avg_pool2d(e, 2)
+            c = torch.einsum("kc,vchw->vkhw", matrix, e)
+            total = total + pyramid * (e.abs().mean() + c.abs().mean())
+    return total
+
+
+def psnr(mse):
+    return -10 * math.log10(max(mse, 1e-10))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Schedule, as functions of the fraction of the budget that is used
+
+
+def rate_weight(x, args):
+    start, end = args.rate_start, args.rate_ramp
+    return 1.0 if x >= end else start ** (1 - x / end)
+
+
+def learning_rate(x, step, args):
+    warm = min(1.0, (step + 1) / args.warmup) if args.warmup else 1.0
+    if x < args.decay_from:
+        return warm
+    return warm * (0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * (x - args.decay_from) / (1 - args.decay_from))))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def atomic_save(obj, path):
+    torch.save(obj, path + ".tmp")
+    os.replace(path + ".tmp", path)
+
+
+class Trainer:
+    def __init__(self, args):
+        self.args, self.device = args, args.device
+        with open(args.config) as f:
+            self.cfg = json.load(f)
+        torch.manual_seed(args.seed)
+        self.rng = random.Random(args.seed)
+        self.model = B2P(self.cfg).to(self.device)
+        self.optimiser = torch.optim.Adam(groups(self.model, args.lr_conv, args.lr_linear), betas=(0.9, 0.99), eps=1e-8, fused=True)
+        self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+        self.step, self.used, self.calibrated = 0, 0.0, False
+
+    def state(self):
+        return {"model": self.model.state_dict(), "average": self.average, "optimiser": self.optimiser.state_dict(), "step": self.step,
+                "used": self.used, "calibrated": self.calibrated, "config": self.cfg, "args": vars(self.args), "torch_rng": torch.get_rng_state(),
+                "rng": self.rng.getstate()}
+
+    def restore(self, path, weights_only=False):
+        s = torch.load(path, map_location=self.device, weights_only=False)
+        if weights_only:
+            self.model.load_state_dict(s["average"])
+            self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+            self.calibrated = True
+            return
+        self.model.load_state_dict(s["model"])
+        self.average = s["average"]
+        self.optimiser.load_state_dict(s["optimiser"])
+        self.step, self.used, self.calibrated = s["step"], s["used"], s["calibrated"]
+        torch.set_rng_state(s["torch_rng"].cpu())
+        self.rng.setstate(s["rng"])
+
+    def fraction(self):
+        return self.used / (self.args.minutes * 60) if self.args.minutes else self.step / self.args.steps
+
+    def loss(self, sample, head, weight, mode):
+        features = self.model.analyse(sample.crop, sample.rgb)
+        g, rates, latents = self.model.code(sample.crop, features, head, mode)
+        (mean, cov, alpha, colour), raw = self.model.generate(g, sample.crop, head)
+        background = torch.rand(sample.image.shape[0], 3, device=raw.device)
+        h, w = sample.image.shape[2:]
+        image = ops.splat(mean, cov, alpha, colour, sample.cameras, background, w, h)
+        truth = sample.image + (1 - sample.coverage) * background[:, :, None, None]
+        d = distortion(image, truth, self.args.pyramid)
+        rate = sum(rates) / sample.crop.points
+        # A latent that wanders off is cheap to code while the rate weighs nothing, and expensive to bring back.
+        loss = weight * rate + self.args.lam * d + 1e-4 * sum((y / 8).pow(4).mean() for y in latents)
+        return loss, {"rate": [r.item() / sample.crop.points for r in rates], "d": d.item(),
+                      "mse": (image - truth).pow(2).mean().item(), "std": [y.std().item() for y in latents]}
+
+    def train_step(self, samples):
+        args, x = self.args, self.fraction()
+        weight, mode = rate_weight(x, args), "noise" if x < args.rounding_from else "mixed"
+        head = 1 if self.rng.random() < args.coarse else 2
+        heads = [1, 2] if args.both else [head]
+        if not self.calibrated:
+            self.model.calibrate(samples[0].crop, samples[0].rgb)
+            self.calibrated = True
+        self.optimiser.zero_grad(set_to_none=True)
+        for sample in samples:
+            for h in heads:
+                loss, info = self.loss(sample, h, weight, mode)
+                (loss / len(samples)).backward()
+        lr = learning_rate(x, self.step, args)
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["base"] * lr
+        norm = torch.nn.utils.clip_grad_norm_([p for p in self.model.parameters() if p.grad is not None], args.clip)
+        if torch.isfinite(norm):
+            self.optimiser.step()
+        self.step += 1
+        keep = min(args.average, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            now = self.model.state_dict()
+            keys = [k for k in now if now[k].is_floating_point()]
+            torch._foreach_lerp_([self.average[k] for k in keys], [now[k] for k in keys], 1 - keep)
+        return info | {"loss": loss.item(), "head": heads[-1], "norm": norm.item(), "weight": weight, "lr": lr, "points": samples[-1].crop.points}
+
+    @torch.no_grad()
+    def evaluate(self, samples, averaged=True):
+        """Rounded bpp per role and PSNR (full, foreground) of both heads, white background, at the 2x2 average."""
+        if averaged:
+            keep = {k: v.clone() for k, v in self.model.state_dict().items()}
+            self.model.load_state_dict(self.average)
+        sums, bits, points = {1: [0.0] * 4, 2: [0.0] * 4}, [0.0] * 3, 0
+        for sample in samples:
+            features = self.model.analyse(sample.crop, sample.rgb)
+            points += sample.crop.points
+            for head in (1, 2):
+                g, rates, _ = self.model.code(sample.crop, features, head, "round")
+                if head == 2:
+                    bits = [b + r.item() for b, r in zip(bits, rates)]
+                (mean, cov, alpha, colour), _ = self.model.generate(g, sample.crop, head)
+                h, w = sample.image.shape[2:]
+                white = torch.ones(sample.image.shape[0], 3, device=mean.device)
+                image = ops.splat(mean, cov, alpha, colour, sample.cameras, white, w, h)
+                truth = sample.image + (1 - sample.coverage)
+                image, truth, mask = F.avg_pool2d(image, 2), F.avg_pool2d(truth, 2), F.avg_pool2d(sample.coverage, 2) > 0.5
+                e = (image - truth).pow(2)
+                s = sums[head]
+                s[0] += e.sum().item()
+                s[1] += e.numel()
+                s[2] += (e * mask).sum().item()
+                s[3] += 3 * mask.sum().item()
+        if averaged:
+            self.model.load_state_dict(keep)
+        row = {"bpp": [round(b / points, 4) for b in bits]}
+        for head, s in sums.items():
+            row[f"psnr{head}"], row[f"fg{head}"] = round(psnr(s[0] / s[1]), 2), round(psnr(s[2] / s[3]), 2)
+        return row
+
+
+def main(argv=None):
+    p = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    p.add_argument("--data", required=True, help="folder of samples")
+    p.add_argument("--out", required=True, help="folder of checkpoints and logs")
+    p.add_argument("--config", default=os.path.join(HERE, "configs/full.json"))
+    p.add_argument("--lam", type=float, default=5.0, help="weight of distortion against bits per finest-level point")
+    p.add_argument("--minutes", type=float, default=0, help="budget in minutes; the schedule follows it")
+    p.add_argument("--steps", type=int, default=20000, help="budget in steps, when no --minutes are given")
+    p.add_argument("--batch", type=int, default=1)
+    p.add_argument("--views", type=int, default=3, help="views drawn per sample")
+    p.add_argument("--coarse", type=float, default=0.4, help="share of steps that train the head of role 1")
+    p.add_argument("--both", action="store_true", help="train both heads in every step")
+    p.add_argument("--pyramid", type=float, default=1.0, help="weight of the multi-scale term")
+    p.add_argument("--lr-conv", type=float, default=3e-4)
+    p.add_argument("--lr-linear", type=float, default=1e-3)
+    p.add_argument("--warmup", type=int, default=50)
+    p.add_argument("--decay-from", type=float, default=0.6)
+    p.add_argument("--rate-start", type=float, default=0.003)
+    p.add_argument("--rate-ramp", type=float, default=0.6)
+    p.add_argument("--rounding-from", type=float, default=0.6)
+    p.add_argument("--clip", type=float, default=1.0)
+    p.add_argument("--average", type=float, default=0.998, help="decay of the averaged weights")
+    p.add_argument("--held-out", type=int, default=8)
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--threads", type=int, default=2)
+    p.add_argument("--device", default="cpu")
+    p.add_argument("--save-minutes", type=float, default=5)
+    p.add_argument("--evaluate-every", type=int, default=250)
+    p.add_argument("--log-every", type=int, default=10)
+    p.add_argument("--resume", action="store_true", help="continue from OUT/last.pt")
+    p.add_argument("--init", help="start from the averaged weights of this checkpoint")
+    args = p.parse_args(argv)
+
+    torch.set_num_threads(args.threads)
+    os.makedirs(args.out, exist_ok=True)
+    trainer = Trainer(args)
+    last = os.path.join(args.out, "last.pt")
+    if args.resume:
+        trainer.restore(last)
+    elif args.init:
+        trainer.restore(args.init, weights_only=True)
+    train_files, held_files = data.split(args.data, args.held_out)
+    held = [data.load_sample(f).to(args.device) for f in held_files]
+    stream = data.Stream(train_files, args.views, args.seed, start=trainer.step * args.batch)
+    log = open(os.path.join(args.out, "log.jsonl"), "a")
+
+    def write(row):
+        log.write(json.dumps(row) + "\n")
+        log.flush()
+        print(" ".join(f"{k}={v}" for k, v in row.items()), flush=True)
+
+    stop = []
+    signal.signal(signal.SIGINT, lambda *_: stop.append(1))
+    signal.signal(signal.SIGTERM, lambda *_: stop.append(1))
+    saved, means = time.monotonic(), []
+    while trainer.fraction() < 1 and not stop:
+        begin = time.monotonic()
+        info = trainer.train_step([stream.next().to(args.device) for _ in range(args.batch)])
+        trainer.used += time.monotonic() - begin
+        means.append(info)
+        if trainer.step % args.log_every == 0:
+            mean = lambda key: sum(m[key] for m in means) / len(means)
+            row = {"step": trainer.step, "x": round(trainer.fraction(), 4), "loss": round(mean("loss"), 4), "sec": round(time.monotonic() - begin, 2),
+                   "points": int(mean("points")), "w": round(info["weight"], 4), "norm": round(mean("norm"), 3)}
+            for h in (1, 2):
+                of = [m for m in means if m["head"] == h]
+                if of:
+                    row[f"rate{h}"] = [round(sum(m["rate"][r] for m in of) / len(of), 4) for r in range(h + 1)]
+                    row[f"std{h}"] = [round(of[-1]["std"][r], 2) for r in range(h + 1)]
+                    row[f"d{h}"] = round(sum(m["d"] for m in of) / len(of), 4)
+                    row[f"psnr{h}"] = round(psnr(sum(m["mse"] for m in of) / len(of)), 2)
+            write(row)
+            means = []
+        if trainer.step % args.evaluate_every == 0:
+            begin = time.monotonic()
+            row = {"eval": trainer.step, "x": round(trainer.fraction(), 4)} | trainer.evaluate(held)
+            trainer.used += time.monotonic() - begin
+            write(row)
+        if time.monotonic() - saved > args.save_minutes * 60:
+            atomic_save(trainer.state(), last)
+            saved = time.monotonic()
+    atomic_save(trainer.state(), last)
+    write({"final": trainer.step} | trainer.evaluate(held))
+    return trainer
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
