@@ -65,8 +65,7 @@ class Conv(nn.Module):
 
     def forward(self, x, kmap=None, relu=False):
         if self.taps == 1:
-            y = torch.addmm(self.bias, x, self.weight[0])
-            return torch.relu_(y) if relu else y
+            return ops.linear(x, self.weight, self.bias, relu)
         return ops.conv(x, self.weight, self.bias, kmap, relu)
 
 
@@ -84,9 +83,8 @@ class NormConv(nn.Module):
 
     def forward(self, x, kmap=None, relu=False):
         if self.taps == 1:
-            w = self.weight[0]
-            y = torch.addmm(self.bias, x, w * (self.gain * torch.rsqrt((w * w).sum(0) + 1e-8)))
-            return torch.relu_(y) if relu else y
+            w = self.weight
+            return ops.linear(x, w * (self.gain * torch.rsqrt((w * w).sum(1, keepdim=True) + 1e-8)), self.bias, relu)
         return ops.norm_conv(x, self.weight, self.gain, self.bias, kmap, relu)
 
 
@@ -210,8 +208,8 @@ class Generate(nn.Module):
         for b in self.before:
             x = b(x, kmap)
         if self.fanout == 8:
-            w = self.layer4.weight.permute(1, 0, 2).reshape(x.shape[1], -1)
-            x = (x @ w).view(8 * x.shape[0], -1) + self.layer4.bias
+            w = self.layer4.weight.permute(1, 0, 2).reshape(1, x.shape[1], -1).contiguous()
+            x = ops.linear(x, w, self.layer4.bias.repeat(8)).view(8 * x.shape[0], -1)
             kmap = crop.children3
         else:
             x = self.layer4(x, crop.corners)

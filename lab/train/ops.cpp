@@ -100,18 +100,21 @@ void pack(const float* w, int64_t taps, int64_t cin, int64_t cout, bool transpos
 template <int R>
 inline void tile(const float* const* x, float* const* y, const float* w, int64_t cin) {
   __m256 a[R][2];
+#pragma GCC unroll 8
   for (int r = 0; r < R; r++) {
     a[r][0] = _mm256_load_ps(y[r]);
     a[r][1] = _mm256_load_ps(y[r] + 8);
   }
   for (int64_t c = 0; c < cin; c++) {
     const __m256 w0 = _mm256_load_ps(w + 16 * c), w1 = _mm256_load_ps(w + 16 * c + 8);
-    for (int r = 0; r < R; r++) {
+#pragma GCC unroll 8
+  for (int r = 0; r < R; r++) {
       const __m256 b = _mm256_broadcast_ss(x[r] + c);
       a[r][0] = _mm256_fmadd_ps(b, w0, a[r][0]);
       a[r][1] = _mm256_fmadd_ps(b, w1, a[r][1]);
     }
   }
+#pragma GCC unroll 8
   for (int r = 0; r < R; r++) {
     _mm256_store_ps(y[r], a[r][0]);
     _mm256_store_ps(y[r] + 8, a[r][1]);
@@ -196,19 +199,23 @@ std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const
       }
       for (int64_t i = 0; i < m; i++)
         for (int64_t p = 0; p < panels; p++) {
-          const float* a = acc.p + (p * BLOCK + i) * 16;
+          float* a = acc.p + (p * BLOCK + i) * 16;
           const int64_t o0 = p * 16, width = std::min<int64_t>(16, cout - o0), at = (r0 + i) * cout + o0;
-          for (int64_t j = 0; j < width; j++) {
-            float v = a[j];
-            if (norm) {
-              const float r = 1.f / std::sqrt(den.p[i * wide + o0 + j] + 1e-8f);
-              ip[at + j] = r;
-              hp[at + j] = v * r;
-              v = gp[o0 + j] * (v * r);
+          if (norm) {
+            float* d = den.p + i * wide + o0;
+            for (int64_t j = 0; j < 16; j++) {
+              d[j] = 1.f / std::sqrt(d[j] + 1e-8f);
+              a[j] *= d[j];
             }
-            if (bp) v += bp[o0 + j];
-            yp[at + j] = relu ? std::max(v, 0.f) : v;
+            std::copy(d, d + width, ip + at);
+            std::copy(a, a + width, hp + at);
+            for (int64_t j = 0; j < width; j++) a[j] *= gp[o0 + j];
           }
+          if (bp)
+            for (int64_t j = 0; j < width; j++) a[j] += bp[o0 + j];
+          if (relu)
+            for (int64_t j = 0; j < 16; j++) a[j] = a[j] > 0.f ? a[j] : 0.f;
+          std::copy(a, a + width, yp + at);
         }
     }
   }
@@ -219,86 +226,104 @@ std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const
 template <int R>
 inline void outer(const float* x, const float* g, float* dw, int64_t n) {
   __m256 a[R][2];
+#pragma GCC unroll 8
   for (int r = 0; r < R; r++) {
     a[r][0] = _mm256_load_ps(dw + 16 * r);
     a[r][1] = _mm256_load_ps(dw + 16 * r + 8);
   }
   for (int64_t i = 0; i < n; i++) {
     const __m256 g0 = _mm256_load_ps(g + 16 * i), g1 = _mm256_load_ps(g + 16 * i + 8);
-    for (int r = 0; r < R; r++) {
+#pragma GCC unroll 8
+  for (int r = 0; r < R; r++) {
       const __m256 b = _mm256_broadcast_ss(x + 6 * i + r);
       a[r][0] = _mm256_fmadd_ps(b, g0, a[r][0]);
       a[r][1] = _mm256_fmadd_ps(b, g1, a[r][1]);
     }
   }
+#pragma GCC unroll 8
   for (int r = 0; r < R; r++) {
     _mm256_store_ps(dw + 16 * r, a[r][0]);
     _mm256_store_ps(dw + 16 * r + 8, a[r][1]);
   }
 }
 
-// dW[k] = sum over pairs of x[in]^T g[out]. Pairs are packed by chunks, x in strips of 6 columns and g in panels of 16.
+// dW[k] = sum over pairs of x[in]^T g[out]. Rows go in blocks whose inputs stay in the cache over all taps; the pairs of a block are
+// packed, x in strips of 6 columns and g in panels of 16.
 Tensor weight_grad(const Tensor& x, const Tensor& g, const Tensor& map) {
   check(x, at::kFloat);
   check(g, at::kFloat);
   check(map, at::kInt);
-  constexpr int64_t CHUNK = 128;
+  constexpr int64_t CHUNK = 128, SHARES = 8;
   const int64_t taps = map.size(0), n = map.size(1), cin = x.size(1), cout = g.size(1), panels = (cout + 15) / 16, strips = (cin + 5) / 6;
+  const int64_t size = panels * strips * 96;
   TORCH_CHECK(g.size(0) == n, "gradient rows do not match the map");
-  Tensor dw = torch::empty({taps, cin, cout});
+  Aligned acc(SHARES * taps * size);
   const float *xp = x.data_ptr<float>(), *gp = g.data_ptr<float>();
   const int32_t* mp = map.data_ptr<int32_t>();
-  float* dp = dw.data_ptr<float>();
 #pragma omp parallel
   {
-    Aligned acc(panels * strips * 96), gs(panels * CHUNK * 16), xs(strips * CHUNK * 6);
+    Aligned gs(panels * CHUNK * 16), xs(strips * CHUNK * 6);
     std::fill(gs.p, gs.p + panels * CHUNK * 16, 0.f);
     std::fill(xs.p, xs.p + strips * CHUNK * 6, 0.f);
+    int32_t ins[BLOCK], outs[BLOCK];
 #pragma omp for schedule(dynamic, 1)
-    for (int64_t task = 0; task < taps; task++) {
-      // The centre tap has the most pairs: it goes first, so that the threads end together.
-      const int64_t k = (task + taps / 2) % taps;
-      std::fill(acc.p, acc.p + panels * strips * 96, 0.f);
-      int64_t i = 0;
-      while (i < n) {
-        int64_t count = 0;
-        for (; i < n && count < CHUNK; i++) {
-          const int32_t in = mp[k * n + i];
-          if (in < 0) continue;
-          const float *src = gp + i * cout, *row = xp + int64_t(in) * cin;
-          int64_t p = 0;
-          for (; (p + 1) * 16 <= cout; p++) {
-            float* to = gs.p + (p * CHUNK + count) * 16;
-            _mm256_store_ps(to, _mm256_loadu_ps(src + 16 * p));
-            _mm256_store_ps(to + 8, _mm256_loadu_ps(src + 16 * p + 8));
+    for (int64_t share = 0; share < SHARES; share++) {
+      float* mine = acc.p + share * taps * size;
+      std::fill(mine, mine + taps * size, 0.f);
+      const int64_t stop = n * (share + 1) / SHARES;
+      for (int64_t r0 = n * share / SHARES; r0 < stop; r0 += BLOCK) {
+        const int64_t r1 = std::min(stop, r0 + BLOCK);
+        for (int64_t k = 0; k < taps; k++) {
+          int64_t pairs = 0;
+          for (int64_t i = r0; i < r1; i++) {
+            ins[pairs] = mp[k * n + i];
+            outs[pairs] = int32_t(i);
+            pairs += ins[pairs] >= 0;
           }
-          for (int64_t o = p * 16; o < cout; o++) gs.p[(p * CHUNK + count) * 16 + o % 16] = src[o];
-          int64_t s = 0;
-          for (; (s + 1) * 6 <= cin; s++) {
-            float* to = xs.p + (s * CHUNK + count) * 6;
-            _mm_storeu_ps(to, _mm_loadu_ps(row + 6 * s));
-            _mm_storel_pi(reinterpret_cast<__m64*>(to + 4), _mm_loadl_pi(_mm_setzero_ps(), reinterpret_cast<const __m64*>(row + 6 * s + 4)));
+          for (int64_t first = 0; first < pairs; first += CHUNK) {
+            const int64_t count = std::min(CHUNK, pairs - first);
+            for (int64_t j = 0; j < count; j++) {
+              const float *src = gp + int64_t(outs[first + j]) * cout, *row = xp + int64_t(ins[first + j]) * cin;
+              int64_t p = 0;
+              for (; (p + 1) * 16 <= cout; p++) {
+                float* to = gs.p + (p * CHUNK + j) * 16;
+                _mm256_store_ps(to, _mm256_loadu_ps(src + 16 * p));
+                _mm256_store_ps(to + 8, _mm256_loadu_ps(src + 16 * p + 8));
+              }
+              for (int64_t o = p * 16; o < cout; o++) gs.p[(p * CHUNK + j) * 16 + o % 16] = src[o];
+              int64_t s = 0;
+              for (; (s + 1) * 6 <= cin; s++) {
+                float* to = xs.p + (s * CHUNK + j) * 6;
+                _mm_storeu_ps(to, _mm_loadu_ps(row + 6 * s));
+                _mm_storel_pi(reinterpret_cast<__m64*>(to + 4), _mm_loadl_pi(_mm_setzero_ps(), reinterpret_cast<const __m64*>(row + 6 * s + 4)));
+              }
+              for (int64_t c = s * 6; c < cin; c++) xs.p[(s * CHUNK + j) * 6 + c % 6] = row[c];
+            }
+            for (int64_t p = 0; p < panels; p++)
+              for (int64_t s = 0; s < strips; s++) {
+                const float *xa = xs.p + s * CHUNK * 6, *ga = gs.p + p * CHUNK * 16;
+                float* to = mine + k * size + (p * strips + s) * 96;
+                if (cin - 6 * s >= 5) outer<6>(xa, ga, to, count);
+                else if (cin - 6 * s >= 4) outer<4>(xa, ga, to, count);
+                else outer<3>(xa, ga, to, count);
+              }
           }
-          for (int64_t c = s * 6; c < cin; c++) xs.p[(s * CHUNK + count) * 6 + c % 6] = row[c];
-          count++;
         }
-        for (int64_t p = 0; p < panels; p++)
-          for (int64_t s = 0; s < strips; s++) {
-            const float *xa = xs.p + s * CHUNK * 6, *ga = gs.p + p * CHUNK * 16;
-            float* to = acc.p + (p * strips + s) * 96;
-            if (cin - 6 * s >= 6) outer<6>(xa, ga, to, count);
-            else if (cin - 6 * s >= 4) outer<5>(xa, ga, to, count);
-            else outer<3>(xa, ga, to, count);
-          }
       }
-      for (int64_t c = 0; c < cin; c++)
-        for (int64_t o = 0; o < cout; o++) dp[(k * cin + c) * cout + o] = acc.p[((o / 16) * strips + c / 6) * 96 + c % 6 * 16 + o % 16];
     }
   }
+  Tensor dw = torch::zeros({taps, cin, cout});
+  float* dp = dw.data_ptr<float>();
+#pragma omp parallel for schedule(static)
+  for (int64_t k = 0; k < taps; k++)
+    for (int64_t share = 0; share < SHARES; share++)
+      for (int64_t c = 0; c < cin; c++)
+        for (int64_t o = 0; o < cout; o++)
+          dp[(k * cin + c) * cout + o] += acc.p[(share * taps + k) * size + ((o / 16) * strips + c / 6) * 96 + c % 6 * 16 + o % 16];
   return dw;
 }
 
-// Sums of PARTS partial results, in order.
+// Sums of partial results, in order.
 Tensor join(const Tensor& parts) { return parts.sum(0); }
 
 // Gradient at the accumulator of a plain convolution, and of its bias.

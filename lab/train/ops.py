@@ -130,6 +130,13 @@ class _Conv(torch.autograd.Function):
         return dx, e.weight_grad(x, g, ctx.kmap.table), db, None, None
 
 
+@functools.lru_cache(maxsize=64)
+def identity(n):
+    """The map of a linear layer."""
+    table = torch.arange(n, dtype=torch.int32)[None]
+    return Map(table, table)
+
+
 class _NormConv(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, w, gain, bias, kmap, relu):
@@ -161,6 +168,14 @@ def conv(x, w, bias, kmap, relu=False):
     if native(x):
         return _Conv.apply(x.contiguous(), w, bias, kmap, relu)
     y = _gather_conv(x, w, kmap) + bias
+    return torch.relu(y) if relu else y
+
+
+def linear(x, w, bias, relu=False):
+    """x [n, c_in], w [1, c_in, c_out]."""
+    if native(x):
+        return _Conv.apply(x.contiguous(), w, bias, identity(x.shape[0]), relu)
+    y = torch.addmm(bias, x, w[0])
     return torch.relu(y) if relu else y
 
 

@@ -1,6 +1,7 @@
 """Trains the codec. See README.md; `python train.py --help` lists the options."""
 
 import argparse
+import ctypes
 import json
 import math
 import os
@@ -97,6 +98,16 @@ def learning_rate(x, step, args):
 def atomic_save(obj, path):
     torch.save(obj, path + ".tmp")
     os.replace(path + ".tmp", path)
+
+
+def keep_memory():
+    """Asks the C library to keep freed blocks: a step allocates the same large tensors again, and fresh pages are slow."""
+    try:
+        libc = ctypes.CDLL("libc.so.6")
+        libc.mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD
+        libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
+    except OSError:
+        pass
 
 
 class Trainer:
@@ -243,6 +254,7 @@ def main(argv=None):
     args = p.parse_args(argv)
 
     torch.set_num_threads(args.threads)
+    keep_memory()
     os.makedirs(args.out, exist_ok=True)
     trainer = Trainer(args)
     last = os.path.join(args.out, "last.pt")
