@@ -12,6 +12,7 @@
 #![forbid(unsafe_code)]
 
 pub mod cloud;
+pub mod entropy;
 pub mod error;
 pub mod gaussians;
 pub mod geometry;

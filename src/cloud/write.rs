@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::PointCloud;
 use crate::error::{Error, Result};
+use crate::output::write_file;
 
 impl PointCloud {
     /// The cloud as a binary little-endian PLY: `float x y z` (`double` if `float` would round a coordinate) and
@@ -45,12 +46,14 @@ impl PointCloud {
         bytes
     }
 
-    /// Writes [`PointCloud::to_ply`] to a file.
+    /// Writes [`PointCloud::to_ply`] to a file, whole or not at all.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
-        std::fs::write(path, self.to_ply()).map_err(|source| Error::Io {
-            path: path.to_owned(),
-            source,
+        write_file(path, |file| {
+            file.write_all(&self.to_ply()).map_err(|source| Error::Io {
+                path: path.to_owned(),
+                source,
+            })
         })
     }
 }

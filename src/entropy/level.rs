@@ -1,0 +1,158 @@
+//! One level: slices in parallel, and what its latents hash to.
+
+use rayon::prelude::*;
+use xxhash_rust::xxh3::Xxh3Default;
+
+use super::slice::{Condition, decode_into, encode_slice};
+use super::tables::Tables;
+use crate::error::{Error, Result, Stage};
+
+/// Codes a level's latents in slices of `slice_voxels` voxels, the last one what is left.
+///
+/// # Panics
+/// As [`encode_slice`] does, and if `slice_voxels` is 0.
+pub fn encode_level(
+    tables: &Tables,
+    condition: Condition,
+    latents: &[i16],
+    slice_voxels: usize,
+) -> Vec<Vec<u8>> {
+    condition.check(tables, latents.len());
+    let width = slice_voxels * tables.channels();
+    latents
+        .par_chunks(width)
+        .enumerate()
+        .map(|(i, part)| {
+            let start = i * width;
+            encode_slice(tables, condition.of(start..start + part.len()), part)
+        })
+        .collect()
+}
+
+/// Decodes the latents of a level of `voxels` voxels, whose number the caller has held against its limits.
+///
+/// # Errors
+/// [`Error::Malformed`] if there are more or fewer slices than the voxels fill; else the error of the first slice that has one.
+///
+/// # Panics
+/// As [`encode_level`] does.
+pub fn decode_level(
+    tables: &Tables,
+    condition: Condition,
+    slices: &[&[u8]],
+    voxels: usize,
+    slice_voxels: usize,
+    level: u8,
+) -> Result<Vec<i16>> {
+    let mut latents = vec![0; voxels * tables.channels()];
+    condition.check(tables, latents.len());
+    let needed = voxels.div_ceil(slice_voxels);
+    if slices.len() != needed {
+        return Err(Error::malformed(
+            Stage::Entropy,
+            format!("level {level}"),
+            "number of feature slices",
+            slices.len(),
+            needed,
+        ));
+    }
+    let width = slice_voxels * tables.channels();
+    let results: Vec<Result<()>> = latents
+        .par_chunks_mut(width)
+        .zip(slices)
+        .enumerate()
+        .map(|(i, (part, bytes))| {
+            let start = i * width;
+            let condition = condition.of(start..start + part.len());
+            let at = format_args!("level {level}, feature slice {i}");
+            decode_into(tables, condition, bytes, part, &at)
+        })
+        .collect();
+    results.into_iter().collect::<Result<()>>()?;
+    Ok(latents)
+}
+
+/// XXH3-64 of a level's latents as little-endian 16-bit numbers, voxel by voxel.
+pub fn latent_hash(latents: &[i16]) -> u64 {
+    let mut hasher = Xxh3Default::new();
+    let mut bytes = [0; 4096];
+    for part in latents.chunks(bytes.len() / 2) {
+        for (bytes, latent) in bytes.chunks_exact_mut(2).zip(part) {
+            bytes.copy_from_slice(&latent.to_le_bytes());
+        }
+        hasher.update(&bytes[..2 * part.len()]);
+    }
+    hasher.digest()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::entropy::test_tables::{Random, tables};
+
+    fn sample(voxels: usize) -> (Vec<i16>, Vec<u8>, Vec<i16>) {
+        let mut random = Random(3);
+        let count = voxels * tables().channels();
+        let mu = (0..count)
+            .map(|_| (random.next() % 1000) as i16 - 500)
+            .collect();
+        let sigma = (0..count).map(|_| (random.next() % 64) as u8).collect();
+        let latents = (0..count)
+            .map(|_| (random.next() % 63) as i16 - 31)
+            .collect();
+        (mu, sigma, latents)
+    }
+
+    #[test]
+    fn one_thread_and_two_make_the_same_bytes_and_latents() {
+        let tables = tables();
+        let (mu, sigma, latents) = sample(1000);
+        let gauss = Condition::Gauss {
+            mu: &mu,
+            sigma: &sigma,
+        };
+        for condition in [Condition::Prior, gauss] {
+            let run = |threads| {
+                let pool = rayon::ThreadPoolBuilder::new()
+                    .num_threads(threads)
+                    .build()
+                    .unwrap();
+                pool.install(|| {
+                    let bytes = encode_level(&tables, condition, &latents, 64);
+                    let slices: Vec<&[u8]> = bytes.iter().map(|b| &b[..]).collect();
+                    let back = decode_level(&tables, condition, &slices, 1000, 64, 7).unwrap();
+                    (bytes.clone(), back)
+                })
+            };
+            let one = run(1);
+            assert_eq!(one.0.len(), 16);
+            assert_eq!(one.1, latents);
+            assert_eq!(one, run(2));
+        }
+    }
+
+    #[test]
+    fn a_missing_or_damaged_slice_is_named() {
+        let tables = tables();
+        let (.., latents) = sample(100);
+        let bytes = encode_level(&tables, Condition::Prior, &latents, 40);
+        let mut slices: Vec<&[u8]> = bytes.iter().map(|b| &b[..]).collect();
+        let decode = |slices: &[&[u8]]| decode_level(&tables, Condition::Prior, slices, 100, 40, 7);
+        let error = decode(&slices[..2]).unwrap_err().to_string();
+        assert!(
+            error.contains("level 7: number of feature slices is 2, expected 3"),
+            "{error}"
+        );
+        slices[1] = &bytes[1][4..];
+        let error = decode(&slices).unwrap_err().to_string();
+        assert!(error.contains("level 7, feature slice 1"), "{error}");
+    }
+
+    #[test]
+    fn the_hash_is_that_of_the_little_endian_bytes() {
+        let (.., latents) = sample(3000);
+        let bytes: Vec<u8> = latents.iter().flat_map(|l| l.to_le_bytes()).collect();
+        assert_eq!(latent_hash(&latents), xxhash_rust::xxh3::xxh3_64(&bytes));
+        assert_eq!(latent_hash(&[]), 0x2d06_8005_38d3_94c2);
+    }
+}
