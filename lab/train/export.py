@@ -1,0 +1,293 @@
+"""Checkpoint -> model file (safetensors): the exact zone as integers, the rest as f16, the probability tables, and the proofs.
+
+    python export.py RUN/last.pt MODEL.safetensors --data FOLDER
+    python export.py --random configs/tiny.json MODEL.safetensors
+"""
+
+import argparse
+import json
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors.numpy import save_file
+
+import data
+import integer
+import ops
+from integer import LIMIT, SIGMA_MAX, SIGMA_MIN, SIGMAS, sigma_of
+from model import B2P, Inception, NormConv
+
+WEIGHT_MAX = 511
+LATENT_SHIFT = 6
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Activation ranges
+
+
+class Ranges:
+    """Largest magnitude and a high percentile of every layer's output over the calibration crops, after its ReLU if it has one."""
+
+    def __init__(self):
+        self.peak, self.high = {}, {}
+
+    def add(self, name, x):
+        x = x.abs().flatten()
+        k = max(1, int(len(x) * 0.9999))
+        self.peak[name] = max(self.peak.get(name, 0.0), x.max().item())
+        self.high[name] = max(self.high.get(name, 0.0), x.kthvalue(k).values.item())
+
+    def scale(self, *names):
+        """Real value of one integer step for an edge shared by `names`: outliers beyond twice the percentile are cut."""
+        reach = max(min(1.15 * self.peak[n], 2 * self.high[n]) for n in names)
+        return max(reach, 1e-6) / LIMIT
+
+
+@torch.no_grad()
+def ranges_of(model, samples):
+    """Runs the float network with rounded latents and records every edge of the exact zone."""
+    r = Ranges()
+    hooks = []
+    names = {m: n for n, m in model.named_modules()}
+
+    def record(module, _, output):
+        r.add(names[module], output)
+
+    for name, module in model.named_modules():
+        if name.split(".")[0] in ("up", "pem", "fr") and (isinstance(module, Inception) or hasattr(module, "taps")):
+            hooks.append(module.register_forward_hook(record))
+    for s in samples:
+        model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+    for h in hooks:
+        h.remove()
+    return r
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Quantisation
+
+
+def quantise_plain(name, weight, bias, scale_in, scale_out, out):
+    """weight [taps, in, out] in reals; scale_in [in] or a number. Writes int16 weights, int32 biases with the rounding constant, shifts."""
+    w = weight * np.asarray(scale_in, dtype=np.float64).reshape(-1, 1) / scale_out
+    peak = np.maximum(np.abs(w).max((0, 1)), 1e-12)
+    shift = np.floor(np.log2((WEIGHT_MAX + 0.49) / peak)).astype(np.int64)
+    # A larger bias than the proof allows would need a smaller shift.
+    room = np.floor(np.log2(2**30 / np.maximum(np.abs(bias / scale_out), 1e-12))).astype(np.int64)
+    shift = np.clip(np.minimum(shift, room), 0, 30)
+    q = np.clip(np.rint(w * 2.0**shift), -WEIGHT_MAX, WEIGHT_MAX)
+    b = np.rint(bias / scale_out * 2.0**shift) + np.where(shift > 0, 2.0 ** (shift - 1), 0)
+    worst = np.abs(q).sum((0, 1)) * LIMIT + np.abs(b)
+    if worst.max() >= 2**31:
+        raise SystemExit(f"{name}: an accumulator may reach {worst.max():.0f}")
+    out[name + ".weight"] = q.astype(np.int16)
+    out[name + ".bias"] = b.astype(np.int32)
+    out[name + ".shift"] = shift.astype(np.uint8)
+
+
+def quantise_norm(name, weight, gain, bias, scale_in, scale_out, out):
+    peak = np.maximum(np.abs(weight).max((0, 1)), 1e-12)
+    q = np.rint(weight * (WEIGHT_MAX / peak))
+    if (q**2).sum((0, 1)).max() >= 2**31 or np.abs(q).sum((0, 1)).max() * LIMIT >= 2**31:
+        raise SystemExit(f"{name}: weights too large for the norm's accumulator")
+    out[name + ".weight"] = q.astype(np.int16)
+    out[name + ".gain"] = (gain * (scale_in / scale_out)).astype(np.float32)
+    out[name + ".bias"] = (bias / scale_out).astype(np.float32)
+
+
+def quantise(model, ranges):
+    cfg, out = model.cfg, {}
+    modules = dict(model.named_modules())
+    value = lambda p: p.detach().double().numpy()
+
+    def layer(name, scale_in, scale_out, factor=1.0, shift=0.0):
+        m = modules[name]
+        if isinstance(m, NormConv):
+            quantise_norm(name, value(m.weight), value(m.gain), value(m.bias), scale_in, scale_out, out)
+        else:
+            quantise_plain(name, value(m.weight) * factor, (value(m.bias) + shift) * factor, scale_in, scale_out, out)
+
+    def inception(name, scale):
+        own = {k: ranges.scale(f"{name}.{k}") for k in ("a1", "b1", "b2")}
+        layer(name + ".a1", scale, own["a1"])
+        layer(name + ".a2", own["a1"], scale)
+        layer(name + ".b1", scale, own["b1"])
+        layer(name + ".b2", own["b1"], own["b2"])
+        layer(name + ".b3", own["b2"], scale)
+
+    def chain(first, prefix, blocks):
+        """One scale for a residual chain: what enters it, every branch and every sum."""
+        names = [first] + [f"{prefix}.blocks.{b}" for b in range(blocks)]
+        names += [f"{prefix}.blocks.{b}.{k}" for b in range(blocks) for k in ("a2", "b3")]
+        return ranges.scale(*names)
+
+    g_scale = [ranges.scale(f"fr.{r}.lin2") for r in range(3)]
+    c_scale = [0.0, *g_scale[:2]]
+    if cfg["upsample"] == "learned":
+        for r in (1, 2):
+            c_scale[r] = ranges.scale(f"up.{r}")
+            layer(f"up.{r}", g_scale[r - 1], c_scale[r])
+    per_nat = (SIGMAS - 1) / math.log(SIGMA_MAX / SIGMA_MIN)
+    for r in (1, 2):
+        s = chain(f"pem.{r}.conv_in", f"pem.{r}", cfg["pem_blocks"])
+        layer(f"pem.{r}.conv_in", c_scale[r], s)
+        for b in range(cfg["pem_blocks"]):
+            inception(f"pem.{r}.blocks.{b}", s)
+        layer(f"pem.{r}.mu", s, 1.0, factor=16.0)
+        layer(f"pem.{r}.sigma", s, 1.0, factor=per_nat, shift=-math.log(SIGMA_MIN))
+    for r in range(3):
+        s = chain(f"fr.{r}.lin1", f"fr.{r}", cfg["fr_blocks"])
+        inputs = np.full(cfg["latents"] + (cfg["channels"] if r else 0), c_scale[r])
+        inputs[:cfg["latents"]] = 2.0**-LATENT_SHIFT
+        layer(f"fr.{r}.lin1", inputs, s)
+        for b in range(cfg["fr_blocks"]):
+            inception(f"fr.{r}.blocks.{b}", s)
+        layer(f"fr.{r}.lin2", s, g_scale[r])
+    out["g_scale"], out["c_scale"] = np.array(g_scale, np.float32), np.array(c_scale, np.float32)
+    for name, m in modules.items():
+        if name.split(".")[0] in ("fc", "fs", "gg") and hasattr(m, "taps"):
+            w = m.weight.detach()
+            if isinstance(m, NormConv):  # free of scale: bring it to where f16 has its precision
+                w = w / w.abs().amax((0, 1)).clamp_min(1e-12)
+                out[name + ".gain"] = m.gain.detach().numpy().astype(np.float32)
+            out[name + ".weight"] = w.half().numpy()
+            out[name + ".bias"] = m.bias.detach().numpy().astype(np.float32)
+    return out
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Tables
+
+
+def normal_cdf(x):
+    return 0.5 * torch.special.erfc(-torch.as_tensor(x, dtype=torch.float64) / math.sqrt(2)).numpy()
+
+
+def frequencies(mass):
+    """Integers >= 1 that sum to 65536, proportional to the masses; the last entry is the escape, whose mass is what is missing."""
+    p = np.append(mass, max(0.0, 1.0 - mass.sum()))
+    p = p / p.sum()
+    f = 1 + np.floor(p * (65536 - len(p))).astype(np.int64)
+    f[np.argmax(p)] += 65536 - f.sum()
+    assert f.min() >= 1 and f.sum() == 65536
+    return f
+
+
+def pack(rows, lows):
+    flat = np.concatenate([r - 1 for r in rows]).astype(np.uint16)
+    offset = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(np.uint32)
+    return flat, offset, np.array(lows, np.int16)
+
+
+def gauss_tables():
+    rows, lows = [], []
+    for i in range(SIGMAS):
+        sigma = float(sigma_of(i))
+        half = min(330, max(1, math.ceil(5 * sigma)) + 1)
+        edge = np.arange(-half, half + 2) - 0.5
+        for frac in range(-8, 8):
+            z = (edge - frac / 16) / sigma
+            # Differences are taken in the tail where the function is small.
+            upper, lower = normal_cdf(-z), normal_cdf(z)
+            mass = np.where(z[:-1] > 0, upper[:-1] - upper[1:], lower[1:] - lower[:-1])
+            rows.append(frequencies(mass))
+            lows.append(-half)
+    return pack(rows, lows)
+
+
+@torch.no_grad()
+def prior_tables(model):
+    limit = model.cfg["latent_max"]
+    y = torch.arange(-limit, limit + 1, dtype=torch.float64)[:, None].expand(-1, model.cfg["latents"])
+    mass = model.prior.double()(y).numpy()
+    model.prior.float()
+    return pack([frequencies(mass[:, k]) for k in range(mass.shape[1])], [-limit] * mass.shape[1])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def export(model, samples, path, info):
+    out = quantise(model, ranges_of(model, samples))
+    for name, t in (("cdf.gauss", gauss_tables()), ("cdf.prior", prior_tables(model))):
+        out[name], out[name + ".offset"], out[name + ".low"] = t
+    meta = {"format": 1, **model.cfg, "latent_shift": LATENT_SHIFT, **info}
+    save_file({k: np.ascontiguousarray(v) for k, v in sorted(out.items())}, path, metadata={"b2p": json.dumps(meta)})
+
+
+def half_weights(model):
+    """Rounds the float zone's weights to what the file holds."""
+    with torch.no_grad():
+        for name, m in model.named_modules():
+            if name.split(".")[0] in ("fc", "fs", "gg") and hasattr(m, "taps"):
+                if isinstance(m, NormConv):
+                    m.weight.div_(m.weight.abs().amax((0, 1)).clamp_min(1e-12))
+                m.weight.copy_(m.weight.half().float())
+
+
+@torch.no_grad()
+def picture_error(model, sample, g):
+    (mean, cov, alpha, colour), _ = model.generate(g, sample.crop, 2)
+    h, w = sample.image.shape[2:]
+    image = ops.splat(mean, cov, alpha, colour, sample.cameras, torch.ones(sample.image.shape[0], 3), w, h)
+    truth = sample.image + (1 - sample.coverage)
+    return (F.avg_pool2d(image, 2) - F.avg_pool2d(truth, 2)).pow(2).mean().item()
+
+
+@torch.no_grad()
+def verify(path, model, samples):
+    """Rate of the integer path against the float path on whole crops, pictures of both, and saturation."""
+    exact, totals, points, error = integer.Exact(path), np.zeros((2, 3)), 0, np.zeros(2)
+    for s in samples:
+        g, rates, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+        bits, gi = integer.code(exact, model, s.crop, s.rgb)
+        totals += np.array([[r.item() for r in rates], bits])
+        error += [picture_error(model, s, g), picture_error(model, s, gi)]
+        points += s.crop.points
+    penalty = totals[1].sum() / totals[0].sum() - 1
+    psnr = -10 * np.log10(error / len(samples))
+    saturated = {k: f"{a / b:.1e}" for k, (a, b) in exact.saturated.items() if a}
+    print(f"bpp float {totals[0] / points} = {totals[0].sum() / points:.4f}")
+    print(f"bpp integer {totals[1] / points} = {totals[1].sum() / points:.4f}: {100 * penalty:+.2f} %")
+    print(f"PSNR float {psnr[0]:.2f} integer {psnr[1]:.2f} dB; saturated shares {saturated}")
+    return penalty
+
+
+def load_checkpoint(path, averaged=True):
+    s = torch.load(path, map_location="cpu", weights_only=False)
+    model = B2P(s["config"])
+    model.load_state_dict(s["average"] if averaged else s["model"])
+    return model.eval(), {"lambda": s["args"]["lam"], "steps": s["step"]}
+
+
+def main():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("checkpoint", nargs="?", help="left out with --random")
+    p.add_argument("out")
+    p.add_argument("--data", help="folder of samples to calibrate on; procedural ones when left out")
+    p.add_argument("--samples", type=int, default=8)
+    p.add_argument("--verify", type=int, default=3, help="crops for the check against the float path")
+    p.add_argument("--random", metavar="CONFIG", help="an untrained network of this configuration, for tests")
+    p.add_argument("--last", action="store_true", help="the last weights instead of the averaged ones")
+    args = p.parse_args()
+    samples = [data.procedural(i) for i in range(2)]
+    if args.data:
+        training, held = data.split(args.data, 8)
+        samples = [data.load_sample(f) for f in held[:args.verify] + training[:max(0, args.samples - args.verify)]]
+    if args.random:
+        torch.manual_seed(1)
+        with open(args.random) as f:
+            model, info = B2P(json.load(f)).eval(), {"steps": 0}
+        model.calibrate(samples[0].crop, samples[0].rgb)
+    else:
+        model, info = load_checkpoint(args.checkpoint, not args.last)
+    export(model, samples, args.out, info)
+    half_weights(model)
+    if verify(args.out, model, samples[:args.verify]) > 0.02:
+        print("warning: the integer path costs more than 2 %")
+
+
+if __name__ == "__main__":
+    main()
