@@ -1,5 +1,15 @@
 //! The laboratory of `b2p`: what is needed to make data, train, and judge, and never to decode.
 #![forbid(unsafe_code)]
 
+pub mod cli;
+pub mod dataset;
+pub mod error;
 pub mod mesh;
 pub mod procedural;
+pub mod random;
+pub mod raster;
+pub mod sample;
+pub mod surface;
+pub mod triplanar;
+
+pub use error::{LabError, Result};

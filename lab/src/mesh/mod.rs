@@ -1,5 +1,6 @@
 //! Textured triangle meshes: where clouds and ground-truth pictures come from.
 
+pub mod glb;
 /// A mesh in its own units, y up.
 #[derive(Debug, Clone, Default)]
 pub struct Mesh {

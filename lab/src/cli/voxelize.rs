@@ -1,0 +1,45 @@
+//! `b2p-lab voxelize`
+
+use std::path::PathBuf;
+
+use crate::error::Result;
+use crate::mesh::glb;
+use crate::sample::{Grid, Sampler, write_ply};
+use crate::surface::Surface;
+
+/// Sample a textured mesh into a voxelised coloured cloud (PLY)
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The mesh: self-contained binary glTF
+    mesh: PathBuf,
+    /// The cloud to write
+    #[arg(short, long, value_name = "CLOUD.ply")]
+    output: PathBuf,
+    /// Bit depth: the cube has 2^BITS voxels a side
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u8).range(1..=21))]
+    bits: u8,
+    /// The share of the cube's side that the mesh's longest side spans
+    #[arg(long, default_value_t = 0.95)]
+    fill: f64,
+    /// How many points to draw
+    #[arg(long, default_value_t = 15_000_000)]
+    points: u64,
+    /// Which points to draw
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+}
+
+impl Args {
+    /// Reads, samples, writes.
+    ///
+    /// # Errors
+    /// If the mesh cannot be read or has no area, or the cloud cannot be written.
+    pub fn run(self) -> Result<()> {
+        let surface = Surface::new(&glb::load(&self.mesh)?);
+        let grid = Grid::fit(surface.bounds(), self.bits, self.fill)?;
+        let cloud = Sampler::new(&surface, grid, self.points, self.seed)?.cloud(None);
+        write_ply(&self.output, &cloud, &grid)?;
+        eprintln!("{}: {} voxels", self.output.display(), cloud.keys.len());
+        Ok(())
+    }
+}

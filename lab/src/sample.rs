@@ -1,0 +1,310 @@
+//! Mesh to cloud: points drawn uniformly by area, averaged per voxel.
+//!
+//! Point number `j` of a seed is always the same point, whatever thread draws it and whatever others are wanted: a box of the cloud
+//! can be sampled alone. Triangles get their share of the points by rounding the running sum of their areas. Colour sums are
+//! integers, so their order does not matter.
+
+use std::path::Path;
+
+use b2p::geometry::morton;
+use rayon::prelude::*;
+
+use crate::error::{LabError, Result};
+use crate::random::Random;
+use crate::surface::{Face, Surface};
+
+/// Where voxels lie in a surface's space: `voxel = floor((p − origin) / unit + shift)`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grid {
+    /// Voxels per side are `2^bits`.
+    pub bits: u8,
+    /// Edge of a voxel.
+    pub unit: f64,
+    /// Lowest corner of the surface's bounding box.
+    pub origin: [f64; 3],
+    /// Whole voxels between the grid's lowest corner and the bounding box's.
+    pub shift: [f64; 3],
+}
+
+impl Grid {
+    /// The grid in which the longest side of the bounding box spans `fill · 2^bits` voxels and the box is centred.
+    ///
+    /// # Errors
+    /// If `bits` is not in 1..=21, `fill` not in (0, 1], or the box empty.
+    pub fn fit([low, high]: [[f64; 3]; 2], bits: u8, fill: f64) -> Result<Self> {
+        if !(1..=morton::MAX_DEPTH).contains(&bits) {
+            return Err(LabError::Usage(format!("bits is {bits}, expected 1 to 21")));
+        }
+        if !(fill > 0.0 && fill <= 1.0) {
+            return Err(LabError::Usage(format!(
+                "fill is {fill}, expected above 0 and at most 1"
+            )));
+        }
+        let extent: [f64; 3] = std::array::from_fn(|i| high[i] - low[i]);
+        let longest = extent.iter().copied().fold(0.0, f64::max);
+        if !(longest > 0.0 && longest.is_finite()) {
+            return Err(LabError::Usage("the mesh has no extent".into()));
+        }
+        let side = f64::from(1u32 << bits);
+        let unit = longest / (fill * side);
+        Ok(Grid {
+            bits,
+            unit,
+            origin: low,
+            shift: extent.map(|e| ((side - e / unit) / 2.0).floor()),
+        })
+    }
+
+    /// A grid whose units are the surface's own.
+    pub fn unit(bits: u8) -> Self {
+        Grid {
+            bits,
+            unit: 1.0,
+            origin: [0.0; 3],
+            shift: [0.0; 3],
+        }
+    }
+
+    /// Continuous voxel coordinates of a point.
+    pub fn coordinate(&self, p: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|i| (p[i] - self.origin[i]) / self.unit + self.shift[i])
+    }
+}
+
+/// A half-open box of voxels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct VoxelBox {
+    /// The lowest voxel.
+    pub low: [u32; 3],
+    /// One above the highest, per axis.
+    pub high: [u32; 3],
+}
+
+/// Voxels and their mean colours.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Sampled {
+    /// Morton keys, ascending.
+    pub keys: Vec<u64>,
+    /// 8-bit sRGB.
+    pub rgb: Vec<[u8; 3]>,
+}
+
+/// Draws points of a surface.
+#[derive(Debug)]
+pub struct Sampler<'a> {
+    surface: &'a Surface,
+    grid: Grid,
+    seed: u64,
+    faces: Vec<Face>,
+    /// `ends[i]` points belong to the triangles up to and with `faces[i]`.
+    ends: Vec<u64>,
+}
+
+/// Points drawn and sorted at a time: few enough for a fast cache.
+const CHUNK: u64 = 1 << 15;
+
+/// Voxel sums of a chunk. Colours have 8 fractional bits.
+#[derive(Debug, Clone, Copy)]
+struct Sum {
+    key: u64,
+    rgb: [u32; 3],
+    count: u32,
+}
+
+impl<'a> Sampler<'a> {
+    /// Shares `points` among the triangles.
+    ///
+    /// # Errors
+    /// If the surface has no area.
+    pub fn new(surface: &'a Surface, grid: Grid, points: u64, seed: u64) -> Result<Self> {
+        let faces: Vec<Face> = surface.faces().collect();
+        let areas: Vec<f64> = faces
+            .par_iter()
+            .map(|&face| {
+                let [a, b, c] = corners(surface, face);
+                (b - a).cross(c - a).length()
+            })
+            .collect();
+        let total: f64 = areas.iter().sum();
+        if !(total > 0.0 && total.is_finite()) {
+            return Err(LabError::Usage("the mesh has no area".into()));
+        }
+        let mut sum = 0.0;
+        let mut ends: Vec<u64> = areas
+            .iter()
+            .map(|area| {
+                sum += area;
+                ((points as f64 * (sum / total)) as u64).min(points)
+            })
+            .collect();
+        if let Some(last) = ends.last_mut() {
+            *last = points;
+        }
+        Ok(Sampler {
+            surface,
+            grid,
+            seed,
+            faces,
+            ends,
+        })
+    }
+
+    /// Where point `index` is, in continuous voxel coordinates.
+    pub fn point(&self, index: u64) -> [f64; 3] {
+        let face = self.faces[self.ends.partition_point(|&end| end <= index)];
+        let corners = corners(self.surface, face);
+        self.place(&corners, self.weights(index)).to_array()
+    }
+
+    /// All voxels that hold a visible point, or those in a box.
+    pub fn cloud(&self, only: Option<VoxelBox>) -> Sampled {
+        let mut sums: Vec<Sum> = self
+            .chunks(only)
+            .par_iter()
+            .flat_map_iter(|chunk| self.draw(chunk, only))
+            .collect();
+        sums.par_sort_unstable_by_key(|s| s.key);
+        let mut cloud = Sampled::default();
+        for group in sums.chunk_by(|a, b| a.key == b.key) {
+            let count: u64 = group.iter().map(|s| u64::from(s.count)).sum();
+            let mean = |i: usize| {
+                let sum: u64 = group.iter().map(|s| u64::from(s.rgb[i])).sum();
+                (sum as f64 / (256 * count) as f64).round_ties_even() as u8
+            };
+            cloud.keys.push(group[0].key);
+            cloud.rgb.push([mean(0), mean(1), mean(2)]);
+        }
+        cloud
+    }
+
+    /// Runs of points of at most [`CHUNK`], each on consecutive triangles: face index, first point, end.
+    fn chunks(&self, only: Option<VoxelBox>) -> Vec<Vec<(usize, u64, u64)>> {
+        let mut chunks = Vec::new();
+        let mut chunk = Vec::new();
+        let mut room = CHUNK;
+        let mut first = 0;
+        for (i, &end) in self.ends.iter().enumerate() {
+            if only.is_none_or(|b| self.may_touch(self.faces[i], b)) {
+                while first < end {
+                    let take = room.min(end - first);
+                    chunk.push((i, first, first + take));
+                    first += take;
+                    room -= take;
+                    if room == 0 {
+                        chunks.push(std::mem::take(&mut chunk));
+                        room = CHUNK;
+                    }
+                }
+            }
+            first = end;
+        }
+        chunks.push(chunk);
+        chunks
+    }
+
+    /// Whether a triangle's bounding box meets the box, with a voxel's margin for rounding.
+    fn may_touch(&self, face: Face, only: VoxelBox) -> bool {
+        let corners = corners(self.surface, face).map(|p| self.grid.coordinate(p.to_array()));
+        (0..3).all(|axis| {
+            let x = corners.map(|c| c[axis]);
+            let low = x.iter().copied().fold(f64::INFINITY, f64::min);
+            let high = x.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            high >= f64::from(only.low[axis]) - 1.0 && low <= f64::from(only.high[axis]) + 1.0
+        })
+    }
+
+    fn draw(&self, chunk: &[(usize, u64, u64)], only: Option<VoxelBox>) -> Vec<Sum> {
+        let side = 1u32 << self.grid.bits;
+        let mut sums = Vec::new();
+        for &(i, first, end) in chunk {
+            let face = self.faces[i];
+            let corners = corners(self.surface, face);
+            for index in first..end {
+                let weights = self.weights(index);
+                let place = self.place(&corners, weights).to_array();
+                // Saturates below 0, which rounding may reach.
+                let voxel = place.map(|x| (x as u32).min(side - 1));
+                let inside =
+                    |b: VoxelBox| (0..3).all(|a| (b.low[a]..b.high[a]).contains(&voxel[a]));
+                let weights = weights.map(|w| w as f32);
+                if !only.is_none_or(inside) || !self.surface.is_opaque(face, weights) {
+                    continue;
+                }
+                let colour = self.surface.colour(face, &[weights; 3]);
+                sums.push(Sum {
+                    key: morton::encode(voxel),
+                    rgb: colour.map(|c| (c.clamp(0.0, 255.0) * 256.0).round() as u32),
+                    count: 1,
+                });
+            }
+        }
+        sums.sort_unstable_by_key(|s| s.key);
+        sums.dedup_by(|next, sum| {
+            let same = next.key == sum.key;
+            if same {
+                sum.count += next.count;
+                for (a, b) in sum.rgb.iter_mut().zip(next.rgb) {
+                    *a += b;
+                }
+            }
+            same
+        });
+        sums
+    }
+
+    /// Barycentric coordinates of point `index`, uniform over the triangle.
+    fn weights(&self, index: u64) -> [f64; 3] {
+        let mut random = Random::at(self.seed, 2 * index);
+        let (r, s) = (random.unit().sqrt(), random.unit());
+        [1.0 - r, r * (1.0 - s), r * s]
+    }
+
+    fn place(&self, corners: &[glam::DVec3; 3], weights: [f64; 3]) -> glam::DVec3 {
+        let p = corners[0] * weights[0] + corners[1] * weights[1] + corners[2] * weights[2];
+        self.grid.coordinate(p.to_array()).into()
+    }
+}
+
+fn corners(surface: &Surface, face: Face) -> [glam::DVec3; 3] {
+    surface
+        .corners(face)
+        .map(|p| glam::Vec3::from(p).as_dvec3())
+}
+
+/// Writes a cloud as binary little-endian PLY: float x y z, uchar red green blue, and comments that map it back to the mesh.
+///
+/// # Errors
+/// If the file cannot be written; nothing is left behind then.
+pub fn write_ply(path: &Path, cloud: &Sampled, grid: &Grid) -> Result<()> {
+    let list = |x: [f64; 3]| format!("{:?} {:?} {:?}", x[0], x[1], x[2]);
+    let mut bytes = format!(
+        "ply\nformat binary_little_endian 1.0\ncomment bits {}\ncomment unit {:?}\ncomment origin {}\ncomment shift {}\n\
+         element vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
+        grid.bits,
+        grid.unit,
+        list(grid.origin),
+        list(grid.shift),
+        cloud.keys.len()
+    )
+    .into_bytes();
+    bytes.reserve(15 * cloud.keys.len());
+    for (&key, rgb) in cloud.keys.iter().zip(&cloud.rgb) {
+        for x in morton::decode(key) {
+            bytes.extend_from_slice(&(x as f32).to_le_bytes());
+        }
+        bytes.extend_from_slice(rgb);
+    }
+    write_bytes(path, &bytes)
+}
+
+/// Writes a file whole or not at all.
+pub(crate) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<()> {
+    b2p::output::write_file(path, |w| {
+        w.write_all(bytes).map_err(|source| b2p::Error::Io {
+            path: path.to_owned(),
+            source,
+        })
+    })?;
+    Ok(())
+}

@@ -1,0 +1,86 @@
+//! Photographs projected onto a surface along the three axes, blended by the normal.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::error::{LabError, Result};
+use crate::mesh::Texture;
+use crate::surface::Pyramid;
+
+/// A photograph laid over a surface.
+#[derive(Debug, Clone)]
+pub struct Photograph {
+    /// The picture.
+    pub pyramid: Arc<Pyramid>,
+    /// Height of one repetition in the surface's units.
+    pub period: f32,
+    /// Width of one repetition over its height.
+    pub aspect: f32,
+    /// Shift of the picture, in repetitions, per axis of projection.
+    pub offset: [[f32; 2]; 3],
+    /// Whether the surface's own texture darkens the photograph, as an occlusion map does.
+    pub shaded: bool,
+}
+
+impl Photograph {
+    /// Red, green and blue, 0 to 255, at a position (and its neighbours on the picture) with this normal.
+    pub fn colour(&self, at: [[f32; 3]; 3], normal: [f32; 3]) -> [f32; 3] {
+        // The fourth power keeps the zones where two projections blend, and blur each other, narrow.
+        let weight = normal.map(|n| n * n * n * n);
+        let total: f32 = weight.iter().sum();
+        let mut colour = [0.0; 3];
+        for (axis, weight) in weight.into_iter().enumerate() {
+            let w = weight / total;
+            // A weight this small changes no 8-bit value.
+            if w < 0.001 {
+                continue;
+            }
+            let [here, right, down] = at.map(|p| self.coordinates(axis, p));
+            let sample = self.pyramid.filtered(here, right, down);
+            for (sum, value) in colour.iter_mut().zip(sample) {
+                *sum += w * value;
+            }
+        }
+        colour.map(|c| c.clamp(0.0, 255.0))
+    }
+
+    fn coordinates(&self, axis: usize, [x, y, z]: [f32; 3]) -> [f32; 2] {
+        let (right, up) = match axis {
+            0 => (z, y),
+            1 => (x, z),
+            _ => (x, y),
+        };
+        [
+            right / (self.period * self.aspect) + self.offset[axis][0],
+            self.offset[axis][1] - up / self.period,
+        ]
+    }
+}
+
+/// Reads all photographs (JPEG, PNG) of a folder, in the order of their names.
+///
+/// # Errors
+/// If the folder or a picture cannot be read.
+pub fn load_folder(folder: &Path) -> Result<Vec<(Arc<Pyramid>, f32)>> {
+    let mut paths = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(LabError::io(folder))? {
+        let path: PathBuf = entry.map_err(LabError::io(folder))?.path();
+        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
+        if ["jpg", "jpeg", "png"].contains(&extension) {
+            paths.push(path);
+        }
+    }
+    paths.sort();
+    paths
+        .iter()
+        .map(|path| {
+            let picture = image::open(path).map_err(|source| LabError::Picture {
+                path: path.clone(),
+                source,
+            })?;
+            let texture = Texture::from(picture);
+            let aspect = texture.width as f32 / texture.height as f32;
+            Ok((Arc::new(Pyramid::new(&texture)), aspect))
+        })
+        .collect()
+}
