@@ -17,6 +17,9 @@ pub struct Args {
     /// The folder to write samples to
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
+    /// Add meshes of the project's own making; another seed makes others
+    #[arg(long)]
+    procedural: bool,
     /// A folder of photographs to project onto some of the objects
     #[arg(long, value_name = "DIR")]
     textures: Option<PathBuf>,
@@ -46,7 +49,10 @@ impl Args {
     /// # Errors
     /// If a mesh or photograph cannot be read, or a sample cannot be written.
     pub fn run(self) -> Result<()> {
-        let objects = Object::load_all(&self.inputs)?;
+        let mut objects = Object::load_all(&self.inputs)?;
+        if self.procedural {
+            objects.extend(Object::procedural(self.seed));
+        }
         let photos = match &self.textures {
             Some(folder) => triplanar::load_folder(folder)?,
             None => Vec::new(),

@@ -3,9 +3,13 @@
 pub mod dataset;
 pub mod voxelize;
 
+use std::path::Path;
+
 use clap::{Parser, Subcommand};
 
-use crate::error::Result;
+use crate::error::{LabError, Result};
+use crate::mesh::{Mesh, glb};
+use crate::procedural;
 
 /// The laboratory of b2p: mesh to cloud, training sets, evaluation.
 #[derive(Debug, Parser)]
@@ -31,5 +35,14 @@ impl Cli {
             Command::Voxelize(args) => args.run(),
             Command::Dataset(args) => args.run(),
         }
+    }
+}
+
+/// The mesh of a `.glb` file, or the one that `procedural:NAME` names.
+fn load_mesh(path: &Path) -> Result<Mesh> {
+    match path.to_str() {
+        Some(name) if name.starts_with(procedural::PREFIX) => procedural::named(name)
+            .ok_or_else(|| LabError::Usage(format!("there is no mesh called {name}"))),
+        _ => glb::load(path),
     }
 }

@@ -3,14 +3,13 @@
 use std::path::PathBuf;
 
 use crate::error::Result;
-use crate::mesh::glb;
 use crate::sample::{Grid, Sampler, write_ply};
 use crate::surface::Surface;
 
 /// Sample a textured mesh into a voxelised coloured cloud (PLY)
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The mesh: self-contained binary glTF
+    /// The mesh: self-contained binary glTF, or procedural:NAME
     mesh: PathBuf,
     /// The cloud to write
     #[arg(short, long, value_name = "CLOUD.ply")]
@@ -35,7 +34,7 @@ impl Args {
     /// # Errors
     /// If the mesh cannot be read or has no area, or the cloud cannot be written.
     pub fn run(self) -> Result<()> {
-        let surface = Surface::new(&glb::load(&self.mesh)?);
+        let surface = Surface::new(&super::load_mesh(&self.mesh)?);
         let grid = Grid::fit(surface.bounds(), self.bits, self.fill)?;
         let cloud = Sampler::new(&surface, grid, self.points, self.seed)?.cloud(None);
         write_ply(&self.output, &cloud, &grid)?;

@@ -30,6 +30,7 @@ pub use variant::Kind;
 
 use crate::error::{LabError, Result};
 use crate::mesh::{Mesh, glb};
+use crate::procedural;
 use crate::random::Random;
 use crate::raster::{self, Clip};
 use crate::sample::{Grid, Sampler, VoxelBox, write_bytes};
@@ -74,7 +75,7 @@ impl Object {
     /// Reads mesh files, and all `.glb` files of folders, in the order of their paths.
     ///
     /// # Errors
-    /// If a file or folder cannot be read, or there is none.
+    /// If a file or folder cannot be read.
     pub fn load_all(inputs: &[PathBuf]) -> Result<Vec<Self>> {
         let mut paths = Vec::new();
         for input in inputs {
@@ -91,6 +92,14 @@ impl Object {
         }
         paths.sort();
         paths.par_iter().map(|path| Object::load(path)).collect()
+    }
+
+    /// Objects of the project's own making.
+    pub fn procedural(seed: u64) -> Vec<Self> {
+        procedural::objects(seed)
+            .into_par_iter()
+            .map(|(name, mesh)| Object::new(format!("procedural_{name}"), &mesh))
+            .collect()
     }
 
     fn load(path: &Path) -> Result<Self> {
