@@ -11,6 +11,7 @@
 //! A stage imports only from the stages to its left, the `b2p-kernels` crate, and the commons ([`error`], [`limits`], [`placement`]).
 #![forbid(unsafe_code)]
 
+pub mod bitstream;
 pub mod cloud;
 pub mod entropy;
 pub mod error;

@@ -1,0 +1,263 @@
+//! A stream taken apart: its header, and its whole levels.
+
+use super::chunk::{Chunk, ChunkKind, Chunks};
+use super::header::Header;
+use super::reader::Reader;
+use crate::error::{Error, Result, Stage};
+use crate::limits::Limits;
+
+/// A stream whose header is sound, with the levels that are whole.
+///
+/// A level is whole if all chunks of it and of the levels before are there, in order, with the right checksums and possible voxel
+/// counts. Whether their payloads decode is for the stages that read them.
+#[derive(Debug)]
+pub struct Stream<'a> {
+    header: Header,
+    levels: Vec<Level<'a>>,
+    damage: Option<Error>,
+}
+
+/// A whole level.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Level<'a> {
+    /// Its number.
+    pub level: u8,
+    /// How many voxels it has.
+    pub voxels: u32,
+    /// The octree from the level before to this one; in the base level from level 0, one entry per level.
+    pub geometry: Vec<Geometry<'a>>,
+    /// The latents, one entry per slice.
+    pub features: Vec<Slice<'a>>,
+    /// XXH3-64 of the latents.
+    pub latent_hash: u64,
+}
+
+/// The octree of one level, given the level before.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Geometry<'a> {
+    /// The level.
+    pub level: u8,
+    /// One entry for every slice of parents; counts are those of their children.
+    pub slices: Vec<Slice<'a>>,
+}
+
+/// An independently coded part of a level.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Slice<'a> {
+    /// How many voxels it describes.
+    pub voxels: u32,
+    /// Its code.
+    pub bytes: &'a [u8],
+    /// Byte offset of `bytes` in the stream.
+    pub offset: usize,
+}
+
+impl<'a> Stream<'a> {
+    /// Takes a stream, or a prefix of one, apart. Reserves no more than a small multiple of the bytes given.
+    ///
+    /// # Errors
+    /// Those of [`Header::parse`]. Anything wrong later is [`Stream::damage`], and leaves the whole levels before it usable.
+    pub fn parse(bytes: &'a [u8], limits: &Limits) -> Result<Self> {
+        let header = Header::parse(bytes, limits)?;
+        let mut levels = Vec::new();
+        let damage = take_levels(bytes, &header, &mut levels).err();
+        Ok(Stream {
+            header,
+            levels,
+            damage,
+        })
+    }
+
+    /// The header.
+    pub fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// The whole levels, from the base level on.
+    pub fn levels(&self) -> &[Level<'a>] {
+        &self.levels
+    }
+
+    /// The deepest whole level.
+    pub fn deepest(&self) -> Option<u8> {
+        self.levels.last().map(|level| level.level)
+    }
+
+    /// What is wrong with the first level that is not whole, or with what follows the last one.
+    pub fn damage(&self) -> Option<&Error> {
+        self.damage.as_ref()
+    }
+
+    /// The stream, if `level` is whole.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the header tells of no such level, else the damage.
+    pub fn require(self, level: u8) -> Result<Self> {
+        let index = self.header.index(level)?;
+        match self.damage {
+            Some(damage) if self.levels.len() <= index => Err(damage),
+            _ => Ok(self),
+        }
+    }
+}
+
+impl Level<'_> {
+    /// Fails with [`Error::DeterminismMismatch`] unless decoded latents with the hash `found` are those that were coded.
+    pub fn check_latents(&self, found: u64) -> Result<()> {
+        if found == self.latent_hash {
+            return Ok(());
+        }
+        Err(Error::DeterminismMismatch {
+            level: self.level,
+            expected: self.latent_hash,
+            found,
+        })
+    }
+}
+
+/// Fills `levels` until the first fault.
+fn take_levels<'a>(bytes: &'a [u8], header: &Header, levels: &mut Vec<Level<'a>>) -> Result<()> {
+    let mut at = header.bytes();
+    let mut parents = 1;
+    for (level, (&voxels, section)) in
+        (header.base..).zip(header.voxels.iter().zip(&header.sections))
+    {
+        let mut chunks = take_section(bytes, &mut at, section.geometry, "geometry section")?;
+        let mut geometry = Vec::new();
+        let first = if level == header.base { 1 } else { level };
+        for level in first..=level {
+            let slices = take_geometry(&mut chunks, header.slice_voxels, level, parents, voxels)?;
+            parents = slices.iter().map(|s| u64::from(s.voxels)).sum();
+            geometry.push(Geometry { level, slices });
+        }
+        if parents != u64::from(voxels) {
+            let field = format!("voxel count of level {level}");
+            return Err(malformed(
+                at,
+                field,
+                parents,
+                format!("{voxels}, as the header tells"),
+            ));
+        }
+        chunks.finish()?;
+
+        let mut chunks = take_section(bytes, &mut at, section.features, "feature section")?;
+        let (features, latent_hash) =
+            take_features(&mut chunks, header.slice_voxels, level, voxels)?;
+        chunks.finish()?;
+        levels.push(Level {
+            level,
+            voxels,
+            geometry,
+            features,
+            latent_hash,
+        });
+    }
+    match bytes.len() - at {
+        0 => Ok(()),
+        rest => Err(malformed(
+            at,
+            "length of what follows the last section",
+            rest,
+            0,
+        )),
+    }
+}
+
+fn take_section<'a>(
+    bytes: &'a [u8],
+    at: &mut usize,
+    length: u32,
+    field: &'static str,
+) -> Result<Chunks<'a>> {
+    let start = *at;
+    Reader::new(bytes, start).take(length as usize, field)?;
+    *at += length as usize;
+    Ok(Chunks::new(bytes, start..*at))
+}
+
+/// The geometry of a level whose parents are known; no level has more voxels than the `most` of the one that ends the section.
+fn take_geometry<'a>(
+    chunks: &mut Chunks<'a>,
+    slice_voxels: u32,
+    level: u8,
+    parents: u64,
+    most: u32,
+) -> Result<Vec<Slice<'a>>> {
+    let mut slices = Vec::new();
+    let mut total = 0;
+    // Ends with the section's chunks, however many parents are claimed.
+    for (slice, parents) in sliced(parents, slice_voxels) {
+        let counts = parents..=8 * parents;
+        let chunk = chunks.expect(ChunkKind::Geometry, level, slice, counts)?;
+        total += u64::from(chunk.count);
+        if total > u64::from(most) {
+            let field = format!("voxel count of level {level}");
+            let expected = format!("at most {most}, as the header tells");
+            return Err(malformed(chunk.offset, field, total, expected));
+        }
+        slices.push(Slice::of(&chunk, 0));
+    }
+    Ok(slices)
+}
+
+fn take_features<'a>(
+    chunks: &mut Chunks<'a>,
+    slice_voxels: u32,
+    level: u8,
+    voxels: u32,
+) -> Result<(Vec<Slice<'a>>, u64)> {
+    let mut slices = Vec::new();
+    let mut latent_hash = 0;
+    for (slice, count) in sliced(voxels.into(), slice_voxels) {
+        let chunk = chunks.expect(ChunkKind::Features, level, slice, count..=count)?;
+        let mut hash_bytes = 0;
+        if slice == 0 {
+            let mut reader = Reader::new(chunk.payload, 0);
+            let Ok(hash) = reader.u64("latent hash") else {
+                let field = "length of a level's first feature chunk";
+                return Err(malformed(
+                    chunk.offset,
+                    field,
+                    chunk.payload.len(),
+                    "8 or more",
+                ));
+            };
+            latent_hash = hash;
+            hash_bytes = reader.at();
+        }
+        slices.push(Slice::of(&chunk, hash_bytes));
+    }
+    Ok((slices, latent_hash))
+}
+
+impl<'a> Slice<'a> {
+    fn of(chunk: &Chunk<'a>, skip: usize) -> Self {
+        Slice {
+            voxels: chunk.count,
+            bytes: &chunk.payload[skip..],
+            offset: chunk.offset + super::chunk::CHUNK_HEADER + skip,
+        }
+    }
+}
+
+/// Numbers of the slices that `voxels` fill, and how many voxels each has.
+pub(super) fn sliced(voxels: u64, slice_voxels: u32) -> impl Iterator<Item = (u64, u64)> {
+    let size = u64::from(slice_voxels);
+    (0..voxels.div_ceil(size)).map(move |i| (i, size.min(voxels - i * size)))
+}
+
+fn malformed(
+    offset: usize,
+    field: impl ToString,
+    value: impl ToString,
+    expected: impl ToString,
+) -> Error {
+    Error::malformed(
+        Stage::Bitstream,
+        format!("byte {offset}"),
+        field,
+        value,
+        expected,
+    )
+}

@@ -1,0 +1,140 @@
+//! Streams out.
+
+use super::chunk::{Chunk, ChunkKind};
+use super::header::{Header, Section};
+use super::stream::{Stream, sliced};
+use crate::error::{Error, Result};
+use crate::limits::Limits;
+
+/// Puts a stream together, level by level.
+#[derive(Debug)]
+pub struct Writer {
+    header: Header,
+    body: Vec<u8>,
+}
+
+/// What may be written is for the format to say, what may be read for the reader.
+const UNLIMITED: Limits = Limits {
+    max_points: u64::MAX,
+    max_depth: u8::MAX,
+    max_pixels: u64::MAX,
+    max_bytes: u64::MAX,
+};
+
+impl Writer {
+    /// Starts a stream. The header's `sections` need not be right: the writer fills them in.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if the format forbids the header.
+    pub fn new(mut header: Header) -> Result<Self> {
+        header.sections = vec![Section::default(); header.voxels.len()];
+        header.check(&UNLIMITED)?;
+        Ok(Writer {
+            header,
+            body: Vec::new(),
+        })
+    }
+
+    /// Adds the geometry of `level`: for every slice of its parents the number of their children, and the code.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the stream has no such level or the code is too long.
+    pub fn geometry(&mut self, level: u8, slices: &[(u32, impl AsRef<[u8]>)]) -> Result<()> {
+        let section = self.header.index(level.max(self.header.base))?;
+        let start = self.body.len();
+        for (slice, (count, bytes)) in slices.iter().enumerate() {
+            self.chunk(
+                ChunkKind::Geometry,
+                level,
+                slice,
+                *count,
+                &[],
+                bytes.as_ref(),
+            )?;
+        }
+        let length = &mut self.header.sections[section].geometry;
+        *length = extended(*length, self.body.len() - start)?;
+        Ok(())
+    }
+
+    /// Adds the features of `level`: the hash of its latents, and for every slice of its voxels the code.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the stream has no such level, the slices are more or fewer than its voxels fill, or the code is too long.
+    pub fn features(
+        &mut self,
+        level: u8,
+        latent_hash: u64,
+        slices: &[impl AsRef<[u8]>],
+    ) -> Result<()> {
+        let section = self.header.index(level)?;
+        let voxels = self.header.voxels[section].into();
+        let counts: Vec<u64> = sliced(voxels, self.header.slice_voxels)
+            .map(|(_, count)| count)
+            .collect();
+        if counts.len() != slices.len() {
+            return Err(Error::Usage(format!(
+                "{voxels} voxels fill {} slices, not {}",
+                counts.len(),
+                slices.len()
+            )));
+        }
+        let start = self.body.len();
+        for (slice, (&count, bytes)) in counts.iter().zip(slices).enumerate() {
+            let hash = latent_hash.to_le_bytes();
+            let prefix = if slice == 0 { &hash[..] } else { &[] };
+            let count = count as u32;
+            self.chunk(
+                ChunkKind::Features,
+                level,
+                slice,
+                count,
+                prefix,
+                bytes.as_ref(),
+            )?;
+        }
+        let length = &mut self.header.sections[section].features;
+        *length = extended(*length, self.body.len() - start)?;
+        Ok(())
+    }
+
+    /// The stream, read once to see that every level is whole.
+    ///
+    /// # Errors
+    /// What the reader finds wrong: levels missing, out of order, or with other voxel counts than the header's.
+    pub fn finish(self) -> Result<Vec<u8>> {
+        let mut bytes = self.header.write();
+        bytes.extend(self.body);
+        let stream = Stream::parse(&bytes, &UNLIMITED)?;
+        stream.require(self.header.top)?;
+        Ok(bytes)
+    }
+
+    fn chunk(
+        &mut self,
+        kind: ChunkKind,
+        level: u8,
+        slice: usize,
+        count: u32,
+        prefix: &[u8],
+        payload: &[u8],
+    ) -> Result<()> {
+        let chunk = Chunk {
+            kind,
+            level,
+            slice: u16::try_from(slice)
+                .map_err(|_| Error::Usage(format!("level {level} has more than 65536 slices")))?,
+            count,
+            payload,
+            offset: 0,
+        };
+        chunk.write(prefix, &mut self.body)
+    }
+}
+
+fn extended(length: u32, by: usize) -> Result<u32> {
+    u32::try_from(by)
+        .ok()
+        .and_then(|by| length.checked_add(by))
+        .ok_or_else(|| Error::Usage("a section cannot hold 4 GiB".into()))
+}
