@@ -1,7 +1,8 @@
 //! Chunks: typed, numbered, checked pieces of a section.
 
+use super::malformed;
 use super::reader::Reader;
-use crate::error::{Error, Result, Stage};
+use crate::error::{Error, Result};
 
 /// Bytes of a chunk before its payload.
 pub(super) const CHUNK_HEADER: usize = 16;
@@ -156,10 +157,9 @@ impl<'a> Chunks<'a> {
     ) -> Result<Chunk<'a>> {
         let wanted = format!("{kind} chunk of level {level}, slice {slice}");
         let Some(chunk) = self.next_critical()? else {
-            let at = format!("byte {}", self.end);
-            return Err(malformed(at, "end of the section", "here", wanted));
+            return Err(malformed(self.end, "end of the section", "here", wanted));
         };
-        let at = format!("byte {}", chunk.offset);
+        let at = chunk.offset;
         if chunk.kind != kind || chunk.level != level || u64::from(chunk.slice) != slice {
             let found = format!(
                 "{} of level {}, slice {}",
@@ -180,10 +180,9 @@ impl<'a> Chunks<'a> {
         match self.next_critical()? {
             None => Ok(()),
             Some(chunk) => {
-                let at = format!("byte {}", chunk.offset);
                 let found = format!("a {} chunk", chunk.kind);
                 Err(malformed(
-                    at,
+                    chunk.offset,
                     "chunk after the section's last",
                     found,
                     "none",
@@ -217,13 +216,4 @@ impl<'a> Iterator for Chunks<'a> {
         }
         Some(chunk)
     }
-}
-
-fn malformed(
-    at: impl ToString,
-    field: impl ToString,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
-    Error::malformed(Stage::Bitstream, at, field, value, expected)
 }

@@ -1,7 +1,8 @@
 //! The header: everything a reader must know before it reserves memory.
 
+use super::malformed;
 use super::reader::Reader;
-use crate::error::{Error, Result, Stage};
+use crate::error::{Error, Result};
 use crate::geometry::morton::MAX_DEPTH;
 use crate::limits::Limits;
 use crate::placement::Placement;
@@ -278,19 +279,4 @@ fn check_levels(base: u8, top: u8) -> Result<()> {
         ));
     }
     Ok(())
-}
-
-fn malformed(
-    offset: usize,
-    field: impl ToString,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
-    Error::malformed(
-        Stage::Bitstream,
-        format!("byte {offset}"),
-        field,
-        value,
-        expected,
-    )
 }

@@ -57,5 +57,23 @@ pub use reader::Reader;
 pub use stream::{Geometry, Level, Slice, Stream};
 pub use writer::Writer;
 
+use crate::error::{Error, Stage};
+
+/// Something at byte `offset` that breaks the format.
+fn malformed(
+    offset: usize,
+    field: impl ToString,
+    value: impl ToString,
+    expected: impl ToString,
+) -> Error {
+    Error::malformed(
+        Stage::Bitstream,
+        format!("byte {offset}"),
+        field,
+        value,
+        expected,
+    )
+}
+
 #[cfg(test)]
 mod tests;

@@ -2,8 +2,9 @@
 
 use super::chunk::{Chunk, ChunkKind, Chunks};
 use super::header::Header;
+use super::malformed;
 use super::reader::Reader;
-use crate::error::{Error, Result, Stage};
+use crate::error::{Error, Result};
 use crate::limits::Limits;
 
 /// A stream whose header is sound, with the levels that are whole.
@@ -245,19 +246,4 @@ impl<'a> Slice<'a> {
 pub(super) fn sliced(voxels: u64, slice_voxels: u32) -> impl Iterator<Item = (u64, u64)> {
     let size = u64::from(slice_voxels);
     (0..voxels.div_ceil(size)).map(move |i| (i, size.min(voxels - i * size)))
-}
-
-fn malformed(
-    offset: usize,
-    field: impl ToString,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
-    Error::malformed(
-        Stage::Bitstream,
-        format!("byte {offset}"),
-        field,
-        value,
-        expected,
-    )
 }

@@ -241,7 +241,8 @@ fn limits_hold_before_anything_is_reserved() {
 
 #[test]
 fn a_header_that_the_format_forbids_is_neither_written_nor_read() {
-    let forbidden: [(usize, u8, fn(&mut Header)); 9] = [
+    type Change = fn(&mut Header);
+    let forbidden: [(usize, u8, Change); 9] = [
         (20, 4, |h| h.bits = 4),
         (20, 22, |h| h.bits = 22),
         (21, 1, |h| h.base = 1),

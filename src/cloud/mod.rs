@@ -10,3 +10,15 @@ mod write;
 
 pub use points::{Hints, PointCloud};
 pub use voxelise::{ColouredVoxels, voxelise};
+
+use crate::error::{Error, Stage};
+
+/// Something in a file or among its points that is no cloud.
+fn malformed(
+    at: impl ToString,
+    field: impl ToString,
+    value: impl ToString,
+    expected: impl ToString,
+) -> Error {
+    Error::malformed(Stage::Cloud, at, field, value, expected)
+}

@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use super::malformed;
 use super::ply::{Column, Ply, Scalar, Values};
-use crate::error::{Error, Result, Stage};
+use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::placement::Placement;
 
@@ -168,15 +169,6 @@ fn number(word: &str) -> Option<f64> {
         .strip_prefix("np.float64(")
         .and_then(|w| w.strip_suffix(')'));
     bare.unwrap_or(word).parse().ok()
-}
-
-fn malformed(
-    at: impl ToString,
-    field: impl ToString,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
-    Error::malformed(Stage::Cloud, at, field, value, expected)
 }
 
 #[cfg(test)]

@@ -2,11 +2,13 @@
 
 use rayon::prelude::*;
 
-use super::{Hints, PointCloud};
-use crate::error::{Error, Result, Stage};
+use super::{Hints, PointCloud, malformed};
+use crate::error::{Error, Result};
 use crate::geometry::{Voxels, morton};
 use crate::placement::Placement;
 
+/// Where errors say they are: a cloud in memory has no lines.
+const POINTS: &str = "the points";
 /// The bit depth of a cloud that does not say, and is told, no other.
 const DEFAULT_BITS: u8 = 10;
 
@@ -71,6 +73,7 @@ pub fn voxelise(cloud: &PointCloud, bits: Option<u8>) -> Result<ColouredVoxels> 
     if !placement.is_valid() {
         let extent = format!("{low:?} to {high:?}");
         return Err(malformed(
+            POINTS,
             "bounding box",
             extent,
             "a size that numbers can express",
@@ -128,14 +131,14 @@ impl ColouredVoxels {
 
 fn bounds(positions: &[[f64; 3]]) -> Result<([f64; 3], [f64; 3])> {
     if positions.is_empty() {
-        return Err(malformed("number of points", 0, "at least one"));
+        return Err(malformed(POINTS, "number of points", 0, "at least one"));
     }
     let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
     for (row, position) in positions.iter().enumerate() {
         for axis in 0..3 {
             if !position[axis].is_finite() {
                 let field = format!("coordinate of point {row}");
-                return Err(malformed(field, position[axis], "a finite number"));
+                return Err(malformed(POINTS, field, position[axis], "a finite number"));
             }
             low[axis] = low[axis].min(position[axis]);
             high[axis] = high[axis].max(position[axis]);
@@ -178,10 +181,6 @@ fn mean(points: &[(u64, [u8; 3])]) -> [u8; 3] {
         let sum: u64 = points.iter().map(|(_, c)| u64::from(c[channel])).sum();
         ((sum + count / 2) / count) as u8
     })
-}
-
-fn malformed(field: impl ToString, value: impl ToString, expected: impl ToString) -> Error {
-    Error::malformed(Stage::Cloud, "the points", field, value, expected)
 }
 
 #[cfg(test)]

@@ -1,7 +1,8 @@
 //! Rows of an ASCII file: one a line, blank lines passed over.
 
-use super::header::{Element, Header, Kind, Scalar, malformed, shown};
+use super::header::{Element, Header, Kind, Scalar, shown};
 use super::{Column, truncated};
+use crate::cloud::malformed;
 use crate::error::Result;
 
 struct Lines<'a> {

@@ -1,7 +1,8 @@
 //! Rows of a binary file.
 
-use super::header::{Element, Kind, Scalar, malformed};
+use super::header::{Element, Kind, Scalar};
 use super::{Column, Values, truncated};
+use crate::cloud::malformed;
 use crate::error::Result;
 
 struct Cursor<'a> {

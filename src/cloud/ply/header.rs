@@ -1,6 +1,7 @@
 //! The header: what the file declares.
 
-use crate::error::{Error, Result, Stage};
+use crate::cloud::malformed;
+use crate::error::{Error, Result};
 
 /// How the rows are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -272,15 +273,6 @@ fn property_kind(words: &[&str]) -> Option<Kind> {
         }
         _ => None,
     }
-}
-
-pub(super) fn malformed(
-    at: impl ToString,
-    field: impl ToString,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
-    Error::malformed(Stage::Cloud, at, field, value, expected)
 }
 
 /// Something that the header should declare and does not.
