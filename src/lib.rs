@@ -19,7 +19,10 @@ pub mod gaussians;
 pub mod geometry;
 pub mod limits;
 pub mod output;
+pub mod pixels;
 pub mod placement;
+pub mod projection;
+pub mod tiles;
 
 pub use error::{Error, Result};
 pub use limits::Limits;

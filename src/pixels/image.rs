@@ -1,0 +1,189 @@
+//! Pictures.
+
+use rayon::prelude::*;
+use tiny_skia::{IntSize, Pixmap};
+
+use crate::error::{Error, Result};
+
+/// A picture in floats: premultiplied red, green, blue, and alpha, row by row from the top left.
+///
+/// The colours are display-referred (sRGB) values, blended as they are; they may lie outside `[0, 1]` if Gaussians' colours do.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Image {
+    /// Pixels in a row, at least 1.
+    pub width: u32,
+    /// Rows, at least 1.
+    pub height: u32,
+    /// `width·height` pixels.
+    pub pixels: Vec<[f32; 4]>,
+}
+
+impl Image {
+    /// The pixel in column `x` and row `y`.
+    ///
+    /// # Panics
+    /// If there is none.
+    pub fn pixel(&self, x: u32, y: u32) -> [f32; 4] {
+        assert!(x < self.width, "column {x} of {}", self.width);
+        self.pixels[y as usize * self.width as usize + x as usize]
+    }
+
+    /// Half the size: each pixel is the mean of 2×2. A last odd column or row is the mean of the pixels that there are.
+    pub fn box_half(&self) -> Image {
+        let mut half = Image {
+            width: self.width.div_ceil(2),
+            height: self.height.div_ceil(2),
+            pixels: Vec::new(),
+        };
+        half.pixels = quarters(self.width, self.height)
+            .map(|from| {
+                let from = from.map(|i| self.pixels[i]);
+                std::array::from_fn(|k| {
+                    0.25 * ((from[0][k] + from[1][k]) + (from[2][k] + from[3][k]))
+                })
+            })
+            .collect();
+        half
+    }
+
+    /// Eight bits a channel, premultiplied: clamped (alpha to `[0, 1]`, colours to `[0, alpha]`), then rounded to the nearest.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if a side is 0 or a row longer than 2²⁹ pixels; never for a picture of a [`Renderer`](super::Renderer).
+    pub fn to_pixmap(&self) -> Result<Pixmap> {
+        let mut bytes = vec![0; self.pixels.len() * 4];
+        bytes
+            .par_chunks_exact_mut(4)
+            .zip(self.pixels.par_iter())
+            .with_min_len(1 << 14)
+            .for_each(|(bytes, &[r, g, b, alpha])| {
+                let alpha = alpha.clamp(0.0, 1.0);
+                for (byte, value) in bytes.iter_mut().zip([r, g, b, alpha]) {
+                    *byte = (value.clamp(0.0, alpha) * 255.0 + 0.5) as u8;
+                }
+            });
+        pixmap(bytes, self.width, self.height)
+    }
+
+    /// A PNG file of eight bits a channel, with straight alpha.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if the picture is too large for the format.
+    pub fn to_png(&self) -> Result<Vec<u8>> {
+        self.to_pixmap()?.encode_png().map_err(|e| {
+            let size = format!("{}×{}: {e}", self.width, self.height);
+            unsupported(size)
+        })
+    }
+}
+
+/// [`Image::box_half`] of eight-bit pixels: means rounded to the nearest, halves up.
+///
+/// # Errors
+/// [`Error::Unsupported`] never for a pixmap of an [`Image`].
+pub fn box_half(pixmap: &Pixmap) -> Result<Pixmap> {
+    let (width, height) = (pixmap.width(), pixmap.height());
+    let data = pixmap.data();
+    let bytes = quarters(width, height)
+        .flat_map(|from| -> [u8; 4] {
+            std::array::from_fn(|k| {
+                let sum: u16 = from.iter().map(|i| u16::from(data[4 * i + k])).sum();
+                ((sum + 2) / 4) as u8
+            })
+        })
+        .collect();
+    self::pixmap(bytes, width.div_ceil(2), height.div_ceil(2))
+}
+
+/// For every pixel of a picture of half the size, the four that it is the mean of; at an odd edge they repeat.
+fn quarters(width: u32, height: u32) -> impl Iterator<Item = [usize; 4]> {
+    let (width, height) = (width as usize, height as usize);
+    (0..height).step_by(2).flat_map(move |y| {
+        let rows = [y * width, (y + 1).min(height - 1) * width];
+        (0..width).step_by(2).map(move |x| {
+            let next = (x + 1).min(width - 1);
+            [rows[0] + x, rows[0] + next, rows[1] + x, rows[1] + next]
+        })
+    })
+}
+
+fn pixmap(bytes: Vec<u8>, width: u32, height: u32) -> Result<Pixmap> {
+    IntSize::from_wh(width, height)
+        .and_then(|size| Pixmap::from_vec(bytes, size))
+        .ok_or_else(|| unsupported(format!("{width}×{height}")))
+}
+
+fn unsupported(detail: String) -> Error {
+    Error::Unsupported {
+        what: "an eight-bit picture of this size",
+        detail,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(width: u32, height: u32, pixel: impl Fn(u32, u32) -> [f32; 4]) -> Image {
+        let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+        let pixels = pixels.map(|(x, y)| pixel(x, y)).collect();
+        Image {
+            width,
+            height,
+            pixels,
+        }
+    }
+
+    #[test]
+    fn values_are_clamped_and_rounded_to_the_nearest() {
+        let image = image(2, 1, |x, _| match x {
+            0 => [100.49 / 255.0, 100.51 / 255.0, -3.0, 1.0],
+            _ => [f32::NAN, 1e30, 0.5, 0.4],
+        });
+        let pixmap = image.to_pixmap().unwrap();
+        assert_eq!(pixmap.data(), [100, 101, 0, 255, 0, 102, 102, 102]);
+    }
+
+    #[test]
+    fn a_png_has_straight_alpha() {
+        let image = image(3, 1, |x, _| match x {
+            0 => [0.5, 0.25, 0.0, 0.5],
+            1 => [0.0; 4],
+            _ => [1.0, 0.5, 0.0, 1.0],
+        });
+        let png = image.to_png().unwrap();
+        let straight = Pixmap::decode_png(&png).unwrap().take_demultiplied();
+        assert_eq!(straight, [255, 128, 0, 128, 0, 0, 0, 0, 255, 128, 0, 255]);
+    }
+
+    #[test]
+    fn halving_averages_two_by_two_and_keeps_odd_edges() {
+        let image = image(3, 3, |x, y| [x as f32, y as f32, (x * y) as f32, 1.0]);
+        let half = image.box_half();
+        assert_eq!((half.width, half.height), (2, 2));
+        let expected = [
+            [0.5, 0.5, 0.25, 1.0],
+            [2.0, 0.5, 1.0, 1.0],
+            [0.5, 2.0, 1.0, 1.0],
+            [2.0, 2.0, 4.0, 1.0],
+        ];
+        assert_eq!(half.pixels, expected);
+    }
+
+    #[test]
+    fn halving_eight_bits_rounds_to_the_nearest() {
+        let image = image(4, 2, |x, y| {
+            let ink = if x < 2 { x + y > 1 } else { x + y > 2 };
+            [f32::from(ink); 4]
+        });
+        let half = box_half(&image.to_pixmap().unwrap()).unwrap();
+        // One of four: 63.75. Three of four … (2,0) is blank: 191.25.
+        assert_eq!(half.data(), [64, 64, 64, 64, 191, 191, 191, 191]);
+    }
+
+    #[test]
+    fn a_picture_of_one_pixel_can_be_halved() {
+        let image = image(1, 1, |_, _| [0.25, 0.5, 0.75, 1.0]);
+        assert_eq!(image.box_half(), image);
+    }
+}

@@ -1,0 +1,72 @@
+//! Against the reference.
+
+use super::*;
+
+#[test]
+fn random_scenes_are_close_to_the_reference() {
+    for seed in 0..6 {
+        let scene = scene(random_splats(seed, 150));
+        assert_close(&scene, &orbit(75, 50));
+    }
+}
+
+#[test]
+fn with_the_same_cut_offs_only_rounding_is_left() {
+    let mut worst = 0.0f32;
+    for seed in 0..6 {
+        let scene = scene(random_splats(seed, 600));
+        let camera = orbit(75, 50);
+        let drawn = draw(&scene, &camera);
+        let exact = reference::render(&scene, &camera, Background::WHITE, Cutoffs::RENDERER);
+        let (largest, psnr) = difference(&drawn, &exact);
+        worst = worst.max(largest);
+        // An α within rounding of 1/255 may be skipped by one and not by the other.
+        assert!(
+            largest <= 1.1 / 255.0 && psnr >= 90.0,
+            "{:.5}/255, {psnr:.1} dB",
+            largest * 255.0
+        );
+    }
+    assert!(worst > 0.0);
+}
+
+/// The floor of α is part of how a splat is defined, and it costs: where many faint tails overlap, as beside a silhouette, each is
+/// skipped.
+#[test]
+fn the_cut_offs_themselves_cost_a_bounded_difference() {
+    let camera = orbit(75, 50);
+    let cost = |scene: &Gaussians| {
+        let drawn = draw(scene, &camera);
+        let exact = reference::render(scene, &camera, Background::WHITE, Cutoffs::NONE);
+        difference(&drawn, &exact)
+    };
+    for seed in 0..6 {
+        let (largest, psnr) = cost(&scene(random_splats(seed, 150)));
+        assert!(largest <= 4.0 / 255.0 && psnr >= 57.0, "{largest} {psnr}");
+    }
+    let (largest, psnr) = cost(&scene(surface_splats(4000, 0.8, 0.02)));
+    assert!(largest <= 9.0 / 255.0 && psnr >= 54.0, "{largest} {psnr}");
+}
+
+#[test]
+fn a_surface_of_small_splats_is_close_to_the_reference() {
+    let scene = scene(surface_splats(4000, 0.8, 0.02));
+    assert_close(&scene, &orbit(70, 90));
+}
+
+#[test]
+fn an_off_centre_principal_point_is_close_to_the_reference() {
+    let scene = scene(random_splats(7, 150));
+    for (cx, cy) in [(-40.0, 20.0), (200.0, -90.0), (3.5, 49.5)] {
+        let mut camera = orbit(75, 50);
+        (camera.cx, camera.cy) = (cx, cy);
+        assert_close(&scene, &camera);
+    }
+}
+
+#[test]
+fn a_wide_view_from_among_the_splats_is_close_to_the_reference() {
+    let scene = scene(random_splats(8, 150));
+    let camera = Camera::orbit(70.0, -20.0, 0.3, 100.0, 75, 50).unwrap();
+    assert_close(&scene, &camera);
+}

@@ -1,0 +1,216 @@
+//! Pinhole cameras in the cube frame.
+
+use glam::{DAffine3, DMat3, DVec3};
+
+use crate::error::{Error, Result};
+
+/// How far `R·Rᵀ` of a pose may be from the identity, so that a rotation printed with four decimals still is one.
+const ROTATION_TOLERANCE: f64 = 1e-3;
+
+/// A pinhole camera. Camera axes: x right, y down, z forward. Pixel `i` covers `[i, i + 1]`, its centre is `i + ½`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    /// From the cube frame to the camera: a rotation and a translation.
+    pub pose: DAffine3,
+    /// Focal length along x, in pixels.
+    pub fx: f64,
+    /// Focal length along y, in pixels.
+    pub fy: f64,
+    /// Principal point, x, in pixels; it may lie outside the picture.
+    pub cx: f64,
+    /// Principal point, y, in pixels.
+    pub cy: f64,
+    /// Width of the picture in pixels.
+    pub width: u32,
+    /// Height of the picture in pixels.
+    pub height: u32,
+    /// What is not farther than this along z is not drawn. Cube-frame units.
+    pub near: f64,
+}
+
+impl Camera {
+    /// The near plane of [`Camera::orbit`]: five finest voxels of a 10-bit cloud.
+    pub const NEAR: f64 = 0.01;
+    /// The longest side of a picture: up to here a pixel's centre is exactly an `f32`.
+    pub const MAX_SIDE: u32 = 1 << 22;
+
+    /// A camera on a sphere around the cube's centre, looking at it, with +y up.
+    ///
+    /// `azimuth` and `elevation` in degrees: the eye is at `radius·(cos el·sin az, sin el, cos el·cos az)`. `fov` is the horizontal
+    /// field of view in degrees; pixels are square and the principal point is the middle. At the poles, up is the limit of up.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if that is no camera: see [`Camera::check`].
+    pub fn orbit(
+        azimuth: f64,
+        elevation: f64,
+        radius: f64,
+        fov: f64,
+        width: u32,
+        height: u32,
+    ) -> Result<Camera> {
+        let (sin_az, cos_az) = azimuth.to_radians().sin_cos();
+        let (sin_el, cos_el) = elevation.to_radians().sin_cos();
+        let outwards = DVec3::new(cos_el * sin_az, sin_el, cos_el * cos_az);
+        let right = DVec3::new(cos_az, 0.0, -sin_az);
+        let down = right.cross(outwards);
+        let rotation = DMat3::from_cols(right, down, -outwards).transpose();
+        if !(fov > 0.0 && fov < 180.0) {
+            return Err(Error::Usage(format!(
+                "the field of view is {fov}°, it must lie between 0° and 180°"
+            )));
+        }
+        let focal = f64::from(width) / 2.0 / (fov.to_radians() / 2.0).tan();
+        let camera = Camera {
+            pose: DAffine3::from_mat3_translation(rotation, DVec3::new(0.0, 0.0, radius)),
+            fx: focal,
+            fy: focal,
+            cx: f64::from(width) / 2.0,
+            cy: f64::from(height) / 2.0,
+            width,
+            height,
+            near: Self::NEAR,
+        };
+        camera.check()?;
+        Ok(camera)
+    }
+
+    /// Whether pictures can be taken with it.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if a number is not finite, the pose scales, shears or mirrors, a focal length or the near plane is not
+    /// positive, or a side of the picture is 0 or over [`Camera::MAX_SIDE`].
+    pub fn check(&self) -> Result<()> {
+        let complaint = |what: String| Err(Error::Usage(format!("camera: {what}")));
+        let rotation = self.pose.matrix3;
+        let error = rotation * rotation.transpose() - DMat3::IDENTITY;
+        let largest = error
+            .to_cols_array()
+            .iter()
+            .fold(0.0, |m: f64, x| m.max(x.abs()));
+        if !self.pose.is_finite() {
+            return complaint("the pose holds a number that is not finite".into());
+        }
+        if !(largest <= ROTATION_TOLERANCE && rotation.determinant() > 0.0) {
+            return complaint(
+                "the pose is not a rotation and a translation: it scales, shears or mirrors".into(),
+            );
+        }
+        for (name, length) in [("fx", self.fx), ("fy", self.fy), ("near", self.near)] {
+            if !(length >= f64::from(f32::MIN_POSITIVE) && length <= f64::from(f32::MAX)) {
+                return complaint(format!(
+                    "{name} is {length}, it must be positive and finite"
+                ));
+            }
+        }
+        for (name, centre) in [("cx", self.cx), ("cy", self.cy)] {
+            if !(-f64::from(f32::MAX)..=f64::from(f32::MAX)).contains(&centre) {
+                return complaint(format!("{name} is {centre}, it must be finite"));
+            }
+        }
+        let sides = 1..=Self::MAX_SIDE;
+        if !(sides.contains(&self.width) && sides.contains(&self.height)) {
+            return complaint(format!(
+                "the picture is {}×{}, each side must be of 1 to {} pixels",
+                self.width,
+                self.height,
+                Self::MAX_SIDE
+            ));
+        }
+        Ok(())
+    }
+
+    /// The range of `x/z` and of `y/z` outside which the projection is linearised at the range's end: the field of view, and 15 %
+    /// of its width more at either side. Far outside the picture the linearisation would otherwise stretch splats into streaks.
+    ///
+    /// The ends follow the principal point, so an off-centre one is handled.
+    pub(crate) fn slope_ranges(&self) -> [[f64; 2]; 2] {
+        let range = |size: u32, focal: f64, centre: f64| {
+            let size = f64::from(size);
+            let margin = 0.15 * size;
+            [(-centre - margin) / focal, (size - centre + margin) / focal]
+        };
+        [
+            range(self.width, self.fx, self.cx),
+            range(self.height, self.fy, self.cy),
+        ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera() -> Camera {
+        Camera::orbit(0.0, 0.0, 3.0, 45.0, 64, 48).unwrap()
+    }
+
+    fn pixel(camera: &Camera, p: [f64; 3]) -> [f64; 2] {
+        let t = camera.pose.transform_point3(p.into());
+        [
+            camera.fx * t.x / t.z + camera.cx,
+            camera.fy * t.y / t.z + camera.cy,
+        ]
+    }
+
+    #[test]
+    fn an_orbit_looks_at_the_centre_with_y_up_and_x_to_the_right_of_the_front() {
+        for (azimuth, elevation) in [(0.0, 0.0), (30.0, 0.0), (200.0, 40.0), (0.0, -90.0)] {
+            let camera = Camera::orbit(azimuth, elevation, 3.0, 45.0, 64, 48).unwrap();
+            let [x, y] = pixel(&camera, [0.0; 3]);
+            assert!((x - 32.0).abs() < 1e-9 && (y - 24.0).abs() < 1e-9);
+        }
+        let front = camera();
+        assert!(pixel(&front, [0.0, 0.5, 0.0])[1] < 24.0);
+        assert!(pixel(&front, [0.5, 0.0, 0.0])[0] > 32.0);
+        let from_plus_x = Camera::orbit(90.0, 0.0, 3.0, 45.0, 64, 48).unwrap();
+        assert!(pixel(&from_plus_x, [0.0, 0.0, 0.5])[0] < 32.0);
+        let from_above = Camera::orbit(0.0, 90.0, 3.0, 45.0, 64, 48).unwrap();
+        assert!(pixel(&from_above, [0.0, 0.0, -0.5])[1] < 24.0);
+    }
+
+    #[test]
+    fn the_horizontal_field_of_view_spans_the_width() {
+        let camera = camera();
+        let edge = 3.0 * (22.5f64).to_radians().tan();
+        assert!((pixel(&camera, [edge, 0.0, 0.0])[0] - 64.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn what_is_no_camera_is_refused() {
+        let broken: [fn(&mut Camera); 12] = [
+            |c| c.pose.translation.x = f64::NAN,
+            |c| c.pose.matrix3.x_axis.y = f64::INFINITY,
+            |c| c.pose.matrix3 *= 2.0,
+            |c| c.pose.matrix3 = DMat3::ZERO,
+            |c| c.pose.matrix3.x_axis *= -1.0,
+            |c| c.fx = 0.0,
+            |c| c.fy = f64::NAN,
+            |c| c.cx = f64::INFINITY,
+            |c| c.near = -1.0,
+            |c| c.width = 0,
+            |c| c.height = 0,
+            |c| c.height = Camera::MAX_SIDE + 1,
+        ];
+        for (i, spoil) in broken.iter().enumerate() {
+            let mut camera = camera();
+            spoil(&mut camera);
+            assert!(matches!(camera.check(), Err(Error::Usage(_))), "case {i}");
+        }
+        for fov in [0.0, 180.0, f64::NAN] {
+            assert!(Camera::orbit(0.0, 0.0, 3.0, fov, 8, 8).is_err());
+        }
+        assert!(Camera::orbit(f64::NAN, 0.0, 3.0, 45.0, 8, 8).is_err());
+    }
+
+    #[test]
+    fn the_range_of_slopes_follows_an_off_centre_principal_point() {
+        let mut camera = camera();
+        let [low, high] = camera.slope_ranges()[0];
+        let half = 32.0 / camera.fx;
+        assert!((low + 1.3 * half).abs() < 1e-12 && (high - 1.3 * half).abs() < 1e-12);
+        camera.cx = -40.0;
+        let [low, high] = camera.slope_ranges()[0];
+        assert!(low < 40.0 / camera.fx && high > 104.0 / camera.fx);
+    }
+}
