@@ -1,3 +1,25 @@
 //! The arithmetic kernels of `b2p`, and the one place that maps files into memory.
 //!
 //! Every `unsafe` block of the project lives here, each with its reason. Nothing here knows of streams, levels or Gaussians.
+//!
+//! A sparse convolution is one loop ([`ExactConv`] in integers, [`FloatConv`] in floats): for every output row, the rows its
+//! [`Taps`] name are multiplied by that tap's weights and added up. Each kernel is one portable body, compiled once for the
+//! baseline and once more for every [`Isa`] above it. Nothing is contracted or reordered, so all of them give the same bits.
+
+mod convert;
+mod exact;
+mod float;
+mod isa;
+mod map;
+mod rows;
+mod taps;
+
+pub mod reference;
+
+pub use convert::{to_f16, to_f32};
+pub use exact::{ExactConv, LIMIT, Requantise};
+pub use float::{FloatConv, FloatOut, Scale};
+pub use isa::{Isa, UnknownIsa};
+pub use map::{MappedFile, map_file};
+pub use rows::Output;
+pub use taps::{ABSENT, Taps};

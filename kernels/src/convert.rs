@@ -1,0 +1,143 @@
+//! f16 ↔ f32, exact one way and rounded to even the other, in integer steps that any compiler turns into SIMD.
+
+use half::f16;
+
+use crate::isa::{Isa, dispatch};
+
+/// The largest finite f16.
+const MAX: f32 = 65504.0;
+/// The difference of the two formats' exponent biases, in an f32's place.
+const REBIAS: u32 = (127 - 15) << 23;
+/// The f32 whose last mantissa bit weighs as much as the smallest f16.
+const DENORMAL: u32 = (127 - 15 + 23 - 10 + 1) << 23;
+
+/// Widens, exactly. Infinities and NaN stay what they are.
+///
+/// # Panics
+/// If the lengths differ.
+pub fn to_f32(isa: Isa, from: &[f16], to: &mut [f32]) {
+    assert_eq!(from.len(), to.len());
+    dispatch!(isa, fn widen(from: &[f16], to: &mut [f32]));
+}
+
+/// Rounds to the nearest f16, ties to even; beyond ±65504, and for NaN, to the nearest end (NaN to −65504): the result is
+/// always finite.
+///
+/// # Panics
+/// If the lengths differ.
+pub fn to_f16(isa: Isa, from: &[f32], to: &mut [f16]) {
+    assert_eq!(from.len(), to.len());
+    dispatch!(isa, fn narrow(from: &[f32], to: &mut [f16]));
+}
+
+#[inline(always)]
+pub(crate) fn widen(from: &[f16], to: &mut [f32]) {
+    for (to, from) in to.iter_mut().zip(from) {
+        let bits = u32::from(from.to_bits());
+        let magnitude = (bits & 0x7fff) << 13;
+        let sign = (bits & 0x8000) << 16;
+        let exponent = magnitude & (0x1f << 23);
+        // Infinity and NaN keep the largest exponent: it moves up by the rest of the way.
+        let normal = magnitude + REBIAS + if exponent == 0x1f << 23 { REBIAS } else { 0 };
+        // A subnormal's mantissa is read as a normal number's, and the implied one taken off again.
+        let subnormal =
+            f32::from_bits(magnitude + REBIAS + (1 << 23)) - f32::from_bits(REBIAS + (1 << 23));
+        let value = if exponent == 0 {
+            subnormal.to_bits()
+        } else {
+            normal
+        };
+        *to = f32::from_bits(value | sign);
+    }
+}
+
+#[inline(always)]
+#[expect(
+    clippy::manual_clamp,
+    reason = "`max` gives the number of a number and NaN, `clamp` keeps NaN"
+)]
+pub(crate) fn narrow(from: &[f32], to: &mut [f16]) {
+    for (to, &from) in to.iter_mut().zip(from) {
+        let value = from.max(-MAX).min(MAX);
+        let sign = (value.to_bits() >> 16) & 0x8000;
+        let bits = value.to_bits() & 0x7fff_ffff;
+        // Adding half an even step less one rounds to nearest; the parity of the kept mantissa breaks ties to even.
+        let normal = (bits - REBIAS.min(bits) + 0xfff + ((bits >> 13) & 1)) >> 13;
+        // The floating-point adder rounds at the weight of the smallest f16.
+        let subnormal = (f32::from_bits(bits) + f32::from_bits(DENORMAL))
+            .to_bits()
+            .wrapping_sub(DENORMAL);
+        let magnitude = if bits < REBIAS + (1 << 23) {
+            subnormal
+        } else {
+            normal
+        };
+        *to = f16::from_bits((magnitude | sign) as u16);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn widening_agrees_with_the_format_for_every_value() {
+        let all: Vec<f16> = (0..=u16::MAX).map(f16::from_bits).collect();
+        for isa in Isa::available() {
+            println!("ran on {isa}");
+            let mut wide = vec![0.0; all.len()];
+            to_f32(isa, &all, &mut wide);
+            for (narrow, wide) in all.iter().zip(wide) {
+                let expected = narrow.to_f32();
+                assert!(
+                    wide.to_bits() == expected.to_bits() || (wide.is_nan() && expected.is_nan()),
+                    "{narrow:?} became {wide}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn narrowing_rounds_to_even_and_saturates() {
+        // Every f16, every midpoint between two, and their neighbours in f32.
+        let mut samples = vec![
+            f32::INFINITY,
+            1e30,
+            65519.9,
+            65520.0,
+            f32::MIN_POSITIVE,
+            1e-45,
+            0.0,
+        ];
+        for bits in 0..0x7bffu16 {
+            let low = f16::from_bits(bits).to_f32();
+            let middle = (low + f16::from_bits(bits + 1).to_f32()) / 2.0;
+            for at in [low, middle] {
+                samples.extend([at.next_down(), at, at.next_up()]);
+            }
+        }
+        samples.extend(samples.clone().iter().map(|x| -x));
+        for isa in Isa::available() {
+            println!("ran on {isa}");
+            let mut narrow = vec![f16::ZERO; samples.len()];
+            to_f16(isa, &samples, &mut narrow);
+            for (wide, narrow) in samples.iter().zip(narrow) {
+                let expected = f16::from_f32(wide.clamp(-MAX, MAX));
+                assert_eq!(
+                    narrow.to_bits(),
+                    expected.to_bits(),
+                    "{wide} became {narrow}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn narrowing_always_gives_a_finite_number() {
+        for isa in Isa::available() {
+            let mut narrow = [f16::ZERO; 2];
+            to_f16(isa, &[f32::NAN, f32::NEG_INFINITY], &mut narrow);
+            assert_eq!(narrow, [f16::MIN, f16::MIN]);
+        }
+    }
+}

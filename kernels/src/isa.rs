@@ -1,0 +1,139 @@
+//! Which instructions the kernels may use.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// An instruction set that this machine has: the kernels' licence to use it.
+///
+/// Only [`Isa::detect`], [`Isa::available`] and parsing make one, and they ask the processor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Isa(Level);
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(crate) enum Level {
+    Scalar,
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+}
+
+impl Isa {
+    /// What the target guarantees; every machine has it.
+    pub const SCALAR: Isa = Isa(Level::Scalar);
+
+    /// The best that this machine has.
+    pub fn detect() -> Isa {
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2")
+            && is_x86_feature_detected!("fma")
+            && is_x86_feature_detected!("f16c")
+            && is_x86_feature_detected!("bmi1")
+            && is_x86_feature_detected!("bmi2")
+            && is_x86_feature_detected!("popcnt")
+            && is_x86_feature_detected!("lzcnt")
+        {
+            return Isa(Level::Avx2);
+        }
+        Isa::SCALAR
+    }
+
+    /// Everything that this machine has, plainest first.
+    pub fn available() -> Vec<Isa> {
+        let levels = [
+            Level::Scalar,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2,
+        ];
+        let best = Isa::detect();
+        levels
+            .into_iter()
+            .map(Isa)
+            .filter(|isa| *isa <= best)
+            .collect()
+    }
+
+    pub(crate) fn level(self) -> Level {
+        self.0
+    }
+
+    fn name(self) -> &'static str {
+        match self.0 {
+            Level::Scalar => "scalar",
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => "avx2",
+        }
+    }
+}
+
+impl fmt::Display for Isa {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// The name of an instruction set that this machine lacks, or that does not exist.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct UnknownIsa(String);
+
+impl fmt::Display for UnknownIsa {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let have: Vec<_> = Isa::available().iter().map(|isa| isa.name()).collect();
+        write!(
+            f,
+            "no instruction set `{}` here, but {}",
+            self.0,
+            have.join(", ")
+        )
+    }
+}
+
+impl std::error::Error for UnknownIsa {}
+
+impl FromStr for Isa {
+    type Err = UnknownIsa;
+
+    fn from_str(name: &str) -> Result<Self, UnknownIsa> {
+        Isa::available()
+            .into_iter()
+            .find(|isa| isa.name() == name)
+            .ok_or_else(|| UnknownIsa(name.to_owned()))
+    }
+}
+
+/// Calls `$body(args…)` as compiled for `$isa`. Each compilation stays a function of its own, small enough for the compiler
+/// to find the vectors in it.
+macro_rules! dispatch {
+    ($isa:expr, fn $body:ident $(<$($g:ident: $bound:path),* $(; const $n:ident)?>)? ($($arg:ident: $ty:ty),* $(,)?)) => {{
+        #[inline(never)]
+        fn scalar $(<$($g: $bound,)* $(const $n: usize)?>)? ($($arg: $ty),*) {
+            $body $(::<$($g,)* $($n)?>)? ($($arg),*)
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
+        fn avx2 $(<$($g: $bound,)* $(const $n: usize)?>)? ($($arg: $ty),*) {
+            $body $(::<$($g,)* $($n)?>)? ($($arg),*)
+        }
+        match $crate::isa::Isa::level($isa) {
+            $crate::isa::Level::Scalar => scalar $(::<$($g,)* $($n)?>)? ($($arg),*),
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: an `Isa` of this level is only made where the processor has these features.
+            $crate::isa::Level::Avx2 => unsafe { avx2 $(::<$($g,)* $($n)?>)? ($($arg),*) },
+        }
+    }};
+}
+pub(crate) use dispatch;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_available_set_can_be_named_and_no_other() {
+        for isa in Isa::available() {
+            assert_eq!(isa.to_string().parse(), Ok(isa));
+        }
+        assert!(Isa::available().contains(&Isa::SCALAR));
+        assert_eq!(Isa::available().last(), Some(&Isa::detect()));
+        let error = "abacus".parse::<Isa>().unwrap_err().to_string();
+        assert!(error.contains("abacus") && error.contains("scalar"));
+    }
+}

@@ -1,0 +1,116 @@
+//! The convolutions as their definitions read: triple loops over i64 and f64. What the kernels are tested against.
+
+use half::f16;
+
+use crate::exact::{LIMIT, Requantise};
+use crate::float::Scale;
+use crate::taps::{ABSENT, Taps};
+
+/// The input row that output row `i` reads through tap `k`.
+pub fn tap(taps: &Taps<'_>, i: usize, k: usize) -> Option<usize> {
+    match taps {
+        Taps::Same => Some(i),
+        Taps::Map { volume, rows } => {
+            let row = rows[i * volume + k];
+            (row != ABSENT).then_some(row as usize)
+        }
+        Taps::Octants { parents, octants } => {
+            (usize::from(octants[i]) == k).then(|| parents[i] as usize)
+        }
+        Taps::Children => (i % 8 == k).then_some(i / 8),
+    }
+}
+
+/// `rows` rows of an exact layer: sums in i64, wrapped to i32 once.
+pub fn exact(
+    [cin, cout]: [usize; 2],
+    weights: &[i16],
+    requantise: &Requantise,
+    taps: &Taps<'_>,
+    input: &[i16],
+    rows: usize,
+    residual: Option<&[i16]>,
+    relu: bool,
+) -> Vec<i16> {
+    let mut out = Vec::with_capacity(rows * cout);
+    let limit = i64::from(LIMIT);
+    for i in 0..rows {
+        for o in 0..cout {
+            let (mut sum, mut energy) = (0i64, 0i64);
+            for k in 0..taps.volume() {
+                let Some(row) = tap(taps, i, k) else { continue };
+                for c in 0..cin {
+                    let w = i64::from(weights[(k * cin + c) * cout + o]);
+                    sum += w * i64::from(input[row * cin + c]);
+                    energy += w * w;
+                }
+            }
+            let mut q = match requantise {
+                Requantise::Shift { bias, shift } => {
+                    i64::from((sum + i64::from(bias[o])) as i32 >> shift[o])
+                }
+                Requantise::Invariant { gain, bias } => {
+                    let scale = gain[o] / ((energy as u32).max(1) as f32).sqrt();
+                    (sum as i32 as f32 * scale + bias[o]).round_ties_even() as i64
+                }
+            }
+            .clamp(-limit, limit);
+            if let Some(residual) = residual {
+                q = (q + i64::from(residual[i * cout + o])).clamp(-limit, limit);
+            }
+            out.push(if relu { q.max(0) } else { q } as i16);
+        }
+    }
+    out
+}
+
+/// A value, and how large the terms it was summed from are: what a bound on its rounding error scales with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Value {
+    /// The result.
+    pub value: f64,
+    /// The sum of its terms' magnitudes.
+    pub magnitude: f64,
+}
+
+/// `rows` rows of a float layer, before any rounding to f16.
+pub fn float(
+    [cin, cout]: [usize; 2],
+    weights: &[f16],
+    bias: &[f32],
+    scale: &Scale,
+    taps: &Taps<'_>,
+    input: &[f16],
+    rows: usize,
+    residual: Option<&[f16]>,
+    relu: bool,
+) -> Vec<Value> {
+    let mut out = Vec::with_capacity(rows * cout);
+    for i in 0..rows {
+        for o in 0..cout {
+            let (mut sum, mut magnitude, mut energy) = (0f64, 0f64, 0f64);
+            for k in 0..taps.volume() {
+                let Some(row) = tap(taps, i, k) else { continue };
+                for c in 0..cin {
+                    let w = weights[(k * cin + c) * cout + o].to_f64();
+                    let product = w * input[row * cin + c].to_f64();
+                    sum += product;
+                    magnitude += product.abs();
+                    energy += w * w;
+                }
+            }
+            if let Scale::Invariant(gain) = scale {
+                let factor = f64::from(gain[o]) / (energy + 1e-8).sqrt();
+                sum *= factor;
+                magnitude *= factor.abs();
+            }
+            let extra = residual.map_or(0.0, |x| x[i * cout + o].to_f64());
+            let value = sum + f64::from(bias[o]) + extra;
+            out.push(Value {
+                value: if relu { value.max(0.0) } else { value },
+                magnitude: magnitude + f64::from(bias[o]).abs() + extra.abs(),
+            });
+        }
+    }
+    out
+}
