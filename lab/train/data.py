@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save_file
 
 from model import Crop, make_crop
 
@@ -160,3 +160,16 @@ def procedural(seed, size=64, views=4, pixels=80):
         coverage.append(box(hit.astype(float)[..., None]).transpose(2, 0, 1))
     tensor = lambda a: torch.from_numpy(np.ascontiguousarray(a)).float()
     return Sample(f"procedural-{seed}", make_crop(coords, parents), tensor(rgb), tensor(np.stack(cameras)), tensor(np.stack(image)), tensor(np.stack(coverage)))
+
+
+def save_sample(sample, path, size):
+    """Writes a sample in the file format of `b2p-lab dataset`."""
+    crop = sample.crop
+    out = {f"xyz.{r}": crop.coords[r].numpy() for r in range(4)}
+    for r in (1, 2, 3):
+        count = (crop.first[r - 1][1:] - crop.first[r - 1][:-1]).numpy()
+        out[f"parent.{r}"] = np.repeat(np.arange(len(count), dtype=np.int32), count)
+    byte = lambda t: np.clip(np.rint(t.numpy() * 255), 0, 255).astype(np.uint8)
+    out["rgb"], out["camera"] = byte(sample.rgb), sample.cameras.numpy()
+    out["image"] = np.ascontiguousarray(byte(torch.cat([sample.image, sample.coverage], 1)).transpose(0, 2, 3, 1))
+    save_file(out, path, metadata={"name": sample.name, "bits": str(int(size).bit_length() - 1), "size": str(size)})

@@ -241,10 +241,10 @@ def verify(path, model, samples):
     """Rate of the integer path against the float path on whole crops, pictures of both, and saturation."""
     exact, totals, points, error = integer.Exact(path), np.zeros((2, 3)), 0, np.zeros(2)
     for s in samples:
-        g, rates, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+        trail, rates, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
         bits, gi = integer.code(exact, model, s.crop, s.rgb)
         totals += np.array([[r.item() for r in rates], bits])
-        error += [picture_error(model, s, g), picture_error(model, s, gi)]
+        error += [picture_error(model, s, trail[-1]), picture_error(model, s, gi)]
         points += s.crop.points
     penalty = totals[1].sum() / totals[0].sum() - 1
     psnr = -10 * np.log10(error / len(samples))
@@ -260,6 +260,19 @@ def load_checkpoint(path, averaged=True):
     model = B2P(s["config"])
     model.load_state_dict(s["average"] if averaged else s["model"])
     return model.eval(), {"lambda": s["args"]["lam"], "steps": s["step"]}
+
+
+@torch.no_grad()
+def untrained(config, samples, seed=1):
+    """A network with random weights, biases and gains."""
+    torch.manual_seed(seed)
+    with open(config) as f:
+        model = B2P(json.load(f)).eval()
+    for name, p in model.named_parameters():
+        if name.endswith(("bias", "gain")):
+            p.add_(torch.randn_like(p) * 0.05)
+    model.calibrate([(s.crop, s.rgb) for s in samples])
+    return model
 
 
 def main():
@@ -278,9 +291,7 @@ def main():
         samples = [data.load_sample(f) for f in held[:args.verify] + training[:max(0, args.samples - args.verify)]]
     if args.random:
         torch.manual_seed(1)
-        with open(args.random) as f:
-            model, info = B2P(json.load(f)).eval(), {"steps": 0}
-        model.calibrate(samples[0].crop, samples[0].rgb)
+        model, info = untrained(args.random, samples), {"steps": 0}
     else:
         model, info = load_checkpoint(args.checkpoint, not args.last)
     export(model, samples, args.out, info)

@@ -45,7 +45,8 @@ class Exact:
 
     def _count(self, name, q):
         s = self.saturated.setdefault(name, [0, 0])
-        s[0] += int((np.abs(q) >= LIMIT).sum())
+        rectified = name.rsplit(".", 1)[1] in ("a1", "b1", "b2", "lin1") or name.startswith("pem") and name.endswith("conv_in")
+        s[0] += int(((q if rectified else np.abs(q)) >= LIMIT).sum())
         s[1] += q.size
 
     def conv(self, name, x, table, active=None):

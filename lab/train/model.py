@@ -284,6 +284,11 @@ class B2P(nn.Module):
         self.pem = nn.ModuleDict({str(r): Entropy(cfg) for r in (1, 2)})
         self.gg = nn.ModuleDict({str(g["role"]): Generate(cfg, g) for g in cfg["gg"]})
         self.prior = Prior(cfg["latents"])
+        with torch.no_grad():  # natural colours vary mostly in luma: let the first layer see chroma as strongly
+            first = self.fc[3].conv_in.weight
+            first.copy_(torch.tensor([[0.5, 0.5, 0.5], [2.0, -2.0, 0.0], [-1.5, -1.5, 3.0]]).T @ first)
+        # Training only: what colour a voxel has, read linearly from g.
+        self.probe = nn.ModuleList(Conv(c, 3, 1, 0.3) for _ in range(3))
         self.up = nn.ModuleDict()
         if cfg["upsample"] == "learned":
             for r in (1, 2):
@@ -313,10 +318,10 @@ class B2P(nn.Module):
 
     def code(self, crop, features, top, mode):
         """Runs roles 0 .. top. mode: 'noise' (noise for rate and distortion), 'mixed' (noise for rate, straight-through rounding for
-        distortion), 'round'. Returns g of role `top`, bits per role and the latents per role."""
-        g, rates, latents, limit = None, [], [], float(self.cfg["latent_max"])
+        distortion), 'round'. Returns g, bits and latents of each role."""
+        trail, rates, latents, limit = [], [], [], float(self.cfg["latent_max"])
         for r in range(top + 1):
-            c = self.context(g, crop, r)
+            c = self.context(trail[-1], crop, r) if r else None
             y = self.fs[r](features[r], c).clamp(-limit, limit)
             rounded = y + (torch.round(y) - y).detach()
             noisy = rounded if mode == "round" else y + torch.rand_like(y) - 0.5
@@ -327,8 +332,8 @@ class B2P(nn.Module):
                 mass = bin_mass(noisy, mu, bounded_sigma(log_sigma))
             rates.append(bits(mass))
             latents.append(y)
-            g = self.fr[r](noisy if mode == "noise" else rounded, c, crop.kernel3[r])
-        return g, rates, latents
+            trail.append(self.fr[r](noisy if mode == "noise" else rounded, c, crop.kernel3[r]))
+        return trail, rates, latents
 
     def generate(self, g, crop, role):
         """Gaussians of head `role`, in finest-voxel units."""
@@ -338,17 +343,29 @@ class B2P(nn.Module):
         return gaussians(raw, coords, 2.0, self.cfg, opaque=role == 2), raw
 
     @torch.no_grad()
-    def calibrate(self, crop, rgb, target=3.0):
-        """Scales the latents to the wanted standard deviation and centres them, on one crop."""
-        features, g = self.analyse(crop, rgb), None
+    def calibrate(self, samples, target=3.0):
+        """Starts each squeeze as the leading principal components of its hidden layer, whitened to the wanted standard deviation, on a
+        few (crop, rgb) samples."""
+        features = [self.analyse(crop, rgb) for crop, rgb in samples]
+        g = [None] * len(samples)
         for r in range(3):
-            c = self.context(g, crop, r)
-            lin = self.fs[r].lin2
-            y = self.fs[r](features[r], c)
-            s = target / y.std(0).clamp_min(1e-6)
-            lin.weight.mul_(s)
-            lin.bias.copy_((lin.bias - y.mean(0)) * s)
-            g = self.fr[r](torch.round(self.fs[r](features[r], c)), c, crop.kernel3[r])
+            c = [self.context(gi, crop, r) for gi, (crop, _) in zip(g, samples)]
+            inputs = [f[r] if ci is None else torch.cat([f[r], ci], 1) for f, ci in zip(features, c)]
+            hidden = torch.cat([self.fs[r].lin1(x, relu=True) for x in inputs]).double()
+            mean = hidden.mean(0)
+            values, vectors = torch.linalg.eigh(torch.cov(hidden.T))
+            k = self.cfg["latents"]
+            w = vectors[:, -k:] * (target / values[-k:].clamp_min(1e-12).sqrt())
+            self.fs[r].lin2.weight.copy_(w[None].float())
+            self.fs[r].lin2.bias.copy_((-mean @ w).float())
+            g = [self.fr[r](torch.round(self.fs[r](f[r], ci)), ci, crop.kernel3[r]) for f, ci, (crop, _) in zip(features, c, samples)]
+
+    def colours(self, crop, rgb):
+        """Mean colour of the voxels of roles 0, 1, 2."""
+        out = [rgb]
+        for r in (2, 1, 0):
+            out.insert(0, ops.pool(out[0], crop.first[r]))
+        return out[:3]
 
 
 def groups(model, lr_conv, lr_linear):

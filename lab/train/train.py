@@ -51,6 +51,7 @@ def ssim(a, b):
     return (((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma * ma + mb * mb + c1) * (va + vb + c2))).mean()
 
 
+LUMA_CHROMA = torch.tensor([[0.33, 0.34, 0.33], [1.0, -1.0, 0.0], [-0.5, -0.5, 1.0]]).T.contiguous()
 CHROMA = torch.tensor([[0.5, -0.5, 0.0], [-0.25, -0.25, 0.5]])
 
 
@@ -144,10 +145,10 @@ class Trainer:
     def fraction(self):
         return self.used / (self.args.minutes * 60) if self.args.minutes else self.step / self.args.steps
 
-    def loss(self, sample, head, weight, mode):
+    def loss(self, sample, head, weight, mode, hint):
         features = self.model.analyse(sample.crop, sample.rgb)
-        g, rates, latents = self.model.code(sample.crop, features, head, mode)
-        (mean, cov, alpha, colour), raw = self.model.generate(g, sample.crop, head)
+        trail, rates, latents = self.model.code(sample.crop, features, head, mode)
+        (mean, cov, alpha, colour), raw = self.model.generate(trail[-1], sample.crop, head)
         background = torch.rand(sample.image.shape[0], 3, device=raw.device)
         h, w = sample.image.shape[2:]
         image = ops.splat(mean, cov, alpha, colour, sample.cameras, background, w, h)
@@ -155,22 +156,29 @@ class Trainer:
         d = distortion(image, truth, self.args.pyramid)
         rate = sum(rates) / sample.crop.points
         # A latent that wanders off is cheap to code while the rate weighs nothing, and expensive to bring back.
-        loss = weight * rate + self.args.lam * d + 1e-4 * sum((y / 8).pow(4).mean() for y in latents)
+        probes = 0.0
+        if hint > 0:  # early on, the colour of each voxel is asked of g directly
+            matrix = LUMA_CHROMA.to(raw.device)
+            for g, probe, target in zip(trail, self.model.probe, self.model.colours(sample.crop, sample.rgb)):
+                probes = probes + ((probe(g) + 0.5 - target) @ matrix).abs().mean()
+        loss = hint * self.args.lam * probes + weight * rate + self.args.lam * d + 1e-4 * sum((y / 8).pow(4).mean() for y in latents)
         return loss, {"rate": [r.item() / sample.crop.points for r in rates], "d": d.item(),
                       "mse": (image - truth).pow(2).mean().item(), "std": [y.std().item() for y in latents]}
 
-    def train_step(self, samples):
+    def train_step(self, samples, calibration=None):
         args, x = self.args, self.fraction()
         weight, mode = rate_weight(x, args), "noise" if x < args.rounding_from else "mixed"
         head = 1 if self.rng.random() < args.coarse else 2
+        hint = args.hint * max(0.0, 1 - x / args.hint_until)
         heads = [1, 2] if args.both else [head]
         if not self.calibrated:
-            self.model.calibrate(samples[0].crop, samples[0].rgb)
+            self.model.calibrate([(s.crop, s.rgb) for s in calibration or samples])
+            self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
             self.calibrated = True
         self.optimiser.zero_grad(set_to_none=True)
         for sample in samples:
             for h in heads:
-                loss, info = self.loss(sample, h, weight, mode)
+                loss, info = self.loss(sample, h, weight, mode, hint)
                 (loss / len(samples)).backward()
         lr = learning_rate(x, self.step, args)
         for group in self.optimiser.param_groups:
@@ -197,10 +205,10 @@ class Trainer:
             features = self.model.analyse(sample.crop, sample.rgb)
             points += sample.crop.points
             for head in (1, 2):
-                g, rates, _ = self.model.code(sample.crop, features, head, "round")
+                trail, rates, _ = self.model.code(sample.crop, features, head, "round")
                 if head == 2:
                     bits = [b + r.item() for b, r in zip(bits, rates)]
-                (mean, cov, alpha, colour), _ = self.model.generate(g, sample.crop, head)
+                (mean, cov, alpha, colour), _ = self.model.generate(trail[-1], sample.crop, head)
                 h, w = sample.image.shape[2:]
                 white = torch.ones(sample.image.shape[0], 3, device=mean.device)
                 image = ops.splat(mean, cov, alpha, colour, sample.cameras, white, w, h)
@@ -233,6 +241,8 @@ def main(argv=None):
     p.add_argument("--coarse", type=float, default=0.4, help="share of steps that train the head of role 1")
     p.add_argument("--both", action="store_true", help="train both heads in every step")
     p.add_argument("--pyramid", type=float, default=1.0, help="weight of the multi-scale term")
+    p.add_argument("--hint", type=float, default=1.0, help="weight of the early colour probes against distortion")
+    p.add_argument("--hint-until", type=float, default=0.5)
     p.add_argument("--lr-conv", type=float, default=3e-4)
     p.add_argument("--lr-linear", type=float, default=1e-3)
     p.add_argument("--warmup", type=int, default=50)
@@ -250,6 +260,7 @@ def main(argv=None):
     p.add_argument("--evaluate-every", type=int, default=250)
     p.add_argument("--log-every", type=int, default=10)
     p.add_argument("--resume", action="store_true", help="continue from OUT/last.pt")
+    p.add_argument("--stop-after", type=int, default=0, help="stop at this step, as an interruption would")
     p.add_argument("--init", help="start from the averaged weights of this checkpoint")
     args = p.parse_args(argv)
 
@@ -276,9 +287,9 @@ def main(argv=None):
     signal.signal(signal.SIGINT, lambda *_: stop.append(1))
     signal.signal(signal.SIGTERM, lambda *_: stop.append(1))
     saved, means = time.monotonic(), []
-    while trainer.fraction() < 1 and not stop:
+    while trainer.fraction() < 1 and not stop and not (args.stop_after and trainer.step >= args.stop_after):
         begin = time.monotonic()
-        info = trainer.train_step([stream.next().to(args.device) for _ in range(args.batch)])
+        info = trainer.train_step([stream.next().to(args.device) for _ in range(args.batch)], held)
         trainer.used += time.monotonic() - begin
         means.append(info)
         if trainer.step % args.log_every == 0:
