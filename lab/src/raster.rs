@@ -391,3 +391,7 @@ fn span(setup: &Setup, y: f64) -> [usize; 2] {
         [0, 0]
     }
 }
+
+#[cfg(test)]
+#[path = "raster_tests.rs"]
+mod tests;

@@ -308,3 +308,149 @@ pub(crate) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<()> {
     })?;
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::fixtures::{mesh, quad, texture};
+
+    /// A square of 16 × 16 voxels in the plane z = 8.5, red rising along x.
+    fn square() -> Surface {
+        let red = texture(16, 16, |x, _| [(x * 10) as u8, 20, 30, 255]);
+        Surface::new(&mesh(quad(
+            [0.0, 0.0, 8.5],
+            [16.0, 0.0, 0.0],
+            [0.0, 16.0, 0.0],
+            Some(red),
+        )))
+    }
+
+    fn sample(surface: &Surface, only: Option<VoxelBox>) -> Sampled {
+        Sampler::new(surface, Grid::unit(4), 50_000, 3)
+            .unwrap()
+            .cloud(only)
+    }
+
+    #[test]
+    fn a_square_fills_its_voxels_with_the_textures_colours() {
+        let cloud = sample(&square(), None);
+        assert_eq!(cloud.keys.len(), 256);
+        for (&key, rgb) in cloud.keys.iter().zip(&cloud.rgb) {
+            let [x, _, z] = morton::decode(key);
+            assert_eq!((z, rgb[1], rgb[2]), (8, 20, 30));
+            // At the borders the texture repeats, so the mean leans to the other side's colour.
+            if (1..15).contains(&x) {
+                assert!(rgb[0].abs_diff(10 * x as u8) <= 1, "{x}: {rgb:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_box_of_a_cloud_is_what_the_whole_cloud_has_there() {
+        let surface = square();
+        let only = VoxelBox {
+            low: [3, 5, 0],
+            high: [9, 16, 16],
+        };
+        let whole = sample(&surface, None);
+        let part = sample(&surface, Some(only));
+        let inside = |key: u64| {
+            let v = morton::decode(key);
+            (0..3).all(|a| (only.low[a]..only.high[a]).contains(&v[a]))
+        };
+        let expected: Vec<_> = (whole.keys.iter().zip(&whole.rgb))
+            .filter(|(k, _)| inside(**k))
+            .collect();
+        assert_eq!(expected.len(), 6 * 11);
+        assert!(expected.into_iter().eq(part.keys.iter().zip(&part.rgb)));
+    }
+
+    #[test]
+    fn the_number_of_threads_changes_nothing() {
+        let surface = square();
+        let with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+            pool.build().unwrap().install(|| sample(&surface, None))
+        };
+        assert_eq!(with(1), with(5));
+    }
+
+    #[test]
+    fn points_follow_the_area_and_the_seed() {
+        // A second quad of a third of the area.
+        let mut both = mesh(quad([0.0; 3], [12.0, 0.0, 0.0], [0.0, 1.0, 0.0], None));
+        both.parts.push(quad(
+            [0.0, 8.0, 0.0],
+            [4.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0],
+            None,
+        ));
+        let surface = Surface::new(&both);
+        let sampler = Sampler::new(&surface, Grid::unit(4), 40_000, 9).unwrap();
+        assert_eq!(sampler.ends[1], 30_000);
+        assert!(sampler.point(29_999)[1] < 2.0 && sampler.point(30_000)[1] > 7.0);
+        let other = Sampler::new(&surface, Grid::unit(4), 40_000, 10).unwrap();
+        assert_ne!(sampler.point(5), other.point(5));
+    }
+
+    #[test]
+    fn transparent_texels_give_no_voxels() {
+        let left = texture(16, 16, |x, _| [255, 255, 255, if x < 8 { 200 } else { 0 }]);
+        let surface = Surface::new(&mesh(quad(
+            [0.0, 0.0, 8.5],
+            [16.0, 0.0, 0.0],
+            [0.0, 16.0, 0.0],
+            Some(left),
+        )));
+        let cloud = sample(&surface, None);
+        let columns: Vec<u32> = cloud.keys.iter().map(|&k| morton::decode(k)[0]).collect();
+        assert!(columns.iter().all(|&x| x < 8), "{columns:?}");
+        assert!((0..8).all(|x| columns.contains(&x)));
+    }
+
+    #[test]
+    fn the_longest_side_spans_the_fill_and_the_box_is_centred() {
+        let grid = Grid::fit([[1.0, 2.0, 3.0], [5.0, 4.0, 3.5]], 8, 0.5).unwrap();
+        assert_eq!(grid.unit, 4.0 / 128.0);
+        assert_eq!(grid.shift, [64.0, 96.0, 120.0]);
+        assert_eq!(grid.coordinate([5.0, 2.0, 3.0]), [192.0, 96.0, 120.0]);
+    }
+
+    #[test]
+    fn nonsense_is_refused() {
+        let unit = [[0.0; 3], [1.0; 3]];
+        assert!(Grid::fit(unit, 0, 0.9).is_err());
+        assert!(Grid::fit(unit, 22, 0.9).is_err());
+        assert!(Grid::fit(unit, 10, 1.5).is_err());
+        assert!(Grid::fit([[0.0; 3]; 2], 10, 0.9).is_err());
+        let flat = Surface::new(&mesh(quad(
+            [0.0; 3],
+            [1.0, 0.0, 0.0],
+            [2.0, 0.0, 0.0],
+            None,
+        )));
+        assert!(Sampler::new(&flat, Grid::unit(4), 10, 0).is_err());
+    }
+
+    #[test]
+    fn the_codec_reads_the_cloud_back_where_the_mesh_was() {
+        let surface = square();
+        let grid = Grid::fit(surface.bounds(), 5, 0.75).unwrap();
+        let cloud = Sampler::new(&surface, grid, 50_000, 3).unwrap().cloud(None);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("square.ply");
+        write_ply(&path, &cloud, &grid).unwrap();
+        let read = b2p::cloud::PointCloud::open(&path, &b2p::Limits::default()).unwrap();
+        let voxels = b2p::cloud::voxelise(&read, None).unwrap();
+        assert_eq!(voxels.voxels.depth(), 5);
+        assert_eq!(voxels.voxels.keys(), cloud.keys);
+        assert_eq!(voxels.colours, cloud.rgb);
+        let point = [4.0, 9.0, 8.5];
+        let voxel = grid.coordinate(point);
+        let placement = voxels.placement;
+        for a in 0..3 {
+            let world = placement.origin[a] + placement.voxel_size * voxel[a];
+            assert!((world - point[a]).abs() < 1e-9);
+        }
+    }
+}

@@ -350,3 +350,107 @@ fn half(texture: &Texture) -> Texture {
         rgba,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::fixtures::{mesh, quad, texture};
+
+    fn grid() -> Pyramid {
+        Pyramid::new(&texture(4, 4, |x, y| {
+            [(x * 10) as u8, (y * 20) as u8, 0, 255]
+        }))
+    }
+
+    #[test]
+    fn a_texels_centre_has_its_value_and_half_way_the_mean() {
+        let grid = grid();
+        assert_eq!(grid.bilinear(0, [0.375, 0.625])[..2], [10.0, 40.0]);
+        assert_eq!(grid.bilinear(0, [0.5, 0.5])[..2], [15.0, 30.0]);
+    }
+
+    #[test]
+    fn textures_repeat() {
+        let grid = grid();
+        assert_eq!(
+            grid.bilinear(0, [0.375, 0.625]),
+            grid.bilinear(0, [5.375, -3.375])
+        );
+        // Across the border: the mean of the last column and the first.
+        assert_eq!(grid.bilinear(0, [0.0, 0.625])[0], 15.0);
+    }
+
+    #[test]
+    fn a_distant_checkerboard_is_grey_and_a_near_one_sharp() {
+        let board = Pyramid::new(&texture(64, 64, |x, y| {
+            if (x + y) % 2 == 0 {
+                [255; 4]
+            } else {
+                [0, 0, 0, 255]
+            }
+        }));
+        let at = [0.5 / 64.0, 0.5 / 64.0];
+        let far = board.filtered(at, [at[0] + 0.25, at[1]], [at[0], at[1] + 0.25]);
+        assert!((far[0] - 127.5).abs() < 1.0, "{far:?}");
+        let near = board.filtered(at, [at[0] + 0.001, at[1]], [at[0], at[1] + 0.001]);
+        assert_eq!(near[0], 255.0);
+    }
+
+    #[test]
+    fn what_is_cut_away_does_not_bleed_into_coarser_levels() {
+        let half_seen = texture(2, 1, |x, _| {
+            if x == 0 {
+                [200, 100, 50, 255]
+            } else {
+                [0, 0, 0, 0]
+            }
+        });
+        let coarse = half(&half_seen);
+        assert_eq!(coarse.rgba, [[200, 100, 50, 128]]);
+    }
+
+    #[test]
+    fn a_tint_of_nothing_changes_nothing_and_a_third_of_a_turn_swaps_channels() {
+        let colour = [200.0, 100.0, 50.0];
+        let close = |a: [f32; 3], b: [f32; 3]| (0..3).all(|i| (a[i] - b[i]).abs() < 0.01);
+        assert!(close(Tint::new(0.0, 1.0, [1.0; 3]).apply(colour), colour));
+        let third = Tint::new(std::f32::consts::TAU / 3.0, 1.0, [1.0; 3]);
+        assert!(close(third.apply(colour), [50.0, 200.0, 100.0]));
+    }
+
+    #[test]
+    fn alpha_of_127_is_hidden_and_of_128_seen() {
+        for (alpha, seen) in [(127, false), (128, true)] {
+            let skin = texture(1, 1, |_, _| [0, 0, 0, alpha]);
+            let part = quad([0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], Some(skin));
+            let surface = Surface::new(&mesh(part));
+            let face = surface.faces().next().unwrap();
+            assert_eq!(surface.is_opaque(face, [0.2, 0.3, 0.5]), seen, "{alpha}");
+        }
+    }
+
+    #[test]
+    fn normals_are_smooth_across_a_seam_of_the_texture() {
+        // A roof of two quads that meet at x = 1 but share no vertex index.
+        let mut roof = quad([0.0; 3], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0], None);
+        let other = quad([1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0], None);
+        let shift = roof.positions.len() as u32;
+        roof.positions.extend(other.positions);
+        roof.triangles
+            .extend(other.triangles.iter().map(|t| t.map(|v| v + shift)));
+        let mut surface = Surface::new(&mesh(roof));
+        surface.find_normals();
+        let piece = &surface.parts[0];
+        for end in 0..2 {
+            let place = [1.0, 1.0, end as f32];
+            let normals: Vec<[f32; 3]> = (piece.positions.iter().zip(piece.normals.iter()))
+                .filter(|(p, _)| **p == place)
+                .map(|(_, n)| *n)
+                .collect();
+            assert_eq!(normals.len(), 2);
+            assert_eq!(normals[0], normals[1]);
+            // The slopes' own normals have 0.71 along both.
+            assert!(normals[0][0].abs() < 0.4 && normals[0][1].abs() > 0.9);
+        }
+    }
+}

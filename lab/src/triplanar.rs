@@ -84,3 +84,46 @@ pub fn load_folder(folder: &Path) -> Result<Vec<(Arc<Pyramid>, f32)>> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::fixtures::texture;
+
+    fn photograph() -> Photograph {
+        Photograph {
+            pyramid: Arc::new(Pyramid::new(&texture(8, 4, |x, y| {
+                [(x * 30) as u8, (y * 60) as u8, 0, 255]
+            }))),
+            period: 4.0,
+            aspect: 2.0,
+            offset: [[0.0; 2]; 3],
+            shaded: false,
+        }
+    }
+
+    #[test]
+    fn a_wall_that_faces_an_axis_shows_the_picture_upright_and_undistorted() {
+        let photograph = photograph();
+        // One texel is one unit of length; the picture's top is up.
+        let at = |x: f32, y: f32| photograph.colour([[x, y, 7.0]; 3], [0.0, 0.0, 1.0]);
+        assert_eq!(at(2.5, -1.5), [60.0, 60.0, 0.0]);
+        assert_eq!(at(3.5, -2.5), [90.0, 120.0, 0.0]);
+        let side = photograph.colour([[7.0, -1.5, 2.5]; 3], [-1.0, 0.0, 0.0]);
+        assert_eq!(side, [60.0, 60.0, 0.0]);
+    }
+
+    #[test]
+    fn between_two_axes_both_projections_count_alike() {
+        let photograph = photograph();
+        let place = [[2.5, -1.5, 3.5]; 3];
+        let (x, z) = (
+            photograph.colour(place, [1.0, 0.0, 0.0]),
+            photograph.colour(place, [0.0, 0.0, 1.0]),
+        );
+        let between = photograph.colour(place, [0.5f32.sqrt(), 0.0, 0.5f32.sqrt()]);
+        for i in 0..3 {
+            assert!((between[i] - (x[i] + z[i]) / 2.0).abs() < 1e-3);
+        }
+    }
+}

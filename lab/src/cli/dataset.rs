@@ -29,6 +29,9 @@ pub struct Args {
     /// Everything random follows from it
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Bit depth of the clouds that crops are cut from
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u8).range(4..=21))]
+    bits: u8,
     /// Side of a crop in finest voxels: a power of two
     #[arg(long, default_value_t = 128)]
     crop: u32,
@@ -60,6 +63,7 @@ impl Args {
         let options = Options {
             count: self.count,
             seed: self.seed,
+            bits: self.bits,
             crop: self.crop,
             views: self.views,
             size: self.size,

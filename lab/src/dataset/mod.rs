@@ -43,7 +43,9 @@ pub struct Options {
     pub count: usize,
     /// Everything random follows from it.
     pub seed: u64,
-    /// Side of a crop in finest voxels; a power of two, at least 16.
+    /// Bit depth of the clouds that crops are cut from, where the object is not sampled to fit a single crop.
+    pub bits: u8,
+    /// Side of a crop in finest voxels; a power of two, at least 16 and at most `2^bits`.
     pub crop: u32,
     /// Pictures per sample.
     pub views: usize,
@@ -127,10 +129,12 @@ pub fn write(
     if objects.is_empty() {
         return Err(LabError::Usage("no meshes to cut samples from".into()));
     }
-    if !options.crop.is_power_of_two() || !(16..=1024).contains(&options.crop) {
+    let sides = 16..=1u32 << options.bits.min(b2p::geometry::morton::MAX_DEPTH);
+    if !options.crop.is_power_of_two() || !sides.contains(&options.crop) {
         return Err(LabError::Usage(format!(
-            "crop is {}, expected a power of two from 16 to 1024",
-            options.crop
+            "crop is {}, expected a power of two from 16 to {}",
+            options.crop,
+            sides.end()
         )));
     }
     std::fs::create_dir_all(folder).map_err(LabError::io(folder))?;
@@ -162,7 +166,7 @@ fn sample(
     for attempt in 0..TRIES_PER_OBJECT * OBJECTS_TRIED {
         let object = &objects[turn(objects, options.seed, index, attempt / TRIES_PER_OBJECT)];
         let variant =
-            variant::Variant::random(object.kind, options.crop, !photos.is_empty(), &mut random);
+            variant::Variant::random(object.kind, options, !photos.is_empty(), &mut random);
         let (surface, grid) = variant.apply(&object.surface, photos, &mut random)?;
         let sampler = Sampler::new(&surface, grid, variant.points, random.bits())?;
         let only = crop::place(&sampler, &grid, variant.points, options.crop, &mut random);
@@ -213,3 +217,6 @@ fn whole(grid: &Grid) -> VoxelBox {
         high: [1 << grid.bits; 3],
     }
 }
+
+#[cfg(test)]
+mod tests;

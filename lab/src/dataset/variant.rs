@@ -6,7 +6,7 @@ use crate::sample::Grid;
 use crate::surface::{Surface, Tint};
 use crate::triplanar::Photograph;
 
-use super::Photo;
+use super::{Options, Photo};
 
 /// What kind of object a file holds, told by its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,12 +56,12 @@ const PROTOCOL_FILL: f64 = 0.95;
 const PROTOCOL_BITS: u8 = 10;
 
 impl Variant {
-    pub fn random(kind: Kind, crop: u32, photos: bool, random: &mut Random) -> Self {
+    pub fn random(kind: Kind, options: &Options, photos: bool, random: &mut Random) -> Self {
         let small = random.chance(0.1);
         let bits = if small {
-            crop.trailing_zeros() as u8
+            options.crop.trailing_zeros() as u8
         } else {
-            PROTOCOL_BITS.max(crop.trailing_zeros() as u8)
+            options.bits
         };
         let as_sampled = if kind == Kind::Person { 0.75 } else { 0.5 };
         let fill = if random.chance(as_sampled) {

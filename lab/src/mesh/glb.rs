@@ -240,3 +240,7 @@ impl From<image::DynamicImage> for Texture {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "glb_tests.rs"]
+mod tests;

@@ -1,5 +1,7 @@
 //! Textured triangle meshes: where clouds and ground-truth pictures come from.
 
+#[cfg(test)]
+pub(crate) mod fixtures;
 pub mod glb;
 /// A mesh in its own units, y up.
 #[derive(Debug, Clone, Default)]
