@@ -14,8 +14,11 @@ use crate::mesh::Mesh;
 /// Texels per unit of length on objects that fill the unit sphere: more than voxels of a 10-bit cloud.
 const DENSITY: f32 = 700.0;
 
+/// A shape by chance, about as large as the unit sphere.
+type Shape = fn(&mut Rng) -> Vec<Patch>;
+
 /// The shapes that [`objects`] makes one each of, by name.
-const SHAPES: [(&str, fn(&mut Rng) -> Vec<Patch>); 16] = [
+const SHAPES: [(&str, Shape); 16] = [
     ("sphere", |_| vec![shapes::sphere()]),
     ("box", cuboid),
     ("torus", torus),

@@ -1,0 +1,281 @@
+//! How far a picture is from the truth.
+
+use fast_ssim2::{PixelDescriptor, PixelSlice, Ssimulacra2Error, Ssimulacra2Reference};
+
+use super::picture::Picture;
+
+/// Peak signal-to-noise ratio in dB over all pixels and the three channels; infinite for equal pictures.
+///
+/// # Panics
+/// If the pictures differ in size.
+pub fn psnr(a: &Picture, b: &Picture) -> f64 {
+    decibel(a, b, |_| true)
+}
+
+/// [`psnr`] over the pixels of a mask alone; infinite if there are none.
+///
+/// # Panics
+/// If the pictures and the mask differ in size.
+pub fn masked_psnr(a: &Picture, b: &Picture, mask: &[bool]) -> f64 {
+    assert_eq!(a.rgb.len(), mask.len(), "a mask has a picture's pixels");
+    decibel(a, b, |i| mask[i])
+}
+
+fn decibel(a: &Picture, b: &Picture, counts: impl Fn(usize) -> bool) -> f64 {
+    assert_same_size(a, b);
+    let (mut sum, mut count) = (0u64, 0u64);
+    for (i, (p, q)) in a.rgb.iter().zip(&b.rgb).enumerate() {
+        if counts(i) {
+            let square = |k: usize| u64::from(p[k].abs_diff(q[k])).pow(2);
+            sum += square(0) + square(1) + square(2);
+            count += 3;
+        }
+    }
+    if sum == 0 {
+        return f64::INFINITY;
+    }
+    10.0 * (255.0 * 255.0 * count as f64 / sum as f64).log10()
+}
+
+fn assert_same_size(a: &Picture, b: &Picture) {
+    assert_eq!(
+        (a.width, a.height),
+        (b.width, b.height),
+        "pictures to compare are of one size"
+    );
+}
+
+/// Weights of the five scales of [`ms_ssim`], the finest first (Wang, Simoncelli and Bovik 2003).
+const SCALES: [f64; 5] = [0.0448, 0.2856, 0.3001, 0.2363, 0.1333];
+/// Half the taps of its window, without the middle one.
+const REACH: usize = 5;
+
+/// Multi-scale structural similarity of the three channels, then their mean: 1 for equal pictures.
+///
+/// As the `pytorch_msssim` package computes it for a data range of 255: Gaussian window of 11 taps, σ 1.5, no padding;
+/// K = 0.01, 0.03; means over 2×2 from scale to scale, with zeros around odd sides. None if a side is 160 pixels or less.
+///
+/// # Panics
+/// If the pictures differ in size.
+pub fn ms_ssim(a: &Picture, b: &Picture) -> Option<f64> {
+    assert_same_size(a, b);
+    if a.width.min(a.height) <= 2 * REACH << (SCALES.len() - 1) {
+        return None;
+    }
+    let channels = (0..3).map(|k| {
+        let plane = |p: &Picture| Plane {
+            width: p.width,
+            height: p.height,
+            values: p.rgb.iter().map(|c| f32::from(c[k])).collect(),
+        };
+        let (mut x, mut y) = (plane(a), plane(b));
+        let mut product = 1.0;
+        for (scale, weight) in SCALES.iter().enumerate() {
+            if scale > 0 {
+                (x, y) = (x.half(), y.half());
+            }
+            let [ssim, contrast] = similarity(&x, &y);
+            let last = scale + 1 == SCALES.len();
+            product *= if last { ssim } else { contrast }.max(0.0).powf(*weight);
+        }
+        product
+    });
+    Some(channels.sum::<f64>() / 3.0)
+}
+
+/// Means of structural similarity and of its contrast and structure part over all whole windows.
+fn similarity(x: &Plane, y: &Plane) -> [f64; 2] {
+    const C1: f32 = (0.01 * 255.0) * (0.01 * 255.0);
+    const C2: f32 = (0.03 * 255.0) * (0.03 * 255.0);
+    let (mx, my) = (x.blur(), y.blur());
+    let product = |a: &Plane, b: &Plane| {
+        let values = a.values.iter().zip(&b.values).map(|(a, b)| a * b).collect();
+        Plane { values, ..*a }.blur()
+    };
+    let (xx, yy, xy) = (product(x, x), product(y, y), product(x, y));
+    let (mut ssim, mut contrast) = (0.0, 0.0);
+    for i in 0..mx.values.len() {
+        let (ux, uy) = (mx.values[i], my.values[i]);
+        let variances = (xx.values[i] - ux * ux) + (yy.values[i] - uy * uy);
+        let covariance = xy.values[i] - ux * uy;
+        let structure = (2.0 * covariance + C2) / (variances + C2);
+        contrast += f64::from(structure);
+        ssim += f64::from((2.0 * ux * uy + C1) / (ux * ux + uy * uy + C1) * structure);
+    }
+    let count = mx.values.len() as f64;
+    [ssim / count, contrast / count]
+}
+
+struct Plane {
+    width: usize,
+    height: usize,
+    values: Vec<f32>,
+}
+
+impl Plane {
+    /// Convolved with the window; 10 less in each extent.
+    fn blur(&self) -> Plane {
+        let window = window();
+        let (width, height) = (self.width - 2 * REACH, self.height - 2 * REACH);
+        let mut down = vec![0.0; self.width * height];
+        for (y, row) in down.chunks_exact_mut(self.width).enumerate() {
+            for (k, w) in window.iter().enumerate() {
+                let from = &self.values[(y + k) * self.width..][..self.width];
+                row.iter_mut().zip(from).for_each(|(r, f)| *r += w * f);
+            }
+        }
+        let mut values = vec![0.0; width * height];
+        for (y, row) in values.chunks_exact_mut(width).enumerate() {
+            for (k, w) in window.iter().enumerate() {
+                let from = &down[y * self.width + k..][..width];
+                row.iter_mut().zip(from).for_each(|(r, f)| *r += w * f);
+            }
+        }
+        Plane {
+            width,
+            height,
+            values,
+        }
+    }
+
+    /// Means over 2×2; an odd side gets a zero before its first and after its last pixel.
+    fn half(&self) -> Plane {
+        let (ox, oy) = (self.width % 2, self.height % 2);
+        let (width, height) = ((self.width + 2 * ox) / 2, (self.height + 2 * oy) / 2);
+        let at = |x: usize, y: usize| {
+            if x < ox || y < oy || x - ox >= self.width || y - oy >= self.height {
+                0.0
+            } else {
+                self.values[(y - oy) * self.width + x - ox]
+            }
+        };
+        let mean = |x: usize, y: usize| {
+            let (x, y) = (2 * x, 2 * y);
+            0.25 * (at(x, y) + at(x + 1, y) + at(x, y + 1) + at(x + 1, y + 1))
+        };
+        let values = (0..height)
+            .flat_map(|y| (0..width).map(move |x| (x, y)))
+            .map(|(x, y)| mean(x, y))
+            .collect();
+        Plane {
+            width,
+            height,
+            values,
+        }
+    }
+}
+
+fn window() -> [f32; 2 * REACH + 1] {
+    let bell: [f64; 2 * REACH + 1] = std::array::from_fn(|i| {
+        let d = i as f64 - REACH as f64;
+        (-d * d / (2.0 * 1.5 * 1.5)).exp()
+    });
+    let sum: f64 = bell.iter().sum();
+    bell.map(|w| (w / sum) as f32)
+}
+
+/// The truth, prepared for SSIMULACRA2.
+pub struct Ssimulacra2(Ssimulacra2Reference);
+
+impl Ssimulacra2 {
+    /// Prepares the picture that others will be compared to.
+    ///
+    /// # Errors
+    /// If the picture is too small for the metric.
+    pub fn new(truth: &Picture) -> Result<Self, Ssimulacra2Error> {
+        Ssimulacra2Reference::new(&slice(truth)?).map(Ssimulacra2)
+    }
+
+    /// The score: 100 for equal pictures, 90 hardly to be told apart, 50 middling, below 0 very bad.
+    ///
+    /// # Errors
+    /// If the picture is of another size.
+    pub fn score(&self, picture: &Picture) -> Result<f64, Ssimulacra2Error> {
+        self.0.compare(&slice(picture)?)
+    }
+}
+
+fn slice(picture: &Picture) -> Result<PixelSlice<'_>, Ssimulacra2Error> {
+    let (width, height) = (picture.width as u32, picture.height as u32);
+    let format = PixelDescriptor::RGB8_SRGB;
+    PixelSlice::new(picture.bytes(), width, height, picture.width * 3, format)
+        .map_err(|_| Ssimulacra2Error::InvalidImageSize)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::procedural::rng::Rng;
+
+    fn noisy(width: usize, height: usize, base: &Picture, strength: f32, seed: u64) -> Picture {
+        let mut rng = Rng::new(seed);
+        let colours = base.rgb.iter().map(|c| {
+            c.map(|v| (f32::from(v) + rng.range(-strength, strength)) / 255.0)
+        });
+        Picture::quantise(width, height, colours)
+    }
+
+    /// Stripes and gradients.
+    fn scene(width: usize, height: usize) -> Picture {
+        let colours = (0..width * height).map(|i| {
+            let (x, y) = ((i % width) as f32, (i / width) as f32);
+            let wave = |f: f32| 0.5 + 0.4 * (x * f + y * 0.07).sin();
+            [wave(0.3), wave(0.11), y / height as f32]
+        });
+        Picture::quantise(width, height, colours)
+    }
+
+    #[test]
+    fn a_difference_of_one_everywhere_is_48_db() {
+        let (a, b) = (Picture::new(8, 8, [100; 3]), Picture::new(8, 8, [101; 3]));
+        assert!((psnr(&a, &b) - 20.0 * 255f64.log10()).abs() < 1e-9);
+        assert_eq!(psnr(&a, &a), f64::INFINITY);
+    }
+
+    #[test]
+    fn a_mask_hides_what_is_outside() {
+        let a = Picture::new(4, 1, [10; 3]);
+        let mut b = a.clone();
+        b.rgb[0] = [250; 3];
+        b.rgb[1] = [10, 20, 10];
+        let inside = masked_psnr(&a, &b, &[false, true, true, false]);
+        assert!((inside - 10.0 * (255f64 * 255.0 * 6.0 / 100.0).log10()).abs() < 1e-9);
+    }
+
+    #[test]
+    fn ms_ssim_is_1_for_equal_pictures_symmetric_and_falls_with_noise() {
+        let truth = scene(200, 170);
+        let (little, much) = (noisy(200, 170, &truth, 8.0, 1), noisy(200, 170, &truth, 60.0, 1));
+        let score = |p: &Picture| ms_ssim(&truth, p).unwrap();
+        assert!((score(&truth) - 1.0).abs() < 1e-5);
+        assert!((score(&little) - ms_ssim(&little, &truth).unwrap()).abs() < 1e-6);
+        assert!(score(&much) < score(&little) && score(&little) < 1.0);
+    }
+
+    #[test]
+    fn ms_ssim_of_a_constant_shift_is_that_of_the_means_at_the_coarsest_scale() {
+        let (a, b) = (Picture::new(176, 176, [100; 3]), Picture::new(176, 176, [120; 3]));
+        let c1 = 2.55f64 * 2.55;
+        let means = (2.0 * 100.0 * 120.0 + c1) / (100.0 * 100.0 + 120.0 * 120.0 + c1);
+        assert!((ms_ssim(&a, &b).unwrap() - means.powf(SCALES[4])).abs() < 1e-4);
+    }
+
+    #[test]
+    fn ms_ssim_needs_more_than_160_pixels_a_side() {
+        let small = Picture::new(160, 400, [0; 3]);
+        assert_eq!(ms_ssim(&small, &small), None);
+        let enough = Picture::new(161, 163, [0; 3]);
+        assert!(ms_ssim(&enough, &enough).is_some());
+    }
+
+    #[test]
+    fn ssimulacra2_is_100_for_equal_pictures_and_falls_with_noise() {
+        let truth = scene(64, 64);
+        let reference = Ssimulacra2::new(&truth).unwrap();
+        let score = |p: &Picture| reference.score(p).unwrap();
+        assert_eq!(score(&truth), 100.0);
+        let (little, much) = (noisy(64, 64, &truth, 8.0, 2), noisy(64, 64, &truth, 60.0, 2));
+        assert!(score(&much) < score(&little) && score(&little) < 100.0);
+        assert!(reference.score(&scene(64, 65)).is_err());
+    }
+}
