@@ -4,6 +4,7 @@
 pub mod cli;
 pub mod dataset;
 pub mod error;
+pub mod eval;
 pub mod mesh;
 pub mod procedural;
 pub mod random;

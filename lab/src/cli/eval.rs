@@ -7,6 +7,7 @@ use b2p::cloud::{PointCloud, voxelise};
 use b2p::gaussians::Frame;
 use b2p::placement::Placement;
 
+use super::load_mesh;
 use crate::error::{LabError, Result};
 use crate::eval::item::{self, Item};
 use crate::eval::points::Points;
@@ -14,7 +15,6 @@ use crate::eval::protocol::{Truth, VIEWS};
 use crate::eval::report::{Rate, Report, Row};
 use crate::eval::sheet::{SheetRow, contact_sheet};
 use crate::eval::{Drawn, judge_cloud};
-use crate::procedural;
 use crate::sample::Grid;
 use crate::surface::Surface;
 
@@ -62,7 +62,7 @@ impl Args {
     /// If a file cannot be read or written, or the mesh is not seen.
     pub fn run(self) -> Result<()> {
         let limits = Limits::default();
-        let surface = Surface::new(&procedural::open(&self.mesh)?);
+        let surface = Surface::new(&load_mesh(&self.mesh)?);
         let cloud = match &self.cloud {
             Some(path) => Some(item::read_cloud(path, &limits)?),
             None => None,
@@ -113,14 +113,18 @@ impl Args {
 
     fn write(&self, folder: &Path, report: &Report, truth: &Truth, drawn: &[Drawn]) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(LabError::io(folder))?;
-        let write = |name: &str, bytes: &[u8]| crate::sample::write_bytes(&folder.join(name), bytes);
+        let write =
+            |name: &str, bytes: &[u8]| crate::sample::write_bytes(&folder.join(name), bytes);
         write("scores.md", report.to_markdown().as_bytes())?;
         let json = report.to_json();
         let failed = |e| LabError::Usage(format!("the report cannot be written as JSON: {e}"));
         write("scores.json", json.map_err(failed)?.as_bytes())?;
         let step = 360 / VIEWS as u32;
         let chosen = |pictures: Vec<_>| -> Vec<_> {
-            self.columns.iter().map(|c| pictures[(c / step) as usize]).collect()
+            self.columns
+                .iter()
+                .map(|c| pictures[(c / step) as usize])
+                .collect()
         };
         let mut rows = vec![SheetRow {
             label: "truth".into(),
@@ -156,7 +160,12 @@ fn label(row: &Row) -> String {
         Some(rate) => format!(", {:.3} bpp", rate.total),
         None => String::new(),
     };
-    let Row { name, drawn, scores, .. } = row;
+    let Row {
+        name,
+        drawn,
+        scores,
+        ..
+    } = row;
     format!(
         "{name}, {drawn}{rate}: {:.2} dB, foreground {:.2} dB",
         scores.psnr, scores.foreground_psnr

@@ -1,6 +1,8 @@
 //! The program's subcommands.
 
 pub mod dataset;
+pub mod eval;
+pub mod scene;
 pub mod voxelize;
 
 use std::path::Path;
@@ -23,6 +25,8 @@ pub struct Cli {
 enum Command {
     Voxelize(voxelize::Args),
     Dataset(dataset::Args),
+    Scene(scene::Args),
+    Eval(eval::Args),
 }
 
 impl Cli {
@@ -34,6 +38,8 @@ impl Cli {
         match self.command {
             Command::Voxelize(args) => args.run(),
             Command::Dataset(args) => args.run(),
+            Command::Scene(args) => args.run(),
+            Command::Eval(args) => args.run(),
         }
     }
 }

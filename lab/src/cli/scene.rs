@@ -17,7 +17,7 @@ pub struct Args {
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u8).range(1..=21))]
     bits: u8,
     /// The share of the cube's side that the scene's height spans
-    #[arg(long, default_value_t = 0.95)]
+    #[arg(long, default_value_t = 0.75)]
     fill: f64,
     /// How many points to draw
     #[arg(long, default_value_t = 15_000_000)]

@@ -71,7 +71,8 @@ pub fn read(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     let damaged = |error: &dyn std::fmt::Display| {
         LabError::Usage(format!("{}: zstd: {error}", path.display()))
     };
-    let unpacker = ruzstd::decoding::StreamingDecoder::new(bytes.as_slice()).map_err(|e| damaged(&e))?;
+    let unpacker =
+        ruzstd::decoding::StreamingDecoder::new(bytes.as_slice()).map_err(|e| damaged(&e))?;
     let mut plain = Vec::new();
     unpacker
         .take(limits.max_bytes + 1)

@@ -209,9 +209,10 @@ mod tests {
 
     fn noisy(width: usize, height: usize, base: &Picture, strength: f32, seed: u64) -> Picture {
         let mut rng = Rng::new(seed);
-        let colours = base.rgb.iter().map(|c| {
-            c.map(|v| (f32::from(v) + rng.range(-strength, strength)) / 255.0)
-        });
+        let colours = base
+            .rgb
+            .iter()
+            .map(|c| c.map(|v| (f32::from(v) + rng.range(-strength, strength)) / 255.0));
         Picture::quantise(width, height, colours)
     }
 
@@ -245,7 +246,10 @@ mod tests {
     #[test]
     fn ms_ssim_is_1_for_equal_pictures_symmetric_and_falls_with_noise() {
         let truth = scene(200, 170);
-        let (little, much) = (noisy(200, 170, &truth, 8.0, 1), noisy(200, 170, &truth, 60.0, 1));
+        let (little, much) = (
+            noisy(200, 170, &truth, 8.0, 1),
+            noisy(200, 170, &truth, 60.0, 1),
+        );
         let score = |p: &Picture| ms_ssim(&truth, p).unwrap();
         assert!((score(&truth) - 1.0).abs() < 1e-5);
         assert!((score(&little) - ms_ssim(&little, &truth).unwrap()).abs() < 1e-6);
@@ -254,7 +258,10 @@ mod tests {
 
     #[test]
     fn ms_ssim_of_a_constant_shift_is_that_of_the_means_at_the_coarsest_scale() {
-        let (a, b) = (Picture::new(176, 176, [100; 3]), Picture::new(176, 176, [120; 3]));
+        let (a, b) = (
+            Picture::new(176, 176, [100; 3]),
+            Picture::new(176, 176, [120; 3]),
+        );
         let c1 = 2.55f64 * 2.55;
         let means = (2.0 * 100.0 * 120.0 + c1) / (100.0 * 100.0 + 120.0 * 120.0 + c1);
         assert!((ms_ssim(&a, &b).unwrap() - means.powf(SCALES[4])).abs() < 1e-4);
@@ -274,7 +281,10 @@ mod tests {
         let reference = Ssimulacra2::new(&truth).unwrap();
         let score = |p: &Picture| reference.score(p).unwrap();
         assert_eq!(score(&truth), 100.0);
-        let (little, much) = (noisy(64, 64, &truth, 8.0, 2), noisy(64, 64, &truth, 60.0, 2));
+        let (little, much) = (
+            noisy(64, 64, &truth, 8.0, 2),
+            noisy(64, 64, &truth, 60.0, 2),
+        );
         assert!(score(&much) < score(&little) && score(&little) < 100.0);
         assert!(reference.score(&scene(64, 65)).is_err());
     }

@@ -66,7 +66,11 @@ fn search(
     let (low, high) = (range.start..middle, middle + 1..range.end);
     let beyond = at[axis] - tree[middle][axis];
     // Which half a point is in does not follow from its coordinate where that equals the median's: both are searched then.
-    let (near, far) = if beyond < 0.0 { (low, high) } else { (high, low) };
+    let (near, far) = if beyond < 0.0 {
+        (low, high)
+    } else {
+        (high, low)
+    };
     search(tree, near, depth + 1, own, best);
     if beyond * beyond <= *best {
         search(tree, far, depth + 1, own, best);
@@ -93,7 +97,8 @@ mod tests {
         let points: Vec<[f32; 3]> = (0..700)
             .map(|_| (rng.direction() * rng.unit()).to_array())
             .collect();
-        let of = |p: &[f32; 3], q: &[f32; 3]| -> f32 { (0..3).map(|k| (p[k] - q[k]).powi(2)).sum() };
+        let of =
+            |p: &[f32; 3], q: &[f32; 3]| -> f32 { (0..3).map(|k| (p[k] - q[k]).powi(2)).sum() };
         let brute = points.iter().enumerate().map(|(i, p)| {
             let others = points.iter().enumerate().filter(|(j, _)| *j != i);
             f64::from(others.map(|(_, q)| of(p, q)).fold(f32::INFINITY, f32::min)).sqrt()

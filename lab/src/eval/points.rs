@@ -167,7 +167,12 @@ mod tests {
 
     #[test]
     fn what_is_behind_the_camera_or_beside_the_picture_is_not_drawn() {
-        for position in [[0.0, 0.0, 3.5], [0.0, 0.0, 3.0], [90.0, 0.0, 0.0], [0.0, -90.0, 0.0]] {
+        for position in [
+            [0.0, 0.0, 3.5],
+            [0.0, 0.0, 3.0],
+            [90.0, 0.0, 0.0],
+            [0.0, -90.0, 0.0],
+        ] {
             assert_eq!(red(&one(position, 0.1).draw_squares(&camera(), 1.0)), 0);
         }
     }

@@ -126,7 +126,8 @@ impl Truth {
     pub fn judge_gaussians(&self, gaussians: &Gaussians) -> Result<Judged> {
         self.judge(|camera| {
             let white = Background::WHITE;
-            let (image, _) = Renderer::default().render(gaussians, camera, white, &Limits::default())?;
+            let (image, _) =
+                Renderer::default().render(gaussians, camera, white, &Limits::default())?;
             Ok(image)
         })
     }

@@ -75,14 +75,24 @@ impl Report {
             let _ = writeln!(
                 text,
                 "| {} | {} | {bpp} | {:.2} | {:.2} | {:.4} | {:.2} | {} |",
-                row.name, row.drawn, s.psnr, s.foreground_psnr, s.ms_ssim, s.ssimulacra2, row.primitives
+                row.name,
+                row.drawn,
+                s.psnr,
+                s.foreground_psnr,
+                s.ms_ssim,
+                s.ssimulacra2,
+                row.primitives
             );
         }
         let mut levels = String::new();
         for row in &self.rows {
             for level in row.rate.iter().flat_map(|r| &r.levels) {
                 let (name, drawn) = (&row.name, &row.drawn);
-                let LevelRate { level, geometry, features } = level;
+                let LevelRate {
+                    level,
+                    geometry,
+                    features,
+                } = level;
                 let _ = writeln!(
                     levels,
                     "| {name} | {drawn} | {level} | {geometry:.4} | {features:.4} |"
@@ -137,7 +147,9 @@ mod tests {
     fn the_table_has_a_line_per_row_and_levels_only_for_streams() {
         let plain = report(26.1, Vec::new()).to_markdown();
         assert_eq!(plain.lines().count(), 3);
-        assert!(plain.contains("| a | squares ×1 | 0.4000 | 26.10 | 25.00 | 0.9800 | 61.50 | 10 |"));
+        assert!(
+            plain.contains("| a | squares ×1 | 0.4000 | 26.10 | 25.00 | 0.9800 | 61.50 | 10 |")
+        );
         let level = LevelRate {
             level: 8,
             geometry: 0.05,

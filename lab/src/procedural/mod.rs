@@ -16,10 +16,7 @@ pub mod shapes;
 pub use objects::objects;
 pub use scene::scene;
 
-use std::path::Path;
-
-use crate::error::{LabError, Result};
-use crate::mesh::{Mesh, glb};
+use crate::mesh::Mesh;
 
 /// What a name must start with where a mesh's file name would also do.
 pub const PREFIX: &str = "procedural:";
@@ -33,19 +30,6 @@ pub fn named(name: &str) -> Option<Mesh> {
     }
     let (name, seed) = name.split_once('@').unwrap_or((name, "0"));
     objects::object(name, seed.parse().ok()?)
-}
-
-/// A mesh from a file, or [`named`].
-///
-/// # Errors
-/// If the file cannot be read, or there is no mesh of that name.
-pub fn open(path: &Path) -> Result<Mesh> {
-    match path.to_str() {
-        Some(name) if name.starts_with(PREFIX) => {
-            named(name).ok_or_else(|| LabError::Usage(format!("there is no mesh called {name}")))
-        }
-        _ => glb::load(path),
-    }
 }
 
 #[cfg(test)]

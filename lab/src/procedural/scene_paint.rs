@@ -46,7 +46,7 @@ pub fn vase() -> Pattern {
             return if tooth > t { TERRACOTTA } else { COBALT };
         }
         if let Some(t) = band(0.375, 0.59) {
-            return rosettes(Vec2::new(s.uv.x * 9.0, t), glaze);
+            return rosettes(Vec2::new(s.uv.x * 7.0, t), glaze);
         }
         if let Some(t) = band(0.622, 0.69) {
             let x = ((s.uv.x * 36.0).fract() * 8.0) as u32;
@@ -74,9 +74,10 @@ pub fn vase() -> Pattern {
 
 /// Flowers of six petals with dots between them; `p.x` counts flowers.
 fn rosettes(p: Vec2, ground: Vec3) -> Vec3 {
-    let to = Vec2::new(p.x.fract() - 0.5, p.y - 0.5);
+    // Cells are higher than wide.
+    let to = Vec2::new(p.x.fract() - 0.5, 1.35 * (p.y - 0.5));
     let (distance, angle) = (to.length(), to.y.atan2(to.x));
-    let petal = 0.31 + 0.12 * (6.0 * angle).cos();
+    let petal = 0.33 + 0.13 * (6.0 * angle).cos();
     if distance < 0.085 {
         hsv(0.12, 0.8, 0.95)
     } else if distance < petal - 0.05 {
@@ -88,7 +89,7 @@ fn rosettes(p: Vec2, ground: Vec3) -> Vec3 {
         }
     } else if distance < petal {
         COBALT
-    } else if Vec2::new((p.x + 0.5).fract() - 0.5, (p.y - 0.5).abs() - 0.36).length() < 0.06 {
+    } else if Vec2::new((p.x + 0.5).fract() - 0.5, 1.35 * (p.y - 0.5).abs() - 0.5).length() < 0.06 {
         TERRACOTTA
     } else {
         ground
@@ -113,13 +114,13 @@ fn lines(st: Vec2, corner: Vec2, lines: &[(&str, f32)]) -> bool {
 /// The plaque's text, each line smaller than the one above, down to dots of about one voxel of a 10-bit cloud.
 pub fn plaque(size: Vec2) -> Pattern {
     const TEXT: [(&str, f32); 7] = [
-        ("b2p", 0.0120),
-        ("bits to photon", 0.0042),
-        ("A cloud of points goes in,", 0.0023),
-        ("Gaussians come out.", 0.0031),
-        ("The quick brown fox jumps over", 0.0020),
-        ("the lazy dog. 0123456789", 0.0025),
-        ("{f(x)} = [1/2] <&> \"@#$%\" ~ ?!", 0.0020),
+        ("b2p", 0.0105),
+        ("bits to photon", 0.0038),
+        ("A cloud of points goes", 0.0024),
+        ("in, Gaussians come out.", 0.0022),
+        ("The quick brown fox jumps", 0.0021),
+        ("over the lazy dog. 0123", 0.0023),
+        ("{f(x)} [1/2] <&> \"@#$%\"", 0.0020),
     ];
     Arc::new(move |s: &Spot| {
         let edge = s.st.min(size - s.st).min_element();
@@ -127,11 +128,11 @@ pub fn plaque(size: Vec2) -> Pattern {
         if (0.008..0.011).contains(&edge) {
             return TERRACOTTA;
         }
-        if edge < 0.004 || lines(s.st, Vec2::new(0.022, 0.026), &TEXT) {
+        if edge < 0.004 || lines(s.st, Vec2::new(0.020, 0.024), &TEXT) {
             return INK;
         }
         // Colour bars right of the title, where its line leaves room.
-        let bar = (s.st - Vec2::new(size.x - 0.140, 0.030)) / Vec2::new(0.0145, 0.038);
+        let bar = (s.st - Vec2::new(size.x - 0.124, 0.028)) / Vec2::new(0.0128, 0.033);
         if (0.0..8.0).contains(&bar.x) && (0.0..2.0).contains(&bar.y) {
             let t = bar.x.floor();
             return if bar.y < 1.0 {
