@@ -59,7 +59,7 @@ const REACH: usize = 5;
 /// If the pictures differ in size.
 pub fn ms_ssim(a: &Picture, b: &Picture) -> Option<f64> {
     assert_same_size(a, b);
-    if a.width.min(a.height) <= 2 * REACH << (SCALES.len() - 1) {
+    if a.width.min(a.height) <= (2 * REACH) << (SCALES.len() - 1) {
         return None;
     }
     let channels = (0..3).map(|k| {
