@@ -19,6 +19,7 @@ pub mod gaussians;
 pub mod geometry;
 pub mod limits;
 pub mod log;
+pub mod network;
 pub mod output;
 pub mod pixels;
 pub mod placement;

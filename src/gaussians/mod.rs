@@ -1,5 +1,9 @@
 //! 3D Gaussians in memory.
 
+mod heads;
+
+pub use heads::activate;
+
 use crate::placement::Placement;
 
 /// Renderable Gaussians, one array per parameter, all of the same length.

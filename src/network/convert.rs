@@ -1,0 +1,140 @@
+//! The encoder's own modules: feature conversion (FC), pooling, feature squeezing (FS), in floats.
+
+use b2p_kernels::{FloatConv, Isa, Taps, to_f16, to_f32};
+use half::f16;
+
+use super::layers::{apply, apply_f32, concat, reals, taps};
+use super::structure::{Convert, Encoder, ROLES};
+use super::{Model, missing};
+use crate::error::Result;
+use crate::geometry::KernelMap;
+
+impl Model {
+    /// The encoder's features of every coded level, finest first: [voxels, C] each.
+    ///
+    /// `colours` are those of the level above the finest coded one, in 0..=1, and `maps[0]` is its 3³ kernel map; the maps of the
+    /// coded levels follow, down to the base level's, and `occupancy[i]` says which children in `maps[i]` the voxels of
+    /// `maps[i + 1]` have.
+    ///
+    /// # Errors
+    /// [`crate::Error::Unsupported`] if the model can only decode.
+    ///
+    /// # Panics
+    /// If there are not one to three coded levels, or lengths disagree.
+    pub fn features(
+        &self,
+        colours: &[[f32; 3]],
+        maps: &[&KernelMap],
+        occupancy: &[&[u8]],
+    ) -> Result<Vec<Vec<f16>>> {
+        let encoder = self.encoder()?;
+        let coded = maps.len() - 1;
+        assert!(
+            (1..=ROLES).contains(&coded),
+            "one to three levels are coded"
+        );
+        assert_eq!(occupancy.len(), coded, "one link between every two levels");
+        let centred: Vec<f32> = colours.as_flattened().iter().map(|c| c - 0.5).collect();
+        let mut x = vec![f16::ZERO; centred.len()];
+        to_f16(self.isa, &centred, &mut x);
+        self.check(&x, 3, maps[0]);
+        let mut x = encoder.fc[ROLES].apply(self.isa, x, maps[0]);
+        let mut out = Vec::with_capacity(coded);
+        for (i, (map, occupancy)) in maps[1..].iter().zip(occupancy).enumerate() {
+            let pooled = pool(self.isa, &x, occupancy, self.shape.channels);
+            self.check(&pooled, self.shape.channels, map);
+            x = encoder.fc[coded - 1 - i].apply(self.isa, pooled, map);
+            out.push(x.clone());
+        }
+        Ok(out)
+    }
+
+    /// The latents [voxels, K] of a role, in ±`latent_max`, from its encoder features and, above role 0, its context.
+    ///
+    /// # Errors
+    /// [`crate::Error::Unsupported`] if the model can only decode.
+    ///
+    /// # Panics
+    /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.
+    pub fn squeeze(
+        &self,
+        role: usize,
+        features: &[f16],
+        context: Option<&[i16]>,
+    ) -> Result<Vec<i16>> {
+        let y = self.squeeze_reals(role, features, context)?;
+        let limit = f32::from(self.shape.latent_max);
+        Ok(y.into_iter()
+            .map(|y| y.clamp(-limit, limit).round_ties_even() as i16)
+            .collect())
+    }
+
+    /// The latents before they are rounded.
+    pub(super) fn squeeze_reals(
+        &self,
+        role: usize,
+        features: &[f16],
+        context: Option<&[i16]>,
+    ) -> Result<Vec<f32>> {
+        assert_eq!(
+            role > 0,
+            context.is_some(),
+            "all roles but 0 have a context"
+        );
+        let (fs, c) = (&self.encoder()?.fs[role], self.shape.channels);
+        let rows = features.len() / c;
+        let hidden = match context {
+            None => apply(self.isa, &fs.lin1, Taps::Same, features, rows, true),
+            Some(context) => {
+                assert_eq!(features.len(), context.len(), "one context per feature");
+                let context = reals(self.isa, context, self.c_scale[role]);
+                let x = concat(features, c, &context, c);
+                apply(self.isa, &fs.lin1, Taps::Same, &x, rows, true)
+            }
+        };
+        Ok(apply_f32(self.isa, &fs.lin2, Taps::Same, &hidden, rows))
+    }
+
+    fn encoder(&self) -> Result<&Encoder<FloatConv>> {
+        self.encoder.as_ref().ok_or_else(|| {
+            missing(
+                "encoding",
+                format!("model {} has the decoder's layers only", self.shape.name),
+            )
+        })
+    }
+}
+
+impl Convert<FloatConv> {
+    fn apply(&self, isa: Isa, x: Vec<f16>, map: &KernelMap) -> Vec<f16> {
+        let x = apply(isa, &self.conv_in, taps(map), &x, map.len(), false);
+        let x = self
+            .blocks
+            .iter()
+            .fold(x, |x, block| block.apply(isa, taps(map), &x));
+        apply(isa, &self.conv_out, taps(map), &x, map.len(), false)
+    }
+}
+
+/// The mean of each voxel's occupied children.
+pub(super) fn pool(isa: Isa, x: &[f16], occupancy: &[u8], c: usize) -> Vec<f16> {
+    let count: usize = occupancy
+        .iter()
+        .map(|mask| mask.count_ones() as usize)
+        .sum();
+    assert_eq!(x.len(), count * c, "one feature per child");
+    let mut out = vec![f16::ZERO; occupancy.len() * c];
+    let (mut child, mut sum) = (vec![0.0; c], vec![0.0; c]);
+    let mut children = x.chunks_exact(c);
+    for (out, mask) in out.chunks_exact_mut(c).zip(occupancy) {
+        sum.fill(0.0f32);
+        for row in children.by_ref().take(mask.count_ones() as usize) {
+            to_f32(isa, row, &mut child);
+            sum.iter_mut().zip(&child).for_each(|(sum, x)| *sum += x);
+        }
+        let count = mask.count_ones() as f32;
+        sum.iter_mut().for_each(|sum| *sum /= count);
+        to_f16(isa, &sum, out);
+    }
+    out
+}

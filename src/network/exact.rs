@@ -1,0 +1,130 @@
+//! The exact zone's modules: context, predictive entropy model, feature reconstruction.
+
+use b2p_kernels::{ExactConv, LIMIT, Taps};
+use rayon::prelude::*;
+
+use super::Model;
+use super::layers::{apply, concat, taps};
+use super::structure::Inception;
+use crate::geometry::KernelMap;
+
+/// Standard deviations that a latent may have.
+const SIGMAS: i16 = 64;
+
+impl Model {
+    /// The context of a role's voxels: their parents' features, upsampled.
+    ///
+    /// `g` holds the features [parents, C] of the role below; bit `x + 2y + 4z` of `occupancy[p]` tells whether parent `p` has
+    /// the child in that octant. Gives [children, C].
+    ///
+    /// # Panics
+    /// If `role` is not 1 or 2, or `g` and `occupancy` disagree in length.
+    pub fn upsample(&self, role: usize, g: &[i16], occupancy: &[u8]) -> Vec<i16> {
+        assert!(role == 1 || role == 2, "role {role} has no context");
+        let c = self.shape.channels;
+        assert_eq!(g.len(), occupancy.len() * c, "one feature per parent");
+        let (parents, octants) = children(occupancy);
+        match &self.exact.up {
+            Some(up) => {
+                let taps = Taps::Octants {
+                    parents: &parents,
+                    octants: &octants,
+                };
+                apply(self.isa, &up[role - 1], taps, g, parents.len(), false)
+            }
+            None => {
+                let mut out = vec![0; parents.len() * c];
+                for (child, &parent) in out.chunks_exact_mut(c).zip(&parents) {
+                    child.copy_from_slice(&g[parent as usize * c..][..c]);
+                }
+                out
+            }
+        }
+    }
+
+    /// How the latents of a role are distributed: means in sixteenths, in ±2047, and scale indices below 64, [voxels, K] each.
+    ///
+    /// `context` is [`Model::upsample`]'s, `map` the level's 3³ kernel map.
+    ///
+    /// # Panics
+    /// If `role` is not 1 or 2, or `context` and `map` disagree in length.
+    pub fn entropy_parameters(
+        &self,
+        role: usize,
+        context: &[i16],
+        map: &KernelMap,
+    ) -> (Vec<i16>, Vec<u8>) {
+        assert!(role == 1 || role == 2, "role {role} has a fixed prior");
+        self.check(context, self.shape.channels, map);
+        let pem = &self.exact.pem[role - 1];
+        let x = apply(self.isa, &pem.conv_in, taps(map), context, map.len(), true);
+        let x = self.blocks(&pem.blocks, x, map);
+        let mu = apply(self.isa, &pem.mu, Taps::Same, &x, map.len(), false);
+        let sigma = apply(self.isa, &pem.sigma, Taps::Same, &x, map.len(), false);
+        let sigma = sigma
+            .into_iter()
+            .map(|q| q.clamp(0, SIGMAS - 1) as u8)
+            .collect();
+        (mu, sigma)
+    }
+
+    /// The features [voxels, C] of a role, from its latents [voxels, K] and, above role 0, its context [voxels, C].
+    ///
+    /// # Panics
+    /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.
+    pub fn reconstruct(
+        &self,
+        role: usize,
+        latents: &[i16],
+        context: Option<&[i16]>,
+        map: &KernelMap,
+    ) -> Vec<i16> {
+        assert_eq!(
+            role > 0,
+            context.is_some(),
+            "all roles but 0 have a context"
+        );
+        let (c, k) = (self.shape.channels, self.shape.latents);
+        self.check(latents, k, map);
+        let limit = i32::from(LIMIT);
+        let shift = self.shape.latent_shift;
+        let raise = |&y: &i16| (i32::from(y) << shift).clamp(-limit, limit) as i16;
+        let mut x: Vec<i16> = latents.par_iter().map(raise).collect();
+        if let Some(context) = context {
+            self.check(context, c, map);
+            x = concat(&x, k, context, c);
+        }
+        let fr = &self.exact.fr[role];
+        let x = apply(self.isa, &fr.lin1, Taps::Same, &x, map.len(), true);
+        let x = self.blocks(&fr.blocks, x, map);
+        apply(self.isa, &fr.lin2, Taps::Same, &x, map.len(), false)
+    }
+
+    fn blocks(&self, blocks: &[Inception<ExactConv>], x: Vec<i16>, map: &KernelMap) -> Vec<i16> {
+        blocks
+            .iter()
+            .fold(x, |x, block| block.apply(self.isa, taps(map), &x))
+    }
+
+    /// Panics unless `values` are `width` for each voxel of `map`.
+    pub(super) fn check<T>(&self, values: &[T], width: usize, map: &KernelMap) {
+        assert_eq!(map.volume(), 27, "layers need the 3³ kernel map");
+        assert_eq!(values.len(), map.len() * width, "{width} values per voxel");
+    }
+}
+
+/// For every child the index of its parent and its octant, children ascending.
+fn children(occupancy: &[u8]) -> (Vec<u32>, Vec<u8>) {
+    let count = occupancy
+        .iter()
+        .map(|mask| mask.count_ones() as usize)
+        .sum();
+    let (mut parents, mut octants) = (Vec::with_capacity(count), Vec::with_capacity(count));
+    for (parent, mask) in (0..).zip(occupancy) {
+        for octant in (0..8).filter(|octant| mask >> octant & 1 == 1) {
+            parents.push(parent);
+            octants.push(octant);
+        }
+    }
+    (parents, octants)
+}

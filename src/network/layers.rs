@@ -1,0 +1,213 @@
+//! Running layers and blocks over all rows of a level, in blocks of rows side by side.
+
+use b2p_kernels::{ExactConv, FloatConv, Isa, Output, Taps, to_f16};
+use half::f16;
+use rayon::prelude::*;
+
+use super::structure::{Inception, ResBlock};
+use crate::geometry::KernelMap;
+
+/// Rows that one task computes. Rows don't depend on one another, so neither do results on the number of threads.
+const BLOCK: usize = 512;
+
+/// A layer whose rows are values of one kind, in and out.
+pub(crate) trait Conv: Sync {
+    type Value: Copy + Default + Send + Sync;
+
+    fn cout(&self) -> usize;
+    fn run(
+        &self,
+        isa: Isa,
+        taps: Taps<'_>,
+        input: &[Self::Value],
+        first: usize,
+        output: Output<'_, Self::Value>,
+    );
+}
+
+impl Conv for ExactConv {
+    type Value = i16;
+
+    fn cout(&self) -> usize {
+        self.cout()
+    }
+
+    fn run(&self, isa: Isa, taps: Taps<'_>, input: &[i16], first: usize, output: Output<'_, i16>) {
+        self.run(isa, taps, input, first, output);
+    }
+}
+
+impl Conv for FloatConv {
+    type Value = f16;
+
+    fn cout(&self) -> usize {
+        self.cout()
+    }
+
+    fn run(&self, isa: Isa, taps: Taps<'_>, input: &[f16], first: usize, output: Output<'_, f16>) {
+        self.run(isa, taps, input, first, output);
+    }
+}
+
+/// The taps of a kernel map.
+pub(super) fn taps(map: &KernelMap) -> Taps<'_> {
+    Taps::Map {
+        volume: map.volume(),
+        rows: map.rows(),
+    }
+}
+
+/// A layer's `rows` output rows.
+pub(super) fn apply<C: Conv>(
+    isa: Isa,
+    conv: &C,
+    taps: Taps<'_>,
+    input: &[C::Value],
+    rows: usize,
+    relu: bool,
+) -> Vec<C::Value> {
+    let mut out = vec![C::Value::default(); rows * conv.cout()];
+    let output = Output {
+        rows: &mut out,
+        stride: conv.cout(),
+        column: 0,
+        residual: None,
+        relu,
+    };
+    spread(output, |first, output| {
+        conv.run(isa, taps, input, first, output)
+    });
+    out
+}
+
+/// The `rows` output rows of a layer that ends in f32.
+pub(super) fn apply_f32(
+    isa: Isa,
+    conv: &FloatConv,
+    taps: Taps<'_>,
+    input: &[f16],
+    rows: usize,
+) -> Vec<f32> {
+    let mut out = vec![0.0; rows * conv.cout()];
+    let output = Output {
+        rows: &mut out,
+        stride: conv.cout(),
+        column: 0,
+        residual: None,
+        relu: false,
+    };
+    spread(output, |first, output| {
+        conv.run(isa, taps, input, first, output)
+    });
+    out
+}
+
+/// Calls `run(first row, part)` for parts of the output, in parallel.
+fn spread<T: Send, R: Sync>(
+    output: Output<'_, T, R>,
+    run: impl Fn(usize, Output<'_, T, R>) + Sync,
+) {
+    let Output {
+        rows,
+        stride,
+        column,
+        residual,
+        relu,
+    } = output;
+    rows.par_chunks_mut(BLOCK * stride)
+        .enumerate()
+        .for_each(|(i, rows)| {
+            let residual = residual.map(|all| &all[i * BLOCK * stride..][..rows.len()]);
+            run(
+                i * BLOCK,
+                Output {
+                    rows,
+                    stride,
+                    column,
+                    residual,
+                    relu,
+                },
+            );
+        });
+}
+
+impl<C: Conv> Inception<C> {
+    /// `relu?(concat[a2(relu(a1(x))), b3(relu(b2(relu(b1(x)))))] + x)`, activations of both branches in ReLU.
+    pub fn apply(&self, isa: Isa, map: Taps<'_>, x: &[C::Value]) -> Vec<C::Value> {
+        let (left, right) = (self.a2.cout(), self.b3.cout());
+        let stride = left + right;
+        let rows = x.len() / stride;
+        let mut out = vec![C::Value::default(); x.len()];
+        let mut branch = |conv: &C, taps: Taps<'_>, input: &[C::Value], column: usize| {
+            let output = Output {
+                rows: &mut out[..],
+                stride,
+                column,
+                residual: Some(x),
+                relu: self.relu,
+            };
+            spread(output, |first, output| {
+                conv.run(isa, taps, input, first, output)
+            });
+        };
+        let a = apply(isa, &self.a1, map, x, rows, true);
+        branch(&self.a2, map, &a, 0);
+        let b = apply(isa, &self.b1, Taps::Same, x, rows, true);
+        let b = apply(isa, &self.b2, map, &b, rows, true);
+        branch(&self.b3, Taps::Same, &b, left);
+        out
+    }
+}
+
+impl<C: Conv> ResBlock<C> {
+    /// `relu?(c2(relu(c1(x))) + x)`.
+    pub fn apply(&self, isa: Isa, map: Taps<'_>, x: &[C::Value]) -> Vec<C::Value> {
+        let stride = self.c2.cout();
+        let inner = apply(isa, &self.c1, map, x, x.len() / stride, true);
+        let mut out = vec![C::Value::default(); x.len()];
+        let output = Output {
+            rows: &mut out[..],
+            stride,
+            column: 0,
+            residual: Some(x),
+            relu: self.relu,
+        };
+        spread(output, |first, output| {
+            self.c2.run(isa, map, &inner, first, output)
+        });
+        out
+    }
+}
+
+/// Rows of `left` and `right`, of `a` and `b` values, side by side.
+pub(super) fn concat<T: Copy + Default + Send + Sync>(
+    left: &[T],
+    a: usize,
+    right: &[T],
+    b: usize,
+) -> Vec<T> {
+    let mut out = vec![T::default(); left.len() + right.len()];
+    let rows = out.par_chunks_mut((a + b) * BLOCK);
+    let parts = left.par_chunks(a * BLOCK).zip(right.par_chunks(b * BLOCK));
+    rows.zip(parts).for_each(|(rows, (left, right))| {
+        let parts = left.chunks_exact(a).zip(right.chunks_exact(b));
+        for (row, (left, right)) in rows.chunks_exact_mut(a + b).zip(parts) {
+            row[..a].copy_from_slice(left);
+            row[a..].copy_from_slice(right);
+        }
+    });
+    out
+}
+
+/// The real numbers that integer activations stand for.
+pub(super) fn reals(isa: Isa, q: &[i16], scale: f32) -> Vec<f16> {
+    const CHUNK: usize = 4096;
+    let mut out = vec![f16::ZERO; q.len()];
+    out.par_chunks_mut(CHUNK)
+        .zip(q.par_chunks(CHUNK))
+        .for_each(|(out, q)| {
+            let real: Vec<f32> = q.iter().map(|&q| f32::from(q) * scale).collect();
+            to_f16(isa, &real, out);
+        });
+    out
+}

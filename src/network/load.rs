@@ -1,0 +1,256 @@
+//! Model files: safetensors, everything checked before it is used.
+
+use b2p_kernels::{ExactConv, FloatConv, LIMIT, Requantise, Scale};
+use half::f16;
+use safetensors::Dtype;
+use safetensors::tensor::{Metadata, SafeTensors};
+use xxhash_rust::xxh3::Xxh3Default;
+
+use super::shape::Shape;
+use super::structure::Spec;
+use crate::error::{Error, Result, Stage};
+
+/// The largest weight of the exact zone.
+const MAX_WEIGHT: u16 = 511;
+/// The largest shift of the exact zone.
+const MAX_SHIFT: u8 = 30;
+/// Sums of the exact zone stay below this.
+const SUM_LIMIT: u64 = 1 << 31;
+/// The largest gain or bias of the close zone: no layer of f16 values can then leave f32's range.
+const MAX_FLOAT: f32 = 65504.0;
+
+/// A type of tensor entries.
+pub(super) trait Element: Sized {
+    const DTYPE: Dtype;
+    /// Reads an entry from as many bytes as it has.
+    fn read(bytes: &[u8]) -> Self;
+}
+
+macro_rules! element {
+    ($($ty:ty: $dtype:ident),*) => {$(
+        impl Element for $ty {
+            const DTYPE: Dtype = Dtype::$dtype;
+            fn read(bytes: &[u8]) -> Self {
+                <$ty>::from_le_bytes(bytes.try_into().expect("chunks have the entry's size"))
+            }
+        }
+    )*};
+}
+element!(u8: U8, i16: I16, u16: U16, i32: I32, u32: U32, f16: F16, f32: F32);
+
+/// The tensors of a model file.
+pub(super) struct Tensors<'a> {
+    metadata: Metadata,
+    data: &'a [u8],
+}
+
+impl<'a> Tensors<'a> {
+    /// Reads the file's table of contents.
+    pub fn new(bytes: &'a [u8]) -> Result<Self> {
+        let (header, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| {
+            Error::malformed(
+                Stage::Network,
+                "model file",
+                "header",
+                error,
+                "a safetensors file",
+            )
+        })?;
+        Ok(Tensors {
+            metadata,
+            data: &bytes[8 + header..],
+        })
+    }
+
+    /// The model's description.
+    pub fn shape(&self) -> Result<Shape> {
+        let json = self.metadata.metadata().as_ref().and_then(|m| m.get("b2p"));
+        let json = json.ok_or_else(|| {
+            Error::malformed(
+                Stage::Network,
+                "metadata",
+                "b2p",
+                "missing",
+                "the model's description",
+            )
+        })?;
+        Shape::from_json(json)
+    }
+
+    /// Whether a tensor's name starts like that.
+    pub fn any(&self, prefix: &str) -> bool {
+        self.metadata
+            .offset_keys()
+            .iter()
+            .any(|name| name.starts_with(prefix))
+    }
+
+    /// The entries of a tensor of that very shape.
+    pub fn get<T: Element>(&self, name: &str, shape: &[usize]) -> Result<Vec<T>> {
+        let entries = self.find::<T>(name)?;
+        let found = self.metadata.info(name).map_or(&[][..], |info| &info.shape);
+        if found != shape {
+            return Err(malformed(
+                name,
+                "shape",
+                format!("{found:?}"),
+                format!("{shape:?}"),
+            ));
+        }
+        Ok(entries.map(T::read).collect())
+    }
+
+    /// The entries of a tensor of one dimension, however long.
+    pub fn list<T: Element>(&self, name: &str) -> Result<Vec<T>> {
+        let entries = self.find::<T>(name)?;
+        Ok(entries.map(T::read).collect())
+    }
+
+    fn find<T: Element>(&self, name: &str) -> Result<std::slice::ChunksExact<'a, u8>> {
+        let info = self
+            .metadata
+            .info(name)
+            .ok_or_else(|| malformed(name, "tensor", "missing", "there"))?;
+        if info.dtype != T::DTYPE {
+            return Err(malformed(
+                name,
+                "type",
+                format!("{:?}", info.dtype),
+                format!("{:?}", T::DTYPE),
+            ));
+        }
+        let (start, end) = info.data_offsets;
+        Ok(self.data[start..end].chunks_exact(size_of::<T>()))
+    }
+
+    /// What a stream calls the model: XXH3-128 of the description's exact part, and of name, type, extents and bytes of every
+    /// tensor that bears on the decoded bits, in the order of their names.
+    pub fn id(&self, shape: &Shape) -> [u8; 16] {
+        let mut names = self.metadata.offset_keys();
+        names.retain(|name| {
+            ["up.", "pem.", "fr.", "cdf."]
+                .iter()
+                .any(|p| name.starts_with(p))
+        });
+        names.sort_unstable();
+        let mut hash = Xxh3Default::new();
+        hash.update(shape.exact_text().as_bytes());
+        for name in &names {
+            let Some(info) = self.metadata.info(name) else {
+                continue;
+            };
+            hash.update(format!("\n{name} {:?} {:?}\n", info.dtype, info.shape).as_bytes());
+            hash.update(&self.data[info.data_offsets.0..info.data_offsets.1]);
+        }
+        hash.digest128().to_be_bytes()
+    }
+
+    /// A layer of the exact zone, with the proof that no sum of it overflows.
+    pub fn exact_layer(&self, spec: Spec) -> Result<ExactConv> {
+        let Spec {
+            name,
+            volume,
+            cin,
+            cout,
+            invariant,
+        } = spec;
+        let tensor = format!("{name}.weight");
+        let weights: Vec<i16> = self.get(&tensor, &[volume, cin, cout])?;
+        if let Some(w) = weights.iter().find(|w| w.unsigned_abs() > MAX_WEIGHT) {
+            return Err(malformed(&tensor, "weight", w, "within ±511"));
+        }
+        let requantise = if invariant {
+            let gain = self.finite(&format!("{name}.gain"), cout, f32::MAX)?;
+            let bias = self.finite(&format!("{name}.bias"), cout, f32::MAX)?;
+            Requantise::Invariant { gain, bias }
+        } else {
+            let bias = self.get(&format!("{name}.bias"), &[cout])?;
+            let shift: Vec<u8> = self.get(&format!("{name}.shift"), &[cout])?;
+            if let Some(shift) = shift.iter().find(|&&shift| shift > MAX_SHIFT) {
+                return Err(malformed(
+                    &format!("{name}.shift"),
+                    "shift",
+                    shift,
+                    "at most 30",
+                ));
+            }
+            Requantise::Shift { bias, shift }
+        };
+        for o in 0..cout {
+            let (mut sum, mut squares) = (0, 0);
+            for w in weights[o..].iter().step_by(cout) {
+                sum += u64::from(w.unsigned_abs());
+                squares += u64::from(w.unsigned_abs()).pow(2);
+            }
+            let bias = match &requantise {
+                Requantise::Shift { bias, .. } => u64::from(bias[o].unsigned_abs()),
+                Requantise::Invariant { .. } => 0,
+            };
+            let reach = sum * u64::from(LIMIT.unsigned_abs()) + bias;
+            if reach >= SUM_LIMIT {
+                return Err(malformed(
+                    &tensor,
+                    &format!("reach of channel {o}"),
+                    reach,
+                    "below 2^31",
+                ));
+            }
+            if invariant && squares >= SUM_LIMIT {
+                return Err(malformed(
+                    &tensor,
+                    &format!("squared norm of channel {o}"),
+                    squares,
+                    "below 2^31",
+                ));
+            }
+        }
+        Ok(ExactConv::new(volume, cin, cout, &weights, requantise))
+    }
+
+    /// A layer of the close zone.
+    pub fn float_layer(&self, spec: Spec) -> Result<FloatConv> {
+        let Spec {
+            name,
+            volume,
+            cin,
+            cout,
+            invariant,
+        } = spec;
+        let tensor = format!("{name}.weight");
+        let weights: Vec<f16> = self.get(&tensor, &[volume, cin, cout])?;
+        if let Some(w) = weights.iter().find(|w| !w.is_finite()) {
+            return Err(malformed(&tensor, "weight", w, "a finite number"));
+        }
+        let bias = self.finite(&format!("{name}.bias"), cout, MAX_FLOAT)?;
+        let scale = match invariant {
+            true => Scale::Invariant(self.finite(&format!("{name}.gain"), cout, MAX_FLOAT)?),
+            false => Scale::Plain,
+        };
+        Ok(FloatConv::new(volume, cin, cout, &weights, bias, scale))
+    }
+
+    /// `count` numbers within ±`limit`.
+    pub fn finite(&self, name: &str, count: usize, limit: f32) -> Result<Vec<f32>> {
+        let values: Vec<f32> = self.get(name, &[count])?;
+        match values.iter().find(|v| !v.is_finite() || v.abs() > limit) {
+            Some(v) => Err(malformed(name, "entry", v, format!("within ±{limit}"))),
+            None => Ok(values),
+        }
+    }
+}
+
+/// An error that names a tensor.
+pub(super) fn malformed(
+    name: &str,
+    field: &str,
+    value: impl ToString,
+    expected: impl ToString,
+) -> Error {
+    Error::malformed(
+        Stage::Network,
+        format!("tensor {name}"),
+        field,
+        value,
+        expected,
+    )
+}

@@ -1,0 +1,183 @@
+//! The learned part: features and latents (the exact zone, in integers), Gaussians, and the encoder's own layers (in floats).
+//!
+//! A level of the stream has a *role*: 0 for its base level L, then 1 and 2. Role 3 is the level above the finest coded one; the
+//! encoder starts from its colours. All modules are those of the paper's appendix (arXiv 2406.05915); where it is silent, here
+//! is what holds:
+//!
+//! - **Geometry-invariant convolution**: output channel `o` is `gain_o · (Σ W x)_o / √(Σ W²_o + 1e-8) + bias_o`, both sums over
+//!   the taps that read an occupied voxel.
+//! - **Context**: `c` of a voxel is a linear layer, one per octant, of its parent's feature `g` (or a copy of it).
+//! - **Base level**: no context; its latents have one distribution per channel.
+//!
+//! # The exact zone
+//! Whatever reaches a probability is computed in integers, and the same on every machine: [`Model::upsample`],
+//! [`Model::entropy_parameters`] (PEM) and [`Model::reconstruct`] (FR).
+//!
+//! Activations are `i16` in ±2047, weights `i16` in ±511, sums `i32`; loading proves per output channel that no sum can overflow.
+//! A sum becomes an activation by `clamp((sum + bias) >> shift)`, the rounding constant being part of the bias; in
+//! geometry-invariant layers by `clamp(round_ties_even(f32(sum) · (gain / √f32(D)) + bias))`, `D` being the sum of the squared
+//! weights of the taps that read something: one square root, one division, one product, one sum of IEEE f32, in that order, never
+//! fused. A residual is added after that and clamped again, then the ReLU follows. No transcendental function, no float sum.
+//!
+//! Means are in sixteenths; standard deviations are an index i, σ = 0.11·(64 / 0.11)^(i / 63).
+//!
+//! # The close zone
+//! Gaussian generation (GG) and the encoder's feature conversion (FC) and squeezing (FS) store f16, saturating, and sum in f32.
+//!
+//! # The model file
+//! Safetensors. The metadata's `b2p` is JSON: [`Shape`]. Layer `NAME` has `NAME.weight` [taps, in, out] and, in the exact zone,
+//! `.bias` i32 and `.shift` u8, or, if geometry-invariant, `.gain` and `.bias` f32; in the close zone, where weights are f16,
+//! `.bias` f32 and, if geometry-invariant, `.gain` f32. The names are those in `structure.rs`. `g_scale[r]` is the real value of
+//! one step of role r's features `g`, `c_scale[r]` that of its context. Tables: see [`crate::entropy::Tables`]. A file without
+//! `fc.*` and `fs.*` can decode only.
+
+mod convert;
+mod exact;
+mod generate;
+mod layers;
+mod load;
+mod shape;
+mod structure;
+mod untrained;
+
+use std::path::Path;
+
+use b2p_kernels::{ExactConv, FloatConv, Isa, map_file};
+
+use crate::entropy::{RawRows, Tables};
+use crate::error::{Error, Result};
+use load::{Tensors, malformed};
+use structure::{Encoder, Exact, Generate};
+
+pub use shape::{Head, Shape, Upsample};
+pub use structure::{RAW, ROLES};
+pub use untrained::untrained;
+
+/// A model, ready to run.
+pub struct Model {
+    shape: Shape,
+    id: [u8; 16],
+    isa: Isa,
+    tables: Tables,
+    exact: Exact<ExactConv>,
+    generators: Vec<Generate<FloatConv>>,
+    encoder: Option<Encoder<FloatConv>>,
+    g_scale: Vec<f32>,
+    c_scale: Vec<f32>,
+}
+
+impl Model {
+    /// Loads a model file.
+    ///
+    /// # Errors
+    /// [`Error::Io`], or as [`Model::from_bytes`].
+    pub fn open(path: &Path) -> Result<Self> {
+        let bytes = map_file(path).map_err(|source| Error::Io {
+            path: path.to_owned(),
+            source,
+        })?;
+        Model::from_bytes(&bytes)
+    }
+
+    /// Loads a model file's content. Memory is bounded by its length.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`], naming field or tensor, if anything is missing, of another type or extent, not finite, out of range,
+    /// or could overflow a sum; [`Error::Unsupported`] for another format.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
+        let tensors = Tensors::new(bytes)?;
+        let shape = tensors.shape()?;
+        let tables = tables(&tensors, &shape)?;
+        let mut float = |spec| tensors.float_layer(spec);
+        let encoder = match tensors.any("fc.") || tensors.any("fs.") {
+            true => Some(shape.encoder(&mut float)?),
+            false => None,
+        };
+        Ok(Model {
+            generators: shape.generators(&mut float)?,
+            exact: shape.exact(&mut |spec| tensors.exact_layer(spec))?,
+            encoder,
+            g_scale: scales(&tensors, "g_scale", 0)?,
+            c_scale: scales(&tensors, "c_scale", 1)?,
+            id: tensors.id(&shape),
+            isa: Isa::detect(),
+            tables,
+            shape,
+        })
+    }
+
+    /// Uses no more than these instructions. Exact results stay as they are; so do close ones.
+    pub fn with_isa(self, isa: Isa) -> Self {
+        Model { isa, ..self }
+    }
+
+    /// The instructions that it uses: the best of this machine unless told otherwise.
+    pub fn isa(&self) -> Isa {
+        self.isa
+    }
+
+    /// The model's extents.
+    pub fn shape(&self) -> &Shape {
+        &self.shape
+    }
+
+    /// What streams call it: a hash of all that bears on the decoded bits.
+    pub fn id(&self) -> [u8; 16] {
+        self.id
+    }
+
+    /// The probability tables.
+    pub fn tables(&self) -> &Tables {
+        &self.tables
+    }
+
+    /// Whether the file had the encoder's layers.
+    pub fn can_encode(&self) -> bool {
+        self.encoder.is_some()
+    }
+}
+
+fn tables(tensors: &Tensors, shape: &Shape) -> Result<Tables> {
+    let rows = |name: &str| -> Result<_> {
+        let entries: Vec<u16> = tensors.list(name)?;
+        let offsets: Vec<u32> = tensors.list(&format!("{name}.offset"))?;
+        let low: Vec<i16> = tensors.list(&format!("{name}.low"))?;
+        Ok((entries, offsets, low))
+    };
+    let (gauss, prior) = (rows("cdf.gauss")?, rows("cdf.prior")?);
+    let raw = |name, (entries, offsets, low)| RawRows {
+        name,
+        entries,
+        offsets,
+        low,
+    };
+    let tables = Tables::new(
+        raw("cdf.gauss", (&gauss.0, &gauss.1, &gauss.2)),
+        raw("cdf.prior", (&prior.0, &prior.1, &prior.2)),
+    )?;
+    match tables.channels() == shape.latents {
+        true => Ok(tables),
+        false => Err(malformed(
+            "cdf.prior.low",
+            "rows",
+            tables.channels(),
+            shape.latents,
+        )),
+    }
+}
+
+/// The real value of one integer step, per role from `first` on.
+fn scales(tensors: &Tensors, name: &str, first: usize) -> Result<Vec<f32>> {
+    // 2047 steps of the largest still fit f16.
+    const MAX: f32 = 31.0;
+    let scales = tensors.finite(name, ROLES, MAX)?;
+    match scales[first..].iter().find(|&&scale| scale <= 0.0) {
+        Some(scale) => Err(malformed(name, "entry", scale, "above 0")),
+        None => Ok(scales),
+    }
+}
+
+/// The error of a model that has no such part.
+fn missing(what: &'static str, detail: String) -> Error {
+    Error::Unsupported { what, detail }
+}

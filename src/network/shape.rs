@@ -1,0 +1,338 @@
+//! The extents of a model, as its file's metadata states them.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, Result, Stage};
+
+/// Everything that a model file says of the network beside its tensors. Other keys of the file are ignored.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Shape {
+    /// Version of the model file's layout; 1.
+    pub format: u32,
+    /// What the model is called.
+    #[serde(default)]
+    pub name: String,
+    /// C: channels of a feature, a multiple of 4.
+    pub channels: usize,
+    /// K: latents per voxel.
+    pub latents: usize,
+    /// Inception blocks of each feature conversion (FC).
+    pub fc_blocks: usize,
+    /// Inception blocks of each predictive entropy model (PEM).
+    pub pem_blocks: usize,
+    /// Inception blocks of each feature reconstruction (FR).
+    pub fr_blocks: usize,
+    /// The Gaussian generators (GG).
+    pub gg: Vec<Head>,
+    /// How a feature gets to the children.
+    pub upsample: Upsample,
+    /// Whether an Inception block ends in a ReLU.
+    pub inception_relu: bool,
+    /// Whether a residual block ends in a ReLU.
+    pub resblock_relu: bool,
+    /// Latents lie in ±latent_max.
+    pub latent_max: i16,
+    /// Latents enter the integer network shifted left by this.
+    pub latent_shift: u8,
+    /// Reach of a Gaussian's centre from its voxel's, in voxels.
+    pub offset_range: f32,
+    /// Standard deviation, in voxels, per unit of softplus.
+    pub scale_range: f32,
+    /// Added to the raw scale before softplus.
+    pub scale_bias: f32,
+    /// Added to the raw opacity before the sigmoid.
+    pub opacity_bias: f32,
+    /// The weight of distortion against rate that the model was trained with.
+    #[serde(default, rename = "lambda", skip_serializing_if = "Option::is_none")]
+    pub lambda: Option<f64>,
+}
+
+/// One Gaussian generator.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Head {
+    /// Which level's features it reads: 1 or 2 above the base level.
+    pub role: usize,
+    /// Its channels.
+    pub channels: usize,
+    /// Residual blocks before the fourth layer.
+    pub blocks_before: usize,
+    /// Residual blocks after it.
+    pub blocks_after: usize,
+    /// Gaussians per voxel: 8 for role 1, 1 for role 2.
+    pub children: usize,
+}
+
+/// How a feature gets to the children.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Upsample {
+    /// Each child copies its parent's.
+    Nearest,
+    /// A linear layer per octant.
+    Learned,
+}
+
+/// Channels beyond which no model is taken.
+const MAX_CHANNELS: usize = 256;
+/// Latents beyond which no model is taken.
+const MAX_LATENTS: usize = 64;
+/// Blocks in a row beyond which no model is taken.
+const MAX_BLOCKS: usize = 16;
+
+impl Shape {
+    /// The smallest network that has every layer, for tests.
+    pub fn tiny() -> Self {
+        let head = |role, children| Head {
+            role,
+            channels: 8,
+            blocks_before: 1,
+            blocks_after: 1,
+            children,
+        };
+        Shape {
+            format: 1,
+            name: "tiny".into(),
+            channels: 8,
+            latents: 4,
+            fc_blocks: 1,
+            pem_blocks: 1,
+            fr_blocks: 1,
+            gg: vec![head(1, 8), head(2, 1)],
+            upsample: Upsample::Learned,
+            inception_relu: true,
+            resblock_relu: true,
+            latent_max: 31,
+            latent_shift: 6,
+            offset_range: 1.0,
+            scale_range: 1.0,
+            scale_bias: -0.31,
+            opacity_bias: 2.0,
+            lambda: None,
+        }
+    }
+
+    /// Reads the metadata's JSON.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if a field is missing or out of range, [`Error::Unsupported`] for another format.
+    pub fn from_json(json: &str) -> Result<Self> {
+        let shape: Shape = serde_json::from_str(json).map_err(|error| {
+            Error::malformed(
+                Stage::Network,
+                "metadata",
+                "b2p",
+                error,
+                "a model's description",
+            )
+        })?;
+        if shape.format != 1 {
+            return Err(Error::Unsupported {
+                what: "the model file's format",
+                detail: format!("it is {}, this program reads 1", shape.format),
+            });
+        }
+        shape.check()?;
+        Ok(shape)
+    }
+
+    /// The metadata's JSON.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string(self).expect("a shape has no keys but strings")
+    }
+
+    /// The head of a role.
+    pub fn head(&self, role: usize) -> Option<&Head> {
+        self.gg.iter().find(|head| head.role == role)
+    }
+
+    /// What of the shape bears on the decoded bits, in a form that is hashed.
+    pub(super) fn exact_text(&self) -> String {
+        let upsample = match self.upsample {
+            Upsample::Nearest => "nearest",
+            Upsample::Learned => "learned",
+        };
+        format!(
+            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}",
+            self.channels,
+            self.latents,
+            self.pem_blocks,
+            self.fr_blocks,
+            self.inception_relu,
+            self.latent_max,
+            self.latent_shift,
+        )
+    }
+
+    fn check(&self) -> Result<()> {
+        let require = |ok: bool, field: &str, value: &dyn ToString, expected: &str| match ok {
+            true => Ok(()),
+            false => Err(Error::malformed(
+                Stage::Network,
+                "metadata",
+                field,
+                value.to_string(),
+                expected,
+            )),
+        };
+        let within = |value: f32, low: f32, high: f32| (low..=high).contains(&value);
+        let channels = |n: usize| n > 0 && n <= MAX_CHANNELS && n.is_multiple_of(4);
+        require(
+            channels(self.channels),
+            "channels",
+            &self.channels,
+            "a multiple of 4 up to 256",
+        )?;
+        let latents = (1..=MAX_LATENTS).contains(&self.latents);
+        require(latents, "latents", &self.latents, "1 to 64")?;
+        for (field, blocks) in [
+            ("fc_blocks", self.fc_blocks),
+            ("pem_blocks", self.pem_blocks),
+            ("fr_blocks", self.fr_blocks),
+        ] {
+            require(blocks <= MAX_BLOCKS, field, &blocks, "at most 16")?;
+        }
+        require(
+            self.latent_max > 0,
+            "latent_max",
+            &self.latent_max,
+            "at least 1",
+        )?;
+        let reach = i64::from(self.latent_max) << self.latent_shift.min(16);
+        require(
+            reach <= 2047,
+            "latent_max << latent_shift",
+            &reach,
+            "at most 2047",
+        )?;
+        require(
+            within(self.offset_range, 0.0, 64.0),
+            "offset_range",
+            &self.offset_range,
+            "0 to 64",
+        )?;
+        require(
+            within(self.scale_range, 1e-3, 64.0),
+            "scale_range",
+            &self.scale_range,
+            "0.001 to 64",
+        )?;
+        require(
+            within(self.scale_bias, -64.0, 64.0),
+            "scale_bias",
+            &self.scale_bias,
+            "−64 to 64",
+        )?;
+        require(
+            within(self.opacity_bias, -64.0, 64.0),
+            "opacity_bias",
+            &self.opacity_bias,
+            "−64 to 64",
+        )?;
+        for (i, head) in self.gg.iter().enumerate() {
+            let field = |name: &str| format!("gg[{i}].{name}");
+            let alone = self.gg[..i].iter().all(|other| other.role != head.role);
+            require(
+                alone && matches!(head.role, 1 | 2),
+                &field("role"),
+                &head.role,
+                "1 or 2, each once",
+            )?;
+            let children = if head.role == 1 { 8 } else { 1 };
+            require(
+                head.children == children,
+                &field("children"),
+                &head.children,
+                "8 for role 1, 1 for role 2",
+            )?;
+            require(
+                channels(head.channels),
+                &field("channels"),
+                &head.channels,
+                "a multiple of 4 up to 256",
+            )?;
+            let blocks = head.blocks_before.max(head.blocks_after);
+            require(
+                blocks <= MAX_BLOCKS,
+                &field("blocks"),
+                &blocks,
+                "at most 16",
+            )?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn altered(field: &str, value: &str) -> Result<Shape> {
+        let mut json: serde_json::Value = serde_json::from_str(&Shape::tiny().to_json()).unwrap();
+        *json.pointer_mut(field).unwrap() = serde_json::from_str(value).unwrap();
+        Shape::from_json(&json.to_string())
+    }
+
+    #[test]
+    fn a_shape_survives_its_own_text() {
+        assert_eq!(
+            Shape::from_json(&Shape::tiny().to_json()).unwrap(),
+            Shape::tiny()
+        );
+    }
+
+    #[test]
+    fn a_key_that_means_nothing_here_is_ignored() {
+        let json = Shape::tiny().to_json().replacen('{', "{\"steps\": 5, ", 1);
+        assert_eq!(Shape::from_json(&json).unwrap(), Shape::tiny());
+    }
+
+    #[test]
+    fn a_field_out_of_range_is_named() {
+        for (field, value) in [
+            ("/channels", "6"),
+            ("/channels", "0"),
+            ("/channels", "1000000"),
+            ("/latents", "65"),
+            ("/pem_blocks", "17"),
+            ("/latent_max", "32"),
+            ("/latent_max", "0"),
+            ("/latent_shift", "200"),
+            ("/scale_range", "0"),
+            ("/offset_range", "1e30"),
+            ("/gg/0/role", "2"),
+            ("/gg/0/role", "0"),
+            ("/gg/1/children", "8"),
+            ("/gg/0/channels", "7"),
+            ("/gg/0/blocks_after", "99"),
+        ] {
+            let name = field.rsplit('/').next().unwrap().split('_').next().unwrap();
+            let error = altered(field, value).unwrap_err();
+            assert!(
+                matches!(error, Error::Malformed { .. }),
+                "{field} = {value}: {error}"
+            );
+            assert!(
+                error.to_string().contains(name),
+                "{field} = {value}: {error}"
+            );
+        }
+        for (field, value) in [
+            ("/channels", "-8"),
+            ("/upsample", "\"cubic\""),
+            ("/latent_max", "40000"),
+        ] {
+            assert!(
+                matches!(altered(field, value), Err(Error::Malformed { .. })),
+                "{field} = {value}"
+            );
+        }
+    }
+
+    #[test]
+    fn another_format_is_not_supported() {
+        assert!(matches!(
+            altered("/format", "2"),
+            Err(Error::Unsupported { .. })
+        ));
+    }
+}
