@@ -17,7 +17,7 @@ import data
 import integer
 import ops
 from integer import LIMIT, SIGMA_MAX, SIGMA_MIN, SIGMAS, sigma_of
-from model import B2P, Inception, NormConv
+from model import B2P, Inception, NormConv, join
 
 WEIGHT_MAX = 511
 LATENT_SHIFT = 6
@@ -271,7 +271,7 @@ def untrained(config, samples, seed=1):
     for name, p in model.named_parameters():
         if name.endswith(("bias", "gain")):
             p.add_(torch.randn_like(p) * 0.05)
-    model.calibrate([(s.crop, s.rgb) for s in samples])
+    model.calibrate(join([s.crop for s in samples]), torch.cat([s.rgb for s in samples]))
     return model
 
 

@@ -41,6 +41,17 @@ class Crop:
                     self.children3.to(device))
 
 
+def join(crops):
+    """Several crops as one, far apart."""
+    step = 4096  # finest voxels
+    coords = [torch.cat([c.coords[r] + torch.tensor([i * step >> (3 - r), 0, 0], dtype=torch.int32) for i, c in enumerate(crops)]) for r in range(4)]
+    parents = {}
+    for r in (1, 2, 3):
+        count = torch.cat([c.first[r - 1][1:] - c.first[r - 1][:-1] for c in crops]).long()
+        parents[r] = torch.repeat_interleave(torch.arange(len(count)), count).int()
+    return make_crop(coords, parents)
+
+
 def make_crop(coords, parents):
     """coords: four int32 tensors, role 0 .. 3, Morton-sorted; parents[r] (r = 1..3): row of each voxel's parent in role r - 1."""
     first = []
@@ -53,13 +64,20 @@ def make_crop(coords, parents):
                 ops.corners(coords[2]), children, ops.neighbours(children))
 
 
+def initial(taps, cin, cout, scale=1.0):
+    """The centre tap is orthogonal and the others small: a network starts close to a point-wise one. With equal random taps the response
+    to a constant colour would depend on which neighbours exist, and a product of random square matrices would lose most directions."""
+    w = torch.randn(taps, cin, cout) * (0.15 / math.sqrt(cin))
+    nn.init.orthogonal_(w[{1: 0, 8: 0, 27: 13}[taps]], math.sqrt(max(1.0, cout / cin)))
+    return w * scale
+
+
 class Conv(nn.Module):
     """Sparse convolution of `taps` taps; taps = 1 is a linear layer. Weight [taps, c_in, c_out]."""
 
     def __init__(self, cin, cout, taps=27, scale=1.0):
         super().__init__()
-        bound = scale * math.sqrt(3.0 / (cin * min(taps, 12)))  # about 12 of the 27 taps of a surface are active
-        self.weight = nn.Parameter(torch.empty(taps, cin, cout).uniform_(-bound, bound))
+        self.weight = nn.Parameter(initial(taps, cin, cout, scale))
         self.bias = nn.Parameter(torch.zeros(cout))
         self.taps = taps
 
@@ -75,13 +93,19 @@ class NormConv(nn.Module):
 
     def __init__(self, cin, cout, taps=27, gain=1.0):
         super().__init__()
-        bound = math.sqrt(3.0 / (cin * min(taps, 12)))
-        self.weight = nn.Parameter(torch.empty(taps, cin, cout).uniform_(-bound, bound))
+        self.weight = nn.Parameter(initial(taps, cin, cout))
         self.gain = nn.Parameter(torch.full((cout,), gain))
         self.bias = nn.Parameter(torch.zeros(cout))
-        self.taps = taps
+        self.taps, self.target, self.calibrating = taps, gain, False
 
     def forward(self, x, kmap=None, relu=False):
+        if self.calibrating:  # gain and bias such that every channel has mean 0 and the wanted standard deviation
+            self.calibrating = False
+            y = self.forward(x, kmap)
+            s = y.std(0)
+            s = self.target / s.clamp_min(0.1 * s.mean())
+            self.gain.mul_(s)
+            self.bias.copy_((self.bias - y.mean(0)) * s)
         if self.taps == 1:
             w = self.weight
             return ops.linear(x, w * (self.gain * torch.rsqrt((w * w).sum(1, keepdim=True) + 1e-8)), self.bias, relu)
@@ -141,6 +165,8 @@ class FeatureSqueeze(nn.Module):
         super().__init__()
         c = cfg["channels"]
         self.lin1 = Conv(2 * c if context else c, c, 1)
+        with torch.no_grad():  # what is known already is not worth a latent
+            self.lin1.weight[:, c:] *= 0.1
         self.lin2 = Conv(c, cfg["latents"], 1)
 
     def forward(self, f, c):
@@ -196,7 +222,7 @@ class Generate(nn.Module):
         if self.fanout == 8:
             self.layer4 = Conv(c, c, 8)
             with torch.no_grad():
-                self.layer4.weight.uniform_(-math.sqrt(3 / c), math.sqrt(3 / c))
+                self.layer4.weight[1:] += self.layer4.weight[0]
         else:
             self.layer4 = NormConv(c, c, 8)
         self.after = nn.ModuleList(ResBlock(c, relu) for _ in range(gg["blocks_after"]))
@@ -294,7 +320,7 @@ class B2P(nn.Module):
             for r in (1, 2):
                 up = Conv(c, c, 8)
                 with torch.no_grad():
-                    up.weight.copy_(torch.eye(c) + torch.randn(8, c, c) * 0.3 / math.sqrt(c))
+                    up.weight.copy_(torch.eye(c) + torch.randn(8, c, c) * 0.1 / math.sqrt(c))
                 self.up[str(r)] = up
 
     def analyse(self, crop, rgb):
@@ -343,22 +369,25 @@ class B2P(nn.Module):
         return gaussians(raw, coords, 2.0, self.cfg, opaque=role == 2), raw
 
     @torch.no_grad()
-    def calibrate(self, samples, target=3.0):
-        """Starts each squeeze as the leading principal components of its hidden layer, whitened to the wanted standard deviation, on a
-        few (crop, rgb) samples."""
-        features = [self.analyse(crop, rgb) for crop, rgb in samples]
-        g = [None] * len(samples)
+    def calibrate(self, crop, rgb, target=3.0):
+        """Starting values from data: every geometry-invariant layer gets outputs of unit scale, and each squeeze becomes the leading
+        principal components of its hidden layer, whitened to the wanted standard deviation. Use a crop of many colours."""
+        for m in self.modules():
+            if isinstance(m, NormConv):
+                m.calibrating = True
+        features, g, k = self.analyse(crop, rgb), None, self.cfg["latents"]
         for r in range(3):
-            c = [self.context(gi, crop, r) for gi, (crop, _) in zip(g, samples)]
-            inputs = [f[r] if ci is None else torch.cat([f[r], ci], 1) for f, ci in zip(features, c)]
-            hidden = torch.cat([self.fs[r].lin1(x, relu=True) for x in inputs]).double()
+            c = self.context(g, crop, r) if r else None
+            hidden = self.fs[r].lin1(features[r] if c is None else torch.cat([features[r], c], 1), relu=True).double()
             mean = hidden.mean(0)
             values, vectors = torch.linalg.eigh(torch.cov(hidden.T))
-            k = self.cfg["latents"]
             w = vectors[:, -k:] * (target / values[-k:].clamp_min(1e-12).sqrt())
             self.fs[r].lin2.weight.copy_(w[None].float())
             self.fs[r].lin2.bias.copy_((-mean @ w).float())
-            g = [self.fr[r](torch.round(self.fs[r](f[r], ci)), ci, crop.kernel3[r]) for f, ci, (crop, _) in zip(features, c, samples)]
+            g = self.fr[r](torch.round(self.fs[r](features[r], c)), c, crop.kernel3[r])
+            if r:
+                self.pem[str(r)](c, crop.kernel3[r])
+                self.generate(g, crop, r)
 
     def colours(self, crop, rgb):
         """Mean colour of the voxels of roles 0, 1, 2."""

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 
 import data
 import ops
-from model import B2P, groups
+from model import B2P, groups, join
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 
@@ -162,7 +162,7 @@ class Trainer:
             for g, probe, target in zip(trail, self.model.probe, self.model.colours(sample.crop, sample.rgb)):
                 probes = probes + ((probe(g) + 0.5 - target) @ matrix).abs().mean()
         loss = hint * self.args.lam * probes + weight * rate + self.args.lam * d + 1e-4 * sum((y / 8).pow(4).mean() for y in latents)
-        return loss, {"rate": [r.item() / sample.crop.points for r in rates], "d": d.item(),
+        return loss, {"probe": float(torch.as_tensor(probes).detach()), "rate": [r.item() / sample.crop.points for r in rates], "d": d.item(),
                       "mse": (image - truth).pow(2).mean().item(), "std": [y.std().item() for y in latents]}
 
     def train_step(self, samples, calibration=None):
@@ -172,7 +172,8 @@ class Trainer:
         hint = args.hint * max(0.0, 1 - x / args.hint_until)
         heads = [1, 2] if args.both else [head]
         if not self.calibrated:
-            self.model.calibrate([(s.crop, s.rgb) for s in calibration or samples])
+            some = calibration or samples
+            self.model.calibrate(join([s.crop for s in some]).to(self.device), torch.cat([s.rgb for s in some]))
             self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
             self.calibrated = True
         self.optimiser.zero_grad(set_to_none=True)
@@ -275,6 +276,7 @@ def main(argv=None):
         trainer.restore(args.init, weights_only=True)
     train_files, held_files = data.split(args.data, args.held_out)
     held = [data.load_sample(f).to(args.device) for f in held_files]
+    calibration = None if trainer.calibrated else [data.load_sample(f) for f in train_files[:6]]
     stream = data.Stream(train_files, args.views, args.seed, start=trainer.step * args.batch)
     log = open(os.path.join(args.out, "log.jsonl"), "a")
 
@@ -289,13 +291,13 @@ def main(argv=None):
     saved, means = time.monotonic(), []
     while trainer.fraction() < 1 and not stop and not (args.stop_after and trainer.step >= args.stop_after):
         begin = time.monotonic()
-        info = trainer.train_step([stream.next().to(args.device) for _ in range(args.batch)], held)
+        info = trainer.train_step([stream.next().to(args.device) for _ in range(args.batch)], calibration)
         trainer.used += time.monotonic() - begin
         means.append(info)
         if trainer.step % args.log_every == 0:
             mean = lambda key: sum(m[key] for m in means) / len(means)
             row = {"step": trainer.step, "x": round(trainer.fraction(), 4), "loss": round(mean("loss"), 4), "sec": round(time.monotonic() - begin, 2),
-                   "points": int(mean("points")), "w": round(info["weight"], 4), "norm": round(mean("norm"), 3)}
+                   "points": int(mean("points")), "w": round(info["weight"], 4), "norm": round(mean("norm"), 3), "probe": round(mean("probe"), 4)}
             for h in (1, 2):
                 of = [m for m in means if m["head"] == h]
                 if of:

@@ -1,0 +1,156 @@
+"""Checks of the trainer, in a few minutes on two cores: `./check.sh`. Each prints one line; any failure raises."""
+
+import json
+import os
+import tempfile
+import time
+
+import torch
+
+import data
+import export
+import ops
+import train
+from model import Conv, NormConv
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+
+
+def near(a, b, tolerance, what):
+    error = ((a.double() - b.double()).norm() / b.double().norm().clamp_min(1e-12)).item()
+    assert error < tolerance, f"{what}: relative error {error:.2e}"
+    return error
+
+
+def gradients(f, inputs, weight):
+    leaves = [t.detach().clone().requires_grad_() for t in inputs]
+    y = f(*leaves)
+    (y * weight.to(y.dtype)).sum().backward()
+    return y.detach(), [t.grad for t in leaves]
+
+
+def against_reference(f, inputs, tolerance, what):
+    """Value and gradients of the extension (f32) against plain PyTorch (f64), and the latter against finite differences."""
+    with torch.no_grad():
+        weight = torch.randn_like(f(*inputs))
+    y, grads = gradients(f, inputs, weight)
+    with ops.reference():
+        doubles = [t.double() for t in inputs]
+        y_ref, grads_ref = gradients(f, doubles, weight)
+        worst = near(y, y_ref, tolerance, what)
+        for i, (a, b) in enumerate(zip(grads, grads_ref)):
+            worst = max(worst, near(a, b, 20 * tolerance, f"{what}, gradient {i}"))
+        step = 1e-6
+        for i, g in enumerate(grads_ref):
+            direction = torch.randn_like(doubles[i])
+            moved = lambda s: [t + s * direction if j == i else t for j, t in enumerate(doubles)]
+            with torch.no_grad():
+                slope = ((f(*moved(step)) - f(*moved(-step))) * weight.double()).sum() / (2 * step)
+            expected = (g * direction).sum()
+            assert abs(slope - expected) < 1e-4 * (g.norm() * direction.norm() + 1e-9), f"{what}: slope {slope:.6f}, gradient {expected:.6f} of input {i}"
+    return worst
+
+
+def operators_agree_with_plain_pytorch():
+    torch.manual_seed(0)
+    crop = data.procedural(1, size=24, views=1, pixels=16).crop
+    worst = 0.0
+    for kmap, taps, rows in ((crop.kernel3[3], 27, crop.points), (crop.corners, 8, len(crop.coords[2])), (crop.descent[2], 8, len(crop.coords[1]))):
+        for cin, cout in ((3, 64), (64, 14), (8, 16), (16, 32), (72, 24), (128, 64)):
+            x, w, b, g = torch.randn(rows, cin), torch.randn(taps, cin, cout) / cin, torch.randn(cout), torch.randn(cout)
+            worst = max(worst, against_reference(lambda x, w, b: ops.conv(x, w, b, kmap), [x, w, b], 1e-5, f"conv {taps} {cin} {cout}"))
+            if taps * cin == 27 * 3 or cin == 64:
+                worst = max(worst, against_reference(lambda x, w, g, b: ops.norm_conv(x, w, g, b, kmap), [x, w, g, b], 1e-5, f"norm conv {taps} {cin} {cout}"))
+    for cin, cout in ((72, 64), (128, 64), (64, 8)):
+        x, w, b = torch.randn(777, cin), torch.randn(1, cin, cout), torch.randn(cout)
+        worst = max(worst, against_reference(lambda x, w, b: ops.linear(x, w, b), [x, w, b], 1e-5, f"linear {cin} {cout}"))
+    worst = max(worst, against_reference(lambda x: ops.pool(x, crop.first[2]), [torch.randn(crop.points, 5)], 1e-5, "pool"))
+    # A rectified layer: compared away from zero, where the two precisions agree on the sign.
+    x, w = torch.randn(crop.points, 16), torch.randn(27, 16, 16) / 16
+    worst = max(worst, against_reference(lambda x, w: ops.conv(x, w, torch.full((16,), 9.0).to(x), crop.kernel3[3], True), [x, w], 1e-5, "rectified conv"))
+    return f"worst relative error {worst:.1e}"
+
+
+def the_splatter_agrees_with_plain_pytorch():
+    torch.manual_seed(0)
+    s = data.procedural(2, size=24, views=3, pixels=40)
+    n = 400
+    mean = torch.rand(n, 3) * 24
+    scale, rotation = torch.rand(n, 3) * 1.5 + 0.2, torch.nn.functional.normalize(torch.randn(n, 4), dim=1)
+    opacity, colour = torch.rand(n) * 0.95 + 0.02, torch.rand(n, 3)
+    background = torch.rand(3, 3)
+
+    def draw(mean, scale, rotation, opacity, colour):
+        cameras, bg = s.cameras.to(mean), background.to(mean)
+        return ops.splat(mean, ops.covariance(scale, rotation), opacity, colour, cameras, bg, 40, 37)
+
+    inputs = [mean, scale, rotation, opacity, colour]
+    with torch.no_grad():
+        weight = torch.randn(3, 3, 37, 40)
+    y, grads = gradients(draw, inputs, weight)
+    with ops.reference():
+        y_ref, grads_ref = gradients(draw, [t.double() for t in inputs], weight)
+    # A pixel whose alpha lies at 1/255 may be decided differently in f32 and f64; it changes by less than 1/255.
+    assert (y - y_ref).abs().max() < 1 / 255, "a pixel is off"
+    worst = near(y, y_ref, 1e-4, "picture")
+    for name, a, b in zip(("mean", "scale", "rotation", "opacity", "colour"), grads, grads_ref):
+        worst = max(worst, near(a, b, 1e-2, f"gradient of {name}"))
+    return f"worst relative error {worst:.1e}"
+
+
+def arguments(**changes):
+    args = dict(config=os.path.join(HERE, "configs/full.json"), device="cpu", seed=0, lr_conv=3e-4, lr_linear=1e-3, minutes=0, steps=100000,
+                rate_start=0.003, rate_ramp=0.6, warmup=10, decay_from=0.6, rounding_from=0.6, coarse=0.0, both=False, lam=5.0, pyramid=1.0,
+                clip=1.0, average=0.9, hint=0.0, hint_until=0.5)
+    return type("Arguments", (), args | changes)()
+
+
+def a_crop_overfits():
+    sample = data.procedural(0, size=48, views=4, pixels=80)
+    trainer = train.Trainer(arguments())
+    for step in range(120):
+        info = trainer.train_step([sample])
+        reached = train.psnr(info["mse"])
+        if reached > 28:
+            return f"{reached:.1f} dB after {step + 1} steps"
+    raise AssertionError(f"only {reached:.1f} dB after 120 steps")
+
+
+def a_resumed_run_equals_an_unbroken_one():
+    with tempfile.TemporaryDirectory() as folder:
+        os.makedirs(f"{folder}/data")
+        for i in range(5):
+            data.save_sample(data.procedural(i, size=32, views=3, pixels=40), f"{folder}/data/{i}.safetensors", 32)
+        common = ["--data", f"{folder}/data", "--held-out", "2", "--views", "2", "--steps", "8", "--config", os.path.join(HERE, "configs/tiny.json"), "--log-every", "100"]
+        whole = train.main([*common, "--out", f"{folder}/whole"])
+        train.main([*common, "--out", f"{folder}/broken", "--stop-after", "5"])
+        resumed = train.main([*common, "--out", f"{folder}/broken", "--resume"])
+        for (name, a), b in zip(whole.model.state_dict().items(), resumed.model.state_dict().values()):
+            assert torch.equal(a, b), f"{name} differs"
+        for name, a in whole.average.items():
+            assert torch.equal(a, resumed.average[name]), f"the average of {name} differs"
+        assert whole.step == resumed.step == 8
+    return "8 steps, broken after 5: every weight is equal"
+
+
+def the_integer_path_follows_the_float_path():
+    samples = [data.procedural(i, size=48, views=2, pixels=80) for i in range(3)]
+    trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
+    for step in range(150):
+        trainer.train_step([samples[step % 3]])
+    with tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/model.safetensors"
+        export.export(trainer.model.eval(), samples, path, {"steps": 150})
+        export.half_weights(trainer.model)
+        penalty = export.verify(path, trainer.model, samples)
+    assert abs(penalty) < 0.02, f"rate penalty {100 * penalty:.2f} %"
+    return f"rate {100 * penalty:+.2f} %"
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "2")))
+    for check in (operators_agree_with_plain_pytorch, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
+                  the_integer_path_follows_the_float_path, a_crop_overfits):
+        begin = time.monotonic()
+        said = check()
+        print(f"{check.__name__.replace('_', ' ')}: {said} ({time.monotonic() - begin:.0f} s)", flush=True)
