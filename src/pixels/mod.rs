@@ -157,10 +157,11 @@ impl Renderer {
         times.project = lap();
         self.order.sort(&self.ellipses.depth)?;
         times.sort = lap();
+        let bounds = &self.ellipses.bounds;
         self.rows
-            .deal(&self.order, &self.ellipses.bounds, camera.height, limits)?;
+            .deal(&self.order, bounds, camera.height, bytes, limits)?;
         let dealt = lap();
-        let (image, [binning, blending]) = self.draw(camera, background, limits)?;
+        let (image, [binning, blending]) = self.draw(camera, background);
         let drawn = lap();
         let share = binning.as_secs_f64() / (binning + blending).as_secs_f64().max(1e-9);
         times.bin = dealt + drawn.mul_f64(share);
@@ -175,12 +176,7 @@ impl Renderer {
     }
 
     /// The picture, and the threads' time for the tiles' lists and for the pixels.
-    fn draw(
-        &self,
-        camera: &Camera,
-        background: Background,
-        limits: &Limits,
-    ) -> Result<(Image, [Duration; 2])> {
+    fn draw(&self, camera: &Camera, background: Background) -> (Image, [Duration; 2]) {
         let (width, height) = (camera.width as usize, camera.height as usize);
         let mut image = Image {
             width: camera.width,
@@ -193,20 +189,15 @@ impl Renderer {
             .enumerate()
             .map_init(Lists::default, |lists, (row, band)| {
                 let start = Instant::now();
-                lists.deal(
-                    self.rows.row(row),
-                    &self.ellipses.bounds,
-                    camera.width,
-                    limits,
-                )?;
+                lists.deal(self.rows.row(row), &self.ellipses.bounds, camera.width);
                 let dealt = Instant::now();
                 for column in 0..width.div_ceil(TILE as usize) {
                     self.draw_tile(lists.tile(column), [column, row], width, background, band);
                 }
-                Ok([dealt - start, dealt.elapsed()])
+                [dealt - start, dealt.elapsed()]
             })
-            .try_reduce(Default::default, |a, b| Ok([a[0] + b[0], a[1] + b[1]]))?;
-        Ok((image, times))
+            .reduce(Default::default, |a, b| [a[0] + b[0], a[1] + b[1]]);
+        (image, times)
     }
 
     /// `band`: the pixels of the tile's row of tiles.

@@ -61,33 +61,38 @@ impl Rows {
     /// Deals the ellipses out to the rows of tiles of a picture `height` pixels high; the memory is reused.
     ///
     /// # Errors
-    /// [`Error::LimitExceeded`] before anything is reserved, if the entries take more than `limits` allow.
+    /// [`Error::LimitExceeded`] before anything is reserved, if `reserved` bytes, these entries, and the [`Lists`] of as many rows as
+    /// there are threads are together more than `limits` allow.
     pub fn deal(
         &mut self,
         order: &Order,
         bounds: &[Bounds],
         height: u32,
+        reserved: u64,
         limits: &Limits,
     ) -> Result<()> {
         let rows = height.div_ceil(TILE) as usize;
         self.starts.clear();
         self.starts.resize(rows + 1, 0);
-        self.pairs = 0;
-        let mut entries = 0u64;
+        let mut pairs = vec![0u64; rows];
         for b in bounds {
+            let (left, right) = tiles(b.x0, b.x1);
             let (first, end) = tiles(b.y0, b.y1);
-            let columns = tiles(b.x0, b.x1);
-            entries += (end - first) as u64;
-            self.pairs += (end - first) as u64 * (columns.1 - columns.0) as u64;
             for row in first..end {
                 self.starts[row + 1] += 1;
+                pairs[row] += (right - left) as u64;
             }
         }
-        limits.check_bytes("bytes of the rows' lists of ellipses", entries * 4)?;
         for row in 0..rows {
             self.starts[row + 1] += self.starts[row];
         }
-        self.ids.resize(entries as usize, 0);
+        self.pairs = pairs.iter().sum();
+        let entries = self.starts[rows];
+        let largest = pairs.into_iter().max().unwrap_or(0);
+        let at_once = rayon::current_num_threads().min(rows) as u64;
+        let bytes = size_of::<u32>() as u64 * (entries as u64 + at_once * largest);
+        limits.check_bytes("bytes to draw the picture", reserved.saturating_add(bytes))?;
+        self.ids.resize(entries, 0);
         let mut next = self.starts[..rows].to_vec();
         for id in order.iter() {
             let b = &bounds[id as usize];
@@ -121,16 +126,7 @@ pub struct Lists {
 
 impl Lists {
     /// Deals the ellipses `row` out to the tiles of a picture `width` pixels wide; the memory is reused.
-    ///
-    /// # Errors
-    /// [`Error::LimitExceeded`] before anything is reserved, if the entries take more than `limits` allow.
-    pub fn deal(
-        &mut self,
-        row: &[u32],
-        bounds: &[Bounds],
-        width: u32,
-        limits: &Limits,
-    ) -> Result<()> {
+    pub fn deal(&mut self, row: &[u32], bounds: &[Bounds], width: u32) {
         let columns = width.div_ceil(TILE) as usize;
         // Each ellipse is counted where it begins and discounted where it ends; running sums then give every tile's count.
         self.next.clear();
@@ -150,7 +146,6 @@ impl Lists {
             total += count;
             self.starts.push(total);
         }
-        limits.check_bytes("bytes of a row's lists of ellipses", total as u64 * 4)?;
         self.ids.resize(total, 0);
         for &id in row {
             let b = &bounds[id as usize];
@@ -160,7 +155,6 @@ impl Lists {
                 *next += 1;
             }
         }
-        Ok(())
     }
 
     /// The ellipses of tile `column`, nearest first.
@@ -214,15 +208,12 @@ mod tests {
         let depth: Vec<f32> = bounds.iter().map(|_| 1.0 + random(40) as f32).collect();
         let order = order(&depth);
         let mut rows = Rows::default();
-        rows.deal(&order, &bounds, height, &Limits::default())
+        rows.deal(&order, &bounds, height, 0, &Limits::default())
             .unwrap();
         let mut pairs = 0;
         for row in 0..height.div_ceil(TILE) {
             let mut lists = Lists::default();
-            let limits = Limits::default();
-            lists
-                .deal(rows.row(row as usize), &bounds, width, &limits)
-                .unwrap();
+            lists.deal(rows.row(row as usize), &bounds, width);
             for column in 0..width.div_ceil(TILE) {
                 let (x, y) = (column * TILE, row * TILE);
                 let expected: Vec<u32> = order
@@ -241,20 +232,20 @@ mod tests {
 
     #[test]
     fn lists_over_the_limit_are_refused_before_they_are_made() {
-        let limits = Limits {
-            max_bytes: 4 * 1000,
-            ..Limits::default()
-        };
-        let bounds = vec![bounds(0, 160, 0, 160); 101];
+        let bounds = vec![bounds(0, 160, 0, 16); 101];
         let order = order(&[1.0; 101]);
-        let mut rows = Rows::default();
-        let error = rows.deal(&order, &bounds, 160, &limits).unwrap_err();
-        assert!(matches!(error, Error::LimitExceeded { needed: 4040, .. }));
-        let row: Vec<u32> = (0..101).collect();
-        let error = Lists::default().deal(&row, &bounds, 160, &limits);
-        assert!(matches!(
-            error,
-            Err(Error::LimitExceeded { needed: 4040, .. })
-        ));
+        // One entry of the only row, and ten of its tiles, each.
+        let needed = 101 * 11 * 4;
+        let deal = |reserved, max_bytes| {
+            let limits = Limits {
+                max_bytes,
+                ..Limits::default()
+            };
+            let mut rows = Rows::default();
+            rows.deal(&order, &bounds, 16, reserved, &limits)
+        };
+        deal(100, needed + 100).unwrap();
+        let error = deal(100, needed + 99).unwrap_err();
+        assert!(matches!(error, Error::LimitExceeded { needed: n, .. } if n == needed + 100));
     }
 }
