@@ -146,7 +146,7 @@ impl Renderer {
         }
         let count = u64::from(camera.width) * u64::from(camera.height);
         limits.check_pixels("pixels of the picture", count)?;
-        let per_gaussian = Ellipses::BYTES + size_of::<u64>() as u64;
+        let per_gaussian = Ellipses::BYTES + Order::BYTES;
         let bytes = count * size_of::<[f32; 4]>() as u64 + gaussians.len() as u64 * per_gaussian;
         limits.check_bytes("bytes to draw the picture", bytes)?;
 

@@ -103,22 +103,28 @@ impl View {
         require(seen.z > self.near, Invisible::Behind)?;
         let depth = seen.z as f32;
 
-        let slope = [seen.x / seen.z, seen.y / seen.z];
-        let centre = [0, 1].map(|k| (self.focal[k] * slope[k] + self.centre[k]) as f32);
+        let inverse = 1.0 / seen.z;
         let scale = scale.abs().min(Vec3::splat(MAX_SCALE));
-        let [m1, m2] = [0, 1].map(|k| {
+        let along = |k: usize, offset: f64| {
+            let slope = offset * inverse;
+            let centre = (self.focal[k] * slope + self.centre[k]) as f32;
             let [low, high] = self.slopes[k];
-            let slope = slope[k].clamp(low, high) as f32;
-            let magnification = (self.focal[k] / seen.z) as f32;
-            let row = (self.rows[k] - self.rows[2] * slope) * magnification;
-            axes.transpose_mul_vec3(row) * scale
-        });
+            let row = self.rows[k] - self.rows[2] * slope.clamp(low, high) as f32;
+            let row = axes.transpose_mul_vec3(row * (self.focal[k] * inverse) as f32);
+            (centre, row * scale)
+        };
+        let (x, m1) = along(0, seen.x);
+        let (y, m2) = along(1, seen.y);
         let (a, c) = (m1.length_squared() + BLUR, m2.length_squared() + BLUR);
-        let finite = [depth, centre[0], centre[1], a, c].map(f32::is_finite) == [true; 5];
+        let finite = Vec3::new(depth, x, y).is_finite() && a.is_finite() && c.is_finite();
         require(finite, Invisible::NotFinite)?;
+
         let log_opacity = opacity.min(1.0).log2();
-        let bounds = self.reach(centre, [a, c], log_opacity);
-        let bounds = bounds.ok_or(Invisible::Outside)?;
+        // α = 1/255 at d² = 2·ln(255·opacity) standard deviations squared.
+        let reach = 2.0 * std::f32::consts::LN_2 * (log_opacity - LOG_FLOOR).max(0.0);
+        let (x0, x1) = covered(x, (a * reach).sqrt(), self.size[0]);
+        let (y0, y1) = covered(y, (c * reach).sqrt(), self.size[1]);
+        require(x0 < x1 && y0 < y1, Invisible::Outside)?;
 
         let (u, v) = if a >= c {
             let (along, across, slope) = factors(m1, m2, a);
@@ -127,8 +133,9 @@ impl View {
             let (along, across, slope) = factors(m2, m1, c);
             ([across, -slope * across], [0.0, along])
         };
+        let bounds = Bounds { x0, y0, x1, y1 };
         let shape = Ellipse {
-            centre,
+            centre: [x, y],
             u,
             v,
             log_opacity,
@@ -136,22 +143,15 @@ impl View {
         };
         Ok((depth, bounds, shape))
     }
+}
 
-    /// The pixels whose centres lie in the tight box of the ellipse on which α is [`ALPHA_FLOOR`].
-    fn reach(&self, centre: [f32; 2], variance: [f32; 2], log_opacity: f32) -> Option<Bounds> {
-        // α = 1/255 at d² = 2·ln(255·opacity) standard deviations squared.
-        let deviations = (2.0 * std::f32::consts::LN_2 * (log_opacity - LOG_FLOOR))
-            .max(0.0)
-            .sqrt();
-        let [x, y] = [0, 1].map(|k| {
-            let half = variance[k].sqrt() * deviations;
-            let first = (centre[k] - half - 0.5).ceil().max(0.0);
-            let end = ((centre[k] + half - 0.5).floor() + 1.0).min(self.size[k] as f32);
-            (first < end).then_some((first as u32, (end as u32).min(self.size[k])))
-        });
-        let ((x0, x1), (y0, y1)) = (x?, y?);
-        (x0 < x1 && y0 < y1).then_some(Bounds { x0, y0, x1, y1 })
-    }
+/// The pixels `first..end` of `size` whose centres lie within `half` of `centre`. Empty if `first ≥ end`.
+fn covered(centre: f32, half: f32, size: u32) -> (u32, u32) {
+    let within = |x: f32| x.clamp(0.0, size as f32);
+    let low = within(centre - half - 0.5);
+    // Rounded up by hand: without SSE 4.1 `ceil` is a call.
+    let first = low as u32 + u32::from((low as u32 as f32) < low);
+    (first, within(centre + half + 0.5) as u32)
 }
 
 /// Phrased for what holds, so that NaN is refused.
@@ -173,10 +173,18 @@ fn factors(long: Vec3, short: Vec3, p: f32) -> (f32, f32, f32) {
 /// The rotation of a quaternion `w, x, y, z` of any length but zero.
 fn rotation_matrix(wxyz: [f32; 4]) -> Option<Mat3> {
     // The square of any f32 but zero is a normal f64.
-    let squared: f64 = wxyz.iter().map(|&x| f64::from(x) * f64::from(x)).sum();
-    (squared > 0.0).then(|| {
-        let inverse = 1.0 / squared.sqrt();
-        let [w, x, y, z] = wxyz.map(|x| (f64::from(x) * inverse) as f32);
-        Mat3::from_quat(Quat::from_xyzw(x, y, z, w))
-    })
+    let square = |x: f32| f64::from(x) * f64::from(x);
+    let [w, x, y, z] = wxyz;
+    let squared = square(w) + square(x) + square(y) + square(z);
+    if squared == 0.0 {
+        return None;
+    }
+    let inverse = 1.0 / squared.sqrt();
+    let unit = |x: f32| (f64::from(x) * inverse) as f32;
+    Some(Mat3::from_quat(Quat::from_xyzw(
+        unit(x),
+        unit(y),
+        unit(z),
+        unit(w),
+    )))
 }

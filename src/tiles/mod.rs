@@ -1,12 +1,10 @@
 //! Which ellipses touch which square of the picture, nearest first.
 //!
-//! The order of drawing is sorted once ([`Order`]), by the bits of the depth and then the index: for positive floats that is the
-//! order of the depths, without loss, and no two keys are equal, so the order is the same however it is computed. The ellipses are
+//! The order of drawing is sorted once ([`Order`]), by the bits of the depth, which for positive floats is the order of the depths,
+//! without loss, and then by index. The ellipses are
 //! then dealt out, keeping that order, to rows of tiles ([`Rows`]), and within a row to its tiles ([`Lists`]). Only the lists of
 //! the rows being drawn exist at a time: an ellipse that fills the picture costs one entry per row of tiles, and one per tile
 //! only while a row is drawn.
-
-use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::limits::Limits;
@@ -18,10 +16,18 @@ pub const TILE: u32 = 16;
 /// Indices of ellipses, the nearest first; ties by index.
 #[derive(Debug, Default)]
 pub struct Order {
+    /// The depth's bits above, the index below.
     keys: Vec<u64>,
+    sorted: Vec<u64>,
 }
 
+/// Bits of a depth that one pass of the sort looks at: 4096 counters fit the first cache.
+const DIGIT: u32 = 12;
+
 impl Order {
+    /// Bytes per ellipse.
+    pub const BYTES: u64 = 2 * size_of::<u64>() as u64;
+
     /// Sorts `depth`, whose numbers must be positive; the memory is reused.
     ///
     /// # Errors
@@ -33,12 +39,31 @@ impl Order {
                 detail: format!("there are {}", depth.len()),
             });
         }
-        depth
-            .par_iter()
-            .enumerate()
-            .map(|(i, z)| u64::from(z.to_bits()) << 32 | i as u64)
-            .collect_into_vec(&mut self.keys);
-        self.keys.par_sort_unstable();
+        let bits = |z: &f32| z.to_bits();
+        let least = depth.iter().map(bits).min().unwrap_or(0);
+        let span = depth.iter().map(bits).max().unwrap_or(0) - least;
+        self.keys.clear();
+        let key = |(i, z): (usize, &f32)| u64::from(z.to_bits() - least) << 32 | i as u64;
+        self.keys.extend(depth.iter().enumerate().map(key));
+        self.sorted.resize(depth.len(), 0);
+        // A radix sort, the least digit first, of the bits in which the depths differ. It is stable, and the indices ascend.
+        for shift in (0..u32::BITS - span.leading_zeros()).step_by(DIGIT as usize) {
+            let digit = |key: u64| (key >> (32 + shift)) as usize & ((1 << DIGIT) - 1);
+            let mut next = [0u32; 1 << DIGIT];
+            for &key in &self.keys {
+                next[digit(key)] += 1;
+            }
+            let mut total = 0;
+            for next in &mut next {
+                total += std::mem::replace(next, total);
+            }
+            for &key in &self.keys {
+                let next = &mut next[digit(key)];
+                self.sorted[*next as usize] = key;
+                *next += 1;
+            }
+            std::mem::swap(&mut self.keys, &mut self.sorted);
+        }
         Ok(())
     }
 
