@@ -4,6 +4,9 @@ mod heads;
 
 pub use heads::activate;
 
+pub mod ply;
+
+use crate::error::{Error, Result};
 use crate::placement::Placement;
 
 /// Renderable Gaussians, one array per parameter, all of the same length.
@@ -41,6 +44,18 @@ impl Default for Frame {
     }
 }
 
+impl Frame {
+    /// One cube-frame unit, half the cube's side, in world units. The frame must be valid.
+    pub fn unit(&self) -> f64 {
+        f64::from(1u32 << (self.bits - 1)) * self.placement.voxel_size
+    }
+
+    /// Whether it is a cube: 1 to 21 bits, and a valid placement.
+    pub fn is_valid(&self) -> bool {
+        (1..=21).contains(&self.bits) && self.placement.is_valid()
+    }
+}
+
 impl Gaussians {
     /// How many Gaussians.
     pub fn len(&self) -> usize {
@@ -50,5 +65,25 @@ impl Gaussians {
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.position.is_empty()
+    }
+
+    /// Whether every Gaussian has all its parameters.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the arrays differ in length.
+    pub fn check_lengths(&self) -> Result<()> {
+        let others = [
+            self.scale.len(),
+            self.rotation.len(),
+            self.opacity.len(),
+            self.colour.len(),
+        ];
+        if others == [self.len(); 4] {
+            return Ok(());
+        }
+        Err(Error::Usage(format!(
+            "{} positions, but {others:?} scales, rotations, opacities and colours",
+            self.len()
+        )))
     }
 }

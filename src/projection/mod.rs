@@ -15,7 +15,7 @@ use rayon::prelude::*;
 pub use camera::Camera;
 pub use ellipse::{Bounds, Ellipse};
 
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::gaussians::Gaussians;
 
 /// Variance that every ellipse is widened by, in px².
@@ -106,20 +106,9 @@ impl Dropped {
 /// [`Error::Usage`] if the camera is none ([`Camera::check`]) or the arrays of `gaussians` differ in length.
 pub fn project(gaussians: &Gaussians, camera: &Camera, ellipses: &mut Ellipses) -> Result<Dropped> {
     camera.check()?;
-    let count = gaussians.len();
-    let lengths = [
-        gaussians.scale.len(),
-        gaussians.rotation.len(),
-        gaussians.opacity.len(),
-        gaussians.colour.len(),
-    ];
-    if lengths != [count; 4] {
-        return Err(Error::Usage(format!(
-            "{count} positions, but {lengths:?} scales, rotations, opacities and colours"
-        )));
-    }
+    gaussians.check_lengths()?;
     let view = ellipse::View::new(camera);
-    ellipses.resize(count);
+    ellipses.resize(gaussians.len());
 
     // Each block gathers its visible ellipses at its start …
     let blocks: Vec<(usize, Dropped)> = ellipses

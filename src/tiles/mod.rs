@@ -97,23 +97,24 @@ impl Rows {
         limits: &Limits,
     ) -> Result<()> {
         let rows = height.div_ceil(TILE) as usize;
-        self.starts.clear();
-        self.starts.resize(rows + 1, 0);
-        let mut pairs = vec![0u64; rows];
+        let mut counts = vec![(0, 0u64); rows];
         for b in bounds {
             let (left, right) = tiles(b.x0, b.x1);
             let (first, end) = tiles(b.y0, b.y1);
-            for row in first..end {
-                self.starts[row + 1] += 1;
-                pairs[row] += (right - left) as u64;
+            for (entries, pairs) in &mut counts[first..end] {
+                *entries += 1;
+                *pairs += (right - left) as u64;
             }
         }
-        for row in 0..rows {
-            self.starts[row + 1] += self.starts[row];
+        let mut entries = 0;
+        self.starts.clear();
+        self.starts.push(0);
+        for (count, _) in &counts {
+            entries += count;
+            self.starts.push(entries);
         }
-        self.pairs = pairs.iter().sum();
-        let entries = self.starts[rows];
-        let largest = pairs.into_iter().max().unwrap_or(0);
+        self.pairs = counts.iter().map(|(_, pairs)| pairs).sum();
+        let largest = counts.iter().map(|(_, pairs)| *pairs).max().unwrap_or(0);
         let at_once = rayon::current_num_threads().min(rows) as u64;
         let bytes = size_of::<u32>() as u64 * (entries as u64 + at_once * largest);
         limits.check_bytes("bytes to draw the picture", reserved.saturating_add(bytes))?;
