@@ -83,8 +83,12 @@ impl Args {
         let mut drawn = Vec::new();
         for item in &self.items {
             eprintln!("{}", item.name);
-            let cloud = item::read_cloud(&item.path, &limits)?;
-            for one in judge_cloud(&truth, &Points::on_grid(&cloud, frame.bits), frame)? {
+            let points = Points::on_grid(
+                &item::read_cloud(&item.path, &limits)?,
+                frame.bits,
+                cloud.as_ref(),
+            );
+            for one in judge_cloud(&truth, &points, frame)? {
                 report.rows.push(row(item, &one));
                 drawn.push(one);
             }

@@ -268,6 +268,23 @@ mod tests {
     }
 
     #[test]
+    fn ms_ssim_is_what_pytorch_msssim_computes() {
+        let (width, height) = (203, 170);
+        let places = || (0..width * height).map(|i| (i % width, i / width));
+        let ramp = |x: usize, y: usize, k: usize| (x * (3 + k) + y * (5 - k)) / 4 % 256;
+        let tiled = |x, y, k| ramp(x, y, k) * 7 / 8 + 16 * ((x / 8 + y / 8) % 2);
+        let picture = |f: &dyn Fn(usize, usize, usize) -> usize| Picture {
+            width,
+            height,
+            rgb: places()
+                .map(|(x, y)| [0, 1, 2].map(|k| f(x, y, k) as u8))
+                .collect(),
+        };
+        let score = ms_ssim(&picture(&ramp), &picture(&tiled)).unwrap();
+        assert!((score - 0.855834).abs() < 1e-5, "{score}");
+    }
+
+    #[test]
     fn ms_ssim_needs_more_than_160_pixels_a_side() {
         let small = Picture::new(160, 400, [0; 3]);
         assert_eq!(ms_ssim(&small, &small), None);

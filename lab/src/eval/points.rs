@@ -1,5 +1,7 @@
 //! Point clouds drawn the two plain ways: as squares that close up, and as one Gaussian a point.
 
+use std::collections::HashSet;
+
 use b2p::cloud::PointCloud;
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::pixels::Image;
@@ -22,15 +24,22 @@ impl Points {
     /// Takes a cloud whose coordinates are voxels of a grid of `2^bits`, voxel `v` being centred on `v + ½`.
     ///
     /// A decoder that dropped low bits leaves a coarser lattice in these coordinates: its spacing is the greatest common divisor of
-    /// all differences. Coordinates that are no integers have their mean distance to the nearest point as spacing.
-    pub fn on_grid(cloud: &PointCloud, bits: u8) -> Points {
+    /// all differences, and a point stands for a cell of voxels. Whether the codec rounded to the lattice (the point is in the
+    /// cell's middle) or cut off bits (in its lowest corner) is asked of the `finest` cloud, if there is one: whichever finds more of
+    /// its voxels. Coordinates that are no integers have their mean distance to the nearest point as spacing.
+    pub fn on_grid(cloud: &PointCloud, bits: u8, finest: Option<&PointCloud>) -> Points {
+        let step = lattice(&cloud.positions);
+        let middle = match (step, finest) {
+            (Some(step @ 2..), Some(finest)) => cell_middle(&cloud.positions, step, finest),
+            _ => 0.5,
+        };
         let scale = 2.0 / f64::from(1u32 << bits);
         let positions: Vec<[f32; 3]> = cloud
             .positions
             .iter()
-            .map(|p| p.map(|v| ((v + 0.5) * scale - 1.0) as f32))
+            .map(|p| p.map(|v| ((v + middle) * scale - 1.0) as f32))
             .collect();
-        let spacing = match lattice(&cloud.positions) {
+        let spacing = match step {
             Some(step) => step as f64 * scale,
             None => mean_nearest_distance(&positions).unwrap_or(scale),
         };
@@ -120,6 +129,26 @@ fn lattice(positions: &[[f64; 3]]) -> Option<u64> {
     (step > 0).then_some(step)
 }
 
+/// From a point's coordinate to the middle of the cell of `step`³ voxels that it stands for.
+fn cell_middle(coarse: &[[f64; 3]], step: u64, finest: &PointCloud) -> f64 {
+    let step = step as f64;
+    let key = |p: [f64; 3]| p.map(|v| v as i64);
+    let known: HashSet<[i64; 3]> = coarse.iter().copied().map(key).collect();
+    let found = |shift: f64| {
+        let cell = |p: &[f64; 3]| key(p.map(|v| ((v + shift) / step).floor() * step));
+        finest
+            .positions
+            .iter()
+            .filter(|p| known.contains(&cell(p)))
+            .count()
+    };
+    if found(step / 2.0) > found(0.0) {
+        0.0
+    } else {
+        step / 2.0
+    }
+}
+
 fn greatest_common_divisor(mut a: u64, mut b: u64) -> u64 {
     while b != 0 {
         (a, b) = (b, a % b);
@@ -198,7 +227,7 @@ mod tests {
             colours: vec![[255, 0, 0]; 32 * 32],
             ..PointCloud::default()
         };
-        let points = Points::on_grid(&cloud, 5);
+        let points = Points::on_grid(&cloud, 5, None);
         assert_eq!(points.spacing, 2.0 / 32.0);
         let image = points.draw_squares(&camera(), 1.0);
         let rows: Vec<usize> = (0..64)
@@ -216,6 +245,33 @@ mod tests {
         assert_eq!(on(vec![[1.0, 2.0, 3.0], [2.0, 4.0, 4.0]]), Some(1));
         assert_eq!(on(vec![[1.0, 2.0, 3.5], [2.0, 4.0, 3.0]]), None);
         assert_eq!(on(vec![[1.0; 3]; 2]), None);
+    }
+
+    #[test]
+    fn a_point_of_a_coarser_lattice_stands_in_the_middle_of_its_cell() {
+        let cloud = |positions: Vec<[f64; 3]>| PointCloud {
+            colours: vec![[0; 3]; positions.len()],
+            positions,
+            ..PointCloud::default()
+        };
+        let finest = cloud((3..29).map(|i| [f64::from(i), 7.0, 9.0]).collect());
+        let coarse = |f: fn(f64) -> f64| {
+            cloud(
+                finest
+                    .positions
+                    .iter()
+                    .map(|p| p.map(|v| 4.0 * f(v / 4.0)))
+                    .collect(),
+            )
+        };
+        let cells_of = |cloud: &PointCloud| Points::on_grid(cloud, 5, Some(&finest)).positions[4];
+        let voxels = |p: f32| (p + 1.0) * 16.0;
+        // Voxel 7 is in [6, 10) rounded, in [4, 8) cut off.
+        let (rounded, cut) = (coarse(|v| (v + 0.5).floor()), coarse(f64::floor));
+        assert_eq!(cells_of(&rounded).map(voxels), [8.0, 8.0, 8.0]);
+        assert_eq!(cells_of(&cut).map(voxels), [6.0, 6.0, 10.0]);
+        let alone = Points::on_grid(&rounded, 5, None).positions[4];
+        assert_eq!(alone.map(voxels), [8.5, 8.5, 8.5]);
     }
 
     #[test]

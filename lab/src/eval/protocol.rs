@@ -23,6 +23,9 @@ pub const SIDE: u32 = 512;
 /// Samples across and down a pixel of the truth.
 const SAMPLES: u32 = 4;
 
+/// Pixels around the foreground that belong to its extent.
+const MARGIN: usize = 8;
+
 /// What a method scored, each the mean over the views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Scores {
@@ -60,7 +63,7 @@ struct TrueView {
 }
 
 impl Truth {
-    /// Draws a surface that is in the cube frame.
+    /// Draws a surface that is in the cube frame, from [`VIEWS`] cameras.
     ///
     /// # Errors
     /// [`LabError::Usage`] if no camera sees any of it.
@@ -81,7 +84,7 @@ impl Truth {
         self.views.iter().map(|v| &v.picture)
     }
 
-    /// The smallest rectangle that holds the foreground of every view: first column, first row, width, height.
+    /// The smallest rectangle that holds the foreground of every view and a little around it: first column, first row, width, height.
     pub fn extent(&self) -> [usize; 4] {
         let side = SIDE as usize;
         let (mut low, mut high) = ([side; 2], [0; 2]);
@@ -93,6 +96,8 @@ impl Truth {
                 }
             }
         }
+        let low = low.map(|v| v.saturating_sub(MARGIN));
+        let high = high.map(|v| (v + MARGIN).min(side));
         [low[0], low[1], high[0] - low[0], high[1] - low[1]]
     }
 
@@ -182,5 +187,73 @@ impl Scores {
             ms_ssim: of(|s| s.ms_ssim),
             ssimulacra2: of(|s| s.ssimulacra2),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use glam::{Affine3A, Vec3};
+
+    use super::*;
+    use crate::eval::points::Points;
+    use crate::mesh::Mesh;
+    use crate::procedural::patch::Pattern;
+    use crate::procedural::shapes;
+
+    /// A ball off the centre whose colour tells directions apart, and points all over it.
+    fn ball() -> (Surface, Points) {
+        let place = Affine3A::from_translation(Vec3::new(0.3, 0.2, -0.1))
+            * Affine3A::from_scale(Vec3::splat(0.4));
+        let ball = shapes::sphere().placed(place);
+        let colour = |p: Vec3| 0.5 + p.clamp(Vec3::splat(-0.5), Vec3::splat(0.5));
+        let paint: Pattern = Arc::new(move |s| colour(s.position));
+        let mesh = Mesh {
+            parts: vec![ball.part(200.0, &paint, None)],
+        };
+        let grid =
+            || (0..600).flat_map(|i| (0..300).map(move |j| (i as f32 / 600.0, j as f32 / 299.0)));
+        let places = || grid().map(|(u, v)| ball.point(u, v));
+        let points = Points {
+            positions: places().map(|p| p.to_array()).collect(),
+            colours: places()
+                .map(|p| (colour(p) * 255.0).round().to_array().map(|v| v as u8))
+                .collect(),
+            spacing: 0.005,
+        };
+        (Surface::new(&mesh), points)
+    }
+
+    #[test]
+    fn truth_points_and_gaussians_are_seen_at_the_same_place_from_every_side() {
+        let (surface, points) = ball();
+        let gaussians = points.to_gaussians(Default::default());
+        for index in [0, 4, 9] {
+            let view = TrueView::new(&surface, index).unwrap();
+            let squares = points.draw_squares(&view.camera, 1.0).box_half();
+            let white = Background::WHITE;
+            let (splats, _) = Renderer::default()
+                .render(&gaussians, &view.camera, white, &Limits::default())
+                .unwrap();
+            for image in [squares, splats.box_half()] {
+                let scores = view.compare(&Picture::from(&image)).unwrap();
+                assert!(scores.psnr > 28.0, "view {index}: {scores:?}");
+                assert!(scores.foreground_psnr > 33.0, "view {index}: {scores:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_foreground_is_what_the_mesh_covers() {
+        let (surface, _) = ball();
+        let view = TrueView::new(&surface, 0).unwrap();
+        let covered = view.foreground.iter().filter(|f| **f).count() as f64;
+        let radius = 0.4 / 3.1 * view.camera.fx / 2.0;
+        let disc = std::f64::consts::PI * radius * radius;
+        assert!((covered / disc - 1.0).abs() < 0.03, "{covered} {disc}");
+        let outside = view.picture.rgb.iter().zip(&view.foreground);
+        let white = outside.filter(|(p, f)| !**f && **p == [255; 3]).count();
+        assert!(white as f64 > 0.98 * (512.0 * 512.0 - covered));
     }
 }
