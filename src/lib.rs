@@ -13,6 +13,9 @@
 
 pub mod bitstream;
 pub mod cloud;
+pub mod decoder;
+
+pub mod encoder;
 pub mod entropy;
 pub mod error;
 pub mod gaussians;

@@ -27,6 +27,16 @@ impl Default for Limits {
 }
 
 impl Limits {
+    /// No bounds but those of the format: for input that is trusted.
+    pub fn unlimited() -> Self {
+        Limits {
+            max_points: u64::MAX,
+            max_depth: u8::MAX,
+            max_pixels: u64::MAX,
+            max_bytes: u64::MAX,
+        }
+    }
+
     /// Fails with [`Error::LimitExceeded`] if `count` points are more than allowed.
     pub fn check_points(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_points, "max_points")

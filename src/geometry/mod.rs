@@ -1,5 +1,6 @@
 //! Which voxels are occupied, at every octree level.
 
+pub mod codec;
 pub mod morton;
 mod neighbours;
 mod octree;

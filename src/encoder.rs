@@ -1,0 +1,244 @@
+//! Point cloud to stream. Runs the decoder in the loop: what a level is predicted from is what the decoder will have.
+
+use std::ops::RangeInclusive;
+
+use rayon::prelude::*;
+
+use crate::bitstream::{Header, MAX_SLICE_VOXELS, Writer};
+use crate::cloud::ColouredVoxels;
+use crate::decoder::Decoder;
+use crate::entropy::{Condition, encode_level, latent_hash};
+use crate::error::{Error, Result};
+use crate::geometry::{KernelMap, Octree, Voxels, codec};
+use crate::limits::Limits;
+use crate::log::Log;
+use crate::network::{Model, ROLES};
+
+/// What may be chosen about a stream.
+#[derive(Debug, Clone, Default)]
+pub struct Options {
+    /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.
+    pub levels: Option<RangeInclusive<u8>>,
+}
+
+/// A finished stream.
+#[derive(Debug, Clone)]
+pub struct Encoded {
+    /// The stream.
+    pub bytes: Vec<u8>,
+    /// What each level took, base level first.
+    pub rates: Vec<Rate>,
+}
+
+/// What a level took.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Rate {
+    /// The octree level.
+    pub level: u8,
+    /// Its voxels.
+    pub voxels: usize,
+    /// Bytes of its geometry, chunk headers included; the base level's include those of all levels above it.
+    pub geometry_bytes: usize,
+    /// Bytes of its features, chunk headers included.
+    pub feature_bytes: usize,
+}
+
+/// Codes a cloud, then decodes the stream and compares before giving it out.
+///
+/// # Errors
+/// [`Error::Usage`] for levels that the cloud or the format does not have, [`Error::Unsupported`] if the model can only decode; and,
+/// if encoder and decoder disagreed on this machine, whatever the decoder found.
+pub fn encode(
+    cloud: &ColouredVoxels,
+    model: &Model,
+    options: &Options,
+    log: &mut Log,
+) -> Result<Encoded> {
+    let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
+    let (base, top) = (*levels.start(), *levels.end());
+    let (finest, colours) = log.step("pool colours", cloud.voxels.len(), "voxels", || {
+        Ok(pooled(cloud, top + 1))
+    })?;
+    let octree = Octree::new(finest)?;
+    let maps = log.step("kernel maps", octree.level(top + 1).len(), "voxels", || {
+        Ok(kernel_maps(&octree, base))
+    })?;
+    let mut features = log.step("features", colours.len(), "voxels", || {
+        let maps: Vec<_> = maps.iter().rev().collect();
+        let occupancy: Vec<_> = levels
+            .clone()
+            .rev()
+            .map(|level| octree.occupancy(level))
+            .collect();
+        model.features(&colours, &maps, &occupancy)
+    })?;
+
+    let slice = MAX_SLICE_VOXELS as usize;
+    let mut writer = Writer::new(Header {
+        optional_flags: 0,
+        bits: cloud.voxels.depth(),
+        base,
+        top,
+        points: cloud.voxels.len() as u64,
+        placement: cloud.placement,
+        model: model.id(),
+        slice_voxels: MAX_SLICE_VOXELS,
+        voxels: levels
+            .clone()
+            .map(|level| octree.level(level).len() as u32)
+            .collect(),
+        sections: Vec::new(),
+    })?;
+    let mut below: Option<Vec<i16>> = None;
+    for (role, level) in levels.clone().enumerate() {
+        let (count, map) = (octree.level(level).len(), &maps[role]);
+        log.step(
+            format!("geometry of level {level}"),
+            count,
+            "voxels",
+            || {
+                if role > 0 {
+                    return writer.geometry(
+                        level,
+                        &codec::encode_level(&octree, &maps[role - 1], level, slice),
+                    );
+                }
+                let mut map = KernelMap::root();
+                (1..=level).try_for_each(|n| {
+                    let slices = codec::encode_level(&octree, &map, n, slice);
+                    map = octree.child_map(n - 1, &map);
+                    writer.geometry(n, &slices)
+                })
+            },
+        )?;
+        // The finest level's features come first, so those of the level at hand are the last.
+        let own = features.pop().unwrap_or_default();
+        below = log.step(
+            format!("features of level {level}"),
+            count,
+            "voxels",
+            || {
+                let context = below
+                    .as_ref()
+                    .map(|g| model.upsample(role, g, octree.occupancy(level - 1)));
+                let latents = model.squeeze(role, &own, context.as_deref())?;
+                let parameters = context
+                    .as_ref()
+                    .map(|c| model.entropy_parameters(role, c, map));
+                let condition = match &parameters {
+                    Some((mu, sigma)) => Condition::Gauss { mu, sigma },
+                    None => Condition::Prior,
+                };
+                let slices = encode_level(model.tables(), condition, &latents, slice);
+                writer.features(level, latent_hash(&latents), &slices)?;
+                Ok(Some(model.reconstruct(
+                    role,
+                    &latents,
+                    context.as_deref(),
+                    map,
+                )))
+            },
+        )?;
+    }
+    let bytes = writer.finish()?;
+    let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
+        Decoder::new(model)
+            .with_limits(Limits::unlimited())
+            .exact(&bytes, top, &mut Log::default())
+    })?;
+    if exact.octree != octree.truncated(top) || Some(exact.features) != below {
+        return Err(Error::Usage(
+            "the stream does not decode to what was encoded: this machine computes wrongly".into(),
+        ));
+    }
+    let header = Header::parse(&bytes, &Limits::unlimited())?;
+    let rates = levels
+        .zip(header.voxels.iter().zip(&header.sections))
+        .map(|(level, (&voxels, section))| Rate {
+            level,
+            voxels: voxels as usize,
+            geometry_bytes: section.geometry as usize,
+            feature_bytes: section.features as usize,
+        })
+        .collect();
+    Ok(Encoded { bytes, rates })
+}
+
+/// The levels to code, for a cloud of bit depth `bits`.
+fn choose_levels(bits: u8, wanted: Option<RangeInclusive<u8>>) -> Result<RangeInclusive<u8>> {
+    let levels = wanted.unwrap_or(bits.saturating_sub(3)..=bits - 1);
+    let (first, last) = (*levels.start(), *levels.end());
+    if first > last || last >= bits || usize::from(last - first) >= ROLES {
+        return Err(Error::Usage(format!(
+            "levels {first}..{last} cannot be coded: a cloud of {bits} bits has levels up to {}, of which at most {ROLES} in a row are coded",
+            bits - 1
+        )));
+    }
+    Ok(levels)
+}
+
+/// The voxels of a level with the mean colours, in `[0, 1]`, of the cloud's voxels in each.
+fn pooled(cloud: &ColouredVoxels, level: u8) -> (Voxels, Vec<[f32; 3]>) {
+    let shift = 3 * (cloud.voxels.depth() - level);
+    let mut keys: Vec<u64> = Vec::new();
+    let mut sums: Vec<([u32; 3], u32)> = Vec::new();
+    for (key, colour) in cloud.voxels.keys().iter().zip(&cloud.colours) {
+        let key = key >> shift;
+        if keys.last() != Some(&key) {
+            keys.push(key);
+            sums.push(([0; 3], 0));
+        }
+        if let Some((sum, count)) = sums.last_mut() {
+            for (sum, &c) in sum.iter_mut().zip(colour) {
+                *sum += u32::from(c);
+            }
+            *count += 1;
+        }
+    }
+    let mean = |(sum, count): &([u32; 3], u32)| sum.map(|s| s as f32 / (255 * count) as f32);
+    let colours = sums.par_iter().map(mean).collect();
+    (Voxels::from_sorted(level, keys), colours)
+}
+
+/// The kernel maps of `base` and all deeper levels, in this order.
+fn kernel_maps(octree: &Octree, base: u8) -> Vec<KernelMap> {
+    let mut maps = vec![octree.kernel_map(base)];
+    for level in base..octree.depth() {
+        let next = octree.child_map(level, &maps[maps.len() - 1]);
+        maps.push(next);
+    }
+    maps
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn levels_default_to_the_three_below_the_bit_depth() {
+        assert_eq!(choose_levels(10, None).unwrap(), 7..=9);
+        assert_eq!(choose_levels(2, None).unwrap(), 0..=1);
+        assert_eq!(choose_levels(1, None).unwrap(), 0..=0);
+        assert_eq!(choose_levels(21, None).unwrap(), 18..=20);
+    }
+
+    #[test]
+    fn levels_that_do_not_exist_are_refused() {
+        for wanted in [7..=10, 5..=8, 11..=12] {
+            let error = choose_levels(10, Some(wanted)).unwrap_err().to_string();
+            assert!(error.contains("up to 9"), "{error}");
+        }
+    }
+
+    #[test]
+    fn pooling_takes_the_mean_of_the_voxels_in_each() {
+        let cloud = ColouredVoxels {
+            voxels: Voxels::new(2, vec![0, 1, 8]),
+            colours: vec![[0, 0, 255], [255, 0, 255], [51, 51, 51]],
+            placement: crate::Placement::VOXEL_GRID,
+        };
+        let (voxels, colours) = pooled(&cloud, 1);
+        assert_eq!(voxels.keys(), [0, 1]);
+        assert_eq!(colours, [[0.5, 0.0, 1.0], [0.2; 3]]);
+    }
+}

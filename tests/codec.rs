@@ -1,0 +1,277 @@
+//! Clouds through encoder and decoder: scalable, exact, the same for any number of threads.
+
+mod common;
+
+use b2p::cloud::{ColouredVoxels, PointCloud, voxelise};
+use b2p::decoder::Decoder;
+use b2p::encoder::{Encoded, Options, encode};
+use b2p::geometry::{Octree, Voxels};
+use b2p::log::Log;
+use b2p::network::Model;
+use b2p::{Error, Limits, Placement};
+use common::{Ball, tiny_model};
+
+fn model() -> Model {
+    Model::from_bytes(&tiny_model(0)).expect("an untrained model loads")
+}
+
+fn ball(bits: u8, radius: f32) -> ColouredVoxels {
+    let cloud = PointCloud::from_ply(
+        Ball::new(bits, radius).to_ply().as_bytes(),
+        &Limits::default(),
+    )
+    .unwrap();
+    voxelise(&cloud, Some(bits)).unwrap()
+}
+
+fn coded(cloud: &ColouredVoxels, model: &Model) -> Encoded {
+    encode(cloud, model, &Options::default(), &mut Log::default()).unwrap()
+}
+
+/// A cloud of these voxels, its colours from their places.
+fn cloud_of(depth: u8, keys: Vec<u64>) -> ColouredVoxels {
+    let voxels = Voxels::new(depth, keys);
+    let colours = voxels
+        .keys()
+        .iter()
+        .map(|k| [*k as u8, (k >> 3) as u8, (k >> 7) as u8])
+        .collect();
+    ColouredVoxels {
+        voxels,
+        colours,
+        placement: Placement::VOXEL_GRID,
+    }
+}
+
+#[test]
+fn every_level_decodes_to_the_voxels_that_were_encoded() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let bytes = coded(&cloud, &model).bytes;
+    let octree = Octree::new(cloud.voxels.clone()).unwrap();
+    for level in 4..=6 {
+        let exact = Decoder::new(&model)
+            .exact(&bytes, level, &mut Log::default())
+            .unwrap();
+        assert_eq!(exact.octree, octree.truncated(level));
+    }
+}
+
+#[test]
+fn a_head_gives_one_gaussian_per_voxel_or_one_per_child() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let bytes = coded(&cloud, &model).bytes;
+    let octree = Octree::new(cloud.voxels.clone()).unwrap();
+    let decoder = Decoder::new(&model);
+    let count = |level| {
+        decoder
+            .decode(&bytes, Some(level), &mut Log::default())
+            .unwrap()
+            .len()
+    };
+    assert_eq!(count(5), 8 * octree.level(5).len());
+    assert_eq!(count(6), octree.level(6).len());
+    assert_eq!(decoder.levels(&bytes).unwrap(), [5, 6]);
+}
+
+#[test]
+fn a_stream_cut_after_a_level_is_the_coarser_stream() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let encoded = coded(&cloud, &model);
+    let decoder = Decoder::new(&model);
+    let stream = b2p::bitstream::Header::parse(&encoded.bytes, &Limits::default()).unwrap();
+    let whole = decoder
+        .decode(&encoded.bytes, Some(5), &mut Log::default())
+        .unwrap();
+    let cut = &encoded.bytes[..stream.prefix_bytes(5).unwrap() as usize];
+    assert_eq!(
+        decoder.decode(cut, Some(5), &mut Log::default()).unwrap(),
+        whole
+    );
+    assert_eq!(
+        decoder.decode(cut, None, &mut Log::default()).unwrap(),
+        whole,
+        "the default is the finest there is"
+    );
+    let error = decoder
+        .decode(cut, Some(6), &mut Log::default())
+        .unwrap_err();
+    assert!(matches!(error, Error::Truncated { .. }), "{error}");
+    let rates: usize = encoded
+        .rates
+        .iter()
+        .map(|r| r.geometry_bytes + r.feature_bytes)
+        .sum();
+    assert!(
+        rates < encoded.bytes.len() && encoded.bytes.len() < rates + 200,
+        "rates account for all but the header"
+    );
+}
+
+#[test]
+fn streams_and_decoded_latents_are_the_same_for_any_number_of_threads() {
+    let (model, cloud) = (model(), ball(8, 100.0));
+    assert!(
+        Octree::new(cloud.voxels.clone()).unwrap().level(7).len() > 16_384,
+        "more than one slice"
+    );
+    let run = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
+        pool.install(|| {
+            let bytes = coded(&cloud, &model).bytes;
+            let exact = Decoder::new(&model)
+                .exact(&bytes, 7, &mut Log::default())
+                .unwrap();
+            let gaussians = Decoder::new(&model)
+                .decode(&bytes, Some(7), &mut Log::default())
+                .unwrap();
+            (bytes, exact, gaussians)
+        })
+    };
+    let one = run(1);
+    assert_eq!(run(2), one);
+    assert_eq!(run(7), one);
+}
+
+#[test]
+fn the_exact_zone_is_the_same_on_every_instruction_set_of_this_machine() {
+    let cloud = ball(7, 45.0);
+    let bytes = coded(&cloud, &model()).bytes;
+    let exact = |isa| {
+        let model = model().with_isa(isa);
+        Decoder::new(&model)
+            .exact(&bytes, 6, &mut Log::default())
+            .unwrap()
+    };
+    let plain = exact(b2p_kernels::Isa::SCALAR);
+    for isa in b2p_kernels::Isa::available() {
+        assert_eq!(exact(isa), plain, "{isa}");
+    }
+}
+
+#[test]
+fn unusual_clouds_survive() {
+    let model = model();
+    let corner = |depth: u8| (1u64 << (3 * depth)) - 1;
+    let full: Vec<u64> = (0..512).collect();
+    let checkerboard = (0..4096u64)
+        .filter(|k| (k ^ k >> 1 ^ k >> 2) & 1 == 0)
+        .collect();
+    let clouds = [
+        ("one voxel", cloud_of(10, vec![123])),
+        ("two far corners", cloud_of(10, vec![0, corner(10)])),
+        ("a full cube", cloud_of(3, full)),
+        ("a checkerboard", cloud_of(4, checkerboard)),
+        (
+            "the deepest octree",
+            cloud_of(21, vec![0, 77, corner(21) - 1, corner(21)]),
+        ),
+        ("two bits", cloud_of(2, vec![0, 5, 63])),
+    ];
+    for (name, cloud) in clouds {
+        let bytes = coded(&cloud, &model).bytes;
+        let decoder = Decoder::new(&model);
+        let top = *decoder
+            .levels(&bytes)
+            .unwrap()
+            .last()
+            .expect("a level with Gaussians");
+        let gaussians = decoder
+            .decode(&bytes, None, &mut Log::default())
+            .unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert!(!gaussians.is_empty(), "{name}");
+        assert!(
+            gaussians.position.iter().flatten().all(|v| v.abs() <= 1.5),
+            "{name}"
+        );
+        assert_eq!(top, cloud.voxels.depth() - 1, "{name}");
+    }
+}
+
+#[test]
+fn a_cloud_of_one_bit_has_no_level_with_gaussians() {
+    let model = model();
+    let bytes = coded(&cloud_of(1, vec![0, 7]), &model).bytes;
+    let error = Decoder::new(&model)
+        .decode(&bytes, None, &mut Log::default())
+        .unwrap_err();
+    assert!(matches!(error, Error::Unsupported { .. }), "{error}");
+}
+
+#[test]
+fn fewer_levels_make_a_shorter_stream_that_still_draws() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let options = Options {
+        levels: Some(4..=5),
+    };
+    let short = encode(&cloud, &model, &options, &mut Log::default()).unwrap();
+    assert!(short.bytes.len() < coded(&cloud, &model).bytes.len());
+    assert_eq!(Decoder::new(&model).levels(&short.bytes).unwrap(), [5]);
+}
+
+#[test]
+fn a_stream_of_another_model_is_told_apart() {
+    let bytes = coded(&ball(6, 20.0), &model()).bytes;
+    let other = Model::from_bytes(&tiny_model(1)).unwrap();
+    let error = Decoder::new(&other)
+        .decode(&bytes, None, &mut Log::default())
+        .unwrap_err();
+    assert!(matches!(error, Error::ModelMismatch { .. }), "{error}");
+}
+
+#[test]
+fn memory_over_the_limit_is_refused_before_it_is_reserved() {
+    let model = model();
+    let bytes = coded(&ball(7, 45.0), &model).bytes;
+    let limits = Limits {
+        max_bytes: 1 << 16,
+        ..Limits::default()
+    };
+    let error = Decoder::new(&model)
+        .with_limits(limits)
+        .decode(&bytes, None, &mut Log::default())
+        .unwrap_err();
+    assert!(matches!(error, Error::LimitExceeded { .. }), "{error}");
+}
+
+#[test]
+fn the_placement_of_the_cloud_comes_back_with_the_gaussians() {
+    let model = model();
+    let mut cloud = ball(6, 20.0);
+    cloud.placement = Placement {
+        origin: [1e6, -3.5, 0.25],
+        voxel_size: 0.125,
+    };
+    let bytes = coded(&cloud, &model).bytes;
+    let gaussians = Decoder::new(&model)
+        .decode(&bytes, None, &mut Log::default())
+        .unwrap();
+    assert_eq!(gaussians.frame.placement, cloud.placement);
+    assert_eq!(gaussians.frame.bits, 6);
+}
+
+#[test]
+fn any_damage_to_a_stream_is_an_error_or_leaves_the_levels_before_it() {
+    let (model, cloud) = (model(), ball(5, 10.0));
+    let bytes = coded(&cloud, &model).bytes;
+    let decoder = Decoder::new(&model);
+    let whole = decoder.decode(&bytes, None, &mut Log::default()).unwrap();
+    for at in 0..bytes.len() {
+        let mut damaged = bytes.clone();
+        damaged[at] ^= 1 << (at % 8);
+        // The flags that a reader ignores, and what nothing is drawn from, are all under a checksum too.
+        assert!(
+            decoder
+                .decode(&damaged, Some(4), &mut Log::default())
+                .is_err(),
+            "byte {at} was flipped unnoticed"
+        );
+        let cut = decoder.decode(&bytes[..at], None, &mut Log::default());
+        assert!(
+            cut.is_err() || cut.is_ok_and(|g| g != whole),
+            "a stream of {at} bytes is not whole"
+        );
+    }
+}

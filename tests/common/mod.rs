@@ -1,0 +1,72 @@
+//! Small objects and helpers that several test files share.
+#![allow(dead_code)] // each test file uses its part
+
+use std::path::Path;
+
+/// A coloured ball's surface on a voxel grid.
+pub struct Ball {
+    bits: u8,
+    radius: f32,
+}
+
+impl Ball {
+    /// A ball of `radius` voxels in the middle of a cube of `2^bits`.
+    pub fn new(bits: u8, radius: f32) -> Self {
+        Ball { bits, radius }
+    }
+
+    /// Surface voxels with their colours.
+    pub fn voxels(&self) -> Vec<([u32; 3], [u8; 3])> {
+        let side = 1u32 << self.bits;
+        let middle = side as f32 / 2.0;
+        let mut voxels = Vec::new();
+        for z in 0..side {
+            for y in 0..side {
+                for x in 0..side {
+                    let p = [x, y, z].map(|v| v as f32 + 0.5 - middle);
+                    let distance = p.iter().map(|v| v * v).sum::<f32>().sqrt();
+                    if (distance - self.radius).abs() < 0.6 {
+                        let colour = p.map(|v| (127.5 + 120.0 * v / self.radius) as u8);
+                        voxels.push(([x, y, z], colour));
+                    }
+                }
+            }
+        }
+        voxels
+    }
+
+    /// The ball as an ascii PLY whose properties are not in the usual order.
+    pub fn to_ply(&self) -> String {
+        let voxels = self.voxels();
+        let mut text = format!(
+            "ply\nformat ascii 1.0\ncomment bits {}\nelement vertex {}\nproperty uchar green\nproperty uchar blue\n\
+             property uchar red\nproperty float z\nproperty float x\nproperty float y\nend_header\n",
+            self.bits,
+            voxels.len()
+        );
+        for ([x, y, z], [r, g, b]) in voxels {
+            text += &format!("{g} {b} {r} {z} {x} {y}\n");
+        }
+        text
+    }
+}
+
+/// A small model with random weights.
+pub fn tiny_model(seed: u64) -> Vec<u8> {
+    b2p::network::untrained(&b2p::network::Shape::tiny(), seed)
+}
+
+/// Reads a picture.
+pub fn png(path: &Path) -> tiny_skia::Pixmap {
+    tiny_skia::Pixmap::load_png(path).expect("a readable PNG")
+}
+
+/// Everything in a folder, sorted.
+pub fn names_in(folder: &Path) -> Vec<std::ffi::OsString> {
+    let mut names: Vec<_> = std::fs::read_dir(folder)
+        .expect("a readable folder")
+        .map(|entry| entry.expect("a readable entry").file_name())
+        .collect();
+    names.sort();
+    names
+}
