@@ -36,8 +36,12 @@ mod exact;
 mod generate;
 mod layers;
 mod load;
+#[cfg(test)]
+mod reference;
 mod shape;
 mod structure;
+#[cfg(test)]
+mod tests;
 mod untrained;
 
 use std::path::Path;

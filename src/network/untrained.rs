@@ -136,6 +136,7 @@ impl File {
         let keep = (terms * (WEIGHT * WEIGHT / 3) as usize).ilog2() / 2;
         let (shift, centre) = match last {
             "a2" | "b3" => (keep + 2, 0),
+            "lin2" => (keep + 1, 0),
             "mu" => (keep + 4, 0),
             "sigma" => (keep + 5, 28),
             _ => (keep, 0),
@@ -166,7 +167,9 @@ impl File {
         let terms = taps_in_use(*volume) * cin;
         let last = name.rsplit('.').next().unwrap_or_default();
         let strength = match last {
-            "a2" | "b3" | "c2" | "conv_out" => 0.3,
+            "conv_out" if name.starts_with("gg") => 0.3,
+            "a2" | "b3" | "c2" => 0.3,
+            "lin2" if name.starts_with("fs.0") => 16.0,
             "lin2" => 3.0,
             _ => 1.0,
         };

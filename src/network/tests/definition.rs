@@ -1,0 +1,330 @@
+//! Every module against its definition.
+
+use b2p_kernels::Isa;
+use half::f16;
+
+use super::super::reference::{Mode, Oracle, Rows};
+use super::super::{Model, RAW, Shape, Upsample, untrained};
+use super::{Cloud, error, rows};
+
+/// Networks that together have every switch in both positions.
+fn shapes() -> Vec<Shape> {
+    let mut nearest = Shape {
+        upsample: Upsample::Nearest,
+        inception_relu: false,
+        resblock_relu: false,
+        ..Shape::tiny()
+    };
+    nearest.gg[0].channels = 12;
+    nearest.gg[1].blocks_before = 0;
+    let wide = Shape {
+        channels: 20,
+        latents: 5,
+        fc_blocks: 2,
+        pem_blocks: 2,
+        fr_blocks: 2,
+        ..Shape::tiny()
+    };
+    vec![Shape::tiny(), nearest, wide]
+}
+
+/// Latents of a plausible spread.
+fn latents(count: usize) -> Vec<i16> {
+    (0..count)
+        .map(|i| ((i * i * 7 + i * 13) % 11) as i16 - 5 + if i % 97 == 0 { 26 } else { 0 })
+        .collect()
+}
+
+/// What a decoder computes for one role.
+#[derive(Default)]
+struct Level<A, B = A> {
+    context: A,
+    mu: A,
+    sigma: B,
+    g: A,
+}
+
+/// All roles, from made-up latents.
+fn decode(model: &Model, cloud: &Cloud) -> Vec<Level<Vec<i16>, Vec<u8>>> {
+    let mut levels: Vec<Level<Vec<i16>, Vec<u8>>> = Vec::new();
+    for role in 0..3 {
+        let (map, y) = (
+            &cloud.maps[role],
+            latents(cloud.len(role) * model.shape().latents),
+        );
+        levels.push(match levels.last() {
+            None => Level {
+                g: model.reconstruct(role, &y, None, map),
+                ..Level::default()
+            },
+            Some(below) => {
+                let context = model.upsample(role, &below.g, cloud.occupancy(role - 1));
+                let (mu, sigma) = model.entropy_parameters(role, &context, map);
+                let g = model.reconstruct(role, &y, Some(&context), map);
+                Level {
+                    context,
+                    mu,
+                    sigma,
+                    g,
+                }
+            }
+        });
+    }
+    levels
+}
+
+/// The same by definition.
+fn decode_by_definition(oracle: &Oracle, cloud: &Cloud) -> Vec<Level<Rows>> {
+    let mut levels: Vec<Level<Rows>> = Vec::new();
+    let k = oracle.shape.latents;
+    for role in 0..3 {
+        let (sites, y) = (cloud.sites(role), rows(&latents(cloud.len(role) * k), k));
+        levels.push(match levels.last() {
+            None => Level {
+                g: oracle.reconstruct(role, &sites, &y, None),
+                ..Level::default()
+            },
+            Some(below) => {
+                let context = oracle.upsample(role, &cloud.sites(role - 1), &sites, &below.g);
+                let (mu, sigma) = oracle.entropy(role, &sites, &context);
+                let g = oracle.reconstruct(role, &sites, &y, Some(&context));
+                Level {
+                    context,
+                    mu,
+                    sigma,
+                    g,
+                }
+            }
+        });
+    }
+    levels
+}
+
+#[test]
+fn the_exact_zone_equals_its_definition_to_the_bit_on_every_isa_and_thread_count() {
+    println!("ran on {:?}", Isa::available());
+    let cloud = Cloud::sheet();
+    for (seed, shape) in (0..).zip(shapes()) {
+        let bytes = untrained(&shape, seed);
+        let want = decode_by_definition(&Oracle::new(&bytes, Mode::Whole), &cloud);
+        let (c, k) = (shape.channels, shape.latents);
+        for isa in Isa::available() {
+            for threads in [1, 3] {
+                let model = Model::from_bytes(&bytes).unwrap().with_isa(isa);
+                let pool = rayon::ThreadPoolBuilder::new()
+                    .num_threads(threads)
+                    .build()
+                    .unwrap();
+                let got = pool.install(|| decode(&model, &cloud));
+                for (role, (got, want)) in got.iter().zip(&want).enumerate() {
+                    let at = format!("{isa}, {threads} threads, {c} channels, role {role}");
+                    assert!(rows(&got.context, c) == want.context, "context: {at}");
+                    assert!(rows(&got.mu, k) == want.mu, "means: {at}");
+                    assert!(rows(&got.sigma, k) == want.sigma, "scales: {at}");
+                    assert!(rows(&got.g, c) == want.g, "features: {at}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn made_up_models_use_their_range_and_stay_inside() {
+    let cloud = Cloud::sheet();
+    let model = Model::from_bytes(&untrained(&Shape::tiny(), 5)).unwrap();
+    for (role, Level { mu, sigma, g, .. }) in decode(&model, &cloud).into_iter().enumerate() {
+        let deviation = |q: &[i16]| {
+            (q.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>() / q.len() as f64).sqrt()
+        };
+        assert!(
+            (30.0..1200.0).contains(&deviation(&g)),
+            "role {role}: {}",
+            deviation(&g)
+        );
+        let clipped = g.iter().filter(|q| q.abs() == 2047).count();
+        assert!(
+            clipped * 20 < g.len(),
+            "role {role}: {clipped} of {} saturate",
+            g.len()
+        );
+        if role > 0 {
+            assert!(
+                (2.0..400.0).contains(&deviation(&mu)),
+                "role {role}: {}",
+                deviation(&mu)
+            );
+            let mut kinds = sigma.clone();
+            kinds.sort_unstable();
+            kinds.dedup();
+            assert!(kinds.len() > 5, "role {role}: scales {kinds:?}");
+        }
+    }
+}
+
+#[test]
+fn the_exact_zone_follows_the_real_function_it_rounds() {
+    let cloud = Cloud::sheet();
+    let bytes = untrained(&Shape::tiny(), 5);
+    let (whole, real) = (
+        Oracle::new(&bytes, Mode::Whole),
+        Oracle::new(&bytes, Mode::Real),
+    );
+    for role in 0..3 {
+        // Inputs small enough that nothing on the way is cut off: there the real function goes its own way.
+        let sites = cloud.sites(role);
+        let y: Vec<i16> = latents(cloud.len(role) * 4)
+            .into_iter()
+            .map(|y| y % 3)
+            .collect();
+        let c: Vec<i16> = (0..cloud.len(role) * 8)
+            .map(|i| ((i * 7919) % 401) as i16 - 200)
+            .collect();
+        let (y, c) = (rows(&y, 4), rows(&c, 8));
+        let near = |what: &str, whole: Rows, real: Rows, steps: f64| {
+            let differences = whole
+                .iter()
+                .flatten()
+                .zip(real.iter().flatten())
+                .map(|(a, b)| (a - b).powi(2));
+            let off = (differences.sum::<f64>() / (whole.len() * whole[0].len()) as f64).sqrt();
+            println!("role {role}, {what}: {off:.2} steps");
+            assert!(off < steps, "role {role}, {what}: {off} steps off");
+        };
+        let context = (role > 0).then_some(&c);
+        let features = |oracle: &Oracle| oracle.reconstruct(role, &sites, &y, context);
+        near("features", features(&whole), features(&real), 2.0);
+        if role > 0 {
+            let ((mu, sigma), (real_mu, real_sigma)) = (
+                whole.entropy(role, &sites, &c),
+                real.entropy(role, &sites, &c),
+            );
+            near("means", mu, real_mu, 1.0);
+            near("scales", sigma, real_sigma, 1.0);
+        }
+    }
+}
+
+/// f16 keeps 11 bits: half a unit of the last is 2⁻¹² of a value. About ten layers are stored on the way to any result here, and a
+/// layer's sum weighs the errors of its inputs as it does the inputs.
+const TOLERANCE: f64 = 10.0 / 4096.0;
+
+#[test]
+fn generation_follows_its_definition_within_f16() {
+    let cloud = Cloud::sheet();
+    for (seed, shape) in (10..).zip(shapes()) {
+        let bytes = untrained(&shape, seed);
+        let oracle = Oracle::new(&bytes, Mode::Whole);
+        let model = Model::from_bytes(&bytes).unwrap();
+        for role in [1, 2] {
+            let g: Vec<i16> = (0..cloud.len(role) * shape.channels)
+                .map(|i| ((i * 7919) % 1601) as i16 - 800)
+                .collect();
+            let want = oracle.generate(role, &cloud.sites(role), &rows(&g, shape.channels));
+            let got = model.generate(role, &g, &cloud.maps[role]).unwrap();
+            assert_eq!(got.len(), want.len() * RAW);
+            let (off, peak) = error(&got, &want);
+            println!("role {role}: {:.2e} of {peak:.2}", off / peak);
+            assert!(
+                off < TOLERANCE * peak,
+                "role {role}: off by {off} of {peak}"
+            );
+            for isa in Isa::available() {
+                let other = Model::from_bytes(&bytes).unwrap().with_isa(isa);
+                assert!(
+                    other.generate(role, &g, &cloud.maps[role]).unwrap() == got,
+                    "{isa} rounds in another order"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn conversion_and_squeezing_follow_their_definition_within_f16() {
+    let cloud = Cloud::sheet();
+    let colours: Vec<[f32; 3]> = (0..cloud.len(3))
+        .map(|i| [i % 7, i % 11, i % 29].map(|c| c as f32 / 29.0))
+        .collect();
+    let sites: Vec<_> = (0..4).rev().map(|role| cloud.sites(role)).collect();
+    for (seed, shape) in (20..).zip(shapes()) {
+        let bytes = untrained(&shape, seed);
+        let oracle = Oracle::new(&bytes, Mode::Whole);
+        let model = Model::from_bytes(&bytes).unwrap();
+        let mut want = oracle.features(
+            &sites.iter().collect::<Vec<_>>(),
+            &rows(colours.as_flattened(), 3),
+        );
+        want.reverse();
+        let got = cloud.features(&model, &colours);
+        for role in 0..3 {
+            let (off, peak) = error(&got[role], &want[role]);
+            println!("features {role}: {:.2e} of {peak:.2}", off / peak);
+            assert!(
+                off < TOLERANCE * peak,
+                "role {role}: off by {off} of {peak}"
+            );
+            let c: Option<Vec<i16>> = (role > 0).then(|| {
+                (0..got[role].len())
+                    .map(|i| ((i * 7919) % 1601) as i16 - 800)
+                    .collect()
+            });
+            let y = model.squeeze_reals(role, &got[role], c.as_deref()).unwrap();
+            let c = c.map(|c| rows(&c, shape.channels));
+            let y_want = oracle.squeeze(
+                role,
+                &cloud.sites(role),
+                &rows(&got[role], shape.channels),
+                c.as_ref(),
+            );
+            let (off, peak) = error(&y, &y_want);
+            println!("latents {role}: {:.2e} of {peak:.2}", off / peak);
+            assert!(
+                off < TOLERANCE * peak,
+                "role {role}: off by {off} of {peak}"
+            );
+        }
+    }
+}
+
+#[test]
+fn fewer_levels_start_from_the_same_first_conversion() {
+    let cloud = Cloud::sheet();
+    let bytes = untrained(&Shape::tiny(), 30);
+    let (model, oracle) = (
+        Model::from_bytes(&bytes).unwrap(),
+        Oracle::new(&bytes, Mode::Whole),
+    );
+    let colours = vec![[0.25, 0.5, 0.75]; cloud.len(3)];
+    let got = model
+        .features(
+            &colours,
+            &[&cloud.maps[3], &cloud.maps[2]],
+            &[cloud.occupancy(2)],
+        )
+        .unwrap();
+    let want = oracle.features(
+        &[&cloud.sites(3), &cloud.sites(2)],
+        &rows(colours.as_flattened(), 3),
+    );
+    assert_eq!((got.len(), want.len()), (1, 1));
+    let (off, peak) = error(&got[0], &want[0]);
+    assert!(off < TOLERANCE * peak, "off by {off} of {peak}");
+}
+
+#[test]
+fn latents_are_rounded_to_even_and_stay_within_their_bound() {
+    let shape = Shape {
+        latent_max: 2,
+        ..Shape::tiny()
+    };
+    let model = Model::from_bytes(&untrained(&shape, 1)).unwrap();
+    let features: Vec<f16> = (0..50 * 8)
+        .map(|i| f16::from_f32((i * 37 % 101) as f32 / 50.0 - 1.0))
+        .collect();
+    let y = model.squeeze_reals(0, &features, None).unwrap();
+    let latents = model.squeeze(0, &features, None).unwrap();
+    assert!(latents.contains(&2) && latents.contains(&-2) && latents.contains(&0));
+    for (q, y) in latents.into_iter().zip(y) {
+        assert_eq!(f32::from(q), y.round_ties_even().clamp(-2.0, 2.0));
+    }
+}
