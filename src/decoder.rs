@@ -50,7 +50,10 @@ impl<'m> Decoder<'m> {
         Ok(self.drawable(&stream).collect())
     }
 
-    /// Decodes a stream, or a prefix of one, to the Gaussians of `level`: by default the finest that is whole and has a head.
+    /// Decodes a stream to the Gaussians of `level`: by default the finest that the stream has and the model has a head for.
+    ///
+    /// A stream cut exactly after a level is a coarser stream. From one that is cut or damaged elsewhere, a level before the damage
+    /// is decoded only when asked for.
     ///
     /// # Errors
     /// [`Error::Unsupported`] if `level` has no head, naming those that have; [`Error::ModelMismatch`]; what the header or the levels
@@ -58,8 +61,17 @@ impl<'m> Decoder<'m> {
     /// [`Error::DeterminismMismatch`] if checksums hold but the latents are not those that were coded.
     pub fn decode(&self, bytes: &[u8], level: Option<u8>, log: &mut Log) -> Result<Gaussians> {
         let stream = self.open(bytes)?;
-        let level = self.choose(&stream, level)?;
-        let stream = stream.require(level)?;
+        let (stream, level) = match level {
+            Some(level) => {
+                self.check_drawable(&stream, level)?;
+                (stream.require(level)?, level)
+            }
+            None => {
+                let stream = stream.intact()?;
+                let level = self.finest(&stream)?;
+                (stream, level)
+            }
+        };
         let header = stream.header();
         let (exact, map) = self.exact_levels(&stream, level, log)?;
         let role = usize::from(level - header.base);
@@ -106,35 +118,37 @@ impl<'m> Decoder<'m> {
             .filter(move |level| self.model.shape().head(usize::from(level - base)).is_some())
     }
 
-    fn choose(&self, stream: &Stream, level: Option<u8>) -> Result<u8> {
+    /// Fails unless the model has a head for `level`.
+    fn check_drawable(&self, stream: &Stream, level: u8) -> Result<()> {
         let drawable: Vec<u8> = self.drawable(stream).collect();
-        let names = || {
-            let names: Vec<_> = drawable.iter().map(u8::to_string).collect();
-            if names.is_empty() {
-                "none".to_owned()
-            } else {
-                names.join(" and ")
-            }
-        };
-        let unsupported = |what: String| Error::Unsupported {
-            what: "decoding to Gaussians",
-            detail: format!("{what}; levels of this stream that have them: {}", names()),
-        };
-        match level {
-            Some(level) if drawable.contains(&level) => Ok(level),
-            Some(level) => Err(unsupported(format!("level {level} has no Gaussians"))),
-            None => {
-                let whole = stream.deepest();
-                let best = drawable
-                    .iter()
-                    .copied()
-                    .filter(|&l| whole.is_some_and(|w| l <= w))
-                    .max();
-                // A stream cut too early is told apart from one without Gaussians by the error of its first missing level.
-                best.or(drawable.first().copied())
-                    .ok_or_else(|| unsupported("no level has Gaussians".into()))
-            }
+        if drawable.contains(&level) {
+            return Ok(());
         }
+        let names: Vec<_> = drawable.iter().map(u8::to_string).collect();
+        let names = match names.is_empty() {
+            true => "none".to_owned(),
+            false => names.join(" and "),
+        };
+        Err(Error::Unsupported {
+            what: "decoding to Gaussians",
+            detail: format!(
+                "level {level} has none; levels of this stream that have them: {names}"
+            ),
+        })
+    }
+
+    /// The finest whole level with Gaussians.
+    fn finest(&self, stream: &Stream) -> Result<u8> {
+        let last = stream.deepest().unwrap_or(stream.header().base);
+        self.drawable(stream)
+            .filter(|level| *level <= last)
+            .last()
+            .ok_or_else(|| Error::Unsupported {
+                what: "decoding to Gaussians",
+                detail: format!(
+                    "the stream ends with level {last}, and no level up to there has them"
+                ),
+            })
     }
 
     fn exact_levels(&self, stream: &Stream, last: u8, log: &mut Log) -> Result<(Exact, KernelMap)> {

@@ -14,6 +14,8 @@
 pub mod bitstream;
 pub mod cloud;
 pub mod decoder;
+#[cfg(feature = "cli")]
+pub mod embedded;
 
 pub mod encoder;
 pub mod entropy;

@@ -275,3 +275,16 @@ fn any_damage_to_a_stream_is_an_error_or_leaves_the_levels_before_it() {
         );
     }
 }
+
+#[test]
+fn nothing_may_follow_the_last_level() {
+    let model = model();
+    let mut bytes = coded(&ball(5, 10.0), &model).bytes;
+    bytes.push(0);
+    let decoder = Decoder::new(&model);
+    assert!(decoder.decode(&bytes, None, &mut Log::default()).is_err());
+    assert!(
+        decoder.decode(&bytes, Some(4), &mut Log::default()).is_ok(),
+        "asked for, a whole level decodes"
+    );
+}

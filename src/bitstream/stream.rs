@@ -16,6 +16,7 @@ pub struct Stream<'a> {
     header: Header,
     levels: Vec<Level<'a>>,
     damage: Option<Error>,
+    length: u64,
 }
 
 /// A whole level.
@@ -66,6 +67,7 @@ impl<'a> Stream<'a> {
             header,
             levels,
             damage,
+            length: bytes.len() as u64,
         })
     }
 
@@ -87,6 +89,20 @@ impl<'a> Stream<'a> {
     /// What is wrong with the first level that is not whole, or with what follows the last one.
     pub fn damage(&self) -> Option<&Error> {
         self.damage.as_ref()
+    }
+
+    /// The stream, if it is whole or ends just where one of its levels ends.
+    ///
+    /// # Errors
+    /// The damage.
+    pub fn intact(self) -> Result<Self> {
+        let end = self.deepest().map(|level| self.header.prefix_bytes(level));
+        match self.damage {
+            Some(damage) if !end.is_some_and(|end| end.is_ok_and(|end| end == self.length)) => {
+                Err(damage)
+            }
+            _ => Ok(self),
+        }
     }
 
     /// The stream, if `level` is whole.

@@ -61,8 +61,8 @@ impl PointCloud {
         let mut colours = vec![[0; 3]; count];
         for (axis, (name, column)) in names.iter().zip(&columns).enumerate() {
             match axis {
-                0..3 => fill_axis(&mut positions, axis, name, column)?,
-                _ => fill_channel(&mut colours, axis - 3, name, column)?,
+                0..3 => fill_axis(&mut positions, axis, name, column, &ply)?,
+                _ => fill_channel(&mut colours, axis - 3, name, column, &ply)?,
             }
         }
         Ok(PointCloud {
@@ -73,11 +73,17 @@ impl PointCloud {
     }
 }
 
-fn fill_axis(positions: &mut [[f64; 3]], axis: usize, name: &str, column: &Column) -> Result<()> {
+fn fill_axis(
+    positions: &mut [[f64; 3]],
+    axis: usize,
+    name: &str,
+    column: &Column,
+    ply: &Ply,
+) -> Result<()> {
     for (row, position) in positions.iter_mut().enumerate() {
         let value = column.get(row);
         if !value.is_finite() {
-            let at = format!("vertex {row}");
+            let at = ply.vertex_place(row);
             return Err(malformed(
                 at,
                 format!("property {name}"),
@@ -95,6 +101,7 @@ fn fill_channel(
     channel: usize,
     name: &str,
     column: &Column,
+    ply: &Ply,
 ) -> Result<()> {
     let scale = match column.scalar {
         Scalar::U8 => 1.0,
@@ -120,7 +127,7 @@ fn fill_channel(
         let value = column.get(row);
         let byte = (value * scale).round();
         if !(0.0..=255.0).contains(&byte) {
-            let at = format!("vertex {row}");
+            let at = ply.vertex_place(row);
             return Err(malformed(
                 at,
                 format!("property {name}"),
@@ -205,10 +212,10 @@ mod tests {
         let text = error(types, "1 2 3 4 5 0.5\n1 2 3 4 nan 0.5\n");
         assert_eq!(
             text,
-            "cloud: at vertex 1: property y is NaN, expected a finite number"
+            "cloud: at line 12: property y is NaN, expected a finite number"
         );
         let text = error(types, "1 2 3 4 5 1.1\n");
-        assert!(text.contains("vertex 0: property red is 1.1"), "{text}");
+        assert!(text.contains("line 11: property red is 1.1"), "{text}");
         assert!(error(types, "1 2 3 4 5 nan\n").contains("property red"));
         assert!(error(types, "").contains("at least one point"));
         let text = error("uchar float float uchar float int", "1 2 3 4 5 6\n");

@@ -96,6 +96,19 @@ pub(super) fn columns(
     Ok(columns)
 }
 
+/// The number of the line that holds row `row` of all rows in the file.
+pub(super) fn line_of(header: &Header, bytes: &[u8], row: usize) -> Option<usize> {
+    let mut lines = Lines {
+        bytes,
+        at: header.body,
+        line: header.lines,
+    };
+    for _ in 0..=row {
+        lines.next_row().ok()?;
+    }
+    Some(lines.line)
+}
+
 impl<'a> Lines<'a> {
     /// The next line that is not blank.
     fn next_row(&mut self) -> Result<&'a [u8]> {

@@ -60,6 +60,39 @@ impl<'a> Ply<'a> {
         self.columns("vertex", names, limits)
     }
 
+    /// Where row `row` of the element `vertex` stands: a line of an ASCII file, a byte offset of a binary one; only the row's
+    /// number if rows before it have no fixed size.
+    pub(super) fn vertex_place(&self, row: usize) -> String {
+        let before = self
+            .header
+            .elements
+            .iter()
+            .take_while(|e| e.name != "vertex");
+        let place = match self.header.format {
+            Format::Ascii => {
+                let rows = before
+                    .filter(|e| !e.properties.is_empty())
+                    .map(|e| e.count as usize)
+                    .sum::<usize>()
+                    + row;
+                ascii::line_of(&self.header, self.bytes, rows).map(|line| format!("line {line}"))
+            }
+            _ => before
+                .chain(self.element("vertex"))
+                .map(|e| Some((e, e.stride()?)))
+                .collect::<Option<Vec<_>>>()
+                .and_then(|strides| {
+                    let ((_, own), before) = strides.split_last()?;
+                    let skipped: usize = before
+                        .iter()
+                        .map(|(e, stride)| e.count as usize * stride)
+                        .sum();
+                    Some(format!("byte {}", self.header.body + skipped + row * own))
+                }),
+        };
+        place.unwrap_or_else(|| format!("vertex {row}"))
+    }
+
     fn columns(&self, element: &str, names: &[&str], limits: &Limits) -> Result<Vec<Column>> {
         let position = self.header.elements.iter().position(|e| e.name == element);
         let Some(position) = position else {

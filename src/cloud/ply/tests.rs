@@ -219,3 +219,15 @@ proptest! {
         prop_assert_eq!(open(ascii.as_bytes()).unwrap(), open(&binary).unwrap());
     }
 }
+
+#[test]
+fn a_vertex_has_a_place_in_every_format() {
+    let bytes = b"ply\nformat ascii 1.0\nelement list 1\nproperty uchar a\nelement vertex 2\nproperty int x\nend_header\n7\n\n1\n2";
+    let ply = Ply::open(bytes).unwrap();
+    assert_eq!(ply.vertex_place(1), "line 11");
+    let bytes = b"ply\nformat binary_little_endian 1.0\nelement list 2\nproperty uchar a\nelement vertex 2\nproperty float x\n\
+        property double y\nend_header\n..";
+    let body = bytes.len() - 2;
+    let ply = Ply::open(bytes).unwrap();
+    assert_eq!(ply.vertex_place(1), format!("byte {}", body + 2 + 12));
+}

@@ -1,0 +1,223 @@
+//! What can be asked of the program.
+
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+
+/// Learned point-cloud streams to 3D Gaussians and pictures, on a plain CPU.
+#[derive(Debug, Parser)]
+#[command(name = "b2p", version, about, max_term_width = 110)]
+pub struct Cli {
+    /// Threads to use [default: one per core]
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    pub threads: Option<u16>,
+
+    /// Print nothing but errors
+    #[arg(short, long, global = true)]
+    pub quiet: bool,
+
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Code a coloured point cloud into a stream
+    Encode(Encode),
+    /// Decode a stream to 3D Gaussians
+    Decode(Decode),
+    /// Draw a stream, or Gaussians, into a picture
+    Render(Render),
+    /// Say what a stream holds
+    Info(Info),
+    /// Decode and draw the sample that comes with the program
+    Demo(Demo),
+}
+
+#[derive(Debug, Args)]
+pub struct Encode {
+    /// Point cloud: PLY, ascii or binary, with x y z and red green blue
+    pub cloud: PathBuf,
+    /// Stream to write
+    #[arg(short, long, value_name = "OUT.b2p")]
+    pub output: PathBuf,
+    /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
+    pub bits: Option<u8>,
+    /// Octree levels whose features are coded, up to three, the last below N [default: N−3..N−1]
+    #[arg(long, value_name = "L..M", value_parser = levels)]
+    pub levels: Option<RangeInclusive<u8>>,
+    #[command(flatten)]
+    pub model: ModelArg,
+}
+
+#[derive(Debug, Args)]
+pub struct Decode {
+    /// Stream to decode
+    pub input: PathBuf,
+    /// Gaussians to write, as a PLY with the property names of 3D Gaussian splatting
+    #[arg(short, long, value_name = "OUT.ply")]
+    pub output: PathBuf,
+    #[command(flatten)]
+    pub level: LevelArg,
+    #[command(flatten)]
+    pub model: ModelArg,
+}
+
+#[derive(Debug, Args)]
+pub struct Render {
+    /// Stream, or PLY of Gaussians
+    pub input: PathBuf,
+    /// Picture to write; with --views a number is put before its ending
+    #[arg(short, long, value_name = "OUT.png")]
+    pub output: PathBuf,
+    #[command(flatten)]
+    pub level: LevelArg,
+    #[command(flatten)]
+    pub view: View,
+    #[command(flatten)]
+    pub model: ModelArg,
+}
+
+/// Where the camera stands and what it sees.
+#[derive(Debug, Args)]
+pub struct View {
+    /// Width and height in pixels
+    #[arg(long, value_name = "WxH", default_value = "1024x1024", value_parser = size)]
+    pub size: (u32, u32),
+    /// Horizontal field of view in degrees
+    #[arg(
+        long,
+        value_name = "DEG",
+        default_value_t = 45.0,
+        allow_negative_numbers = true
+    )]
+    pub fov: f32,
+    /// Azimuth and elevation in degrees and distance from the cube's centre; the cube reaches from −1 to 1
+    #[arg(long, value_name = "AZ,EL,R", default_value = "0,0,3", value_parser = orbit, allow_hyphen_values = true)]
+    pub orbit: [f32; 3],
+    /// Draw N pictures, turning once around the object
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub views: u32,
+    /// white, black, grey, #rrggbb, or transparent
+    #[arg(long, value_name = "COLOUR", default_value = "white", value_parser = background)]
+    pub background: Background,
+}
+
+#[derive(Debug, Args)]
+pub struct Info {
+    /// Stream to describe
+    pub input: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct Demo {
+    /// Folder for the pictures and the Gaussians
+    #[arg(short, long, value_name = "DIR", default_value = "b2p-demo")]
+    pub output: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub struct LevelArg {
+    /// Octree level to decode to [default: the finest in the stream that has a Gaussian head]
+    #[arg(long, value_name = "M")]
+    pub level: Option<u8>,
+}
+
+#[derive(Debug, Args)]
+pub struct ModelArg {
+    /// Model file [default: the one inside the program]
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
+}
+
+pub use b2p::pixels::Background;
+
+fn levels(text: &str) -> Result<RangeInclusive<u8>, String> {
+    let expected = "expected two levels such as 7..9";
+    let (first, last) = text.split_once("..").ok_or(expected)?;
+    let number = |t: &str| {
+        t.trim_start_matches('=')
+            .parse::<u8>()
+            .map_err(|_| expected)
+    };
+    let (first, last) = (number(first)?, number(last)?);
+    if first > last {
+        return Err(format!("level {first} comes after level {last}"));
+    }
+    Ok(first..=last)
+}
+
+fn size(text: &str) -> Result<(u32, u32), String> {
+    let expected = "expected a size such as 1024x1024, both above 0";
+    let (w, h) = text.split_once('x').ok_or(expected)?;
+    match (w.parse(), h.parse()) {
+        (Ok(w), Ok(h)) if w > 0 && h > 0 => Ok((w, h)),
+        _ => Err(expected.into()),
+    }
+}
+
+fn orbit(text: &str) -> Result<[f32; 3], String> {
+    let numbers: Vec<f32> = text
+        .split(',')
+        .map(|t| {
+            t.trim()
+                .parse()
+                .map_err(|_| format!("'{t}' is not a number"))
+        })
+        .collect::<Result<_, _>>()?;
+    <[f32; 3]>::try_from(numbers)
+        .map_err(|_| "expected three numbers: azimuth,elevation,distance".into())
+}
+
+fn background(text: &str) -> Result<Background, String> {
+    let named = match text {
+        "transparent" => return Ok(Background::Transparent),
+        "white" => [255; 3],
+        "black" => [0; 3],
+        "grey" | "gray" => [128; 3],
+        _ => hex(text).ok_or("expected white, black, grey, #rrggbb or transparent")?,
+    };
+    Ok(Background::Colour(named.map(|v| f32::from(v) / 255.0)))
+}
+
+fn hex(text: &str) -> Option<[u8; 3]> {
+    let digits = text
+        .strip_prefix('#')
+        .filter(|d| d.len() == 6 && d.is_ascii())?;
+    let channel = |i: usize| u8::from_str_radix(&digits[2 * i..2 * i + 2], 16).ok();
+    Some([channel(0)?, channel(1)?, channel(2)?])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn values_are_read_as_written() {
+        assert_eq!(levels("7..9"), Ok(7..=9));
+        assert_eq!(size("640x480"), Ok((640, 480)));
+        assert_eq!(orbit("-30, 10,2.5"), Ok([-30.0, 10.0, 2.5]));
+        assert_eq!(hex("#ff0080"), Some([255, 0, 128]));
+    }
+
+    #[test]
+    fn nonsense_is_refused_with_an_example() {
+        assert!(levels("9..7").unwrap_err().contains("after"));
+        assert!(levels("9").unwrap_err().contains("7..9"));
+        assert!(size("0x4").unwrap_err().contains("1024x1024"));
+        assert!(orbit("1,2").unwrap_err().contains("three"));
+        assert!(background("#ff00").is_err());
+        assert!(background("#ää").is_err());
+    }
+}

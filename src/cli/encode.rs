@@ -1,0 +1,63 @@
+//! `b2p encode`: point cloud to stream.
+
+use b2p::cloud::{PointCloud, voxelise};
+use b2p::encoder::{self, Options};
+use b2p::log::Log;
+use b2p::{Error, Limits, output};
+
+use super::args::Encode;
+use super::progress::Progress;
+use super::table::{count, steps, table};
+use super::{Failure, Result, load};
+
+/// Codes a cloud and says what it cost.
+pub fn run(args: &Encode, progress: &Progress) -> Result<String> {
+    let say = |step: &str| progress.say(step);
+    let mut log = Log::with_listener(&say);
+    let in_cloud = Failure::in_file(&args.cloud);
+    let cloud = log
+        .step("read cloud", 1, "file", || {
+            PointCloud::open(&args.cloud, &Limits::default())
+        })
+        .map_err(&in_cloud)?;
+    let points = cloud.positions.len();
+    let cloud = log
+        .step("voxelise", points, "points", || voxelise(&cloud, args.bits))
+        .map_err(&in_cloud)?;
+    let model = load::model(&args.model)?;
+    let options = Options {
+        levels: args.levels.clone(),
+    };
+    let encoded = encoder::encode(&cloud, &model, &options, &mut log).map_err(&in_cloud)?;
+    output::write_file(&args.output, |w| {
+        w.write_all(&encoded.bytes).map_err(|source| Error::Io {
+            path: args.output.clone(),
+            source,
+        })
+    })?;
+
+    let bpp = |bytes: usize| format!("{:.4}", bytes as f64 * 8.0 / cloud.voxels.len() as f64);
+    let mut rows = vec![
+        ["level", "voxels", "geometry bpp", "feature bpp"]
+            .map(String::from)
+            .to_vec(),
+    ];
+    for rate in &encoded.rates {
+        rows.push(vec![
+            rate.level.to_string(),
+            count(rate.voxels as u64),
+            bpp(rate.geometry_bytes),
+            bpp(rate.feature_bytes),
+        ]);
+    }
+    Ok(format!(
+        "{}\n{}\n{}: {} bytes for {} points at {} bits, {} bits per point\n",
+        steps(log.steps()),
+        table(&rows),
+        args.output.display(),
+        count(encoded.bytes.len() as u64),
+        count(cloud.voxels.len() as u64),
+        cloud.voxels.depth(),
+        bpp(encoded.bytes.len()),
+    ))
+}

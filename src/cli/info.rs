@@ -1,0 +1,84 @@
+//! `b2p info`: what a stream holds.
+
+use b2p::Limits;
+use b2p::bitstream::Stream;
+use serde_json::json;
+
+use super::args::Info;
+use super::table::{count, table};
+use super::{Failure, Result, load};
+
+/// Describes a stream as text or JSON. Needs no model; a cut or damaged stream is described with what is wrong.
+pub fn run(args: &Info) -> Result<String> {
+    let bytes = load::bytes(&args.input)?;
+    let stream =
+        Stream::parse(&bytes, &Limits::default()).map_err(Failure::in_file(&args.input))?;
+    let header = stream.header();
+    let whole = stream.levels().len();
+    let model: String = header.model.iter().map(|b| format!("{b:02x}")).collect();
+    let levels = || {
+        (header.base..)
+            .zip(header.voxels.iter().zip(&header.sections))
+            .enumerate()
+    };
+
+    if args.json {
+        let levels: Vec<_> = levels()
+            .map(|(i, (level, (voxels, section)))| {
+                json!({
+                    "level": level,
+                    "voxels": voxels,
+                    "geometry_bytes": section.geometry,
+                    "feature_bytes": section.features,
+                    "whole": i < whole,
+                })
+            })
+            .collect();
+        let description = json!({
+            "bits": header.bits,
+            "points": header.points,
+            "levels": levels,
+            "total_bytes": bytes.len(),
+            "model": model,
+            "origin": header.placement.origin,
+            "voxel_size": header.placement.voxel_size,
+            "damage": stream.damage().map(ToString::to_string),
+        });
+        return Ok(format!("{description:#}\n"));
+    }
+
+    let bpp = |bytes: u64| format!("{:.4}", bytes as f64 * 8.0 / header.points.max(1) as f64);
+    let mut rows = vec![
+        [
+            "level",
+            "voxels",
+            "geometry bytes",
+            "feature bytes",
+            "bits/point up to here",
+        ]
+        .map(String::from)
+        .to_vec(),
+    ];
+    for (i, (level, (&voxels, section))) in levels() {
+        let prefix = header.prefix_bytes(level)?;
+        let missing = if i < whole { "" } else { " (not whole)" };
+        rows.push(vec![
+            format!("{level}{missing}"),
+            count(voxels.into()),
+            count(section.geometry.into()),
+            count(section.features.into()),
+            bpp(prefix),
+        ]);
+    }
+    let mut text = format!(
+        "{} points at {} bits, {} bytes, model {model}\n{}",
+        count(header.points),
+        header.bits,
+        count(bytes.len() as u64),
+        table(&rows),
+    );
+    if let Some(damage) = stream.damage() {
+        text += &format!("damage: {damage}\n");
+    }
+    Ok(text)
+}

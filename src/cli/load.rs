@@ -1,0 +1,60 @@
+//! Files in: models, streams, Gaussians.
+
+use std::path::Path;
+
+use b2p::decoder::Decoder;
+use b2p::gaussians::Gaussians;
+use b2p::log::Log;
+use b2p::network::Model;
+use b2p::{Error, Limits};
+
+use super::args::{LevelArg, ModelArg};
+use super::{Failure, Result};
+
+/// A stream or Gaussians, told apart by their first bytes.
+const PLY_MAGIC: &[u8] = b"ply";
+
+/// The model in a file, or the one inside the program.
+pub fn model(arg: &ModelArg) -> Result<Model> {
+    match &arg.model {
+        Some(path) => Model::open(path).map_err(Failure::in_file(path)),
+        None => Ok(Model::from_bytes(b2p::embedded::MODEL)?),
+    }
+}
+
+/// The bytes of a file.
+pub fn bytes(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|source| {
+        Failure::from(Error::Io {
+            path: path.to_owned(),
+            source,
+        })
+    })
+}
+
+/// Gaussians from a stream, or as they stand in a PLY.
+pub fn gaussians(
+    path: &Path,
+    level: &LevelArg,
+    model_arg: &ModelArg,
+    log: &mut Log,
+) -> Result<Gaussians> {
+    let bytes = bytes(path)?;
+    if bytes.starts_with(PLY_MAGIC) {
+        if level.level.is_some() {
+            return Err(Failure(format!(
+                "{}: --level is for streams, this is a PLY",
+                path.display()
+            )));
+        }
+        return log
+            .step("read Gaussians", 1, "file", || {
+                Gaussians::from_ply(&bytes, &Limits::default())
+            })
+            .map_err(Failure::in_file(path));
+    }
+    let model = model(model_arg)?;
+    Decoder::new(&model)
+        .decode(&bytes, level.level, log)
+        .map_err(Failure::in_file(path))
+}

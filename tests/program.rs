@@ -1,0 +1,264 @@
+//! The program from outside: files in, files out, errors that say what is wrong, and nothing half-written.
+#![cfg(feature = "cli")]
+
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use common::{Ball, names_in};
+
+fn b2p(folder: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_b2p"))
+        .current_dir(folder)
+        .args(arguments)
+        .output()
+        .expect("the program starts")
+}
+
+#[track_caller]
+fn succeeds(folder: &Path, arguments: &[&str]) -> String {
+    let output = b2p(folder, arguments);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?} failed: {errors}");
+    String::from_utf8(output.stdout).expect("output is UTF-8")
+}
+
+/// Runs a command that must fail, mention every one of `words`, and leave the folder as it was.
+#[track_caller]
+fn fails(folder: &Path, arguments: &[&str], words: &[&str]) {
+    let before = names_in(folder);
+    let output = b2p(folder, arguments);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{arguments:?}: {errors}");
+    for word in words {
+        assert!(
+            errors.contains(word),
+            "{arguments:?} should mention '{word}': {errors}"
+        );
+    }
+    assert_eq!(
+        names_in(folder),
+        before,
+        "{arguments:?} left something behind"
+    );
+}
+
+/// A folder with `ball.ply`, a small coloured ball at 7 bits.
+fn folder_with_cloud() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("ball.ply"), Ball::new(7, 40.0).to_ply()).unwrap();
+    folder
+}
+
+/// The same with `ball.b2p`, coded with the program's own model.
+fn folder_with_stream() -> tempfile::TempDir {
+    let folder = folder_with_cloud();
+    succeeds(
+        folder.path(),
+        &["encode", "ball.ply", "-o", "ball.b2p", "--bits", "7"],
+    );
+    folder
+}
+
+#[test]
+fn a_cloud_becomes_a_stream_gaussians_and_pictures() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let info: serde_json::Value =
+        serde_json::from_str(&succeeds(at, &["info", "ball.b2p", "--json"]))
+            .expect("info prints JSON");
+    assert_eq!(info["bits"], 7);
+    assert_eq!(info["points"], Ball::new(7, 40.0).voxels().len());
+    let levels: Vec<i64> = info["levels"]
+        .as_array()
+        .expect("levels is a list")
+        .iter()
+        .map(|l| l["level"].as_i64().expect("a number"))
+        .collect();
+    assert_eq!(levels, [4, 5, 6]);
+    let size = std::fs::metadata(at.join("ball.b2p")).unwrap().len();
+    assert_eq!(info["total_bytes"], size);
+
+    for level in ["5", "6"] {
+        succeeds(
+            at,
+            &["decode", "ball.b2p", "-o", "ball-g.ply", "--level", level],
+        );
+        let from_stream = [
+            "render", "ball.b2p", "-o", "a.png", "--size", "96x64", "--level", level,
+        ];
+        succeeds(at, &from_stream);
+        succeeds(
+            at,
+            &["render", "ball-g.ply", "-o", "b.png", "--size", "96x64"],
+        );
+        let (a, b) = (
+            common::png(&at.join("a.png")),
+            common::png(&at.join("b.png")),
+        );
+        assert_eq!((a.width(), a.height()), (96, 64));
+        let worst = a
+            .data()
+            .iter()
+            .zip(b.data())
+            .map(|(a, b)| a.abs_diff(*b))
+            .max();
+        assert!(
+            worst <= Some(2),
+            "level {level}: stream and exported Gaussians differ by {worst:?}"
+        );
+    }
+}
+
+#[test]
+fn several_views_are_numbered_and_differ() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    succeeds(
+        at,
+        &[
+            "render", "ball.b2p", "-o", "turn.png", "--views", "3", "--size", "48x48",
+        ],
+    );
+    let pictures: Vec<_> = (0..3)
+        .map(|i| common::png(&at.join(format!("turn-{i:03}.png"))))
+        .collect();
+    assert!(pictures[0].data() != pictures[1].data());
+    assert!(!at.join("turn.png").exists());
+}
+
+#[test]
+fn a_transparent_background_stays_transparent_in_the_corners() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    succeeds(
+        at,
+        &[
+            "render",
+            "ball.b2p",
+            "-o",
+            "t.png",
+            "--size",
+            "64x64",
+            "--background",
+            "transparent",
+        ],
+    );
+    let picture = common::png(&at.join("t.png"));
+    assert_eq!(picture.pixel(0, 0).map(|p| p.alpha()), Some(0));
+    assert_eq!(picture.pixel(32, 32).map(|p| p.alpha()), Some(255));
+}
+
+#[test]
+fn a_level_without_gaussians_is_refused_and_the_others_are_named() {
+    let folder = folder_with_stream();
+    fails(
+        folder.path(),
+        &["decode", "ball.b2p", "-o", "x.ply", "--level", "4"],
+        &["level 4", "5", "6"],
+    );
+    fails(
+        folder.path(),
+        &["decode", "ball.b2p", "-o", "x.ply", "--level", "9"],
+        &["level 9"],
+    );
+}
+
+#[test]
+fn what_is_not_a_point_cloud_is_refused() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    std::fs::write(at.join("noise.ply"), b"this is no point cloud").unwrap();
+    fails(
+        at,
+        &["encode", "noise.ply", "-o", "x.b2p"],
+        &["noise.ply", "ply"],
+    );
+    fails(
+        at,
+        &["encode", "absent.ply", "-o", "x.b2p"],
+        &["absent.ply"],
+    );
+
+    let header = |properties: &str, count: usize| {
+        format!("ply\nformat ascii 1.0\nelement vertex {count}\n{properties}end_header\n")
+    };
+    let xyz = "property float x\nproperty float y\nproperty float z\n";
+    let rgb = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+    std::fs::write(at.join("grey.ply"), header(xyz, 1) + "1 2 3\n").unwrap();
+    fails(
+        at,
+        &["encode", "grey.ply", "-o", "x.b2p"],
+        &["grey.ply", "red"],
+    );
+    let coloured = header(&format!("{xyz}{rgb}"), 2);
+    std::fs::write(
+        at.join("nan.ply"),
+        format!("{coloured}1 2 3 4 5 6\n1 nan 3 4 5 6\n"),
+    )
+    .unwrap();
+    fails(
+        at,
+        &["encode", "nan.ply", "-o", "x.b2p"],
+        &["nan.ply", "y", "line 12"],
+    );
+    std::fs::write(at.join("short.ply"), format!("{coloured}1 2 3 4 5 6\n")).unwrap();
+    fails(at, &["encode", "short.ply", "-o", "x.b2p"], &["short.ply"]);
+}
+
+#[test]
+fn a_damaged_stream_is_refused_and_nothing_is_written() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let stream = std::fs::read(at.join("ball.b2p")).unwrap();
+
+    fails(
+        at,
+        &["decode", "ball.ply", "-o", "x.ply"],
+        &["ball.ply", "b2p"],
+    );
+    std::fs::write(at.join("cut.b2p"), &stream[..stream.len() - 1]).unwrap();
+    fails(
+        at,
+        &["decode", "cut.b2p", "-o", "x.ply", "--level", "6"],
+        &["cut.b2p", "truncated"],
+    );
+    let mut flipped = stream.clone();
+    let middle = flipped.len() / 2;
+    flipped[middle] ^= 0x10;
+    std::fs::write(at.join("flipped.b2p"), &flipped).unwrap();
+    fails(
+        at,
+        &["render", "flipped.b2p", "-o", "x.png"],
+        &["flipped.b2p", "checksum"],
+    );
+}
+
+#[test]
+fn another_model_is_recognised_before_anything_is_decoded() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    std::fs::write(at.join("other.safetensors"), common::tiny_model(1)).unwrap();
+    let arguments = [
+        "decode",
+        "ball.b2p",
+        "-o",
+        "x.ply",
+        "--model",
+        "other.safetensors",
+    ];
+    fails(at, &arguments, &["model"]);
+    let no_model = ["decode", "ball.b2p", "-o", "x.ply", "--model", "ball.ply"];
+    fails(at, &no_model, &["ball.ply"]);
+}
+
+#[test]
+fn an_output_folder_that_does_not_exist_is_named() {
+    let folder = folder_with_stream();
+    fails(
+        folder.path(),
+        &["decode", "ball.b2p", "-o", "nowhere/x.ply"],
+        &["nowhere"],
+    );
+}
