@@ -2,7 +2,7 @@
 //!
 //! A Gaussian with axes `R·S` is seen as the image of its centre and the 2×2 covariance `M·Mᵀ + 0.3·I`, where `M = J·W·R·S` and `J`
 //! is the derivative of the pinhole projection at the centre (EWA splatting; 0.3 px² is the pixel's own blur). The covariance is
-//! never formed and inverted, which loses a long thin ellipse to cancellation in single precision; see [`ellipse`].
+//! never formed and inverted, which loses a long thin ellipse to cancellation in single precision; `ellipse.rs` has the formulas.
 //!
 //! [`project`] is the sole gate of visibility: its conditions are phrased so that NaN fails them, and everything after it may
 //! assume finite numbers, a depth beyond the near plane, and at least one pixel.
@@ -103,7 +103,7 @@ impl Dropped {
 /// Projects into `ellipses`, whose memory is reused; counts what is not visible.
 ///
 /// # Errors
-/// [`Error::Usage`] if the camera is none ([`Camera::check`]) or the arrays of `gaussians` differ in length.
+/// [`crate::Error::Usage`] if the camera is none ([`Camera::check`]) or the arrays of `gaussians` differ in length.
 pub fn project(gaussians: &Gaussians, camera: &Camera, ellipses: &mut Ellipses) -> Result<Dropped> {
     camera.check()?;
     gaussians.check_lengths()?;
