@@ -9,12 +9,12 @@ use b2p::placement::Placement;
 
 use super::load_mesh;
 use crate::error::{LabError, Result};
-use crate::eval::item::{self, Item};
+use crate::eval::item::{self, Content, Item};
 use crate::eval::points::Points;
 use crate::eval::protocol::{Truth, VIEWS};
 use crate::eval::report::{Rate, Report, Row};
 use crate::eval::sheet::{SheetRow, contact_sheet};
-use crate::eval::{Drawn, judge_cloud};
+use crate::eval::{Drawn, judge_cloud, judge_gaussians};
 use crate::sample::Grid;
 use crate::surface::Surface;
 
@@ -24,7 +24,7 @@ use crate::surface::Surface;
 /// SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes) and as one round Gaussian a point.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Point clouds (PLY on the voxel grid, also .zst): [NAME=]PATH[@BPP]
+    /// Point clouds on the voxel grid or Gaussians, both as PLY, or PLY in zstd: [NAME=]PATH[@BPP]
     #[arg(value_name = "ITEM", required = true)]
     items: Vec<Item>,
     /// The truth: a self-contained binary glTF, or procedural:NAME
@@ -83,15 +83,17 @@ impl Args {
         let mut drawn = Vec::new();
         for item in &self.items {
             eprintln!("{}", item.name);
-            let points = Points::on_grid(
-                &item::read_cloud(&item.path, &limits)?,
-                frame.bits,
-                cloud.as_ref(),
-            );
-            for one in judge_cloud(&truth, &points, frame)? {
-                report.rows.push(row(item, &one));
-                drawn.push(one);
-            }
+            let found = match item::open(&item.path, &limits)? {
+                Content::Cloud(coded) => {
+                    let points = Points::on_grid(&coded, frame.bits, cloud.as_ref());
+                    judge_cloud(&truth, &points, frame)?.into()
+                }
+                Content::Gaussians(gaussians) => {
+                    vec![judge_gaussians(&truth, gaussians, "Gaussians", frame)?]
+                }
+            };
+            report.rows.extend(found.iter().map(|one| row(item, one)));
+            drawn.extend(found);
         }
         print!("{}", report.to_markdown());
         match &self.output {

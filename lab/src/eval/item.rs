@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 
 use b2p::Limits;
 use b2p::cloud::PointCloud;
+use b2p::cloud::ply::Ply;
+use b2p::gaussians::Gaussians;
 
 use crate::error::{LabError, Result};
 
@@ -82,6 +84,30 @@ pub fn read(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     Ok(plain)
 }
 
+/// What an item's file holds.
+#[derive(Debug, Clone)]
+pub enum Content {
+    /// Points on the voxel grid.
+    Cloud(PointCloud),
+    /// Gaussians.
+    Gaussians(Gaussians),
+}
+
+/// A point cloud's file, or one of Gaussians, compressed or not.
+///
+/// # Errors
+/// As [`read`], or if it is neither.
+pub fn open(path: &Path, limits: &Limits) -> Result<Content> {
+    let bytes = read(path, limits)?;
+    let ply = Ply::open(&bytes)?;
+    let splats = ply.element("vertex").is_some_and(|v| v.has("f_dc_0"));
+    Ok(if splats {
+        Content::Gaussians(Gaussians::from_ply(&bytes, limits)?)
+    } else {
+        Content::Cloud(PointCloud::from_ply(&bytes, limits)?)
+    })
+}
+
 /// A point cloud's file, compressed or not.
 ///
 /// # Errors
@@ -145,5 +171,28 @@ mod tests {
         assert!(refusal.contains("max_bytes"), "{refusal}");
         std::fs::write(&path, &packed[..12]).unwrap();
         assert!(read(&path, &Limits::default()).is_err());
+    }
+
+    #[test]
+    fn a_ply_of_gaussians_is_told_from_one_of_points() {
+        let folder = tempfile::tempdir().unwrap();
+        let limits = Limits::default();
+        let points = PointCloud {
+            positions: vec![[1.0, 2.0, 3.0]],
+            colours: vec![[9; 3]],
+            ..PointCloud::default()
+        };
+        let path = folder.path().join("points.ply");
+        points.write(&path).unwrap();
+        assert!(matches!(open(&path, &limits).unwrap(), Content::Cloud(c) if c == points));
+
+        let mut file = Vec::new();
+        let path = folder.path().join("splats.ply");
+        Gaussians::default().write_ply(&mut file, &path).unwrap();
+        std::fs::write(&path, file).unwrap();
+        assert!(matches!(
+            open(&path, &limits).unwrap(),
+            Content::Gaussians(_)
+        ));
     }
 }

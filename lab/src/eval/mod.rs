@@ -9,10 +9,11 @@ pub mod nearest;
 pub mod picture;
 pub mod points;
 pub mod protocol;
+pub mod reframe;
 pub mod report;
 pub mod sheet;
 
-use b2p::gaussians::Frame;
+use b2p::gaussians::{Frame, Gaussians};
 
 use crate::error::Result;
 use points::Points;
@@ -51,11 +52,24 @@ pub fn judge_cloud(truth: &Truth, points: &Points, frame: Frame) -> Result<[Draw
         primitives: points.positions.len(),
         judged,
     };
-    let gaussians = points.to_gaussians(frame);
-    let round = Drawn {
-        how: "global Gaussian".into(),
+    let round = judge_gaussians(truth, points.to_gaussians(frame), "global Gaussian", frame)?;
+    Ok([squares, round])
+}
+
+/// Judges Gaussians, after bringing them into the cube of `frame`, which the truth is in.
+///
+/// # Errors
+/// If they cannot be drawn.
+pub fn judge_gaussians(
+    truth: &Truth,
+    gaussians: Gaussians,
+    how: &str,
+    frame: Frame,
+) -> Result<Drawn> {
+    let gaussians = reframe::into_frame(gaussians, frame);
+    Ok(Drawn {
+        how: how.into(),
         primitives: gaussians.len(),
         judged: truth.judge_gaussians(&gaussians)?,
-    };
-    Ok([squares, round])
+    })
 }
