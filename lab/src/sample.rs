@@ -6,6 +6,7 @@
 
 use std::path::Path;
 
+use b2p::Placement;
 use b2p::geometry::morton;
 use rayon::prelude::*;
 
@@ -62,6 +63,14 @@ impl Grid {
             unit: 1.0,
             origin: [0.0; 3],
             shift: [0.0; 3],
+        }
+    }
+
+    /// Where the grid lies in the surface's space.
+    pub fn placement(&self) -> Placement {
+        Placement {
+            origin: std::array::from_fn(|i| self.origin[i] - self.shift[i] * self.unit),
+            voxel_size: self.unit,
         }
     }
 

@@ -3,29 +3,30 @@
 use std::path::{Path, PathBuf};
 
 use b2p::Limits;
-use b2p::cloud::{PointCloud, voxelise};
+use b2p::cloud::PointCloud;
 use b2p::gaussians::Frame;
-use b2p::placement::Placement;
+use b2p::network::Model;
 
 use super::load_mesh;
 use crate::error::{LabError, Result};
 use crate::eval::item::{self, Content, Item};
-use crate::eval::points::Points;
+use crate::eval::picture::Picture;
 use crate::eval::protocol::{Truth, VIEWS};
-use crate::eval::report::{Rate, Report, Row};
+use crate::eval::report::{Report, Row};
 use crate::eval::sheet::{SheetRow, contact_sheet};
-use crate::eval::{Drawn, judge_cloud, judge_gaussians};
-use crate::sample::Grid;
+use crate::eval::{Bench, Entry};
+use crate::sample::{Grid, write_bytes};
 use crate::surface::Surface;
 
 /// Judge streams and point clouds by pictures of the mesh they came from
 ///
 /// Every item is drawn from twelve cameras and compared with the mesh: PSNR over whole pictures and over the foreground, MS-SSIM,
-/// SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes) and as one round Gaussian a point.
+/// SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes) and as one round Gaussian a point. With a cloud and a
+/// model but no stream among the items, the cloud is coded first.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Point clouds on the voxel grid or Gaussians, both as PLY, or PLY in zstd: [NAME=]PATH[@BPP]
-    #[arg(value_name = "ITEM", required = true)]
+    /// Streams (.b2p), or point clouds on the voxel grid or Gaussians (.ply, .ply.zst): [NAME=]PATH[@BPP]
+    #[arg(value_name = "ITEM")]
     items: Vec<Item>,
     /// The truth: a self-contained binary glTF, or procedural:NAME
     #[arg(long, value_name = "MESH.glb")]
@@ -33,6 +34,12 @@ pub struct Args {
     /// The finest cloud: tells where the mesh lies on the grid, and over how many points bits are counted
     #[arg(long, value_name = "CLOUD.ply")]
     cloud: Option<PathBuf>,
+    /// The model to code and decode streams with
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// Octree levels to decode streams to [default: all that the model can draw]
+    #[arg(long, value_name = "M,…", value_delimiter = ',')]
+    levels: Option<Vec<u8>>,
     /// Bit depth of the grid, where the cloud does not tell
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u8).range(1..=21))]
     bits: u8,
@@ -68,38 +75,56 @@ impl Args {
             None => None,
         };
         let frame = self.frame(&surface, cloud.as_ref())?;
-        let points = match &cloud {
-            Some(cloud) => Some(voxelise(cloud, Some(frame.bits))?.voxels.len() as u64),
-            None => None,
-        };
-        let in_cube = |p: [f32; 3]| frame.placement.to_cube(frame.bits, p.map(f64::from));
-        let truth = Truth::new(&surface.map(in_cube))?;
-        let mut report = Report {
+        let mut items = Vec::new();
+        for Item { name, path, bpp } in &self.items {
+            items.push((name.clone(), item::open(path, &limits)?, *bpp));
+        }
+        let streams = items
+            .iter()
+            .any(|(_, c, _)| matches!(c, Content::Stream(_)));
+        let code = cloud.is_some() && self.model.is_some() && !streams;
+        let mut bench = Bench::new(&surface, frame)?;
+        if let Some(cloud) = cloud {
+            bench = bench.with_cloud(cloud)?;
+        }
+        if let Some(path) = &self.model {
+            bench = bench.with_model(Model::open(path)?, self.levels.clone());
+        }
+        if code {
+            let stream = bench.encode()?;
+            if let Some(folder) = &self.output {
+                self.write(folder, "cloud.b2p", &stream)?;
+            }
+            items.insert(0, ("b2p".to_owned(), Content::Stream(stream), None));
+        }
+        if items.is_empty() {
+            let what = "nothing to judge: name items, or a cloud and a model";
+            return Err(LabError::Usage(what.into()));
+        }
+        let mut entries = Vec::new();
+        for (name, content, bpp) in items {
+            eprintln!("{name}");
+            entries.extend(bench.judge(&name, content, bpp)?);
+        }
+        let report = Report {
             mesh: self.mesh.display().to_string(),
             bits: frame.bits,
-            points,
-            rows: Vec::new(),
+            points: bench.points(),
+            rows: entries.iter().map(|e| e.row.clone()).collect(),
         };
-        let mut drawn = Vec::new();
-        for item in &self.items {
-            eprintln!("{}", item.name);
-            let found = match item::open(&item.path, &limits)? {
-                Content::Cloud(coded) => {
-                    let points = Points::on_grid(&coded, frame.bits, cloud.as_ref());
-                    judge_cloud(&truth, &points, frame)?.into()
-                }
-                Content::Gaussians(gaussians) => {
-                    vec![judge_gaussians(&truth, gaussians, "Gaussians", frame)?]
-                }
-            };
-            report.rows.extend(found.iter().map(|one| row(item, one)));
-            drawn.extend(found);
-        }
         print!("{}", report.to_markdown());
-        match &self.output {
-            Some(folder) => self.write(folder, &report, &truth, &drawn),
-            None => Ok(()),
+        if let Some(folder) = &self.output {
+            let failed = |e| LabError::Usage(format!("the report cannot be JSON: {e}"));
+            let json = report.to_json().map_err(failed)?;
+            self.write(folder, "scores.md", report.to_markdown().as_bytes())?;
+            self.write(folder, "scores.json", json.as_bytes())?;
+            self.write(
+                folder,
+                "sheet.png",
+                &self.sheet(bench.truth(), &entries).to_png()?,
+            )?;
         }
+        Ok(())
     }
 
     /// Where the cube lies around the mesh: as the cloud's comments say, else as the sampler would put it.
@@ -109,55 +134,30 @@ impl Args {
         if let Some(placement) = hints.placement {
             return Ok(Frame { bits, placement });
         }
-        let grid = Grid::fit(surface.bounds(), bits, self.fill)?;
-        let placement = Placement {
-            origin: std::array::from_fn(|i| grid.origin[i] - grid.shift[i] * grid.unit),
-            voxel_size: grid.unit,
-        };
+        let placement = Grid::fit(surface.bounds(), bits, self.fill)?.placement();
         Ok(Frame { bits, placement })
     }
 
-    fn write(&self, folder: &Path, report: &Report, truth: &Truth, drawn: &[Drawn]) -> Result<()> {
+    fn write(&self, folder: &Path, name: &str, bytes: &[u8]) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(LabError::io(folder))?;
-        let write =
-            |name: &str, bytes: &[u8]| crate::sample::write_bytes(&folder.join(name), bytes);
-        write("scores.md", report.to_markdown().as_bytes())?;
-        let json = report.to_json();
-        let failed = |e| LabError::Usage(format!("the report cannot be written as JSON: {e}"));
-        write("scores.json", json.map_err(failed)?.as_bytes())?;
+        write_bytes(&folder.join(name), bytes)
+    }
+
+    fn sheet(&self, truth: &Truth, entries: &[Entry]) -> Picture {
         let step = 360 / VIEWS as u32;
-        let chosen = |pictures: Vec<_>| -> Vec<_> {
-            self.columns
+        let row = |label: String, pictures: Vec<_>| SheetRow {
+            label,
+            pictures: self
+                .columns
                 .iter()
                 .map(|c| pictures[(c / step) as usize])
-                .collect()
+                .collect(),
         };
-        let mut rows = vec![SheetRow {
-            label: "truth".into(),
-            pictures: chosen(truth.pictures().collect()),
-        }];
-        for (row, one) in report.rows.iter().zip(drawn) {
-            rows.push(SheetRow {
-                label: label(row),
-                pictures: chosen(one.judged.pictures.iter().collect()),
-            });
+        let mut rows = vec![row("truth".into(), truth.pictures().collect())];
+        for entry in entries {
+            rows.push(row(label(&entry.row), entry.pictures.iter().collect()));
         }
-        write("sheet.png", &contact_sheet(&rows, truth.extent()).to_png()?)
-    }
-}
-
-fn row(item: &Item, drawn: &Drawn) -> Row {
-    Row {
-        name: item.name.clone(),
-        drawn: drawn.how.clone(),
-        level: None,
-        rate: item.bpp.map(|total| Rate {
-            total,
-            levels: Vec::new(),
-        }),
-        primitives: drawn.primitives,
-        scores: drawn.judged.mean,
-        views: drawn.judged.views.clone(),
+        contact_sheet(&rows, truth.extent())
     }
 }
 

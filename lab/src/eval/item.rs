@@ -4,6 +4,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use b2p::Limits;
+use b2p::bitstream::MAGIC;
 use b2p::cloud::PointCloud;
 use b2p::cloud::ply::Ply;
 use b2p::gaussians::Gaussians;
@@ -91,14 +92,19 @@ pub enum Content {
     Cloud(PointCloud),
     /// Gaussians.
     Gaussians(Gaussians),
+    /// A `.b2p` stream.
+    Stream(Vec<u8>),
 }
 
-/// A point cloud's file, or one of Gaussians, compressed or not.
+/// A stream, a point cloud's file, or one of Gaussians, compressed or not.
 ///
 /// # Errors
-/// As [`read`], or if it is neither.
+/// As [`read`], or if it is none of them.
 pub fn open(path: &Path, limits: &Limits) -> Result<Content> {
     let bytes = read(path, limits)?;
+    if bytes.starts_with(&MAGIC) {
+        return Ok(Content::Stream(bytes));
+    }
     let ply = Ply::open(&bytes)?;
     let splats = ply.element("vertex").is_some_and(|v| v.has("f_dc_0"));
     Ok(if splats {

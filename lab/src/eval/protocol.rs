@@ -68,7 +68,15 @@ impl Truth {
     /// # Errors
     /// [`LabError::Usage`] if no camera sees any of it.
     pub fn new(surface: &Surface) -> Result<Self> {
-        let views: Vec<TrueView> = (0..VIEWS)
+        Truth::from_first(VIEWS, surface)
+    }
+
+    /// The truth from the first `count` cameras alone.
+    ///
+    /// # Errors
+    /// As [`Truth::new`].
+    pub fn from_first(count: usize, surface: &Surface) -> Result<Self> {
+        let views: Vec<TrueView> = (0..count.min(VIEWS))
             .map(|i| TrueView::new(surface, i))
             .collect::<Result<_>>()?;
         if !views.iter().any(|v| v.foreground.contains(&true)) {
