@@ -9,6 +9,25 @@
 //! ```
 //!
 //! A stage imports only from the stages to its left, the `b2p-kernels` crate, and the commons ([`error`], [`limits`], [`placement`]).
+//!
+//! Stream to picture:
+//!
+//! ```
+//! # #[cfg(feature = "cli")]
+//! # fn main() -> b2p::Result<()> {
+//! use b2p::{Limits, decoder::Decoder, log::Log, network::Model, pixels, projection::Camera};
+//!
+//! let model = Model::from_bytes(b2p::embedded::MODEL)?;
+//! let gaussians = Decoder::new(&model).decode(b2p::embedded::SAMPLE, None, &mut Log::default())?;
+//! let camera = Camera::orbit(20.0, 20.0, 2.6, 45.0, 160, 120)?;
+//! let (image, stats) = pixels::render(&gaussians, &camera, pixels::Background::WHITE, &Limits::default())?;
+//! assert_eq!((image.width, image.height), (160, 120));
+//! assert!(stats.visible > 0);
+//! # Ok(())
+//! # }
+//! # #[cfg(not(feature = "cli"))]
+//! # fn main() {}
+//! ```
 #![forbid(unsafe_code)]
 
 pub mod bitstream;

@@ -146,7 +146,7 @@ impl Header {
     }
 
     /// The header's bytes.
-    pub(super) fn write(&self) -> Vec<u8> {
+    pub fn write(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(self.bytes());
         bytes.extend(MAGIC);
         bytes.extend(VERSION.0.to_le_bytes());

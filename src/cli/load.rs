@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use b2p::decoder::Decoder;
-use b2p::gaussians::Gaussians;
+use b2p::gaussians::{Gaussians, ply};
 use b2p::log::Log;
 use b2p::network::Model;
 use b2p::{Error, Limits};
@@ -47,11 +47,15 @@ pub fn gaussians(
                 path.display()
             )));
         }
-        return log
+        let (gaussians, notes) = log
             .step("read Gaussians", 1, "file", || {
-                Gaussians::from_ply(&bytes, &Limits::default())
+                ply::read(&bytes, &Limits::default())
             })
-            .map_err(Failure::in_file(path));
+            .map_err(Failure::in_file(path))?;
+        for warning in notes.warnings() {
+            eprintln!("b2p: {}: {warning}", path.display());
+        }
+        return Ok(gaussians);
     }
     let model = model(model_arg)?;
     Decoder::new(&model)
