@@ -9,8 +9,9 @@ use b2p::log::Log;
 use b2p::network::{Model, Shape, untrained};
 use libfuzzer_sys::fuzz_target;
 
-static MODEL: LazyLock<Model> =
-    LazyLock::new(|| Model::from_bytes(&untrained(&Shape::tiny(), 0)).expect("an untrained model loads"));
+static MODEL: LazyLock<Model> = LazyLock::new(|| {
+    Model::from_bytes(&untrained(&Shape::tiny(), 0)).expect("an untrained model loads")
+});
 
 fuzz_target!(|bytes: &[u8]| {
     let limits = Limits {

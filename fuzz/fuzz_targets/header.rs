@@ -8,6 +8,10 @@ use libfuzzer_sys::fuzz_target;
 fuzz_target!(|bytes: &[u8]| {
     if let Ok(header) = Header::parse(bytes, &Limits::default()) {
         let written = header.write();
-        assert_eq!(written, bytes[..written.len()], "the header changed on its way");
+        assert_eq!(
+            written,
+            bytes[..written.len()],
+            "the header changed on its way"
+        );
     }
 });
