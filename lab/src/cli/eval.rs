@@ -34,7 +34,7 @@ pub struct Args {
     /// The finest cloud: tells where the mesh lies on the grid, and over how many points bits are counted
     #[arg(long, value_name = "CLOUD.ply")]
     cloud: Option<PathBuf>,
-    /// The model to code and decode streams with
+    /// The model to code and decode streams with [default: the one inside the program]
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
     /// Octree levels to decode streams to [default: all that the model can draw]
@@ -82,14 +82,16 @@ impl Args {
         let streams = items
             .iter()
             .any(|(_, c, _)| matches!(c, Content::Stream(_)));
-        let code = cloud.is_some() && self.model.is_some() && !streams;
+        let code = cloud.is_some() && !streams;
         let mut bench = Bench::new(&surface, frame)?;
         if let Some(cloud) = cloud {
             bench = bench.with_cloud(cloud)?;
         }
-        if let Some(path) = &self.model {
-            bench = bench.with_model(Model::open(path)?, self.levels.clone());
-        }
+        let model = match &self.model {
+            Some(path) => Model::open(path)?,
+            None => Model::from_bytes(b2p::embedded::MODEL)?,
+        };
+        bench = bench.with_model(model, self.levels.clone());
         if code {
             let stream = bench.encode()?;
             if let Some(folder) = &self.output {
