@@ -6,6 +6,11 @@
 //! [`Taps`] name are multiplied by that tap's weights and added up. Each kernel is one portable body, compiled once for the
 //! baseline and once more for every [`Isa`] above it. Nothing is contracted or reordered, so all of them give the same bits.
 
+#[cfg(all(target_arch = "x86", not(target_feature = "sse2")))]
+compile_error!(
+    "x87 arithmetic does not round to f32 after every step: build for a target with SSE2"
+);
+
 mod convert;
 mod exact;
 mod float;

@@ -2,6 +2,7 @@
 
 use b2p_kernels::{FloatConv, Isa, Taps, to_f16, to_f32};
 use half::f16;
+use rayon::prelude::*;
 
 use super::layers::{apply, apply_f32, concat, reals, taps};
 use super::structure::{Convert, Encoder, ROLES};
@@ -117,24 +118,62 @@ impl Convert<FloatConv> {
 }
 
 /// The mean of each voxel's occupied children.
-pub(super) fn pool(isa: Isa, x: &[f16], occupancy: &[u8], c: usize) -> Vec<f16> {
-    let count: usize = occupancy
-        .iter()
-        .map(|mask| mask.count_ones() as usize)
-        .sum();
-    assert_eq!(x.len(), count * c, "one feature per child");
-    let mut out = vec![f16::ZERO; occupancy.len() * c];
-    let (mut child, mut sum) = (vec![0.0; c], vec![0.0; c]);
-    let mut children = x.chunks_exact(c);
-    for (out, mask) in out.chunks_exact_mut(c).zip(occupancy) {
-        sum.fill(0.0f32);
-        for row in children.by_ref().take(mask.count_ones() as usize) {
-            to_f32(isa, row, &mut child);
-            sum.iter_mut().zip(&child).for_each(|(sum, x)| *sum += x);
-        }
-        let count = mask.count_ones() as f32;
-        sum.iter_mut().for_each(|sum| *sum /= count);
-        to_f16(isa, &sum, out);
+fn pool(isa: Isa, x: &[f16], occupancy: &[u8], c: usize) -> Vec<f16> {
+    const BLOCK: usize = 1024;
+    let children = |mask: &u8| mask.count_ones() as usize;
+    // Where each block's children begin.
+    let mut starts = vec![0];
+    for block in occupancy.chunks(BLOCK) {
+        starts.push(starts[starts.len() - 1] + block.iter().map(children).sum::<usize>());
     }
+    assert_eq!(
+        x.len(),
+        starts[starts.len() - 1] * c,
+        "one feature per child"
+    );
+    let mut out = vec![f16::ZERO; occupancy.len() * c];
+    let blocks = out
+        .par_chunks_mut(BLOCK * c)
+        .zip(occupancy.par_chunks(BLOCK))
+        .zip(&starts);
+    blocks.for_each(|((out, occupancy), &start)| {
+        let (mut child, mut sum) = (vec![0.0; c], vec![0.0; c]);
+        let mut rows = x[start * c..].chunks_exact(c);
+        for (out, mask) in out.chunks_exact_mut(c).zip(occupancy) {
+            sum.fill(0.0f32);
+            for row in rows.by_ref().take(children(mask)) {
+                to_f32(isa, row, &mut child);
+                sum.iter_mut().zip(&child).for_each(|(sum, x)| *sum += x);
+            }
+            let count = children(mask) as f32;
+            sum.iter_mut().for_each(|sum| *sum /= count);
+            to_f16(isa, &sum, out);
+        }
+    });
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pooling_averages_over_the_children_that_are_there() {
+        // More parents than one task takes.
+        let occupancy: Vec<u8> = (0..3000u32).map(|i| (i * 37 % 255) as u8 + 1).collect();
+        let count: u32 = occupancy.iter().map(|mask| mask.count_ones()).sum();
+        let x: Vec<f16> = (0..2 * count)
+            .map(|i| f16::from_f32((i % 64) as f32))
+            .collect();
+        let pooled = pool(Isa::detect(), &x, &occupancy, 2);
+        let mut rows = x.chunks_exact(2);
+        for (got, mask) in pooled.chunks_exact(2).zip(&occupancy) {
+            let children: Vec<_> = rows.by_ref().take(mask.count_ones() as usize).collect();
+            for (c, got) in got.iter().enumerate() {
+                let sum: f32 = children.iter().map(|row| row[c].to_f32()).sum();
+                assert_eq!(*got, f16::from_f32(sum / children.len() as f32));
+            }
+        }
+        assert!(rows.next().is_none());
+    }
 }
