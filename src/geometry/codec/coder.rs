@@ -1,137 +1,255 @@
-//! A binary arithmetic coder: 32-bit interval, no carries, 16-bit probabilities.
+//! A binary arithmetic coder: carry-less, 32 bits, byte by byte.
 //!
-//! The interval `[low, high]` starts as all 32-bit numbers. A bit whose probability of being 1 is `p / 65536` splits it at
-//! `mid = low + ⌊(high − low)·p / 65536⌋`: 1 keeps `[low, mid]`, 0 keeps `[mid + 1, high]`. Whenever low and high share their
-//! highest byte, that byte is written and shifted out, zeros following in `low` and ones in `high`. The end writes the four bytes of
-//! `low`. So a decoder that has read every bit has read every byte, which it checks.
+//! The state is an interval `low..=high` of `u32`, at first all of it. A bit that is 1 with probability `one / 65536` splits it at
+//! `mid = low + ((high − low) · one >> 16)` (64-bit product): 1 keeps `low..=mid`, 0 keeps `mid+1..=high`. Then, while the top bytes
+//! of `low` and `high` agree, that byte goes out, and `low = low << 8`, `high = high << 8 | 255`. The encoder ends with the four
+//! bytes of `low`, most significant first. The decoder holds the 32 bits of the input that begin where the interval's do, starts by
+//! reading four bytes, and reads one for every byte that went out.
+//!
+//! So the decoder reads exactly the bytes that the encoder wrote, and ends holding exactly `low`. Every truncation makes it read past
+//! the end, and other damage goes unnoticed only if it leaves both the number of bytes and the last 32 bits as they were.
 
 use crate::error::{Error, Result, Stage};
 
-/// Writes bits.
-pub(super) struct Encoder {
+/// Probabilities are in units of 2^−16.
+pub(super) const ONE: u32 = 1 << 16;
+
+/// What codes bits, one way or the other.
+pub(super) trait Coder {
+    /// Codes a bit that is 1 with probability `one / 65536`, `one` in `1..=65535`. An encoder takes `bit` and returns it; a decoder
+    /// returns the bit it read, whatever `bit` is.
+    fn code(&mut self, bit: bool, one: u32) -> bool;
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Interval {
     low: u32,
     high: u32,
+}
+
+impl Interval {
+    const ALL: Interval = Interval {
+        low: 0,
+        high: u32::MAX,
+    };
+
+    #[inline(always)]
+    fn split(self, one: u32) -> u32 {
+        debug_assert!(0 < one && one < ONE);
+        let width = u64::from(self.high - self.low);
+        self.low + ((width * u64::from(one)) >> 16) as u32
+    }
+
+    #[inline(always)]
+    fn keep(&mut self, bit: bool, mid: u32) {
+        if bit {
+            self.high = mid;
+        } else {
+            self.low = mid + 1;
+        }
+    }
+
+    #[inline(always)]
+    fn top_byte_is_settled(self) -> bool {
+        (self.low ^ self.high) >> 24 == 0
+    }
+
+    #[inline(always)]
+    fn shift(&mut self) {
+        self.low <<= 8;
+        self.high = self.high << 8 | 255;
+    }
+}
+
+/// Writes bits.
+#[derive(Debug)]
+pub(super) struct Encoder {
+    interval: Interval,
     bytes: Vec<u8>,
 }
 
 impl Encoder {
     pub fn new() -> Self {
         Encoder {
-            low: 0,
-            high: u32::MAX,
+            interval: Interval::ALL,
             bytes: Vec::new(),
         }
     }
 
     pub fn finish(mut self) -> Vec<u8> {
-        self.bytes.extend(self.low.to_be_bytes());
+        self.bytes.extend(self.interval.low.to_be_bytes());
         self.bytes
     }
 }
 
-/// Reads bits.
+impl Coder for Encoder {
+    #[inline(always)]
+    fn code(&mut self, bit: bool, one: u32) -> bool {
+        let mid = self.interval.split(one);
+        self.interval.keep(bit, mid);
+        while self.interval.top_byte_is_settled() {
+            self.bytes.push((self.interval.low >> 24) as u8);
+            self.interval.shift();
+        }
+        bit
+    }
+}
+
+/// Reads bits. Past the end it reads zeros and remembers that it did.
+#[derive(Debug)]
 pub(super) struct Decoder<'a> {
-    low: u32,
-    high: u32,
-    code: u32,
-    bytes: std::slice::Iter<'a, u8>,
-    missing: u64,
+    interval: Interval,
+    value: u32,
+    bytes: &'a [u8],
+    next: usize,
 }
 
 impl<'a> Decoder<'a> {
     pub fn new(bytes: &'a [u8]) -> Self {
         let mut decoder = Decoder {
-            low: 0,
-            high: u32::MAX,
-            code: 0,
-            bytes: bytes.iter(),
-            missing: 0,
+            interval: Interval::ALL,
+            value: 0,
+            bytes,
+            next: 0,
         };
         for _ in 0..4 {
-            decoder.code = decoder.code << 8 | u32::from(decoder.byte());
+            decoder.read();
         }
         decoder
     }
 
-    fn byte(&mut self) -> u8 {
-        self.bytes.next().copied().unwrap_or_else(|| {
-            self.missing += 1;
-            0
+    #[inline(always)]
+    fn read(&mut self) {
+        let byte = self.bytes.get(self.next).copied().unwrap_or(0);
+        self.value = self.value << 8 | u32::from(byte);
+        self.next += 1;
+    }
+
+    /// Fails if bits were read that are not there.
+    pub fn check_not_past_end(&self) -> Result<()> {
+        if self.next <= self.bytes.len() {
+            return Ok(());
+        }
+        Err(Error::Truncated {
+            stage: Stage::Geometry,
+            offset: self.bytes.len() as u64,
+            field: "occupancy",
+            needed: (self.next - self.bytes.len()) as u64,
         })
     }
 
-    /// Whether more was read than there is: what follows is of no use.
-    pub fn exhausted(&self) -> bool {
-        self.missing > 0
-    }
-
-    /// Fails unless exactly all bytes were read.
-    pub fn finish(self, at: &str) -> Result<()> {
-        if self.missing > 0 {
+    /// Fails unless everything was read, and ended as an encoder ends.
+    pub fn finish(self) -> Result<()> {
+        self.check_not_past_end()?;
+        if self.next < self.bytes.len() {
             return Err(Error::malformed(
                 Stage::Geometry,
-                at,
-                "code length",
-                format!("at least {} bytes short", self.missing),
-                "as long as its occupancies take",
+                format!("byte {}", self.next),
+                "length of the occupancy",
+                self.bytes.len(),
+                self.next,
             ));
         }
-        match self.bytes.len() {
-            0 => Ok(()),
-            left => Err(Error::malformed(
+        if self.value != self.interval.low {
+            return Err(Error::malformed(
                 Stage::Geometry,
-                at,
-                "bytes after the last occupancy",
-                left,
-                0,
-            )),
+                format!("byte {}", self.next - 4),
+                "end of the occupancy",
+                format!("{:#010x}", self.value),
+                format!("{:#010x}", self.interval.low),
+            ));
         }
-    }
-}
-
-/// Either end of the wire: codes a bit, and says which it was.
-pub(super) trait Coder {
-    /// Codes `bit` (ignored when decoding), whose probability of being 1 is `p / 65536`, `0 < p < 65536`.
-    fn code(&mut self, bit: bool, p: u32) -> bool;
-}
-
-fn split(low: u32, high: u32, p: u32) -> u32 {
-    low + ((u64::from(high - low) * u64::from(p)) >> 16) as u32
-}
-
-impl Coder for Encoder {
-    #[inline]
-    fn code(&mut self, bit: bool, p: u32) -> bool {
-        let mid = split(self.low, self.high, p);
-        if bit {
-            self.high = mid;
-        } else {
-            self.low = mid + 1;
-        }
-        while (self.low ^ self.high) >> 24 == 0 {
-            self.bytes.push((self.high >> 24) as u8);
-            self.low <<= 8;
-            self.high = self.high << 8 | 0xff;
-        }
-        bit
+        Ok(())
     }
 }
 
 impl Coder for Decoder<'_> {
-    #[inline]
-    fn code(&mut self, _: bool, p: u32) -> bool {
-        let mid = split(self.low, self.high, p);
-        let bit = self.code <= mid;
-        if bit {
-            self.high = mid;
-        } else {
-            self.low = mid + 1;
-        }
-        while (self.low ^ self.high) >> 24 == 0 {
-            self.low <<= 8;
-            self.high = self.high << 8 | 0xff;
-            self.code = self.code << 8 | u32::from(self.byte());
+    #[inline(always)]
+    fn code(&mut self, _: bool, one: u32) -> bool {
+        let mid = self.interval.split(one);
+        let bit = self.value <= mid;
+        self.interval.keep(bit, mid);
+        while self.interval.top_byte_is_settled() {
+            self.interval.shift();
+            self.read();
         }
         bit
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn encode(bits: &[(bool, u32)]) -> Vec<u8> {
+        let mut encoder = Encoder::new();
+        for &(bit, one) in bits {
+            encoder.code(bit, one);
+        }
+        encoder.finish()
+    }
+
+    fn decode(bytes: &[u8], bits: &[(bool, u32)]) -> Result<Vec<bool>> {
+        let mut decoder = Decoder::new(bytes);
+        let decoded = bits.iter().map(|&(_, one)| decoder.code(false, one));
+        let decoded = decoded.collect();
+        decoder.finish()?;
+        Ok(decoded)
+    }
+
+    fn some_bits() -> impl Strategy<Value = Vec<(bool, u32)>> {
+        let one = prop_oneof![1..ONE, Just(1), Just(ONE - 1), Just(ONE / 2)];
+        prop::collection::vec((any::<bool>(), one), 0..400)
+    }
+
+    proptest! {
+        #[test]
+        fn what_was_written_is_read(bits in some_bits()) {
+            let read = decode(&encode(&bits), &bits).unwrap();
+            prop_assert!(read.iter().eq(bits.iter().map(|(bit, _)| bit)));
+        }
+
+        #[test]
+        fn every_truncation_is_noticed(bits in some_bits()) {
+            let bytes = encode(&bits);
+            for end in 0..bytes.len() {
+                let noticed = matches!(decode(&bytes[..end], &bits), Err(Error::Truncated { .. }));
+                prop_assert!(noticed);
+            }
+        }
+
+        #[test]
+        fn a_byte_too_many_is_noticed(bits in some_bits(), more in any::<u8>()) {
+            let mut bytes = encode(&bits);
+            bytes.push(more);
+            prop_assert!(decode(&bytes, &bits).is_err());
+        }
+
+        #[test]
+        fn any_bytes_decode_to_something_or_an_error(
+            bytes in prop::collection::vec(any::<u8>(), 0..64), bits in some_bits()
+        ) {
+            if let Ok(read) = decode(&bytes, &bits) {
+                let again: Vec<_> = read.iter().zip(&bits).map(|(&bit, &(_, one))| (bit, one)).collect();
+                prop_assert_eq!(encode(&again), bytes);
+            }
+        }
+    }
+
+    #[test]
+    fn the_length_is_the_entropy() {
+        let mut state = 1u32;
+        let bits: Vec<_> = (0..100_000)
+            .map(|_| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (state >> 16 < 6554, 6554)
+            })
+            .collect();
+        let ones = bits.iter().filter(|b| b.0).count() as f64;
+        let p = 6554.0 / 65536.0f64;
+        let entropy = -ones * p.log2() - (1e5 - ones) * (1.0 - p).log2();
+        let length = 8.0 * encode(&bits).len() as f64;
+        assert!(entropy < length && length < 1.001 * entropy + 32.0);
     }
 }

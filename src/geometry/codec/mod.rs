@@ -1,18 +1,47 @@
-//! The octree, level by level, losslessly.
-mod coder;
-mod context;
-mod mixer;
+//! The octree codec: lossless, level by level.
+//!
+//! A level is coded, given the level above, as the occupancy of each of the parents: which of their eight children are there. The
+//! parents, in Morton order, are cut into slices of so many (16,384 in a stream); each slice is an entropy stream of its own, so the slices of a
+//! level decode in any order and in parallel. Within a slice, parent after parent and child after child by ascending octant, each
+//! child is one binary decision, whose probability comes from a small integer network (`network`) that sees
+//!
+//! - which of the parent's 26 neighbours are occupied,
+//! - which children those neighbours have that come earlier in the slice,
+//! - which children the parent itself has in the octants below,
+//!
+//! and whose output layer goes on learning as it codes (`predictor`). The decisions go through a binary arithmetic coder (`coder`,
+//! `probability`). If a parent has none of its first seven children, the eighth is not coded: it must be there.
+//!
+//! # Exactness
+//! Integers throughout: an encoder and a decoder anywhere, with any number of threads, agree on every bit. A stream is fully
+//! determined by what it codes.
+//!
+//! # Hostile input
+//! A decoder is told how many voxels to expect, and fails as soon as there are more, or in the end fewer. It reserves memory for the
+//! parents it was given and the voxels it was told, no more.
 
-use rayon::prelude::*;
+mod coder;
+mod network;
+mod predictor;
+mod probability;
 
 use super::{KernelMap, Octree};
 use crate::error::{Error, Result, Stage};
-use coder::{Coder, Decoder, Encoder};
-use context::{Contexts, Window};
-use mixer::Mixer;
+use coder::{Decoder, Encoder};
+use predictor::Predictor;
+use rayon::prelude::*;
+use std::ops::Range;
 
-/// Codes which children the voxels of `level − 1` have, in slices of `slice` voxels of that level: for each the number of children, and
-/// the code. `map` is the 3³ kernel map of `level − 1`.
+/// The slices of so many parents: which parents each has, at most `slice`.
+fn slices(parents: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<usize>> {
+    (0..parents.div_ceil(slice)).map(move |i| i * slice..parents.min((i + 1) * slice))
+}
+
+/// Codes level `level` of `octree` in slices of `slice` parents: for each the number of children, and the code. `map` is the 3³
+/// kernel map of the level above.
+///
+/// # Panics
+/// If `level` is 0 or deeper than the octree, `map` is another level's, or `slice` is 0.
 pub fn encode_level(
     octree: &Octree,
     map: &KernelMap,
@@ -20,91 +49,139 @@ pub fn encode_level(
     slice: usize,
 ) -> Vec<(u32, Vec<u8>)> {
     let occupancy = octree.occupancy(level - 1);
-    occupancy
-        .par_chunks(slice)
-        .enumerate()
-        .map(|(i, part)| {
-            let mut encoder = Encoder::new();
-            let mut masks = part.to_vec();
-            run(&mut encoder, map, i * slice, &mut masks, |_| true);
-            let children = part.iter().map(|m| m.count_ones()).sum();
-            (children, encoder.finish())
-        })
-        .collect()
+    assert_eq!(map.len(), occupancy.len(), "one kernel map row per parent");
+    let ranges: Vec<_> = slices(occupancy.len(), slice).collect();
+    let encode = |parents: Range<usize>| {
+        let masks = &occupancy[parents.clone()];
+        let mut encoder = Encoder::new();
+        write(&mut Predictor::new(), &mut encoder, map, parents, masks);
+        (count(masks) as u32, encoder.finish())
+    };
+    ranges.into_par_iter().map(encode).collect()
 }
 
-/// Reads the next level of an octree from slices of (number of children, code).
+/// The occupancies of the parents `parents`, whose children are `voxels` voxels of level `level`; `map` is the 3³ kernel map of the
+/// level above.
+///
+/// # Errors
+/// [`Error::Truncated`] if the stream ends early, [`Error::Malformed`] if it does not hold exactly so many voxels or goes on after them.
+///
+/// # Panics
+/// If `map` has not that many rows.
+pub fn decode_slice(
+    level: u8,
+    map: &KernelMap,
+    parents: Range<usize>,
+    bytes: &[u8],
+    voxels: usize,
+) -> Result<Vec<u8>> {
+    let mut decoder = Decoder::new(bytes);
+    let masks = read(
+        &mut Predictor::new(),
+        &mut decoder,
+        level,
+        map,
+        parents.clone(),
+        voxels,
+    )?;
+    decoder.finish()?;
+    let found = count(&masks);
+    if found != voxels {
+        return Err(wrong_count(level, &parents, found, voxels.to_string()));
+    }
+    Ok(masks)
+}
+
+/// Adds to `octree` the level that these slices hold: for each of `slice` parents the number of children, and the code. `map` is the
+/// 3³ kernel map of what is now the deepest level.
+///
+/// # Errors
+/// Those of [`decode_slice`] and [`Octree::grow`], and [`Error::Malformed`] if there are more or fewer slices than there should be.
+/// The octree is unchanged then.
+///
+/// # Panics
+/// If `map` is another level's, or `slice` is 0.
 pub fn decode_level(
     octree: &mut Octree,
     map: &KernelMap,
-    slices: &[(u32, &[u8])],
+    encoded: &[(u32, &[u8])],
     slice: usize,
 ) -> Result<()> {
-    let parents = octree.level(octree.depth()).len();
     let level = octree.depth() + 1;
-    let needed = parents.div_ceil(slice);
-    if slices.len() != needed {
+    let ranges = slices(map.len(), slice);
+    if encoded.len() != ranges.len() {
         return Err(Error::malformed(
             Stage::Geometry,
             format!("level {level}"),
             "number of slices",
-            slices.len(),
-            needed,
+            encoded.len(),
+            ranges.len(),
         ));
     }
-    let mut occupancy = vec![0u8; parents];
-    let results: Vec<Result<()>> = occupancy
-        .par_chunks_mut(slice)
-        .zip(slices)
-        .enumerate()
-        .map(|(i, (masks, &(children, bytes)))| {
-            let at = format!("level {level}, slice {i}");
-            let mut decoder = Decoder::new(bytes);
-            run(&mut decoder, map, i * slice, masks, |d| !d.exhausted());
-            decoder.finish(&at)?;
-            let found: u32 = masks.iter().map(|m| m.count_ones()).sum();
-            if found != children {
-                return Err(Error::malformed(
-                    Stage::Geometry,
-                    at,
-                    "number of children",
-                    found,
-                    children,
-                ));
-            }
-            Ok(())
-        })
-        .collect();
-    results.into_iter().collect::<Result<()>>()?;
-    octree.grow(occupancy)
+    let tasks: Vec<_> = ranges.zip(encoded).collect();
+    let decode = |(parents, &(voxels, bytes)): (Range<usize>, &(u32, &[u8]))| {
+        decode_slice(level, map, parents, bytes, voxels as usize)
+    };
+    let masks: Result<Vec<_>> = tasks.into_par_iter().map(decode).collect();
+    octree.grow(masks?.concat())
 }
 
-/// Codes the masks of the voxels from `first` on: reads them when encoding, fills them in when decoding. Stops when `go_on` says so.
-fn run<C: Coder>(
-    coder: &mut C,
+/// Codes the occupancies of one slice.
+fn write(
+    predictor: &mut Predictor,
+    encoder: &mut Encoder,
     map: &KernelMap,
-    first: usize,
-    masks: &mut [u8],
-    go_on: impl Fn(&C) -> bool,
+    parents: Range<usize>,
+    masks: &[u8],
 ) {
-    let mut mixer = Mixer::new(Contexts::COUNT, Contexts::SETS);
-    for i in 0..masks.len() {
-        let window = Window::around(map.row(first + i), first, &masks[..i]);
-        let given = masks[i];
-        let mut mask = 0u8;
-        for octant in 0..8 {
-            if octant == 7 && mask == 0 {
-                mask = 1 << 7;
-                break;
-            }
-            let contexts = Contexts::of(&window, octant, mask);
-            let wanted = given >> octant & 1 == 1;
-            let bit = mixer.bit(&contexts.slots, contexts.set, |p| coder.code(wanted, p));
-            mask |= u8::from(bit) << octant;
-        }
-        masks[i] = mask;
-        if !go_on(coder) {
-            return;
-        }
+    for (here, &mask) in parents.clone().zip(masks) {
+        let facts = predictor
+            .network
+            .facts(map.row(here), &parents, here, masks);
+        predictor.code(encoder, &facts, mask);
     }
 }
+
+/// Decodes the occupancies of one slice, unless they come to more than `voxels`.
+fn read(
+    predictor: &mut Predictor,
+    decoder: &mut Decoder,
+    level: u8,
+    map: &KernelMap,
+    parents: Range<usize>,
+    voxels: usize,
+) -> Result<Vec<u8>> {
+    let mut masks = Vec::with_capacity(parents.len());
+    let mut found = 0;
+    for here in parents.clone() {
+        let facts = predictor
+            .network
+            .facts(map.row(here), &parents, here, &masks);
+        let mask = predictor.code(decoder, &facts, 0);
+        decoder.check_not_past_end()?;
+        masks.push(mask);
+        found += mask.count_ones() as usize;
+        let at_least = found + (parents.end - here - 1);
+        if at_least > voxels {
+            return Err(wrong_count(
+                level,
+                &parents,
+                format!("at least {at_least}"),
+                format!("at most {voxels}"),
+            ));
+        }
+    }
+    Ok(masks)
+}
+
+fn count(masks: &[u8]) -> usize {
+    masks.iter().map(|mask| mask.count_ones() as usize).sum()
+}
+
+fn wrong_count(level: u8, parents: &Range<usize>, found: impl ToString, expected: String) -> Error {
+    let at = format!("level {level}, parents {parents:?}");
+    Error::malformed(Stage::Geometry, at, "number of voxels", found, expected)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,49 @@
+//! From a logit to a probability, by a table of integers.
+
+use super::coder::ONE;
+
+/// The largest logit in use, in units of 1/64: the probability stops short of certainty.
+const LIMIT: i32 = 720;
+
+/// `e^(−1/64)` in units of 2^−62, rounded down.
+const DECAY: u64 = 4_540_188_453_729_421_604;
+
+/// Entry `k` is `round(2^16 / (1 + E))` with `E = e^(−k/64)` in units of 2^−62: `E` of `k = 0` is 2^62, and each next one is the last
+/// times `DECAY`, divided by 2^62, rounded down.
+const SQUASH: [u16; LIMIT as usize + 1] = {
+    let mut table = [0; LIMIT as usize + 1];
+    let mut power = 1u128 << 62;
+    let mut k = 0;
+    while k < table.len() {
+        let denominator = (1u128 << 62) + power;
+        table[k] = (((1u128 << 78) + denominator / 2) / denominator) as u16;
+        power = power * DECAY as u128 >> 62;
+        k += 1;
+    }
+    table
+};
+
+/// The probability, in `1..=65535`, of a bit whose logit is `logit / 64`.
+#[inline(always)]
+pub(super) fn squash(logit: i32) -> u32 {
+    let one = u32::from(SQUASH[logit.unsigned_abs().min(LIMIT as u32) as usize]);
+    if logit < 0 { ONE - one } else { one }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_is_the_logistic_function() {
+        for logit in -1000..=1000 {
+            let x = f64::from(logit.clamp(-LIMIT, LIMIT)) / 64.0;
+            let exact = 65536.0 / (1.0 + (-x).exp());
+            assert!(
+                (f64::from(squash(logit)) - exact).abs() < 0.500_001,
+                "{logit}"
+            );
+            assert!((1..ONE).contains(&squash(logit)));
+        }
+    }
+}

@@ -1,0 +1,193 @@
+use super::*;
+use crate::geometry::{Voxels, morton};
+use proptest::prelude::*;
+
+/// The slices of every level from 1 on.
+fn encode(octree: &Octree, slice: usize) -> Vec<Vec<(u32, Vec<u8>)>> {
+    let mut map = KernelMap::root();
+    let mut levels = Vec::new();
+    for level in 1..=octree.depth() {
+        levels.push(encode_level(octree, &map, level, slice));
+        map = octree.child_map(level - 1, &map);
+    }
+    levels
+}
+
+fn decode(levels: &[Vec<(u32, Vec<u8>)>], slice: usize) -> Result<Octree> {
+    let mut octree = Octree::root();
+    for encoded in levels {
+        let map = octree.kernel_map(octree.depth());
+        decode_level(&mut octree, &map, &borrowed(encoded), slice)?;
+    }
+    Ok(octree)
+}
+
+fn borrowed(encoded: &[(u32, Vec<u8>)]) -> Vec<(u32, &[u8])> {
+    encoded
+        .iter()
+        .map(|(n, bytes)| (*n, bytes.as_slice()))
+        .collect()
+}
+
+fn check(voxels: Voxels, slice: usize) {
+    let octree = Octree::new(voxels).unwrap();
+    assert_eq!(decode(&encode(&octree, slice), slice).unwrap(), octree);
+}
+
+/// A bowl, 2^`depth` wide: a surface with every slope.
+fn bowl(depth: u8) -> Octree {
+    let side = 1u32 << depth;
+    let column = |i: u32| {
+        let [x, y] = [i % side, i / side];
+        morton::encode([x, y, (x * x + y * y) / (2 * side)])
+    };
+    Octree::new(Voxels::new(depth, (0..side * side).map(column).collect())).unwrap()
+}
+
+/// Level 6 of a bowl, its kernel map above, and one slice of it all.
+fn level_of_a_bowl() -> (Octree, KernelMap, u32, Vec<u8>) {
+    let octree = bowl(6);
+    let map = octree.kernel_map(5);
+    let (voxels, bytes) = encode_level(&octree, &map, 6, usize::MAX).remove(0);
+    (octree, map, voxels, bytes)
+}
+
+proptest! {
+    #[test]
+    fn any_cloud_comes_back(
+        depth in 1u8..=7, keys in prop::collection::vec(any::<u64>(), 1..500), slice in 1usize..100
+    ) {
+        let keys = keys.iter().map(|k| k & ((1 << (3 * depth)) - 1)).collect();
+        check(Voxels::new(depth, keys), slice);
+    }
+
+    #[test]
+    fn points_in_the_deepest_octree_come_back(keys in prop::collection::vec(0u64..1 << 63, 1..20)) {
+        check(Voxels::new(21, keys), 16);
+    }
+
+    #[test]
+    fn any_bytes_decode_to_as_many_voxels_as_declared_or_to_an_error(
+        bytes in prop::collection::vec(any::<u8>(), 0..200), voxels in 0u32..600
+    ) {
+        let octree = bowl(4).truncated(3);
+        let map = octree.kernel_map(3);
+        let mut grown = octree.clone();
+        match decode_level(&mut grown, &map, &[(voxels, &bytes)], usize::MAX) {
+            Ok(()) => prop_assert_eq!(grown.level(4).len(), voxels as usize),
+            Err(_) => prop_assert_eq!(grown, octree),
+        }
+    }
+}
+
+#[test]
+fn one_point_comes_back_from_every_depth() {
+    for depth in 1..=21 {
+        check(Voxels::new(depth, vec![(1 << (3 * depth)) - 1]), 1);
+        check(Voxels::new(depth, vec![0]), 16_384);
+    }
+}
+
+#[test]
+fn opposite_corners_come_back() {
+    check(Voxels::new(21, vec![0, (1 << 63) - 1]), 16_384);
+}
+
+#[test]
+fn full_cubes_lines_and_checkerboards_come_back() {
+    check(Voxels::new(5, (0..1 << 15).collect()), 1000);
+    let diagonal = (0..1 << 10).map(|i| morton::encode([i, i, 1023 - i]));
+    check(Voxels::new(10, diagonal.collect()), 100);
+    let board = (0..1u64 << 12).filter(|&k| morton::decode(k).iter().sum::<u32>() % 2 == 0);
+    check(Voxels::new(4, board.collect()), 100);
+}
+
+#[test]
+fn a_surface_costs_less_than_two_bits_per_parent() {
+    let octree = bowl(8);
+    let (_, bytes) = encode_level(&octree, &octree.kernel_map(7), 8, usize::MAX).remove(0);
+    assert!(8 * bytes.len() < 2 * octree.level(7).len());
+}
+
+#[test]
+fn a_full_cube_costs_next_to_nothing() {
+    let octree = Octree::new(Voxels::new(6, (0..1 << 18).collect())).unwrap();
+    let (_, bytes) = encode_level(&octree, &octree.kernel_map(5), 6, usize::MAX).remove(0);
+    assert!(
+        8 * bytes.len() < octree.level(5).len() / 4,
+        "{}",
+        bytes.len()
+    );
+}
+
+#[test]
+fn slices_do_not_need_each_other() {
+    let octree = bowl(7);
+    let map = octree.kernel_map(6);
+    let slices = encode_level(&octree, &map, 7, 1000);
+    assert!(slices.len() > 2);
+    for (i, (voxels, bytes)) in slices.iter().enumerate().rev() {
+        let parents = i * 1000..map.len().min((i + 1) * 1000);
+        let masks = decode_slice(7, &map, parents.clone(), bytes, *voxels as usize).unwrap();
+        assert_eq!(masks, octree.occupancy(6)[parents]);
+    }
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bytes() {
+    let octree = bowl(7);
+    let with_threads = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        pool.unwrap().install(|| encode(&octree, 500))
+    };
+    assert_eq!(with_threads(1), with_threads(2));
+}
+
+#[test]
+fn every_truncation_is_noticed() {
+    let (_, map, voxels, bytes) = level_of_a_bowl();
+    for end in 0..bytes.len() {
+        let result = decode_slice(6, &map, 0..map.len(), &bytes[..end], voxels as usize);
+        assert!(matches!(result, Err(Error::Truncated { .. })), "{end}");
+    }
+}
+
+#[test]
+fn bytes_left_over_are_refused() {
+    let (_, map, voxels, mut bytes) = level_of_a_bowl();
+    bytes.push(0);
+    let result = decode_slice(6, &map, 0..map.len(), &bytes, voxels as usize);
+    assert!(matches!(result, Err(Error::Malformed { .. })));
+}
+
+#[test]
+fn a_wrong_count_is_refused() {
+    let (_, map, voxels, bytes) = level_of_a_bowl();
+    for wrong in [0, 1, voxels - 1, voxels + 1, u32::MAX] {
+        let result = decode_slice(6, &map, 0..map.len(), &bytes, wrong as usize);
+        assert!(matches!(result, Err(Error::Malformed { .. })), "{wrong}");
+    }
+}
+
+#[test]
+fn every_flipped_bit_is_noticed() {
+    let octree = bowl(5);
+    let map = octree.kernel_map(4);
+    let (voxels, bytes) = encode_level(&octree, &map, 5, usize::MAX).remove(0);
+    for bit in 0..8 * bytes.len() {
+        let mut bytes = bytes.clone();
+        bytes[bit / 8] ^= 1 << (bit % 8);
+        let result = decode_slice(5, &map, 0..map.len(), &bytes, voxels as usize);
+        assert!(result.is_err(), "bit {bit}");
+    }
+}
+
+#[test]
+fn a_missing_slice_is_refused() {
+    let octree = bowl(5);
+    let map = octree.kernel_map(4);
+    let slices = encode_level(&octree, &map, 5, 50);
+    let mut decoded = octree.truncated(4);
+    let result = decode_level(&mut decoded, &map, &borrowed(&slices[1..]), 50);
+    assert!(matches!(result, Err(Error::Malformed { .. })));
+}
