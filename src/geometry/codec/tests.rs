@@ -39,7 +39,7 @@ fn bowl(depth: u8) -> Octree {
     let side = 1u32 << depth;
     let column = |i: u32| {
         let [x, y] = [i % side, i / side];
-        morton::encode([x, y, (x * x + y * y) / (2 * side)])
+        morton::encode([x, y, (x * x + y * y) / (4 * side)])
     };
     Octree::new(Voxels::new(depth, (0..side * side).map(column).collect())).unwrap()
 }
