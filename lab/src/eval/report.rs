@@ -86,21 +86,28 @@ impl Report {
         }
         let mut levels = String::new();
         for row in &self.rows {
+            // A row of a deeper level tells those above it too.
+            let count = |row: &Row| row.rate.as_ref().map_or(0, |rate| rate.levels.len());
+            let same = |other: &&Row| other.name == row.name;
+            if self
+                .rows
+                .iter()
+                .filter(same)
+                .any(|other| count(other) > count(row))
+            {
+                continue;
+            }
             for level in row.rate.iter().flat_map(|r| &r.levels) {
-                let (name, drawn) = (&row.name, &row.drawn);
-                let LevelRate {
-                    level,
-                    geometry,
-                    features,
-                } = level;
+                let (name, number) = (&row.name, level.level);
+                let (geometry, features) = (level.geometry, level.features);
                 let _ = writeln!(
                     levels,
-                    "| {name} | {drawn} | {level} | {geometry:.4} | {features:.4} |"
+                    "| {name} | {number} | {geometry:.4} | {features:.4} |"
                 );
             }
         }
         if !levels.is_empty() {
-            text += "\n| item | drawn as | level | geometry bpp | feature bpp |\n|---|---|---:|---:|---:|\n";
+            text += "\n| item | level | geometry bpp | feature bpp |\n|---|---:|---:|---:|\n";
             text += &levels;
         }
         text
@@ -156,7 +163,21 @@ mod tests {
             features: 0.2,
         };
         let stream = report(26.1, vec![level]).to_markdown();
-        assert!(stream.contains("| a | squares ×1 | 8 | 0.0500 | 0.2000 |"));
+        assert!(stream.contains("| a | 8 | 0.0500 | 0.2000 |"));
+    }
+
+    #[test]
+    fn levels_are_told_once_by_the_deepest_row_of_an_item() {
+        let level = |level| LevelRate {
+            level,
+            geometry: 0.05,
+            features: 0.2,
+        };
+        let mut both = report(26.1, vec![level(8), level(9)]);
+        both.rows.extend(report(25.0, vec![level(8)]).rows);
+        let text = both.to_markdown();
+        assert_eq!(text.matches("| a | 8 |").count(), 1);
+        assert_eq!(text.matches("| a | 9 |").count(), 1);
     }
 
     #[test]

@@ -178,15 +178,15 @@ pub fn text(lines: &[&str], dot: f32, ink: Vec3, paper: Vec3) -> Pattern {
 /// Three to five colours that go together.
 pub fn palette(rng: &mut Rng) -> Vec<Vec3> {
     let hue = rng.unit();
-    let mode = rng.below(7);
+    let mode = rng.below(9);
     let count = 3 + rng.below(3);
     (0..count)
         .map(|i| {
             let t = i as f32 / (count - 1) as f32;
             let near = hue + rng.range(-0.06, 0.06);
             match mode {
-                0 => hsv(rng.unit(), rng.range(0.8, 1.0), rng.range(0.75, 1.0)),
-                1 => hsv(near, rng.range(0.2, 0.8), rng.range(0.03, 0.22)),
+                0 | 7 => hsv(rng.unit(), rng.range(0.8, 1.0), rng.range(0.75, 1.0)),
+                1 => hsv(near, rng.range(0.2, 0.8), rng.range(0.03, 0.3)),
                 2 => hsv(near, rng.range(0.0, 0.05), rng.range(0.86, 1.0)),
                 3 => hsv(rng.unit(), rng.range(0.15, 0.4), rng.range(0.75, 0.95)),
                 4 => hsv(0.04 + 0.1 * rng.unit(), rng.range(0.3, 0.7), 0.25 + 0.6 * t),

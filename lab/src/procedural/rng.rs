@@ -1,33 +1,27 @@
-//! Chance that is the same every time: a counter hashed, and the noise made of it.
+//! Chance that is the same every time, in single precision, and the noise made of it.
 
 use glam::Vec3;
 
-/// Hashes 64 bits (the finaliser of SplitMix64).
-fn mix(mut x: u64) -> u64 {
-    x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    x ^ (x >> 31)
-}
+use crate::random::Random;
 
-/// A stream of numbers that depends on its seed alone (SplitMix64).
+/// A stream of numbers that depends on its seed alone.
 #[derive(Debug, Clone)]
-pub struct Rng(u64);
+pub struct Rng(Random);
 
 impl Rng {
     /// Starts the stream of `seed`.
     pub fn new(seed: u64) -> Self {
-        Rng(mix(seed ^ 0x9e37_79b9_7f4a_7c15))
+        Rng(Random::new(seed))
     }
 
     /// The next 64 bits.
     pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        mix(self.0)
+        self.0.bits()
     }
 
     /// Uniform in `[0, 1)`.
     pub fn unit(&mut self) -> f32 {
-        (self.bits() >> 40) as f32 / (1u64 << 24) as f32
+        fraction(self.0.bits())
     }
 
     /// Uniform in `[low, high)`.
@@ -37,7 +31,7 @@ impl Rng {
 
     /// Uniform in `0..n`; `n` must not be 0.
     pub fn below(&mut self, n: u32) -> u32 {
-        (self.bits() % u64::from(n)) as u32
+        self.0.below(n.into()) as u32
     }
 
     /// Whether an event of this probability happens.
@@ -54,11 +48,16 @@ impl Rng {
     }
 }
 
-/// A number in `[0, 1)` that belongs to a lattice point.
+/// The upper bits as a number in `[0, 1)`.
+fn fraction(bits: u64) -> f32 {
+    (bits >> 40) as f32 / (1u64 << 24) as f32
+}
+
+/// A number in `[0, 1)` that belongs to a lattice point; the lattice repeats after 2²¹ points.
 pub fn lattice(x: i32, y: i32, z: i32, seed: u32) -> f32 {
-    let xy = u64::from(x as u32) << 32 | u64::from(y as u32);
-    let zs = u64::from(z as u32) << 32 | u64::from(seed);
-    (mix(mix(xy).wrapping_add(zs)) >> 40) as f32 / (1u64 << 24) as f32
+    let packed = [x, y, z].map(|v| u64::from(v as u32 & 0x1f_ffff));
+    let index = packed[0] | packed[1] << 21 | packed[2] << 42;
+    fraction(Random::at(seed.into(), index).bits())
 }
 
 /// Value noise: numbers on the unit lattice, joined smoothly; in `[0, 1]`.
@@ -115,26 +114,6 @@ pub fn fractal(p: Vec3, octaves: u32, seed: u32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_seed_gives_the_same_numbers_each_time_and_another_seed_others() {
-        let take = |seed| -> Vec<u64> {
-            let mut rng = Rng::new(seed);
-            (0..8).map(|_| rng.bits()).collect()
-        };
-        assert_eq!(take(5), take(5));
-        assert_ne!(take(5), take(6));
-    }
-
-    #[test]
-    fn numbers_fill_their_range_evenly() {
-        let mut rng = Rng::new(1);
-        let mut bins = [0u32; 10];
-        for _ in 0..10_000 {
-            bins[(rng.range(-2.0, 3.0) * 2.0 + 4.0) as usize] += 1;
-        }
-        assert!(bins.iter().all(|&b| (850..1150).contains(&b)), "{bins:?}");
-    }
 
     #[test]
     fn noise_is_smooth_and_stays_in_its_range() {
