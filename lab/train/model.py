@@ -343,23 +343,33 @@ class B2P(nn.Module):
         return g[d.table.max(0).values.long()]
 
     def code(self, crop, features, top, mode):
-        """Runs roles 0 .. top. mode: 'noise' (noise for rate and distortion), 'mixed' (noise for rate, straight-through rounding for
-        distortion), 'round'. Returns g, bits and latents of each role."""
+        """Runs roles 0 .. top. mode: 'noise' (noise for rate and distortion), 'mixed' (straight-through rounding for
+        distortion; for rate, noise moves the latents and rounding fits the entropy models), 'round'. Returns g, bits and latents of each role."""
         trail, rates, latents, limit = [], [], [], float(self.cfg["latent_max"])
         for r in range(top + 1):
             c = self.context(trail[-1], crop, r) if r else None
             y = self.fs[r](features[r], c).clamp(-limit, limit)
             rounded = y + (torch.round(y) - y).detach()
             noisy = rounded if mode == "round" else y + torch.rand_like(y) - 0.5
-            if r == 0:
-                mass = self.prior(noisy)
-            else:
-                mu, log_sigma = self.pem[str(r)](c, crop.kernel3[r])
-                mass = bin_mass(noisy, mu, bounded_sigma(log_sigma))
-            rates.append(bits(mass))
+            mu, log_sigma = self.pem[str(r)](c, crop.kernel3[r]) if r else (None, None)
+            if mode != "mixed":
+                rates.append(self.bits(noisy, mu, log_sigma))
+            else:  # the entropy models learn the rounded latents that they will meet, the latents the smooth proxy
+                fixed = (mu.detach(), log_sigma.detach()) if r else (None, None)
+                smooth = self.bits(noisy, *fixed, learn=False)
+                rates.append(self.bits(rounded.detach(), mu, log_sigma) + smooth - smooth.detach())
             latents.append(y)
             trail.append(self.fr[r](noisy if mode == "noise" else rounded, c, crop.kernel3[r]))
         return trail, rates, latents
+
+    def bits(self, y, mu, log_sigma, learn=True):
+        """Cost of latents: under the prior when mu is None. `learn`: whether the prior's parameters get a gradient."""
+        if mu is not None:
+            return bits(bin_mass(y, mu, bounded_sigma(log_sigma)))
+        if learn:
+            return bits(self.prior(y))
+        frozen = {k: p.detach() for k, p in self.prior.named_parameters()}
+        return bits(torch.func.functional_call(self.prior, frozen, (y,)))
 
     def generate(self, g, crop, role):
         """Gaussians of head `role`, in finest-voxel units."""
