@@ -2,6 +2,7 @@
 
 pub mod dataset;
 pub mod eval;
+pub mod occupancy;
 pub mod scene;
 pub mod voxelize;
 
@@ -27,6 +28,7 @@ enum Command {
     Dataset(dataset::Args),
     Scene(scene::Args),
     Eval(eval::Args),
+    Occupancy(occupancy::Args),
 }
 
 impl Cli {
@@ -40,6 +42,7 @@ impl Cli {
             Command::Dataset(args) => args.run(),
             Command::Scene(args) => args.run(),
             Command::Eval(args) => args.run(),
+            Command::Occupancy(args) => args.run(),
         }
     }
 }

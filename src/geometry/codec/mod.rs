@@ -21,7 +21,7 @@
 //! parents it was given and the voxels it was told, no more.
 
 mod coder;
-mod network;
+pub mod network;
 mod predictor;
 mod probability;
 
@@ -135,9 +135,7 @@ fn write(
     masks: &[u8],
 ) {
     for (here, &mask) in parents.clone().zip(masks) {
-        let facts = predictor
-            .network
-            .facts(map.row(here), &parents, here, masks);
+        let facts = predictor.network.sum(map.row(here), &parents, here, masks);
         predictor.code(encoder, &facts, mask);
     }
 }
@@ -154,9 +152,7 @@ fn read(
     let mut masks = Vec::with_capacity(parents.len());
     let mut found = 0;
     for here in parents.clone() {
-        let facts = predictor
-            .network
-            .facts(map.row(here), &parents, here, &masks);
+        let facts = predictor.network.sum(map.row(here), &parents, here, &masks);
         let mask = predictor.code(decoder, &facts, 0);
         decoder.check_not_past_end()?;
         masks.push(mask);

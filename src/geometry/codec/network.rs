@@ -23,15 +23,22 @@ use std::ops::Range;
 use std::sync::OnceLock;
 
 /// Hidden units.
-pub(super) const WIDTH: usize = 128;
+pub const WIDTH: usize = 128;
+
+/// How many facts there are.
+pub const FACTS: usize = PRESENCES + 9 * EARLIER;
+
+/// How many rows there are for children.
+pub const NODES: usize = 255;
+
+/// Bytes of `weights.bin`.
+pub const SIZE: usize = (FACTS + NODES) * WIDTH + 8 * (2 * WIDTH + 4);
+
+const PRESENCES: usize = 26;
+const EARLIER: usize = 19;
 
 /// One number per hidden unit.
 pub(super) type Row = [i16; WIDTH];
-
-const PRESENCE_ROWS: usize = 26;
-const EARLIER: usize = 19;
-const TREE_ROWS: usize = 255;
-const SIZE: usize = (PRESENCE_ROWS + 9 * EARLIER + TREE_ROWS) * WIDTH + 8 * (2 * WIDTH + 4);
 
 static WEIGHTS: &[u8; SIZE] = include_bytes!("weights.bin");
 
@@ -48,6 +55,52 @@ const EARLIER_SLOT: [Option<u8>; 27] = {
     }
     slots
 };
+
+/// Tells the facts that hold for the voxel `here`, each by the number of its row: its 3³ neighbours are `row`, and `occupancy` is
+/// that of the voxels `slice`, up to `here` at least.
+pub fn facts(
+    row: &[u32],
+    slice: &Range<usize>,
+    here: usize,
+    occupancy: &[u8],
+    mut tell: impl FnMut(usize),
+) {
+    visit(row, slice, here, occupancy, |k, children| match children {
+        None => tell(k - usize::from(k > KernelMap::CENTRE)),
+        Some((slot, mask)) => {
+            let known = PRESENCES + 9 * slot;
+            tell(known);
+            (0..8)
+                .filter(|octant| mask >> octant & 1 == 1)
+                .for_each(|octant| tell(known + 1 + octant));
+        }
+    });
+}
+
+/// Visits the occupied neighbours of the voxel `here`: for each its offset and, if its children are known, the offset's place among
+/// those that may come earlier, and its occupancy.
+#[inline(always)]
+fn visit(
+    row: &[u32],
+    slice: &Range<usize>,
+    here: usize,
+    occupancy: &[u8],
+    mut neighbour: impl FnMut(usize, Option<(usize, u8)>),
+) {
+    for (k, &index) in row.iter().enumerate() {
+        if index == KernelMap::ABSENT || k == KernelMap::CENTRE {
+            continue;
+        }
+        let index = index as usize;
+        let children = match EARLIER_SLOT[k] {
+            Some(slot) if slice.start <= index && index < here => {
+                Some((usize::from(slot), occupancy[index - slice.start]))
+            }
+            _ => None,
+        };
+        neighbour(k, children);
+    }
+}
 
 /// The weights, laid out for use.
 #[derive(Debug)]
@@ -93,7 +146,7 @@ impl Network {
             high.push(sums([0; WIDTH], &children[4..]));
         }
         let mut tree = vec![[0; WIDTH]];
-        tree.extend((0..TREE_ROWS).map(|_| row()));
+        tree.extend((0..NODES).map(|_| row()));
         let output = std::array::from_fn(|_| {
             let bytes = bytes(2 * WIDTH);
             std::array::from_fn(|unit| i16::from_le_bytes([bytes[2 * unit], bytes[2 * unit + 1]]))
@@ -115,22 +168,15 @@ impl Network {
     /// The sum of the rows of what is known about the voxel `here`, whose 3³ neighbours are `row`: `occupancy` is that of the voxels
     /// `slice`, up to `here` at least.
     #[inline]
-    pub fn facts(&self, row: &[u32], slice: &Range<usize>, here: usize, occupancy: &[u8]) -> Row {
+    pub fn sum(&self, row: &[u32], slice: &Range<usize>, here: usize, occupancy: &[u8]) -> Row {
         let mut sum = [0; WIDTH];
-        for (k, &neighbour) in row.iter().enumerate() {
-            if neighbour == KernelMap::ABSENT || k == KernelMap::CENTRE {
-                continue;
+        visit(row, slice, here, occupancy, |k, children| match children {
+            None => add(&mut sum, &self.presence[k]),
+            Some((slot, mask)) => {
+                add(&mut sum, &self.low[slot][usize::from(mask & 15)]);
+                add(&mut sum, &self.high[slot][usize::from(mask >> 4)]);
             }
-            let neighbour = neighbour as usize;
-            match EARLIER_SLOT[k] {
-                Some(slot) if slice.start <= neighbour && neighbour < here => {
-                    let mask = usize::from(occupancy[neighbour - slice.start]);
-                    add(&mut sum, &self.low[usize::from(slot)][mask & 15]);
-                    add(&mut sum, &self.high[usize::from(slot)][mask >> 4]);
-                }
-                _ => add(&mut sum, &self.presence[k]),
-            }
-        }
+        });
         sum
     }
 
