@@ -17,7 +17,7 @@ const SQUASH: [u16; LIMIT as usize + 1] = {
     while k < table.len() {
         let denominator = (1u128 << 62) + power;
         table[k] = (((1u128 << 78) + denominator / 2) / denominator) as u16;
-        power = power * DECAY as u128 >> 62;
+        power = (power * DECAY as u128) >> 62;
         k += 1;
     }
     table
