@@ -14,6 +14,8 @@ pub(crate) enum Level {
     Scalar,
     #[cfg(target_arch = "x86_64")]
     Avx2,
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
 }
 
 impl Isa {
@@ -31,7 +33,13 @@ impl Isa {
             && is_x86_feature_detected!("popcnt")
             && is_x86_feature_detected!("lzcnt")
         {
-            return Isa(Level::Avx2);
+            let avx512 = is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512bw")
+                && is_x86_feature_detected!("avx512cd")
+                && is_x86_feature_detected!("avx512dq")
+                && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512vnni");
+            return Isa(if avx512 { Level::Avx512 } else { Level::Avx2 });
         }
         Isa::SCALAR
     }
@@ -42,6 +50,8 @@ impl Isa {
             Level::Scalar,
             #[cfg(target_arch = "x86_64")]
             Level::Avx2,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512,
         ];
         let best = Isa::detect();
         levels
@@ -60,6 +70,8 @@ impl Isa {
             Level::Scalar => "scalar",
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => "avx2",
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => "avx512",
         }
     }
 }
@@ -112,11 +124,21 @@ macro_rules! dispatch {
         fn avx2 $(<$($g: $bound,)* $(const $n: usize)?>)? ($($arg: $ty),*) {
             $body $(::<$($g,)* $($n)?>)? ($($arg),*)
         }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(
+            enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni"
+        )]
+        fn avx512 $(<$($g: $bound,)* $(const $n: usize)?>)? ($($arg: $ty),*) {
+            $body $(::<$($g,)* $($n)?>)? ($($arg),*)
+        }
         match $crate::isa::Isa::level($isa) {
             $crate::isa::Level::Scalar => scalar $(::<$($g,)* $($n)?>)? ($($arg),*),
             #[cfg(target_arch = "x86_64")]
             // SAFETY: an `Isa` of this level is only made where the processor has these features.
             $crate::isa::Level::Avx2 => unsafe { avx2 $(::<$($g,)* $($n)?>)? ($($arg),*) },
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: as above.
+            $crate::isa::Level::Avx512 => unsafe { avx512 $(::<$($g,)* $($n)?>)? ($($arg),*) },
         }
     }};
 }
