@@ -71,6 +71,32 @@ def operators_agree_with_plain_pytorch():
     return f"worst relative error {worst:.1e}"
 
 
+def rounded_operands_stay_close_where_the_processor_has_them():
+    if not ops.extension().set_bf16(True):
+        return "no such processor"
+    torch.manual_seed(0)
+    crop, worst = data.procedural(1, size=24, views=1, pixels=16).crop, 0.0
+    for cin, cout in ((3, 64), (64, 14), (8, 8), (16, 32), (33, 48), (72, 24), (128, 64), (32, 256)):
+        inputs = [torch.randn(crop.points, cin), torch.randn(27, cin, cout) / cin, torch.randn(cout), torch.randn(cout)]
+        f = lambda x, w, g, b: ops.norm_conv(x, w, g, b, crop.kernel3[3])
+        weight = torch.randn(crop.points, cout)
+        ops.extension().set_bf16(False)
+        y_ref, grads_ref = gradients(f, inputs, weight)
+        ops.extension().set_bf16(True)
+        y, grads = gradients(f, inputs, weight)
+        for i, (a, b) in enumerate(zip([y, *grads], [y_ref, *grads_ref])):
+            worst = max(worst, near(a, b, 1e-2, f"bf16 {cin} {cout}, result {i}"))
+    ops.extension().set_bf16(False)
+    return f"worst relative error {worst:.1e}"
+
+
+def maps_from_above_are_those_found_by_searching():
+    crop = data.procedural(1, size=40, views=1, pixels=16).crop
+    for coords, found in zip([*crop.coords, crop.children], [*crop.kernel3, crop.children3]):
+        assert torch.equal(ops.neighbours(coords).table, found.table)
+    return f"{len(crop.children)} generated voxels and four levels"
+
+
 def the_splatter_agrees_with_plain_pytorch():
     torch.manual_seed(0)
     s = data.procedural(2, size=24, views=3, pixels=40)
@@ -100,7 +126,7 @@ def the_splatter_agrees_with_plain_pytorch():
 
 def arguments(**changes):
     args = dict(config=os.path.join(HERE, "configs/full.json"), device="cpu", seed=0, lr_conv=3e-4, lr_linear=1e-3, minutes=0, steps=100000,
-                rate_start=0.003, rate_ramp=0.6, warmup=10, decay_from=0.6, rounding_from=0.6, coarse=0.0, both=False, lam=5.0, pyramid=1.0,
+                rate_start=0.003, rate_ramp=0.6, warmup=10, decay_from=0.6, rounding_from=0.6, coarse=0.0, both=False, lam=5.0, pyramid=1.0, square=0.0,
                 clip=1.0, average=0.9, hint=0.0, hint_until=0.5)
     return type("Arguments", (), args | changes)()
 
@@ -130,6 +156,7 @@ def a_resumed_run_equals_an_unbroken_one():
         for name, a in whole.average.items():
             assert torch.equal(a, resumed.average[name]), f"the average of {name} differs"
         assert whole.step == resumed.step == 8
+    ops.extension().set_bf16(False)
     return "8 steps, broken after 5: every weight is equal"
 
 
@@ -149,7 +176,8 @@ def the_integer_path_follows_the_float_path():
 
 if __name__ == "__main__":
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "2")))
-    for check in (operators_agree_with_plain_pytorch, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
+    for check in (operators_agree_with_plain_pytorch, rounded_operands_stay_close_where_the_processor_has_them,
+                  maps_from_above_are_those_found_by_searching, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
                   the_integer_path_follows_the_float_path, a_crop_overfits):
         begin = time.monotonic()
         said = check()

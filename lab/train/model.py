@@ -58,10 +58,14 @@ def make_crop(coords, parents):
     for r in range(3):
         counts = torch.bincount(parents[r + 1].long(), minlength=coords[r].shape[0])
         first.append(torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)]).int())
-    children = ops.all_children(coords[1])
-    return Crop(coords, [ops.neighbours(c) for c in coords], first,
-                {r: ops.descent(coords[r], parents[r], coords[r - 1].shape[0]) for r in (1, 2)},
-                ops.corners(coords[2]), children, ops.neighbours(children))
+    descent = {r: ops.descent(coords[r], parents[r], coords[r - 1].shape[0]) for r in (1, 2, 3)}
+    kernel3 = [ops.neighbours(coords[0])]
+    for r in (1, 2, 3):
+        kernel3.append(ops.neighbours_below(kernel3[-1], descent[r].back, parents[r], coords[r]))
+    children, n = ops.all_children(coords[1]), coords[1].shape[0]
+    every = torch.arange(8 * n, dtype=torch.int32)
+    children3 = ops.neighbours_below(kernel3[1], every.view(n, 8).T.contiguous(), every // 8, children)
+    return Crop(coords, kernel3, first, {r: descent[r] for r in (1, 2)}, ops.corners(coords[2]), children, children3)
 
 
 def initial(taps, cin, cout, scale=1.0):

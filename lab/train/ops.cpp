@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <numeric>
 #include <vector>
 
@@ -73,6 +74,34 @@ Tensor kernel_map(const Tensor& coords, const Tensor& offsets) {
   return map;
 }
 
+// The 3x3x3 map of the level below one whose 3x3x3 map is `above`; child[o][p] = row of child o of row p, or -1; taps x fastest.
+Tensor child_map(const Tensor& above, const Tensor& child, const Tensor& parent, const Tensor& coords) {
+  for (const Tensor* t : {&above, &child, &parent, &coords}) check(*t, at::kInt);
+  const int64_t n = coords.size(0), np = above.size(1);
+  TORCH_CHECK(above.size(0) == 27 && child.size(0) == 8 && child.size(1) == np && parent.size(0) == n, "levels do not agree");
+  Tensor map = torch::empty({27, n}, torch::kInt);
+  const int32_t *a = above.data_ptr<int32_t>(), *ch = child.data_ptr<int32_t>(), *pp = parent.data_ptr<int32_t>(), *c = coords.data_ptr<int32_t>();
+  int32_t* m = map.data_ptr<int32_t>();
+  int tap[8][27], octant[8][27];
+  for (int o = 0; o < 8; o++)
+    for (int k = 0; k < 27; k++) {
+      tap[o][k] = octant[o][k] = 0;
+      for (int axis = 0, three = 1, offset = k; axis < 3; axis++, three *= 3, offset /= 3) {
+        const int at = (o >> axis & 1) + offset % 3 - 1;
+        tap[o][k] += three * (1 + (at < 0 ? -1 : at > 1 ? 1 : 0));
+        octant[o][k] |= (at & 1) << axis;
+      }
+    }
+  for (int64_t i = 0; i < n; i++) {
+    const int o = (c[3 * i] & 1) | (c[3 * i + 1] & 1) << 1 | (c[3 * i + 2] & 1) << 2;
+    for (int k = 0; k < 27; k++) {
+      const int32_t p = a[tap[o][k] * np + pp[i]];
+      m[k * n + i] = p < 0 ? -1 : ch[octant[o][k] * np + p];
+    }
+  }
+  return map;
+}
+
 // ---------------------------------------------------------------------------------------------------------------
 // Sparse convolution: out[i] = sum_k W_k x[map[k][i]]
 
@@ -134,6 +163,206 @@ void tiles(const float* const* x, float* const* y, const float* w, int64_t cin, 
   }
 }
 
+// ---------------------------------------------------------------------------------------------------------------
+// The same products from operands rounded to bf16, summed in f32: twice as fast where the processor has the instruction.
+
+bool use_bf16 = false;
+
+#ifdef __AVX512BF16__
+constexpr bool HAS_BF16 = true;
+
+struct Halves {
+  uint16_t* p;
+  int64_t stride;  // a multiple of 16; zero beyond the last channel
+  Halves(const float* x, int64_t n, int64_t c) : stride((c + 15) / 16 * 16) {
+    p = static_cast<uint16_t*>(std::aligned_alloc(64, ((n + 1) * stride * 2 + 63) / 64 * 64));
+#pragma omp parallel for schedule(static)
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t j = 0; j < stride; j += 16) {
+        const __mmask16 m = c - j >= 16 ? 0xffff : __mmask16((1u << (c - j)) - 1);
+        const __m512 v = _mm512_maskz_loadu_ps(m, x + i * c + j);
+        _mm256_store_si256(reinterpret_cast<__m256i*>(p + i * stride + j), (__m256i)_mm512_cvtneps_pbh(v));
+      }
+    std::fill(p + n * stride, p + (n + 1) * stride, uint16_t(0));
+  }
+  ~Halves() { std::free(p); }
+  Halves(const Halves&) = delete;
+  const uint16_t* row(int64_t i) const { return p + i * stride; }
+};
+
+uint16_t to_bf16(float v) {
+  uint32_t u;
+  std::memcpy(&u, &v, 4);
+  return uint16_t((u + 0x7fff + ((u >> 16) & 1)) >> 16);
+}
+
+// Weights as [tap][group of 64 columns][pair of inputs][up to 4 panels][16 columns][2 inputs].
+void pack_halves(const float* w, int64_t taps, int64_t cin, int64_t cout, bool transpose, uint16_t* out) {
+  const int64_t panels = (cout + 15) / 16, pairs = (cin + 1) / 2;
+#pragma omp parallel for schedule(static)
+  for (int64_t k = 0; k < taps; k++) {
+    uint16_t* to = out + k * panels * pairs * 32;
+    for (int64_t first = 0; first < panels; first += 4)
+      for (int64_t c = 0; c < pairs; c++)
+        for (int64_t p = first; p < std::min(first + 4, panels); p++)
+          for (int64_t j = 0; j < 32; j++) {
+            const int64_t o = p * 16 + j / 2, i = 2 * c + j % 2;
+            *to++ = o >= cout || i >= cin ? 0 : to_bf16(transpose ? w[(k * cout + o) * cin + i] : w[(k * cin + i) * cout + o]);
+          }
+  }
+}
+
+__m512bh pair_of(const uint16_t* p) {
+  int32_t v;
+  std::memcpy(&v, p, 4);
+  return (__m512bh)_mm512_set1_epi32(v);
+}
+
+// R rows by P panels: y += x w.
+template <int R, int P>
+void tile_halves(const uint16_t* const* x, float* const* y, const uint16_t* w, int64_t pairs) {
+  __m512 a[R][P];
+#pragma GCC unroll 32
+  for (int r = 0; r < R; r++)
+#pragma GCC unroll 4
+    for (int p = 0; p < P; p++) a[r][p] = _mm512_loadu_ps(y[r] + 16 * p);
+  for (int64_t c = 0; c < pairs; c++) {
+    __m512bh v[P];
+#pragma GCC unroll 4
+    for (int p = 0; p < P; p++) v[p] = (__m512bh)_mm512_loadu_si512(w + (c * P + p) * 32);
+#pragma GCC unroll 32
+    for (int r = 0; r < R; r++) {
+      const __m512bh b = pair_of(x[r] + 2 * c);
+#pragma GCC unroll 4
+      for (int p = 0; p < P; p++) a[r][p] = _mm512_dpbf16_ps(a[r][p], v[p], b);
+    }
+  }
+#pragma GCC unroll 32
+  for (int r = 0; r < R; r++)
+#pragma GCC unroll 4
+    for (int p = 0; p < P; p++) _mm512_storeu_ps(y[r] + 16 * p, a[r][p]);
+}
+
+template <int R, int P>
+void rows_halves(const uint16_t* const* x, float* const* y, const uint16_t* w, int64_t pairs, int64_t n) {
+  int64_t i = 0;
+  for (; i + R <= n; i += R) tile_halves<R, P>(x + i, y + i, w, pairs);
+  if constexpr (R > 1) rows_halves<R / 2, P>(x + i, y + i, w, pairs, n - i);
+}
+
+void tiles_halves(const uint16_t* const* x, float* const* y, const uint16_t* w, int64_t pairs, int64_t panels, int64_t n) {
+  switch (panels) {
+    case 1: rows_halves<16, 1>(x, y, w, pairs, n); break;
+    case 2: rows_halves<12, 2>(x, y, w, pairs, n); break;
+    case 3: rows_halves<8, 3>(x, y, w, pairs, n); break;
+    default: rows_halves<6, 4>(x, y, w, pairs, n); break;
+  }
+}
+
+// dw[R][P panels] += sum over steps of x^T g; a step is a pair of rows, interleaved.
+template <int R, int P>
+void outer_halves(const uint16_t* x, int64_t sx, const uint16_t* g, int64_t sg, float* dw, int64_t sw, int64_t steps) {
+  __m512 a[R][P];
+#pragma GCC unroll 8
+  for (int r = 0; r < R; r++)
+#pragma GCC unroll 4
+    for (int p = 0; p < P; p++) a[r][p] = _mm512_loadu_ps(dw + r * sw + 16 * p);
+  for (int64_t i = 0; i < steps; i++) {
+    __m512bh v[P];
+#pragma GCC unroll 4
+    for (int p = 0; p < P; p++) v[p] = (__m512bh)_mm512_loadu_si512(g + i * sg + 32 * p);
+#pragma GCC unroll 8
+    for (int r = 0; r < R; r++) {
+      const __m512bh b = pair_of(x + i * sx + 2 * r);
+#pragma GCC unroll 4
+      for (int p = 0; p < P; p++) a[r][p] = _mm512_dpbf16_ps(a[r][p], v[p], b);
+    }
+  }
+#pragma GCC unroll 8
+  for (int r = 0; r < R; r++)
+#pragma GCC unroll 4
+    for (int p = 0; p < P; p++) _mm512_storeu_ps(dw + r * sw + 16 * p, a[r][p]);
+}
+
+// Two rows, element by element, side by side.
+void interleave(const uint16_t* a, const uint16_t* b, int64_t stride, uint16_t* to) {
+  for (int64_t j = 0; j < stride; j += 16) {
+    const __m512i lo = _mm512_cvtepu16_epi32(_mm256_load_si256(reinterpret_cast<const __m256i*>(a + j)));
+    const __m512i hi = _mm512_cvtepu16_epi32(_mm256_load_si256(reinterpret_cast<const __m256i*>(b + j)));
+    _mm512_storeu_si512(to + 2 * j, _mm512_or_si512(lo, _mm512_slli_epi32(hi, 16)));
+  }
+}
+
+Tensor weight_grad_halves(const Tensor& x, const Tensor& g, const Tensor& map) {
+  constexpr int64_t CHUNK = 128, SHARES = 8;
+  const int64_t taps = map.size(0), n = map.size(1), cin = x.size(1), cout = g.size(1);
+  const Halves xh(x.data_ptr<float>(), x.size(0), cin), gh(g.data_ptr<float>(), n, cout);
+  const int64_t wide = gh.stride, deep = xh.stride, size = deep * wide;
+  Aligned acc(SHARES * taps * size);
+  const int32_t* mp = map.data_ptr<int32_t>();
+#pragma omp parallel
+  {
+    std::vector<uint16_t> gs(CHUNK * wide + 32), xs(CHUNK * deep + 32);
+    int32_t ins[BLOCK + 1], outs[BLOCK + 1];
+#pragma omp for schedule(dynamic, 1)
+    for (int64_t share = 0; share < SHARES; share++) {
+      float* mine = acc.p + share * taps * size;
+      std::fill(mine, mine + taps * size, 0.f);
+      const int64_t stop = n * (share + 1) / SHARES;
+      for (int64_t r0 = n * share / SHARES; r0 < stop; r0 += BLOCK) {
+        const int64_t r1 = std::min(stop, r0 + BLOCK);
+        for (int64_t k = 0; k < taps; k++) {
+          int64_t pairs = 0;
+          for (int64_t i = r0; i < r1; i++) {
+            ins[pairs] = mp[k * n + i];
+            outs[pairs] = int32_t(i);
+            pairs += ins[pairs] >= 0;
+          }
+          if (pairs % 2) {  // the row of zeros makes the last pair whole
+            ins[pairs] = int32_t(x.size(0));
+            outs[pairs++] = int32_t(n);
+          }
+          for (int64_t first = 0; first < pairs; first += CHUNK) {
+            const int64_t steps = std::min(CHUNK, pairs - first) / 2;
+            for (int64_t j = 0; j < steps; j++) {
+              interleave(xh.row(ins[first + 2 * j]), xh.row(ins[first + 2 * j + 1]), deep, xs.data() + j * 2 * deep);
+              interleave(gh.row(outs[first + 2 * j]), gh.row(outs[first + 2 * j + 1]), wide, gs.data() + j * 2 * wide);
+            }
+            for (int64_t o = 0; o < wide; o += 64)
+              for (int64_t c = 0; c < cin; c += 4) {
+                float* to = mine + k * size + c * wide + o;
+                const uint16_t *xa = xs.data() + 2 * c, *ga = gs.data() + 2 * o;
+                switch (std::min<int64_t>(4, (wide - o) / 16)) {
+                  case 1: outer_halves<4, 1>(xa, 2 * deep, ga, 2 * wide, to, wide, steps); break;
+                  case 2: outer_halves<4, 2>(xa, 2 * deep, ga, 2 * wide, to, wide, steps); break;
+                  case 3: outer_halves<4, 3>(xa, 2 * deep, ga, 2 * wide, to, wide, steps); break;
+                  default: outer_halves<4, 4>(xa, 2 * deep, ga, 2 * wide, to, wide, steps); break;
+                }
+              }
+          }
+        }
+      }
+    }
+  }
+  Tensor dw = torch::empty({taps, cin, cout});
+  float* dp = dw.data_ptr<float>();
+#pragma omp parallel for schedule(static)
+  for (int64_t k = 0; k < taps; k++)
+    for (int64_t c = 0; c < cin; c++)
+      for (int64_t o = 0; o < cout; o++) {
+        float sum = 0;
+        for (int64_t share = 0; share < SHARES; share++) sum += acc.p[(share * taps + k) * size + c * wide + o];
+        dp[(k * cin + c) * cout + o] = sum;
+      }
+  return dw;
+}
+#else
+constexpr bool HAS_BF16 = false;
+#endif
+
+// Whether convolutions round their operands to bf16; returns what holds: false where the processor cannot.
+bool set_bf16(bool on) { return use_bf16 = on && HAS_BF16; }
+
 // Plain: y = relu?(conv + bias). With a gain, the geometry-invariant form: y = relu?(gain * conv * r + bias),
 // r = 1 / sqrt(sum of squared active weights + 1e-8); returns y, conv * r and r, which the backward pass needs.
 std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const Tensor& map, const c10::optional<Tensor>& bias,
@@ -143,6 +372,7 @@ std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const
   check(map, at::kInt);
   const int64_t taps = map.size(0), n = map.size(1);
   const int64_t cin = w.size(transpose ? 2 : 1), cout = w.size(transpose ? 1 : 2), panels = (cout + 15) / 16, wide = panels * 16;
+  [[maybe_unused]] const int64_t pairs = (cin + 1) / 2;
   TORCH_CHECK(w.size(0) == taps && x.size(1) == cin, "convolution shapes do not agree");
   const bool norm = gain.has_value();
   Tensor y = torch::empty({n, cout}), hat, inv;
@@ -150,19 +380,24 @@ std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const
     hat = torch::empty({n, cout});
     inv = torch::empty({n, cout});
   }
-  Aligned packed(taps * panels * cin * 16);
-  pack(w.data_ptr<float>(), taps, cin, cout, transpose, packed.p);
+  Aligned packed(taps * panels * (cin + 1) * 16);
+#ifdef __AVX512BF16__
+  uint16_t* halves = reinterpret_cast<uint16_t*>(packed.p);
+  const Halves xh(x.data_ptr<float>(), use_bf16 ? x.size(0) : 0, cin);
+  if (use_bf16) pack_halves(w.data_ptr<float>(), taps, cin, cout, transpose, halves);
+#endif
+  if (!use_bf16) pack(w.data_ptr<float>(), taps, cin, cout, transpose, packed.p);
   Aligned squares(norm ? taps * wide : 1);
-  if (norm)
+  if (norm) {
+    std::fill(squares.p, squares.p + taps * wide, 0.f);
+    const float* wp = w.data_ptr<float>();
     for (int64_t k = 0; k < taps; k++)
-      for (int64_t o = 0; o < wide; o++) {
-        float s = 0;
-        for (int64_t c = 0; c < cin; c++) {
-          const float v = packed.p[((k * panels + o / 16) * cin + c) * 16 + o % 16];
-          s += v * v;
+      for (int64_t c = 0; c < cin; c++)
+        for (int64_t o = 0; o < cout; o++) {
+          const float v = transpose ? wp[(k * cout + o) * cin + c] : wp[(k * cin + c) * cout + o];
+          squares.p[k * wide + o] += v * v;
         }
-        squares.p[k * wide + o] = s;
-      }
+  }
   const float *xp = x.data_ptr<float>(), *bp = bias ? bias->data_ptr<float>() : nullptr, *gp = norm ? gain->data_ptr<float>() : nullptr;
   float *yp = y.data_ptr<float>(), *hp = norm ? hat.data_ptr<float>() : nullptr, *ip = norm ? inv.data_ptr<float>() : nullptr;
   const int32_t* mp = map.data_ptr<int32_t>();
@@ -171,23 +406,38 @@ std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const
   {
     Aligned acc(panels * BLOCK * 16), den(norm ? BLOCK * wide : 1);
     const float* rows[BLOCK];
+#ifdef __AVX512BF16__
+    const uint16_t* narrow[BLOCK];
+#endif
     float* outs[BLOCK];
     int32_t local[BLOCK];
 #pragma omp for schedule(dynamic, 1)
     for (int64_t b = 0; b < blocks; b++) {
       const int64_t r0 = b * BLOCK, m = std::min(BLOCK, n - r0);
-      std::fill(acc.p, acc.p + panels * BLOCK * 16, 0.f);
+      std::fill(acc.p, acc.p + m * wide, 0.f);
       if (norm) std::fill(den.p, den.p + m * wide, 0.f);
       for (int64_t k = 0; k < taps; k++) {
         const int32_t* nb = mp + k * n + r0;
         int64_t count = 0;
         for (int64_t i = 0; i < m; i++) {
           local[count] = int32_t(i);
+#ifdef __AVX512BF16__
+          if (use_bf16) narrow[count] = xh.row(nb[i]);
+          else
+#endif
           rows[count] = xp + int64_t(nb[i]) * cin;
           count += nb[i] >= 0;
         }
+#ifdef __AVX512BF16__
+        if (use_bf16)
+          for (int64_t p = 0; p < panels; p += 4) {
+            for (int64_t i = 0; i < count; i++) outs[i] = acc.p + local[i] * wide + p * 16;
+            tiles_halves(narrow, outs, halves + (k * panels + p) * pairs * 32, pairs, std::min<int64_t>(4, panels - p), count);
+          }
+        else
+#endif
         for (int64_t p = 0; p < panels; p++) {
-          for (int64_t i = 0; i < count; i++) outs[i] = acc.p + (p * BLOCK + local[i]) * 16;
+          for (int64_t i = 0; i < count; i++) outs[i] = acc.p + local[i] * wide + p * 16;
           tiles(rows, outs, packed.p + (k * panels + p) * cin * 16, cin, count);
         }
         if (norm)
@@ -199,7 +449,7 @@ std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const
       }
       for (int64_t i = 0; i < m; i++)
         for (int64_t p = 0; p < panels; p++) {
-          float* a = acc.p + (p * BLOCK + i) * 16;
+          float* a = acc.p + i * wide + p * 16;
           const int64_t o0 = p * 16, width = std::min<int64_t>(16, cout - o0), at = (r0 + i) * cout + o0;
           if (norm) {
             float* d = den.p + i * wide + o0;
@@ -257,6 +507,9 @@ Tensor weight_grad(const Tensor& x, const Tensor& g, const Tensor& map) {
   const int64_t taps = map.size(0), n = map.size(1), cin = x.size(1), cout = g.size(1), panels = (cout + 15) / 16, strips = (cin + 5) / 6;
   const int64_t size = panels * strips * 96;
   TORCH_CHECK(g.size(0) == n, "gradient rows do not match the map");
+#ifdef __AVX512BF16__
+  if (use_bf16) return weight_grad_halves(x, g, map);
+#endif
   Aligned acc(SHARES * taps * size);
   const float *xp = x.data_ptr<float>(), *gp = g.data_ptr<float>();
   const int32_t* mp = map.data_ptr<int32_t>();
@@ -714,7 +967,9 @@ std::vector<Tensor> splat_grad(const Tensor& mean, const Tensor& cov, const Tens
 PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
   using release = pybind11::call_guard<pybind11::gil_scoped_release>;
   m.def("kernel_map", &kernel_map, release());
+  m.def("child_map", &child_map, release());
   m.def("conv", &conv, release());
+  m.def("set_bf16", &set_bf16);
   m.def("weight_grad", &weight_grad, release());
   m.def("plain_grad", &plain_grad, release());
   m.def("norm_grad", &norm_grad, release());

@@ -82,6 +82,12 @@ def neighbours(coords):
     return Map(table, table.flip(0).contiguous())
 
 
+def neighbours_below(above, child, parent, coords):
+    """3x3x3 map of `coords` from that of the level above: `child[o, p]` is the row of child o of row p, or -1."""
+    table = extension().child_map(above.table, child, parent.int(), coords)
+    return Map(table, table.flip(0).contiguous())
+
+
 def corners(coords):
     """2x2x2 map, stride 1, offsets 0 and 1."""
     return Map(extension().kernel_map(coords, OFFSETS2), extension().kernel_map(coords, -OFFSETS2))

@@ -55,14 +55,15 @@ LUMA_CHROMA = torch.tensor([[0.33, 0.34, 0.33], [1.0, -1.0, 0.0], [-0.5, -0.5, 1
 CHROMA = torch.tensor([[0.5, -0.5, 0.0], [-0.25, -0.25, 0.5]])
 
 
-def distortion(image, truth, pyramid):
-    """D = 3 L1 + 0.2 (1 - SSIM), at the drawn size and at its 2x2 average, which is what evaluation looks at, plus `pyramid` times an
-    L1 over coarser averages, luma and chroma, where blotches show."""
+def distortion(image, truth, pyramid, square):
+    """D = 3 L1 + `square` MSE + 0.2 (1 - SSIM), at the drawn size and at its 2x2 average, which is what evaluation looks at, plus
+    `pyramid` times an L1 over coarser averages, luma and chroma, where blotches show."""
     total = 0
     for level in range(2):
         if level:
             image, truth = F.avg_pool2d(image, 2), F.avg_pool2d(truth, 2)
-        total = total + (1, 2)[level] / 3 * (3 * (image - truth).abs().mean() + 0.2 * (1 - ssim(image, truth)))
+        e = image - truth
+        total = total + (1, 2)[level] / 3 * (3 * e.abs().mean() + square * e.pow(2).mean() + 0.2 * (1 - ssim(image, truth)))
     if pyramid > 0:
         e = image - truth
         matrix = CHROMA.to(e.device)
@@ -153,7 +154,7 @@ class Trainer:
         h, w = sample.image.shape[2:]
         image = ops.splat(mean, cov, alpha, colour, sample.cameras, background, w, h)
         truth = sample.image + (1 - sample.coverage) * background[:, :, None, None]
-        d = distortion(image, truth, self.args.pyramid)
+        d = distortion(image, truth, self.args.pyramid, self.args.square)
         rate = sum(rates) / sample.crop.points
         # A latent that wanders off is cheap to code while the rate weighs nothing, and expensive to bring back.
         probes = 0.0
@@ -169,7 +170,7 @@ class Trainer:
         args, x = self.args, self.fraction()
         weight, mode = rate_weight(x, args), "noise" if x < args.rounding_from else "mixed"
         head = 1 if self.rng.random() < args.coarse else 2
-        hint = args.hint * max(0.0, 1 - x / args.hint_until)
+        hint = args.hint * max(0.0, 1 - x / args.hint_until) if args.hint_until > 0 else 0.0
         heads = [1, 2] if args.both else [head]
         if not self.calibrated:
             some = calibration or samples
@@ -242,6 +243,7 @@ def main(argv=None):
     p.add_argument("--coarse", type=float, default=0.4, help="share of steps that train the head of role 1")
     p.add_argument("--both", action="store_true", help="train both heads in every step")
     p.add_argument("--pyramid", type=float, default=1.0, help="weight of the multi-scale term")
+    p.add_argument("--square", type=float, default=20.0, help="weight of the squared error")
     p.add_argument("--hint", type=float, default=1.0, help="weight of the early colour probes against distortion")
     p.add_argument("--hint-until", type=float, default=0.5)
     p.add_argument("--lr-conv", type=float, default=3e-4)
@@ -257,6 +259,7 @@ def main(argv=None):
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--threads", type=int, default=2)
     p.add_argument("--device", default="cpu")
+    p.add_argument("--precision", choices=["f32", "bf16"], default="bf16", help="operands of convolutions on a CPU; bf16 where it has AVX512-BF16")
     p.add_argument("--save-minutes", type=float, default=5)
     p.add_argument("--evaluate-every", type=int, default=250)
     p.add_argument("--log-every", type=int, default=10)
@@ -267,6 +270,7 @@ def main(argv=None):
 
     torch.set_num_threads(args.threads)
     keep_memory()
+    ops.extension().set_bf16(args.precision == "bf16")
     os.makedirs(args.out, exist_ok=True)
     trainer = Trainer(args)
     last = os.path.join(args.out, "last.pt")
