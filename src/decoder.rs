@@ -7,7 +7,7 @@ use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::Model;
+use crate::network::{Model, Module};
 
 /// Decodes streams with one model.
 pub struct Decoder<'m> {
@@ -82,7 +82,7 @@ impl<'m> Decoder<'m> {
             .map_or(1, |head| head.children);
         let voxels = exact.octree.level(level);
         let raw = log.step(
-            format!("generate Gaussians of level {level}"),
+            Module::Gaussians(role).at(level),
             voxels.len(),
             "voxels",
             || self.model.generate(role, &exact.features, &map),
@@ -180,15 +180,17 @@ impl<'m> Decoder<'m> {
                     Ok(octree.child_map(n - 1, &map))
                 })?;
             }
-            let context = (role > 0).then(|| {
-                self.model
-                    .upsample(role, &features, octree.occupancy(n - 1))
-            });
+            let context = match role {
+                0 => None,
+                _ => Some(log.step(Module::Context(role).at(n), count, "voxels", || {
+                    let occupancy = octree.occupancy(n - 1);
+                    Ok(self.model.upsample(role, &features, occupancy))
+                })?),
+            };
             latents = self.latents(role, level, context.as_deref(), &map, slice, log)?;
-            features = log.step(format!("features of level {n}"), count, "voxels", || {
-                Ok(self
-                    .model
-                    .reconstruct(role, &latents, context.as_deref(), &map))
+            features = log.step(Module::Features(role).at(n), count, "voxels", || {
+                let context = context.as_deref();
+                Ok(self.model.reconstruct(role, &latents, context, &map))
             })?;
         }
         Ok((
@@ -213,12 +215,9 @@ impl<'m> Decoder<'m> {
         let (n, count) = (level.level, level.voxels as usize);
         let parameters = context
             .map(|context| {
-                log.step(
-                    format!("probabilities of level {n}"),
-                    count,
-                    "voxels",
-                    || Ok(self.model.entropy_parameters(role, context, map)),
-                )
+                log.step(Module::Probabilities(role).at(n), count, "voxels", || {
+                    Ok(self.model.entropy_parameters(role, context, map))
+                })
             })
             .transpose()?;
         let condition = match &parameters {

@@ -17,7 +17,7 @@ import data
 import integer
 import ops
 from integer import LIMIT, SIGMA_MAX, SIGMA_MIN, SIGMAS, sigma_of
-from model import B2P, Inception, NormConv, join
+from model import B2P, Inception, NormConv, ResBlock, join
 
 WEIGHT_MAX = 511
 LATENT_SHIFT = 6
@@ -47,7 +47,7 @@ class Ranges:
 
 @torch.no_grad()
 def ranges_of(model, samples):
-    """Runs the float network with rounded latents and records every edge of the exact zone."""
+    """Runs the float network with rounded latents and records every edge of the exact zone and of the generators."""
     r = Ranges()
     hooks = []
     names = {m: n for n, m in model.named_modules()}
@@ -56,10 +56,15 @@ def ranges_of(model, samples):
         r.add(names[module], output)
 
     for name, module in model.named_modules():
-        if name.split(".")[0] in ("up", "pem", "fr") and (isinstance(module, Inception) or hasattr(module, "taps")):
+        if name.split(".")[0] in ("up", "pem", "fr", "gg") and (isinstance(module, (Inception, ResBlock)) or hasattr(module, "taps")):
             hooks.append(module.register_forward_hook(record))
+    for role, gg in model.gg.items():  # what follows layer 4 sees its output, whichever way it was computed
+        after = [*gg.after, gg.conv_out][0]
+        hooks.append(after.register_forward_pre_hook(lambda _, inputs, name=f"gg.{role}.layer4": r.add(name, inputs[0])))
     for s in samples:
-        model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+        trail, _, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+        for role in model.gg:
+            model.generate(trail[int(role)], s.crop, int(role))
     for h in hooks:
         h.remove()
     return r
@@ -145,6 +150,8 @@ def quantise(model, ranges):
         for b in range(cfg["fr_blocks"]):
             inception(f"fr.{r}.blocks.{b}", s)
         layer(f"fr.{r}.lin2", s, g_scale[r])
+    for role, gg in model.gg.items():
+        out[f"gg.{role}.scale"] = np.array(generator_scales(f"gg.{role}", gg, ranges), np.float32)
     out["g_scale"], out["c_scale"] = np.array(g_scale, np.float32), np.array(c_scale, np.float32)
     for name, m in modules.items():
         if name.split(".")[0] in ("fc", "fs", "gg") and hasattr(m, "taps"):
@@ -155,6 +162,17 @@ def quantise(model, ranges):
             out[name + ".weight"] = w.half().numpy()
             out[name + ".bias"] = m.bias.detach().numpy().astype(np.float32)
     return out
+
+
+def generator_scales(name, gg, ranges):
+    """Real values of one integer step, for generators that run in integers: of the chain before layer 4 (what enters it, every branch and
+    every sum), inside each of its blocks, and the same after layer 4."""
+    scales = []
+    for first, blocks, part in ((f"{name}.conv_in", gg.before, "before"), (f"{name}.layer4", gg.after, "after")):
+        names = [f"{name}.{part}.{b}" for b in range(len(blocks))]
+        scales.append(ranges.scale(first, *names, *(n + ".c2" for n in names)))
+        scales += [ranges.scale(n + ".c1") for n in names]
+    return scales
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -33,6 +33,8 @@ pub enum Command {
     Info(Info),
     /// Decode and draw the sample that comes with the program
     Demo(Demo),
+    /// Time the stages of decoding
+    Bench(Bench),
 }
 
 #[derive(Debug, Args)]
@@ -122,6 +124,22 @@ pub struct Demo {
 }
 
 #[derive(Debug, Args)]
+pub struct Bench {
+    /// Stream to decode [default: the sample that comes with the program]
+    pub input: Option<PathBuf>,
+    /// Times that it is decoded; medians are told
+    #[arg(long, value_name = "N", default_value_t = 7, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub repeat: u32,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub level: LevelArg,
+    #[command(flatten)]
+    pub model: ModelArg,
+}
+
+#[derive(Debug, Args)]
 pub struct LevelArg {
     /// Octree level to decode to [default: the finest in the stream that has a Gaussian head]
     #[arg(long, value_name = "M")]
@@ -133,6 +151,9 @@ pub struct ModelArg {
     /// Model file [default: the one inside the program]
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
+    /// Use no better instructions than these: scalar, avx2, avx512, neon [default: B2P_ISA, or the best of this machine]
+    #[arg(long, value_name = "NAME")]
+    pub isa: Option<String>,
 }
 
 pub use b2p::pixels::Background;

@@ -6,7 +6,7 @@ use b2p::decoder::Decoder;
 use b2p::gaussians::{Gaussians, ply};
 use b2p::log::Log;
 use b2p::network::Model;
-use b2p::{Error, Limits};
+use b2p::{Error, Isa, Limits, UnknownIsa};
 
 use super::args::{LevelArg, ModelArg};
 use super::{Failure, Result};
@@ -14,11 +14,25 @@ use super::{Failure, Result};
 /// A stream or Gaussians, told apart by their first bytes.
 const PLY_MAGIC: &[u8] = b"ply";
 
-/// The model in a file, or the one inside the program.
+/// The environment variable that says which instructions to use when the arguments don't.
+const ISA: &str = "B2P_ISA";
+
+/// The model in a file, or the one inside the program, set to the instructions asked for.
 pub fn model(arg: &ModelArg) -> Result<Model> {
-    match &arg.model {
-        Some(path) => Model::open(path).map_err(Failure::in_file(path)),
-        None => Ok(Model::from_bytes(b2p::embedded::MODEL)?),
+    let model = match &arg.model {
+        Some(path) => Model::open(path).map_err(Failure::in_file(path))?,
+        None => Model::from_bytes(b2p::embedded::MODEL)?,
+    };
+    Ok(model.with_isa(isa(arg.isa.as_deref())?))
+}
+
+/// The instructions of that name; without one, what the environment names, or the best of this machine.
+pub fn isa(name: Option<&str>) -> Result<Isa> {
+    let parse = |name: &str| name.parse().map_err(|e: UnknownIsa| Failure(e.to_string()));
+    match (name, std::env::var(ISA)) {
+        (Some(name), _) => parse(name),
+        (None, Ok(name)) => parse(&name),
+        (None, Err(_)) => Ok(Isa::detect()),
     }
 }
 

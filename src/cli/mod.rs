@@ -1,6 +1,7 @@
 //! The `b2p` program: arguments in, one stage after the other, files out.
 
 mod args;
+mod bench;
 mod decode;
 mod demo;
 mod encode;
@@ -74,6 +75,7 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Render(args) => render::run(args, &progress)?,
         Command::Info(args) => info::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,
+        Command::Bench(args) => bench::run(args, &progress)?,
     };
     drop(progress);
     if !cli.quiet {

@@ -43,6 +43,7 @@ mod structure;
 #[cfg(test)]
 mod tests;
 mod untrained;
+mod work;
 
 use std::path::Path;
 
@@ -56,6 +57,7 @@ use structure::{Encoder, Exact, Generate};
 pub use shape::{Head, Shape, Upsample};
 pub use structure::{RAW, ROLES};
 pub use untrained::untrained;
+pub use work::{Module, Work};
 
 /// A model, ready to run.
 pub struct Model {

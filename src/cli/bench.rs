@@ -1,0 +1,194 @@
+//! `b2p bench`: how long each stage of decoding takes, and how near that is to what the machine can do.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use b2p::bitstream::Stream;
+use b2p::decoder::Decoder;
+use b2p::geometry::{KernelMap, Octree};
+use b2p::log::{Log, Step};
+use b2p::network::{Module, Shape, Work};
+use b2p::{Limits, embedded};
+use serde_json::json;
+
+use super::args::Bench;
+use super::progress::Progress;
+use super::table::{count, milliseconds, table};
+use super::{Failure, Result, load};
+
+/// One stage's figures.
+struct Line {
+    step: Step,
+    median: Duration,
+    work: Option<Work>,
+}
+
+/// Decodes again and again; prints a table or JSON.
+pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
+    let bytes = match &args.input {
+        Some(path) => load::bytes(path)?,
+        None => embedded::SAMPLE.to_vec(),
+    };
+    let start = Instant::now();
+    let model = load::model(&args.model)?;
+    let loading = start.elapsed();
+    let decoder = Decoder::new(&model);
+    let fail = |error| match &args.input {
+        Some(path) => Failure::in_file(path)(error),
+        None => Failure::from(error),
+    };
+    let levels = decoder.levels(&bytes).map_err(fail)?;
+    let level = match args.level.level {
+        Some(level) => level,
+        None => *levels
+            .last()
+            .ok_or_else(|| Failure("the stream has no level with Gaussians".into()))?,
+    };
+
+    // The first run warms caches and memory up, and is not counted.
+    let mut runs: Vec<(Duration, Vec<Step>)> = Vec::new();
+    for run in 0..=args.repeat {
+        progress.say(&format!("run {run} of {}", args.repeat));
+        let mut log = Log::default();
+        let start = Instant::now();
+        let gaussians = decoder
+            .decode(&bytes, Some(level), &mut log)
+            .map_err(fail)?;
+        let total = start.elapsed();
+        drop(gaussians);
+        if run > 0 {
+            runs.push((total, log.steps().to_vec()));
+        }
+    }
+    let total = median(runs.iter().map(|run| run.0));
+    let exact = decoder
+        .exact(&bytes, level, &mut Log::default())
+        .map_err(fail)?;
+    let base = Stream::parse(&bytes, &Limits::default())
+        .map_err(fail)?
+        .header()
+        .base;
+    let works = works(model.shape(), &exact.octree, base);
+    let lines: Vec<Line> = runs[0]
+        .1
+        .iter()
+        .enumerate()
+        .map(|(i, step)| Line {
+            step: step.clone(),
+            median: median(runs.iter().map(|run| run.1[i].time)),
+            work: works.get(&step.name).copied(),
+        })
+        .collect();
+
+    let threads = rayon::current_num_threads();
+    let memory = peak_memory();
+    if args.json {
+        let stages: Vec<_> = lines
+            .iter()
+            .map(|line| {
+                json!({
+                    "stage": line.step.name,
+                    "count": line.step.count,
+                    "unit": line.step.unit,
+                    "median_ms": line.median.as_secs_f64() * 1e3,
+                    "gmac": line.work.map(|w| w.macs as f64 / 1e9),
+                    "gmac_per_s": line.work.map(|w| rate(w, line.median)),
+                    "mbytes": line.work.map(|w| w.bytes as f64 / 1e6),
+                })
+            })
+            .collect();
+        let report = json!({
+            "level": level,
+            "isa": model.isa().to_string(),
+            "threads": threads,
+            "runs": args.repeat,
+            "load_model_ms": loading.as_secs_f64() * 1e3,
+            "decode_ms": total.as_secs_f64() * 1e3,
+            "peak_memory_bytes": memory,
+            "stages": stages,
+        });
+        return Ok(format!("{report:#}\n"));
+    }
+
+    let mut rows = vec![
+        ["stage", "items", "", "median", "GMAC", "GMAC/s", "MB"]
+            .map(String::from)
+            .to_vec(),
+    ];
+    for line in &lines {
+        let mut row = vec![
+            line.step.name.clone(),
+            count(line.step.count),
+            line.step.unit.into(),
+            milliseconds(line.median),
+        ];
+        if let Some(work) = line.work {
+            row.push(format!("{:.2}", work.macs as f64 / 1e9));
+            row.push(format!("{:.1}", rate(work, line.median)));
+            row.push(format!("{:.0}", work.bytes as f64 / 1e6));
+        }
+        rows.push(row);
+    }
+    rows.push(vec![
+        "decode, bytes to Gaussians".into(),
+        String::new(),
+        String::new(),
+        milliseconds(total),
+    ]);
+    rows.push(vec![
+        "load model".into(),
+        String::new(),
+        String::new(),
+        milliseconds(loading),
+    ]);
+    let memory = memory.map_or(String::new(), |bytes| {
+        format!(", peak memory {} MB", bytes / 1_000_000)
+    });
+    Ok(format!(
+        "level {level}, {}, {threads} threads, medians of {} runs{memory}\n{}",
+        model.isa(),
+        args.repeat,
+        table(&rows),
+    ))
+}
+
+/// What the modules of the network compute, by the names of their steps.
+fn works(shape: &Shape, octree: &Octree, base: u8) -> HashMap<String, Work> {
+    let mut works = HashMap::new();
+    let mut map = KernelMap::root();
+    for level in 0..=octree.depth() {
+        if level > 0 {
+            map = octree.child_map(level - 1, &map);
+        }
+        if let Some(role) = level.checked_sub(base).map(usize::from) {
+            let mut modules = vec![Module::Features(role)];
+            if role > 0 {
+                modules.extend([Module::Context(role), Module::Probabilities(role)]);
+            }
+            if level == octree.depth() {
+                modules.push(Module::Gaussians(role));
+            }
+            works.extend(modules.iter().map(|m| (m.at(level), shape.work(*m, &map))));
+        }
+    }
+    works
+}
+
+/// 10⁹ multiply–accumulates a second.
+fn rate(work: Work, time: Duration) -> f64 {
+    work.macs as f64 / 1e9 / time.as_secs_f64().max(1e-9)
+}
+
+fn median(times: impl Iterator<Item = Duration>) -> Duration {
+    let mut times: Vec<Duration> = times.collect();
+    times.sort_unstable();
+    times[times.len() / 2]
+}
+
+/// The most memory that this process ever held, where the system tells.
+fn peak_memory() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
+    let kilobytes: u64 = line.split_whitespace().nth(1)?.parse().ok()?;
+    Some(kilobytes * 1024)
+}
