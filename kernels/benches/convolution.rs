@@ -1,10 +1,10 @@
-//! How fast one thread convolves, in multiply-adds of taps that read something. Least time of a few repeats. Takes the number of
-//! voxels as its argument.
+//! How fast one thread convolves, in multiply-adds of taps that read something, and as a share of what the core can do at best.
+//! Least time of a few repeats. Arguments: the number of voxels, the names of instruction sets.
 
 use std::collections::HashMap;
 use std::time::Instant;
 
-use b2p_kernels::{ABSENT, ExactConv, FloatConv, Isa, Output, Requantise, Scale, Taps};
+use b2p_kernels::{ABSENT, ExactConv, FloatConv, Isa, Output, Requantise, Scale, Taps, ceiling};
 use half::f16;
 
 /// A bumpy closed surface of about `count` voxels, in Morton order.
@@ -48,105 +48,145 @@ fn kernel_map(voxels: &[[i32; 3]]) -> Vec<u32> {
     rows
 }
 
+/// The least time of a few runs, in seconds.
 fn least(mut run: impl FnMut()) -> f64 {
-    let once = |run: &mut dyn FnMut()| {
+    let mut best = f64::INFINITY;
+    let begin = Instant::now();
+    for i in 0.. {
         let start = Instant::now();
         run();
-        start.elapsed().as_secs_f64()
-    };
-    (0..9).map(|_| once(&mut run)).fold(f64::INFINITY, f64::min)
+        best = best.min(start.elapsed().as_secs_f64());
+        if i >= 2 && begin.elapsed().as_secs_f64() > 0.25 {
+            break;
+        }
+    }
+    best
+}
+
+/// Input and output channels of the layers.
+const LAYERS: [[usize; 2]; 8] = [
+    [64, 64],
+    [32, 32],
+    [32, 14],
+    [64, 14],
+    [16, 16],
+    [64, 16],
+    [64, 32],
+    [16, 32],
+];
+
+struct Bench {
+    map: Vec<u32>,
+    voxels: usize,
+    pairs: usize,
+}
+
+impl Bench {
+    fn report(&self, isa: Isa, [cin, cout]: [usize; 2], what: &str, ceiling: f64, seconds: f64) {
+        let rate = (self.pairs * cin * cout) as f64 / seconds / 1e9;
+        println!(
+            "{:>7} {cin:>3} → {cout:<3} {what:<16} {:7.1} ms {rate:6.1} GMAC/s {:4.0} %",
+            isa.to_string(),
+            seconds * 1e3,
+            100.0 * rate / ceiling
+        );
+    }
+
+    fn taps(&self) -> Taps<'_> {
+        Taps::Map {
+            volume: 27,
+            rows: &self.map,
+        }
+    }
+
+    fn exact(&self, isa: Isa, [cin, cout]: [usize; 2], ceiling: f64) {
+        let weights: Vec<i16> = (0..27 * cin * cout)
+            .map(|i| (i * 7919 % 1023) as i16 - 511)
+            .collect();
+        let input: Vec<i16> = (0..self.voxels * cin)
+            .map(|i| (i * 7907 % 4095) as i16 - 2047)
+            .collect();
+        let shift = Requantise::Shift {
+            bias: vec![0; cout],
+            shift: vec![14; cout],
+        };
+        let invariant = Requantise::Invariant {
+            gain: vec![1.0; cout],
+            bias: vec![0.0; cout],
+        };
+        for (what, requantise) in [("exact", shift), ("exact invariant", invariant)] {
+            let conv = ExactConv::new(27, cin, cout, &weights, requantise);
+            let mut out = vec![0; self.voxels * cout];
+            let seconds = least(|| {
+                for (i, rows) in out.chunks_mut(512 * cout).enumerate() {
+                    let output = Output {
+                        rows,
+                        stride: cout,
+                        column: 0,
+                        residual: None,
+                        relu: true,
+                    };
+                    conv.run(isa, self.taps(), &input, i * 512, output);
+                }
+            });
+            self.report(isa, [cin, cout], what, ceiling, seconds);
+        }
+    }
+
+    fn float(&self, isa: Isa, [cin, cout]: [usize; 2], ceiling: f64) {
+        let value = |i: usize| f16::from_f32((i * 7919 % 1023) as f32 / 512.0 - 1.0);
+        let weights: Vec<f16> = (0..27 * cin * cout).map(value).collect();
+        let input: Vec<f16> = (0..self.voxels * cin).map(value).collect();
+        let scales = [
+            ("float", Scale::Plain),
+            ("float invariant", Scale::Invariant(vec![1.0; cout])),
+        ];
+        for (what, scale) in scales {
+            let conv = FloatConv::new(27, cin, cout, &weights, vec![0.0; cout], scale);
+            let mut out = vec![f16::ZERO; self.voxels * cout];
+            let seconds = least(|| {
+                for (i, rows) in out.chunks_mut(512 * cout).enumerate() {
+                    let output = Output {
+                        rows,
+                        stride: cout,
+                        column: 0,
+                        residual: None,
+                        relu: true,
+                    };
+                    conv.run(isa, self.taps(), &input, i * 512, output);
+                }
+            });
+            self.report(isa, [cin, cout], what, ceiling, seconds);
+        }
+    }
 }
 
 fn main() {
-    let count = std::env::args().skip(1).find_map(|arg| arg.parse().ok());
-    let voxels = surface(count.unwrap_or(50_000));
-    let rows = kernel_map(&voxels);
-    let taps = Taps::Map {
-        volume: 27,
-        rows: &rows,
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let count = args.iter().find_map(|arg| arg.parse().ok());
+    let only: Vec<Isa> = args.iter().filter_map(|arg| arg.parse().ok()).collect();
+    let voxels = surface(count.unwrap_or(200_000));
+    let map = kernel_map(&voxels);
+    let pairs = map.iter().filter(|&&r| r != ABSENT).count();
+    let bench = Bench {
+        map,
+        voxels: voxels.len(),
+        pairs,
     };
-    let pairs = rows.iter().filter(|&&r| r != ABSENT).count();
-    let n = voxels.len();
-    println!("{n} voxels, {:.2} neighbours each", pairs as f64 / n as f64);
+    let each = pairs as f64 / voxels.len() as f64;
+    println!("{} voxels, {each:.2} neighbours each", voxels.len());
     for isa in Isa::available() {
-        for (cin, cout) in [(64, 64), (64, 16), (16, 32), (16, 16)] {
-            let weights: Vec<i16> = (0..27 * cin * cout)
-                .map(|i| (i * 7919 % 1023) as i16 - 511)
-                .collect();
-            let halves: Vec<f16> = weights
-                .iter()
-                .map(|&w| f16::from_f32(f32::from(w) / 4096.0))
-                .collect();
-            let shift = Requantise::Shift {
-                bias: vec![0; cout],
-                shift: vec![14; cout],
-            };
-            let invariant = Requantise::Invariant {
-                gain: vec![1.0; cout],
-                bias: vec![0.0; cout],
-            };
-            let input: Vec<i16> = (0..n * cin)
-                .map(|i| (i * 7907 % 4095) as i16 - 2047)
-                .collect();
-            let float: Vec<f16> = input
-                .iter()
-                .map(|&x| f16::from_f32(f32::from(x) / 1024.0))
-                .collect();
-            let report = |what: &str, seconds: f64| {
-                let rate = (pairs * cin * cout) as f64 / seconds / 1e9;
-                println!(
-                    "{:>7} {cin:>3} → {cout:<3} {what:<16} {:7.1} ms {rate:6.1} GMAC/s",
-                    isa.to_string(),
-                    seconds * 1e3
-                );
-            };
-            for (what, requantise) in [("exact", shift), ("exact invariant", invariant)] {
-                let conv = ExactConv::new(27, cin, cout, &weights, requantise);
-                let mut out = vec![0; n * cout];
-                report(
-                    what,
-                    least(|| {
-                        conv.run(
-                            isa,
-                            taps,
-                            &input,
-                            0,
-                            Output {
-                                rows: &mut out,
-                                stride: cout,
-                                column: 0,
-                                residual: None,
-                                relu: true,
-                            },
-                        );
-                    }),
-                );
-            }
-            for (what, scale) in [
-                ("float", Scale::Plain),
-                ("float invariant", Scale::Invariant(vec![1.0; cout])),
-            ] {
-                let conv = FloatConv::new(27, cin, cout, &halves, vec![0.0; cout], scale);
-                let mut out = vec![f16::ZERO; n * cout];
-                report(
-                    what,
-                    least(|| {
-                        conv.run(
-                            isa,
-                            taps,
-                            &float,
-                            0,
-                            Output {
-                                rows: &mut out,
-                                stride: cout,
-                                column: 0,
-                                residual: None,
-                                relu: true,
-                            },
-                        );
-                    }),
-                );
-            }
+        if !only.is_empty() && !only.contains(&isa) {
+            continue;
+        }
+        let (float, exact) = (ceiling::f32(isa), ceiling::i16(isa));
+        println!(
+            "{:>7} at best: f32 {float:.1} GMAC/s, i16 {exact:.1} GMAC/s",
+            isa.to_string()
+        );
+        for layer in LAYERS {
+            bench.exact(isa, layer, exact);
+            bench.float(isa, layer, float);
         }
     }
 }

@@ -1,11 +1,13 @@
-//! f16 ↔ f32, exact one way and rounded to even the other, in integer steps that any compiler turns into SIMD.
+//! f16 ↔ f32, exact one way and rounded to even the other.
 
 use half::f16;
 
-use crate::isa::{Isa, dispatch};
+use crate::isa::Isa;
+use crate::machine::with_halves;
+use crate::rows::PANEL;
 
 /// The largest finite f16.
-const MAX: f32 = 65504.0;
+pub(crate) const MAX: f32 = 65504.0;
 /// The difference of the two formats' exponent biases, in an f32's place.
 const REBIAS: u32 = (127 - 15) << 23;
 /// The f32 whose last mantissa bit weighs as much as the smallest f16.
@@ -17,7 +19,7 @@ const DENORMAL: u32 = (127 - 15 + 23 - 10 + 1) << 23;
 /// If the lengths differ.
 pub fn to_f32(isa: Isa, from: &[f16], to: &mut [f32]) {
     assert_eq!(from.len(), to.len());
-    dispatch!(isa, fn widen(from: &[f16], to: &mut [f32]));
+    with_halves!(isa, fn widen<>(from: &[f16], to: &mut [f32]));
 }
 
 /// Rounds to the nearest f16, ties to even; beyond ±65504, and for NaN, to the nearest end (NaN to −65504): the result is
@@ -27,28 +29,106 @@ pub fn to_f32(isa: Isa, from: &[f16], to: &mut [f32]) {
 /// If the lengths differ.
 pub fn to_f16(isa: Isa, from: &[f32], to: &mut [f16]) {
     assert_eq!(from.len(), to.len());
-    dispatch!(isa, fn narrow(from: &[f32], to: &mut [f16]));
+    with_halves!(isa, fn narrow<>(from: &[f32], to: &mut [f16]));
+}
+
+/// Conversion of a panel between f32 and f16, as [`to_f32`] and [`to_f16`].
+///
+/// # Safety
+/// Its functions may use instructions that not every processor has; they must only be called where it has them.
+pub(crate) unsafe trait Halves {
+    /// Exactly.
+    unsafe fn widen(from: [f16; PANEL]) -> [f32; PANEL];
+    /// Rounding, saturating.
+    unsafe fn narrow(from: [f32; PANEL]) -> [f16; PANEL];
+}
+
+/// In integer steps that any compiler turns into SIMD.
+pub(crate) struct Portable;
+
+// SAFETY: plain Rust.
+unsafe impl Halves for Portable {
+    #[inline(always)]
+    unsafe fn widen(from: [f16; PANEL]) -> [f32; PANEL] {
+        from.map(widen_one)
+    }
+
+    #[inline(always)]
+    unsafe fn narrow(from: [f32; PANEL]) -> [f16; PANEL] {
+        from.map(narrow_one)
+    }
+}
+
+/// Widens by whole panels.
+///
+/// # Safety
+/// The processor must have `H`'s instructions.
+#[inline(always)]
+pub(crate) unsafe fn widen<H: Halves>(from: &[f16], to: &mut [f32]) {
+    let (from, to) = (from.chunks(PANEL), to.chunks_mut(PANEL));
+    for (from, to) in from.zip(to) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match (
+                <&[f16; PANEL]>::try_from(from),
+                <&mut [f32; PANEL]>::try_from(&mut *to),
+            ) {
+                (Ok(from), Ok(to)) => *to = H::widen(*from),
+                _ => to.copy_from_slice(&H::widen(panel(from))[..from.len()]),
+            }
+        }
+    }
+}
+
+/// Narrows by whole panels.
+///
+/// # Safety
+/// The processor must have `H`'s instructions.
+#[inline(always)]
+pub(crate) unsafe fn narrow<H: Halves>(from: &[f32], to: &mut [f16]) {
+    let (from, to) = (from.chunks(PANEL), to.chunks_mut(PANEL));
+    for (from, to) in from.zip(to) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match (
+                <&[f32; PANEL]>::try_from(from),
+                <&mut [f16; PANEL]>::try_from(&mut *to),
+            ) {
+                (Ok(from), Ok(to)) => *to = H::narrow(*from),
+                _ => to.copy_from_slice(&H::narrow(panel(from))[..from.len()]),
+            }
+        }
+    }
+}
+
+/// The values, and zeros after them.
+#[inline(always)]
+pub(crate) fn panel<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
+    let mut to = [T::default(); PANEL];
+    match <&[T; PANEL]>::try_from(from) {
+        Ok(from) => to = *from,
+        Err(_) => to[..from.len()].copy_from_slice(from),
+    }
+    to
 }
 
 #[inline(always)]
-pub(crate) fn widen(from: &[f16], to: &mut [f32]) {
-    for (to, from) in to.iter_mut().zip(from) {
-        let bits = u32::from(from.to_bits());
-        let magnitude = (bits & 0x7fff) << 13;
-        let sign = (bits & 0x8000) << 16;
-        let exponent = magnitude & (0x1f << 23);
-        // Infinity and NaN keep the largest exponent: it moves up by the rest of the way.
-        let normal = magnitude + REBIAS + if exponent == 0x1f << 23 { REBIAS } else { 0 };
-        // A subnormal's mantissa is read as a normal number's, and the implied one taken off again.
-        let subnormal =
-            f32::from_bits(magnitude + REBIAS + (1 << 23)) - f32::from_bits(REBIAS + (1 << 23));
-        let value = if exponent == 0 {
-            subnormal.to_bits()
-        } else {
-            normal
-        };
-        *to = f32::from_bits(value | sign);
-    }
+fn widen_one(from: f16) -> f32 {
+    let bits = u32::from(from.to_bits());
+    let magnitude = (bits & 0x7fff) << 13;
+    let sign = (bits & 0x8000) << 16;
+    let exponent = magnitude & (0x1f << 23);
+    // Infinity and NaN keep the largest exponent: it moves up by the rest of the way.
+    let normal = magnitude + REBIAS + if exponent == 0x1f << 23 { REBIAS } else { 0 };
+    // A subnormal's mantissa is read as a normal number's, and the implied one taken off again.
+    let subnormal =
+        f32::from_bits(magnitude + REBIAS + (1 << 23)) - f32::from_bits(REBIAS + (1 << 23));
+    let value = if exponent == 0 {
+        subnormal.to_bits()
+    } else {
+        normal
+    };
+    f32::from_bits(value | sign)
 }
 
 #[inline(always)]
@@ -56,24 +136,22 @@ pub(crate) fn widen(from: &[f16], to: &mut [f32]) {
     clippy::manual_clamp,
     reason = "`max` gives the number of a number and NaN, `clamp` keeps NaN"
 )]
-pub(crate) fn narrow(from: &[f32], to: &mut [f16]) {
-    for (to, &from) in to.iter_mut().zip(from) {
-        let value = from.max(-MAX).min(MAX);
-        let sign = (value.to_bits() >> 16) & 0x8000;
-        let bits = value.to_bits() & 0x7fff_ffff;
-        // Adding half an even step less one rounds to nearest; the parity of the kept mantissa breaks ties to even.
-        let normal = (bits - REBIAS.min(bits) + 0xfff + ((bits >> 13) & 1)) >> 13;
-        // The floating-point adder rounds at the weight of the smallest f16.
-        let subnormal = (f32::from_bits(bits) + f32::from_bits(DENORMAL))
-            .to_bits()
-            .wrapping_sub(DENORMAL);
-        let magnitude = if bits < REBIAS + (1 << 23) {
-            subnormal
-        } else {
-            normal
-        };
-        *to = f16::from_bits((magnitude | sign) as u16);
-    }
+fn narrow_one(from: f32) -> f16 {
+    let value = from.max(-MAX).min(MAX);
+    let sign = (value.to_bits() >> 16) & 0x8000;
+    let bits = value.to_bits() & 0x7fff_ffff;
+    // Adding half an even step less one rounds to nearest; the parity of the kept mantissa breaks ties to even.
+    let normal = (bits - REBIAS.min(bits) + 0xfff + ((bits >> 13) & 1)) >> 13;
+    // The floating-point adder rounds at the weight of the smallest f16.
+    let subnormal = (f32::from_bits(bits) + f32::from_bits(DENORMAL))
+        .to_bits()
+        .wrapping_sub(DENORMAL);
+    let magnitude = if bits < REBIAS + (1 << 23) {
+        subnormal
+    } else {
+        normal
+    };
+    f16::from_bits((magnitude | sign) as u16)
 }
 
 #[cfg(test)]

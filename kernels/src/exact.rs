@@ -1,10 +1,10 @@
 //! Sparse convolution in integers: the same bits on every machine.
 
-use std::num::Wrapping;
-
 use crate::isa::{Isa, dispatch};
-use crate::rows::{Arithmetic, Extents, Output, PANEL, TILE, accumulate, energies};
-use crate::taps::{Taps, TileTaps};
+use crate::norms::{Energy, Norms};
+use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panels, with_scratch};
+use crate::taps::Taps;
+use crate::tile::{Arithmetic, Input, accumulate};
 
 /// The largest magnitude of an activation.
 pub const LIMIT: i16 = 2047;
@@ -33,81 +33,32 @@ pub enum Requantise {
 #[derive(Debug, Clone)]
 pub struct ExactConv {
     extents: Extents,
-    /// Per tap, panel and pair of input channels: each of 16 output channels' two weights, side by side.
-    weights: Vec<Weights>,
+    /// Per tap, panel and pair of input channels: each output channel's two weights, side by side.
+    weights: Vec<Lanes>,
     finish: Finish,
 }
 
-type Weights = [[i16; PANEL]; 2];
-
+/// [`Requantise`] in panels.
 #[derive(Debug, Clone)]
 enum Finish {
     Shift {
-        bias: Vec<i32>,
-        shift: Vec<u32>,
+        bias: Vec<[i32; PANEL]>,
+        shift: Vec<[u32; PANEL]>,
     },
     Invariant {
-        energy: Vec<Wrapping<u32>>,
-        gain: Vec<f32>,
-        bias: Vec<f32>,
+        /// `Σ weight²` over the input channels, per tap and panel.
+        energy: Vec<[u32; PANEL]>,
+        gain: Vec<[f32; PANEL]>,
+        bias: Vec<[f32; PANEL]>,
     },
-}
-
-/// Multiplies two input channels at a time, which is one instruction on most machines.
-struct Pairwise;
-
-impl Arithmetic for Pairwise {
-    type Value = i16;
-    // The pair of channels repeated: read from memory like this, the compiler sees the pairwise product.
-    type Factor = [i16; PANEL];
-    type Weights = Weights;
-    type Sums = [[i32; PANEL / 2]; 2];
-
-    #[inline(always)]
-    fn steps(cin: usize) -> usize {
-        cin.div_ceil(2)
-    }
-
-    #[inline(always)]
-    fn expand(row: &[i16], factors: &mut [[i16; PANEL]]) {
-        let pairs = row.chunks_exact(2);
-        if let ([last], Some(factor)) = (pairs.remainder(), factors.last_mut()) {
-            *factor = std::array::from_fn(|j| if j % 2 == 0 { *last } else { 0 });
-        }
-        for (pair, factor) in pairs.zip(factors) {
-            *factor = std::array::from_fn(|j| pair[j % 2]);
-        }
-    }
-
-    #[inline(always)]
-    fn step(mut sums: Self::Sums, weights: &Weights, factor: &[i16; PANEL]) -> Self::Sums {
-        for (sums, weights) in sums.iter_mut().zip(weights) {
-            let products = dot_pairs(weights, factor);
-            for (sum, product) in sums.iter_mut().zip(products) {
-                *sum = sum.wrapping_add(product);
-            }
-        }
-        sums
-    }
-}
-
-/// The sums of products of neighbours.
-#[inline(always)]
-fn dot_pairs(a: &[i16; PANEL], b: &[i16; PANEL]) -> [i32; PANEL / 2] {
-    let mut dots = [0; PANEL / 2];
-    for j in 0..PANEL / 2 {
-        let even = i32::from(a[2 * j]) * i32::from(b[2 * j]);
-        let odd = i32::from(a[2 * j + 1]) * i32::from(b[2 * j + 1]);
-        dots[j] = even.wrapping_add(odd);
-    }
-    dots
 }
 
 impl ExactConv {
     /// Packs `weights[tap][input][output]`.
     ///
     /// # Panics
-    /// If lengths don't match the extents, or a shift is above 31: the caller has checked what it read.
+    /// If lengths don't match the extents, there are more than 64 taps, or a shift is above 31: the caller has checked what it
+    /// read.
     pub fn new(
         volume: usize,
         cin: usize,
@@ -124,9 +75,10 @@ impl ExactConv {
                     "one bias and shift per channel"
                 );
                 assert!(shift.iter().all(|&s| s < 32), "a shift is above 31");
+                let shift: Vec<u32> = shift.into_iter().map(u32::from).collect();
                 Finish::Shift {
-                    bias,
-                    shift: shift.into_iter().map(u32::from).collect(),
+                    bias: panels(&bias),
+                    shift: panels(&shift),
                 }
             }
             Requantise::Invariant { gain, bias } => {
@@ -134,16 +86,26 @@ impl ExactConv {
                     gain.len() == cout && bias.len() == cout,
                     "one gain and bias per channel"
                 );
+                let mut energy = vec![[0u32; PANEL]; volume * extents.panels()];
+                extents.place(weights, |w, panel, _, lane| {
+                    let sum = &mut energy[panel][lane];
+                    *sum = sum.add(u32::from(w.unsigned_abs()).pow(2));
+                });
                 Finish::Invariant {
-                    energy: squares(extents, weights),
-                    gain,
-                    bias,
+                    energy,
+                    gain: panels(&gain),
+                    bias: panels(&bias),
                 }
             }
         };
+        let steps = cin.div_ceil(2);
+        let mut packed = vec![Lanes::default(); volume * extents.panels() * steps];
+        extents.place(weights, |w, panel, c, lane| {
+            packed[panel * steps + c / 2].0[lane] |= place(w, c % 2);
+        });
         ExactConv {
             extents,
-            weights: pack(extents, weights),
+            weights: packed,
             finish,
         }
     }
@@ -170,88 +132,69 @@ impl ExactConv {
         taps: Taps<'_>,
         input: &[i16],
         first: usize,
-        output: Output<'_, i16>,
+        mut output: Output<'_, i16>,
     ) {
         assert_eq!(
             taps.volume(),
             self.extents.volume,
             "these taps belong to another kernel"
         );
-        let Extents { cout, .. } = self.extents;
-        let panels = self.extents.panels();
-        let Output {
-            rows,
-            stride,
-            column,
-            residual,
-            relu,
-        } = output;
-        let mut tile = TileTaps::default();
-        let mut factors = Vec::new();
-        let mut sums = vec![Default::default(); TILE * panels];
-        let mut divisors = vec![Wrapping(0); TILE * cout];
-        for (t, rows) in rows.chunks_mut(TILE * stride).enumerate() {
-            tile.fill(&taps, first + t * TILE, rows.len() / stride);
-            accumulate::<Pairwise>(
-                isa,
-                self.extents,
-                &self.weights,
-                &tile,
-                input,
-                &mut factors,
-                &mut sums,
-            );
-            if let Finish::Invariant { energy, .. } = &self.finish {
-                energies(isa, cout, energy, &tile, &mut divisors);
+        with_scratch(|scratch| {
+            let Scratch {
+                taps: tile,
+                sums,
+                expanded,
+                norms,
+            } = scratch;
+            norms.clear();
+            let inputs = input.len() / self.extents.cin;
+            for (row, output) in output.tiles() {
+                tile.fill(isa, &taps, first + row, output.len(), inputs);
+                let input = match self.extents.cin % 2 {
+                    0 => Input::Ready(input),
+                    _ => Input::Expand(input, pair_up),
+                };
+                accumulate(
+                    isa,
+                    Arithmetic::Integer,
+                    self.extents,
+                    &self.weights,
+                    tile,
+                    input,
+                    expanded,
+                    sums,
+                );
+                let (cout, finish, sums) = (self.extents.cout, &self.finish, &sums[..]);
+                if let Finish::Invariant { energy, gain, .. } = finish {
+                    norms.fill(isa, tile.masks(), energy, gain);
+                }
+                let norms = &*norms;
+                dispatch!(isa, fn finish_tile(
+                    finish: &Finish, cout: usize, sums: &[Lanes], norms: &Norms, output: Output<'_, i16>,
+                ));
             }
-            let (sums, divisors) = (sums.as_flattened().as_flattened(), &divisors[..]);
-            let residual = residual.map(|all| &all[t * TILE * stride..][..rows.len()]);
-            let (finish, output) = (
-                &self.finish,
-                Output {
-                    rows,
-                    stride,
-                    column,
-                    residual,
-                    relu,
-                },
-            );
-            dispatch!(isa, fn finish_tile(
-                finish: &Finish, cout: usize, sums: &[i32], divisors: &[Wrapping<u32>], output: Output<'_, i16>,
-            ));
-        }
+        });
     }
 }
 
-/// `Σ weight²` over the input channels, per tap and output channel.
-fn squares(extents: Extents, weights: &[i16]) -> Vec<Wrapping<u32>> {
-    let Extents { volume, cin, cout } = extents;
-    let mut energy = vec![Wrapping(0); volume * cout];
-    for (i, &w) in weights.iter().enumerate() {
-        energy[i / (cin * cout) * cout + i % cout] += Wrapping(u32::from(w.unsigned_abs()).pow(2));
-    }
-    energy
+/// The half of a word that the pair's first or second value takes.
+fn place(value: i16, which: usize) -> u32 {
+    u32::from(value as u16) << (16 * (which ^ usize::from(cfg!(target_endian = "big"))))
 }
 
-fn pack(extents: Extents, weights: &[i16]) -> Vec<Weights> {
-    let Extents { volume, cin, cout } = extents;
-    let steps = Pairwise::steps(cin);
-    let mut packed = vec![Weights::default(); volume * extents.panels() * steps];
-    for (i, &w) in weights.iter().enumerate() {
-        let (k, c, o) = (i / (cin * cout), i / cout % cin, i % cout);
-        let lane = o % PANEL;
-        packed[(k * extents.panels() + o / PANEL) * steps + c / 2][lane / 8]
-            [lane % 8 * 2 + c % 2] = w;
+/// An odd number of activations as pairs, the last one's second being zero.
+fn pair_up(_: Isa, from: &[i16], to: &mut [u32]) {
+    for (to, pair) in to.iter_mut().zip(from.chunks(2)) {
+        *to = place(pair[0], 0) | pair.get(1).map_or(0, |&value| place(value, 1));
     }
-    packed
 }
 
 #[inline(always)]
 fn finish_tile(
     finish: &Finish,
     cout: usize,
-    sums: &[i32],
-    divisors: &[Wrapping<u32>],
+    sums: &[Lanes],
+    norms: &Norms,
     output: Output<'_, i16>,
 ) {
     let Output {
@@ -261,46 +204,56 @@ fn finish_tile(
         residual,
         relu,
     } = output;
-    let sums = sums.chunks_exact(cout.next_multiple_of(PANEL));
-    let divisors = divisors.chunks_exact(cout);
-    for (r, ((row, sums), divisors)) in rows
+    let panels = cout.div_ceil(PANEL);
+    let floor = if relu { 0 } else { -LIMIT };
+    for (r, (row, sums)) in rows
         .chunks_exact_mut(stride)
-        .zip(sums)
-        .zip(divisors)
+        .zip(sums.chunks_exact(panels))
         .enumerate()
     {
         let row = &mut row[column..column + cout];
-        match finish {
-            Finish::Shift { bias, shift } => shifted(sums, bias, shift, row),
-            Finish::Invariant { gain, bias, .. } => scaled(sums, divisors, gain, bias, row),
-        }
-        if let Some(residual) = residual {
-            for (q, &x) in row.iter_mut().zip(&residual[r * stride + column..]) {
-                *q = q.saturating_add(x).clamp(-LIMIT, LIMIT);
+        let residual = residual.map(|all| &all[r * stride + column..][..cout]);
+        for (p, (row, sums)) in row.chunks_mut(PANEL).zip(sums).enumerate() {
+            let sums = sums.i32();
+            let mut q = match finish {
+                Finish::Shift { bias, shift } => shifted(sums, &bias[p], &shift[p]),
+                Finish::Invariant { bias, .. } => scaled(sums, &norms.of(r, panels)[p], &bias[p]),
+            };
+            if let Some(residual) = residual {
+                let mut x = [0; PANEL];
+                let from = &residual[p * PANEL..][..row.len()];
+                match <&[i16; PANEL]>::try_from(from) {
+                    Ok(from) => x = *from,
+                    Err(_) => x[..from.len()].copy_from_slice(from),
+                }
+                for (q, x) in q.iter_mut().zip(x) {
+                    *q = q.saturating_add(x).min(LIMIT);
+                }
+            }
+            for q in &mut q {
+                *q = (*q).max(floor);
+            }
+            match <&mut [i16; PANEL]>::try_from(&mut *row) {
+                Ok(row) => *row = q,
+                Err(_) => row.copy_from_slice(&q[..row.len()]),
             }
         }
-        if relu {
-            row.iter_mut().for_each(|q| *q = (*q).max(0));
-        }
     }
 }
 
 #[inline(always)]
-fn shifted(sums: &[i32], bias: &[i32], shift: &[u32], row: &mut [i16]) {
-    for (((q, &sum), &bias), &shift) in row.iter_mut().zip(sums).zip(bias).zip(shift) {
-        let value = sum.wrapping_add(bias).wrapping_shr(shift);
-        *q = value.clamp(-i32::from(LIMIT), i32::from(LIMIT)) as i16;
-    }
+fn shifted(sums: [i32; PANEL], bias: &[i32; PANEL], shift: &[u32; PANEL]) -> [i16; PANEL] {
+    std::array::from_fn(|j| {
+        let value = sums[j].wrapping_add(bias[j]).wrapping_shr(shift[j]);
+        value.clamp(-i32::from(LIMIT), i32::from(LIMIT)) as i16
+    })
 }
 
 #[inline(always)]
-fn scaled(sums: &[i32], divisors: &[Wrapping<u32>], gain: &[f32], bias: &[f32], row: &mut [i16]) {
+fn scaled(sums: [i32; PANEL], factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [i16; PANEL] {
     let limit = f32::from(LIMIT);
-    for ((((q, &sum), &divisor), &gain), &bias) in
-        row.iter_mut().zip(sums).zip(divisors).zip(gain).zip(bias)
-    {
-        let scale = gain / (divisor.0.max(1) as f32).sqrt();
-        let value = sum as f32 * scale + bias;
-        *q = value.clamp(-limit, limit).round_ties_even() as i16;
-    }
+    std::array::from_fn(|j| {
+        let value = sums[j] as f32 * factor[j] + bias[j];
+        value.clamp(-limit, limit).round_ties_even() as i16
+    })
 }

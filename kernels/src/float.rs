@@ -2,10 +2,13 @@
 
 use half::f16;
 
-use crate::convert;
-use crate::isa::{Isa, dispatch};
-use crate::rows::{Arithmetic, Extents, Output, PANEL, TILE, accumulate, energies};
-use crate::taps::{Taps, TileTaps};
+use crate::convert::{self, Halves, panel};
+use crate::isa::Isa;
+use crate::machine::{self, with_halves};
+use crate::norms::Norms;
+use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panels, with_scratch};
+use crate::taps::Taps;
+use crate::tile::{Arithmetic, Input, accumulate};
 
 /// What happens to sums.
 #[derive(Debug, Clone)]
@@ -21,73 +24,61 @@ pub enum Scale {
 #[derive(Debug, Clone)]
 pub struct FloatConv {
     extents: Extents,
-    /// Per tap, panel and input channel: 16 output channels.
+    /// Per tap, panel and input channel: each output channel's weight.
     weights: Vec<Lanes>,
-    bias: Vec<f32>,
+    bias: Vec<[f32; PANEL]>,
     invariant: Option<Invariant>,
 }
 
 #[derive(Debug, Clone)]
 struct Invariant {
-    energy: Vec<f32>,
-    gain: Vec<f32>,
+    /// `Σ weight²` over the input channels, per tap and panel.
+    energy: Vec<[f32; PANEL]>,
+    gain: Vec<[f32; PANEL]>,
 }
 
 /// What a layer may write: f16, saturating, or f32 as computed.
-pub trait FloatOut: Copy + Send + Sync + sealed::Sealed {
-    /// Rounds a row.
-    #[doc(hidden)]
-    fn store(from: &[f32], to: &mut [Self]);
-}
+pub trait FloatOut: Copy + Send + Sync + sealed::Sealed {}
+
+impl FloatOut for f32 {}
+impl FloatOut for f16 {}
 
 mod sealed {
-    pub trait Sealed {}
-    impl Sealed for f32 {}
-    impl Sealed for half::f16 {}
-}
+    use half::f16;
 
-impl FloatOut for f32 {
-    #[inline(always)]
-    fn store(from: &[f32], to: &mut [f32]) {
-        to.copy_from_slice(from);
-    }
-}
+    use super::{Halves, PANEL};
 
-impl FloatOut for f16 {
-    #[inline(always)]
-    fn store(from: &[f32], to: &mut [f16]) {
-        convert::narrow(from, to);
-    }
-}
-
-/// One panel.
-type Lanes = [f32; PANEL];
-
-struct Single;
-
-impl Arithmetic for Single {
-    type Value = f16;
-    type Factor = f32;
-    type Weights = Lanes;
-    type Sums = Lanes;
-
-    #[inline(always)]
-    fn steps(cin: usize) -> usize {
-        cin
+    pub trait Sealed: Sized {
+        /// Writes a panel, or as much of it as there is.
+        ///
+        /// # Safety
+        /// The processor must have `H`'s instructions.
+        #[expect(private_bounds, reason = "only this crate calls it")]
+        unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [Self]);
     }
 
-    #[inline(always)]
-    fn expand(row: &[f16], factors: &mut [f32]) {
-        convert::widen(row, factors);
-    }
-
-    #[inline(always)]
-    fn step(mut sums: Lanes, weights: &Lanes, factor: &f32) -> Lanes {
-        let factor = *factor;
-        for j in 0..PANEL {
-            sums[j] += factor * weights[j];
+    impl Sealed for f32 {
+        #[inline(always)]
+        #[expect(private_bounds, reason = "only this crate calls it")]
+        unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [f32]) {
+            match <&mut [f32; PANEL]>::try_from(&mut *to) {
+                Ok(to) => *to = from,
+                Err(_) => to.copy_from_slice(&from[..to.len()]),
+            }
         }
-        sums
+    }
+
+    impl Sealed for f16 {
+        #[inline(always)]
+        #[expect(private_bounds, reason = "only this crate calls it")]
+        unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [f16]) {
+            // SAFETY: the caller's promise.
+            let from = unsafe { H::narrow(from) };
+            match <&mut [f16; PANEL]>::try_from(&mut *to) {
+                Ok(to) => *to = from,
+                Err(_) => to.copy_from_slice(&from[..to.len()]),
+            }
+        }
     }
 }
 
@@ -95,7 +86,7 @@ impl FloatConv {
     /// Packs `weights[tap][input][output]`.
     ///
     /// # Panics
-    /// If lengths don't match the extents: the caller has checked what it read.
+    /// If lengths don't match the extents, or there are more than 64 taps: the caller has checked what it read.
     pub fn new(
         volume: usize,
         cin: usize,
@@ -111,22 +102,24 @@ impl FloatConv {
             Scale::Plain => None,
             Scale::Invariant(gain) => {
                 assert_eq!(gain.len(), cout, "one gain per channel");
-                let mut energy = vec![0.0; volume * cout];
-                for (i, w) in weights.iter().enumerate() {
-                    energy[i / (cin * cout) * cout + i % cout] += w.to_f32().powi(2);
-                }
-                Some(Invariant { energy, gain })
+                let mut energy = vec![[0.0; PANEL]; volume * extents.panels()];
+                extents.place(weights, |w, panel, _, lane| {
+                    energy[panel][lane] += w.to_f32().powi(2);
+                });
+                Some(Invariant {
+                    energy,
+                    gain: panels(&gain),
+                })
             }
         };
         let mut packed = vec![Lanes::default(); volume * extents.panels() * cin];
-        for (i, w) in weights.iter().enumerate() {
-            let (k, c, o) = (i / (cin * cout), i / cout % cin, i % cout);
-            packed[(k * extents.panels() + o / PANEL) * cin + c][o % PANEL] = w.to_f32();
-        }
+        extents.place(weights, |w, panel, c, lane| {
+            packed[panel * cin + c].0[lane] = w.to_f32().to_bits();
+        });
         FloatConv {
             extents,
             weights: packed,
-            bias,
+            bias: panels(&bias),
             invariant,
         }
     }
@@ -151,62 +144,58 @@ impl FloatConv {
         taps: Taps<'_>,
         input: &[f16],
         first: usize,
-        output: Output<'_, T, f16>,
+        mut output: Output<'_, T, f16>,
     ) {
         assert_eq!(
             taps.volume(),
             self.extents.volume,
             "these taps belong to another kernel"
         );
-        let Extents { cout, .. } = self.extents;
-        let panels = self.extents.panels();
-        let Output {
-            rows,
-            stride,
-            column,
-            residual,
-            relu,
-        } = output;
-        let mut tile = TileTaps::default();
-        let mut factors = Vec::new();
-        let mut sums = vec![Lanes::default(); TILE * panels];
-        let mut norms = vec![0.0; TILE * cout];
-        for (t, rows) in rows.chunks_mut(TILE * stride).enumerate() {
-            tile.fill(&taps, first + t * TILE, rows.len() / stride);
-            accumulate::<Single>(
-                isa,
-                self.extents,
-                &self.weights,
-                &tile,
-                input,
-                &mut factors,
-                &mut sums,
-            );
-            if let Some(Invariant { energy, .. }) = &self.invariant {
-                energies(isa, cout, energy, &tile, &mut norms);
+        with_scratch(|scratch| {
+            let Scratch {
+                taps: tile,
+                sums,
+                expanded,
+                norms,
+            } = scratch;
+            norms.clear();
+            let inputs = input.len() / self.extents.cin;
+            for (row, output) in output.tiles() {
+                tile.fill(isa, &taps, first + row, output.len(), inputs);
+                accumulate(
+                    isa,
+                    Arithmetic::Float,
+                    self.extents,
+                    &self.weights,
+                    tile,
+                    Input::Expand(input, widen),
+                    expanded,
+                    sums,
+                );
+                if let Some(Invariant { energy, gain }) = &self.invariant {
+                    norms.fill(isa, tile.masks(), energy, gain);
+                }
+                let (conv, norms, sums) = (self, &*norms, &sums[..]);
+                with_halves!(isa, fn finish_tile<T: FloatOut>(
+                    conv: &FloatConv, norms: &Norms, sums: &[Lanes], output: Output<'_, T, f16>,
+                ));
             }
-            let (conv, norms) = (self, &norms[..]);
-            let sums = sums.as_flattened_mut();
-            let residual = residual.map(|all| &all[t * TILE * stride..][..rows.len()]);
-            let output = Output {
-                rows,
-                stride,
-                column,
-                residual,
-                relu,
-            };
-            dispatch!(isa, fn finish_tile<T: FloatOut>(
-                conv: &FloatConv, sums: &mut [f32], norms: &[f32], output: Output<'_, T, f16>,
-            ));
-        }
+        });
     }
 }
 
+/// Words of f32.
+fn widen(isa: Isa, from: &[f16], to: &mut [u32]) {
+    convert::to_f32(isa, from, machine::floats_mut(to));
+}
+
+/// # Safety
+/// The processor must have `H`'s instructions.
 #[inline(always)]
-fn finish_tile<T: FloatOut>(
+unsafe fn finish_tile<H: Halves, T: FloatOut>(
     conv: &FloatConv,
-    sums: &mut [f32],
-    norms: &[f32],
+    norms: &Norms,
+    sums: &[Lanes],
     output: Output<'_, T, f16>,
 ) {
     let Output {
@@ -217,27 +206,38 @@ fn finish_tile<T: FloatOut>(
         relu,
     } = output;
     let Extents { cout, .. } = conv.extents;
-    let mut skip = vec![0.0; cout];
-    let sums = sums.chunks_exact_mut(cout.next_multiple_of(PANEL));
-    for (r, (row, sums)) in rows.chunks_exact_mut(stride).zip(sums).enumerate() {
-        let sums = &mut sums[..cout];
-        if let Some(Invariant { gain, .. }) = &conv.invariant {
-            for ((sum, norm), gain) in sums.iter_mut().zip(&norms[r * cout..]).zip(gain) {
-                *sum *= gain / (norm + 1e-8).sqrt();
+    let panels = conv.extents.panels();
+    for (r, (row, sums)) in rows
+        .chunks_exact_mut(stride)
+        .zip(sums.chunks_exact(panels))
+        .enumerate()
+    {
+        let row = &mut row[column..column + cout];
+        let residual = residual.map(|all| &all[r * stride + column..][..cout]);
+        let panels = row.chunks_mut(PANEL).zip(sums).zip(&conv.bias);
+        for (p, ((row, sums), bias)) in panels.enumerate() {
+            let mut sums = sums.f32();
+            if conv.invariant.is_some() {
+                let factors = &norms.of(r, conv.extents.panels())[p];
+                for (sum, factor) in sums.iter_mut().zip(factors) {
+                    *sum *= factor;
+                }
             }
-        }
-        for (sum, bias) in sums.iter_mut().zip(&conv.bias) {
-            *sum += bias;
-        }
-        if let Some(residual) = residual {
-            convert::widen(&residual[r * stride + column..][..cout], &mut skip);
-            for (sum, x) in sums.iter_mut().zip(&skip) {
-                *sum += x;
+            for (sum, bias) in sums.iter_mut().zip(bias) {
+                *sum += bias;
             }
+            if let Some(residual) = residual {
+                // SAFETY: the caller's promise.
+                let skip = unsafe { H::widen(panel(&residual[p * PANEL..][..row.len()])) };
+                for (sum, x) in sums.iter_mut().zip(skip) {
+                    *sum += x;
+                }
+            }
+            if relu {
+                sums.iter_mut().for_each(|sum| *sum = sum.max(0.0));
+            }
+            // SAFETY: the caller's promise.
+            unsafe { T::store::<H>(sums, row) };
         }
-        if relu {
-            sums.iter_mut().for_each(|sum| *sum = sum.max(0.0));
-        }
-        T::store(sums, &mut row[column..column + cout]);
     }
 }

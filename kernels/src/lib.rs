@@ -3,8 +3,9 @@
 //! Every `unsafe` block of the project lives here, each with its reason. Nothing here knows of streams, levels or Gaussians.
 //!
 //! A sparse convolution is one loop ([`ExactConv`] in integers, [`FloatConv`] in floats): for every output row, the rows its
-//! [`Taps`] name are multiplied by that tap's weights and added up. Each kernel is one portable body, compiled once for the
-//! baseline and once more for every [`Isa`] above it. Nothing is contracted or reordered, so all of them give the same bits.
+//! [`Taps`] name are multiplied by that tap's weights and added up, in blocks of rows and channels that fill the registers of
+//! the [`Isa`]. Integers give the same bits on all of them. Floats may round differently from one to the next (only some have a
+//! fused multiply-add), but never from one call, or one number of threads, to another.
 
 #[cfg(all(target_arch = "x86", not(target_feature = "sse2")))]
 compile_error!(
@@ -15,10 +16,14 @@ mod convert;
 mod exact;
 mod float;
 mod isa;
+mod machine;
 mod map;
+mod norms;
 mod rows;
 mod taps;
+mod tile;
 
+pub mod ceiling;
 pub mod reference;
 
 pub use convert::{to_f16, to_f32};

@@ -1,17 +1,14 @@
-//! The loop that both convolutions share: tiles of output rows, tap by tap, in blocks that stay in registers.
+//! What both convolutions share: where they write, the extents of their weights, and the memory that a thread reuses.
 
-use std::num::Wrapping;
-use std::ops::AddAssign;
+use std::cell::RefCell;
 
-use crate::isa::{Isa, dispatch};
+use crate::norms::Norms;
 use crate::taps::TileTaps;
 
-/// Channels of one weight panel, and of one accumulator.
+/// Channels of one weight panel.
 pub(crate) const PANEL: usize = 16;
-/// Output rows of a tile: enough that every tap finds full blocks, few enough that their accumulators stay in the cache.
+/// Output rows of a tile: enough that every tap finds full blocks, few enough that their sums stay in the cache.
 pub(crate) const TILE: usize = 128;
-/// Rows multiplied together, sharing each weight that is loaded.
-const BLOCK: usize = 4;
 
 /// Where a layer writes, and what it adds on the way.
 pub struct Output<'a, T, R = T> {
@@ -27,23 +24,57 @@ pub struct Output<'a, T, R = T> {
     pub relu: bool,
 }
 
-/// The arithmetic of one multiply-add over [`PANEL`] output channels.
-pub(crate) trait Arithmetic {
-    /// An activation in memory.
-    type Value: Copy;
-    /// What one step multiplies the panel's weights by.
-    type Factor: Copy + Default;
-    /// A panel's weights of one step.
-    type Weights: Copy + Default;
-    /// A panel's sums.
-    type Sums: Copy + Default;
+impl<T, R> Output<'_, T, R> {
+    /// The output cut into tiles, each with the number of its first row.
+    pub(crate) fn tiles(&mut self) -> impl Iterator<Item = (usize, Output<'_, T, R>)> {
+        let (stride, column, residual, relu) = (self.stride, self.column, self.residual, self.relu);
+        self.rows
+            .chunks_mut(TILE * stride)
+            .enumerate()
+            .map(move |(t, rows)| {
+                let residual = residual.map(|all| &all[t * TILE * stride..][..rows.len()]);
+                let output = Output {
+                    rows,
+                    stride,
+                    column,
+                    residual,
+                    relu,
+                };
+                (t * TILE, output)
+            })
+    }
 
-    /// Steps for `cin` input channels.
-    fn steps(cin: usize) -> usize;
-    /// Prepares a row of input channels: one factor a step.
-    fn expand(row: &[Self::Value], factors: &mut [Self::Factor]);
-    /// `sums + weights · factor`.
-    fn step(sums: Self::Sums, weights: &Self::Weights, factor: &Self::Factor) -> Self::Sums;
+    /// Rows.
+    pub(crate) fn len(&self) -> usize {
+        self.rows.len() / self.stride
+    }
+}
+
+/// Sixteen 32-bit words: a panel's sums, or its weights of one step. Floats are kept as their bits.
+#[repr(C, align(64))]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct Lanes(pub [u32; PANEL]);
+
+impl Lanes {
+    #[inline(always)]
+    pub fn i32(&self) -> [i32; PANEL] {
+        self.0.map(|word| word as i32)
+    }
+
+    #[inline(always)]
+    pub fn f32(&self) -> [f32; PANEL] {
+        self.0.map(f32::from_bits)
+    }
+}
+
+/// One value per channel, in whole panels; the rest is zero.
+pub(crate) fn panels<T: Copy + Default>(values: &[T]) -> Vec<[T; PANEL]> {
+    let panel = |chunk: &[T]| {
+        let mut panel = [T::default(); PANEL];
+        panel[..chunk.len()].copy_from_slice(chunk);
+        panel
+    };
+    values.chunks(PANEL).map(panel).collect()
 }
 
 /// The extents of a layer's weights.
@@ -65,118 +96,38 @@ impl Extents {
             self.volume > 0 && self.cin > 0 && self.cout > 0,
             "a layer has no extent"
         );
+        assert!(self.volume <= 64, "a kernel has more than 64 taps");
         assert_eq!(
             len,
             self.volume * self.cin * self.cout,
             "weights must fill [volume, cin, cout]"
         );
     }
-}
 
-/// Sums over all taps of the tile: `sums[row · panels + panel]`, overwritten.
-///
-/// `weights` are ordered `[tap][panel][step]`.
-pub(crate) fn accumulate<A: Arithmetic>(
-    isa: Isa,
-    extents: Extents,
-    weights: &[A::Weights],
-    taps: &TileTaps,
-    input: &[A::Value],
-    factors: &mut Vec<A::Factor>,
-    sums: &mut [A::Sums],
-) {
-    let (cin, panels, steps) = (extents.cin, extents.panels(), A::steps(extents.cin));
-    sums.fill(A::Sums::default());
-    factors.resize(BLOCK * steps, A::Factor::default());
-    for k in 0..extents.volume {
-        let weights = &weights[k * panels * steps..(k + 1) * panels * steps];
-        for block in taps.of(k).chunks(BLOCK) {
-            for (pair, factors) in block.iter().zip(factors.chunks_exact_mut(steps)) {
-                expand::<A>(isa, &input[pair.input as usize * cin..][..cin], factors);
-            }
-            for (panel, weights) in weights.chunks_exact(steps).enumerate() {
-                let at = |slot: usize| block[slot].row as usize * panels + panel;
-                match block.len() {
-                    4 => {
-                        multiply::<A, 4>(isa, weights, factors, sums, [at(0), at(1), at(2), at(3)])
-                    }
-                    3 => multiply::<A, 3>(isa, weights, factors, sums, [at(0), at(1), at(2)]),
-                    2 => multiply::<A, 2>(isa, weights, factors, sums, [at(0), at(1)]),
-                    _ => multiply::<A, 1>(isa, weights, factors, sums, [at(0)]),
-                }
-            }
+    /// Calls `place(weight, tap · panels + panel, input, lane)` for each weight of `[tap][input][output]`.
+    pub fn place<T: Copy>(&self, weights: &[T], mut place: impl FnMut(T, usize, usize, usize)) {
+        for (i, &w) in weights.iter().enumerate() {
+            let (k, c, o) = (
+                i / (self.cin * self.cout),
+                i / self.cout % self.cin,
+                i % self.cout,
+            );
+            place(w, k * self.panels() + o / PANEL, c, o % PANEL);
         }
     }
 }
 
-fn expand<A: Arithmetic>(isa: Isa, row: &[A::Value], factors: &mut [A::Factor]) {
-    #[inline(always)]
-    fn body<A: Arithmetic>(row: &[A::Value], factors: &mut [A::Factor]) {
-        A::expand(row, factors);
-    }
-    dispatch!(isa, fn body<A: Arithmetic>(row: &[A::Value], factors: &mut [A::Factor]));
+/// What a thread needs for any layer, kept from one call to the next.
+#[derive(Default)]
+pub(crate) struct Scratch {
+    pub taps: TileTaps,
+    pub sums: Vec<Lanes>,
+    pub expanded: Vec<Lanes>,
+    pub norms: Norms,
 }
 
-/// Adds one panel's products to the sums `at[0]`, `at[1]`, …, which stay in registers throughout.
-fn multiply<A: Arithmetic, const ROWS: usize>(
-    isa: Isa,
-    weights: &[A::Weights],
-    factors: &[A::Factor],
-    sums: &mut [A::Sums],
-    at: [usize; ROWS],
-) {
-    #[inline(always)]
-    fn body<A: Arithmetic, const ROWS: usize>(
-        weights: &[A::Weights],
-        factors: &[A::Factor],
-        sums: &mut [A::Sums],
-        at: [usize; ROWS],
-    ) {
-        let steps = weights.len();
-        let mut local: [A::Sums; ROWS] = at.map(|i| sums[i]);
-        let factors: [&[A::Factor]; ROWS] = std::array::from_fn(|r| &factors[r * steps..][..steps]);
-        for (s, weights) in weights.iter().enumerate() {
-            for r in 0..ROWS {
-                local[r] = A::step(local[r], weights, &factors[r][s]);
-            }
-        }
-        for (i, sum) in at.into_iter().zip(local) {
-            sums[i] = sum;
-        }
-    }
-    dispatch!(isa, fn body<A: Arithmetic; const ROWS>(
-        weights: &[A::Weights], factors: &[A::Factor], sums: &mut [A::Sums], at: [usize; ROWS],
-    ));
-}
-
-/// For every row of the tile the sum of `energy[tap][channel]` over its taps: what a geometry-invariant layer divides by.
-pub(crate) fn energies<E: Energy>(
-    isa: Isa,
-    cout: usize,
-    energy: &[E],
-    taps: &TileTaps,
-    sums: &mut [E],
-) {
-    dispatch!(isa, fn add_energies<E: Energy>(cout: usize, energy: &[E], taps: &TileTaps, sums: &mut [E]));
-}
-
-/// A sum of squared weights.
-pub(crate) trait Energy: Copy + Default + AddAssign {}
-
-impl Energy for f32 {}
-impl Energy for Wrapping<u32> {}
-
-#[inline(always)]
-fn add_energies<E: Energy>(cout: usize, energy: &[E], taps: &TileTaps, sums: &mut [E]) {
-    sums.fill(E::default());
-    for (k, energy) in energy.chunks_exact(cout).enumerate() {
-        for pair in taps.of(k) {
-            for (sum, &e) in sums[pair.row as usize * cout..][..cout]
-                .iter_mut()
-                .zip(energy)
-            {
-                *sum += e;
-            }
-        }
-    }
+/// Lends this thread's [`Scratch`].
+pub(crate) fn with_scratch(run: impl FnOnce(&mut Scratch)) {
+    thread_local!(static SCRATCH: RefCell<Scratch> = RefCell::default());
+    SCRATCH.with_borrow_mut(run);
 }

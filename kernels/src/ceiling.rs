@@ -1,0 +1,67 @@
+//! What one core can do at best, to judge the kernels by: loops of their own multiply-adds that wait for nothing.
+//!
+//! Each function measures for about 10 ms and gives the best rate that it saw, in 10⁹ multiply-adds per second.
+
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+use crate::isa::Isa;
+use crate::rows::Lanes;
+use crate::tile::{Arithmetic, Machine, spin};
+
+/// f32 multiply-adds: the bound of [`crate::FloatConv`].
+pub fn f32(isa: Isa) -> f64 {
+    measure(isa, Arithmetic::Float)
+}
+
+/// i16 by i16, summed in i32: the bound of [`crate::ExactConv`].
+pub fn i16(isa: Isa) -> f64 {
+    measure(isa, Arithmetic::Integer)
+}
+
+/// Rounds of one batch, some 50 µs of them.
+const ROUNDS: usize = 1 << 14;
+
+fn measure(isa: Isa, arithmetic: Arithmetic) -> f64 {
+    let begin = Instant::now();
+    let mut best: f64 = 0.0;
+    while begin.elapsed() < Duration::from_millis(10) {
+        let start = Instant::now();
+        let products = spin(isa, arithmetic, ROUNDS);
+        best = best.max(products as f64 / start.elapsed().as_secs_f64() / 1e9);
+    }
+    best
+}
+
+/// Multiplies `rounds` times five factors by two vectors of weights, in registers but for the factors, and gives the number of words
+/// multiplied.
+///
+/// # Safety
+/// The processor must have `M`'s instructions.
+#[inline(always)]
+pub(crate) unsafe fn rounds<M: Machine>(rounds: usize) -> usize {
+    const ROWS: usize = 5;
+    let words = [Lanes::default(); 2];
+    let mut sink = Lanes::default();
+    let from: *const u32 = black_box(&words).as_ptr().cast();
+    // SAFETY: `from` holds 32 words, `sink` 16, and no vector has more than 16 lanes.
+    unsafe {
+        let weights = [M::weight(from), M::weight(from.add(16))];
+        let mut sums = [[M::zero(); 2]; ROWS];
+        for _ in 0..rounds {
+            // Factors come from the cache, or else the compiler would multiply once and for all.
+            let from = black_box(from);
+            for (r, sums) in sums.iter_mut().enumerate() {
+                let factor = M::factor(from.add(r));
+                for (sum, &weight) in sums.iter_mut().zip(&weights) {
+                    *sum = M::mul_add(*sum, weight, factor);
+                }
+            }
+        }
+        for sum in sums.as_flattened() {
+            M::store(sink.0.as_mut_ptr(), *sum);
+            black_box(&sink);
+        }
+    }
+    rounds * ROWS * 2 * M::LANES
+}

@@ -1,0 +1,180 @@
+//! AVX2 with FMA and F16C: blocks of six rows by one panel, or twelve by half of one.
+
+use std::arch::x86_64::*;
+
+use half::f16;
+
+use crate::ceiling;
+use crate::convert::{Halves, MAX};
+use crate::rows::PANEL;
+use crate::tile::{Arithmetic, Block, Machine, columns};
+
+/// # Safety
+/// The processor must have AVX2, FMA and F16C; the rest as [`columns`].
+pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) -> usize {
+    // SAFETY: the caller's promise for one panel, or half of it.
+    unsafe {
+        match (arithmetic, whole) {
+            (Arithmetic::Float, 0) => wide::<Float, 12, 1>(block),
+            (Arithmetic::Float, _) => wide::<Float, 6, 2>(block),
+            (Arithmetic::Integer, 0) => wide::<Integer, 12, 1>(block),
+            (Arithmetic::Integer, _) => wide::<Integer, 6, 2>(block),
+        }
+    }
+    1
+}
+
+/// # Safety
+/// As [`run`].
+#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
+unsafe fn wide<M: Machine, const R: usize, const V: usize>(block: &Block) {
+    // SAFETY: the caller's promise.
+    unsafe { columns::<M, R, V>(block) }
+}
+
+/// # Safety
+/// As [`run`].
+pub(crate) unsafe fn spin(arithmetic: Arithmetic, rounds: usize) -> usize {
+    // SAFETY: the caller's promise.
+    unsafe {
+        match arithmetic {
+            Arithmetic::Float => spinning::<Float>(rounds),
+            Arithmetic::Integer => spinning::<Integer>(rounds),
+        }
+    }
+}
+
+/// # Safety
+/// As [`run`].
+#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
+unsafe fn spinning<M: Machine>(rounds: usize) -> usize {
+    // SAFETY: the caller's promise.
+    unsafe { ceiling::rounds::<M>(rounds) }
+}
+
+struct Float;
+
+// SAFETY: reads and writes `LANES` words, `factor` one.
+unsafe impl Machine for Float {
+    type Sum = __m256;
+    type Weight = __m256;
+    type Factor = __m256;
+    const LANES: usize = 8;
+
+    #[inline(always)]
+    unsafe fn zero() -> Self::Sum {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_setzero_ps() }
+    }
+
+    #[inline(always)]
+    unsafe fn load(at: *const u32) -> Self::Sum {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_load_ps(at.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn store(at: *mut u32, sum: Self::Sum) {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_store_ps(at.cast(), sum) }
+    }
+
+    #[inline(always)]
+    unsafe fn weight(at: *const u32) -> Self::Weight {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_load_ps(at.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn factor(at: *const u32) -> Self::Factor {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_set1_ps(at.cast::<f32>().read_unaligned()) }
+    }
+
+    #[inline(always)]
+    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_fmadd_ps(weight, factor, sum) }
+    }
+}
+
+struct Integer;
+
+// SAFETY: reads and writes `LANES` words, `factor` one.
+unsafe impl Machine for Integer {
+    type Sum = __m256i;
+    type Weight = __m256i;
+    type Factor = __m256i;
+    const LANES: usize = 8;
+
+    #[inline(always)]
+    unsafe fn zero() -> Self::Sum {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_setzero_si256() }
+    }
+
+    #[inline(always)]
+    unsafe fn load(at: *const u32) -> Self::Sum {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_load_si256(at.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn store(at: *mut u32, sum: Self::Sum) {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_store_si256(at.cast(), sum) }
+    }
+
+    #[inline(always)]
+    unsafe fn weight(at: *const u32) -> Self::Weight {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_load_si256(at.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn factor(at: *const u32) -> Self::Factor {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_set1_epi32(at.cast::<i32>().read_unaligned()) }
+    }
+
+    #[inline(always)]
+    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_add_epi32(sum, _mm256_madd_epi16(weight, factor)) }
+    }
+}
+
+pub(crate) struct Convert;
+
+// SAFETY: F16C and AVX, as its module says.
+unsafe impl Halves for Convert {
+    #[inline(always)]
+    unsafe fn widen(from: [f16; PANEL]) -> [f32; PANEL] {
+        // SAFETY: the arrays hold sixteen values each.
+        unsafe {
+            let mut to = [0.0; PANEL];
+            for half in [0, 8] {
+                let wide = _mm256_cvtph_ps(_mm_loadu_si128(from.as_ptr().add(half).cast()));
+                _mm256_storeu_ps(to.as_mut_ptr().add(half), wide);
+            }
+            to
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn narrow(from: [f32; PANEL]) -> [f16; PANEL] {
+        // SAFETY: the arrays hold sixteen values each.
+        unsafe {
+            let mut to = [f16::ZERO; PANEL];
+            for half in [0, 8] {
+                let wide = _mm256_loadu_ps(from.as_ptr().add(half));
+                // Of a NaN and a number, the instruction gives the second.
+                let wide = _mm256_max_ps(wide, _mm256_set1_ps(-MAX));
+                let wide = _mm256_min_ps(wide, _mm256_set1_ps(MAX));
+                let narrow = _mm256_cvtps_ph::<_MM_FROUND_TO_NEAREST_INT>(wide);
+                _mm_storeu_si128(to.as_mut_ptr().add(half).cast(), narrow);
+            }
+            to
+        }
+    }
+}

@@ -1,0 +1,56 @@
+//! What differs from one instruction set to the next.
+
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod avx2;
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod avx512;
+pub(crate) mod scalar;
+
+use crate::rows::{Lanes, PANEL};
+
+/// The same memory, as words.
+pub(crate) fn words_mut(lanes: &mut [Lanes]) -> &mut [u32] {
+    // SAFETY: `Lanes` is `repr(C)` and holds `PANEL` words and nothing else; 64 bytes are their size, so there is no padding.
+    unsafe { std::slice::from_raw_parts_mut(lanes.as_mut_ptr().cast(), lanes.len() * PANEL) }
+}
+
+/// The same memory, as f32.
+pub(crate) fn floats_mut(words: &mut [u32]) -> &mut [f32] {
+    // SAFETY: f32 has u32's size and alignment, and every word is a value of both.
+    unsafe { std::slice::from_raw_parts_mut(words.as_mut_ptr().cast(), words.len()) }
+}
+
+/// Calls the unsafe `$body::<H, …>(args…)` as compiled for `$isa`, `H` being its conversions of f16.
+macro_rules! with_halves {
+    ($isa:expr, fn $body:ident <$($g:ident: $bound:path),*> ($($arg:ident: $ty:ty),* $(,)?)) => {{
+        #[inline(never)]
+        fn scalar <$($g: $bound),*> ($($arg: $ty),*) {
+            // SAFETY: plain Rust.
+            unsafe { $body::<$crate::convert::Portable, $($g),*>($($arg),*) }
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
+        fn avx2 <$($g: $bound),*> ($($arg: $ty),*) {
+            // SAFETY: this function has the features.
+            unsafe { $body::<$crate::machine::avx2::Convert, $($g),*>($($arg),*) }
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(
+            enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni"
+        )]
+        fn avx512 <$($g: $bound),*> ($($arg: $ty),*) {
+            // SAFETY: this function has the features.
+            unsafe { $body::<$crate::machine::avx512::Convert, $($g),*>($($arg),*) }
+        }
+        match $crate::isa::Isa::level($isa) {
+            $crate::isa::Level::Scalar => scalar $(::<$g>)* ($($arg),*),
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: an `Isa` of this level is only made where the processor has these features.
+            $crate::isa::Level::Avx2 => unsafe { avx2 $(::<$g>)* ($($arg),*) },
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: as above.
+            $crate::isa::Level::Avx512 => unsafe { avx512 $(::<$g>)* ($($arg),*) },
+        }
+    }};
+}
+pub(crate) use with_halves;

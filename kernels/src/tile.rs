@@ -1,0 +1,267 @@
+//! The loop at the heart of both convolutions: a tile's sums, tap by tap, in blocks of rows and channels that fill the registers.
+
+use crate::isa::{Isa, Level};
+use crate::machine;
+use crate::rows::{Extents, Lanes, PANEL};
+use crate::taps::{Pair, TileTaps};
+
+/// Rows that are prepared together: what the widest blocks of any machine divide.
+const GROUP: usize = 24;
+
+/// A vector of 32-bit sums, and what multiplies and adds one step: an f32, or a pair of i16 or of bf16.
+///
+/// # Safety
+/// Its functions may use instructions that not every processor has, and read and write `LANES` words at the pointers they get
+/// (`factor`: one). They must only be called where the processor has them and the words are there.
+pub(crate) unsafe trait Machine {
+    /// Sums.
+    type Sum: Copy;
+    /// The weights of as many channels, for one step.
+    type Weight: Copy;
+    /// An input row's values of one step, for all channels.
+    type Factor: Copy;
+    /// Words in a vector; divides [`PANEL`].
+    const LANES: usize;
+
+    /// Zeros.
+    unsafe fn zero() -> Self::Sum;
+    /// Reads sums, aligned.
+    unsafe fn load(at: *const u32) -> Self::Sum;
+    /// Writes sums, aligned.
+    unsafe fn store(at: *mut u32, sum: Self::Sum);
+    /// Reads weights, aligned.
+    unsafe fn weight(at: *const u32) -> Self::Weight;
+    /// Reads a row's values of one step, not aligned.
+    unsafe fn factor(at: *const u32) -> Self::Factor;
+    /// `sum + weight · factor`.
+    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum;
+}
+
+/// Some rows and some panels of one tap.
+pub(crate) struct Block {
+    /// The first panel's weights, `steps` [`Lanes`] a panel.
+    pub weights: *const u32,
+    /// Steps.
+    pub steps: usize,
+    /// Rows.
+    pub rows: usize,
+    /// Each row's input, `steps` words.
+    pub inputs: [*const u32; GROUP],
+    /// Each row's sums of the first panel; those of the next panel follow.
+    pub sums: [*mut u32; GROUP],
+}
+
+/// Adds a block's products to its sums, for `V` vectors of channels from the first panel on, at most `R` rows at once.
+///
+/// # Safety
+/// The processor must have `M`'s instructions, and the block's pointers what they promise, for `V` vectors' panels.
+#[inline(always)]
+pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize>(block: &Block) {
+    let mut parts = block.rows.div_ceil(R);
+    let mut first = 0;
+    while parts > 0 {
+        // Parts of even size: few rows at once would wait for each other's sums.
+        let rows = (block.rows - first).div_ceil(parts);
+        macro_rules! of_size {
+            ($($n:literal)*) => {
+                match rows {
+                    // SAFETY: the caller's promise, for some of the block's rows.
+                    $($n if $n <= R => unsafe { multiply::<M, $n, V>(block, first) },)*
+                    _ => unreachable!("{rows} rows"),
+                }
+            };
+        }
+        of_size!(1 2 3 4 5 6 7 8 9 10 11 12);
+        first += rows;
+        parts -= 1;
+    }
+}
+
+/// Adds the products of `R` rows from `first` on: their sums stay in registers throughout.
+///
+/// # Safety
+/// As [`columns`], and the block must have these rows.
+#[inline(always)]
+#[expect(
+    clippy::needless_range_loop,
+    reason = "rows and vectors are counted alike"
+)]
+unsafe fn multiply<M: Machine, const R: usize, const V: usize>(block: &Block, first: usize) {
+    let mut inputs = [std::ptr::null(); R];
+    let mut outputs = [std::ptr::null_mut(); R];
+    inputs.copy_from_slice(&block.inputs[first..first + R]);
+    outputs.copy_from_slice(&block.sums[first..first + R]);
+    // SAFETY: the caller's promise: vector v of a row lies in its panel v · LANES / PANEL, each row has `steps` words, and so
+    // many lanes each panel.
+    unsafe {
+        let mut sums = [[M::zero(); V]; R];
+        for r in 0..R {
+            for v in 0..V {
+                sums[r][v] = M::load(outputs[r].add(v * M::LANES));
+            }
+        }
+        let mut weights = block.weights;
+        let stride = block.steps * PANEL;
+        for s in 0..block.steps {
+            let mut weight = [M::weight(weights); V];
+            for v in 1..V {
+                let (panel, lane) = (v * M::LANES / PANEL, v * M::LANES % PANEL);
+                weight[v] = M::weight(weights.add(panel * stride + lane));
+            }
+            for r in 0..R {
+                let factor = M::factor(inputs[r].add(s));
+                for v in 0..V {
+                    sums[r][v] = M::mul_add(sums[r][v], weight[v], factor);
+                }
+            }
+            weights = weights.add(PANEL);
+        }
+        for r in 0..R {
+            for v in 0..V {
+                M::store(outputs[r].add(v * M::LANES), sums[r][v]);
+            }
+        }
+    }
+}
+
+/// What steps multiply.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Arithmetic {
+    /// f32.
+    Float,
+    /// Pairs of i16.
+    Integer,
+}
+
+/// Where a tile's input rows are.
+pub(crate) enum Input<'a, T> {
+    /// Words as the machine multiplies them, `steps` a row.
+    Ready(&'a [T]),
+    /// To be written into `steps` words a row by the function, first.
+    Expand(&'a [T], fn(Isa, &[T], &mut [u32])),
+}
+
+/// The sums over all taps of a tile: `sums[row · panels + panel]`, overwritten. `taps` must be filled for this input's rows.
+///
+/// `weights` are ordered `[tap][panel][step]`; an input row has `cin` values.
+pub(crate) fn accumulate<T>(
+    isa: Isa,
+    arithmetic: Arithmetic,
+    extents: Extents,
+    weights: &[Lanes],
+    taps: &TileTaps,
+    input: Input<'_, T>,
+    expanded: &mut Vec<Lanes>,
+    sums: &mut Vec<Lanes>,
+) {
+    let (cin, panels) = (extents.cin, extents.panels());
+    let steps = weights.len() / (extents.volume * panels);
+    sums.clear();
+    sums.resize(taps.masks().len() * panels, Lanes::default());
+    if let Input::Ready(_) = input {
+        assert_eq!(cin * size_of::<T>(), steps * 4, "a row is {steps} words");
+    }
+    expanded.resize((GROUP * steps).div_ceil(PANEL), Lanes::default());
+    let sums = &mut sums[..];
+    let mut block = Block {
+        weights: std::ptr::null(),
+        steps,
+        rows: 0,
+        inputs: [std::ptr::null(); GROUP],
+        sums: [std::ptr::null_mut(); GROUP],
+    };
+    let narrow = extents.cout % PANEL;
+    for (k, weights) in weights.chunks_exact(panels * steps).enumerate() {
+        let mut rest = taps.of(k);
+        while !rest.is_empty() {
+            let parts = rest.len().div_ceil(GROUP);
+            let (group, after) = rest.split_at(rest.len().div_ceil(parts));
+            rest = after;
+            block.rows = group.len();
+            for (slot, pair) in group.iter().enumerate() {
+                let row = sums[pair.row as usize * panels..][..panels].as_mut_ptr();
+                block.sums[slot] = row.cast();
+            }
+            gather(isa, &mut block, group, &input, cin, steps, expanded);
+            let mut panel = 0;
+            while panel < panels {
+                let weights = &weights[panel * steps..];
+                block.weights = weights.as_ptr().cast();
+                let half = (1..=PANEL / 2).contains(&narrow);
+                let whole = panels - panel - usize::from(half);
+                // SAFETY: the slices above hold the rows' sums from here to the last panel, `gather` has taken the inputs from
+                // slices of `steps` words, the weights are those of the panels from here on.
+                let done = unsafe { run(isa, arithmetic, &block, whole) };
+                panel += done;
+                for sums in &mut block.sums[..block.rows] {
+                    *sums = sums.wrapping_add(done * PANEL);
+                }
+            }
+        }
+    }
+}
+
+/// Points the block to its rows' inputs.
+fn gather<T>(
+    isa: Isa,
+    block: &mut Block,
+    group: &[Pair],
+    input: &Input<'_, T>,
+    cin: usize,
+    steps: usize,
+    expanded: &mut [Lanes],
+) {
+    match input {
+        Input::Ready(values) => {
+            for (slot, pair) in group.iter().enumerate() {
+                block.inputs[slot] = values[pair.input as usize * cin..][..cin].as_ptr().cast();
+            }
+        }
+        Input::Expand(values, expand) => {
+            let expanded = machine::words_mut(expanded);
+            for ((slot, pair), to) in group
+                .iter()
+                .enumerate()
+                .zip(expanded.chunks_exact_mut(steps))
+            {
+                expand(isa, &values[pair.input as usize * cin..][..cin], to);
+                block.inputs[slot] = to.as_ptr();
+            }
+        }
+    }
+}
+
+/// Multiplies as many of the `whole` panels as fit, or, if there is none, the half panel that is left; gives their number.
+///
+/// # Safety
+/// The block's pointers must hold what they promise for these panels.
+unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) -> usize {
+    // SAFETY: an `Isa` is only made where the processor has its instructions; the rest is the caller's promise.
+    unsafe {
+        match isa.level() {
+            Level::Scalar => machine::scalar::run(arithmetic, block, whole),
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => machine::avx2::run(arithmetic, block, whole),
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => machine::avx512::run(arithmetic, block, whole),
+        }
+    }
+}
+
+/// Multiplies for as long as `rounds` say, and gives the number of products: see [`crate::ceiling`].
+pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
+    // SAFETY: an `Isa` is only made where the processor has its instructions.
+    let words = unsafe {
+        match isa.level() {
+            Level::Scalar => machine::scalar::spin(arithmetic, rounds),
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => machine::avx2::spin(arithmetic, rounds),
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => machine::avx512::spin(arithmetic, rounds),
+        }
+    };
+    match arithmetic {
+        Arithmetic::Float => words,
+        Arithmetic::Integer => 2 * words,
+    }
+}

@@ -1,0 +1,232 @@
+//! Integers: equal to the bit.
+
+use b2p_kernels::{ExactConv, Isa, LIMIT, Output, Requantise, Taps, reference};
+
+use crate::cases::{Random, cases, kernels, whole};
+
+fn check_exact(
+    [cin, cout]: [usize; 2],
+    weights: &[i16],
+    requantise: &Requantise,
+    taps: &Taps<'_>,
+    input: &[i16],
+    rows: usize,
+    residual: Option<&[i16]>,
+    relu: bool,
+) {
+    let expected = reference::exact(
+        [cin, cout],
+        weights,
+        requantise,
+        taps,
+        input,
+        rows,
+        residual,
+        relu,
+    );
+    let conv = ExactConv::new(taps.volume(), cin, cout, weights, requantise.clone());
+    for isa in Isa::available() {
+        let mut out = vec![i16::MIN; rows * cout];
+        let output = whole(&mut out, cout, residual, relu);
+        conv.run(isa, *taps, input, 0, output);
+        if let Some(i) = (0..out.len()).find(|&i| out[i] != expected[i]) {
+            let (volume, got, want) = (taps.volume(), out[i], expected[i]);
+            panic!(
+                "{isa}: {cin} → {cout}, {volume} taps, {rows} rows: value {i} is {got}, not {want}"
+            );
+        }
+    }
+}
+
+/// A layer of random weights by random activations, both of the model's ranges, requantised both ways.
+fn check_random(
+    random: &mut Random,
+    taps: &Taps<'_>,
+    [rows, inputs]: [usize; 2],
+    [cin, cout]: [usize; 2],
+) {
+    let weights: Vec<i16> = (0..taps.volume() * cin * cout)
+        .map(|_| random.signed(511) as i16)
+        .collect();
+    let mut activations =
+        |n: usize| -> Vec<i16> { (0..n).map(|_| random.signed(2047) as i16).collect() };
+    let input = activations(inputs * cin);
+    let residual = activations(rows * cout);
+    let residual = (cin % 16 == 0).then_some(&residual[..]);
+    let shift = Requantise::Shift {
+        bias: (0..cout).map(|_| random.signed(1 << 20)).collect(),
+        shift: (0..cout).map(|_| 6 + random.below(12) as u8).collect(),
+    };
+    let invariant = Requantise::Invariant {
+        gain: (0..cout).map(|_| random.unit() * 3.0).collect(),
+        bias: (0..cout).map(|_| random.unit() * 300.0).collect(),
+    };
+    for (requantise, relu) in [(shift, false), (invariant, true)] {
+        check_exact(
+            [cin, cout],
+            &weights,
+            &requantise,
+            taps,
+            &input,
+            rows,
+            residual,
+            relu,
+        );
+    }
+}
+
+#[test]
+fn exact_layers_equal_their_definition_to_the_bit() {
+    let mut random = Random(1);
+    for (taps, rows, inputs, extents) in cases(&mut random) {
+        check_random(&mut random, &taps.taps(), [rows, inputs], extents);
+    }
+}
+
+#[test]
+fn exact_layers_wrap_like_their_definition_at_the_extremes() {
+    let rows = 130;
+    let map = vec![0; 27 * rows];
+    let taps = Taps::Map {
+        volume: 27,
+        rows: &map,
+    };
+    let [cin, cout] = [128, 16];
+    for (w, x) in [
+        (i16::MIN, i16::MIN),
+        (i16::MAX, i16::MIN),
+        (511, 2047),
+        (-511, 2047),
+    ] {
+        let (weights, input) = (vec![w; 27 * cin * cout], vec![x; cin]);
+        for (bias, shift) in [(i32::MAX, 0), (i32::MIN, 31), (1 << 29, 30), (-1, 1)] {
+            let requantise = Requantise::Shift {
+                bias: vec![bias; cout],
+                shift: vec![shift; cout],
+            };
+            check_exact(
+                [cin, cout],
+                &weights,
+                &requantise,
+                &taps,
+                &input,
+                rows,
+                None,
+                false,
+            );
+        }
+        for (gain, bias) in [
+            (f32::MAX, f32::MAX),
+            (f32::MAX, -f32::MAX),
+            (1e-45, 0.5),
+            (1.0, 1.5),
+            (-1.0, -0.5),
+        ] {
+            let requantise = Requantise::Invariant {
+                gain: vec![gain; cout],
+                bias: vec![bias; cout],
+            };
+            check_exact(
+                [cin, cout],
+                &weights,
+                &requantise,
+                &taps,
+                &input,
+                rows,
+                None,
+                true,
+            );
+        }
+    }
+}
+
+#[test]
+fn halves_round_to_even_and_sums_stay_within_the_limit() {
+    let taps = Taps::Same;
+    let conv = ExactConv::new(
+        1,
+        1,
+        1,
+        &[2],
+        Requantise::Invariant {
+            gain: vec![1.0],
+            bias: vec![0.5],
+        },
+    );
+    // The weight's own norm is its magnitude, so a row's value is itself plus a half.
+    let input = [0, 1, 2, -1, -2, LIMIT, -LIMIT];
+    for isa in Isa::available() {
+        let mut out = [0; 7];
+        conv.run(isa, taps, &input, 0, whole(&mut out, 1, None, false));
+        assert_eq!(out, [0, 2, 2, 0, -2, LIMIT, -2046], "{isa}");
+        let residual = [-1, 1, 2000, -2047, -2047, 1, -2];
+        let output = Output {
+            rows: &mut out,
+            stride: 1,
+            column: 0,
+            residual: Some(&residual),
+            relu: false,
+        };
+        conv.run(isa, taps, &input, 0, output);
+        assert_eq!(out, [-1, 3, 2002, -2047, -2047, LIMIT, -LIMIT], "{isa}");
+    }
+}
+
+#[test]
+fn a_layer_writes_only_its_own_columns_and_rows_from_the_first_on() {
+    let mut random = Random(2);
+    let weights: Vec<i16> = (0..8 * 4 * 3).map(|_| random.signed(511) as i16).collect();
+    let input: Vec<i16> = (0..40 * 4).map(|_| random.signed(2047) as i16).collect();
+    let requantise = Requantise::Shift {
+        bias: vec![0; 3],
+        shift: vec![9; 3],
+    };
+    let residual: Vec<i16> = (0..320 * 8).map(|_| random.signed(2047) as i16).collect();
+    let columns: Vec<i16> = residual
+        .chunks(8)
+        .flat_map(|row| &row[2..5])
+        .copied()
+        .collect();
+    let whole = reference::exact(
+        [4, 3],
+        &weights,
+        &requantise,
+        &Taps::Children,
+        &input,
+        320,
+        Some(&columns),
+        true,
+    );
+    let conv = ExactConv::new(8, 4, 3, &weights, requantise);
+    for isa in Isa::available() {
+        let mut out = vec![i16::MIN; 150 * 8];
+        let output = Output {
+            rows: &mut out,
+            stride: 8,
+            column: 2,
+            residual: Some(&residual[170 * 8..]),
+            relu: true,
+        };
+        conv.run(isa, Taps::Children, &input, 170, output);
+        for (i, row) in out.chunks(8).enumerate() {
+            assert_eq!(row[2..5], whole[(170 + i) * 3..][..3], "{isa}: row {i}");
+            assert!(row[..2].iter().chain(&row[5..]).all(|&x| x == i16::MIN));
+        }
+    }
+}
+
+#[test]
+fn every_width_and_no_row_at_all_equal_their_definition_to_the_bit() {
+    let mut random = Random(4);
+    for width in 1..=70 {
+        for extents in [[width, 5], [6, width], [width, width]] {
+            let (taps, inputs) = kernels(&mut random, 31).swap_remove(3);
+            check_random(&mut random, &taps.taps(), [31, inputs], extents);
+        }
+    }
+    for rows in [0, 1] {
+        for (taps, inputs) in kernels(&mut random, rows) {
+            check_random(&mut random, &taps.taps(), [rows, inputs], [16, 24]);
+        }
+    }
+}
