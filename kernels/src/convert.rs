@@ -4,7 +4,7 @@ use half::f16;
 
 use crate::isa::Isa;
 use crate::machine::with_halves;
-use crate::rows::PANEL;
+use crate::rows::{PANEL, panel, store};
 
 /// The largest finite f16.
 pub(crate) const MAX: f32 = 65504.0;
@@ -68,15 +68,7 @@ pub(crate) unsafe fn widen<H: Halves>(from: &[f16], to: &mut [f32]) {
     let (from, to) = (from.chunks(PANEL), to.chunks_mut(PANEL));
     for (from, to) in from.zip(to) {
         // SAFETY: the caller's promise.
-        unsafe {
-            match (
-                <&[f16; PANEL]>::try_from(from),
-                <&mut [f32; PANEL]>::try_from(&mut *to),
-            ) {
-                (Ok(from), Ok(to)) => *to = H::widen(*from),
-                _ => to.copy_from_slice(&H::widen(panel(from))[..from.len()]),
-            }
-        }
+        store(unsafe { H::widen(panel(from)) }, to);
     }
 }
 
@@ -89,27 +81,8 @@ pub(crate) unsafe fn narrow<H: Halves>(from: &[f32], to: &mut [f16]) {
     let (from, to) = (from.chunks(PANEL), to.chunks_mut(PANEL));
     for (from, to) in from.zip(to) {
         // SAFETY: the caller's promise.
-        unsafe {
-            match (
-                <&[f32; PANEL]>::try_from(from),
-                <&mut [f16; PANEL]>::try_from(&mut *to),
-            ) {
-                (Ok(from), Ok(to)) => *to = H::narrow(*from),
-                _ => to.copy_from_slice(&H::narrow(panel(from))[..from.len()]),
-            }
-        }
+        store(unsafe { H::narrow(panel(from)) }, to);
     }
-}
-
-/// The values, and zeros after them.
-#[inline(always)]
-pub(crate) fn panel<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
-    let mut to = [T::default(); PANEL];
-    match <&[T; PANEL]>::try_from(from) {
-        Ok(from) => to = *from,
-        Err(_) => to[..from.len()].copy_from_slice(from),
-    }
-    to
 }
 
 #[inline(always)]

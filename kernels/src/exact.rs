@@ -2,7 +2,7 @@
 
 use crate::isa::{Isa, dispatch};
 use crate::norms::{Energy, Norms};
-use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panels, with_scratch};
+use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
 use crate::taps::Taps;
 use crate::tile::{Arithmetic, Input, accumulate};
 
@@ -18,6 +18,13 @@ pub enum Requantise {
         bias: Vec<i32>,
         /// One per output channel, at most 31.
         shift: Vec<u8>,
+    },
+    /// `clamp(round(sum · scale + bias))` in f32, halves to even.
+    Scale {
+        /// One per output channel.
+        scale: Vec<f32>,
+        /// One per output channel.
+        bias: Vec<f32>,
     },
     /// `clamp(round(sum · (gain / √D) + bias))` in f32, halves to even, with
     /// `D = max(1, Σ weight²)` over the output channel's weights in the taps that read something.
@@ -44,6 +51,10 @@ enum Finish {
     Shift {
         bias: Vec<[i32; PANEL]>,
         shift: Vec<[u32; PANEL]>,
+    },
+    Scale {
+        scale: Vec<[f32; PANEL]>,
+        bias: Vec<[f32; PANEL]>,
     },
     Invariant {
         /// `Σ weight²` over the input channels, per tap and panel.
@@ -79,6 +90,16 @@ impl ExactConv {
                 Finish::Shift {
                     bias: panels(&bias),
                     shift: panels(&shift),
+                }
+            }
+            Requantise::Scale { scale, bias } => {
+                assert!(
+                    scale.len() == cout && bias.len() == cout,
+                    "one scale and bias per channel"
+                );
+                Finish::Scale {
+                    scale: panels(&scale),
+                    bias: panels(&bias),
                 }
             }
             Requantise::Invariant { gain, bias } => {
@@ -132,7 +153,64 @@ impl ExactConv {
         taps: Taps<'_>,
         input: &[i16],
         first: usize,
-        mut output: Output<'_, i16>,
+        output: Output<'_, i16>,
+    ) {
+        self.each_tile(
+            isa,
+            taps,
+            input,
+            first,
+            output,
+            |finish, sums, norms, output| {
+                dispatch!(isa, fn finish_tile(
+                    finish: &Finish, sums: &[Lanes], norms: &Norms, output: Tile<'_, i16>,
+                ));
+            },
+        );
+    }
+
+    /// As [`ExactConv::run`], but gives what would be rounded and clamped as it is.
+    ///
+    /// # Panics
+    /// As `run` does, and if the layer requantises by [`Requantise::Shift`], or there is a residual.
+    pub fn run_f32(
+        &self,
+        isa: Isa,
+        taps: Taps<'_>,
+        input: &[i16],
+        first: usize,
+        output: Output<'_, f32, i16>,
+    ) {
+        assert!(
+            output.residual.is_none(),
+            "nothing is added to real results"
+        );
+        assert!(
+            !matches!(self.finish, Finish::Shift { .. }),
+            "shifted results are no real numbers"
+        );
+        self.each_tile(
+            isa,
+            taps,
+            input,
+            first,
+            output,
+            |finish, sums, norms, output| {
+                dispatch!(isa, fn finish_real_tile(
+                    finish: &Finish, sums: &[Lanes], norms: &Norms, output: Tile<'_, f32>,
+                ));
+            },
+        );
+    }
+
+    fn each_tile<T>(
+        &self,
+        isa: Isa,
+        taps: Taps<'_>,
+        input: &[i16],
+        first: usize,
+        mut output: Output<'_, T, i16>,
+        finish: impl Fn(&Finish, &[Lanes], &Norms, Tile<'_, T>),
     ) {
         assert_eq!(
             taps.volume(),
@@ -164,17 +242,27 @@ impl ExactConv {
                     expanded,
                     sums,
                 );
-                let (cout, finish, sums) = (self.extents.cout, &self.finish, &sums[..]);
-                if let Finish::Invariant { energy, gain, .. } = finish {
+                if let Finish::Invariant { energy, gain, .. } = &self.finish {
                     norms.fill(isa, tile.masks(), energy, gain);
                 }
-                let norms = &*norms;
-                dispatch!(isa, fn finish_tile(
-                    finish: &Finish, cout: usize, sums: &[Lanes], norms: &Norms, output: Output<'_, i16>,
-                ));
+                finish(
+                    &self.finish,
+                    sums,
+                    norms,
+                    Tile {
+                        output,
+                        cout: self.extents.cout,
+                    },
+                );
             }
         });
     }
+}
+
+/// Where a tile's `cout` channels go.
+struct Tile<'a, T> {
+    output: Output<'a, T, i16>,
+    cout: usize,
 }
 
 /// The half of a word that the pair's first or second value takes.
@@ -190,13 +278,8 @@ fn pair_up(_: Isa, from: &[i16], to: &mut [u32]) {
 }
 
 #[inline(always)]
-fn finish_tile(
-    finish: &Finish,
-    cout: usize,
-    sums: &[Lanes],
-    norms: &Norms,
-    output: Output<'_, i16>,
-) {
+fn finish_tile(finish: &Finish, sums: &[Lanes], norms: &Norms, tile: Tile<'_, i16>) {
+    let Tile { output, cout } = tile;
     let Output {
         rows,
         stride,
@@ -206,26 +289,21 @@ fn finish_tile(
     } = output;
     let panels = cout.div_ceil(PANEL);
     let floor = if relu { 0 } else { -LIMIT };
-    for (r, (row, sums)) in rows
-        .chunks_exact_mut(stride)
-        .zip(sums.chunks_exact(panels))
-        .enumerate()
-    {
+    let rows = rows.chunks_exact_mut(stride);
+    for (r, (row, sums)) in rows.zip(sums.chunks_exact(panels)).enumerate() {
         let row = &mut row[column..column + cout];
         let residual = residual.map(|all| &all[r * stride + column..][..cout]);
         for (p, (row, sums)) in row.chunks_mut(PANEL).zip(sums).enumerate() {
             let sums = sums.i32();
             let mut q = match finish {
                 Finish::Shift { bias, shift } => shifted(sums, &bias[p], &shift[p]),
-                Finish::Invariant { bias, .. } => scaled(sums, &norms.of(r, panels)[p], &bias[p]),
+                Finish::Scale { scale, bias } => rounded(scaled(sums, &scale[p], &bias[p])),
+                Finish::Invariant { bias, .. } => {
+                    rounded(scaled(sums, &norms.of(r, panels)[p], &bias[p]))
+                }
             };
             if let Some(residual) = residual {
-                let mut x = [0; PANEL];
-                let from = &residual[p * PANEL..][..row.len()];
-                match <&[i16; PANEL]>::try_from(from) {
-                    Ok(from) => x = *from,
-                    Err(_) => x[..from.len()].copy_from_slice(from),
-                }
+                let x = panel(&residual[p * PANEL..][..row.len()]);
                 for (q, x) in q.iter_mut().zip(x) {
                     *q = q.saturating_add(x).min(LIMIT);
                 }
@@ -233,10 +311,29 @@ fn finish_tile(
             for q in &mut q {
                 *q = (*q).max(floor);
             }
-            match <&mut [i16; PANEL]>::try_from(&mut *row) {
-                Ok(row) => *row = q,
-                Err(_) => row.copy_from_slice(&q[..row.len()]),
+            store(q, row);
+        }
+    }
+}
+
+#[inline(always)]
+fn finish_real_tile(finish: &Finish, sums: &[Lanes], norms: &Norms, tile: Tile<'_, f32>) {
+    let Tile { output, cout } = tile;
+    let panels = cout.div_ceil(PANEL);
+    let rows = output.rows.chunks_exact_mut(output.stride);
+    for (r, (row, sums)) in rows.zip(sums.chunks_exact(panels)).enumerate() {
+        let row = &mut row[output.column..output.column + cout];
+        for (p, (row, sums)) in row.chunks_mut(PANEL).zip(sums).enumerate() {
+            let (factor, bias) = match finish {
+                Finish::Shift { .. } => unreachable!("refused above"),
+                Finish::Scale { scale, bias } => (&scale[p], &bias[p]),
+                Finish::Invariant { bias, .. } => (&norms.of(r, panels)[p], &bias[p]),
+            };
+            let mut values = scaled(sums.i32(), factor, bias);
+            if output.relu {
+                values = values.map(|value| value.max(0.0));
             }
+            store(values, row);
         }
     }
 }
@@ -250,10 +347,12 @@ fn shifted(sums: [i32; PANEL], bias: &[i32; PANEL], shift: &[u32; PANEL]) -> [i1
 }
 
 #[inline(always)]
-fn scaled(sums: [i32; PANEL], factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [i16; PANEL] {
+fn scaled(sums: [i32; PANEL], factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [f32; PANEL] {
+    std::array::from_fn(|j| sums[j] as f32 * factor[j] + bias[j])
+}
+
+#[inline(always)]
+fn rounded(values: [f32; PANEL]) -> [i16; PANEL] {
     let limit = f32::from(LIMIT);
-    std::array::from_fn(|j| {
-        let value = sums[j] as f32 * factor[j] + bias[j];
-        value.clamp(-limit, limit).round_ties_even() as i16
-    })
+    values.map(|value| value.clamp(-limit, limit).round_ties_even() as i16)
 }

@@ -2,11 +2,11 @@
 
 use half::f16;
 
-use crate::convert::{self, Halves, panel};
+use crate::convert::{self, Halves};
 use crate::isa::Isa;
 use crate::machine::{self, with_halves};
 use crate::norms::Norms;
-use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panels, with_scratch};
+use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
 use crate::taps::Taps;
 use crate::tile::{Arithmetic, Input, accumulate};
 
@@ -61,10 +61,7 @@ mod sealed {
         #[inline(always)]
         #[expect(private_bounds, reason = "only this crate calls it")]
         unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [f32]) {
-            match <&mut [f32; PANEL]>::try_from(&mut *to) {
-                Ok(to) => *to = from,
-                Err(_) => to.copy_from_slice(&from[..to.len()]),
-            }
+            super::store(from, to);
         }
     }
 
@@ -73,11 +70,7 @@ mod sealed {
         #[expect(private_bounds, reason = "only this crate calls it")]
         unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [f16]) {
             // SAFETY: the caller's promise.
-            let from = unsafe { H::narrow(from) };
-            match <&mut [f16; PANEL]>::try_from(&mut *to) {
-                Ok(to) => *to = from,
-                Err(_) => to.copy_from_slice(&from[..to.len()]),
-            }
+            super::store(unsafe { H::narrow(from) }, to);
         }
     }
 }

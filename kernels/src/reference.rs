@@ -49,6 +49,9 @@ pub fn exact(
                 Requantise::Shift { bias, shift } => {
                     i64::from((sum + i64::from(bias[o])) as i32 >> shift[o])
                 }
+                Requantise::Scale { scale, bias } => {
+                    (sum as i32 as f32 * scale[o] + bias[o]).round_ties_even() as i64
+                }
                 Requantise::Invariant { gain, bias } => {
                     let scale = gain[o] / ((energy as u32).max(1) as f32).sqrt();
                     (sum as i32 as f32 * scale + bias[o]).round_ties_even() as i64

@@ -77,6 +77,26 @@ pub(crate) fn panels<T: Copy + Default>(values: &[T]) -> Vec<[T; PANEL]> {
     values.chunks(PANEL).map(panel).collect()
 }
 
+/// At most a panel's values, and zeros after them.
+#[inline(always)]
+pub(crate) fn panel<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
+    let mut to = [T::default(); PANEL];
+    match <&[T; PANEL]>::try_from(from) {
+        Ok(from) => to = *from,
+        Err(_) => to[..from.len()].copy_from_slice(from),
+    }
+    to
+}
+
+/// Writes a panel's values, or as many of them as there is room for.
+#[inline(always)]
+pub(crate) fn store<T: Copy>(from: [T; PANEL], to: &mut [T]) {
+    match <&mut [T; PANEL]>::try_from(&mut *to) {
+        Ok(to) => *to = from,
+        Err(_) => to.copy_from_slice(&from[..to.len()]),
+    }
+}
+
 /// The extents of a layer's weights.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Extents {

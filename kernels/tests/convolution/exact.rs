@@ -29,6 +29,14 @@ fn check_exact(
         let mut out = vec![i16::MIN; rows * cout];
         let output = whole(&mut out, cout, residual, relu);
         conv.run(isa, *taps, input, 0, output);
+        if residual.is_none() && !matches!(requantise, Requantise::Shift { .. }) {
+            let mut real = vec![f32::NAN; rows * cout];
+            conv.run_f32(isa, *taps, input, 0, whole(&mut real, cout, None, relu));
+            let limit = f32::from(LIMIT);
+            let round = |x: &f32| x.round_ties_even().clamp(-limit, limit) as i16;
+            let rounded: Vec<i16> = real.iter().map(round).collect();
+            assert_eq!(rounded, expected, "{isa}: real results");
+        }
         if let Some(i) = (0..out.len()).find(|&i| out[i] != expected[i]) {
             let (volume, got, want) = (taps.volume(), out[i], expected[i]);
             panic!(
@@ -38,7 +46,7 @@ fn check_exact(
     }
 }
 
-/// A layer of random weights by random activations, both of the model's ranges, requantised both ways.
+/// A layer of random weights by random activations, both of the model's ranges, requantised in every way.
 fn check_random(
     random: &mut Random,
     taps: &Taps<'_>,
@@ -61,7 +69,11 @@ fn check_random(
         gain: (0..cout).map(|_| random.unit() * 3.0).collect(),
         bias: (0..cout).map(|_| random.unit() * 300.0).collect(),
     };
-    for (requantise, relu) in [(shift, false), (invariant, true)] {
+    let scale = Requantise::Scale {
+        scale: (0..cout).map(|_| random.unit() * 1e-3).collect(),
+        bias: (0..cout).map(|_| random.unit() * 300.0).collect(),
+    };
+    for (requantise, relu) in [(shift, false), (scale, false), (invariant, true)] {
         check_exact(
             [cin, cout],
             &weights,
