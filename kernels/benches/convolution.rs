@@ -1,5 +1,6 @@
 //! How fast one thread convolves, in multiply-adds of taps that read something, and as a share of what the core can do at best.
-//! Least time of a few repeats. Arguments: the number of voxels, the names of instruction sets.
+//! Least time of a few repeats. Arguments: the number of voxels, the names of instruction sets,
+//! layers such as `64x16`.
 
 use std::collections::HashMap;
 use std::time::Instant;
@@ -185,6 +186,14 @@ fn main() {
             isa.to_string()
         );
         for layer in LAYERS {
+            let name = format!("{}x{}", layer[0], layer[1]);
+            if args
+                .iter()
+                .any(|arg| arg.contains('x') && !arg.contains("avx"))
+                && !args.contains(&name)
+            {
+                continue;
+            }
             bench.exact(isa, layer, exact);
             bench.float(isa, layer, float);
         }

@@ -270,10 +270,13 @@ fn place(value: i16, which: usize) -> u32 {
     u32::from(value as u16) << (16 * (which ^ usize::from(cfg!(target_endian = "big"))))
 }
 
-/// An odd number of activations as pairs, the last one's second being zero.
-fn pair_up(_: Isa, from: &[i16], to: &mut [u32]) {
-    for (to, pair) in to.iter_mut().zip(from.chunks(2)) {
-        *to = place(pair[0], 0) | pair.get(1).map_or(0, |&value| place(value, 1));
+/// An odd number of activations as pairs, each row's last having a zero.
+fn pair_up(_: Isa, input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
+    for (to, &row) in to.chunks_exact_mut(cin.div_ceil(2)).zip(rows) {
+        let from = &input[row as usize * cin..][..cin];
+        for (to, pair) in to.iter_mut().zip(from.chunks(2)) {
+            *to = place(pair[0], 0) | pair.get(1).map_or(0, |&value| place(value, 1));
+        }
     }
 }
 
@@ -331,7 +334,7 @@ fn finish_real_tile(finish: &Finish, sums: &[Lanes], norms: &Norms, tile: Tile<'
             };
             let mut values = scaled(sums.i32(), factor, bias);
             if output.relu {
-                values = values.map(|value| value.max(0.0));
+                values.iter_mut().for_each(|value| *value = value.max(0.0));
             }
             store(values, row);
         }
@@ -354,5 +357,5 @@ fn scaled(sums: [i32; PANEL], factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [f3
 #[inline(always)]
 fn rounded(values: [f32; PANEL]) -> [i16; PANEL] {
     let limit = f32::from(LIMIT);
-    values.map(|value| value.clamp(-limit, limit).round_ties_even() as i16)
+    std::array::from_fn(|j| values[j].clamp(-limit, limit).round_ties_even() as i16)
 }

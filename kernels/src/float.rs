@@ -177,9 +177,19 @@ impl FloatConv {
     }
 }
 
-/// Words of f32.
-fn widen(isa: Isa, from: &[f16], to: &mut [u32]) {
-    convert::to_f32(isa, from, machine::floats_mut(to));
+/// Rows as f32.
+fn widen(isa: Isa, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
+    with_halves!(isa, fn widen_rows<>(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]));
+}
+
+/// # Safety
+/// The processor must have `H`'s instructions.
+#[inline(always)]
+unsafe fn widen_rows<H: Halves>(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
+    for (to, &row) in machine::floats_mut(to).chunks_exact_mut(cin).zip(rows) {
+        // SAFETY: the caller's promise.
+        unsafe { convert::widen::<H>(&input[row as usize * cin..][..cin], to) };
+    }
 }
 
 /// # Safety

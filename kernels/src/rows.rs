@@ -58,12 +58,12 @@ pub(crate) struct Lanes(pub [u32; PANEL]);
 impl Lanes {
     #[inline(always)]
     pub fn i32(&self) -> [i32; PANEL] {
-        self.0.map(|word| word as i32)
+        std::array::from_fn(|j| self.0[j] as i32)
     }
 
     #[inline(always)]
     pub fn f32(&self) -> [f32; PANEL] {
-        self.0.map(f32::from_bits)
+        std::array::from_fn(|j| f32::from_bits(self.0[j]))
     }
 }
 

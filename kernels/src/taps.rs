@@ -1,6 +1,8 @@
 //! Which input rows each output row reads, and through which tap of the kernel.
 
-use crate::isa::{Isa, dispatch};
+use crate::isa::{Isa, Level};
+#[cfg(target_arch = "x86_64")]
+use crate::machine;
 use crate::rows::TILE;
 
 /// Marks a tap that reads nothing.
@@ -40,22 +42,42 @@ impl Taps<'_> {
     }
 }
 
+/// Room for each tap's pairs: a tile's rows, and what vectors write beyond the last.
+const ROOM: usize = TILE + 8;
+
 /// The pairs of output and input row of one tile, tap by tap.
 #[derive(Default)]
 pub(crate) struct TileTaps {
-    lengths: Vec<u32>,
-    /// `TILE` places for each tap, and some to spare.
-    pairs: Vec<Pair>,
+    /// Pairs of each tap.
+    lengths: Vec<usize>,
+    /// Input rows: [`ROOM`] places for each tap.
+    inputs: Vec<u32>,
+    /// Output rows within the tile, likewise.
+    rows: Vec<u32>,
     /// For each output row, which taps read something.
     masks: Vec<u64>,
 }
 
-#[derive(Debug, Default, Clone, Copy)]
-pub(crate) struct Pair {
-    /// Output row within the tile.
-    pub row: u32,
-    /// Input row.
-    pub input: u32,
+/// One tap's pairs, by ascending output row.
+#[derive(Clone, Copy)]
+pub(crate) struct Pairs<'a> {
+    /// Input rows.
+    pub inputs: &'a [u32],
+    /// Output rows within the tile.
+    pub rows: &'a [u32],
+}
+
+impl Pairs<'_> {
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// The first `count` pairs, and the others.
+    pub fn split_at(&self, count: usize) -> (Self, Self) {
+        let (inputs, rows) = (self.inputs.split_at(count), self.rows.split_at(count));
+        let of = |inputs, rows| Pairs { inputs, rows };
+        (of(inputs.0, rows.0), of(inputs.1, rows.1))
+    }
 }
 
 impl TileTaps {
@@ -70,7 +92,8 @@ impl TileTaps {
         self.lengths.resize(volume, 0);
         self.masks.clear();
         self.masks.resize(count, 0);
-        self.pairs.resize(volume * TILE, Pair::default());
+        self.inputs.resize(volume * ROOM, 0);
+        self.rows.resize(volume * ROOM, 0);
         let mut end = 0;
         match *taps {
             Taps::Same => {
@@ -80,9 +103,22 @@ impl TileTaps {
                 end = first + count;
             }
             Taps::Map { rows, .. } => {
-                let rows = &rows[first * volume..(first + count) * volume];
-                let (tile, past) = (&mut *self, &mut end);
-                dispatch!(isa, fn fill_map(tile: &mut TileTaps, volume: usize, rows: &[u32], past: &mut usize));
+                let map = &rows[first * volume..(first + count) * volume];
+                let lists = Lists {
+                    map,
+                    lengths: &mut self.lengths,
+                    inputs: &mut self.inputs,
+                    rows: &mut self.rows,
+                    masks: &mut self.masks,
+                    room: ROOM,
+                };
+                end = match isa.level() {
+                    Level::Scalar => fill_map(lists),
+                    #[cfg(target_arch = "x86_64")]
+                    // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
+                    // tile's rows and eight more.
+                    Level::Avx2 | Level::Avx512 => unsafe { machine::avx2_lists::fill_map(lists) },
+                };
             }
             Taps::Octants { parents, octants } => {
                 let (parents, octants) = (&parents[first..][..count], &octants[first..][..count]);
@@ -110,17 +146,18 @@ impl TileTaps {
     #[inline(always)]
     fn push(&mut self, k: usize, row: usize, input: u32) {
         let length = &mut self.lengths[k];
-        self.pairs[k * TILE + *length as usize] = Pair {
-            row: row as u32,
-            input,
-        };
+        self.inputs[k * ROOM + *length] = input;
+        self.rows[k * ROOM + *length] = row as u32;
         *length += 1;
         self.masks[row] |= 1 << k;
     }
 
-    /// The pairs of tap `k`, by ascending output row. Their rows are below the tile's count, their inputs below the input's.
-    pub fn of(&self, k: usize) -> &[Pair] {
-        &self.pairs[k * TILE..][..self.lengths[k] as usize]
+    /// The pairs of tap `k`. Their rows are below the tile's count, their inputs below the input's.
+    pub fn of(&self, k: usize) -> Pairs<'_> {
+        Pairs {
+            inputs: &self.inputs[k * ROOM..][..self.lengths[k]],
+            rows: &self.rows[k * ROOM..][..self.lengths[k]],
+        }
     }
 
     /// For each row, bit k of its mask tells whether tap `k` reads something.
@@ -129,23 +166,40 @@ impl TileTaps {
     }
 }
 
-#[inline(always)]
-fn fill_map(tile: &mut TileTaps, volume: usize, rows: &[u32], past: &mut usize) {
-    for k in 0..volume {
-        let pairs = &mut tile.pairs[k * TILE..][..TILE];
-        let mut length = 0;
-        for (row, (taps, mask)) in rows.chunks_exact(volume).zip(&mut tile.masks).enumerate() {
+/// A tile of a kernel map, and where its pairs go.
+pub(crate) struct Lists<'a> {
+    /// One entry per row and tap.
+    pub map: &'a [u32],
+    /// To be written, one per tap.
+    pub lengths: &'a mut [usize],
+    /// `room` for each tap.
+    pub inputs: &'a mut [u32],
+    /// Likewise.
+    pub rows: &'a mut [u32],
+    /// One per row, zero so far.
+    pub masks: &'a mut [u64],
+    /// More than there are rows.
+    pub room: usize,
+}
+
+/// Sorts a kernel map's entries by tap, and gives the end of the input rows that it names.
+fn fill_map(lists: Lists<'_>) -> usize {
+    let mut end = 0;
+    let volume = lists.lengths.len();
+    for (k, length) in lists.lengths.iter_mut().enumerate() {
+        let inputs = &mut lists.inputs[k * lists.room..][..lists.room];
+        let rows = &mut lists.rows[k * lists.room..][..lists.room];
+        let taps = lists.map.chunks_exact(volume);
+        for (row, (taps, mask)) in taps.zip(&mut *lists.masks).enumerate() {
             let input = taps[k];
             let used = input != ABSENT;
             // Written in any case, kept only if used: a branch here would be mispredicted.
-            pairs[length] = Pair {
-                row: row as u32,
-                input,
-            };
-            length += usize::from(used);
+            inputs[*length] = input;
+            rows[*length] = row as u32;
+            *length += usize::from(used);
             *mask |= u64::from(used) << k;
-            *past = (*past).max((input.wrapping_add(1)) as usize);
+            end = end.max(input.wrapping_add(1));
         }
-        tile.lengths[k] = length as u32;
     }
+    end as usize
 }

@@ -3,7 +3,7 @@
 use crate::isa::{Isa, Level};
 use crate::machine;
 use crate::rows::{Extents, Lanes, PANEL};
-use crate::taps::{Pair, TileTaps};
+use crate::taps::{Pairs, TileTaps};
 
 /// Rows that are prepared together: what the widest blocks of any machine divide.
 const GROUP: usize = 24;
@@ -137,8 +137,8 @@ pub(crate) enum Arithmetic {
 pub(crate) enum Input<'a, T> {
     /// Words as the machine multiplies them, `steps` a row.
     Ready(&'a [T]),
-    /// To be written into `steps` words a row by the function, first.
-    Expand(&'a [T], fn(Isa, &[T], &mut [u32])),
+    /// To be written into `steps` words a row first, by a function of the input, the rows to write, and the values of each.
+    Expand(&'a [T], fn(Isa, &[T], &[u32], usize, &mut [u32])),
 }
 
 /// The sums over all taps of a tile: `sums[row · panels + panel]`, overwritten. `taps` must be filled for this input's rows.
@@ -173,16 +173,16 @@ pub(crate) fn accumulate<T>(
     let narrow = extents.cout % PANEL;
     for (k, weights) in weights.chunks_exact(panels * steps).enumerate() {
         let mut rest = taps.of(k);
-        while !rest.is_empty() {
+        while rest.len() > 0 {
             let parts = rest.len().div_ceil(GROUP);
             let (group, after) = rest.split_at(rest.len().div_ceil(parts));
             rest = after;
             block.rows = group.len();
-            for (slot, pair) in group.iter().enumerate() {
-                let row = sums[pair.row as usize * panels..][..panels].as_mut_ptr();
-                block.sums[slot] = row.cast();
+            for (to, &row) in block.sums.iter_mut().zip(group.rows) {
+                let row = &mut sums[row as usize * panels..][..panels];
+                *to = row.as_mut_ptr().cast();
             }
-            gather(isa, &mut block, group, &input, cin, steps, expanded);
+            gather(isa, &mut block, group, &input, cin, expanded);
             let mut panel = 0;
             while panel < panels {
                 let weights = &weights[panel * steps..];
@@ -205,27 +205,23 @@ pub(crate) fn accumulate<T>(
 fn gather<T>(
     isa: Isa,
     block: &mut Block,
-    group: &[Pair],
+    group: Pairs<'_>,
     input: &Input<'_, T>,
     cin: usize,
-    steps: usize,
     expanded: &mut [Lanes],
 ) {
     match input {
         Input::Ready(values) => {
-            for (slot, pair) in group.iter().enumerate() {
-                block.inputs[slot] = values[pair.input as usize * cin..][..cin].as_ptr().cast();
+            for (to, &row) in block.inputs.iter_mut().zip(group.inputs) {
+                *to = values[row as usize * cin..][..cin].as_ptr().cast();
             }
         }
         Input::Expand(values, expand) => {
             let expanded = machine::words_mut(expanded);
-            for ((slot, pair), to) in group
-                .iter()
-                .enumerate()
-                .zip(expanded.chunks_exact_mut(steps))
-            {
-                expand(isa, &values[pair.input as usize * cin..][..cin], to);
-                block.inputs[slot] = to.as_ptr();
+            expand(isa, values, group.inputs, cin, expanded);
+            let rows = expanded.chunks_exact(block.steps);
+            for (to, row) in block.inputs[..group.len()].iter_mut().zip(rows) {
+                *to = row.as_ptr();
             }
         }
     }
