@@ -56,6 +56,8 @@ pub(crate) struct TileTaps {
     rows: Vec<u32>,
     /// For each output row, which taps read something.
     masks: Vec<u64>,
+    /// One more than the last input row.
+    end: usize,
 }
 
 /// One tap's pairs, by ascending output row.
@@ -141,6 +143,7 @@ impl TileTaps {
             "a tap reads row {}, but the input has {inputs}",
             end - 1
         );
+        self.end = end;
     }
 
     #[inline(always)]
@@ -158,6 +161,11 @@ impl TileTaps {
             inputs: &self.inputs[k * ROOM..][..self.lengths[k]],
             rows: &self.rows[k * ROOM..][..self.lengths[k]],
         }
+    }
+
+    /// One more than the last input row that a tap reads, or 0.
+    pub fn end(&self) -> usize {
+        self.end
     }
 
     /// For each row, bit k of its mask tells whether tap `k` reads something.

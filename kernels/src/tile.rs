@@ -3,7 +3,7 @@
 use crate::isa::{Isa, Level};
 use crate::machine;
 use crate::rows::{Extents, Lanes, PANEL};
-use crate::taps::{Pairs, TileTaps};
+use crate::taps::TileTaps;
 
 /// Rows that are prepared together: what the widest blocks of any machine divide.
 const GROUP: usize = 24;
@@ -38,6 +38,7 @@ pub(crate) unsafe trait Machine {
 }
 
 /// Some rows and some panels of one tap.
+#[derive(Clone, Copy)]
 pub(crate) struct Block {
     /// The first panel's weights, `steps` [`Lanes`] a panel.
     pub weights: *const u32,
@@ -45,10 +46,16 @@ pub(crate) struct Block {
     pub steps: usize,
     /// Rows.
     pub rows: usize,
-    /// Each row's input, `steps` words.
-    pub inputs: [*const u32; GROUP],
-    /// Each row's sums of the first panel; those of the next panel follow.
-    pub sums: [*mut u32; GROUP],
+    /// For each row, which of `inputs` it reads.
+    pub reads: *const u32,
+    /// Input rows, `steps` words each.
+    pub inputs: *const u32,
+    /// For each row, which of `sums` it adds to.
+    pub writes: *const u32,
+    /// The first panel's sums, each row's `stride` words after the last's; those of the next panel follow.
+    pub sums: *mut u32,
+    /// Words.
+    pub stride: usize,
 }
 
 /// Adds a block's products to its sums, for `V` vectors of channels from the first panel on, at most `R` rows at once.
@@ -57,11 +64,14 @@ pub(crate) struct Block {
 /// The processor must have `M`'s instructions, and the block's pointers what they promise, for `V` vectors' panels.
 #[inline(always)]
 pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize>(block: &Block) {
-    let mut parts = block.rows.div_ceil(R);
     let mut first = 0;
-    while parts > 0 {
-        // Parts of even size: few rows at once would wait for each other's sums.
-        let rows = (block.rows - first).div_ceil(parts);
+    while first < block.rows {
+        // The last two parts are of even size: few rows at once would wait for each other's sums.
+        let rows = match block.rows - first {
+            rest if rest >= 2 * R || rest == R => R,
+            rest if rest > R => rest.div_ceil(2),
+            rest => rest,
+        };
         macro_rules! of_size {
             ($($n:literal)*) => {
                 match rows {
@@ -73,7 +83,6 @@ pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize>(block: 
         }
         of_size!(1 2 3 4 5 6 7 8 9 10 11 12);
         first += rows;
-        parts -= 1;
     }
 }
 
@@ -87,13 +96,15 @@ pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize>(block: 
     reason = "rows and vectors are counted alike"
 )]
 unsafe fn multiply<M: Machine, const R: usize, const V: usize>(block: &Block, first: usize) {
-    let mut inputs = [std::ptr::null(); R];
-    let mut outputs = [std::ptr::null_mut(); R];
-    inputs.copy_from_slice(&block.inputs[first..first + R]);
-    outputs.copy_from_slice(&block.sums[first..first + R]);
     // SAFETY: the caller's promise: vector v of a row lies in its panel v · LANES / PANEL, each row has `steps` words, and so
     // many lanes each panel.
     unsafe {
+        let mut inputs = [block.inputs; R];
+        let mut outputs = [block.sums; R];
+        for r in 0..R {
+            inputs[r] = inputs[r].add(*block.reads.add(first + r) as usize * block.steps);
+            outputs[r] = outputs[r].add(*block.writes.add(first + r) as usize * block.stride);
+        }
         let mut sums = [[M::zero(); V]; R];
         for r in 0..R {
             for v in 0..V {
@@ -141,9 +152,12 @@ pub(crate) enum Input<'a, T> {
     Expand(&'a [T], fn(Isa, &[T], &[u32], usize, &mut [u32])),
 }
 
-/// The sums over all taps of a tile: `sums[row · panels + panel]`, overwritten. `taps` must be filled for this input's rows.
+/// The sums over all taps of a tile: `sums[row · panels + panel]`, overwritten.
 ///
 /// `weights` are ordered `[tap][panel][step]`; an input row has `cin` values.
+///
+/// # Panics
+/// If the taps read beyond the input, or a row that is ready is not of whole words.
 pub(crate) fn accumulate<T>(
     isa: Isa,
     arithmetic: Arithmetic,
@@ -158,74 +172,64 @@ pub(crate) fn accumulate<T>(
     let steps = weights.len() / (extents.volume * panels);
     sums.clear();
     sums.resize(taps.masks().len() * panels, Lanes::default());
-    if let Input::Ready(_) = input {
-        assert_eq!(cin * size_of::<T>(), steps * 4, "a row is {steps} words");
-    }
-    expanded.resize((GROUP * steps).div_ceil(PANEL), Lanes::default());
-    let sums = &mut sums[..];
-    let mut block = Block {
-        weights: std::ptr::null(),
-        steps,
-        rows: 0,
-        inputs: [std::ptr::null(); GROUP],
-        sums: [std::ptr::null_mut(); GROUP],
+    let values = match input {
+        Input::Ready(values) => {
+            assert_eq!(cin * size_of::<T>(), steps * 4, "a row is {steps} words");
+            values
+        }
+        Input::Expand(values, _) => values,
     };
-    let narrow = extents.cout % PANEL;
+    assert!(taps.end() <= values.len() / cin, "taps of another input");
+    expanded.resize((GROUP * steps).div_ceil(PANEL), Lanes::default());
+    let half = usize::from((1..=PANEL / 2).contains(&(extents.cout % PANEL)));
     for (k, weights) in weights.chunks_exact(panels * steps).enumerate() {
         let mut rest = taps.of(k);
         while rest.len() > 0 {
-            let parts = rest.len().div_ceil(GROUP);
-            let (group, after) = rest.split_at(rest.len().div_ceil(parts));
-            rest = after;
-            block.rows = group.len();
-            for (to, &row) in block.sums.iter_mut().zip(group.rows) {
-                let row = &mut sums[row as usize * panels..][..panels];
-                *to = row.as_mut_ptr().cast();
-            }
-            gather(isa, &mut block, group, &input, cin, expanded);
+            let group;
+            let (reads, inputs) = match input {
+                Input::Ready(values) => {
+                    (group, rest) = rest.split_at(rest.len());
+                    (group.inputs, values.as_ptr().cast())
+                }
+                Input::Expand(values, expand) => {
+                    let parts = rest.len().div_ceil(GROUP);
+                    (group, rest) = rest.split_at(rest.len().div_ceil(parts));
+                    let to = machine::words_mut(expanded);
+                    expand(isa, values, group.inputs, cin, to);
+                    (&IN_ORDER[..group.len()], to.as_ptr())
+                }
+            };
             let mut panel = 0;
             while panel < panels {
-                let weights = &weights[panel * steps..];
-                block.weights = weights.as_ptr().cast();
-                let half = (1..=PANEL / 2).contains(&narrow);
-                let whole = panels - panel - usize::from(half);
-                // SAFETY: the slices above hold the rows' sums from here to the last panel, `gather` has taken the inputs from
-                // slices of `steps` words, the weights are those of the panels from here on.
-                let done = unsafe { run(isa, arithmetic, &block, whole) };
-                panel += done;
-                for sums in &mut block.sums[..block.rows] {
-                    *sums = sums.wrapping_add(done * PANEL);
-                }
+                let block = Block {
+                    weights: weights[panel * steps..].as_ptr().cast(),
+                    steps,
+                    rows: group.len(),
+                    reads: reads.as_ptr(),
+                    inputs,
+                    writes: group.rows.as_ptr(),
+                    sums: sums[panel..].as_mut_ptr().cast(),
+                    stride: panels * PANEL,
+                };
+                // SAFETY: all rows that are read lie below the taps' end, so in the input, or else below `GROUP`, where they were
+                // expanded to; all that are written lie below the tile's number, so in `sums`; the weights are those of the
+                // panels from here on, with no more than `whole` and a half of them left.
+                panel += unsafe { run(isa, arithmetic, &block, panels - panel - half) };
             }
         }
     }
 }
 
-/// Points the block to its rows' inputs.
-fn gather<T>(
-    isa: Isa,
-    block: &mut Block,
-    group: Pairs<'_>,
-    input: &Input<'_, T>,
-    cin: usize,
-    expanded: &mut [Lanes],
-) {
-    match input {
-        Input::Ready(values) => {
-            for (to, &row) in block.inputs.iter_mut().zip(group.inputs) {
-                *to = values[row as usize * cin..][..cin].as_ptr().cast();
-            }
-        }
-        Input::Expand(values, expand) => {
-            let expanded = machine::words_mut(expanded);
-            expand(isa, values, group.inputs, cin, expanded);
-            let rows = expanded.chunks_exact(block.steps);
-            for (to, row) in block.inputs[..group.len()].iter_mut().zip(rows) {
-                *to = row.as_ptr();
-            }
-        }
+/// The places of expanded rows.
+static IN_ORDER: [u32; GROUP] = {
+    let mut places = [0; GROUP];
+    let mut i = 0;
+    while i < GROUP {
+        places[i] = i as u32;
+        i += 1;
     }
-}
+    places
+};
 
 /// Multiplies as many of the `whole` panels as fit, or, if there is none, the half panel that is left; gives their number.
 ///
