@@ -38,9 +38,9 @@ pub fn to_f16(isa: Isa, from: &[f32], to: &mut [f16]) {
 /// Its functions may use instructions that not every processor has; they must only be called where it has them.
 pub(crate) unsafe trait Halves {
     /// Exactly.
-    unsafe fn widen(from: [f16; PANEL]) -> [f32; PANEL];
+    unsafe fn widen(from: &[f16; PANEL], to: &mut [f32; PANEL]);
     /// Rounding, saturating.
-    unsafe fn narrow(from: [f32; PANEL]) -> [f16; PANEL];
+    unsafe fn narrow(from: &[f32; PANEL], to: &mut [f16; PANEL]);
 }
 
 /// In integer steps that any compiler turns into SIMD.
@@ -49,13 +49,17 @@ pub(crate) struct Portable;
 // SAFETY: plain Rust.
 unsafe impl Halves for Portable {
     #[inline(always)]
-    unsafe fn widen(from: [f16; PANEL]) -> [f32; PANEL] {
-        from.map(widen_one)
+    unsafe fn widen(from: &[f16; PANEL], to: &mut [f32; PANEL]) {
+        for (to, &from) in to.iter_mut().zip(from) {
+            *to = widen_one(from);
+        }
     }
 
     #[inline(always)]
-    unsafe fn narrow(from: [f32; PANEL]) -> [f16; PANEL] {
-        from.map(narrow_one)
+    unsafe fn narrow(from: &[f32; PANEL], to: &mut [f16; PANEL]) {
+        for (to, &from) in to.iter_mut().zip(from) {
+            *to = narrow_one(from);
+        }
     }
 }
 
@@ -65,10 +69,16 @@ unsafe impl Halves for Portable {
 /// The processor must have `H`'s instructions.
 #[inline(always)]
 pub(crate) unsafe fn widen<H: Halves>(from: &[f16], to: &mut [f32]) {
-    let (from, to) = (from.chunks(PANEL), to.chunks_mut(PANEL));
-    for (from, to) in from.zip(to) {
+    let ((panels, rest), (to, last)) = (from.as_chunks(), to.as_chunks_mut());
+    for (from, to) in panels.iter().zip(to) {
         // SAFETY: the caller's promise.
-        store(unsafe { H::widen(panel(from)) }, to);
+        unsafe { H::widen(from, to) };
+    }
+    if !rest.is_empty() {
+        let mut wide = [0.0; PANEL];
+        // SAFETY: the caller's promise.
+        unsafe { H::widen(&panel(rest), &mut wide) };
+        store(wide, last);
     }
 }
 
@@ -78,10 +88,16 @@ pub(crate) unsafe fn widen<H: Halves>(from: &[f16], to: &mut [f32]) {
 /// The processor must have `H`'s instructions.
 #[inline(always)]
 pub(crate) unsafe fn narrow<H: Halves>(from: &[f32], to: &mut [f16]) {
-    let (from, to) = (from.chunks(PANEL), to.chunks_mut(PANEL));
-    for (from, to) in from.zip(to) {
+    let ((panels, rest), (to, last)) = (from.as_chunks(), to.as_chunks_mut());
+    for (from, to) in panels.iter().zip(to) {
         // SAFETY: the caller's promise.
-        store(unsafe { H::narrow(panel(from)) }, to);
+        unsafe { H::narrow(from, to) };
+    }
+    if !rest.is_empty() {
+        let mut narrow = [f16::ZERO; PANEL];
+        // SAFETY: the caller's promise.
+        unsafe { H::narrow(&panel(rest), &mut narrow) };
+        store(narrow, last);
     }
 }
 

@@ -1,7 +1,7 @@
 //! Sparse convolution in integers: the same bits on every machine.
 
 use crate::isa::{Isa, dispatch};
-use crate::norms::{Energy, Norms};
+use crate::norms::{Energy, Gains, Norms};
 use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
 use crate::taps::Taps;
 use crate::tile::{Arithmetic, Input, accumulate};
@@ -57,18 +57,28 @@ enum Finish {
         bias: Vec<[f32; PANEL]>,
     },
     Invariant {
-        /// `Σ weight²` over the input channels, per tap and panel.
-        energy: Vec<[u32; PANEL]>,
-        gain: Vec<[f32; PANEL]>,
+        gains: Gains<u32>,
         bias: Vec<[f32; PANEL]>,
     },
+}
+
+impl Finish {
+    /// What each channel of a row is multiplied by, if anything.
+    #[inline(always)]
+    fn factors<'a>(&'a self, norms: &'a mut Norms, mask: u64) -> &'a [[f32; PANEL]] {
+        match self {
+            Finish::Shift { .. } => &[],
+            Finish::Scale { scale, .. } => scale,
+            Finish::Invariant { gains, .. } => norms.of(gains, mask),
+        }
+    }
 }
 
 impl ExactConv {
     /// Packs `weights[tap][input][output]`.
     ///
     /// # Panics
-    /// If lengths don't match the extents, there are more than 64 taps, or a shift is above 31: the caller has checked what it
+    /// If lengths don't match the extents, there are more than 63 taps, or a shift is above 31: the caller has checked what it
     /// read.
     pub fn new(
         volume: usize,
@@ -113,8 +123,7 @@ impl ExactConv {
                     *sum = sum.add(u32::from(w.unsigned_abs()).pow(2));
                 });
                 Finish::Invariant {
-                    energy,
-                    gain: panels(&gain),
+                    gains: Gains::new(energy, panels(&gain)),
                     bias: panels(&bias),
                 }
             }
@@ -163,7 +172,7 @@ impl ExactConv {
             output,
             |finish, sums, norms, output| {
                 dispatch!(isa, fn finish_tile(
-                    finish: &Finish, sums: &[Lanes], norms: &Norms, output: Tile<'_, i16>,
+                    finish: &Finish, sums: &[Lanes], norms: &mut Norms, output: Tile<'_, i16>,
                 ));
             },
         );
@@ -197,7 +206,7 @@ impl ExactConv {
             output,
             |finish, sums, norms, output| {
                 dispatch!(isa, fn finish_real_tile(
-                    finish: &Finish, sums: &[Lanes], norms: &Norms, output: Tile<'_, f32>,
+                    finish: &Finish, sums: &[Lanes], norms: &mut Norms, output: Tile<'_, f32>,
                 ));
             },
         );
@@ -210,7 +219,7 @@ impl ExactConv {
         input: &[i16],
         first: usize,
         mut output: Output<'_, T, i16>,
-        finish: impl Fn(&Finish, &[Lanes], &Norms, Tile<'_, T>),
+        finish: impl Fn(&Finish, &[Lanes], &mut Norms, Tile<'_, T>),
     ) {
         assert_eq!(
             taps.volume(),
@@ -224,7 +233,6 @@ impl ExactConv {
                 expanded,
                 norms,
             } = scratch;
-            norms.clear();
             let inputs = input.len() / self.extents.cin;
             for (row, output) in output.tiles() {
                 tile.fill(isa, &taps, first + row, output.len(), inputs);
@@ -242,9 +250,6 @@ impl ExactConv {
                     expanded,
                     sums,
                 );
-                if let Finish::Invariant { energy, gain, .. } = &self.finish {
-                    norms.fill(isa, tile.masks(), energy, gain);
-                }
                 finish(
                     &self.finish,
                     sums,
@@ -252,6 +257,7 @@ impl ExactConv {
                     Tile {
                         output,
                         cout: self.extents.cout,
+                        masks: tile.masks(),
                     },
                 );
             }
@@ -263,6 +269,8 @@ impl ExactConv {
 struct Tile<'a, T> {
     output: Output<'a, T, i16>,
     cout: usize,
+    /// For each row, the taps that read something.
+    masks: &'a [u64],
 }
 
 /// The half of a word that the pair's first or second value takes.
@@ -281,8 +289,12 @@ fn pair_up(_: Isa, input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
 }
 
 #[inline(always)]
-fn finish_tile(finish: &Finish, sums: &[Lanes], norms: &Norms, tile: Tile<'_, i16>) {
-    let Tile { output, cout } = tile;
+fn finish_tile(finish: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, i16>) {
+    let Tile {
+        output,
+        cout,
+        masks,
+    } = tile;
     let Output {
         rows,
         stride,
@@ -295,14 +307,14 @@ fn finish_tile(finish: &Finish, sums: &[Lanes], norms: &Norms, tile: Tile<'_, i1
     let rows = rows.chunks_exact_mut(stride);
     for (r, (row, sums)) in rows.zip(sums.chunks_exact(panels)).enumerate() {
         let row = &mut row[column..column + cout];
+        let factors = finish.factors(norms, masks[r]);
         let residual = residual.map(|all| &all[r * stride + column..][..cout]);
         for (p, (row, sums)) in row.chunks_mut(PANEL).zip(sums).enumerate() {
             let sums = sums.i32();
             let mut q = match finish {
                 Finish::Shift { bias, shift } => shifted(sums, &bias[p], &shift[p]),
-                Finish::Scale { scale, bias } => rounded(scaled(sums, &scale[p], &bias[p])),
-                Finish::Invariant { bias, .. } => {
-                    rounded(scaled(sums, &norms.of(r, panels)[p], &bias[p]))
+                Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => {
+                    rounded(scaled(sums, &factors[p], &bias[p]))
                 }
             };
             if let Some(residual) = residual {
@@ -320,19 +332,23 @@ fn finish_tile(finish: &Finish, sums: &[Lanes], norms: &Norms, tile: Tile<'_, i1
 }
 
 #[inline(always)]
-fn finish_real_tile(finish: &Finish, sums: &[Lanes], norms: &Norms, tile: Tile<'_, f32>) {
-    let Tile { output, cout } = tile;
+fn finish_real_tile(finish: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, f32>) {
+    let Tile {
+        output,
+        cout,
+        masks,
+    } = tile;
     let panels = cout.div_ceil(PANEL);
     let rows = output.rows.chunks_exact_mut(output.stride);
     for (r, (row, sums)) in rows.zip(sums.chunks_exact(panels)).enumerate() {
         let row = &mut row[output.column..output.column + cout];
+        let factors = finish.factors(norms, masks[r]);
         for (p, (row, sums)) in row.chunks_mut(PANEL).zip(sums).enumerate() {
-            let (factor, bias) = match finish {
+            let bias = match finish {
                 Finish::Shift { .. } => unreachable!("refused above"),
-                Finish::Scale { scale, bias } => (&scale[p], &bias[p]),
-                Finish::Invariant { bias, .. } => (&norms.of(r, panels)[p], &bias[p]),
+                Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => bias,
             };
-            let mut values = scaled(sums.i32(), factor, bias);
+            let mut values = scaled(sums.i32(), &factors[p], &bias[p]);
             if output.relu {
                 values.iter_mut().for_each(|value| *value = value.max(0.0));
             }
@@ -357,5 +373,11 @@ fn scaled(sums: [i32; PANEL], factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [f3
 #[inline(always)]
 fn rounded(values: [f32; PANEL]) -> [i16; PANEL] {
     let limit = f32::from(LIMIT);
-    std::array::from_fn(|j| values[j].clamp(-limit, limit).round_ties_even() as i16)
+    std::array::from_fn(|j| {
+        // Becomes 0, as by `as`, which would keep the compiler from using vectors.
+        let value = if values[j].is_nan() { 0.0 } else { values[j] };
+        let value = value.clamp(-limit, limit).round_ties_even();
+        // SAFETY: it is a number, and no larger than the limit.
+        (unsafe { value.to_int_unchecked::<i32>() }) as i16
+    })
 }

@@ -5,7 +5,7 @@ use half::f16;
 use crate::convert::{self, Halves};
 use crate::isa::Isa;
 use crate::machine::{self, with_halves};
-use crate::norms::Norms;
+use crate::norms::{Gains, Norms};
 use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
 use crate::taps::Taps;
 use crate::tile::{Arithmetic, Input, accumulate};
@@ -27,14 +27,7 @@ pub struct FloatConv {
     /// Per tap, panel and input channel: each output channel's weight.
     weights: Vec<Lanes>,
     bias: Vec<[f32; PANEL]>,
-    invariant: Option<Invariant>,
-}
-
-#[derive(Debug, Clone)]
-struct Invariant {
-    /// `Σ weight²` over the input channels, per tap and panel.
-    energy: Vec<[f32; PANEL]>,
-    gain: Vec<[f32; PANEL]>,
+    invariant: Option<Gains<f32>>,
 }
 
 /// What a layer may write: f16, saturating, or f32 as computed.
@@ -69,8 +62,12 @@ mod sealed {
         #[inline(always)]
         #[expect(private_bounds, reason = "only this crate calls it")]
         unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [f16]) {
-            // SAFETY: the caller's promise.
-            super::store(unsafe { H::narrow(from) }, to);
+            match to.as_mut_array() {
+                // SAFETY: the caller's promise.
+                Some(to) => unsafe { H::narrow(&from, to) },
+                // SAFETY: the caller's promise.
+                None => unsafe { crate::convert::narrow::<H>(&from[..to.len()], to) },
+            }
         }
     }
 }
@@ -79,7 +76,7 @@ impl FloatConv {
     /// Packs `weights[tap][input][output]`.
     ///
     /// # Panics
-    /// If lengths don't match the extents, or there are more than 64 taps: the caller has checked what it read.
+    /// If lengths don't match the extents, or there are more than 63 taps: the caller has checked what it read.
     pub fn new(
         volume: usize,
         cin: usize,
@@ -99,10 +96,7 @@ impl FloatConv {
                 extents.place(weights, |w, panel, _, lane| {
                     energy[panel][lane] += w.to_f32().powi(2);
                 });
-                Some(Invariant {
-                    energy,
-                    gain: panels(&gain),
-                })
+                Some(Gains::new(energy, panels(&gain)))
             }
         };
         let mut packed = vec![Lanes::default(); volume * extents.panels() * cin];
@@ -151,7 +145,6 @@ impl FloatConv {
                 expanded,
                 norms,
             } = scratch;
-            norms.clear();
             let inputs = input.len() / self.extents.cin;
             for (row, output) in output.tiles() {
                 tile.fill(isa, &taps, first + row, output.len(), inputs);
@@ -165,12 +158,9 @@ impl FloatConv {
                     expanded,
                     sums,
                 );
-                if let Some(Invariant { energy, gain }) = &self.invariant {
-                    norms.fill(isa, tile.masks(), energy, gain);
-                }
-                let (conv, norms, sums) = (self, &*norms, &sums[..]);
+                let (conv, norms, sums, masks) = (self, &mut *norms, &sums[..], tile.masks());
                 with_halves!(isa, fn finish_tile<T: FloatOut>(
-                    conv: &FloatConv, norms: &Norms, sums: &[Lanes], output: Output<'_, T, f16>,
+                    conv: &FloatConv, norms: &mut Norms, sums: &[Lanes], masks: &[u64], output: Output<'_, T, f16>,
                 ));
             }
         });
@@ -197,8 +187,9 @@ unsafe fn widen_rows<H: Halves>(input: &[f16], rows: &[u32], cin: usize, to: &mu
 #[inline(always)]
 unsafe fn finish_tile<H: Halves, T: FloatOut>(
     conv: &FloatConv,
-    norms: &Norms,
+    norms: &mut Norms,
     sums: &[Lanes],
+    masks: &[u64],
     output: Output<'_, T, f16>,
 ) {
     let Output {
@@ -217,12 +208,15 @@ unsafe fn finish_tile<H: Halves, T: FloatOut>(
     {
         let row = &mut row[column..column + cout];
         let residual = residual.map(|all| &all[r * stride + column..][..cout]);
+        let factors = conv
+            .invariant
+            .as_ref()
+            .map(|gains| norms.of(gains, masks[r]));
         let panels = row.chunks_mut(PANEL).zip(sums).zip(&conv.bias);
         for (p, ((row, sums), bias)) in panels.enumerate() {
             let mut sums = sums.f32();
-            if conv.invariant.is_some() {
-                let factors = &norms.of(r, conv.extents.panels())[p];
-                for (sum, factor) in sums.iter_mut().zip(factors) {
+            if let Some(factors) = factors {
+                for (sum, factor) in sums.iter_mut().zip(&factors[p]) {
                     *sum *= factor;
                 }
             }
@@ -230,8 +224,9 @@ unsafe fn finish_tile<H: Halves, T: FloatOut>(
                 *sum += bias;
             }
             if let Some(residual) = residual {
+                let mut skip = [0.0; PANEL];
                 // SAFETY: the caller's promise.
-                let skip = unsafe { H::widen(panel(&residual[p * PANEL..][..row.len()])) };
+                unsafe { H::widen(&panel(&residual[p * PANEL..][..row.len()]), &mut skip) };
                 for (sum, x) in sums.iter_mut().zip(skip) {
                     *sum += x;
                 }

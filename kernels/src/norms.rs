@@ -1,37 +1,56 @@
 //! The factors of geometry-invariant layers: they depend on which taps read something, and on nothing else of the input.
 
-use crate::isa::{Isa, dispatch};
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use crate::rows::PANEL;
 
-/// Distinct sets of taps that are remembered at once.
-const KEPT: usize = 512;
-/// Places of the hash table: twice as many, so that it is never more than half full.
-const SLOTS: usize = 2 * KEPT;
+/// Sets of taps that are remembered at once.
+const SLOTS: usize = 1024;
+/// No set of taps: kernels have at most 63.
+const NONE: u64 = u64::MAX;
 
-/// The factors of every set of taps met so far.
-pub(crate) struct Norms {
-    /// One more than the place in `masks`, or 0.
-    slots: Box<[u16; SLOTS]>,
-    masks: Vec<u64>,
-    /// `panels` for each mask.
-    factors: Vec<[f32; PANEL]>,
-    /// For each row of the tile, the place of its mask.
-    of_row: Vec<u32>,
+/// A layer's gains and the squares of its weights.
+#[derive(Debug, Clone)]
+pub(crate) struct Gains<E> {
+    /// Tells it from all others but its clones.
+    id: u64,
+    /// `Σ weight²` over the input channels, `[tap][panel]`.
+    energy: Vec<[E; PANEL]>,
+    gain: Vec<[f32; PANEL]>,
 }
 
-impl Default for Norms {
-    fn default() -> Self {
-        Norms {
-            slots: Box::new([0; SLOTS]),
-            masks: Vec::new(),
-            factors: Vec::new(),
-            of_row: Vec::new(),
+impl<E: Energy> Gains<E> {
+    pub fn new(energy: Vec<[E; PANEL]>, gain: Vec<[f32; PANEL]>) -> Self {
+        static LAST: AtomicU64 = AtomicU64::new(0);
+        Gains {
+            id: LAST.fetch_add(1, Ordering::Relaxed) + 1,
+            energy,
+            gain,
+        }
+    }
+
+    /// The gains over the norms of the weights of some taps.
+    #[inline(always)]
+    fn factors(&self, mask: u64, to: &mut [[f32; PANEL]]) {
+        let panels = self.gain.len();
+        for (panel, (to, gain)) in to.iter_mut().zip(&self.gain).enumerate() {
+            let mut sum = [E::default(); PANEL];
+            let mut rest = mask;
+            while rest != 0 {
+                let tap = rest.trailing_zeros() as usize;
+                rest &= rest - 1;
+                let energy = &self.energy[tap * panels + panel];
+                for (sum, &energy) in sum.iter_mut().zip(energy) {
+                    *sum = sum.add(energy);
+                }
+            }
+            *to = std::array::from_fn(|lane| sum[lane].factor(gain[lane]));
         }
     }
 }
 
 /// What a sum of squared weights is counted in, and what becomes of it.
-pub(crate) trait Energy: Copy + Default + Send + Sync {
+pub(crate) trait Energy: Copy + Default {
     fn add(self, other: Self) -> Self;
     /// `gain` over the norm.
     fn factor(self, gain: f32) -> f32;
@@ -61,84 +80,33 @@ impl Energy for f32 {
     }
 }
 
-impl Norms {
-    /// Forgets everything: another layer follows.
-    pub fn clear(&mut self) {
-        self.slots.fill(0);
-        self.masks.clear();
-        self.factors.clear();
-    }
-
-    /// Looks up, or computes, the factors of a tile's rows from `energy[tap · panels + panel]`.
-    pub fn fill<E: Energy>(
-        &mut self,
-        isa: Isa,
-        masks: &[u64],
-        energy: &[[E; PANEL]],
-        gain: &[[f32; PANEL]],
-    ) {
-        if self.masks.len() + masks.len() > KEPT {
-            self.clear();
-        }
-        self.of_row.clear();
-        for &mask in masks {
-            let at = self.place(isa, mask, energy, gain);
-            self.of_row.push(at);
-        }
-    }
-
-    fn place<E: Energy>(
-        &mut self,
-        isa: Isa,
-        mask: u64,
-        energy: &[[E; PANEL]],
-        gain: &[[f32; PANEL]],
-    ) -> u32 {
-        let mut slot = (mask.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 48) as usize % SLOTS;
-        loop {
-            match self.slots[slot] {
-                0 => break,
-                at if self.masks[usize::from(at) - 1] == mask => return u32::from(at) - 1,
-                _ => slot = (slot + 1) % SLOTS,
-            }
-        }
-        let at = self.masks.len();
-        self.masks.push(mask);
-        self.slots[slot] = at as u16 + 1;
-        self.factors.resize((at + 1) * gain.len(), [0.0; PANEL]);
-        let to = &mut self.factors[at * gain.len()..];
-        dispatch!(isa, fn factors<E: Energy>(mask: u64, energy: &[[E; PANEL]], gain: &[[f32; PANEL]], to: &mut [[f32; PANEL]]));
-        at as u32
-    }
-
-    /// The factors of the tile's row `row`.
-    #[inline(always)]
-    pub fn of(&self, row: usize, panels: usize) -> &[[f32; PANEL]] {
-        &self.factors[self.of_row[row] as usize * panels..][..panels]
-    }
+/// The factors that a thread computed last for its present layer.
+#[derive(Default)]
+pub(crate) struct Norms {
+    /// The layer's id, or 0.
+    layer: u64,
+    masks: Vec<u64>,
+    /// A row of panels for each slot.
+    factors: Vec<[f32; PANEL]>,
 }
 
-#[inline(always)]
-fn factors<E: Energy>(
-    mask: u64,
-    energy: &[[E; PANEL]],
-    gain: &[[f32; PANEL]],
-    to: &mut [[f32; PANEL]],
-) {
-    let panels = gain.len();
-    for (panel, (to, gain)) in to.iter_mut().zip(gain).enumerate() {
-        let mut sum = [E::default(); PANEL];
-        let mut rest = mask;
-        while rest != 0 {
-            let tap = rest.trailing_zeros() as usize;
-            rest &= rest - 1;
-            let energy = &energy[tap * panels + panel];
-            for (sum, &energy) in sum.iter_mut().zip(energy) {
-                *sum = sum.add(energy);
-            }
+impl Norms {
+    /// The layer's factors for a set of taps.
+    #[inline(always)]
+    pub fn of<E: Energy>(&mut self, gains: &Gains<E>, mask: u64) -> &[[f32; PANEL]] {
+        let panels = gains.gain.len();
+        if self.layer != gains.id {
+            self.layer = gains.id;
+            self.masks.clear();
+            self.masks.resize(SLOTS, NONE);
+            self.factors.resize(SLOTS * panels, [0.0; PANEL]);
         }
-        for ((to, sum), &gain) in to.iter_mut().zip(sum).zip(gain) {
-            *to = sum.factor(gain);
+        let slot = (mask.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32) as usize % SLOTS;
+        let factors = &mut self.factors[slot * panels..][..panels];
+        if self.masks[slot] != mask {
+            gains.factors(mask, factors);
+            self.masks[slot] = mask;
         }
+        factors
     }
 }

@@ -116,7 +116,7 @@ impl Extents {
             self.volume > 0 && self.cin > 0 && self.cout > 0,
             "a layer has no extent"
         );
-        assert!(self.volume <= 64, "a kernel has more than 64 taps");
+        assert!(self.volume < 64, "a kernel has more than 63 taps");
         assert_eq!(
             len,
             self.volume * self.cin * self.cout,

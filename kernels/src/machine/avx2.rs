@@ -149,23 +149,20 @@ pub(crate) struct Convert;
 // SAFETY: F16C and AVX, as its module says.
 unsafe impl Halves for Convert {
     #[inline(always)]
-    unsafe fn widen(from: [f16; PANEL]) -> [f32; PANEL] {
+    unsafe fn widen(from: &[f16; PANEL], to: &mut [f32; PANEL]) {
         // SAFETY: the arrays hold sixteen values each.
         unsafe {
-            let mut to = [0.0; PANEL];
             for half in [0, 8] {
                 let wide = _mm256_cvtph_ps(_mm_loadu_si128(from.as_ptr().add(half).cast()));
                 _mm256_storeu_ps(to.as_mut_ptr().add(half), wide);
             }
-            to
         }
     }
 
     #[inline(always)]
-    unsafe fn narrow(from: [f32; PANEL]) -> [f16; PANEL] {
+    unsafe fn narrow(from: &[f32; PANEL], to: &mut [f16; PANEL]) {
         // SAFETY: the arrays hold sixteen values each.
         unsafe {
-            let mut to = [f16::ZERO; PANEL];
             for half in [0, 8] {
                 let wide = _mm256_loadu_ps(from.as_ptr().add(half));
                 // Of a NaN and a number, the instruction gives the second.
@@ -174,7 +171,6 @@ unsafe impl Halves for Convert {
                 let narrow = _mm256_cvtps_ph::<_MM_FROUND_TO_NEAREST_INT>(wide);
                 _mm_storeu_si128(to.as_mut_ptr().add(half).cast(), narrow);
             }
-            to
         }
     }
 }

@@ -259,27 +259,23 @@ pub(crate) struct Convert;
 // SAFETY: AVX-512 F, as its module says.
 unsafe impl Halves for Convert {
     #[inline(always)]
-    unsafe fn widen(from: [f16; PANEL]) -> [f32; PANEL] {
+    unsafe fn widen(from: &[f16; PANEL], to: &mut [f32; PANEL]) {
         // SAFETY: the arrays hold sixteen values each.
         unsafe {
-            let mut to = [0.0; PANEL];
             let wide = _mm512_cvtph_ps(_mm256_loadu_si256(from.as_ptr().cast()));
             _mm512_storeu_ps(to.as_mut_ptr(), wide);
-            to
         }
     }
 
     #[inline(always)]
-    unsafe fn narrow(from: [f32; PANEL]) -> [f16; PANEL] {
+    unsafe fn narrow(from: &[f32; PANEL], to: &mut [f16; PANEL]) {
         // SAFETY: the arrays hold sixteen values each.
         unsafe {
-            let mut to = [f16::ZERO; PANEL];
             // Of a NaN and a number, the instruction gives the second.
             let wide = _mm512_max_ps(_mm512_loadu_ps(from.as_ptr()), _mm512_set1_ps(-MAX));
             let wide = _mm512_min_ps(wide, _mm512_set1_ps(MAX));
             let narrow = _mm512_cvtps_ph::<_MM_FROUND_TO_NEAREST_INT>(wide);
             _mm256_storeu_si256(to.as_mut_ptr().cast(), narrow);
-            to
         }
     }
 }
