@@ -1,0 +1,224 @@
+//! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes. Least and median time of
+//! the whole frame, and the stages of the fastest.
+//!
+//! `raster [--threads N] [SCENE…]`, a scene being a name of [`SCENES`].
+
+use std::time::{Duration, Instant};
+
+use b2p::gaussians::Gaussians;
+use b2p::pixels::{Background, Renderer, Stats};
+use b2p::projection::Camera;
+use b2p::{Error, Limits, Result};
+
+struct Scene {
+    name: &'static str,
+    count: usize,
+    size: (u32, u32),
+}
+
+const SCENES: [Scene; 4] = [
+    Scene {
+        name: "10k",
+        count: 10_000,
+        size: (1024, 1024),
+    },
+    Scene {
+        name: "body",
+        count: 236_000,
+        size: (1024, 1024),
+    },
+    Scene {
+        name: "1M",
+        count: 1_000_000,
+        size: (1920, 1080),
+    },
+    Scene {
+        name: "5M",
+        count: 5_000_000,
+        size: (1920, 1080),
+    },
+];
+
+/// Time that each scene is measured for, and the most frames.
+const PATIENCE: Duration = Duration::from_millis(1500);
+const FRAMES: usize = 60;
+
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f64 {
+        self.0 = self
+            .0
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+/// A capsule: its ends and its radius, in cube-frame units.
+struct Limb([f64; 3], [f64; 3], f64);
+
+const BODY: [Limb; 6] = [
+    Limb([0.0, -0.02, 0.0], [0.0, 0.42, 0.0], 0.19),
+    Limb([0.0, 0.74, 0.02], [0.0, 0.80, 0.02], 0.12),
+    Limb([-0.24, 0.50, 0.0], [-0.42, -0.10, 0.05], 0.065),
+    Limb([0.24, 0.50, 0.0], [0.42, -0.10, 0.05], 0.065),
+    Limb([-0.12, -0.15, 0.0], [-0.15, -0.85, 0.0], 0.095),
+    Limb([0.12, -0.15, 0.0], [0.15, -0.85, 0.0], 0.095),
+];
+
+impl Limb {
+    fn axis(&self) -> ([f64; 3], f64) {
+        let d: [f64; 3] = std::array::from_fn(|k| self.1[k] - self.0[k]);
+        let length = d.iter().map(|x| x * x).sum::<f64>().sqrt();
+        (d.map(|x| x / length), length)
+    }
+
+    fn area(&self) -> f64 {
+        let Limb(_, _, r) = self;
+        std::f64::consts::TAU * r * self.axis().1 + 2.0 * std::f64::consts::TAU * r * r
+    }
+
+    /// A point of the surface and the normal there, evenly spread.
+    fn sample(&self, random: &mut Random) -> ([f64; 3], [f64; 3]) {
+        let Limb(from, to, radius) = self;
+        let (axis, length) = self.axis();
+        let y = 2.0 * random.next() - 1.0;
+        let (sin, cos) = (random.next() * std::f64::consts::TAU).sin_cos();
+        let ring = (1.0 - y * y).sqrt();
+        let mut normal = [cos * ring, y, sin * ring];
+        let along: f64 = (0..3).map(|k| normal[k] * axis[k]).sum();
+        let caps = 2.0 * radius / (length + 2.0 * radius);
+        let start = if random.next() < caps {
+            if along > 0.0 { *to } else { *from }
+        } else {
+            let side: [f64; 3] = std::array::from_fn(|k| normal[k] - along * axis[k]);
+            let norm = side.iter().map(|x| x * x).sum::<f64>().sqrt();
+            normal = side.map(|x| x / norm);
+            let t = random.next() * length;
+            std::array::from_fn(|k| from[k] + t * axis[k])
+        };
+        (
+            std::array::from_fn(|k| start[k] + radius * normal[k]),
+            normal,
+        )
+    }
+}
+
+/// Discs of σ = 0.4, 0.9 and 1.1 voxels on a body, in Morton order; the voxels' edge goes with the density.
+fn body(count: usize) -> Gaussians {
+    let mut random = Random(1);
+    let total: f64 = BODY.iter().map(Limb::area).sum();
+    let voxel = 2.0 / 512.0 * (236_000.0 / count as f64).sqrt();
+    let mut splats = Vec::with_capacity(count);
+    for (i, limb) in BODY.iter().enumerate() {
+        let share = (count as f64 * limb.area() / total) as usize;
+        let share = if i + 1 == BODY.len() {
+            count - splats.len()
+        } else {
+            share
+        };
+        for _ in 0..share {
+            let (point, normal) = limb.sample(&mut random);
+            let point = point.map(|x| ((x + 1.0) / voxel).floor() * voxel + 0.5 * voxel - 1.0);
+            let offset: [f64; 3] = std::array::from_fn(|_| (random.next() - 0.5) * voxel);
+            let point: [f64; 3] = std::array::from_fn(|k| point[k] + offset[k]);
+            let morton = point.map(|x| ((x + 1.0) / 2.0 * 2048.0).clamp(0.0, 2047.0) as u64);
+            let key = (0..11).fold(0, |key, bit| {
+                (0..3).fold(key, |key, k| {
+                    key | (morton[k] >> bit & 1) << (3 * bit + k as u64)
+                })
+            });
+            let shade: [f32; 3] =
+                std::array::from_fn(|k| (0.5 + 0.4 * normal[k] + 0.1 * random.next()) as f32);
+            splats.push((key, point.map(|x| x as f32), facing(normal), shade));
+        }
+    }
+    splats.sort_unstable_by_key(|s| s.0);
+    let mut scene = Gaussians::default();
+    for (_, point, rotation, colour) in splats {
+        scene.position.push(point);
+        scene
+            .scale
+            .push([0.9, 1.1, 0.4].map(|s| (s * voxel) as f32));
+        scene.rotation.push(rotation);
+        scene.opacity.push(1.0);
+        scene.colour.push(colour);
+    }
+    scene
+}
+
+/// The quaternion that turns z into `normal`.
+fn facing([x, y, z]: [f64; 3]) -> [f32; 4] {
+    let w = 1.0 + z;
+    let q = if w > 1e-6 {
+        [w, -y, x, 0.0]
+    } else {
+        [0.0, 1.0, 0.0, 0.0]
+    };
+    let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
+    q.map(|v| (v / norm) as f32)
+}
+
+fn measure(scene: &Scene, gaussians: &Gaussians) -> Result<()> {
+    let (width, height) = scene.size;
+    let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, width, height)?;
+    let mut renderer = Renderer::default();
+    let mut frame = || -> Result<(Duration, Stats)> {
+        let start = Instant::now();
+        let (_, stats) = renderer.render(
+            gaussians,
+            &camera,
+            Background::WHITE,
+            &Limits::unlimited(),
+        )?;
+        Ok((start.elapsed(), stats))
+    };
+    frame()?;
+    let start = Instant::now();
+    let mut frames = Vec::new();
+    while frames.len() < FRAMES && (start.elapsed() < PATIENCE || frames.len() < 3) {
+        frames.push(frame()?);
+    }
+    frames.sort_by_key(|(time, _)| *time);
+    let ms = |t: Duration| t.as_secs_f64() * 1e3;
+    let (least, stats) = &frames[0];
+    let t = stats.times;
+    println!(
+        "{:>5}: {:7.2} ms, median {:7.2}; project {:6.2}, sort {:6.2}, bin {:6.2}, blend {:6.2}; {} visible, {} pairs",
+        scene.name,
+        ms(*least),
+        ms(frames[frames.len() / 2].0),
+        ms(t.project),
+        ms(t.sort),
+        ms(t.bin),
+        ms(t.blend),
+        stats.visible,
+        stats.pairs,
+    );
+    Ok(())
+}
+
+fn main() -> Result<()> {
+    let mut threads = 0;
+    let mut names = Vec::new();
+    let mut args = std::env::args().skip(1).filter(|arg| arg != "--bench");
+    while let Some(arg) = args.next() {
+        match arg.as_str() {
+            "--threads" => threads = args.next().and_then(|n| n.parse().ok()).unwrap_or(0),
+            name => names.push(name.to_owned()),
+        }
+    }
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| Error::Usage(e.to_string()))?;
+    println!("{} threads", pool.current_num_threads());
+    for scene in &SCENES {
+        if names.is_empty() || names.iter().any(|n| n == scene.name) {
+            let gaussians = body(scene.count);
+            pool.install(|| measure(scene, &gaussians))?;
+        }
+    }
+    Ok(())
+}
