@@ -1,14 +1,15 @@
 //! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes. Least and median time of
 //! the whole frame, and the stages of the fastest.
 //!
-//! `raster [--threads N] [SCENE…]`, a scene being a name of [`SCENES`].
+//! `raster [--threads N] [--isa NAME] [SCENE…]`, a scene being a name of [`SCENES`].
 
 use std::time::{Duration, Instant};
 
 use b2p::gaussians::Gaussians;
-use b2p::pixels::{Background, Renderer, Stats};
+use b2p::pixels::{Background, Image, Renderer, Stats};
 use b2p::projection::Camera;
 use b2p::{Error, Limits, Result};
+use b2p_kernels::Isa;
 
 struct Scene {
     name: &'static str,
@@ -160,17 +161,19 @@ fn facing([x, y, z]: [f64; 3]) -> [f32; 4] {
     q.map(|v| (v / norm) as f32)
 }
 
-fn measure(scene: &Scene, gaussians: &Gaussians) -> Result<()> {
+fn measure(isa: Isa, scene: &Scene, gaussians: &Gaussians) -> Result<()> {
     let (width, height) = scene.size;
     let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, width, height)?;
-    let mut renderer = Renderer::default();
+    let mut renderer = Renderer::new(isa);
+    let mut image = Image::default();
     let mut frame = || -> Result<(Duration, Stats)> {
         let start = Instant::now();
-        let (_, stats) = renderer.render(
+        let stats = renderer.render_into(
             gaussians,
             &camera,
             Background::WHITE,
             &Limits::unlimited(),
+            &mut image,
         )?;
         Ok((start.elapsed(), stats))
     };
@@ -185,13 +188,14 @@ fn measure(scene: &Scene, gaussians: &Gaussians) -> Result<()> {
     let (least, stats) = &frames[0];
     let t = stats.times;
     println!(
-        "{:>5}: {:7.2} ms, median {:7.2}; project {:6.2}, sort {:6.2}, bin {:6.2}, blend {:6.2}; {} visible, {} pairs",
+        "{:>7} {:>5}: {:7.2} ms, median {:7.2}; project {:6.2}, bin {:6.2}, sort {:6.2}, blend {:6.2}; {} visible, {} pairs",
+        isa.to_string(),
         scene.name,
         ms(*least),
         ms(frames[frames.len() / 2].0),
         ms(t.project),
-        ms(t.sort),
         ms(t.bin),
+        ms(t.sort),
         ms(t.blend),
         stats.visible,
         stats.pairs,
@@ -201,11 +205,19 @@ fn measure(scene: &Scene, gaussians: &Gaussians) -> Result<()> {
 
 fn main() -> Result<()> {
     let mut threads = 0;
+    let mut isas = Isa::available();
     let mut names = Vec::new();
     let mut args = std::env::args().skip(1).filter(|arg| arg != "--bench");
     while let Some(arg) = args.next() {
         match arg.as_str() {
             "--threads" => threads = args.next().and_then(|n| n.parse().ok()).unwrap_or(0),
+            "--isa" => {
+                isas = args
+                    .next()
+                    .and_then(|n| n.parse().ok())
+                    .into_iter()
+                    .collect()
+            }
             name => names.push(name.to_owned()),
         }
     }
@@ -217,7 +229,9 @@ fn main() -> Result<()> {
     for scene in &SCENES {
         if names.is_empty() || names.iter().any(|n| n == scene.name) {
             let gaussians = body(scene.count);
-            pool.install(|| measure(scene, &gaussians))?;
+            for &isa in &isas {
+                pool.install(|| measure(isa, scene, &gaussians))?;
+            }
         }
     }
     Ok(())

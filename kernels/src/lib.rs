@@ -25,6 +25,7 @@ mod tile;
 
 pub mod ceiling;
 pub mod reference;
+pub mod splat;
 
 pub use convert::{to_f16, to_f32};
 pub use exact::{ExactConv, LIMIT, Requantise};

@@ -8,11 +8,11 @@ use crate::error::{Error, Result};
 /// A picture in floats: premultiplied red, green, blue, and alpha, row by row from the top left.
 ///
 /// The colours are display-referred (sRGB) values, blended as they are; they may lie outside `[0, 1]` if Gaussians' colours do.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Image {
-    /// Pixels in a row, at least 1.
+    /// Pixels in a row, at least 1 once something is drawn.
     pub width: u32,
-    /// Rows, at least 1.
+    /// Rows, at least 1 once something is drawn.
     pub height: u32,
     /// `width·height` pixels.
     pub pixels: Vec<[f32; 4]>,

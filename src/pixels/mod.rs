@@ -22,16 +22,17 @@
 //! picture is the same to the bit for any number of threads: a tile is drawn by one thread, in an order that is a function of the
 //! input alone. Work runs on the rayon pool that the caller is in.
 
-mod blend;
-mod exp2;
 mod image;
 #[doc(hidden)]
 pub mod reference;
 #[cfg(test)]
 mod tests;
 
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
+use b2p_kernels::Isa;
+use b2p_kernels::splat::Tile;
 use rayon::prelude::*;
 
 pub use image::{Image, box_half};
@@ -39,8 +40,8 @@ pub use image::{Image, box_half};
 use crate::error::Result;
 use crate::gaussians::Gaussians;
 use crate::limits::Limits;
-use crate::projection::{Camera, Dropped, Ellipses, project};
-use crate::tiles::{Lists, Order, Rows, TILE};
+use crate::projection::{Camera, Dropped, Ellipses};
+use crate::tiles::{Bins, Count, Grid, Nearest, Part, TILE};
 
 /// What is seen where the Gaussians let light through.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -57,13 +58,11 @@ impl Background {
     /// Black.
     pub const BLACK: Background = Background::Colour([0.0; 3]);
 
-    /// The final pixel over this background, from premultiplied colour and transmittance.
-    fn behind(self, [r, g, b, through]: [f32; 4]) -> [f32; 4] {
+    /// What each channel takes of the transmittance, beyond what the Gaussians give it, and alpha beyond 1.
+    fn behind(self) -> [f32; 4] {
         match self {
-            Background::Transparent => [r, g, b, 1.0 - through],
-            Background::Colour([br, bg, bb]) => {
-                [r + through * br, g + through * bg, b + through * bb, 1.0]
-            }
+            Background::Transparent => [0.0, 0.0, 0.0, -1.0],
+            Background::Colour([r, g, b]) => [r, g, b, 0.0],
         }
     }
 }
@@ -75,23 +74,25 @@ pub struct Stats {
     pub visible: u64,
     /// Gaussians not drawn, and why.
     pub dropped: Dropped,
-    /// Pairs of a Gaussian and a tile of 16×16 pixels that it may touch.
+    /// Pairs of a Gaussian and a tile of 32×32 pixels that it may touch.
     pub pairs: u64,
+    /// Pixels that something was drawn on.
+    pub touched: u64,
     /// Wall time of each stage.
     pub times: Times,
 }
 
 /// Wall time by stage.
 ///
-/// The last two run as one, row of tiles by row: their time is divided in proportion to what the threads spent on each.
+/// The last two run as one, tile by tile: their time is divided in proportion to what the threads spent on each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Times {
     /// From Gaussians to ellipses.
     pub project: Duration,
-    /// Into the order of drawing.
-    pub sort: Duration,
     /// Into the lists of the tiles.
     pub bin: Duration,
+    /// Of each tile, into narrow ranges of depth; in order within these only as they are drawn.
+    pub sort: Duration,
     /// Into pixels.
     pub blend: Duration,
 }
@@ -104,11 +105,30 @@ impl Times {
 }
 
 /// Draws pictures one after the other, reusing its memory.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Renderer {
+    isa: Isa,
     ellipses: Ellipses,
-    order: Order,
-    rows: Rows,
+    counts: Vec<Count>,
+    bins: Bins,
+    /// One for each thread.
+    desks: Vec<Mutex<Desk>>,
+}
+
+/// What a thread needs to draw tiles.
+#[derive(Debug, Default)]
+struct Desk {
+    nearest: Nearest,
+    tile: Tile,
+    touched: u64,
+    sorting: Duration,
+    blending: Duration,
+}
+
+impl Default for Renderer {
+    fn default() -> Self {
+        Renderer::new(Isa::detect())
+    }
 }
 
 /// One picture; [`Renderer::render`] for many.
@@ -125,11 +145,21 @@ pub fn render(
 }
 
 impl Renderer {
+    /// With the instructions of `isa`; [`Renderer::default`] takes the best that the machine has.
+    pub fn new(isa: Isa) -> Self {
+        Renderer {
+            isa,
+            ellipses: Ellipses::default(),
+            counts: Vec::new(),
+            bins: Bins::default(),
+            desks: Vec::new(),
+        }
+    }
+
     /// One picture.
     ///
     /// # Errors
-    /// [`crate::Error::Usage`] if the camera is none, the background is not finite, or the arrays of `gaussians` differ in length;
-    /// [`crate::Error::LimitExceeded`] if the picture or the memory to draw it is over the `limits`.
+    /// As [`Renderer::render_into`].
     pub fn render(
         &mut self,
         gaussians: &Gaussians,
@@ -137,6 +167,24 @@ impl Renderer {
         background: Background,
         limits: &Limits,
     ) -> Result<(Image, Stats)> {
+        let mut image = Image::default();
+        let stats = self.render_into(gaussians, camera, background, limits, &mut image)?;
+        Ok((image, stats))
+    }
+
+    /// One picture into `image`, whose size becomes the camera's. Its memory is reused, and after an error it holds nothing sensible.
+    ///
+    /// # Errors
+    /// [`crate::Error::Usage`] if the camera is none, the background is not finite, or the arrays of `gaussians` differ in length;
+    /// [`crate::Error::LimitExceeded`] if the picture or the memory to draw it is over the `limits`.
+    pub fn render_into(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: Background,
+        limits: &Limits,
+        image: &mut Image,
+    ) -> Result<Stats> {
         camera.check()?;
         if let Background::Colour(c) = background
             && !c.iter().all(|x| x.is_finite())
@@ -146,85 +194,119 @@ impl Renderer {
         }
         let count = u64::from(camera.width) * u64::from(camera.height);
         limits.check_pixels("pixels of the picture", count)?;
-        let per_gaussian = Ellipses::BYTES + Order::BYTES;
-        let bytes = count * size_of::<[f32; 4]>() as u64 + gaussians.len() as u64 * per_gaussian;
+        let grid = Grid::new(camera.width, camera.height);
+        let bytes = count * size_of::<[f32; 4]>() as u64
+            + gaussians.len() as u64 * Ellipses::BYTES
+            + grid.bytes(Ellipses::runs_of(gaussians.len()));
         limits.check_bytes("bytes to draw the picture", bytes)?;
 
         let mut times = Times::default();
         let mut clock = Instant::now();
         let mut lap = || std::mem::replace(&mut clock, Instant::now()).elapsed();
-        let dropped = project(gaussians, camera, &mut self.ellipses)?;
+        let dropped = self.ellipses.project(
+            gaussians,
+            camera,
+            self.isa,
+            &mut self.counts,
+            |count, ellipses| count.count(grid, ellipses),
+        )?;
         times.project = lap();
-        self.order.sort(&self.ellipses.depth)?;
-        times.sort = lap();
-        let bounds = &self.ellipses.bounds;
-        self.rows
-            .deal(&self.order, bounds, camera.height, bytes, limits)?;
-        let dealt = lap();
-        let (image, [binning, blending]) = self.draw(camera, background);
-        let drawn = lap();
-        let share = binning.as_secs_f64() / (binning + blending).as_secs_f64().max(1e-9);
-        times.bin = dealt + drawn.mul_f64(share);
-        times.blend = drawn.mul_f64(1.0 - share);
-        let stats = Stats {
+        let pairs = self.bins.plan(grid, &self.counts, bytes, limits)?;
+        times.bin = lap();
+
+        let size = [camera.width, camera.height];
+        [image.width, image.height] = size;
+        image.pixels.resize(count as usize, [0.0; 4]);
+        self.desks
+            .resize_with(rayon::current_num_threads(), Mutex::default);
+        let mut part = self.bins.next(None);
+        while let Some(now) = part {
+            self.bins
+                .fill(now.clone(), &self.ellipses, &mut self.counts);
+            times.bin += lap();
+            let [sorting, blending] = self.draw(&now, size, background, &mut image.pixels);
+            let drawn = lap();
+            let share = sorting.as_secs_f64() / (sorting + blending).as_secs_f64().max(1e-9);
+            times.sort += drawn.mul_f64(share);
+            times.blend += drawn.mul_f64(1.0 - share);
+            part = self.bins.next(Some(&now));
+        }
+        let touched = |desk: &mut Mutex<Desk>| {
+            let desk = desk.get_mut().unwrap_or_else(|e| e.into_inner());
+            std::mem::take(&mut desk.touched)
+        };
+        Ok(Stats {
+            touched: self.desks.iter_mut().map(touched).sum(),
             visible: self.ellipses.len() as u64,
             dropped,
-            pairs: self.rows.pairs(),
+            pairs,
             times,
-        };
-        Ok((image, stats))
+        })
     }
 
-    /// The picture, and the threads' time for the tiles' lists and for the pixels.
-    fn draw(&self, camera: &Camera, background: Background) -> (Image, [Duration; 2]) {
-        let (width, height) = (camera.width as usize, camera.height as usize);
-        let mut image = Image {
-            width: camera.width,
-            height: camera.height,
-            pixels: vec![[0.0; 4]; width * height],
-        };
-        let times = image
-            .pixels
-            .par_chunks_mut(TILE as usize * width)
-            .enumerate()
-            .map_init(Lists::default, |lists, (row, band)| {
-                let start = Instant::now();
-                lists.deal(self.rows.row(row), &self.ellipses.bounds, camera.width);
-                let dealt = Instant::now();
-                for column in 0..width.div_ceil(TILE as usize) {
-                    self.draw_tile(lists.tile(column), [column, row], width, background, band);
+    /// Draws a part of the picture; returns the threads' time for sorting and for the pixels.
+    fn draw(
+        &self,
+        part: &Part,
+        size: [u32; 2],
+        background: Background,
+        pixels: &mut [[f32; 4]],
+    ) -> [Duration; 2] {
+        let width = size[0] as usize;
+        let band = TILE as usize * width;
+        let end = (part.rows.end * band).min(pixels.len());
+        pixels[part.rows.start * band..end]
+            .par_chunks_mut(band)
+            .zip(part.rows.clone())
+            .with_max_len(1)
+            .for_each(|(band, row)| {
+                let thread = rayon::current_thread_index().unwrap_or(0);
+                // Only this thread uses this desk, and a panic would have ended the drawing.
+                let mut desk = self.desks[thread].lock().unwrap_or_else(|e| e.into_inner());
+                for column in part.columns.clone() {
+                    self.draw_tile([column, row], size, background, &mut desk, band);
                 }
-                [dealt - start, dealt.elapsed()]
-            })
-            .reduce(Default::default, |a, b| [a[0] + b[0], a[1] + b[1]]);
-        (image, times)
+            });
+        self.desks.iter().fold(Default::default(), |sum, desk| {
+            let desk = &mut *desk.lock().unwrap_or_else(|e| e.into_inner());
+            let times = [&mut desk.sorting, &mut desk.blending].map(std::mem::take);
+            [sum[0] + times[0], sum[1] + times[1]]
+        })
     }
 
     /// `band`: the pixels of the tile's row of tiles.
     fn draw_tile(
         &self,
-        ids: &[u32],
         [column, row]: [usize; 2],
-        width: usize,
+        size: [u32; 2],
         background: Background,
+        desk: &mut Desk,
         band: &mut [[f32; 4]],
     ) {
-        let side = TILE as usize;
+        let (side, width) = (TILE as usize, size[0] as usize);
         let left = column * side;
         let columns = left..(left + side).min(width);
-        if ids.is_empty() {
-            let clear = background.behind([0.0, 0.0, 0.0, 1.0]);
+        let entries = self.bins.tile(row, column);
+        if entries.is_empty() {
+            let [r, g, b, a] = background.behind();
+            let clear = [r, g, b, 1.0 + a];
             for line in band.chunks_exact_mut(width) {
                 line[columns.clone()].fill(clear);
             }
             return;
         }
-        let mut tile = blend::Tile::new();
-        tile.blend([left as u32, (row * side) as u32], ids, &self.ellipses);
-        for (y, line) in band.chunks_exact_mut(width).enumerate() {
-            for (x, pixel) in line[columns.clone()].iter_mut().enumerate() {
-                *pixel = background.behind(tile.pixel(x, y));
-            }
-        }
+        let start = Instant::now();
+        desk.nearest.take(entries);
+        let sorted = Instant::now();
+        desk.tile.start([left as u32, (row * side) as u32], size);
+        desk.nearest
+            .each(|keys| desk.tile.blend(self.isa, keys, self.ellipses.all()));
+        let behind = background.behind();
+        let touched = desk
+            .tile
+            .write(self.isa, behind, &mut band[left..], width, columns.len());
+        desk.touched += u64::from(touched);
+        desk.sorting += sorted - start;
+        desk.blending += sorted.elapsed();
     }
 }

@@ -24,10 +24,15 @@ impl Cutoffs {
         alpha: 0.0,
         through: 1e-9,
     };
+    /// What defines a picture: an α below 1/255 is none.
+    pub const DEFINITION: Cutoffs = Cutoffs {
+        alpha: 1.0 / 255.0,
+        ..Cutoffs::NONE
+    };
     /// Those of the renderer.
     pub const RENDERER: Cutoffs = Cutoffs {
         alpha: 1.0 / 255.0,
-        through: 1e-4,
+        through: 1.0 / 1024.0,
     };
 }
 

@@ -2,62 +2,142 @@
 //!
 //! A Gaussian with axes `R·S` is seen as the image of its centre and the 2×2 covariance `M·Mᵀ + 0.3·I`, where `M = J·W·R·S` and `J`
 //! is the derivative of the pinhole projection at the centre (EWA splatting; 0.3 px² is the pixel's own blur). The covariance is
-//! never formed and inverted, which loses a long thin ellipse to cancellation in single precision; `ellipse.rs` has the formulas.
+//! never formed and inverted, which loses a long thin ellipse to cancellation in single precision; the kernel has the formulas
+//! ([`b2p_kernels::splat`]).
 //!
-//! [`project`] is the sole gate of visibility: its conditions are phrased so that NaN fails them, and everything after it may
-//! assume finite numbers, a depth beyond the near plane, and at least one pixel.
+//! [`Ellipses::project`] is the sole gate of visibility: its conditions are phrased so that NaN fails them, and everything after it
+//! may assume finite numbers, a depth beyond the near plane, and at least one pixel.
 
 mod camera;
-mod ellipse;
+#[cfg(test)]
+mod reference;
 
+use std::ops::Range;
+
+use b2p_kernels::Isa;
+use b2p_kernels::splat::{self, Cloud, Tally, View};
 use rayon::prelude::*;
 
+pub use b2p_kernels::splat::{ALPHA_FLOOR, BLUR, Bounds, Ellipse, MAX_SCALE};
 pub use camera::Camera;
-pub use ellipse::{Bounds, Ellipse};
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gaussians::Gaussians;
 
-/// Variance that every ellipse is widened by, in px².
-pub const BLUR: f32 = 0.3;
-/// The least opacity that is drawn.
-pub const ALPHA_FLOOR: f32 = 1.0 / 255.0;
-/// Standard deviations above this many cube-frame units are drawn as this: thousands of cubes, constant over any picture.
-pub const MAX_SCALE: f32 = 1e4;
+/// Gaussians are projected in runs of at least so many, and at most [`RUNS`] runs a thread.
+const LEAST_RUN: usize = 2048;
+const RUNS: usize = 4;
+/// The most runs: what is kept for each of them is kept for every tile.
+const MOST_RUNS: usize = 64;
 
-/// Gaussians that one task projects.
-const BLOCK: usize = 4096;
-
-/// The visible Gaussians of a picture, in the order of the input; one array for each later step.
-#[derive(Debug, Clone, Default, PartialEq)]
+/// The visible Gaussians of a picture, in the order of the input, in runs with gaps between.
+#[derive(Debug, Default)]
 pub struct Ellipses {
-    /// Distance along the viewing direction, for the order of drawing. Positive and finite.
-    pub depth: Vec<f32>,
-    /// The pixels that may be touched, for the tiles.
-    pub bounds: Vec<Bounds>,
-    /// Shape and colour, for the pixels.
-    pub shape: Vec<Ellipse>,
+    all: Vec<Ellipse>,
+    runs: Vec<Run>,
+    visible: usize,
+}
+
+#[derive(Debug, Default, Clone, Copy)]
+struct Run {
+    first: usize,
+    tally: Tally,
 }
 
 impl Ellipses {
-    /// Bytes per ellipse.
-    pub const BYTES: u64 = (size_of::<f32>() + size_of::<Bounds>() + size_of::<Ellipse>()) as u64;
+    /// Bytes per Gaussian.
+    pub const BYTES: u64 = size_of::<Ellipse>() as u64;
 
     /// How many.
     pub fn len(&self) -> usize {
-        self.depth.len()
+        self.visible
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.depth.is_empty()
+        self.visible == 0
     }
 
-    fn resize(&mut self, count: usize) {
-        self.depth.resize(count, 0.0);
-        self.bounds.resize(count, Bounds::default());
-        self.shape.resize(count, Ellipse::default());
+    /// In how many runs as many Gaussians are projected.
+    pub fn runs_of(gaussians: usize) -> usize {
+        gaussians.div_ceil(run_length(gaussians))
     }
+
+    /// All of them, and what stands in the gaps: only the places in [`Ellipses::runs`] hold what this picture shows.
+    pub fn all(&self) -> &[Ellipse] {
+        &self.all
+    }
+
+    /// The runs without gaps.
+    pub fn runs(&self) -> impl IndexedParallelIterator<Item = Range<usize>> {
+        self.runs
+            .par_iter()
+            .map(|run| run.first..run.first + run.tally.visible as usize)
+    }
+
+    /// Projects, reusing memory; counts what is not visible. As soon as a run is done, its ellipses are shown to `look`, together
+    /// with a state of the run's own: `states` is given one for each run.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the camera is none ([`Camera::check`]) or the arrays of `gaussians` differ in length;
+    /// [`Error::Unsupported`] if there are 2³² or more.
+    pub fn project<S: Default + Send>(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        isa: Isa,
+        states: &mut Vec<S>,
+        look: impl Fn(&mut S, &[Ellipse]) + Sync,
+    ) -> Result<Dropped> {
+        camera.check()?;
+        gaussians.check_lengths()?;
+        let count = gaussians.len();
+        if u32::try_from(count).is_err() {
+            return Err(Error::Unsupported {
+                what: "a picture of 2^32 or more Gaussians",
+                detail: format!("there are {count}"),
+            });
+        }
+        let view = view(camera);
+        let length = run_length(count);
+        self.all.resize(count, Ellipse::default());
+        self.runs.clear();
+        self.runs.resize(count.div_ceil(length), Run::default());
+        states.resize_with(self.runs.len(), S::default);
+        self.runs
+            .par_iter_mut()
+            .zip(self.all.par_chunks_mut(length))
+            .zip(states)
+            .enumerate()
+            .with_max_len(1)
+            .for_each(|(i, ((run, ellipses), state))| {
+                let first = i * length;
+                let end = first + ellipses.len();
+                let cloud = Cloud {
+                    position: &gaussians.position[first..end],
+                    scale: &gaussians.scale[first..end],
+                    rotation: &gaussians.rotation[first..end],
+                    opacity: &gaussians.opacity[first..end],
+                    colour: &gaussians.colour[first..end],
+                };
+                let tally = splat::project(isa, &view, cloud, first as u32, ellipses);
+                *run = Run { first, tally };
+                look(state, &ellipses[..tally.visible as usize]);
+            });
+        self.visible = self.runs.iter().map(|run| run.tally.visible as usize).sum();
+        Ok(self.runs.iter().map(|run| Dropped::from(run.tally)).fold(
+            Dropped::default(),
+            |mut sum, run| {
+                sum.add(run);
+                sum
+            },
+        ))
+    }
+}
+
+fn run_length(gaussians: usize) -> usize {
+    let most = (RUNS * rayon::current_num_threads()).min(MOST_RUNS);
+    gaussians.div_ceil(most).max(LEAST_RUN).next_multiple_of(16)
 }
 
 /// How many Gaussians are not drawn, by the first reason that applies.
@@ -88,63 +168,32 @@ impl Dropped {
         self.behind += other.behind;
         self.outside += other.outside;
     }
+}
 
-    fn count(&mut self, reason: ellipse::Invisible) {
-        match reason {
-            ellipse::Invisible::NotFinite => self.not_finite += 1,
-            ellipse::Invisible::NoRotation => self.no_rotation += 1,
-            ellipse::Invisible::TooFaint => self.too_faint += 1,
-            ellipse::Invisible::Behind => self.behind += 1,
-            ellipse::Invisible::Outside => self.outside += 1,
+impl From<Tally> for Dropped {
+    fn from(tally: Tally) -> Self {
+        Dropped {
+            not_finite: tally.not_finite.into(),
+            no_rotation: tally.no_rotation.into(),
+            too_faint: tally.too_faint.into(),
+            behind: tally.behind.into(),
+            outside: tally.outside.into(),
         }
     }
 }
 
-/// Projects into `ellipses`, whose memory is reused; counts what is not visible.
-///
-/// # Errors
-/// [`crate::Error::Usage`] if the camera is none ([`Camera::check`]) or the arrays of `gaussians` differ in length.
-pub fn project(gaussians: &Gaussians, camera: &Camera, ellipses: &mut Ellipses) -> Result<Dropped> {
-    camera.check()?;
-    gaussians.check_lengths()?;
-    let view = ellipse::View::new(camera);
-    ellipses.resize(gaussians.len());
-
-    // Each block gathers its visible ellipses at its start …
-    let blocks: Vec<(usize, Dropped)> = ellipses
-        .depth
-        .par_chunks_mut(BLOCK)
-        .zip(ellipses.bounds.par_chunks_mut(BLOCK))
-        .zip(ellipses.shape.par_chunks_mut(BLOCK))
-        .enumerate()
-        .map(|(block, ((depth, bounds), shape))| {
-            let first = block * BLOCK;
-            let (mut kept, mut dropped) = (0, Dropped::default());
-            for i in first..first + depth.len() {
-                match view.see(gaussians, i) {
-                    Ok(seen) => {
-                        (depth[kept], bounds[kept], shape[kept]) = seen;
-                        kept += 1;
-                    }
-                    Err(reason) => dropped.count(reason),
-                }
-            }
-            (kept, dropped)
-        })
-        .collect();
-
-    // … and the gaps are closed.
-    let (mut visible, mut dropped) = (0, Dropped::default());
-    for (block, (kept, lost)) in blocks.into_iter().enumerate() {
-        let from = block * BLOCK;
-        if from != visible {
-            ellipses.depth.copy_within(from..from + kept, visible);
-            ellipses.bounds.copy_within(from..from + kept, visible);
-            ellipses.shape.copy_within(from..from + kept, visible);
-        }
-        visible += kept;
-        dropped.add(lost);
+/// The camera as the kernel has it.
+fn view(camera: &Camera) -> View {
+    let rotation = camera.pose.matrix3;
+    View {
+        rotation: std::array::from_fn(|i| rotation.row(i).into()),
+        translation: camera.pose.translation.into(),
+        near: camera.near,
+        focal: [camera.fx, camera.fy],
+        centre: [camera.cx, camera.cy],
+        slopes: camera.slope_ranges(),
+        size: [camera.width, camera.height],
+        orthographic: false,
+        compensated: false,
     }
-    ellipses.resize(visible);
-    Ok(dropped)
 }

@@ -1,277 +1,257 @@
 //! Which ellipses touch which square of the picture, nearest first.
 //!
-//! The order of drawing is sorted once ([`Order`]), by the bits of the depth, which for positive floats is the order of the depths,
-//! without loss, and then by index. The ellipses are
-//! then dealt out, keeping that order, to rows of tiles ([`Rows`]), and within a row to its tiles ([`Lists`]). Only the lists of
-//! the rows being drawn exist at a time: an ellipse that fills the picture costs one entry per row of tiles, and one per tile
-//! only while a row is drawn.
+//! The ellipses are dealt out to the tiles whose squares their bounds touch ([`Bins`]): counted run by run while they are projected,
+//! then written, each as its depth and its place, in the order of the input. Each tile is put in the order of drawing only when it
+//! is drawn, and only as far as light gets ([`Nearest`]): by the bits of the depth, which for positive floats is the order of the
+//! depths, without loss, and then by place. So nothing depends on the order in which the threads write.
+//!
+//! An ellipse that fills the picture costs an entry for each tile: where there are too many, the picture is drawn in parts.
 
-use crate::error::{Error, Result};
+mod nearest;
+#[cfg(test)]
+mod tests;
+
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use rayon::prelude::*;
+
+pub use b2p_kernels::splat::TILE;
+pub use nearest::Nearest;
+
+use crate::error::Result;
 use crate::limits::Limits;
-use crate::projection::Bounds;
+use crate::projection::{Bounds, Ellipse, Ellipses};
 
-/// Side of a tile in pixels.
-pub const TILE: u32 = 16;
+/// Entries of the tiles that are drawn in one part, if memory allows; more only where a single tile has more.
+const MOST_ENTRIES: u64 = 1 << 25;
 
-/// Indices of ellipses, the nearest first; ties by index.
+/// How many ellipses of one run touch each tile.
 #[derive(Debug, Default)]
-pub struct Order {
-    /// The depth's bits above, the index below.
-    keys: Vec<u64>,
-    sorted: Vec<u64>,
-}
-
-/// Bits of a depth that one pass of the sort looks at: 4096 counters fit the first cache.
-const DIGIT: u32 = 12;
-
-impl Order {
-    /// Bytes per ellipse.
-    pub const BYTES: u64 = 2 * size_of::<u64>() as u64;
-
-    /// Sorts `depth`, whose numbers must be positive; the memory is reused.
-    ///
-    /// # Errors
-    /// [`Error::Unsupported`] if there are 2³² or more.
-    pub fn sort(&mut self, depth: &[f32]) -> Result<()> {
-        if u32::try_from(depth.len()).is_err() {
-            return Err(Error::Unsupported {
-                what: "a picture of 2^32 or more visible Gaussians",
-                detail: format!("there are {}", depth.len()),
-            });
-        }
-        let bits = |z: &f32| z.to_bits();
-        let least = depth.iter().map(bits).min().unwrap_or(0);
-        let span = depth.iter().map(bits).max().unwrap_or(0) - least;
-        self.keys.clear();
-        let key = |(i, z): (usize, &f32)| u64::from(z.to_bits() - least) << 32 | i as u64;
-        self.keys.extend(depth.iter().enumerate().map(key));
-        self.sorted.resize(depth.len(), 0);
-        // A radix sort, the least digit first, of the bits in which the depths differ. It is stable, and the indices ascend.
-        for shift in (0..u32::BITS - span.leading_zeros()).step_by(DIGIT as usize) {
-            let digit = |key: u64| (key >> (32 + shift)) as usize & ((1 << DIGIT) - 1);
-            let mut next = [0u32; 1 << DIGIT];
-            for &key in &self.keys {
-                next[digit(key)] += 1;
-            }
-            let mut total = 0;
-            for next in &mut next {
-                total += std::mem::replace(next, total);
-            }
-            for &key in &self.keys {
-                let next = &mut next[digit(key)];
-                self.sorted[*next as usize] = key;
-                *next += 1;
-            }
-            std::mem::swap(&mut self.keys, &mut self.sorted);
-        }
-        Ok(())
-    }
-
-    /// The indices.
-    pub fn iter(&self) -> impl ExactSizeIterator<Item = u32> {
-        self.keys.iter().map(|&key| key as u32)
-    }
-}
-
-/// For every row of tiles, the ellipses that touch it, in the order of drawing.
-#[derive(Debug, Default)]
-pub struct Rows {
-    /// Row `r` holds `ids[starts[r]..starts[r + 1]]`.
-    starts: Vec<usize>,
-    ids: Vec<u32>,
+pub struct Count {
+    /// One row and one column more than there are tiles: first, where counts begin and end; then counts; then where the run's next
+    /// entry goes.
+    tiles: Vec<u32>,
     pairs: u64,
 }
 
-impl Rows {
-    /// Deals the ellipses out to the rows of tiles of a picture `height` pixels high; the memory is reused.
+/// A picture's tiles.
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+pub struct Grid {
+    /// Tiles side by side.
+    pub columns: usize,
+    /// Rows of tiles.
+    pub rows: usize,
+}
+
+impl Grid {
+    /// For a picture of `width` × `height` pixels.
+    pub fn new(width: u32, height: u32) -> Self {
+        Grid {
+            columns: width.div_ceil(TILE) as usize,
+            rows: height.div_ceil(TILE) as usize,
+        }
+    }
+
+    /// Bytes of the counts of as many runs.
+    pub fn bytes(&self, runs: usize) -> u64 {
+        let tiles = (self.columns as u64 + 1) * (self.rows as u64 + 1);
+        tiles * (runs as u64 * size_of::<u32>() as u64 + size_of::<u64>() as u64)
+    }
+}
+
+impl Count {
+    /// Counts the ellipses of a run. Each is noted at the corners of what it touches; running sums then give every tile's count.
+    pub fn count(&mut self, grid: Grid, ellipses: &[Ellipse]) {
+        let stride = grid.columns + 1;
+        self.tiles.clear();
+        self.tiles.resize(stride * (grid.rows + 1), 0);
+        self.pairs = 0;
+        for ellipse in ellipses {
+            let [x, y] = touched(&ellipse.bounds);
+            self.pairs += x.len() as u64 * y.len() as u64;
+            for (row, step) in [(y.start, 1), (y.end, u32::MAX)] {
+                let row = &mut self.tiles[row * stride..][..stride];
+                row[x.start] = row[x.start].wrapping_add(step);
+                row[x.end] = row[x.end].wrapping_sub(step);
+            }
+        }
+        for row in self.tiles.chunks_exact_mut(stride) {
+            let mut sum = 0u32;
+            for tile in row {
+                sum = sum.wrapping_add(*tile);
+                *tile = sum;
+            }
+        }
+        for i in stride..self.tiles.len() {
+            self.tiles[i] = self.tiles[i].wrapping_add(self.tiles[i - stride]);
+        }
+    }
+}
+
+/// Tiles that are drawn together: whole rows, or some of one row.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Part {
+    /// Rows of tiles.
+    pub rows: Range<usize>,
+    /// Columns of tiles.
+    pub columns: Range<usize>,
+}
+
+/// For every tile of a part, its ellipses, in no order.
+#[derive(Debug, Default)]
+pub struct Bins {
+    grid: Grid,
+    /// How many ellipses touch each tile.
+    totals: Vec<u32>,
+    /// Tile `t` of the part holds `entries[starts[t]..starts[t + 1]]`, counted row by row from the part's first.
+    starts: Vec<usize>,
+    /// The depth's bits above, the place below. Atomic because threads write side by side, each entry once.
+    entries: Vec<AtomicU64>,
+    most: u64,
+    part: Option<Part>,
+}
+
+impl Bins {
+    /// Sums up the `counts` of the runs, and decides how much is drawn at once.
     ///
     /// # Errors
-    /// [`Error::LimitExceeded`] before anything is reserved, if `reserved` bytes, these entries, and the [`Lists`] of as many rows as
-    /// there are threads are together more than `limits` allow.
-    pub fn deal(
+    /// [`crate::Error::LimitExceeded`] before anything is reserved, if `reserved` bytes, the entries of the fullest tile, and room to
+    /// sort it in every thread, are together more than `limits` allow.
+    pub fn plan(
         &mut self,
-        order: &Order,
-        bounds: &[Bounds],
-        height: u32,
+        grid: Grid,
+        counts: &[Count],
         reserved: u64,
         limits: &Limits,
-    ) -> Result<()> {
-        let rows = height.div_ceil(TILE) as usize;
-        let mut counts = vec![(0, 0u64); rows];
-        for b in bounds {
-            let (left, right) = tiles(b.x0, b.x1);
-            let (first, end) = tiles(b.y0, b.y1);
-            for (entries, pairs) in &mut counts[first..end] {
-                *entries += 1;
-                *pairs += (right - left) as u64;
+    ) -> Result<u64> {
+        self.grid = grid;
+        self.totals.clear();
+        self.totals.resize(grid.columns * grid.rows, 0);
+        let rows = self.totals.par_chunks_mut(grid.columns).enumerate();
+        rows.for_each(|(row, totals)| {
+            for count in counts {
+                let run = &count.tiles[row * (grid.columns + 1)..];
+                for (total, tile) in totals.iter_mut().zip(run) {
+                    *total += tile;
+                }
             }
-        }
-        let mut entries = 0;
-        self.starts.clear();
-        self.starts.push(0);
-        for (count, _) in &counts {
-            entries += count;
-            self.starts.push(entries);
-        }
-        self.pairs = counts.iter().map(|(_, pairs)| pairs).sum();
-        let largest = counts.iter().map(|(_, pairs)| *pairs).max().unwrap_or(0);
-        let at_once = rayon::current_num_threads().min(rows) as u64;
-        let bytes = size_of::<u32>() as u64 * (entries as u64 + at_once * largest);
-        limits.check_bytes("bytes to draw the picture", reserved.saturating_add(bytes))?;
-        self.ids.resize(entries, 0);
-        let mut next = self.starts[..rows].to_vec();
-        for id in order.iter() {
-            let b = &bounds[id as usize];
-            let (first, end) = tiles(b.y0, b.y1);
-            for next in &mut next[first..end] {
-                self.ids[*next] = id;
-                *next += 1;
-            }
-        }
-        Ok(())
+        });
+        let fullest = u64::from(self.totals.iter().copied().max().unwrap_or(0));
+        let entry = size_of::<u64>() as u64;
+        let sorting = fullest * rayon::current_num_threads() as u64 * entry;
+        let reserved = reserved.saturating_add(sorting);
+        limits.check_bytes(
+            "bytes to draw the picture",
+            reserved.saturating_add(fullest * entry),
+        )?;
+        self.most = MOST_ENTRIES
+            .min((limits.max_bytes - reserved) / entry)
+            .max(fullest);
+        Ok(counts.iter().map(|count| count.pairs).sum())
     }
 
-    /// The ellipses of row `row`, nearest first.
-    pub fn row(&self, row: usize) -> &[u32] {
-        &self.ids[self.starts[row]..self.starts[row + 1]]
-    }
-
-    /// Pairs of an ellipse and a tile that it may touch, in the whole picture.
-    pub fn pairs(&self) -> u64 {
-        self.pairs
-    }
-}
-
-/// For every tile of one row, the ellipses that touch it, in the order of drawing.
-#[derive(Debug, Default)]
-pub struct Lists {
-    starts: Vec<usize>,
-    ids: Vec<u32>,
-    next: Vec<usize>,
-}
-
-impl Lists {
-    /// Deals the ellipses `row` out to the tiles of a picture `width` pixels wide; the memory is reused.
-    pub fn deal(&mut self, row: &[u32], bounds: &[Bounds], width: u32) {
-        let columns = width.div_ceil(TILE) as usize;
-        // Each ellipse is counted where it begins and discounted where it ends; running sums then give every tile's count.
-        self.next.clear();
-        self.next.resize(columns + 1, 0);
-        for &id in row {
-            let b = &bounds[id as usize];
-            let (first, end) = tiles(b.x0, b.x1);
-            self.next[first] = self.next[first].wrapping_add(1);
-            self.next[end] = self.next[end].wrapping_sub(1);
-        }
-        self.starts.clear();
-        self.starts.push(0);
-        let (mut count, mut total) = (0usize, 0usize);
-        for next in &mut self.next[..columns] {
-            count = count.wrapping_add(*next);
-            *next = total;
-            total += count;
-            self.starts.push(total);
-        }
-        self.ids.resize(total, 0);
-        for &id in row {
-            let b = &bounds[id as usize];
-            let (first, end) = tiles(b.x0, b.x1);
-            for next in &mut self.next[first..end] {
-                self.ids[*next] = id;
-                *next += 1;
-            }
-        }
-    }
-
-    /// The ellipses of tile `column`, nearest first.
-    pub fn tile(&self, column: usize) -> &[u32] {
-        &self.ids[self.starts[column]..self.starts[column + 1]]
-    }
-}
-
-/// The tiles that the pixels `first..end` (not empty) lie in.
-fn tiles(first: u32, end: u32) -> (usize, usize) {
-    ((first / TILE) as usize, end.div_ceil(TILE) as usize)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn order(depth: &[f32]) -> Order {
-        let mut order = Order::default();
-        order.sort(depth).unwrap();
-        order
-    }
-
-    fn bounds(x0: u32, x1: u32, y0: u32, y1: u32) -> Bounds {
-        Bounds { x0, y0, x1, y1 }
-    }
-
-    #[test]
-    fn the_nearest_comes_first_and_ties_keep_the_order_of_the_input() {
-        let depth = [2.0, 1.0, 1e6, 2.0, f32::MIN_POSITIVE, 1.0 + f32::EPSILON];
-        let ids: Vec<u32> = order(&depth).iter().collect();
-        assert_eq!(ids, [4, 1, 5, 0, 3, 2]);
-    }
-
-    #[test]
-    fn every_tile_lists_just_the_ellipses_whose_bounds_touch_it_nearest_first() {
-        // A small generator: the shapes need no quality, only variety.
-        let mut state = 1u32;
-        let mut random = |n: u32| {
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (state >> 8) % n
+    /// The part that follows `last`, or the first.
+    pub fn next(&self, last: Option<&Part>) -> Option<Part> {
+        let Grid { columns, rows } = self.grid;
+        let (mut row, mut column) = match last {
+            None => (0, 0),
+            Some(part) if part.columns.end < columns => (part.rows.start, part.columns.end),
+            Some(part) => (part.rows.end, 0),
         };
-        let (width, height) = (83, 50);
-        let bounds: Vec<Bounds> = (0..300)
-            .map(|_| {
-                let (x0, y0) = (random(width), random(height));
-                let (w, h) = (1 + random(width - x0), 1 + random(height - y0));
-                bounds(x0, x0 + w, y0, y0 + h)
-            })
-            .collect();
-        let depth: Vec<f32> = bounds.iter().map(|_| 1.0 + random(40) as f32).collect();
-        let order = order(&depth);
-        let mut rows = Rows::default();
-        rows.deal(&order, &bounds, height, 0, &Limits::default())
-            .unwrap();
-        let mut pairs = 0;
-        for row in 0..height.div_ceil(TILE) {
-            let mut lists = Lists::default();
-            lists.deal(rows.row(row as usize), &bounds, width);
-            for column in 0..width.div_ceil(TILE) {
-                let (x, y) = (column * TILE, row * TILE);
-                let expected: Vec<u32> = order
-                    .iter()
-                    .filter(|&id| {
-                        let b = &bounds[id as usize];
-                        b.x0 < x + TILE && b.x1 > x && b.y0 < y + TILE && b.y1 > y
-                    })
-                    .collect();
-                pairs += expected.len() as u64;
-                assert_eq!(lists.tile(column as usize), expected);
+        if row >= rows || columns == 0 {
+            return None;
+        }
+        let sum = |tiles: &[u32]| tiles.iter().copied().map(u64::from).sum::<u64>();
+        let (start, mut entries) = (row, 0);
+        if column == 0 {
+            while row < rows {
+                entries += sum(&self.totals[row * columns..][..columns]);
+                if entries > self.most {
+                    break;
+                }
+                row += 1;
+            }
+            if row > start {
+                return Some(Part {
+                    rows: start..row,
+                    columns: 0..columns,
+                });
             }
         }
-        assert_eq!(rows.pairs(), pairs);
+        let (first, mut entries) = (column, 0);
+        while column < columns {
+            entries += u64::from(self.totals[row * columns + column]);
+            if entries > self.most {
+                break;
+            }
+            column += 1;
+        }
+        Some(Part {
+            rows: row..row + 1,
+            columns: first..column,
+        })
     }
 
-    #[test]
-    fn lists_over_the_limit_are_refused_before_they_are_made() {
-        let bounds = vec![bounds(0, 160, 0, 16); 101];
-        let order = order(&[1.0; 101]);
-        // One entry of the only row, and ten of its tiles, each.
-        let needed = 101 * 11 * 4;
-        let deal = |reserved, max_bytes| {
-            let limits = Limits {
-                max_bytes,
-                ..Limits::default()
-            };
-            let mut rows = Rows::default();
-            rows.deal(&order, &bounds, 16, reserved, &limits)
-        };
-        deal(100, needed + 100).unwrap();
-        let error = deal(100, needed + 99).unwrap_err();
-        assert!(matches!(error, Error::LimitExceeded { needed: n, .. } if n == needed + 100));
+    /// Deals the ellipses out to the tiles of `part`; the memory is reused.
+    pub fn fill(&mut self, part: Part, ellipses: &Ellipses, counts: &mut [Count]) {
+        let Grid { columns, .. } = self.grid;
+        let (width, stride) = (part.columns.len(), columns + 1);
+        // Where each tile starts, and within it, each run.
+        self.starts.clear();
+        let mut next = 0;
+        for row in part.rows.clone() {
+            for column in part.columns.clone() {
+                self.starts.push(next);
+                let mut at = 0;
+                for count in counts.iter_mut() {
+                    let tile = &mut count.tiles[row * stride + column];
+                    at += std::mem::replace(tile, at);
+                }
+                next += at as usize;
+            }
+        }
+        self.starts.push(next);
+        if self.entries.len() < next {
+            self.entries.resize_with(next, AtomicU64::default);
+        }
+        let (starts, entries) = (&self.starts, &self.entries);
+        let all = ellipses.all();
+        ellipses
+            .runs()
+            .zip(counts)
+            .with_max_len(1)
+            .for_each(|(run, count)| {
+                let first = run.start;
+                for (i, ellipse) in all[run].iter().enumerate() {
+                    let key = u64::from(ellipse.depth.to_bits()) << 32 | (first + i) as u64;
+                    let [x, y] = touched(&ellipse.bounds);
+                    for row in y.start.max(part.rows.start)..y.end.min(part.rows.end) {
+                        let tiles = x.start.max(part.columns.start)..x.end.min(part.columns.end);
+                        for column in tiles {
+                            let next = &mut count.tiles[row * stride + column];
+                            let tile =
+                                (row - part.rows.start) * width + column - part.columns.start;
+                            entries[starts[tile] + *next as usize].store(key, Ordering::Relaxed);
+                            *next += 1;
+                        }
+                    }
+                }
+            });
+        self.part = Some(part);
     }
+
+    /// The ellipses of a tile of the part last filled.
+    pub fn tile(&self, row: usize, column: usize) -> &[AtomicU64] {
+        let Some(part) = &self.part else { return &[] };
+        let tile = (row - part.rows.start) * part.columns.len() + column - part.columns.start;
+        &self.entries[self.starts[tile]..self.starts[tile + 1]]
+    }
+}
+
+/// The columns and the rows of the tiles that `bounds` (not empty) touch.
+#[inline]
+fn touched(bounds: &Bounds) -> [Range<usize>; 2] {
+    let tiles = |first: u32, end: u32| (first / TILE) as usize..end.div_ceil(TILE) as usize;
+    [tiles(bounds.x0, bounds.x1), tiles(bounds.y0, bounds.y1)]
 }

@@ -54,6 +54,25 @@ fn a_surface_of_small_splats_is_close_to_the_reference() {
     assert_close(&scene, &orbit(70, 90));
 }
 
+/// As a decoder makes them: thin discs along a surface, a voxel wide.
+#[test]
+fn a_decoded_surface_is_close_to_the_reference_from_near_and_far() {
+    let discs = surface_splats(6000, 0.7, 0.03).into_iter().map(|s| {
+        let [x, y, z] = s.position.map(|x| x / 0.7);
+        Splat {
+            scale: [0.027, 0.033, 0.012],
+            rotation: [1.0 + z, -y, x, 0.0],
+            ..s
+        }
+    });
+    let scene = scene(discs);
+    for (i, radius) in [0.9, 1.3, 2.0, 3.0, 6.0, 20.0].into_iter().enumerate() {
+        let (azimuth, elevation) = (60.0 * i as f64, 25.0 * i as f64 - 60.0);
+        let camera = Camera::orbit(azimuth, elevation, radius, 45.0, 60, 50).unwrap();
+        assert_close(&scene, &camera);
+    }
+}
+
 #[test]
 fn an_off_centre_principal_point_is_close_to_the_reference() {
     let scene = scene(random_splats(7, 150));

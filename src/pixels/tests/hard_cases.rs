@@ -258,7 +258,7 @@ fn ten_thousand_splats_that_fill_the_picture_are_drawn_in_bounded_memory() {
     };
     let scene = scene((0..10_000).map(wall));
     let (image, stats) = draw_on(&scene, &camera, Background::BLACK);
-    assert_eq!(stats.pairs, 10_000 * 7 * 6);
+    assert_eq!(stats.pairs, 10_000 * 4 * 3);
     assert!(image.pixels.iter().all(|p| p[0] > 0.999 && p[0] <= 1.0));
 
     let limits = Limits {

@@ -1,6 +1,5 @@
 //! What may not change a picture, and sums that must come out.
 
-use super::super::Renderer;
 use super::*;
 
 #[test]

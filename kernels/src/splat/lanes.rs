@@ -1,0 +1,493 @@
+//! Several floats side by side.
+//!
+//! [`Lanes`] is what the splat kernels are written in. [`Plain`] is the portable one, and the reference of the others; `avx2.rs` and
+//! `avx512.rs` have those of x86. A kernel is one generic body, inlined into one function per instruction set ([`by_level`]).
+
+use super::Ellipse;
+
+/// A vector of `f32`, all operations lane by lane.
+///
+/// The least and the greatest are those of x86: the second argument if either is NaN. Comparisons with NaN are false.
+pub(super) trait Lanes: Copy {
+    /// How many lanes: a power of two, at most 16.
+    const COUNT: usize;
+    /// One truth per lane.
+    type Mask: Mask;
+    /// As many `f64`.
+    type Double: Double<Lanes = Self, Mask = Self::Mask>;
+
+    fn splat(x: f32) -> Self;
+    /// The first floats of `from`.
+    ///
+    /// # Panics
+    /// If they are fewer than [`Lanes::COUNT`].
+    fn load(from: &[f32]) -> Self;
+    /// Into the first floats of `to`.
+    ///
+    /// # Panics
+    /// If they are fewer than [`Lanes::COUNT`].
+    fn store(self, to: &mut [f32]);
+    fn add(self, other: Self) -> Self;
+    fn sub(self, other: Self) -> Self;
+    fn mul(self, other: Self) -> Self;
+    fn div(self, other: Self) -> Self;
+    /// `self·factor + term`, in one rounding where the machine has that.
+    fn mul_add(self, factor: Self, term: Self) -> Self;
+    /// `term − self·factor`.
+    fn neg_mul_add(self, factor: Self, term: Self) -> Self;
+    fn sqrt(self) -> Self;
+    fn abs(self) -> Self;
+    fn min(self, other: Self) -> Self;
+    fn max(self, other: Self) -> Self;
+    /// The least integer that is no less; for magnitudes up to 2²².
+    fn ceil(self) -> Self;
+    /// The greatest integer that is no more; for magnitudes up to 2²².
+    fn floor(self) -> Self;
+    fn lt(self, other: Self) -> Self::Mask;
+    fn le(self, other: Self) -> Self::Mask;
+    /// `yes` where the mask holds.
+    fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
+    /// `self` where the mask holds, else 0.
+    fn keep(self, mask: Self::Mask) -> Self;
+    /// `2^x` for `−126 ≤ x ≤ 1`, with a relative error below [`EXP2_ERROR`], exact for integers. Anything for other `x`.
+    fn exp2(self) -> Self;
+    /// Whole numbers from 0 to 2²⁴, as the bits of unsigned integers.
+    fn to_integer(self) -> Self;
+    /// The bits of two integers' sum.
+    fn add_integer(self, other: Self) -> Self;
+    /// The lanes whose bit is set in `which`, in order, in the first lanes.
+    fn compress(self, which: u32) -> Self;
+    /// Component `k` of element `i` in lane `i` of vector `k`.
+    ///
+    /// # Panics
+    /// If `from` has fewer elements than [`Lanes::COUNT`].
+    fn deal3(from: &[[f32; 3]]) -> [Self; 3];
+    /// As [`Lanes::deal3`], of four components.
+    fn deal4(from: &[[f32; 4]]) -> [Self; 4];
+    /// For every lane whose bit is set in `which`, in order, what the 16 vectors hold in it, into the next record of `to`.
+    ///
+    /// # Panics
+    /// If `to` is shorter than the highest of the lanes.
+    fn collect(fields: &[Self; 16], which: u32, to: &mut [Ellipse]) -> usize;
+    /// The mantissa, in `[1, 2)`, and the exponent, of a positive normal number.
+    fn split(self) -> (Self, Self);
+}
+
+/// A vector of truths.
+pub(super) trait Mask: Copy {
+    fn and(self, other: Self) -> Self;
+    /// Lane `i` in bit `i`.
+    fn bits(self) -> u32;
+}
+
+/// A vector of `f64`, as wide as its [`Lanes`].
+pub(super) trait Double: Copy {
+    type Lanes;
+    type Mask;
+    fn splat(x: f64) -> Self;
+    fn from_lanes(lanes: Self::Lanes) -> Self;
+    /// Rounded to `f32`.
+    fn to_lanes(self) -> Self::Lanes;
+    fn mul(self, other: Self) -> Self;
+    fn div(self, other: Self) -> Self;
+    fn mul_add(self, factor: Self, term: Self) -> Self;
+    fn min(self, other: Self) -> Self;
+    fn max(self, other: Self) -> Self;
+    fn lt(self, other: Self) -> Self::Mask;
+}
+
+/// The polynomial of degree 4 through (0, 1) that is nearest to `2^f` on `[−½, ½]`, in relative error; highest power first.
+pub(super) const EXP2: [f32; 5] = [9.582_853e-3, 5.590_642_6e-2, 2.402_41e-1, 6.931_242e-1, 1.0];
+/// Relative error of [`Lanes::exp2`].
+#[cfg(test)]
+pub(super) const EXP2_ERROR: f64 = 3.1e-6;
+/// Adding this to a small float leaves its nearest integer in the low bits: `1.5·2²³`.
+pub(super) const ROUND: f32 = 12_582_912.0;
+
+/// Calls `$body::<L>(args…)` with the lanes `L` of `$isa`, as compiled for it.
+macro_rules! by_level {
+    ($isa:expr, fn $body:ident $(<const $flag:ident: u8>)? ($($arg:ident: $ty:ty),* $(,)?) $(-> $out:ty)?) => {{
+        #[inline(never)]
+        fn scalar $(<const $flag: u8>)? ($($arg: $ty),*) $(-> $out)? {
+            $body::<$crate::splat::lanes::Plain $(, $flag)?>($($arg),*)
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt")]
+        fn avx2 $(<const $flag: u8>)? ($($arg: $ty),*) $(-> $out)? {
+            $body::<$crate::splat::avx2::Avx2 $(, $flag)?>($($arg),*)
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(
+            enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl"
+        )]
+        fn avx512 $(<const $flag: u8>)? ($($arg: $ty),*) $(-> $out)? {
+            $body::<$crate::splat::avx512::Avx512 $(, $flag)?>($($arg),*)
+        }
+        #[cfg(target_arch = "x86_64")]
+        {
+            let level = $crate::isa::Isa::level($isa);
+            if level >= $crate::isa::Level::Avx512 {
+                // SAFETY: an `Isa` of this level or above is only made where the processor has these features.
+                unsafe { avx512 $(::<$flag>)? ($($arg),*) }
+            } else if level >= $crate::isa::Level::Avx2 {
+                // SAFETY: as above.
+                unsafe { avx2 $(::<$flag>)? ($($arg),*) }
+            } else {
+                scalar $(::<$flag>)? ($($arg),*)
+            }
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        {
+            let _ = $isa;
+            scalar $(::<$flag>)? ($($arg),*)
+        }
+    }};
+}
+pub(super) use by_level;
+
+/// `[$e; 3]` with `$i` counting. Arrays' own `map` and `from_fn` are calls that the compiler does not always inline into code for
+/// an instruction set above the baseline; so are closures.
+macro_rules! three {
+    ($i:ident => $e:expr) => {
+        [
+            {
+                let $i = 0;
+                $e
+            },
+            {
+                let $i = 1;
+                $e
+            },
+            {
+                let $i = 2;
+                $e
+            },
+        ]
+    };
+}
+pub(super) use three;
+
+/// As [`three`].
+macro_rules! four {
+    ($i:ident => $e:expr) => {
+        [
+            {
+                let $i = 0;
+                $e
+            },
+            {
+                let $i = 1;
+                $e
+            },
+            {
+                let $i = 2;
+                $e
+            },
+            {
+                let $i = 3;
+                $e
+            },
+        ]
+    };
+}
+pub(super) use four;
+
+/// Runs instructions of the level that the surrounding type stands for.
+#[cfg(target_arch = "x86_64")]
+macro_rules! instructions {
+    ($e:expr) => {
+        // SAFETY: the types of a level are named only by `by_level`, in functions that run only where the processor has the level.
+        // What is loaded or stored is a slice whose length is checked before.
+        unsafe { $e }
+    };
+}
+#[cfg(target_arch = "x86_64")]
+pub(super) use instructions;
+
+/// Methods of two arguments that are one instruction each.
+#[cfg(target_arch = "x86_64")]
+macro_rules! binary {
+    ($($name:ident: $instruction:ident),* $(,)?) => {
+        $(#[inline(always)]
+        fn $name(self, other: Self) -> Self {
+            Self(instructions!($instruction(self.0, other.0)))
+        })*
+    };
+}
+#[cfg(target_arch = "x86_64")]
+pub(super) use binary;
+
+/// By Horner's rule, the highest coefficient first.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+pub(super) fn polynomial<L: Lanes>(x: L, coefficients: &[f32; 5]) -> L {
+    let mut p = L::splat(coefficients[0]);
+    for c in &coefficients[1..] {
+        p = p.mul_add(x, L::splat(*c));
+    }
+    p
+}
+
+/// Four floats, in plain Rust.
+#[derive(Clone, Copy)]
+#[repr(align(16))]
+pub(super) struct Plain([f32; 4]);
+
+#[derive(Clone, Copy)]
+pub(super) struct PlainMask([bool; 4]);
+
+#[derive(Clone, Copy)]
+pub(super) struct PlainDouble([f64; 4]);
+
+impl Plain {
+    #[inline(always)]
+    fn each(self, f: impl Fn(f32) -> f32) -> Self {
+        Plain(four!(i => f(self.0[i])))
+    }
+
+    #[inline(always)]
+    fn both(self, other: Self, f: impl Fn(f32, f32) -> f32) -> Self {
+        Plain(four!(i => f(self.0[i], other.0[i])))
+    }
+
+    #[inline(always)]
+    fn compare(self, other: Self, f: impl Fn(f32, f32) -> bool) -> PlainMask {
+        PlainMask(four!(i => f(self.0[i], other.0[i])))
+    }
+}
+
+impl Lanes for Plain {
+    const COUNT: usize = 4;
+    type Mask = PlainMask;
+    type Double = PlainDouble;
+
+    #[inline(always)]
+    fn splat(x: f32) -> Self {
+        Plain([x; 4])
+    }
+
+    #[inline(always)]
+    fn load(from: &[f32]) -> Self {
+        Plain([from[0], from[1], from[2], from[3]])
+    }
+
+    #[inline(always)]
+    fn store(self, to: &mut [f32]) {
+        to[..4].copy_from_slice(&self.0);
+    }
+
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        self.both(other, |a, b| a + b)
+    }
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self.both(other, |a, b| a - b)
+    }
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        self.both(other, |a, b| a * b)
+    }
+
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self.both(other, |a, b| a / b)
+    }
+
+    #[inline(always)]
+    fn mul_add(self, factor: Self, term: Self) -> Self {
+        self.mul(factor).add(term)
+    }
+
+    #[inline(always)]
+    fn neg_mul_add(self, factor: Self, term: Self) -> Self {
+        term.sub(self.mul(factor))
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.each(f32::sqrt)
+    }
+
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.each(f32::abs)
+    }
+
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        self.both(other, |a, b| if a < b { a } else { b })
+    }
+
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        self.both(other, |a, b| if a > b { a } else { b })
+    }
+
+    // By hand: without SSE 4.1 `ceil` and `floor` are calls.
+    #[inline(always)]
+    fn ceil(self) -> Self {
+        self.each(|x| {
+            let whole = x as i32 as f32;
+            if whole < x { whole + 1.0 } else { whole }
+        })
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        self.each(|x| {
+            let whole = x as i32 as f32;
+            if whole > x { whole - 1.0 } else { whole }
+        })
+    }
+
+    #[inline(always)]
+    fn lt(self, other: Self) -> PlainMask {
+        self.compare(other, |a, b| a < b)
+    }
+
+    #[inline(always)]
+    fn le(self, other: Self) -> PlainMask {
+        self.compare(other, |a, b| a <= b)
+    }
+
+    #[inline(always)]
+    fn select(mask: PlainMask, yes: Self, no: Self) -> Self {
+        Plain(four!(i => if mask.0[i] { yes.0[i] } else { no.0[i] }))
+    }
+
+    #[inline(always)]
+    fn keep(self, mask: PlainMask) -> Self {
+        Self::select(mask, self, Plain([0.0; 4]))
+    }
+
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        self.each(|x| {
+            let shifted = x + ROUND;
+            let f = x - (shifted - ROUND);
+            let [a, b, c, d, e] = EXP2;
+            let p = (((a * f + b) * f + c) * f + d) * f + e;
+            f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
+        })
+    }
+
+    #[inline(always)]
+    fn to_integer(self) -> Self {
+        self.each(|x| f32::from_bits(x as u32))
+    }
+
+    #[inline(always)]
+    fn add_integer(self, other: Self) -> Self {
+        self.both(other, |a, b| {
+            f32::from_bits(a.to_bits().wrapping_add(b.to_bits()))
+        })
+    }
+
+    #[inline(always)]
+    fn compress(self, which: u32) -> Self {
+        // Each lane is written where the next that counts will be: no branch.
+        let (mut first, mut kept) = ([0.0; 4], 0);
+        for lane in 0..4 {
+            first[kept % 4] = self.0[lane];
+            kept += (which >> lane) as usize & 1;
+        }
+        Plain(first)
+    }
+
+    #[inline(always)]
+    fn deal3(from: &[[f32; 3]]) -> [Self; 3] {
+        let from = &from[..4];
+        three!(k => Plain(four!(i => from[i][k])))
+    }
+
+    #[inline(always)]
+    fn deal4(from: &[[f32; 4]]) -> [Self; 4] {
+        let from = &from[..4];
+        four!(k => Plain(four!(i => from[i][k])))
+    }
+
+    #[inline(always)]
+    fn collect(fields: &[Self; 16], which: u32, to: &mut [Ellipse]) -> usize {
+        let mut kept = 0;
+        for lane in (0..4).filter(|lane| which >> lane & 1 == 1) {
+            to[kept] = Ellipse::from_fields(std::array::from_fn(|k| fields[k].0[lane]));
+            kept += 1;
+        }
+        kept
+    }
+
+    #[inline(always)]
+    fn split(self) -> (Self, Self) {
+        let one = 1.0f32.to_bits();
+        let mantissa = self.each(|x| f32::from_bits(x.to_bits() & 0x007f_ffff | one));
+        let exponent = self.each(|x| ((x.to_bits() >> 23) as i32 - 127) as f32);
+        (mantissa, exponent)
+    }
+}
+
+impl Mask for PlainMask {
+    #[inline(always)]
+    fn and(self, other: Self) -> Self {
+        PlainMask(four!(i => self.0[i] & other.0[i]))
+    }
+
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        (0..4).map(|i| u32::from(self.0[i]) << i).sum()
+    }
+}
+
+impl Double for PlainDouble {
+    type Lanes = Plain;
+    type Mask = PlainMask;
+
+    #[inline(always)]
+    fn splat(x: f64) -> Self {
+        PlainDouble([x; 4])
+    }
+
+    #[inline(always)]
+    fn from_lanes(lanes: Plain) -> Self {
+        PlainDouble(four!(i => f64::from(lanes.0[i])))
+    }
+
+    #[inline(always)]
+    fn to_lanes(self) -> Plain {
+        Plain(four!(i => self.0[i] as f32))
+    }
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        PlainDouble(four!(i => self.0[i] * other.0[i]))
+    }
+
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        PlainDouble(four!(i => self.0[i] / other.0[i]))
+    }
+
+    #[inline(always)]
+    fn mul_add(self, factor: Self, term: Self) -> Self {
+        PlainDouble(four!(i => self.0[i] * factor.0[i] + term.0[i]))
+    }
+
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        let least = |a: f64, b: f64| if a < b { a } else { b };
+        PlainDouble(four!(i => least(self.0[i], other.0[i])))
+    }
+
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        let greatest = |a: f64, b: f64| if a > b { a } else { b };
+        PlainDouble(four!(i => greatest(self.0[i], other.0[i])))
+    }
+
+    #[inline(always)]
+    fn lt(self, other: Self) -> PlainMask {
+        PlainMask(four!(i => self.0[i] < other.0[i]))
+    }
+}

@@ -1,0 +1,100 @@
+//! Splats: Gaussians onto the picture ([`project`]), and into the pixels of one tile ([`Tile`]).
+//!
+//! Each kernel is one body over lanes of floats, compiled for plain Rust, AVX2 and AVX-512. Between these the last bits differ,
+//! because only some multiply and add in one rounding; on each of them the result is a function of the input alone.
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+mod blend;
+mod lanes;
+mod project;
+
+#[cfg(test)]
+mod tests;
+
+pub use blend::{TILE, Tile};
+pub use project::{Cloud, Tally, View, project};
+
+/// Variance that every ellipse is widened by, in px².
+pub const BLUR: f32 = 0.3;
+/// The least opacity that is drawn.
+pub const ALPHA_FLOOR: f32 = 1.0 / 255.0;
+/// The greatest α of one ellipse.
+pub const ALPHA_CEILING: f32 = 0.99;
+/// A pixel that lets less light through than this is finished: what is not drawn is less than a quarter of a step of eight bits.
+pub const FINISHED: f32 = 1.0 / 1024.0;
+/// Standard deviations above this are drawn as this.
+pub const MAX_SCALE: f32 = 1e4;
+/// What is left of a splat's opacity, at least, by the compensation for its widening.
+pub const MIN_COMPENSATION: f32 = 0.005;
+
+/// `log₂` of [`ALPHA_FLOOR`].
+pub(crate) const LOG_FLOOR: f32 = -7.994_353_4;
+
+/// A splat on the picture: `α(x, y) = 2^(log_opacity − u² − v²)` with `(u, v)` linear in the pixel's distance to the centre.
+///
+/// One cache line.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[repr(C, align(64))]
+pub struct Ellipse {
+    /// The centre in pixels.
+    pub centre: [f32; 2],
+    /// `u = u[0]·dx + u[1]·dy`.
+    pub u: [f32; 2],
+    /// `v = v[0]·dx + v[1]·dy`; one of the two is 0.
+    pub v: [f32; 2],
+    /// Binary logarithm of the opacity at the centre, at most 0.
+    pub log_opacity: f32,
+    /// Red, green and blue; not clamped.
+    pub colour: [f32; 3],
+    /// The pixels that it may touch.
+    pub bounds: Bounds,
+    /// Distance along the viewing direction, for the order of drawing. Positive and finite.
+    pub depth: f32,
+    /// The Gaussian's index in the input.
+    pub index: u32,
+}
+
+/// The pixels `x0 ≤ x < x1`, `y0 ≤ y < y1`. Never empty for a visible splat.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[repr(C)]
+#[allow(missing_docs)]
+pub struct Bounds {
+    pub x0: u32,
+    pub y0: u32,
+    pub x1: u32,
+    pub y1: u32,
+}
+
+impl Ellipse {
+    /// From the bits of its fields, in their order.
+    #[inline(always)]
+    fn from_fields(f: [f32; 16]) -> Self {
+        Ellipse {
+            centre: [f[0], f[1]],
+            u: [f[2], f[3]],
+            v: [f[4], f[5]],
+            log_opacity: f[6],
+            colour: [f[7], f[8], f[9]],
+            bounds: Bounds {
+                x0: f[10].to_bits(),
+                y0: f[11].to_bits(),
+                x1: f[12].to_bits(),
+                y1: f[13].to_bits(),
+            },
+            depth: f[14],
+            index: f[15].to_bits(),
+        }
+    }
+
+    /// The bits of its fields, in their order.
+    #[cfg(target_arch = "x86_64")]
+    #[inline(always)]
+    fn as_fields_mut(&mut self) -> &mut [f32; 16] {
+        const { assert!(size_of::<Ellipse>() == size_of::<[f32; 16]>()) };
+        // SAFETY: of the same size and no stricter alignment, without padding; any bits are an `f32` and any are a `u32`.
+        unsafe { &mut *std::ptr::from_mut(self).cast() }
+    }
+}

@@ -1,0 +1,402 @@
+//! Gaussians seen by a camera.
+//!
+//! With the rows `m₁`, `m₂` of `M = J·W·R·S` the covariance is `[[a, b], [b, c]]`, `a = m₁² + ε`, `b = m₁·m₂`, `c = m₂² + ε`. Its
+//! determinant is taken as `(m₁ × m₂)² + ε(m₁² + m₂²) + ε²` (Cauchy–Binet): a sum of squares, at least `ε²`, nothing cancels. The
+//! quadratic form is evaluated as `u² + v²` with the factors of a Cholesky decomposition that starts from the larger variance `p`:
+//! for `p = a`, `v = dx/√p` and `u = (dy − (b/p)·dx)/√(det/p)`. So the exponent cannot be positive, and a needle of 3000 × 0.1 px
+//! keeps its α to 2·10⁻⁴ where the textbook form is wrong by 1.
+
+use super::lanes::{Double, Lanes, Mask, by_level, four, three};
+use super::{ALPHA_FLOOR, BLUR, Ellipse, LOG_FLOOR, MAX_SCALE, MIN_COMPENSATION};
+use crate::Isa;
+
+/// `√(log₂(e)/2)`: with it `exp(−½d²) = 2^−(d·FORM_SCALE)²`.
+const FORM_SCALE: f32 = 0.849_321_8;
+/// Squared lengths of quaternions within this of 1, as a factor, are taken as they are.
+const LENGTHS: [f32; 2] = [1e-20, 1e20];
+
+/// Bits of the variants of the kernel.
+const ORTHOGRAPHIC: u8 = 1;
+const COMPENSATED: u8 = 2;
+
+/// A camera, prepared.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// Rows of the rotation to the camera's axes: x right, y down, z forward.
+    pub rotation: [[f64; 3]; 3],
+    /// Added after the rotation.
+    pub translation: [f64; 3],
+    /// What is not farther than this along z is not drawn.
+    pub near: f64,
+    /// Pixels per unit of slope, or, of an orthographic camera, per unit of length.
+    pub focal: [f64; 2],
+    /// The principal point, in pixels.
+    pub centre: [f64; 2],
+    /// The ranges of `x/z` and `y/z` outside which the projection is linearised at the range's end.
+    pub slopes: [[f64; 2]; 2],
+    /// Width and height of the picture; at most 2²².
+    pub size: [u32; 2],
+    /// Parallel rays instead of a pinhole.
+    pub orthographic: bool,
+    /// Opacity is taken back by as much as the blur widens.
+    pub compensated: bool,
+}
+
+/// Gaussians, one slice per parameter, all of the same length.
+#[derive(Debug, Clone, Copy)]
+#[allow(missing_docs)]
+pub struct Cloud<'a> {
+    pub position: &'a [[f32; 3]],
+    pub scale: &'a [[f32; 3]],
+    pub rotation: &'a [[f32; 4]],
+    pub opacity: &'a [f32],
+    pub colour: &'a [[f32; 3]],
+}
+
+/// How many Gaussians are visible, and how many are not, by the first reason that applies.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub struct Tally {
+    pub visible: u32,
+    pub not_finite: u32,
+    pub no_rotation: u32,
+    pub too_faint: u32,
+    pub behind: u32,
+    pub outside: u32,
+}
+
+/// Projects `cloud`, whose first Gaussian has the index `first`; the visible go to the beginning of `out`, in order.
+///
+/// # Panics
+/// If the slices of `cloud` differ in length, or `out` is shorter.
+pub fn project(isa: Isa, view: &View, cloud: Cloud, first: u32, out: &mut [Ellipse]) -> Tally {
+    match (view.orthographic, view.compensated) {
+        (false, false) => run::<0>(isa, view, cloud, first, out),
+        (true, false) => run::<ORTHOGRAPHIC>(isa, view, cloud, first, out),
+        (false, true) => run::<COMPENSATED>(isa, view, cloud, first, out),
+        (true, true) => run::<{ ORTHOGRAPHIC | COMPENSATED }>(isa, view, cloud, first, out),
+    }
+}
+
+fn run<const VARIANT: u8>(
+    isa: Isa,
+    view: &View,
+    cloud: Cloud,
+    first: u32,
+    out: &mut [Ellipse],
+) -> Tally {
+    by_level!(isa, fn body<const VARIANT: u8>(view: &View, cloud: Cloud, first: u32, out: &mut [Ellipse]) -> Tally)
+}
+
+#[inline(always)]
+fn body<L: Lanes, const VARIANT: u8>(
+    view: &View,
+    cloud: Cloud,
+    first: u32,
+    out: &mut [Ellipse],
+) -> Tally {
+    let count = cloud.position.len();
+    let lengths = [
+        cloud.scale.len(),
+        cloud.rotation.len(),
+        cloud.opacity.len(),
+        cloud.colour.len(),
+    ];
+    assert_eq!(lengths, [count; 4], "as many of every parameter");
+    assert!(out.len() >= count, "room for every Gaussian");
+    let camera = Camera::<L>::new(view);
+    let mut tally = Tally::default();
+    let mut at = 0;
+    while at + L::COUNT <= count {
+        let group = Cloud {
+            position: &cloud.position[at..],
+            scale: &cloud.scale[at..],
+            rotation: &cloud.rotation[at..],
+            opacity: &cloud.opacity[at..],
+            colour: &cloud.colour[at..],
+        };
+        let to = &mut out[tally.visible as usize..];
+        camera.see::<VARIANT>(group, L::COUNT, first + at as u32, &mut tally, to);
+        at += L::COUNT;
+    }
+    if at < count {
+        let mut vectors = [[[0.0; 3]; 16]; 3];
+        let (mut rotation, mut opacity) = ([[0.0; 4]; 16], [0.0; 16]);
+        let rest = count - at;
+        vectors[0][..rest].copy_from_slice(&cloud.position[at..]);
+        vectors[1][..rest].copy_from_slice(&cloud.scale[at..]);
+        vectors[2][..rest].copy_from_slice(&cloud.colour[at..]);
+        rotation[..rest].copy_from_slice(&cloud.rotation[at..]);
+        opacity[..rest].copy_from_slice(&cloud.opacity[at..]);
+        let group = Cloud {
+            position: &vectors[0],
+            scale: &vectors[1],
+            rotation: &rotation,
+            opacity: &opacity,
+            colour: &vectors[2],
+        };
+        let to = &mut out[tally.visible as usize..];
+        camera.see::<VARIANT>(group, rest, first + at as u32, &mut tally, to);
+    }
+    tally
+}
+
+/// A [`View`] in lanes.
+struct Camera<L: Lanes> {
+    rotation: [[L::Double; 3]; 3],
+    translation: [L::Double; 3],
+    near: L::Double,
+    focal: [L::Double; 2],
+    centre: [L::Double; 2],
+    slopes: [[L::Double; 2]; 2],
+    rows: [[L; 3]; 3],
+    size: [L; 2],
+}
+
+impl<L: Lanes> Camera<L> {
+    #[inline(always)]
+    fn new(view: &View) -> Self {
+        let pair = |[x, y]: [f64; 2]| [L::Double::splat(x), L::Double::splat(y)];
+        Camera {
+            rotation: three!(i => three!(k => L::Double::splat(view.rotation[i][k]))),
+            translation: three!(i => L::Double::splat(view.translation[i])),
+            near: L::Double::splat(view.near),
+            focal: pair(view.focal),
+            centre: pair(view.centre),
+            slopes: [pair(view.slopes[0]), pair(view.slopes[1])],
+            rows: three!(i => three!(k => L::splat(view.rotation[i][k] as f32))),
+            size: [L::splat(view.size[0] as f32), L::splat(view.size[1] as f32)],
+        }
+    }
+
+    /// Sees the first `count` of `group`, at most as many as there are lanes.
+    ///
+    /// The centre is transformed in double precision: the sum of a rotated position and a distant camera's translation is the one
+    /// place where digits are lost.
+    #[inline(always)]
+    fn see<const VARIANT: u8>(
+        &self,
+        group: Cloud,
+        count: usize,
+        index: u32,
+        tally: &mut Tally,
+        out: &mut [Ellipse],
+    ) {
+        let (zero, one) = (L::splat(0.0), L::splat(1.0));
+        let position = L::deal3(group.position);
+        let scale = L::deal3(group.scale);
+        let rotation = L::deal4(group.rotation);
+        let colour = L::deal3(group.colour);
+        let opacity = L::load(group.opacity);
+
+        // Zero times a number is zero exactly if the number is finite.
+        let mut products = opacity.mul(zero);
+        for [x, y, z] in [position, scale, colour] {
+            products = x.mul_add(zero, y.mul_add(zero, z.mul_add(zero, products)));
+        }
+        for x in rotation {
+            products = x.mul_add(zero, products);
+        }
+        let finite = products.le(zero);
+
+        let (axes, turned) = rotation_matrix(rotation);
+
+        let [px, py, pz] = three!(i => L::Double::from_lanes(position[i]));
+        let seen: [L::Double; 3] = three!(k => {
+            let [rx, ry, rz] = self.rotation[k];
+            px.mul_add(rx, py.mul_add(ry, pz.mul_add(rz, self.translation[k])))
+        });
+        let ahead = self.near.lt(seen[2]);
+        let depth = seen[2].to_lanes();
+        let inverse = L::Double::splat(1.0).div(seen[2]);
+
+        let limit = L::splat(MAX_SCALE);
+        let scale = three!(i => scale[i].abs().min(limit));
+        let (x, m1) = self.along::<VARIANT>(0, seen[0], inverse, &axes, scale);
+        let (y, m2) = self.along::<VARIANT>(1, seen[1], inverse, &axes, scale);
+        let blur = L::splat(BLUR);
+        let (a0, c0) = (dot(m1, m1), dot(m2, m2));
+        let (a, c) = (a0.add(blur), c0.add(blur));
+        let products = depth.mul_add(zero, x.mul(zero));
+        let products = y.mul_add(zero, a.mul_add(zero, c.mul_add(zero, products)));
+        let representable = products.le(zero);
+
+        let wide = c.le(a);
+        let long: [L; 3] = three!(i => L::select(wide, m1[i], m2[i]));
+        let short: [L; 3] = three!(i => L::select(wide, m2[i], m1[i]));
+        // `1/√p` and `1/√(det/p)`, and `b/p`; `p` is the larger variance, blur included.
+        let p = L::select(wide, a, c);
+        let inverse = one.div(p);
+        let root = inverse.sqrt();
+        // Divided by √p before it is squared, the cross product stays far from overflow.
+        let minors = cross(three!(i => long[i].mul(root)), short);
+        let minors = dot(minors, minors);
+        let blurred = a0.add(c0).add(blur).mul(inverse).mul(blur);
+        let across = L::splat(FORM_SCALE).div(minors.add(blurred).sqrt());
+        let slope = dot(long, short).mul(inverse);
+        let lengthwise = root.mul(L::splat(FORM_SCALE));
+
+        let mut opacity = opacity.min(one);
+        if VARIANT & COMPENSATED != 0 {
+            let kept = minors.div(minors.add(blurred)).sqrt();
+            opacity = opacity.mul(kept.max(L::splat(MIN_COMPENSATION)));
+        }
+        let bright = L::splat(ALPHA_FLOOR).le(opacity);
+        let log_opacity = if one.le(opacity).bits() + 1 == 1 << L::COUNT {
+            zero
+        } else {
+            log2(opacity)
+        };
+        // α = 1/255 at d² = 2·ln(255·opacity) standard deviations squared.
+        let reach = log_opacity.sub(L::splat(LOG_FLOOR)).max(zero);
+        let reach = reach.mul(L::splat(2.0 * std::f32::consts::LN_2));
+        let (x0, x1) = covered(x, a.mul(reach).sqrt(), self.size[0]);
+        let (y0, y1) = covered(y, c.mul(reach).sqrt(), self.size[1]);
+        let inside = x0.lt(x1).and(y0.lt(y1));
+
+        let mut left = (1 << count) - 1;
+        for (mask, missing) in [
+            (finite, &mut tally.not_finite),
+            (turned, &mut tally.no_rotation),
+            (bright, &mut tally.too_faint),
+            (ahead, &mut tally.behind),
+        ] {
+            let bits = mask.bits();
+            *missing += (left & !bits).count_ones();
+            left &= bits;
+        }
+        for (mask, missing) in [
+            (representable, &mut tally.not_finite),
+            (inside, &mut tally.outside),
+        ] {
+            let bits = mask.bits();
+            *missing += (left & !bits).count_ones();
+            left &= bits;
+        }
+
+        let tilted = zero.sub(slope.mul(across));
+        let mut indices = [0.0; 16];
+        for (i, place) in indices.iter_mut().enumerate() {
+            *place = f32::from_bits(index.wrapping_add(i as u32));
+        }
+        let fields = [
+            x,
+            y,
+            L::select(wide, tilted, across),
+            L::select(wide, across, tilted),
+            L::select(wide, lengthwise, zero),
+            L::select(wide, zero, lengthwise),
+            log_opacity,
+            colour[0],
+            colour[1],
+            colour[2],
+            x0.to_integer(),
+            y0.to_integer(),
+            x1.to_integer(),
+            y1.to_integer(),
+            depth,
+            L::load(&indices),
+        ];
+        tally.visible += L::collect(&fields, left, out) as u32;
+    }
+
+    /// The centre along x (`k` 0) or y (1), and that row of `M`. `seen`: the centre's offset along that axis of the camera.
+    #[inline(always)]
+    fn along<const VARIANT: u8>(
+        &self,
+        k: usize,
+        seen: L::Double,
+        inverse: L::Double,
+        axes: &[[L; 3]; 3],
+        scale: [L; 3],
+    ) -> (L, [L; 3]) {
+        let (offset, focal, row) = if VARIANT & ORTHOGRAPHIC != 0 {
+            (seen, self.focal[k].to_lanes(), self.rows[k])
+        } else {
+            let slope = seen.mul(inverse);
+            let [low, high] = self.slopes[k];
+            let clamped = slope.max(low).min(high).to_lanes();
+            let row = three!(i => self.rows[2][i].neg_mul_add(clamped, self.rows[k][i]));
+            (slope, self.focal[k].mul(inverse).to_lanes(), row)
+        };
+        let centre = self.focal[k].mul_add(offset, self.centre[k]).to_lanes();
+        let row = three!(i => row[i].mul(focal));
+        (centre, three!(i => dot(row, axes[i]).mul(scale[i])))
+    }
+}
+
+/// The first and the end of the pixels of `size` whose centres lie within `half` of `centre`. None if the first isn't below the end.
+#[inline(always)]
+fn covered<L: Lanes>(centre: L, half: L, size: L) -> (L, L) {
+    let (zero, middle) = (L::splat(0.0), L::splat(0.5));
+    // Clamped before it is rounded, the number is small enough for that. NaN comes to an end of the range.
+    let first = centre.sub(half).sub(middle).max(zero).min(size);
+    let end = centre.add(half).add(middle).max(zero).min(size);
+    (first.ceil(), end.floor())
+}
+
+/// The columns of the rotation matrix of a quaternion `w, x, y, z` of any length, and whether that is one: not zero.
+#[inline(always)]
+fn rotation_matrix<L: Lanes>(mut q: [L; 4]) -> ([[L; 3]; 3], L::Mask) {
+    let (zero, one) = (L::splat(0.0), L::splat(1.0));
+    let [w, x, y, z] = q;
+    let largest = w.abs().max(x.abs()).max(y.abs().max(z.abs()));
+    let turned = zero.lt(largest);
+    let mut length = squared(q);
+    let usual = L::splat(LENGTHS[0])
+        .le(length)
+        .and(length.le(L::splat(LENGTHS[1])));
+    if usual.bits() + 1 != 1 << L::COUNT {
+        // Rare: brought to a length whose square is a normal number. The other lanes must not notice.
+        q = four!(i => L::select(usual, q[i], q[i].div(largest)));
+        length = squared(q);
+    }
+    let double = L::splat(2.0).div(length);
+    let [w, x, y, z] = q;
+    let [x2, y2, z2] = [x.mul(double), y.mul(double), z.mul(double)];
+    let [wx, wy, wz] = [w.mul(x2), w.mul(y2), w.mul(z2)];
+    let [xx, xy, xz] = [x.mul(x2), y.mul(x2), z.mul(x2)];
+    let [yy, yz, zz] = [y.mul(y2), z.mul(y2), z.mul(z2)];
+    let columns = [
+        [one.sub(yy).sub(zz), xy.add(wz), xz.sub(wy)],
+        [xy.sub(wz), one.sub(xx).sub(zz), yz.add(wx)],
+        [xz.add(wy), yz.sub(wx), one.sub(xx).sub(yy)],
+    ];
+    (columns, turned)
+}
+
+/// The binary logarithm of a positive normal number, to 10⁻⁷; exact for powers of two.
+#[inline(always)]
+pub(super) fn log2<L: Lanes>(x: L) -> L {
+    let (mantissa, exponent) = x.split();
+    let one = L::splat(1.0);
+    let above = L::splat(std::f32::consts::SQRT_2).lt(mantissa);
+    let mantissa = L::select(above, mantissa.mul(L::splat(0.5)), mantissa);
+    let exponent = exponent.add(one.keep(above));
+    // ln(m) = 2·artanh((m − 1)/(m + 1)), its series times 2/ln 2.
+    let s = mantissa.sub(one).div(mantissa.add(one));
+    let squared = s.mul(s);
+    let mut sum = L::splat(0.320_598_9);
+    for c in [0.412_198_6, 0.577_078, 0.961_796_7, 2.885_39] {
+        sum = sum.mul_add(squared, L::splat(c));
+    }
+    sum.mul_add(s, exponent)
+}
+
+#[inline(always)]
+fn squared<L: Lanes>([w, x, y, z]: [L; 4]) -> L {
+    w.mul_add(w, x.mul_add(x, y.mul_add(y, z.mul(z))))
+}
+
+#[inline(always)]
+fn dot<L: Lanes>(a: [L; 3], b: [L; 3]) -> L {
+    a[0].mul_add(b[0], a[1].mul_add(b[1], a[2].mul(b[2])))
+}
+
+#[inline(always)]
+fn cross<L: Lanes>(a: [L; 3], b: [L; 3]) -> [L; 3] {
+    three!(i => {
+        let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+        a[k].neg_mul_add(b[j], a[j].mul(b[k]))
+    })
+}
