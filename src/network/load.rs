@@ -184,7 +184,7 @@ impl<'a> Tensors<'a> {
             }
             let bias = match &requantise {
                 Requantise::Shift { bias, .. } => u64::from(bias[o].unsigned_abs()),
-                Requantise::Invariant { .. } => 0,
+                Requantise::Scale { .. } | Requantise::Invariant { .. } => 0,
             };
             let reach = sum * u64::from(LIMIT.unsigned_abs()) + bias;
             if reach >= SUM_LIMIT {
