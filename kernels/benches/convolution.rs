@@ -166,6 +166,14 @@ fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
     let count = args.iter().find_map(|arg| arg.parse().ok());
     let only: Vec<Isa> = args.iter().filter_map(|arg| arg.parse().ok()).collect();
+    let asked = args.iter().filter_map(|arg| {
+        let (cin, cout) = arg.split_once('x')?;
+        Some([cin.parse().ok()?, cout.parse().ok()?])
+    });
+    let mut layers: Vec<[usize; 2]> = asked.collect();
+    if layers.is_empty() {
+        layers = LAYERS.to_vec();
+    }
     let voxels = surface(count.unwrap_or(200_000));
     let map = kernel_map(&voxels);
     let pairs = map.iter().filter(|&&r| r != ABSENT).count();
@@ -185,15 +193,7 @@ fn main() {
             "{:>7} at best: f32 {float:.1} GMAC/s, i16 {exact:.1} GMAC/s",
             isa.to_string()
         );
-        for layer in LAYERS {
-            let name = format!("{}x{}", layer[0], layer[1]);
-            if args
-                .iter()
-                .any(|arg| arg.contains('x') && !arg.contains("avx"))
-                && !args.contains(&name)
-            {
-                continue;
-            }
+        for &layer in &layers {
             bench.exact(isa, layer, exact);
             bench.float(isa, layer, float);
         }

@@ -8,7 +8,7 @@ use crate::taps::TileTaps;
 /// Channels of one weight panel.
 pub(crate) const PANEL: usize = 16;
 /// Output rows of a tile: enough that every tap finds full blocks, few enough that their sums stay in the cache.
-pub(crate) const TILE: usize = 128;
+pub(crate) const TILE: usize = 512;
 
 /// Where a layer writes, and what it adds on the way.
 pub struct Output<'a, T, R = T> {
