@@ -5,7 +5,9 @@
 use std::collections::HashMap;
 use std::time::Instant;
 
-use b2p_kernels::{ABSENT, ExactConv, FloatConv, Isa, Output, Requantise, Scale, Taps, ceiling};
+use b2p_kernels::{
+    ABSENT, ExactConv, FloatConv, Isa, Output, Precision, Requantise, Scale, Taps, ceiling,
+};
 use half::f16;
 
 /// A bumpy closed surface of about `count` voxels, in Morton order.
@@ -139,11 +141,22 @@ impl Bench {
         let weights: Vec<f16> = (0..27 * cin * cout).map(value).collect();
         let input: Vec<f16> = (0..self.voxels * cin).map(value).collect();
         let scales = [
-            ("float", Scale::Plain),
-            ("float invariant", Scale::Invariant(vec![1.0; cout])),
+            ("float", Scale::Plain, Precision::F32),
+            (
+                "float invariant",
+                Scale::Invariant(vec![1.0; cout]),
+                Precision::F32,
+            ),
+            ("bf16", Scale::Plain, Precision::Bf16),
         ];
-        for (what, scale) in scales {
+        for (what, scale, precision) in scales {
+            let ceiling = match precision {
+                Precision::F32 => ceiling,
+                Precision::Bf16 if isa.has_bf16() => ceiling::bf16(isa),
+                Precision::Bf16 => continue,
+            };
             let conv = FloatConv::new(27, cin, cout, &weights, vec![0.0; cout], scale);
+            let conv = conv.with_precision(precision);
             let mut out = vec![f16::ZERO; self.voxels * cout];
             let seconds = least(|| {
                 for (i, rows) in out.chunks_mut(512 * cout).enumerate() {
@@ -189,10 +202,11 @@ fn main() {
             continue;
         }
         let (float, exact) = (ceiling::f32(isa), ceiling::i16(isa));
-        println!(
-            "{:>7} at best: f32 {float:.1} GMAC/s, i16 {exact:.1} GMAC/s",
-            isa.to_string()
-        );
+        let name = isa.to_string();
+        println!("{name:>7} at best: f32 {float:.1} GMAC/s, i16 {exact:.1} GMAC/s");
+        if isa.has_bf16() {
+            println!("{name:>7} at best: bf16 {:.1} GMAC/s", ceiling::bf16(isa));
+        }
         for &layer in &layers {
             bench.exact(isa, layer, exact);
             bench.float(isa, layer, float);

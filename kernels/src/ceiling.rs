@@ -19,6 +19,14 @@ pub fn i16(isa: Isa) -> f64 {
     measure(isa, Arithmetic::Integer)
 }
 
+/// bf16 by bf16, summed in f32: the bound of [`crate::Precision::Bf16`]. Where that falls back to f32, so does this.
+pub fn bf16(isa: Isa) -> f64 {
+    match isa.has_bf16() {
+        true => measure(isa, Arithmetic::Brain),
+        false => f32(isa),
+    }
+}
+
 /// Rounds of one batch, some 50 µs of them.
 const ROUNDS: usize = 1 << 14;
 
@@ -64,4 +72,18 @@ pub(crate) unsafe fn rounds<M: Machine>(rounds: usize) -> usize {
         }
     }
     rounds * ROWS * 2 * M::LANES
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_instruction_set_has_a_ceiling() {
+        for isa in Isa::available() {
+            for rate in [f32(isa), i16(isa), bf16(isa)] {
+                assert!(rate.is_finite() && rate > 0.01, "{isa}: {rate}");
+            }
+        }
+    }
 }

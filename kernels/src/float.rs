@@ -1,6 +1,6 @@
 //! Sparse convolution in floats: f16 in memory, f32 in between.
 
-use half::f16;
+use half::{bf16, f16};
 
 use crate::convert::{self, Halves};
 use crate::isa::Isa;
@@ -20,12 +20,25 @@ pub enum Scale {
     Invariant(Vec<f32>),
 }
 
+/// What products are computed in.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+pub enum Precision {
+    /// f32: a sum's error is that of adding in f32.
+    #[default]
+    F32,
+    /// Activations and weights are rounded to bf16 (8 significant bits) first; products are added in f32. A sum's error is at most
+    /// 2⁻⁷ of its terms' magnitudes. Needs [`Isa::has_bf16`]; elsewhere it is [`Precision::F32`].
+    Bf16,
+}
+
 /// A sparse convolution of f16 activations by f16 weights, summed in f32.
 #[derive(Debug, Clone)]
 pub struct FloatConv {
     extents: Extents,
     /// Per tap, panel and input channel: each output channel's weight.
     weights: Vec<Lanes>,
+    /// Per tap, panel and pair of input channels: each output channel's two weights in bf16. Empty unless asked for.
+    brain: Vec<Lanes>,
     bias: Vec<[f32; PANEL]>,
     invariant: Option<Gains<f32>>,
 }
@@ -106,8 +119,37 @@ impl FloatConv {
         FloatConv {
             extents,
             weights: packed,
+            brain: Vec::new(),
             bias: panels(&bias),
             invariant,
+        }
+    }
+
+    /// Computes in that precision from now on.
+    pub fn with_precision(mut self, precision: Precision) -> Self {
+        let Extents { volume, cin, .. } = self.extents;
+        let pairs = cin.div_ceil(2);
+        self.brain = match precision {
+            Precision::F32 => Vec::new(),
+            Precision::Bf16 => vec![Lanes::default(); volume * self.extents.panels() * pairs],
+        };
+        let panels = self.brain.chunks_exact_mut(pairs);
+        for (to, from) in panels.zip(self.weights.chunks_exact(cin)) {
+            for (c, from) in from.iter().enumerate() {
+                for (to, from) in to[c / 2].0.iter_mut().zip(from.f32()) {
+                    // The only machines with bf16 keep the first value in the low half.
+                    *to |= u32::from(bf16::from_f32(from).to_bits()) << (c % 2 * 16);
+                }
+            }
+        }
+        self
+    }
+
+    /// What it computes in, where the machine can.
+    pub fn precision(&self) -> Precision {
+        match self.brain.is_empty() {
+            true => Precision::F32,
+            false => Precision::Bf16,
         }
     }
 
@@ -119,6 +161,24 @@ impl FloatConv {
     /// Input channels.
     pub fn cin(&self) -> usize {
         self.extents.cin
+    }
+
+    /// What to multiply, and how to prepare what it is multiplied by.
+    fn chosen(&self, isa: Isa) -> (Arithmetic, &[Lanes], Expand) {
+        #[cfg(target_arch = "x86_64")]
+        if self.precision() == Precision::Bf16 && isa.has_bf16() {
+            return (
+                Arithmetic::Brain,
+                &self.brain,
+                |isa, input, rows, cin, to| {
+                    assert!(isa.has_bf16());
+                    // SAFETY: the processor has AVX512_BF16, and what `Isa` stands for where it does.
+                    unsafe { machine::avx512::to_brain(input, rows, cin, to) };
+                },
+            );
+        }
+        let _ = isa;
+        (Arithmetic::Float, &self.weights, widen)
     }
 
     /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations each.
@@ -148,13 +208,14 @@ impl FloatConv {
             let inputs = input.len() / self.extents.cin;
             for (row, output) in output.tiles() {
                 tile.fill(isa, &taps, first + row, output.len(), inputs);
+                let (arithmetic, weights, expand) = self.chosen(isa);
                 accumulate(
                     isa,
-                    Arithmetic::Float,
+                    arithmetic,
                     self.extents,
-                    &self.weights,
+                    weights,
                     tile,
-                    Input::Expand(input, widen),
+                    Input::Expand(input, expand),
                     expanded,
                     sums,
                 );
@@ -166,6 +227,9 @@ impl FloatConv {
         });
     }
 }
+
+/// Writes rows of the input, of so many values each, as words.
+type Expand = fn(Isa, &[f16], &[u32], usize, &mut [u32]);
 
 /// Rows as f32.
 fn widen(isa: Isa, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {

@@ -61,6 +61,15 @@ impl Isa {
             .collect()
     }
 
+    /// Whether there are products of bf16 besides (AVX512_BF16).
+    pub fn has_bf16(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        if self.0 == Level::Avx512 {
+            return is_x86_feature_detected!("avx512bf16");
+        }
+        false
+    }
+
     pub(crate) fn level(self) -> Level {
         self.0
     }

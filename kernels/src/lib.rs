@@ -4,8 +4,8 @@
 //!
 //! A sparse convolution is one loop ([`ExactConv`] in integers, [`FloatConv`] in floats): for every output row, the rows its
 //! [`Taps`] name are multiplied by that tap's weights and added up, in blocks of rows and channels that fill the registers of
-//! the [`Isa`]. Integers give the same bits on all of them. Floats may round differently from one to the next (only some have a
-//! fused multiply-add), but never from one call, or one number of threads, to another.
+//! the [`Isa`]. All of them give the same bits: integers wrap, products of two f16 are exact in f32, fused or not, and each sum is
+//! added up in the same order. Only [`Precision::Bf16`] depends on the machine.
 
 #[cfg(all(target_arch = "x86", not(target_feature = "sse2")))]
 compile_error!(
@@ -29,7 +29,7 @@ pub mod splat;
 
 pub use convert::{to_f16, to_f32};
 pub use exact::{ExactConv, LIMIT, Requantise};
-pub use float::{FloatConv, FloatOut, Scale};
+pub use float::{FloatConv, FloatOut, Precision, Scale};
 pub use isa::{Isa, UnknownIsa};
 pub use map::{MappedFile, map_file};
 pub use rows::Output;

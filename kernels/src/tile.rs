@@ -8,7 +8,7 @@ use crate::taps::TileTaps;
 /// Rows that are prepared together: what the widest blocks of any machine divide.
 const GROUP: usize = 24;
 
-/// A vector of 32-bit sums, and what multiplies and adds one step: an f32, or a pair of i16 or of bf16.
+/// A vector of 32-bit sums, and what multiplies and adds one step: an f32, or a pair of i16 or bf16.
 ///
 /// # Safety
 /// Its functions may use instructions that not every processor has, and read and write `LANES` words at the pointers they get
@@ -142,6 +142,8 @@ pub(crate) enum Arithmetic {
     Float,
     /// Pairs of i16.
     Integer,
+    /// Pairs of bf16: only where [`Isa::has_bf16`].
+    Brain,
 }
 
 /// Where a tile's input rows are.
@@ -168,6 +170,7 @@ pub(crate) fn accumulate<T>(
     expanded: &mut Vec<Lanes>,
     sums: &mut Vec<Lanes>,
 ) {
+    assert!(arithmetic != Arithmetic::Brain || isa.has_bf16());
     let (cin, panels) = (extents.cin, extents.panels());
     let steps = weights.len() / (extents.volume * panels);
     sums.clear();
@@ -234,7 +237,7 @@ static IN_ORDER: [u32; GROUP] = {
 /// Multiplies as many of the `whole` panels as fit, or, if there is none, the half panel that is left; gives their number.
 ///
 /// # Safety
-/// The block's pointers must hold what they promise for these panels.
+/// The block's pointers must hold what they promise for these panels, and bf16 must be asked for only where the machine has it.
 unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) -> usize {
     // SAFETY: an `Isa` is only made where the processor has its instructions; the rest is the caller's promise.
     unsafe {
@@ -249,8 +252,12 @@ unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) -> 
 }
 
 /// Multiplies for as long as `rounds` say, and gives the number of products: see [`crate::ceiling`].
+///
+/// # Panics
+/// If the machine has no bf16 and is asked for it.
 pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
-    // SAFETY: an `Isa` is only made where the processor has its instructions.
+    assert!(arithmetic != Arithmetic::Brain || isa.has_bf16());
+    // SAFETY: an `Isa` is only made where the processor has its instructions; bf16 has just been asked about.
     let words = unsafe {
         match isa.level() {
             Level::Scalar => machine::scalar::spin(arithmetic, rounds),
@@ -262,6 +269,6 @@ pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
     };
     match arithmetic {
         Arithmetic::Float => words,
-        Arithmetic::Integer => 2 * words,
+        Arithmetic::Integer | Arithmetic::Brain => 2 * words,
     }
 }

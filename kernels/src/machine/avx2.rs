@@ -6,6 +6,7 @@ use half::f16;
 
 use crate::ceiling;
 use crate::convert::{Halves, MAX};
+use crate::machine::machine;
 use crate::rows::PANEL;
 use crate::tile::{Arithmetic, Block, Machine, columns};
 
@@ -19,6 +20,7 @@ pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) ->
             (Arithmetic::Float, _) => wide::<Float, 6, 2>(block),
             (Arithmetic::Integer, 0) => wide::<Integer, 12, 1>(block),
             (Arithmetic::Integer, _) => wide::<Integer, 6, 2>(block),
+            (Arithmetic::Brain, _) => unreachable!("AVX2 has no bf16"),
         }
     }
     1
@@ -40,6 +42,7 @@ pub(crate) unsafe fn spin(arithmetic: Arithmetic, rounds: usize) -> usize {
         match arithmetic {
             Arithmetic::Float => spinning::<Float>(rounds),
             Arithmetic::Integer => spinning::<Integer>(rounds),
+            Arithmetic::Brain => unreachable!("AVX2 has no bf16"),
         }
     }
 }
@@ -52,96 +55,36 @@ unsafe fn spinning<M: Machine>(rounds: usize) -> usize {
     unsafe { ceiling::rounds::<M>(rounds) }
 }
 
-struct Float;
+machine!(
+    /// f32.
+    Float: __m256, __m256, 8,
+    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_ps, spread8_f32],
+    |sum, weight, factor| _mm256_fmadd_ps(weight, factor, sum)
+);
 
-// SAFETY: reads and writes `LANES` words, `factor` one.
-unsafe impl Machine for Float {
-    type Sum = __m256;
-    type Weight = __m256;
-    type Factor = __m256;
-    const LANES: usize = 8;
+machine!(
+    /// Pairs of i16.
+    Integer: __m256i, __m256i, 8,
+    [_mm256_setzero_si256, _mm256_load_si256, _mm256_store_si256, _mm256_load_si256, spread8],
+    |sum, weight, factor| _mm256_add_epi32(sum, _mm256_madd_epi16(weight, factor))
+);
 
-    #[inline(always)]
-    unsafe fn zero() -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_setzero_ps() }
-    }
-
-    #[inline(always)]
-    unsafe fn load(at: *const u32) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_load_ps(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn store(at: *mut u32, sum: Self::Sum) {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_store_ps(at.cast(), sum) }
-    }
-
-    #[inline(always)]
-    unsafe fn weight(at: *const u32) -> Self::Weight {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_load_ps(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn factor(at: *const u32) -> Self::Factor {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_set1_ps(at.cast::<f32>().read_unaligned()) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_fmadd_ps(weight, factor, sum) }
-    }
+/// # Safety
+/// `at` must be readable.
+#[target_feature(enable = "avx2")]
+#[inline]
+unsafe fn spread8(at: *const i32) -> __m256i {
+    // SAFETY: the caller's promise.
+    _mm256_set1_epi32(unsafe { at.read_unaligned() })
 }
 
-struct Integer;
-
-// SAFETY: reads and writes `LANES` words, `factor` one.
-unsafe impl Machine for Integer {
-    type Sum = __m256i;
-    type Weight = __m256i;
-    type Factor = __m256i;
-    const LANES: usize = 8;
-
-    #[inline(always)]
-    unsafe fn zero() -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_setzero_si256() }
-    }
-
-    #[inline(always)]
-    unsafe fn load(at: *const u32) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_load_si256(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn store(at: *mut u32, sum: Self::Sum) {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_store_si256(at.cast(), sum) }
-    }
-
-    #[inline(always)]
-    unsafe fn weight(at: *const u32) -> Self::Weight {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_load_si256(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn factor(at: *const u32) -> Self::Factor {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_set1_epi32(at.cast::<i32>().read_unaligned()) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_add_epi32(sum, _mm256_madd_epi16(weight, factor)) }
-    }
+/// # Safety
+/// `at` must be readable.
+#[target_feature(enable = "avx2")]
+#[inline]
+unsafe fn spread8_f32(at: *const f32) -> __m256 {
+    // SAFETY: the caller's promise.
+    _mm256_set1_ps(unsafe { at.read_unaligned() })
 }
 
 pub(crate) struct Convert;

@@ -6,36 +6,35 @@ use half::f16;
 
 use crate::ceiling;
 use crate::convert::{Halves, MAX};
+use crate::machine::machine;
 use crate::rows::PANEL;
 use crate::tile::{Arithmetic, Block, Machine, columns};
 
 /// # Safety
-/// The processor must have AVX-512 F, BW, CD, DQ, VL and VNNI; the rest as [`columns`].
+/// The processor must have AVX-512 F, BW, CD, DQ, VL and VNNI, and AVX512_BF16 for [`Arithmetic::Brain`]; the rest as
+/// [`columns`].
 pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) -> usize {
     // SAFETY: the caller's promise for as many panels as each call multiplies.
     unsafe {
-        match arithmetic {
-            Arithmetic::Float => panels::<Float, HalfFloat>(block, whole),
-            Arithmetic::Integer => panels::<Integer, HalfInteger>(block, whole),
+        match (arithmetic, whole) {
+            (Arithmetic::Float, 0) => wide::<HalfFloat, 12, 1>(block),
+            (Arithmetic::Float, 1) => wide::<Float, 12, 1>(block),
+            (Arithmetic::Float, 2) => wide::<Float, 12, 2>(block),
+            (Arithmetic::Float, 3) => wide::<Float, 8, 3>(block),
+            (Arithmetic::Float, _) => wide::<Float, 6, 4>(block),
+            (Arithmetic::Integer, 0) => wide::<HalfInteger, 12, 1>(block),
+            (Arithmetic::Integer, 1) => wide::<Integer, 12, 1>(block),
+            (Arithmetic::Integer, 2) => wide::<Integer, 12, 2>(block),
+            (Arithmetic::Integer, 3) => wide::<Integer, 8, 3>(block),
+            (Arithmetic::Integer, _) => wide::<Integer, 6, 4>(block),
+            (Arithmetic::Brain, 0) => wide_brain::<HalfBrain, 12, 1>(block),
+            (Arithmetic::Brain, 1) => wide_brain::<Brain, 12, 1>(block),
+            (Arithmetic::Brain, 2) => wide_brain::<Brain, 12, 2>(block),
+            (Arithmetic::Brain, 3) => wide_brain::<Brain, 8, 3>(block),
+            (Arithmetic::Brain, _) => wide_brain::<Brain, 6, 4>(block),
         }
     }
     whole.clamp(1, 4)
-}
-
-/// # Safety
-/// As [`run`].
-#[inline(always)]
-unsafe fn panels<M: Machine, H: Machine>(block: &Block, whole: usize) {
-    // SAFETY: the caller's promise.
-    unsafe {
-        match whole {
-            0 => wide::<H, 12, 1>(block),
-            1 => wide::<M, 12, 1>(block),
-            2 => wide::<M, 12, 2>(block),
-            3 => wide::<M, 8, 3>(block),
-            _ => wide::<M, 6, 4>(block),
-        }
-    }
 }
 
 /// # Safety
@@ -49,6 +48,16 @@ unsafe fn wide<M: Machine, const R: usize, const V: usize>(block: &Block) {
 }
 
 /// # Safety
+/// As [`run`] for bf16.
+#[target_feature(
+    enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni,avx512bf16"
+)]
+unsafe fn wide_brain<M: Machine, const R: usize, const V: usize>(block: &Block) {
+    // SAFETY: the caller's promise.
+    unsafe { columns::<M, R, V>(block) }
+}
+
+/// # Safety
 /// As [`run`].
 pub(crate) unsafe fn spin(arithmetic: Arithmetic, rounds: usize) -> usize {
     // SAFETY: the caller's promise.
@@ -56,6 +65,7 @@ pub(crate) unsafe fn spin(arithmetic: Arithmetic, rounds: usize) -> usize {
         match arithmetic {
             Arithmetic::Float => spinning::<Float>(rounds),
             Arithmetic::Integer => spinning::<Integer>(rounds),
+            Arithmetic::Brain => spinning_brain(rounds),
         }
     }
 }
@@ -70,187 +80,123 @@ unsafe fn spinning<M: Machine>(rounds: usize) -> usize {
     unsafe { ceiling::rounds::<M>(rounds) }
 }
 
-struct Float;
-
-// SAFETY: reads and writes `LANES` words, `factor` one.
-unsafe impl Machine for Float {
-    type Sum = __m512;
-    type Weight = __m512;
-    type Factor = __m512;
-    const LANES: usize = 16;
-
-    #[inline(always)]
-    unsafe fn zero() -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_setzero_ps() }
-    }
-
-    #[inline(always)]
-    unsafe fn load(at: *const u32) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_load_ps(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn store(at: *mut u32, sum: Self::Sum) {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_store_ps(at.cast(), sum) }
-    }
-
-    #[inline(always)]
-    unsafe fn weight(at: *const u32) -> Self::Weight {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_load_ps(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn factor(at: *const u32) -> Self::Factor {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_set1_ps(at.cast::<f32>().read_unaligned()) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_fmadd_ps(weight, factor, sum) }
-    }
+/// # Safety
+/// As [`run`] for bf16.
+#[target_feature(
+    enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni,avx512bf16"
+)]
+unsafe fn spinning_brain(rounds: usize) -> usize {
+    // SAFETY: the caller's promise.
+    unsafe { ceiling::rounds::<Brain>(rounds) }
 }
 
-struct HalfFloat;
+machine!(
+    /// f32.
+    Float: __m512, __m512, 16,
+    [_mm512_setzero_ps, _mm512_load_ps, _mm512_store_ps, _mm512_load_ps, spread16_f32],
+    |sum, weight, factor| _mm512_fmadd_ps(weight, factor, sum)
+);
 
-// SAFETY: reads and writes `LANES` words, `factor` one.
-unsafe impl Machine for HalfFloat {
-    type Sum = __m256;
-    type Weight = __m256;
-    type Factor = __m256;
-    const LANES: usize = 8;
+machine!(
+    /// f32, half a panel.
+    HalfFloat: __m256, __m256, 8,
+    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_ps, spread8_f32],
+    |sum, weight, factor| _mm256_fmadd_ps(weight, factor, sum)
+);
 
-    #[inline(always)]
-    unsafe fn zero() -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_setzero_ps() }
-    }
+machine!(
+    /// Pairs of i16.
+    Integer: __m512i, __m512i, 16,
+    [_mm512_setzero_si512, _mm512_load_si512, _mm512_store_si512, _mm512_load_si512, spread16],
+    |sum, weight, factor| _mm512_dpwssd_epi32(sum, weight, factor)
+);
 
-    #[inline(always)]
-    unsafe fn load(at: *const u32) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_load_ps(at.cast()) }
-    }
+machine!(
+    /// Pairs of i16, half a panel.
+    HalfInteger: __m256i, __m256i, 8,
+    [_mm256_setzero_si256, _mm256_load_si256, _mm256_store_si256, _mm256_load_si256, spread8],
+    |sum, weight, factor| _mm256_dpwssd_epi32(sum, weight, factor)
+);
 
-    #[inline(always)]
-    unsafe fn store(at: *mut u32, sum: Self::Sum) {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_store_ps(at.cast(), sum) }
-    }
+machine!(
+    /// Pairs of bf16; needs AVX512_BF16.
+    Brain: __m512, __m512i, 16,
+    [_mm512_setzero_ps, _mm512_load_ps, _mm512_store_ps, _mm512_load_si512, spread16],
+    // SAFETY: the types are 512 bits of anything.
+    |sum, weight, factor| _mm512_dpbf16_ps(sum, std::mem::transmute::<__m512i, __m512bh>(weight), std::mem::transmute::<__m512i, __m512bh>(factor))
+);
 
-    #[inline(always)]
-    unsafe fn weight(at: *const u32) -> Self::Weight {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_load_ps(at.cast()) }
-    }
+machine!(
+    /// Pairs of bf16, half a panel; needs AVX512_BF16.
+    HalfBrain: __m256, __m256i, 8,
+    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_si256, spread8],
+    // SAFETY: the types are 256 bits of anything.
+    |sum, weight, factor| _mm256_dpbf16_ps(sum, std::mem::transmute::<__m256i, __m256bh>(weight), std::mem::transmute::<__m256i, __m256bh>(factor))
+);
 
-    #[inline(always)]
-    unsafe fn factor(at: *const u32) -> Self::Factor {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_set1_ps(at.cast::<f32>().read_unaligned()) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_fmadd_ps(weight, factor, sum) }
-    }
+/// # Safety
+/// `at` must be readable.
+#[target_feature(enable = "avx512f")]
+#[inline]
+unsafe fn spread16(at: *const i32) -> __m512i {
+    // SAFETY: the caller's promise.
+    _mm512_set1_epi32(unsafe { at.read_unaligned() })
 }
 
-struct Integer;
-
-// SAFETY: reads and writes `LANES` words, `factor` one.
-unsafe impl Machine for Integer {
-    type Sum = __m512i;
-    type Weight = __m512i;
-    type Factor = __m512i;
-    const LANES: usize = 16;
-
-    #[inline(always)]
-    unsafe fn zero() -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_setzero_si512() }
-    }
-
-    #[inline(always)]
-    unsafe fn load(at: *const u32) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_load_si512(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn store(at: *mut u32, sum: Self::Sum) {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_store_si512(at.cast(), sum) }
-    }
-
-    #[inline(always)]
-    unsafe fn weight(at: *const u32) -> Self::Weight {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_load_si512(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn factor(at: *const u32) -> Self::Factor {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_set1_epi32(at.cast::<i32>().read_unaligned()) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm512_dpwssd_epi32(sum, weight, factor) }
-    }
+/// # Safety
+/// `at` must be readable.
+#[target_feature(enable = "avx512f")]
+#[inline]
+unsafe fn spread16_f32(at: *const f32) -> __m512 {
+    // SAFETY: the caller's promise.
+    _mm512_set1_ps(unsafe { at.read_unaligned() })
 }
 
-struct HalfInteger;
+/// # Safety
+/// `at` must be readable.
+#[target_feature(enable = "avx2")]
+#[inline]
+unsafe fn spread8(at: *const i32) -> __m256i {
+    // SAFETY: the caller's promise.
+    _mm256_set1_epi32(unsafe { at.read_unaligned() })
+}
 
-// SAFETY: reads and writes `LANES` words, `factor` one.
-unsafe impl Machine for HalfInteger {
-    type Sum = __m256i;
-    type Weight = __m256i;
-    type Factor = __m256i;
-    const LANES: usize = 8;
+/// # Safety
+/// `at` must be readable.
+#[target_feature(enable = "avx2")]
+#[inline]
+unsafe fn spread8_f32(at: *const f32) -> __m256 {
+    // SAFETY: the caller's promise.
+    _mm256_set1_ps(unsafe { at.read_unaligned() })
+}
 
-    #[inline(always)]
-    unsafe fn zero() -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_setzero_si256() }
-    }
-
-    #[inline(always)]
-    unsafe fn load(at: *const u32) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_load_si256(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn store(at: *mut u32, sum: Self::Sum) {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_store_si256(at.cast(), sum) }
-    }
-
-    #[inline(always)]
-    unsafe fn weight(at: *const u32) -> Self::Weight {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_load_si256(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn factor(at: *const u32) -> Self::Factor {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_set1_epi32(at.cast::<i32>().read_unaligned()) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_dpwssd_epi32(sum, weight, factor) }
+/// Rows of f16 as pairs of bf16, rounded to even; an odd row's last pair has a zero.
+///
+/// # Safety
+/// The processor must also have AVX512_BF16.
+#[target_feature(
+    enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni,avx512bf16"
+)]
+pub(crate) unsafe fn to_brain(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
+    let words = cin.div_ceil(2);
+    for (to, &row) in to.chunks_exact_mut(words).zip(rows) {
+        let from = &input[row as usize * cin..][..cin];
+        for (to, from) in to.chunks_mut(PANEL).zip(from.chunks(2 * PANEL)) {
+            let (here, there) = (
+                u32::MAX >> (32 - from.len()),
+                u16::MAX >> (PANEL - to.len()),
+            );
+            // SAFETY: only the values that are there are read, and only the words that are there written. The types are 512 bits
+            // of anything.
+            unsafe {
+                let halves = _mm512_maskz_loadu_epi16(here, from.as_ptr().cast());
+                let low = _mm512_cvtph_ps(_mm512_castsi512_si256(halves));
+                let high = _mm512_cvtph_ps(_mm512_extracti64x4_epi64::<1>(halves));
+                let pairs = _mm512_cvtne2ps_pbh(high, low);
+                let pairs = std::mem::transmute::<__m512bh, __m512i>(pairs);
+                _mm512_mask_storeu_epi32(to.as_mut_ptr().cast(), there, pairs);
+            }
+        }
     }
 }
 

@@ -22,6 +22,66 @@ pub(crate) fn floats_mut(words: &mut [u32]) -> &mut [f32] {
     unsafe { std::slice::from_raw_parts_mut(words.as_mut_ptr().cast(), words.len()) }
 }
 
+/// A [`Machine`](crate::tile::Machine) of `$lanes` words: the intrinsics that make zeros, load, store and spread words, and the
+/// multiplication.
+#[cfg(target_arch = "x86_64")]
+macro_rules! machine {
+    (
+        $(#[$doc:meta])* $name:ident: $sum:ty, $weight:ty, $lanes:literal,
+        [$zero:expr, $load:expr, $store:expr, $weights:expr, $spread:expr],
+        |$s:ident, $w:ident, $f:ident| $mul_add:expr
+    ) => {
+        $(#[$doc])*
+        struct $name;
+
+        // SAFETY: reads and writes `LANES` words, `factor` one.
+        unsafe impl Machine for $name {
+            type Sum = $sum;
+            type Weight = $weight;
+            type Factor = $weight;
+            const LANES: usize = $lanes;
+
+            #[inline(always)]
+            unsafe fn zero() -> Self::Sum {
+                // SAFETY: the caller's promise.
+                unsafe { $zero() }
+            }
+
+            #[inline(always)]
+            unsafe fn load(at: *const u32) -> Self::Sum {
+                // SAFETY: the caller's promise.
+                unsafe { $load(at.cast()) }
+            }
+
+            #[inline(always)]
+            unsafe fn store(at: *mut u32, sum: Self::Sum) {
+                // SAFETY: the caller's promise.
+                unsafe { $store(at.cast(), sum) }
+            }
+
+            #[inline(always)]
+            unsafe fn weight(at: *const u32) -> Self::Weight {
+                // SAFETY: the caller's promise.
+                unsafe { $weights(at.cast()) }
+            }
+
+            #[inline(always)]
+            unsafe fn factor(at: *const u32) -> Self::Factor {
+                // SAFETY: the caller's promise.
+                unsafe { $spread(at.cast()) }
+            }
+
+            #[inline(always)]
+            unsafe fn mul_add($s: Self::Sum, $w: Self::Weight, $f: Self::Factor) -> Self::Sum {
+                // SAFETY: the caller's promise.
+                unsafe { $mul_add }
+            }
+        }
+    };
+}
+#[cfg(target_arch = "x86_64")]
+use machine;
+
 /// Calls the unsafe `$body::<H, …>(args…)` as compiled for `$isa`, `H` being its conversions of f16.
 macro_rules! with_halves {
     ($isa:expr, fn $body:ident <$($g:ident: $bound:path),*> ($($arg:ident: $ty:ty),* $(,)?)) => {{

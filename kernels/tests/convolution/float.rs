@@ -1,6 +1,6 @@
 //! Floats: within the rounding of their sums.
 
-use b2p_kernels::{FloatConv, Isa, Scale, Taps, reference};
+use b2p_kernels::{FloatConv, Isa, Precision, Scale, Taps, reference};
 use half::f16;
 
 use crate::cases::{Random, cases, kernels, whole};
@@ -38,6 +38,8 @@ fn check_random(
             relu,
         );
         let conv = FloatConv::new(taps.volume(), cin, cout, &weights, bias.clone(), scale);
+        let mut first: Option<Vec<f32>> = None;
+        check_bf16(&conv, taps, &input, rows, residual, relu, &expected);
         for isa in Isa::available() {
             let mut out = vec![f32::NAN; rows * cout];
             let mut halves = vec![f16::NAN; rows * cout];
@@ -55,6 +57,86 @@ fn check_random(
                     "{isa}: {got} against {want:?}: {cin} → {cout}"
                 );
                 assert_eq!(half, f16::from_f32(got), "{isa}");
+            }
+            assert!(
+                *first.get_or_insert_with(|| out.clone()) == out,
+                "{isa} rounds in another order"
+            );
+        }
+    }
+}
+
+/// Both factors of a product are off by at most 2⁻⁹ of themselves; adding them up in f32 hardly counts beside that.
+fn check_bf16(
+    conv: &FloatConv,
+    taps: &Taps<'_>,
+    input: &[f16],
+    rows: usize,
+    residual: Option<&[f16]>,
+    relu: bool,
+    expected: &[reference::Value],
+) {
+    let conv = conv.clone().with_precision(Precision::Bf16);
+    for isa in Isa::available() {
+        let mut out = vec![f32::NAN; rows * conv.cout()];
+        let output = whole(&mut out, conv.cout(), residual, relu);
+        conv.run(isa, *taps, input, 0, output);
+        for (&got, want) in out.iter().zip(expected) {
+            let error = (f64::from(got) - want.value).abs();
+            let bound = want.magnitude / 128.0 + 1e-30;
+            assert!(error <= bound, "{isa}: {got} against {want:?} in bf16");
+        }
+    }
+}
+
+/// The root of the mean squared error over that of the values themselves.
+#[test]
+fn bf16_is_off_by_a_few_thousandths() {
+    let mut random = Random(7);
+    let [rows, cin, cout] = [600, 64, 64];
+    let (taps, _) = kernels(&mut random, rows).swap_remove(5);
+    let mut values = |n: usize, low: f32| -> Vec<f16> {
+        (0..n)
+            .map(|_| f16::from_f32(random.unit().max(low)))
+            .collect()
+    };
+    let weights = values(27 * cin * cout, -1.0);
+    // Of any sign, and as a ReLU leaves them.
+    for low in [-1.0, 0.0] {
+        let (input, bias) = (values(rows * cin, low), vec![0.0; cout]);
+        let expected = reference::float(
+            [cin, cout],
+            &weights,
+            &bias,
+            &Scale::Plain,
+            &taps.taps(),
+            &input,
+            rows,
+            None,
+            false,
+        );
+        let conv = FloatConv::new(27, cin, cout, &weights, bias, Scale::Plain);
+        for precision in [Precision::F32, Precision::Bf16] {
+            let conv = conv.clone().with_precision(precision);
+            assert_eq!(conv.precision(), precision);
+            for isa in Isa::available() {
+                let mut out = vec![0.0f32; rows * cout];
+                conv.run(
+                    isa,
+                    taps.taps(),
+                    &input,
+                    0,
+                    whole(&mut out, cout, None, false),
+                );
+                let pairs = out.iter().zip(&expected);
+                let (error, size) = pairs.fold((0.0, 0.0), |(error, size), (&got, want)| {
+                    let off = f64::from(got) - want.value;
+                    (error + off * off, size + want.value * want.value)
+                });
+                let relative = f64::sqrt(error / size);
+                println!("{isa}, {precision:?}, inputs above {low}: {relative:.2e}");
+                let brain = precision == Precision::Bf16 && isa.has_bf16();
+                assert!(relative < if brain { 4e-3 } else { 1e-6 });
             }
         }
     }

@@ -23,4 +23,8 @@ fn every_instruction_set_of_this_machine_is_tested() {
         }
     }
     assert_eq!(names, expected);
+    let bf16 = Isa::detect().has_bf16();
+    println!("bf16: {bf16}");
+    #[cfg(target_arch = "x86_64")]
+    assert_eq!(bf16, is_x86_feature_detected!("avx512bf16"));
 }
