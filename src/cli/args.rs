@@ -154,6 +154,9 @@ pub struct ModelArg {
     /// Use no better instructions than these: scalar, avx2, avx512, neon [default: B2P_ISA, or the best of this machine]
     #[arg(long, value_name = "NAME")]
     pub isa: Option<String>,
+    /// Generate Gaussians in int16 (the same bits everywhere) or f16 [default: int16 if the model has it]
+    #[arg(long, value_name = "NAME")]
+    pub precision: Option<String>,
 }
 
 pub use b2p::pixels::Background;

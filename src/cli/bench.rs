@@ -100,6 +100,7 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
         let report = json!({
             "level": level,
             "isa": model.isa().to_string(),
+            "precision": model.precision().to_string(),
             "threads": threads,
             "runs": args.repeat,
             "load_model_ms": loading.as_secs_f64() * 1e3,
@@ -145,8 +146,9 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
         format!(", peak memory {} MB", bytes / 1_000_000)
     });
     Ok(format!(
-        "level {level}, {}, {threads} threads, medians of {} runs{memory}\n{}",
+        "level {level}, {}, {}, {threads} threads, medians of {} runs{memory}\n{}",
         model.isa(),
+        model.precision(),
         args.repeat,
         table(&rows),
     ))

@@ -17,13 +17,17 @@ const PLY_MAGIC: &[u8] = b"ply";
 /// The environment variable that says which instructions to use when the arguments don't.
 const ISA: &str = "B2P_ISA";
 
-/// The model in a file, or the one inside the program, set to the instructions asked for.
+/// The model in a file, or the one inside the program, set to the instructions and the precision asked for.
 pub fn model(arg: &ModelArg) -> Result<Model> {
     let model = match &arg.model {
         Some(path) => Model::open(path).map_err(Failure::in_file(path))?,
         None => Model::from_bytes(b2p::embedded::MODEL)?,
     };
-    Ok(model.with_isa(isa(arg.isa.as_deref())?))
+    let model = model.with_isa(isa(arg.isa.as_deref())?);
+    match &arg.precision {
+        Some(name) => Ok(model.with_precision(name.parse()?)?),
+        None => Ok(model),
+    }
 }
 
 /// The instructions of that name; without one, what the environment names, or the best of this machine.

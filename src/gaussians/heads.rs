@@ -3,10 +3,12 @@
 //! Activations after the paper's semantics (offset, scale, rotation, opacity, colour; its §"3D Gaussian generation"), which leaves
 //! their functions open. With `u` the edge of a generated voxel in the cube frame:
 //! position = voxel centre + tanh(raw)·range·u, σ = softplus(raw + bias)·range·u, rotation = normalise(raw + (1, 0, 0, 0)),
-//! opacity = sigmoid(raw + bias) where it is learned, else 1, colour = clamp(½ + raw, 0, 1).
+//! opacity = sigmoid(raw + bias) where it is learned, else 1, colour = clamp(½ + raw, 0, 1). Equal raw numbers give equal bits on every
+//! machine.
 
 use rayon::prelude::*;
 
+use super::activations::{sigmoid, softplus, tanh};
 use super::{Frame, Gaussians};
 use crate::geometry::Voxels;
 use crate::network::{RAW, Shape};
@@ -56,7 +58,7 @@ pub fn activate(
                     let centre = centre(voxels, children, i, edge);
                     for axis in 0..3 {
                         position[j][axis] =
-                            centre[axis] + raw[axis].tanh() * shape.offset_range * edge;
+                            centre[axis] + tanh(raw[axis]) * shape.offset_range * edge;
                         scale[j][axis] =
                             softplus(raw[3 + axis] + shape.scale_bias) * shape.scale_range * edge;
                         colour[j][axis] = (0.5 + raw[11 + axis]).clamp(0.0, 1.0);
@@ -79,15 +81,6 @@ fn centre(voxels: &Voxels, children: usize, i: usize, edge: f32) -> [f32; 3] {
         _ => parent,
     };
     coordinate.map(|v| ((f64::from(v) + 0.5) * f64::from(edge) - 1.0) as f32)
-}
-
-/// `ln(1 + eˣ)`, without overflow.
-fn softplus(x: f32) -> f32 {
-    x.max(0.0) + (-x.abs()).exp().ln_1p()
-}
-
-fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + (-x).exp())
 }
 
 /// The unit quaternion along `q`; the identity for zero.

@@ -1,5 +1,6 @@
 //! 3D Gaussians in memory.
 
+mod activations;
 mod heads;
 
 pub use heads::activate;

@@ -23,6 +23,15 @@ pub(crate) trait Conv: Sync {
         first: usize,
         output: Output<'_, Self::Value>,
     );
+    /// As `run`, without rounding.
+    fn run_f32(
+        &self,
+        isa: Isa,
+        taps: Taps<'_>,
+        input: &[Self::Value],
+        first: usize,
+        output: Output<'_, f32, Self::Value>,
+    );
 }
 
 impl Conv for ExactConv {
@@ -35,6 +44,17 @@ impl Conv for ExactConv {
     fn run(&self, isa: Isa, taps: Taps<'_>, input: &[i16], first: usize, output: Output<'_, i16>) {
         self.run(isa, taps, input, first, output);
     }
+
+    fn run_f32(
+        &self,
+        isa: Isa,
+        taps: Taps<'_>,
+        input: &[i16],
+        first: usize,
+        output: Output<'_, f32, i16>,
+    ) {
+        self.run_f32(isa, taps, input, first, output);
+    }
 }
 
 impl Conv for FloatConv {
@@ -45,6 +65,17 @@ impl Conv for FloatConv {
     }
 
     fn run(&self, isa: Isa, taps: Taps<'_>, input: &[f16], first: usize, output: Output<'_, f16>) {
+        self.run(isa, taps, input, first, output);
+    }
+
+    fn run_f32(
+        &self,
+        isa: Isa,
+        taps: Taps<'_>,
+        input: &[f16],
+        first: usize,
+        output: Output<'_, f32, f16>,
+    ) {
         self.run(isa, taps, input, first, output);
     }
 }
@@ -81,11 +112,11 @@ pub(super) fn apply<C: Conv>(
 }
 
 /// The `rows` output rows of a layer that ends in f32.
-pub(super) fn apply_f32(
+pub(super) fn apply_f32<C: Conv>(
     isa: Isa,
-    conv: &FloatConv,
+    conv: &C,
     taps: Taps<'_>,
-    input: &[f16],
+    input: &[C::Value],
     rows: usize,
 ) -> Vec<f32> {
     let mut out = vec![0.0; rows * conv.cout()];
@@ -97,7 +128,7 @@ pub(super) fn apply_f32(
         relu: false,
     };
     spread(output, |first, output| {
-        conv.run(isa, taps, input, first, output)
+        conv.run_f32(isa, taps, input, first, output)
     });
     out
 }
@@ -161,15 +192,15 @@ impl<C: Conv> Inception<C> {
 
 impl<C: Conv> ResBlock<C> {
     /// `relu?(c2(relu(c1(x))) + x)`.
-    pub fn apply(&self, isa: Isa, map: Taps<'_>, x: &[C::Value]) -> Vec<C::Value> {
+    pub fn apply(&self, isa: Isa, map: Taps<'_>, x: Vec<C::Value>) -> Vec<C::Value> {
         let stride = self.c2.cout();
-        let inner = apply(isa, &self.c1, map, x, x.len() / stride, true);
+        let inner = apply(isa, &self.c1, map, &x, x.len() / stride, true);
         let mut out = vec![C::Value::default(); x.len()];
         let output = Output {
             rows: &mut out[..],
             stride,
             column: 0,
-            residual: Some(x),
+            residual: Some(&x),
             relu: self.relu,
         };
         spread(output, |first, output| {

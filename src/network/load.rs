@@ -1,12 +1,13 @@
 //! Model files: safetensors, everything checked before it is used.
 
-use b2p_kernels::{ExactConv, FloatConv, LIMIT, Requantise, Scale};
+use b2p_kernels::{ExactConv, LIMIT, Requantise};
 use half::f16;
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, SafeTensors};
 use xxhash_rust::xxh3::Xxh3Default;
 
 use super::shape::Shape;
+use super::stored::Stored;
 use super::structure::Spec;
 use crate::error::{Error, Result, Stage};
 
@@ -208,25 +209,29 @@ impl<'a> Tensors<'a> {
     }
 
     /// A layer of the close zone.
-    pub fn float_layer(&self, spec: Spec) -> Result<FloatConv> {
-        let Spec {
-            name,
-            volume,
-            cin,
-            cout,
-            invariant,
-        } = spec;
+    pub fn stored_layer(&self, spec: Spec) -> Result<Stored> {
+        let name = &spec.name;
         let tensor = format!("{name}.weight");
-        let weights: Vec<f16> = self.get(&tensor, &[volume, cin, cout])?;
+        let weights: Vec<f16> = self.get(&tensor, &[spec.volume, spec.cin, spec.cout])?;
         if let Some(w) = weights.iter().find(|w| !w.is_finite()) {
             return Err(malformed(&tensor, "weight", w, "a finite number"));
         }
-        let bias = self.finite(&format!("{name}.bias"), cout, MAX_FLOAT)?;
-        let scale = match invariant {
-            true => Scale::Invariant(self.finite(&format!("{name}.gain"), cout, MAX_FLOAT)?),
-            false => Scale::Plain,
+        let bias = self.finite(&format!("{name}.bias"), spec.cout, MAX_FLOAT)?;
+        let gain = match spec.invariant {
+            true => Some(self.finite(&format!("{name}.gain"), spec.cout, MAX_FLOAT)?),
+            false => None,
         };
-        Ok(FloatConv::new(volume, cin, cout, &weights, bias, scale))
+        Ok(Stored {
+            weights,
+            bias,
+            gain,
+            spec,
+        })
+    }
+
+    /// Whether there is a tensor of that name.
+    pub fn has(&self, name: &str) -> bool {
+        self.metadata.info(name).is_some()
     }
 
     /// `count` numbers within ±`limit`.

@@ -22,13 +22,17 @@
 //! Means are in sixteenths; standard deviations are an index i, σ = 0.11·(64 / 0.11)^(i / 63).
 //!
 //! # The close zone
-//! Gaussian generation (GG) and the encoder's feature conversion (FC) and squeezing (FS) store f16, saturating, and sum in f32.
+//! Gaussian generation (GG) and the encoder's feature conversion (FC) and squeezing (FS) are f16 in the file. In f16 they store f16,
+//! saturating, and sum in f32. A decoder may run GG in integers instead ([`Precision`]), with the arithmetic of the exact zone, which is
+//! faster, and gives the same Gaussians to the bit everywhere.
 //!
 //! # The model file
 //! Safetensors. The metadata's `b2p` is JSON: [`Shape`]. Layer `NAME` has `NAME.weight` [taps, in, out] and, in the exact zone,
 //! `.bias` i32 and `.shift` u8, or, if geometry-invariant, `.gain` and `.bias` f32; in the close zone, where weights are f16,
 //! `.bias` f32 and, if geometry-invariant, `.gain` f32. The names are those in `structure.rs`. `g_scale[r]` is the real value of
-//! one step of role r's features `g`, `c_scale[r]` that of its context. Tables: see [`crate::entropy::Tables`]. A file without
+//! one step of role r's features `g`, `c_scale[r]` that of its context. `gg.r.scale`, which may be left out, has the same for a generator:
+//! of the chain of residual blocks before layer 4 (what enters it, every branch, every sum), of the inside of each of its blocks, and
+//! of the same after layer 4. Tables: see [`crate::entropy::Tables`]. A file without
 //! `fc.*` and `fs.*` can decode only.
 
 mod convert;
@@ -39,6 +43,7 @@ mod load;
 #[cfg(test)]
 mod reference;
 mod shape;
+mod stored;
 mod structure;
 #[cfg(test)]
 mod tests;
@@ -51,9 +56,12 @@ use b2p_kernels::{ExactConv, FloatConv, Isa, map_file};
 
 use crate::entropy::{RawRows, Tables};
 use crate::error::{Error, Result};
+use generate::Generator;
 use load::{Tensors, malformed};
+use stored::Stored;
 use structure::{Encoder, Exact, Generate};
 
+pub use generate::Precision;
 pub use shape::{Head, Shape, Upsample};
 pub use structure::{RAW, ROLES};
 pub use untrained::untrained;
@@ -66,7 +74,8 @@ pub struct Model {
     isa: Isa,
     tables: Tables,
     exact: Exact<ExactConv>,
-    generators: Vec<Generate<FloatConv>>,
+    generators: Vec<Generator>,
+    precision: Precision,
     encoder: Option<Encoder<FloatConv>>,
     g_scale: Vec<f32>,
     c_scale: Vec<f32>,
@@ -94,17 +103,25 @@ impl Model {
         let tensors = Tensors::new(bytes)?;
         let shape = tensors.shape()?;
         let tables = tables(&tensors, &shape)?;
-        let mut float = |spec| tensors.float_layer(spec);
+        let mut float = |spec| Ok(tensors.stored_layer(spec)?.float());
         let encoder = match tensors.any("fc.") || tensors.any("fs.") {
             true => Some(shape.encoder(&mut float)?),
             false => None,
         };
+        let g_scale = scales(&tensors, "g_scale", ROLES, 0)?;
+        let generators = generators(&tensors, &shape, &g_scale)?;
+        let integers = generators.iter().all(Generator::has_integers);
         Ok(Model {
-            generators: shape.generators(&mut float)?,
+            precision: if integers {
+                Precision::Int16
+            } else {
+                Precision::F16
+            },
+            generators,
             exact: shape.exact(&mut |spec| tensors.exact_layer(spec))?,
             encoder,
-            g_scale: scales(&tensors, "g_scale", 0)?,
-            c_scale: scales(&tensors, "c_scale", 1)?,
+            g_scale,
+            c_scale: scales(&tensors, "c_scale", ROLES, 1)?,
             id: tensors.id(&shape),
             isa: Isa::detect(),
             tables,
@@ -112,7 +129,28 @@ impl Model {
         })
     }
 
-    /// Uses no more than these instructions. Exact results stay as they are; so do close ones.
+    /// Generates Gaussians in that precision.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if the model file lacks what integers need.
+    pub fn with_precision(self, precision: Precision) -> Result<Self> {
+        let lacks = |generator: &&Generator| !generator.has_integers();
+        match self.generators.iter().find(lacks) {
+            Some(generator) if precision == Precision::Int16 => {
+                let role = generator.head().role;
+                let detail = format!("the model has no tensor gg.{role}.scale");
+                Err(missing("generating Gaussians in integers", detail))
+            }
+            _ => Ok(Model { precision, ..self }),
+        }
+    }
+
+    /// The precision that Gaussians are generated in: integers if the model has what they need, unless told otherwise.
+    pub fn precision(&self) -> Precision {
+        self.precision
+    }
+
+    /// Uses no more than these instructions. Whatever is computed in integers stays as it is.
     pub fn with_isa(self, isa: Isa) -> Self {
         Model { isa, ..self }
     }
@@ -172,11 +210,26 @@ fn tables(tensors: &Tensors, shape: &Shape) -> Result<Tables> {
     }
 }
 
-/// The real value of one integer step, per role from `first` on.
-fn scales(tensors: &Tensors, name: &str, first: usize) -> Result<Vec<f32>> {
+/// The generators, and what they need to run in integers, if the file has it.
+fn generators(tensors: &Tensors, shape: &Shape, g_scale: &[f32]) -> Result<Vec<Generator>> {
+    let stored = shape.generators(&mut |spec| tensors.stored_layer(spec))?;
+    let generator = |stored: Generate<Stored>| {
+        let role = stored.head.role;
+        let name = format!("gg.{role}.scale");
+        let scales = match tensors.has(&name) {
+            true => Some(scales(tensors, &name, stored.head.scales(), 0)?),
+            false => None,
+        };
+        Ok(Generator::new(stored, g_scale[role], scales))
+    };
+    stored.into_iter().map(generator).collect()
+}
+
+/// The real values of one integer step, `count` of them; those from `first` on are above 0.
+fn scales(tensors: &Tensors, name: &str, count: usize, first: usize) -> Result<Vec<f32>> {
     // 2047 steps of the largest still fit f16.
     const MAX: f32 = 31.0;
-    let scales = tensors.finite(name, ROLES, MAX)?;
+    let scales = tensors.finite(name, count, MAX)?;
     match scales[first..].iter().find(|&&scale| scale <= 0.0) {
         Some(scale) => Err(malformed(name, "entry", scale, "above 0")),
         None => Ok(scales),

@@ -62,6 +62,13 @@ pub struct Head {
     pub children: usize,
 }
 
+impl Head {
+    /// How many scales a generator needs to run in integers: two chains, and the inside of every block.
+    pub(super) fn scales(&self) -> usize {
+        2 + self.blocks_before + self.blocks_after
+    }
+}
+
 /// How a feature gets to the children.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

@@ -65,6 +65,43 @@ pub(crate) struct Generate<L> {
     pub conv_out: L,
 }
 
+impl<L> Generate<L> {
+    /// The same network of other layers; `make` is told the steps of a layer's input and output.
+    ///
+    /// `scales`: the steps of the chain before layer 4, of the inside of each of its blocks, and the same after it. The generator's
+    /// input comes in steps of `input`, its output in steps of 1.
+    ///
+    /// # Panics
+    /// If there are not [`Generate::scales`] scales.
+    pub fn with_scales<M>(
+        &self,
+        input: f32,
+        scales: &[f32],
+        make: impl Fn(&L, f32, f32) -> M,
+    ) -> Generate<M> {
+        assert_eq!(scales.len(), self.head.scales(), "one scale per edge");
+        let (before, after) = scales.split_at(1 + self.before.len());
+        let blocks = |blocks: &[ResBlock<L>], scales: &[f32]| {
+            let blocks = blocks.iter().zip(&scales[1..]);
+            blocks
+                .map(|(block, &inner)| ResBlock {
+                    c1: make(&block.c1, scales[0], inner),
+                    c2: make(&block.c2, inner, scales[0]),
+                    relu: block.relu,
+                })
+                .collect()
+        };
+        Generate {
+            head: self.head.clone(),
+            conv_in: make(&self.conv_in, input, before[0]),
+            before: blocks(&self.before, before),
+            layer4: make(&self.layer4, before[0], after[0]),
+            after: blocks(&self.after, after),
+            conv_out: make(&self.conv_out, after[0], 1.0),
+        }
+    }
+}
+
 /// Feature conversion (FC).
 pub(crate) struct Convert<L> {
     pub conv_in: L,

@@ -40,6 +40,11 @@ pub fn untrained(shape: &Shape, seed: u64) -> Vec<u8> {
     );
     let c_scale = [0.0, step, step].map(f32::to_le_bytes);
     file.put("c_scale", Dtype::F32, &[ROLES], c_scale);
+    for head in &shape.gg {
+        let steps = vec![step.to_le_bytes(); head.scales()];
+        let name = format!("gg.{}.scale", head.role);
+        file.put(&name, Dtype::F32, &[head.scales()], steps);
+    }
     file.table("cdf.gauss", gauss_rows());
     file.table("cdf.prior", vec![row(3.0, 0.0); shape.latents]);
     let views = file.tensors.iter().map(|(name, dtype, extents, bytes)| {

@@ -4,7 +4,7 @@ use b2p_kernels::Isa;
 use half::f16;
 
 use super::super::reference::{Mode, Oracle, Rows};
-use super::super::{Model, RAW, Shape, Upsample, untrained};
+use super::super::{Model, Precision, RAW, Shape, Upsample, untrained};
 use super::{Cloud, error, rows};
 
 /// Networks that together have every switch in both positions.
@@ -214,11 +214,9 @@ fn generation_follows_its_definition_within_f16() {
     for (seed, shape) in (10..).zip(shapes()) {
         let bytes = untrained(&shape, seed);
         let oracle = Oracle::new(&bytes, Mode::Whole);
-        let model = Model::from_bytes(&bytes).unwrap();
+        let model = in_floats(&bytes);
         for role in [1, 2] {
-            let g: Vec<i16> = (0..cloud.len(role) * shape.channels)
-                .map(|i| ((i * 7919) % 1601) as i16 - 800)
-                .collect();
+            let g = some_features(cloud.len(role) * shape.channels);
             let want = oracle.generate(role, &cloud.sites(role), &rows(&g, shape.channels));
             let got = model.generate(role, &g, &cloud.maps[role]).unwrap();
             assert_eq!(got.len(), want.len() * RAW);
@@ -229,11 +227,60 @@ fn generation_follows_its_definition_within_f16() {
                 "role {role}: off by {off} of {peak}"
             );
             for isa in Isa::available() {
-                let other = Model::from_bytes(&bytes).unwrap().with_isa(isa);
+                let other = in_floats(&bytes).with_isa(isa);
                 assert!(
                     other.generate(role, &g, &cloud.maps[role]).unwrap() == got,
                     "{isa} rounds in another order"
                 );
+            }
+        }
+    }
+}
+
+fn in_floats(model: &[u8]) -> Model {
+    let model = Model::from_bytes(model).unwrap();
+    model.with_precision(Precision::F16).unwrap()
+}
+
+/// Features that use the middle of their range.
+fn some_features(count: usize) -> Vec<i16> {
+    (0..count)
+        .map(|i| ((i * 7919) % 1601) as i16 - 800)
+        .collect()
+}
+
+/// Raw numbers in integers lie so near their definition, in parts of the largest: each of a dozen layers rounds to a step of 1/256
+/// where the largest is about 4.
+const INTEGER_TOLERANCE: f64 = 0.01;
+
+#[test]
+fn generation_in_integers_follows_its_definition_and_is_the_same_on_every_isa_and_thread_count() {
+    let cloud = Cloud::sheet();
+    for (seed, shape) in (10..).zip(shapes()) {
+        let bytes = untrained(&shape, seed);
+        let oracle = Oracle::new(&bytes, Mode::Whole);
+        assert_eq!(
+            Model::from_bytes(&bytes).unwrap().precision(),
+            Precision::Int16
+        );
+        for role in [1, 2] {
+            let g = some_features(cloud.len(role) * shape.channels);
+            let want = oracle.generate(role, &cloud.sites(role), &rows(&g, shape.channels));
+            let mut first: Option<Vec<f32>> = None;
+            for isa in Isa::available() {
+                for threads in [1, 3] {
+                    let model = Model::from_bytes(&bytes).unwrap().with_isa(isa);
+                    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+                    let got = pool
+                        .build()
+                        .unwrap()
+                        .install(|| model.generate(role, &g, &cloud.maps[role]).unwrap());
+                    let (off, peak) = error(&got, &want);
+                    println!("{isa}, role {role}: {:.2e} of {peak:.2}", off / peak);
+                    assert!(off < INTEGER_TOLERANCE * peak, "off by {off} of {peak}");
+                    let first = first.get_or_insert_with(|| got.clone());
+                    assert!(*first == got, "{isa}, {threads} threads: other bits");
+                }
             }
         }
     }
