@@ -205,6 +205,7 @@ fn fewer_levels_make_a_shorter_stream_that_still_draws() {
     let (model, cloud) = (model(), ball(7, 45.0));
     let options = Options {
         levels: Some(4..=5),
+        ..Options::default()
     };
     let short = encode(&cloud, &model, &options, &mut Log::default()).unwrap();
     assert!(short.bytes.len() < coded(&cloud, &model).bytes.len());

@@ -3,6 +3,7 @@
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
+use b2p::encoder::Options;
 use clap::{Args, Parser, Subcommand};
 
 /// Learned point-cloud streams to 3D Gaussians and pictures, on a plain CPU.
@@ -50,6 +51,9 @@ pub struct Encode {
     /// Octree levels whose features are coded, up to three, the last below N [default: N−3..N−1]
     #[arg(long, value_name = "L..M", value_parser = levels)]
     pub levels: Option<RangeInclusive<u8>>,
+    /// What a bit is worth when latents are rounded, in squared latent steps; 0 rounds to the nearest, more saves bits
+    #[arg(long, value_name = "X", default_value_t = Options::BIT_PRICE, value_parser = price)]
+    pub bit_price: f32,
     #[command(flatten)]
     pub model: ModelArg,
 }
@@ -174,6 +178,13 @@ fn levels(text: &str) -> Result<RangeInclusive<u8>, String> {
         return Err(format!("level {first} comes after level {last}"));
     }
     Ok(first..=last)
+}
+
+fn price(text: &str) -> Result<f32, String> {
+    match text.parse() {
+        Ok(price) if (0.0..=100.0).contains(&price) => Ok(price),
+        _ => Err("expected a number from 0 to 100".into()),
+    }
 }
 
 fn size(text: &str) -> Result<(u32, u32), String> {

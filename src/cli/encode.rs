@@ -27,6 +27,7 @@ pub fn run(args: &Encode, progress: &Progress) -> Result<String> {
     let model = load::model(&args.model)?;
     let options = Options {
         levels: args.levels.clone(),
+        bit_price: args.bit_price,
     };
     let encoded = encoder::encode(&cloud, &model, &options, &mut log).map_err(&in_cloud)?;
     output::write_file(&args.output, |w| {

@@ -27,11 +27,13 @@
 //! but 0.07 % of flipped bits; checksums are for the rest.
 
 mod level;
+mod quantise;
 mod rows;
 mod slice;
 mod tables;
 
 pub use level::{decode_level, encode_level, latent_hash};
+pub use quantise::quantise;
 pub use slice::{Condition, END_STATE, decode_slice, encode_slice};
 pub use tables::{RawRows, Tables};
 

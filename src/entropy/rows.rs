@@ -136,7 +136,7 @@ impl Row<'_> {
         self.cumulative.len() - 2
     }
 
-    fn probability(&self, entry: usize) -> NonZeroU16 {
+    pub(super) fn probability(&self, entry: usize) -> NonZeroU16 {
         let p = self.cumulative[entry + 1].wrapping_sub(self.cumulative[entry]);
         // Two entries of at least 1 that sum to 2¹⁶ leave neither 0 nor 2¹⁶.
         NonZeroU16::new(p).expect("entries of a checked row are never 0")

@@ -64,7 +64,7 @@ impl<'a> Condition<'a> {
 
     /// The row of latent `i`, and what its values count from.
     #[inline]
-    fn row<'t>(&self, tables: &'t Tables, i: usize) -> (Row<'t>, i32) {
+    pub(super) fn row<'t>(&self, tables: &'t Tables, i: usize) -> (Row<'t>, i32) {
         match self {
             Condition::Prior => (tables.prior(i % tables.channels()), 0),
             Condition::Gauss { mu, sigma } => tables.gauss(mu[i], sigma[i]),

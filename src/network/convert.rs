@@ -70,8 +70,8 @@ impl Model {
             .collect())
     }
 
-    /// The latents before they are rounded.
-    pub(super) fn squeeze_reals(
+    /// The latents before they are rounded and bounded; errors and panics are those of [`Model::squeeze`].
+    pub(crate) fn squeeze_reals(
         &self,
         role: usize,
         features: &[f16],
