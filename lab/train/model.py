@@ -383,7 +383,7 @@ class B2P(nn.Module):
         return gaussians(raw, coords, 2.0, self.cfg, opaque=role == 2), raw
 
     @torch.no_grad()
-    def calibrate(self, crop, rgb, target=3.0):
+    def calibrate(self, crop, rgb, target=1.0):
         """Starting values from data: every geometry-invariant layer gets outputs of unit scale, and each squeeze becomes the leading
         principal components of its hidden layer, whitened to the wanted standard deviation. Use a crop of many colours."""
         for m in self.modules():
@@ -402,6 +402,72 @@ class B2P(nn.Module):
             if r:
                 self.pem[str(r)](c, crop.kernel3[r])
                 self.generate(g, crop, r)
+
+    @torch.no_grad()
+    def pass_colour(self, luma=20.0, chroma=14.0):
+        """Starts the network as a pyramid of colours, so that it has only to get better: three latents of every role are what its colour
+        differs from its parent's, in steps of 1/luma and 1/chroma, and what they add up to reaches the colours of the Gaussians. A colour
+        goes through rectified layers as a channel and its negative. Call it after `calibrate`."""
+        n, steps = 3, torch.tensor([luma, chroma, chroma])
+        eye = torch.eye(n)
+        signed = torch.cat([eye, -eye], 1)  # colour -> (colour, -colour)
+        joined = torch.cat([eye, -eye], 0) / 2  # and back, from both
+        rectified = torch.cat([eye, -eye], 0)  # and back, from what a ReLU left of both
+        basis = torch.linalg.qr(torch.tensor([[1.0, 1, 1], [1, 0, -1], [-1, 2, -1]]).T)[0]  # columns: luma and two chromas
+        basis = basis * torch.sign(basis.diagonal())
+
+        def route(m, matrix, at=0, first=0, tap=None):
+            """Outputs at .. of the layer become `matrix` times inputs first .., and nothing else."""
+            i, o = matrix.shape
+            m.weight[:, :, at:at + o] = 0
+            m.bias[at:at + o] = 0
+            taps = [{1: 0, 8: 0, 27: 13}[m.taps]] if tap is None else tap
+            for t in taps:
+                m.weight[t, first:first + i, at:at + o] = matrix
+            if isinstance(m, NormConv):
+                m.gain[at:at + o] = matrix.norm(dim=0)
+
+        def let_pass(block):
+            for m in (block.a2,) if isinstance(block, Inception) else (block.c2,):
+                m.weight[:, :, :2 * n] = 0
+                m.bias[:2 * n] = 0
+
+        for r, fc in enumerate(self.fc):
+            route(fc.conv_in, basis @ signed if r == 3 else joined @ signed)
+            for b in fc.blocks:
+                let_pass(b)
+            route(fc.conv_out, rectified @ signed)
+        c, k = self.cfg["channels"], self.cfg["latents"]
+        for r in range(3):
+            fs, fr = self.fs[r], self.fr[r]
+            fs.lin1.weight[:, :, :2 * n] = 0
+            fs.lin1.bias[:2 * n] = 0
+            fs.lin1.weight[0, :n, :2 * n] = signed
+            if r:
+                fs.lin1.weight[0, c:c + n, :2 * n] = -signed
+            fs.lin2.weight[:, :, :n] = 0
+            fs.lin2.bias[:n] = 0
+            fs.lin2.weight[0, :2 * n, :n] = rectified * steps
+            fr.lin1.weight[:, :, :2 * n] = 0
+            fr.lin1.bias[:2 * n] = 0
+            fr.lin1.weight[0, :n, :2 * n] = signed / steps[:, None]
+            if r:
+                fr.lin1.weight[0, k:k + n, :2 * n] = signed
+            for b in fr.blocks:
+                let_pass(b)
+            route(fr.lin2, rectified)
+            if r and self.up:
+                route(self.up[str(r)], eye, tap=range(8))
+            self.probe[r].weight.zero_()
+            self.probe[r].weight[0, :n] = basis.T
+            self.probe[r].bias.zero_()
+        whole = torch.eye(2 * n)
+        for gg in self.gg.values():
+            route(gg.conv_in, signed)
+            for b in (*gg.before, *gg.after):
+                let_pass(b)
+            route(gg.layer4, whole, tap=range(8) if gg.fanout == 8 else None)
+            route(gg.conv_out, rectified @ basis.T, at=11)
 
     def colours(self, crop, rgb):
         """Mean colour of the voxels of roles 0, 1, 2."""

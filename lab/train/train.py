@@ -175,6 +175,7 @@ class Trainer:
         if not self.calibrated:
             some = calibration or samples
             self.model.calibrate(join([s.crop for s in some]).to(self.device), torch.cat([s.rgb for s in some]))
+            self.model.pass_colour()
             self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
             self.calibrated = True
         self.optimiser.zero_grad(set_to_none=True)
