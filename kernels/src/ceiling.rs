@@ -82,7 +82,7 @@ mod tests {
     fn every_instruction_set_has_a_ceiling() {
         for isa in Isa::available() {
             for rate in [f32(isa), i16(isa), bf16(isa)] {
-                assert!(rate.is_finite() && rate > 0.01, "{isa}: {rate}");
+                assert!(rate.is_finite() && rate > 0.0, "{isa}: {rate}");
             }
         }
     }

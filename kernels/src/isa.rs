@@ -16,6 +16,8 @@ pub(crate) enum Level {
     Avx2,
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    #[cfg(target_arch = "aarch64")]
+    Neon,
 }
 
 impl Isa {
@@ -41,6 +43,10 @@ impl Isa {
                 && is_x86_feature_detected!("avx512vnni");
             return Isa(if avx512 { Level::Avx512 } else { Level::Avx2 });
         }
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("neon") {
+            return Isa(Level::Neon);
+        }
         Isa::SCALAR
     }
 
@@ -52,6 +58,8 @@ impl Isa {
             Level::Avx2,
             #[cfg(target_arch = "x86_64")]
             Level::Avx512,
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon,
         ];
         let best = Isa::detect();
         levels
@@ -81,6 +89,8 @@ impl Isa {
             Level::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => "avx512",
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => "neon",
         }
     }
 }
@@ -142,6 +152,9 @@ macro_rules! dispatch {
         }
         match $crate::isa::Isa::level($isa) {
             $crate::isa::Level::Scalar => scalar $(::<$($g,)* $($n)?>)? ($($arg),*),
+            // Part of the baseline.
+            #[cfg(target_arch = "aarch64")]
+            $crate::isa::Level::Neon => scalar $(::<$($g,)* $($n)?>)? ($($arg),*),
             #[cfg(target_arch = "x86_64")]
             // SAFETY: an `Isa` of this level is only made where the processor has these features.
             $crate::isa::Level::Avx2 => unsafe { avx2 $(::<$($g,)* $($n)?>)? ($($arg),*) },

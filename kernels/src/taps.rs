@@ -116,6 +116,8 @@ impl TileTaps {
                 };
                 end = match isa.level() {
                     Level::Scalar => fill_map(lists),
+                    #[cfg(target_arch = "aarch64")]
+                    Level::Neon => fill_map(lists),
                     #[cfg(target_arch = "x86_64")]
                     // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
                     // tile's rows and eight more.

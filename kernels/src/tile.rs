@@ -247,6 +247,8 @@ unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) -> 
             Level::Avx2 => machine::avx2::run(arithmetic, block, whole),
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => machine::avx512::run(arithmetic, block, whole),
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => machine::neon::run(arithmetic, block, whole),
         }
     }
 }
@@ -265,6 +267,8 @@ pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
             Level::Avx2 => machine::avx2::spin(arithmetic, rounds),
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => machine::avx512::spin(arithmetic, rounds),
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => machine::neon::spin(arithmetic, rounds),
         }
     };
     match arithmetic {

@@ -6,6 +6,8 @@ pub(crate) mod avx2;
 pub(crate) mod avx2_lists;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod neon;
 pub(crate) mod scalar;
 
 use crate::rows::{Lanes, PANEL};
@@ -104,6 +106,12 @@ macro_rules! with_halves {
             // SAFETY: this function has the features.
             unsafe { $body::<$crate::machine::avx512::Convert, $($g),*>($($arg),*) }
         }
+        #[cfg(target_arch = "aarch64")]
+        #[target_feature(enable = "neon")]
+        fn neon <$($g: $bound),*> ($($arg: $ty),*) {
+            // SAFETY: this function has the feature.
+            unsafe { $body::<$crate::machine::neon::Convert, $($g),*>($($arg),*) }
+        }
         match $crate::isa::Isa::level($isa) {
             $crate::isa::Level::Scalar => scalar $(::<$g>)* ($($arg),*),
             #[cfg(target_arch = "x86_64")]
@@ -112,6 +120,9 @@ macro_rules! with_halves {
             #[cfg(target_arch = "x86_64")]
             // SAFETY: as above.
             $crate::isa::Level::Avx512 => unsafe { avx512 $(::<$g>)* ($($arg),*) },
+            #[cfg(target_arch = "aarch64")]
+            // SAFETY: an `Isa` of this level is only made where the processor has this feature.
+            $crate::isa::Level::Neon => unsafe { neon $(::<$g>)* ($($arg),*) },
         }
     }};
 }

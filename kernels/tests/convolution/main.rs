@@ -22,6 +22,8 @@ fn every_instruction_set_of_this_machine_is_tested() {
             expected.push("avx512");
         }
     }
+    #[cfg(target_arch = "aarch64")]
+    expected.push("neon");
     assert_eq!(names, expected);
     let bf16 = Isa::detect().has_bf16();
     println!("bf16: {bf16}");
