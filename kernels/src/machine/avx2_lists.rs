@@ -24,6 +24,9 @@ const fn places() -> [u64; 256] {
     all
 }
 
+/// How many entries before they are read the map's are fetched.
+const AHEAD: usize = 1024;
+
 /// Fills the lists, and gives the end of the input rows that the map names.
 ///
 /// # Safety
@@ -46,6 +49,11 @@ pub(crate) unsafe fn fill_map(lists: Lists<'_>) -> usize {
     let lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
     let mut ends = _mm256_setzero_si256();
     for first in (0..count).step_by(8) {
+        // The map is larger than the caches, and each entry read once.
+        let ahead = map.as_ptr().wrapping_add(first * volume + AHEAD);
+        for line in (0..8 * volume).step_by(16) {
+            _mm_prefetch::<_MM_HINT_T0>(ahead.wrapping_add(line).cast());
+        }
         for tap in (0..volume).step_by(8) {
             let taps = (volume - tap).min(8);
             let here = _mm256_cmpgt_epi32(_mm256_set1_epi32(taps as i32), lane);
