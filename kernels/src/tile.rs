@@ -8,6 +8,9 @@ use crate::taps::TileTaps;
 /// Rows that are prepared together: what the widest blocks of any machine divide.
 const GROUP: usize = 24;
 
+/// Panels from which on it pays to fetch input rows ahead: with fewer, a block is done before what it fetches has come.
+const FETCH: usize = 4;
+
 /// A vector of 32-bit sums, and what multiplies and adds one step: an f32, or a pair of i16 or bf16.
 ///
 /// # Safety
@@ -56,6 +59,8 @@ pub(crate) struct Block {
     pub sums: *mut u32,
     /// Words.
     pub stride: usize,
+    /// Whether input rows are to be fetched before they are read.
+    pub fetch: bool,
 }
 
 /// Adds a block's products to its sums, for `V` vectors of channels from the first panel on, at most `R` rows at once.
@@ -109,6 +114,12 @@ unsafe fn multiply<M: Machine, const R: usize, const V: usize>(block: &Block, fi
         for r in 0..R {
             for v in 0..V {
                 sums[r][v] = M::load(outputs[r].add(v * M::LANES));
+            }
+        }
+        if block.fetch {
+            for r in first + R..(first + 2 * R).min(block.rows) {
+                let row = block.inputs.add(*block.reads.add(r) as usize * block.steps);
+                machine::fetch(row, block.steps);
             }
         }
         let mut weights = block.weights;
@@ -184,6 +195,7 @@ pub(crate) fn accumulate<T>(
     };
     assert!(taps.end() <= values.len() / cin, "taps of another input");
     expanded.resize((GROUP * steps).div_ceil(PANEL), Lanes::default());
+    let fetch = panels >= FETCH && matches!(input, Input::Ready(_));
     let half = usize::from((1..=PANEL / 2).contains(&(extents.cout % PANEL)));
     for (k, weights) in weights.chunks_exact(panels * steps).enumerate() {
         let mut rest = taps.of(k);
@@ -213,6 +225,7 @@ pub(crate) fn accumulate<T>(
                     writes: group.rows.as_ptr(),
                     sums: sums[panel..].as_mut_ptr().cast(),
                     stride: panels * PANEL,
+                    fetch: fetch && panel == 0,
                 };
                 // SAFETY: all rows that are read lie below the taps' end, so in the input, or else below `GROUP`, where they were
                 // expanded to; all that are written lie below the tile's number, so in `sums`; the weights are those of the

@@ -24,6 +24,19 @@ pub(crate) fn floats_mut(words: &mut [u32]) -> &mut [f32] {
     unsafe { std::slice::from_raw_parts_mut(words.as_mut_ptr().cast(), words.len()) }
 }
 
+/// Asks for `count` values to be brought into the cache, if the machine can be asked.
+#[inline(always)]
+pub(crate) fn fetch<T>(at: *const T, count: usize) {
+    #[cfg(target_arch = "x86_64")]
+    for line in (0..count * size_of::<T>()).step_by(64) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: SSE is part of the baseline; a fetch reads nothing, and may be of any address.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast::<i8>().wrapping_add(line)) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (at, count);
+}
+
 /// A [`Machine`](crate::tile::Machine) of `$lanes` words: the intrinsics that make zeros, load, store and spread words, and the
 /// multiplication.
 #[cfg(target_arch = "x86_64")]
