@@ -4,8 +4,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// So many are simply sorted.
 const FEW: usize = 64;
-/// The least that is handed out at once, but for the last.
-const HANDFUL: usize = 48;
+/// Handed out are multiples of this, but for the last: vectors are full then.
+const HANDFUL: usize = 32;
+/// So many handfuls at least.
+const HANDFULS: usize = 2;
 /// The most buckets: their counters fit the first cache.
 const MOST_BUCKETS: usize = 2048;
 
@@ -66,11 +68,12 @@ impl Nearest {
             let end = end as usize;
             sort(&mut self.keys[sorted..end]);
             sorted = end;
-            if sorted - first >= HANDFUL {
-                if !draw(&self.keys[first..sorted]) {
+            if sorted - first >= HANDFULS * HANDFUL {
+                let whole = sorted - (sorted - first) % HANDFUL;
+                if !draw(&self.keys[first..whole]) {
                     return;
                 }
-                first = sorted;
+                first = whole;
             }
         }
         if first < sorted {

@@ -6,7 +6,7 @@ use std::arch::x86_64::*;
 
 use super::Ellipse;
 use super::lanes::{
-    Double, EXP2, Lanes, Mask, ROUND, binary, four, instructions, polynomial, three,
+    Double, EXP2, Lanes, Mask, ROUND, binary, four, instructions, numbered, polynomial, three,
 };
 
 /// For each mask of eight lanes, the lanes that it holds, in order.
@@ -218,6 +218,31 @@ impl Lanes for Avx2 {
             kept += 1;
         }
         kept
+    }
+
+    #[inline(always)]
+    fn from_integer(self) -> Self {
+        Avx2(instructions!(_mm256_cvtepi32_ps(_mm256_castps_si256(
+            self.0
+        ))))
+    }
+
+    #[inline(always)]
+    fn gather(all: &[Ellipse], keys: &[u64]) -> [Self; 16] {
+        let mut fields = [Self::splat(0.0); 16];
+        let low = four!(i => all[numbered(keys, i)].fields());
+        let high = four!(i => all[numbered(keys, i + 4)].fields());
+        for q in 0..4 {
+            let rows = four!(i => instructions!(_mm256_set_m128(
+                _mm_loadu_ps(high[i][4 * q..][..4].as_ptr()),
+                _mm_loadu_ps(low[i][4 * q..][..4].as_ptr())
+            )));
+            let turned = turn4_256(rows);
+            for k in 0..4 {
+                fields[4 * q + k] = Avx2(turned[k]);
+            }
+        }
+        fields
     }
 
     #[inline(always)]

@@ -5,7 +5,9 @@
 use std::arch::x86_64::*;
 
 use super::Ellipse;
-use super::lanes::{Double, EXP2, Lanes, Mask, binary, four, instructions, polynomial, three};
+use super::lanes::{
+    Double, EXP2, Lanes, Mask, binary, four, instructions, numbered, polynomial, three,
+};
 
 /// Sixteen floats.
 #[derive(Clone, Copy)]
@@ -196,6 +198,41 @@ impl Lanes for Avx512 {
             }
         }
         kept
+    }
+
+    #[inline(always)]
+    fn from_integer(self) -> Self {
+        Avx512(instructions!(_mm512_cvtepi32_ps(_mm512_castps_si512(
+            self.0
+        ))))
+    }
+
+    #[inline(always)]
+    fn gather(all: &[Ellipse], keys: &[u64]) -> [Self; 16] {
+        // Quarter `j` of `rows[q][i]` is quarter `q` of record `4j + i`; turned, vector `k` of them is field `4q + k`, in order
+        // but for the lanes: lane `4j + i`.
+        let mut rows = [[instructions!(_mm512_setzero_ps()); 4]; 4];
+        for i in 0..4 {
+            let [a, b, c, d] = four!(j => Self::load(all[numbered(keys, 4 * j + i)].fields()).0);
+            instructions!({
+                let ab_low = _mm512_shuffle_f32x4::<0b01_00_01_00>(a, b);
+                let ab_high = _mm512_shuffle_f32x4::<0b11_10_11_10>(a, b);
+                let cd_low = _mm512_shuffle_f32x4::<0b01_00_01_00>(c, d);
+                let cd_high = _mm512_shuffle_f32x4::<0b11_10_11_10>(c, d);
+                rows[0][i] = _mm512_shuffle_f32x4::<0b10_00_10_00>(ab_low, cd_low);
+                rows[1][i] = _mm512_shuffle_f32x4::<0b11_01_11_01>(ab_low, cd_low);
+                rows[2][i] = _mm512_shuffle_f32x4::<0b10_00_10_00>(ab_high, cd_high);
+                rows[3][i] = _mm512_shuffle_f32x4::<0b11_01_11_01>(ab_high, cd_high);
+            });
+        }
+        let mut fields = [Self::splat(0.0); 16];
+        for q in 0..4 {
+            let turned = turn4_512(rows[q]);
+            for k in 0..4 {
+                fields[4 * q + k] = Avx512(turned[k]);
+            }
+        }
+        fields
     }
 
     #[inline(always)]

@@ -7,7 +7,7 @@
 //! Splats are a few pixels wide, so a tile is cut into blocks of 4×4 pixels. For each splat, the blocks that its ellipse reaches are
 //! found all at once, a block to a lane, and of these the ones that still let light through are blended, a pixel to a lane.
 
-use super::lanes::{Lanes, Mask, by_level};
+use super::lanes::{Lanes, Mask, by_level, four};
 use super::{ALPHA_CEILING, Ellipse, FINISHED, LOG_FLOOR};
 use crate::Isa;
 use crate::isa::dispatch;
@@ -24,22 +24,21 @@ const BLOCKS: u32 = TILE / SIDE;
 /// Ellipses whose blocks are laid out before they are blended, and the most blocks.
 const SPLATS: usize = 32;
 const ITEMS: usize = 512;
-/// Ellipses between the one whose record is asked for and the one that is drawn.
-#[cfg(target_arch = "x86_64")]
-const LEAD: usize = 6;
 /// By so much, in powers of two, a block may be beyond an ellipse and still be looked at, for the sake of rounding.
 const SLACK: f32 = 1e-3;
 
-/// Column and row of the lanes of a block, or of a window.
-const COLUMNS: [f32; AREA] = lane_places(false);
-const ROWS: [f32; AREA] = lane_places(true);
-
+/// Column and row of the pixels of a block, counted from its middle.
+const COLUMNS: [f32; AREA] = lane_places(false, 1.0, 1.5);
+const ROWS: [f32; AREA] = lane_places(true, 1.0, 1.5);
+/// Column and row, in pixels, of the blocks of a window, counted from its first.
+const BLOCK_COLUMNS: [f32; AREA] = lane_places(false, SIDE as f32, 0.0);
+const BLOCK_ROWS: [f32; AREA] = lane_places(true, SIDE as f32, 0.0);
 /// The number in the tile of each block of a window, less the first's.
 const PLACES: [f32; AREA] = {
     let mut places = [0.0; AREA];
     let mut i = 0;
     while i < AREA {
-        places[i] = f32::from_bits(ROWS[i] as u32 * BLOCKS + COLUMNS[i] as u32);
+        places[i] = f32::from_bits(i as u32 / SIDE * BLOCKS + i as u32 % SIDE);
         i += 1;
     }
     places
@@ -47,15 +46,16 @@ const PLACES: [f32; AREA] = {
 /// The bits of a window of so many columns.
 const WINDOW: [u64; 5] = [0, 0x0101_0101, 0x0303_0303, 0x0707_0707, 0x0f0f_0f0f];
 
-const fn lane_places(row: bool) -> [f32; AREA] {
+const fn lane_places(row: bool, step: f32, middle: f32) -> [f32; AREA] {
     let mut places = [0.0; AREA];
     let mut i = 0;
     while i < AREA {
-        places[i] = (if row {
+        let place = if row {
             i / SIDE as usize
         } else {
             i % SIDE as usize
-        }) as f32;
+        };
+        places[i] = place as f32 * step - middle;
         i += 1;
     }
     places
@@ -205,28 +205,76 @@ fn rectangle(x0: u32, x1: u32, y0: u32, y1: u32) -> u64 {
 
 #[inline(always)]
 fn body<L: Lanes>(tile: &mut Tile, keys: &[u64], all: &[Ellipse]) {
-    for (i, &key) in keys.iter().enumerate() {
-        #[cfg(target_arch = "x86_64")]
-        if let Some(next) = keys.get(i + LEAD) {
-            prefetch(all, *next as u32 as usize);
+    prefetch(all, &keys[..keys.len().min(SPLATS)]);
+    for (at, turn) in keys.chunks(SPLATS).enumerate() {
+        let next = (at + 1) * SPLATS;
+        prefetch(
+            all,
+            &keys[next.min(keys.len())..keys.len().min(next + SPLATS)],
+        );
+        for (i, some) in turn.chunks(L::COUNT).enumerate() {
+            tile.lay_out::<L>(i * L::COUNT, some, all);
         }
-        let number = i % SPLATS;
-        tile.lay_out::<L>(number, &all[key as u32 as usize]);
-        if number + 1 == SPLATS || i + 1 == keys.len() {
-            tile.work_off::<L>();
-            if tile.open == 0 {
-                return;
-            }
+        tile.work_off::<L>();
+        if tile.open == 0 {
+            return;
         }
     }
 }
 
-#[cfg(target_arch = "x86_64")]
+/// Asks for the ellipses that the lower halves of `keys` number.
 #[inline(always)]
-fn prefetch(all: &[Ellipse], i: usize) {
-    use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-    // SAFETY: a hint: no address is wrong.
-    unsafe { _mm_prefetch::<_MM_HINT_T0>(all.as_ptr().wrapping_add(i).cast()) }
+fn prefetch(all: &[Ellipse], keys: &[u64]) {
+    #[cfg(target_arch = "x86_64")]
+    for &key in keys {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let ellipse = all.as_ptr().wrapping_add(key as u32 as usize);
+        // SAFETY: a hint: no address is wrong.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(ellipse.cast()) }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (all, keys);
+}
+
+/// Numbers in a [`Batch`].
+const FORMS: usize = 9;
+
+/// Of several ellipses, one to a lane: the form in the middle of the tile's first block; by how much it changes, at most, from there
+/// to the block's outer pixels; how large its square may be, before nothing is drawn; and, as integers, the first column and row of
+/// blocks that it may touch, and their ends.
+#[repr(C, align(64))]
+struct Batch([[f32; AREA]; FORMS]);
+
+impl Batch {
+    #[inline(always)]
+    fn fill<L: Lanes>(&mut self, fields: [L; 16], [left, top]: [f32; 2]) {
+        let [cx, cy, ux, uy, vx, vy, log_opacity, ..] = fields;
+        let [.., x0, y0, x1, y1, _, _] = fields;
+        let middle = 0.5 * (SIDE - 1) as f32;
+        let dx = L::splat(left + 0.5 + middle).sub(cx);
+        let dy = L::splat(top + 0.5 + middle).sub(cy);
+        let half = L::splat(middle);
+        let (zero, side) = (L::splat(0.0), L::splat(TILE as f32));
+        let inverse = L::splat(1.0 / SIDE as f32);
+        let within = |at: L, corner: f32| {
+            let at = at.from_integer().sub(L::splat(corner));
+            at.max(zero).min(side).mul(inverse)
+        };
+        let forms = [
+            ux.mul_add(dx, uy.mul(dy)),
+            vx.mul_add(dx, vy.mul(dy)),
+            ux.abs().add(uy.abs()).mul(half),
+            vx.abs().add(vy.abs()).mul(half),
+            log_opacity.add(L::splat(SLACK - LOG_FLOOR)),
+            within(x0, left).floor().to_integer(),
+            within(y0, top).floor().to_integer(),
+            within(x1, left).ceil().to_integer(),
+            within(y1, top).ceil().to_integer(),
+        ];
+        for (row, form) in self.0.iter_mut().zip(forms) {
+            form.store(row);
+        }
+    }
 }
 
 /// What is to be blended: a list of ellipses and blocks. It is laid out and worked off in turns, because in either loop nearly every
@@ -234,7 +282,7 @@ fn prefetch(all: &[Ellipse], i: usize) {
 #[derive(Debug, Clone)]
 #[repr(C, align(64))]
 struct Work {
-    /// The form at the first pixel of the block.
+    /// The form in the middle of the block.
     u: [f32; ITEMS],
     v: [f32; ITEMS],
     /// The ellipse above, the block in the lowest 8 bits.
@@ -247,7 +295,7 @@ struct Work {
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
 struct Splat {
-    /// The form at the pixels of a block, less what it is at the first.
+    /// The form at the pixels of a block, less what it is in the middle.
     u: [f32; AREA],
     v: [f32; AREA],
     log_opacity: f32,
@@ -255,83 +303,79 @@ struct Splat {
 }
 
 impl Tile {
-    /// Adds an ellipse's blocks to the work.
+    /// Adds the blocks of at most as many ellipses as there are lanes to the work; the first is the turn's `first`.
     #[inline(always)]
-    fn lay_out<L: Lanes>(&mut self, number: usize, ellipse: &Ellipse) {
-        let [left, top] = self.corner;
-        let bounds = &ellipse.bounds;
-        // The blocks within the bounds, none if they are beside the tile.
-        let first = |at: u32, corner: u32| at.saturating_sub(corner).min(TILE) / SIDE;
-        let end = |at: u32, corner: u32| at.saturating_sub(corner).min(TILE).div_ceil(SIDE);
-        let (x0, x1) = (first(bounds.x0, left), end(bounds.x1, left));
-        let (y0, y1) = (first(bounds.y0, top), end(bounds.y1, top));
-        let wanted = self.open & rectangle(x0, x1, y0, y1);
-        if wanted == 0 {
-            return;
-        }
-
-        let splat = &mut self.work.splats[number];
-        splat.log_opacity = ellipse.log_opacity;
-        splat.colour = ellipse.colour;
-        // The form at the tile's first pixel, and its steps.
-        let dx = left as f32 + 0.5 - ellipse.centre[0];
-        let dy = top as f32 + 0.5 - ellipse.centre[1];
-        let ([ux, uy], [vx, vy]) = (ellipse.u, ellipse.v);
-        let (u, v) = (ux * dx + uy * dy, vx * dx + vy * dy);
-        for part in 0..AREA / L::COUNT {
-            let lanes = part * L::COUNT;
-            let (column, row) = (L::load(&COLUMNS[lanes..]), L::load(&ROWS[lanes..]));
-            let steps = column.mul_add(L::splat(ux), row.mul(L::splat(uy)));
-            steps.store(&mut splat.u[lanes..]);
-            let steps = column.mul_add(L::splat(vx), row.mul(L::splat(vy)));
-            steps.store(&mut splat.v[lanes..]);
-        }
-
-        let side = SIDE as f32;
-        let middle = 0.5 * (side - 1.0);
-        let half_u = L::splat(middle * (ux.abs() + uy.abs()));
-        let half_v = L::splat(middle * (vx.abs() + vy.abs()));
-        let reach = L::splat(ellipse.log_opacity - LOG_FLOOR + SLACK);
-        let to_middle_u = L::splat(middle * (ux + uy));
-        let to_middle_v = L::splat(middle * (vx + vy));
-        let mut y = y0;
-        while y < y1 {
-            let mut x = x0;
-            while x < x1 {
-                // A window: the form at the first pixel of each of its blocks …
-                let (px, py) = (side * x as f32, side * y as f32);
-                let at_u = L::splat(u + ux * px + uy * py);
-                let at_v = L::splat(v + vx * px + vy * py);
-                let place = y * BLOCKS + x;
-                let wanted = packed(wanted >> place & WINDOW[(BLOCKS - x).min(SIDE) as usize]);
-                for part in 0..AREA / L::COUNT {
-                    let lanes = part * L::COUNT;
-                    let column = L::load(&COLUMNS[lanes..]).mul(L::splat(side));
-                    let row = L::load(&ROWS[lanes..]).mul(L::splat(side));
-                    let bu = row.mul_add(L::splat(uy), column.mul_add(L::splat(ux), at_u));
-                    let bv = row.mul_add(L::splat(vy), column.mul_add(L::splat(vx), at_v));
-                    // … and the least that it can be anywhere in the block.
-                    let zero = L::splat(0.0);
-                    let least_u = bu.add(to_middle_u).abs().sub(half_u).max(zero);
-                    let least_v = bv.add(to_middle_v).abs().sub(half_v).max(zero);
-                    let least = least_u.mul_add(least_u, least_v.mul(least_v));
-                    let which = least.le(reach).bits() & wanted >> lanes;
-
-                    let work = &mut self.work;
-                    let at = work.items;
-                    bu.compress(which).store(&mut work.u[at..]);
-                    bv.compress(which).store(&mut work.v[at..]);
-                    let place = L::splat(f32::from_bits((number as u32) << 8 | place));
-                    let place = L::load(&PLACES[lanes..]).add_integer(place);
-                    place.compress(which).store(&mut work.place[at..]);
-                    work.items += which.count_ones() as usize;
-                }
-                if self.work.items > ITEMS - 2 * AREA {
-                    self.work_off::<L>();
-                }
-                x += SIDE;
+    fn lay_out<L: Lanes>(&mut self, first: usize, keys: &[u64], all: &[Ellipse]) {
+        let fields = L::gather(all, keys);
+        let corner = [self.corner[0] as f32, self.corner[1] as f32];
+        let mut batch = Batch([[0.0; AREA]; FORMS]);
+        batch.fill(fields, corner);
+        for (i, &key) in keys.iter().enumerate() {
+            let [x0, y0, x1, y1] = four!(k => batch.0[5 + k][i].to_bits());
+            let wanted = self.open & rectangle(x0, x1, y0, y1);
+            if wanted == 0 {
+                continue;
             }
-            y += SIDE;
+            let number = first + i;
+            let ellipse = &all[key as u32 as usize];
+            let splat = &mut self.work.splats[number];
+            splat.log_opacity = ellipse.log_opacity;
+            splat.colour = ellipse.colour;
+            let ([ux, uy], [vx, vy]) = (ellipse.u, ellipse.v);
+            let lanes_u = [L::splat(ux), L::splat(uy)];
+            let lanes_v = [L::splat(vx), L::splat(vy)];
+            for part in 0..AREA / L::COUNT {
+                let lanes = part * L::COUNT;
+                let (column, row) = (L::load(&COLUMNS[lanes..]), L::load(&ROWS[lanes..]));
+                let steps = column.mul_add(lanes_u[0], row.mul(lanes_u[1]));
+                steps.store(&mut splat.u[lanes..]);
+                let steps = column.mul_add(lanes_v[0], row.mul(lanes_v[1]));
+                steps.store(&mut splat.v[lanes..]);
+            }
+            let [u, v, half_u, half_v] = four!(k => batch.0[k][i]);
+            let reach = batch.0[4][i];
+            let (half_u, half_v) = (L::splat(half_u), L::splat(half_v));
+            let reach = L::splat(reach);
+            let mut y = y0;
+            while y < y1 {
+                let mut x = x0;
+                while x < x1 {
+                    // A window: the form in the middle of each of its blocks …
+                    let (px, py) = ((SIDE * x) as i32 as f32, (SIDE * y) as i32 as f32);
+                    let at_u = L::splat(u + (ux * px + uy * py));
+                    let at_v = L::splat(v + (vx * px + vy * py));
+                    let place = y * BLOCKS + x;
+                    let wanted = wanted >> place & WINDOW[(BLOCKS - x).min(SIDE) as usize];
+                    let wanted = packed(wanted);
+                    for part in 0..AREA / L::COUNT {
+                        let lanes = part * L::COUNT;
+                        let column = L::load(&BLOCK_COLUMNS[lanes..]);
+                        let row = L::load(&BLOCK_ROWS[lanes..]);
+                        let bu = column.mul_add(lanes_u[0], row.mul_add(lanes_u[1], at_u));
+                        let bv = column.mul_add(lanes_v[0], row.mul_add(lanes_v[1], at_v));
+                        // … and the least that it can be anywhere in the block.
+                        let zero = L::splat(0.0);
+                        let least_u = bu.abs().sub(half_u).max(zero);
+                        let least_v = bv.abs().sub(half_v).max(zero);
+                        let least = least_u.mul_add(least_u, least_v.mul(least_v));
+                        let which = least.le(reach).bits() & wanted >> lanes;
+
+                        let work = &mut self.work;
+                        let at = work.items;
+                        bu.compress(which).store(&mut work.u[at..]);
+                        bv.compress(which).store(&mut work.v[at..]);
+                        let place = L::splat(f32::from_bits((number as u32) << 8 | place));
+                        let place = L::load(&PLACES[lanes..]).add_integer(place);
+                        place.compress(which).store(&mut work.place[at..]);
+                        work.items += which.count_ones() as usize;
+                    }
+                    if self.work.items > ITEMS - 2 * AREA {
+                        self.work_off::<L>();
+                    }
+                    x += SIDE;
+                }
+                y += SIDE;
+            }
         }
     }
 
@@ -361,7 +405,7 @@ fn packed(bits: u64) -> u32 {
     (bits | bits >> 8) & 0xffff
 }
 
-/// `u`, `v`: the form at the block's first pixel. False, and nothing done, if every pixel is finished.
+/// `u`, `v`: the form in the middle of the block. False, and nothing done, if every pixel is finished.
 #[inline(always)]
 fn blend<L: Lanes>(block: &mut Block, splat: &Splat, [u, v]: [f32; 2]) -> bool {
     let mut open = 0;

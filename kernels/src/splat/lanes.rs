@@ -69,6 +69,14 @@ pub(super) trait Lanes: Copy {
     /// # Panics
     /// If `to` is shorter than the highest of the lanes.
     fn collect(fields: &[Self; 16], which: u32, to: &mut [Ellipse]) -> usize;
+    /// Unsigned integers up to 2²⁴, as floats.
+    fn from_integer(self) -> Self;
+    /// Field `k` of the ellipse that the lower half of key `i` numbers, in lane `i` of vector `k`. Where there are fewer keys than
+    /// lanes, those of the last.
+    ///
+    /// # Panics
+    /// If there is no key, or no such ellipse.
+    fn gather(all: &[Ellipse], keys: &[u64]) -> [Self; 16];
     /// The mantissa, in `[1, 2)`, and the exponent, of a positive normal number.
     fn split(self) -> (Self, Self);
 }
@@ -226,6 +234,12 @@ pub(super) fn polynomial<L: Lanes>(x: L, coefficients: &[f32; 5]) -> L {
         p = p.mul_add(x, L::splat(*c));
     }
     p
+}
+
+/// The ellipse that key `i` numbers, or the last key.
+#[inline(always)]
+pub(super) fn numbered(keys: &[u64], i: usize) -> usize {
+    keys[i.min(keys.len() - 1)] as u32 as usize
 }
 
 /// Four floats, in plain Rust.
@@ -417,6 +431,21 @@ impl Lanes for Plain {
             kept += 1;
         }
         kept
+    }
+
+    #[inline(always)]
+    fn from_integer(self) -> Self {
+        self.each(|x| x.to_bits() as f32)
+    }
+
+    #[inline(always)]
+    fn gather(all: &[Ellipse], keys: &[u64]) -> [Self; 16] {
+        let records = four!(i => all[numbered(keys, i)].fields());
+        let mut fields = [Plain([0.0; 4]); 16];
+        for (k, field) in fields.iter_mut().enumerate() {
+            *field = Plain(four!(i => records[i][k]));
+        }
+        fields
     }
 
     #[inline(always)]

@@ -90,6 +90,14 @@ impl Ellipse {
     }
 
     /// The bits of its fields, in their order.
+    #[inline(always)]
+    fn fields(&self) -> &[f32; 16] {
+        const { assert!(size_of::<Ellipse>() == size_of::<[f32; 16]>()) };
+        // SAFETY: of the same size and no stricter alignment, without padding; any bits are an `f32`.
+        unsafe { &*std::ptr::from_ref(self).cast() }
+    }
+
+    /// The bits of its fields, in their order.
     #[cfg(target_arch = "x86_64")]
     #[inline(always)]
     fn as_fields_mut(&mut self) -> &mut [f32; 16] {
