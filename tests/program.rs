@@ -129,6 +129,98 @@ fn several_views_are_numbered_and_differ() {
 }
 
 #[test]
+fn pictures_and_videos_go_to_a_pipe() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let piped = |args: &[&str]| {
+        let fixed = ["render", "ball.b2p", "-o", "-", "--size", "32x24"];
+        let done = b2p(at, &[&fixed[..], args].concat());
+        assert!(done.status.success());
+        done.stdout
+    };
+    assert!(piped(&[]).starts_with(b"\x89PNG"));
+    assert!(piped(&["--format", "png16"]).starts_with(b"\x89PNG"));
+    assert_eq!(piped(&["--format", "ppm"]).len(), 13 + 32 * 24 * 3);
+    let video = piped(&["--views", "4"]);
+    assert!(video.starts_with(b"YUV4MPEG2 W32 H24 "));
+    let header = video.iter().position(|&b| b == b'\n').unwrap() + 1;
+    assert_eq!(video.len(), header + 4 * (6 + 32 * 24 * 3));
+}
+
+#[test]
+fn the_numbers_of_a_picture_are_printed_as_json() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let args = ["render", "ball.b2p", "-o", "a.png", "--size", "64x64"];
+    let done = b2p(at, &[&args[..], &["--stats", "json"]].concat());
+    let json: serde_json::Value = serde_json::from_slice(&done.stdout).unwrap();
+    assert!(json[0]["visible"].as_u64().unwrap() > 0);
+    assert_eq!(json[0]["dropped"]["not_finite"], 0);
+    let coverage = json[0]["coverage"].as_f64().unwrap();
+    assert!((0.05..1.0).contains(&coverage), "{coverage}");
+    assert!(json[0]["ms"]["total"].as_f64().unwrap() > 0.0);
+}
+
+#[test]
+fn effects_are_explained_and_forced() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let draw = |name: &str, more: &[&str]| {
+        let args = ["render", "ball.b2p", "-o", name, "--size", "16x16", "-v"];
+        let done = b2p(at, &[&args[..], more].concat());
+        assert!(done.status.success());
+        String::from_utf8(done.stdout).unwrap()
+    };
+    assert!(draw("a.png", &[]).contains("antialias off: "));
+    assert!(draw("b.png", &["--effect", "antialias=on"]).contains("antialias on: forced"));
+    let [a, b] = ["a.png", "b.png"].map(|name| common::png(&at.join(name)));
+    assert!(a.data() != b.data());
+    for show in ["depth", "normal", "alpha"] {
+        draw("c.png", &["--show", show, "--orthographic"]);
+    }
+}
+
+#[test]
+fn cameras_come_from_a_file_and_a_broken_one_is_named() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let shot = |scale: f64| {
+        format!(
+            r#"{{"file_path": "x", "transform_matrix":
+             [[{scale}, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}}"#
+        )
+    };
+    let file = |shots: &[String]| {
+        let text = format!(
+            r#"{{"camera_angle_x": 0.8, "frames": [{}]}}"#,
+            shots.join(",")
+        );
+        std::fs::write(at.join("transforms.json"), text).unwrap();
+    };
+    let args = [
+        "render",
+        "ball.b2p",
+        "-o",
+        "f.png",
+        "--size",
+        "16x12",
+        "--camera",
+        "transforms.json",
+    ];
+    file(&[shot(1.0), shot(1.0)]);
+    succeeds(at, &args);
+    assert_eq!(common::png(&at.join("f-001.png")).width(), 16);
+    file(&[shot(1.5)]);
+    let done = b2p(at, &args);
+    assert_eq!(done.status.code(), Some(1));
+    let error = String::from_utf8(done.stderr).unwrap();
+    assert!(
+        error.contains("transforms.json") && error.contains("scales"),
+        "{error}"
+    );
+}
+
+#[test]
 fn a_transparent_background_stays_transparent_in_the_corners() {
     let folder = folder_with_stream();
     let at = folder.path();

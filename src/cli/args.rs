@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use b2p::encoder::Options;
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 
 /// Learned point-cloud streams to 3D Gaussians and pictures, on a plain CPU.
 #[derive(Debug, Parser)]
@@ -75,15 +75,69 @@ pub struct Decode {
 pub struct Render {
     /// Stream, or PLY of Gaussians
     pub input: PathBuf,
-    /// Picture to write; with --views a number is put before its ending
+    /// Picture to write: .png, .ppm, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
     #[arg(short, long, value_name = "OUT.png")]
     pub output: PathBuf,
+    /// What is written [default: by the ending; to standard output png, and y4m of several pictures]
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    pub format: Option<Format>,
+    /// Cameras of a file in place of --orbit: NeRF's transforms.json, or COLMAP's images.txt beside its cameras.txt
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov"])]
+    pub camera: Option<PathBuf>,
+    /// Parallel rays; the cube's centre stays as large as it is
+    #[arg(long, conflicts_with = "camera")]
+    pub orthographic: bool,
+    /// What is drawn
+    #[arg(long, value_enum, value_name = "WHAT", default_value_t = Show::Colour)]
+    pub show: Show,
+    /// Force an effect (harmonics, antialias) on or off
+    #[arg(long, value_name = "NAME=on|off|auto", value_parser = effect)]
+    pub effect: Vec<(Effect, Choice)>,
+    /// Print what each picture took, and what was not drawn and why, as JSON
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    pub stats: Option<StatsFormat>,
+    /// Say which effects are on, and why
+    #[arg(short, long)]
+    pub verbose: bool,
     #[command(flatten)]
     pub level: LevelArg,
     #[command(flatten)]
     pub view: View,
     #[command(flatten)]
     pub model: ModelArg,
+}
+
+/// Kinds of pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    /// Eight bits a channel
+    Png,
+    /// Sixteen bits a channel
+    Png16,
+    /// Eight bits a channel, no transparency
+    Ppm,
+    /// A video of all pictures, 30 a second
+    Y4m,
+}
+
+/// What a picture shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Show {
+    /// Colours
+    Colour,
+    /// Distance along the viewing direction, the farthest white
+    Depth,
+    /// Normals in the camera's axes
+    Normal,
+    /// How much of a pixel is covered
+    Alpha,
+}
+
+/// How numbers are printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum StatsFormat {
+    /// One object per picture, in an array
+    Json,
 }
 
 /// Where the camera stands and what it sees.
@@ -163,7 +217,7 @@ pub struct ModelArg {
     pub precision: Option<String>,
 }
 
-pub use b2p::pixels::Background;
+pub use b2p::pixels::{Background, Choice, Effect};
 
 fn levels(text: &str) -> Result<RangeInclusive<u8>, String> {
     let expected = "expected two levels such as 7..9";
@@ -209,6 +263,13 @@ fn orbit(text: &str) -> Result<[f32; 3], String> {
         .map_err(|_| "expected three numbers: azimuth,elevation,distance".into())
 }
 
+fn effect(text: &str) -> Result<(Effect, Choice), String> {
+    let (name, choice) = text
+        .split_once('=')
+        .ok_or("expected an effect and a choice such as antialias=on")?;
+    Ok((name.parse()?, choice.parse()?))
+}
+
 fn background(text: &str) -> Result<Background, String> {
     let named = match text {
         "transparent" => return Ok(Background::Transparent),
@@ -252,6 +313,9 @@ mod tests {
         assert!(levels("9").unwrap_err().contains("7..9"));
         assert!(size("0x4").unwrap_err().contains("1024x1024"));
         assert!(orbit("1,2").unwrap_err().contains("three"));
+        assert!(effect("antialias").unwrap_err().contains("antialias=on"));
+        assert!(effect("glow=on").unwrap_err().contains("glow"));
+        assert!(effect("antialias=maybe").is_err());
         assert!(background("#ff00").is_err());
         assert!(background("#ää").is_err());
     }

@@ -41,6 +41,7 @@ pub fn activate(
         opacity: vec![1.0; count],
         colour: vec![[0.0; 3]; count],
         frame,
+        ..Gaussians::default()
     };
     gaussians
         .position

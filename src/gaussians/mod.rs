@@ -1,8 +1,10 @@
 //! 3D Gaussians in memory.
 
 mod activations;
+mod harmonics;
 mod heads;
 
+pub use harmonics::Harmonics;
 pub use heads::activate;
 
 pub mod ply;
@@ -23,6 +25,10 @@ pub struct Gaussians {
     pub opacity: Vec<f32>,
     /// Display-referred (sRGB) colour in `[0, 1]`.
     pub colour: Vec<[f32; 3]>,
+    /// View-dependent colour; a stream's Gaussians have none.
+    pub harmonics: Harmonics,
+    /// Whether they were made to be drawn with opacity compensation (anti-aliasing).
+    pub compensated: bool,
     /// Where the cube lies in the world.
     pub frame: Frame,
 }
@@ -80,7 +86,18 @@ impl Gaussians {
             self.colour.len(),
         ];
         if others == [self.len(); 4] {
-            return Ok(());
+            let Harmonics {
+                count,
+                coefficients,
+            } = &self.harmonics;
+            if coefficients.len() == self.len() * count && [0, 3, 8, 15].contains(count) {
+                return Ok(());
+            }
+            return Err(Error::Usage(format!(
+                "{} positions, but {} coefficients of view-dependent colour, {count} each",
+                self.len(),
+                coefficients.len()
+            )));
         }
         Err(Error::Usage(format!(
             "{} positions, but {others:?} scales, rotations, opacities and colours",

@@ -6,12 +6,15 @@
 //! that reading gives back the same frame. Positions are single precision: with an origin a million voxels away they keep a
 //! sixteenth of a voxel.
 //!
+//! View-dependent colour (`f_rest_*`) is read, and not written: this crate's Gaussians have none. The comment `SplatRenderMode: mip`
+//! says that they were made to be drawn with opacity compensation.
+//!
 //! Files of other programs are read as well: number types, byte order and the order of the properties are free.
 
 use std::io::Write;
 use std::path::Path;
 
-use super::{Frame, Gaussians};
+use super::{Frame, Gaussians, Harmonics};
 use crate::cloud::ply::{Header, Ply};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
@@ -28,6 +31,8 @@ const PROPERTIES: [&str; 14] = [
     "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
     "rot_0", "rot_1", "rot_2", "rot_3",
 ];
+/// Render modes of Gaussians that were made to be drawn with opacity compensation.
+const MIP: [&str; 2] = ["mip", "antialiased"];
 /// Rows between two writes.
 const BLOCK: usize = 1024;
 /// Bit depth of a cube that is fitted to a file which names none.
@@ -36,9 +41,9 @@ const FITTED_BITS: u8 = 10;
 /// What reading a file of another program had to leave out or make up.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Notes {
-    /// Coefficients of view-dependent colour per Gaussian that were ignored (`f_rest_*`).
+    /// Coefficients of view-dependent colour per Gaussian that were ignored (`f_rest_*`), because they are not all of a degree.
     pub ignored_harmonics: usize,
-    /// A render mode other than `default`, which was not followed.
+    /// A render mode other than `default` and `mip`, which was not followed.
     pub ignored_mode: Option<String>,
     /// There is no `scale_2`: the Gaussians are discs.
     pub flat: bool,
@@ -153,12 +158,16 @@ impl Gaussians {
 pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
     let ply = Ply::open(bytes)?;
     let has = |name: &str| ply.element("vertex").is_some_and(|vertex| vertex.has(name));
+    let mode = render_mode(&ply.header);
+    let compensated = mode.as_deref().is_some_and(|mode| MIP.contains(&mode));
+    let rest = ply.element("vertex").map_or(0, |vertex| {
+        let names = vertex.properties.iter().map(|p| &p.name);
+        names.filter(|name| name.starts_with("f_rest_")).count()
+    });
+    let whole = [9, 24, 45].contains(&rest) && (0..rest).all(|i| has(&format!("f_rest_{i}")));
     let mut notes = Notes {
-        ignored_mode: render_mode(&ply.header),
-        ignored_harmonics: ply.element("vertex").map_or(0, |vertex| {
-            let names = vertex.properties.iter().map(|p| &p.name);
-            names.filter(|name| name.starts_with("f_rest_")).count()
-        }),
+        ignored_mode: mode.filter(|_| !compensated),
+        ignored_harmonics: if whole { 0 } else { rest },
         flat: !has("scale_2") && has("scale_1"),
         fitted: false,
     };
@@ -168,7 +177,7 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
     }
     let mut columns = ply.vertex_columns(&names, limits)?;
     let count = columns[0].len();
-    let memory = size_of::<[f32; 14]>() as u64 + size_of::<[f64; 3]>() as u64;
+    let memory = size_of::<[f32; 14]>() as u64 + size_of::<[f64; 3]>() as u64 + 4 * rest as u64;
     limits.check_bytes("bytes of the Gaussians", count as u64 * memory)?;
 
     let rotation = columns.split_off(columns.len() - 4);
@@ -194,7 +203,14 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
             deviation
         }
     };
+    let harmonics = if whole {
+        harmonics(&ply, rest / 3, limits)?
+    } else {
+        Harmonics::default()
+    };
     let gaussians = Gaussians {
+        harmonics,
+        compensated,
         position: (0..count)
             .map(|i| frame.placement.to_cube(frame.bits, centre(i)))
             .collect(),
@@ -213,6 +229,23 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
         frame,
     };
     Ok((gaussians, notes))
+}
+
+/// The coefficients `f_rest_*`, `count` for each of red, green and blue, in this order.
+fn harmonics(ply: &Ply, count: usize, limits: &Limits) -> Result<Harmonics> {
+    let names: Vec<String> = (0..3 * count).map(|i| format!("f_rest_{i}")).collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let columns = ply.vertex_columns(&names, limits)?;
+    let one = |i: usize| {
+        let columns = &columns;
+        (0..count).map(move |k| -> [f32; 3] {
+            std::array::from_fn(|c| columns[c * count + k].get(i) as f32)
+        })
+    };
+    Ok(Harmonics {
+        count,
+        coefficients: (0..columns[0].len()).flat_map(one).collect(),
+    })
 }
 
 /// The render mode in the comments, if it isn't the default.

@@ -77,6 +77,72 @@ impl Image {
     }
 }
 
+impl Image {
+    /// A PNG file of 16 bits a channel, with straight alpha.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if the picture is too large for the format.
+    pub fn to_png16(&self) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        let failed =
+            |e: png::EncodingError| unsupported(format!("{}×{}: {e}", self.width, self.height));
+        let mut encoder = png::Encoder::new(&mut file, self.width, self.height);
+        encoder.set_color(png::ColorType::Rgba);
+        encoder.set_depth(png::BitDepth::Sixteen);
+        let mut writer = encoder.write_header().map_err(failed)?;
+        let mut bytes = Vec::with_capacity(self.pixels.len() * 8);
+        for &[r, g, b, alpha] in &self.pixels {
+            let alpha = alpha.clamp(0.0, 1.0);
+            let straight = [r, g, b].map(|c| if alpha > 0.0 { c / alpha } else { 0.0 });
+            for value in [straight[0], straight[1], straight[2], alpha] {
+                let value = (value.clamp(0.0, 1.0) * 65535.0 + 0.5) as u16;
+                bytes.extend(value.to_be_bytes());
+            }
+        }
+        writer.write_image_data(&bytes).map_err(failed)?;
+        writer.finish().map_err(failed)?;
+        Ok(file)
+    }
+
+    /// A binary PPM file: eight bits a channel, what is transparent over black.
+    pub fn to_ppm(&self) -> Vec<u8> {
+        let mut file = format!("P6\n{} {}\n255\n", self.width, self.height).into_bytes();
+        let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+        file.extend(
+            self.pixels
+                .iter()
+                .flat_map(|[r, g, b, _]| [r, g, b].map(|c| byte(*c))),
+        );
+        file
+    }
+
+    /// What a YUV4MPEG2 stream of pictures of this size begins with, at 30 pictures a second.
+    pub fn y4m_header(&self) -> Vec<u8> {
+        format!(
+            "YUV4MPEG2 W{} H{} F30:1 Ip A1:1 C444\n",
+            self.width, self.height
+        )
+        .into_bytes()
+    }
+
+    /// One picture of a YUV4MPEG2 stream: ITU-R BT.601, limited range, colour at full resolution; what is transparent over black.
+    pub fn to_y4m_frame(&self) -> Vec<u8> {
+        let rows = [
+            [65.481, 128.553, 24.966, 16.0],
+            [-37.797, -74.203, 112.0, 128.0],
+            [112.0, -93.786, -18.214, 128.0],
+        ];
+        let mut frame = b"FRAME\n".to_vec();
+        for [kr, kg, kb, offset] in rows {
+            frame.extend(self.pixels.iter().map(|p| -> u8 {
+                let [r, g, b] = [p[0], p[1], p[2]].map(|c| c.clamp(0.0, 1.0));
+                (kr * r + kg * g + kb * b + offset + 0.5) as u8
+            }));
+        }
+        frame
+    }
+}
+
 /// [`Image::box_half`] of eight-bit pixels: means rounded to the nearest, halves up.
 ///
 /// # Errors
@@ -154,6 +220,34 @@ mod tests {
         let png = image.to_png().unwrap();
         let straight = Pixmap::decode_png(&png).unwrap().take_demultiplied();
         assert_eq!(straight, [255, 128, 0, 128, 0, 0, 0, 0, 255, 128, 0, 255]);
+    }
+
+    #[test]
+    fn sixteen_bits_keep_what_eight_lose() {
+        let picture = image(2, 1, |x, _| match x {
+            0 => [0.25, 0.5, 300.0 / 65535.0, 1.0],
+            _ => [0.25, 0.5, 0.0, 0.5],
+        });
+        let file = picture.to_png16().unwrap();
+        let mut reader = png::Decoder::new(std::io::Cursor::new(file))
+            .read_info()
+            .unwrap();
+        let mut bytes = [0; 16];
+        reader.next_frame(&mut bytes).unwrap();
+        let values: Vec<u16> = bytes
+            .chunks(2)
+            .map(|b| u16::from_be_bytes([b[0], b[1]]))
+            .collect();
+        assert_eq!(values, [16384, 32768, 300, 65535, 32768, 65535, 0, 32768]);
+    }
+
+    #[test]
+    fn ppm_and_y4m_hold_the_colours_one_after_the_other_and_plane_by_plane() {
+        let picture = image(2, 1, |x, _| [[1.0; 4], [1.0, 0.0, 0.0, 1.0]][x as usize]);
+        assert_eq!(picture.to_ppm(), b"P6\n2 1\n255\n\xff\xff\xff\xff\0\0");
+        assert!(picture.y4m_header().starts_with(b"YUV4MPEG2 W2 H1 "));
+        let frame = picture.to_y4m_frame();
+        assert_eq!(frame[6..], [235, 81, 128, 90, 128, 240]);
     }
 
     #[test]

@@ -22,9 +22,11 @@
 //! picture is the same to the bit for any number of threads: a tile is drawn by one thread, in an order that is a function of the
 //! input alone. Work runs on the rayon pool that the caller is in.
 
+mod effects;
 mod image;
 #[doc(hidden)]
 pub mod reference;
+mod shade;
 #[cfg(test)]
 mod tests;
 
@@ -35,12 +37,14 @@ use b2p_kernels::Isa;
 use b2p_kernels::splat::Tile;
 use rayon::prelude::*;
 
+pub use effects::{Choice, Effect, EffectSet, Effects, Explanation};
 pub use image::{Image, box_half};
+pub use shade::Channel;
 
 use crate::error::Result;
 use crate::gaussians::Gaussians;
 use crate::limits::Limits;
-use crate::projection::{Camera, Dropped, Ellipses};
+use crate::projection::{Camera, Dropped, Ellipses, How};
 use crate::tiles::{Bins, Count, Grid, Nearest, Part, TILE};
 
 /// What is seen where the Gaussians let light through.
@@ -78,6 +82,8 @@ pub struct Stats {
     pub pairs: u64,
     /// Pixels that something was drawn on.
     pub touched: u64,
+    /// What it was drawn with.
+    pub effects: EffectSet,
     /// Wall time of each stage.
     pub times: Times,
 }
@@ -87,7 +93,7 @@ pub struct Stats {
 /// The last two run as one, tile by tile: their time is divided in proportion to what the threads spent on each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Times {
-    /// From Gaussians to ellipses.
+    /// From Gaussians to ellipses, and before that to the colours of the view, if that is called for.
     pub project: Duration,
     /// Into the lists of the tiles.
     pub bin: Duration,
@@ -108,6 +114,8 @@ impl Times {
 #[derive(Debug)]
 pub struct Renderer {
     isa: Isa,
+    effects: Effects,
+    shades: Vec<[f32; 3]>,
     ellipses: Ellipses,
     counts: Vec<Count>,
     bins: Bins,
@@ -149,11 +157,18 @@ impl Renderer {
     pub fn new(isa: Isa) -> Self {
         Renderer {
             isa,
+            effects: Effects::default(),
+            shades: Vec::new(),
             ellipses: Ellipses::default(),
             counts: Vec::new(),
             bins: Bins::default(),
             desks: Vec::new(),
         }
+    }
+
+    /// Forces effects on or off from now on.
+    pub fn set_effects(&mut self, effects: Effects) {
+        self.effects = effects;
     }
 
     /// One picture.
@@ -185,7 +200,31 @@ impl Renderer {
         limits: &Limits,
         image: &mut Image,
     ) -> Result<Stats> {
+        self.draw_into(
+            gaussians,
+            camera,
+            Channel::Colour,
+            background,
+            limits,
+            image,
+        )
+    }
+
+    /// As [`Renderer::render_into`], of any channel.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_into`].
+    pub fn draw_into(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        channel: Channel,
+        background: Background,
+        limits: &Limits,
+        image: &mut Image,
+    ) -> Result<Stats> {
         camera.check()?;
+        gaussians.check_lengths()?;
         if let Background::Colour(c) = background
             && !c.iter().all(|x| x.is_finite())
         {
@@ -195,18 +234,29 @@ impl Renderer {
         let count = u64::from(camera.width) * u64::from(camera.height);
         limits.check_pixels("pixels of the picture", count)?;
         let grid = Grid::new(camera.width, camera.height);
+        let effects = self.effects.derive(gaussians);
+        let shaded = effects.harmonics || channel != Channel::Colour;
+        let shade = u64::from(shaded) * size_of::<[f32; 3]>() as u64;
         let bytes = count * size_of::<[f32; 4]>() as u64
-            + gaussians.len() as u64 * Ellipses::BYTES
+            + gaussians.len() as u64 * (Ellipses::BYTES + shade)
             + grid.bytes(Ellipses::runs_of(gaussians.len()));
         limits.check_bytes("bytes to draw the picture", bytes)?;
 
         let mut times = Times::default();
         let mut clock = Instant::now();
         let mut lap = || std::mem::replace(&mut clock, Instant::now()).elapsed();
+        if shaded {
+            shade::fill(gaussians, camera, channel, &mut self.shades);
+        }
+        let how = How {
+            isa: self.isa,
+            compensated: effects.antialias,
+            colours: shaded.then_some(&self.shades),
+        };
         let dropped = self.ellipses.project(
             gaussians,
             camera,
-            self.isa,
+            how,
             &mut self.counts,
             |count, ellipses| count.count(grid, ellipses),
         )?;
@@ -224,7 +274,7 @@ impl Renderer {
             self.bins
                 .fill(now.clone(), &self.ellipses, &mut self.counts);
             times.bin += lap();
-            let [sorting, blending] = self.draw(&now, size, background, &mut image.pixels);
+            let [sorting, blending] = self.draw_part(&now, size, background, &mut image.pixels);
             let drawn = lap();
             let share = sorting.as_secs_f64() / (sorting + blending).as_secs_f64().max(1e-9);
             times.sort += drawn.mul_f64(share);
@@ -240,12 +290,13 @@ impl Renderer {
             visible: self.ellipses.len() as u64,
             dropped,
             pairs,
+            effects,
             times,
         })
     }
 
     /// Draws a part of the picture; returns the threads' time for sorting and for the pixels.
-    fn draw(
+    fn draw_part(
         &self,
         part: &Part,
         size: [u32; 2],

@@ -7,7 +7,7 @@ use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 
 use super::{Background, Image};
 use crate::gaussians::Gaussians;
-use crate::projection::Camera;
+use crate::projection::{Camera, Projection};
 
 /// Where the reference cuts off.
 #[derive(Debug, Clone, Copy)]
@@ -16,6 +16,8 @@ pub struct Cutoffs {
     pub alpha: f64,
     /// A pixel with less transmittance is finished.
     pub through: f64,
+    /// Whether opacity is taken back by as much as the blur widens: not a cut-off, but as much a part of the definition.
+    pub compensated: bool,
 }
 
 impl Cutoffs {
@@ -23,6 +25,7 @@ impl Cutoffs {
     pub const NONE: Cutoffs = Cutoffs {
         alpha: 0.0,
         through: 1e-9,
+        compensated: false,
     };
     /// What defines a picture: an α below 1/255 is none.
     pub const DEFINITION: Cutoffs = Cutoffs {
@@ -33,6 +36,7 @@ impl Cutoffs {
     pub const RENDERER: Cutoffs = Cutoffs {
         alpha: 1.0 / 255.0,
         through: 1.0 / 1024.0,
+        compensated: false,
     };
 }
 
@@ -53,7 +57,7 @@ pub fn render(
     cutoffs: Cutoffs,
 ) -> Image {
     let mut seen: Vec<Seen> = (0..gaussians.len())
-        .filter_map(|i| see(gaussians, camera, i))
+        .filter_map(|i| see(gaussians, camera, i, cutoffs.compensated))
         .collect();
     // Stable: ties keep the order of the input.
     seen.sort_by(|a, b| a.depth.total_cmp(&b.depth));
@@ -88,7 +92,7 @@ pub fn render(
     }
 }
 
-fn see(gaussians: &Gaussians, camera: &Camera, i: usize) -> Option<Seen> {
+fn see(gaussians: &Gaussians, camera: &Camera, i: usize, compensated: bool) -> Option<Seen> {
     let position = DVec3::from(gaussians.position[i].map(f64::from));
     let scale = DVec3::from(gaussians.scale[i].map(f64::from));
     let [w, x, y, z] = gaussians.rotation[i].map(f64::from);
@@ -114,19 +118,28 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize) -> Option<Seen> {
     };
     let sx = limit(t.x / t.z, camera.fx, camera.cx, camera.width);
     let sy = limit(t.y / t.z, camera.fy, camera.cy, camera.height);
-    let jx = DVec3::new(1.0, 0.0, -sx) * (camera.fx / t.z);
-    let jy = DVec3::new(0.0, 1.0, -sy) * (camera.fy / t.z);
+    let pinhole = camera.projection == Projection::Pinhole;
+    let (jx, jy, at) = if pinhole {
+        (
+            DVec3::new(1.0, 0.0, -sx) * (camera.fx / t.z),
+            DVec3::new(0.0, 1.0, -sy) * (camera.fy / t.z),
+            t / t.z,
+        )
+    } else {
+        (DVec3::X * camera.fx, DVec3::Y * camera.fy, t)
+    };
     let b = jx.dot(sigma * jy);
-    let covariance = DMat2::from_cols(
-        DVec2::new(jx.dot(sigma * jx) + 0.3, b),
-        DVec2::new(b, jy.dot(sigma * jy) + 0.3),
-    );
+    let (a, c) = (jx.dot(sigma * jx), jy.dot(sigma * jy));
+    let covariance = DMat2::from_cols(DVec2::new(a + 0.3, b), DVec2::new(b, c + 0.3));
+    let kept = ((a * c - b * b).max(0.0) / covariance.determinant()).sqrt();
+    let opacity = if compensated {
+        opacity * kept.max(0.005)
+    } else {
+        opacity
+    };
     Some(Seen {
         depth: t.z as f32,
-        centre: DVec2::new(
-            camera.fx * t.x / t.z + camera.cx,
-            camera.fy * t.y / t.z + camera.cy,
-        ),
+        centre: DVec2::new(camera.fx * at.x + camera.cx, camera.fy * at.y + camera.cy),
         conic: covariance.inverse(),
         opacity,
         colour,

@@ -26,6 +26,18 @@ pub struct Camera {
     pub height: u32,
     /// What is not farther than this along z is not drawn. Cube-frame units.
     pub near: f64,
+    /// How rays go.
+    pub projection: Projection,
+}
+
+/// How a camera's rays go.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Projection {
+    /// Through one point.
+    #[default]
+    Pinhole,
+    /// Side by side along z; the focal lengths are pixels per cube-frame unit.
+    Orthographic,
 }
 
 impl Camera {
@@ -70,9 +82,22 @@ impl Camera {
             width,
             height,
             near: Self::NEAR,
+            projection: Projection::Pinhole,
         };
         camera.check()?;
         Ok(camera)
+    }
+
+    /// The orthographic camera that shows what is `distance` away as large as this pinhole does.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if that is no camera.
+    pub fn orthographic(mut self, distance: f64) -> Result<Camera> {
+        self.projection = Projection::Orthographic;
+        self.fx /= distance;
+        self.fy /= distance;
+        self.check()?;
+        Ok(self)
     }
 
     /// Whether pictures can be taken with it.

@@ -9,6 +9,7 @@
 //! may assume finite numbers, a depth beyond the near plane, and at least one pixel.
 
 mod camera;
+pub mod files;
 #[cfg(test)]
 mod reference;
 
@@ -19,7 +20,7 @@ use b2p_kernels::splat::{self, Cloud, Tally, View};
 use rayon::prelude::*;
 
 pub use b2p_kernels::splat::{ALPHA_FLOOR, BLUR, Bounds, Ellipse, MAX_SCALE};
-pub use camera::Camera;
+pub use camera::{Camera, Projection};
 
 use crate::error::{Error, Result};
 use crate::gaussians::Gaussians;
@@ -36,6 +37,17 @@ pub struct Ellipses {
     all: Vec<Ellipse>,
     runs: Vec<Run>,
     visible: usize,
+}
+
+/// How Gaussians are projected.
+#[derive(Debug, Clone, Copy)]
+pub struct How<'a> {
+    /// With which instructions.
+    pub isa: Isa,
+    /// Opacity is taken back by as much as the blur widens.
+    pub compensated: bool,
+    /// In place of the Gaussians' colours, one for each.
+    pub colours: Option<&'a [[f32; 3]]>,
 }
 
 #[derive(Debug, Default, Clone, Copy)]
@@ -85,12 +97,17 @@ impl Ellipses {
         &mut self,
         gaussians: &Gaussians,
         camera: &Camera,
-        isa: Isa,
+        how: How,
         states: &mut Vec<S>,
         look: impl Fn(&mut S, &[Ellipse]) + Sync,
     ) -> Result<Dropped> {
         camera.check()?;
         gaussians.check_lengths()?;
+        let colours = how.colours.unwrap_or(&gaussians.colour);
+        if colours.len() != gaussians.len() {
+            let what = format!("{} colours of {} Gaussians", colours.len(), gaussians.len());
+            return Err(Error::Usage(what));
+        }
         let count = gaussians.len();
         if u32::try_from(count).is_err() {
             return Err(Error::Unsupported {
@@ -98,7 +115,7 @@ impl Ellipses {
                 detail: format!("there are {count}"),
             });
         }
-        let view = view(camera);
+        let view = view(camera, how.compensated);
         let length = run_length(count);
         self.all.resize(count, Ellipse::default());
         self.runs.clear();
@@ -118,9 +135,9 @@ impl Ellipses {
                     scale: &gaussians.scale[first..end],
                     rotation: &gaussians.rotation[first..end],
                     opacity: &gaussians.opacity[first..end],
-                    colour: &gaussians.colour[first..end],
+                    colour: &colours[first..end],
                 };
-                let tally = splat::project(isa, &view, cloud, first as u32, ellipses);
+                let tally = splat::project(how.isa, &view, cloud, first as u32, ellipses);
                 *run = Run { first, tally };
                 look(state, &ellipses[..tally.visible as usize]);
             });
@@ -183,7 +200,7 @@ impl From<Tally> for Dropped {
 }
 
 /// The camera as the kernel has it.
-fn view(camera: &Camera) -> View {
+fn view(camera: &Camera, compensated: bool) -> View {
     let rotation = camera.pose.matrix3;
     View {
         rotation: std::array::from_fn(|i| rotation.row(i).into()),
@@ -193,7 +210,7 @@ fn view(camera: &Camera) -> View {
         centre: [camera.cx, camera.cy],
         slopes: camera.slope_ranges(),
         size: [camera.width, camera.height],
-        orthographic: false,
-        compensated: false,
+        orthographic: camera.projection == Projection::Orthographic,
+        compensated,
     }
 }

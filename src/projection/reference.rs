@@ -2,7 +2,7 @@
 
 use glam::{DAffine3, Mat3, Quat, Vec3};
 
-use super::{ALPHA_FLOOR, BLUR, Bounds, Camera, Ellipse, Ellipses, MAX_SCALE};
+use super::{ALPHA_FLOOR, BLUR, Bounds, Camera, Ellipse, Ellipses, How, MAX_SCALE};
 use crate::gaussians::Gaussians;
 use b2p_kernels::Isa;
 
@@ -214,9 +214,14 @@ fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
             same
         };
         for isa in Isa::available() {
+            let how = How {
+                isa,
+                compensated: false,
+                colours: None,
+            };
             let mut ellipses = Ellipses::default();
             let dropped = ellipses
-                .project(&all, &camera, isa, &mut Vec::<()>::new(), |_, _| {})
+                .project(&all, &camera, how, &mut Vec::<()>::new(), |_, _| {})
                 .unwrap();
             assert_eq!(dropped.not_finite, count(Invisible::NotFinite), "{isa}");
             assert_eq!(dropped.no_rotation, count(Invisible::NoRotation), "{isa}");

@@ -5,7 +5,7 @@ use b2p_kernels::Isa;
 use super::*;
 use crate::error::Error;
 use crate::gaussians::Gaussians;
-use crate::projection::Camera;
+use crate::projection::{Camera, How};
 
 /// A small generator: the shapes need no quality, only variety.
 fn gaussians(count: usize) -> Gaussians {
@@ -41,9 +41,14 @@ fn project(all: &Gaussians, width: u32, height: u32) -> Scene {
         ellipses: Ellipses::default(),
         counts: Vec::new(),
     };
+    let how = How {
+        isa: Isa::SCALAR,
+        compensated: false,
+        colours: None,
+    };
     scene
         .ellipses
-        .project(all, &camera, Isa::SCALAR, &mut scene.counts, |count, e| {
+        .project(all, &camera, how, &mut scene.counts, |count, e| {
             count.count(scene.grid, e);
         })
         .unwrap();

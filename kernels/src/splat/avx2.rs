@@ -221,7 +221,7 @@ impl Lanes for Avx2 {
     }
 
     #[inline(always)]
-    fn from_integer(self) -> Self {
+    fn to_float(self) -> Self {
         Avx2(instructions!(_mm256_cvtepi32_ps(_mm256_castps_si256(
             self.0
         ))))

@@ -201,7 +201,7 @@ impl Lanes for Avx512 {
     }
 
     #[inline(always)]
-    fn from_integer(self) -> Self {
+    fn to_float(self) -> Self {
         Avx512(instructions!(_mm512_cvtepi32_ps(_mm512_castps_si512(
             self.0
         ))))

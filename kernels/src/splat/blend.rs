@@ -257,7 +257,7 @@ impl Batch {
         let (zero, side) = (L::splat(0.0), L::splat(TILE as f32));
         let inverse = L::splat(1.0 / SIDE as f32);
         let within = |at: L, corner: f32| {
-            let at = at.from_integer().sub(L::splat(corner));
+            let at = at.to_float().sub(L::splat(corner));
             at.max(zero).min(side).mul(inverse)
         };
         let forms = [

@@ -9,6 +9,7 @@ mod avx2;
 mod avx512;
 mod blend;
 mod lanes;
+mod plain;
 mod project;
 
 #[cfg(test)]

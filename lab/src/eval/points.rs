@@ -97,6 +97,7 @@ impl Points {
                 .map(|c| c.map(|v| f32::from(v) / 255.0))
                 .collect(),
             frame,
+            ..Gaussians::default()
         }
     }
 }

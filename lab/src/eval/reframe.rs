@@ -37,6 +37,7 @@ mod tests {
             opacity: vec![1.0],
             colour: vec![[0.0; 3]],
             frame,
+            ..Gaussians::default()
         }
     }
 

@@ -18,6 +18,7 @@ fn gaussians() -> Gaussians {
                 voxel_size: 0.003,
             },
         },
+        ..Gaussians::default()
     }
 }
 
@@ -146,14 +147,14 @@ fn what_is_left_out_of_a_foreign_file_is_told() {
     properties.retain(|p| !p.ends_with("scale_2"));
     properties.extend(["float f_rest_0", "float f_rest_1", "float nx"]);
     let row = "0 0 0 0 0 0 0 -1 -2 1 0 0 0 9 9 9";
-    let bytes = ascii("comment SplatRenderMode: mip\n", &properties, &[row]);
+    let bytes = ascii("comment SplatRenderMode: deep\n", &properties, &[row]);
     let (g, notes) = read_back(&bytes);
     assert_eq!(g.scale[0][2], 0.0);
     assert_eq!(
         notes,
         Notes {
             ignored_harmonics: 2,
-            ignored_mode: Some("mip".into()),
+            ignored_mode: Some("deep".into()),
             flat: true,
             fitted: true,
         }
@@ -287,4 +288,22 @@ fn what_cannot_be_written_is_an_error() {
         .write_ply(&mut Full, Path::new("full.ply"))
         .unwrap_err();
     assert!(error.to_string().contains("full.ply"));
+}
+
+#[test]
+fn view_dependent_colour_is_read_channel_by_channel() {
+    let mut properties: Vec<String> = FLOATS.iter().map(|p| p.to_string()).collect();
+    properties.extend((0..9).map(|i| format!("float f_rest_{i}")));
+    let names: Vec<&str> = properties.iter().map(String::as_str).collect();
+    let row = "0 0 0 0 0 0 0 -1 -2 -3 1 0 0 0 1 2 3 4 5 6 7 8 9";
+    let (g, notes) = read_back(&ascii(
+        "comment SplatRenderMode: mip\n",
+        &names,
+        &[row, row],
+    ));
+    assert_eq!((notes.ignored_harmonics, notes.ignored_mode), (0, None));
+    assert!(g.compensated);
+    assert_eq!(g.harmonics.count, 3);
+    let one = [[1.0, 4.0, 7.0], [2.0, 5.0, 8.0], [3.0, 6.0, 9.0]];
+    assert_eq!(g.harmonics.coefficients, [one, one].concat());
 }

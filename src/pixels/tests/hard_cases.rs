@@ -425,3 +425,76 @@ fn what_cannot_be_drawn_is_an_error() {
         })
     ));
 }
+
+#[test]
+fn every_instruction_set_of_the_machine_is_among_those_that_the_tests_run() {
+    let ran: Vec<String> = Isa::available().iter().map(Isa::to_string).collect();
+    println!("ran on: {}", ran.join(", "));
+    #[cfg(target_arch = "x86_64")]
+    {
+        let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+        assert!(!avx2 || ran.iter().any(|isa| isa == "avx2"), "{ran:?}");
+        let avx512 = avx2 && is_x86_feature_detected!("avx512vnni");
+        assert!(!avx512 || ran.iter().any(|isa| isa == "avx512"), "{ran:?}");
+    }
+    assert!(ran.iter().any(|isa| isa == "scalar"));
+}
+
+#[test]
+fn an_opacity_of_no_number_or_none_is_dropped_and_an_endless_one_is_no_opacity() {
+    let camera = orbit(20, 20);
+    let drawn = |opacity| {
+        let (_, stats) = draw_on(
+            &scene([Splat { opacity, ..RED }]),
+            &camera,
+            Background::WHITE,
+        );
+        (
+            stats.visible,
+            stats.dropped.not_finite,
+            stats.dropped.too_faint,
+        )
+    };
+    assert_eq!(drawn(f32::NAN), (0, 1, 0));
+    assert_eq!(drawn(0.0), (0, 0, 1));
+    assert_eq!(drawn(-1.0), (0, 0, 1));
+    assert_eq!(drawn(7.0), (1, 0, 0));
+}
+
+#[test]
+fn on_every_instruction_set_any_number_of_threads_draws_the_same_bits() {
+    let scene = scene(random_splats(14, 5000));
+    let camera = orbit(130, 90);
+    for isa in Isa::available() {
+        let on = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+            let pool = pool.build().unwrap();
+            let limits = Limits::default();
+            pool.install(|| Renderer::new(isa).render(&scene, &camera, Background::BLACK, &limits))
+                .unwrap()
+                .0
+        };
+        assert!(on(1) == on(3) && on(1) == on(16), "{isa}");
+    }
+}
+
+#[test]
+fn a_million_splats_in_one_pixel_stop_early_and_keep_their_order() {
+    let camera = straight(100.0, 9, 9);
+    let count = 1_000_000;
+    let mut scene = scene([AHEAD]);
+    scene.position = (0..count)
+        .map(|i| [0.0, 0.0, 2.0 + ((i * 7919) % count) as f32 * 1e-5])
+        .collect();
+    scene.scale = vec![[1e-4; 3]; count];
+    scene.rotation = vec![AHEAD.rotation; count];
+    scene.opacity = vec![0.5; count];
+    scene.colour = vec![[1.0, 0.0, 0.0]; count];
+    scene.colour[0] = [0.0, 1.0, 0.0];
+    let image = Renderer::default()
+        .render(&scene, &camera, Background::WHITE, &Limits::default())
+        .unwrap()
+        .0;
+    let [r, g, _, _] = image.pixel(4, 4);
+    assert!((g - 0.5).abs() < 1e-3 && (r - 0.5).abs() < 2e-3, "{r} {g}");
+}

@@ -207,3 +207,44 @@ fn every_gaussian_is_counted_once() {
     assert_eq!((dropped.no_rotation, dropped.too_faint), (1, 1));
     assert_eq!(dropped.not_finite, 1);
 }
+
+#[test]
+fn a_picture_in_crops_is_the_picture() {
+    // What a crop sees is linearised within its own field of view: splats well inside the whole are the same.
+    let scene = scene(random_splats(15, 200).into_iter().map(|s| Splat {
+        position: s.position.map(|x| 0.5 * x),
+        ..s
+    }));
+    let camera = orbit(96, 80);
+    let whole = draw(&scene, &camera);
+    for (x0, y0, width, height) in [(0, 0, 40, 33), (40, 33, 56, 47), (17, 5, 64, 64)] {
+        let mut crop = camera;
+        (crop.width, crop.height) = (width, height);
+        (crop.cx, crop.cy) = (camera.cx - f64::from(x0), camera.cy - f64::from(y0));
+        let part = draw(&scene, &crop);
+        for y in 0..height {
+            for x in 0..width {
+                let (a, b) = (part.pixel(x, y), whole.pixel(x0 + x, y0 + y));
+                for k in 0..3 {
+                    assert!((a[k] - b[k]).abs() < 4.5 / 255.0, "{x} {y}: {a:?} {b:?}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn from_the_second_picture_on_no_memory_is_taken() {
+    let scene = scene(random_splats(16, 3000));
+    let camera = orbit(90, 90);
+    let mut renderer = Renderer::default();
+    let mut image = Image::default();
+    let mut draw = |camera: &Camera| {
+        let limits = Limits::default();
+        renderer
+            .render_into(&scene, camera, Background::WHITE, &limits, &mut image)
+            .unwrap();
+        (image.pixels.as_ptr(), renderer.ellipses.all().as_ptr())
+    };
+    assert_eq!(draw(&camera), draw(&camera));
+}
