@@ -8,6 +8,7 @@ const LN2_HIGH: f32 = 0.693_359_4;
 const LN2_LOW: f32 = -2.121_944_4e-4;
 
 /// `eˣ` with a relative error below 2·10⁻⁷; beyond ±87 that of ±87.
+#[inline(always)]
 fn exp(x: f32) -> f32 {
     let x = x.clamp(-87.0, 87.0);
     let shifted = x * std::f32::consts::LOG2_E + ROUND;
@@ -25,16 +26,19 @@ fn exp(x: f32) -> f32 {
 }
 
 /// `1 / (1 + e⁻ˣ)`, within 10⁻⁷.
+#[inline(always)]
 pub(super) fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
 
 /// The hyperbolic tangent, within 3·10⁻⁷.
+#[inline(always)]
 pub(super) fn tanh(x: f32) -> f32 {
     1.0 - 2.0 / (1.0 + exp(2.0 * x))
 }
 
 /// `ln(1 + eˣ)`, with a relative error below 5·10⁻⁷ down to x = −87.
+#[inline(always)]
 pub(super) fn softplus(x: f32) -> f32 {
     // ln(1 + t) = 2 artanh(s), s = t / (2 + t) ≤ 1/3.
     let t = exp(-x.abs());

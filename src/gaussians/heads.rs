@@ -54,24 +54,64 @@ pub fn activate(
         .enumerate()
         .for_each(
             |(block, (((((position, scale), rotation), opacity), colour), raw))| {
-                for (j, raw) in raw.chunks_exact(RAW).enumerate() {
-                    let i = block * BLOCK + j;
-                    let centre = centre(voxels, children, i, edge);
-                    for axis in 0..3 {
-                        position[j][axis] =
-                            centre[axis] + tanh(raw[axis]) * shape.offset_range * edge;
-                        scale[j][axis] =
-                            softplus(raw[3 + axis] + shape.scale_bias) * shape.scale_range * edge;
-                        colour[j][axis] = (0.5 + raw[11 + axis]).clamp(0.0, 1.0);
-                    }
-                    rotation[j] = normalised([raw[6] + 1.0, raw[7], raw[8], raw[9]]);
-                    if children == 8 {
-                        opacity[j] = sigmoid(raw[10] + shape.opacity_bias);
+                for (g, raw) in raw.chunks(GROUP * RAW).enumerate() {
+                    let group = Group::new(raw, shape, children == 8);
+                    for j in 0..raw.len() / RAW {
+                        let to = g * GROUP + j;
+                        let centre = centre(voxels, children, block * BLOCK + to, edge);
+                        for axis in 0..3 {
+                            position[to][axis] = centre[axis] + group.offset[axis][j] * edge;
+                            scale[to][axis] = group.scale[axis][j] * edge;
+                            colour[to][axis] = group.colour[axis][j];
+                        }
+                        rotation[to] = group.rotation.map(|component| component[j]);
+                        opacity[to] = group.opacity[j];
                     }
                 }
             },
         );
     gaussians
+}
+
+/// Gaussians whose numbers are computed side by side.
+const GROUP: usize = 16;
+
+type Lane = [f32; GROUP];
+
+/// Activated numbers, each kind apart; positions and scales in voxels.
+struct Group {
+    offset: [Lane; 3],
+    scale: [Lane; 3],
+    rotation: [Lane; 4],
+    opacity: Lane,
+    colour: [Lane; 3],
+}
+
+impl Group {
+    /// Up to [`GROUP`] Gaussians; what is missing is as if raw numbers were zero.
+    fn new(raw: &[f32], shape: &Shape, translucent: bool) -> Group {
+        let mut lanes = [[0.0; GROUP]; RAW];
+        for (j, raw) in raw.chunks_exact(RAW).enumerate() {
+            for (lane, &raw) in lanes.iter_mut().zip(raw) {
+                lane[j] = raw;
+            }
+        }
+        let three = |first: usize| [lanes[first], lanes[first + 1], lanes[first + 2]];
+        let offset = |x: f32| tanh(x) * shape.offset_range;
+        let scale = |x: f32| softplus(x + shape.scale_bias) * shape.scale_range;
+        let opacity = match translucent {
+            true => lanes[10].map(|x| sigmoid(x + shape.opacity_bias)),
+            false => [1.0; GROUP],
+        };
+        let rotation = [lanes[6].map(|w| w + 1.0), lanes[7], lanes[8], lanes[9]];
+        Group {
+            offset: three(0).map(|lane| lane.map(offset)),
+            scale: three(3).map(|lane| lane.map(scale)),
+            rotation: normalised(rotation),
+            opacity,
+            colour: three(11).map(|lane| lane.map(|x| (0.5 + x).clamp(0.0, 1.0))),
+        }
+    }
 }
 
 /// The centre of the voxel that Gaussian `i` belongs to. Exact in f32 down to level 20, and within half a voxel at 21 and 22.
@@ -84,14 +124,23 @@ fn centre(voxels: &Voxels, children: usize, i: usize, edge: f32) -> [f32; 3] {
     coordinate.map(|v| ((f64::from(v) + 0.5) * f64::from(edge) - 1.0) as f32)
 }
 
-/// The unit quaternion along `q`; the identity for zero.
-fn normalised(q: [f32; 4]) -> [f32; 4] {
-    let norm = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-    if norm > 0.0 {
-        q.map(|v| (f64::from(v) / norm) as f32)
-    } else {
-        [1.0, 0.0, 0.0, 0.0]
+/// The unit quaternions along `q`; the identity for zero.
+fn normalised(mut q: [Lane; 4]) -> [Lane; 4] {
+    let mut norm = [0.0f64; GROUP];
+    for component in &q {
+        for (norm, x) in norm.iter_mut().zip(component) {
+            *norm += f64::from(*x).powi(2);
+        }
     }
+    let norm = norm.map(f64::sqrt);
+    for (i, component) in q.iter_mut().enumerate() {
+        let identity = if i == 0 { 1.0 } else { 0.0 };
+        for (x, norm) in component.iter_mut().zip(norm) {
+            let unit = (f64::from(*x) / norm) as f32;
+            *x = if norm > 0.0 { unit } else { identity };
+        }
+    }
+    q
 }
 
 #[cfg(test)]
