@@ -50,7 +50,7 @@ pub mod placement;
 pub mod projection;
 pub mod tiles;
 
-pub use b2p_kernels::{Isa, UnknownIsa};
+pub use b2p_kernels::{Isa, UnknownIsa, ceiling};
 pub use error::{Error, Result};
 pub use limits::Limits;
 pub use placement::Placement;

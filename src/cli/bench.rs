@@ -7,8 +7,8 @@ use b2p::bitstream::Stream;
 use b2p::decoder::Decoder;
 use b2p::geometry::{KernelMap, Octree};
 use b2p::log::{Log, Step};
-use b2p::network::{Module, Shape, Work};
-use b2p::{Limits, embedded};
+use b2p::network::{Module, Precision, Shape, Work};
+use b2p::{Isa, Limits, ceiling, embedded};
 use serde_json::json;
 
 use super::args::Bench;
@@ -81,6 +81,8 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
         .collect();
 
     let threads = rayon::current_num_threads();
+    let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
+    let ceilings = Ceilings::measure(model.isa(), model.precision(), threads.min(cores));
     let memory = peak_memory();
     if args.json {
         let stages: Vec<_> = lines
@@ -93,6 +95,7 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
                     "median_ms": line.median.as_secs_f64() * 1e3,
                     "gmac": line.work.map(|w| w.macs as f64 / 1e9),
                     "gmac_per_s": line.work.map(|w| rate(w, line.median)),
+                    "share_of_ceiling": ceilings.share(line),
                     "mbytes": line.work.map(|w| w.bytes as f64 / 1e6),
                 })
             })
@@ -106,15 +109,25 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
             "load_model_ms": loading.as_secs_f64() * 1e3,
             "decode_ms": total.as_secs_f64() * 1e3,
             "peak_memory_bytes": memory,
+            "ceiling_gmac_per_s": { "integers": ceilings.integers, "gaussians": ceilings.gaussians },
             "stages": stages,
         });
         return Ok(format!("{report:#}\n"));
     }
 
     let mut rows = vec![
-        ["stage", "items", "", "median", "GMAC", "GMAC/s", "MB"]
-            .map(String::from)
-            .to_vec(),
+        [
+            "stage",
+            "items",
+            "",
+            "median",
+            "GMAC",
+            "GMAC/s",
+            "of ceiling",
+            "MB",
+        ]
+        .map(String::from)
+        .to_vec(),
     ];
     for line in &lines {
         let mut row = vec![
@@ -126,6 +139,8 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
         if let Some(work) = line.work {
             row.push(format!("{:.2}", work.macs as f64 / 1e9));
             row.push(format!("{:.1}", rate(work, line.median)));
+            let share = ceilings.share(line).unwrap_or_default();
+            row.push(format!("{:.0} %", 100.0 * share));
             row.push(format!("{:.0}", work.bytes as f64 / 1e6));
         }
         rows.push(row);
@@ -146,12 +161,45 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
         format!(", peak memory {} MB", bytes / 1_000_000)
     });
     Ok(format!(
-        "level {level}, {}, {}, {threads} threads, medians of {} runs{memory}\n{}",
+        "level {level}, {}, {}, {threads} threads, medians of {} runs{memory}\n{}\n\
+         Ceilings, measured just now: {:.0} GMAC/s in integers, {:.0} in what Gaussians are generated in.\n\
+         MB: what a stage's layers must read and write at least once.\n",
         model.isa(),
         model.precision(),
         args.repeat,
         table(&rows),
+        ceilings.integers,
+        ceilings.gaussians,
     ))
+}
+
+/// What all threads could multiply and add if nothing had to be fetched, in 10⁹ a second.
+struct Ceilings {
+    integers: f64,
+    gaussians: f64,
+}
+
+impl Ceilings {
+    fn measure(isa: Isa, precision: Precision, cores: usize) -> Self {
+        let integers = cores as f64 * ceiling::i16(isa);
+        let gaussians = match precision {
+            Precision::Int16 => integers,
+            Precision::F16 => cores as f64 * ceiling::f32(isa),
+        };
+        Ceilings {
+            integers,
+            gaussians,
+        }
+    }
+
+    /// How near a stage came.
+    fn share(&self, line: &Line) -> Option<f64> {
+        let ceiling = match line.step.name.starts_with("generate") {
+            true => self.gaussians,
+            false => self.integers,
+        };
+        line.work.map(|work| rate(work, line.median) / ceiling)
+    }
 }
 
 /// What the modules of the network compute, by the names of their steps.
