@@ -301,6 +301,7 @@ def main():
     p.add_argument("--samples", type=int, default=8)
     p.add_argument("--verify", type=int, default=3, help="crops for the check against the float path")
     p.add_argument("--random", metavar="CONFIG", help="an untrained network of this configuration, for tests")
+    p.add_argument("--weights", metavar="FILE", help="also write the float weights, in f16, for `train.py --init`")
     p.add_argument("--last", action="store_true", help="the last weights instead of the averaged ones")
     args = p.parse_args()
     samples = [data.procedural(i) for i in range(2)]
@@ -313,6 +314,9 @@ def main():
     else:
         model, info = load_checkpoint(args.checkpoint, not args.last)
     export(model, samples, args.out, info)
+    if args.weights:
+        tensors = {k: v.half().numpy() for k, v in model.state_dict().items()}
+        save_file(tensors, args.weights, metadata={"config": json.dumps(model.cfg)})
     half_weights(model)
     if verify(args.out, model, samples[:args.verify]) > 0.02:
         print("warning: the integer path costs more than 2 %")

@@ -12,6 +12,7 @@ import time
 
 import torch
 import torch.nn.functional as F
+from safetensors.torch import load_file
 
 import data
 import ops
@@ -120,7 +121,7 @@ class Trainer:
         torch.manual_seed(args.seed)
         self.rng = random.Random(args.seed)
         self.model = B2P(self.cfg).to(self.device)
-        self.optimiser = torch.optim.Adam(groups(self.model, args.lr_conv, args.lr_linear), betas=(0.9, 0.99), eps=1e-8, fused=True)
+        self.optimiser = torch.optim.Adam(groups(self.model, args.lr_conv, args.lr_linear), betas=(0.9, 0.999), eps=1e-8, fused=True)
         self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
         self.step, self.used, self.calibrated = 0, 0.0, False
 
@@ -128,6 +129,14 @@ class Trainer:
         return {"model": self.model.state_dict(), "average": self.average, "optimiser": self.optimiser.state_dict(), "step": self.step,
                 "used": self.used, "calibrated": self.calibrated, "config": self.cfg, "args": vars(self.args), "torch_rng": torch.get_rng_state(),
                 "rng": self.rng.getstate()}
+
+    def start_from(self, path):
+        """Takes the averaged weights of a checkpoint, or those that `export.py --weights` wrote."""
+        if not path.endswith(".safetensors"):
+            return self.restore(path, weights_only=True)
+        self.model.load_state_dict({k: v.float() for k, v in load_file(path, device=self.device).items()})
+        self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+        self.calibrated = True
 
     def restore(self, path, weights_only=False):
         s = torch.load(path, map_location=self.device, weights_only=False)
@@ -247,9 +256,9 @@ def main(argv=None):
     p.add_argument("--square", type=float, default=20.0, help="weight of the squared error")
     p.add_argument("--hint", type=float, default=1.0, help="weight of the early colour probes against distortion")
     p.add_argument("--hint-until", type=float, default=0.5)
-    p.add_argument("--lr-conv", type=float, default=3e-4)
-    p.add_argument("--lr-linear", type=float, default=1e-3)
-    p.add_argument("--warmup", type=int, default=50)
+    p.add_argument("--lr-conv", type=float, default=1e-4)
+    p.add_argument("--lr-linear", type=float, default=3e-4)
+    p.add_argument("--warmup", type=int, default=400)
     p.add_argument("--decay-from", type=float, default=0.6)
     p.add_argument("--rate-start", type=float, default=0.003)
     p.add_argument("--rate-ramp", type=float, default=0.6)
@@ -266,7 +275,7 @@ def main(argv=None):
     p.add_argument("--log-every", type=int, default=10)
     p.add_argument("--resume", action="store_true", help="continue from OUT/last.pt")
     p.add_argument("--stop-after", type=int, default=0, help="stop at this step, as an interruption would")
-    p.add_argument("--init", help="start from the averaged weights of this checkpoint")
+    p.add_argument("--init", help="start from the averaged weights of this checkpoint, or from a file of `export.py --weights`")
     args = p.parse_args(argv)
 
     torch.set_num_threads(args.threads)
@@ -278,7 +287,7 @@ def main(argv=None):
     if args.resume:
         trainer.restore(last)
     elif args.init:
-        trainer.restore(args.init, weights_only=True)
+        trainer.start_from(args.init)
     train_files, held_files = data.split(args.data, args.held_out)
     held = [data.load_sample(f).to(args.device) for f in held_files]
     calibration = None if trainer.calibrated else [data.load_sample(f) for f in train_files[:6]]
