@@ -1,4 +1,4 @@
-//! AVX-512 with VNNI: blocks of six rows by four panels, eight by three, twelve by two, one or half of one.
+//! AVX-512 with VNNI: blocks of six rows by four panels, eight by three, two or one, twelve by half of one.
 
 use std::arch::x86_64::*;
 
@@ -18,18 +18,18 @@ pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) ->
     unsafe {
         match (arithmetic, whole) {
             (Arithmetic::Float, 0) => wide::<HalfFloat, 12, 1>(block),
-            (Arithmetic::Float, 1) => wide::<Float, 12, 1>(block),
-            (Arithmetic::Float, 2) => wide::<Float, 12, 2>(block),
+            (Arithmetic::Float, 1) => wide::<Float, 8, 1>(block),
+            (Arithmetic::Float, 2) => wide::<Float, 8, 2>(block),
             (Arithmetic::Float, 3) => wide::<Float, 8, 3>(block),
             (Arithmetic::Float, _) => wide::<Float, 6, 4>(block),
             (Arithmetic::Integer, 0) => wide::<HalfInteger, 12, 1>(block),
-            (Arithmetic::Integer, 1) => wide::<Integer, 12, 1>(block),
-            (Arithmetic::Integer, 2) => wide::<Integer, 12, 2>(block),
+            (Arithmetic::Integer, 1) => wide::<Integer, 8, 1>(block),
+            (Arithmetic::Integer, 2) => wide::<Integer, 8, 2>(block),
             (Arithmetic::Integer, 3) => wide::<Integer, 8, 3>(block),
             (Arithmetic::Integer, _) => wide::<Integer, 6, 4>(block),
             (Arithmetic::Brain, 0) => wide_brain::<HalfBrain, 12, 1>(block),
-            (Arithmetic::Brain, 1) => wide_brain::<Brain, 12, 1>(block),
-            (Arithmetic::Brain, 2) => wide_brain::<Brain, 12, 2>(block),
+            (Arithmetic::Brain, 1) => wide_brain::<Brain, 8, 1>(block),
+            (Arithmetic::Brain, 2) => wide_brain::<Brain, 8, 2>(block),
             (Arithmetic::Brain, 3) => wide_brain::<Brain, 8, 3>(block),
             (Arithmetic::Brain, _) => wide_brain::<Brain, 6, 4>(block),
         }
