@@ -90,14 +90,15 @@ struct Integer;
 
 // SAFETY: reads and writes `LANES` words, `factor` one.
 unsafe impl Machine for Integer {
-    type Sum = [i32; PANEL];
-    type Weight = [[i16; 2]; PANEL];
-    type Factor = [i16; 2];
+    type Sum = [[i32; PANEL / 2]; 2];
+    type Weight = [[i16; PANEL]; 2];
+    // The pair repeated: like this, compilers see the pairwise product of most machines.
+    type Factor = [i16; PANEL];
     const LANES: usize = PANEL;
 
     #[inline(always)]
     unsafe fn zero() -> Self::Sum {
-        [0; PANEL]
+        [[0; PANEL / 2]; 2]
     }
 
     #[inline(always)]
@@ -119,17 +120,24 @@ unsafe impl Machine for Integer {
     }
 
     #[inline(always)]
-    unsafe fn factor(at: *const u32) -> [i16; 2] {
+    unsafe fn factor(at: *const u32) -> [i16; PANEL] {
         // SAFETY: the caller's promise.
-        unsafe { at.cast::<[i16; 2]>().read_unaligned() }
+        let pair = unsafe { at.cast::<[i16; 2]>().read_unaligned() };
+        std::array::from_fn(|j| pair[j % 2])
     }
 
     #[inline(always)]
-    unsafe fn mul_add(mut sum: Self::Sum, weight: Self::Weight, factor: [i16; 2]) -> Self::Sum {
-        for j in 0..PANEL {
-            let even = i32::from(weight[j][0]) * i32::from(factor[0]);
-            let odd = i32::from(weight[j][1]) * i32::from(factor[1]);
-            sum[j] = sum[j].wrapping_add(even.wrapping_add(odd));
+    unsafe fn mul_add(mut sum: Self::Sum, weight: Self::Weight, factor: [i16; PANEL]) -> Self::Sum {
+        for (sum, weight) in sum.iter_mut().zip(&weight) {
+            let mut dots = [0; PANEL / 2];
+            for (j, dot) in dots.iter_mut().enumerate() {
+                let even = i32::from(weight[2 * j]) * i32::from(factor[2 * j]);
+                let odd = i32::from(weight[2 * j + 1]) * i32::from(factor[2 * j + 1]);
+                *dot = even.wrapping_add(odd);
+            }
+            for (sum, dot) in sum.iter_mut().zip(dots) {
+                *sum = sum.wrapping_add(dot);
+            }
         }
         sum
     }
