@@ -1,12 +1,12 @@
 //! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes. Least and median time of
 //! the whole frame, and the stages of the fastest.
 //!
-//! `raster [--threads N] [--isa NAME] [SCENE…]`, a scene being a name of [`SCENES`].
+//! `raster [--threads N] [--isa NAME] [--effects] [SCENE…]`; `--effects` draws with each effect instead of the plain pictures; a scene being a name of [`SCENES`].
 
 use std::time::{Duration, Instant};
 
-use b2p::gaussians::Gaussians;
-use b2p::pixels::{Background, Image, Renderer, Stats};
+use b2p::gaussians::{Gaussians, Harmonics};
+use b2p::pixels::{Background, Channel, Choice, Effects, Image, Renderer, Stats};
 use b2p::projection::Camera;
 use b2p::{Error, Limits, Result};
 use b2p_kernels::Isa;
@@ -161,16 +161,23 @@ fn facing([x, y, z]: [f64; 3]) -> [f32; 4] {
     q.map(|v| (v / norm) as f32)
 }
 
-fn measure(isa: Isa, scene: &Scene, gaussians: &Gaussians) -> Result<()> {
+fn measure(
+    isa: Isa,
+    scene: &Scene,
+    gaussians: &Gaussians,
+    (what, effects, channel): (&str, Effects, Channel),
+) -> Result<()> {
     let (width, height) = scene.size;
     let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, width, height)?;
     let mut renderer = Renderer::new(isa);
+    renderer.set_effects(effects);
     let mut image = Image::default();
     let mut frame = || -> Result<(Duration, Stats)> {
         let start = Instant::now();
-        let stats = renderer.render_into(
+        let stats = renderer.draw_into(
             gaussians,
             &camera,
+            channel,
             Background::WHITE,
             &Limits::unlimited(),
             &mut image,
@@ -188,7 +195,7 @@ fn measure(isa: Isa, scene: &Scene, gaussians: &Gaussians) -> Result<()> {
     let (least, stats) = &frames[0];
     let t = stats.times;
     println!(
-        "{:>7} {:>5}: {:7.2} ms, median {:7.2}; project {:6.2}, bin {:6.2}, sort {:6.2}, blend {:6.2}; {} visible, {} pairs",
+        "{:>7} {:>5}{what}: {:7.2} ms, median {:7.2}; project {:6.2}, bin {:6.2}, sort {:6.2}, blend {:6.2}; {} visible, {} pairs",
         isa.to_string(),
         scene.name,
         ms(*least),
@@ -203,14 +210,34 @@ fn measure(isa: Isa, scene: &Scene, gaussians: &Gaussians) -> Result<()> {
     Ok(())
 }
 
+/// What is drawn: the plain picture, or one with each effect.
+fn variants(forced: bool) -> Vec<(&'static str, Effects, Channel)> {
+    let none = Effects::default();
+    let antialias = Effects {
+        antialias: Choice::On,
+        ..none
+    };
+    if forced {
+        vec![
+            (", antialias", antialias, Channel::Colour),
+            (", harmonics", none, Channel::Colour),
+            (", depth", none, Channel::Depth),
+            (", normals", none, Channel::Normal),
+        ]
+    } else {
+        vec![("", none, Channel::Colour)]
+    }
+}
+
 fn main() -> Result<()> {
-    let mut threads = 0;
+    let (mut threads, mut forced) = (0, false);
     let mut isas = Isa::available();
     let mut names = Vec::new();
     let mut args = std::env::args().skip(1).filter(|arg| arg != "--bench");
     while let Some(arg) = args.next() {
         match arg.as_str() {
             "--threads" => threads = args.next().and_then(|n| n.parse().ok()).unwrap_or(0),
+            "--effects" => forced = true,
             "--isa" => {
                 isas = args
                     .next()
@@ -228,9 +255,18 @@ fn main() -> Result<()> {
     println!("{} threads", pool.current_num_threads());
     for scene in &SCENES {
         if names.is_empty() || names.iter().any(|n| n == scene.name) {
-            let gaussians = body(scene.count);
+            let mut gaussians = body(scene.count);
             for &isa in &isas {
-                pool.install(|| measure(isa, scene, &gaussians))?;
+                for variant in variants(forced) {
+                    if variant.0 == ", harmonics" {
+                        gaussians.harmonics = Harmonics {
+                            count: 15,
+                            coefficients: vec![[0.01; 3]; 15 * gaussians.len()],
+                        };
+                    }
+                    pool.install(|| measure(isa, scene, &gaussians, variant))?;
+                    gaussians.harmonics = Harmonics::default();
+                }
             }
         }
     }

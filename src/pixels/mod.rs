@@ -351,7 +351,7 @@ impl Renderer {
         let sorted = Instant::now();
         desk.tile.start([left as u32, (row * side) as u32], size);
         desk.nearest
-            .each(|keys| desk.tile.blend(self.isa, keys, self.ellipses.all()));
+            .each(|keys, next| desk.tile.blend(self.isa, keys, next, self.ellipses.all()));
         let behind = background.behind();
         let touched = desk
             .tile

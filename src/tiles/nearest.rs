@@ -6,6 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 const FEW: usize = 64;
 /// Handed out are multiples of this, but for the last: vectors are full then.
 const HANDFUL: usize = 32;
+/// So many are shown before they are handed out.
+const COMING: usize = 3 * HANDFUL;
 /// So many handfuls at least.
 const HANDFULS: usize = 2;
 /// The most buckets: their counters fit the first cache.
@@ -56,11 +58,14 @@ impl Nearest {
         }
     }
 
-    /// Hands out the keys of the tile taken last, nearest first, some at a time, as long as `draw` says to go on.
-    pub fn each(&mut self, mut draw: impl FnMut(&[u64]) -> bool) {
+    /// Hands out the keys of the tile taken last, nearest first, some at a time, as long as `draw` says to go on. With each it is
+    /// shown, before they are sorted, most of those that come next; it begins with these alone.
+    pub fn each(&mut self, mut draw: impl FnMut(&[u64], &[u64]) -> bool) {
+        let coming = |keys: &[u64], first: usize| first..keys.len().min(first + COMING);
+        draw(&[], &self.keys[coming(&self.keys, 0)]);
         if !self.buckets {
             sort(&mut self.keys);
-            draw(&self.keys);
+            draw(&self.keys, &[]);
             return;
         }
         let (mut first, mut sorted) = (0, 0);
@@ -70,14 +75,15 @@ impl Nearest {
             sorted = end;
             if sorted - first >= HANDFULS * HANDFUL {
                 let whole = sorted - (sorted - first) % HANDFUL;
-                if !draw(&self.keys[first..whole]) {
+                let next = &self.keys[coming(&self.keys, whole)];
+                if !draw(&self.keys[first..whole], next) {
                     return;
                 }
                 first = whole;
             }
         }
         if first < sorted {
-            draw(&self.keys[first..sorted]);
+            draw(&self.keys[first..sorted], &[]);
         }
     }
 }

@@ -89,7 +89,7 @@ fn every_tile_lists_just_the_ellipses_whose_bounds_touch_it_nearest_first() {
                     let mut nearest = Nearest::default();
                     nearest.take(bins.tile(row, column));
                     let mut keys = Vec::new();
-                    nearest.each(|some| {
+                    nearest.each(|some, _| {
                         keys.extend_from_slice(some);
                         true
                     });
@@ -122,7 +122,7 @@ fn a_far_outlier_in_a_tile_leaves_the_order_of_the_rest() {
     let mut nearest = Nearest::default();
     nearest.take(&entries);
     let mut sorted = Vec::new();
-    nearest.each(|some| {
+    nearest.each(|some, _| {
         sorted.extend_from_slice(some);
         true
     });

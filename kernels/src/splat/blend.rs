@@ -123,13 +123,14 @@ impl Tile {
     }
 
     /// Blends ellipses, nearest first: those of `all` that the lower halves of `keys` number. False once every pixel is finished.
+    /// `next`: what will probably be blended after these, to be fetched already.
     ///
     /// # Panics
     /// If there is no such ellipse.
-    pub fn blend(&mut self, isa: Isa, keys: &[u64], all: &[Ellipse]) -> bool {
+    pub fn blend(&mut self, isa: Isa, keys: &[u64], next: &[u64], all: &[Ellipse]) -> bool {
         let tile = &mut *self;
         if tile.open != 0 {
-            by_level!(isa, fn body(tile: &mut Tile, keys: &[u64], all: &[Ellipse]));
+            by_level!(isa, fn body(tile: &mut Tile, keys: &[u64], next: &[u64], all: &[Ellipse]));
         }
         self.open != 0
     }
@@ -204,14 +205,9 @@ fn rectangle(x0: u32, x1: u32, y0: u32, y1: u32) -> u64 {
 }
 
 #[inline(always)]
-fn body<L: Lanes>(tile: &mut Tile, keys: &[u64], all: &[Ellipse]) {
-    prefetch(all, &keys[..keys.len().min(SPLATS)]);
-    for (at, turn) in keys.chunks(SPLATS).enumerate() {
-        let next = (at + 1) * SPLATS;
-        prefetch(
-            all,
-            &keys[next.min(keys.len())..keys.len().min(next + SPLATS)],
-        );
+fn body<L: Lanes>(tile: &mut Tile, keys: &[u64], next: &[u64], all: &[Ellipse]) {
+    prefetch(all, next);
+    for turn in keys.chunks(SPLATS) {
         for (i, some) in turn.chunks(L::COUNT).enumerate() {
             tile.lay_out::<L>(i * L::COUNT, some, all);
         }
