@@ -5,7 +5,7 @@
 //!
 //! ```text
 //! bytes → bitstream → geometry → entropy → network → gaussians → projection → tiles → pixels
-//!         ╰─────────── exact: bit-equal everywhere ──────╯╰──── close: bounded error ──────╯
+//!         ╰─────────────── exact: bit-equal everywhere ───────────────╯╰─ close: bounded error ─╯
 //! ```
 //!
 //! A stage imports only from the stages to its left, the `b2p-kernels` crate, and the commons ([`error`], [`limits`], [`placement`]).
