@@ -92,6 +92,8 @@ pub fn run(args: &Render, progress: &Progress) -> Result<String> {
             .iter()
             .map(|(path, width, height, stats)| numbers(path, [*width, *height], stats))
             .collect();
+        // What a program reads is nothing but the numbers.
+        let _ = std::io::stderr().write_all(text.as_bytes());
         text = format!("{:#}\n", json!(all));
     } else {
         for (path, _, _, stats) in &all {
