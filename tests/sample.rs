@@ -1,0 +1,62 @@
+//! The sample and the model that ship: what every user decodes first.
+#![cfg(feature = "cli")]
+
+use b2p::decoder::Decoder;
+use b2p::embedded::{MODEL, SAMPLE};
+use b2p::gaussians::Gaussians;
+use b2p::log::Log;
+use b2p::network::{Model, Precision};
+use b2p::pixels::{Background, render};
+use b2p::projection::Camera;
+use b2p::{Isa, Limits};
+
+fn model() -> Model {
+    Model::from_bytes(MODEL).expect("the model inside the program loads")
+}
+
+fn decoded(model: &Model, level: u8) -> Gaussians {
+    Decoder::new(model)
+        .decode(SAMPLE, Some(level), &mut Log::default())
+        .expect("the sample inside the program decodes")
+}
+
+/// Every number of the Gaussians, as bits.
+fn bits(g: &Gaussians) -> Vec<u32> {
+    let numbers = g.position.as_flattened().iter();
+    let numbers = numbers.chain(g.scale.as_flattened());
+    let numbers = numbers.chain(g.rotation.as_flattened()).chain(&g.opacity);
+    let numbers = numbers.chain(g.colour.as_flattened());
+    numbers.map(|x| x.to_bits()).collect()
+}
+
+#[test]
+fn the_sample_decodes_to_the_same_bits_with_every_instruction_set() {
+    assert_eq!(model().precision(), Precision::Int16);
+    let level = Decoder::new(&model()).levels(SAMPLE).unwrap()[0];
+    let best = bits(&decoded(&model(), level));
+    for isa in Isa::available() {
+        println!("ran on {isa}");
+        let same = bits(&decoded(&model().with_isa(isa), level)) == best;
+        assert!(same, "{isa} gives other Gaussians");
+    }
+}
+
+#[test]
+fn gaussians_generated_in_integers_draw_the_pictures_of_those_generated_in_floats() {
+    let floats = model().with_precision(Precision::F16).unwrap();
+    for level in Decoder::new(&floats).levels(SAMPLE).unwrap() {
+        let camera = Camera::orbit(30.0, 10.0, 3.0, 45.0, 512, 512).unwrap();
+        let [a, b] = [&model(), &floats].map(|model| {
+            let g = decoded(model, level);
+            let (image, _) = render(&g, &camera, Background::WHITE, &Limits::default()).unwrap();
+            image
+        });
+        let errors = a.pixels.as_flattened().iter().zip(b.pixels.as_flattened());
+        let squares: f64 = errors.map(|(a, b)| f64::from(a - b).powi(2)).sum();
+        // A quarter of the numbers is alpha, which is 1 in both.
+        let mse = squares / (a.pixels.len() * 3) as f64;
+        let psnr = -10.0 * mse.log10();
+        println!("level {level}: {psnr:.1} dB");
+        assert!(psnr > 55.0, "level {level}: {psnr:.1} dB");
+    }
+}
