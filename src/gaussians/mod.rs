@@ -29,6 +29,9 @@ pub struct Gaussians {
     pub harmonics: Harmonics,
     /// Whether they were made to be drawn with opacity compensation (anti-aliasing).
     pub compensated: bool,
+    /// Pictures widen every Gaussian by this variance, in cube-frame units squared, where it comes to more than a pixel's own blur: a
+    /// stream's Gaussians were trained blurred like that, and leave gaps without it when seen from close up. Zero for none.
+    pub blur: f32,
     /// Where the cube lies in the world.
     pub frame: Frame,
 }

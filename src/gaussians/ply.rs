@@ -92,10 +92,14 @@ impl Gaussians {
             source,
         };
         let [x, y, z] = placement.origin;
+        let blur = match self.blur > 0.0 {
+            true => format!("comment b2p blur {}\n", self.blur),
+            false => String::new(),
+        };
         let mut header = format!(
             "ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: default\n\
              comment b2p bits {bits}\ncomment b2p origin {x} {y} {z}\n\
-             comment b2p voxel_size {}\nelement vertex {}\n",
+             comment b2p voxel_size {}\n{blur}element vertex {}\n",
             placement.voxel_size,
             self.len()
         );
@@ -209,6 +213,7 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
         Harmonics::default()
     };
     let gaussians = Gaussians {
+        blur: if notes.fitted { 0.0 } else { blur(&ply.header) },
         harmonics,
         compensated,
         position: (0..count)
@@ -258,15 +263,25 @@ fn render_mode(header: &Header) -> Option<String> {
     (mode != "default").then(|| mode.to_owned())
 }
 
+/// The last comment of this crate about `key`.
+fn words<'a>(header: &'a Header, key: &str) -> Option<std::str::SplitAsciiWhitespace<'a>> {
+    let mut comments = header.comments.iter().rev();
+    comments.find_map(|comment| {
+        let mut words = comment.split_ascii_whitespace();
+        (words.next() == Some("b2p") && words.next() == Some(key)).then_some(words)
+    })
+}
+
+/// The blur that the comments name, in the units of the cube that they name too; otherwise none.
+fn blur(header: &Header) -> f32 {
+    let blur = words(header, "blur").and_then(|mut words| words.next()?.parse().ok());
+    blur.filter(|blur: &f32| blur.is_finite() && *blur > 0.0)
+        .unwrap_or(0.0)
+}
+
 /// The cube that the comments name. Comments are free text: what cannot be understood is none.
 fn named_frame(header: &Header) -> Option<Frame> {
-    let words = |key: &str| {
-        let mut comments = header.comments.iter().rev();
-        comments.find_map(|comment| {
-            let mut words = comment.split_ascii_whitespace();
-            (words.next() == Some("b2p") && words.next() == Some(key)).then_some(words)
-        })
-    };
+    let words = |key: &str| words(header, key);
     let mut origin = words("origin")?.map(|word| word.parse().ok());
     let frame = Frame {
         bits: words("bits")?.next()?.parse().ok()?,

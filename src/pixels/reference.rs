@@ -130,7 +130,10 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize, compensated: bool) -> O
     };
     let b = jx.dot(sigma * jy);
     let (a, c) = (jx.dot(sigma * jx), jy.dot(sigma * jy));
-    let covariance = DMat2::from_cols(DVec2::new(a + 0.3, b), DVec2::new(b, c + 0.3));
+    let near = if pinhole { t.z } else { 1.0 };
+    let own = f64::from(gaussians.blur) * camera.fx * camera.fy / (near * near);
+    let blur = own.max(0.3);
+    let covariance = DMat2::from_cols(DVec2::new(a + blur, b), DVec2::new(b, c + blur));
     let kept = ((a * c - b * b).max(0.0) / covariance.determinant()).sqrt();
     let opacity = if compensated {
         opacity * kept.max(0.005)

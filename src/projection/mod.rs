@@ -1,7 +1,7 @@
 //! From Gaussians to ellipses on the picture.
 //!
 //! A Gaussian with axes `R·S` is seen as the image of its centre and the 2×2 covariance `M·Mᵀ + 0.3·I`, where `M = J·W·R·S` and `J`
-//! is the derivative of the pinhole projection at the centre (EWA splatting; 0.3 px² is the pixel's own blur). The covariance is
+//! is the derivative of the pinhole projection at the centre (EWA splatting; 0.3 px² is the pixel's own blur; where the Gaussians' own, [`Gaussians::blur`], comes to more, that takes its place). The covariance is
 //! never formed and inverted, which loses a long thin ellipse to cancellation in single precision; the kernel has the formulas
 //! ([`b2p_kernels::splat`]).
 //!
@@ -115,7 +115,7 @@ impl Ellipses {
                 detail: format!("there are {count}"),
             });
         }
-        let view = view(camera, how.compensated);
+        let view = view(camera, how.compensated, gaussians.blur);
         let length = run_length(count);
         self.all.resize(count, Ellipse::default());
         self.runs.clear();
@@ -200,7 +200,7 @@ impl From<Tally> for Dropped {
 }
 
 /// The camera as the kernel has it.
-fn view(camera: &Camera, compensated: bool) -> View {
+fn view(camera: &Camera, compensated: bool, blur: f32) -> View {
     let rotation = camera.pose.matrix3;
     View {
         rotation: std::array::from_fn(|i| rotation.row(i).into()),
@@ -212,5 +212,10 @@ fn view(camera: &Camera, compensated: bool) -> View {
         size: [camera.width, camera.height],
         orthographic: camera.projection == Projection::Orthographic,
         compensated,
+        blur: if blur.is_finite() {
+            blur.max(0.0).into()
+        } else {
+            0.0
+        },
     }
 }

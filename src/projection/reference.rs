@@ -78,7 +78,9 @@ impl View {
         };
         let (x, m1) = along(0, seen.x);
         let (y, m2) = along(1, seen.y);
-        let (a, c) = (m1.length_squared() + BLUR, m2.length_squared() + BLUR);
+        let own = f64::from(gaussians.blur) * self.focal[0] * self.focal[1] * inverse * inverse;
+        let blur = BLUR.max(own as f32);
+        let (a, c) = (m1.length_squared() + blur, m2.length_squared() + blur);
         let finite = Vec3::new(depth, x, y).is_finite() && a.is_finite() && c.is_finite();
         require(finite, Invisible::NotFinite)?;
 
@@ -90,10 +92,10 @@ impl View {
         require(x0 < x1 && y0 < y1, Invisible::Outside)?;
 
         let (u, v) = if a >= c {
-            let (along, across, slope) = factors(m1, m2, a);
+            let (along, across, slope) = factors(m1, m2, a, blur);
             ([-slope * across, across], [along, 0.0])
         } else {
-            let (along, across, slope) = factors(m2, m1, c);
+            let (along, across, slope) = factors(m2, m1, c, blur);
             ([across, -slope * across], [0.0, along])
         };
         let bounds = Bounds { x0, y0, x1, y1 };
@@ -126,12 +128,12 @@ fn require(holds: bool, otherwise: Invisible) -> Result<(), Invisible> {
 }
 
 /// `1/√p` and `1/√(det/p)`, both times [`FORM_SCALE`], and `b/p`; `p` is the variance (blur included) of the row `long`.
-fn factors(long: Vec3, short: Vec3, p: f32) -> (f32, f32, f32) {
+fn factors(long: Vec3, short: Vec3, p: f32, blur: f32) -> (f32, f32, f32) {
     let inverse = 1.0 / p;
     let root = inverse.sqrt();
     // Divided by √p before it is squared, the cross product stays far from overflow.
     let minors = (long * root).cross(short).length_squared();
-    let blurred = BLUR * ((long.length_squared() + short.length_squared() + BLUR) * inverse);
+    let blurred = blur * ((long.length_squared() + short.length_squared() + blur) * inverse);
     let across = FORM_SCALE / (minors + blurred).sqrt();
     (FORM_SCALE * root, across, long.dot(short) * inverse)
 }
@@ -200,8 +202,9 @@ fn gaussians() -> Gaussians {
 
 #[test]
 fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
-    let all = gaussians();
-    for (azimuth, radius) in [(0.0, 3.0), (77.0, 0.4), (200.0, 40.0)] {
+    let mut all = gaussians();
+    for (azimuth, radius, blur) in [(0.0, 3.0, 0.0), (77.0, 0.4, 3e-5), (200.0, 40.0, 1e-3)] {
+        all.blur = blur;
         let camera = Camera::orbit(azimuth, 20.0, radius, 60.0, 310, 200).unwrap();
         let view = View::new(&camera);
         let expected: Vec<Result<Ellipse, Invisible>> =

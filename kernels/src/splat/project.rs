@@ -40,6 +40,9 @@ pub struct View {
     pub orthographic: bool,
     /// Opacity is taken back by as much as the blur widens.
     pub compensated: bool,
+    /// The Gaussians' own blur: a variance in squared units of length, finite, at least 0. It counts where it comes to more pixels than
+    /// [`BLUR`].
+    pub blur: f64,
 }
 
 /// Gaussians, one slice per parameter, all of the same length.
@@ -151,6 +154,8 @@ struct Camera<L: Lanes> {
     slopes: [[L::Double; 2]; 2],
     rows: [[L; 3]; 3],
     size: [L; 2],
+    /// The Gaussians' own blur in pixels at distance 1.
+    blur: L::Double,
 }
 
 impl<L: Lanes> Camera<L> {
@@ -166,6 +171,7 @@ impl<L: Lanes> Camera<L> {
             slopes: [pair(view.slopes[0]), pair(view.slopes[1])],
             rows: three!(i => three!(k => L::splat(view.rotation[i][k] as f32))),
             size: [L::splat(view.size[0] as f32), L::splat(view.size[1] as f32)],
+            blur: L::Double::splat(view.blur * view.focal[0] * view.focal[1]),
         }
     }
 
@@ -214,7 +220,12 @@ impl<L: Lanes> Camera<L> {
         let scale = three!(i => scale[i].abs().min(limit));
         let (x, m1) = self.along::<VARIANT>(0, seen[0], inverse, &axes, scale);
         let (y, m2) = self.along::<VARIANT>(1, seen[1], inverse, &axes, scale);
-        let blur = L::splat(BLUR);
+        let own = if VARIANT & ORTHOGRAPHIC != 0 {
+            self.blur
+        } else {
+            self.blur.mul(inverse).mul(inverse)
+        };
+        let blur = own.to_lanes().max(L::splat(BLUR));
         let (a0, c0) = (dot(m1, m1), dot(m2, m2));
         let (a, c) = (a0.add(blur), c0.add(blur));
         let products = depth.mul_add(zero, x.mul(zero));

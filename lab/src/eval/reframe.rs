@@ -19,6 +19,7 @@ pub fn into_frame(mut gaussians: Gaussians, frame: Frame) -> Gaussians {
     }
     let unit = |f: Frame| f64::from(1u32 << f.bits) * f.placement.voxel_size;
     let ratio = (unit(from) / unit(frame)) as f32;
+    gaussians.blur *= ratio * ratio;
     for scale in &mut gaussians.scale {
         *scale = scale.map(|s| s * ratio);
     }

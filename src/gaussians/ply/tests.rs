@@ -18,6 +18,7 @@ fn gaussians() -> Gaussians {
                 voxel_size: 0.003,
             },
         },
+        blur: 1.2345678e-6,
         ..Gaussians::default()
     }
 }

@@ -11,6 +11,28 @@ fn random_scenes_are_close_to_the_reference() {
 }
 
 #[test]
+fn gaussians_with_a_blur_of_their_own_are_close_to_the_reference() {
+    for (seed, blur) in [(1, 1e-5), (2, 1e-3), (3, 0.1)] {
+        let mut scene = scene(random_splats(seed, 150));
+        scene.blur = blur;
+        assert_close(&scene, &orbit(75, 50));
+    }
+}
+
+#[test]
+fn a_blur_below_the_pixel_s_own_changes_no_picture_and_one_above_closes_gaps() {
+    let small = surface_splats(2000, 0.8, 1e-3);
+    let mut scene = scene(small);
+    let (far, near) = (orbit(64, 64), orbit(640, 640));
+    let [before_far, before_near] = [&far, &near].map(|camera| draw(&scene, camera));
+    // A deviation of 0.01: a quarter of a pixel from afar, two and a half from close up.
+    scene.blur = 1e-4;
+    assert_eq!(draw(&scene, &far).pixels, before_far.pixels);
+    let covered = |image: &Image| image.pixels.iter().filter(|p| p[0] < 0.9).count();
+    assert!(covered(&draw(&scene, &near)) > 2 * covered(&before_near));
+}
+
+#[test]
 fn with_the_same_cut_offs_only_rounding_is_left() {
     let mut worst = 0.0f32;
     for seed in 0..6 {
