@@ -24,7 +24,7 @@ pub struct Options {
 }
 
 impl Options {
-    /// Saves about an eighth of the bits.
+    /// Rounds to the nearest.
     pub const BIT_PRICE: f32 = 0.0;
 }
 
@@ -147,7 +147,7 @@ pub fn encode(
                 let latents = quantise(
                     model.tables(),
                     condition,
-                    &model.squeeze_reals(role, &own, context.as_deref())?,
+                    &model.squeeze(role, &own, context.as_deref())?,
                     model.shape().latent_max,
                     options.bit_price,
                 );

@@ -50,7 +50,8 @@ impl Model {
         Ok(out)
     }
 
-    /// The latents [voxels, K] of a role, in ±`latent_max`, from its encoder features and, above role 0, its context.
+    /// The latents [voxels, K] of a role before they are rounded and bounded ([`crate::entropy::quantise`]), from its encoder features
+    /// and, above role 0, its context.
     ///
     /// # Errors
     /// [`crate::Error::Unsupported`] if the model can only decode.
@@ -58,20 +59,6 @@ impl Model {
     /// # Panics
     /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.
     pub fn squeeze(
-        &self,
-        role: usize,
-        features: &[f16],
-        context: Option<&[i16]>,
-    ) -> Result<Vec<i16>> {
-        let y = self.squeeze_reals(role, features, context)?;
-        let limit = f32::from(self.shape.latent_max);
-        Ok(y.into_iter()
-            .map(|y| y.clamp(-limit, limit).round_ties_even() as i16)
-            .collect())
-    }
-
-    /// The latents before they are rounded and bounded; errors and panics are those of [`Model::squeeze`].
-    pub(crate) fn squeeze_reals(
         &self,
         role: usize,
         features: &[f16],

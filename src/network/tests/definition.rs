@@ -1,7 +1,6 @@
 //! Every module against its definition.
 
 use b2p_kernels::Isa;
-use half::f16;
 
 use super::super::reference::{Mode, Oracle, Rows};
 use super::super::{Model, Precision, RAW, Shape, Upsample, untrained};
@@ -315,7 +314,7 @@ fn conversion_and_squeezing_follow_their_definition_within_f16() {
                     .map(|i| ((i * 7919) % 1601) as i16 - 800)
                     .collect()
             });
-            let y = model.squeeze_reals(role, &got[role], c.as_deref()).unwrap();
+            let y = model.squeeze(role, &got[role], c.as_deref()).unwrap();
             let c = c.map(|c| rows(&c, shape.channels));
             let y_want = oracle.squeeze(
                 role,
@@ -356,22 +355,4 @@ fn fewer_levels_start_from_the_same_first_conversion() {
     assert_eq!((got.len(), want.len()), (1, 1));
     let (off, peak) = error(&got[0], &want[0]);
     assert!(off < TOLERANCE * peak, "off by {off} of {peak}");
-}
-
-#[test]
-fn latents_are_rounded_to_even_and_stay_within_their_bound() {
-    let shape = Shape {
-        latent_max: 2,
-        ..Shape::tiny()
-    };
-    let model = Model::from_bytes(&untrained(&shape, 1)).unwrap();
-    let features: Vec<f16> = (0..50 * 8)
-        .map(|i| f16::from_f32((i * 37 % 101) as f32 / 50.0 - 1.0))
-        .collect();
-    let y = model.squeeze_reals(0, &features, None).unwrap();
-    let latents = model.squeeze(0, &features, None).unwrap();
-    assert!(latents.contains(&2) && latents.contains(&-2) && latents.contains(&0));
-    for (q, y) in latents.into_iter().zip(y) {
-        assert_eq!(f32::from(q), y.round_ties_even().clamp(-2.0, 2.0));
-    }
 }
