@@ -21,6 +21,8 @@ pub struct Options {
     pub levels: Option<RangeInclusive<u8>>,
     /// What a bit is worth when latents are rounded, in squared latent steps: see [`crate::entropy::quantise`]. 0 rounds to the nearest.
     pub bit_price: f32,
+    /// Voxels per slice, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
+    pub slice_voxels: u32,
 }
 
 impl Options {
@@ -33,6 +35,7 @@ impl Default for Options {
         Options {
             levels: None,
             bit_price: Options::BIT_PRICE,
+            slice_voxels: MAX_SLICE_VOXELS,
         }
     }
 }
@@ -62,7 +65,8 @@ pub struct Rate {
 /// Codes a cloud, then decodes the stream and compares before giving it out.
 ///
 /// # Errors
-/// [`Error::Usage`] for levels that the cloud or the format does not have, [`Error::Unsupported`] if the model can only decode; and,
+/// [`Error::Usage`] for levels that the cloud or the format does not have, [`Error::Malformed`] for slices that the format does not
+/// have, [`Error::Unsupported`] if the model can only decode; and,
 /// if encoder and decoder disagreed on this machine, whatever the decoder found.
 pub fn encode(
     cloud: &ColouredVoxels,
@@ -89,7 +93,7 @@ pub fn encode(
         model.features(&colours, &maps, &occupancy)
     })?;
 
-    let slice = MAX_SLICE_VOXELS as usize;
+    let slice = options.slice_voxels as usize;
     let mut writer = Writer::new(Header {
         optional_flags: 0,
         bits: cloud.voxels.depth(),
@@ -98,7 +102,7 @@ pub fn encode(
         points: cloud.voxels.len() as u64,
         placement: cloud.placement,
         model: model.id(),
-        slice_voxels: MAX_SLICE_VOXELS,
+        slice_voxels: options.slice_voxels,
         voxels: levels
             .clone()
             .map(|level| octree.level(level).len() as u32)

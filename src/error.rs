@@ -96,7 +96,7 @@ pub enum Error {
     },
     /// The input asks for more than the caller allows.
     #[error(
-        "{what} is {needed}, over the limit of {limit}; raise `Limits::{option}` if you trust the input"
+        "{what} is {needed}, over the limit of {limit}; raise `{option}` if you trust the input"
     )]
     LimitExceeded {
         /// The quantity.
@@ -130,6 +130,9 @@ pub enum Error {
         /// What it may hold.
         expected: String,
     },
+    /// The caller threw the [`Cancel`](crate::Cancel) switch.
+    #[error("cancelled")]
+    Cancelled,
     /// The caller asked for something that makes no sense.
     #[error("{0}")]
     Usage(String),

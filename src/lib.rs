@@ -8,7 +8,7 @@
 //!         ╰─────────────── exact: bit-equal everywhere ───────────────╯╰─ close: bounded error ─╯
 //! ```
 //!
-//! A stage imports only from the stages to its left, the `b2p-kernels` crate, and the commons ([`error`], [`limits`], [`placement`]).
+//! A stage imports only from the stages to its left, the `b2p-kernels` crate, and the commons ([`error`], [`limits`], [`cancel`], [`placement`]).
 //!
 //! Stream to picture:
 //!
@@ -31,6 +31,7 @@
 #![forbid(unsafe_code)]
 
 pub mod bitstream;
+pub mod cancel;
 pub mod cloud;
 pub mod decoder;
 #[cfg(feature = "cli")]
@@ -51,6 +52,7 @@ pub mod projection;
 pub mod tiles;
 
 pub use b2p_kernels::{Isa, UnknownIsa, ceiling};
+pub use cancel::Cancel;
 pub use error::{Error, Result};
 pub use limits::Limits;
 pub use placement::Placement;

@@ -2,7 +2,10 @@
 
 use crate::error::{Error, Result};
 
-/// Bounds that are checked before memory is reserved. Finite by default.
+/// The deepest octree level: what a Morton key of 64 bits addresses.
+pub const MAX_DEPTH: u8 = 21;
+
+/// Bounds that are checked before memory is reserved. Finite by default: 2²⁶ points, 21 levels, 2²⁸ pixels, 2 GiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Limits {
     /// Voxels of any one level, and points of any one cloud.
@@ -27,6 +30,19 @@ impl Default for Limits {
 }
 
 impl Limits {
+    /// What the library takes beyond `max_bytes`, however small the input: threads and their desks.
+    pub const OVERHEAD: u64 = 4 << 20;
+
+    /// For boards with 512 MB of memory: 2²⁰ points, pictures of 2²² pixels, 192 MiB.
+    pub fn embedded() -> Self {
+        Limits {
+            max_points: 1 << 20,
+            max_depth: 21,
+            max_pixels: 1 << 22,
+            max_bytes: 192 << 20,
+        }
+    }
+
     /// No bounds but those of the format: for input that is trusted.
     pub fn unlimited() -> Self {
         Limits {

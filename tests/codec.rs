@@ -2,45 +2,25 @@
 
 mod common;
 
-use b2p::cloud::{ColouredVoxels, PointCloud, voxelise};
+use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Encoded, Options, encode};
-use b2p::geometry::{Octree, Voxels};
+use b2p::geometry::Octree;
 use b2p::log::Log;
 use b2p::network::Model;
 use b2p::{Error, Limits, Placement};
-use common::{Ball, tiny_model};
+use common::{Ball, cloud_of, tiny_model};
 
 fn model() -> Model {
     Model::from_bytes(&tiny_model(0)).expect("an untrained model loads")
 }
 
 fn ball(bits: u8, radius: f32) -> ColouredVoxels {
-    let cloud = PointCloud::from_ply(
-        Ball::new(bits, radius).to_ply().as_bytes(),
-        &Limits::default(),
-    )
-    .unwrap();
-    voxelise(&cloud, Some(bits)).unwrap()
+    Ball::new(bits, radius).cloud()
 }
 
 fn coded(cloud: &ColouredVoxels, model: &Model) -> Encoded {
     encode(cloud, model, &Options::default(), &mut Log::default()).unwrap()
-}
-
-/// A cloud of these voxels, its colours from their places.
-fn cloud_of(depth: u8, keys: Vec<u64>) -> ColouredVoxels {
-    let voxels = Voxels::new(depth, keys);
-    let colours = voxels
-        .keys()
-        .iter()
-        .map(|k| [*k as u8, (k >> 3) as u8, (k >> 7) as u8])
-        .collect();
-    ColouredVoxels {
-        voxels,
-        colours,
-        placement: Placement::VOXEL_GRID,
-    }
 }
 
 #[test]
@@ -251,30 +231,6 @@ fn the_placement_of_the_cloud_comes_back_with_the_gaussians() {
         .unwrap();
     assert_eq!(gaussians.frame.placement, cloud.placement);
     assert_eq!(gaussians.frame.bits, 6);
-}
-
-#[test]
-fn any_damage_to_a_stream_is_an_error_or_leaves_the_levels_before_it() {
-    let (model, cloud) = (model(), ball(5, 10.0));
-    let bytes = coded(&cloud, &model).bytes;
-    let decoder = Decoder::new(&model);
-    let whole = decoder.decode(&bytes, None, &mut Log::default()).unwrap();
-    for at in 0..bytes.len() {
-        let mut damaged = bytes.clone();
-        damaged[at] ^= 1 << (at % 8);
-        // The flags that a reader ignores, and what nothing is drawn from, are all under a checksum too.
-        assert!(
-            decoder
-                .decode(&damaged, Some(4), &mut Log::default())
-                .is_err(),
-            "byte {at} was flipped unnoticed"
-        );
-        let cut = decoder.decode(&bytes[..at], None, &mut Log::default());
-        assert!(
-            cut.is_err() || cut.is_ok_and(|g| g != whole),
-            "a stream of {at} bytes is not whole"
-        );
-    }
 }
 
 #[test]

@@ -3,8 +3,9 @@
 
 mod common;
 
+use std::io::Write;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use common::{Ball, names_in};
 
@@ -14,6 +15,25 @@ fn b2p(folder: &Path, arguments: &[&str]) -> Output {
         .args(arguments)
         .output()
         .expect("the program starts")
+}
+
+/// The same with these bytes on standard input, in pieces.
+fn piped(folder: &Path, arguments: &[&str], input: &[u8]) -> Output {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_b2p"))
+        .current_dir(folder)
+        .args(arguments)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    let mut pipe = child.stdin.take().expect("a pipe");
+    for piece in input.chunks(1000) {
+        // A program that has seen enough closes its end.
+        let _ = pipe.write_all(piece).and_then(|()| pipe.flush());
+    }
+    drop(pipe);
+    child.wait_with_output().expect("the program ends")
 }
 
 #[track_caller]
@@ -353,4 +373,110 @@ fn an_output_folder_that_does_not_exist_is_named() {
         &["decode", "ball.b2p", "-o", "nowhere/x.ply"],
         &["nowhere"],
     );
+}
+
+#[test]
+fn a_pipe_is_decoded_and_drawn_like_a_file() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let stream = std::fs::read(at.join("ball.b2p")).unwrap();
+    let size = ["--size", "48x32"];
+    succeeds(
+        at,
+        &[&["render", "ball.b2p", "-o", "file.png"], &size[..]].concat(),
+    );
+    let done = piped(
+        at,
+        &[&["render", "-", "-o", "pipe.png"], &size[..]].concat(),
+        &stream,
+    );
+    assert!(done.status.success());
+    let [file, pipe] = ["file.png", "pipe.png"].map(|name| std::fs::read(at.join(name)).unwrap());
+    assert!(file == pipe);
+    let done = piped(
+        at,
+        &[&["render", "-", "-o", "-"], &size[..]].concat(),
+        &stream,
+    );
+    assert!(
+        done.stdout == file,
+        "one picture on standard output, the finest"
+    );
+
+    succeeds(at, &["decode", "ball.b2p", "-o", "file.ply"]);
+    assert!(
+        piped(at, &["decode", "-", "-o", "pipe.ply"], &stream)
+            .status
+            .success()
+    );
+    let [file, pipe] = ["file.ply", "pipe.ply"].map(|name| std::fs::read(at.join(name)).unwrap());
+    assert!(file == pipe);
+    let done = piped(
+        at,
+        &[&["render", "-", "-o", "g.png"], &size[..]].concat(),
+        &file,
+    );
+    assert!(done.status.success(), "Gaussians come through a pipe too");
+}
+
+#[test]
+fn a_pipe_that_breaks_off_leaves_the_finest_whole_level() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let stream = std::fs::read(at.join("ball.b2p")).unwrap();
+    let cut = &stream[..stream.len() - 1];
+    let done = piped(at, &["decode", "-", "-o", "cut.ply"], cut);
+    let told = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert!(done.status.success(), "{told}");
+    assert!(
+        told.contains("truncated") && told.contains("level 5"),
+        "{told}"
+    );
+    succeeds(
+        at,
+        &["decode", "ball.b2p", "-o", "five.ply", "--level", "5"],
+    );
+    let [cut_ply, five] = ["cut.ply", "five.ply"].map(|name| std::fs::read(at.join(name)).unwrap());
+    assert!(cut_ply == five);
+
+    let named = piped(at, &["decode", "-", "-o", "x.ply", "--level", "6"], cut);
+    assert_eq!(
+        named.status.code(),
+        Some(1),
+        "the level asked for is not there"
+    );
+    let nothing = piped(at, &["decode", "-", "-o", "x.ply"], &stream[..100]);
+    assert_eq!(nothing.status.code(), Some(1));
+    let mut damaged = stream.clone();
+    damaged[stream.len() - 1] ^= 1;
+    let damaged = piped(
+        at,
+        &["decode", "-", "-o", "y.ply", "--level", "6"],
+        &damaged,
+    );
+    assert!(String::from_utf8_lossy(&damaged.stderr).contains("checksum"));
+    assert!(!at.join("x.ply").exists() && !at.join("y.ply").exists());
+}
+
+#[test]
+fn limits_can_be_set_and_say_how_to_raise_them() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let decode = ["decode", "ball.b2p", "-o", "x.ply"];
+    for limit in [["--max-memory", "1M"], ["--max-points", "10"]] {
+        fails(
+            at,
+            &[&decode[..], &limit].concat(),
+            &["ball.b2p", "limit of", limit[0]],
+        );
+    }
+    let render = ["render", "ball.b2p", "-o", "x.png"];
+    let few = ["--max-pixels", "1000"];
+    fails(
+        at,
+        &[&render[..], &few].concat(),
+        &["1048576", "--max-pixels"],
+    );
+    let roomy = ["--limits", "embedded", "--max-memory", "1G"];
+    succeeds(at, &[&decode[..], &roomy].concat());
 }

@@ -3,8 +3,7 @@
 use super::malformed;
 use super::reader::Reader;
 use crate::error::{Error, Result};
-use crate::geometry::morton::MAX_DEPTH;
-use crate::limits::Limits;
+use crate::limits::{Limits, MAX_DEPTH};
 use crate::placement::Placement;
 
 /// The first bytes: not text, and changed by whatever changes line ends.
@@ -185,6 +184,26 @@ impl Header {
         let last = self.index(level)?;
         let sections: u64 = self.sections[..=last].iter().map(Section::bytes).sum();
         Ok(self.bytes() as u64 + sections)
+    }
+
+    /// Length of the whole stream.
+    pub fn stream_bytes(&self) -> u64 {
+        let sections: u64 = self.sections.iter().map(Section::bytes).sum();
+        self.bytes() as u64 + sections
+    }
+
+    /// Fails with [`Error::Malformed`] if something follows the last section in a stream of `length` bytes.
+    pub fn check_end(&self, length: u64) -> Result<()> {
+        let end = self.stream_bytes();
+        match length.saturating_sub(end) {
+            0 => Ok(()),
+            rest => Err(malformed(
+                end,
+                "length of what follows the last section",
+                rest,
+                0,
+            )),
+        }
     }
 
     /// How many voxels `level` has.

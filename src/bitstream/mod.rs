@@ -61,7 +61,7 @@ use crate::error::{Error, Stage};
 
 /// Something at byte `offset` that breaks the format.
 fn malformed(
-    offset: usize,
+    offset: impl std::fmt::Display,
     field: impl ToString,
     value: impl ToString,
     expected: impl ToString,

@@ -31,13 +31,13 @@ impl<'a> Reader<'a> {
 
     /// The next `count` bytes; fails with [`Error::Truncated`], naming `field`.
     pub fn take(&mut self, count: usize, field: &'static str) -> Result<&'a [u8]> {
-        let rest = self.bytes.get(self.at..).unwrap_or_default();
-        let Some(taken) = rest.get(..count) else {
+        let rest = self.bytes.get(self.at..);
+        let Some(taken) = rest.and_then(|rest| rest.get(..count)) else {
             return Err(Error::Truncated {
                 stage: Stage::Bitstream,
                 offset: self.bytes.len() as u64,
                 field,
-                needed: (count - rest.len()) as u64,
+                needed: self.at as u64 + count as u64 - self.bytes.len() as u64,
             });
         };
         self.at += count;

@@ -118,7 +118,50 @@ impl<'a> Stream<'a> {
     }
 }
 
-impl Level<'_> {
+impl<'a> Level<'a> {
+    /// Takes level `level` out of a stream with this header, or out of a prefix of one; the levels before it have been taken.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the header tells of no such level; else what is wrong with it: [`Error::Truncated`],
+    /// [`Error::ChecksumMismatch`], [`Error::Malformed`], [`Error::Unsupported`] for chunks that are not known and not to be skipped.
+    pub fn read(bytes: &'a [u8], header: &Header, level: u8) -> Result<Self> {
+        let index = header.index(level)?;
+        let (voxels, section) = (header.voxels[index], header.sections[index]);
+        let (mut at, mut parents) = match index {
+            0 => (header.bytes() as u64, 1),
+            _ => (
+                header.prefix_bytes(level - 1)?,
+                header.voxels[index - 1].into(),
+            ),
+        };
+        let mut chunks = take_section(bytes, &mut at, section.geometry, "geometry section")?;
+        let mut geometry = Vec::new();
+        let first = if index == 0 { 1 } else { level };
+        for level in first..=level {
+            let slices = take_geometry(&mut chunks, header.slice_voxels, level, parents, voxels)?;
+            parents = slices.iter().map(|s| u64::from(s.voxels)).sum();
+            geometry.push(Geometry { level, slices });
+        }
+        if parents != u64::from(voxels) {
+            let field = format!("voxel count of level {level}");
+            let expected = format!("{voxels}, as the header tells");
+            return Err(malformed(at, field, parents, expected));
+        }
+        chunks.finish()?;
+
+        let mut chunks = take_section(bytes, &mut at, section.features, "feature section")?;
+        let (features, latent_hash) =
+            take_features(&mut chunks, header.slice_voxels, level, voxels)?;
+        chunks.finish()?;
+        Ok(Level {
+            level,
+            voxels,
+            geometry,
+            features,
+            latent_hash,
+        })
+    }
+
     /// Fails with [`Error::DeterminismMismatch`] unless decoded latents with the hash `found` are those that were coded.
     pub fn check_latents(&self, found: u64) -> Result<()> {
         if found == self.latent_hash {
@@ -134,63 +177,25 @@ impl Level<'_> {
 
 /// Fills `levels` until the first fault.
 fn take_levels<'a>(bytes: &'a [u8], header: &Header, levels: &mut Vec<Level<'a>>) -> Result<()> {
-    let mut at = header.bytes();
-    let mut parents = 1;
-    for (level, (&voxels, section)) in
-        (header.base..).zip(header.voxels.iter().zip(&header.sections))
-    {
-        let mut chunks = take_section(bytes, &mut at, section.geometry, "geometry section")?;
-        let mut geometry = Vec::new();
-        let first = if level == header.base { 1 } else { level };
-        for level in first..=level {
-            let slices = take_geometry(&mut chunks, header.slice_voxels, level, parents, voxels)?;
-            parents = slices.iter().map(|s| u64::from(s.voxels)).sum();
-            geometry.push(Geometry { level, slices });
-        }
-        if parents != u64::from(voxels) {
-            let field = format!("voxel count of level {level}");
-            return Err(malformed(
-                at,
-                field,
-                parents,
-                format!("{voxels}, as the header tells"),
-            ));
-        }
-        chunks.finish()?;
-
-        let mut chunks = take_section(bytes, &mut at, section.features, "feature section")?;
-        let (features, latent_hash) =
-            take_features(&mut chunks, header.slice_voxels, level, voxels)?;
-        chunks.finish()?;
-        levels.push(Level {
-            level,
-            voxels,
-            geometry,
-            features,
-            latent_hash,
-        });
+    for level in header.base..=header.top {
+        levels.push(Level::read(bytes, header, level)?);
     }
-    match bytes.len() - at {
-        0 => Ok(()),
-        rest => Err(malformed(
-            at,
-            "length of what follows the last section",
-            rest,
-            0,
-        )),
-    }
+    header.check_end(bytes.len() as u64)
 }
 
+/// The section that starts at `at`, which then is where it ends.
 fn take_section<'a>(
     bytes: &'a [u8],
-    at: &mut usize,
+    at: &mut u64,
     length: u32,
     field: &'static str,
 ) -> Result<Chunks<'a>> {
-    let start = *at;
-    Reader::new(bytes, start).take(length as usize, field)?;
-    *at += length as usize;
-    Ok(Chunks::new(bytes, start..*at))
+    // Whatever starts beyond what a machine can address starts beyond the bytes.
+    let start = usize::try_from(*at).unwrap_or(usize::MAX);
+    *at += u64::from(length);
+    let mut reader = Reader::new(bytes, start);
+    reader.take(length as usize, field)?;
+    Ok(Chunks::new(bytes, start..reader.at()))
 }
 
 /// The geometry of a level whose parents are known; no level has more voxels than the `most` of the one that ends the section.

@@ -3,6 +3,7 @@
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
+use b2p::Limits;
 use b2p::encoder::Options;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -18,8 +19,57 @@ pub struct Cli {
     #[arg(short, long, global = true)]
     pub quiet: bool,
 
+    #[command(flatten)]
+    pub limits: LimitArgs,
+
     #[command(subcommand)]
     pub command: Command,
+}
+
+/// What an input may ask for.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Limits")]
+pub struct LimitArgs {
+    /// Where limits start from: what suits a board with 512 MB, anything, or input that is trusted
+    #[arg(long, global = true, value_enum, value_name = "PRESET", default_value_t = Preset::Default)]
+    pub limits: Preset,
+    /// Memory that one input may make the program reserve, such as 500M or 4G
+    #[arg(long, global = true, value_name = "BYTES", value_parser = bytes)]
+    pub max_memory: Option<u64>,
+    /// Voxels of a level, and points of a cloud
+    #[arg(long, global = true, value_name = "N")]
+    pub max_points: Option<u64>,
+    /// Pixels of a picture
+    #[arg(long, global = true, value_name = "N")]
+    pub max_pixels: Option<u64>,
+}
+
+/// Limits by name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Preset {
+    /// 2²⁰ points, 2²² pixels, 192 MiB
+    Embedded,
+    /// 2²⁶ points, 2²⁸ pixels, 2 GiB
+    Default,
+    /// Those of the format
+    Unlimited,
+}
+
+impl LimitArgs {
+    /// The limits that they name.
+    pub fn limits(&self) -> Limits {
+        let preset = match self.limits {
+            Preset::Embedded => Limits::embedded(),
+            Preset::Default => Limits::default(),
+            Preset::Unlimited => Limits::unlimited(),
+        };
+        Limits {
+            max_points: self.max_points.unwrap_or(preset.max_points),
+            max_pixels: self.max_pixels.unwrap_or(preset.max_pixels),
+            max_bytes: self.max_memory.unwrap_or(preset.max_bytes),
+            ..preset
+        }
+    }
 }
 
 #[derive(Debug, Subcommand)]
@@ -60,7 +110,7 @@ pub struct Encode {
 
 #[derive(Debug, Args)]
 pub struct Decode {
-    /// Stream to decode
+    /// Stream to decode. `-`: standard input, decoded as it comes
     pub input: PathBuf,
     /// Gaussians to write, as a PLY with the property names of 3D Gaussian splatting
     #[arg(short, long, value_name = "OUT.ply")]
@@ -73,7 +123,7 @@ pub struct Decode {
 
 #[derive(Debug, Args)]
 pub struct Render {
-    /// Stream, or PLY of Gaussians
+    /// Stream, or PLY of Gaussians. `-`: standard input, drawn as it comes
     pub input: PathBuf,
     /// Picture to write: .png, .ppm, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
     #[arg(short, long, value_name = "OUT.png")]
@@ -219,6 +269,24 @@ pub struct ModelArg {
 
 pub use b2p::pixels::{Background, Choice, Effect};
 
+/// A number of bytes, with or without K, M, G or T for powers of 1024.
+fn bytes(text: &str) -> Result<u64, String> {
+    let expected = "expected bytes such as 500M or 4G";
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let power = match text[digits.len()..].to_ascii_uppercase().as_str() {
+        "" => 0,
+        "K" => 1,
+        "M" => 2,
+        "G" => 3,
+        "T" => 4,
+        _ => return Err(expected.into()),
+    };
+    let number: u64 = digits.parse().map_err(|_| expected)?;
+    number
+        .checked_mul(1 << (10 * power))
+        .ok_or_else(|| expected.into())
+}
+
 fn levels(text: &str) -> Result<RangeInclusive<u8>, String> {
     let expected = "expected two levels such as 7..9";
     let (first, last) = text.split_once("..").ok_or(expected)?;
@@ -305,10 +373,15 @@ mod tests {
         assert_eq!(size("640x480"), Ok((640, 480)));
         assert_eq!(orbit("-30, 10,2.5"), Ok([-30.0, 10.0, 2.5]));
         assert_eq!(hex("#ff0080"), Some([255, 0, 128]));
+        assert_eq!(bytes("512"), Ok(512));
+        assert_eq!(bytes("3k"), Ok(3 << 10));
+        assert_eq!(bytes("2G"), Ok(2 << 30));
     }
 
     #[test]
     fn nonsense_is_refused_with_an_example() {
+        assert!(bytes("2GB").unwrap_err().contains("500M"));
+        assert!(bytes("-1").is_err() && bytes("99999999T").is_err());
         assert!(levels("9..7").unwrap_err().contains("after"));
         assert!(levels("9").unwrap_err().contains("7..9"));
         assert!(size("0x4").unwrap_err().contains("1024x1024"));

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-use b2p::bitstream::Stream;
+use b2p::bitstream::Header;
 use b2p::decoder::Decoder;
 use b2p::geometry::{KernelMap, Octree};
 use b2p::log::{Log, Step};
@@ -24,7 +24,7 @@ struct Line {
 }
 
 /// Decodes again and again; prints a table or JSON.
-pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
+pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String> {
     let bytes = match &args.input {
         Some(path) => load::bytes(path)?,
         None => embedded::SAMPLE.to_vec(),
@@ -32,7 +32,7 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
     let start = Instant::now();
     let model = load::model(&args.model)?;
     let loading = start.elapsed();
-    let decoder = Decoder::new(&model);
+    let decoder = Decoder::new(&model).with_limits(limits.clone());
     let fail = |error| match &args.input {
         Some(path) => Failure::in_file(path)(error),
         None => Failure::from(error),
@@ -64,10 +64,7 @@ pub fn run(args: &Bench, progress: &Progress) -> Result<String> {
     let exact = decoder
         .exact(&bytes, level, &mut Log::default())
         .map_err(fail)?;
-    let base = Stream::parse(&bytes, &Limits::default())
-        .map_err(fail)?
-        .header()
-        .base;
+    let base = Header::parse(&bytes, limits).map_err(fail)?.base;
     let works = works(model.shape(), &exact.octree, base);
     let lines: Vec<Line> = runs[0]
         .1

@@ -1,30 +1,43 @@
 //! `b2p decode`: stream to Gaussians in a file.
 
-use b2p::decoder::Decoder;
 use b2p::log::Log;
-use b2p::output;
+use b2p::{Limits, output};
 
 use super::args::Decode;
 use super::progress::Progress;
 use super::table::{count, steps};
-use super::{Failure, Result, load};
+use super::{Result, pipe};
 
 /// Decodes a stream into a PLY.
-pub fn run(args: &Decode, progress: &Progress) -> Result<String> {
+pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String> {
     let say = |step: &str| progress.say(step);
     let mut log = Log::with_listener(&say);
-    let bytes = load::bytes(&args.input)?;
-    let model = load::model(&args.model)?;
-    let gaussians = Decoder::new(&model)
-        .decode(&bytes, args.level.level, &mut log)
-        .map_err(Failure::in_file(&args.input))?;
-    log.step("write PLY", gaussians.len(), "Gaussians", || {
-        output::write_file(&args.output, |w| gaussians.write_ply(w, &args.output))
-    })?;
+    let mut written = 0;
+    let Decode {
+        input,
+        output: to,
+        level,
+        model,
+    } = args;
+    pipe::each(
+        input,
+        level,
+        model,
+        limits,
+        true,
+        &mut log,
+        &mut |gaussians, log| {
+            written = gaussians.len();
+            log.step("write PLY", written, "Gaussians", || {
+                output::write_file(to, |w| gaussians.write_ply(w, to))
+            })?;
+            Ok(())
+        },
+    )?;
     Ok(format!(
         "{}\n{}: {} Gaussians\n",
         steps(log.steps()),
-        args.output.display(),
-        count(gaussians.len() as u64),
+        to.display(),
+        count(written as u64),
     ))
 }

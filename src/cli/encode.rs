@@ -11,13 +11,13 @@ use super::table::{count, steps, table};
 use super::{Failure, Result, load};
 
 /// Codes a cloud and says what it cost.
-pub fn run(args: &Encode, progress: &Progress) -> Result<String> {
+pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String> {
     let say = |step: &str| progress.say(step);
     let mut log = Log::with_listener(&say);
     let in_cloud = Failure::in_file(&args.cloud);
     let cloud = log
         .step("read cloud", 1, "file", || {
-            PointCloud::open(&args.cloud, &Limits::default())
+            PointCloud::open(&args.cloud, limits)
         })
         .map_err(&in_cloud)?;
     let points = cloud.positions.len();
@@ -28,6 +28,7 @@ pub fn run(args: &Encode, progress: &Progress) -> Result<String> {
     let options = Options {
         levels: args.levels.clone(),
         bit_price: args.bit_price,
+        ..Options::default()
     };
     let encoded = encoder::encode(&cloud, &model, &options, &mut log).map_err(&in_cloud)?;
     output::write_file(&args.output, |w| {

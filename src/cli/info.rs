@@ -9,10 +9,9 @@ use super::table::{count, table};
 use super::{Failure, Result, load};
 
 /// Describes a stream as text or JSON. Needs no model; a cut or damaged stream is described with what is wrong.
-pub fn run(args: &Info) -> Result<String> {
+pub fn run(args: &Info, limits: &Limits) -> Result<String> {
     let bytes = load::bytes(&args.input)?;
-    let stream =
-        Stream::parse(&bytes, &Limits::default()).map_err(Failure::in_file(&args.input))?;
+    let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
     let header = stream.header();
     let whole = stream.levels().len();
     let model: String = header.model.iter().map(|b| format!("{b:02x}")).collect();

@@ -1,5 +1,6 @@
 //! Files in: models, streams, Gaussians.
 
+use std::io::Read;
 use std::path::Path;
 
 use b2p::decoder::Decoder;
@@ -9,10 +10,10 @@ use b2p::network::Model;
 use b2p::{Error, Isa, Limits, UnknownIsa};
 
 use super::args::{LevelArg, ModelArg};
-use super::{Failure, Result};
+use super::{Failure, Result, pipe};
 
 /// A stream or Gaussians, told apart by their first bytes.
-const PLY_MAGIC: &[u8] = b"ply";
+pub const PLY_MAGIC: &[u8] = b"ply";
 
 /// The environment variable that says which instructions to use when the arguments don't.
 const ISA: &str = "B2P_ISA";
@@ -40,9 +41,17 @@ pub fn isa(name: Option<&str>) -> Result<Isa> {
     }
 }
 
-/// The bytes of a file.
+/// The bytes of a file, or of standard input.
 pub fn bytes(path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path).map_err(|source| {
+    let bytes = match path == Path::new(pipe::PIPE) {
+        true => {
+            let mut bytes = Vec::new();
+            let mut input = std::io::stdin().lock();
+            input.read_to_end(&mut bytes).map(|_| bytes)
+        }
+        false => std::fs::read(path),
+    };
+    bytes.map_err(|source| {
         Failure::from(Error::Io {
             path: path.to_owned(),
             source,
@@ -55,28 +64,39 @@ pub fn gaussians(
     path: &Path,
     level: &LevelArg,
     model_arg: &ModelArg,
+    limits: &Limits,
     log: &mut Log,
 ) -> Result<Gaussians> {
     let bytes = bytes(path)?;
     if bytes.starts_with(PLY_MAGIC) {
-        if level.level.is_some() {
-            return Err(Failure(format!(
-                "{}: --level is for streams, this is a PLY",
-                path.display()
-            )));
-        }
-        let (gaussians, notes) = log
-            .step("read Gaussians", 1, "file", || {
-                ply::read(&bytes, &Limits::default())
-            })
-            .map_err(Failure::in_file(path))?;
-        for warning in notes.warnings() {
-            eprintln!("b2p: {}: {warning}", path.display());
-        }
-        return Ok(gaussians);
+        return ply(path, &bytes, level, limits, log);
     }
     let model = model(model_arg)?;
     Decoder::new(&model)
+        .with_limits(limits.clone())
         .decode(&bytes, level.level, log)
         .map_err(Failure::in_file(path))
+}
+
+/// Gaussians as they stand in the PLY `bytes`, which came from `path`.
+pub fn ply(
+    path: &Path,
+    bytes: &[u8],
+    level: &LevelArg,
+    limits: &Limits,
+    log: &mut Log,
+) -> Result<Gaussians> {
+    if level.level.is_some() {
+        return Err(Failure(format!(
+            "{}: --level is for streams, this is a PLY",
+            path.display()
+        )));
+    }
+    let (gaussians, notes) = log
+        .step("read Gaussians", 1, "file", || ply::read(bytes, limits))
+        .map_err(Failure::in_file(path))?;
+    for warning in notes.warnings() {
+        eprintln!("b2p: {}: {warning}", path.display());
+    }
+    Ok(gaussians)
 }

@@ -7,6 +7,7 @@ mod demo;
 mod encode;
 mod info;
 mod load;
+mod pipe;
 mod progress;
 mod render;
 mod table;
@@ -28,7 +29,17 @@ struct Failure(String);
 
 impl From<Error> for Failure {
     fn from(error: Error) -> Self {
-        Failure(error.to_string())
+        let text = error.to_string();
+        let Error::LimitExceeded { option, .. } = error else {
+            return Failure(text);
+        };
+        // What the library calls a field is an argument here.
+        Failure(match option {
+            "max_bytes" => text.replace(option, "--max-memory"),
+            "max_points" => text.replace(option, "--max-points"),
+            "max_pixels" => text.replace(option, "--max-pixels"),
+            _ => text,
+        })
     }
 }
 
@@ -37,7 +48,7 @@ impl Failure {
     fn in_file(path: &Path) -> impl Fn(Error) -> Failure + '_ {
         move |error| match error {
             Error::Io { .. } => Failure(error.to_string()),
-            _ => Failure(format!("{}: {error}", path.display())),
+            _ => Failure(format!("{}: {}", path.display(), Failure::from(error).0)),
         }
     }
 }
@@ -69,13 +80,14 @@ fn run(cli: &Cli) -> Result<()> {
             .map_err(|e| Failure(format!("cannot start {threads} threads: {e}")))?;
     }
     let progress = progress::Progress::new(cli.quiet);
+    let limits = cli.limits.limits();
     let text = match &cli.command {
-        Command::Encode(args) => encode::run(args, &progress)?,
-        Command::Decode(args) => decode::run(args, &progress)?,
-        Command::Render(args) => render::run(args, &progress)?,
-        Command::Info(args) => info::run(args)?,
+        Command::Encode(args) => encode::run(args, &limits, &progress)?,
+        Command::Decode(args) => decode::run(args, &limits, &progress)?,
+        Command::Render(args) => render::run(args, &limits, &progress)?,
+        Command::Info(args) => info::run(args, &limits)?,
         Command::Demo(args) => demo::run(args, &progress)?,
-        Command::Bench(args) => bench::run(args, &progress)?,
+        Command::Bench(args) => bench::run(args, &limits, &progress)?,
     };
     drop(progress);
     if !cli.quiet {

@@ -11,26 +11,48 @@ use b2p::{Error, Limits, output};
 use serde_json::json;
 
 use super::args::{Format, Render, Show, View};
+use super::pipe::{self, PIPE};
 use super::progress::Progress;
 use super::table::{count, milliseconds, steps};
 use super::{Failure, Result, load};
 
-/// The output that is standard output.
-const STDOUT: &str = "-";
-
 /// Draws one picture, or several: on a circle, or with the cameras of a file.
-pub fn run(args: &Render, progress: &Progress) -> Result<String> {
+pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String> {
     let say = |step: &str| progress.say(step);
     let mut log = Log::with_listener(&say);
-    let gaussians = load::gaussians(&args.input, &args.level, &args.model, &mut log)?;
+    let mut text = String::new();
+    // What has gone to standard output cannot be replaced by something finer.
+    let early = args.output != Path::new(PIPE);
+    pipe::each(
+        &args.input,
+        &args.level,
+        &args.model,
+        limits,
+        early,
+        &mut log,
+        &mut |gaussians, log| {
+            text = pictures(args, limits, gaussians, log)?;
+            Ok(())
+        },
+    )?;
+    Ok(text)
+}
+
+/// Draws these Gaussians into the pictures asked for.
+fn pictures(
+    args: &Render,
+    limits: &Limits,
+    gaussians: &Gaussians,
+    log: &mut Log,
+) -> Result<String> {
     let mut effects = Effects::default();
     for (effect, choice) in &args.effect {
         effects.set(*effect, *choice);
     }
-    let cameras = asked_for(args, &gaussians)?;
+    let cameras = asked_for(args, gaussians)?;
     let mut text = String::new();
     if let (true, Some((_, camera))) = (args.verbose, cameras.first()) {
-        for line in effects.explain(&gaussians, camera) {
+        for line in effects.explain(gaussians, camera) {
             text += &format!("{line}\n");
         }
     }
@@ -43,14 +65,14 @@ pub fn run(args: &Render, progress: &Progress) -> Result<String> {
             format!("draw {}", path.display()),
             gaussians.len(),
             "Gaussians",
-            || show(&mut renderer, &gaussians, camera, args, image),
+            || show(&mut renderer, gaussians, camera, args, limits, image),
         )?;
         all.push((path.to_owned(), camera.width, camera.height, stats));
         Ok(())
     };
 
     let format = format_of(args, cameras.len())?;
-    let to_stdout = args.output == Path::new(STDOUT);
+    let to_stdout = args.output == Path::new(PIPE);
     if format == Format::Y4m {
         let mut video = |to: &mut dyn Write| -> b2p::Result<()> {
             for (i, (path, camera)) in cameras.iter().enumerate() {
@@ -116,7 +138,7 @@ fn format_of(args: &Render, pictures: usize) -> Result<Format> {
     if let Some(format) = args.format {
         return Ok(format);
     }
-    if args.output == Path::new(STDOUT) {
+    if args.output == Path::new(PIPE) {
         return Ok(if pictures == 1 {
             Format::Png
         } else {
@@ -179,6 +201,7 @@ fn show(
     gaussians: &Gaussians,
     camera: &Camera,
     args: &Render,
+    limits: &Limits,
     image: &mut Image,
 ) -> b2p::Result<Stats> {
     let (channel, background) = match args.show {
@@ -187,8 +210,7 @@ fn show(
         Show::Normal => (Channel::Normal, Background::Transparent),
         Show::Alpha => (Channel::Colour, Background::Transparent),
     };
-    let limits = Limits::default();
-    let stats = renderer.draw_into(gaussians, camera, channel, background, &limits, image)?;
+    let stats = renderer.draw_into(gaussians, camera, channel, background, limits, image)?;
     match args.show {
         Show::Colour | Show::Normal => {}
         Show::Alpha => {

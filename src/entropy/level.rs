@@ -5,6 +5,7 @@ use xxhash_rust::xxh3::Xxh3Default;
 
 use super::slice::{Condition, decode_into, encode_slice};
 use super::tables::Tables;
+use crate::cancel::Cancel;
 use crate::error::{Error, Result, Stage};
 
 /// Codes a level's latents in slices of `slice_voxels` voxels, the last one what is left.
@@ -32,7 +33,8 @@ pub fn encode_level(
 /// Decodes the latents of a level of `voxels` voxels, whose number the caller has held against its limits.
 ///
 /// # Errors
-/// [`Error::Malformed`] if there are more or fewer slices than the voxels fill; else the error of the first slice that has one.
+/// [`Error::Malformed`] if there are more or fewer slices than the voxels fill; else the error of the first slice that has one;
+/// [`Error::Cancelled`].
 ///
 /// # Panics
 /// As [`encode_level`] does.
@@ -43,6 +45,7 @@ pub fn decode_level(
     voxels: usize,
     slice_voxels: usize,
     level: u8,
+    cancel: &Cancel,
 ) -> Result<Vec<i16>> {
     let mut latents = vec![0; voxels * tables.channels()];
     condition.check(tables, latents.len());
@@ -62,6 +65,7 @@ pub fn decode_level(
         .zip(slices)
         .enumerate()
         .map(|(i, (part, bytes))| {
+            cancel.check()?;
             let start = i * width;
             let condition = condition.of(start..start + part.len());
             let at = format_args!("level {level}, feature slice {i}");
@@ -120,7 +124,9 @@ mod tests {
                 pool.install(|| {
                     let bytes = encode_level(&tables, condition, &latents, 64);
                     let slices: Vec<&[u8]> = bytes.iter().map(|b| &b[..]).collect();
-                    let back = decode_level(&tables, condition, &slices, 1000, 64, 7).unwrap();
+                    let back =
+                        decode_level(&tables, condition, &slices, 1000, 64, 7, &Cancel::default())
+                            .unwrap();
                     (bytes.clone(), back)
                 })
             };
@@ -137,7 +143,17 @@ mod tests {
         let (.., latents) = sample(100);
         let bytes = encode_level(&tables, Condition::Prior, &latents, 40);
         let mut slices: Vec<&[u8]> = bytes.iter().map(|b| &b[..]).collect();
-        let decode = |slices: &[&[u8]]| decode_level(&tables, Condition::Prior, slices, 100, 40, 7);
+        let decode = |slices: &[&[u8]]| {
+            decode_level(
+                &tables,
+                Condition::Prior,
+                slices,
+                100,
+                40,
+                7,
+                &Cancel::default(),
+            )
+        };
         let error = decode(&slices[..2]).unwrap_err().to_string();
         assert!(
             error.contains("level 7: number of feature slices is 2, expected 3"),

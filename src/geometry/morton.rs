@@ -3,8 +3,7 @@
 //! Bits of x, y and z are interleaved, x lowest, so a key's lowest three bits are the voxel's octant in its parent
 //! (`x + 2y + 4z`), and `key >> 3` is the parent's key.
 
-/// The deepest octree level a 63-bit key can address.
-pub const MAX_DEPTH: u8 = 21;
+pub use crate::limits::MAX_DEPTH;
 
 /// Interleaves the low 21 bits of each coordinate.
 pub fn encode([x, y, z]: [u32; 3]) -> u64 {

@@ -98,6 +98,12 @@ impl Octree {
         }
     }
 
+    /// Removes the levels below `level`.
+    pub fn truncate(&mut self, level: u8) {
+        self.levels.truncate(usize::from(level) + 1);
+        self.links.truncate(usize::from(level));
+    }
+
     /// Adds the next level: one occupancy for every voxel of the deepest.
     ///
     /// # Errors

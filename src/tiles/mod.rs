@@ -213,6 +213,9 @@ impl Bins {
         }
         self.starts.push(next);
         if self.entries.len() < next {
+            // What is outgrown goes before its successor comes, which has no room to spare: memory is what was planned.
+            self.entries = Vec::new();
+            self.entries.reserve_exact(next);
             self.entries.resize_with(next, AtomicU64::default);
         }
         let (starts, entries) = (&self.starts, &self.entries);

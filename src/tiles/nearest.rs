@@ -26,6 +26,9 @@ impl Nearest {
     pub fn take(&mut self, entries: &[AtomicU64]) {
         let read = || entries.iter().map(|e| e.load(Ordering::Relaxed));
         self.keys.clear();
+        if self.keys.capacity() < entries.len() {
+            self.keys = Vec::with_capacity(entries.len());
+        }
         self.buckets = entries.len() > FEW;
         if !self.buckets {
             self.keys.extend(read());

@@ -3,6 +3,13 @@
 
 use std::path::Path;
 
+use b2p::Placement;
+use b2p::cloud::ColouredVoxels;
+use b2p::encoder::{Options, encode};
+use b2p::geometry::{Voxels, morton};
+use b2p::log::Log;
+use b2p::network::Model;
+
 /// A coloured ball's surface on a voxel grid.
 pub struct Ball {
     bits: u8,
@@ -35,6 +42,20 @@ impl Ball {
         voxels
     }
 
+    /// The ball on its grid.
+    pub fn cloud(&self) -> ColouredVoxels {
+        let mut voxels = self.voxels();
+        voxels.sort_by_key(|(at, _)| morton::encode(*at));
+        ColouredVoxels {
+            voxels: Voxels::new(
+                self.bits,
+                voxels.iter().map(|(at, _)| morton::encode(*at)).collect(),
+            ),
+            colours: voxels.iter().map(|(_, colour)| *colour).collect(),
+            placement: Placement::VOXEL_GRID,
+        }
+    }
+
     /// The ball as an ascii PLY whose properties are not in the usual order.
     pub fn to_ply(&self) -> String {
         let voxels = self.voxels();
@@ -54,6 +75,32 @@ impl Ball {
 /// A small model with random weights.
 pub fn tiny_model(seed: u64) -> Vec<u8> {
     b2p::network::untrained(&b2p::network::Shape::tiny(), seed)
+}
+
+/// A cloud of these voxels, its colours from their places.
+pub fn cloud_of(depth: u8, keys: Vec<u64>) -> ColouredVoxels {
+    let voxels = Voxels::new(depth, keys);
+    let colours = voxels
+        .keys()
+        .iter()
+        .map(|k| [*k as u8, (k >> 3) as u8, (k >> 7) as u8])
+        .collect();
+    ColouredVoxels {
+        voxels,
+        colours,
+        placement: Placement::VOXEL_GRID,
+    }
+}
+
+/// A stream of about half a kilobyte for [`tiny_model`]`(0)`: the levels 1 to 3, the finest ones in several slices.
+pub fn small_stream(model: &Model) -> Vec<u8> {
+    let options = Options {
+        slice_voxels: 24,
+        ..Options::default()
+    };
+    let cloud = Ball::new(4, 4.5).cloud();
+    let encoded = encode(&cloud, model, &options, &mut Log::default());
+    encoded.expect("a ball can be coded").bytes
 }
 
 /// Reads a picture.

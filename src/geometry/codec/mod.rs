@@ -26,6 +26,7 @@ mod predictor;
 mod probability;
 
 use super::{KernelMap, Octree};
+use crate::cancel::Cancel;
 use crate::error::{Error, Result, Stage};
 use coder::{Decoder, Encoder};
 use predictor::Predictor;
@@ -96,8 +97,8 @@ pub fn decode_slice(
 /// 3³ kernel map of what is now the deepest level.
 ///
 /// # Errors
-/// Those of [`decode_slice`] and [`Octree::grow`], and [`Error::Malformed`] if there are more or fewer slices than there should be.
-/// The octree is unchanged then.
+/// Those of [`decode_slice`] and [`Octree::grow`], [`Error::Malformed`] if there are more or fewer slices than there should be, and
+/// [`Error::Cancelled`]. The octree is unchanged then.
 ///
 /// # Panics
 /// If `map` is another level's, or `slice` is 0.
@@ -106,6 +107,7 @@ pub fn decode_level(
     map: &KernelMap,
     encoded: &[(u32, &[u8])],
     slice: usize,
+    cancel: &Cancel,
 ) -> Result<()> {
     let level = octree.depth() + 1;
     let ranges = slices(map.len(), slice);
@@ -120,6 +122,7 @@ pub fn decode_level(
     }
     let tasks: Vec<_> = ranges.zip(encoded).collect();
     let decode = |(parents, &(voxels, bytes)): (Range<usize>, &(u32, &[u8]))| {
+        cancel.check()?;
         decode_slice(level, map, parents, bytes, voxels as usize)
     };
     let masks: Result<Vec<_>> = tasks.into_par_iter().map(decode).collect();

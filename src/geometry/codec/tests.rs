@@ -17,7 +17,13 @@ fn decode(levels: &[Vec<(u32, Vec<u8>)>], slice: usize) -> Result<Octree> {
     let mut octree = Octree::root();
     for encoded in levels {
         let map = octree.kernel_map(octree.depth());
-        decode_level(&mut octree, &map, &borrowed(encoded), slice)?;
+        decode_level(
+            &mut octree,
+            &map,
+            &borrowed(encoded),
+            slice,
+            &Cancel::default(),
+        )?;
     }
     Ok(octree)
 }
@@ -73,7 +79,7 @@ proptest! {
         let octree = bowl(4).truncated(3);
         let map = octree.kernel_map(3);
         let mut grown = octree.clone();
-        match decode_level(&mut grown, &map, &[(voxels, &bytes)], usize::MAX) {
+        match decode_level(&mut grown, &map, &[(voxels, &bytes)], usize::MAX, &Cancel::default()) {
             Ok(()) => prop_assert_eq!(grown.level(4).len(), voxels as usize),
             Err(_) => prop_assert_eq!(grown, octree),
         }
@@ -189,6 +195,12 @@ fn a_missing_slice_is_refused() {
     let map = octree.kernel_map(4);
     let slices = encode_level(&octree, &map, 5, 50);
     let mut decoded = octree.truncated(4);
-    let result = decode_level(&mut decoded, &map, &borrowed(&slices[1..]), 50);
+    let result = decode_level(
+        &mut decoded,
+        &map,
+        &borrowed(&slices[1..]),
+        50,
+        &Cancel::default(),
+    );
     assert!(matches!(result, Err(Error::Malformed { .. })));
 }

@@ -1,0 +1,6 @@
+//! Octree codes: see [`b2p_fuzz::octree`].
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| b2p_fuzz::octree(bytes));

@@ -1,0 +1,6 @@
+//! Gaussians to pictures: see [`b2p_fuzz::render`].
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| b2p_fuzz::render(bytes));

@@ -1,0 +1,79 @@
+//! Files that are not streams.
+
+use std::path::Path;
+use std::sync::LazyLock;
+
+use b2p::Limits;
+use b2p::cloud::{PointCloud, voxelise};
+use b2p::gaussians::Gaussians;
+use b2p::geometry::{Octree, Voxels};
+use b2p::network::{Model, Shape, untrained};
+
+/// A model file that bytes are edits of.
+static FILE: LazyLock<Vec<u8>> = LazyLock::new(|| untrained(&Shape::tiny(), 0));
+
+/// Any bytes as a model, and as edits of one: an error, or a model whose identity depends on nothing but the bytes, and that computes
+/// finite numbers.
+pub fn model(bytes: &[u8]) {
+    load(bytes);
+    let mut file = FILE.clone();
+    // The text at the start is a twentieth of the file, and half of the edits are meant for it.
+    let text = 8 + usize::from(u16::from_le_bytes([file[0], file[1]]));
+    for edit in bytes.chunks_exact(5) {
+        let [place @ .., value] = edit else { continue };
+        let place = place
+            .iter()
+            .fold(0, |sum, byte| sum << 8 | usize::from(*byte));
+        let end = if place.is_multiple_of(2) { text } else { file.len() };
+        file[place / 2 % end] = *value;
+    }
+    load(&file);
+}
+
+fn load(bytes: &[u8]) {
+    let Ok(model) = Model::from_bytes(bytes) else {
+        return;
+    };
+    let again = Model::from_bytes(bytes).expect("what loaded once loads again");
+    assert_eq!(model.id(), again.id());
+    let shape = model.shape();
+    let octree = Octree::new(Voxels::new(2, vec![0, 1, 9, 63])).expect("four voxels");
+    let map = octree.kernel_map(2);
+    for role in 0..3 {
+        let latents = vec![shape.latent_max; 4 * shape.latents];
+        let context = vec![2047i16; 4 * shape.channels];
+        let context = (role > 0).then_some(&context[..]);
+        let features = model.reconstruct(role, &latents, context, &map);
+        assert!(features.iter().all(|f| f.unsigned_abs() <= 2047));
+        if let Ok(raw) = model.generate(role, &features, &map) {
+            assert!(raw.iter().all(|x| x.is_finite()));
+        }
+    }
+}
+
+/// Any bytes as a point cloud and as Gaussians: an error, or arrays of equal length that are the same after writing and reading again.
+pub fn ply(bytes: &[u8]) {
+    let limits = Limits {
+        max_points: 1 << 16,
+        ..Limits::default()
+    };
+    if let Ok(cloud) = PointCloud::from_ply(bytes, &limits) {
+        assert_eq!(cloud.positions.len(), cloud.colours.len());
+        let again =
+            PointCloud::from_ply(&cloud.to_ply(), &limits).expect("what is written is read");
+        assert_eq!(again.colours, cloud.colours);
+        if let Ok(voxels) = voxelise(&cloud, None) {
+            assert_eq!(voxels.voxels.len(), voxels.colours.len());
+            assert!(voxels.voxels.len() <= cloud.positions.len());
+        }
+    }
+    if let Ok(gaussians) = Gaussians::from_ply(bytes, &limits) {
+        gaussians.check_lengths().expect("arrays of one length");
+        let mut file = Vec::new();
+        gaussians
+            .write_ply(&mut file, Path::new("memory"))
+            .expect("memory takes it");
+        let again = Gaussians::from_ply(&file, &limits).expect("what is written is read");
+        assert_eq!(again.len(), gaussians.len());
+    }
+}

@@ -1,0 +1,79 @@
+//! What every fuzz target does with its bytes. Here, apart from the fuzzer, so that tests on stable Rust run it too.
+//!
+//! Every target asserts more than that nothing panics; what it asserts is in its documentation.
+
+mod codecs;
+mod files;
+mod pictures;
+#[path = "../../tests/common/seal.rs"]
+mod seal;
+pub mod seeds;
+mod streams;
+
+use std::sync::LazyLock;
+
+use b2p::network::{Model, Shape, untrained};
+
+pub use codecs::{entropy, octree};
+pub use files::{model, ply};
+pub use pictures::{backends, render};
+pub use streams::{chunking, header, stream};
+
+/// A target's name and what it does.
+pub type Target = (&'static str, fn(&[u8]));
+
+/// All targets.
+pub const TARGETS: [Target; 9] = [
+    ("header", header),
+    ("stream", stream),
+    ("chunking", chunking),
+    ("octree", octree),
+    ("entropy", entropy),
+    ("backends", backends),
+    ("model", model),
+    ("ply", ply),
+    ("render", render),
+];
+
+/// The model that streams are coded with here.
+static MODEL: LazyLock<Model> = LazyLock::new(|| {
+    Model::from_bytes(&untrained(&Shape::tiny(), 0)).expect("an untrained model loads")
+});
+
+/// Puts the checksums of a mutated stream right, but for one in four, told by the seed.
+pub fn sealed(bytes: &mut [u8], seed: u32) {
+    if !seed.is_multiple_of(4) {
+        seal::seal(bytes);
+    }
+}
+
+/// Bytes as a source of numbers; zeros when they are used up.
+struct Source<'a>(&'a [u8]);
+
+impl<'a> Source<'a> {
+    fn byte(&mut self) -> u8 {
+        let (first, rest) = self.0.split_first().unwrap_or((&0, &[]));
+        self.0 = rest;
+        *first
+    }
+
+    fn u16(&mut self) -> u16 {
+        u16::from_le_bytes([self.byte(), self.byte()])
+    }
+
+    fn u32(&mut self) -> u32 {
+        u32::from(self.u16()) | u32::from(self.u16()) << 16
+    }
+
+    fn float(&mut self) -> f32 {
+        f32::from_bits(self.u32())
+    }
+
+    fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    fn rest(self) -> &'a [u8] {
+        self.0
+    }
+}

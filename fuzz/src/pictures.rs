@@ -1,0 +1,125 @@
+//! Kernels and pictures.
+
+use std::sync::LazyLock;
+
+use b2p::gaussians::Gaussians;
+use b2p::geometry::{Octree, Voxels};
+use b2p::network::{Model, Precision, Shape, untrained};
+use b2p::pixels::{Background, Renderer};
+use b2p::projection::Camera;
+use b2p::{Isa, Limits};
+
+use crate::Source;
+
+/// Models of several widths, each with the instructions of every set, the plainest first.
+fn models(precision: Precision) -> Vec<Vec<Model>> {
+    let sets = |channels| {
+        let shape = Shape {
+            channels,
+            ..Shape::tiny()
+        };
+        let bytes = untrained(&shape, 5);
+        let load = |isa| {
+            let model = Model::from_bytes(&bytes).expect("a model").with_isa(isa);
+            model.with_precision(precision).expect("it has both")
+        };
+        let mut sets = vec![load(Isa::SCALAR)];
+        sets.extend(Isa::available().into_iter().map(load));
+        sets
+    };
+    [8, 12, 32].map(sets).into()
+}
+
+static MODELS: LazyLock<Vec<Vec<Model>>> = LazyLock::new(|| models(Precision::Int16));
+static FLOATS: LazyLock<Vec<Vec<Model>>> = LazyLock::new(|| models(Precision::F16));
+
+/// Any latents and contexts on any voxels: every instruction set computes what plain code does, to the bit in integers, within a
+/// 256th of the largest number in floats.
+pub fn backends(bytes: &[u8]) {
+    let mut source = Source(bytes);
+    let which = usize::from(source.byte()) % MODELS.len();
+    let role = 1 + usize::from(source.byte()) % 2;
+    let count = usize::from(source.byte()) % 40 + 1;
+    let keys = (0..count).map(|_| u64::from(source.u16()) % 512).collect();
+    let octree = Octree::new(Voxels::new(3, keys)).expect("voxels");
+    let map = octree.kernel_map(3);
+    let shape = MODELS[which][0].shape();
+    let latents: Vec<i16> = (0..map.len() * shape.latents)
+        .map(|_| source.u16() as i16)
+        .collect();
+    let context: Vec<i16> = (0..map.len() * shape.channels)
+        .map(|_| (source.u16() as i16).clamp(-2047, 2047))
+        .collect();
+    let exact = |model: &Model| {
+        let features = model.reconstruct(role, &latents, Some(&context), &map);
+        let parameters = model.entropy_parameters(role, &context, &map);
+        let raw = model.generate(role, &features, &map).expect("a head");
+        let raw: Vec<u32> = raw.iter().map(|x| x.to_bits()).collect();
+        (features, parameters, raw)
+    };
+    let (plain, others) = MODELS[which].split_first().expect("a set");
+    let expected = exact(plain);
+    for model in others {
+        assert!(
+            exact(model) == expected,
+            "{} computes otherwise",
+            model.isa()
+        );
+    }
+    let close = |model: &Model| model.generate(role, &expected.0, &map).expect("a head");
+    let (plain, others) = FLOATS[which].split_first().expect("a set");
+    let expected = close(plain);
+    let largest = expected.iter().fold(1f32, |m, x| m.max(x.abs()));
+    for model in others {
+        for (a, b) in close(model).iter().zip(&expected) {
+            assert!(
+                (a - b).abs() <= largest / 256.0,
+                "{}: {a}, not {b}",
+                model.isa()
+            );
+        }
+    }
+}
+
+/// Any numbers as Gaussians, before a camera anywhere: an error, or a picture whose every pixel is finite, with work in proportion to
+/// Gaussians and pixels, and the same again.
+pub fn render(bytes: &[u8]) {
+    let mut source = Source(bytes);
+    let [width, height] = [source.byte(), source.byte()].map(|size| u32::from(size) % 70 + 1);
+    let angles = [source.u16(), source.u16()].map(|a| f64::from(a) / 100.0);
+    let distance = f64::from(source.byte()) / 32.0;
+    let mut g = Gaussians::default();
+    while !source.is_empty() && g.len() < 500 {
+        let near = source.byte();
+        let mut number = || match near % 4 {
+            // Anything at all, or something that will be seen.
+            0 => source.float(),
+            _ => f32::from(source.byte() as i8) / 64.0,
+        };
+        g.position.push([number(), number(), number()]);
+        g.scale.push([number(), number(), number()]);
+        g.rotation.push([number(), number(), number(), number()]);
+        g.opacity.push(number());
+        g.colour.push([number(), number(), number()]);
+    }
+    let limits = Limits {
+        max_bytes: 64 << 20,
+        ..Limits::default()
+    };
+    let fov = 10.0 + angles[0] / 8.0;
+    let Ok(camera) = Camera::orbit(angles[0], angles[1], distance, fov, width, height) else {
+        return;
+    };
+    let mut renderer = Renderer::default();
+    let draw = |renderer: &mut Renderer| renderer.render(&g, &camera, Background::WHITE, &limits);
+    let Ok((image, stats)) = draw(&mut renderer) else {
+        return;
+    };
+    assert_eq!(image.pixels.len(), (width * height) as usize);
+    assert!(image.pixels.as_flattened().iter().all(|v| v.is_finite()));
+    let tiles = u64::from(width.div_ceil(32)) * u64::from(height.div_ceil(32));
+    assert!(stats.pairs <= g.len() as u64 * tiles);
+    assert_eq!(stats.visible + stats.dropped.total(), g.len() as u64);
+    let (again, _) = draw(&mut renderer).expect("what was drawn once is drawn again");
+    assert_eq!(again.pixels, image.pixels);
+}

@@ -1,0 +1,82 @@
+//! What fuzzing starts from: streams of our own encoder, files of our own writers, and a few numbers.
+
+use std::path::Path;
+
+use b2p::Placement;
+use b2p::cloud::{ColouredVoxels, PointCloud};
+use b2p::decoder::Decoder;
+use b2p::encoder::{Options, encode};
+use b2p::geometry::Voxels;
+use b2p::log::Log;
+
+use crate::MODEL;
+
+/// A stream of these voxels, and the Gaussians of its finest level as a file.
+fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u8>>) {
+    let voxels = Voxels::new(depth, keys);
+    let colour = |key: &u64| [*key as u8, (key >> 3) as u8, (key >> 6) as u8];
+    let cloud = ColouredVoxels {
+        colours: voxels.keys().iter().map(colour).collect(),
+        voxels,
+        placement: Placement::VOXEL_GRID,
+    };
+    let options = Options {
+        slice_voxels,
+        ..Options::default()
+    };
+    let mut log = Log::default();
+    let stream = encode(&cloud, &MODEL, &options, &mut log).expect("a small cloud is coded");
+    let gaussians = Decoder::new(&*MODEL).decode(&stream.bytes, None, &mut log);
+    let file = gaussians.ok().map(|gaussians| {
+        let mut file = Vec::new();
+        let name = Path::new("memory");
+        gaussians
+            .write_ply(&mut file, name)
+            .expect("memory takes it");
+        file
+    });
+    (stream.bytes, file)
+}
+
+/// Pseudo-random bytes.
+fn noise(seed: u64, length: usize) -> Vec<u8> {
+    let mut state = seed;
+    let next = || {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(seed | 1);
+        (state >> 40) as u8
+    };
+    std::iter::repeat_with(next).take(length).collect()
+}
+
+/// The seeds of a target.
+pub fn seeds(target: &str) -> Vec<Vec<u8>> {
+    let clouds = [
+        coded(1, vec![0, 7], 16_384),
+        coded(2, vec![0, 5, 63], 2),
+        coded(3, (0..512).step_by(5).collect(), 16_384),
+        coded(4, (0..4096).step_by(37).collect(), 16),
+        coded(21, vec![0, 77, (1 << 63) - 1], 16_384),
+    ];
+    let streams = clouds.iter().map(|(stream, _)| stream.clone());
+    match target {
+        "header" | "stream" | "chunking" => streams.collect(),
+        "ply" => {
+            let cloud = PointCloud {
+                positions: vec![[0.0, 1.0, 2.0], [3.0, 4.5, -1.0]],
+                colours: vec![[1, 2, 3], [250, 0, 9]],
+                ..PointCloud::default()
+            };
+            let ascii = "ply\nformat ascii 1.0\ncomment bits 3\nelement vertex 2\nproperty uchar green\nproperty uchar blue\n\
+                         property uchar red\nproperty float z\nproperty float x\nproperty float y\nend_header\n1 2 3 4 5 6\n6 5 4 3 2 1\n";
+            let files = clouds.iter().take(2).filter_map(|(_, file)| file.clone());
+            files.chain([cloud.to_ply(), ascii.into()]).collect()
+        }
+        "model" => vec![vec![], noise(1, 5), noise(2, 40)],
+        _ => [0, 7, 60, 300, 1000]
+            .iter()
+            .map(|&length| noise(length as u64, length))
+            .collect(),
+    }
+}

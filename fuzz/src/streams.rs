@@ -1,0 +1,166 @@
+//! Streams from strangers.
+
+use b2p::bitstream::{Header, Stream};
+use b2p::decoder::{Decoder, Decoding};
+use b2p::gaussians::Gaussians;
+use b2p::log::Log;
+use b2p::network::Model;
+use b2p::{Error, Limits};
+
+use crate::MODEL;
+
+/// So little that a level of it is decoded in a millisecond.
+fn limits() -> Limits {
+    Limits {
+        max_points: 1 << 10,
+        max_bytes: 16 << 20,
+        ..Limits::default()
+    }
+}
+
+/// Any bytes: an error, or a header that is within the limits and is written back as it was read, whose levels, where they are whole,
+/// have as many voxels as it tells.
+pub fn header(bytes: &[u8]) {
+    let limits = limits();
+    let Ok(header) = Header::parse(bytes, &limits) else {
+        return;
+    };
+    let mut written = header.write();
+    // A later minor version is read like this one.
+    written[10..12].copy_from_slice(&bytes[10..12]);
+    let end = written.len() - 4;
+    assert_eq!(
+        written[..end],
+        bytes[..end],
+        "the header changed on its way"
+    );
+    assert!(header.points <= limits.max_points);
+    let stream = Stream::parse(bytes, &limits).expect("the header is sound");
+    assert!(stream.levels().len() <= header.voxels.len());
+    for (level, voxels) in stream.levels().iter().zip(&header.voxels) {
+        let slices = level.geometry.last().map_or(1, |geometry| {
+            geometry.slices.iter().map(|slice| slice.voxels).sum()
+        });
+        assert_eq!(slices, *voxels);
+        assert!(level.features.iter().map(|slice| slice.voxels).sum::<u32>() == *voxels);
+        let end = header
+            .prefix_bytes(level.level)
+            .expect("a level of the stream");
+        assert!(end <= bytes.len() as u64);
+    }
+    let whole = stream.levels().len() == header.voxels.len();
+    let exact = bytes.len() as u64 == header.stream_bytes();
+    assert_eq!(stream.damage().is_none(), whole && exact);
+}
+
+/// Any bytes under small limits: an error, or as many finite Gaussians as the header tells, and again the same ones; a level that is
+/// refused leaves those before it as they were.
+pub fn stream(bytes: &[u8]) {
+    let decoder = Decoder::new(&*MODEL).with_limits(limits());
+    let (mut decoding, mut log) = (decoder.start(None), Log::default());
+    decoding.push(bytes);
+    let mut last: Option<Gaussians> = None;
+    loop {
+        match decoding.advance(&mut log) {
+            Ok(Some(level)) => {
+                let header = decoding.header().expect("a level has a header before it");
+                let voxels = header.voxels(level).expect("a level of the stream") as usize;
+                let exact = decoding.exact().expect("a level was decoded");
+                assert_eq!(exact.octree.depth(), level);
+                assert_eq!(exact.octree.level(level).len(), voxels);
+                assert_eq!(exact.latents.len(), voxels * MODEL.shape().latents);
+                last = gaussians(&decoding, &mut log, voxels);
+            }
+            Ok(None) => break,
+            Err(error) => {
+                check(&error);
+                assert_eq!(
+                    gaussians(&decoding, &mut log, usize::MAX),
+                    last,
+                    "damage reached back"
+                );
+                return;
+            }
+        }
+    }
+    if decoding.finish(&mut log).is_ok() && last.is_some() {
+        let whole = decoder.decode(bytes, None, &mut log).ok();
+        assert_eq!(whole, last, "decoding twice gives two results");
+    }
+}
+
+/// The Gaussians of the level reached, if it has any.
+fn gaussians(decoding: &Decoding<&Model>, log: &mut Log, voxels: usize) -> Option<Gaussians> {
+    if !decoding.is_drawable() {
+        return None;
+    }
+    let gaussians = match decoding.gaussians(log) {
+        Err(Error::LimitExceeded { .. }) => return None,
+        gaussians => gaussians.expect("a drawable level has Gaussians"),
+    };
+    gaussians.check_lengths().expect("arrays of one length");
+    assert!(gaussians.len() <= voxels.saturating_mul(8));
+    assert!(
+        gaussians
+            .position
+            .as_flattened()
+            .iter()
+            .all(|v| v.is_finite())
+    );
+    assert!(
+        gaussians
+            .scale
+            .as_flattened()
+            .iter()
+            .all(|v| v.is_finite() && *v >= 0.0)
+    );
+    assert!(gaussians.opacity.iter().all(|v| (0.0..=1.0).contains(v)));
+    Some(gaussians)
+}
+
+/// An error of a stream is one of those that the documentation names, and says something.
+fn check(error: &Error) {
+    assert!(!error.to_string().is_empty());
+    assert!(matches!(
+        error,
+        Error::Truncated { .. }
+            | Error::ChecksumMismatch { .. }
+            | Error::ModelMismatch { .. }
+            | Error::DeterminismMismatch { .. }
+            | Error::LimitExceeded { .. }
+            | Error::Unsupported { .. }
+            | Error::Malformed { .. }
+    ));
+}
+
+/// Any bytes in any pieces, which the last bytes tell the sizes of: result and error are those of the whole.
+pub fn chunking(bytes: &[u8]) {
+    let (sizes, level) = match bytes {
+        [.., a, b, c, level] => (
+            [*a, *b, *c],
+            [None, Some(2), Some(3)][usize::from(level % 3)],
+        ),
+        _ => ([1; 3], None),
+    };
+    let decoder = Decoder::new(&*MODEL).with_limits(limits());
+    let mut log = Log::default();
+    let mut whole = decoder.start(level);
+    whole.push(bytes);
+    let expected = whole.finish(&mut log).map_err(|error| error.to_string());
+    let mut pieces = decoder.start(level);
+    let mut rest = bytes;
+    let mut sizes = sizes.into_iter().cycle();
+    let result = (|| {
+        while !rest.is_empty() {
+            let size = usize::from(sizes.next().unwrap_or(1)).clamp(1, rest.len());
+            let (piece, after) = rest.split_at(size);
+            pieces.push(piece);
+            rest = after;
+            while pieces.advance(&mut log)?.is_some() {}
+        }
+        pieces.finish(&mut log)
+    })();
+    assert_eq!(result.map_err(|error| error.to_string()), expected);
+    assert_eq!(pieces.level(), whole.level());
+    assert_eq!(pieces.exact(), whole.exact());
+}

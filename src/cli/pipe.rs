@@ -1,0 +1,132 @@
+//! Streams that arrive in pieces on standard input.
+
+use std::io::Read;
+use std::path::Path;
+use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+
+use b2p::decoder::{Decoder, Decoding};
+use b2p::error::Stage;
+use b2p::gaussians::Gaussians;
+use b2p::log::Log;
+use b2p::network::Model;
+use b2p::{Error, Limits};
+
+use super::args::{LevelArg, ModelArg};
+use super::{Failure, Result, load};
+
+/// The input that is standard input, and the output that is standard output.
+pub const PIPE: &str = "-";
+
+/// Bytes that are asked for at once, and how many such pieces wait before the sender has to.
+const PIECE: usize = 1 << 16;
+const WAITING: usize = 16;
+
+type Piece = std::io::Result<Vec<u8>>;
+
+/// What is done with Gaussians.
+pub type Show<'a> = dyn FnMut(&Gaussians, &mut Log) -> Result<()> + 'a;
+
+/// Shows the Gaussians of a file, or of standard input: then also those of coarser levels, if `early` and nothing finer has come
+/// meanwhile; and if the stream is cut and no level was named, what its finest whole level has.
+pub fn each(
+    path: &Path,
+    level: &LevelArg,
+    model_arg: &ModelArg,
+    limits: &Limits,
+    early: bool,
+    log: &mut Log,
+    show: &mut Show,
+) -> Result<()> {
+    if path != Path::new(PIPE) {
+        let gaussians = load::gaussians(path, level, model_arg, limits, log)?;
+        return show(&gaussians, log);
+    }
+    let pieces = pieces();
+    let mut start = Vec::new();
+    while start.len() < load::PLY_MAGIC.len() {
+        match pieces.recv() {
+            Ok(piece) => start.extend(piece.map_err(broken)?),
+            Err(_) => break,
+        }
+    }
+    if start.starts_with(load::PLY_MAGIC) {
+        for piece in pieces {
+            start.extend(piece.map_err(broken)?);
+        }
+        return show(&load::ply(path, &start, level, limits, log)?, log);
+    }
+    let model = load::model(model_arg)?;
+    let decoder = Decoder::new(&model).with_limits(limits.clone());
+    let mut decoding = decoder.start(level.level);
+    let mut shown = None;
+    let in_pipe = Failure::in_file(path);
+    let mut piece = Some(start);
+    while let Some(bytes) = piece {
+        decoding.push(&bytes);
+        while decoding.advance(log).map_err(&in_pipe)?.is_some() {}
+        piece = match pieces.try_recv() {
+            Err(TryRecvError::Empty) => {
+                if early && decoding.is_drawable() && shown != decoding.level() {
+                    shown = decoding.level();
+                    show_level(&decoding, log, show)?;
+                }
+                pieces.recv().ok()
+            }
+            next => next.ok(),
+        }
+        .transpose()
+        .map_err(broken)?;
+    }
+    match decoding.finish(log) {
+        Err(
+            error @ Error::Truncated {
+                stage: Stage::Bitstream,
+                ..
+            },
+        ) if level.level.is_none() && decoding.is_drawable() => {
+            let finest = decoding.level().unwrap_or_default();
+            let what = format!("what follows is level {finest}, the finest that is whole");
+            eprintln!("b2p: {}: {error}; {what}", path.display());
+        }
+        done => done.map_err(&in_pipe)?,
+    }
+    match shown == decoding.level() {
+        true => Ok(()),
+        false => show_level(&decoding, log, show),
+    }
+}
+
+fn show_level(decoding: &Decoding<&Model>, log: &mut Log, show: &mut Show) -> Result<()> {
+    let gaussians = decoding
+        .gaussians(log)
+        .map_err(Failure::in_file(Path::new(PIPE)))?;
+    show(&gaussians, log)
+}
+
+/// Standard input, read by a thread of its own so that it can be known whether something waits.
+fn pieces() -> Receiver<Piece> {
+    let (sender, receiver) = sync_channel(WAITING);
+    std::thread::spawn(move || {
+        let mut input = std::io::stdin().lock();
+        loop {
+            let mut bytes = vec![0; PIECE];
+            let piece = input.read(&mut bytes).map(|count| {
+                bytes.truncate(count);
+                bytes
+            });
+            let last = !piece.as_ref().is_ok_and(|bytes| !bytes.is_empty());
+            // Nobody listens any more once decoding has ended.
+            if sender.send(piece).is_err() || last {
+                return;
+            }
+        }
+    });
+    receiver
+}
+
+fn broken(source: std::io::Error) -> Failure {
+    Failure::from(Error::Io {
+        path: PIPE.into(),
+        source,
+    })
+}

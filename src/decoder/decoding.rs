@@ -1,0 +1,389 @@
+//! One stream on its way to Gaussians.
+
+use std::borrow::Cow;
+use std::ops::Deref;
+
+use super::{Decoder, Exact};
+use crate::bitstream::{Header, Level, MAGIC};
+use crate::entropy::{Condition, decode_level, latent_hash};
+use crate::error::{Error, Result};
+use crate::gaussians::{Frame, Gaussians, activate};
+use crate::geometry::{KernelMap, Octree, codec};
+use crate::log::Log;
+use crate::network::{Model, Module};
+
+/// Where decoding is to end.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Goal {
+    /// A level with Gaussians; without one named, the finest that has them, and the rest of the stream must be sound.
+    Gaussians(Option<u8>),
+    /// A level, Gaussians or not.
+    Exact(u8),
+}
+
+/// A stream that is decoded level by level as its bytes arrive.
+///
+/// Bytes are pushed in pieces of any size; [`Decoding::advance`] decodes a level as soon as it is whole, and [`Decoding::gaussians`]
+/// gives those of the level that was reached. After an error what was reached before stays usable, and nothing more is decoded.
+///
+/// ```
+/// # #[cfg(feature = "cli")]
+/// # fn main() -> b2p::Result<()> {
+/// use b2p::{decoder::Decoder, log::Log, network::Model};
+///
+/// let model = Model::from_bytes(b2p::embedded::MODEL)?;
+/// let (mut decoding, mut log) = (Decoder::new(&model).start(Some(8)), Log::default());
+/// for packet in b2p::embedded::SAMPLE.chunks(1400) {
+///     decoding.push(packet);
+///     while let Some(level) = decoding.advance(&mut log)? {
+///         println!("level {level} is there");
+///     }
+/// }
+/// decoding.finish(&mut log)?;
+/// let gaussians = decoding.gaussians(&mut log)?;
+/// # assert!(gaussians.len() > 0);
+/// # Ok(())
+/// # }
+/// # #[cfg(not(feature = "cli"))]
+/// # fn main() {}
+/// ```
+#[derive(Debug)]
+pub struct Decoding<'b, M> {
+    decoder: Decoder<M>,
+    goal: Goal,
+    /// The stream as far as it is needed.
+    bytes: Cow<'b, [u8]>,
+    /// How much of the stream has come, needed or not.
+    length: u64,
+    opened: Option<Opened>,
+    reached: Option<Reached>,
+    failed: bool,
+}
+
+/// What is known once the header is there.
+#[derive(Debug)]
+struct Opened {
+    header: Header,
+    /// The last level to decode.
+    last: u8,
+    /// Bytes of the stream that can be of use.
+    end: u64,
+}
+
+/// The deepest level so far.
+#[derive(Debug)]
+struct Reached {
+    level: u8,
+    exact: Exact,
+    map: KernelMap,
+}
+
+impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
+    pub(super) fn new(decoder: Decoder<M>, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
+        Decoding {
+            decoder,
+            goal,
+            length: bytes.len() as u64,
+            bytes,
+            opened: None,
+            reached: None,
+            failed: false,
+        }
+    }
+
+    /// Takes the next bytes of the stream. No more are kept than the stream's header, once it is there, says are needed.
+    pub fn push(&mut self, bytes: &[u8]) {
+        self.length += bytes.len() as u64;
+        let room = match &self.opened {
+            Some(opened) => opened.end.saturating_sub(self.bytes.len() as u64),
+            None => u64::MAX,
+        };
+        let room = usize::try_from(room).unwrap_or(usize::MAX);
+        let kept = &bytes[..bytes.len().min(room)];
+        if !kept.is_empty() {
+            self.bytes.to_mut().extend_from_slice(kept);
+        }
+    }
+
+    /// Decodes the next level, if all its bytes have come and it is not beyond the one that decoding is to end with: `None` otherwise.
+    ///
+    /// # Errors
+    /// - [`Error::ChecksumMismatch`], [`Error::Malformed`]: the bytes are damaged, or no stream;
+    /// - [`Error::Unsupported`]: a later version or a critical feature of one, or a level to end with that has no Gaussians;
+    /// - [`Error::ModelMismatch`]; [`Error::DeterminismMismatch`], if all checksums hold but the latents are not those that were coded;
+    /// - [`Error::LimitExceeded`], before anything is reserved; [`Error::Cancelled`];
+    /// - [`Error::Usage`] if the stream has no level to end with, or decoding has failed before.
+    pub fn advance(&mut self, log: &mut Log) -> Result<Option<u8>> {
+        self.step(false, log)
+    }
+
+    /// Decodes what is left, knowing that no more bytes will come.
+    ///
+    /// # Errors
+    /// Those of [`Decoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
+    /// the stream must be whole, or end just where one of its levels ends.
+    pub fn finish(&mut self, log: &mut Log) -> Result<()> {
+        while self.step(true, log)?.is_some() {}
+        Ok(())
+    }
+
+    /// The header, once [`Decoding::advance`] found it whole.
+    pub fn header(&self) -> Option<&Header> {
+        self.opened.as_ref().map(|opened| &opened.header)
+    }
+
+    /// The deepest level decoded so far.
+    pub fn level(&self) -> Option<u8> {
+        self.reached.as_ref().map(|reached| reached.level)
+    }
+
+    /// Whether the level reached has Gaussians: [`Decoding::gaussians`] will not fail with [`Error::Unsupported`].
+    pub fn is_drawable(&self) -> bool {
+        let level = self.level();
+        self.header()
+            .is_some_and(|header| self.decoder.drawable(header).any(|l| Some(l) == level))
+    }
+
+    /// The level reached, as decoded in the exact zone.
+    pub fn exact(&self) -> Option<&Exact> {
+        self.reached.as_ref().map(|reached| &reached.exact)
+    }
+
+    pub(super) fn into_exact(self) -> Result<Exact> {
+        self.reached
+            .map(|reached| reached.exact)
+            .ok_or_else(nothing_reached)
+    }
+
+    /// The Gaussians of the level reached.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`]; [`Error::Cancelled`];
+    /// [`Error::Usage`] if no level has been reached.
+    pub fn gaussians(&self, log: &mut Log) -> Result<Gaussians> {
+        let (Some(header), Some(reached)) = (self.header(), &self.reached) else {
+            return Err(nothing_reached());
+        };
+        let (decoder, level) = (&self.decoder, reached.level);
+        decoder.check_drawable(header, level)?;
+        decoder.check_memory(header, level)?;
+        decoder.cancel.check()?;
+        let role = usize::from(level - header.base);
+        let shape = decoder.model.shape();
+        let children = shape.head(role).map_or(1, |head| head.children);
+        let voxels = reached.exact.octree.level(level);
+        let raw = log.step(
+            Module::Gaussians(role).at(level),
+            voxels.len(),
+            "voxels",
+            || {
+                let Reached { exact, map, .. } = reached;
+                decoder.model.generate(role, &exact.features, map)
+            },
+        )?;
+        let frame = Frame {
+            bits: header.bits,
+            placement: header.placement,
+        };
+        log.step("activate", voxels.len() * children, "Gaussians", || {
+            Ok(activate(&raw, voxels, children, shape, frame))
+        })
+    }
+
+    /// Takes the next step; `ended` tells that all bytes have come.
+    fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
+        if self.failed {
+            let what = "decoding has failed before, and goes no further";
+            return Err(Error::Usage(what.into()));
+        }
+        let step = self.next_level(ended).and_then(|next| match next {
+            Some(level) => self.decode(level, log).map(|()| Some(level)),
+            None => Ok(None),
+        });
+        self.failed = step.is_err();
+        step
+    }
+
+    /// The level to decode next, if that is possible already.
+    fn next_level(&mut self, ended: bool) -> Result<Option<u8>> {
+        if self.opened.is_none() {
+            self.open(ended)?;
+        }
+        let Some(Opened { header, last, .. }) = &self.opened else {
+            return Ok(None);
+        };
+        let next = self.level().map_or(header.base, |level| level + 1);
+        let named = !matches!(self.goal, Goal::Gaussians(None));
+        if next > *last {
+            if ended && !named {
+                self.check_rest(header, next)?;
+            }
+            return Ok(None);
+        }
+        let whole = self.length >= header.prefix_bytes(next)?;
+        let cut_before = next > header.base && self.length == header.prefix_bytes(next - 1)?;
+        let wait = !whole && (!ended || (!named && cut_before));
+        Ok((!wait).then_some(next))
+    }
+
+    /// Reads the header, if it is whole, and holds what it asks for against the limits.
+    fn open(&mut self, ended: bool) -> Result<()> {
+        if !ended && self.bytes.len() < MAGIC.len() {
+            return Ok(());
+        }
+        let decoder = &self.decoder;
+        let header = match Header::parse(&self.bytes, &decoder.limits) {
+            Err(Error::Truncated { .. }) if !ended => return Ok(()),
+            header => header?,
+        };
+        header.check_model(&decoder.model.id())?;
+        let last = match self.goal {
+            Goal::Exact(level) => level,
+            Goal::Gaussians(Some(level)) => {
+                decoder.check_drawable(&header, level)?;
+                level
+            }
+            // Without any, the whole stream is decoded as far as there is something to decode.
+            Goal::Gaussians(None) => decoder.drawable(&header).last().unwrap_or(header.top),
+        };
+        decoder.check_memory(&header, last)?;
+        let end = match self.goal {
+            Goal::Gaussians(None) => header.stream_bytes(),
+            _ => header.prefix_bytes(last)?,
+        };
+        self.opened = Some(Opened { header, last, end });
+        Ok(())
+    }
+
+    /// Fails unless the levels from `next` on are sound, or the stream ends between two of them.
+    fn check_rest(&self, header: &Header, next: u8) -> Result<()> {
+        for level in next..=header.top {
+            if self.length == header.prefix_bytes(level - 1)? {
+                return Ok(());
+            }
+            Level::read(&self.bytes, header, level)?;
+        }
+        header.check_end(self.length)
+    }
+
+    /// Decodes a level, all or nothing.
+    fn decode(&mut self, level: u8, log: &mut Log) -> Result<()> {
+        let Some(Opened { header, .. }) = &self.opened else {
+            return Err(nothing_reached());
+        };
+        let level = Level::read(&self.bytes, header, level)?;
+        let mut octree = match &mut self.reached {
+            Some(above) => std::mem::replace(&mut above.exact.octree, Octree::root()),
+            None => Octree::root(),
+        };
+        let above = self.reached.as_ref();
+        let done = self
+            .decoder
+            .exact_level(header, &level, &mut octree, above, log);
+        match (done, &mut self.reached) {
+            (Ok((latents, features, map)), reached) => {
+                *reached = Some(Reached {
+                    level: level.level,
+                    exact: Exact {
+                        octree,
+                        latents,
+                        features,
+                    },
+                    map,
+                });
+                Ok(())
+            }
+            (Err(error), None) => Err(error),
+            (Err(error), Some(above)) => {
+                octree.truncate(above.level);
+                above.exact.octree = octree;
+                Err(error)
+            }
+        }
+    }
+}
+
+fn nothing_reached() -> Error {
+    Error::Usage("no level has been decoded yet".into())
+}
+
+impl<M: Deref<Target = Model> + Clone> Decoder<M> {
+    /// Grows `octree` to a level; its latents, features and kernel map.
+    fn exact_level(
+        &self,
+        header: &Header,
+        level: &Level,
+        octree: &mut Octree,
+        above: Option<&Reached>,
+        log: &mut Log,
+    ) -> Result<(Vec<i16>, Vec<i16>, KernelMap)> {
+        let (n, count) = (level.level, level.voxels as usize);
+        let (role, slice) = (usize::from(n - header.base), header.slice_voxels as usize);
+        let root = KernelMap::root();
+        let mut map = Cow::Borrowed(above.map_or(&root, |above| &above.map));
+        log.step(format!("geometry of level {n}"), count, "voxels", || {
+            level.geometry.iter().try_for_each(|part| {
+                let slices: Vec<_> = part.slices.iter().map(|s| (s.voxels, s.bytes)).collect();
+                codec::decode_level(octree, &map, &slices, slice, &self.cancel)?;
+                if part.level < n {
+                    map = Cow::Owned(octree.child_map(part.level - 1, &map));
+                }
+                Ok(())
+            })
+        })?;
+        if n > 0 {
+            map = log.step(format!("kernel map of level {n}"), count, "voxels", || {
+                Ok(Cow::Owned(octree.child_map(n - 1, &map)))
+            })?;
+        }
+        let context = match above {
+            None => None,
+            Some(above) => {
+                self.cancel.check()?;
+                Some(log.step(Module::Context(role).at(n), count, "voxels", || {
+                    let occupancy = octree.occupancy(n - 1);
+                    Ok(self.model.upsample(role, &above.exact.features, occupancy))
+                })?)
+            }
+        };
+        let latents = self.latents(role, level, context.as_deref(), &map, slice, log)?;
+        self.cancel.check()?;
+        let features = log.step(Module::Features(role).at(n), count, "voxels", || {
+            let context = context.as_deref();
+            Ok(self.model.reconstruct(role, &latents, context, &map))
+        })?;
+        Ok((latents, features, map.into_owned()))
+    }
+
+    fn latents(
+        &self,
+        role: usize,
+        level: &Level,
+        context: Option<&[i16]>,
+        map: &KernelMap,
+        slice: usize,
+        log: &mut Log,
+    ) -> Result<Vec<i16>> {
+        let (n, count) = (level.level, level.voxels as usize);
+        self.cancel.check()?;
+        let parameters = context
+            .map(|context| {
+                log.step(Module::Probabilities(role).at(n), count, "voxels", || {
+                    Ok(self.model.entropy_parameters(role, context, map))
+                })
+            })
+            .transpose()?;
+        let condition = match &parameters {
+            Some((mu, sigma)) => Condition::Gauss { mu, sigma },
+            None => Condition::Prior,
+        };
+        let slices: Vec<_> = level.features.iter().map(|s| s.bytes).collect();
+        let symbols = count * self.model.shape().latents;
+        log.step(format!("latents of level {n}"), symbols, "symbols", || {
+            let tables = self.model.tables();
+            let latents = decode_level(tables, condition, &slices, count, slice, n, &self.cancel)?;
+            level.check_latents(latent_hash(&latents))?;
+            Ok(latents)
+        })
+    }
+}

@@ -1,0 +1,56 @@
+//! What decoding needs, known from the header alone.
+
+use std::ops::Deref;
+
+use super::Decoder;
+use crate::bitstream::Header;
+use crate::error::Result;
+use crate::network::{Model, RAW};
+
+/// Bytes of a row of a 3³ kernel map.
+const MAP: u64 = 27 * 4;
+/// Bytes of a voxel in the octree: its key, its occupancy, its first child.
+const NODE: u64 = 8 + 1 + 4;
+/// Bytes of a Gaussian.
+const GAUSSIAN: u64 = 14 * 4;
+/// Slices of a stream in memory, over their bytes in the stream.
+const SLICES: u64 = 4;
+
+impl<M: Deref<Target = Model> + Clone> Decoder<M> {
+    /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included, beyond
+    /// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and the model itself.
+    ///
+    /// That is linear in the voxels: with C channels and K latents, 124 + 10·C + 7·K bytes for each voxel of a level, the level above it
+    /// with its features, and 220 + 6·H bytes more for each Gaussian that a generator of H channels makes.
+    ///
+    /// # Errors
+    /// [`crate::Error::Usage`] if the stream has no such level.
+    pub fn memory(&self, header: &Header, level: u8) -> Result<u64> {
+        let stream = SLICES * header.prefix_bytes(level)?;
+        let shape = self.model.shape();
+        let (c, k) = (shape.channels as u64, shape.latents as u64);
+        let levels = usize::from(level - header.base) + 1;
+        let counts = || header.voxels[..levels].iter().copied().map(u64::from);
+        let octree =
+            NODE * (counts().sum::<u64>() + u64::from(header.base) * counts().min().unwrap_or(0));
+        let features = 2 * (c + k) + MAP;
+        // Of all levels the last is the largest.
+        let parents = counts().nth_back(1).unwrap_or(0);
+        let voxels = counts().next_back().unwrap_or(0);
+        // Context, four tensors of a block, latents with their means and scales.
+        let exact = parents * features + voxels * (MAP + 16 + 10 * c + 7 * k);
+        let head = shape.head(levels - 1).map_or(0, |head| {
+            let h = head.channels as u64;
+            let one = MAP + 3 * 2 * h + 4 * RAW as u64 + GAUSSIAN;
+            voxels * (head.children as u64 * one + 6 * h + 2 * c + 32)
+        });
+        Ok(stream + octree + exact + head)
+    }
+
+    /// Fails with [`crate::Error::LimitExceeded`] if decoding down to `level` takes more than is allowed.
+    pub(super) fn check_memory(&self, header: &Header, level: u8) -> Result<()> {
+        let bytes = self.memory(header, level)?;
+        self.limits
+            .check_bytes("memory to decode this stream", bytes)
+    }
+}

@@ -1,0 +1,129 @@
+//! Stream to Gaussians: drives the stages, holds no algorithm.
+//!
+//! [`Decoding`] takes a stream as its bytes arrive and decodes each level as soon as it is whole. [`Decoder::decode`], which takes a
+//! whole stream, is the same with all bytes at once: result and error are the same however the bytes are cut, and the error is
+//! that of the first fault in the order of the stream.
+
+mod decoding;
+mod memory;
+
+use std::borrow::Cow;
+use std::ops::Deref;
+
+use crate::bitstream::Header;
+use crate::cancel::Cancel;
+use crate::error::{Error, Result};
+use crate::gaussians::Gaussians;
+use crate::geometry::Octree;
+use crate::limits::Limits;
+use crate::log::Log;
+use crate::network::Model;
+pub use decoding::Decoding;
+use decoding::Goal;
+
+/// Decodes streams with one model: `M` is a `&Model`, or an `Arc<Model>` for decoders that outlive the place they were made in.
+#[derive(Debug, Clone)]
+pub struct Decoder<M> {
+    model: M,
+    limits: Limits,
+    cancel: Cancel,
+}
+
+/// A level, decoded in the exact zone: what the next level's context and the Gaussians are made from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Exact {
+    /// The octree down to this level.
+    pub octree: Octree,
+    /// The latents, K per voxel.
+    pub latents: Vec<i16>,
+    /// The reconstructed features, C per voxel.
+    pub features: Vec<i16>,
+}
+
+impl<M: Deref<Target = Model> + Clone> Decoder<M> {
+    /// A decoder with default limits.
+    pub fn new(model: M) -> Self {
+        Decoder {
+            model,
+            limits: Limits::default(),
+            cancel: Cancel::default(),
+        }
+    }
+
+    /// The same decoder under other limits.
+    pub fn with_limits(mut self, limits: Limits) -> Self {
+        self.limits = limits;
+        self
+    }
+
+    /// The same decoder, stopped when `cancel` is thrown.
+    pub fn with_cancel(mut self, cancel: Cancel) -> Self {
+        self.cancel = cancel;
+        self
+    }
+
+    /// The levels of a stream that can be decoded to Gaussians: those in its header for whose role the model has a head.
+    ///
+    /// # Errors
+    /// Those of [`Header::parse`].
+    pub fn levels(&self, bytes: &[u8]) -> Result<Vec<u8>> {
+        let header = Header::parse(bytes, &self.limits)?;
+        Ok(self.drawable(&header).collect())
+    }
+
+    /// Begins to decode a stream whose bytes are still to come, down to `level`: by default the finest that the stream has and the
+    /// model has a head for.
+    pub fn start(&self, level: Option<u8>) -> Decoding<'static, M> {
+        Decoding::new(self.clone(), Goal::Gaussians(level), Cow::Owned(Vec::new()))
+    }
+
+    /// Decodes a stream to the Gaussians of `level`: by default the finest that the stream has and the model has a head for.
+    ///
+    /// A stream cut exactly after a level is a coarser stream. From one that is cut or damaged elsewhere, a level before the damage
+    /// is decoded only when asked for.
+    ///
+    /// # Errors
+    /// Those of [`Decoding::finish`] and [`Decoding::gaussians`].
+    pub fn decode(&self, bytes: &[u8], level: Option<u8>, log: &mut Log) -> Result<Gaussians> {
+        let goal = Goal::Gaussians(level);
+        let mut decoding = Decoding::new(self.clone(), goal, Cow::Borrowed(bytes));
+        decoding.finish(log)?;
+        decoding.gaussians(log)
+    }
+
+    /// Decodes a stream's exact zone down to `level`, which need not have a head.
+    ///
+    /// # Errors
+    /// Those of [`Decoding::finish`].
+    pub fn exact(&self, bytes: &[u8], level: u8, log: &mut Log) -> Result<Exact> {
+        let goal = Goal::Exact(level);
+        let mut decoding = Decoding::new(self.clone(), goal, Cow::Borrowed(bytes));
+        decoding.finish(log)?;
+        decoding.into_exact()
+    }
+
+    fn drawable(&self, header: &Header) -> impl Iterator<Item = u8> {
+        let (base, top) = (header.base, header.top);
+        (base..=top)
+            .filter(move |level| self.model.shape().head(usize::from(level - base)).is_some())
+    }
+
+    /// Fails with [`Error::Unsupported`] unless the model has a head for `level`.
+    fn check_drawable(&self, header: &Header, level: u8) -> Result<()> {
+        let drawable: Vec<u8> = self.drawable(header).collect();
+        if drawable.contains(&level) {
+            return Ok(());
+        }
+        let names: Vec<_> = drawable.iter().map(u8::to_string).collect();
+        let names = match names.is_empty() {
+            true => "none".to_owned(),
+            false => names.join(" and "),
+        };
+        Err(Error::Unsupported {
+            what: "decoding to Gaussians",
+            detail: format!(
+                "level {level} has none; levels of this stream that have them: {names}"
+            ),
+        })
+    }
+}

@@ -1,0 +1,118 @@
+//! Streams whose checksums are right and whose numbers are not.
+
+use b2p::Limits;
+use b2p::bitstream::Header;
+use rayon::prelude::*;
+
+use crate::common::small_stream;
+use crate::seal::{FIXED, chunks, header_end, seal};
+use crate::{decoded, model, pushed};
+
+/// What a number of `bits` bits may pretend to be.
+fn lies(truth: u64, bits: u32) -> Vec<u64> {
+    let most = u64::MAX >> (64 - bits);
+    let mut lies = vec![
+        0,
+        1,
+        2,
+        truth / 2,
+        truth.wrapping_sub(1),
+        truth + 1,
+        2 * truth,
+        8 * truth,
+    ];
+    lies.extend([
+        16_384,
+        16_385,
+        most / 8,
+        most / 2,
+        most / 2 + 1,
+        most - 1,
+        most,
+    ]);
+    lies.extend((0..bits).map(|bit| truth ^ 1 << bit));
+    lies.retain(|lie| *lie != truth && *lie <= most);
+    lies.sort_unstable();
+    lies.dedup();
+    lies
+}
+
+/// Offset and width in bytes of every number of the stream that counts something or says how long something is.
+fn numbers(bytes: &[u8]) -> Vec<(usize, usize)> {
+    let (levels, end) = header_end(bytes).expect("a header");
+    let mut numbers = vec![(80, 4)];
+    numbers.extend((FIXED..end).step_by(4).map(|at| (at, 4)));
+    assert_eq!(numbers.len(), 1 + 3 * levels);
+    for at in chunks(bytes) {
+        numbers.extend([(at, 1), (at + 1, 1), (at + 2, 2), (at + 4, 4), (at + 8, 4)]);
+    }
+    // Depth, base and top level.
+    numbers.extend([(20, 1), (21, 1), (22, 1)]);
+    numbers
+}
+
+/// Whether the stream means the same: a larger slice is none where no level fills two.
+fn means_the_same(bytes: &[u8], changed: &[u8]) -> bool {
+    let parse = |bytes| Header::parse(bytes, &Limits::unlimited());
+    let (Ok(before), Ok(mut after)) = (parse(bytes), parse(changed)) else {
+        return false;
+    };
+    // How fine the cloud was before it was coded bears on nothing but the scale of the world.
+    after.bits = before.bits;
+    after == before
+}
+
+#[test]
+fn no_lie_about_a_count_or_a_length_is_believed() {
+    let model = model();
+    let bytes = small_stream(&model);
+    let numbers = numbers(&bytes);
+    println!("{} numbers", numbers.len());
+    numbers.into_par_iter().for_each(|(at, width)| {
+        let mut truth = [0; 8];
+        truth[..width].copy_from_slice(&bytes[at..at + width]);
+        for lie in lies(u64::from_le_bytes(truth), 8 * width as u32) {
+            let mut changed = bytes.clone();
+            changed[at..at + width].copy_from_slice(&lie.to_le_bytes()[..width]);
+            seal(&mut changed);
+            if means_the_same(&bytes, &changed) && at < 24 {
+                continue;
+            }
+            let whole = decoded(&model, &changed, None);
+            assert!(whole.is_err(), "{lie} at byte {at} was believed");
+            let (_, pieces) = pushed(&model, &changed, None, [50, 200, 3, 1000]);
+            assert_eq!(pieces, whole, "{lie} at byte {at}");
+        }
+    });
+}
+
+#[test]
+fn a_coder_s_bytes_changed_behind_the_checksums_are_refused() {
+    let model = model();
+    let bytes = small_stream(&model);
+    let starts = chunks(&bytes);
+    // What latents of the base level are coded with, and where its voxels lie, nothing else depends on.
+    let first_feature = starts
+        .iter()
+        .position(|at| bytes[*at] == 2)
+        .expect("features");
+    let payload = |at: &usize| {
+        at + 16..at + 16 + usize::from(bytes[at + 8]) + 256 * usize::from(bytes[at + 9])
+    };
+    let tried: usize = starts[first_feature..]
+        .par_iter()
+        .map(|at| {
+            for byte in payload(at) {
+                for bit in 0..8 {
+                    let mut changed = bytes.clone();
+                    changed[byte] ^= 1 << bit;
+                    seal(&mut changed);
+                    let result = decoded(&model, &changed, None);
+                    assert!(result.is_err(), "bit {bit} of byte {byte} was believed");
+                }
+            }
+            8 * payload(at).len()
+        })
+        .sum();
+    println!("{tried} flipped bits behind right checksums, all refused");
+}

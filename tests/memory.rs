@@ -1,0 +1,198 @@
+//! What decoding and drawing reserve at most, counted by the allocator: no stream can make it more.
+
+mod common;
+
+use std::sync::Mutex;
+
+use b2p::bitstream::Header;
+use b2p::cloud::ColouredVoxels;
+use b2p::decoder::Decoder;
+use b2p::encoder::{Options, encode};
+use b2p::gaussians::Gaussians;
+use b2p::log::Log;
+use b2p::network::{Model, Shape, untrained};
+use b2p::pixels::{Background, render};
+use b2p::projection::Camera;
+use b2p::{Error, Limits};
+use common::{Ball, cloud_of};
+use peak_alloc::PeakAlloc;
+
+#[global_allocator]
+static MEMORY: PeakAlloc = PeakAlloc;
+
+/// One measurement at a time.
+static QUIET: Mutex<()> = Mutex::new(());
+
+/// What `run` gives, and how many bytes more than before it held at its peak.
+fn peak<T>(run: impl FnOnce() -> T) -> (T, u64) {
+    let before = MEMORY.current_usage();
+    MEMORY.reset_peak_usage();
+    let value = run();
+    (value, (MEMORY.peak_usage().saturating_sub(before)) as u64)
+}
+
+fn models() -> Vec<(&'static str, Model)> {
+    let wide = Shape {
+        channels: 32,
+        latents: 8,
+        ..Shape::tiny()
+    };
+    let load = |bytes: &[u8]| Model::from_bytes(bytes).expect("a model loads");
+    vec![
+        ("tiny", load(&untrained(&Shape::tiny(), 0))),
+        ("wide", load(&untrained(&wide, 0))),
+        #[cfg(feature = "cli")]
+        ("lite", load(b2p::embedded::MODEL)),
+    ]
+}
+
+/// Clouds of every kind: surfaces, solids, and the deepest chains of lone voxels.
+fn clouds() -> Vec<(&'static str, ColouredVoxels)> {
+    let far = |i: u64| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 1;
+    vec![
+        ("surface", Ball::new(7, 50.0).cloud()),
+        ("solid", cloud_of(5, (0..1 << 15).collect())),
+        ("lone voxels", cloud_of(21, (0..2000).map(far).collect())),
+        ("one voxel", cloud_of(10, vec![12345])),
+    ]
+}
+
+#[test]
+fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    for (name, model) in models() {
+        let decoder = Decoder::new(&model).with_limits(Limits::unlimited());
+        for (kind, cloud) in clouds() {
+            let options = Options::default();
+            let bytes = encode(&cloud, &model, &options, &mut Log::default())
+                .unwrap()
+                .bytes;
+            let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
+            for level in decoder.levels(&bytes).unwrap() {
+                let most = decoder.memory(&header, level).unwrap();
+                let decode = || decoder.decode(&bytes, Some(level), &mut Log::default());
+                // Threads start, and weights are put in order, the first time.
+                decode().unwrap();
+                let (gaussians, held) = peak(decode);
+                let count = gaussians.unwrap().len();
+                println!(
+                    "{name}, {kind}, level {level}, {count} Gaussians: {held} of {most} bytes"
+                );
+                assert!(
+                    held <= most + Limits::OVERHEAD,
+                    "{name}, {kind}, level {level}: {held}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn a_stream_over_the_memory_limit_is_refused_almost_for_nothing() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    let (_, model) = models().remove(0);
+    let cloud = Ball::new(7, 50.0).cloud();
+    let options = Options::default();
+    let bytes = encode(&cloud, &model, &options, &mut Log::default())
+        .unwrap()
+        .bytes;
+    let header = Header::parse(&bytes, &Limits::default()).unwrap();
+    let needed = Decoder::new(&model).memory(&header, 6).unwrap();
+    let limits = |max_bytes| Limits {
+        max_bytes,
+        ..Limits::default()
+    };
+    let decode = |max_bytes| {
+        let decoder = Decoder::new(&model).with_limits(limits(max_bytes));
+        decoder.decode(&bytes, None, &mut Log::default())
+    };
+    assert!(decode(needed).is_ok());
+    let (refused, held) = peak(|| decode(needed - 1));
+    assert!(matches!(refused, Err(Error::LimitExceeded { needed: n, .. }) if n == needed));
+    assert!(held < 1 << 12, "{held} bytes to refuse");
+}
+
+/// A header that promises the most that the limits allow, and nothing behind it.
+#[test]
+fn a_bomb_of_a_hundred_bytes_reserves_nothing() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    let (_, model) = models().remove(0);
+    let header = Header {
+        optional_flags: 0,
+        bits: 21,
+        base: 18,
+        top: 20,
+        points: 1 << 26,
+        placement: b2p::Placement::VOXEL_GRID,
+        model: model.id(),
+        slice_voxels: 1,
+        voxels: vec![1 << 26; 3],
+        sections: vec![
+            b2p::bitstream::Section {
+                geometry: u32::MAX,
+                features: u32::MAX
+            };
+            3
+        ],
+    };
+    let mut bytes = header.write();
+    bytes.extend([0; 1000]);
+    for limits in [Limits::default(), Limits::unlimited()] {
+        let decoder = Decoder::new(&model).with_limits(limits);
+        let (refused, held) = peak(|| decoder.decode(&bytes, None, &mut Log::default()));
+        let expected = matches!(
+            refused,
+            Err(Error::LimitExceeded { .. } | Error::Truncated { .. })
+        );
+        assert!(expected, "{refused:?}");
+        assert!(held < 1 << 12, "{held} bytes");
+    }
+}
+
+fn splats(count: usize, scale: f32) -> Gaussians {
+    let at = |i: usize| {
+        let turn = i as f32 * 2.399;
+        let height = (i as f32 + 0.5) / count as f32 * 2.0 - 1.0;
+        [turn.cos() * 0.8, height * 0.8, turn.sin() * 0.8]
+    };
+    Gaussians {
+        position: (0..count).map(at).collect(),
+        scale: vec![[scale; 3]; count],
+        rotation: vec![[1.0, 0.0, 0.0, 0.0]; count],
+        opacity: vec![0.9; count],
+        colour: vec![[0.5; 3]; count],
+        ..Gaussians::default()
+    }
+}
+
+#[test]
+fn drawing_stays_within_the_memory_limit() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    let camera = Camera::orbit(10.0, 10.0, 3.0, 45.0, 640, 480).unwrap();
+    for (count, scale) in [(1, 0.01), (20_000, 0.005), (20_000, 0.5)] {
+        let gaussians = splats(count, scale);
+        let draw = |max_bytes: u64| {
+            let limits = Limits {
+                max_bytes,
+                ..Limits::default()
+            };
+            render(&gaussians, &camera, Background::WHITE, &limits)
+        };
+        let Err(Error::LimitExceeded { needed, .. }) = draw(1 << 16) else {
+            panic!("64 kB are too few for a picture of 5 MB");
+        };
+        for max_bytes in [needed, 2 * needed, 1 << 30] {
+            let (picture, held) = peak(|| draw(max_bytes));
+            match picture {
+                Ok(_) => assert!(
+                    held <= max_bytes + Limits::OVERHEAD,
+                    "{held} of {max_bytes}"
+                ),
+                // The fullest tile is known only when all Gaussians have been looked at.
+                Err(Error::LimitExceeded { .. }) => assert!(held <= max_bytes + Limits::OVERHEAD),
+                Err(error) => panic!("{error}"),
+            }
+            println!("{count} Gaussians of {scale}: {held} of {max_bytes} bytes");
+        }
+    }
+}
