@@ -1,0 +1,81 @@
+//! What a stream decodes to, as hashes.
+
+use b2p::decoder::{Decoder, Decoding, Exact};
+use b2p::gaussians::Gaussians;
+use b2p::log::Log;
+use b2p::network::Model;
+use b2p::{Error, Result};
+use sha2::{Digest, Sha256};
+
+fn hash(bytes: impl IntoIterator<Item = u8>) -> String {
+    let bytes: Vec<u8> = bytes.into_iter().collect();
+    let hash = Sha256::digest(bytes);
+    hash.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// `level=geometry,latents,features` and `,gaussians` if there are any.
+fn level(level: u8, exact: &Exact, gaussians: Option<&Gaussians>) -> String {
+    let keys = exact.octree.level(level).keys();
+    let numbers = |numbers: &[i16]| hash(numbers.iter().flat_map(|n| n.to_le_bytes()));
+    let mut line = format!(
+        "{level}={},{},{}",
+        hash(keys.iter().flat_map(|key| key.to_le_bytes())),
+        numbers(&exact.latents),
+        numbers(&exact.features)
+    );
+    if let Some(g) = gaussians {
+        let floats = g.position.as_flattened().iter();
+        let floats = floats.chain(g.scale.as_flattened());
+        let floats = floats.chain(g.rotation.as_flattened()).chain(&g.opacity);
+        let floats = floats.chain(g.colour.as_flattened());
+        line += &format!(",{}", hash(floats.flat_map(|x| x.to_le_bytes())));
+    }
+    line
+}
+
+fn reached(decoding: &Decoding<&Model>, log: &mut Log) -> Result<String> {
+    let gaussians = match decoding.gaussians(log) {
+        Err(Error::Unsupported { .. }) => None,
+        gaussians => Some(gaussians?),
+    };
+    let exact = decoding.exact().expect("a level has been reached");
+    let deepest = exact.octree.depth();
+    Ok(level(deepest, exact, gaussians.as_ref()))
+}
+
+/// The digests of all levels, each decoded on its own from the whole stream.
+pub fn whole(model: &Model, bytes: &[u8]) -> std::result::Result<Vec<String>, String> {
+    let header = b2p::bitstream::Header::parse(bytes, &Default::default()).map_err(told)?;
+    let decoder = Decoder::new(model);
+    let drawable = decoder.levels(bytes).map_err(told)?;
+    let of = |n: u8| {
+        let exact = decoder.exact(bytes, n, &mut Log::default())?;
+        let gaussians = match drawable.contains(&n) {
+            true => Some(decoder.decode(bytes, Some(n), &mut Log::default())?),
+            false => None,
+        };
+        Ok(level(n, &exact, gaussians.as_ref()))
+    };
+    (header.base..=header.top)
+        .map(of)
+        .collect::<Result<_>>()
+        .map_err(told)
+}
+
+/// The same, each as it becomes whole while the stream comes in pieces.
+pub fn in_pieces(model: &Model, bytes: &[u8]) -> std::result::Result<Vec<String>, String> {
+    let (mut decoding, mut log) = (Decoder::new(model).start(None), Log::default());
+    let mut levels = Vec::new();
+    for piece in bytes.chunks(61) {
+        decoding.push(piece);
+        while decoding.advance(&mut log).map_err(told)?.is_some() {
+            levels.push(reached(&decoding, &mut log).map_err(told)?);
+        }
+    }
+    decoding.finish(&mut log).map_err(told)?;
+    Ok(levels)
+}
+
+fn told(error: Error) -> String {
+    error.to_string()
+}

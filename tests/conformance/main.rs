@@ -1,0 +1,117 @@
+//! The conformance suite: small streams, and what each must decode to, bit for bit, on every machine.
+//!
+//! `tests/data/conformance/suite.txt` has a line for each stream: its name, its model, then for every level `level=` and the SHA-256 of
+//! its geometry (Morton keys, u64), latents and features (i16) and, where the model has a head, Gaussians (positions, scales,
+//! rotations, opacities, colours, f32), all little-endian. Here each line is tried with every instruction set of the machine, one,
+//! two and seven threads, whole and in pieces.
+//!
+//! After a change of the format or of the shipped model, this makes streams and digests anew:
+//!
+//! ```text
+//! cargo test --test conformance -- --ignored
+//! ```
+
+#[path = "../common/mod.rs"]
+mod common;
+mod digest;
+mod make;
+#[path = "../common/seal.rs"]
+mod seal;
+
+use std::path::{Path, PathBuf};
+
+use b2p::Isa;
+use b2p::network::Model;
+use digest::{in_pieces, whole};
+use make::model;
+
+fn folder() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/conformance")
+}
+
+/// A line of the suite.
+struct Line {
+    name: String,
+    model: String,
+    levels: Vec<String>,
+}
+
+fn suite() -> Vec<Line> {
+    let text = std::fs::read_to_string(folder().join("suite.txt")).expect("the suite is there");
+    let line = |line: &str| {
+        let mut words = line.split(' ').map(str::to_owned);
+        Line {
+            name: words.next().expect("a name"),
+            model: words.next().expect("a model"),
+            levels: words.collect(),
+        }
+    };
+    text.lines().map(line).collect()
+}
+
+fn stream(name: &str) -> Vec<u8> {
+    std::fs::read(folder().join(format!("{name}.b2p"))).expect("every line has a stream")
+}
+
+#[test]
+fn every_stream_decodes_to_its_digests_with_every_instruction_set_and_number_of_threads() {
+    let suite = suite();
+    assert!(suite.len() >= 60, "{} streams", suite.len());
+    let pools: Vec<_> = [1, 2, 7]
+        .map(|threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+            (threads, pool.build().expect("threads start"))
+        })
+        .into();
+    let mut ran = 0;
+    for isa in Isa::available() {
+        let mut loaded: Option<(String, Model)> = None;
+        for line in &suite {
+            if loaded.as_ref().is_none_or(|(name, _)| *name != line.model) {
+                // Without the program there is no shipped model.
+                loaded = model(&line.model).map(|model| (line.model.clone(), model.with_isa(isa)));
+            }
+            let Some((_, model)) = &loaded else { continue };
+            let bytes = stream(&line.name);
+            for (threads, pool) in &pools {
+                let of = format!("{} with {isa} and {threads} threads", line.name);
+                let found = pool.install(|| whole(model, &bytes));
+                assert_eq!(found, Ok(line.levels.clone()), "{of}, whole");
+                let found = pool.install(|| in_pieces(model, &bytes));
+                assert_eq!(found, Ok(line.levels.clone()), "{of}, in pieces");
+                ran += 2;
+            }
+        }
+        println!("ran on {isa}");
+    }
+    println!("{ran} decodings of {} streams", suite.len());
+}
+
+#[test]
+fn the_generator_makes_the_same_streams_again() {
+    for case in make::cases() {
+        let Some(bytes) = case.bytes else { continue };
+        if case.anywhere {
+            assert!(bytes == stream(&case.name), "{} has changed", case.name);
+        }
+    }
+}
+
+#[test]
+#[ignore = "overwrites the suite"]
+fn make_the_suite_anew() {
+    let folder = folder();
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).expect("a folder for the suite");
+    let (mut text, mut size) = (String::new(), 0);
+    for case in make::cases() {
+        let bytes = case.bytes.expect("all models are there");
+        let model = model(case.model).expect("all models are there");
+        let levels = whole(&model, &bytes).unwrap_or_else(|e| panic!("{}: {e}", case.name));
+        text += &format!("{} {} {}\n", case.name, case.model, levels.join(" "));
+        size += bytes.len();
+        std::fs::write(folder.join(format!("{}.b2p", case.name)), bytes).expect("a stream");
+    }
+    println!("{} streams, {size} bytes", text.lines().count());
+    std::fs::write(folder.join("suite.txt"), text).expect("a list");
+}
