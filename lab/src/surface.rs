@@ -90,6 +90,15 @@ impl Surface {
         surface
     }
 
+    /// The surface elsewhere, with all that is on it.
+    pub fn translated(&self, by: [f32; 3]) -> Self {
+        let mut surface = self.map(|p| std::array::from_fn(|a| p[a] + by[a]));
+        surface.photograph = surface
+            .photograph
+            .map(|photograph| photograph.translated(by));
+        surface
+    }
+
     /// The surface with a photograph projected onto it.
     pub fn with_photograph(mut self, photograph: Photograph) -> Self {
         self.photograph = Some(photograph);

@@ -44,6 +44,12 @@ impl Photograph {
         colour.map(|c| c.clamp(0.0, 255.0))
     }
 
+    /// The photograph on a surface that moved by so much.
+    pub fn translated(mut self, by: [f32; 3]) -> Self {
+        self.offset = std::array::from_fn(|axis| self.coordinates(axis, by.map(|x| -x)));
+        self
+    }
+
     fn coordinates(&self, axis: usize, [x, y, z]: [f32; 3]) -> [f32; 2] {
         let (right, up) = match axis {
             0 => (z, y),

@@ -175,7 +175,7 @@ fn sample(
             continue;
         }
         let crop = Crop::new(&cloud, only.low);
-        let local = surface.map(|p| std::array::from_fn(|a| p[a] - only.low[a] as f32));
+        let local = surface.translated(only.low.map(|x| -(x as f32)));
         // A crop that is the whole cube has nothing to cut off, not even by rounding.
         let whole = 1 << grid.bits == options.crop;
         let clip = (!whole).then_some(Clip {

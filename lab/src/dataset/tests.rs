@@ -134,13 +134,11 @@ fn a_samples_levels_fit_together_and_its_pictures_show_its_voxels() {
         );
         let mut on_picture = 0;
         for (c, pixels) in numbers.chunks(16).zip(pixels.chunks(40 * 40)) {
-            for v in finest {
-                let p = v.map(|x| x as f32 + 0.5);
-                let q: [f32; 3] = std::array::from_fn(|i| {
-                    c[3 * i] * p[0] + c[3 * i + 1] * p[1] + c[3 * i + 2] * p[2] + c[9 + i]
-                });
-                let x = (c[12] * q[0] / q[2] + c[14]).floor() as i32;
-                let y = (c[13] * q[1] / q[2] + c[15]).floor() as i32;
+            for &v in finest {
+                let Some((pixel, _)) = project(c, v) else {
+                    continue;
+                };
+                let (x, y) = (pixel as i32 % 40, pixel as i32 / 40);
                 if !(2..38).contains(&x) || !(2..38).contains(&y) {
                     continue;
                 }
@@ -155,6 +153,65 @@ fn a_samples_levels_fit_together_and_its_pictures_show_its_voxels() {
         }
         assert!(on_picture > finest.len(), "{name}: {on_picture}");
     }
+}
+
+/// The pixel of a 40 × 40 picture that a voxel's centre falls on, and how far away it is.
+fn project(camera: &[f32], voxel: [i32; 3]) -> Option<(usize, f32)> {
+    let p = voxel.map(|x| x as f32 + 0.5);
+    let q: [f32; 3] = std::array::from_fn(|i| {
+        let row = &camera[3 * i..3 * i + 3];
+        row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + camera[9 + i]
+    });
+    let x = (camera[12] * q[0] / q[2] + camera[14]).floor();
+    let y = (camera[13] * q[1] / q[2] + camera[15]).floor();
+    let inside = |v: f32| (0.0..40.0).contains(&v);
+    (inside(x) && inside(y)).then_some(((40.0 * y + x) as usize, q[2]))
+}
+
+#[test]
+fn a_samples_pictures_have_the_colours_of_its_voxels() {
+    let options = Options {
+        count: 8,
+        ..options()
+    };
+    let photographs = made(&options, 2);
+    let photographs = photographs.iter().filter(|(name, _)| name.contains("tds_"));
+    let mut samples = 0;
+    for (name, bytes) in photographs {
+        let file = safetensors::SafeTensors::deserialize(bytes).unwrap();
+        let data = |tensor: &str| file.tensor(tensor).unwrap().data().to_vec();
+        let words = |tensor: &str| data(tensor).as_chunks::<4>().0.to_vec();
+        let xyz: Vec<i32> = words("xyz.3").into_iter().map(i32::from_le_bytes).collect();
+        let cameras: Vec<f32> = words("camera")
+            .into_iter()
+            .map(f32::from_le_bytes)
+            .collect();
+        let (rgb, pixels) = (data("rgb"), words("image"));
+        let (rgb, xyz) = (rgb.as_chunks::<3>().0, xyz.as_chunks::<3>().0);
+        let mut differences = Vec::new();
+        for (camera, pixels) in cameras.chunks(16).zip(pixels.chunks(40 * 40)) {
+            let mut nearest = vec![(f32::INFINITY, [0; 3]); 40 * 40];
+            for (&voxel, &colour) in xyz.iter().zip(rgb) {
+                if let Some((pixel, depth)) = project(camera, voxel)
+                    && depth < nearest[pixel].0
+                {
+                    nearest[pixel] = (depth, colour);
+                }
+            }
+            let seen = pixels.iter().zip(nearest);
+            let seen = seen.filter(|(p, (depth, _))| p[3] == 255 && depth.is_finite());
+            differences
+                .extend(seen.flat_map(|(p, (_, c))| (0..3).map(move |i| p[i].abs_diff(c[i]))));
+        }
+        differences.sort_unstable();
+        let median = differences[differences.len() / 2];
+        assert!(
+            median <= 8,
+            "{name}: half of the pixels are off by {median}"
+        );
+        samples += 1;
+    }
+    assert!(samples >= 2, "{samples} samples with a photograph");
 }
 
 #[test]
