@@ -37,14 +37,14 @@ def pictures(image, views):
     return t[:, :3].contiguous(), t[:, 3:].contiguous()
 
 
-def load_sample(path, views=None, rng=None):
-    """One file. `views`: how many views to draw at random (all, in order, when None)."""
+def load_sample(path, views=None, rng=None, finest=True):
+    """One file. `views`: how many views to draw at random (all, in order, when None); `finest` as in `make_crop`."""
     d = load_file(path)
     chosen = np.arange(len(d["camera"])) if views is None else rng.permutation(len(d["camera"]))[:views]
     coords = [torch.from_numpy(d[f"xyz.{r}"]).int().contiguous() for r in range(4)]
     parents = {r: torch.from_numpy(d[f"parent.{r}"]) for r in (1, 2, 3)}
     image, coverage = pictures(d["image"], chosen)
-    return Sample(os.path.basename(path), make_crop(coords, parents), torch.from_numpy(d["rgb"]).float().div_(255),
+    return Sample(os.path.basename(path), make_crop(coords, parents, finest), torch.from_numpy(d["rgb"]).float().div_(255),
                   torch.from_numpy(d["camera"][chosen]).contiguous(), image, coverage)
 
 
@@ -57,10 +57,11 @@ def split(folder, held_out):
 
 
 class Stream:
-    """Samples in an order that is a function of (seed, position), loaded ahead by one thread."""
+    """Samples in an order that is a function of (seed, position), loaded ahead by one thread; without the finest kernel map those
+    whose name is in `known`."""
 
-    def __init__(self, files, views, seed, start=0, ahead=3):
-        self.files, self.views, self.seed = files, views, seed
+    def __init__(self, files, views, seed, start=0, ahead=3, known=()):
+        self.files, self.views, self.seed, self.known = files, views, seed, known
         self.queue = queue.Queue(ahead)
         self.stopped = False
         threading.Thread(target=self._run, args=(start,), daemon=True).start()
@@ -72,7 +73,8 @@ class Stream:
                 epoch, at = divmod(position, len(self.files))
                 order = np.random.default_rng((self.seed, epoch)).permutation(len(self.files))
                 rng = np.random.default_rng((self.seed, epoch, at))
-                self.queue.put(load_sample(self.files[order[at]], self.views, rng))
+                path = self.files[order[at]]
+                self.queue.put(load_sample(path, self.views, rng, os.path.basename(path) not in self.known))
                 position += 1
         except Exception as error:
             self.queue.put(error)

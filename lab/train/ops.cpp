@@ -11,6 +11,11 @@
 #include <numeric>
 #include <vector>
 
+#if defined(__AMX_BF16__) && defined(__AVX512BF16__)
+#define HAS_AMX 1
+#include "amx.h"
+#endif
+
 using torch::Tensor;
 
 namespace {
@@ -363,30 +368,47 @@ constexpr bool HAS_BF16 = false;
 // Whether convolutions round their operands to bf16; returns what holds: false where the processor cannot.
 bool set_bf16(bool on) { return use_bf16 = on && HAS_BF16; }
 
+bool use_amx() {
+#ifdef HAS_AMX
+  return use_bf16 && amx::granted();
+#else
+  return false;
+#endif
+}
+
+// What products read: on AMX the rows in bf16, padded as `taps` call for; x itself elsewhere.
+Tensor rows(const Tensor& x, int64_t taps) {
+#ifdef HAS_AMX
+  if (use_amx()) {
+    check(x, at::kFloat);
+    const int64_t n = x.size(0), c = x.size(1), stride = amx::Packing(taps, c).wide;
+    Tensor out = torch::empty({amx::Rows::size(n, stride)}, torch::kBFloat16);
+    amx::Rows to(static_cast<uint16_t*>(out.data_ptr()), n, stride);
+    const float* xp = x.data_ptr<float>();
+#pragma omp parallel for schedule(static)
+    for (int64_t i = 0; i < n; i++) to.set(i, xp + i * c, c);
+    return out;
+  }
+#endif
+  return x;
+}
+
 // Plain: y = relu?(conv + bias). With a gain, the geometry-invariant form: y = relu?(gain * conv * r + bias),
 // r = 1 / sqrt(sum of squared active weights + 1e-8); returns y, conv * r and r, which the backward pass needs.
 std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const Tensor& map, const c10::optional<Tensor>& bias,
                          const c10::optional<Tensor>& gain, bool relu) {
-  check(x, at::kFloat);
   check(w, at::kFloat);
   check(map, at::kInt);
   const int64_t taps = map.size(0), n = map.size(1);
   const int64_t cin = w.size(transpose ? 2 : 1), cout = w.size(transpose ? 1 : 2), panels = (cout + 15) / 16, wide = panels * 16;
   [[maybe_unused]] const int64_t pairs = (cin + 1) / 2;
-  TORCH_CHECK(w.size(0) == taps && x.size(1) == cin, "convolution shapes do not agree");
+  TORCH_CHECK(w.size(0) == taps, "convolution shapes do not agree");
   const bool norm = gain.has_value();
   Tensor y = torch::empty({n, cout}), hat, inv;
   if (norm) {
     hat = torch::empty({n, cout});
     inv = torch::empty({n, cout});
   }
-  Aligned packed(taps * panels * (cin + 1) * 16);
-#ifdef __AVX512BF16__
-  uint16_t* halves = reinterpret_cast<uint16_t*>(packed.p);
-  const Halves xh(x.data_ptr<float>(), use_bf16 ? x.size(0) : 0, cin);
-  if (use_bf16) pack_halves(w.data_ptr<float>(), taps, cin, cout, transpose, halves);
-#endif
-  if (!use_bf16) pack(w.data_ptr<float>(), taps, cin, cout, transpose, packed.p);
   Aligned squares(norm ? taps * wide : 1);
   if (norm) {
     std::fill(squares.p, squares.p + taps * wide, 0.f);
@@ -398,9 +420,27 @@ std::vector<Tensor> conv(const Tensor& x, const Tensor& w, bool transpose, const
           squares.p[k * wide + o] += v * v;
         }
   }
-  const float *xp = x.data_ptr<float>(), *bp = bias ? bias->data_ptr<float>() : nullptr, *gp = norm ? gain->data_ptr<float>() : nullptr;
+  const float *bp = bias ? bias->data_ptr<float>() : nullptr, *gp = norm ? gain->data_ptr<float>() : nullptr;
   float *yp = y.data_ptr<float>(), *hp = norm ? hat.data_ptr<float>() : nullptr, *ip = norm ? inv.data_ptr<float>() : nullptr;
   const int32_t* mp = map.data_ptr<int32_t>();
+#ifdef HAS_AMX
+  if (x.scalar_type() == at::kBFloat16) {
+    TORCH_CHECK(taps <= 32, "more taps than a mask holds");
+    amx::convolve(amx::Rows(static_cast<const uint16_t*>(x.data_ptr()), amx::Packing(taps, cin).wide), cin, w.data_ptr<float>(), transpose, mp, taps, squares.p, {n, cout, panels, bp, gp, relu, yp, hp, ip});
+    if (norm) return {y, hat, inv};
+    return {y};
+  }
+#endif
+  check(x, at::kFloat);
+  TORCH_CHECK(x.size(1) == cin, "convolution shapes do not agree");
+  const float* xp = x.data_ptr<float>();
+  Aligned packed(taps * panels * (cin + 1) * 16);
+#ifdef __AVX512BF16__
+  uint16_t* halves = reinterpret_cast<uint16_t*>(packed.p);
+  const Halves xh(x.data_ptr<float>(), use_bf16 ? x.size(0) : 0, cin);
+  if (use_bf16) pack_halves(w.data_ptr<float>(), taps, cin, cout, transpose, halves);
+#endif
+  if (!use_bf16) pack(w.data_ptr<float>(), taps, cin, cout, transpose, packed.p);
   const int64_t blocks = (n + BLOCK - 1) / BLOCK;
 #pragma omp parallel
   {
@@ -499,14 +539,23 @@ inline void outer(const float* x, const float* g, float* dw, int64_t n) {
 
 // dW[k] = sum over pairs of x[in]^T g[out]. Rows go in blocks whose inputs stay in the cache over all taps; the pairs of a block are
 // packed, x in strips of 6 columns and g in panels of 16.
-Tensor weight_grad(const Tensor& x, const Tensor& g, const Tensor& map) {
-  check(x, at::kFloat);
-  check(g, at::kFloat);
+Tensor weight_grad(const Tensor& x, const Tensor& g, const Tensor& map, int64_t cin, int64_t cout) {
   check(map, at::kInt);
   constexpr int64_t CHUNK = 128, SHARES = 8;
-  const int64_t taps = map.size(0), n = map.size(1), cin = x.size(1), cout = g.size(1), panels = (cout + 15) / 16, strips = (cin + 5) / 6;
+  const int64_t taps = map.size(0), n = map.size(1), panels = (cout + 15) / 16, strips = (cin + 5) / 6;
   const int64_t size = panels * strips * 96;
-  TORCH_CHECK(g.size(0) == n, "gradient rows do not match the map");
+#ifdef HAS_AMX
+  if (x.scalar_type() == at::kBFloat16) {
+    Tensor dw = torch::empty({taps, cin, cout});
+    const amx::Rows xr(static_cast<const uint16_t*>(x.data_ptr()), amx::Packing(taps, cin).wide);
+    const amx::Rows gr(static_cast<const uint16_t*>(g.data_ptr()), amx::Packing(taps, cout).wide);
+    amx::weight_gradient(xr, cin, gr, cout, map.data_ptr<int32_t>(), taps, n, dw.data_ptr<float>());
+    return dw;
+  }
+#endif
+  check(x, at::kFloat);
+  check(g, at::kFloat);
+  TORCH_CHECK(g.size(0) == n && x.size(1) == cin && g.size(1) == cout, "gradient shapes do not agree");
 #ifdef __AVX512BF16__
   if (use_bf16) return weight_grad_halves(x, g, map);
 #endif
@@ -579,23 +628,55 @@ Tensor weight_grad(const Tensor& x, const Tensor& g, const Tensor& map) {
 // Sums of partial results, in order.
 Tensor join(const Tensor& parts) { return parts.sum(0); }
 
+// Rows of a gradient on their way to products: bf16 on AMX (see `rows`), f32 elsewhere.
+struct Gradient {
+  Tensor out;
+  int64_t c;
+#ifdef HAS_AMX
+  int64_t stride;
+  std::unique_ptr<amx::Rows> half;
+#endif
+  Gradient(int64_t n, int64_t c_, [[maybe_unused]] int64_t taps) : c(c_) {
+#ifdef HAS_AMX
+    if (use_amx()) {
+      stride = amx::Packing(taps, c).wide;
+      out = torch::empty({amx::Rows::size(n, stride)}, torch::kBFloat16);
+      half = std::make_unique<amx::Rows>(static_cast<uint16_t*>(out.data_ptr()), n, stride);
+      return;
+    }
+#endif
+    out = torch::empty({n, c});
+  }
+  void set(int64_t i, const float* row) {
+#ifdef HAS_AMX
+    if (half) return half->set(i, row, c);
+#endif
+    std::copy(row, row + c, out.data_ptr<float>() + i * c);
+  }
+};
+
 // Gradient at the accumulator of a plain convolution, and of its bias.
-std::vector<Tensor> plain_grad(const Tensor& dy, const Tensor& y, bool relu) {
+std::vector<Tensor> plain_grad(const Tensor& dy, const Tensor& y, bool relu, int64_t taps) {
   check(dy, at::kFloat);
   check(y, at::kFloat);
   const int64_t n = y.size(0), c = y.size(1);
-  Tensor g = torch::empty_like(y), db = torch::zeros({PARTS, c});
+  Tensor db = torch::zeros({PARTS, c});
+  Gradient g(n, c, taps);
   const float *dp = dy.data_ptr<float>(), *yp = y.data_ptr<float>();
-  float *gp = g.data_ptr<float>(), *bp = db.data_ptr<float>();
+  float* bp = db.data_ptr<float>();
 #pragma omp parallel for schedule(dynamic, 1)
-  for (int64_t part = 0; part < PARTS; part++)
-    for (int64_t i = n * part / PARTS; i < n * (part + 1) / PARTS; i++)
+  for (int64_t part = 0; part < PARTS; part++) {
+    std::vector<float> row(c);
+    for (int64_t i = n * part / PARTS; i < n * (part + 1) / PARTS; i++) {
       for (int64_t o = 0; o < c; o++) {
         const float v = !relu || yp[i * c + o] > 0 ? dp[i * c + o] : 0.f;
-        gp[i * c + o] = v;
+        row[o] = v;
         bp[part * c + o] += v;
       }
-  return {g, join(db)};
+      g.set(i, row.data());
+    }
+  }
+  return {g.out, join(db)};
 }
 
 // The same for the geometry-invariant form: gradients at the accumulator, of gain and bias, and of the squared norms S[k][o].
@@ -603,22 +684,24 @@ std::vector<Tensor> norm_grad(const Tensor& dy, const Tensor& y, const Tensor& h
   for (const Tensor* t : {&dy, &y, &hat, &inv, &gain}) check(*t, at::kFloat);
   check(map, at::kInt);
   const int64_t n = y.size(0), c = y.size(1), taps = map.size(0);
-  Tensor g = torch::empty_like(y), db = torch::zeros({PARTS, c}), dgain = torch::zeros({PARTS, c}), ds = torch::zeros({PARTS, taps, c});
+  Tensor db = torch::zeros({PARTS, c}), dgain = torch::zeros({PARTS, c}), ds = torch::zeros({PARTS, taps, c});
+  Gradient g(n, c, taps);
   const float *dp = dy.data_ptr<float>(), *yp = y.data_ptr<float>(), *hp = hat.data_ptr<float>(), *ip = inv.data_ptr<float>(), *ap = gain.data_ptr<float>();
   const int32_t* mp = map.data_ptr<int32_t>();
-  float *gp = g.data_ptr<float>(), *bp = db.data_ptr<float>(), *np = dgain.data_ptr<float>(), *sp = ds.data_ptr<float>();
+  float *bp = db.data_ptr<float>(), *np = dgain.data_ptr<float>(), *sp = ds.data_ptr<float>();
 #pragma omp parallel for schedule(dynamic, 1)
   for (int64_t part = 0; part < PARTS; part++) {
-    std::vector<float> dd(c);
+    std::vector<float> dd(c), row(c);
     for (int64_t i = n * part / PARTS; i < n * (part + 1) / PARTS; i++) {
       for (int64_t o = 0; o < c; o++) {
         const int64_t at = i * c + o;
         const float v = !relu || yp[at] > 0 ? dp[at] : 0.f, gv = v * ap[o] * ip[at];
         bp[part * c + o] += v;
         np[part * c + o] += v * hp[at];
-        gp[at] = gv;
+        row[o] = gv;
         dd[o] = -0.5f * gv * hp[at] * ip[at];
       }
+      g.set(i, row.data());
       for (int64_t k = 0; k < taps; k++)
         if (mp[k * n + i] >= 0) {
           float* s = sp + (part * taps + k) * c;
@@ -626,7 +709,57 @@ std::vector<Tensor> norm_grad(const Tensor& dy, const Tensor& y, const Tensor& h
         }
     }
   }
-  return {g, join(dgain), join(db), join(ds)};
+  return {g.out, join(dgain), join(db), join(ds)};
+}
+
+// End of a block: y = relu?(parts side by side + x), in one pass.
+Tensor residual(const std::vector<Tensor>& parts, const Tensor& x, bool relu) {
+  check(x, at::kFloat);
+  const int64_t n = x.size(0), c = x.size(1);
+  Tensor y = torch::empty_like(x);
+  int64_t at = 0;
+  for (const Tensor& part : parts) {
+    check(part, at::kFloat);
+    const int64_t w = part.size(1);
+    TORCH_CHECK(part.size(0) == n && at + w <= c, "parts do not fit the residual");
+    const float *pp = part.data_ptr<float>(), *xp = x.data_ptr<float>() + at;
+    float* yp = y.data_ptr<float>() + at;
+#pragma omp parallel for schedule(static)
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t o = 0; o < w; o++) {
+        const float v = pp[i * w + o] + xp[i * c + o];
+        yp[i * c + o] = relu && v < 0 ? 0.f : v;
+      }
+    at += w;
+  }
+  TORCH_CHECK(at == c, "parts do not fill the residual");
+  return y;
+}
+
+// Gradients of x and of parts `widths` wide.
+std::vector<Tensor> residual_grad(const Tensor& dy, const Tensor& y, bool relu, const std::vector<int64_t>& widths) {
+  check(dy, at::kFloat);
+  check(y, at::kFloat);
+  const int64_t n = y.size(0), c = y.size(1);
+  std::vector<Tensor> out{relu ? torch::empty_like(y) : dy};
+  if (relu) {
+    const float *dp = dy.data_ptr<float>(), *yp = y.data_ptr<float>();
+    float* xp = out[0].data_ptr<float>();
+#pragma omp parallel for schedule(static)
+    for (int64_t i = 0; i < n * c; i++) xp[i] = yp[i] > 0 ? dp[i] : 0.f;
+  }
+  if (widths.size() == 1) return {out[0], out[0]};
+  int64_t at = 0;
+  for (const int64_t w : widths) {
+    Tensor part = torch::empty({n, w});
+    const float* from = out[0].data_ptr<float>() + at;
+    float* to = part.data_ptr<float>();
+#pragma omp parallel for schedule(static)
+    for (int64_t i = 0; i < n; i++) std::copy(from + i * c, from + i * c + w, to + i * w);
+    out.push_back(part);
+    at += w;
+  }
+  return out;
 }
 
 // Mean over the children [first[i], first[i + 1]) of each parent, and its gradient.
@@ -968,11 +1101,15 @@ PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
   using release = pybind11::call_guard<pybind11::gil_scoped_release>;
   m.def("kernel_map", &kernel_map, release());
   m.def("child_map", &child_map, release());
+  m.def("rows", &rows, release());
   m.def("conv", &conv, release());
   m.def("set_bf16", &set_bf16);
+  m.def("use_amx", &use_amx);
   m.def("weight_grad", &weight_grad, release());
   m.def("plain_grad", &plain_grad, release());
   m.def("norm_grad", &norm_grad, release());
+  m.def("residual", &residual, release());
+  m.def("residual_grad", &residual_grad, release());
   m.def("pool", &pool, release());
   m.def("pool_grad", &pool_grad, release());
   m.def("splat", &splat, release());

@@ -122,6 +122,7 @@ def all_children(coords):
 class _Conv(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, w, bias, kmap, relu):
+        x = extension().rows(x, w.shape[0])
         (y,) = extension().conv(x, w, False, kmap.table, bias, None, relu)
         ctx.kmap, ctx.relu = kmap, relu
         ctx.save_for_backward(x, w, y)
@@ -131,9 +132,9 @@ class _Conv(torch.autograd.Function):
     def backward(ctx, dy):
         x, w, y = ctx.saved_tensors
         e = extension()
-        g, db = e.plain_grad(dy.contiguous(), y, ctx.relu)
+        g, db = e.plain_grad(dy.contiguous(), y, ctx.relu, w.shape[0])
         dx = e.conv(g, w, True, ctx.kmap.back, None, None, False)[0] if ctx.needs_input_grad[0] else None
-        return dx, e.weight_grad(x, g, ctx.kmap.table), db, None, None
+        return dx, e.weight_grad(x, g, ctx.kmap.table, *w.shape[1:]), db, None, None
 
 
 @functools.lru_cache(maxsize=64)
@@ -146,6 +147,7 @@ def identity(n):
 class _NormConv(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, w, gain, bias, kmap, relu):
+        x = extension().rows(x, w.shape[0])
         y, hat, inv = extension().conv(x, w, False, kmap.table, bias, gain, relu)
         ctx.kmap, ctx.relu = kmap, relu
         ctx.save_for_backward(x, w, gain, y, hat, inv)
@@ -157,7 +159,7 @@ class _NormConv(torch.autograd.Function):
         e = extension()
         g, dgain, db, ds = e.norm_grad(dy.contiguous(), y, hat, inv, gain, ctx.kmap.table, ctx.relu)
         dx = e.conv(g, w, True, ctx.kmap.back, None, None, False)[0] if ctx.needs_input_grad[0] else None
-        dw = e.weight_grad(x, g, ctx.kmap.table).addcmul_(w, ds[:, None, :], value=2)
+        dw = e.weight_grad(x, g, ctx.kmap.table, *w.shape[1:]).addcmul_(w, ds[:, None, :], value=2)
         return dx, dw, dgain, db, None, None
 
 
@@ -192,6 +194,28 @@ def norm_conv(x, w, gain, bias, kmap, relu=False):
     active = (kmap.table >= 0).to(x.dtype)
     norm = active.T @ (w * w).sum(1)
     y = gain * (_gather_conv(x, w, kmap) * torch.rsqrt(norm + 1e-8)) + bias
+    return torch.relu(y) if relu else y
+
+
+class _Residual(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, relu, *parts):
+        y = extension().residual(parts, x, relu)
+        ctx.relu, ctx.widths = relu, [p.shape[1] for p in parts]
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx, dy):
+        dx, *parts = extension().residual_grad(dy.contiguous(), *ctx.saved_tensors, ctx.relu, ctx.widths)
+        return dx, None, *parts
+
+
+def residual(parts, x, relu):
+    """The end of a block: parts [n, ..] side by side, plus x."""
+    if native(x):
+        return _Residual.apply(x, relu, *parts)
+    y = torch.cat(parts, 1) + x
     return torch.relu(y) if relu else y
 
 

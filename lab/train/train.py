@@ -124,6 +124,7 @@ class Trainer:
         self.optimiser = torch.optim.Adam(groups(self.model, args.lr_conv, args.lr_linear), betas=(0.9, 0.999), eps=1e-8, fused=True)
         self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
         self.step, self.used, self.calibrated = 0, 0.0, False
+        self.finest = {}  # of a frozen first encoder: its features, in f16, by the sample's name
 
     def state(self):
         return {"model": self.model.state_dict(), "average": self.average, "optimiser": self.optimiser.state_dict(), "step": self.step,
@@ -152,11 +153,24 @@ class Trainer:
         torch.set_rng_state(s["torch_rng"].cpu())
         self.rng.setstate(s["rng"])
 
+    def revive(self, crop, rgb):
+        self.model.revive(crop, rgb, self.args.revive)
+        self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+
     def fraction(self):
         return self.used / (self.args.minutes * 60) if self.args.minutes else self.step / self.args.steps
 
+    @torch.no_grad()
+    def frozen(self, sample):
+        """Features of the finest level where its encoder is frozen: they are computed once."""
+        if not self.args.freeze_finest:
+            return None
+        if sample.name not in self.finest:
+            self.finest[sample.name] = self.model.analyse_finest(sample.crop, sample.rgb).half()
+        return self.finest[sample.name].float()
+
     def loss(self, sample, head, weight, mode, hint):
-        features = self.model.analyse(sample.crop, sample.rgb)
+        features = self.model.analyse(sample.crop, sample.rgb, self.frozen(sample))
         trail, rates, latents = self.model.code(sample.crop, features, head, mode)
         (mean, cov, alpha, colour), raw = self.model.generate(trail[-1], sample.crop, head)
         background = torch.rand(sample.image.shape[0], 3, device=raw.device)
@@ -214,7 +228,7 @@ class Trainer:
             self.model.load_state_dict(self.average)
         sums, bits, points = {1: [0.0] * 4, 2: [0.0] * 4}, [0.0] * 3, 0
         for sample in samples:
-            features = self.model.analyse(sample.crop, sample.rgb)
+            features = self.model.analyse(sample.crop, sample.rgb, self.frozen(sample))
             points += sample.crop.points
             for head in (1, 2):
                 trail, rates, _ = self.model.code(sample.crop, features, head, "round")
@@ -274,6 +288,8 @@ def main(argv=None):
     p.add_argument("--evaluate-every", type=int, default=250)
     p.add_argument("--log-every", type=int, default=10)
     p.add_argument("--resume", action="store_true", help="continue from OUT/last.pt")
+    p.add_argument("--revive", type=int, choices=[1, 2], help="with --init: give this role new latents, where its own died")
+    p.add_argument("--freeze-finest", action="store_true", help="leave the encoder of the finest level as it is: a step is then twice as fast")
     p.add_argument("--stop-after", type=int, default=0, help="stop at this step, as an interruption would")
     p.add_argument("--init", help="start from the averaged weights of this checkpoint, or from a file of `export.py --weights`")
     args = p.parse_args(argv)
@@ -291,7 +307,10 @@ def main(argv=None):
     train_files, held_files = data.split(args.data, args.held_out)
     held = [data.load_sample(f).to(args.device) for f in held_files]
     calibration = None if trainer.calibrated else [data.load_sample(f) for f in train_files[:6]]
-    stream = data.Stream(train_files, args.views, args.seed, start=trainer.step * args.batch)
+    if args.revive and not args.resume:
+        some = [data.load_sample(f) for f in train_files[:10]]
+        trainer.revive(join([s.crop for s in some]), torch.cat([s.rgb for s in some]))
+    stream = data.Stream(train_files, args.views, args.seed, trainer.step * args.batch, known=trainer.finest)
     log = open(os.path.join(args.out, "log.jsonl"), "a")
 
     def write(row):
