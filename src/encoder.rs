@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use crate::bitstream::{Header, MAX_SLICE_VOXELS, Writer};
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
-use crate::entropy::{Condition, encode_level, latent_hash, quantise};
+use crate::entropy::{Condition, encode_level, encode_passes, latent_hash, quantise};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
@@ -148,14 +148,23 @@ pub fn encode(
                     Some((mu, sigma)) => Condition::Gauss { mu, sigma },
                     None => Condition::Prior,
                 };
+                let tables = model.tables();
                 let latents = quantise(
-                    model.tables(),
+                    tables,
                     condition,
                     &model.squeeze(role, &own, context.as_deref())?,
                     model.shape().latent_max,
                     options.bit_price,
                 );
-                let slices = encode_level(model.tables(), condition, &latents, slice);
+                let slices = if role == 0 && model.predicts_base() {
+                    let octants = octree.level(level).octants();
+                    let predict = |slice, voxels: &[u32], latents: &[i16]| {
+                        model.base_parameters(&octants, map, slice, voxels, latents)
+                    };
+                    encode_passes(tables, &octants, &predict, &latents, slice)
+                } else {
+                    encode_level(tables, condition, &latents, slice)
+                };
                 writer.features(level, latent_hash(&latents), &slices)?;
                 Ok(Some(model.reconstruct(
                     role,

@@ -56,13 +56,15 @@ def ranges_of(model, samples):
         r.add(names[module], output)
 
     for name, module in model.named_modules():
-        if name.split(".")[0] in ("up", "pem", "fr", "gg") and (isinstance(module, (Inception, ResBlock)) or hasattr(module, "taps")):
+        if name.split(".")[0] in ("up", "base", "pem", "fr", "gg") and (isinstance(module, (Inception, ResBlock)) or hasattr(module, "taps")):
             hooks.append(module.register_forward_hook(record))
     for role, gg in model.gg.items():  # what follows layer 4 sees its output, whichever way it was computed
         after = [*gg.after, gg.conv_out][0]
         hooks.append(after.register_forward_pre_hook(lambda _, inputs, name=f"gg.{role}.layer4": r.add(name, inputs[0])))
     for s in samples:
-        trail, _, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+        trail, _, latents = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+        if model.cfg.get("base_channels"):
+            model.base(model.base.inputs(torch.round(latents[0]), s.crop.coords[0], s.crop.kernel3[0].table)[0])
         for role in model.gg:
             model.generate(trail[int(role)], s.crop, int(role))
     for h in hooks:
@@ -142,6 +144,12 @@ def quantise(model, ranges):
             inception(f"pem.{r}.blocks.{b}", s)
         layer(f"pem.{r}.mu", s, 1.0, factor=16.0)
         layer(f"pem.{r}.sigma", s, 1.0, factor=per_nat, shift=-math.log(SIGMA_MIN))
+    if cfg.get("base_channels"):
+        s1, s2 = ranges.scale("base.lin1"), ranges.scale("base.lin2")
+        layer("base.lin1", 2.0**-LATENT_SHIFT, s1)
+        layer("base.lin2", s1, s2)
+        layer("base.mu", s2, 1.0, factor=16.0)
+        layer("base.sigma", s2, 1.0, factor=per_nat, shift=-math.log(SIGMA_MIN))
     for r in range(3):
         s = chain(f"fr.{r}.lin1", f"fr.{r}", cfg["fr_blocks"])
         inputs = np.full(cfg["latents"] + (cfg["channels"] if r else 0), c_scale[r])

@@ -11,9 +11,11 @@ import torch
 from safetensors import safe_open
 
 import ops
+from model import Base
 
 LIMIT = 2047
 SIGMA_MIN, SIGMA_MAX, SIGMAS = 0.11, 64.0, 64
+UNPREDICTED = 255
 
 
 def clamp(q):
@@ -35,7 +37,7 @@ def accumulate(x, weight, table):
 
 
 class Exact:
-    """up, pem and fr of a model file."""
+    """up, base, pem and fr of a model file."""
 
     def __init__(self, path):
         with safe_open(path, "numpy") as f:
@@ -45,7 +47,7 @@ class Exact:
 
     def _count(self, name, q):
         s = self.saturated.setdefault(name, [0, 0])
-        rectified = name.rsplit(".", 1)[1] in ("a1", "b1", "b2", "lin1") or name.startswith("pem") and name.endswith("conv_in")
+        rectified = name.rsplit(".", 1)[1] in ("a1", "b1", "b2", "lin1") or name == "base.lin2" or name.startswith("pem") and name.endswith("conv_in")
         s[0] += int(((q if rectified else np.abs(q)) >= LIMIT).sum())
         s[1] += q.size
 
@@ -80,6 +82,15 @@ class Exact:
         if self.cfg["upsample"] == "learned":
             return self.conv(f"up.{role}", g, descent)
         return g[descent.max(0)]
+
+    def base(self, latents, coords, table):
+        """(mu in 1/16, sigma index, or UNPREDICTED where no neighbour is known) of role 0, from its whole latents [n, K]."""
+        shift = self.cfg["latent_shift"]
+        x, known = Base.inputs(torch.from_numpy(latents).double(), coords, torch.from_numpy(table), shift)
+        x = clamp((x.numpy() * (1 << shift)).astype(np.int64))
+        x = relu(self.conv("base.lin2", relu(self.conv("base.lin1", x, None)), None))
+        sigma = np.clip(self.conv("base.sigma", x, None), 0, SIGMAS - 1)
+        return self.conv("base.mu", x, None), np.where(known.numpy()[:, None], sigma, UNPREDICTED)
 
     def entropy(self, role, c, table, trace=None):
         """(mu in 1/16, sigma index) of a role."""
@@ -118,8 +129,10 @@ class Exact:
         return self._bits("prior", np.broadcast_to(np.arange(latents.shape[1]), latents.shape), latents)
 
     def bits_gauss(self, latents, mu, index):
+        known = (index != UNPREDICTED).all(1)
+        mu, index, rest = mu[known], index[known], latents[~known]
         whole = (mu + 8) >> 4
-        return self._bits("gauss", index * 16 + (mu - 16 * whole + 8), latents - whole)
+        return self._bits("gauss", index * 16 + (mu - 16 * whole + 8), latents[known] - whole) + self.bits_prior(rest)
 
 
 def sigma_of(index):
@@ -145,10 +158,12 @@ def code(exact, model, crop, rgb, top=2, trace=None):
         y = model.fs[r](features[r], real)
         latents = torch.round(y.clamp(-limit, limit)).numpy().astype(np.int64)
         t[f"fc.{r}"], t[f"fs.{r}"], t[f"latent.{r}"] = features[r].numpy(), y.numpy(), latents
-        if r:
-            mu, index = exact.entropy(r, c, table3[r], trace)
+        if r or exact.cfg.get("base_channels"):
+            mu, index = exact.entropy(r, c, table3[r], trace) if r else exact.base(latents, crop.coords[0], table3[0])
             bits.append(exact.bits_gauss(latents, mu, index))
-            t[f"c.{r}"], t[f"mu.{r}"], t[f"sigma.{r}"] = c, mu, index
+            t[f"mu.{r}"], t[f"sigma.{r}"] = mu, index
+            if r:
+                t[f"c.{r}"] = c
         else:
             bits.append(exact.bits_prior(latents))
         g = exact.reconstruct(r, latents, c, table3[r], trace)

@@ -52,15 +52,16 @@ def join(crops):
     return make_crop(coords, parents)
 
 
-def make_crop(coords, parents):
-    """coords: four int32 tensors, role 0 .. 3, Morton-sorted; parents[r] (r = 1..3): row of each voxel's parent in role r - 1."""
+def make_crop(coords, parents, finest=True):
+    """coords: four int32 tensors, role 0 .. 3, Morton-sorted; parents[r] (r = 1..3): row of each voxel's parent in role r - 1.
+    `finest`: with the kernel map of role 3."""
     first = []
     for r in range(3):
         counts = torch.bincount(parents[r + 1].long(), minlength=coords[r].shape[0])
         first.append(torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)]).int())
     descent = {r: ops.descent(coords[r], parents[r], coords[r - 1].shape[0]) for r in (1, 2, 3)}
     kernel3 = [ops.neighbours(coords[0])]
-    for r in (1, 2, 3):
+    for r in (1, 2, 3) if finest else (1, 2):
         kernel3.append(ops.neighbours_below(kernel3[-1], descent[r].back, parents[r], coords[r]))
     children, n = ops.all_children(coords[1]), coords[1].shape[0]
     every = torch.arange(8 * n, dtype=torch.int32)
@@ -133,8 +134,7 @@ class Inception(nn.Module):
     def forward(self, x, kmap):
         a = self.a2(self.a1(x, kmap, True), kmap)
         b = self.b3(self.b2(self.b1(x, kmap, True), kmap, True), kmap)
-        y = torch.cat([a, b], 1) + x
-        return torch.relu_(y) if self.relu else y
+        return ops.residual([a, b], x, self.relu)
 
 
 class ResBlock(nn.Module):
@@ -145,8 +145,7 @@ class ResBlock(nn.Module):
         self.c2 = Conv(c, c, 27, branch)
 
     def forward(self, x, kmap):
-        y = self.c2(self.c1(x, kmap, True), kmap) + x
-        return torch.relu_(y) if self.relu else y
+        return ops.residual([self.c2(self.c1(x, kmap, True), kmap)], x, self.relu)
 
 
 class FeatureConvert(nn.Module):
@@ -262,6 +261,42 @@ class Prior(nn.Module):
         return (w * bin_mass(y[:, :, None], self.mean, bounded_sigma(self.log_sigma))).sum(2)
 
 
+class Base(nn.Module):
+    """Predicts the latents of role 0, which have no level below them: its voxels are coded octant by octant, and each is predicted from
+    those of its 26 neighbours that came before."""
+
+    def __init__(self, cfg):
+        super().__init__()
+        k, h = cfg["latents"], cfg["base_channels"]
+        self.lin1 = Conv(7 * (k + 1) + 3, h, 1)
+        self.lin2 = Conv(h, h, 1)
+        self.mu = Conv(h, k, 1, 0.1)
+        self.sigma = Conv(h, k, 1, 0.1)
+        nn.init.constant_(self.sigma.bias, 1.0)
+
+    @staticmethod
+    def inputs(y, coords, table, shift=6):
+        """What is known of voxels from whole latents y [n, K]: for each of the seven sets of neighbours that lie in one other octant, the
+        mean of their latents in steps of 2^-shift and whether there are any, if that octant came before; and the octant's three bits.
+        Also which voxels know any."""
+        octant, one = ops.octants(coords), 1 << shift
+        steps = ops.OFFSETS3.abs() @ torch.tensor([1, 2, 4], dtype=torch.int32)
+        rows, parts = torch.cat([y, y.new_zeros(1, y.shape[1])]), []
+        for other in range(1, 8):
+            before = (octant & 1 << other.bit_length() - 1) > 0
+            at = table[steps == other].long()
+            there = ((at >= 0) & before).to(y.dtype)
+            count = there.sum(0)[:, None]
+            mean = torch.floor((2 * one * torch.einsum("tn,tnk->nk", there, rows[at]) + count) / (2 * count.clamp_min(1))) / one
+            parts += [mean, (count > 0).to(y.dtype)]
+        any = torch.cat(parts[1::2], 1).sum(1) > 0
+        return torch.cat([*parts, torch.stack([octant >> b & 1 for b in range(3)], 1).to(y.dtype)], 1), any
+
+    def forward(self, x):
+        x = self.lin2(self.lin1(x, relu=True), relu=True)
+        return self.mu(x), self.sigma(x)
+
+
 class _Bound(torch.autograd.Function):
     """Clamp whose gradient passes at a bound when it leads back inside."""
 
@@ -303,6 +338,12 @@ def gaussians(raw, coords, unit, cfg, opaque):
     return mean, ops.covariance(sigma, rotation), alpha, _Bound.apply(0.5 + colour, 0.0, 1.0)
 
 
+def colour_basis():
+    """Orthonormal columns: luma and two chromas."""
+    basis = torch.linalg.qr(torch.tensor([[1.0, 1, 1], [1, 0, -1], [-1, 2, -1]]).T)[0]
+    return basis * torch.sign(basis.diagonal())
+
+
 class B2P(nn.Module):
     def __init__(self, cfg):
         super().__init__()
@@ -314,6 +355,8 @@ class B2P(nn.Module):
         self.pem = nn.ModuleDict({str(r): Entropy(cfg) for r in (1, 2)})
         self.gg = nn.ModuleDict({str(g["role"]): Generate(cfg, g) for g in cfg["gg"]})
         self.prior = Prior(cfg["latents"])
+        if cfg.get("base_channels"):
+            self.base = Base(cfg)
         with torch.no_grad():  # natural colours vary mostly in luma: let the first layer see chroma as strongly
             first = self.fc[3].conv_in.weight
             first.copy_(torch.tensor([[0.5, 0.5, 0.5], [2.0, -2.0, 0.0], [-1.5, -1.5, 3.0]]).T @ first)
@@ -327,13 +370,15 @@ class B2P(nn.Module):
                     up.weight.copy_(torch.eye(c) + torch.randn(8, c, c) * 0.1 / math.sqrt(c))
                 self.up[str(r)] = up
 
-    def analyse(self, crop, rgb):
-        """Encoder features f_r for roles 2, 1, 0. rgb: float [n_3, 3] in 0..1."""
-        x, out = rgb - 0.5, {}
-        for r in (3, 2, 1, 0):
-            x = self.fc[r](x, crop.kernel3[r])
-            if r < 3:
-                out[r] = x
+    def analyse_finest(self, crop, rgb):
+        """Features of role 3, averaged over each voxel of role 2. rgb: float [n_3, 3] in 0..1."""
+        return ops.pool(self.fc[3](rgb - 0.5, crop.kernel3[3]), crop.first[2])
+
+    def analyse(self, crop, rgb, finest=None):
+        """Encoder features f_r for roles 2, 1, 0. `finest`: what `analyse_finest` gave, if it is known."""
+        x, out = self.analyse_finest(crop, rgb) if finest is None else finest, {}
+        for r in (2, 1, 0):
+            x = out[r] = self.fc[r](x, crop.kernel3[r])
             if r > 0:
                 x = ops.pool(x, crop.first[r - 1])
         return out
@@ -365,6 +410,14 @@ class B2P(nn.Module):
             latents.append(y)
             trail.append(self.fr[r](noisy if mode == "noise" else rounded, c, crop.kernel3[r]))
         return trail, rates, latents
+
+    def base_bits(self, y, crop):
+        """Cost of whole latents of role 0 as they are coded: from neighbours where there are any that came before."""
+        if not self.cfg.get("base_channels"):
+            return bits(self.prior(y))
+        x, known = self.base.inputs(y, crop.coords[0], crop.kernel3[0].table)
+        mu, log_sigma = self.base(x[known])
+        return bits(bin_mass(y[known], mu, bounded_sigma(log_sigma))) + bits(self.prior(y[~known]))
 
     def bits(self, y, mu, log_sigma, learn=True):
         """Cost of latents: under the prior when mu is None. `learn`: whether the prior's parameters get a gradient."""
@@ -413,8 +466,7 @@ class B2P(nn.Module):
         signed = torch.cat([eye, -eye], 1)  # colour -> (colour, -colour)
         joined = torch.cat([eye, -eye], 0) / 2  # and back, from both
         rectified = torch.cat([eye, -eye], 0)  # and back, from what a ReLU left of both
-        basis = torch.linalg.qr(torch.tensor([[1.0, 1, 1], [1, 0, -1], [-1, 2, -1]]).T)[0]  # columns: luma and two chromas
-        basis = basis * torch.sign(basis.diagonal())
+        basis = colour_basis()
 
         def route(m, matrix, at=0, first=0, tap=None):
             """Outputs at .. of the layer become `matrix` times inputs first .., and nothing else."""
@@ -468,6 +520,33 @@ class B2P(nn.Module):
                 let_pass(b)
             route(gg.layer4, whole, tap=range(8) if gg.fanout == 8 else None)
             route(gg.conv_out, rectified @ basis.T, at=11)
+
+    def revive(self, crop, rgb, role=2, step=(14.0, 10.0, 10.0)):
+        """Gives a role whose latents died new ones: its first three become the error of the colours that it draws, predicted linearly
+        from the features that the encoder has, in steps of 1/`step` of luma and two chromas; the decoder answers each with the shift
+        that corrects its colours on average (the pseudo-inverse of its mean response)."""
+        n, r = 3, str(role)
+        fs, fr, pem, steps = self.fs[role], self.fr[role], self.pem[r], torch.tensor(step)
+        features = self.analyse(crop, rgb)
+        trail, _, _ = self.code(crop, features, role, "round")
+        (_, _, _, colour), raw = self.generate(trail[role], crop, role)
+        basis = colour_basis()
+        response = [torch.autograd.grad((raw[:, 11:14] @ basis).mean(0)[k], fr.lin1.bias, retain_graph=True)[0] for k in range(n)]
+        with torch.no_grad():
+            known = torch.cat([features[role], self.context(trail[role - 1], crop, role)], 1)
+            x = torch.cat([known, torch.ones(len(known), 1)], 1).double()
+            error = (self.colours(crop, rgb)[role] - colour) @ basis
+            gram = x.T @ x / len(x)
+            ridge = torch.diag(torch.full((len(gram),), 1e-3 * gram.diagonal().mean().item()).double())
+            fit = torch.linalg.solve(gram + ridge, x.T @ error.double() / len(x)).float()
+            for at, sign in ((0, 1), (n, -1)):
+                fs.lin1.weight[0, :, at:at + n], fs.lin1.bias[at:at + n] = sign * fit[:-1], sign * fit[-1]
+            fs.lin2.weight[0, :, :n], fs.lin2.weight[0, :2 * n, n:], fs.lin2.bias[:n] = 0, 0, 0
+            fs.lin2.weight[0, :2 * n, :n] = torch.cat([torch.diag(steps), -torch.diag(steps)])
+            fr.lin1.weight[0, :n] = torch.linalg.pinv(torch.stack(response)).T / steps[:, None]
+            for head in (pem.mu, pem.sigma):
+                head.weight[:, :, :n], head.bias[:n] = 0, 0
+            pem.sigma.bias[:n] = (x.float() @ fit * steps).std(0).clamp_min(0.2).log()
 
     def colours(self, crop, rgb):
         """Mean colour of the voxels of roles 0, 1, 2."""

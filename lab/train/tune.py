@@ -20,7 +20,7 @@ from train import atomic_save, keep_memory
 
 @torch.no_grad()
 def inputs(model, sample):
-    """(context, rounded latents, kernel map) of roles 0 .. 2, and the number of points."""
+    """(context, rounded latents, kernel map) of roles 0 .. 2, the crop, and the number of points."""
     features, g, out, limit = model.analyse(sample.crop, sample.rgb), None, [], float(model.cfg["latent_max"])
     for r in range(3):
         c, kmap = model.context(g, sample.crop, r) if r else None, sample.crop.kernel3[r]
@@ -28,12 +28,12 @@ def inputs(model, sample):
         out.append((c, y, kmap))
         if r < 2:
             g = model.fr[r](y, c, kmap)
-    return out, sample.crop.points
+    return out, sample.crop, sample.crop.points
 
 
-def rates(model, roles, coarse_mean=False):
+def rates(model, roles, crop, coarse_mean=False):
     """Bits per role. `coarse_mean`: with the means in the sixteenths that the stream has."""
-    out = [bits(model.prior(roles[0][1]))]
+    out = [model.base_bits(roles[0][1], crop)]
     for r in (1, 2):
         c, y, kmap = roles[r]
         mu, log_sigma = model.pem[str(r)](c, kmap)
@@ -46,8 +46,8 @@ def rates(model, roles, coarse_mean=False):
 @torch.no_grad()
 def measure(model, cached):
     total, points = np.zeros(3), 0
-    for roles, n in cached:
-        total += [r.item() for r in rates(model, roles, True)]
+    for roles, crop, n in cached:
+        total += [r.item() for r in rates(model, roles, crop, True)]
         points += n
     return total / points
 
@@ -60,31 +60,33 @@ def main():
     p.add_argument("--minutes", type=float, default=4)
     p.add_argument("--samples", type=int, default=150, help="crops, whose latents are computed once")
     p.add_argument("--lr", type=float, default=3e-4)
+    p.add_argument("--base-channels", type=int, default=48, help="of the network that predicts role 0 from neighbours, if the model has none yet")
     p.add_argument("--threads", type=int, default=2)
     args = p.parse_args()
     torch.set_num_threads(args.threads)
     keep_memory()
     begin = time.monotonic()
     state = torch.load(args.checkpoint, map_location="cpu", weights_only=False)
+    state["config"].setdefault("base_channels", args.base_channels)
     model = B2P(state["config"])
-    model.load_state_dict(state["average"])
+    model.load_state_dict(state["average"], strict=False)
     training, held = data.split(args.data, 8)
     order = np.random.default_rng(0).permutation(len(training))[:args.samples]
     held = [inputs(model, data.load_sample(f)) for f in held]
     before = measure(model, held)
-    cached, tuned = [], [*model.pem.parameters(), *model.prior.parameters()]
+    cached, tuned = [], [*model.pem.parameters(), *model.prior.parameters(), *(model.base.parameters() if model.cfg["base_channels"] else ())]
     optimiser, step = torch.optim.Adam(tuned, args.lr, betas=(0.9, 0.99)), 0
     rng = np.random.default_rng(1)
     while (x := (time.monotonic() - begin) / (60 * args.minutes)) < 1:
         if len(cached) < len(order):
             cached.append(inputs(model, data.load_sample(training[order[len(cached)]])))
-            roles, points = cached[-1]
+            roles, crop, points = cached[-1]
         else:
-            roles, points = cached[rng.integers(len(cached))]
+            roles, crop, points = cached[rng.integers(len(cached))]
         for group in optimiser.param_groups:
             group["lr"] = args.lr * min(1, (step + 1) / 20) * 0.5 * (1 + math.cos(math.pi * x))
         optimiser.zero_grad()
-        (sum(rates(model, roles, True)) / points).backward()
+        (sum(rates(model, roles, crop, True)) / points).backward()
         torch.nn.utils.clip_grad_norm_(tuned, 1.0)
         optimiser.step()
         step += 1

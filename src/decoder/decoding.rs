@@ -5,7 +5,7 @@ use std::ops::Deref;
 
 use super::{Decoder, Exact};
 use crate::bitstream::{Header, Level, MAGIC};
-use crate::entropy::{Condition, decode_level, latent_hash};
+use crate::entropy::{Condition, decode_level, decode_passes, latent_hash};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, codec};
@@ -346,7 +346,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
                 })?)
             }
         };
-        let latents = self.latents(role, level, context.as_deref(), &map, slice, log)?;
+        let latents = self.latents(header, level, context.as_deref(), octree, &map, log)?;
         self.cancel.check()?;
         let features = log.step(Module::Features(role).at(n), count, "voxels", || {
             let context = context.as_deref();
@@ -357,14 +357,15 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
 
     fn latents(
         &self,
-        role: usize,
+        header: &Header,
         level: &Level,
         context: Option<&[i16]>,
+        octree: &Octree,
         map: &KernelMap,
-        slice: usize,
         log: &mut Log,
     ) -> Result<Vec<i16>> {
         let (n, count) = (level.level, level.voxels as usize);
+        let (role, slice) = (usize::from(n - header.base), header.slice_voxels as usize);
         self.cancel.check()?;
         let parameters = context
             .map(|context| {
@@ -373,15 +374,25 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
                 })
             })
             .transpose()?;
-        let condition = match &parameters {
-            Some((mu, sigma)) => Condition::Gauss { mu, sigma },
-            None => Condition::Prior,
-        };
         let slices: Vec<_> = level.features.iter().map(|s| s.bytes).collect();
         let symbols = count * self.model.shape().latents;
         log.step(format!("latents of level {n}"), symbols, "symbols", || {
-            let tables = self.model.tables();
-            let latents = decode_level(tables, condition, &slices, count, slice, n, &self.cancel)?;
+            let (tables, cancel) = (self.model.tables(), &self.cancel);
+            let latents = match &parameters {
+                Some((mu, sigma)) => {
+                    let condition = Condition::Gauss { mu, sigma };
+                    decode_level(tables, condition, &slices, count, slice, n, cancel)?
+                }
+                None if self.model.predicts_base() => {
+                    let octants = octree.level(n).octants();
+                    let model = &*self.model;
+                    let predict = |slice, voxels: &[u32], latents: &[i16]| {
+                        model.base_parameters(&octants, map, slice, voxels, latents)
+                    };
+                    decode_passes(tables, &octants, &predict, &slices, slice, n, cancel)?
+                }
+                None => decode_level(tables, Condition::Prior, &slices, count, slice, n, cancel)?,
+            };
             level.check_latents(latent_hash(&latents))?;
             Ok(latents)
         })

@@ -49,16 +49,7 @@ pub fn decode_level(
 ) -> Result<Vec<i16>> {
     let mut latents = vec![0; voxels * tables.channels()];
     condition.check(tables, latents.len());
-    let needed = voxels.div_ceil(slice_voxels);
-    if slices.len() != needed {
-        return Err(Error::malformed(
-            Stage::Entropy,
-            format!("level {level}"),
-            "number of feature slices",
-            slices.len(),
-            needed,
-        ));
-    }
+    expect_slices(slices.len(), voxels, slice_voxels, level)?;
     let width = slice_voxels * tables.channels();
     let results: Vec<Result<()>> = latents
         .par_chunks_mut(width)
@@ -74,6 +65,26 @@ pub fn decode_level(
         .collect();
     results.into_iter().collect::<Result<()>>()?;
     Ok(latents)
+}
+
+/// [`Error::Malformed`] unless there are as many slices as the voxels fill.
+pub(super) fn expect_slices(
+    slices: usize,
+    voxels: usize,
+    slice_voxels: usize,
+    level: u8,
+) -> Result<()> {
+    let needed = voxels.div_ceil(slice_voxels);
+    match slices == needed {
+        true => Ok(()),
+        false => Err(Error::malformed(
+            Stage::Entropy,
+            format!("level {level}"),
+            "number of feature slices",
+            slices,
+            needed,
+        )),
+    }
 }
 
 /// XXH3-64 of a level's latents as little-endian 16-bit numbers, voxel by voxel.

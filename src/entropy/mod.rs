@@ -6,8 +6,12 @@
 //! # Symbols
 //! A level has K latents per voxel, coded voxel by voxel in Morton order, the K latents of a voxel in turn. A latent `y` with the
 //! predicted mean `μ` (in sixteenths) and the scale index `σ` is coded as `d = y − m` with `m = (μ + 8) >> 4`, under row
-//! `16·σ + (μ − 16·m + 8)` of the table `cdf.gauss`. Where nothing is predicted, at the base level, `d = y` under row `k` of
-//! `cdf.prior` for channel `k`.
+//! `16·σ + (μ − 16·m + 8)` of the table `cdf.gauss`. Where nothing is predicted, `d = y` under row `k` of `cdf.prior` for channel `k`.
+//!
+//! No level predicts the base level. With a model that has no layers `base.…`, all its latents are unpredicted. With one that has, the
+//! voxels of a slice are coded in eight passes, one for each octant `x + 2y + 4z` of their parents, in Morton order within a pass; and
+//! a voxel is predicted from those of its 26 neighbours that lie in the same slice and were coded before
+//! ([`crate::network::Model::base_parameters`]), unless there are none.
 //!
 //! A row has n entries, each a probability in units of 2⁻¹⁶, at least 1, together 65,536. Entry `i < n − 1` stands for
 //! `d = low + i`; the last one for every other `d`, whose distance from the row then follows in equiprobable bits, each an
@@ -27,14 +31,16 @@
 //! but 0.07 % of flipped bits; checksums are for the rest.
 
 mod level;
+mod passes;
 mod quantise;
 mod rows;
 mod slice;
 mod tables;
 
 pub use level::{decode_level, encode_level, latent_hash};
+pub use passes::{Predict, decode_passes, encode_passes};
 pub use quantise::quantise;
-pub use slice::{Condition, END_STATE, decode_slice, encode_slice};
+pub use slice::{Condition, END_STATE, UNPREDICTED, decode_slice, encode_slice};
 pub use tables::{RawRows, Tables};
 
 #[cfg(test)]

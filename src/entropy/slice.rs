@@ -12,6 +12,9 @@ use crate::error::{Error, Result, Stage};
 /// The coder's state before the first symbol is put on the stack, so after the last one is taken off.
 pub const END_STATE: u64 = 0x1_9e37_79b9;
 
+/// In place of a scale index: this latent has no prediction, and is coded as at a base level without one.
+pub const UNPREDICTED: u8 = u8::MAX;
+
 /// Ones before the zero of an escape: distances are below 2²¹.
 const MAX_PREFIX: u32 = 20;
 
@@ -30,7 +33,7 @@ pub enum Condition<'a> {
     Gauss {
         /// Means in sixteenths.
         mu: &'a [i16],
-        /// Scale indices, 0 to 63.
+        /// Scale indices, 0 to 63; [`UNPREDICTED`] where the channel alone is known.
         sigma: &'a [u8],
     },
 }
@@ -66,8 +69,10 @@ impl<'a> Condition<'a> {
     #[inline]
     pub(super) fn row<'t>(&self, tables: &'t Tables, i: usize) -> (Row<'t>, i32) {
         match self {
-            Condition::Prior => (tables.prior(i % tables.channels()), 0),
-            Condition::Gauss { mu, sigma } => tables.gauss(mu[i], sigma[i]),
+            Condition::Gauss { mu, sigma } if sigma[i] != UNPREDICTED => {
+                tables.gauss(mu[i], sigma[i])
+            }
+            _ => (tables.prior(i % tables.channels()), 0),
         }
     }
 }
@@ -130,38 +135,63 @@ pub(super) fn decode_into(
     latents: &mut [i16],
     at: &dyn Display,
 ) -> Result<()> {
-    condition.check(tables, latents.len());
-    let mut coder = open(bytes, at)?;
-    for (i, latent) in latents.iter_mut().enumerate() {
-        let (row, centre) = condition.row(tables, i);
-        let Ok(entry) = coder.decode_symbol(row);
-        let value = if entry < row.escape() {
-            centre + row.low() + entry as i32
-        } else {
-            let (above, distance) = pop_distance(&mut coder, at)?;
-            match above {
-                true => centre + row.low() + row.escape() as i32 - 1 + distance,
-                false => centre + row.low() - distance,
-            }
-        };
-        *latent = i16::try_from(value)
-            .map_err(|_| malformed(at, "latent", value, "a number of 16 bits"))?;
-    }
-    let (words, state) = coder.into_raw_parts();
-    if !words.is_empty() {
-        let left = format!("{} bytes", words.len() * WORD_BYTES);
-        return Err(malformed(at, "rest after the last latent", left, "none"));
-    }
-    if state != END_STATE {
-        let (state, end) = (format!("{state:#x}"), format!("{END_STATE:#x}"));
-        return Err(malformed(
+    let mut reader = Reader::open(tables, bytes, at)?;
+    reader.read(condition, latents)?;
+    reader.finish()
+}
+
+/// A slice that is read part by part.
+pub(super) struct Reader<'a> {
+    tables: &'a Tables,
+    coder: Coder,
+    at: &'a dyn Display,
+}
+
+impl<'a> Reader<'a> {
+    pub fn open(tables: &'a Tables, bytes: &[u8], at: &'a dyn Display) -> Result<Self> {
+        Ok(Reader {
+            tables,
+            coder: open(bytes, at)?,
             at,
-            "coder state after the last latent",
-            state,
-            end,
-        ));
+        })
     }
-    Ok(())
+
+    /// The next latents, whole voxels.
+    pub fn read(&mut self, condition: Condition, latents: &mut [i16]) -> Result<()> {
+        condition.check(self.tables, latents.len());
+        for (i, latent) in latents.iter_mut().enumerate() {
+            let (row, centre) = condition.row(self.tables, i);
+            let Ok(entry) = self.coder.decode_symbol(row);
+            let value = if entry < row.escape() {
+                centre + row.low() + entry as i32
+            } else {
+                let (above, distance) = pop_distance(&mut self.coder, self.at)?;
+                match above {
+                    true => centre + row.low() + row.escape() as i32 - 1 + distance,
+                    false => centre + row.low() - distance,
+                }
+            };
+            *latent = i16::try_from(value)
+                .map_err(|_| malformed(self.at, "latent", value, "a number of 16 bits"))?;
+        }
+        Ok(())
+    }
+
+    /// Nothing may be left.
+    pub fn finish(self) -> Result<()> {
+        let (words, state) = self.coder.into_raw_parts();
+        if !words.is_empty() {
+            let left = format!("{} bytes", words.len() * WORD_BYTES);
+            let field = "rest after the last latent";
+            return Err(malformed(self.at, field, left, "none"));
+        }
+        if state != END_STATE {
+            let (state, end) = (format!("{state:#x}"), format!("{END_STATE:#x}"));
+            let field = "coder state after the last latent";
+            return Err(malformed(self.at, field, state, end));
+        }
+        Ok(())
+    }
 }
 
 /// The first state and the stack of words, the next to be read on top.

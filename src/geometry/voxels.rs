@@ -47,6 +47,11 @@ impl Voxels {
         &self.keys
     }
 
+    /// Every voxel's place in its parent, `x + 2y + 4z`.
+    pub fn octants(&self) -> Vec<u8> {
+        self.keys.iter().map(|key| (key & 7) as u8).collect()
+    }
+
     /// How many voxels.
     pub fn len(&self) -> usize {
         self.keys.len()

@@ -129,7 +129,7 @@ impl<'a> Tensors<'a> {
     pub fn id(&self, shape: &Shape) -> [u8; 16] {
         let mut names = self.metadata.offset_keys();
         names.retain(|name| {
-            ["up.", "pem.", "fr.", "cdf."]
+            ["up.", "base.", "pem.", "fr.", "cdf."]
                 .iter()
                 .any(|p| name.starts_with(p))
         });

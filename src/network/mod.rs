@@ -7,11 +7,12 @@
 //! - **Geometry-invariant convolution**: output channel `o` is `gain_o · (Σ W x)_o / √(Σ W²_o + 1e-8) + bias_o`, both sums over
 //!   the taps that read an occupied voxel.
 //! - **Context**: `c` of a voxel is a linear layer, one per octant, of its parent's feature `g` (or a copy of it).
-//! - **Base level**: no context; its latents have one distribution per channel.
+//! - **Base level**: no context. Beyond the paper, a small network predicts its latents from those of neighbours that were coded
+//!   before ([`Model::base_parameters`]); without one, they have one distribution per channel.
 //!
 //! # The exact zone
 //! Whatever reaches a probability is computed in integers, and the same on every machine: [`Model::upsample`],
-//! [`Model::entropy_parameters`] (PEM) and [`Model::reconstruct`] (FR).
+//! [`Model::base_parameters`], [`Model::entropy_parameters`] (PEM) and [`Model::reconstruct`] (FR).
 //!
 //! Activations are `i16` in ±2047, weights `i16` in ±511, sums `i32`; loading proves per output channel that no sum can overflow.
 //! A sum becomes an activation by `clamp((sum + bias) >> shift)`, the rounding constant being part of the bias; in
@@ -35,6 +36,7 @@
 //! of the same after layer 4. Tables: see [`crate::entropy::Tables`]. A file without
 //! `fc.*` and `fs.*` can decode only.
 
+mod base;
 mod convert;
 mod exact;
 mod generate;

@@ -16,6 +16,9 @@ pub struct Shape {
     pub channels: usize,
     /// K: latents per voxel.
     pub latents: usize,
+    /// Channels of the network that predicts the base level from neighbours, a multiple of 4; 0 where there is none.
+    #[serde(default)]
+    pub base_channels: usize,
     /// Inception blocks of each feature conversion (FC).
     pub fc_blocks: usize,
     /// Inception blocks of each predictive entropy model (PEM).
@@ -101,6 +104,7 @@ impl Shape {
             name: "tiny".into(),
             channels: 8,
             latents: 4,
+            base_channels: 8,
             fc_blocks: 1,
             pem_blocks: 1,
             fr_blocks: 1,
@@ -158,8 +162,12 @@ impl Shape {
             Upsample::Nearest => "nearest",
             Upsample::Learned => "learned",
         };
+        let base = match self.base_channels {
+            0 => String::new(),
+            channels => format!(";base_channels={channels}"),
+        };
         format!(
-            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}",
+            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}",
             self.channels,
             self.latents,
             self.pem_blocks,
@@ -188,6 +196,12 @@ impl Shape {
             "channels",
             &self.channels,
             "a multiple of 4 up to 256",
+        )?;
+        require(
+            self.base_channels == 0 || channels(self.base_channels),
+            "base_channels",
+            &self.base_channels,
+            "0, or a multiple of 4 up to 256",
         )?;
         let latents = (1..=MAX_LATENTS).contains(&self.latents);
         require(latents, "latents", &self.latents, "1 to 64")?;
@@ -300,6 +314,7 @@ mod tests {
             ("/channels", "0"),
             ("/channels", "1000000"),
             ("/latents", "65"),
+            ("/base_channels", "260"),
             ("/pem_blocks", "17"),
             ("/latent_max", "32"),
             ("/latent_max", "0"),

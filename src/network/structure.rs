@@ -11,6 +11,12 @@ pub const RAW: usize = 14;
 /// Levels that a stream may code: roles 0, 1, 2. The level above them, which the encoder starts from, has role 3.
 pub const ROLES: usize = 3;
 
+/// What is known of a voxel of the base level: from each of the seven sets of neighbours that lie in one other octant the mean of each of
+/// `latents` latents and whether there are any, and the three bits of its own octant.
+pub(super) fn base_inputs(latents: usize) -> usize {
+    7 * (latents + 1) + 3
+}
+
 /// One layer to be had.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Spec {
@@ -44,6 +50,14 @@ pub(crate) struct ResBlock<L> {
 pub(crate) struct Entropy<L> {
     pub conv_in: L,
     pub blocks: Vec<Inception<L>>,
+    pub mu: L,
+    pub sigma: L,
+}
+
+/// What predicts the base level's latents from those of neighbours.
+pub(crate) struct Base<L> {
+    pub lin1: L,
+    pub lin2: L,
     pub mu: L,
     pub sigma: L,
 }
@@ -119,6 +133,8 @@ pub(crate) struct Squeeze<L> {
 pub(crate) struct Exact<L> {
     /// Of roles 1 and 2, if learned.
     pub up: Option<[L; 2]>,
+    /// Of role 0, if the model has it.
+    pub base: Option<Base<L>>,
     /// Of roles 1 and 2.
     pub pem: [Entropy<L>; 2],
     /// Of roles 0, 1 and 2.
@@ -218,6 +234,19 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
         })
     }
 
+    fn base(&mut self) -> Result<Option<Base<L>>> {
+        let (h, k) = (self.shape.base_channels, self.shape.latents);
+        if h == 0 {
+            return Ok(None);
+        }
+        Ok(Some(Base {
+            lin1: self.linear("base.lin1", base_inputs(k), h)?,
+            lin2: self.linear("base.lin2", h, h)?,
+            mu: self.linear("base.mu", h, k)?,
+            sigma: self.linear("base.sigma", h, k)?,
+        }))
+    }
+
     fn reconstruct(&mut self, role: usize) -> Result<Reconstruct<L>> {
         let (c, k, module) = (
             self.shape.channels,
@@ -289,6 +318,7 @@ impl Shape {
         };
         Ok(Exact {
             up,
+            base: maker.base()?,
             pem: [maker.entropy(1)?, maker.entropy(2)?],
             fr: [
                 maker.reconstruct(0)?,

@@ -5,6 +5,7 @@ use b2p_kernels::Isa;
 use super::super::reference::{Mode, Oracle, Rows};
 use super::super::{Model, Precision, RAW, Shape, Upsample, untrained};
 use super::{Cloud, error, rows};
+use crate::entropy::UNPREDICTED;
 
 /// Networks that together have every switch in both positions.
 fn shapes() -> Vec<Shape> {
@@ -14,6 +15,7 @@ fn shapes() -> Vec<Shape> {
         resblock_relu: false,
         ..Shape::tiny()
     };
+    nearest.base_channels = 0;
     nearest.gg[0].channels = 12;
     nearest.gg[1].blocks_before = 0;
     let wide = Shape {
@@ -124,6 +126,61 @@ fn the_exact_zone_equals_its_definition_to_the_bit_on_every_isa_and_thread_count
                 }
             }
         }
+    }
+}
+
+#[test]
+fn the_base_level_is_predicted_as_defined_to_the_bit_on_every_isa() {
+    let cloud = Cloud::sheet();
+    // Role 1's voxels are more than role 0's: any level serves.
+    let (map, sites) = (&cloud.maps[1], cloud.sites(1));
+    let octants = cloud.octree.level(cloud.level(1)).octants();
+    let all: Vec<u32> = (0..map.len() as u32).collect();
+    for (seed, shape) in (20..).zip(shapes()).filter(|(_, s)| s.base_channels > 0) {
+        let bytes = untrained(&shape, seed);
+        let (k, y) = (shape.latents, latents(map.len() * shape.latents));
+        let oracle = Oracle::new(&bytes, Mode::Whole);
+        let (want_mu, want_sigma, known) = oracle.base(&sites, &rows(&y, k));
+        assert!(known.contains(&true) && known.contains(&false));
+        for isa in Isa::available() {
+            let model = Model::from_bytes(&bytes).unwrap().with_isa(isa);
+            let (mu, sigma) = model.base_parameters(&octants, map, 0..map.len(), &all, &y);
+            assert!(rows(&mu, k) == want_mu, "means: {isa}");
+            for ((got, want), known) in sigma.chunks(k).zip(&want_sigma).zip(&known) {
+                let unpredicted = vec![UNPREDICTED; k];
+                match known {
+                    true => assert!(rows(got, k)[0] == *want, "scales: {isa}"),
+                    false => assert_eq!(got, unpredicted, "{isa}"),
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_base_level_is_predicted_from_earlier_voxels_of_its_slice_alone() {
+    let cloud = Cloud::sheet();
+    let map = &cloud.maps[1];
+    let octants = cloud.octree.level(cloud.level(1)).octants();
+    let model = Model::from_bytes(&untrained(&Shape::tiny(), 3)).unwrap();
+    let (k, slice) = (model.shape().latents, map.len() / 4..map.len() / 2);
+    let y = latents(slice.len() * k);
+    for octant in 0..8 {
+        let pass: Vec<u32> = slice
+            .clone()
+            .filter(|&v| octants[v] == octant)
+            .map(|v| v as u32)
+            .collect();
+        let parameters = |y: &[i16]| model.base_parameters(&octants, map, slice.clone(), &pass, y);
+        let mut later = y.clone();
+        for (v, y) in slice.clone().zip(later.chunks_exact_mut(k)) {
+            if octants[v] >= octant {
+                y.fill(i16::MIN);
+            }
+        }
+        assert!(parameters(&y) == parameters(&later), "octant {octant}");
+        let known = parameters(&y).1.iter().any(|&sigma| sigma != UNPREDICTED);
+        assert_eq!(known, octant > 0, "octant {octant}");
     }
 }
 

@@ -37,6 +37,12 @@ fn cloud() -> Cloud {
 fn the_exact_zone_computes_the_trainer_s_integers() {
     let (model, cloud) = (model(), cloud());
     let values = |name: &str, role: usize| -> Vec<i16> { golden(&format!("{name}.{role}")) };
+    let octants = cloud.octree.level(cloud.level(0)).octants();
+    let (map, y) = (&cloud.maps[0], values("latent", 0));
+    let all: Vec<u32> = (0..map.len() as u32).collect();
+    let (mu, sigma) = model.base_parameters(&octants, map, 0..map.len(), &all, &y);
+    assert_eq!(mu, values("mu", 0));
+    assert_eq!(sigma, golden::<u8>("sigma.0"));
     for role in 0..3 {
         let map = &cloud.maps[role];
         let context = (role > 0)
