@@ -5,7 +5,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::level::expect_slices;
-use super::slice::{Condition, Reader, UNPREDICTED, encode_slice};
+use super::slice::{Condition, Reader, encode_slice};
 use super::tables::Tables;
 use crate::cancel::Cancel;
 use crate::error::Result;
@@ -17,7 +17,7 @@ const PASSES: u8 = 8;
 ///
 /// Called with the range of the level's voxels that a slice holds, the voxels of the pass, ascending, and the latents of the slice so
 /// far, [voxels, K]; it may look at those of lower octants alone. Gives means in sixteenths and scale indices for all latents of the
-/// pass, [`UNPREDICTED`] where it knows nothing.
+/// pass, [`super::UNPREDICTED`] where it knows nothing.
 pub type Predict<'a> = dyn Fn(Range<usize>, &[u32], &[i16]) -> (Vec<i16>, Vec<u8>) + Sync + 'a;
 
 /// Codes a level's latents in slices of `slice_voxels` voxels; `octants[i]` is voxel `i`'s place in its parent, `x + 2y + 4z`.
@@ -122,6 +122,7 @@ fn passes<'a>(octants: &'a [u8], slice: &Range<usize>) -> impl Iterator<Item = V
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::entropy::UNPREDICTED;
     use crate::entropy::test_tables::{Random, tables};
     use proptest::prelude::*;
 
@@ -162,7 +163,7 @@ mod tests {
             let predict = predict(&octants);
             let bytes = encode_passes(&tables, &octants, &predict, &latents, slice);
             let slices: Vec<&[u8]> = bytes.iter().map(|b| &b[..]).collect();
-            prop_assert_eq!(decode_passes(&tables, &octants, &predict, &slices, slice, 7, &Cancel::new()).unwrap(), latents);
+            prop_assert_eq!(decode_passes(&tables, &octants, &predict, &slices, slice, 7, &Cancel::default()).unwrap(), latents);
         }
 
         #[test]
@@ -170,7 +171,7 @@ mod tests {
             bytes in prop::collection::vec(any::<u8>(), 0..200),
             octants in prop::collection::vec(0u8..8, 1..100),
         ) {
-            let _ = decode_passes(&tables(), &octants, &predict(&octants), &[&bytes], 100, 7, &Cancel::new());
+            let _ = decode_passes(&tables(), &octants, &predict(&octants), &[&bytes], 100, 7, &Cancel::default());
         }
     }
 
@@ -178,7 +179,7 @@ mod tests {
     fn neighbours_that_are_known_save_bits() {
         let tables = tables();
         let mut random = Random(5);
-        let octants: Vec<u8> = (0..4000).map(|i| i % 8).collect();
+        let octants: Vec<u8> = (0..4000).map(|i| (i % 8) as u8).collect();
         let mut value = 0i16;
         let mut latents = Vec::new();
         for _ in &octants {

@@ -318,13 +318,13 @@ impl Shape {
         };
         Ok(Exact {
             up,
-            base: maker.base()?,
             pem: [maker.entropy(1)?, maker.entropy(2)?],
             fr: [
                 maker.reconstruct(0)?,
                 maker.reconstruct(1)?,
                 maker.reconstruct(2)?,
             ],
+            base: maker.base()?,
         })
     }
 

@@ -28,8 +28,11 @@ pub fn untrained(shape: &Shape, seed: u64) -> Vec<u8> {
         tensors: Vec::new(),
     };
     let [exact, float] = layers(shape).expect("listing layers has no way to fail");
-    exact.iter().for_each(|spec| file.exact_layer(spec));
+    // The optional part comes last: with and without it, everything else is the same.
+    let (base, exact): (Vec<_>, Vec<_>) = exact.iter().partition(|s| s.name.starts_with("base."));
+    exact.into_iter().for_each(|spec| file.exact_layer(spec));
     float.iter().for_each(|spec| file.float_layer(spec));
+    base.into_iter().for_each(|spec| file.exact_layer(spec));
     // Half the features' range stands for ±4.
     let step = 1.0 / 256.0;
     file.put(
