@@ -3,7 +3,7 @@
 use b2p::Placement;
 use b2p::bitstream::{Header, Writer};
 use b2p::encoder::{Options, encode};
-use b2p::entropy::{Condition, encode_level, latent_hash};
+use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
 use b2p::network::{Model, Shape, Upsample, untrained};
@@ -151,13 +151,22 @@ fn stream(
         let parameters = context
             .as_ref()
             .map(|c| model.entropy_parameters(role, c, &map));
-        let condition = match &parameters {
-            Some((mu, sigma)) => Condition::Gauss { mu, sigma },
-            None => Condition::Prior,
-        };
         let count = octree.level(level).len() * model.shape().latents;
         let latents: Vec<i16> = (0..count).map(|_| latents.next(&mut random)).collect();
-        let slices = encode_level(model.tables(), condition, &latents, slice as usize);
+        let (tables, slice) = (model.tables(), slice as usize);
+        let slices = match &parameters {
+            Some((mu, sigma)) => {
+                encode_level(tables, Condition::Gauss { mu, sigma }, &latents, slice)
+            }
+            None if model.predicts_base() => {
+                let octants = octree.level(level).octants();
+                let predict = |slice, voxels: &[u32], latents: &[i16]| {
+                    model.base_parameters(&octants, &map, slice, voxels, latents)
+                };
+                encode_passes(tables, &octants, &predict, &latents, slice)
+            }
+            None => encode_level(tables, Condition::Prior, &latents, slice),
+        };
         writer
             .features(level, latent_hash(&latents), &slices)
             .expect("features");
