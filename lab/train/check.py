@@ -127,7 +127,7 @@ def the_splatter_agrees_with_plain_pytorch():
 def arguments(**changes):
     args = dict(config=os.path.join(HERE, "configs/full.json"), device="cpu", seed=0, lr_conv=3e-4, lr_linear=1e-3, minutes=0, steps=100000,
                 rate_start=0.003, rate_ramp=0.6, warmup=10, decay_from=0.6, rounding_from=0.6, coarse=0.0, both=False, lam=5.0, pyramid=1.0, square=0.0,
-                clip=1.0, average=0.9, hint=0.0, hint_until=0.5)
+                clip=1.0, average=0.9, hint=0.0, hint_until=0.5, freeze_finest=False)
     return type("Arguments", (), args | changes)()
 
 
@@ -160,6 +160,18 @@ def a_resumed_run_equals_an_unbroken_one():
     return "8 steps, broken after 5: every weight is equal"
 
 
+def a_frozen_first_encoder_changes_nothing_but_its_own_gradient():
+    sample, losses = data.procedural(2, size=48, views=2, pixels=60), []
+    for frozen in (False, True):
+        trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), freeze_finest=frozen))
+        torch.manual_seed(3)
+        losses.append(trainer.loss(sample, 2, 1.0, "mixed", 0.0)[0])
+        losses[-1].backward()
+        assert (trainer.model.fc[3].conv_in.weight.grad is None) == frozen
+    worst = near(losses[1], losses[0], 1e-3, "loss")
+    return f"losses differ by {worst:.1e}: features are kept in f16"
+
+
 def the_integer_path_follows_the_float_path():
     samples = [data.procedural(i, size=48, views=2, pixels=80) for i in range(3)]
     trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
@@ -178,7 +190,7 @@ if __name__ == "__main__":
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "2")))
     for check in (operators_agree_with_plain_pytorch, rounded_operands_stay_close_where_the_processor_has_them,
                   maps_from_above_are_those_found_by_searching, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
-                  the_integer_path_follows_the_float_path, a_crop_overfits):
+                  a_frozen_first_encoder_changes_nothing_but_its_own_gradient, the_integer_path_follows_the_float_path, a_crop_overfits):
         begin = time.monotonic()
         said = check()
         print(f"{check.__name__.replace('_', ' ')}: {said} ({time.monotonic() - begin:.0f} s)", flush=True)

@@ -267,7 +267,8 @@ def verify(path, model, samples):
     """Rate of the integer path against the float path on whole crops, pictures of both, and saturation."""
     exact, totals, points, error = integer.Exact(path), np.zeros((2, 3)), 0, np.zeros(2)
     for s in samples:
-        trail, rates, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+        trail, rates, latents = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
+        rates[0] = model.base_bits(torch.round(latents[0]), s.crop)
         bits, gi = integer.code(exact, model, s.crop, s.rgb)
         totals += np.array([[r.item() for r in rates], bits])
         error += [picture_error(model, s, trail[-1]), picture_error(model, s, gi)]

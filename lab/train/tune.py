@@ -74,8 +74,12 @@ def main():
     order = np.random.default_rng(0).permutation(len(training))[:args.samples]
     held = [inputs(model, data.load_sample(f)) for f in held]
     before = measure(model, held)
-    cached, tuned = [], [*model.pem.parameters(), *model.prior.parameters(), *(model.base.parameters() if model.cfg["base_channels"] else ())]
-    optimiser, step = torch.optim.Adam(tuned, args.lr, betas=(0.9, 0.99)), 0
+    cached, step = [], 0
+    groups = [{"params": [*model.pem.parameters(), *model.prior.parameters()], "base": args.lr}]
+    if model.cfg["base_channels"]:  # small, and often new
+        groups.append({"params": [*model.base.parameters()], "base": 3 * args.lr})
+    tuned = [p for group in groups for p in group["params"]]
+    optimiser = torch.optim.Adam(groups, args.lr, betas=(0.9, 0.99))
     rng = np.random.default_rng(1)
     while (x := (time.monotonic() - begin) / (60 * args.minutes)) < 1:
         if len(cached) < len(order):
@@ -84,7 +88,7 @@ def main():
         else:
             roles, crop, points = cached[rng.integers(len(cached))]
         for group in optimiser.param_groups:
-            group["lr"] = args.lr * min(1, (step + 1) / 20) * 0.5 * (1 + math.cos(math.pi * x))
+            group["lr"] = group["base"] * min(1, (step + 1) / 20) * 0.5 * (1 + math.cos(math.pi * x))
         optimiser.zero_grad()
         (sum(rates(model, roles, crop, True)) / points).backward()
         torch.nn.utils.clip_grad_norm_(tuned, 1.0)
