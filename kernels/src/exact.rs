@@ -1,6 +1,11 @@
 //! Sparse convolution in integers: the same bits on every machine.
 
+#[cfg(target_arch = "x86_64")]
+use std::sync::OnceLock;
+
 use crate::isa::{Isa, dispatch};
+#[cfg(target_arch = "x86_64")]
+use crate::machine::amx;
 use crate::norms::{Energy, Gains, Norms};
 use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
 use crate::taps::Taps;
@@ -43,6 +48,9 @@ pub struct ExactConv {
     /// Per tap, panel and pair of input channels: each output channel's two weights, side by side.
     weights: Vec<Lanes>,
     finish: Finish,
+    /// What [`Isa::has_tiles`] multiplies, once it is needed: nothing, if weights are too large for it.
+    #[cfg(target_arch = "x86_64")]
+    tiles: OnceLock<Option<amx::Weights>>,
 }
 
 /// [`Requantise`] in panels.
@@ -137,6 +145,8 @@ impl ExactConv {
             extents,
             weights: packed,
             finish,
+            #[cfg(target_arch = "x86_64")]
+            tiles: OnceLock::new(),
         }
     }
 
@@ -227,15 +237,32 @@ impl ExactConv {
             "these taps belong to another kernel"
         );
         with_scratch(|scratch| {
-            let Scratch {
-                taps: tile,
-                sums,
-                expanded,
-                norms,
-            } = scratch;
-            let inputs = input.len() / self.extents.cin;
             for (row, output) in output.tiles() {
-                tile.fill(isa, &taps, first + row, output.len(), inputs);
+                let (first, cout) = (first + row, self.extents.cout);
+                let Scratch {
+                    taps: tile,
+                    sums,
+                    expanded,
+                    norms,
+                    #[cfg(target_arch = "x86_64")]
+                    planner,
+                    #[cfg(target_arch = "x86_64")]
+                    tiles,
+                    ..
+                } = scratch;
+                #[cfg(target_arch = "x86_64")]
+                if isa.has_tiles()
+                    && let Some(weights) = self.tiles()
+                {
+                    let plan = planner.plan(isa, &taps, [first, output.len()], tile);
+                    if amx::accumulate(isa, weights, plan, input, tiles, sums) {
+                        let masks = plan.masks();
+                        finish(&self.finish, sums, norms, Tile { output, cout, masks });
+                        continue;
+                    }
+                }
+                let inputs = input.len() / self.extents.cin;
+                tile.fill(isa, &taps, first, output.len(), inputs);
                 let input = match self.extents.cin % 2 {
                     0 => Input::Ready(input),
                     _ => Input::Expand(input, pair_up),
@@ -250,18 +277,24 @@ impl ExactConv {
                     expanded,
                     sums,
                 );
-                finish(
-                    &self.finish,
-                    sums,
-                    norms,
-                    Tile {
-                        output,
-                        cout: self.extents.cout,
-                        masks: tile.masks(),
-                    },
-                );
+                let masks = tile.masks();
+                finish(&self.finish, sums, norms, Tile { output, cout, masks });
             }
         });
+    }
+
+    /// The weights in tiles.
+    #[cfg(target_arch = "x86_64")]
+    fn tiles(&self) -> Option<&amx::Weights> {
+        let pack = || {
+            let (steps, panels) = (self.extents.cin.div_ceil(2), self.extents.panels());
+            amx::Weights::new(self.extents, |tap, channel, out| {
+                let panel = tap * panels + out / PANEL;
+                let pair = self.weights[panel * steps + channel / 2].0[out % PANEL];
+                (pair >> (16 * (channel % 2))) as i16
+            })
+        };
+        self.tiles.get_or_init(pack).as_ref()
     }
 }
 

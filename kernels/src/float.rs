@@ -204,6 +204,7 @@ impl FloatConv {
                 sums,
                 expanded,
                 norms,
+                ..
             } = scratch;
             let inputs = input.len() / self.extents.cin;
             for (row, output) in output.tiles() {

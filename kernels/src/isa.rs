@@ -16,6 +16,9 @@ pub(crate) enum Level {
     Avx2,
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    /// AVX-512, and tiles for what they serve.
+    #[cfg(target_arch = "x86_64")]
+    Amx,
     #[cfg(target_arch = "aarch64")]
     Neon,
 }
@@ -41,7 +44,11 @@ impl Isa {
                 && is_x86_feature_detected!("avx512dq")
                 && is_x86_feature_detected!("avx512vl")
                 && is_x86_feature_detected!("avx512vnni");
-            return Isa(if avx512 { Level::Avx512 } else { Level::Avx2 });
+            return Isa(match avx512 {
+                true if amx() => Level::Amx,
+                true => Level::Avx512,
+                false => Level::Avx2,
+            });
         }
         #[cfg(target_arch = "aarch64")]
         if std::arch::is_aarch64_feature_detected!("neon") {
@@ -58,6 +65,8 @@ impl Isa {
             Level::Avx2,
             #[cfg(target_arch = "x86_64")]
             Level::Avx512,
+            #[cfg(target_arch = "x86_64")]
+            Level::Amx,
             #[cfg(target_arch = "aarch64")]
             Level::Neon,
         ];
@@ -72,8 +81,17 @@ impl Isa {
     /// Whether there are products of bf16 besides (AVX512_BF16).
     pub fn has_bf16(self) -> bool {
         #[cfg(target_arch = "x86_64")]
-        if self.0 == Level::Avx512 {
+        if self.0 >= Level::Avx512 {
             return is_x86_feature_detected!("avx512bf16");
+        }
+        false
+    }
+
+    /// Whether there are matrix tiles of bytes and bf16 (AMX), which a [`crate::Plan`] is for.
+    pub fn has_tiles(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        if self.0 == Level::Amx {
+            return true;
         }
         false
     }
@@ -89,6 +107,8 @@ impl Isa {
             Level::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => "avx512",
+            #[cfg(target_arch = "x86_64")]
+            Level::Amx => "amx",
             #[cfg(target_arch = "aarch64")]
             Level::Neon => "neon",
         }
@@ -99,6 +119,51 @@ impl fmt::Display for Isa {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }
+}
+
+/// Whether there is AMX with bytes and bf16, and the system lets this process use it. Asks once.
+#[cfg(target_arch = "x86_64")]
+fn amx() -> bool {
+    static AMX: std::sync::OnceLock<bool> = std::sync::OnceLock::new();
+    *AMX.get_or_init(|| {
+        use std::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
+        const BF16_TILE_INT8: u32 = 1 << 22 | 1 << 24 | 1 << 25;
+        const TILE_STATE: u64 = 1 << 17 | 1 << 18;
+        if __cpuid(0).eax < 7 || __cpuid_count(7, 0).edx & BF16_TILE_INT8 != BF16_TILE_INT8 {
+            return false;
+        }
+        // SAFETY: AVX-512, which was found before, is found only where the system saves registers by XSAVE.
+        let saved = unsafe { _xgetbv(0) };
+        saved & TILE_STATE == TILE_STATE && tiles_permitted()
+    })
+}
+
+/// Asks Linux for room for the tiles in this process's saved registers, which it grants once and for all threads.
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+fn tiles_permitted() -> bool {
+    const ARCH_PRCTL: i64 = 158;
+    const ARCH_REQ_XCOMP_PERM: i64 = 0x1023;
+    const XTILEDATA: i64 = 18;
+    let answer: i64;
+    // SAFETY: a system call that reads and writes no memory of this process, with the registers that it may change named.
+    unsafe {
+        std::arch::asm!(
+            "syscall",
+            inlateout("rax") ARCH_PRCTL => answer,
+            in("rdi") ARCH_REQ_XCOMP_PERM,
+            in("rsi") XTILEDATA,
+            out("rcx") _,
+            out("r11") _,
+            options(nostack),
+        );
+    }
+    answer == 0
+}
+
+/// Elsewhere it is not known how to ask.
+#[cfg(all(target_arch = "x86_64", not(target_os = "linux")))]
+fn tiles_permitted() -> bool {
+    false
 }
 
 /// The name of an instruction set that this machine lacks, or that does not exist.
@@ -160,7 +225,7 @@ macro_rules! dispatch {
             $crate::isa::Level::Avx2 => unsafe { avx2 $(::<$($g,)* $($n)?>)? ($($arg),*) },
             #[cfg(target_arch = "x86_64")]
             // SAFETY: as above.
-            $crate::isa::Level::Avx512 => unsafe { avx512 $(::<$($g,)* $($n)?>)? ($($arg),*) },
+            $crate::isa::Level::Avx512 | $crate::isa::Level::Amx => unsafe { avx512 $(::<$($g,)* $($n)?>)? ($($arg),*) },
         }
     }};
 }

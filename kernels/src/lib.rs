@@ -19,6 +19,8 @@ mod isa;
 mod machine;
 mod map;
 mod norms;
+#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
+mod plan;
 mod rows;
 mod taps;
 mod tile;
@@ -32,5 +34,6 @@ pub use exact::{ExactConv, LIMIT, Requantise};
 pub use float::{FloatConv, FloatOut, Precision, Scale};
 pub use isa::{Isa, UnknownIsa};
 pub use map::{MappedFile, map_file};
+pub use plan::{Plan, PlanTile};
 pub use rows::Output;
 pub use taps::{ABSENT, Taps};

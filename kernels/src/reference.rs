@@ -10,7 +10,7 @@ use crate::taps::{ABSENT, Taps};
 pub fn tap(taps: &Taps<'_>, i: usize, k: usize) -> Option<usize> {
     match taps {
         Taps::Same => Some(i),
-        Taps::Map { volume, rows } => {
+        Taps::Map { volume, rows, .. } => {
             let row = rows[i * volume + k];
             (row != ABSENT).then_some(row as usize)
         }

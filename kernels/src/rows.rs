@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 
 use crate::norms::Norms;
+use crate::plan::Planner;
 use crate::taps::TileTaps;
 
 /// Channels of one weight panel.
@@ -124,6 +125,13 @@ impl Extents {
         );
     }
 
+    /// Tap, input and output of each weight of `[tap][input][output]`.
+    pub fn each(self) -> impl Iterator<Item = (usize, usize, usize)> {
+        (0..self.volume).flat_map(move |tap| {
+            (0..self.cin).flat_map(move |c| (0..self.cout).map(move |o| (tap, c, o)))
+        })
+    }
+
     /// Calls `place(weight, tap · panels + panel, input, lane)` for each weight of `[tap][input][output]`.
     pub fn place<T: Copy>(&self, weights: &[T], mut place: impl FnMut(T, usize, usize, usize)) {
         for (i, &w) in weights.iter().enumerate() {
@@ -144,6 +152,9 @@ pub(crate) struct Scratch {
     pub sums: Vec<Lanes>,
     pub expanded: Vec<Lanes>,
     pub norms: Norms,
+    pub planner: Planner,
+    #[cfg(target_arch = "x86_64")]
+    pub tiles: crate::machine::amx::Buffers,
 }
 
 /// Lends this thread's [`Scratch`].

@@ -3,6 +3,7 @@
 use crate::isa::{Isa, Level};
 #[cfg(target_arch = "x86_64")]
 use crate::machine;
+use crate::plan::Plan;
 use crate::rows::TILE;
 
 /// Marks a tap that reads nothing.
@@ -19,6 +20,8 @@ pub enum Taps<'a> {
         volume: usize,
         /// One entry per output row and tap.
         rows: &'a [u32],
+        /// The same, arranged for [`Isa`]s with tiles.
+        plan: Option<&'a Plan>,
     },
     /// Eight taps, of which row `i` uses only `octants[i]`, to read row `parents[i]`.
     Octants {
@@ -121,7 +124,7 @@ impl TileTaps {
                     #[cfg(target_arch = "x86_64")]
                     // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
                     // tile's rows and eight more.
-                    Level::Avx2 | Level::Avx512 => unsafe { machine::avx2_lists::fill_map(lists) },
+                    Level::Avx2 | Level::Avx512 | Level::Amx => unsafe { machine::avx2_lists::fill_map(lists) },
                 };
             }
             Taps::Octants { parents, octants } => {
@@ -163,6 +166,11 @@ impl TileTaps {
             inputs: &self.inputs[k * ROOM..][..self.lengths[k]],
             rows: &self.rows[k * ROOM..][..self.lengths[k]],
         }
+    }
+
+    /// Taps of the kernel.
+    pub fn volume(&self) -> usize {
+        self.lengths.len()
     }
 
     /// One more than the last input row that a tap reads, or 0.

@@ -259,7 +259,7 @@ unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) -> 
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => machine::avx2::run(arithmetic, block, whole),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => machine::avx512::run(arithmetic, block, whole),
+            Level::Avx512 | Level::Amx => machine::avx512::run(arithmetic, block, whole),
             #[cfg(target_arch = "aarch64")]
             Level::Neon => machine::neon::run(arithmetic, block, whole),
         }
@@ -279,7 +279,7 @@ pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => machine::avx2::spin(arithmetic, rounds),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => machine::avx512::spin(arithmetic, rounds),
+            Level::Avx512 | Level::Amx => machine::avx512::spin(arithmetic, rounds),
             #[cfg(target_arch = "aarch64")]
             Level::Neon => machine::neon::spin(arithmetic, rounds),
         }

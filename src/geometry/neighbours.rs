@@ -4,17 +4,30 @@
 //! parent or in one of its parent's 26 neighbours, whose children are found from its occupancy by counting bits. The 3³ neighbours
 //! of up to eight siblings together fill a window of 4³ positions around them; the window is looked up once per parent.
 
+use std::sync::OnceLock;
+
+use b2p_kernels::{Isa, Plan, PlanTile, Taps};
 use rayon::prelude::*;
 
 /// The neighbours of every voxel under a 3³ or 2³ kernel.
 ///
 /// Row `i` holds `volume` indices of input voxels in the kernel's offset order (x fastest), [`KernelMap::ABSENT`] where none is:
 /// offsets −1, 0, 1 along each axis for 3³, `k = (dx+1) + 3(dy+1) + 9(dz+1)`; 0, 1 for 2³, `k = dx + 2dy + 4dz`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub struct KernelMap {
     volume: usize,
     rows: Vec<u32>,
+    /// The same for matrix tiles, once it is asked for.
+    plan: OnceLock<Plan>,
 }
+
+impl PartialEq for KernelMap {
+    fn eq(&self, other: &Self) -> bool {
+        self.volume == other.volume && self.rows == other.rows
+    }
+}
+
+impl Eq for KernelMap {}
 
 impl KernelMap {
     /// Marks an unoccupied neighbour.
@@ -25,14 +38,32 @@ impl KernelMap {
     /// Wraps rows of `volume` indices each.
     pub fn new(volume: usize, rows: Vec<u32>) -> Self {
         assert_eq!(rows.len() % volume, 0, "kernel map rows must be whole");
-        KernelMap { volume, rows }
+        KernelMap {
+            volume,
+            rows,
+            plan: OnceLock::new(),
+        }
+    }
+
+    /// The map as layers take it.
+    pub fn taps(&self, isa: Isa) -> Taps<'_> {
+        let plan = || {
+            let tiles = self.rows.par_chunks(PlanTile::ROWS * self.volume);
+            let tiles = tiles.map(|rows| PlanTile::new(isa, self.volume, rows));
+            Plan::from(tiles.collect::<Vec<_>>())
+        };
+        Taps::Map {
+            volume: self.volume,
+            rows: &self.rows,
+            plan: isa.has_tiles().then(|| self.plan.get_or_init(plan)),
+        }
     }
 
     /// The 3³ map of level 0: one voxel, alone.
     pub fn root() -> Self {
         let mut rows = vec![Self::ABSENT; 27];
         rows[Self::CENTRE] = 0;
-        KernelMap { volume: 27, rows }
+        KernelMap::new(27, rows)
     }
 
     /// The 3³ map of the voxels that arise when *every* voxel of this 3³ map's level has all eight children: the child in octant
@@ -54,7 +85,7 @@ impl KernelMap {
                     }
                 }
             });
-        KernelMap { volume: 27, rows }
+        KernelMap::new(27, rows)
     }
 
     /// The 2³ map of the same voxels.
@@ -68,7 +99,7 @@ impl KernelMap {
             .par_chunks_exact(27)
             .flat_map_iter(|row| [13, 14, 16, 17, 22, 23, 25, 26].map(|k| row[k]))
             .collect();
-        KernelMap { volume: 8, rows }
+        KernelMap::new(8, rows)
     }
 
     /// Number of kernel offsets: 27, 8 or 1.
@@ -136,7 +167,7 @@ pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]
             }
         }
     });
-    KernelMap { volume: 27, rows }
+    KernelMap::new(27, rows)
 }
 
 /// For every position of the 4³ window around a voxel's children, x fastest: the parent's neighbour it lies in and its octant there.

@@ -4,7 +4,7 @@ use b2p_kernels::{FloatConv, Isa, Taps, to_f16, to_f32};
 use half::f16;
 use rayon::prelude::*;
 
-use super::layers::{apply, apply_f32, concat, reals, taps};
+use super::layers::{apply, apply_f32, concat, reals};
 use super::structure::{Convert, Encoder, ROLES};
 use super::{Model, missing};
 use crate::error::Result;
@@ -95,12 +95,12 @@ impl Model {
 
 impl Convert<FloatConv> {
     fn apply(&self, isa: Isa, x: Vec<f16>, map: &KernelMap) -> Vec<f16> {
-        let x = apply(isa, &self.conv_in, taps(map), &x, map.len(), false);
+        let x = apply(isa, &self.conv_in, map.taps(isa), &x, map.len(), false);
         let x = self
             .blocks
             .iter()
-            .fold(x, |x, block| block.apply(isa, taps(map), &x));
-        apply(isa, &self.conv_out, taps(map), &x, map.len(), false)
+            .fold(x, |x, block| block.apply(isa, map.taps(isa), &x));
+        apply(isa, &self.conv_out, map.taps(isa), &x, map.len(), false)
     }
 }
 

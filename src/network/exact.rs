@@ -4,7 +4,7 @@ use b2p_kernels::{ExactConv, LIMIT, Taps};
 use rayon::prelude::*;
 
 use super::Model;
-use super::layers::{apply, concat, taps};
+use super::layers::{apply, concat};
 use super::structure::Inception;
 use crate::geometry::KernelMap;
 
@@ -57,7 +57,7 @@ impl Model {
         assert!(role == 1 || role == 2, "role {role} has a fixed prior");
         self.check(context, self.shape.channels, map);
         let pem = &self.exact.pem[role - 1];
-        let x = apply(self.isa, &pem.conv_in, taps(map), context, map.len(), true);
+        let x = apply(self.isa, &pem.conv_in, map.taps(self.isa), context, map.len(), true);
         let x = self.blocks(&pem.blocks, x, map);
         let mu = apply(self.isa, &pem.mu, Taps::Same, &x, map.len(), false);
         let sigma = apply(self.isa, &pem.sigma, Taps::Same, &x, map.len(), false);
@@ -103,7 +103,7 @@ impl Model {
     fn blocks(&self, blocks: &[Inception<ExactConv>], x: Vec<i16>, map: &KernelMap) -> Vec<i16> {
         blocks
             .iter()
-            .fold(x, |x, block| block.apply(self.isa, taps(map), &x))
+            .fold(x, |x, block| block.apply(self.isa, map.taps(self.isa), &x))
     }
 
     /// Panics unless `values` are `width` for each voxel of `map`.

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use b2p_kernels::{ExactConv, FloatConv, Taps};
 
-use super::layers::{Conv, apply, apply_f32, reals, taps};
+use super::layers::{Conv, apply, apply_f32, reals};
 use super::shape::Head;
 use super::stored::Stored;
 use super::structure::{Generate, RAW};
@@ -141,23 +141,23 @@ impl Model {
         map: &KernelMap,
     ) -> Vec<f32> {
         let (isa, n) = (self.isa, map.len());
-        let x = apply(isa, &gg.conv_in, taps(map), g, n, true);
+        let x = apply(isa, &gg.conv_in, map.taps(isa), g, n, true);
         let x = gg
             .before
             .iter()
-            .fold(x, |x, block| block.apply(isa, taps(map), x));
+            .fold(x, |x, block| block.apply(isa, map.taps(isa), x));
         let finish = |x: Vec<C::Value>, map: &KernelMap| {
             let x = gg
                 .after
                 .iter()
-                .fold(x, |x, block| block.apply(isa, taps(map), x));
-            apply_f32(isa, &gg.conv_out, taps(map), &x, map.len())
+                .fold(x, |x, block| block.apply(isa, map.taps(isa), x));
+            apply_f32(isa, &gg.conv_out, map.taps(isa), &x, map.len())
         };
         let out = if gg.head.children == 8 {
             let x = apply(isa, &gg.layer4, Taps::Children, &x, 8 * n, false);
             finish(x, &map.generated_children())
         } else {
-            let x = apply(isa, &gg.layer4, taps(&map.forward()), &x, n, false);
+            let x = apply(isa, &gg.layer4, map.forward().taps(isa), &x, n, false);
             finish(x, map)
         };
         debug_assert_eq!(out.len(), n * gg.head.children * RAW);

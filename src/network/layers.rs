@@ -5,7 +5,6 @@ use half::f16;
 use rayon::prelude::*;
 
 use super::structure::{Inception, ResBlock};
-use crate::geometry::KernelMap;
 
 /// Rows that one task computes. Rows don't depend on one another, so neither do results on the number of threads.
 const BLOCK: usize = 512;
@@ -77,14 +76,6 @@ impl Conv for FloatConv {
         output: Output<'_, f32, f16>,
     ) {
         self.run(isa, taps, input, first, output);
-    }
-}
-
-/// The taps of a kernel map.
-pub(super) fn taps(map: &KernelMap) -> Taps<'_> {
-    Taps::Map {
-        volume: map.volume(),
-        rows: map.rows(),
     }
 }
 

@@ -1,6 +1,8 @@
 //! What differs from one instruction set to the next.
 
 #[cfg(target_arch = "x86_64")]
+pub(crate) mod amx;
+#[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2_lists;
@@ -132,7 +134,7 @@ macro_rules! with_halves {
             $crate::isa::Level::Avx2 => unsafe { avx2 $(::<$g>)* ($($arg),*) },
             #[cfg(target_arch = "x86_64")]
             // SAFETY: as above.
-            $crate::isa::Level::Avx512 => unsafe { avx512 $(::<$g>)* ($($arg),*) },
+            $crate::isa::Level::Avx512 | $crate::isa::Level::Amx => unsafe { avx512 $(::<$g>)* ($($arg),*) },
             #[cfg(target_arch = "aarch64")]
             // SAFETY: an `Isa` of this level is only made where the processor has this feature.
             $crate::isa::Level::Neon => unsafe { neon $(::<$g>)* ($($arg),*) },

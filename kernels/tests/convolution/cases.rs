@@ -95,6 +95,7 @@ impl Owned {
             Owned::Map(volume, rows) => Taps::Map {
                 volume: *volume,
                 rows,
+                plan: None,
             },
             Owned::Octants(parents, octants) => Taps::Octants { parents, octants },
             Owned::Children => Taps::Children,

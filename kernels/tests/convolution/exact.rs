@@ -102,6 +102,7 @@ fn exact_layers_wrap_like_their_definition_at_the_extremes() {
     let taps = Taps::Map {
         volume: 27,
         rows: &map,
+        plan: None,
     };
     let [cin, cout] = [128, 16];
     for (w, x) in [

@@ -43,6 +43,7 @@ fn a_tap_that_reads_beyond_the_input_panics_on_every_isa() {
                 let taps = Taps::Map {
                     volume: 2,
                     rows: &map,
+                    plan: None,
                 };
                 let refused = [
                     std::panic::catch_unwind(|| {

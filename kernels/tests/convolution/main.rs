@@ -21,6 +21,9 @@ fn every_instruction_set_of_this_machine_is_tested() {
         if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw") {
             expected.push("avx512");
         }
+        if Isa::detect().has_tiles() {
+            expected.push("amx");
+        }
     }
     #[cfg(target_arch = "aarch64")]
     expected.push("neon");
