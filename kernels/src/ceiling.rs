@@ -29,6 +29,10 @@ pub fn i16(isa: Isa) -> f64 {
 
 /// bf16 by bf16, summed in f32: the bound of [`crate::Precision::Bf16`]. Where that falls back to f32, so does this.
 pub fn bf16(isa: Isa) -> f64 {
+    #[cfg(target_arch = "x86_64")]
+    if isa.has_tiles() {
+        return best(|| amx::spin_brain(isa, ROUNDS));
+    }
     match isa.has_bf16() {
         true => measure(isa, Arithmetic::Brain),
         false => f32(isa),

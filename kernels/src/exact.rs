@@ -255,9 +255,18 @@ impl ExactConv {
                     && let Some(weights) = self.tiles()
                 {
                     let plan = planner.plan(isa, &taps, [first, output.len()], tile);
-                    if amx::accumulate(isa, weights, plan, input, tiles, sums) {
+                    if amx::integers::accumulate(isa, weights, plan, input, tiles, sums) {
                         let masks = plan.masks();
-                        finish(&self.finish, sums, norms, Tile { output, cout, masks });
+                        finish(
+                            &self.finish,
+                            sums,
+                            norms,
+                            Tile {
+                                output,
+                                cout,
+                                masks,
+                            },
+                        );
                         continue;
                     }
                 }
@@ -278,7 +287,16 @@ impl ExactConv {
                     sums,
                 );
                 let masks = tile.masks();
-                finish(&self.finish, sums, norms, Tile { output, cout, masks });
+                finish(
+                    &self.finish,
+                    sums,
+                    norms,
+                    Tile {
+                        output,
+                        cout,
+                        masks,
+                    },
+                );
             }
         });
     }
@@ -288,7 +306,7 @@ impl ExactConv {
     fn tiles(&self) -> Option<&amx::Weights> {
         let pack = || {
             let (steps, panels) = (self.extents.cin.div_ceil(2), self.extents.panels());
-            amx::Weights::new(self.extents, |tap, channel, out| {
+            amx::Weights::of_integers(self.extents, |tap, channel, out| {
                 let panel = tap * panels + out / PANEL;
                 let pair = self.weights[panel * steps + channel / 2].0[out % PANEL];
                 (pair >> (16 * (channel % 2))) as i16

@@ -1,9 +1,14 @@
 //! Sparse convolution in floats: f16 in memory, f32 in between.
 
+#[cfg(target_arch = "x86_64")]
+use std::sync::OnceLock;
+
 use half::{bf16, f16};
 
 use crate::convert::{self, Halves};
 use crate::isa::Isa;
+#[cfg(target_arch = "x86_64")]
+use crate::machine::amx;
 use crate::machine::{self, with_halves};
 use crate::norms::{Gains, Norms};
 use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
@@ -29,6 +34,8 @@ pub enum Precision {
     /// Activations and weights are rounded to bf16 (8 significant bits) first; products are added in f32. A sum's error is at most
     /// 2⁻⁷ of its terms' magnitudes. Needs [`Isa::has_bf16`]; elsewhere it is [`Precision::F32`].
     Bf16,
+    /// [`Precision::Bf16`] where that is much faster: where [`Isa::has_tiles`].
+    Tiles,
 }
 
 /// A sparse convolution of f16 activations by f16 weights, summed in f32.
@@ -39,6 +46,10 @@ pub struct FloatConv {
     weights: Vec<Lanes>,
     /// Per tap, panel and pair of input channels: each output channel's two weights in bf16. Empty unless asked for.
     brain: Vec<Lanes>,
+    precision: Precision,
+    /// What [`Isa::has_tiles`] multiplies, once it is needed.
+    #[cfg(target_arch = "x86_64")]
+    tiles: OnceLock<amx::Weights>,
     bias: Vec<[f32; PANEL]>,
     invariant: Option<Gains<f32>>,
 }
@@ -120,6 +131,9 @@ impl FloatConv {
             extents,
             weights: packed,
             brain: Vec::new(),
+            precision: Precision::F32,
+            #[cfg(target_arch = "x86_64")]
+            tiles: OnceLock::new(),
             bias: panels(&bias),
             invariant,
         }
@@ -129,8 +143,9 @@ impl FloatConv {
     pub fn with_precision(mut self, precision: Precision) -> Self {
         let Extents { volume, cin, .. } = self.extents;
         let pairs = cin.div_ceil(2);
+        self.precision = precision;
         self.brain = match precision {
-            Precision::F32 => Vec::new(),
+            Precision::F32 | Precision::Tiles => Vec::new(),
             Precision::Bf16 => vec![Lanes::default(); volume * self.extents.panels() * pairs],
         };
         let panels = self.brain.chunks_exact_mut(pairs);
@@ -147,10 +162,7 @@ impl FloatConv {
 
     /// What it computes in, where the machine can.
     pub fn precision(&self) -> Precision {
-        match self.brain.is_empty() {
-            true => Precision::F32,
-            false => Precision::Bf16,
-        }
+        self.precision
     }
 
     /// Output channels.
@@ -204,10 +216,24 @@ impl FloatConv {
                 sums,
                 expanded,
                 norms,
+                #[cfg(target_arch = "x86_64")]
+                planner,
+                #[cfg(target_arch = "x86_64")]
+                tiles,
                 ..
             } = scratch;
             let inputs = input.len() / self.extents.cin;
             for (row, output) in output.tiles() {
+                #[cfg(target_arch = "x86_64")]
+                if isa.has_tiles() && self.precision != Precision::F32 {
+                    let plan = planner.plan(isa, &taps, [first + row, output.len()], tile);
+                    amx::brain::accumulate(isa, self.tiles(), plan, input, tiles, sums);
+                    let (conv, norms, sums, masks) = (self, &mut *norms, &sums[..], plan.masks());
+                    with_halves!(isa, fn finish_tile<T: FloatOut>(
+                        conv: &FloatConv, norms: &mut Norms, sums: &[Lanes], masks: &[u64], output: Output<'_, T, f16>,
+                    ));
+                    continue;
+                }
                 tile.fill(isa, &taps, first + row, output.len(), inputs);
                 let (arithmetic, weights, expand) = self.chosen(isa);
                 accumulate(
@@ -226,6 +252,20 @@ impl FloatConv {
                 ));
             }
         });
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl FloatConv {
+    /// The weights in tiles.
+    fn tiles(&self) -> &amx::Weights {
+        self.tiles.get_or_init(|| {
+            let (cin, panels) = (self.extents.cin, self.extents.panels());
+            amx::Weights::of_brain(self.extents, |tap, channel, out| {
+                let lanes = &self.weights[(tap * panels + out / PANEL) * cin + channel];
+                f32::from_bits(lanes.0[out % PANEL])
+            })
+        })
     }
 }
 

@@ -45,7 +45,7 @@ impl Isa {
                 && is_x86_feature_detected!("avx512vl")
                 && is_x86_feature_detected!("avx512vnni");
             return Isa(match avx512 {
-                true if amx() => Level::Amx,
+                true if is_x86_feature_detected!("avx512bf16") && amx() => Level::Amx,
                 true => Level::Avx512,
                 false => Level::Avx2,
             });

@@ -4,7 +4,7 @@ use b2p_kernels::{FloatConv, Isa, Taps, to_f16, to_f32};
 use half::f16;
 use rayon::prelude::*;
 
-use super::layers::{apply, apply_f32, concat, reals};
+use super::layers::{Pool, apply, apply_f32, concat, reals};
 use super::structure::{Convert, Encoder, ROLES};
 use super::{Model, missing};
 use crate::error::Result;
@@ -70,14 +70,14 @@ impl Model {
             "all roles but 0 have a context"
         );
         let (fs, c) = (&self.encoder()?.fs[role], self.shape.channels);
-        let rows = features.len() / c;
+        let (rows, pool) = (features.len() / c, &mut Pool::new());
         let hidden = match context {
-            None => apply(self.isa, &fs.lin1, Taps::Same, features, rows, true),
+            None => apply(pool, self.isa, &fs.lin1, Taps::Same, features, rows, true),
             Some(context) => {
                 assert_eq!(features.len(), context.len(), "one context per feature");
                 let context = reals(self.isa, context, self.c_scale[role]);
                 let x = concat(features, c, &context, c);
-                apply(self.isa, &fs.lin1, Taps::Same, &x, rows, true)
+                apply(pool, self.isa, &fs.lin1, Taps::Same, &x, rows, true)
             }
         };
         Ok(apply_f32(self.isa, &fs.lin2, Taps::Same, &hidden, rows))
@@ -95,12 +95,11 @@ impl Model {
 
 impl Convert<FloatConv> {
     fn apply(&self, isa: Isa, x: Vec<f16>, map: &KernelMap) -> Vec<f16> {
-        let x = apply(isa, &self.conv_in, map.taps(isa), &x, map.len(), false);
-        let x = self
-            .blocks
-            .iter()
-            .fold(x, |x, block| block.apply(isa, map.taps(isa), &x));
-        apply(isa, &self.conv_out, map.taps(isa), &x, map.len(), false)
+        let (n, pool) = (map.len(), &mut Pool::new());
+        let x = apply(pool, isa, &self.conv_in, map.taps(isa), &x, n, false);
+        let blocks = self.blocks.iter();
+        let x = blocks.fold(x, |x, block| block.apply(pool, isa, map.taps(isa), x));
+        apply(pool, isa, &self.conv_out, map.taps(isa), &x, n, false)
     }
 }
 

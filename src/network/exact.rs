@@ -4,7 +4,7 @@ use b2p_kernels::{ExactConv, LIMIT, Taps};
 use rayon::prelude::*;
 
 use super::Model;
-use super::layers::{apply, concat};
+use super::layers::{Pool, apply, concat};
 use super::structure::Inception;
 use crate::geometry::KernelMap;
 
@@ -30,7 +30,15 @@ impl Model {
                     parents: &parents,
                     octants: &octants,
                 };
-                apply(self.isa, &up[role - 1], taps, g, parents.len(), false)
+                apply(
+                    &mut Pool::new(),
+                    self.isa,
+                    &up[role - 1],
+                    taps,
+                    g,
+                    parents.len(),
+                    false,
+                )
             }
             None => {
                 let mut out = vec![0; parents.len() * c];
@@ -57,10 +65,11 @@ impl Model {
         assert!(role == 1 || role == 2, "role {role} has a fixed prior");
         self.check(context, self.shape.channels, map);
         let pem = &self.exact.pem[role - 1];
-        let x = apply(self.isa, &pem.conv_in, map.taps(self.isa), context, map.len(), true);
-        let x = self.blocks(&pem.blocks, x, map);
-        let mu = apply(self.isa, &pem.mu, Taps::Same, &x, map.len(), false);
-        let sigma = apply(self.isa, &pem.sigma, Taps::Same, &x, map.len(), false);
+        let (isa, n, pool) = (self.isa, map.len(), &mut Pool::new());
+        let x = apply(pool, isa, &pem.conv_in, map.taps(isa), context, n, true);
+        let x = self.blocks(pool, &pem.blocks, x, map);
+        let mu = apply(pool, isa, &pem.mu, Taps::Same, &x, n, false);
+        let sigma = apply(pool, isa, &pem.sigma, Taps::Same, &x, n, false);
         let sigma = sigma
             .into_iter()
             .map(|q| q.clamp(0, SIGMAS - 1) as u8)
@@ -95,15 +104,23 @@ impl Model {
             x = concat(&x, k, context, c);
         }
         let fr = &self.exact.fr[role];
-        let x = apply(self.isa, &fr.lin1, Taps::Same, &x, map.len(), true);
-        let x = self.blocks(&fr.blocks, x, map);
-        apply(self.isa, &fr.lin2, Taps::Same, &x, map.len(), false)
+        let (isa, n, pool) = (self.isa, map.len(), &mut Pool::new());
+        let hidden = apply(pool, isa, &fr.lin1, Taps::Same, &x, n, true);
+        pool.give(x);
+        let x = self.blocks(pool, &fr.blocks, hidden, map);
+        apply(pool, isa, &fr.lin2, Taps::Same, &x, n, false)
     }
 
-    fn blocks(&self, blocks: &[Inception<ExactConv>], x: Vec<i16>, map: &KernelMap) -> Vec<i16> {
-        blocks
-            .iter()
-            .fold(x, |x, block| block.apply(self.isa, map.taps(self.isa), &x))
+    fn blocks(
+        &self,
+        pool: &mut Pool<i16>,
+        blocks: &[Inception<ExactConv>],
+        x: Vec<i16>,
+        map: &KernelMap,
+    ) -> Vec<i16> {
+        blocks.iter().fold(x, |x, block| {
+            block.apply(pool, self.isa, map.taps(self.isa), x)
+        })
     }
 
     /// Panics unless `values` are `width` for each voxel of `map`.

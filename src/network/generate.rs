@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use b2p_kernels::{ExactConv, FloatConv, Taps};
 
-use super::layers::{Conv, apply, apply_f32, reals};
+use super::layers::{Conv, Pool, apply, apply_f32, reals};
 use super::shape::Head;
 use super::stored::Stored;
 use super::structure::{Generate, RAW};
@@ -141,24 +141,27 @@ impl Model {
         map: &KernelMap,
     ) -> Vec<f32> {
         let (isa, n) = (self.isa, map.len());
-        let x = apply(isa, &gg.conv_in, map.taps(isa), g, n, true);
-        let x = gg
-            .before
-            .iter()
-            .fold(x, |x, block| block.apply(isa, map.taps(isa), x));
-        let finish = |x: Vec<C::Value>, map: &KernelMap| {
-            let x = gg
-                .after
-                .iter()
-                .fold(x, |x, block| block.apply(isa, map.taps(isa), x));
+        let pool = &mut Pool::new();
+        let mut x = apply(pool, isa, &gg.conv_in, map.taps(isa), g, n, true);
+        for block in &gg.before {
+            x = block.apply(pool, isa, map.taps(isa), x);
+        }
+        let finish = |pool: &mut Pool<C::Value>, mut x: Vec<C::Value>, map: &KernelMap| {
+            for block in &gg.after {
+                x = block.apply(pool, isa, map.taps(isa), x);
+            }
             apply_f32(isa, &gg.conv_out, map.taps(isa), &x, map.len())
         };
         let out = if gg.head.children == 8 {
-            let x = apply(isa, &gg.layer4, Taps::Children, &x, 8 * n, false);
-            finish(x, &map.generated_children())
+            let children = apply(pool, isa, &gg.layer4, Taps::Children, &x, 8 * n, false);
+            // Theirs are eight times as large: nothing before is of use to them.
+            drop(x);
+            finish(&mut Pool::new(), children, &map.generated_children())
         } else {
-            let x = apply(isa, &gg.layer4, map.forward().taps(isa), &x, n, false);
-            finish(x, map)
+            let forward = map.forward();
+            let next = apply(pool, isa, &gg.layer4, forward.taps(isa), &x, n, false);
+            pool.give(x);
+            finish(pool, next, map)
         };
         debug_assert_eq!(out.len(), n * gg.head.children * RAW);
         out

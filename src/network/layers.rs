@@ -79,8 +79,38 @@ impl Conv for FloatConv {
     }
 }
 
+/// Memory of results that have been read, for the next ones: what is fresh from the system costs a fault every page when it is first
+/// written.
+pub(super) struct Pool<T>(Vec<Vec<T>>);
+
+impl<T: Copy + Default> Pool<T> {
+    pub fn new() -> Self {
+        Pool(Vec::new())
+    }
+
+    /// `len` values, which may be anything.
+    fn take(&mut self, len: usize) -> Vec<T> {
+        let fitting = self.0.iter().enumerate();
+        let fitting = fitting.filter(|(_, buffer)| buffer.capacity() >= len);
+        match fitting.min_by_key(|(_, buffer)| buffer.capacity()) {
+            Some((i, _)) => {
+                let mut buffer = self.0.swap_remove(i);
+                buffer.resize(len, T::default());
+                buffer
+            }
+            None => vec![T::default(); len],
+        }
+    }
+
+    /// Takes back what nobody reads any more.
+    pub fn give(&mut self, buffer: Vec<T>) {
+        self.0.push(buffer);
+    }
+}
+
 /// A layer's `rows` output rows.
 pub(super) fn apply<C: Conv>(
+    pool: &mut Pool<C::Value>,
     isa: Isa,
     conv: &C,
     taps: Taps<'_>,
@@ -88,7 +118,7 @@ pub(super) fn apply<C: Conv>(
     rows: usize,
     relu: bool,
 ) -> Vec<C::Value> {
-    let mut out = vec![C::Value::default(); rows * conv.cout()];
+    let mut out = pool.take(rows * conv.cout());
     let output = Output {
         rows: &mut out,
         stride: conv.cout(),
@@ -155,38 +185,54 @@ fn spread<T: Send, R: Sync>(
 
 impl<C: Conv> Inception<C> {
     /// `relu?(concat[a2(relu(a1(x))), b3(relu(b2(relu(b1(x)))))] + x)`, activations of both branches in ReLU.
-    pub fn apply(&self, isa: Isa, map: Taps<'_>, x: &[C::Value]) -> Vec<C::Value> {
+    pub fn apply(
+        &self,
+        pool: &mut Pool<C::Value>,
+        isa: Isa,
+        map: Taps<'_>,
+        x: Vec<C::Value>,
+    ) -> Vec<C::Value> {
         let (left, right) = (self.a2.cout(), self.b3.cout());
         let stride = left + right;
         let rows = x.len() / stride;
-        let mut out = vec![C::Value::default(); x.len()];
+        let mut out = pool.take(x.len());
         let mut branch = |conv: &C, taps: Taps<'_>, input: &[C::Value], column: usize| {
             let output = Output {
                 rows: &mut out[..],
                 stride,
                 column,
-                residual: Some(x),
+                residual: Some(&x[..]),
                 relu: self.relu,
             };
             spread(output, |first, output| {
                 conv.run(isa, taps, input, first, output)
             });
         };
-        let a = apply(isa, &self.a1, map, x, rows, true);
+        let a = apply(pool, isa, &self.a1, map, &x, rows, true);
         branch(&self.a2, map, &a, 0);
-        let b = apply(isa, &self.b1, Taps::Same, x, rows, true);
-        let b = apply(isa, &self.b2, map, &b, rows, true);
-        branch(&self.b3, Taps::Same, &b, left);
+        pool.give(a);
+        let b1 = apply(pool, isa, &self.b1, Taps::Same, &x, rows, true);
+        let b2 = apply(pool, isa, &self.b2, map, &b1, rows, true);
+        branch(&self.b3, Taps::Same, &b2, left);
+        for read in [b1, b2, x] {
+            pool.give(read);
+        }
         out
     }
 }
 
 impl<C: Conv> ResBlock<C> {
     /// `relu?(c2(relu(c1(x))) + x)`.
-    pub fn apply(&self, isa: Isa, map: Taps<'_>, x: Vec<C::Value>) -> Vec<C::Value> {
+    pub fn apply(
+        &self,
+        pool: &mut Pool<C::Value>,
+        isa: Isa,
+        map: Taps<'_>,
+        x: Vec<C::Value>,
+    ) -> Vec<C::Value> {
         let stride = self.c2.cout();
-        let inner = apply(isa, &self.c1, map, &x, x.len() / stride, true);
-        let mut out = vec![C::Value::default(); x.len()];
+        let inner = apply(pool, isa, &self.c1, map, &x, x.len() / stride, true);
+        let mut out = pool.take(x.len());
         let output = Output {
             rows: &mut out[..],
             stride,
@@ -197,6 +243,8 @@ impl<C: Conv> ResBlock<C> {
         spread(output, |first, output| {
             self.c2.run(isa, map, &inner, first, output)
         });
+        pool.give(inner);
+        pool.give(x);
         out
     }
 }

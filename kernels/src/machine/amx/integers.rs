@@ -1,0 +1,177 @@
+//! Integers in tiles of bytes.
+//!
+//! Numbers of up to 13 bits are cut into two digits, `x = 64·high + low`, each of a signed byte. Three products of digits make one of
+//! numbers: `high·high`, `low·low`, and what the two mixed ones add up to. With few input channels, both digits of a row lie in one tile
+//! row, and the mixed products are one multiplication; with many, `(high + low)·(high + low)` contains them (Karatsuba). All is added
+//! modulo 2³², as everywhere, so sums are equal to the bit.
+
+use std::arch::x86_64::*;
+
+use super::{Buffers, LINE, Scheme, Weights, multiply, prepare};
+use crate::plan::PlanTile;
+use crate::rows::{Extents, Lanes, PANEL};
+
+/// The largest magnitude whose digits, and their sum, are signed bytes.
+const REACH: i16 = 4095;
+/// Input channels whose two digits fit into a tile row.
+const NARROW: usize = 32;
+
+impl Weights {
+    /// Cuts the weights, which `weight(tap, input, output)` tells, into digits; nothing, if one is too large for that.
+    pub fn of_integers(
+        extents: Extents,
+        weight: impl Fn(usize, usize, usize) -> i16,
+    ) -> Option<Weights> {
+        let mut packed = Weights::new(
+            extents,
+            match extents.cin {
+                ..=NARROW => Scheme::Together,
+                _ => Scheme::Apart,
+            },
+        );
+        let panels = extents.panels();
+        for (tap, channel, out) in extents.each() {
+            let w = weight(tap, channel, out);
+            if w.unsigned_abs() > REACH.unsigned_abs() {
+                return None;
+            }
+            let ((high, low), (panel, lane)) = (digits(w), (out / PANEL, out % PANEL));
+            let mut put = |pass: usize, column: usize, byte: usize, digit: i8| {
+                let word = packed.word(pass, tap, byte, column, lane);
+                *word |= u32::from(digit as u8) << (8 * (byte % 4));
+            };
+            match extents.cin {
+                ..=NARROW => {
+                    let byte = channel / 8 * 16 + channel % 8;
+                    put(0, panel, byte, high);
+                    put(0, panels + panel, byte + 8, low);
+                    put(0, 2 * panels + panel, byte, low);
+                    put(0, 2 * panels + panel, byte + 8, high);
+                }
+                _ => {
+                    let (chunk, channel) = (channel / LINE, channel % LINE);
+                    let (half, channel) = (channel / 32, channel % 32);
+                    let byte = chunk * LINE + channel / 8 * 16 + 8 * half + channel % 8;
+                    put(0, panel, byte, high);
+                    put(1, panel, byte, low);
+                    put(2, panel, byte, high + low);
+                }
+            }
+        }
+        Some(packed)
+    }
+}
+
+/// `(high, low)` with `x = 64·high + low`.
+fn digits(x: i16) -> (i8, i8) {
+    let high = (x + 32) >> 6;
+    (high as i8, (x - (high << 6)) as i8)
+}
+
+/// The sums over all taps of a tile: `sums[row · panels + panel]`, overwritten. False, and no sums, if activations are too large for
+/// digits.
+///
+/// # Panics
+/// If the processor lacks AMX, or the plan reads beyond the input.
+pub(crate) fn accumulate(
+    isa: crate::Isa,
+    weights: &Weights,
+    plan: &PlanTile,
+    input: &[i16],
+    buffers: &mut Buffers,
+    sums: &mut Vec<Lanes>,
+) -> bool {
+    let cin = weights.extents.cin;
+    prepare(isa, weights, plan, input.len() / cin, buffers);
+    // SAFETY: an `Isa` with tiles is only made where the processor has AVX-512. All rows of the plan lie below its end.
+    let small = unsafe {
+        match cin {
+            ..=NARROW => together(input, cin, plan.inputs(), &mut buffers.rows),
+            _ => apart(input, cin, plan.inputs(), &mut buffers.rows),
+        }
+    };
+    if small {
+        sums.resize(
+            plan.masks().len() * weights.extents.panels(),
+            Lanes::default(),
+        );
+        // SAFETY: as above, and it has AMX; `rows` has just been filled for this plan and these weights.
+        unsafe { multiply(weights, plan, buffers, sums) };
+    }
+    small
+}
+
+/// Writes rows of at most [`NARROW`] channels as a tile row each: by eights, high digits and low ones. Zeros follow. Tells whether all
+/// were small enough.
+///
+/// # Safety
+/// The processor must have AVX-512 F, BW and VL; the input must have the rows.
+#[target_feature(enable = "avx512f,avx512bw,avx512vl")]
+unsafe fn together(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) -> bool {
+    let here = u32::MAX >> (32 - cin);
+    let mut largest = _mm512_setzero_si512();
+    let (last, to) = to.split_last_mut().expect("room for zeros");
+    for (&row, to) in rows.iter().zip(to) {
+        // SAFETY: the row's `cin` values are read, and a whole line written.
+        unsafe {
+            let x = _mm512_maskz_loadu_epi16(here, input.as_ptr().add(row as usize * cin));
+            largest = _mm512_max_epu16(largest, _mm512_abs_epi16(x));
+            let (high, low) = split(x);
+            _mm512_store_si512(std::ptr::from_mut(to).cast(), _mm512_packs_epi16(high, low));
+        }
+    }
+    *last = Lanes::default();
+    within_reach(largest)
+}
+
+/// Writes rows as tile rows of 64 channels, first the high digits of all rows, then the low ones, then their sums. Zeros follow each
+/// time. Tells whether all were small enough.
+///
+/// # Safety
+/// As [`together`].
+#[target_feature(enable = "avx512f,avx512bw,avx512vl")]
+unsafe fn apart(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) -> bool {
+    let chunks = cin.div_ceil(LINE);
+    let (highs, rest) = to.split_at_mut((rows.len() + 1) * chunks);
+    let (lows, both) = rest.split_at_mut(highs.len());
+    let mut largest = _mm512_setzero_si512();
+    for chunk in 0..chunks {
+        let there = u64::MAX >> LINE.saturating_sub(cin - chunk * LINE);
+        for (i, &row) in rows.iter().enumerate() {
+            // SAFETY: of the row's values only those that are there are read, and whole lines written.
+            unsafe {
+                let from = input.as_ptr().add(row as usize * cin + chunk * LINE);
+                let a = _mm512_maskz_loadu_epi16(there as u32, from);
+                let b = _mm512_maskz_loadu_epi16((there >> 32) as u32, from.wrapping_add(32));
+                largest = _mm512_max_epu16(largest, _mm512_abs_epi16(a));
+                largest = _mm512_max_epu16(largest, _mm512_abs_epi16(b));
+                let ((high_a, low_a), (high_b, low_b)) = (split(a), split(b));
+                let high = _mm512_packs_epi16(high_a, high_b);
+                let low = _mm512_packs_epi16(low_a, low_b);
+                let at = i * chunks + chunk;
+                _mm512_store_si512(std::ptr::from_mut(&mut highs[at]).cast(), high);
+                _mm512_store_si512(std::ptr::from_mut(&mut lows[at]).cast(), low);
+                let sum = _mm512_add_epi8(high, low);
+                _mm512_store_si512(std::ptr::from_mut(&mut both[at]).cast(), sum);
+            }
+        }
+    }
+    for zeros in [highs, lows, both] {
+        zeros[rows.len() * chunks..].fill(Lanes::default());
+    }
+    within_reach(largest)
+}
+
+/// [`digits`] of 32 numbers.
+#[target_feature(enable = "avx512f,avx512bw")]
+#[inline]
+fn split(x: __m512i) -> (__m512i, __m512i) {
+    let high = _mm512_srai_epi16::<6>(_mm512_add_epi16(x, _mm512_set1_epi16(32)));
+    (high, _mm512_sub_epi16(x, _mm512_slli_epi16::<6>(high)))
+}
+
+#[target_feature(enable = "avx512f,avx512bw")]
+#[inline]
+fn within_reach(largest: __m512i) -> bool {
+    _mm512_cmpgt_epu16_mask(largest, _mm512_set1_epi16(REACH)) == 0
+}
