@@ -13,19 +13,18 @@ import math
 import subprocess
 from pathlib import Path
 
-# Bit depth, share of the cube's side, points drawn on the surface.
-CLOUDS = [(6, 0.95, 10**6), (7, 0.95, 3 * 10**6), (8, 0.95, 10**7), (9, 0.95, 15 * 10**6), (10, 0.95, 4 * 10**7), (11, 0.95, 10**8)]
+# Bit depth, points drawn on the surface.
+CLOUDS = [(6, 10**6), (7, 3 * 10**6), (8, 10**7), (9, 15 * 10**6), (10, 4 * 10**7), (11, 10**8)]
 OBJECT = "procedural:stone"
 
 
-def prepare(programs, folder, bits, fill, points):
+def prepare(programs, folder, bits, points):
     """The stream of one cloud, or nothing with the reason printed."""
-    stem = folder / f"{bits}-{fill}"
-    cloud, stream = stem.with_suffix(".ply"), stem.with_suffix(".b2p")
+    cloud, stream = folder / f"{bits}.ply", folder / f"{bits}.b2p"
     if not stream.exists():
         if not cloud.exists():
-            subprocess.run([programs / "b2p-lab", "voxelize", OBJECT, "-o", cloud, "--bits", str(bits), "--fill", str(fill),
-                            "--points", str(points)], check=True)
+            subprocess.run([programs / "b2p-lab", "voxelize", OBJECT, "-o", cloud, "--bits", str(bits), "--points", str(points)],
+                           check=True)
         done = subprocess.run([programs / "b2p", "-q", "encode", cloud, "-o", stream], capture_output=True, text=True)
         if done.returncode:
             print(f"{cloud}: {done.stderr.strip()}")
@@ -74,7 +73,7 @@ def main():
     p.add_argument("--most", type=float, default=math.inf, help="the most points to draw for a cloud")
     args = p.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
-    clouds = [cloud for cloud in CLOUDS if cloud[2] <= args.most]
+    clouds = [cloud for cloud in CLOUDS if cloud[1] <= args.most]
     streams = [stream for cloud in clouds if (stream := prepare(args.programs, args.folder, *cloud))]
     if args.prepare:
         return

@@ -81,7 +81,7 @@ impl Conv for FloatConv {
 
 /// Memory of results that have been read, for the next ones: what is fresh from the system costs a fault every page when it is first
 /// written.
-pub(super) struct Pool<T>(Vec<Vec<T>>);
+pub(crate) struct Pool<T>(Vec<Vec<T>>);
 
 impl<T: Copy + Default> Pool<T> {
     pub fn new() -> Self {

@@ -1,6 +1,6 @@
 //! Integers: equal to the bit.
 
-use b2p_kernels::{ExactConv, Isa, LIMIT, Output, Requantise, Taps, reference};
+use b2p_kernels::{ExactConv, Isa, LIMIT, Output, Plan, PlanTile, Requantise, Taps, reference};
 
 use crate::cases::{Random, cases, kernels, whole};
 
@@ -224,6 +224,50 @@ fn a_layer_writes_only_its_own_columns_and_rows_from_the_first_on() {
         for (i, row) in out.chunks(8).enumerate() {
             assert_eq!(row[2..5], whole[(170 + i) * 3..][..3], "{isa}: row {i}");
             assert!(row[..2].iter().chain(&row[5..]).all(|&x| x == i16::MIN));
+        }
+    }
+}
+
+#[test]
+fn a_plan_changes_nothing() {
+    let mut random = Random(5);
+    let [rows, cin, cout] = [1300, 40, 24];
+    let (taps, _) = kernels(&mut random, rows).swap_remove(5);
+    let Taps::Map {
+        volume,
+        rows: map,
+        plan: None,
+    } = taps.taps()
+    else {
+        panic!("the sixth kernel is a surface's");
+    };
+    let weights: Vec<i16> = (0..volume * cin * cout)
+        .map(|_| random.signed(2047) as i16)
+        .collect();
+    let input: Vec<i16> = (0..rows * cin)
+        .map(|_| random.signed(2047) as i16)
+        .collect();
+    let requantise = Requantise::Invariant {
+        gain: vec![0.5; cout],
+        bias: vec![0.0; cout],
+    };
+    let conv = ExactConv::new(volume, cin, cout, &weights, requantise);
+    for isa in Isa::available() {
+        let tiles = map.chunks(PlanTile::ROWS * volume);
+        let plan: Plan = tiles.map(|rows| PlanTile::new(isa, volume, rows)).collect();
+        // From a tile's first row on, and from amid one.
+        for first in [0, 512, 700] {
+            let run = |plan| {
+                let mut out = vec![i16::MIN; (rows - first) * cout];
+                let taps = Taps::Map {
+                    volume,
+                    rows: map,
+                    plan,
+                };
+                conv.run(isa, taps, &input, first, whole(&mut out, cout, None, true));
+                out
+            };
+            assert!(run(Some(&plan)) == run(None), "{isa}, from row {first}");
         }
     }
 }
