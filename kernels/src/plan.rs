@@ -1,5 +1,7 @@
 //! Kernel maps as matrix tiles want them: few input rows, each known by a short number, and output rows of like neighbours together.
 
+use std::ops::Range;
+
 use crate::isa::Isa;
 use crate::rows::{TILE, with_scratch};
 use crate::taps::{Taps, TileTaps};
@@ -37,7 +39,6 @@ impl Plan {
 /// Up to [`PlanTile::ROWS`] rows of a kernel map, arranged.
 ///
 /// Rows are sorted by which taps they use, and cut into groups of sixteen: what a group multiplies is the taps that any of its rows uses.
-/// Two groups at a time share the weights.
 #[derive(Debug, Clone, Default)]
 pub struct PlanTile {
     /// Taps of the kernel.
@@ -50,33 +51,14 @@ pub struct PlanTile {
     masks: Vec<u64>,
     /// The rows in the order of the groups.
     order: Vec<u16>,
-    /// What two groups multiply, for every two.
-    pairs: Vec<Pair>,
-    /// Of all pairs.
+    /// For each group, the taps that any of its rows uses.
+    unions: Vec<u64>,
+    /// Where each group's steps begin.
+    starts: Vec<u32>,
+    /// Each step's tap; they ascend within a group.
     taps: Vec<u8>,
-    /// Likewise.
+    /// For each step, which of `inputs` the group's rows read; their number for nothing. One more, of nothing, comes last.
     places: Vec<[u16; GROUP]>,
-}
-
-/// What two groups multiply.
-#[derive(Debug, Clone)]
-struct Pair {
-    /// Taps that both use, that the first uses alone, that the second uses alone.
-    counts: [usize; 3],
-    /// Where the pair's taps begin.
-    taps: usize,
-    /// Where its places begin: for each tap those of the first group, if it uses it, then those of the second.
-    places: usize,
-}
-
-/// What two groups multiply, in this order.
-pub(crate) struct Steps<'a> {
-    /// Taps that both use, that the first uses alone, that the second uses alone.
-    pub counts: [usize; 3],
-    /// The taps.
-    pub taps: &'a [u8],
-    /// For each tap which of the inputs the rows of each group that uses it read; the inputs' number for nothing.
-    pub places: &'a [[u16; GROUP]],
 }
 
 impl PlanTile {
@@ -110,19 +92,38 @@ impl PlanTile {
         self.end = taps.end();
         self.masks.clear();
         self.masks.extend_from_slice(masks);
-        self.sort();
+        self.sort(volume);
         let mut position = [0u16; TILE];
         for (at, &row) in (0..).zip(&self.order) {
             position[usize::from(row)] = at;
         }
-        let homes = self.pair();
+        self.unions.clear();
+        self.starts.clear();
+        self.taps.clear();
+        for group in self.order.chunks(GROUP) {
+            let rows = group.iter().map(|&row| masks[usize::from(row)]);
+            let mut union = rows.fold(0, |union, mask| union | mask);
+            self.unions.push(union);
+            self.starts.push(self.taps.len() as u32);
+            while union != 0 {
+                self.taps.push(union.trailing_zeros() as u8);
+                union &= union - 1;
+            }
+        }
+
         numbers.clear(&mut self.inputs);
-        for (k, homes) in homes.iter().enumerate().take(volume) {
+        self.places.clear();
+        self.places.resize(self.taps.len() + 1, [u16::MAX; GROUP]);
+        for k in 0..volume {
+            let mut homes = [0; TILE / GROUP];
+            for (group, home) in homes.iter_mut().take(self.unions.len()).enumerate() {
+                *home = self.step(group, k);
+            }
             let pairs = taps.of(k);
             for (&input, &row) in pairs.inputs.iter().zip(pairs.rows) {
                 let at = usize::from(position[row as usize]);
-                let home = usize::from(homes[at / GROUP]);
-                self.places[home][at % GROUP] = numbers.of(input, &mut self.inputs);
+                let place = numbers.of(input, &mut self.inputs);
+                self.places[homes[at / GROUP]][at % GROUP] = place;
             }
         }
         let none = self.inputs.len() as u16;
@@ -131,47 +132,14 @@ impl PlanTile {
         }
     }
 
-    /// Lists the taps of every two groups, and makes room for their places; tells which places are those of a tap's group.
-    fn pair(&mut self) -> [[u16; TILE / GROUP]; 64] {
-        let mut homes = [[0; TILE / GROUP]; 64];
-        self.pairs.clear();
-        self.taps.clear();
-        let mut places = 0;
-        for (pair, rows) in self.order.chunks(2 * GROUP).enumerate() {
-            let mut unions = [0; 2];
-            for (union, rows) in unions.iter_mut().zip(rows.chunks(GROUP)) {
-                let masks = rows.iter().map(|&row| self.masks[usize::from(row)]);
-                *union = masks.fold(0, |union, mask| union | mask);
-            }
-            let [mine, others] = unions;
-            let kinds = [mine & others, mine & !others, others & !mine];
-            self.pairs.push(Pair {
-                counts: kinds.map(|taps| taps.count_ones() as usize),
-                taps: self.taps.len(),
-                places: usize::from(places),
-            });
-            for mut rest in kinds {
-                while rest != 0 {
-                    let k = rest.trailing_zeros() as usize;
-                    rest &= rest - 1;
-                    self.taps.push(k as u8);
-                    for (group, union) in unions.iter().enumerate() {
-                        if union >> k & 1 == 1 {
-                            homes[k][2 * pair + group] = places;
-                            places += 1;
-                        }
-                    }
-                }
-            }
-        }
-        self.places.clear();
-        self.places.resize(places.into(), [u16::MAX; GROUP]);
-        homes
+    /// The first step of a group whose tap is `k` or beyond.
+    fn step(&self, group: usize, k: usize) -> usize {
+        let before = self.unions[group] & ((1 << k) - 1);
+        self.starts[group] as usize + before.count_ones() as usize
     }
 
     /// Orders rows by their masks in reflected binary, the taps that half of the rows use first: neighbours then differ in few taps.
-    fn sort(&mut self) {
-        let volume = self.volume;
+    fn sort(&mut self, volume: usize) {
         self.order.clear();
         self.order.extend(0..self.masks.len() as u16);
         if volume == 1 {
@@ -219,28 +187,22 @@ impl PlanTile {
         &self.masks
     }
 
-    /// Pairs of groups.
-    pub(crate) fn pairs(&self) -> usize {
-        self.pairs.len()
+    /// Groups.
+    pub(crate) fn groups(&self) -> usize {
+        self.unions.len()
     }
 
-    /// The tile's rows of a pair's two groups, at most [`GROUP`] each.
-    pub(crate) fn rows(&self, pair: usize) -> impl Iterator<Item = &[u16]> {
-        self.order.chunks(GROUP).skip(2 * pair).take(2)
+    /// The tile's rows of a group.
+    pub(crate) fn rows(&self, group: usize) -> &[u16] {
+        let rows = &self.order[group * GROUP..];
+        &rows[..rows.len().min(GROUP)]
     }
 
-    /// What a pair of groups multiplies.
-    pub(crate) fn steps(&self, pair: usize) -> Steps<'_> {
-        let Pair {
-            counts,
-            taps,
-            places,
-        } = self.pairs[pair];
-        Steps {
-            counts,
-            taps: &self.taps[taps..][..counts.iter().sum()],
-            places: &self.places[places..][..2 * counts[0] + counts[1] + counts[2]],
-        }
+    /// What a group multiplies of some taps, ascending: the taps it uses, and for each of them the places of the input rows, followed by
+    /// one more.
+    pub(crate) fn steps(&self, group: usize, taps: Range<usize>) -> (&[u8], &[[u16; GROUP]]) {
+        let (start, end) = (self.step(group, taps.start), self.step(group, taps.end));
+        (&self.taps[start..end], &self.places[start..=end])
     }
 }
 
@@ -347,29 +309,16 @@ mod tests {
                 .collect();
             let plan = PlanTile::new(Isa::SCALAR, volume, &rows);
             let mut found = vec![ABSENT; rows.len()];
-            for pair in 0..plan.pairs() {
-                let Steps {
-                    counts,
-                    taps,
-                    places,
-                } = plan.steps(pair);
-                let groups: Vec<&[u16]> = plan.rows(pair).collect();
-                let mut places = places.iter();
-                for (step, &tap) in taps.iter().enumerate() {
-                    let of = match step {
-                        step if step < counts[0] => 0..2,
-                        step if step < counts[0] + counts[1] => 0..1,
-                        _ => 1..2,
-                    };
-                    for group in of {
-                        for (&row, &place) in groups[group].iter().zip(places.next().unwrap()) {
-                            if let Some(&input) = plan.inputs().get(usize::from(place)) {
-                                found[usize::from(row) * volume + usize::from(tap)] = input;
-                            }
+            for group in 0..plan.groups() {
+                let (taps, places) = plan.steps(group, 0..volume);
+                assert!(taps.is_sorted_by(|a, b| a < b));
+                for (&tap, places) in taps.iter().zip(places) {
+                    for (&row, &place) in plan.rows(group).iter().zip(places) {
+                        if let Some(&input) = plan.inputs().get(usize::from(place)) {
+                            found[usize::from(row) * volume + usize::from(tap)] = input;
                         }
                     }
                 }
-                assert!(places.next().is_none());
             }
             assert_eq!(found, rows);
             let mut inputs = plan.inputs().to_vec();

@@ -6,15 +6,16 @@ pub(crate) mod brain;
 pub(crate) mod integers;
 
 use std::arch::asm;
-use std::arch::x86_64::*;
 
-use crate::plan::{GROUP, PlanTile, Steps};
+use crate::plan::{GROUP, PlanTile};
 use crate::rows::{Extents, Lanes, PANEL};
 
 /// Bytes of a tile row.
 const LINE: usize = 64;
 /// [`Lanes`] of a tile.
 const TILE: usize = 16;
+/// Tiles of weights that the first cache holds besides rows and products.
+const CACHED: usize = 28;
 
 /// What is in the tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -73,6 +74,12 @@ impl Weights {
         }
     }
 
+    /// Columns that are multiplied at once: as many in each block.
+    fn width(&self) -> usize {
+        let blocks = self.columns().div_ceil(4);
+        self.columns().div_ceil(blocks)
+    }
+
     /// The word that multiplies the bytes from `byte` on of a tap's tile rows.
     fn word(
         &mut self,
@@ -94,12 +101,10 @@ impl Weights {
 pub(crate) struct Buffers {
     /// The input rows that a tile reads, as tile rows, and a row of zeros: `[pass][row][chunk]`.
     rows: Vec<Lanes>,
-    /// The tiles that two groups multiply.
+    /// What a group multiplies now, and what next.
     gathered: Vec<Lanes>,
-    /// The products of two groups: `[pass][column][group]` tiles.
+    /// The products: `[pass][block of columns][group][column]` tiles.
     products: Vec<Lanes>,
-    /// Where the weights lie that two groups multiply.
-    offsets: Vec<usize>,
 }
 
 /// Room for a plan's input rows, once it is known that they are there.
@@ -130,99 +135,103 @@ fn prepare(
 
 /// # Safety
 /// The processor must have AMX and AVX-512 F and BW, `buffers.rows` the plan's input rows in tile rows as the weights' scheme has them.
+///
+/// Weights of all taps are more than the first cache holds: for as many taps as do fit, all groups are multiplied by them, and their sums
+/// stored and loaded again with the next taps.
 #[target_feature(enable = "avx2,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512vl")]
 unsafe fn multiply(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, sums: &mut [Lanes]) {
     let Buffers {
         rows,
         gathered,
         products,
-        offsets,
     } = buffers;
     let Extents { volume, .. } = weights.extents;
     let (chunks, columns, passes) = (weights.chunks(), weights.columns(), weights.passes());
-    let (per_pass, lines) = (volume * chunks * columns, rows.len() / passes);
-    gathered.resize(2 * volume * chunks * TILE, Lanes::default());
-    products.resize(2 * passes * columns * TILE, Lanes::default());
+    let (per_tap, lines) = (chunks * columns * TILE, rows.len() / passes);
+    let (width, groups) = (weights.width(), plan.groups());
+    gathered.resize(2 * TILE, Lanes::default());
+    products.resize(passes * columns * groups * TILE, Lanes::default());
     configure();
-    for pair in 0..plan.pairs() {
-        let steps = plan.steps(pair);
-        offsets.clear();
-        for &tap in steps.taps {
-            let first = usize::from(tap) * chunks;
-            offsets.extend((first..first + chunks).map(|tile| tile * columns * TILE * LINE));
-        }
-        for pass in 0..passes {
-            let rows = &rows[pass * lines..][..lines];
-            // SAFETY: as promised; there is room for the tiles of two groups, all taps and chunks.
-            unsafe { gather(&steps, chunks, rows, gathered) };
-            let tiles = &weights.tiles[pass * per_pass * TILE..][..per_pass * TILE];
-            let mut column = 0;
-            while column < columns {
-                let to = &mut products[2 * (pass * columns + column) * TILE..];
-                let block = Block {
-                    counts: steps.counts.map(|count| count * chunks),
-                    offsets: offsets.as_ptr(),
-                    a: gathered.as_ptr(),
-                    b: tiles[column * TILE..].as_ptr(),
-                    to: to.as_mut_ptr(),
-                };
-                // SAFETY: `gathered` has the steps' tiles, `tiles` those of their weights, this column's and where there is one the
-                // next one's; `to` has room for two tiles a column. Tiles are configured.
-                unsafe {
-                    column += match (columns - column, weights.scheme) {
-                        (1, Scheme::Brain) => one_brain(&block),
-                        (_, Scheme::Brain) => two_brain(&block),
-                        (1, _) => one(&block),
-                        _ => two(&block),
+    for pass in 0..passes {
+        for column in (0..columns).step_by(width) {
+            let width = width.min(columns - column);
+            let first = (pass * columns + column) * groups * TILE;
+            let products = &mut products[first..][..width * groups * TILE];
+            let taps = (CACHED / width).max(1);
+            for (tap, chunk) in (0..volume)
+                .step_by(taps)
+                .flat_map(|tap| (0..chunks).map(move |chunk| (tap, chunk)))
+            {
+                let tile = (pass * volume * chunks + chunk) * columns + column;
+                for (group, to) in products.chunks_exact_mut(width * TILE).enumerate() {
+                    let (taps, places) = plan.steps(group, tap..(tap + taps).min(volume));
+                    let block = Block {
+                        steps: taps.len(),
+                        taps: taps.as_ptr(),
+                        places: places.as_ptr(),
+                        rows: rows[pass * lines + chunk..].as_ptr(),
+                        row: chunks * LINE,
+                        gathered: gathered.as_mut_ptr(),
+                        weights: weights.tiles[tile * TILE..].as_ptr(),
+                        tap: per_tap * LINE,
+                        to: to.as_mut_ptr(),
+                        more: usize::from(tap + chunk > 0),
                     };
+                    // SAFETY: all rows that the places name are there, and one of zeros; so are the weights of all taps from this
+                    // chunk and column on, room for two tiles and for the products. Tiles are configured.
+                    unsafe { block.run(width, weights.scheme) };
                 }
             }
         }
-        for (group, rows) in plan.rows(pair).enumerate() {
-            combine(weights, rows, &products[group * TILE..], sums);
-        }
     }
     release();
-}
-
-/// Copies the rows that two groups multiply into tiles: for each tap and chunk the first group's, if it uses the tap, then the second's.
-///
-/// # Safety
-/// The processor must have AVX-512 F; `rows` must have as many rows as the places say, of so many chunks, and `to` room for all tiles.
-#[target_feature(enable = "avx512f")]
-#[inline]
-unsafe fn gather(steps: &Steps, chunks: usize, rows: &[Lanes], to: &mut [Lanes]) {
-    let (both, one) = steps.places.split_at(2 * steps.counts[0]);
-    let mut to = to.as_mut_ptr();
-    let mut copy = |places: &[u16; GROUP], chunk: usize| {
-        for &place in places {
-            // SAFETY: the caller's promise.
-            unsafe {
-                let line = rows.as_ptr().add(usize::from(place) * chunks + chunk);
-                _mm512_store_si512(to.cast(), _mm512_load_si512(line.cast()));
-                to = to.add(1);
-            }
-        }
-    };
-    for places in both.chunks_exact(2).chain(one.chunks_exact(1)) {
-        for chunk in 0..chunks {
-            places.iter().for_each(|places| copy(places, chunk));
-        }
+    for group in 0..groups {
+        combine(weights, plan.rows(group), [group, groups], products, sums);
     }
 }
 
-/// Two groups' steps by some columns of tiles.
+/// Some steps of one group by some columns of tiles.
 struct Block {
-    /// Steps of both groups, of the first alone, of the second alone.
-    counts: [usize; 3],
-    /// Where each step's weights lie, in bytes from `b`.
-    offsets: *const usize,
-    /// The steps' tiles of input rows.
-    a: *const Lanes,
-    /// Weights.
-    b: *const Lanes,
-    /// Two tiles of products for each column.
+    /// Steps.
+    steps: usize,
+    /// Each step's tap.
+    taps: *const u8,
+    /// For each step, and one more, which of the rows to multiply.
+    places: *const [u16; GROUP],
+    /// Input rows.
+    rows: *const Lanes,
+    /// Bytes from one to the next.
+    row: usize,
+    /// Room for two tiles.
+    gathered: *mut Lanes,
+    /// Tiles of weights of the first tap.
+    weights: *const Lanes,
+    /// Bytes from one tap's to the next's.
+    tap: usize,
+    /// The products, a tile for each column.
     to: *mut Lanes,
+    /// Whether there already are some to add to, or 0.
+    more: usize,
+}
+
+impl Block {
+    /// # Safety
+    /// Tiles must be configured, and the pointers hold what they promise for so many columns.
+    unsafe fn run(&self, columns: usize, scheme: Scheme) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match (columns, scheme) {
+                (1, Scheme::Brain) => one_brain(self),
+                (2, Scheme::Brain) => two_brain(self),
+                (3, Scheme::Brain) => three_brain(self),
+                (_, Scheme::Brain) => four_brain(self),
+                (1, _) => one(self),
+                (2, _) => two(self),
+                (3, _) => three(self),
+                _ => four(self),
+            }
+        }
+    }
 }
 
 /// Lays out eight tiles of 16 rows by 64 bytes.
@@ -243,128 +252,210 @@ fn release() {
     unsafe { asm!("tilerelease", options(nostack, preserves_flags, nomem)) };
 }
 
-/// A function that multiplies two groups by some columns of tiles, summing in tile registers over all steps, and gives the number of
-/// columns.
-///
-/// `$column($sums, $others, $weight, $at)`: for each column the registers of its sums for the first and second group, that of its
-/// weights, and where these lie.
+/// Copies the rows of one step into a tile: one instruction after the other, for they are to fill what time multiplications leave.
+macro_rules! gather {
+    () => {
+        concat!(
+            "movzx {at:e}, word ptr [{places} + 0]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm16, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 0], zmm16\n",
+            "movzx {at:e}, word ptr [{places} + 2]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm17, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 64], zmm17\n",
+            "movzx {at:e}, word ptr [{places} + 4]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm18, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 128], zmm18\n",
+            "movzx {at:e}, word ptr [{places} + 6]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm19, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 192], zmm19\n",
+            "movzx {at:e}, word ptr [{places} + 8]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm20, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 256], zmm20\n",
+            "movzx {at:e}, word ptr [{places} + 10]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm21, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 320], zmm21\n",
+            "movzx {at:e}, word ptr [{places} + 12]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm22, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 384], zmm22\n",
+            "movzx {at:e}, word ptr [{places} + 14]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm23, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 448], zmm23\n",
+            "movzx {at:e}, word ptr [{places} + 16]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm16, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 512], zmm16\n",
+            "movzx {at:e}, word ptr [{places} + 18]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm17, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 576], zmm17\n",
+            "movzx {at:e}, word ptr [{places} + 20]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm18, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 640], zmm18\n",
+            "movzx {at:e}, word ptr [{places} + 22]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm19, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 704], zmm19\n",
+            "movzx {at:e}, word ptr [{places} + 24]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm20, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 768], zmm20\n",
+            "movzx {at:e}, word ptr [{places} + 26]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm21, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 832], zmm21\n",
+            "movzx {at:e}, word ptr [{places} + 28]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm22, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 896], zmm22\n",
+            "movzx {at:e}, word ptr [{places} + 30]\n",
+            "imul {at}, {row}\n",
+            "vmovdqa64 zmm23, [{rows} + {at}]\n",
+            "vmovdqa64 [{next} + 960], zmm23\n",
+        )
+    };
+}
+
+/// A function that multiplies a block by some columns of tiles, summing in tile registers: for each column that of its sums, one for its
+/// weights, and where these lie. Each step's rows are gathered while the one before is multiplied.
 macro_rules! columns {
-    ($(#[$doc:meta])* $name:ident, $count:literal, $multiply:literal, $(($first:literal, $second:literal, $weight:literal, $at:literal, $to:literal)),*) => {
+    ($(#[$doc:meta])* $name:ident, $multiply:literal, $(($sum:literal, $weight:literal, $at:literal)),*) => {
         $(#[$doc])*
         ///
         /// # Safety
         /// Tiles must be configured, and the block's pointers hold what they promise for these columns.
-        unsafe fn $name(block: &Block) -> usize {
+        unsafe fn $name(block: &Block) {
             // SAFETY: the caller's promise. All registers that are written are named.
             unsafe {
                 asm!(
-                    $(concat!("tilezero tmm", $first), concat!("tilezero tmm", $second),)*
-                    "test {both}, {both}",
-                    "jz 3f",
+                    "test {at}, {at}",
+                    "jnz 2f",
+                    $(concat!("tilezero tmm", $sum),)*
+                    "jmp 3f",
                     "2:",
-                    "mov {at}, qword ptr [{weights}]",
-                    "tileloadd tmm4, [{a} + {line}]",
-                    "tileloadd tmm5, [{a} + {line} + 1024]",
-                    "add {at}, {b}",
-                    $(
-                        concat!("tileloadd tmm", $weight, ", [{at} + {line} + ", $at, "]"),
-                        concat!($multiply, " tmm", $first, ", tmm4, tmm", $weight),
-                        concat!($multiply, " tmm", $second, ", tmm5, tmm", $weight),
-                    )*
-                    "add {a}, 2048",
-                    "add {weights}, 8",
-                    "dec {both}",
-                    "jnz 2b",
-                    "3:",
-                    "test {mine}, {mine}",
+                    "test {steps}, {steps}",
                     "jz 5f",
+                    $(concat!("tileloadd tmm", $sum, ", [{to} + {line} + ", $at, "]"),)*
+                    "3:",
+                    "test {steps}, {steps}",
+                    "jz 6f",
+                    gather!(),
                     "4:",
-                    "mov {at}, qword ptr [{weights}]",
-                    "tileloadd tmm4, [{a} + {line}]",
-                    "add {at}, {b}",
+                    "xchg {now}, {next}",
+                    "add {places}, 32",
+                    gather!(),
+                    "movzx {at:e}, byte ptr [{taps}]",
+                    "imul {at}, {tap}",
+                    "add {at}, {weights}",
+                    "tileloadd tmm4, [{now} + {line}]",
                     $(
                         concat!("tileloadd tmm", $weight, ", [{at} + {line} + ", $at, "]"),
-                        concat!($multiply, " tmm", $first, ", tmm4, tmm", $weight),
+                        concat!($multiply, " tmm", $sum, ", tmm4, tmm", $weight),
                     )*
-                    "add {a}, 1024",
-                    "add {weights}, 8",
-                    "dec {mine}",
+                    "inc {taps}",
+                    "dec {steps}",
                     "jnz 4b",
-                    "5:",
-                    "test {others}, {others}",
-                    "jz 7f",
                     "6:",
-                    "mov {at}, qword ptr [{weights}]",
-                    "tileloadd tmm5, [{a} + {line}]",
-                    "add {at}, {b}",
-                    $(
-                        concat!("tileloadd tmm", $weight, ", [{at} + {line} + ", $at, "]"),
-                        concat!($multiply, " tmm", $second, ", tmm5, tmm", $weight),
-                    )*
-                    "add {a}, 1024",
-                    "add {weights}, 8",
-                    "dec {others}",
-                    "jnz 6b",
-                    "7:",
-                    $(
-                        concat!("tilestored [{to} + {line} + 2*", $at, "], tmm", $first),
-                        concat!("tilestored [{to} + {line} + 2*", $at, " + 1024], tmm", $second),
-                    )*
-                    a = inout(reg) block.a => _,
-                    b = in(reg) block.b,
+                    $(concat!("tilestored [{to} + {line} + ", $at, "], tmm", $sum),)*
+                    "5:",
+                    steps = inout(reg) block.steps => _,
+                    taps = inout(reg) block.taps => _,
+                    places = inout(reg) block.places => _,
+                    rows = in(reg) block.rows,
+                    row = in(reg) block.row,
+                    next = inout(reg) block.gathered => _,
+                    now = inout(reg) block.gathered.add(TILE) => _,
+                    weights = in(reg) block.weights,
+                    tap = in(reg) block.tap,
                     to = in(reg) block.to,
-                    at = out(reg) _,
-                    weights = inout(reg) block.offsets => _,
-                    both = inout(reg) block.counts[0] => _,
-                    mine = inout(reg) block.counts[1] => _,
-                    others = inout(reg) block.counts[2] => _,
+                    at = inout(reg) block.more => _,
                     line = in(reg) LINE,
                     out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
                     out("tmm4") _, out("tmm5") _, out("tmm6") _, out("tmm7") _,
+                    out("zmm16") _, out("zmm17") _, out("zmm18") _, out("zmm19") _,
+                    out("zmm20") _, out("zmm21") _, out("zmm22") _, out("zmm23") _,
                     options(nostack),
                 );
             }
-            $count
         }
     };
 }
 
 columns!(
-    /// One column of bf16.
-    one_brain, 1, "tdpbf16ps", ("0", "1", "6", "0", "0")
-);
-columns!(
-    /// Two columns of bf16.
-    two_brain, 2, "tdpbf16ps", ("0", "1", "6", "0", "0"), ("2", "3", "7", "1024", "2048")
-);
-columns!(
     /// One column.
-    one, 1, "tdpbssd", ("0", "1", "6", "0", "0")
+    one, "tdpbssd", ("0", "5", "0")
 );
 columns!(
     /// Two columns.
-    two, 2, "tdpbssd", ("0", "1", "6", "0", "0"), ("2", "3", "7", "1024", "2048")
+    two, "tdpbssd", ("0", "5", "0"), ("1", "6", "1024")
+);
+columns!(
+    /// Three columns.
+    three, "tdpbssd", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048")
+);
+columns!(
+    /// Four columns.
+    four, "tdpbssd", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048"), ("3", "5", "3072")
+);
+columns!(
+    /// One column of bf16.
+    one_brain, "tdpbf16ps", ("0", "5", "0")
+);
+columns!(
+    /// Two columns of bf16.
+    two_brain, "tdpbf16ps", ("0", "5", "0"), ("1", "6", "1024")
+);
+columns!(
+    /// Three columns of bf16.
+    three_brain, "tdpbf16ps", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048")
+);
+columns!(
+    /// Four columns of bf16.
+    four_brain, "tdpbf16ps", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048"), ("3", "5", "3072")
 );
 
-/// Puts together the products for the rows of a group. `products` begins with the group's first tile.
+/// Puts together the products for the rows of a group.
 #[target_feature(enable = "avx512f")]
 #[inline]
-fn combine(weights: &Weights, rows: &[u16], products: &[Lanes], sums: &mut [Lanes]) {
+fn combine(
+    weights: &Weights,
+    rows: &[u16],
+    [group, groups]: [usize; 2],
+    products: &[Lanes],
+    sums: &mut [Lanes],
+) {
     let panels = weights.extents.panels();
-    for (at, &row) in rows.iter().enumerate() {
-        let sums = &mut sums[usize::from(row) * panels..][..panels];
-        for (panel, sum) in sums.iter_mut().enumerate() {
-            let product = |which: usize| products[2 * (which * panels + panel) * TILE + at].0;
-            if weights.scheme == Scheme::Brain {
-                sum.0 = product(0);
-                continue;
-            }
-            let (high, low, mixed) = (product(0), product(1), product(2));
+    let (columns, block) = (weights.columns(), weights.width());
+    // The tile of a pass's column: blocks of columns, then groups, then the block's columns.
+    let tile = |pass: usize, column: usize| {
+        let first = column - column % block;
+        let width = block.min(columns - first);
+        let tile = (pass * columns + first) * groups + group * width + column - first;
+        &products[tile * TILE..][..TILE]
+    };
+    for panel in 0..panels {
+        let [high, low, mixed] = match weights.scheme {
+            Scheme::Together => [0, 1, 2].map(|which| tile(0, which * panels + panel)),
+            Scheme::Apart => [0, 1, 2].map(|pass| tile(pass, panel)),
+            Scheme::Brain => [tile(0, panel); 3],
+        };
+        for (at, &row) in rows.iter().enumerate() {
+            let (high, low, mixed) = (high[at].0, low[at].0, mixed[at].0);
+            let sum = &mut sums[usize::from(row) * panels + panel];
             sum.0 = std::array::from_fn(|lane: usize| {
                 let (high, low) = (high[lane], low[lane]);
                 let mixed = match weights.scheme {
+                    Scheme::Brain => return high,
                     Scheme::Apart => mixed[lane].wrapping_sub(high).wrapping_sub(low),
-                    _ => mixed[lane],
+                    Scheme::Together => mixed[lane],
                 };
                 (high << 12).wrapping_add(mixed << 6).wrapping_add(low)
             });
