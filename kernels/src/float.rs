@@ -34,8 +34,6 @@ pub enum Precision {
     /// Activations and weights are rounded to bf16 (8 significant bits) first; products are added in f32. A sum's error is at most
     /// 2⁻⁷ of its terms' magnitudes. Needs [`Isa::has_bf16`]; elsewhere it is [`Precision::F32`].
     Bf16,
-    /// [`Precision::Bf16`] where that is much faster: where [`Isa::has_tiles`].
-    Tiles,
 }
 
 /// A sparse convolution of f16 activations by f16 weights, summed in f32.
@@ -145,7 +143,7 @@ impl FloatConv {
         let pairs = cin.div_ceil(2);
         self.precision = precision;
         self.brain = match precision {
-            Precision::F32 | Precision::Tiles => Vec::new(),
+            Precision::F32 => Vec::new(),
             Precision::Bf16 => vec![Lanes::default(); volume * self.extents.panels() * pairs],
         };
         let panels = self.brain.chunks_exact_mut(pairs);

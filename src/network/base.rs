@@ -5,7 +5,7 @@ use std::ops::Range;
 use b2p_kernels::{LIMIT, Taps};
 
 use super::Model;
-use super::layers::apply;
+use super::layers::{Pool, apply};
 use super::structure::base_inputs;
 use crate::entropy::UNPREDICTED;
 use crate::geometry::KernelMap;
@@ -54,8 +54,9 @@ impl Model {
             let (octant, row) = (octants[v as usize], map.row(v as usize));
             known.push(self.surroundings(octant, row, &slice, latents, input));
         }
-        let layer =
-            |conv, x: &[i16], relu| apply(self.isa, conv, Taps::Same, x, voxels.len(), relu);
+        let pool = &mut Pool::new();
+        let mut layer =
+            |conv, x: &[i16], relu| apply(pool, self.isa, conv, Taps::Same, x, voxels.len(), relu);
         let x = layer(&base.lin1, &inputs, true);
         let x = layer(&base.lin2, &x, true);
         let mu = layer(&base.mu, &x, false);

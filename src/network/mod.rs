@@ -61,7 +61,7 @@ use crate::error::{Error, Result};
 use generate::Generator;
 use load::{Tensors, malformed};
 use stored::Stored;
-use structure::{Encoder, Exact, Generate, Spec};
+use structure::{Encoder, Exact, Generate};
 
 pub use generate::Precision;
 pub use shape::{Head, Shape, Upsample};
@@ -105,17 +105,9 @@ impl Model {
         let tensors = Tensors::new(bytes)?;
         let shape = tensors.shape()?;
         let tables = tables(&tensors, &shape)?;
-        let float = |spec| Ok(tensors.stored_layer(spec)?.float());
-        // Features are rounded to latents in the end, and cost the most.
-        let mut features = |spec: Spec| {
-            let precision = match spec.name.starts_with("fc.") {
-                true => b2p_kernels::Precision::Tiles,
-                false => b2p_kernels::Precision::F32,
-            };
-            Ok(float(spec)?.with_precision(precision))
-        };
+        let mut float = |spec| Ok(tensors.stored_layer(spec)?.float());
         let encoder = match tensors.any("fc.") || tensors.any("fs.") {
-            true => Some(shape.encoder(&mut features)?),
+            true => Some(shape.encoder(&mut float)?),
             false => None,
         };
         let g_scale = scales(&tensors, "g_scale", ROLES, 0)?;
