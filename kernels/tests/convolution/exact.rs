@@ -104,7 +104,7 @@ fn exact_layers_wrap_like_their_definition_at_the_extremes() {
         rows: &map,
         plan: None,
     };
-    let [cin, cout] = [128, 16];
+    let [cin, cout] = [128, 48];
     for (w, x) in [
         (i16::MIN, i16::MIN),
         (i16::MAX, i16::MIN),
@@ -231,7 +231,7 @@ fn a_layer_writes_only_its_own_columns_and_rows_from_the_first_on() {
 #[test]
 fn a_plan_changes_nothing() {
     let mut random = Random(5);
-    let [rows, cin, cout] = [1300, 40, 24];
+    let [rows, cin, cout] = [1300, 40, 40];
     let (taps, _) = kernels(&mut random, rows).swap_remove(5);
     let Taps::Map {
         volume,

@@ -1,9 +1,8 @@
 //! Integers in tiles of bytes.
 //!
 //! Numbers of up to 13 bits are cut into two digits, `x = 64·high + low`, each of a signed byte. Three products of digits make one of
-//! numbers: `high·high`, `low·low`, and what the two mixed ones add up to. With few input channels, both digits of a row lie in one tile
-//! row, and the mixed products are one multiplication; with many, `(high + low)·(high + low)` contains them (Karatsuba). All is added
-//! modulo 2³², as everywhere, so sums are equal to the bit.
+//! numbers: `high·high`, `low·low`, and `(high + low)·(high + low)`, which contains them and the mixed ones (Karatsuba). All is added modulo
+//! 2³², as everywhere, so sums are equal to the bit.
 
 use std::arch::x86_64::*;
 
@@ -13,49 +12,32 @@ use crate::rows::{Extents, Lanes, PANEL};
 
 /// The largest magnitude whose digits, and their sum, are signed bytes.
 const REACH: i16 = 4095;
-/// Input channels whose two digits fit into a tile row.
-const NARROW: usize = 32;
+/// Input channels, and panels of output channels, from which on tiles are full enough.
+const WIDE: [usize; 2] = [33, 3];
 
 impl Weights {
-    /// Cuts the weights, which `weight(tap, input, output)` tells, into digits; nothing, if one is too large for that.
+    /// Cuts the weights, which `weight(tap, input, output)` tells, into digits; nothing, if one is too large for that, or the layer too
+    /// narrow to gain.
     pub fn of_integers(
         extents: Extents,
         weight: impl Fn(usize, usize, usize) -> i16,
     ) -> Option<Weights> {
-        let mut packed = Weights::new(
-            extents,
-            match extents.cin {
-                ..=NARROW => Scheme::Together,
-                _ => Scheme::Apart,
-            },
-        );
-        let panels = extents.panels();
+        if extents.cin < WIDE[0] || extents.panels() < WIDE[1] {
+            return None;
+        }
+        let mut packed = Weights::new(extents, Scheme::Digits);
         for (tap, channel, out) in extents.each() {
             let w = weight(tap, channel, out);
             if w.unsigned_abs() > REACH.unsigned_abs() {
                 return None;
             }
-            let ((high, low), (panel, lane)) = (digits(w), (out / PANEL, out % PANEL));
-            let mut put = |pass: usize, column: usize, byte: usize, digit: i8| {
-                let word = packed.word(pass, tap, byte, column, lane);
+            let (high, low) = digits(w);
+            let (chunk, channel) = (channel / LINE, channel % LINE);
+            let (half, channel) = (channel / 32, channel % 32);
+            let byte = chunk * LINE + channel / 8 * 16 + 8 * half + channel % 8;
+            for (pass, digit) in [high, low, high + low].into_iter().enumerate() {
+                let word = packed.word(pass, tap, byte, out / PANEL, out % PANEL);
                 *word |= u32::from(digit as u8) << (8 * (byte % 4));
-            };
-            match extents.cin {
-                ..=NARROW => {
-                    let byte = channel / 8 * 16 + channel % 8;
-                    put(0, panel, byte, high);
-                    put(0, panels + panel, byte + 8, low);
-                    put(0, 2 * panels + panel, byte, low);
-                    put(0, 2 * panels + panel, byte + 8, high);
-                }
-                _ => {
-                    let (chunk, channel) = (channel / LINE, channel % LINE);
-                    let (half, channel) = (channel / 32, channel % 32);
-                    let byte = chunk * LINE + channel / 8 * 16 + 8 * half + channel % 8;
-                    put(0, panel, byte, high);
-                    put(1, panel, byte, low);
-                    put(2, panel, byte, high + low);
-                }
             }
         }
         Some(packed)
@@ -84,12 +66,7 @@ pub(crate) fn accumulate(
     let cin = weights.extents.cin;
     prepare(isa, weights, plan, input.len() / cin, buffers);
     // SAFETY: an `Isa` with tiles is only made where the processor has AVX-512. All rows of the plan lie below its end.
-    let small = unsafe {
-        match cin {
-            ..=NARROW => together(input, cin, plan.inputs(), &mut buffers.rows),
-            _ => apart(input, cin, plan.inputs(), &mut buffers.rows),
-        }
-    };
+    let small = unsafe { split_rows(input, cin, plan.inputs(), &mut buffers.rows) };
     if small {
         sums.resize(
             plan.masks().len() * weights.extents.panels(),
@@ -101,36 +78,13 @@ pub(crate) fn accumulate(
     small
 }
 
-/// Writes rows of at most [`NARROW`] channels as a tile row each: by eights, high digits and low ones. Zeros follow. Tells whether all
-/// were small enough.
-///
-/// # Safety
-/// The processor must have AVX-512 F, BW and VL; the input must have the rows.
-#[target_feature(enable = "avx512f,avx512bw,avx512vl")]
-unsafe fn together(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) -> bool {
-    let here = u32::MAX >> (32 - cin);
-    let mut largest = _mm512_setzero_si512();
-    let (last, to) = to.split_last_mut().expect("room for zeros");
-    for (&row, to) in rows.iter().zip(to) {
-        // SAFETY: the row's `cin` values are read, and a whole line written.
-        unsafe {
-            let x = _mm512_maskz_loadu_epi16(here, input.as_ptr().add(row as usize * cin));
-            largest = _mm512_max_epu16(largest, _mm512_abs_epi16(x));
-            let (high, low) = split(x);
-            _mm512_store_si512(std::ptr::from_mut(to).cast(), _mm512_packs_epi16(high, low));
-        }
-    }
-    *last = Lanes::default();
-    within_reach(largest)
-}
-
 /// Writes rows as tile rows of 64 channels, first the high digits of all rows, then the low ones, then their sums. Zeros follow each
 /// time. Tells whether all were small enough.
 ///
 /// # Safety
-/// As [`together`].
+/// The processor must have AVX-512 F, BW and VL; the input must have the rows.
 #[target_feature(enable = "avx512f,avx512bw,avx512vl")]
-unsafe fn apart(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) -> bool {
+unsafe fn split_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) -> bool {
     let chunks = cin.div_ceil(LINE);
     let (highs, rest) = to.split_at_mut((rows.len() + 1) * chunks);
     let (lows, both) = rest.split_at_mut(highs.len());

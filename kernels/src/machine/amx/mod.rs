@@ -20,10 +20,8 @@ const CACHED: usize = 28;
 /// What is in the tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Scheme {
-    /// Both digits of 32 channels in a tile row; three columns of tiles for a panel: high·high, low·low, mixed.
-    Together,
     /// High digits, low ones and their sums in three passes of a tile row each 64 channels.
-    Apart,
+    Digits,
     /// 32 channels in bf16.
     Brain,
 }
@@ -52,26 +50,22 @@ impl Weights {
     /// Passes over a group's rows, each of its own tile rows.
     fn passes(&self) -> usize {
         match self.scheme {
-            Scheme::Together | Scheme::Brain => 1,
-            Scheme::Apart => 3,
+            Scheme::Digits => 3,
+            Scheme::Brain => 1,
         }
     }
 
     /// Tile rows that an input row takes in each pass.
     fn chunks(&self) -> usize {
         match self.scheme {
-            Scheme::Together => 1,
-            Scheme::Apart => self.extents.cin.div_ceil(LINE),
+            Scheme::Digits => self.extents.cin.div_ceil(LINE),
             Scheme::Brain => self.extents.cin.div_ceil(LINE / 2),
         }
     }
 
     /// Columns of tiles in each pass.
     fn columns(&self) -> usize {
-        match self.scheme {
-            Scheme::Together => 3 * self.extents.panels(),
-            Scheme::Apart | Scheme::Brain => self.extents.panels(),
-        }
+        self.extents.panels()
     }
 
     /// Columns that are multiplied at once: as many in each block.
@@ -443,8 +437,7 @@ fn combine(
     };
     for panel in 0..panels {
         let [high, low, mixed] = match weights.scheme {
-            Scheme::Together => [0, 1, 2].map(|which| tile(0, which * panels + panel)),
-            Scheme::Apart => [0, 1, 2].map(|pass| tile(pass, panel)),
+            Scheme::Digits => [0, 1, 2].map(|pass| tile(pass, panel)),
             Scheme::Brain => [tile(0, panel); 3],
         };
         for (at, &row) in rows.iter().enumerate() {
@@ -452,11 +445,10 @@ fn combine(
             let sum = &mut sums[usize::from(row) * panels + panel];
             sum.0 = std::array::from_fn(|lane: usize| {
                 let (high, low) = (high[lane], low[lane]);
-                let mixed = match weights.scheme {
-                    Scheme::Brain => return high,
-                    Scheme::Apart => mixed[lane].wrapping_sub(high).wrapping_sub(low),
-                    Scheme::Together => mixed[lane],
-                };
+                if weights.scheme == Scheme::Brain {
+                    return high;
+                }
+                let mixed = mixed[lane].wrapping_sub(high).wrapping_sub(low);
                 (high << 12).wrapping_add(mixed << 6).wrapping_add(low)
             });
         }
