@@ -6,8 +6,7 @@ use std::collections::HashMap;
 use std::time::Instant;
 
 use b2p_kernels::{
-    ABSENT, ExactConv, FloatConv, Isa, Output, Plan, PlanTile, Precision, Requantise, Scale, Taps,
-    ceiling,
+    ABSENT, ExactConv, FloatConv, Isa, Output, Plan, Precision, Requantise, Scale, Taps, ceiling,
 };
 use half::f16;
 
@@ -193,12 +192,7 @@ fn main() {
     let voxels = surface(count.unwrap_or(200_000));
     let map = kernel_map(&voxels);
     let pairs = map.iter().filter(|&&r| r != ABSENT).count();
-    let start = Instant::now();
-    let tiles = map.chunks(PlanTile::ROWS * 27);
-    let plan: Plan = tiles
-        .map(|rows| PlanTile::new(Isa::detect(), 27, rows))
-        .collect();
-    let planning = start.elapsed().as_secs_f64();
+    let plan = Plan::new(voxels.len());
     let bench = Bench {
         map,
         plan,
@@ -207,7 +201,6 @@ fn main() {
     };
     let each = pairs as f64 / voxels.len() as f64;
     println!("{} voxels, {each:.2} neighbours each", voxels.len());
-    println!("planned for matrix tiles in {:.1} ms", planning * 1e3);
     for isa in Isa::available() {
         if !only.is_empty() && !only.contains(&isa) {
             continue;

@@ -35,6 +35,6 @@ pub use exact::{ExactConv, LIMIT, Requantise};
 pub use float::{FloatConv, FloatOut, Precision, Scale};
 pub use isa::{Isa, UnknownIsa};
 pub use map::{MappedFile, map_file};
-pub use plan::{Plan, PlanTile};
+pub use plan::Plan;
 pub use rows::Output;
 pub use taps::{ABSENT, Taps};

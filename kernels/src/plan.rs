@@ -1,46 +1,32 @@
 //! Kernel maps as matrix tiles want them: few input rows, each known by a short number, and output rows of like neighbours together.
 
 use std::ops::Range;
+use std::sync::OnceLock;
 
 use crate::isa::Isa;
-use crate::rows::{TILE, with_scratch};
+use crate::rows::TILE;
 use crate::taps::{Taps, TileTaps};
 
 /// Output rows of a group: those of one matrix tile.
 pub(crate) const GROUP: usize = 16;
 
-/// A kernel map arranged for matrix tiles. It pays where a map serves several layers and the [`Isa`] has such tiles; results
-/// are the same without.
-///
-/// Made of a [`PlanTile`] for every [`PlanTile::ROWS`] rows of the map, in their order.
-#[derive(Debug, Clone, Default)]
-pub struct Plan(Vec<PlanTile>);
-
-impl FromIterator<PlanTile> for Plan {
-    fn from_iter<I: IntoIterator<Item = PlanTile>>(tiles: I) -> Self {
-        Plan(tiles.into_iter().collect())
-    }
-}
-
-impl From<Vec<PlanTile>> for Plan {
-    fn from(tiles: Vec<PlanTile>) -> Self {
-        Plan(tiles)
-    }
-}
+/// A kernel map arranged for matrix tiles, part by part as layers first read it. It pays where a map serves several layers and the
+/// [`Isa`] has such tiles; results are the same without.
+#[derive(Debug, Clone)]
+pub struct Plan(Vec<OnceLock<PlanTile>>);
 
 impl Plan {
-    /// The plan of `count` rows from `first` on, if there is one for just these.
-    pub(crate) fn tile(&self, first: usize, count: usize) -> Option<&PlanTile> {
-        let tile = self.0.get(first / TILE)?;
-        (first.is_multiple_of(TILE) && tile.masks.len() == count).then_some(tile)
+    /// For a map of so many output rows.
+    pub fn new(rows: usize) -> Self {
+        Plan(vec![OnceLock::new(); rows.div_ceil(TILE)])
     }
 }
 
-/// Up to [`PlanTile::ROWS`] rows of a kernel map, arranged.
+/// Up to [`TILE`] rows of a kernel map, arranged.
 ///
 /// Rows are sorted by which taps they use, and cut into groups of sixteen: what a group multiplies is the taps that any of its rows uses.
 #[derive(Debug, Clone, Default)]
-pub struct PlanTile {
+pub(crate) struct PlanTile {
     /// Taps of the kernel.
     volume: usize,
     /// The input rows that are read, each once.
@@ -62,31 +48,8 @@ pub struct PlanTile {
 }
 
 impl PlanTile {
-    /// Rows that a tile has, unless it is a map's last.
-    pub const ROWS: usize = TILE;
-
-    /// Arranges at most [`PlanTile::ROWS`] rows of a kernel map of `volume` taps, laid out as in [`Taps::Map`].
-    ///
-    /// # Panics
-    /// If there are more rows, or more than 63 taps.
-    pub fn new(isa: Isa, volume: usize, rows: &[u32]) -> Self {
-        assert!(volume < 64, "a kernel has more than 63 taps");
-        let mut plan = PlanTile::default();
-        let map = Taps::Map {
-            volume,
-            rows,
-            plan: None,
-        };
-        with_scratch(|scratch| {
-            let (taps, numbers) = (&mut scratch.taps, &mut scratch.planner.numbers);
-            taps.fill(isa, &map, 0, rows.len() / volume, usize::MAX);
-            plan.arrange(taps, numbers);
-        });
-        plan
-    }
-
     /// Arranges a tile's rows.
-    pub(crate) fn arrange(&mut self, taps: &TileTaps, numbers: &mut Numbers) {
+    fn arrange(&mut self, taps: &TileTaps, numbers: &mut Numbers) {
         let (masks, volume) = (taps.masks(), taps.volume());
         self.volume = volume;
         self.end = taps.end();
@@ -222,14 +185,28 @@ impl Planner {
         [first, count]: [usize; 2],
         scratch: &mut TileTaps,
     ) -> &'a PlanTile {
-        if let Taps::Map { plan, .. } = taps
-            && let Some(tile) = plan.and_then(|plan| plan.tile(first, count))
+        let Planner { numbers, own } = self;
+        let mut arrange = |tile: &mut PlanTile| {
+            scratch.fill(isa, taps, first, count, usize::MAX);
+            tile.arrange(scratch, numbers);
+        };
+        if let Taps::Map {
+            plan: Some(plan), ..
+        } = taps
+            && first.is_multiple_of(TILE)
+            && let Some(place) = plan.0.get(first / TILE)
         {
-            return tile;
+            let tile = place.get_or_init(|| {
+                let mut tile = PlanTile::default();
+                arrange(&mut tile);
+                tile
+            });
+            if tile.masks.len() == count {
+                return tile;
+            }
         }
-        scratch.fill(isa, taps, first, count, usize::MAX);
-        self.own.arrange(scratch, &mut self.numbers);
-        &self.own
+        arrange(own);
+        own
     }
 }
 
@@ -307,7 +284,13 @@ mod tests {
                     false => ABSENT,
                 })
                 .collect();
-            let plan = PlanTile::new(Isa::SCALAR, volume, &rows);
+            let taps = Taps::Map {
+                volume,
+                rows: &rows,
+                plan: None,
+            };
+            let mut planner = Planner::default();
+            let plan = planner.plan(Isa::SCALAR, &taps, [0, count], &mut TileTaps::default());
             let mut found = vec![ABSENT; rows.len()];
             for group in 0..plan.groups() {
                 let (taps, places) = plan.steps(group, 0..volume);

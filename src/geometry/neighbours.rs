@@ -6,7 +6,7 @@
 
 use std::sync::OnceLock;
 
-use b2p_kernels::{Isa, Plan, PlanTile, Taps};
+use b2p_kernels::{Isa, Plan, Taps};
 use rayon::prelude::*;
 
 /// The neighbours of every voxel under a 3³ or 2³ kernel.
@@ -17,7 +17,7 @@ use rayon::prelude::*;
 pub struct KernelMap {
     volume: usize,
     rows: Vec<u32>,
-    /// The same for matrix tiles, once it is asked for.
+    /// The same for matrix tiles.
     plan: OnceLock<Plan>,
 }
 
@@ -47,11 +47,7 @@ impl KernelMap {
 
     /// The map as layers take it.
     pub fn taps(&self, isa: Isa) -> Taps<'_> {
-        let plan = || {
-            let tiles = self.rows.par_chunks(PlanTile::ROWS * self.volume);
-            let tiles = tiles.map(|rows| PlanTile::new(isa, self.volume, rows));
-            Plan::from(tiles.collect::<Vec<_>>())
-        };
+        let plan = || Plan::new(self.len());
         Taps::Map {
             volume: self.volume,
             rows: &self.rows,
