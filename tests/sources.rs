@@ -172,7 +172,7 @@ fn a_stage_knows_only_the_stages_before_it() {
 }
 
 #[test]
-fn unsafe_stands_only_in_the_kernels() {
+fn unsafe_stands_only_in_the_kernels_and_at_the_c_border() {
     for library in [
         "src/lib.rs",
         "src/main.rs",

@@ -1,0 +1,264 @@
+// b2p: learned point-cloud streams to 3D Gaussians and pictures. Made by cbindgen from capi/src; see the README.
+
+#ifndef B2P_H
+#define B2P_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+// Rules. Every object is freed by the function named after it, once; NULL is ignored there. Functions that can fail return a status,
+// and put a text of at most `size` bytes, zero at the end, into `message`, which may be NULL. What takes a `const` object may be
+// called from several threads at once, everything else from one thread at a time. There is no global state. Nothing of Rust
+// unwinds across the border: a defect inside the library is reported as B2P_STATUS_INTERNAL.
+
+// How a function ended.
+typedef enum b2p_status {
+  // As it should.
+  B2P_STATUS_OK = 0,
+  // A file could not be read.
+  B2P_STATUS_IO = 1,
+  // The input ends before it is complete.
+  B2P_STATUS_TRUNCATED = 2,
+  // The bytes are not what was written.
+  B2P_STATUS_CHECKSUM = 3,
+  // The stream was made with another model.
+  B2P_STATUS_MODEL = 4,
+  // Encoder and decoder did not compute the same.
+  B2P_STATUS_DETERMINISM = 5,
+  // The input asks for more than the limits allow.
+  B2P_STATUS_LIMIT = 6,
+  // Well-formed, but not supported.
+  B2P_STATUS_UNSUPPORTED = 7,
+  // The input breaks the format.
+  B2P_STATUS_MALFORMED = 8,
+  // Another thread has cancelled.
+  B2P_STATUS_CANCELLED = 9,
+  // The caller asked for something that makes no sense: an argument is NULL, out of range, or too small.
+  B2P_STATUS_USAGE = 10,
+  // A defect in the library.
+  B2P_STATUS_INTERNAL = 11,
+} b2p_status;
+
+// A switch that stops decodings from another thread.
+typedef struct b2p_cancel b2p_cancel;
+
+// A stream that is decoded as its bytes arrive.
+typedef struct b2p_decoding b2p_decoding;
+
+// Gaussians of a level.
+typedef struct b2p_gaussians b2p_gaussians;
+
+// A model, ready to run. Any number of decodings share it, in any threads.
+typedef struct b2p_model b2p_model;
+
+// What an input may ask for.
+typedef struct b2p_limits {
+  // Voxels of a level.
+  uint64_t max_points;
+  // Pixels of a picture.
+  uint64_t max_pixels;
+  // Bytes that one input may make the library reserve.
+  uint64_t max_bytes;
+  // Octree levels.
+  uint8_t max_depth;
+} b2p_limits;
+
+// Where the numbers of Gaussians lie, until these are freed. Coordinates are those of the cube frame, in which the voxel cube reaches
+// from -1 to 1; `origin` and `unit` lead to the world's: world = origin + (position + 1) * unit.
+typedef struct b2p_arrays {
+  // How many Gaussians.
+  size_t count;
+  // Centres x, y, z: 3 * count numbers.
+  const float *position;
+  // Standard deviations along the Gaussian's own axes: 3 * count numbers.
+  const float *scale;
+  // Unit quaternions w, x, y, z: 4 * count numbers.
+  const float *rotation;
+  // Opacities in [0, 1]: count numbers.
+  const float *opacity;
+  // Red, green, blue in [0, 1], display-referred: 3 * count numbers.
+  const float *colour;
+  // The world coordinates of the cube's lowest corner.
+  double origin[3];
+  // One unit of the cube frame in the world's.
+  double unit;
+} b2p_arrays;
+
+// A camera on a sphere around the cube's centre, looking at it, and what is behind the Gaussians.
+typedef struct b2p_camera {
+  // Degrees around the vertical axis.
+  double azimuth;
+  // Degrees above the horizon.
+  double elevation;
+  // From the cube's centre; the cube reaches from -1 to 1.
+  double distance;
+  // Horizontal field of view in degrees.
+  double fov;
+  // Pixels side by side.
+  uint32_t width;
+  // Rows of pixels.
+  uint32_t height;
+  // Red, green, blue of the background in [0, 1], if it is not transparent.
+  float background[3];
+  // Whether the background lets light through.
+  bool transparent;
+} b2p_camera;
+
+#ifdef __cplusplus
+extern "C" {
+#endif // __cplusplus
+
+// Limits for anything: 2^26 points, 2^28 pixels, 2 GiB. What NULL stands for.
+struct b2p_limits b2p_limits_default(void);
+
+// Limits for boards with 512 MB of memory.
+struct b2p_limits b2p_limits_embedded(void);
+
+// No limits but the format's, for input that is trusted.
+struct b2p_limits b2p_limits_unlimited(void);
+
+// The library's version, such as "0.1.0".
+const char *b2p_version(void);
+
+// Loads a model file. Fails with IO, MALFORMED, UNSUPPORTED, USAGE.
+//
+// # Safety
+// `path` is NULL or a string; `model` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_model_open(const char *path,
+                               struct b2p_model **model,
+                               char *message,
+                               size_t size);
+
+// Loads a model file's content, which is not needed afterwards. Fails with MALFORMED, UNSUPPORTED, USAGE.
+//
+// # Safety
+// `bytes` leads to `length` bytes; `model` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_model_from_bytes(const uint8_t *bytes,
+                                     size_t length,
+                                     struct b2p_model **model,
+                                     char *message,
+                                     size_t size);
+
+// Frees a model. Decodings that were started with it go on.
+//
+// # Safety
+// `model` is NULL or came from this library, and is not used any more.
+void b2p_model_free(struct b2p_model *model);
+
+// A new switch.
+//
+// # Safety
+// `cancel` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_cancel_new(struct b2p_cancel **cancel, char *message, size_t size);
+
+// Throws the switch, from any thread: what decodes with it ends with CANCELLED before it begins its next slice or step.
+//
+// # Safety
+// `cancel` is NULL or a switch.
+void b2p_cancel_throw(const struct b2p_cancel *cancel);
+
+// Frees a switch. Decodings that were started with it go on.
+//
+// # Safety
+// `cancel` is NULL or came from this library, and is not used any more.
+void b2p_cancel_free(struct b2p_cancel *cancel);
+
+// Begins to decode a stream down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits` and `cancel`
+// may be NULL. Fails with USAGE.
+//
+// # Safety
+// `model` is a model; `limits` and `cancel` are NULL or what they say; `decoding` is writable; `message` is NULL or leads to `size`
+// bytes.
+enum b2p_status b2p_decoding_start(const struct b2p_model *model,
+                                   const struct b2p_limits *limits,
+                                   const struct b2p_cancel *cancel,
+                                   int32_t level,
+                                   struct b2p_decoding **decoding,
+                                   char *message,
+                                   size_t size);
+
+// Takes the next bytes of the stream, which are not needed afterwards. Decodes nothing yet. Fails with USAGE.
+//
+// # Safety
+// `decoding` is a decoding; `bytes` leads to `length` bytes; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_push(struct b2p_decoding *decoding,
+                                  const uint8_t *bytes,
+                                  size_t length,
+                                  char *message,
+                                  size_t size);
+
+// Decodes the next level if all of it has come: `level` is then its number, else -1. To be called until it is -1. After a failure
+// the level reached before can still be had. Fails with everything but IO, TRUNCATED and INTERNAL.
+//
+// # Safety
+// `decoding` is a decoding; `level` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_advance(struct b2p_decoding *decoding,
+                                     int32_t *level,
+                                     char *message,
+                                     size_t size);
+
+// Decodes what is left, knowing that no more bytes will come. Fails as b2p_decoding_advance does, and with TRUNCATED if the level
+// to end with is not whole, or, where none was named, if the stream ends elsewhere than after one of its levels.
+//
+// # Safety
+// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_finish(struct b2p_decoding *decoding,
+                                    char *message,
+                                    size_t size);
+
+// The deepest level decoded so far, or -1.
+//
+// # Safety
+// `decoding` is NULL or a decoding.
+int32_t b2p_decoding_level(const struct b2p_decoding *decoding);
+
+// Frees a decoding. Gaussians that were made of it stay.
+//
+// # Safety
+// `decoding` is NULL or came from this library, and is not used any more.
+void b2p_decoding_free(struct b2p_decoding *decoding);
+
+// Makes the Gaussians of the deepest level decoded so far. Fails with UNSUPPORTED if it has none, LIMIT, CANCELLED, USAGE.
+//
+// # Safety
+// `decoding` is a decoding; `gaussians` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_gaussians(const struct b2p_decoding *decoding,
+                                       struct b2p_gaussians **gaussians,
+                                       char *message,
+                                       size_t size);
+
+// Where the numbers of the Gaussians lie. Fails with USAGE.
+//
+// # Safety
+// `gaussians` are Gaussians; `arrays` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_gaussians_arrays(const struct b2p_gaussians *gaussians,
+                                     struct b2p_arrays *arrays,
+                                     char *message,
+                                     size_t size);
+
+// Frees Gaussians, and with them what b2p_gaussians_arrays told.
+//
+// # Safety
+// `gaussians` is NULL or came from this library, and is not used any more.
+void b2p_gaussians_free(struct b2p_gaussians *gaussians);
+
+// Draws Gaussians into `pixels`: 4 * width * height bytes of red, green, blue, alpha, premultiplied, row by row from the top left.
+// `limits` may be NULL. Fails with USAGE if the camera is none or `length` is another, and with LIMIT.
+//
+// # Safety
+// `gaussians` are Gaussians; `camera` is a camera; `limits` is NULL or limits; `pixels` leads to `length` writable bytes; `message` is
+// NULL or leads to `size` bytes.
+enum b2p_status b2p_render(const struct b2p_gaussians *gaussians,
+                           const struct b2p_camera *camera,
+                           const struct b2p_limits *limits,
+                           uint8_t *pixels,
+                           size_t length,
+                           char *message,
+                           size_t size);
+
+#ifdef __cplusplus
+}  // extern "C"
+#endif  // __cplusplus
+
+#endif  /* B2P_H */

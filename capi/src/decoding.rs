@@ -1,0 +1,283 @@
+//! Streams in pieces, and the Gaussians that come of them.
+
+use std::ffi::c_char;
+use std::sync::Arc;
+
+use b2p::decoder::Decoder;
+use b2p::log::Log;
+
+use crate::border::{Fault, Status, borrowed, changed, give, guard, slice, take};
+use crate::model::{Limits, Model};
+
+/// A switch that stops decodings from another thread.
+#[derive(Default)]
+pub struct Cancel(b2p::Cancel);
+
+/// A stream that is decoded as its bytes arrive.
+pub struct Decoding(b2p::decoder::Decoding<'static, Arc<b2p::network::Model>>);
+
+/// Gaussians of a level.
+pub struct Gaussians(pub(crate) b2p::gaussians::Gaussians);
+
+/// Where the numbers of Gaussians lie, until these are freed. Coordinates are those of the cube frame, in which the voxel cube reaches
+/// from -1 to 1; `origin` and `unit` lead to the world's: world = origin + (position + 1) * unit.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct Arrays {
+    /// How many Gaussians.
+    pub count: usize,
+    /// Centres x, y, z: 3 * count numbers.
+    pub position: *const f32,
+    /// Standard deviations along the Gaussian's own axes: 3 * count numbers.
+    pub scale: *const f32,
+    /// Unit quaternions w, x, y, z: 4 * count numbers.
+    pub rotation: *const f32,
+    /// Opacities in [0, 1]: count numbers.
+    pub opacity: *const f32,
+    /// Red, green, blue in [0, 1], display-referred: 3 * count numbers.
+    pub colour: *const f32,
+    /// The world coordinates of the cube's lowest corner.
+    pub origin: [f64; 3],
+    /// One unit of the cube frame in the world's.
+    pub unit: f64,
+}
+
+/// A new switch.
+///
+/// # Safety
+/// `cancel` is writable; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_cancel_new(
+    cancel: *mut *mut Cancel,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    // SAFETY: the caller vouches for `cancel`.
+    let run = || unsafe { give(cancel, "cancel", Cancel::default()) };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Throws the switch, from any thread: what decodes with it ends with CANCELLED before it begins its next slice or step.
+///
+/// # Safety
+/// `cancel` is NULL or a switch.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_cancel_throw(cancel: *const Cancel) {
+    // SAFETY: the caller vouches for `cancel`.
+    if let Ok(cancel) = unsafe { borrowed(cancel, "cancel") } {
+        cancel.0.cancel();
+    }
+}
+
+/// Frees a switch. Decodings that were started with it go on.
+///
+/// # Safety
+/// `cancel` is NULL or came from this library, and is not used any more.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_cancel_free(cancel: *mut Cancel) {
+    // SAFETY: the caller vouches for `cancel`.
+    unsafe { take(cancel) }
+}
+
+/// Begins to decode a stream down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits` and `cancel`
+/// may be NULL. Fails with USAGE.
+///
+/// # Safety
+/// `model` is a model; `limits` and `cancel` are NULL or what they say; `decoding` is writable; `message` is NULL or leads to `size`
+/// bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_start(
+    model: *const Model,
+    limits: *const Limits,
+    cancel: *const Cancel,
+    level: i32,
+    decoding: *mut *mut Decoding,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `model`, `limits` and `cancel`.
+        let (model, limits, cancel) =
+            unsafe { (borrowed(model, "model")?, limits.as_ref(), cancel.as_ref()) };
+        let mut decoder = Decoder::new(Arc::clone(&model.0));
+        if let Some(limits) = limits {
+            decoder = decoder.with_limits((*limits).into());
+        }
+        if let Some(cancel) = cancel {
+            decoder = decoder.with_cancel(cancel.0.clone());
+        }
+        let level = match level {
+            ..0 => None,
+            _ => Some(u8::try_from(level).map_err(|_| Fault::usage("level is above 255"))?),
+        };
+        // SAFETY: the caller vouches for `decoding`.
+        unsafe { give(decoding, "decoding", Decoding(decoder.start(level))) }
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Takes the next bytes of the stream, which are not needed afterwards. Decodes nothing yet. Fails with USAGE.
+///
+/// # Safety
+/// `decoding` is a decoding; `bytes` leads to `length` bytes; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_push(
+    decoding: *mut Decoding,
+    bytes: *const u8,
+    length: usize,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `decoding` and `bytes`.
+        let (decoding, bytes) = unsafe {
+            (
+                changed(decoding, "decoding")?,
+                slice(bytes, length, "bytes")?,
+            )
+        };
+        decoding.0.push(bytes);
+        Ok(())
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Decodes the next level if all of it has come: `level` is then its number, else -1. To be called until it is -1. After a failure
+/// the level reached before can still be had. Fails with everything but IO, TRUNCATED and INTERNAL.
+///
+/// # Safety
+/// `decoding` is a decoding; `level` is writable; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_advance(
+    decoding: *mut Decoding,
+    level: *mut i32,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `decoding` and `level`.
+        let (decoding, level) =
+            unsafe { (changed(decoding, "decoding")?, changed(level, "level")?) };
+        *level = -1;
+        *level = decoding
+            .0
+            .advance(&mut Log::default())?
+            .map_or(-1, i32::from);
+        Ok(())
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Decodes what is left, knowing that no more bytes will come. Fails as b2p_decoding_advance does, and with TRUNCATED if the level
+/// to end with is not whole, or, where none was named, if the stream ends elsewhere than after one of its levels.
+///
+/// # Safety
+/// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_finish(
+    decoding: *mut Decoding,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `decoding`.
+        let decoding = unsafe { changed(decoding, "decoding") }?;
+        Ok(decoding.0.finish(&mut Log::default())?)
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// The deepest level decoded so far, or -1.
+///
+/// # Safety
+/// `decoding` is NULL or a decoding.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_level(decoding: *const Decoding) -> i32 {
+    // SAFETY: the caller vouches for `decoding`.
+    let decoding = unsafe { decoding.as_ref() };
+    decoding
+        .and_then(|decoding| decoding.0.level())
+        .map_or(-1, i32::from)
+}
+
+/// Frees a decoding. Gaussians that were made of it stay.
+///
+/// # Safety
+/// `decoding` is NULL or came from this library, and is not used any more.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_free(decoding: *mut Decoding) {
+    // SAFETY: the caller vouches for `decoding`.
+    unsafe { take(decoding) }
+}
+
+/// Makes the Gaussians of the deepest level decoded so far. Fails with UNSUPPORTED if it has none, LIMIT, CANCELLED, USAGE.
+///
+/// # Safety
+/// `decoding` is a decoding; `gaussians` is writable; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_gaussians(
+    decoding: *const Decoding,
+    gaussians: *mut *mut Gaussians,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `decoding`.
+        let decoding = unsafe { borrowed(decoding, "decoding") }?;
+        let made = decoding.0.gaussians(&mut Log::default())?;
+        // SAFETY: the caller vouches for `gaussians`.
+        unsafe { give(gaussians, "gaussians", Gaussians(made)) }
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Where the numbers of the Gaussians lie. Fails with USAGE.
+///
+/// # Safety
+/// `gaussians` are Gaussians; `arrays` is writable; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_gaussians_arrays(
+    gaussians: *const Gaussians,
+    arrays: *mut Arrays,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `gaussians` and `arrays`.
+        let (Gaussians(g), arrays) = unsafe {
+            (
+                borrowed(gaussians, "gaussians")?,
+                changed(arrays, "arrays")?,
+            )
+        };
+        *arrays = Arrays {
+            count: g.len(),
+            position: g.position.as_ptr().cast(),
+            scale: g.scale.as_ptr().cast(),
+            rotation: g.rotation.as_ptr().cast(),
+            opacity: g.opacity.as_ptr(),
+            colour: g.colour.as_ptr().cast(),
+            origin: g.frame.placement.origin,
+            unit: g.frame.unit(),
+        };
+        Ok(())
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Frees Gaussians, and with them what b2p_gaussians_arrays told.
+///
+/// # Safety
+/// `gaussians` is NULL or came from this library, and is not used any more.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_gaussians_free(gaussians: *mut Gaussians) {
+    // SAFETY: the caller vouches for `gaussians`.
+    unsafe { take(gaussians) }
+}

@@ -1,0 +1,93 @@
+//! A C program built against the header and the static library: it runs, with AddressSanitizer watching where the compiler has it, and
+//! draws what Rust draws.
+
+#[path = "../../tests/common/mod.rs"]
+mod common;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use b2p::decoder::Decoder;
+use b2p::log::Log;
+use b2p::network::Model;
+use b2p::pixels::{Background, render};
+use b2p::projection::Camera;
+
+/// Where cargo put the static library: beside this test, or a folder above.
+fn library() -> PathBuf {
+    let test = std::env::current_exe().expect("a path");
+    let found = test
+        .ancestors()
+        .skip(1)
+        .take(2)
+        .map(|folder| folder.join("libb2p_c.a"))
+        .find(|library| library.exists());
+    found.expect("the static library is built with the test")
+}
+
+fn compile(to: &Path, more: &[&str]) -> Output {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    Command::new("cc")
+        .args(["-std=c11", "-Wall", "-Wextra", "-Werror", "-O1", "-g"])
+        .args(more)
+        .arg("-I")
+        .arg(here.join("include"))
+        .arg(here.join("tests/use.c"))
+        .arg(library())
+        .args(["-lpthread", "-ldl", "-lm", "-o"])
+        .arg(to)
+        .output()
+        .expect("a C compiler")
+}
+
+#[track_caller]
+fn printed(output: Output) -> String {
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+    String::from_utf8(output.stdout).expect("text")
+}
+
+#[test]
+fn a_c_program_decodes_and_draws_as_rust_does() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name);
+    let file = common::tiny_model(0);
+    let model = Model::from_bytes(&file).expect("a model");
+    let stream = common::small_stream(&model);
+    std::fs::write(at("model"), &file).expect("written");
+    std::fs::write(at("stream"), &stream).expect("written");
+
+    let gaussians = Decoder::new(&model)
+        .decode(&stream, None, &mut Log::default())
+        .expect("a stream");
+    let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, 40, 30).expect("a camera");
+    let limits = b2p::Limits::default();
+    let (image, _) = render(&gaussians, &camera, Background::WHITE, &limits).expect("a picture");
+    let picture = image.to_pixmap().expect("a picture");
+    let sum = |sum: u64, byte: &u8| sum.wrapping_mul(31).wrapping_add(u64::from(*byte));
+    let expected = format!("{:016x}\n", picture.data().iter().fold(0, sum));
+
+    let sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
+    printed(compile(&at("plain"), &[]));
+    let mut programs = vec![("alone", Command::new(at("plain")))];
+    match compile(&at("watched"), &sanitizers).status.success() {
+        true => programs.push(("with sanitizers", Command::new(at("watched")))),
+        false => println!("NOT RUN: this compiler has no AddressSanitizer"),
+    }
+    if Command::new("valgrind").arg("--version").output().is_ok() {
+        let mut valgrind = Command::new("valgrind");
+        valgrind.args(["-q", "--error-exitcode=9", "--leak-check=full"]);
+        valgrind
+            .args(["--errors-for-leak-kinds=definite"])
+            .arg(at("plain"));
+        programs.push(("under valgrind", valgrind));
+    } else {
+        println!("NOT RUN: there is no valgrind");
+    }
+    for (how, mut program) in programs {
+        program.arg(at("model")).arg(at("stream"));
+        let output = program.output().expect("the program starts");
+        assert_eq!(printed(output), expected, "{how}");
+        println!("ran {how}");
+    }
+}

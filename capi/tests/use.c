@@ -1,0 +1,177 @@
+// What a C program does with the library: a stream in pieces, Gaussians, a picture; mistakes; two threads at once.
+#include "b2p.h"
+
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static char message[256];
+
+#define CHECK(condition)                                                                                                       \
+    do {                                                                                                                       \
+        if (!(condition)) {                                                                                                    \
+            fprintf(stderr, "line %d: %s (%s)\n", __LINE__, #condition, message);                                              \
+            exit(1);                                                                                                           \
+        }                                                                                                                      \
+    } while (0)
+
+typedef struct {
+    uint8_t *bytes;
+    size_t length;
+} file;
+
+static file read_file(const char *path) {
+    FILE *from = fopen(path, "rb");
+    CHECK(from);
+    CHECK(fseek(from, 0, SEEK_END) == 0);
+    file f = {NULL, (size_t)ftell(from)};
+    rewind(from);
+    f.bytes = malloc(f.length);
+    CHECK(f.bytes && fread(f.bytes, 1, f.length, from) == f.length);
+    fclose(from);
+    return f;
+}
+
+typedef struct {
+    const b2p_model *model;
+    const file *stream;
+    uint64_t sum;
+} job;
+
+// Decodes the stream in pieces of 100 bytes and draws it; the sum is that of the picture's bytes.
+static void *decode(void *argument) {
+    job *job = argument;
+    char message[256];
+    b2p_decoding *decoding = NULL;
+    CHECK(b2p_decoding_start(job->model, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_OK);
+    int32_t level, last = -1;
+    for (size_t at = 0; at < job->stream->length; at += 100) {
+        size_t left = job->stream->length - at;
+        CHECK(b2p_decoding_push(decoding, job->stream->bytes + at, left < 100 ? left : 100, NULL, 0) == B2P_STATUS_OK);
+        do {
+            CHECK(b2p_decoding_advance(decoding, &level, message, sizeof message) == B2P_STATUS_OK);
+            CHECK(level == -1 || level == b2p_decoding_level(decoding));
+            last = level == -1 ? last : level;
+        } while (level != -1);
+    }
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(last == b2p_decoding_level(decoding));
+    b2p_gaussians *gaussians = NULL;
+    CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_OK);
+    b2p_decoding_free(decoding);
+
+    b2p_arrays arrays;
+    CHECK(b2p_gaussians_arrays(gaussians, &arrays, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(arrays.count > 0 && arrays.unit > 0);
+    for (size_t i = 0; i < 3 * arrays.count; i++) {
+        CHECK(arrays.position[i] > -2 && arrays.position[i] < 2);
+        CHECK(arrays.scale[i] >= 0 && arrays.colour[i] >= 0 && arrays.colour[i] <= 1);
+    }
+    for (size_t i = 0; i < arrays.count; i++) {
+        const float *q = arrays.rotation + 4 * i;
+        float norm = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+        CHECK(norm > 0.999f && norm < 1.001f && arrays.opacity[i] <= 1);
+    }
+
+    b2p_camera camera = {.azimuth = 20, .elevation = 10, .distance = 3, .fov = 45, .width = 40, .height = 30, .background = {1, 1, 1}};
+    uint8_t pixels[4 * 40 * 30];
+    b2p_status drawn = b2p_render(gaussians, &camera, NULL, pixels, sizeof pixels, message, sizeof message);
+    CHECK(drawn == B2P_STATUS_OK);
+    for (size_t i = 0; i < sizeof pixels; i++) {
+        job->sum = job->sum * 31 + pixels[i];
+    }
+    CHECK(pixels[3] == 255);
+    CHECK(b2p_render(gaussians, &camera, NULL, pixels, 7, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(strstr(message, "4800") && strstr(message, "7"));
+    b2p_limits few = b2p_limits_default();
+    few.max_pixels = 100;
+    CHECK(b2p_render(gaussians, &camera, &few, pixels, sizeof pixels, message, sizeof message) == B2P_STATUS_LIMIT);
+    b2p_gaussians_free(gaussians);
+    return NULL;
+}
+
+static void mistakes(const b2p_model *model, file stream) {
+    b2p_model *none = NULL;
+    CHECK(b2p_model_open("/no/such/model", &none, message, sizeof message) == B2P_STATUS_IO);
+    CHECK(strstr(message, "/no/such/model"));
+    char little[4];
+    CHECK(b2p_model_open("/no/such/model", &none, little, sizeof little) == B2P_STATUS_IO);
+    CHECK(strlen(little) == 3);
+    CHECK(b2p_model_open(NULL, &none, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_model_from_bytes(stream.bytes, stream.length, &none, message, sizeof message) == B2P_STATUS_MALFORMED);
+    CHECK(none == NULL);
+
+    b2p_decoding *decoding = NULL;
+    CHECK(b2p_decoding_start(NULL, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_start(model, NULL, NULL, 256, &decoding, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_push(NULL, stream.bytes, stream.length, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_level(NULL) == -1);
+
+    // Cut, damaged, over the limits, cancelled.
+    b2p_gaussians *gaussians = NULL;
+    CHECK(b2p_decoding_start(model, NULL, NULL, -1, &decoding, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_push(decoding, stream.bytes, stream.length - 1, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_TRUNCATED);
+    CHECK(b2p_decoding_level(decoding) >= 0);
+    CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_OK);
+    b2p_gaussians_free(gaussians);
+    b2p_decoding_free(decoding);
+
+    stream.bytes[stream.length - 1] ^= 1;
+    CHECK(b2p_decoding_start(model, NULL, NULL, -1, &decoding, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_push(decoding, stream.bytes, stream.length, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_CHECKSUM);
+    b2p_decoding_free(decoding);
+    stream.bytes[stream.length - 1] ^= 1;
+
+    b2p_limits limits = b2p_limits_embedded();
+    limits.max_bytes = 1000;
+    b2p_cancel *cancel = NULL;
+    CHECK(b2p_cancel_new(&cancel, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_start(model, &limits, cancel, -1, &decoding, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_push(decoding, stream.bytes, stream.length, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_LIMIT);
+    CHECK(strstr(message, "max_bytes"));
+    b2p_decoding_free(decoding);
+    CHECK(b2p_decoding_start(model, NULL, cancel, -1, &decoding, NULL, 0) == B2P_STATUS_OK);
+    b2p_cancel_throw(cancel);
+    b2p_cancel_free(cancel);
+    CHECK(b2p_decoding_push(decoding, stream.bytes, stream.length, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_CANCELLED);
+    b2p_decoding_free(decoding);
+
+    b2p_model_free(NULL);
+    b2p_decoding_free(NULL);
+    b2p_gaussians_free(NULL);
+    b2p_cancel_free(NULL);
+    b2p_cancel_throw(NULL);
+}
+
+int main(int count, char **arguments) {
+    CHECK(count == 3);
+    file model_file = read_file(arguments[1]), stream = read_file(arguments[2]);
+    b2p_model *model = NULL, *again = NULL;
+    CHECK(b2p_model_open(arguments[1], &model, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_model_from_bytes(model_file.bytes, model_file.length, &again, message, sizeof message) == B2P_STATUS_OK);
+    free(model_file.bytes);
+    CHECK(strlen(b2p_version()) >= 5);
+    CHECK(b2p_limits_unlimited().max_bytes > b2p_limits_default().max_bytes);
+
+    mistakes(model, stream);
+    job jobs[3] = {{model, &stream, 0}, {model, &stream, 0}, {again, &stream, 0}};
+    pthread_t threads[3];
+    for (int i = 0; i < 3; i++) {
+        CHECK(pthread_create(&threads[i], NULL, decode, &jobs[i]) == 0);
+    }
+    for (int i = 0; i < 3; i++) {
+        CHECK(pthread_join(threads[i], NULL) == 0);
+        CHECK(jobs[i].sum == jobs[0].sum);
+    }
+    b2p_model_free(model);
+    b2p_model_free(again);
+    free(stream.bytes);
+    printf("%016llx\n", (unsigned long long)jobs[0].sum);
+    return 0;
+}
