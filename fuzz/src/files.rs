@@ -24,7 +24,11 @@ pub fn model(bytes: &[u8]) {
         let place = place
             .iter()
             .fold(0, |sum, byte| sum << 8 | usize::from(*byte));
-        let end = if place.is_multiple_of(2) { text } else { file.len() };
+        let end = if place.is_multiple_of(2) {
+            text
+        } else {
+            file.len()
+        };
         file[place / 2 % end] = *value;
     }
     load(&file);
