@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from safetensors.numpy import load_file, save_file
 
-from model import Crop, make_crop
+from crop import Crop, make_crop
 
 
 @dataclass

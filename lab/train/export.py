@@ -16,8 +16,9 @@ from safetensors.numpy import save_file
 import data
 import integer
 import ops
+from crop import join
 from integer import LIMIT, SIGMA_MAX, SIGMA_MIN, SIGMAS, sigma_of
-from model import B2P, Inception, NormConv, ResBlock, join
+from model import B2P, Inception, NormConv, ResBlock
 
 WEIGHT_MAX = 511
 LATENT_SHIFT = 6

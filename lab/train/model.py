@@ -1,72 +1,16 @@
 """The network of Bits-to-Photon (arXiv 2406.05915, appendix tables), float, for training.
 
-Roles: 3 = finest input level, 2, 1, 0 = coarsest coded level. A `Crop` holds one cloud's coordinates and kernel maps for all roles.
+Roles: 3 = finest input level, 2, 1, 0 = coarsest coded level.
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
 import ops
-
-SIGMA_MIN, SIGMA_MAX = 0.11, 64.0
-LIKELIHOOD_MIN = 1e-9
-
-
-@dataclass
-class Crop:
-    """coords[r] int32 [n_r, 3]; kernel3[r]; first[r] = first child (in role r + 1) of each voxel, n_r + 1 entries;
-    descent[r] maps role r - 1 to r; corners = 2x2x2 map of role 2; children, children3 = generated level of role 1."""
-
-    coords: list
-    kernel3: list
-    first: list
-    descent: dict
-    corners: ops.Map
-    children: torch.Tensor
-    children3: ops.Map
-
-    @property
-    def points(self):
-        return self.coords[3].shape[0]
-
-    def to(self, device):
-        if device == "cpu":
-            return self
-        return Crop([c.to(device) for c in self.coords], [k.to(device) for k in self.kernel3], [f.to(device) for f in self.first],
-                    {r: m.to(device) for r, m in self.descent.items()}, self.corners.to(device), self.children.to(device),
-                    self.children3.to(device))
-
-
-def join(crops):
-    """Several crops as one, far apart."""
-    step = 4096  # finest voxels
-    coords = [torch.cat([c.coords[r] + torch.tensor([i * step >> (3 - r), 0, 0], dtype=torch.int32) for i, c in enumerate(crops)]) for r in range(4)]
-    parents = {}
-    for r in (1, 2, 3):
-        count = torch.cat([c.first[r - 1][1:] - c.first[r - 1][:-1] for c in crops]).long()
-        parents[r] = torch.repeat_interleave(torch.arange(len(count)), count).int()
-    return make_crop(coords, parents)
-
-
-def make_crop(coords, parents, finest=True):
-    """coords: four int32 tensors, role 0 .. 3, Morton-sorted; parents[r] (r = 1..3): row of each voxel's parent in role r - 1.
-    `finest`: with the kernel map of role 3."""
-    first = []
-    for r in range(3):
-        counts = torch.bincount(parents[r + 1].long(), minlength=coords[r].shape[0])
-        first.append(torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)]).int())
-    descent = {r: ops.descent(coords[r], parents[r], coords[r - 1].shape[0]) for r in (1, 2, 3)}
-    kernel3 = [ops.neighbours(coords[0])]
-    for r in (1, 2, 3) if finest else (1, 2):
-        kernel3.append(ops.neighbours_below(kernel3[-1], descent[r].back, parents[r], coords[r]))
-    children, n = ops.all_children(coords[1]), coords[1].shape[0]
-    every = torch.arange(8 * n, dtype=torch.int32)
-    children3 = ops.neighbours_below(kernel3[1], every.view(n, 8).T.contiguous(), every // 8, children)
-    return Crop(coords, kernel3, first, {r: descent[r] for r in (1, 2)}, ops.corners(coords[2]), children, children3)
+from rates import Bound, Prior, bin_mass, bits, bounded_sigma
 
 
 def initial(taps, cin, cout, scale=1.0):
@@ -247,20 +191,6 @@ class Generate(nn.Module):
         return self.conv_out(x, kmap)
 
 
-class Prior(nn.Module):
-    """Factorised prior of role 0: per channel a mixture of three Gaussians, integrated over the rounding bin."""
-
-    def __init__(self, k):
-        super().__init__()
-        self.weight = nn.Parameter(torch.zeros(k, 3))
-        self.mean = nn.Parameter(torch.tensor([[-2.0, 0.0, 2.0]]).repeat(k, 1))
-        self.log_sigma = nn.Parameter(torch.full((k, 3), 0.7))
-
-    def forward(self, y):
-        w = torch.softmax(self.weight, 1)
-        return (w * bin_mass(y[:, :, None], self.mean, bounded_sigma(self.log_sigma))).sum(2)
-
-
 class Base(nn.Module):
     """Predicts the latents of role 0, which have no level below them: its voxels are coded octant by octant, and each is predicted from
     those of its 26 neighbours that came before."""
@@ -297,37 +227,6 @@ class Base(nn.Module):
         return self.mu(x), self.sigma(x)
 
 
-class _Bound(torch.autograd.Function):
-    """Clamp whose gradient passes at a bound when it leads back inside."""
-
-    @staticmethod
-    def forward(ctx, x, lo, hi):
-        ctx.save_for_backward(x)
-        ctx.lo, ctx.hi = lo, hi
-        return x.clamp(lo, hi)
-
-    @staticmethod
-    def backward(ctx, g):
-        (x,) = ctx.saved_tensors
-        stop = ((x < ctx.lo) & (g > 0)) | ((x > ctx.hi) & (g < 0))
-        return g.masked_fill(stop, 0), None, None
-
-
-def bounded_sigma(log_sigma):
-    return torch.exp(_Bound.apply(log_sigma, math.log(SIGMA_MIN), math.log(SIGMA_MAX)))
-
-
-def bin_mass(y, mu, sigma):
-    """Mass of N(mu, sigma) in [y - 1/2, y + 1/2], computed in the lower tail, where erfc keeps its precision."""
-    d = (y - mu).abs()
-    s = 1 / (sigma * math.sqrt(2))
-    return 0.5 * (torch.erfc((d - 0.5) * s) - torch.erfc((d + 0.5) * s))
-
-
-def bits(mass):
-    return -torch.log2(_Bound.apply(mass, LIKELIHOOD_MIN, 2.0)).sum()
-
-
 def gaussians(raw, coords, unit, cfg, opaque):
     """Gaussians of voxels `coords` whose size is `unit` finest voxels: mean, covariance, opacity, colour in finest-voxel units."""
     offset, scale, rotation, opacity, colour = raw.split([3, 3, 4, 1, 3], 1)
@@ -335,7 +234,7 @@ def gaussians(raw, coords, unit, cfg, opaque):
     sigma = F.softplus(scale + cfg["scale_bias"]) * (cfg["scale_range"] * unit)
     rotation = F.normalize(rotation + torch.tensor([1.0, 0, 0, 0], device=raw.device, dtype=raw.dtype), dim=1)
     alpha = torch.ones_like(opacity[:, 0]) if opaque else torch.sigmoid(opacity[:, 0] + cfg["opacity_bias"])
-    return mean, ops.covariance(sigma, rotation), alpha, _Bound.apply(0.5 + colour, 0.0, 1.0)
+    return mean, ops.covariance(sigma, rotation), alpha, Bound.apply(0.5 + colour, 0.0, 1.0)
 
 
 def colour_basis():

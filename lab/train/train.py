@@ -16,7 +16,8 @@ from safetensors.torch import load_file
 
 import data
 import ops
-from model import B2P, groups, join
+from crop import join
+from model import B2P, groups
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 

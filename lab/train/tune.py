@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 import data
-from model import B2P, bin_mass, bits, bounded_sigma
+from model import B2P
+from rates import bin_mass, bits, bounded_sigma
 from train import atomic_save, keep_memory
 
 
