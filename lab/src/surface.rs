@@ -78,7 +78,7 @@ impl Surface {
         }
     }
 
-    /// The surface with every position mapped by `f`.
+    /// The surface with every position mapped by `f`; a photograph stays where it was in space (but see [`Surface::translated`]).
     pub fn map(&self, f: impl Fn([f32; 3]) -> [f32; 3] + Sync) -> Self {
         let mut surface = self.clone();
         for part in &mut surface.parts {

@@ -21,7 +21,8 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and the model itself.
     ///
     /// That is linear in the voxels: with C channels and K latents, 124 + 10·C + 7·K bytes for each voxel of a level, the level above it
-    /// with its features, and 220 + 6·H bytes more for each Gaussian that a generator of H channels makes.
+    /// with its features, 220 + 6·H bytes more for each Gaussian that a generator of H channels makes, and, where a network of B channels
+    /// predicts the base level, 20 + 19·K + 4·B bytes for each of its voxels.
     ///
     /// # Errors
     /// [`crate::Error::Usage`] if the stream has no such level.
@@ -39,12 +40,13 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let voxels = counts().next_back().unwrap_or(0);
         // Context, four tensors of a block, latents with their means and scales.
         let exact = parents * features + voxels * (MAP + 16 + 10 * c + 7 * k);
+        let base = counts().next().unwrap_or(0) * shape.base_bytes() as u64;
         let head = shape.head(levels - 1).map_or(0, |head| {
             let h = head.channels as u64;
             let one = MAP + 3 * 2 * h + 4 * RAW as u64 + GAUSSIAN;
             voxels * (head.children as u64 * one + 6 * h + 2 * c + 32)
         });
-        Ok(stream + octree + exact + head)
+        Ok(stream + octree + base + exact + head)
     }
 
     /// Fails with [`crate::Error::LimitExceeded`] if decoding down to `level` takes more than is allowed.

@@ -4,9 +4,9 @@ use std::ops::Range;
 
 use b2p_kernels::{LIMIT, Taps};
 
-use super::Model;
 use super::layers::{Pool, apply};
 use super::structure::base_inputs;
+use super::{Model, Shape};
 use crate::entropy::UNPREDICTED;
 use crate::geometry::KernelMap;
 
@@ -14,6 +14,16 @@ use crate::geometry::KernelMap;
 const OTHERS: usize = 7;
 /// Standard deviations that a latent may have.
 const SIGMAS: i16 = 64;
+
+impl Shape {
+    /// Bytes that predicting one voxel of the base level takes at most: the network's inputs, two hidden layers, means and scales.
+    pub(crate) fn base_bytes(&self) -> usize {
+        match self.base_channels {
+            0 => 0,
+            hidden => 2 * (base_inputs(self.latents) + 2 * hidden) + 5 * self.latents,
+        }
+    }
+}
 
 impl Model {
     /// Whether the base level's latents are predicted from neighbours.
