@@ -1,6 +1,6 @@
 //! Stream to Gaussians: drives the stages, holds no algorithm.
 
-use crate::bitstream::{Level, Stream};
+use crate::bitstream::{Header, Level, Stream};
 use crate::entropy::{Condition, decode_level, latent_hash};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
@@ -8,6 +8,7 @@ use crate::geometry::{KernelMap, Octree, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::network::{Model, Module};
+use crate::projection::Camera;
 
 /// Decodes streams with one model.
 pub struct Decoder<'m> {
@@ -87,13 +88,36 @@ impl<'m> Decoder<'m> {
             "voxels",
             || self.model.generate(role, &exact.features, &map),
         )?;
-        let frame = Frame {
-            bits: header.bits,
-            placement: header.placement,
-        };
+        let frame = frame_of(header);
         log.step("activate", voxels.len() * children, "Gaussians", || {
             Ok(activate(&raw, voxels, children, self.model.shape(), frame))
         })
+    }
+
+    /// The cube that a stream's Gaussians refer to.
+    ///
+    /// # Errors
+    /// Those of [`Stream::parse`].
+    pub fn frame(&self, bytes: &[u8]) -> Result<Frame> {
+        let stream = Stream::parse(bytes, &self.limits)?;
+        Ok(frame_of(stream.header()))
+    }
+
+    /// The coarsest level with Gaussians whose voxels are nowhere wider than a pixel in the pictures that `cameras` take: what is finer
+    /// is hardly seen. The finest level where even its voxels are.
+    ///
+    /// # Errors
+    /// Those of [`Decoder::decode`] that the header and a scan of the chunks show.
+    pub fn level_for(&self, bytes: &[u8], cameras: &[Camera]) -> Result<u8> {
+        let stream = self.open(bytes)?.intact()?;
+        let finest = self.finest(&stream)?;
+        let pixels = cameras.iter().map(Camera::pixels_per_unit);
+        let pixels = pixels.fold(0.0, f64::max);
+        let seen = |level: &u8| 2.0 / f64::from(1u32 << level) * pixels <= 1.0;
+        Ok(self
+            .drawable(&stream)
+            .find(seen)
+            .map_or(finest, |level| level.min(finest)))
     }
 
     /// Decodes a stream's exact zone down to `level`, which need not have a head.
@@ -257,5 +281,12 @@ impl<'m> Decoder<'m> {
             .unwrap_or(0);
         self.limits
             .check_bytes("memory to decode this stream", peak)
+    }
+}
+
+fn frame_of(header: &Header) -> Frame {
+    Frame {
+        bits: header.bits,
+        placement: header.placement,
     }
 }
