@@ -1,12 +1,13 @@
 //! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes. Least and median time of
 //! the whole frame, and the stages of the fastest.
 //!
-//! `raster [--threads N] [--isa NAME] [--effects] [SCENE…]`; `--effects` draws with each effect instead of the plain pictures; a scene being a name of [`SCENES`].
+//! `raster [--threads N] [--isa NAME] [--effects] [--fine] [SCENE…]`; `--effects` draws with each effect instead of the plain pictures,
+//! `--fine` in that quality; a scene being a name of [`SCENES`].
 
 use std::time::{Duration, Instant};
 
 use b2p::gaussians::{Gaussians, Harmonics};
-use b2p::pixels::{Background, Channel, Choice, Effects, Image, Renderer, Stats};
+use b2p::pixels::{Background, Channel, Choice, Effects, Image, Quality, Renderer, Stats};
 use b2p::projection::Camera;
 use b2p::{Error, Limits, Result};
 use b2p_kernels::Isa;
@@ -165,12 +166,14 @@ fn measure(
     isa: Isa,
     scene: &Scene,
     gaussians: &Gaussians,
+    quality: Quality,
     (what, effects, channel): (&str, Effects, Channel),
 ) -> Result<()> {
     let (width, height) = scene.size;
     let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, width, height)?;
     let mut renderer = Renderer::new(isa);
     renderer.set_effects(effects);
+    renderer.set_quality(quality);
     let mut image = Image::default();
     let mut frame = || -> Result<(Duration, Stats)> {
         let start = Instant::now();
@@ -217,9 +220,14 @@ fn variants(forced: bool) -> Vec<(&'static str, Effects, Channel)> {
         antialias: Choice::On,
         ..none
     };
+    let order = Effects {
+        order: Choice::On,
+        ..none
+    };
     if forced {
         vec![
             (", antialias", antialias, Channel::Colour),
+            (", order", order, Channel::Colour),
             (", harmonics", none, Channel::Colour),
             (", depth", none, Channel::Depth),
             (", normals", none, Channel::Normal),
@@ -231,6 +239,7 @@ fn variants(forced: bool) -> Vec<(&'static str, Effects, Channel)> {
 
 fn main() -> Result<()> {
     let (mut threads, mut forced) = (0, false);
+    let mut quality = Quality::default();
     let mut isas = Isa::available();
     let mut names = Vec::new();
     let mut args = std::env::args().skip(1).filter(|arg| arg != "--bench");
@@ -238,6 +247,7 @@ fn main() -> Result<()> {
         match arg.as_str() {
             "--threads" => threads = args.next().and_then(|n| n.parse().ok()).unwrap_or(0),
             "--effects" => forced = true,
+            "--fine" => quality = Quality::Fine,
             "--isa" => {
                 isas = args
                     .next()
@@ -264,7 +274,7 @@ fn main() -> Result<()> {
                             coefficients: vec![[0.01; 3]; 15 * gaussians.len()],
                         };
                     }
-                    pool.install(|| measure(isa, scene, &gaussians, variant))?;
+                    pool.install(|| measure(isa, scene, &gaussians, quality, variant))?;
                     gaussians.harmonics = Harmonics::default();
                 }
             }

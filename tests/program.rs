@@ -161,6 +161,9 @@ fn pictures_and_videos_go_to_a_pipe() {
     assert!(piped(&[]).starts_with(b"\x89PNG"));
     assert!(piped(&["--format", "png16"]).starts_with(b"\x89PNG"));
     assert_eq!(piped(&["--format", "ppm"]).len(), 13 + 32 * 24 * 3);
+    let exr = piped(&["--format", "exr"]);
+    // Five channels, and for every line its place, its row and its length.
+    assert!(exr.starts_with(b"\x76\x2f\x31\x01") && exr.len() > 24 * (16 + 32 * 5 * 4));
     let video = piped(&["--views", "4"]);
     assert!(video.starts_with(b"YUV4MPEG2 W32 H24 "));
     let header = video.iter().position(|&b| b == b'\n').unwrap() + 1;
@@ -195,9 +198,41 @@ fn effects_are_explained_and_forced() {
     assert!(draw("b.png", &["--effect", "antialias=on"]).contains("antialias on: forced"));
     let [a, b] = ["a.png", "b.png"].map(|name| common::png(&at.join(name)));
     assert!(a.data() != b.data());
-    for show in ["depth", "normal", "alpha"] {
+    for show in ["depth", "normal", "alpha", "id"] {
         draw("c.png", &["--show", show, "--orthographic"]);
     }
+    let cost = draw("d.png", &["--effect", "order=on", "--quality", "exact"]);
+    let line = cost.lines().find(|line| line.starts_with("order on"));
+    assert!(line.is_some_and(|line| line.contains(" ms of ")), "{cost}");
+}
+
+#[test]
+fn a_small_picture_is_drawn_from_a_coarser_level_unless_one_is_named() {
+    let folder = folder_with_stream();
+    let draw = |more: &[&str]| {
+        let args = ["render", "ball.b2p", "-o", "a.png", "-v"];
+        succeeds(folder.path(), &[&args[..], more].concat())
+    };
+    assert!(draw(&["--size", "8x8"]).contains("detail on: level 5"));
+    assert!(draw(&["--size", "400x400"]).contains("detail off: level 6"));
+    assert!(draw(&["--size", "8x8", "--level", "6"]).contains("detail off: level 6, forced"));
+}
+
+#[test]
+fn drawing_is_timed_stage_by_stage() {
+    let folder = folder_with_stream();
+    let args = [
+        "bench", "ball.b2p", "--render", "--size", "64x48", "--repeat", "2",
+    ];
+    assert!(succeeds(folder.path(), &args).contains("blend"));
+    let json = succeeds(folder.path(), &[&args[..], &["--json"]].concat());
+    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(
+        (json["width"].as_u64(), json["runs"].as_u64()),
+        (Some(64), Some(2))
+    );
+    let frame = json["median_ms"]["frame"].as_f64().unwrap();
+    assert!(frame >= json["median_ms"]["project"].as_f64().unwrap());
 }
 
 #[test]

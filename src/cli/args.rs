@@ -125,13 +125,14 @@ pub struct Decode {
 pub struct Render {
     /// Stream, or PLY of Gaussians. `-`: standard input, drawn as it comes
     pub input: PathBuf,
-    /// Picture to write: .png, .ppm, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
+    /// Picture to write: .png, .ppm, .exr, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
     #[arg(short, long, value_name = "OUT.png")]
     pub output: PathBuf,
     /// What is written [default: by the ending; to standard output png, and y4m of several pictures]
     #[arg(long, value_enum, value_name = "FORMAT")]
     pub format: Option<Format>,
-    /// Cameras of a file in place of --orbit: NeRF's transforms.json, or COLMAP's images.txt beside its cameras.txt
+    /// Cameras of a file in place of --orbit: NeRF's transforms.json, COLMAP's images.txt beside its cameras.txt, Open3D's pinhole JSON,
+    /// glTF's camera nodes
     #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov"])]
     pub camera: Option<PathBuf>,
     /// Parallel rays; the cube's centre stays as large as it is
@@ -140,13 +141,16 @@ pub struct Render {
     /// What is drawn
     #[arg(long, value_enum, value_name = "WHAT", default_value_t = Show::Colour)]
     pub show: Show,
-    /// Force an effect (harmonics, antialias) on or off
+    /// Force an effect (harmonics, antialias, supersample, near, order) on or off
     #[arg(long, value_name = "NAME=on|off|auto", value_parser = effect)]
     pub effect: Vec<(Effect, Choice)>,
+    /// How much of what is faint may be left out: fast, fine, exact
+    #[arg(long, value_name = "NAME", default_value = "fast")]
+    pub quality: Quality,
     /// Print what each picture took, and what was not drawn and why, as JSON
     #[arg(long, value_enum, value_name = "FORMAT")]
     pub stats: Option<StatsFormat>,
-    /// Say which effects are on, and why
+    /// Say which effects are on, why, and what each costs
     #[arg(short, long)]
     pub verbose: bool,
     #[command(flatten)]
@@ -168,6 +172,8 @@ pub enum Format {
     Ppm,
     /// A video of all pictures, 30 a second
     Y4m,
+    /// OpenEXR: linear light, alpha, and of colours the depth
+    Exr,
 }
 
 /// What a picture shows.
@@ -181,6 +187,8 @@ pub enum Show {
     Normal,
     /// How much of a pixel is covered
     Alpha,
+    /// The Gaussian that a pixel shows most of: its number plus one, the lowest eight bits red
+    Id,
 }
 
 /// How numbers are printed.
@@ -233,9 +241,18 @@ pub struct Demo {
 
 #[derive(Debug, Args)]
 pub struct Bench {
-    /// Stream to decode [default: the sample that comes with the program]
+    /// Stream to decode, or, to render, PLY of Gaussians [default: the sample that comes with the program]
     pub input: Option<PathBuf>,
-    /// Times that it is decoded; medians are told
+    /// Time drawing instead, stage by stage, seen from the front
+    #[arg(long)]
+    pub render: bool,
+    /// Width and height in pixels of what is drawn
+    #[arg(long, value_name = "WxH", default_value = "1024x1024", value_parser = size, requires = "render")]
+    pub size: (u32, u32),
+    /// What is drawn leaves out as much as this quality does: fast, fine, exact
+    #[arg(long, value_name = "NAME", default_value = "fast", requires = "render")]
+    pub quality: Quality,
+    /// Times that it is decoded or drawn; medians are told
     #[arg(long, value_name = "N", default_value_t = 7, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub repeat: u32,
     /// Print JSON
@@ -249,7 +266,7 @@ pub struct Bench {
 
 #[derive(Debug, Args)]
 pub struct LevelArg {
-    /// Octree level to decode to [default: the finest in the stream that has a Gaussian head]
+    /// Octree level to decode to [default: the finest with Gaussians; to draw, the finest that can be seen]
     #[arg(long, value_name = "M")]
     pub level: Option<u8>,
 }
@@ -267,7 +284,7 @@ pub struct ModelArg {
     pub precision: Option<String>,
 }
 
-pub use b2p::pixels::{Background, Choice, Effect};
+pub use b2p::pixels::{Background, Choice, Effect, Quality};
 
 /// A number of bytes, with or without K, M, G or T for powers of 1024.
 fn bytes(text: &str) -> Result<u64, String> {

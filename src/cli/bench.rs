@@ -14,7 +14,7 @@ use serde_json::json;
 use super::args::Bench;
 use super::progress::Progress;
 use super::table::{count, milliseconds, table};
-use super::{Failure, Result, load};
+use super::{Failure, Result, bench_render, load};
 
 /// One stage's figures.
 struct Line {
@@ -25,6 +25,9 @@ struct Line {
 
 /// Decodes again and again; prints a table or JSON.
 pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String> {
+    if args.render {
+        return bench_render::run(args, limits, progress);
+    }
     let bytes = match &args.input {
         Some(path) => load::bytes(path)?,
         None => embedded::SAMPLE.to_vec(),
@@ -226,14 +229,14 @@ fn rate(work: Work, time: Duration) -> f64 {
     work.macs as f64 / 1e9 / time.as_secs_f64().max(1e-9)
 }
 
-fn median(times: impl Iterator<Item = Duration>) -> Duration {
+pub fn median(times: impl Iterator<Item = Duration>) -> Duration {
     let mut times: Vec<Duration> = times.collect();
     times.sort_unstable();
     times[times.len() / 2]
 }
 
 /// The most memory that this process ever held, where the system tells.
-fn peak_memory() -> Option<u64> {
+pub fn peak_memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
     let kilobytes: u64 = line.split_whitespace().nth(1)?.parse().ok()?;

@@ -4,9 +4,11 @@ use std::io::Read;
 use std::path::Path;
 
 use b2p::decoder::Decoder;
-use b2p::gaussians::{Gaussians, ply};
+use b2p::gaussians::{Frame, Gaussians, ply};
 use b2p::log::Log;
 use b2p::network::Model;
+use b2p::pixels::Explanation;
+use b2p::projection::Camera;
 use b2p::{Error, Isa, Limits, UnknownIsa};
 
 use super::args::{LevelArg, ModelArg};
@@ -76,6 +78,96 @@ pub fn gaussians(
         .with_limits(limits.clone())
         .decode(&bytes, level.level, log)
         .map_err(Failure::in_file(path))
+}
+
+/// Where Gaussians come from.
+pub enum Source<'p> {
+    /// A PLY that has been read.
+    Gaussians(Gaussians),
+    /// A stream, and what decodes it.
+    Stream {
+        path: &'p Path,
+        bytes: Vec<u8>,
+        model: Box<Model>,
+        limits: &'p Limits,
+    },
+}
+
+impl<'p> Source<'p> {
+    /// Reads a file.
+    pub fn open(
+        path: &'p Path,
+        level: &LevelArg,
+        model_arg: &ModelArg,
+        limits: &'p Limits,
+        log: &mut Log,
+    ) -> Result<Self> {
+        let bytes = bytes(path)?;
+        if bytes.starts_with(PLY_MAGIC) {
+            return Ok(Source::Gaussians(ply(path, &bytes, level, limits, log)?));
+        }
+        let model = Box::new(model(model_arg)?);
+        Ok(Source::Stream {
+            path,
+            bytes,
+            model,
+            limits,
+        })
+    }
+
+    /// The cube that they refer to.
+    pub fn frame(&self) -> Result<Frame> {
+        match self {
+            Source::Gaussians(gaussians) => Ok(gaussians.frame),
+            Source::Stream {
+                path,
+                bytes,
+                model,
+                limits,
+            } => Decoder::new(&**model)
+                .with_limits((*limits).clone())
+                .frame(bytes)
+                .map_err(Failure::in_file(path)),
+        }
+    }
+
+    /// The Gaussians of `level`; without one, of what `cameras` can show, and why that level.
+    pub fn gaussians(
+        self,
+        level: &LevelArg,
+        cameras: &[Camera],
+        log: &mut Log,
+    ) -> Result<(Gaussians, Explanation)> {
+        let explain = |on, why| Explanation {
+            name: "detail",
+            on,
+            why,
+        };
+        let (path, bytes, model, limits) = match self {
+            Source::Gaussians(gaussians) => {
+                return Ok((gaussians, explain(false, "a PLY has no levels".into())));
+            }
+            Source::Stream {
+                path,
+                bytes,
+                model,
+                limits,
+            } => (path, bytes, model, limits),
+        };
+        let decoder = Decoder::new(&*model).with_limits(limits.clone());
+        let fail = Failure::in_file(path);
+        let seen = match level.level {
+            Some(_) => None,
+            None => decoder.level_for(&bytes, cameras).map_err(&fail)?,
+        };
+        let why = match (level.level, seen) {
+            (Some(level), _) => format!("level {level}, forced"),
+            (None, Some(level)) => format!("level {level}: its voxels already fall under a pixel"),
+            (None, None) => "as fine as there is".into(),
+        };
+        let gaussians = decoder.decode(&bytes, level.level.or(seen), log);
+        Ok((gaussians.map_err(&fail)?, explain(seen.is_some(), why)))
+    }
 }
 
 /// Gaussians as they stand in the PLY `bytes`, which came from `path`.

@@ -2,11 +2,13 @@
 
 mod args;
 mod bench;
+mod bench_render;
 mod decode;
 mod demo;
 mod encode;
 mod info;
 mod load;
+mod picture;
 mod pipe;
 mod progress;
 mod render;

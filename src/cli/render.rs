@@ -2,40 +2,55 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
-use b2p::gaussians::Gaussians;
+use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
-use b2p::pixels::{Background, Channel, Effects, Image, Renderer, Stats};
+use b2p::pixels::{Choice, Effects, Explanation, Renderer, Stats};
 use b2p::projection::{Camera, files};
 use b2p::{Error, Limits, output};
 use serde_json::json;
 
-use super::args::{Format, Render, Show, View};
+use super::args::{Format, Render, View};
+use super::load::Source;
+use super::picture::{Artist, format_of};
 use super::pipe::{self, PIPE};
 use super::progress::Progress;
 use super::table::{count, milliseconds, steps};
 use super::{Failure, Result, load};
 
+/// Frames that the cost of an effect is measured with; the fastest counts.
+const TRIALS: usize = 3;
+
 /// Draws one picture, or several: on a circle, or with the cameras of a file.
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String> {
     let say = |step: &str| progress.say(step);
     let mut log = Log::with_listener(&say);
-    let mut text = String::new();
-    // What has gone to standard output cannot be replaced by something finer.
-    let early = args.output != Path::new(PIPE);
-    pipe::each(
-        &args.input,
-        &args.level,
-        &args.model,
-        limits,
-        early,
-        &mut log,
-        &mut |gaussians, log| {
-            text = pictures(args, limits, gaussians, log)?;
+    if args.input == Path::new(PIPE) {
+        let mut text = String::new();
+        // What has gone to standard output cannot be replaced by something finer.
+        let early = args.output != Path::new(PIPE);
+        let mut show = |gaussians: &Gaussians, log: &mut Log| {
+            let cameras = asked_for(args, &gaussians.frame)?;
+            text = pictures(args, limits, gaussians, &cameras, None, log)?;
             Ok(())
-        },
-    )?;
-    Ok(text)
+        };
+        pipe::each(
+            &args.input,
+            &args.level,
+            &args.model,
+            limits,
+            early,
+            &mut log,
+            &mut show,
+        )?;
+        return Ok(text);
+    }
+    let source = Source::open(&args.input, &args.level, &args.model, limits, &mut log)?;
+    let cameras = asked_for(args, &source.frame()?)?;
+    let views: Vec<Camera> = cameras.iter().map(|(_, camera)| *camera).collect();
+    let (gaussians, detail) = source.gaussians(&args.level, &views, &mut log)?;
+    pictures(args, limits, &gaussians, &cameras, Some(detail), &mut log)
 }
 
 /// Draws these Gaussians into the pictures asked for.
@@ -43,48 +58,44 @@ fn pictures(
     args: &Render,
     limits: &Limits,
     gaussians: &Gaussians,
+    cameras: &[(PathBuf, Camera)],
+    detail: Option<Explanation>,
     log: &mut Log,
 ) -> Result<String> {
     let mut effects = Effects::default();
     for (effect, choice) in &args.effect {
         effects.set(*effect, *choice);
     }
-    let cameras = asked_for(args, gaussians)?;
-    let mut text = String::new();
-    if let (true, Some((_, camera))) = (args.verbose, cameras.first()) {
-        for line in effects.explain(gaussians, camera) {
-            text += &format!("{line}\n");
-        }
-    }
     let mut renderer = Renderer::new(load::isa(args.model.isa.as_deref())?);
     renderer.set_effects(effects);
-    let mut image = Image::default();
+    renderer.set_quality(args.quality);
+    let format = format_of(args, cameras.len())?;
+    let mut artist = Artist::new(renderer, gaussians, limits, args, format);
     let mut all = Vec::new();
-    let mut each = |path: &Path, camera: &Camera, image: &mut Image| -> b2p::Result<()> {
+    let mut each = |path: &Path, camera: &Camera, artist: &mut Artist| -> b2p::Result<()> {
         let stats = log.step(
             format!("draw {}", path.display()),
             gaussians.len(),
             "Gaussians",
-            || show(&mut renderer, gaussians, camera, args, limits, image),
+            || artist.draw(camera),
         )?;
-        all.push((path.to_owned(), camera.width, camera.height, stats));
+        all.push((path.to_owned(), camera.size(), stats));
         Ok(())
     };
 
-    let format = format_of(args, cameras.len())?;
     let to_stdout = args.output == Path::new(PIPE);
     if format == Format::Y4m {
         let mut video = |to: &mut dyn Write| -> b2p::Result<()> {
             for (i, (path, camera)) in cameras.iter().enumerate() {
-                let last = (image.width, image.height);
-                each(path, camera, &mut image)?;
+                let last = (artist.image.width, artist.image.height);
+                each(path, camera, &mut artist)?;
                 if i == 0 {
-                    write(to, &image.y4m_header(), &args.output)?;
-                } else if last != (image.width, image.height) {
+                    write(to, &artist.image.y4m_header(), &args.output)?;
+                } else if last != (artist.image.width, artist.image.height) {
                     let what = "the pictures of a video are all of one size";
                     return Err(Error::Usage(format!("{what}: {} is not", path.display())));
                 }
-                write(to, &image.to_y4m_frame(), &args.output)?;
+                write(to, &artist.file()?, &args.output)?;
             }
             Ok(())
         };
@@ -94,13 +105,9 @@ fn pictures(
             output::write_file(&args.output, video)?;
         }
     } else {
-        for (path, camera) in &cameras {
-            each(path, camera, &mut image)?;
-            let file = match format {
-                Format::Png => image.to_png()?,
-                Format::Png16 => image.to_png16()?,
-                Format::Ppm | Format::Y4m => image.to_ppm(),
-            };
+        for (path, camera) in cameras {
+            each(path, camera, &mut artist)?;
+            let file = artist.file()?;
             if to_stdout {
                 write(&mut std::io::stdout().lock(), &file, path)?;
             } else {
@@ -109,16 +116,26 @@ fn pictures(
         }
     }
 
+    let mut text = String::new();
+    if let (true, Some((_, camera)), Some((_, _, stats))) = (args.verbose, cameras.first(), all.first()) {
+        if let Some(detail) = detail {
+            text += &format!("{detail}\n");
+        }
+        for line in effects.explain(gaussians, camera, stats) {
+            let cost = cost_of(&line, &mut artist, effects, camera)?;
+            text += &format!("{line}{cost}\n");
+        }
+    }
     if args.stats.is_some() {
         let all: Vec<_> = all
             .iter()
-            .map(|(path, width, height, stats)| numbers(path, [*width, *height], stats))
+            .map(|(path, size, stats)| numbers(path, *size, stats))
             .collect();
         // What a program reads is nothing but the numbers.
         let _ = std::io::stderr().write_all(text.as_bytes());
         text = format!("{:#}\n", json!(all));
     } else {
-        for (path, _, _, stats) in &all {
+        for (path, _, stats) in &all {
             text += &describe(path, stats);
         }
         text = format!("{}\n{text}", steps(log.steps()));
@@ -133,32 +150,36 @@ fn pictures(
     Ok(text)
 }
 
-/// The format asked for, or that the ending tells.
-fn format_of(args: &Render, pictures: usize) -> Result<Format> {
-    if let Some(format) = args.format {
-        return Ok(format);
+/// What an effect that is on costs, in words: how much sooner the picture is there without it.
+fn cost_of(
+    line: &Explanation,
+    artist: &mut Artist,
+    effects: Effects,
+    camera: &Camera,
+) -> Result<String> {
+    let Ok(effect) = line.name.parse() else {
+        return Ok(String::new());
+    };
+    if !line.on {
+        return Ok(String::new());
     }
-    if args.output == Path::new(PIPE) {
-        return Ok(if pictures == 1 {
-            Format::Png
-        } else {
-            Format::Y4m
-        });
-    }
-    let ending = args.output.extension().unwrap_or_default();
-    match ending.to_string_lossy().to_lowercase().as_str() {
-        "ppm" => Ok(Format::Ppm),
-        "y4m" => Ok(Format::Y4m),
-        "png" | "" => Ok(Format::Png),
-        other => Err(Failure(format!(
-            "{}: no pictures are written as .{other}, but as .png, .ppm and .y4m",
-            args.output.display()
-        ))),
-    }
+    let mut least = |effects| -> Result<Duration> {
+        artist.renderer.set_effects(effects);
+        let mut least = Duration::MAX;
+        for _ in 0..TRIALS {
+            least = least.min(artist.draw(camera)?.times.total());
+        }
+        Ok(least)
+    };
+    let mut without = effects;
+    without.set(effect, Choice::Off);
+    let [without, with] = [least(without)?, least(effects)?];
+    let cost = with.as_secs_f64() - without.as_secs_f64();
+    Ok(format!("; {:+.2} ms of {}", cost * 1e3, milliseconds(with)))
 }
 
 /// The cameras of the file, or of the circle.
-fn asked_for(args: &Render, gaussians: &Gaussians) -> Result<Vec<(PathBuf, Camera)>> {
+fn asked_for(args: &Render, frame: &Frame) -> Result<Vec<(PathBuf, Camera)>> {
     let Some(path) = &args.camera else {
         let mut cameras = cameras(&args.view, &args.output)?;
         if args.orthographic {
@@ -172,12 +193,11 @@ fn asked_for(args: &Render, gaussians: &Gaussians) -> Result<Vec<(PathBuf, Camer
         String::from_utf8(load::bytes(path)?)
             .map_err(|_| Failure(format!("{}: not a text", path.display())))
     };
-    let json = path.extension().is_some_and(|ending| ending == "json");
-    let named = if json {
-        files::nerf(&text(path)?, &gaussians.frame, args.view.size)
-    } else {
+    let named = if path.extension().is_some_and(|ending| ending == "txt") {
         let lenses = text(&path.with_file_name("cameras.txt"))?;
-        files::colmap(&lenses, &text(path)?, &gaussians.frame)
+        files::colmap(&lenses, &text(path)?, frame)
+    } else {
+        files::read(&load::bytes(path)?, frame, args.view.size)
     };
     let named = named.map_err(Failure::in_file(path))?;
     if named.is_empty() {
@@ -193,41 +213,6 @@ fn asked_for(args: &Render, gaussians: &Gaussians) -> Result<Vec<(PathBuf, Camer
     };
     let cameras = named.into_iter().enumerate();
     Ok(cameras.map(|(i, (_, camera))| (path(i), camera)).collect())
-}
-
-/// Draws what is asked for.
-fn show(
-    renderer: &mut Renderer,
-    gaussians: &Gaussians,
-    camera: &Camera,
-    args: &Render,
-    limits: &Limits,
-    image: &mut Image,
-) -> b2p::Result<Stats> {
-    let (channel, background) = match args.show {
-        Show::Colour => (Channel::Colour, args.view.background),
-        Show::Depth => (Channel::Depth, Background::Transparent),
-        Show::Normal => (Channel::Normal, Background::Transparent),
-        Show::Alpha => (Channel::Colour, Background::Transparent),
-    };
-    let stats = renderer.draw_into(gaussians, camera, channel, background, limits, image)?;
-    match args.show {
-        Show::Colour | Show::Normal => {}
-        Show::Alpha => {
-            for pixel in &mut image.pixels {
-                *pixel = [pixel[3], pixel[3], pixel[3], 1.0];
-            }
-        }
-        Show::Depth => {
-            let depth = |p: &[f32; 4]| if p[3] > 0.0 { p[0] / p[3] } else { 0.0 };
-            let farthest = image.pixels.iter().map(depth).fold(0.0, f32::max);
-            for pixel in &mut image.pixels {
-                let share = depth(pixel) / farthest.max(f32::MIN_POSITIVE);
-                *pixel = [share, share, share, 1.0];
-            }
-        }
-    }
-    Ok(stats)
 }
 
 fn write(to: &mut dyn Write, bytes: &[u8], path: &Path) -> b2p::Result<()> {
@@ -303,10 +288,17 @@ fn numbers(path: &Path, [width, height]: [u32; 2], stats: &Stats) -> serde_json:
             "behind": dropped.behind,
             "outside": dropped.outside,
         },
+        "crossing": stats.crossing,
         "pairs": stats.pairs,
         "overlap": stats.pairs as f64 / stats.visible.max(1) as f64,
         "coverage": stats.touched as f64 / (f64::from(width) * f64::from(height)),
-        "effects": { "harmonics": effects.harmonics, "antialias": effects.antialias },
+        "effects": {
+            "harmonics": effects.harmonics,
+            "antialias": effects.antialias,
+            "supersample": effects.supersample,
+            "near": effects.near,
+            "order": effects.order,
+        },
         "ms": {
             "project": ms(times.project),
             "bin": ms(times.bin),

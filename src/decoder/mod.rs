@@ -10,14 +10,15 @@ mod memory;
 use std::borrow::Cow;
 use std::ops::Deref;
 
-use crate::bitstream::Header;
+use crate::bitstream::{Header, Stream};
 use crate::cancel::Cancel;
 use crate::error::{Error, Result};
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::Octree;
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::network::Model;
+use crate::projection::Camera;
 pub use decoding::Decoding;
 use decoding::Goal;
 
@@ -100,6 +101,32 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let mut decoding = Decoding::new(self.clone(), goal, Cow::Borrowed(bytes));
         decoding.finish(log)?;
         decoding.into_exact()
+    }
+
+    /// The cube that a stream's Gaussians refer to.
+    ///
+    /// # Errors
+    /// Those of [`Header::parse`].
+    pub fn frame(&self, bytes: &[u8]) -> Result<Frame> {
+        let header = Header::parse(bytes, &self.limits)?;
+        Ok(Frame {
+            bits: header.bits,
+            placement: header.placement,
+        })
+    }
+
+    /// The coarsest level with Gaussians whose voxels are nowhere wider than a pixel in the pictures that `cameras` take: what is finer
+    /// is hardly seen. `None` if no level before the finest whole one does, so that the stream as it is serves best.
+    ///
+    /// # Errors
+    /// Those of [`Stream::parse`], and the damage of a stream that is cut or damaged elsewhere than right after a level.
+    pub fn level_for(&self, bytes: &[u8], cameras: &[Camera]) -> Result<Option<u8>> {
+        let stream = Stream::parse(bytes, &self.limits)?.intact()?;
+        let pixels = cameras.iter().map(Camera::pixels_per_unit);
+        let pixels = pixels.fold(0.0, f64::max);
+        let seen = |level: &u8| 2.0 / f64::from(1u32 << level) * pixels <= 1.0;
+        let coarsest = self.drawable(stream.header()).find(seen);
+        Ok(coarsest.filter(|level| Some(*level) < stream.deepest()))
     }
 
     fn drawable(&self, header: &Header) -> impl Iterator<Item = u8> {

@@ -6,6 +6,14 @@ use std::str::FromStr;
 use crate::gaussians::Gaussians;
 use crate::projection::{Camera, Projection};
 
+use super::Stats;
+use super::survey::typical_width;
+
+/// Standard deviations of splats from this many samples on count as resolved.
+pub const RESOLVED: f64 = 1.5;
+/// The most samples along each side of a pixel.
+pub const MOST_SAMPLES: u32 = 32;
+
 /// Whether an effect is on.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Choice {
@@ -26,6 +34,16 @@ pub enum Effect {
     /// Opacity is taken back by as much as the pixel's blur widens a splat (the Mip filter): what is smaller than a pixel is dimmed
     /// and not grown. Called for by files made that way; a stream's Gaussians are trained without.
     Antialias,
+    /// Each pixel is the mean of several samples a side, as many as it takes to bring the typical splat to [`RESOLVED`] of them, and
+    /// at most [`MOST_SAMPLES`]. A crowd of dimmed splats lets through what the crowd itself would not, and only what is resolved is
+    /// free of that. Called for by anti-aliasing where splats fall under a pixel.
+    Supersample,
+    /// What reaches over the near plane is drawn as what of it is beyond the plane, evaluated in space along each pixel's ray: it has no
+    /// sensible image in the plane, and its centre may be behind. Called for where there are such Gaussians.
+    Near,
+    /// In each pixel, splats are blended in the order of their depths there, not in that of their centres, as far as the
+    /// [`b2p_kernels::splat::WAITING`] nearest of them tell. Called for by nothing: Gaussians are made for the order of their centres.
+    Order,
 }
 
 /// The caller's choice for each effect.
@@ -35,15 +53,39 @@ pub struct Effects {
     pub harmonics: Choice,
     /// [`Effect::Antialias`].
     pub antialias: Choice,
+    /// [`Effect::Supersample`].
+    pub supersample: Choice,
+    /// [`Effect::Near`].
+    pub near: Choice,
+    /// [`Effect::Order`].
+    pub order: Choice,
 }
 
 /// Which effects a picture is drawn with. What is off is not in the loops.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct EffectSet {
     /// [`Effect::Harmonics`].
     pub harmonics: bool,
     /// [`Effect::Antialias`].
     pub antialias: bool,
+    /// [`Effect::Supersample`]: samples along each side of a pixel, a power of two; 1 if it is off.
+    pub supersample: u32,
+    /// [`Effect::Near`]: whether there was anything to take care of, once a picture is drawn.
+    pub near: bool,
+    /// [`Effect::Order`].
+    pub order: bool,
+}
+
+impl Default for EffectSet {
+    fn default() -> Self {
+        EffectSet {
+            harmonics: false,
+            antialias: false,
+            supersample: 1,
+            near: false,
+            order: false,
+        }
+    }
 }
 
 /// Something that changes how a picture is drawn, whether it does, and why.
@@ -63,26 +105,42 @@ impl Effects {
         match effect {
             Effect::Harmonics => self.harmonics = choice,
             Effect::Antialias => self.antialias = choice,
+            Effect::Supersample => self.supersample = choice,
+            Effect::Near => self.near = choice,
+            Effect::Order => self.order = choice,
         }
     }
 
-    /// What `gaussians` call for, where it is not forced. Harmonics that there are none of cannot be forced on.
-    pub fn derive(&self, gaussians: &Gaussians) -> EffectSet {
+    /// What `gaussians` seen by `camera` call for, where it is not forced. Harmonics that there are none of cannot be forced on. Whether
+    /// anything reaches over the near plane is found out only while drawing.
+    pub fn derive(&self, gaussians: &Gaussians, camera: &Camera) -> EffectSet {
         let decide = |choice, called_for| match choice {
             Choice::Auto => called_for,
             Choice::On => true,
             Choice::Off => false,
         };
         let some = gaussians.harmonics.count > 0;
+        let antialias = decide(self.antialias, gaussians.compensated);
         EffectSet {
             harmonics: some && decide(self.harmonics, true),
-            antialias: decide(self.antialias, gaussians.compensated),
+            antialias,
+            supersample: match decide(self.supersample, antialias) {
+                true => samples(typical_width(gaussians, camera), camera),
+                false => 1,
+            },
+            near: decide(self.near, false),
+            order: decide(self.order, false),
         }
     }
 
-    /// Everything that is decided for a picture, in words. Looks at every Gaussian: it is meant for people.
-    pub fn explain(&self, gaussians: &Gaussians, camera: &Camera) -> Vec<Explanation> {
-        let set = self.derive(gaussians);
+    /// Everything that was decided for a picture that took `stats`, in words. Looks at every Gaussian: it is meant for people.
+    pub fn explain(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        stats: &Stats,
+    ) -> Vec<Explanation> {
+        let set = stats.effects;
         let forced = |choice, otherwise: &str| match choice {
             Choice::Auto => otherwise.to_owned(),
             Choice::On | Choice::Off => "forced".to_owned(),
@@ -118,6 +176,37 @@ impl Effects {
                 ),
             ),
             line(
+                "supersample",
+                set.supersample > 1,
+                format!(
+                    "{0}×{0} samples a pixel; the typical splat is {1:.2} px wide{2}",
+                    set.supersample,
+                    typical_width(gaussians, camera),
+                    match (self.supersample, set.antialias) {
+                        (Choice::Off, _) => ", forced",
+                        (Choice::Auto, false) => ", without anti-aliasing none are called for",
+                        _ => "",
+                    }
+                ),
+            ),
+            line(
+                "near",
+                set.near,
+                match (self.near, stats.crossing) {
+                    (_, 0) => "no Gaussian reaches over the near plane".into(),
+                    (Choice::Off, n) => format!("forced; {n} Gaussians reach over the near plane"),
+                    (_, n) => format!("{n} Gaussians reach over the near plane"),
+                },
+            ),
+            line(
+                "order",
+                set.order,
+                forced(
+                    self.order,
+                    "Gaussians are made for the order of their centres",
+                ),
+            ),
+            line(
                 "orthographic",
                 orthographic,
                 format!(
@@ -134,6 +223,16 @@ impl Effects {
     }
 }
 
+/// How many samples a side bring a typical splat, `width` pixels wide, to [`RESOLVED`].
+fn samples(width: f64, camera: &Camera) -> u32 {
+    let room = Camera::MAX_SIDE / camera.width.max(camera.height);
+    let mut samples = 1;
+    while f64::from(samples) < RESOLVED / width && samples < MOST_SAMPLES && 2 * samples <= room {
+        samples *= 2;
+    }
+    samples
+}
+
 impl fmt::Display for Explanation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let on = if self.on { "on" } else { "off" };
@@ -148,7 +247,12 @@ impl FromStr for Effect {
         match name {
             "harmonics" => Ok(Effect::Harmonics),
             "antialias" => Ok(Effect::Antialias),
-            _ => Err(format!("no effect `{name}`, but harmonics and antialias")),
+            "supersample" => Ok(Effect::Supersample),
+            "near" => Ok(Effect::Near),
+            "order" => Ok(Effect::Order),
+            _ => Err(format!(
+                "no effect `{name}`, but harmonics, antialias, supersample, near and order"
+            )),
         }
     }
 }

@@ -18,6 +18,17 @@ pub struct Image {
     pub pixels: Vec<[f32; 4]>,
 }
 
+/// Which Gaussian each pixel shows most of.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Ids {
+    /// Pixels in a row, at least 1 once something is drawn.
+    pub width: u32,
+    /// Rows, at least 1 once something is drawn.
+    pub height: u32,
+    /// Row by row, the index of the Gaussian, [`u32::MAX`] where there is none.
+    pub indices: Vec<u32>,
+}
+
 impl Image {
     /// The pixel in column `x` and row `y`.
     ///

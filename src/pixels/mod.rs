@@ -22,11 +22,14 @@
 //! picture is the same to the bit for any number of threads: a tile is drawn by one thread, in an order that is a function of the
 //! input alone. Work runs on the rayon pool that the caller is in.
 
+mod canvas;
 mod effects;
+mod exr;
 mod image;
 #[doc(hidden)]
 pub mod reference;
 mod shade;
+mod survey;
 #[cfg(test)]
 mod tests;
 
@@ -34,18 +37,19 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use b2p_kernels::Isa;
-use b2p_kernels::splat::Tile;
+use b2p_kernels::splat::{Crossing, Loop, Scene};
 use rayon::prelude::*;
 
-pub use effects::{Choice, Effect, EffectSet, Effects, Explanation};
-pub use image::{Image, box_half};
+pub use effects::{Choice, Effect, EffectSet, Effects, Explanation, MOST_SAMPLES, RESOLVED};
+pub use image::{Ids, Image, box_half};
 pub use shade::Channel;
 
 use crate::error::Result;
 use crate::gaussians::Gaussians;
 use crate::limits::Limits;
-use crate::projection::{Camera, Dropped, Ellipses, How};
-use crate::tiles::{Bins, Count, Grid, Nearest, Part, TILE};
+use crate::projection::{Camera, Dropped, Ellipse, Ellipses, How};
+use crate::tiles::{Bins, Count, Grid, Part, TILE};
+use canvas::{Canvas, Contents, Desk, Pixel};
 
 /// What is seen where the Gaussians let light through.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -71,6 +75,50 @@ impl Background {
     }
 }
 
+/// How much of splats may be left out. A splat is looked at in all the blocks of 4×4 pixels where its α may reach a floor; what is
+/// left out adds up where many tails overlap, as beside the silhouette of a crowd.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub enum Quality {
+    /// A floor of 1/255, as is usual: beside silhouettes, pictures are off by several steps of eight bits, and by many where splats are
+    /// far smaller than pixels.
+    #[default]
+    Fast,
+    /// A floor of 1/4096.
+    Fine,
+    /// A floor of [`LEAST_FLOOR`].
+    Exact,
+    /// A floor of one's own, from [`LEAST_FLOOR`] to 1.
+    Floor(f32),
+}
+
+/// The lowest floor of α.
+pub const LEAST_FLOOR: f32 = 1.0 / (1 << 20) as f32;
+
+impl Quality {
+    /// The least α that is drawn.
+    pub fn floor(self) -> f32 {
+        match self {
+            Quality::Fast => 1.0 / 255.0,
+            Quality::Fine => 1.0 / 4096.0,
+            Quality::Exact => LEAST_FLOOR,
+            Quality::Floor(floor) => floor.clamp(LEAST_FLOOR, 1.0),
+        }
+    }
+}
+
+impl std::str::FromStr for Quality {
+    type Err = String;
+
+    fn from_str(name: &str) -> std::result::Result<Self, String> {
+        match name {
+            "fast" => Ok(Quality::Fast),
+            "fine" => Ok(Quality::Fine),
+            "exact" => Ok(Quality::Exact),
+            _ => Err(format!("no quality `{name}`, but fast, fine and exact")),
+        }
+    }
+}
+
 /// What a picture took.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Stats {
@@ -78,6 +126,8 @@ pub struct Stats {
     pub visible: u64,
     /// Gaussians not drawn, and why.
     pub dropped: Dropped,
+    /// Gaussians that reach over the near plane, drawn or not.
+    pub crossing: u64,
     /// Pairs of a Gaussian and a tile of 32×32 pixels that it may touch.
     pub pairs: u64,
     /// Pixels that something was drawn on.
@@ -114,6 +164,7 @@ impl Times {
 #[derive(Debug)]
 pub struct Renderer {
     isa: Isa,
+    quality: Quality,
     effects: Effects,
     shades: Vec<[f32; 3]>,
     ellipses: Ellipses,
@@ -121,16 +172,6 @@ pub struct Renderer {
     bins: Bins,
     /// One for each thread.
     desks: Vec<Mutex<Desk>>,
-}
-
-/// What a thread needs to draw tiles.
-#[derive(Debug, Default)]
-struct Desk {
-    nearest: Nearest,
-    tile: Tile,
-    touched: u64,
-    sorting: Duration,
-    blending: Duration,
 }
 
 impl Default for Renderer {
@@ -157,6 +198,7 @@ impl Renderer {
     pub fn new(isa: Isa) -> Self {
         Renderer {
             isa,
+            quality: Quality::default(),
             effects: Effects::default(),
             shades: Vec::new(),
             ellipses: Ellipses::default(),
@@ -164,6 +206,11 @@ impl Renderer {
             bins: Bins::default(),
             desks: Vec::new(),
         }
+    }
+
+    /// How much may be left out from now on.
+    pub fn set_quality(&mut self, quality: Quality) {
+        self.quality = quality;
     }
 
     /// Forces effects on or off from now on.
@@ -223,6 +270,50 @@ impl Renderer {
         limits: &Limits,
         image: &mut Image,
     ) -> Result<Stats> {
+        let wanted = Wanted {
+            channel,
+            background,
+            ids: false,
+        };
+        let stats = self.frame(gaussians, camera, wanted, limits, &mut image.pixels)?;
+        [image.width, image.height] = camera.size();
+        Ok(stats)
+    }
+
+    /// Which Gaussian each pixel shows most of; one sample a pixel, whatever the effects. Otherwise as [`Renderer::render_into`].
+    ///
+    /// # Errors
+    /// As [`Renderer::render_into`].
+    pub fn ids_into(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        limits: &Limits,
+        ids: &mut Ids,
+    ) -> Result<Stats> {
+        let wanted = Wanted {
+            channel: Channel::Colour,
+            background: Background::Transparent,
+            ids: true,
+        };
+        let stats = self.frame(gaussians, camera, wanted, limits, &mut ids.indices)?;
+        [ids.width, ids.height] = camera.size();
+        Ok(stats)
+    }
+
+    fn frame<P: Pixel>(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        wanted: Wanted,
+        limits: &Limits,
+        pixels: &mut Vec<P>,
+    ) -> Result<Stats> {
+        let Wanted {
+            channel,
+            background,
+            ids,
+        } = wanted;
         camera.check()?;
         gaussians.check_lengths()?;
         if let Background::Colour(c) = background
@@ -231,14 +322,23 @@ impl Renderer {
             let what = format!("the background {c:?} is not a colour");
             return Err(crate::Error::Usage(what));
         }
-        let count = u64::from(camera.width) * u64::from(camera.height);
+        let [width, height] = camera.size();
+        let count = u64::from(width) * u64::from(height);
         limits.check_pixels("pixels of the picture", count)?;
-        let grid = Grid::new(camera.width, camera.height);
-        let effects = self.effects.derive(gaussians);
+        let mut effects = self.effects.derive(gaussians, camera);
+        if ids {
+            effects.supersample = 1;
+            effects.order = false;
+        }
+        let fine = camera.magnified(effects.supersample);
+        let grid = Grid::new(fine.window());
+        let floor = self.quality.floor();
         let shaded = effects.harmonics || channel != Channel::Colour;
-        let shade = u64::from(shaded) * size_of::<[f32; 3]>() as u64;
-        let bytes = count * size_of::<[f32; 4]>() as u64
-            + gaussians.len() as u64 * (Ellipses::BYTES + shade)
+        let each = Ellipses::BYTES
+            + u64::from(shaded) * size_of::<[f32; 3]>() as u64
+            + u64::from(effects.order) * size_of::<[f32; 2]>() as u64;
+        let bytes = count * size_of::<P>() as u64
+            + gaussians.len() as u64 * each
             + grid.bytes(Ellipses::runs_of(gaussians.len()));
         limits.check_bytes("bytes to draw the picture", bytes)?;
 
@@ -248,33 +348,53 @@ impl Renderer {
         if shaded {
             shade::fill(gaussians, camera, channel, &mut self.shades);
         }
-        let how = How {
+        let mut how = How {
             isa: self.isa,
             compensated: effects.antialias,
+            floor,
+            near_care: effects.near,
+            slopes: effects.order,
             colours: shaded.then_some(&self.shades),
         };
-        let dropped = self.ellipses.project(
-            gaussians,
-            camera,
-            how,
-            &mut self.counts,
-            |count, ellipses| count.count(grid, ellipses),
-        )?;
+        let mut project = |how| {
+            let look = |count: &mut Count, ellipses: &[Ellipse]| count.count(grid, ellipses);
+            self.ellipses
+                .project(gaussians, &fine, how, &mut self.counts, look)
+        };
+        let mut seen = project(how)?;
+        if seen.crossing > 0 && self.effects.near == Choice::Auto {
+            // Only now is it known that care is called for.
+            how.near_care = true;
+            seen = project(how)?;
+        }
+        effects.near = how.near_care && seen.crossing > 0;
+        let crossing = if effects.near { seen.crossing } else { 0 };
+        let bytes = bytes + crossing * size_of::<Crossing>() as u64;
         times.project = lap();
         let pairs = self.bins.plan(grid, &self.counts, bytes, limits)?;
         times.bin = lap();
 
-        let size = [camera.width, camera.height];
-        [image.width, image.height] = size;
-        image.pixels.resize(count as usize, [0.0; 4]);
+        pixels.resize(count as usize, P::default());
         self.desks
             .resize_with(rayon::current_num_threads(), Mutex::default);
+        let canvas = Canvas {
+            grid,
+            window: camera.window(),
+            shrink: effects.supersample,
+            background,
+        };
+        let what = match (ids, effects.order, effects.near) {
+            (true, ..) => Loop::Ids,
+            (_, true, _) => Loop::Order,
+            (.., true) => Loop::Care,
+            _ => Loop::Plain,
+        };
         let mut part = self.bins.next(None);
         while let Some(now) = part {
             self.bins
                 .fill(now.clone(), &self.ellipses, &mut self.counts);
             times.bin += lap();
-            let [sorting, blending] = self.draw_part(&now, size, background, &mut image.pixels);
+            let [sorting, blending] = self.draw_part(&now, &canvas, floor, what, pixels);
             let drawn = lap();
             let share = sorting.as_secs_f64() / (sorting + blending).as_secs_f64().max(1e-9);
             times.sort += drawn.mul_f64(share);
@@ -285,10 +405,12 @@ impl Renderer {
             let desk = desk.get_mut().unwrap_or_else(|e| e.into_inner());
             std::mem::take(&mut desk.touched)
         };
+        let samples = u64::from(effects.supersample).pow(2);
         Ok(Stats {
-            touched: self.desks.iter_mut().map(touched).sum(),
+            touched: self.desks.iter_mut().map(touched).sum::<u64>() / samples,
             visible: self.ellipses.len() as u64,
-            dropped,
+            dropped: seen.dropped,
+            crossing: seen.crossing,
             pairs,
             effects,
             times,
@@ -296,18 +418,33 @@ impl Renderer {
     }
 
     /// Draws a part of the picture; returns the threads' time for sorting and for the pixels.
-    fn draw_part(
+    fn draw_part<P: Pixel>(
         &self,
         part: &Part,
-        size: [u32; 2],
-        background: Background,
-        pixels: &mut [[f32; 4]],
+        canvas: &Canvas,
+        floor: f32,
+        what: Loop,
+        pixels: &mut [P],
     ) -> [Duration; 2] {
-        let width = size[0] as usize;
-        let band = TILE as usize * width;
-        let end = (part.rows.end * band).min(pixels.len());
-        pixels[part.rows.start * band..end]
-            .par_chunks_mut(band)
+        let contents = Contents {
+            isa: self.isa,
+            bins: &self.bins,
+            scene: Scene {
+                all: self.ellipses.all(),
+                crossing: self.ellipses.crossing(),
+                slopes: self.ellipses.slopes(),
+            },
+            floor,
+            what,
+        };
+        let width = canvas.width();
+        let start = canvas.rows(part.rows.start).start * width;
+        let end = canvas.rows(part.rows.end - 1).end * width;
+        // A window may begin within a row of tiles.
+        let first = canvas.rows(part.rows.start).len() * width;
+        let (first, rest) = pixels[start..end].split_at_mut(first);
+        rayon::iter::once(first)
+            .chain(rest.par_chunks_mut((TILE / canvas.shrink) as usize * width))
             .zip(part.rows.clone())
             .with_max_len(1)
             .for_each(|(band, row)| {
@@ -315,7 +452,7 @@ impl Renderer {
                 // Only this thread uses this desk, and a panic would have ended the drawing.
                 let mut desk = self.desks[thread].lock().unwrap_or_else(|e| e.into_inner());
                 for column in part.columns.clone() {
-                    self.draw_tile([column, row], size, background, &mut desk, band);
+                    desk.draw([column, row], canvas, &contents, band);
                 }
             });
         self.desks.iter().fold(Default::default(), |sum, desk| {
@@ -324,40 +461,12 @@ impl Renderer {
             [sum[0] + times[0], sum[1] + times[1]]
         })
     }
+}
 
-    /// `band`: the pixels of the tile's row of tiles.
-    fn draw_tile(
-        &self,
-        [column, row]: [usize; 2],
-        size: [u32; 2],
-        background: Background,
-        desk: &mut Desk,
-        band: &mut [[f32; 4]],
-    ) {
-        let (side, width) = (TILE as usize, size[0] as usize);
-        let left = column * side;
-        let columns = left..(left + side).min(width);
-        let entries = self.bins.tile(row, column);
-        if entries.is_empty() {
-            let [r, g, b, a] = background.behind();
-            let clear = [r, g, b, 1.0 + a];
-            for line in band.chunks_exact_mut(width) {
-                line[columns.clone()].fill(clear);
-            }
-            return;
-        }
-        let start = Instant::now();
-        desk.nearest.take(entries);
-        let sorted = Instant::now();
-        desk.tile.start([left as u32, (row * side) as u32], size);
-        desk.nearest
-            .each(|keys, next| desk.tile.blend(self.isa, keys, next, self.ellipses.all()));
-        let behind = background.behind();
-        let touched = desk
-            .tile
-            .write(self.isa, behind, &mut band[left..], width, columns.len());
-        desk.touched += u64::from(touched);
-        desk.sorting += sorted - start;
-        desk.blending += sorted.elapsed();
-    }
+/// What a picture is to show.
+struct Wanted {
+    channel: Channel,
+    background: Background,
+    /// Gaussians instead of a channel.
+    ids: bool,
 }

@@ -2,6 +2,8 @@
 
 use glam::{DAffine3, DMat3, DVec3};
 
+use b2p_kernels::splat::{Bounds, TILE};
+
 use crate::error::{Error, Result};
 
 /// How far `R·Rᵀ` of a pose may be from the identity, so that a rotation printed with four decimals still is one.
@@ -28,6 +30,8 @@ pub struct Camera {
     pub near: f64,
     /// How rays go.
     pub projection: Projection,
+    /// The part of the picture that is drawn, if not all of it: see [`Camera::crop`].
+    pub crop: Option<Bounds>,
 }
 
 /// How a camera's rays go.
@@ -83,6 +87,7 @@ impl Camera {
             height,
             near: Self::NEAR,
             projection: Projection::Pinhole,
+            crop: None,
         };
         camera.check()?;
         Ok(camera)
@@ -100,11 +105,76 @@ impl Camera {
         Ok(self)
     }
 
+    /// The camera that draws only the pixels `x0 ≤ x < x1`, `y0 ≤ y < y1` of this one's picture: to the bit what the whole shows there.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if that is empty or reaches out of the picture.
+    pub fn crop(mut self, part: Bounds) -> Result<Camera> {
+        self.crop = Some(part);
+        self.check()?;
+        Ok(self)
+    }
+
+    /// The camera whose picture is the same, `times` larger.
+    pub(crate) fn magnified(mut self, times: u32) -> Camera {
+        let factor = f64::from(times);
+        for length in [&mut self.fx, &mut self.fy, &mut self.cx, &mut self.cy] {
+            *length *= factor;
+        }
+        self.width *= times;
+        self.height *= times;
+        if let Some(Bounds { x0, y0, x1, y1 }) = &mut self.crop {
+            for at in [x0, y0, x1, y1] {
+                *at *= times;
+            }
+        }
+        self
+    }
+
+    /// The most pixels that a cube-frame unit takes in the picture, where the cube of the Gaussians comes nearest.
+    pub fn pixels_per_unit(&self) -> f64 {
+        let along = self.pose.matrix3.row(2).abs();
+        let nearest = self.pose.translation.z - along.element_sum();
+        let focal = self.fx.max(self.fy);
+        match self.projection {
+            Projection::Pinhole => focal / nearest.max(self.near),
+            Projection::Orthographic => focal,
+        }
+    }
+
+    /// The pixels that are drawn.
+    pub fn window(&self) -> Bounds {
+        self.crop.unwrap_or(Bounds {
+            x0: 0,
+            y0: 0,
+            x1: self.width,
+            y1: self.height,
+        })
+    }
+
+    /// Width and height of what is drawn.
+    pub fn size(&self) -> [u32; 2] {
+        let Bounds { x0, y0, x1, y1 } = self.window();
+        [x1 - x0, y1 - y0]
+    }
+
+    /// The window, widened to the edges of tiles as far as there is a picture: what is drawn in a pixel may depend on which splats
+    /// reach its neighbours, but never on where the picture is cut.
+    pub(crate) fn tiled_window(&self) -> Bounds {
+        let Bounds { x0, y0, x1, y1 } = self.window();
+        Bounds {
+            x0: x0 - x0 % TILE,
+            y0: y0 - y0 % TILE,
+            x1: x1.next_multiple_of(TILE).min(self.width),
+            y1: y1.next_multiple_of(TILE).min(self.height),
+        }
+    }
+
     /// Whether pictures can be taken with it.
     ///
     /// # Errors
     /// [`Error::Usage`] if a number is not finite, the pose scales, shears or mirrors, a focal length or the near plane is not
-    /// positive, or a side of the picture is 0 or over [`Camera::MAX_SIDE`].
+    /// positive, a side of the picture is 0 or over [`Camera::MAX_SIDE`], or the crop is not a part of it.
     pub fn check(&self) -> Result<()> {
         let complaint = |what: String| Err(Error::Usage(format!("camera: {what}")));
         let rotation = self.pose.matrix3;
@@ -140,6 +210,13 @@ impl Camera {
                 self.width,
                 self.height,
                 Self::MAX_SIDE
+            ));
+        }
+        let Bounds { x0, y0, x1, y1 } = self.window();
+        if !(x0 < x1 && x1 <= self.width && y0 < y1 && y1 <= self.height) {
+            return complaint(format!(
+                "the crop from {x0}, {y0} to {x1}, {y1} is not a part of a picture of {}×{}",
+                self.width, self.height
             ));
         }
         Ok(())

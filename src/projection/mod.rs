@@ -12,14 +12,15 @@ mod camera;
 pub mod files;
 #[cfg(test)]
 mod reference;
+mod space;
 
 use std::ops::Range;
 
 use b2p_kernels::Isa;
-use b2p_kernels::splat::{self, Cloud, Tally, View};
+use b2p_kernels::splat::{self, Cloud, Crossing, Tally, View};
 use rayon::prelude::*;
 
-pub use b2p_kernels::splat::{ALPHA_FLOOR, BLUR, Bounds, Ellipse, MAX_SCALE};
+pub use b2p_kernels::splat::{BLUR, Bounds, Ellipse, MAX_SCALE};
 pub use camera::{Camera, Projection};
 
 use crate::error::{Error, Result};
@@ -37,6 +38,8 @@ pub struct Ellipses {
     all: Vec<Ellipse>,
     runs: Vec<Run>,
     visible: usize,
+    crossing: Vec<Crossing>,
+    slopes: Vec<[f32; 2]>,
 }
 
 /// How Gaussians are projected.
@@ -46,6 +49,12 @@ pub struct How<'a> {
     pub isa: Isa,
     /// Opacity is taken back by as much as the blur widens.
     pub compensated: bool,
+    /// The least α that is drawn, in `(0, 1]`.
+    pub floor: f32,
+    /// Gaussians that reach over the near plane are drawn, whatever side their centres are on.
+    pub near_care: bool,
+    /// How depths change across ellipses is found out too.
+    pub slopes: bool,
     /// In place of the Gaussians' colours, one for each.
     pub colours: Option<&'a [[f32; 3]]>,
 }
@@ -100,7 +109,7 @@ impl Ellipses {
         how: How,
         states: &mut Vec<S>,
         look: impl Fn(&mut S, &[Ellipse]) + Sync,
-    ) -> Result<Dropped> {
+    ) -> Result<Seen> {
         camera.check()?;
         gaussians.check_lengths()?;
         let colours = how.colours.unwrap_or(&gaussians.colour);
@@ -115,7 +124,7 @@ impl Ellipses {
                 detail: format!("there are {count}"),
             });
         }
-        let view = view(camera, how.compensated, gaussians.blur);
+        let view = view(camera, how, gaussians.blur);
         let length = run_length(count);
         self.all.resize(count, Ellipse::default());
         self.runs.clear();
@@ -141,20 +150,30 @@ impl Ellipses {
                 *run = Run { first, tally };
                 look(state, &ellipses[..tally.visible as usize]);
             });
+        self.find_crossing(gaussians, camera, how.near_care);
+        self.find_slopes(gaussians, camera, how.slopes);
         self.visible = self.runs.iter().map(|run| run.tally.visible as usize).sum();
-        Ok(self.runs.iter().map(|run| Dropped::from(run.tally)).fold(
-            Dropped::default(),
-            |mut sum, run| {
-                sum.add(run);
-                sum
-            },
-        ))
+        let mut seen = Seen::default();
+        for run in &self.runs {
+            seen.dropped.add(run.tally.into());
+            seen.crossing += u64::from(run.tally.crossing);
+        }
+        Ok(seen)
     }
 }
 
 fn run_length(gaussians: usize) -> usize {
     let most = (RUNS * rayon::current_num_threads()).min(MOST_RUNS);
     gaussians.div_ceil(most).max(LEAST_RUN).next_multiple_of(16)
+}
+
+/// What projecting found out.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Seen {
+    /// Gaussians that are not drawn.
+    pub dropped: Dropped,
+    /// Gaussians that reach over the near plane.
+    pub crossing: u64,
 }
 
 /// How many Gaussians are not drawn, by the first reason that applies.
@@ -164,12 +183,54 @@ pub struct Dropped {
     pub not_finite: u64,
     /// The rotation is the zero quaternion.
     pub no_rotation: u64,
-    /// The opacity is below [`ALPHA_FLOOR`].
+    /// The opacity is below the least that is drawn.
     pub too_faint: u64,
     /// The centre is not beyond the near plane. A Gaussian that only reaches over it is dropped as well, never mirrored.
     pub behind: u64,
     /// No pixel within reach.
     pub outside: u64,
+}
+
+/// Indices are in the order of the input: a run's place in them goes with its place among the runs.
+impl Ellipses {
+    /// Those that reach over the near plane, by index, if they are drawn.
+    pub fn crossing(&self) -> &[Crossing] {
+        &self.crossing
+    }
+
+    /// For each of [`Ellipses::all`], how its depth changes by pixel to the right and down, if that was asked for.
+    pub fn slopes(&self) -> &[[f32; 2]] {
+        &self.slopes
+    }
+
+    fn find_crossing(&mut self, gaussians: &Gaussians, camera: &Camera, wanted: bool) {
+        self.crossing.clear();
+        if !wanted || self.runs.iter().all(|run| run.tally.crossing == 0) {
+            return;
+        }
+        let crossing = self.runs.par_iter().flat_map_iter(|run| {
+            let ellipses = &self.all[run.first..][..run.tally.visible as usize];
+            let crossing = ellipses.iter().filter(|ellipse| ellipse.crosses());
+            crossing.map(|ellipse| space::crossing(gaussians, camera, ellipse.index as usize))
+        });
+        self.crossing = crossing.collect();
+    }
+
+    fn find_slopes(&mut self, gaussians: &Gaussians, camera: &Camera, wanted: bool) {
+        self.slopes.clear();
+        if !wanted {
+            return;
+        }
+        self.slopes.resize(self.all.len(), [0.0; 2]);
+        let length = run_length(self.all.len());
+        let runs = self.runs.par_iter().zip(self.slopes.par_chunks_mut(length));
+        runs.for_each(|(run, slopes)| {
+            let ellipses = &self.all[run.first..][..run.tally.visible as usize];
+            for (slope, ellipse) in slopes.iter_mut().zip(ellipses) {
+                *slope = space::slopes(gaussians, camera, ellipse.index as usize);
+            }
+        });
+    }
 }
 
 impl Dropped {
@@ -200,18 +261,20 @@ impl From<Tally> for Dropped {
 }
 
 /// The camera as the kernel has it.
-fn view(camera: &Camera, compensated: bool, blur: f32) -> View {
+fn view(camera: &Camera, how: How, blur: f32) -> View {
     let rotation = camera.pose.matrix3;
     View {
         rotation: std::array::from_fn(|i| rotation.row(i).into()),
         translation: camera.pose.translation.into(),
         near: camera.near,
+        near_care: how.near_care,
         focal: [camera.fx, camera.fy],
         centre: [camera.cx, camera.cy],
         slopes: camera.slope_ranges(),
-        size: [camera.width, camera.height],
+        window: camera.tiled_window(),
+        floor: how.floor,
         orthographic: camera.projection == Projection::Orthographic,
-        compensated,
+        compensated: how.compensated,
         blur: if blur.is_finite() {
             blur.max(0.0).into()
         } else {

@@ -2,14 +2,15 @@
 
 use glam::{DAffine3, Mat3, Quat, Vec3};
 
-use super::{ALPHA_FLOOR, BLUR, Bounds, Camera, Ellipse, Ellipses, How, MAX_SCALE};
+use super::{BLUR, Bounds, Camera, Ellipse, Ellipses, How, MAX_SCALE};
 use crate::gaussians::Gaussians;
 use b2p_kernels::Isa;
 
 /// `√(log₂(e)/2)`: with it `exp(−½d²) = 2^−(d·FORM_SCALE)²`.
 const FORM_SCALE: f32 = 0.849_321_8;
-/// `log₂` of [`ALPHA_FLOOR`].
-const LOG_FLOOR: f32 = -7.994_353_4;
+/// The least α that is drawn, and its binary logarithm.
+const FLOOR: f32 = 1.0 / 1024.0;
+const LOG_FLOOR: f32 = -10.0;
 
 /// Why a Gaussian is not drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,7 +62,7 @@ impl View {
             && Vec3::from(colour).is_finite();
         require(finite, Invisible::NotFinite)?;
         let axes = rotation_matrix(rotation).ok_or(Invisible::NoRotation)?;
-        require(opacity >= ALPHA_FLOOR, Invisible::TooFaint)?;
+        require(opacity >= FLOOR, Invisible::TooFaint)?;
         let seen = self.pose.transform_point3(position.as_dvec3());
         require(seen.z > self.near, Invisible::Behind)?;
         let depth = seen.z as f32;
@@ -85,7 +86,7 @@ impl View {
         require(finite, Invisible::NotFinite)?;
 
         let log_opacity = opacity.min(1.0).log2();
-        // α = 1/255 at d² = 2·ln(255·opacity) standard deviations squared.
+        // α is at the floor at d² = 2·ln(opacity/floor) standard deviations squared.
         let reach = 2.0 * std::f32::consts::LN_2 * (log_opacity - LOG_FLOOR).max(0.0);
         let (x0, x1) = covered(x, (a * reach).sqrt(), self.size[0]);
         let (y0, y1) = covered(y, (c * reach).sqrt(), self.size[1]);
@@ -187,8 +188,8 @@ fn gaussians() -> Gaussians {
             8 => scale = [0.0, scale[1], 0.0],
             9 => scale = [f32::MAX; 3],
             10 => position = position.map(|x| x * 1e38),
-            11 => opacity = ALPHA_FLOOR,
-            12 => opacity = ALPHA_FLOOR.next_down(),
+            11 => opacity = FLOOR,
+            12 => opacity = FLOOR.next_down(),
             _ => {}
         }
         all.position.push(position);
@@ -220,12 +221,16 @@ fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
             let how = How {
                 isa,
                 compensated: false,
+                floor: FLOOR,
+                near_care: false,
+                slopes: false,
                 colours: None,
             };
             let mut ellipses = Ellipses::default();
             let dropped = ellipses
                 .project(&all, &camera, how, &mut Vec::<()>::new(), |_, _| {})
-                .unwrap();
+                .unwrap()
+                .dropped;
             assert_eq!(dropped.not_finite, count(Invisible::NotFinite), "{isa}");
             assert_eq!(dropped.no_rotation, count(Invisible::NoRotation), "{isa}");
             assert_eq!(dropped.too_faint, count(Invisible::TooFaint), "{isa}");

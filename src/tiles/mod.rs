@@ -38,6 +38,8 @@ pub struct Count {
 /// A picture's tiles.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub struct Grid {
+    /// Column and row of the first, counted in tiles from the corner of the whole picture.
+    pub first: [usize; 2],
     /// Tiles side by side.
     pub columns: usize,
     /// Rows of tiles.
@@ -45,12 +47,22 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// For a picture of `width` × `height` pixels.
-    pub fn new(width: u32, height: u32) -> Self {
+    /// The tiles that pixels of `window` are in.
+    pub fn new(window: Bounds) -> Self {
+        let [x, y] = touched(&window);
         Grid {
-            columns: width.div_ceil(TILE) as usize,
-            rows: height.div_ceil(TILE) as usize,
+            first: [x.start, y.start],
+            columns: x.len(),
+            rows: y.len(),
         }
+    }
+
+    /// The columns and the rows of the tiles that `bounds` (not empty, within the grid) touch.
+    #[inline]
+    fn touched(&self, bounds: &Bounds) -> [Range<usize>; 2] {
+        let [x, y] = touched(bounds);
+        let [column, row] = self.first;
+        [x.start - column..x.end - column, y.start - row..y.end - row]
     }
 
     /// Bytes of the counts of as many runs.
@@ -68,7 +80,7 @@ impl Count {
         self.tiles.resize(stride * (grid.rows + 1), 0);
         self.pairs = 0;
         for ellipse in ellipses {
-            let [x, y] = touched(&ellipse.bounds);
+            let [x, y] = grid.touched(&ellipse.bounds);
             self.pairs += x.len() as u64 * y.len() as u64;
             for (row, step) in [(y.start, 1), (y.end, u32::MAX)] {
                 let row = &mut self.tiles[row * stride..][..stride];
@@ -153,7 +165,7 @@ impl Bins {
 
     /// The part that follows `last`, or the first.
     pub fn next(&self, last: Option<&Part>) -> Option<Part> {
-        let Grid { columns, rows } = self.grid;
+        let Grid { columns, rows, .. } = self.grid;
         let (mut row, mut column) = match last {
             None => (0, 0),
             Some(part) if part.columns.end < columns => (part.rows.start, part.columns.end),
@@ -218,7 +230,7 @@ impl Bins {
             self.entries.reserve_exact(next);
             self.entries.resize_with(next, AtomicU64::default);
         }
-        let (starts, entries) = (&self.starts, &self.entries);
+        let (grid, starts, entries) = (self.grid, &self.starts, &self.entries);
         let all = ellipses.all();
         ellipses
             .runs()
@@ -228,7 +240,7 @@ impl Bins {
                 let first = run.start;
                 for (i, ellipse) in all[run].iter().enumerate() {
                     let key = u64::from(ellipse.depth.to_bits()) << 32 | (first + i) as u64;
-                    let [x, y] = touched(&ellipse.bounds);
+                    let [x, y] = grid.touched(&ellipse.bounds);
                     for row in y.start.max(part.rows.start)..y.end.min(part.rows.end) {
                         let tiles = x.start.max(part.columns.start)..x.end.min(part.columns.end);
                         for column in tiles {
@@ -252,7 +264,7 @@ impl Bins {
     }
 }
 
-/// The columns and the rows of the tiles that `bounds` (not empty) touch.
+/// The columns and the rows of the tiles that `bounds` (not empty) touch, counted from the corner of the picture.
 #[inline]
 fn touched(bounds: &Bounds) -> [Range<usize>; 2] {
     let tiles = |first: u32, end: u32| (first / TILE) as usize..end.div_ceil(TILE) as usize;

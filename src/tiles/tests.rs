@@ -37,13 +37,16 @@ struct Scene {
 fn project(all: &Gaussians, width: u32, height: u32) -> Scene {
     let camera = Camera::orbit(30.0, 10.0, 3.0, 45.0, width, height).unwrap();
     let mut scene = Scene {
-        grid: Grid::new(width, height),
+        grid: Grid::new(camera.window()),
         ellipses: Ellipses::default(),
         counts: Vec::new(),
     };
     let how = How {
         isa: Isa::SCALAR,
         compensated: false,
+        floor: 1.0 / 255.0,
+        near_care: false,
+        slopes: false,
         colours: None,
     };
     scene

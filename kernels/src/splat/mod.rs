@@ -9,30 +9,29 @@ mod avx2;
 mod avx512;
 mod blend;
 mod lanes;
+mod layout;
+mod pixels;
 mod plain;
 mod project;
 
 #[cfg(test)]
 mod tests;
 
-pub use blend::{TILE, Tile};
+pub use blend::{Loop, Scene, TILE, Tile};
 pub use project::{Cloud, Tally, View, project};
 
 /// Variance that every ellipse is widened by, in px².
 pub const BLUR: f32 = 0.3;
-/// The least opacity that is drawn.
-pub const ALPHA_FLOOR: f32 = 1.0 / 255.0;
 /// The greatest α of one ellipse.
 pub const ALPHA_CEILING: f32 = 0.99;
 /// A pixel that lets less light through than this is finished: what is not drawn is less than a quarter of a step of eight bits.
 pub const FINISHED: f32 = 1.0 / 1024.0;
+/// With [`Loop::Order`], so many splats of a pixel wait for one that may be nearer.
+pub const WAITING: usize = 8;
 /// Standard deviations above this are drawn as this.
 pub const MAX_SCALE: f32 = 1e4;
 /// What is left of a splat's opacity, at least, by the compensation for its widening.
 pub const MIN_COMPENSATION: f32 = 0.005;
-
-/// `log₂` of [`ALPHA_FLOOR`].
-pub(crate) const LOG_FLOOR: f32 = -7.994_353_4;
 
 /// A splat on the picture: `α(x, y) = 2^(log_opacity − u² − v²)` with `(u, v)` linear in the pixel's distance to the centre.
 ///
@@ -56,6 +55,23 @@ pub struct Ellipse {
     pub depth: f32,
     /// The Gaussian's index in the input.
     pub index: u32,
+}
+
+/// A Gaussian that reaches over the near plane, where no ellipse approximates it: α is opacity·2^(−|x|²) at the point nearest to its
+/// centre, in its own measure, of the part of a pixel's ray that is beyond the plane. At depth `t` on the ray of pixel `(px, py)`,
+/// `x = from·(px, py, 1) + t·along·(px, py, 1)`.
+///
+/// Its [`Ellipse`] has forms of zeroes and the bounds of the whole picture.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Crossing {
+    /// The Gaussian's index in the input.
+    pub index: u32,
+    /// Depth of the near plane.
+    pub near: f32,
+    /// Rows of a matrix.
+    pub from: [[f32; 3]; 3],
+    /// Rows of a matrix.
+    pub along: [[f32; 3]; 3],
 }
 
 /// The pixels `x0 ≤ x < x1`, `y0 ≤ y < y1`. Never empty for a visible splat.
@@ -88,6 +104,11 @@ impl Ellipse {
             depth: f[14],
             index: f[15].to_bits(),
         }
+    }
+
+    /// Whether it stands for a [`Crossing`].
+    pub fn crosses(&self) -> bool {
+        self.u == [0.0; 2] && self.v == [0.0; 2]
     }
 
     /// The bits of its fields, in their order.

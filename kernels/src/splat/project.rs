@@ -7,13 +7,16 @@
 //! keeps its α to 2·10⁻⁴ where the textbook form is wrong by 1.
 
 use super::lanes::{Double, Lanes, Mask, by_level, four, three};
-use super::{ALPHA_FLOOR, BLUR, Ellipse, LOG_FLOOR, MAX_SCALE, MIN_COMPENSATION};
+use super::{BLUR, Bounds, Ellipse, MAX_SCALE, MIN_COMPENSATION};
 use crate::Isa;
 
 /// `√(log₂(e)/2)`: with it `exp(−½d²) = 2^−(d·FORM_SCALE)²`.
 const FORM_SCALE: f32 = 0.849_321_8;
 /// Squared lengths of quaternions within this of 1, as a factor, are taken as they are.
 const LENGTHS: [f32; 2] = [1e-20, 1e20];
+
+/// So many standard deviations from its centre, a Gaussian reaches over the near plane or doesn't.
+const REACH: f32 = 3.0;
 
 /// Bits of the variants of the kernel.
 const ORTHOGRAPHIC: u8 = 1;
@@ -28,14 +31,18 @@ pub struct View {
     pub translation: [f64; 3],
     /// What is not farther than this along z is not drawn.
     pub near: f64,
+    /// Gaussians that reach over the near plane are drawn whatever side of it their centres are on: see [`super::Crossing`].
+    pub near_care: bool,
     /// Pixels per unit of slope, or, of an orthographic camera, per unit of length.
     pub focal: [f64; 2],
     /// The principal point, in pixels.
     pub centre: [f64; 2],
     /// The ranges of `x/z` and `y/z` outside which the projection is linearised at the range's end.
     pub slopes: [[f64; 2]; 2],
-    /// Width and height of the picture; at most 2²².
-    pub size: [u32; 2],
+    /// The pixels that are drawn; none is beyond 2²².
+    pub window: Bounds,
+    /// The least α that is drawn: of an ellipse, what is fainter may be left out. In `(0, 1]`.
+    pub floor: f32,
     /// Parallel rays instead of a pinhole.
     pub orthographic: bool,
     /// Opacity is taken back by as much as the blur widens.
@@ -66,6 +73,8 @@ pub struct Tally {
     pub too_faint: u32,
     pub behind: u32,
     pub outside: u32,
+    /// Of all that could be drawn otherwise, how many reach over the near plane, on whatever side their centres are.
+    pub crossing: u32,
 }
 
 /// Projects `cloud`, whose first Gaussian has the index `first`; the visible go to the beginning of `out`, in order.
@@ -149,11 +158,16 @@ struct Camera<L: Lanes> {
     rotation: [[L::Double; 3]; 3],
     translation: [L::Double; 3],
     near: L::Double,
+    near_care: bool,
+    near_plane: L,
     focal: [L::Double; 2],
     centre: [L::Double; 2],
     slopes: [[L::Double; 2]; 2],
     rows: [[L; 3]; 3],
-    size: [L; 2],
+    /// First and end of the window, by column and by row.
+    window: [[L; 2]; 2],
+    floor: L,
+    log_floor: L,
     /// The Gaussians' own blur in pixels at distance 1.
     blur: L::Double,
 }
@@ -162,15 +176,23 @@ impl<L: Lanes> Camera<L> {
     #[inline(always)]
     fn new(view: &View) -> Self {
         let pair = |[x, y]: [f64; 2]| [L::Double::splat(x), L::Double::splat(y)];
+        let Bounds { x0, y0, x1, y1 } = view.window;
         Camera {
             rotation: three!(i => three!(k => L::Double::splat(view.rotation[i][k]))),
             translation: three!(i => L::Double::splat(view.translation[i])),
             near: L::Double::splat(view.near),
+            near_care: view.near_care,
+            near_plane: L::splat(view.near as f32),
             focal: pair(view.focal),
             centre: pair(view.centre),
             slopes: [pair(view.slopes[0]), pair(view.slopes[1])],
             rows: three!(i => three!(k => L::splat(view.rotation[i][k] as f32))),
-            size: [L::splat(view.size[0] as f32), L::splat(view.size[1] as f32)],
+            window: [
+                [L::splat(x0 as f32), L::splat(x1 as f32)],
+                [L::splat(y0 as f32), L::splat(y1 as f32)],
+            ],
+            floor: L::splat(view.floor),
+            log_floor: L::splat(view.floor.log2()),
             blur: L::Double::splat(view.blur * view.focal[0] * view.focal[1]),
         }
     }
@@ -213,13 +235,13 @@ impl<L: Lanes> Camera<L> {
             px.mul_add(rx, py.mul_add(ry, pz.mul_add(rz, self.translation[k])))
         });
         let ahead = self.near.lt(seen[2]);
-        let depth = seen[2].to_lanes();
+        let mut depth = seen[2].to_lanes();
         let inverse = L::Double::splat(1.0).div(seen[2]);
 
         let limit = L::splat(MAX_SCALE);
         let scale = three!(i => scale[i].abs().min(limit));
-        let (x, m1) = self.along::<VARIANT>(0, seen[0], inverse, &axes, scale);
-        let (y, m2) = self.along::<VARIANT>(1, seen[1], inverse, &axes, scale);
+        let (mut x, m1) = self.along::<VARIANT>(0, seen[0], inverse, &axes, scale);
+        let (mut y, m2) = self.along::<VARIANT>(1, seen[1], inverse, &axes, scale);
         let own = if VARIANT & ORTHOGRAPHIC != 0 {
             self.blur
         } else {
@@ -247,22 +269,23 @@ impl<L: Lanes> Camera<L> {
         let slope = dot(long, short).mul(inverse);
         let lengthwise = root.mul(L::splat(FORM_SCALE));
 
-        let mut opacity = opacity.min(one);
+        let uncompensated = opacity.min(one);
+        let mut opacity = uncompensated;
         if VARIANT & COMPENSATED != 0 {
             let kept = minors.div(minors.add(blurred)).sqrt();
             opacity = opacity.mul(kept.max(L::splat(MIN_COMPENSATION)));
         }
-        let bright = L::splat(ALPHA_FLOOR).le(opacity);
-        let log_opacity = if one.le(opacity).bits() + 1 == 1 << L::COUNT {
+        let bright = self.floor.le(opacity);
+        let mut log_opacity = if one.le(opacity).bits() + 1 == 1 << L::COUNT {
             zero
         } else {
             log2(opacity)
         };
-        // α = 1/255 at d² = 2·ln(255·opacity) standard deviations squared.
-        let reach = log_opacity.sub(L::splat(LOG_FLOOR)).max(zero);
+        // α is at the floor at d² = 2·ln(opacity/floor) standard deviations squared.
+        let reach = log_opacity.sub(self.log_floor).max(zero);
         let reach = reach.mul(L::splat(2.0 * std::f32::consts::LN_2));
-        let (x0, x1) = covered(x, a.mul(reach).sqrt(), self.size[0]);
-        let (y0, y1) = covered(y, c.mul(reach).sqrt(), self.size[1]);
+        let (mut x0, mut x1) = covered(x, a.mul(reach).sqrt(), self.window[0]);
+        let (mut y0, mut y1) = covered(y, c.mul(reach).sqrt(), self.window[1]);
         let inside = x0.lt(x1).and(y0.lt(y1));
 
         let mut left = (1 << count) - 1;
@@ -270,22 +293,42 @@ impl<L: Lanes> Camera<L> {
             (finite, &mut tally.not_finite),
             (turned, &mut tally.no_rotation),
             (bright, &mut tally.too_faint),
-            (ahead, &mut tally.behind),
         ] {
             let bits = mask.bits();
             *missing += (left & !bits).count_ones();
             left &= bits;
         }
+        let ahead_of = three!(i => dot(self.rows[2], axes[i]).mul(scale[i]));
+        let reach = dot(ahead_of, ahead_of).mul(L::splat(REACH * REACH));
+        let beyond = depth.sub(self.near_plane);
+        let crossing = beyond.mul(beyond).lt(reach);
+        let crossed = left & crossing.bits();
+        tally.crossing += crossed.count_ones();
+        let cared = if self.near_care { crossed } else { 0 };
         for (mask, missing) in [
+            (ahead, &mut tally.behind),
             (representable, &mut tally.not_finite),
             (inside, &mut tally.outside),
         ] {
-            let bits = mask.bits();
+            let bits = mask.bits() | cared;
             *missing += (left & !bits).count_ones();
             left &= bits;
         }
 
-        let tilted = zero.sub(slope.mul(across));
+        let (mut across, mut lengthwise) = (across, lengthwise);
+        let mut tilted = zero.sub(slope.mul(across));
+        if cared != 0 {
+            // They may be anywhere, and have no form in the plane.
+            let either = |yes, no| L::select(crossing, yes, no);
+            for form in [&mut x, &mut y, &mut across, &mut lengthwise, &mut tilted] {
+                *form = either(zero, *form);
+            }
+            let [[left, right], [top, bottom]] = self.window;
+            (x0, x1) = (either(left, x0), either(right, x1));
+            (y0, y1) = (either(top, y0), either(bottom, y1));
+            depth = either(depth.max(self.near_plane), depth);
+            log_opacity = either(log2(uncompensated), log_opacity);
+        }
         let mut indices = [0.0; 16];
         for (i, place) in indices.iter_mut().enumerate() {
             *place = f32::from_bits(index.wrapping_add(i as u32));
@@ -336,13 +379,14 @@ impl<L: Lanes> Camera<L> {
     }
 }
 
-/// The first and the end of the pixels of `size` whose centres lie within `half` of `centre`. None if the first isn't below the end.
+/// The first and the end of the pixels from `low` to `high` whose centres lie within `half` of `centre`. None if the first isn't below
+/// the end.
 #[inline(always)]
-fn covered<L: Lanes>(centre: L, half: L, size: L) -> (L, L) {
-    let (zero, middle) = (L::splat(0.0), L::splat(0.5));
+fn covered<L: Lanes>(centre: L, half: L, [low, high]: [L; 2]) -> (L, L) {
+    let middle = L::splat(0.5);
     // Clamped before it is rounded, the number is small enough for that. NaN comes to an end of the range.
-    let first = centre.sub(half).sub(middle).max(zero).min(size);
-    let end = centre.add(half).add(middle).max(zero).min(size);
+    let first = centre.sub(half).sub(middle).max(low).min(high);
+    let end = centre.add(half).add(middle).max(low).min(high);
     (first.ceil(), end.floor())
 }
 

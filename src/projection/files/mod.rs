@@ -1,13 +1,21 @@
-//! Cameras from files: NeRF's `transforms.json`, and COLMAP's `cameras.txt` with `images.txt`.
+//! Cameras from files: NeRF's `transforms.json`, COLMAP's `cameras.txt` with `images.txt`, Open3D's pinhole cameras, and the camera nodes
+//! of glTF.
 //!
 //! Both speak of the world; the cube that the Gaussians refer to says where it is.
 
-use glam::{DAffine3, DMat3, DQuat, DVec3};
+mod colmap;
+mod gltf;
+mod open3d;
+
+use glam::{DAffine3, DMat3, DVec3};
 use serde::Deserialize;
+use serde_json::Value;
 
 use super::{Camera, Projection};
 use crate::error::{Error, Result};
 use crate::gaussians::Frame;
+
+pub use colmap::colmap;
 
 /// A camera and the name of the picture that was taken with it.
 pub type Named = (String, Camera);
@@ -52,13 +60,39 @@ impl Lens {
     }
 }
 
-/// The cameras of a `transforms.json`: OpenGL axes, from the camera to the world. `size` is for files that name none.
+/// The cameras of a file that is no text of COLMAP's, told apart by what it holds: binary or JSON glTF, Open3D's JSON, NeRF's. `size` is for
+/// files that name none.
 ///
 /// # Errors
-/// [`Error::Usage`] if it is not such a file, or one of them is no camera ([`Camera::check`]).
-pub fn nerf(text: &str, frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
-    let file: Transforms =
-        serde_json::from_str(text).map_err(|e| Error::Usage(format!("transforms.json: {e}")))?;
+/// [`Error::Usage`] if it is none of these, or one of its cameras is none ([`Camera::check`]).
+pub fn read(bytes: &[u8], frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
+    let text = match bytes.starts_with(gltf::MAGIC) {
+        true => gltf::json_of(bytes)?,
+        false => bytes,
+    };
+    let value: Value = serde_json::from_slice(text)
+        .map_err(|e| Error::Usage(format!("no file of cameras: {e}")))?;
+    let has = |name: &str| value.get(name).is_some();
+    if has("asset") {
+        gltf::cameras(value, frame, size)
+    } else if has("frames") {
+        nerf(value, frame, size)
+    } else if has("intrinsic") || has("parameters") {
+        open3d::cameras(value, frame)
+    } else {
+        let what = "no file of cameras: neither `frames` (NeRF), nor `intrinsic` or `parameters` (Open3D), nor `asset` (glTF)";
+        Err(Error::Usage(what.into()))
+    }
+}
+
+/// What `value` describes, or what is wrong with it.
+fn parsed<T: serde::de::DeserializeOwned>(what: &str, value: Value) -> Result<T> {
+    serde_json::from_value(value).map_err(|e| Error::Usage(format!("{what}: {e}")))
+}
+
+/// The cameras of a `transforms.json`: OpenGL axes, from the camera to the world.
+fn nerf(file: Value, frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
+    let file: Transforms = parsed("transforms.json", file)?;
     let camera = |shot: &Shot| {
         let lens = shot.lens.or(file.lens);
         let side = |given: Option<f64>, otherwise: u32| given.map_or(otherwise, |side| side as u32);
@@ -85,78 +119,11 @@ pub fn nerf(text: &str, frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
             height,
             near: Camera::NEAR,
             projection: Projection::Pinhole,
+            crop: None,
         };
         checked(&shot.file_path, named)
     };
     file.frames.iter().map(camera).collect()
-}
-
-/// The cameras of COLMAP's text files, in the order of the images.
-///
-/// # Errors
-/// [`Error::Usage`] if a line cannot be understood, a lens distorts, or one of them is no camera.
-pub fn colmap(cameras: &str, images: &str, frame: &Frame) -> Result<Vec<Named>> {
-    let bad = |file: &str, line: &str| Error::Usage(format!("{file}: cannot read `{line}`"));
-    let lens = |id: &str| -> Result<Camera> {
-        let words = cameras.lines().map(|l| l.split_whitespace());
-        let mut words = words.filter(|w| w.clone().next() == Some(id));
-        let line: Vec<&str> = words
-            .next()
-            .ok_or_else(|| Error::Usage(format!("cameras.txt: no camera {id}")))?
-            .collect();
-        let numbers: Option<Vec<f64>> = line.iter().skip(2).map(|w| w.parse().ok()).collect();
-        let numbers = numbers.ok_or_else(|| bad("cameras.txt", &line.join(" ")))?;
-        let (fx, fy, cx, cy, width, height) = match (line.get(1).copied(), &numbers[..]) {
-            (Some("SIMPLE_PINHOLE"), &[w, h, f, cx, cy]) => (f, f, cx, cy, w, h),
-            (Some("PINHOLE"), &[w, h, fx, fy, cx, cy]) => (fx, fy, cx, cy, w, h),
-            (Some("SIMPLE_PINHOLE" | "PINHOLE"), _) => {
-                return Err(bad("cameras.txt", &line.join(" ")));
-            }
-            (model, _) => {
-                return Err(Error::Unsupported {
-                    what: "a camera that is no pinhole",
-                    detail: format!(
-                        "camera {id} of cameras.txt is a {}; undistort the images first",
-                        model.unwrap_or("nameless one")
-                    ),
-                });
-            }
-        };
-        Ok(Camera {
-            pose: DAffine3::IDENTITY,
-            fx,
-            fy,
-            cx,
-            cy,
-            width: width as u32,
-            height: height as u32,
-            near: Camera::NEAR,
-            projection: Projection::Pinhole,
-        })
-    };
-    // Every other line lists the image's points, and may be empty.
-    let mut named = Vec::new();
-    let mut lines = images.lines().filter(|l| !l.starts_with('#'));
-    while let Some(line) = lines.next() {
-        if line.trim().is_empty() {
-            continue;
-        }
-        let words: Vec<&str> = line.split_whitespace().collect();
-        let [_, numbers @ .., id, name] = &words[..] else {
-            return Err(bad("images.txt", line));
-        };
-        let numbers: Option<Vec<f64>> = numbers.iter().map(|w| w.parse().ok()).collect();
-        let Some([w, x, y, z, tx, ty, tz]) = numbers.and_then(|n| <[f64; 7]>::try_from(n).ok())
-        else {
-            return Err(bad("images.txt", line));
-        };
-        let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
-        let mut camera = lens(id)?;
-        camera.pose = pose(rotation, DVec3::new(tx, ty, tz), frame);
-        named.push(checked(name, camera)?);
-        lines.next();
-    }
-    Ok(named)
 }
 
 /// From the cube to the camera, in cube-frame units, of what is from the world to the camera in the world's.
@@ -198,11 +165,11 @@ mod tests {
     }
 
     #[test]
-    fn a_nerf_file_and_a_colmap_file_of_the_same_view_agree() {
+    fn files_of_every_kind_that_describe_the_same_view_agree() {
         let json = r#"{"camera_angle_x": 1.5707963267948966, "w": 80, "h": 60, "frames": [
             {"file_path": "a.png", "transform_matrix":
              [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 17], [0, 0, 0, 1]]}]}"#;
-        let named = nerf(json, &FRAME, (1, 1)).unwrap();
+        let named = read(json.as_bytes(), &FRAME, (1, 1)).unwrap();
         assert_eq!((named.len(), named[0].0.as_str()), (1, "a.png"));
         assert_is_the_orbit(&named[0].1);
 
@@ -212,6 +179,65 @@ mod tests {
         let named = colmap(cameras, images, &FRAME).unwrap();
         assert_eq!(named.len(), 2);
         assert_is_the_orbit(&named[1].1);
+
+        // Column by column; the middle of the first pixel is 0.
+        let open3d = r#"{"class_name": "PinholeCameraParameters",
+            "extrinsic": [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, -5, 6, 17, 1],
+            "intrinsic": {"width": 80, "height": 60, "intrinsic_matrix": [40, 0, 0, 0, 40, 0, 39.5, 29.5, 1]}}"#;
+        let many = format!(
+            r#"{{"class_name": "PinholeCameraTrajectory", "parameters": [{open3d}, {open3d}]}}"#
+        );
+        for (file, count) in [(open3d, 1), (many.as_str(), 2)] {
+            let named = read(file.as_bytes(), &FRAME, (1, 1)).unwrap();
+            assert_eq!(named.len(), count);
+            assert_is_the_orbit(&named[count - 1].1);
+        }
+
+        // Half the height over the distance is the tangent of half the angle: 30/40. The parent lifts what its child moves back.
+        let gltf = r#"{"asset": {"version": "2.0"},
+            "cameras": [{"type": "perspective", "perspective": {"yfov": 1.2870022175866872, "znear": 0.04}}],
+            "nodes": [{"translation": [5, 6, 7], "scale": [2, 2, 2], "children": [1]},
+                      {"name": "eye", "camera": 0, "translation": [0, 0, 5]}]}"#;
+        let mut binary = b"glTF\x02\0\0\0".to_vec();
+        binary.extend((20 + gltf.len() as u32).to_le_bytes());
+        binary.extend((gltf.len() as u32).to_le_bytes());
+        binary.extend(b"JSON");
+        binary.extend(gltf.as_bytes());
+        for file in [gltf.as_bytes(), &binary] {
+            let named = read(file, &FRAME, (80, 60)).unwrap();
+            assert_eq!((named.len(), named[0].0.as_str()), (1, "eye"));
+            assert_is_the_orbit(&named[0].1);
+            assert!((named[0].1.near - 0.01).abs() < 1e-12);
+        }
+        for cut in 0..binary.len() {
+            assert!(read(&binary[..cut], &FRAME, (80, 60)).is_err(), "{cut}");
+        }
+    }
+
+    #[test]
+    fn an_orthographic_node_shows_as_much_as_it_says_and_circles_of_nodes_are_refused() {
+        let file = |nodes: &str| {
+            format!(
+                r#"{{"asset": {{"version": "2.0"}}, "nodes": {nodes}, "cameras": [
+                {{"type": "orthographic", "orthographic": {{"xmag": 8, "ymag": 6, "znear": 0, "zfar": 9}}}}]}}"#
+            )
+        };
+        let named = read(file(r#"[{"camera": 0}]"#).as_bytes(), &FRAME, (80, 60)).unwrap();
+        let camera = named[0].1;
+        assert_eq!(camera.projection, Projection::Orthographic);
+        // 80 pixels are 16 of the world's units, and 4 of the cube's.
+        assert!((camera.fx - 20.0).abs() < 1e-9 && (camera.fy - 20.0).abs() < 1e-9);
+        for nodes in [
+            r#"[{"camera": 0, "children": [1]}, {"children": [0]}]"#,
+            r#"[{"camera": 1}]"#,
+            r#"[{"camera": 0, "children": [7]}]"#,
+            r#"[{"camera": 0, "scale": [1, -1, 1]}]"#,
+        ] {
+            assert!(
+                read(file(nodes).as_bytes(), &FRAME, (8, 8)).is_err(),
+                "{nodes}"
+            );
+        }
     }
 
     #[test]
@@ -225,12 +251,14 @@ mod tests {
             "[[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]",
             "[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
         ] {
-            let error = nerf(&json(matrix), &FRAME, (8, 8)).unwrap_err().to_string();
+            let error = read(json(matrix).as_bytes(), &FRAME, (8, 8))
+                .unwrap_err()
+                .to_string();
             assert!(error.contains("a: "), "{error}");
         }
-        assert!(nerf("{}", &FRAME, (8, 8)).is_err());
+        assert!(read(b"{}", &FRAME, (8, 8)).is_err());
         assert!(
-            nerf(r#"{"frames": []}"#, &FRAME, (8, 8))
+            read(br#"{"frames": []}"#, &FRAME, (8, 8))
                 .unwrap()
                 .is_empty()
         );
