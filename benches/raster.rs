@@ -1,8 +1,8 @@
 //! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes. Least and median time of
 //! the whole frame, and the stages of the fastest.
 //!
-//! `raster [--threads N] [--isa NAME] [--effects] [--fine] [SCENE…]`; `--effects` draws with each effect instead of the plain pictures,
-//! `--fine` in that quality; a scene being a name of [`SCENES`].
+//! `raster [--threads N] [--isa NAME] [--effects] [--quality NAME] [SCENE…]`; `--effects` draws with each effect instead of the plain pictures,
+//! `--quality` in that quality; a scene being a name of [`SCENES`].
 
 use std::time::{Duration, Instant};
 
@@ -247,7 +247,7 @@ fn main() -> Result<()> {
         match arg.as_str() {
             "--threads" => threads = args.next().and_then(|n| n.parse().ok()).unwrap_or(0),
             "--effects" => forced = true,
-            "--fine" => quality = Quality::Fine,
+            "--quality" => quality = args.next().and_then(|n| n.parse().ok()).unwrap_or_default(),
             "--isa" => {
                 isas = args
                     .next()

@@ -145,7 +145,7 @@ pub struct Render {
     #[arg(long, value_name = "NAME=on|off|auto", value_parser = effect)]
     pub effect: Vec<(Effect, Choice)>,
     /// How much of what is faint may be left out: fast, fine, exact
-    #[arg(long, value_name = "NAME", default_value = "fast")]
+    #[arg(long, value_name = "NAME", default_value = "fine")]
     pub quality: Quality,
     /// Print what each picture took, and what was not drawn and why, as JSON
     #[arg(long, value_enum, value_name = "FORMAT")]
@@ -250,7 +250,7 @@ pub struct Bench {
     #[arg(long, value_name = "WxH", default_value = "1024x1024", value_parser = size, requires = "render")]
     pub size: (u32, u32),
     /// What is drawn leaves out as much as this quality does: fast, fine, exact
-    #[arg(long, value_name = "NAME", default_value = "fast", requires = "render")]
+    #[arg(long, value_name = "NAME", default_value = "fine", requires = "render")]
     pub quality: Quality,
     /// Times that it is decoded or drawn; medians are told
     #[arg(long, value_name = "N", default_value_t = 7, value_parser = clap::value_parser!(u32).range(1..=10_000))]

@@ -40,9 +40,11 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         }
         None => {
             let model = load::model(&args.model)?;
-            Decoder::new(&model)
-                .with_limits(limits.clone())
-                .decode(embedded::SAMPLE, args.level.level, &mut log)?
+            Decoder::new(&model).with_limits(limits.clone()).decode(
+                embedded::SAMPLE,
+                args.level.level,
+                &mut log,
+            )?
         }
     };
     let isa = load::isa(args.model.isa.as_deref())?;

@@ -117,7 +117,9 @@ fn pictures(
     }
 
     let mut text = String::new();
-    if let (true, Some((_, camera)), Some((_, _, stats))) = (args.verbose, cameras.first(), all.first()) {
+    if let (true, Some((_, camera)), Some((_, _, stats))) =
+        (args.verbose, cameras.first(), all.first())
+    {
         if let Some(detail) = detail {
             text += &format!("{detail}\n");
         }

@@ -81,9 +81,9 @@ impl Background {
 pub enum Quality {
     /// A floor of 1/255, as is usual: beside silhouettes, pictures are off by several steps of eight bits, and by many where splats are
     /// far smaller than pixels.
-    #[default]
     Fast,
-    /// A floor of 1/4096.
+    /// A floor of 1/16384.
+    #[default]
     Fine,
     /// A floor of [`LEAST_FLOOR`].
     Exact,
@@ -99,7 +99,7 @@ impl Quality {
     pub fn floor(self) -> f32 {
         match self {
             Quality::Fast => 1.0 / 255.0,
-            Quality::Fine => 1.0 / 4096.0,
+            Quality::Fine => 1.0 / 16384.0,
             Quality::Exact => LEAST_FLOOR,
             Quality::Floor(floor) => floor.clamp(LEAST_FLOOR, 1.0),
         }

@@ -1,7 +1,7 @@
 //! Several floats side by side.
 //!
 //! [`Lanes`] is what the splat kernels are written in. `plain.rs` has the portable ones, the reference of the others; `avx2.rs` and
-//! `avx512.rs` have those of x86. A kernel is one generic body, inlined into one function per instruction set ([`by_level`]).
+//! `avx512.rs` have those of x86, `neon.rs` those of AArch64. A kernel is one generic body, inlined into one function per instruction set ([`by_level`]).
 
 use super::Ellipse;
 
@@ -144,7 +144,20 @@ macro_rules! by_level {
                 scalar $(::<$flag>)? ($($arg),*)
             }
         }
-        #[cfg(not(target_arch = "x86_64"))]
+        #[cfg(target_arch = "aarch64")]
+        {
+            #[target_feature(enable = "neon")]
+            fn neon $(<const $flag: u8>)? ($($arg: $ty),*) $(-> $out)? {
+                $body::<$crate::splat::neon::Neon $(, $flag)?>($($arg),*)
+            }
+            if $crate::isa::Isa::level($isa) >= $crate::isa::Level::Neon {
+                // SAFETY: an `Isa` of this level is only made where the processor has NEON.
+                unsafe { neon $(::<$flag>)? ($($arg),*) }
+            } else {
+                scalar $(::<$flag>)? ($($arg),*)
+            }
+        }
+        #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
         {
             let _ = $isa;
             scalar $(::<$flag>)? ($($arg),*)
@@ -201,7 +214,7 @@ macro_rules! four {
 pub(super) use four;
 
 /// Runs instructions of the level that the surrounding type stands for.
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! instructions {
     ($e:expr) => {
         // SAFETY: the types of a level are named only by `by_level`, in functions that run only where the processor has the level.
@@ -209,11 +222,11 @@ macro_rules! instructions {
         unsafe { $e }
     };
 }
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 pub(super) use instructions;
 
 /// Methods of two arguments that are one instruction each.
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! binary {
     ($($name:ident: $instruction:ident),* $(,)?) => {
         $(#[inline(always)]
@@ -222,11 +235,11 @@ macro_rules! binary {
         })*
     };
 }
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 pub(super) use binary;
 
 /// By Horner's rule, the highest coefficient first.
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 #[inline(always)]
 pub(super) fn polynomial<L: Lanes>(x: L, coefficients: &[f32; 5]) -> L {
     let mut p = L::splat(coefficients[0]);

@@ -1,6 +1,6 @@
 //! Splats: Gaussians onto the picture ([`project`]), and into the pixels of one tile ([`Tile`]).
 //!
-//! Each kernel is one body over lanes of floats, compiled for plain Rust, AVX2 and AVX-512. Between these the last bits differ,
+//! Each kernel is one body over lanes of floats, compiled for plain Rust, AVX2, AVX-512 and NEON. Between these the last bits differ,
 //! because only some multiply and add in one rounding; on each of them the result is a function of the input alone.
 
 #[cfg(target_arch = "x86_64")]
@@ -10,6 +10,8 @@ mod avx512;
 mod blend;
 mod lanes;
 mod layout;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod pixels;
 mod plain;
 mod project;
@@ -120,7 +122,7 @@ impl Ellipse {
     }
 
     /// The bits of its fields, in their order.
-    #[cfg(target_arch = "x86_64")]
+    #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
     #[inline(always)]
     fn as_fields_mut(&mut self) -> &mut [f32; 16] {
         const { assert!(size_of::<Ellipse>() == size_of::<[f32; 16]>()) };

