@@ -74,7 +74,10 @@ fn a_better_quality_is_nearer_to_the_reference() {
         });
         let [(fast, _), (standard, _), (best, _)] = cost;
         // Between the better two only rounding is left.
-        assert!(best <= standard + 1e-6 && standard < fast, "{isa}: {cost:?}");
+        assert!(
+            best <= standard + 1e-6 && standard < fast,
+            "{isa}: {cost:?}"
+        );
         assert!(fast <= 10.0 / 255.0, "{isa}: {cost:?}");
     }
 }

@@ -176,7 +176,7 @@ fn white_on_white_stays_white() {
         (scene(white(surface_splats(4000, 0.8, 0.02))), 2e-6),
         (scene(layers(1.0, 100)), 2e-6),
         (scene(layers(0.1, 1000)), 1e-5),
-        (scene(layers(1.01 / 255.0, 3000)), 1e-5),
+        (scene(layers(1.01 / 255.0, 3000)), 2e-5),
     ];
     for (i, (scene, tolerance)) in scenes.iter().enumerate() {
         for pixel in draw(scene, &camera).pixels {
