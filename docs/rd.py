@@ -1,62 +1,176 @@
-"""Draws docs/rd.svg, rate against PSNR, from the table of measurements in README.md: python3 docs/rd.py"""
+"""Rate against distortion of the models and of MPEG's G-PCC on whole objects, by `b2p-lab eval`'s protocol.
 
+    python3 docs/rd.py --data FOLDER [--models NAME=FILE …]   measures, then does the rest
+    python3 docs/rd.py                                        from docs/rd.json: the tables between README's marks, and docs/rd.svg
+
+FOLDER holds `val/*.glb`, and TMC13's decoded clouds in `gpcc/`.
+"""
+
+import argparse
+import json
+import math
 import re
+import subprocess
+import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).parent
-SERIES = {"b2p lite-low": "#c2410c", "b2p": "#1d4ed8", "TMC13": "#6b7280"}
-WIDTH, HEIGHT, LEFT, TOP, GAP = 340, 240, 50, 40, 70
+ROOT = HERE.parent
+OBJECTS = {"person_Asian_F_3_Casual": "Asian_F_3", "person_Hispanic_M_3_Milit": "Hispanic_M_3", "tds_Penelope": "Penelope (statue)", "coffee_grinder": "Coffee grinder"}
+# TMC13 v23: bits per input point of whole streams.
+PEERS = {
+    "person_Asian_F_3_Casual": {"s0.25_q34": 0.1005, "s0.25_q28": 0.1400, "s0.5_q34": 0.2975, "s0.5_q28": 0.4092},
+    "person_Hispanic_M_3_Milit": {"s0.25_q34": 0.0944, "s0.25_q28": 0.1571, "s0.5_q34": 0.2775, "s0.5_q28": 0.4457},
+}
+MODELS = {"lite": "models/lite.safetensors", "lite-low": "models/lite-low.safetensors"}
+COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce"]
+PEER, PEER_COLOUR = "TMC13", "#6b7280"
+SCORES = {"psnr": "PSNR", "foreground_psnr": "foreground PSNR", "ms_ssim": "MS-SSIM", "ssimulacra2": "SSIMULACRA2"}
 
 
-def points():
-    """(object, series, level, bits per point, PSNR, foreground PSNR) of every row."""
-    out, name = [], None
-    for line in (HERE.parent / "README.md").read_text().splitlines():
-        cells = [c.replace("*", "").strip() for c in line.strip("|").split("|")]
-        level = re.search(r"(TMC13|b2p)( `lite-low`)? level (\d)", cells[0])
-        if len(cells) != 6 or not level:
-            continue
-        if line.startswith("| **"):
-            name = re.match(r"\| \*\*(.+?)\*\*", line)[1]
-        series = level[1] + (" lite-low" if level[2] else "")
-        out.append((name, series, int(level[3]), *map(float, cells[1:4])))
+# ---------------------------------------------------------------------------------------------------------------------
+# Measuring
+
+
+def lab(*args):
+    subprocess.run(["cargo", "run", "--release", "--quiet", "-p", "b2p-lab", "--", *map(str, args)], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+
+
+def evaluate(mesh, cloud, out, *args):
+    lab("eval", "--mesh", mesh, "--cloud", cloud, "-o", out, *args)
+    return json.loads((Path(out) / "scores.json").read_text())["rows"]
+
+
+def measure(data, models):
+    rows = []
+    for name in OBJECTS:
+        with tempfile.TemporaryDirectory() as folder:
+            folder, mesh = Path(folder), data / "val" / f"{name}.glb"
+            cloud = folder / "cloud.ply"
+            lab("voxelize", mesh, "-o", cloud)
+            for model, path in models.items():
+                for row in evaluate(mesh, cloud, folder / model, "--model", ROOT / path):
+                    parts = {part["level"]: part for part in row["rate"]["levels"]}
+                    rows.append({"object": name, "series": model, "level": row["level"], "rate": row["rate"]["total"],
+                                 "geometry": sum(p["geometry"] for p in parts.values()), **row["scores"]})
+            items = [f"{item}={data}/gpcc/{name}_{item}.ply.zst@{rate}" for item, rate in PEERS.get(name, {}).items()]
+            best = {}
+            for row in evaluate(mesh, cloud, folder / "peer", *items) if items else []:
+                if row["name"] not in best or row["scores"]["psnr"] > best[row["name"]]["scores"]["psnr"]:
+                    best[row["name"]] = row
+            for item, row in best.items():
+                level = {"s0.25": 8, "s0.5": 9}[item.split("_")[0]]
+                rows.append({"object": name, "series": PEER, "level": level, "rate": PEERS[name][item], "quality": item.split("_q")[1], **row["scores"]})
+    return rows
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Bjøntegaard's differences, over the piecewise linear curves through the points that no other beats
+
+
+def front(rows, score):
+    best, out = -math.inf, []
+    for row in sorted(rows, key=lambda r: (r["rate"], -r[score])):
+        if row[score] > best:
+            best = row[score]
+            out.append((math.log(row["rate"]), row[score]))
     return out
 
 
-def panel(x0, y0, title, rows, value):
-    rates, values = [r[3] for r in rows], [r[value] for r in rows]
+def mean_between(curve, low, high, steps=1000):
+    """The mean of a piecewise linear curve of (x, y), x rising."""
+    def at(x):
+        for (x0, y0), (x1, y1) in zip(curve, curve[1:]):
+            if x <= x1:
+                return y0 + (y1 - y0) * (x - x0) / (x1 - x0)
+        return curve[-1][1]
+    return sum(at(low + (high - low) * (i + 0.5) / steps) for i in range(steps)) / steps
+
+
+def bjontegaard(ours, peers, score):
+    """(mean difference of the score at equal rates, rates it was taken over, mean change of the rate at equal scores; None without overlap)."""
+    a, b = front(ours, score), front(peers, score)
+    low, high = max(a[0][0], b[0][0]), min(a[-1][0], b[-1][0])
+    gain = mean_between(a, low, high) - mean_between(b, low, high) if low < high else None
+    turn = lambda curve: [(y, x) for x, y in curve]
+    least, most = max(a[0][1], b[0][1]), min(a[-1][1], b[-1][1])
+    saved = math.expm1(mean_between(turn(a), least, most) - mean_between(turn(b), least, most)) if least < most else None
+    return gain, (math.exp(low), math.exp(high)), saved
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Tables and the plot
+
+
+def table(rows):
+    out = ["| | bits/point | PSNR | foreground PSNR | MS-SSIM | SSIMULACRA2 |", "|---|---:|---:|---:|---:|---:|"]
+    for name, title in OBJECTS.items():
+        for i, r in enumerate(sorted((r for r in rows if r["object"] == name), key=lambda r: (r["series"] == PEER, r["rate"]))):
+            what = f"{PEER} level {r['level']}, QP {r['quality']}" if r["series"] == PEER else f"`{r['series']}` level {r['level']}"
+            head = f"**{title}**, " if i == 0 else ""
+            out.append(f"| {head}{what} | {r['rate']:.3f} | {r['psnr']:.2f} | {r['foreground_psnr']:.2f} | {r['ms_ssim']:.4f} | {r['ssimulacra2']:.1f} |")
+    return out
+
+
+def differences(rows):
+    out = ["| at equal rates, ours less TMC13's | " + " | ".join(SCORES.values()) + " | bits saved at equal PSNR |", "|---|" + "---:|" * (len(SCORES) + 1)]
+    for name in PEERS:
+        ours, peers = ([r for r in rows if r["object"] == name and (r["series"] == PEER) == is_peer] for is_peer in (False, True))
+        gains = [bjontegaard(ours, peers, score) for score in SCORES]
+        (low, high), saved = gains[0][1], gains[0][2]
+        cells = ["—" if g is None else f"{g:+.2f} dB" if "psnr" in score else f"{g:+.4f}" if score == "ms_ssim" else f"{g:+.1f}" for score, (g, _, _) in zip(SCORES, gains)]
+        out.append(f"| {OBJECTS[name]}, {low:.2f} to {high:.2f} bits/point | " + " | ".join(cells) + f" | {'no equal PSNR' if saved is None else f'{-100 * saved:.0f} %'} |")
+    return out
+
+
+def panel(x0, y0, title, rows, score, colours):
+    width, height = 340, 240
+    values = [r[score] for r in rows]
     low, high = min(values) - 0.5, max(values) + 0.5
-    x = lambda r: x0 + (r - 0.1) / 0.45 * WIDTH
-    y = lambda v: y0 + HEIGHT - (v - low) / (high - low) * HEIGHT
-    out = [f'<text x="{x0}" y="{y0 - 12}" font-weight="bold">{title}</text>',
-           f'<rect x="{x0}" y="{y0}" width="{WIDTH}" height="{HEIGHT}" fill="none" stroke="#d1d5db"/>']
-    for r in (0.1, 0.2, 0.3, 0.4, 0.5):
-        out.append(f'<text x="{x(r)}" y="{y0 + HEIGHT + 16}" text-anchor="middle">{r}</text>')
+    x = lambda r: x0 + (r - 0.05) / 0.5 * width
+    y = lambda v: y0 + height - (v - low) / (high - low) * height
+    out = [f'<text x="{x0}" y="{y0 - 12}" font-weight="bold">{title}</text>', f'<rect x="{x0}" y="{y0}" width="{width}" height="{height}" fill="none" stroke="#d1d5db"/>']
+    out += [f'<text x="{x(r)}" y="{y0 + height + 16}" text-anchor="middle">{r}</text>' for r in (0.1, 0.2, 0.3, 0.4, 0.5)]
     for v in range(int(low) + 1, int(high) + 1, 2):
-        out.append(f'<path d="M{x0} {y(v):.1f}h{WIDTH}" stroke="#e5e7eb"/><text x="{x0 - 6}" y="{y(v) + 4:.1f}" text-anchor="end">{v}</text>')
-    for series, colour in SERIES.items():
-        own = sorted((r[3], r[value], r[2]) for r in rows if r[1] == series)
-        path = "L".join(f"{x(r):.1f} {y(v):.1f}" for r, v, _ in own)
-        out.append(f'<path d="M{path}" fill="none" stroke="{colour}" stroke-width="2"/>')
-        out += [f'<circle cx="{x(r):.1f}" cy="{y(v):.1f}" r="4" fill="{colour}"/><text x="{x(r) + 6:.1f}" y="{y(v) + 14:.1f}" fill="{colour}">{level}</text>'
-                for r, v, level in own]
+        out.append(f'<path d="M{x0} {y(v):.1f}h{width}" stroke="#e5e7eb"/><text x="{x0 - 6}" y="{y(v) + 4:.1f}" text-anchor="end">{v}</text>')
+    for series, colour in colours.items():
+        own = sorted((r["rate"], r[score], r["level"]) for r in rows if r["series"] == series)
+        if own:
+            path = "L".join(f"{x(r):.1f} {y(v):.1f}" for r, v, _ in own)
+            out.append(f'<path d="M{path}" fill="none" stroke="{colour}" stroke-width="2"/>')
+        out += [f'<circle cx="{x(r):.1f}" cy="{y(v):.1f}" r="4" fill="{colour}"/><text x="{x(r) + 6:.1f}" y="{y(v) + 14:.1f}" fill="{colour}">{level}</text>' for r, v, level in own]
     return out
+
+
+def plot(rows):
+    series = [s for s in dict.fromkeys(r["series"] for r in rows) if s != PEER]
+    colours, body = dict(zip(series, COLOURS)) | {PEER: PEER_COLOUR}, []
+    for column, name in enumerate(PEERS):
+        own = [r for r in rows if r["object"] == name]
+        for line, score in enumerate(("psnr", "foreground_psnr")):
+            body += panel(50 + column * 410, 40 + line * 310, f"{OBJECTS[name]}: {SCORES[score]}, dB", own, score, colours)
+    for i, (name, colour) in enumerate(colours.items()):
+        body.append(f'<text x="{50 + 100 * i}" y="654" fill="{colour}" font-weight="bold">{name}</text>')
+    body.append(f'<text x="{50 + 100 * len(colours)}" y="654">bits per input point, geometry included; numbers are octree levels</text>')
+    head = '<svg xmlns="http://www.w3.org/2000/svg" width="870" height="668" font-family="sans-serif" font-size="12">'
+    return f'{head}<rect width="100%" height="100%" fill="white"/>{"".join(body)}</svg>\n'
 
 
 def main():
-    rows, body = points(), []
-    objects = [n for n in dict.fromkeys(r[0] for r in rows) if any(r[0] == n and r[1] == "TMC13" for r in rows)]
-    for column, name in enumerate(objects):
-        own = [r for r in rows if r[0] == name]
-        for line, (value, what) in enumerate(((4, "PSNR"), (5, "foreground PSNR"))):
-            body += panel(LEFT + column * (WIDTH + GAP), TOP + line * (HEIGHT + GAP), f"{name}: {what}, dB", own, value)
-    foot = TOP + 2 * (HEIGHT + GAP) - 6
-    for i, (series, colour) in enumerate(SERIES.items()):
-        body.append(f'<text x="{LEFT + 130 * i}" y="{foot}" fill="{colour}" font-weight="bold">{series}</text>')
-    body.append(f'<text x="{LEFT + 400}" y="{foot}">bits per input point, geometry included; numbers are octree levels</text>')
-    size = (LEFT + len(objects) * (WIDTH + GAP), foot + 14)
-    svg = f'<svg xmlns="http://www.w3.org/2000/svg" width="{size[0]}" height="{size[1]}" font-family="sans-serif" font-size="12">'
-    (HERE / "rd.svg").write_text(f'{svg}<rect width="100%" height="100%" fill="white"/>{"".join(body)}</svg>\n')
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--models", nargs="*", default=[f"{name}={path}" for name, path in MODELS.items()])
+    args = parser.parse_args()
+    measured = HERE / "rd.json"
+    if args.data:
+        rows = measure(args.data.resolve(), dict(model.split("=", 1) for model in args.models))
+        measured.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+    rows = json.loads(measured.read_text())
+    text = "\n".join([*table(rows), "", *differences(rows)])
+    readme = ROOT / "README.md"
+    marked = re.sub(r"(<!-- rd -->\n).*?(\n<!-- /rd -->)", lambda m: m[1] + "\n" + text + "\n" + m[2], readme.read_text(), flags=re.S)
+    readme.write_text(marked)
+    (HERE / "rd.svg").write_text(plot(rows))
 
 
 if __name__ == "__main__":

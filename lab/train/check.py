@@ -127,7 +127,8 @@ def the_splatter_agrees_with_plain_pytorch():
 def arguments(**changes):
     args = dict(config=os.path.join(HERE, "configs/full.json"), device="cpu", seed=0, lr_conv=3e-4, lr_linear=1e-3, minutes=0, steps=100000,
                 rate_start=0.003, rate_ramp=0.6, warmup=10, decay_from=0.6, rounding_from=0.6, coarse=0.0, both=False, lam=5.0, pyramid=1.0, square=0.0,
-                clip=1.0, average=0.9, hint=0.0, hint_until=0.5, freeze_finest=False)
+                clip=1.0, average=0.9, hint=0.0, hint_until=0.5, freeze_finest=False,
+                only_heads=False, lr_heads=1.0)
     return type("Arguments", (), args | changes)()
 
 
@@ -172,6 +173,18 @@ def a_frozen_first_encoder_changes_nothing_but_its_own_gradient():
     return f"losses differ by {worst:.1e}: features are kept in f16"
 
 
+def heads_alone_learn_and_leave_the_bits_as_they_are():
+    sample = data.procedural(4, size=48, views=2, pixels=60)
+    trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), only_heads=True))
+    trainer.calibrated, losses = True, []
+    before = {name: p.detach().clone() for name, p in trainer.model.named_parameters()}
+    losses = [trainer.train_step([sample])["loss"] for _ in range(12)]
+    moved = {name for name, p in trainer.model.named_parameters() if not torch.equal(p, before[name])}
+    assert moved and all(name.startswith("gg.2.") for name in moved), sorted(moved)[:3]
+    assert losses[-1] < losses[0], losses
+    return f"loss {losses[0]:.2f} to {losses[-1]:.2f}"
+
+
 def the_integer_path_follows_the_float_path():
     samples = [data.procedural(i, size=48, views=2, pixels=80) for i in range(3)]
     trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
@@ -190,7 +203,8 @@ if __name__ == "__main__":
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "2")))
     for check in (operators_agree_with_plain_pytorch, rounded_operands_stay_close_where_the_processor_has_them,
                   maps_from_above_are_those_found_by_searching, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
-                  a_frozen_first_encoder_changes_nothing_but_its_own_gradient, the_integer_path_follows_the_float_path, a_crop_overfits):
+                  a_frozen_first_encoder_changes_nothing_but_its_own_gradient, heads_alone_learn_and_leave_the_bits_as_they_are,
+                  the_integer_path_follows_the_float_path, a_crop_overfits):
         begin = time.monotonic()
         said = check()
         print(f"{check.__name__.replace('_', ' ')}: {said} ({time.monotonic() - begin:.0f} s)", flush=True)

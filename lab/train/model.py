@@ -455,9 +455,12 @@ class B2P(nn.Module):
         return out[:3]
 
 
-def groups(model, lr_conv, lr_linear):
-    """Parameter groups: geometry-invariant and other convolutions move at lr_conv, everything else at lr_linear."""
-    conv, other = [], []
+def groups(model, lr_conv, lr_linear, heads=1.0):
+    """Parameter groups: geometry-invariant and other convolutions move at lr_conv, everything else at lr_linear; those of the heads
+    `heads` times as fast."""
+    parts = {}
     for name, p in model.named_parameters():
-        (conv if p.ndim == 3 and p.shape[0] > 1 else other).append(p)
-    return [{"params": conv, "base": lr_conv}, {"params": other, "base": lr_linear}]
+        conv, head = p.ndim == 3 and p.shape[0] > 1, name.startswith("gg.")
+        base = (lr_conv if conv else lr_linear) * (heads if head else 1.0)
+        parts.setdefault((head, conv), {"params": [], "base": base})["params"].append(p)
+    return list(parts.values())

@@ -2,6 +2,7 @@
 
 import argparse
 import ctypes
+import glob
 import json
 import math
 import os
@@ -10,6 +11,7 @@ import signal
 import sys
 import time
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
@@ -122,10 +124,12 @@ class Trainer:
         torch.manual_seed(args.seed)
         self.rng = random.Random(args.seed)
         self.model = B2P(self.cfg).to(self.device)
-        self.optimiser = torch.optim.Adam(groups(self.model, args.lr_conv, args.lr_linear), betas=(0.9, 0.999), eps=1e-8, fused=True)
+        learning = self.model.gg if args.only_heads else self.model
+        self.optimiser = torch.optim.Adam(groups(learning, args.lr_conv, args.lr_linear, args.lr_heads), betas=(0.9, 0.999), eps=1e-8, fused=True)
         self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
         self.step, self.used, self.calibrated = 0, 0.0, False
         self.finest = {}  # of a frozen first encoder: its features, in f16, by the sample's name
+        self.decoded = {}  # where only the heads are trained: what they read, in f16, by the sample's name
 
     def state(self):
         return {"model": self.model.state_dict(), "average": self.average, "optimiser": self.optimiser.state_dict(), "step": self.step,
@@ -170,9 +174,26 @@ class Trainer:
             self.finest[sample.name] = self.model.analyse_finest(sample.crop, sample.rgb).half()
         return self.finest[sample.name].float()
 
+    def keep_finest(self, folder):
+        """What `frozen` computes, from the files of a folder where there are any."""
+        for path in glob.glob(os.path.join(folder, "*.npy")):
+            self.finest[os.path.basename(path)[: -len(".npy")]] = torch.from_numpy(np.load(path))
+
+    @torch.no_grad()
+    def heads_read(self, sample, head):
+        """Reconstructed features of a head's role, from rounded latents: computed once, as nothing before the heads learns."""
+        if sample.name not in self.decoded:
+            features = self.model.analyse(sample.crop, sample.rgb)
+            trail, _, _ = self.model.code(sample.crop, features, 2, "round")
+            self.decoded[sample.name] = [trail[r].half() for r in (1, 2)]
+        return self.decoded[sample.name][head - 1].float()
+
     def loss(self, sample, head, weight, mode, hint):
-        features = self.model.analyse(sample.crop, sample.rgb, self.frozen(sample))
-        trail, rates, latents = self.model.code(sample.crop, features, head, mode)
+        if self.args.only_heads:
+            trail, rates, latents = [self.heads_read(sample, head)], [torch.zeros(())] * (head + 1), [torch.zeros(2)] * (head + 1)
+        else:
+            features = self.model.analyse(sample.crop, sample.rgb, self.frozen(sample))
+            trail, rates, latents = self.model.code(sample.crop, features, head, mode)
         (mean, cov, alpha, colour), raw = self.model.generate(trail[-1], sample.crop, head)
         background = torch.rand(sample.image.shape[0], 3, device=raw.device)
         h, w = sample.image.shape[2:]
@@ -210,7 +231,7 @@ class Trainer:
         lr = learning_rate(x, self.step, args)
         for group in self.optimiser.param_groups:
             group["lr"] = group["base"] * lr
-        norm = torch.nn.utils.clip_grad_norm_([p for p in self.model.parameters() if p.grad is not None], args.clip)
+        norm = torch.nn.utils.clip_grad_norm_([p for g in self.optimiser.param_groups for p in g["params"] if p.grad is not None], args.clip)
         if torch.isfinite(norm):
             self.optimiser.step()
         self.step += 1
@@ -273,6 +294,7 @@ def main(argv=None):
     p.add_argument("--hint-until", type=float, default=0.5)
     p.add_argument("--lr-conv", type=float, default=1e-4)
     p.add_argument("--lr-linear", type=float, default=3e-4)
+    p.add_argument("--lr-heads", type=float, default=1.0, help="by how much faster the heads learn when the whole network does")
     p.add_argument("--warmup", type=int, default=400)
     p.add_argument("--decay-from", type=float, default=0.6)
     p.add_argument("--rate-start", type=float, default=0.003)
@@ -291,6 +313,8 @@ def main(argv=None):
     p.add_argument("--resume", action="store_true", help="continue from OUT/last.pt")
     p.add_argument("--revive", type=int, choices=[1, 2], help="with --init: give this role new latents, where its own died")
     p.add_argument("--freeze-finest", action="store_true", help="leave the encoder of the finest level as it is: a step is then twice as fast")
+    p.add_argument("--only-heads", action="store_true", help="train what turns features into Gaussians and leave the bits as they are")
+    p.add_argument("--cache", help="with --freeze-finest: folder of features of the finest level, NAME.npy for each sample")
     p.add_argument("--stop-after", type=int, default=0, help="stop at this step, as an interruption would")
     p.add_argument("--init", help="start from the averaged weights of this checkpoint, or from a file of `export.py --weights`")
     args = p.parse_args(argv)
@@ -311,7 +335,9 @@ def main(argv=None):
     if args.revive and not args.resume:
         some = [data.load_sample(f) for f in train_files[:10]]
         trainer.revive(join([s.crop for s in some]), torch.cat([s.rgb for s in some]))
-    stream = data.Stream(train_files, args.views, args.seed, trainer.step * args.batch, known=trainer.finest)
+    if args.cache:
+        trainer.keep_finest(args.cache)
+    stream = data.Stream(train_files, args.views, args.seed, trainer.step * args.batch, known=trainer.decoded if args.only_heads else trainer.finest)
     log = open(os.path.join(args.out, "log.jsonl"), "a")
 
     def write(row):
