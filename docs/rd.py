@@ -3,12 +3,13 @@
     python3 docs/rd.py --data FOLDER [--models NAME=FILE …]   measures, then does the rest
     python3 docs/rd.py                                        from docs/rd.json: the tables between README's marks, and docs/rd.svg
 
-FOLDER holds `val/*.glb`, and TMC13's decoded clouds in `gpcc/`.
+FOLDER holds `val/*.glb`, and TMC13's decoded clouds in `gpcc/`. B2P_LAB names a `b2p-lab` that is built already.
 """
 
 import argparse
 import json
 import math
+import os
 import re
 import subprocess
 import tempfile
@@ -33,7 +34,8 @@ SCORES = {"psnr": "PSNR", "foreground_psnr": "foreground PSNR", "ms_ssim": "MS-S
 
 
 def lab(*args):
-    subprocess.run(["cargo", "run", "--release", "--quiet", "-p", "b2p-lab", "--", *map(str, args)], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    program = [os.environ["B2P_LAB"]] if "B2P_LAB" in os.environ else ["cargo", "run", "--release", "--quiet", "-p", "b2p-lab", "--"]
+    subprocess.run([*program, *map(str, args)], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
 
 
 def evaluate(mesh, cloud, out, *args):

@@ -1,14 +1,14 @@
 """How time and memory grow with the cloud: the procedural scene at several bit depths, decoded to its finest level.
 
-    python3 docs/scaling.py [BITS …]      measures (default 7 to 12; 12 takes some minutes and 10 GB), then does the rest
+    python3 docs/scaling.py [BITS …]      measures (default 7 to 12; 12 takes some minutes), then does the rest
     python3 docs/scaling.py --plot        from docs/scaling.json: docs/scaling.svg, and the table on standard output
 """
 
 import json
 import math
+import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -21,20 +21,22 @@ def run(*args):
 
 
 def measure(bits):
-    program, lab = ROOT / "target/release/b2p", ROOT / "target/release/b2p-lab"
-    with tempfile.TemporaryDirectory() as folder:
-        cloud, stream = Path(folder) / "scene.ply", Path(folder) / "scene.b2p"
+    built = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
+    program, lab, folder = built / "release/b2p", built / "release/b2p-lab", built / "scaling"
+    folder.mkdir(exist_ok=True)
+    cloud, stream = folder / f"{bits}.ply", folder / f"{bits}.b2p"
+    if not stream.exists():
         run(lab, "voxelize", "procedural:scene", "--bits", bits, "--points", max(200_000, min(200_000_000, 14 * 4**bits)), "-o", cloud)
         run(program, "-q", "encode", cloud, "-o", stream, "--limits", "unlimited")
-        out = {"bits": bits, "bytes": stream.stat().st_size}
-        repeat = 7 if bits < 11 else 3
-        for key, more in (("ms", []), ("ms_one", ["--threads", 1])):
-            report = json.loads(run(program, "bench", stream, "--json", "--repeat", repeat, "--limits", "unlimited", *more))
-            out[key] = report["decode_ms"]
-            if key == "ms":
-                out |= {"mb": report["peak_memory_bytes"] / 1e6, "isa": report["isa"], "level": report["level"]}
-                out["voxels"] = max(s["count"] for s in report["stages"] if s["stage"] == f"geometry of level {report['level']}")
-        return out
+        cloud.unlink()
+    out = {"bits": bits, "bytes": stream.stat().st_size}
+    for key, more in (("ms", []), ("ms_one", ["--threads", 1])):
+        report = json.loads(run(program, "bench", stream, "--json", "--repeat", 7 if bits < 11 else 3, "--limits", "unlimited", *more))
+        out[key] = report["decode_ms"]
+        if key == "ms":
+            out |= {"mb": report["peak_memory_bytes"] / 1e6, "isa": report["isa"], "level": report["level"]}
+            out["voxels"] = max(s["count"] for s in report["stages"] if s["stage"] == f"geometry of level {report['level']}")
+    return out
 
 
 def plot(rows):

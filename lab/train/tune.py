@@ -62,6 +62,7 @@ def main():
     p.add_argument("--samples", type=int, default=150, help="crops, whose latents are computed once")
     p.add_argument("--lr", type=float, default=3e-4)
     p.add_argument("--base-channels", type=int, default=48, help="of the network that predicts role 0 from neighbours, if the model has none yet")
+    p.add_argument("--only-base", action="store_true", help="leave the models of roles 1 and 2 as they are: after `train.py --rounding-from 0` they know rounded latents")
     p.add_argument("--threads", type=int, default=2)
     args = p.parse_args()
     torch.set_num_threads(args.threads)
@@ -76,7 +77,7 @@ def main():
     held = [inputs(model, data.load_sample(f)) for f in held]
     before = measure(model, held)
     cached, step = [], 0
-    groups = [{"params": [*model.pem.parameters(), *model.prior.parameters()], "base": args.lr}]
+    groups = [{"params": [*model.prior.parameters(), *([] if args.only_base else model.pem.parameters())], "base": args.lr}]
     if model.cfg["base_channels"]:  # small, and often new
         groups.append({"params": [*model.base.parameters()], "base": 3 * args.lr})
     tuned = [p for group in groups for p in group["params"]]
