@@ -1,6 +1,6 @@
 """Rate against distortion of the models and of MPEG's G-PCC on whole objects, by `b2p-lab eval`'s protocol.
 
-    python3 docs/rd.py --data FOLDER [--models NAME=FILE …]   measures, then does the rest
+    python3 docs/rd.py --data FOLDER [--models NAME=FILE …]   measures these models, and TMC13 if that has not been yet; then does the rest
     python3 docs/rd.py                                        from docs/rd.json: the tables between README's marks, and docs/rd.svg
 
 FOLDER holds `val/*.glb`, and TMC13's decoded clouds in `gpcc/`. B2P_LAB names a `b2p-lab` that is built already.
@@ -23,7 +23,7 @@ PEERS = {
     "person_Asian_F_3_Casual": {"s0.25_q34": 0.1005, "s0.25_q28": 0.1400, "s0.5_q34": 0.2975, "s0.5_q28": 0.4092},
     "person_Hispanic_M_3_Milit": {"s0.25_q34": 0.0944, "s0.25_q28": 0.1571, "s0.5_q34": 0.2775, "s0.5_q28": 0.4457},
 }
-MODELS = {"lite": "models/lite.safetensors", "lite-low": "models/lite-low.safetensors"}
+MODELS = {name: f"models/{name}.safetensors" for name in ("lite", "lite-low", "lite-least")}
 COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce"]
 PEER, PEER_COLOUR = "TMC13", "#6b7280"
 SCORES = {"psnr": "PSNR", "foreground_psnr": "foreground PSNR", "ms_ssim": "MS-SSIM", "ssimulacra2": "SSIMULACRA2"}
@@ -43,7 +43,7 @@ def evaluate(mesh, cloud, out, *args):
     return json.loads((Path(out) / "scores.json").read_text())["rows"]
 
 
-def measure(data, models):
+def measure(data, models, peers):
     rows = []
     for name in OBJECTS:
         with tempfile.TemporaryDirectory() as folder:
@@ -55,10 +55,10 @@ def measure(data, models):
                     parts = {part["level"]: part for part in row["rate"]["levels"]}
                     rows.append({"object": name, "series": model, "level": row["level"], "rate": row["rate"]["total"],
                                  "geometry": sum(p["geometry"] for p in parts.values()), **row["scores"]})
-            items = [f"{item}={data}/gpcc/{name}_{item}.ply.zst@{rate}" for item, rate in PEERS.get(name, {}).items()]
+            items = [f"{item}={data}/gpcc/{name}_{item}.ply.zst@{rate}" for item, rate in PEERS.get(name, {}).items() if peers]
             best = {}
             for row in evaluate(mesh, cloud, folder / "peer", *items) if items else []:
-                if row["name"] not in best or row["scores"]["psnr"] > best[row["name"]]["scores"]["psnr"]:
+                if row["name"] in PEERS[name] and row["name"] not in best or row["name"] in best and row["scores"]["psnr"] > best[row["name"]]["scores"]["psnr"]:
                     best[row["name"]] = row
             for item, row in best.items():
                 level = {"s0.25": 8, "s0.5": 9}[item.split("_")[0]]
@@ -165,7 +165,10 @@ def main():
     args = parser.parse_args()
     measured = HERE / "rd.json"
     if args.data:
-        rows = measure(args.data.resolve(), dict(model.split("=", 1) for model in args.models))
+        models = dict(model.split("=", 1) for model in args.models)
+        kept = json.loads(measured.read_text()) if measured.exists() else []
+        kept = [row for row in kept if row["series"] not in models]
+        rows = kept + measure(args.data.resolve(), models, not any(row["series"] == PEER for row in kept))
         measured.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     rows = json.loads(measured.read_text())
     text = "\n".join([*table(rows), "", *differences(rows)])

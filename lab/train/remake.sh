@@ -35,9 +35,9 @@ train() {
         --average 0.999 --threads 1 --evaluate-every 1000 --log-every 50 --hint 0 --hint-until 0 "$@"
     touch "$out/$name/done"
 }
-# ship NAME FILE: fits the entropy models and writes the model
+# ship NAME FILE ARGUMENTS…: fits the entropy models and writes the model
 ship() {
-    "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 3)" --samples 80 --lr 5e-4 --threads 1
+    "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 3)" --samples 150 --lr 3e-4 --threads 1 "${@:3}"
     "$python" export.py "$out/$1/tuned.pt" "$out/$2.safetensors" --data "$out/data" --samples 10 --verify 4 --weights "$out/$2.weights.safetensors"
 }
 # The heads alone read what was decoded; they bear five times the learning rate, and a step is short.
@@ -49,3 +49,7 @@ train start lite 100 --lam 18 --rate-start 0.2 --rate-ramp 0.12 --rounding-from 
 train low lite 12 --init "$out/start/last.pt" --lam 4 --freeze-finest --rate-start 1 --rate-ramp 0.01 --rounding-from 0.02 --decay-from 0.3 --warmup 100
 train low-heads lite 44 --init "$out/low/last.pt" --lam 1 "${heads[@]}"
 ship low-heads lite-low
+train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
+ship high lite --only-base
+train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
+ship least lite-least --only-base
