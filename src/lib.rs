@@ -50,6 +50,8 @@ pub mod pixels;
 pub mod placement;
 pub mod projection;
 pub mod tiles;
+#[cfg(feature = "tradeoff")]
+pub mod tradeoff;
 
 pub use b2p_kernels::{Isa, UnknownIsa, ceiling};
 pub use cancel::Cancel;

@@ -16,7 +16,7 @@ const STAGES: [&str; 9] = [
 ];
 
 /// What drives the stages, and no stage may know.
-const DRIVERS: [&str; 5] = ["decoder", "encoder", "embedded", "cli", "log"];
+const DRIVERS: [&str; 6] = ["decoder", "encoder", "embedded", "tradeoff", "cli", "log"];
 
 /// Sources whose every result must be the same bits on every machine.
 const EXACT: [&str; 14] = [

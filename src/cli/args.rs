@@ -86,6 +86,8 @@ pub enum Command {
     Demo(Demo),
     /// Time the stages of decoding
     Bench(Bench),
+    /// Measure what accuracy costs in time on this machine: a table, JSON, a plot, and a page with all of them
+    Tradeoff(Tradeoff),
 }
 
 #[derive(Debug, Args)]
@@ -119,6 +121,8 @@ pub struct Decode {
     pub level: LevelArg,
     #[command(flatten)]
     pub model: ModelArg,
+    #[command(flatten)]
+    pub budget: BudgetArgs,
 }
 
 #[derive(Debug, Args)]
@@ -145,7 +149,7 @@ pub struct Render {
     #[arg(long, value_name = "NAME=on|off|auto", value_parser = effect)]
     pub effect: Vec<(Effect, Choice)>,
     /// How much of what is faint may be left out: fast, fine, exact
-    #[arg(long, value_name = "NAME", default_value = "fine")]
+    #[arg(long, value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
     pub quality: Quality,
     /// Print what each picture took, and what was not drawn and why, as JSON
     #[arg(long, value_enum, value_name = "FORMAT")]
@@ -159,6 +163,8 @@ pub struct Render {
     pub view: View,
     #[command(flatten)]
     pub model: ModelArg,
+    #[command(flatten)]
+    pub budget: BudgetArgs,
 }
 
 /// Kinds of pictures.
@@ -265,13 +271,34 @@ pub struct Bench {
 }
 
 #[derive(Debug, Args)]
+pub struct Tradeoff {
+    /// Stream to measure with [default: the sample that comes with the program]
+    pub input: Option<PathBuf>,
+    /// Folder for tradeoff.html, tradeoff.json and tradeoff.svg
+    #[arg(short, long, value_name = "DIR", default_value = "b2p-tradeoff")]
+    pub output: PathBuf,
+    /// Pictures, once around
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub views: u32,
+    /// Width and height of the pictures in pixels
+    #[arg(long, value_name = "WxH", default_value = "512x512", value_parser = size)]
+    pub size: (u32, u32),
+    /// Times that everything is measured; medians are told
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub repeat: u32,
+    /// Model file [default: the one inside the program]
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
 pub struct LevelArg {
     /// Octree level to decode to [default: the finest with Gaussians; to draw, the finest that can be seen]
     #[arg(long, value_name = "M")]
     pub level: Option<u8>,
 }
 
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 pub struct ModelArg {
     /// Model file [default: the one inside the program]
     #[arg(long, value_name = "FILE")]
@@ -284,6 +311,7 @@ pub struct ModelArg {
     pub precision: Option<String>,
 }
 
+use super::budget::BudgetArgs;
 pub use b2p::pixels::{Background, Choice, Effect, Quality};
 
 /// A number of bytes, with or without K, M, G or T for powers of 1024.

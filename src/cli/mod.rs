@@ -3,6 +3,7 @@
 mod args;
 mod bench;
 mod bench_render;
+mod budget;
 mod decode;
 mod demo;
 mod encode;
@@ -13,6 +14,7 @@ mod pipe;
 mod progress;
 mod render;
 mod table;
+mod tradeoff;
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -90,6 +92,7 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Info(args) => info::run(args, &limits)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,
+        Command::Tradeoff(args) => tradeoff::run(args, &limits, &progress)?,
     };
     drop(progress);
     if !cli.quiet {

@@ -6,12 +6,14 @@ use std::time::Duration;
 
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
-use b2p::pixels::{Choice, Effects, Explanation, Renderer, Stats};
+use b2p::pixels::{Choice, Effects, Explanation, Quality, Renderer, Stats};
 use b2p::projection::{Camera, files};
+use b2p::tradeoff::Task;
 use b2p::{Error, Limits, output};
 use serde_json::json;
 
 use super::args::{Format, Render, View};
+use super::budget::{self, Chosen};
 use super::load::Source;
 use super::picture::{Artist, format_of};
 use super::pipe::{self, PIPE};
@@ -26,13 +28,20 @@ const TRIALS: usize = 3;
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String> {
     let say = |step: &str| progress.say(step);
     let mut log = Log::with_listener(&say);
-    if args.input == Path::new(PIPE) {
+    if args.input == Path::new(PIPE) && !args.budget.is_given() {
         let mut text = String::new();
         // What has gone to standard output cannot be replaced by something finer.
         let early = args.output != Path::new(PIPE);
         let mut show = |gaussians: &Gaussians, log: &mut Log| {
             let cameras = asked_for(args, &gaussians.frame)?;
-            text = pictures(args, limits, gaussians, &cameras, None, log)?;
+            let drawing = Drawing {
+                args,
+                quality: args.quality,
+                limits,
+                detail: None,
+                chosen: None,
+            };
+            text = pictures(&drawing, gaussians, &cameras, log)?;
             Ok(())
         };
         pipe::each(
@@ -46,29 +55,53 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
         )?;
         return Ok(text);
     }
-    let source = Source::open(&args.input, &args.level, &args.model, limits, &mut log)?;
+    let pixels = u64::from(args.view.size.0) * u64::from(args.view.size.1);
+    let task = Task::Picture { pixels };
+    let (budget, input) = (&args.budget, &args.input);
+    let chosen = budget::choose(budget, &args.model, input, task, limits, progress)?;
+    let chosen_args = chosen.as_ref().map(|c| (c.level(), c.model(&args.model)));
+    let (level, model) = match &chosen_args {
+        Some((level, model)) => (level, model),
+        None => (&args.level, &args.model),
+    };
+    let source = Source::open(input, level, model, limits, &mut log)?;
     let cameras = asked_for(args, &source.frame()?)?;
     let views: Vec<Camera> = cameras.iter().map(|(_, camera)| *camera).collect();
-    let (gaussians, detail) = source.gaussians(&args.level, &views, &mut log)?;
-    pictures(args, limits, &gaussians, &cameras, Some(detail), &mut log)
+    let (gaussians, detail) = source.gaussians(level, &views, &mut log)?;
+    let drawing = Drawing {
+        args,
+        quality: chosen.as_ref().map_or(args.quality, |c| c.choice.quality),
+        limits,
+        detail: Some(detail),
+        chosen: chosen.as_ref().map(|chosen| (chosen, task)),
+    };
+    pictures(&drawing, &gaussians, &cameras, &mut log)
+}
+
+/// How pictures are drawn.
+struct Drawing<'a> {
+    args: &'a Render,
+    quality: Quality,
+    limits: &'a Limits,
+    detail: Option<Explanation>,
+    chosen: Option<(&'a Chosen, Task)>,
 }
 
 /// Draws these Gaussians into the pictures asked for.
 fn pictures(
-    args: &Render,
-    limits: &Limits,
+    drawing: &Drawing,
     gaussians: &Gaussians,
     cameras: &[(PathBuf, Camera)],
-    detail: Option<Explanation>,
     log: &mut Log,
 ) -> Result<String> {
+    let &Drawing { args, limits, .. } = drawing;
     let mut effects = Effects::default();
     for (effect, choice) in &args.effect {
         effects.set(*effect, *choice);
     }
     let mut renderer = Renderer::new(load::isa(args.model.isa.as_deref())?);
     renderer.set_effects(effects);
-    renderer.set_quality(args.quality);
+    renderer.set_quality(drawing.quality);
     let format = format_of(args, cameras.len())?;
     let mut artist = Artist::new(renderer, gaussians, limits, args, format);
     let mut all = Vec::new();
@@ -117,10 +150,14 @@ fn pictures(
     }
 
     let mut text = String::new();
+    if let Some((chosen, task)) = drawing.chosen {
+        let slowest = all.iter().map(|(.., stats)| stats.times.total()).max();
+        text += &chosen.describe(task, slowest.unwrap_or_default());
+    }
     if let (true, Some((_, camera)), Some((_, _, stats))) =
         (args.verbose, cameras.first(), all.first())
     {
-        if let Some(detail) = detail {
+        if let Some(detail) = &drawing.detail {
             text += &format!("{detail}\n");
         }
         for line in effects.explain(gaussians, camera, stats) {
@@ -144,7 +181,7 @@ fn pictures(
     }
     if to_stdout {
         // Standard output is the picture's. Nobody to tell if even this fails.
-        if args.stats.is_some() || args.verbose {
+        if args.stats.is_some() || args.verbose || drawing.chosen.is_some() {
             let _ = std::io::stderr().write_all(text.as_bytes());
         }
         return Ok(String::new());

@@ -84,12 +84,15 @@ impl Generator {
         self.scales.is_some()
     }
 
+    /// The same of layers that take reals, made by `make`.
+    pub fn of_layers<L>(&self, make: impl Fn(&Stored) -> L) -> Generate<L> {
+        let any = vec![1.0; self.stored.head.scales()];
+        self.stored
+            .with_scales(1.0, &any, |layer, _, _| make(layer))
+    }
+
     fn float(&self) -> &Generate<FloatConv> {
-        self.float.get_or_init(|| {
-            let any = vec![1.0; self.stored.head.scales()];
-            self.stored
-                .with_scales(1.0, &any, |layer, _, _| layer.float())
-        })
+        self.float.get_or_init(|| self.of_layers(Stored::float))
     }
 
     fn integer(&self, scales: &[f32]) -> &Generate<ExactConv> {
@@ -110,18 +113,7 @@ impl Model {
     /// # Panics
     /// If `g` and `map` disagree in length.
     pub fn generate(&self, role: usize, g: &[i16], map: &KernelMap) -> Result<Vec<f32>> {
-        let of_role = |generator: &&Generator| generator.head().role == role;
-        let generator = self.generators.iter().find(of_role).ok_or_else(|| {
-            let roles = self.generators.iter().map(|gg| gg.head().role.to_string());
-            let roles: Vec<_> = roles.collect();
-            missing(
-                "drawing this level",
-                format!(
-                    "it lies {role} above the base level, the model has generators for {}",
-                    roles.join(" and ")
-                ),
-            )
-        })?;
+        let generator = self.generator(role)?;
         self.check(g, self.shape.channels, map);
         match (&generator.scales, self.precision) {
             (Some(scales), Precision::Int16) => {
@@ -134,7 +126,23 @@ impl Model {
         }
     }
 
-    fn run_generator<C: Conv>(
+    /// The generator of a role.
+    pub(super) fn generator(&self, role: usize) -> Result<&Generator> {
+        let of_role = |generator: &&Generator| generator.head().role == role;
+        self.generators.iter().find(of_role).ok_or_else(|| {
+            let roles = self.generators.iter().map(|gg| gg.head().role.to_string());
+            let roles: Vec<_> = roles.collect();
+            missing(
+                "drawing this level",
+                format!(
+                    "it lies {role} above the base level, the model has generators for {}",
+                    roles.join(" and ")
+                ),
+            )
+        })
+    }
+
+    pub(super) fn run_generator<C: Conv>(
         &self,
         gg: &Generate<C>,
         g: &[C::Value],

@@ -38,6 +38,8 @@
 
 mod base;
 mod convert;
+#[cfg(feature = "tradeoff")]
+mod double;
 mod exact;
 mod generate;
 mod layers;

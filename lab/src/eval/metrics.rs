@@ -1,5 +1,6 @@
 //! How far a picture is from the truth.
 
+use b2p::tradeoff::Plane;
 use fast_ssim2::{PixelDescriptor, PixelSlice, Ssimulacra2Error, Ssimulacra2Reference};
 
 use super::picture::Picture;
@@ -45,133 +46,18 @@ fn assert_same_size(a: &Picture, b: &Picture) {
     );
 }
 
-/// Weights of the five scales of [`ms_ssim`], the finest first (Wang, Simoncelli and Bovik 2003).
-const SCALES: [f64; 5] = [0.0448, 0.2856, 0.3001, 0.2363, 0.1333];
-/// Half the taps of its window, without the middle one.
-const REACH: usize = 5;
-
-/// Multi-scale structural similarity of the three channels, then their mean: 1 for equal pictures.
-///
-/// As the `pytorch_msssim` package computes it for a data range of 255: Gaussian window of 11 taps, σ 1.5, no padding;
-/// K = 0.01, 0.03; means over 2×2 from scale to scale, with zeros around odd sides. None if a side is 160 pixels or less.
+/// Multi-scale structural similarity: see [`b2p::tradeoff::ms_ssim`]. None if a side is 160 pixels or less.
 ///
 /// # Panics
 /// If the pictures differ in size.
 pub fn ms_ssim(a: &Picture, b: &Picture) -> Option<f64> {
     assert_same_size(a, b);
-    if a.width.min(a.height) <= (2 * REACH) << (SCALES.len() - 1) {
-        return None;
-    }
-    let channels = (0..3).map(|k| {
-        let plane = |p: &Picture| Plane {
-            width: p.width,
-            height: p.height,
-            values: p.rgb.iter().map(|c| f32::from(c[k])).collect(),
-        };
-        let (mut x, mut y) = (plane(a), plane(b));
-        let mut product = 1.0;
-        for (scale, weight) in SCALES.iter().enumerate() {
-            if scale > 0 {
-                (x, y) = (x.half(), y.half());
-            }
-            let [ssim, contrast] = similarity(&x, &y);
-            let last = scale + 1 == SCALES.len();
-            product *= if last { ssim } else { contrast }.max(0.0).powf(*weight);
-        }
-        product
-    });
-    Some(channels.sum::<f64>() / 3.0)
-}
-
-/// Means of structural similarity and of its contrast and structure part over all whole windows.
-fn similarity(x: &Plane, y: &Plane) -> [f64; 2] {
-    const C1: f32 = (0.01 * 255.0) * (0.01 * 255.0);
-    const C2: f32 = (0.03 * 255.0) * (0.03 * 255.0);
-    let (mx, my) = (x.blur(), y.blur());
-    let product = |a: &Plane, b: &Plane| {
-        let values = a.values.iter().zip(&b.values).map(|(a, b)| a * b).collect();
-        Plane { values, ..*a }.blur()
+    let plane = |p: &Picture, k: usize| Plane {
+        width: p.width,
+        height: p.height,
+        values: p.rgb.iter().map(|c| f32::from(c[k])).collect(),
     };
-    let (xx, yy, xy) = (product(x, x), product(y, y), product(x, y));
-    let (mut ssim, mut contrast) = (0.0, 0.0);
-    for i in 0..mx.values.len() {
-        let (ux, uy) = (mx.values[i], my.values[i]);
-        let variances = (xx.values[i] - ux * ux) + (yy.values[i] - uy * uy);
-        let covariance = xy.values[i] - ux * uy;
-        let structure = (2.0 * covariance + C2) / (variances + C2);
-        contrast += f64::from(structure);
-        ssim += f64::from((2.0 * ux * uy + C1) / (ux * ux + uy * uy + C1) * structure);
-    }
-    let count = mx.values.len() as f64;
-    [ssim / count, contrast / count]
-}
-
-struct Plane {
-    width: usize,
-    height: usize,
-    values: Vec<f32>,
-}
-
-impl Plane {
-    /// Convolved with the window; 10 less in each extent.
-    fn blur(&self) -> Plane {
-        let window = window();
-        let (width, height) = (self.width - 2 * REACH, self.height - 2 * REACH);
-        let mut down = vec![0.0; self.width * height];
-        for (y, row) in down.chunks_exact_mut(self.width).enumerate() {
-            for (k, w) in window.iter().enumerate() {
-                let from = &self.values[(y + k) * self.width..][..self.width];
-                row.iter_mut().zip(from).for_each(|(r, f)| *r += w * f);
-            }
-        }
-        let mut values = vec![0.0; width * height];
-        for (y, row) in values.chunks_exact_mut(width).enumerate() {
-            for (k, w) in window.iter().enumerate() {
-                let from = &down[y * self.width + k..][..width];
-                row.iter_mut().zip(from).for_each(|(r, f)| *r += w * f);
-            }
-        }
-        Plane {
-            width,
-            height,
-            values,
-        }
-    }
-
-    /// Means over 2×2; an odd side gets a zero before its first and after its last pixel.
-    fn half(&self) -> Plane {
-        let (ox, oy) = (self.width % 2, self.height % 2);
-        let (width, height) = ((self.width + 2 * ox) / 2, (self.height + 2 * oy) / 2);
-        let at = |x: usize, y: usize| {
-            if x < ox || y < oy || x - ox >= self.width || y - oy >= self.height {
-                0.0
-            } else {
-                self.values[(y - oy) * self.width + x - ox]
-            }
-        };
-        let mean = |x: usize, y: usize| {
-            let (x, y) = (2 * x, 2 * y);
-            0.25 * (at(x, y) + at(x + 1, y) + at(x, y + 1) + at(x + 1, y + 1))
-        };
-        let values = (0..height)
-            .flat_map(|y| (0..width).map(move |x| (x, y)))
-            .map(|(x, y)| mean(x, y))
-            .collect();
-        Plane {
-            width,
-            height,
-            values,
-        }
-    }
-}
-
-fn window() -> [f32; 2 * REACH + 1] {
-    let bell: [f64; 2 * REACH + 1] = std::array::from_fn(|i| {
-        let d = i as f64 - REACH as f64;
-        (-d * d / (2.0 * 1.5 * 1.5)).exp()
-    });
-    let sum: f64 = bell.iter().sum();
-    bell.map(|w| (w / sum) as f32)
+    b2p::tradeoff::ms_ssim([0, 1, 2].map(|k| [plane(a, k), plane(b, k)]))
 }
 
 /// The truth, prepared for SSIMULACRA2.
@@ -264,7 +150,7 @@ mod tests {
         );
         let c1 = 2.55f64 * 2.55;
         let means = (2.0 * 100.0 * 120.0 + c1) / (100.0 * 100.0 + 120.0 * 120.0 + c1);
-        assert!((ms_ssim(&a, &b).unwrap() - means.powf(SCALES[4])).abs() < 1e-4);
+        assert!((ms_ssim(&a, &b).unwrap() - means.powf(0.1333)).abs() < 1e-4);
     }
 
     #[test]
