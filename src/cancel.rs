@@ -15,7 +15,10 @@ impl Cancel {
         self.0.store(true, Ordering::Relaxed);
     }
 
-    /// Fails with [`Error::Cancelled`] once the switch is thrown.
+    /// Goes on, or not.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`] once the switch is thrown.
     pub fn check(&self) -> Result<()> {
         match self.0.load(Ordering::Relaxed) {
             true => Err(Error::Cancelled),

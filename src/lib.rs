@@ -32,11 +32,12 @@
 
 pub mod bitstream;
 pub mod cancel;
+#[cfg(feature = "ply")]
 pub mod cloud;
 pub mod decoder;
 #[cfg(feature = "cli")]
 pub mod embedded;
-
+#[cfg(feature = "encoder")]
 pub mod encoder;
 pub mod entropy;
 pub mod error;
@@ -46,9 +47,12 @@ pub mod limits;
 pub mod log;
 pub mod network;
 pub mod output;
+#[cfg(feature = "render")]
 pub mod pixels;
 pub mod placement;
+#[cfg(feature = "render")]
 pub mod projection;
+#[cfg(feature = "render")]
 pub mod tiles;
 #[cfg(feature = "tradeoff")]
 pub mod tradeoff;

@@ -53,24 +53,37 @@ impl Limits {
         }
     }
 
-    /// Fails with [`Error::LimitExceeded`] if `count` points are more than allowed.
+    /// Holds `count` points against the limit.
+    ///
+    /// # Errors
+    /// [`Error::LimitExceeded`], naming `what`, if they are more.
     pub fn check_points(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_points, "max_points")
     }
 
-    /// Fails with [`Error::LimitExceeded`] if `depth` levels are more than allowed.
+    /// Holds `depth` levels against the limit.
+    ///
+    /// # Errors
+    /// [`Error::LimitExceeded`], naming `what`, if they are more.
     pub fn check_depth(&self, what: &'static str, depth: u8) -> Result<()> {
         check(what, depth.into(), self.max_depth.into(), "max_depth")
     }
 
-    /// Fails with [`Error::LimitExceeded`] if `count` pixels are more than allowed.
+    /// Holds `count` pixels against the limit.
+    ///
+    /// # Errors
+    /// [`Error::LimitExceeded`], naming `what`, if they are more.
     pub fn check_pixels(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_pixels, "max_pixels")
     }
 
-    /// Fails with [`Error::LimitExceeded`] if `bytes` are more than allowed.
+    /// Holds `bytes` against the limit, which is never more than the machine can address.
+    ///
+    /// # Errors
+    /// [`Error::LimitExceeded`], naming `what`, if they are more.
     pub fn check_bytes(&self, what: &'static str, bytes: u64) -> Result<()> {
-        check(what, bytes, self.max_bytes, "max_bytes")
+        let addressable = isize::MAX as u64;
+        check(what, bytes, self.max_bytes.min(addressable), "max_bytes")
     }
 }
 

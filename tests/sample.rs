@@ -1,5 +1,4 @@
 //! The sample and the model that ship: what every user decodes first.
-#![cfg(feature = "cli")]
 
 use b2p::decoder::Decoder;
 use b2p::embedded::{MODEL, SAMPLE};

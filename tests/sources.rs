@@ -19,7 +19,7 @@ const STAGES: [&str; 9] = [
 const DRIVERS: [&str; 6] = ["decoder", "encoder", "embedded", "tradeoff", "cli", "log"];
 
 /// Sources whose every result must be the same bits on every machine.
-const EXACT: [&str; 14] = [
+const EXACT: [&str; 15] = [
     "src/bitstream",
     "src/geometry",
     "src/entropy",
@@ -29,6 +29,7 @@ const EXACT: [&str; 14] = [
     "src/network/stored.rs",
     "src/gaussians/activations.rs",
     "src/gaussians/heads.rs",
+    "kernels/src/binary16.rs",
     "kernels/src/exact.rs",
     "kernels/src/norms.rs",
     "kernels/src/taps.rs",
@@ -172,6 +173,43 @@ fn a_stage_knows_only_the_stages_before_it() {
 }
 
 #[test]
+fn every_public_function_that_can_fail_says_how() {
+    let mut faults = Vec::new();
+    let mut looked_at = 0;
+    let library = ["src", "kernels/src", "capi/src"].map(files).concat();
+    for file in library.iter().filter(|file| !is_test(file)) {
+        // The program's own parts are no interface.
+        if named(file).starts_with("src/cli") {
+            continue;
+        }
+        let text = std::fs::read_to_string(file).expect("a readable source");
+        let lines: Vec<&str> = text.lines().collect();
+        let functions = code(file)
+            .into_iter()
+            .filter(|(_, line)| line.trim_start().starts_with("pub fn "));
+        for (number, _) in functions {
+            let rest = lines[number - 1..].join(" ");
+            let signature = rest.split(['{', ';']).next().unwrap_or_default();
+            let result = signature.rsplit_once("->").map_or("", |(_, result)| result);
+            if !result.trim_start().starts_with("Result<") {
+                continue;
+            }
+            looked_at += 1;
+            let above = lines[..number - 1].iter().rev();
+            let documented = above
+                .map(|line| line.trim_start())
+                .take_while(|line| line.starts_with("///") || line.starts_with("#["))
+                .any(|line| line == "/// # Errors");
+            if !documented {
+                faults.push(format!("{}:{number}: {signature}", named(file)));
+            }
+        }
+    }
+    assert!(looked_at > 80, "only {looked_at} functions that can fail");
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+}
+
+#[test]
 fn unsafe_stands_only_in_the_kernels_and_at_the_c_border() {
     for library in [
         "src/lib.rs",
@@ -208,4 +246,31 @@ fn no_file_has_grown_past_500_lines() {
         let lines = text.lines().count();
         assert!(lines <= 500, "{} has {lines} lines", named(&file));
     }
+}
+
+#[test]
+fn the_bare_decoder_stands_on_few_crates() {
+    let tree = std::process::Command::new(env!("CARGO"))
+        .current_dir(root())
+        .args([
+            "tree",
+            "--locked",
+            "--package",
+            "b2p",
+            "--no-default-features",
+        ])
+        .args(["--edges", "normal", "--prefix", "none", "--format", "{p}"])
+        .output()
+        .expect("cargo lists the crates");
+    assert!(tree.status.success(), "{tree:?}");
+    let tree = String::from_utf8(tree.stdout).expect("names are text");
+    let mut crates: Vec<&str> = tree
+        .lines()
+        .map(|line| line.split(" (").next().unwrap_or(line))
+        .collect();
+    crates.sort_unstable();
+    crates.dedup();
+    println!("{} crates: {}", crates.len(), crates.join(", "));
+    assert!(crates.contains(&"b2p v0.1.0"));
+    assert!(crates.len() <= 25, "{} crates", crates.len());
 }

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 
 use b2p::Cancel;
-use b2p::entropy::{Condition, RawRows, Tables, decode_slice, encode_slice};
+use b2p::bitstream::Slice;
+use b2p::entropy::{Condition, RawRows, Tables, decode_slice, encode_slice, quantise};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec};
 
 use crate::Source;
@@ -24,7 +25,7 @@ pub fn octree(bytes: &[u8]) {
     let mut map = KernelMap::root();
     for level in 1..=depth {
         let encoded = codec::encode_level(&octree, &map, level, slice);
-        let slices: Vec<_> = encoded.iter().map(|(n, code)| (*n, &code[..])).collect();
+        let slices: Vec<_> = encoded.iter().map(|(n, code)| whole(*n, code)).collect();
         codec::decode_level(&mut decoded, &map, &slices, slice, &Cancel::default())
             .expect("what was encoded decodes");
         map = octree.child_map(level - 1, &map);
@@ -34,7 +35,8 @@ pub fn octree(bytes: &[u8]) {
     let parents = octree.level(depth).len();
     let voxels = parents + usize::from(source.byte()) % (7 * parents + 1);
     let code = source.rest();
-    let Ok(masks) = codec::decode_slice(depth + 1, &map, 0..parents, code, voxels) else {
+    let slice = whole(voxels as u32, code);
+    let Ok(masks) = codec::decode_slice(depth + 1, &map, 0..parents, &slice) else {
         return;
     };
     assert_eq!(
@@ -47,6 +49,15 @@ pub fn octree(bytes: &[u8]) {
         .expect("one occupancy for every parent, none empty");
     let again = codec::encode_level(&grown, &map, depth + 1, usize::MAX);
     assert_eq!(again[0].1, code, "another code for the same octree");
+}
+
+/// A slice that is all there is of its stream.
+fn whole(voxels: u32, bytes: &[u8]) -> Slice<'_> {
+    Slice {
+        voxels,
+        bytes,
+        offset: 0,
+    }
 }
 
 /// Tables made of the seed: steep and flat rows, short and long, from anywhere.
@@ -99,7 +110,8 @@ fn raw<'a>(name: &'a str, rows: &'a (Vec<u16>, Vec<u32>, Vec<i16>)) -> RawRows<'
     }
 }
 
-/// Any table and symbols: encode → decode is equal. Any bytes as code: an error, or symbols that have the very same code.
+/// Any table and symbols: encode → decode is equal. Any bytes as code: an error, or symbols that have the very same code. Any real
+/// latents: rounded down or up, whatever a bit costs.
 pub fn entropy(bytes: &[u8]) {
     let mut source = Source(bytes);
     let tables = tables(source.byte());
@@ -129,5 +141,15 @@ pub fn entropy(bytes: &[u8]) {
     if let Ok(latents) = decode_slice(&tables, condition, code, voxels, &at) {
         let again = encode_slice(&tables, condition, &latents);
         assert_eq!(again, code, "another code for the same latents");
+    }
+
+    const LIMIT: i16 = 500;
+    let price = f32::from(code.first().copied().unwrap_or(0)) / 64.0;
+    let real: Vec<f32> = latents.iter().map(|&y| f32::from(y) / 7.0).collect();
+    let rounded = quantise(&tables, condition, &real, LIMIT, price);
+    for (q, y) in rounded.iter().zip(real) {
+        let bound = f32::from(LIMIT);
+        let away = (f32::from(*q) - y.clamp(-bound, bound)).abs();
+        assert!(q.abs() <= LIMIT && away <= 1.0, "{y} became {q}");
     }
 }

@@ -5,10 +5,10 @@
 use std::collections::HashMap;
 use std::time::Instant;
 
+use b2p_kernels::f16;
 use b2p_kernels::{
     ABSENT, ExactConv, FloatConv, Isa, Output, Plan, Precision, Requantise, Scale, Taps, ceiling,
 };
-use half::f16;
 
 /// A bumpy closed surface of about `count` voxels, in Morton order.
 fn surface(count: usize) -> Vec<[i32; 3]> {

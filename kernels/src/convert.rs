@@ -1,6 +1,6 @@
 //! f16 ↔ f32, exact one way and rounded to even the other.
 
-use half::f16;
+use crate::f16;
 
 use crate::isa::Isa;
 use crate::machine::with_halves;
@@ -102,7 +102,7 @@ pub(crate) unsafe fn narrow<H: Halves>(from: &[f32], to: &mut [f16]) {
 }
 
 #[inline(always)]
-fn widen_one(from: f16) -> f32 {
+pub(crate) fn widen_one(from: f16) -> f32 {
     let bits = u32::from(from.to_bits());
     let magnitude = (bits & 0x7fff) << 13;
     let sign = (bits & 0x8000) << 16;
@@ -125,7 +125,7 @@ fn widen_one(from: f16) -> f32 {
     clippy::manual_clamp,
     reason = "`max` gives the number of a number and NaN, `clamp` keeps NaN"
 )]
-fn narrow_one(from: f32) -> f16 {
+pub(crate) fn narrow_one(from: f32) -> f16 {
     let value = from.max(-MAX).min(MAX);
     let sign = (value.to_bits() >> 16) & 0x8000;
     let bits = value.to_bits() & 0x7fff_ffff;

@@ -13,6 +13,7 @@ compile_error!(
     "x87 arithmetic does not round to f32 after every step: build for a target with SSE2"
 );
 
+mod binary16;
 mod convert;
 mod exact;
 mod float;
@@ -30,6 +31,7 @@ pub mod ceiling;
 pub mod reference;
 pub mod splat;
 
+pub use binary16::f16;
 pub use convert::{to_f16, to_f32};
 pub use exact::{ExactConv, LIMIT, Requantise};
 pub use float::{FloatConv, FloatOut, Precision, Scale};

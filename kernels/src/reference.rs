@@ -1,6 +1,6 @@
 //! The convolutions as their definitions read: triple loops over i64 and f64. What the kernels are tested against.
 
-use half::f16;
+use crate::f16;
 
 use crate::exact::{LIMIT, Requantise};
 use crate::float::Scale;

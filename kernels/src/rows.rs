@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 
 use crate::norms::Norms;
+#[cfg(target_arch = "x86_64")]
 use crate::plan::Planner;
 use crate::taps::TileTaps;
 
@@ -126,6 +127,7 @@ impl Extents {
     }
 
     /// Tap, input and output of each weight of `[tap][input][output]`.
+    #[cfg(target_arch = "x86_64")]
     pub fn each(self) -> impl Iterator<Item = (usize, usize, usize)> {
         (0..self.volume).flat_map(move |tap| {
             (0..self.cin).flat_map(move |c| (0..self.cout).map(move |o| (tap, c, o)))
@@ -152,6 +154,7 @@ pub(crate) struct Scratch {
     pub sums: Vec<Lanes>,
     pub expanded: Vec<Lanes>,
     pub norms: Norms,
+    #[cfg(target_arch = "x86_64")]
     pub planner: Planner,
     #[cfg(target_arch = "x86_64")]
     pub tiles: crate::machine::amx::Buffers,

@@ -192,7 +192,10 @@ impl Header {
         self.bytes() as u64 + sections
     }
 
-    /// Fails with [`Error::Malformed`] if something follows the last section in a stream of `length` bytes.
+    /// Sees that nothing follows the last section in a stream of `length` bytes.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if something does.
     pub fn check_end(&self, length: u64) -> Result<()> {
         let end = self.stream_bytes();
         match length.saturating_sub(end) {
@@ -214,7 +217,10 @@ impl Header {
         Ok(self.voxels[self.index(level)?])
     }
 
-    /// Fails with [`Error::ModelMismatch`] unless the stream was made with the model of that id.
+    /// Sees that the stream was made with the model of that id.
+    ///
+    /// # Errors
+    /// [`Error::ModelMismatch`] if it was not.
     pub fn check_model(&self, loaded: &[u8; 16]) -> Result<()> {
         if self.model == *loaded {
             return Ok(());

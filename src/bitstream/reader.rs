@@ -11,7 +11,10 @@ pub struct Reader<'a> {
 
 macro_rules! numbers {
     ($($number:ident),*) => {$(
-        /// The next number of this type; fails with [`Error::Truncated`], naming `field`.
+        /// The next number of this type.
+        ///
+        /// # Errors
+        /// [`Error::Truncated`], naming `field`.
         pub fn $number(&mut self, field: &'static str) -> Result<$number> {
             Ok($number::from_le_bytes(self.array(field)?))
         }
@@ -29,7 +32,10 @@ impl<'a> Reader<'a> {
         self.at
     }
 
-    /// The next `count` bytes; fails with [`Error::Truncated`], naming `field`.
+    /// The next `count` bytes.
+    ///
+    /// # Errors
+    /// [`Error::Truncated`], naming `field`.
     pub fn take(&mut self, count: usize, field: &'static str) -> Result<&'a [u8]> {
         let rest = self.bytes.get(self.at..);
         let Some(taken) = rest.and_then(|rest| rest.get(..count)) else {
@@ -44,7 +50,10 @@ impl<'a> Reader<'a> {
         Ok(taken)
     }
 
-    /// The next `N` bytes; fails with [`Error::Truncated`], naming `field`.
+    /// The next `N` bytes.
+    ///
+    /// # Errors
+    /// [`Error::Truncated`], naming `field`.
     pub fn array<const N: usize>(&mut self, field: &'static str) -> Result<[u8; N]> {
         let mut array = [0; N];
         array.copy_from_slice(self.take(N, field)?);

@@ -162,7 +162,10 @@ impl<'a> Level<'a> {
         })
     }
 
-    /// Fails with [`Error::DeterminismMismatch`] unless decoded latents with the hash `found` are those that were coded.
+    /// Sees that decoded latents with the hash `found` are those that were coded.
+    ///
+    /// # Errors
+    /// [`Error::DeterminismMismatch`] if they are not.
     pub fn check_latents(&self, found: u64) -> Result<()> {
         if found == self.latent_hash {
             return Ok(());

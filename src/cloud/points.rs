@@ -30,6 +30,9 @@ pub struct Hints {
 
 impl PointCloud {
     /// Reads a PLY file.
+    ///
+    /// # Errors
+    /// [`Error::Io`], [`Error::LimitExceeded`] for a file larger than allowed, or as [`PointCloud::from_ply`].
     pub fn open(path: impl AsRef<Path>, limits: &Limits) -> Result<Self> {
         let path = path.as_ref();
         let failed = |source| Error::Io {
@@ -44,7 +47,10 @@ impl PointCloud {
     /// Reads a whole PLY file in memory.
     ///
     /// Wants `x y z` of any number type and `red green blue`, each `uchar`, `ushort` (0 to 65535) or `float`/`double` (0 to 1).
-    /// Fails with [`Error::Malformed`] if one is absent, there are no points, a coordinate is not finite or a colour out of range.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if one is absent, there are no points, a coordinate is not finite or a colour out of range;
+    /// [`Error::Truncated`] if the file ends early; [`Error::LimitExceeded`] if there are more points than `limits` allow.
     pub fn from_ply(bytes: &[u8], limits: &Limits) -> Result<Self> {
         let ply = Ply::open(bytes)?;
         let names = ["x", "y", "z", "red", "green", "blue"];

@@ -41,7 +41,8 @@ enum Grid {
 /// Any other cloud is fitted to a grid of `bits` or 10: the longest side of its bounding box spans the whole cube, and the box lies
 /// in the cube's middle. Points that share a voxel merge.
 ///
-/// Fails with [`Error::Usage`] if `bits` is not 1 to 21 or colours and points differ in number, with [`Error::Malformed`] if there
+/// # Errors
+/// [`Error::Usage`] if `bits` is not 1 to 21 or colours and points differ in number; [`Error::Malformed`] if there
 /// are no points or the bounding box is not one of finite numbers.
 pub fn voxelise(cloud: &PointCloud, bits: Option<u8>) -> Result<ColouredVoxels> {
     if let Some(bits) = bits

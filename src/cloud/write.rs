@@ -47,6 +47,9 @@ impl PointCloud {
     }
 
     /// Writes [`PointCloud::to_ply`] to a file, whole or not at all.
+    ///
+    /// # Errors
+    /// [`Error::Io`](crate::Error::Io).
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
         write_file(path, |file| {

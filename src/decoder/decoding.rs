@@ -323,8 +323,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let mut map = Cow::Borrowed(above.map_or(&root, |above| &above.map));
         log.step(format!("geometry of level {n}"), count, "voxels", || {
             level.geometry.iter().try_for_each(|part| {
-                let slices: Vec<_> = part.slices.iter().map(|s| (s.voxels, s.bytes)).collect();
-                codec::decode_level(octree, &map, &slices, slice, &self.cancel)?;
+                codec::decode_level(octree, &map, &part.slices, slice, &self.cancel)?;
                 if part.level < n {
                     map = Cow::Owned(octree.child_map(part.level - 1, &map));
                 }
@@ -374,14 +373,14 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
                 })
             })
             .transpose()?;
-        let slices: Vec<_> = level.features.iter().map(|s| s.bytes).collect();
         let symbols = count * self.model.shape().latents;
         log.step(format!("latents of level {n}"), symbols, "symbols", || {
             let (tables, cancel) = (self.model.tables(), &self.cancel);
+            let slices = &level.features;
             let latents = match &parameters {
                 Some((mu, sigma)) => {
                     let condition = Condition::Gauss { mu, sigma };
-                    decode_level(tables, condition, &slices, count, slice, n, cancel)?
+                    decode_level(tables, condition, slices, count, slice, n, cancel)?
                 }
                 None if self.model.predicts_base() => {
                     let octants = octree.level(n).octants();
@@ -389,9 +388,9 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
                     let predict = |slice, voxels: &[u32], latents: &[i16]| {
                         model.base_parameters(&octants, map, slice, voxels, latents)
                     };
-                    decode_passes(tables, &octants, &predict, &slices, slice, n, cancel)?
+                    decode_passes(tables, &octants, &predict, slices, slice, n, cancel)?
                 }
-                None => decode_level(tables, Condition::Prior, &slices, count, slice, n, cancel)?,
+                None => decode_level(tables, Condition::Prior, slices, count, slice, n, cancel)?,
             };
             level.check_latents(latent_hash(&latents))?;
             Ok(latents)

@@ -5,6 +5,7 @@ use xxhash_rust::xxh3::Xxh3Default;
 
 use super::slice::{Condition, decode_into, encode_slice};
 use super::tables::Tables;
+use crate::bitstream::Slice;
 use crate::cancel::Cancel;
 use crate::error::{Error, Result, Stage};
 
@@ -41,7 +42,7 @@ pub fn encode_level(
 pub fn decode_level(
     tables: &Tables,
     condition: Condition,
-    slices: &[&[u8]],
+    slices: &[Slice],
     voxels: usize,
     slice_voxels: usize,
     level: u8,
@@ -55,16 +56,21 @@ pub fn decode_level(
         .par_chunks_mut(width)
         .zip(slices)
         .enumerate()
-        .map(|(i, (part, bytes))| {
+        .map(|(i, (part, slice))| {
             cancel.check()?;
             let start = i * width;
             let condition = condition.of(start..start + part.len());
-            let at = format_args!("level {level}, feature slice {i}");
-            decode_into(tables, condition, bytes, part, &at)
+            let at = place(level, i, slice);
+            decode_into(tables, condition, slice.bytes, part, &at)
         })
         .collect();
     results.into_iter().collect::<Result<()>>()?;
     Ok(latents)
+}
+
+/// Where a feature slice lies.
+pub(super) fn place(level: u8, slice: usize, part: &Slice) -> String {
+    format!("byte {}, level {level}, feature slice {slice}", part.offset)
 }
 
 /// [`Error::Malformed`] unless there are as many slices as the voxels fill.
@@ -103,7 +109,7 @@ pub fn latent_hash(latents: &[i16]) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::entropy::test_tables::{Random, tables};
+    use crate::entropy::test_tables::{Random, slices_of, tables};
 
     fn sample(voxels: usize) -> (Vec<i16>, Vec<u8>, Vec<i16>) {
         let mut random = Random(3);
@@ -134,7 +140,7 @@ mod tests {
                     .unwrap();
                 pool.install(|| {
                     let bytes = encode_level(&tables, condition, &latents, 64);
-                    let slices: Vec<&[u8]> = bytes.iter().map(|b| &b[..]).collect();
+                    let slices = slices_of(&bytes);
                     let back =
                         decode_level(&tables, condition, &slices, 1000, 64, 7, &Cancel::default())
                             .unwrap();
@@ -153,8 +159,9 @@ mod tests {
         let tables = tables();
         let (.., latents) = sample(100);
         let bytes = encode_level(&tables, Condition::Prior, &latents, 40);
-        let mut slices: Vec<&[u8]> = bytes.iter().map(|b| &b[..]).collect();
-        let decode = |slices: &[&[u8]]| {
+        let mut slices = slices_of(&bytes);
+        slices[1].offset = 1000;
+        let decode = |slices: &[Slice]| {
             decode_level(
                 &tables,
                 Condition::Prior,
@@ -170,9 +177,10 @@ mod tests {
             error.contains("level 7: number of feature slices is 2, expected 3"),
             "{error}"
         );
-        slices[1] = &bytes[1][4..];
+        slices[1].bytes = &bytes[1][4..];
         let error = decode(&slices).unwrap_err().to_string();
-        assert!(error.contains("level 7, feature slice 1"), "{error}");
+        let place = "byte 1000, level 7, feature slice 1";
+        assert!(error.contains(place), "{error}");
     }
 
     #[test]

@@ -35,6 +35,7 @@ mod passes;
 mod quantise;
 mod rows;
 mod slice;
+mod stack;
 mod tables;
 
 pub use level::{decode_level, encode_level, latent_hash};

@@ -4,9 +4,10 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::level::expect_slices;
+use super::level::{expect_slices, place};
 use super::slice::{Condition, Reader, encode_slice};
 use super::tables::Tables;
+use crate::bitstream::Slice;
 use crate::cancel::Cancel;
 use crate::error::Result;
 
@@ -68,7 +69,7 @@ pub fn decode_passes(
     tables: &Tables,
     octants: &[u8],
     predict: &Predict,
-    slices: &[&[u8]],
+    slices: &[Slice],
     slice_voxels: usize,
     level: u8,
     cancel: &Cancel,
@@ -80,11 +81,11 @@ pub fn decode_passes(
         .par_chunks_mut(slice_voxels * k)
         .zip(slices)
         .enumerate()
-        .map(|(i, (part, bytes))| {
+        .map(|(i, (part, code))| {
             cancel.check()?;
             let slice = range(i, slice_voxels, octants.len());
-            let at = format_args!("level {level}, feature slice {i}");
-            let mut reader = Reader::open(tables, bytes, &at)?;
+            let at = place(level, i, code);
+            let mut reader = Reader::open(tables, code.bytes, &at)?;
             for voxels in passes(octants, &slice) {
                 let (mu, sigma) = predict(slice.clone(), &voxels, part);
                 let mut values = vec![0; voxels.len() * k];
@@ -123,7 +124,7 @@ fn passes<'a>(octants: &'a [u8], slice: &Range<usize>) -> impl Iterator<Item = V
 mod tests {
     use super::*;
     use crate::entropy::UNPREDICTED;
-    use crate::entropy::test_tables::{Random, tables};
+    use crate::entropy::test_tables::{Random, slices_of, tables};
     use proptest::prelude::*;
 
     /// A voxel's channels are predicted from the voxel before it, if that is of a lower octant.
@@ -160,7 +161,7 @@ mod tests {
             let latents: Vec<i16> = voxels.iter().flat_map(|v| vec![value(v); tables.channels()]).collect();
             let predict = predict(&octants);
             let bytes = encode_passes(&tables, &octants, &*predict, &latents, slice);
-            let slices: Vec<&[u8]> = bytes.iter().map(|b| &b[..]).collect();
+            let slices = slices_of(&bytes);
             prop_assert_eq!(decode_passes(&tables, &octants, &*predict, &slices, slice, 7, &Cancel::default()).unwrap(), latents);
         }
 
@@ -169,7 +170,7 @@ mod tests {
             bytes in prop::collection::vec(any::<u8>(), 0..200),
             octants in prop::collection::vec(0u8..8, 1..100),
         ) {
-            let _ = decode_passes(&tables(), &octants, &*predict(&octants), &[&bytes], 100, 7, &Cancel::default());
+            let _ = decode_passes(&tables(), &octants, &*predict(&octants), &slices_of(&[bytes]), 100, 7, &Cancel::default());
         }
     }
 

@@ -64,7 +64,7 @@ impl Row<'_> {
         } else {
             0
         };
-        16.0 - f32::from(self.probability(entry).get()).log2() + more as f32
+        16.0 - f32::from(self.interval(entry).size).log2() + more as f32
     }
 }
 

@@ -1,18 +1,14 @@
 //! Rows of integer probabilities, and how the coder looks things up in them.
 
-use std::borrow::Borrow;
-use std::num::NonZeroU16;
-
-use constriction::stream::model::{DecoderModel, EncoderModel, EntropyModel};
-
+use super::stack::Interval;
 use super::tables::RawRows;
 use crate::error::{Error, Result, Stage};
 
 /// Probabilities are in units of 2⁻¹⁶.
-pub(super) const PRECISION: usize = 16;
+pub(super) const PRECISION: u32 = 16;
 
 /// Quantiles are looked up by their highest bits first.
-const BUCKET_BITS: usize = 6;
+const BUCKET_BITS: u32 = 6;
 const BUCKETS: usize = 1 << BUCKET_BITS;
 
 /// Rows of different length.
@@ -136,64 +132,24 @@ impl Row<'_> {
         self.cumulative.len() - 2
     }
 
-    pub(super) fn probability(&self, entry: usize) -> NonZeroU16 {
-        let p = self.cumulative[entry + 1].wrapping_sub(self.cumulative[entry]);
+    /// The part of 2¹⁶ that stands for an entry.
+    #[inline]
+    pub(super) fn interval(&self, entry: usize) -> Interval {
+        let start = self.cumulative[entry];
         // Two entries of at least 1 that sum to 2¹⁶ leave neither 0 nor 2¹⁶.
-        NonZeroU16::new(p).expect("entries of a checked row are never 0")
+        let size = self.cumulative[entry + 1].wrapping_sub(start);
+        Interval { start, size }
     }
-}
 
-impl EntropyModel<PRECISION> for Row<'_> {
-    type Symbol = usize;
-    type Probability = u16;
-}
-
-impl EncoderModel<PRECISION> for Row<'_> {
+    /// The entry that a number lies in.
     #[inline]
-    fn left_cumulative_and_probability(
-        &self,
-        entry: impl Borrow<usize>,
-    ) -> Option<(u16, NonZeroU16)> {
-        let entry = *entry.borrow();
-        (entry <= self.escape()).then(|| (self.cumulative[entry], self.probability(entry)))
-    }
-}
-
-impl DecoderModel<PRECISION> for Row<'_> {
-    #[inline]
-    fn quantile_function(&self, quantile: u16) -> (usize, u16, NonZeroU16) {
+    pub(super) fn find(&self, quantile: u16) -> (usize, Interval) {
         let bucket = usize::from(quantile >> (PRECISION - BUCKET_BITS));
         let first = usize::from(self.head.buckets[bucket]);
         let last = usize::from(self.head.buckets[bucket + 1]);
         let entry =
             first + self.cumulative[first + 1..=last].partition_point(|&sum| sum <= quantile);
-        (entry, self.cumulative[entry], self.probability(entry))
-    }
-}
-
-/// Zero or one, equally likely.
-#[derive(Clone, Copy)]
-pub(super) struct Bit;
-
-impl EntropyModel<PRECISION> for Bit {
-    type Symbol = bool;
-    type Probability = u16;
-}
-
-const HALF: NonZeroU16 = NonZeroU16::new(1 << (PRECISION - 1)).expect("2¹⁵ is not 0");
-
-impl EncoderModel<PRECISION> for Bit {
-    fn left_cumulative_and_probability(&self, bit: impl Borrow<bool>) -> Option<(u16, NonZeroU16)> {
-        Some((if *bit.borrow() { HALF.get() } else { 0 }, HALF))
-    }
-}
-
-impl DecoderModel<PRECISION> for Bit {
-    fn quantile_function(&self, quantile: u16) -> (bool, u16, NonZeroU16) {
-        match quantile >= HALF.get() {
-            true => (true, HALF.get(), HALF),
-            false => (false, 0, HALF),
-        }
+        (entry, self.interval(entry))
     }
 }
 
@@ -229,11 +185,11 @@ mod tests {
         for index in 0..rows.len() {
             let row = rows.row(index);
             for quantile in 0..=u16::MAX {
-                let (entry, start, p) = row.quantile_function(quantile);
-                assert!(start <= quantile && quantile - start < p.get());
-                assert_eq!(row.left_cumulative_and_probability(entry), Some((start, p)));
+                let (entry, interval) = row.find(quantile);
+                let Interval { start, size } = interval;
+                assert!(start <= quantile && quantile - start < size);
+                assert_eq!(row.interval(entry), interval);
             }
-            assert_eq!(row.left_cumulative_and_probability(row.escape() + 1), None);
         }
     }
 

@@ -2,10 +2,8 @@
 
 use std::fmt::Display;
 
-use constriction::stream::stack::AnsCoder;
-use constriction::stream::{Decode, Encode};
-
-use super::rows::{Bit, Row};
+use super::rows::Row;
+use super::stack::Stack;
 use super::tables::Tables;
 use crate::error::{Error, Result, Stage};
 
@@ -21,8 +19,6 @@ const MAX_PREFIX: u32 = 20;
 /// States of the coder take these numbers of bytes.
 const LEAST_STATE_BYTES: usize = 5;
 const WORD_BYTES: usize = 4;
-
-type Coder = AnsCoder<u32, u64, Vec<u32>>;
 
 /// What is known of latents before they are decoded.
 #[derive(Debug, Clone, Copy)]
@@ -83,22 +79,22 @@ impl<'a> Condition<'a> {
 /// If the latents are not whole voxels, the condition has not one mean and scale for each, or a scale index is above 63.
 pub fn encode_slice(tables: &Tables, condition: Condition, latents: &[i16]) -> Vec<u8> {
     condition.check(tables, latents.len());
-    let mut coder = Coder::from_raw_parts(Vec::new(), END_STATE);
+    let mut stack = Stack::new(END_STATE, Vec::new());
     // A stack: what is to be read first is put on last.
     for (i, &latent) in latents.iter().enumerate().rev() {
         let (row, centre) = condition.row(tables, i);
         let entry = i32::from(latent) - centre - row.low();
         let values = row.escape() as i32;
         if (0..values).contains(&entry) {
-            push_entry(&mut coder, row, entry as usize);
+            stack.push(row.interval(entry as usize));
         } else {
             let above = entry >= values;
             let distance = if above { entry - values + 1 } else { -entry };
-            push_distance(&mut coder, above, distance as u32);
-            push_entry(&mut coder, row, row.escape());
+            push_distance(&mut stack, above, distance as u32);
+            stack.push(row.interval(row.escape()));
         }
     }
-    let (words, state) = coder.into_raw_parts();
+    let (state, words) = stack.into_parts();
     let state_bytes = (u64::BITS - state.leading_zeros()).div_ceil(8) as usize;
     let mut bytes = Vec::with_capacity(state_bytes + WORD_BYTES * words.len());
     bytes.extend(&state.to_le_bytes()[..state_bytes]);
@@ -143,29 +139,34 @@ pub(super) fn decode_into(
 /// A slice that is read part by part.
 pub(super) struct Reader<'a> {
     tables: &'a Tables,
-    coder: Coder,
+    stack: Stack,
     at: &'a dyn Display,
 }
 
 impl<'a> Reader<'a> {
+    /// # Errors
+    /// [`Error::Malformed`], naming `at`, if the bytes do not begin as a slice does.
     pub fn open(tables: &'a Tables, bytes: &[u8], at: &'a dyn Display) -> Result<Self> {
         Ok(Reader {
             tables,
-            coder: open(bytes, at)?,
+            stack: open(bytes, at)?,
             at,
         })
     }
 
     /// The next latents, whole voxels.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`], naming `at`, if one is no number of 16 bits.
     pub fn read(&mut self, condition: Condition, latents: &mut [i16]) -> Result<()> {
         condition.check(self.tables, latents.len());
         for (i, latent) in latents.iter_mut().enumerate() {
             let (row, centre) = condition.row(self.tables, i);
-            let Ok(entry) = self.coder.decode_symbol(row);
+            let entry = self.stack.pop(|quantile| row.find(quantile));
             let value = if entry < row.escape() {
                 centre + row.low() + entry as i32
             } else {
-                let (above, distance) = pop_distance(&mut self.coder, self.at)?;
+                let (above, distance) = pop_distance(&mut self.stack, self.at)?;
                 match above {
                     true => centre + row.low() + row.escape() as i32 - 1 + distance,
                     false => centre + row.low() - distance,
@@ -178,8 +179,11 @@ impl<'a> Reader<'a> {
     }
 
     /// Nothing may be left.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`], naming `at`, if something is.
     pub fn finish(self) -> Result<()> {
-        let (words, state) = self.coder.into_raw_parts();
+        let (state, words) = self.stack.into_parts();
         if !words.is_empty() {
             let left = format!("{} bytes", words.len() * WORD_BYTES);
             let field = "rest after the last latent";
@@ -195,7 +199,7 @@ impl<'a> Reader<'a> {
 }
 
 /// The first state and the stack of words, the next to be read on top.
-fn open(bytes: &[u8], at: &dyn Display) -> Result<Coder> {
+fn open(bytes: &[u8], at: &dyn Display) -> Result<Stack> {
     let Some(more) = bytes.len().checked_sub(LEAST_STATE_BYTES) else {
         let expected = format!("at least {LEAST_STATE_BYTES} bytes");
         return Err(malformed(at, "length of the slice", bytes.len(), expected));
@@ -214,42 +218,24 @@ fn open(bytes: &[u8], at: &dyn Display) -> Result<Coder> {
     state[..first.len()].copy_from_slice(first);
     let words = words.rchunks_exact(WORD_BYTES);
     let words = words.map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]]));
-    Ok(Coder::from_raw_parts(
-        words.collect(),
-        u64::from_le_bytes(state),
-    ))
-}
-
-fn push_entry(coder: &mut Coder, row: Row, entry: usize) {
-    coder
-        .encode_symbol(entry, row)
-        .expect("the row has the entry and memory takes it");
-}
-
-fn push_bit(coder: &mut Coder, bit: bool) {
-    coder
-        .encode_symbol(bit, Bit)
-        .expect("a bit has two values and memory takes it");
+    Ok(Stack::new(u64::from_le_bytes(state), words.collect()))
 }
 
 /// Side and distance of an escape, last bit first.
-fn push_distance(coder: &mut Coder, above: bool, distance: u32) {
+fn push_distance(stack: &mut Stack, above: bool, distance: u32) {
     let bits = distance.ilog2();
     for bit in 0..bits {
-        push_bit(coder, distance >> bit & 1 == 1);
+        stack.push_bit(distance >> bit & 1 == 1);
     }
-    push_bit(coder, false);
+    stack.push_bit(false);
     for _ in 0..bits {
-        push_bit(coder, true);
+        stack.push_bit(true);
     }
-    push_bit(coder, above);
+    stack.push_bit(above);
 }
 
-fn pop_distance(coder: &mut Coder, at: &dyn Display) -> Result<(bool, i32)> {
-    let mut bit = || {
-        let Ok(bit) = coder.decode_symbol(Bit);
-        bit
-    };
+fn pop_distance(stack: &mut Stack, at: &dyn Display) -> Result<(bool, i32)> {
+    let mut bit = || stack.pop_bit();
     let above = bit();
     let mut bits = 0;
     while bit() {
@@ -367,14 +353,13 @@ mod tests {
             mu.push((random.next() % 4095) as i16 - 2047);
             sigma.push((random.next() % 64) as u8);
             let (row, centre) = tables.gauss(mu[mu.len() - 1], sigma[sigma.len() - 1]);
-            use constriction::stream::model::DecoderModel;
-            let (entry, _, p) = row.quantile_function(random.next() as u16);
+            let (entry, interval) = row.find(random.next() as u16);
             if entry == row.escape() {
                 mu.pop();
                 sigma.pop();
                 continue;
             }
-            ideal -= (f64::from(p.get()) / 65536.0).log2();
+            ideal -= (f64::from(interval.size) / 65536.0).log2();
             latents.push((centre + row.low() + entry as i32) as i16);
         }
         (mu, sigma, latents, ideal)

@@ -3,6 +3,7 @@
 use std::sync::LazyLock;
 
 use super::tables::{RawRows, Tables};
+use crate::bitstream::Slice;
 
 /// A linear congruential generator: what tests draw from.
 pub(crate) struct Random(pub u64);
@@ -15,6 +16,16 @@ impl Random {
             .wrapping_add(1);
         self.0 >> 33
     }
+}
+
+/// Codes as slices of a stream, wherever they lie in it.
+pub(crate) fn slices_of(codes: &[Vec<u8>]) -> Vec<Slice<'_>> {
+    let slice = |bytes| Slice {
+        voxels: 0,
+        bytes,
+        offset: 0,
+    };
+    codes.iter().map(Vec::as_slice).map(slice).collect()
 }
 
 pub(crate) fn tables() -> Tables {

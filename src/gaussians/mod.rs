@@ -7,6 +7,7 @@ mod heads;
 pub use harmonics::Harmonics;
 pub use heads::activate;
 
+#[cfg(feature = "ply")]
 pub mod ply;
 
 use crate::error::{Error, Result};

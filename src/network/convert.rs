@@ -1,7 +1,7 @@
 //! The encoder's own modules: feature conversion (FC), pooling, feature squeezing (FS), in floats.
 
+use b2p_kernels::f16;
 use b2p_kernels::{FloatConv, Isa, Taps, to_f16, to_f32};
-use half::f16;
 use rayon::prelude::*;
 
 use super::layers::{Pool, apply, apply_f32, concat, reals};

@@ -1,7 +1,7 @@
 //! Running layers and blocks over all rows of a level, in blocks of rows side by side.
 
+use b2p_kernels::f16;
 use b2p_kernels::{ExactConv, FloatConv, Isa, Output, Taps, to_f16};
-use half::f16;
 use rayon::prelude::*;
 
 use super::structure::{Inception, ResBlock};

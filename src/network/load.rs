@@ -1,11 +1,10 @@
 //! Model files: safetensors, everything checked before it is used.
 
+use b2p_kernels::f16;
 use b2p_kernels::{ExactConv, LIMIT, Requantise};
-use half::f16;
-use safetensors::Dtype;
-use safetensors::tensor::{Metadata, SafeTensors};
 use xxhash_rust::xxh3::Xxh3Default;
 
+use super::container::{Contents, Dtype};
 use super::shape::Shape;
 use super::stored::Stored;
 use super::structure::Spec;
@@ -41,32 +40,26 @@ element!(u8: U8, i16: I16, u16: U16, i32: I32, u32: U32, f16: F16, f32: F32);
 
 /// The tensors of a model file.
 pub(super) struct Tensors<'a> {
-    metadata: Metadata,
+    contents: Contents,
     data: &'a [u8],
 }
 
 impl<'a> Tensors<'a> {
     /// Reads the file's table of contents.
+    ///
+    /// # Errors
+    /// Those of [`Contents::read`].
     pub fn new(bytes: &'a [u8]) -> Result<Self> {
-        let (header, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| {
-            Error::malformed(
-                Stage::Network,
-                "model file",
-                "header",
-                error,
-                "a safetensors file",
-            )
-        })?;
-        Ok(Tensors {
-            metadata,
-            data: &bytes[8 + header..],
-        })
+        let (contents, data) = Contents::read(bytes)?;
+        Ok(Tensors { contents, data })
     }
 
     /// The model's description.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if there is none, or as [`Shape::from_json`].
     pub fn shape(&self) -> Result<Shape> {
-        let json = self.metadata.metadata().as_ref().and_then(|m| m.get("b2p"));
-        let json = json.ok_or_else(|| {
+        let json = self.contents.metadata.get("b2p").ok_or_else(|| {
             Error::malformed(
                 Stage::Network,
                 "metadata",
@@ -80,16 +73,18 @@ impl<'a> Tensors<'a> {
 
     /// Whether a tensor's name starts like that.
     pub fn any(&self, prefix: &str) -> bool {
-        self.metadata
-            .offset_keys()
-            .iter()
-            .any(|name| name.starts_with(prefix))
+        let mut names = self.contents.tensors.keys();
+        names.any(|name| name.starts_with(prefix))
     }
 
     /// The entries of a tensor of that very shape.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if there is no such tensor, or it is of another type or shape.
     pub fn get<T: Element>(&self, name: &str, shape: &[usize]) -> Result<Vec<T>> {
         let entries = self.find::<T>(name)?;
-        let found = self.metadata.info(name).map_or(&[][..], |info| &info.shape);
+        let found = self.contents.tensors.get(name);
+        let found = found.map_or(&[][..], |info| &info.shape);
         if found != shape {
             return Err(malformed(
                 name,
@@ -102,6 +97,9 @@ impl<'a> Tensors<'a> {
     }
 
     /// The entries of a tensor of one dimension, however long.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if there is no such tensor, or it is of another type.
     pub fn list<T: Element>(&self, name: &str) -> Result<Vec<T>> {
         let entries = self.find::<T>(name)?;
         Ok(entries.map(T::read).collect())
@@ -109,8 +107,9 @@ impl<'a> Tensors<'a> {
 
     fn find<T: Element>(&self, name: &str) -> Result<std::slice::ChunksExact<'a, u8>> {
         let info = self
-            .metadata
-            .info(name)
+            .contents
+            .tensors
+            .get(name)
             .ok_or_else(|| malformed(name, "tensor", "missing", "there"))?;
         if info.dtype != T::DTYPE {
             return Err(malformed(
@@ -120,33 +119,29 @@ impl<'a> Tensors<'a> {
                 format!("{:?}", T::DTYPE),
             ));
         }
-        let (start, end) = info.data_offsets;
-        Ok(self.data[start..end].chunks_exact(size_of::<T>()))
+        Ok(self.data[info.range()].chunks_exact(size_of::<T>()))
     }
 
     /// What a stream calls the model: XXH3-128 of the description's exact part, and of name, type, extents and bytes of every
     /// tensor that bears on the decoded bits, in the order of their names.
     pub fn id(&self, shape: &Shape) -> [u8; 16] {
-        let mut names = self.metadata.offset_keys();
-        names.retain(|name| {
-            ["up.", "base.", "pem.", "fr.", "cdf."]
-                .iter()
-                .any(|p| name.starts_with(p))
-        });
-        names.sort_unstable();
+        const EXACT: [&str; 5] = ["up.", "base.", "pem.", "fr.", "cdf."];
         let mut hash = Xxh3Default::new();
         hash.update(shape.exact_text().as_bytes());
-        for name in &names {
-            let Some(info) = self.metadata.info(name) else {
+        for (name, info) in &self.contents.tensors {
+            if !EXACT.iter().any(|prefix| name.starts_with(prefix)) {
                 continue;
-            };
+            }
             hash.update(format!("\n{name} {:?} {:?}\n", info.dtype, info.shape).as_bytes());
-            hash.update(&self.data[info.data_offsets.0..info.data_offsets.1]);
+            hash.update(&self.data[info.range()]);
         }
         hash.digest128().to_be_bytes()
     }
 
     /// A layer of the exact zone, with the proof that no sum of it overflows.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`], naming the tensor, if one is missing, of another type or shape, or out of range.
     pub fn exact_layer(&self, spec: Spec) -> Result<ExactConv> {
         let Spec {
             name,
@@ -209,6 +204,9 @@ impl<'a> Tensors<'a> {
     }
 
     /// A layer of the close zone.
+    ///
+    /// # Errors
+    /// As [`Tensors::exact_layer`].
     pub fn stored_layer(&self, spec: Spec) -> Result<Stored> {
         let name = &spec.name;
         let tensor = format!("{name}.weight");
@@ -231,10 +229,13 @@ impl<'a> Tensors<'a> {
 
     /// Whether there is a tensor of that name.
     pub fn has(&self, name: &str) -> bool {
-        self.metadata.info(name).is_some()
+        self.contents.tensors.contains_key(name)
     }
 
     /// `count` numbers within ±`limit`.
+    ///
+    /// # Errors
+    /// As [`Tensors::get`], and [`Error::Malformed`] for a number beyond.
     pub fn finite(&self, name: &str, count: usize, limit: f32) -> Result<Vec<f32>> {
         let values: Vec<f32> = self.get(name, &[count])?;
         match values.iter().find(|v| !v.is_finite() || v.abs() > limit) {

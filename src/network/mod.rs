@@ -37,6 +37,7 @@
 //! `fc.*` and `fs.*` can decode only.
 
 mod base;
+mod container;
 mod convert;
 #[cfg(feature = "tradeoff")]
 mod double;

@@ -4,7 +4,7 @@
 
 use std::collections::HashMap;
 
-use half::f16;
+use b2p_kernels::f16;
 
 use super::load::{Element, Tensors};
 use super::shape::Upsample;

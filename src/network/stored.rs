@@ -1,7 +1,7 @@
 //! Layers as the model file has them, in f16, and what they run as.
 
+use b2p_kernels::f16;
 use b2p_kernels::{ExactConv, FloatConv, LIMIT, Requantise, Scale};
-use half::f16;
 
 use super::structure::Spec;
 

@@ -1,11 +1,8 @@
 //! Models made up from a seed: for tests and fuzzing, where any valid model will do. The same bytes on every machine.
 
-use std::collections::HashMap;
+use b2p_kernels::f16;
 
-use half::f16;
-use safetensors::Dtype;
-use safetensors::tensor::TensorView;
-
+use super::container::{Dtype, File as Container};
 use super::shape::Shape;
 use super::structure::{ROLES, Spec};
 use crate::error::Result;
@@ -25,7 +22,7 @@ const REACH: i32 = 24;
 pub fn untrained(shape: &Shape, seed: u64) -> Vec<u8> {
     let mut file = File {
         random: seed,
-        tensors: Vec::new(),
+        file: Container::new([("b2p".to_owned(), shape.to_json())].into()),
     };
     let [exact, float] = layers(shape).expect("listing layers has no way to fail");
     // The optional part comes last: with and without it, everything else is the same.
@@ -50,13 +47,7 @@ pub fn untrained(shape: &Shape, seed: u64) -> Vec<u8> {
     }
     file.table("cdf.gauss", gauss_rows());
     file.table("cdf.prior", vec![row(3.0, 0.0); shape.latents]);
-    let views = file.tensors.iter().map(|(name, dtype, extents, bytes)| {
-        let view =
-            TensorView::new(*dtype, extents.clone(), bytes).expect("the bytes fill the extents");
-        (name.as_str(), view)
-    });
-    let metadata = HashMap::from([("b2p".to_owned(), shape.to_json())]);
-    safetensors::serialize(views, Some(metadata)).expect("names and extents are sound")
+    file.file.write()
 }
 
 /// All layers of the exact zone, and all others.
@@ -74,7 +65,7 @@ fn layers(shape: &Shape) -> Result<[Vec<Spec>; 2]> {
 
 struct File {
     random: u64,
-    tensors: Vec<(String, Dtype, Vec<usize>, Vec<u8>)>,
+    file: Container,
 }
 
 impl File {
@@ -85,9 +76,8 @@ impl File {
         extents: &[usize],
         entries: impl IntoIterator<Item = [u8; N]>,
     ) {
-        let bytes = entries.into_iter().flatten().collect();
-        self.tensors
-            .push((name.to_owned(), dtype, extents.to_vec(), bytes));
+        let bytes: Vec<u8> = entries.into_iter().flatten().collect();
+        self.file.add(name, dtype, extents, &bytes);
     }
 
     /// SplitMix64, as an integer in ±limit.

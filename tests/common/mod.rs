@@ -103,11 +103,6 @@ pub fn small_stream(model: &Model) -> Vec<u8> {
     encoded.expect("a ball can be coded").bytes
 }
 
-/// Reads a picture.
-pub fn png(path: &Path) -> tiny_skia::Pixmap {
-    tiny_skia::Pixmap::load_png(path).expect("a readable PNG")
-}
-
 /// Everything in a folder, sorted.
 pub fn names_in(folder: &Path) -> Vec<std::ffi::OsString> {
     let mut names: Vec<_> = std::fs::read_dir(folder)

@@ -43,8 +43,11 @@ fn reached(decoding: &Decoding<&Model>, log: &mut Log) -> Result<String> {
     Ok(level(deepest, exact, gaussians.as_ref()))
 }
 
+/// The digests of a stream's levels, or why there are none.
+pub type Levels = std::result::Result<Vec<String>, String>;
+
 /// The digests of all levels, each decoded on its own from the whole stream.
-pub fn whole(model: &Model, bytes: &[u8]) -> std::result::Result<Vec<String>, String> {
+pub fn whole(model: &Model, bytes: &[u8]) -> Levels {
     let header = b2p::bitstream::Header::parse(bytes, &Default::default()).map_err(told)?;
     let decoder = Decoder::new(model);
     let drawable = decoder.levels(bytes).map_err(told)?;
@@ -63,7 +66,7 @@ pub fn whole(model: &Model, bytes: &[u8]) -> std::result::Result<Vec<String>, St
 }
 
 /// The same, each as it becomes whole while the stream comes in pieces.
-pub fn in_pieces(model: &Model, bytes: &[u8]) -> std::result::Result<Vec<String>, String> {
+pub fn in_pieces(model: &Model, bytes: &[u8]) -> Levels {
     let (mut decoding, mut log) = (Decoder::new(model).start(None), Log::default());
     let mut levels = Vec::new();
     for piece in bytes.chunks(61) {

@@ -6,59 +6,19 @@ use b2p::encoder::{Options, encode};
 use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
-use b2p::network::{Model, Shape, Upsample, untrained};
+use b2p::network::Model;
 
 use crate::common::{Ball, cloud_of};
+use crate::models::model;
 use crate::seal;
 
 /// A stream of the suite.
 pub struct Case {
     pub name: String,
     pub model: &'static str,
-    /// `None` without the model.
-    pub bytes: Option<Vec<u8>>,
+    pub bytes: Vec<u8>,
     /// Whether no float had a part in it, so that every machine makes the same bytes.
     pub anywhere: bool,
-}
-
-/// The models of the suite; `lite` is the one inside the program.
-pub fn model(name: &str) -> Option<Model> {
-    let tiny = Shape::tiny();
-    let made = |shape: Shape, seed| Some(untrained(&shape, seed));
-    let bytes = match name {
-        "tiny" => made(tiny, 0),
-        "other" => made(tiny, 1),
-        "nearest" => made(
-            Shape {
-                upsample: Upsample::Nearest,
-                ..tiny
-            },
-            2,
-        ),
-        "wide" => made(
-            Shape {
-                channels: 32,
-                latents: 8,
-                pem_blocks: 2,
-                fr_blocks: 2,
-                ..tiny
-            },
-            3,
-        ),
-        "plain" => made(
-            Shape {
-                inception_relu: false,
-                resblock_relu: false,
-                latent_shift: 3,
-                ..tiny
-            },
-            4,
-        ),
-        #[cfg(feature = "cli")]
-        "lite" => Some(b2p::embedded::MODEL.to_vec()),
-        _ => None,
-    };
-    bytes.map(|bytes| Model::from_bytes(&bytes).expect("a model of the suite loads"))
 }
 
 /// SplitMix64.
@@ -233,7 +193,7 @@ pub fn cases() -> Vec<Case> {
             cases.push(Case {
                 name: format!("{name}-{what}"),
                 model: name,
-                bytes: model.as_ref().map(make),
+                bytes: make(&model),
                 anywhere,
             });
         };

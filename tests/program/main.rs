@@ -1,5 +1,4 @@
 //! The program from outside: files in, files out, errors that say what is wrong, and nothing half-written.
-#![cfg(feature = "cli")]
 
 #[path = "../common/mod.rs"]
 mod common;
@@ -83,6 +82,11 @@ fn folder_with_stream() -> tempfile::TempDir {
     folder
 }
 
+/// Reads a picture.
+fn png(path: &Path) -> tiny_skia::Pixmap {
+    tiny_skia::Pixmap::load_png(path).expect("a readable PNG")
+}
+
 #[test]
 fn a_cloud_becomes_a_stream_gaussians_and_pictures() {
     let folder = folder_with_stream();
@@ -115,10 +119,7 @@ fn a_cloud_becomes_a_stream_gaussians_and_pictures() {
             at,
             &["render", "ball-g.ply", "-o", "b.png", "--size", "96x64"],
         );
-        let (a, b) = (
-            common::png(&at.join("a.png")),
-            common::png(&at.join("b.png")),
-        );
+        let (a, b) = (png(&at.join("a.png")), png(&at.join("b.png")));
         assert_eq!((a.width(), a.height()), (96, 64));
         let worst = a
             .data()

@@ -13,7 +13,7 @@ fn several_views_are_numbered_and_differ() {
         ],
     );
     let pictures: Vec<_> = (0..3)
-        .map(|i| common::png(&at.join(format!("turn-{i:03}.png"))))
+        .map(|i| png(&at.join(format!("turn-{i:03}.png"))))
         .collect();
     assert!(pictures[0].data() != pictures[1].data());
     assert!(!at.join("turn.png").exists());
@@ -67,7 +67,7 @@ fn effects_are_explained_and_forced() {
     };
     assert!(draw("a.png", &[]).contains("antialias off: "));
     assert!(draw("b.png", &["--effect", "antialias=on"]).contains("antialias on: forced"));
-    let [a, b] = ["a.png", "b.png"].map(|name| common::png(&at.join(name)));
+    let [a, b] = ["a.png", "b.png"].map(|name| png(&at.join(name)));
     assert!(a.data() != b.data());
     for show in ["depth", "normal", "alpha", "id"] {
         draw("c.png", &["--show", show, "--orthographic"]);
@@ -135,7 +135,7 @@ fn cameras_come_from_a_file_and_a_broken_one_is_named() {
     ];
     file(&[shot(1.0), shot(1.0)]);
     succeeds(at, &args);
-    assert_eq!(common::png(&at.join("f-001.png")).width(), 16);
+    assert_eq!(png(&at.join("f-001.png")).width(), 16);
     file(&[shot(1.5)]);
     let done = b2p(at, &args);
     assert_eq!(done.status.code(), Some(1));
@@ -163,7 +163,7 @@ fn a_transparent_background_stays_transparent_in_the_corners() {
             "transparent",
         ],
     );
-    let picture = common::png(&at.join("t.png"));
+    let picture = png(&at.join("t.png"));
     assert_eq!(picture.pixel(0, 0).map(|p| p.alpha()), Some(0));
     assert_eq!(picture.pixel(32, 32).map(|p| p.alpha()), Some(255));
 }

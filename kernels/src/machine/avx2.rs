@@ -2,7 +2,7 @@
 
 use std::arch::x86_64::*;
 
-use half::f16;
+use crate::f16;
 
 use crate::ceiling;
 use crate::convert::{Halves, MAX};

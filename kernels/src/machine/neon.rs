@@ -4,7 +4,7 @@
 use std::arch::aarch64::*;
 use std::arch::asm;
 
-use half::f16;
+use crate::f16;
 
 use crate::ceiling;
 use crate::convert::{Halves, MAX};

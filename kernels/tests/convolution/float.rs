@@ -1,7 +1,7 @@
 //! Floats: within the rounding of their sums.
 
+use b2p_kernels::f16;
 use b2p_kernels::{FloatConv, Isa, Precision, Scale, Taps, reference};
-use half::f16;
 
 use crate::cases::{Random, cases, kernels, whole};
 

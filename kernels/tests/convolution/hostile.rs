@@ -1,7 +1,7 @@
 //! What must be refused.
 
+use b2p_kernels::f16;
 use b2p_kernels::{ABSENT, ExactConv, FloatConv, Isa, Requantise, Scale, Taps};
-use half::f16;
 
 use crate::cases::whole;
 

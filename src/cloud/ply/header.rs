@@ -180,6 +180,9 @@ impl Element {
 
 impl Header {
     /// Reads from `ply` to `end_header`. Lines end with LF or CR LF; bytes after the header are not looked at.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`], naming the line, if it is no PLY header; [`Error::Truncated`] if it does not end.
     pub fn parse(bytes: &[u8]) -> Result<Header> {
         if !bytes.starts_with(b"ply") {
             let start = &bytes[..bytes.len().min(8)];

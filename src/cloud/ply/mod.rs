@@ -42,6 +42,9 @@ pub enum Values {
 
 impl<'a> Ply<'a> {
     /// Reads the header of a whole file.
+    ///
+    /// # Errors
+    /// Those of [`Header::parse`].
     pub fn open(bytes: &'a [u8]) -> Result<Self> {
         let header = Header::parse(bytes)?;
         Ok(Ply { header, bytes })
@@ -54,8 +57,9 @@ impl<'a> Ply<'a> {
 
     /// The scalar properties `names` (distinct) of the element `vertex`, in that order.
     ///
-    /// Fails with [`Error::Malformed`] if one is absent, a list, or holds what its type cannot; with [`Error::Truncated`] if the
-    /// file ends early; with [`Error::LimitExceeded`] if there are more rows, or more bytes in them, than `limits` allow.
+    /// # Errors
+    /// [`Error::Malformed`] if one is absent, a list, or holds what its type cannot; [`Error::Truncated`] if the
+    /// file ends early; [`Error::LimitExceeded`] if there are more rows, or more bytes in them, than `limits` allow.
     pub fn vertex_columns(&self, names: &[&str], limits: &Limits) -> Result<Vec<Column>> {
         self.columns("vertex", names, limits)
     }

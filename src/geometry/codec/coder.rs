@@ -102,15 +102,19 @@ pub(super) struct Decoder<'a> {
     value: u32,
     bytes: &'a [u8],
     next: usize,
+    /// Where the bytes lie in the stream.
+    offset: usize,
 }
 
 impl<'a> Decoder<'a> {
-    pub fn new(bytes: &'a [u8]) -> Self {
+    /// Reads `bytes`, whose first is byte `offset` of the stream.
+    pub fn new(bytes: &'a [u8], offset: usize) -> Self {
         let mut decoder = Decoder {
             interval: Interval::ALL,
             value: 0,
             bytes,
             next: 0,
+            offset,
         };
         for _ in 0..4 {
             decoder.read();
@@ -125,26 +129,32 @@ impl<'a> Decoder<'a> {
         self.next += 1;
     }
 
-    /// Fails if bits were read that are not there.
+    /// Sees that no bits were read that are not there.
+    ///
+    /// # Errors
+    /// [`Error::Truncated`] if they were.
     pub fn check_not_past_end(&self) -> Result<()> {
         if self.next <= self.bytes.len() {
             return Ok(());
         }
         Err(Error::Truncated {
             stage: Stage::Geometry,
-            offset: self.bytes.len() as u64,
+            offset: self.offset as u64 + self.bytes.len() as u64,
             field: "occupancy",
             needed: (self.next - self.bytes.len()) as u64,
         })
     }
 
-    /// Fails unless everything was read, and ended as an encoder ends.
+    /// Sees that everything was read, and ended as an encoder ends.
+    ///
+    /// # Errors
+    /// [`Error::Truncated`] or [`Error::Malformed`] if not.
     pub fn finish(self) -> Result<()> {
         self.check_not_past_end()?;
         if self.next < self.bytes.len() {
             return Err(Error::malformed(
                 Stage::Geometry,
-                format!("byte {}", self.next),
+                format!("byte {}", self.offset + self.next),
                 "length of the occupancy",
                 self.bytes.len(),
                 self.next,
@@ -153,7 +163,7 @@ impl<'a> Decoder<'a> {
         if self.value != self.interval.low {
             return Err(Error::malformed(
                 Stage::Geometry,
-                format!("byte {}", self.next - 4),
+                format!("byte {}", self.offset + self.next - 4),
                 "end of the occupancy",
                 format!("{:#010x}", self.value),
                 format!("{:#010x}", self.interval.low),
@@ -191,7 +201,7 @@ mod tests {
     }
 
     fn decode(bytes: &[u8], bits: &[(bool, u32)]) -> Result<Vec<bool>> {
-        let mut decoder = Decoder::new(bytes);
+        let mut decoder = Decoder::new(bytes, 0);
         let decoded = bits.iter().map(|&(_, one)| decoder.code(false, one));
         let decoded = decoded.collect();
         decoder.finish()?;

@@ -26,6 +26,7 @@ mod predictor;
 mod probability;
 
 use super::{KernelMap, Octree};
+use crate::bitstream::Slice;
 use crate::cancel::Cancel;
 use crate::error::{Error, Result, Stage};
 use coder::{Decoder, Encoder};
@@ -61,11 +62,11 @@ pub fn encode_level(
     ranges.into_par_iter().map(encode).collect()
 }
 
-/// The occupancies of the parents `parents`, whose children are `voxels` voxels of level `level`; `map` is the 3³ kernel map of the
-/// level above.
+/// The occupancies of the parents `parents`, whose children are the slice's voxels of level `level`; `map` is the 3³ kernel map of
+/// the level above.
 ///
 /// # Errors
-/// [`Error::Truncated`] if the stream ends early, [`Error::Malformed`] if it does not hold exactly so many voxels or goes on after them.
+/// [`Error::Truncated`] if the code ends early, [`Error::Malformed`] if it does not hold exactly so many voxels or goes on after them.
 ///
 /// # Panics
 /// If `map` has not that many rows.
@@ -73,28 +74,20 @@ pub fn decode_slice(
     level: u8,
     map: &KernelMap,
     parents: Range<usize>,
-    bytes: &[u8],
-    voxels: usize,
+    slice: &Slice,
 ) -> Result<Vec<u8>> {
-    let mut decoder = Decoder::new(bytes);
-    let masks = read(
-        &mut Predictor::new(),
-        &mut decoder,
-        level,
-        map,
-        parents.clone(),
-        voxels,
-    )?;
-    decoder.finish()?;
-    let found = count(&masks);
-    if found != voxels {
-        return Err(wrong_count(level, &parents, found, voxels.to_string()));
+    let masks = read(&mut Predictor::new(), level, map, parents.clone(), slice)?;
+    match count(&masks) {
+        found if found == slice.voxels as usize => Ok(masks),
+        found => {
+            let expected = slice.voxels.to_string();
+            Err(wrong_count(level, &parents, slice, found, expected))
+        }
     }
-    Ok(masks)
 }
 
-/// Adds to `octree` the level that these slices hold: for each of `slice` parents the number of children, and the code. `map` is the
-/// 3³ kernel map of what is now the deepest level.
+/// Adds to `octree` the level that these slices hold, each of the children of `slice` parents. `map` is the 3³ kernel map of what is
+/// now the deepest level.
 ///
 /// # Errors
 /// Those of [`decode_slice`] and [`Octree::grow`], [`Error::Malformed`] if there are more or fewer slices than there should be, and
@@ -105,7 +98,7 @@ pub fn decode_slice(
 pub fn decode_level(
     octree: &mut Octree,
     map: &KernelMap,
-    encoded: &[(u32, &[u8])],
+    encoded: &[Slice],
     slice: usize,
     cancel: &Cancel,
 ) -> Result<()> {
@@ -121,11 +114,13 @@ pub fn decode_level(
         ));
     }
     let tasks: Vec<_> = ranges.zip(encoded).collect();
-    let decode = |(parents, &(voxels, bytes)): (Range<usize>, &(u32, &[u8]))| {
+    let decode = |(parents, slice): (Range<usize>, &Slice)| {
         cancel.check()?;
-        decode_slice(level, map, parents, bytes, voxels as usize)
+        decode_slice(level, map, parents, slice)
     };
-    let masks: Result<Vec<_>> = tasks.into_par_iter().map(decode).collect();
+    // All of them, so that the error is that of the first slice that has one.
+    let masks: Vec<Result<_>> = tasks.into_par_iter().map(decode).collect();
+    let masks: Result<Vec<_>> = masks.into_iter().collect();
     octree.grow(masks?.concat())
 }
 
@@ -143,33 +138,31 @@ fn write(
     }
 }
 
-/// Decodes the occupancies of one slice, unless they come to more than `voxels`.
+/// Decodes the occupancies of one slice, unless they come to more than its voxels.
 fn read(
     predictor: &mut Predictor,
-    decoder: &mut Decoder,
     level: u8,
     map: &KernelMap,
     parents: Range<usize>,
-    voxels: usize,
+    slice: &Slice,
 ) -> Result<Vec<u8>> {
+    let mut decoder = Decoder::new(slice.bytes, slice.offset);
     let mut masks = Vec::with_capacity(parents.len());
     let mut found = 0;
     for here in parents.clone() {
         let facts = predictor.network.sum(map.row(here), &parents, here, &masks);
-        let mask = predictor.code(decoder, &facts, 0);
+        let mask = predictor.code(&mut decoder, &facts, 0);
         decoder.check_not_past_end()?;
         masks.push(mask);
         found += mask.count_ones() as usize;
         let at_least = found + (parents.end - here - 1);
-        if at_least > voxels {
-            return Err(wrong_count(
-                level,
-                &parents,
-                format!("at least {at_least}"),
-                format!("at most {voxels}"),
-            ));
+        if at_least > slice.voxels as usize {
+            let found = format!("at least {at_least}");
+            let expected = format!("at most {}", slice.voxels);
+            return Err(wrong_count(level, &parents, slice, found, expected));
         }
     }
+    decoder.finish()?;
     Ok(masks)
 }
 
@@ -177,8 +170,14 @@ fn count(masks: &[u8]) -> usize {
     masks.iter().map(|mask| mask.count_ones() as usize).sum()
 }
 
-fn wrong_count(level: u8, parents: &Range<usize>, found: impl ToString, expected: String) -> Error {
-    let at = format!("level {level}, parents {parents:?}");
+fn wrong_count(
+    level: u8,
+    parents: &Range<usize>,
+    slice: &Slice,
+    found: impl ToString,
+    expected: String,
+) -> Error {
+    let at = format!("byte {}, level {level}, parents {parents:?}", slice.offset);
     Error::malformed(Stage::Geometry, at, "number of voxels", found, expected)
 }
 

@@ -28,11 +28,21 @@ fn decode(levels: &[Vec<(u32, Vec<u8>)>], slice: usize) -> Result<Octree> {
     Ok(octree)
 }
 
-fn borrowed(encoded: &[(u32, Vec<u8>)]) -> Vec<(u32, &[u8])> {
-    encoded
-        .iter()
-        .map(|(n, bytes)| (*n, bytes.as_slice()))
-        .collect()
+/// A slice as if it stood at byte `offset` of a stream.
+fn slice_at(offset: usize, voxels: u32, bytes: &[u8]) -> Slice<'_> {
+    Slice {
+        voxels,
+        bytes,
+        offset,
+    }
+}
+
+fn borrowed(encoded: &[(u32, Vec<u8>)]) -> Vec<Slice<'_>> {
+    let mut slices = Vec::new();
+    for (voxels, bytes) in encoded {
+        slices.push(slice_at(0, *voxels, bytes));
+    }
+    slices
 }
 
 fn check(voxels: Voxels, slice: usize) {
@@ -79,7 +89,7 @@ proptest! {
         let octree = bowl(4).truncated(3);
         let map = octree.kernel_map(3);
         let mut grown = octree.clone();
-        match decode_level(&mut grown, &map, &[(voxels, &bytes)], usize::MAX, &Cancel::default()) {
+        match decode_level(&mut grown, &map, &[slice_at(0, voxels, &bytes)], usize::MAX, &Cancel::default()) {
             Ok(()) => prop_assert_eq!(grown.level(4).len(), voxels as usize),
             Err(_) => prop_assert_eq!(grown, octree),
         }
@@ -135,7 +145,7 @@ fn slices_do_not_need_each_other() {
     assert!(slices.len() > 2);
     for (i, (voxels, bytes)) in slices.iter().enumerate().rev() {
         let parents = i * 1000..map.len().min((i + 1) * 1000);
-        let masks = decode_slice(7, &map, parents.clone(), bytes, *voxels as usize).unwrap();
+        let masks = decode_slice(7, &map, parents.clone(), &slice_at(0, *voxels, bytes)).unwrap();
         assert_eq!(masks, octree.occupancy(6)[parents]);
     }
 }
@@ -154,7 +164,7 @@ fn any_number_of_threads_gives_the_same_bytes() {
 fn every_truncation_is_noticed() {
     let (_, map, voxels, bytes) = level_of_a_bowl();
     for end in 0..bytes.len() {
-        let result = decode_slice(6, &map, 0..map.len(), &bytes[..end], voxels as usize);
+        let result = decode_slice(6, &map, 0..map.len(), &slice_at(0, voxels, &bytes[..end]));
         assert!(matches!(result, Err(Error::Truncated { .. })), "{end}");
     }
 }
@@ -163,7 +173,7 @@ fn every_truncation_is_noticed() {
 fn bytes_left_over_are_refused() {
     let (_, map, voxels, mut bytes) = level_of_a_bowl();
     bytes.push(0);
-    let result = decode_slice(6, &map, 0..map.len(), &bytes, voxels as usize);
+    let result = decode_slice(6, &map, 0..map.len(), &slice_at(0, voxels, &bytes));
     assert!(matches!(result, Err(Error::Malformed { .. })));
 }
 
@@ -171,7 +181,7 @@ fn bytes_left_over_are_refused() {
 fn a_wrong_count_is_refused() {
     let (_, map, voxels, bytes) = level_of_a_bowl();
     for wrong in [0, 1, voxels - 1, voxels + 1, u32::MAX] {
-        let result = decode_slice(6, &map, 0..map.len(), &bytes, wrong as usize);
+        let result = decode_slice(6, &map, 0..map.len(), &slice_at(0, wrong, &bytes));
         assert!(matches!(result, Err(Error::Malformed { .. })), "{wrong}");
     }
 }
@@ -184,7 +194,7 @@ fn every_flipped_bit_is_noticed() {
     for bit in 0..8 * bytes.len() {
         let mut bytes = bytes.clone();
         bytes[bit / 8] ^= 1 << (bit % 8);
-        let result = decode_slice(5, &map, 0..map.len(), &bytes, voxels as usize);
+        let result = decode_slice(5, &map, 0..map.len(), &slice_at(0, voxels, &bytes));
         assert!(result.is_err(), "bit {bit}");
     }
 }
@@ -203,4 +213,28 @@ fn a_missing_slice_is_refused() {
         &Cancel::default(),
     );
     assert!(matches!(result, Err(Error::Malformed { .. })));
+}
+
+#[test]
+fn faults_are_placed_in_the_stream() {
+    let (_, map, voxels, bytes) = level_of_a_bowl();
+    let fault = |voxels: u32, bytes: &[u8]| {
+        let slice = slice_at(1000, voxels, bytes);
+        decode_slice(6, &map, 0..map.len(), &slice).unwrap_err()
+    };
+    let cut = fault(voxels, &bytes[..bytes.len() - 1]);
+    let end = 1000 + bytes.len() as u64;
+    assert!(
+        matches!(cut, Error::Truncated { offset, .. } if offset == end - 1),
+        "{cut}"
+    );
+    let longer = fault(voxels, &[&bytes[..], &[0]].concat()).to_string();
+    assert!(longer.contains(&format!("byte {end}:")), "{longer}");
+    let last = bytes.len() - 1;
+    let mut changed = bytes.clone();
+    changed[last] ^= 1;
+    let changed = fault(voxels, &changed).to_string();
+    assert!(changed.contains(&format!("byte {}:", end - 4)), "{changed}");
+    let fewer = fault(voxels - 1, &bytes).to_string();
+    assert!(fewer.contains("byte 1000, level 6"), "{fewer}");
 }

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use half::f16;
+use b2p_kernels::f16;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
 use super::super::{Model, Shape, untrained};

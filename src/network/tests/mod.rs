@@ -61,7 +61,7 @@ impl Cloud {
     }
 
     /// The encoder's features of roles 0, 1, 2.
-    fn features(&self, model: &Model, colours: &[[f32; 3]]) -> [Vec<half::f16>; 3] {
+    fn features(&self, model: &Model, colours: &[[f32; 3]]) -> [Vec<b2p_kernels::f16>; 3] {
         let maps: Vec<&KernelMap> = self.maps.iter().rev().collect();
         let occupancy = [self.occupancy(2), self.occupancy(1), self.occupancy(0)];
         let mut features = model.features(colours, &maps, &occupancy).unwrap();

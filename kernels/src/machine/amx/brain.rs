@@ -2,7 +2,7 @@
 
 use std::arch::x86_64::*;
 
-use half::{bf16, f16};
+use crate::binary16::{f16, to_bf16};
 
 use super::{Buffers, LINE, Scheme, Weights, multiply, prepare};
 use crate::plan::PlanTile;
@@ -16,7 +16,7 @@ impl Weights {
     pub fn of_brain(extents: Extents, weight: impl Fn(usize, usize, usize) -> f32) -> Weights {
         let mut packed = Weights::new(extents, Scheme::Brain);
         for (tap, channel, out) in extents.each() {
-            let w = bf16::from_f32(weight(tap, channel, out)).to_bits();
+            let w = to_bf16(weight(tap, channel, out));
             let word = packed.word(0, tap, 2 * channel, out / PANEL, out % PANEL);
             *word |= u32::from(w) << (16 * (channel % 2));
         }

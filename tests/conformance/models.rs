@@ -1,0 +1,47 @@
+//! The models that the streams of the suite are coded with.
+
+use std::path::Path;
+
+use b2p::network::{Model, Shape, Upsample, untrained};
+
+/// A model of the suite; `lite` is the one that ships.
+pub fn model(name: &str) -> Model {
+    let tiny = Shape::tiny();
+    let made = |shape: Shape, seed| untrained(&shape, seed);
+    let bytes = match name {
+        "tiny" => made(tiny, 0),
+        "other" => made(tiny, 1),
+        "nearest" => made(
+            Shape {
+                upsample: Upsample::Nearest,
+                ..tiny
+            },
+            2,
+        ),
+        "wide" => made(
+            Shape {
+                channels: 32,
+                latents: 8,
+                pem_blocks: 2,
+                fr_blocks: 2,
+                ..tiny
+            },
+            3,
+        ),
+        "plain" => made(
+            Shape {
+                inception_relu: false,
+                resblock_relu: false,
+                latent_shift: 3,
+                ..tiny
+            },
+            4,
+        ),
+        "lite" => {
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/lite.safetensors");
+            std::fs::read(path).expect("the model that ships")
+        }
+        _ => panic!("the suite has no model {name}"),
+    };
+    Model::from_bytes(&bytes).expect("a model of the suite loads")
+}
