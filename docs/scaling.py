@@ -31,7 +31,7 @@ def measure(bits):
         cloud.unlink()
     out = {"bits": bits, "bytes": stream.stat().st_size}
     for key, more in (("ms", []), ("ms_one", ["--threads", 1])):
-        report = json.loads(run(program, "bench", stream, "--json", "--repeat", 7 if bits < 11 else 3, "--limits", "unlimited", *more))
+        report = json.loads(run(program, "bench", stream, "--json", "--repeat", 7 if bits < 10 else 3 if bits < 12 else 1, "--limits", "unlimited", *more))
         out[key] = report["decode_ms"]
         if key == "ms":
             out |= {"mb": report["peak_memory_bytes"] / 1e6, "isa": report["isa"], "level": report["level"]}
