@@ -79,6 +79,10 @@ fn stage_of(step: &Step) -> usize {
 }
 
 impl<'a> Run<'a> {
+    /// What decodes and draws with each of the settings, ready to be measured.
+    ///
+    /// # Errors
+    /// Those of [`Header::parse`], of reading the model, and [`crate::Error::Usage`] for a setting that the model does not have.
     pub fn new(
         subject: &'a Subject<'a>,
         options: &'a Options,
@@ -129,6 +133,9 @@ impl<'a> Run<'a> {
     }
 
     /// What there is to choose from for a stream.
+    ///
+    /// # Errors
+    /// Those of reading the model, and of [`Decoder::levels`].
     pub fn choices(subject: &Subject<'_>) -> Result<Choices> {
         let model = (subject.model)()?;
         let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
@@ -148,6 +155,9 @@ impl<'a> Run<'a> {
     }
 
     /// Runs everything once in each repeat.
+    ///
+    /// # Errors
+    /// Those of [`Decoder::decode`] and of [`Renderer::render_into`].
     pub fn measure(&mut self, truth: &Truth, say: &dyn Fn(&str)) -> Result<()> {
         for repeat in 0..self.options.repeats {
             say(&format!(
@@ -298,6 +308,9 @@ impl<'a> Run<'a> {
     }
 
     /// The pictures of the finest level, generated and drawn in double precision without any cut-off.
+    ///
+    /// # Errors
+    /// Those of [`Decoder::exact`] and [`Model::generate_in_double`].
     pub fn truth(&self, choices: &Choices, say: &dyn Fn(&str)) -> Result<Truth> {
         let model = (self.subject.model)()?;
         let level = choices.levels.last().copied().unwrap_or_default();

@@ -11,6 +11,9 @@ use crate::log::Log;
 use crate::network::Model;
 
 /// The Gaussians of a level, generated in double precision; and how many milliseconds that took.
+///
+/// # Errors
+/// Those of [`Decoder::exact`] and [`Model::generate_in_double`].
 pub fn in_double(subject: &Subject<'_>, model: &Model, level: u8) -> Result<(Gaussians, f64)> {
     let header = Header::parse(subject.stream, subject.limits)?;
     let decoder = Decoder::new(model).with_limits(subject.limits.clone());
