@@ -10,7 +10,9 @@ mod memory;
 use std::borrow::Cow;
 use std::ops::Deref;
 
-use crate::bitstream::{Header, Stream};
+use crate::bitstream::Header;
+#[cfg(feature = "render")]
+use crate::bitstream::Stream;
 use crate::cancel::Cancel;
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians};
@@ -18,6 +20,7 @@ use crate::geometry::Octree;
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::network::Model;
+#[cfg(feature = "render")]
 use crate::projection::Camera;
 pub use decoding::Decoding;
 use decoding::Goal;
@@ -120,6 +123,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     ///
     /// # Errors
     /// Those of [`Stream::parse`], and the damage of a stream that is cut or damaged elsewhere than right after a level.
+    #[cfg(feature = "render")]
     pub fn level_for(&self, bytes: &[u8], cameras: &[Camera]) -> Result<Option<u8>> {
         let stream = Stream::parse(bytes, &self.limits)?.intact()?;
         let pixels = cameras.iter().map(Camera::pixels_per_unit);
