@@ -58,8 +58,9 @@ def measure(data, models, peers):
             items = [f"{item}={data}/gpcc/{name}_{item}.ply.zst@{rate}" for item, rate in PEERS.get(name, {}).items() if peers]
             best = {}
             for row in evaluate(mesh, cloud, folder / "peer", *items) if items else []:
-                if row["name"] in PEERS[name] and row["name"] not in best or row["name"] in best and row["scores"]["psnr"] > best[row["name"]]["scores"]["psnr"]:
-                    best[row["name"]] = row
+                item = row["name"]  # the cloud, coded by the program's own model, is among them
+                if item in PEERS[name] and (item not in best or row["scores"]["psnr"] > best[item]["scores"]["psnr"]):
+                    best[item] = row
             for item, row in best.items():
                 level = {"s0.25": 8, "s0.5": 9}[item.split("_")[0]]
                 rows.append({"object": name, "series": PEER, "level": level, "rate": PEERS[name][item], "quality": item.split("_q")[1], **row["scores"]})
