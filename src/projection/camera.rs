@@ -77,8 +77,16 @@ impl Camera {
             )));
         }
         let focal = f64::from(width) / 2.0 / (fov.to_radians() / 2.0).tan();
-        let camera = Camera {
-            pose: DAffine3::from_mat3_translation(rotation, DVec3::new(0.0, 0.0, radius)),
+        let pose = DAffine3::from_mat3_translation(rotation, DVec3::new(0.0, 0.0, radius));
+        let camera = Self::centred(pose, focal, width, height);
+        camera.check()?;
+        Ok(camera)
+    }
+
+    /// A pinhole camera of square pixels with its principal point in the middle; unchecked.
+    pub(crate) fn centred(pose: DAffine3, focal: f64, width: u32, height: u32) -> Camera {
+        Camera {
+            pose,
             fx: focal,
             fy: focal,
             cx: f64::from(width) / 2.0,
@@ -88,9 +96,7 @@ impl Camera {
             near: Self::NEAR,
             projection: Projection::Pinhole,
             crop: None,
-        };
-        camera.check()?;
-        Ok(camera)
+        }
     }
 
     /// The orthographic camera that shows what is `distance` away as large as this pinhole does.

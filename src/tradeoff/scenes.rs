@@ -1,10 +1,10 @@
 //! Scenes that fast renderers break on, and scenes that call for effects.
 
-use glam::{DAffine3, DMat3, DVec3};
+use glam::DAffine3;
 
 use crate::error::Result;
 use crate::gaussians::{Gaussians, Harmonics};
-use crate::projection::{Camera, Projection};
+use crate::projection::Camera;
 
 /// Gaussians, and where they are seen from.
 pub struct Scene {
@@ -97,18 +97,7 @@ fn surface(count: usize, width: f32) -> impl Iterator<Item = Splat> {
 
 /// A camera in the origin that looks along z.
 fn straight(focal: f64, width: u32, height: u32) -> Camera {
-    Camera {
-        pose: DAffine3::from_mat3_translation(DMat3::IDENTITY, DVec3::ZERO),
-        fx: focal,
-        fy: focal,
-        cx: f64::from(width) / 2.0,
-        cy: f64::from(height) / 2.0,
-        width,
-        height,
-        near: 0.01,
-        projection: Projection::Pinhole,
-        crop: None,
-    }
+    Camera::centred(DAffine3::IDENTITY, focal, width, height)
 }
 
 fn orbit(radius: f64, side: u32) -> Result<Camera> {

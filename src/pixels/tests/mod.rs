@@ -7,13 +7,13 @@ mod invariance;
 mod space;
 
 use b2p_kernels::Isa;
-use glam::{DAffine3, DMat3, DVec3};
+use glam::{DAffine3, DMat3};
 
 use super::reference::{self, Cutoffs};
 use super::{Background, Image, Quality, Renderer, Stats, render};
 use crate::gaussians::Gaussians;
 use crate::limits::Limits;
-use crate::projection::{Camera, Projection};
+use crate::projection::Camera;
 
 /// A small generator of numbers in `[0, 1)` that needs no quality, only variety.
 pub(super) struct Random(pub u64);
@@ -111,18 +111,7 @@ fn orbit(width: u32, height: u32) -> Camera {
 
 /// A camera at the origin of the cube frame that looks along +z, with its principal point in the middle.
 fn straight(focal: f64, width: u32, height: u32) -> Camera {
-    Camera {
-        pose: DAffine3::from_mat3_translation(DMat3::IDENTITY, DVec3::ZERO),
-        fx: focal,
-        fy: focal,
-        cx: f64::from(width) / 2.0,
-        cy: f64::from(height) / 2.0,
-        width,
-        height,
-        near: 0.01,
-        projection: Projection::Pinhole,
-        crop: None,
-    }
+    Camera::centred(DAffine3::IDENTITY, focal, width, height)
 }
 
 fn draw(scene: &Gaussians, camera: &Camera) -> Image {
