@@ -1,12 +1,10 @@
-//! Streams in pieces: see [`b2p_fuzz::chunking`]. Three of four inputs have their checksums put right.
+//! Streams in pieces: see [`b2p_fuzz::chunking`]. Changed by [`b2p_fuzz::mutate`].
 #![no_main]
 
 use libfuzzer_sys::{fuzz_mutator, fuzz_target, fuzzer_mutate};
 
-fuzz_target!(|bytes: &[u8]| b2p_fuzz::chunking(bytes));
+fuzz_target!(init: b2p_fuzz::alone(), |bytes: &[u8]| b2p_fuzz::chunking(bytes));
 
 fuzz_mutator!(|data: &mut [u8], size: usize, max_size: usize, seed: u32| {
-    let size = fuzzer_mutate(data, size, max_size);
-    b2p_fuzz::sealed(&mut data[..size], seed);
-    size
+    b2p_fuzz::mutate(data, size, max_size, seed, &mut fuzzer_mutate)
 });

@@ -3,4 +3,4 @@
 
 use libfuzzer_sys::fuzz_target;
 
-fuzz_target!(|bytes: &[u8]| b2p_fuzz::entropy(bytes));
+fuzz_target!(init: b2p_fuzz::alone(), |bytes: &[u8]| b2p_fuzz::entropy(bytes));

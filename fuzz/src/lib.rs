@@ -4,6 +4,7 @@
 
 mod codecs;
 mod files;
+mod mutate;
 mod pictures;
 #[path = "../../tests/common/seal.rs"]
 mod seal;
@@ -16,8 +17,9 @@ use b2p::network::{Model, Shape, untrained};
 
 pub use codecs::{entropy, octree};
 pub use files::{model, ply};
+pub use mutate::{Change, mutate};
 pub use pictures::{backends, render};
-pub use streams::{chunking, header, stream};
+pub use streams::{chunking, deepest, header, stream};
 
 /// A target's name and what it does.
 pub type Target = (&'static str, fn(&[u8]));
@@ -40,11 +42,14 @@ static MODEL: LazyLock<Model> = LazyLock::new(|| {
     Model::from_bytes(&untrained(&Shape::tiny(), 0)).expect("an untrained model loads")
 });
 
-/// Puts the checksums of a mutated stream right, but for one in four, told by the seed.
-pub fn sealed(bytes: &mut [u8], seed: u32) {
-    if !seed.is_multiple_of(4) {
-        seal::seal(bytes);
-    }
+/// The targets whose inputs are streams, to be changed by [`mutate`].
+pub const STREAMS: [&str; 3] = ["header", "stream", "chunking"];
+
+/// Has the calling thread do all work from now on: inputs are so small that handing them over takes longer than they do.
+pub fn alone() {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1);
+    let pool = pool.use_current_thread().build_global();
+    pool.expect("nothing has run before");
 }
 
 /// Bytes as a source of numbers; zeros when they are used up.

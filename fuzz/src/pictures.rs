@@ -37,7 +37,8 @@ static FLOATS: LazyLock<Vec<Vec<Model>>> = LazyLock::new(|| models(Precision::F1
 /// 256th of the largest number in floats.
 pub fn backends(bytes: &[u8]) {
     let mut source = Source(bytes);
-    let which = usize::from(source.byte()) % MODELS.len();
+    // The widest takes as long as a dozen of the others.
+    let which = [0, 0, 0, 0, 1, 1, 1, 2][usize::from(source.byte()) % 8];
     let role = 1 + usize::from(source.byte()) % 2;
     let count = usize::from(source.byte()) % 40 + 1;
     let keys = (0..count).map(|_| u64::from(source.u16()) % 512).collect();

@@ -53,6 +53,17 @@ pub fn header(bytes: &[u8]) {
     assert_eq!(stream.damage().is_none(), whole && exact);
 }
 
+/// The finest level that a stream decodes to.
+///
+/// # Errors
+/// What the decoder says.
+pub fn deepest(bytes: &[u8]) -> Result<Option<u8>, Error> {
+    let mut decoding = Decoder::new(&*MODEL).with_limits(limits()).start(None);
+    decoding.push(bytes);
+    decoding.finish(&mut Log::default())?;
+    Ok(decoding.level())
+}
+
 /// Any bytes under small limits: an error, or as many finite Gaussians as the header tells, and again the same ones; a level that is
 /// refused leaves those before it as they were.
 pub fn stream(bytes: &[u8]) {

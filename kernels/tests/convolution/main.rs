@@ -12,21 +12,22 @@ use b2p_kernels::Isa;
 fn every_instruction_set_of_this_machine_is_tested() {
     let names: Vec<String> = Isa::available().iter().map(Isa::to_string).collect();
     println!("ran on {}", names.join(", "));
-    let mut expected = vec!["scalar"];
     #[cfg(target_arch = "x86_64")]
-    {
-        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("f16c") {
-            expected.push("avx2");
-        }
-        if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw") {
-            expected.push("avx512");
-        }
-        if Isa::detect().has_tiles() {
-            expected.push("amx");
-        }
-    }
-    #[cfg(target_arch = "aarch64")]
-    expected.push("neon");
+    let others = [
+        (
+            "avx2",
+            is_x86_feature_detected!("avx2") && is_x86_feature_detected!("f16c"),
+        ),
+        (
+            "avx512",
+            is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw"),
+        ),
+        ("amx", Isa::detect().has_tiles()),
+    ];
+    #[cfg(not(target_arch = "x86_64"))]
+    let others = [("neon", cfg!(target_arch = "aarch64"))];
+    let others = others.iter().filter(|(_, has)| *has).map(|(name, _)| *name);
+    let expected: Vec<&str> = std::iter::once("scalar").chain(others).collect();
     assert_eq!(names, expected);
     let bf16 = Isa::detect().has_bf16();
     println!("bf16: {bf16}");

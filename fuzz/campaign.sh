@@ -1,0 +1,79 @@
+#!/usr/bin/env bash
+# Goes on with the fuzzing campaign: every target in turn, from where it was left, guided by coverage, on stable Rust.
+#
+#     fuzz/campaign.sh [SECONDS [TARGET …]]    so many seconds a target (60), again and again until it is stopped; all targets by default
+#     fuzz/campaign.sh once [SECONDS [TARGET …]]
+#     fuzz/campaign.sh keep [TARGET …]         adds to fuzz/corpus what covers more than it does, the smallest inputs first
+#     fuzz/campaign.sh total                   how often each target has run
+#
+# Inputs and the log of executions are kept in fuzz/target/campaign. An input that breaks a promise is left in fuzz/artifacts, and ends it.
+set -euo pipefail
+cd "$(dirname "$0")"
+
+all="header entropy octree stream chunking backends model ply render"
+work=target/campaign
+log=$work/log
+mkdir -p $work artifacts
+
+build() { RUSTC_WRAPPER=$PWD/rustc.sh cargo build --locked --release --bins --target-dir target/fuzzers; }
+
+program() { echo "target/fuzzers/release/$1"; }
+
+# What longer inputs have is more of the same, and slower.
+longest() {
+    case $1 in
+        octree | entropy | header) echo 400 ;;
+        backends | model | render) echo 600 ;;
+        *) echo 1500 ;;
+    esac
+}
+
+# Runs a target for so many seconds, and writes down how often.
+run() {
+    local seconds=$1 target=$2
+    mkdir -p "$work/$target"
+    "$(program "$target")" -max_total_time="$seconds" -max_len="$(longest "$target")" -timeout=60 -rss_limit_mb=2048 -print_final_stats=1 \
+        -artifact_prefix="artifacts/$target-" "$work/$target" "corpus/$target" > "$work/$target.txt" 2>&1 || {
+        tail -n 40 "$work/$target.txt"
+        exit 1
+    }
+    local runs
+    runs=$(sed -n 's/^stat::number_of_executed_units: *//p' "$work/$target.txt")
+    echo "$(date -u +%F) $target $runs $seconds" | tee -a $log
+}
+
+total() {
+    for target in $all; do
+        awk -v target="$target" '$2 == target { runs += $3; seconds += $4; first = first ? first : $1; last = $1 }
+            END { printf "%-9s %11d executions in %6d s, %s to %s\n", target, runs, seconds, first, last }' $log
+    done
+}
+
+keep() {
+    for target in "$@"; do
+        "$(program "$target")" -merge=1 -max_len="$(longest "$target")" "corpus/$target" "$work/$target" 2>&1 | grep MERGE-OUTER | tail -n 1
+    done
+}
+
+case ${1:-} in
+    total) total ;;
+    keep)
+        build
+        # Words, not one argument.
+        # shellcheck disable=SC2046
+        keep $([ $# -gt 1 ] && echo "${@:2}" || echo $all)
+        ;;
+    *)
+        build
+        once=
+        [ "${1:-}" != once ] || { once=1 && shift; }
+        seconds=${1:-60}
+        targets=${*:2}
+        while true; do
+            for target in ${targets:-$all}; do
+                run "$seconds" "$target"
+            done
+            [ -z $once ] || break
+        done
+        ;;
+esac

@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# Which share of each module's lines the fuzz targets reach on what is committed: the corpus, and changed seeds as `cargo test` makes them.
+#
+#     fuzz/coverage.sh           a table by module, then the files
+#     fuzz/coverage.sh FILE …    the lines of these files that are never reached, for example src/geometry/octree.rs
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+tools=$(rustc --print sysroot)/lib/rustlib/x86_64-unknown-linux-gnu/bin
+test -x "$tools/llvm-cov" || rustup component add llvm-tools
+out=target/coverage
+mkdir -p $out
+
+if [ $# -eq 0 ]; then
+    rm -f $out/*.profraw
+    export RUSTFLAGS="-C instrument-coverage" LLVM_PROFILE_FILE="$PWD/$out/%p-%m.profraw"
+    cargo test --locked --manifest-path fuzz/Cargo.toml --target-dir $out --test replay
+    "$tools/llvm-profdata" merge -sparse $out/*.profraw -o $out/all.profdata
+fi
+program=$(find $out/debug/deps -name 'replay-*' -type f -executable -printf '%T@ %p\n' | sort -n | tail -n 1 | cut -d' ' -f2)
+if [ $# -gt 0 ]; then
+    "$tools/llvm-cov" show "$program" -instr-profile=$out/all.profdata "$@" | grep -E '^ *[0-9]+\| *0\|'
+    exit
+fi
+"$tools/llvm-cov" report "$program" -instr-profile=$out/all.profdata | tee $out/files.txt |
+    awk '$1 ~ /^src\// || $1 ~ /^kernels\/src\// { split($1, part, "/"); module = part[1] == "src" ? part[2] : "kernels"
+            lines[module] += $8; missed[module] += $9 }
+        END { for (module in lines) printf "%-12s %5d lines  %5.1f %%\n", module, lines[module], 100 - 100 * missed[module] / lines[module] }' | sort
+grep -E '^(src|kernels/src)/(bitstream|geometry|entropy)' $out/files.txt | awk '{ printf "  %-36s %5d lines, %4d missed\n", $1, $8, $9 }'

@@ -1,0 +1,111 @@
+//! Changes of streams that get past what notices them first: checksums, lengths, the model's identity.
+
+use crate::MODEL;
+use crate::seal::{self, CHUNK, FIXED};
+
+/// Where the header holds the model's identity.
+const MODEL_ID: usize = 64;
+
+/// How a fuzzer changes the first bytes of a buffer: how many they are, how many they may become; how many they are then.
+pub type Change<'a> = &'a mut dyn FnMut(&mut [u8], usize, usize) -> usize;
+
+/// Changes the stream that the first `size` bytes of `data` are, and says how many they are then, `most` at the most.
+///
+/// The seed tells how. One in four is changed anywhere; one in four too, and then has its checksums put right; in the other half the
+/// payload of one chunk is changed, and every length, every checksum and the model's identity fit what comes out.
+pub fn mutate(data: &mut [u8], size: usize, most: usize, seed: u32, change: Change) -> usize {
+    if !seed.is_multiple_of(2)
+        && let Some(stream) = with_other_payload(&data[..size], most, seed / 4, change)
+    {
+        data[..stream.len()].copy_from_slice(&stream);
+        return stream.len();
+    }
+    let size = change(data, size, most);
+    if !seed.is_multiple_of(4) {
+        seal::seal(&mut data[..size]);
+    }
+    size
+}
+
+/// A stream that fits together, with the payload of one chunk changed; nothing if these bytes have no chunks.
+fn with_other_payload(bytes: &[u8], most: usize, which: u32, change: Change) -> Option<Vec<u8>> {
+    let starts = seal::chunks(bytes);
+    let start = *starts.get(which as usize % starts.len().max(1))?;
+    let length = number(bytes, start + 8);
+    let (payload, end) = (start + CHUNK, start + CHUNK + length);
+    let section = section_of(bytes, start)?;
+
+    let room = most.checked_sub(bytes.len() - length)?.max(length);
+    let mut changed = bytes[payload..end].to_vec();
+    changed.resize(room, 0);
+    let now = match room {
+        0 => 0,
+        _ => change(&mut changed, length, room),
+    };
+    let mut stream = [&bytes[..payload], &changed[..now], &bytes[end..]].concat();
+    put(&mut stream, start + 8, now);
+    let section_length = (number(bytes, section) + now).saturating_sub(length);
+    put(&mut stream, section, section_length);
+    stream[MODEL_ID..MODEL_ID + 16].copy_from_slice(&MODEL.id());
+    seal::seal(&mut stream);
+    (stream.len() <= most).then_some(stream)
+}
+
+/// Where the header tells the length of the section that holds the byte `at`.
+fn section_of(bytes: &[u8], at: usize) -> Option<usize> {
+    let (levels, end) = seal::header_end(bytes)?;
+    let mut section_end = end + 4;
+    (0..2 * levels)
+        .map(|i| FIXED + 4 * levels + 4 * i)
+        .find(|&section| {
+            section_end = section_end.saturating_add(number(bytes, section));
+            at < section_end
+        })
+}
+
+fn number(bytes: &[u8], at: usize) -> usize {
+    let bytes = [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]];
+    u32::from_le_bytes(bytes) as usize
+}
+
+fn put(bytes: &mut [u8], at: usize, number: usize) {
+    bytes[at..at + 4].copy_from_slice(&(number as u32).to_le_bytes());
+}
+
+#[cfg(test)]
+mod tests {
+    use b2p::Limits;
+    use b2p::bitstream::Stream;
+
+    use super::*;
+    use crate::seeds::seeds;
+
+    #[test]
+    fn a_stream_whose_payload_grows_or_shrinks_still_fits_together() {
+        let mut changed = 0;
+        for stream in seeds("stream") {
+            let parsed = Stream::parse(&stream, &Limits::default()).expect("a stream");
+            assert!(parsed.damage().is_none());
+            for which in 0..seal::chunks(&stream).len() as u32 {
+                let mut longer = |data: &mut [u8], size: usize, _| {
+                    data[size..size + 3].copy_from_slice(b"abc");
+                    size + 3
+                };
+                let mut shorter = |data: &mut [u8], size: usize, _| {
+                    data[..size].reverse();
+                    // The first eight bytes of a level's features are their hash.
+                    size - size.min(3).min(size.saturating_sub(8))
+                };
+                let changes: [Change; 2] = [&mut longer, &mut shorter];
+                for change in changes {
+                    let stream = with_other_payload(&stream, 4000, which, change);
+                    let stream = stream.expect("it has chunks");
+                    let parsed = Stream::parse(&stream, &Limits::default()).expect("a stream");
+                    assert!(parsed.damage().is_none(), "{:?}", parsed.damage());
+                    changed += 1;
+                }
+            }
+        }
+        assert!(changed > 20);
+    }
+}
