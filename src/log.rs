@@ -41,7 +41,7 @@ impl<'a> Log<'a> {
     /// Runs a step that works on `count` items.
     ///
     /// # Errors
-    /// Those of `run`; the step is then not recorded.
+    /// The [`crate::Error`] of `run`; the step is then not recorded.
     pub fn step<T>(
         &mut self,
         name: impl Into<String>,

@@ -196,11 +196,14 @@ fn every_public_function_that_can_fail_says_how() {
             }
             looked_at += 1;
             let above = lines[..number - 1].iter().rev();
-            let documented = above
+            let docs: Vec<&str> = above
                 .map(|line| line.trim_start())
                 .take_while(|line| line.starts_with("///") || line.starts_with("#["))
-                .any(|line| line == "/// # Errors");
-            if !documented {
+                .collect();
+            // Upwards: what follows the heading comes first. It links to errors, or to a function that has the same.
+            let heading = docs.iter().position(|line| *line == "/// # Errors");
+            let says = heading.is_some_and(|end| docs[..end].iter().any(|l| l.contains("[`")));
+            if !says {
                 faults.push(format!("{}:{number}: {signature}", named(file)));
             }
         }

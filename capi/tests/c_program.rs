@@ -84,6 +84,10 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     } else {
         println!("NOT RUN: there is no valgrind");
     }
+    assert!(
+        programs.len() > 1,
+        "nothing here watches a program's memory"
+    );
     for (how, mut program) in programs {
         program.arg(at("model")).arg(at("stream"));
         let output = program.output().expect("the program starts");

@@ -21,7 +21,7 @@ impl Deref for MappedFile {
 /// Other programs must not shrink or overwrite the file meanwhile: its bytes would change under the reader.
 ///
 /// # Errors
-/// What the system says: no such file, no permission, not a regular file.
+/// What the system says, as an [`io::Error`]: no such file, no permission, not a regular file.
 pub fn map_file(path: &Path) -> io::Result<MappedFile> {
     let file = File::open(path)?;
     // SAFETY: the mapping is private and read-only, so nothing this process does can change it. Another process that truncates

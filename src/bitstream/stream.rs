@@ -94,7 +94,7 @@ impl<'a> Stream<'a> {
     /// The stream, if it is whole or ends just where one of its levels ends.
     ///
     /// # Errors
-    /// The damage.
+    /// The [`Stream::damage`].
     pub fn intact(self) -> Result<Self> {
         let end = self.deepest().map(|level| self.header.prefix_bytes(level));
         match self.damage {

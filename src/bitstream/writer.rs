@@ -101,7 +101,7 @@ impl Writer {
     /// The stream, read once to see that every level is whole.
     ///
     /// # Errors
-    /// What the reader finds wrong: levels missing, out of order, or with other voxel counts than the header's.
+    /// Those of [`Stream::parse`], or the [`Stream::damage`]: levels missing, out of order, or with other voxel counts than the header's.
     pub fn finish(self) -> Result<Vec<u8>> {
         let mut bytes = self.header.write();
         bytes.extend(self.body);

@@ -78,7 +78,8 @@ impl Calibration {
     /// Measures with a stream and its model, on the rayon pool that the caller is in; `say` is told what is being done.
     ///
     /// # Errors
-    /// Those of decoding and drawing.
+    /// Those of [`Decoder::decode`](crate::decoder::Decoder::decode) and
+    /// [`Renderer::render`](crate::pixels::Renderer::render); [`Error::Usage`] if no level has Gaussians.
     pub fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
         let header = Header::parse(subject.stream, subject.limits)?;
         let model = (subject.model)()?;

@@ -164,7 +164,8 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
 /// Every effect on a scene that calls for it and on one that doesn't, on and off in turns.
 ///
 /// # Errors
-/// Those of decoding and drawing.
+/// Those of [`Decoder::decode`](crate::decoder::Decoder::decode) and
+/// [`Renderer::render`](crate::pixels::Renderer::render).
 pub fn effect_costs(subject: &Subject<'_>, options: &Options) -> Result<Vec<EffectCost>> {
     let cases = cases(subject, options)?;
     let mut times = vec![[Vec::new(), Vec::new()]; cases.len()];

@@ -52,7 +52,7 @@ impl CaseError {
 /// Every hard scene with every quality, and with the default one on every other instruction set.
 ///
 /// # Errors
-/// Those of drawing.
+/// Those of [`Renderer::render`](crate::pixels::Renderer::render).
 pub fn renderer_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
     let best = Isa::detect();
     let mut settings: Vec<(String, Quality, Isa)> = QUALITIES
@@ -92,7 +92,8 @@ const LEVEL: u8 = 5;
 /// The model's generators on features that are hard to compute with, in every precision.
 ///
 /// # Errors
-/// Those of loading the model, and of generating.
+/// Those of [`Model::from_bytes`](crate::network::Model::from_bytes), of [`Model::generate`](crate::network::Model::generate), and of
+/// [`Renderer::render`](crate::pixels::Renderer::render).
 pub fn network_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
     let model = (subject.model)()?;
     let mut others = Vec::new();

@@ -21,7 +21,7 @@ td small,p small{color:#6b7280}svg{max-width:100%;height:auto}.crops td{text-ali
 /// The page: plot, tables, and cut-outs of the worst differences.
 ///
 /// # Errors
-/// Those of writing pictures.
+/// Those of [`Image::to_png`](crate::pixels::Image::to_png).
 pub fn page(report: &Report) -> Result<String> {
     let machine = &report.machine;
     let [width, height] = report.size;

@@ -107,7 +107,7 @@ fn orbit(radius: f64, side: u32) -> Result<Camera> {
 /// What has broken renderers, each small enough to be drawn in double precision in a moment.
 ///
 /// # Errors
-/// None: every camera is one.
+/// [`Error::Usage`](crate::Error::Usage) if one of the cameras were none, as they all are.
 pub fn hard_scenes() -> Result<Vec<Scene>> {
     let scene = |name, gaussians, camera| Scene {
         name,
