@@ -30,7 +30,7 @@ pub fn chunks(bytes: &[u8]) -> Vec<usize> {
 fn chunk_end(bytes: &[u8], at: usize) -> Option<usize> {
     let length = bytes.get(at + 8..at + 12)?;
     let length = u32::from_le_bytes([length[0], length[1], length[2], length[3]]);
-    let end = at + CHUNK + length as usize;
+    let end = (at + CHUNK).checked_add(length as usize)?;
     (end <= bytes.len()).then_some(end)
 }
 
