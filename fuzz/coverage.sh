@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Which share of each module's lines the fuzz targets reach on what is committed: the corpus, and changed seeds as `cargo test` makes them.
+# Which share of each module's lines the fuzz targets reach on the corpus that is committed.
 #
 #     fuzz/coverage.sh           a table by module, then the files
 #     fuzz/coverage.sh FILE …    the lines of these files that are never reached, for example src/geometry/octree.rs
@@ -14,7 +14,7 @@ mkdir -p $out
 if [ $# -eq 0 ]; then
     rm -f $out/*.profraw
     export RUSTFLAGS="-C instrument-coverage" LLVM_PROFILE_FILE="$PWD/$out/%p-%m.profraw"
-    cargo test --locked --manifest-path fuzz/Cargo.toml --target-dir $out --test replay
+    cargo test --locked --manifest-path fuzz/Cargo.toml --target-dir $out --test replay -- every_input_that_is_kept_passes
     "$tools/llvm-profdata" merge -sparse $out/*.profraw -o $out/all.profdata
 fi
 program=$(find $out/debug/deps -name 'replay-*' -type f -executable -printf '%T@ %p\n' | sort -n | tail -n 1 | cut -d' ' -f2)
@@ -22,7 +22,7 @@ if [ $# -gt 0 ]; then
     "$tools/llvm-cov" show "$program" -instr-profile=$out/all.profdata "$@" | grep -E '^ *[0-9]+\| *0\|'
     exit
 fi
-"$tools/llvm-cov" report "$program" -instr-profile=$out/all.profdata | tee $out/files.txt |
+"$tools/llvm-cov" report "$program" -instr-profile=$out/all.profdata | sed "s|^${PWD#/}/||" | tee $out/files.txt |
     awk '$1 ~ /^src\// || $1 ~ /^kernels\/src\// { split($1, part, "/"); module = part[1] == "src" ? part[2] : "kernels"
             lines[module] += $8; missed[module] += $9 }
         END { for (module in lines) printf "%-12s %5d lines  %5.1f %%\n", module, lines[module], 100 - 100 * missed[module] / lines[module] }' | sort
