@@ -2,9 +2,10 @@
 
 use crate::f16;
 
+use crate::exact::{LIMIT, scaled};
 use crate::isa::Isa;
 use crate::machine::with_halves;
-use crate::rows::{PANEL, panel, store};
+use crate::rows::{Lanes, PANEL, panel, store};
 
 /// The largest finite f16.
 pub(crate) const MAX: f32 = 65504.0;
@@ -32,7 +33,7 @@ pub fn to_f16(isa: Isa, from: &[f32], to: &mut [f16]) {
     with_halves!(isa, fn narrow<>(from: &[f32], to: &mut [f16]));
 }
 
-/// Conversion of a panel between f32 and f16, as [`to_f32`] and [`to_f16`].
+/// Conversion of a panel between f32 and f16, as [`to_f32`] and [`to_f16`], and from sums to i16.
 ///
 /// # Safety
 /// Its functions may use instructions that not every processor has; they must only be called where it has them.
@@ -41,6 +42,47 @@ pub(crate) unsafe trait Halves {
     unsafe fn widen(from: &[f16; PANEL], to: &mut [f32; PANEL]);
     /// Rounding, saturating.
     unsafe fn narrow(from: &[f32; PANEL], to: &mut [f16; PANEL]);
+
+    /// `(sum + bias) >> shift`, wrapping, and clamped to ±[`LIMIT`].
+    #[inline(always)]
+    unsafe fn shift(sums: &Lanes, bias: &[i32; PANEL], shift: &[u32; PANEL]) -> [i16; PANEL] {
+        let sums = sums.i32();
+        std::array::from_fn(|j| {
+            let value = sums[j].wrapping_add(bias[j]).wrapping_shr(shift[j]);
+            value.clamp(-i32::from(LIMIT), i32::from(LIMIT)) as i16
+        })
+    }
+
+    /// `sum · factor + bias` rounded, halves to even, and clamped to ±[`LIMIT`]; no number is 0.
+    #[inline(always)]
+    unsafe fn round(sums: &Lanes, factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [i16; PANEL] {
+        let (values, limit) = (scaled(sums, factor, bias), f32::from(LIMIT));
+        std::array::from_fn(|j| {
+            // As by `as`, which would keep the compiler from using vectors.
+            let value = if values[j].is_nan() { 0.0 } else { values[j] };
+            let value = value.clamp(-limit, limit).round_ties_even();
+            // SAFETY: it is a number, and no larger than the limit.
+            (unsafe { value.to_int_unchecked::<i32>() }) as i16
+        })
+    }
+
+    /// Adds what is given, and clamps between `floor` and [`LIMIT`].
+    #[inline(always)]
+    unsafe fn settle(
+        mut q: [i16; PANEL],
+        residual: Option<&[i16; PANEL]>,
+        floor: i16,
+    ) -> [i16; PANEL] {
+        if let Some(residual) = residual {
+            for (q, x) in q.iter_mut().zip(residual) {
+                *q = q.saturating_add(*x).min(LIMIT);
+            }
+        }
+        for q in &mut q {
+            *q = (*q).max(floor);
+        }
+        q
+    }
 }
 
 /// In integer steps that any compiler turns into SIMD.

@@ -3,13 +3,18 @@
 #[cfg(target_arch = "x86_64")]
 use std::sync::OnceLock;
 
+use crate::convert::Halves;
 use crate::isa::{Isa, dispatch};
 #[cfg(target_arch = "x86_64")]
 use crate::machine::amx;
+use crate::machine::{fetch, halves_mut, with_halves};
 use crate::norms::{Energy, Gains, Norms};
-use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
+use crate::plan::PlanTile;
+use crate::rows::{
+    AHEAD, Extents, Lanes, Output, PANEL, Scratch, panels, part, store_part, with_scratch,
+};
 use crate::taps::Taps;
-use crate::tile::{Arithmetic, Input, accumulate};
+use crate::tile::{Arithmetic, accumulate};
 
 /// The largest magnitude of an activation.
 pub const LIMIT: i16 = 2047;
@@ -174,18 +179,7 @@ impl ExactConv {
         first: usize,
         output: Output<'_, i16>,
     ) {
-        self.each_tile(
-            isa,
-            taps,
-            input,
-            first,
-            output,
-            |finish, sums, norms, output| {
-                dispatch!(isa, fn finish_tile(
-                    finish: &Finish, sums: &[Lanes], norms: &mut Norms, output: Tile<'_, i16>,
-                ));
-            },
-        );
+        self.each_tile(isa, taps, input, first, output);
     }
 
     /// As [`ExactConv::run`], but gives what would be rounded and clamped as it is.
@@ -208,28 +202,16 @@ impl ExactConv {
             !matches!(self.finish, Finish::Shift { .. }),
             "shifted results are no real numbers"
         );
-        self.each_tile(
-            isa,
-            taps,
-            input,
-            first,
-            output,
-            |finish, sums, norms, output| {
-                dispatch!(isa, fn finish_real_tile(
-                    finish: &Finish, sums: &[Lanes], norms: &mut Norms, output: Tile<'_, f32>,
-                ));
-            },
-        );
+        self.each_tile(isa, taps, input, first, output);
     }
 
-    fn each_tile<T>(
+    fn each_tile<T: Value>(
         &self,
         isa: Isa,
         taps: Taps<'_>,
         input: &[i16],
         first: usize,
         mut output: Output<'_, T, i16>,
-        finish: impl Fn(&Finish, &[Lanes], &mut Norms, Tile<'_, T>),
     ) {
         assert_eq!(
             taps.volume(),
@@ -244,59 +226,35 @@ impl ExactConv {
                     sums,
                     expanded,
                     norms,
-                    #[cfg(target_arch = "x86_64")]
                     planner,
                     #[cfg(target_arch = "x86_64")]
                     tiles,
-                    ..
                 } = scratch;
+                let plan = planner.plan(isa, &taps, [first, output.len()], tile);
                 #[cfg(target_arch = "x86_64")]
-                if isa.has_tiles()
-                    && let Some(weights) = self.tiles()
-                {
-                    let plan = planner.plan(isa, &taps, [first, output.len()], tile);
-                    if amx::integers::accumulate(isa, weights, plan, input, tiles, sums) {
-                        let masks = plan.masks();
-                        finish(
-                            &self.finish,
-                            sums,
-                            norms,
-                            Tile {
-                                output,
-                                cout,
-                                masks,
-                            },
-                        );
-                        continue;
-                    }
+                let done = isa.has_tiles()
+                    && self.tiles().is_some_and(|weights| {
+                        amx::integers::accumulate(isa, weights, plan, input, tiles, sums)
+                    });
+                #[cfg(not(target_arch = "x86_64"))]
+                let done = false;
+                if !done {
+                    accumulate(
+                        isa,
+                        Arithmetic::Integer,
+                        self.extents,
+                        &self.weights,
+                        plan,
+                        (input, pair_up),
+                        expanded,
+                        sums,
+                    );
                 }
-                let inputs = input.len() / self.extents.cin;
-                tile.fill(isa, &taps, first, output.len(), inputs);
-                let input = match self.extents.cin % 2 {
-                    0 => Input::Ready(input),
-                    _ => Input::Expand(input, pair_up),
-                };
-                accumulate(
-                    isa,
-                    Arithmetic::Integer,
-                    self.extents,
-                    &self.weights,
-                    tile,
-                    input,
-                    expanded,
-                    sums,
-                );
-                let masks = tile.masks();
-                finish(
-                    &self.finish,
-                    sums,
-                    norms,
-                    Tile {
-                        output,
-                        cout,
-                        masks,
-                    },
-                );
+                let (layer, tile) = (&self.finish, Tile { output, cout, plan });
+                let sums = &sums[..];
+                with_halves!(isa, fn finish_tile<T: Value>(
+                    layer: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, T>,
+                ));
             }
         });
     }
@@ -320,8 +278,8 @@ impl ExactConv {
 struct Tile<'a, T> {
     output: Output<'a, T, i16>,
     cout: usize,
-    /// For each row, the taps that read something.
-    masks: &'a [u64],
+    /// Which rows the sums are of, and the taps that read something for each.
+    plan: &'a PlanTile,
 }
 
 /// The half of a word that the pair's first or second value takes.
@@ -329,23 +287,103 @@ fn place(value: i16, which: usize) -> u32 {
     u32::from(value as u16) << (16 * (which ^ usize::from(cfg!(target_endian = "big"))))
 }
 
-/// An odd number of activations as pairs, each row's last having a zero.
-fn pair_up(_: Isa, input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
-    for (to, &row) in to.chunks_exact_mut(cin.div_ceil(2)).zip(rows) {
+/// Rows of activations as pairs; the last has a zero if their number is odd.
+fn pair_up(isa: Isa, input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
+    dispatch!(isa, fn pair_rows(input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]));
+}
+
+#[inline(always)]
+fn pair_rows(input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
+    let to = halves_mut(to).chunks_exact_mut(cin.next_multiple_of(2));
+    for (i, (to, &row)) in to.zip(rows).enumerate() {
+        if let Some(&next) = rows.get(i + AHEAD) {
+            fetch(&input[next as usize * cin..][..cin]);
+        }
+        let (to, odd) = to.split_at_mut(cin);
         let from = &input[row as usize * cin..][..cin];
-        for (to, pair) in to.iter_mut().zip(from.chunks(2)) {
-            *to = place(pair[0], 0) | pair.get(1).map_or(0, |&value| place(value, 1));
+        let ((whole, rest), (to, last)) = (from.as_chunks::<8>(), to.as_chunks_mut::<8>());
+        for (to, from) in to.iter_mut().zip(whole) {
+            *to = *from;
+        }
+        if !rest.is_empty() {
+            last.copy_from_slice(rest);
+        }
+        odd.fill(0);
+    }
+}
+
+/// What a layer ends in.
+trait Value: Copy + Send + Sync {
+    /// The results of panel `p`.
+    ///
+    /// # Safety
+    /// The processor must have `H`'s instructions.
+    unsafe fn results<H: Halves>(
+        p: usize,
+        layer: &Finish,
+        sums: &Lanes,
+        factors: &[[f32; PANEL]],
+        residual: Option<&[i16; PANEL]>,
+        relu: bool,
+    ) -> [Self; PANEL];
+}
+
+impl Value for i16 {
+    #[inline(always)]
+    unsafe fn results<H: Halves>(
+        p: usize,
+        layer: &Finish,
+        sums: &Lanes,
+        factors: &[[f32; PANEL]],
+        residual: Option<&[i16; PANEL]>,
+        relu: bool,
+    ) -> [i16; PANEL] {
+        let floor = if relu { 0 } else { -LIMIT };
+        // SAFETY: the caller's promise.
+        unsafe {
+            let q = match layer {
+                Finish::Shift { bias, shift } => H::shift(sums, &bias[p], &shift[p]),
+                Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => {
+                    H::round(sums, &factors[p], &bias[p])
+                }
+            };
+            H::settle(q, residual, floor)
         }
     }
 }
 
+impl Value for f32 {
+    #[inline(always)]
+    unsafe fn results<H: Halves>(
+        p: usize,
+        layer: &Finish,
+        sums: &Lanes,
+        factors: &[[f32; PANEL]],
+        _: Option<&[i16; PANEL]>,
+        relu: bool,
+    ) -> [f32; PANEL] {
+        let bias = match layer {
+            Finish::Shift { .. } => unreachable!("refused above"),
+            Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => bias,
+        };
+        let mut values = scaled(sums, &factors[p], &bias[p]);
+        if relu {
+            values.iter_mut().for_each(|value| *value = value.max(0.0));
+        }
+        values
+    }
+}
+
+/// # Safety
+/// The processor must have `H`'s instructions.
 #[inline(always)]
-fn finish_tile(finish: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, i16>) {
-    let Tile {
-        output,
-        cout,
-        masks,
-    } = tile;
+unsafe fn finish_tile<H: Halves, T: Value>(
+    layer: &Finish,
+    sums: &[Lanes],
+    norms: &mut Norms,
+    tile: Tile<'_, T>,
+) {
+    let Tile { output, cout, plan } = tile;
     let Output {
         rows,
         stride,
@@ -354,81 +392,31 @@ fn finish_tile(finish: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_
         relu,
     } = output;
     let panels = cout.div_ceil(PANEL);
-    let floor = if relu { 0 } else { -LIMIT };
-    let rows = rows.chunks_exact_mut(stride);
-    for (r, (row, sums)) in rows.zip(sums.chunks_exact(panels)).enumerate() {
-        let row = &mut row[column..column + cout];
-        let factors = finish.factors(norms, masks[r]);
-        let residual = residual.map(|all| &all[r * stride + column..][..cout]);
-        for (p, (row, sums)) in row.chunks_mut(PANEL).zip(sums).enumerate() {
-            let sums = sums.i32();
-            let mut q = match finish {
-                Finish::Shift { bias, shift } => shifted(sums, &bias[p], &shift[p]),
-                Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => {
-                    rounded(scaled(sums, &factors[p], &bias[p]))
-                }
-            };
-            if let Some(residual) = residual {
-                let x = panel(&residual[p * PANEL..][..row.len()]);
-                for (q, x) in q.iter_mut().zip(x) {
-                    *q = q.saturating_add(x).min(LIMIT);
-                }
-            }
-            for q in &mut q {
-                *q = (*q).max(floor);
-            }
-            store(q, row);
+    for (row, (&position, &mask)) in plan.positions().iter().zip(plan.masks()).enumerate() {
+        let sums = &sums[usize::from(position) * panels..][..panels];
+        let factors = layer.factors(norms, mask);
+        let first = row * stride + column;
+        let residual = residual.map(|all| all[first..][..cout].as_chunks::<PANEL>());
+        let (whole, rest) = rows[first..][..cout].as_chunks_mut::<PANEL>();
+        let last = whole.len();
+        for (p, to) in whole.iter_mut().enumerate() {
+            let residual = residual.map(|(whole, _)| &whole[p]);
+            // SAFETY: the caller's promise.
+            *to = unsafe { T::results::<H>(p, layer, &sums[p], factors, residual, relu) };
+        }
+        if !rest.is_empty() {
+            let residual = residual.map(|(_, rest)| part(rest));
+            let residual = residual.as_ref();
+            // SAFETY: the caller's promise.
+            let results =
+                unsafe { T::results::<H>(last, layer, &sums[last], factors, residual, relu) };
+            store_part(results, rest);
         }
     }
 }
 
 #[inline(always)]
-fn finish_real_tile(finish: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, f32>) {
-    let Tile {
-        output,
-        cout,
-        masks,
-    } = tile;
-    let panels = cout.div_ceil(PANEL);
-    let rows = output.rows.chunks_exact_mut(output.stride);
-    for (r, (row, sums)) in rows.zip(sums.chunks_exact(panels)).enumerate() {
-        let row = &mut row[output.column..output.column + cout];
-        let factors = finish.factors(norms, masks[r]);
-        for (p, (row, sums)) in row.chunks_mut(PANEL).zip(sums).enumerate() {
-            let bias = match finish {
-                Finish::Shift { .. } => unreachable!("refused above"),
-                Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => bias,
-            };
-            let mut values = scaled(sums.i32(), &factors[p], &bias[p]);
-            if output.relu {
-                values.iter_mut().for_each(|value| *value = value.max(0.0));
-            }
-            store(values, row);
-        }
-    }
-}
-
-#[inline(always)]
-fn shifted(sums: [i32; PANEL], bias: &[i32; PANEL], shift: &[u32; PANEL]) -> [i16; PANEL] {
-    std::array::from_fn(|j| {
-        let value = sums[j].wrapping_add(bias[j]).wrapping_shr(shift[j]);
-        value.clamp(-i32::from(LIMIT), i32::from(LIMIT)) as i16
-    })
-}
-
-#[inline(always)]
-fn scaled(sums: [i32; PANEL], factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [f32; PANEL] {
+pub(crate) fn scaled(sums: &Lanes, factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [f32; PANEL] {
+    let sums = sums.i32();
     std::array::from_fn(|j| sums[j] as f32 * factor[j] + bias[j])
-}
-
-#[inline(always)]
-fn rounded(values: [f32; PANEL]) -> [i16; PANEL] {
-    let limit = f32::from(LIMIT);
-    std::array::from_fn(|j| {
-        // Becomes 0, as by `as`, which would keep the compiler from using vectors.
-        let value = if values[j].is_nan() { 0.0 } else { values[j] };
-        let value = value.clamp(-limit, limit).round_ties_even();
-        // SAFETY: it is a number, and no larger than the limit.
-        (unsafe { value.to_int_unchecked::<i32>() }) as i16
-    })
 }

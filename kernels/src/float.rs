@@ -11,9 +11,10 @@ use crate::isa::Isa;
 use crate::machine::amx;
 use crate::machine::{self, with_halves};
 use crate::norms::{Gains, Norms};
+use crate::plan::PlanTile;
 use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
 use crate::taps::Taps;
-use crate::tile::{Arithmetic, Input, accumulate};
+use crate::tile::{Arithmetic, Expand, accumulate};
 
 /// What happens to sums.
 #[derive(Debug, Clone)]
@@ -174,7 +175,7 @@ impl FloatConv {
     }
 
     /// What to multiply, and how to prepare what it is multiplied by.
-    fn chosen(&self, isa: Isa) -> (Arithmetic, &[Lanes], Expand) {
+    fn chosen(&self, isa: Isa) -> (Arithmetic, &[Lanes], Expand<f16>) {
         #[cfg(target_arch = "x86_64")]
         if self.precision() == Precision::Bf16 && isa.has_bf16() {
             return (
@@ -214,39 +215,36 @@ impl FloatConv {
                 sums,
                 expanded,
                 norms,
-                #[cfg(target_arch = "x86_64")]
                 planner,
                 #[cfg(target_arch = "x86_64")]
                 tiles,
-                ..
             } = scratch;
-            let inputs = input.len() / self.extents.cin;
             for (row, output) in output.tiles() {
+                let plan = planner.plan(isa, &taps, [first + row, output.len()], tile);
                 #[cfg(target_arch = "x86_64")]
-                if isa.has_tiles() && self.precision != Precision::F32 {
-                    let plan = planner.plan(isa, &taps, [first + row, output.len()], tile);
+                let done = isa.has_tiles() && self.precision != Precision::F32;
+                #[cfg(target_arch = "x86_64")]
+                if done {
                     amx::brain::accumulate(isa, self.tiles(), plan, input, tiles, sums);
-                    let (conv, norms, sums, masks) = (self, &mut *norms, &sums[..], plan.masks());
-                    with_halves!(isa, fn finish_tile<T: FloatOut>(
-                        conv: &FloatConv, norms: &mut Norms, sums: &[Lanes], masks: &[u64], output: Output<'_, T, f16>,
-                    ));
-                    continue;
                 }
-                tile.fill(isa, &taps, first + row, output.len(), inputs);
-                let (arithmetic, weights, expand) = self.chosen(isa);
-                accumulate(
-                    isa,
-                    arithmetic,
-                    self.extents,
-                    weights,
-                    tile,
-                    Input::Expand(input, expand),
-                    expanded,
-                    sums,
-                );
-                let (conv, norms, sums, masks) = (self, &mut *norms, &sums[..], tile.masks());
+                #[cfg(not(target_arch = "x86_64"))]
+                let done = false;
+                if !done {
+                    let (arithmetic, weights, expand) = self.chosen(isa);
+                    accumulate(
+                        isa,
+                        arithmetic,
+                        self.extents,
+                        weights,
+                        plan,
+                        (input, expand),
+                        expanded,
+                        sums,
+                    );
+                }
+                let (conv, norms, sums) = (self, &mut *norms, &sums[..]);
                 with_halves!(isa, fn finish_tile<T: FloatOut>(
-                    conv: &FloatConv, norms: &mut Norms, sums: &[Lanes], masks: &[u64], output: Output<'_, T, f16>,
+                    conv: &FloatConv, norms: &mut Norms, sums: &[Lanes], plan: &PlanTile, output: Output<'_, T, f16>,
                 ));
             }
         });
@@ -266,9 +264,6 @@ impl FloatConv {
         })
     }
 }
-
-/// Writes rows of the input, of so many values each, as words.
-type Expand = fn(Isa, &[f16], &[u32], usize, &mut [u32]);
 
 /// Rows as f32.
 fn widen(isa: Isa, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
@@ -292,7 +287,7 @@ unsafe fn finish_tile<H: Halves, T: FloatOut>(
     conv: &FloatConv,
     norms: &mut Norms,
     sums: &[Lanes],
-    masks: &[u64],
+    plan: &PlanTile,
     output: Output<'_, T, f16>,
 ) {
     let Output {
@@ -304,17 +299,11 @@ unsafe fn finish_tile<H: Halves, T: FloatOut>(
     } = output;
     let Extents { cout, .. } = conv.extents;
     let panels = conv.extents.panels();
-    for (r, (row, sums)) in rows
-        .chunks_exact_mut(stride)
-        .zip(sums.chunks_exact(panels))
-        .enumerate()
-    {
-        let row = &mut row[column..column + cout];
-        let residual = residual.map(|all| &all[r * stride + column..][..cout]);
-        let factors = conv
-            .invariant
-            .as_ref()
-            .map(|gains| norms.of(gains, masks[r]));
+    for (row, (&position, &mask)) in plan.positions().iter().zip(plan.masks()).enumerate() {
+        let sums = &sums[usize::from(position) * panels..][..panels];
+        let residual = residual.map(|all| &all[row * stride + column..][..cout]);
+        let row = &mut rows[row * stride + column..][..cout];
+        let factors = conv.invariant.as_ref().map(|gains| norms.of(gains, mask));
         let panels = row.chunks_mut(PANEL).zip(sums).zip(&conv.bias);
         for (p, ((row, sums), bias)) in panels.enumerate() {
             let mut sums = sums.f32();

@@ -23,6 +23,9 @@ pub(crate) enum Level {
     Neon,
 }
 
+/// The smallest [`Isa::group`].
+pub(crate) const MIN_GROUP: usize = 4;
+
 impl Isa {
     /// What the target guarantees; every machine has it.
     pub const SCALAR: Isa = Isa(Level::Scalar);
@@ -87,7 +90,19 @@ impl Isa {
         false
     }
 
-    /// Whether there are matrix tiles of bytes and bf16 (AMX), which a [`crate::Plan`] is for.
+    /// Output rows that are multiplied by the same taps: those of a matrix tile, or as many as keep the registers busy. A multiple of
+    /// [`MIN_GROUP`].
+    pub(crate) fn group(self) -> usize {
+        match self.0 {
+            #[cfg(target_arch = "x86_64")]
+            Level::Amx => 16,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => 8,
+            _ => MIN_GROUP,
+        }
+    }
+
+    /// Whether there are matrix tiles of bytes and bf16 (AMX).
     pub fn has_tiles(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         if self.0 == Level::Amx {

@@ -3,8 +3,8 @@
 //! Every `unsafe` block of the project lives here, each with its reason. Nothing here knows of streams, levels or Gaussians.
 //!
 //! A sparse convolution is one loop ([`ExactConv`] in integers, [`FloatConv`] in floats): for every output row, the rows its
-//! [`Taps`] name are multiplied by that tap's weights and added up, in blocks of rows and channels that fill the registers of
-//! the [`Isa`]; with matrix tiles, in tiles that stay there over all taps ([`Plan`]). All of them give the same bits: integers wrap,
+//! [`Taps`] name are multiplied by that tap's weights and added up, in groups of rows with like neighbours ([`Plan`]) whose sums stay in the
+//! registers, or matrix tiles, of the [`Isa`] while the taps go by. All of them give the same bits: integers wrap,
 //! products of two f16 are exact in f32, fused or not, and each sum is added up in the same order. Only [`Precision::Bf16`]
 //! depends on the machine.
 
@@ -21,7 +21,6 @@ mod isa;
 mod machine;
 mod map;
 mod norms;
-#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
 mod plan;
 mod rows;
 mod taps;

@@ -14,14 +14,32 @@ const NONE: u64 = u64::MAX;
 pub(crate) struct Gains<E> {
     /// Tells it from all others but its clones.
     id: u64,
-    /// `Σ weight²` over the input channels, `[tap][panel]`.
+    /// `Σ weight²` over the input channels of some of [`PART`] taps, by which of them: `[panel][taps / PART][1 << PART]`.
     energy: Vec<[E; PANEL]>,
     gain: Vec<[f32; PANEL]>,
 }
 
+/// Taps whose weights are summed ahead, in all combinations.
+const PART: usize = 4;
+
 impl<E: Energy> Gains<E> {
-    pub fn new(energy: Vec<[E; PANEL]>, gain: Vec<[f32; PANEL]>) -> Self {
+    /// `taps` holds `Σ weight²` over the input channels, `[tap][panel]`.
+    pub fn new(taps: Vec<[E; PANEL]>, gain: Vec<[f32; PANEL]>) -> Self {
         static LAST: AtomicU64 = AtomicU64::new(0);
+        let panels = gain.len();
+        let mut energy = Vec::with_capacity(taps.len().div_ceil(PART) << PART);
+        for panel in 0..panels {
+            for taps in taps.chunks(PART * panels) {
+                for some in 0..1 << PART {
+                    let mut sum = [E::default(); PANEL];
+                    let taps = taps.iter().skip(panel).step_by(panels).enumerate();
+                    for (_, tap) in taps.filter(|(tap, _)| some >> tap & 1 == 1) {
+                        add(&mut sum, tap);
+                    }
+                    energy.push(sum);
+                }
+            }
+        }
         Gains {
             id: LAST.fetch_add(1, Ordering::Relaxed) + 1,
             energy,
@@ -32,20 +50,26 @@ impl<E: Energy> Gains<E> {
     /// The gains over the norms of the weights of some taps.
     #[inline(always)]
     fn factors(&self, mask: u64, to: &mut [[f32; PANEL]]) {
-        let panels = self.gain.len();
-        for (panel, (to, gain)) in to.iter_mut().zip(&self.gain).enumerate() {
+        let panels = self
+            .energy
+            .chunks_exact(self.energy.len() / self.gain.len());
+        for ((to, gain), parts) in to.iter_mut().zip(&self.gain).zip(panels) {
             let mut sum = [E::default(); PANEL];
-            let mut rest = mask;
-            while rest != 0 {
-                let tap = rest.trailing_zeros() as usize;
-                rest &= rest - 1;
-                let energy = &self.energy[tap * panels + panel];
-                for (sum, &energy) in sum.iter_mut().zip(energy) {
-                    *sum = sum.add(energy);
-                }
+            for (part, energy) in parts.chunks_exact(1 << PART).enumerate() {
+                add(
+                    &mut sum,
+                    &energy[(mask >> (part * PART)) as usize % (1 << PART)],
+                );
             }
             *to = std::array::from_fn(|lane| sum[lane].factor(gain[lane]));
         }
+    }
+}
+
+#[inline(always)]
+fn add<E: Energy>(sum: &mut [E; PANEL], other: &[E; PANEL]) {
+    for (sum, &other) in sum.iter_mut().zip(other) {
+        *sum = sum.add(other);
     }
 }
 

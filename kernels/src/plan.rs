@@ -1,17 +1,14 @@
-//! Kernel maps as matrix tiles want them: few input rows, each known by a short number, and output rows of like neighbours together.
+//! Kernel maps as layers read them: few input rows, each known by a short number, and output rows of like neighbours together.
 
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use crate::isa::Isa;
+use crate::isa::{Isa, MIN_GROUP};
 use crate::rows::TILE;
 use crate::taps::{Taps, TileTaps};
 
-/// Output rows of a group: those of one matrix tile.
-pub(crate) const GROUP: usize = 16;
-
-/// A kernel map arranged for matrix tiles, part by part as layers first read it. It pays where a map serves several layers and the
-/// [`Isa`] has such tiles; results are the same without.
+/// A kernel map arranged for the layers that read it, part by part as they first do. It pays where a map serves several layers; results are
+/// the same without.
 #[derive(Debug, Clone)]
 pub struct Plan(Vec<OnceLock<PlanTile>>);
 
@@ -24,9 +21,12 @@ impl Plan {
 
 /// Up to [`TILE`] rows of a kernel map, arranged.
 ///
-/// Rows are sorted by which taps they use, and cut into groups of sixteen: what a group multiplies is the taps that any of its rows uses.
+/// Rows are sorted by which taps they use, and cut into groups of [`Isa::group`]: what a group multiplies is the taps that any of its rows
+/// uses.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct PlanTile {
+    /// Rows of a group.
+    group: usize,
     /// Taps of the kernel.
     volume: usize,
     /// The input rows that are read, each once.
@@ -37,33 +37,37 @@ pub(crate) struct PlanTile {
     masks: Vec<u64>,
     /// The rows in the order of the groups.
     order: Vec<u16>,
+    /// Where each row is in that order.
+    positions: Vec<u16>,
     /// For each group, the taps that any of its rows uses.
     unions: Vec<u64>,
     /// Where each group's steps begin.
     starts: Vec<u32>,
     /// Each step's tap; they ascend within a group.
     taps: Vec<u8>,
-    /// For each step, which of `inputs` the group's rows read; their number for nothing. One more, of nothing, comes last.
-    places: Vec<[u16; GROUP]>,
+    /// For each step and row of its group, which of `inputs` it reads; their number for nothing. One more step, of nothing, comes last.
+    places: Vec<u16>,
 }
 
 impl PlanTile {
     /// Arranges a tile's rows.
-    fn arrange(&mut self, taps: &TileTaps, numbers: &mut Numbers) {
+    fn arrange(&mut self, group: usize, taps: &TileTaps, numbers: &mut Numbers) {
         let (masks, volume) = (taps.masks(), taps.volume());
+        self.group = group;
         self.volume = volume;
         self.end = taps.end();
         self.masks.clear();
         self.masks.extend_from_slice(masks);
-        self.sort(volume);
-        let mut position = [0u16; TILE];
+        self.sort();
+        self.positions.clear();
+        self.positions.resize(masks.len(), 0);
         for (at, &row) in (0..).zip(&self.order) {
-            position[usize::from(row)] = at;
+            self.positions[usize::from(row)] = at;
         }
         self.unions.clear();
         self.starts.clear();
         self.taps.clear();
-        for group in self.order.chunks(GROUP) {
+        for group in self.order.chunks(group) {
             let rows = group.iter().map(|&row| masks[usize::from(row)]);
             let mut union = rows.fold(0, |union, mask| union | mask);
             self.unions.push(union);
@@ -74,25 +78,50 @@ impl PlanTile {
             }
         }
 
-        numbers.clear(&mut self.inputs);
+        let near = (0..volume).find_map(|k| taps.of(k).inputs.first());
+        numbers.clear(near.copied().unwrap_or(0), &mut self.inputs);
         self.places.clear();
-        self.places.resize(self.taps.len() + 1, [u16::MAX; GROUP]);
+        self.places.resize((self.taps.len() + 1) * group, u16::MAX);
         for k in 0..volume {
-            let mut homes = [0; TILE / GROUP];
+            let mut homes = [0; TILE / MIN_GROUP];
             for (group, home) in homes.iter_mut().take(self.unions.len()).enumerate() {
                 *home = self.step(group, k);
             }
             let pairs = taps.of(k);
             for (&input, &row) in pairs.inputs.iter().zip(pairs.rows) {
-                let at = usize::from(position[row as usize]);
+                let at = usize::from(self.positions[row as usize]);
                 let place = numbers.of(input, &mut self.inputs);
-                self.places[homes[at / GROUP]][at % GROUP] = place;
+                self.places[homes[at / group] * group + at % group] = place;
             }
         }
         let none = self.inputs.len() as u16;
-        for place in self.places.as_flattened_mut() {
+        for place in &mut self.places {
             *place = (*place).min(none);
         }
+    }
+
+    /// Arranges `count` rows from `first` on, of which each reads the input row of its own number, through the only tap.
+    fn arrange_same(&mut self, group: usize, first: usize, count: usize) {
+        if (self.group, self.masks.len()) != (group, count) {
+            let groups = count.div_ceil(group);
+            let rows = (groups + 1) * group;
+            *self = PlanTile {
+                group,
+                volume: 1,
+                inputs: Vec::new(),
+                end: 0,
+                masks: vec![1; count],
+                order: (0..count as u16).collect(),
+                positions: (0..count as u16).collect(),
+                unions: vec![1; groups],
+                starts: (0..groups as u32).collect(),
+                taps: vec![0; groups],
+                places: (0..rows).map(|row| row.min(count) as u16).collect(),
+            };
+        }
+        self.end = first + count;
+        self.inputs.clear();
+        self.inputs.extend(first as u32..self.end as u32);
     }
 
     /// The first step of a group whose tap is `k` or beyond.
@@ -102,12 +131,8 @@ impl PlanTile {
     }
 
     /// Orders rows by their masks in reflected binary, the taps that half of the rows use first: neighbours then differ in few taps.
-    fn sort(&mut self, volume: usize) {
-        self.order.clear();
-        self.order.extend(0..self.masks.len() as u16);
-        if volume == 1 {
-            return;
-        }
+    fn sort(&mut self) {
+        let rows = self.masks.len() as i32;
         let mut uses = [0i32; 64];
         for &mask in &self.masks {
             let mut rest = mask;
@@ -116,18 +141,19 @@ impl PlanTile {
                 rest &= rest - 1;
             }
         }
-        let rows = self.masks.len() as i32;
-        let mut taps: Vec<u32> = (0..volume as u32).collect();
+        let mut taps: Vec<u32> = (0..self.volume as u32).collect();
         taps.sort_by_key(|&k| (2 * uses[k as usize] - rows).abs());
-        let mut keys: Vec<u64> = Vec::with_capacity(self.masks.len());
-        for &mask in &self.masks {
+        let mut keys: Vec<(u64, u16)> = Vec::with_capacity(self.masks.len());
+        for (row, &mask) in (0..).zip(&self.masks) {
             let mut key = taps.iter().fold(0, |key, k| key << 1 | (mask >> k & 1));
             for shift in [1, 2, 4, 8, 16, 32] {
                 key ^= key >> shift;
             }
-            keys.push(key);
+            keys.push((key, row));
         }
-        self.order.sort_by_key(|&row| keys[usize::from(row)]);
+        keys.sort_unstable();
+        self.order.clear();
+        self.order.extend(keys.iter().map(|&(_, row)| row));
     }
 
     /// Taps of the kernel.
@@ -155,17 +181,22 @@ impl PlanTile {
         self.unions.len()
     }
 
-    /// The tile's rows of a group.
-    pub(crate) fn rows(&self, group: usize) -> &[u16] {
-        let rows = &self.order[group * GROUP..];
-        &rows[..rows.len().min(GROUP)]
+    /// Rows of a group.
+    pub(crate) fn group(&self) -> usize {
+        self.group
+    }
+
+    /// For each of the tile's rows, its place in the order of the groups.
+    pub(crate) fn positions(&self) -> &[u16] {
+        &self.positions
     }
 
     /// What a group multiplies of some taps, ascending: the taps it uses, and for each of them the places of the input rows, followed by
     /// one more.
-    pub(crate) fn steps(&self, group: usize, taps: Range<usize>) -> (&[u8], &[[u16; GROUP]]) {
+    pub(crate) fn steps(&self, group: usize, taps: Range<usize>) -> (&[u8], &[u16]) {
         let (start, end) = (self.step(group, taps.start), self.step(group, taps.end));
-        (&self.taps[start..end], &self.places[start..=end])
+        let places = start * self.group..(end + 1) * self.group;
+        (&self.taps[start..end], &self.places[places])
     }
 }
 
@@ -174,6 +205,7 @@ impl PlanTile {
 pub(crate) struct Planner {
     numbers: Numbers,
     own: PlanTile,
+    same: PlanTile,
 }
 
 impl Planner {
@@ -185,10 +217,15 @@ impl Planner {
         [first, count]: [usize; 2],
         scratch: &mut TileTaps,
     ) -> &'a PlanTile {
-        let Planner { numbers, own } = self;
+        let Planner { numbers, own, same } = self;
+        let group = isa.group();
+        if let Taps::Same = taps {
+            same.arrange_same(group, first, count);
+            return same;
+        }
         let mut arrange = |tile: &mut PlanTile| {
             scratch.fill(isa, taps, first, count, usize::MAX);
-            tile.arrange(scratch, numbers);
+            tile.arrange(group, scratch, numbers);
         };
         if let Taps::Map {
             plan: Some(plan), ..
@@ -201,7 +238,7 @@ impl Planner {
                 arrange(&mut tile);
                 tile
             });
-            if tile.masks.len() == count {
+            if tile.masks.len() == count && tile.group == group {
                 return tile;
             }
         }
@@ -213,51 +250,66 @@ impl Planner {
 /// Numbers for input rows, in the order in which they are first asked for.
 #[derive(Default)]
 pub(crate) struct Numbers {
-    /// By hash: an input row and its number, or [`FREE`].
-    slots: Vec<(u32, u16)>,
-    /// The last that was asked for.
-    last: (u32, u16),
+    /// The first of the rows of `near`.
+    base: u32,
+    /// Their numbers, or [`FREE`]: most of a tile's inputs lie close to each other.
+    near: Vec<u16>,
+    /// Of the others, by hash: an input row and its number, or [`FREE`].
+    far: Vec<(u32, u16)>,
 }
 
-const FREE: (u32, u16) = (u32::MAX, 0);
+/// No number: a tile has at most 512 · 63 pairs.
+const FREE: u16 = u16::MAX;
+/// Rows before the first that is asked for, and half of those after it, whose numbers are found by place.
+const NEAR: u32 = 4096;
 
 impl Numbers {
-    /// Forgets all numbers.
-    fn clear(&mut self, inputs: &mut Vec<u32>) {
+    /// Forgets all numbers; most that will be asked for are near to a row.
+    fn clear(&mut self, row: u32, inputs: &mut Vec<u32>) {
         inputs.clear();
-        self.slots.clear();
-        self.slots.resize(4096, FREE);
-        self.last = FREE;
+        self.base = row.saturating_sub(NEAR);
+        self.near.clear();
+        self.near.resize(3 * NEAR as usize, FREE);
+        self.far.clear();
+        self.far.resize(1024, (0, FREE));
     }
 
+    #[inline(always)]
     fn of(&mut self, input: u32, inputs: &mut Vec<u32>) -> u16 {
-        if self.last.0 == input {
-            return self.last.1;
+        let near = input.wrapping_sub(self.base) as usize;
+        if let Some(number) = self.near.get_mut(near) {
+            if *number == FREE {
+                *number = inputs.len() as u16;
+                inputs.push(input);
+            }
+            return *number;
         }
-        if 2 * inputs.len() >= self.slots.len() {
-            let size = 2 * self.slots.len();
-            self.slots.clear();
-            self.slots.resize(size, FREE);
+        self.of_far(input, inputs)
+    }
+
+    fn of_far(&mut self, input: u32, inputs: &mut Vec<u32>) -> u16 {
+        if 2 * inputs.len() >= self.far.len() {
+            let size = 2 * self.far.len();
+            self.far.clear();
+            self.far.resize(size, (0, FREE));
             for (number, &input) in (0..).zip(&*inputs) {
                 let slot = self.slot(input);
-                self.slots[slot] = (input, number);
+                self.far[slot] = (input, number);
             }
         }
         let slot = self.slot(input);
-        if self.slots[slot].0 != input {
-            // A tile has at most 512 · 63 pairs.
-            self.slots[slot] = (input, inputs.len() as u16);
+        if self.far[slot].1 == FREE {
+            self.far[slot] = (input, inputs.len() as u16);
             inputs.push(input);
         }
-        self.last = self.slots[slot];
-        self.last.1
+        self.far[slot].1
     }
 
     /// Where an input row is, or could be.
     fn slot(&self, input: u32) -> usize {
-        let mask = self.slots.len() - 1;
+        let mask = self.far.len() - 1;
         let mut slot = (input.wrapping_mul(0x9e37_79b9) >> 12) as usize & mask;
-        while self.slots[slot].0 != input && self.slots[slot] != FREE {
+        while self.far[slot].0 != input && self.far[slot].1 != FREE {
             slot = (slot + 1) & mask;
         }
         slot
@@ -295,8 +347,9 @@ mod tests {
             for group in 0..plan.groups() {
                 let (taps, places) = plan.steps(group, 0..volume);
                 assert!(taps.is_sorted_by(|a, b| a < b));
+                let places = places.chunks_exact(plan.group);
                 for (&tap, places) in taps.iter().zip(places) {
-                    for (&row, &place) in plan.rows(group).iter().zip(places) {
+                    for (&row, &place) in plan.order[group * plan.group..].iter().zip(places) {
                         if let Some(&input) = plan.inputs().get(usize::from(place)) {
                             found[usize::from(row) * volume + usize::from(tap)] = input;
                         }

@@ -3,7 +3,6 @@
 use std::cell::RefCell;
 
 use crate::norms::Norms;
-#[cfg(target_arch = "x86_64")]
 use crate::plan::Planner;
 use crate::taps::TileTaps;
 
@@ -11,6 +10,8 @@ use crate::taps::TileTaps;
 pub(crate) const PANEL: usize = 16;
 /// Output rows of a tile: enough that every tap finds full blocks, few enough that their sums stay in the cache.
 pub(crate) const TILE: usize = 512;
+/// By how many rows memory is asked before they are read.
+pub(crate) const AHEAD: usize = 32;
 
 /// Where a layer writes, and what it adds on the way.
 pub struct Output<'a, T, R = T> {
@@ -82,12 +83,10 @@ pub(crate) fn panels<T: Copy + Default>(values: &[T]) -> Vec<[T; PANEL]> {
 /// At most a panel's values, and zeros after them.
 #[inline(always)]
 pub(crate) fn panel<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
-    let mut to = [T::default(); PANEL];
     match <&[T; PANEL]>::try_from(from) {
-        Ok(from) => to = *from,
-        Err(_) => to[..from.len()].copy_from_slice(from),
+        Ok(from) => *from,
+        Err(_) => part(from),
     }
-    to
 }
 
 /// Writes a panel's values, or as many of them as there is room for.
@@ -95,8 +94,44 @@ pub(crate) fn panel<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
 pub(crate) fn store<T: Copy>(from: [T; PANEL], to: &mut [T]) {
     match <&mut [T; PANEL]>::try_from(&mut *to) {
         Ok(to) => *to = from,
-        Err(_) => to.copy_from_slice(&from[..to.len()]),
+        Err(_) => store_part(from, to),
     }
+}
+
+/// Values of half a panel, which many layers end with.
+const HALF: usize = PANEL / 2;
+
+/// Less than a panel's values, and zeros after them.
+#[inline(always)]
+pub(crate) fn part<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
+    let mut to = [T::default(); PANEL];
+    match from.split_first_chunk::<HALF>() {
+        Some((from, [])) => to[..HALF].copy_from_slice(from),
+        _ => to = any_part(from),
+    }
+    to
+}
+
+/// Apart, or else compilers make one copy of any length of both.
+#[inline(never)]
+fn any_part<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
+    let mut to = [T::default(); PANEL];
+    to[..from.len()].copy_from_slice(from);
+    to
+}
+
+/// Writes as many of a panel's values as there is room for.
+#[inline(always)]
+pub(crate) fn store_part<T: Copy>(from: [T; PANEL], to: &mut [T]) {
+    match to.split_first_chunk_mut::<HALF>() {
+        Some((to, [])) => to.copy_from_slice(&from[..HALF]),
+        _ => store_any(&from, to),
+    }
+}
+
+#[inline(never)]
+fn store_any<T: Copy>(from: &[T; PANEL], to: &mut [T]) {
+    to.copy_from_slice(&from[..to.len()]);
 }
 
 /// The extents of a layer's weights.
@@ -154,7 +189,6 @@ pub(crate) struct Scratch {
     pub sums: Vec<Lanes>,
     pub expanded: Vec<Lanes>,
     pub norms: Norms,
-    #[cfg(target_arch = "x86_64")]
     pub planner: Planner,
     #[cfg(target_arch = "x86_64")]
     pub tiles: crate::machine::amx::Buffers,

@@ -72,19 +72,6 @@ pub(crate) struct Pairs<'a> {
     pub rows: &'a [u32],
 }
 
-impl Pairs<'_> {
-    pub fn len(&self) -> usize {
-        self.rows.len()
-    }
-
-    /// The first `count` pairs, and the others.
-    pub fn split_at(&self, count: usize) -> (Self, Self) {
-        let (inputs, rows) = (self.inputs.split_at(count), self.rows.split_at(count));
-        let of = |inputs, rows| Pairs { inputs, rows };
-        (of(inputs.0, rows.0), of(inputs.1, rows.1))
-    }
-}
-
 impl TileTaps {
     /// Gathers the pairs of output rows `first .. first + count`, at most [`TILE`] of them.
     ///

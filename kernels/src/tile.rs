@@ -1,15 +1,12 @@
-//! The loop at the heart of both convolutions: a tile's sums, tap by tap, in blocks of rows and channels that fill the registers.
+//! The loop at the heart of both convolutions: the sums of a group's rows stay in registers while its taps go by.
 
 use crate::isa::{Isa, Level};
 use crate::machine;
+use crate::plan::PlanTile;
 use crate::rows::{Extents, Lanes, PANEL};
-use crate::taps::TileTaps;
 
-/// Rows that are prepared together: what the widest blocks of any machine divide.
-const GROUP: usize = 24;
-
-/// Panels from which on it pays to fetch input rows ahead: with fewer, a block is done before what it fetches has come.
-const FETCH: usize = 4;
+/// [`Lanes`] of weights that the first cache holds besides rows and sums.
+const CACHED: usize = 256;
 
 /// A vector of 32-bit sums, and what multiplies and adds one step: an f32, or a pair of i16 or bf16.
 ///
@@ -36,111 +33,125 @@ pub(crate) unsafe trait Machine {
     unsafe fn weight(at: *const u32) -> Self::Weight;
     /// Reads a row's values of one step, not aligned.
     unsafe fn factor(at: *const u32) -> Self::Factor;
+    /// `a + b`.
+    unsafe fn add(a: Self::Sum, b: Self::Sum) -> Self::Sum;
     /// `sum + weight · factor`.
     unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum;
 }
 
-/// Some rows and some panels of one tap.
+/// A group's rows, some taps and some panels.
 #[derive(Clone, Copy)]
 pub(crate) struct Block {
-    /// The first panel's weights, `steps` [`Lanes`] a panel.
-    pub weights: *const u32,
-    /// Steps.
-    pub steps: usize,
-    /// Rows.
-    pub rows: usize,
-    /// For each row, which of `inputs` it reads.
-    pub reads: *const u32,
+    /// Rows of the group.
+    pub group: usize,
+    /// Its taps.
+    pub taps: *const u8,
+    /// Their number.
+    pub count: usize,
+    /// For each tap and row, which of `inputs` it reads.
+    pub places: *const u16,
     /// Input rows, `steps` words each.
     pub inputs: *const u32,
-    /// For each row, which of `sums` it adds to.
-    pub writes: *const u32,
-    /// The first panel's sums, each row's `stride` words after the last's; those of the next panel follow.
+    /// Steps.
+    pub steps: usize,
+    /// The first panel's weights of tap 0, `steps` [`Lanes`] a panel.
+    pub weights: *const u32,
+    /// Words from one tap's weights to the next's.
+    pub tap: usize,
+    /// The first panel's sums of the group's rows, each `stride` words after the last's; those of the next panel follow.
     pub sums: *mut u32,
     /// Words.
     pub stride: usize,
-    /// Whether input rows are to be fetched before they are read.
-    pub fetch: bool,
+    /// Whether there are sums to add to.
+    pub more: bool,
 }
 
-/// Adds a block's products to its sums, for `V` vectors of channels from the first panel on, at most `R` rows at once.
+/// Sums a block's products, for `V` vectors of channels from the first panel on, `R` rows at once, which divide the group. Each sum is
+/// computed in `P` parts, of every `P`th step, where there would be too few to keep the machine from waiting for one.
 ///
 /// # Safety
 /// The processor must have `M`'s instructions, and the block's pointers what they promise, for `V` vectors' panels.
 #[inline(always)]
-pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize>(block: &Block) {
-    let mut first = 0;
-    while first < block.rows {
-        // The last two parts are of even size: few rows at once would wait for each other's sums.
-        let rows = match block.rows - first {
-            rest if rest >= 2 * R || rest == R => R,
-            rest if rest > R => rest.div_ceil(2),
-            rest => rest,
-        };
-        macro_rules! of_size {
-            ($($n:literal)*) => {
-                match rows {
-                    // SAFETY: the caller's promise, for some of the block's rows.
-                    $($n if $n <= R => unsafe { multiply::<M, $n, V>(block, first) },)*
-                    _ => unreachable!("{rows} rows"),
-                }
-            };
-        }
-        of_size!(1 2 3 4 5 6 7 8 9 10 11 12);
-        first += rows;
+pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize, const P: usize>(
+    block: &Block,
+) {
+    for first in (0..block.group).step_by(R) {
+        // SAFETY: the caller's promise, for some of the group's rows.
+        unsafe { multiply::<M, R, V, P>(block, first) };
     }
 }
 
-/// Adds the products of `R` rows from `first` on: their sums stay in registers throughout.
+/// Sums the products of `R` rows from `first` on.
 ///
 /// # Safety
 /// As [`columns`], and the block must have these rows.
 #[inline(always)]
 #[expect(
     clippy::needless_range_loop,
-    reason = "rows and vectors are counted alike"
+    reason = "rows, vectors and parts are counted alike"
 )]
-unsafe fn multiply<M: Machine, const R: usize, const V: usize>(block: &Block, first: usize) {
+unsafe fn multiply<M: Machine, const R: usize, const V: usize, const P: usize>(
+    block: &Block,
+    first: usize,
+) {
     // SAFETY: the caller's promise: vector v of a row lies in its panel v · LANES / PANEL, each row has `steps` words, and so
     // many lanes each panel.
     unsafe {
-        let mut inputs = [block.inputs; R];
         let mut outputs = [block.sums; R];
         for r in 0..R {
-            inputs[r] = inputs[r].add(*block.reads.add(first + r) as usize * block.steps);
-            outputs[r] = outputs[r].add(*block.writes.add(first + r) as usize * block.stride);
+            outputs[r] = outputs[r].add((first + r) * block.stride);
         }
-        let mut sums = [[M::zero(); V]; R];
-        for r in 0..R {
-            for v in 0..V {
-                sums[r][v] = M::load(outputs[r].add(v * M::LANES));
-            }
-        }
-        if block.fetch {
-            for r in first + R..(first + 2 * R).min(block.rows) {
-                let row = block.inputs.add(*block.reads.add(r) as usize * block.steps);
-                machine::fetch(row, block.steps);
-            }
-        }
-        let mut weights = block.weights;
-        let stride = block.steps * PANEL;
-        for s in 0..block.steps {
-            let mut weight = [M::weight(weights); V];
-            for v in 1..V {
-                let (panel, lane) = (v * M::LANES / PANEL, v * M::LANES % PANEL);
-                weight[v] = M::weight(weights.add(panel * stride + lane));
-            }
+        let mut sums = [[[M::zero(); V]; R]; P];
+        if block.more {
             for r in 0..R {
-                let factor = M::factor(inputs[r].add(s));
                 for v in 0..V {
-                    sums[r][v] = M::mul_add(sums[r][v], weight[v], factor);
+                    sums[0][r][v] = M::load(outputs[r].add(v * M::LANES));
                 }
             }
-            weights = weights.add(PANEL);
+        }
+        let panel = block.steps * PANEL;
+        for t in 0..block.count {
+            let mut inputs = [block.inputs; R];
+            for r in 0..R {
+                let place = usize::from(*block.places.add(t * block.group + first + r));
+                inputs[r] = inputs[r].add(place * block.steps);
+            }
+            let mut weights = block
+                .weights
+                .add(usize::from(*block.taps.add(t)) * block.tap);
+            let mut step = |part: usize, s: usize, weights: *const u32| {
+                let mut weight = [M::weight(weights); V];
+                for v in 1..V {
+                    let (at, lane) = (v * M::LANES / PANEL, v * M::LANES % PANEL);
+                    weight[v] = M::weight(weights.add(at * panel + lane));
+                }
+                for r in 0..R {
+                    let factor = M::factor(inputs[r].add(s));
+                    for v in 0..V {
+                        sums[part][r][v] = M::mul_add(sums[part][r][v], weight[v], factor);
+                    }
+                }
+            };
+            let whole = block.steps - block.steps % P;
+            let mut s = 0;
+            while s < whole {
+                for part in 0..P {
+                    step(part, s + part, weights.add(part * PANEL));
+                }
+                s += P;
+                weights = weights.add(P * PANEL);
+            }
+            for part in 0..block.steps - whole {
+                step(part, whole + part, weights.add(part * PANEL));
+            }
         }
         for r in 0..R {
             for v in 0..V {
-                M::store(outputs[r].add(v * M::LANES), sums[r][v]);
+                let mut sum = sums[0][r][v];
+                for part in 1..P {
+                    sum = M::add(sum, sums[part][r][v]);
+                }
+                M::store(outputs[r].add(v * M::LANES), sum);
             }
         }
     }
@@ -157,102 +168,95 @@ pub(crate) enum Arithmetic {
     Brain,
 }
 
-/// Where a tile's input rows are.
-pub(crate) enum Input<'a, T> {
-    /// Words as the machine multiplies them, `steps` a row.
-    Ready(&'a [T]),
-    /// To be written into `steps` words a row first, by a function of the input, the rows to write, and the values of each.
-    Expand(&'a [T], fn(Isa, &[T], &[u32], usize, &mut [u32])),
-}
+/// Writes rows of the input, of so many values each, as words.
+pub(crate) type Expand<T> = fn(Isa, &[T], &[u32], usize, &mut [u32]);
 
-/// The sums over all taps of a tile: `sums[row · panels + panel]`, overwritten.
+/// The sums over all taps of a tile, `sums[row · panels + panel]`, rows in the plan's order; others may follow.
 ///
-/// `weights` are ordered `[tap][panel][step]`; an input row has `cin` values.
+/// `weights` are ordered `[tap][panel][step]`; an input row has `cin` values, which `expand` writes into a word for each step.
 ///
 /// # Panics
-/// If the taps read beyond the input, or a row that is ready is not of whole words.
+/// If the plan reads beyond the input.
+#[expect(clippy::too_many_arguments, reason = "all that a layer and a tile are")]
 pub(crate) fn accumulate<T>(
     isa: Isa,
     arithmetic: Arithmetic,
     extents: Extents,
     weights: &[Lanes],
-    taps: &TileTaps,
-    input: Input<'_, T>,
+    plan: &PlanTile,
+    (input, expand): (&[T], Expand<T>),
     expanded: &mut Vec<Lanes>,
     sums: &mut Vec<Lanes>,
 ) {
     assert!(arithmetic != Arithmetic::Brain || isa.has_bf16());
-    let (cin, panels) = (extents.cin, extents.panels());
-    let steps = weights.len() / (extents.volume * panels);
-    sums.clear();
-    sums.resize(taps.masks().len() * panels, Lanes::default());
-    let values = match input {
-        Input::Ready(values) => {
-            assert_eq!(cin * size_of::<T>(), steps * 4, "a row is {steps} words");
-            values
-        }
-        Input::Expand(values, _) => values,
-    };
-    assert!(taps.end() <= values.len() / cin, "taps of another input");
-    expanded.resize((GROUP * steps).div_ceil(PANEL), Lanes::default());
-    let fetch = panels >= FETCH && matches!(input, Input::Ready(_));
+    let Extents { volume, cin, .. } = extents;
+    let panels = extents.panels();
+    let steps = weights.len() / (volume * panels);
+    assert_eq!(plan.volume(), volume, "another kernel's plan");
+    let (end, inputs) = (plan.end(), input.len() / cin);
+    assert!(
+        end <= inputs,
+        "a tap reads row {}, but the input has {inputs}",
+        end - 1
+    );
+    let words = plan.inputs().len() * steps;
+    expanded.resize((words + steps).div_ceil(PANEL), Lanes::default());
+    let rows = machine::words_mut(expanded);
+    expand(isa, input, plan.inputs(), cin, &mut rows[..words]);
+    rows[words..words + steps].fill(0);
+
+    let group = plan.group();
+    sums.resize(plan.groups() * group * panels, Lanes::default());
     let half = usize::from((1..=PANEL / 2).contains(&(extents.cout % PANEL)));
-    for (k, weights) in weights.chunks_exact(panels * steps).enumerate() {
-        let mut rest = taps.of(k);
-        while rest.len() > 0 {
-            let group;
-            let (reads, inputs) = match input {
-                Input::Ready(values) => {
-                    (group, rest) = rest.split_at(rest.len());
-                    (group.inputs, values.as_ptr().cast())
+    let mut panel = 0;
+    while panel < panels {
+        let whole = panels - panel - half;
+        let width = width(isa, whole);
+        let taps = (CACHED / (width * steps)).max(1);
+        for tap in (0..volume).step_by(taps) {
+            for (number, sums) in sums.chunks_exact_mut(group * panels).enumerate() {
+                let (taps, places) = plan.steps(number, tap..(tap + taps).min(volume));
+                if tap > 0 && taps.is_empty() {
+                    continue;
                 }
-                Input::Expand(values, expand) => {
-                    let parts = rest.len().div_ceil(GROUP);
-                    (group, rest) = rest.split_at(rest.len().div_ceil(parts));
-                    let to = machine::words_mut(expanded);
-                    expand(isa, values, group.inputs, cin, to);
-                    (&IN_ORDER[..group.len()], to.as_ptr())
-                }
-            };
-            let mut panel = 0;
-            while panel < panels {
                 let block = Block {
-                    weights: weights[panel * steps..].as_ptr().cast(),
+                    group,
+                    taps: taps.as_ptr(),
+                    count: taps.len(),
+                    places: places.as_ptr(),
+                    inputs: rows.as_ptr(),
                     steps,
-                    rows: group.len(),
-                    reads: reads.as_ptr(),
-                    inputs,
-                    writes: group.rows.as_ptr(),
+                    weights: weights[panel * steps..].as_ptr().cast(),
+                    tap: panels * steps * PANEL,
                     sums: sums[panel..].as_mut_ptr().cast(),
                     stride: panels * PANEL,
-                    fetch: fetch && panel == 0,
+                    more: tap > 0,
                 };
-                // SAFETY: all rows that are read lie below the taps' end, so in the input, or else below `GROUP`, where they were
-                // expanded to; all that are written lie below the tile's number, so in `sums`; the weights are those of the
-                // panels from here on, with no more than `whole` and a half of them left.
-                panel += unsafe { run(isa, arithmetic, &block, panels - panel - half) };
+                // SAFETY: all places are those of an expanded row, or of the zeros that follow; `sums` are those of the group's rows; the
+                // weights are those of the panels from here on, with `whole` and, if there is none, half of one left.
+                unsafe { run(isa, arithmetic, &block, whole) };
             }
         }
+        panel += width;
     }
 }
 
-/// The places of expanded rows.
-static IN_ORDER: [u32; GROUP] = {
-    let mut places = [0; GROUP];
-    let mut i = 0;
-    while i < GROUP {
-        places[i] = i as u32;
-        i += 1;
+/// Of `whole` panels, or the half that is left, as many as are multiplied at once.
+fn width(isa: Isa, whole: usize) -> usize {
+    match isa.level() {
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 | Level::Amx => whole.clamp(1, 2),
+        _ => 1,
     }
-    places
-};
+}
 
-/// Multiplies as many of the `whole` panels as fit, or, if there is none, the half panel that is left; gives their number.
+/// Multiplies [`width`] panels.
 ///
 /// # Safety
 /// The block's pointers must hold what they promise for these panels, and bf16 must be asked for only where the machine has it.
-unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) -> usize {
-    // SAFETY: an `Isa` is only made where the processor has its instructions; the rest is the caller's promise.
+unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) {
+    // SAFETY: an `Isa` is only made where the processor has its instructions, and its group is what blocks of its rows divide; the
+    // rest is the caller's promise.
     unsafe {
         match isa.level() {
             Level::Scalar => machine::scalar::run(arithmetic, block, whole),

@@ -6,7 +6,7 @@
 
 use std::sync::OnceLock;
 
-use b2p_kernels::{Isa, Plan, Taps};
+use b2p_kernels::{Plan, Taps};
 use rayon::prelude::*;
 
 /// The neighbours of every voxel under a 3³ or 2³ kernel.
@@ -17,7 +17,7 @@ use rayon::prelude::*;
 pub struct KernelMap {
     volume: usize,
     rows: Vec<u32>,
-    /// The same for matrix tiles.
+    /// The same as layers read it.
     plan: OnceLock<Plan>,
 }
 
@@ -46,12 +46,12 @@ impl KernelMap {
     }
 
     /// The map as layers take it.
-    pub fn taps(&self, isa: Isa) -> Taps<'_> {
+    pub fn taps(&self) -> Taps<'_> {
         let plan = || Plan::new(self.len());
         Taps::Map {
             volume: self.volume,
             rows: &self.rows,
-            plan: isa.has_tiles().then(|| self.plan.get_or_init(plan)),
+            plan: Some(self.plan.get_or_init(plan)),
         }
     }
 

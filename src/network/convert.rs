@@ -96,10 +96,10 @@ impl Model {
 impl Convert<FloatConv> {
     fn apply(&self, isa: Isa, x: Vec<f16>, map: &KernelMap) -> Vec<f16> {
         let (n, pool) = (map.len(), &mut Pool::new());
-        let x = apply(pool, isa, &self.conv_in, map.taps(isa), &x, n, false);
+        let x = apply(pool, isa, &self.conv_in, map.taps(), &x, n, false);
         let blocks = self.blocks.iter();
-        let x = blocks.fold(x, |x, block| block.apply(pool, isa, map.taps(isa), x));
-        apply(pool, isa, &self.conv_out, map.taps(isa), &x, n, false)
+        let x = blocks.fold(x, |x, block| block.apply(pool, isa, map.taps(), x));
+        apply(pool, isa, &self.conv_out, map.taps(), &x, n, false)
     }
 }
 

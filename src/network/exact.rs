@@ -66,7 +66,7 @@ impl Model {
         self.check(context, self.shape.channels, map);
         let pem = &self.exact.pem[role - 1];
         let (isa, n, pool) = (self.isa, map.len(), &mut Pool::new());
-        let x = apply(pool, isa, &pem.conv_in, map.taps(isa), context, n, true);
+        let x = apply(pool, isa, &pem.conv_in, map.taps(), context, n, true);
         let x = self.blocks(pool, &pem.blocks, x, map);
         let mu = apply(pool, isa, &pem.mu, Taps::Same, &x, n, false);
         let sigma = apply(pool, isa, &pem.sigma, Taps::Same, &x, n, false);
@@ -118,9 +118,9 @@ impl Model {
         x: Vec<i16>,
         map: &KernelMap,
     ) -> Vec<i16> {
-        blocks.iter().fold(x, |x, block| {
-            block.apply(pool, self.isa, map.taps(self.isa), x)
-        })
+        blocks
+            .iter()
+            .fold(x, |x, block| block.apply(pool, self.isa, map.taps(), x))
     }
 
     /// Panics unless `values` are `width` for each voxel of `map`.

@@ -150,15 +150,15 @@ impl Model {
     ) -> Vec<f32> {
         let (isa, n) = (self.isa, map.len());
         let pool = &mut Pool::new();
-        let mut x = apply(pool, isa, &gg.conv_in, map.taps(isa), g, n, true);
+        let mut x = apply(pool, isa, &gg.conv_in, map.taps(), g, n, true);
         for block in &gg.before {
-            x = block.apply(pool, isa, map.taps(isa), x);
+            x = block.apply(pool, isa, map.taps(), x);
         }
         let finish = |pool: &mut Pool<C::Value>, mut x: Vec<C::Value>, map: &KernelMap| {
             for block in &gg.after {
-                x = block.apply(pool, isa, map.taps(isa), x);
+                x = block.apply(pool, isa, map.taps(), x);
             }
-            apply_f32(isa, &gg.conv_out, map.taps(isa), &x, map.len())
+            apply_f32(isa, &gg.conv_out, map.taps(), &x, map.len())
         };
         let out = if gg.head.children == 8 {
             let children = apply(pool, isa, &gg.layer4, Taps::Children, &x, 8 * n, false);
@@ -167,7 +167,7 @@ impl Model {
             finish(&mut Pool::new(), children, &map.generated_children())
         } else {
             let forward = map.forward();
-            let next = apply(pool, isa, &gg.layer4, forward.taps(isa), &x, n, false);
+            let next = apply(pool, isa, &gg.layer4, forward.taps(), &x, n, false);
             pool.give(x);
             finish(pool, next, map)
         };

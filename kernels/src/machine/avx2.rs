@@ -1,4 +1,4 @@
-//! AVX2 with FMA and F16C: blocks of six rows by one panel, or twelve by half of one.
+//! AVX2 with FMA and F16C: blocks of four rows by one panel, or by half of one.
 
 use std::arch::x86_64::*;
 
@@ -6,32 +6,32 @@ use crate::f16;
 
 use crate::ceiling;
 use crate::convert::{Halves, MAX};
+use crate::exact::LIMIT;
 use crate::machine::machine;
-use crate::rows::PANEL;
+use crate::rows::{Lanes, PANEL};
 use crate::tile::{Arithmetic, Block, Machine, columns};
 
 /// # Safety
 /// The processor must have AVX2, FMA and F16C; the rest as [`columns`].
-pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) -> usize {
+pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) {
     // SAFETY: the caller's promise for one panel, or half of it.
     unsafe {
         match (arithmetic, whole) {
-            (Arithmetic::Float, 0) => wide::<Float, 12, 1>(block),
-            (Arithmetic::Float, _) => wide::<Float, 6, 2>(block),
-            (Arithmetic::Integer, 0) => wide::<Integer, 12, 1>(block),
-            (Arithmetic::Integer, _) => wide::<Integer, 6, 2>(block),
+            (Arithmetic::Float, 0) => wide::<Float, 4, 1, 1>(block),
+            (Arithmetic::Float, _) => wide::<Float, 4, 2, 1>(block),
+            (Arithmetic::Integer, 0) => wide::<Integer, 4, 1, 1>(block),
+            (Arithmetic::Integer, _) => wide::<Integer, 4, 2, 1>(block),
             (Arithmetic::Brain, _) => unreachable!("AVX2 has no bf16"),
         }
     }
-    1
 }
 
 /// # Safety
 /// As [`run`].
 #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
-unsafe fn wide<M: Machine, const R: usize, const V: usize>(block: &Block) {
+unsafe fn wide<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
     // SAFETY: the caller's promise.
-    unsafe { columns::<M, R, V>(block) }
+    unsafe { columns::<M, R, V, P>(block) }
 }
 
 /// # Safety
@@ -58,14 +58,14 @@ unsafe fn spinning<M: Machine>(rounds: usize) -> usize {
 machine!(
     /// f32.
     Float: __m256, __m256, 8,
-    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_ps, spread8_f32],
+    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_ps, spread8_f32, _mm256_add_ps],
     |sum, weight, factor| _mm256_fmadd_ps(weight, factor, sum)
 );
 
 machine!(
     /// Pairs of i16.
     Integer: __m256i, __m256i, 8,
-    [_mm256_setzero_si256, _mm256_load_si256, _mm256_store_si256, _mm256_load_si256, spread8],
+    [_mm256_setzero_si256, _mm256_load_si256, _mm256_store_si256, _mm256_load_si256, spread8, _mm256_add_epi32],
     |sum, weight, factor| _mm256_add_epi32(sum, _mm256_madd_epi16(weight, factor))
 );
 
@@ -115,5 +115,73 @@ unsafe impl Halves for Convert {
                 _mm_storeu_si128(to.as_mut_ptr().add(half).cast(), narrow);
             }
         }
+    }
+
+    #[inline(always)]
+    unsafe fn shift(sums: &Lanes, bias: &[i32; PANEL], shift: &[u32; PANEL]) -> [i16; PANEL] {
+        let limit = i32::from(LIMIT);
+        // SAFETY: all are sixteen values of 32 bits, read eight by eight.
+        unsafe {
+            let mut results = [_mm256_setzero_si256(); 2];
+            for (half, result) in results.iter_mut().enumerate() {
+                let bias = _mm256_loadu_si256(bias.as_ptr().add(8 * half).cast());
+                let shift = _mm256_loadu_si256(shift.as_ptr().add(8 * half).cast());
+                let sum = _mm256_load_si256(sums.0.as_ptr().add(8 * half).cast());
+                let sum = _mm256_add_epi32(sum, bias);
+                let sum = _mm256_srav_epi32(sum, shift);
+                let sum = _mm256_max_epi32(sum, _mm256_set1_epi32(-limit));
+                *result = _mm256_min_epi32(sum, _mm256_set1_epi32(limit));
+            }
+            join(results)
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn round(sums: &Lanes, factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [i16; PANEL] {
+        let limit = f32::from(LIMIT);
+        // SAFETY: all are sixteen values of 32 bits, read eight by eight.
+        unsafe {
+            let mut results = [_mm256_setzero_si256(); 2];
+            for (half, result) in results.iter_mut().enumerate() {
+                let sum = _mm256_load_si256(sums.0.as_ptr().add(8 * half).cast());
+                let factor = _mm256_loadu_ps(factor.as_ptr().add(8 * half));
+                let value = _mm256_mul_ps(_mm256_cvtepi32_ps(sum), factor);
+                let value = _mm256_add_ps(value, _mm256_loadu_ps(bias.as_ptr().add(8 * half)));
+                let value = _mm256_and_ps(value, _mm256_cmp_ps::<_CMP_ORD_Q>(value, value));
+                let value = _mm256_max_ps(value, _mm256_set1_ps(-limit));
+                *result = _mm256_cvtps_epi32(_mm256_min_ps(value, _mm256_set1_ps(limit)));
+            }
+            join(results)
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn settle(q: [i16; PANEL], residual: Option<&[i16; PANEL]>, floor: i16) -> [i16; PANEL] {
+        // SAFETY: the types are sixteen values of 16 bits.
+        unsafe {
+            let mut q = std::mem::transmute::<[i16; PANEL], __m256i>(q);
+            if let Some(residual) = residual {
+                // What is larger than this takes any result beyond the limit, and does not overflow.
+                let most = i16::MAX - LIMIT;
+                let x = _mm256_loadu_si256(residual.as_ptr().cast());
+                let x = _mm256_max_epi16(x, _mm256_set1_epi16(-most));
+                let x = _mm256_min_epi16(x, _mm256_set1_epi16(most));
+                q = _mm256_min_epi16(_mm256_add_epi16(q, x), _mm256_set1_epi16(LIMIT));
+            }
+            std::mem::transmute(_mm256_max_epi16(q, _mm256_set1_epi16(floor)))
+        }
+    }
+}
+
+/// Two times eight small numbers as i16.
+///
+/// # Safety
+/// The processor must have AVX2.
+#[inline(always)]
+unsafe fn join(halves: [__m256i; 2]) -> [i16; PANEL] {
+    // SAFETY: the types of the result are the same bits.
+    unsafe {
+        let packed = _mm256_packs_epi32(halves[0], halves[1]);
+        std::mem::transmute(_mm256_permute4x64_epi64::<0b11_01_10_00>(packed))
     }
 }

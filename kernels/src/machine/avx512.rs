@@ -1,4 +1,4 @@
-//! AVX-512 with VNNI: blocks of six rows by four panels, eight by three, two or one, twelve by half of one.
+//! AVX-512 with VNNI: blocks of eight rows by two panels, or by one or half of one, in two parts.
 
 use std::arch::x86_64::*;
 
@@ -6,35 +6,29 @@ use crate::f16;
 
 use crate::ceiling;
 use crate::convert::{Halves, MAX};
+use crate::exact::LIMIT;
 use crate::machine::machine;
-use crate::rows::PANEL;
+use crate::rows::{Lanes, PANEL};
 use crate::tile::{Arithmetic, Block, Machine, columns};
 
 /// # Safety
 /// The processor must have AVX-512 F, BW, CD, DQ, VL and VNNI, and AVX512_BF16 for [`Arithmetic::Brain`]; the rest as
 /// [`columns`].
-pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) -> usize {
+pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) {
     // SAFETY: the caller's promise for as many panels as each call multiplies.
     unsafe {
         match (arithmetic, whole) {
-            (Arithmetic::Float, 0) => wide::<HalfFloat, 12, 1>(block),
-            (Arithmetic::Float, 1) => wide::<Float, 8, 1>(block),
-            (Arithmetic::Float, 2) => wide::<Float, 8, 2>(block),
-            (Arithmetic::Float, 3) => wide::<Float, 8, 3>(block),
-            (Arithmetic::Float, _) => wide::<Float, 6, 4>(block),
-            (Arithmetic::Integer, 0) => wide::<HalfInteger, 12, 1>(block),
-            (Arithmetic::Integer, 1) => wide::<Integer, 8, 1>(block),
-            (Arithmetic::Integer, 2) => wide::<Integer, 8, 2>(block),
-            (Arithmetic::Integer, 3) => wide::<Integer, 8, 3>(block),
-            (Arithmetic::Integer, _) => wide::<Integer, 6, 4>(block),
-            (Arithmetic::Brain, 0) => wide_brain::<HalfBrain, 12, 1>(block),
-            (Arithmetic::Brain, 1) => wide_brain::<Brain, 8, 1>(block),
-            (Arithmetic::Brain, 2) => wide_brain::<Brain, 8, 2>(block),
-            (Arithmetic::Brain, 3) => wide_brain::<Brain, 8, 3>(block),
-            (Arithmetic::Brain, _) => wide_brain::<Brain, 6, 4>(block),
+            (Arithmetic::Float, 0) => wide::<HalfFloat, 8, 1, 1>(block),
+            (Arithmetic::Float, 1) => wide::<Float, 8, 1, 1>(block),
+            (Arithmetic::Float, _) => wide::<Float, 8, 2, 1>(block),
+            (Arithmetic::Integer, 0) => wide::<HalfInteger, 8, 1, 2>(block),
+            (Arithmetic::Integer, 1) => wide::<Integer, 8, 1, 2>(block),
+            (Arithmetic::Integer, _) => wide::<Integer, 8, 2, 1>(block),
+            (Arithmetic::Brain, 0) => wide_brain::<HalfBrain, 8, 1, 1>(block),
+            (Arithmetic::Brain, 1) => wide_brain::<Brain, 8, 1, 1>(block),
+            (Arithmetic::Brain, _) => wide_brain::<Brain, 8, 2, 1>(block),
         }
     }
-    whole.clamp(1, 4)
 }
 
 /// # Safety
@@ -42,9 +36,9 @@ pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) ->
 #[target_feature(
     enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni"
 )]
-unsafe fn wide<M: Machine, const R: usize, const V: usize>(block: &Block) {
+unsafe fn wide<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
     // SAFETY: the caller's promise.
-    unsafe { columns::<M, R, V>(block) }
+    unsafe { columns::<M, R, V, P>(block) }
 }
 
 /// # Safety
@@ -52,9 +46,9 @@ unsafe fn wide<M: Machine, const R: usize, const V: usize>(block: &Block) {
 #[target_feature(
     enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni,avx512bf16"
 )]
-unsafe fn wide_brain<M: Machine, const R: usize, const V: usize>(block: &Block) {
+unsafe fn wide_brain<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
     // SAFETY: the caller's promise.
-    unsafe { columns::<M, R, V>(block) }
+    unsafe { columns::<M, R, V, P>(block) }
 }
 
 /// # Safety
@@ -93,35 +87,35 @@ unsafe fn spinning_brain(rounds: usize) -> usize {
 machine!(
     /// f32.
     Float: __m512, __m512, 16,
-    [_mm512_setzero_ps, _mm512_load_ps, _mm512_store_ps, _mm512_load_ps, spread16_f32],
+    [_mm512_setzero_ps, _mm512_load_ps, _mm512_store_ps, _mm512_load_ps, spread16_f32, _mm512_add_ps],
     |sum, weight, factor| _mm512_fmadd_ps(weight, factor, sum)
 );
 
 machine!(
     /// f32, half a panel.
     HalfFloat: __m256, __m256, 8,
-    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_ps, spread8_f32],
+    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_ps, spread8_f32, _mm256_add_ps],
     |sum, weight, factor| _mm256_fmadd_ps(weight, factor, sum)
 );
 
 machine!(
     /// Pairs of i16.
     Integer: __m512i, __m512i, 16,
-    [_mm512_setzero_si512, _mm512_load_si512, _mm512_store_si512, _mm512_load_si512, spread16],
+    [_mm512_setzero_si512, _mm512_load_si512, _mm512_store_si512, _mm512_load_si512, spread16, _mm512_add_epi32],
     |sum, weight, factor| _mm512_dpwssd_epi32(sum, weight, factor)
 );
 
 machine!(
     /// Pairs of i16, half a panel.
     HalfInteger: __m256i, __m256i, 8,
-    [_mm256_setzero_si256, _mm256_load_si256, _mm256_store_si256, _mm256_load_si256, spread8],
+    [_mm256_setzero_si256, _mm256_load_si256, _mm256_store_si256, _mm256_load_si256, spread8, _mm256_add_epi32],
     |sum, weight, factor| _mm256_dpwssd_epi32(sum, weight, factor)
 );
 
 machine!(
     /// Pairs of bf16; needs AVX512_BF16.
     Brain: __m512, __m512i, 16,
-    [_mm512_setzero_ps, _mm512_load_ps, _mm512_store_ps, _mm512_load_si512, spread16],
+    [_mm512_setzero_ps, _mm512_load_ps, _mm512_store_ps, _mm512_load_si512, spread16, _mm512_add_ps],
     // SAFETY: the types are 512 bits of anything.
     |sum, weight, factor| _mm512_dpbf16_ps(sum, std::mem::transmute::<__m512i, __m512bh>(weight), std::mem::transmute::<__m512i, __m512bh>(factor))
 );
@@ -129,7 +123,7 @@ machine!(
 machine!(
     /// Pairs of bf16, half a panel; needs AVX512_BF16.
     HalfBrain: __m256, __m256i, 8,
-    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_si256, spread8],
+    [_mm256_setzero_ps, _mm256_load_ps, _mm256_store_ps, _mm256_load_si256, spread8, _mm256_add_ps],
     // SAFETY: the types are 256 bits of anything.
     |sum, weight, factor| _mm256_dpbf16_ps(sum, std::mem::transmute::<__m256i, __m256bh>(weight), std::mem::transmute::<__m256i, __m256bh>(factor))
 );
@@ -223,5 +217,41 @@ unsafe impl Halves for Convert {
             let narrow = _mm512_cvtps_ph::<_MM_FROUND_TO_NEAREST_INT>(wide);
             _mm256_storeu_si256(to.as_mut_ptr().cast(), narrow);
         }
+    }
+
+    #[inline(always)]
+    unsafe fn shift(sums: &Lanes, bias: &[i32; PANEL], shift: &[u32; PANEL]) -> [i16; PANEL] {
+        // SAFETY: all are sixteen values of 32 bits; the types of the result are the same bits.
+        unsafe {
+            let sum = _mm512_load_si512(std::ptr::from_ref(sums).cast());
+            let sum = _mm512_add_epi32(sum, _mm512_loadu_si512(bias.as_ptr().cast()));
+            let sum = _mm512_srav_epi32(sum, _mm512_loadu_si512(shift.as_ptr().cast()));
+            let limit = i32::from(LIMIT);
+            let sum = _mm512_max_epi32(sum, _mm512_set1_epi32(-limit));
+            let sum = _mm512_min_epi32(sum, _mm512_set1_epi32(limit));
+            std::mem::transmute(_mm512_cvtepi32_epi16(sum))
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn round(sums: &Lanes, factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [i16; PANEL] {
+        // SAFETY: all are sixteen values of 32 bits; the types of the result are the same bits.
+        unsafe {
+            let sum = _mm512_load_si512(std::ptr::from_ref(sums).cast());
+            let value = _mm512_mul_ps(_mm512_cvtepi32_ps(sum), _mm512_loadu_ps(factor.as_ptr()));
+            let value = _mm512_add_ps(value, _mm512_loadu_ps(bias.as_ptr()));
+            let number = _mm512_cmp_ps_mask::<_CMP_ORD_Q>(value, value);
+            let value = _mm512_maskz_mov_ps(number, value);
+            let limit = f32::from(LIMIT);
+            let value = _mm512_max_ps(value, _mm512_set1_ps(-limit));
+            let value = _mm512_min_ps(value, _mm512_set1_ps(limit));
+            std::mem::transmute(_mm512_cvtepi32_epi16(_mm512_cvtps_epi32(value)))
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn settle(q: [i16; PANEL], residual: Option<&[i16; PANEL]>, floor: i16) -> [i16; PANEL] {
+        // SAFETY: AVX2, which any processor with AVX-512 has.
+        unsafe { super::avx2::Convert::settle(q, residual, floor) }
     }
 }

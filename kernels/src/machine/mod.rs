@@ -20,32 +20,38 @@ pub(crate) fn words_mut(lanes: &mut [Lanes]) -> &mut [u32] {
     unsafe { std::slice::from_raw_parts_mut(lanes.as_mut_ptr().cast(), lanes.len() * PANEL) }
 }
 
+/// The same memory, as i16.
+pub(crate) fn halves_mut(words: &mut [u32]) -> &mut [i16] {
+    // SAFETY: two i16 take u32's size, need no more alignment, and have every bit pattern as a value.
+    unsafe { std::slice::from_raw_parts_mut(words.as_mut_ptr().cast(), 2 * words.len()) }
+}
+
 /// The same memory, as f32.
 pub(crate) fn floats_mut(words: &mut [u32]) -> &mut [f32] {
     // SAFETY: f32 has u32's size and alignment, and every word is a value of both.
     unsafe { std::slice::from_raw_parts_mut(words.as_mut_ptr().cast(), words.len()) }
 }
 
-/// Asks for `count` values to be brought into the cache, if the machine can be asked.
+/// Asks for a row to be brought into the cache, if the machine can be asked.
 #[inline(always)]
-pub(crate) fn fetch<T>(at: *const T, count: usize) {
+pub(crate) fn fetch<T>(row: &[T]) {
     #[cfg(target_arch = "x86_64")]
-    for line in (0..count * size_of::<T>()).step_by(64) {
+    for line in (0..size_of_val(row)).step_by(64) {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         // SAFETY: SSE is part of the baseline; a fetch reads nothing, and may be of any address.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast::<i8>().wrapping_add(line)) };
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(row.as_ptr().cast::<i8>().wrapping_add(line)) };
     }
     #[cfg(not(target_arch = "x86_64"))]
-    let _ = (at, count);
+    let _ = row;
 }
 
-/// A [`Machine`](crate::tile::Machine) of `$lanes` words: the intrinsics that make zeros, load, store and spread words, and the
-/// multiplication.
+/// A [`Machine`](crate::tile::Machine) of `$lanes` words: the intrinsics that make zeros, load, store, spread and add words, and
+/// the multiplication.
 #[cfg(target_arch = "x86_64")]
 macro_rules! machine {
     (
         $(#[$doc:meta])* $name:ident: $sum:ty, $weight:ty, $lanes:literal,
-        [$zero:expr, $load:expr, $store:expr, $weights:expr, $spread:expr],
+        [$zero:expr, $load:expr, $store:expr, $weights:expr, $spread:expr, $add:expr],
         |$s:ident, $w:ident, $f:ident| $mul_add:expr
     ) => {
         $(#[$doc])*
@@ -86,6 +92,12 @@ macro_rules! machine {
             unsafe fn factor(at: *const u32) -> Self::Factor {
                 // SAFETY: the caller's promise.
                 unsafe { $spread(at.cast()) }
+            }
+
+            #[inline(always)]
+            unsafe fn add(a: Self::Sum, b: Self::Sum) -> Self::Sum {
+                // SAFETY: the caller's promise.
+                unsafe { $add(a, b) }
             }
 
             #[inline(always)]

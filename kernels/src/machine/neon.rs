@@ -1,5 +1,4 @@
-//! NEON as every AArch64 processor has it: blocks of six rows by one panel, or twelve by half of one, in f32; four by one panel, or
-//! eight by half of one, in i16, whose weights take more registers.
+//! NEON as every AArch64 processor has it: blocks of four rows by one panel, or by half of one.
 
 use std::arch::aarch64::*;
 use std::arch::asm;
@@ -13,26 +12,25 @@ use crate::tile::{Arithmetic, Block, Machine, columns};
 
 /// # Safety
 /// The processor must have NEON; the rest as [`columns`].
-pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) -> usize {
+pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) {
     // SAFETY: the caller's promise for one panel, or half of it.
     unsafe {
         match (arithmetic, whole) {
-            (Arithmetic::Float, 0) => wide::<Float, 12, 2>(block),
-            (Arithmetic::Float, _) => wide::<Float, 6, 4>(block),
-            (Arithmetic::Integer, 0) => wide::<Integer, 8, 1>(block),
-            (Arithmetic::Integer, _) => wide::<Integer, 4, 2>(block),
+            (Arithmetic::Float, 0) => wide::<Float, 4, 2, 1>(block),
+            (Arithmetic::Float, _) => wide::<Float, 4, 4, 1>(block),
+            (Arithmetic::Integer, 0) => wide::<Integer, 4, 1, 1>(block),
+            (Arithmetic::Integer, _) => wide::<Integer, 4, 2, 1>(block),
             (Arithmetic::Brain, _) => unreachable!("NEON has no bf16"),
         }
     }
-    1
 }
 
 /// # Safety
 /// As [`run`].
 #[target_feature(enable = "neon")]
-unsafe fn wide<M: Machine, const R: usize, const V: usize>(block: &Block) {
+unsafe fn wide<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
     // SAFETY: the caller's promise.
-    unsafe { columns::<M, R, V>(block) }
+    unsafe { columns::<M, R, V, P>(block) }
 }
 
 /// # Safety
@@ -97,6 +95,12 @@ unsafe impl Machine for Float {
     }
 
     #[inline(always)]
+    unsafe fn add(a: Self::Sum, b: Self::Sum) -> Self::Sum {
+        // SAFETY: the caller's promise.
+        unsafe { vaddq_f32(a, b) }
+    }
+
+    #[inline(always)]
     unsafe fn mul_add(sum: Self::Sum, weight: Self::Weight, factor: f32) -> Self::Sum {
         // SAFETY: the caller's promise.
         unsafe { vfmaq_n_f32(sum, weight, factor) }
@@ -144,6 +148,12 @@ unsafe impl Machine for Integer {
     unsafe fn factor(at: *const u32) -> int16x4_t {
         // SAFETY: the caller's promise.
         unsafe { vreinterpret_s16_u32(vdup_n_u32(at.read_unaligned())) }
+    }
+
+    #[inline(always)]
+    unsafe fn add(a: Self::Sum, b: Self::Sum) -> Self::Sum {
+        // SAFETY: the caller's promise.
+        unsafe { [vaddq_s32(a[0], b[0]), vaddq_s32(a[1], b[1])] }
     }
 
     #[inline(always)]

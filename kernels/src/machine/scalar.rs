@@ -6,16 +6,15 @@ use crate::tile::{Arithmetic, Block, Machine, columns};
 
 /// # Safety
 /// As [`columns`].
-pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, _whole: usize) -> usize {
+pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, _whole: usize) {
     // SAFETY: the caller's promise for one panel; plain Rust needs no instructions of its own.
     unsafe {
         match arithmetic {
-            Arithmetic::Float => columns::<Float, 2, 1>(block),
-            Arithmetic::Integer => columns::<Integer, 2, 1>(block),
+            Arithmetic::Float => columns::<Float, 2, 1, 1>(block),
+            Arithmetic::Integer => columns::<Integer, 2, 1, 1>(block),
             Arithmetic::Brain => unreachable!("plain Rust has no bf16"),
         }
     }
-    1
 }
 
 /// # Safety
@@ -78,6 +77,11 @@ unsafe impl Machine for Float {
     }
 
     #[inline(always)]
+    unsafe fn add(a: Self::Sum, b: Self::Sum) -> Self::Sum {
+        std::array::from_fn(|j| a[j] + b[j])
+    }
+
+    #[inline(always)]
     unsafe fn mul_add(mut sum: Self::Sum, weight: Self::Weight, factor: f32) -> Self::Sum {
         for j in 0..PANEL {
             sum[j] += weight[j] * factor;
@@ -124,6 +128,11 @@ unsafe impl Machine for Integer {
         // SAFETY: the caller's promise.
         let pair = unsafe { at.cast::<[i16; 2]>().read_unaligned() };
         std::array::from_fn(|j| pair[j % 2])
+    }
+
+    #[inline(always)]
+    unsafe fn add(a: Self::Sum, b: Self::Sum) -> Self::Sum {
+        std::array::from_fn(|i| std::array::from_fn(|j| a[i][j].wrapping_add(b[i][j])))
     }
 
     #[inline(always)]

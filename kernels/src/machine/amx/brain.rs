@@ -24,7 +24,7 @@ impl Weights {
     }
 }
 
-/// The sums over all taps of a tile: `sums[row · panels + panel]`, overwritten.
+/// The sums over all taps of a tile: `sums[row · panels + panel]`, rows in the plan's order.
 ///
 /// # Panics
 /// If the processor lacks AMX, or the plan reads beyond the input.
@@ -39,7 +39,7 @@ pub(crate) fn accumulate(
     let cin = weights.extents.cin;
     prepare(isa, weights, plan, input.len() / cin, buffers);
     sums.resize(
-        plan.masks().len() * weights.extents.panels(),
+        plan.groups() * plan.group() * weights.extents.panels(),
         Lanes::default(),
     );
     // SAFETY: an `Isa` with tiles is only made where the processor has AMX, AVX-512 and AVX512_BF16. All rows of the plan lie below its

@@ -1,19 +1,23 @@
 //! Integers in tiles of bytes.
 //!
 //! Numbers of up to 13 bits are cut into two digits, `x = 64·high + low`, each of a signed byte. Three products of digits make one of
-//! numbers: `high·high`, `low·low`, and `(high + low)·(high + low)`, which contains them and the mixed ones (Karatsuba). All is added modulo
-//! 2³², as everywhere, so sums are equal to the bit.
+//! numbers: `high·high`, `low·low`, and `(high + low)·(high + low)`, which contains them and the mixed ones (Karatsuba). Of up to 32 channels
+//! both digits fit a tile row, and the mixed products come of one multiplication by the weights' digits the other way round. All is added
+//! modulo 2³², as everywhere, so sums are equal to the bit.
 
 use std::arch::x86_64::*;
 
 use super::{Buffers, LINE, Scheme, Weights, multiply, prepare};
+use crate::machine::fetch;
 use crate::plan::PlanTile;
-use crate::rows::{Extents, Lanes, PANEL};
+use crate::rows::{AHEAD, Extents, Lanes, PANEL};
 
 /// The largest magnitude whose digits, and their sum, are signed bytes.
 const REACH: i16 = 4095;
-/// Input channels, and panels of output channels, from which on tiles are full enough.
-const WIDE: [usize; 2] = [33, 3];
+/// Input channels whose two digits fit a tile row.
+const HALF: usize = LINE / 2;
+/// Input channels from which on tiles are full enough; and panels of output channels, where a tile row holds one digit.
+const WIDE: [usize; 2] = [17, 3];
 
 impl Weights {
     /// Cuts the weights, which `weight(tap, input, output)` tells, into digits; nothing, if one is too large for that, or the layer too
@@ -22,22 +26,36 @@ impl Weights {
         extents: Extents,
         weight: impl Fn(usize, usize, usize) -> i16,
     ) -> Option<Weights> {
-        if extents.cin < WIDE[0] || extents.panels() < WIDE[1] {
+        let (cin, panels) = (extents.cin, extents.panels());
+        if cin < WIDE[0] || cin > HALF && panels < WIDE[1] {
             return None;
         }
-        let mut packed = Weights::new(extents, Scheme::Digits);
+        let both = cin <= HALF;
+        let scheme = if both { Scheme::Both } else { Scheme::Digits };
+        let mut packed = Weights::new(extents, scheme);
         for (tap, channel, out) in extents.each() {
             let w = weight(tap, channel, out);
             if w.unsigned_abs() > REACH.unsigned_abs() {
                 return None;
             }
             let (high, low) = digits(w);
+            let mut put = |pass: usize, byte: usize, column: usize, digit: i8| {
+                let word = packed.word(pass, tap, byte, column, out % PANEL);
+                *word |= u32::from(digit as u8) << (8 * (byte % 4));
+            };
+            let panel = out / PANEL;
+            if both {
+                put(0, channel, panel, high);
+                put(0, channel, panels + panel, low);
+                put(0, HALF + channel, panels + panel, high);
+                put(0, HALF + channel, 2 * panels + panel, low);
+                continue;
+            }
             let (chunk, channel) = (channel / LINE, channel % LINE);
             let (half, channel) = (channel / 32, channel % 32);
             let byte = chunk * LINE + channel / 8 * 16 + 8 * half + channel % 8;
             for (pass, digit) in [high, low, high + low].into_iter().enumerate() {
-                let word = packed.word(pass, tap, byte, out / PANEL, out % PANEL);
-                *word |= u32::from(digit as u8) << (8 * (byte % 4));
+                put(pass, byte, panel, digit);
             }
         }
         Some(packed)
@@ -50,7 +68,7 @@ fn digits(x: i16) -> (i8, i8) {
     (high as i8, (x - (high << 6)) as i8)
 }
 
-/// The sums over all taps of a tile: `sums[row · panels + panel]`, overwritten. False, and no sums, if activations are too large for
+/// The sums over all taps of a tile: `sums[row · panels + panel]`, rows in the plan's order. False, and no sums, if activations are too large for
 /// digits.
 ///
 /// # Panics
@@ -66,10 +84,15 @@ pub(crate) fn accumulate(
     let cin = weights.extents.cin;
     prepare(isa, weights, plan, input.len() / cin, buffers);
     // SAFETY: an `Isa` with tiles is only made where the processor has AVX-512. All rows of the plan lie below its end.
-    let small = unsafe { split_rows(input, cin, plan.inputs(), &mut buffers.rows) };
+    let small = unsafe {
+        match weights.scheme {
+            Scheme::Both => split_short_rows(input, cin, plan.inputs(), &mut buffers.rows),
+            _ => split_rows(input, cin, plan.inputs(), &mut buffers.rows),
+        }
+    };
     if small {
         sums.resize(
-            plan.masks().len() * weights.extents.panels(),
+            plan.groups() * plan.group() * weights.extents.panels(),
             Lanes::default(),
         );
         // SAFETY: as above, and it has AMX; `rows` has just been filled for this plan and these weights.
@@ -113,6 +136,33 @@ unsafe fn split_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) 
     for zeros in [highs, lows, both] {
         zeros[rows.len() * chunks..].fill(Lanes::default());
     }
+    within_reach(largest)
+}
+
+/// Writes rows as a tile row each, first the high digits, then the low ones. A row of zeros follows. Tells whether all were small enough.
+///
+/// # Safety
+/// The processor must have AVX-512 F, BW and VL; the input must have the rows, of at most 32 channels.
+#[target_feature(enable = "avx512f,avx512bw,avx512vl")]
+unsafe fn split_short_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) -> bool {
+    let (to, zeros) = to.split_at_mut(rows.len());
+    let mut largest = _mm512_setzero_si512();
+    let there = u32::MAX >> (HALF - cin);
+    for (i, (to, &row)) in to.iter_mut().zip(rows).enumerate() {
+        if let Some(&next) = rows.get(i + AHEAD) {
+            fetch(&input[next as usize * cin..][..cin]);
+        }
+        // SAFETY: of the row's values only those that are there are read, and a whole line written.
+        unsafe {
+            let x = _mm512_maskz_loadu_epi16(there, input.as_ptr().add(row as usize * cin));
+            largest = _mm512_max_epu16(largest, _mm512_abs_epi16(x));
+            let (high, low) = split(x);
+            let to = std::ptr::from_mut(to).cast::<__m256i>();
+            _mm256_store_si256(to, _mm512_cvtepi16_epi8(high));
+            _mm256_store_si256(to.add(1), _mm512_cvtepi16_epi8(low));
+        }
+    }
+    zeros.fill(Lanes::default());
     within_reach(largest)
 }
 

@@ -4,15 +4,18 @@
 
 pub(crate) mod brain;
 pub(crate) mod integers;
+mod spin;
 
 use std::arch::asm;
 
-use crate::plan::{GROUP, PlanTile};
-use crate::rows::{Extents, Lanes, PANEL};
+pub(crate) use spin::{spin, spin_brain};
+
+use crate::plan::PlanTile;
+use crate::rows::{Extents, Lanes};
 
 /// Bytes of a tile row.
 const LINE: usize = 64;
-/// [`Lanes`] of a tile.
+/// [`Lanes`] of a tile, and rows of a group.
 const TILE: usize = 16;
 /// Tiles of weights that the first cache holds besides rows and products.
 const CACHED: usize = 28;
@@ -22,6 +25,8 @@ const CACHED: usize = 28;
 enum Scheme {
     /// High digits, low ones and their sums in three passes of a tile row each 64 channels.
     Digits,
+    /// 32 high digits and 32 low ones in a tile row, which meet three tiles of weights: columns of high, mixed and low products.
+    Both,
     /// 32 channels in bf16.
     Brain,
 }
@@ -51,7 +56,7 @@ impl Weights {
     fn passes(&self) -> usize {
         match self.scheme {
             Scheme::Digits => 3,
-            Scheme::Brain => 1,
+            Scheme::Both | Scheme::Brain => 1,
         }
     }
 
@@ -59,19 +64,32 @@ impl Weights {
     fn chunks(&self) -> usize {
         match self.scheme {
             Scheme::Digits => self.extents.cin.div_ceil(LINE),
-            Scheme::Brain => self.extents.cin.div_ceil(LINE / 2),
+            Scheme::Both | Scheme::Brain => self.extents.cin.div_ceil(LINE / 2),
         }
     }
 
     /// Columns of tiles in each pass.
     fn columns(&self) -> usize {
-        self.extents.panels()
+        match self.scheme {
+            Scheme::Both => 3 * self.extents.panels(),
+            Scheme::Digits | Scheme::Brain => self.extents.panels(),
+        }
     }
 
     /// Columns that are multiplied at once: as many in each block.
     fn width(&self) -> usize {
-        let blocks = self.columns().div_ceil(4);
+        let most = if self.scheme == Scheme::Both { 6 } else { 4 };
+        let blocks = self.columns().div_ceil(most);
         self.columns().div_ceil(blocks)
+    }
+
+    /// Taps that all groups are multiplied by before the next ones, at so many columns.
+    fn taps(&self, width: usize) -> usize {
+        match self.scheme {
+            // Rows are short: their sums would be stored and loaded too often.
+            Scheme::Both => self.extents.volume,
+            Scheme::Digits | Scheme::Brain => (CACHED / width).max(1),
+        }
     }
 
     /// The word that multiplies the bytes from `byte` on of a tap's tile rows.
@@ -141,6 +159,7 @@ unsafe fn multiply(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, su
     } = buffers;
     let Extents { volume, .. } = weights.extents;
     let (chunks, columns, passes) = (weights.chunks(), weights.columns(), weights.passes());
+    let panels = weights.extents.panels();
     let (per_tap, lines) = (chunks * columns * TILE, rows.len() / passes);
     let (width, groups) = (weights.width(), plan.groups());
     gathered.resize(2 * TILE, Lanes::default());
@@ -151,7 +170,7 @@ unsafe fn multiply(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, su
             let width = width.min(columns - column);
             let first = (pass * columns + column) * groups * TILE;
             let products = &mut products[first..][..width * groups * TILE];
-            let taps = (CACHED / width).max(1);
+            let taps = weights.taps(width);
             for (tap, chunk) in (0..volume)
                 .step_by(taps)
                 .flat_map(|tap| (0..chunks).map(move |chunk| (tap, chunk)))
@@ -180,7 +199,9 @@ unsafe fn multiply(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, su
     }
     release();
     for group in 0..groups {
-        combine(weights, plan.rows(group), [group, groups], products, sums);
+        let first = group * TILE * panels;
+        let sums = &mut sums[first..][..TILE * panels];
+        combine(weights, [group, groups], products, sums);
     }
 }
 
@@ -190,8 +211,8 @@ struct Block {
     steps: usize,
     /// Each step's tap.
     taps: *const u8,
-    /// For each step, and one more, which of the rows to multiply.
-    places: *const [u16; GROUP],
+    /// For each step, and one more, which sixteen of the rows to multiply.
+    places: *const u16,
     /// Input rows.
     rows: *const Lanes,
     /// Bytes from one to the next.
@@ -222,7 +243,9 @@ impl Block {
                 (1, _) => one(self),
                 (2, _) => two(self),
                 (3, _) => three(self),
-                _ => four(self),
+                (4, _) => four(self),
+                (5, _) => five(self),
+                _ => six(self),
             }
         }
     }
@@ -318,10 +341,10 @@ macro_rules! gather {
     };
 }
 
-/// A function that multiplies a block by some columns of tiles, summing in tile registers: for each column that of its sums, one for its
-/// weights, and where these lie. Each step's rows are gathered while the one before is multiplied.
+/// A function that multiplies a block by some columns of tiles, summing in tile registers: that of the rows, for each column that of its
+/// sums, one for its weights, and where these lie. Each step's rows are gathered while the one before is multiplied.
 macro_rules! columns {
-    ($(#[$doc:meta])* $name:ident, $multiply:literal, $(($sum:literal, $weight:literal, $at:literal)),*) => {
+    ($(#[$doc:meta])* $name:ident, $multiply:literal, $rows:literal, $(($sum:literal, $weight:literal, $at:literal)),*) => {
         $(#[$doc])*
         ///
         /// # Safety
@@ -349,10 +372,10 @@ macro_rules! columns {
                     "movzx {at:e}, byte ptr [{taps}]",
                     "imul {at}, {tap}",
                     "add {at}, {weights}",
-                    "tileloadd tmm4, [{now} + {line}]",
+                    concat!("tileloadd tmm", $rows, ", [{now} + {line}]"),
                     $(
                         concat!("tileloadd tmm", $weight, ", [{at} + {line} + ", $at, "]"),
-                        concat!($multiply, " tmm", $sum, ", tmm4, tmm", $weight),
+                        concat!($multiply, " tmm", $sum, ", tmm", $rows, ", tmm", $weight),
                     )*
                     "inc {taps}",
                     "dec {steps}",
@@ -385,47 +408,49 @@ macro_rules! columns {
 
 columns!(
     /// One column.
-    one, "tdpbssd", ("0", "5", "0")
+    one, "tdpbssd", "4", ("0", "5", "0")
 );
 columns!(
     /// Two columns.
-    two, "tdpbssd", ("0", "5", "0"), ("1", "6", "1024")
+    two, "tdpbssd", "4", ("0", "5", "0"), ("1", "6", "1024")
 );
 columns!(
     /// Three columns.
-    three, "tdpbssd", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048")
+    three, "tdpbssd", "4", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048")
 );
 columns!(
     /// Four columns.
-    four, "tdpbssd", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048"), ("3", "5", "3072")
+    four, "tdpbssd", "4", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048"), ("3", "5", "3072")
+);
+columns!(
+    /// Five columns.
+    five, "tdpbssd", "6", ("0", "7", "0"), ("1", "7", "1024"), ("2", "7", "2048"), ("3", "7", "3072"), ("4", "7", "4096")
+);
+columns!(
+    /// Six columns.
+    six, "tdpbssd", "6", ("0", "7", "0"), ("1", "7", "1024"), ("2", "7", "2048"), ("3", "7", "3072"), ("4", "7", "4096"), ("5", "7", "5120")
 );
 columns!(
     /// One column of bf16.
-    one_brain, "tdpbf16ps", ("0", "5", "0")
+    one_brain, "tdpbf16ps", "4", ("0", "5", "0")
 );
 columns!(
     /// Two columns of bf16.
-    two_brain, "tdpbf16ps", ("0", "5", "0"), ("1", "6", "1024")
+    two_brain, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024")
 );
 columns!(
     /// Three columns of bf16.
-    three_brain, "tdpbf16ps", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048")
+    three_brain, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048")
 );
 columns!(
     /// Four columns of bf16.
-    four_brain, "tdpbf16ps", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048"), ("3", "5", "3072")
+    four_brain, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048"), ("3", "5", "3072")
 );
 
-/// Puts together the products for the rows of a group.
+/// Puts together the products of a group.
 #[target_feature(enable = "avx512f")]
 #[inline]
-fn combine(
-    weights: &Weights,
-    rows: &[u16],
-    [group, groups]: [usize; 2],
-    products: &[Lanes],
-    sums: &mut [Lanes],
-) {
+fn combine(weights: &Weights, [group, groups]: [usize; 2], products: &[Lanes], sums: &mut [Lanes]) {
     let panels = weights.extents.panels();
     let (columns, block) = (weights.columns(), weights.width());
     // The tile of a pass's column: blocks of columns, then groups, then the block's columns.
@@ -438,48 +463,23 @@ fn combine(
     for panel in 0..panels {
         let [high, low, mixed] = match weights.scheme {
             Scheme::Digits => [0, 1, 2].map(|pass| tile(pass, panel)),
+            Scheme::Both => [0, 2, 1].map(|digit| tile(0, digit * panels + panel)),
             Scheme::Brain => [tile(0, panel); 3],
         };
-        for (at, &row) in rows.iter().enumerate() {
+        for (at, sums) in sums.chunks_exact_mut(panels).enumerate() {
             let (high, low, mixed) = (high[at].0, low[at].0, mixed[at].0);
-            let sum = &mut sums[usize::from(row) * panels + panel];
+            let sum = &mut sums[panel];
             sum.0 = std::array::from_fn(|lane: usize| {
                 let (high, low) = (high[lane], low[lane]);
                 if weights.scheme == Scheme::Brain {
                     return high;
                 }
-                let mixed = mixed[lane].wrapping_sub(high).wrapping_sub(low);
+                let mut mixed = mixed[lane];
+                if weights.scheme == Scheme::Digits {
+                    mixed = mixed.wrapping_sub(high).wrapping_sub(low);
+                }
                 (high << 12).wrapping_add(mixed << 6).wrapping_add(low)
             });
         }
     }
 }
-
-/// A function that multiplies tiles `4 · rounds` times, and gives the number of products of `$bytes` bytes: see [`crate::ceiling`].
-macro_rules! spin {
-    ($name:ident, $multiply:literal, $bytes:literal) => {
-        pub(crate) fn $name(isa: crate::Isa, rounds: usize) -> usize {
-            assert!(isa.has_tiles());
-            configure();
-            // SAFETY: tiles are configured, and zero; the registers that are written are named.
-            unsafe {
-                asm!(
-                    "2:",
-                    concat!($multiply, " tmm0, tmm4, tmm6"),
-                    concat!($multiply, " tmm1, tmm5, tmm6"),
-                    concat!($multiply, " tmm2, tmm4, tmm7"),
-                    concat!($multiply, " tmm3, tmm5, tmm7"),
-                    "dec {rounds}",
-                    "jnz 2b",
-                    rounds = inout(reg) rounds.max(1) => _,
-                    out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
-                    options(nostack, nomem),
-                );
-            }
-            release();
-            rounds.max(1) * 4 * GROUP * PANEL * LINE / $bytes
-        }
-    };
-}
-spin!(spin, "tdpbssd", 1);
-spin!(spin_brain, "tdpbf16ps", 2);
