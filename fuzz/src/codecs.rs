@@ -2,25 +2,36 @@
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::rc::Rc;
 
 use b2p::Cancel;
 use b2p::bitstream::Slice;
-use b2p::entropy::{Condition, RawRows, Tables, decode_slice, encode_slice, quantise};
-use b2p::geometry::{KernelMap, Octree, Voxels, codec};
+use b2p::entropy::{
+    Condition, RawRows, Tables, UNPREDICTED, decode_level, decode_passes, decode_slice,
+    encode_level, encode_passes, encode_slice, quantise,
+};
+use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 
 use crate::Source;
 
-/// Any bytes as voxels: encode → decode is equal. Any bytes as the code of the next level: an error, or occupancies that have the
-/// very same code.
+/// Any bytes as voxels: encode → decode is equal, and parents and neighbours are those that a search finds. Any bytes as occupancies:
+/// an error, or the octree that its finest voxels have. Any bytes as the code of the next level: an error, or occupancies that have
+/// the very same code.
 pub fn octree(bytes: &[u8]) {
     let mut source = Source(bytes);
     let depth = 1 + source.byte() % 5;
     let slice = 1 + usize::from(source.byte()) % 40;
-    let count = usize::from(source.byte()) % 64 + 1;
+    let count = (usize::from(source.byte()) + 1) % 65;
     let keys = (0..count).map(|_| u64::from(source.u16()) % (1 << (3 * depth)));
     let voxels = Voxels::new(depth, keys.collect());
-    let octree = Octree::new(voxels).expect("at least one voxel");
+    let octree = match Octree::new(voxels) {
+        Ok(octree) => octree,
+        Err(error) => {
+            assert!(count == 0, "{error}");
+            return;
+        }
+    };
     let mut decoded = Octree::root();
     let mut map = KernelMap::root();
     for level in 1..=depth {
@@ -28,9 +39,17 @@ pub fn octree(bytes: &[u8]) {
         let slices: Vec<_> = encoded.iter().map(|(n, code)| whole(*n, code)).collect();
         codec::decode_level(&mut decoded, &map, &slices, slice, &Cancel::default())
             .expect("what was encoded decodes");
+        assert_eq!(decoded, octree.truncated(level));
+        let fewer = &slices[1..];
+        let refused = codec::decode_level(&mut decoded, &map, fewer, slice, &Cancel::default());
+        assert!(refused.is_err(), "a slice is missing");
+        assert_eq!(decoded, octree.truncated(level));
         map = octree.child_map(level - 1, &map);
+        check_family(octree.level(level - 1), octree.level(level));
+        assert_eq!(map, searched(octree.level(level)));
     }
     assert_eq!(decoded, octree);
+    occupancies(source.0);
 
     let parents = octree.level(depth).len();
     let voxels = parents + usize::from(source.byte()) % (7 * parents + 1);
@@ -49,6 +68,55 @@ pub fn octree(bytes: &[u8]) {
         .expect("one occupancy for every parent, none empty");
     let again = codec::encode_level(&grown, &map, depth + 1, usize::MAX);
     assert_eq!(again[0].1, code, "another code for the same octree");
+}
+
+/// Every voxel is a child of its parent, and every parent has one.
+fn check_family(parents: &Voxels, children: &Voxels) {
+    assert_eq!(children.parents(), *parents);
+    let indices = children.parent_indices();
+    assert_eq!(indices.len(), children.len());
+    for ((&parent, key), octant) in indices.iter().zip(children.keys()).zip(children.octants()) {
+        let parent = parents.keys()[parent as usize];
+        assert_eq!(*key, parent << 3 | u64::from(octant));
+    }
+}
+
+/// The 3³ kernel map by looking every neighbour up.
+fn searched(voxels: &Voxels) -> KernelMap {
+    let size = 1i64 << voxels.depth();
+    let mut rows = Vec::new();
+    for i in 0..voxels.len() {
+        let [x, y, z] = voxels.coordinate(i).map(i64::from);
+        for k in 0..27 {
+            let at = [x + k % 3 - 1, y + k / 3 % 3 - 1, z + k / 9 - 1];
+            let inside = at.iter().all(|v| (0..size).contains(v));
+            let key = || morton::encode(at.map(|v| v as u32));
+            let found = inside.then(|| voxels.keys().binary_search(&key()).ok());
+            rows.push(found.flatten().map_or(KernelMap::ABSENT, |i| i as u32));
+        }
+    }
+    KernelMap::new(27, rows)
+}
+
+/// Bytes as the occupancies of one level after the other: refused if they are too few, one is zero, or there is no such level.
+fn occupancies(mut bytes: &[u8]) {
+    let mut octree = Octree::root();
+    while !bytes.is_empty() {
+        let parents = octree.level(octree.depth()).len();
+        let (masks, rest) = bytes.split_at(parents.min(bytes.len()));
+        let possible =
+            masks.len() == parents && !masks.contains(&0) && octree.depth() < morton::MAX_DEPTH;
+        let before = octree.clone();
+        if octree.grow(masks.to_vec()).is_err() {
+            assert!(!possible, "occupancies were refused");
+            assert_eq!(octree, before);
+            break;
+        }
+        assert!(possible, "no occupancies of a level");
+        bytes = rest;
+    }
+    let again = Octree::new(octree.level(octree.depth()).clone());
+    assert_eq!(again.expect("it has voxels"), octree);
 }
 
 /// A slice that is all there is of its stream.
@@ -101,7 +169,10 @@ fn make(seed: u8) -> Tables {
     Tables::new(raw("gauss", &gauss), raw("prior", &prior)).expect("tables made to be sound")
 }
 
-fn raw<'a>(name: &'a str, rows: &'a (Vec<u16>, Vec<u32>, Vec<i16>)) -> RawRows<'a> {
+/// Entries, offsets, low, as in [`RawRows`].
+type RawTable = (Vec<u16>, Vec<u32>, Vec<i16>);
+
+fn raw<'a>(name: &'a str, rows: &'a RawTable) -> RawRows<'a> {
     RawRows {
         name,
         entries: &rows.0,
@@ -110,11 +181,15 @@ fn raw<'a>(name: &'a str, rows: &'a (Vec<u16>, Vec<u32>, Vec<i16>)) -> RawRows<'
     }
 }
 
-/// Any table and symbols: encode → decode is equal. Any bytes as code: an error, or symbols that have the very same code. Any real
-/// latents: rounded down or up, whatever a bit costs.
+/// Any table and symbols: encode → decode is equal, in slices and in passes too. Any bytes as code: an error, or symbols that have the
+/// very same code. Any real latents: rounded down or up, whatever a bit costs. Any numbers as a table: an error, or a sound one.
 pub fn entropy(bytes: &[u8]) {
     let mut source = Source(bytes);
-    let tables = tables(source.byte());
+    let seed = source.byte();
+    if seed >= 224 {
+        return any_table(source, seed);
+    }
+    let tables = tables(seed);
     let voxels = usize::from(source.byte()) % 16;
     let prior = source.byte().is_multiple_of(2);
     let count = voxels * tables.channels();
@@ -142,6 +217,12 @@ pub fn entropy(bytes: &[u8]) {
         let again = encode_slice(&tables, condition, &latents);
         assert_eq!(again, code, "another code for the same latents");
     }
+    let slice = 1 + code.len() % 6;
+    in_slices(&tables, condition, &latents, slice);
+    let octants: Vec<u8> = (0..voxels)
+        .map(|v| code.get(v).copied().unwrap_or(v as u8) % 8)
+        .collect();
+    in_passes(&tables, &octants, &latents, slice, code);
 
     const LIMIT: i16 = 500;
     let price = f32::from(code.first().copied().unwrap_or(0)) / 64.0;
@@ -152,4 +233,126 @@ pub fn entropy(bytes: &[u8]) {
         let away = (f32::from(*q) - y.clamp(-bound, bound)).abs();
         assert!(q.abs() <= LIMIT && away <= 1.0, "{y} became {q}");
     }
+}
+
+fn slices(codes: &[Vec<u8>]) -> Vec<Slice<'_>> {
+    codes.iter().map(|code| whole(0, code)).collect()
+}
+
+/// A level in slices: each has the code that it has alone, and together they decode; one less does not.
+fn in_slices(tables: &Tables, condition: Condition, latents: &[i16], slice: usize) {
+    let voxels = latents.len() / tables.channels();
+    let codes = encode_level(tables, condition, latents, slice);
+    if voxels <= slice && voxels > 0 {
+        assert_eq!(codes, [encode_slice(tables, condition, latents)]);
+    }
+    let decode = |slices: &[Slice]| {
+        let cancel = Cancel::default();
+        decode_level(tables, condition, slices, voxels, slice, 1, &cancel)
+    };
+    let slices = slices(&codes);
+    assert_eq!(decode(&slices).expect("what was encoded decodes"), latents);
+    if let [_, fewer @ ..] = &slices[..] {
+        assert!(decode(fewer).is_err(), "a slice is missing");
+    }
+}
+
+/// A level in passes, each voxel predicted from the one before it if that is of a lower octant: encode → decode is equal, and what
+/// any bytes decode to has the very same code.
+fn in_passes(tables: &Tables, octants: &[u8], latents: &[i16], slice: usize, code: &[u8]) {
+    let k = tables.channels();
+    let predict = |slice: Range<usize>, voxels: &[u32], known: &[i16]| {
+        let (mut mu, mut sigma) = (Vec::new(), Vec::new());
+        for v in voxels.iter().map(|&v| v as usize) {
+            let lower = v > slice.start && octants[v - 1] < octants[v];
+            for channel in 0..k {
+                let before = || known[(v - 1 - slice.start) * k + channel];
+                mu.push(if lower { before().wrapping_mul(7) } else { 0 });
+                sigma.push(if lower { octants[v] * 8 } else { UNPREDICTED });
+            }
+        }
+        (mu, sigma)
+    };
+    let decode = |slices: &[Slice], slice: usize| {
+        let cancel = Cancel::default();
+        decode_passes(tables, octants, &predict, slices, slice, 1, &cancel)
+    };
+    let codes = encode_passes(tables, octants, &predict, latents, slice);
+    let decoded = decode(&slices(&codes), slice);
+    assert_eq!(decoded.expect("what was encoded decodes"), latents);
+    if let Ok(latents) = decode(&[whole(0, code)], octants.len().max(1)) {
+        let again = encode_passes(tables, octants, &predict, &latents, octants.len());
+        assert_eq!(again, [code], "another code for the same latents");
+    }
+}
+
+/// Numbers as a table, some of them put right: an error, or a table under which symbols of each of its rows come back.
+fn any_table(mut source: Source, how: u8) {
+    let rows = usize::from(source.byte() % 4);
+    let (mut entries, mut offsets, mut low) = (Vec::new(), vec![0u32], Vec::new());
+    for _ in 0..rows {
+        let length = usize::from(source.byte() % 8);
+        let mut row: Vec<u16> = (0..length).map(|_| source.u16()).collect();
+        // One in four is left as it comes, as the last entry of the others makes up for what the sum lacks.
+        if how % 4 != 0
+            && let Some((last, others)) = row.split_last_mut()
+        {
+            others.iter_mut().for_each(|entry| *entry >>= 3);
+            let sum: u32 = others.iter().map(|&entry| u32::from(entry) + 1).sum();
+            *last = (65_535 - sum) as u16;
+        }
+        entries.extend(row);
+        offsets.push(entries.len() as u32);
+        low.push(source.u16() as i16);
+    }
+    match how / 4 % 8 {
+        0 => offsets[rows / 2] = source.u16().into(),
+        1 => _ = low.pop(),
+        2 => _ = offsets.pop(),
+        _ => (),
+    }
+    let sound = is_sound(&entries, &offsets, &low);
+    let flat = flat();
+    let table = (entries, offsets, low);
+    let refused = Tables::new(raw("gauss", &table), raw("prior", &flat));
+    assert!(refused.is_err(), "1024 rows are needed");
+    let tables = match Tables::new(raw("gauss", &flat), raw("prior", &table)) {
+        Ok(tables) => tables,
+        Err(error) => return assert!(!sound, "{error}"),
+    };
+    assert!(sound, "a table that is none");
+    let voxels = source.0.len() / (2 * rows);
+    let latents: Vec<i16> = (0..voxels * rows).map(|_| source.u16() as i16).collect();
+    let code = encode_slice(&tables, Condition::Prior, &latents);
+    let decoded = decode_slice(&tables, Condition::Prior, &code, voxels, &"here");
+    assert_eq!(decoded.expect("what was encoded decodes"), latents);
+}
+
+/// Whether these are rows end to end, each of probabilities for values of 16 bits and an escape.
+fn is_sound(entries: &[u16], offsets: &[u32], low: &[i16]) -> bool {
+    let mut end = 0;
+    let mut rows = 0;
+    for (ends, &low) in offsets.windows(2).zip(low) {
+        let Some(row) = entries.get(end..ends[1] as usize) else {
+            return false;
+        };
+        let sum: u64 = row.iter().map(|&entry| u64::from(entry) + 1).sum();
+        let last = i64::from(low) + row.len() as i64 - 2;
+        if ends[0] as usize != end || row.len() < 2 || sum != 65_536 || last > 32_767 {
+            return false;
+        }
+        (end, rows) = (ends[1] as usize, rows + 1);
+    }
+    rows > 0 && rows == low.len() && rows + 1 == offsets.len() && end == entries.len()
+}
+
+/// The least table that conditions with means and scales can have: two entries a row.
+fn flat() -> RawTable {
+    let rows = 1024;
+    let offsets = (0..=rows).map(|row| 2 * row).collect();
+    (
+        vec![32_767; 2 * rows as usize],
+        offsets,
+        vec![0; rows as usize],
+    )
 }

@@ -1,6 +1,6 @@
 //! Streams from strangers.
 
-use b2p::bitstream::{Header, Stream};
+use b2p::bitstream::{Header, Stream, Writer};
 use b2p::decoder::{Decoder, Decoding};
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
@@ -19,7 +19,7 @@ fn limits() -> Limits {
 }
 
 /// Any bytes: an error, or a header that is within the limits and is written back as it was read, whose levels, where they are whole,
-/// have as many voxels as it tells.
+/// have as many voxels as it tells; a whole stream is written back as it was read, but for chunks that may be skipped.
 pub fn header(bytes: &[u8]) {
     let limits = limits();
     let Ok(header) = Header::parse(bytes, &limits) else {
@@ -51,6 +51,55 @@ pub fn header(bytes: &[u8]) {
     let whole = stream.levels().len() == header.voxels.len();
     let exact = bytes.len() as u64 == header.stream_bytes();
     assert_eq!(stream.damage().is_none(), whole && exact);
+    assert_eq!(*stream.header(), header);
+    if stream.damage().is_none() {
+        let written = rewritten(&stream);
+        assert_eq!(
+            written,
+            rewritten(&Stream::parse(&written, &limits).expect("a stream"))
+        );
+        assert!(written.len() <= bytes.len());
+        if written.len() == bytes.len() {
+            assert_eq!(written[header.bytes()..], bytes[header.bytes()..]);
+        }
+    }
+    requests(bytes, &header, stream.deepest());
+}
+
+/// The same stream, put together from its parts.
+fn rewritten(stream: &Stream) -> Vec<u8> {
+    let mut writer = Writer::new(stream.header().clone()).expect("a header that was read");
+    for level in stream.levels() {
+        for part in &level.geometry {
+            let slices = part.slices.iter().map(|slice| (slice.voxels, slice.bytes));
+            let slices: Vec<_> = slices.collect();
+            writer.geometry(part.level, &slices).expect("a level of it");
+        }
+        let mut slices: Vec<_> = level.features.iter().map(|slice| slice.bytes).collect();
+        slices.push(&[]);
+        let excess = writer.features(level.level, level.latent_hash, &slices);
+        assert!(excess.is_err(), "more slices than the voxels fill");
+        slices.pop();
+        writer
+            .features(level.level, level.latent_hash, &slices)
+            .expect("a level of it");
+    }
+    writer.finish().expect("the parts of a whole stream")
+}
+
+/// A level can be asked for if it is whole; a prefix is intact if it ends with a level; a header has as many voxel counts as levels.
+fn requests(bytes: &[u8], header: &Header, deepest: Option<u8>) {
+    let stream = || Stream::parse(bytes, &limits()).expect("the header is sound");
+    for level in header.base.saturating_sub(1)..=header.top + 1 {
+        let whole = level >= header.base && deepest.is_some_and(|deepest| level <= deepest);
+        assert_eq!(stream().require(level).is_ok(), whole);
+    }
+    let length = deepest.map(|level| header.prefix_bytes(level).expect("a level of the stream"));
+    let intact = length == Some(bytes.len() as u64);
+    assert_eq!(stream().intact().is_ok(), intact);
+    let mut other = header.clone();
+    other.voxels.pop();
+    assert!(Writer::new(other).is_err());
 }
 
 /// The finest level that a stream decodes to.
