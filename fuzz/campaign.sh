@@ -3,7 +3,7 @@
 #
 #     fuzz/campaign.sh [SECONDS [TARGET …]]    so many seconds a target (60), again and again until it is stopped; all targets by default
 #     fuzz/campaign.sh once [SECONDS [TARGET …]]
-#     fuzz/campaign.sh keep [TARGET …]         adds to fuzz/corpus what covers more than it does, the smallest inputs first
+#     fuzz/campaign.sh keep [TARGET …]         makes fuzz/corpus anew: the seeds, and as few inputs as cover all that is covered by any
 #     fuzz/campaign.sh total                   how often each target has run
 #
 # Inputs and the log of executions are kept in fuzz/target/campaign. An input that breaks a promise is left in fuzz/artifacts, and ends it.
@@ -49,9 +49,21 @@ total() {
     done
 }
 
+# Only where inputs lead counts here, not how often: that is for the campaign to remember.
 keep() {
+    local target least
     for target in "$@"; do
-        "$(program "$target")" -merge=1 -max_len="$(longest "$target")" "corpus/$target" "$work/$target" 2>&1 | grep MERGE-OUTER | tail -n 1
+        mkdir -p "$work/$target"
+        least=$(mktemp -d "$work/least-XXXXXX")
+        cp "corpus/$target"/seed-* "$least"
+        "$(program "$target")" -set_cover_merge=1 -use_counters=0 -max_len=4096 "$least" "corpus/$target" "$work/$target" > "$work/$target.txt" 2>&1 || {
+            tail -n 40 "$work/$target.txt"
+            exit 1
+        }
+        rm -r "corpus/$target"
+        chmod 755 "$least"
+        mv "$least" "corpus/$target"
+        echo "$target: $(find "corpus/$target" -type f | wc -l) inputs"
     done
 }
 

@@ -74,9 +74,38 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
             files.chain([cloud.to_ply(), ascii.into()]).collect()
         }
         "model" => vec![vec![], noise(1, 5), noise(2, 40)],
-        _ => [0, 7, 60, 300, 1000]
-            .iter()
-            .map(|&length| noise(length as u64, length))
-            .collect(),
+        // No voxels; one at every level, and one level too many.
+        "octree" => {
+            let deepest = [&[0; 5][..], &[1; 22]].concat();
+            [vec![0, 0, 64], deepest]
+                .into_iter()
+                .chain(noises())
+                .collect()
+        }
+        "entropy" => faulty_tables().into_iter().chain(noises()).collect(),
+        _ => noises().collect(),
     }
+}
+
+fn noises() -> impl Iterator<Item = Vec<u8>> {
+    let lengths = [0, 7, 60, 300, 1000];
+    lengths
+        .into_iter()
+        .map(|length| noise(length as u64, length))
+}
+
+/// What the target `entropy` reads as tables of one row of three entries, and as symbols under it: one that is sound, and one with each
+/// fault that is more than a wrong sum.
+fn faulty_tables() -> [Vec<u8>; 5] {
+    let table = |how: u8, low: i16, rest: &[u8]| {
+        let entries = [0, 1, 2, 3, 4, 5];
+        [&[how, 1, 3][..], &entries, &low.to_le_bytes(), rest].concat()
+    };
+    [
+        table(237, -1, &noise(3, 40)),
+        table(237, i16::MAX, &[]),
+        table(225, 0, &[9, 0]),
+        table(229, 0, &[]),
+        table(233, 0, &[]),
+    ]
 }
