@@ -294,7 +294,7 @@ fn any_table(mut source: Source, how: u8) {
         let length = usize::from(source.byte() % 8);
         let mut row: Vec<u16> = (0..length).map(|_| source.u16()).collect();
         // One in four is left as it comes, as the last entry of the others makes up for what the sum lacks.
-        if how % 4 != 0
+        if !how.is_multiple_of(4)
             && let Some((last, others)) = row.split_last_mut()
         {
             others.iter_mut().for_each(|entry| *entry >>= 3);
