@@ -5,10 +5,10 @@ use std::ops::Deref;
 use super::Decoder;
 use crate::bitstream::Header;
 use crate::error::Result;
-use crate::network::{Model, RAW};
+use crate::network::{AT_ONCE, Model, RAW};
 
-/// Bytes of a row of a 3³ kernel map.
-const MAP: u64 = 27 * 4;
+/// Bytes of a row of a 3³ kernel map, and of the same arranged for the kernels.
+const MAP: u64 = 27 * 4 + 100;
 /// Bytes of a voxel in the octree: its key, its occupancy, its first child.
 const NODE: u64 = 8 + 1 + 4;
 /// Bytes of a Gaussian.
@@ -20,9 +20,9 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included, beyond
     /// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and the model itself.
     ///
-    /// That is linear in the voxels: with C channels and K latents, 124 + 10·C + 7·K bytes for each voxel of a level, the level above it
-    /// with its features, 220 + 6·H bytes more for each Gaussian that a generator of H channels makes, and, where a network of B channels
-    /// predicts the base level, 20 + 19·K + 4·B bytes for each of its voxels.
+    /// That is linear in the voxels: with C channels and K latents, 224 + 10·C + 7·K bytes for each voxel of a level, the level above it
+    /// with its features, 112 bytes for each Gaussian, 208 + 6·H bytes more for each that a generator of H channels makes at once, and, where
+    /// a network of B channels predicts the base level, 20 + 19·K + 4·B bytes for each of its voxels.
     ///
     /// # Errors
     /// [`crate::Error::Usage`] if the stream has no such level.
@@ -42,9 +42,14 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let exact = parents * features + voxels * (MAP + 16 + 10 * c + 7 * k);
         let base = counts().next().unwrap_or(0) * shape.base_bytes() as u64;
         let head = shape.head(levels - 1).map_or(0, |head| {
-            let h = head.channels as u64;
-            let one = MAP + 3 * 2 * h + 4 * RAW as u64 + GAUSSIAN;
-            voxels * (head.children as u64 * one + 6 * h + 2 * c + 32)
+            let (h, children) = (head.channels as u64, head.children as u64);
+            let at_once = match children {
+                1 => voxels,
+                _ => voxels.min(AT_ONCE as u64) * children,
+            };
+            voxels * (6 * h + 2 * c + 36)
+                + voxels * children * (4 * RAW as u64 + GAUSSIAN)
+                + at_once * (MAP + 3 * 2 * h)
         });
         Ok(stream + octree + base + exact + head)
     }

@@ -80,7 +80,9 @@ impl Model {
                 apply(pool, self.isa, &fs.lin1, Taps::Same, &x, rows, true)
             }
         };
-        Ok(apply_f32(self.isa, &fs.lin2, Taps::Same, &hidden, rows))
+        let mut out = vec![0.0; rows * self.shape.latents];
+        apply_f32(self.isa, &fs.lin2, Taps::Same, &hidden, &mut out);
+        Ok(out)
     }
 
     fn encoder(&self) -> Result<&Encoder<FloatConv>> {

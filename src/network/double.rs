@@ -127,6 +127,6 @@ impl Model {
         let step = f64::from(self.g_scale[role]);
         let g: Vec<f64> = g.iter().map(|&q| f64::from(q) * step).collect();
         let layers = generator.of_layers(Double::new);
-        Ok(self.run_generator(&layers, &g, map))
+        Ok(self.run_generator(&layers, &g, map, map.len().max(1)))
     }
 }

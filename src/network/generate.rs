@@ -6,6 +6,7 @@ use std::sync::OnceLock;
 
 use b2p_kernels::{ExactConv, FloatConv, Taps};
 
+use super::children::{Part, Parts};
 use super::layers::{Conv, Pool, apply, apply_f32, reals};
 use super::shape::Head;
 use super::stored::Stored;
@@ -117,11 +118,11 @@ impl Model {
         self.check(g, self.shape.channels, map);
         match (&generator.scales, self.precision) {
             (Some(scales), Precision::Int16) => {
-                Ok(self.run_generator(generator.integer(scales), g, map))
+                Ok(self.run_generator(generator.integer(scales), g, map, PART))
             }
             _ => {
                 let g = reals(self.isa, g, self.g_scale[role]);
-                Ok(self.run_generator(generator.float(), &g, map))
+                Ok(self.run_generator(generator.float(), &g, map, PART))
             }
         }
     }
@@ -142,11 +143,13 @@ impl Model {
         })
     }
 
+    /// What a generator makes of features; the children of so many voxels at once.
     pub(super) fn run_generator<C: Conv>(
         &self,
         gg: &Generate<C>,
         g: &[C::Value],
         map: &KernelMap,
+        part: usize,
     ) -> Vec<f32> {
         let (isa, n) = (self.isa, map.len());
         let pool = &mut Pool::new();
@@ -154,24 +157,101 @@ impl Model {
         for block in &gg.before {
             x = block.apply(pool, isa, map.taps(), x);
         }
-        let finish = |pool: &mut Pool<C::Value>, mut x: Vec<C::Value>, map: &KernelMap| {
-            for block in &gg.after {
-                x = block.apply(pool, isa, map.taps(), x);
-            }
-            apply_f32(isa, &gg.conv_out, map.taps(), &x, map.len())
-        };
-        let out = if gg.head.children == 8 {
-            let children = apply(pool, isa, &gg.layer4, Taps::Children, &x, 8 * n, false);
-            // Theirs are eight times as large: nothing before is of use to them.
-            drop(x);
-            finish(&mut Pool::new(), children, &map.generated_children())
+        let mut out = vec![0.0; n * gg.head.children * RAW];
+        if gg.head.children == 8 {
+            self.finish_children(pool, gg, x, map, part, &mut out);
         } else {
             let forward = map.forward();
             let next = apply(pool, isa, &gg.layer4, forward.taps(), &x, n, false);
             pool.give(x);
-            finish(pool, next, map)
-        };
-        debug_assert_eq!(out.len(), n * gg.head.children * RAW);
+            let mut x = next;
+            for block in &gg.after {
+                x = block.apply(pool, isa, map.taps(), x);
+            }
+            apply_f32(isa, &gg.conv_out, map.taps(), &x, &mut out);
+        }
         out
+    }
+
+    /// What a generator makes of the features of all eight children of every voxel, part by part.
+    fn finish_children<C: Conv>(
+        &self,
+        pool: &mut Pool<C::Value>,
+        gg: &Generate<C>,
+        x: Vec<C::Value>,
+        map: &KernelMap,
+        part: usize,
+        out: &mut [f32],
+    ) {
+        let (isa, h, n) = (self.isa, gg.head.channels, map.len());
+        let layers = 2 * gg.after.len() + 1;
+        let mut parts = Parts::new(map);
+        for (i, out) in out.chunks_mut(part * 8 * RAW).enumerate() {
+            let rows = i * part..n.min((i + 1) * part);
+            let Part { voxels, ends, map } = parts.part(rows, layers.div_ceil(2));
+            // After that many layers, the children whose results some later layer reads.
+            let rows = |done: usize| 8 * ends[(layers - done).div_ceil(2)];
+            let mut parents = pool.take(voxels.len() * h);
+            for (to, &voxel) in parents.chunks_exact_mut(h).zip(&voxels) {
+                to.copy_from_slice(&x[voxel as usize * h..][..h]);
+            }
+            let map = map.generated_children();
+            let mut y = apply(
+                pool,
+                isa,
+                &gg.layer4,
+                Taps::Children,
+                &parents,
+                rows(0),
+                false,
+            );
+            pool.give(parents);
+            for (block, done) in gg.after.iter().zip((0..).step_by(2)) {
+                let rows = [rows(done + 1), rows(done + 2)];
+                y = block.apply_to_some(pool, isa, map.taps(), y, rows);
+            }
+            apply_f32(isa, &gg.conv_out, map.taps(), &y, out);
+            pool.give(y);
+        }
+    }
+}
+
+/// Voxels whose children are generated at once: so few that the second cache holds most of what a layer reads and writes.
+const PART: usize = 16384;
+/// As many voxels at most are in memory with their children: those of a part, and the rings around it.
+pub(crate) const AT_ONCE: usize = 4 * PART;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Octree, Voxels, morton};
+    use crate::network::{Shape, untrained};
+
+    #[test]
+    fn children_generated_in_parts_are_those_generated_at_once() {
+        let bowl = (0..1u32 << 10).map(|i| {
+            let [x, y] = [i % 32, i / 32];
+            morton::encode([x, y, (x * x + y * y) / 64])
+        });
+        let octree = Octree::new(Voxels::new(5, bowl.collect())).unwrap();
+        let map = &octree.kernel_map(5);
+        for blocks_after in [0, 1, 2] {
+            let mut shape = Shape::tiny();
+            shape.gg[0].blocks_after = blocks_after;
+            let model = Model::from_bytes(&untrained(&shape, 7)).unwrap();
+            let g = (0..map.len() * shape.channels).map(|i| (i * 7919 % 3001) as i16 - 1500);
+            let g: Vec<i16> = g.collect();
+            let generator = model.generator(1).unwrap();
+            let integer = generator.integer(generator.scales.as_ref().unwrap());
+            let whole = model.run_generator(integer, &g, map, map.len());
+            let real = reals(model.isa, &g, model.g_scale[1]);
+            let whole_real = model.run_generator(generator.float(), &real, map, map.len());
+            for part in [1, 37, 1000] {
+                let parts = model.run_generator(integer, &g, map, part);
+                assert!(parts == whole, "{blocks_after} blocks, {part} voxels");
+                let parts = model.run_generator(generator.float(), &real, map, part);
+                assert!(parts == whole_real, "{blocks_after} blocks, {part} voxels");
+            }
+        }
     }
 }

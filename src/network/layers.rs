@@ -89,7 +89,7 @@ impl<T: Copy + Default> Pool<T> {
     }
 
     /// `len` values, which may be anything.
-    fn take(&mut self, len: usize) -> Vec<T> {
+    pub fn take(&mut self, len: usize) -> Vec<T> {
         let fitting = self.0.iter().enumerate();
         let fitting = fitting.filter(|(_, buffer)| buffer.capacity() >= len);
         match fitting.min_by_key(|(_, buffer)| buffer.capacity()) {
@@ -132,17 +132,16 @@ pub(super) fn apply<C: Conv>(
     out
 }
 
-/// The `rows` output rows of a layer that ends in f32.
+/// Output rows of a layer that ends in f32, as many as there is room for.
 pub(super) fn apply_f32<C: Conv>(
     isa: Isa,
     conv: &C,
     taps: Taps<'_>,
     input: &[C::Value],
-    rows: usize,
-) -> Vec<f32> {
-    let mut out = vec![0.0; rows * conv.cout()];
+    out: &mut [f32],
+) {
     let output = Output {
-        rows: &mut out,
+        rows: out,
         stride: conv.cout(),
         column: 0,
         residual: None,
@@ -151,7 +150,6 @@ pub(super) fn apply_f32<C: Conv>(
     spread(output, |first, output| {
         conv.run_f32(isa, taps, input, first, output)
     });
-    out
 }
 
 /// Calls `run(first row, part)` for parts of the output, in parallel.
@@ -230,14 +228,40 @@ impl<C: Conv> ResBlock<C> {
         map: Taps<'_>,
         x: Vec<C::Value>,
     ) -> Vec<C::Value> {
+        let rows = x.len() / self.c2.cout();
+        self.apply_to_some(pool, isa, map, x, [rows, rows])
+    }
+
+    /// As `apply`, but the inner layer computes its first `rows[0]` rows only, the others being zero, and the outer one as many as are asked
+    /// for, the first `rows[1]`.
+    pub fn apply_to_some(
+        &self,
+        pool: &mut Pool<C::Value>,
+        isa: Isa,
+        map: Taps<'_>,
+        x: Vec<C::Value>,
+        rows: [usize; 2],
+    ) -> Vec<C::Value> {
         let stride = self.c2.cout();
-        let inner = apply(pool, isa, &self.c1, map, &x, x.len() / stride, true);
-        let mut out = pool.take(x.len());
+        let mut inner = pool.take(x.len());
+        let (some, others) = inner.split_at_mut(rows[0] * stride);
+        others.fill(C::Value::default());
+        let output = Output {
+            rows: some,
+            stride,
+            column: 0,
+            residual: None,
+            relu: true,
+        };
+        spread(output, |first, output| {
+            self.c1.run(isa, map, &x, first, output)
+        });
+        let mut out = pool.take(rows[1] * stride);
         let output = Output {
             rows: &mut out[..],
             stride,
             column: 0,
-            residual: Some(&x),
+            residual: Some(&x[..rows[1] * stride]),
             relu: self.relu,
         };
         spread(output, |first, output| {

@@ -37,6 +37,7 @@
 //! `fc.*` and `fs.*` can decode only.
 
 mod base;
+mod children;
 mod container;
 mod convert;
 #[cfg(feature = "tradeoff")]
@@ -66,6 +67,7 @@ use load::{Tensors, malformed};
 use stored::Stored;
 use structure::{Encoder, Exact, Generate};
 
+pub(crate) use generate::AT_ONCE;
 pub use generate::Precision;
 pub use shape::{Head, Shape, Upsample};
 pub use structure::{RAW, ROLES};

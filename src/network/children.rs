@@ -1,0 +1,108 @@
+//! A level's voxels in parts, each with what lies around it: their children are eight times as many, and need not all be in memory at once.
+
+use std::ops::Range;
+
+use crate::geometry::KernelMap;
+
+/// Some voxels of a level, one after the other, and rings of neighbours around them.
+pub(super) struct Part {
+    /// The voxels' rows in the level: first those of the part, then ring by ring.
+    pub voxels: Vec<u32>,
+    /// How many voxels there are without any ring, with one, and so on.
+    pub ends: Vec<usize>,
+    /// The 3³ map of all voxels but those of the last ring.
+    pub map: KernelMap,
+}
+
+/// Cuts a level into parts.
+pub(super) struct Parts<'a> {
+    map: &'a KernelMap,
+    /// For each voxel, its place in the present part.
+    places: Vec<u32>,
+}
+
+impl<'a> Parts<'a> {
+    pub fn new(map: &'a KernelMap) -> Self {
+        Parts {
+            map,
+            places: vec![KernelMap::ABSENT; map.len()],
+        }
+    }
+
+    /// The part of these rows, with at least one ring around it.
+    ///
+    /// Two steps from child to neighbouring child lead to a neighbour of the parent at most: what `2n` layers of 3³ make of the children of
+    /// the part and of `n` rings is, for the part itself, what they make of all children.
+    pub fn part(&mut self, rows: Range<usize>, rings: usize) -> Part {
+        let Parts { map, places } = self;
+        let mut voxels: Vec<u32> = (rows.start as u32..rows.end as u32).collect();
+        for (&voxel, place) in voxels.iter().zip(0..) {
+            places[voxel as usize] = place;
+        }
+        let mut ends = vec![voxels.len()];
+        let mut seen = 0;
+        for _ in 0..rings {
+            for at in seen..voxels.len() {
+                for &q in map.row(voxels[at] as usize) {
+                    if q != KernelMap::ABSENT && places[q as usize] == KernelMap::ABSENT {
+                        places[q as usize] = voxels.len() as u32;
+                        voxels.push(q);
+                    }
+                }
+            }
+            seen = ends[ends.len() - 1];
+            ends.push(voxels.len());
+        }
+        let mut near = Vec::with_capacity(seen * 27);
+        for &voxel in &voxels[..seen] {
+            let place = |&q: &u32| match q {
+                KernelMap::ABSENT => q,
+                q => places[q as usize],
+            };
+            near.extend(map.row(voxel as usize).iter().map(place));
+        }
+        for &voxel in &voxels {
+            places[voxel as usize] = KernelMap::ABSENT;
+        }
+        Part {
+            voxels,
+            ends,
+            map: KernelMap::new(27, near),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Octree, Voxels, morton};
+
+    #[test]
+    fn a_part_s_map_names_the_neighbours_of_the_level_s() {
+        let bowl = (0..1u32 << 12).map(|i| {
+            let [x, y] = [i % 64, i / 64];
+            morton::encode([x, y, (x * x + y * y) / 128])
+        });
+        let octree = Octree::new(Voxels::new(6, bowl.collect())).unwrap();
+        let map = &octree.kernel_map(6);
+        let mut parts = Parts::new(map);
+        for (rows, rings) in [(0..100, 1), (700..1400, 3), (4000..map.len(), 2)] {
+            let part = parts.part(rows.clone(), rings);
+            assert_eq!(part.ends.len(), rings + 1);
+            assert_eq!(part.ends[0], rows.len());
+            assert_eq!(part.voxels.len(), part.ends[rings]);
+            assert_eq!(part.map.len(), part.ends[rings - 1]);
+            for i in 0..part.map.len() {
+                let named = part.map.row(i).iter().map(|&q| match q {
+                    KernelMap::ABSENT => q,
+                    q => part.voxels[q as usize],
+                });
+                assert!(named.eq(map.row(part.voxels[i] as usize).iter().copied()));
+            }
+            let mut voxels = part.voxels.clone();
+            voxels.sort_unstable();
+            voxels.dedup();
+            assert_eq!(voxels.len(), part.voxels.len(), "each voxel once");
+        }
+    }
+}
