@@ -7,11 +7,12 @@
 import argparse
 import json
 import math
+import sys
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 import data
 import integer
@@ -236,10 +237,15 @@ def prior_tables(model):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def export(model, samples, path, info):
+def export(model, samples, path, info, streams_of=None):
     out = quantise(model, ranges_of(model, samples))
     for name, t in (("cdf.gauss", gauss_tables()), ("cdf.prior", prior_tables(model))):
         out[name], out[name + ".offset"], out[name + ".low"] = t
+    if streams_of:
+        old = load_file(streams_of)
+        if {k: v.shape for k, v in old.items()} != {k: v.shape for k, v in out.items()}:
+            sys.exit(f"{streams_of} is another network")
+        out = {k: v if k.startswith("gg.") else old[k] for k, v in out.items()}
     meta = {"format": 1, **model.cfg, "latent_shift": LATENT_SHIFT, **info}
     save_file({k: np.ascontiguousarray(v) for k, v in sorted(out.items())}, path, metadata={"b2p": json.dumps(meta)})
 
@@ -312,6 +318,7 @@ def main():
     p.add_argument("--verify", type=int, default=3, help="crops for the check against the float path")
     p.add_argument("--random", metavar="CONFIG", help="an untrained network of this configuration, for tests")
     p.add_argument("--weights", metavar="FILE", help="also write the float weights, in f16, for `train.py --init`")
+    p.add_argument("--streams-of", metavar="FILE", help="take all but the heads from this exported model, so that its streams stay valid: after `train.py --only-heads`")
     p.add_argument("--last", action="store_true", help="the last weights instead of the averaged ones")
     args = p.parse_args()
     samples = [data.procedural(i) for i in range(2)]
@@ -323,7 +330,7 @@ def main():
         model, info = untrained(args.random, samples), {"steps": 0}
     else:
         model, info = load_checkpoint(args.checkpoint, not args.last)
-    export(model, samples, args.out, info)
+    export(model, samples, args.out, info, args.streams_of)
     if args.weights:
         tensors = {k: v.half().numpy() for k, v in model.state_dict().items()}
         save_file(tensors, args.weights, metadata={"config": json.dumps(model.cfg)})
