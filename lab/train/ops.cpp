@@ -801,7 +801,7 @@ Tensor pool_grad(const Tensor& dy, const Tensor& first, int64_t rows) {
 // ---------------------------------------------------------------------------------------------------------------
 // Splatter. Cameras: world-to-camera rotation (9), translation (3), fx, fy, cx, cy.
 
-constexpr float ALPHA_MAX = 0.99f, ALPHA_MIN = 1.f / 255, T_MIN = 1e-4f, BLUR = 0.3f, NEAR = 1e-2f;
+constexpr float ALPHA_MAX = 0.99f, ALPHA_MIN = 1.f / 16384, T_MIN = 1e-4f, BLUR = 0.3f, NEAR = 1e-2f;
 constexpr int TILE = 16;
 
 struct View {
@@ -816,7 +816,7 @@ struct View {
 struct Projected {
   float x, y, z, m[6];      // camera coordinates; M = J R, 2 x 3
   float u, v, a, b, c;      // pixel and inverse covariance
-  float ex, ey;             // half extents at alpha = 1/255
+  float ex, ey;             // half extents at ALPHA_MIN
   bool seen;
 };
 
@@ -843,7 +843,7 @@ Projected project(const View& w, const float* p, const float* s, float opacity) 
   if (!(det > 0)) return q;
   q.a = yy / det, q.b = -xy / det, q.c = xx / det;
   q.u = w.fx * q.x * iz + w.cx, q.v = w.fy * q.y * iz + w.cy;
-  const float reach = 2 * std::log(255 * opacity);
+  const float reach = 2 * std::log(opacity / ALPHA_MIN);
   q.ex = std::sqrt(std::max(0.f, reach * xx)), q.ey = std::sqrt(std::max(0.f, reach * yy));
   q.seen = true;
   return q;

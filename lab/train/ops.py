@@ -242,7 +242,7 @@ def pool(x, first):
 # ---------------------------------------------------------------------------------------------------------------------
 # Splatter
 
-ALPHA_MAX, ALPHA_MIN, T_MIN, BLUR, NEAR = 0.99, 1.0 / 255, 1e-4, 0.3, 1e-2
+ALPHA_MAX, ALPHA_MIN, T_MIN, BLUR, NEAR = 0.99, 1.0 / 16384, 1e-4, 0.3, 1e-2
 
 
 def covariance(scale, rotation):
@@ -293,7 +293,7 @@ def _splat_view(mean, cov, opacity, colour, camera, background, width, height):
     a, b, c = c2[:, 1, 1] / det, -c2[:, 0, 1] / det, c2[:, 0, 0] / det
     u, v = fx * x / z + cx, fy * y / z + cy
     with torch.no_grad():  # all pairs of a pixel and a splat that may reach it
-        reach = 2 * torch.log(255 * o)
+        reach = 2 * torch.log(o / ALPHA_MIN)
         ex, ey = (reach * c2[:, 0, 0]).clamp_min(0).sqrt(), (reach * c2[:, 1, 1]).clamp_min(0).sqrt()
         x0, x1 = (u - ex - 0.5).ceil().clamp(0, width).long(), (u + ex - 0.5).floor().clamp(-1, width - 1).long()
         y0, y1 = (v - ey - 0.5).ceil().clamp(0, height).long(), (v + ey - 0.5).floor().clamp(-1, height - 1).long()
