@@ -312,62 +312,54 @@ fn pair_rows(input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
     }
 }
 
+/// A row's sums of one panel, and what becomes of them.
+#[derive(Clone, Copy)]
+struct Panel<'a> {
+    layer: &'a Finish,
+    /// Which panel.
+    number: usize,
+    sums: &'a Lanes,
+    /// Those of all panels, if sums are multiplied.
+    factors: &'a [[f32; PANEL]],
+    residual: Option<&'a [i16; PANEL]>,
+    relu: bool,
+}
+
 /// What a layer ends in.
 trait Value: Copy + Send + Sync {
-    /// The results of panel `p`.
-    ///
     /// # Safety
     /// The processor must have `H`'s instructions.
-    unsafe fn results<H: Halves>(
-        p: usize,
-        layer: &Finish,
-        sums: &Lanes,
-        factors: &[[f32; PANEL]],
-        residual: Option<&[i16; PANEL]>,
-        relu: bool,
-    ) -> [Self; PANEL];
+    unsafe fn of<H: Halves>(panel: Panel<'_>) -> [Self; PANEL];
 }
 
 impl Value for i16 {
     #[inline(always)]
-    unsafe fn results<H: Halves>(
-        p: usize,
-        layer: &Finish,
-        sums: &Lanes,
-        factors: &[[f32; PANEL]],
-        residual: Option<&[i16; PANEL]>,
-        relu: bool,
-    ) -> [i16; PANEL] {
-        let floor = if relu { 0 } else { -LIMIT };
+    unsafe fn of<H: Halves>(panel: Panel<'_>) -> [i16; PANEL] {
+        let (p, sums) = (panel.number, panel.sums);
+        let floor = if panel.relu { 0 } else { -LIMIT };
         // SAFETY: the caller's promise.
         unsafe {
-            let q = match layer {
+            let q = match panel.layer {
                 Finish::Shift { bias, shift } => H::shift(sums, &bias[p], &shift[p]),
                 Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => {
-                    H::round(sums, &factors[p], &bias[p])
+                    H::round(sums, &panel.factors[p], &bias[p])
                 }
             };
-            H::settle(q, residual, floor)
+            H::settle(q, panel.residual, floor)
         }
     }
 }
 
 impl Value for f32 {
     #[inline(always)]
-    unsafe fn results<H: Halves>(
-        p: usize,
-        layer: &Finish,
-        sums: &Lanes,
-        factors: &[[f32; PANEL]],
-        _: Option<&[i16; PANEL]>,
-        relu: bool,
-    ) -> [f32; PANEL] {
-        let bias = match layer {
+    unsafe fn of<H: Halves>(panel: Panel<'_>) -> [f32; PANEL] {
+        let p = panel.number;
+        let bias = match panel.layer {
             Finish::Shift { .. } => unreachable!("refused above"),
             Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => bias,
         };
-        let mut values = scaled(sums, &factors[p], &bias[p]);
-        if relu {
+        let mut values = scaled(panel.sums, &panel.factors[p], &bias[p]);
+        if panel.relu {
             values.iter_mut().for_each(|value| *value = value.max(0.0));
         }
         values
@@ -398,19 +390,27 @@ unsafe fn finish_tile<H: Halves, T: Value>(
         let first = row * stride + column;
         let residual = residual.map(|all| all[first..][..cout].as_chunks::<PANEL>());
         let (whole, rest) = rows[first..][..cout].as_chunks_mut::<PANEL>();
+        let mut panel = Panel {
+            layer,
+            number: 0,
+            sums: &sums[0],
+            factors,
+            residual: None,
+            relu,
+        };
         let last = whole.len();
         for (p, to) in whole.iter_mut().enumerate() {
-            let residual = residual.map(|(whole, _)| &whole[p]);
+            (panel.number, panel.sums) = (p, &sums[p]);
+            panel.residual = residual.map(|(whole, _)| &whole[p]);
             // SAFETY: the caller's promise.
-            *to = unsafe { T::results::<H>(p, layer, &sums[p], factors, residual, relu) };
+            *to = unsafe { T::of::<H>(panel) };
         }
         if !rest.is_empty() {
             let residual = residual.map(|(_, rest)| part(rest));
-            let residual = residual.as_ref();
+            (panel.number, panel.sums) = (last, &sums[last]);
+            panel.residual = residual.as_ref();
             // SAFETY: the caller's promise.
-            let results =
-                unsafe { T::results::<H>(last, layer, &sums[last], factors, residual, relu) };
-            store_part(results, rest);
+            store_part(unsafe { T::of::<H>(panel) }, rest);
         }
     }
 }
