@@ -246,7 +246,10 @@ fn width(isa: Isa, whole: usize) -> usize {
     match isa.level() {
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 | Level::Amx => whole.clamp(1, 2),
-        _ => 1,
+        _ => {
+            let _ = whole;
+            1
+        }
     }
 }
 
