@@ -2,6 +2,8 @@
 
 use std::ops::Range;
 
+use rayon::prelude::*;
+
 use crate::geometry::KernelMap;
 
 /// Some voxels of a level, one after the other, and rings of neighbours around them.
@@ -53,14 +55,15 @@ impl<'a> Parts<'a> {
             seen = ends[ends.len() - 1];
             ends.push(voxels.len());
         }
-        let mut near = Vec::with_capacity(seen * 27);
-        for &voxel in &voxels[..seen] {
-            let place = |&q: &u32| match q {
-                KernelMap::ABSENT => q,
-                q => places[q as usize],
-            };
-            near.extend(map.row(voxel as usize).iter().map(place));
-        }
+        let mut near = vec![KernelMap::ABSENT; seen * 27];
+        let rows = near.par_chunks_exact_mut(27).zip(&voxels[..seen]);
+        rows.with_min_len(256).for_each(|(row, &voxel)| {
+            for (place, &q) in row.iter_mut().zip(map.row(voxel as usize)) {
+                if q != KernelMap::ABSENT {
+                    *place = places[q as usize];
+                }
+            }
+        });
         for &voxel in &voxels {
             places[voxel as usize] = KernelMap::ABSENT;
         }

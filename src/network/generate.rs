@@ -5,6 +5,7 @@ use std::str::FromStr;
 use std::sync::OnceLock;
 
 use b2p_kernels::{ExactConv, FloatConv, Taps};
+use rayon::prelude::*;
 
 use super::children::{Part, Parts};
 use super::layers::{Conv, Pool, apply, apply_f32, reals};
@@ -192,9 +193,10 @@ impl Model {
             // After that many layers, the children whose results some later layer reads.
             let rows = |done: usize| 8 * ends[(layers - done).div_ceil(2)];
             let mut parents = pool.take(voxels.len() * h);
-            for (to, &voxel) in parents.chunks_exact_mut(h).zip(&voxels) {
+            let copies = parents.par_chunks_exact_mut(h).zip(&voxels);
+            copies.with_min_len(1024).for_each(|(to, &voxel)| {
                 to.copy_from_slice(&x[voxel as usize * h..][..h]);
-            }
+            });
             let map = map.generated_children();
             let mut y = apply(
                 pool,
@@ -216,8 +218,9 @@ impl Model {
     }
 }
 
-/// Voxels whose children are generated at once: so few that the second cache holds most of what a layer reads and writes.
-const PART: usize = 16384;
+/// Voxels whose children are generated at once. Fewer need less memory, and more time for the rings around them: of a body's 59,046 voxels at
+/// level 8 (`lite`) parts of 16,384 take 165 MB in all and an eighth longer than all at once with 249 MB.
+const PART: usize = 32768;
 /// As many voxels at most are in memory with their children: those of a part, and the rings around it.
 pub(crate) const AT_ONCE: usize = 4 * PART;
 
