@@ -47,7 +47,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
                 1 => voxels,
                 _ => voxels.min(AT_ONCE as u64) * children,
             };
-            voxels * (6 * h + 2 * c + 36)
+            voxels * (6 * h + 2 * c + 40)
                 + voxels * children * (4 * RAW as u64 + GAUSSIAN)
                 + at_once * (MAP + 3 * 2 * h)
         });

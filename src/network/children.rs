@@ -31,11 +31,38 @@ impl<'a> Parts<'a> {
         }
     }
 
-    /// The part of these rows, with at least one ring around it.
+    /// The part of these rows, with at least one ring around it: of fewer of them, down to one, if with the rings they were more than `most`.
     ///
     /// Two steps from child to neighbouring child lead to a neighbour of the parent at most: what `2n` layers of 3³ make of the children of
     /// the part and of `n` rings is, for the part itself, what they make of all children.
-    pub fn part(&mut self, rows: Range<usize>, rings: usize) -> Part {
+    pub fn part(&mut self, mut rows: Range<usize>, rings: usize, most: usize) -> Part {
+        let (mut voxels, mut ends) = self.surround(rows.clone(), rings);
+        while voxels.len() > most && rows.len() > 1 {
+            self.forget(&voxels);
+            rows.end = rows.start + rows.len() / 2;
+            (voxels, ends) = self.surround(rows.clone(), rings);
+        }
+        let (map, places) = (self.map, &self.places);
+        let seen = ends[rings - 1];
+        let mut near = vec![KernelMap::ABSENT; seen * 27];
+        let rows = near.par_chunks_exact_mut(27).zip(&voxels[..seen]);
+        rows.with_min_len(256).for_each(|(row, &voxel)| {
+            for (place, &q) in row.iter_mut().zip(map.row(voxel as usize)) {
+                if q != KernelMap::ABSENT {
+                    *place = places[q as usize];
+                }
+            }
+        });
+        self.forget(&voxels);
+        Part {
+            voxels,
+            ends,
+            map: KernelMap::new(27, near),
+        }
+    }
+
+    /// Gives rows and the rings around them their places, ring by ring, and tells how many there are with each.
+    fn surround(&mut self, rows: Range<usize>, rings: usize) -> (Vec<u32>, Vec<usize>) {
         let Parts { map, places } = self;
         let mut voxels: Vec<u32> = (rows.start as u32..rows.end as u32).collect();
         for (&voxel, place) in voxels.iter().zip(0..) {
@@ -55,22 +82,13 @@ impl<'a> Parts<'a> {
             seen = ends[ends.len() - 1];
             ends.push(voxels.len());
         }
-        let mut near = vec![KernelMap::ABSENT; seen * 27];
-        let rows = near.par_chunks_exact_mut(27).zip(&voxels[..seen]);
-        rows.with_min_len(256).for_each(|(row, &voxel)| {
-            for (place, &q) in row.iter_mut().zip(map.row(voxel as usize)) {
-                if q != KernelMap::ABSENT {
-                    *place = places[q as usize];
-                }
-            }
-        });
-        for &voxel in &voxels {
-            places[voxel as usize] = KernelMap::ABSENT;
-        }
-        Part {
-            voxels,
-            ends,
-            map: KernelMap::new(27, near),
+        (voxels, ends)
+    }
+
+    /// Takes their places away.
+    fn forget(&mut self, voxels: &[u32]) {
+        for &voxel in voxels {
+            self.places[voxel as usize] = KernelMap::ABSENT;
         }
     }
 }
@@ -90,7 +108,7 @@ mod tests {
         let map = &octree.kernel_map(6);
         let mut parts = Parts::new(map);
         for (rows, rings) in [(0..100, 1), (700..1400, 3), (4000..map.len(), 2)] {
-            let part = parts.part(rows.clone(), rings);
+            let part = parts.part(rows.clone(), rings, map.len());
             assert_eq!(part.ends.len(), rings + 1);
             assert_eq!(part.ends[0], rows.len());
             assert_eq!(part.voxels.len(), part.ends[rings]);
@@ -107,5 +125,18 @@ mod tests {
             voxels.dedup();
             assert_eq!(voxels.len(), part.voxels.len(), "each voxel once");
         }
+    }
+
+    #[test]
+    fn a_part_whose_surroundings_are_too_many_is_made_smaller() {
+        let octree = Octree::new(Voxels::new(4, (0..1 << 12).collect())).unwrap();
+        let map = &octree.kernel_map(4);
+        let mut parts = Parts::new(map);
+        let whole = parts.part(0..512, 3, map.len());
+        assert_eq!((whole.ends[0], whole.voxels.len()), (512, 11 * 11 * 11));
+        let part = parts.part(0..512, 3, 1000);
+        assert!(part.voxels.len() <= 1000 && (1..512).contains(&part.ends[0]));
+        assert_eq!(parts.part(0..512, 3, 1).ends[0], 1, "not less than a voxel");
+        assert_eq!(parts.part(0..512, 3, map.len()).voxels, whole.voxels);
     }
 }

@@ -187,9 +187,12 @@ impl Model {
         let (isa, h, n) = (self.isa, gg.head.channels, map.len());
         let layers = 2 * gg.after.len() + 1;
         let mut parts = Parts::new(map);
-        for (i, out) in out.chunks_mut(part * 8 * RAW).enumerate() {
-            let rows = i * part..n.min((i + 1) * part);
-            let Part { voxels, ends, map } = parts.part(rows, layers.div_ceil(2));
+        let (mut first, mut rest) = (0, out);
+        while first < n {
+            let rows = first..n.min(first + part);
+            let Part { voxels, ends, map } = parts.part(rows, layers.div_ceil(2), AROUND * part);
+            let (out, after) = rest.split_at_mut(ends[0] * 8 * RAW);
+            (first, rest) = (first + ends[0], after);
             // After that many layers, the children whose results some later layer reads.
             let rows = |done: usize| 8 * ends[(layers - done).div_ceil(2)];
             let mut parents = pool.take(voxels.len() * h);
@@ -221,8 +224,11 @@ impl Model {
 /// Voxels whose children are generated at once. Fewer need less memory, and more time for the rings around them: of a body's 59,046 voxels at
 /// level 8 (`lite`) parts of 16,384 take 165 MB in all and an eighth longer than all at once with 249 MB.
 const PART: usize = 32768;
-/// As many voxels at most are in memory with their children: those of a part, and the rings around it.
-pub(crate) const AT_ONCE: usize = 4 * PART;
+/// How many times as many voxels as a part has may be in memory with it and the rings around it: more are only in streams that are
+/// made for it, whose parts are smaller then.
+const AROUND: usize = 4;
+/// As many voxels at most are in memory with their children.
+pub(crate) const AT_ONCE: usize = AROUND * PART;
 
 #[cfg(test)]
 mod tests {
