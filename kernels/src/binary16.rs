@@ -6,7 +6,7 @@ use crate::convert::{MAX, narrow_one, widen_one};
 
 /// A number of IEEE 754's binary16: 5 bits of exponent, 11 of mantissa.
 #[expect(non_camel_case_types, reason = "named as Rust names its floats")]
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy, Default, bytemuck::Zeroable)]
 #[repr(transparent)]
 pub struct f16(u16);
 

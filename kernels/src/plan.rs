@@ -229,7 +229,8 @@ impl Planner {
         };
         if let Taps::Map {
             plan: Some(plan), ..
-        } = taps
+        }
+        | Taps::AllChildren { plan, .. } = taps
             && first.is_multiple_of(TILE)
             && let Some(place) = plan.0.get(first / TILE)
         {

@@ -18,6 +18,17 @@ pub fn tap(taps: &Taps<'_>, i: usize, k: usize) -> Option<usize> {
             (usize::from(octants[i]) == k).then(|| parents[i] as usize)
         }
         Taps::Children => (i % 8 == k).then_some(i / 8),
+        Taps::AllChildren { neighbours, .. } => {
+            // Where the neighbour is, in steps of a child from the parent's corner.
+            let axis = |bit: usize, step: usize| (i >> bit & 1) as i32 + (step % 3) as i32 - 1;
+            let at = [axis(0, k), axis(1, k / 3), axis(2, k / 9)];
+            let sum = |part: fn(i32) -> i32, base: i32| {
+                at.iter().rev().fold(0, |sum, &x| sum * base + part(x)) as usize
+            };
+            let neighbour = neighbours[i / 8 * 27 + sum(|x| x.div_euclid(2) + 1, 3)];
+            let octant = sum(|x| x.rem_euclid(2), 2);
+            (neighbour != ABSENT).then(|| 8 * neighbour as usize + octant)
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! Which input rows each output row reads, and through which tap of the kernel.
 
+use crate::family;
 use crate::isa::{Isa, Level};
 #[cfg(target_arch = "x86_64")]
 use crate::machine;
@@ -32,6 +33,14 @@ pub enum Taps<'a> {
     },
     /// Eight taps: row `8p + o` reads row `p` through tap `o`. All children of every voxel.
     Children,
+    /// 27 taps: row `8p + o` is the child in octant `o` of voxel `p`, and reads the children of `p` and its neighbours around it. All
+    /// children of every voxel.
+    AllChildren {
+        /// Entry `p·27 + k` is the neighbour of voxel `p` at offset `k`, x fastest, or [`ABSENT`].
+        neighbours: &'a [u32],
+        /// The rows, arranged for [`Isa`]s.
+        plan: &'a Plan,
+    },
 }
 
 impl Taps<'_> {
@@ -41,6 +50,7 @@ impl Taps<'_> {
             Taps::Same => 1,
             Taps::Map { volume, .. } => *volume,
             Taps::Octants { .. } | Taps::Children => 8,
+            Taps::AllChildren { .. } => 27,
         }
     }
 }
@@ -61,6 +71,8 @@ pub(crate) struct TileTaps {
     masks: Vec<u64>,
     /// One more than the last input row.
     end: usize,
+    /// The tile's part of a map that is not there as a whole.
+    map: Vec<u32>,
 }
 
 /// One tap's pairs, by ascending output row.
@@ -95,26 +107,14 @@ impl TileTaps {
                 end = first + count;
             }
             Taps::Map { rows, .. } => {
-                let map = &rows[first * volume..(first + count) * volume];
-                let lists = Lists {
-                    map,
-                    lengths: &mut self.lengths,
-                    inputs: &mut self.inputs,
-                    rows: &mut self.rows,
-                    masks: &mut self.masks,
-                    room: ROOM,
-                };
-                end = match isa.level() {
-                    Level::Scalar => fill_map(lists),
-                    #[cfg(target_arch = "aarch64")]
-                    Level::Neon => fill_map(lists),
-                    #[cfg(target_arch = "x86_64")]
-                    // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
-                    // tile's rows and eight more.
-                    Level::Avx2 | Level::Avx512 | Level::Amx => unsafe {
-                        machine::avx2_lists::fill_map(lists)
-                    },
-                };
+                end = self.fill_from(isa, &rows[first * volume..(first + count) * volume]);
+            }
+            Taps::AllChildren { neighbours, .. } => {
+                let mut map = std::mem::take(&mut self.map);
+                map.resize(count * volume, ABSENT);
+                family::rows_of_all(neighbours, first, &mut map);
+                end = self.fill_from(isa, &map);
+                self.map = map;
             }
             Taps::Octants { parents, octants } => {
                 let (parents, octants) = (&parents[first..][..count], &octants[first..][..count]);
@@ -138,6 +138,29 @@ impl TileTaps {
             end - 1
         );
         self.end = end;
+    }
+
+    /// Gathers the pairs of a tile's part of a map, and gives the end of the input rows.
+    fn fill_from(&mut self, isa: Isa, map: &[u32]) -> usize {
+        let lists = Lists {
+            map,
+            lengths: &mut self.lengths,
+            inputs: &mut self.inputs,
+            rows: &mut self.rows,
+            masks: &mut self.masks,
+            room: ROOM,
+        };
+        match isa.level() {
+            Level::Scalar => fill_map(lists),
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => fill_map(lists),
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
+            // tile's rows and eight more.
+            Level::Avx2 | Level::Avx512 | Level::Amx => unsafe {
+                machine::avx2_lists::fill_map(lists)
+            },
+        }
     }
 
     #[inline(always)]

@@ -7,8 +7,10 @@ use crate::bitstream::Header;
 use crate::error::Result;
 use crate::network::{AT_ONCE, Model, RAW};
 
-/// Bytes of a row of a 3³ kernel map, and of the same arranged for the kernels.
-const MAP: u64 = 27 * 4 + 100;
+/// Bytes of a row of a 3³ kernel map arranged for the kernels.
+const PLAN: u64 = 100;
+/// Bytes of a row of a 3³ kernel map, and of the same arranged.
+const MAP: u64 = 27 * 4 + PLAN;
 /// Bytes of a voxel in the octree: its key, its occupancy, its first child.
 const NODE: u64 = 8 + 1 + 4;
 /// Bytes of a Gaussian.
@@ -21,8 +23,8 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and the model itself.
     ///
     /// That is linear in the voxels: with C channels and K latents, 224 + 10·C + 7·K bytes for each voxel of a level, the level above it
-    /// with its features, 112 bytes for each Gaussian, 208 + 6·H bytes more for each that a generator of H channels makes at once, and, where
-    /// a network of B channels predicts the base level, 20 + 19·K + 4·B bytes for each of its voxels.
+    /// with its features, 112 bytes for each Gaussian, 100 + 6·H bytes more for each that a generator of H channels makes at once, 208 + 6·H if it
+    /// makes one for each voxel, and, where a network of B channels predicts the base level, 20 + 19·K + 4·B bytes for each of its voxels.
     ///
     /// # Errors
     /// [`crate::Error::Usage`] if the stream has no such level.
@@ -43,13 +45,13 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let base = counts().next().unwrap_or(0) * shape.base_bytes() as u64;
         let head = shape.head(levels - 1).map_or(0, |head| {
             let (h, children) = (head.channels as u64, head.children as u64);
-            let at_once = match children {
-                1 => voxels,
-                _ => voxels.min(AT_ONCE as u64) * children,
+            let (at_once, map) = match children {
+                1 => (voxels, MAP),
+                _ => (voxels.min(AT_ONCE as u64) * children, PLAN),
             };
             voxels * (6 * h + 2 * c + 40)
                 + voxels * children * (4 * RAW as u64 + GAUSSIAN)
-                + at_once * (MAP + 3 * 2 * h)
+                + at_once * (map + 3 * 2 * h)
         });
         Ok(stream + octree + base + exact + head)
     }

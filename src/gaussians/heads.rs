@@ -6,6 +6,7 @@
 //! opacity = sigmoid(raw + bias) where it is learned, else 1, colour = clamp(½ + raw, 0, 1). Equal raw numbers give equal bits on every
 //! machine.
 
+use b2p_kernels::zeros;
 use rayon::prelude::*;
 
 use super::activations::{sigmoid, softplus, tanh};
@@ -40,11 +41,11 @@ pub fn activate(
     let edge = 2.0 / (1u32 << generated) as f32;
     let mut gaussians = Gaussians {
         blur: BLUR * edge * edge,
-        position: vec![[0.0; 3]; count],
-        scale: vec![[0.0; 3]; count],
-        rotation: vec![[0.0; 4]; count],
-        opacity: vec![1.0; count],
-        colour: vec![[0.0; 3]; count],
+        position: zeros(count),
+        scale: zeros(count),
+        rotation: zeros(count),
+        opacity: zeros(count),
+        colour: zeros(count),
         frame,
         ..Gaussians::default()
     };

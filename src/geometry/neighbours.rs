@@ -1,12 +1,12 @@
 //! Kernel maps: for every voxel, which of its neighbours are occupied and where they are.
 //!
 //! A kernel map is built from the one of the level above, so nothing is searched or hashed: the neighbour of a child lies in its
-//! parent or in one of its parent's 26 neighbours, whose children are found from its occupancy by counting bits. The 3³ neighbours
-//! of up to eight siblings together fill a window of 4³ positions around them; the window is looked up once per parent.
+//! parent or in one of its parent's 26 neighbours, whose children are found from its occupancy by counting bits. The window around up to
+//! eight siblings is looked up once per parent.
 
 use std::sync::OnceLock;
 
-use b2p_kernels::{Plan, Taps};
+use b2p_kernels::{Plan, Taps, copy_row, window, zeros};
 use rayon::prelude::*;
 
 /// The neighbours of every voxel under a 3³ or 2³ kernel.
@@ -62,26 +62,18 @@ impl KernelMap {
         KernelMap::new(27, rows)
     }
 
-    /// The 3³ map of the voxels that arise when *every* voxel of this 3³ map's level has all eight children: the child in octant
+    /// The neighbours of the voxels that arise when *every* voxel of this 3³ map's level has all eight children: the child in octant
     /// `o` of voxel `i` has index `8i + o`.
     ///
     /// # Panics
     /// If this is not a 3³ map, or of more than 2²⁹ − 1 voxels.
-    pub fn generated_children(&self) -> Self {
+    pub fn generated_children(&self) -> GeneratedChildren<'_> {
         assert_eq!(self.volume, 27, "children come from a 3³ map");
         assert!(self.len() < 1 << 29, "child indices must fit 32 bits");
-        let mut rows = vec![Self::ABSENT; self.len() * 8 * 27];
-        rows.par_chunks_mut(BLOCK * 8 * 27)
-            .zip(self.rows.par_chunks(BLOCK * 27))
-            .for_each(|(rows, parents)| {
-                for (rows, parent) in rows.chunks_exact_mut(8 * 27).zip(parents.chunks_exact(27)) {
-                    let window = window(parent, |q, octant| q << 3 | octant);
-                    for (octant, row) in rows.chunks_exact_mut(27).enumerate() {
-                        copy_row(&window, octant, row);
-                    }
-                }
-            });
-        KernelMap::new(27, rows)
+        GeneratedChildren {
+            parents: self,
+            plan: Plan::new(8 * self.len()),
+        }
     }
 
     /// The 2³ map of the same voxels.
@@ -124,6 +116,23 @@ impl KernelMap {
     }
 }
 
+/// All eight children of every voxel of a level, and their neighbours under a 3³ kernel.
+#[derive(Debug)]
+pub struct GeneratedChildren<'a> {
+    parents: &'a KernelMap,
+    plan: Plan,
+}
+
+impl GeneratedChildren<'_> {
+    /// The neighbours as layers take them.
+    pub fn taps(&self) -> Taps<'_> {
+        Taps::AllChildren {
+            neighbours: &self.parents.rows,
+            plan: &self.plan,
+        }
+    }
+}
+
 /// Parents that one task handles.
 const BLOCK: usize = 1024;
 
@@ -136,7 +145,7 @@ pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]
     assert_eq!(map.len(), occupancy.len(), "one occupancy per voxel");
     assert_eq!(map.len(), first_child.len(), "one first child per voxel");
     let count = |masks: &[u8]| masks.iter().map(|m| m.count_ones() as usize).sum::<usize>();
-    let mut rows = vec![KernelMap::ABSENT; count(occupancy) * 27];
+    let mut rows = zeros(count(occupancy) * 27);
 
     let mut tasks = Vec::with_capacity(map.len().div_ceil(BLOCK));
     let mut rest = rows.as_mut_slice();
@@ -166,45 +175,11 @@ pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]
     KernelMap::new(27, rows)
 }
 
-/// For every position of the 4³ window around a voxel's children, x fastest: the parent's neighbour it lies in and its octant there.
-const WINDOW: [(u8, u8); 64] = {
-    let mut window = [(0, 0); 64];
-    let mut i = 0;
-    while i < 64 {
-        // Window position 0..4 along an axis is child coordinate −1..2: parent offset −1, 0, 0, 1 and octant bit 1, 0, 1, 0.
-        let (x, y, z) = (i & 3, i >> 2 & 3, i >> 4);
-        window[i] = (
-            (((x + 1) >> 1) + 3 * ((y + 1) >> 1) + 9 * ((z + 1) >> 1)) as u8,
-            (((x + 1) & 1) + 2 * ((y + 1) & 1) + 4 * ((z + 1) & 1)) as u8,
-        );
-        i += 1;
-    }
-    window
-};
-
-/// The indices of the voxels in the window around the children of the voxel whose neighbours are `parents`.
-fn window(parents: &[u32], child: impl Fn(u32, u32) -> u32) -> [u32; 64] {
-    WINDOW.map(
-        |(neighbour, octant)| match parents[usize::from(neighbour)] {
-            KernelMap::ABSENT => KernelMap::ABSENT,
-            q => child(q, octant.into()),
-        },
-    )
-}
-
-/// The 3³ part of the window that is centred on the child in `octant`.
-fn copy_row(window: &[u32; 64], octant: usize, row: &mut [u32]) {
-    let corner = (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2);
-    for (line, run) in row.chunks_exact_mut(3).enumerate() {
-        let start = corner + 4 * (line % 3) + 16 * (line / 3);
-        run.copy_from_slice(&window[start..start + 3]);
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::geometry::{Octree, Voxels, morton};
+    use b2p_kernels::reference::tap;
     use proptest::prelude::*;
 
     /// The definition, by binary search.
@@ -242,7 +217,12 @@ mod tests {
             if voxels.depth() < morton::MAX_DEPTH {
                 let all = voxels.keys().iter().flat_map(|k| k << 3..=k << 3 | 7);
                 let all = Voxels::from_sorted(voxels.depth() + 1, all.collect());
-                assert_eq!(map.generated_children(), searched(&all, -1..=1));
+                let children = map.generated_children();
+                let rows = (0..all.len()).flat_map(|i| {
+                    let taps = children.taps();
+                    (0..27).map(move |k| tap(&taps, i, k).map_or(KernelMap::ABSENT, |i| i as u32))
+                });
+                assert_eq!(KernelMap::new(27, rows.collect()), searched(&all, -1..=1));
             }
         }
     }

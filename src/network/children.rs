@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use b2p_kernels::zeros;
 use rayon::prelude::*;
 
 use crate::geometry::KernelMap;
@@ -44,13 +45,14 @@ impl<'a> Parts<'a> {
         }
         let (map, places) = (self.map, &self.places);
         let seen = ends[rings - 1];
-        let mut near = vec![KernelMap::ABSENT; seen * 27];
+        let mut near = zeros(seen * 27);
         let rows = near.par_chunks_exact_mut(27).zip(&voxels[..seen]);
         rows.with_min_len(256).for_each(|(row, &voxel)| {
             for (place, &q) in row.iter_mut().zip(map.row(voxel as usize)) {
-                if q != KernelMap::ABSENT {
-                    *place = places[q as usize];
-                }
+                *place = match q {
+                    KernelMap::ABSENT => q,
+                    q => places[q as usize],
+                };
             }
         });
         self.forget(&voxels);

@@ -4,7 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::OnceLock;
 
-use b2p_kernels::{ExactConv, FloatConv, Taps};
+use b2p_kernels::{ExactConv, FloatConv, Taps, zeros};
 use rayon::prelude::*;
 
 use super::children::{Part, Parts};
@@ -158,7 +158,7 @@ impl Model {
         for block in &gg.before {
             x = block.apply(pool, isa, map.taps(), x);
         }
-        let mut out = vec![0.0; n * gg.head.children * RAW];
+        let mut out = zeros(n * gg.head.children * RAW);
         if gg.head.children == 8 {
             self.finish_children(pool, gg, x, map, part, &mut out);
         } else {

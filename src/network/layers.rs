@@ -1,7 +1,8 @@
 //! Running layers and blocks over all rows of a level, in blocks of rows side by side.
 
 use b2p_kernels::f16;
-use b2p_kernels::{ExactConv, FloatConv, Isa, Output, Taps, to_f16};
+use b2p_kernels::{ExactConv, FloatConv, Isa, Output, Taps, to_f16, zeros};
+use bytemuck::Zeroable;
 use rayon::prelude::*;
 
 use super::structure::{Inception, ResBlock};
@@ -11,7 +12,7 @@ const BLOCK: usize = 512;
 
 /// A layer whose rows are values of one kind, in and out.
 pub(crate) trait Conv: Sync {
-    type Value: Copy + Default + Send + Sync;
+    type Value: Copy + Default + Zeroable + Send + Sync;
 
     fn cout(&self) -> usize;
     fn run(
@@ -83,7 +84,7 @@ impl Conv for FloatConv {
 /// written.
 pub(crate) struct Pool<T>(Vec<Vec<T>>);
 
-impl<T: Copy + Default> Pool<T> {
+impl<T: Copy + Zeroable> Pool<T> {
     pub fn new() -> Self {
         Pool(Vec::new())
     }
@@ -95,10 +96,10 @@ impl<T: Copy + Default> Pool<T> {
         match fitting.min_by_key(|(_, buffer)| buffer.capacity()) {
             Some((i, _)) => {
                 let mut buffer = self.0.swap_remove(i);
-                buffer.resize(len, T::default());
+                buffer.resize(len, T::zeroed());
                 buffer
             }
-            None => vec![T::default(); len],
+            None => zeros(len),
         }
     }
 
@@ -274,13 +275,13 @@ impl<C: Conv> ResBlock<C> {
 }
 
 /// Rows of `left` and `right`, of `a` and `b` values, side by side.
-pub(super) fn concat<T: Copy + Default + Send + Sync>(
+pub(super) fn concat<T: Copy + Zeroable + Send + Sync>(
     left: &[T],
     a: usize,
     right: &[T],
     b: usize,
 ) -> Vec<T> {
-    let mut out = vec![T::default(); left.len() + right.len()];
+    let mut out = zeros(left.len() + right.len());
     let rows = out.par_chunks_mut((a + b) * BLOCK);
     let parts = left.par_chunks(a * BLOCK).zip(right.par_chunks(b * BLOCK));
     rows.zip(parts).for_each(|(rows, (left, right))| {
@@ -296,7 +297,7 @@ pub(super) fn concat<T: Copy + Default + Send + Sync>(
 /// The real numbers that integer activations stand for.
 pub(super) fn reals(isa: Isa, q: &[i16], scale: f32) -> Vec<f16> {
     const CHUNK: usize = 4096;
-    let mut out = vec![f16::ZERO; q.len()];
+    let mut out = zeros(q.len());
     out.par_chunks_mut(CHUNK)
         .zip(q.par_chunks(CHUNK))
         .for_each(|(out, q)| {

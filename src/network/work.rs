@@ -44,14 +44,13 @@ impl Shape {
     /// # Panics
     /// If `map` is not a 3³ map.
     pub fn work(&self, module: Module, map: &KernelMap) -> Work {
-        let generated = match module {
+        let same = Support::of(map);
+        let children = match module {
             Module::Gaussians(role) if self.head(role).is_some_and(|h| h.children == 8) => {
-                Some(map.generated_children())
+                Some(Support::of_children(map))
             }
             _ => None,
         };
-        let same = Support::of(map);
-        let children = generated.as_ref().map(Support::of);
         let mut work = Work::default();
         let mut after = false;
         for spec in self.layers(module) {
@@ -63,7 +62,7 @@ impl Shape {
             };
             let pairs = match spec.volume {
                 27 => support.pairs,
-                8 if fourth && children.is_none() => support.forward,
+                8 if fourth && children.is_none() => forward(map),
                 _ => support.rows,
             };
             after |= fourth;
@@ -104,8 +103,13 @@ struct Support {
     rows: u64,
     /// Pairs of a voxel and an occupied neighbour, itself among them.
     pairs: u64,
-    /// Those of the neighbours at offsets 0 and 1.
-    forward: u64,
+}
+
+/// Pairs of a voxel and an occupied neighbour at offsets 0 and 1.
+fn forward(map: &KernelMap) -> u64 {
+    let forward = map.forward();
+    let occupied = forward.rows().iter().filter(|&&q| q != KernelMap::ABSENT);
+    occupied.count() as u64
 }
 
 impl Support {
@@ -115,7 +119,26 @@ impl Support {
         Support {
             rows: map.len() as u64,
             pairs: map.rows().iter().filter(occupied).count() as u64,
-            forward: map.forward().rows().iter().filter(occupied).count() as u64,
+        }
+    }
+
+    /// Of all eight children of every voxel.
+    fn of_children(map: &KernelMap) -> Support {
+        // Along an axis, of a voxel's two children each reads itself and the other, and one of them one of the neighbour's.
+        let along = |step: usize| if step % 3 == 1 { 4 } else { 1 };
+        let mut pairs = 0;
+        for row in map.rows().chunks_exact(27) {
+            let occupied = row
+                .iter()
+                .enumerate()
+                .filter(|(_, q)| **q != KernelMap::ABSENT);
+            pairs += occupied
+                .map(|(k, _)| along(k) * along(k / 3) * along(k / 9))
+                .sum::<u64>();
+        }
+        Support {
+            rows: 8 * map.len() as u64,
+            pairs,
         }
     }
 }

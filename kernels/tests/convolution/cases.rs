@@ -1,6 +1,6 @@
 //! Data to convolve.
 
-use b2p_kernels::{ABSENT, Output, Taps};
+use b2p_kernels::{ABSENT, Output, Plan, Taps};
 
 /// SplitMix64.
 pub struct Random(pub u64);
@@ -36,7 +36,6 @@ pub const CHANNELS: [usize; 7] = [3, 8, 14, 16, 32, 72, 128];
 /// All kinds of taps over `rows` output rows, and how many input rows each needs.
 pub fn kernels(random: &mut Random, rows: usize) -> Vec<(Owned, usize)> {
     let inputs = rows + 5;
-    let surface = Owned::Map(27, surface(rows));
     let mut map = |volume: usize, density: usize| {
         let entry = |random: &mut Random| match random.below(100) < density {
             true => random.below(inputs) as u32,
@@ -52,12 +51,15 @@ pub fn kernels(random: &mut Random, rows: usize) -> Vec<(Owned, usize)> {
         map(8, 60),
         map(1, 100),
     ];
-    all.push((surface, rows));
+    all.push((Owned::Map(27, surface(rows)), rows));
     all.push((Owned::Same, rows));
     let parents = (0..rows).map(|_| random.below(inputs) as u32).collect();
     let octants = (0..rows).map(|_| random.below(8) as u8).collect();
     all.push((Owned::Octants(parents, octants), inputs));
-    all.push((Owned::Children, rows.div_ceil(8)));
+    let parents = rows.div_ceil(8);
+    all.push((Owned::Children, parents));
+    let plan = Plan::new(rows);
+    all.push((Owned::AllChildren(surface(parents), plan), 8 * parents));
     all
 }
 
@@ -86,6 +88,7 @@ pub enum Owned {
     Map(usize, Vec<u32>),
     Octants(Vec<u32>, Vec<u8>),
     Children,
+    AllChildren(Vec<u32>, Plan),
 }
 
 impl Owned {
@@ -99,6 +102,7 @@ impl Owned {
             },
             Owned::Octants(parents, octants) => Taps::Octants { parents, octants },
             Owned::Children => Taps::Children,
+            Owned::AllChildren(neighbours, plan) => Taps::AllChildren { neighbours, plan },
         }
     }
 }

@@ -1,0 +1,44 @@
+//! Large blocks of memory.
+
+use bytemuck::Zeroable;
+
+/// The pages that systems have beside their small ones, on most machines.
+#[cfg(target_os = "linux")]
+const HUGE: usize = 2 << 20;
+
+/// So many zeros, from the system as they are touched: in huge pages where it has them, for every small one costs a fault.
+pub fn zeros<T: Zeroable>(len: usize) -> Vec<T> {
+    let zeros = bytemuck::zeroed_vec(len);
+    #[cfg(target_os = "linux")]
+    ask_for_huge_pages(&zeros);
+    zeros
+}
+
+/// Asks for huge pages where whole ones fit. It is up to the system to give them.
+#[cfg(target_os = "linux")]
+fn ask_for_huge_pages<T>(block: &[T]) {
+    let start = block.as_ptr().addr().next_multiple_of(HUGE);
+    let end = block.as_ptr_range().end.addr() / HUGE * HUGE;
+    if start < end {
+        let at = block
+            .as_ptr()
+            .cast::<u8>()
+            .wrapping_add(start - block.as_ptr().addr());
+        // SAFETY: these pages belong to the block alone, and the advice changes nothing but how the system backs them.
+        unsafe { libc::madvise(at.cast_mut().cast(), end - start, libc::MADV_HUGEPAGE) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn zeros_are_as_many_as_asked_for_and_zero() {
+        for len in [0, 1, 1000, (3 << 20) + 5] {
+            let zeros: Vec<u32> = zeros(len);
+            assert_eq!(zeros.len(), len);
+            assert!(zeros.iter().all(|&zero| zero == 0));
+        }
+    }
+}
