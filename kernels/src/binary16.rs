@@ -6,9 +6,12 @@ use crate::convert::{MAX, narrow_one, widen_one};
 
 /// A number of IEEE 754's binary16: 5 bits of exponent, 11 of mantissa.
 #[expect(non_camel_case_types, reason = "named as Rust names its floats")]
-#[derive(Clone, Copy, Default, bytemuck::Zeroable)]
+#[derive(Clone, Copy, Default)]
 #[repr(transparent)]
 pub struct f16(u16);
+
+// SAFETY: all of its bits zero are 0.
+unsafe impl bytemuck::Zeroable for f16 {}
 
 impl f16 {
     /// 0.

@@ -2,10 +2,12 @@
 
 use crate::f16;
 
-use crate::exact::{LIMIT, scaled};
+use crate::exact::LIMIT;
+use crate::finish::scaled;
 use crate::isa::Isa;
 use crate::machine::with_halves;
 use crate::rows::{Lanes, PANEL, panel, store};
+use crate::winograd::Registers;
 
 /// The largest finite f16.
 pub(crate) const MAX: f32 = 65504.0;
@@ -37,7 +39,7 @@ pub fn to_f16(isa: Isa, from: &[f32], to: &mut [f16]) {
 ///
 /// # Safety
 /// Its functions may use instructions that not every processor has; they must only be called where it has them.
-pub(crate) unsafe trait Halves {
+pub(crate) unsafe trait Halves: Registers {
     /// Exactly.
     unsafe fn widen(from: &[f16; PANEL], to: &mut [f32; PANEL]);
     /// Rounding, saturating.
@@ -103,6 +105,66 @@ unsafe impl Halves for Portable {
             *to = narrow_one(from);
         }
     }
+}
+
+// SAFETY: reads and writes 16 bytes, wherever they are.
+unsafe impl Registers for Portable {
+    type Register = [u16; 8];
+    type Narrow = Self;
+    const BYTES: usize = 16;
+
+    #[inline(always)]
+    unsafe fn read(at: *const u8) -> [u16; 8] {
+        // SAFETY: the caller's promise.
+        unsafe { at.cast::<[u16; 8]>().read_unaligned() }
+    }
+
+    #[inline(always)]
+    unsafe fn write(at: *mut u8, register: [u16; 8]) {
+        // SAFETY: the caller's promise.
+        unsafe { at.cast::<[u16; 8]>().write_unaligned(register) }
+    }
+
+    #[inline(always)]
+    unsafe fn add16(a: [u16; 8], b: [u16; 8]) -> [u16; 8] {
+        std::array::from_fn(|j| a[j].wrapping_add(b[j]))
+    }
+
+    #[inline(always)]
+    unsafe fn sub16(a: [u16; 8], b: [u16; 8]) -> [u16; 8] {
+        std::array::from_fn(|j| a[j].wrapping_sub(b[j]))
+    }
+
+    #[inline(always)]
+    unsafe fn add32(a: [u16; 8], b: [u16; 8]) -> [u16; 8] {
+        let (a, b) = (wide(a), wide(b));
+        halves(std::array::from_fn(|j| a[j].wrapping_add(b[j])))
+    }
+
+    #[inline(always)]
+    unsafe fn sub32(a: [u16; 8], b: [u16; 8]) -> [u16; 8] {
+        let (a, b) = (wide(a), wide(b));
+        halves(std::array::from_fn(|j| a[j].wrapping_sub(b[j])))
+    }
+
+    #[inline(always)]
+    unsafe fn eighth(a: [u16; 8]) -> [u16; 8] {
+        halves(wide(a).map(|a| a >> 3))
+    }
+}
+
+/// The same memory in 32 bits.
+#[inline(always)]
+fn wide(register: [u16; 8]) -> [i32; 4] {
+    // SAFETY: the same bytes, of which all are values of both.
+    unsafe { std::mem::transmute(register) }
+}
+
+/// The same memory in 16 bits.
+#[inline(always)]
+fn halves(register: [i32; 4]) -> [u16; 8] {
+    // SAFETY: the same bytes, of which all are values of both.
+    unsafe { std::mem::transmute(register) }
 }
 
 /// Widens by whole panels.

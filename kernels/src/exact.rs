@@ -1,20 +1,17 @@
 //! Sparse convolution in integers: the same bits on every machine.
 
-#[cfg(target_arch = "x86_64")]
 use std::sync::OnceLock;
 
-use crate::convert::Halves;
+use crate::finish::{Finish, Tile, Value, finish_tile};
 use crate::isa::{Isa, dispatch};
 #[cfg(target_arch = "x86_64")]
 use crate::machine::amx;
 use crate::machine::{fetch, halves_mut, with_halves};
 use crate::norms::{Energy, Gains, Norms};
-use crate::plan::PlanTile;
-use crate::rows::{
-    AHEAD, Extents, Lanes, Output, PANEL, Scratch, panels, part, store_part, with_scratch,
-};
+use crate::rows::{AHEAD, Extents, Lanes, Output, PANEL, Scratch, TILE, panels, with_scratch};
 use crate::taps::Taps;
 use crate::tile::{Arithmetic, accumulate};
+use crate::winograd;
 
 /// The largest magnitude of an activation.
 pub const LIMIT: i16 = 2047;
@@ -56,35 +53,8 @@ pub struct ExactConv {
     /// What [`Isa::has_tiles`] multiplies, once it is needed: nothing, if weights are too large for it.
     #[cfg(target_arch = "x86_64")]
     tiles: OnceLock<Option<amx::Weights>>,
-}
-
-/// [`Requantise`] in panels.
-#[derive(Debug, Clone)]
-enum Finish {
-    Shift {
-        bias: Vec<[i32; PANEL]>,
-        shift: Vec<[u32; PANEL]>,
-    },
-    Scale {
-        scale: Vec<[f32; PANEL]>,
-        bias: Vec<[f32; PANEL]>,
-    },
-    Invariant {
-        gains: Gains<u32>,
-        bias: Vec<[f32; PANEL]>,
-    },
-}
-
-impl Finish {
-    /// What each channel of a row is multiplied by, if anything.
-    #[inline(always)]
-    fn factors<'a>(&'a self, norms: &'a mut Norms, mask: u64) -> &'a [[f32; PANEL]] {
-        match self {
-            Finish::Shift { .. } => &[],
-            Finish::Scale { scale, .. } => scale,
-            Finish::Invariant { gains, .. } => norms.of(gains, mask),
-        }
-    }
+    /// For all children of voxels, once it is needed: nothing, if sums could be too large for it.
+    winograd: OnceLock<Option<winograd::Weights>>,
 }
 
 impl ExactConv {
@@ -152,6 +122,7 @@ impl ExactConv {
             finish,
             #[cfg(target_arch = "x86_64")]
             tiles: OnceLock::new(),
+            winograd: OnceLock::new(),
         }
     }
 
@@ -165,7 +136,8 @@ impl ExactConv {
         self.extents.cin
     }
 
-    /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations each.
+    /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations each, within
+    /// ±[`LIMIT`].
     ///
     /// The residual is added after requantising, and the sum clamped to ±[`LIMIT`] again.
     ///
@@ -218,6 +190,13 @@ impl ExactConv {
             self.extents.volume,
             "these taps belong to another kernel"
         );
+        if let Taps::AllChildren { neighbours, .. } = taps
+            && first.is_multiple_of(8)
+            && output.len().is_multiple_of(8)
+            && let Some(weights) = self.winograd()
+        {
+            return self.each_family(isa, weights, neighbours, input, first, output);
+        }
         with_scratch(|scratch| {
             for (row, output) in output.tiles() {
                 let (first, cout) = (first + row, self.extents.cout);
@@ -227,6 +206,7 @@ impl ExactConv {
                     expanded,
                     norms,
                     planner,
+                    winograd: _,
                     #[cfg(target_arch = "x86_64")]
                     tiles,
                 } = scratch;
@@ -250,7 +230,16 @@ impl ExactConv {
                         sums,
                     );
                 }
-                let (layer, tile) = (&self.finish, Tile { output, cout, plan });
+                let (positions, masks) = (plan.positions(), plan.masks());
+                let (layer, tile) = (
+                    &self.finish,
+                    Tile {
+                        output,
+                        cout,
+                        positions,
+                        masks,
+                    },
+                );
                 let sums = &sums[..];
                 with_halves!(isa, fn finish_tile<T: Value>(
                     layer: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, T>,
@@ -259,31 +248,85 @@ impl ExactConv {
         });
     }
 
+    /// The weight of a tap, from an input channel to an output channel.
+    fn weight(&self, steps: usize, panels: usize, tap: usize, channel: usize, out: usize) -> i16 {
+        let pair = self.weights[(tap * panels + out / PANEL) * steps + channel / 2].0[out % PANEL];
+        let which = (channel % 2) ^ usize::from(cfg!(target_endian = "big"));
+        (pair >> (16 * which)) as i16
+    }
+
+    /// All children of voxels, by minimal filtering.
+    fn each_family<T: Value>(
+        &self,
+        isa: Isa,
+        weights: &winograd::Weights,
+        neighbours: &[u32],
+        input: &[i16],
+        first: usize,
+        mut output: Output<'_, T, i16>,
+    ) {
+        with_scratch(|scratch| {
+            for (row, output) in output.tiles() {
+                let voxels = (first + row) / 8..(first + row + output.len()) / 8;
+                let neighbours = &neighbours[voxels.start * 27..voxels.end * 27];
+                let Scratch {
+                    sums,
+                    norms,
+                    winograd: buffers,
+                    ..
+                } = scratch;
+                let masks = winograd::accumulate(isa, weights, neighbours, input, buffers, sums);
+                let tile = Tile {
+                    output,
+                    cout: self.extents.cout,
+                    positions: &IN_ORDER[..masks.len()],
+                    masks,
+                };
+                let (layer, sums) = (&self.finish, &sums[..]);
+                with_halves!(isa, fn finish_tile<T: Value>(
+                    layer: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, T>,
+                ));
+            }
+        });
+    }
+
+    /// The weights for minimal filtering.
+    fn winograd(&self) -> Option<&winograd::Weights> {
+        let (steps, panels) = (self.extents.cin.div_ceil(2), self.extents.panels());
+        let make = || {
+            winograd::Weights::new(self.extents, |tap, channel, out| {
+                self.weight(steps, panels, tap, channel, out)
+            })
+        };
+        self.winograd.get_or_init(make).as_ref()
+    }
+
     /// The weights in tiles.
     #[cfg(target_arch = "x86_64")]
     fn tiles(&self) -> Option<&amx::Weights> {
         let pack = || {
             let (steps, panels) = (self.extents.cin.div_ceil(2), self.extents.panels());
             amx::Weights::of_integers(self.extents, |tap, channel, out| {
-                let panel = tap * panels + out / PANEL;
-                let pair = self.weights[panel * steps + channel / 2].0[out % PANEL];
-                (pair >> (16 * (channel % 2))) as i16
+                self.weight(steps, panels, tap, channel, out)
             })
         };
         self.tiles.get_or_init(pack).as_ref()
     }
 }
 
-/// Where a tile's `cout` channels go.
-struct Tile<'a, T> {
-    output: Output<'a, T, i16>,
-    cout: usize,
-    /// Which rows the sums are of, and the taps that read something for each.
-    plan: &'a PlanTile,
-}
+/// The positions of rows in order.
+static IN_ORDER: [u16; TILE] = {
+    let mut positions = [0; TILE];
+    let mut i = 0;
+    while i < TILE {
+        positions[i] = i as u16;
+        i += 1;
+    }
+    positions
+};
 
 /// The half of a word that the pair's first or second value takes.
-fn place(value: i16, which: usize) -> u32 {
+pub(crate) fn place(value: i16, which: usize) -> u32 {
     u32::from(value as u16) << (16 * (which ^ usize::from(cfg!(target_endian = "big"))))
 }
 
@@ -310,113 +353,4 @@ fn pair_rows(input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
         }
         odd.fill(0);
     }
-}
-
-/// A row's sums of one panel, and what becomes of them.
-#[derive(Clone, Copy)]
-struct Panel<'a> {
-    layer: &'a Finish,
-    /// Which panel.
-    number: usize,
-    sums: &'a Lanes,
-    /// Those of all panels, if sums are multiplied.
-    factors: &'a [[f32; PANEL]],
-    residual: Option<&'a [i16; PANEL]>,
-    relu: bool,
-}
-
-/// What a layer ends in.
-trait Value: Copy + Send + Sync {
-    /// # Safety
-    /// The processor must have `H`'s instructions.
-    unsafe fn of<H: Halves>(panel: Panel<'_>) -> [Self; PANEL];
-}
-
-impl Value for i16 {
-    #[inline(always)]
-    unsafe fn of<H: Halves>(panel: Panel<'_>) -> [i16; PANEL] {
-        let (p, sums) = (panel.number, panel.sums);
-        let floor = if panel.relu { 0 } else { -LIMIT };
-        // SAFETY: the caller's promise.
-        unsafe {
-            let q = match panel.layer {
-                Finish::Shift { bias, shift } => H::shift(sums, &bias[p], &shift[p]),
-                Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => {
-                    H::round(sums, &panel.factors[p], &bias[p])
-                }
-            };
-            H::settle(q, panel.residual, floor)
-        }
-    }
-}
-
-impl Value for f32 {
-    #[inline(always)]
-    unsafe fn of<H: Halves>(panel: Panel<'_>) -> [f32; PANEL] {
-        let p = panel.number;
-        let bias = match panel.layer {
-            Finish::Shift { .. } => unreachable!("refused above"),
-            Finish::Scale { bias, .. } | Finish::Invariant { bias, .. } => bias,
-        };
-        let mut values = scaled(panel.sums, &panel.factors[p], &bias[p]);
-        if panel.relu {
-            values.iter_mut().for_each(|value| *value = value.max(0.0));
-        }
-        values
-    }
-}
-
-/// # Safety
-/// The processor must have `H`'s instructions.
-#[inline(always)]
-unsafe fn finish_tile<H: Halves, T: Value>(
-    layer: &Finish,
-    sums: &[Lanes],
-    norms: &mut Norms,
-    tile: Tile<'_, T>,
-) {
-    let Tile { output, cout, plan } = tile;
-    let Output {
-        rows,
-        stride,
-        column,
-        residual,
-        relu,
-    } = output;
-    let panels = cout.div_ceil(PANEL);
-    for (row, (&position, &mask)) in plan.positions().iter().zip(plan.masks()).enumerate() {
-        let sums = &sums[usize::from(position) * panels..][..panels];
-        let factors = layer.factors(norms, mask);
-        let first = row * stride + column;
-        let residual = residual.map(|all| all[first..][..cout].as_chunks::<PANEL>());
-        let (whole, rest) = rows[first..][..cout].as_chunks_mut::<PANEL>();
-        let mut panel = Panel {
-            layer,
-            number: 0,
-            sums: &sums[0],
-            factors,
-            residual: None,
-            relu,
-        };
-        let last = whole.len();
-        for (p, to) in whole.iter_mut().enumerate() {
-            (panel.number, panel.sums) = (p, &sums[p]);
-            panel.residual = residual.map(|(whole, _)| &whole[p]);
-            // SAFETY: the caller's promise.
-            *to = unsafe { T::of::<H>(panel) };
-        }
-        if !rest.is_empty() {
-            let residual = residual.map(|(_, rest)| part(rest));
-            (panel.number, panel.sums) = (last, &sums[last]);
-            panel.residual = residual.as_ref();
-            // SAFETY: the caller's promise.
-            store_part(unsafe { T::of::<H>(panel) }, rest);
-        }
-    }
-}
-
-#[inline(always)]
-pub(crate) fn scaled(sums: &Lanes, factor: &[f32; PANEL], bias: &[f32; PANEL]) -> [f32; PANEL] {
-    let sums = sums.i32();
-    std::array::from_fn(|j| sums[j] as f32 * factor[j] + bias[j])
 }

@@ -47,6 +47,15 @@ pub fn copy_row(window: &[u32; 64], octant: usize, row: &mut [u32]) {
     }
 }
 
+/// Which of the 27 positions of the window around the child in `octant` are occupied.
+#[inline(always)]
+pub(crate) fn copy_mask(window: &[u32; 64], octant: usize) -> u64 {
+    let mut row = [0; 27];
+    copy_row(window, octant, &mut row);
+    let bits = row.iter().enumerate();
+    bits.fold(0, |mask, (k, &q)| mask | u64::from(q != ABSENT) << k)
+}
+
 /// Writes the rows of some children, `rows.len() / 27` from `first` on, of all eight children of voxels with these neighbours, 27 each: the
 /// child in octant `o` of voxel `i` has index `8i + o`.
 pub(crate) fn rows_of_all(neighbours: &[u32], first: usize, rows: &mut [u32]) {

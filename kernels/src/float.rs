@@ -216,6 +216,7 @@ impl FloatConv {
                 expanded,
                 norms,
                 planner,
+                winograd: _,
                 #[cfg(target_arch = "x86_64")]
                 tiles,
             } = scratch;

@@ -17,6 +17,7 @@ mod binary16;
 mod convert;
 mod exact;
 mod family;
+mod finish;
 mod float;
 mod isa;
 mod machine;
@@ -27,6 +28,7 @@ mod plan;
 mod rows;
 mod taps;
 mod tile;
+mod winograd;
 
 pub mod ceiling;
 pub mod reference;

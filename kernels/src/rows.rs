@@ -190,6 +190,7 @@ pub(crate) struct Scratch {
     pub expanded: Vec<Lanes>,
     pub norms: Norms,
     pub planner: Planner,
+    pub winograd: crate::winograd::Buffers,
     #[cfg(target_arch = "x86_64")]
     pub tiles: crate::machine::amx::Buffers,
 }

@@ -241,6 +241,66 @@ pub(crate) fn accumulate<T>(
     }
 }
 
+/// The products of rows of words by the weights `[panel][step]` of one tap: `products[row · panels + panel]`.
+///
+/// # Panics
+/// If there are more than [`ROWS`] rows, or not whole groups.
+pub(crate) fn multiply_rows(
+    isa: Isa,
+    cout: usize,
+    weights: &[Lanes],
+    rows: &[u32],
+    products: &mut [Lanes],
+) {
+    let panels = cout.div_ceil(PANEL);
+    let (steps, count) = (weights.len() / panels, products.len() / panels);
+    assert!(count <= ROWS && count.is_multiple_of(isa.group()));
+    assert_eq!(
+        rows.len(),
+        count * steps,
+        "a row of words for each of products"
+    );
+    let half = usize::from((1..=PANEL / 2).contains(&(cout % PANEL)));
+    let mut panel = 0;
+    while panel < panels {
+        let whole = panels - panel - half;
+        let block = Block {
+            group: count,
+            taps: FIRST.as_ptr(),
+            count: 1,
+            places: IN_ORDER.as_ptr(),
+            inputs: rows.as_ptr(),
+            steps,
+            weights: weights[panel * steps..].as_ptr().cast(),
+            tap: panels * steps * PANEL,
+            sums: products[panel..].as_mut_ptr().cast(),
+            stride: panels * PANEL,
+            more: false,
+        };
+        // SAFETY: there are as many places as rows, each of `steps` words, and `products` for all of them; the weights are those of the panels
+        // from here on, with `whole` and, if there is none, half of one left.
+        unsafe { run(isa, Arithmetic::Integer, &block, whole) };
+        panel += width(isa, whole);
+    }
+}
+
+/// Rows that [`multiply_rows`] multiplies at most.
+const ROWS: usize = 16;
+
+/// The only tap.
+static FIRST: [u8; 1] = [0];
+
+/// The places of rows in order.
+static IN_ORDER: [u16; ROWS] = {
+    let mut places = [0; ROWS];
+    let mut i = 0;
+    while i < ROWS {
+        places[i] = i as u16;
+        i += 1;
+    }
+    places
+};
+
 /// Of `whole` panels, or the half that is left, as many as are multiplied at once.
 fn width(isa: Isa, whole: usize) -> usize {
     match isa.level() {

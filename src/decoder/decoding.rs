@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::ops::Deref;
+use std::sync::{Mutex, PoisonError};
 
 use super::{Decoder, Exact};
 use crate::bitstream::{Header, Level, MAGIC};
@@ -10,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
-use crate::network::{Model, Module};
+use crate::network::{Model, Module, Pool};
 
 /// Where decoding is to end.
 #[derive(Debug, Clone, Copy)]
@@ -58,6 +59,8 @@ pub struct Decoding<'b, M> {
     opened: Option<Opened>,
     reached: Option<Reached>,
     failed: bool,
+    /// Between two steps, what the last has left.
+    pool: Mutex<Pool<i16>>,
 }
 
 /// What is known once the header is there.
@@ -88,6 +91,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
             opened: None,
             reached: None,
             failed: false,
+            pool: Mutex::new(Pool::new()),
         }
     }
 
@@ -178,7 +182,11 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
             "voxels",
             || {
                 let Reached { exact, map, .. } = reached;
-                decoder.model.generate(role, &exact.features, map)
+                let mut pool = self.take_pool();
+                let model = &decoder.model;
+                let raw = model.generate_in(&mut pool, role, &exact.features, map);
+                self.return_pool(pool);
+                raw
             },
         )?;
         let frame = Frame {
@@ -188,6 +196,18 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
         log.step("activate", voxels.len() * children, "Gaussians", || {
             Ok(activate(&raw, voxels, children, shape, frame))
         })
+    }
+
+    fn take_pool(&self) -> Pool<i16> {
+        let pool = self.pool.lock();
+        std::mem::replace(
+            &mut *pool.unwrap_or_else(PoisonError::into_inner),
+            Pool::new(),
+        )
+    }
+
+    fn return_pool(&self, pool: Pool<i16>) {
+        *self.pool.lock().unwrap_or_else(PoisonError::into_inner) = pool;
     }
 
     /// Takes the next step; `ended` tells that all bytes have come.
@@ -277,9 +297,10 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
             None => Octree::root(),
         };
         let above = self.reached.as_ref();
-        let done = self
-            .decoder
-            .exact_level(header, &level, &mut octree, above, log);
+        let mut pool = self.take_pool();
+        let decoder = &self.decoder;
+        let done = decoder.exact_level(&mut pool, header, &level, &mut octree, above, log);
+        self.return_pool(pool);
         match (done, &mut self.reached) {
             (Ok((latents, features, map)), reached) => {
                 *reached = Some(Reached {
@@ -311,6 +332,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// Grows `octree` to a level; its latents, features and kernel map.
     fn exact_level(
         &self,
+        pool: &mut Pool<i16>,
         header: &Header,
         level: &Level,
         octree: &mut Octree,
@@ -341,21 +363,27 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
                 self.cancel.check()?;
                 Some(log.step(Module::Context(role).at(n), count, "voxels", || {
                     let occupancy = octree.occupancy(n - 1);
-                    Ok(self.model.upsample(role, &above.exact.features, occupancy))
+                    let features = &above.exact.features;
+                    Ok(self.model.upsample_in(pool, role, features, occupancy))
                 })?)
             }
         };
-        let latents = self.latents(header, level, context.as_deref(), octree, &map, log)?;
+        let latents = self.latents(pool, header, level, context.as_deref(), octree, &map, log)?;
         self.cancel.check()?;
         let features = log.step(Module::Features(role).at(n), count, "voxels", || {
             let context = context.as_deref();
-            Ok(self.model.reconstruct(role, &latents, context, &map))
+            let model = &self.model;
+            Ok(model.reconstruct_in(pool, role, &latents, context, &map))
         })?;
+        if let Some(context) = context {
+            pool.give(context);
+        }
         Ok((latents, features, map.into_owned()))
     }
 
     fn latents(
         &self,
+        pool: &mut Pool<i16>,
         header: &Header,
         level: &Level,
         context: Option<&[i16]>,
@@ -369,12 +397,12 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let parameters = context
             .map(|context| {
                 log.step(Module::Probabilities(role).at(n), count, "voxels", || {
-                    Ok(self.model.entropy_parameters(role, context, map))
+                    Ok(self.model.entropy_parameters_in(pool, role, context, map))
                 })
             })
             .transpose()?;
         let symbols = count * self.model.shape().latents;
-        log.step(format!("latents of level {n}"), symbols, "symbols", || {
+        let latents = log.step(format!("latents of level {n}"), symbols, "symbols", || {
             let (tables, cancel) = (self.model.tables(), &self.cancel);
             let slices = &level.features;
             let latents = match &parameters {
@@ -394,6 +422,10 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
             };
             level.check_latents(latent_hash(&latents))?;
             Ok(latents)
-        })
+        });
+        if let Some((mu, _)) = parameters {
+            pool.give(mu);
+        }
+        latents
     }
 }

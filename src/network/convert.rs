@@ -76,7 +76,7 @@ impl Model {
             Some(context) => {
                 assert_eq!(features.len(), context.len(), "one context per feature");
                 let context = reals(self.isa, context, self.c_scale[role]);
-                let x = concat(features, c, &context, c);
+                let x = concat(pool, features, c, &context, c);
                 apply(pool, self.isa, &fs.lin1, Taps::Same, &x, rows, true)
             }
         };

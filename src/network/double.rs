@@ -4,7 +4,7 @@ use b2p_kernels::reference::tap;
 use b2p_kernels::{Isa, Output, Taps};
 
 use super::Model;
-use super::layers::Conv;
+use super::layers::{Conv, Pool};
 use super::stored::Stored;
 use crate::error::Result;
 use crate::geometry::KernelMap;
@@ -127,6 +127,6 @@ impl Model {
         let step = f64::from(self.g_scale[role]);
         let g: Vec<f64> = g.iter().map(|&q| f64::from(q) * step).collect();
         let layers = generator.of_layers(Double::new);
-        Ok(self.run_generator(&layers, &g, map, map.len().max(1)))
+        Ok(self.run_generator(&mut Pool::new(), &layers, &g, map, map.len().max(1)))
     }
 }

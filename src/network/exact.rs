@@ -20,6 +20,16 @@ impl Model {
     /// # Panics
     /// If `role` is not 1 or 2, or `g` and `occupancy` disagree in length.
     pub fn upsample(&self, role: usize, g: &[i16], occupancy: &[u8]) -> Vec<i16> {
+        self.upsample_in(&mut Pool::new(), role, g, occupancy)
+    }
+
+    pub(crate) fn upsample_in(
+        &self,
+        pool: &mut Pool<i16>,
+        role: usize,
+        g: &[i16],
+        occupancy: &[u8],
+    ) -> Vec<i16> {
         assert!(role == 1 || role == 2, "role {role} has no context");
         let c = self.shape.channels;
         assert_eq!(g.len(), occupancy.len() * c, "one feature per parent");
@@ -30,18 +40,10 @@ impl Model {
                     parents: &parents,
                     octants: &octants,
                 };
-                apply(
-                    &mut Pool::new(),
-                    self.isa,
-                    &up[role - 1],
-                    taps,
-                    g,
-                    parents.len(),
-                    false,
-                )
+                apply(pool, self.isa, &up[role - 1], taps, g, parents.len(), false)
             }
             None => {
-                let mut out = vec![0; parents.len() * c];
+                let mut out = pool.take(parents.len() * c);
                 for (child, &parent) in out.chunks_exact_mut(c).zip(&parents) {
                     child.copy_from_slice(&g[parent as usize * c..][..c]);
                 }
@@ -62,19 +64,29 @@ impl Model {
         context: &[i16],
         map: &KernelMap,
     ) -> (Vec<i16>, Vec<u8>) {
+        self.entropy_parameters_in(&mut Pool::new(), role, context, map)
+    }
+
+    pub(crate) fn entropy_parameters_in(
+        &self,
+        pool: &mut Pool<i16>,
+        role: usize,
+        context: &[i16],
+        map: &KernelMap,
+    ) -> (Vec<i16>, Vec<u8>) {
         assert!(role == 1 || role == 2, "role {role} has a fixed prior");
         self.check(context, self.shape.channels, map);
         let pem = &self.exact.pem[role - 1];
-        let (isa, n, pool) = (self.isa, map.len(), &mut Pool::new());
+        let (isa, n) = (self.isa, map.len());
         let x = apply(pool, isa, &pem.conv_in, map.taps(), context, n, true);
         let x = self.blocks(pool, &pem.blocks, x, map);
         let mu = apply(pool, isa, &pem.mu, Taps::Same, &x, n, false);
         let sigma = apply(pool, isa, &pem.sigma, Taps::Same, &x, n, false);
-        let sigma = sigma
-            .into_iter()
-            .map(|q| q.clamp(0, SIGMAS - 1) as u8)
-            .collect();
-        (mu, sigma)
+        pool.give(x);
+        let index = |q: &i16| (*q).clamp(0, SIGMAS - 1) as u8;
+        let indices = sigma.iter().map(index).collect();
+        pool.give(sigma);
+        (mu, indices)
     }
 
     /// The features [voxels, C] of a role, from its latents [voxels, K] and, above role 0, its context [voxels, C].
@@ -83,6 +95,17 @@ impl Model {
     /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.
     pub fn reconstruct(
         &self,
+        role: usize,
+        latents: &[i16],
+        context: Option<&[i16]>,
+        map: &KernelMap,
+    ) -> Vec<i16> {
+        self.reconstruct_in(&mut Pool::new(), role, latents, context, map)
+    }
+
+    pub(crate) fn reconstruct_in(
+        &self,
+        pool: &mut Pool<i16>,
         role: usize,
         latents: &[i16],
         context: Option<&[i16]>,
@@ -101,14 +124,16 @@ impl Model {
         let mut x: Vec<i16> = latents.par_iter().map(raise).collect();
         if let Some(context) = context {
             self.check(context, c, map);
-            x = concat(&x, k, context, c);
+            x = concat(pool, &x, k, context, c);
         }
         let fr = &self.exact.fr[role];
-        let (isa, n, pool) = (self.isa, map.len(), &mut Pool::new());
+        let (isa, n) = (self.isa, map.len());
         let hidden = apply(pool, isa, &fr.lin1, Taps::Same, &x, n, true);
         pool.give(x);
         let x = self.blocks(pool, &fr.blocks, hidden, map);
-        apply(pool, isa, &fr.lin2, Taps::Same, &x, n, false)
+        let features = apply(pool, isa, &fr.lin2, Taps::Same, &x, n, false);
+        pool.give(x);
+        features
     }
 
     fn blocks(

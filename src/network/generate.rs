@@ -115,15 +115,25 @@ impl Model {
     /// # Panics
     /// If `g` and `map` disagree in length.
     pub fn generate(&self, role: usize, g: &[i16], map: &KernelMap) -> Result<Vec<f32>> {
+        self.generate_in(&mut Pool::new(), role, g, map)
+    }
+
+    pub(crate) fn generate_in(
+        &self,
+        pool: &mut Pool<i16>,
+        role: usize,
+        g: &[i16],
+        map: &KernelMap,
+    ) -> Result<Vec<f32>> {
         let generator = self.generator(role)?;
         self.check(g, self.shape.channels, map);
         match (&generator.scales, self.precision) {
             (Some(scales), Precision::Int16) => {
-                Ok(self.run_generator(generator.integer(scales), g, map, PART))
+                Ok(self.run_generator(pool, generator.integer(scales), g, map, PART))
             }
             _ => {
                 let g = reals(self.isa, g, self.g_scale[role]);
-                Ok(self.run_generator(generator.float(), &g, map, PART))
+                Ok(self.run_generator(&mut Pool::new(), generator.float(), &g, map, PART))
             }
         }
     }
@@ -147,13 +157,13 @@ impl Model {
     /// What a generator makes of features; the children of so many voxels at once.
     pub(super) fn run_generator<C: Conv>(
         &self,
+        pool: &mut Pool<C::Value>,
         gg: &Generate<C>,
         g: &[C::Value],
         map: &KernelMap,
         part: usize,
     ) -> Vec<f32> {
         let (isa, n) = (self.isa, map.len());
-        let pool = &mut Pool::new();
         let mut x = apply(pool, isa, &gg.conv_in, map.taps(), g, n, true);
         for block in &gg.before {
             x = block.apply(pool, isa, map.taps(), x);
@@ -170,6 +180,7 @@ impl Model {
                 x = block.apply(pool, isa, map.taps(), x);
             }
             apply_f32(isa, &gg.conv_out, map.taps(), &x, &mut out);
+            pool.give(x);
         }
         out
     }
@@ -252,13 +263,15 @@ mod tests {
             let g: Vec<i16> = g.collect();
             let generator = model.generator(1).unwrap();
             let integer = generator.integer(generator.scales.as_ref().unwrap());
-            let whole = model.run_generator(integer, &g, map, map.len());
+            let whole = model.run_generator(&mut Pool::new(), integer, &g, map, map.len());
             let real = reals(model.isa, &g, model.g_scale[1]);
-            let whole_real = model.run_generator(generator.float(), &real, map, map.len());
+            let whole_real =
+                model.run_generator(&mut Pool::new(), generator.float(), &real, map, map.len());
             for part in [1, 37, 1000] {
-                let parts = model.run_generator(integer, &g, map, part);
+                let parts = model.run_generator(&mut Pool::new(), integer, &g, map, part);
                 assert!(parts == whole, "{blocks_after} blocks, {part} voxels");
-                let parts = model.run_generator(generator.float(), &real, map, part);
+                let parts =
+                    model.run_generator(&mut Pool::new(), generator.float(), &real, map, part);
                 assert!(parts == whole_real, "{blocks_after} blocks, {part} voxels");
             }
         }

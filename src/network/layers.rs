@@ -82,6 +82,7 @@ impl Conv for FloatConv {
 
 /// Memory of results that have been read, for the next ones: what is fresh from the system costs a fault every page when it is first
 /// written.
+#[derive(Debug)]
 pub(crate) struct Pool<T>(Vec<Vec<T>>);
 
 impl<T: Copy + Zeroable> Pool<T> {
@@ -99,7 +100,14 @@ impl<T: Copy + Zeroable> Pool<T> {
                 buffer.resize(len, T::zeroed());
                 buffer
             }
-            None => zeros(len),
+            None => {
+                // What is too small now will be so later: levels grow.
+                let sizes = self.0.iter().enumerate();
+                if let Some((i, _)) = sizes.max_by_key(|(_, buffer)| buffer.capacity()) {
+                    self.0.swap_remove(i);
+                }
+                zeros(len)
+            }
         }
     }
 
@@ -276,12 +284,13 @@ impl<C: Conv> ResBlock<C> {
 
 /// Rows of `left` and `right`, of `a` and `b` values, side by side.
 pub(super) fn concat<T: Copy + Zeroable + Send + Sync>(
+    pool: &mut Pool<T>,
     left: &[T],
     a: usize,
     right: &[T],
     b: usize,
 ) -> Vec<T> {
-    let mut out = zeros(left.len() + right.len());
+    let mut out = pool.take(left.len() + right.len());
     let rows = out.par_chunks_mut((a + b) * BLOCK);
     let parts = left.par_chunks(a * BLOCK).zip(right.par_chunks(b * BLOCK));
     rows.zip(parts).for_each(|(rows, (left, right))| {

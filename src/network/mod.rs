@@ -69,6 +69,7 @@ use structure::{Encoder, Exact, Generate};
 
 pub(crate) use generate::AT_ONCE;
 pub use generate::Precision;
+pub(crate) use layers::Pool;
 pub use shape::{Head, Shape, Upsample};
 pub use structure::{RAW, ROLES};
 pub use untrained::untrained;

@@ -18,8 +18,10 @@ pub(super) struct Stored {
 
 /// The largest weight of a layer that runs in integers, unless sums could overflow.
 const WEIGHT: u64 = 2047;
-/// Sums of products, and of squared weights, stay below this.
+/// Sums of squared weights stay below this, and those of products.
 const SUM_LIMIT: u64 = 1 << 31;
+/// Sums of products of 3³ kernels stay below this, with which all children of a voxel are computed at once ([`ExactConv`]).
+const SMALL_SUM_LIMIT: u64 = 1 << 28;
 
 impl Stored {
     /// The layer in floats.
@@ -35,7 +37,7 @@ impl Stored {
     }
 
     /// The layer in integers: its input is in steps of `from`, its output in steps of `to`. A channel's largest weight becomes 2047,
-    /// or half that and so on until no sum can overflow.
+    /// or seven eighths of that and so on until no sum can be too large.
     pub fn integer(&self, from: f32, to: f32) -> ExactConv {
         let Spec {
             volume, cin, cout, ..
@@ -49,14 +51,19 @@ impl Stored {
                 let scale = if peak > 0.0 { top as f64 / peak } else { 0.0 };
                 channel().map(move |w| (w * scale).round_ties_even() as i64)
             };
+            let limit = if volume == 27 {
+                SMALL_SUM_LIMIT
+            } else {
+                SUM_LIMIT
+            };
             let overflows = |top: &u64| {
                 let (sum, squares) = quantised(*top).fold((0, 0), |(sum, squares), q| {
                     let q = q.unsigned_abs();
                     (sum + q, squares + q * q)
                 });
-                sum * u64::from(LIMIT.unsigned_abs()) >= SUM_LIMIT || squares >= SUM_LIMIT
+                sum * u64::from(LIMIT.unsigned_abs()) >= limit || squares >= SUM_LIMIT
             };
-            let mut tops = std::iter::successors(Some(WEIGHT), |top| Some(top / 2));
+            let mut tops = std::iter::successors(Some(WEIGHT), |top| Some(top * 7 / 8));
             let top = tops.find(|top| !overflows(top)).unwrap_or(0);
             for (q, weight) in quantised(top).zip(weights[o..].iter_mut().step_by(cout)) {
                 // In ±2047 by construction.

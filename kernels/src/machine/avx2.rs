@@ -10,6 +10,7 @@ use crate::exact::LIMIT;
 use crate::machine::machine;
 use crate::rows::{Lanes, PANEL};
 use crate::tile::{Arithmetic, Block, Machine, columns};
+use crate::winograd::Registers;
 
 /// # Safety
 /// The processor must have AVX2, FMA and F16C; the rest as [`columns`].
@@ -183,5 +184,54 @@ unsafe fn join(halves: [__m256i; 2]) -> [i16; PANEL] {
     unsafe {
         let packed = _mm256_packs_epi32(halves[0], halves[1]);
         std::mem::transmute(_mm256_permute4x64_epi64::<0b11_01_10_00>(packed))
+    }
+}
+
+// SAFETY: reads and writes 32 bytes, wherever they are.
+unsafe impl Registers for Convert {
+    type Register = __m256i;
+    type Narrow = Self;
+    const BYTES: usize = 32;
+
+    #[inline(always)]
+    unsafe fn read(at: *const u8) -> __m256i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_loadu_si256(at.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn write(at: *mut u8, register: __m256i) {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_storeu_si256(at.cast(), register) }
+    }
+
+    #[inline(always)]
+    unsafe fn add16(a: __m256i, b: __m256i) -> __m256i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_add_epi16(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn sub16(a: __m256i, b: __m256i) -> __m256i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_sub_epi16(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn add32(a: __m256i, b: __m256i) -> __m256i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_add_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn sub32(a: __m256i, b: __m256i) -> __m256i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_sub_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn eighth(a: __m256i) -> __m256i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm256_srai_epi32::<3>(a) }
     }
 }

@@ -10,6 +10,7 @@ use crate::exact::LIMIT;
 use crate::machine::machine;
 use crate::rows::{Lanes, PANEL};
 use crate::tile::{Arithmetic, Block, Machine, columns};
+use crate::winograd::Registers;
 
 /// # Safety
 /// The processor must have AVX-512 F, BW, CD, DQ, VL and VNNI, and AVX512_BF16 for [`Arithmetic::Brain`]; the rest as
@@ -253,5 +254,54 @@ unsafe impl Halves for Convert {
     unsafe fn settle(q: [i16; PANEL], residual: Option<&[i16; PANEL]>, floor: i16) -> [i16; PANEL] {
         // SAFETY: AVX2, which any processor with AVX-512 has.
         unsafe { super::avx2::Convert::settle(q, residual, floor) }
+    }
+}
+
+// SAFETY: reads and writes 64 bytes, wherever they are.
+unsafe impl Registers for Convert {
+    type Register = __m512i;
+    type Narrow = super::avx2::Convert;
+    const BYTES: usize = 64;
+
+    #[inline(always)]
+    unsafe fn read(at: *const u8) -> __m512i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm512_loadu_si512(at.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn write(at: *mut u8, register: __m512i) {
+        // SAFETY: the caller's promise.
+        unsafe { _mm512_storeu_si512(at.cast(), register) }
+    }
+
+    #[inline(always)]
+    unsafe fn add16(a: __m512i, b: __m512i) -> __m512i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm512_add_epi16(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn sub16(a: __m512i, b: __m512i) -> __m512i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm512_sub_epi16(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn add32(a: __m512i, b: __m512i) -> __m512i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm512_add_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn sub32(a: __m512i, b: __m512i) -> __m512i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm512_sub_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn eighth(a: __m512i) -> __m512i {
+        // SAFETY: the caller's promise.
+        unsafe { _mm512_srai_epi32::<3>(a) }
     }
 }

@@ -9,6 +9,7 @@ use crate::ceiling;
 use crate::convert::{Halves, MAX};
 use crate::rows::PANEL;
 use crate::tile::{Arithmetic, Block, Machine, columns};
+use crate::winograd::Registers;
 
 /// # Safety
 /// The processor must have NEON; the rest as [`columns`].
@@ -215,5 +216,64 @@ unsafe impl Halves for Convert {
                 vst1q_u16(to.as_mut_ptr().add(half).cast(), narrow);
             }
         }
+    }
+}
+
+// SAFETY: reads and writes 16 bytes, wherever they are.
+unsafe impl Registers for Convert {
+    type Register = int16x8_t;
+    type Narrow = Self;
+    const BYTES: usize = 16;
+
+    #[inline(always)]
+    unsafe fn read(at: *const u8) -> int16x8_t {
+        // SAFETY: the caller's promise.
+        unsafe { vld1q_s16(at.cast()) }
+    }
+
+    #[inline(always)]
+    unsafe fn write(at: *mut u8, register: int16x8_t) {
+        // SAFETY: the caller's promise.
+        unsafe { vst1q_s16(at.cast(), register) }
+    }
+
+    #[inline(always)]
+    unsafe fn add16(a: int16x8_t, b: int16x8_t) -> int16x8_t {
+        // SAFETY: the caller's promise.
+        unsafe { vaddq_s16(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn sub16(a: int16x8_t, b: int16x8_t) -> int16x8_t {
+        // SAFETY: the caller's promise.
+        unsafe { vsubq_s16(a, b) }
+    }
+
+    #[inline(always)]
+    unsafe fn add32(a: int16x8_t, b: int16x8_t) -> int16x8_t {
+        // SAFETY: the caller's promise.
+        unsafe {
+            vreinterpretq_s16_s32(vaddq_s32(
+                vreinterpretq_s32_s16(a),
+                vreinterpretq_s32_s16(b),
+            ))
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn sub32(a: int16x8_t, b: int16x8_t) -> int16x8_t {
+        // SAFETY: the caller's promise.
+        unsafe {
+            vreinterpretq_s16_s32(vsubq_s32(
+                vreinterpretq_s32_s16(a),
+                vreinterpretq_s32_s16(b),
+            ))
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn eighth(a: int16x8_t) -> int16x8_t {
+        // SAFETY: the caller's promise.
+        unsafe { vreinterpretq_s16_s32(vshrq_n_s32::<3>(vreinterpretq_s32_s16(a))) }
     }
 }

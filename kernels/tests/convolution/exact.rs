@@ -1,6 +1,6 @@
 //! Integers: equal to the bit.
 
-use b2p_kernels::{ExactConv, Isa, LIMIT, Output, Plan, Requantise, Taps, reference};
+use b2p_kernels::{ABSENT, ExactConv, Isa, LIMIT, Output, Plan, Requantise, Taps, reference};
 
 use crate::cases::{Random, cases, kernels, whole};
 
@@ -92,6 +92,68 @@ fn exact_layers_equal_their_definition_to_the_bit() {
     let mut random = Random(1);
     for (taps, rows, inputs, extents) in cases(&mut random) {
         check_random(&mut random, &taps.taps(), [rows, inputs], extents);
+    }
+}
+
+/// Where sums are small enough, all children of a voxel are computed at once, else each by itself: on both sides of that border, and with the
+/// largest sums on either side of zero.
+#[test]
+fn all_children_equal_their_definition_up_to_the_largest_sums() {
+    // 27 voxels around one, and one far from all.
+    let around = |voxel: i32, k: i32| {
+        let along = |base: i32| voxel / base % 3 + k / base % 3 - 1;
+        let at = [along(1), along(3), along(9)];
+        let inside = at.iter().all(|x| (0..3).contains(x));
+        inside.then(|| (at[0] + 3 * at[1] + 9 * at[2]) as u32)
+    };
+    let mut neighbours: Vec<u32> = (0..27)
+        .flat_map(|voxel| (0..27).map(move |k| around(voxel, k).unwrap_or(ABSENT)))
+        .collect();
+    neighbours.extend((0..27).map(|k| if k == 13 { 27 } else { ABSENT }));
+    let rows = 8 * 28;
+    let plan = Plan::new(rows);
+    let taps = Taps::AllChildren {
+        neighbours: &neighbours,
+        plan: &plan,
+    };
+    for [cin, cout] in [[16, 16], [32, 14], [64, 40]] {
+        // The largest even weight, if all are alike, with which sums stay below 2²⁸; the next; what transforms make too large.
+        let most = ((1 << 28) / 2047 - 1) / (27 * cin as i32);
+        for weight in [most, most + 1, 2047, i16::MAX.into()] {
+            for sign in [1, -1] {
+                let weights = vec![(sign * weight) as i16; 27 * cin * cout];
+                let mixed: Vec<i16> = (0..weights.len() as i32)
+                    .map(|i| if i * 7919 % 5 < 2 { weight } else { -weight } as i16)
+                    .collect();
+                let input = vec![LIMIT; rows * cin];
+                let scale = Requantise::Scale {
+                    scale: vec![1e-5; cout],
+                    bias: vec![0.0; cout],
+                };
+                let invariant = Requantise::Invariant {
+                    gain: vec![0.3; cout],
+                    bias: vec![-1.0; cout],
+                };
+                for (weights, requantise) in [(&weights, &scale), (&mixed, &invariant)] {
+                    let input: Vec<i16> = match requantise {
+                        Requantise::Scale { .. } => input.clone(),
+                        _ => (0..input.len())
+                            .map(|i| LIMIT - (i % 3) as i16 * LIMIT)
+                            .collect(),
+                    };
+                    check_exact(
+                        [cin, cout],
+                        weights,
+                        requantise,
+                        &taps,
+                        &input,
+                        rows,
+                        None,
+                        false,
+                    );
+                }
+            }
+        }
     }
 }
 
