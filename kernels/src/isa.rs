@@ -14,6 +14,9 @@ pub(crate) enum Level {
     Scalar,
     #[cfg(target_arch = "x86_64")]
     Avx2,
+    /// AVX2, and products of pairs of i16 that are added in the same step: small processors without AVX-512 have it.
+    #[cfg(target_arch = "x86_64")]
+    AvxVnni,
     #[cfg(target_arch = "x86_64")]
     Avx512,
     /// AVX-512, and tiles for what they serve.
@@ -50,6 +53,7 @@ impl Isa {
             return Isa(match avx512 {
                 true if is_x86_feature_detected!("avx512bf16") && amx() => Level::Amx,
                 true => Level::Avx512,
+                false if is_x86_feature_detected!("avxvnni") => Level::AvxVnni,
                 false => Level::Avx2,
             });
         }
@@ -67,6 +71,8 @@ impl Isa {
             #[cfg(target_arch = "x86_64")]
             Level::Avx2,
             #[cfg(target_arch = "x86_64")]
+            Level::AvxVnni,
+            #[cfg(target_arch = "x86_64")]
             Level::Avx512,
             #[cfg(target_arch = "x86_64")]
             Level::Amx,
@@ -77,8 +83,17 @@ impl Isa {
         levels
             .into_iter()
             .map(Isa)
-            .filter(|isa| *isa <= best)
+            .filter(|isa| *isa <= best && isa.is_here())
             .collect()
+    }
+
+    /// Whether this machine has what others below its best have: AVX-512 does not tell of AVX-VNNI.
+    fn is_here(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        if self.0 == Level::AvxVnni {
+            return is_x86_feature_detected!("avxvnni");
+        }
+        true
     }
 
     /// Whether there are products of bf16 besides (AVX512_BF16).
@@ -120,6 +135,8 @@ impl Isa {
             Level::Scalar => "scalar",
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => "avx2",
+            #[cfg(target_arch = "x86_64")]
+            Level::AvxVnni => "avxvnni",
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => "avx512",
             #[cfg(target_arch = "x86_64")]
@@ -237,7 +254,7 @@ macro_rules! dispatch {
             $crate::isa::Level::Neon => scalar $(::<$($g,)* $($n)?>)? ($($arg),*),
             #[cfg(target_arch = "x86_64")]
             // SAFETY: an `Isa` of this level is only made where the processor has these features.
-            $crate::isa::Level::Avx2 => unsafe { avx2 $(::<$($g,)* $($n)?>)? ($($arg),*) },
+            $crate::isa::Level::Avx2 | $crate::isa::Level::AvxVnni => unsafe { avx2 $(::<$($g,)* $($n)?>)? ($($arg),*) },
             #[cfg(target_arch = "x86_64")]
             // SAFETY: as above.
             $crate::isa::Level::Avx512 | $crate::isa::Level::Amx => unsafe { avx512 $(::<$($g,)* $($n)?>)? ($($arg),*) },

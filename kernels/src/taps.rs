@@ -157,7 +157,7 @@ impl TileTaps {
             #[cfg(target_arch = "x86_64")]
             // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
             // tile's rows and eight more.
-            Level::Avx2 | Level::Avx512 | Level::Amx => unsafe {
+            Level::Avx2 | Level::AvxVnni | Level::Avx512 | Level::Amx => unsafe {
                 machine::avx2_lists::fill_map(lists)
             },
         }

@@ -326,6 +326,8 @@ unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) {
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => machine::avx2::run(arithmetic, block, whole),
             #[cfg(target_arch = "x86_64")]
+            Level::AvxVnni => machine::avx2::run_vnni(arithmetic, block, whole),
+            #[cfg(target_arch = "x86_64")]
             Level::Avx512 | Level::Amx => machine::avx512::run(arithmetic, block, whole),
             #[cfg(target_arch = "aarch64")]
             Level::Neon => machine::neon::run(arithmetic, block, whole),
@@ -345,6 +347,8 @@ pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
             Level::Scalar => machine::scalar::spin(arithmetic, rounds),
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => machine::avx2::spin(arithmetic, rounds),
+            #[cfg(target_arch = "x86_64")]
+            Level::AvxVnni => machine::avx2::spin_vnni(arithmetic, rounds),
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 | Level::Amx => machine::avx512::spin(arithmetic, rounds),
             #[cfg(target_arch = "aarch64")]

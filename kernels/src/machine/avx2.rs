@@ -1,4 +1,4 @@
-//! AVX2 with FMA and F16C: blocks of four rows by one panel, or by half of one.
+//! AVX2 with FMA and F16C, and AVX-VNNI beside: blocks of four rows by one panel, or by half of one.
 
 use std::arch::x86_64::*;
 
@@ -25,6 +25,47 @@ pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) {
             (Arithmetic::Brain, _) => unreachable!("AVX2 has no bf16"),
         }
     }
+}
+
+/// # Safety
+/// The processor must have AVX-VNNI, too; the rest as [`run`].
+pub(crate) unsafe fn run_vnni(arithmetic: Arithmetic, block: &Block, whole: usize) {
+    // SAFETY: the caller's promise for one panel, or half of it.
+    unsafe {
+        match (arithmetic, whole) {
+            (Arithmetic::Integer, 0) => wide_vnni::<Vnni, 4, 1, 2>(block),
+            (Arithmetic::Integer, _) => wide_vnni::<Vnni, 4, 2, 1>(block),
+            _ => run(arithmetic, block, whole),
+        }
+    }
+}
+
+/// # Safety
+/// As [`run_vnni`].
+#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avxvnni")]
+unsafe fn wide_vnni<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
+    // SAFETY: the caller's promise.
+    unsafe { columns::<M, R, V, P>(block) }
+}
+
+/// # Safety
+/// As [`run_vnni`].
+pub(crate) unsafe fn spin_vnni(arithmetic: Arithmetic, rounds: usize) -> usize {
+    // SAFETY: the caller's promise.
+    unsafe {
+        match arithmetic {
+            Arithmetic::Integer => spinning_vnni::<Vnni>(rounds),
+            _ => spin(arithmetic, rounds),
+        }
+    }
+}
+
+/// # Safety
+/// As [`run_vnni`].
+#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avxvnni")]
+unsafe fn spinning_vnni<M: Machine>(rounds: usize) -> usize {
+    // SAFETY: the caller's promise.
+    unsafe { ceiling::rounds::<M>(rounds) }
 }
 
 /// # Safety
@@ -68,6 +109,13 @@ machine!(
     Integer: __m256i, __m256i, 8,
     [_mm256_setzero_si256, _mm256_load_si256, _mm256_store_si256, _mm256_load_si256, spread8, _mm256_add_epi32],
     |sum, weight, factor| _mm256_add_epi32(sum, _mm256_madd_epi16(weight, factor))
+);
+
+machine!(
+    /// Pairs of i16, multiplied and added at once.
+    Vnni: __m256i, __m256i, 8,
+    [_mm256_setzero_si256, _mm256_load_si256, _mm256_store_si256, _mm256_load_si256, spread8, _mm256_add_epi32],
+    |sum, weight, factor| _mm256_dpwssd_avx_epi32(sum, weight, factor)
 );
 
 /// # Safety

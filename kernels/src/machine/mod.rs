@@ -143,7 +143,7 @@ macro_rules! with_halves {
             $crate::isa::Level::Scalar => scalar $(::<$g>)* ($($arg),*),
             #[cfg(target_arch = "x86_64")]
             // SAFETY: an `Isa` of this level is only made where the processor has these features.
-            $crate::isa::Level::Avx2 => unsafe { avx2 $(::<$g>)* ($($arg),*) },
+            $crate::isa::Level::Avx2 | $crate::isa::Level::AvxVnni => unsafe { avx2 $(::<$g>)* ($($arg),*) },
             #[cfg(target_arch = "x86_64")]
             // SAFETY: as above.
             $crate::isa::Level::Avx512 | $crate::isa::Level::Amx => unsafe { avx512 $(::<$g>)* ($($arg),*) },

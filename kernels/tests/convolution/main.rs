@@ -18,6 +18,7 @@ fn every_instruction_set_of_this_machine_is_tested() {
             "avx2",
             is_x86_feature_detected!("avx2") && is_x86_feature_detected!("f16c"),
         ),
+        ("avxvnni", is_x86_feature_detected!("avxvnni")),
         (
             "avx512",
             is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw"),
