@@ -126,6 +126,8 @@ impl Model {
         map: &KernelMap,
     ) -> Result<Vec<f32>> {
         let generator = self.generator(role)?;
+        // A residual block's input, inner rows and output.
+        pool.keep(3);
         self.check(g, self.shape.channels, map);
         match (&generator.scales, self.precision) {
             (Some(scales), Precision::Int16) => {

@@ -111,6 +111,13 @@ impl<T: Copy + Zeroable> Pool<T> {
         }
     }
 
+    /// Gives all but some of the memory back to the system.
+    pub fn keep(&mut self, buffers: usize) {
+        self.0
+            .sort_by_key(|buffer| std::cmp::Reverse(buffer.capacity()));
+        self.0.truncate(buffers);
+    }
+
     /// Takes back what nobody reads any more.
     pub fn give(&mut self, buffer: Vec<T>) {
         self.0.push(buffer);
