@@ -3,6 +3,7 @@
 # neither (Raspberry Pi 3).
 #
 #     tests/aarch64.sh            the bare decoder decodes the conformance suite with NEON and without, and the kernels pass their own tests
+#     tests/aarch64.sh renderer   the renderer passes its own tests, hard cases among them, with NEON and without
 #     tests/aarch64.sh program    the program as it is shipped is small enough, and decodes to the bytes that this machine's does
 #
 # On Debian, as root, it installs what it needs. A compiler that has the target's standard library is rustup's if that can add it, else Debian's.
@@ -49,6 +50,12 @@ if [ "${1:-}" = program ]; then
     size=$(stat -c %s "$there")
     echo "$there: $size bytes, the model and the sample in it"
     [ "$size" -le $most_bytes ]
+    exit
+fi
+
+if [ "${1:-}" = renderer ]; then
+    export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="timeout 1800 qemu-aarch64 -cpu max"
+    cargo test --locked --target $target -p b2p --no-default-features --features render --lib -- projection tiles pixels
     exit
 fi
 

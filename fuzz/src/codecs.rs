@@ -4,6 +4,7 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::rc::Rc;
+use std::sync::LazyLock;
 
 use b2p::Cancel;
 use b2p::bitstream::Slice;
@@ -22,7 +23,7 @@ pub fn octree(bytes: &[u8]) {
     let mut source = Source(bytes);
     let depth = 1 + source.byte() % 5;
     let slice = 1 + usize::from(source.byte()) % 40;
-    let count = (usize::from(source.byte()) + 1) % 65;
+    let count = source.count(8, 64);
     let keys = (0..count).map(|_| u64::from(source.u16()) % (1 << (3 * depth)));
     let voxels = Voxels::new(depth, keys.collect());
     let octree = match Octree::new(voxels) {
@@ -312,11 +313,10 @@ fn any_table(mut source: Source, how: u8) {
         _ => (),
     }
     let sound = is_sound(&entries, &offsets, &low);
-    let flat = flat();
     let table = (entries, offsets, low);
-    let refused = Tables::new(raw("gauss", &table), raw("prior", &flat));
+    let refused = Tables::new(raw("gauss", &table), raw("prior", &FLAT));
     assert!(refused.is_err(), "1024 rows are needed");
-    let tables = match Tables::new(raw("gauss", &flat), raw("prior", &table)) {
+    let tables = match Tables::new(raw("gauss", &FLAT), raw("prior", &table)) {
         Ok(tables) => tables,
         Err(error) => return assert!(!sound, "{error}"),
     };
@@ -347,7 +347,7 @@ fn is_sound(entries: &[u16], offsets: &[u32], low: &[i16]) -> bool {
 }
 
 /// The least table that conditions with means and scales can have: two entries a row.
-fn flat() -> RawTable {
+static FLAT: LazyLock<RawTable> = LazyLock::new(|| {
     let rows = 1024;
     let offsets = (0..=rows).map(|row| 2 * row).collect();
     (
@@ -355,4 +355,4 @@ fn flat() -> RawTable {
         offsets,
         vec![0; rows as usize],
     )
-}
+});

@@ -14,6 +14,7 @@ mod streams;
 use std::sync::LazyLock;
 
 use b2p::network::{Model, Shape, untrained};
+use peak_alloc::PeakAlloc;
 
 pub use codecs::{entropy, octree};
 pub use files::{model, ply};
@@ -37,6 +38,19 @@ pub const TARGETS: [Target; 9] = [
     ("render", render),
 ];
 
+#[global_allocator]
+static MEMORY: PeakAlloc = PeakAlloc;
+
+/// What `run` gives, which must not hold more than so many bytes beyond what was held before. For one thread at a time.
+fn within<T>(bytes: usize, run: impl FnOnce() -> T) -> T {
+    let before = MEMORY.current_usage();
+    MEMORY.reset_peak_usage();
+    let value = run();
+    let held = MEMORY.peak_usage().saturating_sub(before);
+    assert!(held <= bytes, "{held} bytes where {bytes} would do");
+    value
+}
+
 /// The model that streams are coded with here.
 static MODEL: LazyLock<Model> = LazyLock::new(|| {
     Model::from_bytes(&untrained(&Shape::tiny(), 0)).expect("an untrained model loads")
@@ -52,6 +66,16 @@ pub fn alone() {
     pool.expect("nothing has run before");
 }
 
+/// Whether an input is one of those, one in `n`, for which checks are made that take longer than all others: as good as at random, and
+/// always the same for the same bytes.
+fn one_in(n: u8, bytes: &[u8]) -> bool {
+    bytes
+        .iter()
+        .copied()
+        .fold(0, u8::wrapping_add)
+        .is_multiple_of(n)
+}
+
 /// Bytes as a source of numbers; zeros when they are used up.
 struct Source<'a>(&'a [u8]);
 
@@ -60,6 +84,12 @@ impl<'a> Source<'a> {
         let (first, rest) = self.0.split_first().unwrap_or((&0, &[]));
         self.0 = rest;
         *first
+    }
+
+    /// Up to `most`, and up to `few` for seven in eight of the bytes.
+    fn count(&mut self, few: u8, most: u8) -> usize {
+        let byte = self.byte();
+        usize::from(byte % (if byte < 224 { few } else { most } + 1))
     }
 
     fn u16(&mut self) -> u16 {

@@ -1,8 +1,15 @@
 //! What the fuzzer does, on stable Rust: every input that is kept, and the seeds changed at random for a few seconds.
 
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use b2p_fuzz::{STREAMS, TARGETS, seeds::seeds};
+
+/// Targets count what memory they take: one test at a time.
+fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 fn corpus(target: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -22,6 +29,7 @@ fn inputs(target: &str) -> Vec<Vec<u8>> {
 
 #[test]
 fn every_input_that_is_kept_passes() {
+    let _alone = alone();
     for (name, run) in TARGETS {
         let inputs = inputs(name);
         assert!(!inputs.is_empty(), "{name} has no corpus");
@@ -33,6 +41,7 @@ fn every_input_that_is_kept_passes() {
 /// Streams of an earlier format or model would all be refused alike, and nothing behind that be tried.
 #[test]
 fn the_streams_that_are_kept_as_seeds_are_as_whole_as_new_ones() {
+    let _alone = alone();
     for name in STREAMS {
         for (i, seed) in seeds(name).iter().enumerate() {
             let kept = std::fs::read(corpus(name).join(format!("seed-{i}"))).expect("a seed");
@@ -67,6 +76,7 @@ fn mutate(bytes: &mut Vec<u8>, others: &[Vec<u8>], random: &mut impl FnMut(usize
 /// `B2P_FUZZ_ROUNDS` asks for more than the usual few seconds: so many times as many inputs, and others than the usual ones.
 #[test]
 fn every_target_holds_on_changed_seeds() {
+    let _alone = alone();
     let rounds = std::env::var("B2P_FUZZ_ROUNDS").map_or(1, |n| n.parse().expect("a number"));
     for (name, run) in TARGETS {
         let mut others = seeds(name);

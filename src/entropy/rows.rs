@@ -114,9 +114,9 @@ impl Rows {
 
 fn buckets(sums: &[u16]) -> [u16; BUCKETS + 1] {
     let mut buckets = [(sums.len() - 1) as u16; BUCKETS + 1];
-    for (bucket, entry) in buckets[..BUCKETS].iter_mut().enumerate() {
-        let first = (bucket << (PRECISION - BUCKET_BITS)) as u16;
-        *entry = (sums.partition_point(|&sum| sum <= first) - 1) as u16;
+    let bucket = |sum: u16| usize::from(sum).div_ceil(1 << (PRECISION - BUCKET_BITS));
+    for (entry, sums) in sums.windows(2).enumerate() {
+        buckets[bucket(sums[0])..bucket(sums[1])].fill(entry as u16);
     }
     buckets
 }
