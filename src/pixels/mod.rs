@@ -147,7 +147,7 @@ pub struct Times {
     pub project: Duration,
     /// Into the lists of the tiles.
     pub bin: Duration,
-    /// Of each tile, into narrow ranges of depth; in order within these only as they are drawn.
+    /// Of each tile, by depth.
     pub sort: Duration,
     /// Into pixels.
     pub blend: Duration,
@@ -335,6 +335,7 @@ impl Renderer {
         let floor = self.quality.floor();
         let shaded = effects.harmonics || channel != Channel::Colour;
         let each = Ellipses::BYTES
+            + Count::BYTES
             + u64::from(shaded) * size_of::<[f32; 3]>() as u64
             + u64::from(effects.order) * size_of::<[f32; 2]>() as u64;
         let bytes = count * size_of::<P>() as u64
@@ -357,9 +358,10 @@ impl Renderer {
             colours: shaded.then_some(&self.shades),
         };
         let mut project = |how| {
+            let start = |count: &mut Count, length| count.start(grid, length);
             let look = |count: &mut Count, ellipses: &[Ellipse]| count.count(grid, ellipses);
             self.ellipses
-                .project(gaussians, &fine, how, &mut self.counts, look)
+                .project(gaussians, &fine, how, &mut self.counts, start, look)
         };
         let mut seen = project(how)?;
         if seen.crossing > 0 && self.effects.near == Choice::Auto {
@@ -371,7 +373,7 @@ impl Renderer {
         let crossing = if effects.near { seen.crossing } else { 0 };
         let bytes = bytes + crossing * size_of::<Crossing>() as u64;
         times.project = lap();
-        let pairs = self.bins.plan(grid, &self.counts, bytes, limits)?;
+        let pairs = self.bins.plan(grid, &mut self.counts, bytes, limits)?;
         times.bin = lap();
 
         pixels.resize(count as usize, P::default());

@@ -29,6 +29,8 @@ use crate::gaussians::Gaussians;
 /// Gaussians are projected in runs of at least so many, and at most [`RUNS`] runs a thread.
 const LEAST_RUN: usize = 2048;
 const RUNS: usize = 4;
+/// Gaussians that are projected before anybody looks at them: their ellipses take 32 KB. A multiple of all numbers of lanes.
+const PIECE: usize = 512;
 /// The most runs: what is kept for each of them is kept for every tile.
 const MOST_RUNS: usize = 64;
 
@@ -96,8 +98,9 @@ impl Ellipses {
             .map(|run| run.first..run.first + run.tally.visible as usize)
     }
 
-    /// Projects, reusing memory; counts what is not visible. As soon as a run is done, its ellipses are shown to `look`, together
-    /// with a state of the run's own: `states` is given one for each run.
+    /// Projects, reusing memory; counts what is not visible. While they are still in the cache, the ellipses of a run are shown to
+    /// `look`, some at a time, together with a state of the run's own: `states` is given one for each run, to which first `start`
+    /// is told the run's length.
     ///
     /// # Errors
     /// [`Error::Usage`] if the camera is none ([`Camera::check`]) or the arrays of `gaussians` differ in length;
@@ -108,6 +111,7 @@ impl Ellipses {
         camera: &Camera,
         how: How,
         states: &mut Vec<S>,
+        start: impl Fn(&mut S, usize) + Sync,
         look: impl Fn(&mut S, &[Ellipse]) + Sync,
     ) -> Result<Seen> {
         camera.check()?;
@@ -137,18 +141,27 @@ impl Ellipses {
             .enumerate()
             .with_max_len(1)
             .for_each(|(i, ((run, ellipses), state))| {
-                let first = i * length;
-                let end = first + ellipses.len();
-                let cloud = Cloud {
-                    position: &gaussians.position[first..end],
-                    scale: &gaussians.scale[first..end],
-                    rotation: &gaussians.rotation[first..end],
-                    opacity: &gaussians.opacity[first..end],
-                    colour: &colours[first..end],
+                let (begin, end) = (i * length, i * length + ellipses.len());
+                start(state, ellipses.len());
+                let mut tally = Tally::default();
+                for first in (begin..end).step_by(PIECE) {
+                    let piece = first..end.min(first + PIECE);
+                    let cloud = Cloud {
+                        position: &gaussians.position[piece.clone()],
+                        scale: &gaussians.scale[piece.clone()],
+                        rotation: &gaussians.rotation[piece.clone()],
+                        opacity: &gaussians.opacity[piece.clone()],
+                        colour: &colours[piece],
+                    };
+                    let room = &mut ellipses[tally.visible as usize..];
+                    let seen = splat::project(how.isa, &view, cloud, first as u32, room);
+                    look(state, &room[..seen.visible as usize]);
+                    tally = tally + seen;
+                }
+                *run = Run {
+                    first: begin,
+                    tally,
                 };
-                let tally = splat::project(how.isa, &view, cloud, first as u32, ellipses);
-                *run = Run { first, tally };
-                look(state, &ellipses[..tally.visible as usize]);
             });
         self.find_crossing(gaussians, camera, how.near_care);
         self.find_slopes(gaussians, camera, how.slopes);

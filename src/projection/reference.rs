@@ -228,7 +228,14 @@ fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
             };
             let mut ellipses = Ellipses::default();
             let dropped = ellipses
-                .project(&all, &camera, how, &mut Vec::<()>::new(), |_, _| {})
+                .project(
+                    &all,
+                    &camera,
+                    how,
+                    &mut Vec::<()>::new(),
+                    |_, _| {},
+                    |_, _| {},
+                )
                 .unwrap()
                 .dropped;
             assert_eq!(dropped.not_finite, count(Invisible::NotFinite), "{isa}");

@@ -2,8 +2,8 @@
 //!
 //! The ellipses are dealt out to the tiles whose squares their bounds touch ([`Bins`]): counted run by run while they are projected,
 //! then written, each as its depth and its place, in the order of the input. Each tile is put in the order of drawing only when it
-//! is drawn, and only as far as light gets ([`Nearest`]): by the bits of the depth, which for positive floats is the order of the
-//! depths, without loss, and then by place. So nothing depends on the order in which the threads write.
+//! is drawn ([`Nearest`]): by the bits of the depth, which for positive floats is the order of the depths, without loss, and then by
+//! place. So nothing depends on the order in which the threads write.
 //!
 //! An ellipse that fills the picture costs an entry for each tile: where there are too many, the picture is drawn in parts.
 
@@ -32,7 +32,20 @@ pub struct Count {
     /// One row and one column more than there are tiles: first, where counts begin and end; then counts; then where the run's next
     /// entry goes.
     tiles: Vec<u32>,
+    /// For each ellipse of the run.
+    touches: Vec<Touch>,
     pairs: u64,
+}
+
+/// What an ellipse needs to be dealt out.
+#[derive(Debug, Clone, Copy)]
+struct Touch {
+    /// The depth's bits.
+    depth: u32,
+    /// Of the tiles that it may touch, the place of the first in [`Count::tiles`], and how many columns and rows they are.
+    first: u32,
+    columns: u32,
+    rows: u32,
 }
 
 /// A picture's tiles.
@@ -73,21 +86,45 @@ impl Grid {
 }
 
 impl Count {
-    /// Counts the ellipses of a run. Each is noted at the corners of what it touches; running sums then give every tile's count.
+    /// Bytes per ellipse.
+    pub const BYTES: u64 = size_of::<Touch>() as u64;
+
+    /// Nothing is counted yet; there is room for a run of `length`.
+    pub fn start(&mut self, grid: Grid, length: usize) {
+        self.tiles.clear();
+        self.tiles.resize((grid.columns + 1) * (grid.rows + 1), 0);
+        self.touches.clear();
+        self.touches.reserve_exact(length);
+        self.pairs = 0;
+    }
+
+    /// Counts the next ellipses of the run. Each is noted at the corners of what it touches; running sums will give every tile's
+    /// count.
     pub fn count(&mut self, grid: Grid, ellipses: &[Ellipse]) {
         let stride = grid.columns + 1;
-        self.tiles.clear();
-        self.tiles.resize(stride * (grid.rows + 1), 0);
-        self.pairs = 0;
-        for ellipse in ellipses {
+        let tiles = &mut self.tiles[..];
+        let touches = ellipses.iter().map(|ellipse| {
             let [x, y] = grid.touched(&ellipse.bounds);
+            let [first, below] = [y.start, y.end].map(|row| row * stride + x.start);
             self.pairs += x.len() as u64 * y.len() as u64;
-            for (row, step) in [(y.start, 1), (y.end, u32::MAX)] {
-                let row = &mut self.tiles[row * stride..][..stride];
-                row[x.start] = row[x.start].wrapping_add(step);
-                row[x.end] = row[x.end].wrapping_sub(step);
+            for (at, step) in [(first, 1), (below, u32::MAX)] {
+                let end = at + x.len();
+                tiles[at] = tiles[at].wrapping_add(step);
+                tiles[end] = tiles[end].wrapping_sub(step);
             }
-        }
+            Touch {
+                depth: ellipse.depth.to_bits(),
+                first: first as u32,
+                columns: x.len() as u32,
+                rows: y.len() as u32,
+            }
+        });
+        self.touches.extend(touches);
+    }
+
+    /// From corners to counts.
+    fn sum(&mut self, grid: Grid) {
+        let stride = grid.columns + 1;
         for row in self.tiles.chunks_exact_mut(stride) {
             let mut sum = 0u32;
             for tile in row {
@@ -97,6 +134,56 @@ impl Count {
         }
         for i in stride..self.tiles.len() {
             self.tiles[i] = self.tiles[i].wrapping_add(self.tiles[i - stride]);
+        }
+    }
+
+    /// Writes the keys of the run's ellipses, the first of which has the place `place`, to where the counts say by now. What touches
+    /// up to 2×2 tiles, which is nearly everything, is written four times, some of them to where it already is: without a branch
+    /// that may go either way.
+    fn deal(&mut self, stride: usize, place: usize, entries: &[AtomicU64]) {
+        let cursors = &mut self.tiles[..];
+        for (i, touch) in self.touches.iter().enumerate() {
+            let key = u64::from(touch.depth) << 32 | (place + i) as u64;
+            let first = touch.first as usize;
+            if touch.columns.max(touch.rows) <= 2 {
+                let at = cursors[first];
+                let [wide, high] = [touch.columns == 2, touch.rows == 2];
+                for (off, there) in [
+                    (0, true),
+                    (1, wide),
+                    (stride, high),
+                    (stride + 1, wide & high),
+                ] {
+                    let tile = if there { first + off } else { first };
+                    let at = if there { cursors[tile] } else { at };
+                    entries[at as usize].store(key, Ordering::Relaxed);
+                    cursors[tile] = at + 1;
+                }
+            } else {
+                for row in 0..touch.rows as usize {
+                    let tiles = &mut cursors[first + row * stride..][..touch.columns as usize];
+                    for next in tiles {
+                        entries[*next as usize].store(key, Ordering::Relaxed);
+                        *next += 1;
+                    }
+                }
+            }
+        }
+    }
+
+    /// As [`Count::deal`], of the tiles of `part` alone.
+    fn deal_part(&mut self, stride: usize, place: usize, entries: &[AtomicU64], part: &Part) {
+        for (i, touch) in self.touches.iter().enumerate() {
+            let key = u64::from(touch.depth) << 32 | (place + i) as u64;
+            let [row, column] = [touch.first as usize / stride, touch.first as usize % stride];
+            let (rows, columns) = (row + touch.rows as usize, column + touch.columns as usize);
+            for row in row.max(part.rows.start)..rows.min(part.rows.end) {
+                for column in column.max(part.columns.start)..columns.min(part.columns.end) {
+                    let next = &mut self.tiles[row * stride + column];
+                    entries[*next as usize].store(key, Ordering::Relaxed);
+                    *next += 1;
+                }
+            }
         }
     }
 }
@@ -133,11 +220,13 @@ impl Bins {
     pub fn plan(
         &mut self,
         grid: Grid,
-        counts: &[Count],
+        counts: &mut [Count],
         reserved: u64,
         limits: &Limits,
     ) -> Result<u64> {
         self.grid = grid;
+        counts.par_iter_mut().for_each(|count| count.sum(grid));
+        let counts = &*counts;
         self.totals.clear();
         self.totals.resize(grid.columns * grid.rows, 0);
         let rows = self.totals.par_chunks_mut(grid.columns).enumerate();
@@ -151,7 +240,7 @@ impl Bins {
         });
         let fullest = u64::from(self.totals.iter().copied().max().unwrap_or(0));
         let entry = size_of::<u64>() as u64;
-        let sorting = fullest * rayon::current_num_threads() as u64 * entry;
+        let sorting = fullest * rayon::current_num_threads() as u64 * Nearest::BYTES;
         let reserved = reserved.saturating_add(sorting);
         limits.check_bytes(
             "bytes to draw the picture",
@@ -208,19 +297,18 @@ impl Bins {
     /// Deals the ellipses out to the tiles of `part`; the memory is reused.
     pub fn fill(&mut self, part: Part, ellipses: &Ellipses, counts: &mut [Count]) {
         let Grid { columns, .. } = self.grid;
-        let (width, stride) = (part.columns.len(), columns + 1);
+        let stride = columns + 1;
         // Where each tile starts, and within it, each run.
         self.starts.clear();
         let mut next = 0;
         for row in part.rows.clone() {
             for column in part.columns.clone() {
                 self.starts.push(next);
-                let mut at = 0;
                 for count in counts.iter_mut() {
                     let tile = &mut count.tiles[row * stride + column];
-                    at += std::mem::replace(tile, at);
+                    // No part has 2³² entries: a tile has at most as many as there are ellipses, more tiles have fewer.
+                    next += std::mem::replace(tile, next as u32) as usize;
                 }
-                next += at as usize;
             }
         }
         self.starts.push(next);
@@ -230,29 +318,16 @@ impl Bins {
             self.entries.reserve_exact(next);
             self.entries.resize_with(next, AtomicU64::default);
         }
-        let (grid, starts, entries) = (self.grid, &self.starts, &self.entries);
-        let all = ellipses.all();
-        ellipses
-            .runs()
-            .zip(counts)
-            .with_max_len(1)
-            .for_each(|(run, count)| {
-                let first = run.start;
-                for (i, ellipse) in all[run].iter().enumerate() {
-                    let key = u64::from(ellipse.depth.to_bits()) << 32 | (first + i) as u64;
-                    let [x, y] = grid.touched(&ellipse.bounds);
-                    for row in y.start.max(part.rows.start)..y.end.min(part.rows.end) {
-                        let tiles = x.start.max(part.columns.start)..x.end.min(part.columns.end);
-                        for column in tiles {
-                            let next = &mut count.tiles[row * stride + column];
-                            let tile =
-                                (row - part.rows.start) * width + column - part.columns.start;
-                            entries[starts[tile] + *next as usize].store(key, Ordering::Relaxed);
-                            *next += 1;
-                        }
-                    }
-                }
-            });
+        let entries = &self.entries[..];
+        let whole = part.rows.len() == self.grid.rows && part.columns.len() == columns;
+        let runs = ellipses.runs().zip(counts).with_max_len(1);
+        runs.for_each(|(run, count)| {
+            if whole {
+                count.deal(stride, run.start, entries);
+            } else {
+                count.deal_part(stride, run.start, entries, &part);
+            }
+        });
         self.part = Some(part);
     }
 

@@ -51,9 +51,14 @@ fn project(all: &Gaussians, width: u32, height: u32) -> Scene {
     };
     scene
         .ellipses
-        .project(all, &camera, how, &mut scene.counts, |count, e| {
-            count.count(scene.grid, e);
-        })
+        .project(
+            all,
+            &camera,
+            how,
+            &mut scene.counts,
+            |count, length| count.start(scene.grid, length),
+            |count, e| count.count(scene.grid, e),
+        )
         .unwrap();
     scene
 }
@@ -81,7 +86,7 @@ fn every_tile_lists_just_the_ellipses_whose_bounds_touch_it_nearest_first() {
         let mut scene = project(&all, 183, 150);
         let mut bins = Bins::default();
         let pairs = bins
-            .plan(scene.grid, &scene.counts, 0, &Limits::default())
+            .plan(scene.grid, &mut scene.counts, 0, &Limits::default())
             .unwrap();
         bins.most = bins.most.min(most).max(3500);
         let (mut part, mut parts, mut listed, mut tiles) = (bins.next(None), 0, 0, 0);
@@ -137,18 +142,50 @@ fn a_far_outlier_in_a_tile_leaves_the_order_of_the_rest() {
 #[test]
 fn lists_over_the_limit_are_refused_before_they_are_made() {
     let all = gaussians(300);
-    let scene = project(&all, 32, 32);
-    let entries = scene.ellipses.len() as u64;
+    let entries = project(&all, 32, 32).ellipses.len() as u64;
     let threads = rayon::current_num_threads() as u64;
-    let needed = entries * 8 * (1 + threads);
+    let needed = entries * (8 + Nearest::BYTES * threads);
     let plan = |reserved, max_bytes| {
+        let mut scene = project(&all, 32, 32);
         let limits = Limits {
             max_bytes,
             ..Limits::default()
         };
-        Bins::default().plan(scene.grid, &scene.counts, reserved, &limits)
+        Bins::default().plan(scene.grid, &mut scene.counts, reserved, &limits)
     };
     assert_eq!(plan(100, needed + 100).unwrap(), entries);
     let error = plan(100, needed + 99).unwrap_err();
     assert!(matches!(error, Error::LimitExceeded { needed: n, .. } if n == needed + 100));
+}
+
+#[test]
+fn tiles_are_put_in_order_whatever_their_depths_are() {
+    let mut state = 1u64;
+    let mut random = |below: u64| {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1);
+        (state >> 33) % below
+    };
+    let mut nearest = Nearest::default();
+    for count in [0, 1, 2, 31, 64, 65, 96, 100, 1000, 20_000] {
+        for depths in [1, 2, 10, 1000, 1 << 23] {
+            // Of each kind a few far away.
+            let mut keys: Vec<u64> = (0..count)
+                .map(|i| {
+                    let far = if random(50) == 0 { 1 << 28 } else { 0 };
+                    ((1 << 29) + far + random(depths)) << 32 | i
+                })
+                .collect();
+            let entries: Vec<AtomicU64> = keys.iter().copied().map(AtomicU64::new).collect();
+            nearest.take(&entries);
+            let mut sorted = Vec::new();
+            nearest.each(|some, _| {
+                sorted.extend_from_slice(some);
+                true
+            });
+            keys.sort();
+            assert_eq!(sorted, keys, "{count} of {depths} depths");
+        }
+    }
 }

@@ -77,6 +77,22 @@ pub struct Tally {
     pub crossing: u32,
 }
 
+impl std::ops::Add for Tally {
+    type Output = Tally;
+
+    fn add(self, other: Tally) -> Tally {
+        Tally {
+            visible: self.visible + other.visible,
+            not_finite: self.not_finite + other.not_finite,
+            no_rotation: self.no_rotation + other.no_rotation,
+            too_faint: self.too_faint + other.too_faint,
+            behind: self.behind + other.behind,
+            outside: self.outside + other.outside,
+            crossing: self.crossing + other.crossing,
+        }
+    }
+}
+
 /// Projects `cloud`, whose first Gaussian has the index `first`; the visible go to the beginning of `out`, in order.
 ///
 /// # Panics
