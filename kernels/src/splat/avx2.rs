@@ -6,7 +6,8 @@ use std::arch::x86_64::*;
 
 use super::Ellipse;
 use super::lanes::{
-    Double, EXP2, Lanes, Mask, ROUND, binary, four, instructions, numbered, polynomial, three,
+    Double, EXP2, LEAST_POWER, Lanes, Mask, ROUND, binary, four, instructions, numbered,
+    polynomial, three,
 };
 
 /// For each mask of eight lanes, the lanes that it holds, in order.
@@ -118,8 +119,9 @@ impl Lanes for Avx2 {
 
     #[inline(always)]
     fn exp2(self) -> Self {
-        let shifted = self.add(Self::splat(ROUND));
-        let f = self.sub(shifted.sub(Self::splat(ROUND)));
+        let x = self.max(Self::splat(LEAST_POWER));
+        let shifted = x.add(Self::splat(ROUND));
+        let f = x.sub(shifted.sub(Self::splat(ROUND)));
         let p = polynomial(f, &EXP2);
         Avx2(instructions!(_mm256_castsi256_ps(_mm256_add_epi32(
             _mm256_castps_si256(p.0),

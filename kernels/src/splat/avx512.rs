@@ -6,7 +6,7 @@ use std::arch::x86_64::*;
 
 use super::Ellipse;
 use super::lanes::{
-    Double, EXP2, Lanes, Mask, binary, four, instructions, numbered, polynomial, three,
+    Double, EXP2_ABOVE, Lanes, Mask, binary, four, instructions, numbered, polynomial, three,
 };
 
 /// Sixteen floats.
@@ -105,11 +105,12 @@ impl Lanes for Avx512 {
 
     #[inline(always)]
     fn exp2(self) -> Self {
-        let whole = instructions!(_mm512_roundscale_ps::<
-            { _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC },
+        // What is beyond the integer below; scaling takes that integer by itself.
+        let f = instructions!(_mm512_reduce_ps::<
+            { _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC },
         >(self.0));
-        let p = polynomial(self.sub(Avx512(whole)), &EXP2);
-        Avx512(instructions!(_mm512_scalef_ps(p.0, whole)))
+        let p = polynomial(Avx512(f), &EXP2_ABOVE);
+        Avx512(instructions!(_mm512_scalef_ps(p.0, self.0)))
     }
 
     #[inline(always)]

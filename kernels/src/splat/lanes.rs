@@ -49,7 +49,7 @@ pub(super) trait Lanes: Copy {
     fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
     /// `self` where the mask holds, else 0.
     fn keep(self, mask: Self::Mask) -> Self;
-    /// `2^x` for `−126 ≤ x ≤ 1`, with a relative error below [`EXP2_ERROR`], exact for integers. Anything for other `x`.
+    /// `2^x` for `−126 ≤ x ≤ 1`, with a relative error below [`EXP2_ERROR`], exact for integers; at most 2⁻¹²⁶ for any less.
     fn exp2(self) -> Self;
     /// Whole numbers from 0 to 2²⁴, as the bits of unsigned integers.
     fn to_integer(self) -> Self;
@@ -106,9 +106,20 @@ pub(super) trait Double: Copy {
 
 /// The polynomial of degree 4 through (0, 1) that is nearest to `2^f` on `[−½, ½]`, in relative error; highest power first.
 pub(super) const EXP2: [f32; 5] = [9.582_853e-3, 5.590_642_6e-2, 2.402_41e-1, 6.931_242e-1, 1.0];
+/// As [`EXP2`], on `[0, 1]`.
+#[cfg(target_arch = "x86_64")]
+pub(super) const EXP2_ABOVE: [f32; 5] = [
+    1.342_679_7e-2,
+    5.224_229_4e-2,
+    2.412_802_9e-1,
+    6.930_448_4e-1,
+    1.0,
+];
 /// Relative error of [`Lanes::exp2`].
 #[cfg(test)]
 pub(super) const EXP2_ERROR: f64 = 3.1e-6;
+/// The least exponent of a normal number.
+pub(super) const LEAST_POWER: f32 = -126.0;
 /// Adding this to a small float leaves its nearest integer in the low bits: `1.5·2²³`.
 pub(super) const ROUND: f32 = 12_582_912.0;
 

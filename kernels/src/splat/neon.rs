@@ -6,7 +6,7 @@ use std::arch::aarch64::*;
 
 use super::Ellipse;
 use super::lanes::{
-    Double, EXP2, Lanes, Mask, ROUND, binary, four, instructions, numbered, polynomial,
+    Double, EXP2, LEAST_POWER, Lanes, Mask, ROUND, binary, four, instructions, numbered, polynomial,
 };
 
 /// For each mask of four lanes, the bytes of the lanes that it holds, in order.
@@ -136,8 +136,9 @@ impl Lanes for Neon {
 
     #[inline(always)]
     fn exp2(self) -> Self {
-        let shifted = self.add(Self::splat(ROUND));
-        let f = self.sub(shifted.sub(Self::splat(ROUND)));
+        let x = self.max(Self::splat(LEAST_POWER));
+        let shifted = x.add(Self::splat(ROUND));
+        let f = x.sub(shifted.sub(Self::splat(ROUND)));
         let p = polynomial(f, &EXP2);
         p.add_integer(Self::of_integers(instructions!(vshlq_n_u32::<23>(
             shifted.integers()

@@ -1,12 +1,9 @@
 //! The pixels of one block: one splat more.
 
 use super::blend::{AREA, Block, SIDE};
-use super::lanes::{Lanes, Mask};
+use super::lanes::{LEAST_POWER, Lanes, Mask};
 use super::layout::{COLUMNS, More, ROWS, Splat};
 use super::{ALPHA_CEILING, Crossing, FINISHED, WAITING};
-
-/// The least exponent that [`Lanes::exp2`] takes.
-const LEAST_POWER: f32 = -126.0;
 
 /// Puts an ellipse on the block. `u`, `v`: its form in the block's middle. False, and nothing done, if every pixel is finished.
 #[inline(always)]
@@ -57,8 +54,6 @@ fn planar<L: Lanes>(splat: &Splat, [u, v]: [f32; 2], lanes: usize) -> L {
     let u = L::load(&splat.u[lanes..]).add(L::splat(u));
     let v = L::load(&splat.v[lanes..]).add(L::splat(v));
     let power = v.neg_mul_add(v, u.neg_mul_add(u, L::splat(splat.log_opacity)));
-    // In a block that the ellipse reaches with a corner, the others may be anywhere.
-    let power = power.max(L::splat(LEAST_POWER));
     power.exp2().min(L::splat(ALPHA_CEILING))
 }
 

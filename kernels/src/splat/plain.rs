@@ -1,7 +1,7 @@
 //! Lanes of portable Rust.
 
 use super::Ellipse;
-use super::lanes::{Double, EXP2, Lanes, Mask, ROUND, four, numbered, three};
+use super::lanes::{Double, EXP2, LEAST_POWER, Lanes, Mask, ROUND, four, numbered, three};
 
 /// Four floats, in plain Rust.
 #[derive(Clone, Copy)]
@@ -141,6 +141,7 @@ impl Lanes for Plain {
     #[inline(always)]
     fn exp2(self) -> Self {
         self.each(|x| {
+            let x = if x > LEAST_POWER { x } else { LEAST_POWER };
             let shifted = x + ROUND;
             let f = x - (shifted - ROUND);
             let [a, b, c, d, e] = EXP2;
