@@ -1,12 +1,13 @@
-//! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes. Least and median time of
-//! the whole frame, and the stages of the fastest.
+//! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes. The first picture's time,
+//! least and median time of those after it, and the stages of the fastest.
 //!
-//! `raster [--threads N] [--isa NAME] [--effects] [--quality NAME] [SCENE…]`; `--effects` draws with each effect instead of the plain pictures,
-//! `--quality` in that quality; a scene being a name of [`SCENES`].
+//! `raster [--threads N] [--isa NAME] [--effects] [--quality NAME] [--turn DEGREES] [SCENE…]`; `--effects` draws with each effect instead
+//! of the plain pictures, `--quality` in that quality; with `--turn` the camera goes around by so much from picture to picture; a scene
+//! is a name of [`SCENES`] or a PLY file, drawn at 1024×1024.
 
 use std::time::{Duration, Instant};
 
-use b2p::gaussians::{Gaussians, Harmonics};
+use b2p::gaussians::{Gaussians, Harmonics, ply};
 use b2p::pixels::{Background, Channel, Choice, Effects, Image, Quality, Renderer, Stats};
 use b2p::projection::Camera;
 use b2p::{Error, Limits, Result};
@@ -15,28 +16,40 @@ use b2p_kernels::Isa;
 struct Scene {
     name: &'static str,
     count: usize,
+    /// Of a body of how many, in Morton order, these are the first.
+    of: usize,
     size: (u32, u32),
 }
 
-const SCENES: [Scene; 4] = [
+const SCENES: [Scene; 5] = [
     Scene {
         name: "10k",
         count: 10_000,
+        of: 236_000,
+        size: (1024, 1024),
+    },
+    Scene {
+        name: "10k-large",
+        count: 10_000,
+        of: 10_000,
         size: (1024, 1024),
     },
     Scene {
         name: "body",
         count: 236_000,
+        of: 236_000,
         size: (1024, 1024),
     },
     Scene {
         name: "1M",
         count: 1_000_000,
+        of: 1_000_000,
         size: (1920, 1080),
     },
     Scene {
         name: "5M",
         count: 5_000_000,
+        of: 5_000_000,
         size: (1920, 1080),
     },
 ];
@@ -107,8 +120,8 @@ impl Limb {
     }
 }
 
-/// Discs of σ = 0.4, 0.9 and 1.1 voxels on a body, in Morton order; the voxels' edge goes with the density.
-fn body(count: usize) -> Gaussians {
+/// The `first` of `count` discs of σ = 0.4, 0.9 and 1.1 voxels on a body, in Morton order; the voxels' edge goes with the density.
+fn body(count: usize, first: usize) -> Gaussians {
     let mut random = Random(1);
     let total: f64 = BODY.iter().map(Limb::area).sum();
     let voxel = 2.0 / 512.0 * (236_000.0 / count as f64).sqrt();
@@ -137,6 +150,7 @@ fn body(count: usize) -> Gaussians {
         }
     }
     splats.sort_unstable_by_key(|s| s.0);
+    splats.truncate(first);
     let mut scene = Gaussians::default();
     for (_, point, rotation, colour) in splats {
         scene.position.push(point);
@@ -164,18 +178,21 @@ fn facing([x, y, z]: [f64; 3]) -> [f32; 4] {
 
 fn measure(
     isa: Isa,
-    scene: &Scene,
+    name: &str,
+    (width, height): (u32, u32),
     gaussians: &Gaussians,
     quality: Quality,
+    turn: f64,
     (what, effects, channel): (&str, Effects, Channel),
 ) -> Result<()> {
-    let (width, height) = scene.size;
-    let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, width, height)?;
+    let mut azimuth = 20.0;
     let mut renderer = Renderer::new(isa);
     renderer.set_effects(effects);
     renderer.set_quality(quality);
     let mut image = Image::default();
     let mut frame = || -> Result<(Duration, Stats)> {
+        let camera = Camera::orbit(azimuth, 10.0, 3.0, 45.0, width, height)?;
+        azimuth += turn;
         let start = Instant::now();
         let stats = renderer.draw_into(
             gaussians,
@@ -187,7 +204,7 @@ fn measure(
         )?;
         Ok((start.elapsed(), stats))
     };
-    frame()?;
+    let (first, _) = frame()?;
     let start = Instant::now();
     let mut frames = Vec::new();
     while frames.len() < FRAMES && (start.elapsed() < PATIENCE || frames.len() < 3) {
@@ -198,11 +215,11 @@ fn measure(
     let (least, stats) = &frames[0];
     let t = stats.times;
     println!(
-        "{:>7} {:>5}{what}: {:7.2} ms, median {:7.2}; project {:6.2}, bin {:6.2}, sort {:6.2}, blend {:6.2}; {} visible, {} pairs",
+        "{:>7} {name:>9}{what}: {:7.2} ms, median {:7.2}, first {:7.2}; project {:6.2}, bin {:6.2}, sort {:6.2}, blend {:6.2}; {} visible, {} pairs",
         isa.to_string(),
-        scene.name,
         ms(*least),
         ms(frames[frames.len() / 2].0),
+        ms(first),
         ms(t.project),
         ms(t.bin),
         ms(t.sort),
@@ -238,7 +255,7 @@ fn variants(forced: bool) -> Vec<(&'static str, Effects, Channel)> {
 }
 
 fn main() -> Result<()> {
-    let (mut threads, mut forced) = (0, false);
+    let (mut threads, mut forced, mut turn) = (0, false, 0.0);
     let mut quality = Quality::default();
     let mut isas = Isa::available();
     let mut names = Vec::new();
@@ -247,6 +264,7 @@ fn main() -> Result<()> {
         match arg.as_str() {
             "--threads" => threads = args.next().and_then(|n| n.parse().ok()).unwrap_or(0),
             "--effects" => forced = true,
+            "--turn" => turn = args.next().and_then(|n| n.parse().ok()).unwrap_or(0.0),
             "--quality" => quality = args.next().and_then(|n| n.parse().ok()).unwrap_or_default(),
             "--isa" => {
                 isas = args
@@ -263,22 +281,34 @@ fn main() -> Result<()> {
         .build()
         .map_err(|e| Error::Usage(e.to_string()))?;
     println!("{} threads", pool.current_num_threads());
-    for scene in &SCENES {
-        if names.is_empty() || names.iter().any(|n| n == scene.name) {
-            let mut gaussians = body(scene.count);
-            for &isa in &isas {
-                for variant in variants(forced) {
-                    if variant.0 == ", harmonics" {
-                        gaussians.harmonics = Harmonics {
-                            count: 15,
-                            coefficients: vec![[0.01; 3]; 15 * gaussians.len()],
-                        };
-                    }
-                    pool.install(|| measure(isa, scene, &gaussians, quality, variant))?;
-                    gaussians.harmonics = Harmonics::default();
+    let draw = |name: &str, size, mut gaussians: Gaussians| -> Result<()> {
+        for &isa in &isas {
+            for variant in variants(forced) {
+                if variant.0 == ", harmonics" {
+                    gaussians.harmonics = Harmonics {
+                        count: 15,
+                        coefficients: vec![[0.01; 3]; 15 * gaussians.len()],
+                    };
                 }
+                let measure = || measure(isa, name, size, &gaussians, quality, turn, variant);
+                pool.install(measure)?;
+                gaussians.harmonics = Harmonics::default();
             }
         }
+        Ok(())
+    };
+    for scene in &SCENES {
+        if names.is_empty() || names.iter().any(|n| n == scene.name) {
+            draw(scene.name, scene.size, body(scene.of, scene.count))?;
+        }
+    }
+    for path in names.iter().filter(|name| name.ends_with(".ply")) {
+        let bytes = std::fs::read(path).map_err(|source| Error::Io {
+            path: path.into(),
+            source,
+        })?;
+        let (gaussians, _) = ply::read(&bytes, &Limits::default())?;
+        draw("file", (1024, 1024), gaussians)?;
     }
     Ok(())
 }
