@@ -23,8 +23,9 @@ PEERS = {
     "person_Asian_F_3_Casual": {"s0.25_q34": 0.1005, "s0.25_q28": 0.1400, "s0.5_q34": 0.2975, "s0.5_q28": 0.4092},
     "person_Hispanic_M_3_Milit": {"s0.25_q34": 0.0944, "s0.25_q28": 0.1571, "s0.5_q34": 0.2775, "s0.5_q28": 0.4457},
 }
-MODELS = {name: f"models/{name}.safetensors" for name in ("lite", "lite-low", "lite-least")}
-COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce"]
+MODELS = {name: f"models/{name}.safetensors" for name in ("lite", "lite-low", "lite-least")} | {"lite-quick": "models/lite.safetensors"}
+QUICK = "-quick"  # ends the name of a model whose quick heads are measured
+COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce", "#be185d"]
 PEER, PEER_COLOUR = "TMC13", "#6b7280"
 SCORES = {"psnr": "PSNR", "foreground_psnr": "foreground PSNR", "ms_ssim": "MS-SSIM", "ssimulacra2": "SSIMULACRA2"}
 
@@ -51,7 +52,8 @@ def measure(data, models, peers):
             cloud = folder / "cloud.ply"
             lab("voxelize", mesh, "-o", cloud)
             for model, path in models.items():
-                for row in evaluate(mesh, cloud, folder / model, "--model", ROOT / path):
+                heads = "quick" if model.endswith(QUICK) else "best"
+                for row in evaluate(mesh, cloud, folder / model, "--model", ROOT / path, "--heads", heads):
                     parts = {part["level"]: part for part in row["rate"]["levels"]}
                     rows.append({"object": name, "series": model, "level": row["level"], "rate": row["rate"]["total"],
                                  "geometry": sum(p["geometry"] for p in parts.values()), **row["scores"]})

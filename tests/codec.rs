@@ -2,12 +2,13 @@
 
 mod common;
 
+use b2p::bitstream::Header;
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Encoded, Options, encode};
 use b2p::geometry::Octree;
 use b2p::log::Log;
-use b2p::network::Model;
+use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::{Error, Limits, Placement};
 use common::{Ball, cloud_of, tiny_model};
 
@@ -51,6 +52,39 @@ fn a_head_gives_one_gaussian_per_voxel_or_one_per_child() {
     assert_eq!(count(5), 8 * octree.level(5).len());
     assert_eq!(count(6), octree.level(6).len());
     assert_eq!(decoder.levels(&bytes).unwrap(), [5, 6]);
+}
+
+#[test]
+fn whichever_heads_are_used_the_same_is_decoded_and_only_gaussians_differ() {
+    let shape = Shape::tiny().with_quick_heads();
+    let both = Model::from_bytes(&untrained(&shape, 0)).unwrap();
+    let bytes = coded(&ball(6, 20.0), &model()).bytes;
+    let log = &mut Log::default();
+    let best = Decoder::new(&both);
+    let quick = best.clone().with_heads(Heads::Quick).unwrap();
+    for level in quick.levels(&bytes).unwrap() {
+        let exact = |decoder: &Decoder<_>| decoder.exact(&bytes, level, &mut Log::default());
+        assert_eq!(exact(&quick).unwrap(), exact(&best).unwrap());
+        let thin = quick.decode(&bytes, Some(level), log).unwrap();
+        let thick = best.decode(&bytes, Some(level), log).unwrap();
+        assert_eq!(thin.len(), thick.len());
+        assert!(thin.position != thick.position);
+        let model = model();
+        let before = Decoder::new(&model).decode(&bytes, Some(level), log);
+        assert_eq!(before.unwrap(), thick, "quick heads change nothing else");
+        let mut decoding = best.start(Some(level));
+        decoding.push(&bytes);
+        decoding.finish(log).unwrap();
+        for (heads, gaussians) in [(Heads::Quick, &thin), (Heads::Best, &thick)] {
+            decoding.set_heads(heads).unwrap();
+            assert_eq!(&decoding.gaussians(log).unwrap(), gaussians);
+        }
+    }
+    let header = Header::parse(&bytes, &Limits::default()).unwrap();
+    assert!(quick.memory(&header, 5).unwrap() < best.memory(&header, 5).unwrap());
+    let model = model();
+    let error = Decoder::new(&model).with_heads(Heads::Quick).err().unwrap();
+    assert!(matches!(error, Error::Unsupported { .. }), "{error}");
 }
 
 #[test]

@@ -10,7 +10,7 @@ use b2p::decoder::Decoder;
 use b2p::encoder::{Options, encode};
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::network::{Model, Shape, untrained};
+use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::pixels::{Background, render};
 use b2p::projection::Camera;
 use b2p::{Error, Limits};
@@ -39,7 +39,10 @@ fn models() -> Vec<(&'static str, Model)> {
     };
     let load = |bytes: &[u8]| Model::from_bytes(bytes).expect("a model loads");
     vec![
-        ("tiny", load(&untrained(&Shape::tiny(), 0))),
+        (
+            "tiny",
+            load(&untrained(&Shape::tiny().with_quick_heads(), 0)),
+        ),
         ("wide", load(&untrained(&wide, 0))),
         #[cfg(feature = "cli")]
         ("lite", load(b2p::embedded::MODEL)),
@@ -62,13 +65,19 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     for (name, model) in models() {
         let decoder = Decoder::new(&model).with_limits(Limits::unlimited());
+        let with = |heads: &Heads| decoder.clone().with_heads(*heads).unwrap();
+        let decoders: Vec<_> = model.shape().heads().iter().map(with).collect();
         for (kind, cloud) in clouds() {
             let options = Options::default();
             let bytes = encode(&cloud, &model, &options, &mut Log::default())
                 .unwrap()
                 .bytes;
             let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
-            for level in decoder.levels(&bytes).unwrap() {
+            let levels = decoder.levels(&bytes).unwrap();
+            for (decoder, level) in decoders
+                .iter()
+                .flat_map(|d| levels.iter().map(move |l| (d, *l)))
+            {
                 let most = decoder.memory(&header, level).unwrap();
                 let decode = || decoder.decode(&bytes, Some(level), &mut Log::default());
                 // Threads start, and weights are put in order, the first time.

@@ -6,6 +6,7 @@ mod common;
 use std::path::Path;
 use std::process::{Command, Output};
 
+use b2p::network::{Shape, untrained};
 use common::Ball;
 use serde_json::Value;
 
@@ -32,7 +33,8 @@ fn folder_with_stream() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     std::fs::write(at.join("ball.ply"), Ball::new(6, 20.0).to_ply()).unwrap();
-    std::fs::write(at.join("tiny.safetensors"), common::tiny_model(1)).unwrap();
+    let model = untrained(&Shape::tiny().with_quick_heads(), 1);
+    std::fs::write(at.join("tiny.safetensors"), model).unwrap();
     let model = ["--model", "tiny.safetensors"];
     succeeds(
         at,
@@ -51,9 +53,8 @@ fn the_page_has_all_its_parts_and_more_precise_is_never_less_accurate() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     std::fs::write(at.join("ball.ply"), Ball::new(7, 40.0).to_ply()).unwrap();
-    succeeds(at, &["encode", "ball.ply", "-o", "ball.b2p"]);
     let arguments = [
-        "tradeoff", "ball.b2p", "-o", "out", "--views", "1", "--size", "168x168", "--repeat", "2",
+        "tradeoff", "ball.ply", "-o", "out", "--views", "1", "--size", "168x168", "--repeat", "2",
     ];
     let text = succeeds(at, &arguments);
     assert!(text.contains("one knob at a time") && text.contains("tradeoff.html"));
@@ -69,6 +70,7 @@ fn the_page_has_all_its_parts_and_more_precise_is_never_less_accurate() {
         "Hard cases",
         "Effects",
         "data:image/png;base64,",
+        "PSNR, cloud",
     ] {
         assert!(page.contains(part), "the page lacks {part}");
     }
@@ -90,6 +92,7 @@ fn the_page_has_all_its_parts_and_more_precise_is_never_less_accurate() {
         }
         assert_eq!(row["stages"].as_object().unwrap().len(), 8);
         assert!(decibel(row) > 10.0, "{row}");
+        assert!(row["cloud_psnr"].as_f64().unwrap() > 10.0, "{row}");
     }
     let of = |knob: &str, what: &str, value: Value| {
         let mut rows = ladder.iter();
@@ -259,6 +262,7 @@ fn a_budget_and_a_knob_exclude_each_other_and_pipes_and_gaussians_have_none() {
     let decode = ["decode", "ball.b2p", "-o", "x.ply", "--budget"];
     misuse(&[&decode[..], &["1s", "--level", "5"]].concat());
     misuse(&[&decode[..], &["1s", "--precision", "f16"]].concat());
+    misuse(&[&decode[..], &["1s", "--heads", "quick"]].concat());
     misuse(&[&decode[..], &["33"]].concat());
     let render = ["render", "ball.b2p", "-o", "x.png", "--quality", "exact"];
     misuse(&[&render[..], &["--min-psnr", "40"]].concat());

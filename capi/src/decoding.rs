@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use b2p::decoder::Decoder;
 use b2p::log::Log;
+use b2p::network::Heads;
 
 use crate::border::{Fault, Status, borrowed, changed, give, guard, slice, take};
 use crate::model::{Limits, Model};
@@ -113,6 +114,28 @@ pub unsafe extern "C" fn b2p_decoding_start(
         };
         // SAFETY: the caller vouches for `decoding`.
         unsafe { give(decoding, "decoding", Decoding(decoder.start(level))) }
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Generates Gaussians with the model's quick heads from now on, thinner ones for weak machines, which only some models have; or, as at first,
+/// with its best. What has been decoded stays. Fails with UNSUPPORTED, USAGE.
+///
+/// # Safety
+/// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_use_quick_heads(
+    decoding: *mut Decoding,
+    quick: bool,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `decoding`.
+        let decoding = unsafe { changed(decoding, "decoding") }?;
+        let heads = if quick { Heads::Quick } else { Heads::Best };
+        Ok(decoding.0.set_heads(heads)?)
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }

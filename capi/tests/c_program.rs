@@ -9,7 +9,7 @@ use std::process::{Command, Output};
 
 use b2p::decoder::Decoder;
 use b2p::log::Log;
-use b2p::network::Model;
+use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::pixels::{Background, render};
 use b2p::projection::Camera;
 
@@ -54,18 +54,26 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     let file = common::tiny_model(0);
     let model = Model::from_bytes(&file).expect("a model");
     let stream = common::small_stream(&model);
+    let file_of_both = untrained(&Shape::tiny().with_quick_heads(), 0);
+    let both = Model::from_bytes(&file_of_both).expect("a model");
     std::fs::write(at("model"), &file).expect("written");
+    std::fs::write(at("both"), &file_of_both).expect("written");
     std::fs::write(at("stream"), &stream).expect("written");
 
-    let gaussians = Decoder::new(&model)
-        .decode(&stream, None, &mut Log::default())
-        .expect("a stream");
     let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, 40, 30).expect("a camera");
     let limits = b2p::Limits::default();
-    let (image, _) = render(&gaussians, &camera, Background::WHITE, &limits).expect("a picture");
-    let picture = image.to_pixmap().expect("a picture");
-    let sum = |sum: u64, byte: &u8| sum.wrapping_mul(31).wrapping_add(u64::from(*byte));
-    let expected = format!("{:016x}\n", picture.data().iter().fold(0, sum));
+    let sum = |model: &Model, heads| {
+        let decoder = Decoder::new(model).with_heads(heads).expect("heads");
+        let gaussians = decoder.decode(&stream, None, &mut Log::default());
+        let gaussians = gaussians.expect("a stream");
+        let drawn = render(&gaussians, &camera, Background::WHITE, &limits);
+        let picture = drawn.expect("a picture").0.to_pixmap().expect("bytes");
+        let sum = |sum: u64, byte: &u8| sum.wrapping_mul(31).wrapping_add(u64::from(*byte));
+        picture.data().iter().fold(0, sum)
+    };
+    let (best, quick) = (sum(&model, Heads::Best), sum(&both, Heads::Quick));
+    assert_ne!(best, quick);
+    let expected = format!("{best:016x}\n{quick:016x}\n");
 
     let sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
     printed(compile(&at("plain"), &[]));
@@ -89,7 +97,7 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
         "nothing here watches a program's memory"
     );
     for (how, mut program) in programs {
-        program.arg(at("model")).arg(at("stream"));
+        program.args([at("model"), at("stream"), at("both")]);
         let output = program.output().expect("the program starts");
         assert_eq!(printed(output), expected, "{how}");
         println!("ran {how}");

@@ -36,6 +36,7 @@ static file read_file(const char *path) {
 typedef struct {
     const b2p_model *model;
     const file *stream;
+    bool quick;
     uint64_t sum;
 } job;
 
@@ -45,6 +46,7 @@ static void *decode(void *argument) {
     char message[256];
     b2p_decoding *decoding = NULL;
     CHECK(b2p_decoding_start(job->model, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_use_quick_heads(decoding, job->quick, message, sizeof message) == B2P_STATUS_OK);
     int32_t level, last = -1;
     for (size_t at = 0; at < job->stream->length; at += 100) {
         size_t left = job->stream->length - at;
@@ -108,9 +110,12 @@ static void mistakes(const b2p_model *model, file stream) {
     CHECK(b2p_decoding_push(NULL, stream.bytes, stream.length, message, sizeof message) == B2P_STATUS_USAGE);
     CHECK(b2p_decoding_level(NULL) == -1);
 
-    // Cut, damaged, over the limits, cancelled.
+    // No quick heads, cut, damaged, over the limits, cancelled.
     b2p_gaussians *gaussians = NULL;
+    CHECK(b2p_decoding_use_quick_heads(NULL, true, message, sizeof message) == B2P_STATUS_USAGE);
     CHECK(b2p_decoding_start(model, NULL, NULL, -1, &decoding, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_use_quick_heads(decoding, true, message, sizeof message) == B2P_STATUS_UNSUPPORTED);
+    CHECK(strstr(message, "quick"));
     CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_USAGE);
     CHECK(b2p_decoding_push(decoding, stream.bytes, stream.length - 1, NULL, 0) == B2P_STATUS_OK);
     CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_TRUNCATED);
@@ -150,28 +155,29 @@ static void mistakes(const b2p_model *model, file stream) {
 }
 
 int main(int count, char **arguments) {
-    CHECK(count == 3);
-    file model_file = read_file(arguments[1]), stream = read_file(arguments[2]);
-    b2p_model *model = NULL, *again = NULL;
+    // A model, a stream, and the same model with quick heads as well.
+    CHECK(count == 4);
+    file model_file = read_file(arguments[3]), stream = read_file(arguments[2]);
+    b2p_model *model = NULL, *both = NULL;
     CHECK(b2p_model_open(arguments[1], &model, message, sizeof message) == B2P_STATUS_OK);
-    CHECK(b2p_model_from_bytes(model_file.bytes, model_file.length, &again, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_model_from_bytes(model_file.bytes, model_file.length, &both, message, sizeof message) == B2P_STATUS_OK);
     free(model_file.bytes);
     CHECK(strlen(b2p_version()) >= 5);
     CHECK(b2p_limits_unlimited().max_bytes > b2p_limits_default().max_bytes);
 
     mistakes(model, stream);
-    job jobs[3] = {{model, &stream, 0}, {model, &stream, 0}, {again, &stream, 0}};
-    pthread_t threads[3];
-    for (int i = 0; i < 3; i++) {
+    job jobs[4] = {{model, &stream, false, 0}, {model, &stream, false, 0}, {both, &stream, false, 0}, {both, &stream, true, 0}};
+    pthread_t threads[4];
+    for (int i = 0; i < 4; i++) {
         CHECK(pthread_create(&threads[i], NULL, decode, &jobs[i]) == 0);
     }
-    for (int i = 0; i < 3; i++) {
+    for (int i = 0; i < 4; i++) {
         CHECK(pthread_join(threads[i], NULL) == 0);
-        CHECK(jobs[i].sum == jobs[0].sum);
+        CHECK(jobs[i].quick || jobs[i].sum == jobs[0].sum);
     }
     b2p_model_free(model);
-    b2p_model_free(again);
+    b2p_model_free(both);
     free(stream.bytes);
-    printf("%016llx\n", (unsigned long long)jobs[0].sum);
+    printf("%016llx\n%016llx\n", (unsigned long long)jobs[0].sum, (unsigned long long)jobs[3].sum);
     return 0;
 }

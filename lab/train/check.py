@@ -5,6 +5,7 @@ import os
 import tempfile
 import time
 
+import numpy as np
 import torch
 
 import data
@@ -184,6 +185,40 @@ def heads_alone_learn_and_leave_the_bits_as_they_are():
     return f"{len(moved)} tensors of the head that was drawn with move, no other"
 
 
+def quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own():
+    samples, tiny = [data.procedural(i, size=48, views=2, pixels=60) for i in range(2)], os.path.join(HERE, "configs/tiny.json")
+    trainer = train.Trainer(arguments(config=tiny))
+    trainer.train_step(samples)
+    model = trainer.model.eval()
+    with tempfile.TemporaryDirectory() as folder:
+        weights, config, old, new = (f"{folder}/{name}" for name in ("w.safetensors", "quick.json", "old.safetensors", "new.safetensors"))
+        export.save_file({k: v.numpy() for k, v in model.state_dict().items()}, weights)
+        export.export(model, samples, old, {"steps": 1})
+        with open(config, "w") as f:
+            json.dump({**model.cfg, "gg": [{**g, "channels": 12, "blocks_before": 0} for g in model.cfg["gg"]]}, f)
+        quick = train.Trainer(arguments(config=config, only_heads=True))
+        quick.start_from(weights)
+        assert quick.new_heads
+        quick.start_heads(samples)
+        s, error = samples[0], 0.0
+        with torch.no_grad():
+            trail, _, _ = quick.model.code(s.crop, quick.model.analyse(s.crop, s.rgb), 2, "round")
+            colour = quick.model.generate(trail[2], s.crop, 2)[0][3]
+            error, spread = (colour - quick.model.colours(s.crop, s.rgb)[2]).std().item(), s.rgb.std().item()
+        assert error < 0.3 * spread, f"colours start {error:.3f} off, where they vary by {spread:.3f}"
+        for s in samples:
+            quick.train_step([s])
+        for name, p in quick.model.state_dict().items():
+            assert name.startswith("gg.") or torch.equal(p, model.state_dict()[name]), f"{name} has changed"
+        export.export_quick(quick.model.eval(), samples, new, {"steps": 2}, old)
+        (before, tensors), (after, more) = export.read(old), export.read(new)
+        assert all(np.array_equal(more[k], v) for k, v in tensors.items())
+        added = more.keys() - tensors.keys()
+        assert added and all(export.is_quick(k) for k in added)
+        assert {"gg": after.pop("gg")[:2], "quick": after.pop("quick_steps")} == {"gg": before.pop("gg"), "quick": 2} and before == after
+    return f"{len(added)} tensors more, all others as they were; colours start {error:.3f} off of {spread:.3f}"
+
+
 def the_integer_path_follows_the_float_path():
     samples = [data.procedural(i, size=48, views=2, pixels=80) for i in range(3)]
     trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
@@ -203,6 +238,7 @@ if __name__ == "__main__":
     for check in (operators_agree_with_plain_pytorch, rounded_operands_stay_close_where_the_processor_has_them,
                   maps_from_above_are_those_found_by_searching, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
                   a_frozen_first_encoder_changes_nothing_but_its_own_gradient, heads_alone_learn_and_leave_the_bits_as_they_are,
+                  quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own,
                   the_integer_path_follows_the_float_path, a_crop_overfits):
         begin = time.monotonic()
         said = check()

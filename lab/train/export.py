@@ -2,6 +2,7 @@
 
     python export.py RUN/last.pt MODEL.safetensors --data FOLDER
     python export.py --random configs/tiny.json MODEL.safetensors
+    python export.py --quick RUN/last.pt --streams-of OLD.safetensors MODEL.safetensors --data FOLDER
 """
 
 import argparse
@@ -12,7 +13,8 @@ import sys
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.numpy import load_file, save_file
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 import data
 import integer
@@ -237,17 +239,56 @@ def prior_tables(model):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def read(path):
+    """Description and tensors of a model file."""
+    with safe_open(path, "numpy") as f:
+        return json.loads(f.metadata()["b2p"]), {k: f.get_tensor(k) for k in f.keys()}
+
+
+def write(path, meta, tensors):
+    save_file({k: np.ascontiguousarray(v) for k, v in sorted(tensors.items())}, path, metadata={"b2p": json.dumps(meta)})
+
+
+def is_quick(name):
+    return name.startswith("gg.quick.")
+
+
+def same_streams(path, cfg):
+    """Description and tensors of a model file whose streams a network of this configuration is to decode."""
+    meta, tensors = read(path)
+    exact = ("channels", "latents", "base_channels", "pem_blocks", "fr_blocks", "upsample", "inception_relu", "latent_max")
+    if any(meta.get(k) != cfg.get(k) for k in exact):
+        sys.exit(f"{path} is another network")
+    return meta, tensors
+
+
 def export(model, samples, path, info, streams_of=None):
     out = quantise(model, ranges_of(model, samples))
     for name, t in (("cdf.gauss", gauss_tables()), ("cdf.prior", prior_tables(model))):
         out[name], out[name + ".offset"], out[name + ".low"] = t
-    if streams_of:
-        old = load_file(streams_of)
-        if {k: v.shape for k, v in old.items()} != {k: v.shape for k, v in out.items()}:
-            sys.exit(f"{streams_of} is another network")
-        out = {k: v if k.startswith("gg.") else old[k] for k, v in out.items()}
     meta = {"format": 1, **model.cfg, "latent_shift": LATENT_SHIFT, **info}
-    save_file({k: np.ascontiguousarray(v) for k, v in sorted(out.items())}, path, metadata={"b2p": json.dumps(meta)})
+    if streams_of:
+        before, old = same_streams(streams_of, model.cfg)
+        if {k: v.shape for k, v in old.items() if not is_quick(k)} != {k: v.shape for k, v in out.items()}:
+            sys.exit(f"{streams_of} is another network")
+        out = {k: out[k] if k.startswith("gg.") and not is_quick(k) else v for k, v in old.items()}
+        meta["gg"] = model.cfg["gg"] + [g for g in before["gg"] if g.get("heads") == "quick"]
+    write(path, meta, out)
+
+
+def export_quick(model, samples, path, info, streams_of):
+    """The model file `streams_of` with the heads of `model`, which was trained on its features, as quick ones beside its own."""
+    meta, out = same_streams(streams_of, model.cfg)
+    own = [g for g in meta["gg"] if g.get("heads", "best") == "best"]
+    if [g["role"] for g in own] != [g["role"] for g in model.cfg["gg"]]:
+        sys.exit(f"{streams_of} has heads for other roles")
+    for shared in ("offset_range", "scale_range", "scale_bias", "opacity_bias", "resblock_relu"):
+        if meta[shared] != model.cfg[shared]:
+            sys.exit(f"{streams_of} has another {shared}, which all heads share")
+    heads = {k: v for k, v in quantise(model, ranges_of(model, samples)).items() if k.startswith("gg.")}
+    out = {k: v for k, v in out.items() if not is_quick(k)} | {"gg.quick." + k.removeprefix("gg."): v for k, v in heads.items()}
+    meta |= {"gg": own + [{**g, "heads": "quick"} for g in model.cfg["gg"]], "quick_steps": info["steps"]}
+    write(path, meta, out)
 
 
 def half_weights(model):
@@ -261,8 +302,8 @@ def half_weights(model):
 
 
 @torch.no_grad()
-def picture_error(model, sample, g):
-    (mean, cov, alpha, colour), _ = model.generate(g, sample.crop, 2)
+def picture_error(model, sample, g, role):
+    (mean, cov, alpha, colour), _ = model.generate(g, sample.crop, role)
     h, w = sample.image.shape[2:]
     image = ops.splat(mean, cov, alpha, colour, sample.cameras, torch.ones(sample.image.shape[0], 3), w, h)
     truth = sample.image + (1 - sample.coverage)
@@ -272,20 +313,23 @@ def picture_error(model, sample, g):
 @torch.no_grad()
 def verify(path, model, samples):
     """Rate of the integer path against the float path on whole crops, pictures of both, and saturation."""
-    exact, totals, points, error = integer.Exact(path), np.zeros((2, 3)), 0, np.zeros(2)
+    exact, totals, points, error = integer.Exact(path), np.zeros((2, 3)), 0, {int(role): np.zeros(2) for role in model.gg}
     for s in samples:
         trail, rates, latents = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
         rates[0] = model.base_bits(torch.round(latents[0]), s.crop)
-        bits, gi = integer.code(exact, model, s.crop, s.rgb)
+        for role, e in error.items():
+            bits, gi = integer.code(exact, model, s.crop, s.rgb, role)
+            e += [picture_error(model, s, trail[role], role), picture_error(model, s, gi, role)]
         totals += np.array([[r.item() for r in rates], bits])
-        error += [picture_error(model, s, trail[-1]), picture_error(model, s, gi)]
         points += s.crop.points
     penalty = totals[1].sum() / totals[0].sum() - 1
-    psnr = -10 * np.log10(error / len(samples))
     saturated = {k: f"{a / b:.1e}" for k, (a, b) in exact.saturated.items() if a}
     print(f"bpp float {totals[0] / points} = {totals[0].sum() / points:.4f}")
     print(f"bpp integer {totals[1] / points} = {totals[1].sum() / points:.4f}: {100 * penalty:+.2f} %")
-    print(f"PSNR float {psnr[0]:.2f} integer {psnr[1]:.2f} dB; saturated shares {saturated}")
+    for role, e in error.items():
+        psnr = -10 * np.log10(e / len(samples))
+        print(f"head {role}: PSNR float {psnr[0]:.2f}, from integer features {psnr[1]:.2f} dB")
+    print(f"saturated shares {saturated}")
     return penalty
 
 
@@ -319,18 +363,24 @@ def main():
     p.add_argument("--random", metavar="CONFIG", help="an untrained network of this configuration, for tests")
     p.add_argument("--weights", metavar="FILE", help="also write the float weights, in f16, for `train.py --init`")
     p.add_argument("--streams-of", metavar="FILE", help="take all but the heads from this exported model, so that its streams stay valid: after `train.py --only-heads`")
+    p.add_argument("--quick", metavar="CHECKPOINT", help="with --streams-of: that model with the heads of this checkpoint as quick ones beside its own")
     p.add_argument("--last", action="store_true", help="the last weights instead of the averaged ones")
     args = p.parse_args()
     samples = [data.procedural(i) for i in range(2)]
     if args.data:
         training, held = data.split(args.data, 8)
         samples = [data.load_sample(f) for f in held[:args.verify] + training[:max(0, args.samples - args.verify)]]
+    if bool(args.checkpoint) + bool(args.random) + bool(args.quick) != 1 or args.quick and not args.streams_of:
+        p.error("a checkpoint, --random, or --quick with --streams-of")
     if args.random:
         torch.manual_seed(1)
         model, info = untrained(args.random, samples), {"steps": 0}
     else:
-        model, info = load_checkpoint(args.checkpoint, not args.last)
-    export(model, samples, args.out, info, args.streams_of)
+        model, info = load_checkpoint(args.quick or args.checkpoint, not args.last)
+    if args.quick:
+        export_quick(model, samples, args.out, info, args.streams_of)
+    else:
+        export(model, samples, args.out, info, args.streams_of)
     if args.weights:
         tensors = {k: v.half().numpy() for k, v in model.state_dict().items()}
         save_file(tensors, args.weights, metadata={"config": json.dumps(model.cfg)})

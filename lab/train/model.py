@@ -190,6 +190,16 @@ class Generate(nn.Module):
             x = b(x, kmap)
         return self.conv_out(x, kmap)
 
+    @torch.no_grad()
+    def pass_colour(self, matrix, shift):
+        """Starts with Gaussians of the colours `g @ matrix + shift`: luma and two chromas around grey."""
+        route(self.conv_in, matrix @ SIGNED)
+        self.conv_in.bias[:6] = shift @ SIGNED
+        for b in (*self.before, *self.after):
+            let_pass(b)
+        route(self.layer4, torch.eye(6), tap=range(8) if self.fanout == 8 else None)
+        route(self.conv_out, RECTIFIED @ colour_basis().T, at=11)
+
 
 class Base(nn.Module):
     """Predicts the latents of role 0, which have no level below them: its voxels are coded octant by octant, and each is predicted from
@@ -241,6 +251,36 @@ def colour_basis():
     """Orthonormal columns: luma and two chromas."""
     basis = torch.linalg.qr(torch.tensor([[1.0, 1, 1], [1, 0, -1], [-1, 2, -1]]).T)[0]
     return basis * torch.sign(basis.diagonal())
+
+
+def ridge(x, y, damping=1e-3):
+    """The linear map from x to y by least squares; features are often close to collinear."""
+    gram = x.T @ x / len(x)
+    gram += torch.eye(len(gram)).to(gram) * damping * gram.diagonal().mean()
+    return torch.linalg.solve(gram, x.T @ y / len(x))
+
+
+SIGNED = torch.cat([torch.eye(3), -torch.eye(3)], 1)  # a colour to it and its negative
+RECTIFIED = SIGNED.T  # and back, from what a ReLU left of both
+
+
+def route(m, matrix, at=0, first=0, tap=None):
+    """Outputs at .. of the layer become `matrix` times inputs first .., and nothing else."""
+    i, o = matrix.shape
+    m.weight[:, :, at:at + o] = 0
+    m.bias[at:at + o] = 0
+    taps = [{1: 0, 8: 0, 27: 13}[m.taps]] if tap is None else tap
+    for t in taps:
+        m.weight[t, first:first + i, at:at + o] = matrix
+    if isinstance(m, NormConv):
+        m.gain[at:at + o] = matrix.norm(dim=0)
+
+
+def let_pass(block):
+    """The first channels, a colour and its negative, go through a block as they are."""
+    for m in (block.a2,) if isinstance(block, Inception) else (block.c2,):
+        m.weight[:, :, :6] = 0
+        m.bias[:6] = 0
 
 
 class B2P(nn.Module):
@@ -360,29 +400,8 @@ class B2P(nn.Module):
         """Starts the network as a pyramid of colours, so that it has only to get better: three latents of every role are what its colour
         differs from its parent's, in steps of 1/luma and 1/chroma, and what they add up to reaches the colours of the Gaussians. A colour
         goes through rectified layers as a channel and its negative. Call it after `calibrate`."""
-        n, steps = 3, torch.tensor([luma, chroma, chroma])
-        eye = torch.eye(n)
-        signed = torch.cat([eye, -eye], 1)  # colour -> (colour, -colour)
-        joined = torch.cat([eye, -eye], 0) / 2  # and back, from both
-        rectified = torch.cat([eye, -eye], 0)  # and back, from what a ReLU left of both
-        basis = colour_basis()
-
-        def route(m, matrix, at=0, first=0, tap=None):
-            """Outputs at .. of the layer become `matrix` times inputs first .., and nothing else."""
-            i, o = matrix.shape
-            m.weight[:, :, at:at + o] = 0
-            m.bias[at:at + o] = 0
-            taps = [{1: 0, 8: 0, 27: 13}[m.taps]] if tap is None else tap
-            for t in taps:
-                m.weight[t, first:first + i, at:at + o] = matrix
-            if isinstance(m, NormConv):
-                m.gain[at:at + o] = matrix.norm(dim=0)
-
-        def let_pass(block):
-            for m in (block.a2,) if isinstance(block, Inception) else (block.c2,):
-                m.weight[:, :, :2 * n] = 0
-                m.bias[:2 * n] = 0
-
+        n, steps, eye, signed, rectified, basis = 3, torch.tensor([luma, chroma, chroma]), torch.eye(3), SIGNED, RECTIFIED, colour_basis()
+        joined = rectified / 2  # to a colour from both of it and its negative
         for r, fc in enumerate(self.fc):
             route(fc.conv_in, basis @ signed if r == 3 else joined @ signed)
             for b in fc.blocks:
@@ -412,13 +431,24 @@ class B2P(nn.Module):
             self.probe[r].weight.zero_()
             self.probe[r].weight[0, :n] = basis.T
             self.probe[r].bias.zero_()
-        whole = torch.eye(2 * n)
+        features = torch.eye(c)[:, :n], torch.zeros(n)
         for gg in self.gg.values():
-            route(gg.conv_in, signed)
-            for b in (*gg.before, *gg.after):
-                let_pass(b)
-            route(gg.layer4, whole, tap=range(8) if gg.fanout == 8 else None)
-            route(gg.conv_out, rectified @ basis.T, at=11)
+            gg.pass_colour(*features)
+
+    @torch.no_grad()
+    def start_heads(self, crop, rgb):
+        """Starting values for heads of a network that has learned: layers of unit scale, and the colours that a linear fit reads from the
+        features that they get. Use a crop of many colours."""
+        for m in self.gg.modules():
+            if isinstance(m, NormConv):
+                m.calibrating = True
+        trail, _, _ = self.code(crop, self.analyse(crop, rgb), 2, "round")
+        for role, gg in self.gg.items():
+            r = int(role)
+            self.generate(trail[r], crop, r)
+            known = torch.cat([trail[r], torch.ones(len(trail[r]), 1)], 1).double()
+            fit = ridge(known, ((self.colours(crop, rgb)[r] - 0.5) @ colour_basis()).double()).float()
+            gg.pass_colour(fit[:-1], fit[-1])
 
     def revive(self, crop, rgb, role=2, step=(14.0, 10.0, 10.0)):
         """Gives a role whose latents died new ones: its first three become the error of the colours that it draws, predicted linearly
@@ -435,9 +465,7 @@ class B2P(nn.Module):
             known = torch.cat([features[role], self.context(trail[role - 1], crop, role)], 1)
             x = torch.cat([known, torch.ones(len(known), 1)], 1).double()
             error = (self.colours(crop, rgb)[role] - colour) @ basis
-            gram = x.T @ x / len(x)
-            ridge = torch.diag(torch.full((len(gram),), 1e-3 * gram.diagonal().mean().item()).double())
-            fit = torch.linalg.solve(gram + ridge, x.T @ error.double() / len(x)).float()
+            fit = ridge(x, error.double()).float()
             for at, sign in ((0, 1), (n, -1)):
                 fs.lin1.weight[0, :, at:at + n], fs.lin1.bias[at:at + n] = sign * fit[:-1], sign * fit[-1]
             fs.lin2.weight[0, :, :n], fs.lin2.weight[0, :2 * n, n:], fs.lin2.bias[:n] = 0, 0, 0

@@ -127,7 +127,7 @@ class Trainer:
         learning = self.model.gg if args.only_heads else self.model
         self.optimiser = torch.optim.Adam(groups(learning, args.lr_conv, args.lr_linear, args.lr_heads), betas=(0.9, 0.999), eps=1e-8, fused=True)
         self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
-        self.step, self.used, self.calibrated = 0, 0.0, False
+        self.step, self.used, self.calibrated, self.new_heads = 0, 0.0, False, False
         self.finest = {}  # of a frozen first encoder: its features, in f16, by the sample's name
         self.decoded = {}  # where only the heads are trained: what they read, in f16, by the sample's name
 
@@ -137,20 +137,26 @@ class Trainer:
                 "rng": self.rng.getstate()}
 
     def start_from(self, path):
-        """Takes the averaged weights of a checkpoint, or those that `export.py --weights` wrote."""
+        """Takes the averaged weights of a checkpoint, or those that `export.py --weights` wrote; all but the heads where only heads are
+        to be trained and the configuration has others."""
         if not path.endswith(".safetensors"):
-            return self.restore(path, weights_only=True)
-        self.model.load_state_dict({k: v.float() for k, v in load_file(path, device=self.device).items()})
+            weights = torch.load(path, map_location=self.device, weights_only=False)["average"]
+        else:
+            weights = {k: v.float() for k, v in load_file(path, device=self.device).items()}
+        heads = lambda tensors: {k: v.shape for k, v in tensors.items() if k.startswith("gg.")}
+        self.new_heads = self.args.only_heads and heads(weights) != heads(self.model.state_dict())
+        if self.new_heads:
+            weights = {k: v for k, v in weights.items() if not k.startswith("gg.")} | {f"gg.{k}": v for k, v in self.model.gg.state_dict().items()}
+        self.model.load_state_dict(weights)
         self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
         self.calibrated = True
 
-    def restore(self, path, weights_only=False):
+    def start_heads(self, samples):
+        self.model.start_heads(join([s.crop for s in samples]).to(self.device), torch.cat([s.rgb for s in samples]).to(self.device))
+        self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+
+    def restore(self, path):
         s = torch.load(path, map_location=self.device, weights_only=False)
-        if weights_only:
-            self.model.load_state_dict(s["average"])
-            self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
-            self.calibrated = True
-            return
         self.model.load_state_dict(s["model"])
         self.average = s["average"]
         self.optimiser.load_state_dict(s["optimiser"])
@@ -183,7 +189,7 @@ class Trainer:
     def heads_read(self, sample, head):
         """Reconstructed features of a head's role, from rounded latents: computed once, as nothing before the heads learns."""
         if sample.name not in self.decoded:
-            features = self.model.analyse(sample.crop, sample.rgb)
+            features = self.model.analyse(sample.crop, sample.rgb, self.frozen(sample))
             trail, _, _ = self.model.code(sample.crop, features, 2, "round")
             self.decoded[sample.name] = [trail[r].half() for r in (1, 2)]
         return self.decoded[sample.name][head - 1].float()
@@ -313,7 +319,7 @@ def main(argv=None):
     p.add_argument("--resume", action="store_true", help="continue from OUT/last.pt")
     p.add_argument("--revive", type=int, choices=[1, 2], help="with --init: give this role new latents, where its own died")
     p.add_argument("--freeze-finest", action="store_true", help="leave the encoder of the finest level as it is: a step is then twice as fast")
-    p.add_argument("--only-heads", action="store_true", help="train what turns features into Gaussians and leave the bits as they are")
+    p.add_argument("--only-heads", action="store_true", help="train what turns features into Gaussians and leave the bits as they are; with --init from weights of other heads than --config has, new ones")
     p.add_argument("--cache", help="with --freeze-finest: folder of features of the finest level, NAME.npy for each sample")
     p.add_argument("--stop-after", type=int, default=0, help="stop at this step, as an interruption would")
     p.add_argument("--init", help="start from the averaged weights of this checkpoint, or from a file of `export.py --weights`")
@@ -332,12 +338,14 @@ def main(argv=None):
     train_files, held_files = data.split(args.data, args.held_out)
     held = [data.load_sample(f).to(args.device) for f in held_files]
     calibration = None if trainer.calibrated else [data.load_sample(f) for f in train_files[:6]]
+    if trainer.new_heads:
+        trainer.start_heads([data.load_sample(f) for f in train_files[:10]])
     if args.revive and not args.resume:
         some = [data.load_sample(f) for f in train_files[:10]]
         trainer.revive(join([s.crop for s in some]), torch.cat([s.rgb for s in some]))
     if args.cache:
         trainer.keep_finest(args.cache)
-    stream = data.Stream(train_files, args.views, args.seed, trainer.step * args.batch, known=trainer.decoded if args.only_heads else trainer.finest)
+    stream = data.Stream(train_files, args.views, args.seed, trainer.step * args.batch, known=trainer.finest if args.freeze_finest else trainer.decoded)
     log = open(os.path.join(args.out, "log.jsonl"), "a")
 
     def write(row):

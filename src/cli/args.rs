@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use b2p::Limits;
 use b2p::encoder::Options;
+use b2p::network::Heads;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 /// Learned point-cloud streams to 3D Gaussians and pictures, on a plain CPU.
@@ -118,7 +119,7 @@ pub struct Decode {
     #[arg(short, long, value_name = "OUT.ply")]
     pub output: PathBuf,
     #[command(flatten)]
-    pub level: LevelArg,
+    pub detail: DetailArg,
     #[command(flatten)]
     pub model: ModelArg,
     #[command(flatten)]
@@ -158,7 +159,7 @@ pub struct Render {
     #[arg(short, long)]
     pub verbose: bool,
     #[command(flatten)]
-    pub level: LevelArg,
+    pub detail: DetailArg,
     #[command(flatten)]
     pub view: View,
     #[command(flatten)]
@@ -236,6 +237,9 @@ pub struct Info {
     /// Print JSON
     #[arg(long)]
     pub json: bool,
+    /// Model file to look for the stream's model in [default: the one inside the program]
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
@@ -265,14 +269,15 @@ pub struct Bench {
     #[arg(long)]
     pub json: bool,
     #[command(flatten)]
-    pub level: LevelArg,
+    pub detail: DetailArg,
     #[command(flatten)]
     pub model: ModelArg,
 }
 
 #[derive(Debug, Args)]
 pub struct Tradeoff {
-    /// Stream to measure with [default: the sample that comes with the program]
+    /// Stream to measure with, or cloud to be coded first, whose own pictures are then compared with as well [default: the sample that comes
+    /// with the program]
     pub input: Option<PathBuf>,
     /// Folder for tradeoff.html, tradeoff.json and tradeoff.svg
     #[arg(short, long, value_name = "DIR", default_value = "b2p-tradeoff")]
@@ -291,11 +296,15 @@ pub struct Tradeoff {
     pub model: Option<PathBuf>,
 }
 
+/// Which of the Gaussians that a stream can be decoded to.
 #[derive(Debug, Args)]
-pub struct LevelArg {
+pub struct DetailArg {
     /// Octree level to decode to [default: the finest with Gaussians; to draw, the finest that can be seen]
     #[arg(long, value_name = "M")]
     pub level: Option<u8>,
+    /// Heads of the model that generate Gaussians: best, or quick, which only some models have: less accurate, for weak machines
+    #[arg(long, value_name = "NAME", default_value_t = Heads::Best)]
+    pub heads: Heads,
 }
 
 #[derive(Debug, Clone, Args)]

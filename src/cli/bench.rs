@@ -4,10 +4,9 @@ use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use b2p::bitstream::Header;
-use b2p::decoder::Decoder;
 use b2p::geometry::{KernelMap, Octree};
 use b2p::log::{Log, Step};
-use b2p::network::{Module, Precision, Shape, Work};
+use b2p::network::{Heads, Module, Precision, Shape, Work};
 use b2p::{Isa, Limits, ceiling, embedded};
 use serde_json::json;
 
@@ -35,13 +34,14 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
     let start = Instant::now();
     let model = load::model(&args.model)?;
     let loading = start.elapsed();
-    let decoder = Decoder::new(&model).with_limits(limits.clone());
+    let heads = args.detail.heads;
+    let decoder = load::decoder(&model, &args.detail, limits)?;
     let fail = |error| match &args.input {
         Some(path) => Failure::in_file(path)(error),
         None => Failure::from(error),
     };
     let levels = decoder.levels(&bytes).map_err(fail)?;
-    let level = match args.level.level {
+    let level = match args.detail.level {
         Some(level) => level,
         None => *levels
             .last()
@@ -68,7 +68,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         .exact(&bytes, level, &mut Log::default())
         .map_err(fail)?;
     let base = Header::parse(&bytes, limits).map_err(fail)?.base;
-    let works = works(model.shape(), &exact.octree, base);
+    let works = works(model.shape(), heads, &exact.octree, base);
     let lines: Vec<Line> = runs[0]
         .1
         .iter()
@@ -104,6 +104,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
             "level": level,
             "isa": model.isa().to_string(),
             "precision": model.precision().to_string(),
+            "heads": heads.to_string(),
             "threads": threads,
             "runs": args.repeat,
             "load_model_ms": loading.as_secs_f64() * 1e3,
@@ -161,7 +162,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         format!(", peak memory {} MB", bytes / 1_000_000)
     });
     Ok(format!(
-        "level {level}, {}, {}, {threads} threads, medians of {} runs{memory}\n{}\n\
+        "level {level}, {heads} heads, {}, {}, {threads} threads, medians of {} runs{memory}\n{}\n\
          Ceilings, measured just now: {:.0} GMAC/s in integers, {:.0} in what Gaussians are generated in.\n\
          MB: what a stage's layers must read and write at least once.\n",
         model.isa(),
@@ -203,7 +204,7 @@ impl Ceilings {
 }
 
 /// What the modules of the network compute, by the names of their steps.
-fn works(shape: &Shape, octree: &Octree, base: u8) -> HashMap<String, Work> {
+fn works(shape: &Shape, heads: Heads, octree: &Octree, base: u8) -> HashMap<String, Work> {
     let mut works = HashMap::new();
     let mut map = KernelMap::root();
     for level in 0..=octree.depth() {
@@ -216,7 +217,7 @@ fn works(shape: &Shape, octree: &Octree, base: u8) -> HashMap<String, Work> {
                 modules.extend([Module::Context(role), Module::Probabilities(role)]);
             }
             if level == octree.depth() {
-                modules.push(Module::Gaussians(role));
+                modules.push(Module::Gaussians(role, heads));
             }
             works.extend(modules.iter().map(|m| (m.at(level), shape.work(*m, &map))));
         }

@@ -3,7 +3,6 @@
 use std::path::Path;
 use std::time::Duration;
 
-use b2p::decoder::Decoder;
 use b2p::log::Log;
 use b2p::pixels::{Background, Image, Renderer, Stats, Times};
 use b2p::projection::Camera;
@@ -35,16 +34,13 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
     let mut log = Log::default();
     let gaussians = match &args.input {
         Some(path) => {
-            let source = Source::open(path, &args.level, &args.model, limits, &mut log)?;
-            source.gaussians(&args.level, &[camera], &mut log)?.0
+            let source = Source::open(path, &args.detail, &args.model, limits, &mut log)?;
+            source.gaussians(&args.detail, &[camera], &mut log)?.0
         }
         None => {
             let model = load::model(&args.model)?;
-            Decoder::new(&model).with_limits(limits.clone()).decode(
-                embedded::SAMPLE,
-                args.level.level,
-                &mut log,
-            )?
+            let decoder = load::decoder(&model, &args.detail, limits)?;
+            decoder.decode(embedded::SAMPLE, args.detail.level, &mut log)?
         }
     };
     let isa = load::isa(args.model.isa.as_deref())?;

@@ -5,12 +5,12 @@ use std::time::Duration;
 
 use b2p::bitstream::Header;
 use b2p::decoder::Decoder;
-use b2p::network::Model;
+use b2p::network::{Heads, Model};
 use b2p::tradeoff::{Budget, Calibration, Choice, Subject, Task, quality_name};
 use b2p::{Limits, embedded};
 use clap::Args;
 
-use super::args::{LevelArg, ModelArg};
+use super::args::{DetailArg, ModelArg};
 use super::pipe::PIPE;
 use super::progress::Progress;
 use super::table::milliseconds;
@@ -23,10 +23,10 @@ pub struct BudgetArgs {
     /// Time that it may take, such as 33ms or 0.5s: level, precision and quality are chosen by what they cost on this machine, which is
     /// measured at the first use and kept in the user's cache folder. Decoding: from the stream in memory to Gaussians. Drawing: from
     /// Gaussians to each picture
-    #[arg(long, value_name = "TIME", value_parser = time, conflicts_with_all = ["level", "precision"])]
+    #[arg(long, value_name = "TIME", value_parser = time, conflicts_with_all = ["level", "precision", "heads"])]
     pub budget: Option<Duration>,
     /// Least PSNR in dB against double precision, as it was for the sample
-    #[arg(long, value_name = "DB", value_parser = decibel, conflicts_with_all = ["level", "precision"])]
+    #[arg(long, value_name = "DB", value_parser = decibel, conflicts_with_all = ["level", "precision", "heads"])]
     pub min_psnr: Option<f64>,
     /// Measure this machine anew
     #[arg(long)]
@@ -113,6 +113,7 @@ fn calibration(
     };
     let subject = Subject {
         stream,
+        cloud: None,
         model: &|| Ok(Model::from_bytes(&file)?.with_isa(model.isa())),
         limits,
     };
@@ -127,9 +128,10 @@ fn calibration(
 
 impl Chosen {
     /// The arguments that the choice stands for.
-    pub fn level(&self) -> LevelArg {
-        LevelArg {
+    pub fn detail(&self) -> DetailArg {
+        DetailArg {
             level: Some(self.choice.level),
+            heads: self.choice.heads,
         }
     }
 
@@ -145,6 +147,7 @@ impl Chosen {
     pub fn describe(&self, task: Task, took: Duration) -> String {
         let Choice {
             level,
+            heads,
             precision,
             quality,
             expected,
@@ -155,8 +158,12 @@ impl Chosen {
             Task::Decode => String::new(),
             Task::Picture { .. } => format!(", {}", quality_name(quality)),
         };
+        let heads = match heads {
+            Heads::Best => String::new(),
+            heads => format!("{heads} heads, "),
+        };
         let mut text = format!(
-            "budget: level {level}, {precision}{quality}; expected {} and {psnr:.1} dB",
+            "budget: level {level}, {heads}{precision}{quality}; expected {} and {psnr:.1} dB",
             milliseconds(expected)
         );
         if let Some(least) = self.budget.min_psnr

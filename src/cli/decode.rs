@@ -26,14 +26,14 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String
         limits,
         progress,
     )?;
-    let chosen_args = chosen.as_ref().map(|c| (c.level(), c.model(&args.model)));
-    let (level, model) = match &chosen_args {
-        Some((level, model)) => (level, model),
-        None => (&args.level, &args.model),
+    let chosen_args = chosen.as_ref().map(|c| (c.detail(), c.model(&args.model)));
+    let (detail, model) = match &chosen_args {
+        Some((detail, model)) => (detail, model),
+        None => (&args.detail, &args.model),
     };
     pipe::each(
         input,
-        level,
+        detail,
         model,
         limits,
         true,

@@ -8,13 +8,19 @@ use super::args::Info;
 use super::table::{count, table};
 use super::{Failure, Result, load};
 
-/// Describes a stream as text or JSON. Needs no model; a cut or damaged stream is described with what is wrong.
+/// Describes a stream as text or JSON. A cut or damaged stream is described with what is wrong; its model is described if it is the one at hand.
 pub fn run(args: &Info, limits: &Limits) -> Result<String> {
     let bytes = load::bytes(&args.input)?;
     let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
     let header = stream.header();
     let whole = stream.levels().len();
     let model: String = header.model.iter().map(|b| format!("{b:02x}")).collect();
+    let at_hand = load::from_file(args.model.as_deref())?;
+    let known = (at_hand.id() == header.model).then(|| {
+        let shape = at_hand.shape();
+        let heads: Vec<_> = shape.heads().iter().map(ToString::to_string).collect();
+        (shape.name.clone(), heads)
+    });
     let levels = || {
         (header.base..)
             .zip(header.voxels.iter().zip(&header.sections))
@@ -39,6 +45,8 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             "levels": levels,
             "total_bytes": bytes.len(),
             "model": model,
+            "model_name": known.as_ref().map(|(name, _)| name),
+            "heads": known.as_ref().map(|(_, heads)| heads),
             "origin": header.placement.origin,
             "voxel_size": header.placement.voxel_size,
             "damage": stream.damage().map(ToString::to_string),
@@ -70,11 +78,16 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
         ]);
     }
     let mut text = format!(
-        "{} points at {} bits, {} bytes, model {model}\n{}",
+        "{} points at {} bits, {} bytes, model {model}\n{}{}\n",
         count(header.points),
         header.bits,
         count(bytes.len() as u64),
         table(&rows),
+        match (&known, &args.model) {
+            (Some((name, heads)), _) => format!("model {name}, heads: {}", heads.join(", ")),
+            (None, None) => "the model is not the one inside the program".into(),
+            (None, Some(path)) => format!("the model is not {}", path.display()),
+        },
     );
     if let Some(damage) = stream.damage() {
         text += &format!("damage: {damage}\n");

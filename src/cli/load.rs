@@ -6,12 +6,12 @@ use std::path::Path;
 use b2p::decoder::Decoder;
 use b2p::gaussians::{Frame, Gaussians, ply};
 use b2p::log::Log;
-use b2p::network::Model;
+use b2p::network::{Heads, Model};
 use b2p::pixels::Explanation;
 use b2p::projection::Camera;
 use b2p::{Error, Isa, Limits, UnknownIsa};
 
-use super::args::{LevelArg, ModelArg};
+use super::args::{DetailArg, ModelArg};
 use super::{Failure, Result, pipe};
 
 /// A stream or Gaussians, told apart by their first bytes.
@@ -20,17 +20,32 @@ pub const PLY_MAGIC: &[u8] = b"ply";
 /// The environment variable that says which instructions to use when the arguments don't.
 const ISA: &str = "B2P_ISA";
 
-/// The model in a file, or the one inside the program, set to the instructions and the precision asked for.
+/// The model in a file, or the one inside the program.
+pub fn from_file(path: Option<&Path>) -> Result<Model> {
+    match path {
+        Some(path) => Model::open(path).map_err(Failure::in_file(path)),
+        None => Ok(Model::from_bytes(b2p::embedded::MODEL)?),
+    }
+}
+
+/// The same, set to the instructions and the precision asked for.
 pub fn model(arg: &ModelArg) -> Result<Model> {
-    let model = match &arg.model {
-        Some(path) => Model::open(path).map_err(Failure::in_file(path))?,
-        None => Model::from_bytes(b2p::embedded::MODEL)?,
-    };
+    let model = from_file(arg.model.as_deref())?;
     let model = model.with_isa(isa(arg.isa.as_deref())?);
     match &arg.precision {
         Some(name) => Ok(model.with_precision(name.parse()?)?),
         None => Ok(model),
     }
+}
+
+/// What decodes with a model under limits, with the heads asked for.
+pub fn decoder<'m>(
+    model: &'m Model,
+    detail: &DetailArg,
+    limits: &Limits,
+) -> b2p::Result<Decoder<&'m Model>> {
+    let decoder = Decoder::new(model).with_limits(limits.clone());
+    decoder.with_heads(detail.heads)
 }
 
 /// The instructions of that name; without one, what the environment names, or the best of this machine.
@@ -64,20 +79,18 @@ pub fn bytes(path: &Path) -> Result<Vec<u8>> {
 /// Gaussians from a stream, or as they stand in a PLY.
 pub fn gaussians(
     path: &Path,
-    level: &LevelArg,
+    detail: &DetailArg,
     model_arg: &ModelArg,
     limits: &Limits,
     log: &mut Log,
 ) -> Result<Gaussians> {
     let bytes = bytes(path)?;
     if bytes.starts_with(PLY_MAGIC) {
-        return ply(path, &bytes, level, limits, log);
+        return ply(path, &bytes, detail, limits, log);
     }
     let model = model(model_arg)?;
-    Decoder::new(&model)
-        .with_limits(limits.clone())
-        .decode(&bytes, level.level, log)
-        .map_err(Failure::in_file(path))
+    let gaussians = decoder(&model, detail, limits)?.decode(&bytes, detail.level, log);
+    gaussians.map_err(Failure::in_file(path))
 }
 
 /// Where Gaussians come from.
@@ -97,14 +110,14 @@ impl<'p> Source<'p> {
     /// Reads a file.
     pub fn open(
         path: &'p Path,
-        level: &LevelArg,
+        detail: &DetailArg,
         model_arg: &ModelArg,
         limits: &'p Limits,
         log: &mut Log,
     ) -> Result<Self> {
         let bytes = bytes(path)?;
         if bytes.starts_with(PLY_MAGIC) {
-            return Ok(Source::Gaussians(ply(path, &bytes, level, limits, log)?));
+            return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
         }
         let model = Box::new(model(model_arg)?);
         Ok(Source::Stream {
@@ -134,7 +147,7 @@ impl<'p> Source<'p> {
     /// The Gaussians of `level`; without one, of what `cameras` can show, and why that level.
     pub fn gaussians(
         self,
-        level: &LevelArg,
+        detail: &DetailArg,
         cameras: &[Camera],
         log: &mut Log,
     ) -> Result<(Gaussians, Explanation)> {
@@ -154,18 +167,18 @@ impl<'p> Source<'p> {
                 limits,
             } => (path, bytes, model, limits),
         };
-        let decoder = Decoder::new(&*model).with_limits(limits.clone());
+        let decoder = decoder(&model, detail, limits)?;
         let fail = Failure::in_file(path);
-        let seen = match level.level {
+        let seen = match detail.level {
             Some(_) => None,
             None => decoder.level_for(&bytes, cameras).map_err(&fail)?,
         };
-        let why = match (level.level, seen) {
+        let why = match (detail.level, seen) {
             (Some(level), _) => format!("level {level}, forced"),
             (None, Some(level)) => format!("level {level}: its voxels already fall under a pixel"),
             (None, None) => "as fine as there is".into(),
         };
-        let gaussians = decoder.decode(&bytes, level.level.or(seen), log);
+        let gaussians = decoder.decode(&bytes, detail.level.or(seen), log);
         Ok((gaussians.map_err(&fail)?, explain(seen.is_some(), why)))
     }
 }
@@ -174,13 +187,17 @@ impl<'p> Source<'p> {
 pub fn ply(
     path: &Path,
     bytes: &[u8],
-    level: &LevelArg,
+    detail: &DetailArg,
     limits: &Limits,
     log: &mut Log,
 ) -> Result<Gaussians> {
-    if level.level.is_some() {
+    let asked = [
+        ("--level", detail.level.is_some()),
+        ("--heads", detail.heads != Heads::Best),
+    ];
+    if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
         return Err(Failure(format!(
-            "{}: --level is for streams, this is a PLY",
+            "{}: {name} is for streams, this is a PLY",
             path.display()
         )));
     }

@@ -4,14 +4,14 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 
-use b2p::decoder::{Decoder, Decoding};
+use b2p::decoder::Decoding;
 use b2p::error::Stage;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
 use b2p::network::Model;
 use b2p::{Error, Limits};
 
-use super::args::{LevelArg, ModelArg};
+use super::args::{DetailArg, ModelArg};
 use super::{Failure, Result, load};
 
 /// The input that is standard input, and the output that is standard output.
@@ -30,7 +30,7 @@ pub type Show<'a> = dyn FnMut(&Gaussians, &mut Log) -> Result<()> + 'a;
 /// meanwhile; and if the stream is cut and no level was named, what its finest whole level has.
 pub fn each(
     path: &Path,
-    level: &LevelArg,
+    detail: &DetailArg,
     model_arg: &ModelArg,
     limits: &Limits,
     early: bool,
@@ -38,7 +38,7 @@ pub fn each(
     show: &mut Show,
 ) -> Result<()> {
     if path != Path::new(PIPE) {
-        let gaussians = load::gaussians(path, level, model_arg, limits, log)?;
+        let gaussians = load::gaussians(path, detail, model_arg, limits, log)?;
         return show(&gaussians, log);
     }
     let pieces = pieces();
@@ -53,11 +53,10 @@ pub fn each(
         for piece in pieces {
             start.extend(piece.map_err(broken)?);
         }
-        return show(&load::ply(path, &start, level, limits, log)?, log);
+        return show(&load::ply(path, &start, detail, limits, log)?, log);
     }
     let model = load::model(model_arg)?;
-    let decoder = Decoder::new(&model).with_limits(limits.clone());
-    let mut decoding = decoder.start(level.level);
+    let mut decoding = load::decoder(&model, detail, limits)?.start(detail.level);
     let mut shown = None;
     let in_pipe = Failure::in_file(path);
     let mut piece = Some(start);
@@ -83,7 +82,7 @@ pub fn each(
                 stage: Stage::Bitstream,
                 ..
             },
-        ) if level.level.is_none() && decoding.is_drawable() => {
+        ) if detail.level.is_none() && decoding.is_drawable() => {
             let finest = decoding.level().unwrap_or_default();
             let what = format!("what follows is level {finest}, the finest that is whole");
             eprintln!("b2p: {}: {error}; {what}", path.display());

@@ -46,7 +46,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
         };
         pipe::each(
             &args.input,
-            &args.level,
+            &args.detail,
             &args.model,
             limits,
             early,
@@ -59,15 +59,15 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
     let task = Task::Picture { pixels };
     let (budget, input) = (&args.budget, &args.input);
     let chosen = budget::choose(budget, &args.model, input, task, limits, progress)?;
-    let chosen_args = chosen.as_ref().map(|c| (c.level(), c.model(&args.model)));
-    let (level, model) = match &chosen_args {
-        Some((level, model)) => (level, model),
-        None => (&args.level, &args.model),
+    let chosen_args = chosen.as_ref().map(|c| (c.detail(), c.model(&args.model)));
+    let (detail, model) = match &chosen_args {
+        Some((detail, model)) => (detail, model),
+        None => (&args.detail, &args.model),
     };
-    let source = Source::open(input, level, model, limits, &mut log)?;
+    let source = Source::open(input, detail, model, limits, &mut log)?;
     let cameras = asked_for(args, &source.frame()?)?;
     let views: Vec<Camera> = cameras.iter().map(|(_, camera)| *camera).collect();
-    let (gaussians, detail) = source.gaussians(level, &views, &mut log)?;
+    let (gaussians, detail) = source.gaussians(detail, &views, &mut log)?;
     let drawing = Drawing {
         args,
         quality: chosen.as_ref().map_or(args.quality, |c| c.choice.quality),

@@ -1,5 +1,9 @@
 //! `b2p tradeoff`: what accuracy costs in time on this machine.
 
+use b2p::cloud::{ColouredVoxels, PointCloud, voxelise};
+use b2p::encoder;
+use b2p::log::Log;
+use b2p::network::Model;
 use b2p::tradeoff::{self, Options, Report, Row, Spread, Subject, Verdict};
 use b2p::{Error, Limits, embedded, output};
 
@@ -18,9 +22,22 @@ pub fn run(args: &Tradeoff, limits: &Limits, progress: &Progress) -> Result<Stri
         Some(path) => load::bytes(path)?,
         None => embedded::MODEL.to_vec(),
     };
+    let in_input = |error| match &args.input {
+        Some(path) => Failure::in_file(path)(error),
+        None => Failure::from(error),
+    };
+    let (stream, cloud) = match stream.starts_with(load::PLY_MAGIC) {
+        true => {
+            progress.say("encode");
+            let (stream, cloud) = coded(&stream, &file, limits).map_err(in_input)?;
+            (stream, Some(cloud))
+        }
+        false => (stream, None),
+    };
     let subject = Subject {
         stream: &stream,
-        model: &|| b2p::network::Model::from_bytes(&file),
+        model: &|| Model::from_bytes(&file),
+        cloud: cloud.as_ref(),
         limits,
     };
     let options = Options {
@@ -29,10 +46,7 @@ pub fn run(args: &Tradeoff, limits: &Limits, progress: &Progress) -> Result<Stri
         repeats: args.repeat,
     };
     let report = tradeoff::run(&subject, &options, &|step| progress.say(step));
-    let report = report.map_err(|error| match &args.input {
-        Some(path) => Failure::in_file(path)(error),
-        None => Failure::from(error),
-    })?;
+    let report = report.map_err(in_input)?;
     std::fs::create_dir_all(&args.output).map_err(|source| Error::Io {
         path: args.output.clone(),
         source,
@@ -59,6 +73,14 @@ pub fn run(args: &Tradeoff, limits: &Limits, progress: &Progress) -> Result<Stri
     Ok(text)
 }
 
+/// A point cloud's stream, and its voxels.
+fn coded(ply: &[u8], model: &[u8], limits: &Limits) -> b2p::Result<(Vec<u8>, ColouredVoxels)> {
+    let cloud = voxelise(&PointCloud::from_ply(ply, limits)?, None)?;
+    let (model, log) = (Model::from_bytes(model)?, &mut Log::default());
+    let coded = encoder::encode(&cloud, &model, &encoder::Options::default(), log)?;
+    Ok((coded.bytes, cloud))
+}
+
 fn summary(report: &Report) -> String {
     let [width, height] = report.size;
     let mut text = format!(
@@ -81,6 +103,9 @@ fn summary(report: &Report) -> String {
         "MB at most",
     ];
     let mut rows = vec![head.map(String::from).to_vec()];
+    if report.ladder.iter().any(|row| row.cloud_psnr.is_some()) {
+        rows[0].push("PSNR, cloud".into());
+    }
     rows.extend(report.ladder.iter().map(line));
     text += &table(&rows);
     rows.truncate(1);
@@ -136,7 +161,7 @@ fn line(row: &Row) -> Vec<String> {
         let same = if verdict == Verdict::Same { "~" } else { "" };
         format!("{same}{:.1}", spread.median)
     };
-    vec![
+    let mut cells = vec![
         row.name(),
         time(row.decode, row.decode_verdict),
         time(row.picture, row.picture_verdict),
@@ -144,5 +169,7 @@ fn line(row: &Row) -> Vec<String> {
         row.ms_ssim.map_or("-".into(), |s| format!("{s:.5}")),
         format!("{:.2}", row.worst),
         (row.most_memory / 1_000_000).to_string(),
-    ]
+    ];
+    cells.extend(row.cloud_psnr.map(|db| format!("{db:.2}")));
+    cells
 }

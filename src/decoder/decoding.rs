@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
-use crate::network::{Model, Module, Pool};
+use crate::network::{Heads, Model, Module, Pool};
 
 /// Where decoding is to end.
 #[derive(Debug, Clone, Copy)]
@@ -141,6 +141,15 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
         self.reached.as_ref().map(|reached| reached.level)
     }
 
+    /// Generates Gaussians with other heads of the model from now on; what has been decoded stays.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if the model has no such heads.
+    pub fn set_heads(&mut self, heads: Heads) -> Result<()> {
+        self.decoder = self.decoder.clone().with_heads(heads)?;
+        Ok(())
+    }
+
     /// Whether the level reached has Gaussians: [`Decoding::gaussians`] will not fail with [`Error::Unsupported`].
     pub fn is_drawable(&self) -> bool {
         let level = self.level();
@@ -174,17 +183,18 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
         decoder.cancel.check()?;
         let role = usize::from(level - header.base);
         let shape = decoder.model.shape();
-        let children = shape.head(role).map_or(1, |head| head.children);
+        let heads = decoder.heads;
+        let children = shape.head(role, heads).map_or(1, |head| head.children);
         let voxels = reached.exact.octree.level(level);
         let raw = log.step(
-            Module::Gaussians(role).at(level),
+            Module::Gaussians(role, heads).at(level),
             voxels.len(),
             "voxels",
             || {
                 let Reached { exact, map, .. } = reached;
                 let mut pool = self.take_pool();
                 let model = &decoder.model;
-                let raw = model.generate_in(&mut pool, role, &exact.features, map);
+                let raw = model.generate_in(&mut pool, heads, role, &exact.features, map);
                 self.return_pool(pool);
                 raw
             },

@@ -43,7 +43,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         // Context, four tensors of a block, latents with their means and scales.
         let exact = parents * features + voxels * (MAP + 16 + 10 * c + 7 * k);
         let base = counts().next().unwrap_or(0) * shape.base_bytes() as u64;
-        let head = shape.head(levels - 1).map_or(0, |head| {
+        let head = shape.head(levels - 1, self.heads).map_or(0, |head| {
             let (h, children) = (head.channels as u64, head.children as u64);
             let (at_once, map) = match children {
                 1 => (voxels, MAP),

@@ -19,7 +19,7 @@ use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::Octree;
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::Model;
+use crate::network::{Heads, Model};
 #[cfg(feature = "render")]
 use crate::projection::Camera;
 pub use decoding::Decoding;
@@ -29,6 +29,7 @@ use decoding::Goal;
 #[derive(Debug, Clone)]
 pub struct Decoder<M> {
     model: M,
+    heads: Heads,
     limits: Limits,
     cancel: Cancel,
 }
@@ -45,13 +46,24 @@ pub struct Exact {
 }
 
 impl<M: Deref<Target = Model> + Clone> Decoder<M> {
-    /// A decoder with default limits.
+    /// A decoder with default limits and the model's best heads.
     pub fn new(model: M) -> Self {
         Decoder {
             model,
+            heads: Heads::Best,
             limits: Limits::default(),
             cancel: Cancel::default(),
         }
+    }
+
+    /// The same decoder with other heads of the model. Only Gaussians differ by them.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if the model has no such heads.
+    pub fn with_heads(mut self, heads: Heads) -> Result<Self> {
+        self.model.check_heads(heads)?;
+        self.heads = heads;
+        Ok(self)
     }
 
     /// The same decoder under other limits.
@@ -134,9 +146,9 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     }
 
     fn drawable(&self, header: &Header) -> impl Iterator<Item = u8> {
-        let (base, top) = (header.base, header.top);
-        (base..=top)
-            .filter(move |level| self.model.shape().head(usize::from(level - base)).is_some())
+        let (base, top, shape) = (header.base, header.top, self.model.shape());
+        let head = move |level: u8| shape.head(usize::from(level - base), self.heads);
+        (base..=top).filter(move |level| head(*level).is_some())
     }
 
     /// Fails with [`Error::Unsupported`] unless the model has a head for `level`.

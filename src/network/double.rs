@@ -3,9 +3,9 @@
 use b2p_kernels::reference::tap;
 use b2p_kernels::{Isa, Output, Taps};
 
-use super::Model;
 use super::layers::{Conv, Pool};
 use super::stored::Stored;
+use super::{Heads, Model};
 use crate::error::Result;
 use crate::geometry::KernelMap;
 
@@ -113,16 +113,22 @@ impl Conv for Double {
 }
 
 impl Model {
-    /// As [`Model::generate`], with the weights of the file and everything else in double precision, rounded to `f32` at the end: slow,
+    /// As [`Model::generate_with`], with the weights of the file and everything else in double precision, rounded to `f32` at the end: slow,
     /// and what [`super::Precision`]s are measured against.
     ///
     /// # Errors
-    /// As [`Model::generate`].
+    /// As [`Model::generate_with`].
     ///
     /// # Panics
     /// If `g` and `map` disagree in length.
-    pub fn generate_in_double(&self, role: usize, g: &[i16], map: &KernelMap) -> Result<Vec<f32>> {
-        let generator = self.generator(role)?;
+    pub fn generate_in_double(
+        &self,
+        heads: Heads,
+        role: usize,
+        g: &[i16],
+        map: &KernelMap,
+    ) -> Result<Vec<f32>> {
+        let generator = self.generator(role, heads)?;
         self.check(g, self.shape.channels, map);
         let step = f64::from(self.g_scale[role]);
         let g: Vec<f64> = g.iter().map(|&q| f64::from(q) * step).collect();

@@ -8,8 +8,8 @@ use b2p_kernels::{ExactConv, FloatConv, Taps, zeros};
 use rayon::prelude::*;
 
 use super::children::{Part, Parts};
+use super::heads::{Head, Heads};
 use super::layers::{Conv, Pool, apply, apply_f32, reals};
-use super::shape::Head;
 use super::stored::Stored;
 use super::structure::{Generate, RAW};
 use super::{Model, missing};
@@ -86,6 +86,11 @@ impl Generator {
         self.scales.is_some()
     }
 
+    #[cfg(test)]
+    pub fn is_ready(&self) -> bool {
+        self.float.get().is_some() || self.integer.get().is_some()
+    }
+
     /// The same of layers that take reals, made by `make`.
     pub fn of_layers<L>(&self, make: impl Fn(&Stored) -> L) -> Generate<L> {
         let any = vec![1.0; self.stored.head.scales()];
@@ -104,28 +109,47 @@ impl Generator {
 }
 
 impl Model {
+    /// [`Model::generate_with`] the best heads.
+    ///
+    /// # Errors
+    /// Those of [`Model::generate_with`].
+    ///
+    /// # Panics
+    /// If `g` and `map` disagree in length.
+    pub fn generate(&self, role: usize, g: &[i16], map: &KernelMap) -> Result<Vec<f32>> {
+        self.generate_with(Heads::Best, role, g, map)
+    }
+
     /// The raw parameters of the Gaussians of a role's level, [`RAW`] numbers each: see [`crate::gaussians::activate`].
     ///
     /// `g` holds its features [voxels, C], `map` is its 3³ kernel map. Role 2 gives one Gaussian per voxel, role 1 eight, those of
     /// all eight children of the first voxel first. All numbers are finite.
     ///
     /// # Errors
-    /// [`crate::Error::Unsupported`], naming the roles that have one, if the model has no generator for `role`.
+    /// [`crate::Error::Unsupported`], naming the roles that have one, if the model has no such generator for `role`.
     ///
     /// # Panics
     /// If `g` and `map` disagree in length.
-    pub fn generate(&self, role: usize, g: &[i16], map: &KernelMap) -> Result<Vec<f32>> {
-        self.generate_in(&mut Pool::new(), role, g, map)
-    }
-
-    pub(crate) fn generate_in(
+    pub fn generate_with(
         &self,
-        pool: &mut Pool<i16>,
+        heads: Heads,
         role: usize,
         g: &[i16],
         map: &KernelMap,
     ) -> Result<Vec<f32>> {
-        let generator = self.generator(role)?;
+        self.generate_in(&mut Pool::new(), heads, role, g, map)
+    }
+
+    /// [`Model::generate_with`] the memory of a pool.
+    pub(crate) fn generate_in(
+        &self,
+        pool: &mut Pool<i16>,
+        heads: Heads,
+        role: usize,
+        g: &[i16],
+        map: &KernelMap,
+    ) -> Result<Vec<f32>> {
+        let generator = self.generator(role, heads)?;
         // A residual block's input, inner rows and output.
         pool.keep(3);
         self.check(g, self.shape.channels, map);
@@ -141,11 +165,14 @@ impl Model {
     }
 
     /// The generator of a role.
-    pub(super) fn generator(&self, role: usize) -> Result<&Generator> {
-        let of_role = |generator: &&Generator| generator.head().role == role;
-        self.generators.iter().find(of_role).ok_or_else(|| {
-            let roles = self.generators.iter().map(|gg| gg.head().role.to_string());
-            let roles: Vec<_> = roles.collect();
+    pub(super) fn generator(&self, role: usize, heads: Heads) -> Result<&Generator> {
+        let of_set = || self.generators.iter().filter(|gg| gg.head().heads == heads);
+        let found = of_set().find(|gg| gg.head().role == role);
+        found.ok_or_else(|| {
+            let roles: Vec<_> = of_set().map(|gg| gg.head().role.to_string()).collect();
+            if roles.is_empty() {
+                return no_such_heads(heads);
+            }
             missing(
                 "drawing this level",
                 format!(
@@ -154,6 +181,18 @@ impl Model {
                 ),
             )
         })
+    }
+
+    /// Fails unless the model has these heads.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`].
+    pub fn check_heads(&self, heads: Heads) -> Result<()> {
+        // A model without any head at all has none to be missed.
+        match heads == Heads::Best || self.shape.heads().contains(&heads) {
+            true => Ok(()),
+            false => Err(no_such_heads(heads)),
+        }
     }
 
     /// What a generator makes of features; the children of so many voxels at once.
@@ -234,6 +273,11 @@ impl Model {
     }
 }
 
+fn no_such_heads(heads: Heads) -> Error {
+    let detail = format!("the model has no {heads} heads");
+    missing("generating Gaussians with these heads", detail)
+}
+
 /// Voxels whose children are generated at once. Fewer need less memory, and more time for the rings around them: of a body's 59,046 voxels at
 /// level 8 (`lite`) parts of 16,384 take 165 MB in all and an eighth longer than all at once with 249 MB.
 const PART: usize = 32768;
@@ -263,7 +307,7 @@ mod tests {
             let model = Model::from_bytes(&untrained(&shape, 7)).unwrap();
             let g = (0..map.len() * shape.channels).map(|i| (i * 7919 % 3001) as i16 - 1500);
             let g: Vec<i16> = g.collect();
-            let generator = model.generator(1).unwrap();
+            let generator = model.generator(1, Heads::Best).unwrap();
             let integer = generator.integer(generator.scales.as_ref().unwrap());
             let whole = model.run_generator(&mut Pool::new(), integer, &g, map, map.len());
             let real = reals(model.isa, &g, model.g_scale[1]);

@@ -33,8 +33,8 @@
 //! `.bias` f32 and, if geometry-invariant, `.gain` f32. The names are those in `structure.rs`. `g_scale[r]` is the real value of
 //! one step of role r's features `g`, `c_scale[r]` that of its context. `gg.r.scale`, which may be left out, has the same for a generator:
 //! of the chain of residual blocks before layer 4 (what enters it, every branch, every sum), of the inside of each of its blocks, and
-//! of the same after layer 4. Tables: see [`crate::entropy::Tables`]. A file without
-//! `fc.*` and `fs.*` can decode only.
+//! of the same after layer 4. Where `gg` of the metadata has further generators that say `"heads": "quick"`, their layers are `gg.quick.r.*`
+//! ([`Heads`]). Tables: see [`crate::entropy::Tables`]. A file without `fc.*` and `fs.*` can decode only.
 
 mod base;
 mod children;
@@ -44,6 +44,7 @@ mod convert;
 mod double;
 mod exact;
 mod generate;
+mod heads;
 mod layers;
 mod load;
 #[cfg(test)]
@@ -69,8 +70,9 @@ use structure::{Encoder, Exact, Generate};
 
 pub(crate) use generate::AT_ONCE;
 pub use generate::Precision;
+pub use heads::{Head, Heads};
 pub(crate) use layers::Pool;
-pub use shape::{Head, Shape, Upsample};
+pub use shape::{Shape, Upsample};
 pub use structure::{RAW, ROLES};
 pub use untrained::untrained;
 pub use work::{Module, Work};
@@ -145,8 +147,8 @@ impl Model {
         let lacks = |generator: &&Generator| !generator.has_integers();
         match self.generators.iter().find(lacks) {
             Some(generator) if precision == Precision::Int16 => {
-                let role = generator.head().role;
-                let detail = format!("the model has no tensor gg.{role}.scale");
+                let module = generator.head().module();
+                let detail = format!("the model has no tensor {module}.scale");
                 Err(missing("generating Gaussians in integers", detail))
             }
             _ => Ok(Model { precision, ..self }),
@@ -223,7 +225,7 @@ fn generators(tensors: &Tensors, shape: &Shape, g_scale: &[f32]) -> Result<Vec<G
     let stored = shape.generators(&mut |spec| tensors.stored_layer(spec))?;
     let generator = |stored: Generate<Stored>| {
         let role = stored.head.role;
-        let name = format!("gg.{role}.scale");
+        let name = format!("{}.scale", stored.head.module());
         let scales = match tensors.has(&name) {
             true => Some(scales(tensors, &name, stored.head.scales(), 0)?),
             false => None,

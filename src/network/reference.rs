@@ -6,6 +6,7 @@ use std::collections::HashMap;
 
 use b2p_kernels::f16;
 
+use super::heads::Heads;
 use super::load::{Element, Tensors};
 use super::shape::Upsample;
 use super::structure::{
@@ -372,7 +373,7 @@ impl Oracle {
     }
 
     /// From features in integer steps to raw numbers.
-    pub fn generate(&self, role: usize, at: &Sites, g: &Rows) -> Rows {
+    pub fn generate(&self, heads: Heads, role: usize, at: &Sites, g: &Rows) -> Rows {
         let Generate {
             head,
             conv_in,
@@ -383,7 +384,7 @@ impl Oracle {
         } = self
             .generators
             .iter()
-            .find(|gg| gg.head.role == role)
+            .find(|gg| (gg.head.role, gg.head.heads) == (role, heads))
             .unwrap();
         let scale = f64::from(self.g_scale[role]);
         let g: Rows = g

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::heads::{Head, Heads};
 use crate::error::{Error, Result, Stage};
 
 /// Everything that a model file says of the network beside its tensors. Other keys of the file are ignored.
@@ -25,7 +26,7 @@ pub struct Shape {
     pub pem_blocks: usize,
     /// Inception blocks of each feature reconstruction (FR).
     pub fr_blocks: usize,
-    /// The Gaussian generators (GG).
+    /// The Gaussian generators (GG): one for each role that has Gaussians, and if there are quick ones, another for each of these.
     pub gg: Vec<Head>,
     /// How a feature gets to the children.
     pub upsample: Upsample,
@@ -48,28 +49,6 @@ pub struct Shape {
     /// The weight of distortion against rate that the model was trained with.
     #[serde(default, rename = "lambda", skip_serializing_if = "Option::is_none")]
     pub lambda: Option<f64>,
-}
-
-/// One Gaussian generator.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Head {
-    /// Which level's features it reads: 1 or 2 above the base level.
-    pub role: usize,
-    /// Its channels.
-    pub channels: usize,
-    /// Residual blocks before the fourth layer.
-    pub blocks_before: usize,
-    /// Residual blocks after it.
-    pub blocks_after: usize,
-    /// Gaussians per voxel: 8 for role 1, 1 for role 2.
-    pub children: usize,
-}
-
-impl Head {
-    /// How many scales a generator needs to run in integers: two chains, and the inside of every block.
-    pub(super) fn scales(&self) -> usize {
-        2 + self.blocks_before + self.blocks_after
-    }
 }
 
 /// How a feature gets to the children.
@@ -98,6 +77,7 @@ impl Shape {
             blocks_before: 1,
             blocks_after: 1,
             children,
+            heads: Heads::Best,
         };
         Shape {
             format: 1,
@@ -120,6 +100,22 @@ impl Shape {
             opacity_bias: 2.0,
             lambda: None,
         }
+    }
+
+    /// The same with quick heads as well: those it has, of 4 channels and without blocks before the fourth layer.
+    pub fn with_quick_heads(mut self) -> Self {
+        let quick: Vec<Head> = self
+            .gg
+            .iter()
+            .map(|head| Head {
+                channels: 4,
+                blocks_before: 0,
+                heads: Heads::Quick,
+                ..head.clone()
+            })
+            .collect();
+        self.gg.extend(quick);
+        self
     }
 
     /// Reads the metadata's JSON.
@@ -152,8 +148,15 @@ impl Shape {
     }
 
     /// The head of a role.
-    pub fn head(&self, role: usize) -> Option<&Head> {
-        self.gg.iter().find(|head| head.role == role)
+    pub fn head(&self, role: usize, heads: Heads) -> Option<&Head> {
+        let wanted = |head: &&Head| (head.role, head.heads) == (role, heads);
+        self.gg.iter().find(wanted)
+    }
+
+    /// The sets of heads that there are, the default first.
+    pub fn heads(&self) -> Vec<Heads> {
+        let has = |heads: &Heads| self.gg.iter().any(|head| head.heads == *heads);
+        Heads::ALL.into_iter().filter(has).collect()
     }
 
     /// What of the shape bears on the decoded bits, in a form that is hashed.
@@ -251,12 +254,21 @@ impl Shape {
         )?;
         for (i, head) in self.gg.iter().enumerate() {
             let field = |name: &str| format!("gg[{i}].{name}");
-            let alone = self.gg[..i].iter().all(|other| other.role != head.role);
+            let before = |heads| {
+                let mut before = self.gg[..i].iter();
+                before.any(|other| (other.role, other.heads) == (head.role, heads))
+            };
             require(
-                alone && matches!(head.role, 1 | 2),
+                !before(head.heads) && matches!(head.role, 1 | 2),
                 &field("role"),
                 &head.role,
                 "1 or 2, each once",
+            )?;
+            require(
+                head.heads == Heads::Best || before(Heads::Best),
+                &field("heads"),
+                &head.heads,
+                "quick for a role that has its best before it",
             )?;
             let children = if head.role == 1 { 8 } else { 1 };
             require(
@@ -279,7 +291,19 @@ impl Shape {
                 "at most 16",
             )?;
         }
-        Ok(())
+        let of = |heads| {
+            self.gg
+                .iter()
+                .filter(move |head| head.heads == heads)
+                .count()
+        };
+        let quick = of(Heads::Quick);
+        require(
+            quick == 0 || quick == of(Heads::Best),
+            "gg",
+            &format!("{quick} quick heads"),
+            "none, or one for each role that has Gaussians",
+        )
     }
 }
 
@@ -288,7 +312,11 @@ mod tests {
     use super::*;
 
     fn altered(field: &str, value: &str) -> Result<Shape> {
-        let mut json: serde_json::Value = serde_json::from_str(&Shape::tiny().to_json()).unwrap();
+        altered_from(Shape::tiny(), field, value)
+    }
+
+    fn altered_from(shape: Shape, field: &str, value: &str) -> Result<Shape> {
+        let mut json: serde_json::Value = serde_json::from_str(&shape.to_json()).unwrap();
         *json.pointer_mut(field).unwrap() = serde_json::from_str(value).unwrap();
         Shape::from_json(&json.to_string())
     }
@@ -299,6 +327,52 @@ mod tests {
             Shape::from_json(&Shape::tiny().to_json()).unwrap(),
             Shape::tiny()
         );
+    }
+
+    #[test]
+    fn quick_heads_stand_beside_the_best_and_are_found_by_role() {
+        let shape = Shape::tiny().with_quick_heads();
+        let json = shape.to_json();
+        assert_eq!(json.matches("\"heads\":\"quick\"").count(), 2, "{json}");
+        assert!(!json.contains("best"), "{json}");
+        assert_eq!(Shape::from_json(&json).unwrap(), shape);
+        assert_eq!(shape.heads(), Heads::ALL);
+        assert_eq!(Shape::tiny().heads(), [Heads::Best]);
+        for role in [1, 2] {
+            for heads in Heads::ALL {
+                let head = shape.head(role, heads).unwrap();
+                assert_eq!((head.role, head.heads), (role, heads));
+            }
+            assert_eq!(Shape::tiny().head(role, Heads::Quick), None);
+        }
+    }
+
+    #[test]
+    fn marks_that_are_unknown_or_fit_nothing_are_refused() {
+        let both = || Shape::tiny().with_quick_heads();
+        for (field, value, word) in [
+            ("/gg/2/heads", "\"fast\"", "fast"),
+            ("/gg/2/heads", "3", "heads"),
+            ("/gg/2/heads", "null", "description"),
+            ("/gg/2/heads", "\"best\"", "role"),
+            ("/gg/2/role", "2", "role"),
+            ("/gg/2/children", "1", "children"),
+            ("/gg/3/channels", "6", "channels"),
+        ] {
+            let error = altered_from(both(), field, value).unwrap_err();
+            assert!(matches!(error, Error::Malformed { .. }), "{error}");
+            assert!(error.to_string().contains(word), "{field}: {error}");
+        }
+        let mut alone = both();
+        alone.gg.remove(0);
+        let mut first = both();
+        first.gg.rotate_left(2);
+        let mut one = both();
+        one.gg.pop();
+        for (shape, word) in [(alone, "heads"), (first, "heads"), (one, "1 quick heads")] {
+            let error = Shape::from_json(&shape.to_json()).unwrap_err().to_string();
+            assert!(error.contains(word), "{error}");
+        }
     }
 
     #[test]

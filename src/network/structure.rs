@@ -3,7 +3,8 @@
 //! Written once, for any kind of layer `L`: the layers that run, the ones that tests compute by definition, the ones to be made up.
 //! Every constructor asks its `layer` function for one layer after the other.
 
-use super::shape::{Head, Shape, Upsample};
+use super::heads::Head;
+use super::shape::{Shape, Upsample};
 use crate::error::Result;
 
 /// Numbers per Gaussian that a generator puts out.
@@ -262,7 +263,7 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
     }
 
     fn generate(&mut self, head: &Head) -> Result<Generate<L>> {
-        let (c, module) = (head.channels, format!("gg.{}", head.role));
+        let (c, module) = (head.channels, head.module());
         Ok(Generate {
             head: head.clone(),
             conv_in: self.make(

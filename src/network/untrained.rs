@@ -25,11 +25,14 @@ pub fn untrained(shape: &Shape, seed: u64) -> Vec<u8> {
         file: Container::new([("b2p".to_owned(), shape.to_json())].into()),
     };
     let [exact, float] = layers(shape).expect("listing layers has no way to fail");
-    // The optional part comes last: with and without it, everything else is the same.
+    // Optional parts come last: with and without them, everything else is the same.
     let (base, exact): (Vec<_>, Vec<_>) = exact.iter().partition(|s| s.name.starts_with("base."));
+    let quick = |spec: &&Spec| spec.name.starts_with("gg.quick.");
+    let (quick, float): (Vec<_>, Vec<_>) = float.iter().partition(quick);
     exact.into_iter().for_each(|spec| file.exact_layer(spec));
-    float.iter().for_each(|spec| file.float_layer(spec));
+    float.into_iter().for_each(|spec| file.float_layer(spec));
     base.into_iter().for_each(|spec| file.exact_layer(spec));
+    quick.into_iter().for_each(|spec| file.float_layer(spec));
     // Half the features' range stands for ±4.
     let step = 1.0 / 256.0;
     file.put(
@@ -42,7 +45,7 @@ pub fn untrained(shape: &Shape, seed: u64) -> Vec<u8> {
     file.put("c_scale", Dtype::F32, &[ROLES], c_scale);
     for head in &shape.gg {
         let steps = vec![step.to_le_bytes(); head.scales()];
-        let name = format!("gg.{}.scale", head.role);
+        let name = format!("{}.scale", head.module());
         file.put(&name, Dtype::F32, &[head.scales()], steps);
     }
     file.table("cdf.gauss", gauss_rows());

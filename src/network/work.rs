@@ -1,5 +1,6 @@
 //! How much there is to compute: for benchmarks, and for estimates of time.
 
+use super::heads::Heads;
 use super::shape::Shape;
 use super::structure::Spec;
 use crate::geometry::KernelMap;
@@ -13,8 +14,8 @@ pub enum Module {
     Probabilities(usize),
     /// [`super::Model::reconstruct`].
     Features(usize),
-    /// [`super::Model::generate`].
-    Gaussians(usize),
+    /// [`super::Model::generate_with`].
+    Gaussians(usize, Heads),
 }
 
 impl Module {
@@ -24,7 +25,7 @@ impl Module {
             Module::Context(_) => format!("context of level {level}"),
             Module::Probabilities(_) => format!("probabilities of level {level}"),
             Module::Features(_) => format!("features of level {level}"),
-            Module::Gaussians(_) => format!("generate Gaussians of level {level}"),
+            Module::Gaussians(..) => format!("generate Gaussians of level {level}"),
         }
     }
 }
@@ -44,18 +45,18 @@ impl Shape {
     /// # Panics
     /// If `map` is not a 3³ map.
     pub fn work(&self, module: Module, map: &KernelMap) -> Work {
-        let same = Support::of(map);
-        let children = match module {
-            Module::Gaussians(role) if self.head(role).is_some_and(|h| h.children == 8) => {
-                Some(Support::of_children(map))
-            }
+        let head = match module {
+            Module::Gaussians(role, heads) => self.head(role, heads),
             _ => None,
         };
+        let eight = head.is_some_and(|head| head.children == 8);
+        let same = Support::of(map);
+        let children = eight.then(|| Support::of_children(map));
         let mut work = Work::default();
         let mut after = false;
         for spec in self.layers(module) {
             // In a generator, layer 4 is where the children come in.
-            let fourth = matches!(module, Module::Gaussians(_)) && spec.volume == 8;
+            let fourth = matches!(module, Module::Gaussians(..)) && spec.volume == 8;
             let support = match &children {
                 Some(children) if after || fourth => children,
                 _ => &same,
@@ -82,7 +83,10 @@ impl Shape {
             Module::Context(role) => format!("up.{role}"),
             Module::Probabilities(role) => format!("pem.{role}."),
             Module::Features(role) => format!("fr.{role}."),
-            Module::Gaussians(role) => format!("gg.{role}."),
+            Module::Gaussians(role, heads) => match self.head(role, heads) {
+                Some(head) => format!("{}.", head.module()),
+                None => return Vec::new(),
+            },
         };
         let mut layers = Vec::new();
         let mut note = |spec: Spec| {
@@ -165,12 +169,12 @@ mod tests {
         assert_eq!(macs(Module::Features(2)), (k + c) * c + inception + c * c);
         let raw = RAW as u64;
         assert_eq!(
-            macs(Module::Gaussians(2)),
+            macs(Module::Gaussians(2, Heads::Best)),
             c * c * (1 + 2 + 1 + 2) + c * raw
         );
         // Eight children, all neighbours of each other.
         assert_eq!(
-            macs(Module::Gaussians(1)),
+            macs(Module::Gaussians(1, Heads::Best)),
             c * c * (1 + 2 + 8 + 64 * 2) + 64 * c * raw
         );
     }

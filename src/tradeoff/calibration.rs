@@ -14,9 +14,10 @@ use super::truth::in_double;
 use crate::bitstream::Header;
 use crate::decoder::Decoder;
 use crate::error::{Error, Result};
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Frame, Gaussians, activate};
+use crate::geometry::{KernelMap, Voxels};
 use crate::log::{Log, Step};
-use crate::network::{Model, Precision};
+use crate::network::{Head, Heads, Model, Precision};
 use crate::output;
 use crate::pixels::reference::{self, Cutoffs};
 use crate::pixels::{Background, Image, Quality, Renderer};
@@ -24,10 +25,14 @@ use crate::projection::Camera;
 
 /// Times that everything is measured; medians count.
 const REPEATS: usize = 3;
-/// Sides of the pictures whose times tell what a Gaussian and what a pixel costs.
+/// Sides of the pictures whose times tell what a Gaussian and what a pixel costs; the smaller one's accuracy is measured.
 const SIDES: [u32; 2] = [320, 800];
-/// Side of the picture whose accuracy is measured.
-const JUDGED: u32 = 320;
+/// The renderer's qualities by name.
+const QUALITIES: [(&str, Quality); 3] = [
+    ("fast", Quality::Fast),
+    ("fine", Quality::Fine),
+    ("exact", Quality::Exact),
+];
 /// The accuracy, in dB, of pictures that are equal.
 const EQUAL: f64 = 200.0;
 /// What is longer is no calibration.
@@ -47,24 +52,30 @@ pub struct Calibration {
     pub threads: usize,
     /// With which model: its id, hexadecimal.
     pub model: String,
+    /// With which heads: streams of a model have one id with any.
+    pub gg: Vec<Head>,
     /// Of each role, what a voxel of its level costs in the exact zone.
     pub exact: Vec<f64>,
-    /// Each role, precision and quality.
+    /// Each role, set of heads, precision and quality.
     pub draws: Vec<DrawCost>,
 }
 
-/// What Gaussians and pictures of one role, precision and quality cost.
+/// What Gaussians and pictures of one role, set of heads, precision and quality cost.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DrawCost {
     /// How far the level lies above the base level.
     pub role: usize,
     /// Gaussians for each voxel.
     pub children: u8,
+    /// What generates Gaussians.
+    pub heads: String,
     /// Precision of the network.
     pub precision: String,
     /// Quality of the renderer.
     pub quality: String,
-    /// Nanoseconds to generate the Gaussians of a voxel.
+    /// Nanoseconds to get the heads ready, once a model …
+    pub prepare: f64,
+    /// … and to generate the Gaussians of a voxel.
     pub generate: f64,
     /// Nanoseconds to draw, for each Gaussian …
     pub per_gaussian: f64,
@@ -83,9 +94,8 @@ impl Calibration {
     pub fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
         let header = Header::parse(subject.stream, subject.limits)?;
         let model = (subject.model)()?;
-        let levels = Decoder::new(&model)
-            .with_limits(subject.limits.clone())
-            .levels(subject.stream)?;
+        let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
+        let levels = decoder.levels(subject.stream)?;
         let Some(&finest) = levels.last() else {
             return Err(Error::Usage(
                 "the stream has no level with Gaussians".into(),
@@ -93,76 +103,59 @@ impl Calibration {
         };
         say("calibrate: the truth");
         let truth = in_double(subject, &model, finest)?.0;
-        let truth = reference::render(&truth, &camera(JUDGED)?, Background::WHITE, Cutoffs::NONE);
+        let truth = reference::render(&truth, &camera(SIDES[0])?, Background::WHITE, Cutoffs::NONE);
+        say("calibrate: levels");
         let mut calibration = Calibration {
             machine: Machine::this(),
             isa: model.isa().to_string(),
             threads: rayon::current_num_threads(),
             model: model_name(&model),
-            exact: vec![0.0; header.voxels.len()],
+            gg: model.shape().gg.clone(),
+            exact: exact_costs(subject, &decoder, &header, finest)?,
             draws: Vec::new(),
         };
+        let frame = decoder.frame(subject.stream)?;
         for level in levels {
-            let role = usize::from(level - header.base);
-            let children = model.shape().head(role).map_or(1, |head| head.children);
-            for precision in Precision::ALL {
-                let precise = || (subject.model)()?.with_precision(precision);
-                if precise().is_err() {
-                    continue;
-                }
-                say(&format!("calibrate: level {level} in {precision}"));
-                let mut runs = Vec::new();
-                for _ in 0..REPEATS {
-                    let mut log = Log::default();
-                    let fresh = precise()?;
-                    let decoder = Decoder::new(&fresh).with_limits(subject.limits.clone());
-                    let gaussians = decoder.decode(subject.stream, Some(level), &mut log)?;
-                    runs.push((log.steps().to_vec(), gaussians));
-                }
-                let cost = |counts: &dyn Fn(&Step) -> bool, voxels: u32| {
-                    let sum = |(steps, _): &(Vec<Step>, Gaussians)| -> f64 {
-                        let steps = steps.iter().filter(|step| counts(step));
-                        steps.map(|step| step.time.as_nanos() as f64).sum()
+            let exact = decoder.exact(subject.stream, level, &mut Log::default())?;
+            let at = Level {
+                map: exact.octree.kernel_map(level),
+                role: usize::from(level - header.base),
+                voxels: exact.octree.level(level),
+                features: &exact.features,
+                frame,
+            };
+            // What a picture costs hardly depends on what generated the Gaussians: the first tells for all.
+            let mut costs: Option<[DrawTime; 3]> = None;
+            for heads in model.shape().heads() {
+                for precision in Precision::ALL {
+                    let precise = || (subject.model)()?.with_precision(precision);
+                    if precise().is_err() {
+                        continue;
+                    }
+                    say(&format!(
+                        "calibrate: level {level}, {heads} heads, {precision}"
+                    ));
+                    let made = at.generate(&precise, heads)?;
+                    let gaussians = &made.gaussians;
+                    let costs = match costs {
+                        Some(costs) => costs,
+                        None => *costs.insert(draw_times(subject, &model, gaussians)?),
                     };
-                    Spread::of(runs.iter().map(sum)).median / f64::from(voxels.max(1))
-                };
-                for (cost_of_role, (n, &voxels)) in calibration
-                    .exact
-                    .iter_mut()
-                    .zip((header.base..=level).zip(&header.voxels))
-                {
-                    let ending = format!(" of level {n}");
-                    *cost_of_role = cost(
-                        &|step| step.name.ends_with(&ending) && !generates(step),
-                        voxels,
-                    );
-                }
-                let generate = cost(&generates, header.voxels[role]);
-                let Some((_, gaussians)) = runs.pop() else {
-                    continue;
-                };
-                for (name, quality) in [
-                    ("fast", Quality::Fast),
-                    ("fine", Quality::Fine),
-                    ("exact", Quality::Exact),
-                ] {
-                    let draw =
-                        |side, repeats| draw(subject, &model, &gaussians, quality, side, repeats);
-                    let [small, large] = [draw(SIDES[0], REPEATS)?.0, draw(SIDES[1], REPEATS)?.0];
-                    let [few, many] = SIDES.map(|side| f64::from(side).powi(2));
-                    let count = gaussians.len().max(1) as f64;
-                    let per_pixel = ((large - small) / (many - few)).max(0.0);
-                    let error = pixels_apart(&truth, &draw(JUDGED, 1)?.1).0;
-                    calibration.draws.push(DrawCost {
-                        role,
-                        children: children as u8,
-                        precision: precision.to_string(),
-                        quality: name.into(),
-                        generate,
-                        per_gaussian: ((large - per_pixel * many) / count).max(0.0),
-                        per_pixel,
-                        psnr: psnr(error).min(EQUAL),
-                    });
+                    for ((name, quality), cost) in QUALITIES.into_iter().zip(costs) {
+                        let picture = draw(subject, &model, gaussians, quality, SIDES[0], 1)?.1;
+                        calibration.draws.push(DrawCost {
+                            role: at.role,
+                            children: made.children as u8,
+                            heads: heads.to_string(),
+                            precision: precision.to_string(),
+                            quality: name.into(),
+                            prepare: made.prepare,
+                            generate: made.per_voxel,
+                            per_gaussian: cost.per_gaussian,
+                            per_pixel: cost.per_pixel,
+                            psnr: psnr(pixels_apart(&truth, &picture).0).min(EQUAL),
+                        });
+                    }
                 }
             }
         }
@@ -198,7 +191,8 @@ impl Calibration {
         let fits = found.machine == Machine::this()
             && found.isa == model.isa().to_string()
             && found.threads == rayon::current_num_threads()
-            && found.model == model_name(model);
+            && found.model == model_name(model)
+            && found.gg == model.shape().gg;
         (fits && found.is_sound()).then_some(found)
     }
 
@@ -219,10 +213,15 @@ impl Calibration {
     }
 
     fn is_sound(&self) -> bool {
-        let numbers = self
-            .draws
-            .iter()
-            .flat_map(|d| [d.generate, d.per_gaussian, d.per_pixel, d.psnr.abs()]);
+        let numbers = self.draws.iter().flat_map(|d| {
+            [
+                d.prepare,
+                d.generate,
+                d.per_gaussian,
+                d.per_pixel,
+                d.psnr.abs(),
+            ]
+        });
         let mut numbers = numbers.chain(self.exact.iter().copied());
         self.draws.len() <= MOST_ENTRIES
             && self.exact.len() <= MOST_ENTRIES
@@ -238,8 +237,102 @@ fn model_name(model: &Model) -> String {
         .collect()
 }
 
-fn generates(step: &Step) -> bool {
-    step.name.starts_with("generate") || step.name == "activate"
+/// Of each role up to the finest level's, what a voxel of its level costs in the exact zone.
+fn exact_costs(
+    subject: &Subject<'_>,
+    decoder: &Decoder<&Model>,
+    header: &Header,
+    finest: u8,
+) -> Result<Vec<f64>> {
+    let mut runs = Vec::new();
+    for _ in 0..REPEATS {
+        let mut log = Log::default();
+        decoder.exact(subject.stream, finest, &mut log)?;
+        runs.push(log.steps().to_vec());
+    }
+    let levels = (header.base..=finest).zip(&header.voxels);
+    let cost = |(level, &voxels): (u8, &u32)| {
+        let ending = format!(" of level {level}");
+        let sum = |steps: &Vec<Step>| -> f64 {
+            let steps = steps.iter().filter(|step| step.name.ends_with(&ending));
+            steps.map(|step| step.time.as_nanos() as f64).sum()
+        };
+        Spread::of(runs.iter().map(sum)).median / f64::from(voxels.max(1))
+    };
+    Ok(levels.map(cost).collect())
+}
+
+/// A level, decoded in the exact zone.
+struct Level<'a> {
+    map: KernelMap,
+    role: usize,
+    voxels: &'a Voxels,
+    features: &'a [i16],
+    frame: Frame,
+}
+
+/// Gaussians of a level, and what they cost in nanoseconds.
+struct Made {
+    gaussians: Gaussians,
+    children: usize,
+    /// To get ready for the first voxel.
+    prepare: f64,
+    per_voxel: f64,
+}
+
+impl Level<'_> {
+    /// Generates Gaussians, each time with a model as it comes from the file.
+    fn generate(&self, model: &dyn Fn() -> Result<Model>, heads: Heads) -> Result<Made> {
+        let time = |voxels: &Voxels, features: &[i16], map: &KernelMap| {
+            let (mut times, mut made) = (Vec::new(), None);
+            for _ in 0..REPEATS {
+                let fresh = model()?;
+                let head = fresh.shape().head(self.role, heads);
+                let children = head.map_or(1, |head| head.children);
+                let start = Instant::now();
+                let raw = fresh.generate_with(heads, self.role, features, map)?;
+                let gaussians = activate(&raw, voxels, children, fresh.shape(), self.frame);
+                times.push(start.elapsed().as_nanos() as f64);
+                made = Some((gaussians, children));
+            }
+            Result::Ok((Spread::of(times).median, made.unwrap_or_default()))
+        };
+        let one = (Voxels::new(0, vec![0]), KernelMap::root());
+        let channels = self.features.len() / self.voxels.len().max(1);
+        let prepare = time(&one.0, &self.features[..channels], &one.1)?.0;
+        let (whole, (gaussians, children)) = time(self.voxels, self.features, &self.map)?;
+        Ok(Made {
+            gaussians,
+            children,
+            prepare,
+            per_voxel: (whole - prepare).max(0.0) / self.voxels.len().max(1) as f64,
+        })
+    }
+}
+
+/// Nanoseconds that a Gaussian and a pixel take to be drawn.
+#[derive(Clone, Copy, Default)]
+struct DrawTime {
+    per_gaussian: f64,
+    per_pixel: f64,
+}
+
+/// Of each of [`QUALITIES`], from pictures of two sizes.
+fn draw_times(
+    subject: &Subject<'_>,
+    model: &Model,
+    gaussians: &Gaussians,
+) -> Result<[DrawTime; 3]> {
+    let [few, many] = SIDES.map(|side| f64::from(side).powi(2));
+    let mut times = [DrawTime::default(); 3];
+    for ((_, quality), time) in QUALITIES.into_iter().zip(&mut times) {
+        let draw = |side| draw(subject, model, gaussians, quality, side, REPEATS);
+        let [small, large] = [draw(SIDES[0])?.0, draw(SIDES[1])?.0];
+        time.per_pixel = ((large - small) / (many - few)).max(0.0);
+        let rest = large - time.per_pixel * many;
+        time.per_gaussian = (rest / gaussians.len().max(1) as f64).max(0.0);
+    }
+    Ok(times)
 }
 
 fn camera(side: u32) -> Result<Camera> {
@@ -285,6 +378,7 @@ mod tests {
             isa: model.isa().to_string(),
             threads: rayon::current_num_threads(),
             model: model_name(model),
+            gg: model.shape().gg.clone(),
             exact: vec![1.5; 3],
             draws: Vec::new(),
         }
@@ -305,11 +399,12 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("c.json");
         let model = model();
-        let spoil: [fn(&mut Calibration); 6] = [
+        let spoil: [fn(&mut Calibration); 7] = [
             |c| c.machine.processor.push('x'),
             |c| c.machine.version.push('x'),
             |c| c.isa.push('x'),
             |c| c.model.push('x'),
+            |c| c.gg[0].channels += 4,
             |c| c.threads += 1,
             |c| c.exact[0] = -1.0,
         ];

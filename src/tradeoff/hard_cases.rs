@@ -10,7 +10,7 @@ use super::setting::{QUALITIES, quality_name};
 use crate::error::Result;
 use crate::gaussians::{Frame, activate};
 use crate::geometry::{Octree, Voxels, morton};
-use crate::network::{Model, Precision};
+use crate::network::{Heads, Model, Precision};
 use crate::pixels::reference::{self, Cutoffs};
 use crate::pixels::{Background, Image, Quality, Renderer};
 use crate::projection::Camera;
@@ -122,9 +122,9 @@ pub fn network_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
                     Cutoffs::NONE,
                 ))
             };
-            let truth = picture(&model.generate_in_double(head.role, &g, &map)?)?;
+            let truth = picture(&model.generate_in_double(head.heads, head.role, &g, &map)?)?;
             let error = |(precision, model): &(Precision, Model)| {
-                let raw = model.generate(head.role, &g, &map)?;
+                let raw = model.generate_with(head.heads, head.role, &g, &map)?;
                 Ok(CaseError::between(
                     precision.to_string(),
                     &truth,
@@ -132,7 +132,11 @@ pub fn network_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
                 ))
             };
             let errors = others.iter().map(error).collect::<Result<_>>()?;
-            let name = format!("{name}, {} Gaussians a voxel", head.children);
+            let heads = match head.heads {
+                Heads::Best => String::new(),
+                heads => format!(", {heads} heads"),
+            };
+            let name = format!("{name}, {} Gaussians a voxel{heads}", head.children);
             cases.push(HardCase { name, errors });
             Result::Ok(())
         };

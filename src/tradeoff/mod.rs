@@ -6,6 +6,9 @@
 //! precisions of the network, the qualities of the renderer, and smaller pictures, enlarged as a viewer does. Instructions and threads
 //! change time alone; that they hardly change the picture is shown by their rows.
 //!
+//! Where the cloud that was coded is at hand, the same pictures are also held against pictures of the cloud ([`of_cloud`]): what a setting loses,
+//! beside what coding has lost.
+//!
 //! What decides the next bit of a stream is exact with every setting: none of the knobs bears on it.
 //!
 //! Settings take turns: each is run once in every repeat, so that whatever disturbs the machine disturbs all alike. Medians are given with
@@ -26,6 +29,7 @@ mod setting;
 mod spread;
 mod truth;
 
+use crate::cloud::ColouredVoxels;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::network::Model;
@@ -42,6 +46,7 @@ pub use plot::plot;
 pub use report::{Crop, Measured, Report, Row, STAGES};
 pub use setting::{Choices, Decode, Knob, QUALITIES, Setting, pareto_front, quality_name};
 pub use spread::{Spread, Verdict};
+pub use truth::of_cloud;
 
 use run::Run;
 
@@ -51,6 +56,8 @@ pub struct Subject<'a> {
     pub stream: &'a [u8],
     /// Loads the model that it was coded with.
     pub model: &'a dyn Fn() -> Result<Model>,
+    /// The cloud that was coded, if it is there: pictures are held against its own as well ([`of_cloud`]).
+    pub cloud: Option<&'a ColouredVoxels>,
     /// Limits of decoding and drawing.
     pub limits: &'a Limits,
 }

@@ -114,9 +114,11 @@ fn named(row: &Row) -> String {
 }
 
 fn table(rows: &[Row]) -> String {
-    let mut html = String::from(
+    let of_cloud = rows.iter().any(|row| row.cloud_psnr.is_some());
+    let mut html = format!(
         "<div class=\"wide\"><table><tr><th>setting</th><th>decode, ms</th><th>picture, ms</th><th>both, ms</th><th>PSNR</th>\
-         <th>MS-SSIM</th><th>worst</th><th>MB at most</th></tr>\n",
+         <th>MS-SSIM</th><th>worst</th>{}<th>MB at most</th></tr>\n",
+        if of_cloud { "<th>PSNR, cloud</th>" } else { "" }
     );
     for row in rows {
         // The default is the same as itself.
@@ -125,7 +127,7 @@ fn table(rows: &[Row]) -> String {
             _ => [row.decode_verdict, row.picture_verdict],
         };
         html += &format!(
-            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{:.1}</td><td>{}</td><td>{}</td><td>{:.2}</td><td>{}</td></tr>\n",
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{:.1}</td><td>{}</td><td>{}</td><td>{:.2}</td>{}<td>{}</td></tr>\n",
             escaped(&named(row)),
             spread(row.decode, decode),
             spread(row.picture, picture),
@@ -133,6 +135,8 @@ fn table(rows: &[Row]) -> String {
             decibel(row.psnr),
             row.ms_ssim.map_or("–".into(), |s| format!("{s:.5}")),
             row.worst,
+            row.cloud_psnr
+                .map_or(String::new(), |db| format!("<td>{db:.2}</td>")),
             row.most_memory / 1_000_000,
         );
     }

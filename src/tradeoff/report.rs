@@ -12,6 +12,7 @@ use super::spread::{Spread, Verdict};
 use super::{Options, Subject};
 use crate::bitstream::Header;
 use crate::error::Result;
+use crate::network::Heads;
 use crate::pixels::Image;
 
 /// The stages, four of decoding and four of drawing.
@@ -39,6 +40,8 @@ pub struct Measured {
     pub total: Spread,
     /// From what the pictures should be: the means of all views, and the worst pixel of all.
     pub distance: Distance,
+    /// PSNR in dB against the cloud's pictures, where there is a cloud.
+    pub from_cloud: Option<f64>,
     /// The view that has the worst pixel.
     pub view: usize,
     /// Bytes of memory that decoding takes at most: [`crate::decoder::Decoder::memory`].
@@ -98,6 +101,8 @@ pub struct Row {
     pub knob: Knob,
     /// Octree level.
     pub level: u8,
+    /// What generated the Gaussians.
+    pub heads: String,
     /// Precision of the network.
     pub precision: String,
     /// Instructions.
@@ -123,6 +128,8 @@ pub struct Row {
     pub picture_verdict: Verdict,
     /// In dB against the truth; `None` (in JSON, null) for equal pictures.
     pub psnr: Option<f64>,
+    /// In dB against pictures of the cloud that was coded, where that was at hand.
+    pub cloud_psnr: Option<f64>,
     /// Multi-scale structural similarity; `None` of pictures too small for it.
     pub ms_ssim: Option<f64>,
     /// The largest difference of a channel in steps of eight bits.
@@ -155,6 +162,7 @@ impl Row {
             picture,
             total,
             distance,
+            from_cloud,
             view,
             memory,
             crop,
@@ -163,6 +171,7 @@ impl Row {
         Row {
             knob,
             level: setting.decode.level,
+            heads: setting.decode.heads.to_string(),
             precision: setting.decode.precision.to_string(),
             isa: setting.decode.isa.to_string(),
             threads: setting.decode.threads,
@@ -175,6 +184,7 @@ impl Row {
             decode_verdict: Verdict::Same,
             picture_verdict: Verdict::Same,
             psnr: Some(distance.psnr()).filter(|psnr| psnr.is_finite()),
+            cloud_psnr: from_cloud,
             ms_ssim: distance.ms_ssim,
             worst: distance.worst,
             worst_at: [view as u32, x, y],
@@ -190,6 +200,7 @@ impl Row {
         let size = format!("{}×{}", self.size[0], self.size[1]);
         match self.knob {
             Knob::Level => format!("level {}", self.level),
+            Knob::Heads => format!("{} heads", self.heads),
             Knob::Precision => self.precision.clone(),
             Knob::Quality => self.quality.clone(),
             Knob::Size => size,
@@ -203,7 +214,11 @@ impl Row {
                     quality,
                     ..
                 } = self;
-                format!("level {level}, {precision}, {quality}, {size}")
+                let heads = match self.heads == Heads::Best.to_string() {
+                    true => String::new(),
+                    false => format!("{} heads, ", self.heads),
+                };
+                format!("level {level}, {heads}{precision}, {quality}, {size}")
             }
         }
     }
@@ -242,7 +257,7 @@ pub struct Report {
     pub truth_ms: [f64; 2],
     /// The default, then one knob at a time.
     pub ladder: Vec<Row>,
-    /// Levels, precisions, qualities and sizes, each with each.
+    /// Levels, heads, precisions, qualities and sizes: see [`super::Choices::combinations`].
     pub combinations: Vec<Row>,
     /// Hard cases of the renderer, with every quality, and with the default one on the other instruction sets.
     pub renderer_cases: Vec<HardCase>,

@@ -4,20 +4,20 @@ use std::time::Instant;
 
 use rayon::ThreadPool;
 
-use super::metrics::{Distance, resized};
+use super::metrics::{Distance, pixels_apart, psnr, resized};
 use super::report::{Crop, Measured, STAGES};
 use super::setting::{Choices, Decode, Setting};
 use super::spread::Spread;
-use super::truth::in_double;
+use super::truth::{in_double, of_cloud};
 use super::{Options, Subject};
 use crate::bitstream::Header;
 use crate::decoder::Decoder;
 use crate::error::{Error, Result};
 use crate::gaussians::Gaussians;
 use crate::log::{Log, Step};
-use crate::network::{Model, Precision};
+use crate::network::{Heads, Model, Precision};
 use crate::pixels::reference::{self, Cutoffs};
-use crate::pixels::{Background, Image, Renderer};
+use crate::pixels::{Background, Image, Quality, Renderer};
 
 /// Half the side of the cut-out around a worst pixel.
 const CROP: u32 = 28;
@@ -36,11 +36,12 @@ struct Decoding {
     memory: u64,
 }
 
-/// One way of drawing, and what it took; the Gaussians are those of its level and precision.
+/// One way of drawing, and what it took; the Gaussians are those of its level, heads and precision.
 struct Drawing {
     how: Setting,
     laps: Vec<Lap>,
     distance: Option<Distance>,
+    from_cloud: Option<f64>,
     view: usize,
     crop: Option<Crop>,
 }
@@ -53,12 +54,21 @@ pub(super) struct Run<'a> {
     pools: Vec<(usize, ThreadPool)>,
     decodings: Vec<Decoding>,
     drawings: Vec<Drawing>,
-    gaussians: Vec<(u8, Precision, Gaussians)>,
+    gaussians: Vec<(Kind, Gaussians)>,
+}
+
+/// What Gaussians depend on.
+type Kind = (u8, Heads, Precision);
+
+fn kind(how: &Decode) -> Kind {
+    (how.level, how.heads, how.precision)
 }
 
 /// The pictures as they should be, and what they took, in milliseconds.
 pub(super) struct Truth {
     pub images: Vec<Image>,
+    /// Those of the cloud, where there is one.
+    pub cloud: Option<Vec<Image>>,
     pub generate: f64,
     pub draw: f64,
 }
@@ -104,6 +114,7 @@ impl<'a> Run<'a> {
                     how,
                     laps: Vec::new(),
                     distance: None,
+                    from_cloud: None,
                     view: 0,
                     crop: None,
                 });
@@ -114,7 +125,8 @@ impl<'a> Run<'a> {
             }
             let model = (subject.model)()?;
             let model = model.with_isa(how.isa).with_precision(how.precision)?;
-            let memory = Decoder::new(&model).memory(&header, how.level)?;
+            let decoder = Decoder::new(&model).with_heads(how.heads)?;
+            let memory = decoder.memory(&header, how.level)?;
             run.models.push((how, model));
             run.decodings.push(Decoding {
                 how,
@@ -149,6 +161,7 @@ impl<'a> Run<'a> {
         }
         Ok(Choices {
             levels,
+            heads: model.shape().heads(),
             precisions,
             threads: rayon::current_num_threads(),
         })
@@ -175,12 +188,9 @@ impl<'a> Run<'a> {
                 };
                 let (lap, gaussians) = self.decode(self.decodings[i].how)?;
                 self.decodings[i].laps.push(lap);
-                let Decode {
-                    level, precision, ..
-                } = self.decodings[i].how;
-                let known = |(l, p, _): &(u8, Precision, Gaussians)| (*l, *p) == (level, precision);
-                if !self.gaussians.iter().any(known) {
-                    self.gaussians.push((level, precision, gaussians));
+                let kind = kind(&self.decodings[i].how);
+                if !self.gaussians.iter().any(|(known, _)| *known == kind) {
+                    self.gaussians.push((kind, gaussians));
                 }
             }
             for i in 0..self.drawings.len() {
@@ -216,6 +226,7 @@ impl<'a> Run<'a> {
         self.pool(how.threads)?.install(|| {
             let mut log = Log::default();
             let decoder = Decoder::new(model).with_limits((*limits).clone());
+            let decoder = decoder.with_heads(how.heads)?;
             let start = Instant::now();
             let gaussians = decoder.decode(stream, Some(how.level), &mut log)?;
             let mut lap = Lap {
@@ -231,11 +242,8 @@ impl<'a> Run<'a> {
 
     /// The mean over all views, and their pictures.
     fn draw(&self, how: Setting) -> Result<(Lap, Vec<Image>)> {
-        let Decode {
-            level, precision, ..
-        } = how.decode;
         let mut all = self.gaussians.iter();
-        let Some((.., gaussians)) = all.find(|(l, p, _)| (*l, *p) == (level, precision)) else {
+        let Some((_, gaussians)) = all.find(|(known, _)| *known == kind(&how.decode)) else {
             return Err(Error::Usage("nothing was decoded for this setting".into()));
         };
         let cameras = self.options.cameras(how.shrink)?;
@@ -276,6 +284,11 @@ impl<'a> Run<'a> {
             false => resized(image, truth.width, truth.height),
         };
         let images: Vec<Image> = truth.images.iter().zip(&images).map(enlarged).collect();
+        let from_cloud = truth.cloud.as_ref().map(|cloud| {
+            let pairs = cloud.iter().zip(&images);
+            let sum: f64 = pairs.map(|(a, b)| pixels_apart(a, b).0).sum();
+            psnr(sum / images.len() as f64)
+        });
         let each: Vec<Distance> = truth
             .images
             .iter()
@@ -293,6 +306,7 @@ impl<'a> Run<'a> {
         let ms_ssim = each.iter().all(|d| d.ms_ssim.is_some());
         let drawing = &mut self.drawings[i];
         drawing.view = view;
+        drawing.from_cloud = from_cloud;
         drawing.distance = Some(Distance {
             mean_square: mean(&|d| d.mean_square),
             ms_ssim: ms_ssim.then(|| mean(&|d| d.ms_ssim.unwrap_or_default())),
@@ -310,7 +324,7 @@ impl<'a> Run<'a> {
     /// The pictures of the finest level, generated and drawn in double precision without any cut-off.
     ///
     /// # Errors
-    /// Those of [`Decoder::exact`] and [`Model::generate_in_double`].
+    /// Those of [`Decoder::exact`] and [`Model::generate_in_double`], and of drawing the cloud.
     pub fn truth(&self, choices: &Choices, say: &dyn Fn(&str)) -> Result<Truth> {
         let model = (self.subject.model)()?;
         let level = choices.levels.last().copied().unwrap_or_default();
@@ -323,10 +337,24 @@ impl<'a> Run<'a> {
             .iter()
             .map(|camera| reference::render(&gaussians, camera, Background::WHITE, Cutoffs::NONE))
             .collect();
+        let draw = milliseconds(start) / cameras.len() as f64;
+        let cloud = self.subject.cloud.map(|cloud| {
+            say("draw the cloud");
+            let gaussians = of_cloud(cloud);
+            let mut renderer = Renderer::new(model.isa());
+            renderer.set_quality(Quality::Exact);
+            let mut draw = |camera| {
+                let limits = self.subject.limits;
+                let drawn = renderer.render(&gaussians, camera, Background::WHITE, limits)?;
+                Ok(drawn.0)
+            };
+            cameras.iter().map(&mut draw).collect::<Result<_>>()
+        });
         Ok(Truth {
             images,
+            cloud: cloud.transpose()?,
             generate,
-            draw: milliseconds(start) / cameras.len() as f64,
+            draw,
         })
     }
 
@@ -345,6 +373,7 @@ impl<'a> Run<'a> {
             picture: Spread::of(drawing.laps.iter().map(|lap| lap.total)),
             total: Spread::of(totals.map(|(a, b)| a.total + b.total)),
             distance: drawing.distance?,
+            from_cloud: drawing.from_cloud,
             view: drawing.view,
             memory: decoding.memory,
             crop: drawing.crop.clone(),

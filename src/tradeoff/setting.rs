@@ -3,7 +3,7 @@
 use b2p_kernels::Isa;
 use serde::Serialize;
 
-use crate::network::Precision;
+use crate::network::{Heads, Precision};
 use crate::pixels::Quality;
 
 /// One way from a stream to pictures.
@@ -22,7 +22,9 @@ pub struct Setting {
 pub struct Decode {
     /// The octree level.
     pub level: u8,
-    /// What Gaussians are generated in.
+    /// What generates Gaussians.
+    pub heads: Heads,
+    /// What they are generated in.
     pub precision: Precision,
     /// Instructions.
     pub isa: Isa,
@@ -38,6 +40,8 @@ pub enum Knob {
     Default,
     /// [`Decode::level`].
     Level,
+    /// [`Decode::heads`].
+    Heads,
     /// [`Decode::precision`].
     Precision,
     /// [`Setting::quality`].
@@ -58,6 +62,7 @@ impl Knob {
         match self {
             Knob::Default => "default",
             Knob::Level => "level",
+            Knob::Heads => "heads",
             Knob::Precision => "precision",
             Knob::Quality => "quality",
             Knob::Size => "size",
@@ -84,6 +89,8 @@ const SHRINKS: [u32; 3] = [1, 2, 4];
 pub struct Choices {
     /// Levels with Gaussians, the finest last.
     pub levels: Vec<u8>,
+    /// Heads that the model has, the default first.
+    pub heads: Vec<Heads>,
     /// Precisions that the model has, the default first.
     pub precisions: Vec<Precision>,
     /// Threads that the caller has.
@@ -96,6 +103,7 @@ impl Choices {
         Some(Setting {
             decode: Decode {
                 level: *self.levels.last()?,
+                heads: *self.heads.first()?,
                 precision: *self.precisions.first()?,
                 isa: Isa::detect(),
                 threads: self.threads,
@@ -120,6 +128,9 @@ impl Choices {
         let decode = default.decode;
         for &level in &self.levels {
             push(Knob::Level, with(Decode { level, ..decode }));
+        }
+        for &heads in &self.heads {
+            push(Knob::Heads, with(Decode { heads, ..decode }));
         }
         for &precision in &self.precisions {
             push(
@@ -147,18 +158,24 @@ impl Choices {
         ladder
     }
 
-    /// All combinations of level, precision, quality, and the two larger sizes.
+    /// All combinations of level, heads, precision, quality, and the two larger sizes; those of quick heads in the default precision, as they
+    /// are for who lacks time.
     pub fn combinations(&self) -> Vec<Setting> {
         let Some(default) = self.default_setting() else {
             return Vec::new();
         };
         let mut all = Vec::new();
+        let best = self.precisions.iter().map(|p| (default.decode.heads, *p));
+        let others = self.heads.iter().filter(|h| **h != default.decode.heads);
+        let generators = best.chain(others.map(|h| (*h, default.decode.precision)));
+        let generators: Vec<_> = generators.collect();
         for &level in &self.levels {
-            for &precision in &self.precisions {
+            for &(heads, precision) in &generators {
                 for quality in QUALITIES {
                     all.extend(SHRINKS[..2].iter().map(|&shrink| Setting {
                         decode: Decode {
                             level,
+                            heads,
                             precision,
                             ..default.decode
                         },
@@ -198,6 +215,7 @@ mod tests {
     fn choices() -> Choices {
         Choices {
             levels: vec![8, 9],
+            heads: Heads::ALL.to_vec(),
             precisions: Precision::ALL.to_vec(),
             threads: 4,
         }
@@ -212,6 +230,7 @@ mod tests {
             let (a, b) = (setting.decode, default.decode);
             let turned = [
                 (Knob::Level, a.level != b.level),
+                (Knob::Heads, a.heads != b.heads),
                 (Knob::Precision, a.precision != b.precision),
                 (Knob::Quality, setting.quality != default.quality),
                 (Knob::Size, setting.shrink != default.shrink),
@@ -230,7 +249,7 @@ mod tests {
     fn combinations_are_all_different_and_hold_the_default() {
         let choices = choices();
         let all = choices.combinations();
-        assert_eq!(all.len(), 2 * 2 * QUALITIES.len() * 2);
+        assert_eq!(all.len(), 2 * 3 * QUALITIES.len() * 2);
         assert!(all.contains(&choices.default_setting().unwrap()));
         for (i, a) in all.iter().enumerate() {
             assert!(!all[..i].contains(a));

@@ -8,7 +8,9 @@ use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-use common::{Ball, names_in};
+use b2p::network::{Shape, untrained};
+use common::{Ball, names_in, tiny_model};
+use serde_json::Value;
 
 fn b2p(folder: &Path, arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_b2p"))
@@ -135,6 +137,50 @@ fn a_cloud_becomes_a_stream_gaussians_and_pictures() {
 }
 
 #[test]
+fn quick_heads_are_used_where_the_model_has_them() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    let both = untrained(&Shape::tiny().with_quick_heads(), 1);
+    std::fs::write(at.join("one.safetensors"), tiny_model(1)).unwrap();
+    std::fs::write(at.join("both.safetensors"), both).unwrap();
+    let (one, both) = (
+        ["--model", "one.safetensors"],
+        ["--model", "both.safetensors"],
+    );
+    let with = |arguments: &[&str], model: &[&str]| succeeds(at, &[arguments, model].concat());
+    with(&["encode", "ball.ply", "-o", "ball.b2p"], &one);
+    let decode = ["decode", "ball.b2p", "--heads", "quick", "-o"];
+    with(&["decode", "ball.b2p", "-o", "best.ply"], &both);
+    with(&[&decode[..], &["quick.ply"]].concat(), &both);
+    let [best, quick] = ["best.ply", "quick.ply"].map(|name| std::fs::read(at.join(name)).unwrap());
+    assert!(best.len() == quick.len() && best != quick);
+    let render = [
+        "render", "ball.b2p", "--size", "40x30", "--heads", "quick", "-o", "a.png",
+    ];
+    with(&render, &both);
+    succeeds(
+        at,
+        &["render", "quick.ply", "--size", "40x30", "-o", "b.png"],
+    );
+    assert_eq!(png(&at.join("a.png")).data().len(), 4 * 40 * 30);
+    let bench = [
+        "bench", "ball.b2p", "--repeat", "1", "--heads", "quick", "--json",
+    ];
+    let bench: Value = serde_json::from_str(&with(&bench, &both)).unwrap();
+    assert_eq!(bench["heads"], "quick");
+    let info = |model| with(&["info", "ball.b2p"], model);
+    assert!(info(&one).contains("tiny, heads: best\n"));
+    assert!(info(&both).contains("tiny, heads: best, quick\n"));
+    assert!(succeeds(at, &["info", "ball.b2p"]).contains("not the one inside"));
+
+    let refused = |arguments: &[&str], words: &[&str]| fails(at, arguments, words);
+    let to = [&decode[..], &["x.ply"]].concat();
+    refused(&[&to[..], &one].concat(), &["no quick heads"]);
+    let ply = ["render", "quick.ply", "--heads", "quick", "-o", "x.png"];
+    refused(&ply, &["quick.ply", "--heads"]);
+}
+
+#[test]
 fn a_level_without_gaussians_is_refused_and_the_others_are_named() {
     let folder = folder_with_stream();
     fails(
@@ -223,7 +269,7 @@ fn a_damaged_stream_is_refused_and_nothing_is_written() {
 fn another_model_is_recognised_before_anything_is_decoded() {
     let folder = folder_with_stream();
     let at = folder.path();
-    std::fs::write(at.join("other.safetensors"), common::tiny_model(1)).unwrap();
+    std::fs::write(at.join("other.safetensors"), tiny_model(1)).unwrap();
     let arguments = [
         "decode",
         "ball.b2p",

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use b2p::Limits;
 use b2p::cloud::PointCloud;
 use b2p::gaussians::Frame;
-use b2p::network::Model;
+use b2p::network::{Heads, Model};
 
 use super::load_mesh;
 use crate::error::{LabError, Result};
@@ -37,6 +37,9 @@ pub struct Args {
     /// The model to code and decode streams with [default: the one inside the program]
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
+    /// The model's heads that decode streams: best, or quick if it has them
+    #[arg(long, value_name = "NAME", default_value_t = Heads::Best)]
+    heads: Heads,
     /// Octree levels to decode streams to [default: all that the model can draw]
     #[arg(long, value_name = "M,…", value_delimiter = ',')]
     levels: Option<Vec<u8>>,
@@ -91,7 +94,9 @@ impl Args {
             Some(path) => Model::open(path)?,
             None => Model::from_bytes(b2p::embedded::MODEL)?,
         };
-        bench = bench.with_model(model, self.levels.clone());
+        bench = bench
+            .with_model(model, self.levels.clone())
+            .with_heads(self.heads);
         if code {
             let stream = bench.encode()?;
             if let Some(folder) = &self.output {

@@ -7,7 +7,7 @@ use b2p::decoder::Decoder;
 use b2p::encoder::{Options, encode};
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
-use b2p::network::Model;
+use b2p::network::{Heads, Model};
 
 use super::item::Content;
 use super::picture::Picture;
@@ -29,6 +29,7 @@ pub struct Bench {
     points: Option<u64>,
     model: Option<Model>,
     levels: Option<Vec<u8>>,
+    heads: Heads,
 }
 
 /// One way to draw one item, and how that looks.
@@ -58,6 +59,7 @@ impl Bench {
             points: None,
             model: None,
             levels: None,
+            heads: Heads::Best,
         })
     }
 
@@ -70,6 +72,12 @@ impl Bench {
         self.points = Some(voxels.len() as u64);
         self.finest = Some(cloud);
         Ok(self)
+    }
+
+    /// With Gaussians of streams made by these heads of the model.
+    pub fn with_heads(mut self, heads: Heads) -> Self {
+        self.heads = heads;
+        self
     }
 
     /// With a model to code and decode streams, at these levels or at all that it can draw.
@@ -140,7 +148,7 @@ impl Bench {
             }
             Content::Stream(bytes) => {
                 let header = Header::parse(&bytes, &Limits::default())?;
-                let decoder = Decoder::new(self.model()?);
+                let decoder = Decoder::new(self.model()?).with_heads(self.heads)?;
                 let levels = match &self.levels {
                     Some(levels) => levels.clone(),
                     None => decoder.levels(&bytes)?,

@@ -3,7 +3,7 @@
 use b2p_kernels::Isa;
 
 use super::super::reference::{Mode, Oracle, Rows};
-use super::super::{Model, Precision, RAW, Shape, Upsample, untrained};
+use super::super::{Head, Model, Precision, RAW, Shape, Upsample, untrained};
 use super::{Cloud, error, rows};
 use crate::entropy::UNPREDICTED;
 
@@ -26,7 +26,14 @@ fn shapes() -> Vec<Shape> {
         fr_blocks: 2,
         ..Shape::tiny()
     };
-    vec![Shape::tiny(), nearest, wide]
+    let mut both = Shape {
+        channels: 32,
+        ..Shape::tiny()
+    }
+    .with_quick_heads();
+    both.gg[2].channels = 16;
+    both.gg[3].blocks_before = 1;
+    vec![Shape::tiny(), nearest, wide, both]
 }
 
 /// Latents of a plausible spread.
@@ -271,13 +278,15 @@ fn generation_follows_its_definition_within_f16() {
         let bytes = untrained(&shape, seed);
         let oracle = Oracle::new(&bytes, Mode::Whole);
         let model = in_floats(&bytes);
-        for role in [1, 2] {
+        for &Head { role, heads, .. } in &shape.gg {
             let g = some_features(cloud.len(role) * shape.channels);
-            let want = oracle.generate(role, &cloud.sites(role), &rows(&g, shape.channels));
-            let got = model.generate(role, &g, &cloud.maps[role]).unwrap();
+            let features = rows(&g, shape.channels);
+            let want = oracle.generate(heads, role, &cloud.sites(role), &features);
+            let generate = |model: &Model| model.generate_with(heads, role, &g, &cloud.maps[role]);
+            let got = generate(&model).unwrap();
             assert_eq!(got.len(), want.len() * RAW);
             let (off, peak) = error(&got, &want);
-            println!("role {role}: {:.2e} of {peak:.2}", off / peak);
+            println!("{heads}, role {role}: {:.2e} of {peak:.2}", off / peak);
             assert!(
                 off < TOLERANCE * peak,
                 "role {role}: off by {off} of {peak}"
@@ -285,7 +294,7 @@ fn generation_follows_its_definition_within_f16() {
             for isa in Isa::available() {
                 let other = in_floats(&bytes).with_isa(isa);
                 assert!(
-                    other.generate(role, &g, &cloud.maps[role]).unwrap() == got,
+                    generate(&other).unwrap() == got,
                     "{isa} rounds in another order"
                 );
             }
@@ -319,20 +328,23 @@ fn generation_in_integers_follows_its_definition_and_is_the_same_on_every_isa_an
             Model::from_bytes(&bytes).unwrap().precision(),
             Precision::Int16
         );
-        for role in [1, 2] {
+        for &Head { role, heads, .. } in &shape.gg {
             let g = some_features(cloud.len(role) * shape.channels);
-            let want = oracle.generate(role, &cloud.sites(role), &rows(&g, shape.channels));
+            let features = rows(&g, shape.channels);
+            let want = oracle.generate(heads, role, &cloud.sites(role), &features);
             let mut first: Option<Vec<f32>> = None;
             for isa in Isa::available() {
                 for threads in [1, 3] {
                     let model = Model::from_bytes(&bytes).unwrap().with_isa(isa);
                     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-                    let got = pool
-                        .build()
-                        .unwrap()
-                        .install(|| model.generate(role, &g, &cloud.maps[role]).unwrap());
+                    let map = &cloud.maps[role];
+                    let generate = || model.generate_with(heads, role, &g, map).unwrap();
+                    let got = pool.build().unwrap().install(generate);
                     let (off, peak) = error(&got, &want);
-                    println!("{isa}, role {role}: {:.2e} of {peak:.2}", off / peak);
+                    println!(
+                        "{isa}, {heads}, role {role}: {:.2e} of {peak:.2}",
+                        off / peak
+                    );
                     assert!(off < INTEGER_TOLERANCE * peak, "off by {off} of {peak}");
                     let first = first.get_or_insert_with(|| got.clone());
                     assert!(*first == got, "{isa}, {threads} threads: other bits");

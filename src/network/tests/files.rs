@@ -5,7 +5,8 @@ use std::collections::HashMap;
 use b2p_kernels::f16;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
-use super::super::{Model, Shape, untrained};
+use super::super::generate::Generator;
+use super::super::{Heads, Model, Precision, Shape, untrained};
 use crate::error::{Error, Result};
 
 /// A model file that can be altered.
@@ -16,7 +17,16 @@ struct File {
 
 impl File {
     fn tiny() -> Self {
-        let bytes = untrained(&Shape::tiny(), 1);
+        File::of(&Shape::tiny())
+    }
+
+    /// With quick heads as well.
+    fn both() -> Self {
+        File::of(&Shape::tiny().with_quick_heads())
+    }
+
+    fn of(shape: &Shape) -> Self {
+        let bytes = untrained(shape, 1);
         let (_, metadata) = SafeTensors::read_metadata(&bytes).unwrap();
         let json = metadata.metadata().as_ref().unwrap()["b2p"].clone();
         let view = SafeTensors::deserialize(&bytes).unwrap();
@@ -147,6 +157,19 @@ fn an_error_names_the_tensor_at_fault() {
             File::tiny().poke("cdf.gauss", 0, &u16::MAX.to_le_bytes()),
         ),
         (
+            "gg.quick.1.conv_in.weight",
+            File::both().without("gg.quick.1.conv_in."),
+        ),
+        ("gg.2.conv_in.weight", File::both().without("gg.2.")),
+        (
+            "gg.quick.2.after.0.c1.weight",
+            File::both().poke("gg.quick.2.after.0.c1.weight", 3, &f16::NAN.to_le_bytes()),
+        ),
+        (
+            "gg.quick.1.scale",
+            File::both().with("gg.quick.1.scale", Dtype::F32, &[1], &[0; 4]),
+        ),
+        (
             "cdf.prior",
             File::tiny().with("cdf.prior.offset", Dtype::U32, &[1], &[0; 4]),
         ),
@@ -231,6 +254,41 @@ fn a_role_without_a_generator_is_an_error_that_names_those_that_have_one() {
 }
 
 #[test]
+fn quick_heads_that_a_model_has_not_are_an_error_that_says_so() {
+    let (one, both) = (File::tiny().load().unwrap(), File::both().load().unwrap());
+    let map = crate::geometry::KernelMap::root();
+    let error = one.generate_with(Heads::Quick, 1, &[0; 8], &map);
+    let error = error.unwrap_err();
+    assert!(
+        matches!(error, Error::Unsupported { .. }) && error.to_string().contains("no quick heads"),
+        "{error}"
+    );
+    let best = one.generate(1, &[9; 8], &map).unwrap();
+    assert_eq!(both.generate(1, &[9; 8], &map).unwrap(), best);
+    let quick = both.generate_with(Heads::Quick, 1, &[9; 8], &map).unwrap();
+    assert!(quick.len() == best.len() && quick != best);
+    assert_eq!(both.shape().heads(), Heads::ALL);
+}
+
+#[test]
+fn heads_that_cannot_run_in_integers_make_the_whole_model_run_in_floats() {
+    let model = File::both().without("gg.quick.2.scale").load().unwrap();
+    assert_eq!(model.precision(), Precision::F16);
+    let error = model.with_precision(Precision::Int16).err().unwrap();
+    assert!(error.to_string().contains("gg.quick.2.scale"), "{error}");
+}
+
+#[test]
+fn only_the_heads_that_are_used_are_got_ready() {
+    let model = File::both().load().unwrap();
+    let map = crate::geometry::KernelMap::root();
+    let ready = || -> Vec<bool> { model.generators.iter().map(Generator::is_ready).collect() };
+    assert_eq!(ready(), [false; 4]);
+    model.generate_with(Heads::Quick, 2, &[9; 8], &map).unwrap();
+    assert_eq!(ready(), [false, false, false, true]);
+}
+
+#[test]
 fn the_id_changes_with_whatever_bears_on_the_decoded_bits_and_nothing_else() {
     let id = |file: File| file.load().unwrap().id();
     let plain = id(File::tiny());
@@ -247,6 +305,8 @@ fn the_id_changes_with_whatever_bears_on_the_decoded_bits_and_nothing_else() {
         File::tiny().poke("gg.1.conv_out.bias", 0, &0.5f32.to_le_bytes()),
         File::tiny().poke("fc.0.conv_in.bias", 0, &0.5f32.to_le_bytes()),
         described,
+        File::both(),
+        File::both().poke("gg.quick.1.conv_out.bias", 0, &0.5f32.to_le_bytes()),
     ];
     for file in alike {
         assert_eq!(plain, id(file));
