@@ -81,7 +81,7 @@ fn the_page_has_all_its_parts_and_more_precise_is_never_less_accurate() {
     let ladder = report["ladder"].as_array().unwrap();
     let default = &ladder[0];
     assert_eq!(default["knob"], "default");
-    for knob in ["level", "precision", "quality", "size", "isa"] {
+    for knob in ["level", "heads", "precision", "quality", "size", "isa"] {
         assert!(ladder.iter().any(|row| row["knob"] == knob), "{knob}");
     }
     for row in ladder {
@@ -99,7 +99,8 @@ fn the_page_has_all_its_parts_and_more_precise_is_never_less_accurate() {
         let row = rows.find(|row| row["knob"] == knob && row[what] == value);
         decibel(row.unwrap_or(default))
     };
-    // A coarser level, a smaller picture, a higher floor of α: none is nearer to the truth.
+    // A coarser level, thinner heads, a smaller picture, a higher floor of α: none is nearer to the truth.
+    assert!(of("heads", "heads", "quick".into()) < decibel(default));
     assert!(of("level", "level", 5.into()) < decibel(default));
     assert!(of("size", "size", vec![84, 84].into()) < decibel(default));
     assert!(of("size", "size", vec![42, 42].into()) < of("size", "size", vec![84, 84].into()));
