@@ -178,6 +178,16 @@ enum b2p_status b2p_decoding_start(const struct b2p_model *model,
                                    char *message,
                                    size_t size);
 
+// Generates Gaussians with the model's quick heads from now on, thinner ones for weak machines, which only some models have; or, as at first,
+// with its best. What has been decoded stays. Fails with UNSUPPORTED, USAGE.
+//
+// # Safety
+// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_use_quick_heads(struct b2p_decoding *decoding,
+                                             bool quick,
+                                             char *message,
+                                             size_t size);
+
 // Takes the next bytes of the stream, which are not needed afterwards. Decodes nothing yet. Fails with USAGE.
 //
 // # Safety
