@@ -352,8 +352,8 @@ mod tests {
         let both = || Shape::tiny().with_quick_heads();
         for (field, value, word) in [
             ("/gg/2/heads", "\"fast\"", "fast"),
-            ("/gg/2/heads", "3", "heads"),
-            ("/gg/2/heads", "null", "description"),
+            ("/gg/2/heads", "3", "metadata"),
+            ("/gg/2/heads", "null", "metadata"),
             ("/gg/2/heads", "\"best\"", "role"),
             ("/gg/2/role", "2", "role"),
             ("/gg/2/children", "1", "children"),
