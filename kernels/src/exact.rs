@@ -8,7 +8,7 @@ use crate::isa::{Isa, dispatch};
 use crate::machine::amx;
 use crate::machine::{fetch, halves_mut, with_halves};
 use crate::norms::{Energy, Gains, Norms};
-use crate::rows::{AHEAD, Extents, Lanes, Output, PANEL, Scratch, TILE, panels, with_scratch};
+use crate::rows::{AHEAD, Extents, IN_ORDER, Lanes, Output, PANEL, Scratch, panels, with_scratch};
 use crate::taps::Taps;
 use crate::tile::{Arithmetic, accumulate};
 use crate::winograd;
@@ -313,17 +313,6 @@ impl ExactConv {
         self.tiles.get_or_init(pack).as_ref()
     }
 }
-
-/// The positions of rows in order.
-static IN_ORDER: [u16; TILE] = {
-    let mut positions = [0; TILE];
-    let mut i = 0;
-    while i < TILE {
-        positions[i] = i as u16;
-        i += 1;
-    }
-    positions
-};
 
 /// The half of a word that the pair's first or second value takes.
 pub(crate) fn place(value: i16, which: usize) -> u32 {

@@ -10,6 +10,16 @@ use crate::taps::TileTaps;
 pub(crate) const PANEL: usize = 16;
 /// Output rows of a tile: enough that every tap finds full blocks, few enough that their sums stay in the cache.
 pub(crate) const TILE: usize = 512;
+/// The numbers of a tile's rows.
+pub(crate) static IN_ORDER: [u16; TILE] = {
+    let mut rows = [0; TILE];
+    let mut i = 0;
+    while i < TILE {
+        rows[i] = i as u16;
+        i += 1;
+    }
+    rows
+};
 /// By how many rows memory is asked before they are read.
 pub(crate) const AHEAD: usize = 32;
 

@@ -3,7 +3,7 @@
 use crate::isa::{Isa, Level};
 use crate::machine;
 use crate::plan::PlanTile;
-use crate::rows::{Extents, Lanes, PANEL};
+use crate::rows::{Extents, IN_ORDER, Lanes, PANEL, TILE};
 
 /// [`Lanes`] of weights that the first cache holds besides rows and sums.
 const CACHED: usize = 256;
@@ -244,7 +244,7 @@ pub(crate) fn accumulate<T>(
 /// The products of rows of words by the weights `[panel][step]` of one tap: `products[row · panels + panel]`.
 ///
 /// # Panics
-/// If there are more than [`ROWS`] rows, or not whole groups.
+/// If there are more than [`TILE`] rows, or not whole groups.
 pub(crate) fn multiply_rows(
     isa: Isa,
     cout: usize,
@@ -254,7 +254,7 @@ pub(crate) fn multiply_rows(
 ) {
     let panels = cout.div_ceil(PANEL);
     let (steps, count) = (weights.len() / panels, products.len() / panels);
-    assert!(count <= ROWS && count.is_multiple_of(isa.group()));
+    assert!(count <= TILE && count.is_multiple_of(isa.group()));
     assert_eq!(
         rows.len(),
         count * steps,
@@ -284,22 +284,8 @@ pub(crate) fn multiply_rows(
     }
 }
 
-/// Rows that [`multiply_rows`] multiplies at most.
-const ROWS: usize = 16;
-
 /// The only tap.
 static FIRST: [u8; 1] = [0];
-
-/// The places of rows in order.
-static IN_ORDER: [u16; ROWS] = {
-    let mut places = [0; ROWS];
-    let mut i = 0;
-    while i < ROWS {
-        places[i] = i as u16;
-        i += 1;
-    }
-    places
-};
 
 /// Of `whole` panels, or the half that is left, as many as are multiplied at once.
 fn width(isa: Isa, whole: usize) -> usize {
