@@ -45,11 +45,15 @@ impl Stored {
         let mut weights = vec![0; self.weights.len()];
         let mut steps = vec![0.0; cout];
         for (o, step) in steps.iter_mut().enumerate() {
-            let channel = || self.weights[o..].iter().step_by(cout).map(|w| w.to_f64());
-            let peak = channel().fold(0.0, |peak: f64, w| peak.max(w.abs()));
+            let channel = self.weights[o..].iter().step_by(cout);
+            let channel: Vec<f64> = channel.map(|w| w.to_f64()).collect();
+            let peak = channel.iter().fold(0.0, |peak: f64, w| peak.max(w.abs()));
+            let total: f64 = channel.iter().map(|w| w.abs()).sum();
+            let scale = |top: u64| if peak > 0.0 { top as f64 / peak } else { 0.0 };
             let quantised = |top: u64| {
-                let scale = if peak > 0.0 { top as f64 / peak } else { 0.0 };
-                channel().map(move |w| (w * scale).round_ties_even() as i64)
+                let scale = scale(top);
+                let steps = channel.iter().map(move |w| w * scale);
+                steps.map(|w| w.round_ties_even() as i64)
             };
             let limit = if volume == 27 {
                 SMALL_SUM_LIMIT
@@ -57,6 +61,11 @@ impl Stored {
                 SUM_LIMIT
             };
             let overflows = |top: &u64| {
+                // Rounding takes half a step off a weight at most, so that most tops are known to be too large.
+                let least = total * scale(*top) - channel.len() as f64 / 2.0;
+                if least * f64::from(LIMIT) >= limit as f64 {
+                    return true;
+                }
                 let (sum, squares) = quantised(*top).fold((0, 0), |(sum, squares), q| {
                     let q = q.unsigned_abs();
                     (sum + q, squares + q * q)
