@@ -21,7 +21,7 @@ pub enum Taps<'a> {
         volume: usize,
         /// One entry per output row and tap.
         rows: &'a [u32],
-        /// The same, arranged for [`Isa`]s with tiles.
+        /// The same, arranged for [`Isa`]s.
         plan: Option<&'a Plan>,
     },
     /// Eight taps, of which row `i` uses only `octants[i]`, to read row `parents[i]`.
