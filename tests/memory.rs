@@ -97,6 +97,41 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
 }
 
 #[test]
+fn a_decode_gives_back_all_that_it_reserved_whether_it_succeeds_or_fails() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    let (_, model) = models().remove(0);
+    let options = Options::default();
+    let bytes = encode(
+        &Ball::new(7, 50.0).cloud(),
+        &model,
+        &options,
+        &mut Log::default(),
+    )
+    .unwrap()
+    .bytes;
+    let (mut cut, mut damaged) = (bytes.clone(), bytes.clone());
+    cut.truncate(bytes.len() * 9 / 10);
+    damaged[bytes.len() * 9 / 10] ^= 1;
+    for (kind, bytes, sound) in [
+        ("whole", bytes, true),
+        ("cut", cut, false),
+        ("damaged", damaged, false),
+    ] {
+        let decode = || {
+            let decoded = Decoder::new(&model).decode(&bytes, None, &mut Log::default());
+            assert_eq!(decoded.is_ok(), sound, "{kind}");
+        };
+        // What is prepared at the first use stays, and so does an odd block of the threads' queues.
+        decode();
+        let ((), most) = peak(decode);
+        let before = MEMORY.current_usage();
+        (0..20).for_each(|_| decode());
+        let kept = MEMORY.current_usage().saturating_sub(before) as u64;
+        assert!(kept < most / 100, "{kind}: {kept} of {most} bytes are kept");
+    }
+}
+
+#[test]
 fn a_stream_over_the_memory_limit_is_refused_almost_for_nothing() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let (_, model) = models().remove(0);

@@ -51,6 +51,19 @@ fn within<T>(bytes: usize, run: impl FnOnce() -> T) -> T {
     value
 }
 
+/// Runs it, and holds it to giving back all memory: what is prepared at the first use and kept from then on, it takes only once. For one
+/// thread at a time.
+fn giving_back(run: impl Fn()) {
+    let taken = || {
+        let before = MEMORY.current_usage();
+        run();
+        MEMORY.current_usage().saturating_sub(before)
+    };
+    if taken() > 0 {
+        assert_eq!(taken(), 0, "bytes are kept");
+    }
+}
+
 /// The model that streams are coded with here.
 static MODEL: LazyLock<Model> = LazyLock::new(|| {
     Model::from_bytes(&untrained(&Shape::tiny(), 0)).expect("an untrained model loads")

@@ -7,7 +7,7 @@ use b2p::log::Log;
 use b2p::network::Model;
 use b2p::{Error, Limits};
 
-use crate::{MODEL, one_in, within};
+use crate::{MODEL, giving_back, one_in, within};
 
 /// So little that a level of it is decoded in a fraction of a millisecond.
 fn limits() -> Limits {
@@ -116,8 +116,13 @@ pub fn deepest(bytes: &[u8]) -> Result<Option<u8>, Error> {
 }
 
 /// Any bytes under small limits: an error, or as many finite Gaussians as the header tells, and again the same ones; a level that is
-/// refused leaves those before it as they were, and no level takes more memory than it may. For one input in four the Gaussians of all levels, and everything twice.
+/// refused leaves those before it as they were, no level takes more memory than it may, and all of it is given back. For one input in
+/// four the Gaussians of all levels, and everything twice.
 pub fn stream(bytes: &[u8]) {
+    giving_back(|| decoded(bytes));
+}
+
+fn decoded(bytes: &[u8]) {
     let decoder = Decoder::new(&*MODEL).with_limits(limits());
     let (mut decoding, mut log) = (decoder.start(None), Log::default());
     decoding.push(bytes);
@@ -204,8 +209,12 @@ fn check(error: &Error) {
     ));
 }
 
-/// Any bytes in any pieces, which the last bytes tell the sizes of: result and error are those of the whole.
+/// Any bytes in any pieces, which the last bytes tell the sizes of: result and error are those of the whole, and all memory is given back.
 pub fn chunking(bytes: &[u8]) {
+    giving_back(|| pieced(bytes));
+}
+
+fn pieced(bytes: &[u8]) {
     let (sizes, level) = match bytes {
         [.., a, b, c, level] => (
             [*a, *b, *c],

@@ -7,6 +7,7 @@ mod incremental;
 mod lies;
 #[path = "../common/seal.rs"]
 mod seal;
+mod stack;
 
 use b2p::decoder::Decoder;
 use b2p::gaussians::Gaussians;
