@@ -2,6 +2,8 @@
 //!
 //! Each function measures for about 10 ms and gives the best rate that it saw, in 10⁹ multiply-adds per second. For plain Rust
 //! (`scalar`) it tells what the compiler makes of such a loop, which is no bound.
+//!
+//! What is multiplied matters: processors that have little current to spare take longer for bits that change than for zeros.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -9,7 +11,7 @@ use std::time::{Duration, Instant};
 use crate::isa::Isa;
 #[cfg(target_arch = "x86_64")]
 use crate::machine::amx;
-use crate::rows::Lanes;
+use crate::rows::{Lanes, PANEL};
 use crate::tile::{Arithmetic, Machine, spin};
 
 /// f32 multiply-adds: the bound of [`crate::FloatConv`].
@@ -58,6 +60,18 @@ fn best(spin: impl Fn() -> usize) -> f64 {
     best
 }
 
+/// Words that are numbers of either sign around 1 as f32, as two bf16, and large ones as two i16: many of their bits differ.
+pub(crate) fn some_words<const N: usize>() -> [Lanes; N] {
+    let mut state = 1u32;
+    [(); N].map(|()| {
+        Lanes([(); PANEL].map(|()| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            let bits = state ^ (state >> 16);
+            0x3f00_3f00 | (bits & 0x80ff_80ff)
+        }))
+    })
+}
+
 /// Multiplies `rounds` times five factors by two vectors of weights, in registers but for the factors, and gives the number of words
 /// multiplied.
 ///
@@ -66,7 +80,7 @@ fn best(spin: impl Fn() -> usize) -> f64 {
 #[inline(always)]
 pub(crate) unsafe fn rounds<M: Machine>(rounds: usize) -> usize {
     const ROWS: usize = 5;
-    let words = [Lanes::default(); 2];
+    let words: [Lanes; 2] = some_words();
     let mut sink = Lanes::default();
     let from: *const u32 = black_box(&words).as_ptr().cast();
     // SAFETY: `from` holds 32 words, `sink` 16, and no vector has more than 16 lanes.

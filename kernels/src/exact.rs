@@ -61,7 +61,7 @@ impl ExactConv {
     /// Packs `weights[tap][input][output]`.
     ///
     /// # Panics
-    /// If lengths don't match the extents, there are more than 63 taps, or a shift is above 31: the caller has checked what it
+    /// If lengths don't match the extents, there are more than 54 taps, or a shift is above 31: the caller has checked what it
     /// read.
     pub fn new(
         volume: usize,

@@ -2,8 +2,13 @@
 
 use crate::convert::Halves;
 use crate::exact::LIMIT;
+use crate::machine::fetch;
 use crate::norms::{Gains, Norms};
 use crate::rows::{Lanes, Output, PANEL, part, store_part};
+use crate::winograd::Registers;
+
+/// By how many rows memory is asked for what is added.
+const AHEAD: usize = 16;
 
 /// [`Requantise`] in panels.
 #[derive(Debug, Clone)]
@@ -24,12 +29,20 @@ pub(crate) enum Finish {
 
 impl Finish {
     /// What each channel of a row is multiplied by, if anything.
+    ///
+    /// # Safety
+    /// The processor must have `R`'s instructions.
     #[inline(always)]
-    pub fn factors<'a>(&'a self, norms: &'a mut Norms, mask: u64) -> &'a [[f32; PANEL]] {
+    unsafe fn factors<'a, R: Registers>(
+        &'a self,
+        norms: &'a mut Norms,
+        mask: u64,
+    ) -> &'a [[f32; PANEL]] {
         match self {
             Finish::Shift { .. } => &[],
             Finish::Scale { scale, .. } => scale,
-            Finish::Invariant { gains, .. } => norms.of(gains, mask),
+            // SAFETY: the caller's promise.
+            Finish::Invariant { gains, .. } => unsafe { norms.of::<R, _>(gains, mask) },
         }
     }
 }
@@ -123,8 +136,13 @@ pub(crate) unsafe fn finish_tile<H: Halves, T: Value>(
     let panels = cout.div_ceil(PANEL);
     for (row, (&position, &mask)) in positions.iter().zip(masks).enumerate() {
         let sums = &sums[usize::from(position) * panels..][..panels];
-        let factors = layer.factors(norms, mask);
+        // SAFETY: the caller's promise.
+        let factors = unsafe { layer.factors::<H>(norms, mask) };
         let first = row * stride + column;
+        let ahead = first + AHEAD * stride;
+        if let Some(next) = residual.and_then(|all| all.get(ahead..ahead + cout)) {
+            fetch(next);
+        }
         let residual = residual.map(|all| all[first..][..cout].as_chunks::<PANEL>());
         let (whole, rest) = rows[first..][..cout].as_chunks_mut::<PANEL>();
         let mut panel = Panel {

@@ -99,7 +99,7 @@ impl FloatConv {
     /// Packs `weights[tap][input][output]`.
     ///
     /// # Panics
-    /// If lengths don't match the extents, or there are more than 63 taps: the caller has checked what it read.
+    /// If lengths don't match the extents, or there are more than 54 taps: the caller has checked what it read.
     pub fn new(
         volume: usize,
         cin: usize,
@@ -304,7 +304,10 @@ unsafe fn finish_tile<H: Halves, T: FloatOut>(
         let sums = &sums[usize::from(position) * panels..][..panels];
         let residual = residual.map(|all| &all[row * stride + column..][..cout]);
         let row = &mut rows[row * stride + column..][..cout];
-        let factors = conv.invariant.as_ref().map(|gains| norms.of(gains, mask));
+        let factors = conv.invariant.as_ref().map(|gains| {
+            // SAFETY: the caller's promise.
+            unsafe { norms.of::<H, _>(gains, mask) }
+        });
         let panels = row.chunks_mut(PANEL).zip(sums).zip(&conv.bias);
         for (p, ((row, sums), bias)) in panels.enumerate() {
             let mut sums = sums.f32();

@@ -3,10 +3,11 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::rows::PANEL;
+use crate::winograd::Registers;
 
 /// Sets of taps that are remembered at once.
 const SLOTS: usize = 1024;
-/// No set of taps: kernels have at most 63.
+/// No set of taps: kernels have fewer than 64.
 const NONE: u64 = u64::MAX;
 
 /// A layer's gains and the squares of its weights.
@@ -48,25 +49,27 @@ impl<E: Energy> Gains<E> {
     }
 
     /// The gains over the norms of the weights of some taps.
+    ///
+    /// # Safety
+    /// The processor must have `R`'s instructions.
     #[inline(always)]
-    fn factors(&self, mask: u64, to: &mut [[f32; PANEL]]) {
+    unsafe fn factors<R: Registers>(&self, mask: u64, to: &mut [[f32; PANEL]]) {
         let panels = self
             .energy
             .chunks_exact(self.energy.len() / self.gain.len());
         for ((to, gain), parts) in to.iter_mut().zip(&self.gain).zip(panels) {
-            let mut sum = [E::default(); PANEL];
-            for (part, energy) in parts.chunks_exact(1 << PART).enumerate() {
-                add(
-                    &mut sum,
-                    &energy[(mask >> (part * PART)) as usize % (1 << PART)],
-                );
-            }
+            let chosen = parts.as_chunks::<{ 1 << PART }>().0.iter().enumerate();
+            let chosen = chosen.map(|(part, energy)| {
+                let some = (mask >> (part * PART)) as usize % (1 << PART);
+                &energy[some]
+            });
+            // SAFETY: the caller's promise.
+            let sum = unsafe { E::sum::<R>(chosen) };
             *to = std::array::from_fn(|lane| sum[lane].factor(gain[lane]));
         }
     }
 }
 
-#[inline(always)]
 fn add<E: Energy>(sum: &mut [E; PANEL], other: &[E; PANEL]) {
     for (sum, &other) in sum.iter_mut().zip(other) {
         *sum = sum.add(other);
@@ -74,8 +77,15 @@ fn add<E: Energy>(sum: &mut [E; PANEL], other: &[E; PANEL]) {
 }
 
 /// What a sum of squared weights is counted in, and what becomes of it.
-pub(crate) trait Energy: Copy + Default {
+pub(crate) trait Energy: Copy + Default + 'static {
     fn add(self, other: Self) -> Self;
+    /// Of some panels.
+    ///
+    /// # Safety
+    /// The processor must have `R`'s instructions.
+    unsafe fn sum<'a, R: Registers>(
+        panels: impl Iterator<Item = &'a [Self; PANEL]> + Clone,
+    ) -> [Self; PANEL];
     /// `gain` over the norm.
     fn factor(self, gain: f32) -> f32;
 }
@@ -84,6 +94,27 @@ impl Energy for u32 {
     #[inline(always)]
     fn add(self, other: u32) -> u32 {
         self.wrapping_add(other)
+    }
+
+    #[inline(always)]
+    unsafe fn sum<'a, R: Registers>(
+        panels: impl Iterator<Item = &'a [u32; PANEL]> + Clone,
+    ) -> [u32; PANEL] {
+        let mut sum = [0; PANEL];
+        // Of its own accord the compiler adds one by one.
+        for at in (0..size_of_val(&sum)).step_by(R::BYTES) {
+            let mut panels = panels.clone().map(|panel| panel.as_ptr().cast::<u8>());
+            let Some(first) = panels.next() else {
+                break;
+            };
+            // SAFETY: the caller's promise, and a panel holds a whole number of registers.
+            unsafe {
+                let first = R::read(first.add(at));
+                let sum_of = panels.fold(first, |sum, panel| R::add32(sum, R::read(panel.add(at))));
+                R::write(sum.as_mut_ptr().cast::<u8>().add(at), sum_of);
+            }
+        }
+        sum
     }
 
     #[inline(always)]
@@ -96,6 +127,15 @@ impl Energy for f32 {
     #[inline(always)]
     fn add(self, other: f32) -> f32 {
         self + other
+    }
+
+    #[inline(always)]
+    unsafe fn sum<'a, R: Registers>(
+        panels: impl Iterator<Item = &'a [f32; PANEL]> + Clone,
+    ) -> [f32; PANEL] {
+        panels.fold([0.0; PANEL], |sum, panel| {
+            std::array::from_fn(|lane| sum[lane] + panel[lane])
+        })
     }
 
     #[inline(always)]
@@ -116,8 +156,15 @@ pub(crate) struct Norms {
 
 impl Norms {
     /// The layer's factors for a set of taps.
+    ///
+    /// # Safety
+    /// The processor must have `R`'s instructions.
     #[inline(always)]
-    pub fn of<E: Energy>(&mut self, gains: &Gains<E>, mask: u64) -> &[[f32; PANEL]] {
+    pub unsafe fn of<R: Registers, E: Energy>(
+        &mut self,
+        gains: &Gains<E>,
+        mask: u64,
+    ) -> &[[f32; PANEL]] {
         let panels = gains.gain.len();
         if self.layer != gains.id {
             self.layer = gains.id;
@@ -128,7 +175,8 @@ impl Norms {
         let slot = (mask.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32) as usize % SLOTS;
         let factors = &mut self.factors[slot * panels..][..panels];
         if self.masks[slot] != mask {
-            gains.factors(mask, factors);
+            // SAFETY: the caller's promise.
+            unsafe { gains.factors::<R>(mask, factors) };
             self.masks[slot] = mask;
         }
         factors

@@ -143,17 +143,15 @@ impl PlanTile {
         }
         let mut taps: Vec<u32> = (0..self.volume as u32).collect();
         taps.sort_by_key(|&k| (2 * uses[k as usize] - rows).abs());
-        let mut keys: Vec<(u64, u16)> = Vec::with_capacity(self.masks.len());
-        for (row, &mask) in (0..).zip(&self.masks) {
-            let mut key = taps.iter().fold(0, |key, k| key << 1 | (mask >> k & 1));
-            for shift in [1, 2, 4, 8, 16, 32] {
-                key ^= key >> shift;
-            }
-            keys.push((key, row));
-        }
+        let keys = Keys::new(&taps);
+        let keys = (0..)
+            .zip(&self.masks)
+            .map(|(row, &mask)| keys.of(mask) << ROW_BITS | row);
+        let mut keys: Vec<u64> = keys.collect();
         keys.sort_unstable();
         self.order.clear();
-        self.order.extend(keys.iter().map(|&(_, row)| row));
+        let row = |&key: &u64| (key % (1 << ROW_BITS)) as u16;
+        self.order.extend(keys.iter().map(row));
     }
 
     /// Taps of the kernel.
@@ -197,6 +195,38 @@ impl PlanTile {
         let (start, end) = (self.step(group, taps.start), self.step(group, taps.end));
         let places = start * self.group..(end + 1) * self.group;
         (&self.taps[start..end], &self.places[places])
+    }
+}
+
+/// Bits of the number of a tile's row.
+const ROW_BITS: u32 = TILE.trailing_zeros();
+
+/// What places a mask has when masks are ordered in reflected binary, their taps in another order.
+///
+/// The bits of a place are sums, modulo 2, of those of the mask: so it is the sum of what the mask's bytes contribute.
+struct Keys(Vec<[u64; 256]>);
+
+impl Keys {
+    /// For these taps, of which the first weighs most.
+    fn new(taps: &[u32]) -> Self {
+        let mut bytes = vec![[0; 256]; taps.len().div_ceil(8)];
+        for (weight, &tap) in taps.iter().rev().enumerate() {
+            // In reflected binary a bit turns all below it.
+            let place = (2u64 << weight) - 1;
+            bytes[tap as usize / 8][1 << (tap % 8)] = place;
+        }
+        for places in &mut bytes {
+            for byte in 1..256usize {
+                let last = 1 << byte.trailing_zeros();
+                places[byte] = places[byte - last] ^ places[last];
+            }
+        }
+        Keys(bytes)
+    }
+
+    fn of(&self, mask: u64) -> u64 {
+        let bytes = self.0.iter().zip(mask.to_le_bytes());
+        bytes.fold(0, |key, (places, byte)| key ^ places[usize::from(byte)])
     }
 }
 
@@ -259,7 +289,7 @@ pub(crate) struct Numbers {
     far: Vec<(u32, u16)>,
 }
 
-/// No number: a tile has at most 512 · 63 pairs.
+/// No number: a tile has at most 512 · 54 pairs.
 const FREE: u16 = u16::MAX;
 /// Rows before the first that is asked for, and half of those after it, whose numbers are found by place.
 const NEAR: u32 = 4096;
@@ -321,6 +351,18 @@ impl Numbers {
 mod tests {
     use super::*;
     use crate::ABSENT;
+
+    #[test]
+    fn places_count_masks_in_reflected_binary() {
+        let taps = [4, 0, 3, 1, 2, 5, 8, 7, 6, 9];
+        let keys = Keys::new(&taps);
+        let mut masks: Vec<u64> = (0..1 << taps.len()).collect();
+        masks.sort_by_key(|&mask| keys.of(mask));
+        let turned = |masks: &[u64]| masks[0] ^ masks[1];
+        assert!(masks.windows(2).all(|m| turned(m).is_power_of_two()));
+        let first = masks.iter().position(|mask| mask >> taps[0] & 1 == 1);
+        assert_eq!(first, Some(masks.len() / 2));
+    }
 
     #[test]
     fn a_plan_says_what_its_map_says() {

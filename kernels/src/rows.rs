@@ -10,6 +10,8 @@ use crate::taps::TileTaps;
 pub(crate) const PANEL: usize = 16;
 /// Output rows of a tile: enough that every tap finds full blocks, few enough that their sums stay in the cache.
 pub(crate) const TILE: usize = 512;
+/// Taps of the largest kernel: as many bits, and a tile's row, fit a word.
+pub(crate) const MOST_TAPS: usize = 54;
 /// The numbers of a tile's rows.
 pub(crate) static IN_ORDER: [u16; TILE] = {
     let mut rows = [0; TILE];
@@ -163,7 +165,7 @@ impl Extents {
             self.volume > 0 && self.cin > 0 && self.cout > 0,
             "a layer has no extent"
         );
-        assert!(self.volume < 64, "a kernel has more than 63 taps");
+        assert!(self.volume <= MOST_TAPS, "a kernel has too many taps");
         assert_eq!(
             len,
             self.volume * self.cin * self.cout,

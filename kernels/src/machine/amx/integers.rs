@@ -7,7 +7,7 @@
 
 use std::arch::x86_64::*;
 
-use super::{Buffers, LINE, Scheme, Weights, multiply, prepare};
+use super::{Buffers, LINE, Scheme, TILE, Weights, multiply, pairs, prepare};
 use crate::machine::fetch;
 use crate::plan::PlanTile;
 use crate::rows::{AHEAD, Extents, Lanes, PANEL};
@@ -30,8 +30,11 @@ impl Weights {
         if cin < WIDE[0] || cin > HALF && panels < WIDE[1] {
             return None;
         }
-        let both = cin <= HALF;
-        let scheme = if both { Scheme::Both } else { Scheme::Digits };
+        let scheme = match (cin <= HALF, extents.volume) {
+            (true, 1) => Scheme::Both,
+            (true, _) => Scheme::Pairs,
+            (false, _) => Scheme::Digits,
+        };
         let mut packed = Weights::new(extents, scheme);
         for (tap, channel, out) in extents.each() {
             let w = weight(tap, channel, out);
@@ -44,7 +47,19 @@ impl Weights {
                 *word |= u32::from(digit as u8) << (8 * (byte % 4));
             };
             let panel = out / PANEL;
-            if both {
+            if scheme == Scheme::Pairs {
+                let [pair, half] = packed.homes[tap];
+                for (product, digit) in [high, low, high + low].into_iter().enumerate() {
+                    let (byte, tile) = (
+                        half * HALF + channel,
+                        pairs::tile(extents, pair, product, panel),
+                    );
+                    let word = &mut packed.tiles[tile * TILE + byte / 4].0[out % PANEL];
+                    *word |= u32::from(digit as u8) << (8 * (byte % 4));
+                }
+                continue;
+            }
+            if scheme == Scheme::Both {
                 put(0, channel, panel, high);
                 put(0, channel, panels + panel, low);
                 put(0, HALF + channel, panels + panel, high);
@@ -86,7 +101,9 @@ pub(crate) fn accumulate(
     // SAFETY: an `Isa` with tiles is only made where the processor has AVX-512. All rows of the plan lie below its end.
     let small = unsafe {
         match weights.scheme {
-            Scheme::Both => split_short_rows(input, cin, plan.inputs(), &mut buffers.rows),
+            Scheme::Both | Scheme::Pairs => {
+                split_short_rows(input, cin, plan.inputs(), &mut buffers.rows)
+            }
             _ => split_rows(input, cin, plan.inputs(), &mut buffers.rows),
         }
     };
@@ -96,7 +113,12 @@ pub(crate) fn accumulate(
             Lanes::default(),
         );
         // SAFETY: as above, and it has AMX; `rows` has just been filled for this plan and these weights.
-        unsafe { multiply(weights, plan, buffers, sums) };
+        unsafe {
+            match weights.scheme {
+                Scheme::Pairs => pairs::multiply(weights, plan, buffers, sums),
+                _ => multiply(weights, plan, buffers, sums),
+            }
+        }
     }
     small
 }

@@ -4,6 +4,7 @@
 
 pub(crate) mod brain;
 pub(crate) mod integers;
+mod pairs;
 mod spin;
 
 use std::arch::asm;
@@ -27,6 +28,8 @@ enum Scheme {
     Digits,
     /// 32 high digits and 32 low ones in a tile row, which meet three tiles of weights: columns of high, mixed and low products.
     Both,
+    /// 32 channels of two taps in a tile row, of one digit: see [`pairs`].
+    Pairs,
     /// 32 channels in bf16.
     Brain,
 }
@@ -38,6 +41,8 @@ pub(crate) struct Weights {
     scheme: Scheme,
     /// `[pass][tap][chunk][column]` tiles: four input bytes of one output channel are a word.
     tiles: Vec<Lanes>,
+    /// Of each tap, its pair and half, if taps are multiplied in pairs.
+    homes: Vec<[usize; 2]>,
 }
 
 impl Weights {
@@ -46,8 +51,13 @@ impl Weights {
             extents,
             scheme,
             tiles: Vec::new(),
+            homes: pairs::homes(extents.volume),
         };
-        let tiles = weights.passes() * extents.volume * weights.chunks() * weights.columns();
+        let taps = match scheme {
+            Scheme::Pairs => extents.volume.div_ceil(2),
+            _ => extents.volume,
+        };
+        let tiles = weights.passes() * taps * weights.chunks() * weights.columns();
         weights.tiles.resize(tiles * TILE, Lanes::default());
         weights
     }
@@ -56,7 +66,7 @@ impl Weights {
     fn passes(&self) -> usize {
         match self.scheme {
             Scheme::Digits => 3,
-            Scheme::Both | Scheme::Brain => 1,
+            Scheme::Both | Scheme::Pairs | Scheme::Brain => 1,
         }
     }
 
@@ -64,14 +74,14 @@ impl Weights {
     fn chunks(&self) -> usize {
         match self.scheme {
             Scheme::Digits => self.extents.cin.div_ceil(LINE),
-            Scheme::Both | Scheme::Brain => self.extents.cin.div_ceil(LINE / 2),
+            Scheme::Both | Scheme::Pairs | Scheme::Brain => self.extents.cin.div_ceil(LINE / 2),
         }
     }
 
     /// Columns of tiles in each pass.
     fn columns(&self) -> usize {
         match self.scheme {
-            Scheme::Both => 3 * self.extents.panels(),
+            Scheme::Both | Scheme::Pairs => 3 * self.extents.panels(),
             Scheme::Digits | Scheme::Brain => self.extents.panels(),
         }
     }
@@ -87,7 +97,7 @@ impl Weights {
     fn taps(&self, width: usize) -> usize {
         match self.scheme {
             // Rows are short: their sums would be stored and loaded too often.
-            Scheme::Both => self.extents.volume,
+            Scheme::Both | Scheme::Pairs => self.extents.volume,
             Scheme::Digits | Scheme::Brain => (CACHED / width).max(1),
         }
     }
@@ -117,6 +127,8 @@ pub(crate) struct Buffers {
     gathered: Vec<Lanes>,
     /// The products: `[pass][block of columns][group][column]` tiles.
     products: Vec<Lanes>,
+    /// What [`pairs`] multiplies.
+    steps: pairs::Steps,
 }
 
 /// Room for a plan's input rows, once it is known that they are there.
@@ -156,6 +168,7 @@ unsafe fn multiply(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, su
         rows,
         gathered,
         products,
+        ..
     } = buffers;
     let Extents { volume, .. } = weights.extents;
     let (chunks, columns, passes) = (weights.chunks(), weights.columns(), weights.passes());
@@ -464,7 +477,7 @@ fn combine(weights: &Weights, [group, groups]: [usize; 2], products: &[Lanes], s
         let [high, low, mixed] = match weights.scheme {
             Scheme::Digits => [0, 1, 2].map(|pass| tile(pass, panel)),
             Scheme::Both => [0, 2, 1].map(|digit| tile(0, digit * panels + panel)),
-            Scheme::Brain => [tile(0, panel); 3],
+            Scheme::Pairs | Scheme::Brain => [tile(0, panel); 3],
         };
         for (at, sums) in sums.chunks_exact_mut(panels).enumerate() {
             let (high, low, mixed) = (high[at].0, low[at].0, mixed[at].0);

@@ -3,17 +3,33 @@
 use std::arch::asm;
 
 use super::{LINE, TILE, configure, release};
-use crate::rows::PANEL;
+use crate::ceiling::some_words;
+use crate::rows::{Lanes, PANEL};
 
-/// A function that multiplies tiles `4 · rounds` times, and gives the number of products of `$bytes` bytes.
+/// As many tiles of bytes between −32 and 31: the digits of numbers are no larger.
+fn some_digits<const N: usize>() -> [Lanes; N] {
+    let digits = |word: u32| {
+        let of = |byte: u8| ((byte << 2) as i8 >> 2) as u8;
+        u32::from_le_bytes(word.to_le_bytes().map(of))
+    };
+    // Their lower bytes are as good as any.
+    some_words().map(|words: Lanes| Lanes(words.0.map(|word| digits(word ^ word << 8))))
+}
+
+/// A function that multiplies tiles of `$words` `4 · rounds` times, and gives the number of products of `$bytes` bytes.
 macro_rules! spin {
-    ($name:ident, $multiply:literal, $bytes:literal) => {
+    ($name:ident, $multiply:literal, $bytes:literal, $words:expr) => {
         pub(crate) fn $name(isa: crate::Isa, rounds: usize) -> usize {
             assert!(isa.has_tiles());
+            let words: [Lanes; 4 * TILE] = $words;
             configure();
-            // SAFETY: tiles are configured, and zero; the registers that are written are named.
+            // SAFETY: tiles are configured, and four of them read; the registers that are written are named.
             unsafe {
                 asm!(
+                    "tileloadd tmm4, [{words} + {line}]",
+                    "tileloadd tmm5, [{words} + {line} + 1024]",
+                    "tileloadd tmm6, [{words} + {line} + 2048]",
+                    "tileloadd tmm7, [{words} + {line} + 3072]",
                     "2:",
                     concat!($multiply, " tmm0, tmm4, tmm6"),
                     concat!($multiply, " tmm1, tmm5, tmm6"),
@@ -22,8 +38,11 @@ macro_rules! spin {
                     "dec {rounds}",
                     "jnz 2b",
                     rounds = inout(reg) rounds.max(1) => _,
+                    words = in(reg) words.as_ptr(),
+                    line = in(reg) LINE,
                     out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
-                    options(nostack, nomem),
+                    out("tmm4") _, out("tmm5") _, out("tmm6") _, out("tmm7") _,
+                    options(nostack, readonly),
                 );
             }
             release();
@@ -31,5 +50,5 @@ macro_rules! spin {
         }
     };
 }
-spin!(spin, "tdpbssd", 1);
-spin!(spin_brain, "tdpbf16ps", 2);
+spin!(spin, "tdpbssd", 1, some_digits());
+spin!(spin_brain, "tdpbf16ps", 2, some_words());

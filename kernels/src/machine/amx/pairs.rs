@@ -1,0 +1,353 @@
+//! Up to 32 channels of two taps in a tile row: the multiplication fills its tiles, and a step of two taps takes the time of one.
+
+use std::arch::asm;
+
+use super::{Buffers, LINE, TILE, Weights, configure, release};
+use crate::plan::PlanTile;
+use crate::rows::{Extents, Lanes, MOST_TAPS};
+
+/// Panels whose sums of three products fit the tiles, beside one of rows and one of weights.
+const WIDTH: usize = 2;
+/// Products of digits: high, low, and of their sums.
+const PRODUCTS: usize = 3;
+/// [`Lanes`] of a group's products.
+const STORED: usize = WIDTH * PRODUCTS * TILE;
+
+/// The taps of a 3³ kernel in pairs that few groups need: on surfaces a voxel has both neighbours or none more often than not.
+const OF_27: [&[u8]; 14] = [
+    &[0, 1],
+    &[2],
+    &[3, 6],
+    &[4, 7],
+    &[5, 8],
+    &[9, 18],
+    &[10, 13],
+    &[11, 14],
+    &[12, 15],
+    &[16, 17],
+    &[19, 20],
+    &[21, 24],
+    &[22, 25],
+    &[23, 26],
+];
+
+/// The pair of each tap, and its half.
+pub(super) fn homes(volume: usize) -> Vec<[usize; 2]> {
+    let mut homes: Vec<_> = (0..volume).map(|tap| [tap / 2, tap % 2]).collect();
+    if volume == 27 {
+        for (pair, taps) in OF_27.iter().enumerate() {
+            for (half, &tap) in taps.iter().enumerate() {
+                homes[usize::from(tap)] = [pair, half];
+            }
+        }
+    }
+    homes
+}
+
+/// The tile of a pair's product of one panel: those of a block of panels follow each other for each pair.
+pub(super) fn tile(extents: Extents, pair: usize, product: usize, panel: usize) -> usize {
+    let (pairs, block) = (extents.volume.div_ceil(2), panel / WIDTH);
+    let width = WIDTH.min(extents.panels() - block * WIDTH);
+    let before = block * WIDTH * PRODUCTS * pairs;
+    before + (pair * PRODUCTS + product) * width + panel % WIDTH
+}
+
+/// The rows of two taps, and the weights that they meet.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct Step {
+    /// For each tap, which sixteen of the rows.
+    places: [*const u16; 2],
+    weights: *const Lanes,
+}
+
+/// Memory that a thread reuses.
+#[derive(Default)]
+pub(super) struct Steps {
+    /// Of all groups, one after the other.
+    all: Vec<Step>,
+    /// How many each group has.
+    counts: Vec<usize>,
+}
+
+/// One group's products of one block of panels.
+struct Block {
+    /// Steps, and two more of which the rows are there.
+    steps: *const Step,
+    count: usize,
+    /// Input rows, high digits and low ones.
+    rows: *const Lanes,
+    /// Room for three tiles each: the rows of the first step, those of the second, and nothing yet.
+    gathered: [*mut Lanes; 3],
+    /// Where the products go.
+    to: *mut Lanes,
+}
+
+/// The sums of all groups: `sums[row · panels + panel]`.
+///
+/// What a step multiplies is gathered two steps before, in whatever group they are: what has just been written to memory takes long to come
+/// back as a tile.
+///
+/// # Safety
+/// The processor must have AMX and AVX-512 F, BW and VL, `buffers.rows` the plan's input rows, high digits and low ones, and then one of zeros.
+#[target_feature(enable = "avx2,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512vl")]
+pub(super) unsafe fn multiply(
+    weights: &Weights,
+    plan: &PlanTile,
+    buffers: &mut Buffers,
+    sums: &mut [Lanes],
+) {
+    let Buffers {
+        rows,
+        gathered,
+        products,
+        steps: Steps { all: steps, counts },
+    } = buffers;
+    let extents = weights.extents;
+    let panels = extents.panels();
+    let nothing = [plan.inputs().len() as u16; TILE];
+    gathered.resize(3 * PRODUCTS * TILE, Lanes::default());
+    products.resize(2 * STORED, Lanes::default());
+    let rows = rows.as_ptr();
+    let mut gathered = [0, 1, 2].map(|i| gathered[i * PRODUCTS * TILE..].as_mut_ptr());
+    configure();
+    // Each group's products are put together while the next one's are made.
+    let mut made: Option<[usize; 2]> = None;
+    let mut turn = 0;
+    for panel in (0..panels).step_by(WIDTH) {
+        steps.clear();
+        counts.clear();
+        for group in 0..plan.groups() {
+            let (taps, places) = plan.steps(group, 0..extents.volume);
+            let mut halves = [[nothing.as_ptr(); 2]; MOST_TAPS.div_ceil(2)];
+            let mut used = 0u32;
+            for (&tap, places) in taps.iter().zip(places.chunks_exact(TILE)) {
+                let [pair, half] = weights.homes[usize::from(tap)];
+                halves[pair][half] = places.as_ptr();
+                used |= 1 << pair;
+            }
+            counts.push(used.count_ones() as usize);
+            while used != 0 {
+                let pair = used.trailing_zeros() as usize;
+                steps.push(Step {
+                    places: halves[pair],
+                    weights: weights.tiles[tile(extents, pair, 0, panel) * TILE..].as_ptr(),
+                });
+                used &= used - 1;
+            }
+        }
+        let end = Step {
+            places: [nothing.as_ptr(); 2],
+            weights: weights.tiles.as_ptr(),
+        };
+        steps.extend([end; 2]);
+        for (step, to) in steps.iter().zip(gathered).take(2) {
+            // SAFETY: the places name rows that are there, and the tiles are there.
+            unsafe { gather(step, rows, to) };
+        }
+        let mut first = 0;
+        for (group, &count) in counts.iter().enumerate() {
+            let mut block = Block {
+                steps: steps[first..].as_ptr(),
+                count,
+                rows,
+                gathered,
+                to: products[turn * STORED..].as_mut_ptr(),
+            };
+            // SAFETY: the places name rows that are there, the weights are those of whole pairs, there is room for the tiles, and they
+            // are configured; the first two steps' rows are gathered.
+            unsafe {
+                match panels - panel {
+                    1 => one(&mut block),
+                    _ => two(&mut block),
+                }
+            }
+            gathered = block.gathered;
+            first += count;
+            if let Some(of) = made.replace([group, panel]) {
+                combine(panels, of, &products[(1 - turn) * STORED..], sums);
+            }
+            turn = 1 - turn;
+        }
+    }
+    release();
+    if let Some(of) = made {
+        combine(panels, of, &products[(1 - turn) * STORED..], sums);
+    }
+    // They point into the plan.
+    steps.clear();
+}
+
+/// Puts a group's products of a block of panels together.
+#[target_feature(enable = "avx512f")]
+#[inline]
+fn combine(panels: usize, [group, panel]: [usize; 2], products: &[Lanes], sums: &mut [Lanes]) {
+    let width = WIDTH.min(panels - panel);
+    let sums = &mut sums[group * TILE * panels..][..TILE * panels];
+    for at in 0..width {
+        let [high, low, both] = [0, 1, 2].map(|product| {
+            let tile = &products[(product * width + at) * TILE..];
+            &tile[..TILE]
+        });
+        for (row, sums) in sums.chunks_exact_mut(panels).enumerate() {
+            let (high, low, both) = (&high[row].0, &low[row].0, &both[row].0);
+            sums[panel + at].0 = std::array::from_fn(|lane: usize| {
+                let (high, low) = (high[lane], low[lane]);
+                let mixed = both[lane].wrapping_sub(high).wrapping_sub(low);
+                (high << 12).wrapping_add(mixed << 6).wrapping_add(low)
+            });
+        }
+    }
+}
+
+/// Puts one row of both taps into the tiles of high digits, low ones and sums.
+macro_rules! row {
+    ($($place:literal: $line:literal),*) => {
+        concat!($(
+            "movzx {a:e}, word ptr [{first} + ", $place, "]\n",
+            "movzx {b:e}, word ptr [{second} + ", $place, "]\n",
+            "shl {a:e}, 6\n",
+            "shl {b:e}, 6\n",
+            "vmovdqa64 zmm16, [{rows} + {a}]\n",
+            "vmovdqa64 zmm17, [{rows} + {b}]\n",
+            "vinserti64x4 zmm18, zmm16, ymm17, 1\n",
+            "vshufi64x2 zmm19, zmm16, zmm17, 0xEE\n",
+            "vpaddb zmm20, zmm18, zmm19\n",
+            "vmovdqa64 [{next} + ", $line, "], zmm18\n",
+            "vmovdqa64 [{next} + ", $line, " + 1024], zmm19\n",
+            "vmovdqa64 [{next} + ", $line, " + 2048], zmm20\n",
+        )*)
+    };
+}
+
+/// Gathers the rows of one step.
+macro_rules! gather {
+    () => {
+        row!(
+            "0": "0", "2": "64", "4": "128", "6": "192", "8": "256", "10": "320", "12": "384", "14": "448",
+            "16": "512", "18": "576", "20": "640", "22": "704", "24": "768", "26": "832", "28": "896", "30": "960"
+        )
+    };
+}
+
+/// Gathers the rows of a step.
+///
+/// # Safety
+/// The processor must have AVX-512 F and BW, the places name rows that are there, and `to` have room for three tiles.
+unsafe fn gather(step: &Step, rows: *const Lanes, to: *mut Lanes) {
+    // SAFETY: the caller's promise. All registers that are written are named.
+    unsafe {
+        asm!(
+            gather!(),
+            rows = in(reg) rows,
+            next = in(reg) to,
+            first = in(reg) step.places[0],
+            second = in(reg) step.places[1],
+            a = out(reg) _,
+            b = out(reg) _,
+            out("zmm16") _, out("zmm17") _, out("zmm18") _, out("zmm19") _, out("zmm20") _,
+            options(nostack),
+        );
+    }
+}
+
+/// A function that multiplies a block of some panels: where their tiles lie, for each product.
+macro_rules! panels {
+    ($(#[$doc:meta])* $name:ident, $($rows:literal: $(($sum:literal, $at:literal)),*);*) => {
+        $(#[$doc])*
+        ///
+        /// # Safety
+        /// Tiles must be configured, and the block's pointers hold what they promise for these panels.
+        unsafe fn $name(block: &mut Block) {
+            let [now, soon, next] = &mut block.gathered;
+            // SAFETY: the caller's promise. All registers that are written are named.
+            unsafe {
+                asm!(
+                    $($(concat!("tilezero tmm", $sum),)*)*
+                    "test {count}, {count}",
+                    "jz 6f",
+                    "4:",
+                    "mov {first}, [{steps} + 48]",
+                    "mov {second}, [{steps} + 56]",
+                    gather!(),
+                    "mov {a}, [{steps} + 16]",
+                    $(
+                        concat!("tileloadd tmm6, [{now} + {line} + ", $rows, "]"),
+                        $(
+                            concat!("tileloadd tmm7, [{a} + {line} + ", $at, "]"),
+                            concat!("tdpbssd tmm", $sum, ", tmm6, tmm7"),
+                        )*
+                    )*
+                    "mov {a}, {now}",
+                    "mov {now}, {soon}",
+                    "mov {soon}, {next}",
+                    "mov {next}, {a}",
+                    "add {steps}, 24",
+                    "dec {count}",
+                    "jnz 4b",
+                    "6:",
+                    $($(concat!("tilestored [{to} + {line} + ", $at, "], tmm", $sum),)*)*
+                    steps = inout(reg) block.steps => _,
+                    count = inout(reg) block.count => _,
+                    rows = in(reg) block.rows,
+                    now = inout(reg) *now,
+                    soon = inout(reg) *soon,
+                    next = inout(reg) *next,
+                    to = in(reg) block.to,
+                    line = in(reg) LINE,
+                    first = out(reg) _,
+                    second = out(reg) _,
+                    a = out(reg) _,
+                    b = out(reg) _,
+                    out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
+                    out("tmm4") _, out("tmm5") _, out("tmm6") _, out("tmm7") _,
+                    out("zmm16") _, out("zmm17") _, out("zmm18") _, out("zmm19") _, out("zmm20") _,
+                    options(nostack),
+                );
+            }
+        }
+    };
+}
+
+panels!(
+    /// One panel.
+    one, "0": ("0", "0"); "1024": ("1", "1024"); "2048": ("2", "2048")
+);
+panels!(
+    /// Two panels.
+    two, "0": ("0", "0"), ("1", "1024"); "1024": ("2", "2048"), ("3", "3072"); "2048": ("4", "4096"), ("5", "5120")
+);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_tap_has_a_half_of_a_pair_of_its_own() {
+        for volume in [1, 2, 8, 27, 54] {
+            let mut homes = homes(volume);
+            assert!(homes.iter().all(|[pair, _]| *pair < volume.div_ceil(2)));
+            homes.sort_unstable();
+            homes.dedup();
+            assert_eq!(homes.len(), volume);
+        }
+    }
+
+    #[test]
+    fn every_product_has_a_tile_of_its_own() {
+        for panels in 1..6 {
+            let extents = Extents {
+                volume: 27,
+                cin: 32,
+                cout: 16 * panels,
+            };
+            let all = (0..14).flat_map(|pair| (0..3).map(move |product| (pair, product)));
+            let tiles = all.flat_map(|(pair, product)| {
+                (0..panels).map(move |panel| tile(extents, pair, product, panel))
+            });
+            let mut tiles: Vec<_> = tiles.collect();
+            tiles.sort_unstable();
+            assert!(tiles.into_iter().eq(0..14 * 3 * panels));
+        }
+    }
+}
