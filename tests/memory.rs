@@ -8,10 +8,10 @@ use b2p::bitstream::Header;
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Options, encode};
-use b2p::gaussians::Gaussians;
+use b2p::gaussians::{Gaussians, Harmonics};
 use b2p::log::Log;
 use b2p::network::{Heads, Model, Shape, untrained};
-use b2p::pixels::{Background, render};
+use b2p::pixels::{Background, Channel, Choice, Effects, Ids, Image, Renderer, render};
 use b2p::projection::Camera;
 use b2p::{Error, Limits};
 use common::{Ball, cloud_of};
@@ -237,6 +237,76 @@ fn drawing_stays_within_the_memory_limit() {
                 Err(error) => panic!("{error}"),
             }
             println!("{count} Gaussians of {scale}: {held} of {max_bytes} bytes");
+        }
+    }
+}
+
+#[test]
+fn gaussians_over_the_near_plane_are_refused_before_their_memory_is_taken() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    let gaussians = splats(100_000, 0.9);
+    let camera = Camera::orbit(10.0, 10.0, 0.5, 45.0, 32, 32).unwrap();
+    let draw = |max_bytes| {
+        let limits = Limits {
+            max_bytes,
+            ..Limits::default()
+        };
+        render(&gaussians, &camera, Background::WHITE, &limits)
+    };
+    let (_, stats) = draw(1 << 30).unwrap();
+    assert!(stats.crossing > 90_000, "{}", stats.crossing);
+    // As much as they take without what is kept for those that cross.
+    let Err(Error::LimitExceeded { needed, .. }) = draw(1 << 20) else {
+        panic!("1 MB is too little for 100,000 Gaussians");
+    };
+    let (refused, held) = peak(|| draw(needed));
+    assert!(matches!(refused, Err(Error::LimitExceeded { .. })));
+    assert!(held <= needed + Limits::OVERHEAD, "{held} of {needed}");
+}
+
+#[test]
+fn from_the_third_picture_on_drawing_takes_no_memory() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    let mut gaussians = splats(20_000, 0.02);
+    gaussians.harmonics = Harmonics {
+        count: 3,
+        coefficients: vec![[0.01; 3]; 3 * gaussians.len()],
+    };
+    let plain = Effects::default();
+    let on = Choice::On;
+    let antialias = Effects {
+        antialias: on,
+        ..plain
+    };
+    let order = Effects { order: on, ..plain };
+    // One thread: of several, each takes what it needs when the fullest tile first comes to it.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1);
+    let pool = pool.build().unwrap();
+    // From afar, and from among them, where some reach over the near plane.
+    for (distance, crossing) in [(3.0, false), (0.8, true)] {
+        let camera = Camera::orbit(10.0, 10.0, distance, 45.0, 200, 150).unwrap();
+        for effects in [plain, antialias, order] {
+            let mut renderer = Renderer::default();
+            renderer.set_effects(effects);
+            let (mut image, mut ids) = (Image::default(), Ids::default());
+            let mut draw = || {
+                let limits = Limits::default();
+                for channel in [Channel::Colour, Channel::Depth] {
+                    let over = Background::WHITE;
+                    let image = &mut image;
+                    let stats =
+                        renderer.draw_into(&gaussians, &camera, channel, over, &limits, image);
+                    assert_eq!(stats.unwrap().crossing > 0, crossing);
+                }
+                let stats = renderer.ids_into(&gaussians, &camera, &limits, &mut ids);
+                assert!(stats.unwrap().touched > 0);
+            };
+            pool.install(|| {
+                draw();
+                draw();
+                let ((), held) = peak(&mut draw);
+                assert_eq!(held, 0, "{effects:?} at {distance}");
+            });
         }
     }
 }

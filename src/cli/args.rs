@@ -16,7 +16,7 @@ pub struct Cli {
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     pub threads: Option<u16>,
 
-    /// Print nothing but errors
+    /// Print nothing but warnings and errors
     #[arg(short, long, global = true)]
     pub quiet: bool,
 

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use b2p_kernels::Isa;
 use b2p_kernels::splat::{Loop, Scene, Tile};
+use bytemuck::Zeroable;
 
 use super::Background;
 use crate::projection::Bounds;
@@ -46,7 +47,7 @@ pub(super) struct Desk {
 }
 
 /// What a picture is made of.
-pub(super) trait Pixel: Copy + Default + Send {
+pub(super) trait Pixel: Copy + Zeroable + Send {
     /// Where nothing is drawn.
     fn empty(background: Background) -> Self;
 

@@ -349,34 +349,34 @@ impl Renderer {
         if shaded {
             shade::fill(gaussians, camera, channel, &mut self.shades);
         }
-        let mut how = How {
+        let how = How {
             isa: self.isa,
             compensated: effects.antialias,
             floor,
-            near_care: effects.near,
+            near_care: self.effects.near != Choice::Off,
             slopes: effects.order,
             colours: shaded.then_some(&self.shades),
         };
-        let mut project = |how| {
-            let start = |count: &mut Count, length| count.start(grid, length);
-            let look = |count: &mut Count, ellipses: &[Ellipse]| count.count(grid, ellipses);
-            self.ellipses
-                .project(gaussians, &fine, how, &mut self.counts, start, look)
-        };
-        let mut seen = project(how)?;
-        if seen.crossing > 0 && self.effects.near == Choice::Auto {
-            // Only now is it known that care is called for.
-            how.near_care = true;
-            seen = project(how)?;
-        }
+        let start = |count: &mut Count, length| count.start(grid, length);
+        let look = |count: &mut Count, ellipses: &[Ellipse]| count.count(grid, ellipses);
+        let seen = self
+            .ellipses
+            .project(gaussians, &fine, how, &mut self.counts, start, look)?;
         effects.near = how.near_care && seen.crossing > 0;
         let crossing = if effects.near { seen.crossing } else { 0 };
         let bytes = bytes + crossing * size_of::<Crossing>() as u64;
+        limits.check_bytes("bytes to draw the picture", bytes)?;
+        self.ellipses.look_closer(gaussians, &fine, how);
         times.project = lap();
         let pairs = self.bins.plan(grid, &mut self.counts, bytes, limits)?;
         times.bin = lap();
 
-        pixels.resize(count as usize, P::default());
+        if pixels.capacity() < count as usize {
+            // What is outgrown goes first, and zeros come as tiles are drawn, from the threads that draw them.
+            *pixels = Vec::new();
+            *pixels = bytemuck::zeroed_vec(count as usize);
+        }
+        pixels.resize(count as usize, P::zeroed());
         self.desks
             .resize_with(rayon::current_num_threads(), Mutex::default);
         let canvas = Canvas {

@@ -12,12 +12,16 @@ const ASKED: usize = 1024;
 pub(super) fn typical_width(gaussians: &Gaussians, camera: &Camera) -> f64 {
     let step = gaussians.len().div_ceil(ASKED).max(1);
     let all = (0..gaussians.len()).step_by(step);
-    let mut widths: Vec<f64> = all.filter_map(|i| width(gaussians, camera, i)).collect();
+    let (mut widths, mut seen) = ([0.0; ASKED], 0);
+    for width in all.filter_map(|i| width(gaussians, camera, i)) {
+        widths[seen] = width;
+        seen += 1;
+    }
+    let widths = &mut widths[..seen];
     if widths.is_empty() {
         return f64::INFINITY;
     }
-    let middle = widths.len() / 2;
-    *widths.select_nth_unstable_by(middle, f64::total_cmp).1
+    *widths.select_nth_unstable_by(seen / 2, f64::total_cmp).1
 }
 
 /// The width of Gaussian `i`, if it is in the picture: the middle one of its three standard deviations, in pixels.

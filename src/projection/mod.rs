@@ -18,6 +18,7 @@ use std::ops::Range;
 
 use b2p_kernels::Isa;
 use b2p_kernels::splat::{self, Cloud, Crossing, Tally, View};
+use rayon::iter::repeat_n;
 use rayon::prelude::*;
 
 pub use b2p_kernels::splat::{BLUR, Bounds, Ellipse, MAX_SCALE};
@@ -130,7 +131,17 @@ impl Ellipses {
         }
         let view = view(camera, how, gaussians.blur);
         let length = run_length(count);
-        self.all.resize(count, Ellipse::default());
+        if self.all.len() < count {
+            if self.all.capacity() < count {
+                // What is outgrown goes before its successor comes.
+                self.all = Vec::new();
+            }
+            // New memory comes from the system page by page, as it is touched: by all threads.
+            repeat_n(Ellipse::default(), count)
+                .with_min_len(LEAST_RUN)
+                .collect_into_vec(&mut self.all);
+        }
+        self.all.truncate(count);
         self.runs.clear();
         self.runs.resize(count.div_ceil(length), Run::default());
         states.resize_with(self.runs.len(), S::default);
@@ -163,8 +174,8 @@ impl Ellipses {
                     tally,
                 };
             });
-        self.find_crossing(gaussians, camera, how.near_care);
-        self.find_slopes(gaussians, camera, how.slopes);
+        self.crossing.clear();
+        self.slopes.clear();
         self.visible = self.runs.iter().map(|run| run.tally.visible as usize).sum();
         let mut seen = Seen::default();
         for run in &self.runs {
@@ -216,33 +227,60 @@ impl Ellipses {
         &self.slopes
     }
 
-    fn find_crossing(&mut self, gaussians: &Gaussians, camera: &Camera, wanted: bool) {
-        self.crossing.clear();
-        if !wanted || self.runs.iter().all(|run| run.tally.crossing == 0) {
-            return;
+    /// Finds out, reusing memory, what effects need to know of those last projected beyond their ellipses. [`Seen::crossing`] says how many
+    /// [`Crossing`] that may take.
+    pub fn look_closer(&mut self, gaussians: &Gaussians, camera: &Camera, how: How) {
+        if how.near_care {
+            let crossing = self.runs.iter().map(|run| run.tally.crossing as usize);
+            self.crossing.resize(crossing.sum(), Crossing::default());
+            fill_crossing(&self.runs, &self.all, &mut self.crossing, &|index| {
+                space::crossing(gaussians, camera, index as usize)
+            });
         }
-        let crossing = self.runs.par_iter().flat_map_iter(|run| {
-            let ellipses = &self.all[run.first..][..run.tally.visible as usize];
-            let crossing = ellipses.iter().filter(|ellipse| ellipse.crosses());
-            crossing.map(|ellipse| space::crossing(gaussians, camera, ellipse.index as usize))
-        });
-        self.crossing = crossing.collect();
+        if how.slopes {
+            self.slopes.resize(self.all.len(), [0.0; 2]);
+            let length = run_length(self.all.len());
+            let runs = self.runs.par_iter().zip(self.slopes.par_chunks_mut(length));
+            runs.for_each(|(run, slopes)| {
+                for (slope, ellipse) in slopes.iter_mut().zip(run.of(&self.all)) {
+                    *slope = space::slopes(gaussians, camera, ellipse.index as usize);
+                }
+            });
+        }
     }
+}
 
-    fn find_slopes(&mut self, gaussians: &Gaussians, camera: &Camera, wanted: bool) {
-        self.slopes.clear();
-        if !wanted {
-            return;
-        }
-        self.slopes.resize(self.all.len(), [0.0; 2]);
-        let length = run_length(self.all.len());
-        let runs = self.runs.par_iter().zip(self.slopes.par_chunks_mut(length));
-        runs.for_each(|(run, slopes)| {
-            let ellipses = &self.all[run.first..][..run.tally.visible as usize];
-            for (slope, ellipse) in slopes.iter_mut().zip(ellipses) {
-                *slope = space::slopes(gaussians, camera, ellipse.index as usize);
+/// Fills `crossing` with what `see` says of those of the runs' ellipses that cross the near plane, all of which are visible.
+fn fill_crossing(
+    runs: &[Run],
+    all: &[Ellipse],
+    crossing: &mut [Crossing],
+    see: &(impl Fn(u32) -> Crossing + Sync),
+) {
+    match runs {
+        [] => {}
+        [run] => {
+            let crosses = run.of(all).iter().filter(|ellipse| ellipse.crosses());
+            for (to, ellipse) in crossing.iter_mut().zip(crosses) {
+                *to = see(ellipse.index);
             }
-        });
+        }
+        _ => {
+            let (left, right) = runs.split_at(runs.len() / 2);
+            let some = left.iter().map(|run| run.tally.crossing as usize).sum();
+            let (first, rest) = crossing.split_at_mut(some);
+            rayon::join(
+                || fill_crossing(left, all, first, see),
+                || fill_crossing(right, all, rest, see),
+            );
+        }
+    }
+}
+
+impl Run {
+    /// Its ellipses.
+    fn of<'a>(&self, all: &'a [Ellipse]) -> &'a [Ellipse] {
+        &all[self.first..][..self.tally.visible as usize]
     }
 }
 

@@ -247,7 +247,7 @@ fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
             assert!(seen.abs_diff(ellipses.len()) <= 5, "{isa}");
             let mut compared = 0;
             for run in ellipses.runs.iter() {
-                let ellipses = &ellipses.all[run.first..][..run.tally.visible as usize];
+                let ellipses = run.of(&ellipses.all);
                 for found in ellipses {
                     if let Ok(expected) = &expected[found.index as usize] {
                         assert_same(found, expected, isa);

@@ -78,10 +78,15 @@ impl Grid {
         [x.start - column..x.end - column, y.start - row..y.end - row]
     }
 
-    /// Bytes of the counts of as many runs.
+    /// Bytes of the counts of as many runs, their sums, and where tiles start.
     pub fn bytes(&self, runs: usize) -> u64 {
         let tiles = (self.columns as u64 + 1) * (self.rows as u64 + 1);
-        tiles * (runs as u64 * size_of::<u32>() as u64 + size_of::<u64>() as u64)
+        let [counts, total, start] = [
+            runs * size_of::<u32>(),
+            size_of::<u32>(),
+            size_of::<usize>(),
+        ];
+        tiles * (counts + total + start) as u64
     }
 }
 
@@ -315,8 +320,7 @@ impl Bins {
         if self.entries.len() < next {
             // What is outgrown goes before its successor comes, which has no room to spare: memory is what was planned.
             self.entries = Vec::new();
-            self.entries.reserve_exact(next);
-            self.entries.resize_with(next, AtomicU64::default);
+            self.entries = bytemuck::zeroed_vec(next);
         }
         let entries = &self.entries[..];
         let whole = part.rows.len() == self.grid.rows && part.columns.len() == columns;

@@ -64,7 +64,7 @@ pub struct Ellipse {
 /// `x = from·(px, py, 1) + t·along·(px, py, 1)`.
 ///
 /// Its [`Ellipse`] has forms of zeroes and the bounds of the whole picture.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Crossing {
     /// The Gaussian's index in the input.
     pub index: u32,
