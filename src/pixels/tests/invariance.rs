@@ -177,12 +177,15 @@ fn a_picture_in_crops_is_the_picture_to_the_bit() {
     for radius in [3.0, 0.6] {
         let camera = Camera::orbit(30.0, 10.0, radius, 70.0, 96, 80).unwrap();
         for isa in isas() {
-            for choice in [Choice::Off, Choice::On] {
-                let effects = Effects {
-                    antialias: choice,
-                    ..Effects::default()
-                };
-                let whole = with(&scene, &camera, isa, effects).0;
+            let (plain, on) = (Effects::default(), Choice::On);
+            let antialias = Effects {
+                antialias: on,
+                ..plain
+            };
+            let order = Effects { order: on, ..plain };
+            for effects in [plain, antialias, order] {
+                let (whole, stats) = with(&scene, &camera, isa, effects);
+                assert_eq!(stats.effects.near, radius < 1.0, "{radius}");
                 for [x0, y0, x1, y1] in parts {
                     let crop = camera.crop(Bounds { x0, y0, x1, y1 }).unwrap();
                     let part = with(&scene, &crop, isa, effects).0;
@@ -197,20 +200,4 @@ fn a_picture_in_crops_is_the_picture_to_the_bit() {
             }
         }
     }
-}
-
-#[test]
-fn from_the_second_picture_on_no_memory_is_taken() {
-    let scene = scene(random_splats(16, 3000));
-    let camera = orbit(90, 90);
-    let mut renderer = Renderer::default();
-    let mut image = Image::default();
-    let mut draw = |camera: &Camera| {
-        let limits = Limits::default();
-        renderer
-            .render_into(&scene, camera, Background::WHITE, &limits, &mut image)
-            .unwrap();
-        (image.pixels.as_ptr(), renderer.ellipses.all().as_ptr())
-    };
-    assert_eq!(draw(&camera), draw(&camera));
 }
