@@ -155,7 +155,7 @@ impl Bench {
             let ceiling = match precision {
                 Precision::F32 => ceiling,
                 Precision::Bf16 if isa.has_bf16() => ceiling::bf16(isa),
-                Precision::Bf16 => continue,
+                Precision::Bf16 | Precision::Fastest => continue,
             };
             let conv = FloatConv::new(27, cin, cout, &weights, vec![0.0; cout], scale);
             let conv = conv.with_precision(precision);

@@ -1,11 +1,11 @@
 //! The encoder's own modules: feature conversion (FC), pooling, feature squeezing (FS), in floats.
 
 use b2p_kernels::f16;
-use b2p_kernels::{FloatConv, Isa, Taps, to_f16, to_f32};
+use b2p_kernels::{FloatConv, Isa, Precision, Taps, to_f16, to_f32};
 use rayon::prelude::*;
 
 use super::layers::{Pool, apply, apply_f32, concat, reals};
-use super::structure::{Convert, Encoder, ROLES};
+use super::structure::{Convert, Encoder, ROLES, Spec};
 use super::{Model, missing};
 use crate::error::Result;
 use crate::geometry::KernelMap;
@@ -39,13 +39,17 @@ impl Model {
         let mut x = vec![f16::ZERO; centred.len()];
         to_f16(self.isa, &centred, &mut x);
         self.check(&x, 3, maps[0]);
-        let mut x = encoder.fc[ROLES].apply(self.isa, x, maps[0]);
-        let mut out = Vec::with_capacity(coded);
+        let memory = &mut Pool::new();
+        let mut finest = Some(encoder.fc[ROLES].apply(memory, self.isa, &x, maps[0]));
+        let mut out: Vec<Vec<f16>> = Vec::with_capacity(coded);
         for (i, (map, occupancy)) in maps[1..].iter().zip(occupancy).enumerate() {
-            let pooled = pool(self.isa, &x, occupancy, self.shape.channels);
+            let finer = finest.as_ref().or(out.last()).expect("one has been made");
+            let pooled = pool(self.isa, finer, occupancy, self.shape.channels);
+            if let Some(read) = finest.take() {
+                memory.give(read);
+            }
             self.check(&pooled, self.shape.channels, map);
-            x = encoder.fc[coded - 1 - i].apply(self.isa, pooled, map);
-            out.push(x.clone());
+            out.push(encoder.fc[coded - 1 - i].apply(memory, self.isa, &pooled, map));
         }
         Ok(out)
     }
@@ -95,13 +99,24 @@ impl Model {
     }
 }
 
+/// What a layer of the encoder is computed in. The finest level has most of the voxels, and what is made of it is averaged before anything
+/// comes of it: that may be off a little, but for the colours themselves.
+pub(super) fn precision(layer: &Spec) -> Precision {
+    match layer.name.starts_with("fc.3.") && layer.cin > 3 {
+        true => Precision::Fastest,
+        false => Precision::F32,
+    }
+}
+
 impl Convert<FloatConv> {
-    fn apply(&self, isa: Isa, x: Vec<f16>, map: &KernelMap) -> Vec<f16> {
-        let (n, pool) = (map.len(), &mut Pool::new());
-        let x = apply(pool, isa, &self.conv_in, map.taps(), &x, n, false);
+    fn apply(&self, pool: &mut Pool<f16>, isa: Isa, x: &[f16], map: &KernelMap) -> Vec<f16> {
+        let n = map.len();
+        let x = apply(pool, isa, &self.conv_in, map.taps(), x, n, false);
         let blocks = self.blocks.iter();
         let x = blocks.fold(x, |x, block| block.apply(pool, isa, map.taps(), x));
-        apply(pool, isa, &self.conv_out, map.taps(), &x, n, false)
+        let out = apply(pool, isa, &self.conv_out, map.taps(), &x, n, false);
+        pool.give(x);
+        out
     }
 }
 

@@ -66,7 +66,7 @@ use crate::error::{Error, Result};
 use generate::Generator;
 use load::{Tensors, malformed};
 use stored::Stored;
-use structure::{Encoder, Exact, Generate};
+use structure::{Encoder, Exact, Generate, Spec};
 
 pub(crate) use generate::AT_ONCE;
 pub use generate::Precision;
@@ -113,7 +113,13 @@ impl Model {
         let tensors = Tensors::new(bytes)?;
         let shape = tensors.shape()?;
         let tables = tables(&tensors, &shape)?;
-        let mut float = |spec| Ok(tensors.stored_layer(spec)?.float());
+        let mut float = |spec: Spec| {
+            let precision = convert::precision(&spec);
+            Ok(tensors
+                .stored_layer(spec)?
+                .float()
+                .with_precision(precision))
+        };
         let encoder = match tensors.any("fc.") || tensors.any("fs.") {
             true => Some(shape.encoder(&mut float)?),
             false => None,

@@ -76,11 +76,18 @@ fn check_bf16(
     relu: bool,
     expected: &[reference::Value],
 ) {
-    let conv = conv.clone().with_precision(Precision::Bf16);
+    let of = |precision| conv.clone().with_precision(precision);
+    let (conv, fastest) = (of(Precision::Bf16), of(Precision::Fastest));
     for isa in Isa::available() {
         let mut out = vec![f32::NAN; rows * conv.cout()];
         let output = whole(&mut out, conv.cout(), residual, relu);
         conv.run(isa, *taps, input, 0, output);
+        if isa.has_tiles() {
+            let mut same = vec![f32::NAN; out.len()];
+            let output = whole(&mut same, conv.cout(), residual, relu);
+            fastest.run(isa, *taps, input, 0, output);
+            assert_eq!(same, out, "tiles hold bf16");
+        }
         for (&got, want) in out.iter().zip(expected) {
             let error = (f64::from(got) - want.value).abs();
             let bound = want.magnitude / 128.0 + 1e-30;
@@ -116,7 +123,7 @@ fn bf16_is_off_by_a_few_thousandths() {
             false,
         );
         let conv = FloatConv::new(27, cin, cout, &weights, bias, Scale::Plain);
-        for precision in [Precision::F32, Precision::Bf16] {
+        for precision in [Precision::F32, Precision::Bf16, Precision::Fastest] {
             let conv = conv.clone().with_precision(precision);
             assert_eq!(conv.precision(), precision);
             for isa in Isa::available() {
@@ -135,7 +142,11 @@ fn bf16_is_off_by_a_few_thousandths() {
                 });
                 let relative = f64::sqrt(error / size);
                 println!("{isa}, {precision:?}, inputs above {low}: {relative:.2e}");
-                let brain = precision == Precision::Bf16 && isa.has_bf16();
+                let brain = match precision {
+                    Precision::F32 => false,
+                    Precision::Bf16 => isa.has_bf16(),
+                    Precision::Fastest => isa.has_tiles(),
+                };
                 assert!(relative < if brain { 4e-3 } else { 1e-6 });
             }
         }

@@ -4,7 +4,7 @@ use b2p_kernels::Isa;
 
 use super::super::reference::{Mode, Oracle, Rows};
 use super::super::{Head, Model, Precision, RAW, Shape, Upsample, untrained};
-use super::{Cloud, error, rows};
+use super::{Cloud, coarser, error, rows};
 use crate::entropy::UNPREDICTED;
 
 /// Networks that together have every switch in both positions.
@@ -355,7 +355,7 @@ fn generation_in_integers_follows_its_definition_and_is_the_same_on_every_isa_an
 }
 
 #[test]
-fn conversion_and_squeezing_follow_their_definition_within_f16() {
+fn conversion_and_squeezing_follow_their_definition_within_f16_or_bf16() {
     let cloud = Cloud::sheet();
     let colours: Vec<[f32; 3]> = (0..cloud.len(3))
         .map(|i| [i % 7, i % 11, i % 29].map(|c| c as f32 / 29.0))
@@ -364,39 +364,42 @@ fn conversion_and_squeezing_follow_their_definition_within_f16() {
     for (seed, shape) in (20..).zip(shapes()) {
         let bytes = untrained(&shape, seed);
         let oracle = Oracle::new(&bytes, Mode::Whole);
-        let model = Model::from_bytes(&bytes).unwrap();
         let mut want = oracle.features(
             &sites.iter().collect::<Vec<_>>(),
             &rows(colours.as_flattened(), 3),
         );
         want.reverse();
-        let got = cloud.features(&model, &colours);
-        for role in 0..3 {
-            let (off, peak) = error(&got[role], &want[role]);
-            println!("features {role}: {:.2e} of {peak:.2}", off / peak);
-            assert!(
-                off < TOLERANCE * peak,
-                "role {role}: off by {off} of {peak}"
-            );
-            let c: Option<Vec<i16>> = (role > 0).then(|| {
-                (0..got[role].len())
-                    .map(|i| ((i * 7919) % 1601) as i16 - 800)
-                    .collect()
-            });
-            let y = model.squeeze(role, &got[role], c.as_deref()).unwrap();
-            let c = c.map(|c| rows(&c, shape.channels));
-            let y_want = oracle.squeeze(
-                role,
-                &cloud.sites(role),
-                &rows(&got[role], shape.channels),
-                c.as_ref(),
-            );
-            let (off, peak) = error(&y, &y_want);
-            println!("latents {role}: {:.2e} of {peak:.2}", off / peak);
-            assert!(
-                off < TOLERANCE * peak,
-                "role {role}: off by {off} of {peak}"
-            );
+        for isa in Isa::available() {
+            let model = Model::from_bytes(&bytes).unwrap().with_isa(isa);
+            let tolerance = TOLERANCE * coarser(isa);
+            let got = cloud.features(&model, &colours);
+            for role in 0..3 {
+                let (off, peak) = error(&got[role], &want[role]);
+                println!("{isa}, features {role}: {:.2e} of {peak:.2}", off / peak);
+                assert!(
+                    off < tolerance * peak,
+                    "{isa}, role {role}: off by {off} of {peak}"
+                );
+                let c: Option<Vec<i16>> = (role > 0).then(|| {
+                    (0..got[role].len())
+                        .map(|i| ((i * 7919) % 1601) as i16 - 800)
+                        .collect()
+                });
+                let y = model.squeeze(role, &got[role], c.as_deref()).unwrap();
+                let c = c.map(|c| rows(&c, shape.channels));
+                let y_want = oracle.squeeze(
+                    role,
+                    &cloud.sites(role),
+                    &rows(&got[role], shape.channels),
+                    c.as_ref(),
+                );
+                let (off, peak) = error(&y, &y_want);
+                println!("{isa}, latents {role}: {:.2e} of {peak:.2}", off / peak);
+                assert!(
+                    off < tolerance * peak,
+                    "{isa}, role {role}: off by {off} of {peak}"
+                );
+            }
         }
     }
 }
@@ -423,5 +426,8 @@ fn fewer_levels_start_from_the_same_first_conversion() {
     );
     assert_eq!((got.len(), want.len()), (1, 1));
     let (off, peak) = error(&got[0], &want[0]);
-    assert!(off < TOLERANCE * peak, "off by {off} of {peak}");
+    assert!(
+        off < TOLERANCE * coarser(model.isa()) * peak,
+        "off by {off} of {peak}"
+    );
 }

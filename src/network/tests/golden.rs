@@ -1,8 +1,10 @@
 //! The trainer's own results on a small cloud: an untrained tiny model, and every number PyTorch computed with it.
 
+use b2p_kernels::Isa;
+
 use super::super::load::{Element, Tensors};
 use super::super::{Model, RAW};
-use super::{Cloud, error, rows};
+use super::{Cloud, coarser, error, rows};
 use crate::gaussians::{Frame, activate};
 use crate::geometry::morton;
 
@@ -87,37 +89,46 @@ fn integer_distributions_are_those_that_the_float_network_predicts() {
 const TOLERANCE: f64 = 10.0 / 4096.0;
 
 #[test]
-fn the_encoder_s_features_and_latents_are_the_trainer_s_within_f16() {
-    let (model, cloud) = (model(), cloud());
+fn the_encoder_s_features_and_latents_are_the_trainer_s_within_f16_or_bf16() {
+    let cloud = cloud();
     let colours: Vec<[f32; 3]> = golden::<u8>("rgb")
         .chunks(3)
         .map(|c| [c[0], c[1], c[2]].map(|c| f32::from(c) / 255.0))
         .collect();
-    for (role, features) in cloud.features(&model, &colours).iter().enumerate() {
-        let want = rows(&golden::<f32>(&format!("fc.{role}")), 16);
-        let (off, peak) = error(features, &want);
-        println!("fc.{role}: {:.2e} of {peak:.2}", off / peak);
-        assert!(off < TOLERANCE * peak, "fc.{role}: off by {off} of {peak}");
-        let context: Option<Vec<i16>> = (role > 0).then(|| golden(&format!("c.{role}")));
-        let y = model.squeeze(role, features, context.as_deref()).unwrap();
-        let want = rows(&golden::<f32>(&format!("fs.{role}")), 4);
-        let (off, peak) = error(&y, &want);
-        println!("fs.{role}: {:.2e} of {peak:.2}", off / peak);
-        assert!(off < TOLERANCE * peak, "fs.{role}: off by {off} of {peak}");
-        // Only what lies near a half may round the other way.
-        let limit = f32::from(model.shape().latent_max);
-        let round = |y: &f32| y.clamp(-limit, limit).round_ties_even() as i16;
-        for ((q, &want), &y) in y
-            .iter()
-            .map(round)
-            .zip(&golden::<i16>(&format!("latent.{role}")))
-            .zip(want.iter().flatten())
-        {
-            let margin = ((y - y.floor()) - 0.5).abs();
+    for isa in Isa::available() {
+        let (model, tolerance) = (model().with_isa(isa), TOLERANCE * coarser(isa));
+        for (role, features) in cloud.features(&model, &colours).iter().enumerate() {
+            let want = rows(&golden::<f32>(&format!("fc.{role}")), 16);
+            let (off, peak) = error(features, &want);
+            println!("{isa}, fc.{role}: {:.2e} of {peak:.2}", off / peak);
             assert!(
-                q == want || margin < TOLERANCE * peak,
-                "fs.{role}: {q} for {y}"
+                off < tolerance * peak,
+                "{isa}, fc.{role}: off by {off} of {peak}"
             );
+            let context: Option<Vec<i16>> = (role > 0).then(|| golden(&format!("c.{role}")));
+            let y = model.squeeze(role, features, context.as_deref()).unwrap();
+            let want = rows(&golden::<f32>(&format!("fs.{role}")), 4);
+            let (off, peak) = error(&y, &want);
+            println!("{isa}, fs.{role}: {:.2e} of {peak:.2}", off / peak);
+            assert!(
+                off < tolerance * peak,
+                "{isa}, fs.{role}: off by {off} of {peak}"
+            );
+            // Only what lies near a half may round the other way.
+            let limit = f32::from(model.shape().latent_max);
+            let round = |y: &f32| y.clamp(-limit, limit).round_ties_even() as i16;
+            for ((q, &want), &y) in y
+                .iter()
+                .map(round)
+                .zip(&golden::<i16>(&format!("latent.{role}")))
+                .zip(want.iter().flatten())
+            {
+                let margin = ((y - y.floor()) - 0.5).abs();
+                assert!(
+                    q == want || margin < tolerance * peak,
+                    "{isa}, fs.{role}: {q} for {y}"
+                );
+            }
         }
     }
 }

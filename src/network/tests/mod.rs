@@ -4,6 +4,8 @@ mod definition;
 mod files;
 mod golden;
 
+use b2p_kernels::Isa;
+
 use super::Model;
 use super::reference::{Rows, Sites};
 use crate::geometry::{KernelMap, Octree, Voxels, morton};
@@ -68,6 +70,11 @@ impl Cloud {
         features.reverse();
         features.try_into().unwrap()
     }
+}
+
+/// By how much the encoder is coarser than f16 with these instructions: tiles hold bf16, of eight significant bits instead of eleven.
+fn coarser(isa: Isa) -> f64 {
+    if isa.has_tiles() { 8.0 } else { 1.0 }
 }
 
 /// Rows of `width` numbers.
