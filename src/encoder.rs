@@ -93,8 +93,7 @@ pub fn encode(
         model.features(&colours, &maps, &occupancy)
     })?;
 
-    let slice = options.slice_voxels as usize;
-    let mut writer = Writer::new(Header {
+    let header = Header {
         optional_flags: 0,
         bits: cloud.voxels.depth(),
         base,
@@ -103,14 +102,69 @@ pub fn encode(
         placement: cloud.placement,
         model: model.id(),
         slice_voxels: options.slice_voxels,
-        voxels: levels
-            .clone()
-            .map(|level| octree.level(level).len() as u32)
-            .collect(),
+        voxels: Vec::new(),
         sections: Vec::new(),
+    };
+    let mut squeezed = |role: usize, condition: Condition<'_>, context: Option<&[i16]>| {
+        // The finest level's features come first, so those of the level at hand are the last.
+        let own = features.pop().unwrap_or_default();
+        Ok(quantise(
+            model.tables(),
+            condition,
+            &model.squeeze(role, &own, context)?,
+            model.shape().latent_max,
+            options.bit_price,
+        ))
+    };
+    let (bytes, below) = write(header, &octree, &maps, model, &mut squeezed, log)?;
+    let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
+        Decoder::new(model)
+            .with_limits(Limits::unlimited())
+            .exact(&bytes, top, &mut Log::default())
+    })?;
+    if exact.octree != octree.truncated(top) || exact.features != below {
+        return Err(Error::Usage(
+            "the stream does not decode to what was encoded: this machine computes wrongly".into(),
+        ));
+    }
+    let header = Header::parse(&bytes, &Limits::unlimited())?;
+    let rates = levels
+        .zip(header.voxels.iter().zip(&header.sections))
+        .map(|(level, (&voxels, section))| Rate {
+            level,
+            voxels: voxels as usize,
+            geometry_bytes: section.geometry as usize,
+            feature_bytes: section.features as usize,
+        })
+        .collect();
+    Ok(Encoded { bytes, rates })
+}
+
+/// A role's latents, K per voxel of its level, given what is known of them and its context.
+pub(crate) type Latents<'a> =
+    dyn FnMut(usize, Condition<'_>, Option<&[i16]>) -> Result<Vec<i16>> + 'a;
+
+/// A stream of the `header`'s levels of an octree, and the features of the last; voxels and sections are filled in. `maps` are the levels'
+/// 3³ kernel maps.
+///
+/// # Errors
+/// Those of [`Writer`], and of `latents`.
+pub(crate) fn write(
+    header: Header,
+    octree: &Octree,
+    maps: &[KernelMap],
+    model: &Model,
+    latents: &mut Latents<'_>,
+    log: &mut Log,
+) -> Result<(Vec<u8>, Vec<i16>)> {
+    let (levels, slice) = (header.base..=header.top, header.slice_voxels as usize);
+    let voxels = levels.clone().map(|level| octree.level(level).len() as u32);
+    let mut writer = Writer::new(Header {
+        voxels: voxels.collect(),
+        ..header
     })?;
     let mut below: Option<Vec<i16>> = None;
-    for (role, level) in levels.clone().enumerate() {
+    for (role, level) in levels.enumerate() {
         let (count, map) = (octree.level(level).len(), &maps[role]);
         log.step(
             format!("geometry of level {level}"),
@@ -120,19 +174,17 @@ pub fn encode(
                 if role > 0 {
                     return writer.geometry(
                         level,
-                        &codec::encode_level(&octree, &maps[role - 1], level, slice),
+                        &codec::encode_level(octree, &maps[role - 1], level, slice),
                     );
                 }
                 let mut map = KernelMap::root();
                 (1..=level).try_for_each(|n| {
-                    let slices = codec::encode_level(&octree, &map, n, slice);
+                    let slices = codec::encode_level(octree, &map, n, slice);
                     map = octree.child_map(n - 1, &map);
                     writer.geometry(n, &slices)
                 })
             },
         )?;
-        // The finest level's features come first, so those of the level at hand are the last.
-        let own = features.pop().unwrap_or_default();
         below = log.step(
             format!("features of level {level}"),
             count,
@@ -149,13 +201,7 @@ pub fn encode(
                     None => Condition::Prior,
                 };
                 let tables = model.tables();
-                let latents = quantise(
-                    tables,
-                    condition,
-                    &model.squeeze(role, &own, context.as_deref())?,
-                    model.shape().latent_max,
-                    options.bit_price,
-                );
+                let latents = latents(role, condition, context.as_deref())?;
                 let slices = if role == 0 && model.predicts_base() {
                     let octants = octree.level(level).octants();
                     let predict = |slice, voxels: &[u32], latents: &[i16]| {
@@ -175,28 +221,7 @@ pub fn encode(
             },
         )?;
     }
-    let bytes = writer.finish()?;
-    let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
-        Decoder::new(model)
-            .with_limits(Limits::unlimited())
-            .exact(&bytes, top, &mut Log::default())
-    })?;
-    if exact.octree != octree.truncated(top) || Some(exact.features) != below {
-        return Err(Error::Usage(
-            "the stream does not decode to what was encoded: this machine computes wrongly".into(),
-        ));
-    }
-    let header = Header::parse(&bytes, &Limits::unlimited())?;
-    let rates = levels
-        .zip(header.voxels.iter().zip(&header.sections))
-        .map(|(level, (&voxels, section))| Rate {
-            level,
-            voxels: voxels as usize,
-            geometry_bytes: section.geometry as usize,
-            feature_bytes: section.features as usize,
-        })
-        .collect();
-    Ok(Encoded { bytes, rates })
+    Ok((writer.finish()?, below.unwrap_or_default()))
 }
 
 /// The levels to code, for a cloud of bit depth `bits`.
@@ -236,7 +261,7 @@ fn pooled(cloud: &ColouredVoxels, level: u8) -> (Voxels, Vec<[f32; 3]>) {
 }
 
 /// The kernel maps of `base` and all deeper levels, in this order.
-fn kernel_maps(octree: &Octree, base: u8) -> Vec<KernelMap> {
+pub(crate) fn kernel_maps(octree: &Octree, base: u8) -> Vec<KernelMap> {
     let mut maps = vec![octree.kernel_map(base)];
     for level in base..octree.depth() {
         let next = octree.child_map(level, &maps[maps.len() - 1]);

@@ -248,11 +248,12 @@ impl ExactConv {
         });
     }
 
-    /// The weight of a tap, from an input channel to an output channel.
-    fn weight(&self, steps: usize, panels: usize, tap: usize, channel: usize, out: usize) -> i16 {
-        let pair = self.weights[(tap * panels + out / PANEL) * steps + channel / 2].0[out % PANEL];
+    /// The weights of a tap, from an input channel to a panel of output channels.
+    fn weights(&self, tap: usize, channel: usize, panel: usize) -> [i16; PANEL] {
+        let (steps, panels) = (self.extents.cin.div_ceil(2), self.extents.panels());
+        let pairs = self.weights[(tap * panels + panel) * steps + channel / 2].0;
         let which = (channel % 2) ^ usize::from(cfg!(target_endian = "big"));
-        (pair >> (16 * which)) as i16
+        pairs.map(|pair| (pair >> (16 * which)) as i16)
     }
 
     /// All children of voxels, by minimal filtering.
@@ -292,24 +293,16 @@ impl ExactConv {
 
     /// The weights for minimal filtering.
     fn winograd(&self) -> Option<&winograd::Weights> {
-        let (steps, panels) = (self.extents.cin.div_ceil(2), self.extents.panels());
-        let make = || {
-            winograd::Weights::new(self.extents, |tap, channel, out| {
-                self.weight(steps, panels, tap, channel, out)
-            })
-        };
+        let weights = |tap, channel, panel| self.weights(tap, channel, panel);
+        let make = || winograd::Weights::new(self.extents, weights);
         self.winograd.get_or_init(make).as_ref()
     }
 
     /// The weights in tiles.
     #[cfg(target_arch = "x86_64")]
     fn tiles(&self) -> Option<&amx::Weights> {
-        let pack = || {
-            let (steps, panels) = (self.extents.cin.div_ceil(2), self.extents.panels());
-            amx::Weights::of_integers(self.extents, |tap, channel, out| {
-                self.weight(steps, panels, tap, channel, out)
-            })
-        };
+        let weights = |tap, channel, panel| self.weights(tap, channel, panel);
+        let pack = || amx::Weights::of_integers(self.extents, weights);
         self.tiles.get_or_init(pack).as_ref()
     }
 }

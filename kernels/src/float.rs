@@ -260,9 +260,8 @@ impl FloatConv {
     fn tiles(&self) -> &amx::Weights {
         self.tiles.get_or_init(|| {
             let (cin, panels) = (self.extents.cin, self.extents.panels());
-            amx::Weights::of_brain(self.extents, |tap, channel, out| {
-                let lanes = &self.weights[(tap * panels + out / PANEL) * cin + channel];
-                f32::from_bits(lanes.0[out % PANEL])
+            amx::Weights::of_brain(self.extents, |tap, channel, panel| {
+                self.weights[(tap * panels + panel) * cin + channel].f32()
             })
         })
     }

@@ -15,6 +15,7 @@ compile_error!(
 
 mod binary16;
 mod convert;
+mod double;
 mod exact;
 mod family;
 mod finish;
@@ -36,12 +37,13 @@ pub mod splat;
 
 pub use binary16::f16;
 pub use convert::{to_f16, to_f32};
+pub use double::add_products;
 pub use exact::{ExactConv, LIMIT, Requantise};
 pub use family::{copy_row, window};
 pub use float::{FloatConv, FloatOut, Precision, Scale};
 pub use isa::{Isa, UnknownIsa};
 pub use map::{MappedFile, map_file};
-pub use memory::zeros;
+pub use memory::{give_back, zeros};
 pub use plan::Plan;
 pub use rows::Output;
 pub use taps::{ABSENT, Taps};

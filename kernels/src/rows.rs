@@ -173,23 +173,21 @@ impl Extents {
         );
     }
 
-    /// Tap, input and output of each weight of `[tap][input][output]`.
+    /// Tap, input and panel of outputs of each panel of weights.
     #[cfg(target_arch = "x86_64")]
     pub fn each(self) -> impl Iterator<Item = (usize, usize, usize)> {
         (0..self.volume).flat_map(move |tap| {
-            (0..self.cin).flat_map(move |c| (0..self.cout).map(move |o| (tap, c, o)))
+            (0..self.cin).flat_map(move |c| (0..self.panels()).map(move |panel| (tap, c, panel)))
         })
     }
 
     /// Calls `place(weight, tap · panels + panel, input, lane)` for each weight of `[tap][input][output]`.
     pub fn place<T: Copy>(&self, weights: &[T], mut place: impl FnMut(T, usize, usize, usize)) {
-        for (i, &w) in weights.iter().enumerate() {
-            let (k, c, o) = (
-                i / (self.cin * self.cout),
-                i / self.cout % self.cin,
-                i % self.cout,
-            );
-            place(w, k * self.panels() + o / PANEL, c, o % PANEL);
+        for (i, weights) in weights.chunks_exact(self.cout).enumerate() {
+            let (k, c) = (i / self.cin, i % self.cin);
+            for (o, &w) in weights.iter().enumerate() {
+                place(w, k * self.panels() + o / PANEL, c, o % PANEL);
+            }
         }
     }
 }

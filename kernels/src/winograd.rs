@@ -38,31 +38,34 @@ pub(crate) struct Buffers {
 }
 
 impl Weights {
-    /// Transforms `weight(tap, input, output)`; nothing if sums could be too large, a weight does not fit 16 bits afterwards, or
-    /// input channels are not whole panels.
-    pub fn new(extents: Extents, weight: impl Fn(usize, usize, usize) -> i16) -> Option<Self> {
+    /// Transforms the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs; nothing if sums could be too large, a
+    /// weight does not fit 16 bits afterwards, or input channels are not whole panels.
+    pub fn new(
+        extents: Extents,
+        weights: impl Fn(usize, usize, usize) -> [i16; PANEL],
+    ) -> Option<Self> {
         assert_eq!(extents.volume, 27, "a window is that of a 3³ kernel");
-        let Extents { cin, cout, .. } = extents;
+        let cin = extents.cin;
         if !cin.is_multiple_of(PANEL) {
             return None;
         }
         let (steps, panels) = (cin / 2, extents.panels());
         let mut words = vec![Lanes::default(); WINDOW * panels * steps];
-        for o in 0..cout {
-            let mut sum = 0;
+        for panel in 0..panels {
+            let mut sums = [0; PANEL];
             for c in 0..cin {
-                let mut taps = [0i64; 27];
-                for (k, tap) in taps.iter_mut().enumerate() {
-                    *tap = i64::from(weight(k, c, o));
-                    sum += tap.abs();
-                }
-                for (at, value) in transformed(&taps).into_iter().enumerate() {
-                    let value = i16::try_from(value).ok()?;
-                    let place = (at * panels + o / PANEL) * steps + c / 2;
-                    words[place].0[o % PANEL] |= crate::exact::place(value, c % 2);
+                let taps: [[i16; PANEL]; 27] = std::array::from_fn(|k| weights(k, c, panel));
+                for (lane, sum) in sums.iter_mut().enumerate() {
+                    let taps = taps.map(|weights| i32::from(weights[lane]));
+                    *sum += taps.iter().map(|tap| i64::from(tap.abs())).sum::<i64>();
+                    for (at, value) in transformed(&taps).into_iter().enumerate() {
+                        let value = i16::try_from(value).ok()?;
+                        let place = (at * panels + panel) * steps + c / 2;
+                        words[place].0[lane] |= crate::exact::place(value, c % 2);
+                    }
                 }
             }
-            if sum * i64::from(LIMIT) >= SUM_LIMIT {
+            if sums.iter().any(|sum| sum * i64::from(LIMIT) >= SUM_LIMIT) {
                 return None;
             }
         }
@@ -70,13 +73,17 @@ impl Weights {
     }
 }
 
-/// Eightfold transformed weights: (2, 0, 0), (1, 1, 1), (1, −1, 1), (0, 0, 2) along each axis.
-fn transformed(taps: &[i64; 27]) -> [i64; WINDOW] {
-    const ROWS: [[i64; 3]; 4] = [[2, 0, 0], [1, 1, 1], [1, -1, 1], [0, 0, 2]];
+/// Eightfold transformed weights: (2, 0, 0), (1, 1, 1), (1, −1, 1), (0, 0, 2) along each axis, one after the other.
+fn transformed(taps: &[i32; 27]) -> [i32; WINDOW] {
+    let along = |[a, b, c]: [i32; 3]| [2 * a, a + b + c, a - b + c, 2 * c];
+    let x: [[i32; 4]; 9] =
+        std::array::from_fn(|i| along([taps[3 * i], taps[3 * i + 1], taps[3 * i + 2]]));
+    let y: [[[i32; 4]; 4]; 3] = std::array::from_fn(|z| {
+        std::array::from_fn(|i| along([x[3 * z][i], x[3 * z + 1][i], x[3 * z + 2][i]]))
+    });
     std::array::from_fn(|at| {
-        let rows = [ROWS[at & 3], ROWS[at >> 2 & 3], ROWS[at >> 4]];
-        let term = |k: usize| rows[0][k % 3] * rows[1][k / 3 % 3] * rows[2][k / 9] * taps[k];
-        (0..27).map(term).sum()
+        let [i, j] = [at & 3, at >> 2 & 3];
+        along([y[0][i][j], y[1][i][j], y[2][i][j]])[at >> 4]
     })
 }
 

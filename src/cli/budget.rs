@@ -171,6 +171,11 @@ impl Chosen {
         {
             text += &format!(", not the {least} dB asked for");
         }
+        if let Some(time) = self.budget.time
+            && !self.choice.in_time
+        {
+            text += &format!(", nothing promises {}", milliseconds(time));
+        }
         text += &match self.budget.time {
             None => format!("; took {}", milliseconds(took)),
             Some(time) if took <= time => {

@@ -1,7 +1,7 @@
 //! Gaussian generation in double precision: what the other precisions are measured against.
 
 use b2p_kernels::reference::tap;
-use b2p_kernels::{Isa, Output, Taps};
+use b2p_kernels::{Isa, Output, Taps, add_products};
 
 use super::layers::{Conv, Pool};
 use super::stored::Stored;
@@ -46,6 +46,7 @@ impl Double {
 
     fn rows<T>(
         &self,
+        isa: Isa,
         taps: Taps<'_>,
         input: &[f64],
         first: usize,
@@ -62,12 +63,7 @@ impl Double {
                     continue;
                 };
                 let weights = &self.weights[k * cin * cout..][..cin * cout];
-                let input = &input[from * cin..][..cin];
-                for (x, weights) in input.iter().zip(weights.chunks_exact(cout)) {
-                    for (sum, w) in sums.iter_mut().zip(weights) {
-                        *sum += x * w;
-                    }
-                }
+                add_products(isa, &input[from * cin..][..cin], weights, &mut sums);
                 if let Some((_, of_taps)) = &self.invariant {
                     for (energy, of_tap) in energies.iter_mut().zip(&of_taps[k * cout..]) {
                         *energy += of_tap;
@@ -96,19 +92,19 @@ impl Conv for Double {
         self.cout
     }
 
-    fn run(&self, _: Isa, taps: Taps<'_>, input: &[f64], first: usize, output: Output<'_, f64>) {
-        self.rows(taps, input, first, output, |value| value);
+    fn run(&self, isa: Isa, taps: Taps<'_>, input: &[f64], first: usize, output: Output<'_, f64>) {
+        self.rows(isa, taps, input, first, output, |value| value);
     }
 
     fn run_f32(
         &self,
-        _: Isa,
+        isa: Isa,
         taps: Taps<'_>,
         input: &[f64],
         first: usize,
         output: Output<'_, f32, f64>,
     ) {
-        self.rows(taps, input, first, output, |value| value as f32);
+        self.rows(isa, taps, input, first, output, |value| value as f32);
     }
 }
 

@@ -42,44 +42,58 @@ impl Stored {
         let Spec {
             volume, cin, cout, ..
         } = self.spec;
-        let mut weights = vec![0; self.weights.len()];
-        let mut steps = vec![0.0; cout];
-        for (o, step) in steps.iter_mut().enumerate() {
-            let channel = self.weights[o..].iter().step_by(cout);
-            let channel: Vec<f64> = channel.map(|w| w.to_f64()).collect();
-            let peak = channel.iter().fold(0.0, |peak: f64, w| peak.max(w.abs()));
-            let total: f64 = channel.iter().map(|w| w.abs()).sum();
-            let scale = |top: u64| if peak > 0.0 { top as f64 / peak } else { 0.0 };
-            let quantised = |top: u64| {
-                let scale = scale(top);
-                let steps = channel.iter().map(move |w| w * scale);
-                steps.map(|w| w.round_ties_even() as i64)
-            };
-            let limit = if volume == 27 {
-                SMALL_SUM_LIMIT
-            } else {
-                SUM_LIMIT
-            };
-            let overflows = |top: &u64| {
-                // Rounding takes half a step off a weight at most, so that most tops are known to be too large.
-                let least = total * scale(*top) - channel.len() as f64 / 2.0;
-                if least * f64::from(LIMIT) >= limit as f64 {
-                    return true;
+        let real: Vec<f64> = self.weights.iter().map(|w| w.to_f64()).collect();
+        let (mut peaks, mut totals) = (vec![0.0f64; cout], vec![0.0; cout]);
+        for row in real.chunks_exact(cout) {
+            for ((w, peak), total) in row.iter().zip(&mut peaks).zip(&mut totals) {
+                *peak = peak.max(w.abs());
+                *total += w.abs();
+            }
+        }
+        let scale = |top: u64, peak: f64| if peak > 0.0 { top as f64 / peak } else { 0.0 };
+        let limit = if volume == 27 {
+            SMALL_SUM_LIMIT
+        } else {
+            SUM_LIMIT
+        };
+        // Rounding takes half a step off a weight at most, so that most tops are known to be too large.
+        let lowered = |mut top: u64, o: usize| {
+            let least = |top| totals[o] * scale(top, peaks[o]) - (volume * cin) as f64 / 2.0;
+            while least(top) * f64::from(LIMIT) >= limit as f64 {
+                top = top * 7 / 8;
+            }
+            top
+        };
+        let mut tops: Vec<u64> = (0..cout).map(|o| lowered(WEIGHT, o)).collect();
+        let mut weights = vec![0i16; real.len()];
+        loop {
+            let scales = tops.iter().zip(&peaks);
+            let scales: Vec<f64> = scales.map(|(&top, &peak)| scale(top, peak)).collect();
+            let mut sums = vec![[0, 0]; cout];
+            for (to, from) in weights.chunks_exact_mut(cout).zip(real.chunks_exact(cout)) {
+                let channels = to.iter_mut().zip(from).zip(&scales).zip(&mut sums);
+                for (((to, w), scale), [sum, squares]) in channels {
+                    // In ±2047: the largest becomes the top.
+                    *to = rounded(w * scale) as i16;
+                    let q = u64::from(to.unsigned_abs());
+                    *sum += q;
+                    *squares += q * q;
                 }
-                let (sum, squares) = quantised(*top).fold((0, 0), |(sum, squares), q| {
-                    let q = q.unsigned_abs();
-                    (sum + q, squares + q * q)
-                });
+            }
+            let overflows = |[sum, squares]: [u64; 2]| {
                 sum * u64::from(LIMIT.unsigned_abs()) >= limit || squares >= SUM_LIMIT
             };
-            let mut tops = std::iter::successors(Some(WEIGHT), |top| Some(top * 7 / 8));
-            let top = tops.find(|top| !overflows(top)).unwrap_or(0);
-            for (q, weight) in quantised(top).zip(weights[o..].iter_mut().step_by(cout)) {
-                // In ±2047 by construction.
-                *weight = q as i16;
+            let over: Vec<usize> = (0..cout).filter(|&o| overflows(sums[o])).collect();
+            if over.is_empty() {
+                break;
             }
-            *step = if top > 0 { peak / top as f64 } else { 0.0 };
+            for o in over {
+                tops[o] = lowered(tops[o] * 7 / 8, o);
+            }
         }
+        let steps = tops.iter().zip(&peaks);
+        let step = |(&top, peak)| if top > 0 { peak / top as f64 } else { 0.0 };
+        let steps: Vec<f64> = steps.map(step).collect();
         let ratio = f64::from(from) / f64::from(to);
         let bias = self.bias.iter().map(|b| b / to).collect();
         let requantise = match &self.gain {
@@ -96,5 +110,25 @@ impl Stored {
             },
         };
         ExactConv::new(volume, cin, cout, &weights, requantise)
+    }
+}
+
+/// To the nearest integer, halves to even, of numbers below 2⁵¹; `f64::round_ties_even` is a call unless instructions beyond the least are
+/// compiled for.
+fn rounded(x: f64) -> f64 {
+    const ONES: f64 = 1.5 * (1u64 << 52) as f64;
+    x + ONES - ONES
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_rounded_to_the_nearest_and_halves_to_even() {
+        for i in -10_000..10_000 {
+            let x = f64::from(i) / 4.0;
+            assert_eq!(rounded(x), x.round_ties_even());
+        }
     }
 }

@@ -8,8 +8,10 @@ use crate::error::{Error, Result};
 use crate::network::{Heads, Precision};
 use crate::pixels::Quality;
 
-/// Estimates count as kept only with this much to spare.
+/// A time is promised only if the estimate, so many times and with so many nanoseconds more, keeps it: in short tasks it shows when a thread
+/// wakes late, or a page is long in coming.
 const MARGIN: f64 = 1.1;
+const SPARE: f64 = 1e6;
 
 /// What is asked for. With a time, the most accurate setting that keeps it; with an accuracy alone, the fastest that has it.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -25,7 +27,7 @@ pub struct Budget {
 pub enum Task {
     /// From a stream in memory to its Gaussians.
     Decode,
-    /// From Gaussians to one picture of so many pixels.
+    /// From Gaussians to one picture of so many pixels, from where the program's camera stands: from nearer, it shows more.
     Picture {
         /// Width times height.
         pixels: u64,
@@ -47,7 +49,7 @@ pub struct Choice {
     pub expected: Duration,
     /// PSNR in dB of the setting in the calibration.
     pub psnr: f64,
-    /// Whether that keeps the time asked for, with a tenth to spare.
+    /// Whether that keeps the time asked for, with a tenth and a millisecond to spare.
     pub in_time: bool,
     /// Whether it has the accuracy asked for.
     pub accurate: bool,
@@ -116,11 +118,12 @@ impl Budget {
                     .iter()
                     .zip(&header.voxels)
                     .take(draw.role + 1);
-                let exact: f64 = exact.map(|(cost, &n)| cost * f64::from(n)).sum();
-                exact + draw.prepare + draw.generate * here
+                let exact: f64 = exact.map(|(cost, &n)| cost.of(f64::from(n))).sum();
+                calibration.start + exact + draw.generate.of(here)
             }
             Task::Picture { pixels } => {
-                draw.per_gaussian * here * f64::from(draw.children) + draw.per_pixel * pixels as f64
+                let gaussians = here * f64::from(draw.children);
+                draw.draw.of(gaussians, faces(here, level), pixels as f64)
             }
         };
         let expected = Duration::try_from_secs_f64(nanoseconds / 1e9).ok()?;
@@ -133,10 +136,15 @@ impl Budget {
             psnr: draw.psnr,
             in_time: self
                 .time
-                .is_none_or(|time| expected.mul_f64(MARGIN) <= time),
+                .is_none_or(|time| nanoseconds * MARGIN + SPARE <= time.as_secs_f64() * 1e9),
             accurate: self.min_psnr.is_none_or(|least| draw.psnr >= least),
         })
     }
+}
+
+/// The area of a surface of so many voxels of a level, in faces of the cube.
+pub(super) fn faces(voxels: f64, level: u8) -> f64 {
+    voxels / 4f64.powi(level.into())
 }
 
 #[cfg(test)]
@@ -145,7 +153,7 @@ mod tests {
     use crate::bitstream::Section;
     use crate::network::Shape;
     use crate::placement::Placement;
-    use crate::tradeoff::Machine;
+    use crate::tradeoff::{LevelCost, Machine, PictureCost};
 
     fn header() -> Header {
         Header {
@@ -170,10 +178,15 @@ mod tests {
                 heads: generator[0].into(),
                 precision: generator[1].into(),
                 quality: quality.into(),
-                prepare: 2e6,
-                generate: costs[0],
-                per_gaussian: costs[1],
-                per_pixel: costs[2],
+                generate: LevelCost {
+                    once: 2e6,
+                    per_voxel: costs[0],
+                },
+                draw: PictureCost {
+                    per_gaussian: costs[1],
+                    per_pixel: costs[2],
+                    ..PictureCost::default()
+                },
                 psnr,
             };
         let (best, quick, float) = (["best", "int16"], ["quick", "int16"], ["best", "f16"]);
@@ -183,7 +196,14 @@ mod tests {
             threads: 2,
             model: String::new(),
             gg: Shape::tiny().gg,
-            exact: vec![1000.0; 3],
+            start: 0.0,
+            exact: vec![
+                LevelCost {
+                    once: 0.0,
+                    per_voxel: 1000.0
+                };
+                3
+            ],
             draws: vec![
                 draw(1, 8, quick, "fast", [1000.0, 20.0, 5.0], 28.0),
                 draw(1, 8, best, "fast", [4000.0, 20.0, 5.0], 30.0),

@@ -2,46 +2,24 @@
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
 use super::Subject;
 use super::machine::Machine;
-use super::metrics::{pixels_apart, psnr};
-use super::spread::Spread;
-use super::truth::in_double;
-use crate::bitstream::Header;
-use crate::decoder::Decoder;
+use super::measure::measure;
 use crate::error::{Error, Result};
-use crate::gaussians::{Frame, Gaussians, activate};
-use crate::geometry::{KernelMap, Voxels};
-use crate::log::{Log, Step};
-use crate::network::{Head, Heads, Model, Precision};
+use crate::network::{Head, Model};
 use crate::output;
-use crate::pixels::reference::{self, Cutoffs};
-use crate::pixels::{Background, Image, Quality, Renderer};
-use crate::projection::Camera;
 
-/// Times that everything is measured; medians count.
-const REPEATS: usize = 3;
-/// Sides of the pictures whose times tell what a Gaussian and what a pixel costs; the smaller one's accuracy is measured.
-const SIDES: [u32; 2] = [320, 1024];
-/// The renderer's qualities by name.
-const QUALITIES: [(&str, Quality); 3] = [
-    ("fast", Quality::Fast),
-    ("fine", Quality::Fine),
-    ("exact", Quality::Exact),
-];
-/// The accuracy, in dB, of pictures that are equal.
-const EQUAL: f64 = 200.0;
 /// What is longer is no calibration.
 const MOST_BYTES: u64 = 1 << 16;
 /// So are more entries, and numbers above this.
 const MOST_ENTRIES: usize = 256;
 const MOST: f64 = 1e12;
 
-/// What decoding and drawing cost, in nanoseconds, as when it is done once: memory is new, and nothing is in the caches.
+/// What decoding and drawing cost, in nanoseconds, as in a process that does it once: threads have just started, memory is fresh from the
+/// system, and nothing is ready.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// Where it was measured.
@@ -54,10 +32,49 @@ pub struct Calibration {
     pub model: String,
     /// With which heads: streams of a model have one id with any.
     pub gg: Vec<Head>,
-    /// Of each role, what a voxel of its level costs in the exact zone.
-    pub exact: Vec<f64>,
+    /// Nanoseconds that threads take to start, once a process.
+    pub start: f64,
+    /// Of each role, what its level costs in the exact zone.
+    pub exact: Vec<LevelCost>,
     /// Each role, set of heads, precision and quality.
     pub draws: Vec<DrawCost>,
+}
+
+/// What a level costs in nanoseconds.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct LevelCost {
+    /// However many there are: what has to be got ready, and what is done by steps.
+    pub once: f64,
+    /// For each voxel.
+    pub per_voxel: f64,
+}
+
+/// What a picture costs in nanoseconds.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct PictureCost {
+    /// However much is drawn.
+    pub once: f64,
+    /// For each Gaussian.
+    pub per_gaussian: f64,
+    /// For each pixel …
+    pub per_pixel: f64,
+    /// … and how much more if the surface that is drawn has as much area as a face of the cube.
+    pub per_face: f64,
+}
+
+/// What pictures took in nanoseconds.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PictureTimes {
+    /// Few Gaussians, and many.
+    pub gaussians: [f64; 2],
+    /// The area of the surface of both, in faces of the cube.
+    pub faces: [f64; 2],
+    /// Few pixels, and many.
+    pub pixels: [f64; 2],
+    /// Few and many Gaussians, of both few and many pixels.
+    pub drawn: [[f64; 2]; 2],
+    /// Many pixels, and nothing on them.
+    pub empty: f64,
 }
 
 /// What Gaussians and pictures of one role, set of heads, precision and quality cost.
@@ -73,93 +90,84 @@ pub struct DrawCost {
     pub precision: String,
     /// Quality of the renderer.
     pub quality: String,
-    /// Nanoseconds to get the heads ready, once a model …
-    pub prepare: f64,
-    /// … and to generate the Gaussians of a voxel.
-    pub generate: f64,
-    /// Nanoseconds to draw, for each Gaussian …
-    pub per_gaussian: f64,
-    /// … and for each pixel.
-    pub per_pixel: f64,
+    /// To generate the Gaussians of a level, its heads not being ready.
+    pub generate: LevelCost,
+    /// To draw a picture.
+    pub draw: PictureCost,
     /// PSNR in dB against the finest level in double precision.
     pub psnr: f64,
 }
 
+impl LevelCost {
+    /// From few voxels and the nanoseconds that they took, and many: what lies between is interpolated. Where the second are not more, or
+    /// did not take longer, all is the voxels' cost.
+    pub fn through(few: [f64; 2], many: [f64; 2]) -> LevelCost {
+        let per_voxel = (many[1] - few[1]) / (many[0] - few[0]);
+        if many[0] > few[0] && per_voxel >= 0.0 {
+            // Few may take less than their share, of many that no longer fit the caches.
+            let once = (few[1] - per_voxel * few[0]).max(0.0);
+            return LevelCost { once, per_voxel };
+        }
+        let longer = if few[1] > many[1] { few } else { many };
+        LevelCost {
+            once: 0.0,
+            per_voxel: longer[1] / longer[0].max(1.0),
+        }
+    }
+
+    /// Nanoseconds of so many voxels.
+    pub fn of(&self, voxels: f64) -> f64 {
+        self.once + self.per_voxel * voxels
+    }
+}
+
+impl PictureCost {
+    /// The cost by which none of the pictures took more than it says, but for an empty one.
+    pub(super) fn from_times(times: &PictureTimes) -> PictureCost {
+        let PictureTimes {
+            gaussians,
+            faces,
+            pixels,
+            drawn,
+            empty,
+        } = *times;
+        let slope = |by: f64, rise: f64| if by > 0.0 { (rise / by).max(0.0) } else { 0.0 };
+        let per_pixel = empty / pixels[1].max(1.0);
+        let more = |i: usize| {
+            let each = slope(pixels[1] - pixels[0], drawn[i][1] - drawn[i][0]);
+            slope(faces[i], each - per_pixel)
+        };
+        let mut cost = PictureCost {
+            once: 0.0,
+            per_gaussian: slope(gaussians[1] - gaussians[0], drawn[1][0] - drawn[0][0]),
+            per_pixel,
+            per_face: more(0).max(more(1)),
+        };
+        for i in 0..2 {
+            for (pixels, time) in pixels.into_iter().zip(drawn[i]) {
+                cost.once += (time - cost.of(gaussians[i], faces[i], pixels)).max(0.0);
+            }
+        }
+        cost
+    }
+
+    /// Nanoseconds of a picture of so many Gaussians on a surface with the area of so many faces of the cube.
+    pub fn of(&self, gaussians: f64, faces: f64, pixels: f64) -> f64 {
+        self.once
+            + self.per_gaussian * gaussians
+            + (self.per_pixel + self.per_face * faces) * pixels
+    }
+}
+
 impl Calibration {
-    /// Measures with a stream and its model, on the rayon pool that the caller is in; `say` is told what is being done.
+    /// Measures with a stream and its model, with as many threads as the rayon pool that the caller is in has; `say` is told what is being
+    /// done.
     ///
     /// # Errors
     /// Those of [`Decoder::decode`](crate::decoder::Decoder::decode) and
-    /// [`Renderer::render`](crate::pixels::Renderer::render); [`Error::Usage`] if no level has Gaussians.
+    /// [`Renderer::render`](crate::pixels::Renderer::render); [`Error::Usage`] if no level has Gaussians, or threads cannot be started.
     pub fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
-        let header = Header::parse(subject.stream, subject.limits)?;
-        let model = (subject.model)()?;
-        let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
-        let levels = decoder.levels(subject.stream)?;
-        let Some(&finest) = levels.last() else {
-            return Err(Error::Usage(
-                "the stream has no level with Gaussians".into(),
-            ));
-        };
-        say("calibrate: the truth");
-        let truth = in_double(subject, &model, finest)?.0;
-        let truth = reference::render(&truth, &camera(SIDES[0])?, Background::WHITE, Cutoffs::NONE);
-        say("calibrate: levels");
-        let mut calibration = Calibration {
-            machine: Machine::this(),
-            isa: model.isa().to_string(),
-            threads: rayon::current_num_threads(),
-            model: model_name(&model),
-            gg: model.shape().gg.clone(),
-            exact: exact_costs(subject, &decoder, &header, finest)?,
-            draws: Vec::new(),
-        };
-        let frame = decoder.frame(subject.stream)?;
-        for level in levels {
-            let exact = decoder.exact(subject.stream, level, &mut Log::default())?;
-            let at = Level {
-                map: exact.octree.kernel_map(level),
-                role: usize::from(level - header.base),
-                voxels: exact.octree.level(level),
-                features: &exact.features,
-                frame,
-            };
-            // What a picture costs hardly depends on what generated the Gaussians: the first tells for all.
-            let mut costs: Option<[DrawTime; 3]> = None;
-            for heads in model.shape().heads() {
-                for precision in Precision::ALL {
-                    let precise = || (subject.model)()?.with_precision(precision);
-                    if precise().is_err() {
-                        continue;
-                    }
-                    say(&format!(
-                        "calibrate: level {level}, {heads} heads, {precision}"
-                    ));
-                    let made = at.generate(&precise, heads)?;
-                    let gaussians = &made.gaussians;
-                    let costs = match costs {
-                        Some(costs) => costs,
-                        None => *costs.insert(draw_times(subject, &model, gaussians)?),
-                    };
-                    for ((name, quality), cost) in QUALITIES.into_iter().zip(costs) {
-                        let picture = draw(subject, &model, gaussians, quality, SIDES[0], 1)?.1;
-                        calibration.draws.push(DrawCost {
-                            role: at.role,
-                            children: made.children as u8,
-                            heads: heads.to_string(),
-                            precision: precision.to_string(),
-                            quality: name.into(),
-                            prepare: made.prepare,
-                            generate: made.per_voxel,
-                            per_gaussian: cost.per_gaussian,
-                            per_pixel: cost.per_pixel,
-                            psnr: psnr(pixels_apart(&truth, &picture).0).min(EQUAL),
-                        });
-                    }
-                }
-            }
-        }
-        Ok(calibration)
+        measure(subject, say)
     }
 
     /// Where the user's calibration for a model and a number of threads is kept: under `XDG_CACHE_HOME`, or `.cache` at home. None where
@@ -215,21 +223,27 @@ impl Calibration {
     fn is_sound(&self) -> bool {
         let numbers = self.draws.iter().flat_map(|d| {
             [
-                d.prepare,
-                d.generate,
-                d.per_gaussian,
-                d.per_pixel,
+                d.generate.once,
+                d.generate.per_voxel,
+                d.draw.once,
+                d.draw.per_gaussian,
+                d.draw.per_pixel,
+                d.draw.per_face,
                 d.psnr.abs(),
             ]
         });
-        let mut numbers = numbers.chain(self.exact.iter().copied());
+        let exact = self
+            .exact
+            .iter()
+            .flat_map(|cost| [cost.once, cost.per_voxel]);
+        let mut numbers = numbers.chain(exact).chain([self.start]);
         self.draws.len() <= MOST_ENTRIES
             && self.exact.len() <= MOST_ENTRIES
             && numbers.all(|n| (0.0..=MOST).contains(&n))
     }
 }
 
-fn model_name(model: &Model) -> String {
+pub(super) fn model_name(model: &Model) -> String {
     model
         .id()
         .iter()
@@ -237,140 +251,15 @@ fn model_name(model: &Model) -> String {
         .collect()
 }
 
-/// Of each role up to the finest level's, what a voxel of its level costs in the exact zone.
-fn exact_costs(
-    subject: &Subject<'_>,
-    decoder: &Decoder<&Model>,
-    header: &Header,
-    finest: u8,
-) -> Result<Vec<f64>> {
-    let mut runs = Vec::new();
-    for _ in 0..REPEATS {
-        let mut log = Log::default();
-        decoder.exact(subject.stream, finest, &mut log)?;
-        runs.push(log.steps().to_vec());
-    }
-    let levels = (header.base..=finest).zip(&header.voxels);
-    let cost = |(level, &voxels): (u8, &u32)| {
-        let ending = format!(" of level {level}");
-        let sum = |steps: &Vec<Step>| -> f64 {
-            let steps = steps.iter().filter(|step| step.name.ends_with(&ending));
-            steps.map(|step| step.time.as_nanos() as f64).sum()
-        };
-        Spread::of(runs.iter().map(sum)).median / f64::from(voxels.max(1))
-    };
-    Ok(levels.map(cost).collect())
-}
-
-/// A level, decoded in the exact zone.
-struct Level<'a> {
-    map: KernelMap,
-    role: usize,
-    voxels: &'a Voxels,
-    features: &'a [i16],
-    frame: Frame,
-}
-
-/// Gaussians of a level, and what they cost in nanoseconds.
-struct Made {
-    gaussians: Gaussians,
-    children: usize,
-    /// To get ready for the first voxel.
-    prepare: f64,
-    per_voxel: f64,
-}
-
-impl Level<'_> {
-    /// Generates Gaussians, each time with a model as it comes from the file.
-    fn generate(&self, model: &dyn Fn() -> Result<Model>, heads: Heads) -> Result<Made> {
-        let time = |voxels: &Voxels, features: &[i16], map: &KernelMap| {
-            let (mut times, mut made) = (Vec::new(), None);
-            for _ in 0..REPEATS {
-                let fresh = model()?;
-                let head = fresh.shape().head(self.role, heads);
-                let children = head.map_or(1, |head| head.children);
-                let start = Instant::now();
-                let raw = fresh.generate_with(heads, self.role, features, map)?;
-                let gaussians = activate(&raw, voxels, children, fresh.shape(), self.frame);
-                times.push(start.elapsed().as_nanos() as f64);
-                made = Some((gaussians, children));
-            }
-            Result::Ok((Spread::of(times).median, made.unwrap_or_default()))
-        };
-        let one = (Voxels::new(0, vec![0]), KernelMap::root());
-        let channels = self.features.len() / self.voxels.len().max(1);
-        let prepare = time(&one.0, &self.features[..channels], &one.1)?.0;
-        let (whole, (gaussians, children)) = time(self.voxels, self.features, &self.map)?;
-        Ok(Made {
-            gaussians,
-            children,
-            prepare,
-            per_voxel: (whole - prepare).max(0.0) / self.voxels.len().max(1) as f64,
-        })
-    }
-}
-
-/// Nanoseconds that a Gaussian and a pixel take to be drawn.
-#[derive(Clone, Copy, Default)]
-struct DrawTime {
-    per_gaussian: f64,
-    per_pixel: f64,
-}
-
-/// Of each of [`QUALITIES`], from pictures of two sizes and an empty one. What a line through two noisy times would make too little is made at least
-/// as much as they say.
-fn draw_times(
-    subject: &Subject<'_>,
-    model: &Model,
-    gaussians: &Gaussians,
-) -> Result<[DrawTime; 3]> {
-    let [few, many] = SIDES.map(|side| f64::from(side).powi(2));
-    let count = gaussians.len().max(1) as f64;
-    let empty = Gaussians::default();
-    let mut times = [DrawTime::default(); 3];
-    for ((_, quality), time) in QUALITIES.into_iter().zip(&mut times) {
-        let draw = |of, side| Ok::<_, Error>(draw(subject, model, of, quality, side, REPEATS)?.0);
-        let bare = draw(&empty, SIDES[1])? / many;
-        let [small, large] = [draw(gaussians, SIDES[0])?, draw(gaussians, SIDES[1])?];
-        time.per_pixel = ((large - small) / (many - few)).max(bare);
-        let rest = (small - time.per_pixel * few).max(large - time.per_pixel * many);
-        time.per_gaussian = (rest / count).max(0.0);
-    }
-    Ok(times)
-}
-
-fn camera(side: u32) -> Result<Camera> {
-    Camera::orbit(20.0, 20.0, 2.6, 45.0, side, side)
-}
-
-/// The median time of a picture in nanoseconds, each by a renderer of its own; and the picture.
-fn draw(
-    subject: &Subject<'_>,
-    model: &Model,
-    gaussians: &Gaussians,
-    quality: Quality,
-    side: u32,
-    repeats: usize,
-) -> Result<(f64, Image)> {
-    let camera = camera(side)?;
-    let mut image = Image::default();
-    let mut times = Vec::new();
-    for _ in 0..repeats {
-        let mut renderer = Renderer::new(model.isa());
-        renderer.set_quality(quality);
-        let start = Instant::now();
-        image = renderer
-            .render(gaussians, &camera, Background::WHITE, subject.limits)?
-            .0;
-        times.push(start.elapsed().as_nanos() as f64);
-    }
-    Ok((Spread::of(times).median, image))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::network::{Shape, untrained};
+
+    const LINE: LevelCost = LevelCost {
+        once: 2.0,
+        per_voxel: 1.5,
+    };
 
     fn model() -> Model {
         Model::from_bytes(&untrained(&Shape::tiny(), 1)).unwrap()
@@ -383,8 +272,64 @@ mod tests {
             threads: rayon::current_num_threads(),
             model: model_name(model),
             gg: model.shape().gg.clone(),
-            exact: vec![1.5; 3],
+            start: 1.0,
+            exact: vec![LINE; 3],
             draws: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_level_costs_what_few_and_many_voxels_took_and_never_less_than_a_voxels_share() {
+        let cost = LevelCost::through([10.0, 120.0], [110.0, 320.0]);
+        assert_eq!((cost.once, cost.per_voxel), (100.0, 2.0));
+        let steep = LevelCost::through([10.0, 10.0], [110.0, 310.0]);
+        assert_eq!((steep.once, steep.per_voxel), (0.0, 3.0));
+        for odd in [
+            LevelCost::through([10.0, 500.0], [110.0, 320.0]),
+            LevelCost::through([10.0, 500.0], [10.0, 320.0]),
+        ] {
+            assert_eq!(odd.of(10.0), 500.0);
+        }
+        assert_eq!(LevelCost::through([0.0, 0.0], [0.0, 0.0]).of(7.0), 0.0);
+    }
+
+    #[test]
+    fn no_picture_took_more_than_its_cost_says() {
+        let cost = PictureCost {
+            once: 7.0,
+            per_gaussian: 2.0,
+            per_pixel: 3.0,
+            per_face: 4.0,
+        };
+        let mut times = PictureTimes {
+            gaussians: [100.0, 1100.0],
+            faces: [1.5, 1.5],
+            pixels: [10.0, 60.0],
+            drawn: [[0.0; 2]; 2],
+            empty: 180.0,
+        };
+        let PictureTimes {
+            gaussians, pixels, ..
+        } = times;
+        times.drawn = gaussians.map(|g| pixels.map(|p| cost.of(g, 1.5, p)));
+        assert_eq!(PictureCost::from_times(&times), cost);
+        for (drawn, faces) in [
+            ([[5.0, 1.0], [9.0, 4.0]], [1.0, 2.0]),
+            ([[9.0, 14.0], [3.0, 4.0]], [1.0, 0.0]),
+            ([[0.0, 900.0], [300.0, 350.0]], [2.0, 1.0]),
+        ] {
+            let times = PictureTimes {
+                drawn,
+                faces,
+                ..times
+            };
+            let cost = PictureCost::from_times(&times);
+            for i in 0..2 {
+                for (p, time) in pixels.into_iter().zip(drawn[i]) {
+                    let said = cost.of(gaussians[i], faces[i], p);
+                    assert!(said >= time, "{cost:?}: {said} of {time}");
+                }
+            }
         }
     }
 
@@ -410,7 +355,7 @@ mod tests {
             |c| c.model.push('x'),
             |c| c.gg[0].channels += 4,
             |c| c.threads += 1,
-            |c| c.exact[0] = -1.0,
+            |c| c.exact[0].per_voxel = -1.0,
         ];
         for (i, spoil) in spoil.iter().enumerate() {
             let mut kept = calibration(&model);

@@ -19,6 +19,7 @@ mod calibration;
 mod effects;
 mod hard_cases;
 mod machine;
+mod measure;
 mod metrics;
 mod page;
 mod plot;
@@ -36,7 +37,7 @@ use crate::network::Model;
 use crate::projection::Camera;
 
 pub use budget::{Budget, Choice, Task};
-pub use calibration::{Calibration, DrawCost};
+pub use calibration::{Calibration, DrawCost, LevelCost, PictureCost};
 pub use effects::EffectCost;
 pub use hard_cases::{BOUND, CaseError, HardCase};
 pub use machine::Machine;

@@ -12,13 +12,17 @@ use crate::rows::{Extents, Lanes, PANEL};
 const CHANNELS: usize = LINE / 2;
 
 impl Weights {
-    /// Rounds the weights, which `weight(tap, input, output)` tells, to bf16.
-    pub fn of_brain(extents: Extents, weight: impl Fn(usize, usize, usize) -> f32) -> Weights {
+    /// Rounds the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, to bf16.
+    pub fn of_brain(
+        extents: Extents,
+        weights: impl Fn(usize, usize, usize) -> [f32; PANEL],
+    ) -> Weights {
         let mut packed = Weights::new(extents, Scheme::Brain);
-        for (tap, channel, out) in extents.each() {
-            let w = to_bf16(weight(tap, channel, out));
-            let word = packed.word(0, tap, 2 * channel, out / PANEL, out % PANEL);
-            *word |= u32::from(w) << (16 * (channel % 2));
+        for (tap, channel, panel) in extents.each() {
+            let words = packed.words(0, tap, 2 * channel, panel);
+            for (word, w) in words.iter_mut().zip(weights(tap, channel, panel)) {
+                *word |= u32::from(to_bf16(w)) << (16 * (channel % 2));
+            }
         }
         packed
     }

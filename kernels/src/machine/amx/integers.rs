@@ -20,11 +20,11 @@ const HALF: usize = LINE / 2;
 const WIDE: [usize; 2] = [17, 3];
 
 impl Weights {
-    /// Cuts the weights, which `weight(tap, input, output)` tells, into digits; nothing, if one is too large for that, or the layer too
-    /// narrow to gain.
+    /// Cuts the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, into digits; nothing, if one is too large
+    /// for that, or the layer too narrow to gain.
     pub fn of_integers(
         extents: Extents,
-        weight: impl Fn(usize, usize, usize) -> i16,
+        weights: impl Fn(usize, usize, usize) -> [i16; PANEL],
     ) -> Option<Weights> {
         let (cin, panels) = (extents.cin, extents.panels());
         if cin < WIDE[0] || cin > HALF && panels < WIDE[1] {
@@ -36,26 +36,25 @@ impl Weights {
             (false, _) => Scheme::Digits,
         };
         let mut packed = Weights::new(extents, scheme);
-        for (tap, channel, out) in extents.each() {
-            let w = weight(tap, channel, out);
-            if w.unsigned_abs() > REACH.unsigned_abs() {
+        for (tap, channel, panel) in extents.each() {
+            let weights = weights(tap, channel, panel);
+            if weights
+                .iter()
+                .any(|w| w.unsigned_abs() > REACH.unsigned_abs())
+            {
                 return None;
             }
-            let (high, low) = digits(w);
-            let mut put = |pass: usize, byte: usize, column: usize, digit: i8| {
-                let word = packed.word(pass, tap, byte, column, out % PANEL);
-                *word |= u32::from(digit as u8) << (8 * (byte % 4));
+            let [high, low] = [weights.map(|w| digits(w).0), weights.map(|w| digits(w).1)];
+            let mut put = |pass: usize, byte: usize, column: usize, digits: [i8; PANEL]| {
+                add(packed.words(pass, tap, byte, column), byte, digits);
             };
-            let panel = out / PANEL;
+            let sums: [i8; PANEL] = std::array::from_fn(|i| high[i] + low[i]);
             if scheme == Scheme::Pairs {
                 let [pair, half] = packed.homes[tap];
-                for (product, digit) in [high, low, high + low].into_iter().enumerate() {
-                    let (byte, tile) = (
-                        half * HALF + channel,
-                        pairs::tile(extents, pair, product, panel),
-                    );
-                    let word = &mut packed.tiles[tile * TILE + byte / 4].0[out % PANEL];
-                    *word |= u32::from(digit as u8) << (8 * (byte % 4));
+                for (product, digits) in [high, low, sums].into_iter().enumerate() {
+                    let byte = half * HALF + channel;
+                    let tile = pairs::tile(extents, pair, product, panel);
+                    add(&mut packed.tiles[tile * TILE + byte / 4].0, byte, digits);
                 }
                 continue;
             }
@@ -69,11 +68,18 @@ impl Weights {
             let (chunk, channel) = (channel / LINE, channel % LINE);
             let (half, channel) = (channel / 32, channel % 32);
             let byte = chunk * LINE + channel / 8 * 16 + 8 * half + channel % 8;
-            for (pass, digit) in [high, low, high + low].into_iter().enumerate() {
-                put(pass, byte, panel, digit);
+            for (pass, digits) in [high, low, sums].into_iter().enumerate() {
+                put(pass, byte, panel, digits);
             }
         }
         Some(packed)
+    }
+}
+
+/// Puts digits into the words that multiply the bytes from `byte` on.
+fn add(words: &mut [u32; PANEL], byte: usize, digits: [i8; PANEL]) {
+    for (word, digit) in words.iter_mut().zip(digits) {
+        *word |= u32::from(digit as u8) << (8 * (byte % 4));
     }
 }
 

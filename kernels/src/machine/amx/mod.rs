@@ -12,7 +12,7 @@ use std::arch::asm;
 pub(crate) use spin::{spin, spin_brain};
 
 use crate::plan::PlanTile;
-use crate::rows::{Extents, Lanes};
+use crate::rows::{Extents, Lanes, PANEL};
 
 /// Bytes of a tile row.
 const LINE: usize = 64;
@@ -102,19 +102,12 @@ impl Weights {
         }
     }
 
-    /// The word that multiplies the bytes from `byte` on of a tap's tile rows.
-    fn word(
-        &mut self,
-        pass: usize,
-        tap: usize,
-        byte: usize,
-        column: usize,
-        lane: usize,
-    ) -> &mut u32 {
+    /// The words, one for each output channel of a column, that multiply the bytes from `byte` on of a tap's tile rows.
+    fn words(&mut self, pass: usize, tap: usize, byte: usize, column: usize) -> &mut [u32; PANEL] {
         let (chunk, byte) = (byte / LINE, byte % LINE);
         let tap = pass * self.extents.volume + tap;
         let tile = (tap * self.chunks() + chunk) * self.columns() + column;
-        &mut self.tiles[tile * TILE + byte / 4].0[lane]
+        &mut self.tiles[tile * TILE + byte / 4].0
     }
 }
 
