@@ -44,7 +44,7 @@ const QUALITIES: [(&str, Quality); 3] = [
 const EQUAL: f64 = 200.0;
 
 /// [`Calibration::measure`].
-pub fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
+pub(super) fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
     let header = Header::parse(subject.stream, subject.limits)?;
     let model = (subject.model)()?;
     let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
