@@ -2,8 +2,7 @@
 //!
 //! Each function measures for about 10 ms and gives the best rate that it saw, in 10⁹ multiply-adds per second. For plain Rust
 //! (`scalar`) it tells what the compiler makes of such a loop, which is no bound.
-//!
-//! What is multiplied matters: processors that have little current to spare take longer for bits that change than for zeros.
+//! Numbers are of many different bits, as a layer's are: with zeros alone AMX came out 1 % faster.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};

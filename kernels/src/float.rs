@@ -149,7 +149,7 @@ impl FloatConv {
             Precision::F32 | Precision::Fastest => Vec::new(),
             Precision::Bf16 => vec![Lanes::default(); volume * self.extents.panels() * pairs],
         };
-        let panels = self.brain.chunks_exact_mut(pairs.max(1));
+        let panels = self.brain.chunks_exact_mut(pairs);
         for (to, from) in panels.zip(self.weights.chunks_exact(cin)) {
             for (c, from) in from.iter().enumerate() {
                 for (to, from) in to[c / 2].0.iter_mut().zip(from.f32()) {

@@ -6,7 +6,7 @@
 //! [`Taps`] name are multiplied by that tap's weights and added up, in groups of rows with like neighbours ([`Plan`]) whose sums stay in the
 //! registers, or matrix tiles, of the [`Isa`] while the taps go by. All of them give the same bits: integers wrap,
 //! products of two f16 are exact in f32, fused or not, and each sum is added up in the same order. Only [`Precision::Bf16`]
-//! depends on the machine.
+//! and [`Precision::Fastest`] depend on the machine.
 
 #[cfg(all(target_arch = "x86", not(target_feature = "sse2")))]
 compile_error!(

@@ -24,7 +24,7 @@
 //!
 //! # The close zone
 //! Gaussian generation (GG) and the encoder's feature conversion (FC) and squeezing (FS) are f16 in the file. In f16 they store f16,
-//! saturating, and sum in f32. A decoder may run GG in integers instead ([`Precision`]), with the arithmetic of the exact zone, which is
+//! saturating, and sum in f32; where there are matrix tiles, FC of the finest level multiplies in bf16. A decoder may run GG in integers instead ([`Precision`]), with the arithmetic of the exact zone, which is
 //! faster, and gives the same Gaussians to the bit everywhere.
 //!
 //! # The model file

@@ -10,7 +10,7 @@ use b2p::projection::Camera;
 use crate::common::{Ball, cloud_of};
 use crate::{decoded, model};
 
-/// A sixteenth of what Linux gives the main thread, an eighth of what Rust gives others; unoptimised code must do with it too.
+/// A thirty-second of what Linux gives the main thread, an eighth of what Rust gives others; unoptimised code must do with it too.
 const STACK: usize = 256 << 10;
 
 /// Runs it on a thread of so little stack, whose parallel work is done by threads of no more; overflowing it ends the process.

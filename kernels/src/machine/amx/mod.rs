@@ -470,7 +470,8 @@ fn combine(weights: &Weights, [group, groups]: [usize; 2], products: &[Lanes], s
         let [high, low, mixed] = match weights.scheme {
             Scheme::Digits => [0, 1, 2].map(|pass| tile(pass, panel)),
             Scheme::Both => [0, 2, 1].map(|digit| tile(0, digit * panels + panel)),
-            Scheme::Pairs | Scheme::Brain => [tile(0, panel); 3],
+            Scheme::Brain => [tile(0, panel); 3],
+            Scheme::Pairs => unreachable!("`pairs` puts its own together"),
         };
         for (at, sums) in sums.chunks_exact_mut(panels).enumerate() {
             let (high, low, mixed) = (high[at].0, low[at].0, mixed[at].0);
