@@ -25,6 +25,10 @@ pub fn i16(isa: Isa) -> f64 {
     if isa.has_tiles() {
         return best(|| amx::spin(isa, ROUNDS)) / 3.0;
     }
+    #[cfg(target_arch = "aarch64")]
+    if isa.has_dot() {
+        return best(|| crate::machine::dot::spin(isa, ROUNDS));
+    }
     measure(isa, Arithmetic::Integer)
 }
 

@@ -6,6 +6,8 @@ use crate::finish::{Finish, Tile, Value, finish_tile};
 use crate::isa::{Isa, dispatch};
 #[cfg(target_arch = "x86_64")]
 use crate::machine::amx;
+#[cfg(target_arch = "aarch64")]
+use crate::machine::dot;
 use crate::machine::{fetch, halves_mut, with_halves};
 use crate::norms::{Energy, Gains, Norms};
 use crate::rows::{AHEAD, Extents, IN_ORDER, Lanes, Output, PANEL, Scratch, panels, with_scratch};
@@ -53,6 +55,9 @@ pub struct ExactConv {
     /// What [`Isa::has_tiles`] multiplies, once it is needed: nothing, if weights are too large for it.
     #[cfg(target_arch = "x86_64")]
     tiles: OnceLock<Option<amx::Weights>>,
+    /// What `dotprod` multiplies, likewise.
+    #[cfg(target_arch = "aarch64")]
+    digits: OnceLock<Option<dot::Weights>>,
     /// For all children of voxels, once it is needed: nothing, if sums could be too large for it.
     winograd: OnceLock<Option<winograd::Weights>>,
 }
@@ -122,6 +127,8 @@ impl ExactConv {
             finish,
             #[cfg(target_arch = "x86_64")]
             tiles: OnceLock::new(),
+            #[cfg(target_arch = "aarch64")]
+            digits: OnceLock::new(),
             winograd: OnceLock::new(),
         }
     }
@@ -209,6 +216,8 @@ impl ExactConv {
                     winograd: _,
                     #[cfg(target_arch = "x86_64")]
                     tiles,
+                    #[cfg(target_arch = "aarch64")]
+                    digits,
                 } = scratch;
                 let plan = planner.plan(isa, &taps, [first, output.len()], tile);
                 #[cfg(target_arch = "x86_64")]
@@ -216,7 +225,12 @@ impl ExactConv {
                     && self.tiles().is_some_and(|weights| {
                         amx::integers::accumulate(isa, weights, plan, input, tiles, sums)
                     });
-                #[cfg(not(target_arch = "x86_64"))]
+                #[cfg(target_arch = "aarch64")]
+                let done = isa.has_dot()
+                    && self.digits().is_some_and(|weights| {
+                        dot::accumulate(isa, weights, plan, input, digits, sums)
+                    });
+                #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
                 let done = false;
                 if !done {
                     accumulate(
@@ -296,6 +310,14 @@ impl ExactConv {
         let weights = |tap, channel, panel| self.weights(tap, channel, panel);
         let make = || winograd::Weights::new(self.extents, weights);
         self.winograd.get_or_init(make).as_ref()
+    }
+
+    /// The weights in digits.
+    #[cfg(target_arch = "aarch64")]
+    fn digits(&self) -> Option<&dot::Weights> {
+        let weights = |tap, channel, panel| self.weights(tap, channel, panel);
+        let pack = || dot::Weights::new(self.extents, weights);
+        self.digits.get_or_init(pack).as_ref()
     }
 
     /// The weights in tiles.

@@ -221,6 +221,8 @@ impl FloatConv {
                 winograd: _,
                 #[cfg(target_arch = "x86_64")]
                 tiles,
+                #[cfg(target_arch = "aarch64")]
+                    digits: _,
             } = scratch;
             for (row, output) in output.tiles() {
                 let plan = planner.plan(isa, &taps, [first + row, output.len()], tile);

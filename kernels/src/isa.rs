@@ -24,6 +24,9 @@ pub(crate) enum Level {
     Amx,
     #[cfg(target_arch = "aarch64")]
     Neon,
+    /// NEON, and sums of four products of bytes.
+    #[cfg(target_arch = "aarch64")]
+    NeonDot,
 }
 
 /// The smallest [`Isa::group`].
@@ -59,7 +62,10 @@ impl Isa {
         }
         #[cfg(target_arch = "aarch64")]
         if std::arch::is_aarch64_feature_detected!("neon") {
-            return Isa(Level::Neon);
+            return Isa(match std::arch::is_aarch64_feature_detected!("dotprod") {
+                true => Level::NeonDot,
+                false => Level::Neon,
+            });
         }
         Isa::SCALAR
     }
@@ -78,6 +84,8 @@ impl Isa {
             Level::Amx,
             #[cfg(target_arch = "aarch64")]
             Level::Neon,
+            #[cfg(target_arch = "aarch64")]
+            Level::NeonDot,
         ];
         let best = Isa::detect();
         levels
@@ -126,6 +134,12 @@ impl Isa {
         false
     }
 
+    /// Whether there are sums of four products of bytes on NEON (`dotprod`).
+    #[cfg(target_arch = "aarch64")]
+    pub(crate) fn has_dot(self) -> bool {
+        self.0 == Level::NeonDot
+    }
+
     pub(crate) fn level(self) -> Level {
         self.0
     }
@@ -143,6 +157,8 @@ impl Isa {
             Level::Amx => "amx",
             #[cfg(target_arch = "aarch64")]
             Level::Neon => "neon",
+            #[cfg(target_arch = "aarch64")]
+            Level::NeonDot => "dotprod",
         }
     }
 }
@@ -251,7 +267,7 @@ macro_rules! dispatch {
             $crate::isa::Level::Scalar => scalar $(::<$($g,)* $($n)?>)? ($($arg),*),
             // Part of the baseline.
             #[cfg(target_arch = "aarch64")]
-            $crate::isa::Level::Neon => scalar $(::<$($g,)* $($n)?>)? ($($arg),*),
+            $crate::isa::Level::Neon | $crate::isa::Level::NeonDot => scalar $(::<$($g,)* $($n)?>)? ($($arg),*),
             #[cfg(target_arch = "x86_64")]
             // SAFETY: an `Isa` of this level is only made where the processor has these features.
             $crate::isa::Level::Avx2 | $crate::isa::Level::AvxVnni => unsafe { avx2 $(::<$($g,)* $($n)?>)? ($($arg),*) },

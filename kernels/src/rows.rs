@@ -174,7 +174,7 @@ impl Extents {
     }
 
     /// Tap, input and panel of outputs of each panel of weights.
-    #[cfg(target_arch = "x86_64")]
+    #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
     pub fn each(self) -> impl Iterator<Item = (usize, usize, usize)> {
         (0..self.volume).flat_map(move |tap| {
             (0..self.cin).flat_map(move |c| (0..self.panels()).map(move |panel| (tap, c, panel)))
@@ -203,6 +203,8 @@ pub(crate) struct Scratch {
     pub winograd: crate::winograd::Buffers,
     #[cfg(target_arch = "x86_64")]
     pub tiles: crate::machine::amx::Buffers,
+    #[cfg(target_arch = "aarch64")]
+    pub digits: crate::machine::dot::Buffers,
 }
 
 /// Lends this thread's [`Scratch`].

@@ -153,7 +153,7 @@ impl TileTaps {
         match isa.level() {
             Level::Scalar => fill_map(lists),
             #[cfg(target_arch = "aarch64")]
-            Level::Neon => fill_map(lists),
+            Level::Neon | Level::NeonDot => fill_map(lists),
             #[cfg(target_arch = "x86_64")]
             // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
             // tile's rows and eight more.

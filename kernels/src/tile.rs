@@ -316,7 +316,7 @@ unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) {
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 | Level::Amx => machine::avx512::run(arithmetic, block, whole),
             #[cfg(target_arch = "aarch64")]
-            Level::Neon => machine::neon::run(arithmetic, block, whole),
+            Level::Neon | Level::NeonDot => machine::neon::run(arithmetic, block, whole),
         }
     }
 }
@@ -338,7 +338,7 @@ pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 | Level::Amx => machine::avx512::spin(arithmetic, rounds),
             #[cfg(target_arch = "aarch64")]
-            Level::Neon => machine::neon::spin(arithmetic, rounds),
+            Level::Neon | Level::NeonDot => machine::neon::spin(arithmetic, rounds),
         }
     };
     match arithmetic {

@@ -312,7 +312,7 @@ pub struct ModelArg {
     /// Model file [default: the one inside the program]
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
-    /// Use no better instructions than these: scalar, avx2, avxvnni, avx512, amx, neon [default: B2P_ISA, or the best of this machine]
+    /// Use no better instructions than these: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
     #[arg(long, value_name = "NAME")]
     pub isa: Option<String>,
     /// Generate Gaussians in int16 (the same bits everywhere) or f16 [default: int16 if the model has it]

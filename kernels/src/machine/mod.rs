@@ -9,6 +9,8 @@ pub(crate) mod avx2_lists;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
 #[cfg(target_arch = "aarch64")]
+pub(crate) mod dot;
+#[cfg(target_arch = "aarch64")]
 pub(crate) mod neon;
 pub(crate) mod scalar;
 
@@ -149,7 +151,7 @@ macro_rules! with_halves {
             $crate::isa::Level::Avx512 | $crate::isa::Level::Amx => unsafe { avx512 $(::<$g>)* ($($arg),*) },
             #[cfg(target_arch = "aarch64")]
             // SAFETY: an `Isa` of this level is only made where the processor has this feature.
-            $crate::isa::Level::Neon => unsafe { neon $(::<$g>)* ($($arg),*) },
+            $crate::isa::Level::Neon | $crate::isa::Level::NeonDot => unsafe { neon $(::<$g>)* ($($arg),*) },
         }
     }};
 }

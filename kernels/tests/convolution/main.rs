@@ -25,8 +25,16 @@ fn every_instruction_set_of_this_machine_is_tested() {
         ),
         ("amx", Isa::detect().has_tiles()),
     ];
-    #[cfg(not(target_arch = "x86_64"))]
-    let others = [("neon", cfg!(target_arch = "aarch64"))];
+    #[cfg(target_arch = "aarch64")]
+    let others = [
+        ("neon", true),
+        (
+            "dotprod",
+            std::arch::is_aarch64_feature_detected!("dotprod"),
+        ),
+    ];
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+    let others: [(&str, bool); 0] = [];
     let others = others.iter().filter(|(_, has)| *has).map(|(name, _)| *name);
     let expected: Vec<&str> = std::iter::once("scalar").chain(others).collect();
     assert_eq!(names, expected);
