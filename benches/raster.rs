@@ -1,4 +1,5 @@
-//! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes. The first picture's time,
+//! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes, and a room full of splats of all
+//! shapes, seen from within. The first picture's time,
 //! least and median time of those after it, and the stages of the fastest.
 //!
 //! `raster [--threads N] [--isa NAME] [--effects] [--quality NAME] [--turn DEGREES] [SCENE…]`; `--effects` draws with each effect instead
@@ -20,6 +21,9 @@ struct Scene {
     of: usize,
     size: (u32, u32),
 }
+
+/// Gaussians of the room, and its name.
+const ROOM: (&str, usize) = ("room", 500_000);
 
 const SCENES: [Scene; 5] = [
     Scene {
@@ -164,6 +168,23 @@ fn body(count: usize, first: usize) -> Gaussians {
     scene
 }
 
+/// Splats of all shapes, σ around 5 thousandths, anywhere in the cube.
+fn room(count: usize) -> Gaussians {
+    let mut random = Random(2);
+    let mut scene = Gaussians::default();
+    for _ in 0..count {
+        let mut cube = || std::array::from_fn(|_| (2.0 * random.next() - 1.0) as f32);
+        scene.position.push(cube());
+        let scale: [f32; 3] = cube();
+        scene.scale.push(scale.map(|x| 0.005 * (1.5 * x).exp()));
+        let [x, y, z]: [f32; 3] = cube();
+        scene.rotation.push([0.5, x, y, z]);
+        scene.colour.push(cube().map(f32::abs));
+        scene.opacity.push(random.next() as f32);
+    }
+    scene
+}
+
 /// The quaternion that turns z into `normal`.
 fn facing([x, y, z]: [f64; 3]) -> [f32; 4] {
     let w = 1.0 + z;
@@ -180,6 +201,7 @@ fn measure(
     isa: Isa,
     name: &str,
     (width, height): (u32, u32),
+    radius: f64,
     gaussians: &Gaussians,
     quality: Quality,
     turn: f64,
@@ -191,7 +213,7 @@ fn measure(
     renderer.set_quality(quality);
     let mut image = Image::default();
     let mut frame = || -> Result<(Duration, Stats)> {
-        let camera = Camera::orbit(azimuth, 10.0, 3.0, 45.0, width, height)?;
+        let camera = Camera::orbit(azimuth, 10.0, radius, 45.0, width, height)?;
         azimuth += turn;
         let start = Instant::now();
         let stats = renderer.draw_into(
@@ -230,9 +252,13 @@ fn measure(
     Ok(())
 }
 
-/// What is drawn: the plain picture, or one with each effect.
-fn variants(forced: bool) -> Vec<(&'static str, Effects, Channel)> {
+/// What is drawn: the plain picture, one without care for the near plane too where something reaches over it, or one with each effect.
+fn variants(forced: bool, within: bool) -> Vec<(&'static str, Effects, Channel)> {
     let none = Effects::default();
+    let careless = Effects {
+        near: Choice::Off,
+        ..none
+    };
     let antialias = Effects {
         antialias: Choice::On,
         ..none
@@ -248,6 +274,11 @@ fn variants(forced: bool) -> Vec<(&'static str, Effects, Channel)> {
             (", harmonics", none, Channel::Colour),
             (", depth", none, Channel::Depth),
             (", normals", none, Channel::Normal),
+        ]
+    } else if within {
+        vec![
+            ("", none, Channel::Colour),
+            (", no care", careless, Channel::Colour),
         ]
     } else {
         vec![("", none, Channel::Colour)]
@@ -281,16 +312,17 @@ fn main() -> Result<()> {
         .build()
         .map_err(|e| Error::Usage(e.to_string()))?;
     println!("{} threads", pool.current_num_threads());
-    let draw = |name: &str, size, mut gaussians: Gaussians| -> Result<()> {
+    let draw = |name: &str, size, radius, mut gaussians: Gaussians| -> Result<()> {
         for &isa in &isas {
-            for variant in variants(forced) {
+            for variant in variants(forced, radius < 1.0) {
                 if variant.0 == ", harmonics" {
                     gaussians.harmonics = Harmonics {
                         count: 15,
                         coefficients: vec![[0.01; 3]; 15 * gaussians.len()],
                     };
                 }
-                let measure = || measure(isa, name, size, &gaussians, quality, turn, variant);
+                let measure =
+                    || measure(isa, name, size, radius, &gaussians, quality, turn, variant);
                 pool.install(measure)?;
                 gaussians.harmonics = Harmonics::default();
             }
@@ -299,8 +331,12 @@ fn main() -> Result<()> {
     };
     for scene in &SCENES {
         if names.is_empty() || names.iter().any(|n| n == scene.name) {
-            draw(scene.name, scene.size, body(scene.of, scene.count))?;
+            draw(scene.name, scene.size, 3.0, body(scene.of, scene.count))?;
         }
+    }
+    let (name, count) = ROOM;
+    if names.is_empty() || names.iter().any(|n| n == name) {
+        draw(name, (1024, 1024), 0.3, room(count))?;
     }
     for path in names.iter().filter(|name| name.ends_with(".ply")) {
         let bytes = std::fs::read(path).map_err(|source| Error::Io {
@@ -308,7 +344,7 @@ fn main() -> Result<()> {
             source,
         })?;
         let (gaussians, _) = ply::read(&bytes, &Limits::default())?;
-        draw("file", (1024, 1024), gaussians)?;
+        draw("file", (1024, 1024), 3.0, gaussians)?;
     }
     Ok(())
 }

@@ -126,7 +126,7 @@ pub struct Stats {
     pub visible: u64,
     /// Gaussians not drawn, and why.
     pub dropped: Dropped,
-    /// Gaussians that reach over the near plane, drawn or not.
+    /// Gaussians that reach over the near plane: of those drawn with care for it the visible ones, else all.
     pub crossing: u64,
     /// Pairs of a Gaussian and a tile of 32×32 pixels that it may touch.
     pub pairs: u64,

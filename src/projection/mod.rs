@@ -196,7 +196,7 @@ fn run_length(gaussians: usize) -> usize {
 pub struct Seen {
     /// Gaussians that are not drawn.
     pub dropped: Dropped,
-    /// Gaussians that reach over the near plane.
+    /// Gaussians that reach over the near plane; with care for it, those that are visible.
     pub crossing: u64,
 }
 

@@ -3,6 +3,7 @@
 //! Each kernel is one body over lanes of floats, compiled for plain Rust, AVX2, AVX-512 and NEON. Between these the last bits differ,
 //! because only some multiply and add in one rounding; on each of them the result is a function of the input alone.
 
+mod ahead;
 #[cfg(target_arch = "x86_64")]
 mod avx2;
 #[cfg(target_arch = "x86_64")]
@@ -63,7 +64,7 @@ pub struct Ellipse {
 /// centre, in its own measure, of the part of a pixel's ray that is beyond the plane. At depth `t` on the ray of pixel `(px, py)`,
 /// `x = from·(px, py, 1) + t·along·(px, py, 1)`.
 ///
-/// Its [`Ellipse`] has forms of zeroes and the bounds of the whole picture.
+/// Its [`Ellipse`] has forms of zeroes, and the bounds of a box around what of it lies beyond the plane.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Crossing {
     /// The Gaussian's index in the input.

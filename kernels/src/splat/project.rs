@@ -6,6 +6,7 @@
 //! for `p = a`, `v = dx/√p` and `u = (dy − (b/p)·dx)/√(det/p)`. So the exponent cannot be positive, and a needle of 3000 × 0.1 px
 //! keeps its α to 2·10⁻⁴ where the textbook form is wrong by 1.
 
+use super::ahead::Ahead;
 use super::lanes::{Double, Lanes, Mask, by_level, four, three};
 use super::{BLUR, Bounds, Ellipse, MAX_SCALE, MIN_COMPENSATION};
 use crate::Isa;
@@ -19,7 +20,7 @@ const LENGTHS: [f32; 2] = [1e-20, 1e20];
 const REACH: f32 = 3.0;
 
 /// Bits of the variants of the kernel.
-const ORTHOGRAPHIC: u8 = 1;
+pub(super) const ORTHOGRAPHIC: u8 = 1;
 const COMPENSATED: u8 = 2;
 
 /// A camera, prepared.
@@ -73,7 +74,8 @@ pub struct Tally {
     pub too_faint: u32,
     pub behind: u32,
     pub outside: u32,
-    /// Of all that could be drawn otherwise, how many reach over the near plane, on whatever side their centres are.
+    /// Of all that could be drawn otherwise, how many reach over the near plane, on whatever side their centres are; of those that are
+    /// drawn like that, how many are visible.
     pub crossing: u32,
 }
 
@@ -170,22 +172,25 @@ fn body<L: Lanes, const VARIANT: u8>(
 }
 
 /// A [`View`] in lanes.
-struct Camera<L: Lanes> {
+pub(super) struct Camera<L: Lanes> {
     rotation: [[L::Double; 3]; 3],
     translation: [L::Double; 3],
     near: L::Double,
     near_care: bool,
-    near_plane: L,
-    focal: [L::Double; 2],
-    centre: [L::Double; 2],
+    pub(super) near_plane: L,
+    pub(super) focal: [L::Double; 2],
+    pub(super) centre: [L::Double; 2],
     slopes: [[L::Double; 2]; 2],
     rows: [[L; 3]; 3],
     /// First and end of the window, by column and by row.
-    window: [[L; 2]; 2],
+    pub(super) window: [[L; 2]; 2],
     floor: L,
     log_floor: L,
     /// The Gaussians' own blur in pixels at distance 1.
     blur: L::Double,
+    /// [`BLUR`] in units of length at distance 1, and the Gaussians' own in these.
+    pub(super) pixel: L,
+    pub(super) own: L,
 }
 
 impl<L: Lanes> Camera<L> {
@@ -210,6 +215,8 @@ impl<L: Lanes> Camera<L> {
             floor: L::splat(view.floor),
             log_floor: L::splat(view.floor.log2()),
             blur: L::Double::splat(view.blur * view.focal[0] * view.focal[1]),
+            pixel: L::splat((f64::from(BLUR) / view.focal[0] / view.focal[1]) as f32),
+            own: L::splat(view.blur as f32),
         }
     }
 
@@ -298,8 +305,7 @@ impl<L: Lanes> Camera<L> {
             log2(opacity)
         };
         // α is at the floor at d² = 2·ln(opacity/floor) standard deviations squared.
-        let reach = log_opacity.sub(self.log_floor).max(zero);
-        let reach = reach.mul(L::splat(2.0 * std::f32::consts::LN_2));
+        let reach = self.reach(log_opacity);
         let (mut x0, mut x1) = covered(x, a.mul(reach).sqrt(), self.window[0]);
         let (mut y0, mut y1) = covered(y, c.mul(reach).sqrt(), self.window[1]);
         let inside = x0.lt(x1).and(y0.lt(y1));
@@ -315,10 +321,27 @@ impl<L: Lanes> Camera<L> {
             left &= bits;
         }
         let ahead_of = three!(i => dot(self.rows[2], axes[i]).mul(scale[i]));
-        let reach = dot(ahead_of, ahead_of).mul(L::splat(REACH * REACH));
+        let variance = dot(ahead_of, ahead_of);
         let beyond = depth.sub(self.near_plane);
-        let crossing = beyond.mul(beyond).lt(reach);
-        let crossed = left & crossing.bits();
+        let crossing = beyond.mul(beyond).lt(variance.mul(L::splat(REACH * REACH)));
+        let mut crossed = left & crossing.bits();
+        if self.near_care && crossed != 0 {
+            log_opacity = L::select(crossing, log2(uncompensated), log_opacity);
+            let sigmas = self.reach(log_opacity);
+            let ahead = Ahead::new::<VARIANT>(self, depth, variance, sigmas);
+            let rows = three!(k => three!(i => dot(self.rows[k], axes[i]).mul(scale[i])));
+            let halves = three!(k => dot(rows[k], rows[k]).add(ahead.blur).mul(sigmas).sqrt());
+            let across = ahead.covered::<VARIANT>(self, 0, seen[0].to_lanes(), halves[0]);
+            let along = ahead.covered::<VARIANT>(self, 1, seen[1].to_lanes(), halves[1]);
+            let visible = across[0].lt(across[1]).and(along[0].lt(along[1])).bits();
+            tally.outside += (crossed & !visible).count_ones();
+            left &= visible | !crossed;
+            crossed &= visible;
+            x0 = L::select(crossing, across[0], x0);
+            x1 = L::select(crossing, across[1], x1);
+            y0 = L::select(crossing, along[0], y0);
+            y1 = L::select(crossing, along[1], y1);
+        }
         tally.crossing += crossed.count_ones();
         let cared = if self.near_care { crossed } else { 0 };
         for (mask, missing) in [
@@ -339,11 +362,7 @@ impl<L: Lanes> Camera<L> {
             for form in [&mut x, &mut y, &mut across, &mut lengthwise, &mut tilted] {
                 *form = either(zero, *form);
             }
-            let [[left, right], [top, bottom]] = self.window;
-            (x0, x1) = (either(left, x0), either(right, x1));
-            (y0, y1) = (either(top, y0), either(bottom, y1));
             depth = either(depth.max(self.near_plane), depth);
-            log_opacity = either(log2(uncompensated), log_opacity);
         }
         let mut indices = [0.0; 16];
         for (i, place) in indices.iter_mut().enumerate() {
@@ -368,6 +387,13 @@ impl<L: Lanes> Camera<L> {
             L::load(&indices),
         ];
         tally.visible += L::collect(&fields, left, out) as u32;
+    }
+
+    /// So many standard deviations, squared, α is from its peak to the floor.
+    #[inline(always)]
+    fn reach(&self, log_opacity: L) -> L {
+        let powers = log_opacity.sub(self.log_floor).max(L::splat(0.0));
+        powers.mul(L::splat(2.0 * std::f32::consts::LN_2))
     }
 
     /// The centre along x (`k` 0) or y (1), and that row of `M`. `seen`: the centre's offset along that axis of the camera.

@@ -42,6 +42,68 @@ fn what_reaches_over_the_near_plane_is_close_to_the_reference() {
     }
 }
 
+/// At the near plane, as far beside the view as within it: what isn't looked at has to be what isn't seen.
+#[test]
+fn splats_all_along_the_near_plane_are_close_to_the_reference() {
+    for (seed, size, spread) in [(1, 0.003, 0.6), (2, 0.03, 1.5), (3, 0.3, 5.0)] {
+        let mut random = Random(seed);
+        let mut camera = straight(40.0, 60, 50);
+        camera.near = 0.2;
+        [camera.cx, camera.cy] = [-20.0, 70.0];
+        let splat = |_| {
+            let [x, y, z] = [spread, spread, 4.0 * size].map(|most| random.within(-most, most));
+            let [width, depth] = [random.within(0.1, 1.0), random.within(0.1, 2.0)];
+            Splat {
+                position: [x, y, 0.2 + z],
+                scale: [size * width, size, size * depth],
+                rotation: random.rotation(),
+                opacity: random.next(),
+                colour: random.colour(),
+            }
+        };
+        let scene = scene((0..800).map(splat).collect::<Vec<_>>());
+        for camera in [camera, camera.orthographic(1.0).unwrap()] {
+            let exact = reference::render(&scene, &camera, Background::BLACK, Cutoffs::NONE);
+            for isa in isas() {
+                let (image, stats) = with(&scene, &camera, isa, NONE);
+                assert!(stats.effects.near && stats.crossing > 0, "{isa}");
+                let (largest, psnr) = difference(&image, &exact);
+                assert!(
+                    largest <= 2.0 / 255.0 && psnr >= 60.0,
+                    "{isa}, {size}: {largest} {psnr}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn what_reaches_over_the_near_plane_beside_the_picture_is_looked_at_nowhere() {
+    let beside = |i: usize| Splat {
+        position: [
+            [5.0, 0.0, 0.25],
+            [-5.0, 0.0, 0.25],
+            [0.0, 5.0, 0.25],
+            [0.0, -5.0, 0.25],
+        ][i % 4],
+        ..RED
+    };
+    let mut camera = straight(30.0, 64, 64);
+    camera.near = 0.25;
+    for camera in [camera, camera.orthographic(1.0).unwrap()] {
+        for isa in isas() {
+            let (image, stats) = with(&scene((0..100).map(beside)), &camera, isa, NONE);
+            assert_eq!(
+                (stats.pairs, stats.crossing, stats.dropped.outside),
+                (0, 0, 100),
+                "{isa}"
+            );
+            assert!(!stats.effects.near);
+            assert!(image.pixels.iter().all(|p| p[..3] == [0.0; 3]));
+        }
+    }
+}
+
 #[test]
 fn walking_through_a_splat_changes_the_picture_little_by_little() {
     let splat = Splat {
