@@ -14,8 +14,10 @@
 use std::io::Write;
 use std::path::Path;
 
+use rayon::prelude::*;
+
 use super::{Frame, Gaussians, Harmonics};
-use crate::cloud::ply::{Header, Ply};
+use crate::cloud::ply::{Column, Header, Ply};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::placement::Placement;
@@ -217,18 +219,23 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
         harmonics,
         compensated,
         position: (0..count)
+            .into_par_iter()
             .map(|i| frame.placement.to_cube(frame.bits, centre(i)))
             .collect(),
         scale: (0..count)
+            .into_par_iter()
             .map(|i| std::array::from_fn(|k| deviation(i, k)))
             .collect(),
         rotation: (0..count)
+            .into_par_iter()
             .map(|i| std::array::from_fn(|k| rotation[k].get(i) as f32))
             .collect(),
         opacity: (0..count)
+            .into_par_iter()
             .map(|i| (1.0 / (1.0 + (-opacity[0].get(i)).exp())) as f32)
             .collect(),
         colour: (0..count)
+            .into_par_iter()
             .map(|i| std::array::from_fn(|k| (0.5 + HARMONIC * colour[k].get(i)) as f32))
             .collect(),
         frame,
@@ -241,15 +248,21 @@ fn harmonics(ply: &Ply, count: usize, limits: &Limits) -> Result<Harmonics> {
     let names: Vec<String> = (0..3 * count).map(|i| format!("f_rest_{i}")).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     let columns = ply.vertex_columns(&names, limits)?;
-    let one = |i: usize| {
-        let columns = &columns;
-        (0..count).map(move |k| -> [f32; 3] {
-            std::array::from_fn(|c| columns[c * count + k].get(i) as f32)
-        })
-    };
+    let columns: Vec<Vec<f32>> = columns.into_iter().map(Column::into_f32).collect();
+    let mut coefficients = vec![[0.0; 3]; columns[0].len() * count];
+    let blocks = coefficients.par_chunks_mut(BLOCK * count).enumerate();
+    blocks.for_each(|(block, to)| {
+        for k in 0..count {
+            let of = |channel: usize| &columns[channel * count + k][block * BLOCK..];
+            let each = of(0).iter().zip(of(1)).zip(of(2));
+            for (to, ((&r, &g), &b)) in to[k..].iter_mut().step_by(count).zip(each) {
+                *to = [r, g, b];
+            }
+        }
+    });
     Ok(Harmonics {
         count,
-        coefficients: (0..columns[0].len()).flat_map(one).collect(),
+        coefficients,
     })
 }
 

@@ -1,9 +1,15 @@
 //! Rows of a binary file.
 
+use rayon::prelude::*;
+
 use super::header::{Element, Kind, Scalar};
 use super::{Column, Values, truncated};
 use crate::cloud::malformed;
 use crate::error::Result;
+
+/// Rows and columns that a thread reads together.
+const BLOCK: usize = 512;
+const TOGETHER: usize = 16;
 
 struct Cursor<'a> {
     bytes: &'a [u8],
@@ -37,13 +43,21 @@ pub(super) fn columns(
         return cursor.listed_columns(element, wanted);
     };
     let rows = cursor.take_rows(element.count, stride)?;
-    Ok(wanted
-        .iter()
-        .map(|&(property, scalar)| Column {
-            scalar,
-            values: gather_scalar(rows, stride, offset(element, property), scalar, big_endian),
-        })
-        .collect())
+    let with_room = |&(_, scalar)| Column::with_capacity(scalar, element.count as usize);
+    let mut columns: Vec<Column> = wanted.iter().map(with_room).collect();
+    let offsets: Vec<usize> = wanted.iter().map(|w| offset(element, w.0)).collect();
+    let parts = columns.par_chunks_mut(TOGETHER);
+    parts
+        .zip(offsets.par_chunks(TOGETHER))
+        .for_each(|(columns, offsets)| {
+            // Some rows at a time, so that they are still in the cache for the last column.
+            for rows in rows.chunks(BLOCK * stride) {
+                for (column, &at) in columns.iter_mut().zip(offsets) {
+                    column.extend(rows, stride, at, big_endian);
+                }
+            }
+        });
+    Ok(columns)
 }
 
 impl<'a> Cursor<'a> {
@@ -148,36 +162,32 @@ fn offset(element: &Element, property: usize) -> usize {
 
 /// One number from exactly its bytes.
 fn number(bytes: &[u8], scalar: Scalar, big_endian: bool) -> f64 {
-    match gather_scalar(bytes, scalar.size(), 0, scalar, big_endian) {
-        Values::U8(v) => v[0].into(),
-        Values::F32(v) => v[0].into(),
-        Values::F64(v) => v[0],
-    }
+    let mut column = Column::with_capacity(scalar, 1);
+    column.extend(bytes, bytes.len(), 0, big_endian);
+    column.get(0)
 }
 
-fn gather_scalar(
-    rows: &[u8],
-    stride: usize,
-    at: usize,
-    scalar: Scalar,
-    big_endian: bool,
-) -> Values {
-    macro_rules! column {
-        ($values:ident, $file:ty as $memory:ty) => {
-            Values::$values(gather(rows, stride, at, big_endian, |bytes| {
-                <$file>::from_le_bytes(bytes) as $memory
-            }))
-        };
-    }
-    match scalar {
-        Scalar::I8 => column!(F32, i8 as f32),
-        Scalar::U8 => column!(U8, u8 as u8),
-        Scalar::I16 => column!(F32, i16 as f32),
-        Scalar::U16 => column!(F32, u16 as f32),
-        Scalar::I32 => column!(F64, i32 as f64),
-        Scalar::U32 => column!(F64, u32 as f64),
-        Scalar::F32 => column!(F32, f32 as f32),
-        Scalar::F64 => column!(F64, f64 as f64),
+impl Column {
+    /// Adds a property of `rows` of `stride` bytes, `at` bytes from each row's start.
+    fn extend(&mut self, rows: &[u8], stride: usize, at: usize, big_endian: bool) {
+        macro_rules! add {
+            ($to:ident, $file:ty as $memory:ty) => {
+                gather(rows, stride, at, big_endian, $to, |bytes| {
+                    <$file>::from_le_bytes(bytes) as $memory
+                })
+            };
+        }
+        match (self.scalar, &mut self.values) {
+            (Scalar::I8, Values::F32(to)) => add!(to, i8 as f32),
+            (Scalar::U8, Values::U8(to)) => add!(to, u8 as u8),
+            (Scalar::I16, Values::F32(to)) => add!(to, i16 as f32),
+            (Scalar::U16, Values::F32(to)) => add!(to, u16 as f32),
+            (Scalar::I32, Values::F64(to)) => add!(to, i32 as f64),
+            (Scalar::U32, Values::F64(to)) => add!(to, u32 as f64),
+            (Scalar::F32, Values::F32(to)) => add!(to, f32 as f32),
+            (Scalar::F64, Values::F64(to)) => add!(to, f64 as f64),
+            _ => unreachable!("a column is made for its type"),
+        }
     }
 }
 
@@ -186,16 +196,15 @@ fn gather<const N: usize, T>(
     stride: usize,
     at: usize,
     big_endian: bool,
+    to: &mut Vec<T>,
     value: impl Fn([u8; N]) -> T,
-) -> Vec<T> {
-    rows.chunks_exact(stride)
-        .map(|row| {
-            let mut bytes = [0; N];
-            bytes.copy_from_slice(&row[at..at + N]);
-            if big_endian {
-                bytes.reverse();
-            }
-            value(bytes)
-        })
-        .collect()
+) {
+    to.extend(rows.chunks_exact(stride).map(|row| {
+        let mut bytes = [0; N];
+        bytes.copy_from_slice(&row[at..at + N]);
+        if big_endian {
+            bytes.reverse();
+        }
+        value(bytes)
+    }));
 }

@@ -66,6 +66,41 @@ fn every_format_reads_the_same_columns() {
 }
 
 #[test]
+fn many_columns_of_many_rows_are_read_like_few() {
+    let (columns, rows) = (37, 1300);
+    let value = |row: usize, column: usize| (row * 100 + column) as f32;
+    for big_endian in [false, true] {
+        let kind = if big_endian { "big" } else { "little" };
+        let mut bytes =
+            format!("ply\nformat binary_{kind}_endian 1.0\nelement vertex {rows}\n").into_bytes();
+        let names: Vec<String> = (0..columns).map(|i| format!("p{i}")).collect();
+        for name in &names {
+            bytes.extend(format!("property float {name}\n").bytes());
+        }
+        bytes.extend(b"end_header\n");
+        for row in 0..rows {
+            for column in 0..columns {
+                let bits = value(row, column).to_bits();
+                bytes.extend(if big_endian {
+                    bits.to_be_bytes()
+                } else {
+                    bits.to_le_bytes()
+                });
+            }
+        }
+        let ply = Ply::open(&bytes).unwrap();
+        // Not in the order of the file, and not all.
+        let wanted: Vec<usize> = (1..columns).rev().collect();
+        let names: Vec<&str> = wanted.iter().map(|&i| names[i].as_str()).collect();
+        let read = ply.vertex_columns(&names, &Limits::default()).unwrap();
+        for (column, read) in wanted.into_iter().zip(read) {
+            let expected = (0..rows).map(|row| value(row, column)).collect();
+            assert_eq!(read.values, Values::F32(expected), "{kind}, {column}");
+        }
+    }
+}
+
+#[test]
 fn lists_inside_the_vertices_are_passed_over() {
     let header = "element vertex 2\nproperty list uchar ushort tags\nproperty uchar x\n\
                   property uint y\nproperty list ushort double more\nproperty char z\nend_header\n";

@@ -308,3 +308,29 @@ fn view_dependent_colour_is_read_channel_by_channel() {
     let one = [[1.0, 4.0, 7.0], [2.0, 5.0, 8.0], [3.0, 6.0, 9.0]];
     assert_eq!(g.harmonics.coefficients, [one, one].concat());
 }
+
+#[test]
+fn view_dependent_colour_of_many_is_each_one_s_own() {
+    let count = 2 * BLOCK + 7;
+    let mut bytes =
+        format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n").into_bytes();
+    let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();
+    for name in PROPERTIES
+        .into_iter()
+        .chain(rest.iter().map(String::as_str))
+    {
+        bytes.extend(format!("property float {name}\n").bytes());
+    }
+    bytes.extend(b"end_header\n");
+    let value = |i: usize, k: usize| (10 * i + k) as f32;
+    for i in 0..count {
+        bytes.extend([0.5f32; 14].into_iter().flat_map(f32::to_le_bytes));
+        bytes.extend((0..9).flat_map(|k| value(i, k).to_le_bytes()));
+    }
+    let (g, _) = read_back(&bytes);
+    let of = |i| (0..3).map(move |k| [0, 3, 6].map(|channel| value(i, channel + k)));
+    assert_eq!(
+        g.harmonics.coefficients,
+        (0..count).flat_map(of).collect::<Vec<_>>()
+    );
+}
