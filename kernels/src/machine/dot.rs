@@ -1,19 +1,16 @@
 //! Integers by sums of four products of bytes (NEON with `dotprod`), of which a processor does two a cycle where it does one of the long
 //! products that NEON has otherwise.
 //!
-//! Numbers of up to 13 bits are cut into two digits, `x = 64·high + low`, each of a signed byte. Three products of digits make one of
-//! numbers: `high·high`, `low·low`, and `(high + low)·(high + low)`, which contains them and the mixed ones (Karatsuba). All is added modulo
-//! 2³², as everywhere, so sums are equal to the bit.
+//! Numbers of up to 13 bits are cut into two digits, of which three products make one of numbers ([`digits`]).
 
 use std::arch::aarch64::*;
 use std::arch::asm;
 
 use crate::Isa;
+use crate::machine::{REACH, digits, fetch};
 use crate::plan::PlanTile;
 use crate::rows::{AHEAD, Extents, Lanes, PANEL};
 
-/// The largest magnitude whose digits, and their sum, are signed bytes.
-const REACH: i16 = 4095;
 /// `high`, `low` and their sum.
 const DIGITS: usize = 3;
 /// Input channels of a word of digits.
@@ -65,8 +62,7 @@ impl Weights {
                 if half >= halves {
                     break;
                 }
-                let high = (weight + 32) >> 6;
-                let low = weight - (high << 6);
+                let (high, low) = digits(weight);
                 let step = (half * volume + tap) * steps + channel / STEP;
                 for (k, digit) in [high, low, high + low].into_iter().enumerate() {
                     packed[step * DIGITS + k].0[lane % HALF] |=
@@ -177,7 +173,7 @@ unsafe fn split_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [u32]) ->
     let each = to.chunks_exact_mut(cin.div_ceil(EIGHT) * WORDS);
     for (i, (to, &row)) in each.zip(rows).enumerate() {
         if let Some(&next) = rows.get(i + AHEAD) {
-            crate::machine::fetch(&input[next as usize * cin..][..cin]);
+            fetch(&input[next as usize * cin..][..cin]);
         }
         let from = &input[row as usize * cin..][..cin];
         let (whole, rest) = from.as_chunks::<EIGHT>();

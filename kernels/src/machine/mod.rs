@@ -16,6 +16,20 @@ pub(crate) mod scalar;
 
 use crate::rows::{Lanes, PANEL};
 
+/// The largest magnitude of a number whose [`digits`], and their sum, are signed bytes.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+const REACH: i16 = 4095;
+
+/// `(high, low)` with `x = 64·high + low`.
+///
+/// Three products of digits make one of numbers: `high·high`, `low·low`, and `(high + low)·(high + low)`, which contains them and the mixed
+/// ones (Karatsuba). Added modulo 2³², as everywhere, sums are equal to the bit.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+fn digits(x: i16) -> (i8, i8) {
+    let high = (x + 32) >> 6;
+    (high as i8, (x - (high << 6)) as i8)
+}
+
 /// The same memory, as words.
 pub(crate) fn words_mut(lanes: &mut [Lanes]) -> &mut [u32] {
     // SAFETY: `Lanes` is `repr(C)` and holds `PANEL` words and nothing else; 64 bytes are their size, so there is no padding.

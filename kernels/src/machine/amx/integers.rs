@@ -1,19 +1,15 @@
 //! Integers in tiles of bytes.
 //!
-//! Numbers of up to 13 bits are cut into two digits, `x = 64·high + low`, each of a signed byte. Three products of digits make one of
-//! numbers: `high·high`, `low·low`, and `(high + low)·(high + low)`, which contains them and the mixed ones (Karatsuba). Of up to 32 channels
-//! both digits fit a tile row, and the mixed products come of one multiplication by the weights' digits the other way round. All is added
-//! modulo 2³², as everywhere, so sums are equal to the bit.
+//! Numbers of up to 13 bits are cut into two digits, of which three products make one of numbers ([`digits`]). Of up to 32 channels both digits
+//! fit a tile row, and the mixed products come of one multiplication by the weights' digits the other way round.
 
 use std::arch::x86_64::*;
 
 use super::{Buffers, LINE, Scheme, TILE, Weights, multiply, pairs, prepare};
-use crate::machine::fetch;
+use crate::machine::{REACH, digits, fetch};
 use crate::plan::PlanTile;
 use crate::rows::{AHEAD, Extents, Lanes, PANEL};
 
-/// The largest magnitude whose digits, and their sum, are signed bytes.
-const REACH: i16 = 4095;
 /// Input channels whose two digits fit a tile row.
 const HALF: usize = LINE / 2;
 /// Input channels from which on tiles are full enough; and panels of output channels, where a tile row holds one digit.
@@ -81,12 +77,6 @@ fn add(words: &mut [u32; PANEL], byte: usize, digits: [i8; PANEL]) {
     for (word, digit) in words.iter_mut().zip(digits) {
         *word |= u32::from(digit as u8) << (8 * (byte % 4));
     }
-}
-
-/// `(high, low)` with `x = 64·high + low`.
-fn digits(x: i16) -> (i8, i8) {
-    let high = (x + 32) >> 6;
-    (high as i8, (x - (high << 6)) as i8)
 }
 
 /// The sums over all taps of a tile: `sums[row · panels + panel]`, rows in the plan's order. False, and no sums, if activations are too large for
