@@ -32,8 +32,8 @@ export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUSTFLAGS="-C target-feature=+crt-
 if [ "${1:-}" = program ]; then
     out=$(mktemp -d)
     trap 'rm -rf "$out"' EXIT
-    cargo build --locked --profile dist -p b2p --target $target
-    there=${CARGO_TARGET_DIR:-target}/$target/dist/b2p
+    cargo build --locked --release -p b2p --target $target
+    there=${CARGO_TARGET_DIR:-target}/$target/release/b2p
     cargo build --locked --release -p b2p
     # STREAM PROCESSOR INSTRUCTIONS
     same() {
