@@ -65,7 +65,8 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
         supersample: Choice::Off,
         ..Effects::default()
     };
-    let inside = Camera::orbit(0.0, 0.0, 0.75, 90.0, side, side)?;
+    // The near plane touches the surface.
+    let inside = Camera::orbit(0.0, 0.0, 0.8 + Camera::NEAR, 90.0, side, side)?;
     let case = |effect, name, scene, gaussians: &Gaussians, camera, others| Case {
         effect,
         name,
