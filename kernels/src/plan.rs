@@ -154,19 +154,19 @@ impl PlanTile {
         self.order.extend(keys.iter().map(row));
     }
 
-    /// Taps of the kernel.
-    pub(crate) fn volume(&self) -> usize {
-        self.volume
+    /// Checks that it is the plan of a kernel of so many taps, and reads nothing beyond so many input rows.
+    pub(crate) fn check(&self, volume: usize, inputs: usize) {
+        assert_eq!(self.volume, volume, "another kernel's plan");
+        assert!(
+            self.end <= inputs,
+            "a tap reads row {}, but the input has {inputs}",
+            self.end - 1
+        );
     }
 
     /// The input rows that are read, each once. [`PlanTile::places`] counts them.
     pub(crate) fn inputs(&self) -> &[u32] {
         &self.inputs
-    }
-
-    /// One more than the last input row.
-    pub(crate) fn end(&self) -> usize {
-        self.end
     }
 
     /// For each row, bit k tells whether tap `k` reads something.

@@ -192,13 +192,7 @@ pub(crate) fn accumulate<T>(
     let Extents { volume, cin, .. } = extents;
     let panels = extents.panels();
     let steps = weights.len() / (volume * panels);
-    assert_eq!(plan.volume(), volume, "another kernel's plan");
-    let (end, inputs) = (plan.end(), input.len() / cin);
-    assert!(
-        end <= inputs,
-        "a tap reads row {}, but the input has {inputs}",
-        end - 1
-    );
+    plan.check(volume, input.len() / cin);
     let words = plan.inputs().len() * steps;
     expanded.resize((words + steps).div_ceil(PANEL), Lanes::default());
     let rows = machine::words_mut(expanded);

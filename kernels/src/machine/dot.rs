@@ -92,13 +92,7 @@ pub(crate) fn accumulate(
 ) -> bool {
     assert!(isa.has_dot() && plan.group() == ROWS);
     let Extents { volume, cin, cout } = weights.extents;
-    assert_eq!(plan.volume(), volume, "another kernel's plan");
-    let (end, inputs) = (plan.end(), input.len() / cin);
-    assert!(
-        end <= inputs,
-        "a tap reads row {}, but the input has {inputs}",
-        end - 1
-    );
+    plan.check(volume, input.len() / cin);
     let row = cin.div_ceil(2 * STEP) * 2 * DIGITS;
     let words = plan.inputs().len() * row;
     buffers.rows.resize(words + row + 1, 0);

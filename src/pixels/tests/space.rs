@@ -20,6 +20,20 @@ const NONE: Effects = Effects {
     order: Choice::Auto,
 };
 
+/// Whether something reaches over the near plane, and the picture is close to the reference on every instruction set.
+fn assert_cared_for(scene: &Gaussians, camera: &Camera) {
+    let exact = reference::render(scene, camera, Background::BLACK, Cutoffs::NONE);
+    for isa in isas() {
+        let (image, stats) = with(scene, camera, isa, NONE);
+        assert!(stats.effects.near && stats.crossing > 0, "{isa}");
+        let (largest, psnr) = difference(&image, &exact);
+        assert!(
+            largest <= 2.0 / 255.0 && psnr >= 60.0,
+            "{isa}: {largest} {psnr}"
+        );
+    }
+}
+
 #[test]
 fn what_reaches_over_the_near_plane_is_close_to_the_reference() {
     // From among them, with a near plane that many are cut by.
@@ -28,16 +42,7 @@ fn what_reaches_over_the_near_plane_is_close_to_the_reference() {
         let mut camera = Camera::orbit(70.0, -20.0, 0.7, 80.0, 60, 50).unwrap();
         camera.near = near;
         for camera in [camera, camera.orthographic(1.0).unwrap()] {
-            let exact = reference::render(&scene, &camera, Background::BLACK, Cutoffs::NONE);
-            for isa in isas() {
-                let (image, stats) = with(&scene, &camera, isa, NONE);
-                assert!(stats.effects.near && stats.crossing > 0, "{isa}");
-                let (largest, psnr) = difference(&image, &exact);
-                assert!(
-                    largest <= 2.0 / 255.0 && psnr >= 60.0,
-                    "{isa}: {largest} {psnr}"
-                );
-            }
+            assert_cared_for(&scene, &camera);
         }
     }
 }
@@ -63,16 +68,7 @@ fn splats_all_along_the_near_plane_are_close_to_the_reference() {
         };
         let scene = scene((0..800).map(splat).collect::<Vec<_>>());
         for camera in [camera, camera.orthographic(1.0).unwrap()] {
-            let exact = reference::render(&scene, &camera, Background::BLACK, Cutoffs::NONE);
-            for isa in isas() {
-                let (image, stats) = with(&scene, &camera, isa, NONE);
-                assert!(stats.effects.near && stats.crossing > 0, "{isa}");
-                let (largest, psnr) = difference(&image, &exact);
-                assert!(
-                    largest <= 2.0 / 255.0 && psnr >= 60.0,
-                    "{isa}, {size}: {largest} {psnr}"
-                );
-            }
+            assert_cared_for(&scene, &camera);
         }
     }
 }

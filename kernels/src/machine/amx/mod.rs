@@ -136,14 +136,7 @@ fn prepare(
     buffers: &mut Buffers,
 ) {
     assert!(isa.has_tiles());
-    let volume = weights.extents.volume;
-    assert_eq!(plan.volume(), volume, "another kernel's plan");
-    let end = plan.end();
-    assert!(
-        end <= inputs,
-        "a tap reads row {}, but the input has {inputs}",
-        end - 1
-    );
+    plan.check(weights.extents.volume, inputs);
     let lines = (plan.inputs().len() + 1) * weights.chunks();
     buffers
         .rows
