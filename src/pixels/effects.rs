@@ -193,9 +193,9 @@ impl Effects {
                 "near",
                 set.near,
                 match (self.near, stats.crossing) {
-                    (_, 0) => "no Gaussian reaches over the near plane".into(),
+                    (_, 0) => "no Gaussian in view reaches over the near plane".into(),
                     (Choice::Off, n) => format!("forced; {n} Gaussians reach over the near plane"),
-                    (_, n) => format!("{n} Gaussians reach over the near plane"),
+                    (_, n) => format!("{n} Gaussians in view reach over the near plane"),
                 },
             ),
             line(
