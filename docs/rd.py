@@ -70,15 +70,17 @@ def measure(data, models, peers):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Bjøntegaard's differences, over the piecewise linear curves through the points that no other beats
+# Bjøntegaard's differences, over the concave envelopes of both's points: a better point never counts against whose it is
 
 
-def front(rows, score):
-    best, out = -math.inf, []
-    for row in sorted(rows, key=lambda r: (r["rate"], -r[score])):
-        if row[score] > best:
-            best = row[score]
-            out.append((math.log(row["rate"]), row[score]))
+def envelope(rows, score):
+    out = []
+    for x, y in sorted((math.log(row["rate"]), row[score]) for row in rows):
+        if out and y <= out[-1][1]:
+            continue
+        while len(out) > 1 and (out[-1][1] - out[-2][1]) * (x - out[-2][0]) <= (y - out[-2][1]) * (out[-1][0] - out[-2][0]):
+            out.pop()
+        out.append((x, y))
     return out
 
 
@@ -94,7 +96,7 @@ def mean_between(curve, low, high, steps=1000):
 
 def bjontegaard(ours, peers, score):
     """(mean difference of the score at equal rates, rates it was taken over, mean change of the rate at equal scores; None without overlap)."""
-    a, b = front(ours, score), front(peers, score)
+    a, b = envelope(ours, score), envelope(peers, score)
     low, high = max(a[0][0], b[0][0]), min(a[-1][0], b[-1][0])
     gain = mean_between(a, low, high) - mean_between(b, low, high) if low < high else None
     turn = lambda curve: [(y, x) for x, y in curve]

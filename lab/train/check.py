@@ -129,7 +129,7 @@ def arguments(**changes):
     args = dict(config=os.path.join(HERE, "configs/full.json"), device="cpu", seed=0, lr_conv=3e-4, lr_linear=1e-3, minutes=0, steps=100000,
                 rate_start=0.003, rate_ramp=0.6, warmup=10, decay_from=0.6, rounding_from=0.6, coarse=0.0, both=False, lam=5.0, pyramid=1.0, square=0.0,
                 clip=1.0, average=0.9, hint=0.0, hint_until=0.5, freeze_finest=False,
-                only_heads=False, lr_heads=1.0)
+                only_heads=False, lr_heads=1.0, quick_of=None, imitate=1.0, imitate_until=2.0, draw_from=0.0)
     return type("Arguments", (), args | changes)()
 
 
@@ -211,12 +211,50 @@ def quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own
         for name, p in quick.model.state_dict().items():
             assert name.startswith("gg.") or torch.equal(p, model.state_dict()[name]), f"{name} has changed"
         export.export_quick(quick.model.eval(), samples, new, {"steps": 2}, old)
+        again = train.Trainer(arguments(config=config, only_heads=True, quick_of=new))
+        again.start_from(weights)
+        again.start_heads(samples)
+        with torch.no_grad():
+            own, read = (t.model.generate(trail[2], samples[0].crop, 2)[1] for t in (quick, again))
+        near(read, own, 1e-2, "heads read back from the file")
         (before, tensors), (after, more) = export.read(old), export.read(new)
         assert all(np.array_equal(more[k], v) for k, v in tensors.items())
         added = more.keys() - tensors.keys()
         assert added and all(export.is_quick(k) for k in added)
         assert {"gg": after.pop("gg")[:2], "quick": after.pop("quick_steps")} == {"gg": before.pop("gg"), "quick": 2} and before == after
     return f"{len(added)} tensors more, all others as they were; colours start {error:.3f} off of {spread:.3f}"
+
+
+def heads_that_imitate_others_come_to_say_what_these_say():
+    samples, tiny = [data.procedural(i, size=48, views=2, pixels=60) for i in range(2)], os.path.join(HERE, "configs/tiny.json")
+    trainer = train.Trainer(arguments(config=tiny))
+    trainer.train_step(samples)
+    with tempfile.TemporaryDirectory() as folder:
+        weights, config = f"{folder}/w.safetensors", f"{folder}/quick.json"
+        model = trainer.model.eval()
+        export.save_file({k: v.numpy() for k, v in model.state_dict().items()}, weights, metadata={"config": json.dumps(model.cfg)})
+        with open(config, "w") as f:
+            json.dump({**model.cfg, "gg": [{**g, "channels": 12, "blocks_before": 0} for g in model.cfg["gg"]]}, f)
+        quick = train.Trainer(arguments(config=config, only_heads=True, draw_from=2.0, lr_conv=2e-3, lr_linear=4e-3))
+        quick.start_from(weights)
+        quick.start_heads(samples)
+        quick.learn_from(weights)
+        s = samples[0]
+        with torch.no_grad():
+            raw = model.generate(quick.heads_read(s, 2), s.crop, 2)[1]
+            near(quick.taught_raw(s, 2), raw, 1e-2, "what the teacher says")
+            itself = train.imitation(*[train.parameters(raw, model.cfg, True)] * 2).item()
+        first = [quick.train_step([s])["loss"] for s in samples]
+        for step in range(60):
+            quick.train_step([samples[step % 2]])
+        last = [quick.train_step([s])["loss"] for s in samples]
+        reached = {k: v.clone() for k, v in quick.average.items()}
+        start = f"{folder}/start.pt"
+        torch.save({"average": {k: torch.zeros_like(v) for k, v in reached.items()}}, start)
+        quick.stay_near(start, 0.25)
+        assert all(torch.allclose(v, 0.75 * reached[k]) for k, v in quick.average.items())
+    assert itself == 0 and sum(last) < 0.5 * sum(first), f"{itself}, {first} and {last}"
+    return f"apart by {sum(first) / 2:.3f} at first and {sum(last) / 2:.3f} after 60 steps without a picture"
 
 
 def the_integer_path_follows_the_float_path():
@@ -238,7 +276,7 @@ if __name__ == "__main__":
     for check in (operators_agree_with_plain_pytorch, rounded_operands_stay_close_where_the_processor_has_them,
                   maps_from_above_are_those_found_by_searching, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
                   a_frozen_first_encoder_changes_nothing_but_its_own_gradient, heads_alone_learn_and_leave_the_bits_as_they_are,
-                  quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own,
+                  quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own, heads_that_imitate_others_come_to_say_what_these_say,
                   the_integer_path_follows_the_float_path, a_crop_overfits):
         begin = time.monotonic()
         said = check()

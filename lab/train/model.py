@@ -237,14 +237,19 @@ class Base(nn.Module):
         return self.mu(x), self.sigma(x)
 
 
-def gaussians(raw, coords, unit, cfg, opaque):
-    """Gaussians of voxels `coords` whose size is `unit` finest voxels: mean, covariance, opacity, colour in finest-voxel units."""
+def parameters(raw, cfg, opaque):
+    """What raw numbers stand for: offset and standard deviations in voxels, rotation, opacity, colour."""
     offset, scale, rotation, opacity, colour = raw.split([3, 3, 4, 1, 3], 1)
-    mean = (coords.to(raw.dtype) + 0.5 + torch.tanh(offset) * cfg["offset_range"]) * unit
-    sigma = F.softplus(scale + cfg["scale_bias"]) * (cfg["scale_range"] * unit)
+    sigma = F.softplus(scale + cfg["scale_bias"]) * cfg["scale_range"]
     rotation = F.normalize(rotation + torch.tensor([1.0, 0, 0, 0], device=raw.device, dtype=raw.dtype), dim=1)
     alpha = torch.ones_like(opacity[:, 0]) if opaque else torch.sigmoid(opacity[:, 0] + cfg["opacity_bias"])
-    return mean, ops.covariance(sigma, rotation), alpha, Bound.apply(0.5 + colour, 0.0, 1.0)
+    return torch.tanh(offset) * cfg["offset_range"], sigma, rotation, alpha, Bound.apply(0.5 + colour, 0.0, 1.0)
+
+
+def gaussians(raw, coords, unit, cfg, opaque):
+    """Gaussians of voxels `coords` whose size is `unit` finest voxels: mean, covariance, opacity, colour in finest-voxel units."""
+    offset, sigma, rotation, alpha, colour = parameters(raw, cfg, opaque)
+    return (coords.to(raw.dtype) + 0.5 + offset) * unit, ops.covariance(sigma * unit, rotation), alpha, colour
 
 
 def colour_basis():

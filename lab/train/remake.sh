@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Trains the models of models/ anew, from nothing: remake.sh MESHES PHOTOS OUT [SHARE]
-# MESHES and PHOTOS are folders of glTF binaries and of pictures. SHARE scales the minutes of every step (1: as the shipped models had, about four
+# MESHES and PHOTOS are folders of glTF binaries and of pictures. SHARE scales the minutes of every step (1: as the shipped models had, about six
 # hours on one core of a Sapphire Rapids Xeon; 0.01 shows that it runs). PYTHON names the interpreter that has torch.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
@@ -24,6 +24,10 @@ if [ ! -d "$out/data" ]; then
         for file in "$out/$from"/*; do mv "$file" "$out/data/$from-$(basename "$file")"; done
     done
 fi
+if [ ! -d "$out/whole" ]; then
+    "$lab" dataset -o "$out/whole-part" --textures "$photos" --count 40 --seed 7 --crop 1024 --size 1024 --views 6 --supersampling 3 "$meshes"
+    mv "$out/whole-part" "$out/whole"
+fi
 
 cd "$here"
 # train NAME CONFIG MINUTES ARGUMENTS…
@@ -42,6 +46,12 @@ ship() {
 }
 # The heads alone read what was decoded; they bear five times the learning rate, and a step is short.
 heads=(--only-heads --lr-conv 5e-4 --lr-linear 8e-4 --warmup 300 --decay-from 0.15 --coarse 0.35)
+# On whole objects, whose edges are none of a crop's; each head by itself. Half way back to where they were: there are few of them.
+whole=(--only-heads --stay 0.5 --data "$out/whole" --views 2 --square 40 --held-out 1 --average 0.98 --lam 1 --lr-conv 2e-4 --lr-linear 3e-4 --warmup 10
+    --decay-from 0.2 --evaluate-every 100000)
+# Thin heads first imitate those of the weights that they start from.
+imitate=(--only-heads --init "$out/lite.weights.safetensors" --teacher "$out/lite.weights.safetensors" --draw-from 2 --imitate-until 1e9 --lam 1
+    --average 0.998 --lr-conv 1.5e-3 --lr-linear 2.4e-3 --warmup 100 --decay-from 0.3)
 # Of a network that has learned, everything, the heads faster than the rest.
 all=(--freeze-finest --lr-heads 3 --rate-start 1 --rate-ramp 0.01 --rounding-from 0 --decay-from 0.25 --warmup 50)
 
@@ -50,6 +60,15 @@ train low lite 12 --init "$out/start/last.pt" --lam 4 --freeze-finest --rate-sta
 train low-heads lite 44 --init "$out/low/last.pt" --lam 1 "${heads[@]}"
 ship low-heads lite-low
 train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
-ship high lite --only-base
+train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
+train high-whole-1 lite 25 --init "$out/high-heads/last.pt" --coarse 1 "${whole[@]}"
+train high-whole-2 lite 25 --init "$out/high-whole-1/last.pt" --coarse 0 "${whole[@]}"
+ship high-whole-2 lite --only-base
+train quick-1 lite-quick 20 --coarse 1 "${imitate[@]}"
+train quick-2 lite-quick 18 --coarse 0 "${imitate[@]}" --init "$out/quick-1/last.pt"
+train quick-whole-1 lite-quick 21 --init "$out/quick-2/last.pt" --coarse 1 "${whole[@]}"
+train quick-whole-2 lite-quick 21 --init "$out/quick-whole-1/last.pt" --coarse 0 "${whole[@]}"
+"$python" export.py --quick "$out/quick-whole-2/last.pt" --streams-of "$out/lite.safetensors" "$out/lite-both.safetensors" --data "$out/data" --samples 10 --verify 4
+mv "$out/lite-both.safetensors" "$out/lite.safetensors"
 train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 ship least lite-least --only-base

@@ -14,12 +14,13 @@ import time
 import numpy as np
 import torch
 import torch.nn.functional as F
+from safetensors import safe_open
 from safetensors.torch import load_file
 
 import data
 import ops
 from crop import join
-from model import B2P, groups
+from model import B2P, groups, parameters
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 
@@ -42,8 +43,12 @@ def window(size, sigma=1.5, width=11):
 _windows = {}
 
 
-def ssim(a, b):
-    """Structural similarity of pictures [V, 3, H, W] in 0..1."""
+def ssim(a, b, most=256):
+    """Structural similarity of pictures [V, 3, H, W] in 0..1; of larger ones than `most`, of a part at random, which is that of the whole on average."""
+    for axis in (2, 3):
+        if a.shape[axis] > most:
+            at = int(torch.randint(a.shape[axis] - most + 1, ()))
+            a, b = a.narrow(axis, at, most), b.narrow(axis, at, most)
     h, w = a.shape[2:]
     for s in (h, w):
         if (s, a.device) not in _windows:
@@ -78,8 +83,29 @@ def distortion(image, truth, pyramid, square):
     return total
 
 
+def imitation(own, taught, thin=0.05):
+    """How far Gaussians are from those that other heads make of the same voxels (`model.parameters` of both), by parameters and not by what
+    they look like: of a covariance whose normal is uncertain, the mean is thick. Sizes below `thin` are all the same. What the other heads
+    let vanish may look like anything."""
+    (offset, sigma, rotation, alpha, colour), (offset_t, sigma_t, rotation_t, alpha_t, colour_t) = own, taught
+    log = lambda s: s.clamp_min(thin).log()
+    apart = lambda a, b: (a - b).pow(2).sum(1)
+    d = 4 * apart(offset, offset_t) + 0.5 * apart(log(sigma), log(sigma_t)) + 10 * apart(rotation, rotation_t) + 10 * apart(colour, colour_t)
+    return (alpha_t * d).sum() / alpha_t.sum().clamp_min(1e-6) + (alpha - alpha_t).abs().mean()
+
+
 def psnr(mse):
     return -10 * math.log10(max(mse, 1e-10))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Heads of an exported model
+
+
+def quick_heads(path, like):
+    """The quick heads of a model file as the state of `like`: f16 weights, those of normalised layers up to a factor that they don't depend on."""
+    tensors = {k.removeprefix("gg.quick."): v.float() for k, v in load_file(path).items() if k.startswith("gg.quick.")}
+    return {k: tensors[k].reshape(v.shape) for k, v in like.state_dict().items()}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -130,19 +156,27 @@ class Trainer:
         self.step, self.used, self.calibrated, self.new_heads = 0, 0.0, False, False
         self.finest = {}  # of a frozen first encoder: its features, in f16, by the sample's name
         self.decoded = {}  # where only the heads are trained: what they read, in f16, by the sample's name
+        self.teacher, self.taught = None, {}  # other heads of the same network, and what they make of a sample, in f16
 
     def state(self):
         return {"model": self.model.state_dict(), "average": self.average, "optimiser": self.optimiser.state_dict(), "step": self.step,
                 "used": self.used, "calibrated": self.calibrated, "config": self.cfg, "args": vars(self.args), "torch_rng": torch.get_rng_state(),
                 "rng": self.rng.getstate()}
 
+    def weights_of(self, path):
+        if not path.endswith(".safetensors"):
+            return torch.load(path, map_location=self.device, weights_only=False)["average"]
+        return {k: v.float() for k, v in load_file(path, device=self.device).items()}
+
+    def stay_near(self, path, share):
+        """Moves the averaged weights this share of the way back to those of `path`."""
+        start = self.weights_of(path)
+        self.average = {k: torch.lerp(v, start[k], share) if v.is_floating_point() else v for k, v in self.average.items()}
+
     def start_from(self, path):
         """Takes the averaged weights of a checkpoint, or those that `export.py --weights` wrote; all but the heads where only heads are
         to be trained and the configuration has others."""
-        if not path.endswith(".safetensors"):
-            weights = torch.load(path, map_location=self.device, weights_only=False)["average"]
-        else:
-            weights = {k: v.float() for k, v in load_file(path, device=self.device).items()}
+        weights = self.weights_of(path)
         heads = lambda tensors: {k: v.shape for k, v in tensors.items() if k.startswith("gg.")}
         self.new_heads = self.args.only_heads and heads(weights) != heads(self.model.state_dict())
         if self.new_heads:
@@ -152,8 +186,24 @@ class Trainer:
         self.calibrated = True
 
     def start_heads(self, samples):
-        self.model.start_heads(join([s.crop for s in samples]).to(self.device), torch.cat([s.rgb for s in samples]).to(self.device))
+        if self.args.quick_of:
+            self.model.gg.load_state_dict(quick_heads(self.args.quick_of, self.model.gg))
+        else:
+            self.model.start_heads(join([s.crop for s in samples]).to(self.device), torch.cat([s.rgb for s in samples]).to(self.device))
         self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+
+    def learn_from(self, path):
+        """Takes the heads of a file of `export.py --weights` as a teacher of others for the same network."""
+        with safe_open(path, "pt") as f:
+            self.teacher = B2P(json.loads(f.metadata()["config"])).to(self.device).eval()
+        self.teacher.load_state_dict(self.weights_of(path))
+
+    @torch.no_grad()
+    def taught_raw(self, sample, head):
+        """What the teacher says of a sample: its heads run once."""
+        if sample.name not in self.taught:
+            self.taught[sample.name] = [self.teacher.generate(self.heads_read(sample, h), sample.crop, h)[1].half() for h in (1, 2)]
+        return self.taught[sample.name][head - 1].float()
 
     def restore(self, path):
         s = torch.load(path, map_location=self.device, weights_only=False)
@@ -194,18 +244,25 @@ class Trainer:
             self.decoded[sample.name] = [trail[r].half() for r in (1, 2)]
         return self.decoded[sample.name][head - 1].float()
 
-    def loss(self, sample, head, weight, mode, hint):
+    def picture_loss(self, generated, sample):
+        """Distortion and mean squared error of pictures over backgrounds of random colours."""
+        background = torch.rand(sample.image.shape[0], 3, device=generated[0].device)
+        h, w = sample.image.shape[2:]
+        image = ops.splat(*generated, sample.cameras, background, w, h)
+        truth = sample.image + (1 - sample.coverage) * background[:, :, None, None]
+        return distortion(image, truth, self.args.pyramid, self.args.square), (image - truth).pow(2).mean().item()
+
+    def loss(self, sample, head, weight, mode, hint, imitate=0.0, draw=True):
         if self.args.only_heads:
             trail, rates, latents = [self.heads_read(sample, head)], [torch.zeros(())] * (head + 1), [torch.zeros(2)] * (head + 1)
         else:
             features = self.model.analyse(sample.crop, sample.rgb, self.frozen(sample))
             trail, rates, latents = self.model.code(sample.crop, features, head, mode)
-        (mean, cov, alpha, colour), raw = self.model.generate(trail[-1], sample.crop, head)
-        background = torch.rand(sample.image.shape[0], 3, device=raw.device)
-        h, w = sample.image.shape[2:]
-        image = ops.splat(mean, cov, alpha, colour, sample.cameras, background, w, h)
-        truth = sample.image + (1 - sample.coverage) * background[:, :, None, None]
-        d = distortion(image, truth, self.args.pyramid, self.args.square)
+        generated, raw = self.model.generate(trail[-1], sample.crop, head)
+        d, mse = self.picture_loss(generated, sample) if draw else (raw.new_zeros(()), None)
+        drawn = d.item()
+        if imitate > 0:
+            d = d + imitate * imitation(*(parameters(r, self.cfg, head == 2) for r in (raw, self.taught_raw(sample, head))))
         rate = sum(rates) / sample.crop.points
         # A latent that wanders off is cheap to code while the rate weighs nothing, and expensive to bring back.
         probes = 0.0
@@ -214,14 +271,15 @@ class Trainer:
             for g, probe, target in zip(trail, self.model.probe, self.model.colours(sample.crop, sample.rgb)):
                 probes = probes + ((probe(g) + 0.5 - target) @ matrix).abs().mean()
         loss = hint * self.args.lam * probes + weight * rate + self.args.lam * d + 1e-4 * sum((y / 8).pow(4).mean() for y in latents)
-        return loss, {"probe": float(torch.as_tensor(probes).detach()), "rate": [r.item() / sample.crop.points for r in rates], "d": d.item(),
-                      "mse": (image - truth).pow(2).mean().item(), "std": [y.std().item() for y in latents]}
+        return loss, {"probe": float(torch.as_tensor(probes).detach()), "rate": [r.item() / sample.crop.points for r in rates], "d": drawn,
+                      "mse": mse, "std": [y.std().item() for y in latents]}
 
     def train_step(self, samples, calibration=None):
         args, x = self.args, self.fraction()
         weight, mode = rate_weight(x, args), "noise" if x < args.rounding_from else "mixed"
         head = 1 if self.rng.random() < args.coarse else 2
         hint = args.hint * max(0.0, 1 - x / args.hint_until) if args.hint_until > 0 else 0.0
+        imitate = args.imitate * max(0.0, 1 - x / args.imitate_until) if self.teacher else 0.0
         heads = [1, 2] if args.both else [head]
         if not self.calibrated:
             some = calibration or samples
@@ -232,7 +290,7 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         for sample in samples:
             for h in heads:
-                loss, info = self.loss(sample, h, weight, mode, hint)
+                loss, info = self.loss(sample, h, weight, mode, hint, imitate, draw=x >= args.draw_from)
                 (loss / len(samples)).backward()
         lr = learning_rate(x, self.step, args)
         for group in self.optimiser.param_groups:
@@ -320,8 +378,14 @@ def main(argv=None):
     p.add_argument("--revive", type=int, choices=[1, 2], help="with --init: give this role new latents, where its own died")
     p.add_argument("--freeze-finest", action="store_true", help="leave the encoder of the finest level as it is: a step is then twice as fast")
     p.add_argument("--only-heads", action="store_true", help="train what turns features into Gaussians and leave the bits as they are; with --init from weights of other heads than --config has, new ones")
+    p.add_argument("--quick-of", metavar="MODEL", help="with --only-heads: start from this exported model's quick heads")
+    p.add_argument("--teacher", metavar="WEIGHTS", help="with --only-heads: imitate the heads of these weights, of the same network")
+    p.add_argument("--imitate", type=float, default=1.0, help="weight of the imitation at the start")
+    p.add_argument("--imitate-until", type=float, default=0.5, help="fraction of the budget at which it has vanished")
+    p.add_argument("--draw-from", type=float, default=0.0, help="fraction of the budget from which pictures are drawn; before, with --teacher, heads only imitate")
     p.add_argument("--cache", help="with --freeze-finest: folder of features of the finest level, NAME.npy for each sample")
     p.add_argument("--stop-after", type=int, default=0, help="stop at this step, as an interruption would")
+    p.add_argument("--stay", type=float, default=0.0, help="at the end, the share of the averaged weights that are those of --init again")
     p.add_argument("--init", help="start from the averaged weights of this checkpoint, or from a file of `export.py --weights`")
     args = p.parse_args(argv)
 
@@ -335,6 +399,8 @@ def main(argv=None):
         trainer.restore(last)
     elif args.init:
         trainer.start_from(args.init)
+    if args.teacher:
+        trainer.learn_from(args.teacher)
     train_files, held_files = data.split(args.data, args.held_out)
     held = [data.load_sample(f).to(args.device) for f in held_files]
     calibration = None if trainer.calibrated else [data.load_sample(f) for f in train_files[:6]]
@@ -372,7 +438,9 @@ def main(argv=None):
                     row[f"rate{h}"] = [round(sum(m["rate"][r] for m in of) / len(of), 4) for r in range(h + 1)]
                     row[f"std{h}"] = [round(of[-1]["std"][r], 2) for r in range(h + 1)]
                     row[f"d{h}"] = round(sum(m["d"] for m in of) / len(of), 4)
-                    row[f"psnr{h}"] = round(psnr(sum(m["mse"] for m in of) / len(of)), 2)
+                drawn = [m["mse"] for m in of if m["mse"] is not None]
+                if drawn:
+                    row[f"psnr{h}"] = round(psnr(sum(drawn) / len(drawn)), 2)
             write(row)
             means = []
         if trainer.step % args.evaluate_every == 0:
@@ -383,6 +451,8 @@ def main(argv=None):
         if time.monotonic() - saved > args.save_minutes * 60:
             atomic_save(trainer.state(), last)
             saved = time.monotonic()
+    if args.stay and trainer.fraction() >= 1:
+        trainer.stay_near(args.init, args.stay)
     atomic_save(trainer.state(), last)
     write({"final": trainer.step} | trainer.evaluate(held))
     return trainer
