@@ -399,6 +399,8 @@ def main(argv=None):
         trainer.restore(last)
     elif args.init:
         trainer.start_from(args.init)
+    if args.stay and (not args.init or trainer.new_heads):
+        p.error("--stay wants weights of the same heads in --init")
     if args.teacher:
         trainer.learn_from(args.teacher)
     train_files, held_files = data.split(args.data, args.held_out)
