@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Trains the models of models/ anew, from nothing: remake.sh MESHES PHOTOS OUT [SHARE]
 # MESHES and PHOTOS are folders of glTF binaries and of pictures. SHARE scales the minutes of every step (1: as the shipped models had, about six
-# hours on one core of a Sapphire Rapids Xeon; 0.01 shows that it runs). PYTHON names the interpreter that has torch.
+# and a half hours on one core; 0.01 shows that it runs). PYTHON names the interpreter that has torch.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 meshes=$(realpath "$1") photos=$(realpath "$2") share=${4:-1}

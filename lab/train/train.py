@@ -399,6 +399,8 @@ def main(argv=None):
         trainer.restore(last)
     elif args.init:
         trainer.start_from(args.init)
+    if (args.teacher or args.quick_of) and not args.only_heads or args.draw_from and not args.teacher:
+        p.error("--teacher and --quick-of want --only-heads, --draw-from wants --teacher")
     if args.stay and (not args.init or trainer.new_heads):
         p.error("--stay wants weights of the same heads in --init")
     if args.teacher:
@@ -424,7 +426,7 @@ def main(argv=None):
     stop = []
     signal.signal(signal.SIGINT, lambda *_: stop.append(1))
     signal.signal(signal.SIGTERM, lambda *_: stop.append(1))
-    saved, means = time.monotonic(), []
+    saved, means, unfinished = time.monotonic(), [], trainer.fraction() < 1
     while trainer.fraction() < 1 and not stop and not (args.stop_after and trainer.step >= args.stop_after):
         begin = time.monotonic()
         info = trainer.train_step([stream.next().to(args.device) for _ in range(args.batch)], calibration)
@@ -453,7 +455,7 @@ def main(argv=None):
         if time.monotonic() - saved > args.save_minutes * 60:
             atomic_save(trainer.state(), last)
             saved = time.monotonic()
-    if args.stay and trainer.fraction() >= 1:
+    if args.stay and unfinished and trainer.fraction() >= 1:
         trainer.stay_near(args.init, args.stay)
     atomic_save(trainer.state(), last)
     write({"final": trainer.step} | trainer.evaluate(held))
