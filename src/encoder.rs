@@ -12,7 +12,7 @@ use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::{Model, ROLES};
+use crate::network::{Model, Pass, ROLES};
 
 /// What may be chosen about a stream.
 #[derive(Debug, Clone)]
@@ -202,10 +202,18 @@ pub(crate) fn write(
                 };
                 let tables = model.tables();
                 let latents = latents(role, condition, context.as_deref())?;
-                let slices = if role == 0 && model.predicts_base() {
+                let slices = if model.has_passes(role) {
                     let octants = octree.level(level).octants();
+                    let level = parameters.as_ref().map(|(mu, sigma)| (&mu[..], &sigma[..]));
                     let predict = |slice, voxels: &[u32], latents: &[i16]| {
-                        model.base_parameters(&octants, map, slice, voxels, latents)
+                        let pass = Pass {
+                            octants: &octants,
+                            map,
+                            slice,
+                            voxels,
+                            latents,
+                        };
+                        model.pass_parameters(role, &pass, level)
                     };
                     encode_passes(tables, &octants, &predict, &latents, slice)
                 } else {

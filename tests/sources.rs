@@ -23,7 +23,7 @@ const EXACT: [&str; 27] = [
     "src/bitstream",
     "src/geometry",
     "src/entropy",
-    "src/network/base.rs",
+    "src/network/passes.rs",
     "src/network/children.rs",
     "src/network/container.rs",
     "src/network/exact.rs",

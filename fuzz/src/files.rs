@@ -17,6 +17,7 @@ static FILE: LazyLock<Vec<u8>> = LazyLock::new(|| {
         channels: 4,
         latents: 2,
         base_channels: 4,
+        near_channels: [4, 4],
         ..Shape::tiny()
     };
     shape.gg.iter_mut().for_each(|head| head.channels = 4);

@@ -12,6 +12,7 @@ import data
 import export
 import ops
 import train
+import tune
 from model import Conv, NormConv
 
 HERE = os.path.dirname(os.path.abspath(__file__))
@@ -257,11 +258,49 @@ def heads_that_imitate_others_come_to_say_what_these_say():
     return f"apart by {sum(first) / 2:.3f} at first and {sum(last) / 2:.3f} after 60 steps without a picture"
 
 
+def fit_near(model, samples, steps=60):
+    """Fits what corrects from neighbours; bits of roles 1 and 2 before and after."""
+    known = [tune.inputs(model, s) for s in samples]
+    bits = lambda: sum(sum(tune.rates(model, roles, crop, True)[1:]) for roles, crop, _ in known)
+    before, optimiser = bits().item(), torch.optim.Adam(model.near.parameters(), 1e-2)
+    for _ in range(steps):
+        optimiser.zero_grad()
+        (bits() / 1e4).backward()
+        optimiser.step()
+    return before, bits().item()
+
+
+def what_neighbours_tell_saves_bits_and_comes_from_those_before_alone():
+    samples = [data.procedural(i, size=48, views=2, pixels=60) for i in range(2)]
+    with open(os.path.join(HERE, "configs/tiny.json")) as f:
+        model = train.B2P(json.load(f))
+    model.calibrate(samples[0].crop, samples[0].rgb)
+    model.pass_colour()
+    roles, crop, _ = tune.inputs(model, samples[0])
+    with torch.no_grad():
+        c, y, kmap = roles[2]
+        predicted = model.pem["2"](c, kmap)
+        untouched = model.coded_bits(2, y, *predicted, crop)
+        assert torch.isclose(untouched, model.bits(y, torch.round(predicted[0] * 16) / 16, predicted[1])), "at first nothing changes"
+    before, after = fit_near(model, samples)
+    octant = ops.octants(crop.coords[2])
+    with torch.no_grad():
+        correct = lambda y: model.near["2"].correct(y, *predicted, crop.coords[2], kmap.table)
+        for last in range(8):
+            later = torch.where((octant >= last)[:, None], y + 7, y)
+            same = [torch.equal(a[octant <= last], b[octant <= last]) for a, b in zip(correct(y), correct(later))]
+            assert all(same), f"octant {last} knows of itself or of later ones"
+        assert not torch.equal(correct(y)[0], correct(y + 7)[0])
+    assert after < 0.9 * before, f"{before} -> {after}"
+    return f"{before:.0f} -> {after:.0f} bits"
+
+
 def the_integer_path_follows_the_float_path():
     samples = [data.procedural(i, size=48, views=2, pixels=80) for i in range(3)]
     trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
     for step in range(150):
         trainer.train_step([samples[step % 3]])
+    fit_near(trainer.model, samples)
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/model.safetensors"
         export.export(trainer.model.eval(), samples, path, {"steps": 150})
@@ -277,7 +316,7 @@ if __name__ == "__main__":
                   maps_from_above_are_those_found_by_searching, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
                   a_frozen_first_encoder_changes_nothing_but_its_own_gradient, heads_alone_learn_and_leave_the_bits_as_they_are,
                   quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own, heads_that_imitate_others_come_to_say_what_these_say,
-                  the_integer_path_follows_the_float_path, a_crop_overfits):
+                  what_neighbours_tell_saves_bits_and_comes_from_those_before_alone, the_integer_path_follows_the_float_path, a_crop_overfits):
         begin = time.monotonic()
         said = check()
         print(f"{check.__name__.replace('_', ' ')}: {said} ({time.monotonic() - begin:.0f} s)", flush=True)

@@ -60,7 +60,7 @@ def ranges_of(model, samples):
         r.add(names[module], output)
 
     for name, module in model.named_modules():
-        if name.split(".")[0] in ("up", "base", "pem", "fr", "gg") and (isinstance(module, (Inception, ResBlock)) or hasattr(module, "taps")):
+        if name.split(".")[0] in ("up", "base", "near", "pem", "fr", "gg") and (isinstance(module, (Inception, ResBlock)) or hasattr(module, "taps")):
             hooks.append(module.register_forward_hook(record))
     for role, gg in model.gg.items():  # what follows layer 4 sees its output, whichever way it was computed
         after = [*gg.after, gg.conv_out][0]
@@ -68,7 +68,7 @@ def ranges_of(model, samples):
     for s in samples:
         trail, _, latents = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
         if model.cfg.get("base_channels"):
-            model.base(model.base.inputs(torch.round(latents[0]), s.crop.coords[0], s.crop.kernel3[0].table)[0])
+            model.base(model.base.inputs(torch.round(latents[0]), s.crop.coords[0], s.crop.kernel3[0].table)[0])  # the others' ran in `code`
         for role in model.gg:
             model.generate(trail[int(role)], s.crop, int(role))
     for h in hooks:
@@ -154,6 +154,12 @@ def quantise(model, ranges):
         layer("base.lin2", s1, s2)
         layer("base.mu", s2, 1.0, factor=16.0)
         layer("base.sigma", s2, 1.0, factor=per_nat, shift=-math.log(SIGMA_MIN))
+    for r in model.near:
+        s1, s2 = ranges.scale(f"near.{r}.lin1"), ranges.scale(f"near.{r}.lin2")
+        layer(f"near.{r}.lin1", 2.0**-LATENT_SHIFT, s1)
+        layer(f"near.{r}.lin2", s1, s2)
+        layer(f"near.{r}.mu", s2, 1.0, factor=16.0)
+        layer(f"near.{r}.sigma", s2, 1.0, factor=per_nat)
     for r in range(3):
         s = chain(f"fr.{r}.lin1", f"fr.{r}", cfg["fr_blocks"])
         inputs = np.full(cfg["latents"] + (cfg["channels"] if r else 0), c_scale[r])
@@ -256,7 +262,7 @@ def is_quick(name):
 def same_streams(path, cfg):
     """Description and tensors of a model file whose streams a network of this configuration is to decode."""
     meta, tensors = read(path)
-    exact = ("channels", "latents", "base_channels", "pem_blocks", "fr_blocks", "upsample", "inception_relu", "latent_max")
+    exact = ("channels", "latents", "base_channels", "near_channels", "pem_blocks", "fr_blocks", "upsample", "inception_relu", "latent_max")
     if any(meta.get(k) != cfg.get(k) for k in exact):
         sys.exit(f"{path} is another network")
     return meta, tensors
@@ -316,7 +322,7 @@ def verify(path, model, samples):
     exact, totals, points, error = integer.Exact(path), np.zeros((2, 3)), 0, {int(role): np.zeros(2) for role in model.gg}
     for s in samples:
         trail, rates, latents = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
-        rates[0] = model.base_bits(torch.round(latents[0]), s.crop)
+        rates[0] = model.coded_bits(0, torch.round(latents[0]), None, None, s.crop)
         for role, e in error.items():
             bits, gi = integer.code(exact, model, s.crop, s.rgb, role)
             e += [picture_error(model, s, trail[role], role), picture_error(model, s, gi, role)]
@@ -349,6 +355,8 @@ def untrained(config, samples, seed=1):
     for name, p in model.named_parameters():
         if name.endswith(("bias", "gain")):
             p.add_(torch.randn_like(p) * 0.05)
+        if name.startswith("near.") and name.endswith(("mu.weight", "sigma.weight")):
+            p.copy_(torch.randn_like(p) * 0.1)
     model.calibrate(join([s.crop for s in samples]), torch.cat([s.rgb for s in samples]))
     return model
 

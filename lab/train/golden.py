@@ -8,7 +8,7 @@ Tensors of golden.safetensors, n_R voxels at role R, all in Morton order:
   fs.R f32 [n_R, K]              squeezed features before clamping and rounding; latent.R i16 [n_R, K] after
   c.R, g.R i16 [n_R, C]          context and reconstruction, in integer steps of c_scale[R], g_scale[R]
   pem.R.conv_in, pem.R.blocks.B, fr.R.lin1, fr.R.blocks.B   i16, after their ReLU
-  mu.R i16, sigma.R u8 [n_R, K]  probability parameters; float.mu.R, float.lnsigma.R f32: the float network on the same context
+  pem.mu.R i16, pem.sigma.R u8 [n_R, K]  what the level below predicts; mu.R, sigma.R  the same corrected from neighbours; float.mu.R, float.lnsigma.R f32: the float network on the same context
   raw.R f32 [m, 14]              output of head R = 1 (m = 8 n_1), R = 2 (m = n_2)
   gauss.R.{mean,cov,opacity,colour} f32   Gaussians, in finest-voxel units of the cloud's corner; cov is xx xy xz yy yz zz
   camera f32 [V, 16], picture.R f32 [V, 3, H, W]   pictures over white
@@ -48,7 +48,7 @@ def main(folder):
         out[f"parent.{r}"] = np.repeat(np.arange(len(count), dtype=np.int32), count)
     out["rgb"] = np.rint(s.rgb.numpy() * 255).astype(np.uint8)
     for name, value in trace.items():
-        out[name] = value.astype(np.uint8 if name.startswith("sigma") else np.float32 if value.dtype == np.float32 else np.int16)
+        out[name] = value.astype(np.uint8 if name.startswith(("sigma", "pem.sigma")) else np.float32 if value.dtype == np.float32 else np.int16)
     for r in (1, 2):
         c = torch.from_numpy((trace[f"c.{r}"] * float(exact.t["c_scale"][r])).astype(np.float32))
         mu, log_sigma = model.pem[str(r)](c, s.crop.kernel3[r])

@@ -11,7 +11,7 @@ import torch
 from safetensors import safe_open
 
 import ops
-from model import Base
+from passes import Base, Near
 
 LIMIT = 2047
 SIGMA_MIN, SIGMA_MAX, SIGMAS = 0.11, 64.0, 64
@@ -37,7 +37,7 @@ def accumulate(x, weight, table):
 
 
 class Exact:
-    """up, base, pem and fr of a model file."""
+    """up, base, near, pem and fr of a model file."""
 
     def __init__(self, path):
         with safe_open(path, "numpy") as f:
@@ -47,7 +47,7 @@ class Exact:
 
     def _count(self, name, q):
         s = self.saturated.setdefault(name, [0, 0])
-        rectified = name.rsplit(".", 1)[1] in ("a1", "b1", "b2", "lin1") or name == "base.lin2" or name.startswith("pem") and name.endswith("conv_in")
+        rectified = name.rsplit(".", 1)[1] in ("a1", "b1", "b2", "lin1") or name.startswith(("base", "near")) and name.endswith("lin2") or name.startswith("pem") and name.endswith("conv_in")
         s[0] += int(((q if rectified else np.abs(q)) >= LIMIT).sum())
         s[1] += q.size
 
@@ -91,6 +91,17 @@ class Exact:
         x = relu(self.conv("base.lin2", relu(self.conv("base.lin1", x, None)), None))
         sigma = np.clip(self.conv("base.sigma", x, None), 0, SIGMAS - 1)
         return self.conv("base.mu", x, None), np.where(known.numpy()[:, None], sigma, UNPREDICTED)
+
+    def near(self, role, latents, mu, index, coords, table):
+        """What `entropy` gave of a role, corrected from neighbours if the model does so."""
+        if not self.cfg.get("near_channels", [0, 0])[role - 1]:
+            return mu, index
+        shift, real, name = self.cfg["latent_shift"], lambda a: torch.from_numpy(a).double(), f"near.{role}"
+        x, known = Near.inputs(real(latents), real(mu) / 16, real(index), coords, torch.from_numpy(table), shift)
+        x = clamp((x.numpy() * (1 << shift)).astype(np.int64))
+        x = relu(self.conv(name + ".lin2", relu(self.conv(name + ".lin1", x, None)), None))
+        known = known.numpy()[:, None]
+        return clamp(mu + known * self.conv(name + ".mu", x, None)), np.clip(index + known * self.conv(name + ".sigma", x, None), 0, SIGMAS - 1)
 
     def entropy(self, role, c, table, trace=None):
         """(mu in 1/16, sigma index) of a role."""
@@ -159,7 +170,11 @@ def code(exact, model, crop, rgb, top=2, trace=None):
         latents = torch.round(y.clamp(-limit, limit)).numpy().astype(np.int64)
         t[f"fc.{r}"], t[f"fs.{r}"], t[f"latent.{r}"] = features[r].numpy(), y.numpy(), latents
         if r or exact.cfg.get("base_channels"):
-            mu, index = exact.entropy(r, c, table3[r], trace) if r else exact.base(latents, crop.coords[0], table3[0])
+            if r:
+                t[f"pem.mu.{r}"], t[f"pem.sigma.{r}"] = exact.entropy(r, c, table3[r], trace)
+                mu, index = exact.near(r, latents, t[f"pem.mu.{r}"], t[f"pem.sigma.{r}"], crop.coords[r], table3[r])
+            else:
+                mu, index = exact.base(latents, crop.coords[0], table3[0])
             bits.append(exact.bits_gauss(latents, mu, index))
             t[f"mu.{r}"], t[f"sigma.{r}"] = mu, index
             if r:

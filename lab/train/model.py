@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import nn
 
 import ops
+from passes import Base, Near
 from rates import Bound, Prior, bin_mass, bits, bounded_sigma
 
 
@@ -201,42 +202,6 @@ class Generate(nn.Module):
         route(self.conv_out, RECTIFIED @ colour_basis().T, at=11)
 
 
-class Base(nn.Module):
-    """Predicts the latents of role 0, which have no level below them: its voxels are coded octant by octant, and each is predicted from
-    those of its 26 neighbours that came before."""
-
-    def __init__(self, cfg):
-        super().__init__()
-        k, h = cfg["latents"], cfg["base_channels"]
-        self.lin1 = Conv(7 * (k + 1) + 3, h, 1)
-        self.lin2 = Conv(h, h, 1)
-        self.mu = Conv(h, k, 1, 0.1)
-        self.sigma = Conv(h, k, 1, 0.1)
-        nn.init.constant_(self.sigma.bias, 1.0)
-
-    @staticmethod
-    def inputs(y, coords, table, shift=6):
-        """What is known of voxels from whole latents y [n, K]: for each of the seven sets of neighbours that lie in one other octant, the
-        mean of their latents in steps of 2^-shift and whether there are any, if that octant came before; and the octant's three bits.
-        Also which voxels know any."""
-        octant, one = ops.octants(coords), 1 << shift
-        steps = ops.OFFSETS3.abs() @ torch.tensor([1, 2, 4], dtype=torch.int32)
-        rows, parts = torch.cat([y, y.new_zeros(1, y.shape[1])]), []
-        for other in range(1, 8):
-            before = (octant & 1 << other.bit_length() - 1) > 0
-            at = table[steps == other].long()
-            there = ((at >= 0) & before).to(y.dtype)
-            count = there.sum(0)[:, None]
-            mean = torch.floor((2 * one * torch.einsum("tn,tnk->nk", there, rows[at]) + count) / (2 * count.clamp_min(1))) / one
-            parts += [mean, (count > 0).to(y.dtype)]
-        any = torch.cat(parts[1::2], 1).sum(1) > 0
-        return torch.cat([*parts, torch.stack([octant >> b & 1 for b in range(3)], 1).to(y.dtype)], 1), any
-
-    def forward(self, x):
-        x = self.lin2(self.lin1(x, relu=True), relu=True)
-        return self.mu(x), self.sigma(x)
-
-
 def parameters(raw, cfg, opaque):
     """What raw numbers stand for: offset and standard deviations in voxels, rotation, opacity, colour."""
     offset, scale, rotation, opacity, colour = raw.split([3, 3, 4, 1, 3], 1)
@@ -300,7 +265,7 @@ class B2P(nn.Module):
         self.gg = nn.ModuleDict({str(g["role"]): Generate(cfg, g) for g in cfg["gg"]})
         self.prior = Prior(cfg["latents"])
         if cfg.get("base_channels"):
-            self.base = Base(cfg)
+            self.base = Base(Conv, cfg)
         with torch.no_grad():  # natural colours vary mostly in luma: let the first layer see chroma as strongly
             first = self.fc[3].conv_in.weight
             first.copy_(torch.tensor([[0.5, 0.5, 0.5], [2.0, -2.0, 0.0], [-1.5, -1.5, 3.0]]).T @ first)
@@ -313,6 +278,8 @@ class B2P(nn.Module):
                 with torch.no_grad():
                     up.weight.copy_(torch.eye(c) + torch.randn(8, c, c) * 0.1 / math.sqrt(c))
                 self.up[str(r)] = up
+        with torch.random.fork_rng(devices=[]):  # with and without this optional part, all else starts the same
+            self.near = nn.ModuleDict({str(r): Near(Conv, cfg, r) for r in (1, 2) if cfg.get("near_channels", [0, 0])[r - 1]})
 
     def analyse_finest(self, crop, rgb):
         """Features of role 3, averaged over each voxel of role 2. rgb: float [n_3, 3] in 0..1."""
@@ -345,7 +312,9 @@ class B2P(nn.Module):
             rounded = y + (torch.round(y) - y).detach()
             noisy = rounded if mode == "round" else y + torch.rand_like(y) - 0.5
             mu, log_sigma = self.pem[str(r)](c, crop.kernel3[r]) if r else (None, None)
-            if mode != "mixed":
+            if mode == "round":
+                rates.append(self.coded_bits(r, rounded, mu, log_sigma, crop) if r else self.bits(rounded, mu, log_sigma))
+            elif mode == "noise":
                 rates.append(self.bits(noisy, mu, log_sigma))
             else:  # the entropy models learn the rounded latents that they will meet, the latents the smooth proxy
                 fixed = (mu.detach(), log_sigma.detach()) if r else (None, None)
@@ -355,11 +324,17 @@ class B2P(nn.Module):
             trail.append(self.fr[r](noisy if mode == "noise" else rounded, c, crop.kernel3[r]))
         return trail, rates, latents
 
-    def base_bits(self, y, crop):
-        """Cost of whole latents of role 0 as they are coded: from neighbours where there are any that came before."""
+    def coded_bits(self, r, y, mu, log_sigma, crop):
+        """Cost of whole latents of a role as they are coded: predicted from neighbours too, where the model does so and there are any that
+        came before. `mu` and `log_sigma` are what the level below predicts, None for role 0."""
+        coords, table = crop.coords[r], crop.kernel3[r].table
+        if r:
+            if str(r) in self.near:
+                mu, log_sigma = self.near[str(r)].correct(y, mu, log_sigma, coords, table)
+            return self.bits(y, mu, log_sigma)
         if not self.cfg.get("base_channels"):
             return bits(self.prior(y))
-        x, known = self.base.inputs(y, crop.coords[0], crop.kernel3[0].table)
+        x, known = self.base.inputs(y, coords, table)
         mu, log_sigma = self.base(x[known])
         return bits(bin_mass(y[known], mu, bounded_sigma(log_sigma))) + bits(self.prior(y[~known]))
 

@@ -15,7 +15,6 @@ import torch
 
 import data
 from model import B2P
-from rates import bin_mass, bits, bounded_sigma
 from train import atomic_save, keep_memory
 
 
@@ -34,13 +33,13 @@ def inputs(model, sample):
 
 def rates(model, roles, crop, coarse_mean=False):
     """Bits per role. `coarse_mean`: with the means in the sixteenths that the stream has."""
-    out = [model.base_bits(roles[0][1], crop)]
+    out = [model.coded_bits(0, roles[0][1], None, None, crop)]
     for r in (1, 2):
         c, y, kmap = roles[r]
         mu, log_sigma = model.pem[str(r)](c, kmap)
         if coarse_mean:
             mu = mu + (torch.round(mu * 16) / 16 - mu).detach()
-        out.append(bits(bin_mass(y, mu, bounded_sigma(log_sigma))))
+        out.append(model.coded_bits(r, y, mu, log_sigma, crop))
     return out
 
 
@@ -62,7 +61,8 @@ def main():
     p.add_argument("--samples", type=int, default=150, help="crops, whose latents are computed once")
     p.add_argument("--lr", type=float, default=3e-4)
     p.add_argument("--base-channels", type=int, default=48, help="of the network that predicts role 0 from neighbours, if the model has none yet")
-    p.add_argument("--only-base", action="store_true", help="leave the models of roles 1 and 2 as they are: after `train.py --rounding-from 0` they know rounded latents")
+    p.add_argument("--near-channels", type=int, nargs=2, default=[64, 0], help="of the networks that correct roles 1 and 2 from neighbours, if the model has none yet")
+    p.add_argument("--only-base", action="store_true", help="leave the models of roles 1 and 2 as they are but for what corrects them: after `train.py --rounding-from 0` they know rounded latents")
     p.add_argument("--threads", type=int, default=2)
     args = p.parse_args()
     torch.set_num_threads(args.threads)
@@ -70,6 +70,7 @@ def main():
     begin = time.monotonic()
     state = torch.load(args.checkpoint, map_location="cpu", weights_only=False)
     state["config"].setdefault("base_channels", args.base_channels)
+    state["config"].setdefault("near_channels", args.near_channels)
     model = B2P(state["config"])
     model.load_state_dict(state["average"], strict=False)
     training, held = data.split(args.data, 8)
@@ -80,6 +81,7 @@ def main():
     groups = [{"params": [*model.prior.parameters(), *([] if args.only_base else model.pem.parameters())], "base": args.lr}]
     if model.cfg["base_channels"]:  # small, and often new
         groups.append({"params": [*model.base.parameters()], "base": 3 * args.lr})
+    groups.append({"params": [*model.near.parameters()], "base": 6 * args.lr})
     tuned = [p for group in groups for p in group["params"]]
     optimiser = torch.optim.Adam(groups, args.lr, betas=(0.9, 0.99))
     rng = np.random.default_rng(1)

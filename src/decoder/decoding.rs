@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
-use crate::network::{Heads, Model, Module, Pool};
+use crate::network::{Heads, Model, Module, Pass, Pool};
 
 /// Where decoding is to end.
 #[derive(Debug, Clone, Copy)]
@@ -415,20 +415,27 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let latents = log.step(format!("latents of level {n}"), symbols, "symbols", || {
             let (tables, cancel) = (self.model.tables(), &self.cancel);
             let slices = &level.features;
-            let latents = match &parameters {
-                Some((mu, sigma)) => {
-                    let condition = Condition::Gauss { mu, sigma };
-                    decode_level(tables, condition, slices, count, slice, n, cancel)?
-                }
-                None if self.model.predicts_base() => {
-                    let octants = octree.level(n).octants();
-                    let model = &*self.model;
-                    let predict = |slice, voxels: &[u32], latents: &[i16]| {
-                        model.base_parameters(&octants, map, slice, voxels, latents)
+            let latents = if self.model.has_passes(role) {
+                let octants = octree.level(n).octants();
+                let level = parameters.as_ref().map(|(mu, sigma)| (&mu[..], &sigma[..]));
+                let model = &*self.model;
+                let predict = |slice, voxels: &[u32], latents: &[i16]| {
+                    let pass = Pass {
+                        octants: &octants,
+                        map,
+                        slice,
+                        voxels,
+                        latents,
                     };
-                    decode_passes(tables, &octants, &predict, slices, slice, n, cancel)?
-                }
-                None => decode_level(tables, Condition::Prior, slices, count, slice, n, cancel)?,
+                    model.pass_parameters(role, &pass, level)
+                };
+                decode_passes(tables, &octants, &predict, slices, slice, n, cancel)?
+            } else {
+                let condition = match &parameters {
+                    Some((mu, sigma)) => Condition::Gauss { mu, sigma },
+                    None => Condition::Prior,
+                };
+                decode_level(tables, condition, slices, count, slice, n, cancel)?
             };
             level.check_latents(latent_hash(&latents))?;
             Ok(latents)

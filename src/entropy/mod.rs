@@ -11,7 +11,8 @@
 //! No level predicts the base level. With a model that has no layers `base.…`, all its latents are unpredicted. With one that has, the
 //! voxels of a slice are coded in eight passes, one for each octant `x + 2y + 4z` of their parents, in Morton order within a pass; and
 //! a voxel is predicted from those of its 26 neighbours that lie in the same slice and were coded before
-//! ([`crate::network::Model::base_parameters`]), unless there are none.
+//! ([`crate::network::Model::pass_parameters`]), unless there are none. A level of role 1 or 2 is coded likewise with a model that has layers
+//! `near.1.…` or `near.2.…`, which correct what the level below predicts.
 //!
 //! A row has n entries, each a probability in units of 2⁻¹⁶, at least 1, together 65,536. Entry `i < n − 1` stands for
 //! `d = low + i`; the last one for every other `d`, whose distance from the row then follows in equiprobable bits, each an

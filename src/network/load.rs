@@ -125,7 +125,7 @@ impl<'a> Tensors<'a> {
     /// What a stream calls the model: XXH3-128 of the description's exact part, and of name, type, extents and bytes of every
     /// tensor that bears on the decoded bits, in the order of their names.
     pub fn id(&self, shape: &Shape) -> [u8; 16] {
-        const EXACT: [&str; 5] = ["up.", "base.", "pem.", "fr.", "cdf."];
+        const EXACT: [&str; 6] = ["up.", "base.", "near.", "pem.", "fr.", "cdf."];
         let mut hash = Xxh3Default::new();
         hash.update(shape.exact_text().as_bytes());
         for (name, info) in &self.contents.tensors {

@@ -8,11 +8,12 @@
 //!   the taps that read an occupied voxel.
 //! - **Context**: `c` of a voxel is a linear layer, one per octant, of its parent's feature `g` (or a copy of it).
 //! - **Base level**: no context. Beyond the paper, a small network predicts its latents from those of neighbours that were coded
-//!   before ([`Model::base_parameters`]); without one, they have one distribution per channel.
+//!   before ([`Model::pass_parameters`]); without one, they have one distribution per channel.
+//! - **Neighbours**: beyond the paper, another such network may correct, at the levels above, what PEM predicts from the context.
 //!
 //! # The exact zone
 //! Whatever reaches a probability is computed in integers, and the same on every machine: [`Model::upsample`],
-//! [`Model::base_parameters`], [`Model::entropy_parameters`] (PEM) and [`Model::reconstruct`] (FR).
+//! [`Model::entropy_parameters`] (PEM), [`Model::pass_parameters`] and [`Model::reconstruct`] (FR).
 //!
 //! Activations are `i16` in ±2047, weights `i16` in ±511, sums `i32`; loading proves per output channel that no sum can overflow.
 //! A sum becomes an activation by `clamp((sum + bias) >> shift)`, the rounding constant being part of the bias; in
@@ -36,7 +37,6 @@
 //! of the same after layer 4. Where `gg` of the metadata has further generators that say `"heads": "quick"`, their layers are `gg.quick.r.*`
 //! ([`Heads`]). Tables: see [`crate::entropy::Tables`]. A file without `fc.*` and `fs.*` can decode only.
 
-mod base;
 mod children;
 mod container;
 mod convert;
@@ -47,6 +47,7 @@ mod generate;
 mod heads;
 mod layers;
 mod load;
+mod passes;
 #[cfg(test)]
 mod reference;
 mod shape;
@@ -72,6 +73,7 @@ pub(crate) use generate::AT_ONCE;
 pub use generate::Precision;
 pub use heads::{Head, Heads};
 pub(crate) use layers::Pool;
+pub use passes::Pass;
 pub use shape::{Shape, Upsample};
 pub use structure::{RAW, ROLES};
 pub use untrained::untrained;

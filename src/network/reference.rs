@@ -2,6 +2,8 @@
 //!
 //! Shares with it the list of modules and layers (`structure.rs`) and nothing else.
 
+mod passes;
+
 use std::collections::HashMap;
 
 use b2p_kernels::f16;
@@ -10,8 +12,7 @@ use super::heads::Heads;
 use super::load::{Element, Tensors};
 use super::shape::Upsample;
 use super::structure::{
-    Base, Convert, Encoder, Entropy, Exact, Generate, Inception, Reconstruct, ResBlock, Spec,
-    Squeeze,
+    Convert, Encoder, Entropy, Exact, Generate, Inception, Reconstruct, ResBlock, Spec, Squeeze,
 };
 use super::{ROLES, Shape};
 
@@ -311,49 +312,6 @@ impl Oracle {
             .flatten()
             .for_each(|s| *s = s.clamp(0.0, 63.0));
         (self.here(mu, at, &x), sigma)
-    }
-
-    /// Means in sixteenths, scale indices, and whether anything is known, of base-level voxels whose latents are `latents`.
-    pub fn base(&self, at: &Sites, latents: &Rows) -> (Rows, Rows, Vec<bool>) {
-        let Base {
-            lin1,
-            lin2,
-            mu,
-            sigma,
-        } = self.exact.base.as_ref().unwrap();
-        let unit = f64::from(1 << self.shape.latent_shift);
-        let octant = |v: &[i32; 3]| v[0] % 2 + 2 * (v[1] % 2) + 4 * (v[2] % 2);
-        let inputs = |v: &[i32; 3]| {
-            let mut row = Vec::new();
-            let mut any = false;
-            for other in 1..8 {
-                let theirs: Vec<&Vec<f64>> = (0..27)
-                    .map(|k| [k % 3 - 1, k / 3 % 3 - 1, k / 9 - 1])
-                    .filter(|d| (0..3).all(|a| (d[a] != 0) == (other >> a & 1 == 1)))
-                    .map(|d| std::array::from_fn(|a| v[a] + d[a]))
-                    .filter(|w| octant(v) ^ other < octant(v) && at.index.contains_key(w))
-                    .map(|w: [i32; 3]| &latents[at.index[&w]])
-                    .collect();
-                for c in 0..self.shape.latents {
-                    let sum: f64 = theirs.iter().map(|y| y[c]).sum();
-                    let mean = sum * unit / theirs.len().max(1) as f64;
-                    row.push((mean + 0.5).floor().clamp(-2047.0, 2047.0));
-                }
-                row.push(if theirs.is_empty() { 0.0 } else { unit });
-                any |= !theirs.is_empty();
-            }
-            row.extend((0..3).map(|a| f64::from(octant(v) >> a & 1) * unit));
-            (row, any)
-        };
-        let (x, known): (Rows, Vec<bool>) = at.voxels.iter().map(inputs).unzip();
-        let x = relu(self.here(lin1, at, &x));
-        let x = relu(self.here(lin2, at, &x));
-        let mut sigma = self.here(sigma, at, &x);
-        sigma
-            .iter_mut()
-            .flatten()
-            .for_each(|s| *s = s.clamp(0.0, 63.0));
-        (self.here(mu, at, &x), sigma, known)
     }
 
     pub fn reconstruct(&self, role: usize, at: &Sites, latents: &Rows, c: Option<&Rows>) -> Rows {

@@ -20,6 +20,9 @@ pub struct Shape {
     /// Channels of the network that predicts the base level from neighbours, a multiple of 4; 0 where there is none.
     #[serde(default)]
     pub base_channels: usize,
+    /// The same of the networks that do so above it, for roles 1 and 2.
+    #[serde(default)]
+    pub near_channels: [usize; 2],
     /// Inception blocks of each feature conversion (FC).
     pub fc_blocks: usize,
     /// Inception blocks of each predictive entropy model (PEM).
@@ -85,6 +88,7 @@ impl Shape {
             channels: 8,
             latents: 4,
             base_channels: 8,
+            near_channels: [8, 4],
             fc_blocks: 1,
             pem_blocks: 1,
             fr_blocks: 1,
@@ -169,8 +173,12 @@ impl Shape {
             0 => String::new(),
             channels => format!(";base_channels={channels}"),
         };
+        let near = match self.near_channels {
+            [0, 0] => String::new(),
+            [first, second] => format!(";near_channels={first},{second}"),
+        };
         format!(
-            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}",
+            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}{near}",
             self.channels,
             self.latents,
             self.pem_blocks,
@@ -206,6 +214,14 @@ impl Shape {
             &self.base_channels,
             "0, or a multiple of 4 up to 256",
         )?;
+        for near in self.near_channels {
+            require(
+                near == 0 || channels(near),
+                "near_channels",
+                &near,
+                "0, or a multiple of 4 up to 256",
+            )?;
+        }
         let latents = (1..=MAX_LATENTS).contains(&self.latents);
         require(latents, "latents", &self.latents, "1 to 64")?;
         for (field, blocks) in [
@@ -389,6 +405,7 @@ mod tests {
             ("/channels", "1000000"),
             ("/latents", "65"),
             ("/base_channels", "260"),
+            ("/near_channels/1", "6"),
             ("/pem_blocks", "17"),
             ("/latent_max", "32"),
             ("/latent_max", "0"),
@@ -401,7 +418,8 @@ mod tests {
             ("/gg/0/channels", "7"),
             ("/gg/0/blocks_after", "99"),
         ] {
-            let name = field.rsplit('/').next().unwrap().split('_').next().unwrap();
+            let key = field.rsplit('/').find(|part| part.parse::<u8>().is_err());
+            let name = key.unwrap().split('_').next().unwrap();
             let error = altered(field, value).unwrap_err();
             assert!(
                 matches!(error, Error::Malformed { .. }),
@@ -415,6 +433,7 @@ mod tests {
         for (field, value) in [
             ("/channels", "-8"),
             ("/upsample", "\"cubic\""),
+            ("/near_channels", "[8]"),
             ("/latent_max", "40000"),
         ] {
             assert!(

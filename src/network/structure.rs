@@ -18,6 +18,11 @@ pub(super) fn base_inputs(latents: usize) -> usize {
     7 * (latents + 1) + 3
 }
 
+/// What is known of a voxel above the base level: the same, of neighbours of the same parent and of others; its own means and scales.
+pub(super) fn near_inputs(latents: usize) -> usize {
+    2 * 7 * (latents + 1) + 2 * latents + 3
+}
+
 /// One layer to be had.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Spec {
@@ -55,8 +60,8 @@ pub(crate) struct Entropy<L> {
     pub sigma: L,
 }
 
-/// What predicts the base level's latents from those of neighbours.
-pub(crate) struct Base<L> {
+/// What predicts latents from those of neighbours.
+pub(crate) struct Neighbours<L> {
     pub lin1: L,
     pub lin2: L,
     pub mu: L,
@@ -135,7 +140,9 @@ pub(crate) struct Exact<L> {
     /// Of roles 1 and 2, if learned.
     pub up: Option<[L; 2]>,
     /// Of role 0, if the model has it.
-    pub base: Option<Base<L>>,
+    pub base: Option<Neighbours<L>>,
+    /// Of roles 1 and 2, for which the model has it.
+    pub near: [Option<Neighbours<L>>; 2],
     /// Of roles 1 and 2.
     pub pem: [Entropy<L>; 2],
     /// Of roles 0, 1 and 2.
@@ -235,16 +242,21 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
         })
     }
 
-    fn base(&mut self) -> Result<Option<Base<L>>> {
-        let (h, k) = (self.shape.base_channels, self.shape.latents);
-        if h == 0 {
+    fn neighbours(
+        &mut self,
+        module: &str,
+        inputs: usize,
+        hidden: usize,
+    ) -> Result<Option<Neighbours<L>>> {
+        let k = self.shape.latents;
+        if hidden == 0 {
             return Ok(None);
         }
-        Ok(Some(Base {
-            lin1: self.linear("base.lin1", base_inputs(k), h)?,
-            lin2: self.linear("base.lin2", h, h)?,
-            mu: self.linear("base.mu", h, k)?,
-            sigma: self.linear("base.sigma", h, k)?,
+        Ok(Some(Neighbours {
+            lin1: self.linear(&format!("{module}.lin1"), inputs, hidden)?,
+            lin2: self.linear(&format!("{module}.lin2"), hidden, hidden)?,
+            mu: self.linear(&format!("{module}.mu"), hidden, k)?,
+            sigma: self.linear(&format!("{module}.sigma"), hidden, k)?,
         }))
     }
 
@@ -308,8 +320,9 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
 impl Shape {
     /// The exact zone, of layers that `layer` makes.
     pub(crate) fn exact<L>(&self, layer: &mut impl FnMut(Spec) -> Result<L>) -> Result<Exact<L>> {
-        let c = self.channels;
+        let (c, k) = (self.channels, self.latents);
         let mut maker = Maker { layer, shape: self };
+        let [near1, near2] = self.near_channels;
         let up = match self.upsample {
             Upsample::Nearest => None,
             Upsample::Learned => Some([
@@ -325,7 +338,11 @@ impl Shape {
                 maker.reconstruct(1)?,
                 maker.reconstruct(2)?,
             ],
-            base: maker.base()?,
+            base: maker.neighbours("base", base_inputs(k), self.base_channels)?,
+            near: [
+                maker.neighbours("near.1", near_inputs(k), near1)?,
+                maker.neighbours("near.2", near_inputs(k), near2)?,
+            ],
         })
     }
 

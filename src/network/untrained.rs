@@ -26,12 +26,14 @@ pub fn untrained(shape: &Shape, seed: u64) -> Vec<u8> {
     };
     let [exact, float] = layers(shape).expect("listing layers has no way to fail");
     // Optional parts come last: with and without them, everything else is the same.
-    let (base, exact): (Vec<_>, Vec<_>) = exact.iter().partition(|s| s.name.starts_with("base."));
-    let quick = |spec: &&Spec| spec.name.starts_with("gg.quick.");
-    let (quick, float): (Vec<_>, Vec<_>) = float.iter().partition(quick);
+    let of = |module: &'static str| move |s: &&Spec| s.name.starts_with(module);
+    let (base, exact): (Vec<_>, Vec<_>) = exact.iter().partition(of("base."));
+    let (near, exact): (Vec<_>, Vec<_>) = exact.into_iter().partition(of("near."));
+    let (quick, float): (Vec<_>, Vec<_>) = float.iter().partition(of("gg.quick."));
     exact.into_iter().for_each(|spec| file.exact_layer(spec));
     float.into_iter().for_each(|spec| file.float_layer(spec));
     base.into_iter().for_each(|spec| file.exact_layer(spec));
+    near.into_iter().for_each(|spec| file.exact_layer(spec));
     quick.into_iter().for_each(|spec| file.float_layer(spec));
     // Half the features' range stands for ±4.
     let step = 1.0 / 256.0;
@@ -139,6 +141,7 @@ impl File {
             "a2" | "b3" => (keep + 2, 0),
             "lin2" => (keep + 1, 0),
             "mu" => (keep + 4, 0),
+            "sigma" if name.starts_with("near.") => (keep + 5, 0),
             "sigma" => (keep + 5, 28),
             _ => (keep, 0),
         };

@@ -6,7 +6,7 @@ use b2p::encoder::{Options, encode};
 use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
-use b2p::network::Model;
+use b2p::network::{Model, Pass};
 
 use crate::common::{Ball, cloud_of};
 use crate::models::model;
@@ -114,18 +114,26 @@ fn stream(
         let count = octree.level(level).len() * model.shape().latents;
         let latents: Vec<i16> = (0..count).map(|_| latents.next(&mut random)).collect();
         let (tables, slice) = (model.tables(), slice as usize);
-        let slices = match &parameters {
-            Some((mu, sigma)) => {
-                encode_level(tables, Condition::Gauss { mu, sigma }, &latents, slice)
-            }
-            None if model.predicts_base() => {
-                let octants = octree.level(level).octants();
-                let predict = |slice, voxels: &[u32], latents: &[i16]| {
-                    model.base_parameters(&octants, &map, slice, voxels, latents)
+        let slices = if model.has_passes(role) {
+            let octants = octree.level(level).octants();
+            let level = parameters.as_ref().map(|(mu, sigma)| (&mu[..], &sigma[..]));
+            let predict = |slice, voxels: &[u32], latents: &[i16]| {
+                let pass = Pass {
+                    octants: &octants,
+                    map: &map,
+                    slice,
+                    voxels,
+                    latents,
                 };
-                encode_passes(tables, &octants, &predict, &latents, slice)
-            }
-            None => encode_level(tables, Condition::Prior, &latents, slice),
+                model.pass_parameters(role, &pass, level)
+            };
+            encode_passes(tables, &octants, &predict, &latents, slice)
+        } else {
+            let condition = match &parameters {
+                Some((mu, sigma)) => Condition::Gauss { mu, sigma },
+                None => Condition::Prior,
+            };
+            encode_level(tables, condition, &latents, slice)
         };
         writer
             .features(level, latent_hash(&latents), &slices)

@@ -320,6 +320,7 @@ fn the_id_changes_with_whatever_bears_on_the_decoded_bits_and_nothing_else() {
     let different = [
         File::tiny().poke("pem.1.mu.weight", 3, &5i16.to_le_bytes()),
         File::tiny().poke("up.2.bias", 3, &5i32.to_le_bytes()),
+        File::tiny().poke("near.2.lin1.weight", 3, &5i16.to_le_bytes()),
         File::tiny().poke("fr.0.lin1.shift", 0, &[3]),
         File::tiny().poke("pem.1.conv_in.gain", 0, &0.5f32.to_le_bytes()),
         altered,

@@ -4,7 +4,7 @@ use b2p_kernels::Isa;
 
 use super::super::load::{Element, Tensors};
 use super::super::{Model, RAW};
-use super::{Cloud, coarser, error, rows};
+use super::{Cloud, all_passes, coarser, error, rows};
 use crate::gaussians::{Frame, activate};
 use crate::geometry::morton;
 
@@ -39,21 +39,26 @@ fn cloud() -> Cloud {
 fn the_exact_zone_computes_the_trainer_s_integers() {
     let (model, cloud) = (model(), cloud());
     let values = |name: &str, role: usize| -> Vec<i16> { golden(&format!("{name}.{role}")) };
-    let octants = cloud.octree.level(cloud.level(0)).octants();
-    let (map, y) = (&cloud.maps[0], values("latent", 0));
-    let all: Vec<u32> = (0..map.len() as u32).collect();
-    let (mu, sigma) = model.base_parameters(&octants, map, 0..map.len(), &all, &y);
-    assert_eq!(mu, values("mu", 0));
-    assert_eq!(sigma, golden::<u8>("sigma.0"));
     for role in 0..3 {
         let map = &cloud.maps[role];
+        let octants = cloud.octree.level(cloud.level(role)).octants();
+        let passes = |level: Option<(&[i16], &[u8])>| {
+            all_passes(&model, role, &octants, map, &values("latent", role), level)
+        };
         let context = (role > 0)
             .then(|| model.upsample(role, &values("g", role - 1), cloud.occupancy(role - 1)));
         if let Some(context) = &context {
             assert_eq!(context, &values("c", role));
             let (mu, sigma) = model.entropy_parameters(role, context, map);
+            assert_eq!(mu, values("pem.mu", role));
+            assert_eq!(sigma, golden::<u8>(&format!("pem.sigma.{role}")));
+            let (mu, sigma) = passes(Some((&mu, &sigma)));
             assert_eq!(mu, values("mu", role));
             assert_eq!(sigma, golden::<u8>(&format!("sigma.{role}")));
+        } else {
+            let (mu, sigma) = passes(None);
+            assert_eq!(mu, values("mu", role));
+            assert_eq!(sigma, golden::<u8>("sigma.0"));
         }
         let g = model.reconstruct(role, &values("latent", role), context.as_deref(), map);
         assert_eq!(g, values("g", role), "role {role}");
@@ -64,7 +69,7 @@ fn the_exact_zone_computes_the_trainer_s_integers() {
 fn integer_distributions_are_those_that_the_float_network_predicts() {
     let per_nat = 63.0 / (64.0f64 / 0.11).ln();
     for role in [1, 2] {
-        let mu: Vec<i16> = golden(&format!("mu.{role}"));
+        let mu: Vec<i16> = golden(&format!("pem.mu.{role}"));
         let real: Vec<f32> = golden(&format!("float.mu.{role}"));
         // Weights of ten bits and activations of twelve add about as much as rounding to a sixteenth does.
         for (&q, &real) in mu.iter().zip(&real) {
@@ -73,7 +78,7 @@ fn integer_distributions_are_those_that_the_float_network_predicts() {
                 "role {role}: {q} for {real}"
             );
         }
-        let sigma: Vec<u8> = golden(&format!("sigma.{role}"));
+        let sigma: Vec<u8> = golden(&format!("pem.sigma.{role}"));
         let real: Vec<f32> = golden(&format!("float.lnsigma.{role}"));
         for (&q, &real) in sigma.iter().zip(&real) {
             let index = (f64::from(real) - 0.11f64.ln()) * per_nat;

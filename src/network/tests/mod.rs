@@ -6,8 +6,8 @@ mod golden;
 
 use b2p_kernels::Isa;
 
-use super::Model;
 use super::reference::{Rows, Sites};
+use super::{Model, Pass};
 use crate::geometry::{KernelMap, Octree, Voxels, morton};
 
 /// A cloud of which levels are coded, role 3 being the deepest.
@@ -75,6 +75,37 @@ impl Cloud {
 /// By how much the encoder is coarser than f16 with these instructions: tiles hold bf16, of eight significant bits instead of eleven.
 fn coarser(isa: Isa) -> f64 {
     if isa.has_tiles() { 8.0 } else { 1.0 }
+}
+
+/// The parameters of all voxels of a level that is one slice, pass by pass.
+fn all_passes(
+    model: &Model,
+    role: usize,
+    octants: &[u8],
+    map: &KernelMap,
+    latents: &[i16],
+    level: Option<(&[i16], &[u8])>,
+) -> (Vec<i16>, Vec<u8>) {
+    let k = model.shape().latents;
+    let (mut mu, mut sigma) = (vec![0; latents.len()], vec![0; latents.len()]);
+    for octant in 0..8 {
+        let voxels = 0..map.len() as u32;
+        let voxels: Vec<u32> = voxels.filter(|&v| octants[v as usize] == octant).collect();
+        let pass = Pass {
+            octants,
+            map,
+            slice: 0..map.len(),
+            voxels: &voxels,
+            latents,
+        };
+        let (m, s) = model.pass_parameters(role, &pass, level);
+        for (i, &v) in voxels.iter().enumerate() {
+            let (from, to) = (i * k..(i + 1) * k, v as usize * k..(v as usize + 1) * k);
+            mu[to.clone()].copy_from_slice(&m[from.clone()]);
+            sigma[to].copy_from_slice(&s[from]);
+        }
+    }
+    (mu, sigma)
 }
 
 /// Rows of `width` numbers.
