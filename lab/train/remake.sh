@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Trains the models of models/ anew, from nothing: remake.sh MESHES PHOTOS OUT [SHARE]
-# MESHES and PHOTOS are folders of glTF binaries and of pictures. SHARE scales the minutes of every step (1: as the shipped models had, about six
-# and a half hours on one core; 0.01 shows that it runs). PYTHON names the interpreter that has torch.
+# MESHES and PHOTOS are folders of glTF binaries and of pictures. SHARE scales the minutes of every step (1: as the shipped models had, about eight
+# hours on one core; 0.01 shows that it runs). PYTHON names the interpreter that has torch.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 meshes=$(realpath "$1") photos=$(realpath "$2") share=${4:-1}
@@ -41,8 +41,13 @@ train() {
 }
 # ship NAME FILE ARGUMENTS…: fits the entropy models and writes the model
 ship() {
-    "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 3)" --samples 150 --lr 3e-4 --threads 1 "${@:3}"
+    "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 6)" --samples 260 --lr 3e-4 --threads 1 "${@:3}"
     "$python" export.py "$out/$1/tuned.pt" "$out/$2.safetensors" --data "$out/data" --samples 10 --verify 4 --weights "$out/$2.weights.safetensors"
+}
+# beside NAME FILE: these heads as quick ones of the model
+beside() {
+    "$python" export.py --quick "$out/$1/last.pt" --streams-of "$out/$2.safetensors" "$out/$2-both.safetensors" --data "$out/data" --samples 10 --verify 4
+    mv "$out/$2-both.safetensors" "$out/$2.safetensors"
 }
 # The heads alone read what was decoded; they bear five times the learning rate, and a step is short.
 heads=(--only-heads --lr-conv 5e-4 --lr-linear 8e-4 --warmup 300 --decay-from 0.15 --coarse 0.35)
@@ -58,7 +63,13 @@ all=(--freeze-finest --lr-heads 3 --rate-start 1 --rate-ramp 0.01 --rounding-fro
 train start lite 100 --lam 18 --rate-start 0.2 --rate-ramp 0.12 --rounding-from 0.03 --decay-from 0.35 --warmup 400
 train low lite 12 --init "$out/start/last.pt" --lam 4 --freeze-finest --rate-start 1 --rate-ramp 0.01 --rounding-from 0.02 --decay-from 0.3 --warmup 100
 train low-heads lite 44 --init "$out/low/last.pt" --lam 1 "${heads[@]}"
-ship low-heads lite-low
+train low-whole-1 lite 21 --init "$out/low-heads/last.pt" --coarse 1 "${whole[@]}"
+train low-whole-2 lite 21 --init "$out/low-whole-1/last.pt" --coarse 0 "${whole[@]}"
+ship low-whole-2 lite-low
+low=(--init "$out/lite-low.weights.safetensors" --teacher "$out/lite-low.weights.safetensors")
+train low-quick-1 lite-quick 5 --coarse 1 "${imitate[@]}" "${low[@]}"
+train low-quick-2 lite-quick 5 --coarse 0 "${imitate[@]}" "${low[@]}" --init "$out/low-quick-1/last.pt"
+beside low-quick-2 lite-low
 train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
 train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
 train high-whole-1 lite 25 --init "$out/high-heads/last.pt" --coarse 1 "${whole[@]}"
@@ -68,7 +79,8 @@ train quick-1 lite-quick 20 --coarse 1 "${imitate[@]}"
 train quick-2 lite-quick 18 --coarse 0 "${imitate[@]}" --init "$out/quick-1/last.pt"
 train quick-whole-1 lite-quick 21 --init "$out/quick-2/last.pt" --coarse 1 "${whole[@]}"
 train quick-whole-2 lite-quick 21 --init "$out/quick-whole-1/last.pt" --coarse 0 "${whole[@]}"
-"$python" export.py --quick "$out/quick-whole-2/last.pt" --streams-of "$out/lite.safetensors" "$out/lite-both.safetensors" --data "$out/data" --samples 10 --verify 4
-mv "$out/lite-both.safetensors" "$out/lite.safetensors"
+beside quick-whole-2 lite
 train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
-ship least lite-least --only-base
+train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
+train least-whole-2 lite 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${whole[@]}"
+ship least-whole-2 lite-least --only-base
