@@ -20,6 +20,7 @@ pub struct Options {
     /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.
     pub levels: Option<RangeInclusive<u8>>,
     /// What a bit is worth when latents are rounded, in squared latent steps: see [`crate::entropy::quantise`]. 0 rounds to the nearest.
+    /// Bits are those that the level below predicts, whatever neighbours tell.
     pub bit_price: f32,
     /// Voxels per slice, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,

@@ -5,9 +5,10 @@ use std::sync::LazyLock;
 
 use b2p::Limits;
 use b2p::cloud::{PointCloud, voxelise};
+use b2p::entropy::UNPREDICTED;
 use b2p::gaussians::Gaussians;
-use b2p::geometry::{Octree, Voxels};
-use b2p::network::{Model, Shape, untrained};
+use b2p::geometry::{KernelMap, Octree, Voxels};
+use b2p::network::{Model, Pass, Shape, untrained};
 
 use crate::one_in;
 
@@ -63,6 +64,9 @@ fn load(bytes: &[u8]) {
         if role != one && !rarely {
             continue;
         }
+        if model.has_passes(role) {
+            passes(&model, role, &octree, &map);
+        }
         let latents = vec![shape.latent_max; 4 * shape.latents];
         let context = vec![2047i16; 4 * shape.channels];
         let context = (role > 0).then_some(&context[..]);
@@ -71,6 +75,28 @@ fn load(bytes: &[u8]) {
         if let Ok(raw) = model.generate(role, &features, &map) {
             assert!(raw.iter().all(|x| x.is_finite()));
         }
+    }
+}
+
+/// Every pass over the voxels, after latents that no encoder makes and parameters at the ends of their range.
+fn passes(model: &Model, role: usize, octree: &Octree, map: &KernelMap) {
+    let octants = octree.level(2).octants();
+    let count = octants.len() * model.shape().latents;
+    let (mu, sigma) = (vec![-2047; count], vec![63; count]);
+    let level = (role > 0).then_some((&mu[..], &sigma[..]));
+    for octant in 0..8 {
+        let voxels = 0..octants.len() as u32;
+        let voxels: Vec<u32> = voxels.filter(|&v| octants[v as usize] == octant).collect();
+        let pass = Pass {
+            octants: &octants,
+            map,
+            slice: 0..octants.len(),
+            voxels: &voxels,
+            latents: &vec![i16::MIN; count],
+        };
+        let (mu, sigma) = model.pass_parameters(role, &pass, level);
+        assert!(mu.iter().all(|mu| mu.unsigned_abs() <= 2047));
+        assert!(sigma.iter().all(|&s| s < 64 || s == UNPREDICTED));
     }
 }
 

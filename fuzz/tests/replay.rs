@@ -1,14 +1,16 @@
 //! What the fuzzer does, on stable Rust: every input that is kept, and the seeds changed at random for a few seconds.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use b2p_fuzz::{STREAMS, TARGETS, seeds::seeds};
 
-/// Targets count what memory they take: one test at a time.
-fn alone() -> MutexGuard<'static, ()> {
+/// Targets count what memory they take: one test at a time, and on one thread, for each keeps what it has prepared for itself.
+fn alone(test: impl FnOnce() + Send) {
     static ALONE: Mutex<()> = Mutex::new(());
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
+    pool.expect("a pool").install(test);
 }
 
 fn corpus(target: &str) -> PathBuf {
@@ -29,26 +31,28 @@ fn inputs(target: &str) -> Vec<Vec<u8>> {
 
 #[test]
 fn every_input_that_is_kept_passes() {
-    let _alone = alone();
-    for (name, run) in TARGETS {
-        let inputs = inputs(name);
-        assert!(!inputs.is_empty(), "{name} has no corpus");
-        inputs.iter().for_each(|input| run(input));
-        println!("{name}: {} inputs", inputs.len());
-    }
+    alone(|| {
+        for (name, run) in TARGETS {
+            let inputs = inputs(name);
+            assert!(!inputs.is_empty(), "{name} has no corpus");
+            inputs.iter().for_each(|input| run(input));
+            println!("{name}: {} inputs", inputs.len());
+        }
+    });
 }
 
 /// Streams of an earlier format or model would all be refused alike, and nothing behind that be tried.
 #[test]
 fn the_streams_that_are_kept_as_seeds_are_as_whole_as_new_ones() {
-    let _alone = alone();
-    for name in STREAMS {
-        for (i, seed) in seeds(name).iter().enumerate() {
-            let kept = std::fs::read(corpus(name).join(format!("seed-{i}"))).expect("a seed");
-            let reached = |bytes| b2p_fuzz::deepest(bytes).map_err(|error| error.to_string());
-            assert_eq!(reached(&kept), reached(seed), "{name}, seed {i}");
+    alone(|| {
+        for name in STREAMS {
+            for (i, seed) in seeds(name).iter().enumerate() {
+                let kept = std::fs::read(corpus(name).join(format!("seed-{i}"))).expect("a seed");
+                let reached = |bytes| b2p_fuzz::deepest(bytes).map_err(|error| error.to_string());
+                assert_eq!(reached(&kept), reached(seed), "{name}, seed {i}");
+            }
         }
-    }
+    });
 }
 
 /// A change that a fuzzer might make.
@@ -76,44 +80,45 @@ fn mutate(bytes: &mut Vec<u8>, others: &[Vec<u8>], random: &mut impl FnMut(usize
 /// `B2P_FUZZ_ROUNDS` asks for more than the usual few seconds: so many times as many inputs, and others than the usual ones.
 #[test]
 fn every_target_holds_on_changed_seeds() {
-    let _alone = alone();
-    let rounds = std::env::var("B2P_FUZZ_ROUNDS").map_or(1, |n| n.parse().expect("a number"));
-    for (name, run) in TARGETS {
-        let mut others = seeds(name);
-        others.extend(inputs(name));
-        let mut state = u64::from(rounds);
-        let mut random = |below: usize| {
-            state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(3);
-            (state >> 33) as usize % below.max(1)
-        };
-        let runs = match name {
-            "model" => 100,
-            "backends" | "stream" | "render" => 1_000,
-            _ => 5_000,
-        } * rounds;
-        for seed in 0..runs {
-            let mut bytes = others[random(others.len())].clone();
-            if STREAMS.contains(&name) {
-                let (size, most) = (bytes.len(), bytes.len() + 1000);
-                bytes.resize(most, 0);
-                let mut change = |data: &mut [u8], size: usize, most: usize| {
-                    let mut some = data[..size].to_vec();
-                    mutate(&mut some, &others, &mut random);
-                    some.truncate(most);
-                    data[..some.len()].copy_from_slice(&some);
-                    some.len()
-                };
-                let size = b2p_fuzz::mutate(&mut bytes, size, most, seed, &mut change);
-                bytes.truncate(size);
-            } else {
-                mutate(&mut bytes, &others, &mut random);
+    alone(|| {
+        let rounds = std::env::var("B2P_FUZZ_ROUNDS").map_or(1, |n| n.parse().expect("a number"));
+        for (name, run) in TARGETS {
+            let mut others = seeds(name);
+            others.extend(inputs(name));
+            let mut state = u64::from(rounds);
+            let mut random = |below: usize| {
+                state = state
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(3);
+                (state >> 33) as usize % below.max(1)
+            };
+            let runs = match name {
+                "model" => 100,
+                "backends" | "stream" | "render" => 1_000,
+                _ => 5_000,
+            } * rounds;
+            for seed in 0..runs {
+                let mut bytes = others[random(others.len())].clone();
+                if STREAMS.contains(&name) {
+                    let (size, most) = (bytes.len(), bytes.len() + 1000);
+                    bytes.resize(most, 0);
+                    let mut change = |data: &mut [u8], size: usize, most: usize| {
+                        let mut some = data[..size].to_vec();
+                        mutate(&mut some, &others, &mut random);
+                        some.truncate(most);
+                        data[..some.len()].copy_from_slice(&some);
+                        some.len()
+                    };
+                    let size = b2p_fuzz::mutate(&mut bytes, size, most, seed, &mut change);
+                    bytes.truncate(size);
+                } else {
+                    mutate(&mut bytes, &others, &mut random);
+                }
+                run(&bytes);
             }
-            run(&bytes);
+            println!("{name}: {runs} changed inputs");
         }
-        println!("{name}: {runs} changed inputs");
-    }
+    });
 }
 
 #[test]
