@@ -12,7 +12,7 @@ use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::{Model, Pass, ROLES};
+use crate::network::{Model, ROLES};
 
 /// What may be chosen about a stream.
 #[derive(Debug, Clone)]
@@ -205,17 +205,7 @@ pub(crate) fn write(
                 let latents = latents(role, condition, context.as_deref())?;
                 let slices = if model.has_passes(role) {
                     let octants = octree.level(level).octants();
-                    let level = parameters.as_ref().map(|(mu, sigma)| (&mu[..], &sigma[..]));
-                    let predict = |slice, voxels: &[u32], latents: &[i16]| {
-                        let pass = Pass {
-                            octants: &octants,
-                            map,
-                            slice,
-                            voxels,
-                            latents,
-                        };
-                        model.pass_parameters(role, &pass, level)
-                    };
+                    let predict = model.passes(role, &octants, map, parameters.as_ref());
                     encode_passes(tables, &octants, &predict, &latents, slice)
                 } else {
                     encode_level(tables, condition, &latents, slice)

@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
-use crate::network::{Heads, Model, Module, Pass, Pool};
+use crate::network::{Heads, Model, Module, Pool};
 
 /// Where decoding is to end.
 #[derive(Debug, Clone, Copy)]
@@ -417,18 +417,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
             let slices = &level.features;
             let latents = if self.model.has_passes(role) {
                 let octants = octree.level(n).octants();
-                let level = parameters.as_ref().map(|(mu, sigma)| (&mu[..], &sigma[..]));
-                let model = &*self.model;
-                let predict = |slice, voxels: &[u32], latents: &[i16]| {
-                    let pass = Pass {
-                        octants: &octants,
-                        map,
-                        slice,
-                        voxels,
-                        latents,
-                    };
-                    model.pass_parameters(role, &pass, level)
-                };
+                let predict = self.model.passes(role, &octants, map, parameters.as_ref());
                 decode_passes(tables, &octants, &predict, slices, slice, n, cancel)?
             } else {
                 let condition = match &parameters {

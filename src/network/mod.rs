@@ -73,7 +73,7 @@ pub(crate) use generate::AT_ONCE;
 pub use generate::Precision;
 pub use heads::{Head, Heads};
 pub(crate) use layers::Pool;
-pub use passes::Pass;
+pub use passes::{Parameters, Pass};
 pub use shape::{Shape, Upsample};
 pub use structure::{RAW, ROLES};
 pub use untrained::untrained;

@@ -20,6 +20,9 @@ const SIGMA_SHIFT: u8 = 3;
 /// Voxels whose inputs are gathered at once.
 const BLOCK: usize = 256;
 
+/// How latents are distributed: means in sixteenths and scale indices, [voxels, K] each.
+pub type Parameters = (Vec<i16>, Vec<u8>);
+
 /// One pass over a slice: what is to be predicted, and from what.
 #[derive(Debug, Clone)]
 pub struct Pass<'a> {
@@ -56,6 +59,28 @@ impl Model {
         self.neighbours(role).is_some()
     }
 
+    /// What predicts the passes over a level for [`crate::entropy::encode_passes`] and [`crate::entropy::decode_passes`]: [`Model::pass_parameters`] of
+    /// a role, for a level with these octants, this 3³ kernel map, and these parameters of all its voxels, if it has any.
+    pub fn passes<'a>(
+        &'a self,
+        role: usize,
+        octants: &'a [u8],
+        map: &'a KernelMap,
+        level: Option<&'a Parameters>,
+    ) -> impl Fn(Range<usize>, &[u32], &[i16]) -> Parameters + Sync + 'a {
+        let level = level.map(|(mu, sigma)| (&mu[..], &sigma[..]));
+        move |slice, voxels, latents| {
+            let pass = Pass {
+                octants,
+                map,
+                slice,
+                voxels,
+                latents,
+            };
+            self.pass_parameters(role, &pass, level)
+        }
+    }
+
     /// How the latents of a pass are distributed: means in sixteenths, in ±2047, and scale indices below 64; [voxels, K] each.
     ///
     /// `level` is what [`Model::entropy_parameters`] gave for all voxels of the level; the base level has none. A voxel with no neighbour
@@ -75,7 +100,7 @@ impl Model {
         role: usize,
         pass: &Pass,
         level: Option<(&[i16], &[u8])>,
-    ) -> (Vec<i16>, Vec<u8>) {
+    ) -> Parameters {
         let k = self.shape.latents;
         let network = self.neighbours(role);
         let network = network.expect("the caller asks has_passes first");

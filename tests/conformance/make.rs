@@ -6,7 +6,7 @@ use b2p::encoder::{Options, encode};
 use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
-use b2p::network::{Model, Pass};
+use b2p::network::Model;
 
 use crate::common::{Ball, cloud_of};
 use crate::models::model;
@@ -116,17 +116,7 @@ fn stream(
         let (tables, slice) = (model.tables(), slice as usize);
         let slices = if model.has_passes(role) {
             let octants = octree.level(level).octants();
-            let level = parameters.as_ref().map(|(mu, sigma)| (&mu[..], &sigma[..]));
-            let predict = |slice, voxels: &[u32], latents: &[i16]| {
-                let pass = Pass {
-                    octants: &octants,
-                    map: &map,
-                    slice,
-                    voxels,
-                    latents,
-                };
-                model.pass_parameters(role, &pass, level)
-            };
+            let predict = model.passes(role, &octants, &map, parameters.as_ref());
             encode_passes(tables, &octants, &predict, &latents, slice)
         } else {
             let condition = match &parameters {
