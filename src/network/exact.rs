@@ -9,7 +9,7 @@ use super::structure::Inception;
 use crate::geometry::KernelMap;
 
 /// Standard deviations that a latent may have.
-const SIGMAS: i16 = 64;
+pub(super) const SIGMAS: i16 = 64;
 
 impl Model {
     /// The context of a role's voxels: their parents' features, upsampled.

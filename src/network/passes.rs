@@ -5,6 +5,7 @@ use std::ops::Range;
 use b2p_kernels::{ExactConv, LIMIT, Taps};
 use rayon::prelude::*;
 
+use super::exact::SIGMAS;
 use super::layers::{Pool, apply};
 use super::structure::{Neighbours, base_inputs, near_inputs};
 use super::{Model, Shape};
@@ -13,8 +14,6 @@ use crate::geometry::KernelMap;
 
 /// Sets of neighbours that lie in another octant than the voxel itself: one for every set of axes along which they differ.
 const OTHERS: usize = 7;
-/// Standard deviations that a latent may have.
-const SIGMAS: i16 = 64;
 /// A scale index enters a network shifted left by this.
 const SIGMA_SHIFT: u8 = 3;
 /// Voxels whose inputs are gathered at once.
