@@ -88,6 +88,40 @@ fn whichever_heads_are_used_the_same_is_decoded_and_only_gaussians_differ() {
 }
 
 #[test]
+fn levels_without_latents_cost_hardly_more_than_their_geometry_and_are_not_predicted() {
+    for roles in 1..=3 {
+        let shape = Shape {
+            latent_roles: roles,
+            near_channels: [0, 0],
+            ..Shape::tiny()
+        };
+        let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
+        let (encoded, mut log) = (coded(&ball(7, 45.0), &model), Log::default());
+        let decoder = Decoder::new(&model);
+        assert!(
+            !decoder
+                .decode(&encoded.bytes, None, &mut log)
+                .unwrap()
+                .is_empty()
+        );
+        for (role, rate) in encoded.rates.iter().enumerate() {
+            let has = role < roles;
+            // A chunk's header and the hash of no latents.
+            assert_eq!(rate.feature_bytes > 16 + 8, has, "role {role} of {roles}");
+            let exact = decoder.exact(&encoded.bytes, rate.level, &mut Log::default());
+            assert_eq!(exact.unwrap().latents.is_empty(), !has);
+            let asked = |step: &str| {
+                let name = format!("{step} of level {}", rate.level);
+                log.steps().iter().any(|step| step.name == name)
+            };
+            assert_eq!(asked("latents"), has);
+            assert_eq!(asked("probabilities"), has && role > 0);
+            assert!(asked("features"));
+        }
+    }
+}
+
+#[test]
 fn a_stream_cut_after_a_level_is_the_coarser_stream() {
     let (model, cloud) = (model(), ball(7, 45.0));
     let encoded = coded(&cloud, &model);

@@ -67,7 +67,7 @@ fn load(bytes: &[u8]) {
         if model.has_passes(role) {
             passes(&model, role, &octree, &map);
         }
-        let latents = vec![shape.latent_max; 4 * shape.latents];
+        let latents = vec![shape.latent_max; 4 * shape.latents_of(role)];
         let context = vec![2047i16; 4 * shape.channels];
         let context = (role > 0).then_some(&context[..]);
         let features = model.reconstruct(role, &latents, context, &map);

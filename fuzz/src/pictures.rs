@@ -16,6 +16,9 @@ fn models(precision: Precision) -> Vec<Vec<Model>> {
     let sets = |channels| {
         let shape = Shape {
             channels,
+            // The narrowest has no latents at its finest level.
+            latent_roles: if channels == 8 { 2 } else { 3 },
+            near_channels: [8, 0],
             ..Shape::tiny()
         };
         let bytes = untrained(&shape, 5);
@@ -47,7 +50,7 @@ pub fn backends(bytes: &[u8]) {
     let octree = Octree::new(Voxels::new(3, keys)).expect("voxels");
     let map = octree.kernel_map(3);
     let shape = MODELS[which][0].shape();
-    let latents: Vec<i16> = (0..map.len() * shape.latents)
+    let latents: Vec<i16> = (0..map.len() * shape.latents_of(role))
         .map(|_| source.u16() as i16)
         .collect();
     let context: Vec<i16> = (0..map.len() * shape.channels)
@@ -66,7 +69,8 @@ pub fn backends(bytes: &[u8]) {
     };
     let exact = |model: &Model| {
         let features = asked(0).then(|| model.reconstruct(role, &latents, Some(&context), &map));
-        let parameters = asked(1).then(|| model.entropy_parameters(role, &context, &map));
+        let predicted = asked(1) && model.has_latents(role);
+        let parameters = predicted.then(|| model.entropy_parameters(role, &context, &map));
         let raw = asked(2).then(|| generate(model, features.as_ref().unwrap_or(&context)));
         let bits = raw.map(|raw| raw.iter().map(|x| x.to_bits()).collect::<Vec<_>>());
         (features, parameters, bits)

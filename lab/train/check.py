@@ -11,6 +11,7 @@ import torch
 import data
 import export
 import ops
+import rates
 import train
 import tune
 from model import Conv, NormConv
@@ -280,17 +281,23 @@ def what_neighbours_tell_saves_bits_and_comes_from_those_before_alone():
     with torch.no_grad():
         c, y, kmap = roles[2]
         predicted = model.pem["2"](c, kmap)
-        untouched = model.coded_bits(2, y, *predicted, crop)
-        assert torch.isclose(untouched, model.bits(y, torch.round(predicted[0] * 16) / 16, predicted[1])), "at first nothing changes"
+        untouched = rates.bits(rates.bin_mass(y, torch.round(predicted[0] * 16) / 16, rates.bounded_sigma(predicted[1])))
+        assert torch.isclose(model.bits(2, y, *predicted, crop), untouched), "at first nothing changes"
     before, after = fit_near(model, samples)
     octant = ops.octants(crop.coords[2])
     with torch.no_grad():
-        correct = lambda y: model.near["2"].correct(y, *predicted, crop.coords[2], kmap.table)
+        correct = lambda y: model.near["2"](y, *predicted, crop.coords[2], kmap.table)
         for last in range(8):
             later = torch.where((octant >= last)[:, None], y + 7, y)
             same = [torch.equal(a[octant <= last], b[octant <= last]) for a, b in zip(correct(y), correct(later))]
             assert all(same), f"octant {last} knows of itself or of later ones"
         assert not torch.equal(correct(y)[0], correct(y + 7)[0])
+    y, fixed = y.requires_grad_(), [t.detach() for t in predicted]
+    own, = torch.autograd.grad(model.bits(2, y, *fixed, crop, seen=y.detach(), learn=False), y)
+    full, = torch.autograd.grad(model.bits(2, y, *fixed, crop, learn=False), y)
+    others = (full - own).abs().sum(1) > 1e-6
+    assert others[octant < 7].any() and not others[octant == 7].any(), "a latent's gradient is also what it does to those coded after it"
+    assert not model.bits(2, y.detach(), *fixed, crop, learn=False).requires_grad, "nothing learns"
     assert after < 0.9 * before, f"{before} -> {after}"
     return f"{before:.0f} -> {after:.0f} bits"
 

@@ -21,7 +21,7 @@ import integer
 import ops
 from crop import join
 from integer import LIMIT, SIGMA_MAX, SIGMA_MIN, SIGMAS, sigma_of
-from model import B2P, Inception, NormConv, ResBlock
+from model import B2P, Inception, NormConv, ResBlock, latents_of
 
 WEIGHT_MAX = 511
 LATENT_SHIFT = 6
@@ -66,9 +66,7 @@ def ranges_of(model, samples):
         after = [*gg.after, gg.conv_out][0]
         hooks.append(after.register_forward_pre_hook(lambda _, inputs, name=f"gg.{role}.layer4": r.add(name, inputs[0])))
     for s in samples:
-        trail, _, latents = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
-        if model.cfg.get("base_channels"):
-            model.base(model.base.inputs(torch.round(latents[0]), s.crop.coords[0], s.crop.kernel3[0].table)[0])  # the others' ran in `code`
+        trail, _, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
         for role in model.gg:
             model.generate(trail[int(role)], s.crop, int(role))
     for h in hooks:
@@ -141,7 +139,7 @@ def quantise(model, ranges):
             c_scale[r] = ranges.scale(f"up.{r}")
             layer(f"up.{r}", g_scale[r - 1], c_scale[r])
     per_nat = (SIGMAS - 1) / math.log(SIGMA_MAX / SIGMA_MIN)
-    for r in (1, 2):
+    for r in map(int, model.pem):
         s = chain(f"pem.{r}.conv_in", f"pem.{r}", cfg["pem_blocks"])
         layer(f"pem.{r}.conv_in", c_scale[r], s)
         for b in range(cfg["pem_blocks"]):
@@ -162,8 +160,8 @@ def quantise(model, ranges):
         layer(f"near.{r}.sigma", s2, 1.0, factor=per_nat)
     for r in range(3):
         s = chain(f"fr.{r}.lin1", f"fr.{r}", cfg["fr_blocks"])
-        inputs = np.full(cfg["latents"] + (cfg["channels"] if r else 0), c_scale[r])
-        inputs[:cfg["latents"]] = 2.0**-LATENT_SHIFT
+        inputs = np.full(latents_of(cfg, r) + (cfg["channels"] if r else 0), c_scale[r])
+        inputs[:latents_of(cfg, r)] = 2.0**-LATENT_SHIFT
         layer(f"fr.{r}.lin1", inputs, s)
         for b in range(cfg["fr_blocks"]):
             inception(f"fr.{r}.blocks.{b}", s)
@@ -262,7 +260,7 @@ def is_quick(name):
 def same_streams(path, cfg):
     """Description and tensors of a model file whose streams a network of this configuration is to decode."""
     meta, tensors = read(path)
-    exact = ("channels", "latents", "base_channels", "near_channels", "pem_blocks", "fr_blocks", "upsample", "inception_relu", "latent_max")
+    exact = ("channels", "latents", "latent_roles", "base_channels", "near_channels", "pem_blocks", "fr_blocks", "upsample", "inception_relu", "latent_max")
     if any(meta.get(k) != cfg.get(k) for k in exact):
         sys.exit(f"{path} is another network")
     return meta, tensors
@@ -321,8 +319,7 @@ def verify(path, model, samples):
     """Rate of the integer path against the float path on whole crops, pictures of both, and saturation."""
     exact, totals, points, error = integer.Exact(path), np.zeros((2, 3)), 0, {int(role): np.zeros(2) for role in model.gg}
     for s in samples:
-        trail, rates, latents = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
-        rates[0] = model.coded_bits(0, torch.round(latents[0]), None, None, s.crop)
+        trail, rates, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
         for role, e in error.items():
             bits, gi = integer.code(exact, model, s.crop, s.rgb, role)
             e += [picture_error(model, s, trail[role], role), picture_error(model, s, gi, role)]

@@ -162,14 +162,18 @@ def code(exact, model, crop, rgb, top=2, trace=None):
     t = trace if trace is not None else {}
     table3, descent = tables(crop)
     features = model.analyse(crop, rgb)
-    limit, bits, g = float(exact.cfg["latent_max"]), [], None
+    bits, g = [], None
     for r in range(top + 1):
         c = exact.context(r, g, descent[r]) if r else None
         real = torch.from_numpy((c * float(exact.t["c_scale"][r])).astype(np.float32)) if r else None
-        y = model.fs[r](features[r], real)
-        latents = torch.round(y.clamp(-limit, limit)).numpy().astype(np.int64)
+        y = model.squeeze(r, features[r], real)
+        latents = torch.round(y).numpy().astype(np.int64)
         t[f"fc.{r}"], t[f"fs.{r}"], t[f"latent.{r}"] = features[r].numpy(), y.numpy(), latents
-        if r or exact.cfg.get("base_channels"):
+        if r:
+            t[f"c.{r}"] = c
+        if not latents.shape[1]:
+            bits.append(0.0)
+        elif r or exact.cfg.get("base_channels"):
             if r:
                 t[f"pem.mu.{r}"], t[f"pem.sigma.{r}"] = exact.entropy(r, c, table3[r], trace)
                 mu, index = exact.near(r, latents, t[f"pem.mu.{r}"], t[f"pem.sigma.{r}"], crop.coords[r], table3[r])
@@ -177,8 +181,6 @@ def code(exact, model, crop, rgb, top=2, trace=None):
                 mu, index = exact.base(latents, crop.coords[0], table3[0])
             bits.append(exact.bits_gauss(latents, mu, index))
             t[f"mu.{r}"], t[f"sigma.{r}"] = mu, index
-            if r:
-                t[f"c.{r}"] = c
         else:
             bits.append(exact.bits_prior(latents))
         g = exact.reconstruct(r, latents, c, table3[r], trace)

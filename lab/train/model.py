@@ -8,10 +8,11 @@ import math
 import torch
 import torch.nn.functional as F
 from torch import nn
+from torch.func import functional_call
 
 import ops
 from passes import Base, Near
-from rates import Bound, Prior, bin_mass, bits, bounded_sigma
+from rates import Bound, Prior, Through, bin_mass, bits, bounded_sigma
 
 
 def initial(taps, cin, cout, scale=1.0):
@@ -141,13 +142,18 @@ class Entropy(nn.Module):
         return self.mu(x), self.sigma(x)
 
 
+def latents_of(cfg, role):
+    """How many latents a voxel of a role has: those from `latent_roles` on are told by the level below alone."""
+    return cfg["latents"] if role < cfg.get("latent_roles", 3) else 0
+
+
 class Reconstruct(nn.Module):
-    def __init__(self, cfg, context):
+    def __init__(self, cfg, role):
         super().__init__()
-        c, k = cfg["channels"], cfg["latents"]
+        c, k, context = cfg["channels"], latents_of(cfg, role), role > 0
         self.lin1 = Conv(k + c if context else k, c, 1)
         with torch.no_grad():  # latents have a standard deviation of 2 to 4, features of about 1
-            self.lin1.weight[:, :k] = torch.randn(1, k, c) * (0.3 / math.sqrt(k) if context else 0.4 / math.sqrt(k))
+            self.lin1.weight[:, :k] = torch.randn(1, k, c) * ((0.3 if context else 0.4) / math.sqrt(max(k, 1)))
         self.blocks = nn.ModuleList(Inception(c, cfg["inception_relu"]) for _ in range(cfg["fr_blocks"]))
         self.lin2 = Conv(c, c, 1)
 
@@ -259,9 +265,9 @@ class B2P(nn.Module):
         self.cfg = cfg
         c = cfg["channels"]
         self.fc = nn.ModuleList(FeatureConvert(cfg, 3 if r == 3 else c) for r in range(4))
-        self.fs = nn.ModuleList(FeatureSqueeze(cfg, r > 0) for r in range(3))
-        self.fr = nn.ModuleList(Reconstruct(cfg, r > 0) for r in range(3))
-        self.pem = nn.ModuleDict({str(r): Entropy(cfg) for r in (1, 2)})
+        self.fs = nn.ModuleList(FeatureSqueeze(cfg, r > 0) for r in range(3) if latents_of(cfg, r))
+        self.fr = nn.ModuleList(Reconstruct(cfg, r) for r in range(3))
+        self.pem = nn.ModuleDict({str(r): Entropy(cfg) for r in (1, 2) if latents_of(cfg, r)})
         self.gg = nn.ModuleDict({str(g["role"]): Generate(cfg, g) for g in cfg["gg"]})
         self.prior = Prior(cfg["latents"])
         if cfg.get("base_channels"):
@@ -305,47 +311,52 @@ class B2P(nn.Module):
     def code(self, crop, features, top, mode):
         """Runs roles 0 .. top. mode: 'noise' (noise for rate and distortion), 'mixed' (straight-through rounding for
         distortion; for rate, noise moves the latents and rounding fits the entropy models), 'round'. Returns g, bits and latents of each role."""
-        trail, rates, latents, limit = [], [], [], float(self.cfg["latent_max"])
+        trail, rates, latents = [], [], []
         for r in range(top + 1):
             c = self.context(trail[-1], crop, r) if r else None
-            y = self.fs[r](features[r], c).clamp(-limit, limit)
-            rounded = y + (torch.round(y) - y).detach()
-            noisy = rounded if mode == "round" else y + torch.rand_like(y) - 0.5
-            mu, log_sigma = self.pem[str(r)](c, crop.kernel3[r]) if r else (None, None)
+            y = self.squeeze(r, features[r], c)
+            rounded = Through.apply(torch.round(y), y)
+            noisy = y + torch.rand_like(y) - 0.5
+            mu, log_sigma = self.predict(r, c, crop)
             if mode == "round":
-                rates.append(self.coded_bits(r, rounded, mu, log_sigma, crop) if r else self.bits(rounded, mu, log_sigma))
+                rates.append(self.bits(r, rounded, mu, log_sigma, crop))
             elif mode == "noise":
-                rates.append(self.bits(noisy, mu, log_sigma))
+                rates.append(self.bits(r, noisy, mu, log_sigma, crop))
             else:  # the entropy models learn the rounded latents that they will meet, the latents the smooth proxy
-                fixed = (mu.detach(), log_sigma.detach()) if r else (None, None)
-                smooth = self.bits(noisy, *fixed, learn=False)
-                rates.append(self.bits(rounded.detach(), mu, log_sigma) + smooth - smooth.detach())
+                fixed = [p if p is None else p.detach() for p in (mu, log_sigma)]
+                smooth = self.bits(r, noisy, *fixed, crop, seen=rounded, learn=False)
+                rates.append(self.bits(r, rounded.detach(), mu, log_sigma, crop) + smooth - smooth.detach())
             latents.append(y)
             trail.append(self.fr[r](noisy if mode == "noise" else rounded, c, crop.kernel3[r]))
         return trail, rates, latents
 
-    def coded_bits(self, r, y, mu, log_sigma, crop):
-        """Cost of whole latents of a role as they are coded: predicted from neighbours too, where the model does so and there are any that
-        came before. `mu` and `log_sigma` are what the level below predicts, None for role 0."""
-        coords, table = crop.coords[r], crop.kernel3[r].table
+    def squeeze(self, r, features, c):
+        """The latents of a role before they are rounded."""
+        if not latents_of(self.cfg, r):
+            return features.new_zeros(len(features), 0)
+        limit = float(self.cfg["latent_max"])
+        return self.fs[r](features, c).clamp(-limit, limit)
+
+    def predict(self, r, c, crop):
+        """Mean and log standard deviation of a role's latents as the level below tells them; None for role 0 and where there are no latents."""
+        return self.pem[str(r)](c, crop.kernel3[r]) if r and latents_of(self.cfg, r) else (None, None)
+
+    def bits(self, r, y, mu, log_sigma, crop, seen=None, learn=True):
+        """Cost of a role's latents as they are coded: predicted from neighbours too, where the model does so and there are any that came
+        before. `mu` and `log_sigma` are what `predict` gave. `seen`: what neighbours show, if not `y`; `learn`:
+        whether what predicts from neighbours, and the prior, get a gradient."""
+        use = (lambda m, *x: m(*x)) if learn else (lambda m, *x: functional_call(m, {k: p.detach() for k, p in m.named_parameters()}, x))
+        seen, coords, table = y if seen is None else seen, crop.coords[r], crop.kernel3[r].table
+        if not y.shape[1]:
+            return y.sum()
         if r:
             if str(r) in self.near:
-                mu, log_sigma = self.near[str(r)].correct(y, mu, log_sigma, coords, table)
-            return self.bits(y, mu, log_sigma)
-        if not self.cfg.get("base_channels"):
-            return bits(self.prior(y))
-        x, known = self.base.inputs(y, coords, table)
-        mu, log_sigma = self.base(x[known])
-        return bits(bin_mass(y[known], mu, bounded_sigma(log_sigma))) + bits(self.prior(y[~known]))
-
-    def bits(self, y, mu, log_sigma, learn=True):
-        """Cost of latents: under the prior when mu is None. `learn`: whether the prior's parameters get a gradient."""
-        if mu is not None:
+                mu, log_sigma = use(self.near[str(r)], seen, mu, log_sigma, coords, table)
             return bits(bin_mass(y, mu, bounded_sigma(log_sigma)))
-        if learn:
-            return bits(self.prior(y))
-        frozen = {k: p.detach() for k, p in self.prior.named_parameters()}
-        return bits(torch.func.functional_call(self.prior, frozen, (y,)))
+        if not self.cfg.get("base_channels"):
+            return bits(use(self.prior, y))
+        any, mu, log_sigma = use(self.base, seen, coords, table)
+        return bits(bin_mass(y[any], mu, bounded_sigma(log_sigma))) + bits(use(self.prior, y[~any]))
 
     def generate(self, g, crop, role):
         """Gaussians of head `role`, in finest-voxel units."""
@@ -361,19 +372,25 @@ class B2P(nn.Module):
         for m in self.modules():
             if isinstance(m, NormConv):
                 m.calibrating = True
-        features, g, k = self.analyse(crop, rgb), None, self.cfg["latents"]
+        features, g = self.analyse(crop, rgb), None
         for r in range(3):
             c = self.context(g, crop, r) if r else None
-            hidden = self.fs[r].lin1(features[r] if c is None else torch.cat([features[r], c], 1), relu=True).double()
-            mean = hidden.mean(0)
-            values, vectors = torch.linalg.eigh(torch.cov(hidden.T))
-            w = vectors[:, -k:] * (target / values[-k:].clamp_min(1e-12).sqrt())
-            self.fs[r].lin2.weight.copy_(w[None].float())
-            self.fs[r].lin2.bias.copy_((-mean @ w).float())
-            g = self.fr[r](torch.round(self.fs[r](features[r], c)), c, crop.kernel3[r])
+            if latents_of(self.cfg, r):
+                self.start_squeeze(r, features[r], c, target)
+            g = self.fr[r](torch.round(self.squeeze(r, features[r], c)), c, crop.kernel3[r])
             if r:
-                self.pem[str(r)](c, crop.kernel3[r])
+                self.predict(r, c, crop)
                 self.generate(g, crop, r)
+
+    def start_squeeze(self, r, features, c, target):
+        """A squeeze's starting values: the leading principal components of its hidden layer, whitened to a standard deviation of `target`."""
+        k = self.cfg["latents"]
+        hidden = self.fs[r].lin1(features if c is None else torch.cat([features, c], 1), relu=True).double()
+        mean = hidden.mean(0)
+        values, vectors = torch.linalg.eigh(torch.cov(hidden.T))
+        w = vectors[:, -k:] * (target / values[-k:].clamp_min(1e-12).sqrt())
+        self.fs[r].lin2.weight.copy_(w[None].float())
+        self.fs[r].lin2.bias.copy_((-mean @ w).float())
 
     @torch.no_grad()
     def pass_colour(self, luma=20.0, chroma=14.0):
@@ -387,20 +404,23 @@ class B2P(nn.Module):
             for b in fc.blocks:
                 let_pass(b)
             route(fc.conv_out, rectified @ signed)
-        c, k = self.cfg["channels"], self.cfg["latents"]
+        c = self.cfg["channels"]
         for r in range(3):
-            fs, fr = self.fs[r], self.fr[r]
-            fs.lin1.weight[:, :, :2 * n] = 0
-            fs.lin1.bias[:2 * n] = 0
-            fs.lin1.weight[0, :n, :2 * n] = signed
-            if r:
-                fs.lin1.weight[0, c:c + n, :2 * n] = -signed
-            fs.lin2.weight[:, :, :n] = 0
-            fs.lin2.bias[:n] = 0
-            fs.lin2.weight[0, :2 * n, :n] = rectified * steps
+            fr, k = self.fr[r], latents_of(self.cfg, r)
+            if k:
+                fs = self.fs[r]
+                fs.lin1.weight[:, :, :2 * n] = 0
+                fs.lin1.bias[:2 * n] = 0
+                fs.lin1.weight[0, :n, :2 * n] = signed
+                if r:
+                    fs.lin1.weight[0, c:c + n, :2 * n] = -signed
+                fs.lin2.weight[:, :, :n] = 0
+                fs.lin2.bias[:n] = 0
+                fs.lin2.weight[0, :2 * n, :n] = rectified * steps
             fr.lin1.weight[:, :, :2 * n] = 0
             fr.lin1.bias[:2 * n] = 0
-            fr.lin1.weight[0, :n, :2 * n] = signed / steps[:, None]
+            if k:
+                fr.lin1.weight[0, :n, :2 * n] = signed / steps[:, None]
             if r:
                 fr.lin1.weight[0, k:k + n, :2 * n] = signed
             for b in fr.blocks:

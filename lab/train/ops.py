@@ -134,7 +134,8 @@ class _Conv(torch.autograd.Function):
         e = extension()
         g, db = e.plain_grad(dy.contiguous(), y, ctx.relu, w.shape[0])
         dx = e.conv(g, w, True, ctx.kmap.back, None, None, False)[0] if ctx.needs_input_grad[0] else None
-        return dx, e.weight_grad(x, g, ctx.kmap.table, *w.shape[1:]), db, None, None
+        dw = e.weight_grad(x, g, ctx.kmap.table, *w.shape[1:]) if ctx.needs_input_grad[1] else None
+        return dx, dw, db, None, None
 
 
 @functools.lru_cache(maxsize=64)
@@ -159,7 +160,7 @@ class _NormConv(torch.autograd.Function):
         e = extension()
         g, dgain, db, ds = e.norm_grad(dy.contiguous(), y, hat, inv, gain, ctx.kmap.table, ctx.relu)
         dx = e.conv(g, w, True, ctx.kmap.back, None, None, False)[0] if ctx.needs_input_grad[0] else None
-        dw = e.weight_grad(x, g, ctx.kmap.table, *w.shape[1:]).addcmul_(w, ds[:, None, :], value=2)
+        dw = e.weight_grad(x, g, ctx.kmap.table, *w.shape[1:]).addcmul_(w, ds[:, None, :], value=2) if ctx.needs_input_grad[1] else None
         return dx, dw, dgain, db, None, None
 
 

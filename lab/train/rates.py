@@ -39,6 +39,18 @@ class Bound(torch.autograd.Function):
         return g.masked_fill(stop, 0), None, None
 
 
+class Through(torch.autograd.Function):
+    """The first argument, with the gradient of the second."""
+
+    @staticmethod
+    def forward(ctx, exact, smooth):
+        return exact.view_as(exact)
+
+    @staticmethod
+    def backward(ctx, g):
+        return None, g
+
+
 def bounded_sigma(log_sigma):
     return torch.exp(Bound.apply(log_sigma, math.log(SIGMA_MIN), math.log(SIGMA_MAX)))
 

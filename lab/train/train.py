@@ -150,6 +150,7 @@ class Trainer:
         torch.manual_seed(args.seed)
         self.rng = random.Random(args.seed)
         self.model = B2P(self.cfg).to(self.device)
+        self.model.gg.requires_grad_(args.lr_heads > 0)
         learning = self.model.gg if args.only_heads else self.model
         self.optimiser = torch.optim.Adam(groups(learning, args.lr_conv, args.lr_linear, args.lr_heads), betas=(0.9, 0.999), eps=1e-8, fused=True)
         self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
@@ -270,9 +271,9 @@ class Trainer:
             matrix = LUMA_CHROMA.to(raw.device)
             for g, probe, target in zip(trail, self.model.probe, self.model.colours(sample.crop, sample.rgb)):
                 probes = probes + ((probe(g) + 0.5 - target) @ matrix).abs().mean()
-        loss = hint * self.args.lam * probes + weight * rate + self.args.lam * d + 1e-4 * sum((y / 8).pow(4).mean() for y in latents)
+        loss = hint * self.args.lam * probes + weight * rate + self.args.lam * d + 1e-4 * sum((y / 8).pow(4).mean() for y in latents if y.numel())
         return loss, {"probe": float(torch.as_tensor(probes).detach()), "rate": [r.item() / sample.crop.points for r in rates], "d": drawn,
-                      "mse": mse, "std": [y.std().item() for y in latents]}
+                      "mse": mse, "std": [y.std().item() for y in latents if y.numel()]}
 
     def train_step(self, samples, calibration=None):
         args, x = self.args, self.fraction()
@@ -358,7 +359,7 @@ def main(argv=None):
     p.add_argument("--hint-until", type=float, default=0.5)
     p.add_argument("--lr-conv", type=float, default=1e-4)
     p.add_argument("--lr-linear", type=float, default=3e-4)
-    p.add_argument("--lr-heads", type=float, default=1.0, help="by how much faster the heads learn when the whole network does")
+    p.add_argument("--lr-heads", type=float, default=1.0, help="by how much faster the heads learn when the whole network does; 0: they stay")
     p.add_argument("--warmup", type=int, default=400)
     p.add_argument("--decay-from", type=float, default=0.6)
     p.add_argument("--rate-start", type=float, default=0.003)
@@ -401,6 +402,8 @@ def main(argv=None):
         trainer.start_from(args.init)
     if (args.teacher or args.quick_of) and not args.only_heads or args.draw_from and not args.teacher:
         p.error("--teacher and --quick-of want --only-heads, --draw-from wants --teacher")
+    if args.revive and args.revive >= trainer.cfg.get("latent_roles", 3):
+        p.error("--revive wants a role that has latents")
     if args.stay and (not args.init or trainer.new_heads):
         p.error("--stay wants weights of the same heads in --init")
     if args.teacher:
@@ -440,7 +443,7 @@ def main(argv=None):
                 of = [m for m in means if m["head"] == h]
                 if of:
                     row[f"rate{h}"] = [round(sum(m["rate"][r] for m in of) / len(of), 4) for r in range(h + 1)]
-                    row[f"std{h}"] = [round(of[-1]["std"][r], 2) for r in range(h + 1)]
+                    row[f"std{h}"] = [round(std, 2) for std in of[-1]["std"]]
                     row[f"d{h}"] = round(sum(m["d"] for m in of) / len(of), 4)
                 drawn = [m["mse"] for m in of if m["mse"] is not None]
                 if drawn:

@@ -21,10 +21,10 @@ from train import atomic_save, keep_memory
 @torch.no_grad()
 def inputs(model, sample):
     """(context, rounded latents, kernel map) of roles 0 .. 2, the crop, and the number of points."""
-    features, g, out, limit = model.analyse(sample.crop, sample.rgb), None, [], float(model.cfg["latent_max"])
+    features, g, out = model.analyse(sample.crop, sample.rgb), None, []
     for r in range(3):
         c, kmap = model.context(g, sample.crop, r) if r else None, sample.crop.kernel3[r]
-        y = torch.round(model.fs[r](features[r], c).clamp(-limit, limit))
+        y = torch.round(model.squeeze(r, features[r], c))
         out.append((c, y, kmap))
         if r < 2:
             g = model.fr[r](y, c, kmap)
@@ -33,13 +33,12 @@ def inputs(model, sample):
 
 def rates(model, roles, crop, coarse_mean=False):
     """Bits per role. `coarse_mean`: with the means in the sixteenths that the stream has."""
-    out = [model.coded_bits(0, roles[0][1], None, None, crop)]
-    for r in (1, 2):
-        c, y, kmap = roles[r]
-        mu, log_sigma = model.pem[str(r)](c, kmap)
-        if coarse_mean:
+    out = []
+    for r, (c, y, _) in enumerate(roles):
+        mu, log_sigma = model.predict(r, c, crop)
+        if coarse_mean and mu is not None:
             mu = mu + (torch.round(mu * 16) / 16 - mu).detach()
-        out.append(model.coded_bits(r, y, mu, log_sigma, crop))
+        out.append(model.bits(r, y, mu, log_sigma, crop))
     return out
 
 

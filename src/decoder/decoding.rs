@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 
 use super::{Decoder, Exact};
 use crate::bitstream::{Header, Level, MAGIC};
-use crate::entropy::{Condition, decode_level, decode_passes, latent_hash};
+use crate::entropy::{Condition, decode_level, decode_nothing, decode_passes, latent_hash};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, codec};
@@ -404,6 +404,11 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let (n, count) = (level.level, level.voxels as usize);
         let (role, slice) = (usize::from(n - header.base), header.slice_voxels as usize);
         self.cancel.check()?;
+        if !self.model.has_latents(role) {
+            decode_nothing(&level.features, count, slice, n)?;
+            level.check_latents(latent_hash(&[]))?;
+            return Ok(Vec::new());
+        }
         let parameters = context
             .map(|context| {
                 log.step(Module::Probabilities(role).at(n), count, "voxels", || {

@@ -39,7 +39,7 @@ pub struct Decoder<M> {
 pub struct Exact {
     /// The octree down to this level.
     pub octree: Octree,
-    /// The latents, K per voxel.
+    /// The latents, K per voxel; none if the level's role has none.
     pub latents: Vec<i16>,
     /// The reconstructed features, C per voxel.
     pub features: Vec<i16>,

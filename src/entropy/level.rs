@@ -68,6 +68,41 @@ pub fn decode_level(
     Ok(latents)
 }
 
+/// The slices of a level whose voxels have no latents: empty ones.
+///
+/// # Panics
+/// If `slice_voxels` is 0.
+pub fn encode_nothing(voxels: usize, slice_voxels: usize) -> Vec<Vec<u8>> {
+    vec![Vec::new(); voxels.div_ceil(slice_voxels)]
+}
+
+/// Sees that these are what [`encode_nothing`] makes.
+///
+/// # Errors
+/// [`Error::Malformed`] if there are more or fewer slices, or one is not empty.
+///
+/// # Panics
+/// If `slice_voxels` is 0.
+pub fn decode_nothing(
+    slices: &[Slice],
+    voxels: usize,
+    slice_voxels: usize,
+    level: u8,
+) -> Result<()> {
+    expect_slices(slices.len(), voxels, slice_voxels, level)?;
+    let filled = (0..).zip(slices).find(|(_, slice)| !slice.bytes.is_empty());
+    match filled {
+        None => Ok(()),
+        Some((i, slice)) => Err(Error::malformed(
+            Stage::Entropy,
+            place(level, i, slice),
+            "length",
+            slice.bytes.len(),
+            "0: the model has no latents there",
+        )),
+    }
+}
+
 /// Where a feature slice lies.
 pub(super) fn place(level: u8, slice: usize, part: &Slice) -> String {
     format!("byte {}, level {level}, feature slice {slice}", part.offset)
@@ -181,6 +216,22 @@ mod tests {
         let error = decode(&slices).unwrap_err().to_string();
         let place = "byte 1000, level 7, feature slice 1";
         assert!(error.contains(place), "{error}");
+    }
+
+    #[test]
+    fn a_level_without_latents_has_empty_slices_and_no_others() {
+        let nothing = encode_nothing(100, 40);
+        assert_eq!(nothing, vec![Vec::<u8>::new(); 3]);
+        let mut slices = slices_of(&nothing);
+        assert!(decode_nothing(&slices, 100, 40, 9).is_ok());
+        assert!(decode_nothing(&slices[..2], 100, 40, 9).is_err());
+        slices[1].bytes = &[0];
+        slices[1].offset = 1000;
+        let error = decode_nothing(&slices, 100, 40, 9).unwrap_err().to_string();
+        assert!(
+            error.contains("byte 1000, level 9, feature slice 1: length is 1, expected 0"),
+            "{error}"
+        );
     }
 
     #[test]

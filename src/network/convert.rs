@@ -55,7 +55,7 @@ impl Model {
     }
 
     /// The latents [voxels, K] of a role before they are rounded and bounded ([`crate::entropy::quantise`]), from its encoder features
-    /// and, above role 0, its context.
+    /// and, above role 0, its context. None of a role that has none.
     ///
     /// # Errors
     /// [`crate::Error::Unsupported`] if the model can only decode.
@@ -74,6 +74,9 @@ impl Model {
             "all roles but 0 have a context"
         );
         let (fs, c) = (&self.encoder()?.fs[role], self.shape.channels);
+        let Some(fs) = fs else {
+            return Ok(Vec::new());
+        };
         let (rows, pool) = (features.len() / c, &mut Pool::new());
         let hidden = match context {
             None => apply(pool, self.isa, &fs.lin1, Taps::Same, features, rows, true),

@@ -52,12 +52,17 @@ impl Model {
         }
     }
 
+    /// Whether a role has latents.
+    pub fn has_latents(&self, role: usize) -> bool {
+        self.shape.latents_of(role) > 0
+    }
+
     /// How the latents of a role are distributed: means in sixteenths, in ±2047, and scale indices below 64, [voxels, K] each.
     ///
     /// `context` is [`Model::upsample`]'s, `map` the level's 3³ kernel map.
     ///
     /// # Panics
-    /// If `role` is not 1 or 2, or `context` and `map` disagree in length.
+    /// If `role` is not 1 or 2 or has no latents, or `context` and `map` disagree in length.
     pub fn entropy_parameters(
         &self,
         role: usize,
@@ -76,7 +81,8 @@ impl Model {
     ) -> (Vec<i16>, Vec<u8>) {
         assert!(role == 1 || role == 2, "role {role} has a fixed prior");
         self.check(context, self.shape.channels, map);
-        let pem = &self.exact.pem[role - 1];
+        let pem = self.exact.pem[role - 1].as_ref();
+        let pem = pem.expect("the caller asks has_latents first");
         let (isa, n) = (self.isa, map.len());
         let x = apply(pool, isa, &pem.conv_in, map.taps(), context, n, true);
         let x = self.blocks(pool, &pem.blocks, x, map);
@@ -89,7 +95,7 @@ impl Model {
         (mu, indices)
     }
 
-    /// The features [voxels, C] of a role, from its latents [voxels, K] and, above role 0, its context [voxels, C].
+    /// The features [voxels, C] of a role, from its latents [voxels, K], none if it has none, and, above role 0, its context [voxels, C].
     ///
     /// # Panics
     /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.
@@ -116,19 +122,27 @@ impl Model {
             context.is_some(),
             "all roles but 0 have a context"
         );
-        let (c, k) = (self.shape.channels, self.shape.latents);
+        let (c, k) = (self.shape.channels, self.shape.latents_of(role));
         self.check(latents, k, map);
         let limit = i32::from(LIMIT);
         let shift = self.shape.latent_shift;
         let raise = |&y: &i16| (i32::from(y) << shift).clamp(-limit, limit) as i16;
         let mut x: Vec<i16> = latents.par_iter().map(raise).collect();
-        if let Some(context) = context {
-            self.check(context, c, map);
-            x = concat(pool, &x, k, context, c);
-        }
+        let known = match context {
+            None => &x,
+            Some(context) => {
+                self.check(context, c, map);
+                if k == 0 {
+                    context
+                } else {
+                    x = concat(pool, &x, k, context, c);
+                    &x
+                }
+            }
+        };
         let fr = &self.exact.fr[role];
         let (isa, n) = (self.isa, map.len());
-        let hidden = apply(pool, isa, &fr.lin1, Taps::Same, &x, n, true);
+        let hidden = apply(pool, isa, &fr.lin1, Taps::Same, known, n, true);
         pool.give(x);
         let x = self.blocks(pool, &fr.blocks, hidden, map);
         let features = apply(pool, isa, &fr.lin2, Taps::Same, &x, n, false);

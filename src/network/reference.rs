@@ -303,7 +303,7 @@ impl Oracle {
             blocks,
             mu,
             sigma,
-        } = &self.exact.pem[role - 1];
+        } = self.exact.pem[role - 1].as_ref().unwrap();
         let x = relu(self.around(conv_in, at, c));
         let x = self.inceptions(blocks, at, x);
         let mut sigma = self.here(sigma, at, &x);
@@ -384,7 +384,7 @@ impl Oracle {
 
     /// Latents before they are clamped and rounded; the context in integer steps.
     pub fn squeeze(&self, role: usize, at: &Sites, f: &Rows, c: Option<&Rows>) -> Rows {
-        let Squeeze { lin1, lin2 } = &self.encoder.fs[role];
+        let Squeeze { lin1, lin2 } = self.encoder.fs[role].as_ref().unwrap();
         let scale = f64::from(self.c_scale[role]);
         let x = match c {
             None => f.clone(),

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::heads::{Head, Heads};
+use super::structure::ROLES;
 use crate::error::{Error, Result, Stage};
 
 /// Everything that a model file says of the network beside its tensors. Other keys of the file are ignored.
@@ -17,6 +18,9 @@ pub struct Shape {
     pub channels: usize,
     /// K: latents per voxel.
     pub latents: usize,
+    /// How many roles have latents, the first ones: what is known of the levels of others comes from the level below alone.
+    #[serde(default = "all_roles")]
+    pub latent_roles: usize,
     /// Channels of the network that predicts the base level from neighbours, a multiple of 4; 0 where there is none.
     #[serde(default)]
     pub base_channels: usize,
@@ -64,6 +68,10 @@ pub enum Upsample {
     Learned,
 }
 
+fn all_roles() -> usize {
+    ROLES
+}
+
 /// Channels beyond which no model is taken.
 const MAX_CHANNELS: usize = 256;
 /// Latents beyond which no model is taken.
@@ -87,6 +95,7 @@ impl Shape {
             name: "tiny".into(),
             channels: 8,
             latents: 4,
+            latent_roles: ROLES,
             base_channels: 8,
             near_channels: [8, 4],
             fc_blocks: 1,
@@ -151,6 +160,15 @@ impl Shape {
         serde_json::to_string(self).expect("a shape has no keys but strings")
     }
 
+    /// Latents per voxel of a role: K, or 0 if it has none.
+    pub fn latents_of(&self, role: usize) -> usize {
+        if role < self.latent_roles {
+            self.latents
+        } else {
+            0
+        }
+    }
+
     /// The head of a role.
     pub fn head(&self, role: usize, heads: Heads) -> Option<&Head> {
         let wanted = |head: &&Head| (head.role, head.heads) == (role, heads);
@@ -177,8 +195,12 @@ impl Shape {
             [0, 0] => String::new(),
             [first, second] => format!(";near_channels={first},{second}"),
         };
+        let roles = match self.latent_roles {
+            ROLES => String::new(),
+            roles => format!(";latent_roles={roles}"),
+        };
         format!(
-            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}{near}",
+            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}{near}{roles}",
             self.channels,
             self.latents,
             self.pem_blocks,
@@ -214,16 +236,18 @@ impl Shape {
             &self.base_channels,
             "0, or a multiple of 4 up to 256",
         )?;
-        for near in self.near_channels {
-            require(
-                near == 0 || channels(near),
-                "near_channels",
-                &near,
-                "0, or a multiple of 4 up to 256",
-            )?;
-        }
         let latents = (1..=MAX_LATENTS).contains(&self.latents);
         require(latents, "latents", &self.latents, "1 to 64")?;
+        let roles = (1..=ROLES).contains(&self.latent_roles);
+        require(roles, "latent_roles", &self.latent_roles, "1 to 3")?;
+        for (role, near) in (1..).zip(self.near_channels) {
+            require(
+                near == 0 || (channels(near) && role < self.latent_roles),
+                "near_channels",
+                &near,
+                "0, or for a role that has latents a multiple of 4 up to 256",
+            )?;
+        }
         for (field, blocks) in [
             ("fc_blocks", self.fc_blocks),
             ("pem_blocks", self.pem_blocks),
@@ -404,6 +428,8 @@ mod tests {
             ("/channels", "0"),
             ("/channels", "1000000"),
             ("/latents", "65"),
+            ("/latent_roles", "0"),
+            ("/latent_roles", "4"),
             ("/base_channels", "260"),
             ("/near_channels/1", "6"),
             ("/pem_blocks", "17"),

@@ -143,8 +143,8 @@ pub(crate) struct Exact<L> {
     pub base: Option<Neighbours<L>>,
     /// Of roles 1 and 2, for which the model has it.
     pub near: [Option<Neighbours<L>>; 2],
-    /// Of roles 1 and 2.
-    pub pem: [Entropy<L>; 2],
+    /// Of roles 1 and 2, if they have latents.
+    pub pem: [Option<Entropy<L>>; 2],
     /// Of roles 0, 1 and 2.
     pub fr: [Reconstruct<L>; ROLES],
 }
@@ -153,8 +153,8 @@ pub(crate) struct Exact<L> {
 pub(crate) struct Encoder<L> {
     /// Of roles 0 to 3.
     pub fc: [Convert<L>; ROLES + 1],
-    /// Of roles 0 to 2.
-    pub fs: [Squeeze<L>; ROLES],
+    /// Of roles 0 to 2, if they have latents.
+    pub fs: [Option<Squeeze<L>>; ROLES],
 }
 
 /// Makes layers for [`Spec`]s below a name.
@@ -228,18 +228,18 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
             .collect()
     }
 
-    fn entropy(&mut self, role: usize) -> Result<Entropy<L>> {
-        let (c, k, module) = (
-            self.shape.channels,
-            self.shape.latents,
-            format!("pem.{role}"),
-        );
-        Ok(Entropy {
+    fn entropy(&mut self, role: usize) -> Result<Option<Entropy<L>>> {
+        let (c, k) = (self.shape.channels, self.shape.latents_of(role));
+        let module = format!("pem.{role}");
+        if k == 0 {
+            return Ok(None);
+        }
+        Ok(Some(Entropy {
             conv_in: self.make(&format!("{module}.conv_in"), 27, c, c, true)?,
             blocks: self.inceptions(&module, self.shape.pem_blocks, true)?,
             mu: self.linear(&format!("{module}.mu"), c, k)?,
             sigma: self.linear(&format!("{module}.sigma"), c, k)?,
-        })
+        }))
     }
 
     fn neighbours(
@@ -261,11 +261,8 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
     }
 
     fn reconstruct(&mut self, role: usize) -> Result<Reconstruct<L>> {
-        let (c, k, module) = (
-            self.shape.channels,
-            self.shape.latents,
-            format!("fr.{role}"),
-        );
+        let (c, k) = (self.shape.channels, self.shape.latents_of(role));
+        let module = format!("fr.{role}");
         let cin = if role == 0 { k } else { k + c };
         Ok(Reconstruct {
             lin1: self.linear(&format!("{module}.lin1"), cin, c)?,
@@ -303,17 +300,17 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
         })
     }
 
-    fn squeeze(&mut self, role: usize) -> Result<Squeeze<L>> {
-        let (c, k, module) = (
-            self.shape.channels,
-            self.shape.latents,
-            format!("fs.{role}"),
-        );
+    fn squeeze(&mut self, role: usize) -> Result<Option<Squeeze<L>>> {
+        let (c, k) = (self.shape.channels, self.shape.latents_of(role));
+        let module = format!("fs.{role}");
+        if k == 0 {
+            return Ok(None);
+        }
         let cin = if role == 0 { c } else { 2 * c };
-        Ok(Squeeze {
+        Ok(Some(Squeeze {
             lin1: self.linear(&format!("{module}.lin1"), cin, c)?,
             lin2: self.linear(&format!("{module}.lin2"), c, k)?,
-        })
+        }))
     }
 }
 

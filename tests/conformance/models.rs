@@ -37,6 +37,14 @@ pub fn model(name: &str) -> Model {
             },
             4,
         ),
+        "base" => made(
+            Shape {
+                latent_roles: 1,
+                near_channels: [0, 0],
+                ..tiny
+            },
+            5,
+        ),
         "lite" => {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/lite.safetensors");
             std::fs::read(path).expect("the model that ships")

@@ -231,6 +231,20 @@ fn a_model_for_another_number_of_latents_than_its_tables_is_refused() {
 }
 
 #[test]
+fn a_model_whose_layers_read_latents_that_its_description_has_not_is_refused() {
+    let shape = Shape {
+        latent_roles: 2,
+        near_channels: [8, 0],
+        ..Shape::tiny()
+    };
+    let mut file = File::tiny();
+    file.json = shape.to_json();
+    let error = file.load().err().unwrap().to_string();
+    assert!(error.contains("fr.2.lin1"), "{error}");
+    assert!(Model::from_bytes(&untrained(&shape, 1)).is_ok());
+}
+
+#[test]
 fn a_file_without_the_encoder_decodes_and_says_that_it_cannot_encode() {
     let model = File::tiny().without("fc.").without("fs.").load().unwrap();
     assert!(!model.can_encode());
