@@ -7,9 +7,7 @@ use rayon::prelude::*;
 use crate::bitstream::{Header, MAX_SLICE_VOXELS, Writer};
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
-use crate::entropy::{
-    Condition, encode_level, encode_nothing, encode_passes, latent_hash, quantise,
-};
+use crate::entropy::{Condition, encode_level, encode_passes, latent_hash, quantise};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
@@ -196,20 +194,19 @@ pub(crate) fn write(
                 let context = below
                     .as_ref()
                     .map(|g| model.upsample(role, g, octree.occupancy(level - 1)));
-                let predicted = context.as_ref().filter(|_| model.has_latents(role));
-                let parameters = predicted.map(|c| model.entropy_parameters(role, c, map));
+                if !model.has_latents(role) {
+                    return Ok(Some(model.reconstruct(role, &[], context.as_deref(), map)));
+                }
+                let parameters = context
+                    .as_ref()
+                    .map(|c| model.entropy_parameters(role, c, map));
                 let condition = match &parameters {
                     Some((mu, sigma)) => Condition::Gauss { mu, sigma },
                     None => Condition::Prior,
                 };
                 let tables = model.tables();
-                let latents = match model.has_latents(role) {
-                    true => latents(role, condition, context.as_deref())?,
-                    false => Vec::new(),
-                };
-                let slices = if !model.has_latents(role) {
-                    encode_nothing(count, slice)
-                } else if model.has_passes(role) {
+                let latents = latents(role, condition, context.as_deref())?;
+                let slices = if model.has_passes(role) {
                     let octants = octree.level(level).octants();
                     let predict = model.passes(role, &octants, map, parameters.as_ref());
                     encode_passes(tables, &octants, &predict, &latents, slice)

@@ -57,6 +57,8 @@ whole=(--only-heads --stay 0.5 --data "$out/whole" --views 2 --square 40 --held-
 # Thin heads first imitate those of the weights that they start from.
 imitate=(--only-heads --init "$out/lite.weights.safetensors" --teacher "$out/lite.weights.safetensors" --draw-from 2 --imitate-until 1e9 --lam 1
     --average 0.998 --lr-conv 1.5e-3 --lr-linear 2.4e-3 --warmup 100 --decay-from 0.3)
+# Of a network that has learned, everything but its heads, and the mean with before.
+rest=(--freeze-finest --lr-heads 0 --rate-start 1 --rate-ramp 0.01 --rounding-from 0 --decay-from 0.2 --warmup 100 --square 40 --stay 0.5)
 # Of a network that has learned, everything, the heads faster than the rest.
 all=(--freeze-finest --lr-heads 3 --rate-start 1 --rate-ramp 0.01 --rounding-from 0 --decay-from 0.25 --warmup 50)
 
@@ -65,7 +67,8 @@ train low lite 12 --init "$out/start/last.pt" --lam 4 --freeze-finest --rate-sta
 train low-heads lite 44 --init "$out/low/last.pt" --lam 1 "${heads[@]}"
 train low-whole-1 lite 21 --init "$out/low-heads/last.pt" --coarse 1 "${whole[@]}"
 train low-whole-2 lite 21 --init "$out/low-whole-1/last.pt" --coarse 0 "${whole[@]}"
-ship low-whole-2 lite-low
+train low-rest lite 30 --init "$out/low-whole-2/last.pt" --lam 4 "${rest[@]}"
+ship low-rest lite-low --only-base
 low=(--init "$out/lite-low.weights.safetensors" --teacher "$out/lite-low.weights.safetensors")
 train low-quick-1 lite-quick 5 --coarse 1 "${imitate[@]}" "${low[@]}"
 train low-quick-2 lite-quick 5 --coarse 0 "${imitate[@]}" "${low[@]}" --init "$out/low-quick-1/last.pt"
@@ -83,4 +86,5 @@ beside quick-whole-2 lite
 train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
 train least-whole-2 lite 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${whole[@]}"
-ship least-whole-2 lite-least --only-base
+train least-rest lite 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@]}"
+ship least-rest lite-least --only-base

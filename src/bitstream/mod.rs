@@ -42,7 +42,7 @@
 //!
 //! The feature section of a level has a chunk for every S of its voxels (the last one for what is left), slices numbered from 0.
 //! The payload is that of [`crate::entropy`]; that of slice 0 is preceded by the level's latent hash, u64:
-//! XXH3-64 of the level's latents as 16-bit numbers, voxel by voxel. Where the model has no latents, nothing else is there.
+//! XXH3-64 of the level's latents as 16-bit numbers, voxel by voxel. A level whose role has no latents in the model has an empty section.
 //!
 //! Nothing follows the last section.
 

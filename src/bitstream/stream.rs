@@ -28,9 +28,9 @@ pub struct Level<'a> {
     pub voxels: u32,
     /// The octree from the level before to this one; in the base level from level 0, one entry per level.
     pub geometry: Vec<Geometry<'a>>,
-    /// The latents, one entry per slice.
+    /// The latents, one entry per slice; none if the level has no latents.
     pub features: Vec<Slice<'a>>,
-    /// XXH3-64 of the latents.
+    /// XXH3-64 of the latents, 0 if there are none.
     pub latent_hash: u64,
 }
 
@@ -150,8 +150,10 @@ impl<'a> Level<'a> {
         chunks.finish()?;
 
         let mut chunks = take_section(bytes, &mut at, section.features, "feature section")?;
-        let (features, latent_hash) =
-            take_features(&mut chunks, header.slice_voxels, level, voxels)?;
+        let (features, latent_hash) = match section.features {
+            0 => Default::default(),
+            _ => take_features(&mut chunks, header.slice_voxels, level, voxels)?,
+        };
         chunks.finish()?;
         Ok(Level {
             level,

@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 
 use super::{Decoder, Exact};
 use crate::bitstream::{Header, Level, MAGIC};
-use crate::entropy::{Condition, decode_level, decode_nothing, decode_passes, latent_hash};
+use crate::entropy::{Condition, decode_level, decode_passes, expect_no_latents, latent_hash};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, codec};
@@ -405,8 +405,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let (role, slice) = (usize::from(n - header.base), header.slice_voxels as usize);
         self.cancel.check()?;
         if !self.model.has_latents(role) {
-            decode_nothing(&level.features, count, slice, n)?;
-            level.check_latents(latent_hash(&[]))?;
+            expect_no_latents(&level.features, n)?;
             return Ok(Vec::new());
         }
         let parameters = context

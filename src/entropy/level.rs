@@ -68,54 +68,33 @@ pub fn decode_level(
     Ok(latents)
 }
 
-/// The slices of a level whose voxels have no latents: empty ones.
-///
-/// # Panics
-/// If `slice_voxels` is 0.
-pub fn encode_nothing(voxels: usize, slice_voxels: usize) -> Vec<Vec<u8>> {
-    vec![Vec::new(); voxels.div_ceil(slice_voxels)]
-}
-
-/// Sees that these are what [`encode_nothing`] makes.
-///
-/// # Errors
-/// [`Error::Malformed`] if there are more or fewer slices, or one is not empty.
-///
-/// # Panics
-/// If `slice_voxels` is 0.
-pub fn decode_nothing(
-    slices: &[Slice],
-    voxels: usize,
-    slice_voxels: usize,
-    level: u8,
-) -> Result<()> {
-    expect_slices(slices.len(), voxels, slice_voxels, level)?;
-    let filled = (0..).zip(slices).find(|(_, slice)| !slice.bytes.is_empty());
-    match filled {
-        None => Ok(()),
-        Some((i, slice)) => Err(Error::malformed(
-            Stage::Entropy,
-            place(level, i, slice),
-            "length",
-            slice.bytes.len(),
-            "0: the model has no latents there",
-        )),
-    }
-}
-
 /// Where a feature slice lies.
 pub(super) fn place(level: u8, slice: usize, part: &Slice) -> String {
     format!("byte {}, level {level}, feature slice {slice}", part.offset)
 }
 
-/// [`Error::Malformed`] unless there are as many slices as the voxels fill.
+/// Sees that a level has as many slices as its voxels fill.
+///
+/// # Errors
+/// [`Error::Malformed`] if it has more or fewer.
 pub(super) fn expect_slices(
     slices: usize,
     voxels: usize,
     slice_voxels: usize,
     level: u8,
 ) -> Result<()> {
-    let needed = voxels.div_ceil(slice_voxels);
+    expect_number(slices, voxels.div_ceil(slice_voxels), level)
+}
+
+/// Sees that a level whose role has no latents has no slices.
+///
+/// # Errors
+/// [`Error::Malformed`] if it has any.
+pub fn expect_no_latents(slices: &[Slice], level: u8) -> Result<()> {
+    expect_number(slices.len(), 0, level)
+}
+
+fn expect_number(slices: usize, needed: usize, level: u8) -> Result<()> {
     match slices == needed {
         true => Ok(()),
         false => Err(Error::malformed(
@@ -212,26 +191,16 @@ mod tests {
             error.contains("level 7: number of feature slices is 2, expected 3"),
             "{error}"
         );
+        let error = expect_no_latents(&slices, 9).unwrap_err().to_string();
+        assert!(
+            error.contains("level 9: number of feature slices is 3, expected 0"),
+            "{error}"
+        );
+        assert!(expect_no_latents(&[], 9).is_ok());
         slices[1].bytes = &bytes[1][4..];
         let error = decode(&slices).unwrap_err().to_string();
         let place = "byte 1000, level 7, feature slice 1";
         assert!(error.contains(place), "{error}");
-    }
-
-    #[test]
-    fn a_level_without_latents_has_empty_slices_and_no_others() {
-        let nothing = encode_nothing(100, 40);
-        assert_eq!(nothing, vec![Vec::<u8>::new(); 3]);
-        let mut slices = slices_of(&nothing);
-        assert!(decode_nothing(&slices, 100, 40, 9).is_ok());
-        assert!(decode_nothing(&slices[..2], 100, 40, 9).is_err());
-        slices[1].bytes = &[0];
-        slices[1].offset = 1000;
-        let error = decode_nothing(&slices, 100, 40, 9).unwrap_err().to_string();
-        assert!(
-            error.contains("byte 1000, level 9, feature slice 1: length is 1, expected 0"),
-            "{error}"
-        );
     }
 
     #[test]

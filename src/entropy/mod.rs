@@ -4,7 +4,7 @@
 //! data of the model, never computed here.
 //!
 //! # Symbols
-//! A level has K latents per voxel, or none if the model has none in its role: then its slices have no bytes. They are coded voxel by
+//! A level has K latents per voxel, or none if the model has none in its role: then it has no slices. They are coded voxel by
 //! voxel in Morton order, the K latents of a voxel in turn. A latent `y` with the predicted mean `μ` (in sixteenths) and the scale index `σ` is coded as `d = y − m` with `m = (μ + 8) >> 4`, under row
 //! `16·σ + (μ − 16·m + 8)` of the table `cdf.gauss`. Where nothing is predicted, `d = y` under row `k` of `cdf.prior` for channel `k`.
 //!
@@ -39,7 +39,7 @@ mod slice;
 mod stack;
 mod tables;
 
-pub use level::{decode_level, decode_nothing, encode_level, encode_nothing, latent_hash};
+pub use level::{decode_level, encode_level, expect_no_latents, latent_hash};
 pub use passes::{Predict, decode_passes, encode_passes};
 pub use quantise::quantise;
 pub use slice::{Condition, END_STATE, UNPREDICTED, decode_slice, encode_slice};

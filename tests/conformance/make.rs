@@ -3,7 +3,7 @@
 use b2p::Placement;
 use b2p::bitstream::{Header, Writer};
 use b2p::encoder::{Options, encode};
-use b2p::entropy::{Condition, encode_level, encode_nothing, encode_passes, latent_hash};
+use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
 use b2p::network::Model;
@@ -108,15 +108,17 @@ fn stream(
         let context = below
             .as_ref()
             .map(|g| model.upsample(role, g, octree.occupancy(level - 1)));
-        let predicted = context.as_ref().filter(|_| model.has_latents(role));
-        let parameters = predicted.map(|c| model.entropy_parameters(role, c, &map));
-        let voxels = octree.level(level).len();
-        let count = voxels * model.shape().latents_of(role);
+        if !model.has_latents(role) {
+            below = Some(model.reconstruct(role, &[], context.as_deref(), &map));
+            continue;
+        }
+        let parameters = context
+            .as_ref()
+            .map(|c| model.entropy_parameters(role, c, &map));
+        let count = octree.level(level).len() * model.shape().latents;
         let latents: Vec<i16> = (0..count).map(|_| latents.next(&mut random)).collect();
         let (tables, slice) = (model.tables(), slice as usize);
-        let slices = if !model.has_latents(role) {
-            encode_nothing(voxels, slice)
-        } else if model.has_passes(role) {
+        let slices = if model.has_passes(role) {
             let octants = octree.level(level).octants();
             let predict = model.passes(role, &octants, &map, parameters.as_ref());
             encode_passes(tables, &octants, &predict, &latents, slice)
