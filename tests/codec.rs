@@ -2,7 +2,7 @@
 
 mod common;
 
-use b2p::bitstream::Header;
+use b2p::bitstream::{Header, Stream, Writer};
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Encoded, Options, encode};
@@ -117,6 +117,41 @@ fn levels_without_latents_cost_their_geometry_alone_and_are_not_predicted() {
             assert_eq!(asked("probabilities"), has && role > 0);
             assert!(asked("features"));
         }
+    }
+}
+
+#[test]
+fn latents_where_the_model_has_none_are_refused_and_so_is_their_absence_elsewhere() {
+    for (roles, found, expected) in [(1, 1, 0), (3, 0, 1)] {
+        let shape = Shape {
+            latent_roles: roles,
+            near_channels: [0, 0],
+            ..Shape::tiny()
+        };
+        let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
+        let bytes = coded(&ball(6, 20.0), &model).bytes;
+        let stream = Stream::parse(&bytes, &Limits::unlimited()).unwrap();
+        let mut writer = Writer::new(stream.header().clone()).unwrap();
+        for level in stream.levels() {
+            for part in &level.geometry {
+                let slices = part.slices.iter().map(|s| (s.voxels, s.bytes.to_vec()));
+                let slices: Vec<_> = slices.collect();
+                writer.geometry(part.level, &slices).unwrap();
+            }
+            let slices: Vec<_> = level.features.iter().map(|s| s.bytes).collect();
+            match level.level {
+                3 => writer.features(3, level.latent_hash, &slices).unwrap(),
+                level if found > 0 => writer.features(level, 0, &[b"more"]).unwrap(),
+                _ => {}
+            }
+        }
+        let claims = writer.finish().unwrap();
+        let (decoder, log) = (Decoder::new(&model), &mut Log::default());
+        assert!(decoder.exact(&claims, 3, log).is_ok());
+        let error = decoder.decode(&claims, None, log).unwrap_err();
+        assert!(matches!(error, Error::Malformed { .. }), "{error}");
+        let said = format!("level 4: number of feature slices is {found}, expected {expected}");
+        assert!(error.to_string().contains(&said), "{error}");
     }
 }
 
