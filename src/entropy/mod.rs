@@ -5,7 +5,8 @@
 //!
 //! # Symbols
 //! A level has K latents per voxel, or none if the model has none in its role: then it has no slices. They are coded voxel by
-//! voxel in Morton order, the K latents of a voxel in turn. A latent `y` with the predicted mean `μ` (in sixteenths) and the scale index `σ` is coded as `d = y − m` with `m = (μ + 8) >> 4`, under row
+//! voxel in Morton order, the K latents of a voxel in turn. A latent `y` with the predicted mean `μ` (in sixteenths) and the scale
+//! index `σ` is coded as `d = y − m` with `m = (μ + 8) >> 4`, under row
 //! `16·σ + (μ − 16·m + 8)` of the table `cdf.gauss`. Where nothing is predicted, `d = y` under row `k` of `cdf.prior` for channel `k`.
 //!
 //! No level predicts the base level. With a model that has no layers `base.…`, all its latents are unpredicted. With one that has, the
