@@ -187,6 +187,17 @@ def heads_alone_learn_and_leave_the_bits_as_they_are():
     return f"{len(moved)} tensors of the head that was drawn with move, no other"
 
 
+def everything_else_learns_while_heads_stay():
+    sample = data.procedural(4, size=48, views=2, pixels=60)
+    trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), lr_heads=0.0, rate_start=1.0, rounding_from=0.0))
+    trainer.train_step([sample])
+    before = {name: p.detach().clone() for name, p in trainer.model.named_parameters()}
+    trainer.train_step([sample])
+    moved = {name.split(".")[0] for name, p in trainer.model.named_parameters() if not torch.equal(p, before[name])}
+    assert moved == {"fc", "fs", "fr", "pem", "prior", "base", "near", "up"}, sorted(moved)
+    return "what predicts from neighbours is among it"
+
+
 def quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own():
     samples, tiny = [data.procedural(i, size=48, views=2, pixels=60) for i in range(2)], os.path.join(HERE, "configs/tiny.json")
     trainer = train.Trainer(arguments(config=tiny))
@@ -302,13 +313,16 @@ def what_neighbours_tell_saves_bits_and_comes_from_those_before_alone():
     return f"{before:.0f} -> {after:.0f} bits"
 
 
-def the_integer_path_follows_the_float_path():
+def the_integer_path_follows_the_float_path(**changes):
     samples = [data.procedural(i, size=48, views=2, pixels=80) for i in range(3)]
-    trainer = train.Trainer(arguments(config=os.path.join(HERE, "configs/tiny.json"), rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
-    for step in range(150):
-        trainer.train_step([samples[step % 3]])
-    fit_near(trainer.model, samples)
     with tempfile.TemporaryDirectory() as folder:
+        config = f"{folder}/config.json"
+        with open(os.path.join(HERE, "configs/tiny.json")) as f, open(config, "w") as to:
+            json.dump(json.load(f) | changes, to)
+        trainer = train.Trainer(arguments(config=config, rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
+        for step in range(150):
+            trainer.train_step([samples[step % 3]])
+        fit_near(trainer.model, samples)
         path = f"{folder}/model.safetensors"
         export.export(trainer.model.eval(), samples, path, {"steps": 150})
         export.half_weights(trainer.model)
@@ -317,13 +331,18 @@ def the_integer_path_follows_the_float_path():
     return f"rate {100 * penalty:+.2f} %"
 
 
+def so_it_does_where_the_finest_role_has_no_latents():
+    return the_integer_path_follows_the_float_path(latent_roles=2, near_channels=[16, 0])
+
+
 if __name__ == "__main__":
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "2")))
     for check in (operators_agree_with_plain_pytorch, rounded_operands_stay_close_where_the_processor_has_them,
                   maps_from_above_are_those_found_by_searching, the_splatter_agrees_with_plain_pytorch, a_resumed_run_equals_an_unbroken_one,
                   a_frozen_first_encoder_changes_nothing_but_its_own_gradient, heads_alone_learn_and_leave_the_bits_as_they_are,
                   quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own, heads_that_imitate_others_come_to_say_what_these_say,
-                  what_neighbours_tell_saves_bits_and_comes_from_those_before_alone, the_integer_path_follows_the_float_path, a_crop_overfits):
+                  everything_else_learns_while_heads_stay, what_neighbours_tell_saves_bits_and_comes_from_those_before_alone,
+                  the_integer_path_follows_the_float_path, so_it_does_where_the_finest_role_has_no_latents, a_crop_overfits):
         begin = time.monotonic()
         said = check()
         print(f"{check.__name__.replace('_', ' ')}: {said} ({time.monotonic() - begin:.0f} s)", flush=True)
