@@ -18,6 +18,8 @@ pub enum ChunkKind {
     Geometry,
     /// A slice of the latents.
     Features,
+    /// A correction of colours.
+    Filter,
     /// Something that a reader may skip: its type, 128 to 255.
     Ancillary(u8),
 }
@@ -51,6 +53,7 @@ impl ChunkKind {
         match self {
             ChunkKind::Geometry => 1,
             ChunkKind::Features => 2,
+            ChunkKind::Filter => 3,
             ChunkKind::Ancillary(code) => code,
         }
     }
@@ -61,6 +64,7 @@ impl std::fmt::Display for ChunkKind {
         match self {
             ChunkKind::Geometry => f.write_str("geometry"),
             ChunkKind::Features => f.write_str("feature"),
+            ChunkKind::Filter => f.write_str("filter"),
             ChunkKind::Ancillary(code) => write!(f, "ancillary {code}"),
         }
     }
@@ -127,6 +131,7 @@ impl<'a> Chunks<'a> {
         let kind = match code {
             1 => ChunkKind::Geometry,
             2 => ChunkKind::Features,
+            3 => ChunkKind::Filter,
             ANCILLARY.. => ChunkKind::Ancillary(code),
             _ => {
                 return Err(Error::Unsupported {
@@ -173,6 +178,14 @@ impl<'a> Chunks<'a> {
             return Err(malformed(at, field, chunk.count, expected));
         }
         Ok(chunk)
+    }
+
+    /// The next chunk that is not ancillary, without taking it.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub(super) fn peek(&self) -> Result<Option<Chunk<'a>>> {
+        self.clone().next_critical()
     }
 
     /// Fails unless nothing but ancillary chunks is left.

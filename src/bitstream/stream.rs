@@ -19,6 +19,9 @@ pub struct Stream<'a> {
     length: u64,
 }
 
+/// The most colour filters of a level.
+pub(super) const FILTERS: usize = 2;
+
 /// A whole level.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Level<'a> {
@@ -32,6 +35,8 @@ pub struct Level<'a> {
     pub features: Vec<Slice<'a>>,
     /// XXH3-64 of the latents, 0 if there are none.
     pub latent_hash: u64,
+    /// Corrections of the colours that the best and the quick heads generate.
+    pub filters: [Option<Slice<'a>>; FILTERS],
 }
 
 /// The octree of one level, given the level before.
@@ -150,10 +155,11 @@ impl<'a> Level<'a> {
         chunks.finish()?;
 
         let mut chunks = take_section(bytes, &mut at, section.features, "feature section")?;
-        let (features, latent_hash) = match section.features {
-            0 => Default::default(),
-            _ => take_features(&mut chunks, header.slice_voxels, level, voxels)?,
+        let (features, latent_hash) = match chunks.peek()?.map(|chunk| chunk.kind) {
+            None | Some(ChunkKind::Filter) => Default::default(),
+            Some(_) => take_features(&mut chunks, header.slice_voxels, level, voxels)?,
         };
+        let filters = take_filters(&mut chunks, level, voxels)?;
         chunks.finish()?;
         Ok(Level {
             level,
@@ -161,6 +167,7 @@ impl<'a> Level<'a> {
             geometry,
             features,
             latent_hash,
+            filters,
         })
     }
 
@@ -256,6 +263,23 @@ fn take_features<'a>(
         slices.push(Slice::of(&chunk, hash_bytes));
     }
     Ok((slices, latent_hash))
+}
+
+fn take_filters<'a>(
+    chunks: &mut Chunks<'a>,
+    level: u8,
+    voxels: u32,
+) -> Result<[Option<Slice<'a>>; FILTERS]> {
+    let mut filters = [None; FILTERS];
+    for (number, filter) in filters.iter_mut().enumerate() {
+        let counts = u64::from(voxels)..=voxels.into();
+        let next = chunks.peek()?;
+        if next.is_some_and(|next| usize::from(next.slice) == number) {
+            let chunk = chunks.expect(ChunkKind::Filter, level, number as u64, counts)?;
+            *filter = Some(Slice::of(&chunk, 0));
+        }
+    }
+    Ok(filters)
 }
 
 impl<'a> Slice<'a> {

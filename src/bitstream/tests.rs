@@ -282,7 +282,7 @@ fn unknown_critical_things_are_refused_and_unknown_others_passed_over() {
     assert!(!refused(16, 0xff), "optional flag");
 
     let mut bytes = sample();
-    bytes[124] = 3;
+    bytes[124] = 4;
     seal_chunks(&mut bytes, 124);
     let error = parse(&bytes).unwrap().require(2).unwrap_err();
     assert!(matches!(error, Error::Unsupported { .. }), "{error}");
@@ -345,6 +345,72 @@ fn chunks_out_of_order_or_with_impossible_counts_are_damage() {
         seal_header(&mut bytes);
         assert!(parse(&bytes).unwrap().require(2).is_err());
     }
+}
+
+/// A stream whose last level has no latents, and these filters.
+fn filtered(filters: &[(u8, usize, &[u8])]) -> Result<Vec<u8>> {
+    let mut writer = Writer::new(header())?;
+    writer.geometry(1, &[(2, b"one")])?;
+    writer.geometry(2, &[(3, b"second")])?;
+    writer.features(2, HASHES[0], &[b"latents 2"])?;
+    writer.geometry(3, &[(10, b"")])?;
+    writer.features(3, HASHES[1], &[b"a", b"b", b"c"])?;
+    for (level, slice, payload) in filters {
+        if *level == 3 {
+            writer.filter(3, *slice, payload)?;
+        }
+    }
+    writer.geometry(4, &[(8, b"x"), (8, b"y"), (4, b"z")])?;
+    for (level, slice, payload) in filters {
+        if *level == 4 {
+            writer.filter(4, *slice, payload)?;
+        }
+    }
+    writer.finish()
+}
+
+#[test]
+fn filters_follow_latents_or_stand_where_there_are_none() {
+    let bytes = filtered(&[(3, 0, b"best"), (4, 1, b"quick")]).unwrap();
+    let stream = parse(&bytes).unwrap().intact().unwrap();
+    let [base, middle, top] = stream.levels() else {
+        panic!("three levels")
+    };
+    let codes = |level: &Level| {
+        level
+            .filters
+            .map(|f| f.map(|f| (f.voxels, f.bytes.to_vec())))
+    };
+    assert_eq!(codes(base), [None, None]);
+    assert_eq!(codes(middle), [Some((10, b"best".to_vec())), None]);
+    assert_eq!(codes(top), [None, Some((20, b"quick".to_vec()))]);
+    assert_eq!(middle.features.len(), 3);
+    assert!(top.features.is_empty());
+    let filter = top.filters[1].unwrap();
+    assert_eq!(&bytes[filter.offset..][..5], b"quick");
+}
+
+#[test]
+fn filters_out_of_order_twice_or_of_unknown_heads_are_refused() {
+    for filters in [
+        [(3, 1, &b"quick"[..]), (3, 0, b"best")],
+        [(3, 0, b"best"), (3, 0, b"best")],
+        [(3, 0, b"best"), (3, 2, b"what")],
+        [(4, 1, b"quick"), (4, 0, b"best")],
+    ] {
+        let error = filtered(&filters).unwrap_err().to_string();
+        assert!(error.contains("after the section's last"), "{error}");
+    }
+}
+
+#[test]
+fn a_filter_for_another_number_of_voxels_is_refused() {
+    let mut bytes = filtered(&[(4, 0, b"best")]).unwrap();
+    let at = bytes.len() - CHUNK_HEADER - 4;
+    bytes[at + 4] = 19;
+    seal_chunks(&mut bytes, at);
+    let error = parse(&bytes).unwrap().require(4).unwrap_err().to_string();
+    assert!(error.contains("is 19, expected 20 to 20"), "{error}");
 }
 
 #[test]

@@ -98,6 +98,19 @@ impl Writer {
         Ok(())
     }
 
+    /// Adds a colour filter for the best heads of `level` (`slice` 0) or its quick ones (1), after its features.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the stream has no such level.
+    pub fn filter(&mut self, level: u8, slice: usize, payload: &[u8]) -> Result<()> {
+        let section = self.header.index(level)?;
+        let (voxels, start) = (self.header.voxels[section], self.body.len());
+        self.chunk(ChunkKind::Filter, level, slice, voxels, &[], payload)?;
+        let length = &mut self.header.sections[section].features;
+        *length = extended(*length, self.body.len() - start)?;
+        Ok(())
+    }
+
     /// The stream, read once to see that every level is whole.
     ///
     /// # Errors

@@ -107,6 +107,9 @@ pub struct Encode {
     /// What a bit is worth when latents are rounded, in squared latent steps; 0 rounds to the nearest, more saves bits
     #[arg(long, value_name = "X", default_value_t = Options::BIT_PRICE, value_parser = price)]
     pub bit_price: f32,
+    /// Leave colours as the model makes them, which takes less time: otherwise each level tells in 58 bytes how to correct those of the cloud
+    #[arg(long)]
+    pub no_filter: bool,
     #[command(flatten)]
     pub model: ModelArg,
 }

@@ -8,7 +8,7 @@ use super::{Decoder, Exact};
 use crate::bitstream::{Header, Level, MAGIC};
 use crate::entropy::{Condition, decode_level, decode_passes, expect_no_latents, latent_hash};
 use crate::error::{Error, Result};
-use crate::gaussians::{Frame, Gaussians, activate};
+use crate::gaussians::{ColourFilter, Frame, Gaussians, Surroundings, activate};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
 use crate::network::{Heads, Model, Module, Pool};
@@ -79,6 +79,10 @@ struct Reached {
     level: u8,
     exact: Exact,
     map: KernelMap,
+    /// The map of the level above, where a filter reads it.
+    above: Option<KernelMap>,
+    /// What the stream says of the colours, for each set of heads.
+    filters: [Option<ColourFilter>; Heads::ALL.len()],
 }
 
 impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
@@ -203,9 +207,21 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
             bits: header.bits,
             placement: header.placement,
         };
-        log.step("activate", voxels.len() * children, "Gaussians", || {
+        let count = voxels.len() * children;
+        let mut gaussians = log.step("activate", count, "Gaussians", || {
             Ok(activate(&raw, voxels, children, shape, frame))
-        })
+        })?;
+        drop(raw);
+        if let Some(filter) = &reached.filters[heads as usize] {
+            log.step("filter colours", count, "Gaussians", || {
+                let (octree, map) = (&reached.exact.octree, &reached.map);
+                let above = reached.above.as_ref();
+                let around = Surroundings::of_level(&gaussians, octree, level, map, above);
+                filter.apply(&mut gaussians, &around);
+                Ok(())
+            })?;
+        }
+        Ok(gaussians)
     }
 
     fn take_pool(&self) -> Pool<i16> {
@@ -302,6 +318,11 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
             return Err(nothing_reached());
         };
         let level = Level::read(&self.bytes, header, level)?;
+        let mut filters = [const { None }; Heads::ALL.len()];
+        for (filter, payload) in filters.iter_mut().zip(&level.filters) {
+            let parse = |payload| ColourFilter::parse(payload, level.level);
+            *filter = payload.as_ref().map(parse).transpose()?;
+        }
         let mut octree = match &mut self.reached {
             Some(above) => std::mem::replace(&mut above.exact.octree, Octree::root()),
             None => Octree::root(),
@@ -313,8 +334,12 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
         self.return_pool(pool);
         match (done, &mut self.reached) {
             (Ok((latents, features, map)), reached) => {
+                let read = filters.iter().any(Option::is_some);
+                let above = reached.take().map(|above| above.map);
                 *reached = Some(Reached {
                     level: level.level,
+                    above: above.filter(|_| read),
+                    filters,
                     exact: Exact {
                         octree,
                         latents,

@@ -1,9 +1,11 @@
 //! 3D Gaussians in memory.
 
 mod activations;
+mod filter;
 mod harmonics;
 mod heads;
 
+pub use filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundings};
 pub use harmonics::Harmonics;
 pub use heads::activate;
 

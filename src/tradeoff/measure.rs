@@ -196,6 +196,7 @@ fn without_features(
         &maps,
         model,
         &mut zero,
+        &mut |_| Ok(Vec::new()),
         &mut Log::default(),
     )?
     .0)

@@ -3,11 +3,11 @@
 use std::time::Instant;
 
 use super::Subject;
-use crate::bitstream::Header;
+use crate::bitstream::{Header, Stream};
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
 use crate::error::Result;
-use crate::gaussians::{Frame, Gaussians, activate};
+use crate::gaussians::{ColourFilter, Frame, Gaussians, Surroundings, activate};
 use crate::log::Log;
 use crate::network::{Heads, Model};
 
@@ -27,7 +27,15 @@ pub fn in_double(subject: &Subject<'_>, model: &Model, level: u8) -> Result<(Gau
     let head = model.shape().head(role, Heads::Best);
     let children = head.map_or(1, |head| head.children);
     let (voxels, frame) = (exact.octree.level(level), decoder.frame(subject.stream)?);
-    Ok((activate(&raw, voxels, children, model.shape(), frame), took))
+    let mut gaussians = activate(&raw, voxels, children, model.shape(), frame);
+    let stream = Stream::parse(subject.stream, subject.limits)?;
+    let filter = stream.levels().get(role).and_then(|found| found.filters[0]);
+    if let Some(filter) = filter {
+        let above = level.checked_sub(1).map(|up| exact.octree.kernel_map(up));
+        let around = Surroundings::of_level(&gaussians, &exact.octree, level, &map, above.as_ref());
+        ColourFilter::parse(&filter, level)?.apply(&mut gaussians, &around);
+    }
+    Ok((gaussians, took))
 }
 
 /// A cloud as Gaussians: of each voxel one, opaque, round, with a standard deviation of half the voxel's width.

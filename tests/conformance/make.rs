@@ -4,6 +4,7 @@ use b2p::Placement;
 use b2p::bitstream::{Header, Writer};
 use b2p::encoder::{Options, encode};
 use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
+use b2p::gaussians::{COLOUR_INPUTS, ColourFilter};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
 use b2p::network::Model;
@@ -71,9 +72,22 @@ fn stream(
     model: &Model,
     bits: u8,
     keys: &[u64],
+    levels: (u8, u8),
+    slice: u32,
+    latents: Latents,
+) -> Vec<u8> {
+    filtered(model, bits, keys, levels, slice, latents, None)
+}
+
+/// The same, and all its levels have colour filters for both sets of heads, of this exponent and weights up to as much.
+fn filtered(
+    model: &Model,
+    bits: u8,
+    keys: &[u64],
     (base, top): (u8, u8),
     slice: u32,
     latents: Latents,
+    filter: Option<(u8, i8)>,
 ) -> Vec<u8> {
     let cloud = Voxels::new(bits, keys.to_vec());
     let octree = Octree::new(cloud.clone()).expect("voxels");
@@ -108,8 +122,23 @@ fn stream(
         let context = below
             .as_ref()
             .map(|g| model.upsample(role, g, octree.occupancy(level - 1)));
+        let filters = |writer: &mut Writer, random: &mut Random| {
+            let Some((exponent, most)) = filter else {
+                return;
+            };
+            for set in 0..2 {
+                let mut weights = [[0; COLOUR_INPUTS]; 3];
+                for weight in weights.as_flattened_mut() {
+                    let whole = 2 * most as u64 + 1;
+                    *weight = (random.below(whole) as i64 - i64::from(most)) as i8;
+                }
+                let payload = ColourFilter { exponent, weights }.to_bytes();
+                writer.filter(level, set, &payload).expect("a filter");
+            }
+        };
         if !model.has_latents(role) {
             below = Some(model.reconstruct(role, &[], context.as_deref(), &map));
+            filters(&mut writer, &mut random);
             continue;
         }
         let parameters = context
@@ -132,6 +161,7 @@ fn stream(
         writer
             .features(level, latent_hash(&latents), &slices)
             .expect("features");
+        filters(&mut writer, &mut random);
         below = Some(model.reconstruct(role, &latents, context.as_deref(), &map));
     }
     writer.finish().expect("a stream that the format allows")
@@ -270,6 +300,12 @@ pub fn cases() -> Vec<Case> {
         });
         add("extremes".into(), true, &|m| {
             stream(m, 4, &cube(5), (1, 3), 50, Extremes)
+        });
+        add("filtered".into(), true, &|m| {
+            filtered(m, 4, &sphere, (1, 3), 30, Small, Some((6, 20)))
+        });
+        add("filtered-to-the-ends".into(), true, &|m| {
+            filtered(m, 5, &scattered(5, 90), (2, 4), 30, Small, Some((0, 127)))
         });
         let encoded = |cloud, m: &Model| {
             let options = Options {

@@ -1,5 +1,7 @@
 //! Point cloud to stream. Runs the decoder in the loop: what a level is predicted from is what the decoder will have.
 
+mod colours;
+
 use std::ops::RangeInclusive;
 
 use rayon::prelude::*;
@@ -9,10 +11,11 @@ use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
 use crate::entropy::{Condition, encode_level, encode_passes, latent_hash, quantise};
 use crate::error::{Error, Result};
+use crate::gaussians::{ColourFilter, Frame, Surroundings, activate};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::{Model, ROLES};
+use crate::network::{Heads, Model, ROLES};
 
 /// What may be chosen about a stream.
 #[derive(Debug, Clone)]
@@ -22,6 +25,9 @@ pub struct Options {
     /// What a bit is worth when latents are rounded, in squared latent steps: see [`crate::entropy::quantise`]. 0 rounds to the nearest.
     /// Bits are those that the level below predicts, whatever neighbours tell.
     pub bit_price: f32,
+    /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
+    /// [`ColourFilter`].
+    pub filter: bool,
     /// Voxels per slice, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
 }
@@ -36,6 +42,7 @@ impl Default for Options {
         Options {
             levels: None,
             bit_price: Options::BIT_PRICE,
+            filter: true,
             slice_voxels: MAX_SLICE_VOXELS,
         }
     }
@@ -117,7 +124,19 @@ pub fn encode(
             options.bit_price,
         ))
     };
-    let (bytes, below) = write(header, &octree, &maps, model, &mut squeezed, log)?;
+    let mut corrected = |level: Level<'_>| match options.filter {
+        true => filters(cloud, model, level),
+        false => Ok(Vec::new()),
+    };
+    let (bytes, below) = write(
+        header,
+        &octree,
+        &maps,
+        model,
+        &mut squeezed,
+        &mut corrected,
+        log,
+    )?;
     let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
         Decoder::new(model)
             .with_limits(Limits::unlimited())
@@ -145,17 +164,32 @@ pub fn encode(
 pub(crate) type Latents<'a> =
     dyn FnMut(usize, Condition<'_>, Option<&[i16]>) -> Result<Vec<i16>> + 'a;
 
+/// A level whose latents are coded.
+pub(crate) struct Level<'a> {
+    role: usize,
+    level: u8,
+    octree: &'a Octree,
+    maps: &'a [KernelMap],
+    features: &'a [i16],
+    /// Bytes of latents up to here.
+    latents: usize,
+}
+
+/// A level's corrections of colours.
+pub(crate) type Filters<'a> = dyn FnMut(Level<'_>) -> Result<Vec<(Heads, ColourFilter)>> + 'a;
+
 /// A stream of the `header`'s levels of an octree, and the features of the last; voxels and sections are filled in. `maps` are the levels'
 /// 3³ kernel maps.
 ///
 /// # Errors
-/// Those of [`Writer`], and of `latents`.
+/// Those of [`Writer`], of `latents`, and of `filters`.
 pub(crate) fn write(
     header: Header,
     octree: &Octree,
     maps: &[KernelMap],
     model: &Model,
     latents: &mut Latents<'_>,
+    filters: &mut Filters<'_>,
     log: &mut Log,
 ) -> Result<(Vec<u8>, Vec<i16>)> {
     let (levels, slice) = (header.base..=header.top, header.slice_voxels as usize);
@@ -165,6 +199,7 @@ pub(crate) fn write(
         ..header
     })?;
     let mut below: Option<Vec<i16>> = None;
+    let mut latent_bytes = 0;
     for (role, level) in levels.enumerate() {
         let (count, map) = (octree.level(level).len(), &maps[role]);
         log.step(
@@ -213,6 +248,7 @@ pub(crate) fn write(
                 } else {
                     encode_level(tables, condition, &latents, slice)
                 };
+                latent_bytes += slices.iter().map(Vec::len).sum::<usize>();
                 writer.features(level, latent_hash(&latents), &slices)?;
                 Ok(Some(model.reconstruct(
                     role,
@@ -222,8 +258,69 @@ pub(crate) fn write(
                 )))
             },
         )?;
+        log.step(format!("colours of level {level}"), count, "voxels", || {
+            let found = filters(Level {
+                role,
+                level,
+                octree,
+                maps,
+                features: below.as_deref().unwrap_or_default(),
+                latents: latent_bytes,
+            })?;
+            found.iter().try_for_each(|(heads, filter)| {
+                writer.filter(level, *heads as usize, &filter.to_bytes())
+            })
+        })?;
     }
     Ok((writer.finish()?, below.unwrap_or_default()))
+}
+
+/// The corrections that a level's colours are worth.
+fn filters(
+    cloud: &ColouredVoxels,
+    model: &Model,
+    at: Level<'_>,
+) -> Result<Vec<(Heads, ColourFilter)>> {
+    let (shape, map) = (model.shape(), &at.maps[at.role]);
+    let mut found = Vec::new();
+    for heads in Heads::ALL {
+        let Some(head) = shape.head(at.role, heads) else {
+            continue;
+        };
+        let raw = model.generate_with(heads, at.role, at.features, map)?;
+        let voxels = at.octree.level(at.level);
+        let gaussians = activate(&raw, voxels, head.children, shape, Frame::default());
+        drop(raw);
+        let above = at.role.checked_sub(1).map(|role| &at.maps[role]);
+        let around = Surroundings::of_level(&gaussians, at.octree, at.level, map, above);
+        let (_, mut wanted) = pooled(cloud, at.level);
+        let mut drawn = at.level;
+        if head.children == 8 {
+            drawn += 1;
+            wanted = of_children(
+                &wanted,
+                &pooled(cloud, drawn).1,
+                at.octree.occupancy(at.level),
+            );
+        }
+        let filter = colours::fit(gaussians, &around, &wanted, drawn, at.latents)?;
+        found.extend(filter.map(|filter| (heads, filter)));
+    }
+    Ok(found)
+}
+
+/// The colours of all eight children of each voxel: where there is no such child, the voxel's.
+fn of_children(voxels: &[[f32; 3]], children: &[[f32; 3]], occupancy: &[u8]) -> Vec<[f32; 3]> {
+    let mut children = children.iter();
+    let mut all = Vec::with_capacity(8 * voxels.len());
+    for (voxel, mask) in voxels.iter().zip(occupancy) {
+        for octant in 0..8 {
+            let there = mask >> octant & 1 == 1;
+            let child = if there { children.next() } else { None };
+            all.push(*child.unwrap_or(voxel));
+        }
+    }
+    all
 }
 
 /// The levels to code, for a cloud of bit depth `bits`.

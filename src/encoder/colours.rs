@@ -1,0 +1,312 @@
+//! What is wrong with the colours that heads generate for one cloud, fitted to pictures.
+//!
+//! Pictures are linear in the colours of Gaussians, so the weights of a [`ColourFilter`] that bring pictures of the Gaussians nearest to pictures of
+//! the same Gaussians in the cloud's colours are a linear least-squares problem, with an equation for each pixel inside the silhouette.
+
+use rayon::prelude::*;
+
+use crate::error::Result;
+use crate::gaussians::{COLOUR_INPUTS as INPUTS, ColourFilter, Gaussians, Surroundings};
+use crate::limits::Limits;
+use crate::pixels::{Background, Image, Quality, Renderer};
+use crate::projection::Camera;
+
+/// Cameras, once around the cloud, from above and below by turns.
+const VIEWS: usize = 3;
+/// A pixel counts where the picture is as opaque as that.
+const OPAQUE: f32 = 0.9;
+/// Of the mean square of each input, added against inputs that go together.
+const DAMPING: f64 = 1e-4;
+/// The share of the latents' bytes that a decibel of what these pictures differ by is worth: from `lite-low` to `lite` it takes 9 to 17 % more.
+const DECIBEL: f64 = 0.12;
+
+/// The filter that brings pictures of Gaussians nearest to those of the same Gaussians of the colours `wanted`, unless it is not worth its bytes
+/// beside `latents` bytes of latents. A voxel of level `level` is about a pixel wide.
+///
+/// # Errors
+/// Those of [`Renderer::render`].
+pub(super) fn fit(
+    mut gaussians: Gaussians,
+    surroundings: &Surroundings,
+    wanted: &[[f32; 3]],
+    level: u8,
+    latents: usize,
+) -> Result<Option<ColourFilter>> {
+    let colours = std::mem::take(&mut gaussians.colour);
+    let count = colours.len();
+    let over = |f: &(dyn Fn(usize) -> [f32; 3] + Sync)| -> Vec<[f32; 3]> {
+        (0..count)
+            .into_par_iter()
+            .with_min_len(4096)
+            .map(f)
+            .collect()
+    };
+    // The first input is 1, whose picture is that of the opacities.
+    let firsts = (1..INPUTS).step_by(3);
+    let mut drawn: Vec<_> = firsts
+        .map(|first| {
+            over(&|i| {
+                let inputs = surroundings.inputs(i, colours[i]);
+                [inputs[first], inputs[first + 1], inputs[first + 2]]
+            })
+        })
+        .collect();
+    drawn.push(over(&|i| {
+        std::array::from_fn(|c| wanted[i][c] - colours[i][c])
+    }));
+    let size = 1 << level.clamp(6, 10);
+    let mut renderer = Renderer::default();
+    renderer.set_quality(Quality::Fast);
+    let (mut sums, mut pictures) = (Sums::default(), vec![Image::default(); drawn.len()]);
+    for view in 0..VIEWS {
+        let elevation = if view % 2 == 0 { 15.0 } else { -15.0 };
+        let azimuth = 360.0 / VIEWS as f64 * (view as f64 + 0.5);
+        let camera = Camera::orbit(azimuth, elevation, 3.0, 45.0, size, size)?;
+        for (colours, picture) in drawn.iter_mut().zip(&mut pictures) {
+            std::mem::swap(&mut gaussians.colour, colours);
+            let (back, limits) = (Background::Transparent, Limits::unlimited());
+            let done = renderer.render_into(&gaussians, &camera, back, &limits, picture);
+            std::mem::swap(&mut gaussians.colour, colours);
+            done?;
+        }
+        if let [planes @ .., missing] = &pictures[..] {
+            sums.add(planes, missing);
+        }
+    }
+    Ok(sums.solve(latents))
+}
+
+/// Of the equations' two sides: inputs by inputs, inputs by what they should give, and the squares of that.
+#[derive(Clone, Default)]
+struct Sums {
+    inputs: [[f64; INPUTS]; INPUTS],
+    wanted: [[f64; INPUTS]; 3],
+    squares: f64,
+}
+
+impl Sums {
+    /// Adds the pixels of a view: `planes` show three inputs each, `missing` what is to be added.
+    fn add(&mut self, planes: &[Image], missing: &Image) {
+        let missing = &missing.pixels;
+        let part = |first: usize| {
+            let mut sums = Sums::default();
+            for at in first..missing.len().min(first + PART) {
+                let [missing @ .., alpha] = missing[at];
+                if alpha < OPAQUE {
+                    continue;
+                }
+                let mut inputs = [f64::from(alpha); INPUTS];
+                for (to, plane) in inputs[1..].chunks_exact_mut(3).zip(planes) {
+                    for (to, x) in to.iter_mut().zip(plane.pixels[at]) {
+                        *to = x.into();
+                    }
+                }
+                sums.add_pixel(&inputs, missing.map(f64::from));
+            }
+            sums
+        };
+        let parts: Vec<usize> = (0..missing.len()).step_by(PART).collect();
+        let parts: Vec<Sums> = parts.into_par_iter().map(part).collect();
+        parts.iter().for_each(|part| self.add_all(part));
+    }
+
+    fn add_pixel(&mut self, inputs: &[f64; INPUTS], missing: [f64; 3]) {
+        for (sums, x) in self.inputs.iter_mut().zip(inputs) {
+            for (sum, y) in sums.iter_mut().zip(inputs) {
+                *sum += x * y;
+            }
+        }
+        for (sums, y) in self.wanted.iter_mut().zip(missing) {
+            for (sum, x) in sums.iter_mut().zip(inputs) {
+                *sum += x * y;
+            }
+            self.squares += y * y;
+        }
+    }
+
+    fn add_all(&mut self, other: &Sums) {
+        let own = self.inputs.as_flattened_mut().iter_mut();
+        own.zip(other.inputs.as_flattened())
+            .for_each(|(a, b)| *a += b);
+        let own = self.wanted.as_flattened_mut().iter_mut();
+        own.zip(other.wanted.as_flattened())
+            .for_each(|(a, b)| *a += b);
+        self.squares += other.squares;
+    }
+
+    /// The filter, in steps of its weights, if it is worth its bytes.
+    fn solve(&self, latents: usize) -> Option<ColourFilter> {
+        let reals = self
+            .wanted
+            .map(|wanted| least_squares(&self.inputs, &wanted));
+        let greatest = reals
+            .iter()
+            .flat_map(|w| &w[1..])
+            .fold(0.0, |m: f64, w| m.max(w.abs()));
+        let exponent = (127.0 / greatest.max(1e-3)).log2().floor().clamp(0.0, 15.0) as u8;
+        let step = |k| f64::from(ColourFilter::step(exponent, k));
+        let mut weights = [[0i8; INPUTS]; 3];
+        let mut left = self.squares;
+        for (weights, (reals, wanted)) in weights.iter_mut().zip(reals.iter().zip(&self.wanted)) {
+            let steps = |real: f64, k| (real / step(k)).round().clamp(-127.0, 127.0) as i8;
+            for k in 1..INPUTS {
+                weights[k] = steps(reals[k], k);
+            }
+            let real = |k: usize, weights: &[i8; INPUTS]| f64::from(weights[k]) * step(k);
+            // The first again, now that the others are rounded.
+            let others: f64 = (1..INPUTS)
+                .map(|k| self.inputs[0][k] * real(k, weights))
+                .sum();
+            weights[0] = steps((wanted[0] - others) / self.inputs[0][0].max(1e-9), 0);
+            for (k, (row, wanted)) in self.inputs.iter().zip(wanted).enumerate() {
+                let given = row.iter().enumerate().map(|(j, x)| x * real(j, weights));
+                left += real(k, weights) * (given.sum::<f64>() - 2.0 * wanted);
+            }
+        }
+        let gain = 10.0 * (self.squares / left.max(1e-9)).log10();
+        let cost = CHUNK + 1 + 3 * INPUTS;
+        let worth = gain * DECIBEL * latents as f64 > cost as f64;
+        worth.then_some(ColourFilter { exponent, weights })
+    }
+}
+
+/// Pixels of a task.
+const PART: usize = 1024;
+/// Bytes of a chunk around its payload.
+const CHUNK: usize = 16;
+
+/// The damped solution of `gram · x = wanted`, by Cholesky's method; 0 for inputs that are never there.
+fn least_squares(gram: &[[f64; INPUTS]; INPUTS], wanted: &[f64; INPUTS]) -> [f64; INPUTS] {
+    let scale: [f64; INPUTS] = std::array::from_fn(|k| {
+        let square = gram[k][k];
+        if square > 0.0 {
+            square.sqrt().recip()
+        } else {
+            0.0
+        }
+    });
+    let mut lower = [[0.0; INPUTS]; INPUTS];
+    for i in 0..INPUTS {
+        for j in 0..=i {
+            let own = if i == j {
+                DAMPING + f64::from(u8::from(scale[i] == 0.0))
+            } else {
+                0.0
+            };
+            let known: f64 = (0..j).map(|k| lower[i][k] * lower[j][k]).sum();
+            let left = gram[i][j] * scale[i] * scale[j] + own - known;
+            lower[i][j] = if i == j {
+                left.max(DAMPING / 2.0).sqrt()
+            } else {
+                left / lower[j][j]
+            };
+        }
+    }
+    let mut x: [f64; INPUTS] = std::array::from_fn(|k| wanted[k] * scale[k]);
+    for i in 0..INPUTS {
+        let known: f64 = (0..i).map(|k| lower[i][k] * x[k]).sum();
+        x[i] = (x[i] - known) / lower[i][i];
+    }
+    for i in (0..INPUTS).rev() {
+        let known: f64 = (i + 1..INPUTS).map(|k| lower[k][i] * x[k]).sum();
+        x[i] = (x[i] - known) / lower[i][i];
+    }
+    std::array::from_fn(|k| x[k] * scale[k])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Octree, Voxels, morton};
+
+    /// Eight balls for every voxel of a disc across the cube, of smooth colours, and what surrounds them.
+    fn scene() -> (Gaussians, Surroundings) {
+        let at = (0..1024u32).map(|i| [i % 32, i / 32, 16]);
+        let voxels = Voxels::new(5, at.map(morton::encode).collect());
+        let octree = Octree::new(voxels).unwrap();
+        let voxels = octree.level(5);
+        let mut gaussians = Gaussians::default();
+        for i in 0..8 * voxels.len() {
+            let parent = voxels.coordinate(i / 8);
+            let at: [f32; 3] = std::array::from_fn(|k| {
+                let child = 2 * parent[k] + (i as u32 >> k & 1);
+                (child as f32 + 0.5) / 32.0 - 1.0
+            });
+            gaussians.position.push(at);
+            gaussians.scale.push([1.0 / 64.0; 3]);
+            gaussians.rotation.push([1.0, 0.0, 0.0, 0.0]);
+            gaussians.opacity.push(1.0);
+            let wave = |k: f32| 0.5 + 0.3 * (at[0] * k + at[1] * 7.0).sin();
+            gaussians.colour.push([wave(5.0), wave(9.0), wave(13.0)]);
+        }
+        let map = octree.kernel_map(5);
+        let around = Surroundings::of_level(&gaussians, &octree, 5, &map, None);
+        (gaussians, around)
+    }
+
+    #[test]
+    fn a_filter_that_was_applied_is_found_again() {
+        let (gaussians, around) = scene();
+        let mut applied = ColourFilter {
+            exponent: 7,
+            weights: [[0; INPUTS]; 3],
+        };
+        applied.weights[0][0] = 40;
+        applied.weights[1][3] = -30;
+        applied.weights[2][4] = 50;
+        applied.weights[2][12] = 25;
+        let mut wanted = gaussians.clone();
+        applied.apply(&mut wanted, &around);
+        let off = |colours: &[[f32; 3]]| {
+            let pairs = colours.iter().flatten().zip(wanted.colour.iter().flatten());
+            pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>()
+        };
+        let found = fit(gaussians.clone(), &around, &wanted.colour, 6, 1 << 20).unwrap();
+        let mut corrected = gaussians.clone();
+        found.unwrap().apply(&mut corrected, &around);
+        let (before, after) = (off(&gaussians.colour), off(&corrected.colour));
+        assert!(after < before / 300.0, "{before} to {after}");
+    }
+
+    #[test]
+    fn right_colours_have_no_filter_and_few_latents_do_not_pay_for_one() {
+        let (gaussians, around) = scene();
+        let colours = gaussians.colour.clone();
+        let none = fit(gaussians.clone(), &around, &colours, 6, 1 << 20).unwrap();
+        assert_eq!(none, None);
+        let wanted: Vec<_> = colours.iter().map(|c| c.map(|x| x * 0.9)).collect();
+        let few = fit(gaussians.clone(), &around, &wanted, 6, 8).unwrap();
+        assert_eq!(few, None);
+        let many = fit(gaussians, &around, &wanted, 6, 1 << 20).unwrap();
+        assert!(many.is_some());
+    }
+
+    #[test]
+    fn nothing_in_sight_gives_no_filter() {
+        let (mut gaussians, around) = scene();
+        gaussians.opacity.fill(0.0);
+        let wanted = vec![[0.0; 3]; gaussians.len()];
+        assert_eq!(fit(gaussians, &around, &wanted, 6, 1 << 20).unwrap(), None);
+    }
+
+    #[test]
+    fn the_same_filter_is_found_with_any_number_of_threads() {
+        let (gaussians, around) = scene();
+        let wanted: Vec<_> = gaussians.colour.iter().map(|c| c.map(|x| x * x)).collect();
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+            let find = || fit(gaussians.clone(), &around, &wanted, 6, 1 << 20);
+            pool.build().unwrap().install(find).unwrap()
+        };
+        assert_eq!(with(1), with(3));
+        assert!(with(1).is_some());
+    }
+
+    #[test]
+    fn missing_children_have_the_colour_of_their_voxel() {
+        let all = super::super::of_children(&[[0.5; 3]], &[[0.1; 3], [0.2; 3]], &[0b1000_0010]);
+        let mut want = vec![[0.5; 3]; 8];
+        (want[1], want[7]) = ([0.1; 3], [0.2; 3]);
+        assert_eq!(all, want);
+    }
+}
