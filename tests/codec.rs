@@ -6,9 +6,12 @@ use b2p::bitstream::{Header, Stream, Writer};
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Encoded, Options, encode};
+use b2p::gaussians::Gaussians;
 use b2p::geometry::Octree;
 use b2p::log::Log;
 use b2p::network::{Heads, Model, Shape, untrained};
+use b2p::pixels::{Background, render};
+use b2p::projection::Camera;
 use b2p::{Error, Limits, Placement};
 use common::{Ball, cloud_of, tiny_model};
 
@@ -96,8 +99,14 @@ fn levels_without_latents_cost_their_geometry_alone_and_are_not_predicted() {
             ..Shape::tiny()
         };
         let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
-        let (encoded, mut log) = (coded(&ball(7, 45.0), &model), Log::default());
+        let options = Options {
+            filter: false,
+            ..Options::default()
+        };
+        let mut log = Log::default();
+        let encoded = encode(&ball(7, 45.0), &model, &options, &mut log).unwrap();
         let decoder = Decoder::new(&model);
+        let mut log = Log::default();
         assert!(
             !decoder
                 .decode(&encoded.bytes, None, &mut log)
@@ -346,4 +355,62 @@ fn nothing_may_follow_the_last_level() {
         decoder.decode(&bytes, Some(4), &mut Log::default()).is_ok(),
         "asked for, a whole level decodes"
     );
+}
+
+#[test]
+fn filters_bring_the_colours_of_gaussians_nearer_to_the_cloud_s_and_change_nothing_else() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let with = |filter: bool| {
+        let options = Options {
+            filter,
+            ..Options::default()
+        };
+        encode(&cloud, &model, &options, &mut Log::default()).unwrap()
+    };
+    let (plain, filtered) = (with(false), with(true));
+    let decoder = Decoder::new(&model);
+    for rate in &filtered.rates[1..] {
+        let level = rate.level;
+        let bytes = [&plain.bytes, &filtered.bytes];
+        let exact = bytes.map(|bytes| decoder.exact(bytes, level, &mut Log::default()).unwrap());
+        assert_eq!(exact[0], exact[1]);
+        let decode = |bytes: &Vec<u8>| decoder.decode(bytes, Some(level), &mut Log::default());
+        let [before, after] = bytes.map(|bytes| decode(bytes).unwrap());
+        assert_ne!(before.colour, after.colour, "level {level}");
+        let recoloured = Gaussians {
+            colour: after.colour.clone(),
+            ..before.clone()
+        };
+        assert_eq!(after, recoloured);
+        if before.len() == exact[0].octree.level(level).len() {
+            let mut right = before.clone();
+            right.colour = colours_at(&cloud, level);
+            let [before, after, right] = [before, after, right].map(|g| picture(&g));
+            let off = |picture: &[[f32; 4]]| {
+                let pairs = picture.iter().flatten().zip(right.iter().flatten());
+                pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>()
+            };
+            let off = [off(&before), off(&after)];
+            assert!(off[1] < 0.95 * off[0], "level {level}: {off:?}");
+        }
+    }
+}
+
+/// The mean colours of a level's voxels.
+fn colours_at(cloud: &ColouredVoxels, level: u8) -> Vec<[f32; 3]> {
+    let shift = 3 * (cloud.voxels.depth() - level);
+    let voxels: Vec<_> = cloud.voxels.keys().iter().zip(&cloud.colours).collect();
+    let mean = |voxels: &[(&u64, &[u8; 3])]| {
+        let sum = |c: usize| voxels.iter().map(|(_, x)| f32::from(x[c])).sum::<f32>();
+        std::array::from_fn(|c| sum(c) / (255 * voxels.len()) as f32)
+    };
+    let of_voxels = voxels.chunk_by(|a, b| a.0 >> shift == b.0 >> shift);
+    of_voxels.map(mean).collect()
+}
+
+/// From where no encoder looks.
+fn picture(gaussians: &Gaussians) -> Vec<[f32; 4]> {
+    let camera = Camera::orbit(100.0, 30.0, 3.0, 45.0, 64, 64).unwrap();
+    let drawn = render(gaussians, &camera, Background::WHITE, &Limits::default());
+    drawn.unwrap().0.pixels
 }
