@@ -2,14 +2,17 @@
 
 use std::path::Path;
 
-use b2p::Placement;
+use b2p::bitstream::Stream;
 use b2p::cloud::{ColouredVoxels, PointCloud};
 use b2p::decoder::Decoder;
 use b2p::encoder::{Options, encode};
+use b2p::gaussians::{COLOUR_INPUTS, ColourFilter};
 use b2p::geometry::Voxels;
 use b2p::log::Log;
+use b2p::{Limits, Placement};
 
 use crate::MODEL;
+use crate::streams::rewritten;
 
 /// A stream of these voxels, and the Gaussians of its finest level as a file.
 fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u8>>) {
@@ -38,6 +41,20 @@ fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u
     (stream.bytes, file)
 }
 
+/// The same stream with colour filters at every level, for which small clouds do not pay by themselves.
+fn filtered(bytes: &[u8]) -> Vec<u8> {
+    let stream = Stream::parse(bytes, &Limits::unlimited()).expect("a stream of ours");
+    let mut weights = [[0; COLOUR_INPUTS]; 3];
+    for (weight, byte) in weights.as_flattened_mut().iter_mut().zip(noise(9, 57)) {
+        *weight = byte as i8;
+    }
+    let filter = ColourFilter {
+        exponent: 7,
+        weights,
+    };
+    rewritten(&stream, Some(&filter.to_bytes()))
+}
+
 /// Pseudo-random bytes.
 fn noise(seed: u64, length: usize) -> Vec<u8> {
     let mut state = seed;
@@ -61,7 +78,10 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
     ];
     let streams = clouds.iter().map(|(stream, _)| stream.clone());
     match target {
-        "header" | "stream" | "chunking" => streams.collect(),
+        "header" | "stream" | "chunking" => {
+            let filtered = filtered(&clouds[3].0);
+            streams.chain([filtered]).collect()
+        }
         "ply" => {
             let cloud = PointCloud {
                 positions: vec![[0.0, 1.0, 2.0], [3.0, 4.5, -1.0]],

@@ -1,6 +1,6 @@
 //! Streams from strangers.
 
-use b2p::bitstream::{Header, Stream, Writer};
+use b2p::bitstream::{Header, Level, Stream, Writer};
 use b2p::decoder::{Decoder, Decoding, Exact};
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
@@ -44,7 +44,11 @@ pub fn header(bytes: &[u8]) {
             geometry.slices.iter().map(|slice| slice.voxels).sum()
         });
         assert_eq!(slices, *voxels);
-        assert!(level.features.iter().map(|slice| slice.voxels).sum::<u32>() == *voxels);
+        let latents: u32 = level.features.iter().map(|slice| slice.voxels).sum();
+        assert!(latents == *voxels || level.features.is_empty());
+        for filter in level.filters.iter().flatten() {
+            assert_eq!(filter.voxels, *voxels);
+        }
         let end = header
             .prefix_bytes(level.level)
             .expect("a level of the stream");
@@ -55,10 +59,10 @@ pub fn header(bytes: &[u8]) {
     assert_eq!(stream.damage().is_none(), whole && exact);
     assert_eq!(*stream.header(), header);
     if stream.damage().is_none() {
-        let written = rewritten(&stream);
+        let written = rewritten(&stream, None);
         assert_eq!(
             written,
-            rewritten(&Stream::parse(&written, &limits).expect("a stream"))
+            rewritten(&Stream::parse(&written, &limits).expect("a stream"), None)
         );
         assert!(written.len() <= bytes.len());
         if written.len() == bytes.len() {
@@ -68,14 +72,18 @@ pub fn header(bytes: &[u8]) {
     requests(bytes, &header, stream.deepest());
 }
 
-/// The same stream, put together from its parts.
-fn rewritten(stream: &Stream) -> Vec<u8> {
+/// The same stream, put together from its parts; with `filter`, if there is one, as the payload of all colour filters.
+pub(crate) fn rewritten(stream: &Stream, filter: Option<&[u8]>) -> Vec<u8> {
     let mut writer = Writer::new(stream.header().clone()).expect("a header that was read");
     for level in stream.levels() {
         for part in &level.geometry {
             let slices = part.slices.iter().map(|slice| (slice.voxels, slice.bytes));
             let slices: Vec<_> = slices.collect();
             writer.geometry(part.level, &slices).expect("a level of it");
+        }
+        if level.features.is_empty() {
+            filters(&mut writer, level, filter);
+            continue;
         }
         let mut slices: Vec<_> = level.features.iter().map(|slice| slice.bytes).collect();
         slices.push(&[]);
@@ -85,8 +93,18 @@ fn rewritten(stream: &Stream) -> Vec<u8> {
         writer
             .features(level.level, level.latent_hash, &slices)
             .expect("a level of it");
+        filters(&mut writer, level, filter);
     }
     writer.finish().expect("the parts of a whole stream")
+}
+
+fn filters(writer: &mut Writer, level: &Level, filter: Option<&[u8]>) {
+    for (slice, own) in level.filters.iter().enumerate() {
+        if let Some(payload) = filter.or(own.map(|own| own.bytes)) {
+            let written = writer.filter(level.level, slice, payload);
+            written.expect("a level of it");
+        }
+    }
 }
 
 /// A level can be asked for if it is whole; a prefix is intact if it ends with a level; a header has as many voxel counts as levels.
