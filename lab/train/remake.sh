@@ -88,3 +88,7 @@ train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
 train least-whole-2 lite 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${whole[@]}"
 train least-rest lite 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@]}"
 ship least-rest lite-least --only-base
+least=(--init "$out/lite-least.weights.safetensors" --teacher "$out/lite-least.weights.safetensors")
+train least-quick-1 lite-quick 7 --coarse 1 "${imitate[@]}" "${least[@]}"
+train least-quick-2 lite-quick 7 --coarse 0 "${imitate[@]}" "${least[@]}" --init "$out/least-quick-1/last.pt"
+beside least-quick-2 lite-least
