@@ -33,41 +33,30 @@ pub(super) fn fit(
     latents: usize,
 ) -> Result<Option<ColourFilter>> {
     let colours = std::mem::take(&mut gaussians.colour);
-    let count = colours.len();
     let over = |f: &(dyn Fn(usize) -> [f32; 3] + Sync)| -> Vec<[f32; 3]> {
-        (0..count)
-            .into_par_iter()
-            .with_min_len(4096)
-            .map(f)
-            .collect()
+        let each = (0..colours.len()).into_par_iter().with_min_len(4096);
+        each.map(f).collect()
     };
-    // The first input is 1, whose picture is that of the opacities.
-    let firsts = (1..INPUTS).step_by(3);
-    let mut drawn: Vec<_> = firsts
-        .map(|first| {
-            over(&|i| {
-                let inputs = surroundings.inputs(i, colours[i]);
-                [inputs[first], inputs[first + 1], inputs[first + 2]]
-            })
-        })
-        .collect();
-    drawn.push(over(&|i| {
-        std::array::from_fn(|c| wanted[i][c] - colours[i][c])
-    }));
     let size = 1 << level.clamp(6, 10);
     let mut renderer = Renderer::default();
     renderer.set_quality(Quality::Fast);
-    let (mut sums, mut pictures) = (Sums::default(), vec![Image::default(); drawn.len()]);
+    // The first input is 1, whose picture is that of the opacities; last comes what the inputs are to give.
+    let mut pictures = vec![Image::default(); INPUTS / 3 + 1];
+    let mut sums = Sums::default();
     for view in 0..VIEWS {
         let elevation = if view % 2 == 0 { 15.0 } else { -15.0 };
         let azimuth = 360.0 / VIEWS as f64 * (view as f64 + 0.5);
         let camera = Camera::orbit(azimuth, elevation, 3.0, 45.0, size, size)?;
-        for (colours, picture) in drawn.iter_mut().zip(&mut pictures) {
-            std::mem::swap(&mut gaussians.colour, colours);
+        for (plane, picture) in pictures.iter_mut().enumerate() {
+            gaussians.colour = over(&|i| match 1 + 3 * plane {
+                INPUTS => std::array::from_fn(|c| wanted[i][c] - colours[i][c]),
+                first => {
+                    let inputs = surroundings.inputs(i, colours[i]);
+                    std::array::from_fn(|c| inputs[first + c])
+                }
+            });
             let (back, limits) = (Background::Transparent, Limits::unlimited());
-            let done = renderer.render_into(&gaussians, &camera, back, &limits, picture);
-            std::mem::swap(&mut gaussians.colour, colours);
-            done?;
+            renderer.render_into(&gaussians, &camera, back, &limits, picture)?;
         }
         if let [planes @ .., missing] = &pictures[..] {
             sums.add(planes, missing);
@@ -82,6 +71,7 @@ struct Sums {
     inputs: [[f64; INPUTS]; INPUTS],
     wanted: [[f64; INPUTS]; 3],
     squares: f64,
+    pixels: usize,
 }
 
 impl Sums {
@@ -111,6 +101,7 @@ impl Sums {
     }
 
     fn add_pixel(&mut self, inputs: &[f64; INPUTS], missing: [f64; 3]) {
+        self.pixels += 1;
         for (sums, x) in self.inputs.iter_mut().zip(inputs) {
             for (sum, y) in sums.iter_mut().zip(inputs) {
                 *sum += x * y;
@@ -132,6 +123,7 @@ impl Sums {
         own.zip(other.wanted.as_flattened())
             .for_each(|(a, b)| *a += b);
         self.squares += other.squares;
+        self.pixels += other.pixels;
     }
 
     /// The filter, in steps of its weights, if it is worth its bytes.
@@ -163,6 +155,9 @@ impl Sums {
                 left += real(k, weights) * (given.sum::<f64>() - 2.0 * wanted);
             }
         }
+        // As many weights as pixels would fit them whatever they are.
+        let free = self.pixels.checked_sub(INPUTS + 1)?;
+        let left = left * (self.pixels as f64 / (free + 1) as f64);
         let gain = 10.0 * (self.squares / left.max(1e-9)).log10();
         let cost = CHUNK + 1 + 3 * INPUTS;
         let worth = gain * DECIBEL * latents as f64 > cost as f64;
@@ -279,6 +274,27 @@ mod tests {
         assert_eq!(few, None);
         let many = fit(gaussians, &around, &wanted, 6, 1 << 20).unwrap();
         assert!(many.is_some());
+    }
+
+    #[test]
+    fn a_few_pixels_of_any_colours_do_not_make_a_filter() {
+        let at = [[3, 3, 3], [4, 3, 3], [3, 4, 3], [4, 4, 4]];
+        let mut keys = at.map(morton::encode);
+        keys.sort();
+        let octree = Octree::new(Voxels::new(5, keys.to_vec())).unwrap();
+        let (some, _) = scene();
+        let of = |i: usize| (i as f32 * 0.7).sin().abs();
+        let few = Gaussians {
+            position: some.position[..32].to_vec(),
+            scale: some.scale[..32].to_vec(),
+            rotation: some.rotation[..32].to_vec(),
+            opacity: some.opacity[..32].to_vec(),
+            colour: (0..32).map(|i| [of(i), of(2 * i), of(3 * i)]).collect(),
+            ..Gaussians::default()
+        };
+        let around = Surroundings::of_level(&few, &octree, 5, &octree.kernel_map(5), None);
+        let wanted: Vec<_> = (0..32).map(|i| [of(5 * i), of(7 * i), of(9 * i)]).collect();
+        assert_eq!(fit(few, &around, &wanted, 6, 1 << 8).unwrap(), None);
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! Streams whose checksums are right and whose numbers are not.
 
 use b2p::Limits;
-use b2p::bitstream::Header;
+use b2p::bitstream::{Header, Stream, Writer};
+use b2p::gaussians::ColourFilter;
 use rayon::prelude::*;
 
 use crate::common::small_stream;
@@ -133,4 +134,50 @@ fn a_coder_s_bytes_changed_behind_the_checksums_are_refused() {
         })
         .sum();
     println!("{tried} flipped bits behind right checksums, all refused");
+}
+
+#[test]
+fn a_colour_filter_of_another_length_or_exponent_is_refused_and_the_level_before_stays() {
+    let (model, whole) = (model(), small_stream(&model()));
+    let stream = Stream::parse(&whole, &Limits::default()).unwrap();
+    let with = |filter: &[u8]| {
+        let mut writer = Writer::new(stream.header().clone()).unwrap();
+        for level in stream.levels() {
+            for part in &level.geometry {
+                let slices = part.slices.iter().map(|slice| (slice.voxels, slice.bytes));
+                let slices: Vec<_> = slices.collect();
+                writer.geometry(part.level, &slices).unwrap();
+            }
+            let slices: Vec<_> = level.features.iter().map(|slice| slice.bytes).collect();
+            let (number, hash) = (level.level, level.latent_hash);
+            writer.features(number, hash, &slices).unwrap();
+        }
+        writer.filter(stream.header().top, 0, filter).unwrap();
+        writer.finish().unwrap()
+    };
+    let sound = ColourFilter {
+        exponent: 15,
+        weights: [[127; _]; 3],
+    };
+    let sound = sound.to_bytes();
+    let top = stream.header().top;
+    assert!(decoded(&model, &with(&sound), Some(top)).is_ok());
+    let before = decoded(&model, &whole, Some(top - 1));
+    for (wrong, told) in [
+        (sound[1..].to_vec(), "length of the colour filter"),
+        ([&sound[..], &[0]].concat(), "length of the colour filter"),
+        (
+            [&[16], &sound[1..]].concat(),
+            "exponent of the colour filter",
+        ),
+    ] {
+        let bytes = with(&wrong);
+        let error = decoded(&model, &bytes, Some(top)).unwrap_err();
+        let named = error.contains("Malformed") && error.contains(told);
+        assert!(
+            named && place(&error).is_some_and(|at| at < bytes.len()),
+            "{error}"
+        );
+        assert_eq!(decoded(&model, &bytes, Some(top - 1)), before);
+    }
 }
