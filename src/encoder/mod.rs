@@ -282,27 +282,27 @@ fn filters(
     at: Level<'_>,
 ) -> Result<Vec<(Heads, ColourFilter)>> {
     let (shape, map) = (model.shape(), &at.maps[at.role]);
+    let Some(children) = shape.head(at.role, Heads::Best).map(|head| head.children) else {
+        return Ok(Vec::new());
+    };
+    let (_, mut wanted) = pooled(cloud, at.level);
+    let mut drawn = at.level;
+    if children == 8 {
+        drawn += 1;
+        let finer = pooled(cloud, drawn).1;
+        wanted = of_children(&wanted, &finer, at.octree.occupancy(at.level));
+    }
     let mut found = Vec::new();
     for heads in Heads::ALL {
-        let Some(head) = shape.head(at.role, heads) else {
+        if shape.head(at.role, heads).is_none() {
             continue;
-        };
+        }
         let raw = model.generate_with(heads, at.role, at.features, map)?;
         let voxels = at.octree.level(at.level);
-        let gaussians = activate(&raw, voxels, head.children, shape, Frame::default());
+        let gaussians = activate(&raw, voxels, children, shape, Frame::default());
         drop(raw);
         let above = at.role.checked_sub(1).map(|role| &at.maps[role]);
         let around = Surroundings::of_level(&gaussians, at.octree, at.level, map, above);
-        let (_, mut wanted) = pooled(cloud, at.level);
-        let mut drawn = at.level;
-        if head.children == 8 {
-            drawn += 1;
-            wanted = of_children(
-                &wanted,
-                &pooled(cloud, drawn).1,
-                at.octree.occupancy(at.level),
-            );
-        }
         let filter = colours::fit(gaussians, &around, &wanted, drawn, at.latents)?;
         found.extend(filter.map(|filter| (heads, filter)));
     }
