@@ -6,14 +6,14 @@ use b2p::bitstream::{Header, Stream, Writer};
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Encoded, Options, encode};
-use b2p::gaussians::Gaussians;
+use b2p::gaussians::{ColourFilter, Gaussians};
 use b2p::geometry::Octree;
 use b2p::log::Log;
 use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::pixels::{Background, render};
 use b2p::projection::Camera;
 use b2p::{Error, Limits, Placement};
-use common::{Ball, cloud_of, tiny_model};
+use common::{Ball, cloud_of, tiny_model, with_filter};
 
 fn model() -> Model {
     Model::from_bytes(&tiny_model(0)).expect("an untrained model loads")
@@ -392,6 +392,36 @@ fn filters_bring_the_colours_of_gaussians_nearer_to_the_cloud_s_and_change_nothi
             };
             let off = [off(&before), off(&after)];
             assert!(off[1] < 0.95 * off[0], "level {level}: {off:?}");
+        }
+    }
+}
+
+#[test]
+fn a_filter_for_one_set_of_heads_leaves_the_other_s_colours_as_they_are() {
+    let shape = Shape::tiny().with_quick_heads();
+    let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
+    let options = Options {
+        filter: false,
+        ..Options::default()
+    };
+    let plain = encode(&ball(6, 20.0), &model, &options, &mut Log::default()).unwrap();
+    let mut filter = ColourFilter {
+        exponent: 0,
+        weights: [[0; _]; 3],
+    };
+    // An eighth less red.
+    filter.weights[0][0] = -128;
+    for filtered in Heads::ALL {
+        let bytes = with_filter(&plain.bytes, filtered, &filter.to_bytes());
+        for heads in Heads::ALL {
+            let decoder = Decoder::new(&model).with_heads(heads).unwrap();
+            let decode = |bytes| decoder.decode(bytes, None, &mut Log::default()).unwrap();
+            let mut want = decode(&plain.bytes);
+            if heads == filtered {
+                let reds = want.colour.iter_mut().map(|colour| &mut colour[0]);
+                reds.for_each(|red| *red = (*red - 0.125).clamp(0.0, 1.0));
+            }
+            assert!(decode(&bytes) == want, "{heads}, filter for {filtered}");
         }
     }
 }

@@ -57,6 +57,13 @@ whole=(--only-heads --stay 0.5 --data "$out/whole" --views 2 --square 40 --held-
 # Thin heads first imitate those of the weights that they start from.
 imitate=(--only-heads --init "$out/lite.weights.safetensors" --teacher "$out/lite.weights.safetensors" --draw-from 2 --imitate-until 1e9 --lam 1
     --average 0.998 --lr-conv 1.5e-3 --lr-linear 2.4e-3 --warmup 100 --decay-from 0.3)
+# imitating FILE MINUTES: quick heads for a model, that only imitate
+imitating() {
+    local of=(--init "$out/$1.weights.safetensors" --teacher "$out/$1.weights.safetensors")
+    train "$1-quick-1" lite-quick "$2" --coarse 1 "${imitate[@]}" "${of[@]}"
+    train "$1-quick-2" lite-quick "$2" --coarse 0 "${imitate[@]}" "${of[@]}" --init "$out/$1-quick-1/last.pt"
+    beside "$1-quick-2" "$1"
+}
 # Of a network that has learned, everything but its heads, and the mean with before.
 rest=(--freeze-finest --lr-heads 0 --rate-start 1 --rate-ramp 0.01 --rounding-from 0 --decay-from 0.2 --warmup 100 --square 40 --stay 0.5)
 # Of a network that has learned, everything, the heads faster than the rest.
@@ -69,10 +76,7 @@ train low-whole-1 lite 21 --init "$out/low-heads/last.pt" --coarse 1 "${whole[@]
 train low-whole-2 lite 21 --init "$out/low-whole-1/last.pt" --coarse 0 "${whole[@]}"
 train low-rest lite 30 --init "$out/low-whole-2/last.pt" --lam 4 "${rest[@]}"
 ship low-rest lite-low --only-base
-low=(--init "$out/lite-low.weights.safetensors" --teacher "$out/lite-low.weights.safetensors")
-train low-quick-1 lite-quick 5 --coarse 1 "${imitate[@]}" "${low[@]}"
-train low-quick-2 lite-quick 5 --coarse 0 "${imitate[@]}" "${low[@]}" --init "$out/low-quick-1/last.pt"
-beside low-quick-2 lite-low
+imitating lite-low 5
 train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
 train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
 train high-whole-1 lite 25 --init "$out/high-heads/last.pt" --coarse 1 "${whole[@]}"
@@ -88,7 +92,4 @@ train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
 train least-whole-2 lite 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${whole[@]}"
 train least-rest lite 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@]}"
 ship least-rest lite-least --only-base
-least=(--init "$out/lite-least.weights.safetensors" --teacher "$out/lite-least.weights.safetensors")
-train least-quick-1 lite-quick 7 --coarse 1 "${imitate[@]}" "${least[@]}"
-train least-quick-2 lite-quick 7 --coarse 0 "${imitate[@]}" "${least[@]}" --init "$out/least-quick-1/last.pt"
-beside least-quick-2 lite-least
+imitating lite-least 7

@@ -124,19 +124,12 @@ pub fn encode(
             options.bit_price,
         ))
     };
-    let mut corrected = |level: Level<'_>| match options.filter {
-        true => filters(cloud, model, level),
-        false => Ok(Vec::new()),
+    let mut corrected = |level: Level<'_>| filters(cloud, model, level);
+    let filters: Option<&mut Filters<'_>> = match options.filter {
+        true => Some(&mut corrected),
+        false => None,
     };
-    let (bytes, below) = write(
-        header,
-        &octree,
-        &maps,
-        model,
-        &mut squeezed,
-        &mut corrected,
-        log,
-    )?;
+    let (bytes, below) = write(header, &octree, &maps, model, &mut squeezed, filters, log)?;
     let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
         Decoder::new(model)
             .with_limits(Limits::unlimited())
@@ -164,10 +157,12 @@ pub fn encode(
 pub(crate) type Latents<'a> =
     dyn FnMut(usize, Condition<'_>, Option<&[i16]>) -> Result<Vec<i16>> + 'a;
 
-/// A level whose latents are coded.
+/// A level whose latents are coded, and which is drawn.
 pub(crate) struct Level<'a> {
     role: usize,
     level: u8,
+    /// Gaussians of each voxel.
+    children: usize,
     octree: &'a Octree,
     maps: &'a [KernelMap],
     features: &'a [i16],
@@ -189,7 +184,7 @@ pub(crate) fn write(
     maps: &[KernelMap],
     model: &Model,
     latents: &mut Latents<'_>,
-    filters: &mut Filters<'_>,
+    mut filters: Option<&mut Filters<'_>>,
     log: &mut Log,
 ) -> Result<(Vec<u8>, Vec<i16>)> {
     let (levels, slice) = (header.base..=header.top, header.slice_voxels as usize);
@@ -258,10 +253,15 @@ pub(crate) fn write(
                 )))
             },
         )?;
+        let head = model.shape().head(role, Heads::Best);
+        let (Some(filters), Some(head)) = (&mut filters, head) else {
+            continue;
+        };
         log.step(format!("colours of level {level}"), count, "voxels", || {
             let found = filters(Level {
                 role,
                 level,
+                children: head.children,
                 octree,
                 maps,
                 features: below.as_deref().unwrap_or_default(),
@@ -282,12 +282,9 @@ fn filters(
     at: Level<'_>,
 ) -> Result<Vec<(Heads, ColourFilter)>> {
     let (shape, map) = (model.shape(), &at.maps[at.role]);
-    let Some(children) = shape.head(at.role, Heads::Best).map(|head| head.children) else {
-        return Ok(Vec::new());
-    };
     let (_, mut wanted) = pooled(cloud, at.level);
     let mut drawn = at.level;
-    if children == 8 {
+    if at.children == 8 {
         drawn += 1;
         let finer = pooled(cloud, drawn).1;
         wanted = of_children(&wanted, &finer, at.octree.occupancy(at.level));
@@ -299,7 +296,7 @@ fn filters(
         }
         let raw = model.generate_with(heads, at.role, at.features, map)?;
         let voxels = at.octree.level(at.level);
-        let gaussians = activate(&raw, voxels, children, shape, Frame::default());
+        let gaussians = activate(&raw, voxels, at.children, shape, Frame::default());
         drop(raw);
         let above = at.role.checked_sub(1).map(|role| &at.maps[role]);
         let around = Surroundings::of_level(&gaussians, at.octree, at.level, map, above);

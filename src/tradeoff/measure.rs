@@ -196,7 +196,7 @@ fn without_features(
         &maps,
         model,
         &mut zero,
-        &mut |_| Ok(Vec::new()),
+        None,
         &mut Log::default(),
     )?
     .0)

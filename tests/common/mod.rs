@@ -3,12 +3,13 @@
 
 use std::path::Path;
 
-use b2p::Placement;
+use b2p::bitstream::{Stream, Writer};
 use b2p::cloud::ColouredVoxels;
 use b2p::encoder::{Options, encode};
 use b2p::geometry::{Voxels, morton};
 use b2p::log::Log;
-use b2p::network::Model;
+use b2p::network::{Heads, Model};
+use b2p::{Limits, Placement};
 
 /// A coloured ball's surface on a voxel grid.
 pub struct Ball {
@@ -111,4 +112,24 @@ pub fn names_in(folder: &Path) -> Vec<std::ffi::OsString> {
         .collect();
     names.sort();
     names
+}
+
+/// The same stream, its last level with this colour filter for one set of heads.
+pub fn with_filter(bytes: &[u8], heads: Heads, filter: &[u8]) -> Vec<u8> {
+    let stream = Stream::parse(bytes, &Limits::default()).expect("a header");
+    let mut writer = Writer::new(stream.header().clone()).expect("a header that was read");
+    for level in stream.levels() {
+        for part in &level.geometry {
+            let slices = part.slices.iter().map(|slice| (slice.voxels, slice.bytes));
+            let slices: Vec<_> = slices.collect();
+            writer.geometry(part.level, &slices).expect("geometry");
+        }
+        let slices: Vec<_> = level.features.iter().map(|slice| slice.bytes).collect();
+        let (number, hash) = (level.level, level.latent_hash);
+        writer.features(number, hash, &slices).expect("features");
+    }
+    let top = stream.header().top;
+    let written = writer.filter(top, heads as usize, filter);
+    written.expect("a level of the stream");
+    writer.finish().expect("the parts of a whole stream")
 }

@@ -1,11 +1,12 @@
 //! Streams whose checksums are right and whose numbers are not.
 
 use b2p::Limits;
-use b2p::bitstream::{Header, Stream, Writer};
+use b2p::bitstream::Header;
 use b2p::gaussians::ColourFilter;
+use b2p::network::Heads;
 use rayon::prelude::*;
 
-use crate::common::small_stream;
+use crate::common::{small_stream, with_filter};
 use crate::seal::{FIXED, chunks, header_end, seal};
 use crate::{decoded, model, pushed};
 
@@ -139,28 +140,13 @@ fn a_coder_s_bytes_changed_behind_the_checksums_are_refused() {
 #[test]
 fn a_colour_filter_of_another_length_or_exponent_is_refused_and_the_level_before_stays() {
     let (model, whole) = (model(), small_stream(&model()));
-    let stream = Stream::parse(&whole, &Limits::default()).unwrap();
-    let with = |filter: &[u8]| {
-        let mut writer = Writer::new(stream.header().clone()).unwrap();
-        for level in stream.levels() {
-            for part in &level.geometry {
-                let slices = part.slices.iter().map(|slice| (slice.voxels, slice.bytes));
-                let slices: Vec<_> = slices.collect();
-                writer.geometry(part.level, &slices).unwrap();
-            }
-            let slices: Vec<_> = level.features.iter().map(|slice| slice.bytes).collect();
-            let (number, hash) = (level.level, level.latent_hash);
-            writer.features(number, hash, &slices).unwrap();
-        }
-        writer.filter(stream.header().top, 0, filter).unwrap();
-        writer.finish().unwrap()
-    };
+    let with = |filter: &[u8]| with_filter(&whole, Heads::Best, filter);
     let sound = ColourFilter {
         exponent: 15,
         weights: [[127; _]; 3],
     };
     let sound = sound.to_bytes();
-    let top = stream.header().top;
+    let top = Header::parse(&whole, &Limits::default()).unwrap().top;
     assert!(decoded(&model, &with(&sound), Some(top)).is_ok());
     let before = decoded(&model, &whole, Some(top - 1));
     for (wrong, told) in [
