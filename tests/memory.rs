@@ -289,6 +289,7 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
             let mut renderer = Renderer::default();
             renderer.set_effects(effects);
             let (mut image, mut ids) = (Image::default(), Ids::default());
+            let mut mixed = Vec::new();
             let mut draw = || {
                 let limits = Limits::default();
                 for channel in [Channel::Colour, Channel::Depth] {
@@ -300,6 +301,9 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
                 }
                 let stats = renderer.ids_into(&gaussians, &camera, &limits, &mut ids);
                 assert!(stats.unwrap().touched > 0);
+                let one = |_| [1.0];
+                let mix = renderer.mix_into(&gaussians, &camera, one, &limits, &mut mixed);
+                mix.unwrap();
             };
             pool.install(|| {
                 draw();

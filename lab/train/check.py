@@ -335,6 +335,41 @@ def so_it_does_where_the_finest_role_has_no_latents():
     return the_integer_path_follows_the_float_path(latent_roles=2, near_channels=[16, 0])
 
 
+def and_where_nothing_makes_its_features():
+    return the_integer_path_follows_the_float_path(latent_roles=2, fr_roles=2, near_channels=[16, 0])
+
+
+def a_network_without_a_reconstruction_starts_near_one_that_had_it():
+    samples = [data.procedural(i, size=48, views=2, pixels=60) for i in range(2)]
+    with tempfile.TemporaryDirectory() as folder, open(os.path.join(HERE, "configs/tiny.json")) as f:
+        config = json.load(f) | {"latent_roles": 2, "near_channels": [16, 0]}
+        paths = {}
+        for roles in (3, 2):
+            paths[roles] = f"{folder}/{roles}.json"
+            with open(paths[roles], "w") as to:
+                json.dump(config | {"fr_roles": roles}, to)
+        longer = train.Trainer(arguments(config=paths[3], rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
+        for step in range(40):
+            longer.train_step([samples[step % 2]])
+        longer.average = longer.model.state_dict()
+        train.atomic_save(longer.state(), f"{folder}/longer.pt")
+        shorter = train.Trainer(arguments(config=paths[2]))
+        shorter.start_from(f"{folder}/longer.pt")
+        shorter.shorten(samples)
+    left, whole = 0.0, 0.0
+    with torch.no_grad():
+        for s in samples:
+            (want, bits, _), (got, same_bits, _) = (m.code(s.crop, m.analyse(s.crop, s.rgb), 2, "round") for m in (longer.model, shorter.model))
+            assert torch.equal(want[1], got[1]) and all_equal(bits, same_bits), "what was coded stays"
+            left, whole = left + (want[2] - got[2]).pow(2).sum().item(), whole + (want[2] - want[2].mean(0)).pow(2).sum().item()
+    assert left < 0.5 * whole, f"{left} of {whole}"
+    return f"{100 * left / whole:.0f} % of the features' variance is left"
+
+
+def all_equal(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
 if __name__ == "__main__":
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "2")))
     for check in (operators_agree_with_plain_pytorch, rounded_operands_stay_close_where_the_processor_has_them,
@@ -342,7 +377,8 @@ if __name__ == "__main__":
                   a_frozen_first_encoder_changes_nothing_but_its_own_gradient, heads_alone_learn_and_leave_the_bits_as_they_are,
                   quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own, heads_that_imitate_others_come_to_say_what_these_say,
                   everything_else_learns_while_heads_stay, what_neighbours_tell_saves_bits_and_comes_from_those_before_alone,
-                  the_integer_path_follows_the_float_path, so_it_does_where_the_finest_role_has_no_latents, a_crop_overfits):
+                  the_integer_path_follows_the_float_path, so_it_does_where_the_finest_role_has_no_latents, and_where_nothing_makes_its_features,
+                  a_network_without_a_reconstruction_starts_near_one_that_had_it, a_crop_overfits):
         begin = time.monotonic()
         said = check()
         print(f"{check.__name__.replace('_', ' ')}: {said} ({time.monotonic() - begin:.0f} s)", flush=True)

@@ -21,7 +21,7 @@ import integer
 import ops
 from crop import join
 from integer import LIMIT, SIGMA_MAX, SIGMA_MIN, SIGMAS, sigma_of
-from model import B2P, Inception, NormConv, ResBlock, latents_of
+from model import B2P, Inception, NormConv, ResBlock, latents_of, reconstructed
 
 WEIGHT_MAX = 511
 LATENT_SHIFT = 6
@@ -132,7 +132,7 @@ def quantise(model, ranges):
         names += [f"{prefix}.blocks.{b}.{k}" for b in range(blocks) for k in ("a2", "b3")]
         return ranges.scale(*names)
 
-    g_scale = [ranges.scale(f"fr.{r}.lin2") for r in range(3)]
+    g_scale = [ranges.scale(f"fr.{r}.lin2") if reconstructed(cfg, r) else 0.0 for r in range(3)]
     c_scale = [0.0, *g_scale[:2]]
     if cfg["upsample"] == "learned":
         for r in (1, 2):
@@ -159,6 +159,9 @@ def quantise(model, ranges):
         layer(f"near.{r}.mu", s2, 1.0, factor=16.0)
         layer(f"near.{r}.sigma", s2, 1.0, factor=per_nat)
     for r in range(3):
+        if not reconstructed(cfg, r):
+            g_scale[r] = c_scale[r]
+            continue
         s = chain(f"fr.{r}.lin1", f"fr.{r}", cfg["fr_blocks"])
         inputs = np.full(latents_of(cfg, r) + (cfg["channels"] if r else 0), c_scale[r])
         inputs[:latents_of(cfg, r)] = 2.0**-LATENT_SHIFT
@@ -260,7 +263,7 @@ def is_quick(name):
 def same_streams(path, cfg):
     """Description and tensors of a model file whose streams a network of this configuration is to decode."""
     meta, tensors = read(path)
-    exact = ("channels", "latents", "latent_roles", "base_channels", "near_channels", "pem_blocks", "fr_blocks", "upsample", "inception_relu", "latent_max")
+    exact = ("channels", "latents", "latent_roles", "base_channels", "near_channels", "pem_blocks", "fr_blocks", "fr_roles", "upsample", "inception_relu", "latent_max")
     if any(meta.get(k) != cfg.get(k) for k in exact):
         sys.exit(f"{path} is another network")
     return meta, tensors

@@ -11,6 +11,7 @@ import torch
 from safetensors import safe_open
 
 import ops
+from model import reconstructed
 from passes import Base, Near
 
 LIMIT = 2047
@@ -115,6 +116,8 @@ class Exact:
         return self.conv(f"pem.{role}.mu", x, None), np.clip(self.conv(f"pem.{role}.sigma", x, None), 0, SIGMAS - 1)
 
     def reconstruct(self, role, latents, c, table, trace=None):
+        if not reconstructed(self.cfg, role):
+            return c
         x = clamp(latents << self.cfg["latent_shift"])
         x = relu(self.conv(f"fr.{role}.lin1", x if c is None else np.concatenate([x, c], 1), None))
         if trace is not None:

@@ -11,87 +11,9 @@ from torch import nn
 from torch.func import functional_call
 
 import ops
+from layers import Conv, Inception, NormConv, ResBlock
 from passes import Base, Near
 from rates import Bound, Prior, Through, bin_mass, bits, bounded_sigma
-
-
-def initial(taps, cin, cout, scale=1.0):
-    """The centre tap is orthogonal and the others small: a network starts close to a point-wise one. With equal random taps the response
-    to a constant colour would depend on which neighbours exist, and a product of random square matrices would lose most directions."""
-    w = torch.randn(taps, cin, cout) * (0.15 / math.sqrt(cin))
-    nn.init.orthogonal_(w[{1: 0, 8: 0, 27: 13}[taps]], math.sqrt(max(1.0, cout / cin)))
-    return w * scale
-
-
-class Conv(nn.Module):
-    """Sparse convolution of `taps` taps; taps = 1 is a linear layer. Weight [taps, c_in, c_out]."""
-
-    def __init__(self, cin, cout, taps=27, scale=1.0):
-        super().__init__()
-        self.weight = nn.Parameter(initial(taps, cin, cout, scale))
-        self.bias = nn.Parameter(torch.zeros(cout))
-        self.taps = taps
-
-    def forward(self, x, kmap=None, relu=False):
-        if self.taps == 1:
-            return ops.linear(x, self.weight, self.bias, relu)
-        return ops.conv(x, self.weight, self.bias, kmap, relu)
-
-
-class NormConv(nn.Module):
-    """Geometry-invariant convolution (paper section 4): the response is divided by the L2 norm of the active weights of each
-    output channel; a gain and a bias follow."""
-
-    def __init__(self, cin, cout, taps=27, gain=1.0):
-        super().__init__()
-        self.weight = nn.Parameter(initial(taps, cin, cout))
-        self.gain = nn.Parameter(torch.full((cout,), gain))
-        self.bias = nn.Parameter(torch.zeros(cout))
-        self.taps, self.target, self.calibrating = taps, gain, False
-
-    def forward(self, x, kmap=None, relu=False):
-        if self.calibrating:  # gain and bias such that every channel has mean 0 and the wanted standard deviation
-            self.calibrating = False
-            y = self.forward(x, kmap)
-            s = y.std(0)
-            s = self.target / s.clamp_min(0.1 * s.mean())
-            self.gain.mul_(s)
-            self.bias.copy_((self.bias - y.mean(0)) * s)
-        if self.taps == 1:
-            w = self.weight
-            return ops.linear(x, w * (self.gain * torch.rsqrt((w * w).sum(1, keepdim=True) + 1e-8)), self.bias, relu)
-        return ops.norm_conv(x, self.weight, self.gain, self.bias, kmap, relu)
-
-
-class Inception(nn.Module):
-    def __init__(self, c, relu, norm=False, branch=0.3):
-        super().__init__()
-        self.relu = relu
-        if norm:
-            make = lambda i, o, taps, last: NormConv(i, o, taps, branch if last else 1.0)
-        else:
-            make = lambda i, o, taps, last: Conv(i, o, taps, branch if last else 1.0)
-        self.a1 = make(c, c // 4, 27, False)
-        self.a2 = make(c // 4, c // 2, 27, True)
-        self.b1 = make(c, c // 4, 1, False)
-        self.b2 = make(c // 4, c // 4, 27, False)
-        self.b3 = make(c // 4, c // 2, 1, True)
-
-    def forward(self, x, kmap):
-        a = self.a2(self.a1(x, kmap, True), kmap)
-        b = self.b3(self.b2(self.b1(x, kmap, True), kmap, True), kmap)
-        return ops.residual([a, b], x, self.relu)
-
-
-class ResBlock(nn.Module):
-    def __init__(self, c, relu, branch=0.1):
-        super().__init__()
-        self.relu = relu
-        self.c1 = Conv(c, c, 27)
-        self.c2 = Conv(c, c, 27, branch)
-
-    def forward(self, x, kmap):
-        return ops.residual([self.c2(self.c1(x, kmap, True), kmap)], x, self.relu)
 
 
 class FeatureConvert(nn.Module):
@@ -145,6 +67,11 @@ class Entropy(nn.Module):
 def latents_of(cfg, role):
     """How many latents a voxel of a role has: those from `latent_roles` on are told by the level below alone."""
     return cfg["latents"] if role < cfg.get("latent_roles", 3) else 0
+
+
+def reconstructed(cfg, role):
+    """Whether a role has a network that makes its features. Where it has none, they are what the level below tells."""
+    return role < cfg.get("fr_roles", 3)
 
 
 class Reconstruct(nn.Module):
@@ -266,7 +193,7 @@ class B2P(nn.Module):
         c = cfg["channels"]
         self.fc = nn.ModuleList(FeatureConvert(cfg, 3 if r == 3 else c) for r in range(4))
         self.fs = nn.ModuleList(FeatureSqueeze(cfg, r > 0) for r in range(3) if latents_of(cfg, r))
-        self.fr = nn.ModuleList(Reconstruct(cfg, r) for r in range(3))
+        self.fr = nn.ModuleList(Reconstruct(cfg, r) for r in range(3) if reconstructed(cfg, r))
         self.pem = nn.ModuleDict({str(r): Entropy(cfg) for r in (1, 2) if latents_of(cfg, r)})
         self.gg = nn.ModuleDict({str(g["role"]): Generate(cfg, g) for g in cfg["gg"]})
         self.prior = Prior(cfg["latents"])
@@ -327,8 +254,12 @@ class B2P(nn.Module):
                 smooth = self.bits(r, noisy, *fixed, crop, seen=rounded, learn=False)
                 rates.append(self.bits(r, rounded.detach(), mu, log_sigma, crop) + smooth - smooth.detach())
             latents.append(y)
-            trail.append(self.fr[r](noisy if mode == "noise" else rounded, c, crop.kernel3[r]))
+            trail.append(self.reconstruct(r, noisy if mode == "noise" else rounded, c, crop))
         return trail, rates, latents
+
+    def reconstruct(self, r, y, c, crop):
+        """Features of a role, from its latents and its context."""
+        return self.fr[r](y, c, crop.kernel3[r]) if reconstructed(self.cfg, r) else c
 
     def squeeze(self, r, features, c):
         """The latents of a role before they are rounded."""
@@ -377,7 +308,7 @@ class B2P(nn.Module):
             c = self.context(g, crop, r) if r else None
             if latents_of(self.cfg, r):
                 self.start_squeeze(r, features[r], c, target)
-            g = self.fr[r](torch.round(self.squeeze(r, features[r], c)), c, crop.kernel3[r])
+            g = self.reconstruct(r, torch.round(self.squeeze(r, features[r], c)), c, crop)
             if r:
                 self.predict(r, c, crop)
                 self.generate(g, crop, r)
@@ -406,7 +337,7 @@ class B2P(nn.Module):
             route(fc.conv_out, rectified @ signed)
         c = self.cfg["channels"]
         for r in range(3):
-            fr, k = self.fr[r], latents_of(self.cfg, r)
+            k = latents_of(self.cfg, r)
             if k:
                 fs = self.fs[r]
                 fs.lin1.weight[:, :, :2 * n] = 0
@@ -417,15 +348,17 @@ class B2P(nn.Module):
                 fs.lin2.weight[:, :, :n] = 0
                 fs.lin2.bias[:n] = 0
                 fs.lin2.weight[0, :2 * n, :n] = rectified * steps
-            fr.lin1.weight[:, :, :2 * n] = 0
-            fr.lin1.bias[:2 * n] = 0
-            if k:
-                fr.lin1.weight[0, :n, :2 * n] = signed / steps[:, None]
-            if r:
-                fr.lin1.weight[0, k:k + n, :2 * n] = signed
-            for b in fr.blocks:
-                let_pass(b)
-            route(fr.lin2, rectified)
+            if reconstructed(self.cfg, r):
+                fr = self.fr[r]
+                fr.lin1.weight[:, :, :2 * n] = 0
+                fr.lin1.bias[:2 * n] = 0
+                if k:
+                    fr.lin1.weight[0, :n, :2 * n] = signed / steps[:, None]
+                if r:
+                    fr.lin1.weight[0, k:k + n, :2 * n] = signed
+                for b in fr.blocks:
+                    let_pass(b)
+                route(fr.lin2, rectified)
             if r and self.up:
                 route(self.up[str(r)], eye, tap=range(8))
             self.probe[r].weight.zero_()
@@ -474,6 +407,27 @@ class B2P(nn.Module):
             for head in (pem.mu, pem.sigma):
                 head.weight[:, :, :n], head.bias[:n] = 0, 0
             pem.sigma.bias[:n] = (x.float() @ fit * steps).std(0).clamp_min(0.2).log()
+
+    @torch.no_grad()
+    def shorten(self, model, samples):
+        """Takes the weights of a network that makes features of more roles; what the level below tells of these becomes what comes nearest to
+        their features, linearly."""
+        weights = model.state_dict()
+        for r in range(3):
+            if reconstructed(self.cfg, r) or not reconstructed(model.cfg, r):
+                continue
+            known, wanted = [], []
+            for s in samples:
+                trail, _, _ = model.code(s.crop, model.analyse(s.crop, s.rgb), r, "round")
+                known.append(model.context(trail[r - 1], s.crop, r).double())
+                wanted.append(trail[r].double())
+            known, wanted = torch.cat(known), torch.cat(wanted)
+            fit = ridge(torch.cat([known, torch.ones(len(known), 1).to(known)], 1), wanted, 1e-5).float()
+            up = f"up.{r}"
+            weights[up + ".weight"] = weights[up + ".weight"] @ fit[:-1]
+            weights[up + ".bias"] = weights[up + ".bias"] @ fit[:-1] + fit[-1]
+        own = self.state_dict()
+        self.load_state_dict({k: v for k, v in weights.items() if k in own})
 
     def colours(self, crop, rgb):
         """Mean colour of the voxels of roles 0, 1, 2."""

@@ -157,6 +157,7 @@ class Trainer:
         self.step, self.used, self.calibrated, self.new_heads = 0, 0.0, False, False
         self.finest = {}  # of a frozen first encoder: its features, in f16, by the sample's name
         self.decoded = {}  # where only the heads are trained: what they read, in f16, by the sample's name
+        self.longer = None  # what to start from, where it makes features of more roles
         self.teacher, self.taught = None, {}  # other heads of the same network, and what they make of a sample, in f16
 
     def state(self):
@@ -169,6 +170,13 @@ class Trainer:
             return torch.load(path, map_location=self.device, weights_only=False)["average"]
         return {k: v.float() for k, v in load_file(path, device=self.device).items()}
 
+    @staticmethod
+    def config_of(path):
+        if not path.endswith(".safetensors"):
+            return torch.load(path, map_location="cpu", weights_only=False)["config"]
+        with safe_open(path, "pt") as f:
+            return json.loads((f.metadata() or {}).get("config", "{}"))
+
     def stay_near(self, path, share):
         """Moves the averaged weights this share of the way back to those of `path`."""
         start = self.weights_of(path)
@@ -177,7 +185,11 @@ class Trainer:
     def start_from(self, path):
         """Takes the averaged weights of a checkpoint, or those that `export.py --weights` wrote; all but the heads where only heads are
         to be trained and the configuration has others."""
-        weights = self.weights_of(path)
+        weights, before = self.weights_of(path), self.config_of(path)
+        if before.get("fr_roles", 3) > self.cfg.get("fr_roles", 3):
+            self.longer = B2P(before).to(self.device)
+            self.longer.load_state_dict(weights)
+            return
         heads = lambda tensors: {k: v.shape for k, v in tensors.items() if k.startswith("gg.")}
         self.new_heads = self.args.only_heads and heads(weights) != heads(self.model.state_dict())
         if self.new_heads:
@@ -193,10 +205,15 @@ class Trainer:
             self.model.start_heads(join([s.crop for s in samples]).to(self.device), torch.cat([s.rgb for s in samples]).to(self.device))
         self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
 
+    def shorten(self, samples):
+        """Takes the weights of `--init` where these make features of more roles."""
+        self.model.shorten(self.longer, samples)
+        self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+        self.calibrated, self.longer = True, None
+
     def learn_from(self, path):
         """Takes the heads of a file of `export.py --weights` as a teacher of others for the same network."""
-        with safe_open(path, "pt") as f:
-            self.teacher = B2P(json.loads(f.metadata()["config"])).to(self.device).eval()
+        self.teacher = B2P(self.config_of(path)).to(self.device).eval()
         self.teacher.load_state_dict(self.weights_of(path))
 
     @torch.no_grad()
@@ -404,11 +421,13 @@ def main(argv=None):
         p.error("--teacher and --quick-of want --only-heads, --draw-from wants --teacher")
     if args.revive and args.revive >= trainer.cfg.get("latent_roles", 3):
         p.error("--revive wants a role that has latents")
-    if args.stay and (not args.init or trainer.new_heads):
+    if args.stay and (not args.init or trainer.new_heads or trainer.longer):
         p.error("--stay wants weights of the same heads in --init")
     if args.teacher:
         trainer.learn_from(args.teacher)
     train_files, held_files = data.split(args.data, args.held_out)
+    if trainer.longer:
+        trainer.shorten([data.load_sample(f) for f in train_files[:10]])
     held = [data.load_sample(f).to(args.device) for f in held_files]
     calibration = None if trainer.calibrated else [data.load_sample(f) for f in train_files[:6]]
     if trainer.new_heads:

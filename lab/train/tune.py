@@ -27,7 +27,7 @@ def inputs(model, sample):
         y = torch.round(model.squeeze(r, features[r], c))
         out.append((c, y, kmap))
         if r < 2:
-            g = model.fr[r](y, c, kmap)
+            g = model.reconstruct(r, y, c, sample.crop)
     return out, sample.crop, sample.crop.points
 
 

@@ -406,13 +406,9 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let latents = self.latents(pool, header, level, context.as_deref(), octree, &map, log)?;
         self.cancel.check()?;
         let features = log.step(Module::Features(role).at(n), count, "voxels", || {
-            let context = context.as_deref();
             let model = &self.model;
             Ok(model.reconstruct_in(pool, role, &latents, context, &map))
         })?;
-        if let Some(context) = context {
-            pool.give(context);
-        }
         Ok((latents, features, map.into_owned()))
     }
 

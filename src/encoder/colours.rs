@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::error::Result;
 use crate::gaussians::{COLOUR_INPUTS as INPUTS, ColourFilter, Gaussians, Surroundings};
 use crate::limits::Limits;
-use crate::pixels::{Background, Image, Quality, Renderer};
+use crate::pixels::{Quality, Renderer};
 use crate::projection::Camera;
 
 /// Cameras, once around the cloud, from above and below by turns.
@@ -26,41 +26,35 @@ const DECIBEL: f64 = 0.12;
 /// # Errors
 /// Those of [`Renderer::render`].
 pub(super) fn fit(
-    mut gaussians: Gaussians,
+    gaussians: &Gaussians,
     surroundings: &Surroundings,
     wanted: &[[f32; 3]],
     level: u8,
     latents: usize,
 ) -> Result<Option<ColourFilter>> {
-    let colours = std::mem::take(&mut gaussians.colour);
-    let over = |f: &(dyn Fn(usize) -> [f32; 3] + Sync)| -> Vec<[f32; 3]> {
-        let each = (0..colours.len()).into_par_iter().with_min_len(4096);
-        each.map(f).collect()
-    };
     let size = 1 << level.clamp(6, 10);
     let mut renderer = Renderer::default();
     renderer.set_quality(Quality::Fast);
-    // The first input is 1, whose picture is that of the opacities; last comes what the inputs are to give.
-    let mut pictures = vec![Image::default(); INPUTS / 3 + 1];
+    let colours = &gaussians.colour;
+    let numbers = |i: usize| -> [f32; INPUTS + 3] {
+        let mut numbers = [0.0; INPUTS + 3];
+        numbers[..INPUTS].copy_from_slice(&surroundings.inputs(i, colours[i]));
+        for (missing, (wanted, own)) in numbers[INPUTS..]
+            .iter_mut()
+            .zip(wanted[i].iter().zip(colours[i]))
+        {
+            *missing = wanted - own;
+        }
+        numbers
+    };
+    let (limits, mut pixels) = (Limits::unlimited(), Vec::new());
     let mut sums = Sums::default();
     for view in 0..VIEWS {
         let elevation = if view % 2 == 0 { 15.0 } else { -15.0 };
         let azimuth = 360.0 / VIEWS as f64 * (view as f64 + 0.5);
         let camera = Camera::orbit(azimuth, elevation, 3.0, 45.0, size, size)?;
-        for (plane, picture) in pictures.iter_mut().enumerate() {
-            gaussians.colour = over(&|i| match 1 + 3 * plane {
-                INPUTS => std::array::from_fn(|c| wanted[i][c] - colours[i][c]),
-                first => {
-                    let inputs = surroundings.inputs(i, colours[i]);
-                    std::array::from_fn(|c| inputs[first + c])
-                }
-            });
-            let (back, limits) = (Background::Transparent, Limits::unlimited());
-            renderer.render_into(&gaussians, &camera, back, &limits, picture)?;
-        }
-        if let [planes @ .., missing] = &pictures[..] {
-            sums.add(planes, missing);
-        }
+        renderer.mix_into(gaussians, &camera, numbers, &limits, &mut pixels)?;
+        sums.add(&pixels);
     }
     Ok(sums.solve(latents))
 }
@@ -75,33 +69,22 @@ struct Sums {
 }
 
 impl Sums {
-    /// Adds the pixels of a view: `planes` show three inputs each, `missing` what is to be added.
-    fn add(&mut self, planes: &[Image], missing: &Image) {
-        let missing = &missing.pixels;
-        let part = |first: usize| {
+    /// Adds the pixels of a view: the inputs, of which the first is the opacity, and what they are to give.
+    fn add(&mut self, pixels: &[[f32; INPUTS + 3]]) {
+        let part = |pixels: &[[f32; INPUTS + 3]]| {
             let mut sums = Sums::default();
-            for at in first..missing.len().min(first + PART) {
-                let [missing @ .., alpha] = missing[at];
-                if alpha < OPAQUE {
-                    continue;
-                }
-                let mut inputs = [f64::from(alpha); INPUTS];
-                for (to, plane) in inputs[1..].chunks_exact_mut(3).zip(planes) {
-                    for (to, x) in to.iter_mut().zip(plane.pixels[at]) {
-                        *to = x.into();
-                    }
-                }
-                sums.add_pixel(&inputs, missing.map(f64::from));
-            }
+            let opaque = pixels.iter().filter(|pixel| pixel[0] >= OPAQUE);
+            opaque.for_each(|pixel| sums.add_pixel(pixel.map(f64::from)));
             sums
         };
-        let parts: Vec<usize> = (0..missing.len()).step_by(PART).collect();
-        let parts: Vec<Sums> = parts.into_par_iter().map(part).collect();
+        let parts: Vec<Sums> = pixels.par_chunks(PART).map(part).collect();
         parts.iter().for_each(|part| self.add_all(part));
     }
 
-    fn add_pixel(&mut self, inputs: &[f64; INPUTS], missing: [f64; 3]) {
+    fn add_pixel(&mut self, pixel: [f64; INPUTS + 3]) {
         self.pixels += 1;
+        let inputs: &[f64; INPUTS] = pixel[..INPUTS].try_into().expect("the first of them");
+        let missing = [0, 1, 2].map(|c| pixel[INPUTS + c]);
         for (sums, x) in self.inputs.iter_mut().zip(inputs) {
             for (sum, y) in sums.iter_mut().zip(inputs) {
                 *sum += x * y;
@@ -256,7 +239,7 @@ mod tests {
             let pairs = colours.iter().flatten().zip(wanted.colour.iter().flatten());
             pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>()
         };
-        let found = fit(gaussians.clone(), &around, &wanted.colour, 6, 1 << 20).unwrap();
+        let found = fit(&gaussians, &around, &wanted.colour, 6, 1 << 20).unwrap();
         let mut corrected = gaussians.clone();
         found.unwrap().apply(&mut corrected, &around);
         let (before, after) = (off(&gaussians.colour), off(&corrected.colour));
@@ -267,12 +250,12 @@ mod tests {
     fn right_colours_have_no_filter_and_few_latents_do_not_pay_for_one() {
         let (gaussians, around) = scene();
         let colours = gaussians.colour.clone();
-        let none = fit(gaussians.clone(), &around, &colours, 6, 1 << 20).unwrap();
+        let none = fit(&gaussians, &around, &colours, 6, 1 << 20).unwrap();
         assert_eq!(none, None);
         let wanted: Vec<_> = colours.iter().map(|c| c.map(|x| x * 0.9)).collect();
-        let few = fit(gaussians.clone(), &around, &wanted, 6, 8).unwrap();
+        let few = fit(&gaussians, &around, &wanted, 6, 8).unwrap();
         assert_eq!(few, None);
-        let many = fit(gaussians, &around, &wanted, 6, 1 << 20).unwrap();
+        let many = fit(&gaussians, &around, &wanted, 6, 1 << 20).unwrap();
         assert!(many.is_some());
     }
 
@@ -294,7 +277,7 @@ mod tests {
         };
         let around = Surroundings::of_level(&few, &octree, 5, &octree.kernel_map(5), None);
         let wanted: Vec<_> = (0..32).map(|i| [of(5 * i), of(7 * i), of(9 * i)]).collect();
-        assert_eq!(fit(few, &around, &wanted, 6, 1 << 8).unwrap(), None);
+        assert_eq!(fit(&few, &around, &wanted, 6, 1 << 8).unwrap(), None);
     }
 
     #[test]
@@ -302,7 +285,7 @@ mod tests {
         let (mut gaussians, around) = scene();
         gaussians.opacity.fill(0.0);
         let wanted = vec![[0.0; 3]; gaussians.len()];
-        assert_eq!(fit(gaussians, &around, &wanted, 6, 1 << 20).unwrap(), None);
+        assert_eq!(fit(&gaussians, &around, &wanted, 6, 1 << 20).unwrap(), None);
     }
 
     #[test]
@@ -311,7 +294,7 @@ mod tests {
         let wanted: Vec<_> = gaussians.colour.iter().map(|c| c.map(|x| x * x)).collect();
         let with = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-            let find = || fit(gaussians.clone(), &around, &wanted, 6, 1 << 20);
+            let find = || fit(&gaussians, &around, &wanted, 6, 1 << 20);
             pool.build().unwrap().install(find).unwrap()
         };
         assert_eq!(with(1), with(3));

@@ -300,7 +300,7 @@ fn filters(
         drop(raw);
         let above = at.role.checked_sub(1).map(|role| &at.maps[role]);
         let around = Surroundings::of_level(&gaussians, at.octree, at.level, map, above);
-        let filter = colours::fit(gaussians, &around, &wanted, drawn, at.latents)?;
+        let filter = colours::fit(&gaussians, &around, &wanted, drawn, at.latents)?;
         found.extend(filter.map(|filter| (heads, filter)));
     }
     Ok(found)

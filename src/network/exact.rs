@@ -95,7 +95,8 @@ impl Model {
         (mu, indices)
     }
 
-    /// The features [voxels, C] of a role, from its latents [voxels, K], none if it has none, and, above role 0, its context [voxels, C].
+    /// The features [voxels, C] of a role, from its latents [voxels, K], none if it has none, and, above role 0, its context [voxels, C]:
+    /// the context itself where the model has nothing that reconstructs.
     ///
     /// # Panics
     /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.
@@ -106,6 +107,7 @@ impl Model {
         context: Option<&[i16]>,
         map: &KernelMap,
     ) -> Vec<i16> {
+        let context = context.map(<[i16]>::to_vec);
         self.reconstruct_in(&mut Pool::new(), role, latents, context, map)
     }
 
@@ -114,7 +116,7 @@ impl Model {
         pool: &mut Pool<i16>,
         role: usize,
         latents: &[i16],
-        context: Option<&[i16]>,
+        context: Option<Vec<i16>>,
         map: &KernelMap,
     ) -> Vec<i16> {
         assert_eq!(
@@ -124,26 +126,30 @@ impl Model {
         );
         let (c, k) = (self.shape.channels, self.shape.latents_of(role));
         self.check(latents, k, map);
+        if let Some(context) = &context {
+            self.check(context, c, map);
+        }
+        let Some(fr) = &self.exact.fr[role] else {
+            return context.expect("role 0 is reconstructed");
+        };
         let limit = i32::from(LIMIT);
         let shift = self.shape.latent_shift;
         let raise = |&y: &i16| (i32::from(y) << shift).clamp(-limit, limit) as i16;
         let mut x: Vec<i16> = latents.par_iter().map(raise).collect();
-        let known = match context {
-            None => &x,
+        let known = match &context {
+            Some(context) if k == 0 => context,
             Some(context) => {
-                self.check(context, c, map);
-                if k == 0 {
-                    context
-                } else {
-                    x = concat(pool, &x, k, context, c);
-                    &x
-                }
+                x = concat(pool, &x, k, context, c);
+                &x
             }
+            None => &x,
         };
-        let fr = &self.exact.fr[role];
         let (isa, n) = (self.isa, map.len());
         let hidden = apply(pool, isa, &fr.lin1, Taps::Same, known, n, true);
         pool.give(x);
+        if let Some(context) = context {
+            pool.give(context);
+        }
         let x = self.blocks(pool, &fr.blocks, hidden, map);
         let features = apply(pool, isa, &fr.lin2, Taps::Same, &x, n, false);
         pool.give(x);

@@ -9,8 +9,8 @@
 //! - **Context**: `c` of a voxel is a linear layer, one per octant, of its parent's feature `g` (or a copy of it).
 //! - **Base level**: no context. Beyond the paper, a small network predicts its latents from those of neighbours that were coded
 //!   before ([`Model::pass_parameters`]); without one, they have one distribution per channel.
-//! - **Latents**: a model may have none in its finest roles ([`Shape::latent_roles`]), beyond the paper: such a level brings geometry alone, and
-//!   its features are made of the context.
+//! - **Latents**: a model may have none in its finest roles ([`Shape::latent_roles`]), beyond the paper: such a level brings geometry alone. Its
+//!   features are made of the context, or are the context ([`Shape::fr_roles`]).
 //! - **Neighbours**: beyond the paper, another such network may correct, at the levels above, what PEM predicts from the context.
 //!
 //! # The exact zone

@@ -33,6 +33,9 @@ pub struct Shape {
     pub pem_blocks: usize,
     /// Inception blocks of each feature reconstruction (FR).
     pub fr_blocks: usize,
+    /// How many roles have one: at least those that have latents. The features of others are what the level below tells.
+    #[serde(default = "all_roles")]
+    pub fr_roles: usize,
     /// The Gaussian generators (GG): one for each role that has Gaussians, and if there are quick ones, another for each of these.
     pub gg: Vec<Head>,
     /// How a feature gets to the children.
@@ -101,6 +104,7 @@ impl Shape {
             fc_blocks: 1,
             pem_blocks: 1,
             fr_blocks: 1,
+            fr_roles: ROLES,
             gg: vec![head(1, 8), head(2, 1)],
             upsample: Upsample::Learned,
             inception_relu: true,
@@ -199,8 +203,12 @@ impl Shape {
             ROLES => String::new(),
             roles => format!(";latent_roles={roles}"),
         };
+        let reconstructed = match self.fr_roles {
+            ROLES => String::new(),
+            roles => format!(";fr_roles={roles}"),
+        };
         format!(
-            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}{near}{roles}",
+            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}{near}{roles}{reconstructed}",
             self.channels,
             self.latents,
             self.pem_blocks,
@@ -240,6 +248,8 @@ impl Shape {
         require(latents, "latents", &self.latents, "1 to 64")?;
         let roles = (1..=ROLES).contains(&self.latent_roles);
         require(roles, "latent_roles", &self.latent_roles, "1 to 3")?;
+        let roles = (self.latent_roles..=ROLES).contains(&self.fr_roles);
+        require(roles, "fr_roles", &self.fr_roles, "latent_roles to 3")?;
         for (role, near) in (1..).zip(self.near_channels) {
             require(
                 near == 0 || (channels(near) && role < self.latent_roles),
@@ -430,6 +440,8 @@ mod tests {
             ("/latents", "65"),
             ("/latent_roles", "0"),
             ("/latent_roles", "4"),
+            ("/fr_roles", "2"),
+            ("/fr_roles", "4"),
             ("/base_channels", "260"),
             ("/near_channels/1", "6"),
             ("/pem_blocks", "17"),

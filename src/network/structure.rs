@@ -145,8 +145,8 @@ pub(crate) struct Exact<L> {
     pub near: [Option<Neighbours<L>>; 2],
     /// Of roles 1 and 2, if they have latents.
     pub pem: [Option<Entropy<L>>; 2],
-    /// Of roles 0, 1 and 2.
-    pub fr: [Reconstruct<L>; ROLES],
+    /// Of roles 0, 1 and 2, for which the model has it.
+    pub fr: [Option<Reconstruct<L>>; ROLES],
 }
 
 /// What only an encoder needs.
@@ -260,15 +260,18 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
         }))
     }
 
-    fn reconstruct(&mut self, role: usize) -> Result<Reconstruct<L>> {
+    fn reconstruct(&mut self, role: usize) -> Result<Option<Reconstruct<L>>> {
         let (c, k) = (self.shape.channels, self.shape.latents_of(role));
+        if role >= self.shape.fr_roles {
+            return Ok(None);
+        }
         let module = format!("fr.{role}");
         let cin = if role == 0 { k } else { k + c };
-        Ok(Reconstruct {
+        Ok(Some(Reconstruct {
             lin1: self.linear(&format!("{module}.lin1"), cin, c)?,
             blocks: self.inceptions(&module, self.shape.fr_blocks, false)?,
             lin2: self.linear(&format!("{module}.lin2"), c, c)?,
-        })
+        }))
     }
 
     fn generate(&mut self, head: &Head) -> Result<Generate<L>> {

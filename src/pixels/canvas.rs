@@ -11,6 +11,9 @@ use super::Background;
 use crate::projection::Bounds;
 use crate::tiles::{Bins, Grid, Nearest, TILE};
 
+/// Side of the blocks that [`b2p_kernels::splat::Share`] is about.
+const SIDE: usize = 4;
+
 /// A picture's place and what is behind it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Canvas {
@@ -40,6 +43,8 @@ pub(super) struct Desk {
     nearest: Nearest,
     tile: Tile,
     samples: Vec<[f32; 4]>,
+    /// Of each of the tile's pixels, what [`Mixed`] adds up.
+    sums: Vec<f32>,
     /// Samples that something was drawn on.
     pub touched: u64,
     pub sorting: Duration,
@@ -47,35 +52,56 @@ pub(super) struct Desk {
 }
 
 /// What a picture is made of.
-pub(super) trait Pixel: Copy + Zeroable + Send {
-    /// Where nothing is drawn.
-    fn empty(background: Background) -> Self;
+pub(super) trait Output: Sync {
+    type Pixel: Copy + Zeroable + Send;
 
-    /// Writes the wanted part of the desk's tile, `size` samples, into `rows` of `width` pixels each.
+    /// What the loop over splats does in any case.
+    const LOOP: Option<Loop>;
+
+    /// Where nothing is drawn.
+    fn empty(&self, background: Background) -> Self::Pixel;
+
+    /// Before anything is put on the desk's tile.
+    fn start(&self, _desk: &mut Desk) {}
+
+    /// After some splats were put on it.
+    fn look(&self, _desk: &mut Desk) {}
+
+    /// Writes the wanted `part` of the desk's tile into `rows` of `width` pixels each.
     fn write(
+        &self,
         desk: &mut Desk,
         isa: Isa,
         canvas: &Canvas,
-        size: [u32; 2],
-        rows: &mut [Self],
+        part: Bounds,
+        rows: &mut [Self::Pixel],
         width: usize,
     );
 }
 
-impl Pixel for [f32; 4] {
-    fn empty(background: Background) -> Self {
+/// Red, green, blue and alpha.
+pub(super) struct Colours;
+
+impl Output for Colours {
+    type Pixel = [f32; 4];
+
+    const LOOP: Option<Loop> = None;
+
+    fn empty(&self, background: Background) -> [f32; 4] {
         let [r, g, b, a] = background.behind();
         [r, g, b, 1.0 + a]
     }
 
     fn write(
+        &self,
         desk: &mut Desk,
         isa: Isa,
         canvas: &Canvas,
-        size: [u32; 2],
-        rows: &mut [Self],
+        part: Bounds,
+        rows: &mut [[f32; 4]],
         width: usize,
     ) {
+        let size = [part.x1 - part.x0, part.y1 - part.y0];
         let behind = canvas.background.behind();
         let touched = if canvas.shrink == 1 {
             desk.tile.write(isa, behind, rows, width)
@@ -92,31 +118,106 @@ impl Pixel for [f32; 4] {
 }
 
 /// The index of a Gaussian.
-impl Pixel for u32 {
-    fn empty(_: Background) -> Self {
+pub(super) struct Indices;
+
+impl Output for Indices {
+    type Pixel = u32;
+
+    const LOOP: Option<Loop> = Some(Loop::Ids);
+
+    fn empty(&self, _: Background) -> u32 {
         u32::MAX
     }
 
-    fn write(desk: &mut Desk, _: Isa, _: &Canvas, _: [u32; 2], rows: &mut [Self], width: usize) {
+    fn write(
+        &self,
+        desk: &mut Desk,
+        _: Isa,
+        _: &Canvas,
+        _: Bounds,
+        rows: &mut [u32],
+        width: usize,
+    ) {
         desk.touched += u64::from(desk.tile.write_ids(rows, width));
+    }
+}
+
+/// What Gaussians have `N` numbers of, mixed as their colours would be.
+pub(super) struct Mixed<F, const N: usize>(pub F);
+
+impl<F: Fn(usize) -> [f32; N] + Sync, const N: usize> Output for Mixed<F, N> {
+    type Pixel = [f32; N];
+
+    const LOOP: Option<Loop> = Some(Loop::Shares);
+
+    fn empty(&self, _: Background) -> [f32; N] {
+        [0.0; N]
+    }
+
+    fn start(&self, desk: &mut Desk) {
+        desk.sums.clear();
+        desk.sums.resize((TILE * TILE) as usize * N, 0.0);
+    }
+
+    fn look(&self, desk: &mut Desk) {
+        let (sums, _) = desk.sums.as_chunks_mut::<N>();
+        let mut last = None;
+        for share in desk.tile.shares() {
+            // The blocks of a Gaussian come one after the other.
+            let numbers = match last {
+                Some((index, numbers)) if index == share.index => numbers,
+                _ => (self.0)(share.index as usize),
+            };
+            last = Some((share.index, numbers));
+            let [x, y] = share.at.map(|at| at as usize);
+            for (row, weights) in share.weights.chunks_exact(SIDE).enumerate() {
+                let pixels = &mut sums[(y + row) * TILE as usize + x..][..SIDE];
+                for (sums, &weight) in pixels.iter_mut().zip(weights) {
+                    if weight > 0.0 {
+                        for (sum, x) in sums.iter_mut().zip(numbers) {
+                            *sum += weight * x;
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    fn write(
+        &self,
+        desk: &mut Desk,
+        _: Isa,
+        _: &Canvas,
+        part: Bounds,
+        rows: &mut [[f32; N]],
+        width: usize,
+    ) {
+        let (sums, _) = desk.sums.as_chunks::<N>();
+        let columns = part.x0 as usize..part.x1 as usize;
+        let lines = sums.chunks_exact(TILE as usize);
+        let lines = lines.take(part.y1 as usize).skip(part.y0 as usize);
+        for (line, row) in lines.zip(rows.chunks_mut(width)) {
+            row[..columns.len()].copy_from_slice(&line[columns.clone()]);
+        }
     }
 }
 
 impl Desk {
     /// Draws a tile into `band`, the pixels of its row of tiles.
-    pub fn draw<P: Pixel>(
+    pub fn draw<O: Output>(
         &mut self,
         [column, row]: [usize; 2],
         canvas: &Canvas,
         contents: &Contents,
-        band: &mut [P],
+        output: &O,
+        band: &mut [O::Pixel],
     ) {
         let Contents { isa, scene, .. } = *contents;
         let columns = canvas.columns(column);
         let width = canvas.width();
         let entries = contents.bins.tile(row, column);
         if entries.is_empty() {
-            let empty = P::empty(canvas.background);
+            let empty = output.empty(canvas.background);
             for line in band.chunks_exact_mut(width) {
                 line[columns.clone()].fill(empty);
             }
@@ -127,11 +228,16 @@ impl Desk {
         let sorted = Instant::now();
         let (corner, part) = canvas.tile([column, row]);
         self.tile.start(corner, part, contents.floor, contents.what);
-        self.nearest
-            .each(|keys, next| self.tile.blend(isa, keys, next, scene));
+        output.start(self);
+        let nearest = std::mem::take(&mut self.nearest);
+        nearest.each(|keys, next| {
+            let open = self.tile.blend(isa, keys, next, scene);
+            output.look(self);
+            open
+        });
+        self.nearest = nearest;
         self.tile.finish(isa);
-        let size = [part.x1 - part.x0, part.y1 - part.y0];
-        P::write(self, isa, canvas, size, &mut band[columns.start..], width);
+        output.write(self, isa, canvas, part, &mut band[columns.start..], width);
         self.sorting += sorted - start;
         self.blending += sorted.elapsed();
     }

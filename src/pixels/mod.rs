@@ -49,7 +49,7 @@ use crate::gaussians::Gaussians;
 use crate::limits::Limits;
 use crate::projection::{Camera, Dropped, Ellipse, Ellipses, How};
 use crate::tiles::{Bins, Count, Grid, Part, TILE};
-use canvas::{Canvas, Contents, Desk, Pixel};
+use canvas::{Canvas, Colours, Contents, Desk, Indices, Mixed, Output};
 
 /// What is seen where the Gaussians let light through.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -273,9 +273,9 @@ impl Renderer {
         let wanted = Wanted {
             channel,
             background,
-            ids: false,
         };
-        let stats = self.frame(gaussians, camera, wanted, limits, &mut image.pixels)?;
+        let pixels = &mut image.pixels;
+        let stats = self.frame(gaussians, camera, wanted, &Colours, limits, pixels)?;
         [image.width, image.height] = camera.size();
         Ok(stats)
     }
@@ -291,28 +291,42 @@ impl Renderer {
         limits: &Limits,
         ids: &mut Ids,
     ) -> Result<Stats> {
-        let wanted = Wanted {
-            channel: Channel::Colour,
-            background: Background::Transparent,
-            ids: true,
-        };
-        let stats = self.frame(gaussians, camera, wanted, limits, &mut ids.indices)?;
+        let (wanted, indices) = (Wanted::default(), &mut ids.indices);
+        let stats = self.frame(gaussians, camera, wanted, &Indices, limits, indices)?;
         [ids.width, ids.height] = camera.size();
         Ok(stats)
     }
 
-    fn frame<P: Pixel>(
+    /// A picture of any `numbers` that each Gaussian, by its index, has `N` of, mixed as colours are: in each of `pixels`, row by row, the
+    /// sum over the Gaussians there of what they contribute, of which a 1 makes the opacity. One sample a pixel, whatever the effects.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_into`].
+    pub fn mix_into<const N: usize>(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        numbers: impl Fn(usize) -> [f32; N] + Sync,
+        limits: &Limits,
+        pixels: &mut Vec<[f32; N]>,
+    ) -> Result<()> {
+        let (wanted, mixed) = (Wanted::default(), Mixed(numbers));
+        self.frame(gaussians, camera, wanted, &mixed, limits, pixels)?;
+        Ok(())
+    }
+
+    fn frame<O: Output>(
         &mut self,
         gaussians: &Gaussians,
         camera: &Camera,
         wanted: Wanted,
+        output: &O,
         limits: &Limits,
-        pixels: &mut Vec<P>,
+        pixels: &mut Vec<O::Pixel>,
     ) -> Result<Stats> {
         let Wanted {
             channel,
             background,
-            ids,
         } = wanted;
         camera.check()?;
         gaussians.check_lengths()?;
@@ -326,7 +340,7 @@ impl Renderer {
         let count = u64::from(width) * u64::from(height);
         limits.check_pixels("pixels of the picture", count)?;
         let mut effects = self.effects.derive(gaussians, camera);
-        if ids {
+        if O::LOOP.is_some() {
             effects.supersample = 1;
             effects.order = false;
         }
@@ -338,7 +352,7 @@ impl Renderer {
             + Count::BYTES
             + u64::from(shaded) * size_of::<[f32; 3]>() as u64
             + u64::from(effects.order) * size_of::<[f32; 2]>() as u64;
-        let bytes = count * size_of::<P>() as u64
+        let bytes = count * size_of::<O::Pixel>() as u64
             + gaussians.len() as u64 * each
             + grid.bytes(Ellipses::runs_of(gaussians.len()));
         limits.check_bytes("bytes to draw the picture", bytes)?;
@@ -376,7 +390,7 @@ impl Renderer {
             *pixels = Vec::new();
             *pixels = bytemuck::zeroed_vec(count as usize);
         }
-        pixels.resize(count as usize, P::zeroed());
+        pixels.resize(count as usize, bytemuck::Zeroable::zeroed());
         self.desks
             .resize_with(rayon::current_num_threads(), Mutex::default);
         let canvas = Canvas {
@@ -385,18 +399,17 @@ impl Renderer {
             shrink: effects.supersample,
             background,
         };
-        let what = match (ids, effects.order, effects.near) {
-            (true, ..) => Loop::Ids,
-            (_, true, _) => Loop::Order,
-            (.., true) => Loop::Care,
+        let what = O::LOOP.unwrap_or(match (effects.order, effects.near) {
+            (true, _) => Loop::Order,
+            (_, true) => Loop::Care,
             _ => Loop::Plain,
-        };
+        });
         let mut part = self.bins.next(None);
         while let Some(now) = part {
             self.bins
                 .fill(now.clone(), &self.ellipses, &mut self.counts);
             times.bin += lap();
-            let [sorting, blending] = self.draw_part(&now, &canvas, floor, what, pixels);
+            let [sorting, blending] = self.draw_part(&now, &canvas, floor, what, output, pixels);
             let drawn = lap();
             let share = sorting.as_secs_f64() / (sorting + blending).as_secs_f64().max(1e-9);
             times.sort += drawn.mul_f64(share);
@@ -420,13 +433,14 @@ impl Renderer {
     }
 
     /// Draws a part of the picture; returns the threads' time for sorting and for the pixels.
-    fn draw_part<P: Pixel>(
+    fn draw_part<O: Output>(
         &self,
         part: &Part,
         canvas: &Canvas,
         floor: f32,
         what: Loop,
-        pixels: &mut [P],
+        output: &O,
+        pixels: &mut [O::Pixel],
     ) -> [Duration; 2] {
         let contents = Contents {
             isa: self.isa,
@@ -454,7 +468,7 @@ impl Renderer {
                 // Only this thread uses this desk, and a panic would have ended the drawing.
                 let mut desk = self.desks[thread].lock().unwrap_or_else(|e| e.into_inner());
                 for column in part.columns.clone() {
-                    desk.draw([column, row], canvas, &contents, band);
+                    desk.draw([column, row], canvas, &contents, output, band);
                 }
             });
         self.desks.iter().fold(Default::default(), |sum, desk| {
@@ -469,6 +483,13 @@ impl Renderer {
 struct Wanted {
     channel: Channel,
     background: Background,
-    /// Gaussians instead of a channel.
-    ids: bool,
+}
+
+impl Default for Wanted {
+    fn default() -> Self {
+        Wanted {
+            channel: Channel::Colour,
+            background: Background::Transparent,
+        }
+    }
 }

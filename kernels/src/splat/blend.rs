@@ -38,12 +38,15 @@ pub enum Loop {
     Order,
     /// As `Care`, and keeps which Gaussian each pixel shows most of.
     Ids,
+    /// As `Care`, and keeps how much of each Gaussian each pixel shows, for whoever mixes something else than colours.
+    Shares,
 }
 
 pub(super) const PLAIN: u8 = 0;
 pub(super) const CARE: u8 = 1;
 pub(super) const ORDER: u8 = 2;
 pub(super) const IDS: u8 = 3;
+pub(super) const SHARES: u8 = 4;
 
 /// What there is to blend.
 #[derive(Debug, Clone, Copy)]
@@ -71,6 +74,17 @@ const CLEAR: Block = Block {
     colour: [[0.0; AREA]; 3],
 };
 
+/// How much of a Gaussian the pixels of a block show.
+#[derive(Debug, Clone, Copy)]
+pub struct Share {
+    /// The Gaussian's index in the input.
+    pub index: u32,
+    /// Column and row of the block's first pixel in the tile.
+    pub at: [u32; 2],
+    /// Of each of its 4×4 pixels, row by row.
+    pub weights: [f32; AREA],
+}
+
 /// A tile being drawn: [`TILE`]² pixels.
 #[derive(Debug, Clone)]
 pub struct Tile {
@@ -89,6 +103,8 @@ pub struct Tile {
     pub(super) pending: Vec<Pending>,
     /// For each block, with [`Loop::Ids`].
     pub(super) best: Vec<Best>,
+    /// Of what was blended last, with [`Loop::Shares`].
+    pub(super) shares: Vec<Share>,
 }
 
 impl Default for Tile {
@@ -104,6 +120,7 @@ impl Default for Tile {
             what: Loop::Plain,
             pending: Vec::new(),
             best: Vec::new(),
+            shares: Vec::new(),
         }
     }
 }
@@ -129,7 +146,7 @@ impl Tile {
         self.pending.clear();
         self.best.clear();
         match what {
-            Loop::Plain | Loop::Care => {}
+            Loop::Plain | Loop::Care | Loop::Shares => {}
             Loop::Order => self.pending.resize(ALL_BLOCKS, Pending::NONE),
             Loop::Ids => self.best.resize(ALL_BLOCKS, Best::NONE),
         }
@@ -141,15 +158,23 @@ impl Tile {
     /// # Panics
     /// If there is no such ellipse, or the scene lacks what the loop needs of it.
     pub fn blend(&mut self, isa: Isa, keys: &[u64], next: &[u64], scene: Scene) -> bool {
+        self.shares.clear();
         if self.open != 0 {
             match self.what {
                 Loop::Plain => self.run::<PLAIN>(isa, keys, next, scene),
                 Loop::Care => self.run::<CARE>(isa, keys, next, scene),
                 Loop::Order => self.run::<ORDER>(isa, keys, next, scene),
                 Loop::Ids => self.run::<IDS>(isa, keys, next, scene),
+                Loop::Shares => self.run::<SHARES>(isa, keys, next, scene),
             }
         }
         self.open != 0
+    }
+
+    /// With [`Loop::Shares`], how much the pixels show of what the last call of [`Tile::blend`] put on them: in each pixel, all shares of a
+    /// picture and the transmittance that is left are together 1.
+    pub fn shares(&self) -> &[Share] {
+        &self.shares
     }
 
     fn run<const WHAT: u8>(&mut self, isa: Isa, keys: &[u64], next: &[u64], scene: Scene) {

@@ -2,7 +2,7 @@
 
 use super::Ellipse;
 use super::blend::{
-    ALL_BLOCKS, AREA, BLOCKS, IDS, ORDER, PLAIN, SIDE, Scene, TILE, Tile, rectangle,
+    ALL_BLOCKS, AREA, BLOCKS, IDS, ORDER, PLAIN, SHARES, SIDE, Scene, TILE, Tile, rectangle,
 };
 use super::lanes::{Lanes, Mask, four};
 use super::pixels;
@@ -300,6 +300,19 @@ impl Tile {
                     IDS => {
                         let best = &mut self.best[place];
                         best.blend::<L>(block, splat, [u, v], more, at, self.corner, crossing)
+                    }
+                    SHARES => {
+                        let shares = &mut self.shares;
+                        pixels::share::<L>(
+                            block,
+                            splat,
+                            [u, v],
+                            more,
+                            at,
+                            self.corner,
+                            crossing,
+                            shares,
+                        )
                     }
                     _ => match crossing {
                         Some(crossing) => {

@@ -20,7 +20,7 @@ mod project;
 #[cfg(test)]
 mod tests;
 
-pub use blend::{Loop, Scene, TILE, Tile};
+pub use blend::{Loop, Scene, Share, TILE, Tile};
 pub use project::{Cloud, Tally, View, project};
 
 /// Variance that every ellipse is widened by, in px².

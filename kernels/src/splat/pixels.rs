@@ -1,6 +1,6 @@
 //! The pixels of one block: one splat more.
 
-use super::blend::{AREA, Block, SIDE};
+use super::blend::{AREA, Block, SIDE, Share};
 use super::lanes::{LEAST_POWER, Lanes, Mask};
 use super::layout::{COLUMNS, More, ROWS, Splat};
 use super::{ALPHA_CEILING, Crossing, FINISHED, WAITING};
@@ -110,6 +110,38 @@ fn add<L: Lanes>(block: &mut Block, lanes: usize, weight: L, colour: [f32; 3]) {
         let sum = weight.mul_add(L::splat(colour), sum);
         sum.store(&mut sums[lanes..]);
     }
+}
+
+/// As [`blend`] and [`cross`], without colours: what stays in each pixel goes into `shares`.
+#[inline(always)]
+pub(super) fn share<L: Lanes>(
+    block: &mut Block,
+    splat: &Splat,
+    form: [f32; 2],
+    more: &More,
+    at: [u32; 2],
+    corner: [u32; 2],
+    crossing: Option<&Crossing>,
+    shares: &mut Vec<Share>,
+) -> bool {
+    let mut open = 0;
+    let mut weights = [0.0; AREA];
+    for part in 0..AREA / L::COUNT {
+        let lanes = part * L::COUNT;
+        let (through, unfinished) = light::<L>(block, lanes);
+        open |= unfinished.bits();
+        let alpha = match crossing {
+            Some(crossing) => spatial::<L>(splat, at, corner, crossing, lanes).0,
+            None => planar::<L>(splat, form, lanes),
+        };
+        let weight = pass::<L>(block, lanes, through, alpha.keep(unfinished));
+        weight.store(&mut weights[lanes..]);
+    }
+    if open != 0 {
+        let index = more.index;
+        shares.push(Share { index, at, weights });
+    }
+    open != 0
 }
 
 /// What a block's pixels show most of.

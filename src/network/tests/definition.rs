@@ -33,8 +33,9 @@ pub(super) fn shapes() -> Vec<Shape> {
     .with_quick_heads();
     both.gg[2].channels = 16;
     both.gg[3].blocks_before = 1;
-    let with_latents = |roles, near_channels| Shape {
-        latent_roles: roles,
+    let with_latents = |latent_roles, fr_roles, near_channels| Shape {
+        latent_roles,
+        fr_roles,
         near_channels,
         ..Shape::tiny()
     };
@@ -43,8 +44,10 @@ pub(super) fn shapes() -> Vec<Shape> {
         nearest,
         wide,
         both,
-        with_latents(2, [8, 0]),
-        with_latents(1, [0, 0]),
+        with_latents(2, 3, [8, 0]),
+        with_latents(1, 3, [0, 0]),
+        with_latents(2, 2, [8, 0]),
+        with_latents(1, 1, [0, 0]),
     ]
 }
 

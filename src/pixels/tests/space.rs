@@ -3,6 +3,7 @@
 use super::effects::with;
 use super::*;
 use crate::pixels::{Choice, Effects, Ids};
+use crate::projection::Bounds;
 
 const CARELESS: Effects = Effects {
     near: Choice::Off,
@@ -236,4 +237,61 @@ fn a_pixel_s_number_is_that_of_the_gaussian_that_it_shows_most_of() {
             .unwrap();
         assert!(ids.indices.iter().all(|id| *id == u32::MAX));
     }
+}
+
+#[test]
+fn numbers_are_mixed_as_colours_are() {
+    let splats = random_splats(9, 300);
+    // From afar, and from among them, where some reach over the near plane.
+    for (distance, crossing) in [(4.0, false), (0.7, true)] {
+        let camera = Camera::orbit(20.0, 10.0, distance, 50.0, 70, 45).unwrap();
+        let part = Bounds {
+            x0: 5,
+            y0: 7,
+            x1: 61,
+            y1: 42,
+        };
+        let crop = camera.crop(part).unwrap();
+        let both = |isa| [(isa, camera), (isa, crop)];
+        for (isa, camera) in isas().into_iter().flat_map(both) {
+            let scene = scene(splats.clone());
+            let mut renderer = Renderer::new(isa);
+            let (limits, mut image) = (Limits::default(), Image::default());
+            let back = Background::Transparent;
+            let stats = renderer.render_into(&scene, &camera, back, &limits, &mut image);
+            assert_eq!(stats.unwrap().crossing > 0, crossing);
+            let numbers = |i: usize| {
+                let [r, g, b] = scene.colour[i];
+                [1.0, b, g, r, 0.0]
+            };
+            let mut mixed = Vec::new();
+            renderer
+                .mix_into(&scene, &camera, numbers, &limits, &mut mixed)
+                .unwrap();
+            assert_eq!(mixed.len(), image.pixels.len());
+            for ([one, b, g, r, nothing], want) in mixed.into_iter().zip(&image.pixels) {
+                assert_eq!(nothing, 0.0);
+                for (x, want) in [r, g, b, one].into_iter().zip(want) {
+                    assert!((x - want).abs() < 1e-5, "{isa}: {x} instead of {want}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn numbers_are_mixed_the_same_with_any_number_of_threads() {
+    let scene = scene(random_splats(5, 3000));
+    let camera = orbit(150, 130);
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+        let mut mixed = Vec::new();
+        let numbers = |i: usize| [i as f32, 1.0];
+        let mix = || {
+            Renderer::default().mix_into(&scene, &camera, numbers, &Limits::default(), &mut mixed)
+        };
+        pool.build().unwrap().install(mix).unwrap();
+        mixed
+    };
+    assert!(with(1) == with(3));
 }
