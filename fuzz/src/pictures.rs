@@ -16,8 +16,9 @@ fn models(precision: Precision) -> Vec<Vec<Model>> {
     let sets = |channels| {
         let shape = Shape {
             channels,
-            // The narrowest has no latents at its finest level.
-            latent_roles: if channels == 8 { 2 } else { 3 },
+            // Only the widest has latents at its finest level, and the second does not even make features of it.
+            latent_roles: if channels == 32 { 3 } else { 2 },
+            fr_roles: if channels == 12 { 2 } else { 3 },
             near_channels: [8, 0],
             ..Shape::tiny()
         };

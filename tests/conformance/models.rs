@@ -45,6 +45,15 @@ pub fn model(name: &str) -> Model {
             },
             5,
         ),
+        "bare" => made(
+            Shape {
+                latent_roles: 2,
+                fr_roles: 2,
+                near_channels: [8, 0],
+                ..tiny
+            },
+            6,
+        ),
         "lite" => {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/lite.safetensors");
             std::fs::read(path).expect("the model that ships")
