@@ -93,6 +93,22 @@ fn spatial<L: Lanes>(
     (alpha.keep(drawn), depth)
 }
 
+/// α of an ellipse, or of the Gaussian that it stands for, if that reaches over the near plane.
+#[inline(always)]
+fn either<L: Lanes>(
+    splat: &Splat,
+    form: [f32; 2],
+    at: [u32; 2],
+    corner: [u32; 2],
+    crossing: Option<&Crossing>,
+    lanes: usize,
+) -> L {
+    match crossing {
+        Some(crossing) => spatial::<L>(splat, at, corner, crossing, lanes).0,
+        None => planar::<L>(splat, form, lanes),
+    }
+}
+
 /// Lets light through a layer of `alpha`; returns what stays there. That is the difference between what was and what is let through,
 /// rounded as they are, so that the sum of all that stays, and what is let through in the end, is 1.
 #[inline(always)]
@@ -130,10 +146,7 @@ pub(super) fn share<L: Lanes>(
         let lanes = part * L::COUNT;
         let (through, unfinished) = light::<L>(block, lanes);
         open |= unfinished.bits();
-        let alpha = match crossing {
-            Some(crossing) => spatial::<L>(splat, at, corner, crossing, lanes).0,
-            None => planar::<L>(splat, form, lanes),
-        };
+        let alpha = either::<L>(splat, form, at, corner, crossing, lanes);
         let weight = pass::<L>(block, lanes, through, alpha.keep(unfinished));
         weight.store(&mut weights[lanes..]);
     }
@@ -176,10 +189,7 @@ impl Best {
             let lanes = part * L::COUNT;
             let (through, unfinished) = light::<L>(block, lanes);
             open |= unfinished.bits();
-            let alpha = match crossing {
-                Some(crossing) => spatial::<L>(splat, at, corner, crossing, lanes).0,
-                None => planar::<L>(splat, form, lanes),
-            };
+            let alpha = either::<L>(splat, form, at, corner, crossing, lanes);
             let weight = pass::<L>(block, lanes, through, alpha.keep(unfinished));
             let best = L::load(&self.weight[lanes..]);
             let more_of = best.lt(weight);
