@@ -92,9 +92,10 @@ fn whichever_heads_are_used_the_same_is_decoded_and_only_gaussians_differ() {
 
 #[test]
 fn levels_without_latents_cost_their_geometry_alone_and_are_not_predicted() {
-    for roles in 1..=3 {
+    for (roles, fr_roles) in [(1, 1), (1, 3), (2, 2), (2, 3), (3, 3)] {
         let shape = Shape {
             latent_roles: roles,
+            fr_roles,
             near_channels: [0, 0],
             ..Shape::tiny()
         };
@@ -124,7 +125,7 @@ fn levels_without_latents_cost_their_geometry_alone_and_are_not_predicted() {
             };
             assert_eq!(asked("latents"), has);
             assert_eq!(asked("probabilities"), has && role > 0);
-            assert!(asked("features"));
+            assert_eq!(asked("features"), role < fr_roles);
         }
     }
 }

@@ -405,10 +405,13 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         };
         let latents = self.latents(pool, header, level, context.as_deref(), octree, &map, log)?;
         self.cancel.check()?;
-        let features = log.step(Module::Features(role).at(n), count, "voxels", || {
-            let model = &self.model;
-            Ok(model.reconstruct_in(pool, role, &latents, context, &map))
-        })?;
+        let features = match context {
+            Some(context) if !self.model.makes_features(role) => context,
+            context => log.step(Module::Features(role).at(n), count, "voxels", || {
+                let model = &self.model;
+                Ok(model.reconstruct_in(pool, role, &latents, context, &map))
+            })?,
+        };
         Ok((latents, features, map.into_owned()))
     }
 

@@ -57,6 +57,11 @@ impl Model {
         self.shape.latents_of(role) > 0
     }
 
+    /// Whether a role's features are made, or are its context.
+    pub fn makes_features(&self, role: usize) -> bool {
+        role < self.shape.fr_roles
+    }
+
     /// How the latents of a role are distributed: means in sixteenths, in ±2047, and scale indices below 64, [voxels, K] each.
     ///
     /// `context` is [`Model::upsample`]'s, `map` the level's 3³ kernel map.

@@ -219,7 +219,9 @@ fn sphere() -> Vec<u64> {
 pub fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     let corner = |bits: u8| (1u64 << (3 * bits)) - 1;
-    for name in ["tiny", "other", "nearest", "wide", "plain", "base", "bare", "lite"] {
+    for name in [
+        "tiny", "other", "nearest", "wide", "plain", "base", "bare", "lite",
+    ] {
         let model = model(name);
         let mut add = |what: String, anywhere: bool, make: &dyn Fn(&Model) -> Vec<u8>| {
             cases.push(Case {
