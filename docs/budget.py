@@ -2,7 +2,7 @@
 
     python3 docs/budget.py --streams FOLDER --code --clouds NAME=CLOUD.ply …    codes each cloud at several sizes
     python3 docs/budget.py --streams FOLDER --clouds NAME …                     measures them; then does the rest
-    python3 docs/budget.py                              from docs/budget.json: the table between README's marks
+    python3 docs/budget.py                              from docs/budget.json: the table between the marks of docs/MEASUREMENTS.md
 
 Clouds are of 10 bits (`b2p-lab voxelize`); smaller sizes are made of them by dropping bits. Other clouds' figures of the same machine are kept. B2P names
 a `b2p` that is built already. Give it a quiet machine. Whatever is promised may take a fifth longer at most.
@@ -108,7 +108,7 @@ def main():
     for name in args.clouds:
         rows = [r for r in rows if r["cloud"] != name] + measure(name, args.streams.resolve(), args.repeat)
         KEPT.write_text("[\n" + ",\n".join(json.dumps(r) for r in rows) + "\n]\n")
-    text, readme = table(rows), ROOT / "README.md"
+    text, readme = table(rows), HERE / "MEASUREMENTS.md"
     marked = re.sub(r"(<!-- budget -->\n).*?(\n<!-- /budget -->)", lambda m: m[1] + "\n" + text + "\n" + m[2], readme.read_text(), flags=re.S)
     readme.write_text(marked)
     over = sorted((r for r in rows if r["promised"]), key=lambda r: -r["took"] / r["budget"])

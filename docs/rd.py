@@ -1,7 +1,7 @@
 """Rate against distortion of the models and of MPEG's G-PCC on whole objects, by `b2p-lab eval`'s protocol.
 
     python3 docs/rd.py --data FOLDER [--models NAME=FILE …]   measures these models, and TMC13 if that has not been yet; then does the rest
-    python3 docs/rd.py                                        from docs/rd.json: the tables between README's marks, and docs/rd.svg
+    python3 docs/rd.py                                        from docs/rd.json: the tables between the marks of README.md and docs/MEASUREMENTS.md, and docs/rd.svg
 
 FOLDER holds `val/*.glb`, and TMC13's decoded clouds in `gpcc/`. B2P_LAB names a `b2p-lab` that is built already.
 """
@@ -119,6 +119,17 @@ def table(rows):
     return out
 
 
+def summary(rows):
+    """A line for each object, a column for each point of the models themselves."""
+    columns = [(name, level) for name in ("lite-least", "lite-low", "lite") for level in (8, 9)]
+    out = ["| bits/point: PSNR / foreground | " + " | ".join(f"`{name}`, level {level}" for name, level in columns) + " |", "|---|" + "---:|" * len(columns)]
+    for name, title in OBJECTS.items():
+        own = {(r["series"], r["level"]): r for r in rows if r["object"] == name and r["series"] != PEER}
+        cells = [f"{r['rate']:.3f}: {r['psnr']:.2f} / {r['foreground_psnr']:.2f}" for r in (own[column] for column in columns)]
+        out.append(f"| {title} | " + " | ".join(cells) + " |")
+    return out
+
+
 def differences(rows):
     out = ["| at equal rates, ours less TMC13's | " + " | ".join(SCORES.values()) + " | bits saved at equal PSNR |", "|---|" + "---:|" * (len(SCORES) + 1)]
     for name in PEERS:
@@ -176,10 +187,9 @@ def main():
         rows = kept + measure(args.data.resolve(), models, not any(row["series"] == PEER for row in kept))
         measured.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     rows = json.loads(measured.read_text())
-    text = "\n".join([*table(rows), "", *differences(rows)])
-    readme = ROOT / "README.md"
-    marked = re.sub(r"(<!-- rd -->\n).*?(\n<!-- /rd -->)", lambda m: m[1] + "\n" + text + "\n" + m[2], readme.read_text(), flags=re.S)
-    readme.write_text(marked)
+    for path, mark, lines in ((ROOT / "README.md", "rd", [*summary(rows), "", *differences(rows)]), (HERE / "MEASUREMENTS.md", "rd-all", table(rows))):
+        text = "\n".join(lines)
+        path.write_text(re.sub(rf"(<!-- {mark} -->\n).*?(\n<!-- /{mark} -->)", lambda m: m[1] + "\n" + text + "\n" + m[2], path.read_text(), flags=re.S))
     (HERE / "rd.svg").write_text(plot(rows))
 
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Trains the models of models/ anew, from nothing: remake.sh MESHES PHOTOS OUT [SHARE]
-# MESHES and PHOTOS are folders of glTF binaries and of pictures. SHARE scales the minutes of every step (1: as the shipped models had, about nine
+# MESHES and PHOTOS are folders of glTF binaries and of pictures. SHARE scales the minutes of every step (1: about as the shipped models had, eleven
 # hours on one core; 0.01 shows that it runs). PYTHON names the interpreter that has torch.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
@@ -29,6 +29,20 @@ if [ ! -d "$out/whole" ]; then
     mv "$out/whole-part" "$out/whole"
 fi
 
+# Crops, and whole objects at a half and a quarter of the scale.
+if [ ! -d "$out/mixed" ]; then
+    "$lab" dataset -o "$out/half0" --textures "$photos" --count 120 --seed 31 --bits 9 --crop 512 --size 512 "$meshes"
+    "$lab" dataset -o "$out/half1" --procedural --count 20 --seed 32 --bits 9 --crop 512 --size 512
+    "$lab" dataset -o "$out/quarter0" --textures "$photos" --count 200 --seed 33 --bits 8 --crop 256 --size 256 --views 8 "$meshes"
+    "$lab" dataset -o "$out/quarter1" --procedural --count 40 --seed 34 --bits 8 --crop 256 --size 256 --views 8
+    mkdir "$out/mixed-part"
+    for from in half0 half1 quarter0 quarter1; do
+        for file in "$out/$from"/*; do mv "$file" "$out/mixed-part/$from-$(basename "$file")"; done
+    done
+    for crop in "$out"/data/*-00[0-5]*; do ln -s "$crop" "$out/mixed-part/"; done
+    mv "$out/mixed-part" "$out/mixed"
+fi
+
 cd "$here"
 # train NAME CONFIG MINUTES ARGUMENTS…
 train() {
@@ -39,10 +53,13 @@ train() {
         --average 0.999 --threads 1 --evaluate-every 1000 --log-every 50 --hint 0 --hint-until 0 "$@"
     touch "$out/$name/done"
 }
-# ship NAME FILE ARGUMENTS…: fits the entropy models and writes the model
+# fit NAME: fits the entropy models to rounded latents
+fit() {
+    "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 6)" --samples 260 --lr 3e-4 --threads 1 --only-base
+}
+# ship NAME FILE: writes the model
 ship() {
-    "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 6)" --samples 260 --lr 3e-4 --threads 1 "${@:3}"
-    "$python" export.py "$out/$1/tuned.pt" "$out/$2.safetensors" --data "$out/data" --samples 10 --verify 4 --weights "$out/$2.weights.safetensors"
+    "$python" export.py "$out/$1/last.pt" "$out/$2.safetensors" --data "$out/mixed" --samples 10 --verify 2 --weights "$out/$2.weights.safetensors"
 }
 # beside NAME FILE: these heads as quick ones of the model
 beside() {
@@ -54,20 +71,19 @@ heads=(--only-heads --lr-conv 5e-4 --lr-linear 8e-4 --warmup 300 --decay-from 0.
 # On whole objects, whose edges are none of a crop's; each head by itself. Half way back to where they were: there are few of them.
 whole=(--only-heads --stay 0.5 --data "$out/whole" --views 2 --square 40 --held-out 1 --average 0.98 --lam 1 --lr-conv 2e-4 --lr-linear 3e-4 --warmup 10
     --decay-from 0.2 --evaluate-every 100000)
-# Thin heads first imitate those of the weights that they start from.
-imitate=(--only-heads --init "$out/lite.weights.safetensors" --teacher "$out/lite.weights.safetensors" --draw-from 2 --imitate-until 1e9 --lam 1
-    --average 0.998 --lr-conv 1.5e-3 --lr-linear 2.4e-3 --warmup 100 --decay-from 0.3)
-# imitating FILE MINUTES: quick heads for a model, that only imitate
+# Thin heads imitate those of the weights that they start from.
+imitate=(--only-heads --draw-from 2 --imitate-until 1e9 --lam 1 --coarse 0.5 --average 0.998 --lr-conv 1.5e-3 --lr-linear 2.4e-3 --warmup 100 --decay-from 0.3)
+# imitating FILE MINUTES: quick heads for a model
 imitating() {
-    local of=(--init "$out/$1.weights.safetensors" --teacher "$out/$1.weights.safetensors")
-    train "$1-quick-1" lite-quick "$2" --coarse 1 "${imitate[@]}" "${of[@]}"
-    train "$1-quick-2" lite-quick "$2" --coarse 0 "${imitate[@]}" "${of[@]}" --init "$out/$1-quick-1/last.pt"
-    beside "$1-quick-2" "$1"
+    train "$1-quick" lite-quick "$2" "${imitate[@]}" --init "$out/$1.weights.safetensors" --teacher "$out/$1.weights.safetensors"
+    beside "$1-quick" "$1"
 }
 # Of a network that has learned, everything but its heads, and the mean with before.
 rest=(--freeze-finest --lr-heads 0 --rate-start 1 --rate-ramp 0.01 --rounding-from 0 --decay-from 0.2 --warmup 100 --square 40 --stay 0.5)
 # Of a network that has learned, everything, the heads faster than the rest.
 all=(--freeze-finest --lr-heads 3 --rate-start 1 --rate-ramp 0.01 --rounding-from 0 --decay-from 0.25 --warmup 50)
+# The same, with whole objects among the crops.
+mixed=(--data "$out/mixed" --held-out 20 --freeze-finest --lr-heads 3 --rate-start 1 --rate-ramp 0.01 --rounding-from 0 --decay-from 0.2 --warmup 200 --square 40)
 
 train start lite 100 --lam 18 --rate-start 0.2 --rate-ramp 0.12 --rounding-from 0.03 --decay-from 0.35 --warmup 400
 train low lite 12 --init "$out/start/last.pt" --lam 4 --freeze-finest --rate-start 1 --rate-ramp 0.01 --rounding-from 0.02 --decay-from 0.3 --warmup 100
@@ -75,21 +91,23 @@ train low-heads lite 44 --init "$out/low/last.pt" --lam 1 "${heads[@]}"
 train low-whole-1 lite 21 --init "$out/low-heads/last.pt" --coarse 1 "${whole[@]}"
 train low-whole-2 lite 21 --init "$out/low-whole-1/last.pt" --coarse 0 "${whole[@]}"
 train low-rest lite 30 --init "$out/low-whole-2/last.pt" --lam 4 "${rest[@]}"
-ship low-rest lite-low --only-base
-imitating lite-low 5
+fit low-rest
+train low-mixed lite 42 --init "$out/low-rest/tuned.pt" --lam 4 "${mixed[@]}"
+ship low-mixed lite-low
+imitating lite-low 15
 train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
 train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
 train high-whole-1 lite 25 --init "$out/high-heads/last.pt" --coarse 1 "${whole[@]}"
 train high-whole-2 lite 25 --init "$out/high-whole-1/last.pt" --coarse 0 "${whole[@]}"
-ship high-whole-2 lite --only-base
-train quick-1 lite-quick 20 --coarse 1 "${imitate[@]}"
-train quick-2 lite-quick 18 --coarse 0 "${imitate[@]}" --init "$out/quick-1/last.pt"
-train quick-whole-1 lite-quick 21 --init "$out/quick-2/last.pt" --coarse 1 "${whole[@]}"
-train quick-whole-2 lite-quick 21 --init "$out/quick-whole-1/last.pt" --coarse 0 "${whole[@]}"
-beside quick-whole-2 lite
+fit high-whole-2
+train high-mixed lite 82 --init "$out/high-whole-2/tuned.pt" --lam 16 "${mixed[@]}"
+ship high-mixed lite
+imitating lite 15
 train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
 train least-whole-2 lite 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${whole[@]}"
 train least-rest lite 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@]}"
-ship least-rest lite-least --only-base
-imitating lite-least 7
+fit least-rest
+train least-mixed lite 40 --init "$out/least-rest/tuned.pt" --lam 1.2 "${mixed[@]}"
+ship least-mixed lite-least
+imitating lite-least 15
