@@ -2,7 +2,7 @@
 
 use super::Ellipse;
 use super::blend::{
-    ALL_BLOCKS, AREA, BLOCKS, IDS, ORDER, PLAIN, SHARES, SIDE, Scene, TILE, Tile, rectangle,
+    ALL_BLOCKS, AREA, BLOCKS, IDS, ORDER, PLAIN, SHARES, SIDE, Scene, Share, TILE, Tile, rectangle,
 };
 use super::lanes::{Lanes, Mask, four};
 use super::pixels;
@@ -297,22 +297,19 @@ impl Tile {
                             self.least,
                         )
                     }
-                    IDS => {
-                        let best = &mut self.best[place];
-                        best.blend::<L>(block, splat, [u, v], more, at, self.corner, crossing)
-                    }
-                    SHARES => {
-                        let shares = &mut self.shares;
-                        pixels::share::<L>(
-                            block,
-                            splat,
-                            [u, v],
-                            more,
-                            at,
-                            self.corner,
-                            crossing,
-                            shares,
-                        )
+                    IDS | SHARES => {
+                        let form = [u, v];
+                        let weights =
+                            pixels::weigh::<L>(block, splat, form, at, self.corner, crossing);
+                        let index = more.index;
+                        match weights {
+                            Some(weights) if WHAT == IDS => {
+                                self.best[place].note::<L>(&weights, index);
+                            }
+                            Some(weights) => self.shares.push(Share { index, at, weights }),
+                            None => {}
+                        }
+                        weights.is_some()
                     }
                     _ => match crossing {
                         Some(crossing) => {

@@ -1,6 +1,6 @@
 //! The pixels of one block: one splat more.
 
-use super::blend::{AREA, Block, SIDE, Share};
+use super::blend::{AREA, Block, SIDE};
 use super::lanes::{LEAST_POWER, Lanes, Mask};
 use super::layout::{COLUMNS, More, ROWS, Splat};
 use super::{ALPHA_CEILING, Crossing, FINISHED, WAITING};
@@ -93,22 +93,6 @@ fn spatial<L: Lanes>(
     (alpha.keep(drawn), depth)
 }
 
-/// α of an ellipse, or of the Gaussian that it stands for, if that reaches over the near plane.
-#[inline(always)]
-fn either<L: Lanes>(
-    splat: &Splat,
-    form: [f32; 2],
-    at: [u32; 2],
-    corner: [u32; 2],
-    crossing: Option<&Crossing>,
-    lanes: usize,
-) -> L {
-    match crossing {
-        Some(crossing) => spatial::<L>(splat, at, corner, crossing, lanes).0,
-        None => planar::<L>(splat, form, lanes),
-    }
-}
-
 /// Lets light through a layer of `alpha`; returns what stays there. That is the difference between what was and what is let through,
 /// rounded as they are, so that the sum of all that stays, and what is let through in the end, is 1.
 #[inline(always)]
@@ -128,33 +112,30 @@ fn add<L: Lanes>(block: &mut Block, lanes: usize, weight: L, colour: [f32; 3]) {
     }
 }
 
-/// As [`blend`] and [`cross`], without colours: what stays in each pixel goes into `shares`.
+/// As [`blend`] and [`cross`], without colours: what stays in each pixel. `None`, and nothing done, if every pixel is finished.
 #[inline(always)]
-pub(super) fn share<L: Lanes>(
+pub(super) fn weigh<L: Lanes>(
     block: &mut Block,
     splat: &Splat,
     form: [f32; 2],
-    more: &More,
     at: [u32; 2],
     corner: [u32; 2],
     crossing: Option<&Crossing>,
-    shares: &mut Vec<Share>,
-) -> bool {
+) -> Option<[f32; AREA]> {
     let mut open = 0;
     let mut weights = [0.0; AREA];
     for part in 0..AREA / L::COUNT {
         let lanes = part * L::COUNT;
         let (through, unfinished) = light::<L>(block, lanes);
         open |= unfinished.bits();
-        let alpha = either::<L>(splat, form, at, corner, crossing, lanes);
+        let alpha = match crossing {
+            Some(crossing) => spatial::<L>(splat, at, corner, crossing, lanes).0,
+            None => planar::<L>(splat, form, lanes),
+        };
         let weight = pass::<L>(block, lanes, through, alpha.keep(unfinished));
         weight.store(&mut weights[lanes..]);
     }
-    if open != 0 {
-        let index = more.index;
-        shares.push(Share { index, at, weights });
-    }
-    open != 0
+    (open != 0).then_some(weights)
 }
 
 /// What a block's pixels show most of.
@@ -172,34 +153,19 @@ impl Best {
         id: [f32::from_bits(u32::MAX); AREA],
     };
 
-    /// As [`blend`] and [`cross`].
+    /// Notes what stays of a Gaussian in each pixel.
     #[inline(always)]
-    pub(super) fn blend<L: Lanes>(
-        &mut self,
-        block: &mut Block,
-        splat: &Splat,
-        form: [f32; 2],
-        more: &More,
-        at: [u32; 2],
-        corner: [u32; 2],
-        crossing: Option<&Crossing>,
-    ) -> bool {
-        let mut open = 0;
+    pub(super) fn note<L: Lanes>(&mut self, weights: &[f32; AREA], index: u32) {
         for part in 0..AREA / L::COUNT {
             let lanes = part * L::COUNT;
-            let (through, unfinished) = light::<L>(block, lanes);
-            open |= unfinished.bits();
-            let alpha = either::<L>(splat, form, at, corner, crossing, lanes);
-            let weight = pass::<L>(block, lanes, through, alpha.keep(unfinished));
+            let weight = L::load(&weights[lanes..]);
             let best = L::load(&self.weight[lanes..]);
             let more_of = best.lt(weight);
-            let id = L::splat(f32::from_bits(more.index));
+            let id = L::splat(f32::from_bits(index));
             let id = L::select(more_of, id, L::load(&self.id[lanes..]));
             id.store(&mut self.id[lanes..]);
             best.max(weight).store(&mut self.weight[lanes..]);
-            add::<L>(block, lanes, weight, splat.colour);
         }
-        open != 0
     }
 }
 
