@@ -220,10 +220,16 @@ pub fn entropy(bytes: &[u8]) {
     }
     let slice = 1 + code.len() % 6;
     in_slices(&tables, condition, &latents, slice);
-    let octants: Vec<u8> = (0..voxels)
-        .map(|v| code.get(v).copied().unwrap_or(v as u8) % 8)
+    // Far and near, of any octants.
+    let mut key = 0;
+    let keys: Vec<u64> = (0..voxels)
+        .map(|v| {
+            key += 1 + u64::from(code.get(v).copied().unwrap_or(0) % 16);
+            key
+        })
         .collect();
-    in_passes(&tables, &octants, &latents, slice, code);
+    in_passes(&tables, &keys, &latents, slice, code);
+    in_passes(&tables.with_learning(true), &keys, &latents, slice, code);
 
     const LIMIT: i16 = 500;
     let price = f32::from(code.first().copied().unwrap_or(0)) / 64.0;
@@ -260,29 +266,29 @@ fn in_slices(tables: &Tables, condition: Condition, latents: &[i16], slice: usiz
 
 /// A level in passes, each voxel predicted from the one before it if that is of a lower octant: encode → decode is equal, and what
 /// any bytes decode to has the very same code.
-fn in_passes(tables: &Tables, octants: &[u8], latents: &[i16], slice: usize, code: &[u8]) {
+fn in_passes(tables: &Tables, keys: &[u64], latents: &[i16], slice: usize, code: &[u8]) {
     let k = tables.channels();
     let predict = |slice: Range<usize>, voxels: &[u32], known: &[i16]| {
         let (mut mu, mut sigma) = (Vec::new(), Vec::new());
         for v in voxels.iter().map(|&v| v as usize) {
-            let lower = v > slice.start && octants[v - 1] < octants[v];
+            let lower = v > slice.start && keys[v - 1] & 7 < keys[v] & 7;
             for channel in 0..k {
                 let before = || known[(v - 1 - slice.start) * k + channel];
                 mu.push(if lower { before().wrapping_mul(7) } else { 0 });
-                sigma.push(if lower { octants[v] * 8 } else { UNPREDICTED });
+                sigma.push(if lower { (keys[v] & 7) as u8 * 8 } else { UNPREDICTED });
             }
         }
         (mu, sigma)
     };
     let decode = |slices: &[Slice], slice: usize| {
         let cancel = Cancel::default();
-        decode_passes(tables, octants, &predict, slices, slice, 1, &cancel)
+        decode_passes(tables, keys, &predict, slices, slice, 1, &cancel)
     };
-    let codes = encode_passes(tables, octants, &predict, latents, slice);
+    let codes = encode_passes(tables, keys, &predict, latents, slice);
     let decoded = decode(&slices(&codes), slice);
     assert_eq!(decoded.expect("what was encoded decodes"), latents);
-    if let Ok(latents) = decode(&[whole(0, code)], octants.len().max(1)) {
-        let again = encode_passes(tables, octants, &predict, &latents, octants.len());
+    if let Ok(latents) = decode(&[whole(0, code)], keys.len().max(1)) {
+        let again = encode_passes(tables, keys, &predict, &latents, keys.len());
         assert_eq!(again, [code], "another code for the same latents");
     }
 }

@@ -19,6 +19,7 @@ static FILE: LazyLock<Vec<u8>> = LazyLock::new(|| {
         latents: 2,
         base_channels: 4,
         near_channels: [4, 4],
+        learning: true,
         ..Shape::tiny()
     };
     shape.gg.iter_mut().for_each(|head| head.channels = 4);

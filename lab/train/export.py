@@ -263,7 +263,7 @@ def is_quick(name):
 def same_streams(path, cfg):
     """Description and tensors of a model file whose streams a network of this configuration is to decode."""
     meta, tensors = read(path)
-    exact = ("channels", "latents", "latent_roles", "base_channels", "near_channels", "pem_blocks", "fr_blocks", "fr_roles", "upsample", "inception_relu", "latent_max")
+    exact = ("channels", "latents", "latent_roles", "base_channels", "near_channels", "learning", "pem_blocks", "fr_blocks", "fr_roles", "upsample", "inception_relu", "latent_max")
     if any(meta.get(k) != cfg.get(k) for k in exact):
         sys.exit(f"{path} is another network")
     return meta, tensors

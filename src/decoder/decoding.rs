@@ -446,7 +446,15 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
             let latents = if self.model.has_passes(role) {
                 let octants = octree.level(n).octants();
                 let predict = self.model.passes(role, &octants, map, parameters.as_ref());
-                decode_passes(tables, &octants, &predict, slices, slice, n, cancel)?
+                decode_passes(
+                    tables,
+                    octree.level(n).keys(),
+                    &predict,
+                    slices,
+                    slice,
+                    n,
+                    cancel,
+                )?
             } else {
                 let condition = match &parameters {
                     Some((mu, sigma)) => Condition::Gauss { mu, sigma },

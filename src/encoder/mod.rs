@@ -239,7 +239,13 @@ pub(crate) fn write(
                 let slices = if model.has_passes(role) {
                     let octants = octree.level(level).octants();
                     let predict = model.passes(role, &octants, map, parameters.as_ref());
-                    encode_passes(tables, &octants, &predict, &latents, slice)
+                    encode_passes(
+                        tables,
+                        octree.level(level).keys(),
+                        &predict,
+                        &latents,
+                        slice,
+                    )
                 } else {
                     encode_level(tables, condition, &latents, slice)
                 };

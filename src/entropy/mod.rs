@@ -13,7 +13,8 @@
 //! voxels of a slice are coded in eight passes, one for each octant `x + 2y + 4z` of their parents, in Morton order within a pass; and
 //! a voxel is predicted from those of its 26 neighbours that lie in the same slice and were coded before
 //! ([`crate::network::Model::pass_parameters`]), unless there are none. A level of role 1 or 2 is coded likewise with a model that has layers
-//! `near.1.…` or `near.2.…`, which correct what the level below predicts.
+//! `near.1.…` or `near.2.…`, which correct what the level below predicts. If the model says `learning`, what such passes have coded corrects what is
+//! predicted of the next latents, in a way that `learning` (`src/entropy/learning.rs`) defines.
 //!
 //! A row has n entries, each a probability in units of 2⁻¹⁶, at least 1, together 65,536. Entry `i < n − 1` stands for
 //! `d = low + i`; the last one for every other `d`, whose distance from the row then follows in equiprobable bits, each an
@@ -32,6 +33,7 @@
 //! After the last symbol all words must have been read, and the state must be [`END_STATE`]. That notices every cut tried and all
 //! but 0.07 % of flipped bits; checksums are for the rest.
 
+mod learning;
 mod level;
 mod passes;
 mod quantise;

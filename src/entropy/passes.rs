@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::learning::Learning;
 use super::level::{expect_slices, place};
 use super::slice::{Condition, Reader, encode_slice};
 use super::tables::Tables;
@@ -12,7 +13,7 @@ use crate::cancel::Cancel;
 use crate::error::Result;
 
 /// Passes of a slice: one for each place that a voxel may have in its parent.
-const PASSES: u8 = 8;
+const PASSES: u64 = 8;
 
 /// What predicts a pass.
 ///
@@ -21,27 +22,37 @@ const PASSES: u8 = 8;
 /// pass, [`super::UNPREDICTED`] where it knows nothing.
 pub type Predict<'a> = dyn Fn(Range<usize>, &[u32], &[i16]) -> (Vec<i16>, Vec<u8>) + Sync + 'a;
 
-/// Codes a level's latents in slices of `slice_voxels` voxels; `octants[i]` is voxel `i`'s place in its parent, `x + 2y + 4z`.
+/// Codes a level's latents in slices of `slice_voxels` voxels; `keys` are the Morton keys of its voxels, ascending, whose lowest three bits are
+/// a voxel's octant.
 ///
 /// # Panics
-/// If the latents are not K per octant, `slice_voxels` is 0, or `predict` gives other than one mean and scale per latent.
+/// If the latents are not K per key, `slice_voxels` is 0, or `predict` gives other than one mean and scale per latent.
 pub fn encode_passes(
     tables: &Tables,
-    octants: &[u8],
+    keys: &[u64],
     predict: &Predict,
     latents: &[i16],
     slice_voxels: usize,
 ) -> Vec<Vec<u8>> {
     let k = tables.channels();
-    assert_eq!(latents.len(), octants.len() * k, "K latents per voxel");
+    assert_eq!(latents.len(), keys.len() * k, "K latents per voxel");
     latents
         .par_chunks(slice_voxels * k)
         .enumerate()
         .map(|(i, part)| {
-            let slice = range(i, slice_voxels, octants.len());
+            let slice = range(i, slice_voxels, keys.len());
             let (mut order, mut mu, mut sigma) = (Vec::new(), Vec::new(), Vec::new());
-            for voxels in passes(octants, &slice) {
-                let (m, s) = predict(slice.clone(), &voxels, part);
+            let mut learning = Learning::of(tables, &keys[slice.clone()]);
+            for voxels in passes(keys, &slice) {
+                let (mut m, mut s) = predict(slice.clone(), &voxels, part);
+                if let Some(learning) = &mut learning {
+                    let parameters = m.chunks_exact_mut(k).zip(s.chunks_exact_mut(k));
+                    for (&v, (mu, sigma)) in voxels.iter().zip(parameters) {
+                        let at = v as usize - slice.start;
+                        learning.prepare(at, part, mu, sigma);
+                        learning.learn(at, &part[at * k..][..k]);
+                    }
+                }
                 mu.extend(m);
                 sigma.extend(s);
                 order.extend(voxels.iter().flat_map(|&v| {
@@ -67,7 +78,7 @@ pub fn encode_passes(
 /// If `slice_voxels` is 0, or `predict` gives other than one mean and scale per latent.
 pub fn decode_passes(
     tables: &Tables,
-    octants: &[u8],
+    keys: &[u64],
     predict: &Predict,
     slices: &[Slice],
     slice_voxels: usize,
@@ -75,27 +86,31 @@ pub fn decode_passes(
     cancel: &Cancel,
 ) -> Result<Vec<i16>> {
     let k = tables.channels();
-    expect_slices(slices.len(), octants.len(), slice_voxels, level)?;
-    let mut latents = vec![0; octants.len() * k];
+    expect_slices(slices.len(), keys.len(), slice_voxels, level)?;
+    let mut latents = vec![0; keys.len() * k];
     let results: Vec<Result<()>> = latents
         .par_chunks_mut(slice_voxels * k)
         .zip(slices)
         .enumerate()
         .map(|(i, (part, code))| {
             cancel.check()?;
-            let slice = range(i, slice_voxels, octants.len());
+            let slice = range(i, slice_voxels, keys.len());
             let at = place(level, i, code);
             let mut reader = Reader::open(tables, code.bytes, &at)?;
-            for voxels in passes(octants, &slice) {
-                let (mu, sigma) = predict(slice.clone(), &voxels, part);
-                let mut values = vec![0; voxels.len() * k];
-                let condition = Condition::Gauss {
-                    mu: &mu,
-                    sigma: &sigma,
-                };
-                reader.read(condition, &mut values)?;
-                for (&v, values) in voxels.iter().zip(values.chunks_exact(k)) {
-                    part[(v as usize - slice.start) * k..][..k].copy_from_slice(values);
+            let mut learning = Learning::of(tables, &keys[slice.clone()]);
+            for voxels in passes(keys, &slice) {
+                let (mut mu, mut sigma) = predict(slice.clone(), &voxels, part);
+                let parameters = mu.chunks_exact_mut(k).zip(sigma.chunks_exact_mut(k));
+                for (&v, (mu, sigma)) in voxels.iter().zip(parameters) {
+                    let at = v as usize - slice.start;
+                    if let Some(learning) = &mut learning {
+                        learning.prepare(at, part, mu, sigma);
+                    }
+                    let values = &mut part[at * k..][..k];
+                    reader.read(Condition::Gauss { mu, sigma }, values)?;
+                    if let Some(learning) = &mut learning {
+                        learning.learn(at, values);
+                    }
                 }
             }
             reader.finish()
@@ -112,10 +127,10 @@ fn range(i: usize, slice_voxels: usize, voxels: usize) -> Range<usize> {
 }
 
 /// The voxels of a slice, octant by octant.
-fn passes<'a>(octants: &'a [u8], slice: &Range<usize>) -> impl Iterator<Item = Vec<u32>> + use<'a> {
+fn passes<'a>(keys: &'a [u64], slice: &Range<usize>) -> impl Iterator<Item = Vec<u32>> + use<'a> {
     let slice = slice.clone();
     (0..PASSES).map(move |pass| {
-        let voxels = slice.clone().filter(|&v| octants[v] == pass);
+        let voxels = slice.clone().filter(|&v| keys[v] & 7 == pass);
         voxels.map(|v| v as u32).collect()
     })
 }
@@ -125,16 +140,17 @@ mod tests {
     use super::*;
     use crate::entropy::UNPREDICTED;
     use crate::entropy::test_tables::{Random, slices_of, tables};
+    use crate::geometry::morton;
     use proptest::prelude::*;
 
     /// A voxel's channels are predicted from the voxel before it, if that is of a lower octant.
-    fn predict(octants: &[u8]) -> Box<Predict<'_>> {
+    fn predict(keys: &[u64]) -> Box<Predict<'_>> {
         let k = tables().channels();
         Box::new(move |slice, voxels, latents| {
             let (mut mu, mut sigma) = (Vec::new(), Vec::new());
             for &v in voxels {
                 let v = v as usize;
-                let known = v > slice.start && octants[v - 1] < octants[v];
+                let known = v > slice.start && keys[v - 1] & 7 < keys[v] & 7;
                 for c in 0..k {
                     let before = || latents[(v - 1 - slice.start) * k + c];
                     mu.push(if known {
@@ -149,28 +165,43 @@ mod tests {
         })
     }
 
+    /// Nothing is predicted of any latent.
+    fn nothing(_: Range<usize>, voxels: &[u32], _: &[i16]) -> (Vec<i16>, Vec<u8>) {
+        let count = voxels.len() * tables().channels();
+        (vec![0; count], vec![UNPREDICTED; count])
+    }
+
+    fn size(tables: &Tables, keys: &[u64], predict: &Predict, latents: &[i16]) -> usize {
+        let slices = encode_passes(tables, keys, predict, latents, keys.len());
+        slices.iter().map(Vec::len).sum()
+    }
+
     proptest! {
         #[test]
         fn latents_come_back_whatever_their_octants_and_slices(
-            voxels in prop::collection::vec((0u8..8, any::<i16>(), any::<bool>()), 0..200),
+            voxels in prop::collection::btree_map(0u64..4000, (any::<i16>(), any::<bool>()), 0..200),
             slice in 1usize..100,
+            learning in any::<bool>(),
         ) {
-            let tables = tables();
-            let octants: Vec<u8> = voxels.iter().map(|v| v.0).collect();
-            let value = |v: &(u8, i16, bool)| if v.2 { v.1 % 30 } else { v.1 };
-            let latents: Vec<i16> = voxels.iter().flat_map(|v| vec![value(v); tables.channels()]).collect();
-            let predict = predict(&octants);
-            let bytes = encode_passes(&tables, &octants, &*predict, &latents, slice);
+            let tables = tables().with_learning(learning);
+            let keys: Vec<u64> = voxels.keys().copied().collect();
+            let value = |v: &(i16, bool)| if v.1 { v.0 % 30 } else { v.0 };
+            let latents: Vec<i16> = voxels.values().flat_map(|v| vec![value(v); tables.channels()]).collect();
+            let predict = predict(&keys);
+            let bytes = encode_passes(&tables, &keys, &*predict, &latents, slice);
             let slices = slices_of(&bytes);
-            prop_assert_eq!(decode_passes(&tables, &octants, &*predict, &slices, slice, 7, &Cancel::default()).unwrap(), latents);
+            prop_assert_eq!(decode_passes(&tables, &keys, &*predict, &slices, slice, 7, &Cancel::default()).unwrap(), latents);
         }
 
         #[test]
         fn arbitrary_bytes_never_panic(
             bytes in prop::collection::vec(any::<u8>(), 0..200),
-            octants in prop::collection::vec(0u8..8, 1..100),
+            keys in prop::collection::btree_set(any::<u64>(), 1..100),
+            learning in any::<bool>(),
         ) {
-            let _ = decode_passes(&tables(), &octants, &*predict(&octants), &slices_of(&[bytes]), 100, 7, &Cancel::default());
+            let keys: Vec<u64> = keys.into_iter().collect();
+            let tables = tables().with_learning(learning);
+            let _ = decode_passes(&tables, &keys, &*predict(&keys), &slices_of(&[bytes]), 100, 7, &Cancel::default());
         }
     }
 
@@ -178,21 +209,52 @@ mod tests {
     fn neighbours_that_are_known_save_bits() {
         let tables = tables();
         let mut random = Random(5);
-        let octants: Vec<u8> = (0..4000).map(|i| (i % 8) as u8).collect();
+        let keys: Vec<u64> = (0..4000).collect();
         let mut value = 0i16;
         let mut latents = Vec::new();
-        for _ in &octants {
+        for _ in &keys {
             value = (value + (random.next() % 3) as i16 - 1).clamp(-30, 30);
             latents.extend(vec![value; tables.channels()]);
         }
-        let nothing = |_: Range<usize>, voxels: &[u32], _: &[i16]| {
-            let count = voxels.len() * tables.channels();
-            (vec![0; count], vec![UNPREDICTED; count])
+        let known = size(&tables, &keys, &*predict(&keys), &latents);
+        assert!(known < size(&tables, &keys, &nothing, &latents) * 3 / 4);
+    }
+
+    #[test]
+    fn passes_that_learn_find_the_mean_and_scale_that_a_prediction_lacks() {
+        let tables = tables();
+        let keys: Vec<u64> = (0..4000).collect();
+        let mut random = Random(6);
+        // About normal, around 5 and some 3 wide; another channel is 0 throughout.
+        let wide =
+            |random: &mut Random| (0..12).map(|_| (random.next() % 4) as i16).sum::<i16>() - 13;
+        let latents: Vec<i16> = keys.iter().flat_map(|_| [wide(&mut random), 0]).collect();
+        let constant = |mu: [i16; 2], sigma: [u8; 2]| {
+            move |_: Range<usize>, voxels: &[u32], _: &[i16]| {
+                (mu.repeat(voxels.len()), sigma.repeat(voxels.len()))
+            }
         };
-        let size = |predict: &Predict| {
-            let slices = encode_passes(&tables, &octants, predict, &latents, 4000);
-            slices.iter().map(Vec::len).sum::<usize>()
-        };
-        assert!(size(&*predict(&octants)) < size(&nothing) * 3 / 4);
+        let right = size(&tables, &keys, &constant([80, 0], [35, 0]), &latents);
+        let wrong = constant([0, 0], [16, 30]);
+        let plain = size(&tables, &keys, &wrong, &latents);
+        let learned = size(&tables.with_learning(true), &keys, &wrong, &latents);
+        assert!(plain > 2 * right, "{plain} {right}");
+        assert!(learned < right * 21 / 20, "{learned} {right}");
+    }
+
+    #[test]
+    fn passes_that_learn_predict_voxels_without_neighbours_from_those_two_away() {
+        let tables = tables();
+        // A plane of voxels whose latents rise slowly.
+        let mut voxels: Vec<(u64, i16)> = (0..64 * 64)
+            .map(|i| [i % 64, i / 64, 0])
+            .map(|at| (morton::encode(at), (at[0] + at[1]) as i16 / 2 - 30))
+            .collect();
+        voxels.sort_unstable();
+        let keys: Vec<u64> = voxels.iter().map(|v| v.0).collect();
+        let latents: Vec<i16> = voxels.iter().flat_map(|v| [v.1; 2]).collect();
+        let plain = size(&tables, &keys, &nothing, &latents);
+        let learned = size(&tables.with_learning(true), &keys, &nothing, &latents);
+        assert!(learned < plain / 4, "{learned} {plain}");
     }
 }

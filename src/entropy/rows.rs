@@ -141,6 +141,19 @@ impl Row<'_> {
         Interval { start, size }
     }
 
+    /// What a value has of 2¹⁶, or, if it has no entry of its own, all such values together.
+    #[inline]
+    pub(super) fn part(&self, value: i32) -> u32 {
+        let entry = usize::try_from(value - self.low()).unwrap_or(usize::MAX);
+        u32::from(self.interval(entry.min(self.escape())).size)
+    }
+
+    /// What the likeliest value has of 2¹⁶.
+    pub(super) fn peak(&self) -> u32 {
+        let parts = (0..self.escape()).map(|entry| u32::from(self.interval(entry).size));
+        parts.max().unwrap_or(0)
+    }
+
     /// The entry that a number lies in.
     #[inline]
     pub(super) fn find(&self, quantile: u16) -> (usize, Interval) {

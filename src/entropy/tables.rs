@@ -4,7 +4,7 @@ use super::rows::{Row, Rows};
 use crate::error::Result;
 
 /// Scale indices: σ of index i is 0.11·(64 / 0.11)^(i / 63).
-const SCALES: usize = 64;
+pub(super) const SCALES: usize = 64;
 /// Fractions of a mean, in sixteenths.
 const FRACTIONS: usize = 16;
 
@@ -26,6 +26,9 @@ pub struct RawRows<'a> {
 pub struct Tables {
     gauss: Rows,
     prior: Rows,
+    /// For every channel the scale that its prior is nearest to.
+    prior_scales: Vec<u8>,
+    learning: bool,
 }
 
 impl Tables {
@@ -35,10 +38,36 @@ impl Tables {
     /// [`crate::Error::Malformed`], naming table and row, unless offsets ascend from 0 to the number of entries, every row has at
     /// least two entries that sum to 65,536, and stands for values that `i16` holds.
     pub fn new(gauss: RawRows, prior: RawRows) -> Result<Self> {
+        let gauss = Rows::new(gauss, Some(SCALES * FRACTIONS))?;
+        let prior = Rows::new(prior, None)?;
+        let peak = |sigma| gauss.row(sigma * FRACTIONS + FRACTIONS / 2).peak();
+        let scale = |peak_of_prior| {
+            let scale = (0..SCALES).find(|&sigma| peak(sigma) <= peak_of_prior);
+            scale.unwrap_or(SCALES - 1) as u8
+        };
+        let channels = 0..prior.len();
+        let prior_scales = channels.map(|c| scale(prior.row(c).peak())).collect();
         Ok(Tables {
-            gauss: Rows::new(gauss, Some(SCALES * FRACTIONS))?,
-            prior: Rows::new(prior, None)?,
+            gauss,
+            prior,
+            prior_scales,
+            learning: false,
         })
+    }
+
+    /// The same tables, for passes that learn from what they have coded, or do not, as at first.
+    pub fn with_learning(self, learning: bool) -> Self {
+        Tables { learning, ..self }
+    }
+
+    /// Whether passes learn.
+    pub(super) fn learning(&self) -> bool {
+        self.learning
+    }
+
+    /// The scale index that a channel's latents start from where nothing predicts them but others nearby.
+    pub(super) fn prior_scale(&self, channel: usize) -> u8 {
+        self.prior_scales[channel]
     }
 
     /// K: latents per voxel.

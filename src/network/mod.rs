@@ -218,7 +218,8 @@ fn tables(tensors: &Tensors, shape: &Shape) -> Result<Tables> {
     let tables = Tables::new(
         raw("cdf.gauss", (&gauss.0, &gauss.1, &gauss.2)),
         raw("cdf.prior", (&prior.0, &prior.1, &prior.2)),
-    )?;
+    )?
+    .with_learning(shape.learning);
     match tables.channels() == shape.latents {
         true => Ok(tables),
         false => Err(malformed(

@@ -21,6 +21,9 @@ pub struct Shape {
     /// How many roles have latents, the first ones: what is known of the levels of others comes from the level below alone.
     #[serde(default = "all_roles")]
     pub latent_roles: usize,
+    /// Whether what predicts from neighbours learns from what is coded: see [`crate::entropy`].
+    #[serde(default)]
+    pub learning: bool,
     /// Channels of the network that predicts the base level from neighbours, a multiple of 4; 0 where there is none.
     #[serde(default)]
     pub base_channels: usize,
@@ -99,6 +102,7 @@ impl Shape {
             channels: 8,
             latents: 4,
             latent_roles: ROLES,
+            learning: false,
             base_channels: 8,
             near_channels: [8, 4],
             fc_blocks: 1,
@@ -207,8 +211,9 @@ impl Shape {
             ROLES => String::new(),
             roles => format!(";fr_roles={roles}"),
         };
+        let learning = if self.learning { ";learning" } else { "" };
         format!(
-            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}{near}{roles}{reconstructed}",
+            "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}{near}{roles}{reconstructed}{learning}",
             self.channels,
             self.latents,
             self.pem_blocks,
@@ -472,6 +477,7 @@ mod tests {
             ("/channels", "-8"),
             ("/upsample", "\"cubic\""),
             ("/near_channels", "[8]"),
+            ("/learning", "1"),
             ("/latent_max", "40000"),
         ] {
             assert!(

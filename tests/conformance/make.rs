@@ -150,7 +150,13 @@ fn filtered(
         let slices = if model.has_passes(role) {
             let octants = octree.level(level).octants();
             let predict = model.passes(role, &octants, &map, parameters.as_ref());
-            encode_passes(tables, &octants, &predict, &latents, slice)
+            encode_passes(
+                tables,
+                octree.level(level).keys(),
+                &predict,
+                &latents,
+                slice,
+            )
         } else {
             let condition = match &parameters {
                 Some((mu, sigma)) => Condition::Gauss { mu, sigma },
@@ -220,7 +226,7 @@ pub fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     let corner = |bits: u8| (1u64 << (3 * bits)) - 1;
     for name in [
-        "tiny", "other", "nearest", "wide", "plain", "base", "bare", "lite",
+        "tiny", "other", "nearest", "wide", "plain", "base", "bare", "learning", "lite",
     ] {
         let model = model(name);
         let mut add = |what: String, anywhere: bool, make: &dyn Fn(&Model) -> Vec<u8>| {
@@ -289,6 +295,20 @@ pub fn cases() -> Vec<Case> {
             });
             add("cut-cloud".into(), true, &|m| {
                 stream(m, 8, &scattered(8, 60), (2, 3), 30, Small)
+            });
+        }
+        if name == "learning" {
+            let ends = [0, 77, corner(21) - 1, corner(21)];
+            add("far-corners".into(), true, &|m| {
+                stream(m, 21, &ends, (18, 20), 4, Small)
+            });
+            add("slices-of-7".into(), true, &|m| {
+                stream(m, 4, &cube(7), (1, 3), 7, Small)
+            });
+            add("a-voxel-in-two".into(), true, &|m| {
+                let lone = cube(12).into_iter().filter(|key| key & 7 == 0);
+                let lone: Vec<u64> = lone.map(|key| key << 3).collect();
+                stream(m, 5, &lone, (2, 4), 100, Small)
             });
         }
         add("nothing-to-say".into(), true, &|m| {
