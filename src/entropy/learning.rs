@@ -211,3 +211,139 @@ fn slope(tables: &Tables, coded: &Latent, latent: i16) -> i32 {
     let narrower = part(coded.sigma.saturating_sub(1));
     ((wider - narrower) << SLOPE_SHIFT) / (wider + narrower)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::entropy::test_tables::{Random, tables};
+    use std::collections::BTreeMap;
+
+    /// One voxel: its key, latents, and the means and scale indices predicted for them.
+    type Voxel = (u64, [i16; 2], [i16; 2], [u8; 2]);
+
+    /// Voxels of all octants, close by and far away, in the order of coding; predictions are now right and now wrong.
+    fn some(seed: u64, count: usize) -> Vec<Voxel> {
+        let mut random = Random(seed);
+        let mut draw = move |n: u64| random.next() % n;
+        let keys: BTreeMap<u64, [u64; 5]> = (0..count)
+            .map(|_| (draw(1 << 12), std::array::from_fn(|_| draw(1 << 20))))
+            .collect();
+        let mut voxels: Vec<Voxel> = keys
+            .iter()
+            .map(|(&key, r)| {
+                let large = if r[0] % 50 == 0 { 3000 } else { 9 };
+                let value = |r: u64| (r % large) as i16 - large as i16 / 2 + (key >> 9) as i16;
+                let y = [value(r[1]), value(r[2]) / 4];
+                let predicted = key & 7 > 1 || r[0] % 3 == 0;
+                let sigma = |r: u64| match predicted {
+                    true => (r % 64) as u8,
+                    false => UNPREDICTED,
+                };
+                let mu = [(r[1] % 600) as i16 - 300, (r[3] % 5000) as i16 - 2500];
+                (key, y, mu, [sigma(r[3]), sigma(r[4])])
+            })
+            .collect();
+        voxels.sort_by_key(|&(key, ..)| (key & 7, key));
+        voxels
+    }
+
+    /// What this module's documentation says, word by word.
+    fn by_definition(voxels: &[Voxel]) -> Vec<([i64; 2], [i64; 2])> {
+        let (tables, mut keys) = (tables(), Vec::new());
+        keys.extend(voxels.iter().map(|v| v.0));
+        keys.sort_unstable();
+        let rank = |key: u64| keys.binary_search(&key).unwrap() as i64;
+        let (mut means, mut scales, mut trend) = ([0i64; 2], [[0i64; 3]; 2], 0i64);
+        let mut surprises: Vec<(i64, i64)> = Vec::new();
+        let mut done: Vec<(u64, [i16; 2])> = Vec::new();
+        let mut used = Vec::new();
+        for &(key, y, mu, sigma) in voxels {
+            let near = surprises.iter().filter(|s| (s.0 - rank(key)).abs() <= 8);
+            let lively = 4 * trend + near.map(|s| s.1).sum::<i64>() > 0;
+            let at = morton::decode(key).map(i64::from);
+            let around: Vec<(i64, [i16; 2])> = done
+                .iter()
+                .filter_map(|&(other, y)| {
+                    let there = morton::decode(other).map(i64::from);
+                    let away: [i64; 3] = std::array::from_fn(|i| (there[i] - at[i]).abs());
+                    let moved = away.iter().filter(|&&d| d > 0).count();
+                    let two = away.iter().all(|&d| d == 0 || d == 2);
+                    (two && other < key).then_some(([0, 4, 2, 1][moved], y))
+                })
+                .collect();
+            let (mut m, mut s) = ([0; 2], [0; 2]);
+            let mut surprise = None;
+            for c in 0..2 {
+                let all: i64 = around.iter().map(|a| a.0).sum();
+                let place = match (sigma[c], all) {
+                    (UNPREDICTED, 0) => {
+                        (m[c], s[c]) = (mu[c].into(), UNPREDICTED.into());
+                        continue;
+                    }
+                    (UNPREDICTED, _) => 2,
+                    _ => usize::from(lively),
+                };
+                let scale = if place == 2 {
+                    let sum: i64 = around.iter().map(|a| a.0 * 16 * i64::from(a.1[c])).sum();
+                    m[c] = (2 * sum + all).div_euclid(2 * all).clamp(-32_768, 32_767);
+                    i64::from(tables.prior_scale(c))
+                } else {
+                    m[c] = (i64::from(mu[c]) + means[c].div_euclid(1024)).clamp(-2047, 2047);
+                    i64::from(sigma[c])
+                };
+                s[c] = (scale + (scales[c][place] + 32_768).div_euclid(65_536)).clamp(0, 63);
+                let has = |sigma: i64| {
+                    let (row, centre) = tables.gauss(m[c] as i16, sigma.clamp(0, 63) as u8);
+                    i64::from(row.part(i32::from(y[c]) - centre))
+                };
+                let (more, less) = (has(s[c] + 1), has(s[c] - 1));
+                let slope = 4096 * (more - less) / (more + less);
+                scales[c][place] = (scales[c][place] + 48 * slope).clamp(-(1 << 22), 1 << 22);
+                if place < 2 {
+                    let error = (16 * i64::from(y[c]) - m[c]).clamp(-64, 64);
+                    means[c] = (means[c] + 32 * error).clamp(-(1 << 21), 1 << 21);
+                    *surprise.get_or_insert(0) += slope;
+                }
+            }
+            if let Some(surprise) = surprise {
+                surprises.push((rank(key), surprise));
+                trend += (surprise - trend).div_euclid(4);
+            }
+            done.push((key, y));
+            used.push((m, s));
+        }
+        used
+    }
+
+    #[test]
+    fn what_is_learned_is_what_the_definition_says() {
+        for (seed, count) in [(1, 1), (2, 3), (3, 40), (4, 700), (5, 3000)] {
+            let voxels = some(seed, count);
+            let mut keys: Vec<u64> = voxels.iter().map(|v| v.0).collect();
+            keys.sort_unstable();
+            let tables = tables().with_learning(true);
+            let mut learning = Learning::of(&tables, &keys).expect("these tables learn");
+            let mut coded = vec![0; 2 * keys.len()];
+            let (mut unpredicted, mut alone) = (0, 0);
+            for (&(key, y, mut mu, mut sigma), (m, s)) in voxels.iter().zip(by_definition(&voxels))
+            {
+                let voxel = keys.binary_search(&key).unwrap();
+                unpredicted += usize::from(sigma[0] == UNPREDICTED);
+                learning.prepare(voxel, &coded, &mut mu, &mut sigma);
+                alone += usize::from(sigma[0] == UNPREDICTED);
+                assert_eq!((mu.map(i64::from), sigma.map(i64::from)), (m, s));
+                coded[2 * voxel..][..2].copy_from_slice(&y);
+                learning.learn(voxel, &y);
+            }
+            assert!(count < 700 || (alone > 0 && unpredicted > 2 * alone));
+        }
+    }
+
+    #[test]
+    fn a_prior_starts_from_the_scale_that_is_as_sure() {
+        let tables = tables();
+        // Half of all latents are 0: so they are under a normal law 0.74 wide.
+        let sigma = 0.11 * (64.0f64 / 0.11).powf(f64::from(tables.prior_scale(0)) / 63.0);
+        assert!((0.7..0.85).contains(&sigma), "{sigma}");
+    }
+}
