@@ -35,6 +35,7 @@ fn models() -> Vec<(&'static str, Model)> {
     let wide = Shape {
         channels: 32,
         latents: 8,
+        learning: true,
         ..Shape::tiny()
     };
     let load = |bytes: &[u8]| Model::from_bytes(bytes).expect("a model loads");

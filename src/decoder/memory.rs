@@ -24,8 +24,8 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     ///
     /// That is linear in the voxels: with C channels and K latents, 224 + 10·C + 7·K bytes for each voxel of a level, the level above it
     /// with its features, 112 bytes for each Gaussian, 100 + 6·H bytes more for each that a generator of H channels makes at once, 208 + 6·H if it
-    /// makes one for each voxel, where a network of B channels predicts the base level 20 + 19·K + 4·B bytes for each of its voxels, and where
-    /// others correct the levels above it 5 + 5·K for each of the last one's.
+    /// makes one for each voxel, where a network of B channels predicts the base level 24 + 17·K + 4·B bytes for each of its voxels, and where
+    /// others correct the levels above it 9 + 3·K for each of the last one's.
     ///
     /// # Errors
     /// [`crate::Error::Usage`] if the stream has no such level.
@@ -44,9 +44,9 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         // Context, four tensors of a block, latents with their means and scales.
         let exact = parents * features + voxels * (MAP + 16 + 10 * c + 7 * k);
         let base = counts().next().unwrap_or(0) * shape.base_bytes() as u64;
-        // Octants, the order of a pass, its means, scales and latents.
+        // Octants, the order of a pass, its means and scales, what surprised it.
         let near = match shape.corrects_up_to(levels - 1) {
-            true => voxels * (5 + 5 * k),
+            true => voxels * (9 + 3 * k),
             false => 0,
         };
         let head = shape.head(levels - 1, self.heads).map_or(0, |head| {

@@ -16,23 +16,26 @@ const BUCKETS: usize = 1 << BUCKET_BITS;
 pub(super) struct Rows {
     /// Per row the sums of the entries before each entry, and 2¹⁶, which is stored as 0.
     cumulative: Vec<u16>,
+    /// What every look at a row needs, close together.
     heads: Vec<Head>,
+    /// Per row the entry that the first quantile of each bucket belongs to, and the last entry.
+    buckets: Vec<[u16; BUCKETS + 1]>,
 }
 
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Head {
-    start: usize,
-    end: usize,
+    start: u32,
+    /// The number of the last entry.
+    escape: u16,
     low: i16,
-    /// The entry that the first quantile of each bucket belongs to, and the last entry.
-    buckets: [u16; BUCKETS + 1],
 }
 
 /// One row.
 #[derive(Clone, Copy)]
 pub(super) struct Row<'a> {
     cumulative: &'a [u16],
-    head: &'a Head,
+    low: i16,
+    buckets: &'a [u16; BUCKETS + 1],
 }
 
 impl Rows {
@@ -65,7 +68,7 @@ impl Rows {
             return fault("range of offsets", value, format!("0 to {}", entries.len()));
         }
         let mut cumulative = Vec::with_capacity(entries.len() + rows);
-        let mut heads = Vec::with_capacity(rows);
+        let (mut heads, mut buckets) = (Vec::with_capacity(rows), Vec::with_capacity(rows));
         for (row, ends) in offsets.windows(2).enumerate() {
             let Some(entries) = entries.get(ends[0] as usize..ends[1] as usize) else {
                 let value = format!("{} to {}", ends[0], ends[1]);
@@ -87,32 +90,37 @@ impl Rows {
                 cumulative.push(sum);
                 sum = sum.wrapping_add(entry).wrapping_add(1);
             }
-            let buckets = buckets(&cumulative[start..]);
+            buckets.push(buckets_of(&cumulative[start..]));
             cumulative.push(sum);
             heads.push(Head {
-                start,
-                end: cumulative.len(),
+                start: start as u32,
+                escape: (entries.len() - 1) as u16,
                 low: low[row],
-                buckets,
             });
         }
-        Ok(Rows { cumulative, heads })
+        Ok(Rows {
+            cumulative,
+            heads,
+            buckets,
+        })
     }
 
     pub(super) fn len(&self) -> usize {
         self.heads.len()
     }
 
+    #[inline]
     pub(super) fn row(&self, index: usize) -> Row<'_> {
-        let head = &self.heads[index];
+        let Head { start, escape, low } = self.heads[index];
         Row {
-            cumulative: &self.cumulative[head.start..head.end],
-            head,
+            cumulative: &self.cumulative[start as usize..][..usize::from(escape) + 2],
+            low,
+            buckets: &self.buckets[index],
         }
     }
 }
 
-fn buckets(sums: &[u16]) -> [u16; BUCKETS + 1] {
+fn buckets_of(sums: &[u16]) -> [u16; BUCKETS + 1] {
     let mut buckets = [(sums.len() - 1) as u16; BUCKETS + 1];
     let bucket = |sum: u16| usize::from(sum).div_ceil(1 << (PRECISION - BUCKET_BITS));
     for (entry, sums) in sums.windows(2).enumerate() {
@@ -124,7 +132,7 @@ fn buckets(sums: &[u16]) -> [u16; BUCKETS + 1] {
 impl Row<'_> {
     /// What the first entry stands for.
     pub(super) fn low(&self) -> i32 {
-        self.head.low.into()
+        self.low.into()
     }
 
     /// The last entry: everything that no other stands for.
@@ -158,8 +166,8 @@ impl Row<'_> {
     #[inline]
     pub(super) fn find(&self, quantile: u16) -> (usize, Interval) {
         let bucket = usize::from(quantile >> (PRECISION - BUCKET_BITS));
-        let first = usize::from(self.head.buckets[bucket]);
-        let last = usize::from(self.head.buckets[bucket + 1]);
+        let first = usize::from(self.buckets[bucket]);
+        let last = usize::from(self.buckets[bucket + 1]);
         let entry =
             first + self.cumulative[first + 1..=last].partition_point(|&sum| sum <= quantile);
         (entry, self.interval(entry))

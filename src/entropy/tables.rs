@@ -81,6 +81,7 @@ impl Tables {
     }
 
     /// The row for a mean in sixteenths and a scale index, and the whole number its values count from.
+    #[inline]
     pub(super) fn gauss(&self, mu: i16, sigma: u8) -> (Row<'_>, i32) {
         let mu = i32::from(mu);
         let whole = (mu + 8) >> 4;
