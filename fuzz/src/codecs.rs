@@ -229,7 +229,8 @@ pub fn entropy(bytes: &[u8]) {
         })
         .collect();
     in_passes(&tables, &keys, &latents, slice, code);
-    in_passes(&tables.with_learning(true), &keys, &latents, slice, code);
+    let learning = Tables::clone(&tables).with_learning(true);
+    in_passes(&learning, &keys, &latents, slice, code);
 
     const LIMIT: i16 = 500;
     let price = f32::from(code.first().copied().unwrap_or(0)) / 64.0;
@@ -275,7 +276,11 @@ fn in_passes(tables: &Tables, keys: &[u64], latents: &[i16], slice: usize, code:
             for channel in 0..k {
                 let before = || known[(v - 1 - slice.start) * k + channel];
                 mu.push(if lower { before().wrapping_mul(7) } else { 0 });
-                sigma.push(if lower { (keys[v] & 7) as u8 * 8 } else { UNPREDICTED });
+                sigma.push(if lower {
+                    (keys[v] & 7) as u8 * 8
+                } else {
+                    UNPREDICTED
+                });
             }
         }
         (mu, sigma)
