@@ -35,8 +35,11 @@ if [ ! -d "$out/mixed" ]; then
     "$lab" dataset -o "$out/half1" --procedural --count 20 --seed 32 --bits 9 --crop 512 --size 512
     "$lab" dataset -o "$out/quarter0" --textures "$photos" --count 200 --seed 33 --bits 8 --crop 256 --size 256 --views 8 "$meshes"
     "$lab" dataset -o "$out/quarter1" --procedural --count 40 --seed 34 --bits 8 --crop 256 --size 256 --views 8
+    "$lab" dataset -o "$out/half2" --textures "$photos" --count 160 --seed 51 --bits 9 --crop 512 --size 512 "$meshes"
+    "$lab" dataset -o "$out/half3" --procedural --count 40 --seed 52 --bits 9 --crop 512 --size 512
+    "$lab" dataset -o "$out/quarter2" --textures "$photos" --count 160 --seed 53 --bits 8 --crop 256 --size 256 --views 8 "$meshes"
     mkdir "$out/mixed-part"
-    for from in half0 half1 quarter0 quarter1; do
+    for from in half0 half1 half2 half3 quarter0 quarter1 quarter2; do
         for file in "$out/$from"/*; do mv "$file" "$out/mixed-part/$from-$(basename "$file")"; done
     done
     for crop in "$out"/data/*-00[0-5]*; do ln -s "$crop" "$out/mixed-part/"; done
@@ -93,7 +96,8 @@ train low-whole-2 lite 21 --init "$out/low-whole-1/last.pt" --coarse 0 "${whole[
 train low-rest lite 30 --init "$out/low-whole-2/last.pt" --lam 4 "${rest[@]}"
 fit low-rest
 train low-mixed lite 42 --init "$out/low-rest/tuned.pt" --lam 4 "${mixed[@]}"
-ship low-mixed lite-low
+train low-more lite 70 --init "$out/low-mixed/last.pt" --lam 4 "${mixed[@]}"
+ship low-more lite-low
 imitating lite-low 15
 train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
 train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
@@ -101,7 +105,8 @@ train high-whole-1 lite 25 --init "$out/high-heads/last.pt" --coarse 1 "${whole[
 train high-whole-2 lite 25 --init "$out/high-whole-1/last.pt" --coarse 0 "${whole[@]}"
 fit high-whole-2
 train high-mixed lite 82 --init "$out/high-whole-2/tuned.pt" --lam 16 "${mixed[@]}"
-ship high-mixed lite
+train high-more lite 82 --init "$out/high-mixed/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
+ship high-more lite
 imitating lite 15
 train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
