@@ -11,8 +11,8 @@
 //! # Scales
 //! Every channel has an offset for calm places, one for lively ones, and one for where nothing is predicted, in units of 2⁻¹⁶ of a scale
 //! index, at first 0. `σ′ = σ + ⌊(offset + 2¹⁵) / 2¹⁶⌋`, kept in 0 to 63, is used, and then the offset grows by 48 times the latent's
-//! *slope*, and is kept within ±2²². With `p₊` and `p₋` what the latent's entry has of 2¹⁶ in the rows of the scale indices `σ′ + 1`
-//! and `σ′ − 1` (kept in 0 to 63) and of `μ′`, the slope is `2¹²·(p₊ − p₋) / (p₊ + p₋)`, rounded towards zero.
+//! *slope*, and is kept within ±2²². With `p₊` and `p₋` what the latent's entry (the last one, if it has none of its own there) has of 2¹⁶ in the rows of the
+//! scale indices `σ′ + 1` and `σ′ − 1` (kept in 0 to 63) and of `μ′`, the slope is `2¹²·(p₊ − p₋) / (p₊ + p₋)`, rounded towards zero.
 //!
 //! A voxel's surprise is the sum of the slopes of its predicted latents. After each voxel that has any, `trend`, at first 0, grows by
 //! a quarter of what the surprise is above it, rounded down. A place is lively if `4·trend` plus the surprises of the voxels up to eight
