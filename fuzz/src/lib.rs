@@ -66,7 +66,11 @@ fn giving_back(run: impl Fn()) {
 
 /// The model that streams are coded with here.
 static MODEL: LazyLock<Model> = LazyLock::new(|| {
-    Model::from_bytes(&untrained(&Shape::tiny(), 0)).expect("an untrained model loads")
+    let shape = Shape {
+        learning: true,
+        ..Shape::tiny()
+    };
+    Model::from_bytes(&untrained(&shape, 0)).expect("an untrained model loads")
 });
 
 /// The targets whose inputs are streams, to be changed by [`mutate`].
