@@ -444,17 +444,9 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
             let (tables, cancel) = (self.model.tables(), &self.cancel);
             let slices = &level.features;
             let latents = if self.model.has_passes(role) {
-                let octants = octree.level(n).octants();
+                let (keys, octants) = (octree.level(n).keys(), octree.level(n).octants());
                 let predict = self.model.passes(role, &octants, map, parameters.as_ref());
-                decode_passes(
-                    tables,
-                    octree.level(n).keys(),
-                    &predict,
-                    slices,
-                    slice,
-                    n,
-                    cancel,
-                )?
+                decode_passes(tables, keys, &predict, slices, slice, n, cancel)?
             } else {
                 let condition = match &parameters {
                     Some((mu, sigma)) => Condition::Gauss { mu, sigma },

@@ -237,15 +237,10 @@ pub(crate) fn write(
                 let tables = model.tables();
                 let latents = latents(role, condition, context.as_deref())?;
                 let slices = if model.has_passes(role) {
-                    let octants = octree.level(level).octants();
+                    let voxels = octree.level(level);
+                    let octants = voxels.octants();
                     let predict = model.passes(role, &octants, map, parameters.as_ref());
-                    encode_passes(
-                        tables,
-                        octree.level(level).keys(),
-                        &predict,
-                        &latents,
-                        slice,
-                    )
+                    encode_passes(tables, voxels.keys(), &predict, &latents, slice)
                 } else {
                     encode_level(tables, condition, &latents, slice)
                 };

@@ -100,6 +100,12 @@ pub fn decode_passes(
             let mut learning = Learning::of(tables, &keys[slice.clone()]);
             for voxels in passes(keys, &slice) {
                 let (mut mu, mut sigma) = predict(slice.clone(), &voxels, part);
+                let latents = voxels.len() * k;
+                assert_eq!(
+                    (mu.len(), sigma.len()),
+                    (latents, latents),
+                    "one mean and scale per latent"
+                );
                 let parameters = mu.chunks_exact_mut(k).zip(sigma.chunks_exact_mut(k));
                 for (&v, (mu, sigma)) in voxels.iter().zip(parameters) {
                     let at = v as usize - slice.start;
