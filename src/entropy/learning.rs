@@ -21,7 +21,7 @@
 //! # Where nothing is predicted
 //! `μ` is the mean of the voxels two away along any of the axes that come before it in Morton order and in its slice, so have the same octant; those
 //! count four that differ along one axis, two along two, one along three; in sixteenths, rounded to the nearest, halves up, and kept to 16 bits. `σ` is the
-//! first scale whose likeliest value, with a whole mean, is no likelier than that of the channel's prior. If there are no such voxels, the prior codes the
+//! first scale whose likeliest value, with a whole mean, is no likelier than that of the channel's prior, 63 if there is none. If there are no such voxels, the prior codes the
 //! latent, and nothing is learned.
 
 use b2p_kernels::LIMIT;

@@ -24,6 +24,7 @@ pub(super) struct Rows {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Head {
+    /// Entries before the row's first; each row before it has one sum more than entries.
     start: u32,
     /// The number of the last entry.
     escape: u16,
@@ -93,7 +94,7 @@ impl Rows {
             buckets.push(buckets_of(&cumulative[start..]));
             cumulative.push(sum);
             heads.push(Head {
-                start: start as u32,
+                start: ends[0],
                 escape: (entries.len() - 1) as u16,
                 low: low[row],
             });
@@ -113,7 +114,7 @@ impl Rows {
     pub(super) fn row(&self, index: usize) -> Row<'_> {
         let Head { start, escape, low } = self.heads[index];
         Row {
-            cumulative: &self.cumulative[start as usize..][..usize::from(escape) + 2],
+            cumulative: &self.cumulative[start as usize + index..][..usize::from(escape) + 2],
             low,
             buckets: &self.buckets[index],
         }

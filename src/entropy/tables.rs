@@ -41,12 +41,13 @@ impl Tables {
         let gauss = Rows::new(gauss, Some(SCALES * FRACTIONS))?;
         let prior = Rows::new(prior, None)?;
         let peak = |sigma| gauss.row(sigma * FRACTIONS + FRACTIONS / 2).peak();
-        let scale = |peak_of_prior| {
-            let scale = (0..SCALES).find(|&sigma| peak(sigma) <= peak_of_prior);
+        let peaks: Vec<u32> = (0..SCALES).map(peak).collect();
+        let scale = |channel| {
+            let sure = prior.row(channel).peak();
+            let scale = peaks.iter().position(|&peak| peak <= sure);
             scale.unwrap_or(SCALES - 1) as u8
         };
-        let channels = 0..prior.len();
-        let prior_scales = channels.map(|c| scale(prior.row(c).peak())).collect();
+        let prior_scales = (0..prior.len()).map(scale).collect();
         Ok(Tables {
             gauss,
             prior,

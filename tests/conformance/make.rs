@@ -148,15 +148,10 @@ fn filtered(
         let latents: Vec<i16> = (0..count).map(|_| latents.next(&mut random)).collect();
         let (tables, slice) = (model.tables(), slice as usize);
         let slices = if model.has_passes(role) {
-            let octants = octree.level(level).octants();
+            let voxels = octree.level(level);
+            let octants = voxels.octants();
             let predict = model.passes(role, &octants, &map, parameters.as_ref());
-            encode_passes(
-                tables,
-                octree.level(level).keys(),
-                &predict,
-                &latents,
-                slice,
-            )
+            encode_passes(tables, voxels.keys(), &predict, &latents, slice)
         } else {
             let condition = match &parameters {
                 Some((mu, sigma)) => Condition::Gauss { mu, sigma },
