@@ -94,11 +94,12 @@ pub(super) enum Mode {
 }
 
 impl Layer {
-    fn finish(&self, mode: Mode, o: usize, sum: f64, energy: f64) -> f64 {
+    fn finish(&self, (mode, limit): (Mode, f64), o: usize, sum: f64, energy: f64) -> f64 {
         match &self.finish {
-            Finish::Plain { bias } => sum + f64::from(bias[o]),
+            Finish::Plain { bias } => (sum + f64::from(bias[o])).clamp(-limit, limit),
             Finish::Invariant { gain, bias } => {
-                sum * f64::from(gain[o]) / (energy + 1e-8).sqrt() + f64::from(bias[o])
+                let value = sum * f64::from(gain[o]) / (energy + 1e-8).sqrt();
+                (value + f64::from(bias[o])).clamp(-limit, limit)
             }
             // Sums of integers are exact in f64 up to 2^53.
             Finish::Shifted { bias, shift } => match mode {
@@ -128,12 +129,13 @@ impl Layer {
     }
 
     /// What a sum with a residual becomes.
-    fn bound(&self, mode: Mode, value: f64) -> f64 {
+    fn bound(&self, (mode, limit): (Mode, f64), value: f64) -> f64 {
         match (&self.finish, mode) {
+            (Finish::Plain { .. } | Finish::Invariant { .. }, _) => value.clamp(-limit, limit),
             (Finish::Shifted { .. } | Finish::Scaled { .. }, Mode::Whole) => {
                 value.clamp(-2047.0, 2047.0)
             }
-            _ => value,
+            (_, Mode::Real) => value,
         }
     }
 }
@@ -155,6 +157,8 @@ pub(super) fn concat(left: &Rows, right: &Rows) -> Rows {
 pub(super) struct Oracle {
     pub shape: Shape,
     pub mode: Mode,
+    /// How far from 0 activations outside of the exact zone get.
+    limit: f64,
     pub exact: Exact<Layer>,
     pub generators: Vec<Generate<Layer>>,
     pub encoder: Encoder<Layer>,
@@ -216,8 +220,14 @@ impl Oracle {
             g_scale: all(&tensors, "g_scale"),
             c_scale: all(&tensors, "c_scale"),
             mode,
+            limit: f64::INFINITY,
             shape,
         }
+    }
+
+    /// With activations outside of the exact zone that saturate there, as those of Gaussian generation in integers do.
+    pub fn saturating(self, limit: f64) -> Self {
+        Oracle { limit, ..self }
     }
 
     fn layer(&self, layer: &Layer, reach: Reach, from: &Sites, to: &Sites, x: &Rows) -> Rows {
@@ -238,7 +248,7 @@ impl Oracle {
                         energy += w * w;
                     }
                 }
-                layer.finish(self.mode, o, sum, energy)
+                layer.finish((self.mode, self.limit), o, sum, energy)
             };
             (0..cout).map(channel).collect()
         };
@@ -257,7 +267,7 @@ impl Oracle {
         let sum = |(x, y): (&Vec<f64>, Vec<f64>)| {
             x.iter()
                 .zip(y)
-                .map(|(x, y)| last.bound(self.mode, x + y))
+                .map(|(x, y)| last.bound((self.mode, self.limit), x + y))
                 .collect()
         };
         let rows = x.iter().zip(y).map(sum).collect();

@@ -3,7 +3,7 @@
 use b2p_kernels::Isa;
 
 use super::super::reference::{Mode, Oracle, Rows};
-use super::super::{Head, Model, Precision, RAW, Shape, Upsample, untrained};
+use super::super::{Head, Heads, Model, Precision, RAW, Shape, Upsample, untrained};
 use super::{Cloud, coarser, error, rows};
 
 /// Networks that together have every switch in both positions.
@@ -320,6 +320,40 @@ fn generation_in_integers_follows_its_definition_and_is_the_same_on_every_isa_an
                 }
             }
         }
+    }
+}
+
+/// The ends of the range of activations in steps of 1/256, as those of untrained networks are.
+const RANGE: f64 = 2047.0 / 256.0;
+
+#[test]
+fn generation_in_integers_saturates_where_activations_leave_their_range() {
+    let cloud = Cloud::sheet();
+    for (shape, seed) in [(3, 116), (4, 118), (7, 115)] {
+        let shape = &shapes()[shape];
+        let bytes = untrained(shape, seed);
+        let role = 1;
+        let g = some_features(cloud.len(role) * shape.channels);
+        let features = rows(&g, shape.channels);
+        let by_definition =
+            |oracle: Oracle| oracle.generate(Heads::Best, role, &cloud.sites(role), &features);
+        let whole = by_definition(Oracle::new(&bytes, Mode::Whole));
+        let bounded = by_definition(Oracle::new(&bytes, Mode::Whole).saturating(RANGE));
+        let model = Model::from_bytes(&bytes).unwrap();
+        let got = model.generate_with(Heads::Best, role, &g, &cloud.maps[role]);
+        let got = got.unwrap();
+        let (without, _) = error(&got, &whole);
+        let (off, peak) = error(&got, &bounded);
+        println!(
+            "seed {seed}: {:.2e}, unbounded {:.2e} of {peak:.2}",
+            off / peak,
+            without / peak
+        );
+        assert!(
+            without > INTEGER_TOLERANCE * peak,
+            "seed {seed} stays within its range"
+        );
+        assert!(off < INTEGER_TOLERANCE * peak, "off by {off} of {peak}");
     }
 }
 
