@@ -6,14 +6,16 @@ use b2p::bitstream::{Header, Stream, Writer};
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Encoded, Options, encode};
-use b2p::gaussians::{ColourFilter, Gaussians};
+use std::num::NonZeroU8;
+
+use b2p::gaussians::{ColourFilter, ColourResidual, Gaussians};
 use b2p::geometry::Octree;
 use b2p::log::Log;
 use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::pixels::{Background, render};
 use b2p::projection::Camera;
 use b2p::{Error, Limits, Placement};
-use common::{Ball, cloud_of, tiny_model, with_filter};
+use common::{Ball, cloud_of, tiny_model, with_filter, with_residual};
 
 fn model() -> Model {
     Model::from_bytes(&tiny_model(0)).expect("an untrained model loads")
@@ -423,6 +425,91 @@ fn a_filter_for_one_set_of_heads_leaves_the_other_s_colours_as_they_are() {
                 reds.for_each(|red| *red = (*red - 0.125).clamp(0.0, 1.0));
             }
             assert!(decode(&bytes) == want, "{heads}, filter for {filtered}");
+        }
+    }
+}
+
+#[test]
+fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_nothing_else() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let decoder = Decoder::new(&model);
+    let mut last = f64::INFINITY;
+    let encoded = |filter: bool, residual: Option<u8>| {
+        let options = Options {
+            filter,
+            residual: residual.and_then(NonZeroU8::new),
+            ..Options::default()
+        };
+        encode(&cloud, &model, &options, &mut Log::default()).unwrap()
+    };
+    for filter in [true, false] {
+        let plain = encoded(filter, None);
+        let finest = plain.rates.last().unwrap().level;
+        for step in [80, 20, 5, 1] {
+            let refined = encoded(filter, Some(step));
+            for rate in &plain.rates[1..] {
+                let level = rate.level;
+                let bytes = [&plain.bytes, &refined.bytes];
+                let exact =
+                    bytes.map(|bytes| decoder.exact(bytes, level, &mut Log::default()).unwrap());
+                assert_eq!(exact[0], exact[1]);
+                let decode = |bytes: &Vec<u8>| {
+                    decoder
+                        .decode(bytes, Some(level), &mut Log::default())
+                        .unwrap()
+                };
+                let [before, after] = bytes.map(decode);
+                let recoloured = Gaussians {
+                    colour: after.colour.clone(),
+                    ..before.clone()
+                };
+                assert_eq!(after, recoloured);
+                if level < finest {
+                    assert_eq!(after, before, "level {level}");
+                    continue;
+                }
+                let want = colours_at(&cloud, level);
+                let pairs = after.colour.as_flattened().iter().zip(want.as_flattened());
+                let squares = pairs.map(|(a, b)| f64::from(a - b).powi(2));
+                let off = (squares.sum::<f64>() / (3 * want.len()) as f64).sqrt();
+                assert!(off < 0.67 * f64::from(step) / 255.0, "step {step}: {off}");
+                assert!(off < last, "step {step}: {off} after {last}");
+                last = off;
+            }
+        }
+        last = f64::INFINITY;
+    }
+}
+
+#[test]
+fn quick_heads_are_corrected_by_the_same_residual() {
+    let shape = Shape::tiny().with_quick_heads();
+    let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
+    let options = Options {
+        filter: false,
+        ..Options::default()
+    };
+    let plain = encode(&ball(6, 20.0), &model, &options, &mut Log::default()).unwrap();
+    let level = plain.rates.last().unwrap().level;
+    let octree = Decoder::new(&model).exact(&plain.bytes, level, &mut Log::default());
+    let keys = octree.unwrap().octree.level(level).keys().to_vec();
+    // A tenth less of everything.
+    let missing = vec![[-0.1; 3]; keys.len()];
+    let slice = options.slice_voxels as usize;
+    let residual = ColourResidual::of(&missing, &keys, slice, 1).to_payloads();
+    let bytes = with_residual(&plain.bytes, &residual);
+    for heads in Heads::ALL {
+        let decoder = Decoder::new(&model).with_heads(heads).unwrap();
+        let decode = |bytes| decoder.decode(bytes, None, &mut Log::default()).unwrap();
+        let (before, after) = (decode(&plain.bytes), decode(&bytes));
+        let pairs = before
+            .colour
+            .as_flattened()
+            .iter()
+            .zip(after.colour.as_flattened());
+        for (before, after) in pairs {
+            let want = (before - 0.1).max(0.0);
+            assert!((after - want).abs() < 0.001, "{heads}: {before} to {after}");
         }
     }
 }

@@ -2,6 +2,7 @@
 
 mod common;
 
+use std::num::NonZeroU8;
 use std::sync::Mutex;
 
 use b2p::bitstream::Header;
@@ -69,7 +70,10 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
         let with = |heads: &Heads| decoder.clone().with_heads(*heads).unwrap();
         let decoders: Vec<_> = model.shape().heads().iter().map(with).collect();
         for (kind, cloud) in clouds() {
-            let options = Options::default();
+            let options = Options {
+                residual: NonZeroU8::new(4),
+                ..Options::default()
+            };
             let bytes = encode(&cloud, &model, &options, &mut Log::default())
                 .unwrap()
                 .bytes;

@@ -9,8 +9,8 @@ use std::sync::LazyLock;
 use b2p::Cancel;
 use b2p::bitstream::Slice;
 use b2p::entropy::{
-    Condition, RawRows, Tables, UNPREDICTED, decode_level, decode_passes, decode_slice,
-    encode_level, encode_passes, encode_slice, quantise,
+    Condition, RawRows, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
+    decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice, quantise,
 };
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 
@@ -218,6 +218,7 @@ pub fn entropy(bytes: &[u8]) {
         let again = encode_slice(&tables, condition, &latents);
         assert_eq!(again, code, "another code for the same latents");
     }
+    as_coefficients(&latents, code);
     let slice = 1 + code.len() % 6;
     in_slices(&tables, condition, &latents, slice);
     // Far and near, of any octants.
@@ -240,6 +241,26 @@ pub fn entropy(bytes: &[u8]) {
         let bound = f32::from(LIMIT);
         let away = (f32::from(*q) - y.clamp(-bound, bound)).abs();
         assert!(q.abs() <= LIMIT && away <= 1.0, "{y} became {q}");
+    }
+}
+
+/// Numbers as coefficients of colours: encode → decode is equal, but for the one number that is brought within. Any bytes: an error, or
+/// coefficients that have the very same code.
+fn as_coefficients(values: &[i16], code: &[u8]) {
+    let within = |value: &i16| (*value).max(-i16::MAX);
+    let triples: Vec<[i16; 3]> = (values.chunks_exact(3))
+        .map(|three| [within(&three[0]), within(&three[1]), within(&three[2])])
+        .collect();
+    let mut decoded = vec![[0; 3]; triples.len()];
+    let coded = encode_coefficients(&triples);
+    decode_coefficients(&coded, &mut decoded, &"here").expect("what was encoded decodes");
+    assert_eq!(decoded, triples);
+    for count in [0, 1, 40, code.len()] {
+        decoded.resize(count, [0; 3]);
+        if decode_coefficients(code, &mut decoded, &"here").is_ok() {
+            let again = encode_coefficients(&decoded);
+            assert_eq!(again, code, "another code for the same coefficients");
+        }
     }
 }
 

@@ -2,17 +2,17 @@
 
 use std::path::Path;
 
-use b2p::bitstream::Stream;
+use b2p::bitstream::{Level, Stream};
 use b2p::cloud::{ColouredVoxels, PointCloud};
 use b2p::decoder::Decoder;
 use b2p::encoder::{Options, encode};
-use b2p::gaussians::{COLOUR_INPUTS, ColourFilter};
+use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual};
 use b2p::geometry::Voxels;
 use b2p::log::Log;
 use b2p::{Limits, Placement};
 
 use crate::MODEL;
-use crate::streams::rewritten;
+use crate::streams::{Colours, rewritten};
 
 /// A stream of these voxels, and the Gaussians of its finest level as a file.
 fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u8>>) {
@@ -41,8 +41,8 @@ fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u
     (stream.bytes, file)
 }
 
-/// The same stream with colour filters at every level, for which small clouds do not pay by themselves.
-fn filtered(bytes: &[u8]) -> Vec<u8> {
+/// The same stream with colour filters, for which small clouds do not pay by themselves, and residuals at every level.
+fn coloured(bytes: &[u8]) -> Vec<u8> {
     let stream = Stream::parse(bytes, &Limits::unlimited()).expect("a stream of ours");
     let mut weights = [[0; COLOUR_INPUTS]; 3];
     for (weight, byte) in weights.as_flattened_mut().iter_mut().zip(noise(9, 57)) {
@@ -52,7 +52,21 @@ fn filtered(bytes: &[u8]) -> Vec<u8> {
         exponent: 7,
         weights,
     };
-    rewritten(&stream, Some(&filter.to_bytes()))
+    let slice = stream.header().slice_voxels as usize;
+    let residual = |level: &Level| {
+        let keys: Vec<u64> = (0..level.voxels.into()).collect();
+        let noise = noise(4, 3 * keys.len());
+        let missing = noise
+            .chunks(3)
+            .map(|c| [0, 1, 2].map(|k| f32::from(c[k]) / 300.0 - 0.4));
+        let missing: Vec<_> = missing.collect();
+        ColourResidual::of(&missing, &keys, slice, 30).to_payloads()
+    };
+    let colours = Colours {
+        filter: filter.to_bytes().to_vec(),
+        residual: &residual,
+    };
+    rewritten(&stream, Some(&colours))
 }
 
 /// Pseudo-random bytes.
@@ -79,8 +93,8 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
     let streams = clouds.iter().map(|(stream, _)| stream.clone());
     match target {
         "header" | "stream" | "chunking" => {
-            let filtered = filtered(&clouds[3].0);
-            streams.chain([filtered]).collect()
+            let coloured = coloured(&clouds[3].0);
+            streams.chain([coloured]).collect()
         }
         "ply" => {
             let cloud = PointCloud {

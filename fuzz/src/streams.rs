@@ -1,6 +1,6 @@
 //! Streams from strangers.
 
-use b2p::bitstream::{Header, Level, Stream, Writer};
+use b2p::bitstream::{Header, Level, Slice, Stream, Writer};
 use b2p::decoder::{Decoder, Decoding, Exact};
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
@@ -49,6 +49,8 @@ pub fn header(bytes: &[u8]) {
         for filter in level.filters.iter().flatten() {
             assert_eq!(filter.voxels, *voxels);
         }
+        let residual: u32 = level.residual.iter().map(|slice| slice.voxels).sum();
+        assert!(residual == *voxels || level.residual.is_empty());
         let end = header
             .prefix_bytes(level.level)
             .expect("a level of the stream");
@@ -72,8 +74,9 @@ pub fn header(bytes: &[u8]) {
     requests(bytes, &header, stream.deepest());
 }
 
-/// The same stream, put together from its parts; with `filter`, if there is one, as the payload of all colour filters.
-pub(crate) fn rewritten(stream: &Stream, filter: Option<&[u8]>) -> Vec<u8> {
+/// The same stream, put together from its parts; with `colours`, if there are any, as the payload of all colour filters and the slices of
+/// a residual of each level.
+pub(crate) fn rewritten(stream: &Stream, colours: Option<&Colours<'_>>) -> Vec<u8> {
     let mut writer = Writer::new(stream.header().clone()).expect("a header that was read");
     for level in stream.levels() {
         for part in &level.geometry {
@@ -81,30 +84,47 @@ pub(crate) fn rewritten(stream: &Stream, filter: Option<&[u8]>) -> Vec<u8> {
             let slices: Vec<_> = slices.collect();
             writer.geometry(part.level, &slices).expect("a level of it");
         }
-        if level.features.is_empty() {
-            filters(&mut writer, level, filter);
-            continue;
+        if !level.features.is_empty() {
+            let mut slices = with_excess(&level.features);
+            let excess = writer.features(level.level, level.latent_hash, &slices);
+            assert!(excess.is_err(), "more slices than the voxels fill");
+            slices.pop();
+            writer
+                .features(level.level, level.latent_hash, &slices)
+                .expect("a level of it");
         }
-        let mut slices: Vec<_> = level.features.iter().map(|slice| slice.bytes).collect();
-        slices.push(&[]);
-        let excess = writer.features(level.level, level.latent_hash, &slices);
-        assert!(excess.is_err(), "more slices than the voxels fill");
-        slices.pop();
-        writer
-            .features(level.level, level.latent_hash, &slices)
-            .expect("a level of it");
-        filters(&mut writer, level, filter);
+        for (slice, own) in level.filters.iter().enumerate() {
+            let made = colours.map(|colours| &colours.filter[..]);
+            if let Some(payload) = made.or(own.map(|own| own.bytes)) {
+                let written = writer.filter(level.level, slice, payload);
+                written.expect("a level of it");
+            }
+        }
+        if let Some(colours) = colours {
+            let written = writer.residual(level.level, &(colours.residual)(level));
+            written.expect("a level of it");
+        } else if !level.residual.is_empty() {
+            let mut slices = with_excess(&level.residual);
+            let excess = writer.residual(level.level, &slices);
+            assert!(excess.is_err(), "more slices than the voxels fill");
+            slices.pop();
+            let written = writer.residual(level.level, &slices);
+            written.expect("a level of it");
+        }
     }
     writer.finish().expect("the parts of a whole stream")
 }
 
-fn filters(writer: &mut Writer, level: &Level, filter: Option<&[u8]>) {
-    for (slice, own) in level.filters.iter().enumerate() {
-        if let Some(payload) = filter.or(own.map(|own| own.bytes)) {
-            let written = writer.filter(level.level, slice, payload);
-            written.expect("a level of it");
-        }
-    }
+/// The code of slices, and of one more.
+fn with_excess<'a>(slices: &[Slice<'a>]) -> Vec<&'a [u8]> {
+    let codes = slices.iter().map(|slice| slice.bytes);
+    codes.chain([&[][..]]).collect()
+}
+
+/// What all levels of a stream are to say of their colours.
+pub(crate) struct Colours<'a> {
+    pub filter: Vec<u8>,
+    pub residual: &'a dyn Fn(&Level) -> Vec<Vec<u8>>,
 }
 
 /// A level can be asked for if it is whole; a prefix is intact if it ends with a level; a header has as many voxel counts as levels.

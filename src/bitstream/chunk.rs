@@ -20,6 +20,8 @@ pub enum ChunkKind {
     Features,
     /// A correction of colours.
     Filter,
+    /// A slice of what colours are still off.
+    Residual,
     /// Something that a reader may skip: its type, 128 to 255.
     Ancillary(u8),
 }
@@ -54,6 +56,7 @@ impl ChunkKind {
             ChunkKind::Geometry => 1,
             ChunkKind::Features => 2,
             ChunkKind::Filter => 3,
+            ChunkKind::Residual => 4,
             ChunkKind::Ancillary(code) => code,
         }
     }
@@ -65,6 +68,7 @@ impl std::fmt::Display for ChunkKind {
             ChunkKind::Geometry => f.write_str("geometry"),
             ChunkKind::Features => f.write_str("feature"),
             ChunkKind::Filter => f.write_str("filter"),
+            ChunkKind::Residual => f.write_str("residual"),
             ChunkKind::Ancillary(code) => write!(f, "ancillary {code}"),
         }
     }
@@ -132,6 +136,7 @@ impl<'a> Chunks<'a> {
             1 => ChunkKind::Geometry,
             2 => ChunkKind::Features,
             3 => ChunkKind::Filter,
+            4 => ChunkKind::Residual,
             ANCILLARY.. => ChunkKind::Ancillary(code),
             _ => {
                 return Err(Error::Unsupported {

@@ -27,7 +27,7 @@
 //!
 //! | offset | type | field |
 //! |---|---|---|
-//! | 0 | u8 | type: 1 geometry, 2 features, 3 colour filter. From 128 on: ancillary, anywhere in a section, to be skipped. Any other: refuse |
+//! | 0 | u8 | type: 1 geometry, 2 features, 3 colour filter, 4 colour residual. From 128 on: ancillary, anywhere in a section, to be skipped. Any other: refuse |
 //! | 1 | u8 | level |
 //! | 2 | u16 | slice |
 //! | 4 | u32 | voxels of the slice |
@@ -44,7 +44,8 @@
 //! The payload is that of [`crate::entropy`]; that of slice 0 is preceded by the level's latent hash, u64:
 //! XXH3-64 of the level's latents as 16-bit numbers, voxel by voxel. A level whose role has no latents in the model has none of these chunks.
 //! Then may follow colour filters, at most one for each set of heads: slice 0 for the best, then slice 1 for quick ones, whose count is
-//! the level's voxels and whose payload is that of [`crate::gaussians::ColourFilter`].
+//! the level's voxels and whose payload is that of [`crate::gaussians::ColourFilter`]. Then may follow the colour residual of the level: a chunk for every S of its
+//! voxels (the last one for what is left), slices numbered from 0, with the payload of [`crate::gaussians::ColourResidual`].
 //!
 //! Nothing follows the last section.
 

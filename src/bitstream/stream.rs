@@ -37,6 +37,8 @@ pub struct Level<'a> {
     pub latent_hash: u64,
     /// Corrections of the colours that the best and the quick heads generate.
     pub filters: [Option<Slice<'a>>; FILTERS],
+    /// What the colours are still off, one entry per slice; none if the stream does not say.
+    pub residual: Vec<Slice<'a>>,
 }
 
 /// The octree of one level, given the level before.
@@ -156,10 +158,11 @@ impl<'a> Level<'a> {
 
         let mut chunks = take_section(bytes, &mut at, section.features, "feature section")?;
         let (features, latent_hash) = match chunks.peek()?.map(|chunk| chunk.kind) {
-            None | Some(ChunkKind::Filter) => Default::default(),
+            None | Some(ChunkKind::Filter | ChunkKind::Residual) => Default::default(),
             Some(_) => take_features(&mut chunks, header.slice_voxels, level, voxels)?,
         };
         let filters = take_filters(&mut chunks, level, voxels)?;
+        let residual = take_residual(&mut chunks, header.slice_voxels, level, voxels)?;
         chunks.finish()?;
         Ok(Level {
             level,
@@ -168,6 +171,7 @@ impl<'a> Level<'a> {
             features,
             latent_hash,
             filters,
+            residual,
         })
     }
 
@@ -274,12 +278,31 @@ fn take_filters<'a>(
     for (number, filter) in filters.iter_mut().enumerate() {
         let counts = u64::from(voxels)..=voxels.into();
         let next = chunks.peek()?;
-        if next.is_some_and(|next| usize::from(next.slice) == number) {
+        let comes =
+            |next: Chunk| next.kind != ChunkKind::Residual && usize::from(next.slice) == number;
+        if next.is_some_and(comes) {
             let chunk = chunks.expect(ChunkKind::Filter, level, number as u64, counts)?;
             *filter = Some(Slice::of(&chunk, 0));
         }
     }
     Ok(filters)
+}
+
+fn take_residual<'a>(
+    chunks: &mut Chunks<'a>,
+    slice_voxels: u32,
+    level: u8,
+    voxels: u32,
+) -> Result<Vec<Slice<'a>>> {
+    let mut slices = Vec::new();
+    if chunks.peek()?.is_none() {
+        return Ok(slices);
+    }
+    for (slice, count) in sliced(voxels.into(), slice_voxels) {
+        let chunk = chunks.expect(ChunkKind::Residual, level, slice, count..=count)?;
+        slices.push(Slice::of(&chunk, 0));
+    }
+    Ok(slices)
 }
 
 impl<'a> Slice<'a> {

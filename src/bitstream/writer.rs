@@ -68,22 +68,11 @@ impl Writer {
         slices: &[impl AsRef<[u8]>],
     ) -> Result<()> {
         let section = self.header.index(level)?;
-        let voxels = self.header.voxels[section].into();
-        let counts: Vec<u64> = sliced(voxels, self.header.slice_voxels)
-            .map(|(_, count)| count)
-            .collect();
-        if counts.len() != slices.len() {
-            return Err(Error::Usage(format!(
-                "{voxels} voxels fill {} slices, not {}",
-                counts.len(),
-                slices.len()
-            )));
-        }
+        let counts = self.slices(section, slices.len())?;
         let start = self.body.len();
         for (slice, (&count, bytes)) in counts.iter().zip(slices).enumerate() {
             let hash = latent_hash.to_le_bytes();
             let prefix = if slice == 0 { &hash[..] } else { &[] };
-            let count = count as u32;
             self.chunk(
                 ChunkKind::Features,
                 level,
@@ -109,6 +98,38 @@ impl Writer {
         let length = &mut self.header.sections[section].features;
         *length = extended(*length, self.body.len() - start)?;
         Ok(())
+    }
+
+    /// Adds the colour residual of `level`, after its filters: for every slice of its voxels the payload.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the stream has no such level, the slices are more or fewer than its voxels fill, or a payload is too long.
+    pub fn residual(&mut self, level: u8, slices: &[impl AsRef<[u8]>]) -> Result<()> {
+        let section = self.header.index(level)?;
+        let counts = self.slices(section, slices.len())?;
+        let start = self.body.len();
+        for (slice, (count, bytes)) in counts.into_iter().zip(slices).enumerate() {
+            let bytes = bytes.as_ref();
+            self.chunk(ChunkKind::Residual, level, slice, count, &[], bytes)?;
+        }
+        let length = &mut self.header.sections[section].features;
+        *length = extended(*length, self.body.len() - start)?;
+        Ok(())
+    }
+
+    /// The voxels of each slice of a level, of which there must be so many.
+    fn slices(&self, section: usize, found: usize) -> Result<Vec<u32>> {
+        let voxels = self.header.voxels[section].into();
+        let counts: Vec<u32> = sliced(voxels, self.header.slice_voxels)
+            .map(|(_, count)| count as u32)
+            .collect();
+        if counts.len() != found {
+            return Err(Error::Usage(format!(
+                "{voxels} voxels fill {} slices, not {found}",
+                counts.len(),
+            )));
+        }
+        Ok(counts)
     }
 
     /// The stream, read once to see that every level is whole.

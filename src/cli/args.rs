@@ -110,6 +110,9 @@ pub struct Encode {
     /// Leave colours as the model makes them, which takes less time: otherwise each level tells in 58 bytes how to correct those of the cloud
     #[arg(long)]
     pub no_filter: bool,
+    /// Also code what the finest level's colours are still off, in steps of STEP/255, 1 to 255: 64 takes a few percent of bits, 16 doubles a stream
+    #[arg(long, value_name = "STEP")]
+    pub residual: Option<std::num::NonZeroU8>,
     #[command(flatten)]
     pub model: ModelArg,
 }

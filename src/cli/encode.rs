@@ -29,6 +29,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         levels: args.levels.clone(),
         bit_price: args.bit_price,
         filter: !args.no_filter,
+        residual: args.residual,
         ..Options::default()
     };
     let encoded = encoder::encode(&cloud, &model, &options, &mut log).map_err(&in_cloud)?;

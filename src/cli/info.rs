@@ -27,6 +27,13 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             .enumerate()
     };
 
+    // Of a level that is not whole it is not known.
+    let residual = |i: usize| {
+        let level = stream.levels().get(i)?;
+        let bytes = level.residual.iter().map(|slice| slice.bytes.len() + 16);
+        Some(bytes.sum::<usize>())
+    };
+
     if args.json {
         let levels: Vec<_> = levels()
             .map(|(i, (level, (voxels, section)))| {
@@ -35,6 +42,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
                     "voxels": voxels,
                     "geometry_bytes": section.geometry,
                     "feature_bytes": section.features,
+                    "residual_bytes": residual(i),
                     "whole": i < whole,
                 })
             })
@@ -61,6 +69,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             "voxels",
             "geometry bytes",
             "feature bytes",
+            "of them residual",
             "bits/point up to here",
         ]
         .map(String::from)
@@ -74,6 +83,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             count(voxels.into()),
             count(section.geometry.into()),
             count(section.features.into()),
+            residual(i).map_or("?".into(), |bytes| count(bytes as u64)),
             bpp(prefix),
         ]);
     }

@@ -8,7 +8,7 @@ use super::{Decoder, Exact};
 use crate::bitstream::{Header, Level, MAGIC};
 use crate::entropy::{Condition, decode_level, decode_passes, expect_no_latents, latent_hash};
 use crate::error::{Error, Result};
-use crate::gaussians::{ColourFilter, Frame, Gaussians, Surroundings, activate};
+use crate::gaussians::{ColourFilter, ColourResidual, Frame, Gaussians, Surroundings, activate};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
 use crate::network::{Heads, Model, Module, Pool};
@@ -83,6 +83,8 @@ struct Reached {
     above: Option<KernelMap>,
     /// What the stream says of the colours, for each set of heads.
     filters: [Option<ColourFilter>; Heads::ALL.len()],
+    /// And what they are still off.
+    residual: Option<ColourResidual>,
 }
 
 impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
@@ -221,6 +223,12 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
                 Ok(())
             })?;
         }
+        if let Some(residual) = &reached.residual {
+            log.step("add residual", count, "Gaussians", || {
+                residual.apply(&mut gaussians, voxels.keys());
+                Ok(())
+            })?;
+        }
         Ok(gaussians)
     }
 
@@ -323,6 +331,16 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
             let parse = |payload| ColourFilter::parse(payload, level.level);
             *filter = payload.as_ref().map(parse).transpose()?;
         }
+        let slice = header.slice_voxels as usize;
+        let residual = match level.residual.is_empty() {
+            true => None,
+            false => {
+                let (name, count) = (format!("residual of level {}", level.level), level.voxels);
+                log.step(name, count as usize, "voxels", || {
+                    ColourResidual::parse(&level.residual, slice, level.level)
+                })?
+            }
+        };
         let mut octree = match &mut self.reached {
             Some(above) => std::mem::replace(&mut above.exact.octree, Octree::root()),
             None => Octree::root(),
@@ -340,6 +358,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
                     level: level.level,
                     above: above.filter(|_| read),
                     filters,
+                    residual,
                     exact: Exact {
                         octree,
                         latents,

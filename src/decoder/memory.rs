@@ -15,6 +15,8 @@ const MAP: u64 = 27 * 4 + PLAN;
 const NODE: u64 = 8 + 1 + 4;
 /// Bytes of a Gaussian.
 const GAUSSIAN: u64 = 14 * 4;
+/// Bytes of a voxel in a colour residual, which any stream may have.
+const RESIDUAL: u64 = 3 * 2;
 /// Slices of a stream in memory, over their bytes in the stream.
 const SLICES: u64 = 4;
 
@@ -22,7 +24,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included, beyond
     /// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and the model itself.
     ///
-    /// That is linear in the voxels: with C channels and K latents, 224 + 10·C + 7·K bytes for each voxel of a level, the level above it
+    /// That is linear in the voxels: with C channels and K latents, 230 + 10·C + 7·K bytes for each voxel of a level, the level above it
     /// with its features, 112 bytes for each Gaussian, 100 + 6·H bytes more for each that a generator of H channels makes at once, 208 + 6·H if it
     /// makes one for each voxel, where a network of B channels predicts the base level 24 + 17·K + 4·B bytes for each of its voxels, and where
     /// others correct the levels above it 9 + 3·K for each of the last one's.
@@ -42,7 +44,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let parents = counts().nth_back(1).unwrap_or(0);
         let voxels = counts().next_back().unwrap_or(0);
         // Context, four tensors of a block, latents with their means and scales.
-        let exact = parents * features + voxels * (MAP + 16 + 10 * c + 7 * k);
+        let exact = parents * features + voxels * (MAP + RESIDUAL + 16 + 10 * c + 7 * k);
         let base = counts().next().unwrap_or(0) * shape.base_bytes() as u64;
         // Octants, the order of a pass, its means and scales, what surprised it.
         let near = match shape.corrects_up_to(levels - 1) {

@@ -300,12 +300,4 @@ mod tests {
         assert_eq!(with(1), with(3));
         assert!(with(1).is_some());
     }
-
-    #[test]
-    fn missing_children_have_the_colour_of_their_voxel() {
-        let all = super::super::of_children(&[[0.5; 3]], &[[0.1; 3], [0.2; 3]], &[0b1000_0010]);
-        let mut want = vec![[0.5; 3]; 8];
-        (want[1], want[7]) = ([0.1; 3], [0.2; 3]);
-        assert_eq!(all, want);
-    }
 }

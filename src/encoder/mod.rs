@@ -1,7 +1,9 @@
 //! Point cloud to stream. Runs the decoder in the loop: what a level is predicted from is what the decoder will have.
 
 mod colours;
+mod corrections;
 
+use std::num::NonZeroU8;
 use std::ops::RangeInclusive;
 
 use rayon::prelude::*;
@@ -11,11 +13,11 @@ use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
 use crate::entropy::{Condition, encode_level, encode_passes, latent_hash, quantise};
 use crate::error::{Error, Result};
-use crate::gaussians::{ColourFilter, Frame, Surroundings, activate};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::network::{Heads, Model, ROLES};
+use corrections::{Corrections, Level, corrections};
 
 /// What may be chosen about a stream.
 #[derive(Debug, Clone)]
@@ -28,6 +30,9 @@ pub struct Options {
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
     /// [`ColourFilter`].
     pub filter: bool,
+    /// Code what the colours of the finest level that is drawn are still off those of the cloud, in steps of so many 255ths: see
+    /// [`ColourResidual`](crate::gaussians::ColourResidual). Default: not at all.
+    pub residual: Option<NonZeroU8>,
     /// Voxels per slice, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
 }
@@ -43,6 +48,7 @@ impl Default for Options {
             levels: None,
             bit_price: Options::BIT_PRICE,
             filter: true,
+            residual: None,
             slice_voxels: MAX_SLICE_VOXELS,
         }
     }
@@ -124,12 +130,12 @@ pub fn encode(
             options.bit_price,
         ))
     };
-    let mut corrected = |level: Level<'_>| filters(cloud, model, level);
-    let filters: Option<&mut Filters<'_>> = match options.filter {
-        true => Some(&mut corrected),
+    let mut correct = |level: Level<'_>| corrections(cloud, model, options, level);
+    let correct: Option<&mut Correct<'_>> = match options.filter || options.residual.is_some() {
+        true => Some(&mut correct),
         false => None,
     };
-    let (bytes, below) = write(header, &octree, &maps, model, &mut squeezed, filters, log)?;
+    let (bytes, below) = write(header, &octree, &maps, model, &mut squeezed, correct, log)?;
     let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
         Decoder::new(model)
             .with_limits(Limits::unlimited())
@@ -157,34 +163,21 @@ pub fn encode(
 pub(crate) type Latents<'a> =
     dyn FnMut(usize, Condition<'_>, Option<&[i16]>) -> Result<Vec<i16>> + 'a;
 
-/// A level whose latents are coded, and which is drawn.
-pub(crate) struct Level<'a> {
-    role: usize,
-    level: u8,
-    /// Gaussians of each voxel.
-    children: usize,
-    octree: &'a Octree,
-    maps: &'a [KernelMap],
-    features: &'a [i16],
-    /// Bytes of latents up to here.
-    latents: usize,
-}
-
-/// A level's corrections of colours.
-pub(crate) type Filters<'a> = dyn FnMut(Level<'_>) -> Result<Vec<(Heads, ColourFilter)>> + 'a;
+/// What to say of a level's colours.
+type Correct<'a> = dyn FnMut(Level<'_>) -> Result<Corrections> + 'a;
 
 /// A stream of the `header`'s levels of an octree, and the features of the last; voxels and sections are filled in. `maps` are the levels'
 /// 3³ kernel maps.
 ///
 /// # Errors
-/// Those of [`Writer`], of `latents`, and of `filters`.
+/// Those of [`Writer`], of `latents`, and of `correct`.
 pub(crate) fn write(
     header: Header,
     octree: &Octree,
     maps: &[KernelMap],
     model: &Model,
     latents: &mut Latents<'_>,
-    mut filters: Option<&mut Filters<'_>>,
+    mut correct: Option<&mut Correct<'_>>,
     log: &mut Log,
 ) -> Result<(Vec<u8>, Vec<i16>)> {
     let (levels, slice) = (header.base..=header.top, header.slice_voxels as usize);
@@ -193,6 +186,11 @@ pub(crate) fn write(
         voxels: voxels.collect(),
         ..header
     })?;
+    let drawn = |level: &u8| {
+        let role = usize::from(level - *levels.start());
+        model.shape().head(role, Heads::Best).is_some()
+    };
+    let finest = levels.clone().rev().find(drawn);
     let mut below: Option<Vec<i16>> = None;
     let mut latent_bytes = 0;
     for (role, level) in levels.enumerate() {
@@ -255,70 +253,30 @@ pub(crate) fn write(
             },
         )?;
         let head = model.shape().head(role, Heads::Best);
-        let (Some(filters), Some(head)) = (&mut filters, head) else {
+        let (Some(correct), Some(head)) = (&mut correct, head) else {
             continue;
         };
         log.step(format!("colours of level {level}"), count, "voxels", || {
-            let found = filters(Level {
+            let found = correct(Level {
                 role,
                 level,
+                finest: Some(level) == finest,
                 children: head.children,
                 octree,
                 maps,
                 features: below.as_deref().unwrap_or_default(),
                 latents: latent_bytes,
             })?;
-            found.iter().try_for_each(|(heads, filter)| {
-                writer.filter(level, *heads as usize, &filter.to_bytes())
-            })
+            for (heads, filter) in &found.filters {
+                writer.filter(level, *heads as usize, &filter.to_bytes())?;
+            }
+            match &found.residual {
+                Some(residual) => writer.residual(level, &residual.to_payloads()),
+                None => Ok(()),
+            }
         })?;
     }
     Ok((writer.finish()?, below.unwrap_or_default()))
-}
-
-/// The corrections that a level's colours are worth.
-fn filters(
-    cloud: &ColouredVoxels,
-    model: &Model,
-    at: Level<'_>,
-) -> Result<Vec<(Heads, ColourFilter)>> {
-    let (shape, map) = (model.shape(), &at.maps[at.role]);
-    let (_, mut wanted) = pooled(cloud, at.level);
-    let mut drawn = at.level;
-    if at.children == 8 {
-        drawn += 1;
-        let finer = pooled(cloud, drawn).1;
-        wanted = of_children(&wanted, &finer, at.octree.occupancy(at.level));
-    }
-    let mut found = Vec::new();
-    for heads in Heads::ALL {
-        if shape.head(at.role, heads).is_none() {
-            continue;
-        }
-        let raw = model.generate_with(heads, at.role, at.features, map)?;
-        let voxels = at.octree.level(at.level);
-        let gaussians = activate(&raw, voxels, at.children, shape, Frame::default());
-        drop(raw);
-        let above = at.role.checked_sub(1).map(|role| &at.maps[role]);
-        let around = Surroundings::of_level(&gaussians, at.octree, at.level, map, above);
-        let filter = colours::fit(&gaussians, &around, &wanted, drawn, at.latents)?;
-        found.extend(filter.map(|filter| (heads, filter)));
-    }
-    Ok(found)
-}
-
-/// The colours of all eight children of each voxel: where there is no such child, the voxel's.
-fn of_children(voxels: &[[f32; 3]], children: &[[f32; 3]], occupancy: &[u8]) -> Vec<[f32; 3]> {
-    let mut children = children.iter();
-    let mut all = Vec::with_capacity(8 * voxels.len());
-    for (voxel, mask) in voxels.iter().zip(occupancy) {
-        for octant in 0..8 {
-            let there = mask >> octant & 1 == 1;
-            let child = if there { children.next() } else { None };
-            all.push(*child.unwrap_or(voxel));
-        }
-    }
-    all
 }
 
 /// The levels to code, for a cloud of bit depth `bits`.

@@ -94,6 +94,11 @@ pub fn encode_slice(tables: &Tables, condition: Condition, latents: &[i16]) -> V
             stack.push(row.interval(row.escape()));
         }
     }
+    sealed(stack)
+}
+
+/// The bytes of a slice whose symbols are all on the stack.
+pub(super) fn sealed(stack: Stack) -> Vec<u8> {
     let (state, words) = stack.into_parts();
     let state_bytes = (u64::BITS - state.leading_zeros()).div_ceil(8) as usize;
     let mut bytes = Vec::with_capacity(state_bytes + WORD_BYTES * words.len());
@@ -183,23 +188,27 @@ impl<'a> Reader<'a> {
     /// # Errors
     /// [`Error::Malformed`], naming `at`, if something is.
     pub fn finish(self) -> Result<()> {
-        let (state, words) = self.stack.into_parts();
-        if !words.is_empty() {
-            let left = format!("{} bytes", words.len() * WORD_BYTES);
-            let field = "rest after the last latent";
-            return Err(malformed(self.at, field, left, "none"));
-        }
-        if state != END_STATE {
-            let (state, end) = (format!("{state:#x}"), format!("{END_STATE:#x}"));
-            let field = "coder state after the last latent";
-            return Err(malformed(self.at, field, state, end));
-        }
-        Ok(())
+        expect_end(self.stack, self.at)
     }
 }
 
+/// Fails, naming `at`, if anything is left on the stack.
+pub(super) fn expect_end(stack: Stack, at: &dyn Display) -> Result<()> {
+    let (state, words) = stack.into_parts();
+    if !words.is_empty() {
+        let left = format!("{} bytes", words.len() * WORD_BYTES);
+        return Err(malformed(at, "rest after the last symbol", left, "none"));
+    }
+    if state != END_STATE {
+        let (state, end) = (format!("{state:#x}"), format!("{END_STATE:#x}"));
+        let field = "coder state after the last symbol";
+        return Err(malformed(at, field, state, end));
+    }
+    Ok(())
+}
+
 /// The first state and the stack of words, the next to be read on top.
-fn open(bytes: &[u8], at: &dyn Display) -> Result<Stack> {
+pub(super) fn open(bytes: &[u8], at: &dyn Display) -> Result<Stack> {
     let Some(more) = bytes.len().checked_sub(LEAST_STATE_BYTES) else {
         let expected = format!("at least {LEAST_STATE_BYTES} bytes");
         return Err(malformed(at, "length of the slice", bytes.len(), expected));

@@ -4,10 +4,12 @@ mod activations;
 mod filter;
 mod harmonics;
 mod heads;
+mod residual;
 
 pub use filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundings};
 pub use harmonics::Harmonics;
 pub use heads::activate;
+pub use residual::{BASIS as COLOUR_BASIS, ColourResidual};
 
 #[cfg(feature = "ply")]
 pub mod ply;

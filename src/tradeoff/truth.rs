@@ -7,7 +7,7 @@ use crate::bitstream::{Header, Stream};
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
 use crate::error::Result;
-use crate::gaussians::{ColourFilter, Frame, Gaussians, Surroundings, activate};
+use crate::gaussians::{ColourFilter, ColourResidual, Frame, Gaussians, Surroundings, activate};
 use crate::log::Log;
 use crate::network::{Heads, Model};
 
@@ -29,11 +29,17 @@ pub fn in_double(subject: &Subject<'_>, model: &Model, level: u8) -> Result<(Gau
     let (voxels, frame) = (exact.octree.level(level), decoder.frame(subject.stream)?);
     let mut gaussians = activate(&raw, voxels, children, model.shape(), frame);
     let stream = Stream::parse(subject.stream, subject.limits)?;
-    let filter = stream.levels().get(role).and_then(|found| found.filters[0]);
-    if let Some(filter) = filter {
+    let Some(said) = stream.levels().get(role) else {
+        return Ok((gaussians, took));
+    };
+    if let Some(filter) = said.filters[0] {
         let above = level.checked_sub(1).map(|up| exact.octree.kernel_map(up));
         let around = Surroundings::of_level(&gaussians, &exact.octree, level, &map, above.as_ref());
         ColourFilter::parse(&filter, level)?.apply(&mut gaussians, &around);
+    }
+    let slice = header.slice_voxels as usize;
+    if let Some(residual) = ColourResidual::parse(&said.residual, slice, level)? {
+        residual.apply(&mut gaussians, voxels.keys());
     }
     Ok((gaussians, took))
 }

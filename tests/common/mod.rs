@@ -116,6 +116,22 @@ pub fn names_in(folder: &Path) -> Vec<std::ffi::OsString> {
 
 /// The same stream, its last level with this colour filter for one set of heads.
 pub fn with_filter(bytes: &[u8], heads: Heads, filter: &[u8]) -> Vec<u8> {
+    with_more(bytes, |writer, top| {
+        let written = writer.filter(top, heads as usize, filter);
+        written.expect("a level of the stream");
+    })
+}
+
+/// The same stream, its last level with these slices of a colour residual.
+pub fn with_residual(bytes: &[u8], slices: &[Vec<u8>]) -> Vec<u8> {
+    with_more(bytes, |writer, top| {
+        let written = writer.residual(top, slices);
+        written.expect("a level of the stream, and its slices");
+    })
+}
+
+/// The same stream with what `add` adds to its last level, and without what levels said of their colours.
+fn with_more(bytes: &[u8], add: impl Fn(&mut Writer, u8)) -> Vec<u8> {
     let stream = Stream::parse(bytes, &Limits::default()).expect("a header");
     let mut writer = Writer::new(stream.header().clone()).expect("a header that was read");
     for level in stream.levels() {
@@ -128,8 +144,6 @@ pub fn with_filter(bytes: &[u8], heads: Heads, filter: &[u8]) -> Vec<u8> {
         let (number, hash) = (level.level, level.latent_hash);
         writer.features(number, hash, &slices).expect("features");
     }
-    let top = stream.header().top;
-    let written = writer.filter(top, heads as usize, filter);
-    written.expect("a level of the stream");
+    add(&mut writer, stream.header().top);
     writer.finish().expect("the parts of a whole stream")
 }

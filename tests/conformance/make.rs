@@ -4,7 +4,9 @@ use b2p::Placement;
 use b2p::bitstream::{Header, Writer};
 use b2p::encoder::{Options, encode};
 use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
-use b2p::gaussians::{COLOUR_INPUTS, ColourFilter};
+use std::num::NonZeroU8;
+
+use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
 use b2p::network::Model;
@@ -76,18 +78,35 @@ fn stream(
     slice: u32,
     latents: Latents,
 ) -> Vec<u8> {
-    filtered(model, bits, keys, levels, slice, latents, None)
+    coloured(
+        model,
+        bits,
+        keys,
+        levels,
+        slice,
+        latents,
+        Corrections::default(),
+    )
 }
 
-/// The same, and all its levels have colour filters for both sets of heads, of this exponent and weights up to as much.
-fn filtered(
+/// What all levels of a stream say of their colours.
+#[derive(Default, Clone, Copy)]
+struct Corrections {
+    /// Filters for both sets of heads, of this exponent and weights up to as much.
+    filter: Option<(u8, i8)>,
+    /// In this step, what is up to so much in each channel.
+    residual: Option<(u8, f32)>,
+}
+
+/// The same, and all its levels correct colours.
+fn coloured(
     model: &Model,
     bits: u8,
     keys: &[u64],
     (base, top): (u8, u8),
     slice: u32,
     latents: Latents,
-    filter: Option<(u8, i8)>,
+    corrections: Corrections,
 ) -> Vec<u8> {
     let cloud = Voxels::new(bits, keys.to_vec());
     let octree = Octree::new(cloud.clone()).expect("voxels");
@@ -122,11 +141,11 @@ fn filtered(
         let context = below
             .as_ref()
             .map(|g| model.upsample(role, g, octree.occupancy(level - 1)));
-        let filters = |writer: &mut Writer, random: &mut Random| {
-            let Some((exponent, most)) = filter else {
-                return;
-            };
+        let correct = |writer: &mut Writer, random: &mut Random| {
             for set in 0..2 {
+                let Some((exponent, most)) = corrections.filter else {
+                    break;
+                };
                 let mut weights = [[0; COLOUR_INPUTS]; 3];
                 for weight in weights.as_flattened_mut() {
                     let whole = 2 * most as u64 + 1;
@@ -135,10 +154,18 @@ fn filtered(
                 let payload = ColourFilter { exponent, weights }.to_bytes();
                 writer.filter(level, set, &payload).expect("a filter");
             }
+            if let Some((step, most)) = corrections.residual {
+                let keys = octree.level(level).keys();
+                let mut draw = || most * (random.below(1 << 20) as f32 / (1 << 19) as f32 - 1.0);
+                let missing: Vec<_> = keys.iter().map(|_| [draw(), draw(), draw()]).collect();
+                let residual = ColourResidual::of(&missing, keys, slice as usize, step);
+                let written = writer.residual(level, &residual.to_payloads());
+                written.expect("a residual");
+            }
         };
         if !model.has_latents(role) {
             below = Some(model.reconstruct(role, &[], context.as_deref(), &map));
-            filters(&mut writer, &mut random);
+            correct(&mut writer, &mut random);
             continue;
         }
         let parameters = context
@@ -162,7 +189,7 @@ fn filtered(
         writer
             .features(level, latent_hash(&latents), &slices)
             .expect("features");
-        filters(&mut writer, &mut random);
+        correct(&mut writer, &mut random);
         below = Some(model.reconstruct(role, &latents, context.as_deref(), &map));
     }
     writer.finish().expect("a stream that the format allows")
@@ -319,14 +346,61 @@ pub fn cases() -> Vec<Case> {
             stream(m, 4, &cube(5), (1, 3), 50, Extremes)
         });
         add("filtered".into(), true, &|m| {
-            filtered(m, 4, &sphere, (1, 3), 30, Small, Some((6, 20)))
+            let filter = Some((6, 20));
+            let residual = None;
+            coloured(
+                m,
+                4,
+                &sphere,
+                (1, 3),
+                30,
+                Small,
+                Corrections { filter, residual },
+            )
         });
         add("filtered-to-the-ends".into(), true, &|m| {
-            filtered(m, 5, &scattered(5, 90), (2, 4), 30, Small, Some((0, 127)))
+            let filter = Some((0, 127));
+            let residual = None;
+            coloured(
+                m,
+                5,
+                &scattered(5, 90),
+                (2, 4),
+                30,
+                Small,
+                Corrections { filter, residual },
+            )
         });
-        let encoded = |cloud, m: &Model| {
+        add("residual".into(), true, &|m| {
+            let filter = Some((6, 20));
+            let residual = Some((20, 0.3));
+            coloured(
+                m,
+                4,
+                &sphere,
+                (1, 3),
+                30,
+                Small,
+                Corrections { filter, residual },
+            )
+        });
+        add("residual-to-the-ends".into(), true, &|m| {
+            let filter = None;
+            let residual = Some((1, 100.0));
+            coloured(
+                m,
+                5,
+                &scattered(5, 90),
+                (2, 4),
+                30,
+                Small,
+                Corrections { filter, residual },
+            )
+        });
+        let encoded = |cloud, m: &Model, residual: u8| {
             let options = Options {
                 slice_voxels: 60,
+                residual: NonZeroU8::new(residual),
                 ..Options::default()
             };
             encode(&cloud, m, &options, &mut Log::default())
@@ -334,10 +408,13 @@ pub fn cases() -> Vec<Case> {
                 .bytes
         };
         add("encoded-sphere".into(), false, &|m| {
-            encoded(Ball::new(5, 7.5).cloud(), m)
+            encoded(Ball::new(5, 7.5).cloud(), m, 0)
+        });
+        add("encoded-sphere-with-residual".into(), false, &|m| {
+            encoded(Ball::new(5, 7.5).cloud(), m, 8)
         });
         add("encoded-scatter".into(), false, &|m| {
-            encoded(cloud_of(7, scattered(7, 60)), m)
+            encoded(cloud_of(7, scattered(7, 60)), m, 0)
         });
     }
     cases

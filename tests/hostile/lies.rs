@@ -2,11 +2,12 @@
 
 use b2p::Limits;
 use b2p::bitstream::Header;
-use b2p::gaussians::ColourFilter;
+use b2p::bitstream::Stream;
+use b2p::gaussians::{ColourFilter, ColourResidual};
 use b2p::network::Heads;
 use rayon::prelude::*;
 
-use crate::common::{small_stream, with_filter};
+use crate::common::{small_stream, with_filter, with_residual};
 use crate::seal::{FIXED, chunks, header_end, seal};
 use crate::{decoded, model, pushed};
 
@@ -165,5 +166,45 @@ fn a_colour_filter_of_another_length_or_exponent_is_refused_and_the_level_before
             "{error}"
         );
         assert_eq!(decoded(&model, &bytes, Some(top - 1)), before);
+    }
+}
+
+#[test]
+fn a_colour_residual_without_step_or_with_another_code_is_refused_and_the_level_before_stays() {
+    let (model, whole) = (model(), small_stream(&model()));
+    let stream = Stream::parse(&whole, &Limits::default()).unwrap();
+    let top = stream.levels().last().unwrap();
+    let slice = stream.header().slice_voxels as usize;
+    let count = top.voxels as usize;
+    let keys: Vec<u64> = (0..count as u64).collect();
+    let missing: Vec<_> = (0..count).map(|i| [(i % 7) as f32 / 9.0; 3]).collect();
+    let sound = ColourResidual::of(&missing, &keys, slice, 3).to_payloads();
+    assert!(sound.len() > 2, "several slices");
+    let level = Some(top.level);
+    assert!(decoded(&model, &with_residual(&whole, &sound), level).is_ok());
+    let before = decoded(&model, &whole, Some(top.level - 1));
+    let flipped = [&sound[1][..9], &[!sound[1][9]], &sound[1][10..]].concat();
+    for (wrong, told) in [
+        (vec![], "step of the colour residual"),
+        (
+            [&[0], &sound[1][1..]].concat(),
+            "step of the colour residual",
+        ),
+        (sound[1][..4].to_vec(), "length of the slice"),
+        ([&sound[1][..], &[7; 4]].concat(), "last symbol"),
+        (flipped, "last symbol"),
+    ] {
+        let mut slices = sound.clone();
+        // What is wrong later does not show.
+        slices[2].clear();
+        slices[1] = wrong;
+        let bytes = with_residual(&whole, &slices);
+        let error = decoded(&model, &bytes, level).unwrap_err();
+        let named = error.contains("Malformed") && error.contains(told);
+        assert!(
+            named && place(&error).is_some_and(|at| at < bytes.len()),
+            "{error}"
+        );
+        assert_eq!(decoded(&model, &bytes, Some(top.level - 1)), before);
     }
 }
