@@ -3,7 +3,7 @@
     python3 docs/rd.py --data FOLDER [--models NAME=FILE …]   measures these models, and TMC13 if that has not been yet; then does the rest
     python3 docs/rd.py                                        from docs/rd.json: the tables between the marks of README.md and docs/MEASUREMENTS.md, and docs/rd.svg
 
-FOLDER holds `val/*.glb`, and TMC13's decoded clouds in `gpcc/`. B2P_LAB names a `b2p-lab` that is built already.
+FOLDER holds `val/*.glb`, and TMC13's decoded clouds in `gpcc/`. B2P and B2P_LAB name a `b2p` and a `b2p-lab` that are built already.
 """
 
 import argparse
@@ -23,8 +23,10 @@ PEERS = {
     "person_Asian_F_3_Casual": {"s0.25_q34": 0.1005, "s0.25_q28": 0.1400, "s0.5_q34": 0.2975, "s0.5_q28": 0.4092},
     "person_Hispanic_M_3_Milit": {"s0.25_q34": 0.0944, "s0.25_q28": 0.1571, "s0.5_q34": 0.2775, "s0.5_q28": 0.4457},
 }
-MODELS = {name: f"models/{name}.safetensors" for name in ("lite", "lite-low", "lite-least")} | {"lite-quick": "models/lite.safetensors"}
+MODELS = {name: f"models/{name}.safetensors" for name in ("lite", "lite-low", "lite-least")} | {"lite-quick": "models/lite.safetensors", "lite-residual": "models/lite.safetensors"}
 QUICK = "-quick"  # ends the name of a model whose quick heads are measured
+RESIDUAL = "-residual"  # of a model whose streams have colour residuals, of these steps of luma
+STEPS = (96, 48, 24)
 COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce", "#be185d"]
 PEER, PEER_COLOUR = "TMC13", "#6b7280"
 SCORES = {"psnr": "PSNR", "foreground_psnr": "foreground PSNR", "ms_ssim": "MS-SSIM", "ssimulacra2": "SSIMULACRA2"}
@@ -34,9 +36,14 @@ SCORES = {"psnr": "PSNR", "foreground_psnr": "foreground PSNR", "ms_ssim": "MS-S
 # Measuring
 
 
-def lab(*args):
-    program = [os.environ["B2P_LAB"]] if "B2P_LAB" in os.environ else ["cargo", "run", "--release", "--quiet", "-p", "b2p-lab", "--"]
+def run(package, *args):
+    built = os.environ.get(package.upper().replace("-", "_"))
+    program = [built] if built else ["cargo", "run", "--release", "--quiet", "-p", package, "--"]
     subprocess.run([*program, *map(str, args)], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+
+
+def lab(*args):
+    run("b2p-lab", *args)
 
 
 def evaluate(mesh, cloud, out, *args):
@@ -52,11 +59,19 @@ def measure(data, models, peers):
             cloud = folder / "cloud.ply"
             lab("voxelize", mesh, "-o", cloud)
             for model, path in models.items():
-                heads = "quick" if model.endswith(QUICK) else "best"
-                for row in evaluate(mesh, cloud, folder / model, "--model", ROOT / path, "--heads", heads):
+                args = ["--model", ROOT / path, "--heads", "quick" if model.endswith(QUICK) else "best"]
+                if model.endswith(RESIDUAL):
+                    for step in STEPS:
+                        run("b2p", "encode", cloud, "-o", folder / f"{step}.b2p", "--model", ROOT / path, "--residual", step)
+                    args += ["--levels", "9", *(f"{step}={folder / f'{step}.b2p'}" for step in STEPS)]
+                for row in evaluate(mesh, cloud, folder / model, *args):
+                    if model.endswith(RESIDUAL) and row["name"] not in map(str, STEPS):
+                        continue  # the cloud, coded without one, is among them
                     parts = {part["level"]: part for part in row["rate"]["levels"]}
                     rows.append({"object": name, "series": model, "level": row["level"], "rate": row["rate"]["total"],
                                  "geometry": sum(p["geometry"] for p in parts.values()), **row["scores"]})
+                    if model.endswith(RESIDUAL):
+                        rows[-1]["step"] = row["name"]
             items = [f"{item}={data}/gpcc/{name}_{item}.ply.zst@{rate}" for item, rate in PEERS.get(name, {}).items() if peers]
             best = {}
             for row in evaluate(mesh, cloud, folder / "peer", *items) if items else []:
@@ -84,21 +99,27 @@ def envelope(rows, score):
     return out
 
 
-def mean_between(curve, low, high, steps=1000):
-    """The mean of a piecewise linear curve of (x, y), x rising."""
+def along(curve, low, high, steps=1000):
+    """A piecewise linear curve of (x, y), x rising, at so many places from `low` to `high`."""
     def at(x):
         for (x0, y0), (x1, y1) in zip(curve, curve[1:]):
             if x <= x1:
                 return y0 + (y1 - y0) * (x - x0) / (x1 - x0)
         return curve[-1][1]
-    return sum(at(low + (high - low) * (i + 0.5) / steps) for i in range(steps)) / steps
+    return [at(low + (high - low) * (i + 0.5) / steps) for i in range(steps)]
+
+
+def mean_between(curve, low, high):
+    both = along(curve, low, high)
+    return sum(both) / len(both)
 
 
 def bjontegaard(ours, peers, score):
-    """(mean difference of the score at equal rates, rates it was taken over, mean change of the rate at equal scores; None without overlap)."""
+    """(mean and least difference of the score at equal rates, rates they were taken over, mean change of the rate at equal scores; None without overlap)."""
     a, b = envelope(ours, score), envelope(peers, score)
     low, high = max(a[0][0], b[0][0]), min(a[-1][0], b[-1][0])
-    gain = mean_between(a, low, high) - mean_between(b, low, high) if low < high else None
+    gains = [x - y for x, y in zip(along(a, low, high), along(b, low, high))] if low < high else None
+    gain = gains and (sum(gains) / len(gains), min(gains))
     turn = lambda curve: [(y, x) for x, y in curve]
     least, most = max(a[0][1], b[0][1]), min(a[-1][1], b[-1][1])
     saved = math.expm1(mean_between(turn(a), least, most) - mean_between(turn(b), least, most)) if least < most else None
@@ -113,7 +134,9 @@ def table(rows):
     out = ["| | bits/point | PSNR | foreground PSNR | MS-SSIM | SSIMULACRA2 |", "|---|---:|---:|---:|---:|---:|"]
     for name, title in OBJECTS.items():
         for i, r in enumerate(sorted((r for r in rows if r["object"] == name), key=lambda r: (r["series"] == PEER, r["rate"]))):
-            what = f"{PEER} level {r['level']}, QP {r['quality']}" if r["series"] == PEER else f"`{r['series']}` level {r['level']}"
+            what = f"`{r['series'].removesuffix(RESIDUAL)}` level {r['level']}" + (f", residual {r['step']}" if "step" in r else "")
+            if r["series"] == PEER:
+                what = f"{PEER} level {r['level']}, QP {r['quality']}"
             head = f"**{title}**, " if i == 0 else ""
             out.append(f"| {head}{what} | {r['rate']:.3f} | {r['psnr']:.2f} | {r['foreground_psnr']:.2f} | {r['ms_ssim']:.4f} | {r['ssimulacra2']:.1f} |")
     return out
@@ -131,12 +154,13 @@ def summary(rows):
 
 
 def differences(rows):
-    out = ["| at equal rates, ours less TMC13's | " + " | ".join(SCORES.values()) + " | bits saved at equal PSNR |", "|---|" + "---:|" * (len(SCORES) + 1)]
+    out = ["| at equal rates, ours less TMC13's, on average | " + " | ".join(SCORES.values()) + " | bits saved at equal PSNR |", "|---|" + "---:|" * (len(SCORES) + 1)]
     for name in PEERS:
         ours, peers = ([r for r in rows if r["object"] == name and (r["series"] == PEER) == is_peer] for is_peer in (False, True))
         gains = [bjontegaard(ours, peers, score) for score in SCORES]
         (low, high), saved = gains[0][1], gains[0][2]
-        cells = ["—" if g is None else f"{g:+.2f} dB" if "psnr" in score else f"{g:+.4f}" if score == "ms_ssim" else f"{g:+.1f}" for score, (g, _, _) in zip(SCORES, gains)]
+        digits = lambda score: ".2f" if "psnr" in score else ".4f" if score == "ms_ssim" else ".1f"
+        cells = ["—" if g is None else f"{g[0]:+{digits(score)}}, at least {g[1]:{digits(score)}}" for score, (g, _, _) in zip(SCORES, gains)]
         out.append(f"| {OBJECTS[name]}, {low:.2f} to {high:.2f} bits/point | " + " | ".join(cells) + f" | {'no equal PSNR' if saved is None else f'{-100 * saved:.0f} %'} |")
     return out
 
@@ -145,14 +169,14 @@ def panel(x0, y0, title, rows, score, colours):
     width, height = 340, 240
     values = [r[score] for r in rows]
     low, high = min(values) - 0.5, max(values) + 0.5
-    x = lambda r: x0 + (r - 0.05) / 0.5 * width
+    x = lambda r: x0 + (r - 0.05) / 0.75 * width
     y = lambda v: y0 + height - (v - low) / (high - low) * height
     out = [f'<text x="{x0}" y="{y0 - 12}" font-weight="bold">{title}</text>', f'<rect x="{x0}" y="{y0}" width="{width}" height="{height}" fill="none" stroke="#d1d5db"/>']
-    out += [f'<text x="{x(r)}" y="{y0 + height + 16}" text-anchor="middle">{r}</text>' for r in (0.1, 0.2, 0.3, 0.4, 0.5)]
+    out += [f'<text x="{x(r)}" y="{y0 + height + 16}" text-anchor="middle">{r}</text>' for r in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)]
     for v in range(int(low) + 1, int(high) + 1, 2):
         out.append(f'<path d="M{x0} {y(v):.1f}h{width}" stroke="#e5e7eb"/><text x="{x0 - 6}" y="{y(v) + 4:.1f}" text-anchor="end">{v}</text>')
     for series, colour in colours.items():
-        own = sorted((r["rate"], r[score], r["level"]) for r in rows if r["series"] == series)
+        own = sorted((r["rate"], r[score], r.get("step", r["level"])) for r in rows if r["series"] == series)
         if own:
             path = "L".join(f"{x(r):.1f} {y(v):.1f}" for r, v, _ in own)
             out.append(f'<path d="M{path}" fill="none" stroke="{colour}" stroke-width="2"/>')
@@ -169,8 +193,8 @@ def plot(rows):
             body += panel(50 + column * 410, 40 + line * 310, f"{OBJECTS[name]}: {SCORES[score]}, dB", own, score, colours)
     for i, (name, colour) in enumerate(colours.items()):
         body.append(f'<text x="{50 + 100 * i}" y="654" fill="{colour}" font-weight="bold">{name}</text>')
-    body.append(f'<text x="{50 + 100 * len(colours)}" y="654">bits per input point, geometry included; numbers are octree levels</text>')
-    head = '<svg xmlns="http://www.w3.org/2000/svg" width="870" height="668" font-family="sans-serif" font-size="12">'
+    body.append(f'<text x="50" y="674">bits per input point, geometry included; numbers are octree levels, or steps of residuals at level 9</text>')
+    head = '<svg xmlns="http://www.w3.org/2000/svg" width="870" height="688" font-family="sans-serif" font-size="12">'
     return f'{head}<rect width="100%" height="100%" fill="white"/>{"".join(body)}</svg>\n'
 
 

@@ -6,8 +6,6 @@ use b2p::bitstream::{Header, Stream, Writer};
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Encoded, Options, encode};
-use std::num::NonZeroU8;
-
 use b2p::gaussians::{ColourFilter, ColourResidual, Gaussians};
 use b2p::geometry::Octree;
 use b2p::log::Log;
@@ -15,7 +13,7 @@ use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::pixels::{Background, render};
 use b2p::projection::Camera;
 use b2p::{Error, Limits, Placement};
-use common::{Ball, cloud_of, tiny_model, with_filter, with_residual};
+use common::{Ball, cloud_of, steps, tiny_model, with_filter, with_residual};
 
 fn model() -> Model {
     Model::from_bytes(&tiny_model(0)).expect("an untrained model loads")
@@ -437,7 +435,7 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
     let encoded = |filter: bool, residual: Option<u8>| {
         let options = Options {
             filter,
-            residual: residual.and_then(NonZeroU8::new),
+            residual: residual.map(steps),
             ..Options::default()
         };
         encode(&cloud, &model, &options, &mut Log::default()).unwrap()
@@ -496,7 +494,7 @@ fn quick_heads_are_corrected_by_the_same_residual() {
     // A tenth less of everything.
     let missing = vec![[-0.1; 3]; keys.len()];
     let slice = options.slice_voxels as usize;
-    let residual = ColourResidual::of(&missing, &keys, slice, 1).to_payloads();
+    let residual = ColourResidual::of(&missing, &keys, slice, steps(1)).to_payloads();
     let bytes = with_residual(&plain.bytes, &residual);
     for heads in Heads::ALL {
         let decoder = Decoder::new(&model).with_heads(heads).unwrap();

@@ -2,7 +2,6 @@
 
 mod common;
 
-use std::num::NonZeroU8;
 use std::sync::Mutex;
 
 use b2p::bitstream::Header;
@@ -15,7 +14,7 @@ use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::pixels::{Background, Channel, Choice, Effects, Ids, Image, Renderer, render};
 use b2p::projection::Camera;
 use b2p::{Error, Limits};
-use common::{Ball, cloud_of};
+use common::{Ball, cloud_of, steps};
 use peak_alloc::PeakAlloc;
 
 #[global_allocator]
@@ -71,7 +70,7 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
         let decoders: Vec<_> = model.shape().heads().iter().map(with).collect();
         for (kind, cloud) in clouds() {
             let options = Options {
-                residual: NonZeroU8::new(4),
+                residual: Some(steps(4)),
                 ..Options::default()
             };
             let bytes = encode(&cloud, &model, &options, &mut Log::default())

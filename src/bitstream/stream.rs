@@ -295,7 +295,8 @@ fn take_residual<'a>(
     voxels: u32,
 ) -> Result<Vec<Slice<'a>>> {
     let mut slices = Vec::new();
-    if chunks.peek()?.is_none() {
+    let next = chunks.peek()?;
+    if next.is_none_or(|next| next.kind != ChunkKind::Residual) {
         return Ok(slices);
     }
     for (slice, count) in sliced(voxels.into(), slice_voxels) {

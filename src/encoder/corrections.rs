@@ -1,7 +1,5 @@
 //! What a stream says of the colours that its heads generate: filters, and what is left after them.
 
-use std::num::NonZeroU8;
-
 use super::{Options, colours, pooled};
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
@@ -71,10 +69,10 @@ pub(super) fn corrections(
             }
             found.filters.extend(filter.map(|filter| (heads, filter)));
         }
-        if let Some(step) = left.map(NonZeroU8::get) {
+        if let Some(steps) = left {
             let missing = missing(&gaussians, &wanted, at.children);
             let slice = options.slice_voxels as usize;
-            let residual = ColourResidual::of(&missing, voxels.keys(), slice, step);
+            let residual = ColourResidual::of(&missing, voxels.keys(), slice, steps);
             found.residual = Some(residual);
         }
     }

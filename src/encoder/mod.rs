@@ -3,7 +3,6 @@
 mod colours;
 mod corrections;
 
-use std::num::NonZeroU8;
 use std::ops::RangeInclusive;
 
 use rayon::prelude::*;
@@ -13,6 +12,7 @@ use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
 use crate::entropy::{Condition, encode_level, encode_passes, latent_hash, quantise};
 use crate::error::{Error, Result};
+use crate::gaussians::Steps;
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -30,9 +30,9 @@ pub struct Options {
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
     /// [`ColourFilter`].
     pub filter: bool,
-    /// Code what the colours of the finest level that is drawn are still off those of the cloud, in steps of so many 255ths: see
+    /// Code what the colours of the finest level that is drawn are still off those of the cloud, in these steps: see
     /// [`ColourResidual`](crate::gaussians::ColourResidual). Default: not at all.
-    pub residual: Option<NonZeroU8>,
+    pub residual: Option<Steps>,
     /// Voxels per slice, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
 }

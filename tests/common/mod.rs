@@ -1,11 +1,13 @@
 //! Small objects and helpers that several test files share.
 #![allow(dead_code)] // each test file uses its part
 
+use std::num::NonZeroU8;
 use std::path::Path;
 
 use b2p::bitstream::{Stream, Writer};
 use b2p::cloud::ColouredVoxels;
 use b2p::encoder::{Options, encode};
+use b2p::gaussians::Steps;
 use b2p::geometry::{Voxels, morton};
 use b2p::log::Log;
 use b2p::network::{Heads, Model};
@@ -128,6 +130,15 @@ pub fn with_residual(bytes: &[u8], slices: &[Vec<u8>]) -> Vec<u8> {
         let written = writer.residual(top, slices);
         written.expect("a level of the stream, and its slices");
     })
+}
+
+/// The same step for luma and chromas.
+pub fn steps(step: u8) -> Steps {
+    let step = NonZeroU8::new(step).expect("a step");
+    Steps {
+        luma: step,
+        chroma: step,
+    }
 }
 
 /// The same stream with what `add` adds to its last level, and without what levels said of their colours.

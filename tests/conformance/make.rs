@@ -4,14 +4,12 @@ use b2p::Placement;
 use b2p::bitstream::{Header, Writer};
 use b2p::encoder::{Options, encode};
 use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
-use std::num::NonZeroU8;
-
-use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual};
+use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual, Steps};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
 use b2p::network::Model;
 
-use crate::common::{Ball, cloud_of};
+use crate::common::{Ball, cloud_of, steps};
 use crate::models::model;
 use crate::seal;
 
@@ -94,8 +92,8 @@ fn stream(
 struct Corrections {
     /// Filters for both sets of heads, of this exponent and weights up to as much.
     filter: Option<(u8, i8)>,
-    /// In this step, what is up to so much in each channel.
-    residual: Option<(u8, f32)>,
+    /// In these steps of luma and chroma, what is up to so much in each channel.
+    residual: Option<([u8; 2], f32)>,
 }
 
 /// The same, and all its levels correct colours.
@@ -154,11 +152,15 @@ fn coloured(
                 let payload = ColourFilter { exponent, weights }.to_bytes();
                 writer.filter(level, set, &payload).expect("a filter");
             }
-            if let Some((step, most)) = corrections.residual {
+            if let Some((own, most)) = corrections.residual {
+                let own = Steps {
+                    luma: steps(own[0]).luma,
+                    chroma: steps(own[1]).chroma,
+                };
                 let keys = octree.level(level).keys();
                 let mut draw = || most * (random.below(1 << 20) as f32 / (1 << 19) as f32 - 1.0);
                 let missing: Vec<_> = keys.iter().map(|_| [draw(), draw(), draw()]).collect();
-                let residual = ColourResidual::of(&missing, keys, slice as usize, step);
+                let residual = ColourResidual::of(&missing, keys, slice as usize, own);
                 let written = writer.residual(level, &residual.to_payloads());
                 written.expect("a residual");
             }
@@ -373,7 +375,7 @@ pub fn cases() -> Vec<Case> {
         });
         add("residual".into(), true, &|m| {
             let filter = Some((6, 20));
-            let residual = Some((20, 0.3));
+            let residual = Some(([20, 9], 0.3));
             coloured(
                 m,
                 4,
@@ -386,7 +388,7 @@ pub fn cases() -> Vec<Case> {
         });
         add("residual-to-the-ends".into(), true, &|m| {
             let filter = None;
-            let residual = Some((1, 100.0));
+            let residual = Some(([1, 2], 100.0));
             coloured(
                 m,
                 5,
@@ -400,7 +402,7 @@ pub fn cases() -> Vec<Case> {
         let encoded = |cloud, m: &Model, residual: u8| {
             let options = Options {
                 slice_voxels: 60,
-                residual: NonZeroU8::new(residual),
+                residual: (residual > 0).then(|| steps(residual)),
                 ..Options::default()
             };
             encode(&cloud, m, &options, &mut Log::default())
