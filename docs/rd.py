@@ -153,6 +153,17 @@ def summary(rows):
     return out
 
 
+def residuals(rows):
+    """As `summary`, of level 9 of one model, without and with residuals."""
+    own = [r for r in rows if r["level"] == 9 and r["series"].removesuffix(RESIDUAL) == "lite"]
+    out = ["| bits/point: PSNR / foreground | none | " + " | ".join(f"`{step}`" for step in STEPS) + " |", "|---|" + "---:|" * (1 + len(STEPS))]
+    for name, title in OBJECTS.items():
+        found = {r.get("step"): r for r in own if r["object"] == name}
+        cells = [f"{r['rate']:.3f}: {r['psnr']:.2f} / {r['foreground_psnr']:.2f}" for r in (found[step] for step in (None, *map(str, STEPS)))]
+        out.append(f"| {title} | " + " | ".join(cells) + " |")
+    return out
+
+
 def differences(rows):
     out = ["| at equal rates, ours less TMC13's, on average | " + " | ".join(SCORES.values()) + " | bits saved at equal PSNR |", "|---|" + "---:|" * (len(SCORES) + 1)]
     for name in PEERS:
@@ -211,7 +222,7 @@ def main():
         rows = kept + measure(args.data.resolve(), models, not any(row["series"] == PEER for row in kept))
         measured.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     rows = json.loads(measured.read_text())
-    for path, mark, lines in ((ROOT / "README.md", "rd", [*summary(rows), "", *differences(rows)]), (HERE / "MEASUREMENTS.md", "rd-all", table(rows))):
+    for path, mark, lines in ((ROOT / "README.md", "rd", [*summary(rows), "", *differences(rows)]), (ROOT / "README.md", "rd-residual", residuals(rows)), (HERE / "MEASUREMENTS.md", "rd-all", table(rows))):
         text = "\n".join(lines)
         path.write_text(re.sub(rf"(<!-- {mark} -->\n).*?(\n<!-- /{mark} -->)", lambda m: m[1] + "\n" + text + "\n" + m[2], path.read_text(), flags=re.S))
     (HERE / "rd.svg").write_text(plot(rows))
