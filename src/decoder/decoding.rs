@@ -331,16 +331,6 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
             let parse = |payload| ColourFilter::parse(payload, level.level);
             *filter = payload.as_ref().map(parse).transpose()?;
         }
-        let slice = header.slice_voxels as usize;
-        let residual = match level.residual.is_empty() {
-            true => None,
-            false => {
-                let (name, count) = (format!("residual of level {}", level.level), level.voxels);
-                log.step(name, count as usize, "voxels", || {
-                    ColourResidual::parse(&level.residual, slice, level.level)
-                })?
-            }
-        };
         let mut octree = match &mut self.reached {
             Some(above) => std::mem::replace(&mut above.exact.octree, Octree::root()),
             None => Octree::root(),
@@ -349,9 +339,10 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
         let mut pool = self.take_pool();
         let decoder = &self.decoder;
         let done = decoder.exact_level(&mut pool, header, &level, &mut octree, above, log);
+        let done = done.and_then(|exact| Ok((exact, residual(header, &level, log)?)));
         self.return_pool(pool);
         match (done, &mut self.reached) {
-            (Ok((latents, features, map)), reached) => {
+            (Ok(((latents, features, map), residual)), reached) => {
                 let read = filters.iter().any(Option::is_some);
                 let above = reached.take().map(|above| above.map);
                 *reached = Some(Reached {
@@ -376,6 +367,18 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
             }
         }
     }
+}
+
+/// What a level says that its colours are still off.
+fn residual(header: &Header, level: &Level, log: &mut Log) -> Result<Option<ColourResidual>> {
+    if level.residual.is_empty() {
+        return Ok(None);
+    }
+    let (n, slice) = (level.level, header.slice_voxels as usize);
+    let voxels = level.voxels as usize;
+    log.step(format!("residual of level {n}"), voxels, "voxels", || {
+        ColourResidual::parse(&level.residual, slice, n)
+    })
 }
 
 fn nothing_reached() -> Error {

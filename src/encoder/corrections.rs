@@ -83,11 +83,14 @@ pub(super) fn corrections(
 fn missing(gaussians: &Gaussians, wanted: &[[f32; 3]], children: usize) -> Vec<[f32; 3]> {
     let voxel = |first: usize| {
         let (mut sum, mut weights) = ([0.0; 3], 0.0);
-        for i in first..first + children {
-            let weight = gaussians.opacity[i];
+        let own = first..first + children;
+        let colours = gaussians.colour[own.clone()]
+            .iter()
+            .zip(&wanted[own.clone()]);
+        for (weight, (own, wanted)) in gaussians.opacity[own].iter().zip(colours) {
             weights += weight;
-            for (c, sum) in sum.iter_mut().enumerate() {
-                *sum += weight * (wanted[i][c] - gaussians.colour[i][c]);
+            for (sum, (own, wanted)) in sum.iter_mut().zip(own.iter().zip(wanted)) {
+                *sum += weight * (wanted - own);
             }
         }
         sum.map(|sum| if weights > 0.0 { sum / weights } else { 0.0 })

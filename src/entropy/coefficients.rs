@@ -293,7 +293,7 @@ mod tests {
     fn what_is_likelier_after_what_came_takes_fewer_bits_than_its_histogram_says() {
         // Calm for long, then lively for long: an order-0 code would have to average.
         let mut random = Random(3);
-        let mut draw = |odds: u64| i16::from(random.next() % odds == 0);
+        let mut draw = |odds: u64| i16::from(random.next().is_multiple_of(odds));
         let triples: Vec<[i16; 3]> = (0..16_000)
             .map(|i| if i / 2000 % 2 == 0 { 400 } else { 3 })
             .map(|odds| [draw(odds), draw(odds), draw(odds)])

@@ -21,7 +21,7 @@
 //! | 1 | u8 | step of both chromas, 1 to 255 |
 //! | 2 | | coefficients, a triple for each voxel: first the first voxel's, then those of voxels that join at higher bits before those at lower ones, of one bit in order |
 //!
-//! A coefficient q of step s stands for q·s/255. The three are those of a luma and two chromas, whose vectors are [`BASIS`]; a voxel's sum of the three, in turn, is added to the colour of
+//! A coefficient q of step s stands for q·(s/255). The three are those of a luma and two chromas, whose vectors are [`BASIS`]; a voxel's sum of the three, in turn, is added to the colour of
 //! each of its Gaussians, which then is clamped to `[0, 1]`. All in f32: equal streams give equal bits on every machine.
 
 use std::num::NonZeroU8;
@@ -42,7 +42,7 @@ pub const BASIS: [[f32; 3]; 3] = [
     [0.707_106_77, 0.0, -0.707_106_77],
     [-0.408_248_3, 0.816_496_6, -0.408_248_3],
 ];
-/// A coefficient of so many steps or more, its fraction left out of it, is rounded up.
+/// The fraction of a step from which a magnitude is rounded up: what is near zero costs least.
 #[cfg(feature = "encoder")]
 const ROUND_UP: f32 = 0.67;
 
@@ -338,10 +338,9 @@ mod tests {
                 let (v, w) = (j - left, next.unwrap_or(keys.len()) - j);
                 let root = |n: usize| (n as f64 / (v + w) as f64).sqrt();
                 let (a, c) = (root(v), root(w));
-                for k in 0..3 {
-                    let (low, high) = (x[left][k], x[j][k]);
-                    (x[left][k], x[j][k]) = (a * low + c * high, a * high - c * low);
-                }
+                let (low, high) = (x[left], x[j]);
+                x[left] = std::array::from_fn(|k| a * low[k] + c * high[k]);
+                x[j] = std::array::from_fn(|k| a * high[k] - c * low[k]);
             }
             order.splice(0..0, joining);
         }
@@ -430,7 +429,7 @@ mod tests {
             payloads.iter().zip(missing.chunks(64)).zip(keys.chunks(64))
         {
             let alone = ColourResidual::of(missing, keys, 64, steps(12, 7));
-            assert_eq!(alone.to_payloads(), [payload.clone()]);
+            assert_eq!(alone.to_payloads(), std::slice::from_ref(payload));
         }
     }
 

@@ -137,6 +137,39 @@ fn a_cloud_becomes_a_stream_gaussians_and_pictures() {
 }
 
 #[test]
+fn a_residual_is_coded_as_finely_as_asked_for_and_told_by_info() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    let bytes = |residual: &[&str]| {
+        let encode = ["encode", "ball.ply", "-o", "ball.b2p"];
+        succeeds(at, &[&encode, residual].concat());
+        let info = succeeds(at, &["info", "ball.b2p", "--json"]);
+        let info: Value = serde_json::from_str(&info).expect("info prints JSON");
+        let of = |level: usize| info["levels"][level]["residual_bytes"].as_u64();
+        assert_eq!(
+            (of(0), of(1)),
+            (Some(0), Some(0)),
+            "coarser levels have none"
+        );
+        of(2).expect("the level is whole")
+    };
+    let none = bytes(&[]);
+    let [coarse, fine] = ["40", "5"].map(|step| bytes(&["--residual", step]));
+    let colourful = bytes(&["--residual", "40,1"]);
+    assert!(none == 0 && 0 < coarse && coarse < fine && coarse < colourful);
+    for wrong in ["0", "256", "40,", "40,0", "a few"] {
+        let encode = ["encode", "ball.ply", "-o", "x.b2p", "--residual", wrong];
+        let output = b2p(at, &encode);
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(
+            !output.status.success() && errors.contains("1 to 255"),
+            "{errors}"
+        );
+        assert!(!at.join("x.b2p").exists());
+    }
+}
+
+#[test]
 fn quick_heads_are_used_where_the_model_has_them() {
     let folder = folder_with_cloud();
     let at = folder.path();
