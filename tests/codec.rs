@@ -343,6 +343,26 @@ fn the_placement_of_the_cloud_comes_back_with_the_gaussians() {
 }
 
 #[test]
+fn a_dearer_bit_makes_a_shorter_stream_and_the_model_says_its_price_unless_the_user_does() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let bytes = |bit_price| {
+        let options = Options {
+            bit_price,
+            ..Options::default()
+        };
+        encode(&cloud, &model, &options, &mut Log::default())
+            .unwrap()
+            .bytes
+    };
+    assert_eq!(model.bit_price(), 0.0);
+    assert!(
+        bytes(None) == bytes(Some(0.0)),
+        "an untrained model has no price"
+    );
+    assert!(bytes(Some(0.5)).len() < bytes(Some(0.0)).len());
+}
+
+#[test]
 fn nothing_may_follow_the_last_level() {
     let model = model();
     let mut bytes = coded(&ball(5, 10.0), &model).bytes;

@@ -5,7 +5,6 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use b2p::Limits;
-use b2p::encoder::Options;
 use b2p::gaussians::Steps;
 use b2p::network::Heads;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -106,9 +105,9 @@ pub struct Encode {
     /// Octree levels whose features are coded, up to three, the last below N [default: N−3..N−1]
     #[arg(long, value_name = "L..M", value_parser = levels)]
     pub levels: Option<RangeInclusive<u8>>,
-    /// What a bit is worth when latents are rounded, in squared latent steps; 0 rounds to the nearest, more saves bits
-    #[arg(long, value_name = "X", default_value_t = Options::BIT_PRICE, value_parser = price)]
-    pub bit_price: f32,
+    /// What a bit is worth when latents are rounded, in squared latent steps; 0 rounds to the nearest, more saves bits [default: what the model says]
+    #[arg(long, value_name = "X", value_parser = price)]
+    pub bit_price: Option<f32>,
     /// Leave colours as the model makes them, which takes less time: otherwise each level tells in 58 bytes how to correct those of the cloud
     #[arg(long)]
     pub no_filter: bool,

@@ -25,8 +25,8 @@ pub struct Options {
     /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.
     pub levels: Option<RangeInclusive<u8>>,
     /// What a bit is worth when latents are rounded, in squared latent steps: see [`crate::entropy::quantise`]. 0 rounds to the nearest.
-    /// Bits are those that the level below predicts, whatever neighbours tell.
-    pub bit_price: f32,
+    /// Bits are those that the level below predicts, whatever neighbours tell. Default: what the model says, [`Model::bit_price`].
+    pub bit_price: Option<f32>,
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
     /// [`ColourFilter`].
     pub filter: bool,
@@ -37,16 +37,11 @@ pub struct Options {
     pub slice_voxels: u32,
 }
 
-impl Options {
-    /// Rounds to the nearest.
-    pub const BIT_PRICE: f32 = 0.0;
-}
-
 impl Default for Options {
     fn default() -> Self {
         Options {
             levels: None,
-            bit_price: Options::BIT_PRICE,
+            bit_price: None,
             filter: true,
             residual: None,
             slice_voxels: MAX_SLICE_VOXELS,
@@ -127,7 +122,7 @@ pub fn encode(
             condition,
             &model.squeeze(role, &own, context)?,
             model.shape().latent_max,
-            options.bit_price,
+            options.bit_price.unwrap_or(model.bit_price()),
         ))
     };
     let mut correct = |level: Level<'_>| corrections(cloud, model, options, level);

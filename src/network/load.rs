@@ -71,6 +71,30 @@ impl<'a> Tensors<'a> {
         Shape::from_json(json)
     }
 
+    /// What a bit is worth when latents are rounded, in squared latent steps, if the description says: 0 if it does not.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if it is no number from 0 to 100.
+    pub fn bit_price(&self) -> Result<f32> {
+        let json = self.contents.metadata.get("b2p").map_or("{}", |json| json);
+        let description: serde_json::Value = serde_json::from_str(json).unwrap_or_default();
+        let Some(said) = description.get("bit_price") else {
+            return Ok(0.0);
+        };
+        let price = said.as_f64().filter(|price| (0.0..=100.0).contains(price));
+        let price = price.ok_or_else(|| {
+            let (field, expected) = ("bit_price", "a number from 0 to 100");
+            Error::malformed(
+                Stage::Network,
+                "metadata",
+                field,
+                said.to_string(),
+                expected,
+            )
+        })?;
+        Ok(price as f32)
+    }
+
     /// Whether a tensor's name starts like that.
     pub fn any(&self, prefix: &str) -> bool {
         let mut names = self.contents.tensors.keys();

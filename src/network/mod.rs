@@ -38,6 +38,7 @@
 //! of the chain of residual blocks before layer 4 (what enters it, every branch, every sum), of the inside of each of its blocks, and
 //! of the same after layer 4. Where `gg` of the metadata has further generators that say `"heads": "quick"`, their layers are `gg.quick.r.*`
 //! ([`Heads`]). Tables: see [`crate::entropy::Tables`]. A file without `fc.*` and `fs.*` can decode only.
+//! The JSON may also say at which `bit_price` latents are best rounded.
 
 mod children;
 mod container;
@@ -91,6 +92,7 @@ pub struct Model {
     generators: Vec<Generator>,
     precision: Precision,
     encoder: Option<Encoder<FloatConv>>,
+    bit_price: f32,
     g_scale: Vec<f32>,
     c_scale: Vec<f32>,
 }
@@ -143,6 +145,7 @@ impl Model {
             g_scale,
             c_scale: scales(&tensors, "c_scale", ROLES, 1)?,
             id: tensors.id(&shape),
+            bit_price: tensors.bit_price()?,
             isa: Isa::detect(),
             tables,
             shape,
@@ -193,6 +196,11 @@ impl Model {
     /// The probability tables.
     pub fn tables(&self) -> &Tables {
         &self.tables
+    }
+
+    /// What a bit is best worth when this model's latents are rounded: see [`crate::entropy::quantise`].
+    pub fn bit_price(&self) -> f32 {
+        self.bit_price
     }
 
     /// Whether the file had the encoder's layers.

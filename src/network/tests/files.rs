@@ -392,3 +392,28 @@ fn a_model_is_the_same_from_a_file_and_from_memory() {
     std::fs::write(&path, b"").unwrap();
     assert!(matches!(Model::open(&path), Err(Error::Malformed { .. })));
 }
+
+#[test]
+fn what_a_bit_is_worth_is_for_the_model_to_say_and_changes_nothing_of_its_streams() {
+    let plain = File::tiny();
+    let id = Model::from_bytes(&plain.bytes()).unwrap().id();
+    let saying = |price: &str| {
+        let mut file = File::tiny();
+        file.json = file
+            .json
+            .replacen('{', &format!("{{\"bit_price\": {price}, "), 1);
+        Model::from_bytes(&file.bytes()).map(|model| (model.id(), model.bit_price()))
+    };
+    assert_eq!(Model::from_bytes(&plain.bytes()).unwrap().bit_price(), 0.0);
+    assert_eq!(saying("0.25").unwrap(), (id, 0.25));
+    assert_eq!(saying("100").unwrap(), (id, 100.0));
+    for wrong in ["-1", "101", "\"much\"", "null"] {
+        let error = saying(wrong).unwrap_err();
+        let text = error.to_string();
+        assert!(matches!(error, Error::Malformed { .. }), "{text}");
+        assert!(
+            text.contains("bit_price") && text.contains("0 to 100"),
+            "{text}"
+        );
+    }
+}
