@@ -39,7 +39,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let counts = || header.voxels[..levels].iter().copied().map(u64::from);
         let octree =
             NODE * (counts().sum::<u64>() + u64::from(header.base) * counts().min().unwrap_or(0));
-        let features = 2 * (c + k) + MAP;
+        let features = 2 * (c + k) + MAP + RESIDUAL;
         // Of all levels the last is the largest.
         let parents = counts().nth_back(1).unwrap_or(0);
         let voxels = counts().next_back().unwrap_or(0);
