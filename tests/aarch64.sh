@@ -75,7 +75,7 @@ told=$(mktemp -d)
 trap 'rm -rf "$told"' EXIT
 suite --no-run
 kernels --no-run
-# All at once: alone, none keeps two cores busy.
+# All at once.
 for processor in $processors; do
     try "$processor" > "$told/$processor" 2>&1 && touch "$told/$processor.passed" &
 done

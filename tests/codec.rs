@@ -343,7 +343,7 @@ fn the_placement_of_the_cloud_comes_back_with_the_gaussians() {
 }
 
 #[test]
-fn a_dearer_bit_makes_a_shorter_stream_and_the_model_says_its_price_unless_the_user_does() {
+fn a_dearer_bit_makes_a_shorter_stream_and_costs_nothing_where_nobody_says() {
     let (model, cloud) = (model(), ball(7, 45.0));
     let bytes = |bit_price| {
         let options = Options {

@@ -5,7 +5,7 @@ mod common;
 use b2p::Limits;
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
-use b2p::encoder::{Options, encode};
+use b2p::encoder::{Encoded, Options, encode};
 use b2p::gaussians::{ColourFilter, ColourResidual, Gaussians};
 use b2p::log::Log;
 use b2p::network::{Heads, Model, Shape, untrained};
@@ -19,6 +19,18 @@ fn model() -> Model {
 
 fn ball(bits: u8, radius: f32) -> ColouredVoxels {
     Ball::new(bits, radius).cloud()
+}
+
+/// A model with both sets of heads, and a stream of it that says nothing of its colours.
+fn plain_with_both_heads() -> (Model, Encoded) {
+    let shape = Shape::tiny().with_quick_heads();
+    let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
+    let options = Options {
+        filter: false,
+        ..Options::default()
+    };
+    let plain = encode(&ball(6, 20.0), &model, &options, &mut Log::default()).unwrap();
+    (model, plain)
 }
 
 #[test]
@@ -62,13 +74,7 @@ fn filters_bring_the_colours_of_gaussians_nearer_to_the_cloud_s_and_change_nothi
 
 #[test]
 fn a_filter_for_one_set_of_heads_leaves_the_other_s_colours_as_they_are() {
-    let shape = Shape::tiny().with_quick_heads();
-    let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
-    let options = Options {
-        filter: false,
-        ..Options::default()
-    };
-    let plain = encode(&ball(6, 20.0), &model, &options, &mut Log::default()).unwrap();
+    let (model, plain) = plain_with_both_heads();
     let mut filter = ColourFilter {
         exponent: 0,
         weights: [[0; _]; 3],
@@ -144,19 +150,13 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
 
 #[test]
 fn quick_heads_are_corrected_by_the_same_residual() {
-    let shape = Shape::tiny().with_quick_heads();
-    let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
-    let options = Options {
-        filter: false,
-        ..Options::default()
-    };
-    let plain = encode(&ball(6, 20.0), &model, &options, &mut Log::default()).unwrap();
+    let (model, plain) = plain_with_both_heads();
     let level = plain.rates.last().unwrap().level;
     let octree = Decoder::new(&model).exact(&plain.bytes, level, &mut Log::default());
     let keys = octree.unwrap().octree.level(level).keys().to_vec();
     // A tenth less of everything.
     let missing = vec![[-0.1; 3]; keys.len()];
-    let slice = options.slice_voxels as usize;
+    let slice = Options::default().slice_voxels as usize;
     let residual = ColourResidual::of(&missing, &keys, slice, steps(1)).to_payloads();
     let bytes = with_residual(&plain.bytes, &residual);
     for heads in Heads::ALL {

@@ -1,13 +1,17 @@
 //! The sample and the model that ship: what every user decodes first.
 
+mod common;
+
 use b2p::decoder::Decoder;
 use b2p::embedded::{MODEL, SAMPLE};
+use b2p::encoder::{Options, encode};
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
 use b2p::network::{Model, Precision};
 use b2p::pixels::{Background, render};
 use b2p::projection::Camera;
 use b2p::{Isa, Limits};
+use common::Ball;
 
 fn model() -> Model {
     Model::from_bytes(MODEL).expect("the model inside the program loads")
@@ -26,6 +30,22 @@ fn bits(g: &Gaussians) -> Vec<u32> {
     let numbers = numbers.chain(g.rotation.as_flattened()).chain(&g.opacity);
     let numbers = numbers.chain(g.colour.as_flattened());
     numbers.map(|x| x.to_bits()).collect()
+}
+
+#[test]
+fn latents_are_rounded_at_the_price_that_the_model_says_unless_the_user_says_another() {
+    let (model, cloud) = (model(), Ball::new(7, 45.0).cloud());
+    let bytes = |bit_price| {
+        let options = Options {
+            bit_price,
+            ..Options::default()
+        };
+        let encoded = encode(&cloud, &model, &options, &mut Log::default());
+        encoded.expect("the model encodes").bytes
+    };
+    assert!(model.bit_price() > 0.0);
+    assert!(bytes(None) == bytes(Some(model.bit_price())));
+    assert!(bytes(None).len() < bytes(Some(0.0)).len());
 }
 
 #[test]

@@ -347,57 +347,25 @@ pub fn cases() -> Vec<Case> {
         add("extremes".into(), true, &|m| {
             stream(m, 4, &cube(5), (1, 3), 50, Extremes)
         });
+        let sphere_saying = |m: &Model, filter, residual| {
+            let corrections = Corrections { filter, residual };
+            coloured(m, 4, &sphere, (1, 3), 30, Small, corrections)
+        };
+        let scatter_saying = |m: &Model, filter, residual| {
+            let corrections = Corrections { filter, residual };
+            coloured(m, 5, &scattered(5, 90), (2, 4), 30, Small, corrections)
+        };
         add("filtered".into(), true, &|m| {
-            let filter = Some((6, 20));
-            let residual = None;
-            coloured(
-                m,
-                4,
-                &sphere,
-                (1, 3),
-                30,
-                Small,
-                Corrections { filter, residual },
-            )
+            sphere_saying(m, Some((6, 20)), None)
         });
         add("filtered-to-the-ends".into(), true, &|m| {
-            let filter = Some((0, 127));
-            let residual = None;
-            coloured(
-                m,
-                5,
-                &scattered(5, 90),
-                (2, 4),
-                30,
-                Small,
-                Corrections { filter, residual },
-            )
+            scatter_saying(m, Some((0, 127)), None)
         });
         add("residual".into(), true, &|m| {
-            let filter = Some((6, 20));
-            let residual = Some(([20, 9], 0.3));
-            coloured(
-                m,
-                4,
-                &sphere,
-                (1, 3),
-                30,
-                Small,
-                Corrections { filter, residual },
-            )
+            sphere_saying(m, Some((6, 20)), Some(([20, 9], 0.3)))
         });
         add("residual-to-the-ends".into(), true, &|m| {
-            let filter = None;
-            let residual = Some(([1, 2], 100.0));
-            coloured(
-                m,
-                5,
-                &scattered(5, 90),
-                (2, 4),
-                30,
-                Small,
-                Corrections { filter, residual },
-            )
+            scatter_saying(m, None, Some(([1, 2], 100.0)))
         });
         let encoded = |cloud, m: &Model, residual: u8| {
             let options = Options {
