@@ -23,11 +23,11 @@ PEERS = {
     "person_Asian_F_3_Casual": {"s0.25_q34": 0.1005, "s0.25_q28": 0.1400, "s0.5_q34": 0.2975, "s0.5_q28": 0.4092},
     "person_Hispanic_M_3_Milit": {"s0.25_q34": 0.0944, "s0.25_q28": 0.1571, "s0.5_q34": 0.2775, "s0.5_q28": 0.4457},
 }
-MODELS = {name: f"models/{name}.safetensors" for name in ("lite", "lite-low", "lite-least")} | {"lite-quick": "models/lite.safetensors", "lite-residual": "models/lite.safetensors"}
+MODELS = {name: f"models/{name}.safetensors" for name in ("lite", "lite-low", "lite-least")} | {"lite-quick": "models/lite.safetensors", "lite-price": "models/lite.safetensors", "lite-residual": "models/lite.safetensors"}
 QUICK = "-quick"  # ends the name of a model whose quick heads are measured
-RESIDUAL = "-residual"  # of a model whose streams have colour residuals, of these steps of luma
-STEPS = (96, 48, 24)
-COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce", "#be185d"]
+PRICE, RESIDUAL = "-price", "-residual"  # of a model whose streams are made with an option
+OPTIONS = {PRICE: ("--bit-price", (0, 0.5, 2, 4)), RESIDUAL: ("--residual", (96, 48, 24))}
+COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce", "#b45309", "#be185d"]
 PEER, PEER_COLOUR = "TMC13", "#6b7280"
 SCORES = {"psnr": "PSNR", "foreground_psnr": "foreground PSNR", "ms_ssim": "MS-SSIM", "ssimulacra2": "SSIMULACRA2"}
 
@@ -60,18 +60,20 @@ def measure(data, models, peers):
             lab("voxelize", mesh, "-o", cloud)
             for model, path in models.items():
                 args = ["--model", ROOT / path, "--heads", "quick" if model.endswith(QUICK) else "best"]
+                option, values = OPTIONS.get("-" + model.split("-")[-1], ("", ()))
+                for value in values:
+                    run("b2p", "encode", cloud, "-o", folder / f"{value}.b2p", "--model", ROOT / path, option, value)
+                args += [f"{value}={folder / f'{value}.b2p'}" for value in values]
                 if model.endswith(RESIDUAL):
-                    for step in STEPS:
-                        run("b2p", "encode", cloud, "-o", folder / f"{step}.b2p", "--model", ROOT / path, "--residual", step)
-                    args += ["--levels", "9", *(f"{step}={folder / f'{step}.b2p'}" for step in STEPS)]
+                    args += ["--levels", "9"]
                 for row in evaluate(mesh, cloud, folder / model, *args):
-                    if model.endswith(RESIDUAL) and row["name"] not in map(str, STEPS):
-                        continue  # the cloud, coded without one, is among them
+                    if values and row["name"] not in map(str, values):
+                        continue  # the cloud, coded without the option, is among them
                     parts = {part["level"]: part for part in row["rate"]["levels"]}
                     rows.append({"object": name, "series": model, "level": row["level"], "rate": row["rate"]["total"],
                                  "geometry": sum(p["geometry"] for p in parts.values()), **row["scores"]})
-                    if model.endswith(RESIDUAL):
-                        rows[-1]["step"] = row["name"]
+                    if values:
+                        rows[-1]["option"] = row["name"]
             items = [f"{item}={data}/gpcc/{name}_{item}.ply.zst@{rate}" for item, rate in PEERS.get(name, {}).items() if peers]
             best = {}
             for row in evaluate(mesh, cloud, folder / "peer", *items) if items else []:
@@ -134,7 +136,10 @@ def table(rows):
     out = ["| | bits/point | PSNR | foreground PSNR | MS-SSIM | SSIMULACRA2 |", "|---|---:|---:|---:|---:|---:|"]
     for name, title in OBJECTS.items():
         for i, r in enumerate(sorted((r for r in rows if r["object"] == name), key=lambda r: (r["series"] == PEER, r["rate"]))):
-            what = f"`{r['series'].removesuffix(RESIDUAL)}` level {r['level']}" + (f", residual {r['step']}" if "step" in r else "")
+            what = f"`{r['series']}` level {r['level']}"
+            for end in OPTIONS:
+                if r["series"].endswith(end):
+                    what = f"`{r['series'].removesuffix(end)}` level {r['level']}, {end[1:]} {r['option']}"
             if r["series"] == PEER:
                 what = f"{PEER} level {r['level']}, QP {r['quality']}"
             head = f"**{title}**, " if i == 0 else ""
@@ -153,13 +158,17 @@ def summary(rows):
     return out
 
 
-def residuals(rows):
-    """As `summary`, of level 9 of one model, without and with residuals."""
-    own = [r for r in rows if r["level"] == 9 and r["series"].removesuffix(RESIDUAL) == "lite"]
-    out = ["| bits/point: PSNR / foreground | none | " + " | ".join(f"`{step}`" for step in STEPS) + " |", "|---|" + "---:|" * (1 + len(STEPS))]
+def optional(rows, end, levels):
+    """As `summary`, of one model without and with an option."""
+    values, none = map(str, OPTIONS[end][1]), {PRICE: "1", RESIDUAL: "none"}[end]
+    own = [r | {"option": r.get("option", none)} for r in rows if r["series"] in ("lite", "lite" + end)]
+    values = sorted([none, *values], key=lambda v: float(v) if v != "none" else 0) if end == PRICE else [none, *values]
+    columns = [(level, value) for level in levels for value in values]
+    heading = lambda level, value: (f"level {level}, " if len(levels) > 1 else "") + (value if value == "none" else f"`{value}`")
+    out = ["| bits/point: PSNR / foreground | " + " | ".join(heading(*column) for column in columns) + " |", "|---|" + "---:|" * len(columns)]
     for name, title in OBJECTS.items():
-        found = {r.get("step"): r for r in own if r["object"] == name}
-        cells = [f"{r['rate']:.3f}: {r['psnr']:.2f} / {r['foreground_psnr']:.2f}" for r in (found[step] for step in (None, *map(str, STEPS)))]
+        found = {(r["level"], r["option"]): r for r in own if r["object"] == name}
+        cells = [f"{r['rate']:.3f}: {r['psnr']:.2f} / {r['foreground_psnr']:.2f}" for r in (found[column] for column in columns)]
         out.append(f"| {title} | " + " | ".join(cells) + " |")
     return out
 
@@ -187,11 +196,11 @@ def panel(x0, y0, title, rows, score, colours):
     for v in range(int(low) + 1, int(high) + 1, 2):
         out.append(f'<path d="M{x0} {y(v):.1f}h{width}" stroke="#e5e7eb"/><text x="{x0 - 6}" y="{y(v) + 4:.1f}" text-anchor="end">{v}</text>')
     for series, colour in colours.items():
-        own = sorted((r["rate"], r[score], r.get("step", r["level"])) for r in rows if r["series"] == series)
-        if own:
-            path = "L".join(f"{x(r):.1f} {y(v):.1f}" for r, v, _ in own)
-            out.append(f'<path d="M{path}" fill="none" stroke="{colour}" stroke-width="2"/>')
-        out += [f'<circle cx="{x(r):.1f}" cy="{y(v):.1f}" r="4" fill="{colour}"/><text x="{x(r) + 6:.1f}" y="{y(v) + 14:.1f}" fill="{colour}">{level}</text>' for r, v, level in own]
+        own = sorted((r["rate"], r[score], r.get("option", r["level"]), r["level"]) for r in rows if r["series"] == series)
+        for level in {p[3] for p in own} if series.endswith(PRICE) else {None}:
+            path = "L".join(f"{x(r):.1f} {y(v):.1f}" for r, v, _, at in own if level in (None, at))
+            out += [f'<path d="M{path}" fill="none" stroke="{colour}" stroke-width="2"/>'] * bool(path)
+        out += [f'<circle cx="{x(r):.1f}" cy="{y(v):.1f}" r="4" fill="{colour}"/><text x="{x(r) + 6:.1f}" y="{y(v) + 14:.1f}" fill="{colour}">{level}</text>' for r, v, level, _ in own]
     return out
 
 
@@ -204,7 +213,7 @@ def plot(rows):
             body += panel(50 + column * 410, 40 + line * 310, f"{OBJECTS[name]}: {SCORES[score]}, dB", own, score, colours)
     for i, (name, colour) in enumerate(colours.items()):
         body.append(f'<text x="{50 + 100 * i}" y="654" fill="{colour}" font-weight="bold">{name}</text>')
-    body.append(f'<text x="50" y="674">bits per input point, geometry included; numbers are octree levels, or steps of residuals at level 9</text>')
+    body.append(f'<text x="50" y="674">bits per input point, geometry included; numbers are octree levels, or what the option says: the price of a bit, or the step of residuals at level 9</text>')
     head = '<svg xmlns="http://www.w3.org/2000/svg" width="870" height="688" font-family="sans-serif" font-size="12">'
     return f'{head}<rect width="100%" height="100%" fill="white"/>{"".join(body)}</svg>\n'
 
@@ -222,7 +231,7 @@ def main():
         rows = kept + measure(args.data.resolve(), models, not any(row["series"] == PEER for row in kept))
         measured.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     rows = json.loads(measured.read_text())
-    for path, mark, lines in ((ROOT / "README.md", "rd", [*summary(rows), "", *differences(rows)]), (ROOT / "README.md", "rd-residual", residuals(rows)), (HERE / "MEASUREMENTS.md", "rd-all", table(rows))):
+    for path, mark, lines in ((ROOT / "README.md", "rd", [*summary(rows), "", *differences(rows)]), (ROOT / "README.md", "rd-price", optional(rows, PRICE, (9,))), (ROOT / "README.md", "rd-residual", optional(rows, RESIDUAL, (9,))), (HERE / "MEASUREMENTS.md", "rd-all", table(rows))):
         text = "\n".join(lines)
         path.write_text(re.sub(rf"(<!-- {mark} -->\n).*?(\n<!-- /{mark} -->)", lambda m: m[1] + "\n" + text + "\n" + m[2], path.read_text(), flags=re.S))
     (HERE / "rd.svg").write_text(plot(rows))

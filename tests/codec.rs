@@ -343,7 +343,7 @@ fn the_placement_of_the_cloud_comes_back_with_the_gaussians() {
 }
 
 #[test]
-fn a_dearer_bit_makes_a_shorter_stream_and_costs_nothing_where_nobody_says() {
+fn a_bit_costs_nothing_where_the_model_does_not_say() {
     let (model, cloud) = (model(), ball(7, 45.0));
     let bytes = |bit_price| {
         let options = Options {
@@ -354,12 +354,27 @@ fn a_dearer_bit_makes_a_shorter_stream_and_costs_nothing_where_nobody_says() {
             .unwrap()
             .bytes
     };
-    assert_eq!(model.bit_price(), 0.0);
-    assert!(
-        bytes(None) == bytes(Some(0.0)),
-        "an untrained model has no price"
-    );
-    assert!(bytes(Some(0.5)).len() < bytes(Some(0.0)).len());
+    assert!(bytes(1.0) == bytes(0.0));
+}
+
+#[test]
+fn levels_left_out_at_the_fine_end_change_nothing_above_them() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let features = |top| {
+        let options = Options {
+            levels: Some(4..=top),
+            filter: false,
+            ..Options::default()
+        };
+        let coded = encode(&cloud, &model, &options, &mut Log::default()).unwrap();
+        let decoder = Decoder::new(&model);
+        decoder
+            .exact(&coded.bytes, 4, &mut Log::default())
+            .unwrap()
+            .features
+    };
+    let all = features(6);
+    assert!(features(5) == all && features(4) == all);
 }
 
 #[test]

@@ -9,8 +9,9 @@ use std::sync::LazyLock;
 use b2p::Cancel;
 use b2p::bitstream::Slice;
 use b2p::entropy::{
-    Condition, RawRows, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
-    decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice, quantise,
+    Condition, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level,
+    decode_passes, decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice,
+    quantise, quantise_passes,
 };
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 
@@ -236,11 +237,13 @@ pub fn entropy(bytes: &[u8]) {
     const LIMIT: i16 = 500;
     let price = f32::from(code.first().copied().unwrap_or(0)) / 64.0;
     let real: Vec<f32> = latents.iter().map(|&y| f32::from(y) / 7.0).collect();
-    let rounded = quantise(&tables, condition, &real, LIMIT, price);
-    for (q, y) in rounded.iter().zip(real) {
-        let bound = f32::from(LIMIT);
-        let away = (f32::from(*q) - y.clamp(-bound, bound)).abs();
-        assert!(q.abs() <= LIMIT && away <= 1.0, "{y} became {q}");
+    let prices = vec![price; tables.channels()];
+    let rounding = Rounding {
+        limit: LIMIT,
+        prices: &prices,
+    };
+    for q in quantise(&tables, condition, &real, rounding) {
+        assert!(q.abs() <= LIMIT, "{q} is beyond the limit");
     }
 }
 
@@ -313,6 +316,21 @@ fn in_passes(tables: &Tables, keys: &[u64], latents: &[i16], slice: usize, code:
     let codes = encode_passes(tables, keys, &predict, latents, slice);
     let decoded = decode(&slices(&codes), slice);
     assert_eq!(decoded.expect("what was encoded decodes"), latents);
+    // Whole already: at no price they stay; at one they may not, and have a code all the same.
+    let real: Vec<f32> = latents.iter().map(|&y| f32::from(y)).collect();
+    for price in [0.0, 0.3] {
+        let prices = vec![price; k];
+        let rounding = Rounding {
+            limit: i16::MAX,
+            prices: &prices,
+        };
+        let rounded = quantise_passes(tables, keys, &predict, &real, rounding, slice);
+        let within = |y: &i16| (*y).max(-i16::MAX);
+        assert!(price > 0.0 || rounded.iter().copied().eq(latents.iter().map(within)));
+        let codes = encode_passes(tables, keys, &predict, &rounded, slice);
+        let decoded = decode(&slices(&codes), slice);
+        assert_eq!(decoded.expect("what was rounded decodes"), rounded);
+    }
     if let Ok(latents) = decode(&[whole(0, code)], keys.len().max(1)) {
         let again = encode_passes(tables, keys, &predict, &latents, keys.len());
         assert_eq!(again, [code], "another code for the same latents");

@@ -372,7 +372,7 @@ def main():
     p.add_argument("--weights", metavar="FILE", help="also write the float weights, in f16, for `train.py --init`")
     p.add_argument("--streams-of", metavar="FILE", help="take all but the heads from this exported model, so that its streams stay valid: after `train.py --only-heads`")
     p.add_argument("--quick", metavar="CHECKPOINT", help="with --streams-of: that model with the heads of this checkpoint as quick ones beside its own")
-    p.add_argument("--bit-price", type=float, help="what encoders shall take a bit to be worth when they round latents, in squared steps (0)")
+    p.add_argument("--bit-price", type=json.loads, metavar="JSON", help="what encoders shall take a bit to be worth when they round latents, in squared steps: one number, or K for each of the three roles (0)")
     p.add_argument("--last", action="store_true", help="the last weights instead of the averaged ones")
     args = p.parse_args()
     samples = [data.procedural(i) for i in range(2)]

@@ -60,9 +60,12 @@ train() {
 fit() {
     "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 6)" --samples 260 --lr 3e-4 --threads 1 --only-base
 }
-# ship NAME FILE PRICE: writes the model, and what a bit is worth to its encoder
+# prices A B C: of channels, the last of all from the third on
+prices() { echo "[$1, $2, $3, $3, $3, $3, $3, $3]"; }
+# ship NAME FILE PRICES PRICES: writes the model, and what bits of roles 0 and 1 are worth to its encoder
 ship() {
-    "$python" export.py "$out/$1/last.pt" "$out/$2.safetensors" --data "$out/mixed" --samples 10 --verify 2 --weights "$out/$2.weights.safetensors" --bit-price "$3"
+    local all="[$(prices $3), $(prices $4), $(prices 0 0 0)]"
+    "$python" export.py "$out/$1/last.pt" "$out/$2.safetensors" --data "$out/mixed" --samples 10 --verify 2 --weights "$out/$2.weights.safetensors" --bit-price "$all"
 }
 # beside NAME FILE: these heads as quick ones of the model
 beside() {
@@ -97,7 +100,7 @@ train low-rest lite 30 --init "$out/low-whole-2/last.pt" --lam 4 "${rest[@]}"
 fit low-rest
 train low-mixed lite 42 --init "$out/low-rest/tuned.pt" --lam 4 "${mixed[@]}"
 train low-more lite 70 --init "$out/low-mixed/last.pt" --lam 4 "${mixed[@]}"
-ship low-more lite-low 0.08
+ship low-more lite-low "0.02 0.05 0.05" "0.05 0.15 0.15"
 imitating lite-low 15
 train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
 train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
@@ -106,7 +109,7 @@ train high-whole-2 lite 25 --init "$out/high-whole-1/last.pt" --coarse 0 "${whol
 fit high-whole-2
 train high-mixed lite 82 --init "$out/high-whole-2/tuned.pt" --lam 16 "${mixed[@]}"
 train high-more lite 82 --init "$out/high-mixed/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
-ship high-more lite 0.16
+ship high-more lite "0.03 0.1 0.1" "0.1 0.2 0.2"
 imitating lite 15
 train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
@@ -114,5 +117,5 @@ train least-whole-2 lite 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${wh
 train least-rest lite 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@]}"
 fit least-rest
 train least-mixed lite 40 --init "$out/least-rest/tuned.pt" --lam 1.2 "${mixed[@]}"
-ship least-mixed lite-least 0
+ship least-mixed lite-least "0 0.02 0.02" "0.02 0.05 0.05"
 imitating lite-least 15

@@ -105,13 +105,13 @@ pub struct Encode {
     /// Octree levels whose features are coded, up to three, the last below N [default: N−3..N−1]
     #[arg(long, value_name = "L..M", value_parser = levels)]
     pub levels: Option<RangeInclusive<u8>>,
-    /// What a bit is worth when latents are rounded, in squared latent steps; 0 rounds to the nearest, more saves bits [default: what the model says]
-    #[arg(long, value_name = "X", value_parser = price)]
-    pub bit_price: Option<f32>,
+    /// How dear a bit is when latents are rounded, times what the model says: 0 rounds to the nearest, more saves bits and costs quality
+    #[arg(long, value_name = "X", value_parser = price, default_value_t = 1.0)]
+    pub bit_price: f32,
     /// Leave colours as the model makes them, which takes less time: otherwise each level tells in 58 bytes how to correct those of the cloud
     #[arg(long)]
     pub no_filter: bool,
-    /// Also code what the finest level's colours are still off, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 96 takes 2 to 21 % more bits, 24 doubles some streams
+    /// Also code what the finest level's colours are still off, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 96 takes 3 to 28 % more bits, 24 doubles some streams
     #[arg(long, value_name = "STEP[,CHROMA]", value_parser = steps)]
     pub residual: Option<Steps>,
     #[command(flatten)]

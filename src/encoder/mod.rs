@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::bitstream::{Header, MAX_SLICE_VOXELS, Writer};
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
-use crate::entropy::{Condition, encode_level, encode_passes, latent_hash, quantise};
+use crate::entropy::{Coding, Condition, Rounding, latent_hash};
 use crate::error::{Error, Result};
 use crate::gaussians::Steps;
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
@@ -24,9 +24,9 @@ use corrections::{Corrections, Level, corrections};
 pub struct Options {
     /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.
     pub levels: Option<RangeInclusive<u8>>,
-    /// What a bit is worth when latents are rounded, in squared latent steps: see [`crate::entropy::quantise`]. 0 rounds to the nearest.
-    /// Bits are those that the level below predicts, whatever neighbours tell. Default: what the model says, [`Model::bit_price`].
-    pub bit_price: Option<f32>,
+    /// How dear a bit is when latents are rounded, times what the model says ([`Model::bit_prices`]): 0 rounds to the nearest, more saves bits.
+    /// Default: 1.
+    pub bit_price: f32,
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
     /// [`ColourFilter`].
     pub filter: bool,
@@ -41,7 +41,7 @@ impl Default for Options {
     fn default() -> Self {
         Options {
             levels: None,
-            bit_price: None,
+            bit_price: 1.0,
             filter: true,
             residual: None,
             slice_voxels: MAX_SLICE_VOXELS,
@@ -85,17 +85,18 @@ pub fn encode(
 ) -> Result<Encoded> {
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
     let (base, top) = (*levels.start(), *levels.end());
+    // Networks have learned to see a level through all those below it, coded or not.
+    let seen = cloud.voxels.depth().min(base + ROLES as u8);
     let (finest, colours) = log.step("pool colours", cloud.voxels.len(), "voxels", || {
-        Ok(pooled(cloud, top + 1))
+        Ok(pooled(cloud, seen))
     })?;
     let octree = Octree::new(finest)?;
-    let maps = log.step("kernel maps", octree.level(top + 1).len(), "voxels", || {
+    let maps = log.step("kernel maps", octree.level(seen).len(), "voxels", || {
         Ok(kernel_maps(&octree, base))
     })?;
     let mut features = log.step("features", colours.len(), "voxels", || {
         let maps: Vec<_> = maps.iter().rev().collect();
-        let occupancy: Vec<_> = levels
-            .clone()
+        let occupancy: Vec<_> = (base..seen)
             .rev()
             .map(|level| octree.occupancy(level))
             .collect();
@@ -114,16 +115,19 @@ pub fn encode(
         voxels: Vec::new(),
         sections: Vec::new(),
     };
-    let mut squeezed = |role: usize, condition: Condition<'_>, context: Option<&[i16]>| {
+    let mut squeezed = |role: usize, coding: Coding<'_>, context: Option<&[i16]>| {
         // The finest level's features come first, so those of the level at hand are the last.
         let own = features.pop().unwrap_or_default();
-        Ok(quantise(
-            model.tables(),
-            condition,
-            &model.squeeze(role, &own, context)?,
-            model.shape().latent_max,
-            options.bit_price.unwrap_or(model.bit_price()),
-        ))
+        let real = model.squeeze(role, &own, context)?;
+        let prices = model.bit_prices(role).iter();
+        let rounding = Rounding {
+            limit: model.shape().latent_max,
+            prices: &prices
+                .map(|price| price * options.bit_price)
+                .collect::<Vec<_>>(),
+        };
+        let slice = options.slice_voxels as usize;
+        Ok(coding.quantise(model.tables(), &real, rounding, slice))
     };
     let mut correct = |level: Level<'_>| corrections(cloud, model, options, level);
     let correct: Option<&mut Correct<'_>> = match options.filter || options.residual.is_some() {
@@ -154,9 +158,8 @@ pub fn encode(
     Ok(Encoded { bytes, rates })
 }
 
-/// A role's latents, K per voxel of its level, given what is known of them and its context.
-pub(crate) type Latents<'a> =
-    dyn FnMut(usize, Condition<'_>, Option<&[i16]>) -> Result<Vec<i16>> + 'a;
+/// A role's latents, K per voxel of its level, given what they are coded under and its context.
+pub(crate) type Latents<'a> = dyn FnMut(usize, Coding<'_>, Option<&[i16]>) -> Result<Vec<i16>> + 'a;
 
 /// What to say of a level's colours.
 type Correct<'a> = dyn FnMut(Level<'_>) -> Result<Corrections> + 'a;
@@ -223,20 +226,21 @@ pub(crate) fn write(
                 let parameters = context
                     .as_ref()
                     .map(|c| model.entropy_parameters(role, c, map));
-                let condition = match &parameters {
-                    Some((mu, sigma)) => Condition::Gauss { mu, sigma },
-                    None => Condition::Prior,
+                let (tables, voxels) = (model.tables(), octree.level(level));
+                let octants = voxels.octants();
+                let predict = model
+                    .has_passes(role)
+                    .then(|| model.passes(role, &octants, map, parameters.as_ref()));
+                let coding = match (&predict, &parameters) {
+                    (Some(predict), _) => Coding::Passes {
+                        keys: voxels.keys(),
+                        predict,
+                    },
+                    (None, Some((mu, sigma))) => Coding::Known(Condition::Gauss { mu, sigma }),
+                    (None, None) => Coding::Known(Condition::Prior),
                 };
-                let tables = model.tables();
-                let latents = latents(role, condition, context.as_deref())?;
-                let slices = if model.has_passes(role) {
-                    let voxels = octree.level(level);
-                    let octants = voxels.octants();
-                    let predict = model.passes(role, &octants, map, parameters.as_ref());
-                    encode_passes(tables, voxels.keys(), &predict, &latents, slice)
-                } else {
-                    encode_level(tables, condition, &latents, slice)
-                };
+                let latents = latents(role, coding, context.as_deref())?;
+                let slices = coding.encode(tables, &latents, slice);
                 latent_bytes += slices.iter().map(Vec::len).sum::<usize>();
                 writer.features(level, latent_hash(&latents), &slices)?;
                 Ok(Some(model.reconstruct(

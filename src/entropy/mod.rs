@@ -33,6 +33,7 @@
 //! After the last symbol all words must have been read, and the state must be [`END_STATE`]. That notices every cut tried and all
 //! but 0.07 % of flipped bits; checksums are for the rest.
 
+mod coding;
 mod coefficients;
 mod learning;
 mod level;
@@ -43,10 +44,11 @@ mod slice;
 mod stack;
 mod tables;
 
+pub use coding::Coding;
 pub use coefficients::{decode_coefficients, encode_coefficients};
 pub use level::{decode_level, encode_level, expect_no_latents, latent_hash};
 pub use passes::{Predict, decode_passes, encode_passes};
-pub use quantise::quantise;
+pub use quantise::{Rounding, quantise, quantise_passes};
 pub use slice::{Condition, END_STATE, UNPREDICTED, decode_slice, encode_slice};
 pub use tables::{RawRows, Tables};
 

@@ -1,5 +1,6 @@
 //! A level that nothing below predicts, predicted from itself: its voxels are coded octant by octant, and each pass from those before it.
 
+use std::convert::Infallible;
 use std::ops::Range;
 
 use rayon::prelude::*;
@@ -42,24 +43,14 @@ pub fn encode_passes(
         .map(|(i, part)| {
             let slice = range(i, slice_voxels, keys.len());
             let (mut order, mut mu, mut sigma) = (Vec::new(), Vec::new(), Vec::new());
-            let mut learning = Learning::of(tables, &keys[slice.clone()]);
-            for voxels in passes(keys, &slice) {
-                let (mut m, mut s) = predict(slice.clone(), &voxels, part);
-                if let Some(learning) = &mut learning {
-                    let parameters = m.chunks_exact_mut(k).zip(s.chunks_exact_mut(k));
-                    for (&v, (mu, sigma)) in voxels.iter().zip(parameters) {
-                        let at = v as usize - slice.start;
-                        learning.prepare(at, part, mu, sigma);
-                        learning.learn(at, &part[at * k..][..k]);
-                    }
-                }
-                mu.extend(m);
-                sigma.extend(s);
-                order.extend(voxels.iter().flat_map(|&v| {
-                    let at = (v as usize - slice.start) * k;
-                    part[at..at + k].iter().copied()
-                }));
-            }
+            let mut known = vec![0; part.len()];
+            let Ok(()) = each_voxel(tables, keys, slice, predict, &mut known, |at, m, s, own| {
+                own.copy_from_slice(&part[at * k..][..k]);
+                mu.extend_from_slice(m);
+                sigma.extend_from_slice(s);
+                order.extend_from_slice(own);
+                Ok::<_, Infallible>(())
+            });
             let condition = Condition::Gauss {
                 mu: &mu,
                 sigma: &sigma,
@@ -67,6 +58,42 @@ pub fn encode_passes(
             encode_slice(tables, condition, &order)
         })
         .collect()
+}
+
+/// Goes through a slice in the order of coding. `latents` are those of the slice so far, [voxels, K]; `code` gets each voxel's number
+/// in the slice, means in sixteenths and scale indices of its latents, and says what they are, or fails.
+pub(super) fn each_voxel<E>(
+    tables: &Tables,
+    keys: &[u64],
+    slice: Range<usize>,
+    predict: &Predict,
+    latents: &mut [i16],
+    mut code: impl FnMut(usize, &[i16], &[u8], &mut [i16]) -> Result<(), E>,
+) -> Result<(), E> {
+    let k = tables.channels();
+    let mut learning = Learning::of(tables, &keys[slice.clone()]);
+    for voxels in passes(keys, &slice) {
+        let (mut mu, mut sigma) = predict(slice.clone(), &voxels, latents);
+        let count = voxels.len() * k;
+        assert_eq!(
+            (mu.len(), sigma.len()),
+            (count, count),
+            "one mean and scale per latent"
+        );
+        let parameters = mu.chunks_exact_mut(k).zip(sigma.chunks_exact_mut(k));
+        for (&v, (mu, sigma)) in voxels.iter().zip(parameters) {
+            let at = v as usize - slice.start;
+            if let Some(learning) = &mut learning {
+                learning.prepare(at, latents, mu, sigma);
+            }
+            let own = &mut latents[at * k..][..k];
+            code(at, mu, sigma, own)?;
+            if let Some(learning) = &mut learning {
+                learning.learn(at, own);
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Decodes what [`encode_passes`] made. The work is bounded by the number of voxels, which the caller has held against its limits.
@@ -97,28 +124,9 @@ pub fn decode_passes(
             let slice = range(i, slice_voxels, keys.len());
             let at = place(level, i, code);
             let mut reader = Reader::open(tables, code.bytes, &at)?;
-            let mut learning = Learning::of(tables, &keys[slice.clone()]);
-            for voxels in passes(keys, &slice) {
-                let (mut mu, mut sigma) = predict(slice.clone(), &voxels, part);
-                let latents = voxels.len() * k;
-                assert_eq!(
-                    (mu.len(), sigma.len()),
-                    (latents, latents),
-                    "one mean and scale per latent"
-                );
-                let parameters = mu.chunks_exact_mut(k).zip(sigma.chunks_exact_mut(k));
-                for (&v, (mu, sigma)) in voxels.iter().zip(parameters) {
-                    let at = v as usize - slice.start;
-                    if let Some(learning) = &mut learning {
-                        learning.prepare(at, part, mu, sigma);
-                    }
-                    let values = &mut part[at * k..][..k];
-                    reader.read(Condition::Gauss { mu, sigma }, values)?;
-                    if let Some(learning) = &mut learning {
-                        learning.learn(at, values);
-                    }
-                }
-            }
+            each_voxel(tables, keys, slice, predict, part, |_, mu, sigma, own| {
+                reader.read(Condition::Gauss { mu, sigma }, own)
+            })?;
             reader.finish()
         })
         .collect();
@@ -127,7 +135,7 @@ pub fn decode_passes(
 }
 
 /// The voxels of slice `i`.
-fn range(i: usize, slice_voxels: usize, voxels: usize) -> Range<usize> {
+pub(super) fn range(i: usize, slice_voxels: usize, voxels: usize) -> Range<usize> {
     let start = i * slice_voxels;
     start..(start + slice_voxels).min(voxels)
 }

@@ -2,8 +2,10 @@
 
 use b2p_kernels::f16;
 use b2p_kernels::{ExactConv, LIMIT, Requantise};
+use serde_json::Value;
 use xxhash_rust::xxh3::Xxh3Default;
 
+use super::ROLES;
 use super::container::{Contents, Dtype};
 use super::shape::Shape;
 use super::stored::Stored;
@@ -71,28 +73,28 @@ impl<'a> Tensors<'a> {
         Shape::from_json(json)
     }
 
-    /// What a bit is worth when latents are rounded, in squared latent steps, if the description says: 0 if it does not.
+    /// What a bit is worth when latents are rounded, in squared latent steps, for each of a role's K channels, if the description says: 0 if it
+    /// does not.
     ///
     /// # Errors
-    /// [`Error::Malformed`] if it is no number from 0 to 100.
-    pub fn bit_price(&self) -> Result<f32> {
+    /// [`Error::Malformed`] if it is neither a number from 0 to 100 nor K such numbers for each role.
+    pub fn bit_prices(&self, latents: usize) -> Result<[Vec<f32>; ROLES]> {
         let json = self.contents.metadata.get("b2p").map_or("{}", |json| json);
-        let description: serde_json::Value = serde_json::from_str(json).unwrap_or_default();
+        let description: Value = serde_json::from_str(json).unwrap_or_default();
         let Some(said) = description.get("bit_price") else {
-            return Ok(0.0);
+            return Ok(std::array::from_fn(|_| vec![0.0; latents]));
         };
-        let price = said.as_f64().filter(|price| (0.0..=100.0).contains(price));
-        let price = price.ok_or_else(|| {
-            let (field, expected) = ("bit_price", "a number from 0 to 100");
-            Error::malformed(
-                Stage::Network,
-                "metadata",
-                field,
-                said.to_string(),
-                expected,
-            )
-        })?;
-        Ok(price as f32)
+        let prices = match said {
+            Value::Array(roles) => roles.iter().map(|role| prices(role, latents)).collect(),
+            one => price(one).map(|price| vec![vec![price; latents]; ROLES]),
+        };
+        prices.and_then(|p| p.try_into().ok()).ok_or_else(|| {
+            let expected = format!(
+                "a number from 0 to 100, or {latents} such numbers for each of {ROLES} roles"
+            );
+            let (field, said) = ("bit_price", said.to_string());
+            Error::malformed(Stage::Network, "metadata", field, said, expected)
+        })
     }
 
     /// Whether a tensor's name starts like that.
@@ -283,4 +285,15 @@ pub(super) fn malformed(
         value,
         expected,
     )
+}
+
+/// A price of each of so many channels.
+fn prices(said: &Value, latents: usize) -> Option<Vec<f32>> {
+    let said = said.as_array().filter(|said| said.len() == latents)?;
+    said.iter().map(price).collect()
+}
+
+fn price(said: &Value) -> Option<f32> {
+    let price = said.as_f64().filter(|price| (0.0..=100.0).contains(price));
+    price.map(|price| price as f32)
 }

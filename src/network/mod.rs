@@ -38,7 +38,7 @@
 //! of the chain of residual blocks before layer 4 (what enters it, every branch, every sum), of the inside of each of its blocks, and
 //! of the same after layer 4. Where `gg` of the metadata has further generators that say `"heads": "quick"`, their layers are `gg.quick.r.*`
 //! ([`Heads`]). Tables: see [`crate::entropy::Tables`]. A file without `fc.*` and `fs.*` can decode only.
-//! The JSON may also say at which `bit_price` latents are best rounded.
+//! The JSON may also say at which `bit_price` latents are best rounded: one for all, or K for each of the three roles.
 
 mod children;
 mod container;
@@ -92,7 +92,7 @@ pub struct Model {
     generators: Vec<Generator>,
     precision: Precision,
     encoder: Option<Encoder<FloatConv>>,
-    bit_price: f32,
+    bit_prices: [Vec<f32>; ROLES],
     g_scale: Vec<f32>,
     c_scale: Vec<f32>,
 }
@@ -145,7 +145,7 @@ impl Model {
             g_scale,
             c_scale: scales(&tensors, "c_scale", ROLES, 1)?,
             id: tensors.id(&shape),
-            bit_price: tensors.bit_price()?,
+            bit_prices: tensors.bit_prices(shape.latents)?,
             isa: Isa::detect(),
             tables,
             shape,
@@ -198,9 +198,12 @@ impl Model {
         &self.tables
     }
 
-    /// What a bit is best worth when this model's latents are rounded: see [`crate::entropy::quantise`].
-    pub fn bit_price(&self) -> f32 {
-        self.bit_price
+    /// What a bit is best worth when a role's latents are rounded, in squared latent steps, of each channel: see [`crate::entropy::Rounding`].
+    ///
+    /// # Panics
+    /// If `role` is above 2.
+    pub fn bit_prices(&self, role: usize) -> &[f32] {
+        &self.bit_prices[role]
     }
 
     /// Whether the file had the encoder's layers.

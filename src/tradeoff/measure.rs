@@ -16,7 +16,7 @@ use super::spread::Spread;
 use crate::bitstream::Header;
 use crate::decoder::Decoder;
 use crate::encoder::{kernel_maps, write};
-use crate::entropy::Condition;
+use crate::entropy::Coding;
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
 use crate::geometry::{KernelMap, Octree, Voxels};
@@ -186,7 +186,7 @@ fn without_features(
         ..header.clone()
     };
     let latents = model.shape().latents;
-    let mut zero = |role: usize, _: Condition<'_>, _: Option<&[i16]>| {
+    let mut zero = |role: usize, _: Coding<'_>, _: Option<&[i16]>| {
         Ok(vec![0; octree.level(base + role as u8).len() * latents])
     };
     let maps = kernel_maps(&octree, base);

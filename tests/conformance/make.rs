@@ -371,7 +371,7 @@ pub fn cases() -> Vec<Case> {
             let options = Options {
                 slice_voxels: 60,
                 residual: (residual > 0).then(|| steps(residual)),
-                bit_price: Some(0.0),
+                bit_price: 0.0,
                 ..Options::default()
             };
             encode(&cloud, m, &options, &mut Log::default())

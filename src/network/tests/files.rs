@@ -402,13 +402,30 @@ fn what_a_bit_is_worth_is_for_the_model_to_say_and_changes_nothing_of_its_stream
         file.json = file
             .json
             .replacen('{', &format!("{{\"bit_price\": {price}, "), 1);
-        Model::from_bytes(&file.bytes()).map(|model| (model.id(), model.bit_price()))
+        Model::from_bytes(&file.bytes())
     };
-    assert_eq!(Model::from_bytes(&plain.bytes()).unwrap().bit_price(), 0.0);
-    assert_eq!(saying("0.25").unwrap(), (id, 0.25));
-    assert_eq!(saying("100").unwrap(), (id, 100.0));
-    for wrong in ["-1", "101", "\"much\"", "null"] {
-        let error = saying(wrong).unwrap_err();
+    let k = Model::from_bytes(&plain.bytes()).unwrap().shape().latents;
+    let of_roles = |model: &Model| [0, 1, 2].map(|role| model.bit_prices(role).to_vec());
+    let of = |price: f32| [0, 1, 2].map(|_| vec![price; k]);
+    assert_eq!(
+        of_roles(&Model::from_bytes(&plain.bytes()).unwrap()),
+        of(0.0)
+    );
+    for (said, price) in [("0.25", 0.25), ("100", 100.0)] {
+        let model = saying(said).unwrap();
+        assert_eq!((model.id(), of_roles(&model)), (id, of(price)));
+    }
+    let each: [Vec<f32>; 3] = [0, 1, 2].map(|role| (0..k).map(|c| (role * k + c) as f32).collect());
+    let model = saying(&format!("{each:?}")).unwrap();
+    assert_eq!((model.id(), of_roles(&model)), (id, each.clone()));
+    let two_roles = format!("{:?}", &each[..2]);
+    let too_many = format!("{:?}", each.clone().map(|role| [role, vec![1.0]].concat()));
+    let too_dear = format!("{:?}", of(101.0));
+    let said = [
+        "-1", "101", "\"much\"", "null", "[]", &two_roles, &too_many, &too_dear,
+    ];
+    for wrong in said {
+        let error = saying(wrong).err().expect("it is wrong");
         let text = error.to_string();
         assert!(matches!(error, Error::Malformed { .. }), "{text}");
         assert!(
