@@ -28,7 +28,8 @@ QUICK = "-quick"  # ends the name of a model whose quick heads are measured
 PRICE, RESIDUAL = "-price", "-residual"  # of a model whose streams are made with an option
 OPTIONS = {PRICE: ("--bit-price", (0, 0.5, 2, 4)), RESIDUAL: ("--residual", (96, 48, 24))}
 COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce", "#b45309", "#be185d"]
-PEER, PEER_COLOUR = "TMC13", "#6b7280"
+PEER = "TMC13"  # begins the names of its series
+PEER_COLOURS = {f"{PEER} squares": "#6b7280", f"{PEER} Gaussians": "#d1a3a3"}
 SCORES = {"psnr": "PSNR", "foreground_psnr": "foreground PSNR", "ms_ssim": "MS-SSIM", "ssimulacra2": "SSIMULACRA2"}
 
 
@@ -75,15 +76,16 @@ def measure(data, models, peers):
                     if values:
                         rows[-1]["option"] = row["name"]
             items = [f"{item}={data}/gpcc/{name}_{item}.ply.zst@{rate}" for item, rate in PEERS.get(name, {}).items() if peers]
-            best = {}
             for row in evaluate(mesh, cloud, folder / "peer", *items) if items else []:
                 item = row["name"]  # the cloud, coded by the program's own model, is among them
-                if item in PEERS[name] and (item not in best or row["scores"]["psnr"] > best[item]["scores"]["psnr"]):
-                    best[item] = row
-            for item, row in best.items():
-                level = {"s0.25": 8, "s0.5": 9}[item.split("_")[0]]
-                rows.append({"object": name, "series": PEER, "level": level, "rate": PEERS[name][item], "quality": item.split("_q")[1], **row["scores"]})
+                if item in PEERS[name]:
+                    level, drawn = {"s0.25": 8, "s0.5": 9}[item.split("_")[0]], "squares" if row["drawn"].startswith("squares") else "Gaussians"
+                    rows.append({"object": name, "series": f"{PEER} {drawn}", "level": level, "rate": PEERS[name][item], "quality": item.split("_q")[1], **row["scores"]})
     return rows
+
+
+def is_peer(row):
+    return row["series"].startswith(PEER)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -135,13 +137,13 @@ def bjontegaard(ours, peers, score):
 def table(rows):
     out = ["| | bits/point | PSNR | foreground PSNR | MS-SSIM | SSIMULACRA2 |", "|---|---:|---:|---:|---:|---:|"]
     for name, title in OBJECTS.items():
-        for i, r in enumerate(sorted((r for r in rows if r["object"] == name), key=lambda r: (r["series"] == PEER, r["rate"]))):
+        for i, r in enumerate(sorted((r for r in rows if r["object"] == name), key=lambda r: (is_peer(r), r["rate"]))):
             what = f"`{r['series']}` level {r['level']}"
             for end in OPTIONS:
                 if r["series"].endswith(end):
                     what = f"`{r['series'].removesuffix(end)}` level {r['level']}, {end[1:]} {r['option']}"
-            if r["series"] == PEER:
-                what = f"{PEER} level {r['level']}, QP {r['quality']}"
+            if is_peer(r):
+                what = f"{PEER} level {r['level']}, QP {r['quality']}, {r['series'].split()[1]}"
             head = f"**{title}**, " if i == 0 else ""
             out.append(f"| {head}{what} | {r['rate']:.3f} | {r['psnr']:.2f} | {r['foreground_psnr']:.2f} | {r['ms_ssim']:.4f} | {r['ssimulacra2']:.1f} |")
     return out
@@ -152,7 +154,7 @@ def summary(rows):
     columns = [(name, level) for name in ("lite-least", "lite-low", "lite") for level in (8, 9)]
     out = ["| bits/point: PSNR / foreground | " + " | ".join(f"`{name}`, level {level}" for name, level in columns) + " |", "|---|" + "---:|" * len(columns)]
     for name, title in OBJECTS.items():
-        own = {(r["series"], r["level"]): r for r in rows if r["object"] == name and r["series"] != PEER}
+        own = {(r["series"], r["level"]): r for r in rows if r["object"] == name and not is_peer(r)}
         cells = [f"{r['rate']:.3f}: {r['psnr']:.2f} / {r['foreground_psnr']:.2f}" for r in (own[column] for column in columns)]
         out.append(f"| {title} | " + " | ".join(cells) + " |")
     return out
@@ -176,7 +178,7 @@ def optional(rows, end, levels):
 def differences(rows):
     out = ["| at equal rates, ours less TMC13's, on average | " + " | ".join(SCORES.values()) + " | bits saved at equal PSNR |", "|---|" + "---:|" * (len(SCORES) + 1)]
     for name in PEERS:
-        ours, peers = ([r for r in rows if r["object"] == name and (r["series"] == PEER) == is_peer] for is_peer in (False, True))
+        ours, peers = ([r for r in rows if r["object"] == name and is_peer(r) == peer] for peer in (False, True))
         gains = [bjontegaard(ours, peers, score) for score in SCORES]
         (low, high), saved = gains[0][1], gains[0][2]
         digits = lambda score: ".2f" if "psnr" in score else ".4f" if score == "ms_ssim" else ".1f"
@@ -205,14 +207,14 @@ def panel(x0, y0, title, rows, score, colours):
 
 
 def plot(rows):
-    series = [s for s in dict.fromkeys(r["series"] for r in rows) if s != PEER]
-    colours, body = dict(zip(series, COLOURS)) | {PEER: PEER_COLOUR}, []
+    series = dict.fromkeys(r["series"] for r in rows if not is_peer(r))
+    colours, body = dict(zip(series, COLOURS)) | PEER_COLOURS, []
     for column, name in enumerate(PEERS):
         own = [r for r in rows if r["object"] == name]
         for line, score in enumerate(("psnr", "foreground_psnr")):
             body += panel(50 + column * 410, 40 + line * 310, f"{OBJECTS[name]}: {SCORES[score]}, dB", own, score, colours)
     for i, (name, colour) in enumerate(colours.items()):
-        body.append(f'<text x="{50 + 100 * i}" y="654" fill="{colour}" font-weight="bold">{name}</text>')
+        body.append(f'<text x="{50 + 94 * i}" y="654" fill="{colour}" font-weight="bold">{name}</text>')
     body.append(f'<text x="50" y="674">bits per input point, geometry included; numbers are octree levels, or what the option says: the price of a bit, or the step of residuals at level 9</text>')
     head = '<svg xmlns="http://www.w3.org/2000/svg" width="870" height="688" font-family="sans-serif" font-size="12">'
     return f'{head}<rect width="100%" height="100%" fill="white"/>{"".join(body)}</svg>\n'
@@ -228,7 +230,7 @@ def main():
         models = dict(model.split("=", 1) for model in args.models)
         kept = json.loads(measured.read_text()) if measured.exists() else []
         kept = [row for row in kept if row["series"] not in models]
-        rows = kept + measure(args.data.resolve(), models, not any(row["series"] == PEER for row in kept))
+        rows = kept + measure(args.data.resolve(), models, not any(map(is_peer, kept)))
         measured.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     rows = json.loads(measured.read_text())
     for path, mark, lines in ((ROOT / "README.md", "rd", [*summary(rows), "", *differences(rows)]), (ROOT / "README.md", "rd-price", optional(rows, PRICE, (9,))), (ROOT / "README.md", "rd-residual", optional(rows, RESIDUAL, (9,))), (HERE / "MEASUREMENTS.md", "rd-all", table(rows))):
