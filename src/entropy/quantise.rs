@@ -17,8 +17,7 @@ const MADE_UP: f32 = 0.05;
 
 /// How real latents become whole ones.
 ///
-/// Each becomes the whole number near it, on the way to what is likeliest, that has the smallest `(y − q)² + price · bits(q)`: from the nearest one on, as long
-/// as the next is better.
+/// Each becomes the whole number of small `(y − q)² + price · bits(q)` that is found from the nearest one on, either way, as long as the next is better.
 #[derive(Debug, Clone, Copy)]
 pub struct Rounding<'a> {
     /// Latents are kept within ± this.
