@@ -25,6 +25,8 @@ from model import B2P, Inception, NormConv, ResBlock, latents_of, reconstructed
 
 WEIGHT_MAX = 511
 LATENT_SHIFT = 6
+# In squared edges of a generated voxel, which are two finest ones.
+BLUR = ops.VOXEL_BLUR / 4
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -273,12 +275,13 @@ def export(model, samples, path, info, streams_of=None):
     out = quantise(model, ranges_of(model, samples))
     for name, t in (("cdf.gauss", gauss_tables()), ("cdf.prior", prior_tables(model))):
         out[name], out[name + ".offset"], out[name + ".low"] = t
-    meta = {"format": 1, **model.cfg, "latent_shift": LATENT_SHIFT, **info}
+    meta = {"format": 1, **model.cfg, "latent_shift": LATENT_SHIFT, "blur": BLUR, **info}
     if streams_of:
         before, old = same_streams(streams_of, model.cfg)
         if {k: v.shape for k, v in old.items() if not is_quick(k)} != {k: v.shape for k, v in out.items()}:
             sys.exit(f"{streams_of} is another network")
         out = {k: out[k] if k.startswith("gg.") and not is_quick(k) else v for k, v in old.items()}
+        meta |= {"heads_steps": meta["steps"]} | {k: before[k] for k in ("lambda", "steps", "bit_price", "learning", "quick_steps") if k in before}
         meta["gg"] = model.cfg["gg"] + [g for g in before["gg"] if g.get("heads") == "quick"]
     write(path, meta, out)
 
@@ -292,6 +295,8 @@ def export_quick(model, samples, path, info, streams_of):
     for shared in ("offset_range", "scale_range", "scale_bias", "opacity_bias", "resblock_relu"):
         if meta[shared] != model.cfg[shared]:
             sys.exit(f"{streams_of} has another {shared}, which all heads share")
+    if meta.get("blur") != BLUR:
+        sys.exit(f"{streams_of} has heads trained with another blur")
     heads = {k: v for k, v in quantise(model, ranges_of(model, samples)).items() if k.startswith("gg.")}
     out = {k: v for k, v in out.items() if not is_quick(k)} | {"gg.quick." + k.removeprefix("gg."): v for k, v in heads.items()}
     meta |= {"gg": own + [{**g, "heads": "quick"} for g in model.cfg["gg"]], "quick_steps": info["steps"]}

@@ -801,7 +801,9 @@ Tensor pool_grad(const Tensor& dy, const Tensor& first, int64_t rows) {
 // ---------------------------------------------------------------------------------------------------------------
 // Splatter. Cameras: world-to-camera rotation (9), translation (3), fx, fy, cx, cy.
 
-constexpr float ALPHA_MAX = 0.99f, ALPHA_MIN = 1.f / 16384, T_MIN = 1e-4f, BLUR = 0.3f, NEAR = 1e-2f;
+constexpr float ALPHA_MAX = 0.99f, ALPHA_MIN = 1.f / 16384, T_MIN = 1e-4f, NEAR = 1e-2f;
+// What every splat is widened by: so much of a finest voxel squared, or of a pixel squared if that is more.
+constexpr float VOXEL_BLUR = 0.1f, PIXEL_BLUR = 1.f / 32;
 constexpr int TILE = 16;
 
 struct View {
@@ -819,6 +821,8 @@ struct Projected {
   float ex, ey;             // half extents at ALPHA_MIN
   bool seen;
 };
+
+float voxel_blur(const View& w, float iz) { return VOXEL_BLUR * w.fx * w.fy * iz * iz; }
 
 Projected project(const View& w, const float* p, const float* s, float opacity) {
   Projected q{};
@@ -838,8 +842,9 @@ Projected project(const View& w, const float* p, const float* s, float opacity) 
     h[3 * i + 1] = m[3 * i] * s[1] + m[3 * i + 1] * s[3] + m[3 * i + 2] * s[4];
     h[3 * i + 2] = m[3 * i] * s[2] + m[3 * i + 1] * s[4] + m[3 * i + 2] * s[5];
   }
-  const float xx = h[0] * m[0] + h[1] * m[1] + h[2] * m[2] + BLUR, xy = h[0] * m[3] + h[1] * m[4] + h[2] * m[5],
-              yy = h[3] * m[3] + h[4] * m[4] + h[5] * m[5] + BLUR, det = xx * yy - xy * xy;
+  const float blur = std::max(PIXEL_BLUR, voxel_blur(w, iz));
+  const float xx = h[0] * m[0] + h[1] * m[1] + h[2] * m[2] + blur, xy = h[0] * m[3] + h[1] * m[4] + h[2] * m[5],
+              yy = h[3] * m[3] + h[4] * m[4] + h[5] * m[5] + blur, det = xx * yy - xy * xy;
   if (!(det > 0)) return q;
   q.a = yy / det, q.b = -xy / det, q.c = xx / det;
   q.u = w.fx * q.x * iz + w.cx, q.v = w.fy * q.y * iz + w.cy;
@@ -1088,7 +1093,8 @@ std::vector<Tensor> splat_grad(const Tensor& mean, const Tensor& cov, const Tens
       auto dot = [&](int row, int cam) { return dm[3 * row] * R[3 * cam] + dm[3 * row + 1] * R[3 * cam + 1] + dm[3 * row + 2] * R[3 * cam + 2]; };
       const float d00 = dot(0, 0), d02 = dot(0, 2), d11 = dot(1, 1), d12 = dot(1, 2), iz = 1 / p.z, iz2 = iz * iz, iz3 = iz2 * iz;
       const float tx = -d02 * w.fx * iz2 + d[4] * w.fx * iz, ty = -d12 * w.fy * iz2 + d[5] * w.fy * iz;
-      const float tz = -d00 * w.fx * iz2 + 2 * d02 * w.fx * p.x * iz3 - d11 * w.fy * iz2 + 2 * d12 * w.fy * p.y * iz3 - d[4] * w.fx * p.x * iz2 - d[5] * w.fy * p.y * iz2;
+      const float widened = voxel_blur(w, iz) > PIXEL_BLUR ? -2 * voxel_blur(w, iz) * iz * (xx + yy) : 0.f;
+      const float tz = widened - d00 * w.fx * iz2 + 2 * d02 * w.fx * p.x * iz3 - d11 * w.fy * iz2 + 2 * d12 * w.fy * p.y * iz3 - d[4] * w.fx * p.x * iz2 - d[5] * w.fy * p.y * iz2;
       for (int k = 0; k < 3; k++) gm[3 * i + k] += R[k] * tx + R[3 + k] * ty + R[6 + k] * tz;
     }
   }

@@ -243,7 +243,9 @@ def pool(x, first):
 # ---------------------------------------------------------------------------------------------------------------------
 # Splatter
 
-ALPHA_MAX, ALPHA_MIN, T_MIN, BLUR, NEAR = 0.99, 1.0 / 16384, 1e-4, 0.3, 1e-2
+ALPHA_MAX, ALPHA_MIN, T_MIN, NEAR = 0.99, 1.0 / 16384, 1e-4, 1e-2
+# What every splat is widened by: so much of a finest voxel squared, or of a pixel squared if that is more.
+VOXEL_BLUR, PIXEL_BLUR = 0.1, 1.0 / 32
 
 
 def covariance(scale, rotation):
@@ -289,7 +291,8 @@ def _splat_view(mean, cov, opacity, colour, camera, background, width, height):
     j = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], 1).view(-1, 2, 3)
     m = j @ r
     full = s[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
-    c2 = m @ full @ m.transpose(1, 2) + BLUR * torch.eye(2, device=p.device, dtype=p.dtype)
+    blur = (VOXEL_BLUR * fx * fy / z**2).clamp_min(PIXEL_BLUR)
+    c2 = m @ full @ m.transpose(1, 2) + blur[:, None, None] * torch.eye(2, device=p.device, dtype=p.dtype)
     det = c2[:, 0, 0] * c2[:, 1, 1] - c2[:, 0, 1] ** 2
     a, b, c = c2[:, 1, 1] / det, -c2[:, 0, 1] / det, c2[:, 0, 0] / det
     u, v = fx * x / z + cx, fy * y / z + cy

@@ -91,6 +91,9 @@ all=(--freeze-finest --lr-heads 3 --rate-start 1 --rate-ramp 0.01 --rounding-fro
 # The same, with whole objects among the crops.
 mixed=(--data "$out/mixed" --held-out 20 --freeze-finest --lr-heads 3 --rate-start 1 --rate-ramp 0.01 --rounding-from 0 --decay-from 0.2 --warmup 200 --square 40)
 
+# Heads alone, once all else has learned.
+last=(--data "$out/mixed" --held-out 20 --only-heads --lam 1 --lr-conv 4e-4 --lr-linear 6.5e-4 --warmup 50 --decay-from 0.2 --coarse 0.45 --average 0.998 --square 40)
+
 train start lite 100 --lam 18 --rate-start 0.2 --rate-ramp 0.12 --rounding-from 0.03 --decay-from 0.35 --warmup 400
 train low lite 12 --init "$out/start/last.pt" --lam 4 --freeze-finest --rate-start 1 --rate-ramp 0.01 --rounding-from 0.02 --decay-from 0.3 --warmup 100
 train low-heads lite 44 --init "$out/low/last.pt" --lam 1 "${heads[@]}"
@@ -100,7 +103,8 @@ train low-rest lite 30 --init "$out/low-whole-2/last.pt" --lam 4 "${rest[@]}"
 fit low-rest
 train low-mixed lite 42 --init "$out/low-rest/tuned.pt" --lam 4 "${mixed[@]}"
 train low-more lite 70 --init "$out/low-mixed/last.pt" --lam 4 "${mixed[@]}"
-ship low-more lite-low "0.02 0.05 0.05" "0.05 0.15 0.15"
+train low-last lite 19 --init "$out/low-more/last.pt" "${last[@]}"
+ship low-last lite-low "0.02 0.05 0.05" "0.05 0.15 0.15"
 imitating lite-low 15
 train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
 train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
@@ -109,7 +113,8 @@ train high-whole-2 lite 25 --init "$out/high-whole-1/last.pt" --coarse 0 "${whol
 fit high-whole-2
 train high-mixed lite 82 --init "$out/high-whole-2/tuned.pt" --lam 16 "${mixed[@]}"
 train high-more lite 82 --init "$out/high-mixed/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
-ship high-more lite "0.03 0.1 0.1" "0.1 0.2 0.2"
+train high-last lite 24 --init "$out/high-more/last.pt" "${last[@]}"
+ship high-last lite "0.03 0.1 0.1" "0.1 0.2 0.2"
 imitating lite 15
 train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
@@ -117,5 +122,6 @@ train least-whole-2 lite 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${wh
 train least-rest lite 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@]}"
 fit least-rest
 train least-mixed lite 40 --init "$out/least-rest/tuned.pt" --lam 1.2 "${mixed[@]}"
-ship least-mixed lite-least "0 0.02 0.02" "0.02 0.05 0.05"
+train least-last lite 19 --init "$out/least-mixed/last.pt" "${last[@]}"
+ship least-last lite-least "0 0.02 0.02" "0.02 0.05 0.05"
 imitating lite-least 15

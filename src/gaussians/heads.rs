@@ -14,10 +14,6 @@ use super::{Frame, Gaussians};
 use crate::geometry::Voxels;
 use crate::network::{RAW, Shape};
 
-/// The blur of a stream's Gaussians, in squared edges of a generated voxel: the trainer's 0.3 px² where such a voxel is two pixels wide, which
-/// is the middle of the sizes that it draws.
-const BLUR: f32 = 0.075;
-
 /// Gaussians per parallel task.
 const BLOCK: usize = 4096;
 
@@ -40,7 +36,7 @@ pub fn activate(
     let generated = voxels.depth() + u8::from(children == 8);
     let edge = 2.0 / (1u32 << generated) as f32;
     let mut gaussians = Gaussians {
-        blur: BLUR * edge * edge,
+        blur: shape.blur * edge * edge,
         position: zeros(count),
         scale: zeros(count),
         rotation: zeros(count),

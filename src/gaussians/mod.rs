@@ -34,8 +34,9 @@ pub struct Gaussians {
     pub harmonics: Harmonics,
     /// Whether they were made to be drawn with opacity compensation (anti-aliasing).
     pub compensated: bool,
-    /// Pictures widen every Gaussian by this variance, in cube-frame units squared, where it comes to more than a pixel's own blur: a
-    /// stream's Gaussians were trained blurred like that, and leave gaps without it when seen from close up. Zero for none.
+    /// Pictures widen every Gaussian by this variance, in cube-frame units squared: a stream's Gaussians were trained like that, and leave
+    /// gaps without it when seen from close up. Zero for none; then, and wherever it comes to less, the pixel's blur takes its place
+    /// ([`Gaussians::pixel_blur`]).
     pub blur: f32,
     /// Where the cube lies in the world.
     pub frame: Frame,
@@ -75,6 +76,26 @@ impl Gaussians {
     /// How many Gaussians.
     pub fn len(&self) -> usize {
         self.position.len()
+    }
+
+    /// The variance, in px², that pictures widen every Gaussian by at least: 0.3, which 3D Gaussian Splatting trains with, or next to
+    /// nothing where they have a blur of their own. That keeps surfaces closed whatever the distance; by 0.3 more, silhouettes would
+    /// grow the more, the smaller an object is seen.
+    pub fn pixel_blur(&self) -> f32 {
+        if self.own_blur() > 0.0 {
+            1.0 / 32.0
+        } else {
+            0.3
+        }
+    }
+
+    /// [`Gaussians::blur`], where it is a variance; otherwise none.
+    pub(crate) fn own_blur(&self) -> f32 {
+        if self.blur.is_finite() {
+            self.blur.max(0.0)
+        } else {
+            0.0
+        }
     }
 
     /// Whether there are none.

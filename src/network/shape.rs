@@ -59,6 +59,9 @@ pub struct Shape {
     pub scale_bias: f32,
     /// Added to the raw opacity before the sigmoid.
     pub opacity_bias: f32,
+    /// Variance that pictures widen the Gaussians by, in squared voxels ([`crate::gaussians::Gaussians::blur`]): what they were trained with.
+    #[serde(default = "first_blur")]
+    pub blur: f32,
     /// The weight of distortion against rate that the model was trained with.
     #[serde(default, rename = "lambda", skip_serializing_if = "Option::is_none")]
     pub lambda: Option<f64>,
@@ -72,6 +75,11 @@ pub enum Upsample {
     Nearest,
     /// A linear layer per octant.
     Learned,
+}
+
+/// Of models whose descriptions do not say.
+fn first_blur() -> f32 {
+    0.075
 }
 
 fn all_roles() -> usize {
@@ -119,6 +127,7 @@ impl Shape {
             scale_range: 1.0,
             scale_bias: -0.31,
             opacity_bias: 2.0,
+            blur: first_blur(),
             lambda: None,
         }
     }
@@ -307,6 +316,7 @@ impl Shape {
             &self.opacity_bias,
             "−64 to 64",
         )?;
+        require(within(self.blur, 0.0, 1.0), "blur", &self.blur, "0 to 1")?;
         for (i, head) in self.gg.iter().enumerate() {
             let field = |name: &str| format!("gg[{i}].{name}");
             let before = |heads| {
@@ -454,6 +464,7 @@ mod tests {
             ("/latent_max", "0"),
             ("/latent_shift", "200"),
             ("/scale_range", "0"),
+            ("/blur", "-1"),
             ("/offset_range", "1e30"),
             ("/gg/0/role", "2"),
             ("/gg/0/role", "0"),

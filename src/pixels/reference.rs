@@ -198,7 +198,8 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Op
     if crosses {
         let pinhole = camera.projection == Projection::Pinhole;
         let distance = if pinhole { t.z.max(camera.near) } else { 1.0 };
-        let blur = 0.3 * distance * distance / (camera.fx * camera.fy);
+        let blur =
+            f64::from(gaussians.pixel_blur()) * distance * distance / (camera.fx * camera.fy);
         let variance = scale * scale + blur.max(gaussians.blur.into());
         let whiten = DMat3::from_diagonal(variance.map(|v| 1.0 / v.sqrt())) * axes.transpose();
         return Some(Seen {
@@ -230,7 +231,7 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Op
     let (a, c) = (jx.dot(sigma * jx), jy.dot(sigma * jy));
     let near = if pinhole { t.z } else { 1.0 };
     let own = f64::from(gaussians.blur) * camera.fx * camera.fy / (near * near);
-    let blur = own.max(0.3);
+    let blur = own.max(gaussians.pixel_blur().into());
     let covariance = DMat2::from_cols(DVec2::new(a + blur, b), DVec2::new(b, c + blur));
     let kept = ((a * c - b * b).max(0.0) / covariance.determinant()).sqrt();
     let opacity = if cutoffs.compensated {

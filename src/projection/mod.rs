@@ -1,8 +1,8 @@
 //! From Gaussians to ellipses on the picture.
 //!
-//! A Gaussian with axes `R·S` is seen as the image of its centre and the 2×2 covariance `M·Mᵀ + 0.3·I`, where `M = J·W·R·S` and `J`
-//! is the derivative of the pinhole projection at the centre (EWA splatting; 0.3 px² is the pixel's own blur; where the Gaussians' own, [`Gaussians::blur`], comes to more, that takes its place). The covariance is
-//! never formed and inverted, which loses a long thin ellipse to cancellation in single precision; the kernel has the formulas
+//! A Gaussian with axes `R·S` is seen as the image of its centre and the 2×2 covariance `M·Mᵀ + b·I`, where `M = J·W·R·S` and `J`
+//! is the derivative of the pinhole projection at the centre (EWA splatting), and `b` the Gaussians' own blur ([`Gaussians::blur`]) at that distance, or the pixel's
+//! ([`Gaussians::pixel_blur`]) if that is more. The covariance is never formed and inverted, which loses a long thin ellipse to cancellation in single precision; the kernel has the formulas
 //! ([`b2p_kernels::splat`]).
 //!
 //! [`Ellipses::project`] is the sole gate of visibility: its conditions are phrased so that NaN fails them, and everything after it
@@ -21,7 +21,7 @@ use b2p_kernels::splat::{self, Cloud, Crossing, Tally, View};
 use rayon::iter::repeat_n;
 use rayon::prelude::*;
 
-pub use b2p_kernels::splat::{BLUR, Bounds, Ellipse, MAX_SCALE};
+pub use b2p_kernels::splat::{Bounds, Ellipse, MAX_SCALE};
 pub use camera::{Camera, Projection};
 
 use crate::error::{Error, Result};
@@ -129,7 +129,7 @@ impl Ellipses {
                 detail: format!("there are {count}"),
             });
         }
-        let view = view(camera, how, gaussians.blur);
+        let view = view(camera, how, gaussians);
         let length = run_length(count);
         if self.all.len() < count {
             if self.all.capacity() < count {
@@ -312,7 +312,7 @@ impl From<Tally> for Dropped {
 }
 
 /// The camera as the kernel has it.
-fn view(camera: &Camera, how: How, blur: f32) -> View {
+fn view(camera: &Camera, how: How, gaussians: &Gaussians) -> View {
     let rotation = camera.pose.matrix3;
     View {
         rotation: std::array::from_fn(|i| rotation.row(i).into()),
@@ -326,10 +326,7 @@ fn view(camera: &Camera, how: How, blur: f32) -> View {
         floor: how.floor,
         orthographic: camera.projection == Projection::Orthographic,
         compensated: how.compensated,
-        blur: if blur.is_finite() {
-            blur.max(0.0).into()
-        } else {
-            0.0
-        },
+        blur: gaussians.own_blur().into(),
+        pixel_blur: gaussians.pixel_blur(),
     }
 }

@@ -2,7 +2,7 @@
 
 use glam::{DAffine3, Mat3, Quat, Vec3};
 
-use super::{BLUR, Bounds, Camera, Ellipse, Ellipses, How, MAX_SCALE};
+use super::{Bounds, Camera, Ellipse, Ellipses, How, MAX_SCALE};
 use crate::gaussians::Gaussians;
 use b2p_kernels::Isa;
 
@@ -80,7 +80,7 @@ impl View {
         let (x, m1) = along(0, seen.x);
         let (y, m2) = along(1, seen.y);
         let own = f64::from(gaussians.blur) * self.focal[0] * self.focal[1] * inverse * inverse;
-        let blur = BLUR.max(own as f32);
+        let blur = gaussians.pixel_blur().max(own as f32);
         let (a, c) = (m1.length_squared() + blur, m2.length_squared() + blur);
         let finite = Vec3::new(depth, x, y).is_finite() && a.is_finite() && c.is_finite();
         require(finite, Invisible::NotFinite)?;

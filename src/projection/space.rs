@@ -1,6 +1,6 @@
 //! What effects need to know of a Gaussian beyond its ellipse.
 
-use b2p_kernels::splat::{BLUR, Crossing, MAX_SCALE};
+use b2p_kernels::splat::{Crossing, MAX_SCALE};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::{Camera, Projection};
@@ -45,7 +45,7 @@ pub(super) fn crossing(gaussians: &Gaussians, camera: &Camera, i: usize) -> Cros
         1.0
     };
     let pixel = distance * distance / (focal.x * focal.y);
-    let blur = (f64::from(BLUR) * pixel).max(f64::from(gaussians.blur));
+    let blur = (f64::from(gaussians.pixel_blur()) * pixel).max(gaussians.own_blur().into());
     let measure = (scale * scale + blur).map(|variance| FORM_SCALE / variance.sqrt());
     // From the camera's axes to the Gaussian's, in its own measure.
     let whiten = DMat3::from_diagonal(measure) * axes.transpose();
@@ -90,8 +90,8 @@ pub(super) fn slopes(gaussians: &Gaussians, camera: &Camera, i: usize) -> [f32; 
         }
         Projection::Orthographic => (right * camera.fx, down * camera.fy, 1.0),
     };
-    let own = f64::from(gaussians.blur) * camera.fx * camera.fy / (near * near);
-    let blur = own.max(f64::from(BLUR));
+    let own = f64::from(gaussians.own_blur()) * camera.fx * camera.fy / (near * near);
+    let blur = own.max(gaussians.pixel_blur().into());
     let (a, b, c) = (
         m1.length_squared() + blur,
         m1.dot(m2),

@@ -23,8 +23,6 @@ mod tests;
 pub use blend::{Loop, Scene, Share, TILE, Tile};
 pub use project::{Cloud, Tally, View, project};
 
-/// Variance that every ellipse is widened by, in px².
-pub const BLUR: f32 = 0.3;
 /// The greatest α of one ellipse.
 pub const ALPHA_CEILING: f32 = 0.99;
 /// A pixel that lets less light through than this is finished: what is not drawn is less than a quarter of a step of eight bits.

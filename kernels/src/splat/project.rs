@@ -8,7 +8,7 @@
 
 use super::ahead::Ahead;
 use super::lanes::{Double, Lanes, Mask, by_level, four, three};
-use super::{BLUR, Bounds, Ellipse, MAX_SCALE, MIN_COMPENSATION};
+use super::{Bounds, Ellipse, MAX_SCALE, MIN_COMPENSATION};
 use crate::Isa;
 
 /// `√(log₂(e)/2)`: with it `exp(−½d²) = 2^−(d·FORM_SCALE)²`.
@@ -48,9 +48,11 @@ pub struct View {
     pub orthographic: bool,
     /// Opacity is taken back by as much as the blur widens.
     pub compensated: bool,
-    /// The Gaussians' own blur: a variance in squared units of length, finite, at least 0. It counts where it comes to more pixels than
-    /// [`BLUR`].
+    /// The Gaussians' own blur: a variance in squared units of length, finite, at least 0. It counts where it comes to more than the
+    /// pixel's.
     pub blur: f64,
+    /// The pixel's blur: every ellipse is widened by at least this variance, in px², more than 0.
+    pub pixel_blur: f32,
 }
 
 /// Gaussians, one slice per parameter, all of the same length.
@@ -188,7 +190,9 @@ pub(super) struct Camera<L: Lanes> {
     log_floor: L,
     /// The Gaussians' own blur in pixels at distance 1.
     blur: L::Double,
-    /// [`BLUR`] in units of length at distance 1, and the Gaussians' own in these.
+    /// The pixel's blur in px².
+    pixel_blur: L,
+    /// The same in units of length at distance 1, and the Gaussians' own in these.
     pub(super) pixel: L,
     pub(super) own: L,
 }
@@ -215,7 +219,8 @@ impl<L: Lanes> Camera<L> {
             floor: L::splat(view.floor),
             log_floor: L::splat(view.floor.log2()),
             blur: L::Double::splat(view.blur * view.focal[0] * view.focal[1]),
-            pixel: L::splat((f64::from(BLUR) / view.focal[0] / view.focal[1]) as f32),
+            pixel_blur: L::splat(view.pixel_blur),
+            pixel: L::splat((f64::from(view.pixel_blur) / view.focal[0] / view.focal[1]) as f32),
             own: L::splat(view.blur as f32),
         }
     }
@@ -270,7 +275,7 @@ impl<L: Lanes> Camera<L> {
         } else {
             self.blur.mul(inverse).mul(inverse)
         };
-        let blur = own.to_lanes().max(L::splat(BLUR));
+        let blur = own.to_lanes().max(self.pixel_blur);
         let (a0, c0) = (dot(m1, m1), dot(m2, m2));
         let (a, c) = (a0.add(blur), c0.add(blur));
         let products = depth.mul_add(zero, x.mul(zero));

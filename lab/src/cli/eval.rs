@@ -21,7 +21,7 @@ use crate::surface::Surface;
 /// Judge streams and point clouds by pictures of the mesh they came from
 ///
 /// Every item is drawn from twelve cameras and compared with the mesh: PSNR over whole pictures and over the foreground, MS-SSIM,
-/// SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes) and as one round Gaussian a point. With a cloud and a
+/// SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes) and as one round Gaussian a point (of four). With a cloud and a
 /// model but no stream among the items, the cloud is coded first.
 #[derive(Debug, clap::Args)]
 pub struct Args {

@@ -9,6 +9,9 @@ use b2p::projection::Camera;
 
 use super::nearest::mean_nearest_distance;
 
+/// The share of a round Gaussian's variance that is blur.
+const OWN_BLUR: f64 = 0.01;
+
 /// A cloud's points in the cube frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Points {
@@ -82,15 +85,19 @@ impl Points {
         image
     }
 
-    /// One round Gaussian a point: σ is the cloud's mean distance from a point to the nearest other, opacity 1.
-    pub fn to_gaussians(&self, frame: Frame) -> Gaussians {
-        let sigma = mean_nearest_distance(&self.positions).unwrap_or(self.spacing) as f32;
+    /// One round Gaussian a point: σ is the `factor`-fold mean distance from a point to the nearest other, opacity 1. Some of σ² counts as
+    /// a blur of their own, so that pictures widen them by no more than a stream's.
+    pub fn to_gaussians(&self, frame: Frame, factor: f64) -> Gaussians {
+        let nearest = mean_nearest_distance(&self.positions).unwrap_or(self.spacing);
+        let variance = (factor * nearest).powi(2);
+        let sigma = ((1.0 - OWN_BLUR) * variance).sqrt() as f32;
         let count = self.positions.len();
         Gaussians {
             position: self.positions.clone(),
             scale: vec![[sigma; 3]; count],
             rotation: vec![[1.0, 0.0, 0.0, 0.0]; count],
             opacity: vec![1.0; count],
+            blur: (OWN_BLUR * variance) as f32,
             colour: self
                 .colours
                 .iter()
@@ -276,12 +283,13 @@ mod tests {
     }
 
     #[test]
-    fn the_global_gaussian_is_as_wide_as_points_are_apart() {
+    fn a_global_gaussian_is_as_wide_as_the_wanted_part_of_what_points_are_apart() {
         let mut points = one([0.0; 3], 0.1);
         points.positions.push([0.0, 0.2, 0.0]);
         points.colours.push([0; 3]);
-        let gaussians = points.to_gaussians(Frame::default());
-        assert_eq!(gaussians.scale, [[0.2; 3]; 2]);
+        let gaussians = points.to_gaussians(Frame::default(), 0.5);
+        let variance = gaussians.scale[1][2].powi(2) + gaussians.blur;
+        assert!((variance - 0.01).abs() < 1e-6, "{variance}");
         assert_eq!(gaussians.opacity, [1.0; 2]);
     }
 }

@@ -236,7 +236,7 @@ mod tests {
     #[test]
     fn truth_points_and_gaussians_are_seen_at_the_same_place_from_every_side() {
         let (surface, points) = ball();
-        let gaussians = points.to_gaussians(Default::default());
+        let gaussians = points.to_gaussians(Default::default(), 1.0);
         for index in [0, 4, 9] {
             let view = TrueView::new(&surface, index).unwrap();
             let squares = points.draw_squares(&view.camera, 1.0).box_half();

@@ -20,16 +20,34 @@ fn gaussians_with_a_blur_of_their_own_are_close_to_the_reference() {
 }
 
 #[test]
-fn a_blur_below_the_pixel_s_own_changes_no_picture_and_one_above_closes_gaps() {
+fn gaussians_with_a_blur_of_their_own_close_gaps_from_close_up_and_stay_slim_from_afar() {
     let small = surface_splats(2000, 0.8, 1e-3);
     let mut scene = scene(small);
     let (far, near) = (orbit(64, 64), orbit(640, 640));
     let [before_far, before_near] = [&far, &near].map(|camera| draw(&scene, camera));
     // A deviation of 0.01: a quarter of a pixel from afar, two and a half from close up.
     scene.blur = 1e-4;
-    assert_eq!(draw(&scene, &far).pixels, before_far.pixels);
+    let ink = |image: &Image| image.pixels.iter().map(|p| 1.0 - p[0]).sum::<f32>();
     let covered = |image: &Image| image.pixels.iter().filter(|p| p[0] < 0.9).count();
     assert!(covered(&draw(&scene, &near)) > 2 * covered(&before_near));
+    assert!(ink(&draw(&scene, &far)) < 0.95 * ink(&before_far));
+}
+
+#[test]
+fn an_object_with_a_blur_of_its_own_is_as_large_from_afar_as_from_close_up() {
+    let mut scene = scene(surface_splats(20_000, 0.8, 1e-3));
+    scene.blur = 4e-4;
+    let ink = |side: u32| {
+        let image = draw(&scene, &orbit(side, side));
+        let all = image
+            .pixels
+            .iter()
+            .map(|p| f64::from(1.0 - p[0]))
+            .sum::<f64>();
+        all / f64::from(side * side)
+    };
+    let (near, far) = (ink(512), ink(64));
+    assert!((far / near - 1.0).abs() < 0.02, "{near} {far}");
 }
 
 #[test]
