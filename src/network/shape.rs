@@ -244,7 +244,6 @@ impl Shape {
                 expected,
             )),
         };
-        let within = |value: f32, low: f32, high: f32| (low..=high).contains(&value);
         let channels = |n: usize| n > 0 && n <= MAX_CHANNELS && n.is_multiple_of(4);
         require(
             channels(self.channels),
@@ -292,31 +291,16 @@ impl Shape {
             &reach,
             "at most 2047",
         )?;
-        require(
-            within(self.offset_range, 0.0, 64.0),
-            "offset_range",
-            &self.offset_range,
-            "0 to 64",
-        )?;
-        require(
-            within(self.scale_range, 1e-3, 64.0),
-            "scale_range",
-            &self.scale_range,
-            "0.001 to 64",
-        )?;
-        require(
-            within(self.scale_bias, -64.0, 64.0),
-            "scale_bias",
-            &self.scale_bias,
-            "−64 to 64",
-        )?;
-        require(
-            within(self.opacity_bias, -64.0, 64.0),
-            "opacity_bias",
-            &self.opacity_bias,
-            "−64 to 64",
-        )?;
-        require(within(self.blur, 0.0, 1.0), "blur", &self.blur, "0 to 1")?;
+        let ranges = [
+            ("offset_range", self.offset_range, 0.0, 64.0, "0 to 64"),
+            ("scale_range", self.scale_range, 1e-3, 64.0, "0.001 to 64"),
+            ("scale_bias", self.scale_bias, -64.0, 64.0, "−64 to 64"),
+            ("opacity_bias", self.opacity_bias, -64.0, 64.0, "−64 to 64"),
+            ("blur", self.blur, 0.0, 1.0, "0 to 1"),
+        ];
+        for (field, value, low, high, expected) in ranges {
+            require((low..=high).contains(&value), field, &value, expected)?;
+        }
         for (i, head) in self.gg.iter().enumerate() {
             let field = |name: &str| format!("gg[{i}].{name}");
             let before = |heads| {

@@ -48,10 +48,9 @@ pub struct View {
     pub orthographic: bool,
     /// Opacity is taken back by as much as the blur widens.
     pub compensated: bool,
-    /// The Gaussians' own blur: a variance in squared units of length, finite, at least 0. It counts where it comes to more than the
-    /// pixel's.
+    /// The Gaussians' own blur: a variance in squared units of length, finite, at least 0.
     pub blur: f64,
-    /// The pixel's blur: every ellipse is widened by at least this variance, in px², more than 0.
+    /// The pixel's, in px², more than 0: what ellipses are widened by where the Gaussians' own comes to less.
     pub pixel_blur: f32,
 }
 
@@ -188,11 +187,10 @@ pub(super) struct Camera<L: Lanes> {
     pub(super) window: [[L; 2]; 2],
     floor: L,
     log_floor: L,
-    /// The Gaussians' own blur in pixels at distance 1.
+    /// The Gaussians' own blur in pixels at distance 1, and the pixel's in px².
     blur: L::Double,
-    /// The pixel's blur in px².
     pixel_blur: L,
-    /// The same in units of length at distance 1, and the Gaussians' own in these.
+    /// Both in units of length, the pixel's at distance 1.
     pub(super) pixel: L,
     pub(super) own: L,
 }
@@ -426,8 +424,7 @@ impl<L: Lanes> Camera<L> {
     }
 }
 
-/// The first and the end of the pixels from `low` to `high` whose centres lie within `half` of `centre`. None if the first isn't below
-/// the end.
+/// The first and the end of the pixels from `low` to `high` whose centres lie within `half` of `centre`: none if they don't rise.
 #[inline(always)]
 fn covered<L: Lanes>(centre: L, half: L, [low, high]: [L; 2]) -> (L, L) {
     let middle = L::splat(0.5);
@@ -443,7 +440,6 @@ fn rotation_matrix<L: Lanes>(mut q: [L; 4]) -> ([[L; 3]; 3], L::Mask) {
     let (zero, one) = (L::splat(0.0), L::splat(1.0));
     let [w, x, y, z] = q;
     let largest = w.abs().max(x.abs()).max(y.abs().max(z.abs()));
-    let turned = zero.lt(largest);
     let mut length = squared(q);
     let usual = L::splat(LENGTHS[0])
         .le(length)
@@ -464,7 +460,7 @@ fn rotation_matrix<L: Lanes>(mut q: [L; 4]) -> ([[L; 3]; 3], L::Mask) {
         [xy.sub(wz), one.sub(xx).sub(zz), yz.add(wx)],
         [xz.add(wy), yz.sub(wx), one.sub(xx).sub(yy)],
     ];
-    (columns, turned)
+    (columns, zero.lt(largest))
 }
 
 /// The binary logarithm of a positive normal number, to 10⁻⁷; exact for powers of two.
