@@ -83,7 +83,7 @@ impl Gaussians {
     /// grow the more, the smaller an object is seen.
     pub fn pixel_blur(&self) -> f32 {
         if self.own_blur() > 0.0 {
-            1.0 / 32.0
+            1.0 / 16.0
         } else {
             0.3
         }
