@@ -35,7 +35,7 @@ fn plain_with_both_heads() -> (Model, Encoded) {
 
 #[test]
 fn filters_bring_the_colours_of_gaussians_nearer_to_the_cloud_s_and_change_nothing_else() {
-    let (model, cloud) = (model(), ball(7, 45.0));
+    let (model, cloud) = (model(), ball(8, 90.0));
     let with = |filter: bool| {
         let options = Options {
             filter,
