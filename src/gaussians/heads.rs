@@ -186,6 +186,19 @@ mod tests {
     }
 
     #[test]
+    fn the_model_says_how_blurred_its_gaussians_are_in_generated_voxels() {
+        let shape = Shape {
+            blur: 0.25,
+            ..Shape::tiny()
+        };
+        for (children, edge) in [(1, 1.0), (8, 0.5)] {
+            let (raw, voxels) = (vec![0.0; children * RAW], Voxels::new(1, vec![7]));
+            let gaussians = activate(&raw, &voxels, children, &shape, Frame::default());
+            assert_eq!(gaussians.blur, 0.25 * edge * edge);
+        }
+    }
+
+    #[test]
     fn extreme_raw_numbers_stay_finite_and_in_range() {
         let voxels = Voxels::new(3, vec![5]);
         for extreme in [65504.0, -65504.0] {

@@ -34,8 +34,8 @@ pub struct Gaussians {
     pub harmonics: Harmonics,
     /// Whether they were made to be drawn with opacity compensation (anti-aliasing).
     pub compensated: bool,
-    /// Pictures widen every Gaussian by this variance, in cube-frame units squared: a stream's Gaussians were trained like that, and leave
-    /// gaps without it when seen from close up. Zero for none; then, and wherever it comes to less, the pixel's blur takes its place
+    /// Pictures widen every Gaussian by this variance, in cube-frame units squared: a stream's Gaussians were trained with about so much, and
+    /// leave gaps without it when seen from close up. Zero for none; then, and wherever it comes to less, the pixel's blur takes its place
     /// ([`Gaussians::pixel_blur`]).
     pub blur: f32,
     /// Where the cube lies in the world.

@@ -59,7 +59,7 @@ pub struct Shape {
     pub scale_bias: f32,
     /// Added to the raw opacity before the sigmoid.
     pub opacity_bias: f32,
-    /// Variance that pictures widen the Gaussians by, in squared voxels ([`crate::gaussians::Gaussians::blur`]): what they were trained with.
+    /// Variance that pictures widen the Gaussians by, in squared voxels ([`crate::gaussians::Gaussians::blur`]): about what they were trained with.
     #[serde(default = "first_blur")]
     pub blur: f32,
     /// The weight of distortion against rate that the model was trained with.

@@ -35,8 +35,9 @@ fn gaussians_with_a_blur_of_their_own_close_gaps_from_close_up_and_stay_slim_fro
 
 #[test]
 fn an_object_with_a_blur_of_its_own_is_as_large_from_afar_as_from_close_up() {
-    let mut scene = scene(surface_splats(20_000, 0.8, 1e-3));
-    scene.blur = 4e-4;
+    let mut scene = scene(surface_splats(40_000, 0.8, 1e-3));
+    // From afar a fifteenth of a pixel squared.
+    scene.blur = 1e-4;
     let ink = |side: u32| {
         let image = draw(&scene, &orbit(side, side));
         let all = image
