@@ -366,6 +366,36 @@ def a_network_without_a_reconstruction_starts_near_one_that_had_it():
     return f"{100 * left / whole:.0f} % of the features' variance is left"
 
 
+def a_network_of_half_as_many_channels_grows_and_does_the_same():
+    sample, changes = data.procedural(1, size=48, views=2, pixels=60), {"latent_roles": 2, "fr_roles": 2, "near_channels": [16, 0]}
+    with tempfile.TemporaryDirectory() as folder, open(os.path.join(HERE, "configs/tiny.json")) as f:
+        config, paths = json.load(f) | changes, {}
+        for channels in (8, 16):
+            paths[channels] = f"{folder}/{channels}.json"
+            heads = [gg | {"channels": channels} for gg in config["gg"]]
+            with open(paths[channels], "w") as to:
+                json.dump(config | {"channels": channels, "gg": heads}, to)
+        narrow = train.Trainer(arguments(config=paths[8], rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
+        for _ in range(20):
+            narrow.train_step([sample])
+        narrow.average = narrow.model.state_dict()
+        train.atomic_save(narrow.state(), f"{folder}/narrow.pt")
+        wide = train.Trainer(arguments(config=paths[16], rate_start=1.0, lam=60.0))
+        wide.start_from(f"{folder}/narrow.pt")
+    with torch.no_grad():
+        said = []
+        for trainer in (narrow, wide):
+            trail, bits, latents = trainer.model.code(sample.crop, trainer.model.analyse(sample.crop, sample.rgb), 2, "round")
+            said.append([torch.cat([y.flatten() for y in latents]), torch.stack(bits), *(trainer.model.generate(trail[r], sample.crop, r)[1] for r in (1, 2))])
+    worst = max(((a - b).abs().max() / b.abs().max()).item() for a, b in zip(*said, strict=True))
+    assert worst < 2e-3, f"{worst:.1e}"
+    head = wide.model.gg["2"].before[0].c1.weight
+    wide.train_step([sample])
+    apart = (head.grad[..., ::2] - head.grad[..., 1::2]).abs().max() / head.grad.abs().max()
+    assert apart > 0.05, "both copies of a channel learn the same"
+    return f"at most {worst:.1e} apart"
+
+
 def all_equal(a, b):
     return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
@@ -378,7 +408,7 @@ if __name__ == "__main__":
                   quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own, heads_that_imitate_others_come_to_say_what_these_say,
                   everything_else_learns_while_heads_stay, what_neighbours_tell_saves_bits_and_comes_from_those_before_alone,
                   the_integer_path_follows_the_float_path, so_it_does_where_the_finest_role_has_no_latents, and_where_nothing_makes_its_features,
-                  a_network_without_a_reconstruction_starts_near_one_that_had_it, a_crop_overfits):
+                  a_network_without_a_reconstruction_starts_near_one_that_had_it, a_network_of_half_as_many_channels_grows_and_does_the_same, a_crop_overfits):
         begin = time.monotonic()
         said = check()
         print(f"{check.__name__.replace('_', ' ')}: {said} ({time.monotonic() - begin:.0f} s)", flush=True)

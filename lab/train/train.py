@@ -20,6 +20,7 @@ from safetensors.torch import load_file
 import data
 import ops
 from crop import join
+from grow import grow
 from model import B2P, groups, parameters
 
 HERE = os.path.dirname(os.path.abspath(__file__))
@@ -184,12 +185,17 @@ class Trainer:
 
     def start_from(self, path):
         """Takes the averaged weights of a checkpoint, or those that `export.py --weights` wrote; all but the heads where only heads are
-        to be trained and the configuration has others."""
+        to be trained and the configuration has others. Half as many channels grow."""
         weights, before = self.weights_of(path), self.config_of(path)
         if before.get("fr_roles", 3) > self.cfg.get("fr_roles", 3):
             self.longer = B2P(before).to(self.device)
             self.longer.load_state_dict(weights)
             return
+        if before.get("channels", self.cfg["channels"]) < self.cfg["channels"]:
+            narrow = B2P(before).to(self.device)
+            narrow.load_state_dict(weights)
+            grow(self.model, narrow)
+            weights = self.model.state_dict()
         heads = lambda tensors: {k: v.shape for k, v in tensors.items() if k.startswith("gg.")}
         self.new_heads = self.args.only_heads and heads(weights) != heads(self.model.state_dict())
         if self.new_heads:
@@ -404,7 +410,7 @@ def main(argv=None):
     p.add_argument("--cache", help="with --freeze-finest: folder of features of the finest level, NAME.npy for each sample")
     p.add_argument("--stop-after", type=int, default=0, help="stop at this step, as an interruption would")
     p.add_argument("--stay", type=float, default=0.0, help="at the end, the share of the averaged weights that are those of --init again")
-    p.add_argument("--init", help="start from the averaged weights of this checkpoint, or from a file of `export.py --weights`")
+    p.add_argument("--init", help="start from the averaged weights of this checkpoint, or from a file of `export.py --weights`; of half as many channels: they grow")
     args = p.parse_args(argv)
 
     torch.set_num_threads(args.threads)

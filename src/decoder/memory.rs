@@ -17,6 +17,8 @@ const NODE: u64 = 8 + 1 + 4;
 const GAUSSIAN: u64 = 14 * 4;
 /// Bytes of a voxel in a colour residual, which any stream may have.
 const RESIDUAL: u64 = 3 * 2;
+/// Bytes of a voxel and its parent where passes learn: what lies nearby, what surprised, and of a latent its residual.
+const NEARBY: u64 = 144;
 /// Slices of a stream in memory, over their bytes in the stream.
 const SLICES: u64 = 4;
 
@@ -26,8 +28,8 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     ///
     /// That is linear in the voxels: with C channels and K latents, 230 + 10·C + 7·K bytes for each voxel of a level, the level above it
     /// with its features, 112 bytes for each Gaussian, 100 + 6·H bytes more for each that a generator of H channels makes at once, 208 + 6·H if it
-    /// makes one for each voxel, where a network of B channels predicts the base level 24 + 17·K + 4·B bytes for each of its voxels, and where
-    /// others correct the levels above it 9 + 3·K for each of the last one's.
+    /// makes one for each voxel, where a network of B channels predicts the base level 20 + 17·K + 4·B bytes for each of its voxels, where
+    /// others correct the levels above it 9 + 3·K for each of the last one's, and where passes learn 144 + 2·K for each of these.
     ///
     /// # Errors
     /// [`crate::Error::Usage`] if the stream has no such level.
@@ -45,10 +47,17 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let voxels = counts().next_back().unwrap_or(0);
         // Context, four tensors of a block, latents with their means and scales.
         let exact = parents * features + voxels * (MAP + RESIDUAL + 16 + 10 * c + 7 * k);
-        let base = counts().next().unwrap_or(0) * shape.base_bytes() as u64;
-        // Octants, the order of a pass, its means and scales, what surprised it.
+        let learning = match shape.learning {
+            true => NEARBY + 2 * k,
+            false => 0,
+        };
+        let base = match shape.base_bytes() as u64 {
+            0 => 0,
+            bytes => counts().next().unwrap_or(0) * (bytes + learning),
+        };
+        // Octants, the order of a pass, its means and scales.
         let near = match shape.corrects_up_to(levels - 1) {
-            true => voxels * (9 + 3 * k),
+            true => voxels * (9 + 3 * k + learning),
             false => 0,
         };
         let head = shape.head(levels - 1, self.heads).map_or(0, |head| {

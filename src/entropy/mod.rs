@@ -37,6 +37,7 @@ mod coding;
 mod coefficients;
 mod learning;
 mod level;
+mod nearby;
 mod passes;
 mod quantise;
 mod rows;

@@ -44,12 +44,12 @@ pub fn encode_passes(
             let slice = range(i, slice_voxels, keys.len());
             let (mut order, mut mu, mut sigma) = (Vec::new(), Vec::new(), Vec::new());
             let mut known = vec![0; part.len()];
-            let Ok(()) = each_voxel(tables, keys, slice, predict, &mut known, |at, m, s, own| {
-                own.copy_from_slice(&part[at * k..][..k]);
-                mu.extend_from_slice(m);
-                sigma.extend_from_slice(s);
-                order.extend_from_slice(own);
-                Ok::<_, Infallible>(())
+            let Ok(()) = each_latent(tables, keys, slice, predict, &mut known, |at, c, m, s| {
+                let latent = part[at * k + c];
+                mu.push(m);
+                sigma.push(s);
+                order.push(latent);
+                Ok::<_, Infallible>(latent)
             });
             let condition = Condition::Gauss {
                 mu: &mu,
@@ -60,36 +60,42 @@ pub fn encode_passes(
         .collect()
 }
 
-/// Goes through a slice in the order of coding. `latents` are those of the slice so far, [voxels, K]; `code` gets each voxel's number
-/// in the slice, means in sixteenths and scale indices of its latents, and says what they are, or fails.
-pub(super) fn each_voxel<E>(
+/// Goes through a slice in the order of coding. `latents` are those of the slice so far, [voxels, K]; `code` gets each latent's voxel
+/// in the slice, its channel, its mean in sixteenths and its scale index, and says what it is, or fails.
+pub(super) fn each_latent<E>(
     tables: &Tables,
     keys: &[u64],
     slice: Range<usize>,
     predict: &Predict,
     latents: &mut [i16],
-    mut code: impl FnMut(usize, &[i16], &[u8], &mut [i16]) -> Result<(), E>,
+    mut code: impl FnMut(usize, usize, i16, u8) -> Result<i16, E>,
 ) -> Result<(), E> {
     let k = tables.channels();
     let mut learning = Learning::of(tables, &keys[slice.clone()]);
     for voxels in passes(keys, &slice) {
-        let (mut mu, mut sigma) = predict(slice.clone(), &voxels, latents);
+        let (mu, sigma) = predict(slice.clone(), &voxels, latents);
         let count = voxels.len() * k;
         assert_eq!(
             (mu.len(), sigma.len()),
             (count, count),
             "one mean and scale per latent"
         );
-        let parameters = mu.chunks_exact_mut(k).zip(sigma.chunks_exact_mut(k));
+        let parameters = mu.chunks_exact(k).zip(sigma.chunks_exact(k));
         for (&v, (mu, sigma)) in voxels.iter().zip(parameters) {
             let at = v as usize - slice.start;
             if let Some(learning) = &mut learning {
-                learning.prepare(at, latents, mu, sigma);
+                learning.look_around(at, sigma);
             }
-            let own = &mut latents[at * k..][..k];
-            code(at, mu, sigma, own)?;
-            if let Some(learning) = &mut learning {
-                learning.learn(at, own);
+            for (c, (&mu, &sigma)) in mu.iter().zip(sigma).enumerate() {
+                latents[at * k + c] = match &mut learning {
+                    Some(learning) => {
+                        let (mu, sigma) = learning.prepare(c, mu, sigma, latents);
+                        let latent = code(at, c, mu, sigma)?;
+                        learning.learn(c, latent);
+                        latent
+                    }
+                    None => code(at, c, mu, sigma)?,
+                };
             }
         }
     }
@@ -124,8 +130,8 @@ pub fn decode_passes(
             let slice = range(i, slice_voxels, keys.len());
             let at = place(level, i, code);
             let mut reader = Reader::open(tables, code.bytes, &at)?;
-            each_voxel(tables, keys, slice, predict, part, |_, mu, sigma, own| {
-                reader.read(Condition::Gauss { mu, sigma }, own)
+            each_latent(tables, keys, slice, predict, part, |_, c, mu, sigma| {
+                reader.read_one(c, mu, sigma)
             })?;
             reader.finish()
         })

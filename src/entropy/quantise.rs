@@ -4,9 +4,9 @@ use std::convert::Infallible;
 
 use rayon::prelude::*;
 
-use super::passes::{Predict, each_voxel, range};
+use super::passes::{Predict, each_latent, range};
 use super::rows::Row;
-use super::slice::Condition;
+use super::slice::{Condition, row};
 use super::tables::Tables;
 
 /// Voxels of one task.
@@ -27,30 +27,24 @@ pub struct Rounding<'a> {
 }
 
 impl Rounding<'_> {
-    /// The voxels' latents [voxels, K], each under its own row.
-    fn round(self, tables: &Tables, condition: Condition, latents: &[f32], out: &mut [i16]) {
-        let bound = f32::from(self.limit);
-        let prices = self.prices.iter().cycle();
-        let each = out.iter_mut().zip(latents).zip(prices);
-        for (i, ((q, y), &price)) in each.enumerate() {
-            let y = y.clamp(-bound, bound);
-            let near = y.round_ties_even();
-            *q = near as i16;
-            if price <= 0.0 {
-                continue;
-            }
-            let (row, centre) = condition.row(tables, i);
-            let cost = |q: f32| (y - q).powi(2) + price * row.bits(q as i32 - centre);
-            let mut best = (cost(near), near);
-            for step in [-1.0, 1.0] {
-                let mut next = near + step;
-                while next.abs() <= bound && cost(next) < best.0 {
-                    best = (cost(next), next);
-                    next += step;
-                }
-            }
-            *q = best.1 as i16;
+    /// A latent of a channel under its row, whose values count from `centre`.
+    fn round(self, channel: usize, (row, centre): (Row, i32), y: f32) -> i16 {
+        let (bound, price) = (f32::from(self.limit), self.prices[channel]);
+        let y = y.clamp(-bound, bound);
+        let near = y.round_ties_even();
+        if price <= 0.0 {
+            return near as i16;
         }
+        let cost = |q: f32| (y - q).powi(2) + price * row.bits(q as i32 - centre);
+        let mut best = (cost(near), near);
+        for step in [-1.0, 1.0] {
+            let mut next = near + step;
+            while next.abs() <= bound && cost(next) < best.0 {
+                best = (cost(next), next);
+                next += step;
+            }
+        }
+        best.1 as i16
     }
 }
 
@@ -74,7 +68,9 @@ pub fn quantise(
     blocks.enumerate().for_each(|(b, (out, latents))| {
         let first = b * BLOCK * k;
         let condition = condition.of(first..first + latents.len());
-        rounding.round(tables, condition, latents, out);
+        for (i, (q, &y)) in out.iter_mut().zip(latents).enumerate() {
+            *q = rounding.round(i % k, condition.row(tables, i), y);
+        }
     });
     out
 }
@@ -105,24 +101,17 @@ pub fn quantise_passes(
         let slice = range(i, slice_voxels, keys.len());
         let own_keys = &keys[slice.clone()];
         let mut off = vec![0.0; latents.len()];
-        let Ok(()) = each_voxel(tables, keys, slice, predict, part, |at, mu, sigma, own| {
+        let Ok(()) = each_latent(tables, keys, slice, predict, part, |at, c, mu, sigma| {
             let siblings = (0..at).rev();
             let siblings = siblings.take_while(|&v| own_keys[v] >> 3 == own_keys[at] >> 3);
-            let mut wanted: Vec<f32> = (latents[at * k..][..k].iter())
-                .map(|y| y.clamp(-bound, bound))
-                .collect();
-            off[at * k..][..k].copy_from_slice(&wanted);
-            for sibling in siblings {
-                let off = off[sibling * k..][..k].iter().zip(rounding.prices);
-                for (wanted, (off, &price)) in wanted.iter_mut().zip(off) {
-                    *wanted += if price > 0.0 { MADE_UP * off } else { 0.0 };
-                }
-            }
-            rounding.round(tables, Condition::Gauss { mu, sigma }, &wanted, own);
-            for (off, own) in off[at * k..][..k].iter_mut().zip(own) {
-                *off -= f32::from(*own);
-            }
-            Ok::<_, Infallible>(())
+            let y = latents[at * k + c].clamp(-bound, bound);
+            let made_up = match rounding.prices[c] > 0.0 {
+                true => siblings.map(|v| MADE_UP * off[v * k + c]).sum(),
+                false => 0.0,
+            };
+            let q = rounding.round(c, row(tables, c, mu, sigma), y + made_up);
+            off[at * k + c] = y - f32::from(q);
+            Ok::<_, Infallible>(q)
         });
     });
     out
@@ -230,7 +219,9 @@ mod tests {
     fn passes_round_each_latent_under_what_its_decoder_will_know() {
         let keys: Vec<u64> = (0..3000).map(|i| 3 * i).collect();
         let slice = 1000;
-        let (y, ..) = some(keys.len() * K);
+        let (noise, ..) = some(keys.len() * K);
+        let wave = |(i, noise): (usize, &f32)| 9.0 * (i as f32 / 70.0).sin() + noise / 60.0;
+        let y: Vec<f32> = noise.iter().enumerate().map(wave).collect();
         // Every voxel is expected to be like the one before it, if that is known by then.
         let predict = |slice: Range<usize>, voxels: &[u32], known: &[i16]| {
             let before = |&v: &u32| {
@@ -256,29 +247,22 @@ mod tests {
             let mut known = vec![0; slice * K];
             for (i, latents) in q.chunks(slice * K).enumerate() {
                 let own = range(i, slice, keys.len());
-                let Ok(()) = each_voxel(
+                let Ok(()) = each_latent(
                     &tables,
                     &keys,
                     own,
                     &predict,
                     &mut known,
-                    |at, mu, sigma, out| {
-                        let condition = Condition::Gauss { mu, sigma };
+                    |at, c, mu, sigma| {
                         let first = i * slice;
-                        let wanted: Vec<f32> = (0..K)
-                            .map(|c| {
-                                let off = |v: usize| y[v * K + c] - f32::from(q[v * K + c]);
-                                let before = first..first + at;
-                                let siblings =
-                                    before.filter(|v| keys[*v] / 8 == keys[first + at] / 8);
-                                y[(first + at) * K + c]
-                                    + MADE_UP * siblings.rev().map(off).sum::<f32>()
-                            })
-                            .collect();
-                        let rounded = quantise(&tables, condition, &wanted, rounding);
-                        assert_eq!(latents[at * K..][..K], rounded);
-                        out.copy_from_slice(&latents[at * K..][..K]);
-                        Ok::<_, Infallible>(())
+                        let off = |v: usize| y[v * K + c] - f32::from(q[v * K + c]);
+                        let before = first..first + at;
+                        let siblings = before.filter(|v| keys[*v] / 8 == keys[first + at] / 8);
+                        let wanted = y[(first + at) * K + c]
+                            + siblings.rev().map(|v| MADE_UP * off(v)).sum::<f32>();
+                        let rounded = rounding.round(c, row(&tables, c, mu, sigma), wanted);
+                        assert_eq!(latents[at * K + c], rounded);
+                        Ok::<_, Infallible>(rounded)
                     },
                 );
             }

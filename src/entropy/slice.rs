@@ -65,11 +65,18 @@ impl<'a> Condition<'a> {
     #[inline]
     pub(super) fn row<'t>(&self, tables: &'t Tables, i: usize) -> (Row<'t>, i32) {
         match self {
-            Condition::Gauss { mu, sigma } if sigma[i] != UNPREDICTED => {
-                tables.gauss(mu[i], sigma[i])
-            }
-            _ => (tables.prior(i % tables.channels()), 0),
+            Condition::Gauss { mu, sigma } => row(tables, i % tables.channels(), mu[i], sigma[i]),
+            Condition::Prior => (tables.prior(i % tables.channels()), 0),
         }
+    }
+}
+
+/// The row of a latent of a channel, and what its values count from.
+#[inline]
+pub(super) fn row(tables: &Tables, channel: usize, mu: i16, sigma: u8) -> (Row<'_>, i32) {
+    match sigma {
+        UNPREDICTED => (tables.prior(channel), 0),
+        _ => tables.gauss(mu, sigma),
     }
 }
 
@@ -167,20 +174,34 @@ impl<'a> Reader<'a> {
         condition.check(self.tables, latents.len());
         for (i, latent) in latents.iter_mut().enumerate() {
             let (row, centre) = condition.row(self.tables, i);
-            let entry = self.stack.pop(|quantile| row.find(quantile));
-            let value = if entry < row.escape() {
-                centre + row.low() + entry as i32
-            } else {
-                let (above, distance) = pop_distance(&mut self.stack, self.at)?;
-                match above {
-                    true => centre + row.low() + row.escape() as i32 - 1 + distance,
-                    false => centre + row.low() - distance,
-                }
-            };
-            *latent = i16::try_from(value)
-                .map_err(|_| malformed(self.at, "latent", value, "a number of 16 bits"))?;
+            *latent = self.under(row, centre)?;
         }
         Ok(())
+    }
+
+    /// The next latent, of a channel that is predicted so; [`UNPREDICTED`] in place of a scale index if it is not.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn read_one(&mut self, channel: usize, mu: i16, sigma: u8) -> Result<i16> {
+        let (row, centre) = row(self.tables, channel, mu, sigma);
+        self.under(row, centre)
+    }
+
+    #[inline]
+    fn under(&mut self, row: Row, centre: i32) -> Result<i16> {
+        let entry = self.stack.pop(|quantile| row.find(quantile));
+        let value = if entry < row.escape() {
+            centre + row.low() + entry as i32
+        } else {
+            let (above, distance) = pop_distance(&mut self.stack, self.at)?;
+            match above {
+                true => centre + row.low() + row.escape() as i32 - 1 + distance,
+                false => centre + row.low() - distance,
+            }
+        };
+        let expected = "a number of 16 bits";
+        i16::try_from(value).map_err(|_| malformed(self.at, "latent", value, expected))
     }
 
     /// Nothing may be left.

@@ -43,12 +43,11 @@ impl Shape {
         self.near_channels.iter().take(role).any(|&near| near > 0)
     }
 
-    /// Bytes that predicting one voxel of the base level takes at most: the network's inputs, two hidden layers, means and scales, and
-    /// what surprised it.
+    /// Bytes that predicting one voxel of the base level takes at most: the network's inputs, two hidden layers, means and scales.
     pub(crate) fn base_bytes(&self) -> usize {
         match self.base_channels {
             0 => 0,
-            hidden => 2 * (base_inputs(self.latents) + 2 * hidden) + 3 * self.latents + 4,
+            hidden => 2 * (base_inputs(self.latents) + 2 * hidden) + 3 * self.latents,
         }
     }
 }

@@ -220,7 +220,7 @@ impl Shape {
             ROLES => String::new(),
             roles => format!(";fr_roles={roles}"),
         };
-        let learning = if self.learning { ";learning" } else { "" };
+        let learning = if self.learning { ";learning=2" } else { "" };
         format!(
             "channels={};latents={};pem_blocks={};fr_blocks={};upsample={upsample};inception_relu={};latent_max={};latent_shift={}{base}{near}{roles}{reconstructed}{learning}",
             self.channels,
