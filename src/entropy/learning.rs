@@ -96,6 +96,8 @@ struct Channel {
     mean: i32,
     scale: i32,
     scales: [i32; PLACES],
+    /// The last mean, scale and latent, and their slope: where nothing happens, the next ones are the same.
+    last: Option<((i16, u8, i16), i32)>,
 }
 
 /// The voxel at hand.
@@ -134,6 +136,7 @@ impl<'a> Learning<'a> {
             mean: 0,
             scale: 0,
             scales: [0; PLACES],
+            last: None,
         };
         tables.learning().then(|| Learning {
             tables,
@@ -157,7 +160,7 @@ impl<'a> Learning<'a> {
         here.two_away.clear();
         let unpredicted = sigma.contains(&UNPREDICTED);
         let (mut counts, mut surprises) = ([0; SETS], 0);
-        for near in self.nearby.before(voxel) {
+        self.nearby.before(voxel, |near| {
             if unpredicted && near.two {
                 here.two_away.push((near.voxel, 8 >> near.axes));
             }
@@ -170,7 +173,7 @@ impl<'a> Learning<'a> {
                     *sum += i32::from(residual);
                 }
             }
-        }
+        });
         here.factors = counts.map(|count| (1 << 16) / (count + 1));
         let known: i32 = counts.iter().sum();
         here.place = match known {
@@ -237,7 +240,12 @@ impl<'a> Learning<'a> {
             return;
         };
         let channel = &mut self.channels[c][usize::from(latent.unpredicted)];
-        let slope = slope(self.tables, &latent, y);
+        let asked = (latent.mu, latent.sigma, y);
+        let slope = match channel.last {
+            Some((last, slope)) if last == asked => slope,
+            _ => slope(self.tables, &latent, y),
+        };
+        channel.last = Some((asked, slope));
         let grow = |offset: &mut i32, rate: i32| {
             let grown = *offset + rate * slope;
             *offset = grown.clamp(-LARGEST_SCALE_OFFSET, LARGEST_SCALE_OFFSET);

@@ -1,9 +1,5 @@
 //! Which voxels of a slice lie near each other, one or two away along any of the axes.
 
-use std::sync::LazyLock;
-
-use crate::geometry::morton;
-
 /// The voxels of a slice, by their parents.
 #[derive(Debug)]
 pub(super) struct Nearby {
@@ -18,13 +14,15 @@ struct Parent {
     first: u32,
     /// Which of its octants are voxels of the slice.
     mask: u8,
-    /// The numbers of the parents around it, in the order of a 3³ kernel, or [`ABSENT`].
+    /// Where around it there are others, itself among them, in the order of a 3³ kernel, and their numbers.
+    present: u32,
     around: [u32; 27],
 }
 
-const ABSENT: u32 = u32::MAX;
 /// The place of a parent itself in a 3³ kernel.
 const CENTRE: usize = 13;
+/// Every third bit of a key belongs to an axis, those of x from the lowest on.
+const X: u64 = 0x1249_2492_4924_9249;
 
 /// A voxel near another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,128 +35,138 @@ pub(super) struct Near {
     pub axes: u32,
 }
 
-/// Where a near voxel may lie, seen from one of an octant.
-#[derive(Debug, Clone, Copy)]
-struct Place {
-    /// Which of the parents around.
-    tap: usize,
-    octant: u8,
-    two: bool,
-    axes: u32,
-}
-
-/// For every octant the places of voxels that come before: one away, those of lower octants; two away, those of the same one, of which the ones
-/// with parents that come before.
-static PLACES: LazyLock<[Vec<Place>; 8]> = LazyLock::new(|| std::array::from_fn(places));
-
-fn places(octant: usize) -> Vec<Place> {
-    let mut places = Vec::new();
-    for tap in (0..27).filter(|&tap| tap != CENTRE) {
-        let steps = [tap % 3, tap / 3 % 3, tap / 9].map(|step| step as i32 - 1);
-        let axes = steps.iter().filter(|&&step| step != 0).count() as u32;
-        let (mut parent, mut other) = (CENTRE as i32, 0);
-        for (axis, step) in steps.into_iter().enumerate() {
-            let at = (octant >> axis & 1) as i32 + step;
-            parent += at.div_euclid(2) * 3i32.pow(axis as u32);
-            other |= at.rem_euclid(2) << axis;
+/// For an octant, and a place around its parent, the lower octants there that are one away.
+static ONE_AWAY: [[u8; 27]; 8] = {
+    let mut table = [[0; 27]; 8];
+    let mut i = 0;
+    while i < 8 * 27 * 8 {
+        let (octant, tap, other) = (i / (27 * 8), i / 8 % 27, i % 8);
+        let steps = [tap % 3, tap / 3 % 3, tap / 9];
+        let mut one = other < octant;
+        let mut axis = 0;
+        while axis < 3 {
+            // Three more than it is away along this axis.
+            let away = 2 * steps[axis] + (other >> axis & 1) + 1 - (octant >> axis & 1);
+            one = one && 2 <= away && away <= 4;
+            axis += 1;
         }
-        if other < octant as i32 {
-            places.push(Place {
-                tap: parent as usize,
-                octant: other as u8,
-                two: false,
-                axes,
-            });
-        }
-        places.push(Place {
-            tap,
-            octant: octant as u8,
-            two: true,
-            axes,
-        });
+        table[octant][tap] |= (one as u8) << other;
+        i += 1;
     }
-    places
+    table
+};
+
+/// Along how many axes a place around a parent differs.
+const fn axes(tap: usize) -> u32 {
+    (tap % 3 != 1) as u32 + (tap / 3 % 3 != 1) as u32 + (tap / 9 != 1) as u32
 }
 
 impl Nearby {
     /// Of voxels with these Morton keys, ascending.
     pub fn new(keys: &[u64]) -> Self {
-        let (mut above, mut parents, mut voxels) = (Vec::new(), Vec::<Parent>::new(), Vec::new());
-        for (v, key) in keys.iter().enumerate() {
-            if above.last() != Some(&(key >> 3)) {
-                above.push(key >> 3);
-                parents.push(Parent {
-                    first: v as u32,
-                    mask: 0,
-                    around: [ABSENT; 27],
-                });
-            }
-            let octant = (key & 7) as u8;
-            voxels.push((octant, parents.len() as u32 - 1));
-            let parent = parents.last_mut().expect("there is one by now");
-            parent.mask |= 1 << octant;
+        let families = || keys.chunk_by(|a, b| a >> 3 == b >> 3);
+        let count = families().count();
+        let (mut above, mut parents) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        let mut voxels = Vec::with_capacity(keys.len());
+        for (p, family) in families().enumerate() {
+            above.push(family[0] >> 3);
+            let first = voxels.len() as u32;
+            let octants = family.iter().map(|key| (key & 7) as u8);
+            voxels.extend(octants.clone().map(|octant| (octant, p as u32)));
+            let mut parent = Parent {
+                first,
+                mask: octants.fold(0, |mask, octant| mask | 1 << octant),
+                present: 1 << CENTRE,
+                around: [0; 27],
+            };
+            parent.around[CENTRE] = p as u32;
+            parents.push(parent);
         }
-        for p in 0..above.len() {
-            let here = morton::decode(above[p]);
-            parents[p].around[CENTRE] = p as u32;
+        // Neighbours of neighbours are neighbours: each is looked for where the last one in its place was.
+        let mut last = [0; 27];
+        for (p, &key) in above.iter().enumerate() {
+            let moved = [0, 1, 2].map(|axis| [0, 1, 2].map(|step| moved(key, axis, step)));
             // What lies on one side of this one has it on its other side.
             for tap in CENTRE + 1..27 {
-                let steps = [tap % 3, tap / 3 % 3, tap / 9];
-                let there: [u32; 3] =
-                    std::array::from_fn(|a| (here[a] + steps[a] as u32).wrapping_sub(1));
-                // Parents lie one level above the finest that there is.
-                let inside = there.iter().all(|&x| x >> (morton::MAX_DEPTH - 1) == 0);
-                if inside && let Some(q) = find(&above, p, morton::encode(there)) {
-                    parents[p].around[tap] = q as u32;
-                    parents[q].around[26 - tap] = p as u32;
+                let there = moved[0][tap % 3] | moved[1][tap / 3 % 3] | moved[2][tap / 9];
+                let q = first_from(&above, last[tap], there);
+                last[tap] = q;
+                if above.get(q) == Some(&there) {
+                    for (p, tap, q) in [(p, tap, q), (q, 26 - tap, p)] {
+                        parents[p].present |= 1 << tap;
+                        parents[p].around[tap] = q as u32;
+                    }
                 }
             }
         }
         Nearby { parents, voxels }
     }
 
-    /// The voxels near one that come before it, octant by octant, and in Morton order within an octant.
-    pub fn before(&self, voxel: usize) -> impl Iterator<Item = Near> {
+    /// Tells of the voxels near one that come before it, octant by octant, and in Morton order within an octant.
+    #[inline]
+    pub fn before(&self, voxel: usize, mut tell: impl FnMut(Near)) {
         let (octant, own) = self.voxels[voxel];
-        let around = &self.parents[own as usize].around;
-        PLACES[usize::from(octant)].iter().filter_map(move |place| {
-            let q = around[place.tap];
-            if q == ABSENT || place.two && q > own {
-                return None;
+        let octant = u32::from(octant);
+        let parent = &self.parents[own as usize];
+        let mut present = parent.present;
+        while present != 0 {
+            let tap = present.trailing_zeros() as usize;
+            present &= present - 1;
+            let q = parent.around[tap];
+            let Parent { first, mask, .. } = self.parents[q as usize];
+            let voxel = |octant: u32| (first + (mask & ((1 << octant) - 1)).count_ones()) as usize;
+            let mut near = ONE_AWAY[octant as usize][tap] & mask;
+            while near != 0 {
+                let other = near.trailing_zeros();
+                near &= near - 1;
+                tell(Near {
+                    voxel: voxel(other),
+                    two: false,
+                    axes: (octant ^ other).count_ones(),
+                });
             }
-            let parent = &self.parents[q as usize];
-            let below = (1u8 << place.octant) - 1;
-            (parent.mask >> place.octant & 1 == 1).then(|| Near {
-                voxel: (parent.first + (parent.mask & below).count_ones()) as usize,
-                two: place.two,
-                axes: place.axes,
-            })
-        })
+            if q < own && mask >> octant & 1 == 1 {
+                tell(Near {
+                    voxel: voxel(octant),
+                    two: true,
+                    axes: axes(tap),
+                });
+            }
+        }
     }
 }
 
-/// Where a key is among ascending ones, most likely not far from `from`.
-fn find(keys: &[u64], from: usize, key: u64) -> Option<usize> {
+/// The bits of an axis of a key, one less, as they are, or one more for a step of 0, 1 or 2. Beyond the cube no key is that of a parent.
+fn moved(key: u64, axis: u32, step: u32) -> u64 {
+    let (bits, one) = (X << axis, 1 << axis);
+    match step {
+        0 => (key & bits).wrapping_sub(one) & bits,
+        1 => key & bits,
+        _ => (key | !bits).wrapping_add(one) & bits,
+    }
+}
+
+/// The first of ascending keys that is no lower than `key`, most likely not far from `from`.
+fn first_from(keys: &[u64], from: usize, key: u64) -> usize {
     let mut step = 1;
-    let among = if key > keys[from] {
+    let (low, high) = if keys.get(from).is_some_and(|&k| k < key) {
         while keys.get(from + step).is_some_and(|&k| k < key) {
             step *= 2;
         }
-        from + step / 2..keys.len().min(from + step + 1)
+        (from + step / 2, keys.len().min(from + step))
     } else {
-        while step <= from && keys[from - step] > key {
+        while step <= from && keys[from - step] >= key {
             step *= 2;
         }
-        from.saturating_sub(step)..from
+        (from.saturating_sub(step), from)
     };
-    let start = among.start;
-    let found = keys[among].binary_search(&key).ok();
-    found.map(|i| start + i)
+    low + keys[low..high].partition_point(|&k| k < key)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::morton;
     use proptest::prelude::*;
 
     /// By definition: all voxels, one by one.
@@ -186,7 +194,8 @@ mod tests {
     fn check(keys: &[u64]) {
         let nearby = Nearby::new(keys);
         for voxel in 0..keys.len() {
-            let mut found: Vec<Near> = nearby.before(voxel).collect();
+            let mut found = Vec::new();
+            nearby.before(voxel, |near| found.push(near));
             found.sort_by_key(|near| near.voxel);
             assert_eq!(found, searched(keys, voxel), "voxel {voxel}");
         }
