@@ -104,7 +104,8 @@ fit low-rest
 train low-mixed lite 42 --init "$out/low-rest/tuned.pt" --lam 4 "${mixed[@]}"
 train low-more lite 70 --init "$out/low-mixed/last.pt" --lam 4 "${mixed[@]}"
 train low-last lite 19 --init "$out/low-more/last.pt" "${last[@]}"
-ship low-last lite-low "0.02 0.05 0.05" "0.05 0.15 0.15"
+train low-again lite 23 --init "$out/low-last/last.pt" --lam 4 --stay 0.5 "${mixed[@]}"
+ship low-again lite-low "0.02 0.05 0.05" "0.05 0.15 0.15"
 imitating lite-low 15
 train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
 train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
@@ -114,7 +115,8 @@ fit high-whole-2
 train high-mixed lite 82 --init "$out/high-whole-2/tuned.pt" --lam 16 "${mixed[@]}"
 train high-more lite 82 --init "$out/high-mixed/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
 train high-last lite 24 --init "$out/high-more/last.pt" "${last[@]}"
-ship high-last lite "0.03 0.1 0.1" "0.1 0.2 0.2"
+train high-again lite 62 --init "$out/high-last/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
+ship high-again lite "0.03 0.1 0.1" "0.1 0.2 0.2"
 imitating lite 15
 train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
@@ -123,5 +125,6 @@ train least-rest lite 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@
 fit least-rest
 train least-mixed lite 40 --init "$out/least-rest/tuned.pt" --lam 1.2 "${mixed[@]}"
 train least-last lite 19 --init "$out/least-mixed/last.pt" "${last[@]}"
-ship least-last lite-least "0 0.02 0.02" "0.02 0.05 0.05"
+train least-again lite 19 --init "$out/least-last/last.pt" --lam 1.2 --stay 0.5 "${mixed[@]}"
+ship least-again lite-least "0 0.02 0.02" "0.02 0.05 0.05"
 imitating lite-least 15

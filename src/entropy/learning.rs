@@ -104,6 +104,7 @@ struct Channel {
 #[derive(Debug, Default)]
 struct Here {
     voxel: usize,
+    near: Vec<Near>,
     /// Sums of residuals nearby, [sets, K], and what a mean of each set takes them times.
     sums: Vec<i32>,
     factors: [i32; SETS],
@@ -160,12 +161,13 @@ impl<'a> Learning<'a> {
         here.two_away.clear();
         let unpredicted = sigma.contains(&UNPREDICTED);
         let (mut counts, mut surprises) = ([0; SETS], 0);
-        self.nearby.before(voxel, |near| {
+        self.nearby.before(voxel, &mut here.near);
+        for near in &here.near {
             if unpredicted && near.two {
                 here.two_away.push((near.voxel, 8 >> near.axes));
             }
             if let Some(surprise) = self.surprises[near.voxel] {
-                let set = set(&near);
+                let set = set(near);
                 counts[set] += 1;
                 surprises += surprise;
                 let residuals = &self.residuals[near.voxel * k..][..k];
@@ -173,7 +175,7 @@ impl<'a> Learning<'a> {
                     *sum += i32::from(residual);
                 }
             }
-        });
+        }
         here.factors = counts.map(|count| (1 << 16) / (count + 1));
         let known: i32 = counts.iter().sum();
         here.place = match known {

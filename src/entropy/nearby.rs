@@ -102,9 +102,9 @@ impl Nearby {
         Nearby { parents, voxels }
     }
 
-    /// Tells of the voxels near one that come before it, octant by octant, and in Morton order within an octant.
-    #[inline]
-    pub fn before(&self, voxel: usize, mut tell: impl FnMut(Near)) {
+    /// Lists the voxels near one that come before it, octant by octant, and in Morton order within an octant.
+    pub fn before(&self, voxel: usize, list: &mut Vec<Near>) {
+        list.clear();
         let (octant, own) = self.voxels[voxel];
         let octant = u32::from(octant);
         let parent = &self.parents[own as usize];
@@ -119,14 +119,14 @@ impl Nearby {
             while near != 0 {
                 let other = near.trailing_zeros();
                 near &= near - 1;
-                tell(Near {
+                list.push(Near {
                     voxel: voxel(other),
                     two: false,
                     axes: (octant ^ other).count_ones(),
                 });
             }
             if q < own && mask >> octant & 1 == 1 {
-                tell(Near {
+                list.push(Near {
                     voxel: voxel(octant),
                     two: true,
                     axes: axes(tap),
@@ -195,7 +195,7 @@ mod tests {
         let nearby = Nearby::new(keys);
         for voxel in 0..keys.len() {
             let mut found = Vec::new();
-            nearby.before(voxel, |near| found.push(near));
+            nearby.before(voxel, &mut found);
             found.sort_by_key(|near| near.voxel);
             assert_eq!(found, searched(keys, voxel), "voxel {voxel}");
         }
