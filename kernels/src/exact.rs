@@ -204,6 +204,7 @@ impl ExactConv {
         {
             return self.each_family(isa, weights, neighbours, input, first, output);
         }
+        let group = isa.group(self.extents.cout);
         with_scratch(|scratch| {
             for (row, output) in output.tiles() {
                 let (first, cout) = (first + row, self.extents.cout);
@@ -219,7 +220,7 @@ impl ExactConv {
                     #[cfg(target_arch = "aarch64")]
                     digits,
                 } = scratch;
-                let plan = planner.plan(isa, &taps, [first, output.len()], tile);
+                let plan = planner.plan(isa, group, &taps, [first, output.len()], tile);
                 #[cfg(target_arch = "x86_64")]
                 let done = isa.has_tiles()
                     && self.tiles().is_some_and(|weights| {

@@ -211,6 +211,7 @@ impl FloatConv {
             self.extents.volume,
             "these taps belong to another kernel"
         );
+        let group = isa.group(self.extents.cout);
         with_scratch(|scratch| {
             let Scratch {
                 taps: tile,
@@ -225,7 +226,7 @@ impl FloatConv {
                     digits: _,
             } = scratch;
             for (row, output) in output.tiles() {
-                let plan = planner.plan(isa, &taps, [first + row, output.len()], tile);
+                let plan = planner.plan(isa, group, &taps, [first + row, output.len()], tile);
                 #[cfg(target_arch = "x86_64")]
                 let done = isa.has_tiles() && self.precision != Precision::F32;
                 #[cfg(target_arch = "x86_64")]

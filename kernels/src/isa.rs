@@ -3,6 +3,9 @@
 use std::fmt;
 use std::str::FromStr;
 
+#[cfg(target_arch = "x86_64")]
+use crate::rows::PANEL;
+
 /// An instruction set that this machine has: the kernels' licence to use it.
 ///
 /// Only [`Isa::detect`], [`Isa::available`] and parsing make one, and they ask the processor.
@@ -31,6 +34,9 @@ pub(crate) enum Level {
 
 /// The smallest [`Isa::group`].
 pub(crate) const MIN_GROUP: usize = 4;
+/// Panels that AVX-512 multiplies at once, by the rows of the smallest group, where a layer has so many.
+#[cfg(target_arch = "x86_64")]
+pub(crate) const WIDE: usize = 4;
 
 impl Isa {
     /// What the target guarantees; every machine has it.
@@ -113,15 +119,18 @@ impl Isa {
         false
     }
 
-    /// Output rows that are multiplied by the same taps: those of a matrix tile, or as many as keep the registers busy. A multiple of
-    /// [`MIN_GROUP`].
-    pub(crate) fn group(self) -> usize {
+    /// Output rows of a layer of `cout` channels that are multiplied by the same taps: those of a matrix tile, or as many as keep the
+    /// registers busy. A multiple of [`MIN_GROUP`].
+    pub(crate) fn group(self, cout: usize) -> usize {
         match self.0 {
             #[cfg(target_arch = "x86_64")]
             Level::Amx => 16,
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => 8,
-            _ => MIN_GROUP,
+            Level::Avx512 if !cout.is_multiple_of(WIDE * PANEL) => 8,
+            _ => {
+                let _ = cout;
+                MIN_GROUP
+            }
         }
     }
 

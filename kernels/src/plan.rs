@@ -7,15 +7,15 @@ use crate::isa::{Isa, MIN_GROUP};
 use crate::rows::TILE;
 use crate::taps::{Taps, TileTaps};
 
-/// A kernel map arranged for the layers that read it, part by part as they first do. It pays where a map serves several layers; results are
-/// the same without.
+/// A kernel map arranged for the layers that read it, part by part as they first do, in the smallest groups and in larger ones. It pays where a
+/// map serves several layers; results are the same without.
 #[derive(Debug, Clone)]
-pub struct Plan(Vec<OnceLock<PlanTile>>);
+pub struct Plan(Vec<[OnceLock<PlanTile>; 2]>);
 
 impl Plan {
     /// For a map of so many output rows.
     pub fn new(rows: usize) -> Self {
-        Plan(vec![OnceLock::new(); rows.div_ceil(TILE)])
+        Plan(vec![Default::default(); rows.div_ceil(TILE)])
     }
 }
 
@@ -239,16 +239,16 @@ pub(crate) struct Planner {
 }
 
 impl Planner {
-    /// The plan of `count` output rows from `first` on: the map's own, or one made now.
+    /// The plan of `count` output rows from `first` on in groups of so many rows: the map's own, or one made now.
     pub fn plan<'a>(
         &'a mut self,
         isa: Isa,
+        group: usize,
         taps: &Taps<'a>,
         [first, count]: [usize; 2],
         scratch: &mut TileTaps,
     ) -> &'a PlanTile {
         let Planner { numbers, own, same } = self;
-        let group = isa.group();
         if let Taps::Same = taps {
             same.arrange_same(group, first, count);
             return same;
@@ -262,9 +262,10 @@ impl Planner {
         }
         | Taps::AllChildren { plan, .. } = taps
             && first.is_multiple_of(TILE)
-            && let Some(place) = plan.0.get(first / TILE)
+            && let Some(places) = plan.0.get(first / TILE)
         {
-            let tile = place.get_or_init(|| {
+            let place = usize::from(group > MIN_GROUP);
+            let tile = places[place].get_or_init(|| {
                 let mut tile = PlanTile::default();
                 arrange(&mut tile);
                 tile
@@ -385,7 +386,13 @@ mod tests {
                 plan: None,
             };
             let mut planner = Planner::default();
-            let plan = planner.plan(Isa::SCALAR, &taps, [0, count], &mut TileTaps::default());
+            let plan = planner.plan(
+                Isa::SCALAR,
+                MIN_GROUP,
+                &taps,
+                [0, count],
+                &mut TileTaps::default(),
+            );
             let mut found = vec![ABSENT; rows.len()];
             for group in 0..plan.groups() {
                 let (taps, places) = plan.steps(group, 0..volume);

@@ -1,5 +1,7 @@
 //! The loop at the heart of both convolutions: the sums of a group's rows stay in registers while its taps go by.
 
+#[cfg(target_arch = "x86_64")]
+use crate::isa::WIDE;
 use crate::isa::{Isa, Level};
 use crate::machine;
 use crate::plan::PlanTile;
@@ -248,7 +250,7 @@ pub(crate) fn multiply_rows(
 ) {
     let panels = cout.div_ceil(PANEL);
     let (steps, count) = (weights.len() / panels, products.len() / panels);
-    assert!(count <= TILE && count.is_multiple_of(isa.group()));
+    assert!(count <= TILE && count.is_multiple_of(isa.group(cout)));
     assert_eq!(
         rows.len(),
         count * steps,
@@ -285,7 +287,10 @@ static FIRST: [u8; 1] = [0];
 fn width(isa: Isa, whole: usize) -> usize {
     match isa.level() {
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 | Level::Amx => whole.clamp(1, 2),
+        Level::Avx512 | Level::Amx => match whole {
+            WIDE.. => WIDE,
+            _ => whole.clamp(1, 2),
+        },
         _ => {
             let _ = whole;
             1

@@ -1,4 +1,4 @@
-//! AVX-512 with VNNI: blocks of eight rows by two panels, or by one or half of one, in two parts.
+//! AVX-512 with VNNI: blocks of four rows by four panels, of eight by two, or by one or half of one, in two parts.
 
 use std::arch::x86_64::*;
 
@@ -7,6 +7,7 @@ use crate::f16;
 use crate::ceiling;
 use crate::convert::{Halves, MAX};
 use crate::exact::LIMIT;
+use crate::isa::{MIN_GROUP, WIDE};
 use crate::machine::machine;
 use crate::rows::{Lanes, PANEL};
 use crate::tile::{Arithmetic, Block, Machine, columns};
@@ -21,13 +22,16 @@ pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) {
         match (arithmetic, whole) {
             (Arithmetic::Float, 0) => wide::<HalfFloat, 8, 1, 1>(block),
             (Arithmetic::Float, 1) => wide::<Float, 8, 1, 1>(block),
-            (Arithmetic::Float, _) => wide::<Float, 8, 2, 1>(block),
+            (Arithmetic::Float, ..WIDE) => wide::<Float, 8, 2, 1>(block),
+            (Arithmetic::Float, _) => wide::<Float, MIN_GROUP, WIDE, 1>(block),
             (Arithmetic::Integer, 0) => wide::<HalfInteger, 8, 1, 2>(block),
             (Arithmetic::Integer, 1) => wide::<Integer, 8, 1, 2>(block),
-            (Arithmetic::Integer, _) => wide::<Integer, 8, 2, 1>(block),
+            (Arithmetic::Integer, ..WIDE) => wide::<Integer, 8, 2, 1>(block),
+            (Arithmetic::Integer, _) => wide::<Integer, MIN_GROUP, WIDE, 1>(block),
             (Arithmetic::Brain, 0) => wide_brain::<HalfBrain, 8, 1, 1>(block),
             (Arithmetic::Brain, 1) => wide_brain::<Brain, 8, 1, 1>(block),
-            (Arithmetic::Brain, _) => wide_brain::<Brain, 8, 2, 1>(block),
+            (Arithmetic::Brain, ..WIDE) => wide_brain::<Brain, 8, 2, 1>(block),
+            (Arithmetic::Brain, _) => wide_brain::<Brain, MIN_GROUP, WIDE, 1>(block),
         }
     }
 }
