@@ -11,6 +11,7 @@ import torch
 import data
 import export
 import ops
+import prune
 import rates
 import train
 import tune
@@ -396,6 +397,39 @@ def a_network_of_half_as_many_channels_grows_and_does_the_same():
     return f"at most {worst:.1e} apart"
 
 
+def latents_that_never_change_can_be_left_out():
+    samples, changes = [data.procedural(i, size=48, views=2, pixels=60) for i in range(2)], {"latent_roles": 2, "fr_roles": 2, "near_channels": [16, 0], "base_channels": 16}
+    with tempfile.TemporaryDirectory() as folder, open(os.path.join(HERE, "configs/tiny.json")) as f:
+        path = f"{folder}/config.json"
+        with open(path, "w") as to:
+            json.dump(json.load(f) | changes, to)
+        whole = train.Trainer(arguments(config=path, rate_start=1.0, lam=60.0, lr_conv=2e-3, lr_linear=4e-3))
+        for step in range(20):
+            whole.train_step([samples[step % 2]])
+        model = whole.model
+        with torch.no_grad():  # the second is always 2 and the last always 0, of which the networks are sure
+            for k, constant in ((1, 2.0), (3, 0.0)):
+                for layer in [fs.lin2 for fs in model.fs] + [m for n in (model.base, model.near["1"], model.pem["1"]) for m in (n.mu, n.sigma)]:
+                    layer.weight[..., k] = layer.bias[k] = 0
+                for layer in [fs.lin2 for fs in model.fs] + [model.base.mu, model.pem["1"].mu]:
+                    layer.bias[k] = constant
+                model.base.sigma.bias[k] = model.pem["1"].sigma.bias[k] = -9
+                model.prior.mean[k], model.prior.log_sigma[k] = constant, -9
+        keep, cfg, weights = prune.prune(model, samples)
+        assert keep == [0, 2] and cfg["latents"] == 2
+        narrow = model.__class__(cfg)
+        narrow.load_state_dict(weights)
+    worst = 0.0
+    with torch.no_grad():
+        for s in samples:
+            (want, bits, latents), (got, same_bits, left) = (m.code(s.crop, m.analyse(s.crop, s.rgb), 2, "round") for m in (model, narrow))
+            pairs = [*zip(want, got, strict=True), (torch.stack(bits[:2]), torch.stack(same_bits[:2]))]
+            pairs += [(y[:, keep], z) for y, z in zip(latents[:2], left[:2], strict=True)]
+            worst = max(worst, *(((a - b).abs().max() / a.abs().max()).item() for a, b in pairs))
+    assert worst < 1e-3, f"{worst:.1e}"
+    return f"features and bits are at most {worst:.1e} apart"
+
+
 def all_equal(a, b):
     return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
@@ -408,7 +442,8 @@ if __name__ == "__main__":
                   quick_heads_are_made_for_a_network_that_has_learned_and_stand_beside_its_own, heads_that_imitate_others_come_to_say_what_these_say,
                   everything_else_learns_while_heads_stay, what_neighbours_tell_saves_bits_and_comes_from_those_before_alone,
                   the_integer_path_follows_the_float_path, so_it_does_where_the_finest_role_has_no_latents, and_where_nothing_makes_its_features,
-                  a_network_without_a_reconstruction_starts_near_one_that_had_it, a_network_of_half_as_many_channels_grows_and_does_the_same, a_crop_overfits):
+                  a_network_without_a_reconstruction_starts_near_one_that_had_it, a_network_of_half_as_many_channels_grows_and_does_the_same,
+                  latents_that_never_change_can_be_left_out, a_crop_overfits):
         begin = time.monotonic()
         said = check()
         print(f"{check.__name__.replace('_', ' ')}: {said} ({time.monotonic() - begin:.0f} s)", flush=True)
