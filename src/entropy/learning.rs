@@ -96,15 +96,12 @@ struct Channel {
     mean: i32,
     scale: i32,
     scales: [i32; PLACES],
-    /// The last mean, scale and latent, and their slope: where nothing happens, the next ones are the same.
-    last: Option<((i16, u8, i16), i32)>,
 }
 
 /// The voxel at hand.
 #[derive(Debug, Default)]
 struct Here {
     voxel: usize,
-    near: Vec<Near>,
     /// Sums of residuals nearby, [sets, K], and what a mean of each set takes them times.
     sums: Vec<i32>,
     factors: [i32; SETS],
@@ -137,7 +134,6 @@ impl<'a> Learning<'a> {
             mean: 0,
             scale: 0,
             scales: [0; PLACES],
-            last: None,
         };
         tables.learning().then(|| Learning {
             tables,
@@ -161,8 +157,7 @@ impl<'a> Learning<'a> {
         here.two_away.clear();
         let unpredicted = sigma.contains(&UNPREDICTED);
         let (mut counts, mut surprises) = ([0; SETS], 0);
-        self.nearby.before(voxel, &mut here.near);
-        for near in &here.near {
+        self.nearby.before(voxel, |near| {
             if unpredicted && near.two {
                 here.two_away.push((near.voxel, 8 >> near.axes));
             }
@@ -175,7 +170,7 @@ impl<'a> Learning<'a> {
                     *sum += i32::from(residual);
                 }
             }
-        }
+        });
         here.factors = counts.map(|count| (1 << 16) / (count + 1));
         let known: i32 = counts.iter().sum();
         here.place = match known {
@@ -242,12 +237,7 @@ impl<'a> Learning<'a> {
             return;
         };
         let channel = &mut self.channels[c][usize::from(latent.unpredicted)];
-        let asked = (latent.mu, latent.sigma, y);
-        let slope = match channel.last {
-            Some((last, slope)) if last == asked => slope,
-            _ => slope(self.tables, &latent, y),
-        };
-        channel.last = Some((asked, slope));
+        let slope = slope(self.tables, &latent, y);
         let grow = |offset: &mut i32, rate: i32| {
             let grown = *offset + rate * slope;
             *offset = grown.clamp(-LARGEST_SCALE_OFFSET, LARGEST_SCALE_OFFSET);
@@ -272,7 +262,7 @@ impl<'a> Learning<'a> {
 }
 
 /// Which set a voxel nearby is of.
-fn set(near: &Near) -> usize {
+fn set(near: Near) -> usize {
     2 * usize::from(near.two) + usize::from(near.axes > 1)
 }
 

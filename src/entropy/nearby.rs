@@ -4,19 +4,26 @@
 #[derive(Debug)]
 pub(super) struct Nearby {
     parents: Vec<Parent>,
+    around: Vec<Around>,
     /// Each voxel's octant, and the number of its parent.
     voxels: Vec<(u8, u32)>,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 struct Parent {
     /// The number of its first voxel.
     first: u32,
     /// Which of its octants are voxels of the slice.
     mask: u8,
-    /// Where around it there are others, itself among them, in the order of a 3³ kernel, and their numbers.
+}
+
+/// What lies around a parent, in the order of a 3³ kernel.
+#[derive(Debug)]
+struct Around {
+    /// Where there are parents, itself among them; and where those that come before it.
     present: u32,
-    around: [u32; 27],
+    earlier: u32,
+    numbers: [u32; 27],
 }
 
 /// The place of a parent itself in a 3³ kernel.
@@ -56,10 +63,42 @@ static ONE_AWAY: [[u8; 27]; 8] = {
     table
 };
 
+/// For an octant, the places around its parent where there are any.
+static WITH_ONE_AWAY: [u32; 8] = {
+    let mut table = [0; 8];
+    let mut i = 0;
+    while i < 8 * 27 {
+        table[i / 27] |= ((ONE_AWAY[i / 27][i % 27] != 0) as u32) << (i % 27);
+        i += 1;
+    }
+    table
+};
+
 /// Along how many axes a place around a parent differs.
-const fn axes(tap: usize) -> u32 {
-    (tap % 3 != 1) as u32 + (tap / 3 % 3 != 1) as u32 + (tap / 9 != 1) as u32
-}
+static AXES: [u8; 27] = {
+    let mut table = [0; 27];
+    let mut tap = 0;
+    while tap < 27 {
+        table[tap] = (tap % 3 != 1) as u8 + (tap / 3 % 3 != 1) as u8 + (tap / 9 != 1) as u8;
+        tap += 1;
+    }
+    table
+};
+
+/// Along how many axes two octants differ, by the bits that do.
+static ONES: [u8; 8] = [0, 1, 1, 2, 1, 2, 2, 3];
+
+/// For a mask of octants and an octant, how many lie below it, four bits each.
+static BELOW: [u32; 256] = {
+    let mut table = [0; 256];
+    let mut i = 0;
+    while i < 256 * 8 {
+        let (mask, octant) = (i / 8, i % 8);
+        table[mask] |= (mask & ((1 << octant) - 1)).count_ones() << (4 * octant);
+        i += 1;
+    }
+    table
+};
 
 impl Nearby {
     /// Of voxels with these Morton keys, ascending.
@@ -67,20 +106,22 @@ impl Nearby {
         let families = || keys.chunk_by(|a, b| a >> 3 == b >> 3);
         let count = families().count();
         let (mut above, mut parents) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        let mut around: Vec<Around> = Vec::with_capacity(count);
         let mut voxels = Vec::with_capacity(keys.len());
         for (p, family) in families().enumerate() {
             above.push(family[0] >> 3);
             let first = voxels.len() as u32;
             let octants = family.iter().map(|key| (key & 7) as u8);
             voxels.extend(octants.clone().map(|octant| (octant, p as u32)));
-            let mut parent = Parent {
-                first,
-                mask: octants.fold(0, |mask, octant| mask | 1 << octant),
-                present: 1 << CENTRE,
-                around: [0; 27],
-            };
-            parent.around[CENTRE] = p as u32;
-            parents.push(parent);
+            let mask = octants.fold(0, |mask, octant| mask | 1 << octant);
+            parents.push(Parent { first, mask });
+            let (present, mut numbers) = (1 << CENTRE, [0; 27]);
+            numbers[CENTRE] = p as u32;
+            around.push(Around {
+                present,
+                earlier: 0,
+                numbers,
+            });
         }
         // Neighbours of neighbours are neighbours: each is looked for where the last one in its place was.
         let mut last = [0; 27];
@@ -93,47 +134,65 @@ impl Nearby {
                 last[tap] = q;
                 if above.get(q) == Some(&there) {
                     for (p, tap, q) in [(p, tap, q), (q, 26 - tap, p)] {
-                        parents[p].present |= 1 << tap;
-                        parents[p].around[tap] = q as u32;
+                        around[p].present |= 1 << tap;
+                        around[p].earlier |= u32::from(q < p) << tap;
+                        around[p].numbers[tap] = q as u32;
                     }
                 }
             }
         }
-        Nearby { parents, voxels }
+        Nearby {
+            parents,
+            around,
+            voxels,
+        }
     }
 
-    /// Lists the voxels near one that come before it, octant by octant, and in Morton order within an octant.
-    pub fn before(&self, voxel: usize, list: &mut Vec<Near>) {
-        list.clear();
+    /// Visits the voxels near one that come before it, octant by octant, and in Morton order within an octant.
+    #[inline]
+    pub fn before(&self, voxel: usize, mut visit: impl FnMut(Near)) {
         let (octant, own) = self.voxels[voxel];
         let octant = u32::from(octant);
-        let parent = &self.parents[own as usize];
-        let mut present = parent.present;
-        while present != 0 {
-            let tap = present.trailing_zeros() as usize;
-            present &= present - 1;
-            let q = parent.around[tap];
-            let Parent { first, mask, .. } = self.parents[q as usize];
-            let voxel = |octant: u32| (first + (mask & ((1 << octant) - 1)).count_ones()) as usize;
-            let mut near = ONE_AWAY[octant as usize][tap] & mask;
-            while near != 0 {
-                let other = near.trailing_zeros();
-                near &= near - 1;
-                list.push(Near {
-                    voxel: voxel(other),
+        let around = &self.around[own as usize];
+        for tap in bits(around.present & WITH_ONE_AWAY[octant as usize]) {
+            let parent = self.parents[around.numbers[tap as usize] as usize];
+            for other in bits(u32::from(
+                ONE_AWAY[octant as usize][tap as usize] & parent.mask,
+            )) {
+                visit(Near {
+                    voxel: parent.child(other),
                     two: false,
-                    axes: (octant ^ other).count_ones(),
+                    axes: u32::from(ONES[(octant ^ other) as usize]),
                 });
             }
-            if q < own && mask >> octant & 1 == 1 {
-                list.push(Near {
-                    voxel: voxel(octant),
+        }
+        for tap in bits(around.earlier) {
+            let parent = self.parents[around.numbers[tap as usize] as usize];
+            if parent.mask >> octant & 1 == 1 {
+                visit(Near {
+                    voxel: parent.child(octant),
                     two: true,
-                    axes: axes(tap),
+                    axes: u32::from(AXES[tap as usize]),
                 });
             }
         }
     }
+}
+
+impl Parent {
+    /// The number of the voxel in an octant, or of the one after it.
+    fn child(self, octant: u32) -> usize {
+        (self.first + (BELOW[usize::from(self.mask)] >> (4 * octant) & 7)) as usize
+    }
+}
+
+/// Which bits are set, from the lowest on.
+fn bits(mut word: u32) -> impl Iterator<Item = u32> {
+    std::iter::from_fn(move || {
+        let bit = (word != 0).then(|| word.trailing_zeros());
+        word &= word.wrapping_sub(1);
+        bit
+    })
 }
 
 /// The bits of an axis of a key, one less, as they are, or one more for a step of 0, 1 or 2. Beyond the cube no key is that of a parent.
@@ -195,7 +254,7 @@ mod tests {
         let nearby = Nearby::new(keys);
         for voxel in 0..keys.len() {
             let mut found = Vec::new();
-            nearby.before(voxel, &mut found);
+            nearby.before(voxel, |near| found.push(near));
             found.sort_by_key(|near| near.voxel);
             assert_eq!(found, searched(keys, voxel), "voxel {voxel}");
         }
