@@ -18,30 +18,32 @@ from train import Trainer, weights_of
 
 
 @torch.no_grad()
-def constants(model, samples):
-    """Of each role with latents their least and greatest values [K], rounded; and of those that are predicted the means [2, K] of what is
-    predicted: values, and scale indices in eighths."""
-    spans, predicted = {}, {}
+def habits(model, samples):
+    """Of each role with latents the mean and the variance of each, rounded, [2, K]; and of those that are predicted the means of what is predicted,
+    values, and scale indices in eighths, [2, K]."""
+    own, predicted = {}, {}
     for s in samples:
         trail, _, latents = model.code(s.crop, model.analyse(s.crop, s.rgb), 2, "round")
         for r, y in enumerate(y for y in latents if y.shape[1]):
             y = torch.round(y)
-            low, high = spans.get(r, (y[0], y[0]))
-            spans[r] = torch.minimum(low, y.amin(0)), torch.maximum(high, y.amax(0))
+            own.setdefault(r, []).append(torch.stack([y.mean(0), y.square().mean(0)]))
             if r:
                 mu, log_sigma = model.predict(r, model.context(trail[r - 1], s.crop, r), s.crop)
                 index = ((log_sigma - math.log(SIGMA_MIN)) * PER_NAT).clamp(0, 63) / 8
                 predicted.setdefault(r, []).append(torch.stack([mu.mean(0), index.mean(0)]))
-    return spans, {r: torch.stack(means).mean(0) for r, means in predicted.items()}
+    own, predicted = ({r: torch.stack(all).mean(0) for r, all in of.items()} for of in (own, predicted))
+    return {r: torch.stack([mean, square - mean.square()]) for r, (mean, square) in own.items()}, predicted
 
 
 @torch.no_grad()
-def prune(model, samples):
-    """The same network without the latents that are constant in every role of these samples: which were kept, the configuration, the weights."""
-    spans, predicted = constants(model, samples)
-    k, constant = model.cfg["latents"], {r: low for r, (low, _) in spans.items()}
-    alive = torch.stack([low != high for low, high in spans.values()]).any(0)
-    keep, dead = alive.nonzero().flatten(), (~alive).nonzero().flatten()
+def prune(model, samples, latents=None):
+    """The same network without the latents that are constant in every role of these samples, or with so many as vary most: which were kept, the
+    configuration, the weights."""
+    own, predicted = habits(model, samples)
+    k, constant = model.cfg["latents"], {r: torch.round(mean) for r, (mean, _) in own.items()}
+    variance = torch.stack([v for _, v in own.values()]).amax(0)
+    alive = int((variance > 1e-6).sum()) if latents is None else latents
+    keep, dead = (part.sort().values for part in variance.argsort(descending=True).split([alive, k - alive]))
     weights = dict(model.state_dict())
 
     def outputs(layer):
@@ -71,7 +73,7 @@ def prune(model, samples):
 
     for name in [n for n in weights if n.startswith("prior.")]:
         weights[name] = weights[name][keep]
-    for r in spans:
+    for r in own:
         outputs(f"fs.{r}.lin2")
         inputs(f"fr.{r}.lin1", [(constant[r], False)] + [model.cfg["channels"]] * (r > 0))
         if r:
@@ -94,12 +96,13 @@ def main():
     p.add_argument("out", help="weights for `train.py --init`, with a configuration of as many latents as are left")
     p.add_argument("--data", required=True, help="folder of samples")
     p.add_argument("--samples", type=int, default=40)
+    p.add_argument("--latents", type=int, help="how many to keep, those that vary most; all that vary at all when left out")
     args = p.parse_args()
     model = B2P(Trainer.config_of(args.weights))
     model.load_state_dict(weights_of(args.weights))
     files, _ = data.split(args.data, 8)
     samples = [data.load_sample(f) for f in files[:: max(1, len(files) // args.samples)]]
-    keep, cfg, weights = prune(model.eval(), samples)
+    keep, cfg, weights = prune(model.eval(), samples, args.latents)
     print(f"of {model.cfg['latents']} latents {keep} are left")
     save_file({k: v.half().numpy() for k, v in weights.items()}, args.out, metadata={"config": json.dumps(cfg)})
 

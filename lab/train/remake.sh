@@ -60,8 +60,12 @@ train() {
 fit() {
     "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 6)" --samples 260 --lr 3e-4 --threads 1 --only-base
 }
-# prices A B C: of channels, the last of all from the third on
-prices() { echo "[$1, $2, $3, $3, $3, $3, $3, $3]"; }
+# prune NAME: leaves out latents that never change, once all has learned
+prune() {
+    "$python" prune.py "$out/$1/last.pt" "$out/$1/pruned.safetensors" --data "$out/mixed" --latents 3
+}
+# prices A B C: of luma and two chromas
+prices() { echo "[$1, $2, $3]"; }
 # ship NAME FILE PRICES PRICES: writes the model, and what bits of roles 0 and 1 are worth to its encoder
 ship() {
     local all="[$(prices $3), $(prices $4), $(prices 0 0 0)]"
@@ -94,37 +98,43 @@ mixed=(--data "$out/mixed" --held-out 20 --freeze-finest --lr-heads 3 --rate-sta
 # Heads alone, once all else has learned.
 last=(--data "$out/mixed" --held-out 20 --only-heads --lam 1 --lr-conv 4e-4 --lr-linear 6.5e-4 --warmup 50 --decay-from 0.2 --coarse 0.45 --average 0.998 --square 40)
 
-train start lite 100 --lam 18 --rate-start 0.2 --rate-ramp 0.12 --rounding-from 0.03 --decay-from 0.35 --warmup 400
-train low lite 12 --init "$out/start/last.pt" --lam 4 --freeze-finest --rate-start 1 --rate-ramp 0.01 --rounding-from 0.02 --decay-from 0.3 --warmup 100
-train low-heads lite 44 --init "$out/low/last.pt" --lam 1 "${heads[@]}"
-train low-whole-1 lite 21 --init "$out/low-heads/last.pt" --coarse 1 "${whole[@]}"
-train low-whole-2 lite 21 --init "$out/low-whole-1/last.pt" --coarse 0 "${whole[@]}"
-train low-rest lite 30 --init "$out/low-whole-2/last.pt" --lam 4 "${rest[@]}"
+train start lite-start 100 --lam 18 --rate-start 0.2 --rate-ramp 0.12 --rounding-from 0.03 --decay-from 0.35 --warmup 400
+train low lite-start 12 --init "$out/start/last.pt" --lam 4 --freeze-finest --rate-start 1 --rate-ramp 0.01 --rounding-from 0.02 --decay-from 0.3 --warmup 100
+train low-heads lite-start 44 --init "$out/low/last.pt" --lam 1 "${heads[@]}"
+train low-whole-1 lite-start 21 --init "$out/low-heads/last.pt" --coarse 1 "${whole[@]}"
+train low-whole-2 lite-start 21 --init "$out/low-whole-1/last.pt" --coarse 0 "${whole[@]}"
+train low-rest lite-start 30 --init "$out/low-whole-2/last.pt" --lam 4 "${rest[@]}"
 fit low-rest
-train low-mixed lite 42 --init "$out/low-rest/tuned.pt" --lam 4 "${mixed[@]}"
-train low-more lite 70 --init "$out/low-mixed/last.pt" --lam 4 "${mixed[@]}"
-train low-last lite 19 --init "$out/low-more/last.pt" "${last[@]}"
-train low-again lite 23 --init "$out/low-last/last.pt" --lam 4 --stay 0.5 "${mixed[@]}"
-ship low-again lite-low "0.02 0.05 0.05" "0.05 0.15 0.15"
+train low-mixed lite-start 42 --init "$out/low-rest/tuned.pt" --lam 4 "${mixed[@]}"
+train low-more lite-start 70 --init "$out/low-mixed/last.pt" --lam 4 "${mixed[@]}"
+train low-last lite-start 19 --init "$out/low-more/last.pt" "${last[@]}"
+train low-again lite-start 23 --init "$out/low-last/last.pt" --lam 4 --stay 0.5 "${mixed[@]}"
+prune low-again
+train low-three lite 36 --init "$out/low-again/pruned.safetensors" --lam 4 --stay 0.5 "${mixed[@]}"
+ship low-three lite-low "0.06 0.15 0.15" "0.03 0.1 0.1"
 imitating lite-low 15
-train high lite 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
-train high-heads lite 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
-train high-whole-1 lite 25 --init "$out/high-heads/last.pt" --coarse 1 "${whole[@]}"
-train high-whole-2 lite 25 --init "$out/high-whole-1/last.pt" --coarse 0 "${whole[@]}"
+train high lite-start 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
+train high-heads lite-start 50 --init "$out/high/last.pt" --lam 1 "${heads[@]}" --square 40
+train high-whole-1 lite-start 25 --init "$out/high-heads/last.pt" --coarse 1 "${whole[@]}"
+train high-whole-2 lite-start 25 --init "$out/high-whole-1/last.pt" --coarse 0 "${whole[@]}"
 fit high-whole-2
-train high-mixed lite 82 --init "$out/high-whole-2/tuned.pt" --lam 16 "${mixed[@]}"
-train high-more lite 82 --init "$out/high-mixed/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
-train high-last lite 24 --init "$out/high-more/last.pt" "${last[@]}"
-train high-again lite 62 --init "$out/high-last/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
-ship high-again lite "0.03 0.1 0.1" "0.1 0.2 0.2"
+train high-mixed lite-start 82 --init "$out/high-whole-2/tuned.pt" --lam 16 "${mixed[@]}"
+train high-more lite-start 82 --init "$out/high-mixed/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
+train high-last lite-start 24 --init "$out/high-more/last.pt" "${last[@]}"
+train high-again lite-start 62 --init "$out/high-last/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
+prune high-again
+train high-three lite 62 --init "$out/high-again/pruned.safetensors" --lam 16 --stay 0.5 "${mixed[@]}"
+ship high-three lite "0.06 0.15 0.15" "0.05 0.15 0.15"
 imitating lite 15
-train least lite 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
-train least-whole-1 lite 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
-train least-whole-2 lite 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${whole[@]}"
-train least-rest lite 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@]}"
+train least lite-start 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
+train least-whole-1 lite-start 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
+train least-whole-2 lite-start 21 --init "$out/least-whole-1/last.pt" --coarse 0 "${whole[@]}"
+train least-rest lite-start 30 --init "$out/least-whole-2/last.pt" --lam 1.2 "${rest[@]}"
 fit least-rest
-train least-mixed lite 40 --init "$out/least-rest/tuned.pt" --lam 1.2 "${mixed[@]}"
-train least-last lite 19 --init "$out/least-mixed/last.pt" "${last[@]}"
-train least-again lite 19 --init "$out/least-last/last.pt" --lam 1.2 --stay 0.5 "${mixed[@]}"
-ship least-again lite-least "0 0.02 0.02" "0.02 0.05 0.05"
+train least-mixed lite-start 40 --init "$out/least-rest/tuned.pt" --lam 1.2 "${mixed[@]}"
+train least-last lite-start 19 --init "$out/least-mixed/last.pt" "${last[@]}"
+train least-again lite-start 19 --init "$out/least-last/last.pt" --lam 1.2 --stay 0.5 "${mixed[@]}"
+prune least-again
+train least-three lite 20 --init "$out/least-again/pruned.safetensors" --lam 1.2 --stay 0.5 "${mixed[@]}"
+ship least-three lite-least "0.06 0.15 0.15" "0.015 0.05 0.05"
 imitating lite-least 15
