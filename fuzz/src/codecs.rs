@@ -6,7 +6,6 @@ use std::ops::Range;
 use std::rc::Rc;
 use std::sync::LazyLock;
 
-use b2p::Cancel;
 use b2p::bitstream::Slice;
 use b2p::entropy::{
     Condition, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level,
@@ -14,6 +13,7 @@ use b2p::entropy::{
     quantise, quantise_passes,
 };
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
+use b2p::{Cancel, Isa};
 
 use crate::Source;
 
@@ -37,13 +37,27 @@ pub fn octree(bytes: &[u8]) {
     let mut decoded = Octree::root();
     let mut map = KernelMap::root();
     for level in 1..=depth {
-        let encoded = codec::encode_level(&octree, &map, level, slice);
+        let encoded = codec::encode_level(Isa::detect(), &octree, &map, level, slice);
         let slices: Vec<_> = encoded.iter().map(|(n, code)| whole(*n, code)).collect();
-        codec::decode_level(&mut decoded, &map, &slices, slice, &Cancel::default())
-            .expect("what was encoded decodes");
+        codec::decode_level(
+            Isa::detect(),
+            &mut decoded,
+            &map,
+            &slices,
+            slice,
+            &Cancel::default(),
+        )
+        .expect("what was encoded decodes");
         assert_eq!(decoded, octree.truncated(level));
         let fewer = &slices[1..];
-        let refused = codec::decode_level(&mut decoded, &map, fewer, slice, &Cancel::default());
+        let refused = codec::decode_level(
+            Isa::detect(),
+            &mut decoded,
+            &map,
+            fewer,
+            slice,
+            &Cancel::default(),
+        );
         assert!(refused.is_err(), "a slice is missing");
         assert_eq!(decoded, octree.truncated(level));
         map = octree.child_map(level - 1, &map);
@@ -57,7 +71,7 @@ pub fn octree(bytes: &[u8]) {
     let voxels = parents + usize::from(source.byte()) % (7 * parents + 1);
     let code = source.rest();
     let slice = whole(voxels as u32, code);
-    let Ok(masks) = codec::decode_slice(depth + 1, &map, 0..parents, &slice) else {
+    let Ok(masks) = codec::decode_slice(Isa::detect(), depth + 1, &map, 0..parents, &slice) else {
         return;
     };
     assert_eq!(
@@ -68,7 +82,7 @@ pub fn octree(bytes: &[u8]) {
     grown
         .grow(masks)
         .expect("one occupancy for every parent, none empty");
-    let again = codec::encode_level(&grown, &map, depth + 1, usize::MAX);
+    let again = codec::encode_level(Isa::detect(), &grown, &map, depth + 1, usize::MAX);
     assert_eq!(again[0].1, code, "another code for the same octree");
 }
 

@@ -30,6 +30,7 @@ mod rows;
 mod taps;
 mod tile;
 mod winograd;
+mod work;
 
 pub mod ceiling;
 pub mod reference;
@@ -47,3 +48,4 @@ pub use memory::{give_back, zeros};
 pub use plan::Plan;
 pub use rows::Output;
 pub use taps::{ABSENT, Taps};
+pub use work::Work;

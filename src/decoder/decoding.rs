@@ -398,11 +398,12 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     ) -> Result<(Vec<i16>, Vec<i16>, KernelMap)> {
         let (n, count) = (level.level, level.voxels as usize);
         let (role, slice) = (usize::from(n - header.base), header.slice_voxels as usize);
+        let isa = self.model.isa();
         let root = KernelMap::root();
         let mut map = Cow::Borrowed(above.map_or(&root, |above| &above.map));
         log.step(format!("geometry of level {n}"), count, "voxels", || {
             level.geometry.iter().try_for_each(|part| {
-                codec::decode_level(octree, &map, &part.slices, slice, &self.cancel)?;
+                codec::decode_level(isa, octree, &map, &part.slices, slice, &self.cancel)?;
                 if part.level < n {
                     map = Cow::Owned(octree.child_map(part.level - 1, &map));
                 }

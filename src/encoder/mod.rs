@@ -201,12 +201,12 @@ pub(crate) fn write(
                 if role > 0 {
                     return writer.geometry(
                         level,
-                        &codec::encode_level(octree, &maps[role - 1], level, slice),
+                        &codec::encode_level(model.isa(), octree, &maps[role - 1], level, slice),
                     );
                 }
                 let mut map = KernelMap::root();
                 (1..=level).try_for_each(|n| {
-                    let slices = codec::encode_level(octree, &map, n, slice);
+                    let slices = codec::encode_level(model.isa(), octree, &map, n, slice);
                     map = octree.child_map(n - 1, &map);
                     writer.geometry(n, &slices)
                 })

@@ -129,7 +129,7 @@ fn coloured(
     let mut below: Option<Vec<i16>> = None;
     for level in 0..=top {
         if level > 0 {
-            let slices = codec::encode_level(&octree, &map, level, slice as usize);
+            let slices = codec::encode_level(model.isa(), &octree, &map, level, slice as usize);
             writer.geometry(level, &slices).expect("geometry");
             map = octree.child_map(level - 1, &map);
         }

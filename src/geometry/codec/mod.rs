@@ -29,6 +29,7 @@ use super::{KernelMap, Octree};
 use crate::bitstream::Slice;
 use crate::cancel::Cancel;
 use crate::error::{Error, Result, Stage};
+use b2p_kernels::{Isa, Work};
 use coder::{Decoder, Encoder};
 use predictor::Predictor;
 use rayon::prelude::*;
@@ -40,11 +41,12 @@ fn slices(parents: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<u
 }
 
 /// Codes level `level` of `octree` in slices of `slice` parents: for each the number of children, and the code. `map` is the 3³
-/// kernel map of the level above.
+/// kernel map of the level above; any `isa` gives the same.
 ///
 /// # Panics
 /// If `level` is 0 or deeper than the octree, `map` is another level's, or `slice` is 0.
 pub fn encode_level(
+    isa: Isa,
     octree: &Octree,
     map: &KernelMap,
     level: u8,
@@ -55,9 +57,12 @@ pub fn encode_level(
     let ranges: Vec<_> = slices(occupancy.len(), slice).collect();
     let encode = |parents: Range<usize>| {
         let masks = &occupancy[parents.clone()];
-        let mut encoder = Encoder::new();
-        write(&mut Predictor::new(), &mut encoder, map, parents, masks);
-        (count(masks) as u32, encoder.finish())
+        let work = Encode {
+            map,
+            parents,
+            masks,
+        };
+        (count(masks) as u32, isa.run(work))
     };
     ranges.into_par_iter().map(encode).collect()
 }
@@ -71,12 +76,18 @@ pub fn encode_level(
 /// # Panics
 /// If `map` has not that many rows.
 pub fn decode_slice(
+    isa: Isa,
     level: u8,
     map: &KernelMap,
     parents: Range<usize>,
     slice: &Slice,
 ) -> Result<Vec<u8>> {
-    let masks = read(&mut Predictor::new(), level, map, parents.clone(), slice)?;
+    let masks = isa.run(Decode {
+        level,
+        map,
+        parents: parents.clone(),
+        slice,
+    })?;
     match count(&masks) {
         found if found == slice.voxels as usize => Ok(masks),
         found => {
@@ -96,6 +107,7 @@ pub fn decode_slice(
 /// # Panics
 /// If `map` is another level's, or `slice` is 0.
 pub fn decode_level(
+    isa: Isa,
     octree: &mut Octree,
     map: &KernelMap,
     encoded: &[Slice],
@@ -116,7 +128,7 @@ pub fn decode_level(
     let tasks: Vec<_> = ranges.zip(encoded).collect();
     let decode = |(parents, slice): (Range<usize>, &Slice)| {
         cancel.check()?;
-        decode_slice(level, map, parents, slice)
+        decode_slice(isa, level, map, parents, slice)
     };
     // All of them, so that the error is that of the first slice that has one.
     let masks: Vec<Result<_>> = tasks.into_par_iter().map(decode).collect();
@@ -125,45 +137,70 @@ pub fn decode_level(
 }
 
 /// Codes the occupancies of one slice.
-fn write(
-    predictor: &mut Predictor,
-    encoder: &mut Encoder,
-    map: &KernelMap,
+struct Encode<'a> {
+    map: &'a KernelMap,
     parents: Range<usize>,
-    masks: &[u8],
-) {
-    for (here, &mask) in parents.clone().zip(masks) {
-        let facts = predictor.network.sum(map.row(here), &parents, here, masks);
-        predictor.code(encoder, &facts, mask);
+    masks: &'a [u8],
+}
+
+impl Work for Encode<'_> {
+    type Output = Vec<u8>;
+
+    #[inline(always)]
+    fn run(self) -> Vec<u8> {
+        let Encode {
+            map,
+            parents,
+            masks,
+        } = self;
+        let (mut predictor, mut encoder) = (Predictor::new(), Encoder::new());
+        for (here, &mask) in parents.clone().zip(masks) {
+            let facts = predictor.network.sum(map.row(here), &parents, here, masks);
+            predictor.code(&mut encoder, &facts, mask);
+        }
+        encoder.finish()
     }
 }
 
 /// Decodes the occupancies of one slice, unless they come to more than its voxels.
-fn read(
-    predictor: &mut Predictor,
+struct Decode<'a> {
     level: u8,
-    map: &KernelMap,
+    map: &'a KernelMap,
     parents: Range<usize>,
-    slice: &Slice,
-) -> Result<Vec<u8>> {
-    let mut decoder = Decoder::new(slice.bytes, slice.offset);
-    let mut masks = Vec::with_capacity(parents.len());
-    let mut found = 0;
-    for here in parents.clone() {
-        let facts = predictor.network.sum(map.row(here), &parents, here, &masks);
-        let mask = predictor.code(&mut decoder, &facts, 0);
-        decoder.check_not_past_end()?;
-        masks.push(mask);
-        found += mask.count_ones() as usize;
-        let at_least = found + (parents.end - here - 1);
-        if at_least > slice.voxels as usize {
-            let found = format!("at least {at_least}");
-            let expected = format!("at most {}", slice.voxels);
-            return Err(wrong_count(level, &parents, slice, found, expected));
+    slice: &'a Slice<'a>,
+}
+
+impl Work for Decode<'_> {
+    type Output = Result<Vec<u8>>;
+
+    #[inline(always)]
+    fn run(self) -> Result<Vec<u8>> {
+        let Decode {
+            level,
+            map,
+            parents,
+            slice,
+        } = self;
+        let mut predictor = Predictor::new();
+        let mut decoder = Decoder::new(slice.bytes, slice.offset);
+        let mut masks = Vec::with_capacity(parents.len());
+        let mut found = 0;
+        for here in parents.clone() {
+            let facts = predictor.network.sum(map.row(here), &parents, here, &masks);
+            let mask = predictor.code(&mut decoder, &facts, 0);
+            decoder.check_not_past_end()?;
+            masks.push(mask);
+            found += mask.count_ones() as usize;
+            let at_least = found + (parents.end - here - 1);
+            if at_least > slice.voxels as usize {
+                let found = format!("at least {at_least}");
+                let expected = format!("at most {}", slice.voxels);
+                return Err(wrong_count(level, &parents, slice, found, expected));
+            }
         }
+        decoder.finish()?;
+        Ok(masks)
     }
-    decoder.finish()?;
-    Ok(masks)
 }
 
 fn count(masks: &[u8]) -> usize {

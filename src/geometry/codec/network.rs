@@ -167,7 +167,7 @@ impl Network {
 
     /// The sum of the rows of what is known about the voxel `here`, whose 3³ neighbours are `row`: `occupancy` is that of the voxels
     /// `slice`, up to `here` at least.
-    #[inline]
+    #[inline(always)]
     pub fn sum(&self, row: &[u32], slice: &Range<usize>, here: usize, occupancy: &[u8]) -> Row {
         let mut sum = [0; WIDTH];
         visit(row, slice, here, occupancy, |k, children| match children {
@@ -182,7 +182,7 @@ impl Network {
 
     /// The hidden layer for the child `node` (`1 << octant | occupancy of the octants below it`): of the sum of all rows what is
     /// positive.
-    #[inline(never)]
+    #[inline(always)]
     pub fn hidden(&self, facts: &Row, node: usize) -> Row {
         let tree = &self.tree[node];
         std::array::from_fn(|unit| facts[unit].wrapping_add(tree[unit]).max(0))

@@ -36,7 +36,7 @@ impl Predictor {
 
     /// Codes the occupancy of a voxel of which `facts` are known. An encoder takes `occupancy`, never zero, and returns it; a decoder
     /// returns what it read, also never zero: if seven children are missing, the eighth is there and not coded.
-    #[inline]
+    #[inline(always)]
     pub fn code(&mut self, coder: &mut impl Coder, facts: &Row, occupancy: u8) -> u8 {
         let mut coded = 0u8;
         for octant in 0..8 {
@@ -60,6 +60,7 @@ impl Predictor {
         coded
     }
 
+    #[inline(always)]
     fn learn(&mut self, octant: usize, hidden: &Row, e: i16) {
         self.bias[octant] = self.bias[octant].wrapping_add(4 * i32::from(e));
         for (weight, &unit) in self.output[octant].iter_mut().zip(hidden) {

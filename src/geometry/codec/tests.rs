@@ -7,7 +7,7 @@ fn encode(octree: &Octree, slice: usize) -> Vec<Vec<(u32, Vec<u8>)>> {
     let mut map = KernelMap::root();
     let mut levels = Vec::new();
     for level in 1..=octree.depth() {
-        levels.push(encode_level(octree, &map, level, slice));
+        levels.push(encode_level(Isa::detect(), octree, &map, level, slice));
         map = octree.child_map(level - 1, &map);
     }
     levels
@@ -18,6 +18,7 @@ fn decode(levels: &[Vec<(u32, Vec<u8>)>], slice: usize) -> Result<Octree> {
     for encoded in levels {
         let map = octree.kernel_map(octree.depth());
         decode_level(
+            Isa::detect(),
             &mut octree,
             &map,
             &borrowed(encoded),
@@ -64,7 +65,7 @@ fn bowl(depth: u8) -> Octree {
 fn level_of_a_bowl() -> (Octree, KernelMap, u32, Vec<u8>) {
     let octree = bowl(6);
     let map = octree.kernel_map(5);
-    let (voxels, bytes) = encode_level(&octree, &map, 6, usize::MAX).remove(0);
+    let (voxels, bytes) = encode_level(Isa::detect(), &octree, &map, 6, usize::MAX).remove(0);
     (octree, map, voxels, bytes)
 }
 
@@ -89,7 +90,7 @@ proptest! {
         let octree = bowl(4).truncated(3);
         let map = octree.kernel_map(3);
         let mut grown = octree.clone();
-        match decode_level(&mut grown, &map, &[slice_at(0, voxels, &bytes)], usize::MAX, &Cancel::default()) {
+        match decode_level(Isa::detect(), &mut grown, &map, &[slice_at(0, voxels, &bytes)], usize::MAX, &Cancel::default()) {
             Ok(()) => prop_assert_eq!(grown.level(4).len(), voxels as usize),
             Err(_) => prop_assert_eq!(grown, octree),
         }
@@ -121,7 +122,8 @@ fn full_cubes_lines_and_checkerboards_come_back() {
 #[test]
 fn a_surface_costs_less_than_half_of_its_occupancy_bytes() {
     let octree = bowl(8);
-    let (_, bytes) = encode_level(&octree, &octree.kernel_map(7), 8, usize::MAX).remove(0);
+    let (_, bytes) =
+        encode_level(Isa::detect(), &octree, &octree.kernel_map(7), 8, usize::MAX).remove(0);
     let (bits, parents) = (8 * bytes.len(), octree.level(7).len());
     assert!(bits < 4 * parents, "{bits} bits for {parents} parents");
 }
@@ -129,7 +131,8 @@ fn a_surface_costs_less_than_half_of_its_occupancy_bytes() {
 #[test]
 fn a_full_cube_costs_next_to_nothing() {
     let octree = Octree::new(Voxels::new(6, (0..1 << 18).collect())).unwrap();
-    let (_, bytes) = encode_level(&octree, &octree.kernel_map(5), 6, usize::MAX).remove(0);
+    let (_, bytes) =
+        encode_level(Isa::detect(), &octree, &octree.kernel_map(5), 6, usize::MAX).remove(0);
     assert!(
         8 * bytes.len() < octree.level(5).len() / 4,
         "{}",
@@ -141,11 +144,18 @@ fn a_full_cube_costs_next_to_nothing() {
 fn slices_do_not_need_each_other() {
     let octree = bowl(7);
     let map = octree.kernel_map(6);
-    let slices = encode_level(&octree, &map, 7, 1000);
+    let slices = encode_level(Isa::detect(), &octree, &map, 7, 1000);
     assert!(slices.len() > 2);
     for (i, (voxels, bytes)) in slices.iter().enumerate().rev() {
         let parents = i * 1000..map.len().min((i + 1) * 1000);
-        let masks = decode_slice(7, &map, parents.clone(), &slice_at(0, *voxels, bytes)).unwrap();
+        let masks = decode_slice(
+            Isa::detect(),
+            7,
+            &map,
+            parents.clone(),
+            &slice_at(0, *voxels, bytes),
+        )
+        .unwrap();
         assert_eq!(masks, octree.occupancy(6)[parents]);
     }
 }
@@ -161,10 +171,27 @@ fn any_number_of_threads_gives_the_same_bytes() {
 }
 
 #[test]
+fn every_instruction_set_gives_the_same_bytes_and_voxels() {
+    let (octree, map, voxels, bytes) = level_of_a_bowl();
+    for isa in Isa::available() {
+        let (found, own) = encode_level(isa, &octree, &map, 6, usize::MAX).remove(0);
+        assert_eq!((found, &own), (voxels, &bytes), "{isa}");
+        let masks = decode_slice(isa, 6, &map, 0..map.len(), &slice_at(0, voxels, &bytes));
+        assert_eq!(masks.unwrap(), octree.occupancy(5), "{isa}");
+    }
+}
+
+#[test]
 fn every_truncation_is_noticed() {
     let (_, map, voxels, bytes) = level_of_a_bowl();
     for end in 0..bytes.len() {
-        let result = decode_slice(6, &map, 0..map.len(), &slice_at(0, voxels, &bytes[..end]));
+        let result = decode_slice(
+            Isa::detect(),
+            6,
+            &map,
+            0..map.len(),
+            &slice_at(0, voxels, &bytes[..end]),
+        );
         assert!(matches!(result, Err(Error::Truncated { .. })), "{end}");
     }
 }
@@ -173,7 +200,13 @@ fn every_truncation_is_noticed() {
 fn bytes_left_over_are_refused() {
     let (_, map, voxels, mut bytes) = level_of_a_bowl();
     bytes.push(0);
-    let result = decode_slice(6, &map, 0..map.len(), &slice_at(0, voxels, &bytes));
+    let result = decode_slice(
+        Isa::detect(),
+        6,
+        &map,
+        0..map.len(),
+        &slice_at(0, voxels, &bytes),
+    );
     assert!(matches!(result, Err(Error::Malformed { .. })));
 }
 
@@ -181,7 +214,13 @@ fn bytes_left_over_are_refused() {
 fn a_wrong_count_is_refused() {
     let (_, map, voxels, bytes) = level_of_a_bowl();
     for wrong in [0, 1, voxels - 1, voxels + 1, u32::MAX] {
-        let result = decode_slice(6, &map, 0..map.len(), &slice_at(0, wrong, &bytes));
+        let result = decode_slice(
+            Isa::detect(),
+            6,
+            &map,
+            0..map.len(),
+            &slice_at(0, wrong, &bytes),
+        );
         assert!(matches!(result, Err(Error::Malformed { .. })), "{wrong}");
     }
 }
@@ -190,11 +229,17 @@ fn a_wrong_count_is_refused() {
 fn every_flipped_bit_is_noticed() {
     let octree = bowl(5);
     let map = octree.kernel_map(4);
-    let (voxels, bytes) = encode_level(&octree, &map, 5, usize::MAX).remove(0);
+    let (voxels, bytes) = encode_level(Isa::detect(), &octree, &map, 5, usize::MAX).remove(0);
     for bit in 0..8 * bytes.len() {
         let mut bytes = bytes.clone();
         bytes[bit / 8] ^= 1 << (bit % 8);
-        let result = decode_slice(5, &map, 0..map.len(), &slice_at(0, voxels, &bytes));
+        let result = decode_slice(
+            Isa::detect(),
+            5,
+            &map,
+            0..map.len(),
+            &slice_at(0, voxels, &bytes),
+        );
         assert!(result.is_err(), "bit {bit}");
     }
 }
@@ -203,9 +248,10 @@ fn every_flipped_bit_is_noticed() {
 fn a_missing_slice_is_refused() {
     let octree = bowl(5);
     let map = octree.kernel_map(4);
-    let slices = encode_level(&octree, &map, 5, 50);
+    let slices = encode_level(Isa::detect(), &octree, &map, 5, 50);
     let mut decoded = octree.truncated(4);
     let result = decode_level(
+        Isa::detect(),
         &mut decoded,
         &map,
         &borrowed(&slices[1..]),
@@ -220,7 +266,7 @@ fn faults_are_placed_in_the_stream() {
     let (_, map, voxels, bytes) = level_of_a_bowl();
     let fault = |voxels: u32, bytes: &[u8]| {
         let slice = slice_at(1000, voxels, bytes);
-        decode_slice(6, &map, 0..map.len(), &slice).unwrap_err()
+        decode_slice(Isa::detect(), 6, &map, 0..map.len(), &slice).unwrap_err()
     };
     let cut = fault(voxels, &bytes[..bytes.len() - 1]);
     let end = 1000 + bytes.len() as u64;
