@@ -1,6 +1,8 @@
 //! Plain loops compiled for each instruction set.
 
-use crate::isa::{Isa, Level};
+use crate::isa::Isa;
+#[cfg(target_arch = "x86_64")]
+use crate::isa::Level;
 
 /// Work in plain Rust that is compiled once for every instruction set.
 ///
@@ -17,18 +19,16 @@ pub trait Work {
 impl Isa {
     /// Does work with this instruction set.
     pub fn run<W: Work>(self, work: W) -> W::Output {
+        #[cfg(target_arch = "x86_64")]
         match self.level() {
-            Level::Scalar => work.run(),
+            Level::Scalar => (),
             // SAFETY: an `Isa` of this level is only made where the processor has these features.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 | Level::AvxVnni => unsafe { avx2(work) },
+            Level::Avx2 | Level::AvxVnni => return unsafe { avx2(work) },
             // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 | Level::Amx => unsafe { avx512(work) },
-            // What every processor with NEON has is what this is compiled for anyhow.
-            #[cfg(target_arch = "aarch64")]
-            Level::Neon | Level::NeonDot => work.run(),
+            Level::Avx512 | Level::Amx => return unsafe { avx512(work) },
         }
+        // On AArch64 plain code uses NEON as it is.
+        work.run()
     }
 }
 

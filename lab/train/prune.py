@@ -1,20 +1,17 @@
 """Leaves out latents that never change: what these told the network, as constants, goes into its biases.
 
-    python prune.py RUN/last.pt|WEIGHTS.safetensors OUT.safetensors --data FOLDER
+    python prune.py RUN/last.pt OUT.pt --data FOLDER
 """
 
 import argparse
-import json
 import math
 
 import torch
-from safetensors.numpy import save_file
 
 import data
 from model import B2P
 from passes import PER_NAT
 from rates import SIGMA_MIN
-from train import Trainer, weights_of
 
 
 @torch.no_grad()
@@ -92,19 +89,20 @@ def prune(model, samples, latents=None):
 
 def main():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("weights")
-    p.add_argument("out", help="weights for `train.py --init`, with a configuration of as many latents as are left")
+    p.add_argument("checkpoint")
+    p.add_argument("out", help="its averaged weights, for `export.py`, or for `train.py --init` with a configuration of as many latents as are left")
     p.add_argument("--data", required=True, help="folder of samples")
     p.add_argument("--samples", type=int, default=40)
     p.add_argument("--latents", type=int, help="how many to keep, those that vary most; all that vary at all when left out")
     args = p.parse_args()
-    model = B2P(Trainer.config_of(args.weights))
-    model.load_state_dict(weights_of(args.weights))
+    state = torch.load(args.checkpoint, map_location="cpu", weights_only=False)
+    model = B2P(state["config"])
+    model.load_state_dict(state["average"])
     files, _ = data.split(args.data, 8)
     samples = [data.load_sample(f) for f in files[:: max(1, len(files) // args.samples)]]
     keep, cfg, weights = prune(model.eval(), samples, args.latents)
     print(f"of {model.cfg['latents']} latents {keep} are left")
-    save_file({k: v.half().numpy() for k, v in weights.items()}, args.out, metadata={"config": json.dumps(cfg)})
+    torch.save({"config": cfg, "average": weights, "args": state["args"], "step": state["step"]}, args.out)
 
 
 if __name__ == "__main__":

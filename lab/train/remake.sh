@@ -60,9 +60,10 @@ train() {
 fit() {
     "$python" tune.py "$out/$1/last.pt" "$out/$1/tuned.pt" --data "$out/data" --minutes "$(minutes 6)" --samples 260 --lr 3e-4 --threads 1 --only-base
 }
-# prune NAME: leaves out latents that never change, once all has learned
+# prune NAME NEW: leaves out latents that never change, once all has learned
 prune() {
-    "$python" prune.py "$out/$1/last.pt" "$out/$1/pruned.safetensors" --data "$out/mixed" --latents 3
+    mkdir -p "$out/$2"
+    "$python" prune.py "$out/$1/last.pt" "$out/$2/last.pt" --data "$out/mixed" --latents 3
 }
 # prices A B C: of luma and two chromas
 prices() { echo "[$1, $2, $3]"; }
@@ -109,8 +110,8 @@ train low-mixed lite-start 42 --init "$out/low-rest/tuned.pt" --lam 4 "${mixed[@
 train low-more lite-start 70 --init "$out/low-mixed/last.pt" --lam 4 "${mixed[@]}"
 train low-last lite-start 19 --init "$out/low-more/last.pt" "${last[@]}"
 train low-again lite-start 23 --init "$out/low-last/last.pt" --lam 4 --stay 0.5 "${mixed[@]}"
-prune low-again
-train low-three lite 36 --init "$out/low-again/pruned.safetensors" --lam 4 --stay 0.5 "${mixed[@]}"
+prune low-again low-pruned
+train low-three lite 36 --init "$out/low-pruned/last.pt" --lam 4 --stay 0.5 "${mixed[@]}"
 ship low-three lite-low "0.06 0.15 0.15" "0.03 0.1 0.1"
 imitating lite-low 15
 train high lite-start 38 --init "$out/low-heads/last.pt" --lam 16 "${all[@]}"
@@ -122,9 +123,8 @@ train high-mixed lite-start 82 --init "$out/high-whole-2/tuned.pt" --lam 16 "${m
 train high-more lite-start 82 --init "$out/high-mixed/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
 train high-last lite-start 24 --init "$out/high-more/last.pt" "${last[@]}"
 train high-again lite-start 62 --init "$out/high-last/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
-prune high-again
-train high-three lite 62 --init "$out/high-again/pruned.safetensors" --lam 16 --stay 0.5 "${mixed[@]}"
-ship high-three lite "0.06 0.15 0.15" "0.05 0.15 0.15"
+prune high-again high-pruned
+ship high-pruned lite "0.06 0.15 0.15" "0.05 0.1 0.1"
 imitating lite 15
 train least lite-start 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 train least-whole-1 lite-start 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"
@@ -134,7 +134,6 @@ fit least-rest
 train least-mixed lite-start 40 --init "$out/least-rest/tuned.pt" --lam 1.2 "${mixed[@]}"
 train least-last lite-start 19 --init "$out/least-mixed/last.pt" "${last[@]}"
 train least-again lite-start 19 --init "$out/least-last/last.pt" --lam 1.2 --stay 0.5 "${mixed[@]}"
-prune least-again
-train least-three lite 20 --init "$out/least-again/pruned.safetensors" --lam 1.2 --stay 0.5 "${mixed[@]}"
-ship least-three lite-least "0.06 0.15 0.15" "0.015 0.05 0.05"
+prune least-again least-pruned
+ship least-pruned lite-least "0.06 0.15 0.15" "0.015 0.05 0.05"
 imitating lite-least 15

@@ -143,13 +143,6 @@ def keep_memory():
         pass
 
 
-def weights_of(path, device="cpu"):
-    """The averaged weights of a checkpoint, or those that `export.py --weights` wrote."""
-    if not path.endswith(".safetensors"):
-        return torch.load(path, map_location=device, weights_only=False)["average"]
-    return {k: v.float() for k, v in load_file(path, device=device).items()}
-
-
 class Trainer:
     def __init__(self, args):
         self.args, self.device = args, args.device
@@ -173,6 +166,11 @@ class Trainer:
                 "used": self.used, "calibrated": self.calibrated, "config": self.cfg, "args": vars(self.args), "torch_rng": torch.get_rng_state(),
                 "rng": self.rng.getstate()}
 
+    def weights_of(self, path):
+        if not path.endswith(".safetensors"):
+            return torch.load(path, map_location=self.device, weights_only=False)["average"]
+        return {k: v.float() for k, v in load_file(path, device=self.device).items()}
+
     @staticmethod
     def config_of(path):
         if not path.endswith(".safetensors"):
@@ -182,13 +180,13 @@ class Trainer:
 
     def stay_near(self, path, share):
         """Moves the averaged weights this share of the way back to those of `path`."""
-        start = weights_of(path, self.device)
+        start = self.weights_of(path)
         self.average = {k: torch.lerp(v, start[k], share) if v.is_floating_point() else v for k, v in self.average.items()}
 
     def start_from(self, path):
         """Takes the averaged weights of a checkpoint, or those that `export.py --weights` wrote; all but the heads where only heads are
         to be trained and the configuration has others. Half as many channels grow."""
-        weights, before = weights_of(path, self.device), self.config_of(path)
+        weights, before = self.weights_of(path), self.config_of(path)
         if before.get("fr_roles", 3) > self.cfg.get("fr_roles", 3):
             self.longer = B2P(before).to(self.device)
             self.longer.load_state_dict(weights)
@@ -222,7 +220,7 @@ class Trainer:
     def learn_from(self, path):
         """Takes the heads of a file of `export.py --weights` as a teacher of others for the same network."""
         self.teacher = B2P(self.config_of(path)).to(self.device).eval()
-        self.teacher.load_state_dict(weights_of(path, self.device))
+        self.teacher.load_state_dict(self.weights_of(path))
 
     @torch.no_grad()
     def taught_raw(self, sample, head):
