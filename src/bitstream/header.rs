@@ -9,7 +9,7 @@ use crate::placement::Placement;
 /// The first bytes: not text, and changed by whatever changes line ends.
 pub const MAGIC: [u8; 8] = [0x89, b'B', b'2', b'P', b'\r', b'\n', 0x1a, b'\n'];
 /// Major and minor version that this crate writes.
-pub const VERSION: (u16, u16) = (1, 0);
+pub const VERSION: (u16, u16) = (2, 0);
 /// The most voxels of a slice.
 pub const MAX_SLICE_VOXELS: u32 = 16_384;
 

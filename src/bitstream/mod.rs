@@ -1,4 +1,4 @@
-//! The container: `.b2p` streams, version 1.
+//! The container: `.b2p` streams, version 2.
 //!
 //! All numbers are little-endian. A stream is a header, then for every level from L to M its geometry and then its features, so that
 //! what ends after a level is a valid coarser stream.
@@ -9,7 +9,7 @@
 //! | offset | type | field |
 //! |---|---|---|
 //! | 0 | 8 bytes | magic: `89 42 32 50 0d 0a 1a 0a` |
-//! | 8 | u16, u16 | version: major 1, minor 0. Another major is another format; a greater minor is read like 0 |
+//! | 8 | u16, u16 | version: major 2, minor 0. Another major is another format; a greater minor is read like 0 |
 //! | 12 | u32 | critical flags: a reader must refuse what it does not know. None is defined |
 //! | 16 | u32 | optional flags: what a reader does not know it ignores. None is defined |
 //! | 20 | u8, u8, u8, u8 | bit depth N, base level L, top level M, zero. 1 ≤ N ≤ 21, L ≤ M < N, M − L ≤ 2 |

@@ -9,7 +9,8 @@
 //! - which children those neighbours have that come earlier in the slice,
 //! - which children the parent itself has in the octants below,
 //!
-//! and whose output layer goes on learning as it codes (`predictor`). The decisions go through a binary arithmetic coder (`coder`,
+//! and whose output layer goes on learning as it codes (`predictor`). Where the network is in doubt, five tables of what the slice has shown in like
+//! `surroundings` have their say (`mixer`): what a cloud repeats, it tells once. The decisions go through a binary arithmetic coder (`coder`,
 //! `probability`). If a parent has none of its first seven children, the eighth is not coded: it must be there.
 //!
 //! # Exactness
@@ -21,9 +22,11 @@
 //! parents it was given and the voxels it was told, no more.
 
 mod coder;
+mod mixer;
 pub mod network;
 mod predictor;
 mod probability;
+mod surroundings;
 
 use super::{KernelMap, Octree};
 use crate::bitstream::Slice;
@@ -153,10 +156,9 @@ impl Work for Encode<'_> {
             parents,
             masks,
         } = self;
-        let (mut predictor, mut encoder) = (Predictor::new(), Encoder::new());
+        let (mut predictor, mut encoder) = (Predictor::new(parents.len()), Encoder::new());
         for (here, &mask) in parents.clone().zip(masks) {
-            let facts = predictor.network.sum(map.row(here), &parents, here, masks);
-            predictor.code(&mut encoder, &facts, mask);
+            predictor.code(&mut encoder, map, &parents, here, masks, mask);
         }
         encoder.finish()
     }
@@ -181,13 +183,12 @@ impl Work for Decode<'_> {
             parents,
             slice,
         } = self;
-        let mut predictor = Predictor::new();
+        let mut predictor = Predictor::new(parents.len());
         let mut decoder = Decoder::new(slice.bytes, slice.offset);
         let mut masks = Vec::with_capacity(parents.len());
         let mut found = 0;
         for here in parents.clone() {
-            let facts = predictor.network.sum(map.row(here), &parents, here, &masks);
-            let mask = predictor.code(&mut decoder, &facts, 0);
+            let mask = predictor.code(&mut decoder, map, &parents, here, &masks, 0);
             decoder.check_not_past_end()?;
             masks.push(mask);
             found += mask.count_ones() as usize;

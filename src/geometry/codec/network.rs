@@ -80,18 +80,21 @@ pub fn facts(
 /// Visits the occupied neighbours of the voxel `here`: for each its offset and, if its children are known, the offset's place among
 /// those that may come earlier, and its occupancy.
 #[inline(always)]
-fn visit(
+pub(super) fn visit(
     row: &[u32],
     slice: &Range<usize>,
     here: usize,
     occupancy: &[u8],
     mut neighbour: impl FnMut(usize, Option<(usize, u8)>),
 ) {
-    for (k, &index) in row.iter().enumerate() {
-        if index == KernelMap::ABSENT || k == KernelMap::CENTRE {
-            continue;
-        }
-        let index = index as usize;
+    // Which are there is a guess for each, so that is told first, without branches.
+    let there = |(k, &index)| u32::from(index != KernelMap::ABSENT) << k;
+    let mut left: u32 = row.iter().enumerate().map(there).sum();
+    left &= !(1 << KernelMap::CENTRE);
+    while left != 0 {
+        let k = left.trailing_zeros() as usize;
+        left &= left - 1;
+        let index = row[k] as usize;
         let children = match EARLIER_SLOT[k] {
             Some(slot) if slice.start <= index && index < here => {
                 Some((usize::from(slot), occupancy[index - slice.start]))
@@ -165,19 +168,16 @@ impl Network {
         }
     }
 
-    /// The sum of the rows of what is known about the voxel `here`, whose 3³ neighbours are `row`: `occupancy` is that of the voxels
-    /// `slice`, up to `here` at least.
+    /// Adds to `sum` the rows of the neighbour at offset `k`: of its children, if they are known, by its place among those that may come earlier.
     #[inline(always)]
-    pub fn sum(&self, row: &[u32], slice: &Range<usize>, here: usize, occupancy: &[u8]) -> Row {
-        let mut sum = [0; WIDTH];
-        visit(row, slice, here, occupancy, |k, children| match children {
-            None => add(&mut sum, &self.presence[k]),
+    pub fn add(&self, sum: &mut Row, k: usize, children: Option<(usize, u8)>) {
+        match children {
+            None => add(sum, &self.presence[k]),
             Some((slot, mask)) => {
-                add(&mut sum, &self.low[slot][usize::from(mask & 15)]);
-                add(&mut sum, &self.high[slot][usize::from(mask >> 4)]);
+                add(sum, &self.low[slot][usize::from(mask & 15)]);
+                add(sum, &self.high[slot][usize::from(mask >> 4)]);
             }
-        });
-        sum
+        }
     }
 
     /// The hidden layer for the child `node` (`1 << octant | occupancy of the octants below it`): of the sum of all rows what is

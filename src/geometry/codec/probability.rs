@@ -1,9 +1,9 @@
-//! From a logit to a probability, by a table of integers.
+//! From a logit to a probability, by a table of integers, and back.
 
 use super::coder::ONE;
 
 /// The largest logit in use, in units of 1/64: the probability stops short of certainty.
-const LIMIT: i32 = 720;
+pub(super) const LIMIT: i32 = 720;
 
 /// `e^(−1/64)` in units of 2^−62, rounded down.
 const DECAY: u64 = 4_540_188_453_729_421_604;
@@ -26,13 +26,50 @@ const SQUASH: [u16; LIMIT as usize + 1] = {
 /// The probability, in `1..=65535`, of a bit whose logit is `logit / 64`.
 #[inline(always)]
 pub(super) fn squash(logit: i32) -> u32 {
-    let one = u32::from(SQUASH[logit.unsigned_abs().min(LIMIT as u32) as usize]);
+    one_of(logit.clamp(-LIMIT, LIMIT))
+}
+
+/// That of a logit within ±[`LIMIT`].
+#[inline(always)]
+const fn one_of(logit: i32) -> u32 {
+    let one = SQUASH[logit.unsigned_abs() as usize] as u32;
     if logit < 0 { ONE - one } else { one }
+}
+
+/// Entry `i` is the least logit whose probability is at least `16·i + 8`, or −[`LIMIT`].
+static STRETCH: [i16; 1 << 12] = {
+    let mut table = [0; 1 << 12];
+    let (mut i, mut logit) = (0, -LIMIT);
+    while i < table.len() {
+        while logit < LIMIT && one_of(logit) < 16 * i as u32 + 8 {
+            logit += 1;
+        }
+        table[i] = logit as i16;
+        i += 1;
+    }
+    table
+};
+
+/// The logit, in units of 1/64, of the probability `one`.
+#[inline(always)]
+pub(super) fn stretch(one: u16) -> i32 {
+    STRETCH[usize::from(one >> 4)].into()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn stretching_undoes_squashing() {
+        for one in 1..=u16::MAX {
+            let back = squash(stretch(one)) as i32;
+            let step = squash(stretch(one) + 1) as i32 - back;
+            assert!((back - i32::from(one)).abs() <= 16 + step, "{one}: {back}");
+        }
+        let ends = [stretch(0), stretch(u16::MAX)];
+        assert_eq!(ends.map(|logit| squash(logit) >> 4), [0, 4095]);
+    }
 
     #[test]
     fn the_table_is_the_logistic_function() {

@@ -1,0 +1,218 @@
+//! What a slice has shown so far, context by context, and how far to trust it beside the network.
+//!
+//! # Memory
+//! Each context (`surroundings`) has a table of its own. With `n` parents in the slice, a table has 2ᵇ entries, 2ᵇ the least power of two of at least n, but at
+//! least 16; a hash `h` has the entry `h >> (64 − b)`, and the check `h & 255`. An entry holds a check, how often its context was *seen*, and `one`, the
+//! probability of a 1 in units of 2⁻¹⁶. An entry that was never used, or has another check, begins anew when it is met: seen 0 times.
+//!
+//! # Prediction
+//! Logits are in units of 1/64. From the network's `s` seven inputs: `s` itself, [`BIAS`], and for each context
+//! `((stretch(one) − s)·⌊1024·seen / (4·seen + 1)⌋) >> 8`, which is 0 for what was never seen. Their products with seven weights are summed (`i32`, wrapping); the
+//! logit is the sum `>> 16`, the probability `squash` of it. Weights start with 65536, 0, and five of 9830.
+//!
+//! # Learning
+//! With `error = 65536·bit − probability`, each weight grows by `(3·error·input + 32768) >> 16`, and stays within ±131072. In the entry of each context, `one`, if it was never seen, first is the probability of
+//! the network alone; then `seen` grows by 1, to [`MOST`] at most, and `one` by `((65536·bit − one)·⌊65536 / (4·seen + 1)⌋) >> 14`, within 16 to 65520.
+//! All shifts of negative numbers round down.
+
+use super::coder::ONE;
+use super::probability::{squash, stretch};
+use super::surroundings::CONTEXTS;
+
+/// The input that is always the same.
+const BIAS: i32 = 20;
+/// Up to where an entry counts how often it was seen.
+const MOST: usize = 30;
+const INPUTS: usize = 2 + CONTEXTS;
+/// The largest magnitude of a weight, so that seven products stay within 32 bits.
+const HEAVIEST: i32 = 1 << 17;
+
+/// How much an entry that was seen so often says, in units of 1/256.
+const TRUST: [i32; MOST + 1] = {
+    let (mut table, mut seen) = ([0; MOST + 1], 0);
+    while seen <= MOST {
+        table[seen] = (1024 * seen / (4 * seen + 1)) as i32;
+        seen += 1;
+    }
+    table
+};
+/// How fast it follows, in units of 2⁻¹⁴.
+const RATE: [i32; MOST + 1] = {
+    let (mut table, mut seen) = ([0; MOST + 1], 0);
+    while seen <= MOST {
+        table[seen] = (65536 / (4 * seen + 1)) as i32;
+        seen += 1;
+    }
+    table
+};
+
+#[derive(Debug, Default, Clone, Copy)]
+struct Entry {
+    one: u16,
+    seen: u8,
+    check: u8,
+}
+
+/// What a slice has shown, and the weights of it.
+#[derive(Debug)]
+pub(super) struct Mixer {
+    tables: Vec<Entry>,
+    /// Entries of a table are 2 to this.
+    bits: u32,
+    weights: [i32; INPUTS],
+}
+
+/// One prediction, to be learned from.
+#[derive(Debug)]
+pub(super) struct Mixed {
+    /// Where the entries of its contexts lie.
+    at: [usize; CONTEXTS],
+    entries: [Entry; CONTEXTS],
+    inputs: [i32; INPUTS],
+    /// The probability of a 1.
+    pub one: u32,
+}
+
+impl Mixer {
+    /// That of a slice of so many parents.
+    pub fn new(parents: usize) -> Self {
+        let entries = parents.next_power_of_two().max(16);
+        let mut weights = [9830; INPUTS];
+        weights[..2].copy_from_slice(&[1 << 16, 0]);
+        Mixer {
+            tables: vec![Entry::default(); CONTEXTS * entries],
+            bits: entries.ilog2(),
+            weights,
+        }
+    }
+
+    /// What to expect in these contexts, if the network's logit is `logit`.
+    #[inline(always)]
+    pub fn predict(&self, logit: i32, contexts: [u64; CONTEXTS]) -> Mixed {
+        let mut mixed = Mixed {
+            at: [0; CONTEXTS],
+            entries: [Entry::default(); CONTEXTS],
+            inputs: [0; INPUTS],
+            one: 0,
+        };
+        mixed.inputs[..2].copy_from_slice(&[logit, BIAS]);
+        for (i, hash) in contexts.into_iter().enumerate() {
+            let at = i << self.bits | (hash >> (u64::BITS - self.bits)) as usize;
+            let (entry, check) = (self.tables[at], hash as u8);
+            let seen = if entry.check == check { entry.seen } else { 0 };
+            let entry = Entry {
+                seen,
+                check,
+                ..entry
+            };
+            (mixed.at[i], mixed.entries[i]) = (at, entry);
+            let apart = stretch(entry.one) - logit;
+            mixed.inputs[2 + i] = (apart * TRUST[usize::from(seen)]) >> 8;
+        }
+        let sum = (0..INPUTS).fold(0i32, |sum, i| {
+            sum.wrapping_add(mixed.inputs[i].wrapping_mul(self.weights[i]))
+        });
+        mixed.one = squash(sum >> 16);
+        mixed
+    }
+
+    /// Learns what it was; `network` is the probability that the network gave alone.
+    #[inline(always)]
+    pub fn learn(&mut self, mixed: &Mixed, network: u32, bit: bool) {
+        let truth = if bit { ONE as i32 } else { 0 };
+        let error = truth - mixed.one as i32;
+        for (weight, input) in self.weights.iter_mut().zip(mixed.inputs) {
+            let step = (3 * error * input + (1 << 15)) >> 16;
+            *weight = (*weight + step).clamp(-HEAVIEST, HEAVIEST);
+        }
+        for (at, mut entry) in mixed.at.into_iter().zip(mixed.entries) {
+            let one = match entry.seen {
+                0 => network as i32,
+                _ => entry.one.into(),
+            };
+            let seen = (usize::from(entry.seen) + 1).min(MOST);
+            entry.seen = seen as u8;
+            let one = one + (((truth - one) * RATE[seen]) >> 14);
+            entry.one = one.clamp(16, 65_520) as u16;
+            self.tables[at] = entry;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::entropy::test_tables::Random;
+
+    /// What a bit costs, in bits.
+    fn cost(one: u32, bit: bool) -> f64 {
+        let one = f64::from(one) / 65536.0;
+        -(if bit { one } else { 1.0 - one }).log2()
+    }
+
+    /// Bits per decision that a network without a clue and one with the mixer behind it take, where the first context tells all but `noise` in 100.
+    fn costs(noise: u64, network: i32) -> [f64; 2] {
+        let (mut mixer, mut random) = (Mixer::new(1 << 12), Random(5));
+        let mut sums = [0.0; 2];
+        for _ in 0..4000 {
+            let context = random.next() % 64;
+            let flip = random.next() % 100 < noise;
+            let bit = (context % 3 == 0) != flip;
+            let mut contexts: [u64; CONTEXTS] = std::array::from_fn(|_| random.next());
+            contexts[0] = context << 58 | 7;
+            let mixed = mixer.predict(network, contexts);
+            assert!((1..ONE).contains(&mixed.one));
+            sums[0] += cost(squash(network), bit);
+            sums[1] += cost(mixed.one, bit);
+            mixer.learn(&mixed, squash(network), bit);
+        }
+        sums.map(|sum| sum / 4000.0)
+    }
+
+    #[test]
+    fn what_one_context_tells_is_learned_though_the_others_are_noise() {
+        for (noise, network) in [(0, 0), (0, -300), (5, 0), (5, 100)] {
+            let [network, mixed] = costs(noise, network);
+            assert!(mixed < 0.55 * network, "{mixed} instead of {network}");
+        }
+    }
+
+    #[test]
+    fn where_contexts_tell_nothing_the_network_is_believed() {
+        let [network, mixed] = costs(50, 0);
+        assert!(mixed < 1.02 * network, "{mixed} instead of {network}");
+    }
+
+    #[test]
+    fn nothing_seen_changes_nothing() {
+        let mixer = Mixer::new(1);
+        for logit in [-384, -1, 0, 77] {
+            assert_eq!(mixer.predict(logit, [3; CONTEXTS]).one, squash(logit));
+        }
+    }
+
+    #[test]
+    fn extremes_stay_within_their_ranges() {
+        let mut mixer = Mixer::new(4);
+        for i in 0..5000u64 {
+            let logit = if i % 2 == 0 { -720 } else { 720 };
+            let mixed = mixer.predict(logit, [i % 3 << 60; CONTEXTS]);
+            mixer.learn(&mixed, squash(logit), i % 2 == 0);
+            assert!(mixer.weights.iter().all(|w| w.abs() <= HEAVIEST));
+            assert!(
+                mixer
+                    .tables
+                    .iter()
+                    .all(|e| e.seen == 0 || (16..=65_520).contains(&e.one))
+            );
+        }
+    }
+
+    #[test]
+    fn tables_grow_with_the_slice() {
+        for (parents, bits) in [(1, 4), (16, 4), (17, 5), (16_384, 14)] {
+            let mixer = Mixer::new(parents);
+            assert_eq!((mixer.bits, mixer.tables.len()), (bits, CONTEXTS << bits));
+        }
+    }
+}

@@ -1,0 +1,341 @@
+//! What is known around a voxel whose children are being coded, child by child, and the contexts that come of it.
+//!
+//! *Cells* are voxels of the children's level. A cell is *occupied* if it is known to be, *unknown* if its parent is occupied but its own
+//! occupancy is not known yet (see `network`: the children of a voxel that comes later, or in another slice; of this voxel's children those not
+//! yet coded), and else empty. The 4³ cells around this voxel's children, of coordinates −1 to 2 where the children have 0 and 1, are numbered
+//! `(x + 1) + 4(y + 1) + 16(z + 1)`; two masks of 64 bits tell which are occupied and which are unknown.
+//!
+//! For the child in octant `c = x + 2y + 4z`, both masks are shifted right by `x + 4y + 16z`: the 3³ cells around the child then have the bits
+//! `i + 4j + 16k`, each 0 to 2, the child itself bit 21. The *near* cells are these but for the child, its *faces* the bits 5, 17, 20, 22, 25, 37.
+//!
+//! Of the 3³ neighbours of the voxel (offset order, bit 13 never set) 27 bits tell the *presence*. Six of them share a face with it, at places 4, 10, 12, 14, 16, 22; in this
+//! order, from the lowest bit up:
+//! - *beside* is 1 bit: the neighbour is there;
+//! - *far* are 8 bits: of its child in octant `c`, occupied (1) or unknown (2);
+//! - *behind*, of the first three alone, are 9 bits: 0 if it is not there, 1 if its children are unknown, else 256 plus its occupancy;
+//! - *beyond*, of the last three alone, are 2 bits: 2 if it is not there, else 1 if the next in that direction is.
+//!
+//! # Contexts
+//! With *node* as in `network` (`1 << c | occupancy of the octants below`), five contexts each have a hash of 64 bits: a sequence of words goes into `h`, at first the number of the
+//! context, by `h = (h ^ word)·0x9E3779B97F4A7C15`, then `h = h ^ (h >> 32)`.
+//!
+//! | context | words |
+//! |---|---|
+//! | 1 | occupied faces + (c << 48) + (beside << 51); unknown faces |
+//! | 2 | occupied near cells; unknown near cells |
+//! | 3 | what context 2 has come to, as the first word; far |
+//! | 4 | node + (behind << 8) |
+//! | 5 | node + (presence << 8) + (beyond << 35) |
+
+use crate::geometry::KernelMap;
+
+/// The neighbours that share a face, by their places in a 3³ row: three that can come before, three that come after.
+const BEFORE: [usize; 3] = [4, 10, 12];
+const AFTER: [usize; 3] = [14, 16, 22];
+
+/// How many contexts there are.
+pub(super) const CONTEXTS: usize = 5;
+
+const NEAR: u64 = {
+    let (mut mask, mut at) = (0, 0);
+    while at < 27 {
+        if at != 13 {
+            mask |= 1 << cell_of(at);
+        }
+        at += 1;
+    }
+    mask
+};
+const FACES: u64 = 1 << 5 | 1 << 17 | 1 << 20 | 1 << 22 | 1 << 25 | 1 << 37;
+/// This voxel's own children.
+const OWN: u64 = 0b0110_0110 << 20 | 0b0110_0110 << 36;
+
+/// Where place `at` of 3³ cells lies among 4³.
+const fn cell_of(at: usize) -> usize {
+    at % 3 + 4 * (at / 3 % 3) + 16 * (at / 9)
+}
+
+/// Of the neighbour at each offset, which of the 4³ cells any half of its occupancy makes: the low four octants, the high four.
+static CELLS: [[[u64; 16]; 2]; 27] = {
+    let mut cells = [[[0; 16]; 2]; 27];
+    let mut k = 0;
+    while k < 27 {
+        let mut octant = 0;
+        while octant < 8 {
+            // Coordinates of the child, plus 1: −1 to 4, of which 0 to 3 are near.
+            let x = 2 * (k % 3) + (octant & 1);
+            let y = 2 * (k / 3 % 3) + (octant >> 1 & 1);
+            let z = 2 * (k / 9) + (octant >> 2);
+            let near = 0 < x && x < 5 && 0 < y && y < 5 && 0 < z && z < 5;
+            let mut half = 0;
+            while near && half < 16 {
+                if half >> (octant & 3) & 1 == 1 {
+                    cells[k][octant >> 2][half] |= 1 << (x - 1 + 4 * (y - 1) + 16 * (z - 1));
+                }
+                half += 1;
+            }
+            octant += 1;
+        }
+        k += 1;
+    }
+    cells
+};
+
+/// What is known around one voxel.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Surroundings {
+    occupied: u64,
+    unknown: u64,
+    presence: u64,
+    /// Of each neighbour 0 if it is not there, 1 if its children are unknown, else 256 plus its occupancy.
+    states: [u16; 27],
+    beside: u64,
+    beyond: u64,
+    behind: u64,
+    /// Of the neighbours in the six directions a byte each: their occupancies, 0 unless known, and 2 where they are there but not known.
+    known: u64,
+    veiled: u64,
+}
+
+impl Surroundings {
+    /// What is known before any neighbour is.
+    #[inline(always)]
+    pub fn new() -> Self {
+        Surroundings {
+            occupied: 0,
+            unknown: OWN,
+            presence: 0,
+            states: [0; 27],
+            beside: 0,
+            beyond: 0,
+            behind: 0,
+            known: 0,
+            veiled: 0,
+        }
+    }
+
+    /// Adds the neighbour at offset `k`, and its children if they are known.
+    #[inline(always)]
+    pub fn add(&mut self, k: usize, children: Option<u8>) {
+        self.presence |= 1 << k;
+        match children {
+            None => {
+                self.states[k] = 1;
+                self.unknown |= CELLS[k][0][15] | CELLS[k][1][15];
+            }
+            Some(mask) => {
+                self.states[k] = 256 | u16::from(mask);
+                let (low, high) = (usize::from(mask & 15), usize::from(mask >> 4));
+                self.occupied |= CELLS[k][0][low] | CELLS[k][1][high];
+            }
+        }
+    }
+
+    /// Looks farther, once all neighbours of the voxel `here` have been added.
+    #[inline(always)]
+    pub fn look_beyond(&mut self, map: &KernelMap, here: usize) {
+        for (i, k) in BEFORE.into_iter().chain(AFTER).enumerate() {
+            let state = u64::from(self.states[k]);
+            let known = if state > 1 { state & 255 } else { 0 };
+            self.known |= known << (8 * i);
+            self.veiled |= u64::from(state == 1) << (8 * i + 1);
+            self.beside |= u64::from(state != 0) << i;
+        }
+        for (i, k) in BEFORE.into_iter().enumerate() {
+            self.behind |= u64::from(self.states[k]) << (9 * i);
+        }
+        for (i, k) in AFTER.into_iter().enumerate() {
+            let there = self.states[k] != 0;
+            // What is not there is looked for around `here`, in vain: a branch would be a guess.
+            let side = if there {
+                map.row(here)[k] as usize
+            } else {
+                here
+            };
+            let more = there && map.row(side)[k] != KernelMap::ABSENT;
+            self.beyond |= (u64::from(more) | u64::from(!there) << 1) << (2 * i);
+        }
+    }
+
+    /// The contexts of the child of `node` in `octant`.
+    #[inline(always)]
+    pub fn contexts(&self, octant: usize, node: usize) -> [u64; CONTEXTS] {
+        let shift = (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2);
+        let (occupied, unknown) = (self.occupied >> shift, self.unknown >> shift);
+        let far = self.known >> octant & 0x0101_0101_0101 | self.veiled;
+        let node = node as u64;
+        let near = hash(hash(2, occupied & NEAR), unknown & NEAR);
+        let faces = occupied & FACES | (octant as u64) << 48 | self.beside << 51;
+        [
+            hash(hash(1, faces), unknown & FACES),
+            near,
+            hash(hash(3, near), far),
+            hash(4, node | self.behind << 8),
+            hash(5, node | self.presence << 8 | self.beyond << 35),
+        ]
+    }
+
+    /// Learns whether the child in `octant` is there.
+    #[inline(always)]
+    pub fn learn(&mut self, octant: usize, there: bool) {
+        let cell = 21 + (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2);
+        self.unknown &= !(1 << cell);
+        self.occupied |= u64::from(there) << cell;
+    }
+}
+
+#[inline(always)]
+fn hash(h: u64, word: u64) -> u64 {
+    let h = (h ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+    h ^ h >> 32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::network::visit;
+    use super::*;
+    use crate::geometry::{Octree, Voxels, morton};
+    use proptest::prelude::*;
+    use std::ops::Range;
+
+    /// 0 for an empty cell, 1 for one that is occupied, 2 for an unknown one: `at` is where it lies, in voxels of the children's level from the first child
+    /// of the voxel `here`, of whose children those below `octant` are known.
+    fn state(
+        octree: &Octree,
+        slice: &Range<usize>,
+        here: usize,
+        octant: usize,
+        at: [i64; 3],
+    ) -> u64 {
+        let level = octree.depth() - 1;
+        let own = octree.level(level).coordinate(here).map(i64::from);
+        let side = 1i64 << level;
+        let parent: [i64; 3] = std::array::from_fn(|k| own[k] + at[k].div_euclid(2));
+        let child = (0..3).fold(0, |o, k| o | (at[k].rem_euclid(2) as usize) << k);
+        if parent.iter().any(|x| !(0..side).contains(x)) {
+            return 0;
+        }
+        let key = morton::encode(parent.map(|x| x as u32));
+        let Ok(index) = octree.level(level).keys().binary_search(&key) else {
+            return 0;
+        };
+        let known = if index == here {
+            child < octant
+        } else {
+            slice.start <= index && index < here
+        };
+        match known {
+            true => u64::from(octree.occupancy(level)[index] >> child & 1),
+            false => 2,
+        }
+    }
+
+    /// The words of the contexts, from their definition, cell by cell.
+    fn by_definition(
+        octree: &Octree,
+        slice: &Range<usize>,
+        here: usize,
+        octant: usize,
+    ) -> [u64; CONTEXTS] {
+        let child = [octant & 1, octant >> 1 & 1, octant >> 2].map(|x| x as i64);
+        let cell = |d: [i64; 3]| {
+            state(
+                octree,
+                slice,
+                here,
+                octant,
+                [0, 1, 2].map(|k| child[k] + d[k]),
+            )
+        };
+        let (mut near, mut faces) = ([0u64; 2], [0u64; 2]);
+        for at in 0..27i64 {
+            let d = [at % 3 - 1, at / 3 % 3 - 1, at / 9 - 1];
+            let distance: i64 = d.iter().map(|x| x.abs()).sum();
+            let bit = d[0] + 1 + 4 * (d[1] + 1) + 16 * (d[2] + 1);
+            for (which, of) in [1, 2].into_iter().enumerate() {
+                let is = u64::from(distance > 0 && cell(d) == of) << bit;
+                near[which] |= is;
+                faces[which] |= if distance == 1 { is } else { 0 };
+            }
+        }
+        let level = octree.depth() - 1;
+        let (voxels, masks) = (octree.level(level), octree.occupancy(level));
+        let place = |d: [i64; 3]| {
+            let at: [i64; 3] =
+                std::array::from_fn(|k| i64::from(voxels.coordinate(here)[k]) + d[k]);
+            let inside = at.iter().all(|x| (0..1i64 << level).contains(x));
+            let key = morton::encode(at.map(|x| if inside { x as u32 } else { 0 }));
+            voxels.keys().binary_search(&key).ok().filter(|_| inside)
+        };
+        let sides = [
+            [0, 0, -1],
+            [0, -1, 0],
+            [-1, 0, 0],
+            [1, 0, 0],
+            [0, 1, 0],
+            [0, 0, 1],
+        ];
+        let (mut beside, mut far, mut behind, mut beyond, mut presence) = (0, 0, 0, 0, 0);
+        for (i, d) in sides.into_iter().enumerate() {
+            far |= cell(d.map(|x| 2 * x)) << (8 * i);
+            beside |= u64::from(place(d).is_some()) << i;
+            if i < 3 {
+                behind |= place(d).map_or(0, |n| match slice.contains(&n) && n < here {
+                    true => 256 + u64::from(masks[n]),
+                    false => 1,
+                }) << (9 * i);
+            } else {
+                let more = u64::from(place(d.map(|x| 2 * x)).is_some());
+                beyond |= if place(d).is_some() { more } else { 2 } << (2 * (i - 3));
+            }
+        }
+        for k in (0..27i64).filter(|&k| k != 13) {
+            let d = [k % 3 - 1, k / 3 % 3 - 1, k / 9 - 1];
+            presence |= u64::from(place(d).is_some()) << k;
+        }
+        let node = 1u64 << octant | u64::from(masks[here]) & ((1 << octant) - 1);
+        let words = |number: u64, words: &[u64]| {
+            words.iter().fold(number, |h, word| {
+                let h = (h ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+                h ^ (h >> 32)
+            })
+        };
+        let two = words(2, &near);
+        [
+            words(
+                1,
+                &[
+                    faces[0] + ((octant as u64) << 48) + (beside << 51),
+                    faces[1],
+                ],
+            ),
+            two,
+            words(3, &[two, far]),
+            words(4, &[node + (behind << 8)]),
+            words(5, &[node + (presence << 8) + (beyond << 35)]),
+        ]
+    }
+
+    proptest! {
+        #[test]
+        fn contexts_are_those_of_the_definition(keys in prop::collection::vec(0u64..1 << 12, 1..700), slice in 1usize..200) {
+            let octree = Octree::new(Voxels::new(4, keys)).unwrap();
+            let (map, masks) = (octree.kernel_map(3), octree.occupancy(3));
+            for here in 0..masks.len() {
+                let first = here / slice * slice;
+                let slice = first..masks.len().min(first + slice);
+                let mut around = Surroundings::new();
+                visit(map.row(here), &slice, here, &masks[slice.clone()], |k, children| {
+                    around.add(k, children.map(|(_, mask)| mask));
+                });
+                around.look_beyond(&map, here);
+                for octant in 0..8 {
+                    let node = 1 << octant | usize::from(masks[here]) & ((1 << octant) - 1);
+                    let want = by_definition(&octree, &slice, here, octant);
+                    prop_assert_eq!(around.contexts(octant, node), want);
+                    around.learn(octant, masks[here] >> octant & 1 == 1);
+                }
+            }
+        }
+    }
+}
