@@ -109,6 +109,11 @@ def quick_heads(path, like):
     return {k: tensors[k].reshape(v.shape) for k, v in like.state_dict().items()}
 
 
+def widths(cfg):
+    """The channels of a network and of its heads."""
+    return [part["channels"] for part in (cfg, *cfg["gg"])]
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Schedule, as functions of the fraction of the budget that is used
 
@@ -191,7 +196,7 @@ class Trainer:
             self.longer = B2P(before).to(self.device)
             self.longer.load_state_dict(weights)
             return
-        if before.get("channels", self.cfg["channels"]) < self.cfg["channels"]:
+        if before and any(a < b for a, b in zip(widths(before), widths(self.cfg))):
             narrow = B2P(before).to(self.device)
             narrow.load_state_dict(weights)
             grow(self.model, narrow)

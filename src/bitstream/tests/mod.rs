@@ -112,7 +112,7 @@ fn the_first_bytes_are_those_that_the_format_describes() {
     assert_eq!(&bytes[..8], b"\x89B2P\r\n\x1a\n");
     assert_eq!(
         bytes[8..24],
-        [1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 128, 5, 2, 4, 0]
+        [2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 128, 5, 2, 4, 0]
     );
     assert_eq!(bytes[24..32], 25u64.to_le_bytes());
     assert_eq!(bytes[56..64], 0.25f64.to_le_bytes());
