@@ -3,15 +3,16 @@
 mod common;
 
 use b2p::Limits;
+use b2p::bitstream::Stream;
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
-use b2p::encoder::{Encoded, Options, encode};
+use b2p::encoder::{Encoded, Options, Residual, encode};
 use b2p::gaussians::{ColourFilter, ColourResidual, Gaussians};
 use b2p::log::Log;
 use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::pixels::{Background, render};
 use b2p::projection::Camera;
-use common::{Ball, steps, tiny_model, with_filter, with_residual};
+use common::{Ball, all_in, steps, tiny_model, with_filter, with_residual};
 
 fn model() -> Model {
     Model::from_bytes(&tiny_model(0)).expect("an untrained model loads")
@@ -39,6 +40,7 @@ fn filters_bring_the_colours_of_gaussians_nearer_to_the_cloud_s_and_change_nothi
     let with = |filter: bool| {
         let options = Options {
             filter,
+            residual: Residual::None,
             ..Options::default()
         };
         encode(&cloud, &model, &options, &mut Log::default()).unwrap()
@@ -101,19 +103,19 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
     let (model, cloud) = (model(), ball(7, 45.0));
     let decoder = Decoder::new(&model);
     let mut last = f64::INFINITY;
-    let encoded = |filter: bool, residual: Option<u8>| {
+    let encoded = |filter: bool, residual: Residual| {
         let options = Options {
             filter,
-            residual: residual.map(steps),
+            residual,
             ..Options::default()
         };
         encode(&cloud, &model, &options, &mut Log::default()).unwrap()
     };
     for filter in [true, false] {
-        let plain = encoded(filter, None);
+        let plain = encoded(filter, Residual::None);
         let finest = plain.rates.last().unwrap().level;
         for step in [80, 20, 5, 1] {
-            let refined = encoded(filter, Some(step));
+            let refined = encoded(filter, Residual::Fine(steps(step)));
             for rate in &plain.rates[1..] {
                 let level = rate.level;
                 let bytes = [&plain.bytes, &refined.bytes];
@@ -132,7 +134,8 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
                 };
                 assert_eq!(after, recoloured);
                 if level < finest {
-                    assert_eq!(after, before, "level {level}");
+                    // What is wide is told of coarser levels too, where filters are.
+                    assert!(filter || after == before, "level {level}");
                     continue;
                 }
                 let want = colours_at(&cloud, level);
@@ -157,7 +160,7 @@ fn quick_heads_are_corrected_by_the_same_residual() {
     // A tenth less of everything.
     let missing = vec![[-0.1; 3]; keys.len()];
     let slice = Options::default().slice_voxels as usize;
-    let residual = ColourResidual::of(&missing, &keys, slice, steps(1)).to_payloads();
+    let residual = ColourResidual::of(&missing, &keys, slice, all_in(1)).to_payloads(&keys);
     let bytes = with_residual(&plain.bytes, &residual);
     for heads in Heads::ALL {
         let decoder = Decoder::new(&model).with_heads(heads).unwrap();
@@ -173,6 +176,56 @@ fn quick_heads_are_corrected_by_the_same_residual() {
             assert!((after - want).abs() < 0.001, "{heads}: {before} to {after}");
         }
     }
+}
+
+#[test]
+fn what_is_wide_of_what_colours_are_off_is_coded_unless_said_otherwise() {
+    let (model, cloud) = (model(), ball(8, 90.0));
+    let encoded = |filter: bool, residual: Residual| {
+        let options = Options {
+            filter,
+            residual,
+            ..Options::default()
+        };
+        encode(&cloud, &model, &options, &mut Log::default()).unwrap()
+    };
+    let has = |encoded: &Encoded| {
+        let stream = Stream::parse(&encoded.bytes, &Limits::default()).unwrap();
+        stream
+            .levels()
+            .iter()
+            .any(|level| !level.residual.is_empty())
+    };
+    assert_eq!(Options::default().residual, Residual::Coarse);
+    let (none, coarse) = (
+        encoded(true, Residual::None),
+        encoded(true, Residual::Coarse),
+    );
+    assert!(has(&coarse) && !has(&none));
+    assert!(!has(&encoded(false, Residual::Coarse)));
+    let decoder = Decoder::new(&model);
+    let finest = none.rates.last().unwrap().level;
+    let keys = cloud.voxels.keys();
+    let mut voxels: Vec<u64> = keys.iter().map(|key| key >> 3).collect();
+    voxels.dedup();
+    let want = colours_at(&cloud, finest);
+    let off = |encoded: &Encoded| {
+        let decoded = decoder.decode(&encoded.bytes, None, &mut Log::default());
+        let colours = decoded.unwrap().colour;
+        assert_eq!(colours.len(), voxels.len(), "one Gaussian for each voxel");
+        let missing = colours.iter().zip(&want);
+        let missing = missing.map(|(a, b)| [0, 1, 2].map(|k| f64::from(a[k] - b[k])));
+        // The mean of each cell of eight voxels' edge.
+        let missing: Vec<_> = voxels.iter().zip(missing).collect();
+        let cells = missing.chunk_by(|a, b| a.0 >> 9 == b.0 >> 9);
+        let squares = cells.map(|cell| {
+            let sum = |k: usize| cell.iter().map(|(_, c)| c[k]).sum::<f64>();
+            (0..3).map(|k| sum(k).powi(2)).sum::<f64>() / cell.len() as f64
+        });
+        squares.sum::<f64>()
+    };
+    let off = [off(&none), off(&coarse)];
+    assert!(off[1] < 0.5 * off[0], "{off:?}");
 }
 
 /// The mean colours of a level's voxels.

@@ -7,7 +7,7 @@ use std::sync::Mutex;
 use b2p::bitstream::Header;
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
-use b2p::encoder::{Options, encode};
+use b2p::encoder::{Options, Residual, encode};
 use b2p::gaussians::{Gaussians, Harmonics};
 use b2p::log::Log;
 use b2p::network::{Heads, Model, Shape, untrained};
@@ -70,7 +70,7 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
         let decoders: Vec<_> = model.shape().heads().iter().map(with).collect();
         for (kind, cloud) in clouds() {
             let options = Options {
-                residual: Some(steps(4)),
+                residual: Residual::Fine(steps(4)),
                 ..Options::default()
             };
             let bytes = encode(&cloud, &model, &options, &mut Log::default())

@@ -1,13 +1,12 @@
 //! What fuzzing starts from: streams of our own encoder, files of our own writers, and a few numbers.
 
-use std::num::NonZeroU8;
 use std::path::Path;
 
 use b2p::bitstream::{Level, Stream};
 use b2p::cloud::{ColouredVoxels, PointCloud};
 use b2p::decoder::Decoder;
 use b2p::encoder::{Options, encode};
-use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual, Steps};
+use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::geometry::Voxels;
 use b2p::log::Log;
 use b2p::{Limits, Placement};
@@ -54,8 +53,12 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
         weights,
     };
     let slice = stream.header().slice_voxels as usize;
-    let [luma, chroma] = [30, 12].map(|step| NonZeroU8::new(step).expect("a step"));
-    let steps = Steps { luma, chroma };
+    let steps = |luma, chroma| Steps { luma, chroma };
+    let precision = Precision {
+        fine: steps(30, 12),
+        coarse: steps(10, 4),
+        boundary: 3,
+    };
     let residual = |level: &Level| {
         let keys: Vec<u64> = (0..level.voxels.into()).collect();
         let noise = noise(4, 3 * keys.len());
@@ -63,7 +66,7 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
             .chunks(3)
             .map(|c| [0, 1, 2].map(|k| f32::from(c[k]) / 300.0 - 0.4));
         let missing: Vec<_> = missing.collect();
-        ColourResidual::of(&missing, &keys, slice, steps).to_payloads()
+        ColourResidual::of(&missing, &keys, slice, precision).to_payloads(&keys)
     };
     let colours = Colours {
         filter: filter.to_bytes().to_vec(),

@@ -124,7 +124,7 @@ train high-more lite-start 82 --init "$out/high-mixed/last.pt" --lam 16 --stay 0
 train high-last lite-start 24 --init "$out/high-more/last.pt" "${last[@]}"
 train high-again lite-start 62 --init "$out/high-last/last.pt" --lam 16 --stay 0.5 "${mixed[@]}"
 prune high-again high-pruned
-ship high-pruned lite "0.06 0.15 0.15" "0.05 0.1 0.1"
+ship high-pruned lite "0.09 0.22 0.22" "0.075 0.15 0.15"
 imitating lite 15
 train least lite-start 9 --init "$out/low-heads/last.pt" --lam 1.2 "${all[@]}"
 train least-whole-1 lite-start 21 --init "$out/least/last.pt" --coarse 1 "${whole[@]}"

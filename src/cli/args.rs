@@ -5,6 +5,7 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use b2p::Limits;
+use b2p::encoder::Residual;
 use b2p::gaussians::Steps;
 use b2p::network::Heads;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -111,9 +112,9 @@ pub struct Encode {
     /// Leave colours as the model makes them, which takes less time: otherwise each level tells in 58 bytes how to correct those of the cloud
     #[arg(long)]
     pub no_filter: bool,
-    /// Also code what the finest level's colours are still off, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 96 takes 3 to 28 % more bits, 24 doubles some streams
-    #[arg(long, value_name = "STEP[,CHROMA]", value_parser = steps)]
-    pub residual: Option<Steps>,
+    /// Code what colours are then still off. `coarse`: what is wide, where that is worth it and filters are made; `none`: nothing; else all of the finest level's too, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
+    #[arg(long, value_name = "coarse|none|STEP[,CHROMA]", value_parser = residual, default_value = "coarse")]
+    pub residual: Residual,
     #[command(flatten)]
     pub model: ModelArg,
 }
@@ -370,15 +371,20 @@ fn price(text: &str) -> Result<f32, String> {
     }
 }
 
-fn steps(text: &str) -> Result<Steps, String> {
-    let expected = |_| "expected a step from 1 to 255, or two, such as 64,32";
+fn residual(text: &str) -> Result<Residual, String> {
+    match text {
+        "none" => return Ok(Residual::None),
+        "coarse" => return Ok(Residual::Coarse),
+        _ => {}
+    }
+    let expected = |_| "expected coarse, none, or a step from 1 to 255, or two, such as 64,32";
     let (luma, chroma) = text.split_once(',').unwrap_or((text, ""));
     let luma: NonZeroU8 = luma.parse().map_err(expected)?;
     let mut steps = Steps::from(luma);
     if text.contains(',') {
-        steps.chroma = chroma.parse().map_err(expected)?;
+        steps.chroma = chroma.parse::<NonZeroU8>().map_err(expected)?.get();
     }
-    Ok(steps)
+    Ok(Residual::Fine(steps))
 }
 
 fn size(text: &str) -> Result<(u32, u32), String> {

@@ -2,6 +2,7 @@
 
 use b2p::Limits;
 use b2p::bitstream::Stream;
+use b2p::gaussians::{Precision, Steps};
 use serde_json::json;
 
 use super::args::Info;
@@ -34,6 +35,11 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
         Some(bytes.sum::<usize>())
     };
 
+    let precision = |i: usize| {
+        let level = stream.levels().get(i)?;
+        Precision::read(level.residual.first()?.bytes)
+    };
+
     if args.json {
         let levels: Vec<_> = levels()
             .map(|(i, (level, (voxels, section)))| {
@@ -43,6 +49,11 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
                     "geometry_bytes": section.geometry,
                     "feature_bytes": section.features,
                     "residual_bytes": residual(i),
+                    "residual_steps": precision(i).map(|told| json!({
+                        "fine": [told.fine.luma, told.fine.chroma],
+                        "coarse": [told.coarse.luma, told.coarse.chroma],
+                        "boundary": told.boundary,
+                    })),
                     "whole": i < whole,
                 })
             })
@@ -70,6 +81,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             "geometry bytes",
             "feature bytes",
             "of them residual",
+            "its steps",
             "bits/point up to here",
         ]
         .map(String::from)
@@ -84,6 +96,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             count(section.geometry.into()),
             count(section.features.into()),
             residual(i).map_or("?".into(), |bytes| count(bytes as u64)),
+            precision(i).map_or("-".into(), told),
             bpp(prefix),
         ]);
     }
@@ -103,4 +116,12 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
         text += &format!("damage: {damage}\n");
     }
     Ok(text)
+}
+
+/// The bands of a residual with their steps of luma and chroma.
+fn told(precision: Precision) -> String {
+    let bands = [("fine", precision.fine), ("coarse", precision.coarse)];
+    let bands = bands.iter().filter(|(_, steps)| *steps != Steps::NONE);
+    let told = bands.map(|(band, steps)| format!("{band} {},{}", steps.luma, steps.chroma));
+    told.collect::<Vec<_>>().join(" ")
 }

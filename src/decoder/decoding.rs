@@ -339,7 +339,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
         let mut pool = self.take_pool();
         let decoder = &self.decoder;
         let done = decoder.exact_level(&mut pool, header, &level, &mut octree, above, log);
-        let done = done.and_then(|exact| Ok((exact, residual(header, &level, log)?)));
+        let done = done.and_then(|exact| Ok((exact, residual(header, &level, &octree, log)?)));
         self.return_pool(pool);
         match (done, &mut self.reached) {
             (Ok(((latents, features, map), residual)), reached) => {
@@ -370,14 +370,19 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
 }
 
 /// What a level says that its colours are still off.
-fn residual(header: &Header, level: &Level, log: &mut Log) -> Result<Option<ColourResidual>> {
+fn residual(
+    header: &Header,
+    level: &Level,
+    octree: &Octree,
+    log: &mut Log,
+) -> Result<Option<ColourResidual>> {
     if level.residual.is_empty() {
         return Ok(None);
     }
     let (n, slice) = (level.level, header.slice_voxels as usize);
     let voxels = level.voxels as usize;
     log.step(format!("residual of level {n}"), voxels, "voxels", || {
-        ColourResidual::parse(&level.residual, slice, n)
+        ColourResidual::parse(&level.residual, octree.level(n).keys(), slice, n)
     })
 }
 

@@ -141,17 +141,21 @@ impl Sums {
         // As many weights as pixels would fit them whatever they are.
         let free = self.pixels.checked_sub(INPUTS + 1)?;
         let left = left * (self.pixels as f64 / (free + 1) as f64);
-        let gain = 10.0 * (self.squares / left.max(1e-9)).log10();
-        let cost = CHUNK + 1 + 3 * INPUTS;
-        let worth = gain * DECIBEL * latents as f64 > cost as f64;
+        let worth = worth([self.squares, left], CHUNK + 1 + 3 * INPUTS, latents);
         worth.then_some(ColourFilter { exponent, weights })
     }
+}
+
+/// Whether squares of what colours are off that become less, from the first to the second, are worth so many `bytes` beside `latents` bytes of latents.
+pub(super) fn worth([before, after]: [f64; 2], bytes: usize, latents: usize) -> bool {
+    let gain = 10.0 * (before / after.max(1e-9)).log10();
+    gain * DECIBEL * latents as f64 > bytes as f64
 }
 
 /// Pixels of a task.
 const PART: usize = 1024;
 /// Bytes of a chunk around its payload.
-const CHUNK: usize = 16;
+pub(super) const CHUNK: usize = 16;
 
 /// The damped solution of `gram · x = wanted`, by Cholesky's method; 0 for inputs that are never there.
 fn least_squares(gram: &[[f64; INPUTS]; INPUTS], wanted: &[f64; INPUTS]) -> [f64; INPUTS] {
@@ -220,6 +224,13 @@ mod tests {
         let map = octree.kernel_map(5);
         let around = Surroundings::of_level(&gaussians, &octree, 5, &map, None);
         (gaussians, around)
+    }
+
+    #[test]
+    fn a_decibel_is_worth_its_share_of_the_latents() {
+        let halved = [2.0, 1.0];
+        assert!(worth(halved, 36, 100) && !worth(halved, 37, 100));
+        assert!(!worth([1.0, 1.0], 1, 1000) && !worth([0.0, 0.0], 1, 1000));
     }
 
     #[test]

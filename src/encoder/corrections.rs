@@ -1,18 +1,64 @@
 //! What a stream says of the colours that its heads generate: filters, and what is left after them.
 
-use super::{Options, colours, pooled};
+use super::colours::{self, CHUNK};
+use super::{Options, pooled};
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
-use crate::gaussians::{ColourFilter, ColourResidual, Frame, Gaussians, Surroundings, activate};
+use crate::gaussians::{
+    ColourFilter, ColourResidual, Frame, Gaussians, Precision, Steps, Surroundings, activate,
+};
 use crate::geometry::{KernelMap, Octree};
 use crate::network::{Heads, Model};
+
+/// How many times as much a decibel of what is wide is worth: pictures from afar and up close show it, where what is narrow blurs or is too fine to trouble.
+const WIDE: usize = 4;
+
+/// How much is coded of what the colours of levels that are drawn are off those of the cloud: see [`ColourResidual`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Residual {
+    /// Nothing.
+    None,
+    /// What is at least eight of the finest level's voxels wide and so shows as blotches from close up, at every level that is drawn: where
+    /// [`Options::filter`] is on, and it is worth its bytes.
+    #[default]
+    Coarse,
+    /// All of it at the finest level, in these steps, and of coarser levels the same as without.
+    Fine(Steps),
+}
+
+impl Residual {
+    /// What is wide is told in these steps, if not more finely.
+    pub const COARSE: Steps = Steps {
+        luma: 32,
+        chroma: 24,
+    };
+    /// How finely that of a level is to be told which is so many above the finest.
+    fn precision(self, above: u8, filter: bool) -> Option<Precision> {
+        let finer = |own: u8, coarse: u8| if own == 0 { coarse } else { own.min(coarse) };
+        let (fine, coarse) = match self {
+            Residual::Fine(fine) if above == 0 => {
+                let luma = finer(fine.luma, Self::COARSE.luma);
+                let chroma = finer(fine.chroma, Self::COARSE.chroma);
+                (fine, Steps { luma, chroma })
+            }
+            Residual::None => return None,
+            _ if filter => (Steps::NONE, Self::COARSE),
+            _ => return None,
+        };
+        Some(Precision {
+            fine,
+            coarse,
+            boundary: 3 * 3u8.saturating_sub(above),
+        })
+    }
+}
 
 /// A level whose latents are coded, and which is drawn.
 pub(crate) struct Level<'a> {
     pub role: usize,
     pub level: u8,
-    /// Whether it is the finest of the stream that is drawn.
-    pub finest: bool,
+    /// How many levels it is above the finest of the stream that is drawn.
+    pub above: u8,
     /// Gaussians of each voxel.
     pub children: usize,
     pub octree: &'a Octree,
@@ -26,7 +72,8 @@ pub(crate) struct Level<'a> {
 #[derive(Default)]
 pub(crate) struct Corrections {
     pub filters: Vec<(Heads, ColourFilter)>,
-    pub residual: Option<ColourResidual>,
+    /// The payloads of the residual.
+    pub residual: Option<Vec<Vec<u8>>>,
 }
 
 /// Those that are worth it, and those that were asked for.
@@ -50,8 +97,8 @@ pub(super) fn corrections(
     let mut found = Corrections::default();
     for heads in Heads::ALL {
         let left = match heads {
-            Heads::Best if at.finest => options.residual,
-            _ => None,
+            Heads::Best => options.residual.precision(at.above, options.filter),
+            Heads::Quick => None,
         };
         if shape.head(at.role, heads).is_none() || !options.filter && left.is_none() {
             continue;
@@ -69,11 +116,19 @@ pub(super) fn corrections(
             }
             found.filters.extend(filter.map(|filter| (heads, filter)));
         }
-        if let Some(steps) = left {
-            let missing = missing(&gaussians, &wanted, at.children);
-            let slice = options.slice_voxels as usize;
-            let residual = ColourResidual::of(&missing, voxels.keys(), slice, steps);
-            found.residual = Some(residual);
+        if let Some(precision) = left {
+            let (keys, slice) = (voxels.keys(), options.slice_voxels as usize);
+            let before = missing(&gaussians, &wanted, at.children);
+            let residual = ColourResidual::of(&before, keys, slice, precision);
+            let payloads = residual.to_payloads(keys);
+            residual.apply(&mut gaussians, keys);
+            let after = missing(&gaussians, &wanted, at.children);
+            let bytes = payloads.iter().map(|payload| CHUNK + payload.len()).sum();
+            let asked = precision.fine != Steps::NONE;
+            let squares = [&before, &after].map(|missing| squares(missing));
+            if asked || colours::worth(squares, bytes, WIDE * at.latents) {
+                found.residual = Some(payloads);
+            }
         }
     }
     Ok(found)
@@ -96,6 +151,11 @@ fn missing(gaussians: &Gaussians, wanted: &[[f32; 3]], children: usize) -> Vec<[
         sum.map(|sum| if weights > 0.0 { sum / weights } else { 0.0 })
     };
     (0..wanted.len()).step_by(children).map(voxel).collect()
+}
+
+fn squares(missing: &[[f32; 3]]) -> f64 {
+    let values = missing.as_flattened().iter();
+    values.map(|&x| f64::from(x).powi(2)).sum()
 }
 
 /// The colours of all eight children of each voxel: where there is no such child, the voxel's.

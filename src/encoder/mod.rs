@@ -12,11 +12,11 @@ use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
 use crate::entropy::{Coding, Condition, Rounding, latent_hash};
 use crate::error::{Error, Result};
-use crate::gaussians::Steps;
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::network::{Heads, Model, ROLES};
+pub use corrections::Residual;
 use corrections::{Corrections, Level, corrections};
 
 /// What may be chosen about a stream.
@@ -30,9 +30,8 @@ pub struct Options {
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
     /// [`ColourFilter`].
     pub filter: bool,
-    /// Code what the colours of the finest level that is drawn are still off those of the cloud, in these steps: see
-    /// [`ColourResidual`](crate::gaussians::ColourResidual). Default: not at all.
-    pub residual: Option<Steps>,
+    /// How much is coded of what colours are then still off those of the cloud. Default: [`Residual::Coarse`].
+    pub residual: Residual,
     /// Voxels per slice, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
 }
@@ -43,7 +42,7 @@ impl Default for Options {
             levels: None,
             bit_price: 1.0,
             filter: true,
-            residual: None,
+            residual: Residual::Coarse,
             slice_voxels: MAX_SLICE_VOXELS,
         }
     }
@@ -130,10 +129,11 @@ pub fn encode(
         Ok(coding.quantise(model.tables(), &real, rounding, slice))
     };
     let mut correct = |level: Level<'_>| corrections(cloud, model, options, level);
-    let correct: Option<&mut Correct<'_>> = match options.filter || options.residual.is_some() {
-        true => Some(&mut correct),
-        false => None,
-    };
+    let correct: Option<&mut Correct<'_>> =
+        match options.filter || matches!(options.residual, Residual::Fine(_)) {
+            true => Some(&mut correct),
+            false => None,
+        };
     let (bytes, below) = write(header, &octree, &maps, model, &mut squeezed, correct, log)?;
     let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
         Decoder::new(model)
@@ -259,7 +259,7 @@ pub(crate) fn write(
             let found = correct(Level {
                 role,
                 level,
-                finest: Some(level) == finest,
+                above: finest.map_or(0, |finest| finest - level),
                 children: head.children,
                 octree,
                 maps,
@@ -270,7 +270,7 @@ pub(crate) fn write(
                 writer.filter(level, *heads as usize, &filter.to_bytes())?;
             }
             match &found.residual {
-                Some(residual) => writer.residual(level, &residual.to_payloads()),
+                Some(residual) => writer.residual(level, residual),
                 None => Ok(()),
             }
         })?;

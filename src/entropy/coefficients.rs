@@ -1,5 +1,8 @@
 //! Coefficients of colours as bytes: triples of whole numbers, most of them zero, under probabilities that follow what was coded.
 //!
+//! The triples of a slice come in parts, and of each part only some channels are *present*: all three, the first, the last two, or none. Those that
+//! are not are 0 without a decision; a part without any takes no decision at all and leaves everything below as it is.
+//!
 //! A triple is coded in decisions between 0 and 1, each under the probability of its context. A context holds two numbers of 16 bits, *quick* and *slow*,
 //! how likely 0 is in units of 2⁻¹⁶; the decision's row has the two entries `p` and `2¹⁶ − p`, where `p` is half of their sum, rounded down, but at
 //! least 64 and at most 2¹⁶ − 64. After a 0 they grow by `(65535 − quick) >> r` and `(65535 − slow) >> t`, after a 1 they shrink by
@@ -9,8 +12,8 @@
 //! magnitude `m` it grows by `(4096·min(m, 15) − activity) >> 2`, rounded down. The *class* of a number is how many of [`CLASSES`] it reaches.
 //!
 //! 1. Is anything not 0? Context: the class of the sum of the three activities.
-//! 2. For each channel: is it not 0? Context: the channel; the class of its activity; the sum of magnitudes before it in the triple, at most 2.
-//!    Left out for the last channel, if the others are 0: then it is not.
+//! 2. For each channel present: is it not 0? Context: the channel; the class of its activity; the sum of magnitudes before it in the triple, at most 2.
+//!    Left out for the last channel present, if the others are 0: then it is not.
 //! 3. If it is not: is it negative? That is an equiprobable bit. Then its magnitude less 1 in as many ones, at most 14, and, unless there are 14, a
 //!    zero. Context: whether it is the first channel; the class as before; how many ones came before it, at most 3. After 14 ones, what is left, less 14, plus 1, is `e`, which follows
 //!    as distances from a row do: `⌊log₂ e⌋` ones, a zero, and the lowest bits of `e`.
@@ -18,6 +21,7 @@
 //! Contexts start with both numbers at [`FIRST`] of their class. A slice is coded as latents are ([`super`]), by itself.
 
 use std::fmt::Display;
+use std::ops::Range;
 
 use super::slice::{self, END_STATE};
 use super::stack::{Interval, Stack};
@@ -149,9 +153,14 @@ impl Model {
         }
     }
 
-    /// The next triple: the encoder's is `wanted`, the decoder's what it reads; `None` if that has a magnitude beyond 16 bits.
+    /// The next triple, of these channels: the encoder's is `wanted`, the decoder's what it reads; `None` if that has a magnitude beyond 16 bits.
     #[inline]
-    fn triple(&mut self, decisions: &mut impl Decisions, wanted: [i16; 3]) -> Option<[i16; 3]> {
+    fn triple(
+        &mut self,
+        decisions: &mut impl Decisions,
+        present: Range<usize>,
+        wanted: [i16; 3],
+    ) -> Option<[i16; 3]> {
         let all: i32 = self.activity.iter().sum();
         let any = &mut self.any[class(all)][0];
         let is = decisions.decide(*any, wanted != [0; 3]);
@@ -159,9 +168,9 @@ impl Model {
         let mut triple = [0; 3];
         if is {
             let mut before = 0;
-            for channel in 0..3 {
+            for channel in present.clone() {
                 let class = class(self.activity[channel]);
-                let must = channel == 2 && before == 0;
+                let must = channel + 1 == present.end && before == 0;
                 let is = must || {
                     let context = &mut self.not_zero[channel][class][before.min(2) as usize];
                     let is = decisions.decide(*context, wanted[channel] != 0);
@@ -209,13 +218,24 @@ fn magnitude(decisions: &mut impl Decisions, contexts: &mut [Context], wanted: u
     Some(ONES + e)
 }
 
-/// Codes the coefficients of one slice. Of −2¹⁵ the code is that of −2¹⁵ + 1: magnitudes have 15 bits.
-pub fn encode_coefficients(triples: &[[i16; 3]]) -> Vec<u8> {
+/// Triples of a slice, `T` being a slice of them, of which the same channels are present.
+#[derive(Debug, Clone)]
+pub struct Part<T> {
+    /// The channels: `0..3`, `0..1`, `1..3`, or none.
+    pub present: Range<usize>,
+    /// The triples.
+    pub triples: T,
+}
+
+/// Codes the coefficients of one slice; those of channels that are not present must be 0. Of −2¹⁵ the code is that of −2¹⁵ + 1: magnitudes have 15 bits.
+pub fn encode_coefficients(parts: &[Part<&[[i16; 3]]>]) -> Vec<u8> {
     let (mut model, mut record) = (Model::new(), Record(Vec::new()));
-    for triple in triples {
-        let within = triple.map(|value| value.max(-i16::MAX));
-        let coded = model.triple(&mut record, within);
-        debug_assert_eq!(coded, Some(within));
+    for Part { present, triples } in parts.iter().filter(|part| !part.present.is_empty()) {
+        for triple in *triples {
+            let within = triple.map(|value| value.max(-i16::MAX));
+            let coded = model.triple(&mut record, present.clone(), within);
+            debug_assert_eq!(coded, Some(within));
+        }
     }
     let mut stack = Stack::new(END_STATE, Vec::new());
     record.0.iter().rev().for_each(|&one| stack.push(one));
@@ -223,17 +243,25 @@ pub fn encode_coefficients(triples: &[[i16; 3]]) -> Vec<u8> {
 }
 
 /// Decodes as many triples as there is room for, which the caller has held against its limits: the work is bounded by that, whatever the bytes.
+/// Triples of parts without channels are left as they are.
 ///
 /// # Errors
 /// [`Error::Malformed`], naming `at`, if the bytes are not what [`encode_coefficients`] makes of as many.
-pub fn decode_coefficients(bytes: &[u8], triples: &mut [[i16; 3]], at: &dyn Display) -> Result<()> {
+pub fn decode_coefficients(
+    bytes: &[u8],
+    parts: &mut [Part<&mut [[i16; 3]]>],
+    at: &dyn Display,
+) -> Result<()> {
     let mut stack = slice::open(bytes, at)?;
     let mut model = Model::new();
-    for triple in triples {
-        *triple = model.triple(&mut stack, [0; 3]).ok_or_else(|| {
-            let (field, found) = ("colour coefficient", "one of 16 bits or more");
-            Error::malformed(Stage::Entropy, at, field, found, "magnitudes of 15 bits")
-        })?;
+    for Part { present, triples } in parts.iter_mut().filter(|part| !part.present.is_empty()) {
+        for triple in triples.iter_mut() {
+            let read = model.triple(&mut stack, present.clone(), [0; 3]);
+            *triple = read.ok_or_else(|| {
+                let (field, found) = ("colour coefficient", "one of 16 bits or more");
+                Error::malformed(Stage::Entropy, at, field, found, "magnitudes of 15 bits")
+            })?;
+        }
     }
     slice::expect_end(stack, at)
 }
@@ -244,10 +272,26 @@ mod tests {
     use crate::entropy::test_tables::Random;
     use proptest::prelude::*;
 
+    /// All channels of as many triples.
     fn decode(bytes: &[u8], count: usize) -> Result<Vec<[i16; 3]>> {
         let mut triples = vec![[0; 3]; count];
-        decode_coefficients(bytes, &mut triples, &"slice 0")?;
+        let whole = Part {
+            present: 0..3,
+            triples: &mut triples[..],
+        };
+        decode_coefficients(bytes, &mut [whole], &"slice 0")?;
         Ok(triples)
+    }
+
+    fn encode(triples: &[[i16; 3]]) -> Vec<u8> {
+        encode_coefficients(&[Part {
+            present: 0..3,
+            triples,
+        }])
+    }
+
+    fn channels() -> impl Strategy<Value = Range<usize>> {
+        prop::sample::select(vec![0..3, 0..1, 1..3, 0..0])
     }
 
     fn value() -> impl Strategy<Value = i16> {
@@ -257,8 +301,37 @@ mod tests {
     proptest! {
         #[test]
         fn any_coefficients_come_back(triples in prop::collection::vec([value(), value(), value()], 0..300)) {
-            let bytes = encode_coefficients(&triples);
+            let bytes = encode(&triples);
             prop_assert_eq!(decode(&bytes, triples.len()).unwrap(), triples);
+        }
+
+        #[test]
+        fn channels_that_are_not_present_cost_nothing_and_the_others_come_back(
+            first in (channels(), prop::collection::vec([value(), value(), value()], 0..100)),
+            second in (channels(), prop::collection::vec([value(), value(), value()], 0..100)),
+        ) {
+            let mut parts = [first, second];
+            for (present, triples) in &mut parts {
+                for triple in triples {
+                    (0..3).filter(|k| !present.contains(k)).for_each(|k| triple[k] = 0);
+                }
+            }
+            let part = |(present, triples): &(Range<usize>, Vec<[i16; 3]>)| (present.clone(), triples.clone());
+            let bytes = encode_coefficients(&parts.each_ref().map(|(present, triples)| Part {
+                present: present.clone(),
+                triples: &triples[..],
+            }));
+            let mut decoded = parts.each_ref().map(part);
+            decoded.iter_mut().for_each(|(_, triples)| triples.fill([0; 3]));
+            let mut room = decoded.each_mut().map(|(present, triples)| Part {
+                present: present.clone(),
+                triples: &mut triples[..],
+            });
+            decode_coefficients(&bytes, &mut room, &"slice 0").unwrap();
+            prop_assert_eq!(&decoded, &parts);
+            if parts.iter().all(|(present, _)| present.is_empty()) {
+                prop_assert_eq!(bytes, encode(&[]));
+            }
         }
 
         #[test]
@@ -274,18 +347,18 @@ mod tests {
         let ends = (0..15).flat_map(|bit| [1 << bit, (1 << bit) + 13, (1 << bit) + 14]);
         let all = ends.chain([i16::MAX]).map(|m: i16| [m, 0, -m]);
         let all: Vec<_> = all.collect();
-        assert_eq!(decode(&encode_coefficients(&all), all.len()).unwrap(), all);
+        assert_eq!(decode(&encode(&all), all.len()).unwrap(), all);
     }
 
     #[test]
     fn the_one_magnitude_of_sixteen_bits_is_brought_within() {
-        let coded = encode_coefficients(&[[i16::MIN, 0, 1]]);
+        let coded = encode(&[[i16::MIN, 0, 1]]);
         assert_eq!(decode(&coded, 1).unwrap(), [[-i16::MAX, 0, 1]]);
     }
 
     #[test]
     fn nothing_costs_next_to_nothing() {
-        let bytes = encode_coefficients(&vec![[0; 3]; 16_384]);
+        let bytes = encode(&vec![[0; 3]; 16_384]);
         assert!(bytes.len() < 40, "{}", bytes.len());
     }
 
@@ -302,7 +375,7 @@ mod tests {
         let all = 3.0 * triples.len() as f64;
         let entropy = -(ones * (ones / all).log2() + (all - ones) * (1.0 - ones / all).log2());
         let signs = ones;
-        let bits = 8.0 * encode_coefficients(&triples).len() as f64;
+        let bits = 8.0 * encode(&triples).len() as f64;
         assert!(
             bits < 0.85 * (entropy + signs),
             "{bits} of {entropy} + {signs}"
@@ -312,7 +385,7 @@ mod tests {
     #[test]
     fn bytes_that_end_early_or_late_are_refused() {
         let triples: Vec<_> = (0..500i16).map(|i| [i % 7 - 3, i % 3, 0]).collect();
-        let bytes = encode_coefficients(&triples);
+        let bytes = encode(&triples);
         let refused = |bytes: &[u8], count| decode(bytes, count).unwrap_err().to_string();
         assert!(refused(&bytes, 499).contains("slice 0"));
         assert!(refused(&bytes, 501).contains("slice 0"));

@@ -46,7 +46,7 @@ mod stack;
 mod tables;
 
 pub use coding::Coding;
-pub use coefficients::{decode_coefficients, encode_coefficients};
+pub use coefficients::{Part, decode_coefficients, encode_coefficients};
 pub use level::{decode_level, encode_level, expect_no_latents, latent_hash};
 pub use passes::{Predict, decode_passes, encode_passes};
 pub use quantise::{Rounding, quantise, quantise_passes};

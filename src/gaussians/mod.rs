@@ -9,7 +9,7 @@ mod residual;
 pub use filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundings};
 pub use harmonics::Harmonics;
 pub use heads::activate;
-pub use residual::{BASIS as COLOUR_BASIS, ColourResidual, Steps};
+pub use residual::{BASIS as COLOUR_BASIS, ColourResidual, Precision, Steps};
 
 #[cfg(feature = "ply")]
 pub mod ply;

@@ -17,22 +17,30 @@
 //!
 //! | offset | type | field |
 //! |---|---|---|
-//! | 0 | u8 | step of luma, 1 to 255 |
-//! | 1 | u8 | step of both chromas, 1 to 255 |
-//! | 2 | | coefficients, a triple for each voxel: first the first voxel's, then those of voxels that join at higher bits before those at lower ones, of one bit in order |
+//! | 0 | u8 | step of luma, fine |
+//! | 1 | u8 | step of both chromas, fine |
+//! | 2 | u8 | step of luma, coarse |
+//! | 3 | u8 | step of both chromas, coarse |
+//! | 4 | u8 | boundary, 0 to 63 |
+//! | 5 | | coefficients, a triple for each voxel: first the first voxel's, then those of voxels that join at higher bits before those at lower ones, of one bit in order |
+//!
+//! *Coarse* are the triples of the first voxel and of those that join at the boundary or above, the others are fine: so the coarse ones come first. A step of 0
+//! says that the coefficients it is for are not told, and 0; not all four may be 0. Coefficients are coded in two parts, coarse and fine; of each
+//! those channels are present whose step is not 0. A boundary of 3·n parts what is wider than 2ⁿ voxels from what is not.
 //!
 //! A coefficient q of step s stands for q·(s/255). The three are those of a luma and two chromas, whose vectors are [`BASIS`]; a voxel's sum of the three, in turn, is added to the colour of
 //! each of its Gaussians, which then is clamped to `[0, 1]`. All in f32: equal streams give equal bits on every machine.
 
 use std::num::NonZeroU8;
+use std::ops::Range;
 
 use rayon::prelude::*;
 
 use super::Gaussians;
 use crate::bitstream::Slice;
-use crate::entropy::decode_coefficients;
 #[cfg(feature = "encoder")]
 use crate::entropy::encode_coefficients;
+use crate::entropy::{Part, decode_coefficients};
 use crate::error::{Error, Result, Stage};
 
 /// The unit vectors of luma and two chromas, in red, green and blue.
@@ -46,30 +54,97 @@ pub const BASIS: [[f32; 3]; 3] = [
 #[cfg(feature = "encoder")]
 const ROUND_UP: f32 = 0.67;
 
-/// How finely coefficients are told, in 255ths.
+/// Bytes of a payload before its coefficients.
+const FIXED: usize = 5;
+
+/// How finely coefficients are told, in 255ths; 0: not at all, they are 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Steps {
     /// Of luma.
-    pub luma: NonZeroU8,
+    pub luma: u8,
     /// Of both chromas.
-    pub chroma: NonZeroU8,
+    pub chroma: u8,
 }
 
 impl From<NonZeroU8> for Steps {
     /// Those that go well with a step of luma: chromas three eighths as coarse. That is as good at equal rates as equal steps, pictures' PSNR being
     /// what counts, and leaves fewer blotches.
     fn from(luma: NonZeroU8) -> Steps {
-        let chroma = u16::from(luma.get()) * 3 / 8;
-        let chroma = NonZeroU8::new(chroma as u8).unwrap_or(NonZeroU8::MIN);
+        let luma = luma.get();
+        let chroma = (u16::from(luma) * 3 / 8).max(1) as u8;
         Steps { luma, chroma }
     }
 }
 
 impl Steps {
+    /// Nothing.
+    pub const NONE: Steps = Steps { luma: 0, chroma: 0 };
+
     /// What the coefficients of luma and chromas count in.
     fn units(self) -> [f32; 3] {
-        let [luma, chroma] = [self.luma, self.chroma].map(|step| f32::from(step.get()) / 255.0);
+        let [luma, chroma] = [self.luma, self.chroma].map(|step| f32::from(step) / 255.0);
         [luma, chroma, chroma]
+    }
+
+    /// The channels that are told.
+    fn channels(self) -> Range<usize> {
+        usize::from(self.luma == 0)..if self.chroma == 0 { 1 } else { 3 }
+    }
+}
+
+/// How finely a residual is told, by how wide what it tells is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Precision {
+    /// Where voxels join below [`Precision::boundary`].
+    pub fine: Steps,
+    /// Where they join there or above, and for the first voxel.
+    pub coarse: Steps,
+    /// A bit of Morton keys, at most [`Precision::MAX_BOUNDARY`]: 3·n for what is wider than 2ⁿ voxels.
+    pub boundary: u8,
+}
+
+impl Precision {
+    /// The highest bit.
+    pub const MAX_BOUNDARY: u8 = 63;
+
+    /// That of the payload of a residual's chunk; `None` if it is none that can be.
+    pub fn read(payload: &[u8]) -> Option<Precision> {
+        let fixed = *payload.first_chunk::<FIXED>()?;
+        let [luma, chroma, coarse_luma, coarse_chroma, boundary] = fixed;
+        let told = [luma, chroma, coarse_luma, coarse_chroma] != [0; 4];
+        (told && boundary <= Precision::MAX_BOUNDARY).then_some(Precision {
+            fine: Steps { luma, chroma },
+            coarse: Steps {
+                luma: coarse_luma,
+                chroma: coarse_chroma,
+            },
+            boundary,
+        })
+    }
+
+    #[cfg(feature = "encoder")]
+    fn to_bytes(self) -> [u8; FIXED] {
+        let Precision {
+            fine,
+            coarse,
+            boundary,
+        } = self;
+        [fine.luma, fine.chroma, coarse.luma, coarse.chroma, boundary]
+    }
+
+    /// How many of the coefficients of a slice with these Morton keys are coarse: the first ones.
+    fn coarse_of(self, keys: &[u64]) -> usize {
+        let joins = keys.windows(2).map(|pair| (pair[0] ^ pair[1]).ilog2());
+        let coarse = joins.filter(|bit| *bit >= u32::from(self.boundary)).count();
+        (coarse + 1).min(keys.len())
+    }
+
+    /// The parts that coarse and fine triples are coded in.
+    fn parts<T>(self, (coarse, fine): (T, T)) -> [Part<T>; 2] {
+        [(self.coarse, coarse), (self.fine, fine)].map(|(steps, triples)| Part {
+            present: steps.channels(),
+            triples,
+        })
     }
 }
 
@@ -79,7 +154,7 @@ pub struct ColourResidual {
     /// Voxels of a slice.
     slice: usize,
     /// One for each slice.
-    steps: Vec<Steps>,
+    precisions: Vec<Precision>,
     /// Three for each voxel, in the order in which they are coded.
     coefficients: Vec<[i16; 3]>,
 }
@@ -94,25 +169,30 @@ struct Join {
 }
 
 impl ColourResidual {
-    /// Reads the payloads of the residual chunks of `level`, one for every `slice` voxels; `None` if there are none.
+    /// Reads the payloads of the residual chunks of `level`, one for every `slice` of its voxels, whose Morton keys are `keys`; `None` if there are none.
     ///
     /// # Errors
-    /// [`Error::Malformed`] if one has no step, or its coefficients do not decode.
-    pub fn parse(payloads: &[Slice], slice: usize, level: u8) -> Result<Option<Self>> {
+    /// [`Error::Malformed`] if one tells nothing, or of a boundary beyond keys, or its coefficients do not decode.
+    ///
+    /// # Panics
+    /// If there are payloads, but not one for every `slice` of the keys.
+    pub fn parse(
+        payloads: &[Slice],
+        keys: &[u64],
+        slice: usize,
+        level: u8,
+    ) -> Result<Option<Self>> {
         if payloads.is_empty() {
             return Ok(None);
         }
-        let voxels = payloads.iter().map(|payload| payload.voxels as usize).sum();
-        let mut coefficients = vec![[0; 3]; voxels];
-        let parse = |(payload, part): (&Slice, &mut [[i16; 3]])| {
+        assert_eq!(payloads.len(), keys.len().div_ceil(slice), "a payload each");
+        let mut coefficients = vec![[0; 3]; keys.len()];
+        let parse = |((payload, keys), triples): ((&Slice, &[u64]), &mut [[i16; 3]])| {
             let at = format!("byte {}, residual of level {level}", payload.offset);
-            let steps = match payload.bytes {
-                [luma, chroma, ..] => NonZeroU8::new(*luma).zip(NonZeroU8::new(*chroma)),
-                _ => None,
-            };
-            let Some((luma, chroma)) = steps else {
-                let (field, expected) = ("steps of the colour residual", "two from 1 to 255");
-                let found = format!("{:?}", &payload.bytes[..payload.bytes.len().min(2)]);
+            let Some(precision) = Precision::read(payload.bytes) else {
+                let field = "steps of the colour residual";
+                let expected = "four steps, not all 0, and a bit up to 63";
+                let found = format!("{:?}", &payload.bytes[..payload.bytes.len().min(FIXED)]);
                 return Err(Error::malformed(
                     Stage::Gaussians,
                     at,
@@ -121,28 +201,31 @@ impl ColourResidual {
                     expected,
                 ));
             };
-            let code = &payload.bytes[2..];
-            decode_coefficients(code, part, &at)?;
-            Ok(Steps { luma, chroma })
+            let mut parts = precision.parts(triples.split_at_mut(precision.coarse_of(keys)));
+            decode_coefficients(&payload.bytes[FIXED..], &mut parts, &at)?;
+            Ok(precision)
         };
-        let parts = payloads.par_iter().zip(coefficients.par_chunks_mut(slice));
+        let parts = payloads.par_iter().zip(keys.par_chunks(slice));
+        let parts = parts.zip(coefficients.par_chunks_mut(slice));
         // All of them, so that the first fault is always the same.
-        let steps: Vec<Result<Steps>> = parts.map(parse).collect();
+        let precisions: Vec<Result<Precision>> = parts.map(parse).collect();
         Ok(Some(ColourResidual {
             slice,
-            steps: steps.into_iter().collect::<Result<_>>()?,
+            precisions: precisions.into_iter().collect::<Result<_>>()?,
             coefficients,
         }))
     }
 
-    /// The residual, in these steps, that brings colours nearer to what they are `missing`, voxel by voxel; `keys` are the voxels' Morton keys.
+    /// The residual, as finely told as this, that brings colours nearer to what they are `missing`, voxel by voxel; `keys` are the voxels' Morton keys.
     ///
     /// # Panics
-    /// If there are more or fewer of the one than of the other, or a slice has none.
+    /// If there are more or fewer of the one than of the other, a slice has none, or the precision is none that can be written.
     #[cfg(feature = "encoder")]
-    pub fn of(missing: &[[f32; 3]], keys: &[u64], slice: usize, steps: Steps) -> Self {
+    pub fn of(missing: &[[f32; 3]], keys: &[u64], slice: usize, precision: Precision) -> Self {
         assert_eq!(missing.len(), keys.len(), "a difference for every voxel");
         assert!(slice > 0, "slices of something");
+        let written = Precision::read(&precision.to_bytes());
+        assert!(written.is_some(), "steps and a boundary: {precision:?}");
         let part = |(missing, keys): (&[[f32; 3]], &[u64])| {
             let mut values: Vec<_> = missing
                 .iter()
@@ -155,33 +238,47 @@ impl ColourResidual {
                 values[join.left as usize] = each(|k| a * x[k] + c * y[k]);
                 values[join.voxel as usize] = each(|k| a * y[k] - c * x[k]);
             }
-            let units = steps.units();
-            let rounded = |voxel: usize| {
-                std::array::from_fn(|k| {
+            let order = joins.iter().map(|join| join.voxel as usize);
+            let coarse = precision.coarse_of(keys);
+            let rounded = |(place, voxel): (usize, usize)| {
+                let fine = place >= coarse;
+                let steps = if fine {
+                    precision.fine
+                } else {
+                    precision.coarse
+                };
+                let units = steps.units();
+                let mut triple = [0; 3];
+                for k in steps.channels() {
                     let steps = values[voxel][k] / units[k];
                     let whole = (steps.abs() + (1.0 - ROUND_UP)).floor();
-                    whole.min(i16::MAX.into()).copysign(steps) as i16
-                })
+                    triple[k] = whole.min(i16::MAX.into()).copysign(steps) as i16;
+                }
+                triple
             };
-            let order = joins.iter().map(|join| join.voxel as usize);
-            [0].into_iter().chain(order).map(rounded).collect()
+            let order = [0].into_iter().chain(order).enumerate();
+            order.map(rounded).collect()
         };
         let parts = missing.par_chunks(slice).zip(keys.par_chunks(slice));
         let parts: Vec<Vec<_>> = parts.map(part).collect();
         ColourResidual {
             slice,
-            steps: vec![steps; parts.len()],
+            precisions: vec![precision; parts.len()],
             coefficients: parts.concat(),
         }
     }
 
-    /// The payloads, one for each slice.
+    /// The payloads, one for each slice of the voxels `keys` that it was made for.
     #[cfg(feature = "encoder")]
-    pub fn to_payloads(&self) -> Vec<Vec<u8>> {
-        let slices = self.coefficients.par_chunks(self.slice).zip(&self.steps);
-        let payload = |(part, steps): (&[[i16; 3]], &Steps)| {
-            let mut bytes = vec![steps.luma.get(), steps.chroma.get()];
-            bytes.extend(encode_coefficients(part));
+    pub fn to_payloads(&self, keys: &[u64]) -> Vec<Vec<u8>> {
+        let slices = self.coefficients.par_chunks(self.slice);
+        let slices = slices
+            .zip(&self.precisions)
+            .zip(keys.par_chunks(self.slice));
+        let payload = |((triples, precision), keys): ((&[[i16; 3]], &Precision), &[u64])| {
+            let parts = precision.parts(triples.split_at(precision.coarse_of(keys)));
+            let mut bytes = precision.to_bytes().to_vec();
+            bytes.extend(encode_coefficients(&parts));
             bytes
         };
         slices.map(payload).collect()
@@ -201,12 +298,12 @@ impl ColourResidual {
         assert_eq!(each * keys.len(), count, "as many for each voxel");
         let colours = gaussians.colour.par_chunks_mut(self.slice * each);
         let keys = keys.par_chunks(self.slice);
-        let slices = self.coefficients.par_chunks(self.slice).zip(&self.steps);
+        let slices = self.coefficients.par_chunks(self.slice);
         colours
             .zip(keys)
-            .zip(slices)
-            .for_each(|((colours, keys), (coefficients, steps))| {
-                let values = differences(coefficients, keys, steps.units());
+            .zip(slices.zip(&self.precisions))
+            .for_each(|((colours, keys), (coefficients, precision))| {
+                let values = differences(coefficients, keys, *precision);
                 for (colours, value) in colours.chunks_mut(each).zip(values) {
                     for colour in colours {
                         for (k, x) in colour.iter_mut().enumerate() {
@@ -222,11 +319,18 @@ impl ColourResidual {
 }
 
 /// The luma and chromas of a slice's voxels.
-fn differences(coefficients: &[[i16; 3]], keys: &[u64], units: [f32; 3]) -> Vec<[f32; 3]> {
+fn differences(coefficients: &[[i16; 3]], keys: &[u64], precision: Precision) -> Vec<[f32; 3]> {
     let mut values = vec![[0.0; 3]; keys.len()];
-    let mut coefficients = coefficients
-        .iter()
-        .map(|triple| each(|k| f32::from(triple[k]) * units[k]));
+    let coarse = precision.coarse_of(keys);
+    let [coarse_units, fine_units] = [precision.coarse, precision.fine].map(Steps::units);
+    let mut coefficients = coefficients.iter().enumerate().map(|(place, triple)| {
+        let units = if place < coarse {
+            coarse_units
+        } else {
+            fine_units
+        };
+        each(|k| f32::from(triple[k]) * units[k])
+    });
     values[0] = coefficients.next().unwrap_or_default();
     for (join, high) in joins(keys).iter().zip(coefficients) {
         let (low, [a, c]) = (values[join.left as usize], join.weights);
@@ -291,204 +395,4 @@ fn joins(keys: &[u64]) -> Vec<Join> {
 }
 
 #[cfg(all(test, feature = "encoder"))]
-mod tests {
-    use super::*;
-    use crate::entropy::test_tables::Random;
-    use std::collections::BTreeSet;
-
-    fn keys(seed: u64, count: usize, depth: u32) -> Vec<u64> {
-        let mut random = Random(seed);
-        let draw = (0..count).map(|_| random.next() >> (64 - 3 * depth));
-        draw.collect::<BTreeSet<_>>().into_iter().collect()
-    }
-
-    fn steps(luma: u8, chroma: u8) -> Steps {
-        let [luma, chroma] = [luma, chroma].map(|step| NonZeroU8::new(step).unwrap());
-        Steps { luma, chroma }
-    }
-
-    fn colours(seed: u64, count: usize) -> Vec<[f32; 3]> {
-        let mut random = Random(seed);
-        let mut draw = || (random.next() >> 40) as f32 / (1 << 24) as f32 - 0.5;
-        (0..count).map(|_| [draw(), draw(), draw()]).collect()
-    }
-
-    fn grey(count: usize) -> Gaussians {
-        Gaussians {
-            colour: vec![[0.5; 3]; count],
-            ..Gaussians::default()
-        }
-    }
-
-    /// What the module's documentation says of one slice, word by word: coefficients in the order of the payload.
-    fn by_definition(values: &[[f64; 3]], keys: &[u64]) -> Vec<[f64; 3]> {
-        let joins_at = |j: usize| {
-            (0..64)
-                .rev()
-                .find(|b| (keys[j] ^ keys[j - 1]) >> b & 1 == 1)
-        };
-        let mut x = values.to_vec();
-        let mut order = Vec::new();
-        for bit in 0..63 {
-            let joining = (1..keys.len()).filter(|&j| joins_at(j) == Some(bit));
-            let joining: Vec<_> = joining.collect();
-            for &j in &joining {
-                let left = (1..j).rev().find(|&i| joins_at(i) > Some(bit)).unwrap_or(0);
-                let next = (j + 1..keys.len()).find(|&i| joins_at(i) >= Some(bit));
-                let (v, w) = (j - left, next.unwrap_or(keys.len()) - j);
-                let root = |n: usize| (n as f64 / (v + w) as f64).sqrt();
-                let (a, c) = (root(v), root(w));
-                let (low, high) = (x[left], x[j]);
-                x[left] = std::array::from_fn(|k| a * low[k] + c * high[k]);
-                x[j] = std::array::from_fn(|k| a * high[k] - c * low[k]);
-            }
-            order.splice(0..0, joining);
-        }
-        order.insert(0, 0);
-        order.into_iter().map(|j| x[j]).collect()
-    }
-
-    #[test]
-    fn coefficients_are_those_of_the_definition_and_those_decode_to_the_colours() {
-        for (seed, count, depth) in [(1, 1, 1), (2, 2, 21), (3, 9, 1), (4, 300, 3), (5, 700, 21)] {
-            let keys = keys(seed, count, depth);
-            let missing = colours(seed, keys.len());
-            let residual = ColourResidual::of(&missing, &keys, keys.len(), steps(1, 1));
-            let luma = |rgb: &[f32; 3]| {
-                BASIS.map(|unit| (0..3).map(|k| f64::from(unit[k] * rgb[k])).sum::<f64>())
-            };
-            let values: Vec<_> = missing.iter().map(luma).collect();
-            for (found, want) in residual
-                .coefficients
-                .iter()
-                .zip(by_definition(&values, &keys))
-            {
-                for (q, want) in found.iter().zip(want) {
-                    let off = f64::from(*q) - 255.0 * want;
-                    assert!(
-                        off.abs() < f64::from(ROUND_UP) + 1e-3,
-                        "{q} for {}",
-                        255.0 * want
-                    );
-                }
-            }
-            let mut decoded = grey(keys.len());
-            residual.apply(&mut decoded, &keys);
-            let squares = |(got, want): (&[f32; 3], &[f32; 3])| -> f32 {
-                (0..3).map(|k| (got[k] - 0.5 - want[k]).powi(2)).sum()
-            };
-            // The transform keeps squares, so those of the colours are those of the rounding.
-            let off: f32 = decoded.colour.iter().zip(&missing).map(squares).sum();
-            let most = 3.0 * keys.len() as f32 * (ROUND_UP / 255.0).powi(2);
-            assert!(off < most, "{off} of {most}");
-        }
-    }
-
-    #[test]
-    fn finer_steps_take_more_bytes_and_bring_colours_nearer() {
-        let keys: Vec<u64> = (0..4096).collect();
-        let missing: Vec<_> = colours(7, 4096)
-            .iter()
-            .map(|c| c.map(|x| 0.3 * x))
-            .collect();
-        let mut before = (usize::MAX, 0.0);
-        for step in [1, 8, 40, 200] {
-            let residual = ColourResidual::of(&missing, &keys, 1000, steps(step, step));
-            let bytes = residual.to_payloads().iter().map(Vec::len).sum();
-            let mut decoded = grey(keys.len());
-            residual.apply(&mut decoded, &keys);
-            let pairs = decoded
-                .colour
-                .as_flattened()
-                .iter()
-                .zip(missing.as_flattened());
-            let off: f32 = pairs.map(|(got, want)| (got - 0.5 - want).powi(2)).sum();
-            assert!(
-                bytes < before.0 && off > before.1,
-                "step {step}: {bytes}, {off}"
-            );
-            before = (bytes, off);
-        }
-    }
-
-    #[test]
-    fn what_is_written_is_read_and_slices_do_not_know_of_each_other() {
-        let keys = keys(8, 500, 4);
-        let missing = colours(8, keys.len());
-        let whole = ColourResidual::of(&missing, &keys, 64, steps(12, 7));
-        let payloads = whole.to_payloads();
-        let slices: Vec<_> = (payloads.iter().zip(keys.chunks(64)))
-            .map(|(bytes, keys)| Slice {
-                voxels: keys.len() as u32,
-                bytes,
-                offset: 9,
-            })
-            .collect();
-        assert_eq!(ColourResidual::parse(&slices, 64, 3).unwrap(), Some(whole));
-        for ((payload, missing), keys) in
-            payloads.iter().zip(missing.chunks(64)).zip(keys.chunks(64))
-        {
-            let alone = ColourResidual::of(missing, keys, 64, steps(12, 7));
-            assert_eq!(alone.to_payloads(), std::slice::from_ref(payload));
-        }
-    }
-
-    #[test]
-    fn all_gaussians_of_a_voxel_get_the_same_and_stay_colours() {
-        let residual = ColourResidual {
-            slice: 2,
-            steps: vec![steps(255, 9), steps(1, 100)],
-            coefficients: vec![[2, 0, 0], [0, 0, 0], [0, 1, 0]],
-        };
-        let mut some = grey(24);
-        some.colour[20] = [0.1, 0.2, 0.9];
-        residual.apply(&mut some, &[0, 1, 5]);
-        // Two voxels share the mean, and one is alone with a difference of red and blue.
-        assert_eq!(some.colour[..16], [[1.0; 3]; 16]);
-        let by = 100.0 / 255.0 * BASIS[1][0];
-        assert_eq!(some.colour[16], [0.5 + by, 0.5, 0.5 - by]);
-        assert_eq!(some.colour[20], [0.1 + by, 0.2, 0.9 - by]);
-    }
-
-    #[test]
-    fn chromas_are_told_more_finely_unless_said_otherwise() {
-        for (luma, chroma) in [(1, 1), (2, 1), (8, 3), (64, 24), (255, 95)] {
-            assert_eq!(
-                Steps::from(NonZeroU8::new(luma).unwrap()),
-                steps(luma, chroma)
-            );
-        }
-    }
-
-    #[test]
-    fn the_basis_is_orthonormal() {
-        for (i, a) in BASIS.iter().enumerate() {
-            for (j, b) in BASIS.iter().enumerate() {
-                let dot: f32 = a.iter().zip(b).map(|(a, b)| a * b).sum();
-                assert!((dot - f32::from(u8::from(i == j))).abs() < 1e-6);
-            }
-        }
-    }
-
-    #[test]
-    fn a_payload_without_steps_or_code_is_refused() {
-        for (bytes, wrong) in [
-            (&[][..], "steps of the colour residual"),
-            (&[9], "steps of the colour residual"),
-            (&[0, 1, 2, 3, 4, 5, 6], "steps of the colour residual"),
-            (&[1, 0, 2, 3, 4, 5, 6], "steps of the colour residual"),
-            (&[1, 2, 3], "length of the slice"),
-        ] {
-            let payload = Slice {
-                voxels: 1,
-                bytes,
-                offset: 100,
-            };
-            let error = ColourResidual::parse(&[payload], 64, 3)
-                .unwrap_err()
-                .to_string();
-            assert!(error.contains(wrong), "{error}");
-            assert!(error.contains("byte 100, residual of level 3"), "{error}");
-        }
-    }
-}
+mod tests;

@@ -38,8 +38,9 @@ pub fn in_double(subject: &Subject<'_>, model: &Model, level: u8) -> Result<(Gau
         ColourFilter::parse(&filter, level)?.apply(&mut gaussians, &around);
     }
     let slice = header.slice_voxels as usize;
-    if let Some(residual) = ColourResidual::parse(&said.residual, slice, level)? {
-        residual.apply(&mut gaussians, voxels.keys());
+    let keys = voxels.keys();
+    if let Some(residual) = ColourResidual::parse(&said.residual, keys, slice, level)? {
+        residual.apply(&mut gaussians, keys);
     }
     Ok((gaussians, took))
 }

@@ -1,13 +1,12 @@
 //! Small objects and helpers that several test files share.
 #![allow(dead_code)] // each test file uses its part
 
-use std::num::NonZeroU8;
 use std::path::Path;
 
 use b2p::bitstream::{Stream, Writer};
 use b2p::cloud::ColouredVoxels;
 use b2p::encoder::{Options, encode};
-use b2p::gaussians::Steps;
+use b2p::gaussians::{Precision, Steps};
 use b2p::geometry::{Voxels, morton};
 use b2p::log::Log;
 use b2p::network::{Heads, Model};
@@ -134,10 +133,18 @@ pub fn with_residual(bytes: &[u8], slices: &[Vec<u8>]) -> Vec<u8> {
 
 /// The same step for luma and chromas.
 pub fn steps(step: u8) -> Steps {
-    let step = NonZeroU8::new(step).expect("a step");
     Steps {
         luma: step,
         chroma: step,
+    }
+}
+
+/// Everything in the same step.
+pub fn all_in(step: u8) -> Precision {
+    Precision {
+        fine: steps(step),
+        coarse: steps(step),
+        boundary: 9,
     }
 }
 

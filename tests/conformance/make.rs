@@ -2,9 +2,9 @@
 
 use b2p::Placement;
 use b2p::bitstream::{Header, Writer};
-use b2p::encoder::{Options, encode};
+use b2p::encoder::{Options, Residual, encode};
 use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
-use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual, Steps};
+use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::log::Log;
 use b2p::network::Model;
@@ -92,8 +92,8 @@ fn stream(
 struct Corrections {
     /// Filters for both sets of heads, of this exponent and weights up to as much.
     filter: Option<(u8, i8)>,
-    /// In these steps of luma and chroma, what is up to so much in each channel.
-    residual: Option<([u8; 2], f32)>,
+    /// As finely as this, what is up to so much in each channel.
+    residual: Option<(Precision, f32)>,
 }
 
 /// The same, and all its levels correct colours.
@@ -153,15 +153,11 @@ fn coloured(
                 writer.filter(level, set, &payload).expect("a filter");
             }
             if let Some((own, most)) = corrections.residual {
-                let own = Steps {
-                    luma: steps(own[0]).luma,
-                    chroma: steps(own[1]).chroma,
-                };
                 let keys = octree.level(level).keys();
                 let mut draw = || most * (random.below(1 << 20) as f32 / (1 << 19) as f32 - 1.0);
                 let missing: Vec<_> = keys.iter().map(|_| [draw(), draw(), draw()]).collect();
                 let residual = ColourResidual::of(&missing, keys, slice as usize, own);
-                let written = writer.residual(level, &residual.to_payloads());
+                let written = writer.residual(level, &residual.to_payloads(keys));
                 written.expect("a residual");
             }
         };
@@ -228,6 +224,16 @@ fn with_notes(bytes: &[u8]) -> Vec<u8> {
     }
     seal::seal(&mut out);
     out
+}
+
+/// Steps of luma and chromas, fine and coarse, and the boundary.
+fn precision(fine: [u8; 2], coarse: [u8; 2], boundary: u8) -> Precision {
+    let [fine, coarse] = [fine, coarse].map(|[luma, chroma]| Steps { luma, chroma });
+    Precision {
+        fine,
+        coarse,
+        boundary,
+    }
 }
 
 fn cube(side: u32) -> Vec<u64> {
@@ -361,16 +367,29 @@ pub fn cases() -> Vec<Case> {
         add("filtered-to-the-ends".into(), true, &|m| {
             scatter_saying(m, Some((0, 127)), None)
         });
-        add("residual".into(), true, &|m| {
-            sphere_saying(m, Some((6, 20)), Some(([20, 9], 0.3)))
-        });
+        for (bands, fine, coarse, boundary) in [
+            ("", [20, 9], [12, 7], 3),
+            ("-coarse", [0, 0], [12, 7], 3),
+            ("-fine", [20, 9], [0, 0], 3),
+            ("-luma", [20, 0], [12, 0], 6),
+            ("-chroma", [0, 9], [0, 7], 6),
+            ("-luma-below-chroma", [20, 0], [0, 7], 4),
+            ("-all-coarse", [0, 0], [12, 7], 0),
+            ("-first-alone", [0, 0], [1, 1], 63),
+        ] {
+            add(format!("residual{bands}"), true, &|m| {
+                let precision = precision(fine, coarse, boundary);
+                sphere_saying(m, Some((6, 20)), Some((precision, 0.3)))
+            });
+        }
         add("residual-to-the-ends".into(), true, &|m| {
-            scatter_saying(m, None, Some(([1, 2], 100.0)))
+            let precision = precision([1, 2], [2, 1], 6);
+            scatter_saying(m, None, Some((precision, 100.0)))
         });
-        let encoded = |cloud, m: &Model, residual: u8| {
+        let encoded = |cloud, m: &Model, residual: Residual| {
             let options = Options {
                 slice_voxels: 60,
-                residual: (residual > 0).then(|| steps(residual)),
+                residual,
                 bit_price: 0.0,
                 ..Options::default()
             };
@@ -379,13 +398,13 @@ pub fn cases() -> Vec<Case> {
                 .bytes
         };
         add("encoded-sphere".into(), false, &|m| {
-            encoded(Ball::new(5, 7.5).cloud(), m, 0)
+            encoded(Ball::new(5, 7.5).cloud(), m, Residual::Coarse)
         });
         add("encoded-sphere-with-residual".into(), false, &|m| {
-            encoded(Ball::new(5, 7.5).cloud(), m, 8)
+            encoded(Ball::new(5, 7.5).cloud(), m, Residual::Fine(steps(8)))
         });
         add("encoded-scatter".into(), false, &|m| {
-            encoded(cloud_of(7, scattered(7, 60)), m, 0)
+            encoded(cloud_of(7, scattered(7, 60)), m, Residual::Coarse)
         });
     }
     cases

@@ -7,7 +7,7 @@ use b2p::gaussians::{ColourFilter, ColourResidual};
 use b2p::network::Heads;
 use rayon::prelude::*;
 
-use crate::common::{small_stream, steps, with_filter, with_residual};
+use crate::common::{all_in, small_stream, with_filter, with_residual};
 use crate::seal::{FIXED, chunks, header_end, seal};
 use crate::{decoded, model, pushed};
 
@@ -178,19 +178,23 @@ fn a_colour_residual_without_steps_or_with_another_code_is_refused_and_the_level
     let count = top.voxels as usize;
     let keys: Vec<u64> = (0..count as u64).collect();
     let missing: Vec<_> = (0..count).map(|i| [(i % 7) as f32 / 9.0; 3]).collect();
-    let sound = ColourResidual::of(&missing, &keys, slice, steps(3)).to_payloads();
+    let sound = ColourResidual::of(&missing, &keys, slice, all_in(3)).to_payloads(&keys);
     assert!(sound.len() > 2, "several slices");
     let level = Some(top.level);
     assert!(decoded(&model, &with_residual(&whole, &sound), level).is_ok());
     let before = decoded(&model, &whole, Some(top.level - 1));
-    let flipped = [&sound[1][..9], &[!sound[1][9]], &sound[1][10..]].concat();
+    let flipped = [&sound[1][..12], &[!sound[1][12]], &sound[1][13..]].concat();
     for (wrong, told) in [
         (vec![], "steps of the colour residual"),
         (
-            [&[0], &sound[1][1..]].concat(),
+            [&[0; 4], &sound[1][4..]].concat(),
             "steps of the colour residual",
         ),
-        (sound[1][..5].to_vec(), "length of the slice"),
+        (
+            [&sound[1][..4], &[64], &sound[1][5..]].concat(),
+            "steps of the colour residual",
+        ),
+        (sound[1][..8].to_vec(), "length of the slice"),
         ([&sound[1][..], &[7; 4]].concat(), "last symbol"),
         (flipped, "last symbol"),
     ] {
