@@ -26,7 +26,8 @@ PEERS = {
 MODELS = {name: f"models/{name}.safetensors" for name in ("lite", "lite-low", "lite-least")} | {"lite-quick": "models/lite.safetensors", "lite-price": "models/lite.safetensors", "lite-residual": "models/lite.safetensors"}
 QUICK = "-quick"  # ends the name of a model whose quick heads are measured
 PRICE, RESIDUAL = "-price", "-residual"  # of a model whose streams are made with an option
-OPTIONS = {PRICE: ("--bit-price", (0, 0.5, 2, 4)), RESIDUAL: ("--residual", (96, 48, 24))}
+OPTIONS = {PRICE: ("--bit-price", (0, 0.5, 2, 4)), RESIDUAL: ("--residual", ("none", 96, 48, 24))}
+DEFAULTS = {PRICE: "1", RESIDUAL: "coarse"}
 COLOURS = ["#1d4ed8", "#c2410c", "#15803d", "#7e22ce", "#b45309", "#be185d"]
 PEER = "TMC13"  # begins the names of its series
 PEER_COLOURS = {f"{PEER} squares": "#6b7280", f"{PEER} Gaussians": "#d1a3a3"}
@@ -161,12 +162,12 @@ def summary(rows):
 
 
 def optional(rows, end, levels):
-    """As `summary`, of one model without and with an option."""
-    values, none = map(str, OPTIONS[end][1]), {PRICE: "1", RESIDUAL: "none"}[end]
-    own = [r | {"option": r.get("option", none)} for r in rows if r["series"] in ("lite", "lite" + end)]
-    values = sorted([none, *values], key=lambda v: float(v) if v != "none" else 0) if end == PRICE else [none, *values]
+    """As `summary`, of one model with the values of an option, the default among them."""
+    values, default = [str(value) for value in OPTIONS[end][1]], DEFAULTS[end]
+    own = [r | {"option": r.get("option", default)} for r in rows if r["series"] in ("lite", "lite" + end)]
+    values.insert(2 if end == PRICE else 1, default)
     columns = [(level, value) for level in levels for value in values]
-    heading = lambda level, value: (f"level {level}, " if len(levels) > 1 else "") + (value if value == "none" else f"`{value}`")
+    heading = lambda level, value: (f"level {level}, " if len(levels) > 1 else "") + f"`{value}`"
     out = ["| bits/point: PSNR / foreground | " + " | ".join(heading(*column) for column in columns) + " |", "|---|" + "---:|" * len(columns)]
     for name, title in OBJECTS.items():
         found = {(r["level"], r["option"]): r for r in own if r["object"] == name}

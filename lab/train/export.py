@@ -278,9 +278,12 @@ def export(model, samples, path, info, streams_of=None):
     meta = {"format": 1, **model.cfg, "latent_shift": LATENT_SHIFT, "blur": BLUR, **info}
     if streams_of:
         before, old = same_streams(streams_of, model.cfg)
-        if {k: v.shape for k, v in old.items() if not is_quick(k)} != {k: v.shape for k, v in out.items()}:
+        rest = lambda tensors: {k: v for k, v in tensors.items() if not k.startswith("gg.")}
+        shapes = lambda tensors: {k: v.shape for k, v in tensors.items()}
+        if shapes(rest(old)) != shapes(rest(out)):
             sys.exit(f"{streams_of} is another network")
-        out = {k: out[k] if k.startswith("gg.") and not is_quick(k) else v for k, v in old.items()}
+        own = {k: v for k, v in out.items() if k.startswith("gg.")}
+        out = rest(old) | own | {k: v for k, v in old.items() if is_quick(k)}
         meta |= {"heads_steps": meta["steps"]} | {k: before[k] for k in ("lambda", "steps", "bit_price", "learning", "quick_steps") if k in before}
         meta["gg"] = model.cfg["gg"] + [g for g in before["gg"] if g.get("heads") == "quick"]
     write(path, meta, out)

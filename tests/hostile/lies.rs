@@ -111,8 +111,11 @@ fn a_coder_s_bytes_changed_behind_the_checksums_are_refused() {
     let payload = |at: &usize| {
         at + 16..at + 16 + usize::from(bytes[at + 8]) + 256 * usize::from(bytes[at + 9])
     };
+    // What corrects colours means something whatever its steps are, so nobody can tell that those were others.
+    let coded = |at: &&usize| bytes[**at] <= 2;
     let tried: usize = starts[first_feature..]
         .par_iter()
+        .filter(coded)
         .map(|at| {
             for byte in payload(at) {
                 for bit in 0..8 {
