@@ -112,7 +112,7 @@ pub struct Encode {
     /// Leave colours as the model makes them, which takes less time: otherwise each level tells in 58 bytes how to correct those of the cloud
     #[arg(long)]
     pub no_filter: bool,
-    /// Code what colours are then still off. `coarse`: what is wide, where that is worth it and filters are made; `none`: nothing; else all of the finest level's too, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
+    /// Code what the finest level's colours are then still off. `coarse`: what is wide, where that is worth it and filters are made; `none`: nothing; else all of it, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
     #[arg(long, value_name = "coarse|none|STEP[,CHROMA]", value_parser = residual, default_value = "coarse")]
     pub residual: Residual,
     #[command(flatten)]

@@ -11,18 +11,20 @@ use crate::geometry::{KernelMap, Octree};
 use crate::network::{Heads, Model};
 
 /// How many times as much a decibel of what is wide is worth: pictures from afar and up close show it, where what is narrow blurs or is too fine to trouble.
-const WIDE: usize = 4;
+const WIDE: usize = 6;
 
-/// How much is coded of what the colours of levels that are drawn are off those of the cloud: see [`ColourResidual`].
+/// The bit of Morton keys from which on voxels eight of their own apart join.
+const BOUNDARY: u8 = 9;
+
+/// How much is coded of what the colours of the finest level that is drawn are off those of the cloud: see [`ColourResidual`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Residual {
     /// Nothing.
     None,
-    /// What is at least eight of the finest level's voxels wide and so shows as blotches from close up, at every level that is drawn: where
-    /// [`Options::filter`] is on, and it is worth its bytes.
+    /// What is at least eight of its voxels wide and so shows as blotches from close up: where [`Options::filter`] is on, and it is worth its bytes.
     #[default]
     Coarse,
-    /// All of it at the finest level, in these steps, and of coarser levels the same as without.
+    /// All of it, in these steps.
     Fine(Steps),
 }
 
@@ -32,23 +34,22 @@ impl Residual {
         luma: 32,
         chroma: 24,
     };
-    /// How finely that of a level is to be told which is so many above the finest.
-    fn precision(self, above: u8, filter: bool) -> Option<Precision> {
+
+    fn precision(self, filter: bool) -> Option<Precision> {
         let finer = |own: u8, coarse: u8| if own == 0 { coarse } else { own.min(coarse) };
         let (fine, coarse) = match self {
-            Residual::Fine(fine) if above == 0 => {
+            Residual::Fine(fine) => {
                 let luma = finer(fine.luma, Self::COARSE.luma);
                 let chroma = finer(fine.chroma, Self::COARSE.chroma);
                 (fine, Steps { luma, chroma })
             }
-            Residual::None => return None,
-            _ if filter => (Steps::NONE, Self::COARSE),
-            _ => return None,
+            Residual::Coarse if filter => (Steps::NONE, Self::COARSE),
+            Residual::Coarse | Residual::None => return None,
         };
         Some(Precision {
             fine,
             coarse,
-            boundary: 3 * 3u8.saturating_sub(above),
+            boundary: BOUNDARY,
         })
     }
 }
@@ -57,8 +58,8 @@ impl Residual {
 pub(crate) struct Level<'a> {
     pub role: usize,
     pub level: u8,
-    /// How many levels it is above the finest of the stream that is drawn.
-    pub above: u8,
+    /// Whether it is the finest of the stream that is drawn.
+    pub finest: bool,
     /// Gaussians of each voxel.
     pub children: usize,
     pub octree: &'a Octree,
@@ -97,8 +98,8 @@ pub(super) fn corrections(
     let mut found = Corrections::default();
     for heads in Heads::ALL {
         let left = match heads {
-            Heads::Best => options.residual.precision(at.above, options.filter),
-            Heads::Quick => None,
+            Heads::Best if at.finest => options.residual.precision(options.filter),
+            _ => None,
         };
         if shape.head(at.role, heads).is_none() || !options.filter && left.is_none() {
             continue;

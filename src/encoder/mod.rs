@@ -259,7 +259,7 @@ pub(crate) fn write(
             let found = correct(Level {
                 role,
                 level,
-                above: finest.map_or(0, |finest| finest - level),
+                finest: Some(level) == finest,
                 children: head.children,
                 octree,
                 maps,
