@@ -196,7 +196,7 @@ mod tests {
         let mut mixer = Mixer::new(4);
         for i in 0..5000u64 {
             let logit = if i % 2 == 0 { -720 } else { 720 };
-            let mixed = mixer.predict(logit, [i % 3 << 60; CONTEXTS]);
+            let mixed = mixer.predict(logit, [(i % 3) << 60; CONTEXTS]);
             mixer.learn(&mixed, squash(logit), i % 2 == 0);
             assert!(mixer.weights.iter().all(|w| w.abs() <= HEAVIEST));
             assert!(
