@@ -37,14 +37,7 @@ fn plain_with_both_heads() -> (Model, Encoded) {
 #[test]
 fn filters_bring_the_colours_of_gaussians_nearer_to_the_cloud_s_and_change_nothing_else() {
     let (model, cloud) = (model(), ball(8, 90.0));
-    let with = |filter: bool| {
-        let options = Options {
-            filter,
-            residual: Residual::None,
-            ..Options::default()
-        };
-        encode(&cloud, &model, &options, &mut Log::default()).unwrap()
-    };
+    let with = |filter| encoded_with(&model, &cloud, filter, Residual::None);
     let (plain, filtered) = (with(false), with(true));
     let decoder = Decoder::new(&model);
     for rate in &filtered.rates[1..] {
@@ -103,14 +96,7 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
     let (model, cloud) = (model(), ball(7, 45.0));
     let decoder = Decoder::new(&model);
     let mut last = f64::INFINITY;
-    let encoded = |filter: bool, residual: Residual| {
-        let options = Options {
-            filter,
-            residual,
-            ..Options::default()
-        };
-        encode(&cloud, &model, &options, &mut Log::default()).unwrap()
-    };
+    let encoded = |filter, residual| encoded_with(&model, &cloud, filter, residual);
     for filter in [true, false] {
         let plain = encoded(filter, Residual::None);
         let finest = plain.rates.last().unwrap().level;
@@ -134,8 +120,7 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
                 };
                 assert_eq!(after, recoloured);
                 if level < finest {
-                    // What is wide is told of coarser levels too, where filters are.
-                    assert!(filter || after == before, "level {level}");
+                    assert_eq!(after, before, "level {level}");
                     continue;
                 }
                 let want = colours_at(&cloud, level);
@@ -181,14 +166,7 @@ fn quick_heads_are_corrected_by_the_same_residual() {
 #[test]
 fn what_is_wide_of_what_colours_are_off_is_coded_unless_said_otherwise() {
     let (model, cloud) = (model(), ball(8, 90.0));
-    let encoded = |filter: bool, residual: Residual| {
-        let options = Options {
-            filter,
-            residual,
-            ..Options::default()
-        };
-        encode(&cloud, &model, &options, &mut Log::default()).unwrap()
-    };
+    let encoded = |filter, residual| encoded_with(&model, &cloud, filter, residual);
     let has = |encoded: &Encoded| {
         let stream = Stream::parse(&encoded.bytes, &Limits::default()).unwrap();
         stream
@@ -226,6 +204,21 @@ fn what_is_wide_of_what_colours_are_off_is_coded_unless_said_otherwise() {
     };
     let off = [off(&none), off(&coarse)];
     assert!(off[1] < 0.5 * off[0], "{off:?}");
+}
+
+/// A cloud, coded with these corrections of its colours.
+fn encoded_with(
+    model: &Model,
+    cloud: &ColouredVoxels,
+    filter: bool,
+    residual: Residual,
+) -> Encoded {
+    let options = Options {
+        filter,
+        residual,
+        ..Options::default()
+    };
+    encode(cloud, model, &options, &mut Log::default()).unwrap()
 }
 
 /// The mean colours of a level's voxels.
