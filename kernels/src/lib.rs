@@ -33,6 +33,8 @@ mod winograd;
 mod work;
 
 pub mod ceiling;
+pub mod hidden;
+pub mod mixing;
 pub mod reference;
 pub mod splat;
 

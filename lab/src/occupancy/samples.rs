@@ -30,7 +30,7 @@ impl Samples {
             for (i, masks) in occupancy.chunks(SLICE).enumerate() {
                 let slice = i * SLICE..i * SLICE + masks.len();
                 for here in slice.clone() {
-                    facts(map.row(here), &slice, here, masks, |fact| {
+                    facts(&map, &slice, here, masks, |fact| {
                         samples.facts.push(fact as u8)
                     });
                     samples.ends.push(samples.facts.len());

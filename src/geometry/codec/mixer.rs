@@ -16,50 +16,21 @@
 //! All shifts of negative numbers round down.
 
 use super::coder::ONE;
-use super::probability::{squash, stretch};
-use super::surroundings::CONTEXTS;
+use super::probability::{STRETCH, squash};
+use b2p_kernels::Isa;
+use b2p_kernels::mixing::{self, CONTEXTS, Lanes, OTHERS};
 
 /// The input that is always the same.
 const BIAS: i32 = 20;
-/// Up to where an entry counts how often it was seen.
-const MOST: usize = 30;
-const INPUTS: usize = 2 + CONTEXTS;
-/// The largest magnitude of a weight, so that seven products stay within 32 bits.
-const HEAVIEST: i32 = 1 << 17;
-
-/// How much an entry that was seen so often says, in units of 1/256.
-const TRUST: [i32; MOST + 1] = {
-    let (mut table, mut seen) = ([0; MOST + 1], 0);
-    while seen <= MOST {
-        table[seen] = (1024 * seen / (4 * seen + 1)) as i32;
-        seen += 1;
-    }
-    table
-};
-/// How fast it follows, in units of 2⁻¹⁴.
-const RATE: [i32; MOST + 1] = {
-    let (mut table, mut seen) = ([0; MOST + 1], 0);
-    while seen <= MOST {
-        table[seen] = (65536 / (4 * seen + 1)) as i32;
-        seen += 1;
-    }
-    table
-};
-
-#[derive(Debug, Default, Clone, Copy)]
-struct Entry {
-    one: u16,
-    seen: u8,
-    check: u8,
-}
 
 /// What a slice has shown, and the weights of it.
 #[derive(Debug)]
 pub(super) struct Mixer {
-    tables: Vec<Entry>,
+    isa: Isa,
+    tables: Vec<u32>,
     /// Entries of a table are 2 to this.
     bits: u32,
-    weights: [i32; INPUTS],
+    weights: Lanes,
 }
 
 /// One prediction, to be learned from.
@@ -67,20 +38,21 @@ pub(super) struct Mixer {
 pub(super) struct Mixed {
     /// Where the entries of its contexts lie.
     at: [usize; CONTEXTS],
-    entries: [Entry; CONTEXTS],
-    inputs: [i32; INPUTS],
+    mixed: mixing::Mixed,
     /// The probability of a 1.
     pub one: u32,
 }
 
 impl Mixer {
     /// That of a slice of so many parents.
-    pub fn new(parents: usize) -> Self {
+    pub fn new(isa: Isa, parents: usize) -> Self {
         let entries = parents.next_power_of_two().max(16);
-        let mut weights = [9830; INPUTS];
-        weights[..2].copy_from_slice(&[1 << 16, 0]);
+        let mut weights = [0; 8];
+        weights[..CONTEXTS].fill(9830);
+        weights[OTHERS[0]] = 1 << 16;
         Mixer {
-            tables: vec![Entry::default(); CONTEXTS * entries],
+            isa,
+            tables: vec![0; CONTEXTS * entries],
             bits: entries.ilog2(),
             weights,
         }
@@ -89,51 +61,27 @@ impl Mixer {
     /// What to expect in these contexts, if the network's logit is `logit`.
     #[inline(always)]
     pub fn predict(&self, logit: i32, contexts: [u64; CONTEXTS]) -> Mixed {
-        let mut mixed = Mixed {
-            at: [0; CONTEXTS],
-            entries: [Entry::default(); CONTEXTS],
-            inputs: [0; INPUTS],
-            one: 0,
-        };
-        mixed.inputs[..2].copy_from_slice(&[logit, BIAS]);
+        // Loops: `map` becomes a call.
+        let (mut at, mut entries, mut checks) = ([0; CONTEXTS], [0; CONTEXTS], [0; CONTEXTS]);
         for (i, hash) in contexts.into_iter().enumerate() {
-            let at = i << self.bits | (hash >> (u64::BITS - self.bits)) as usize;
-            let (entry, check) = (self.tables[at], hash as u8);
-            let seen = if entry.check == check { entry.seen } else { 0 };
-            let entry = Entry {
-                seen,
-                check,
-                ..entry
-            };
-            (mixed.at[i], mixed.entries[i]) = (at, entry);
-            let apart = stretch(entry.one) - logit;
-            mixed.inputs[2 + i] = (apart * TRUST[usize::from(seen)]) >> 8;
+            at[i] = i << self.bits | (hash >> (u64::BITS - self.bits)) as usize;
+            entries[i] = self.tables[at[i]];
+            checks[i] = hash as u32;
         }
-        let sum = (0..INPUTS).fold(0i32, |sum, i| {
-            sum.wrapping_add(mixed.inputs[i].wrapping_mul(self.weights[i]))
-        });
-        mixed.one = squash(sum >> 16);
-        mixed
+        let inputs = [logit, BIAS];
+        let mixed = mixing::mix(self.isa, entries, checks, inputs, &STRETCH, &self.weights);
+        let one = squash(mixed.sum >> 16);
+        Mixed { at, mixed, one }
     }
 
     /// Learns what it was; `network` is the probability that the network gave alone.
     #[inline(always)]
     pub fn learn(&mut self, mixed: &Mixed, network: u32, bit: bool) {
         let truth = if bit { ONE as i32 } else { 0 };
-        let error = truth - mixed.one as i32;
-        for (weight, input) in self.weights.iter_mut().zip(mixed.inputs) {
-            let step = (3 * error * input + (1 << 15)) >> 16;
-            *weight = (*weight + step).clamp(-HEAVIEST, HEAVIEST);
-        }
-        for (at, mut entry) in mixed.at.into_iter().zip(mixed.entries) {
-            let one = match entry.seen {
-                0 => network as i32,
-                _ => entry.one.into(),
-            };
-            let seen = (usize::from(entry.seen) + 1).min(MOST);
-            entry.seen = seen as u8;
-            let one = one + (((truth - one) * RATE[seen]) >> 14);
-            entry.one = one.clamp(16, 65_520) as u16;
+        let (error, truths) = (truth - mixed.one as i32, [truth, network as i32]);
+        let weights = &mut self.weights;
+        let entries = mixing::learn(self.isa, &mixed.mixed, error, truths, weights);
+        for (at, entry) in mixed.at.into_iter().zip(entries) {
             self.tables[at] = entry;
         }
     }
@@ -143,6 +91,7 @@ impl Mixer {
 mod tests {
     use super::*;
     use crate::entropy::test_tables::Random;
+    use b2p_kernels::mixing::HEAVIEST;
 
     /// What a bit costs, in bits.
     fn cost(one: u32, bit: bool) -> f64 {
@@ -152,7 +101,7 @@ mod tests {
 
     /// Bits per decision that a network without a clue and one with the mixer behind it take, where the first context tells all but `noise` in 100.
     fn costs(noise: u64, network: i32) -> [f64; 2] {
-        let (mut mixer, mut random) = (Mixer::new(1 << 12), Random(5));
+        let (mut mixer, mut random) = (Mixer::new(Isa::detect(), 1 << 12), Random(5));
         let mut sums = [0.0; 2];
         for _ in 0..4000 {
             let context = random.next() % 64;
@@ -185,7 +134,7 @@ mod tests {
 
     #[test]
     fn nothing_seen_changes_nothing() {
-        let mixer = Mixer::new(1);
+        let mixer = Mixer::new(Isa::detect(), 1);
         for logit in [-384, -1, 0, 77] {
             assert_eq!(mixer.predict(logit, [3; CONTEXTS]).one, squash(logit));
         }
@@ -193,7 +142,7 @@ mod tests {
 
     #[test]
     fn extremes_stay_within_their_ranges() {
-        let mut mixer = Mixer::new(4);
+        let mut mixer = Mixer::new(Isa::detect(), 4);
         for i in 0..5000u64 {
             let logit = if i % 2 == 0 { -720 } else { 720 };
             let mixed = mixer.predict(logit, [(i % 3) << 60; CONTEXTS]);
@@ -203,7 +152,7 @@ mod tests {
                 mixer
                     .tables
                     .iter()
-                    .all(|e| e.seen == 0 || (16..=65_520).contains(&e.one))
+                    .all(|e| e >> 16 & 255 == 0 || (16..=65_520).contains(&(e & 0xffff)))
             );
         }
     }
@@ -211,7 +160,7 @@ mod tests {
     #[test]
     fn tables_grow_with_the_slice() {
         for (parents, bits) in [(1, 4), (16, 4), (17, 5), (16_384, 14)] {
-            let mixer = Mixer::new(parents);
+            let mixer = Mixer::new(Isa::detect(), parents);
             assert_eq!((mixer.bits, mixer.tables.len()), (bits, CONTEXTS << bits));
         }
     }

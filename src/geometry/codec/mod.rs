@@ -23,6 +23,7 @@
 
 mod coder;
 mod mixer;
+mod neighbourhood;
 pub mod network;
 mod predictor;
 mod probability;
@@ -34,6 +35,7 @@ use crate::cancel::Cancel;
 use crate::error::{Error, Result, Stage};
 use b2p_kernels::{Isa, Work};
 use coder::{Decoder, Encoder};
+use neighbourhood::Neighbourhood;
 use predictor::Predictor;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -61,6 +63,7 @@ pub fn encode_level(
     let encode = |parents: Range<usize>| {
         let masks = &occupancy[parents.clone()];
         let work = Encode {
+            isa,
             map,
             parents,
             masks,
@@ -86,6 +89,7 @@ pub fn decode_slice(
     slice: &Slice,
 ) -> Result<Vec<u8>> {
     let masks = isa.run(Decode {
+        isa,
         level,
         map,
         parents: parents.clone(),
@@ -141,6 +145,7 @@ pub fn decode_level(
 
 /// Codes the occupancies of one slice.
 struct Encode<'a> {
+    isa: Isa,
     map: &'a KernelMap,
     parents: Range<usize>,
     masks: &'a [u8],
@@ -152,13 +157,22 @@ impl Work for Encode<'_> {
     #[inline(always)]
     fn run(self) -> Vec<u8> {
         let Encode {
+            isa,
             map,
             parents,
             masks,
         } = self;
-        let (mut predictor, mut encoder) = (Predictor::new(parents.len()), Encoder::new());
-        for (here, &mask) in parents.clone().zip(masks) {
-            predictor.code(&mut encoder, map, &parents, here, masks, mask);
+        let (mut predictor, mut encoder) = (Predictor::new(isa, parents.len()), Encoder::new());
+        let around = Neighbourhood::of_all(map, &parents);
+        for ((here, &mask), around) in parents.clone().zip(masks).zip(around) {
+            predictor.code(
+                &mut encoder,
+                around,
+                map.row(here),
+                parents.start,
+                masks,
+                mask,
+            );
         }
         encoder.finish()
     }
@@ -166,6 +180,7 @@ impl Work for Encode<'_> {
 
 /// Decodes the occupancies of one slice, unless they come to more than its voxels.
 struct Decode<'a> {
+    isa: Isa,
     level: u8,
     map: &'a KernelMap,
     parents: Range<usize>,
@@ -178,17 +193,20 @@ impl Work for Decode<'_> {
     #[inline(always)]
     fn run(self) -> Result<Vec<u8>> {
         let Decode {
+            isa,
             level,
             map,
             parents,
             slice,
         } = self;
-        let mut predictor = Predictor::new(parents.len());
+        let mut predictor = Predictor::new(isa, parents.len());
         let mut decoder = Decoder::new(slice.bytes, slice.offset);
         let mut masks = Vec::with_capacity(parents.len());
         let mut found = 0;
-        for here in parents.clone() {
-            let mask = predictor.code(&mut decoder, map, &parents, here, &masks, 0);
+        let around = Neighbourhood::of_all(map, &parents);
+        for (here, around) in parents.clone().zip(around) {
+            let (row, first) = (map.row(here), parents.start);
+            let mask = predictor.code(&mut decoder, around, row, first, &masks, 0);
             decoder.check_not_past_end()?;
             masks.push(mask);
             found += mask.count_ones() as usize;

@@ -18,12 +18,12 @@
 //! the known row (`i8`), then the child rows (`i8`), octant 0 first; the 255 rows of the children (`i8`); one output row (`i16`) for
 //! each octant; eight output biases (`i32`).
 
+use super::neighbourhood::{MAY_BE_EARLIER, Neighbourhood, ones};
 use crate::geometry::KernelMap;
+pub use b2p_kernels::hidden::WIDTH;
+use b2p_kernels::hidden::{Narrow, Row};
 use std::ops::Range;
 use std::sync::OnceLock;
-
-/// Hidden units.
-pub const WIDTH: usize = 128;
 
 /// How many facts there are.
 pub const FACTS: usize = PRESENCES + 9 * EARLIER;
@@ -37,86 +37,71 @@ pub const SIZE: usize = (FACTS + NODES) * WIDTH + 8 * (2 * WIDTH + 4);
 const PRESENCES: usize = 26;
 const EARLIER: usize = 19;
 
-/// One number per hidden unit.
-pub(super) type Row = [i16; WIDTH];
-
 static WEIGHTS: &[u8; SIZE] = include_bytes!("weights.bin");
 
-/// For every offset its place among those that may come earlier.
-const EARLIER_SLOT: [Option<u8>; 27] = {
-    let mut slots = [None; 27];
+/// For every offset that may come earlier its place among those.
+const EARLIER_SLOT: [u8; 27] = {
+    let mut slots = [0; 27];
     let (mut k, mut slot) = (0, 0);
     while k < 27 {
-        if k % 3 == 0 || k / 3 % 3 == 0 || k < 9 {
-            slots[k] = Some(slot);
-            slot += 1;
-        }
+        slots[k] = slot;
+        slot += (MAY_BE_EARLIER >> k & 1) as u8;
         k += 1;
     }
     slots
 };
 
-/// Tells the facts that hold for the voxel `here`, each by the number of its row: its 3³ neighbours are `row`, and `occupancy` is
-/// that of the voxels `slice`, up to `here` at least.
+/// Tells the facts that hold for the voxel `here` of the voxels `slice`, whose 3³ kernel map is `map`, each by the number of its row: `occupancy` is
+/// that of the slice, up to `here` at least.
 pub fn facts(
-    row: &[u32],
+    map: &KernelMap,
     slice: &Range<usize>,
     here: usize,
     occupancy: &[u8],
     mut tell: impl FnMut(usize),
 ) {
-    visit(row, slice, here, occupancy, |k, children| match children {
-        None => tell(k - usize::from(k > KernelMap::CENTRE)),
-        Some((slot, mask)) => {
-            let known = PRESENCES + 9 * slot;
-            tell(known);
-            (0..8)
-                .filter(|octant| mask >> octant & 1 == 1)
-                .for_each(|octant| tell(known + 1 + octant));
-        }
-    });
-}
-
-/// Visits the occupied neighbours of the voxel `here`: for each its offset and, if its children are known, the offset's place among
-/// those that may come earlier, and its occupancy.
-#[inline(always)]
-pub(super) fn visit(
-    row: &[u32],
-    slice: &Range<usize>,
-    here: usize,
-    occupancy: &[u8],
-    mut neighbour: impl FnMut(usize, Option<(usize, u8)>),
-) {
-    // Which are there is a guess for each, so that is told first, without branches.
-    let there = |(k, &index)| u32::from(index != KernelMap::ABSENT) << k;
-    let mut left: u32 = row.iter().enumerate().map(there).sum();
-    left &= !(1 << KernelMap::CENTRE);
-    while left != 0 {
-        let k = left.trailing_zeros() as usize;
-        left &= left - 1;
-        let index = row[k] as usize;
-        let children = match EARLIER_SLOT[k] {
-            Some(slot) if slice.start <= index && index < here => {
-                Some((usize::from(slot), occupancy[index - slice.start]))
-            }
-            _ => None,
-        };
-        neighbour(k, children);
+    let around = Neighbourhood::at(map, slice, here);
+    for k in ones(around.there & !around.earlier) {
+        tell(k - usize::from(k > KernelMap::CENTRE));
+    }
+    for k in ones(around.earlier) {
+        let known = PRESENCES + 9 * usize::from(EARLIER_SLOT[k]);
+        tell(known);
+        let mask = occupancy[map.row(here)[k] as usize - slice.start];
+        ones(mask.into()).for_each(|octant| tell(known + 1 + octant));
     }
 }
 
 /// The weights, laid out for use.
 #[derive(Debug)]
 pub(super) struct Network {
-    presence: [Row; 27],
-    /// For every earlier neighbour the sum of the rows of any low half of its occupancy, the known row among them…
-    low: Vec<[Row; 16]>,
-    /// …and of any high half.
-    high: Vec<[Row; 16]>,
-    tree: Vec<Row>,
+    presence: [Narrow; 27],
+    /// For every offset that may come earlier the sums of the rows of any low half of an occupancy and of any high half, the known row split between
+    /// them so that they fit…
+    halves: Vec<[[Narrow; 16]; 2]>,
+    /// …and where they cannot, what is left to be added.
+    pub rest: Vec<Rest>,
+    nodes: [Narrow; NODES + 1],
     /// What the output layer starts from.
     pub output: [Row; 8],
     pub bias: [i32; 8],
+}
+
+/// What is left of the sums of one offset and one half of its occupancy.
+#[derive(Debug)]
+pub(super) struct Rest {
+    /// The offset.
+    pub k: usize,
+    shift: usize,
+    rows: [Narrow; 16],
+}
+
+impl Rest {
+    /// The row to be added of a neighbour that has these children.
+    #[inline(always)]
+    pub fn row(&self, mask: u8) -> &Narrow {
+        &self.rows[usize::from(mask >> self.shift & 15)]
+    }
 }
 
 impl Network {
@@ -133,23 +118,29 @@ impl Network {
             rest = after;
             taken
         };
-        let mut row = || -> Row {
+        let mut row = || -> Narrow {
             let bytes = bytes(WIDTH);
-            std::array::from_fn(|unit| i16::from(bytes[unit] as i8))
+            std::array::from_fn(|unit| bytes[unit] as i8)
         };
         let mut presence = [[0; WIDTH]; 27];
         for k in (0..27).filter(|&k| k != KernelMap::CENTRE) {
             presence[k] = row();
         }
-        let (mut low, mut high) = (Vec::new(), Vec::new());
-        for _ in 0..EARLIER {
+        let (mut halves, mut rest) = (Vec::new(), Vec::new());
+        for k in ones(MAY_BE_EARLIER) {
             let known = row();
-            let children: [Row; 8] = std::array::from_fn(|_| row());
-            low.push(sums(known, &children[..4]));
-            high.push(sums([0; WIDTH], &children[4..]));
+            let children: [Narrow; 8] = std::array::from_fn(|_| row());
+            let parts = split(&known, &children);
+            for (half, (_, left)) in parts.iter().enumerate() {
+                if *left != [[0; WIDTH]; 16] {
+                    let (shift, rows) = (4 * half, *left);
+                    rest.push(Rest { k, shift, rows });
+                }
+            }
+            halves.push(parts.map(|(sums, _)| sums));
         }
-        let mut tree = vec![[0; WIDTH]];
-        tree.extend((0..NODES).map(|_| row()));
+        let mut nodes = [[0; WIDTH]; NODES + 1];
+        nodes[1..].fill_with(row);
         let output = std::array::from_fn(|_| {
             let bytes = bytes(2 * WIDTH);
             std::array::from_fn(|unit| i16::from_le_bytes([bytes[2 * unit], bytes[2 * unit + 1]]))
@@ -160,52 +151,92 @@ impl Network {
         });
         Network {
             presence,
-            low,
-            high,
-            tree,
+            halves,
+            rest,
+            nodes,
             output,
             bias,
         }
     }
 
-    /// Adds to `sum` the rows of the neighbour at offset `k`: of its children, if they are known, by its place among those that may come earlier.
+    /// The row of an occupied neighbour at offset `k` whose children are not known.
     #[inline(always)]
-    pub fn add(&self, sum: &mut Row, k: usize, children: Option<(usize, u8)>) {
-        match children {
-            None => add(sum, &self.presence[k]),
-            Some((slot, mask)) => {
-                add(sum, &self.low[slot][usize::from(mask & 15)]);
-                add(sum, &self.high[slot][usize::from(mask >> 4)]);
-            }
-        }
+    pub fn presence(&self, k: usize) -> &Narrow {
+        &self.presence[k]
     }
 
-    /// The hidden layer for the child `node` (`1 << octant | occupancy of the octants below it`): of the sum of all rows what is
-    /// positive.
+    /// The rows, to be added, of a neighbour at offset `k`, one that may come earlier, that has these children; what is left is in `rest`.
     #[inline(always)]
-    pub fn hidden(&self, facts: &Row, node: usize) -> Row {
-        let tree = &self.tree[node];
-        std::array::from_fn(|unit| facts[unit].wrapping_add(tree[unit]).max(0))
+    pub fn children(&self, k: usize, mask: u8) -> [&Narrow; 2] {
+        let [low, high] = &self.halves[usize::from(EARLIER_SLOT[k])];
+        [&low[usize::from(mask & 15)], &high[usize::from(mask >> 4)]]
+    }
+
+    /// The row of the child `node` (`1 << octant | occupancy of the octants below it`).
+    #[inline(always)]
+    pub fn node(&self, node: usize) -> &Narrow {
+        &self.nodes[node & 255]
     }
 }
 
-/// At most 26 + 19·8 + 1 rows of `i8` meet, so a sum stays within ±22 733.
-#[inline(always)]
-fn add(sum: &mut Row, row: &Row) {
-    for (sum, weight) in sum.iter_mut().zip(row) {
-        *sum = sum.wrapping_add(*weight);
-    }
-}
-
-/// `base` plus any subset of four rows.
-fn sums(base: Row, rows: &[Row]) -> [Row; 16] {
-    std::array::from_fn(|mask| {
-        let mut sum = base;
-        for (bit, row) in rows.iter().enumerate() {
-            if mask >> bit & 1 == 1 {
-                add(&mut sum, row);
-            }
+/// The sums of any low four and of any high four of the rows `children`, `known` once among them, as near as they fit, and what is left of them.
+/// (At most 26 + 19·8 + 1 rows meet, so all sums stay within ±22 733.)
+fn split(known: &Narrow, children: &[Narrow; 8]) -> [([Narrow; 16], [Narrow; 16]); 2] {
+    let sum = |half: usize, mask: usize, unit: usize| -> i32 {
+        ones(mask as u32)
+            .map(|octant| i32::from(children[4 * half + octant][unit]))
+            .sum()
+    };
+    // From what to what a half's base may be.
+    let range = |half: usize, unit: usize| {
+        let sums = (0..16).map(|mask| sum(half, mask, unit));
+        let (least, most) = sums.fold((0, 0), |(a, b), sum| (sum.min(a), sum.max(b)));
+        (i32::from(i8::MIN) - least, i32::from(i8::MAX) - most)
+    };
+    let base = |half: usize, unit: usize| {
+        let known = i32::from(known[unit]);
+        let ((a, b), (c, d)) = (range(0, unit), range(1, unit));
+        let low = known.max(a.max(known - d)).min(b.min(known - c));
+        if half == 0 { low } else { known - low }
+    };
+    [0, 1].map(|half| {
+        let (mut sums, mut left) = ([[0; WIDTH]; 16], [[0; WIDTH]; 16]);
+        for (unit, mask) in (0..WIDTH).flat_map(|unit| (0..16).map(move |mask| (unit, mask))) {
+            let exact = base(half, unit) + sum(half, mask, unit);
+            let fits = exact.clamp(i8::MIN.into(), i8::MAX.into());
+            sums[mask][unit] = fits as i8;
+            left[mask][unit] = i8::try_from(exact - fits).expect("what is left fits");
         }
-        sum
+        (sums, left)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rows_of_an_occupancy_are_those_of_its_children() {
+        let network = Network::get();
+        for (slot, k) in ones(MAY_BE_EARLIER).enumerate() {
+            for mask in 0..=255u8 {
+                for unit in 0..WIDTH {
+                    let at = |row: usize| {
+                        i32::from(WEIGHTS[(PRESENCES + 9 * slot + row) * WIDTH + unit] as i8)
+                    };
+                    let expected =
+                        at(0) + ones(mask.into()).map(|octant| at(1 + octant)).sum::<i32>();
+                    let mut sum: i32 = network
+                        .children(k, mask)
+                        .map(|row| row[unit].into())
+                        .iter()
+                        .sum();
+                    for rest in network.rest.iter().filter(|rest| rest.k == k) {
+                        sum += i32::from(rest.row(mask)[unit]);
+                    }
+                    assert_eq!(sum, expected);
+                }
+            }
+        }
+    }
 }

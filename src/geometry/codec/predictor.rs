@@ -10,11 +10,12 @@
 
 use super::coder::{Coder, ONE};
 use super::mixer::Mixer;
-use super::network::{Network, Row, WIDTH, visit};
+use super::neighbourhood::{Neighbourhood, ones};
+use super::network::Network;
 use super::probability::{LIMIT, squash};
 use super::surroundings::Surroundings;
-use crate::geometry::KernelMap;
-use std::ops::Range;
+use b2p_kernels::Isa;
+use b2p_kernels::hidden::{self, Row};
 
 /// Σ hidden·output is in units of 2^−12 of the logit's.
 const SHIFT: u32 = 12;
@@ -26,6 +27,7 @@ const SURPRISE: i32 = 4096;
 /// The state of one entropy stream.
 #[derive(Debug)]
 pub(super) struct Predictor {
+    isa: Isa,
     network: &'static Network,
     mixer: Mixer,
     output: [Row; 8],
@@ -34,49 +36,60 @@ pub(super) struct Predictor {
 
 impl Predictor {
     /// That of a slice of so many parents.
-    pub fn new(parents: usize) -> Self {
+    pub fn new(isa: Isa, parents: usize) -> Self {
         let network = Network::get();
         Predictor {
+            isa,
             network,
-            mixer: Mixer::new(parents),
+            mixer: Mixer::new(isa, parents),
             output: network.output,
             bias: network.bias,
         }
     }
 
-    /// Codes the occupancy of the voxel `here` of the voxels `slice`, whose 3³ kernel map is `map`; `known` are the occupancies of the slice up to it
-    /// at least. An encoder takes `occupancy`, never zero, and returns it; a decoder
+    /// Codes the occupancy of a voxel that has these neighbours, by the indices `row`; `known` are the occupancies of the slice, whose first voxel
+    /// has the index `first`, up to it at least. An encoder takes `occupancy`, never zero, and returns it; a decoder
     /// returns what it read, also never zero: if seven children are missing, the eighth is there and not coded.
     #[inline(always)]
     pub fn code(
         &mut self,
         coder: &mut impl Coder,
-        map: &KernelMap,
-        slice: &Range<usize>,
-        here: usize,
+        neighbours: Neighbourhood,
+        row: &[u32],
+        first: usize,
         known: &[u8],
         occupancy: u8,
     ) -> u8 {
-        let (mut facts, mut around) = ([0; WIDTH], Surroundings::new());
-        // A list first: what follows is too much to be compiled into each call from `visit`.
-        let (mut neighbours, mut count) = ([(0, None); 27], 0);
-        visit(map.row(here), slice, here, known, |k, children| {
-            neighbours[count] = (k, children);
+        let (network, mut around) = (self.network, Surroundings::new());
+        let (mut rows, mut count) = ([network.presence(0); 2 * 26 + 2 * 19], 0);
+        for k in ones(neighbours.there & !neighbours.earlier) {
+            rows[count] = network.presence(k);
             count += 1;
-        });
-        for &(k, children) in &neighbours[..count] {
-            self.network.add(&mut facts, k, children);
-            around.add(k, children.map(|(_, mask)| mask));
+            around.add_presence(k);
         }
-        around.look_beyond(map, here);
+        for k in ones(neighbours.earlier) {
+            let mask = known[row[k] as usize - first];
+            rows[count..][..2].copy_from_slice(&network.children(k, mask));
+            count += 2;
+            around.add_children(k, mask);
+        }
+        for rest in &network.rest {
+            if neighbours.earlier >> rest.k & 1 == 1 {
+                rows[count] = rest.row(known[row[rest.k] as usize - first]);
+                count += 1;
+            }
+        }
+        around.sum_up(neighbours);
+        let facts = hidden::add_up(self.isa, &rows[..count]);
         let mut coded = 0u8;
         for octant in 0..8 {
             if octant == 7 && coded == 0 {
                 return 0x80;
             }
             let node = 1 << octant | usize::from(coded);
-            let hidden = self.network.hidden(&facts, node);
-            let sum = self.bias[octant].wrapping_add(dot(&hidden, &self.output[octant]));
+            let row = self.network.node(node);
+            let sum = hidden::sum(self.isa, &facts, row, &self.output[octant]);
+            let sum = self.bias[octant].wrapping_add(sum);
             let logit = (sum >> SHIFT).clamp(-LIMIT, LIMIT);
             let network = squash(logit);
             let wanted = occupancy >> octant & 1 == 1;
@@ -88,30 +101,23 @@ impl Predictor {
             } else {
                 coder.code(wanted, network)
             };
-            around.learn(octant, bit);
-            coded |= u8::from(bit) << octant;
+            // The next child waits for a guess, not for the coder: it is seldom wrong.
+            let guess = logit >= 0;
+            around.learn(octant, guess);
+            coded |= u8::from(guess) << octant;
+            if bit != guess {
+                std::hint::cold_path();
+                around.unlearn(octant);
+                coded ^= 1 << octant;
+            }
             let truth = if bit { ONE as i32 } else { 0 };
             let error = truth - network as i32;
             if error.abs() >= SURPRISE {
-                self.learn(octant, &hidden, (error / 64) as i16);
+                let e = error / 64;
+                self.bias[octant] = self.bias[octant].wrapping_add(4 * e);
+                hidden::learn(self.isa, &facts, row, e as i16, &mut self.output[octant]);
             }
         }
         coded
     }
-
-    #[inline(always)]
-    fn learn(&mut self, octant: usize, hidden: &Row, e: i16) {
-        self.bias[octant] = self.bias[octant].wrapping_add(4 * i32::from(e));
-        for (weight, &unit) in self.output[octant].iter_mut().zip(hidden) {
-            let step = ((i32::from(unit) * i32::from(e)) >> 16) as i16;
-            *weight = weight.saturating_add((step + 1) >> 1);
-        }
-    }
-}
-
-#[inline(always)]
-fn dot(a: &Row, b: &Row) -> i32 {
-    a.iter().zip(b).fold(0i32, |sum, (&a, &b)| {
-        sum.wrapping_add(i32::from(a) * i32::from(b))
-    })
 }

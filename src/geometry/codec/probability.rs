@@ -23,21 +23,30 @@ const SQUASH: [u16; LIMIT as usize + 1] = {
     table
 };
 
-/// The probability, in `1..=65535`, of a bit whose logit is `logit / 64`.
-#[inline(always)]
-pub(super) fn squash(logit: i32) -> u32 {
-    one_of(logit.clamp(-LIMIT, LIMIT))
-}
+/// The same for logits from −[`LIMIT`] to [`LIMIT`]: that of `-k` is 2^16 less that of `k`.
+static ONE_OF: [u16; 2 * LIMIT as usize + 1] = {
+    let mut table = [0; 2 * LIMIT as usize + 1];
+    let mut i = 0;
+    while i < table.len() {
+        table[i] = one_of(i as i32 - LIMIT) as u16;
+        i += 1;
+    }
+    table
+};
 
-/// That of a logit within ±[`LIMIT`].
-#[inline(always)]
 const fn one_of(logit: i32) -> u32 {
     let one = SQUASH[logit.unsigned_abs() as usize] as u32;
     if logit < 0 { ONE - one } else { one }
 }
 
+/// The probability, in `1..=65535`, of a bit whose logit is `logit / 64`.
+#[inline(always)]
+pub(super) fn squash(logit: i32) -> u32 {
+    ONE_OF[(logit.clamp(-LIMIT, LIMIT) + LIMIT) as usize].into()
+}
+
 /// Entry `i` is the least logit whose probability is at least `16·i + 8`, or −[`LIMIT`].
-static STRETCH: [i16; 1 << 12] = {
+pub(super) static STRETCH: [i16; 1 << 12] = {
     let mut table = [0; 1 << 12];
     let (mut i, mut logit) = (0, -LIMIT);
     while i < table.len() {
@@ -50,15 +59,13 @@ static STRETCH: [i16; 1 << 12] = {
     table
 };
 
-/// The logit, in units of 1/64, of the probability `one`.
-#[inline(always)]
-pub(super) fn stretch(one: u16) -> i32 {
-    STRETCH[usize::from(one >> 4)].into()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn stretch(one: u16) -> i32 {
+        STRETCH[usize::from(one >> 4)].into()
+    }
 
     #[test]
     fn stretching_undoes_squashing() {

@@ -27,14 +27,11 @@
 //! | 4 | node + (behind << 8) |
 //! | 5 | node + (presence << 8) + (beyond << 35) |
 
-use crate::geometry::KernelMap;
+use super::neighbourhood::{AFTER, Neighbourhood};
+use b2p_kernels::mixing::CONTEXTS;
 
-/// The neighbours that share a face, by their places in a 3³ row: three that can come before, three that come after.
+/// The neighbours that share a face and can come earlier, by their places in a 3³ row.
 const BEFORE: [usize; 3] = [4, 10, 12];
-const AFTER: [usize; 3] = [14, 16, 22];
-
-/// How many contexts there are.
-pub(super) const CONTEXTS: usize = 5;
 
 const NEAR: u64 = {
     let (mut mask, mut at) = (0, 0);
@@ -87,73 +84,70 @@ pub(super) struct Surroundings {
     occupied: u64,
     unknown: u64,
     presence: u64,
-    /// Of each neighbour 0 if it is not there, 1 if its children are unknown, else 256 plus its occupancy.
-    states: [u16; 27],
     beside: u64,
     beyond: u64,
     behind: u64,
     /// Of the neighbours in the six directions a byte each: their occupancies, 0 unless known, and 2 where they are there but not known.
     known: u64,
     veiled: u64,
+    /// The occupancies of the neighbours that are known.
+    masks: [u8; 27],
 }
 
 impl Surroundings {
-    /// What is known before any neighbour is.
+    /// What is known before any neighbour's children are.
     #[inline(always)]
     pub fn new() -> Self {
         Surroundings {
             occupied: 0,
             unknown: OWN,
             presence: 0,
-            states: [0; 27],
             beside: 0,
             beyond: 0,
             behind: 0,
             known: 0,
             veiled: 0,
+            masks: [0; 27],
         }
     }
 
-    /// Adds the neighbour at offset `k`, and its children if they are known.
+    /// Adds the neighbour at offset `k`, whose children are not known.
     #[inline(always)]
-    pub fn add(&mut self, k: usize, children: Option<u8>) {
-        self.presence |= 1 << k;
-        match children {
-            None => {
-                self.states[k] = 1;
-                self.unknown |= CELLS[k][0][15] | CELLS[k][1][15];
-            }
-            Some(mask) => {
-                self.states[k] = 256 | u16::from(mask);
-                let (low, high) = (usize::from(mask & 15), usize::from(mask >> 4));
-                self.occupied |= CELLS[k][0][low] | CELLS[k][1][high];
-            }
-        }
+    pub fn add_presence(&mut self, k: usize) {
+        self.unknown |= CELLS[k][0][15] | CELLS[k][1][15];
     }
 
-    /// Looks farther, once all neighbours of the voxel `here` have been added.
+    /// Adds the neighbour at offset `k`, which has these children.
     #[inline(always)]
-    pub fn look_beyond(&mut self, map: &KernelMap, here: usize) {
-        for (i, k) in BEFORE.into_iter().chain(AFTER).enumerate() {
-            let state = u64::from(self.states[k]);
-            let known = if state > 1 { state & 255 } else { 0 };
-            self.known |= known << (8 * i);
-            self.veiled |= u64::from(state == 1) << (8 * i + 1);
-            self.beside |= u64::from(state != 0) << i;
-        }
+    pub fn add_children(&mut self, k: usize, mask: u8) {
+        self.masks[k] = mask;
+        let (low, high) = (usize::from(mask & 15), usize::from(mask >> 4));
+        self.occupied |= CELLS[k][0][low] | CELLS[k][1][high];
+    }
+
+    /// Sums up, once all neighbours have been added.
+    #[inline(always)]
+    pub fn sum_up(&mut self, neighbours: Neighbourhood) {
+        let Neighbourhood {
+            there,
+            earlier,
+            beyond,
+        } = neighbours;
+        let bit = |mask: u32, k: usize| u64::from(mask >> k & 1);
+        self.presence = there.into();
+        self.beyond = beyond.into();
         for (i, k) in BEFORE.into_iter().enumerate() {
-            self.behind |= u64::from(self.states[k]) << (9 * i);
+            let (is, mask) = (bit(there, k), u64::from(self.masks[k]));
+            let known = bit(earlier, k);
+            self.known |= mask << (8 * i);
+            self.veiled |= (is & !known) << (8 * i + 1);
+            self.behind |= (known << 8 | mask | is & !known) << (9 * i);
+            self.beside |= is << i;
         }
-        for (i, k) in AFTER.into_iter().enumerate() {
-            let there = self.states[k] != 0;
-            // What is not there is looked for around `here`, in vain: a branch would be a guess.
-            let side = if there {
-                map.row(here)[k] as usize
-            } else {
-                here
-            };
-            let more = there && map.row(side)[k] != KernelMap::ABSENT;
-            self.beyond |= (u64::from(more) | u64::from(!there) << 1) << (2 * i);
+        for (i, k) in (3..).zip(AFTER) {
+            let is = bit(there, k);
+            self.veiled |= is << (8 * i + 1);
+            self.beside |= is << i;
         }
     }
 
@@ -182,6 +176,13 @@ impl Surroundings {
         self.unknown &= !(1 << cell);
         self.occupied |= u64::from(there) << cell;
     }
+
+    /// Learns that what was said of the child in `octant` is wrong.
+    #[inline(always)]
+    pub fn unlearn(&mut self, octant: usize) {
+        let cell = 21 + (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2);
+        self.occupied ^= 1 << cell;
+    }
 }
 
 #[inline(always)]
@@ -192,7 +193,7 @@ fn hash(h: u64, word: u64) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::network::visit;
+    use super::super::neighbourhood::ones;
     use super::*;
     use crate::geometry::{Octree, Voxels, morton};
     use proptest::prelude::*;
@@ -324,11 +325,13 @@ mod tests {
             for here in 0..masks.len() {
                 let first = here / slice * slice;
                 let slice = first..masks.len().min(first + slice);
+                let neighbours = Neighbourhood::of_all(&map, &slice)[here - first];
                 let mut around = Surroundings::new();
-                visit(map.row(here), &slice, here, &masks[slice.clone()], |k, children| {
-                    around.add(k, children.map(|(_, mask)| mask));
-                });
-                around.look_beyond(&map, here);
+                ones(neighbours.there & !neighbours.earlier).for_each(|k| around.add_presence(k));
+                for k in ones(neighbours.earlier) {
+                    around.add_children(k, masks[map.row(here)[k] as usize]);
+                }
+                around.sum_up(neighbours);
                 for octant in 0..8 {
                     let node = 1 << octant | usize::from(masks[here]) & ((1 << octant) - 1);
                     let want = by_definition(&octree, &slice, here, octant);
