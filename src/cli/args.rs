@@ -100,7 +100,7 @@ pub struct Encode {
     /// Stream to write
     #[arg(short, long, value_name = "OUT.b2p")]
     pub output: PathBuf,
-    /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs]
+    /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs; less if its points lie too far apart for that]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
     pub bits: Option<u8>,
     /// Octree levels whose features are coded, up to three, the last below N [default: N−3..N−1]

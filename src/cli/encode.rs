@@ -1,6 +1,6 @@
 //! `b2p encode`: point cloud to stream.
 
-use b2p::cloud::{PointCloud, voxelise};
+use b2p::cloud::{PointCloud, voxelise, voxelise_closed};
 use b2p::encoder::{self, Options};
 use b2p::log::Log;
 use b2p::{Error, Limits, output};
@@ -21,8 +21,11 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         })
         .map_err(&in_cloud)?;
     let points = cloud.positions.len();
-    let cloud = log
-        .step("voxelise", points, "points", || voxelise(&cloud, args.bits))
+    let (cloud, finest) = log
+        .step("voxelise", points, "points", || match args.bits {
+            Some(bits) => Ok((voxelise(&cloud, Some(bits))?, bits)),
+            None => voxelise_closed(&cloud),
+        })
         .map_err(&in_cloud)?;
     let model = load::model(&args.model)?;
     let options = Options {
@@ -54,14 +57,20 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
             bpp(rate.feature_bytes),
         ]);
     }
+    let depth = cloud.voxels.depth();
+    let coarser = match depth < finest {
+        true => format!(
+            "The points lie too far apart for {finest} bits: surfaces would have holes. --bits {finest} codes them all the same.\n"
+        ),
+        false => String::new(),
+    };
     Ok(format!(
-        "{}\n{}\n{}: {} bytes for {} points at {} bits, {} bits per point\n",
+        "{}\n{}\n{}: {} bytes for {} points at {depth} bits, {} bits per point\n{coarser}",
         steps(log.steps()),
         table(&rows),
         args.output.display(),
         count(encoded.bytes.len() as u64),
         count(cloud.voxels.len() as u64),
-        cloud.voxels.depth(),
         bpp(encoded.bytes.len()),
     ))
 }

@@ -1,6 +1,6 @@
 //! `b2p tradeoff`: what accuracy costs in time on this machine.
 
-use b2p::cloud::{ColouredVoxels, PointCloud, voxelise};
+use b2p::cloud::{ColouredVoxels, PointCloud, voxelise_closed};
 use b2p::encoder;
 use b2p::log::Log;
 use b2p::network::Model;
@@ -75,7 +75,7 @@ pub fn run(args: &Tradeoff, limits: &Limits, progress: &Progress) -> Result<Stri
 
 /// A point cloud's stream, and its voxels.
 fn coded(ply: &[u8], model: &[u8], limits: &Limits) -> b2p::Result<(Vec<u8>, ColouredVoxels)> {
-    let cloud = voxelise(&PointCloud::from_ply(ply, limits)?, None)?;
+    let (cloud, _) = voxelise_closed(&PointCloud::from_ply(ply, limits)?)?;
     let (model, log) = (Model::from_bytes(model)?, &mut Log::default());
     let coded = encoder::encode(&cloud, &model, &encoder::Options::default(), log)?;
     Ok((coded.bytes, cloud))

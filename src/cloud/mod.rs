@@ -9,7 +9,7 @@ mod voxelise;
 mod write;
 
 pub use points::{Hints, PointCloud};
-pub use voxelise::{ColouredVoxels, voxelise};
+pub use voxelise::{ColouredVoxels, voxelise, voxelise_closed};
 
 use crate::error::{Error, Stage};
 

@@ -89,6 +89,45 @@ fn png(path: &Path) -> tiny_skia::Pixmap {
     tiny_skia::Pixmap::load_png(path).expect("a readable PNG")
 }
 
+/// So many points spread evenly over a ball, in metres.
+fn sparse_ball(points: usize) -> String {
+    use std::fmt::Write;
+    let mut ply = format!(
+        "ply\nformat ascii 1.0\nelement vertex {points}\nproperty float x\nproperty float y\nproperty float z\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    );
+    for i in 0..points {
+        let (z, turn) = (
+            2.0 * (i as f64 + 0.5) / points as f64 - 1.0,
+            i as f64 * 2.399_963,
+        );
+        let (x, y) = (
+            (1.0 - z * z).sqrt() * turn.cos(),
+            (1.0 - z * z).sqrt() * turn.sin(),
+        );
+        writeln!(ply, "{x} {y} {z} 200 80 {}", i % 256).expect("a String takes all");
+    }
+    ply
+}
+
+#[test]
+fn a_sparse_cloud_gets_as_many_bits_as_close_its_surface_unless_told_otherwise() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("sparse.ply"), sparse_ball(6000)).unwrap();
+    let bits = |arguments: &[&str]| {
+        let said = succeeds(
+            at,
+            &[&["encode", "sparse.ply", "-o", "s.b2p"], arguments].concat(),
+        );
+        let info = succeeds(at, &["info", "s.b2p", "--json"]);
+        let info: serde_json::Value = serde_json::from_str(&info).expect("info prints JSON");
+        (info["bits"].as_u64(), said.contains("--bits 10"))
+    };
+    assert_eq!(bits(&[]), (Some(5), true));
+    assert_eq!(bits(&["--bits", "10"]), (Some(10), false));
+}
+
 #[test]
 fn a_cloud_becomes_a_stream_gaussians_and_pictures() {
     let folder = folder_with_stream();
