@@ -39,10 +39,10 @@ pub enum Precision {
     Bf16,
     /// As [`Precision::Bf16`] where it is many times as fast, with [`Isa::has_tiles`]; elsewhere [`Precision::F32`].
     Fastest,
-    /// Products are summed in f16 with fused multiply-adds, 16 at a time, and then in f32. The 16 roundings come to at most 2⁻⁷ of the terms'
-    /// magnitudes (1.004 · 16 · 2⁻¹¹, and what f32 adds), and what is too small for f16 to at most 2⁻¹⁹ · w · (|x| + 1) for each activation x,
-    /// w being the output channel's largest weight. Of finite activations and weights no sum overflows. Needs [`Isa::has_half`];
-    /// elsewhere it is [`Precision::F32`].
+    /// Products are summed in f16 with fused multiply-adds, 16 at a time, and then in f32. Besides what f32 loses, a sum is off by at most
+    /// 1.004 · 2⁻⁷ of its terms' magnitudes, and by 1.01 · 2⁻¹⁹ · w · (|x| + 1) for each activation x that it reads, w being the output
+    /// channel's largest weight. Of finite activations and weights no sum overflows. Needs [`Isa::has_half`]; elsewhere it is
+    /// [`Precision::F32`].
     Half,
 }
 

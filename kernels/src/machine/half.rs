@@ -1,9 +1,15 @@
 //! f16 by f16 (NEON with `fp16`): twice as many products to an instruction as of f32.
 //!
-//! Products are summed in f16 in blocks of [`BLOCK`], blocks in f32: see [`crate::Precision::Half`] for what that loses. An f16 ends at 65504,
-//! so each output channel's weights are scaled by a power of two to below 1/[`HEADROOM`]: a block's terms, of activations below 2¹⁶, are then no
-//! more than 2¹⁵ together, and since rounding keeps the order of numbers, so are all sums on the way. What is scaled down too far loses its
-//! last bits, that is at most 2⁻²⁵ of a weight.
+//! Products are summed in f16 in blocks of [`BLOCK`], blocks in f32, tap by tap.
+//!
+//! **No sum overflows.** An f16 ends at 65504. Each output channel's weights are divided by a power of two, its unit, that brings the largest, w, to
+//! at least 1/64 and below 1/32. Finite activations are below 2¹⁶, so the first k products of a block come to less than k · 2¹¹ together, which f16
+//! holds exactly for every k up to 16; and as rounding keeps the order of numbers, no rounded sum is beyond it.
+//!
+//! **What is lost.** An addition gives (s + p)(1 + ε) + η, |ε| ≤ 2⁻¹¹ and |η| ≤ 2⁻²⁵, so that a block of products p is off by at most
+//! (1 + 2⁻¹¹)¹⁶ − 1 < 1.004 · 2⁻⁷ of Σ|p|, and by 1.008 · 2⁻²⁵ a product. A weight that division takes below f16's normal numbers loses up to 2⁻²⁵,
+//! which takes up to 1.008 · 2⁻²⁵ · |x| from its product. Since the unit is at most 64 w, sums that are multiplied by it again have lost no more
+//! than 1.004 · 2⁻⁷ of their terms' magnitudes, and 1.01 · 2⁻¹⁹ · w · (|x| + 1) a product. Adding blocks in f32 comes on top.
 
 use std::arch::aarch64::*;
 use std::arch::asm;
@@ -16,14 +22,14 @@ use crate::{ceiling, f16};
 
 /// Products that are summed in f16.
 const BLOCK: usize = 16;
-/// No scaled weight reaches its inverse.
+/// No weight that was divided by its unit reaches the inverse.
 const HEADROOM: f32 = 2.0 * BLOCK as f32;
 /// Values of a vector.
 const EIGHT: usize = 8;
 /// Rows whose sums, of a panel, stay in the registers.
 const ROWS: usize = 4;
 
-/// A layer's weights, scaled.
+/// A layer's weights, divided by their units.
 #[derive(Debug, Clone)]
 pub(crate) struct Weights {
     /// Per tap, panel and two input channels, in whole blocks: the weights of the one for all outputs, then those of the other.
@@ -33,7 +39,7 @@ pub(crate) struct Weights {
 }
 
 impl Weights {
-    /// Scales the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs.
+    /// Divides the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, by their units.
     pub fn new(extents: Extents, weights: impl Fn(usize, usize, usize) -> [f32; PANEL]) -> Weights {
         let panels = extents.panels();
         let mut peaks = vec![[0.0f32; PANEL]; panels];
@@ -148,58 +154,36 @@ unsafe fn multiply(block: &Block, first: usize) {
     }
 }
 
-/// The instructions for one of eight input channels: its weights in two registers times a lane of each row's factors.
+/// To the products of a row, in one of two vectors, a lane of its factors times weights.
+macro_rules! row {
+    ($instruction:literal, $products:literal, $weights:literal, $factors:literal, $lane:literal) => {
+        concat!(
+            $instruction,
+            " {",
+            $products,
+            ":v}.8h, {",
+            $weights,
+            ":v}.8h, {",
+            $factors,
+            ":v}.h[",
+            $lane,
+            "]\n"
+        )
+    };
+}
+
+/// One of eight input channels, of which the weights are in two vectors, for all rows.
 macro_rules! channel {
     ($instruction:literal, $lane:literal, $left:literal, $right:literal) => {
         concat!(
-            $instruction,
-            " {al:v}.8h, {",
-            $left,
-            ":v}.8h, {a:v}.h[",
-            $lane,
-            "]\n",
-            $instruction,
-            " {ar:v}.8h, {",
-            $right,
-            ":v}.8h, {a:v}.h[",
-            $lane,
-            "]\n",
-            $instruction,
-            " {bl:v}.8h, {",
-            $left,
-            ":v}.8h, {b:v}.h[",
-            $lane,
-            "]\n",
-            $instruction,
-            " {br:v}.8h, {",
-            $right,
-            ":v}.8h, {b:v}.h[",
-            $lane,
-            "]\n",
-            $instruction,
-            " {cl:v}.8h, {",
-            $left,
-            ":v}.8h, {c:v}.h[",
-            $lane,
-            "]\n",
-            $instruction,
-            " {cr:v}.8h, {",
-            $right,
-            ":v}.8h, {c:v}.h[",
-            $lane,
-            "]\n",
-            $instruction,
-            " {dl:v}.8h, {",
-            $left,
-            ":v}.8h, {d:v}.h[",
-            $lane,
-            "]\n",
-            $instruction,
-            " {dr:v}.8h, {",
-            $right,
-            ":v}.8h, {d:v}.h[",
-            $lane,
-            "]",
+            row!($instruction, "al", $left, "a", $lane),
+            row!($instruction, "ar", $right, "a", $lane),
+            row!($instruction, "bl", $left, "b", $lane),
+            row!($instruction, "br", $right, "b", $lane),
+            row!($instruction, "cl", $left, "c", $lane),
+            row!($instruction, "cr", $right, "c", $lane),
+            row!($instruction, "dl", $left, "d", $lane),
+            row!($instruction, "dr", $right, "d", $lane),
         )
     };
 }
