@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
-# AArch64 under emulation, as the processors of QEMU that are named below: one with everything, one with dot products (Raspberry Pi 5), one with
-# neither (Raspberry Pi 3).
+# AArch64 under emulation, as the processors of QEMU that are named below: one with everything, one with dot products and arithmetic in f16
+# (Raspberry Pi 5), one with neither (Raspberry Pi 3).
 #
-#     tests/aarch64.sh            the bare decoder decodes the conformance suite with every instruction set, and the kernels pass their own tests
+#     tests/aarch64.sh            the bare decoder decodes the conformance suite with every instruction set, and the kernels and what sums in f16 pass their own
+#                                 tests
 #     tests/aarch64.sh renderer   the renderer passes its own tests, hard cases among them, with NEON and without
 #     tests/aarch64.sh program    the program as it is shipped is small enough, and decodes to the bytes that this machine's does
 #
@@ -62,19 +63,24 @@ fi
 
 suite() { cargo test --locked --target $target -p b2p --no-default-features --test conformance "$@"; }
 kernels() { cargo test --locked --target $target -p b2p-kernels --lib --test convolution "$@"; }
+half() { cargo test --locked --target $target -p b2p --no-default-features --lib "$@"; }
 
 # The suite and the kernels' tests as one processor, whose name says where they tell how they went.
 try() {
     export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="timeout 900 qemu-aarch64 -cpu $1"
-    local sets="scalar, neon, dotprod"
-    [ "$1" != cortex-a53 ] || sets="scalar, neon"
-    suite -- --nocapture && { grep -qx "ran on $sets" "$told/$1" || { echo "did not run on $sets" && return 1; }; } && kernels
+    local sets="scalar, neon, dotprod" floats="neon, dotprod"
+    [ "$1" != cortex-a53 ] || { sets="scalar, neon" && floats="none"; }
+    suite -- --nocapture && tells "$1" "ran on $sets" && tells "$1" "half on $floats" && kernels && half -- network::tests::half
 }
+
+# Whether a processor has told so at the end of a line, before which test threads of one processor have put their names.
+tells() { grep -q "$2\$" "$told/$1" || { echo "not told: $2" && return 1; }; }
 
 told=$(mktemp -d)
 trap 'rm -rf "$told"' EXIT
 suite --no-run
 kernels --no-run
+half --no-run
 # All at once.
 for processor in $processors; do
     try "$processor" > "$told/$processor" 2>&1 && touch "$told/$processor.passed" &

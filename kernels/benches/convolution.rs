@@ -150,12 +150,14 @@ impl Bench {
                 Precision::F32,
             ),
             ("bf16", Scale::Plain, Precision::Bf16),
+            ("half", Scale::Plain, Precision::Half),
         ];
         for (what, scale, precision) in scales {
             let ceiling = match precision {
                 Precision::F32 => ceiling,
                 Precision::Bf16 if isa.has_bf16() => ceiling::bf16(isa),
-                Precision::Bf16 | Precision::Fastest => continue,
+                Precision::Half if isa.has_half() => ceiling::half(isa),
+                Precision::Bf16 | Precision::Half | Precision::Fastest => continue,
             };
             let conv = FloatConv::new(27, cin, cout, &weights, vec![0.0; cout], scale);
             let conv = conv.with_precision(precision);
@@ -210,6 +212,9 @@ fn main() {
         println!("{name:>7} at best: f32 {float:.1} GMAC/s, i16 {exact:.1} GMAC/s");
         if isa.has_bf16() {
             println!("{name:>7} at best: bf16 {:.1} GMAC/s", ceiling::bf16(isa));
+        }
+        if isa.has_half() {
+            println!("{name:>7} at best: half {:.1} GMAC/s", ceiling::half(isa));
         }
         for &layer in &layers {
             bench.exact(isa, layer, exact);

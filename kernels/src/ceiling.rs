@@ -44,6 +44,15 @@ pub fn bf16(isa: Isa) -> f64 {
     }
 }
 
+/// f16 by f16, summed in f16: the bound of [`crate::Precision::Half`], whose sums in f32 come on top. Where that falls back to f32, so does this.
+pub fn half(isa: Isa) -> f64 {
+    #[cfg(target_arch = "aarch64")]
+    if isa.has_half() {
+        return measure(isa, Arithmetic::Half);
+    }
+    f32(isa)
+}
+
 /// Rounds of one batch, some 50 µs of them.
 const ROUNDS: usize = 1 << 14;
 
@@ -63,7 +72,7 @@ fn best(spin: impl Fn() -> usize) -> f64 {
     best
 }
 
-/// Words that are numbers of either sign around 1 as f32, as two bf16, and large ones as two i16: many of their bits differ.
+/// Words that are numbers of either sign around 1 as f32, as two bf16 and as two f16, and large ones as two i16: many of their bits differ.
 pub(crate) fn some_words<const N: usize>() -> [Lanes; N] {
     let mut state = 1u32;
     [(); N].map(|()| {
@@ -115,7 +124,7 @@ mod tests {
     #[test]
     fn every_instruction_set_has_a_ceiling() {
         for isa in Isa::available() {
-            for rate in [f32(isa), i16(isa), bf16(isa)] {
+            for rate in [f32(isa), i16(isa), bf16(isa), half(isa)] {
                 assert!(rate.is_finite() && rate > 0.0, "{isa}: {rate}");
             }
         }

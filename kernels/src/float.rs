@@ -9,6 +9,8 @@ use crate::convert::{self, Halves};
 use crate::isa::Isa;
 #[cfg(target_arch = "x86_64")]
 use crate::machine::amx;
+#[cfg(target_arch = "aarch64")]
+use crate::machine::half;
 use crate::machine::{self, with_halves};
 use crate::norms::{Gains, Norms};
 use crate::plan::PlanTile;
@@ -37,6 +39,11 @@ pub enum Precision {
     Bf16,
     /// As [`Precision::Bf16`] where it is many times as fast, with [`Isa::has_tiles`]; elsewhere [`Precision::F32`].
     Fastest,
+    /// Products are summed in f16 with fused multiply-adds, 16 at a time, and then in f32. Besides what f32 loses, a sum is off by at most
+    /// 1.004 · 2⁻⁷ of its terms' magnitudes, and by 1.01 · 2⁻¹⁹ · w · (|x| + 1) for each activation x that it reads, w being the output
+    /// channel's largest weight. Of finite activations and weights no sum overflows. Needs [`Isa::has_half`]; elsewhere it is
+    /// [`Precision::F32`].
+    Half,
 }
 
 /// A sparse convolution of f16 activations by f16 weights, summed in f32.
@@ -47,6 +54,9 @@ pub struct FloatConv {
     weights: Vec<Lanes>,
     /// Per tap, panel and pair of input channels: each output channel's two weights in bf16. Empty unless asked for.
     brain: Vec<Lanes>,
+    /// What [`Isa::has_half`] multiplies, if it was asked for.
+    #[cfg(target_arch = "aarch64")]
+    half: Option<half::Weights>,
     precision: Precision,
     /// What [`Isa::has_tiles`] multiplies, once it is needed.
     #[cfg(target_arch = "x86_64")]
@@ -132,6 +142,8 @@ impl FloatConv {
             extents,
             weights: packed,
             brain: Vec::new(),
+            #[cfg(target_arch = "aarch64")]
+            half: None,
             precision: Precision::F32,
             #[cfg(target_arch = "x86_64")]
             tiles: OnceLock::new(),
@@ -146,7 +158,7 @@ impl FloatConv {
         let pairs = cin.div_ceil(2);
         self.precision = precision;
         self.brain = match precision {
-            Precision::F32 | Precision::Fastest => Vec::new(),
+            Precision::F32 | Precision::Fastest | Precision::Half => Vec::new(),
             Precision::Bf16 => vec![Lanes::default(); volume * self.extents.panels() * pairs],
         };
         let panels = self.brain.chunks_exact_mut(pairs);
@@ -158,7 +170,20 @@ impl FloatConv {
                 }
             }
         }
+        #[cfg(target_arch = "aarch64")]
+        {
+            let half =
+                || half::Weights::new(self.extents, |tap, c, panel| self.weight(tap, c, panel));
+            self.half = (precision == Precision::Half).then(half);
+        }
         self
+    }
+
+    /// The weights of a panel of outputs.
+    #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+    fn weight(&self, tap: usize, channel: usize, panel: usize) -> [f32; PANEL] {
+        let Extents { cin, .. } = self.extents;
+        self.weights[(tap * self.extents.panels() + panel) * cin + channel].f32()
     }
 
     /// What it computes in, where the machine can.
@@ -189,6 +214,10 @@ impl FloatConv {
                     unsafe { machine::avx512::to_brain(input, rows, cin, to) };
                 },
             );
+        }
+        #[cfg(target_arch = "aarch64")]
+        if let Some(half) = self.half(isa) {
+            return (Arithmetic::Half, &half.lanes, half::gather);
         }
         let _ = isa;
         (Arithmetic::Float, &self.weights, widen)
@@ -228,7 +257,8 @@ impl FloatConv {
             for (row, output) in output.tiles() {
                 let plan = planner.plan(isa, group, &taps, [first + row, output.len()], tile);
                 #[cfg(target_arch = "x86_64")]
-                let done = isa.has_tiles() && self.precision != Precision::F32;
+                let done = isa.has_tiles()
+                    && matches!(self.precision, Precision::Bf16 | Precision::Fastest);
                 #[cfg(target_arch = "x86_64")]
                 if done {
                     amx::brain::accumulate(isa, self.tiles(), plan, input, tiles, sums);
@@ -248,12 +278,25 @@ impl FloatConv {
                         sums,
                     );
                 }
+                #[cfg(target_arch = "aarch64")]
+                let units = self.half(isa).map(|half| &half.units[..]);
+                #[cfg(not(target_arch = "aarch64"))]
+                let units = None;
                 let (conv, norms, sums) = (self, &mut *norms, &sums[..]);
                 with_halves!(isa, fn finish_tile<T: FloatOut>(
-                    conv: &FloatConv, norms: &mut Norms, sums: &[Lanes], plan: &PlanTile, output: Output<'_, T, f16>,
+                    conv: &FloatConv, units: Option<&[[f32; PANEL]]>, norms: &mut Norms, sums: &[Lanes], plan: &PlanTile,
+                    output: Output<'_, T, f16>,
                 ));
             }
         });
+    }
+}
+
+#[cfg(target_arch = "aarch64")]
+impl FloatConv {
+    /// The weights in f16, if it is to be multiplied by these instructions.
+    fn half(&self, isa: Isa) -> Option<&half::Weights> {
+        self.half.as_ref().filter(|_| isa.has_half())
     }
 }
 
@@ -262,10 +305,7 @@ impl FloatConv {
     /// The weights in tiles.
     fn tiles(&self) -> &amx::Weights {
         self.tiles.get_or_init(|| {
-            let (cin, panels) = (self.extents.cin, self.extents.panels());
-            amx::Weights::of_brain(self.extents, |tap, channel, panel| {
-                self.weights[(tap * panels + panel) * cin + channel].f32()
-            })
+            amx::Weights::of_brain(self.extents, |tap, c, panel| self.weight(tap, c, panel))
         })
     }
 }
@@ -285,11 +325,14 @@ unsafe fn widen_rows<H: Halves>(input: &[f16], rows: &[u32], cin: usize, to: &mu
     }
 }
 
+/// Sums are multiplied by their channels' `units`, if they have any, before all else.
+///
 /// # Safety
 /// The processor must have `H`'s instructions.
 #[inline(always)]
 unsafe fn finish_tile<H: Halves, T: FloatOut>(
     conv: &FloatConv,
+    units: Option<&[[f32; PANEL]]>,
     norms: &mut Norms,
     sums: &[Lanes],
     plan: &PlanTile,
@@ -315,6 +358,11 @@ unsafe fn finish_tile<H: Halves, T: FloatOut>(
         let panels = row.chunks_mut(PANEL).zip(sums).zip(&conv.bias);
         for (p, ((row, sums), bias)) in panels.enumerate() {
             let mut sums = sums.f32();
+            if let Some(units) = units {
+                for (sum, unit) in sums.iter_mut().zip(&units[p]) {
+                    *sum *= unit;
+                }
+            }
             if let Some(factors) = factors {
                 for (sum, factor) in sums.iter_mut().zip(&factors[p]) {
                     *sum *= factor;

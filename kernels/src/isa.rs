@@ -119,6 +119,15 @@ impl Isa {
         false
     }
 
+    /// Whether there are products and sums of f16 besides (`fp16` on NEON).
+    pub fn has_half(self) -> bool {
+        #[cfg(target_arch = "aarch64")]
+        if self.0 >= Level::Neon {
+            return std::arch::is_aarch64_feature_detected!("fp16");
+        }
+        false
+    }
+
     /// Output rows of a layer of `cout` channels that are multiplied by the same taps: those of a matrix tile, or as many as keep the
     /// registers busy. A multiple of [`MIN_GROUP`].
     pub(crate) fn group(self, cout: usize) -> usize {

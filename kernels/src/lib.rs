@@ -5,8 +5,8 @@
 //! A sparse convolution is one loop ([`ExactConv`] in integers, [`FloatConv`] in floats): for every output row, the rows its
 //! [`Taps`] name are multiplied by that tap's weights and added up, in groups of rows with like neighbours ([`Plan`]) whose sums stay in the
 //! registers, or matrix tiles, of the [`Isa`] while the taps go by. All of them give the same bits: integers wrap,
-//! products of two f16 are exact in f32, fused or not, and each sum is added up in the same order. Only [`Precision::Bf16`]
-//! and [`Precision::Fastest`] depend on the machine.
+//! products of two f16 are exact in f32, fused or not, and each sum is added up in the same order. Only [`Precision::Bf16`],
+//! [`Precision::Fastest`] and [`Precision::Half`] depend on the machine.
 
 #[cfg(all(target_arch = "x86", not(target_feature = "sse2")))]
 compile_error!(

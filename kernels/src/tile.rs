@@ -168,6 +168,20 @@ pub(crate) enum Arithmetic {
     Integer,
     /// Pairs of bf16: only where [`Isa::has_bf16`].
     Brain,
+    /// Pairs of f16, one after the other: only where [`Isa::has_half`].
+    #[cfg(target_arch = "aarch64")]
+    Half,
+}
+
+impl Arithmetic {
+    fn is_in(self, isa: Isa) -> bool {
+        match self {
+            Arithmetic::Float | Arithmetic::Integer => true,
+            Arithmetic::Brain => isa.has_bf16(),
+            #[cfg(target_arch = "aarch64")]
+            Arithmetic::Half => isa.has_half(),
+        }
+    }
 }
 
 /// Writes rows of the input, of so many values each, as words.
@@ -190,7 +204,7 @@ pub(crate) fn accumulate<T>(
     expanded: &mut Vec<Lanes>,
     sums: &mut Vec<Lanes>,
 ) {
-    assert!(arithmetic != Arithmetic::Brain || isa.has_bf16());
+    assert!(arithmetic.is_in(isa));
     let Extents { volume, cin, .. } = extents;
     let panels = extents.panels();
     let steps = weights.len() / (volume * panels);
@@ -301,7 +315,7 @@ fn width(isa: Isa, whole: usize) -> usize {
 /// Multiplies [`width`] panels.
 ///
 /// # Safety
-/// The block's pointers must hold what they promise for these panels, and bf16 must be asked for only where the machine has it.
+/// The block's pointers must hold what they promise for these panels, and the machine must have the arithmetic.
 unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) {
     // SAFETY: an `Isa` is only made where the processor has its instructions, and its group is what blocks of its rows divide; the
     // rest is the caller's promise.
@@ -323,10 +337,10 @@ unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) {
 /// Multiplies for as long as `rounds` say, and gives the number of products: see [`crate::ceiling`].
 ///
 /// # Panics
-/// If the machine has no bf16 and is asked for it.
+/// If the machine lacks what it is asked for.
 pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
-    assert!(arithmetic != Arithmetic::Brain || isa.has_bf16());
-    // SAFETY: an `Isa` is only made where the processor has its instructions; bf16 has just been asked about.
+    assert!(arithmetic.is_in(isa));
+    // SAFETY: an `Isa` is only made where the processor has its instructions; what it may lack has just been asked about.
     let words = unsafe {
         match isa.level() {
             Level::Scalar => machine::scalar::spin(arithmetic, rounds),
@@ -343,5 +357,7 @@ pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
     match arithmetic {
         Arithmetic::Float => words,
         Arithmetic::Integer | Arithmetic::Brain => 2 * words,
+        #[cfg(target_arch = "aarch64")]
+        Arithmetic::Half => 2 * words,
     }
 }

@@ -323,7 +323,7 @@ pub struct ModelArg {
     /// Use no better instructions than these: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
     #[arg(long, value_name = "NAME")]
     pub isa: Option<String>,
-    /// Generate Gaussians in int16 (the same bits everywhere) or f16 [default: int16 if the model has it]
+    /// Generate Gaussians in int16 (the same bits everywhere), f16, or half (f16 with sums in f16 too, on processors that have them) [default: int16 if the model has it]
     #[arg(long, value_name = "NAME")]
     pub precision: Option<String>,
 }

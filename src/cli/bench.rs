@@ -186,6 +186,7 @@ impl Ceilings {
         let gaussians = match precision {
             Precision::Int16 => integers,
             Precision::F16 => cores as f64 * ceiling::f32(isa),
+            Precision::Half => cores as f64 * ceiling::half(isa),
         };
         Ceilings {
             integers,

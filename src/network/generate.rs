@@ -4,7 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::OnceLock;
 
-use b2p_kernels::{ExactConv, FloatConv, Taps, zeros};
+use b2p_kernels::{ExactConv, FloatConv, Precision as Sums, Taps, zeros};
 use rayon::prelude::*;
 
 use super::children::{Part, Parts};
@@ -24,16 +24,19 @@ pub enum Precision {
     Int16,
     /// f16 in memory, sums in f32.
     F16,
+    /// The same, but products are summed in f16 before they are in f32 ([`b2p_kernels::Precision::Half`]). Only where [`crate::Isa::has_half`].
+    Half,
 }
 
 impl Precision {
-    /// All, the default first.
-    pub const ALL: [Precision; 2] = [Precision::Int16, Precision::F16];
+    /// All, the default first; of the last not every machine has what it needs.
+    pub const ALL: [Precision; 3] = [Precision::Int16, Precision::F16, Precision::Half];
 
     fn name(self) -> &'static str {
         match self {
             Precision::Int16 => "int16",
             Precision::F16 => "f16",
+            Precision::Half => "half",
         }
     }
 }
@@ -64,6 +67,7 @@ pub(super) struct Generator {
     /// Those of its own integers.
     scales: Option<Vec<f32>>,
     float: OnceLock<Generate<FloatConv>>,
+    half: OnceLock<Generate<FloatConv>>,
     integer: OnceLock<Generate<ExactConv>>,
 }
 
@@ -74,6 +78,7 @@ impl Generator {
             input,
             scales,
             float: OnceLock::new(),
+            half: OnceLock::new(),
             integer: OnceLock::new(),
         }
     }
@@ -88,7 +93,8 @@ impl Generator {
 
     #[cfg(test)]
     pub fn is_ready(&self) -> bool {
-        self.float.get().is_some() || self.integer.get().is_some()
+        let floats = [&self.float, &self.half].map(|floats| floats.get().is_some());
+        floats.contains(&true) || self.integer.get().is_some()
     }
 
     /// The same of layers that take reals, made by `make`.
@@ -100,6 +106,11 @@ impl Generator {
 
     fn float(&self) -> &Generate<FloatConv> {
         self.float.get_or_init(|| self.of_layers(Stored::float))
+    }
+
+    fn half(&self) -> &Generate<FloatConv> {
+        let half = |stored: &Stored| stored.float().with_precision(Sums::Half);
+        self.half.get_or_init(|| self.of_layers(half))
     }
 
     fn integer(&self, scales: &[f32]) -> &Generate<ExactConv> {
@@ -157,9 +168,13 @@ impl Model {
             (Some(scales), Precision::Int16) => {
                 Ok(self.run_generator(pool, generator.integer(scales), g, map, PART))
             }
-            _ => {
+            (_, precision) => {
                 let g = reals(self.isa, g, self.g_scale[role]);
-                Ok(self.run_generator(&mut Pool::new(), generator.float(), &g, map, PART))
+                let layers = match precision {
+                    Precision::Half => generator.half(),
+                    _ => generator.float(),
+                };
+                Ok(self.run_generator(&mut Pool::new(), layers, &g, map, PART))
             }
         }
     }

@@ -28,7 +28,7 @@
 //! # The close zone
 //! Gaussian generation (GG) and the encoder's feature conversion (FC) and squeezing (FS) are f16 in the file. In f16 they store f16,
 //! saturating, and sum in f32; where there are matrix tiles, FC of the finest level multiplies in bf16. A decoder may run GG in integers instead ([`Precision`]), with the arithmetic of the exact zone, which is
-//! faster, and gives the same Gaussians to the bit everywhere.
+//! faster, and gives the same Gaussians to the bit everywhere; or, where processors have it, with sums in f16, which do not.
 //!
 //! # The model file
 //! Safetensors. The metadata's `b2p` is JSON: [`Shape`]. Layer `NAME` has `NAME.weight` [taps, in, out] and, in the exact zone,
@@ -155,8 +155,12 @@ impl Model {
     /// Generates Gaussians in that precision.
     ///
     /// # Errors
-    /// [`Error::Unsupported`] if the model file lacks what integers need.
+    /// [`Error::Unsupported`] if the model file lacks what integers need, or the instructions lack what [`Precision::Half`] needs.
     pub fn with_precision(self, precision: Precision) -> Result<Self> {
+        if precision == Precision::Half && !self.isa.has_half() {
+            let detail = format!("{} has no arithmetic in f16, take f16 or int16", self.isa);
+            return Err(missing("generating Gaussians in half", detail));
+        }
         let lacks = |generator: &&Generator| !generator.has_integers();
         match self.generators.iter().find(lacks) {
             Some(generator) if precision == Precision::Int16 => {
@@ -173,7 +177,8 @@ impl Model {
         self.precision
     }
 
-    /// Uses no more than these instructions. Whatever is computed in integers stays as it is.
+    /// Uses no more than these instructions. Whatever is computed in integers stays as it is; [`Precision::Half`] becomes [`Precision::F16`] where
+    /// they have no arithmetic in f16.
     pub fn with_isa(self, isa: Isa) -> Self {
         Model { isa, ..self }
     }

@@ -216,7 +216,7 @@ mod tests {
         Choices {
             levels: vec![8, 9],
             heads: Heads::ALL.to_vec(),
-            precisions: Precision::ALL.to_vec(),
+            precisions: vec![Precision::Int16, Precision::F16],
             threads: 4,
         }
     }

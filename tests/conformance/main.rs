@@ -25,7 +25,9 @@ mod seal;
 use std::path::{Path, PathBuf};
 
 use b2p::Isa;
-use b2p::network::Model;
+use b2p::decoder::Decoder;
+use b2p::log::Log;
+use b2p::network::{Model, Precision};
 use digest::{Levels, in_pieces, whole};
 use models::model;
 
@@ -109,6 +111,47 @@ fn every_stream_decodes_to_its_digests_with_every_instruction_set_and_number_of_
         let sets = ["scalar", "neon", "dotprod"];
         assert_eq!(ran, sets[..2 + usize::from(dotprod)]);
     }
+}
+
+/// Of the model that ships; what is off by more than a few thousandths would show.
+#[test]
+fn gaussians_in_half_are_near_those_in_f16_on_machines_that_sum_in_f16() {
+    let bytes = stream("lite-encoded-sphere");
+    let colours = |isa, precision| -> b2p::Result<Vec<f32>> {
+        let model = model("lite").with_isa(isa).with_precision(precision)?;
+        let gaussians = Decoder::new(&model).decode(&bytes, None, &mut Log::default())?;
+        Ok(gaussians.colour.as_flattened().to_vec())
+    };
+    let floats = colours(Isa::SCALAR, Precision::F16).expect("f16 is everywhere");
+    let mut ran = Vec::new();
+    for isa in Isa::available() {
+        let half = match colours(isa, Precision::Half) {
+            Ok(half) => half,
+            Err(error) => {
+                assert!(!isa.has_half(), "{isa}: {error}");
+                continue;
+            }
+        };
+        let pairs = floats.iter().zip(&half);
+        let squares: f32 = pairs.map(|(a, b)| (a - b).powi(2)).sum();
+        let off = (squares / floats.len() as f32).sqrt();
+        println!("{isa}: colours are off by {off:.1e}");
+        assert!((1e-6..3e-3).contains(&off), "{isa}: {off}");
+        ran.push(isa.to_string());
+    }
+    #[cfg(target_arch = "aarch64")]
+    assert_eq!(
+        !ran.is_empty(),
+        std::arch::is_aarch64_feature_detected!("fp16")
+    );
+    println!(
+        "half on {}",
+        if ran.is_empty() {
+            "none".into()
+        } else {
+            ran.join(", ")
+        }
+    );
 }
 
 #[cfg(feature = "encoder")]

@@ -11,6 +11,8 @@ pub(crate) mod avx512;
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod dot;
 #[cfg(target_arch = "aarch64")]
+pub(crate) mod half;
+#[cfg(target_arch = "aarch64")]
 pub(crate) mod neon;
 pub(crate) mod scalar;
 

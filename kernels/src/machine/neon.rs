@@ -7,6 +7,7 @@ use crate::f16;
 
 use crate::ceiling;
 use crate::convert::{Halves, MAX};
+use crate::machine::half;
 use crate::rows::PANEL;
 use crate::tile::{Arithmetic, Block, Machine, columns};
 use crate::winograd::Registers;
@@ -21,6 +22,7 @@ pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) {
             (Arithmetic::Float, _) => wide::<Float, 4, 4, 1>(block),
             (Arithmetic::Integer, 0) => wide::<Integer, 4, 1, 1>(block),
             (Arithmetic::Integer, _) => wide::<Integer, 4, 2, 1>(block),
+            (Arithmetic::Half, _) => half::run(block),
             (Arithmetic::Brain, _) => unreachable!("NEON has no bf16"),
         }
     }
@@ -42,6 +44,7 @@ pub(crate) unsafe fn spin(arithmetic: Arithmetic, rounds: usize) -> usize {
         match arithmetic {
             Arithmetic::Float => spinning::<Float>(rounds),
             Arithmetic::Integer => spinning::<Integer>(rounds),
+            Arithmetic::Half => half::spin(rounds),
             Arithmetic::Brain => unreachable!("NEON has no bf16"),
         }
     }
@@ -171,6 +174,23 @@ unsafe impl Machine for Integer {
     }
 }
 
+/// Eight f16 as f32.
+#[target_feature(enable = "neon")]
+#[inline]
+pub(crate) fn widened(narrow: uint16x8_t) -> [float32x4_t; 2] {
+    let (low, high);
+    // SAFETY: instructions between registers, which any NEON has.
+    unsafe {
+        asm!(
+            "fcvtl {low:v}.4s, {narrow:v}.4h",
+            "fcvtl2 {high:v}.4s, {narrow:v}.8h",
+            low = out(vreg) low, high = lateout(vreg) high, narrow = in(vreg) narrow,
+            options(pure, nomem, nostack, preserves_flags),
+        );
+    }
+    [low, high]
+}
+
 pub(crate) struct Convert;
 
 // SAFETY: NEON, as its module says.
@@ -178,16 +198,9 @@ unsafe impl Halves for Convert {
     #[inline(always)]
     unsafe fn widen(from: &[f16; PANEL], to: &mut [f32; PANEL]) {
         for half in [0, 8] {
-            // SAFETY: eight values are read and written from `half` on; the instructions convert between two registers.
+            // SAFETY: eight values are read and written from `half` on.
             unsafe {
-                let narrow = vld1q_u16(from.as_ptr().add(half).cast());
-                let (low, high): (float32x4_t, float32x4_t);
-                asm!(
-                    "fcvtl {low:v}.4s, {narrow:v}.4h",
-                    "fcvtl2 {high:v}.4s, {narrow:v}.8h",
-                    low = out(vreg) low, high = lateout(vreg) high, narrow = in(vreg) narrow,
-                    options(pure, nomem, nostack, preserves_flags),
-                );
+                let [low, high] = widened(vld1q_u16(from.as_ptr().add(half).cast()));
                 vst1q_f32(to.as_mut_ptr().add(half), low);
                 vst1q_f32(to.as_mut_ptr().add(half + 4), high);
             }

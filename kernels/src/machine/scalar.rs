@@ -12,7 +12,7 @@ pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, _whole: usize) {
         match arithmetic {
             Arithmetic::Float => columns::<Float, 2, 1, 1>(block),
             Arithmetic::Integer => columns::<Integer, 2, 1, 1>(block),
-            Arithmetic::Brain => unreachable!("plain Rust has no bf16"),
+            _ => unreachable!("plain Rust has neither bf16 nor f16"),
         }
     }
 }
@@ -25,7 +25,7 @@ pub(crate) unsafe fn spin(arithmetic: Arithmetic, rounds: usize) -> usize {
         match arithmetic {
             Arithmetic::Float => spinning::<Float>(rounds),
             Arithmetic::Integer => spinning::<Integer>(rounds),
-            Arithmetic::Brain => unreachable!("plain Rust has no bf16"),
+            _ => unreachable!("plain Rust has neither bf16 nor f16"),
         }
     }
 }

@@ -3,6 +3,7 @@
 mod cases;
 mod exact;
 mod float;
+mod half;
 mod hostile;
 
 use b2p_kernels::Isa;
@@ -42,4 +43,16 @@ fn every_instruction_set_of_this_machine_is_tested() {
     println!("bf16: {bf16}");
     #[cfg(target_arch = "x86_64")]
     assert_eq!(bf16, is_x86_feature_detected!("avx512bf16"));
+    let half: Vec<String> = Isa::available()
+        .iter()
+        .filter(|isa| isa.has_half())
+        .map(Isa::to_string)
+        .collect();
+    println!("half on {}", half.join(", "));
+    #[cfg(target_arch = "aarch64")]
+    if std::arch::is_aarch64_feature_detected!("fp16") {
+        assert_eq!(half, names[1..], "all but plain code");
+    }
+    #[cfg(not(target_arch = "aarch64"))]
+    assert!(half.is_empty());
 }

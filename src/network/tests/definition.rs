@@ -277,7 +277,7 @@ fn in_floats(model: &[u8]) -> Model {
 }
 
 /// Features that use the middle of their range.
-fn some_features(count: usize) -> Vec<i16> {
+pub(super) fn some_features(count: usize) -> Vec<i16> {
     (0..count)
         .map(|i| ((i * 7919) % 1601) as i16 - 800)
         .collect()

@@ -3,6 +3,7 @@
 mod definition;
 mod files;
 mod golden;
+mod half;
 mod passes;
 
 use b2p_kernels::Isa;
