@@ -1,7 +1,8 @@
 //! Point clouds: in from PLY files, onto the voxel grid, and out again.
 //!
 //! A cloud is read whatever its number types and the order of its properties. [`voxelise`] then gives the
-//! octree's finest level: as it stands if the coordinates already are a voxel grid's, else fitted to one.
+//! octree's finest level: as it stands if the coordinates already are a voxel grid's, else fitted to one; [`voxelise_closed`] a coarser one where points
+//! lie too far apart for that.
 
 pub mod ply;
 mod points;
