@@ -3,6 +3,7 @@
 mod colours;
 mod corrections;
 mod skeleton;
+mod within;
 
 use std::ops::RangeInclusive;
 
@@ -22,6 +23,7 @@ pub use corrections::Residual;
 use corrections::{Level, corrections};
 pub(crate) use skeleton::Skeleton;
 use skeleton::{Coded, Correct};
+pub use within::encode_within;
 
 /// What may be chosen about a stream.
 #[derive(Debug, Clone)]
