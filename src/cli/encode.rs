@@ -80,7 +80,9 @@ fn within(most: f64, chosen: &Options) -> String {
     let (price, residual) = (chosen.bit_price, chosen.residual);
     let more = match residual {
         Residual::Fine(Steps { luma: 1, .. }) => ", the finest there is",
-        _ if price > 2.0 => "; a model for fewer bits (--model) is likely better",
+        Residual::None if chosen.filter || price > 2.0 => {
+            "; a model for fewer bits (--model) may be better"
+        }
         _ => "",
     };
     format!(" of at most {most}: bit price {price:.2}, {residual}{more}")

@@ -25,7 +25,7 @@ pub(crate) use skeleton::Skeleton;
 use skeleton::{Coded, Correct};
 pub use within::encode_within;
 
-/// What may be chosen about a stream.
+/// What may be chosen about a stream; [`encode_within`] chooses what decides its size.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.

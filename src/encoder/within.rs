@@ -6,7 +6,6 @@
 
 use std::iter::successors;
 use std::num::NonZeroU8;
-use std::rc::Rc;
 
 use super::{Encoded, Options, Residual, Subject};
 use crate::cloud::ColouredVoxels;
@@ -29,7 +28,7 @@ const COARSE: f32 = 2.0;
 ///
 /// From few bits to many it chooses prices of a bit from 4 down to 1 without a residual; from 2 to 1 with [`Residual::Coarse`], where filters are made; and 1 with
 /// [`Residual::Fine`], in steps from 255 down to 1. More bits never lead back on this path; with more than its end takes, that comes out. It takes at most seven tries,
-/// those at a price of 1 of the residual alone.
+/// those at a price that was tried before of the residual alone.
 ///
 /// # Errors
 /// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if no such stream was found, and those of [`encode`](super::encode).
@@ -48,7 +47,8 @@ pub fn encode_within(
     let points = cloud.voxels.len();
     let bits = |stream: &[u8]| stream.len() as f64 * 8.0 / points as f64;
     let subject = Subject::new(cloud, model, options, log)?;
-    let usual = Rc::new(subject.code(USUAL, true, log)?);
+    // One for each price so far.
+    let mut coded = vec![(USUAL, subject.code(USUAL, true, log)?)];
     let path = path(options);
     let most = path.len().ilog2() + 1;
     let (mut tries, mut least, mut best) = (0, f64::INFINITY, None);
@@ -60,31 +60,29 @@ pub fn encode_within(
         } = path[at];
         tries += 1;
         let name = format!("try {tries} of {most}: bit price {bit_price:.2}, {residual}");
-        let (coded, stream) = log.step(name, points, "points", || {
-            let coded = match bit_price == USUAL {
-                true => Rc::clone(&usual),
-                false => {
-                    let wants = residual.precision(options.filter).is_some();
-                    Rc::new(subject.code(bit_price, wants, &mut Log::default())?)
-                }
-            };
-            let stream = subject.stream(&coded, residual)?;
-            Ok((coded, stream))
+        let (own, stream) = log.step(name, points, "points", || {
+            let known = coded.iter().position(|(price, _)| *price == bit_price);
+            let own = known.unwrap_or(coded.len());
+            if known.is_none() {
+                let new = subject.code(bit_price, options.filter, &mut Log::default())?;
+                coded.push((bit_price, new));
+            }
+            Ok((own, subject.stream(&coded[own].1, residual)?))
         })?;
         let bits = bits(&stream);
         least = bits.min(least);
         let fits = bits <= bits_per_point;
         if fits {
-            best = Some((at, coded, stream));
+            best = Some((at, own, stream));
         }
         Ok(fits)
     };
     halve(path.len(), fits)?;
-    let (at, coded, stream) = best.ok_or(Error::TooFewBits {
+    let (at, own, stream) = best.ok_or(Error::TooFewBits {
         asked: bits_per_point,
         least,
     })?;
-    let encoded = subject.checked(stream, &coded.features, log)?;
+    let encoded = subject.checked(stream, &coded[own].1.features, log)?;
     Ok((encoded, path[at].clone()))
 }
 
