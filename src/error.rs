@@ -130,6 +130,18 @@ pub enum Error {
         /// What it may hold.
         expected: String,
     },
+    /// Of the streams that the encoder may choose from, none is as small as was asked for. Fewer levels take less, and so does a model that was trained for
+    /// fewer bits.
+    #[error(
+        "{asked} bits per point are too few: of this cloud's levels, with this model, the least is {:.4}",
+        (least * 1e4).ceil() / 1e4
+    )]
+    TooFewBits {
+        /// Bits per point that were asked for.
+        asked: f64,
+        /// Bits per point of the smallest stream that was tried.
+        least: f64,
+    },
     /// The caller threw the [`Cancel`](crate::Cancel) switch.
     #[error("cancelled")]
     Cancelled,

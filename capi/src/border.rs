@@ -57,7 +57,7 @@ impl From<Error> for Fault {
             Error::Unsupported { .. } => Status::Unsupported,
             Error::Malformed { .. } => Status::Malformed,
             Error::Cancelled => Status::Cancelled,
-            Error::Usage(_) => Status::Usage,
+            Error::Usage(_) | Error::TooFewBits { .. } => Status::Usage,
             _ => Status::Internal,
         };
         Fault(status, error.to_string())

@@ -115,6 +115,9 @@ pub struct Encode {
     /// Code what the finest level's colours are then still off. `coarse`: what is wide, where that is worth it and filters are made; `none`: nothing; else all of it, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
     #[arg(long, value_name = "coarse|none|STEP[,CHROMA]", value_parser = residual, default_value = "coarse")]
     pub residual: Residual,
+    /// Make the best stream of at most X bits for each point, the whole file counted, in up to seven tries: chooses --bit-price and --residual
+    #[arg(long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["bit_price", "residual"])]
+    pub bits_per_point: Option<f64>,
     #[command(flatten)]
     pub model: ModelArg,
 }
@@ -371,6 +374,13 @@ fn price(text: &str) -> Result<f32, String> {
     }
 }
 
+fn bits_per_point(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(bits) if bits > 0.0 && f64::is_finite(bits) => Ok(bits),
+        _ => Err("expected a number above 0 such as 0.3".into()),
+    }
+}
+
 fn residual(text: &str) -> Result<Residual, String> {
     match text {
         "none" => return Ok(Residual::None),
@@ -451,6 +461,7 @@ mod tests {
         assert_eq!(size("640x480"), Ok((640, 480)));
         assert_eq!(orbit("-30, 10,2.5"), Ok([-30.0, 10.0, 2.5]));
         assert_eq!(hex("#ff0080"), Some([255, 0, 128]));
+        assert_eq!(bits_per_point("0.25"), Ok(0.25));
         assert_eq!(bytes("512"), Ok(512));
         assert_eq!(bytes("3k"), Ok(3 << 10));
         assert_eq!(bytes("2G"), Ok(2 << 30));
@@ -462,6 +473,9 @@ mod tests {
         assert!(bytes("-1").is_err() && bytes("99999999T").is_err());
         assert!(levels("9..7").unwrap_err().contains("after"));
         assert!(levels("9").unwrap_err().contains("7..9"));
+        for wrong in ["0", "-1", "nan", "inf", "1e999", "few"] {
+            assert!(bits_per_point(wrong).unwrap_err().contains("above 0"));
+        }
         assert!(size("0x4").unwrap_err().contains("1024x1024"));
         assert!(orbit("1,2").unwrap_err().contains("three"));
         assert!(effect("antialias").unwrap_err().contains("antialias=on"));

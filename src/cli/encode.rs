@@ -1,7 +1,8 @@
 //! `b2p encode`: point cloud to stream.
 
 use b2p::cloud::{PointCloud, voxelise, voxelise_closed};
-use b2p::encoder::{self, Options};
+use b2p::encoder::{self, Options, Residual};
+use b2p::gaussians::Steps;
 use b2p::log::Log;
 use b2p::{Error, Limits, output};
 
@@ -35,7 +36,13 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         residual: args.residual,
         ..Options::default()
     };
-    let encoded = encoder::encode(&cloud, &model, &options, &mut log).map_err(&in_cloud)?;
+    let coded = match args.bits_per_point {
+        Some(bits) => encoder::encode_within(&cloud, &model, &options, bits, &mut log),
+        None => {
+            encoder::encode(&cloud, &model, &options, &mut log).map(|encoded| (encoded, options))
+        }
+    };
+    let (encoded, chosen) = coded.map_err(&in_cloud)?;
     output::write_file(&args.output, |w| {
         w.write_all(&encoded.bytes).map_err(|source| Error::Io {
             path: args.output.clone(),
@@ -65,12 +72,27 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         false => String::new(),
     };
     Ok(format!(
-        "{}\n{}\n{}: {} bytes for {} points at {depth} bits, {} bits per point\n{coarser}",
+        "{}\n{}\n{}: {} bytes for {} points at {depth} bits, {} bits per point{}\n{coarser}",
         steps(log.steps()),
         table(&rows),
         args.output.display(),
         count(encoded.bytes.len() as u64),
         count(cloud.voxels.len() as u64),
         bpp(encoded.bytes.len()),
+        args.bits_per_point
+            .map_or(String::new(), |most| within(most, &chosen)),
     ))
+}
+
+/// What was chosen to keep to so many bits.
+fn within(most: f64, chosen: &Options) -> String {
+    let (price, residual) = (chosen.bit_price, chosen.residual);
+    let more = match residual {
+        Residual::Fine(Steps { luma: 1, .. }) => ", the finest there is",
+        Residual::None if chosen.filter || price > 2.0 => {
+            "; a model for fewer bits (--model) may be better"
+        }
+        _ => "",
+    };
+    format!(" of at most {most}: bit price {price:.2}, {residual}{more}")
 }

@@ -34,14 +34,19 @@ struct Failure(String);
 impl From<Error> for Failure {
     fn from(error: Error) -> Self {
         let text = error.to_string();
-        let Error::LimitExceeded { option, .. } = error else {
-            return Failure(text);
-        };
         // What the library calls a field is an argument here.
-        Failure(match option {
-            "max_bytes" => text.replace(option, "--max-memory"),
-            "max_points" => text.replace(option, "--max-points"),
-            "max_pixels" => text.replace(option, "--max-pixels"),
+        Failure(match error {
+            Error::LimitExceeded { option, .. } => match option {
+                "max_bytes" => text.replace(option, "--max-memory"),
+                "max_points" => text.replace(option, "--max-points"),
+                "max_pixels" => text.replace(option, "--max-pixels"),
+                _ => text,
+            },
+            Error::TooFewBits { .. } => {
+                format!(
+                    "{text}; code fewer levels (--levels), or with a model for fewer bits (--model)"
+                )
+            }
             _ => text,
         })
     }

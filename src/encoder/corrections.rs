@@ -1,7 +1,10 @@
 //! What a stream says of the colours that its heads generate: filters, and what is left after them.
 
+use std::fmt;
+use std::num::NonZeroU8;
+
 use super::colours::{self, CHUNK};
-use super::{Options, pooled};
+use super::pooled;
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
 use crate::gaussians::{
@@ -21,7 +24,7 @@ const BOUNDARY: u8 = 9;
 pub enum Residual {
     /// Nothing.
     None,
-    /// What is at least eight of its voxels wide and so shows as blotches from close up: where [`Options::filter`] is on, and it is worth its bytes.
+    /// What is at least eight of its voxels wide and so shows as blotches from close up: where [`filter`](super::Options::filter) is on, and it is worth its bytes.
     #[default]
     Coarse,
     /// All of it, in these steps.
@@ -35,7 +38,7 @@ impl Residual {
         chroma: 24,
     };
 
-    fn precision(self, filter: bool) -> Option<Precision> {
+    pub(super) fn precision(self, filter: bool) -> Option<Precision> {
         let finer = |own: u8, coarse: u8| if own == 0 { coarse } else { own.min(coarse) };
         let (fine, coarse) = match self {
             Residual::Fine(fine) => {
@@ -51,6 +54,22 @@ impl Residual {
             coarse,
             boundary: BOUNDARY,
         })
+    }
+}
+
+impl fmt::Display for Residual {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Residual::None => f.write_str("no residual"),
+            Residual::Coarse => f.write_str("residual coarse"),
+            Residual::Fine(steps) => {
+                write!(f, "residual in steps of {}", steps.luma)?;
+                match NonZeroU8::new(steps.luma).map(Steps::from) == Some(*steps) {
+                    true => Ok(()),
+                    false => write!(f, ",{}", steps.chroma),
+                }
+            }
+        }
     }
 }
 
@@ -73,18 +92,18 @@ pub(crate) struct Level<'a> {
 #[derive(Default)]
 pub(crate) struct Corrections {
     pub filters: Vec<(Heads, ColourFilter)>,
-    /// The payloads of the residual.
-    pub residual: Option<Vec<Vec<u8>>>,
+    pub left: Option<Left>,
 }
 
-/// Those that are worth it, and those that were asked for.
+/// The filters that are worth it, and what is left for a residual of the finest level, if one is wanted.
 ///
 /// # Errors
 /// Those of generating Gaussians and of drawing them.
 pub(super) fn corrections(
     cloud: &ColouredVoxels,
     model: &Model,
-    options: &Options,
+    filter: bool,
+    residual: bool,
     at: Level<'_>,
 ) -> Result<Corrections> {
     let (shape, map) = (model.shape(), &at.maps[at.role]);
@@ -96,43 +115,77 @@ pub(super) fn corrections(
         wanted = of_children(&wanted, &finer, at.octree.occupancy(at.level));
     }
     let mut found = Corrections::default();
+    let mut kept = None;
     for heads in Heads::ALL {
-        let left = match heads {
-            Heads::Best if at.finest => options.residual.precision(options.filter),
-            _ => None,
-        };
-        if shape.head(at.role, heads).is_none() || !options.filter && left.is_none() {
+        let keep = residual && at.finest && heads == Heads::Best;
+        if shape.head(at.role, heads).is_none() || !filter && !keep {
             continue;
         }
         let raw = model.generate_with(heads, at.role, at.features, map)?;
         let voxels = at.octree.level(at.level);
         let mut gaussians = activate(&raw, voxels, at.children, shape, Frame::default());
         drop(raw);
-        if options.filter {
+        if filter {
             let above = at.role.checked_sub(1).map(|role| &at.maps[role]);
             let around = Surroundings::of_level(&gaussians, at.octree, at.level, map, above);
             let filter = colours::fit(&gaussians, &around, &wanted, drawn, at.latents)?;
-            if let (Some(filter), Some(_)) = (&filter, left) {
+            if let (Some(filter), true) = (&filter, keep) {
                 filter.apply(&mut gaussians, &around);
             }
             found.filters.extend(filter.map(|filter| (heads, filter)));
         }
-        if let Some(precision) = left {
-            let (keys, slice) = (voxels.keys(), options.slice_voxels as usize);
-            let before = missing(&gaussians, &wanted, at.children);
-            let residual = ColourResidual::of(&before, keys, slice, precision);
-            let payloads = residual.to_payloads(keys);
-            residual.apply(&mut gaussians, keys);
-            let after = missing(&gaussians, &wanted, at.children);
-            let bytes = payloads.iter().map(|payload| CHUNK + payload.len()).sum();
-            let asked = precision.fine != Steps::NONE;
-            let squares = [&before, &after].map(|missing| squares(missing));
-            if asked || colours::worth(squares, bytes, WIDE * at.latents) {
-                found.residual = Some(payloads);
-            }
+        if keep {
+            kept = Some(Gaussians {
+                opacity: gaussians.opacity,
+                colour: gaussians.colour,
+                ..Gaussians::default()
+            });
         }
     }
+    found.left = kept.map(|gaussians| Left {
+        level: at.level,
+        children: at.children,
+        gaussians,
+        wanted,
+        latents: at.latents,
+    });
     Ok(found)
+}
+
+/// What a residual is of: the colours that are drawn of a level, with its filter, and those of the cloud.
+pub(crate) struct Left {
+    pub level: u8,
+    /// Gaussians of each voxel.
+    children: usize,
+    /// Their opacities and colours.
+    gaussians: Gaussians,
+    /// What their colours should be.
+    wanted: Vec<[f32; 3]>,
+    /// Bytes of latents up to here.
+    latents: usize,
+}
+
+impl Left {
+    /// The payloads of a residual as finely told as this, for the voxels `keys` in slices; `None` if it has nothing fine and is not worth its bytes.
+    pub fn payloads(
+        &self,
+        keys: &[u64],
+        slice: usize,
+        precision: Precision,
+    ) -> Option<Vec<Vec<u8>>> {
+        let before = missing(&self.gaussians, &self.wanted, self.children);
+        let residual = ColourResidual::of(&before, keys, slice, precision);
+        let payloads = residual.to_payloads(keys);
+        if precision.fine != Steps::NONE {
+            return Some(payloads);
+        }
+        let mut gaussians = self.gaussians.clone();
+        residual.apply(&mut gaussians, keys);
+        let after = missing(&gaussians, &self.wanted, self.children);
+        let squares = [&before, &after].map(|missing| squares(missing));
+        let bytes = payloads.iter().map(|payload| CHUNK + payload.len()).sum();
+        colours::worth(squares, bytes, WIDE * self.latents).then_some(payloads)
+    }
 }
 
 /// What the colours of each voxel's Gaussians are short of, on average, by opacity.

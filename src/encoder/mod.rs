@@ -2,24 +2,30 @@
 
 mod colours;
 mod corrections;
+mod skeleton;
+mod within;
 
 use std::ops::RangeInclusive;
 
+use b2p_kernels::f16;
 use rayon::prelude::*;
 
-use crate::bitstream::{Header, MAX_SLICE_VOXELS, Writer};
+use crate::bitstream::{Header, MAX_SLICE_VOXELS};
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
-use crate::entropy::{Coding, Condition, Rounding, latent_hash};
+use crate::entropy::{Coding, Rounding};
 use crate::error::{Error, Result};
-use crate::geometry::{KernelMap, Octree, Voxels, codec};
+use crate::geometry::{KernelMap, Octree, Voxels};
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::{Heads, Model, ROLES};
+use crate::network::{Model, ROLES};
 pub use corrections::Residual;
-use corrections::{Corrections, Level, corrections};
+use corrections::{Level, corrections};
+pub(crate) use skeleton::Skeleton;
+use skeleton::{Coded, Correct};
+pub use within::encode_within;
 
-/// What may be chosen about a stream.
+/// What may be chosen about a stream; [`encode_within`] chooses what decides its size.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.
@@ -82,200 +88,140 @@ pub fn encode(
     options: &Options,
     log: &mut Log,
 ) -> Result<Encoded> {
-    let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
-    let (base, top) = (*levels.start(), *levels.end());
-    // Networks have learned to see a level through all those below it, coded or not.
-    let seen = cloud.voxels.depth().min(base + ROLES as u8);
-    let (finest, colours) = log.step("pool colours", cloud.voxels.len(), "voxels", || {
-        Ok(pooled(cloud, seen))
-    })?;
-    let octree = Octree::new(finest)?;
-    let maps = log.step("kernel maps", octree.level(seen).len(), "voxels", || {
-        Ok(kernel_maps(&octree, base))
-    })?;
-    let mut features = log.step("features", colours.len(), "voxels", || {
-        let maps: Vec<_> = maps.iter().rev().collect();
-        let occupancy: Vec<_> = (base..seen)
-            .rev()
-            .map(|level| octree.occupancy(level))
-            .collect();
-        model.features(&colours, &maps, &occupancy)
-    })?;
+    let subject = Subject::new(cloud, model, options, log)?;
+    let wants = options.residual.precision(options.filter).is_some();
+    let coded = subject.code(options.bit_price, wants, log)?;
+    let bytes = match &coded.left {
+        Some(left) => log.step(
+            format!("residual of level {}", left.level),
+            subject.skeleton.octree.level(left.level).len(),
+            "voxels",
+            || subject.stream(&coded, options.residual),
+        )?,
+        None => subject.stream(&coded, options.residual)?,
+    };
+    subject.checked(bytes, &coded.features, log)
+}
 
-    let header = Header {
-        optional_flags: 0,
-        bits: cloud.voxels.depth(),
-        base,
-        top,
-        points: cloud.voxels.len() as u64,
-        placement: cloud.placement,
-        model: model.id(),
-        slice_voxels: options.slice_voxels,
-        voxels: Vec::new(),
-        sections: Vec::new(),
-    };
-    let mut squeezed = |role: usize, coding: Coding<'_>, context: Option<&[i16]>| {
-        // The finest level's features come first, so those of the level at hand are the last.
-        let own = features.pop().unwrap_or_default();
-        let real = model.squeeze(role, &own, context)?;
-        let prices = model.bit_prices(role).iter();
-        let rounding = Rounding {
-            limit: model.shape().latent_max,
-            prices: &prices
-                .map(|price| price * options.bit_price)
-                .collect::<Vec<_>>(),
+/// A cloud and what all its streams share, whatever a bit is worth and however fine the residual.
+struct Subject<'a> {
+    cloud: &'a ColouredVoxels,
+    model: &'a Model,
+    options: &'a Options,
+    skeleton: Skeleton<'a>,
+    /// Of every coded level, the finest first.
+    features: Vec<Vec<f16>>,
+}
+
+impl<'a> Subject<'a> {
+    fn new(
+        cloud: &'a ColouredVoxels,
+        model: &'a Model,
+        options: &'a Options,
+        log: &mut Log,
+    ) -> Result<Self> {
+        let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
+        let (base, top) = (*levels.start(), *levels.end());
+        // Networks have learned to see a level through all those below it, coded or not.
+        let seen = cloud.voxels.depth().min(base + ROLES as u8);
+        let (finest, colours) = log.step("pool colours", cloud.voxels.len(), "voxels", || {
+            Ok(pooled(cloud, seen))
+        })?;
+        let octree = Octree::new(finest)?;
+        let maps = log.step("kernel maps", octree.level(seen).len(), "voxels", || {
+            Ok(kernel_maps(&octree, base))
+        })?;
+        let features = log.step("features", colours.len(), "voxels", || {
+            let maps: Vec<_> = maps.iter().rev().collect();
+            let occupancy: Vec<_> = (base..seen)
+                .rev()
+                .map(|level| octree.occupancy(level))
+                .collect();
+            model.features(&colours, &maps, &occupancy)
+        })?;
+        let header = Header {
+            optional_flags: 0,
+            bits: cloud.voxels.depth(),
+            base,
+            top,
+            points: cloud.voxels.len() as u64,
+            placement: cloud.placement,
+            model: model.id(),
+            slice_voxels: options.slice_voxels,
+            voxels: Vec::new(),
+            sections: Vec::new(),
         };
-        let slice = options.slice_voxels as usize;
-        Ok(coding.quantise(model.tables(), &real, rounding, slice))
-    };
-    let mut correct = |level: Level<'_>| corrections(cloud, model, options, level);
-    let correct: Option<&mut Correct<'_>> =
-        match options.filter || matches!(options.residual, Residual::Fine(_)) {
+        Ok(Subject {
+            cloud,
+            model,
+            options,
+            skeleton: Skeleton::new(header, octree, maps, model, log)?,
+            features,
+        })
+    }
+
+    /// Codes everything but a residual, and keeps, if one is wanted, what it is to be of.
+    fn code(&self, bit_price: f32, residual: bool, log: &mut Log) -> Result<Coded> {
+        let model = self.model;
+        let slice = self.options.slice_voxels as usize;
+        let mut squeezed = |role: usize, coding: Coding<'_>, context: Option<&[i16]>| {
+            let own = &self.features[self.features.len() - 1 - role];
+            let real = model.squeeze(role, own, context)?;
+            let prices = model.bit_prices(role).iter();
+            let rounding = Rounding {
+                limit: model.shape().latent_max,
+                prices: &prices.map(|price| price * bit_price).collect::<Vec<_>>(),
+            };
+            Ok(coding.quantise(model.tables(), &real, rounding, slice))
+        };
+        let filter = self.options.filter;
+        let mut correct =
+            |level: Level<'_>| corrections(self.cloud, model, filter, residual, level);
+        let correct: Option<&mut Correct<'_>> = match filter || residual {
             true => Some(&mut correct),
             false => None,
         };
-    let (bytes, below) = write(header, &octree, &maps, model, &mut squeezed, correct, log)?;
-    let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
-        Decoder::new(model)
-            .with_limits(Limits::unlimited())
-            .exact(&bytes, top, &mut Log::default())
-    })?;
-    if exact.octree != octree.truncated(top) || exact.features != below {
-        return Err(Error::Usage(
-            "the stream does not decode to what was encoded: this machine computes wrongly".into(),
-        ));
+        self.skeleton.code(&mut squeezed, correct, log)
     }
-    let header = Header::parse(&bytes, &Limits::unlimited())?;
-    let rates = levels
-        .zip(header.voxels.iter().zip(&header.sections))
-        .map(|(level, (&voxels, section))| Rate {
-            level,
-            voxels: voxels as usize,
-            geometry_bytes: section.geometry as usize,
-            feature_bytes: section.features as usize,
-        })
-        .collect();
-    Ok(Encoded { bytes, rates })
-}
 
-/// A role's latents, K per voxel of its level, given what they are coded under and its context.
-pub(crate) type Latents<'a> = dyn FnMut(usize, Coding<'_>, Option<&[i16]>) -> Result<Vec<i16>> + 'a;
+    /// The stream of what was coded, with such a residual of what was kept for one.
+    fn stream(&self, coded: &Coded, residual: Residual) -> Result<Vec<u8>> {
+        let precision = residual.precision(self.options.filter);
+        let slice = self.options.slice_voxels as usize;
+        let payloads = coded.left.as_ref().zip(precision).and_then(|(left, told)| {
+            let keys = self.skeleton.octree.level(left.level).keys();
+            left.payloads(keys, slice, told)
+        });
+        self.skeleton.stream(coded, payloads.as_deref())
+    }
 
-/// What to say of a level's colours.
-type Correct<'a> = dyn FnMut(Level<'_>) -> Result<Corrections> + 'a;
-
-/// A stream of the `header`'s levels of an octree, and the features of the last; voxels and sections are filled in. `maps` are the levels'
-/// 3³ kernel maps.
-///
-/// # Errors
-/// Those of [`Writer`], of `latents`, and of `correct`.
-pub(crate) fn write(
-    header: Header,
-    octree: &Octree,
-    maps: &[KernelMap],
-    model: &Model,
-    latents: &mut Latents<'_>,
-    mut correct: Option<&mut Correct<'_>>,
-    log: &mut Log,
-) -> Result<(Vec<u8>, Vec<i16>)> {
-    let (levels, slice) = (header.base..=header.top, header.slice_voxels as usize);
-    let voxels = levels.clone().map(|level| octree.level(level).len() as u32);
-    let mut writer = Writer::new(Header {
-        voxels: voxels.collect(),
-        ..header
-    })?;
-    let drawn = |level: &u8| {
-        let role = usize::from(level - *levels.start());
-        model.shape().head(role, Heads::Best).is_some()
-    };
-    let finest = levels.clone().rev().find(drawn);
-    let mut below: Option<Vec<i16>> = None;
-    let mut latent_bytes = 0;
-    for (role, level) in levels.enumerate() {
-        let (count, map) = (octree.level(level).len(), &maps[role]);
-        log.step(
-            format!("geometry of level {level}"),
-            count,
-            "voxels",
-            || {
-                if role > 0 {
-                    return writer.geometry(
-                        level,
-                        &codec::encode_level(model.isa(), octree, &maps[role - 1], level, slice),
-                    );
-                }
-                let mut map = KernelMap::root();
-                (1..=level).try_for_each(|n| {
-                    let slices = codec::encode_level(model.isa(), octree, &map, n, slice);
-                    map = octree.child_map(n - 1, &map);
-                    writer.geometry(n, &slices)
-                })
-            },
-        )?;
-        below = log.step(
-            format!("features of level {level}"),
-            count,
-            "voxels",
-            || {
-                let context = below
-                    .as_ref()
-                    .map(|g| model.upsample(role, g, octree.occupancy(level - 1)));
-                if !model.has_latents(role) {
-                    return Ok(Some(model.reconstruct(role, &[], context.as_deref(), map)));
-                }
-                let parameters = context
-                    .as_ref()
-                    .map(|c| model.entropy_parameters(role, c, map));
-                let (tables, voxels) = (model.tables(), octree.level(level));
-                let octants = voxels.octants();
-                let predict = model
-                    .has_passes(role)
-                    .then(|| model.passes(role, &octants, map, parameters.as_ref()));
-                let coding = match (&predict, &parameters) {
-                    (Some(predict), _) => Coding::Passes {
-                        keys: voxels.keys(),
-                        predict,
-                    },
-                    (None, Some((mu, sigma))) => Coding::Known(Condition::Gauss { mu, sigma }),
-                    (None, None) => Coding::Known(Condition::Prior),
-                };
-                let latents = latents(role, coding, context.as_deref())?;
-                let slices = coding.encode(tables, &latents, slice);
-                latent_bytes += slices.iter().map(Vec::len).sum::<usize>();
-                writer.features(level, latent_hash(&latents), &slices)?;
-                Ok(Some(model.reconstruct(
-                    role,
-                    &latents,
-                    context.as_deref(),
-                    map,
-                )))
-            },
-        )?;
-        let head = model.shape().head(role, Heads::Best);
-        let (Some(correct), Some(head)) = (&mut correct, head) else {
-            continue;
-        };
-        log.step(format!("colours of level {level}"), count, "voxels", || {
-            let found = correct(Level {
-                role,
-                level,
-                finest: Some(level) == finest,
-                children: head.children,
-                octree,
-                maps,
-                features: below.as_deref().unwrap_or_default(),
-                latents: latent_bytes,
-            })?;
-            for (heads, filter) in &found.filters {
-                writer.filter(level, *heads as usize, &filter.to_bytes())?;
-            }
-            match &found.residual {
-                Some(residual) => writer.residual(level, residual),
-                None => Ok(()),
-            }
+    /// The stream, once it has been decoded to what was encoded.
+    fn checked(&self, bytes: Vec<u8>, features: &[i16], log: &mut Log) -> Result<Encoded> {
+        let Skeleton { header, octree, .. } = &self.skeleton;
+        let top = header.top;
+        let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
+            Decoder::new(self.model)
+                .with_limits(Limits::unlimited())
+                .exact(&bytes, top, &mut Log::default())
         })?;
+        if exact.octree != octree.truncated(top) || exact.features != features {
+            return Err(Error::Usage(
+                "the stream does not decode to what was encoded: this machine computes wrongly"
+                    .into(),
+            ));
+        }
+        let header = Header::parse(&bytes, &Limits::unlimited())?;
+        let rates = (header.base..)
+            .zip(header.voxels.iter().zip(&header.sections))
+            .map(|(level, (&voxels, section))| Rate {
+                level,
+                voxels: voxels as usize,
+                geometry_bytes: section.geometry as usize,
+                feature_bytes: section.features as usize,
+            })
+            .collect();
+        Ok(Encoded { bytes, rates })
     }
-    Ok((writer.finish()?, below.unwrap_or_default()))
 }
 
 /// The levels to code, for a cloud of bit depth `bits`.

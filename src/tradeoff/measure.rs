@@ -15,7 +15,7 @@ use super::metrics::{pixels_apart, psnr};
 use super::spread::Spread;
 use crate::bitstream::Header;
 use crate::decoder::Decoder;
-use crate::encoder::{kernel_maps, write};
+use crate::encoder::{Skeleton, kernel_maps};
 use crate::entropy::Coding;
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians, activate};
@@ -185,21 +185,16 @@ fn without_features(
         sections: Vec::new(),
         ..header.clone()
     };
+    let maps = kernel_maps(&octree, base);
+    let log = &mut Log::default();
+    let skeleton = Skeleton::new(header, octree, maps, model, log)?;
     let latents = model.shape().latents;
     let mut zero = |role: usize, _: Coding<'_>, _: Option<&[i16]>| {
-        Ok(vec![0; octree.level(base + role as u8).len() * latents])
+        let voxels = skeleton.octree.level(base + role as u8).len();
+        Ok(vec![0; voxels * latents])
     };
-    let maps = kernel_maps(&octree, base);
-    Ok(write(
-        header,
-        &octree,
-        &maps,
-        model,
-        &mut zero,
-        None,
-        &mut Log::default(),
-    )?
-    .0)
+    let coded = skeleton.code(&mut zero, None, log)?;
+    skeleton.stream(&coded, None)
 }
 
 /// Of each level of a stream down to `finest`, its voxels, and the nanoseconds that it takes in the exact zone.

@@ -3,6 +3,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 mod pictures;
+mod within;
 
 use std::io::Write;
 use std::path::Path;
