@@ -137,6 +137,47 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
 }
 
 #[test]
+fn every_level_that_is_drawn_may_have_a_residual_of_its_own() {
+    let (model, cloud) = (model(), ball(7, 45.0));
+    let encoded = |every_level| {
+        let options = Options {
+            residual: Residual::Fine(steps(5)),
+            every_level,
+            ..Options::default()
+        };
+        encode(&cloud, &model, &options, &mut Log::default()).unwrap()
+    };
+    let decode = |encoded: &Encoded, level| {
+        let decoder = Decoder::new(&model);
+        let decoded = decoder.decode(&encoded.bytes, Some(level), &mut Log::default());
+        decoded.unwrap()
+    };
+    let (finest, all) = (encoded(false), encoded(true));
+    let levels = Decoder::new(&model).levels(&all.bytes).unwrap();
+    let (&last, coarser) = levels.split_last().unwrap();
+    assert_eq!(decode(&finest, last), decode(&all, last));
+    assert!(!coarser.is_empty());
+    for &level in coarser {
+        let colours = colours_at(&cloud, level);
+        let children = decode(&all, level).len() / colours.len();
+        let want: Vec<[f32; 3]> = (colours.into_iter())
+            .flat_map(|colour| vec![colour; children])
+            .collect();
+        let off = |encoded| {
+            let gaussians = decode(encoded, level);
+            let pairs = gaussians
+                .colour
+                .as_flattened()
+                .iter()
+                .zip(want.as_flattened());
+            pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>()
+        };
+        let (before, after) = (off(&finest), off(&all));
+        assert!(after < 0.8 * before, "level {level}: {after} of {before}");
+    }
+}
+
+#[test]
 fn quick_heads_are_corrected_by_the_same_residual() {
     let (model, plain) = plain_with_both_heads();
     let level = plain.rates.last().unwrap().level;

@@ -109,6 +109,7 @@ fn what_else_was_chosen_stays_chosen() {
         slice_voxels: 200,
         bit_price: 0.0,
         residual: Residual::Coarse,
+        every_level: true,
     };
     let mut fine = 0;
     for asked in [2.0, 6.0] {

@@ -115,6 +115,9 @@ pub struct Encode {
     /// Code what the finest level's colours are then still off. `coarse`: what is wide, where that is worth it and filters are made; `none`: nothing; else all of it, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
     #[arg(long, value_name = "coarse|none|STEP[,CHROMA]", value_parser = residual, default_value = "coarse")]
     pub residual: Residual,
+    /// Give each level that is drawn a residual of its own, not the finest alone: better pictures of coarser levels, for bytes that the finest does not need
+    #[arg(long)]
+    pub every_level: bool,
     /// Make the best stream of at most X bits for each point, the whole file counted, in up to seven tries: chooses --bit-price and --residual
     #[arg(long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["bit_price", "residual"])]
     pub bits_per_point: Option<f64>,

@@ -34,6 +34,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         bit_price: args.bit_price,
         filter: !args.no_filter,
         residual: args.residual,
+        every_level: args.every_level,
         ..Options::default()
     };
     let coded = match args.bits_per_point {

@@ -19,7 +19,7 @@ const WIDE: usize = 6;
 /// The bit of Morton keys from which on voxels eight of their own apart join.
 const BOUNDARY: u8 = 9;
 
-/// How much is coded of what the colours of the finest level that is drawn are off those of the cloud: see [`ColourResidual`].
+/// How much is coded of what the colours of a level that is drawn are off those of the cloud: see [`ColourResidual`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Residual {
     /// Nothing.
@@ -95,7 +95,7 @@ pub(crate) struct Corrections {
     pub left: Option<Left>,
 }
 
-/// The filters that are worth it, and what is left for a residual of the finest level, if one is wanted.
+/// The filters that are worth it, and what is left for a residual, if one is wanted.
 ///
 /// # Errors
 /// Those of generating Gaussians and of drawing them.
@@ -117,7 +117,7 @@ pub(super) fn corrections(
     let mut found = Corrections::default();
     let mut kept = None;
     for heads in Heads::ALL {
-        let keep = residual && at.finest && heads == Heads::Best;
+        let keep = residual && heads == Heads::Best;
         if shape.head(at.role, heads).is_none() || !filter && !keep {
             continue;
         }

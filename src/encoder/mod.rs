@@ -20,7 +20,7 @@ use crate::limits::Limits;
 use crate::log::Log;
 use crate::network::{Model, ROLES};
 pub use corrections::Residual;
-use corrections::{Level, corrections};
+use corrections::{Left, Level, corrections};
 pub(crate) use skeleton::Skeleton;
 use skeleton::{Coded, Correct};
 pub use within::encode_within;
@@ -38,6 +38,8 @@ pub struct Options {
     pub filter: bool,
     /// How much is coded of what colours are then still off those of the cloud. Default: [`Residual::Coarse`].
     pub residual: Residual,
+    /// Whether every level that is drawn has such a residual, one of its own, and not the finest alone: the stream of the finest is larger for it, and no better.
+    pub every_level: bool,
     /// Voxels per slice, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
 }
@@ -49,6 +51,7 @@ impl Default for Options {
             bit_price: 1.0,
             filter: true,
             residual: Residual::Coarse,
+            every_level: false,
             slice_voxels: MAX_SLICE_VOXELS,
         }
     }
@@ -91,14 +94,14 @@ pub fn encode(
     let subject = Subject::new(cloud, model, options, log)?;
     let wants = options.residual.precision(options.filter).is_some();
     let coded = subject.code(options.bit_price, wants, log)?;
-    let bytes = match &coded.left {
-        Some(left) => log.step(
-            format!("residual of level {}", left.level),
-            subject.skeleton.octree.level(left.level).len(),
-            "voxels",
-            || subject.stream(&coded, options.residual),
-        )?,
-        None => subject.stream(&coded, options.residual)?,
+    let stream = || subject.stream(&coded, options.residual);
+    let bytes = match coded.left.last() {
+        Some(left) => {
+            let name = format!("residual of level {}", left.level);
+            let voxels = subject.skeleton.octree.level(left.level).len();
+            log.step(name, voxels, "voxels", stream)?
+        }
+        None => stream()?,
     };
     subject.checked(bytes, &coded.features, log)
 }
@@ -174,9 +177,15 @@ impl<'a> Subject<'a> {
             };
             Ok(coding.quantise(model.tables(), &real, rounding, slice))
         };
-        let filter = self.options.filter;
-        let mut correct =
-            |level: Level<'_>| corrections(self.cloud, model, filter, residual, level);
+        let Options {
+            filter,
+            every_level,
+            ..
+        } = *self.options;
+        let mut correct = |level: Level<'_>| {
+            let residual = residual && (level.finest || every_level);
+            corrections(self.cloud, model, filter, residual, level)
+        };
         let correct: Option<&mut Correct<'_>> = match filter || residual {
             true => Some(&mut correct),
             false => None,
@@ -188,11 +197,13 @@ impl<'a> Subject<'a> {
     fn stream(&self, coded: &Coded, residual: Residual) -> Result<Vec<u8>> {
         let precision = residual.precision(self.options.filter);
         let slice = self.options.slice_voxels as usize;
-        let payloads = coded.left.as_ref().zip(precision).and_then(|(left, told)| {
+        let payloads = |left: &Left| {
             let keys = self.skeleton.octree.level(left.level).keys();
-            left.payloads(keys, slice, told)
-        });
-        self.skeleton.stream(coded, payloads.as_deref())
+            let payloads = left.payloads(keys, slice, precision?)?;
+            Some((left.level, payloads))
+        };
+        let residuals: Vec<_> = coded.left.iter().filter_map(payloads).collect();
+        self.skeleton.stream(coded, &residuals)
     }
 
     /// The stream, once it has been decoded to what was encoded.

@@ -34,8 +34,8 @@ pub(crate) struct Coded {
     levels: Vec<CodedLevel>,
     /// The features of the last level.
     pub features: Vec<i16>,
-    /// What a residual would be of.
-    pub left: Option<Left>,
+    /// What residuals would be of, level by level.
+    pub left: Vec<Left>,
 }
 
 #[derive(Default)]
@@ -114,7 +114,7 @@ impl<'m> Skeleton<'m> {
         let mut coded = Coded {
             levels: Vec::new(),
             features: Vec::new(),
-            left: None,
+            left: Vec::new(),
         };
         let mut latent_bytes = 0;
         for (role, level) in levels.enumerate() {
@@ -164,20 +164,19 @@ impl<'m> Skeleton<'m> {
                     })
                 })?;
                 own.filters = found.filters;
-                coded.left = found.left;
+                coded.left.extend(found.left);
             }
             coded.levels.push(own);
         }
         Ok(coded)
     }
 
-    /// The stream of what was coded along it, with these payloads of a residual.
+    /// The stream of what was coded along it, with residuals of some levels, which have these payloads.
     ///
     /// # Errors
     /// Those of [`Writer`].
-    pub fn stream(&self, coded: &Coded, residual: Option<&[Vec<u8>]>) -> Result<Vec<u8>> {
+    pub fn stream(&self, coded: &Coded, residuals: &[(u8, Vec<Vec<u8>>)]) -> Result<Vec<u8>> {
         let mut writer = Writer::new(self.header.clone())?;
-        let corrected = coded.left.as_ref().map(|left| left.level);
         let levels = (self.header.base..).zip(self.geometry.iter().zip(&coded.levels));
         for (level, (geometry, own)) in levels {
             for (n, slices) in geometry {
@@ -189,7 +188,7 @@ impl<'m> Skeleton<'m> {
             for (heads, filter) in &own.filters {
                 writer.filter(level, *heads as usize, &filter.to_bytes())?;
             }
-            if let Some(slices) = residual.filter(|_| corrected == Some(level)) {
+            for (_, slices) in residuals.iter().filter(|(of, _)| *of == level) {
                 writer.residual(level, slices)?;
             }
         }

@@ -194,7 +194,7 @@ fn without_features(
         Ok(vec![0; voxels * latents])
     };
     let coded = skeleton.code(&mut zero, None, log)?;
-    skeleton.stream(&coded, None)
+    skeleton.stream(&coded, &[])
 }
 
 /// Of each level of a stream down to `finest`, its voxels, and the nanoseconds that it takes in the exact zone.
