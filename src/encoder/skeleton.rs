@@ -96,7 +96,7 @@ impl<'m> Skeleton<'m> {
     /// Codes latents along it, level by level.
     ///
     /// # Errors
-    /// Those of `latents` and of `correct`.
+    /// Those of [`Latents`] and of [`Correct`].
     pub fn code(
         &self,
         latents: &mut Latents<'_>,
