@@ -34,7 +34,7 @@ pub struct Options {
     /// Default: 1.
     pub bit_price: f32,
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
-    /// [`ColourFilter`].
+    /// [`ColourFilter`](crate::gaussians::ColourFilter).
     pub filter: bool,
     /// How much is coded of what colours are then still off those of the cloud. Default: [`Residual::Coarse`].
     pub residual: Residual,
