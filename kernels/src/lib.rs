@@ -50,4 +50,4 @@ pub use memory::{give_back, zeros};
 pub use plan::Plan;
 pub use rows::Output;
 pub use taps::{ABSENT, Taps};
-pub use work::Work;
+pub use work::{Baseline, Instructions, Work};

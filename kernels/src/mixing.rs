@@ -3,9 +3,7 @@
 //! An entry of a context is a word: the probability of a 1 in units of 2⁻¹⁶, from bit 16 on how often it was *seen*, from bit 24 on a check. Logits are in
 //! units of 1/64.
 
-use crate::isa::Isa;
-#[cfg(target_arch = "x86_64")]
-use crate::isa::Level;
+use crate::work::Instructions;
 
 /// How many contexts there are.
 pub const CONTEXTS: usize = 5;
@@ -34,8 +32,8 @@ pub struct Mixed {
 /// Mixes what `entries` say, of each if the low byte of `checks` is the entry's check: `((stretch[one >> 4] − logit)·⌊1024·seen / (4·seen + 1)⌋) >> 8`;
 /// the inputs of [`OTHERS`] are `logit` and `bias`.
 #[inline(always)]
-pub fn mix(
-    isa: Isa,
+pub fn mix<I: Instructions>(
+    _: I,
     entries: [u32; CONTEXTS],
     checks: [u32; CONTEXTS],
     [logit, bias]: [i32; 2],
@@ -49,11 +47,10 @@ pub fn mix(
         asked[i] = checks[i] as i32;
     }
     #[cfg(target_arch = "x86_64")]
-    if isa.level() >= Level::Avx2 {
-        // SAFETY: an `Isa` of this level is only made where the processor has AVX2.
+    if I::AVX2 {
+        // SAFETY: an `I` that has AVX2 is only made where the processor does.
         return unsafe { avx2::mix(said, asked, stretched, [logit, bias], weights) };
     }
-    let _ = isa;
     plain::mix(said, asked, stretched, [logit, bias], weights)
 }
 
@@ -61,22 +58,21 @@ pub fn mix(
 /// The result are the entries to come, for a bit of probability `truth`, 0 or 2¹⁶: each *seen* once more, up to [`MOST`], its probability, at first `first`,
 /// grown by `((truth − one)·⌊65536 / (4·seen + 1)⌋) >> 14`, within 16 to 65520.
 #[inline(always)]
-pub fn learn(
-    isa: Isa,
+pub fn learn<I: Instructions>(
+    _: I,
     mixed: &Mixed,
     error: i32,
     [truth, first]: [i32; 2],
     weights: &mut Lanes,
 ) -> [u32; CONTEXTS] {
     #[cfg(target_arch = "x86_64")]
-    let entries = match isa.level() >= Level::Avx2 {
-        // SAFETY: an `Isa` of this level is only made where the processor has AVX2.
+    let entries = match I::AVX2 {
+        // SAFETY: an `I` that has AVX2 is only made where the processor does.
         true => unsafe { avx2::learn(mixed, error, [truth, first], weights) },
         false => plain::learn(mixed, error, [truth, first], weights),
     };
     #[cfg(not(target_arch = "x86_64"))]
     let entries = plain::learn(mixed, error, [truth, first], weights);
-    let _ = isa;
     let mut first = [0; CONTEXTS];
     for (to, entry) in first.iter_mut().zip(entries) {
         *to = entry as u32;
@@ -273,16 +269,20 @@ mod avx2 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::work::Baseline;
+    #[cfg(target_arch = "x86_64")]
     use proptest::prelude::*;
 
+    #[cfg(target_arch = "x86_64")]
     fn an_entry() -> impl Strategy<Value = u32> {
         (16u32..=65_520, 0..=MOST as u32, 0u32..4)
             .prop_map(|(one, seen, check)| one | seen << 16 | check << 24)
     }
 
+    #[cfg(target_arch = "x86_64")]
     proptest! {
         #[test]
-        fn all_instruction_sets_mix_and_learn_alike(
+        fn avx2_mixes_and_learns_as_plain_code_does(
             entries in prop::array::uniform5(an_entry()),
             checks in prop::array::uniform5((0u32..4, any::<u32>()).prop_map(|(check, more)| check | more << 8)),
             logit in -720i32..=720,
@@ -291,40 +291,52 @@ mod tests {
             one in 1i32..65536,
             first in 1i32..65536,
         ) {
+            let Some(avx2) = crate::work::Avx2::here() else {
+                return Ok(());
+            };
             let stretch: [i16; 4096] = std::array::from_fn(|i| (i as i16 - 2048) / 3);
             let [a, b, c, d, e, f, g] = weights;
             let weights = [a, b, c, d, e, f, g, 0];
             let truth = if bit { 65536 } else { 0 };
-            let results = Isa::available().into_iter().map(|isa| {
-                let (mixed, mut learned) = (mix(isa, entries, checks, [logit, 20], &stretch, &weights), weights);
-                let entries = learn(isa, &mixed, truth - one, [truth, first], &mut learned);
-                (mixed.sum, entries, learned)
-            });
-            let results: Vec<_> = results.collect();
-            prop_assert!(results.iter().all(|result| *result == results[0]), "{:?}", results);
+            let [mixed, plain] = [
+                mix(avx2, entries, checks, [logit, 20], &stretch, &weights),
+                mix(Baseline, entries, checks, [logit, 20], &stretch, &weights),
+            ];
+            prop_assert_eq!(mixed.sum, plain.sum);
+            let (mut learned, mut expected) = (weights, weights);
+            let entries = learn(avx2, &mixed, truth - one, [truth, first], &mut learned);
+            prop_assert_eq!(entries, learn(Baseline, &plain, truth - one, [truth, first], &mut expected));
+            prop_assert_eq!(learned, expected);
+        }
+    }
+
+    fn every_count_gives_its_trust_and_its_rate_with<I: Instructions>(instructions: I) {
+        for seen in 0..=MOST {
+            let entry = 65_520 | (seen as u32) << 16;
+            let mut weights = [0, 0, 0, 0, 1, 0, 0, 0];
+            let (entries, checks) = ([entry; CONTEXTS], [0; CONTEXTS]);
+            let mixed = mix(
+                instructions,
+                entries,
+                checks,
+                [-256, 0],
+                &[0; 4096],
+                &weights,
+            );
+            assert_eq!(mixed.sum, 1024 * seen / (4 * seen + 1));
+            let next = learn(instructions, &mixed, 0, [0, 16384], &mut weights)[4];
+            let (one, count) = (if seen == 0 { 16384 } else { 65_520 }, (seen + 1).min(MOST));
+            let expected = one + ((-one * (65536 / (4 * count + 1))) >> 14);
+            assert_eq!(next, (expected.max(16) | count << 16) as u32);
         }
     }
 
     #[test]
-    fn every_count_gives_its_trust_and_its_rate_on_every_instruction_set() {
-        for isa in Isa::available() {
-            for seen in 0..=MOST {
-                let entry = 65_520 | (seen as u32) << 16;
-                let mut weights = [0, 0, 0, 0, 1, 0, 0, 0];
-                let mixed = mix(
-                    isa,
-                    [entry; CONTEXTS],
-                    [0; CONTEXTS],
-                    [-256, 0],
-                    &[0; 4096],
-                    &weights,
-                );
-                assert_eq!(mixed.sum, 1024 * seen / (4 * seen + 1), "{isa}");
-                let next = learn(isa, &mixed, 0, [0, 16384], &mut weights)[4];
-                let (one, count) = (if seen == 0 { 16384 } else { 65_520 }, (seen + 1).min(MOST));
-                let expected = one + ((-one * (65536 / (4 * count + 1))) >> 14);
-                assert_eq!(next, (expected.max(16) | count << 16) as u32, "{isa}");
-            }
+    fn every_count_gives_its_trust_and_its_rate() {
+        every_count_gives_its_trust_and_its_rate_with(Baseline);
+        #[cfg(target_arch = "x86_64")]
+        if let Some(avx2) = crate::work::Avx2::here() {
+            every_count_gives_its_trust_and_its_rate_with(avx2);
         }
     }
 }

@@ -12,8 +12,47 @@ pub trait Work {
     /// What comes of it.
     type Output;
 
-    /// Does it; `#[inline(always)]` in implementations.
-    fn run(self) -> Self::Output;
+    /// Does it, with these instructions; `#[inline(always)]` in implementations.
+    fn run<I: Instructions>(self, instructions: I) -> Self::Output;
+}
+
+/// What work is compiled for, and a licence for the kernels that it calls: a choice at run time would be made for each of them.
+pub trait Instructions: Copy + sealed::Sealed {
+    /// Whether there is AVX2.
+    const AVX2: bool;
+}
+
+/// What every processor of the target has.
+#[derive(Debug, Clone, Copy)]
+pub struct Baseline;
+
+/// AVX2 as well: made only where the processor has it.
+#[cfg(target_arch = "x86_64")]
+#[derive(Debug, Clone, Copy)]
+pub struct Avx2(());
+
+mod sealed {
+    pub trait Sealed {}
+}
+
+impl sealed::Sealed for Baseline {}
+impl Instructions for Baseline {
+    const AVX2: bool = false;
+}
+
+#[cfg(target_arch = "x86_64")]
+impl sealed::Sealed for Avx2 {}
+#[cfg(target_arch = "x86_64")]
+impl Instructions for Avx2 {
+    const AVX2: bool = true;
+}
+
+#[cfg(all(test, target_arch = "x86_64"))]
+impl Avx2 {
+    /// If the processor has it.
+    pub fn here() -> Option<Avx2> {
+        (Isa::detect().level() >= Level::Avx2).then_some(Avx2(()))
+    }
 }
 
 impl Isa {
@@ -28,14 +67,14 @@ impl Isa {
             Level::Avx512 | Level::Amx => return unsafe { avx512(work) },
         }
         // On AArch64 plain code uses NEON as it is.
-        work.run()
+        work.run(Baseline)
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
 fn avx2<W: Work>(work: W) -> W::Output {
-    work.run()
+    work.run(Avx2(()))
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -43,7 +82,7 @@ fn avx2<W: Work>(work: W) -> W::Output {
     enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni"
 )]
 fn avx512<W: Work>(work: W) -> W::Output {
-    work.run()
+    work.run(Avx2(()))
 }
 
 #[cfg(test)]
@@ -56,7 +95,7 @@ mod tests {
         type Output = i32;
 
         #[inline(always)]
-        fn run(self) -> i32 {
+        fn run<I: Instructions>(self, _: I) -> i32 {
             let products = self.0.iter().zip(self.1);
             products.fold(0, |sum, (&a, &b)| {
                 sum.wrapping_add(i32::from(a) * i32::from(b))
@@ -70,7 +109,7 @@ mod tests {
             .map(|i| (i * 7919 % 65_536) as u16 as i16)
             .collect();
         let b: Vec<i16> = a.iter().rev().copied().collect();
-        let expected = Sum(&a, &b).run();
+        let expected = Sum(&a, &b).run(Baseline);
         for isa in Isa::available() {
             assert_eq!(isa.run(Sum(&a, &b)), expected, "{isa}");
         }

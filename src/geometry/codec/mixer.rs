@@ -17,7 +17,7 @@
 
 use super::coder::ONE;
 use super::probability::{STRETCH, squash};
-use b2p_kernels::Isa;
+use b2p_kernels::Instructions;
 use b2p_kernels::mixing::{self, CONTEXTS, Lanes, OTHERS};
 
 /// The input that is always the same.
@@ -25,8 +25,8 @@ const BIAS: i32 = 20;
 
 /// What a slice has shown, and the weights of it.
 #[derive(Debug)]
-pub(super) struct Mixer {
-    isa: Isa,
+pub(super) struct Mixer<I> {
+    instructions: I,
     tables: Vec<u32>,
     /// Entries of a table are 2 to this.
     bits: u32,
@@ -43,15 +43,15 @@ pub(super) struct Mixed {
     pub one: u32,
 }
 
-impl Mixer {
+impl<I: Instructions> Mixer<I> {
     /// That of a slice of so many parents.
-    pub fn new(isa: Isa, parents: usize) -> Self {
+    pub fn new(instructions: I, parents: usize) -> Self {
         let entries = parents.next_power_of_two().max(16);
         let mut weights = [0; 8];
         weights[..CONTEXTS].fill(9830);
         weights[OTHERS[0]] = 1 << 16;
         Mixer {
-            isa,
+            instructions,
             tables: vec![0; CONTEXTS * entries],
             bits: entries.ilog2(),
             weights,
@@ -69,7 +69,14 @@ impl Mixer {
             checks[i] = hash as u32;
         }
         let inputs = [logit, BIAS];
-        let mixed = mixing::mix(self.isa, entries, checks, inputs, &STRETCH, &self.weights);
+        let mixed = mixing::mix(
+            self.instructions,
+            entries,
+            checks,
+            inputs,
+            &STRETCH,
+            &self.weights,
+        );
         let one = squash(mixed.sum >> 16);
         Mixed { at, mixed, one }
     }
@@ -80,7 +87,7 @@ impl Mixer {
         let truth = if bit { ONE as i32 } else { 0 };
         let (error, truths) = (truth - mixed.one as i32, [truth, network as i32]);
         let weights = &mut self.weights;
-        let entries = mixing::learn(self.isa, &mixed.mixed, error, truths, weights);
+        let entries = mixing::learn(self.instructions, &mixed.mixed, error, truths, weights);
         for (at, entry) in mixed.at.into_iter().zip(entries) {
             self.tables[at] = entry;
         }
@@ -91,6 +98,7 @@ impl Mixer {
 mod tests {
     use super::*;
     use crate::entropy::test_tables::Random;
+    use b2p_kernels::Baseline;
     use b2p_kernels::mixing::HEAVIEST;
 
     /// What a bit costs, in bits.
@@ -101,7 +109,7 @@ mod tests {
 
     /// Bits per decision that a network without a clue and one with the mixer behind it take, where the first context tells all but `noise` in 100.
     fn costs(noise: u64, network: i32) -> [f64; 2] {
-        let (mut mixer, mut random) = (Mixer::new(Isa::detect(), 1 << 12), Random(5));
+        let (mut mixer, mut random) = (Mixer::new(Baseline, 1 << 12), Random(5));
         let mut sums = [0.0; 2];
         for _ in 0..4000 {
             let context = random.next() % 64;
@@ -134,7 +142,7 @@ mod tests {
 
     #[test]
     fn nothing_seen_changes_nothing() {
-        let mixer = Mixer::new(Isa::detect(), 1);
+        let mixer = Mixer::new(Baseline, 1);
         for logit in [-384, -1, 0, 77] {
             assert_eq!(mixer.predict(logit, [3; CONTEXTS]).one, squash(logit));
         }
@@ -142,7 +150,7 @@ mod tests {
 
     #[test]
     fn extremes_stay_within_their_ranges() {
-        let mut mixer = Mixer::new(Isa::detect(), 4);
+        let mut mixer = Mixer::new(Baseline, 4);
         for i in 0..5000u64 {
             let logit = if i % 2 == 0 { -720 } else { 720 };
             let mixed = mixer.predict(logit, [(i % 3) << 60; CONTEXTS]);
@@ -160,7 +168,7 @@ mod tests {
     #[test]
     fn tables_grow_with_the_slice() {
         for (parents, bits) in [(1, 4), (16, 4), (17, 5), (16_384, 14)] {
-            let mixer = Mixer::new(Isa::detect(), parents);
+            let mixer = Mixer::new(Baseline, parents);
             assert_eq!((mixer.bits, mixer.tables.len()), (bits, CONTEXTS << bits));
         }
     }

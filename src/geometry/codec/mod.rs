@@ -33,7 +33,7 @@ use super::{KernelMap, Octree};
 use crate::bitstream::Slice;
 use crate::cancel::Cancel;
 use crate::error::{Error, Result, Stage};
-use b2p_kernels::{Isa, Work};
+use b2p_kernels::{Instructions, Isa, Work};
 use coder::{Decoder, Encoder};
 use neighbourhood::Neighbourhood;
 use predictor::Predictor;
@@ -63,7 +63,6 @@ pub fn encode_level(
     let encode = |parents: Range<usize>| {
         let masks = &occupancy[parents.clone()];
         let work = Encode {
-            isa,
             map,
             parents,
             masks,
@@ -89,7 +88,6 @@ pub fn decode_slice(
     slice: &Slice,
 ) -> Result<Vec<u8>> {
     let masks = isa.run(Decode {
-        isa,
         level,
         map,
         parents: parents.clone(),
@@ -145,7 +143,6 @@ pub fn decode_level(
 
 /// Codes the occupancies of one slice.
 struct Encode<'a> {
-    isa: Isa,
     map: &'a KernelMap,
     parents: Range<usize>,
     masks: &'a [u8],
@@ -155,14 +152,14 @@ impl Work for Encode<'_> {
     type Output = Vec<u8>;
 
     #[inline(always)]
-    fn run(self) -> Vec<u8> {
+    fn run<I: Instructions>(self, instructions: I) -> Vec<u8> {
         let Encode {
-            isa,
             map,
             parents,
             masks,
         } = self;
-        let (mut predictor, mut encoder) = (Predictor::new(isa, parents.len()), Encoder::new());
+        let (mut predictor, mut encoder) =
+            (Predictor::new(instructions, parents.len()), Encoder::new());
         let around = Neighbourhood::of_all(map, &parents);
         for ((here, &mask), around) in parents.clone().zip(masks).zip(around) {
             predictor.code(
@@ -180,7 +177,6 @@ impl Work for Encode<'_> {
 
 /// Decodes the occupancies of one slice, unless they come to more than its voxels.
 struct Decode<'a> {
-    isa: Isa,
     level: u8,
     map: &'a KernelMap,
     parents: Range<usize>,
@@ -191,15 +187,14 @@ impl Work for Decode<'_> {
     type Output = Result<Vec<u8>>;
 
     #[inline(always)]
-    fn run(self) -> Result<Vec<u8>> {
+    fn run<I: Instructions>(self, instructions: I) -> Result<Vec<u8>> {
         let Decode {
-            isa,
             level,
             map,
             parents,
             slice,
         } = self;
-        let mut predictor = Predictor::new(isa, parents.len());
+        let mut predictor = Predictor::new(instructions, parents.len());
         let mut decoder = Decoder::new(slice.bytes, slice.offset);
         let mut masks = Vec::with_capacity(parents.len());
         let mut found = 0;

@@ -14,7 +14,7 @@ use super::neighbourhood::{Neighbourhood, ones};
 use super::network::Network;
 use super::probability::{LIMIT, squash};
 use super::surroundings::Surroundings;
-use b2p_kernels::Isa;
+use b2p_kernels::Instructions;
 use b2p_kernels::hidden::{self, Row};
 
 /// Σ hidden·output is in units of 2^−12 of the logit's.
@@ -26,22 +26,22 @@ const SURPRISE: i32 = 4096;
 
 /// The state of one entropy stream.
 #[derive(Debug)]
-pub(super) struct Predictor {
-    isa: Isa,
+pub(super) struct Predictor<I> {
+    instructions: I,
     network: &'static Network,
-    mixer: Mixer,
+    mixer: Mixer<I>,
     output: [Row; 8],
     bias: [i32; 8],
 }
 
-impl Predictor {
+impl<I: Instructions> Predictor<I> {
     /// That of a slice of so many parents.
-    pub fn new(isa: Isa, parents: usize) -> Self {
+    pub fn new(instructions: I, parents: usize) -> Self {
         let network = Network::get();
         Predictor {
-            isa,
+            instructions,
             network,
-            mixer: Mixer::new(isa, parents),
+            mixer: Mixer::new(instructions, parents),
             output: network.output,
             bias: network.bias,
         }
@@ -80,7 +80,7 @@ impl Predictor {
             }
         }
         around.sum_up(neighbours);
-        let facts = hidden::add_up(self.isa, &rows[..count]);
+        let facts = hidden::add_up(self.instructions, &rows[..count]);
         let mut coded = 0u8;
         for octant in 0..8 {
             if octant == 7 && coded == 0 {
@@ -88,7 +88,7 @@ impl Predictor {
             }
             let node = 1 << octant | usize::from(coded);
             let row = self.network.node(node);
-            let sum = hidden::sum(self.isa, &facts, row, &self.output[octant]);
+            let sum = hidden::sum(self.instructions, &facts, row, &self.output[octant]);
             let sum = self.bias[octant].wrapping_add(sum);
             let logit = (sum >> SHIFT).clamp(-LIMIT, LIMIT);
             let network = squash(logit);
@@ -115,7 +115,13 @@ impl Predictor {
             if error.abs() >= SURPRISE {
                 let e = error / 64;
                 self.bias[octant] = self.bias[octant].wrapping_add(4 * e);
-                hidden::learn(self.isa, &facts, row, e as i16, &mut self.output[octant]);
+                hidden::learn(
+                    self.instructions,
+                    &facts,
+                    row,
+                    e as i16,
+                    &mut self.output[octant],
+                );
             }
         }
         coded
