@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 use b2p::Limits;
-use b2p::cloud::{PointCloud, voxelise};
+use b2p::cloud::{PointCloud, voxelise, voxelise_closed};
 use b2p::entropy::UNPREDICTED;
 use b2p::gaussians::Gaussians;
 use b2p::geometry::{KernelMap, Octree, Voxels};
@@ -115,6 +115,12 @@ pub fn ply(bytes: &[u8]) {
         if let Ok(voxels) = voxelise(&cloud, None) {
             assert_eq!(voxels.voxels.len(), voxels.colours.len());
             assert!(voxels.voxels.len() <= cloud.positions.len());
+            // A coarser grid may be larger than numbers can express.
+            if let Ok((closed, depth)) = voxelise_closed(&cloud) {
+                assert_eq!(depth, voxels.voxels.depth());
+                assert!(closed.voxels.depth() <= depth);
+                assert!(closed.voxels.len() <= voxels.voxels.len());
+            }
         }
     }
     if let Ok(gaussians) = Gaussians::from_ply(bytes, &limits) {
