@@ -1,5 +1,7 @@
 //! Which voxels of a slice lie near each other, one or two away along any of the axes.
 
+use crate::geometry::ones;
+
 /// The voxels of a slice, by their parents.
 #[derive(Debug)]
 pub(super) struct Nearby {
@@ -152,27 +154,25 @@ impl Nearby {
     #[inline]
     pub fn before(&self, voxel: usize, mut visit: impl FnMut(Near)) {
         let (octant, own) = self.voxels[voxel];
-        let octant = u32::from(octant);
+        let octant = usize::from(octant);
         let around = &self.around[own as usize];
-        for tap in bits(around.present & WITH_ONE_AWAY[octant as usize]) {
-            let parent = self.parents[around.numbers[tap as usize] as usize];
-            for other in bits(u32::from(
-                ONE_AWAY[octant as usize][tap as usize] & parent.mask,
-            )) {
+        for tap in ones(around.present & WITH_ONE_AWAY[octant]) {
+            let parent = self.parents[around.numbers[tap] as usize];
+            for other in ones(u32::from(ONE_AWAY[octant][tap] & parent.mask)) {
                 visit(Near {
                     voxel: parent.child(other),
                     two: false,
-                    axes: u32::from(ONES[(octant ^ other) as usize]),
+                    axes: u32::from(ONES[octant ^ other]),
                 });
             }
         }
-        for tap in bits(around.earlier) {
-            let parent = self.parents[around.numbers[tap as usize] as usize];
+        for tap in ones(around.earlier) {
+            let parent = self.parents[around.numbers[tap] as usize];
             if parent.mask >> octant & 1 == 1 {
                 visit(Near {
                     voxel: parent.child(octant),
                     two: true,
-                    axes: u32::from(AXES[tap as usize]),
+                    axes: u32::from(AXES[tap]),
                 });
             }
         }
@@ -181,18 +181,9 @@ impl Nearby {
 
 impl Parent {
     /// The number of the voxel in an octant, or of the one after it.
-    fn child(self, octant: u32) -> usize {
+    fn child(self, octant: usize) -> usize {
         (self.first + (BELOW[usize::from(self.mask)] >> (4 * octant) & 7)) as usize
     }
-}
-
-/// Which bits are set, from the lowest on.
-fn bits(mut word: u32) -> impl Iterator<Item = u32> {
-    std::iter::from_fn(move || {
-        let bit = (word != 0).then(|| word.trailing_zeros());
-        word &= word.wrapping_sub(1);
-        bit
-    })
 }
 
 /// The bits of an axis of a key, one less, as they are, or one more for a step of 0, 1 or 2. Beyond the cube no key is that of a parent.

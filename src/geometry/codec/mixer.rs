@@ -6,13 +6,13 @@
 //! probability of a 1 in units of 2⁻¹⁶. An entry that was never used, or has another check, begins anew when it is met: seen 0 times.
 //!
 //! # Prediction
-//! Logits are in units of 1/64. From the network's `s` seven inputs: `s` itself, [`BIAS`], and for each context
+//! Logits are in units of 1/64. From the network's `s` seven inputs: `s` itself, 20, and for each context
 //! `((stretch(one) − s)·⌊1024·seen / (4·seen + 1)⌋) >> 8`, which is 0 for what was never seen. Their products with seven weights are summed (`i32`, wrapping); the
 //! logit is the sum `>> 16`, the probability `squash` of it. Weights start with 65536, 0, and five of 9830.
 //!
 //! # Learning
 //! With `error = 65536·bit − probability`, each weight grows by `(3·error·input + 32768) >> 16`, and stays within ±131072. In the entry of each context, `one`, if it was never seen, first is the probability of
-//! the network alone; then `seen` grows by 1, to [`MOST`] at most, and `one` by `((65536·bit − one)·⌊65536 / (4·seen + 1)⌋) >> 14`, within 16 to 65520.
+//! the network alone; then `seen` grows by 1, to 30 at most, and `one` by `((65536·bit − one)·⌊65536 / (4·seen + 1)⌋) >> 14`, within 16 to 65520.
 //! All shifts of negative numbers round down.
 
 use super::coder::ONE;

@@ -81,15 +81,3 @@ fn occupied(row: &[u32]) -> u32 {
     let there = |(k, &index)| u32::from(index != KernelMap::ABSENT) << k;
     row.iter().enumerate().map(there).sum()
 }
-
-/// The places of the ones in a mask, ascending.
-#[inline(always)]
-pub(super) fn ones(mut mask: u32) -> impl Iterator<Item = usize> {
-    std::iter::from_fn(move || {
-        let place = mask.trailing_zeros() as usize;
-        (mask != 0).then(|| {
-            mask &= mask - 1;
-            place
-        })
-    })
-}

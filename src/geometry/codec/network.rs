@@ -18,8 +18,8 @@
 //! the known row (`i8`), then the child rows (`i8`), octant 0 first; the 255 rows of the children (`i8`); one output row (`i16`) for
 //! each octant; eight output biases (`i32`).
 
-use super::neighbourhood::{MAY_BE_EARLIER, Neighbourhood, ones};
-use crate::geometry::KernelMap;
+use super::neighbourhood::{MAY_BE_EARLIER, Neighbourhood};
+use crate::geometry::{KernelMap, ones};
 pub use b2p_kernels::hidden::WIDTH;
 use b2p_kernels::hidden::{Narrow, Row};
 use std::ops::Range;

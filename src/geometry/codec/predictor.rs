@@ -10,10 +10,11 @@
 
 use super::coder::{Coder, ONE};
 use super::mixer::Mixer;
-use super::neighbourhood::{Neighbourhood, ones};
+use super::neighbourhood::Neighbourhood;
 use super::network::Network;
 use super::probability::{LIMIT, squash};
 use super::surroundings::Surroundings;
+use crate::geometry::ones;
 use b2p_kernels::Instructions;
 use b2p_kernels::hidden::{self, Row};
 

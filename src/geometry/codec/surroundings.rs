@@ -193,9 +193,8 @@ fn hash(h: u64, word: u64) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::neighbourhood::ones;
     use super::*;
-    use crate::geometry::{Octree, Voxels, morton};
+    use crate::geometry::{Octree, Voxels, morton, ones};
     use proptest::prelude::*;
     use std::ops::Range;
 
