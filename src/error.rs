@@ -15,6 +15,8 @@ pub enum Stage {
     Geometry,
     /// The latents.
     Entropy,
+    /// The transform coefficients.
+    Colour,
     /// The model file and the layers.
     Network,
     /// Gaussians in memory or in a PLY file.
@@ -29,6 +31,7 @@ impl std::fmt::Display for Stage {
             Stage::Bitstream => "bitstream",
             Stage::Geometry => "geometry",
             Stage::Entropy => "entropy",
+            Stage::Colour => "colour",
             Stage::Network => "network",
             Stage::Gaussians => "gaussians",
             Stage::Cloud => "cloud",
@@ -82,11 +85,19 @@ pub enum Error {
         /// The id of the loaded model, hexadecimal.
         found: String,
     },
-    /// Checksums and model agree, yet the decoded latents do not: encoder or decoder did not compute exactly.
+    /// A stream of version 2 was to be decoded without a model.
+    #[error("the stream was coded with model {expected}, and no model is loaded")]
+    ModelMissing {
+        /// The id in the stream, hexadecimal.
+        expected: String,
+    },
+    /// Checksums and model agree, yet what was decoded does not: encoder or decoder did not compute exactly.
     #[error(
-        "latents of level {level} hash to {found:#018x}, the stream says {expected:#018x}: encoder and decoder did not compute the same"
+        "{what} of level {level} hash to {found:#018x}, the stream says {expected:#018x}: encoder and decoder did not compute the same"
     )]
     DeterminismMismatch {
+        /// What was decoded: latents or colours.
+        what: &'static str,
         /// The octree level.
         level: u8,
         /// The hash in the stream.

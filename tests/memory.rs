@@ -4,7 +4,7 @@ mod common;
 
 use std::sync::Mutex;
 
-use b2p::bitstream::Header;
+use b2p::bitstream::{Format, Header};
 use b2p::cloud::ColouredVoxels;
 use b2p::decoder::Decoder;
 use b2p::encoder::{Options, Residual, encode};
@@ -172,13 +172,13 @@ fn a_bomb_of_a_hundred_bytes_reserves_nothing() {
         top: 20,
         points: 1 << 26,
         placement: b2p::Placement::VOXEL_GRID,
-        model: model.id(),
+        format: Format::Learned { model: model.id() },
         slice_voxels: 1,
         voxels: vec![1 << 26; 3],
         sections: vec![
             b2p::bitstream::Section {
                 geometry: u32::MAX,
-                features: u32::MAX
+                colours: u32::MAX
             };
             3
         ],

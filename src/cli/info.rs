@@ -15,9 +15,9 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
     let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
     let header = stream.header();
     let whole = stream.levels().len();
-    let model: String = header.model.iter().map(|b| format!("{b:02x}")).collect();
+    let model = header.model().unwrap_or_default();
     let at_hand = load::from_file(args.model.as_deref())?;
-    let known = (at_hand.id() == header.model).then(|| {
+    let known = header.check_model(&at_hand.id()).is_ok().then(|| {
         let shape = at_hand.shape();
         let heads: Vec<_> = shape.heads().iter().map(ToString::to_string).collect();
         (shape.name.clone(), heads)
@@ -47,7 +47,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
                     "level": level,
                     "voxels": voxels,
                     "geometry_bytes": section.geometry,
-                    "feature_bytes": section.features,
+                    "feature_bytes": section.colours,
                     "residual_bytes": residual(i),
                     "residual_steps": precision(i).map(|told| json!({
                         "fine": [told.fine.luma, told.fine.chroma],
@@ -94,7 +94,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             format!("{level}{missing}"),
             count(voxels.into()),
             count(section.geometry.into()),
-            count(section.features.into()),
+            count(section.colours.into()),
             residual(i).map_or("?".into(), |bytes| count(bytes as u64)),
             precision(i).map_or("-".into(), told),
             bpp(prefix),

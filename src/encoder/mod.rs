@@ -10,7 +10,7 @@ use std::ops::RangeInclusive;
 use b2p_kernels::f16;
 use rayon::prelude::*;
 
-use crate::bitstream::{Header, MAX_SLICE_VOXELS};
+use crate::bitstream::{Format, Header, MAX_SLICE_VOXELS};
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
 use crate::entropy::{Coding, Rounding};
@@ -149,7 +149,7 @@ impl<'a> Subject<'a> {
             top,
             points: cloud.voxels.len() as u64,
             placement: cloud.placement,
-            model: model.id(),
+            format: Format::Learned { model: model.id() },
             slice_voxels: options.slice_voxels,
             voxels: Vec::new(),
             sections: Vec::new(),
@@ -228,7 +228,7 @@ impl<'a> Subject<'a> {
                 level,
                 voxels: voxels as usize,
                 geometry_bytes: section.geometry as usize,
-                feature_bytes: section.features as usize,
+                feature_bytes: section.colours as usize,
             })
             .collect();
         Ok(Encoded { bytes, rates })

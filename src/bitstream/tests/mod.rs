@@ -1,6 +1,6 @@
 mod colours;
 
-use super::chunk::{CHUNK_HEADER, Chunk, ChunkKind};
+use super::chunk::{Chunk, ChunkKind, Form};
 use super::*;
 use crate::error::{Error, Result};
 use crate::{Limits, Placement};
@@ -17,12 +17,17 @@ fn header() -> Header {
             origin: [1.5, -2.0, 1e-3],
             voxel_size: 0.25,
         },
-        model: *b"0123456789abcdef",
+        format: Format::Learned {
+            model: *b"0123456789abcdef",
+        },
         slice_voxels: 4,
         voxels: vec![3, 10, 20],
         sections: vec![],
     }
 }
+
+/// Bytes of a chunk of version 2 before its payload.
+const CHUNK_HEADER: usize = 16;
 
 const HASHES: [u64; 3] = [11, u64::MAX, 0x0123_4567_89ab_cdef];
 
@@ -302,8 +307,9 @@ fn unknown_critical_things_are_refused_and_unknown_others_passed_over() {
             count: 0,
             payload: b"a note",
             offset: 0,
+            payload_at: 0,
         };
-        chunk.write(&[], &mut extra).unwrap();
+        chunk.write(Form::Fixed, &[], &mut extra).unwrap();
         let mut longer = [&bytes[..at], &extra, &bytes[at..]].concat();
         longer[96] += extra.len() as u8;
         seal_header(&mut longer);
