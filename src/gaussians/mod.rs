@@ -5,6 +5,7 @@ mod filter;
 mod harmonics;
 mod heads;
 mod residual;
+pub mod surfels;
 
 pub use filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundings};
 pub use harmonics::Harmonics;
