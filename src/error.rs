@@ -13,6 +13,8 @@ pub enum Stage {
     Bitstream,
     /// The octree.
     Geometry,
+    /// The colours of voxels.
+    Colour,
     /// The latents.
     Entropy,
     /// The transform coefficients.
@@ -30,6 +32,7 @@ impl std::fmt::Display for Stage {
         f.write_str(match self {
             Stage::Bitstream => "bitstream",
             Stage::Geometry => "geometry",
+            Stage::Colour => "colour",
             Stage::Entropy => "entropy",
             Stage::Colour => "colour",
             Stage::Network => "network",
