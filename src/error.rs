@@ -17,8 +17,6 @@ pub enum Stage {
     Colour,
     /// The latents.
     Entropy,
-    /// The transform coefficients.
-    Colour,
     /// The model file and the layers.
     Network,
     /// Gaussians in memory or in a PLY file.
@@ -34,7 +32,6 @@ impl std::fmt::Display for Stage {
             Stage::Geometry => "geometry",
             Stage::Colour => "colour",
             Stage::Entropy => "entropy",
-            Stage::Colour => "colour",
             Stage::Network => "network",
             Stage::Gaussians => "gaussians",
             Stage::Cloud => "cloud",
@@ -144,10 +141,10 @@ pub enum Error {
         /// What it may hold.
         expected: String,
     },
-    /// Of the streams that the encoder may choose from, none is as small as was asked for. Fewer levels take less, and so does a model that was trained for
-    /// fewer bits.
+    /// Of the streams that the encoder may choose from, none is as small as was asked for. Coarser levels take less, and so does, of learned
+    /// streams, a model that was trained for fewer bits.
     #[error(
-        "{asked} bits per point are too few: of this cloud's levels, with this model, the least is {:.4}",
+        "{asked} bits per point are too few: the smallest stream of these levels has {:.4}",
         (least * 1e4).ceil() / 1e4
     )]
     TooFewBits {

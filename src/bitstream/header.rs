@@ -62,6 +62,12 @@ impl Format {
     }
 }
 
+/// The major version of a stream that starts with these bytes; `None` if they are too few or none of a stream's.
+pub fn version(bytes: &[u8]) -> Option<u16> {
+    let rest = bytes.strip_prefix(&MAGIC)?;
+    Some(u16::from_le_bytes([*rest.first()?, *rest.get(1)?]))
+}
+
 /// The header of a stream.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Header {

@@ -48,7 +48,7 @@
 //! times the number of parents. A code, in the trunk or in a chunk, is that of a slice in [`crate::geometry::codec`].
 //!
 //! The colour section of level L starts with the colour trunk, slice 0: its level K, 0 ≤ K ≤ L, says that it holds the colours of the levels 0
-//! to K, its count is the voxels of level K. Then follow the chunks of the levels K + 1 to L, and in any other level's section those of this level alone.
+//! to K, its count is the voxels of level K, at most 65,536. Then follow the chunks of the levels K + 1 to L, and in any other level's section those of this level alone.
 //! Level ℓ has a chunk for every C voxels of level ℓ − 1 (the last one for what is left), slices numbered from 0; its count is that of these
 //! parents. The payload of a section's first chunk is preceded by u64: XXH3-64 of the colours of the section's level as decoded, before the
 //! filter, red, green, blue of one voxel after the other, a byte each. At the end of the section may stand the colour filter of its level, slice 0, whose count is the
@@ -83,10 +83,10 @@ mod stream;
 mod transform;
 mod writer;
 
-pub use header::{Format, Header, MAGIC, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Section};
+pub use header::{Format, Header, MAGIC, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Section, version};
 pub use reader::{Reader, put_varint};
 pub use stream::{Geometry, Level, Slice, Stream};
-pub use transform::{ColourLevel, Colours, Trunk};
+pub use transform::{ColourLevel, Colours, MAX_TRUNK_VOXELS, Trunk};
 pub use writer::Writer;
 
 use crate::error::{Error, Stage};

@@ -7,6 +7,9 @@ use super::reader::Reader;
 use super::stream::{Counts, Geometry, Slice, sliced};
 use crate::error::Result;
 
+/// The most voxels of the last level of a colour trunk.
+pub const MAX_TRUNK_VOXELS: u32 = 65_536;
+
 /// The colours of a level as transform coefficients.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Colours<'a> {
@@ -174,6 +177,11 @@ fn take_colour_trunk<'a>(
     let expected = voxels(chunk.level);
     if u64::from(chunk.count) != expected {
         let field = "voxel count of the colour trunk";
+        return Err(malformed(chunk.offset, field, chunk.count, expected));
+    }
+    if chunk.level > 0 && chunk.count > MAX_TRUNK_VOXELS {
+        let field = "voxel count of the colour trunk";
+        let expected = format!("at most {MAX_TRUNK_VOXELS}");
         return Err(malformed(chunk.offset, field, chunk.count, expected));
     }
     let skip = take_hash(&chunk, hash)?;

@@ -131,7 +131,7 @@ impl Chosen {
     pub fn detail(&self) -> DetailArg {
         DetailArg {
             level: Some(self.choice.level),
-            heads: self.choice.heads,
+            heads: Some(self.choice.heads.into()),
         }
     }
 

@@ -97,6 +97,14 @@ pub struct Model {
     c_scale: Vec<f32>,
 }
 
+impl std::fmt::Debug for Model {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Model")
+            .field("id", &self.id)
+            .finish_non_exhaustive()
+    }
+}
+
 impl Model {
     /// Loads a model file.
     ///

@@ -284,7 +284,7 @@ fn unknown_critical_things_are_refused_and_unknown_others_passed_over() {
         matches!(parse(&bytes), Err(Error::Unsupported { .. }))
     };
     assert!(refused(8, 1), "an earlier major version");
-    assert!(refused(8, 3), "a later major version");
+    assert!(refused(8, 4), "a later major version");
     assert!(!refused(10, 9), "minor version");
     assert!(refused(15, 0x80), "critical flag");
     assert!(!refused(16, 0xff), "optional flag");
