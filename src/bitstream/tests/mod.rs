@@ -1,4 +1,5 @@
 mod colours;
+mod transform;
 
 use super::chunk::{Chunk, ChunkKind, Form};
 use super::*;
