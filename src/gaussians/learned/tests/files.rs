@@ -30,7 +30,7 @@ fn a_description_out_of_range_is_refused_with_the_field() {
             json!(1u64 << 40),
             "parent_blocks",
         ),
-        (&format!("{set}/child_blocks"), json!(2), "range child.1.a"),
+        (&format!("{set}/child_blocks"), json!(2), "range child.1."),
         (&format!("{set}/gaussians"), json!(8), "gaussians"),
         (&format!("{set}/ranges/parent.in"), json!(0), "range"),
         (&format!("{set}/ranges/parent.in"), json!(-2), "range"),

@@ -7,6 +7,8 @@ use crate::gaussians::Gaussians;
 use crate::geometry::Voxels;
 
 type Rows = Vec<Vec<f64>>;
+/// How large the outputs of layers get, by the layers' names.
+pub type Ranges = BTreeMap<String, f64>;
 
 /// A level's voxels and where each is.
 struct Level<'a> {
@@ -47,16 +49,28 @@ impl Made {
         (0..level.voxels.len()).map(row).collect()
     }
 
-    fn blocks(&self, side: &str, count: usize, level: &Level<'_>, mut x: Rows) -> Rows {
+    fn blocks(&self, side: &str, level: &Level<'_>, mut x: Rows, seen: &mut Ranges) -> Rows {
+        let count = self.blocks[usize::from(side == "child")];
+        note(seen, format!("{side}.in"), &x);
         for i in 0..count {
             let inner = relu(self.conv3(&format!("{side}.{i}.a"), level, &x));
+            note(seen, format!("{side}.{i}.a"), &inner);
             x = relu(sum(
                 &x,
                 &self.conv3(&format!("{side}.{i}.b"), level, &inner),
             ));
+            note(seen, format!("{side}.{i}.b"), &x);
         }
         x
     }
+}
+
+fn note(seen: &mut Ranges, layer: String, rows: &Rows) {
+    let largest = rows
+        .iter()
+        .flatten()
+        .fold(0.0f64, |most, v| most.max(v.abs()));
+    seen.insert(layer, largest);
 }
 
 /// Adds `x · weights` to `out`.
@@ -88,7 +102,7 @@ fn luma_chroma([r, g, b]: [u8; 3]) -> [f64; 3] {
     ]
 }
 
-fn raw(made: &Made, input: &LevelInput<'_>) -> Rows {
+fn raw(made: &Made, input: &LevelInput<'_>, seen: &mut Ranges) -> Rows {
     let octree = input.octree;
     let above = Level::new(octree.level(input.level - 1));
     let here = Level::new(octree.level(input.level));
@@ -102,7 +116,7 @@ fn raw(made: &Made, input: &LevelInput<'_>) -> Rows {
         bits.chain(luma_chroma(colour)).chain([s]).collect()
     });
     let h = relu(made.conv3("parent.in", &above, &parents.collect()));
-    let h = made.blocks("parent", made.blocks[0], &above, h);
+    let h = made.blocks("parent", &above, h, seen);
 
     let of = |i: usize| above.places[&here.voxels.coordinate(i).map(|v| i64::from(v / 2))];
     let children = input.colours.iter().enumerate().map(|(i, &colour)| {
@@ -124,18 +138,19 @@ fn raw(made: &Made, input: &LevelInput<'_>) -> Rows {
         &made.conv3("child.in", &here, &children.collect()),
         &up,
     ));
-    let x = made.blocks("child", made.blocks[1], &here, x);
+    let x = made.blocks("child", &here, x, seen);
     made.conv3("out", &here, &x)
 }
 
-/// The Gaussians of a level, none left out.
-pub fn gaussians(made: &Made, input: &LevelInput<'_>) -> Gaussians {
+/// The Gaussians of a level, none left out, and how large activations get.
+pub fn gaussians(made: &Made, input: &LevelInput<'_>) -> (Gaussians, Ranges) {
     let voxels = input.octree.level(input.level);
     let k = made.set.1;
     let voxel = 2.0 / f64::from(1u32 << input.level);
     let unit = if k == 8 { voxel / 2.0 } else { voxel };
     let mut out = Gaussians::default();
-    for (i, raw) in raw(made, input).iter().enumerate() {
+    let mut seen = Ranges::new();
+    for (i, raw) in raw(made, input, &mut seen).iter().enumerate() {
         let corner = voxels.coordinate(i).map(|v| f64::from(v) * voxel - 1.0);
         let decoded = input.colours[i].map(|v| f64::from(v) / 255.0);
         for (octant, raw) in raw.chunks(RAW).enumerate() {
@@ -165,5 +180,5 @@ pub fn gaussians(made: &Made, input: &LevelInput<'_>) -> Gaussians {
             out.colour.push(colour.map(|v| v as f32));
         }
     }
-    out
+    (out, seen)
 }
