@@ -4,6 +4,7 @@ mod activations;
 mod filter;
 mod harmonics;
 mod heads;
+pub mod learned;
 mod residual;
 pub mod surfels;
 

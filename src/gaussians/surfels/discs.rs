@@ -5,7 +5,7 @@ use super::moments::{Around, PAIRS};
 use super::normals::normals;
 
 /// σ in the plane, in voxels, of a disc that faces along an axis. Voxels of other planes lie closer together.
-const RADIUS: f32 = 0.62;
+const RADIUS: f32 = 0.6;
 /// σ across, in voxels.
 const THICKNESS: f32 = 0.01;
 /// σ of the round blob that a lone voxel becomes, in voxels.
@@ -14,7 +14,7 @@ const BLOB: f32 = 0.4;
 const SURFACE: f32 = 0.6;
 /// How far the fitted plane of a curved surface is corrected towards that of the nearest voxels. The means of a cap lie under it by half its
 /// curvature times their variance; a part of that is left, as a disc stands over the surface around the point where it touches.
-const UNCURVED: f32 = 0.4;
+const UNCURVED: f32 = 0.3;
 
 /// A voxel's disc, in voxels, relative to the voxel's centre.
 #[derive(Debug, Clone, Copy, PartialEq)]

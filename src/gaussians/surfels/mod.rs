@@ -95,7 +95,11 @@ pub fn surfels(
         .zip(gaussians.scale.par_chunks_mut(block))
         .zip(gaussians.rotation.par_chunks_mut(block))
         .zip(gaussians.colour.par_chunks_mut(block))
-        .zip(near.par_chunks(BLOCK).zip(far.par_chunks(BLOCK)))
+        .zip(
+            near[..voxels.len()]
+                .par_chunks(BLOCK)
+                .zip(far.par_chunks(BLOCK)),
+        )
         .enumerate()
         .for_each(
             |(b, ((((position, scale), rotation), colour), (near, far)))| {

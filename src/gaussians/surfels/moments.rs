@@ -21,7 +21,7 @@ pub type Moments = [u16; 16];
 /// Voxels that one task handles.
 const BLOCK: usize = 1024;
 
-/// The moments of each voxel alone.
+/// The moments of each voxel alone, and zeros at the end.
 pub fn of_voxels(voxels: &Voxels) -> Vec<Moments> {
     let of_voxel = |i: usize| {
         let [x, y, z] = voxels.coordinate(i).map(|v| v as u16);
@@ -34,14 +34,16 @@ pub fn of_voxels(voxels: &Voxels) -> Vec<Moments> {
         moments[7..10].copy_from_slice(&products);
         moments
     };
-    let range = (0..voxels.len()).into_par_iter().with_min_len(BLOCK);
-    range.map(of_voxel).collect()
+    let mut moments: Vec<Moments> = zeros(voxels.len() + 1);
+    let alone = moments[..voxels.len()].par_iter_mut().with_min_len(BLOCK);
+    alone.enumerate().for_each(|(i, to)| *to = of_voxel(i));
+    moments
 }
 
-/// One step: for every voxel the sum over those of its 27 neighbours that are there.
+/// One step: for every voxel the sum over those of its 27 neighbours that are there, and zeros at the end.
 pub fn step(isa: Isa, map: &KernelMap, from: &[Moments]) -> Vec<Moments> {
     let mut to: Vec<Moments> = zeros(from.len());
-    let blocks = to.par_chunks_mut(BLOCK);
+    let blocks = to[..map.len()].par_chunks_mut(BLOCK);
     blocks
         .zip(map.rows().par_chunks(27 * BLOCK))
         .for_each(|(to, rows)| isa.run(passes::Sum { from, rows, to }));

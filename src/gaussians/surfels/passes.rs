@@ -5,10 +5,10 @@ use b2p_kernels::{Instructions, Work};
 use super::discs::{Disc, discs};
 use super::lanes::GROUP;
 use super::moments::{Moments, around};
-use crate::geometry::KernelMap;
 
 /// Sums of moments over neighbours.
 pub struct Sum<'a> {
+    /// One of each voxel, and zeros at the end for neighbours that are not there.
     pub from: &'a [Moments],
     /// 27 indices for each row of `to`.
     pub rows: &'a [u32],
@@ -20,14 +20,14 @@ impl Work for Sum<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
+        let nothing = self.from.len() - 1;
         for (to, row) in self.to.iter_mut().zip(self.rows.chunks_exact(27)) {
             let mut sum = [0u16; 16];
             for &q in row {
-                if q != KernelMap::ABSENT {
-                    let from = &self.from[q as usize];
-                    for (sum, value) in sum.iter_mut().zip(from) {
-                        *sum = sum.wrapping_add(*value);
-                    }
+                // No branch: which neighbours are there cannot be predicted.
+                let from = &self.from[nothing.min(q as usize)];
+                for (sum, value) in sum.iter_mut().zip(from) {
+                    *sum = sum.wrapping_add(*value);
                 }
             }
             *to = sum;

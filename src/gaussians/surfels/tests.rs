@@ -107,7 +107,7 @@ proptest! {
                         }
                     }
                 }
-                let height = product(mean, n) + 0.4 * (product(near, n) - product(mean, n));
+                let height = product(mean, n) + 0.3 * (product(near, n) - product(mean, n));
                 for axis in 0..3 {
                     let centre = f64::from(disc.centre[axis]);
                     prop_assert!((centre - height * n[axis]).abs() < 1e-4);
