@@ -353,11 +353,14 @@ pub struct DetailArg {
     /// streams have none) [default: the best there are]
     #[arg(long, value_name = "NAME")]
     pub heads: Option<HeadSet>,
+    /// Gaussians that learned heads make of a voxel, 1 or 8, of streams of version 3 [default: 1 at the finest two levels, else 8]
+    #[arg(long, value_name = "N", value_parser = per_voxel)]
+    pub per_voxel: Option<usize>,
 }
 
 #[derive(Debug, Clone, Args)]
 pub struct ModelArg {
-    /// Model file [default: the one inside the program]
+    /// Model file: of learned streams the model that they were coded with [default: the one inside the program], of others heads
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
     /// Use no better instructions than these: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
@@ -415,6 +418,14 @@ fn step(text: &str) -> Result<f32, String> {
     match text.parse() {
         Ok(step) if (0.5..=1000.0).contains(&step) => Ok(step),
         _ => Err("expected a number from 0.5 to 1000 such as 16".into()),
+    }
+}
+
+fn per_voxel(text: &str) -> Result<usize, String> {
+    match text {
+        "1" => Ok(1),
+        "8" => Ok(8),
+        _ => Err("expected 1 or 8".into()),
     }
 }
 

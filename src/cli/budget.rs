@@ -132,6 +132,7 @@ impl Chosen {
         DetailArg {
             level: Some(self.choice.level),
             heads: Some(self.choice.heads.into()),
+            per_voxel: None,
         }
     }
 

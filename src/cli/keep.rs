@@ -174,5 +174,6 @@ fn no_detail() -> DetailArg {
     DetailArg {
         level: None,
         heads: None,
+        per_voxel: None,
     }
 }

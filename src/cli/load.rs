@@ -5,7 +5,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use b2p::bitstream::version;
-use b2p::decoder::StreamDecoder;
+use b2p::decoder::{HeadSet, StreamDecoder};
+use b2p::gaussians::learned::HeadsModel;
 use b2p::gaussians::{Frame, Gaussians, ply};
 use b2p::log::Log;
 use b2p::network::Model;
@@ -53,8 +54,20 @@ pub fn decoder(
     if let Some(heads) = detail.heads {
         decoder = decoder.with_heads(heads);
     }
+    if let Some(count) = detail.per_voxel {
+        decoder = decoder.with_per_voxel(count);
+    }
     if version(bytes) == Some(2) {
-        decoder = decoder.with_model(Arc::new(model(model_arg)?));
+        return Ok(decoder.with_model(Arc::new(model(model_arg)?)));
+    }
+    if let Some(name) = &model_arg.precision {
+        decoder = decoder.with_precision(name.parse()?);
+    }
+    if let Some(path) = &model_arg.model
+        && detail.heads != Some(HeadSet::Surfels)
+    {
+        let heads = HeadsModel::open(path).map_err(Failure::in_file(path))?;
+        decoder = decoder.with_heads_model(Arc::new(heads));
     }
     Ok(decoder)
 }

@@ -2,7 +2,7 @@
 
 use std::ops::Deref;
 
-use super::{Decoder, HeadSet};
+use super::Decoder;
 use crate::bitstream::{Header, MAX_TRUNK_VOXELS};
 use crate::colour::Coloured;
 use crate::error::Result;
@@ -88,14 +88,14 @@ const COLOURS: u64 = 3 * Coloured::bytes_per_voxel() as u64 + 3 + 3 * 3;
 /// Bytes of the sums that surfels are made of.
 const SURFEL: u64 = 200;
 
-/// Bytes of memory that decoding a stream of version 3 with this header down to `level` takes at most, its Gaussians included, beyond
-/// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and a model's own.
+/// Bytes of memory that decoding the colours of a stream of version 3 with this header down to `level` takes at most, beyond
+/// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD).
 ///
 /// That is linear in the voxels, but for what slices of colours learn, one on each thread.
 ///
 /// # Errors
 /// [`crate::Error::Usage`] if the stream has no such level.
-pub(super) fn transform(header: &Header, level: u8, heads: HeadSet) -> Result<u64> {
+pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
     let stream = SLICES * header.prefix_bytes(level)?;
     let levels = usize::from(level - header.base) + 1;
     let counts = || header.voxels[..levels].iter().copied().map(u64::from);
@@ -113,9 +113,10 @@ pub(super) fn transform(header: &Header, level: u8, heads: HeadSet) -> Result<u6
     let slices = parents.div_ceil(header.colour_slice().into());
     let learned = 2 + slices.min(rayon::current_num_threads() as u64);
     let colours = (parents + voxels) * (MAP + COLOURS) + learned * Coloured::learned_bytes() as u64;
-    let drawing = match heads.learned() {
-        None => voxels * (SURFEL + GAUSSIAN),
-        Some(_) => voxels * (SURFEL + GAUSSIAN),
-    };
-    Ok(stream + octree + trunk + colours + drawing)
+    Ok(stream + octree + trunk + colours)
+}
+
+/// Bytes that making surfels of so many voxels takes at most, themselves included.
+pub(super) fn surfels(voxels: u64) -> u64 {
+    voxels * (SURFEL + GAUSSIAN)
 }

@@ -18,12 +18,13 @@ use crate::cancel::Cancel;
 #[cfg(feature = "ply")]
 use crate::cloud::{ColouredVoxels, PointCloud};
 use crate::error::{Error, Result};
+use crate::gaussians::learned::{HeadsModel, LevelInput, Set};
 use crate::gaussians::surfels::{PerVoxel, surfels};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::Voxels;
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::{Heads, Model};
+use crate::network::{Heads, Model, Precision};
 #[cfg(feature = "ply")]
 use crate::placement::Placement;
 #[cfg(feature = "render")]
@@ -96,6 +97,10 @@ pub struct StreamDecoder {
     model: Option<Arc<Model>>,
     /// Asked for; otherwise the best there are.
     heads: Option<HeadSet>,
+    heads_model: Option<Arc<HeadsModel>>,
+    /// Gaussians a voxel, if asked for.
+    per_voxel: Option<usize>,
+    precision: Precision,
     isa: Option<Isa>,
     limits: Limits,
     cancel: Cancel,
@@ -146,6 +151,25 @@ impl StreamDecoder {
     /// [`Error::Unsupported`].
     pub fn with_heads(mut self, heads: HeadSet) -> Self {
         self.heads = Some(heads);
+        self
+    }
+
+    /// The same decoder, which draws streams of version 3 with the heads of this model.
+    pub fn with_heads_model(mut self, heads: Arc<HeadsModel>) -> Self {
+        self.heads_model = Some(heads);
+        self
+    }
+
+    /// The same decoder, whose learned heads of streams of version 3 make so many Gaussians of a voxel, 1 or 8. By default it is one where
+    /// voxels are at most twice as wide as those of the cloud, else eight.
+    pub fn with_per_voxel(mut self, count: usize) -> Self {
+        self.per_voxel = Some(count);
+        self
+    }
+
+    /// The same decoder, whose learned heads of streams of version 3 calculate in this precision. Models of version 2 have their own.
+    pub fn with_precision(mut self, precision: Precision) -> Self {
+        self.precision = precision;
         self
     }
 
@@ -244,7 +268,10 @@ impl StreamDecoder {
     pub fn memory(&self, header: &Header, level: u8) -> Result<u64> {
         match header.format {
             Format::Learned { .. } => self.learned(header)?.memory(header, level),
-            Format::Transform { .. } => super::memory::transform(header, level, self.heads()),
+            Format::Transform { .. } => {
+                let drawing = self.drawing_bytes(header, level)?;
+                Ok(drawing + super::memory::transform(header, level)?)
+            }
         }
     }
 
@@ -275,7 +302,49 @@ impl StreamDecoder {
 
     /// The heads that draw streams of version 3.
     pub(super) fn heads(&self) -> HeadSet {
-        self.heads.unwrap_or_default()
+        let has = |heads: &HeadSet| {
+            let own = self.heads_model.iter().flat_map(|model| model.sets());
+            let own = own.map(|(heads, _)| HeadSet::from(heads));
+            own.into_iter().any(|own| own == *heads)
+        };
+        let best = HeadSet::ALL.into_iter().find(has);
+        self.heads.or(best).unwrap_or_default()
+    }
+
+    /// The network that draws a level of a stream of version 3; none if it is drawn as surfels.
+    fn network(&self, header: &Header, level: u8) -> Result<Option<(&HeadsModel, Set)>> {
+        let Some(heads) = self.heads().learned() else {
+            return Ok(None);
+        };
+        let Some(model) = &self.heads_model else {
+            return Err(Error::Unsupported {
+                what: "drawing with learned heads",
+                detail: format!("no file of them is loaded, which the {heads} heads are in"),
+            });
+        };
+        let wide = level + 1 < header.bits;
+        let wanted = self.per_voxel.unwrap_or(if wide { 8 } else { 1 });
+        let has = |count| model.sets().any(|set| set == (heads, count));
+        let count = match self.per_voxel {
+            // What the model has not, it will say itself.
+            Some(count) => count,
+            None if has(wanted) => wanted,
+            None => 9 - wanted,
+        };
+        Ok(Some((model, (heads, count))))
+    }
+
+    /// Bytes of memory that making Gaussians of a level takes at most.
+    fn drawing_bytes(&self, header: &Header, level: u8) -> Result<u64> {
+        let voxels = header.voxels(level)?.into();
+        let above = match level > header.base {
+            true => header.voxels(level - 1)?.into(),
+            false => voxels,
+        };
+        Ok(match self.network(header, level)? {
+            Some((model, set)) => model.bytes(set, voxels, above),
+            None => super::memory::surfels(voxels),
+        })
     }
 
     pub(super) fn isa(&self) -> Isa {
@@ -299,6 +368,7 @@ impl StreamDecoder {
     /// Fails with [`Error::Unsupported`] unless `level` of a stream of version 3 can be drawn.
     pub(super) fn check_drawable(&self, header: &Header, level: u8) -> Result<()> {
         header.voxels(level)?;
+        self.network(header, level)?;
         match self.drawable(header).any(|l| l == level) {
             true => Ok(()),
             false => Err(Error::Unsupported {
@@ -330,11 +400,28 @@ impl StreamDecoder {
     }
 
     /// The Gaussians of a level of a stream of version 3.
-    pub(super) fn generate(&self, reached: &Reached, frame: Frame) -> Result<Gaussians> {
-        let voxels = reached.octree.level(reached.level);
+    pub(super) fn generate(&self, header: &Header, reached: &Reached) -> Result<Gaussians> {
+        let frame = Frame {
+            bits: header.bits,
+            placement: header.placement,
+        };
+        let (octree, level) = (&reached.octree, reached.level);
         let (map, colours) = (&reached.map, &reached.colours);
-        let per_voxel = PerVoxel::One;
-        Ok(surfels(self.isa(), voxels, map, colours, per_voxel, frame))
+        let network = self.network(header, level)?;
+        let (Some((model, set)), Some(above)) = (network, &reached.above_map) else {
+            let (voxels, per_voxel) = (octree.level(level), PerVoxel::One);
+            return Ok(surfels(self.isa(), voxels, map, colours, per_voxel, frame));
+        };
+        let input = LevelInput {
+            octree,
+            level,
+            map,
+            above,
+            colours,
+            colours_above: &reached.colours_above,
+            luma_step: reached.coloured.steps().luma_step(),
+        };
+        model.generate(self.isa(), self.precision, set, input, frame)
     }
 }
 
@@ -447,7 +534,9 @@ impl<'b> StreamDecoding<'b> {
         match (&mut self.state, &self.decoder.model, heads.learned()) {
             (State::Learned(decoding), ..) => decoding.set_heads(learned_heads(Some(heads))?)?,
             // Known before the stream is.
-            (State::Start(_), Some(model), Some(heads)) => model.check_heads(heads)?,
+            (State::Start(_), Some(model), Some(heads)) if self.decoder.heads_model.is_none() => {
+                model.check_heads(heads)?;
+            }
             _ => {}
         }
         self.decoder.heads = Some(heads);
@@ -455,6 +544,14 @@ impl<'b> StreamDecoding<'b> {
             decoding.decoder.heads = Some(heads);
         }
         Ok(())
+    }
+
+    /// Draws streams of version 3 with the heads of this model from now on; what has been decoded stays.
+    pub fn set_heads_model(&mut self, heads: Arc<HeadsModel>) {
+        if let State::Transform(decoding) = &mut self.state {
+            decoding.decoder.heads_model = Some(Arc::clone(&heads));
+        }
+        self.decoder.heads_model = Some(heads);
     }
 
     /// Whether the level reached has Gaussians: [`StreamDecoding::gaussians`] will not fail with [`Error::Unsupported`].

@@ -10,7 +10,7 @@ use super::stream::StreamDecoder;
 use crate::bitstream::{Colours, Header, Level, Trunk};
 use crate::colour::{self, Coloured};
 use crate::error::{Error, Result};
-use crate::gaussians::{Frame, Gaussians};
+use crate::gaussians::Gaussians;
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
 
@@ -129,14 +129,10 @@ impl<'b> Transform<'b> {
         decoder.check_drawable(header, reached.level)?;
         decoder.check_memory(header, reached.level)?;
         decoder.cancel().check()?;
-        let frame = Frame {
-            bits: header.bits,
-            placement: header.placement,
-        };
         let set = decoder.heads();
         let name = format!("Gaussians of level {}, {set}", reached.level);
         let voxels = reached.octree.level(reached.level).len();
-        log.step(name, voxels, "voxels", || decoder.generate(reached, frame))
+        log.step(name, voxels, "voxels", || decoder.generate(header, reached))
     }
 }
 

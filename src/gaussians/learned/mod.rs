@@ -77,6 +77,15 @@ pub struct LevelInput<'a> {
     pub luma_step: f32,
 }
 
+impl std::fmt::Debug for HeadsModel {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let sets: Vec<Set> = self.sets().collect();
+        f.debug_struct("HeadsModel")
+            .field("sets", &sets)
+            .finish_non_exhaustive()
+    }
+}
+
 impl HeadsModel {
     /// Loads a model file.
     ///
