@@ -9,6 +9,7 @@ fn header() -> Header {
     Header {
         format: Format::Transform { colour_slice: 3 },
         bits: 4,
+        points: 20,
         slice_voxels: 2,
         ..super::header()
     }
