@@ -255,7 +255,8 @@ impl Responses {
     }
 }
 
-/// Weights by least squares, in units of 1/16, of normal equations with `terms` on both sides of the products.
+/// Weights in units of 1/16 that solve the normal equations `a·x = b`.
+#[allow(clippy::needless_range_loop)] // elimination, as it is written
 #[cfg(feature = "encoder")]
 pub(super) fn solve(mut a: [[f64; TERMS]; TERMS], mut b: [f64; TERMS]) -> [i8; TERMS] {
     let trace: f64 = (0..TERMS).map(|i| a[i][i]).sum();
