@@ -82,6 +82,11 @@ impl Coloured {
     pub const fn bytes_per_voxel() -> usize {
         size_of::<Ycc>() + size_of::<[u8; 3]>()
     }
+
+    /// Bytes of what a slice learns.
+    pub const fn learned_bytes() -> usize {
+        Model::BYTES
+    }
 }
 
 /// K: how deep the trunk of a stream is whose first level is `base`; `voxels` tells how many a level has.
@@ -192,6 +197,7 @@ pub fn decode_level(
     }
     let decode = |(range, payload): (Range<usize>, &Slice)| {
         cancel.check()?;
+        let first = range.start == 0;
         let (coding, rest) = read_coding(payload, SLICE_FIXED)?;
         if coding.steps.is_lossless() != above.steps.is_lossless() {
             let at = format!("byte {}, level {level}", payload.offset);
@@ -221,6 +227,8 @@ pub fn decode_level(
             "byte {}, colours of level {level}",
             payload.offset
         ))?;
+        // Nothing begins with what the others have learned.
+        let model = if first { model } else { Model::empty() };
         Ok((coding.steps, coded, model))
     };
     let tasks: Vec<_> = ranges.zip(payloads).collect();

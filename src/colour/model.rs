@@ -188,6 +188,11 @@ pub(super) struct Mixed {
 }
 
 impl Model {
+    /// Bytes of memory that it takes.
+    pub const BYTES: usize = (STARTS[CONTEXTS] + SIGN_STARTS[SIGN_CONTEXTS]) * size_of::<u32>()
+        + KINDS * (1 + UNIT_CLASSES + 12) * size_of::<Lanes>()
+        + size_of::<Model>();
+
     /// Nothing, to take the place of one that has been taken out.
     pub fn empty() -> Model {
         Model {
