@@ -122,6 +122,12 @@ def place(own, coords, gaussians):
     return 2 * (anchor + unit * offset), ops.covariance(2 * unit * sigma, rotation), alpha, Clamp.apply(colour)
 
 
+def visible(gaussians, least=1 / 255):
+    """Those of at least this opacity: what training draws, as most of eight a voxel vanish."""
+    keep = (gaussians[2] >= least).nonzero()[:, 0]
+    return gaussians if len(keep) == len(gaussians[2]) else [t[keep] for t in gaussians]
+
+
 class Clamp(torch.autograd.Function):
     """Clamps to 0..1; a gradient that leads back inside passes."""
 

@@ -125,8 +125,29 @@ def quantise(x, step, rounding):
     return np.sign(x) * np.floor(np.abs(x) / step + rounding) * step
 
 
+def smooth(values, table, truth, step):
+    """One pass of a fitted bilateral filter: differences to neighbours, bounded at two multiples of the step, weighted by least squares per channel."""
+    near = {1: ([], 1.0), 2: ([], 0.6), 3: ([], 0.35)}  # faces, edges, corners
+    for tap, offset in enumerate(ops.OFFSETS3.numpy()):
+        if np.abs(offset).sum():
+            near[int(np.abs(offset).sum())][0].append(tap)
+    terms = {}
+    for kind, (taps, weight) in near.items():
+        rows = table[taps]
+        d = np.where(rows[:, :, None] >= 0, values[rows] - values, 0)
+        for k in (0.4, 1.6):
+            terms[kind, k] = weight / 16 * (d / (1 + (d / (k * step)) ** 2)).sum(0)
+    five = [terms[1, 0.4], terms[2, 0.4], terms[3, 0.4], terms[1, 1.6], terms[2, 1.6] + terms[3, 1.6]]
+    out = values.copy()
+    for c in range(3):
+        a = np.stack([t[:, c] for t in five], 1)
+        out[:, c] += a @ np.linalg.lstsq(a.T @ a + 1e-3 * np.eye(5), a.T @ (truth[:, c] - values[:, c]), rcond=None)[0]
+    return out
+
+
 def decoded_colours(tree, role, step, rng):
-    """{role: u8 [n, 3]} of `role` and the one above, as if coded with luma's `step` at `role`, half of it above, and so on. Step 1: the true ones, rounded."""
+    """{role: u8 [n, 3]} of `role` and the one above, as if coded with luma's `step` at `role`, half of it above, and so on, and `role` filtered twice.
+    Step 1: the true ones, rounded."""
     to_bytes = lambda rgb: np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
     if step <= 1:
         return {k: to_bytes(tree.colours[k]) for k in (role - 1, role)}
@@ -143,6 +164,9 @@ def decoded_colours(tree, role, step, rng):
         size = np.maximum(chroma / 2 ** (role - r), 1)
         coded = [g[0] * gain + quantise(s[0] - g[0] * gain, size, rounding) for s, g in zip(steps, guess)]
         values = inverse(steps, coded, values)[there]
+        if r == role:
+            for _ in range(2):
+                values = smooth(values, tree.map[r].table.numpy(), forward_ycc(tree.colours[r]), size)
         if r >= role - 1:
             out[r] = to_bytes(inverse_ycc(values))
     return out
