@@ -11,7 +11,7 @@ from safetensors import safe_open
 import data
 import ops
 from export_heads import main as export
-from heads import Head, draw, parameters, place
+from heads import Head, draw, parameters, per_voxel, place
 from octree_samples import Sample, Tree, decoded_colours, inverse, transform
 
 SHAPES = [{"channels": 16, "parent_blocks": 1, "child_blocks": 1, "gaussians": k} for k in (1, 8)]
@@ -29,7 +29,7 @@ def gradients(head, sample, role):
     above, here, rgb = sample.tree.head_inputs(role, decoded_colours(sample.tree, role, 8.0, np.random.default_rng(0)), 8.0)
     level, k = sample.tree.level(role), head.shape["gaussians"]
     raw = head(above, here, level)
-    image = draw(place(parameters(raw, rgb, k), level.coords, k), sample.cameras, 2 ** (3 - role) / 2, torch.ones(len(sample.cameras), 3), 40)
+    image = draw(place(parameters(raw, rgb, k), level.coords, k), sample.cameras, 2 ** (3 - role) / per_voxel(k), torch.ones(len(sample.cameras), 3), 40)
     (image.pow(2).mean() + raw.pow(2).mean()).backward()
     return raw.detach(), image.detach(), {n: p.grad.clone() for n, p in head.named_parameters()}
 

@@ -1,7 +1,7 @@
 """Writes heads as a model file: export_heads.py OUT.safetensors best.1=CHECKPOINT … --samples A.safetensors,…
 
-Tensors are f16, named `best.1.parent.in.weight` and so on. The metadata's `b2p-heads` is JSON: `version`, `blur` (what Gaussians are widened by, in units
-of half a voxel, squared) and `sets`, of each the shape and `ranges`: of every layer but the last the magnitude that one activation in 10,000 exceeds,
+Tensors are f16, named `best.1.parent.in.weight` and so on. The metadata's `b2p-heads` is JSON: `version`, `blur` (what Gaussians are widened by, in squares
+of half their unit: of half a voxel, or a quarter of one where there are eight a voxel) and `sets`, of each the shape and `ranges`: of every layer but the last the magnitude that one activation in 10,000 exceeds,
 over the samples at several quantisation steps.
 """
 

@@ -12,8 +12,8 @@ from layers import initial
 
 PARENT_CHANNELS, CHILD_CHANNELS, RAW = 12, 7, 14
 SCALE_BIAS, OPACITY_BIAS = -0.31, 2.0
-# What Gaussians are widened by, in units of half a voxel of the drawn level, squared.
-BLUR = ops.VOXEL_BLUR
+# What Gaussians are widened by, in squares of half their unit: half a voxel of the level, or a quarter where there are eight a voxel.
+BLUR = 0.075
 
 
 class Conv3(nn.Module):
@@ -115,11 +115,17 @@ def anchors(coords, gaussians):
     return (coords[:, None] + (octant + 0.5) / 2).reshape(-1, 3), 0.5
 
 
+def per_voxel(gaussians):
+    """How many of the splatter's units a voxel has, so that what that widens by is `BLUR`."""
+    return (2 if gaussians == 1 else 4) * (ops.VOXEL_BLUR / BLUR) ** 0.5
+
+
 def place(own, coords, gaussians):
-    """Gaussians that the splatter draws, in units of half a voxel, from `parameters`."""
+    """Gaussians that the splatter draws, `per_voxel` units a voxel, from `parameters`."""
     offset, sigma, rotation, alpha, colour = own
     anchor, unit = anchors(coords.to(offset.dtype), gaussians)
-    return 2 * (anchor + unit * offset), ops.covariance(2 * unit * sigma, rotation), alpha, Clamp.apply(colour)
+    times = per_voxel(gaussians)
+    return times * (anchor + unit * offset), ops.covariance(times * unit * sigma, rotation), alpha, Clamp.apply(colour)
 
 
 def visible(gaussians, least=1 / 255):
@@ -142,8 +148,8 @@ class Clamp(torch.autograd.Function):
         return dy * ~((x < 0) & (dy > 0) | (x > 1) & (dy < 0))
 
 
-def draw(gaussians, cameras, finest_per_half, background, size):
-    """Pictures of Gaussians in units of half a voxel; cameras count in finest voxels, of which half a voxel has `finest_per_half`."""
+def draw(gaussians, cameras, finest, background, size):
+    """Pictures of Gaussians; cameras count in finest voxels, of which the Gaussians' unit has `finest`."""
     cameras = cameras.clone()
-    cameras[:, 9:12] /= finest_per_half
+    cameras[:, 9:12] /= finest
     return ops.splat(*gaussians, cameras, background, size, size)

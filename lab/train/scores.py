@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from scipy.spatial import cKDTree
 
-from heads import Head, draw, parameters, place
+from heads import Head, draw, parameters, per_voxel, place
 from octree_samples import Sample, decoded_colours
 
 
@@ -18,10 +18,10 @@ def psnr(mse):
     return -10 * float(np.log10(max(mse, 1e-10)))
 
 
-def score(gaussians, sample, finest_per_half):
+def score(gaussians, sample, finest):
     """Whole and foreground PSNR over white at the 2x2 average, rounded to bytes, of all pictures of a sample."""
     cameras, image, coverage = sample.pictures(np.arange(len(sample.cameras)))
-    seen = draw(gaussians, cameras, finest_per_half, torch.ones(len(image), 3), image.shape[-1])
+    seen = draw(gaussians, cameras, finest, torch.ones(len(image), 3), image.shape[-1])
     truth, mask = F.avg_pool2d(image + (1 - coverage), 2), F.avg_pool2d(coverage, 2) > 0.5
     seen = (F.avg_pool2d(seen, 2).clamp(0, 1) * 255).round() / 255
     e = (seen - truth).pow(2)
@@ -42,10 +42,10 @@ def surfels(coords, rgb, neighbours=40, sigma=0.42, thin=0.05):
 
 
 def taught(sample, role, rgb, gaussians):
-    """The teacher's shapes with decoded colours, in units of half a voxel of what it draws: that is what it was trained to be widened by."""
+    """The teacher's shapes with decoded colours, in the finest voxels that it was trained to be widened by."""
     own = parameters(sample.taught[f"raw.{role}"].float(), rgb, gaussians)
     mean, cov, alpha, _ = place(own, torch.from_numpy(sample.tree.coords[role]), gaussians)
-    times = 1 if gaussians == 1 else 2
+    times = 2 ** (3 - role) / per_voxel(gaussians)
     return mean * times, cov * times**2, alpha, rgb.repeat_interleave(gaussians, 0)
 
 
@@ -60,16 +60,17 @@ def compare(sample, step, heads, baselines):
             continue
         decoded = decoded_colours(sample.tree, role, step, np.random.default_rng(0))
         above, here, rgb = sample.tree.head_inputs(role, decoded, step)
-        level, finest = sample.tree.level(role), 2 ** (3 - role) / 2
+        level, voxel = sample.tree.level(role), 2 ** (3 - role)
+        finest = voxel / per_voxel(k)
         for name, head in mine.items():
             own = parameters(head(above, here, level), rgb, k)
             out[name] = score(place(own, level.coords, k), sample, finest)
             decoded_only = place((*own[:4], rgb.repeat_interleave(k, 0)), level.coords, k)
             out[name + " shapes"] = score(decoded_only, sample, finest)
         if baselines:
-            out[f"surfels of {role}"] = score(surfels(level.coords, rgb), sample, finest)
+            out[f"surfels of {role}"] = score(surfels(level.coords, rgb), sample, voxel / 2)
             if sample.taught:
-                out[f"teacher of {role}"] = score(taught(sample, role, rgb, k), sample, finest if k == 1 else finest / 2)
+                out[f"teacher of {role}"] = score(taught(sample, role, rgb, k), sample, 1)
     return out
 
 

@@ -14,7 +14,7 @@ import time
 import numpy as np
 import torch
 
-from heads import Head, draw, parameters, place, visible
+from heads import Head, draw, parameters, per_voxel, place, visible
 from octree_samples import Sample, decoded_colours
 from train import atomic_save, distortion, imitation, keep_memory
 
@@ -126,7 +126,7 @@ class Trainer:
         loss, info = own[0].new_zeros(()), {"role": role, "voxels": len(rgb)}
         if drawing:
             background = torch.rand(len(image), 3)
-            seen = draw(visible(place(own, level.coords, self.gaussians)), cameras, 2 ** (3 - role) / 2, background, image.shape[-1])
+            seen = draw(visible(place(own, level.coords, self.gaussians)), cameras, 2 ** (3 - role) / per_voxel(self.gaussians), background, image.shape[-1])
             truth = image + (1 - coverage) * background[:, :, None, None]
             loss = loss + distortion(seen, truth, self.args.pyramid, self.args.square)
             info |= {"d": loss.item(), "mse": (seen - truth).pow(2).mean().item()}
