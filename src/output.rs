@@ -1,10 +1,13 @@
-//! Files that appear whole or not at all.
+//! Output files that appear whole or not at all.
 //!
-//! A file is written beside its destination under a temporary name and renamed when complete. Temporary files of writes under
-//! way are listed, so that a program that is interrupted can remove them before it exits ([`remove_unfinished`]).
+//! A regular file is written under a temporary name in the same folder, synchronised, and renamed when complete. A symbolic link
+//! stays: the file that it points to is replaced. Devices, FIFOs and other files that are not regular are written into directly,
+//! because a rename would put a regular file in their place. Temporary files of writes in progress are listed, so that an
+//! interrupted program can remove them before it exits ([`remove_unfinished`]).
 
-use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::fs::{File, Metadata, OpenOptions};
+use std::hash::{BuildHasher, Hasher, RandomState};
+use std::io::{self, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
@@ -12,51 +15,149 @@ use crate::error::{Error, Result};
 
 static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
-/// Writes `path` through `fill`: whole, or not at all.
+/// Symbolic links that are followed, one after the other; Linux has the same limit.
+const MAX_LINKS: usize = 40;
+/// Random names that are tried before giving up.
+const MAX_NAMES: usize = 16;
+
+/// Writes `path` through `fill`. A regular file, or one that does not exist yet, appears whole or not at all; what is written into
+/// a device or a FIFO cannot be taken back.
 ///
 /// # Errors
-/// [`Error::Io`] naming `path`, or whatever `fill` fails with; the destination is then as it was.
+/// [`Error::Io`] naming `path`, or whatever `fill` fails with; a regular file is then as it was.
 pub fn write_file(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let temporary = Temporary::beside(path);
     let io = |source| Error::Io {
         path: path.to_owned(),
         source,
     };
-    let file = File::create(&temporary.path).map_err(io)?;
-    let mut writer = BufWriter::with_capacity(1 << 16, file);
-    fill(&mut writer)?;
-    let file = writer.into_inner().map_err(|e| io(e.into_error()))?;
-    file.sync_all().map_err(io)?;
-    drop(file);
-    std::fs::rename(&temporary.path, path).map_err(io)
+    match Target::of(path).map_err(io)? {
+        Target::Open(file) => write_all(file, fill, io).map(drop),
+        Target::Replace { path: to, existing } => {
+            let (mut temporary, file) = Temporary::beside(&to).map_err(io)?;
+            let file = write_all(file, fill, io)?;
+            if let Some(existing) = existing {
+                // The contents matter more than the mode, which some file systems do not have.
+                let _ = file.set_permissions(existing.permissions());
+            }
+            file.sync_all().map_err(io)?;
+            drop(file);
+            temporary.rename(&to).map_err(io)
+        }
+    }
 }
 
-/// Removes the temporary files of all writes under way; for a handler that ends the process.
+/// Removes the temporary files of all writes in progress; for a handler that ends the process.
 pub fn remove_unfinished() {
     for path in lock().iter() {
-        // The file may not exist yet, and the process is ending: there is nobody left to tell.
+        // The process is ending: there is nobody left to tell.
         let _ = std::fs::remove_file(path);
     }
 }
 
+fn write_all(
+    file: File,
+    fill: impl FnOnce(&mut dyn Write) -> Result<()>,
+    io: impl Fn(io::Error) -> Error,
+) -> Result<File> {
+    let mut writer = BufWriter::with_capacity(1 << 16, file);
+    fill(&mut writer)?;
+    writer.into_inner().map_err(|e| io(e.into_error()))
+}
+
+/// How an output path is written.
+enum Target {
+    /// Directly: it exists and is no regular file.
+    Open(File),
+    /// By a rename over `path`, which is no symbolic link.
+    Replace {
+        path: PathBuf,
+        existing: Option<Metadata>,
+    },
+}
+
+impl Target {
+    fn of(path: &Path) -> io::Result<Target> {
+        let existing = match std::fs::metadata(path) {
+            Ok(found) if !found.is_file() => {
+                return OpenOptions::new().write(true).open(path).map(Target::Open);
+            }
+            Ok(found) => Some(found),
+            Err(error) if error.kind() == ErrorKind::NotFound => None,
+            Err(error) => return Err(error),
+        };
+        let mut path = path.to_owned();
+        for _ in 0..MAX_LINKS {
+            let is_link = |found: Metadata| found.is_symlink();
+            if !std::fs::symlink_metadata(&path).is_ok_and(is_link) {
+                return Ok(Target::Replace { path, existing });
+            }
+            if existing.is_some() && is_descriptor(&path) {
+                // The redirection of a shell: whoever made it decided what becomes of earlier contents.
+                return OpenOptions::new().append(true).open(path).map(Target::Open);
+            }
+            // An absolute link replaces the folder.
+            path = folder_of(&path).join(std::fs::read_link(&path)?);
+        }
+        Err(io::Error::other("too many symbolic links"))
+    }
+}
+
+/// Whether a link is one of the kernel's links to open files, such as `/dev/stdout` leads to.
+fn is_descriptor(link: &Path) -> bool {
+    std::fs::canonicalize(folder_of(link)).is_ok_and(|folder| folder.starts_with("/proc"))
+}
+
+fn folder_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    }
+}
+
+/// A file that is removed unless it is renamed.
 struct Temporary {
     path: PathBuf,
+    renamed: bool,
 }
 
 impl Temporary {
-    fn beside(destination: &Path) -> Self {
-        let mut name = std::ffi::OsString::from(".");
-        name.push(destination.file_name().unwrap_or_default());
-        name.push(format!(".{}.tmp", std::process::id()));
-        let path = destination.with_file_name(name);
-        lock().push(path.clone());
-        Temporary { path }
+    /// Creates a file that did not exist, under a name that cannot be guessed. It is short, whatever the destination's is.
+    fn beside(destination: &Path) -> io::Result<(Self, File)> {
+        // Held over the creation, so that the list names every temporary file and no other file.
+        let mut unfinished = lock();
+        let mut last = None;
+        for _ in 0..MAX_NAMES {
+            // Each `RandomState` has keys of its own, from the system's random numbers.
+            let name = format!(
+                ".b2p-{:016x}.tmp",
+                RandomState::new().build_hasher().finish()
+            );
+            let path = destination.with_file_name(name);
+            match OpenOptions::new().write(true).create_new(true).open(&path) {
+                Ok(file) => {
+                    unfinished.push(path.clone());
+                    let renamed = false;
+                    return Ok((Temporary { path, renamed }, file));
+                }
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => last = Some(error),
+                Err(error) => return Err(error),
+            }
+        }
+        Err(last.unwrap_or_else(|| ErrorKind::AlreadyExists.into()))
+    }
+
+    fn rename(&mut self, destination: &Path) -> io::Result<()> {
+        std::fs::rename(&self.path, destination)?;
+        self.renamed = true;
+        Ok(())
     }
 }
 
 impl Drop for Temporary {
     fn drop(&mut self) {
-        let _ = std::fs::remove_file(&self.path);
+        if !self.renamed {
+            let _ = std::fs::remove_file(&self.path);
+        }
         lock().retain(|p| *p != self.path);
     }
 }
@@ -68,26 +169,4 @@ fn lock() -> std::sync::MutexGuard<'static, Vec<PathBuf>> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_failed_write_leaves_the_old_file_and_nothing_else() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("out.txt");
-        std::fs::write(&path, b"old").unwrap();
-        let failed = write_file(&path, |w| {
-            w.write_all(b"half").unwrap();
-            Err(Error::Usage("stop".into()))
-        });
-        assert!(failed.is_err());
-        assert_eq!(std::fs::read(&path).unwrap(), b"old");
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
-    }
-
-    #[test]
-    fn a_missing_folder_is_named_in_the_error() {
-        let error = write_file(Path::new("/no/such/folder/x"), |_| Ok(())).unwrap_err();
-        assert!(error.to_string().contains("/no/such/folder/x"));
-    }
-}
+mod tests;

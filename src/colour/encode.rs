@@ -2,10 +2,11 @@
 
 use std::ops::Range;
 
-use b2p_kernels::Isa;
+use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
 use super::block::{Coding, Quantiser, Source};
+use super::filter::{Responses, TERMS, solve};
 use super::model::{BINS, Circumstances, Model};
 use super::space::{FRACTION, from_rgb};
 use super::transform::forward;
@@ -33,7 +34,7 @@ impl Options {
         Options {
             steps,
             lambda: 0.055,
-            gain: 205,
+            gain: 220,
         }
     }
 
@@ -285,5 +286,84 @@ impl Source for Choosing {
             c,
             if wanted < 0 { -chosen } else { chosen },
         )
+    }
+}
+
+/// The weights of a filter pass that bring values nearest to the truth, by least squares.
+pub(super) fn fit_pass(
+    isa: Isa,
+    values: &[Ycc],
+    map: &KernelMap,
+    steps: Steps,
+    truth: &[Ycc],
+) -> [[i8; TERMS]; 3] {
+    let blocks: Vec<usize> = (0..values.len()).step_by(FIT_BLOCK).collect();
+    let sums: Vec<_> = blocks
+        .into_par_iter()
+        .map(|first| {
+            isa.run(Fit {
+                first,
+                values,
+                map,
+                steps,
+                truth,
+            })
+        })
+        .collect();
+    let mut total = Normal::default();
+    for sum in sums {
+        for t in 0..3 {
+            for i in 0..TERMS {
+                total[t].1[i] += sum[t].1[i];
+                (0..TERMS).for_each(|j| total[t].0[i][j] += sum[t].0[i][j]);
+            }
+        }
+    }
+    total.map(|(a, b)| solve(a, b))
+}
+
+const FIT_BLOCK: usize = 16_384;
+
+/// Normal equations of each channel.
+type Normal = [([[f64; TERMS]; TERMS], [f64; TERMS]); 3];
+
+/// Adds up the normal equations of a block of voxels.
+struct Fit<'a> {
+    first: usize,
+    values: &'a [Ycc],
+    map: &'a KernelMap,
+    steps: Steps,
+    truth: &'a [Ycc],
+}
+
+impl Work for Fit<'_> {
+    type Output = Normal;
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) -> Normal {
+        let Fit {
+            first,
+            values,
+            map,
+            steps,
+            truth,
+        } = self;
+        let responses = Responses::new(steps);
+        let mut sums = Normal::default();
+        for voxel in first..values.len().min(first + FIT_BLOCK) {
+            let terms = responses.terms(values, map, voxel);
+            for t in 0..3 {
+                let missing = f64::from(truth[voxel][t]) - f64::from(values[voxel][t]);
+                let x = terms[t].map(|x| f64::from(x) / 4.0);
+                let (a, b) = &mut sums[t];
+                for i in 0..TERMS {
+                    b[i] += x[i] * missing;
+                    for j in 0..TERMS {
+                        a[i][j] += x[i] * x[j];
+                    }
+                }
+            }
+        }
+        sums
     }
 }

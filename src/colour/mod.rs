@@ -17,6 +17,7 @@
 mod block;
 #[cfg(feature = "encoder")]
 mod encode;
+mod filter;
 mod model;
 mod prediction;
 mod space;
@@ -24,6 +25,7 @@ mod transform;
 
 #[cfg(feature = "encoder")]
 pub use encode::{Options, Truth, encode_level, encode_trunk};
+pub use filter::Filter;
 pub use space::{Steps, Ycc};
 
 use std::ops::Range;

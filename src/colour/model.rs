@@ -27,7 +27,7 @@ pub(super) const FEATURES: usize = 12;
 
 /// How often a slot was met at most, in its low bits; the probability above them, in units of 2⁻²².
 const COUNT_BITS: u32 = 10;
-const MOST: u32 = 255;
+const MOST: u32 = 120;
 
 /// How fast a slot follows after so many decisions, in units of 2⁻¹⁶: `65536·5 / (5·count + 8)`, rounded down.
 static RATE: [u32; MOST as usize + 1] = {
@@ -384,7 +384,7 @@ impl Model {
 
 /// Learning rates, in units that [`Model::learn`] and [`Model::learn_unit`] tell.
 const LEARN: i32 = 7;
-const UNIT_RATE: i32 = 8;
+const UNIT_RATE: i32 = 4;
 const UNIT_FAST: i32 = 64;
 
 /// Codes a number from 0 on as an Exp-Golomb code of even decisions.

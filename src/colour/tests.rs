@@ -275,3 +275,102 @@ fn steps_that_no_stream_has_are_an_error() {
         assert!(error.to_string().contains("steps"), "{error}");
     }
 }
+
+/// A level of a bowl that is coded coarsely, its map, and its truth.
+fn noisy() -> (Coloured, KernelMap, Vec<Ycc>) {
+    let case = Case::bowl(7, 6);
+    let steps = Steps {
+        luma: 44,
+        chroma: 52,
+    };
+    let (_, coloured) = case.encode(Isa::detect(), 3, 1 << 14, steps);
+    (
+        coloured,
+        case.maps[6].clone(),
+        case.truth(steps).level(6).to_vec(),
+    )
+}
+
+fn squared_error(values: &[[u8; 3]], truth: &[Ycc]) -> f64 {
+    let truth = truth
+        .iter()
+        .map(|ycc| space::display(*ycc, space::FRACTION));
+    let squares = values
+        .iter()
+        .zip(truth)
+        .flat_map(|(a, b)| [0, 1, 2].map(|k| f64::from(a[k].abs_diff(b[k])).powi(2)));
+    squares.sum()
+}
+
+#[test]
+fn a_fitted_filter_brings_colours_nearer_and_its_payload_comes_back() {
+    let (coloured, map, truth) = noisy();
+    let filter = Filter::fit(Isa::detect(), &coloured, &map, &truth).expect("noise to take out");
+    let before = squared_error(&coloured.rgb(), &truth);
+    let filtered = filter.rgb(Isa::detect(), &coloured, &map);
+    assert!(squared_error(&filtered, &truth) < 0.95 * before);
+    let bytes = filter.to_bytes();
+    assert_eq!(Filter::parse(&bytes, 0).unwrap(), filter);
+    for wrong in [&bytes[..bytes.len() - 1], &[], &[0], &[3]] {
+        assert!(
+            Filter::parse(wrong, 7)
+                .unwrap_err()
+                .to_string()
+                .contains("byte 7")
+        );
+    }
+    for isa in Isa::available() {
+        assert_eq!(filter.rgb(isa, &coloured, &map), filtered, "{isa}");
+    }
+}
+
+#[test]
+fn one_pass_is_what_its_definition_says() {
+    let (coloured, map, _) = noisy();
+    let weights = [[10i8, -3, 40, 7, 127], [-128, 0, 1, 2, 3], [0; 5]];
+    let bytes: Vec<u8> = [1]
+        .into_iter()
+        .chain(weights.iter().flatten().map(|w| *w as u8))
+        .collect();
+    let filtered = Filter::parse(&bytes, 0)
+        .unwrap()
+        .rgb(Isa::detect(), &coloured, &map);
+    let units = coloured.steps().units().map(i64::from);
+    for (voxel, own) in coloured.values().iter().enumerate() {
+        let mut expected = *own;
+        for t in 0..3 {
+            let (mut terms, mut counts) = ([0i64; 5], 0);
+            for (k, &neighbour) in map.row(voxel).iter().enumerate() {
+                let off = [k % 3, k / 3 % 3, k / 9]
+                    .iter()
+                    .filter(|x| **x != 1)
+                    .count();
+                if neighbour == KernelMap::ABSENT || off == 0 {
+                    continue;
+                }
+                let count = [20, 12, 7][off - 1];
+                counts += count;
+                let d = i64::from(coloured.values()[neighbour as usize][t]) - i64::from(own[t]);
+                let response = |tenths: i64| {
+                    let r = ((1 << 24) / (units[t] * tenths / 10).max(1)).min(1 << 16);
+                    let x = ((d.abs() * r) >> 12).min(4096);
+                    count * ((d * (4096 - ((x * x) >> 12))) >> 12)
+                };
+                terms[off - 1] += response(7);
+                terms[if off == 1 { 3 } else { 4 }] += response(28);
+            }
+            let sum: i64 = (0..5)
+                .map(|j| i64::from(weights[t][j]) * ((terms[j] * (65536 / counts.max(1))) >> 14))
+                .sum();
+            expected[t] = space::clamp(
+                (i64::from(own[t]) + ((sum + 32) >> 6)) as i32,
+                space::FRACTION,
+            );
+        }
+        assert_eq!(
+            filtered[voxel],
+            space::display(expected, space::FRACTION),
+            "voxel {voxel}"
+        );
+    }
+}

@@ -2,6 +2,8 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+#[cfg(unix)]
+mod outputs;
 mod pictures;
 mod transform;
 mod within;

@@ -21,8 +21,8 @@ use crate::surface::Surface;
 /// Judge streams and point clouds by pictures of the mesh they came from
 ///
 /// Every item is drawn from twelve cameras and compared with the mesh: PSNR over whole pictures and over the foreground, MS-SSIM,
-/// SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes) and as one round Gaussian a point (of four). With a cloud and a
-/// model but no stream among the items, the cloud is coded first.
+/// SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes), as one round Gaussian a point (of four) and as surfels (of
+/// five). With a cloud and a model but no stream among the items, the cloud is coded first.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Streams (.b2p), or point clouds on the voxel grid or Gaussians (.ply, .ply.zst): [NAME=]PATH[@BPP]
@@ -49,6 +49,9 @@ pub struct Args {
     /// The share of the cube's side that the mesh's longest side spans, where the cloud does not tell
     #[arg(long, default_value_t = 0.95)]
     fill: f64,
+    /// Judge nothing but the items: do not code the cloud
+    #[arg(long, requires = "items")]
+    items_only: bool,
     /// A folder for the table, all scores as JSON, and a sheet of pictures
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
@@ -85,7 +88,7 @@ impl Args {
         let streams = items
             .iter()
             .any(|(_, c, _)| matches!(c, Content::Stream(_)));
-        let code = cloud.is_some() && !streams;
+        let code = cloud.is_some() && !streams && !self.items_only;
         let mut bench = Bench::new(&surface, frame)?;
         if let Some(cloud) = cloud {
             bench = bench.with_cloud(cloud)?;

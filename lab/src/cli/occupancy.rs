@@ -4,9 +4,10 @@ use std::path::PathBuf;
 
 use rayon::prelude::*;
 
-use crate::error::{LabError, Result};
+use crate::error::Result;
 use crate::occupancy::{Network, Samples, shapes, views};
 use crate::random::Random;
+use crate::sample::write_bytes;
 use crate::surface::Surface;
 
 /// Train the network that predicts octree occupancy (src/geometry/codec/weights.bin)
@@ -57,10 +58,9 @@ impl Args {
             if (step + 1) % 1000 == 0 {
                 eprintln!("step {}: {:.4} bits per voxel", step + 1, bits / 1000.0);
                 bits = 0.0;
-                std::fs::write(&self.output, network.weights())
-                    .map_err(LabError::io(&self.output))?;
+                write_bytes(&self.output, &network.weights())?;
             }
         }
-        std::fs::write(&self.output, network.weights()).map_err(LabError::io(&self.output))
+        write_bytes(&self.output, &network.weights())
     }
 }

@@ -267,13 +267,13 @@ fn a_network_of_zeros_draws_balls_of_the_decoded_colours_in_the_anchors() {
         let unit = 0.25 / if k == 8 { 2.0 } else { 1.0 };
         for i in 0..drawn.len() {
             let voxel = cloud.octree.level(3).coordinate(i / k);
-            for axis in 0..3 {
+            for (axis, &corner) in voxel.iter().enumerate() {
                 let octant = if k == 8 {
                     (i >> axis & 1) as f32 * 0.5 + 0.25
                 } else {
                     0.5
                 };
-                let anchor = (voxel[axis] as f32 + octant) * 0.25 - 1.0;
+                let anchor = (corner as f32 + octant) * 0.25 - 1.0;
                 assert_eq!(drawn.position[i][axis], anchor);
                 assert!((drawn.scale[i][axis] / unit - 0.55).abs() < 0.01);
                 let decoded = f32::from(cloud.colours[0][i / k][axis]) / 255.0;
@@ -302,7 +302,12 @@ fn what_is_not_seen_is_left_out() {
         }
     }
     for precision in [Precision::Int16, Precision::F16] {
-        let drawn = cloud.draw(&model(&[made.clone()]), Isa::detect(), precision, made.set);
+        let drawn = cloud.draw(
+            &model(std::slice::from_ref(&made)),
+            Isa::detect(),
+            precision,
+            made.set,
+        );
         assert_eq!(drawn.len(), 2 * cloud.maps[0].len());
         assert!(drawn.opacity.iter().all(|&o| o >= 1.0 / 255.0));
         for (i, position) in drawn.position.iter().enumerate() {
@@ -321,7 +326,7 @@ fn parts_do_not_show() {
     let cloud = Cloud::surface(8);
     assert!(cloud.maps[0].len() > 2 * activate::PART);
     let made = Made::new((Heads::Quick, 1), 4, [0, 0], 11);
-    let model = model(&[made.clone()]);
+    let model = model(std::slice::from_ref(&made));
     let drawn = cloud.draw(&model, Isa::detect(), Precision::F16, made.set);
     let (expected, _) = reference::gaussians(&made, &cloud.input());
     let off = differences(&drawn, &expected, 8);
@@ -360,7 +365,7 @@ fn what_cannot_be_drawn_is_refused_and_says_why() {
 fn steps_beyond_their_range_are_taken_as_its_ends() {
     let mut cloud = Cloud::surface(3);
     let made = Made::new((Heads::Best, 1), 8, [1, 1], 1);
-    let model = model(&[made.clone()]);
+    let model = model(std::slice::from_ref(&made));
     let mut drawn = |step| {
         cloud.step = step;
         cloud.draw(&model, Isa::detect(), Precision::Int16, made.set)

@@ -73,8 +73,8 @@ pub fn around(moments: &[Moments], coordinates: &[[u32; 3]]) -> Around {
         let (n, times) = (m[0], u16::wrapping_mul);
         let sum = [0, 1, 2].map(|a| m[1 + a].wrapping_sub(times(n, c[a])));
         lanes.count[j] = f32::from(n);
-        for axis in 0..3 {
-            lanes.sum[axis][j] = f32::from(sum[axis] as i16);
+        for (lane, sum) in lanes.sum.iter_mut().zip(sum) {
+            lane[j] = f32::from(sum as i16);
         }
         // Σ(x−c)(y−d) = Σxy − c·Σ(y−d) − d·Σx.
         for (k, (a, b)) in PAIRS.into_iter().enumerate() {

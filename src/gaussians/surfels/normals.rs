@@ -34,9 +34,10 @@ pub fn normals(covariance: [Lane; 6]) -> Normals {
     let [xx, yy, zz, xy, xz, yz] = covariance;
     let mut diagonal = [xx, yy, zz];
     let mut off = [xy, xz, yz];
+    // The components of the axes: x, y, z of each, then which axis.
     let mut axes = [[[0.0; GROUP]; 3]; 3];
-    for (k, axis) in axes.iter_mut().enumerate() {
-        axis[k] = [1.0; GROUP];
+    for (k, component) in axes.iter_mut().enumerate() {
+        component[k] = [1.0; GROUP];
     }
     for _ in 0..SWEEPS {
         // The axes p, q of each entry, and the places of the entries that p and q share with the third axis.
@@ -50,10 +51,10 @@ pub fn normals(covariance: [Lane; 6]) -> Normals {
                 let (x, y) = (off[with_p][j], off[with_q][j]);
                 off[with_p][j] = c * x - s * y;
                 off[with_q][j] = s * x + c * y;
-                for k in 0..3 {
-                    let (x, y) = (axes[p][k][j], axes[q][k][j]);
-                    axes[p][k][j] = c * x - s * y;
-                    axes[q][k][j] = s * x + c * y;
+                for component in &mut axes {
+                    let (x, y) = (component[p][j], component[q][j]);
+                    component[p][j] = c * x - s * y;
+                    component[q][j] = s * x + c * y;
                 }
             }
         }
@@ -70,8 +71,8 @@ fn least(variance: &[Lane; 3], axes: &[[Lane; 3]; 3]) -> Normals {
         let of_z = z[j] <= x[j] && z[j] <= y[j];
         let of_y = y[j] <= x[j];
         let pick = |k: usize| {
-            let other = if of_y { axes[1][k][j] } else { axes[0][k][j] };
-            if of_z { axes[2][k][j] } else { other }
+            let other = if of_y { axes[k][1][j] } else { axes[k][0][j] };
+            if of_z { axes[k][2][j] } else { other }
         };
         let up = 1.0f32.copysign(pick(2));
         for (k, normal) in normal.iter_mut().enumerate() {
