@@ -7,9 +7,9 @@ use xxhash_rust::xxh3::Xxh3Default;
 use super::decoding::nothing_reached;
 use super::feed::{Feed, Goal};
 use super::stream::StreamDecoder;
-use crate::bitstream::{Colours, Header, Level, Trunk};
-use crate::colour::{self, Coloured};
-use crate::error::{Error, Result};
+use crate::bitstream::{Colours, Header, Level, Slice, Trunk};
+use crate::colour::{self, Coloured, Filter};
+use crate::error::Result;
 use crate::gaussians::Gaussians;
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
@@ -89,12 +89,8 @@ impl<'b> Transform<'b> {
         let Some(colours) = &part.colours else {
             return Err(nothing_reached());
         };
-        if let Some(filter) = &colours.filter {
-            return Err(Error::Unsupported {
-                what: "the filter of colours",
-                detail: format!("at byte {}", filter.offset),
-            });
-        }
+        let parse = |payload: &Slice| Filter::parse(payload.bytes, payload.offset);
+        let filter = colours.filter.as_ref().map(parse).transpose()?;
         let mut octree = match &mut self.reached {
             Some(above) => std::mem::replace(&mut above.octree, Octree::root()),
             None => Octree::root(),
@@ -105,7 +101,7 @@ impl<'b> Transform<'b> {
             part: &part,
             colours,
         };
-        match growing.level(&mut octree, self.reached.as_ref(), log) {
+        match growing.level(&mut octree, self.reached.as_ref(), filter.as_ref(), log) {
             Ok(grown) => {
                 self.reached = Some(Reached { octree, ..grown });
                 Ok(())
@@ -158,6 +154,7 @@ impl Growing<'_> {
         &self,
         octree: &mut Octree,
         above: Option<&Reached>,
+        filter: Option<&Filter>,
         log: &mut Log,
     ) -> Result<Reached> {
         let level = self.part.level;
@@ -191,7 +188,15 @@ impl Growing<'_> {
         if colours_above.is_empty() && level > 0 {
             colours_above = means(octree, level, &coloured.rgb());
         }
-        let colours = coloured.rgb();
+        let (isa, count) = (self.decoder.isa(), self.part.voxels as usize);
+        let colours = match filter {
+            None => coloured.rgb(),
+            Some(filter) => {
+                log.step(format!("filter of level {level}"), count, "voxels", || {
+                    Ok(filter.rgb(isa, &coloured, &map))
+                })?
+            }
+        };
         Ok(Reached {
             level,
             octree: Octree::root(),

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::{Encoded, rates};
 use crate::bitstream::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
 use crate::cloud::ColouredVoxels;
-use crate::colour::{self, Steps, Truth};
+use crate::colour::{self, Filter, Steps, Truth};
 use crate::decoder::{StreamDecoder, colour_hash};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
@@ -59,6 +59,8 @@ impl Default for Options {
 
 /// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green and blue comes of both.
 const CHROMA: u8 = 8;
+/// Filters of levels that are not the finest may take one part in so many of a stream that ends there.
+const FILTER_SHARE: usize = 100;
 
 /// Codes a cloud, then decodes the stream and compares before giving it out.
 ///
@@ -254,6 +256,7 @@ impl<'a> Subject<'a> {
             Ok(colour::encode_trunk(isa, octree, maps, truth, coding))
         })?;
         let mut layers = Vec::new();
+        let mut bytes = payload.len();
         let mut colours = Vec::new();
         for level in trunk..=top {
             let count = octree.level(level).len();
@@ -269,14 +272,31 @@ impl<'a> Subject<'a> {
                 })?;
                 coloured = next;
                 slices = counted(above.len(), slice, payloads);
+                bytes += slices.iter().map(|slice| slice.1.len()).sum::<usize>();
+            }
+            let mut filter = None;
+            if level >= base && self.options.filter {
+                let name = format!("filter of level {level}");
+                let most = match level == top {
+                    true => usize::MAX,
+                    false => (bytes + self.geometry_bytes(level)) / FILTER_SHARE,
+                };
+                filter = log.step(name, count, "voxels", || {
+                    let map = &maps[usize::from(level)];
+                    let filter = Filter::fit(isa, &coloured, map, truth.level(level));
+                    Ok(filter.filter(|filter| filter.to_bytes().len() <= most))
+                })?;
             }
             if level == top {
-                colours = coloured.rgb();
+                colours = match &filter {
+                    Some(filter) => filter.rgb(isa, &coloured, &maps[usize::from(level)]),
+                    None => coloured.rgb(),
+                };
             }
             layers.push(Layer {
                 level,
                 hash: colour_hash(&coloured),
-                filter: None,
+                filter: filter.map(|filter| filter.to_bytes()),
                 slices,
             });
         }
