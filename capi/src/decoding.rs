@@ -7,7 +7,7 @@ use b2p::decoder::{HeadSet, StreamDecoder, StreamDecoding};
 use b2p::log::Log;
 
 use crate::border::{Fault, Status, borrowed, changed, give, guard, slice, take};
-use crate::model::{Limits, Model};
+use crate::model::{HeadsModel, Limits, Model};
 
 /// A switch that stops decodings from another thread.
 #[derive(Default)]
@@ -178,6 +178,28 @@ pub unsafe extern "C" fn b2p_decoding_use_heads(
         let known = all.iter().find(|(number, _)| *number as i32 == heads);
         let (_, heads) = known.ok_or_else(|| Fault::usage("heads are none of b2p_heads"))?;
         Ok(decoding.0.set_heads(*heads)?)
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Draws streams of version 3 with these learned heads from now on. What has been decoded stays. Fails with USAGE.
+///
+/// # Safety
+/// `decoding` is a decoding; `heads` are learned heads; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_use_heads_model(
+    decoding: *mut Decoding,
+    heads: *const HeadsModel,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `decoding` and `heads`.
+        let (decoding, heads) =
+            unsafe { (changed(decoding, "decoding")?, borrowed(heads, "heads")?) };
+        decoding.0.set_heads_model(Arc::clone(&heads.0));
+        Ok(())
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }

@@ -166,6 +166,10 @@ static void without_model(file stream) {
     b2p_gaussians *gaussians = NULL;
     CHECK(b2p_decoding_start(NULL, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_OK);
     CHECK(b2p_decoding_use_heads(decoding, B2P_HEADS_SURFELS, message, sizeof message) == B2P_STATUS_OK);
+    b2p_heads_model *heads = NULL;
+    CHECK(b2p_heads_model_from_bytes(stream.bytes, stream.length, &heads, message, sizeof message) == B2P_STATUS_MALFORMED);
+    CHECK(b2p_decoding_use_heads_model(decoding, heads, message, sizeof message) == B2P_STATUS_USAGE);
+    b2p_heads_model_free(heads);
     CHECK(b2p_decoding_push(decoding, stream.bytes, 9, NULL, 0) == B2P_STATUS_OK);
     int32_t level = 0;
     CHECK(b2p_decoding_advance(decoding, &level, message, sizeof message) == B2P_STATUS_OK && level == -1);

@@ -353,7 +353,8 @@ pub struct DetailArg {
     /// streams have none) [default: the best there are]
     #[arg(long, value_name = "NAME")]
     pub heads: Option<HeadSet>,
-    /// Gaussians that learned heads make of a voxel, 1 or 8, of streams of version 3 [default: 1 at the finest two levels, else 8]
+    /// Gaussians that heads make of a voxel of streams of version 3: 1 or 8 [default: 1 at levels from N−1 on, else 8]; of surfels, 1 or 4
+    /// [default: 1]
     #[arg(long, value_name = "N", value_parser = per_voxel)]
     pub per_voxel: Option<usize>,
 }
@@ -424,8 +425,9 @@ fn step(text: &str) -> Result<f32, String> {
 fn per_voxel(text: &str) -> Result<usize, String> {
     match text {
         "1" => Ok(1),
+        "4" => Ok(4),
         "8" => Ok(8),
-        _ => Err("expected 1 or 8".into()),
+        _ => Err("expected 1, 4 or 8".into()),
     }
 }
 

@@ -116,7 +116,7 @@ pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
     Ok(stream + octree + trunk + colours)
 }
 
-/// Bytes that making surfels of so many voxels takes at most, themselves included.
-pub(super) fn surfels(voxels: u64) -> u64 {
-    voxels * (SURFEL + GAUSSIAN)
+/// Bytes that making so many surfels of each of so many voxels takes at most, themselves included.
+pub(super) fn surfels(voxels: u64, per_voxel: u64) -> u64 {
+    voxels * (SURFEL + per_voxel * GAUSSIAN)
 }

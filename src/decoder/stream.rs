@@ -160,8 +160,8 @@ impl StreamDecoder {
         self
     }
 
-    /// The same decoder, whose learned heads of streams of version 3 make so many Gaussians of a voxel, 1 or 8. By default it is one where
-    /// voxels are at most twice as wide as those of the cloud, else eight.
+    /// The same decoder, whose heads of streams of version 3 make so many Gaussians of a voxel: learned heads 1 or 8, by default one where
+    /// voxels are at most twice as wide as those of the cloud, else eight; surfels 1, the default, or 4.
     pub fn with_per_voxel(mut self, count: usize) -> Self {
         self.per_voxel = Some(count);
         self
@@ -334,6 +334,17 @@ impl StreamDecoder {
         Ok(Some((model, (heads, count))))
     }
 
+    fn surfels_per_voxel(&self) -> Result<PerVoxel> {
+        match self.per_voxel {
+            None | Some(1) => Ok(PerVoxel::One),
+            Some(4) => Ok(PerVoxel::Four),
+            Some(count) => Err(Error::Unsupported {
+                what: "drawing with so many surfels a voxel",
+                detail: format!("{count} were asked for, 1 or 4 would do"),
+            }),
+        }
+    }
+
     /// Bytes of memory that making Gaussians of a level takes at most.
     fn drawing_bytes(&self, header: &Header, level: u8) -> Result<u64> {
         let voxels = header.voxels(level)?.into();
@@ -343,7 +354,7 @@ impl StreamDecoder {
         };
         Ok(match self.network(header, level)? {
             Some((model, set)) => model.bytes(set, voxels, above),
-            None => super::memory::surfels(voxels),
+            None => super::memory::surfels(voxels, self.surfels_per_voxel()?.count() as u64),
         })
     }
 
@@ -368,7 +379,9 @@ impl StreamDecoder {
     /// Fails with [`Error::Unsupported`] unless `level` of a stream of version 3 can be drawn.
     pub(super) fn check_drawable(&self, header: &Header, level: u8) -> Result<()> {
         header.voxels(level)?;
-        self.network(header, level)?;
+        if self.network(header, level)?.is_none() {
+            self.surfels_per_voxel()?;
+        }
         match self.drawable(header).any(|l| l == level) {
             true => Ok(()),
             false => Err(Error::Unsupported {
@@ -409,7 +422,7 @@ impl StreamDecoder {
         let (map, colours) = (&reached.map, &reached.colours);
         let network = self.network(header, level)?;
         let (Some((model, set)), Some(above)) = (network, &reached.above_map) else {
-            let (voxels, per_voxel) = (octree.level(level), PerVoxel::One);
+            let (voxels, per_voxel) = (octree.level(level), self.surfels_per_voxel()?);
             return Ok(surfels(self.isa(), voxels, map, colours, per_voxel, frame));
         };
         let input = LevelInput {
