@@ -42,10 +42,10 @@ struct Rows<'a> {
 }
 
 impl<'a> Drawing<'a> {
-    /// None so far, and room for all; `blur` in squares of half a voxel.
+    /// None so far, and room for all; `blur` in squares of half the unit.
     pub fn new(input: &LevelInput<'a>, count: usize, blur: f32, frame: Frame) -> Self {
         let voxels = input.octree.level(input.level);
-        let half = 1.0 / (1u32 << voxels.depth()) as f32;
+        let half = 1.0 / (1u32 << (voxels.depth() + u8::from(count == 8))) as f32;
         let all = voxels.len() * count;
         Drawing {
             voxels,

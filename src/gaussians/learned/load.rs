@@ -14,7 +14,7 @@ use crate::network::{Heads, ResBlock, Spec, Stored, Tensors, malformed, missing}
 pub const INPUTS: [usize; 2] = [12, 7];
 /// The most channels of a network, and the most blocks of one side.
 const MOST: (usize, usize) = (256, 16);
-/// The widest blur, in squares of half a voxel.
+/// The widest blur, in squares of half the unit.
 const WIDEST: f64 = 16.0;
 /// The largest range: 2047 steps of it still fit f16 when it is stretched by [`HEADROOM`].
 const LARGEST: f64 = 32_768.0;

@@ -79,7 +79,7 @@ impl Generator {
         &self.shape
     }
 
-    /// The Gaussians of a level; `blur` in squares of half a voxel.
+    /// The Gaussians of a level; `blur` in squares of half the unit.
     pub fn generate(
         &self,
         isa: Isa,

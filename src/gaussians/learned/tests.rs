@@ -283,7 +283,8 @@ fn a_network_of_zeros_draws_balls_of_the_decoded_colours_in_the_anchors() {
             let opacity = if k == 8 { 0.880_797 } else { 1.0 };
             assert!((drawn.opacity[i] - opacity).abs() < 1e-6);
         }
-        assert!((drawn.blur / (0.15 / 64.0) - 1.0).abs() < 1e-6);
+        let squared_half_unit = if k == 8 { 1.0 / 256.0 } else { 1.0 / 64.0 };
+        assert!((drawn.blur / (0.15 * squared_half_unit) - 1.0).abs() < 1e-6);
     }
 }
 

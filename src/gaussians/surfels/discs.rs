@@ -5,16 +5,18 @@ use super::moments::{Around, PAIRS};
 use super::normals::normals;
 
 /// σ in the plane, in voxels, of a disc that faces along an axis. Voxels of other planes lie closer together.
-const RADIUS: f32 = 0.6;
+const RADIUS: f32 = 0.62;
 /// σ across, in voxels.
 const THICKNESS: f32 = 0.01;
 /// σ of the round blob that a lone voxel becomes, in voxels.
 const BLOB: f32 = 0.4;
 /// The variance along the middle axis above which a neighbourhood is a surface: that of a strip three voxels wide.
 const SURFACE: f32 = 0.6;
-/// How far the fitted plane of a curved surface is corrected towards that of the nearest voxels. The means of a cap lie under it by half its
-/// curvature times their variance; a part of that is left, as a disc stands over the surface around the point where it touches.
-const UNCURVED: f32 = 0.3;
+/// The variance across, beyond that of a flat surface's voxels, from which on the nearest voxels alone say where the surface is: the mean
+/// of a strongly curved surface lies under it, that of two sheets between them.
+const THICK: f32 = 0.4;
+/// How far a disc moves in its plane towards the mean of its neighbourhood, as a share of the way: at borders, so as not to stand over them.
+const INWARDS: f32 = 0.2;
 
 /// A voxel's disc, in voxels, relative to the voxel's centre.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -41,26 +43,33 @@ pub fn discs(near: &Around, far: &Around) -> [Disc; GROUP] {
     let axes = normals(covariance);
     let normal = axes.normal;
     let (low, high) = (dot(&near, &normal), dot(&centre, &normal));
-    let height = lane(|j| high[j] + UNCURVED * (low[j] - high[j]));
+    let density = density(&normal);
+    // The centres of the voxels that a plane cuts are spread evenly across it, over a width of the density.
+    let thick = lane(|j| {
+        let beyond = axes.least[j] - density[j] * density[j] / 12.0;
+        (beyond / THICK).clamp(0.0, 1.0)
+    });
+    let height = lane(|j| high[j] + thick[j] * (low[j] - high[j]));
+    let place = [0, 1, 2].map(|axis| {
+        let (n, mean) = (&normal[axis], &centre[axis]);
+        lane(|j| n[j] * height[j] + INWARDS * (mean[j] - high[j] * n[j]))
+    });
     let flat = lane(|j| (axes.middle[j] / SURFACE).min(1.0));
-    let radius = radius(&normal, &flat);
+    let radius = lane(|j| BLOB + flat[j] * (RADIUS / density[j].sqrt() - BLOB));
     let thickness = lane(|j| BLOB + flat[j] * (THICKNESS - BLOB));
     let rotation = towards(&normal);
     std::array::from_fn(|j| Disc {
-        centre: normal.map(|n| n[j] * height[j]),
+        centre: place.map(|axis| axis[j]),
         rotation: rotation.map(|component| component[j]),
         radius: radius[j],
         thickness: thickness[j],
     })
 }
 
-/// σ in the plane. A plane cuts |x| + |y| + |z| voxels per unit of its area, its normal being (x, y, z).
+/// How many voxels a plane with such a normal cuts per unit of its area.
 #[inline(always)]
-fn radius([x, y, z]: &[Lane; 3], flat: &Lane) -> Lane {
-    lane(|j| {
-        let density = x[j].abs() + y[j].abs() + z[j].abs();
-        BLOB + flat[j] * (RADIUS / density.sqrt() - BLOB)
-    })
+fn density([x, y, z]: &[Lane; 3]) -> Lane {
+    lane(|j| x[j].abs() + y[j].abs() + z[j].abs())
 }
 
 /// The shortest rotations that turn z into normals whose z is not negative.

@@ -1,7 +1,7 @@
 //! Surfels: opaque discs in closed form, from the voxels of a level and their colours. No network, no model file.
 //!
 //! A voxel's normal is the least axis of the covariance of its neighbourhood ([`moments`]). Its disc lies in the plane through the
-//! neighbourhood's mean, which takes the staircase of voxels away, moved a little outwards where the surface is curved. It is as wide as the
+//! neighbourhood's mean, which takes the staircase of voxels away, or nearer to the voxel where the neighbourhood is no plane. It is as wide as the
 //! voxels of such a plane are apart, and next to nothing thick, so that silhouettes do not grow; the fewer neighbours lie beside the
 //! voxel, the rounder it is. With [`PerVoxel::Four`] four smaller discs follow the colours' gradient.
 //!
@@ -27,7 +27,7 @@ use discs::Disc;
 /// Voxels that one task handles.
 const BLOCK: usize = 1024;
 /// [`Gaussians::blur`], in voxels squared.
-const BLUR: f32 = 0.01;
+const BLUR: f32 = 0.003;
 /// Where the four discs of a voxel lie along the axes of their plane, in voxels from its disc's centre.
 const APART: f32 = 0.25;
 /// How wide they are beside the one disc.

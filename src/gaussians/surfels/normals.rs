@@ -9,6 +9,8 @@ const SWEEPS: usize = 4;
 pub struct Normals {
     /// The unit vector along the least axis, its z not negative.
     pub normal: [Lane; 3],
+    /// The variance along it.
+    pub least: Lane,
     /// The variance along the middle axis.
     pub middle: Lane,
 }
@@ -83,5 +85,9 @@ fn least(variance: &[Lane; 3], axes: &[[Lane; 3]; 3]) -> Normals {
         let (low, high) = (x[j].min(y[j]), x[j].max(y[j]));
         low.max(high.min(z[j]))
     });
-    Normals { normal, middle }
+    Normals {
+        normal,
+        least: lane(|j| x[j].min(y[j]).min(z[j])),
+        middle,
+    }
 }
