@@ -1,4 +1,4 @@
-// b2p: learned point-cloud streams to 3D Gaussians and pictures. Made by cbindgen from capi/src; see the README.
+// b2p: point-cloud streams to 3D Gaussians and pictures. Made by cbindgen from capi/src; see the README.
 
 #ifndef B2P_H
 #define B2P_H
@@ -40,6 +40,16 @@ typedef enum b2p_status {
   B2P_STATUS_INTERNAL = 11,
 } b2p_status;
 
+// What makes Gaussians of a level.
+typedef enum b2p_heads {
+  // The best heads of a model.
+  B2P_HEADS_BEST = 0,
+  // Its quick ones: less accurate in a fraction of the time. Only some models have them.
+  B2P_HEADS_QUICK = 1,
+  // Opaque discs, which no model is needed for. Streams of version 2 have none.
+  B2P_HEADS_SURFELS = 2,
+} b2p_heads;
+
 // A switch that stops decodings from another thread.
 typedef struct b2p_cancel b2p_cancel;
 
@@ -48,6 +58,9 @@ typedef struct b2p_decoding b2p_decoding;
 
 // Gaussians of a level.
 typedef struct b2p_gaussians b2p_gaussians;
+
+// Learned heads that draw streams of version 3, ready to run. Any number of decodings share them, in any threads.
+typedef struct b2p_heads_model b2p_heads_model;
 
 // A model, ready to run. Any number of decodings share it, in any threads.
 typedef struct b2p_model b2p_model;
@@ -146,6 +159,22 @@ enum b2p_status b2p_model_from_bytes(const uint8_t *bytes,
 // `model` is NULL or came from this library, and is not used any more.
 void b2p_model_free(struct b2p_model *model);
 
+// Loads the content of a file of learned heads, which is not needed afterwards. Fails with MALFORMED, UNSUPPORTED, USAGE.
+//
+// # Safety
+// `bytes` leads to `length` bytes; `heads` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_heads_model_from_bytes(const uint8_t *bytes,
+                                           size_t length,
+                                           struct b2p_heads_model **heads,
+                                           char *message,
+                                           size_t size);
+
+// Frees learned heads. Decodings that draw with them go on.
+//
+// # Safety
+// `heads` is NULL or came from this library, and is not used any more.
+void b2p_heads_model_free(struct b2p_heads_model *heads);
+
 // A new switch.
 //
 // # Safety
@@ -164,11 +193,12 @@ void b2p_cancel_throw(const struct b2p_cancel *cancel);
 // `cancel` is NULL or came from this library, and is not used any more.
 void b2p_cancel_free(struct b2p_cancel *cancel);
 
-// Begins to decode a stream down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits` and `cancel`
-// may be NULL. Fails with USAGE.
+// Begins to decode a stream of either version down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits`
+// and `cancel` may be NULL, and so may `model`, which streams of version 3 do not need: one of version 2 then fails with MODEL. Fails with
+// USAGE.
 //
 // # Safety
-// `model` is a model; `limits` and `cancel` are NULL or what they say; `decoding` is writable; `message` is NULL or leads to `size`
+// `model` is NULL or a model; `limits` and `cancel` are NULL or what they say; `decoding` is writable; `message` is NULL or leads to `size`
 // bytes.
 enum b2p_status b2p_decoding_start(const struct b2p_model *model,
                                    const struct b2p_limits *limits,
@@ -178,13 +208,31 @@ enum b2p_status b2p_decoding_start(const struct b2p_model *model,
                                    char *message,
                                    size_t size);
 
-// Generates Gaussians with the model's quick heads from now on, thinner ones for weak machines, which only some models have; or, as at first,
-// with its best. What has been decoded stays. Fails with UNSUPPORTED, USAGE.
+// Makes Gaussians with a model's quick heads from now on, or with its best. What has been decoded stays. Fails with UNSUPPORTED, USAGE.
 //
 // # Safety
 // `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
 enum b2p_status b2p_decoding_use_quick_heads(struct b2p_decoding *decoding,
                                              bool quick,
+                                             char *message,
+                                             size_t size);
+
+// Makes Gaussians with these heads from now on: one of b2p_heads. At first they are the best there are. What has been decoded stays. Fails with
+// UNSUPPORTED, USAGE.
+//
+// # Safety
+// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_use_heads(struct b2p_decoding *decoding,
+                                       int32_t heads,
+                                       char *message,
+                                       size_t size);
+
+// Draws streams of version 3 with these learned heads from now on. What has been decoded stays. Fails with USAGE.
+//
+// # Safety
+// `decoding` is a decoding; `heads` are learned heads; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_use_heads_model(struct b2p_decoding *decoding,
+                                             const struct b2p_heads_model *heads,
                                              char *message,
                                              size_t size);
 

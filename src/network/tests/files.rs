@@ -425,7 +425,7 @@ fn what_a_bit_is_worth_is_for_the_model_to_say_and_changes_nothing_of_its_stream
         "-1", "101", "\"much\"", "null", "[]", &two_roles, &too_many, &too_dear,
     ];
     for wrong in said {
-        let error = saying(wrong).err().expect("it is wrong");
+        let error = saying(wrong).expect_err("it is wrong");
         let text = error.to_string();
         assert!(matches!(error, Error::Malformed { .. }), "{text}");
         assert!(
