@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use b2p::Limits;
 use b2p::decoder::HeadSet;
 use b2p::encoder::Residual;
+use b2p::encoder::transform::Fineness;
 use b2p::gaussians::Steps;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -111,9 +112,10 @@ pub struct Encode {
     /// leaves out the finest levels if they do not fit
     #[arg(long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["step", "lossless", "bit_price", "residual"])]
     pub bits_per_point: Option<f64>,
-    /// Quantisation step of the finest level's luma in 255ths, 0.5 to 1000; coarser levels have finer steps [default: 20]
-    #[arg(long, value_name = "S", value_parser = step, conflicts_with = "lossless")]
-    pub step: Option<f32>,
+    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma twice that of luma unless said; coarser
+    /// levels have finer steps [default: 20]
+    #[arg(long, value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
+    pub step: Option<Fineness>,
     /// Code the mean colours of the finest level's voxels exactly
     #[arg(long)]
     pub lossless: bool,
@@ -415,11 +417,18 @@ fn price(text: &str) -> Result<f32, String> {
     }
 }
 
-fn step(text: &str) -> Result<f32, String> {
-    match text.parse() {
+fn step(text: &str) -> Result<Fineness, String> {
+    let size = |text: &str| match text.parse() {
         Ok(step) if (0.5..=1000.0).contains(&step) => Ok(step),
-        _ => Err("expected a number from 0.5 to 1000 such as 16".into()),
-    }
+        _ => Err("expected one or two numbers from 0.5 to 1000 such as 16 or 16,24"),
+    };
+    Ok(match text.split_once(',') {
+        None => Fineness::Step(size(text)?),
+        Some((luma, chroma)) => Fineness::Steps {
+            luma: size(luma)?,
+            chroma: size(chroma)?,
+        },
+    })
 }
 
 fn per_voxel(text: &str) -> Result<usize, String> {
@@ -533,7 +542,7 @@ mod tests {
         for wrong in ["0", "-1", "nan", "inf", "1e999", "few"] {
             assert!(bits_per_point(wrong).unwrap_err().contains("above 0"));
         }
-        assert!(step("0").unwrap_err().contains("0.5") && step("inf").is_err());
+        assert!(step("0").unwrap_err().contains("0.5") && step("8,inf").is_err());
         assert!(size("0x4").unwrap_err().contains("1024x1024"));
         assert!(orbit("1,2").unwrap_err().contains("three"));
         assert!(effect("antialias").unwrap_err().contains("antialias=on"));

@@ -101,7 +101,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Cod
         ..transform::Options::default()
     };
     match args.step {
-        Some(step) => options.fineness = Fineness::Step(step),
+        Some(step) => options.fineness = step,
         None if args.lossless => options.fineness = Fineness::Lossless,
         None => {}
     }
@@ -111,10 +111,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Cod
             let (encoded, chosen) =
                 transform::encode_within(cloud, &options, most, log).map_err(in_cloud)?;
             let level = chosen.levels.map_or(0, |levels| *levels.end());
-            let how = match chosen.fineness {
-                Fineness::Lossless => "exact colours".into(),
-                Fineness::Step(step) => format!("step {step:.2}"),
-            };
+            let how = chosen.fineness;
             (encoded, format!(" of at most {most}: level {level}, {how}"))
         }
         None => {

@@ -2,6 +2,7 @@
 
 mod within;
 
+use std::fmt;
 use std::ops::RangeInclusive;
 
 use b2p_kernels::Isa;
@@ -21,8 +22,15 @@ pub use within::encode_within;
 /// How exactly colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Fineness {
-    /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000.
+    /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice that.
     Step(f32),
+    /// The same with a size for each.
+    Steps {
+        /// Luma's.
+        luma: f32,
+        /// Chroma's, ½ to 1000, too.
+        chroma: f32,
+    },
     /// The mean colours of the finest level's voxels, each channel rounded to a whole 255th.
     Lossless,
 }
@@ -59,6 +67,8 @@ impl Default for Options {
 
 /// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green and blue comes of both.
 const CHROMA: u8 = 8;
+/// The coarsest index of chroma: Co's step is two indices greater.
+const MAX_CHROMA: u8 = Steps::MAX - 2;
 /// Filters of levels that are not the finest may take one part in so many of a stream that ends there.
 const FILTER_SHARE: usize = 100;
 
@@ -76,31 +86,67 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &mut Log) -> Resul
     subject.checked(coded, log)
 }
 
-impl Fineness {
-    /// The steps of the finest level.
-    fn steps(self) -> Result<Steps> {
-        let step = match self {
-            Fineness::Lossless => return Ok(Steps::LOSSLESS),
-            Fineness::Step(step) => step,
-        };
-        if !(0.5..=1000.0).contains(&step) {
-            let what = "the quantisation step of luma is 0.5 to 1000 255ths";
-            return Err(Error::Usage(format!("{what}, not {step}")));
+impl fmt::Display for Fineness {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Fineness::Step(luma) => write!(f, "step {luma:.2}"),
+            Fineness::Steps { luma, chroma } => write!(f, "step {luma:.2},{chroma:.2}"),
+            Fineness::Lossless => f.write_str("exact colours"),
         }
-        let nearest = |a: &u8, b: &u8| {
-            let off = |luma: u8| (steps_of(luma).luma_step() / step).ln().abs();
-            off(*a).total_cmp(&off(*b))
-        };
-        let luma = (0..=Steps::MAX).min_by(nearest).unwrap_or(Steps::MAX);
-        Ok(steps_of(luma))
     }
 }
 
-/// The steps that go with an index of luma's.
-fn steps_of(luma: u8) -> Steps {
+impl Fineness {
+    /// The steps of the finest level.
+    fn steps(self) -> Result<Steps> {
+        match self {
+            Fineness::Lossless => Ok(Steps::LOSSLESS),
+            Fineness::Step(step) => {
+                let luma = nearest(step)?;
+                Ok(steps_of(luma, luma))
+            }
+            Fineness::Steps { luma, chroma } => Ok(Steps {
+                luma: nearest(luma)?,
+                chroma: nearest(chroma)?.min(MAX_CHROMA),
+            }),
+        }
+    }
+
+    /// What stands for these steps.
+    fn of(steps: Steps) -> Self {
+        let size = |luma| Steps { luma, ..steps }.luma_step();
+        match steps.is_lossless() {
+            true => Fineness::Lossless,
+            false => Fineness::Steps {
+                luma: size(steps.luma),
+                chroma: size(steps.chroma),
+            },
+        }
+    }
+}
+
+/// The index of the step nearest to this size.
+fn nearest(size: f32) -> Result<u8> {
+    if !(0.5..=1000.0).contains(&size) {
+        let what = "a quantisation step is 0.5 to 1000 255ths";
+        return Err(Error::Usage(format!("{what}, not {size}")));
+    }
+    let off = |luma: &u8| {
+        let steps = Steps {
+            luma: *luma,
+            chroma: 0,
+        };
+        (steps.luma_step() / size).ln().abs()
+    };
+    let nearest = (0..=Steps::MAX).min_by(|a, b| off(a).total_cmp(&off(b)));
+    Ok(nearest.unwrap_or(Steps::MAX))
+}
+
+/// The steps that go with an index of luma's, and with one for chroma.
+fn steps_of(luma: u8, chroma: u8) -> Steps {
     Steps {
         luma,
-        chroma: (luma + CHROMA).min(Steps::MAX - 2),
+        chroma: (chroma + CHROMA).min(MAX_CHROMA),
     }
 }
 

@@ -4,18 +4,18 @@
 //! steps, then the next level, and so on; at the end of the path are the exact colours of the finest level. A level is on the path from the greatest step that its
 //! geometry is worth.
 
-use super::{Coded, Fineness, Options, Subject, choose_levels, steps_of};
+use super::{Coded, Fineness, MAX_CHROMA, Options, Subject, choose_levels, steps_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth};
 use crate::encoder::Encoded;
 use crate::error::{Error, Result};
 use crate::log::Log;
 
-/// The greatest index of luma's step with which a level is coded that the stream could do without: 64 255ths.
-const COARSEST: u8 = 56;
+/// The coarsest place of a level that the stream could do without: a step of luma of 64 255ths.
+const COARSEST: u8 = 112;
 
-/// The index that is tried first: a step of 11.
-const FIRST: u8 = 36;
+/// The place that is tried first: a step of luma of 11.
+const FIRST: u8 = 72;
 
 /// One place on the path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -70,10 +70,7 @@ pub fn encode_within(
     let encoded = subject.checked(coded, log)?;
     let chosen = Options {
         levels: Some(*levels.start().min(&place.top)..=place.top),
-        fineness: match place.steps.is_lossless() {
-            true => Fineness::Lossless,
-            false => Fineness::Step(place.steps.luma_step()),
-        },
+        fineness: Fineness::of(place.steps),
         ..options.clone()
     };
     Ok((encoded, chosen))
@@ -94,20 +91,21 @@ struct Search<'a> {
 impl Search<'_> {
     /// The largest stream with the last level `top` that fits, if there is one; `only` tells that no coarser level could take its place.
     fn level(&mut self, top: u8, only: bool, log: &mut Log) -> Result<Option<(Place, Coded)>> {
-        let last = if only { Steps::MAX } else { COARSEST };
-        let place = |luma: u8| Place {
+        let last = if only { 2 * MAX_CHROMA } else { COARSEST };
+        // Luma and chroma become finer in turn.
+        let place = |at: u8| Place {
             top,
-            steps: steps_of(luma),
+            steps: steps_of(at / 2, at.div_ceil(2)),
         };
         let fixed = self.subject.geometry_bytes(top) as f64;
         // Bytes of the finest place that fits and of the coarsest that does not, beyond the geometry's.
         let (mut fits, mut exceeds): (Option<Tried>, Option<Tried>) = (None, None);
         let mut best = None;
         let mut next = Some(FIRST);
-        while let Some(luma) = next {
-            let (size, found) = self.attempt_sized(place(luma), log)?;
+        while let Some(at) = next {
+            let (size, found) = self.attempt_sized(place(at), log)?;
             let tried = Some(Tried {
-                luma,
+                at,
                 bytes: (size - fixed).max(1.0),
             });
             match found {
@@ -119,7 +117,7 @@ impl Search<'_> {
         let Some(mut best) = best else {
             return Ok(None);
         };
-        if best.0.steps.luma == 0 {
+        if best.0.steps == place(0).steps {
             let exact = Place {
                 top,
                 steps: Steps::LOSSLESS,
@@ -143,10 +141,7 @@ impl Search<'_> {
     ) -> Result<(f64, Option<(Place, Coded)>)> {
         self.tries += 1;
         let Place { top, steps } = place;
-        let how = match steps.is_lossless() {
-            true => "exact colours".into(),
-            false => format!("step {:.2}", steps.luma_step()),
-        };
+        let how = Fineness::of(steps);
         let name = format!("try {}: level {top}, {how}", self.tries);
         let points = self.subject.cloud.voxels.len();
         let coded = log.step(name, points, "points", || {
@@ -171,18 +166,18 @@ impl Search<'_> {
 /// A place that was tried.
 #[derive(Debug, Clone, Copy)]
 struct Tried {
-    luma: u8,
+    at: u8,
     bytes: f64,
 }
 
 /// The place to try next, from the one that fits and the one that does not, near where the room ends: bytes are about a power of the step.
 /// `None` if nothing is between them.
 fn between(fits: Option<Tried>, exceeds: Option<Tried>, room: f64, last: u8) -> Option<u8> {
-    /// How much the logarithm of the bytes falls from one index to the next, more or less.
-    const SLOPE: f64 = 0.075;
-    let low = exceeds.map_or(0, |tried| tried.luma + 1);
+    /// How much the logarithm of the bytes falls from one place to the next, more or less.
+    const SLOPE: f64 = 0.038;
+    let low = exceeds.map_or(0, |tried| tried.at + 1);
     let high = match fits {
-        Some(tried) => tried.luma.checked_sub(1)?,
+        Some(tried) => tried.at.checked_sub(1)?,
         None => last,
     };
     if low > high {
@@ -191,13 +186,13 @@ fn between(fits: Option<Tried>, exceeds: Option<Tried>, room: f64, last: u8) -> 
     let known = fits.or(exceeds)?;
     let slope = match (fits, exceeds) {
         (Some(a), Some(b)) => {
-            (b.bytes / a.bytes).ln() / (f64::from(a.luma) - f64::from(b.luma)).max(1.0)
+            (b.bytes / a.bytes).ln() / (f64::from(a.at) - f64::from(b.at)).max(1.0)
         }
         _ => SLOPE,
     };
     let off = (known.bytes / room.max(1.0)).ln() / slope.max(0.01);
     // A little to the side that fits, so that both sides close in.
-    let guess = f64::from(known.luma) + off + 0.3;
+    let guess = f64::from(known.at) + off + 0.3;
     Some(guess.round().clamp(f64::from(low), f64::from(high)) as u8)
 }
 
@@ -209,29 +204,29 @@ mod tests {
     fn search(bytes: impl Fn(u8) -> f64, room: f64) -> (Option<u8>, usize) {
         let (mut fits, mut exceeds, mut tries) = (None, None, 0);
         let mut next = Some(FIRST);
-        while let Some(luma) = next {
+        while let Some(at) = next {
             tries += 1;
             let tried = Some(Tried {
-                luma,
-                bytes: bytes(luma),
+                at,
+                bytes: bytes(at),
             });
-            match bytes(luma) <= room {
+            match bytes(at) <= room {
                 true => fits = tried,
                 false => exceeds = tried,
             }
             next = between(fits, exceeds, room, COARSEST);
         }
-        (fits.map(|tried: Tried| tried.luma), tries)
+        (fits.map(|tried: Tried| tried.at), tries)
     }
 
     #[test]
     fn the_finest_step_that_fits_is_found_in_a_few_tries() {
-        for (slope, more) in [(0.03, 0.0), (0.075, 300.0), (0.2, 0.0)] {
-            let bytes = |luma: u8| 1e6 * (-slope * f64::from(luma)).exp() + more;
-            for luma in 0..=COARSEST {
-                let (found, tries) = search(bytes, bytes(luma) + 0.1);
-                assert_eq!(found, Some(luma));
-                assert!(tries <= 12, "{tries} tries for {luma} at {slope}");
+        for (slope, more) in [(0.015, 0.0), (0.04, 300.0), (0.1, 0.0)] {
+            let bytes = |at: u8| 1e6 * (-slope * f64::from(at)).exp() + more;
+            for at in 0..=COARSEST {
+                let (found, tries) = search(bytes, bytes(at) + 0.1);
+                assert_eq!(found, Some(at));
+                assert!(tries <= 12, "{tries} tries for {at} at {slope}");
             }
             assert_eq!(search(bytes, bytes(COARSEST) - 1.0).0, None);
         }
