@@ -274,7 +274,7 @@ pub(super) struct Counts {
 }
 
 impl Counts {
-    pub fn new(header: &Header, level: u8) -> Result<Self> {
+    pub(super) fn new(header: &Header, level: u8) -> Result<Self> {
         Ok(Counts {
             slice_voxels: header.slice_voxels,
             parents: header.parents(level)?,
@@ -285,7 +285,11 @@ impl Counts {
     }
 
     /// The slices of the next level.
-    pub fn take_level<'a>(&mut self, chunks: &mut Chunks<'a>, level: u8) -> Result<Geometry<'a>> {
+    pub(super) fn take_level<'a>(
+        &mut self,
+        chunks: &mut Chunks<'a>,
+        level: u8,
+    ) -> Result<Geometry<'a>> {
         let mut slices = Vec::new();
         let mut total = 0;
         // Ends with the section's chunks, however many parents are claimed.
@@ -301,7 +305,7 @@ impl Counts {
     }
 
     /// No level has more voxels than the one that ends the section.
-    pub fn check_total(&self, level: u8, offset: usize, total: u64) -> Result<()> {
+    pub(super) fn check_total(&self, level: u8, offset: usize, total: u64) -> Result<()> {
         if total <= u64::from(self.most) {
             return Ok(());
         }
@@ -311,7 +315,7 @@ impl Counts {
     }
 
     /// Sees that the section ended with as many voxels as the header tells.
-    pub fn finish(&self) -> Result<()> {
+    pub(super) fn finish(&self) -> Result<()> {
         if self.parents == u64::from(self.most) {
             return Ok(());
         }

@@ -16,6 +16,7 @@ mod progress;
 mod render;
 mod table;
 mod tradeoff;
+mod values;
 
 use std::path::Path;
 use std::process::ExitCode;

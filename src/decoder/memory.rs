@@ -109,9 +109,9 @@ pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
     let trunk = (MAP - PLAN) * above(base.min(MAX_TRUNK_VOXELS.into()));
     let parents = counts().nth_back(1).unwrap_or(base);
     let voxels = counts().next_back().unwrap_or(0);
-    // Of the level above, and of the slices that threads are at.
+    // Of the level and the one above, joined from the slices that threads are at.
     let slices = parents.div_ceil(header.colour_slice().into());
-    let learned = 2 + slices.min(rayon::current_num_threads() as u64);
+    let learned = 3 + slices.min(rayon::current_num_threads() as u64);
     let colours = (parents + voxels) * (MAP + COLOURS) + learned * Coloured::learned_bytes() as u64;
     Ok(stream + octree + trunk + colours)
 }

@@ -419,9 +419,9 @@ impl StreamDecoder {
             placement: header.placement,
         };
         let (octree, level) = (&reached.octree, reached.level);
-        let (map, colours) = (&reached.map, &reached.colours);
+        let (map, colours) = (&reached.map, reached.colours(self.isa()));
         let network = self.network(header, level)?;
-        let (Some((model, set)), Some(above)) = (network, &reached.above_map) else {
+        let (Some((model, set)), Some(above)) = (network, &reached.above) else {
             let (voxels, per_voxel) = (octree.level(level), self.surfels_per_voxel()?);
             return Ok(surfels(self.isa(), voxels, map, colours, per_voxel, frame));
         };
@@ -429,9 +429,9 @@ impl StreamDecoder {
             octree,
             level,
             map,
-            above,
+            above: &above.map,
             colours,
-            colours_above: &reached.colours_above,
+            colours_above: &reached.colours_above(above),
             luma_step: reached.coloured.steps().luma_step(),
         };
         model.generate(self.isa(), self.precision, set, input, frame)
@@ -587,7 +587,7 @@ impl<'b> StreamDecoding<'b> {
         let (reached, header) = (decoding.reached()?, decoding.header()?);
         Some(Points {
             voxels: reached.octree.level(reached.level),
-            colours: &reached.colours,
+            colours: reached.colours(self.decoder.isa()),
             frame: Frame {
                 bits: header.bits,
                 placement: header.placement,

@@ -1,7 +1,9 @@
 //! Streams of version 3 on their way to colours and Gaussians.
 
 use std::borrow::Cow;
+use std::sync::OnceLock;
 
+use b2p_kernels::Isa;
 use xxhash_rust::xxh3::Xxh3Default;
 
 use super::decoding::nothing_reached;
@@ -29,14 +31,40 @@ pub(super) struct Reached {
     pub octree: Octree,
     /// Its 3³ kernel map.
     pub map: KernelMap,
-    /// That of the level above; level 0 has none.
-    pub above_map: Option<KernelMap>,
+    /// Level 0 has none.
+    pub above: Option<Above>,
     /// Decoded, before the filter: what the next level is coded from.
     pub coloured: Coloured,
-    /// Filtered, as they are drawn.
-    pub colours: Vec<[u8; 3]>,
-    /// Of the level above, before its filter.
-    pub colours_above: Vec<[u8; 3]>,
+    filter: Option<Filter>,
+    /// Filtered, as they are drawn, once they are asked for.
+    filtered: OnceLock<Vec<[u8; 3]>>,
+}
+
+/// The level above.
+#[derive(Debug)]
+pub(super) struct Above {
+    pub map: KernelMap,
+    /// Before the filter; not known of the last level but one of a trunk.
+    coloured: Option<Coloured>,
+}
+
+impl Reached {
+    /// The colours of the level as they are drawn.
+    pub fn colours(&self, isa: Isa) -> &[[u8; 3]] {
+        self.filtered.get_or_init(|| match &self.filter {
+            None => self.coloured.rgb(),
+            Some(filter) => filter.rgb(isa, &self.coloured, &self.map),
+        })
+    }
+
+    /// The colours of the level above before its filter: where they are not known, the means of this level's, which come to the same but for
+    /// rounding.
+    pub fn colours_above(&self, above: &Above) -> Vec<[u8; 3]> {
+        match &above.coloured {
+            Some(coloured) => coloured.rgb(),
+            None => means(&self.octree, self.level, &self.coloured.rgb()),
+        }
+    }
 }
 
 impl<'b> Transform<'b> {
@@ -101,9 +129,25 @@ impl<'b> Transform<'b> {
             part: &part,
             colours,
         };
-        match growing.level(&mut octree, self.reached.as_ref(), filter.as_ref(), log) {
-            Ok(grown) => {
-                self.reached = Some(Reached { octree, ..grown });
+        match growing.level(&mut octree, self.reached.as_ref(), log) {
+            Ok(Step {
+                map,
+                coloured,
+                above,
+            }) => {
+                let old = self.reached.take().map(|old| Above {
+                    map: old.map,
+                    coloured: Some(old.coloured),
+                });
+                self.reached = Some(Reached {
+                    level,
+                    octree,
+                    map,
+                    above: above.or(old),
+                    coloured,
+                    filter,
+                    filtered: OnceLock::new(),
+                });
                 Ok(())
             }
             Err(error) => {
@@ -128,6 +172,13 @@ impl<'b> Transform<'b> {
         let set = decoder.heads();
         let name = format!("Gaussians of level {}, {set}", reached.level);
         let voxels = reached.octree.level(reached.level).len();
+        if reached.filter.is_some() && reached.filtered.get().is_none() {
+            let name = format!("filter of level {}", reached.level);
+            log.step(name, voxels, "voxels", || {
+                reached.colours(decoder.isa());
+                Ok(())
+            })?;
+        }
         log.step(name, voxels, "voxels", || decoder.generate(header, reached))
     }
 }
@@ -140,72 +191,40 @@ struct Growing<'a> {
     colours: &'a Colours<'a>,
 }
 
-/// The kernel map and the colours of a level on the way to the one that a section is of.
+/// The kernel map and the colours of a level on the way to the one that a section is of, and of the level above if the section has it.
 struct Step {
     map: KernelMap,
     coloured: Coloured,
-    above_map: Option<KernelMap>,
-    colours_above: Vec<[u8; 3]>,
+    above: Option<Above>,
 }
 
 impl Growing<'_> {
-    /// Grows `octree` to the level of the part; the octree of what is returned is not set.
-    fn level(
-        &self,
-        octree: &mut Octree,
-        above: Option<&Reached>,
-        filter: Option<&Filter>,
-        log: &mut Log,
-    ) -> Result<Reached> {
+    /// Grows `octree` to the level of the part.
+    fn level(&self, octree: &mut Octree, above: Option<&Reached>, log: &mut Log) -> Result<Step> {
         let level = self.part.level;
-        let mut step = None;
-        if let Some(trunk) = &self.colours.trunk {
-            step = Some(self.trunk(octree, trunk, log)?);
-        }
-        let first = step.as_ref().map_or(level, |_| octree.depth() + 1);
-        for n in first..=level {
+        let mut step = match &self.colours.trunk {
+            Some(trunk) => Some(self.trunk(octree, trunk, log)?),
+            None => None,
+        };
+        for n in octree.depth() + 1..=level {
             let (map, coloured) = match (&step, above) {
                 (Some(step), _) => (&step.map, &step.coloured),
                 (None, Some(above)) => (&above.map, &above.coloured),
                 (None, None) => return Err(nothing_reached()),
             };
-            let mut next = self.next(octree, n, map, coloured, log)?;
-            if n == level {
-                next.above_map = Some(map.clone());
-            }
-            step = Some(next);
+            let (map, coloured) = self.next(octree, n, map, coloured, log)?;
+            step = Some(Step {
+                map,
+                coloured,
+                above: step.map(|above| Above {
+                    map: above.map,
+                    coloured: Some(above.coloured),
+                }),
+            });
         }
-        let Some(step) = step else {
-            return Err(nothing_reached());
-        };
-        let Step {
-            map,
-            coloured,
-            above_map,
-            mut colours_above,
-        } = step;
-        self.part.check_colours(colour_hash(&coloured))?;
-        if colours_above.is_empty() && level > 0 {
-            colours_above = means(octree, level, &coloured.rgb());
-        }
-        let (isa, count) = (self.decoder.isa(), self.part.voxels as usize);
-        let colours = match filter {
-            None => coloured.rgb(),
-            Some(filter) => {
-                log.step(format!("filter of level {level}"), count, "voxels", || {
-                    Ok(filter.rgb(isa, &coloured, &map))
-                })?
-            }
-        };
-        Ok(Reached {
-            level,
-            octree: Octree::root(),
-            map,
-            above_map,
-            coloured,
-            colours,
-            colours_above,
-        })
+        let step = step.ok_or_else(nothing_reached)?;
+        self.part.check_colours(colour_hash(&step.coloured))?;
+        Ok(step)
     }
 
     /// The levels that the colour trunk holds.
@@ -232,8 +251,10 @@ impl Growing<'_> {
         Ok(Step {
             map,
             coloured,
-            above_map: maps.pop(),
-            colours_above: Vec::new(),
+            above: maps.pop().map(|map| Above {
+                map,
+                coloured: None,
+            }),
         })
     }
 
@@ -245,7 +266,7 @@ impl Growing<'_> {
         above_map: &KernelMap,
         above: &Coloured,
         log: &mut Log,
-    ) -> Result<Step> {
+    ) -> Result<(KernelMap, Coloured)> {
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
         let header = self.header;
         let geometry = self.part.geometry.iter().find(|part| part.level == n);
@@ -269,12 +290,7 @@ impl Growing<'_> {
                 isa, octree, n, above_map, &map, above, slices, slice, cancel,
             )
         })?;
-        Ok(Step {
-            map,
-            coloured,
-            above_map: None,
-            colours_above: above.rgb(),
-        })
+        Ok((map, coloured))
     }
 }
 

@@ -61,9 +61,10 @@ pub(super) fn log2(x: f32) -> f32 {
     // ln m = 2 artanh(s), s = (m − 1) / (m + 1) < 1/3.
     let s = (mantissa - 1.0) / (mantissa + 1.0);
     let q = s * s;
-    let series = (0..10)
-        .rev()
-        .fold(0.0, |p, k| p * q + 1.0 / f64::from(2 * k + 1));
+    let mut series = 0.0;
+    for k in (0..10).rev() {
+        series = series * q + 1.0 / f64::from(2 * k + 1);
+    }
     (f64::from(exponent) + 2.0 * s * series * std::f64::consts::LOG2_E) as f32
 }
 

@@ -42,7 +42,7 @@ pub struct Shape {
 }
 
 /// The model in a file.
-pub fn model(bytes: &[u8]) -> Result<HeadsModel> {
+pub(super) fn model(bytes: &[u8]) -> Result<HeadsModel> {
     let tensors = Tensors::new(bytes)?;
     let json = tensors.metadata("b2p-heads");
     let json = json.ok_or_else(|| wrong("b2p-heads", "missing", "the heads' description"))?;
