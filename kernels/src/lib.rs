@@ -36,6 +36,7 @@ pub mod ceiling;
 pub mod hidden;
 pub mod mixing;
 pub mod reference;
+pub mod smooth;
 pub mod splat;
 
 pub use binary16::f16;

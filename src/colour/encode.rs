@@ -2,11 +2,12 @@
 
 use std::ops::Range;
 
+use b2p_kernels::smooth::Values;
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
 use super::block::{Coding, Quantiser, Source};
-use super::filter::{Responses, TERMS, solve};
+use super::filter::{Responses, TERMS, solve, widen};
 use super::model::{BINS, Circumstances, Model};
 use super::space::{FRACTION, from_rgb};
 use super::transform::forward;
@@ -297,6 +298,7 @@ pub(super) fn fit_pass(
     steps: Steps,
     truth: &[Ycc],
 ) -> [[i8; TERMS]; 3] {
+    let values = &widen(values);
     let blocks: Vec<usize> = (0..values.len()).step_by(FIT_BLOCK).collect();
     let sums: Vec<_> = blocks
         .into_par_iter()
@@ -330,7 +332,7 @@ type Normal = [([[f64; TERMS]; TERMS], [f64; TERMS]); 3];
 /// Adds up the normal equations of a block of voxels.
 struct Fit<'a> {
     first: usize,
-    values: &'a [Ycc],
+    values: &'a [Values],
     map: &'a KernelMap,
     steps: Steps,
     truth: &'a [Ycc],
@@ -340,7 +342,7 @@ impl Work for Fit<'_> {
     type Output = Normal;
 
     #[inline(always)]
-    fn run<I: Instructions>(self, _: I) -> Normal {
+    fn run<I: Instructions>(self, instructions: I) -> Normal {
         let Fit {
             first,
             values,
@@ -351,7 +353,7 @@ impl Work for Fit<'_> {
         let responses = Responses::new(steps);
         let mut sums = Normal::default();
         for voxel in first..values.len().min(first + FIT_BLOCK) {
-            let terms = responses.terms(values, map, voxel);
+            let terms = responses.terms(instructions, values, map, voxel);
             for t in 0..3 {
                 let missing = f64::from(truth[voxel][t]) - f64::from(values[voxel][t]);
                 let x = terms[t].map(|x| f64::from(x) / 4.0);

@@ -17,6 +17,7 @@
 //! the response is `(d·(4096 − ((x·x) >> 12))) >> 12`. A term is `(sum·⌊2¹⁶ / counts⌋) >> 14`, four times the mean; a pass adds `(Σ weight·term + 32) >> 6`. All shifts round down; products of a
 //! sum and an inverse have 64 bits. Results are clamped as decoded colours are. A channel without a step stays as it is.
 
+use b2p_kernels::smooth::{Lanes, Values, responses};
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
@@ -30,8 +31,8 @@ pub(super) const TERMS: usize = 5;
 const MAX_PASSES: usize = 2;
 /// Bytes of a pass.
 const PASS_BYTES: usize = 3 * TERMS;
-/// How often neighbours count, by how many coordinates differ.
-const COUNTS: [i32; 4] = [0, 20, 12, 7];
+/// How often neighbours by a face, an edge and a corner count.
+const COUNTS: [i32; 3] = [20, 12, 7];
 /// Voxels of a task.
 const BLOCK: usize = 4096;
 
@@ -134,7 +135,7 @@ impl Filter {
 
 /// One pass over a level.
 fn filtered(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, pass: &Pass) -> Vec<Ycc> {
-    let mut out = vec![[0; 3]; values.len()];
+    let (values, mut out) = (&widen(values), vec![[0; 3]; values.len()]);
     let tasks = out.par_chunks_mut(BLOCK).enumerate();
     tasks.for_each(|(i, out)| {
         isa.run(Task {
@@ -151,7 +152,7 @@ fn filtered(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, pass: &Pass
 
 struct Task<'a> {
     first: usize,
-    values: &'a [Ycc],
+    values: &'a [Values],
     map: &'a KernelMap,
     steps: Steps,
     pass: &'a Pass,
@@ -162,7 +163,7 @@ impl Work for Task<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<I: Instructions>(self, _: I) {
+    fn run<I: Instructions>(self, instructions: I) {
         let Task {
             first,
             values,
@@ -171,9 +172,9 @@ impl Work for Task<'_> {
             pass,
             out,
         } = self;
-        let responses = Responses::new(steps);
+        let around = Responses::new(steps);
         for (voxel, out) in (first..).zip(out) {
-            let terms = responses.terms(values, map, voxel);
+            let terms = around.terms(instructions, values, map, voxel);
             for t in 0..3 {
                 let weighted = pass[t].iter().zip(terms[t]);
                 let sum = weighted.fold(0i32, |sum, (w, x)| sum.wrapping_add(i32::from(*w) * x));
@@ -186,20 +187,23 @@ impl Work for Task<'_> {
     }
 }
 
-/// How neighbours' differences count: lanes 0 to 2 narrow responses of Y, Co and Cg, 4 to 6 wide ones.
-pub(super) struct Responses {
-    inverses: [i32; 8],
+/// Values as responses take them: Y, Co, Cg and a zero, twice.
+pub(super) fn widen(values: &[Ycc]) -> Vec<Values> {
+    values
+        .par_iter()
+        .map(|&[y, co, cg]| [y, co, cg, 0, y, co, cg, 0])
+        .collect()
 }
 
-/// By place in a 3³ row: how many coordinates differ.
-static OFF: [u8; 27] = {
-    let (mut off, mut k) = ([0; 27], 0);
-    while k < 27 {
-        off[k] = (k % 3 != 1) as u8 + (k / 3 % 3 != 1) as u8 + (k / 9 != 1) as u8;
-        k += 1;
-    }
-    off
-};
+/// The places in a 3³ row of the neighbours that share a face, an edge, or a corner.
+const FACES: [usize; 6] = [4, 10, 12, 14, 16, 22];
+const EDGES: [usize; 12] = [1, 3, 5, 7, 9, 11, 15, 17, 19, 21, 23, 25];
+const CORNERS: [usize; 8] = [0, 2, 6, 8, 18, 20, 24, 26];
+
+/// How neighbours' differences count: lanes 0 to 2 narrow responses of Y, Co and Cg, 4 to 6 wide ones.
+pub(super) struct Responses {
+    inverses: Lanes,
+}
 
 impl Responses {
     pub fn new(steps: Steps) -> Responses {
@@ -216,40 +220,30 @@ impl Responses {
 
     /// The terms of one voxel.
     #[inline(always)]
-    pub fn terms(&self, values: &[Ycc], map: &KernelMap, voxel: usize) -> Terms {
-        let own = values[voxel];
-        let mut sums = [[0i32; 8]; 4];
-        let mut counts = 0;
-        for (&neighbour, off) in map.row(voxel).iter().zip(OFF) {
-            if neighbour == KernelMap::ABSENT || off == 0 {
-                continue;
-            }
-            let other = values[neighbour as usize];
-            let mut d = [0i32; 8];
-            for t in 0..3 {
-                d[t] = i32::from(other[t]) - i32::from(own[t]);
-                d[4 + t] = d[t];
-            }
-            let count = COUNTS[usize::from(off)];
-            let sums = &mut sums[usize::from(off)];
-            for lane in 0..8 {
-                // |d| is at most 2¹⁵ and the inverse 2¹⁶: unsigned, their product fits.
-                let x =
-                    ((d[lane].unsigned_abs() * self.inverses[lane] as u32) >> 12).min(4096) as i32;
-                let response = (d[lane] * (4096 - ((x * x) >> 12))) >> 12;
-                sums[lane] += count * response;
-            }
-            counts += count;
-        }
+    pub fn terms<I: Instructions>(
+        &self,
+        instructions: I,
+        values: &[Values],
+        map: &KernelMap,
+        voxel: usize,
+    ) -> Terms {
+        let (own, row) = (&values[voxel], map.row(voxel));
+        let sum =
+            |places: &[usize]| responses(instructions, values, own, row, places, &self.inverses);
+        let (faces, face_count) = sum(&FACES);
+        let (edges, edge_count) = sum(&EDGES);
+        let (corners, corner_count) = sum(&CORNERS);
+        let [face, edge, corner] = COUNTS;
+        let counts = face_count * face + edge_count * edge + corner_count * corner;
         let inverse = (1 << 16) / i64::from(counts.max(1));
         let mean = |sum: i32| ((i64::from(sum) * inverse) >> 14) as i32;
         std::array::from_fn(|t| {
             [
-                mean(sums[1][t]),
-                mean(sums[2][t]),
-                mean(sums[3][t]),
-                mean(sums[1][4 + t]),
-                mean(sums[2][4 + t] + sums[3][4 + t]),
+                mean(face * faces[t]),
+                mean(edge * edges[t]),
+                mean(corner * corners[t]),
+                mean(face * faces[4 + t]),
+                mean(edge * edges[4 + t] + corner * corners[4 + t]),
             ]
         })
     }

@@ -3,7 +3,7 @@
 //! Two predictions are made of every child. The first is the mean of the node and of its six face neighbours, each with the weight
 //! `round(4096·e^(−k/64))`, where `k = ⌊(6400·d + 49·n²) / (98·n²)⌋`: `n` is how many children that node has, and `d / n²` the squared distance, in children,
 //! from the child's centre to the mean of theirs. (So the weight is a Gaussian of standard deviation 0.7.) The second adds to these the children that were coded before in the same slice and touch the
-//! child, with weights of 831 (by a face), 113 (by an edge) and 15 (by a corner). Sums are divided by the sum of their weights, rounding towards zero.
+//! child, with weights of 831 (by a face), 113 (by an edge) and 15 (by a corner). A mean is `(sum·⌊2³² / weight⌋ + 2³¹) >> 32`, with the sums of weighted colours and of weights.
 
 /// The place in a 3³ kernel map row of the node itself and of its face neighbours.
 pub(super) const NEAR: [usize; 7] = [13, 4, 10, 12, 14, 16, 22];
@@ -102,8 +102,9 @@ impl Mean {
     /// The mean. Something must have been added whose weight is not 0.
     #[inline(always)]
     pub fn value(self) -> [i32; 3] {
-        let weight = self.weight.max(1);
-        self.sums.map(|sum| sum / weight)
+        let inverse = (1i64 << 32) / i64::from(self.weight.max(1));
+        self.sums
+            .map(|sum| ((i64::from(sum) * inverse + (1 << 31)) >> 32) as i32)
     }
 }
 

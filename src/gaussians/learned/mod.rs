@@ -15,7 +15,7 @@
 //! raw = conv3(x)
 //! ```
 //! `conv3` is a plain submanifold convolution with bias, `up` has one matrix per octant and no bias. Of a Gaussian's 14 raw numbers see
-//! [`activate`](self::activate).
+//! `activate.rs`.
 //!
 //! # The model file
 //! Safetensors, all tensors f16: `SET.parent.in.weight` [27, 12, C] and `.bias` [C], `SET.parent.I.a`, `SET.parent.I.b`, `SET.up.weight`

@@ -1,6 +1,6 @@
 //! Surfels: opaque discs in closed form, from the voxels of a level and their colours. No network, no model file.
 //!
-//! A voxel's normal is the least axis of the covariance of its neighbourhood ([`moments`]). Its disc lies in the plane through the
+//! A voxel's normal is the least axis of the covariance of its neighbourhood (`moments.rs`). Its disc lies in the plane through the
 //! neighbourhood's mean, which takes the staircase of voxels away, or nearer to the voxel where the neighbourhood is no plane. It is as wide as the
 //! voxels of such a plane are apart, and next to nothing thick, so that silhouettes do not grow; the fewer neighbours lie beside the
 //! voxel, the rounder it is. With [`PerVoxel::Four`] four smaller discs follow the colours' gradient.
@@ -39,7 +39,8 @@ pub enum PerVoxel {
     /// One, of the voxel's colour: where voxels are small in pictures.
     #[default]
     One,
-    /// Four, of colours interpolated between neighbours: where voxels are large.
+    /// Four, of colours interpolated between neighbours: where voxels are large. At level 8 of six 10-bit objects they gained 0.2 dB over whole
+    /// pictures, 0.35 dB over the foreground and 2 of SSIMULACRA2; at level 9 −0.3, +0.2 and 0.5, for twice the time.
     Four,
 }
 
