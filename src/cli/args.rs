@@ -353,8 +353,7 @@ pub struct DetailArg {
     /// streams have none) [default: the best there are]
     #[arg(long, value_name = "NAME")]
     pub heads: Option<HeadSet>,
-    /// Gaussians that heads make of a voxel of streams of version 3: 1 or 8 [default: 1 at levels from N−1 on, else 8]; of surfels, 1 or 4
-    /// [default: 1]
+    /// Gaussians that heads make of a voxel of streams of version 3: 1 or 8, of surfels 1 or 4 [default: 1 from level N−1 on, else more]
     #[arg(long, value_name = "N", value_parser = per_voxel)]
     pub per_voxel: Option<usize>,
 }

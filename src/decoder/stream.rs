@@ -160,8 +160,8 @@ impl StreamDecoder {
         self
     }
 
-    /// The same decoder, whose heads of streams of version 3 make so many Gaussians of a voxel: learned heads 1 or 8, by default one where
-    /// voxels are at most twice as wide as those of the cloud, else eight; surfels 1, the default, or 4.
+    /// The same decoder, whose heads of streams of version 3 make so many Gaussians of a voxel: learned heads 1 or 8, surfels 1 or 4. By
+    /// default it is one where voxels are at most twice as wide as those of the cloud, else more.
     pub fn with_per_voxel(mut self, count: usize) -> Self {
         self.per_voxel = Some(count);
         self
@@ -334,11 +334,12 @@ impl StreamDecoder {
         Ok(Some((model, (heads, count))))
     }
 
-    fn surfels_per_voxel(&self) -> Result<PerVoxel> {
-        match self.per_voxel {
-            None | Some(1) => Ok(PerVoxel::One),
-            Some(4) => Ok(PerVoxel::Four),
-            Some(count) => Err(Error::Unsupported {
+    fn surfels_per_voxel(&self, header: &Header, level: u8) -> Result<PerVoxel> {
+        let wide = level + 1 < header.bits;
+        match self.per_voxel.unwrap_or(if wide { 4 } else { 1 }) {
+            1 => Ok(PerVoxel::One),
+            4 => Ok(PerVoxel::Four),
+            count => Err(Error::Unsupported {
                 what: "drawing with so many surfels a voxel",
                 detail: format!("{count} were asked for, 1 or 4 would do"),
             }),
@@ -354,7 +355,10 @@ impl StreamDecoder {
         };
         Ok(match self.network(header, level)? {
             Some((model, set)) => model.bytes(set, voxels, above),
-            None => super::memory::surfels(voxels, self.surfels_per_voxel()?.count() as u64),
+            None => super::memory::surfels(
+                voxels,
+                self.surfels_per_voxel(header, level)?.count() as u64,
+            ),
         })
     }
 
@@ -380,7 +384,7 @@ impl StreamDecoder {
     pub(super) fn check_drawable(&self, header: &Header, level: u8) -> Result<()> {
         header.voxels(level)?;
         if self.network(header, level)?.is_none() {
-            self.surfels_per_voxel()?;
+            self.surfels_per_voxel(header, level)?;
         }
         match self.drawable(header).any(|l| l == level) {
             true => Ok(()),
@@ -422,7 +426,8 @@ impl StreamDecoder {
         let (map, colours) = (&reached.map, reached.colours(self.isa()));
         let network = self.network(header, level)?;
         let (Some((model, set)), Some(above)) = (network, &reached.above) else {
-            let (voxels, per_voxel) = (octree.level(level), self.surfels_per_voxel()?);
+            let voxels = octree.level(level);
+            let per_voxel = self.surfels_per_voxel(header, level)?;
             return Ok(surfels(self.isa(), voxels, map, colours, per_voxel, frame));
         };
         let input = LevelInput {
