@@ -228,6 +228,8 @@ fn a_bomb_of_a_hundred_bytes_reserves_nothing() {
             3
         ],
     };
+    // Threads start the first time.
+    rayon::current_num_threads();
     let learned = Format::Learned { model: model.id() };
     let transform = Format::Transform { colour_slice: 1 };
     for format in [learned, transform] {

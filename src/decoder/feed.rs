@@ -42,7 +42,7 @@ pub(super) fn failed_before() -> Error {
 }
 
 impl<'b> Feed<'b> {
-    pub fn new(goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
+    pub(super) fn new(goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
         Feed {
             goal,
             length: bytes.len() as u64,
@@ -53,7 +53,7 @@ impl<'b> Feed<'b> {
     }
 
     /// Takes the next bytes. No more are kept than the header, once it is there, says are needed.
-    pub fn push(&mut self, bytes: &[u8]) {
+    pub(super) fn push(&mut self, bytes: &[u8]) {
         self.length += bytes.len() as u64;
         let room = match &self.opened {
             Some(opened) => opened.end.saturating_sub(self.bytes.len() as u64),
@@ -66,16 +66,16 @@ impl<'b> Feed<'b> {
         }
     }
 
-    pub fn bytes(&self) -> &[u8] {
+    pub(super) fn bytes(&self) -> &[u8] {
         &self.bytes
     }
 
-    pub fn header(&self) -> Option<&Header> {
+    pub(super) fn header(&self) -> Option<&Header> {
         self.opened.as_ref().map(|opened| &opened.header)
     }
 
     /// Fails if decoding has failed before.
-    pub fn check_usable(&self) -> Result<()> {
+    pub(super) fn check_usable(&self) -> Result<()> {
         match self.failed {
             true => Err(failed_before()),
             false => Ok(()),
@@ -83,13 +83,13 @@ impl<'b> Feed<'b> {
     }
 
     /// Nothing is decoded any more.
-    pub fn fail(&mut self) {
+    pub(super) fn fail(&mut self) {
         self.failed = true;
     }
 
     /// The level to decode next, if that is possible already: `reached` is the one decoded last, and `ended` tells that all bytes have come.
     /// `plan` is asked once for the last level to decode, and holds what that takes against the limits.
-    pub fn next_level(
+    pub(super) fn next_level(
         &mut self,
         ended: bool,
         reached: Option<u8>,

@@ -6,8 +6,10 @@
 
 mod decoding;
 mod feed;
+mod heads;
 mod memory;
 mod stream;
+mod streaming;
 mod transform;
 
 use std::borrow::Cow;
@@ -27,7 +29,9 @@ use crate::network::{Heads, Model};
 use crate::projection::Camera;
 pub use decoding::Decoding;
 use feed::Goal;
-pub use stream::{HeadSet, Points, StreamDecoder, StreamDecoding};
+pub use heads::HeadSet;
+pub use stream::{Points, StreamDecoder};
+pub use streaming::StreamDecoding;
 #[cfg(feature = "encoder")]
 pub(crate) use transform::colour_hash;
 

@@ -1,19 +1,16 @@
 //! Streams of either version to Gaussians.
 
 use std::borrow::Cow;
-use std::fmt;
-use std::str::FromStr;
 use std::sync::Arc;
 
 use b2p_kernels::Isa;
 
-use super::decoding::nothing_reached;
-use super::feed::{Goal, failed_before};
-use super::transform::{Reached, Transform};
-use super::{Decoder, Decoding};
+use super::feed::Goal;
+use super::transform::Reached;
+use super::{Decoder, HeadSet, StreamDecoding};
 #[cfg(feature = "render")]
 use crate::bitstream::Stream;
-use crate::bitstream::{Format, Header, MAGIC, version};
+use crate::bitstream::{Format, Header};
 use crate::cancel::Cancel;
 #[cfg(feature = "ply")]
 use crate::cloud::{ColouredVoxels, PointCloud};
@@ -30,74 +27,13 @@ use crate::placement::Placement;
 #[cfg(feature = "render")]
 use crate::projection::Camera;
 
-/// What makes Gaussians of a level.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum HeadSet {
-    /// The best heads of a model.
-    Best,
-    /// Its quick ones: less accurate in a fraction of the time.
-    Quick,
-    /// Opaque discs in closed form; no model file is needed. Of streams of version 3 alone.
-    #[default]
-    Surfels,
-}
-
-impl HeadSet {
-    /// All, the most accurate first.
-    pub const ALL: [HeadSet; 3] = [HeadSet::Best, HeadSet::Quick, HeadSet::Surfels];
-
-    fn name(self) -> &'static str {
-        match self {
-            HeadSet::Best => "best",
-            HeadSet::Quick => "quick",
-            HeadSet::Surfels => "surfels",
-        }
-    }
-
-    /// The heads of a model; surfels have none.
-    pub fn learned(self) -> Option<Heads> {
-        match self {
-            HeadSet::Best => Some(Heads::Best),
-            HeadSet::Quick => Some(Heads::Quick),
-            HeadSet::Surfels => None,
-        }
-    }
-}
-
-impl From<Heads> for HeadSet {
-    fn from(heads: Heads) -> Self {
-        match heads {
-            Heads::Best => HeadSet::Best,
-            Heads::Quick => HeadSet::Quick,
-        }
-    }
-}
-
-impl fmt::Display for HeadSet {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-impl FromStr for HeadSet {
-    type Err = Error;
-
-    fn from_str(name: &str) -> Result<Self> {
-        let all = HeadSet::ALL;
-        all.into_iter().find(|h| h.name() == name).ok_or_else(|| {
-            let names = all.map(HeadSet::name).join(", ");
-            Error::Usage(format!("no heads `{name}`, but {names}"))
-        })
-    }
-}
-
 /// Decodes streams of either version. Version 3 needs no model; version 2 needs the one that the stream was coded with.
 #[derive(Debug, Clone, Default)]
 pub struct StreamDecoder {
-    model: Option<Arc<Model>>,
+    pub(super) model: Option<Arc<Model>>,
     /// Asked for; otherwise the best there are.
-    heads: Option<HeadSet>,
-    heads_model: Option<Arc<HeadsModel>>,
+    pub(super) heads: Option<HeadSet>,
+    pub(super) heads_model: Option<Arc<HeadsModel>>,
     /// Gaussians a voxel, if asked for.
     per_voxel: Option<usize>,
     precision: Precision,
@@ -289,7 +225,7 @@ impl StreamDecoder {
     }
 
     /// What decodes a stream of version 2.
-    fn learned(&self, header: &Header) -> Result<Decoder<Arc<Model>>> {
+    pub(super) fn learned(&self, header: &Header) -> Result<Decoder<Arc<Model>>> {
         let Some(model) = &self.model else {
             let expected = header.model().unwrap_or_default();
             return Err(Error::ModelMissing { expected });
@@ -375,7 +311,7 @@ impl StreamDecoder {
     }
 
     /// The levels of a stream of version 3 that can be drawn: learned heads read the level above.
-    fn drawable(&self, header: &Header) -> impl Iterator<Item = u8> + use<> {
+    pub(super) fn drawable(&self, header: &Header) -> impl Iterator<Item = u8> + use<> {
         let first = u8::from(self.heads().learned().is_some());
         header.base.max(first)..=header.top
     }
@@ -444,7 +380,7 @@ impl StreamDecoder {
 }
 
 /// The heads of a model of version 2 that were asked for.
-fn learned_heads(heads: Option<HeadSet>) -> Result<Heads> {
+pub(super) fn learned_heads(heads: Option<HeadSet>) -> Result<Heads> {
     let learned = heads.map_or(Some(Heads::default()), HeadSet::learned);
     learned.ok_or_else(|| Error::Unsupported {
         what: "drawing surfels",
@@ -459,197 +395,4 @@ pub(super) fn coarsest_seen(levels: &[u8], cameras: &[Camera]) -> Option<u8> {
     let pixels = pixels.fold(0.0, f64::max);
     let seen = |level: &u8| 2.0 / f64::from(1u32 << level) * pixels <= 1.0;
     levels.iter().copied().find(seen)
-}
-
-/// A stream of either version that is decoded level by level as its bytes arrive.
-///
-/// Bytes are pushed in pieces of any size; [`StreamDecoding::advance`] decodes a level as soon as it is whole, and
-/// [`StreamDecoding::gaussians`] gives those of the level that was reached. After an error what was reached before stays usable, and nothing
-/// more is decoded.
-#[derive(Debug)]
-pub struct StreamDecoding<'b> {
-    decoder: StreamDecoder,
-    goal: Goal,
-    state: State<'b>,
-}
-
-/// What is known of a stream.
-#[derive(Debug)]
-enum State<'b> {
-    /// Not its version.
-    Start(Cow<'b, [u8]>),
-    Learned(Box<Decoding<'b, Arc<Model>>>),
-    Transform(Box<Transform<'b>>),
-    /// No stream that this decoder decodes.
-    Refused,
-}
-
-impl<'b> StreamDecoding<'b> {
-    fn new(decoder: StreamDecoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
-        StreamDecoding {
-            decoder,
-            goal,
-            state: State::Start(bytes),
-        }
-    }
-
-    /// Takes the next bytes of the stream. No more are kept than the stream's header, once it is there, says are needed.
-    pub fn push(&mut self, bytes: &[u8]) {
-        match &mut self.state {
-            State::Start(start) => start.to_mut().extend_from_slice(bytes),
-            State::Learned(decoding) => decoding.push(bytes),
-            State::Transform(decoding) => decoding.push(bytes),
-            State::Refused => {}
-        }
-    }
-
-    /// Decodes the next level, if all its bytes have come and it is not beyond the one that decoding is to end with: `None` otherwise.
-    ///
-    /// # Errors
-    /// - [`Error::ChecksumMismatch`], [`Error::Malformed`]: the bytes are damaged, or no stream;
-    /// - [`Error::Unsupported`]: a later version or a critical feature of one, or a level to end with that has no Gaussians;
-    /// - [`Error::ModelMissing`], [`Error::ModelMismatch`]: a stream of version 2 without its model;
-    /// - [`Error::DeterminismMismatch`], if all checksums hold but what was decoded is not what was coded;
-    /// - [`Error::LimitExceeded`], before anything is reserved; [`Error::Cancelled`];
-    /// - [`Error::Usage`] if the stream has no level to end with, or decoding has failed before.
-    pub fn advance(&mut self, log: &mut Log) -> Result<Option<u8>> {
-        self.step(false, log)
-    }
-
-    /// Decodes what is left, knowing that no more bytes will come.
-    ///
-    /// # Errors
-    /// Those of [`StreamDecoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
-    /// the stream must be whole, or end just where one of its levels ends.
-    pub fn finish(&mut self, log: &mut Log) -> Result<()> {
-        while self.step(true, log)?.is_some() {}
-        Ok(())
-    }
-
-    /// The header, once [`StreamDecoding::advance`] found it whole.
-    pub fn header(&self) -> Option<&Header> {
-        match &self.state {
-            State::Start(_) | State::Refused => None,
-            State::Learned(decoding) => decoding.header(),
-            State::Transform(decoding) => decoding.header(),
-        }
-    }
-
-    /// The deepest level decoded so far.
-    pub fn level(&self) -> Option<u8> {
-        match &self.state {
-            State::Start(_) | State::Refused => None,
-            State::Learned(decoding) => decoding.level(),
-            State::Transform(decoding) => decoding.level(),
-        }
-    }
-
-    /// Makes Gaussians with other heads from now on; what has been decoded stays.
-    ///
-    /// # Errors
-    /// [`Error::Unsupported`] if there are no such heads.
-    pub fn set_heads(&mut self, heads: HeadSet) -> Result<()> {
-        match (&mut self.state, &self.decoder.model, heads.learned()) {
-            (State::Learned(decoding), ..) => decoding.set_heads(learned_heads(Some(heads))?)?,
-            // Known before the stream is.
-            (State::Start(_), Some(model), Some(heads)) if self.decoder.heads_model.is_none() => {
-                model.check_heads(heads)?;
-            }
-            _ => {}
-        }
-        self.decoder.heads = Some(heads);
-        if let State::Transform(decoding) = &mut self.state {
-            decoding.decoder.heads = Some(heads);
-        }
-        Ok(())
-    }
-
-    /// Draws streams of version 3 with the heads of this model from now on; what has been decoded stays.
-    pub fn set_heads_model(&mut self, heads: Arc<HeadsModel>) {
-        if let State::Transform(decoding) = &mut self.state {
-            decoding.decoder.heads_model = Some(Arc::clone(&heads));
-        }
-        self.decoder.heads_model = Some(heads);
-    }
-
-    /// Whether the level reached has Gaussians: [`StreamDecoding::gaussians`] will not fail with [`Error::Unsupported`].
-    pub fn is_drawable(&self) -> bool {
-        match &self.state {
-            State::Start(_) | State::Refused => false,
-            State::Learned(decoding) => decoding.is_drawable(),
-            State::Transform(decoding) => match (decoding.header(), decoding.level()) {
-                (Some(header), Some(level)) => self.decoder.drawable(header).any(|l| l == level),
-                _ => false,
-            },
-        }
-    }
-
-    /// The voxels of the level reached with their colours, if the stream has version 3.
-    pub fn points(&self) -> Option<Points<'_>> {
-        let State::Transform(decoding) = &self.state else {
-            return None;
-        };
-        let (reached, header) = (decoding.reached()?, decoding.header()?);
-        Some(Points {
-            voxels: reached.octree.level(reached.level),
-            colours: reached.colours(self.decoder.isa()),
-            frame: Frame {
-                bits: header.bits,
-                placement: header.placement,
-            },
-        })
-    }
-
-    /// The Gaussians of the level reached.
-    ///
-    /// # Errors
-    /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`]; [`Error::Cancelled`];
-    /// [`Error::Usage`] if no level has been reached.
-    pub fn gaussians(&self, log: &mut Log) -> Result<Gaussians> {
-        match &self.state {
-            State::Start(_) | State::Refused => Err(nothing_reached()),
-            State::Learned(decoding) => decoding.gaussians(log),
-            State::Transform(decoding) => decoding.gaussians(log),
-        }
-    }
-
-    fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
-        if let Err(error) = self.open(ended) {
-            self.state = State::Refused;
-            return Err(error);
-        }
-        match &mut self.state {
-            State::Start(_) => Ok(None),
-            State::Refused => Err(failed_before()),
-            State::Learned(decoding) => decoding.step(ended, log),
-            State::Transform(decoding) => decoding.step(ended, log),
-        }
-    }
-
-    /// Finds out the version, if enough has come. What is no stream, or one of an unknown version, is for the header's parser to refuse.
-    fn open(&mut self, ended: bool) -> Result<()> {
-        let State::Start(bytes) = &mut self.state else {
-            return Ok(());
-        };
-        let known = bytes.len() >= MAGIC.len() && !bytes.starts_with(&MAGIC);
-        if !ended && !known && bytes.len() < MAGIC.len() + 2 {
-            return Ok(());
-        }
-        if version(bytes) == Some(2) {
-            // Of a missing model the header tells which it is.
-            let header = match Header::parse(bytes, &self.decoder.limits) {
-                Err(Error::Truncated { .. }) if !ended => return Ok(()),
-                header => header?,
-            };
-            let decoder = self.decoder.learned(&header)?;
-            let bytes = std::mem::take(bytes);
-            let decoding = Decoding::new(decoder, self.goal, bytes);
-            self.state = State::Learned(Box::new(decoding));
-            return Ok(());
-        }
-        let bytes = std::mem::take(bytes);
-        let decoding = Transform::new(self.decoder.clone(), self.goal, bytes);
-        self.state = State::Transform(Box::new(decoding));
-        Ok(())
-    }
 }

@@ -68,7 +68,7 @@ impl Reached {
 }
 
 impl<'b> Transform<'b> {
-    pub fn new(decoder: StreamDecoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
+    pub(super) fn new(decoder: StreamDecoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
         Transform {
             decoder,
             feed: Feed::new(goal, bytes),
@@ -76,24 +76,24 @@ impl<'b> Transform<'b> {
         }
     }
 
-    pub fn push(&mut self, bytes: &[u8]) {
+    pub(super) fn push(&mut self, bytes: &[u8]) {
         self.feed.push(bytes);
     }
 
-    pub fn header(&self) -> Option<&Header> {
+    pub(super) fn header(&self) -> Option<&Header> {
         self.feed.header()
     }
 
-    pub fn level(&self) -> Option<u8> {
+    pub(super) fn level(&self) -> Option<u8> {
         self.reached.as_ref().map(|reached| reached.level)
     }
 
-    pub fn reached(&self) -> Option<&Reached> {
+    pub(super) fn reached(&self) -> Option<&Reached> {
         self.reached.as_ref()
     }
 
     /// Takes the next step; `ended` tells that all bytes have come.
-    pub fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
+    pub(super) fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
         self.feed.check_usable()?;
         let (decoder, level) = (&self.decoder, self.level());
         let plan = |header: &Header, goal| decoder.plan(header, goal);
@@ -161,7 +161,7 @@ impl<'b> Transform<'b> {
     }
 
     /// The Gaussians of the level reached.
-    pub fn gaussians(&self, log: &mut Log) -> Result<Gaussians> {
+    pub(super) fn gaussians(&self, log: &mut Log) -> Result<Gaussians> {
         let (Some(header), Some(reached)) = (self.header(), &self.reached) else {
             return Err(nothing_reached());
         };

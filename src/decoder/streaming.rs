@@ -1,0 +1,209 @@
+//! Streams of either version as they arrive.
+
+use std::borrow::Cow;
+use std::sync::Arc;
+
+use super::decoding::nothing_reached;
+use super::feed::{Goal, failed_before};
+use super::stream::{Points, StreamDecoder, learned_heads};
+use super::transform::Transform;
+use super::{Decoding, HeadSet};
+use crate::bitstream::{Header, MAGIC, version};
+use crate::error::{Error, Result};
+use crate::gaussians::learned::HeadsModel;
+use crate::gaussians::{Frame, Gaussians};
+use crate::log::Log;
+use crate::network::Model;
+
+/// A stream of either version that is decoded level by level as its bytes arrive.
+///
+/// Bytes are pushed in pieces of any size; [`StreamDecoding::advance`] decodes a level as soon as it is whole, and
+/// [`StreamDecoding::gaussians`] gives those of the level that was reached. After an error what was reached before stays usable, and nothing
+/// more is decoded.
+#[derive(Debug)]
+pub struct StreamDecoding<'b> {
+    decoder: StreamDecoder,
+    goal: Goal,
+    state: State<'b>,
+}
+
+/// What is known of a stream.
+#[derive(Debug)]
+enum State<'b> {
+    /// Not its version.
+    Start(Cow<'b, [u8]>),
+    Learned(Box<Decoding<'b, Arc<Model>>>),
+    Transform(Box<Transform<'b>>),
+    /// No stream that this decoder decodes.
+    Refused,
+}
+
+impl<'b> StreamDecoding<'b> {
+    pub(super) fn new(decoder: StreamDecoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
+        StreamDecoding {
+            decoder,
+            goal,
+            state: State::Start(bytes),
+        }
+    }
+
+    /// Takes the next bytes of the stream. No more are kept than the stream's header, once it is there, says are needed.
+    pub fn push(&mut self, bytes: &[u8]) {
+        match &mut self.state {
+            State::Start(start) => start.to_mut().extend_from_slice(bytes),
+            State::Learned(decoding) => decoding.push(bytes),
+            State::Transform(decoding) => decoding.push(bytes),
+            State::Refused => {}
+        }
+    }
+
+    /// Decodes the next level, if all its bytes have come and it is not beyond the one that decoding is to end with: `None` otherwise.
+    ///
+    /// # Errors
+    /// - [`Error::ChecksumMismatch`], [`Error::Malformed`]: the bytes are damaged, or no stream;
+    /// - [`Error::Unsupported`]: a later version or a critical feature of one, or a level to end with that has no Gaussians;
+    /// - [`Error::ModelMissing`], [`Error::ModelMismatch`]: a stream of version 2 without its model;
+    /// - [`Error::DeterminismMismatch`], if all checksums hold but what was decoded is not what was coded;
+    /// - [`Error::LimitExceeded`], before anything is reserved; [`Error::Cancelled`];
+    /// - [`Error::Usage`] if the stream has no level to end with, or decoding has failed before.
+    pub fn advance(&mut self, log: &mut Log) -> Result<Option<u8>> {
+        self.step(false, log)
+    }
+
+    /// Decodes what is left, knowing that no more bytes will come.
+    ///
+    /// # Errors
+    /// Those of [`StreamDecoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
+    /// the stream must be whole, or end just where one of its levels ends.
+    pub fn finish(&mut self, log: &mut Log) -> Result<()> {
+        while self.step(true, log)?.is_some() {}
+        Ok(())
+    }
+
+    /// The header, once [`StreamDecoding::advance`] found it whole.
+    pub fn header(&self) -> Option<&Header> {
+        match &self.state {
+            State::Start(_) | State::Refused => None,
+            State::Learned(decoding) => decoding.header(),
+            State::Transform(decoding) => decoding.header(),
+        }
+    }
+
+    /// The deepest level decoded so far.
+    pub fn level(&self) -> Option<u8> {
+        match &self.state {
+            State::Start(_) | State::Refused => None,
+            State::Learned(decoding) => decoding.level(),
+            State::Transform(decoding) => decoding.level(),
+        }
+    }
+
+    /// Makes Gaussians with other heads from now on; what has been decoded stays.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if there are no such heads.
+    pub fn set_heads(&mut self, heads: HeadSet) -> Result<()> {
+        match (&mut self.state, &self.decoder.model, heads.learned()) {
+            (State::Learned(decoding), ..) => decoding.set_heads(learned_heads(Some(heads))?)?,
+            // Known before the stream is.
+            (State::Start(_), Some(model), Some(heads)) if self.decoder.heads_model.is_none() => {
+                model.check_heads(heads)?;
+            }
+            _ => {}
+        }
+        self.decoder.heads = Some(heads);
+        if let State::Transform(decoding) = &mut self.state {
+            decoding.decoder.heads = Some(heads);
+        }
+        Ok(())
+    }
+
+    /// Draws streams of version 3 with the heads of this model from now on; what has been decoded stays.
+    pub fn set_heads_model(&mut self, heads: Arc<HeadsModel>) {
+        if let State::Transform(decoding) = &mut self.state {
+            decoding.decoder.heads_model = Some(Arc::clone(&heads));
+        }
+        self.decoder.heads_model = Some(heads);
+    }
+
+    /// Whether the level reached has Gaussians: [`StreamDecoding::gaussians`] will not fail with [`Error::Unsupported`].
+    pub fn is_drawable(&self) -> bool {
+        match &self.state {
+            State::Start(_) | State::Refused => false,
+            State::Learned(decoding) => decoding.is_drawable(),
+            State::Transform(decoding) => match (decoding.header(), decoding.level()) {
+                (Some(header), Some(level)) => self.decoder.drawable(header).any(|l| l == level),
+                _ => false,
+            },
+        }
+    }
+
+    /// The voxels of the level reached with their colours, if the stream has version 3.
+    pub fn points(&self) -> Option<Points<'_>> {
+        let State::Transform(decoding) = &self.state else {
+            return None;
+        };
+        let (reached, header) = (decoding.reached()?, decoding.header()?);
+        Some(Points {
+            voxels: reached.octree.level(reached.level),
+            colours: reached.colours(self.decoder.isa()),
+            frame: Frame {
+                bits: header.bits,
+                placement: header.placement,
+            },
+        })
+    }
+
+    /// The Gaussians of the level reached.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`]; [`Error::Cancelled`];
+    /// [`Error::Usage`] if no level has been reached.
+    pub fn gaussians(&self, log: &mut Log) -> Result<Gaussians> {
+        match &self.state {
+            State::Start(_) | State::Refused => Err(nothing_reached()),
+            State::Learned(decoding) => decoding.gaussians(log),
+            State::Transform(decoding) => decoding.gaussians(log),
+        }
+    }
+
+    fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
+        if let Err(error) = self.open(ended) {
+            self.state = State::Refused;
+            return Err(error);
+        }
+        match &mut self.state {
+            State::Start(_) => Ok(None),
+            State::Refused => Err(failed_before()),
+            State::Learned(decoding) => decoding.step(ended, log),
+            State::Transform(decoding) => decoding.step(ended, log),
+        }
+    }
+
+    /// Finds out the version, if enough has come. What is no stream, or one of an unknown version, is for the header's parser to refuse.
+    fn open(&mut self, ended: bool) -> Result<()> {
+        let State::Start(bytes) = &mut self.state else {
+            return Ok(());
+        };
+        let known = bytes.len() >= MAGIC.len() && !bytes.starts_with(&MAGIC);
+        if !ended && !known && bytes.len() < MAGIC.len() + 2 {
+            return Ok(());
+        }
+        if version(bytes) == Some(2) {
+            // Of a missing model the header tells which it is.
+            let header = match Header::parse(bytes, self.decoder.limits()) {
+                Err(Error::Truncated { .. }) if !ended => return Ok(()),
+                header => header?,
+            };
+            let decoder = self.decoder.learned(&header)?;
+            let bytes = std::mem::take(bytes);
+            let decoding = Decoding::new(decoder, self.goal, bytes);
+            self.state = State::Learned(Box::new(decoding));
+            return Ok(());
+        }
+        let bytes = std::mem::take(bytes);
+        let decoding = Transform::new(self.decoder.clone(), self.goal, bytes);
+        self.state = State::Transform(Box::new(decoding));
+        Ok(())
+    }
+}
