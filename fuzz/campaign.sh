@@ -10,7 +10,7 @@
 set -euo pipefail
 cd "$(dirname "$0")"
 
-all="header entropy octree stream chunking backends model ply render"
+all="header entropy octree stream transform chunking backends model ply render"
 work=target/campaign
 log=$work/log
 mkdir -p $work artifacts

@@ -13,6 +13,8 @@ pub enum Stage {
     Bitstream,
     /// The octree.
     Geometry,
+    /// The colours of voxels.
+    Colour,
     /// The latents.
     Entropy,
     /// The model file and the layers.
@@ -28,6 +30,7 @@ impl std::fmt::Display for Stage {
         f.write_str(match self {
             Stage::Bitstream => "bitstream",
             Stage::Geometry => "geometry",
+            Stage::Colour => "colour",
             Stage::Entropy => "entropy",
             Stage::Network => "network",
             Stage::Gaussians => "gaussians",
@@ -82,11 +85,19 @@ pub enum Error {
         /// The id of the loaded model, hexadecimal.
         found: String,
     },
-    /// Checksums and model agree, yet the decoded latents do not: encoder or decoder did not compute exactly.
+    /// A stream of version 2 was to be decoded without a model.
+    #[error("the stream was coded with model {expected}, and no model is loaded")]
+    ModelMissing {
+        /// The id in the stream, hexadecimal.
+        expected: String,
+    },
+    /// Checksums and model agree, yet what was decoded does not: encoder or decoder did not compute exactly.
     #[error(
-        "latents of level {level} hash to {found:#018x}, the stream says {expected:#018x}: encoder and decoder did not compute the same"
+        "{what} of level {level} hash to {found:#018x}, the stream says {expected:#018x}: encoder and decoder did not compute the same"
     )]
     DeterminismMismatch {
+        /// What was decoded: latents or colours.
+        what: &'static str,
         /// The octree level.
         level: u8,
         /// The hash in the stream.
@@ -130,10 +141,10 @@ pub enum Error {
         /// What it may hold.
         expected: String,
     },
-    /// Of the streams that the encoder may choose from, none is as small as was asked for. Fewer levels take less, and so does a model that was trained for
-    /// fewer bits.
+    /// Of the streams that the encoder may choose from, none is as small as was asked for. Coarser levels take less, and so does, of learned
+    /// streams, a model that was trained for fewer bits.
     #[error(
-        "{asked} bits per point are too few: of this cloud's levels, with this model, the least is {:.4}",
+        "{asked} bits per point are too few: the smallest stream of these levels has {:.4}",
         (least * 1e4).ceil() / 1e4
     )]
     TooFewBits {

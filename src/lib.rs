@@ -34,6 +34,8 @@ pub mod bitstream;
 pub mod cancel;
 #[cfg(feature = "ply")]
 pub mod cloud;
+mod coding;
+pub mod colour;
 pub mod decoder;
 #[cfg(feature = "cli")]
 pub mod embedded;

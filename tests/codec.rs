@@ -113,7 +113,7 @@ fn levels_without_latents_cost_their_geometry_alone_and_are_not_predicted() {
         );
         for (role, rate) in encoded.rates.iter().enumerate() {
             let has = role < roles;
-            assert_eq!(rate.feature_bytes > 0, has, "role {role} of {roles}");
+            assert_eq!(rate.colour_bytes > 0, has, "role {role} of {roles}");
             let exact = decoder.exact(&encoded.bytes, rate.level, &mut Log::default());
             assert_eq!(exact.unwrap().latents.is_empty(), !has);
             let asked = |step: &str| {
@@ -188,7 +188,7 @@ fn a_stream_cut_after_a_level_is_the_coarser_stream() {
     let rates: usize = encoded
         .rates
         .iter()
-        .map(|r| r.geometry_bytes + r.feature_bytes)
+        .map(|r| r.geometry_bytes + r.colour_bytes)
         .sum();
     assert!(
         rates < encoded.bytes.len() && encoded.bytes.len() < rates + 200,

@@ -4,9 +4,10 @@ mod common;
 
 use std::sync::Mutex;
 
-use b2p::bitstream::Header;
+use b2p::bitstream::{Format, Header};
 use b2p::cloud::ColouredVoxels;
-use b2p::decoder::Decoder;
+use b2p::decoder::{Decoder, StreamDecoder};
+use b2p::encoder::transform::{self, Fineness};
 use b2p::encoder::{Options, Residual, encode};
 use b2p::gaussians::{Gaussians, Harmonics};
 use b2p::log::Log;
@@ -101,6 +102,50 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
 }
 
 #[test]
+fn decoding_version_3_holds_no_more_than_its_header_allows_to_foretell() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    let decoder = StreamDecoder::new().with_limits(Limits::unlimited());
+    for (kind, cloud) in clouds() {
+        let top = cloud.voxels.depth();
+        for (levels, slice, fineness) in [
+            (top.saturating_sub(3)..=top, 30_000, Fineness::Step(4.0)),
+            (top.saturating_sub(1)..=top, 500, Fineness::Lossless),
+            (1..=top - 1, 16_384, Fineness::Step(20.0)),
+        ] {
+            let options = transform::Options {
+                levels: Some(levels),
+                fineness,
+                colour_slice: slice,
+                ..transform::Options::default()
+            };
+            let bytes = transform::encode(&cloud, &options, &mut Log::default());
+            let bytes = bytes.unwrap().bytes;
+            let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
+            for level in header.base..=header.top {
+                let most = decoder.memory(&header, level).unwrap();
+                let decode = || decoder.decode(&bytes, Some(level), &mut Log::default());
+                decode().unwrap();
+                let (gaussians, held) = peak(decode);
+                let count = gaussians.unwrap().len();
+                println!("{kind}, level {level}, {count} Gaussians: {held} of {most} bytes");
+                assert!(
+                    held <= most + Limits::OVERHEAD,
+                    "{kind}, level {level}: {held}"
+                );
+            }
+            let limits = Limits {
+                max_bytes: decoder.memory(&header, header.top).unwrap() - 1,
+                ..Limits::default()
+            };
+            let strict = StreamDecoder::new().with_limits(limits);
+            let (refused, held) = peak(|| strict.decode(&bytes, None, &mut Log::default()));
+            assert!(matches!(refused, Err(Error::LimitExceeded { .. })));
+            assert!(held < 1 << 12, "{held} bytes to refuse");
+        }
+    }
+}
+
+#[test]
 fn a_decode_gives_back_all_that_it_reserved_whether_it_succeeds_or_fails() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let (_, model) = models().remove(0);
@@ -165,35 +210,48 @@ fn a_stream_over_the_memory_limit_is_refused_almost_for_nothing() {
 fn a_bomb_of_a_hundred_bytes_reserves_nothing() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let (_, model) = models().remove(0);
-    let header = Header {
+    let header = |format| Header {
         optional_flags: 0,
         bits: 21,
         base: 18,
         top: 20,
         points: 1 << 26,
         placement: b2p::Placement::VOXEL_GRID,
-        model: model.id(),
+        format,
         slice_voxels: 1,
         voxels: vec![1 << 26; 3],
         sections: vec![
             b2p::bitstream::Section {
                 geometry: u32::MAX,
-                features: u32::MAX
+                colours: u32::MAX
             };
             3
         ],
     };
-    let mut bytes = header.write();
-    bytes.extend([0; 1000]);
-    for limits in [Limits::default(), Limits::unlimited()] {
-        let decoder = Decoder::new(&model).with_limits(limits);
-        let (refused, held) = peak(|| decoder.decode(&bytes, None, &mut Log::default()));
-        let expected = matches!(
-            refused,
-            Err(Error::LimitExceeded { .. } | Error::Truncated { .. })
-        );
-        assert!(expected, "{refused:?}");
-        assert!(held < 1 << 12, "{held} bytes");
+    let learned = Format::Learned { model: model.id() };
+    let transform = Format::Transform { colour_slice: 1 };
+    for format in [learned, transform] {
+        let mut bytes = header(format).write();
+        bytes.extend([0; 1000]);
+        for limits in [Limits::default(), Limits::unlimited()] {
+            let decode = || match format {
+                Format::Learned { .. } => {
+                    let decoder = Decoder::new(&model).with_limits(limits.clone());
+                    decoder.decode(&bytes, None, &mut Log::default())
+                }
+                Format::Transform { .. } => {
+                    let decoder = StreamDecoder::new().with_limits(limits.clone());
+                    decoder.decode(&bytes, None, &mut Log::default())
+                }
+            };
+            let (refused, held) = peak(decode);
+            let expected = matches!(
+                refused,
+                Err(Error::LimitExceeded { .. } | Error::Truncated { .. })
+            );
+            assert!(expected, "{refused:?}");
+            assert!(held < 1 << 12, "{held} bytes");
+        }
     }
 }
 

@@ -38,7 +38,12 @@ fn folder_with_stream() -> tempfile::TempDir {
     let model = ["--model", "tiny.safetensors"];
     succeeds(
         at,
-        &[&["encode", "ball.ply", "-o", "ball.b2p"], &model[..]].concat(),
+        &[
+            &["encode", "ball.ply", "-o", "ball.b2p"],
+            &["--colours", "learned"][..],
+            &model[..],
+        ]
+        .concat(),
     );
     folder
 }

@@ -51,7 +51,7 @@ impl From<Error> for Fault {
             Error::Io { .. } => Status::Io,
             Error::Truncated { .. } => Status::Truncated,
             Error::ChecksumMismatch { .. } => Status::Checksum,
-            Error::ModelMismatch { .. } => Status::Model,
+            Error::ModelMismatch { .. } | Error::ModelMissing { .. } => Status::Model,
             Error::DeterminismMismatch { .. } => Status::Determinism,
             Error::LimitExceeded { .. } => Status::Limit,
             Error::Unsupported { .. } => Status::Unsupported,

@@ -3,19 +3,18 @@
 use std::ffi::c_char;
 use std::sync::Arc;
 
-use b2p::decoder::Decoder;
+use b2p::decoder::{HeadSet, StreamDecoder, StreamDecoding};
 use b2p::log::Log;
-use b2p::network::Heads;
 
 use crate::border::{Fault, Status, borrowed, changed, give, guard, slice, take};
-use crate::model::{Limits, Model};
+use crate::model::{HeadsModel, Limits, Model};
 
 /// A switch that stops decodings from another thread.
 #[derive(Default)]
 pub struct Cancel(b2p::Cancel);
 
 /// A stream that is decoded as its bytes arrive.
-pub struct Decoding(b2p::decoder::Decoding<'static, Arc<b2p::network::Model>>);
+pub struct Decoding(StreamDecoding<'static>);
 
 /// Gaussians of a level.
 pub struct Gaussians(pub(crate) b2p::gaussians::Gaussians);
@@ -81,11 +80,24 @@ pub unsafe extern "C" fn b2p_cancel_free(cancel: *mut Cancel) {
     unsafe { take(cancel) }
 }
 
-/// Begins to decode a stream down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits` and `cancel`
-/// may be NULL. Fails with USAGE.
+/// What makes Gaussians of a level.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Heads {
+    /// The best heads of a model.
+    Best = 0,
+    /// Its quick ones: less accurate in a fraction of the time. Only some models have them.
+    Quick = 1,
+    /// Opaque discs, which no model is needed for. Streams of version 2 have none.
+    Surfels = 2,
+}
+
+/// Begins to decode a stream of either version down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits`
+/// and `cancel` may be NULL, and so may `model`, which streams of version 3 do not need: one of version 2 then fails with MODEL. Fails with
+/// USAGE.
 ///
 /// # Safety
-/// `model` is a model; `limits` and `cancel` are NULL or what they say; `decoding` is writable; `message` is NULL or leads to `size`
+/// `model` is NULL or a model; `limits` and `cancel` are NULL or what they say; `decoding` is writable; `message` is NULL or leads to `size`
 /// bytes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn b2p_decoding_start(
@@ -99,9 +111,11 @@ pub unsafe extern "C" fn b2p_decoding_start(
 ) -> Status {
     let run = || {
         // SAFETY: the caller vouches for `model`, `limits` and `cancel`.
-        let (model, limits, cancel) =
-            unsafe { (borrowed(model, "model")?, limits.as_ref(), cancel.as_ref()) };
-        let mut decoder = Decoder::new(Arc::clone(&model.0));
+        let (model, limits, cancel) = unsafe { (model.as_ref(), limits.as_ref(), cancel.as_ref()) };
+        let mut decoder = StreamDecoder::new();
+        if let Some(model) = model {
+            decoder = decoder.with_model(Arc::clone(&model.0));
+        }
         if let Some(limits) = limits {
             decoder = decoder.with_limits((*limits).into());
         }
@@ -119,8 +133,7 @@ pub unsafe extern "C" fn b2p_decoding_start(
     unsafe { guard(message, size, run) }
 }
 
-/// Generates Gaussians with the model's quick heads from now on, thinner ones for weak machines, which only some models have; or, as at first,
-/// with its best. What has been decoded stays. Fails with UNSUPPORTED, USAGE.
+/// Makes Gaussians with a model's quick heads from now on, or with its best. What has been decoded stays. Fails with UNSUPPORTED, USAGE.
 ///
 /// # Safety
 /// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
@@ -134,8 +147,59 @@ pub unsafe extern "C" fn b2p_decoding_use_quick_heads(
     let run = || {
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { changed(decoding, "decoding") }?;
-        let heads = if quick { Heads::Quick } else { Heads::Best };
+        let heads = if quick { HeadSet::Quick } else { HeadSet::Best };
         Ok(decoding.0.set_heads(heads)?)
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Makes Gaussians with these heads from now on: one of b2p_heads. At first they are the best there are. What has been decoded stays. Fails with
+/// UNSUPPORTED, USAGE.
+///
+/// # Safety
+/// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_use_heads(
+    decoding: *mut Decoding,
+    heads: i32,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `decoding`.
+        let decoding = unsafe { changed(decoding, "decoding") }?;
+        // A number, for C lets an enumeration hold any.
+        let all = [
+            (Heads::Best, HeadSet::Best),
+            (Heads::Quick, HeadSet::Quick),
+            (Heads::Surfels, HeadSet::Surfels),
+        ];
+        let known = all.iter().find(|(number, _)| *number as i32 == heads);
+        let (_, heads) = known.ok_or_else(|| Fault::usage("heads are none of b2p_heads"))?;
+        Ok(decoding.0.set_heads(*heads)?)
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Draws streams of version 3 with these learned heads from now on. What has been decoded stays. Fails with USAGE.
+///
+/// # Safety
+/// `decoding` is a decoding; `heads` are learned heads; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_decoding_use_heads_model(
+    decoding: *mut Decoding,
+    heads: *const HeadsModel,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `decoding` and `heads`.
+        let (decoding, heads) =
+            unsafe { (changed(decoding, "decoding")?, borrowed(heads, "heads")?) };
+        decoding.0.set_heads_model(Arc::clone(&heads.0));
+        Ok(())
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }

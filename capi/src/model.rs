@@ -9,6 +9,9 @@ use crate::border::{Fault, Status, give, guard, slice, take};
 /// A model, ready to run. Any number of decodings share it, in any threads.
 pub struct Model(pub(crate) Arc<b2p::network::Model>);
 
+/// Learned heads that draw streams of version 3, ready to run. Any number of decodings share them, in any threads.
+pub struct HeadsModel(pub(crate) Arc<b2p::gaussians::learned::HeadsModel>);
+
 /// What an input may ask for.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -129,4 +132,37 @@ pub unsafe extern "C" fn b2p_model_from_bytes(
 pub unsafe extern "C" fn b2p_model_free(model: *mut Model) {
     // SAFETY: the caller vouches for `model`.
     unsafe { take(model) }
+}
+
+/// Loads the content of a file of learned heads, which is not needed afterwards. Fails with MALFORMED, UNSUPPORTED, USAGE.
+///
+/// # Safety
+/// `bytes` leads to `length` bytes; `heads` is writable; `message` is NULL or leads to `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_heads_model_from_bytes(
+    bytes: *const u8,
+    length: usize,
+    heads: *mut *mut HeadsModel,
+    message: *mut c_char,
+    size: usize,
+) -> Status {
+    let run = || {
+        // SAFETY: the caller vouches for `bytes`.
+        let bytes = unsafe { slice(bytes, length, "bytes") }?;
+        let loaded = b2p::gaussians::learned::HeadsModel::from_bytes(bytes)?;
+        // SAFETY: the caller vouches for `heads`.
+        unsafe { give(heads, "heads", HeadsModel(Arc::new(loaded))) }
+    };
+    // SAFETY: the caller vouches for `message`.
+    unsafe { guard(message, size, run) }
+}
+
+/// Frees learned heads. Decodings that draw with them go on.
+///
+/// # Safety
+/// `heads` is NULL or came from this library, and is not used any more.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn b2p_heads_model_free(heads: *mut HeadsModel) {
+    // SAFETY: the caller vouches for `heads`.
+    unsafe { take(heads) }
 }

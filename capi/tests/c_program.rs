@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use b2p::decoder::Decoder;
+use b2p::encoder::transform;
 use b2p::log::Log;
 use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::pixels::{Background, render};
@@ -59,6 +60,10 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     std::fs::write(at("model"), &file).expect("written");
     std::fs::write(at("both"), &file_of_both).expect("written");
     std::fs::write(at("stream"), &stream).expect("written");
+    let cloud = common::Ball::new(4, 4.5).cloud();
+    let (options, log) = (transform::Options::default(), &mut Log::default());
+    let new = transform::encode(&cloud, &options, log).expect("a ball can be coded");
+    std::fs::write(at("new"), &new.bytes).expect("written");
 
     let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, 40, 30).expect("a camera");
     let limits = b2p::Limits::default();
@@ -97,7 +102,7 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
         "nothing here watches a program's memory"
     );
     for (how, mut program) in programs {
-        program.args([at("model"), at("stream"), at("both")]);
+        program.args([at("model"), at("stream"), at("both"), at("new")]);
         let output = program.output().expect("the program starts");
         assert_eq!(printed(output), expected, "{how}");
         println!("ran {how}");

@@ -105,7 +105,13 @@ static void mistakes(const b2p_model *model, file stream) {
     CHECK(none == NULL);
 
     b2p_decoding *decoding = NULL;
-    CHECK(b2p_decoding_start(NULL, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_USAGE);
+    // Without a model, a stream of version 2 says which it needs.
+    CHECK(b2p_decoding_start(NULL, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_use_heads(decoding, 3, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_push(decoding, stream.bytes, stream.length, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_MODEL);
+    CHECK(strstr(message, "no model"));
+    b2p_decoding_free(decoding);
     CHECK(b2p_decoding_start(model, NULL, NULL, 256, &decoding, message, sizeof message) == B2P_STATUS_USAGE);
     CHECK(b2p_decoding_push(NULL, stream.bytes, stream.length, message, sizeof message) == B2P_STATUS_USAGE);
     CHECK(b2p_decoding_level(NULL) == -1);
@@ -154,9 +160,35 @@ static void mistakes(const b2p_model *model, file stream) {
     b2p_cancel_throw(NULL);
 }
 
+/* A stream of version 3 without a model, in two pieces. */
+static void without_model(file stream) {
+    b2p_decoding *decoding = NULL;
+    b2p_gaussians *gaussians = NULL;
+    CHECK(b2p_decoding_start(NULL, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_use_heads(decoding, B2P_HEADS_SURFELS, message, sizeof message) == B2P_STATUS_OK);
+    b2p_heads_model *heads = NULL;
+    CHECK(b2p_heads_model_from_bytes(stream.bytes, stream.length, &heads, message, sizeof message) == B2P_STATUS_MALFORMED);
+    CHECK(b2p_decoding_use_heads_model(decoding, heads, message, sizeof message) == B2P_STATUS_USAGE);
+    b2p_heads_model_free(heads);
+    CHECK(b2p_decoding_push(decoding, stream.bytes, 9, NULL, 0) == B2P_STATUS_OK);
+    int32_t level = 0;
+    CHECK(b2p_decoding_advance(decoding, &level, message, sizeof message) == B2P_STATUS_OK && level == -1);
+    CHECK(b2p_decoding_push(decoding, stream.bytes + 9, stream.length - 9, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_advance(decoding, &level, message, sizeof message) == B2P_STATUS_OK && level >= 0);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_OK);
+    b2p_arrays arrays;
+    CHECK(b2p_gaussians_arrays(gaussians, &arrays, NULL, 0) == B2P_STATUS_OK && arrays.count > 0);
+    b2p_gaussians_free(gaussians);
+    b2p_decoding_free(decoding);
+}
+
 int main(int count, char **arguments) {
-    // A model, a stream, and the same model with quick heads as well.
-    CHECK(count == 4);
+    // A model, a stream, the same model with quick heads as well, and a stream of version 3.
+    CHECK(count == 5);
+    file new_stream = read_file(arguments[4]);
+    without_model(new_stream);
+    free(new_stream.bytes);
     file model_file = read_file(arguments[3]), stream = read_file(arguments[2]);
     b2p_model *model = NULL, *both = NULL;
     CHECK(b2p_model_open(arguments[1], &model, message, sizeof message) == B2P_STATUS_OK);

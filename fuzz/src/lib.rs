@@ -10,6 +10,7 @@ mod pictures;
 mod seal;
 pub mod seeds;
 mod streams;
+mod transform;
 
 use std::sync::LazyLock;
 
@@ -21,14 +22,16 @@ pub use files::{model, ply};
 pub use mutate::{Change, mutate};
 pub use pictures::{backends, render};
 pub use streams::{chunking, deepest, header, stream};
+pub use transform::transform;
 
 /// A target's name and what it does.
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All targets.
-pub const TARGETS: [Target; 9] = [
+pub const TARGETS: [Target; 10] = [
     ("header", header),
     ("stream", stream),
+    ("transform", transform),
     ("chunking", chunking),
     ("octree", octree),
     ("entropy", entropy),
@@ -74,7 +77,7 @@ static MODEL: LazyLock<Model> = LazyLock::new(|| {
 });
 
 /// The targets whose inputs are streams, to be changed by [`mutate`].
-pub const STREAMS: [&str; 3] = ["header", "stream", "chunking"];
+pub const STREAMS: [&str; 4] = ["header", "stream", "chunking", "transform"];
 
 /// Has the calling thread do all work from now on: inputs are so small that handing them over takes longer than they do.
 pub fn alone() {

@@ -5,7 +5,7 @@ use std::path::Path;
 use b2p::bitstream::{Level, Stream};
 use b2p::cloud::{ColouredVoxels, PointCloud};
 use b2p::decoder::Decoder;
-use b2p::encoder::{Options, encode};
+use b2p::encoder::{Options, encode, transform};
 use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::geometry::Voxels;
 use b2p::log::Log;
@@ -39,6 +39,38 @@ fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u
         file
     });
     (stream.bytes, file)
+}
+
+/// Streams of version 3: of one slice and of several, with exact colours, and of the deepest levels.
+fn transformed() -> Vec<Vec<u8>> {
+    let coded = |depth: u8, keys: Vec<u64>, levels, slice: u32, fineness| {
+        let voxels = Voxels::new(depth, keys);
+        let colour = |key: &u64| [*key as u8, (key >> 3) as u8, (key >> 6) as u8];
+        let cloud = ColouredVoxels {
+            colours: voxels.keys().iter().map(colour).collect(),
+            voxels,
+            placement: Placement::VOXEL_GRID,
+        };
+        let options = transform::Options {
+            levels: Some(levels),
+            fineness,
+            slice_voxels: slice,
+            colour_slice: slice,
+            ..transform::Options::default()
+        };
+        let stream = transform::encode(&cloud, &options, &mut Log::default());
+        stream.expect("a small cloud is coded").bytes
+    };
+    let step = transform::Fineness::Step;
+    let lossless = transform::Fineness::Lossless;
+    vec![
+        coded(1, vec![0, 7], 0..=1, 16_384, step(8.0)),
+        coded(2, vec![0, 5, 63], 1..=2, 2, lossless),
+        coded(3, (0..512).step_by(5).collect(), 1..=3, 16_384, step(20.0)),
+        coded(4, (0..4096).step_by(37).collect(), 2..=4, 16, step(4.0)),
+        coded(4, (0..4096).step_by(41).collect(), 0..=4, 16, lossless),
+        coded(21, vec![0, 77, (1 << 63) - 1], 18..=21, 16_384, step(30.0)),
+    ]
 }
 
 /// The same stream with colour filters, for which small clouds do not pay by themselves, and residuals at every level.
@@ -100,8 +132,10 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
     match target {
         "header" | "stream" | "chunking" => {
             let coloured = coloured(&clouds[3].0);
-            streams.chain([coloured]).collect()
+            let new = (target == "header").then(transformed);
+            streams.chain([coloured]).chain(new.into_iter().flatten()).collect()
         }
+        "transform" => transformed(),
         "ply" => {
             let cloud = PointCloud {
                 positions: vec![[0.0, 1.0, 2.0], [3.0, 4.5, -1.0]],

@@ -1,16 +1,16 @@
 //! Streams from strangers.
 
 use b2p::bitstream::{Header, Level, Slice, Stream, Writer};
-use b2p::decoder::{Decoder, Decoding, Exact};
+use b2p::decoder::{Decoder, Decoding, Exact, StreamDecoder};
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
 use b2p::network::Model;
 use b2p::{Error, Limits};
 
-use crate::{MODEL, giving_back, one_in, within};
+use crate::{MODEL, giving_back, one_in, transform, within};
 
 /// So little that a level of it is decoded in a fraction of a millisecond.
-fn limits() -> Limits {
+pub(crate) fn limits() -> Limits {
     Limits {
         max_points: 1 << 8,
         max_bytes: 2 << 20,
@@ -79,6 +79,10 @@ pub fn header(bytes: &[u8]) {
 pub(crate) fn rewritten(stream: &Stream, colours: Option<&Colours<'_>>) -> Vec<u8> {
     let mut writer = Writer::new(stream.header().clone()).expect("a header that was read");
     for level in stream.levels() {
+        if let Some(colours) = &level.colours {
+            transform::rewrite(&mut writer, level, colours);
+            continue;
+        }
         for part in &level.geometry {
             let slices = part.slices.iter().map(|slice| (slice.voxels, slice.bytes));
             let slices: Vec<_> = slices.collect();
@@ -147,9 +151,14 @@ fn requests(bytes: &[u8], header: &Header, deepest: Option<u8>) {
 /// # Errors
 /// What the decoder says.
 pub fn deepest(bytes: &[u8]) -> Result<Option<u8>, Error> {
+    let log = &mut Log::default();
+    if b2p::bitstream::version(bytes) == Some(3) {
+        let decoder = StreamDecoder::new().with_limits(transform::limits());
+        return Ok(decoder.whole(bytes, None, log)?.level());
+    }
     let mut decoding = Decoder::new(&*MODEL).with_limits(limits()).start(None);
     decoding.push(bytes);
-    decoding.finish(&mut Log::default())?;
+    decoding.finish(log)?;
     Ok(decoding.level())
 }
 
@@ -234,7 +243,7 @@ fn gaussians(decoding: &Decoding<&Model>, log: &mut Log) -> Option<Gaussians> {
 }
 
 /// An error of a stream is one of those that the documentation names, and says something.
-fn check(error: &Error) {
+pub(crate) fn check(error: &Error) {
     assert!(!error.to_string().is_empty());
     assert!(matches!(
         error,

@@ -1,13 +1,20 @@
 //! Chunks: typed, numbered, checked pieces of a section.
 
 use super::malformed;
-use super::reader::Reader;
+use super::reader::{Reader, put_varint};
 use crate::error::{Error, Result};
 
-/// Bytes of a chunk before its payload.
-pub(super) const CHUNK_HEADER: usize = 16;
-/// Those of them that the checksum covers.
-const CHECKED: usize = 12;
+/// How the bytes of a chunk before its payload are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Form {
+    /// Of version 2: all numbers in their full width.
+    Fixed,
+    /// Of version 3: numbers as short as they are.
+    Short,
+}
+
+/// Bytes of a chunk of version 2 before its checksum.
+const FIXED: usize = 12;
 /// Chunk types from here on may be skipped.
 const ANCILLARY: u8 = 128;
 
@@ -22,6 +29,14 @@ pub enum ChunkKind {
     Filter,
     /// A slice of what colours are still off.
     Residual,
+    /// The first levels of the octree, in one.
+    GeometryTrunk,
+    /// The colours of the first levels, in one.
+    ColourTrunk,
+    /// A slice of the colours of a level.
+    Colours,
+    /// The filter of the colours of a level.
+    PostFilter,
     /// Something that a reader may skip: its type, 128 to 255.
     Ancillary(u8),
 }
@@ -35,66 +50,95 @@ pub struct Chunk<'a> {
     pub level: u8,
     /// Its number within level and kind.
     pub slice: u16,
-    /// How many voxels it describes.
+    /// How many voxels it describes; of a slice of colours, how many parents.
     pub count: u32,
     /// Its content.
     pub payload: &'a [u8],
     /// Byte offset of the chunk in the stream.
     pub offset: usize,
+    /// Byte offset of the payload.
+    pub payload_at: usize,
 }
 
 /// The chunks of a section.
 #[derive(Debug, Clone)]
 pub struct Chunks<'a> {
+    form: Form,
     reader: Reader<'a>,
     end: usize,
 }
 
+/// The kinds of each form with their codes and names.
+const KINDS: [(Form, u8, ChunkKind, &str); 9] = [
+    (Form::Fixed, 1, ChunkKind::Geometry, "geometry"),
+    (Form::Fixed, 2, ChunkKind::Features, "feature"),
+    (Form::Fixed, 3, ChunkKind::Filter, "filter"),
+    (Form::Fixed, 4, ChunkKind::Residual, "residual"),
+    (Form::Short, 1, ChunkKind::Geometry, "geometry"),
+    (Form::Short, 5, ChunkKind::GeometryTrunk, "geometry trunk"),
+    (Form::Short, 6, ChunkKind::ColourTrunk, "colour trunk"),
+    (Form::Short, 7, ChunkKind::Colours, "colour"),
+    (Form::Short, 8, ChunkKind::PostFilter, "colour filter"),
+];
+
 impl ChunkKind {
     fn code(self) -> u8 {
+        let code = |(_, code, kind, _): &(_, u8, ChunkKind, _)| (*kind == self).then_some(*code);
         match self {
-            ChunkKind::Geometry => 1,
-            ChunkKind::Features => 2,
-            ChunkKind::Filter => 3,
-            ChunkKind::Residual => 4,
             ChunkKind::Ancillary(code) => code,
+            _ => KINDS.iter().find_map(code).unwrap_or_default(),
         }
+    }
+
+    fn of(form: Form, code: u8) -> Option<Self> {
+        if code >= ANCILLARY {
+            return Some(ChunkKind::Ancillary(code));
+        }
+        let own = KINDS.iter().find(|kind| kind.0 == form && kind.1 == code);
+        own.map(|(_, _, kind, _)| *kind)
     }
 }
 
 impl std::fmt::Display for ChunkKind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            ChunkKind::Geometry => f.write_str("geometry"),
-            ChunkKind::Features => f.write_str("feature"),
-            ChunkKind::Filter => f.write_str("filter"),
-            ChunkKind::Residual => f.write_str("residual"),
             ChunkKind::Ancillary(code) => write!(f, "ancillary {code}"),
+            _ => {
+                let name = KINDS.iter().find(|kind| kind.2 == *self);
+                f.write_str(name.map_or("", |kind| kind.3))
+            }
         }
     }
 }
 
 impl Chunk<'_> {
-    /// Appends the chunk to `out`, `prefix` before its payload. `offset` plays no part.
+    /// Appends the chunk to `out`, `prefix` before its payload. The offsets play no part.
     ///
     /// # Errors
     /// [`Error::Usage`] if the payload is 4 GiB or more.
-    pub(super) fn write(&self, prefix: &[u8], out: &mut Vec<u8>) -> Result<()> {
+    pub(super) fn write(&self, form: Form, prefix: &[u8], out: &mut Vec<u8>) -> Result<()> {
         let length = prefix.len() + self.payload.len();
         let length = u32::try_from(length)
             .map_err(|_| Error::Usage(format!("a chunk cannot hold {length} bytes")))?;
-        let mut head = [0; CHECKED];
-        head[0] = self.kind.code();
-        head[1] = self.level;
-        head[2..4].copy_from_slice(&self.slice.to_le_bytes());
-        head[4..8].copy_from_slice(&self.count.to_le_bytes());
-        head[8..12].copy_from_slice(&length.to_le_bytes());
+        let start = out.len();
+        out.extend([self.kind.code(), self.level]);
+        match form {
+            Form::Fixed => {
+                out.extend(self.slice.to_le_bytes());
+                out.extend(self.count.to_le_bytes());
+                out.extend(length.to_le_bytes());
+            }
+            Form::Short => {
+                for number in [self.slice.into(), self.count, length] {
+                    put_varint(out, number);
+                }
+            }
+        }
         let sum = [prefix, self.payload]
             .iter()
-            .fold(crc32c::crc32c(&head), |sum, part| {
+            .fold(crc32c::crc32c(&out[start..]), |sum, part| {
                 crc32c::crc32c_append(sum, part)
             });
-        out.extend(head);
         out.extend(sum.to_le_bytes());
         out.extend(prefix);
         out.extend(self.payload);
@@ -104,57 +148,79 @@ impl Chunk<'_> {
 
 impl<'a> Chunks<'a> {
     /// The chunks of the section `range` of a stream, which lies within its bytes.
-    pub(super) fn new(stream: &'a [u8], range: std::ops::Range<usize>) -> Self {
+    pub(super) fn new(form: Form, stream: &'a [u8], range: std::ops::Range<usize>) -> Self {
         Chunks {
+            form,
             reader: Reader::new(&stream[..range.end], range.start),
             end: range.end,
         }
     }
 
     fn read(&mut self) -> Result<Chunk<'a>> {
-        let offset = self.reader.at();
-        let head: [u8; CHECKED] = self.reader.array("chunk header")?;
+        let start = self.reader.at();
+        let [code, level, slice, count, length] = match self.form {
+            Form::Fixed => self.fixed_head()?,
+            Form::Short => self.short_head()?,
+        };
+        let head = self.reader.since(start);
         let expected = self.reader.u32("chunk checksum")?;
-        let [code, level, slice @ .., _, _, _, _, _, _, _, _] = head;
-        let mut numbers = Reader::new(&head, 4);
-        let count = numbers.u32("chunk count")?;
-        let length = numbers.u32("chunk length")?;
-        let slice = u16::from_le_bytes(slice);
+        let payload_at = self.reader.at();
         let payload = self.reader.take(length as usize, "chunk payload")?;
-        let found = crc32c::crc32c_append(crc32c::crc32c(&head), payload);
+        let found = crc32c::crc32c_append(crc32c::crc32c(head), payload);
         if found != expected {
             return Err(Error::ChecksumMismatch {
                 what: format!(
                     "a chunk that calls itself type {code}, level {level}, slice {slice}"
                 ),
-                offset: offset as u64,
+                offset: start as u64,
                 expected,
                 found,
             });
         }
-        let kind = match code {
-            1 => ChunkKind::Geometry,
-            2 => ChunkKind::Features,
-            3 => ChunkKind::Filter,
-            4 => ChunkKind::Residual,
-            ANCILLARY.. => ChunkKind::Ancillary(code),
-            _ => {
-                return Err(Error::Unsupported {
-                    what: "this chunk type",
-                    detail: format!(
-                        "byte {offset} has type {code}, which only a later version knows"
-                    ),
-                });
-            }
+        let Some(kind) = ChunkKind::of(self.form, code as u8) else {
+            return Err(Error::Unsupported {
+                what: "this chunk type",
+                detail: format!("byte {start} has type {code}, which only a later version knows"),
+            });
+        };
+        let Ok(slice) = slice.try_into() else {
+            return Err(malformed(start, "slice of a chunk", slice, "at most 65535"));
         };
         Ok(Chunk {
             kind,
-            level,
+            level: level as u8,
             slice,
             count,
             payload,
-            offset,
+            offset: start,
+            payload_at,
         })
+    }
+
+    /// Type, level, slice, count and length of a chunk.
+    fn fixed_head(&mut self) -> Result<[u32; 5]> {
+        // Together, so that one error tells how much of it is missing.
+        let head: [u8; FIXED] = self.reader.array("chunk header")?;
+        let mut head = Reader::new(&head, 0);
+        let field = "chunk header";
+        Ok([
+            head.u8(field)?.into(),
+            head.u8(field)?.into(),
+            head.u16(field)?.into(),
+            head.u32(field)?,
+            head.u32(field)?,
+        ])
+    }
+
+    fn short_head(&mut self) -> Result<[u32; 5]> {
+        let reader = &mut self.reader;
+        Ok([
+            reader.u8("chunk type")?.into(),
+            reader.u8("chunk level")?.into(),
+            reader.varint("chunk slice")?,
+            reader.varint("chunk count")?,
+            reader.varint("chunk length")?,
+        ])
     }
 
     /// The next chunk that is not ancillary; it must be this one, with a count in `counts`.
@@ -165,24 +231,46 @@ impl<'a> Chunks<'a> {
         slice: u64,
         counts: std::ops::RangeInclusive<u64>,
     ) -> Result<Chunk<'a>> {
-        let wanted = format!("{kind} chunk of level {level}, slice {slice}");
-        let Some(chunk) = self.next_critical()? else {
-            return Err(malformed(self.end, "end of the section", "here", wanted));
-        };
-        let at = chunk.offset;
-        if chunk.kind != kind || chunk.level != level || u64::from(chunk.slice) != slice {
-            let found = format!(
-                "{} of level {}, slice {}",
-                chunk.kind, chunk.level, chunk.slice
-            );
-            return Err(malformed(at, "chunk", found, wanted));
-        }
+        let wanted = || format!("{kind} chunk of level {level}, slice {slice}");
+        let fits = |chunk: &Chunk| chunk.level == level && u64::from(chunk.slice) == slice;
+        let chunk = self.expect_kind(kind, fits, wanted)?;
         if !counts.contains(&chunk.count.into()) {
-            let field = format!("voxel count of the {wanted}");
+            let field = format!("voxel count of the {}", wanted());
             let expected = format!("{} to {}", counts.start(), counts.end());
-            return Err(malformed(at, field, chunk.count, expected));
+            return Err(malformed(chunk.offset, field, chunk.count, expected));
         }
         Ok(chunk)
+    }
+
+    /// The next chunk that is not ancillary; it must be of this kind, slice 0, with a level in `levels`.
+    pub(super) fn expect_up_to(
+        &mut self,
+        kind: ChunkKind,
+        levels: std::ops::RangeInclusive<u8>,
+    ) -> Result<Chunk<'a>> {
+        let (first, last) = (levels.start(), levels.end());
+        let wanted = || format!("{kind} chunk of a level from {first} to {last}, slice 0");
+        let fits = |chunk: &Chunk| levels.contains(&chunk.level) && chunk.slice == 0;
+        self.expect_kind(kind, fits, wanted)
+    }
+
+    fn expect_kind(
+        &mut self,
+        kind: ChunkKind,
+        fits: impl Fn(&Chunk) -> bool,
+        wanted: impl Fn() -> String,
+    ) -> Result<Chunk<'a>> {
+        let Some(chunk) = self.next_critical()? else {
+            return Err(malformed(self.end, "end of the section", "here", wanted()));
+        };
+        if chunk.kind == kind && fits(&chunk) {
+            return Ok(chunk);
+        }
+        let found = format!(
+            "{} of level {}, slice {}",
+            chunk.kind, chunk.level, chunk.slice
+        );
+        Err(malformed(chunk.offset, "chunk", found, wanted()))
     }
 
     /// The next chunk that is not ancillary, without taking it.

@@ -8,15 +8,65 @@ use crate::placement::Placement;
 
 /// The first bytes: not text, and changed by whatever changes line ends.
 pub const MAGIC: [u8; 8] = [0x89, b'B', b'2', b'P', b'\r', b'\n', 0x1a, b'\n'];
-/// Major and minor version that this crate writes.
-pub const VERSION: (u16, u16) = (2, 0);
 /// The most voxels of a slice.
 pub const MAX_SLICE_VOXELS: u32 = 16_384;
+/// The most parents of a slice of colours in version 3.
+pub const MAX_COLOUR_SLICE: u32 = 65_536;
 
-/// A stream has at most so many levels.
-const MAX_LEVELS: u8 = 3;
-/// Bytes before the arrays.
-const FIXED: usize = 84;
+/// The minor version that is written.
+const MINOR: u16 = 0;
+
+/// What differs between the versions of the format.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// Version 2: learned latents.
+    Learned {
+        /// The hash of the exact part of the model that they were coded with.
+        model: [u8; 16],
+    },
+    /// Version 3: transform coefficients, which no model file is needed for.
+    Transform {
+        /// Parents per slice of colours, 1 to [`MAX_COLOUR_SLICE`].
+        colour_slice: u32,
+    },
+}
+
+impl Format {
+    /// The major version.
+    pub fn version(&self) -> u16 {
+        match self {
+            Format::Learned { .. } => 2,
+            Format::Transform { .. } => 3,
+        }
+    }
+
+    /// The most levels of a stream.
+    fn max_levels(&self) -> u8 {
+        match self {
+            Format::Learned { .. } => 3,
+            Format::Transform { .. } => MAX_DEPTH,
+        }
+    }
+
+    /// Whether the finest level of the cloud, N, may be coded.
+    fn codes_the_finest(&self) -> bool {
+        matches!(self, Format::Transform { .. })
+    }
+
+    /// Bytes before the arrays.
+    fn fixed(&self) -> usize {
+        match self {
+            Format::Learned { .. } => 84,
+            Format::Transform { .. } => 72,
+        }
+    }
+}
+
+/// The major version of a stream that starts with these bytes; `None` if they are too few or none of a stream's.
+pub fn version(bytes: &[u8]) -> Option<u16> {
+    let rest = bytes.strip_prefix(&MAGIC)?;
+    Some(u16::from_le_bytes([*rest.first()?, *rest.get(1)?]))
+}
 
 /// The header of a stream.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,9 +83,9 @@ pub struct Header {
     pub points: u64,
     /// Where the cube lies in the world.
     pub placement: Placement,
-    /// The hash of the model's exact part.
-    pub model: [u8; 16],
-    /// S: voxels per slice.
+    /// How colours are coded: the version of the stream.
+    pub format: Format,
+    /// S: voxels per slice of the geometry and, in version 2, of the features.
     pub slice_voxels: u32,
     /// Voxels of level L, …, M.
     pub voxels: Vec<u32>,
@@ -48,14 +98,14 @@ pub struct Header {
 pub struct Section {
     /// Bytes of the geometry.
     pub geometry: u32,
-    /// Bytes of the features.
-    pub features: u32,
+    /// Bytes of the colours: in version 2, the features.
+    pub colours: u32,
 }
 
 impl Section {
     /// Bytes of both.
     pub fn bytes(&self) -> u64 {
-        u64::from(self.geometry) + u64::from(self.features)
+        u64::from(self.geometry) + u64::from(self.colours)
     }
 }
 
@@ -75,17 +125,22 @@ impl Header {
         reader.take(MAGIC.len(), "magic")?;
         let major = reader.u16("version")?;
         reader.u16("version")?;
-        if major != VERSION.0 {
-            return Err(Error::Unsupported {
-                what: "this stream version",
-                detail: format!("found {major}, {} would do", VERSION.0),
-            });
-        }
+        // What follows is read in place of these.
+        let mut format = match major {
+            2 => Format::Learned { model: [0; 16] },
+            3 => Format::Transform { colour_slice: 0 },
+            _ => {
+                return Err(Error::Unsupported {
+                    what: "this stream version",
+                    detail: format!("found {major}, 2 or 3 would do"),
+                });
+            }
+        };
         let critical_flags = reader.u32("critical flags")?;
         let optional_flags = reader.u32("optional flags")?;
         let [bits, base, top, reserved] = reader.array("levels")?;
         // The checksum's place depends on these two, so they are looked at before it is.
-        check_levels(base, top)?;
+        check_levels(&format, base, top)?;
         let levels = usize::from(top - base + 1);
         let points = reader.u64("points")?;
         let mut numbers = [0.0; 4];
@@ -93,8 +148,13 @@ impl Header {
             *number = reader.f64("placement")?;
         }
         let [x, y, z, voxel_size] = numbers;
-        let model = reader.array("model id")?;
+        if let Format::Learned { model } = &mut format {
+            *model = reader.array("model id")?;
+        }
         let slice_voxels = reader.u32("slice size")?;
+        if let Format::Transform { colour_slice } = &mut format {
+            *colour_slice = reader.u32("slice size of the colours")?;
+        }
         let mut voxels = Vec::with_capacity(levels);
         for _ in 0..levels {
             voxels.push(reader.u32("voxel counts")?);
@@ -103,7 +163,7 @@ impl Header {
         for _ in 0..levels {
             sections.push(Section {
                 geometry: reader.u32("section lengths")?,
-                features: reader.u32("section lengths")?,
+                colours: reader.u32("section lengths")?,
             });
         }
         let found = crc32c::crc32c(&bytes[..reader.at()]);
@@ -135,7 +195,7 @@ impl Header {
                 origin: [x, y, z],
                 voxel_size,
             },
-            model,
+            format,
             slice_voxels,
             voxels,
             sections,
@@ -148,8 +208,8 @@ impl Header {
     pub fn write(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(self.bytes());
         bytes.extend(MAGIC);
-        bytes.extend(VERSION.0.to_le_bytes());
-        bytes.extend(VERSION.1.to_le_bytes());
+        bytes.extend(self.format.version().to_le_bytes());
+        bytes.extend(MINOR.to_le_bytes());
         bytes.extend(0u32.to_le_bytes());
         bytes.extend(self.optional_flags.to_le_bytes());
         bytes.extend([self.bits, self.base, self.top, 0]);
@@ -158,14 +218,19 @@ impl Header {
             bytes.extend(number.to_le_bytes());
         }
         bytes.extend(self.placement.voxel_size.to_le_bytes());
-        bytes.extend(self.model);
+        if let Format::Learned { model } = &self.format {
+            bytes.extend(model);
+        }
         bytes.extend(self.slice_voxels.to_le_bytes());
+        if let Format::Transform { colour_slice } = &self.format {
+            bytes.extend(colour_slice.to_le_bytes());
+        }
         for count in &self.voxels {
             bytes.extend(count.to_le_bytes());
         }
         for section in &self.sections {
             bytes.extend(section.geometry.to_le_bytes());
-            bytes.extend(section.features.to_le_bytes());
+            bytes.extend(section.colours.to_le_bytes());
         }
         bytes.extend(crc32c::crc32c(&bytes).to_le_bytes());
         bytes
@@ -173,7 +238,7 @@ impl Header {
 
     /// Length of the header itself.
     pub fn bytes(&self) -> usize {
-        FIXED + 12 * self.voxels.len() + 4
+        self.format.fixed() + 12 * self.voxels.len() + 4
     }
 
     /// Length of the stream up to and with `level`: what a reader must fetch to decode that level.
@@ -209,6 +274,30 @@ impl Header {
         }
     }
 
+    /// Parents per slice of colours; in version 2, as of the geometry.
+    pub fn colour_slice(&self) -> u32 {
+        match self.format {
+            Format::Learned { .. } => self.slice_voxels,
+            Format::Transform { colour_slice } => colour_slice,
+        }
+    }
+
+    /// Where the sections of `level` start.
+    pub(super) fn start(&self, level: u8) -> Result<u64> {
+        match self.index(level)? {
+            0 => Ok(self.bytes() as u64),
+            _ => self.prefix_bytes(level - 1),
+        }
+    }
+
+    /// The voxels of the level before `level`; of the base level, the root.
+    pub(super) fn parents(&self, level: u8) -> Result<u64> {
+        match self.index(level)? {
+            0 => Ok(1),
+            index => Ok(self.voxels[index - 1].into()),
+        }
+    }
+
     /// How many voxels `level` has.
     ///
     /// # Errors
@@ -217,19 +306,30 @@ impl Header {
         Ok(self.voxels[self.index(level)?])
     }
 
+    /// The id of the model that the stream was coded with, hexadecimal; none in version 3.
+    pub fn model(&self) -> Option<String> {
+        match &self.format {
+            Format::Learned { model } => Some(hex(model)),
+            Format::Transform { .. } => None,
+        }
+    }
+
     /// Sees that the stream was made with the model of that id.
     ///
     /// # Errors
-    /// [`Error::ModelMismatch`] if it was not.
+    /// [`Error::ModelMismatch`] if it was made with another, [`Error::Unsupported`] if it was made with none, being of version 3.
     pub fn check_model(&self, loaded: &[u8; 16]) -> Result<()> {
-        if self.model == *loaded {
-            return Ok(());
+        match &self.format {
+            Format::Learned { model } if model == loaded => Ok(()),
+            Format::Learned { model } => Err(Error::ModelMismatch {
+                expected: hex(model),
+                found: hex(loaded),
+            }),
+            Format::Transform { .. } => Err(Error::Unsupported {
+                what: "this stream",
+                detail: "it has version 3, which has no learned latents; version 2 would do".into(),
+            }),
         }
-        let hex = |id: &[u8; 16]| id.iter().map(|b| format!("{b:02x}")).collect();
-        Err(Error::ModelMismatch {
-            expected: hex(&self.model),
-            found: hex(loaded),
-        })
     }
 
     /// Position of a level in `voxels` and `sections`.
@@ -246,9 +346,10 @@ impl Header {
     /// Whether the format and `limits` allow all of this.
     pub(super) fn check(&self, limits: &Limits) -> Result<()> {
         let (bits, base, top) = (self.bits, self.base, self.top);
-        check_levels(base, top)?;
-        if !(1..=MAX_DEPTH).contains(&bits) || top >= bits {
-            let expected = format!("{} to {MAX_DEPTH}", u32::from(top) + 1);
+        check_levels(&self.format, base, top)?;
+        let least = top + u8::from(!self.format.codes_the_finest());
+        if !(1..=MAX_DEPTH).contains(&bits) || bits < least {
+            let expected = format!("{} to {MAX_DEPTH}", least.max(1));
             return Err(malformed(20, "bit depth", bits, expected));
         }
         limits.check_depth("bit depth of the stream", bits)?;
@@ -261,15 +362,13 @@ impl Header {
                 "finite, the size positive",
             ));
         }
-        if !(1..=MAX_SLICE_VOXELS).contains(&self.slice_voxels) {
-            let expected = format!("1 to {MAX_SLICE_VOXELS}");
-            return Err(malformed(80, "slice size", self.slice_voxels, expected));
-        }
+        self.check_slices()?;
+        let fixed = self.format.fixed();
         let levels = usize::from(top - base + 1);
         let lengths = (self.voxels.len(), self.sections.len());
         if lengths != (levels, levels) {
             let value = format!("{lengths:?}");
-            return Err(malformed(FIXED, "voxel counts and sections", value, levels));
+            return Err(malformed(fixed, "voxel counts and sections", value, levels));
         }
         let mut allowed = 1..=1u64 << (3 * base);
         for (i, &count) in self.voxels.iter().enumerate() {
@@ -277,7 +376,7 @@ impl Header {
             if !allowed.contains(&count) {
                 let field = format!("voxel count of level {}", usize::from(base) + i);
                 let expected = format!("{} to {}", allowed.start(), allowed.end());
-                return Err(malformed(FIXED + 4 * i, field, count, expected));
+                return Err(malformed(fixed + 4 * i, field, count, expected));
             }
             limits.check_points("voxel count of a level", count)?;
             allowed = count..=8 * count;
@@ -290,12 +389,33 @@ impl Header {
         }
         limits.check_points("points of the stream", self.points)
     }
+
+    fn check_slices(&self) -> Result<()> {
+        let at = self.format.fixed() - 4;
+        let check = |at, field, value, most| match (1..=most).contains(&value) {
+            true => Ok(()),
+            false => Err(malformed(at, field, value, format!("1 to {most}"))),
+        };
+        match self.format {
+            Format::Learned { .. } => check(at, "slice size", self.slice_voxels, MAX_SLICE_VOXELS),
+            Format::Transform { colour_slice } => {
+                check(at - 4, "slice size", self.slice_voxels, MAX_SLICE_VOXELS)?;
+                let field = "slice size of the colours";
+                check(at, field, colour_slice, MAX_COLOUR_SLICE)
+            }
+        }
+    }
 }
 
-fn check_levels(base: u8, top: u8) -> Result<()> {
-    if base > top || top - base >= MAX_LEVELS || top >= MAX_DEPTH {
-        let deepest = MAX_DEPTH - 1;
-        let expected = format!("1 to {MAX_LEVELS} levels, none deeper than {deepest}");
+fn hex(id: &[u8; 16]) -> String {
+    id.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+fn check_levels(format: &Format, base: u8, top: u8) -> Result<()> {
+    let most = format.max_levels();
+    let deepest = MAX_DEPTH - u8::from(!format.codes_the_finest());
+    if base > top || top - base >= most || top > deepest {
+        let expected = format!("1 to {most} levels, none deeper than {deepest}");
         return Err(malformed(
             21,
             "levels",

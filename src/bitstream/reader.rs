@@ -1,5 +1,6 @@
 //! Little-endian numbers from bytes that may end too early.
 
+use super::malformed;
 use crate::error::{Error, Result, Stage};
 
 /// A place in a byte string.
@@ -32,6 +33,11 @@ impl<'a> Reader<'a> {
         self.at
     }
 
+    /// The bytes from `start` up to here.
+    pub(super) fn since(&self, start: usize) -> &'a [u8] {
+        &self.bytes[start..self.at]
+    }
+
     /// The next `count` bytes.
     ///
     /// # Errors
@@ -60,5 +66,36 @@ impl<'a> Reader<'a> {
         Ok(array)
     }
 
+    /// The next number below 2³² in LEB128: seven bits a byte, the lowest first, the top bit set in all bytes but the last, which is not
+    /// zero unless it is the only one.
+    ///
+    /// # Errors
+    /// [`Error::Truncated`], [`Error::Malformed`] for a number that is too large or longer than it need be; both name `field`.
+    pub fn varint(&mut self, field: &'static str) -> Result<u32> {
+        let (start, mut number) = (self.at, 0u64);
+        for shift in (0..35).step_by(7) {
+            let byte = self.u8(field)?;
+            number |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                match u32::try_from(number) {
+                    Ok(number) if byte > 0 || shift == 0 => return Ok(number),
+                    _ => break,
+                }
+            }
+        }
+        let expected = "a number below 2^32 in as few bytes as it takes";
+        let value = format!("{:02x?}", &self.bytes[start..self.at]);
+        Err(malformed(start, field, value, expected))
+    }
+
     numbers!(u8, u16, u32, u64, f64);
+}
+
+/// Appends what [`Reader::varint`] reads.
+pub fn put_varint(out: &mut Vec<u8>, mut number: u32) {
+    while number >= 0x80 {
+        out.push(number as u8 | 0x80);
+        number >>= 7;
+    }
+    out.push(number as u8);
 }

@@ -1,9 +1,10 @@
 //! A stream taken apart: its header, and its whole levels.
 
-use super::chunk::{Chunk, ChunkKind, Chunks};
-use super::header::Header;
+use super::chunk::{Chunk, ChunkKind, Chunks, Form};
+use super::header::{Format, Header};
 use super::malformed;
 use super::reader::Reader;
+use super::transform::{self, Colours};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 
@@ -39,6 +40,8 @@ pub struct Level<'a> {
     pub filters: [Option<Slice<'a>>; FILTERS],
     /// What the colours are still off, one entry per slice; none if the stream does not say.
     pub residual: Vec<Slice<'a>>,
+    /// The colours of version 3, in which the four fields above are empty.
+    pub colours: Option<Colours<'a>>,
 }
 
 /// The octree of one level, given the level before.
@@ -53,7 +56,7 @@ pub struct Geometry<'a> {
 /// An independently coded part of a level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Slice<'a> {
-    /// How many voxels it describes.
+    /// How many voxels it describes; of a slice of colours, how many parents.
     pub voxels: u32,
     /// Its code.
     pub bytes: &'a [u8],
@@ -132,31 +135,44 @@ impl<'a> Level<'a> {
     /// [`Error::Usage`] if the header tells of no such level; else what is wrong with it: [`Error::Truncated`],
     /// [`Error::ChecksumMismatch`], [`Error::Malformed`], [`Error::Unsupported`] for chunks that are not known and not to be skipped.
     pub fn read(bytes: &'a [u8], header: &Header, level: u8) -> Result<Self> {
+        if let Format::Learned { .. } = header.format {
+            return Self::read_learned(bytes, header, level);
+        }
         let index = header.index(level)?;
         let (voxels, section) = (header.voxels[index], header.sections[index]);
-        let (mut at, mut parents) = match index {
-            0 => (header.bytes() as u64, 1),
-            _ => (
-                header.prefix_bytes(level - 1)?,
-                header.voxels[index - 1].into(),
-            ),
-        };
-        let mut chunks = take_section(bytes, &mut at, section.geometry, "geometry section")?;
-        let mut geometry = Vec::new();
-        let first = if index == 0 { 1 } else { level };
-        for level in first..=level {
-            let slices = take_geometry(&mut chunks, header.slice_voxels, level, parents, voxels)?;
-            parents = slices.iter().map(|s| u64::from(s.voxels)).sum();
-            geometry.push(Geometry { level, slices });
-        }
-        if parents != u64::from(voxels) {
-            let field = format!("voxel count of level {level}");
-            let expected = format!("{voxels}, as the header tells");
-            return Err(malformed(at, field, parents, expected));
-        }
+        let mut at = header.start(level)?;
+        let (length, field) = (section.geometry, "geometry section");
+        let mut chunks = take_section(Form::Short, bytes, &mut at, length, field)?;
+        let geometry = transform::take_geometry(&mut chunks, header, level)?;
+        chunks.finish()?;
+        let (length, field) = (section.colours, "colour section");
+        let mut chunks = take_section(Form::Short, bytes, &mut at, length, field)?;
+        let above = header.parents(level)?;
+        let colours = transform::take_colours(&mut chunks, &geometry, above, header, level)?;
+        chunks.finish()?;
+        Ok(Level {
+            level,
+            voxels,
+            geometry,
+            features: Vec::new(),
+            latent_hash: 0,
+            filters: [None; FILTERS],
+            residual: Vec::new(),
+            colours: Some(colours),
+        })
+    }
+
+    fn read_learned(bytes: &'a [u8], header: &Header, level: u8) -> Result<Self> {
+        let index = header.index(level)?;
+        let (voxels, section) = (header.voxels[index], header.sections[index]);
+        let mut at = header.start(level)?;
+        let (length, field) = (section.geometry, "geometry section");
+        let mut chunks = take_section(Form::Fixed, bytes, &mut at, length, field)?;
+        let geometry = take_geometry(&mut chunks, header, level)?;
         chunks.finish()?;
 
-        let mut chunks = take_section(bytes, &mut at, section.features, "feature section")?;
+        let (length, field) = (section.colours, "feature section");
+        let mut chunks = take_section(Form::Fixed, bytes, &mut at, length, field)?;
         let (features, latent_hash) = match chunks.peek()?.map(|chunk| chunk.kind) {
             None | Some(ChunkKind::Filter | ChunkKind::Residual) => Default::default(),
             Some(_) => take_features(&mut chunks, header.slice_voxels, level, voxels)?,
@@ -172,6 +188,7 @@ impl<'a> Level<'a> {
             latent_hash,
             filters,
             residual,
+            colours: None,
         })
     }
 
@@ -180,12 +197,26 @@ impl<'a> Level<'a> {
     /// # Errors
     /// [`Error::DeterminismMismatch`] if they are not.
     pub fn check_latents(&self, found: u64) -> Result<()> {
-        if found == self.latent_hash {
+        self.check_hash("latents", self.latent_hash, found)
+    }
+
+    /// Sees that decoded colours with the hash `found` are those that were coded.
+    ///
+    /// # Errors
+    /// [`Error::DeterminismMismatch`] if they are not.
+    pub fn check_colours(&self, found: u64) -> Result<()> {
+        let expected = self.colours.as_ref().map_or(0, |colours| colours.hash);
+        self.check_hash("colours", expected, found)
+    }
+
+    fn check_hash(&self, what: &'static str, expected: u64, found: u64) -> Result<()> {
+        if found == expected {
             return Ok(());
         }
         Err(Error::DeterminismMismatch {
+            what,
             level: self.level,
-            expected: self.latent_hash,
+            expected,
             found,
         })
     }
@@ -201,6 +232,7 @@ fn take_levels<'a>(bytes: &'a [u8], header: &Header, levels: &mut Vec<Level<'a>>
 
 /// The section that starts at `at`, which then is where it ends.
 fn take_section<'a>(
+    form: Form,
     bytes: &'a [u8],
     at: &mut u64,
     length: u32,
@@ -211,32 +243,82 @@ fn take_section<'a>(
     *at += u64::from(length);
     let mut reader = Reader::new(bytes, start);
     reader.take(length as usize, field)?;
-    Ok(Chunks::new(bytes, start..reader.at()))
+    Ok(Chunks::new(form, bytes, start..reader.at()))
 }
 
-/// The geometry of a level whose parents are known; no level has more voxels than the `most` of the one that ends the section.
+/// The geometry section of a level of version 2.
 fn take_geometry<'a>(
     chunks: &mut Chunks<'a>,
-    slice_voxels: u32,
+    header: &Header,
     level: u8,
-    parents: u64,
+) -> Result<Vec<Geometry<'a>>> {
+    let first = if level == header.base { 1 } else { level };
+    let mut counts = Counts::new(header, level)?;
+    let geometry = (first..=level)
+        .map(|level| counts.take_level(chunks, level))
+        .collect::<Result<Vec<_>>>()?;
+    counts.finish()?;
+    Ok(geometry)
+}
+
+/// What is known of the voxels while a geometry section is read.
+pub(super) struct Counts {
+    slice_voxels: u32,
+    /// Of the level that was read last.
+    pub parents: u64,
+    /// The level that the section ends with, and its voxels as the header tells.
+    level: u8,
     most: u32,
-) -> Result<Vec<Slice<'a>>> {
-    let mut slices = Vec::new();
-    let mut total = 0;
-    // Ends with the section's chunks, however many parents are claimed.
-    for (slice, parents) in sliced(parents, slice_voxels) {
-        let counts = parents..=8 * parents;
-        let chunk = chunks.expect(ChunkKind::Geometry, level, slice, counts)?;
-        total += u64::from(chunk.count);
-        if total > u64::from(most) {
-            let field = format!("voxel count of level {level}");
-            let expected = format!("at most {most}, as the header tells");
-            return Err(malformed(chunk.offset, field, total, expected));
-        }
-        slices.push(Slice::of(&chunk, 0));
+    /// Where the section starts.
+    start: u64,
+}
+
+impl Counts {
+    pub fn new(header: &Header, level: u8) -> Result<Self> {
+        Ok(Counts {
+            slice_voxels: header.slice_voxels,
+            parents: header.parents(level)?,
+            level,
+            most: header.voxels(level)?,
+            start: header.start(level)?,
+        })
     }
-    Ok(slices)
+
+    /// The slices of the next level.
+    pub fn take_level<'a>(&mut self, chunks: &mut Chunks<'a>, level: u8) -> Result<Geometry<'a>> {
+        let mut slices = Vec::new();
+        let mut total = 0;
+        // Ends with the section's chunks, however many parents are claimed.
+        for (slice, parents) in sliced(self.parents, self.slice_voxels) {
+            let counts = parents..=8 * parents;
+            let chunk = chunks.expect(ChunkKind::Geometry, level, slice, counts)?;
+            total += u64::from(chunk.count);
+            self.check_total(level, chunk.offset, total)?;
+            slices.push(Slice::of(&chunk, 0));
+        }
+        self.parents = total;
+        Ok(Geometry { level, slices })
+    }
+
+    /// No level has more voxels than the one that ends the section.
+    pub fn check_total(&self, level: u8, offset: usize, total: u64) -> Result<()> {
+        if total <= u64::from(self.most) {
+            return Ok(());
+        }
+        let field = format!("voxel count of level {level}");
+        let expected = format!("at most {}, as the header tells", self.most);
+        Err(malformed(offset, field, total, expected))
+    }
+
+    /// Sees that the section ended with as many voxels as the header tells.
+    pub fn finish(&self) -> Result<()> {
+        if self.parents == u64::from(self.most) {
+            return Ok(());
+        }
+        let field = format!("voxel count of level {}", self.level);
+        let expected = format!("{}, as the header tells", self.most);
+        Err(malformed(self.start, field, self.parents, expected))
+    }
 }
 
 fn take_features<'a>(
@@ -307,11 +389,12 @@ fn take_residual<'a>(
 }
 
 impl<'a> Slice<'a> {
-    fn of(chunk: &Chunk<'a>, skip: usize) -> Self {
+    /// A chunk's payload without its first bytes.
+    pub(super) fn of(chunk: &Chunk<'a>, skip: usize) -> Self {
         Slice {
             voxels: chunk.count,
             bytes: &chunk.payload[skip..],
-            offset: chunk.offset + super::chunk::CHUNK_HEADER + skip,
+            offset: chunk.payload_at + skip,
         }
     }
 }

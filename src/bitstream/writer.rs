@@ -1,7 +1,8 @@
 //! Streams out.
 
-use super::chunk::{Chunk, ChunkKind};
-use super::header::{Header, Section};
+use super::chunk::{Chunk, ChunkKind, Form};
+use super::header::{Format, Header, Section};
+use super::reader::put_varint;
 use super::stream::{Stream, sliced};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
@@ -82,9 +83,7 @@ impl Writer {
                 bytes.as_ref(),
             )?;
         }
-        let length = &mut self.header.sections[section].features;
-        *length = extended(*length, self.body.len() - start)?;
-        Ok(())
+        self.extend_colours(section, start)
     }
 
     /// Adds a colour filter for the best heads of `level` (`slice` 0) or its quick ones (1), after its features.
@@ -95,9 +94,7 @@ impl Writer {
         let section = self.header.index(level)?;
         let (voxels, start) = (self.header.voxels[section], self.body.len());
         self.chunk(ChunkKind::Filter, level, slice, voxels, &[], payload)?;
-        let length = &mut self.header.sections[section].features;
-        *length = extended(*length, self.body.len() - start)?;
-        Ok(())
+        self.extend_colours(section, start)
     }
 
     /// Adds the colour residual of `level`, after its filters: for every slice of its voxels the payload.
@@ -112,7 +109,85 @@ impl Writer {
             let bytes = bytes.as_ref();
             self.chunk(ChunkKind::Residual, level, slice, count, &[], bytes)?;
         }
-        let length = &mut self.header.sections[section].features;
+        self.extend_colours(section, start)
+    }
+
+    /// Version 3: adds the first levels of the octree, 1 to the number of `levels`, each of one slice: its voxels, and the code. Nothing if
+    /// there are none, as where the base level is 0.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the code is too long.
+    pub fn geometry_trunk(&mut self, levels: &[(u32, impl AsRef<[u8]>)]) -> Result<()> {
+        let Some((count, _)) = levels.last() else {
+            return Ok(());
+        };
+        let (mut payload, start) = (Vec::new(), self.body.len());
+        for (voxels, bytes) in levels {
+            let bytes = bytes.as_ref();
+            put_varint(&mut payload, *voxels);
+            put_varint(&mut payload, extended(0, bytes.len())?);
+            payload.extend(bytes);
+        }
+        let (kind, level) = (ChunkKind::GeometryTrunk, levels.len() as u8);
+        self.chunk(kind, level, 0, *count, &[], &payload)?;
+        let length = &mut self.header.sections[0].geometry;
+        *length = extended(*length, self.body.len() - start)?;
+        Ok(())
+    }
+
+    /// Version 3: adds the colours of the levels 0 to `level`, the last of which has so many voxels, and the hash of the colours of the base
+    /// level.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the payload is too long.
+    pub fn colour_trunk(
+        &mut self,
+        level: u8,
+        voxels: u32,
+        hash: u64,
+        payload: &[u8],
+    ) -> Result<()> {
+        let start = self.body.len();
+        let kind = ChunkKind::ColourTrunk;
+        self.chunk(kind, level, 0, voxels, &hash.to_le_bytes(), payload)?;
+        self.extend_colours(0, start)
+    }
+
+    /// Version 3: adds the colours of `level`: for every slice of its parents their number, and the payload. `hash` is that of the level's
+    /// colours; the levels between the trunk and the base level have none.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the stream has no such level or a payload is too long.
+    pub fn colours(
+        &mut self,
+        level: u8,
+        hash: Option<u64>,
+        slices: &[(u32, impl AsRef<[u8]>)],
+    ) -> Result<()> {
+        let section = self.header.index(level.max(self.header.base))?;
+        let start = self.body.len();
+        for (slice, (count, bytes)) in slices.iter().enumerate() {
+            let hash = hash.filter(|_| slice == 0).map(u64::to_le_bytes);
+            let prefix = hash.as_ref().map_or(&[][..], |hash| hash);
+            let kind = ChunkKind::Colours;
+            self.chunk(kind, level, slice, *count, prefix, bytes.as_ref())?;
+        }
+        self.extend_colours(section, start)
+    }
+
+    /// Version 3: adds the filter of the colours of `level`, after these.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the stream has no such level.
+    pub fn post_filter(&mut self, level: u8, payload: &[u8]) -> Result<()> {
+        let section = self.header.index(level)?;
+        let (voxels, start) = (self.header.voxels[section], self.body.len());
+        self.chunk(ChunkKind::PostFilter, level, 0, voxels, &[], payload)?;
+        self.extend_colours(section, start)
+    }
+
+    fn extend_colours(&mut self, section: usize, start: usize) -> Result<()> {
+        let length = &mut self.header.sections[section].colours;
         *length = extended(*length, self.body.len() - start)?;
         Ok(())
     }
@@ -161,8 +236,13 @@ impl Writer {
             count,
             payload,
             offset: 0,
+            payload_at: 0,
         };
-        chunk.write(prefix, &mut self.body)
+        let form = match self.header.format {
+            Format::Learned { .. } => Form::Fixed,
+            Format::Transform { .. } => Form::Short,
+        };
+        chunk.write(form, prefix, &mut self.body)
     }
 }
 

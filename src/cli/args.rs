@@ -5,12 +5,12 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use b2p::Limits;
+use b2p::decoder::HeadSet;
 use b2p::encoder::Residual;
 use b2p::gaussians::Steps;
-use b2p::network::Heads;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-/// Learned point-cloud streams to 3D Gaussians and pictures, on a plain CPU.
+/// Coloured point clouds as small streams, decoded to 3D Gaussians and pictures on a plain CPU.
 #[derive(Debug, Parser)]
 #[command(name = "b2p", version, about, max_term_width = 110)]
 pub struct Cli {
@@ -103,35 +103,68 @@ pub struct Encode {
     /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs; less if its points lie too far apart for that]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
     pub bits: Option<u8>,
-    /// Octree levels whose features are coded, up to three, the last below N [default: N−3..N−1]
+    /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last below N
+    /// [default: N−3..N−1]
     #[arg(long, value_name = "L..M", value_parser = levels)]
     pub levels: Option<RangeInclusive<u8>>,
-    /// How dear a bit is when latents are rounded, times what the model says: 0 rounds to the nearest, more saves bits and costs quality
-    #[arg(long, value_name = "X", value_parser = price, default_value_t = 1.0)]
-    pub bit_price: f32,
-    /// Leave colours as the model makes them, which takes less time: otherwise each level tells in 58 bytes how to correct those of the cloud
+    /// Make the best stream of at most X bits for each point of the cloud, the whole file counted: chooses the quantisation step, and
+    /// leaves out the finest levels if they do not fit
+    #[arg(long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["step", "lossless", "bit_price", "residual"])]
+    pub bits_per_point: Option<f64>,
+    /// Quantisation step of the finest level's luma in 255ths, 0.5 to 1000; coarser levels have finer steps [default: 20]
+    #[arg(long, value_name = "S", value_parser = step, conflicts_with = "lossless")]
+    pub step: Option<f32>,
+    /// Code the mean colours of the finest level's voxels exactly
+    #[arg(long)]
+    pub lossless: bool,
+    /// How colours are coded
+    #[arg(long, value_enum, value_name = "HOW", default_value_t = Colours::Transform)]
+    pub colours: Colours,
+    /// Leave out colour filters: encoding and decoding take less time, pictures are less accurate
     #[arg(long)]
     pub no_filter: bool,
-    /// Code what the finest level's colours are then still off. `coarse`: what is wide, where that is worth it and filters are made; `none`: nothing; else all of it, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
+    #[command(flatten)]
+    pub learned: LearnedArgs,
+    #[command(flatten)]
+    pub model: ModelArg,
+}
+
+/// How colours are coded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Colours {
+    /// As transform coefficients (version 3): no model file is needed to decode them
+    Transform,
+    /// As latents of a learned model (version 2), which decoding needs, too
+    Learned,
+}
+
+/// What may be chosen about learned streams.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "With --colours learned")]
+pub struct LearnedArgs {
+    /// Price of a bit in the rate-distortion optimisation of latents, times what the model says: 0 rounds to the nearest, more saves bits
+    /// and costs quality
+    #[arg(long, value_name = "X", value_parser = price, default_value_t = 1.0)]
+    pub bit_price: f32,
+    /// Residual of the finest level's colours. `coarse`: low frequencies, where they are worth it and filters are made; `none`: nothing;
+    /// else all of it, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
     #[arg(long, value_name = "coarse|none|STEP[,CHROMA]", value_parser = residual, default_value = "coarse")]
     pub residual: Residual,
     /// Give each level that is drawn a residual of its own, not the finest alone: better pictures of coarser levels, for bytes that the finest does not need
     #[arg(long)]
     pub every_level: bool,
-    /// Make the best stream of at most X bits for each point, the whole file counted, in up to seven tries: chooses --bit-price and --residual
-    #[arg(long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["bit_price", "residual"])]
-    pub bits_per_point: Option<f64>,
-    #[command(flatten)]
-    pub model: ModelArg,
 }
 
 #[derive(Debug, Args)]
 pub struct Decode {
     /// Stream to decode. `-`: standard input, decoded as it comes
     pub input: PathBuf,
-    /// Gaussians to write, as a PLY with the property names of 3D Gaussian splatting
+    /// File to write: Gaussians as a PLY with the property names of 3D Gaussian splatting
     #[arg(short, long, value_name = "OUT.ply")]
     pub output: PathBuf,
+    /// Write the level's voxels with their colours instead, as a PLY of points (of learned streams there are none)
+    #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
+    pub points: bool,
     #[command(flatten)]
     pub detail: DetailArg,
     #[command(flatten)]
@@ -316,14 +349,19 @@ pub struct DetailArg {
     /// Octree level to decode to [default: the finest with Gaussians; to draw, the finest that can be seen]
     #[arg(long, value_name = "M")]
     pub level: Option<u8>,
-    /// Heads of the model that generate Gaussians: best, or quick, which only some models have: less accurate, for weak machines
-    #[arg(long, value_name = "NAME", default_value_t = Heads::Best)]
-    pub heads: Heads,
+    /// Heads that make Gaussians: best; quick, less accurate in a fraction of the time; or surfels, which need no model file (learned
+    /// streams have none) [default: the best there are]
+    #[arg(long, value_name = "NAME")]
+    pub heads: Option<HeadSet>,
+    /// Gaussians that heads make of a voxel of streams of version 3: 1 or 8 [default: 1 at levels from N−1 on, else 8]; of surfels, 1 or 4
+    /// [default: 1]
+    #[arg(long, value_name = "N", value_parser = per_voxel)]
+    pub per_voxel: Option<usize>,
 }
 
 #[derive(Debug, Clone, Args)]
 pub struct ModelArg {
-    /// Model file [default: the one inside the program]
+    /// Model file: of learned streams the model that they were coded with [default: the one inside the program], of others heads
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
     /// Use no better instructions than these: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
@@ -374,6 +412,22 @@ fn price(text: &str) -> Result<f32, String> {
     match text.parse() {
         Ok(price) if (0.0..=100.0).contains(&price) => Ok(price),
         _ => Err("expected a number from 0 to 100".into()),
+    }
+}
+
+fn step(text: &str) -> Result<f32, String> {
+    match text.parse() {
+        Ok(step) if (0.5..=1000.0).contains(&step) => Ok(step),
+        _ => Err("expected a number from 0.5 to 1000 such as 16".into()),
+    }
+}
+
+fn per_voxel(text: &str) -> Result<usize, String> {
+    match text {
+        "1" => Ok(1),
+        "4" => Ok(4),
+        "8" => Ok(8),
+        _ => Err("expected 1, 4 or 8".into()),
     }
 }
 
@@ -479,6 +533,7 @@ mod tests {
         for wrong in ["0", "-1", "nan", "inf", "1e999", "few"] {
             assert!(bits_per_point(wrong).unwrap_err().contains("above 0"));
         }
+        assert!(step("0").unwrap_err().contains("0.5") && step("inf").is_err());
         assert!(size("0x4").unwrap_err().contains("1024x1024"));
         assert!(orbit("1,2").unwrap_err().contains("three"));
         assert!(effect("antialias").unwrap_err().contains("antialias=on"));

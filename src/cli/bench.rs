@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use b2p::bitstream::Header;
+use b2p::decoder::Decoder;
 use b2p::geometry::{KernelMap, Octree};
 use b2p::log::{Log, Step};
 use b2p::network::{Heads, Module, Precision, Shape, Work};
@@ -32,10 +33,9 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         None => embedded::SAMPLE.to_vec(),
     };
     let start = Instant::now();
-    let model = load::model(&args.model)?;
+    let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?;
     let loading = start.elapsed();
-    let heads = args.detail.heads;
-    let decoder = load::decoder(&model, &args.detail, limits)?;
+    let model = decoder.model();
     let fail = |error| match &args.input {
         Some(path) => Failure::in_file(path)(error),
         None => Failure::from(error),
@@ -64,11 +64,18 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         }
     }
     let total = median(runs.iter().map(|run| run.0));
-    let exact = decoder
-        .exact(&bytes, level, &mut Log::default())
-        .map_err(fail)?;
-    let base = Header::parse(&bytes, limits).map_err(fail)?.base;
-    let works = works(model.shape(), heads, &exact.octree, base);
+    let header = Header::parse(&bytes, limits).map_err(fail)?;
+    let heads = decoder.heads_for(&header);
+    // Of version 3, no more is known than the times.
+    let works = match (model, heads.learned()) {
+        (Some(model), Some(heads)) if header.model().is_some() => {
+            let exact = Decoder::new(model).with_limits(limits.clone());
+            let exact = exact.exact(&bytes, level, &mut Log::default());
+            let octree = exact.map_err(fail)?.octree;
+            works(model.shape(), heads, &octree, header.base)
+        }
+        _ => HashMap::new(),
+    };
     let lines: Vec<Line> = runs[0]
         .1
         .iter()
@@ -82,7 +89,9 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
 
     let threads = rayon::current_num_threads();
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
-    let ceilings = Ceilings::measure(model.isa(), model.precision(), threads.min(cores));
+    let isa = load::isa(args.model.isa.as_deref())?;
+    let precision = model.map_or(Precision::Int16, |model| model.precision());
+    let ceilings = Ceilings::measure(isa, precision, threads.min(cores));
     let memory = peak_memory();
     if args.json {
         let stages: Vec<_> = lines
@@ -102,8 +111,8 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
             .collect();
         let report = json!({
             "level": level,
-            "isa": model.isa().to_string(),
-            "precision": model.precision().to_string(),
+            "isa": isa.to_string(),
+            "precision": precision.to_string(),
             "heads": heads.to_string(),
             "threads": threads,
             "runs": args.repeat,
@@ -165,8 +174,8 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         "level {level}, {heads} heads, {}, {}, {threads} threads, medians of {} runs{memory}\n{}\n\
          Ceilings, measured just now: {:.0} GMAC/s in integers, {:.0} in what Gaussians are generated in.\n\
          MB: what a stage's layers must read and write at least once.\n",
-        model.isa(),
-        model.precision(),
+        isa,
+        precision,
         args.repeat,
         table(&rows),
         ceilings.integers,

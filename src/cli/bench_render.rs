@@ -38,8 +38,8 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
             source.gaussians(&args.detail, &[camera], &mut log)?.0
         }
         None => {
-            let model = load::model(&args.model)?;
-            let decoder = load::decoder(&model, &args.detail, limits)?;
+            let sample = embedded::SAMPLE;
+            let decoder = load::decoder(sample, &args.detail, &args.model, limits)?;
             decoder.decode(embedded::SAMPLE, args.detail.level, &mut log)?
         }
     };

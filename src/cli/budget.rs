@@ -131,7 +131,8 @@ impl Chosen {
     pub fn detail(&self) -> DetailArg {
         DetailArg {
             level: Some(self.choice.level),
-            heads: self.choice.heads,
+            heads: Some(self.choice.heads.into()),
+            per_voxel: None,
         }
     }
 

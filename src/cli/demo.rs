@@ -1,8 +1,9 @@
 //! `b2p demo`: the sample inside the program, decoded and drawn.
 
 use std::path::Path;
+use std::sync::Arc;
 
-use b2p::decoder::Decoder;
+use b2p::decoder::StreamDecoder;
 use b2p::log::Log;
 use b2p::network::Model;
 use b2p::pixels::{Background, Renderer};
@@ -24,15 +25,15 @@ pub fn run(args: &Demo, progress: &Progress) -> Result<String> {
         source,
     })?;
     let mut log = Log::with_listener(&say);
-    let model = log.step("load model", embedded::MODEL.len(), "bytes", || {
-        Model::from_bytes(embedded::MODEL)
+    let decoder = log.step("load", embedded::MODEL.len(), "bytes", || {
+        let model = Model::from_bytes(embedded::MODEL)?;
+        Ok(StreamDecoder::new().with_model(Arc::new(model)))
     })?;
     let mut text = format!(
-        "The sample: {} bytes of stream inside the program, decoded with the model inside the program.\n\n{}",
+        "The sample: {} bytes of stream inside the program.\n\n{}",
         count(embedded::SAMPLE.len() as u64),
         steps(log.steps()),
     );
-    let decoder = Decoder::new(&model);
     let mut renderer = Renderer::default();
     let mut written = Vec::new();
     for level in decoder.levels(embedded::SAMPLE)? {

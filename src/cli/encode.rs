@@ -1,12 +1,13 @@
 //! `b2p encode`: point cloud to stream.
 
-use b2p::cloud::{PointCloud, voxelise, voxelise_closed};
-use b2p::encoder::{self, Options, Residual};
+use b2p::cloud::{ColouredVoxels, PointCloud, voxelise, voxelise_closed};
+use b2p::encoder::transform::{self, Fineness};
+use b2p::encoder::{self, Encoded, Options, Residual};
 use b2p::gaussians::Steps;
 use b2p::log::Log;
 use b2p::{Error, Limits, output};
 
-use super::args::Encode;
+use super::args::{Colours, Encode};
 use super::progress::Progress;
 use super::table::{count, steps, table};
 use super::{Failure, Result, load};
@@ -28,22 +29,11 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
             None => voxelise_closed(&cloud),
         })
         .map_err(&in_cloud)?;
-    let model = load::model(&args.model)?;
-    let options = Options {
-        levels: args.levels.clone(),
-        bit_price: args.bit_price,
-        filter: !args.no_filter,
-        residual: args.residual,
-        every_level: args.every_level,
-        ..Options::default()
+    let coded = match args.colours {
+        Colours::Transform => transform(args, &cloud, &mut log)?,
+        Colours::Learned => learned(args, &cloud, &mut log)?,
     };
-    let coded = match args.bits_per_point {
-        Some(bits) => encoder::encode_within(&cloud, &model, &options, bits, &mut log),
-        None => {
-            encoder::encode(&cloud, &model, &options, &mut log).map(|encoded| (encoded, options))
-        }
-    };
-    let (encoded, chosen) = coded.map_err(&in_cloud)?;
+    let Coded { encoded, chosen } = coded;
     output::write_file(&args.output, |w| {
         w.write_all(&encoded.bytes).map_err(|source| Error::Io {
             path: args.output.clone(),
@@ -53,7 +43,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
 
     let bpp = |bytes: usize| format!("{:.4}", bytes as f64 * 8.0 / cloud.voxels.len() as f64);
     let mut rows = vec![
-        ["level", "voxels", "geometry bpp", "feature bpp"]
+        ["level", "voxels", "geometry bpp", "colour bpp"]
             .map(String::from)
             .to_vec(),
     ];
@@ -62,7 +52,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
             rate.level.to_string(),
             count(rate.voxels as u64),
             bpp(rate.geometry_bytes),
-            bpp(rate.feature_bytes),
+            bpp(rate.colour_bytes),
         ]);
     }
     let depth = cloud.voxels.depth();
@@ -80,12 +70,92 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         count(encoded.bytes.len() as u64),
         count(cloud.voxels.len() as u64),
         bpp(encoded.bytes.len()),
-        args.bits_per_point
-            .map_or(String::new(), |most| within(most, &chosen)),
+        chosen,
     ))
 }
 
-/// What was chosen to keep to so many bits.
+/// A stream, and what was chosen about it in words.
+struct Coded {
+    encoded: Encoded,
+    chosen: String,
+}
+
+/// Codes a stream of version 3.
+fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded> {
+    let model = &args.model;
+    let learned = &args.learned;
+    let asked = [
+        ("--model", model.model.is_some()),
+        ("--precision", model.precision.is_some()),
+        ("--bit-price", learned.bit_price != 1.0),
+        ("--residual", learned.residual != Residual::Coarse),
+        ("--every-level", learned.every_level),
+    ];
+    if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
+        return Err(Failure(format!("{name} is for --colours learned")));
+    }
+    let mut options = transform::Options {
+        levels: args.levels.clone(),
+        filter: !args.no_filter,
+        isa: Some(load::isa(model.isa.as_deref())?),
+        ..transform::Options::default()
+    };
+    match args.step {
+        Some(step) => options.fineness = Fineness::Step(step),
+        None if args.lossless => options.fineness = Fineness::Lossless,
+        None => {}
+    }
+    let in_cloud = Failure::in_file(&args.cloud);
+    let (encoded, chosen) = match args.bits_per_point {
+        Some(most) => {
+            let (encoded, chosen) =
+                transform::encode_within(cloud, &options, most, log).map_err(in_cloud)?;
+            let level = chosen.levels.map_or(0, |levels| *levels.end());
+            let how = match chosen.fineness {
+                Fineness::Lossless => "exact colours".into(),
+                Fineness::Step(step) => format!("step {step:.2}"),
+            };
+            (encoded, format!(" of at most {most}: level {level}, {how}"))
+        }
+        None => {
+            let encoded = transform::encode(cloud, &options, log).map_err(in_cloud)?;
+            (encoded, String::new())
+        }
+    };
+    Ok(Coded { encoded, chosen })
+}
+
+/// Codes a stream of version 2.
+fn learned(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded> {
+    if args.step.is_some() || args.lossless {
+        let what = "--step and --lossless are for --colours transform";
+        return Err(Failure(what.into()));
+    }
+    let model = load::model(&args.model)?;
+    let options = Options {
+        levels: args.levels.clone(),
+        bit_price: args.learned.bit_price,
+        filter: !args.no_filter,
+        residual: args.learned.residual,
+        every_level: args.learned.every_level,
+        ..Options::default()
+    };
+    let in_cloud = Failure::in_file(&args.cloud);
+    let (encoded, chosen) = match args.bits_per_point {
+        Some(most) => {
+            let found = encoder::encode_within(cloud, &model, &options, most, log);
+            let (encoded, chosen) = found.map_err(in_cloud)?;
+            (encoded, within(most, &chosen))
+        }
+        None => {
+            let encoded = encoder::encode(cloud, &model, &options, log).map_err(in_cloud)?;
+            (encoded, String::new())
+        }
+    };
+    Ok(Coded { encoded, chosen })
+}
+
+/// What was chosen of a learned stream to keep to so many bits.
 fn within(most: f64, chosen: &Options) -> String {
     let (price, residual) = (chosen.bit_price, chosen.residual);
     let more = match residual {

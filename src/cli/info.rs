@@ -1,8 +1,8 @@
 //! `b2p info`: what a stream holds.
 
-use b2p::Limits;
 use b2p::bitstream::Stream;
 use b2p::gaussians::{Precision, Steps};
+use b2p::{Limits, colour};
 use serde_json::json;
 
 use super::args::Info;
@@ -15,9 +15,13 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
     let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
     let header = stream.header();
     let whole = stream.levels().len();
-    let model: String = header.model.iter().map(|b| format!("{b:02x}")).collect();
-    let at_hand = load::from_file(args.model.as_deref())?;
-    let known = (at_hand.id() == header.model).then(|| {
+    let model = header.model();
+    let at_hand = match model {
+        Some(_) => Some(load::from_file(args.model.as_deref())?),
+        None => None,
+    };
+    let at_hand = at_hand.filter(|at_hand| header.check_model(&at_hand.id()).is_ok());
+    let known = at_hand.map(|at_hand| {
         let shape = at_hand.shape();
         let heads: Vec<_> = shape.heads().iter().map(ToString::to_string).collect();
         (shape.name.clone(), heads)
@@ -40,6 +44,18 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
         Precision::read(level.residual.first()?.bytes)
     };
 
+    // Luma's step of a level of version 3, in 255ths.
+    let step = |i: usize| {
+        let colours = stream.levels().get(i)?.colours.as_ref()?;
+        let trunk = colours.trunk.map(|trunk| trunk.slice);
+        let last = colours.levels.last().and_then(|level| level.slices.first());
+        let &[luma, chroma, ..] = last.or(trunk.as_ref())?.bytes else {
+            return None;
+        };
+        let steps = colour::Steps { luma, chroma };
+        steps.is_valid().then_some(steps)
+    };
+
     if args.json {
         let levels: Vec<_> = levels()
             .map(|(i, (level, (voxels, section)))| {
@@ -47,7 +63,9 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
                     "level": level,
                     "voxels": voxels,
                     "geometry_bytes": section.geometry,
-                    "feature_bytes": section.features,
+                    "colour_bytes": section.colours,
+                    "luma_step": step(i).map(|steps| steps.luma_step()),
+                    "lossless": step(i).map(|steps| steps.is_lossless()),
                     "residual_bytes": residual(i),
                     "residual_steps": precision(i).map(|told| json!({
                         "fine": [told.fine.luma, told.fine.chroma],
@@ -59,6 +77,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             })
             .collect();
         let description = json!({
+            "version": header.format.version(),
             "bits": header.bits,
             "points": header.points,
             "levels": levels,
@@ -79,8 +98,9 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             "level",
             "voxels",
             "geometry bytes",
-            "feature bytes",
-            "of them residual",
+            "colour bytes",
+            "step",
+            "residual bytes",
             "its steps",
             "bits/point up to here",
         ]
@@ -94,28 +114,41 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
             format!("{level}{missing}"),
             count(voxels.into()),
             count(section.geometry.into()),
-            count(section.features.into()),
+            count(section.colours.into()),
+            step(i).map_or("-".into(), step_told),
             residual(i).map_or("?".into(), |bytes| count(bytes as u64)),
             precision(i).map_or("-".into(), told),
             bpp(prefix),
         ]);
     }
+    let coded = match (&model, &known, &args.model) {
+        (None, ..) => "transform coefficients, no model needed".into(),
+        (Some(id), Some((name, heads)), _) => {
+            format!("model {id}: {name}, heads: {}", heads.join(", "))
+        }
+        (Some(id), None, None) => format!("model {id}, which is not the one inside the program"),
+        (Some(id), None, Some(path)) => format!("model {id}, which is not {}", path.display()),
+    };
     let mut text = format!(
-        "{} points at {} bits, {} bytes, model {model}\n{}{}\n",
+        "version {}, {} points at {} bits, {} bytes\n{coded}\n{}\n",
+        header.format.version(),
         count(header.points),
         header.bits,
         count(bytes.len() as u64),
         table(&rows),
-        match (&known, &args.model) {
-            (Some((name, heads)), _) => format!("model {name}, heads: {}", heads.join(", ")),
-            (None, None) => "the model is not the one inside the program".into(),
-            (None, Some(path)) => format!("the model is not {}", path.display()),
-        },
     );
     if let Some(damage) = stream.damage() {
         text += &format!("damage: {damage}\n");
     }
     Ok(text)
+}
+
+/// A step of luma in 255ths.
+fn step_told(steps: colour::Steps) -> String {
+    match steps.is_lossless() {
+        true => "exact".into(),
+        false => format!("{:.2}", steps.luma_step()),
+    }
 }
 
 /// The bands of a residual with their steps of luma and chroma.

@@ -2,11 +2,14 @@
 
 use std::io::Read;
 use std::path::Path;
+use std::sync::Arc;
 
-use b2p::decoder::Decoder;
+use b2p::bitstream::version;
+use b2p::decoder::{HeadSet, StreamDecoder};
+use b2p::gaussians::learned::HeadsModel;
 use b2p::gaussians::{Frame, Gaussians, ply};
 use b2p::log::Log;
-use b2p::network::{Heads, Model};
+use b2p::network::Model;
 use b2p::pixels::Explanation;
 use b2p::projection::Camera;
 use b2p::{Error, Isa, Limits, UnknownIsa};
@@ -38,14 +41,35 @@ pub fn model(arg: &ModelArg) -> Result<Model> {
     }
 }
 
-/// What decodes with a model under limits, with the heads asked for.
-pub fn decoder<'m>(
-    model: &'m Model,
+/// What decodes the stream that starts with these bytes, with the heads asked for. A model is loaded only if it takes one.
+pub fn decoder(
+    bytes: &[u8],
     detail: &DetailArg,
+    model_arg: &ModelArg,
     limits: &Limits,
-) -> b2p::Result<Decoder<&'m Model>> {
-    let decoder = Decoder::new(model).with_limits(limits.clone());
-    decoder.with_heads(detail.heads)
+) -> Result<StreamDecoder> {
+    let mut decoder = StreamDecoder::new()
+        .with_isa(isa(model_arg.isa.as_deref())?)
+        .with_limits(limits.clone());
+    if let Some(heads) = detail.heads {
+        decoder = decoder.with_heads(heads);
+    }
+    if let Some(count) = detail.per_voxel {
+        decoder = decoder.with_per_voxel(count);
+    }
+    if version(bytes) == Some(2) {
+        return Ok(decoder.with_model(Arc::new(model(model_arg)?)));
+    }
+    if let Some(name) = &model_arg.precision {
+        decoder = decoder.with_precision(name.parse()?);
+    }
+    if let Some(path) = &model_arg.model
+        && detail.heads != Some(HeadSet::Surfels)
+    {
+        let heads = HeadsModel::open(path).map_err(Failure::in_file(path))?;
+        decoder = decoder.with_heads_model(Arc::new(heads));
+    }
+    Ok(decoder)
 }
 
 /// The instructions of that name; without one, what the environment names, or the best of this machine.
@@ -88,8 +112,8 @@ pub fn gaussians(
     if bytes.starts_with(PLY_MAGIC) {
         return ply(path, &bytes, detail, limits, log);
     }
-    let model = model(model_arg)?;
-    let gaussians = decoder(&model, detail, limits)?.decode(&bytes, detail.level, log);
+    let decoder = decoder(&bytes, detail, model_arg, limits)?;
+    let gaussians = decoder.decode(&bytes, detail.level, log);
     gaussians.map_err(Failure::in_file(path))
 }
 
@@ -101,8 +125,7 @@ pub enum Source<'p> {
     Stream {
         path: &'p Path,
         bytes: Vec<u8>,
-        model: Box<Model>,
-        limits: &'p Limits,
+        decoder: Box<StreamDecoder>,
     },
 }
 
@@ -112,19 +135,18 @@ impl<'p> Source<'p> {
         path: &'p Path,
         detail: &DetailArg,
         model_arg: &ModelArg,
-        limits: &'p Limits,
+        limits: &Limits,
         log: &mut Log,
     ) -> Result<Self> {
         let bytes = bytes(path)?;
         if bytes.starts_with(PLY_MAGIC) {
             return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
         }
-        let model = Box::new(model(model_arg)?);
+        let decoder = Box::new(decoder(&bytes, detail, model_arg, limits)?);
         Ok(Source::Stream {
             path,
             bytes,
-            model,
-            limits,
+            decoder,
         })
     }
 
@@ -135,12 +157,8 @@ impl<'p> Source<'p> {
             Source::Stream {
                 path,
                 bytes,
-                model,
-                limits,
-            } => Decoder::new(&**model)
-                .with_limits((*limits).clone())
-                .frame(bytes)
-                .map_err(Failure::in_file(path)),
+                decoder,
+            } => decoder.frame(bytes).map_err(Failure::in_file(path)),
         }
     }
 
@@ -156,18 +174,16 @@ impl<'p> Source<'p> {
             on,
             why,
         };
-        let (path, bytes, model, limits) = match self {
+        let (path, bytes, decoder) = match self {
             Source::Gaussians(gaussians) => {
                 return Ok((gaussians, explain(false, "a PLY has no levels".into())));
             }
             Source::Stream {
                 path,
                 bytes,
-                model,
-                limits,
-            } => (path, bytes, model, limits),
+                decoder,
+            } => (path, bytes, decoder),
         };
-        let decoder = decoder(&model, detail, limits)?;
         let fail = Failure::in_file(path);
         let seen = match detail.level {
             Some(_) => None,
@@ -193,7 +209,7 @@ pub fn ply(
 ) -> Result<Gaussians> {
     let asked = [
         ("--level", detail.level.is_some()),
-        ("--heads", detail.heads != Heads::Best),
+        ("--heads", detail.heads.is_some()),
     ];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
         return Err(Failure(format!(

@@ -8,6 +8,7 @@ mod decode;
 mod demo;
 mod encode;
 mod info;
+mod keep;
 mod load;
 mod picture;
 mod pipe;
@@ -42,11 +43,8 @@ impl From<Error> for Failure {
                 "max_pixels" => text.replace(option, "--max-pixels"),
                 _ => text,
             },
-            Error::TooFewBits { .. } => {
-                format!(
-                    "{text}; code fewer levels (--levels), or with a model for fewer bits (--model)"
-                )
-            }
+            Error::TooFewBits { .. } => format!("{text}; code coarser levels (--levels)"),
+            Error::ModelMissing { .. } => format!("{text}; --model FILE loads it"),
             _ => text,
         })
     }

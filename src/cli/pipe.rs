@@ -4,11 +4,10 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 
-use b2p::decoder::Decoding;
+use b2p::decoder::StreamDecoding;
 use b2p::error::Stage;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::network::Model;
 use b2p::{Error, Limits};
 
 use super::args::{DetailArg, ModelArg};
@@ -20,6 +19,9 @@ pub const PIPE: &str = "-";
 /// Bytes that are asked for at once, and how many such pieces wait before the sender has to.
 const PIECE: usize = 1 << 16;
 const WAITING: usize = 16;
+
+/// Bytes that tell what comes, and of which version.
+const STREAM_START: usize = 10;
 
 type Piece = std::io::Result<Vec<u8>>;
 
@@ -43,7 +45,7 @@ pub fn each(
     }
     let pieces = pieces();
     let mut start = Vec::new();
-    while start.len() < load::PLY_MAGIC.len() {
+    while start.len() < STREAM_START {
         match pieces.recv() {
             Ok(piece) => start.extend(piece.map_err(broken)?),
             Err(_) => break,
@@ -55,8 +57,8 @@ pub fn each(
         }
         return show(&load::ply(path, &start, detail, limits, log)?, log);
     }
-    let model = load::model(model_arg)?;
-    let mut decoding = load::decoder(&model, detail, limits)?.start(detail.level);
+    let decoder = load::decoder(&start, detail, model_arg, limits)?;
+    let mut decoding = decoder.start(detail.level);
     let mut shown = None;
     let in_pipe = Failure::in_file(path);
     let mut piece = Some(start);
@@ -95,7 +97,7 @@ pub fn each(
     }
 }
 
-fn show_level(decoding: &Decoding<&Model>, log: &mut Log, show: &mut Show) -> Result<()> {
+fn show_level(decoding: &StreamDecoding, log: &mut Log, show: &mut Show) -> Result<()> {
     let gaussians = decoding
         .gaussians(log)
         .map_err(Failure::in_file(Path::new(PIPE)))?;

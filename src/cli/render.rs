@@ -14,6 +14,7 @@ use serde_json::json;
 
 use super::args::{Format, Render, View};
 use super::budget::{self, Chosen};
+use super::keep::{self, Kept};
 use super::load::Source;
 use super::picture::{Artist, format_of};
 use super::pipe::{self, PIPE};
@@ -55,6 +56,23 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
         )?;
         return Ok(text);
     }
+    if let Some(bytes) = keep::stream(&args.budget, &args.input)? {
+        let frame = load::decoder(&bytes, &args.detail, &args.model, limits)?.frame(&bytes);
+        let cameras = asked_for(args, &frame.map_err(Failure::in_file(&args.input))?)?;
+        let Some((_, camera)) = cameras.first() else {
+            return Ok(String::new());
+        };
+        let (budget, model) = (&args.budget, &args.model);
+        let kept = keep::draw(budget, &args.input, &bytes, model, camera, limits, &mut log)?;
+        let drawing = Drawing {
+            args,
+            quality: args.quality,
+            limits,
+            detail: None,
+            chosen: Some(For::Kept(&kept)),
+        };
+        return pictures(&drawing, &kept.gaussians, &cameras, &mut log);
+    }
     let pixels = u64::from(args.view.size.0) * u64::from(args.view.size.1);
     let task = Task::Picture { pixels };
     let (budget, input) = (&args.budget, &args.input);
@@ -73,7 +91,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
         quality: chosen.as_ref().map_or(args.quality, |c| c.choice.quality),
         limits,
         detail: Some(detail),
-        chosen: chosen.as_ref().map(|chosen| (chosen, task)),
+        chosen: chosen.as_ref().map(|chosen| For::Chosen(chosen, task)),
     };
     pictures(&drawing, &gaussians, &cameras, &mut log)
 }
@@ -84,7 +102,13 @@ struct Drawing<'a> {
     quality: Quality,
     limits: &'a Limits,
     detail: Option<Explanation>,
-    chosen: Option<(&'a Chosen, Task)>,
+    chosen: Option<For<'a>>,
+}
+
+/// What pictures were chosen for.
+enum For<'a> {
+    Chosen(&'a Chosen, Task),
+    Kept(&'a Kept),
 }
 
 /// Draws these Gaussians into the pictures asked for.
@@ -150,9 +174,13 @@ fn pictures(
     }
 
     let mut text = String::new();
-    if let Some((chosen, task)) = drawing.chosen {
+    if let Some(chosen) = &drawing.chosen {
         let slowest = all.iter().map(|(.., stats)| stats.times.total()).max();
-        text += &chosen.describe(task, slowest.unwrap_or_default());
+        let slowest = slowest.unwrap_or_default();
+        text += &match chosen {
+            For::Chosen(chosen, task) => chosen.describe(*task, slowest),
+            For::Kept(kept) => kept.describe(slowest),
+        };
     }
     if let (true, Some((_, camera)), Some((_, _, stats))) =
         (args.verbose, cameras.first(), all.first())

@@ -4,23 +4,15 @@ use std::borrow::Cow;
 use std::ops::Deref;
 use std::sync::{Mutex, PoisonError};
 
+use super::feed::{Feed, Goal};
 use super::{Decoder, Exact};
-use crate::bitstream::{Header, Level, MAGIC};
+use crate::bitstream::{Header, Level};
 use crate::entropy::{Condition, decode_level, decode_passes, expect_no_latents, latent_hash};
 use crate::error::{Error, Result};
 use crate::gaussians::{ColourFilter, ColourResidual, Frame, Gaussians, Surroundings, activate};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
 use crate::network::{Heads, Model, Module, Pool};
-
-/// Where decoding is to end.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Goal {
-    /// A level with Gaussians; without one named, the finest that has them, and the rest of the stream must be sound.
-    Gaussians(Option<u8>),
-    /// A level, Gaussians or not.
-    Exact(u8),
-}
 
 /// A stream that is decoded level by level as its bytes arrive.
 ///
@@ -51,26 +43,10 @@ pub(super) enum Goal {
 #[derive(Debug)]
 pub struct Decoding<'b, M> {
     decoder: Decoder<M>,
-    goal: Goal,
-    /// The stream as far as it is needed.
-    bytes: Cow<'b, [u8]>,
-    /// How much of the stream has come, needed or not.
-    length: u64,
-    opened: Option<Opened>,
+    feed: Feed<'b>,
     reached: Option<Reached>,
-    failed: bool,
     /// Between two steps, what the last has left.
     pool: Mutex<Pool<i16>>,
-}
-
-/// What is known once the header is there.
-#[derive(Debug)]
-struct Opened {
-    header: Header,
-    /// The last level to decode.
-    last: u8,
-    /// Bytes of the stream that can be of use.
-    end: u64,
 }
 
 /// The deepest level so far.
@@ -91,28 +67,15 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
     pub(super) fn new(decoder: Decoder<M>, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
         Decoding {
             decoder,
-            goal,
-            length: bytes.len() as u64,
-            bytes,
-            opened: None,
+            feed: Feed::new(goal, bytes),
             reached: None,
-            failed: false,
             pool: Mutex::new(Pool::new()),
         }
     }
 
     /// Takes the next bytes of the stream. No more are kept than the stream's header, once it is there, says are needed.
     pub fn push(&mut self, bytes: &[u8]) {
-        self.length += bytes.len() as u64;
-        let room = match &self.opened {
-            Some(opened) => opened.end.saturating_sub(self.bytes.len() as u64),
-            None => u64::MAX,
-        };
-        let room = usize::try_from(room).unwrap_or(usize::MAX);
-        let kept = &bytes[..bytes.len().min(room)];
-        if !kept.is_empty() {
-            self.bytes.to_mut().extend_from_slice(kept);
-        }
+        self.feed.push(bytes);
     }
 
     /// Decodes the next level, if all its bytes have come and it is not beyond the one that decoding is to end with: `None` otherwise.
@@ -139,7 +102,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
 
     /// The header, once [`Decoding::advance`] found it whole.
     pub fn header(&self) -> Option<&Header> {
-        self.opened.as_ref().map(|opened| &opened.header)
+        self.feed.header()
     }
 
     /// The deepest level decoded so far.
@@ -245,87 +208,27 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
     }
 
     /// Takes the next step; `ended` tells that all bytes have come.
-    fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
-        if self.failed {
-            let what = "decoding has failed before, and goes no further";
-            return Err(Error::Usage(what.into()));
-        }
-        let step = self.next_level(ended).and_then(|next| match next {
+    pub(super) fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
+        self.feed.check_usable()?;
+        let (decoder, level) = (&self.decoder, self.level());
+        let plan = |header: &Header, goal| decoder.plan(header, goal);
+        let next = self.feed.next_level(ended, level, &decoder.limits, plan);
+        let step = next.and_then(|next| match next {
             Some(level) => self.decode(level, log).map(|()| Some(level)),
             None => Ok(None),
         });
-        self.failed = step.is_err();
+        if step.is_err() {
+            self.feed.fail();
+        }
         step
-    }
-
-    /// The level to decode next, if that is possible already.
-    fn next_level(&mut self, ended: bool) -> Result<Option<u8>> {
-        if self.opened.is_none() {
-            self.open(ended)?;
-        }
-        let Some(Opened { header, last, .. }) = &self.opened else {
-            return Ok(None);
-        };
-        let next = self.level().map_or(header.base, |level| level + 1);
-        let named = !matches!(self.goal, Goal::Gaussians(None));
-        if next > *last {
-            if ended && !named {
-                self.check_rest(header, next)?;
-            }
-            return Ok(None);
-        }
-        let whole = self.length >= header.prefix_bytes(next)?;
-        let cut_before = next > header.base && self.length == header.prefix_bytes(next - 1)?;
-        let wait = !whole && (!ended || (!named && cut_before));
-        Ok((!wait).then_some(next))
-    }
-
-    /// Reads the header, if it is whole, and holds what it asks for against the limits.
-    fn open(&mut self, ended: bool) -> Result<()> {
-        if !ended && self.bytes.len() < MAGIC.len() {
-            return Ok(());
-        }
-        let decoder = &self.decoder;
-        let header = match Header::parse(&self.bytes, &decoder.limits) {
-            Err(Error::Truncated { .. }) if !ended => return Ok(()),
-            header => header?,
-        };
-        header.check_model(&decoder.model.id())?;
-        let last = match self.goal {
-            Goal::Exact(level) => level,
-            Goal::Gaussians(Some(level)) => {
-                decoder.check_drawable(&header, level)?;
-                level
-            }
-            // Without any, the whole stream is decoded as far as there is something to decode.
-            Goal::Gaussians(None) => decoder.drawable(&header).last().unwrap_or(header.top),
-        };
-        decoder.check_memory(&header, last)?;
-        let end = match self.goal {
-            Goal::Gaussians(None) => header.stream_bytes(),
-            _ => header.prefix_bytes(last)?,
-        };
-        self.opened = Some(Opened { header, last, end });
-        Ok(())
-    }
-
-    /// Fails unless the levels from `next` on are sound, or the stream ends between two of them.
-    fn check_rest(&self, header: &Header, next: u8) -> Result<()> {
-        for level in next..=header.top {
-            if self.length == header.prefix_bytes(level - 1)? {
-                return Ok(());
-            }
-            Level::read(&self.bytes, header, level)?;
-        }
-        header.check_end(self.length)
     }
 
     /// Decodes a level, all or nothing.
     fn decode(&mut self, level: u8, log: &mut Log) -> Result<()> {
-        let Some(Opened { header, .. }) = &self.opened else {
+        let Some(header) = self.feed.header() else {
             return Err(nothing_reached());
         };
-        let level = Level::read(&self.bytes, header, level)?;
+        let level = Level::read(self.feed.bytes(), header, level)?;
         let mut filters = [const { None }; Heads::ALL.len()];
         for (filter, payload) in filters.iter_mut().zip(&level.filters) {
             let parse = |payload| ColourFilter::parse(payload, level.level);
@@ -386,11 +289,27 @@ fn residual(
     })
 }
 
-fn nothing_reached() -> Error {
+pub(super) fn nothing_reached() -> Error {
     Error::Usage("no level has been decoded yet".into())
 }
 
 impl<M: Deref<Target = Model> + Clone> Decoder<M> {
+    /// The last level to decode of a stream with this header, if that is possible and allowed.
+    fn plan(&self, header: &Header, goal: Goal) -> Result<u8> {
+        header.check_model(&self.model.id())?;
+        let last = match goal {
+            Goal::Exact(level) => level,
+            Goal::Gaussians(Some(level)) => {
+                self.check_drawable(header, level)?;
+                level
+            }
+            // Without any, the whole stream is decoded as far as there is something to decode.
+            Goal::Gaussians(None) => self.drawable(header).last().unwrap_or(header.top),
+        };
+        self.check_memory(header, last)?;
+        Ok(last)
+    }
+
     /// Grows `octree` to a level; its latents, features and kernel map.
     fn exact_level(
         &self,

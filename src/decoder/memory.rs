@@ -3,7 +3,8 @@
 use std::ops::Deref;
 
 use super::Decoder;
-use crate::bitstream::Header;
+use crate::bitstream::{Header, MAX_TRUNK_VOXELS};
+use crate::colour::Coloured;
 use crate::error::Result;
 use crate::network::{AT_ONCE, Model, RAW};
 
@@ -79,4 +80,43 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         self.limits
             .check_bytes("memory to decode this stream", bytes)
     }
+}
+
+/// Bytes of a voxel's colours in version 3: decoded, in slices and joined; smoothed energies of its parents; as bytes, filtered and of the level
+/// above.
+const COLOURS: u64 = 3 * Coloured::bytes_per_voxel() as u64 + 3 + 3 * 3;
+/// Bytes of the sums that surfels are made of.
+const SURFEL: u64 = 200;
+
+/// Bytes of memory that decoding the colours of a stream of version 3 with this header down to `level` takes at most, beyond
+/// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD).
+///
+/// That is linear in the voxels, but for what slices of colours learn, one on each thread.
+///
+/// # Errors
+/// [`crate::Error::Usage`] if the stream has no such level.
+pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
+    let stream = SLICES * header.prefix_bytes(level)?;
+    let levels = usize::from(level - header.base) + 1;
+    let counts = || header.voxels[..levels].iter().copied().map(u64::from);
+    let base = counts().next().unwrap_or(0);
+    // Of the levels above the base level no more is known than that they have no more voxels.
+    let above = |most: u64| -> u64 {
+        let level = |n: u64| most.min(1 << (3 * n).min(60));
+        (0..u64::from(header.base)).map(level).sum()
+    };
+    let octree = NODE * (counts().sum::<u64>() + above(base));
+    let trunk = (MAP - PLAN) * above(base.min(MAX_TRUNK_VOXELS.into()));
+    let parents = counts().nth_back(1).unwrap_or(base);
+    let voxels = counts().next_back().unwrap_or(0);
+    // Of the level above, and of the slices that threads are at.
+    let slices = parents.div_ceil(header.colour_slice().into());
+    let learned = 2 + slices.min(rayon::current_num_threads() as u64);
+    let colours = (parents + voxels) * (MAP + COLOURS) + learned * Coloured::learned_bytes() as u64;
+    Ok(stream + octree + trunk + colours)
+}
+
+/// Bytes that making so many surfels of each of so many voxels takes at most, themselves included.
+pub(super) fn surfels(voxels: u64, per_voxel: u64) -> u64 {
+    voxels * (SURFEL + per_voxel * GAUSSIAN)
 }

@@ -5,7 +5,10 @@
 //! that of the first fault in the order of the stream.
 
 mod decoding;
+mod feed;
 mod memory;
+mod stream;
+mod transform;
 
 use std::borrow::Cow;
 use std::ops::Deref;
@@ -23,7 +26,10 @@ use crate::network::{Heads, Model};
 #[cfg(feature = "render")]
 use crate::projection::Camera;
 pub use decoding::Decoding;
-use decoding::Goal;
+use feed::Goal;
+pub use stream::{HeadSet, Points, StreamDecoder, StreamDecoding};
+#[cfg(feature = "encoder")]
+pub(crate) use transform::colour_hash;
 
 /// Decodes streams with one model: `M` is a `&Model`, or an `Arc<Model>` for decoders that outlive the place they were made in.
 #[derive(Debug, Clone)]
@@ -138,10 +144,8 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     #[cfg(feature = "render")]
     pub fn level_for(&self, bytes: &[u8], cameras: &[Camera]) -> Result<Option<u8>> {
         let stream = Stream::parse(bytes, &self.limits)?.intact()?;
-        let pixels = cameras.iter().map(Camera::pixels_per_unit);
-        let pixels = pixels.fold(0.0, f64::max);
-        let seen = |level: &u8| 2.0 / f64::from(1u32 << level) * pixels <= 1.0;
-        let coarsest = self.drawable(stream.header()).find(seen);
+        let levels: Vec<u8> = self.drawable(stream.header()).collect();
+        let coarsest = stream::coarsest_seen(&levels, cameras);
         Ok(coarsest.filter(|level| Some(*level) < stream.deepest()))
     }
 

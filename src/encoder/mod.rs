@@ -1,8 +1,11 @@
-//! Point cloud to stream. Runs the decoder in the loop: what a level is predicted from is what the decoder will have.
+//! Point cloud to stream: of version 3 in [`transform`], of version 2, with learned features, here.
+//!
+//! Both run the decoder in the loop: what a level is predicted from is what the decoder will have.
 
 mod colours;
 mod corrections;
 mod skeleton;
+pub mod transform;
 mod within;
 
 use std::ops::RangeInclusive;
@@ -10,7 +13,7 @@ use std::ops::RangeInclusive;
 use b2p_kernels::f16;
 use rayon::prelude::*;
 
-use crate::bitstream::{Header, MAX_SLICE_VOXELS};
+use crate::bitstream::{Format, Header, MAX_SLICE_VOXELS, Section};
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoder;
 use crate::entropy::{Coding, Rounding};
@@ -75,8 +78,8 @@ pub struct Rate {
     pub voxels: usize,
     /// Bytes of its geometry, chunk headers included; the base level's include those of all levels above it.
     pub geometry_bytes: usize,
-    /// Bytes of its features, chunk headers included.
-    pub feature_bytes: usize,
+    /// Bytes of its colours (in version 2, features), chunk headers included.
+    pub colour_bytes: usize,
 }
 
 /// Codes a cloud, then decodes the stream and compares before giving it out.
@@ -149,7 +152,7 @@ impl<'a> Subject<'a> {
             top,
             points: cloud.voxels.len() as u64,
             placement: cloud.placement,
-            model: model.id(),
+            format: Format::Learned { model: model.id() },
             slice_voxels: options.slice_voxels,
             voxels: Vec::new(),
             sections: Vec::new(),
@@ -221,18 +224,21 @@ impl<'a> Subject<'a> {
                     .into(),
             ));
         }
-        let header = Header::parse(&bytes, &Limits::unlimited())?;
-        let rates = (header.base..)
-            .zip(header.voxels.iter().zip(&header.sections))
-            .map(|(level, (&voxels, section))| Rate {
-                level,
-                voxels: voxels as usize,
-                geometry_bytes: section.geometry as usize,
-                feature_bytes: section.features as usize,
-            })
-            .collect();
+        let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);
         Ok(Encoded { bytes, rates })
     }
+}
+
+/// What the levels of a stream with this header took.
+fn rates(header: &Header) -> Vec<Rate> {
+    let levels = (header.base..).zip(header.voxels.iter().zip(&header.sections));
+    let rate = |(level, (&voxels, section)): (u8, (&u32, &Section))| Rate {
+        level,
+        voxels: voxels as usize,
+        geometry_bytes: section.geometry as usize,
+        colour_bytes: section.colours as usize,
+    };
+    levels.map(rate).collect()
 }
 
 /// The levels to code, for a cloud of bit depth `bits`.

@@ -53,6 +53,20 @@ pub(super) fn softplus(x: f32) -> f32 {
     x.max(0.0) + 2.0 * s * p
 }
 
+/// The logarithm to base 2 of a normal number above 0, within 10⁻⁷ of its size or of 1.
+pub(super) fn log2(x: f32) -> f32 {
+    let bits = x.to_bits();
+    let exponent = (bits >> 23) as i32 - 127;
+    let mantissa = f64::from(f32::from_bits(bits & 0x7f_ffff | 0x3f80_0000));
+    // ln m = 2 artanh(s), s = (m − 1) / (m + 1) < 1/3.
+    let s = (mantissa - 1.0) / (mantissa + 1.0);
+    let q = s * s;
+    let series = (0..10)
+        .rev()
+        .fold(0.0, |p, k| p * q + 1.0 / f64::from(2 * k + 1));
+    (f64::from(exponent) + 2.0 * s * series * std::f64::consts::LOG2_E) as f32
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -81,6 +95,21 @@ mod tests {
                 |y| y
             ) < 5e-7
         );
+    }
+
+    #[test]
+    fn logarithms_are_exact_at_powers_of_two_and_close_between() {
+        for k in -20..=20 {
+            assert_eq!(log2(2f32.powi(k)), k as f32);
+        }
+        for i in 1..100_000 {
+            let x = i as f32 * 0.037;
+            let exact = f64::from(x).log2();
+            assert!(
+                (f64::from(log2(x)) - exact).abs() < 1e-7 * exact.abs().max(1.0),
+                "{x}"
+            );
+        }
     }
 
     #[test]

@@ -76,9 +76,9 @@ pub fn activate(
 }
 
 /// Gaussians whose numbers are computed side by side.
-const GROUP: usize = 16;
+pub(super) const GROUP: usize = 16;
 
-type Lane = [f32; GROUP];
+pub(super) type Lane = [f32; GROUP];
 
 /// Activated numbers, each kind apart; positions and scales in voxels.
 struct Group {
@@ -127,7 +127,7 @@ fn centre(voxels: &Voxels, children: usize, i: usize, edge: f32) -> [f32; 3] {
 }
 
 /// The unit quaternions along `q`; the identity for zero.
-fn normalised(mut q: [Lane; 4]) -> [Lane; 4] {
+pub(super) fn normalised(mut q: [Lane; 4]) -> [Lane; 4] {
     let mut norm = [0.0f64; GROUP];
     for component in &q {
         for (norm, x) in norm.iter_mut().zip(component) {

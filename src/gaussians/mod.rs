@@ -4,7 +4,9 @@ mod activations;
 mod filter;
 mod harmonics;
 mod heads;
+pub mod learned;
 mod residual;
+pub mod surfels;
 
 pub use filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundings};
 pub use harmonics::Harmonics;

@@ -14,7 +14,7 @@ const LENGTH: usize = size_of::<u64>();
 /// What a tensor's entries are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "UPPERCASE")]
-pub(super) enum Dtype {
+pub(crate) enum Dtype {
     Bool,
     U8,
     I8,
@@ -44,7 +44,7 @@ impl Dtype {
 
 /// A tensor as the table has it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Info {
+pub(crate) struct Info {
     pub dtype: Dtype,
     pub shape: Vec<usize>,
     data_offsets: (usize, usize),
@@ -65,7 +65,7 @@ impl Info {
 
 /// A table of contents.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Contents {
+pub(crate) struct Contents {
     /// Texts by their names.
     #[serde(rename = "__metadata__", default)]
     pub metadata: BTreeMap<String, String>,
@@ -132,7 +132,7 @@ fn malformed(
 
 /// A file that is being put together.
 #[derive(Debug, Default)]
-pub(super) struct File {
+pub(crate) struct File {
     contents: Contents,
     data: Vec<u8>,
 }

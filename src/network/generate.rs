@@ -17,10 +17,11 @@ use crate::error::{Error, Result};
 use crate::geometry::KernelMap;
 
 /// What Gaussians are generated in.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Precision {
     /// Activations in ±2047 with a scale per layer, weights in ±2047 with a scale per channel, sums in 32 bits: the same bits on every
     /// machine and with any instruction set.
+    #[default]
     Int16,
     /// f16 in memory, sums in f32.
     F16,

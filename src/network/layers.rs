@@ -125,7 +125,7 @@ impl<T: Copy + Zeroable> Pool<T> {
 }
 
 /// A layer's `rows` output rows.
-pub(super) fn apply<C: Conv>(
+pub(crate) fn apply<C: Conv>(
     pool: &mut Pool<C::Value>,
     isa: Isa,
     conv: &C,
@@ -148,6 +148,51 @@ pub(super) fn apply<C: Conv>(
     out
 }
 
+/// `relu(layer + added)`, as many rows as `added` has.
+pub(crate) fn apply_added<C: Conv>(
+    pool: &mut Pool<C::Value>,
+    isa: Isa,
+    conv: &C,
+    taps: Taps<'_>,
+    input: &[C::Value],
+    added: &[C::Value],
+) -> Vec<C::Value> {
+    let mut out = pool.take(added.len());
+    let output = Output {
+        rows: &mut out,
+        stride: conv.cout(),
+        column: 0,
+        residual: Some(added),
+        relu: true,
+    };
+    spread(output, |first, output| {
+        conv.run(isa, taps, input, first, output)
+    });
+    out
+}
+
+/// Output rows of a layer that ends in f32, from row `first` on, as many as there is room for. `first` is a multiple of 512.
+pub(crate) fn apply_part<C: Conv>(
+    isa: Isa,
+    conv: &C,
+    taps: Taps<'_>,
+    input: &[C::Value],
+    first: usize,
+    out: &mut [f32],
+) {
+    debug_assert!(first.is_multiple_of(BLOCK));
+    let output = Output {
+        rows: out,
+        stride: conv.cout(),
+        column: 0,
+        residual: None,
+        relu: false,
+    };
+    spread(output, |row, output| {
+        conv.run_f32(isa, taps, input, first + row, output)
+    });
+}
+
 /// Output rows of a layer that ends in f32, as many as there is room for.
 pub(super) fn apply_f32<C: Conv>(
     isa: Isa,
@@ -156,16 +201,7 @@ pub(super) fn apply_f32<C: Conv>(
     input: &[C::Value],
     out: &mut [f32],
 ) {
-    let output = Output {
-        rows: out,
-        stride: conv.cout(),
-        column: 0,
-        residual: None,
-        relu: false,
-    };
-    spread(output, |first, output| {
-        conv.run_f32(isa, taps, input, first, output)
-    });
+    apply_part(isa, conv, taps, input, 0, out);
 }
 
 /// Calls `run(first row, part)` for parts of the output, in parallel.
@@ -311,7 +347,7 @@ pub(super) fn concat<T: Copy + Zeroable + Send + Sync>(
 }
 
 /// The real numbers that integer activations stand for.
-pub(super) fn reals(isa: Isa, q: &[i16], scale: f32) -> Vec<f16> {
+pub(crate) fn reals(isa: Isa, q: &[i16], scale: f32) -> Vec<f16> {
     const CHUNK: usize = 4096;
     let mut out = zeros(q.len());
     out.par_chunks_mut(CHUNK)

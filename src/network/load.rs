@@ -22,7 +22,7 @@ const SUM_LIMIT: u64 = 1 << 31;
 const MAX_FLOAT: f32 = 65504.0;
 
 /// A type of tensor entries.
-pub(super) trait Element: Sized {
+pub(crate) trait Element: Sized {
     const DTYPE: Dtype;
     /// Reads an entry from as many bytes as it has.
     fn read(bytes: &[u8]) -> Self;
@@ -41,7 +41,7 @@ macro_rules! element {
 element!(u8: U8, i16: I16, u16: U16, i32: I32, u32: U32, f16: F16, f32: F32);
 
 /// The tensors of a model file.
-pub(super) struct Tensors<'a> {
+pub(crate) struct Tensors<'a> {
     contents: Contents,
     data: &'a [u8],
 }
@@ -71,6 +71,11 @@ impl<'a> Tensors<'a> {
             )
         })?;
         Shape::from_json(json)
+    }
+
+    /// A text of the metadata.
+    pub fn metadata(&self, key: &str) -> Option<&str> {
+        self.contents.metadata.get(key).map(String::as_str)
     }
 
     /// What a bit is worth when latents are rounded, in squared latent steps, for each of a role's K channels, if the description says: 0 if it
@@ -272,7 +277,7 @@ impl<'a> Tensors<'a> {
 }
 
 /// An error that names a tensor.
-pub(super) fn malformed(
+pub(crate) fn malformed(
     name: &str,
     field: &str,
     value: impl ToString,

@@ -68,17 +68,20 @@ use b2p_kernels::{ExactConv, FloatConv, Isa, map_file};
 use crate::entropy::{RawRows, Tables};
 use crate::error::{Error, Result};
 use generate::Generator;
-use load::{Tensors, malformed};
-use stored::Stored;
-use structure::{Encoder, Exact, Generate, Spec};
+use structure::{Encoder, Exact, Generate};
 
+#[cfg(test)]
+pub(crate) use container::{Dtype, File};
 pub(crate) use generate::AT_ONCE;
 pub use generate::Precision;
 pub use heads::{Head, Heads};
-pub(crate) use layers::Pool;
+pub(crate) use layers::{Conv, Pool, apply, apply_added, apply_part, reals};
+pub(crate) use load::{Tensors, malformed};
 pub use passes::{Parameters, Pass};
 pub use shape::{Shape, Upsample};
+pub(crate) use stored::Stored;
 pub use structure::{RAW, ROLES};
+pub(crate) use structure::{ResBlock, Spec};
 pub use untrained::untrained;
 pub use work::{Module, Work};
 
@@ -95,6 +98,14 @@ pub struct Model {
     bit_prices: [Vec<f32>; ROLES],
     g_scale: Vec<f32>,
     c_scale: Vec<f32>,
+}
+
+impl std::fmt::Debug for Model {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Model")
+            .field("id", &self.id)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Model {
@@ -274,6 +285,6 @@ fn scales(tensors: &Tensors, name: &str, count: usize, first: usize) -> Result<V
 }
 
 /// The error of a model that has no such part.
-fn missing(what: &'static str, detail: String) -> Error {
+pub(crate) fn missing(what: &'static str, detail: String) -> Error {
     Error::Unsupported { what, detail }
 }

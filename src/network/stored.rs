@@ -6,7 +6,7 @@ use b2p_kernels::{ExactConv, FloatConv, LIMIT, Requantise, Scale};
 use super::structure::Spec;
 
 /// A layer of the close zone.
-pub(super) struct Stored {
+pub(crate) struct Stored {
     pub spec: Spec,
     /// [taps, in, out], finite.
     pub weights: Vec<f16>,

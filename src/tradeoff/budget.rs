@@ -150,7 +150,7 @@ pub(super) fn faces(voxels: f64, level: u8) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bitstream::Section;
+    use crate::bitstream::{Format, Section};
     use crate::network::Shape;
     use crate::placement::Placement;
     use crate::tradeoff::{LevelCost, Machine, PictureCost};
@@ -163,7 +163,7 @@ mod tests {
             top: 9,
             points: 1_000_000,
             placement: Placement::VOXEL_GRID,
-            model: [0; 16],
+            format: Format::Learned { model: [0; 16] },
             slice_voxels: 16_384,
             voxels: vec![10_000, 50_000, 200_000],
             sections: vec![Section::default(); 3],

@@ -7,7 +7,7 @@ use b2p::network::Model;
 use b2p::{Error, Result};
 use sha2::{Digest, Sha256};
 
-fn hash(bytes: impl IntoIterator<Item = u8>) -> String {
+pub fn hash(bytes: impl IntoIterator<Item = u8>) -> String {
     let bytes: Vec<u8> = bytes.into_iter().collect();
     let hash = Sha256::digest(bytes);
     hash.iter().map(|byte| format!("{byte:02x}")).collect()
@@ -23,14 +23,19 @@ fn level(level: u8, exact: &Exact, gaussians: Option<&Gaussians>) -> String {
         numbers(&exact.latents),
         numbers(&exact.features)
     );
-    if let Some(g) = gaussians {
-        let floats = g.position.as_flattened().iter();
-        let floats = floats.chain(g.scale.as_flattened());
-        let floats = floats.chain(g.rotation.as_flattened()).chain(&g.opacity);
-        let floats = floats.chain(g.colour.as_flattened());
-        line += &format!(",{}", hash(floats.flat_map(|x| x.to_le_bytes())));
+    if let Some(gaussians) = gaussians {
+        line += &format!(",{}", gaussians_hash(gaussians));
     }
     line
+}
+
+/// The hash of all their parameters.
+pub fn gaussians_hash(g: &Gaussians) -> String {
+    let floats = g.position.as_flattened().iter();
+    let floats = floats.chain(g.scale.as_flattened());
+    let floats = floats.chain(g.rotation.as_flattened()).chain(&g.opacity);
+    let floats = floats.chain(g.colour.as_flattened());
+    hash(floats.flat_map(|x| x.to_le_bytes()))
 }
 
 fn reached(decoding: &Decoding<&Model>, log: &mut Log) -> Result<String> {

@@ -1,7 +1,7 @@
 //! The streams of the suite: what is unusual about them is in their names.
 
 use b2p::Placement;
-use b2p::bitstream::{Header, Writer};
+use b2p::bitstream::{Format, Header, Writer};
 use b2p::encoder::{Options, Residual, encode};
 use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
 use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
@@ -119,7 +119,7 @@ fn coloured(
             origin: [-1.5, 1e6, 0.0],
             voxel_size: 0.25,
         },
-        model: model.id(),
+        format: Format::Learned { model: model.id() },
         slice_voxels: slice,
         voxels: (base..=top).map(|n| octree.level(n).len() as u32).collect(),
         sections: Vec::new(),

@@ -8,6 +8,7 @@ mod lies;
 #[path = "../common/seal.rs"]
 mod seal;
 mod stack;
+mod transform;
 
 use b2p::decoder::Decoder;
 use b2p::gaussians::Gaussians;

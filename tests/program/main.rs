@@ -5,6 +5,7 @@ mod common;
 #[cfg(unix)]
 mod outputs;
 mod pictures;
+mod transform;
 mod within;
 
 use std::io::Write;
@@ -77,13 +78,21 @@ fn folder_with_cloud() -> tempfile::TempDir {
     folder
 }
 
-/// The same with `ball.b2p`, coded with the program's own model.
+/// The same with `ball.b2p`, a stream of version 3.
 fn folder_with_stream() -> tempfile::TempDir {
+    folder_coded("transform")
+}
+
+/// The same with a stream of version 2, coded with the program's own model.
+fn folder_with_learned_stream() -> tempfile::TempDir {
+    folder_coded("learned")
+}
+
+fn folder_coded(colours: &str) -> tempfile::TempDir {
     let folder = folder_with_cloud();
-    succeeds(
-        folder.path(),
-        &["encode", "ball.ply", "-o", "ball.b2p", "--bits", "7"],
-    );
+    let encode = ["encode", "ball.ply", "-o", "ball.b2p", "--bits", "7"];
+    let how = ["--colours", colours];
+    succeeds(folder.path(), &[&encode[..], &how].concat());
     folder
 }
 
@@ -133,8 +142,13 @@ fn a_sparse_cloud_gets_as_many_bits_as_close_its_surface_unless_told_otherwise()
 
 #[test]
 fn a_cloud_becomes_a_stream_gaussians_and_pictures() {
-    let folder = folder_with_stream();
-    let at = folder.path();
+    for colours in ["transform", "learned"] {
+        becomes_pictures(folder_coded(colours).path());
+    }
+}
+
+#[track_caller]
+fn becomes_pictures(at: &Path) {
     let info: serde_json::Value =
         serde_json::from_str(&succeeds(at, &["info", "ball.b2p", "--json"]))
             .expect("info prints JSON");
@@ -184,7 +198,8 @@ fn a_residual_is_coded_as_finely_as_asked_for_and_told_by_info() {
     let at = folder.path();
     let bytes = |residual: &[&str]| {
         let encode = ["encode", "ball.ply", "-o", "ball.b2p"];
-        succeeds(at, &[&encode, residual].concat());
+        let learned = ["--colours", "learned"];
+        succeeds(at, &[&encode, &learned[..], residual].concat());
         let info = succeeds(at, &["info", "ball.b2p", "--json"]);
         let info: Value = serde_json::from_str(&info).expect("info prints JSON");
         let of = |level: usize| info["levels"][level]["residual_bytes"].as_u64();
@@ -223,7 +238,8 @@ fn quick_heads_are_used_where_the_model_has_them() {
         ["--model", "both.safetensors"],
     );
     let with = |arguments: &[&str], model: &[&str]| succeeds(at, &[arguments, model].concat());
-    with(&["encode", "ball.ply", "-o", "ball.b2p"], &one);
+    let encode = ["encode", "ball.ply", "-o", "ball.b2p"];
+    with(&[&encode[..], &["--colours", "learned"]].concat(), &one);
     let decode = ["decode", "ball.b2p", "--heads", "quick", "-o"];
     with(&["decode", "ball.b2p", "-o", "best.ply"], &both);
     with(&[&decode[..], &["quick.ply"]].concat(), &both);
@@ -257,7 +273,7 @@ fn quick_heads_are_used_where_the_model_has_them() {
 
 #[test]
 fn a_level_without_gaussians_is_refused_and_the_others_are_named() {
-    let folder = folder_with_stream();
+    let folder = folder_with_learned_stream();
     fails(
         folder.path(),
         &["decode", "ball.b2p", "-o", "x.ply", "--level", "4"],
@@ -342,7 +358,7 @@ fn a_damaged_stream_is_refused_and_nothing_is_written() {
 
 #[test]
 fn another_model_is_recognised_before_anything_is_decoded() {
-    let folder = folder_with_stream();
+    let folder = folder_with_learned_stream();
     let at = folder.path();
     std::fs::write(at.join("other.safetensors"), tiny_model(1)).unwrap();
     let arguments = [
@@ -370,8 +386,12 @@ fn an_output_folder_that_does_not_exist_is_named() {
 
 #[test]
 fn a_pipe_is_decoded_and_drawn_like_a_file() {
-    let folder = folder_with_stream();
-    let at = folder.path();
+    for colours in ["transform", "learned"] {
+        drawn_like_a_file(folder_coded(colours).path());
+    }
+}
+
+fn drawn_like_a_file(at: &Path) {
     let stream = std::fs::read(at.join("ball.b2p")).unwrap();
     let size = ["--size", "48x32"];
     succeeds(
@@ -414,8 +434,12 @@ fn a_pipe_is_decoded_and_drawn_like_a_file() {
 
 #[test]
 fn a_pipe_that_breaks_off_leaves_the_finest_whole_level() {
-    let folder = folder_with_stream();
-    let at = folder.path();
+    for colours in ["transform", "learned"] {
+        breaks_off(folder_coded(colours).path());
+    }
+}
+
+fn breaks_off(at: &Path) {
     let stream = std::fs::read(at.join("ball.b2p")).unwrap();
     let cut = &stream[..stream.len() - 1];
     let done = piped(at, &["decode", "-", "-o", "cut.ply"], cut);

@@ -79,14 +79,21 @@ fn effects_are_explained_and_forced() {
 
 #[test]
 fn a_small_picture_is_drawn_from_a_coarser_level_unless_one_is_named() {
-    let folder = folder_with_stream();
-    let draw = |more: &[&str]| {
-        let args = ["render", "ball.b2p", "-o", "a.png", "-v"];
-        succeeds(folder.path(), &[&args[..], more].concat())
-    };
-    assert!(draw(&["--size", "8x8"]).contains("detail on: level 5"));
-    assert!(draw(&["--size", "400x400"]).contains("detail off: as fine as there is"));
-    assert!(draw(&["--size", "8x8", "--level", "6"]).contains("detail off: level 6, forced"));
+    // The base level of a learned stream has no Gaussians.
+    for (colours, coarsest) in [("transform", 4), ("learned", 5)] {
+        let folder = folder_coded(colours);
+        let draw = |more: &[&str]| {
+            let args = ["render", "ball.b2p", "-o", "a.png", "-v"];
+            succeeds(folder.path(), &[&args[..], more].concat())
+        };
+        let small = draw(&["--size", "8x8"]);
+        assert!(
+            small.contains(&format!("detail on: level {coarsest}")),
+            "{small}"
+        );
+        assert!(draw(&["--size", "400x400"]).contains("detail off: as fine as there is"));
+        assert!(draw(&["--size", "8x8", "--level", "6"]).contains("detail off: level 6, forced"));
+    }
 }
 
 #[test]

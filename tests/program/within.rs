@@ -1,4 +1,4 @@
-//! `b2p encode --bits-per-point`.
+//! `b2p encode --bits-per-point`, of learned streams.
 
 use super::*;
 
@@ -7,7 +7,8 @@ fn a_stream_of_at_most_so_many_bits_is_made_and_said_to_be() {
     let folder = folder_with_cloud();
     let at = folder.path();
     let points = Ball::new(7, 40.0).voxels().len() as f64;
-    let encode = ["encode", "ball.ply", "-o", "ball.b2p", "--bits-per-point"];
+    let learned = ["encode", "ball.ply", "--colours", "learned"];
+    let encode = [&learned[..], &["-o", "ball.b2p", "--bits-per-point"]].concat();
     let said = succeeds(at, &[&encode[..], &["1.2"]].concat());
     let bits = |name: &str| std::fs::metadata(at.join(name)).unwrap().len() as f64 * 8.0 / points;
     assert!((1.0..=1.2).contains(&bits("ball.b2p")), "{said}");
@@ -19,14 +20,7 @@ fn a_stream_of_at_most_so_many_bits_is_made_and_said_to_be() {
     let step = said.trim().rsplit("residual in steps of ").next().unwrap();
     succeeds(
         at,
-        &[
-            "encode",
-            "ball.ply",
-            "-o",
-            "by-hand.b2p",
-            "--residual",
-            step,
-        ],
+        &[&learned[..], &["-o", "by-hand.b2p", "--residual", step]].concat(),
     );
     let [found, by_hand] =
         ["ball.b2p", "by-hand.b2p"].map(|name| std::fs::read(at.join(name)).unwrap());
@@ -47,24 +41,14 @@ fn a_stream_of_at_most_so_many_bits_is_made_and_said_to_be() {
 #[test]
 fn fewer_bits_than_there_can_be_write_nothing_and_say_what_can_be_done() {
     let folder = folder_with_cloud();
-    fails(
-        folder.path(),
-        &[
-            "encode",
-            "ball.ply",
-            "-o",
-            "x.b2p",
-            "--bits-per-point",
-            "0.01",
-        ],
-        &[
-            "ball.ply",
-            "0.01 bits",
-            "the least is 0.",
-            "--levels",
-            "--model",
-        ],
-    );
+    for colours in ["transform", "learned"] {
+        let encode = ["encode", "ball.ply", "-o", "x.b2p", "--bits-per-point"];
+        fails(
+            folder.path(),
+            &[&encode[..], &["0.001", "--colours", colours]].concat(),
+            &["ball.ply", "0.001 bits", "smallest stream", "--levels"],
+        );
+    }
 }
 
 #[test]

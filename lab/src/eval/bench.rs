@@ -225,7 +225,7 @@ fn rate_of(header: &Header, level: u8, points: Option<u64>) -> Result<Rate> {
             .map(|(level, section)| LevelRate {
                 level,
                 geometry: bpp(section.geometry.into()),
-                features: bpp(section.features.into()),
+                features: bpp(section.colours.into()),
             })
             .collect(),
     })

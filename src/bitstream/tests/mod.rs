@@ -1,6 +1,7 @@
 mod colours;
+mod transform;
 
-use super::chunk::{CHUNK_HEADER, Chunk, ChunkKind};
+use super::chunk::{Chunk, ChunkKind, Form};
 use super::*;
 use crate::error::{Error, Result};
 use crate::{Limits, Placement};
@@ -17,12 +18,17 @@ fn header() -> Header {
             origin: [1.5, -2.0, 1e-3],
             voxel_size: 0.25,
         },
-        model: *b"0123456789abcdef",
+        format: Format::Learned {
+            model: *b"0123456789abcdef",
+        },
         slice_voxels: 4,
         voxels: vec![3, 10, 20],
         sections: vec![],
     }
 }
+
+/// Bytes of a chunk of version 2 before its payload.
+const CHUNK_HEADER: usize = 16;
 
 const HASHES: [u64; 3] = [11, u64::MAX, 0x0123_4567_89ab_cdef];
 
@@ -279,7 +285,7 @@ fn unknown_critical_things_are_refused_and_unknown_others_passed_over() {
         matches!(parse(&bytes), Err(Error::Unsupported { .. }))
     };
     assert!(refused(8, 1), "an earlier major version");
-    assert!(refused(8, 3), "a later major version");
+    assert!(refused(8, 4), "a later major version");
     assert!(!refused(10, 9), "minor version");
     assert!(refused(15, 0x80), "critical flag");
     assert!(!refused(16, 0xff), "optional flag");
@@ -302,8 +308,9 @@ fn unknown_critical_things_are_refused_and_unknown_others_passed_over() {
             count: 0,
             payload: b"a note",
             offset: 0,
+            payload_at: 0,
         };
-        chunk.write(&[], &mut extra).unwrap();
+        chunk.write(Form::Fixed, &[], &mut extra).unwrap();
         let mut longer = [&bytes[..at], &extra, &bytes[at..]].concat();
         longer[96] += extra.len() as u8;
         seal_header(&mut longer);

@@ -9,10 +9,8 @@
 //! So the decoder reads exactly the bytes that the encoder wrote, and ends holding exactly `low`. Every truncation makes it read past
 //! the end, and other damage goes unnoticed only if it leaves both the number of bytes and the last 32 bits as they were.
 
+use crate::coding::ONE;
 use crate::error::{Error, Result, Stage};
-
-/// Probabilities are in units of 2^−16.
-pub(super) const ONE: u32 = 1 << 16;
 
 /// What codes bits, one way or the other.
 pub(super) trait Coder {

@@ -15,8 +15,8 @@
 //! the network alone; then `seen` grows by 1, to 30 at most, and `one` by `((65536·bit − one)·⌊65536 / (4·seen + 1)⌋) >> 14`, within 16 to 65520.
 //! All shifts of negative numbers round down.
 
-use super::coder::ONE;
-use super::probability::{STRETCH, squash};
+use crate::coding::ONE;
+use crate::coding::probability::{STRETCH, squash};
 use b2p_kernels::Instructions;
 use b2p_kernels::mixing::{self, CONTEXTS, Lanes, OTHERS};
 

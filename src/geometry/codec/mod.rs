@@ -26,7 +26,6 @@ mod mixer;
 mod neighbourhood;
 pub mod network;
 mod predictor;
-mod probability;
 mod surroundings;
 
 use super::{KernelMap, Octree};

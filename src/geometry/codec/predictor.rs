@@ -8,12 +8,13 @@
 //! `e = error / 64` towards zero, each weight of the octant grows by `((hidden·e >> 16) + 1) >> 1` (saturating `i16`), its bias by
 //! `4·e` (wrapping `i32`).
 
-use super::coder::{Coder, ONE};
+use super::coder::Coder;
 use super::mixer::Mixer;
 use super::neighbourhood::Neighbourhood;
 use super::network::Network;
-use super::probability::{LIMIT, squash};
 use super::surroundings::Surroundings;
+use crate::coding::ONE;
+use crate::coding::probability::{LIMIT, squash};
 use crate::geometry::ones;
 use b2p_kernels::Instructions;
 use b2p_kernels::hidden::{self, Row};

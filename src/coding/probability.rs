@@ -1,9 +1,9 @@
 //! From a logit to a probability, by a table of integers, and back.
 
-use super::coder::ONE;
+use super::ONE;
 
 /// The largest logit in use, in units of 1/64: the probability stops short of certainty.
-pub(super) const LIMIT: i32 = 720;
+pub(crate) const LIMIT: i32 = 720;
 
 /// `e^(−1/64)` in units of 2^−62, rounded down.
 const DECAY: u64 = 4_540_188_453_729_421_604;
@@ -41,12 +41,12 @@ const fn one_of(logit: i32) -> u32 {
 
 /// The probability, in `1..=65535`, of a bit whose logit is `logit / 64`.
 #[inline(always)]
-pub(super) fn squash(logit: i32) -> u32 {
+pub(crate) fn squash(logit: i32) -> u32 {
     ONE_OF[(logit.clamp(-LIMIT, LIMIT) + LIMIT) as usize].into()
 }
 
 /// Entry `i` is the least logit whose probability is at least `16·i + 8`, or −[`LIMIT`].
-pub(super) static STRETCH: [i16; 1 << 12] = {
+pub(crate) static STRETCH: [i16; 1 << 12] = {
     let mut table = [0; 1 << 12];
     let (mut i, mut logit) = (0, -LIMIT);
     while i < table.len() {

@@ -1,0 +1,369 @@
+//! Choosing coefficients: rate–distortion optimised quantisation.
+
+use std::ops::Range;
+
+use b2p_kernels::{Instructions, Isa, Work};
+use rayon::prelude::*;
+
+use super::block::{Coding, Quantiser, Source};
+use super::filter::{Responses, TERMS, solve};
+use super::model::{BINS, Circumstances, Model};
+use super::space::{FRACTION, from_rgb};
+use super::transform::forward;
+use super::{
+    Coloured, Pass, Steps, Ycc, coding_above, join, nodes, slices, spread_energies, start,
+};
+use crate::coding::ONE;
+use crate::coding::binary::Encoder;
+use crate::geometry::{KernelMap, Octree, Voxels};
+
+/// How a level is encoded.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Options {
+    /// The quantisation steps.
+    pub steps: Steps,
+    /// What a bit costs in squared steps: the Lagrangian multiplier of rate–distortion optimised quantisation. 0 rounds to the nearest.
+    pub lambda: f32,
+    /// How much of the predicted differences is believed, in units of 1/256.
+    pub gain: u8,
+}
+
+impl Options {
+    /// Good values for these steps.
+    pub fn new(steps: Steps) -> Options {
+        Options {
+            steps,
+            lambda: 0.055,
+            gain: 220,
+        }
+    }
+
+    fn coding(&self) -> Coding {
+        Coding {
+            steps: self.steps,
+            gain: self.gain,
+        }
+    }
+}
+
+/// The colours that a stream approaches: those of its finest level, and of the levels above the means that the transform makes of them.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Truth {
+    levels: Vec<Vec<Ycc>>,
+    lossless: bool,
+}
+
+impl Truth {
+    /// The mean colours of a cloud's voxels in each voxel of `top`, and of the levels above. In lossless streams they are rounded to whole 255ths.
+    ///
+    /// # Panics
+    /// If there is not a colour for every voxel, or the octree is not that deep.
+    pub fn new(
+        voxels: &Voxels,
+        colours: &[[u8; 3]],
+        octree: &Octree,
+        top: u8,
+        lossless: bool,
+    ) -> Truth {
+        assert_eq!(voxels.len(), colours.len(), "a colour for every voxel");
+        let shift = 3 * (voxels.depth() - top);
+        let fraction = if lossless { 0 } else { FRACTION };
+        let means = octree.level(top).keys().par_iter().map(|key| {
+            let first = voxels.keys().partition_point(|k| k >> shift < *key);
+            let (mut sum, mut count) = ([0u64; 3], 0u64);
+            let inside = voxels.keys()[first..]
+                .iter()
+                .take_while(|k| *k >> shift == *key);
+            for (_, colour) in inside.zip(&colours[first..]) {
+                for (sum, c) in sum.iter_mut().zip(colour) {
+                    *sum += u64::from(*c);
+                }
+                count += 1;
+            }
+            let mean =
+                sum.map(|sum| (((sum << (fraction + 1)) + count) / (2 * count).max(1)) as i32);
+            from_rgb(mean).map(|x| x as i16)
+        });
+        let mut levels: Vec<Vec<Ycc>> = vec![means.collect()];
+        for level in (0..top).rev() {
+            let (masks, first) = (octree.occupancy(level), octree.first_child(level));
+            let below = &levels[levels.len() - 1];
+            let mean = |(mask, first): (&u8, &u32)| {
+                let children = super::block::spread(*mask, &below[*first as usize..]);
+                forward(*mask, children).0.map(|x| x as i16)
+            };
+            let means = masks.par_iter().zip(first).map(mean).collect();
+            levels.push(means);
+        }
+        levels.reverse();
+        Truth { levels, lossless }
+    }
+
+    /// The colours of a level, as [`Coloured::values`] has them.
+    pub fn level(&self, level: u8) -> &[Ycc] {
+        &self.levels[usize::from(level)]
+    }
+
+    /// Whether no voxel has a chroma.
+    pub fn is_grey(&self) -> bool {
+        self.levels
+            .last()
+            .is_some_and(|values| values.iter().all(|ycc| ycc[1..] == [0, 0]))
+    }
+}
+
+/// Codes the root and the levels 1 to K, whose kernel maps are `maps`, from that of level 0 on: the payload, and what it decodes to.
+///
+/// # Panics
+/// If the octree is not as deep as there are maps.
+pub fn encode_trunk(
+    isa: Isa,
+    octree: &Octree,
+    maps: &[KernelMap],
+    truth: &Truth,
+    options: Options,
+) -> (Vec<u8>, Coloured) {
+    let depth = maps.len() - 1;
+    let fraction = options.steps.fraction();
+    let half = (1 << fraction) >> 1;
+    let root = truth.level(0)[0].map(|x| (x + half) >> fraction);
+    let mut bytes = vec![options.steps.luma, options.steps.chroma, options.gain];
+    bytes.push(root[0].clamp(0, 255) as u8);
+    bytes.extend(
+        root[1..]
+            .iter()
+            .flat_map(|x| x.clamp(&-255, &255).to_le_bytes()),
+    );
+    let root = [
+        root[0].clamp(0, 255),
+        root[1].clamp(-255, 255),
+        root[2].clamp(-255, 255),
+    ];
+    let mut coloured = start(options.steps, root);
+    let mut source = Choosing::new(options.lambda);
+    for level in 1..=depth {
+        let coding = coding_above(options.coding(), depth - level);
+        let mut model = std::mem::replace(&mut coloured.model, Model::empty());
+        let nodes = nodes(
+            octree,
+            level as u8,
+            &maps[level - 1],
+            &maps[level],
+            &coloured,
+        );
+        let range = 0..nodes.masks.len();
+        let truth = Some(truth.level(level as u8));
+        let coded = isa.run(Pass {
+            source: &mut source,
+            model: &mut model,
+            nodes,
+            range,
+            coding,
+            truth,
+        });
+        let energies = spread_energies(nodes, &coded.energies);
+        coloured = Coloured {
+            steps: coding.steps,
+            values: coded.values,
+            energies,
+            model,
+        };
+    }
+    bytes.extend(source.coder.finish());
+    (bytes, coloured)
+}
+
+/// Codes the colours of `level`, one payload for every `slice` nodes of the level above; and what they decode to.
+///
+/// # Panics
+/// If maps or colours are another level's, or `slice` is 0.
+#[allow(clippy::too_many_arguments)]
+pub fn encode_level(
+    isa: Isa,
+    octree: &Octree,
+    level: u8,
+    above_map: &KernelMap,
+    map: &KernelMap,
+    above: &Coloured,
+    truth: &Truth,
+    slice: usize,
+    options: Options,
+) -> (Vec<Vec<u8>>, Coloured) {
+    let nodes = nodes(octree, level, above_map, map, above);
+    let coding = options.coding();
+    let encode = |range: Range<usize>| {
+        let (mut source, mut model) = (Choosing::new(options.lambda), above.model.clone());
+        let first = nodes.first_child[range.start] as usize;
+        let truth = Some(&truth.level(level)[first..]);
+        let coded = isa.run(Pass {
+            source: &mut source,
+            model: &mut model,
+            nodes,
+            range,
+            coding,
+            truth,
+        });
+        let mut bytes = vec![coding.steps.luma, coding.steps.chroma, coding.gain];
+        bytes.extend(source.coder.finish());
+        (bytes, (coding.steps, coded, model))
+    };
+    let ranges: Vec<_> = slices(nodes.masks.len(), slice).collect();
+    let (payloads, coded): (Vec<_>, Vec<_>) = ranges.into_par_iter().map(encode).unzip();
+    (payloads, join(nodes, coded))
+}
+
+/// Above this magnitude coefficients are rounded to the nearest.
+const LARGE: f32 = 12.0;
+
+/// Coefficients for an entropy stream, each the one whose squared error and price are least.
+struct Choosing {
+    coder: Encoder,
+    lambda: f32,
+}
+
+impl Choosing {
+    fn new(lambda: f32) -> Choosing {
+        Choosing {
+            coder: Encoder::default(),
+            lambda,
+        }
+    }
+
+    #[inline(always)]
+    fn choose(&self, model: &Model, c: &Circumstances, wanted: f32) -> i32 {
+        let nearest = wanted.round();
+        if nearest == 0.0 || nearest > LARGE || self.lambda == 0.0 {
+            return nearest as i32;
+        }
+        let mut costs = [0.0; LARGE as usize + 1];
+        let costs = &mut costs[..=nearest as usize];
+        bits(model, c, costs);
+        let price = |value: i32| {
+            let sign = if value == 0 { 0.0 } else { 1.0 };
+            let error = wanted - value as f32;
+            error * error + self.lambda * (costs[value as usize] + sign)
+        };
+        let nearest = nearest as i32;
+        let candidates = [nearest, nearest - 1, 0];
+        candidates
+            .into_iter()
+            .min_by(|a, b| price(*a).total_cmp(&price(*b)))
+            .unwrap_or(nearest)
+    }
+}
+
+/// What coding the magnitudes 0 to `costs.len() − 1` would take, in bits, but for the sign. There are fewer than an escape needs.
+#[inline(always)]
+fn bits(model: &Model, c: &Circumstances, costs: &mut [f32]) {
+    let unit = model.prepare(c);
+    let mut sum = 0.0;
+    for (magnitude, cost) in costs.iter_mut().enumerate() {
+        let one = model.predict(c, unit, magnitude.min(BINS - 1)).one as f32 / ONE as f32;
+        *cost = sum - (1.0 - one).log2();
+        sum -= one.log2();
+    }
+}
+
+impl Source for Choosing {
+    #[inline(always)]
+    fn coefficient(
+        &mut self,
+        model: &mut Model,
+        c: &Circumstances,
+        wanted: i32,
+        quantiser: Quantiser,
+    ) -> i32 {
+        let Quantiser { scale, unit } = quantiser;
+        let exact = unit == 1;
+        let steps = wanted.unsigned_abs() as f32 * scale.forward as f32 / (4096.0 * unit as f32);
+        let chosen = if exact {
+            wanted.abs()
+        } else {
+            self.choose(model, c, steps)
+        };
+        model.code(
+            &mut self.coder,
+            c,
+            if wanted < 0 { -chosen } else { chosen },
+        )
+    }
+}
+
+/// The weights of a filter pass that bring values nearest to the truth, by least squares.
+pub(super) fn fit_pass(
+    isa: Isa,
+    values: &[Ycc],
+    map: &KernelMap,
+    steps: Steps,
+    truth: &[Ycc],
+) -> [[i8; TERMS]; 3] {
+    let blocks: Vec<usize> = (0..values.len()).step_by(FIT_BLOCK).collect();
+    let sums: Vec<_> = blocks
+        .into_par_iter()
+        .map(|first| {
+            isa.run(Fit {
+                first,
+                values,
+                map,
+                steps,
+                truth,
+            })
+        })
+        .collect();
+    let mut total = Normal::default();
+    for sum in sums {
+        for t in 0..3 {
+            for i in 0..TERMS {
+                total[t].1[i] += sum[t].1[i];
+                (0..TERMS).for_each(|j| total[t].0[i][j] += sum[t].0[i][j]);
+            }
+        }
+    }
+    total.map(|(a, b)| solve(a, b))
+}
+
+const FIT_BLOCK: usize = 16_384;
+
+/// Normal equations of each channel.
+type Normal = [([[f64; TERMS]; TERMS], [f64; TERMS]); 3];
+
+/// Adds up the normal equations of a block of voxels.
+struct Fit<'a> {
+    first: usize,
+    values: &'a [Ycc],
+    map: &'a KernelMap,
+    steps: Steps,
+    truth: &'a [Ycc],
+}
+
+impl Work for Fit<'_> {
+    type Output = Normal;
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) -> Normal {
+        let Fit {
+            first,
+            values,
+            map,
+            steps,
+            truth,
+        } = self;
+        let responses = Responses::new(steps);
+        let mut sums = Normal::default();
+        for voxel in first..values.len().min(first + FIT_BLOCK) {
+            let terms = responses.terms(values, map, voxel);
+            for t in 0..3 {
+                let missing = f64::from(truth[voxel][t]) - f64::from(values[voxel][t]);
+                let x = terms[t].map(|x| f64::from(x) / 4.0);
+                let (a, b) = &mut sums[t];
+                for i in 0..TERMS {
+                    b[i] += x[i] * missing;
+                    for j in 0..TERMS {
+                        a[i][j] += x[i] * x[j];
+                    }
+                }
+            }
+        }
+        sums
+    }
+}

@@ -1,0 +1,282 @@
+//! The transform of a node's children: up to seven two-point butterflies, as in RAHT.
+//!
+//! Children are joined along z, then y, then x. Two values a and b that stand for `v` and `w` children become their difference `b − a` and their
+//! mean `a + ⌊(b − a)·w / (v + w)⌋`; a value without a partner passes through. In the end the mean of all is left in place 0, and each join
+//! has left a difference in its *slot*: 0 along x, 1 and 2 along y, 3 to 6 along z. Means are integers of the same scale, so the
+//! transform is undone exactly (de Queiroz and Chou, doi 10.1109/TIP.2016.2575005; without their normalisation, which is in [`SCALE`]).
+
+/// A join: its slot, and the places of its two values.
+type Join = (usize, usize, usize);
+
+/// All joins in the order of the transform.
+const JOINS: [Join; 7] = [
+    (3, 0, 4),
+    (4, 1, 5),
+    (5, 2, 6),
+    (6, 3, 7),
+    (1, 0, 2),
+    (2, 1, 3),
+    (0, 0, 1),
+];
+
+/// Of every slot, along which axis it joins: 2 for z, 1 for y, 0 for x.
+pub(super) const AXIS: [usize; 7] = [0, 1, 1, 2, 2, 2, 2];
+
+/// The joins of a node whose children are known, in the order in which coefficients are coded: the last join of the transform first.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Joins {
+    pub count: usize,
+    slots: [u8; 7],
+    /// Of each slot, how many children its two values stand for.
+    weights: [[u8; 2]; 7],
+}
+
+impl Joins {
+    const NONE: Joins = Joins {
+        count: 0,
+        slots: [0; 7],
+        weights: [[0; 2]; 7],
+    };
+
+    #[inline(always)]
+    pub fn slots(&self) -> impl Iterator<Item = usize> + '_ {
+        self.slots[..self.count]
+            .iter()
+            .map(|&slot| usize::from(slot))
+    }
+
+    /// How many children the two values of a slot stand for.
+    #[inline(always)]
+    pub fn weights(&self, slot: usize) -> [usize; 2] {
+        self.weights[slot].map(usize::from)
+    }
+}
+
+/// The joins of every occupancy.
+pub(super) static JOINS_OF: [Joins; 256] = {
+    let mut all = [Joins::NONE; 256];
+    let mut mask = 0;
+    while mask < 256 {
+        let mut weights = [0u8; 8];
+        let mut place = 0;
+        while place < 8 {
+            weights[place] = (mask >> place & 1) as u8;
+            place += 1;
+        }
+        let mut joins = Joins::NONE;
+        let mut slots = [0u8; 7];
+        let mut i = 0;
+        while i < 7 {
+            let (slot, a, b) = JOINS[i];
+            if weights[a] > 0 && weights[b] > 0 {
+                joins.weights[slot] = [weights[a], weights[b]];
+                slots[joins.count] = slot as u8;
+                joins.count += 1;
+            }
+            weights[a] += weights[b];
+            i += 1;
+        }
+        let mut i = 0;
+        while i < joins.count {
+            joins.slots[i] = slots[joins.count - 1 - i];
+            i += 1;
+        }
+        all[mask] = joins;
+        mask += 1;
+    }
+    all
+};
+
+/// The place of the two values of each slot.
+#[cfg(test)]
+const PLACES: [[usize; 2]; 7] = {
+    let mut places = [[0; 2]; 7];
+    let mut i = 0;
+    while i < 7 {
+        let (slot, a, b) = JOINS[i];
+        places[slot] = [a, b];
+        i += 1;
+    }
+    places
+};
+
+/// Transforms the values of the children in `mask`, place by octant: the mean, and the difference of each slot.
+#[inline(always)]
+pub(super) fn forward(mask: u8, mut values: [[i32; 3]; 8]) -> ([i32; 3], [[i32; 3]; 7]) {
+    let mut differences = [[0; 3]; 7];
+    let mut there = mask;
+    for (slot, a, b) in JOINS {
+        match (there >> a & 1, there >> b & 1) {
+            (1, 1) => {
+                let [v, w] = JOINS_OF[usize::from(mask)].weights(slot).map(|w| w as i32);
+                for k in 0..3 {
+                    let difference = values[b][k] - values[a][k];
+                    differences[slot][k] = difference;
+                    values[a][k] += share(difference, v, w);
+                }
+            }
+            (0, 1) => values[a] = values[b],
+            _ => (),
+        }
+        there |= (there >> b & 1) << a;
+    }
+    (values[0], differences)
+}
+
+/// Undoes [`forward`].
+#[inline(always)]
+pub(super) fn inverse(mask: u8, mean: [i32; 3], differences: &[[i32; 3]; 7]) -> [[i32; 3]; 8] {
+    let mut values = [[0; 3]; 8];
+    values[0] = mean;
+    let joins = &JOINS_OF[usize::from(mask)];
+    for (slot, a, b) in JOINS.into_iter().rev() {
+        let [v, w] = joins.weights(slot).map(|w| w as i32);
+        if v > 0 {
+            for k in 0..3 {
+                values[a][k] -= share(differences[slot][k], v, w);
+                values[b][k] = values[a][k] + differences[slot][k];
+            }
+        } else if mask & REACH[b] != 0 {
+            values[b] = values[a];
+        }
+    }
+    values
+}
+
+/// Of every place that is the second of joins, the children that its value can stand for when its last join comes.
+const REACH: [u8; 8] = [
+    0xff,
+    0b1010_1010,
+    0b0100_0100,
+    0b1000_1000,
+    1 << 4,
+    1 << 5,
+    1 << 6,
+    1 << 7,
+];
+
+/// By how much the mean lies above the first of two values.
+#[inline(always)]
+fn share(difference: i32, v: i32, w: i32) -> i32 {
+    // A division by a constant is a multiplication; sums are at most 8.
+    let product = difference * w;
+    match v + w {
+        2 => product >> 1,
+        3 => product.div_euclid(3),
+        4 => product >> 2,
+        5 => product.div_euclid(5),
+        6 => product.div_euclid(6),
+        7 => product.div_euclid(7),
+        _ => product >> 3,
+    }
+}
+
+/// What makes differences orthonormal, `√(vw / (v + w))`, and its inverse, in units of 2⁻¹², of weights up to 4.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Scale {
+    pub forward: i32,
+    pub inverse: i32,
+}
+
+/// [`Scale`] by the weights of both values.
+pub(super) static SCALE: [[Scale; 5]; 5] = {
+    let mut table = [[Scale {
+        forward: 1 << 12,
+        inverse: 1 << 12,
+    }; 5]; 5];
+    let mut v = 1;
+    while v < 5 {
+        let mut w = 1;
+        while w < 5 {
+            let (product, sum) = (v as u64 * w as u64, v as u64 + w as u64);
+            table[v][w] = Scale {
+                forward: nearest_root(product, sum) as i32,
+                inverse: nearest_root(sum, product) as i32,
+            };
+            w += 1;
+        }
+        v += 1;
+    }
+    table
+};
+
+/// `round(2¹²·√(numerator / denominator))`.
+const fn nearest_root(numerator: u64, denominator: u64) -> u64 {
+    // (2·root ± 1)² is compared, so that halves round as they should.
+    let square = (numerator << 26) / denominator;
+    let twice = square.isqrt();
+    twice.div_ceil(2)
+}
+
+/// [`SCALE`] of lossless colours, whose differences are coded as they are.
+pub(super) const UNSCALED: Scale = Scale {
+    forward: 1 << 12,
+    inverse: 1 << 12,
+};
+
+/// The place of the first value of each slot, and of the second.
+#[cfg(test)]
+pub(super) const fn places(slot: usize) -> [usize; 2] {
+    PLACES[slot]
+}
+
+#[allow(clippy::needless_range_loop)] // tables are indexed as their definitions are
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn the_inverse_undoes_the_transform(mask in 1u8..=255, values in prop::array::uniform8(prop::array::uniform3(-16384i32..16384))) {
+            let (mean, differences) = forward(mask, values);
+            let back = inverse(mask, mean, &differences);
+            for octant in 0..8 {
+                if mask >> octant & 1 == 1 {
+                    prop_assert_eq!(back[octant], values[octant]);
+                }
+            }
+        }
+
+        #[test]
+        fn the_mean_is_that_of_the_children_within_a_unit_a_join(mask in 1u8..=255, values in prop::array::uniform8(prop::array::uniform3(-16384i32..16384))) {
+            let (mean, _) = forward(mask, values);
+            let children: Vec<_> = (0..8).filter(|o| mask >> o & 1 == 1).collect();
+            for k in 0..3 {
+                let sum: i32 = children.iter().map(|&o| values[o][k]).sum();
+                let exact = f64::from(sum) / children.len() as f64;
+                prop_assert!((f64::from(mean[k]) - exact).abs() < 3.0);
+            }
+        }
+    }
+
+    #[test]
+    fn a_node_has_one_coefficient_fewer_than_children() {
+        for mask in 1..=255u8 {
+            let joins = &JOINS_OF[usize::from(mask)];
+            assert_eq!(joins.count, mask.count_ones() as usize - 1);
+            for slot in joins.slots() {
+                let [a, b] = places(slot);
+                assert!(a < b && joins.weights(slot).iter().all(|w| (1..=4).contains(w)));
+            }
+        }
+    }
+
+    #[test]
+    fn the_scale_makes_a_rotation() {
+        for v in 1..5 {
+            for w in 1..5 {
+                let Scale { forward, inverse } = SCALE[v][w];
+                let exact = (v as f64 * w as f64 / (v + w) as f64).sqrt();
+                assert!(
+                    (f64::from(forward) / 4096.0 - exact).abs() < 1.3e-4,
+                    "{v} {w}"
+                );
+                assert!(
+                    (f64::from(inverse) / 4096.0 - 1.0 / exact).abs() < 1.3e-4,
+                    "{v} {w}"
+                );
+            }
+        }
+    }
+}

@@ -1,0 +1,390 @@
+//! Streams of version 3: colours as transform coefficients.
+
+mod within;
+
+use std::ops::RangeInclusive;
+
+use b2p_kernels::Isa;
+use rayon::prelude::*;
+
+use super::{Encoded, rates};
+use crate::bitstream::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
+use crate::cloud::ColouredVoxels;
+use crate::colour::{self, Filter, Steps, Truth};
+use crate::decoder::{StreamDecoder, colour_hash};
+use crate::error::{Error, Result};
+use crate::geometry::{KernelMap, Octree, Voxels, codec};
+use crate::limits::Limits;
+use crate::log::Log;
+pub use within::encode_within;
+
+/// How exactly colours are coded.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Fineness {
+    /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000.
+    Step(f32),
+    /// The mean colours of the finest level's voxels, each channel rounded to a whole 255th.
+    Lossless,
+}
+
+/// What may be chosen about a stream of version 3; [`encode_within`] chooses how exactly colours are coded, and may leave out the finest levels.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// The levels that a stream may be cut after, the last one at most the bit depth N. Default: N−3 to N−1.
+    pub levels: Option<RangeInclusive<u8>>,
+    /// How exactly colours are coded.
+    pub fineness: Fineness,
+    /// Whether levels have a filter that the decoder runs on their colours.
+    pub filter: bool,
+    /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
+    pub slice_voxels: u32,
+    /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`].
+    pub colour_slice: u32,
+    /// The instructions to use; any give the same stream. Default: the best of this machine.
+    pub isa: Option<Isa>,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Options {
+            levels: None,
+            fineness: Fineness::Step(20.0),
+            filter: true,
+            slice_voxels: MAX_SLICE_VOXELS,
+            colour_slice: MAX_COLOUR_SLICE / 2,
+            isa: None,
+        }
+    }
+}
+
+/// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green and blue comes of both.
+const CHROMA: u8 = 8;
+/// Filters of levels that are not the finest may take one part in so many of a stream that ends there.
+const FILTER_SHARE: usize = 100;
+
+/// Codes a cloud, then decodes the stream and compares before giving it out.
+///
+/// # Errors
+/// [`Error::Usage`] for levels that the cloud does not have and steps that the format does not have, [`Error::Malformed`] for slices that the
+/// format does not have; and, if encoder and decoder disagreed on this machine, whatever the decoder found.
+pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &mut Log) -> Result<Encoded> {
+    let steps = options.fineness.steps()?;
+    let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
+    let subject = Subject::new(cloud, levels, options, log)?;
+    let top = *subject.levels.end();
+    let coded = subject.code(top, steps, log)?;
+    subject.checked(coded, log)
+}
+
+impl Fineness {
+    /// The steps of the finest level.
+    fn steps(self) -> Result<Steps> {
+        let step = match self {
+            Fineness::Lossless => return Ok(Steps::LOSSLESS),
+            Fineness::Step(step) => step,
+        };
+        if !(0.5..=1000.0).contains(&step) {
+            let what = "the quantisation step of luma is 0.5 to 1000 255ths";
+            return Err(Error::Usage(format!("{what}, not {step}")));
+        }
+        let nearest = |a: &u8, b: &u8| {
+            let off = |luma: u8| (steps_of(luma).luma_step() / step).ln().abs();
+            off(*a).total_cmp(&off(*b))
+        };
+        let luma = (0..=Steps::MAX).min_by(nearest).unwrap_or(Steps::MAX);
+        Ok(steps_of(luma))
+    }
+}
+
+/// The steps that go with an index of luma's.
+fn steps_of(luma: u8) -> Steps {
+    Steps {
+        luma,
+        chroma: (luma + CHROMA).min(Steps::MAX - 2),
+    }
+}
+
+/// The levels to code, for a cloud of bit depth `bits`.
+fn choose_levels(bits: u8, wanted: Option<RangeInclusive<u8>>) -> Result<RangeInclusive<u8>> {
+    let levels = wanted.unwrap_or(bits.saturating_sub(3)..=bits.saturating_sub(1));
+    let (first, last) = (*levels.start(), *levels.end());
+    if first > last || last > bits {
+        return Err(Error::Usage(format!(
+            "levels {first}..{last} cannot be coded: a cloud of {bits} bits has levels up to {bits}"
+        )));
+    }
+    Ok(levels)
+}
+
+/// A cloud and what all its streams share, however exactly colours are coded.
+struct Subject<'a> {
+    cloud: &'a ColouredVoxels,
+    options: &'a Options,
+    isa: Isa,
+    levels: RangeInclusive<u8>,
+    octree: Octree,
+    /// The 3³ kernel maps of the levels from 0 on.
+    maps: Vec<KernelMap>,
+    /// The code of the levels from 1 on: of each slice the children, and its bytes.
+    geometry: Vec<Vec<(u32, Vec<u8>)>>,
+    grey: bool,
+}
+
+/// A stream that has not been checked yet.
+struct Coded {
+    bytes: Vec<u8>,
+    top: u8,
+    /// The colours of the finest level, filtered.
+    colours: Vec<[u8; 3]>,
+}
+
+/// The colours of a level in a stream.
+struct Layer {
+    level: u8,
+    hash: u64,
+    filter: Option<Vec<u8>>,
+    slices: Vec<(u32, Vec<u8>)>,
+}
+
+impl<'a> Subject<'a> {
+    fn new(
+        cloud: &'a ColouredVoxels,
+        levels: RangeInclusive<u8>,
+        options: &'a Options,
+        log: &mut Log,
+    ) -> Result<Self> {
+        let (isa, top) = (options.isa.unwrap_or_else(Isa::detect), *levels.end());
+        let subject = Subject {
+            cloud,
+            options,
+            isa,
+            levels,
+            octree: Octree::root(),
+            maps: Vec::new(),
+            geometry: Vec::new(),
+            grey: cloud.colours.par_iter().all(|[r, g, b]| r == g && g == b),
+        };
+        // What the format forbids is refused before anything is computed, as if of one voxel.
+        Writer::new(Header {
+            points: 1,
+            ..subject.header(top, |_| 1)
+        })?;
+        let shift = 3 * (cloud.voxels.depth() - top);
+        let mut keys: Vec<u64> = cloud.voxels.keys().iter().map(|key| key >> shift).collect();
+        keys.dedup();
+        let count = keys.len();
+        let octree = log.step("octree", count, "voxels", || {
+            Octree::new(Voxels::from_sorted(top, keys))
+        })?;
+        let maps = log.step("kernel maps", count, "voxels", || {
+            Ok(super::kernel_maps(&octree, 0))
+        })?;
+        let slice = options.slice_voxels as usize;
+        let geometry = log.step("geometry", count, "voxels", || {
+            let code = |level: u8| {
+                let map = &maps[usize::from(level) - 1];
+                codec::encode_level(isa, &octree, map, level, slice)
+            };
+            Ok((1..=top).into_par_iter().map(code).collect())
+        })?;
+        Ok(Subject {
+            octree,
+            maps,
+            geometry,
+            ..subject
+        })
+    }
+
+    /// The header of a stream whose last level is `top`.
+    fn header(&self, top: u8, voxels: impl Fn(u8) -> usize) -> Header {
+        let levels = *self.levels.start().min(&top)..=top;
+        Header {
+            optional_flags: 0,
+            bits: self.cloud.voxels.depth(),
+            base: *levels.start(),
+            top,
+            points: self.cloud.voxels.len() as u64,
+            placement: self.cloud.placement,
+            format: Format::Transform {
+                colour_slice: self.options.colour_slice,
+            },
+            slice_voxels: self.options.slice_voxels,
+            voxels: levels.map(|level| voxels(level) as u32).collect(),
+            sections: Vec::new(),
+        }
+    }
+
+    /// The colours that a stream whose last level is `top` approaches.
+    fn truth(&self, top: u8, lossless: bool) -> Truth {
+        let ColouredVoxels {
+            voxels, colours, ..
+        } = self.cloud;
+        Truth::new(voxels, colours, &self.octree, top, lossless)
+    }
+
+    /// How levels are coded, if the last one, `top`, has these steps: the coarser a level, the smaller are its steps, for what it brings is seen
+    /// at all levels that follow.
+    fn coding(&self, steps: Steps, top: u8, level: u8) -> colour::Options {
+        let mut steps = (level..top).fold(steps, |steps, _| steps.above());
+        if self.grey && !steps.is_lossless() {
+            steps.chroma = Steps::ABSENT;
+        }
+        colour::Options::new(steps)
+    }
+
+    /// Codes the colours of the levels down to `top`.
+    fn code(&self, top: u8, steps: Steps, log: &mut Log) -> Result<Coded> {
+        let truth = log.step("mean colours", self.cloud.voxels.len(), "voxels", || {
+            Ok(self.truth(top, steps.is_lossless()))
+        })?;
+        self.code_towards(&truth, top, steps, log)
+    }
+
+    /// The same, of colours that have been computed.
+    fn code_towards(&self, truth: &Truth, top: u8, steps: Steps, log: &mut Log) -> Result<Coded> {
+        let (octree, maps, isa) = (&self.octree, &self.maps, self.isa);
+        let slice = self.options.colour_slice as usize;
+        let header = self.header(top, |level| octree.level(level).len());
+        let base = header.base;
+        let mut writer = Writer::new(header)?;
+        let trunk = colour::trunk_depth(base, |level| octree.level(level).len());
+        let count = octree.level(trunk).len();
+        let name = format!("colours of levels 0 to {trunk}");
+        let (payload, mut coloured) = log.step(name, count, "voxels", || {
+            let maps = &maps[..=usize::from(trunk)];
+            let coding = self.coding(steps, top, trunk);
+            Ok(colour::encode_trunk(isa, octree, maps, truth, coding))
+        })?;
+        let mut layers = Vec::new();
+        let mut bytes = payload.len();
+        let mut colours = Vec::new();
+        for level in trunk..=top {
+            let count = octree.level(level).len();
+            let mut slices = Vec::new();
+            if level > trunk {
+                let [above, map] = [level - 1, level].map(|n| &maps[usize::from(n)]);
+                let coding = self.coding(steps, top, level);
+                let name = format!("colours of level {level}");
+                let (payloads, next) = log.step(name, count, "voxels", || {
+                    Ok(colour::encode_level(
+                        isa, octree, level, above, map, &coloured, truth, slice, coding,
+                    ))
+                })?;
+                coloured = next;
+                slices = counted(above.len(), slice, payloads);
+                bytes += slices.iter().map(|slice| slice.1.len()).sum::<usize>();
+            }
+            let mut filter = None;
+            if level >= base && self.options.filter {
+                let name = format!("filter of level {level}");
+                let most = match level == top {
+                    true => usize::MAX,
+                    false => (bytes + self.geometry_bytes(level)) / FILTER_SHARE,
+                };
+                filter = log.step(name, count, "voxels", || {
+                    let map = &maps[usize::from(level)];
+                    let filter = Filter::fit(isa, &coloured, map, truth.level(level));
+                    Ok(filter.filter(|filter| filter.to_bytes().len() <= most))
+                })?;
+            }
+            if level == top {
+                colours = match &filter {
+                    Some(filter) => filter.rgb(isa, &coloured, &maps[usize::from(level)]),
+                    None => coloured.rgb(),
+                };
+            }
+            layers.push(Layer {
+                level,
+                hash: colour_hash(&coloured),
+                filter: filter.map(|filter| filter.to_bytes()),
+                slices,
+            });
+        }
+        self.write(&mut writer, base, trunk, &payload, &layers)?;
+        let bytes = writer.finish()?;
+        Ok(Coded {
+            bytes,
+            top,
+            colours,
+        })
+    }
+
+    /// Bytes of the geometry of the levels 1 to `level`.
+    fn geometry_bytes(&self, level: u8) -> usize {
+        let levels = self.geometry[..usize::from(level)].iter().flatten();
+        levels.map(|(_, bytes)| bytes.len()).sum()
+    }
+
+    /// Writes the sections of all levels.
+    fn write(
+        &self,
+        writer: &mut Writer,
+        base: u8,
+        trunk: u8,
+        payload: &[u8],
+        layers: &[Layer],
+    ) -> Result<()> {
+        let slice = self.options.slice_voxels as usize;
+        let voxels = |level: usize| self.octree.level(level as u8).len();
+        // Levels of one slice each.
+        let small = (1..=usize::from(base)).take_while(|level| voxels(level - 1) <= slice);
+        let small = small.count();
+        let levels = self.geometry[..small].iter().flatten();
+        let levels: Vec<_> = levels.map(|(count, bytes)| (*count, bytes)).collect();
+        writer.geometry_trunk(&levels)?;
+        let rest = small + 1..=usize::from(base);
+        for level in rest {
+            writer.geometry(level as u8, &self.geometry[level - 1])?;
+        }
+        for layer in layers {
+            let level = layer.level;
+            if level > base {
+                writer.geometry(level, &self.geometry[usize::from(level) - 1])?;
+            }
+            if level == trunk {
+                let hash = layers[usize::from(base - trunk)].hash;
+                writer.colour_trunk(level, voxels(level.into()) as u32, hash, payload)?;
+            } else {
+                let hash = (level > base).then_some(layer.hash);
+                writer.colours(level, hash, &layer.slices)?;
+            }
+            if let Some(filter) = &layer.filter {
+                writer.post_filter(level, filter)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The stream, once it has been decoded to what was encoded.
+    fn checked(&self, coded: Coded, log: &mut Log) -> Result<Encoded> {
+        let Coded {
+            bytes,
+            top,
+            colours,
+        } = coded;
+        let voxels = self.octree.level(top);
+        let decoder = StreamDecoder::new()
+            .with_isa(self.isa)
+            .with_limits(Limits::unlimited());
+        let same = log.step("decode again", voxels.len(), "voxels", || {
+            let decoding = decoder.whole(&bytes, Some(top), &mut Log::default())?;
+            let points = decoding.points();
+            Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == colours))
+        })?;
+        if !same {
+            return Err(Error::Usage(
+                "the stream does not decode to what was encoded: this machine computes wrongly"
+                    .into(),
+            ));
+        }
+        let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);
+        Ok(Encoded { bytes, rates })
+    }
+}
+
+/// Payloads with the numbers of their parents.
+fn counted(parents: usize, slice: usize, payloads: Vec<Vec<u8>>) -> Vec<(u32, Vec<u8>)> {
+    let count = |i: usize| (parents - i * slice).min(slice) as u32;
+    let payloads = payloads.into_iter().enumerate();
+    payloads.map(|(i, bytes)| (count(i), bytes)).collect()
+}

@@ -1,0 +1,239 @@
+//! The best stream of at most so many bits.
+//!
+//! Streams of more and more bits are on one path, which a level and a quantisation step make: first the coarsest level in smaller and smaller
+//! steps, then the next level, and so on; at the end of the path are the exact colours of the finest level. A level is on the path from the greatest step that its
+//! geometry is worth.
+
+use super::{Coded, Fineness, Options, Subject, choose_levels, steps_of};
+use crate::cloud::ColouredVoxels;
+use crate::colour::{Steps, Truth};
+use crate::encoder::Encoded;
+use crate::error::{Error, Result};
+use crate::log::Log;
+
+/// The greatest index of luma's step with which a level is coded that the stream could do without: 64 255ths.
+const COARSEST: u8 = 56;
+
+/// The index that is tried first: a step of 11.
+const FIRST: u8 = 36;
+
+/// One place on the path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Place {
+    top: u8,
+    steps: Steps,
+}
+
+/// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and says with which options:
+/// [`encode`](super::encode) makes the same stream of them. `options` say what else is to be; of their levels, the finest may be left out.
+///
+/// # Errors
+/// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if the smallest stream has more, and those of
+/// [`encode`](super::encode).
+pub fn encode_within(
+    cloud: &ColouredVoxels,
+    options: &Options,
+    bits_per_point: f64,
+    log: &mut Log,
+) -> Result<(Encoded, Options)> {
+    if !(bits_per_point.is_finite() && bits_per_point > 0.0) {
+        return Err(Error::Usage(format!(
+            "{bits_per_point} bits per point cannot be kept to: more than 0, and finitely many, can"
+        )));
+    }
+    let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
+    let subject = Subject::new(cloud, levels.clone(), options, log)?;
+    let room = bits_per_point * cloud.voxels.len() as f64 / 8.0;
+    let mut search = Search {
+        subject: &subject,
+        room,
+        least: f64::INFINITY,
+        truth: None,
+        tries: 0,
+    };
+    let mut found = None;
+    for top in levels.clone().rev() {
+        // What does not fit without colours does not fit with them.
+        if subject.geometry_bytes(top) as f64 > room && top > *levels.start() {
+            continue;
+        }
+        found = search.level(top, top == *levels.start(), log)?;
+        if found.is_some() {
+            break;
+        }
+    }
+    let bits = |bytes: f64| bytes * 8.0 / cloud.voxels.len() as f64;
+    let (place, coded) = found.ok_or_else(|| Error::TooFewBits {
+        asked: bits_per_point,
+        least: bits(search.least),
+    })?;
+    let encoded = subject.checked(coded, log)?;
+    let chosen = Options {
+        levels: Some(*levels.start().min(&place.top)..=place.top),
+        fineness: match place.steps.is_lossless() {
+            true => Fineness::Lossless,
+            false => Fineness::Step(place.steps.luma_step()),
+        },
+        ..options.clone()
+    };
+    Ok((encoded, chosen))
+}
+
+/// What was found on the way.
+struct Search<'a> {
+    subject: &'a Subject<'a>,
+    /// Bytes that a stream may have.
+    room: f64,
+    /// Of the smallest stream so far.
+    least: f64,
+    /// The lossy colours of the level at hand.
+    truth: Option<(u8, Truth)>,
+    tries: usize,
+}
+
+impl Search<'_> {
+    /// The largest stream with the last level `top` that fits, if there is one; `only` tells that no coarser level could take its place.
+    fn level(&mut self, top: u8, only: bool, log: &mut Log) -> Result<Option<(Place, Coded)>> {
+        let last = if only { Steps::MAX } else { COARSEST };
+        let place = |luma: u8| Place {
+            top,
+            steps: steps_of(luma),
+        };
+        let fixed = self.subject.geometry_bytes(top) as f64;
+        // Bytes of the finest place that fits and of the coarsest that does not, beyond the geometry's.
+        let (mut fits, mut exceeds): (Option<Tried>, Option<Tried>) = (None, None);
+        let mut best = None;
+        let mut next = Some(FIRST);
+        while let Some(luma) = next {
+            let (size, found) = self.attempt_sized(place(luma), log)?;
+            let tried = Some(Tried {
+                luma,
+                bytes: (size - fixed).max(1.0),
+            });
+            match found {
+                Some(found) => (fits, best) = (tried, Some(found)),
+                None => exceeds = tried,
+            }
+            next = between(fits, exceeds, self.room - fixed, last);
+        }
+        let Some(mut best) = best else {
+            return Ok(None);
+        };
+        if best.0.steps.luma == 0 {
+            let exact = Place {
+                top,
+                steps: Steps::LOSSLESS,
+            };
+            if let Some(found) = self.attempt(exact, log)? {
+                best = found;
+            }
+        }
+        Ok(Some(best))
+    }
+
+    fn attempt(&mut self, place: Place, log: &mut Log) -> Result<Option<(Place, Coded)>> {
+        Ok(self.attempt_sized(place, log)?.1)
+    }
+
+    /// Codes at a place: the bytes, and the stream if it fits.
+    fn attempt_sized(
+        &mut self,
+        place: Place,
+        log: &mut Log,
+    ) -> Result<(f64, Option<(Place, Coded)>)> {
+        self.tries += 1;
+        let Place { top, steps } = place;
+        let how = match steps.is_lossless() {
+            true => "exact colours".into(),
+            false => format!("step {:.2}", steps.luma_step()),
+        };
+        let name = format!("try {}: level {top}, {how}", self.tries);
+        let points = self.subject.cloud.voxels.len();
+        let coded = log.step(name, points, "points", || {
+            let log = &mut Log::default();
+            if steps.is_lossless() {
+                return self.subject.code(top, steps, log);
+            }
+            if self.truth.as_ref().is_none_or(|(of, _)| *of != top) {
+                self.truth = Some((top, self.subject.truth(top, false)));
+            }
+            match &self.truth {
+                Some((_, truth)) => self.subject.code_towards(truth, top, steps, log),
+                None => self.subject.code(top, steps, log),
+            }
+        })?;
+        let size = coded.bytes.len() as f64;
+        self.least = self.least.min(size);
+        Ok((size, (size <= self.room).then_some((place, coded))))
+    }
+}
+
+/// A place that was tried.
+#[derive(Debug, Clone, Copy)]
+struct Tried {
+    luma: u8,
+    bytes: f64,
+}
+
+/// The place to try next, from the one that fits and the one that does not, near where the room ends: bytes are about a power of the step.
+/// `None` if nothing is between them.
+fn between(fits: Option<Tried>, exceeds: Option<Tried>, room: f64, last: u8) -> Option<u8> {
+    /// How much the logarithm of the bytes falls from one index to the next, more or less.
+    const SLOPE: f64 = 0.075;
+    let low = exceeds.map_or(0, |tried| tried.luma + 1);
+    let high = match fits {
+        Some(tried) => tried.luma.checked_sub(1)?,
+        None => last,
+    };
+    if low > high {
+        return None;
+    }
+    let known = fits.or(exceeds)?;
+    let slope = match (fits, exceeds) {
+        (Some(a), Some(b)) => {
+            (b.bytes / a.bytes).ln() / (f64::from(a.luma) - f64::from(b.luma)).max(1.0)
+        }
+        _ => SLOPE,
+    };
+    let off = (known.bytes / room.max(1.0)).ln() / slope.max(0.01);
+    // A little to the side that fits, so that both sides close in.
+    let guess = f64::from(known.luma) + off + 0.3;
+    Some(guess.round().clamp(f64::from(low), f64::from(high)) as u8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The place that is found where so many bytes are taken, and how many tries it took.
+    fn search(bytes: impl Fn(u8) -> f64, room: f64) -> (Option<u8>, usize) {
+        let (mut fits, mut exceeds, mut tries) = (None, None, 0);
+        let mut next = Some(FIRST);
+        while let Some(luma) = next {
+            tries += 1;
+            let tried = Some(Tried {
+                luma,
+                bytes: bytes(luma),
+            });
+            match bytes(luma) <= room {
+                true => fits = tried,
+                false => exceeds = tried,
+            }
+            next = between(fits, exceeds, room, COARSEST);
+        }
+        (fits.map(|tried: Tried| tried.luma), tries)
+    }
+
+    #[test]
+    fn the_finest_step_that_fits_is_found_in_a_few_tries() {
+        for (slope, more) in [(0.03, 0.0), (0.075, 300.0), (0.2, 0.0)] {
+            let bytes = |luma: u8| 1e6 * (-slope * f64::from(luma)).exp() + more;
+            for luma in 0..=COARSEST {
+                let (found, tries) = search(bytes, bytes(luma) + 0.1);
+                assert_eq!(found, Some(luma));
+                assert!(tries <= 12, "{tries} tries for {luma} at {slope}");
+            }
+            assert_eq!(search(bytes, bytes(COARSEST) - 1.0).0, None);
+        }
+    }
+}

@@ -1,0 +1,188 @@
+//! Learned heads: Gaussians of any octree level from its occupancy and its decoded colours.
+//!
+//! Nothing that is decoded depends on them, so any heads draw any stream, and the same weights serve every level: all lengths count in voxels
+//! of the level. There are up to four networks: [`Heads::Best`] and [`Heads::Quick`], each for one Gaussian a voxel and for eight.
+//!
+//! # The network
+//! It reads level ℓ − 1 ("parent") and level ℓ ("child"). Of a colour with R, G, B in 0..=255, y = (R + 2G + B) / 512 − 1,
+//! co = (R − B) / 128, cg = (G − (R + B) / 2) / 128; s = log2(step) / 4, `step` being the quantisation step of level ℓ's luma.
+//! - A parent's 12 channels: 8 occupancy bits (octant x + 2y + 4z), y, co, cg, s.
+//! - A child's 7 channels: four times the difference of its y, co, cg from the parent's; its y, co, cg; s.
+//!
+//! ```text
+//! h = relu(conv3(parent));  P times: h = relu(h + conv3(relu(conv3(h))))
+//! x = relu(conv3(child) + up[octant](h[parent]));  B times: x = relu(x + conv3(relu(conv3(x))))
+//! raw = conv3(x)
+//! ```
+//! `conv3` is a plain submanifold convolution with bias, `up` has one matrix per octant and no bias. Of a Gaussian's 14 raw numbers see
+//! [`activate`](self::activate).
+//!
+//! # The model file
+//! Safetensors, all tensors f16: `SET.parent.in.weight` [27, 12, C] and `.bias` [C], `SET.parent.I.a`, `SET.parent.I.b`, `SET.up.weight`
+//! [8, C, C], `SET.child.in`, `SET.child.I.a`, `SET.child.I.b`, `SET.out` [27, C, 14·K], `SET` being `best.1`, `best.8`, `quick.1` or
+//! `quick.8`. The metadata's `b2p-heads` is JSON: `version` 1, `blur` (see [`Gaussians::blur`]; in squares of half the unit), and `sets`, for
+//! each `channels`, `parent_blocks`, `child_blocks`, `gaussians`, and `ranges`: how large the outputs of each layer but the last get.
+//!
+//! # Precision
+//! In [`Precision::Int16`], the default, activations are integers in ±2047 in steps that follow from `ranges`, weights likewise; every sum fits
+//! 32 bits by construction, and the Gaussians are the same bits on every machine. [`Precision::F16`] stores f16 and sums in f32.
+
+mod activate;
+mod inputs;
+mod load;
+mod network;
+#[cfg(test)]
+mod tests;
+
+use std::path::Path;
+
+use b2p_kernels::{Isa, map_file};
+
+use super::{Frame, Gaussians};
+use crate::error::{Error, Result};
+use crate::geometry::{KernelMap, Octree};
+use crate::network::{Heads, Precision, missing};
+use network::Generator;
+
+/// Raw numbers per Gaussian.
+const RAW: usize = 14;
+
+/// One of a model's networks: which quality, and how many Gaussians a voxel, 1 or 8.
+pub type Set = (Heads, usize);
+
+/// Heads, ready to run.
+pub struct HeadsModel {
+    /// In squares of half a voxel.
+    blur: f32,
+    generators: Vec<(Set, Generator)>,
+}
+
+/// What heads read of a level.
+#[derive(Debug, Clone, Copy)]
+pub struct LevelInput<'a> {
+    /// The octree, down to `level` or deeper.
+    pub octree: &'a Octree,
+    /// The level to draw.
+    pub level: u8,
+    /// Its 3³ kernel map.
+    pub map: &'a KernelMap,
+    /// The 3³ kernel map of the level above.
+    pub above: &'a KernelMap,
+    /// Its voxels' decoded sRGB colours.
+    pub colours: &'a [[u8; 3]],
+    /// Those of the level above.
+    pub colours_above: &'a [[u8; 3]],
+    /// The quantisation step of the level's luma (R + 2G + B) / 4, in its units: 1 for lossless, at most 2¹⁶. What is beyond is taken as the
+    /// nearest of both.
+    pub luma_step: f32,
+}
+
+impl std::fmt::Debug for HeadsModel {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let sets: Vec<Set> = self.sets().collect();
+        f.debug_struct("HeadsModel")
+            .field("sets", &sets)
+            .finish_non_exhaustive()
+    }
+}
+
+impl HeadsModel {
+    /// Loads a model file.
+    ///
+    /// # Errors
+    /// [`Error::Io`], or as [`HeadsModel::from_bytes`].
+    pub fn open(path: &Path) -> Result<Self> {
+        let bytes = map_file(path).map_err(|source| Error::Io {
+            path: path.to_owned(),
+            source,
+        })?;
+        HeadsModel::from_bytes(&bytes)
+    }
+
+    /// Loads a model file's content. Memory is bounded by its length.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`], naming field or tensor, if anything is missing, of another type or shape, not finite, or out of range;
+    /// [`Error::Unsupported`] for another version.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
+        load::model(bytes)
+    }
+
+    /// The networks that it has.
+    pub fn sets(&self) -> impl Iterator<Item = Set> + '_ {
+        self.generators.iter().map(|(set, _)| *set)
+    }
+
+    /// Bytes that drawing a level of so many voxels with so many above it takes at most, its Gaussians included; none for a set that the
+    /// model does not have.
+    pub fn bytes(&self, set: Set, voxels: u64, above: u64) -> u64 {
+        match self.find(set) {
+            Some(generator) => network::bytes(generator.shape(), voxels, above),
+            None => 0,
+        }
+    }
+
+    /// The Gaussians of a level: those of its first voxel first, one each or eight, of which those with an opacity below 1/255 are left out.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] for level 0, which has none above it, for a set that the model does not have, and for [`Precision::Half`]
+    /// where `isa` has no arithmetic in f16.
+    ///
+    /// # Panics
+    /// If the octree is not that deep, or the kernel maps or colours are not those of its levels in number.
+    pub fn generate(
+        &self,
+        isa: Isa,
+        precision: Precision,
+        set: Set,
+        input: LevelInput<'_>,
+        frame: Frame,
+    ) -> Result<Gaussians> {
+        let Some(generator) = self.find(set) else {
+            let sets = self.sets().map(|(heads, k)| format!("{heads}.{k}"));
+            let sets = sets.collect::<Vec<_>>().join(", ");
+            let detail = format!("the model has {sets}, not {}.{}", set.0, set.1);
+            return Err(missing("drawing with these heads", detail));
+        };
+        if input.level == 0 {
+            let detail = "heads read the level above, level 0 has none".into();
+            return Err(missing("drawing level 0 with learned heads", detail));
+        }
+        if precision == Precision::Half && !isa.has_half() {
+            let detail = format!("{isa} has no arithmetic in f16, take f16 or int16");
+            return Err(missing("generating Gaussians in half", detail));
+        }
+        input.check();
+        Ok(generator.generate(isa, precision, &input, self.blur, frame))
+    }
+
+    fn find(&self, set: Set) -> Option<&Generator> {
+        let mut generators = self.generators.iter();
+        generators
+            .find(|(of, _)| *of == set)
+            .map(|(_, generator)| generator)
+    }
+}
+
+impl LevelInput<'_> {
+    fn check(&self) {
+        let (voxels, above) = (
+            self.octree.level(self.level).len(),
+            self.octree.level(self.level - 1).len(),
+        );
+        assert!(
+            self.map.volume() == 27 && self.above.volume() == 27,
+            "heads need 3³ maps"
+        );
+        assert_eq!(
+            [self.map.len(), self.colours.len()],
+            [voxels; 2],
+            "kernel map and colours of the level"
+        );
+        assert_eq!(
+            [self.above.len(), self.colours_above.len()],
+            [above; 2],
+            "kernel map and colours of the level above"
+        );
+    }
+}

@@ -1,0 +1,173 @@
+//! Running the network, in integers or in floats.
+
+use std::sync::OnceLock;
+
+use b2p_kernels::{ExactConv, FloatConv, Isa, Precision as Sums, Taps, zeros};
+
+use super::activate::{Drawing, PART};
+use super::inputs::{CHILD_STEP, Channels, PARENT_STEP};
+use super::load::{INPUTS, Shape};
+use super::{LevelInput, RAW};
+use crate::gaussians::{Frame, Gaussians};
+use crate::network::{
+    Conv, Pool, Precision, ResBlock, Stored, apply, apply_added, apply_part, reals,
+};
+
+/// The layers.
+pub struct Net<L> {
+    pub parent_in: L,
+    pub parent: Vec<ResBlock<L>>,
+    pub up: L,
+    pub child_in: L,
+    pub child: Vec<ResBlock<L>>,
+    pub out: L,
+}
+
+/// The real values of one integer step: of each side's sums, and of the inside of each of its blocks.
+pub struct Steps {
+    pub parent: (f32, Vec<f32>),
+    pub child: (f32, Vec<f32>),
+}
+
+impl<L> Net<L> {
+    /// The same network of other layers; `make` is told the steps of a layer's input and output. The last layer's output is real.
+    fn with_steps<M>(&self, steps: &Steps, make: impl Fn(&L, f32, f32) -> M) -> Net<M> {
+        let blocks = |blocks: &[ResBlock<L>], (sum, inner): &(f32, Vec<f32>)| {
+            let blocks = blocks.iter().zip(inner);
+            let block = blocks.map(|(block, &inner)| ResBlock {
+                c1: make(&block.c1, *sum, inner),
+                c2: make(&block.c2, inner, *sum),
+                relu: block.relu,
+            });
+            block.collect()
+        };
+        let (parent, child) = (steps.parent.0, steps.child.0);
+        Net {
+            parent_in: make(&self.parent_in, PARENT_STEP, parent),
+            parent: blocks(&self.parent, &steps.parent),
+            up: make(&self.up, parent, child),
+            child_in: make(&self.child_in, CHILD_STEP, child),
+            child: blocks(&self.child, &steps.child),
+            out: make(&self.out, child, 1.0),
+        }
+    }
+}
+
+/// A network: its layers as stored, and ready to run in the precisions that were asked for.
+pub struct Generator {
+    shape: Shape,
+    steps: Steps,
+    stored: Net<Stored>,
+    integer: OnceLock<Net<ExactConv>>,
+    float: OnceLock<Net<FloatConv>>,
+    half: OnceLock<Net<FloatConv>>,
+}
+
+impl Generator {
+    pub fn new(shape: Shape, steps: Steps, stored: Net<Stored>) -> Self {
+        Generator {
+            shape,
+            steps,
+            stored,
+            integer: OnceLock::new(),
+            float: OnceLock::new(),
+            half: OnceLock::new(),
+        }
+    }
+
+    pub fn shape(&self) -> &Shape {
+        &self.shape
+    }
+
+    /// The Gaussians of a level; `blur` in squares of half the unit.
+    pub fn generate(
+        &self,
+        isa: Isa,
+        precision: Precision,
+        input: &LevelInput<'_>,
+        blur: f32,
+        frame: Frame,
+    ) -> Gaussians {
+        let drawing = Drawing::new(input, self.shape.gaussians, blur, frame);
+        let floats = |cell: &'_ OnceLock<Net<FloatConv>>, sums: Sums, drawing| {
+            let make = |layer: &Stored, _, _| layer.float().with_precision(sums);
+            let net = cell.get_or_init(|| self.stored.with_steps(&self.steps, make));
+            let channels = Channels::fine(input);
+            let real = |channels: &[i16]| reals(isa, channels, PARENT_STEP);
+            let (parent, child) = (real(&channels.parent), real(&channels.child));
+            run(isa, net, input, &channels, [&parent, &child], drawing)
+        };
+        match precision {
+            Precision::Int16 => {
+                let make = || self.stored.with_steps(&self.steps, Stored::integer);
+                let net = self.integer.get_or_init(make);
+                let channels = Channels::within_limit(input);
+                let rows = [&channels.parent[..], &channels.child];
+                run(isa, net, input, &channels, rows, drawing)
+            }
+            Precision::F16 => floats(&self.float, Sums::F32, drawing),
+            Precision::Half => floats(&self.half, Sums::Half, drawing),
+        }
+    }
+}
+
+/// Runs all layers on the parents' and the children's channels.
+fn run<C: Conv>(
+    isa: Isa,
+    net: &Net<C>,
+    input: &LevelInput<'_>,
+    channels: &Channels,
+    [parent, child]: [&[C::Value]; 2],
+    mut drawing: Drawing<'_>,
+) -> Gaussians {
+    let pool = &mut Pool::new();
+    let (above, map) = (input.above, input.map);
+    let mut h = apply(
+        pool,
+        isa,
+        &net.parent_in,
+        above.taps(),
+        parent,
+        above.len(),
+        true,
+    );
+    for block in &net.parent {
+        h = block.apply(pool, isa, above.taps(), h);
+    }
+    let descent = Taps::Octants {
+        parents: &channels.parents,
+        octants: &channels.octants,
+    };
+    let up = apply(pool, isa, &net.up, descent, &h, map.len(), false);
+    pool.give(h);
+    let mut x = apply_added(pool, isa, &net.child_in, map.taps(), child, &up);
+    pool.give(up);
+    for block in &net.child {
+        x = block.apply(pool, isa, map.taps(), x);
+    }
+    let mut raw = zeros(map.len().min(PART) * net.out.cout());
+    for first in (0..map.len()).step_by(PART) {
+        let rows = PART.min(map.len() - first);
+        let raw = &mut raw[..rows * net.out.cout()];
+        apply_part(isa, &net.out, map.taps(), &x, first, raw);
+        drawing.add(first, raw);
+    }
+    drawing.gaussians
+}
+
+/// Bytes that drawing takes at most, with its Gaussians.
+pub fn bytes(shape: &Shape, voxels: u64, above: u64) -> u64 {
+    let (c, k) = (shape.channels as u64, shape.gaussians as u64);
+    // Channels as integers and as f16, the octant and the parent of each voxel.
+    let [parent, child] = INPUTS.map(|channels| 4 * channels as u64);
+    let inputs = parent
+        .saturating_mul(above)
+        .saturating_add((child + 5).saturating_mul(voxels));
+    // A block's input, inner rows and output, of both sides.
+    let rows = voxels.saturating_add(above);
+    let activations = (3 * 2 * c).saturating_mul(rows);
+    let raw = (4 * RAW as u64 * k) * voxels.min(PART as u64);
+    let gaussians = (size_of::<[f32; 14]>() as u64 * k).saturating_mul(voxels);
+    let parts = [inputs, activations, raw, gaussians];
+    parts.into_iter().fold(0, u64::saturating_add)
+}

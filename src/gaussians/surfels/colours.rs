@@ -1,0 +1,51 @@
+//! How colours run along the surface.
+
+use super::discs::Disc;
+use crate::geometry::KernelMap;
+
+/// What is added to the sums of squares that a gradient is divided by: few neighbours tell less of it than noise does.
+const DAMPING: f32 = 0.3;
+
+/// The change of R, G and B per voxel along both axes of a disc's plane: least squares over the 26 neighbours that are there.
+pub fn gradient(
+    map: &KernelMap,
+    colours: &[[u8; 3]],
+    voxel: usize,
+    [u, v]: [[f32; 3]; 2],
+) -> [[f32; 3]; 2] {
+    let own = colours[voxel].map(f32::from);
+    let (mut uu, mut uv, mut vv) = (DAMPING, 0.0, DAMPING);
+    let (mut ru, mut rv) = ([0.0f32; 3], [0.0f32; 3]);
+    for (k, &q) in map.row(voxel).iter().enumerate() {
+        if q == KernelMap::ABSENT {
+            continue;
+        }
+        let offset = [k % 3, k / 3 % 3, k / 9].map(|step| step as f32 - 1.0);
+        let along =
+            |axis: [f32; 3]| offset[0] * axis[0] + offset[1] * axis[1] + offset[2] * axis[2];
+        let (a, b) = (along(u), along(v));
+        uu += a * a;
+        uv += a * b;
+        vv += b * b;
+        for channel in 0..3 {
+            let change = f32::from(colours[q as usize][channel]) - own[channel];
+            ru[channel] += a * change;
+            rv[channel] += b * change;
+        }
+    }
+    let determinant = uu * vv - uv * uv;
+    let solve = |a: f32, b: f32, c: f32, d: f32| (a * b - c * d) / determinant;
+    [
+        [0, 1, 2].map(|c| solve(vv, ru[c], uv, rv[c])),
+        [0, 1, 2].map(|c| solve(uu, rv[c], uv, ru[c])),
+    ]
+}
+
+/// The two axes of a disc's plane: what its rotation turns x and y into.
+pub fn plane(disc: &Disc) -> [[f32; 3]; 2] {
+    let [w, x, y, _] = disc.rotation;
+    [
+        [1.0 - 2.0 * y * y, 2.0 * x * y, -2.0 * w * y],
+        [2.0 * x * y, 1.0 - 2.0 * x * x, 2.0 * w * x],
+    ]
+}

@@ -1,0 +1,290 @@
+use super::discs::Disc;
+use super::*;
+use crate::geometry::{Octree, morton};
+use proptest::prelude::*;
+
+/// A cloud's voxels and kernel map.
+fn cloud(depth: u8, voxels: impl IntoIterator<Item = [u32; 3]>) -> (Voxels, KernelMap) {
+    let keys = voxels.into_iter().map(morton::encode).collect();
+    let octree = Octree::new(Voxels::new(depth, keys)).unwrap();
+    (octree.level(depth).clone(), octree.kernel_map(depth))
+}
+
+fn one_each(voxels: &Voxels, map: &KernelMap) -> Gaussians {
+    let grey = vec![[128; 3]; voxels.len()];
+    surfels(
+        Isa::detect(),
+        voxels,
+        map,
+        &grey,
+        PerVoxel::One,
+        Frame::default(),
+    )
+}
+
+/// The walk counts from one voxel to all, by stepping between all pairs of voxels.
+fn walks(coordinates: &[[u32; 3]], from: usize, steps: usize) -> Vec<f64> {
+    let beside = |a: [u32; 3], b: [u32; 3]| a.into_iter().zip(b).all(|(a, b)| a.abs_diff(b) <= 1);
+    let mut counts = vec![0.0; coordinates.len()];
+    counts[from] = 1.0;
+    for _ in 0..steps {
+        let reached = coordinates.iter().map(|&to| {
+            let neighbours = coordinates.iter().zip(&counts);
+            neighbours
+                .filter(|(q, _)| beside(**q, to))
+                .map(|(_, n)| n)
+                .sum()
+        });
+        counts = reached.collect();
+    }
+    counts
+}
+
+/// Mean and covariance of a neighbourhood around a voxel, as defined.
+fn distribution(coordinates: &[[u32; 3]], voxel: usize, steps: usize) -> ([f64; 3], [[f64; 3]; 3]) {
+    let weights = walks(coordinates, voxel, steps);
+    let total: f64 = weights.iter().sum();
+    let offset = |i: usize| {
+        let of = |axis| f64::from(coordinates[i][axis]) - f64::from(coordinates[voxel][axis]);
+        [0, 1, 2].map(of)
+    };
+    let mean_of = |f: &dyn Fn([f64; 3]) -> f64| {
+        let terms = weights.iter().enumerate().map(|(i, w)| w * f(offset(i)));
+        terms.sum::<f64>() / total
+    };
+    let mean = [0, 1, 2].map(|a| mean_of(&|d| d[a]));
+    let covariance =
+        [0, 1, 2].map(|a| [0, 1, 2].map(|b| mean_of(&|d| (d[a] - mean[a]) * (d[b] - mean[b]))));
+    (mean, covariance)
+}
+
+fn all_discs(isa: Isa, voxels: &Voxels, map: &KernelMap) -> Vec<Disc> {
+    let near = moments::step(isa, map, &moments::of_voxels(voxels));
+    let far = (1..moments::ROUNDS).fold(near.clone(), |m, _| moments::step(isa, map, &m));
+    let coordinates: Vec<_> = (0..voxels.len()).map(|i| voxels.coordinate(i)).collect();
+    isa.run(passes::Fit {
+        coordinates: &coordinates,
+        near: &near,
+        far: &far,
+    })
+}
+
+fn normal(disc: &Disc) -> [f64; 3] {
+    let [w, x, y, _] = disc.rotation.map(f64::from);
+    [2.0 * w * y, -2.0 * w * x, 1.0 - 2.0 * (x * x + y * y)]
+}
+
+fn product(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn discs_are_those_of_the_definition(
+        keys in prop::collection::vec(0u64..512, 1..150), far_out in prop::bool::ANY
+    ) {
+        // Far from the origin, sums of absolute coordinates wrap.
+        let shift = if far_out { [900_001, 77_777, 1_048_000] } else { [0; 3] };
+        let moved = |key| { let c = morton::decode(key); [0, 1, 2].map(|a| c[a] + shift[a]) };
+        let (voxels, map) = cloud(21, keys.into_iter().map(moved));
+        let coordinates: Vec<_> = (0..voxels.len()).map(|i| voxels.coordinate(i)).collect();
+        for isa in Isa::available() {
+            for (i, disc) in all_discs(isa, &voxels, &map).iter().enumerate() {
+                let n = normal(disc);
+                prop_assert!((product(n, n) - 1.0).abs() < 1e-5);
+                let (near, _) = distribution(&coordinates, i, 1);
+                let (mean, covariance) = distribution(&coordinates, i, moments::ROUNDS);
+                // The variance along the normal is the least of all: no direction has less.
+                let along = |d: [f64; 3]| product(d, covariance.map(|row| product(row, d)));
+                let least = along(n);
+                for a in -4..=4 {
+                    for b in -4..=4 {
+                        for d in [[a, b, 4], [a, 4, b], [4, a, b]] {
+                            let d = d.map(f64::from);
+                            prop_assert!(along(d) / product(d, d) > least - 2e-5);
+                        }
+                    }
+                }
+                let density: f64 = n.iter().map(|v| v.abs()).sum();
+                let thick = ((least - density * density / 12.0) / 0.4).clamp(0.0, 1.0);
+                let high = product(mean, n);
+                let height = high + thick * (product(near, n) - high);
+                for axis in 0..3 {
+                    let inwards = 0.2 * (mean[axis] - high * n[axis]);
+                    let centre = f64::from(disc.centre[axis]);
+                    prop_assert!((centre - height * n[axis] - inwards).abs() < 1e-4);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_gives_the_same_bits(
+        keys in prop::collection::vec(0u64..4096, 1..600), seed in any::<u8>()
+    ) {
+        let (voxels, map) = cloud(4, keys.into_iter().map(morton::decode));
+        let colour = |i: usize| [i * 7, i * 31, i * 101].map(|v| (v as u8).wrapping_mul(seed));
+        let colours: Vec<_> = (0..voxels.len()).map(colour).collect();
+        for per_voxel in [PerVoxel::One, PerVoxel::Four] {
+            let made = |isa| surfels(isa, &voxels, &map, &colours, per_voxel, Frame::default());
+            let expected = made(Isa::available()[0]);
+            prop_assert!(expected.check_lengths().is_ok());
+            for isa in Isa::available() {
+                prop_assert!(made(isa) == expected, "{}", isa);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_lone_voxel_is_a_round_blob_in_its_middle() {
+    let (voxels, map) = cloud(3, [[5, 2, 7]]);
+    let blob = one_each(&voxels, &map);
+    let [x, y, z] = blob.scale[0];
+    assert!(x == y && y == z && x == 0.4 * 0.25);
+    assert_eq!(blob.position[0], [0.375, -0.375, 0.875]);
+    assert_eq!(blob.colour[0], [128.0 / 255.0; 3]);
+}
+
+#[test]
+fn a_row_of_voxels_is_as_thick_as_a_voxel_from_all_sides() {
+    let (voxels, map) = cloud(5, (3..25).map(|x| [x, 4, 4]));
+    for scale in one_each(&voxels, &map).scale {
+        assert!(scale.iter().all(|s| (s / (2.0 / 32.0) - 0.4).abs() < 0.01));
+    }
+}
+
+#[test]
+fn a_flat_face_is_flat() {
+    for axis in 0..3 {
+        let at = |i: u32| {
+            let mut c = [i % 16, i / 16, 0];
+            c.rotate_right(axis);
+            c[(2 + axis) % 3] = 9;
+            c
+        };
+        let (voxels, map) = cloud(4, (0..256).map(at));
+        let gaussians = one_each(&voxels, &map);
+        let flat = (2 + axis) % 3;
+        let height = 2.0 * 9.5 / 16.0 - 1.0;
+        assert!(
+            gaussians
+                .position
+                .iter()
+                .all(|p| (p[flat] - height).abs() < 1e-6)
+        );
+        let thin = gaussians
+            .scale
+            .iter()
+            .filter(|s| s[2] < 0.02 * s[0])
+            .count();
+        assert!(thin >= 14 * 14, "{thin} discs are thin");
+    }
+}
+
+#[test]
+fn a_staircase_becomes_a_slope() {
+    // A plane of slope 1/3, and every voxel that it cuts.
+    let on = |i: u32| (i % 48, i / 48);
+    let voxels = (0..48 * 48).map(on).map(|(x, y)| [x, y, 8 + x / 3]);
+    let (voxels, map) = cloud(6, voxels);
+    let discs = all_discs(Isa::detect(), &voxels, &map);
+    for (i, disc) in discs.iter().enumerate() {
+        let [x, y, z] = voxels.coordinate(i);
+        if [x, y].iter().any(|v| !(5..43).contains(v)) {
+            continue;
+        }
+        // Voxels of one step have the middles of their heights on the slope.
+        let centre = [x, y, z].map(|v| f64::from(v) + 0.5);
+        let at: Vec<f64> = (0..3)
+            .map(|a| centre[a] + f64::from(disc.centre[a]))
+            .collect();
+        let off = (at[2] - 8.5 - (at[0] - 1.5) / 3.0) / 10f64.sqrt() * 3.0;
+        assert!(off.abs() < 0.12, "voxel {i} is {off} off");
+        let cosine = product(normal(disc), [-1.0, 0.0, 3.0]) / 10f64.sqrt();
+        assert!(cosine > 0.99, "{cosine}");
+    }
+}
+
+#[test]
+fn sheets_that_nothing_joins_do_not_see_each_other() {
+    let sheet = |z: u32| (0..400).map(move |i| [i % 20, i / 20, z]);
+    let (alone, map) = cloud(5, sheet(8));
+    let one = one_each(&alone, &map);
+    let (both, map) = cloud(5, sheet(8).chain(sheet(10)));
+    let two = one_each(&both, &map);
+    let lower = (0..both.len()).filter(|&i| both.coordinate(i)[2] == 8);
+    for (i, j) in lower.zip(0..) {
+        assert_eq!(two.position[i], one.position[j]);
+        assert_eq!(two.scale[i], one.scale[j]);
+        assert_eq!(two.rotation[i], one.rotation[j]);
+    }
+}
+
+#[test]
+fn two_sheets_that_touch_and_a_full_cube_stay_finite_and_within_their_voxels() {
+    let sheets = (0..800).map(|i| [i % 20, i / 20 % 20, 8 + i / 400]);
+    let full = (0..4096).map(|i| [i % 16, i / 16 % 16, i / 256]);
+    for (voxels, map) in [cloud(5, sheets), cloud(5, full)] {
+        for disc in all_discs(Isa::detect(), &voxels, &map) {
+            assert!(disc.centre.iter().all(|v| v.abs() < 1.0));
+            assert!(disc.rotation.iter().all(|v| v.is_finite()));
+            assert!(disc.radius > 0.3 && disc.radius < 0.7);
+        }
+    }
+}
+
+#[test]
+fn a_ball_shrinks_to_under_its_surface_and_faces_outwards() {
+    const RADIUS: f64 = 12.0;
+    let middle = 15.7;
+    let from = |c: [u32; 3]| c.map(|v| f64::from(v) + 0.5 - middle);
+    let length = |d: [f64; 3]| product(d, d).sqrt();
+    let shell = (0..1 << 15).map(|i| [i % 32, i / 32 % 32, i / 1024]);
+    let shell = shell.filter(|&c| (length(from(c)) - RADIUS).abs() < 0.6);
+    let (voxels, map) = cloud(5, shell);
+    let mut mean = 0.0;
+    for (i, disc) in all_discs(Isa::detect(), &voxels, &map).iter().enumerate() {
+        let d = from(voxels.coordinate(i));
+        let at = [0, 1, 2].map(|a| d[a] + f64::from(disc.centre[a]));
+        assert!((length(at) - RADIUS).abs() < 0.5, "{}", length(at));
+        assert!(product(normal(disc), d).abs() / length(d) > 0.95);
+        mean += length(at) / voxels.len() as f64;
+    }
+    assert!((RADIUS - 0.3..RADIUS).contains(&mean), "{mean}");
+}
+
+#[test]
+fn four_discs_continue_a_gradient_of_colours_between_voxels() {
+    let (voxels, map) = cloud(5, (0..900).map(|i| [i % 30, i / 30, 7]));
+    let colours = (0..voxels.len()).map(|i| {
+        let [x, y, _] = voxels.coordinate(i);
+        [(8 * x) as u8, (6 * y) as u8, 100]
+    });
+    let colours: Vec<_> = colours.collect();
+    let frame = Frame::default();
+    let four = surfels(
+        Isa::detect(),
+        &voxels,
+        &map,
+        &colours,
+        PerVoxel::Four,
+        frame,
+    );
+    assert_eq!(four.len(), 4 * voxels.len());
+    for i in 0..four.len() {
+        let [x, y, z] = voxels.coordinate(i / 4);
+        if [x, y].iter().any(|v| !(3..27).contains(v)) {
+            continue;
+        }
+        let place = four.position[i].map(|v| (v + 1.0) * 16.0 - 0.5);
+        assert!((place[0] - x as f32).abs() == 0.25 && (place[1] - y as f32).abs() == 0.25);
+        assert!((place[2] - z as f32).abs() < 1e-4);
+        // Damping takes some of the slope.
+        let [red, green, blue] = four.colour[i].map(|v| v * 255.0);
+        assert!((red - 8.0 * place[0]).abs() < 0.25 && (green - 6.0 * place[1]).abs() < 0.25);
+        assert_eq!(blue, 100.0);
+    }
+}
