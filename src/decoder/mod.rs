@@ -1,8 +1,9 @@
 //! Stream to Gaussians: drives the stages, holds no algorithm.
 //!
-//! [`Decoding`] takes a stream as its bytes arrive and decodes each level as soon as it is whole. [`Decoder::decode`], which takes a
-//! whole stream, is the same with all bytes at once: result and error are the same however the bytes are cut, and the error is
-//! that of the first fault in the order of the stream.
+//! [`StreamDecoder`] decodes streams of either version, [`StreamDecoding`] takes one as its bytes arrive and decodes each level as soon as it is
+//! whole. [`StreamDecoder::decode`], which takes a whole stream, is the same with all bytes at once: result and error are the same however the
+//! bytes are cut, and the error is that of the first fault in the order of the stream. [`Decoder`] and [`Decoding`] are what is of version 2 alone:
+//! what a learned model decodes, down to latents and features.
 
 mod decoding;
 mod feed;
