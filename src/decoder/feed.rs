@@ -116,6 +116,14 @@ impl<'b> Feed<'b> {
         Ok((!wait).then_some(next))
     }
 
+    /// The level after `level`, if it is to be decoded and all its bytes have come.
+    pub(super) fn after(&self, level: u8) -> Option<u8> {
+        let Opened { header, last, .. } = self.opened.as_ref()?;
+        let next = level + 1;
+        let whole = next <= *last && self.length >= header.prefix_bytes(next).ok()?;
+        whole.then_some(next)
+    }
+
     /// Reads the header, if it is whole.
     fn open(
         &mut self,

@@ -22,7 +22,11 @@ pub(super) struct Transform<'b> {
     pub decoder: StreamDecoder,
     feed: Feed<'b>,
     reached: Option<Reached>,
+    ahead: Ahead,
 }
+
+/// The occupancies of a level that were decoded beside the colours of the level above, which are coded apart from them and take as long.
+type Ahead = Option<(u8, Result<Vec<u8>>)>;
 
 /// The deepest level so far.
 #[derive(Debug)]
@@ -73,6 +77,7 @@ impl<'b> Transform<'b> {
             decoder,
             feed: Feed::new(goal, bytes),
             reached: None,
+            ahead: None,
         }
     }
 
@@ -123,13 +128,17 @@ impl<'b> Transform<'b> {
             Some(above) => std::mem::replace(&mut above.octree, Octree::root()),
             None => Octree::root(),
         };
+        // What is wrong with it is told when it is its turn.
+        let next = self.feed.after(level);
+        let next = next.and_then(|next| Level::read(self.feed.bytes(), header, next).ok());
         let growing = Growing {
             decoder: &self.decoder,
             header,
             part: &part,
             colours,
+            next: next.as_ref(),
         };
-        match growing.level(&mut octree, self.reached.as_ref(), log) {
+        match growing.level(&mut octree, self.reached.as_ref(), &mut self.ahead, log) {
             Ok(Step {
                 map,
                 coloured,
@@ -189,6 +198,8 @@ struct Growing<'a> {
     header: &'a Header,
     part: &'a Level<'a>,
     colours: &'a Colours<'a>,
+    /// The level after it, if its geometry may be decoded already.
+    next: Option<&'a Level<'a>>,
 }
 
 /// The kernel map and the colours of a level on the way to the one that a section is of, and of the level above if the section has it.
@@ -200,10 +211,16 @@ struct Step {
 
 impl Growing<'_> {
     /// Grows `octree` to the level of the part.
-    fn level(&self, octree: &mut Octree, above: Option<&Reached>, log: &mut Log) -> Result<Step> {
+    fn level(
+        &self,
+        octree: &mut Octree,
+        above: Option<&Reached>,
+        ahead: &mut Ahead,
+        log: &mut Log,
+    ) -> Result<Step> {
         let level = self.part.level;
         let mut step = match &self.colours.trunk {
-            Some(trunk) => Some(self.trunk(octree, trunk, log)?),
+            Some(trunk) => Some(self.trunk(octree, trunk, ahead, log)?),
             None => None,
         };
         for n in octree.depth() + 1..=level {
@@ -212,7 +229,7 @@ impl Growing<'_> {
                 (None, Some(above)) => (&above.map, &above.coloured),
                 (None, None) => return Err(nothing_reached()),
             };
-            let (map, coloured) = self.next(octree, n, map, coloured, log)?;
+            let (map, coloured) = self.next(octree, n, map, coloured, ahead, log)?;
             step = Some(Step {
                 map,
                 coloured,
@@ -228,7 +245,13 @@ impl Growing<'_> {
     }
 
     /// The levels that the colour trunk holds.
-    fn trunk(&self, octree: &mut Octree, trunk: &Trunk, log: &mut Log) -> Result<Step> {
+    fn trunk(
+        &self,
+        octree: &mut Octree,
+        trunk: &Trunk,
+        ahead: &mut Ahead,
+        log: &mut Log,
+    ) -> Result<Step> {
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
         let (depth, count) = (trunk.level, trunk.slice.voxels as usize);
         let slice = self.header.slice_voxels as usize;
@@ -245,7 +268,8 @@ impl Growing<'_> {
         cancel.check()?;
         let name = format!("colours of levels 0 to {depth}");
         let coloured = log.step(name, count, "voxels", || {
-            colour::decode_trunk(isa, octree, &maps, &trunk.slice)
+            let colours = || colour::decode_trunk(isa, octree, &maps, &trunk.slice);
+            self.beside(depth, &maps[maps.len() - 1], ahead, colours)
         })?;
         let map = maps.pop().unwrap_or_else(KernelMap::root);
         Ok(Step {
@@ -265,6 +289,7 @@ impl Growing<'_> {
         n: u8,
         above_map: &KernelMap,
         above: &Coloured,
+        ahead: &mut Ahead,
         log: &mut Log,
     ) -> Result<(KernelMap, Coloured)> {
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
@@ -276,21 +301,54 @@ impl Growing<'_> {
         };
         let slices = &geometry.slices;
         let count = slices.iter().map(|s| s.voxels as usize).sum();
-        log.step(format!("geometry of level {n}"), count, "voxels", || {
-            let slice = header.slice_voxels as usize;
-            codec::decode_level(isa, octree, above_map, slices, slice, cancel)
-        })?;
+        log.step(
+            format!("geometry of level {n}"),
+            count,
+            "voxels",
+            || match ahead.take() {
+                Some((level, masks)) if level == n => octree.grow(masks?),
+                _ => {
+                    let slice = header.slice_voxels as usize;
+                    codec::decode_level(isa, octree, above_map, slices, slice, cancel)
+                }
+            },
+        )?;
         let map = log.step(format!("kernel map of level {n}"), count, "voxels", || {
             Ok(octree.child_map(n - 1, above_map))
         })?;
         let coloured = log.step(format!("colours of level {n}"), count, "voxels", || {
             let slice = header.colour_slice() as usize;
             let slices = &colours.slices;
-            colour::decode_level(
-                isa, octree, n, above_map, &map, above, slices, slice, cancel,
-            )
+            let colours = || {
+                colour::decode_level(
+                    isa, octree, n, above_map, &map, above, slices, slice, cancel,
+                )
+            };
+            self.beside(n, &map, ahead, colours)
         })?;
         Ok((map, coloured))
+    }
+
+    /// Decodes the colours of level `n`, and beside them the occupancies of the level after it, if it is there. `map` is the kernel map of level
+    /// `n`.
+    fn beside(
+        &self,
+        n: u8,
+        map: &KernelMap,
+        ahead: &mut Ahead,
+        colours: impl FnOnce() -> Result<Coloured> + Send,
+    ) -> Result<Coloured> {
+        let parts = self.part.geometry.iter();
+        let mut parts = parts.chain(self.next.iter().flat_map(|next| &next.geometry));
+        let Some(next) = parts.find(|part| part.level == n + 1) else {
+            return colours();
+        };
+        let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
+        let slice = self.header.slice_voxels as usize;
+        let masks = || codec::decode_masks(isa, n + 1, map, &next.slices, slice, cancel);
+        let (coloured, masks) = rayon::join(colours, masks);
+        *ahead = Some((n + 1, masks));
+        coloured
     }
 }
 

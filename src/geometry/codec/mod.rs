@@ -105,8 +105,7 @@ pub fn decode_slice(
 /// now the deepest level.
 ///
 /// # Errors
-/// Those of [`decode_slice`] and [`Octree::grow`], [`Error::Malformed`] if there are more or fewer slices than there should be, and
-/// [`Error::Cancelled`]. The octree is unchanged then.
+/// Those of [`decode_masks`] and [`Octree::grow`]. The octree is unchanged then.
 ///
 /// # Panics
 /// If `map` is another level's, or `slice` is 0.
@@ -119,6 +118,25 @@ pub fn decode_level(
     cancel: &Cancel,
 ) -> Result<()> {
     let level = octree.depth() + 1;
+    octree.grow(decode_masks(isa, level, map, encoded, slice, cancel)?)
+}
+
+/// The occupancies of all parents of `level`, whose 3³ kernel map is `map`, from slices of the children of `slice` parents each: what
+/// [`Octree::grow`] adds that level with.
+///
+/// # Errors
+/// Those of [`decode_slice`], [`Error::Malformed`] if there are more or fewer slices than there should be, and [`Error::Cancelled`].
+///
+/// # Panics
+/// If `slice` is 0.
+pub fn decode_masks(
+    isa: Isa,
+    level: u8,
+    map: &KernelMap,
+    encoded: &[Slice],
+    slice: usize,
+    cancel: &Cancel,
+) -> Result<Vec<u8>> {
     let ranges = slices(map.len(), slice);
     if encoded.len() != ranges.len() {
         return Err(Error::malformed(
@@ -137,7 +155,7 @@ pub fn decode_level(
     // All of them, so that the error is that of the first slice that has one.
     let masks: Vec<Result<_>> = tasks.into_par_iter().map(decode).collect();
     let masks: Result<Vec<_>> = masks.into_iter().collect();
-    octree.grow(masks?.concat())
+    Ok(masks?.concat())
 }
 
 /// Codes the occupancies of one slice.
