@@ -3,7 +3,7 @@
 #[cfg(target_arch = "x86_64")]
 use std::sync::OnceLock;
 
-use crate::binary16::{f16, to_bf16};
+use half::{bf16, f16};
 
 use crate::convert::{self, Halves};
 use crate::isa::Isa;
@@ -166,7 +166,7 @@ impl FloatConv {
             for (c, from) in from.iter().enumerate() {
                 for (to, from) in to[c / 2].0.iter_mut().zip(from.f32()) {
                     // The only machines with bf16 keep the first value in the low half.
-                    *to |= u32::from(to_bf16(from)) << (c % 2 * 16);
+                    *to |= u32::from(bf16::from_f32(from).to_bits()) << (c % 2 * 16);
                 }
             }
         }

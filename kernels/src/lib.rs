@@ -13,7 +13,6 @@ compile_error!(
     "x87 arithmetic does not round to f32 after every step: build for a target with SSE2"
 );
 
-mod binary16;
 mod convert;
 mod double;
 mod exact;
@@ -39,12 +38,12 @@ pub mod reference;
 pub mod smooth;
 pub mod splat;
 
-pub use binary16::f16;
 pub use convert::{to_f16, to_f32};
 pub use double::add_products;
 pub use exact::{ExactConv, LIMIT, Requantise};
 pub use family::{copy_row, window};
 pub use float::{FloatConv, FloatOut, Precision, Scale};
+pub use half::f16;
 pub use isa::{Isa, UnknownIsa};
 pub use map::{MappedFile, map_file};
 pub use memory::{give_back, zeros};

@@ -2,7 +2,7 @@
 
 use std::arch::x86_64::*;
 
-use crate::binary16::{f16, to_bf16};
+use half::{bf16, f16};
 
 use super::{Buffers, LINE, Scheme, Weights, multiply, prepare};
 use crate::plan::PlanTile;
@@ -21,7 +21,7 @@ impl Weights {
         for (tap, channel, panel) in extents.each() {
             let words = packed.words(0, tap, 2 * channel, panel);
             for (word, w) in words.iter_mut().zip(weights(tap, channel, panel)) {
-                *word |= u32::from(to_bf16(w)) << (16 * (channel % 2));
+                *word |= u32::from(bf16::from_f32(w).to_bits()) << (16 * (channel % 2));
             }
         }
         packed
