@@ -46,7 +46,7 @@ pub use float::{FloatConv, FloatOut, Precision, Scale};
 pub use half::f16;
 pub use isa::{Isa, UnknownIsa};
 pub use map::{MappedFile, map_file};
-pub use memory::{give_back, zeros};
+pub use memory::{Zeros, give_back, zeros};
 pub use plan::Plan;
 pub use rows::Output;
 pub use taps::{ABSENT, Taps};

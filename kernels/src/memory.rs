@@ -1,6 +1,8 @@
 //! Large blocks of memory.
 
 use bytemuck::Zeroable;
+use half::f16;
+use half::vec::HalfBitsVecExt;
 
 /// The pages that systems have beside their small ones, on most machines.
 #[cfg(target_os = "linux")]
@@ -12,6 +14,30 @@ pub fn zeros<T: Zeroable>(len: usize) -> Vec<T> {
     #[cfg(target_os = "linux")]
     ask_for_huge_pages(&zeros);
     zeros
+}
+
+/// Numbers of which large blocks of zeros can be had as [`zeros`] are.
+pub trait Zeros: Copy + Default {
+    /// So many zeros.
+    fn zeros(len: usize) -> Vec<Self>;
+}
+
+impl Zeros for i16 {
+    fn zeros(len: usize) -> Vec<i16> {
+        zeros(len)
+    }
+}
+
+impl Zeros for f64 {
+    fn zeros(len: usize) -> Vec<f64> {
+        zeros(len)
+    }
+}
+
+impl Zeros for f16 {
+    fn zeros(len: usize) -> Vec<f16> {
+        zeros::<u16>(len).reinterpret_into()
+    }
 }
 
 /// Gives what is free back to the system, where the allocator keeps some for later: what is reserved next is as fresh as in a process that has

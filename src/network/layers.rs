@@ -1,8 +1,7 @@
 //! Running layers and blocks over all rows of a level, in blocks of rows side by side.
 
 use b2p_kernels::f16;
-use b2p_kernels::{ExactConv, FloatConv, Isa, Output, Taps, to_f16, zeros};
-use bytemuck::Zeroable;
+use b2p_kernels::{ExactConv, FloatConv, Isa, Output, Taps, Zeros, to_f16};
 use rayon::prelude::*;
 
 use super::structure::{Inception, ResBlock};
@@ -12,7 +11,7 @@ const BLOCK: usize = 512;
 
 /// A layer whose rows are values of one kind, in and out.
 pub(crate) trait Conv: Sync {
-    type Value: Copy + Default + Zeroable + Send + Sync;
+    type Value: Zeros + Send + Sync;
 
     fn cout(&self) -> usize;
     fn run(
@@ -85,7 +84,7 @@ impl Conv for FloatConv {
 #[derive(Debug)]
 pub(crate) struct Pool<T>(Vec<Vec<T>>);
 
-impl<T: Copy + Zeroable> Pool<T> {
+impl<T: Zeros> Pool<T> {
     pub fn new() -> Self {
         Pool(Vec::new())
     }
@@ -97,7 +96,7 @@ impl<T: Copy + Zeroable> Pool<T> {
         match fitting.min_by_key(|(_, buffer)| buffer.capacity()) {
             Some((i, _)) => {
                 let mut buffer = self.0.swap_remove(i);
-                buffer.resize(len, T::zeroed());
+                buffer.resize(len, T::default());
                 buffer
             }
             None => {
@@ -106,7 +105,7 @@ impl<T: Copy + Zeroable> Pool<T> {
                 if let Some((i, _)) = sizes.max_by_key(|(_, buffer)| buffer.capacity()) {
                     self.0.swap_remove(i);
                 }
-                zeros(len)
+                T::zeros(len)
             }
         }
     }
@@ -326,7 +325,7 @@ impl<C: Conv> ResBlock<C> {
 }
 
 /// Rows of `left` and `right`, of `a` and `b` values, side by side.
-pub(super) fn concat<T: Copy + Zeroable + Send + Sync>(
+pub(super) fn concat<T: Zeros + Send + Sync>(
     pool: &mut Pool<T>,
     left: &[T],
     a: usize,
@@ -349,7 +348,7 @@ pub(super) fn concat<T: Copy + Zeroable + Send + Sync>(
 /// The real numbers that integer activations stand for.
 pub(crate) fn reals(isa: Isa, q: &[i16], scale: f32) -> Vec<f16> {
     const CHUNK: usize = 4096;
-    let mut out = zeros(q.len());
+    let mut out = f16::zeros(q.len());
     out.par_chunks_mut(CHUNK)
         .zip(q.par_chunks(CHUNK))
         .for_each(|(out, q)| {
