@@ -9,7 +9,7 @@ use xxhash_rust::xxh3::Xxh3Default;
 use super::decoding::nothing_reached;
 use super::feed::{Feed, Goal};
 use super::stream::StreamDecoder;
-use crate::bitstream::{Colours, Header, Level, Slice, Trunk};
+use crate::bitstream::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::colour::{self, Coloured, Filter};
 use crate::error::Result;
 use crate::gaussians::Gaussians;
@@ -266,7 +266,7 @@ impl Growing<'_> {
             Ok(())
         })?;
         cancel.check()?;
-        let name = format!("colours of levels 0 to {depth}");
+        let name = self.named(format!("colours of levels 0 to {depth}"), depth);
         let coloured = log.step(name, count, "voxels", || {
             let colours = || colour::decode_trunk(isa, octree, &maps, &trunk.slice);
             self.beside(depth, &maps[maps.len() - 1], ahead, colours)
@@ -316,7 +316,8 @@ impl Growing<'_> {
         let map = log.step(format!("kernel map of level {n}"), count, "voxels", || {
             Ok(octree.child_map(n - 1, above_map))
         })?;
-        let coloured = log.step(format!("colours of level {n}"), count, "voxels", || {
+        let name = self.named(format!("colours of level {n}"), n);
+        let coloured = log.step(name, count, "voxels", || {
             let slice = header.colour_slice() as usize;
             let slices = &colours.slices;
             let colours = || {
@@ -329,6 +330,21 @@ impl Growing<'_> {
         Ok((map, coloured))
     }
 
+    /// The geometry of the level after `n`, if it is there.
+    fn after(&self, n: u8) -> Option<&Geometry<'_>> {
+        let parts = self.part.geometry.iter();
+        let mut parts = parts.chain(self.next.iter().flat_map(|next| &next.geometry));
+        parts.find(|part| part.level == n + 1)
+    }
+
+    /// The name of a step that decodes `colours`, those of level `n` the last.
+    fn named(&self, colours: String, n: u8) -> String {
+        match self.after(n) {
+            None => colours,
+            Some(next) => format!("{colours}, geometry of level {}", next.level),
+        }
+    }
+
     /// Decodes the colours of level `n`, and beside them the occupancies of the level after it, if it is there. `map` is the kernel map of level
     /// `n`.
     fn beside(
@@ -338,9 +354,7 @@ impl Growing<'_> {
         ahead: &mut Ahead,
         colours: impl FnOnce() -> Result<Coloured> + Send,
     ) -> Result<Coloured> {
-        let parts = self.part.geometry.iter();
-        let mut parts = parts.chain(self.next.iter().flat_map(|next| &next.geometry));
-        let Some(next) = parts.find(|part| part.level == n + 1) else {
+        let Some(next) = self.after(n) else {
             return colours();
         };
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
