@@ -4,8 +4,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use b2p::decoder::StreamDecoder;
+use b2p::gaussians::learned::HeadsModel;
 use b2p::log::Log;
-use b2p::network::Model;
 use b2p::pixels::{Background, Renderer};
 use b2p::{Error, embedded, output};
 
@@ -25,20 +25,20 @@ pub fn run(args: &Demo, progress: &Progress) -> Result<String> {
         source,
     })?;
     let mut log = Log::with_listener(&say);
-    let decoder = log.step("load", embedded::MODEL.len(), "bytes", || {
-        let model = Model::from_bytes(embedded::MODEL)?;
-        Ok(StreamDecoder::new().with_model(Arc::new(model)))
+    let decoder = log.step("load", embedded::HEADS.len(), "bytes", || {
+        let heads = HeadsModel::from_bytes(embedded::HEADS)?;
+        Ok(StreamDecoder::new().with_heads_model(Arc::new(heads)))
     })?;
     let mut text = format!(
         "The sample: {} bytes of stream inside the program.\n\n{}",
-        count(embedded::SAMPLE.len() as u64),
+        count(embedded::SCENE.len() as u64),
         steps(log.steps()),
     );
     let mut renderer = Renderer::default();
     let mut written = Vec::new();
-    for level in decoder.levels(embedded::SAMPLE)? {
+    for level in decoder.levels(embedded::SCENE)? {
         let mut log = Log::with_listener(&say);
-        let gaussians = decoder.decode(embedded::SAMPLE, Some(level), &mut log)?;
+        let gaussians = decoder.decode(embedded::SCENE, Some(level), &mut log)?;
         let mut lines = String::new();
         for (name, orbit) in VIEWS {
             let path = args.output.join(format!("level-{level}-{name}.png"));

@@ -31,7 +31,15 @@ pub fn from_file(path: Option<&Path>) -> Result<Model> {
     }
 }
 
-/// The same, set to the instructions and the precision asked for.
+/// The heads in a file, or those inside the program.
+pub fn heads(path: Option<&Path>) -> Result<HeadsModel> {
+    match path {
+        Some(path) => HeadsModel::open(path).map_err(Failure::in_file(path)),
+        None => Ok(HeadsModel::from_bytes(b2p::embedded::HEADS)?),
+    }
+}
+
+/// The model in a file, or the one inside the program, set to the instructions and the precision asked for.
 pub fn model(arg: &ModelArg) -> Result<Model> {
     let model = from_file(arg.model.as_deref())?;
     let model = model.with_isa(isa(arg.isa.as_deref())?);
@@ -63,11 +71,8 @@ pub fn decoder(
     if let Some(name) = &model_arg.precision {
         decoder = decoder.with_precision(name.parse()?);
     }
-    if let Some(path) = &model_arg.model
-        && detail.heads != Some(HeadSet::Surfels)
-    {
-        let heads = HeadsModel::open(path).map_err(Failure::in_file(path))?;
-        decoder = decoder.with_heads_model(Arc::new(heads));
+    if detail.heads != Some(HeadSet::Surfels) {
+        decoder = decoder.with_heads_model(Arc::new(heads(model_arg.model.as_deref())?));
     }
     Ok(decoder)
 }
