@@ -32,9 +32,13 @@ make q1 --count 36 --seed 402 --bits 8 --crop 256 --size 256 "$meshes"
 make c0 --count 70 --seed 411 --bits 10 --crop 128 "$out/things"
 make c1 --count 70 --seed 412 --bits 9 --crop 128 "$out/things"
 make c2 --count 40 --seed 413 --bits 10 --crop 128 "$meshes"
+# Whole objects of a half of the scale, and objects of the project's own making.
+make h0 --count 40 --seed 403 --bits 9 --crop 512 --size 512 --views 5 "$out/things"
+make h1 --count 22 --seed 404 --bits 9 --crop 512 --size 512 --views 5 "$meshes"
+make q2 --count 30 --seed 405 --bits 8 --crop 256 --size 256 --procedural
 
 cd "$here"
-"$python" teach.py ../../models/lite.weights.safetensors "$out/taught" "$out/data"/*.safetensors
+"$python" teach.py ../../models/lite.weights.safetensors "$out/taught" "$out/data"/[cq][01]-*.safetensors "$out/data"/c2-*.safetensors
 # train NAME CONFIG MINUTES ARGUMENTS…
 train() {
     local name=$1 config=$2 time=$3
@@ -44,17 +48,19 @@ train() {
         --minutes "$(minutes "$time")" "$@"
     touch "$out/$name/done"
 }
-taught=(--draw-from 2 --imitate 1 --decay-from 0.2)
-drawn1=(--roles 2:0.85,1:0.15 --most-voxels 12000 --views 2)
-drawn8=(--roles 1:0.7,2:0.3 --most-voxels 5000 --views 1)
+small=(--only c0,c1,c2,q0,q1)
+taught=("${small[@]}" --draw-from 2 --imitate 1 --decay-from 0.2)
+drawn1=("${small[@]}" --roles 2:0.85,1:0.15 --most-voxels 12000 --views 2)
+drawn8=("${small[@]}" --roles 1:0.7,2:0.3 --most-voxels 5000 --views 1)
 train start-best-1 best-1 25 "${taught[@]}" --lr 1.5e-3 --roles 2:1
 train start-best-8 best-8 16 "${taught[@]}" --lr 1.5e-3 --roles 1:1
 train best-1 best-1 50 --init "$out/start-best-1/last.pt" "${drawn1[@]}" --lr 7e-4 --imitate 0.2 --imitate-until 0.4 --average 0.998
 train best-8 best-8 50 --init "$out/start-best-8/last.pt" "${drawn8[@]}" --lr 7e-4 --imitate 0.2 --imitate-until 0.4 --average 0.998
+train whole-8 best-8 17 --init "$out/best-8/last.pt" --only q0,q1,q2,h0,h1 --roles 1:0.75,2:0.25 --most-voxels 9000 --views 2 --lr 4e-4 --decay-from 0.2
 train start-quick-1 quick-1 8 "${taught[@]}" --lr 2e-3 --roles 2:1
 train start-quick-8 quick-8 8 "${taught[@]}" --lr 2e-3 --roles 1:1
 train quick-1 quick-1 21 --init "$out/start-quick-1/last.pt" --elder "$out/best-1/last.pt" "${drawn1[@]}" --lr 1.2e-3 --imitate 0.5 --imitate-until 0.4
 train quick-8 quick-8 21 --init "$out/start-quick-8/last.pt" --elder "$out/best-8/last.pt" "${drawn8[@]}" --lr 1.2e-3 --imitate 0.5 --imitate-until 0.4
 some=$(printf '%s,' "$out"/data/q1-000[0-5]*.safetensors)
-"$python" export_heads.py "$out/heads.safetensors" best.1="$out/best-1/last.pt" best.8="$out/best-8/last.pt" \
+"$python" export_heads.py "$out/heads.safetensors" best.1="$out/best-1/last.pt" best.8="$out/whole-8/last.pt" \
     quick.1="$out/quick-1/last.pt" quick.8="$out/quick-8/last.pt" --samples "${some%,}"

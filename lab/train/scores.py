@@ -74,10 +74,11 @@ def compare(sample, step, heads, baselines):
     return out
 
 
-def load_head(path):
-    saved = torch.load(path, weights_only=False, map_location="cpu")
-    head = Head(saved["shape"])
-    head.load_state_dict(saved["average"])
+def load_head(paths):
+    """The averaged weights of a checkpoint; of several, joined by +, their mean."""
+    saved = [torch.load(path, weights_only=False, map_location="cpu") for path in paths.split("+")]
+    head = Head(saved[0]["shape"])
+    head.load_state_dict({k: torch.stack([s["average"][k] for s in saved]).mean(0) for k in saved[0]["average"]})
     return head.eval()
 
 
