@@ -5,8 +5,8 @@
     python3 docs/rd.py    from docs/rd.json: tables, plot, and the list of what falls short
 
 The data folder holds meshes (`val/*.glb`, `train/*.glb`), TMC13's decoded clouds (`gpcc/*.ply.zst`) with their rates (`SOURCES.md`), and
-V-PCC's scores (`vpcc.md`). The cache holds clouds, streams and TMC13's scores, so that only b2p is measured again. B2P and B2P_LAB name
-programs that are built already.
+V-PCC's scores (`vpcc.md`). The cache holds clouds, streams and TMC13's scores, so that only b2p is measured again: remove its `streams` when
+the encoder has changed. B2P and B2P_LAB name programs that are built already, B2P_HEADS a file of heads for `best` and `quick`.
 """
 
 import argparse
@@ -32,7 +32,9 @@ LEVELS = {"s0.25": 8, "s0.5": 9, "s1": 10}
 
 def at_rates(*heads):
     """Streams of every rate that the tables compare at, drawn by these heads."""
-    return lambda rates: [(f"{rate:.4f}", ("--bits-per-point", f"{rate:.4f}"), None, heads) for rate in rates]
+    file = os.environ.get("B2P_HEADS")
+    decode = (*heads, *(("--model", Path(file).resolve()) if file and "surfels" not in heads else ()))
+    return lambda rates: [(f"{rate:.4f}", ("--bits-per-point", f"{rate:.4f}"), None, decode) for rate in rates]
 
 
 def learned(name):
