@@ -133,7 +133,10 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
         "header" | "stream" | "chunking" => {
             let coloured = coloured(&clouds[3].0);
             let new = (target == "header").then(transformed);
-            streams.chain([coloured]).chain(new.into_iter().flatten()).collect()
+            streams
+                .chain([coloured])
+                .chain(new.into_iter().flatten())
+                .collect()
         }
         "transform" => transformed(),
         "ply" => {

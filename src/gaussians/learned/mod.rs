@@ -52,7 +52,7 @@ pub type Set = (Heads, usize);
 
 /// Heads, ready to run.
 pub struct HeadsModel {
-    /// In squares of half a voxel.
+    /// In squares of half the unit.
     blur: f32,
     generators: Vec<(Set, Generator)>,
 }
