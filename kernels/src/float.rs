@@ -3,7 +3,7 @@
 #[cfg(target_arch = "x86_64")]
 use std::sync::OnceLock;
 
-use half::{bf16, f16};
+use ::half::{bf16, f16};
 
 use crate::convert::{self, Halves};
 use crate::isa::Isa;

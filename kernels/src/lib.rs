@@ -43,7 +43,7 @@ pub use double::add_products;
 pub use exact::{ExactConv, LIMIT, Requantise};
 pub use family::{copy_row, window};
 pub use float::{FloatConv, FloatOut, Precision, Scale};
-pub use half::f16;
+pub use ::half::f16;
 pub use isa::{Isa, UnknownIsa};
 pub use map::{MappedFile, map_file};
 pub use memory::{Zeros, give_back, zeros};

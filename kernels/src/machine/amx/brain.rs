@@ -2,7 +2,7 @@
 
 use std::arch::x86_64::*;
 
-use half::{bf16, f16};
+use ::half::{bf16, f16};
 
 use super::{Buffers, LINE, Scheme, Weights, multiply, prepare};
 use crate::plan::PlanTile;
