@@ -38,12 +38,12 @@ pub mod reference;
 pub mod smooth;
 pub mod splat;
 
+pub use ::half::f16;
 pub use convert::{to_f16, to_f32};
 pub use double::add_products;
 pub use exact::{ExactConv, LIMIT, Requantise};
 pub use family::{copy_row, window};
 pub use float::{FloatConv, FloatOut, Precision, Scale};
-pub use ::half::f16;
 pub use isa::{Isa, UnknownIsa};
 pub use map::{MappedFile, map_file};
 pub use memory::{Zeros, give_back, zeros};

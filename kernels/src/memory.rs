@@ -1,8 +1,8 @@
 //! Large blocks of memory.
 
-use bytemuck::Zeroable;
 use ::half::f16;
 use ::half::vec::HalfBitsVecExt;
+use bytemuck::Zeroable;
 
 /// The pages that systems have beside their small ones, on most machines.
 #[cfg(target_os = "linux")]
