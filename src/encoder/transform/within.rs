@@ -14,6 +14,10 @@ use crate::log::Log;
 /// The coarsest place of a level that the stream could do without: a step of luma of 64 255ths.
 const COARSEST: u8 = 112;
 
+/// The same of the level of the cloud's own voxels, whose geometry takes most: a step of luma of 23. In coarser steps the level above makes better pictures
+/// of the same bits.
+const COARSEST_OF_ALL: u8 = 88;
+
 /// The place that is tried first: a step of luma of 11.
 const FIRST: u8 = 72;
 
@@ -25,7 +29,8 @@ struct Place {
 }
 
 /// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and says with which options:
-/// [`encode`](super::encode) makes the same stream of them. `options` say what else is to be; of their levels, the finest may be left out.
+/// [`encode`](super::encode) makes the same stream of them. `options` say what else is to be; of their levels (N − 3 to N of a cloud of N bits by default), the
+/// finest may be left out.
 ///
 /// # Errors
 /// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if the smallest stream has more, and those of
@@ -41,7 +46,9 @@ pub fn encode_within(
             "{bits_per_point} bits per point cannot be kept to: more than 0, and finitely many, can"
         )));
     }
-    let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
+    let depth = cloud.voxels.depth();
+    let wanted = options.levels.clone();
+    let levels = choose_levels(depth, wanted.or(Some(depth.saturating_sub(3)..=depth)))?;
     let subject = Subject::new(cloud, levels.clone(), options, log)?;
     let room = bits_per_point * cloud.voxels.len() as f64 / 8.0;
     let mut search = Search {
@@ -91,7 +98,11 @@ struct Search<'a> {
 impl Search<'_> {
     /// The largest stream with the last level `top` that fits, if there is one; `only` tells that no coarser level could take its place.
     fn level(&mut self, top: u8, only: bool, log: &mut Log) -> Result<Option<(Place, Coded)>> {
-        let last = if only { 2 * MAX_CHROMA } else { COARSEST };
+        let last = match top == self.subject.cloud.voxels.depth() {
+            _ if only => 2 * MAX_CHROMA,
+            true => COARSEST_OF_ALL,
+            false => COARSEST,
+        };
         // Luma and chroma become finer in turn.
         let place = |at: u8| Place {
             top,
