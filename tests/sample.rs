@@ -78,3 +78,27 @@ fn gaussians_generated_in_integers_draw_the_pictures_of_those_generated_in_float
         assert!(psnr > 55.0, "level {level}: {psnr:.1} dB");
     }
 }
+
+#[test]
+fn all_heads_draw_the_scene_and_give_the_same_bits_with_every_instruction_set() {
+    use b2p::decoder::{HeadSet, StreamDecoder};
+    use b2p::gaussians::learned::HeadsModel;
+
+    let heads = std::sync::Arc::new(HeadsModel::from_bytes(b2p::embedded::HEADS).unwrap());
+    for set in [HeadSet::Best, HeadSet::Quick, HeadSet::Surfels] {
+        let draw = |isa| {
+            let decoder = StreamDecoder::new().with_heads_model(heads.clone());
+            let decoder = decoder.with_heads(set).with_isa(isa);
+            let mut log = b2p::log::Log::default();
+            decoder
+                .decode(b2p::embedded::SCENE, Some(7), &mut log)
+                .unwrap()
+        };
+        let gaussians = draw(b2p::Isa::detect());
+        gaussians.check_lengths().unwrap();
+        assert!(gaussians.len() > 10_000, "{set:?}");
+        for isa in b2p::Isa::available() {
+            assert!(draw(isa) == gaussians, "{set:?} on {isa}");
+        }
+    }
+}
