@@ -201,7 +201,9 @@ def tables(rows):
     """Lines by file and mark."""
     series = "best" if any(row["series"] == "best" for row in rows) else "lite"
     more = [line for who in (*OURS[1:], *LEARNED) if any(row["series"] == who for row in rows) for line in (*gains(rows, who, PEER), "")]
-    falls = [f"- `{who}`, {line}" for who, lines in shortfalls(rows).items() for line in lines]
+    short = shortfalls(rows)
+    falls = [f"- `{series}`, {line}" for line in short.get(series, [])]
+    falls += [f"- `{who}`: {len(lines)} scores, listed by `python3 docs/rd.py`." for who, lines in short.items() if who != series]
     prices, residuals = ("0", "0.5", "1", "2", "4"), ("none", "coarse", "96", "48", "24")
     return {
         "README.md": {"rd": gains(rows, series, PEER)},
