@@ -103,7 +103,7 @@ pub struct Encode {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
     pub bits: Option<u8>,
     /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last below N
-    /// [default: N−3..N−1]
+    /// [default: N−3..N−1; with --bits-per-point up to N]
     #[arg(long, value_name = "L..M", value_parser = levels)]
     pub levels: Option<RangeInclusive<u8>>,
     /// Make the best stream of at most X bits for each point of the cloud, the whole file counted: chooses the quantisation step, and

@@ -56,7 +56,7 @@ fn bits_per_point_are_kept_to_and_what_is_said_makes_the_same_stream() {
     assert!(found == by_hand, "what is said makes the same stream");
     let said = succeeds(at, &[&encode[..], &["1000"]].concat());
     assert!(
-        said.contains("of at most 1000: level 6, exact colours"),
+        said.contains("of at most 1000: level 7, exact colours"),
         "{said}"
     );
 }
