@@ -11,9 +11,7 @@ use super::filter::{Responses, TERMS, solve, widen};
 use super::model::{BINS, Circumstances, Model};
 use super::space::{FRACTION, from_rgb};
 use super::transform::forward;
-use super::{
-    Coloured, Pass, Steps, Ycc, coding_above, join, nodes, slices, spread_energies, start,
-};
+use super::{Coloured, Pass, Steps, Ycc, join, nodes, slices, trunk};
 use crate::coding::ONE;
 use crate::coding::binary::Encoder;
 use crate::geometry::{KernelMap, Octree, Voxels};
@@ -124,7 +122,6 @@ pub fn encode_trunk(
     truth: &Truth,
     options: Options,
 ) -> (Vec<u8>, Coloured) {
-    let depth = maps.len() - 1;
     let fraction = options.steps.fraction();
     let half = (1 << fraction) >> 1;
     let root = truth.level(0)[0].map(|x| (x + half) >> fraction);
@@ -140,36 +137,16 @@ pub fn encode_trunk(
         root[1].clamp(-255, 255),
         root[2].clamp(-255, 255),
     ];
-    let mut coloured = start(options.steps, root);
     let mut source = Choosing::new(options.lambda);
-    for level in 1..=depth {
-        let coding = coding_above(options.coding(), depth - level);
-        let mut model = std::mem::replace(&mut coloured.model, Model::empty());
-        let nodes = nodes(
-            octree,
-            level as u8,
-            &maps[level - 1],
-            &maps[level],
-            &coloured,
-        );
-        let range = 0..nodes.masks.len();
-        let truth = Some(truth.level(level as u8));
-        let coded = isa.run(Pass {
-            source: &mut source,
-            model: &mut model,
-            nodes,
-            range,
-            coding,
-            truth,
-        });
-        let energies = spread_energies(nodes, &coded.energies);
-        coloured = Coloured {
-            steps: coding.steps,
-            values: coded.values,
-            energies,
-            model,
-        };
-    }
+    let coloured = trunk(
+        isa,
+        octree,
+        maps,
+        options.coding(),
+        root,
+        &mut source,
+        |level| Some(truth.level(level)),
+    );
     bytes.extend(source.coder.finish());
     (bytes, coloured)
 }

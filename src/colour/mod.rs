@@ -117,7 +117,7 @@ pub fn decode_trunk(
     let (coding, rest) = read_coding(payload, TRUNK_FIXED)?;
     let number = |at: usize| i16::from_le_bytes([payload.bytes[at], payload.bytes[at + 1]]);
     let root = [payload.bytes[3].into(), number(4), number(6)];
-    if root[1..].iter().any(|x| x.abs() > 255) {
+    if root[1..].iter().any(|x| !(-255..=255).contains(x)) {
         let at = format!("byte {}", payload.offset + 4);
         return Err(Error::malformed(
             Stage::Colour,
@@ -127,26 +127,39 @@ pub fn decode_trunk(
             "−255 to 255",
         ));
     }
-    let mut coloured = start(coding.steps, root);
     let mut source = Reading(Decoder::new(rest));
+    let coloured = trunk(isa, octree, maps, coding, root, &mut source, |_| None);
+    source.0.finish(&format!(
+        "byte {}, colours of levels 1 to {depth}",
+        payload.offset
+    ))?;
+    Ok(coloured)
+}
+
+/// Codes the levels 1 to K in turn, from a root of this colour; `coding` is that of level K, `truth` gives an encoder a level's colours.
+fn trunk<'t, S: Source>(
+    isa: Isa,
+    octree: &Octree,
+    maps: &[KernelMap],
+    coding: Coding,
+    root: [i16; 3],
+    source: &mut S,
+    truth: impl Fn(u8) -> Option<&'t [Ycc]>,
+) -> Coloured {
+    let depth = maps.len() - 1;
+    let mut coloured = start(coding.steps, root);
     for level in 1..=depth {
         let coding = coding_above(coding, depth - level);
         let mut model = std::mem::replace(&mut coloured.model, Model::empty());
-        let nodes = nodes(
-            octree,
-            level as u8,
-            &maps[level - 1],
-            &maps[level],
-            &coloured,
-        );
-        let all = 0..nodes.masks.len();
+        let [above, map] = [&maps[level - 1], &maps[level]];
+        let nodes = nodes(octree, level as u8, above, map, &coloured);
         let coded = isa.run(Pass {
-            source: &mut source,
+            source,
             model: &mut model,
             nodes,
-            range: all,
+            range: 0..nodes.masks.len(),
             coding,
-            truth: None,
+            truth: truth(level as u8),
         });
         let energies = spread_energies(nodes, &coded.energies);
         coloured = Coloured {
@@ -156,11 +169,7 @@ pub fn decode_trunk(
             model,
         };
     }
-    source.0.finish(&format!(
-        "byte {}, colours of levels 1 to {depth}",
-        payload.offset
-    ))?;
-    Ok(coloured)
+    coloured
 }
 
 /// Decodes the colours of `level` from those of the level above and one payload for every `slice` nodes. `above_map` and `map` are the 3³ kernel

@@ -374,3 +374,18 @@ fn one_pass_is_what_its_definition_says() {
         );
     }
 }
+
+#[test]
+fn a_root_that_no_colour_has_is_an_error() {
+    let case = Case::bowl(5, 5);
+    let steps = Steps {
+        luma: 32,
+        chroma: 32,
+    };
+    let (mut payloads, _) = case.encode(Isa::detect(), 3, 100, steps);
+    for chroma in [i16::MIN, -256, 256, i16::MAX] {
+        payloads[0][0][4..6].copy_from_slice(&chroma.to_le_bytes());
+        let error = case.decode(Isa::detect(), 3, 100, &payloads).unwrap_err();
+        assert!(error.to_string().contains("root's chroma"), "{error}");
+    }
+}
