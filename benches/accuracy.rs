@@ -41,18 +41,13 @@ fn gaussians(path: Option<&String>) -> Result<Gaussians> {
 fn difference(a: &Image, b: &Image) -> (f32, f64) {
     let (a, b) = (a.pixels.as_flattened(), b.pixels.as_flattened());
     let pairs = a.iter().zip(b);
-    let largest = pairs
-        .clone()
-        .fold(0.0f32, |most, (x, y)| most.max((x - y).abs()));
+    let largest = pairs.clone().fold(0.0f32, |most, (x, y)| most.max((x - y).abs()));
     let squares: f64 = pairs.map(|(x, y)| f64::from(x - y).powi(2)).sum();
     (largest * 255.0, squares / a.len() as f64)
 }
 
 fn main() -> Result<()> {
-    let args: Vec<String> = std::env::args()
-        .skip(1)
-        .filter(|a| a != "--bench")
-        .collect();
+    let args: Vec<String> = std::env::args().skip(1).filter(|a| a != "--bench").collect();
     let scene = gaussians(args.first())?;
     let size = args.get(1).and_then(|n| n.parse().ok()).unwrap_or(512);
     let limits = Limits::default();
@@ -60,14 +55,7 @@ fn main() -> Result<()> {
         let mut worst = [(0.0f32, 0.0f64, Duration::ZERO); FLOORS.len()];
         for turn in 0..TURNS {
             let turns = turn as f64 / TURNS as f64;
-            let camera = Camera::orbit(
-                360.0 * turns,
-                60.0 * turns - 20.0,
-                distance,
-                45.0,
-                size,
-                size,
-            )?;
+            let camera = Camera::orbit(360.0 * turns, 60.0 * turns - 20.0, distance, 45.0, size, size)?;
             let exact = reference::render(&scene, &camera, Background::WHITE, Cutoffs::NONE);
             for (floor, (largest, square, time)) in FLOORS.iter().zip(&mut worst) {
                 let mut renderer = Renderer::default();
@@ -76,13 +64,7 @@ fn main() -> Result<()> {
                 let mut least = Duration::MAX;
                 for _ in 0..FRAMES {
                     let start = Instant::now();
-                    renderer.render_into(
-                        &scene,
-                        &camera,
-                        Background::WHITE,
-                        &limits,
-                        &mut image,
-                    )?;
+                    renderer.render_into(&scene, &camera, Background::WHITE, &limits, &mut image)?;
                     least = least.min(start.elapsed());
                 }
                 let (l, s) = difference(&image, &exact);

@@ -117,10 +117,7 @@ impl Limb {
             let t = random.next() * length;
             std::array::from_fn(|k| from[k] + t * axis[k])
         };
-        (
-            std::array::from_fn(|k| start[k] + radius * normal[k]),
-            normal,
-        )
+        (std::array::from_fn(|k| start[k] + radius * normal[k]), normal)
     }
 }
 
@@ -144,12 +141,9 @@ fn body(count: usize, first: usize) -> Gaussians {
             let point: [f64; 3] = std::array::from_fn(|k| point[k] + offset[k]);
             let morton = point.map(|x| ((x + 1.0) / 2.0 * 2048.0).clamp(0.0, 2047.0) as u64);
             let key = (0..11).fold(0, |key, bit| {
-                (0..3).fold(key, |key, k| {
-                    key | (morton[k] >> bit & 1) << (3 * bit + k as u64)
-                })
+                (0..3).fold(key, |key, k| key | (morton[k] >> bit & 1) << (3 * bit + k as u64))
             });
-            let shade: [f32; 3] =
-                std::array::from_fn(|k| (0.5 + 0.4 * normal[k] + 0.1 * random.next()) as f32);
+            let shade: [f32; 3] = std::array::from_fn(|k| (0.5 + 0.4 * normal[k] + 0.1 * random.next()) as f32);
             splats.push((key, point.map(|x| x as f32), facing(normal), shade));
         }
     }
@@ -158,9 +152,7 @@ fn body(count: usize, first: usize) -> Gaussians {
     let mut scene = Gaussians::default();
     for (_, point, rotation, colour) in splats {
         scene.position.push(point);
-        scene
-            .scale
-            .push([0.9, 1.1, 0.4].map(|s| (s * voxel) as f32));
+        scene.scale.push([0.9, 1.1, 0.4].map(|s| (s * voxel) as f32));
         scene.rotation.push(rotation);
         scene.opacity.push(1.0);
         scene.colour.push(colour);
@@ -276,10 +268,7 @@ fn variants(forced: bool, within: bool) -> Vec<(&'static str, Effects, Channel)>
             (", normals", none, Channel::Normal),
         ]
     } else if within {
-        vec![
-            ("", none, Channel::Colour),
-            (", no care", careless, Channel::Colour),
-        ]
+        vec![("", none, Channel::Colour), (", no care", careless, Channel::Colour)]
     } else {
         vec![("", none, Channel::Colour)]
     }
@@ -297,13 +286,7 @@ fn main() -> Result<()> {
             "--effects" => forced = true,
             "--turn" => turn = args.next().and_then(|n| n.parse().ok()).unwrap_or(0.0),
             "--quality" => quality = args.next().and_then(|n| n.parse().ok()).unwrap_or_default(),
-            "--isa" => {
-                isas = args
-                    .next()
-                    .and_then(|n| n.parse().ok())
-                    .into_iter()
-                    .collect()
-            }
+            "--isa" => isas = args.next().and_then(|n| n.parse().ok()).into_iter().collect(),
             name => names.push(name.to_owned()),
         }
     }
@@ -321,8 +304,7 @@ fn main() -> Result<()> {
                         coefficients: vec![[0.01; 3]; 15 * gaussians.len()],
                     };
                 }
-                let measure =
-                    || measure(isa, name, size, radius, &gaussians, quality, turn, variant);
+                let measure = || measure(isa, name, size, radius, &gaussians, quality, turn, variant);
                 pool.install(measure)?;
                 gaussians.harmonics = Harmonics::default();
             }

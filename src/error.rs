@@ -106,9 +106,7 @@ pub enum Error {
         found: u64,
     },
     /// The input asks for more than the caller allows.
-    #[error(
-        "{what} is {needed}, over the limit of {limit}; raise `{option}` if you trust the input"
-    )]
+    #[error("{what} is {needed}, over the limit of {limit}; raise `{option}` if you trust the input")]
     LimitExceeded {
         /// The quantity.
         what: &'static str,

@@ -69,10 +69,7 @@ enum Target {
     /// Directly: it exists and is no regular file.
     Open(File),
     /// By a rename over `path`, which is no symbolic link.
-    Replace {
-        path: PathBuf,
-        existing: Option<Metadata>,
-    },
+    Replace { path: PathBuf, existing: Option<Metadata> },
 }
 
 impl Target {
@@ -128,10 +125,7 @@ impl Temporary {
         let mut last = None;
         for _ in 0..MAX_NAMES {
             // Each `RandomState` has keys of its own, from the system's random numbers.
-            let name = format!(
-                ".b2p-{:016x}.tmp",
-                RandomState::new().build_hasher().finish()
-            );
+            let name = format!(".b2p-{:016x}.tmp", RandomState::new().build_hasher().finish());
             let path = destination.with_file_name(name);
             match OpenOptions::new().write(true).create_new(true).open(&path) {
                 Ok(file) => {
@@ -163,9 +157,7 @@ impl Drop for Temporary {
 }
 
 fn lock() -> std::sync::MutexGuard<'static, Vec<PathBuf>> {
-    UNFINISHED
-        .lock()
-        .unwrap_or_else(|poisoned| poisoned.into_inner())
+    UNFINISHED.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
 }
 
 #[cfg(test)]

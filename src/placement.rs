@@ -31,8 +31,6 @@ impl Placement {
 
     /// Whether every number is finite and the voxel size positive.
     pub fn is_valid(&self) -> bool {
-        self.origin.iter().all(|x| x.is_finite())
-            && self.voxel_size.is_finite()
-            && self.voxel_size > 0.0
+        self.origin.iter().all(|x| x.is_finite()) && self.voxel_size.is_finite() && self.voxel_size > 0.0
     }
 }

@@ -30,9 +30,7 @@ fn every_level_decodes_to_the_voxels_that_were_encoded() {
     let bytes = coded(&cloud, &model).bytes;
     let octree = Octree::new(cloud.voxels.clone()).unwrap();
     for level in 4..=6 {
-        let exact = Decoder::new(&model)
-            .exact(&bytes, level, &mut Log::default())
-            .unwrap();
+        let exact = Decoder::new(&model).exact(&bytes, level, &mut Log::default()).unwrap();
         assert_eq!(exact.octree, octree.truncated(level));
     }
 }
@@ -43,12 +41,7 @@ fn a_head_gives_one_gaussian_per_voxel_or_one_per_child() {
     let bytes = coded(&cloud, &model).bytes;
     let octree = Octree::new(cloud.voxels.clone()).unwrap();
     let decoder = Decoder::new(&model);
-    let count = |level| {
-        decoder
-            .decode(&bytes, Some(level), &mut Log::default())
-            .unwrap()
-            .len()
-    };
+    let count = |level| decoder.decode(&bytes, Some(level), &mut Log::default()).unwrap().len();
     assert_eq!(count(5), 8 * octree.level(5).len());
     assert_eq!(count(6), octree.level(6).len());
     assert_eq!(decoder.levels(&bytes).unwrap(), [5, 6]);
@@ -105,12 +98,7 @@ fn levels_without_latents_cost_their_geometry_alone_and_are_not_predicted() {
         let encoded = encode(&ball(7, 45.0), &model, &options, &mut log).unwrap();
         let decoder = Decoder::new(&model);
         let mut log = Log::default();
-        assert!(
-            !decoder
-                .decode(&encoded.bytes, None, &mut log)
-                .unwrap()
-                .is_empty()
-        );
+        assert!(!decoder.decode(&encoded.bytes, None, &mut log).unwrap().is_empty());
         for (role, rate) in encoded.rates.iter().enumerate() {
             let has = role < roles;
             assert_eq!(rate.colour_bytes > 0, has, "role {role} of {roles}");
@@ -168,28 +156,17 @@ fn a_stream_cut_after_a_level_is_the_coarser_stream() {
     let encoded = coded(&cloud, &model);
     let decoder = Decoder::new(&model);
     let stream = b2p::bitstream::Header::parse(&encoded.bytes, &Limits::default()).unwrap();
-    let whole = decoder
-        .decode(&encoded.bytes, Some(5), &mut Log::default())
-        .unwrap();
+    let whole = decoder.decode(&encoded.bytes, Some(5), &mut Log::default()).unwrap();
     let cut = &encoded.bytes[..stream.prefix_bytes(5).unwrap() as usize];
-    assert_eq!(
-        decoder.decode(cut, Some(5), &mut Log::default()).unwrap(),
-        whole
-    );
+    assert_eq!(decoder.decode(cut, Some(5), &mut Log::default()).unwrap(), whole);
     assert_eq!(
         decoder.decode(cut, None, &mut Log::default()).unwrap(),
         whole,
         "the default is the finest there is"
     );
-    let error = decoder
-        .decode(cut, Some(6), &mut Log::default())
-        .unwrap_err();
+    let error = decoder.decode(cut, Some(6), &mut Log::default()).unwrap_err();
     assert!(matches!(error, Error::Truncated { .. }), "{error}");
-    let rates: usize = encoded
-        .rates
-        .iter()
-        .map(|r| r.geometry_bytes + r.colour_bytes)
-        .sum();
+    let rates: usize = encoded.rates.iter().map(|r| r.geometry_bytes + r.colour_bytes).sum();
     assert!(
         rates < encoded.bytes.len() && encoded.bytes.len() < rates + 200,
         "rates account for all but the header"
@@ -204,15 +181,10 @@ fn streams_and_decoded_latents_are_the_same_for_any_number_of_threads() {
         "more than one slice"
     );
     let run = |threads| {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .build()
-            .unwrap();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let bytes = coded(&cloud, &model).bytes;
-            let exact = Decoder::new(&model)
-                .exact(&bytes, 7, &mut Log::default())
-                .unwrap();
+            let exact = Decoder::new(&model).exact(&bytes, 7, &mut Log::default()).unwrap();
             let gaussians = Decoder::new(&model)
                 .decode(&bytes, Some(7), &mut Log::default())
                 .unwrap();
@@ -230,9 +202,7 @@ fn the_exact_zone_is_the_same_on_every_instruction_set_of_this_machine() {
     let bytes = coded(&cloud, &model()).bytes;
     let exact = |isa| {
         let model = model().with_isa(isa);
-        Decoder::new(&model)
-            .exact(&bytes, 6, &mut Log::default())
-            .unwrap()
+        Decoder::new(&model).exact(&bytes, 6, &mut Log::default()).unwrap()
     };
     let plain = exact(b2p_kernels::Isa::SCALAR);
     for isa in b2p_kernels::Isa::available() {
@@ -245,9 +215,7 @@ fn unusual_clouds_survive() {
     let model = model();
     let corner = |depth: u8| (1u64 << (3 * depth)) - 1;
     let full: Vec<u64> = (0..512).collect();
-    let checkerboard = (0..4096u64)
-        .filter(|k| (k ^ k >> 1 ^ k >> 2) & 1 == 0)
-        .collect();
+    let checkerboard = (0..4096u64).filter(|k| (k ^ k >> 1 ^ k >> 2) & 1 == 0).collect();
     let clouds = [
         ("one voxel", cloud_of(10, vec![123])),
         ("two far corners", cloud_of(10, vec![0, corner(10)])),
@@ -262,19 +230,12 @@ fn unusual_clouds_survive() {
     for (name, cloud) in clouds {
         let bytes = coded(&cloud, &model).bytes;
         let decoder = Decoder::new(&model);
-        let top = *decoder
-            .levels(&bytes)
-            .unwrap()
-            .last()
-            .expect("a level with Gaussians");
+        let top = *decoder.levels(&bytes).unwrap().last().expect("a level with Gaussians");
         let gaussians = decoder
             .decode(&bytes, None, &mut Log::default())
             .unwrap_or_else(|e| panic!("{name}: {e}"));
         assert!(!gaussians.is_empty(), "{name}");
-        assert!(
-            gaussians.position.iter().flatten().all(|v| v.abs() <= 1.5),
-            "{name}"
-        );
+        assert!(gaussians.position.iter().flatten().all(|v| v.abs() <= 1.5), "{name}");
         assert_eq!(top, cloud.voxels.depth() - 1, "{name}");
     }
 }
@@ -335,9 +296,7 @@ fn the_placement_of_the_cloud_comes_back_with_the_gaussians() {
         voxel_size: 0.125,
     };
     let bytes = coded(&cloud, &model).bytes;
-    let gaussians = Decoder::new(&model)
-        .decode(&bytes, None, &mut Log::default())
-        .unwrap();
+    let gaussians = Decoder::new(&model).decode(&bytes, None, &mut Log::default()).unwrap();
     assert_eq!(gaussians.frame.placement, cloud.placement);
     assert_eq!(gaussians.frame.bits, 6);
 }
@@ -350,9 +309,7 @@ fn a_bit_costs_nothing_where_the_model_does_not_say() {
             bit_price,
             ..Options::default()
         };
-        encode(&cloud, &model, &options, &mut Log::default())
-            .unwrap()
-            .bytes
+        encode(&cloud, &model, &options, &mut Log::default()).unwrap().bytes
     };
     assert!(bytes(1.0) == bytes(0.0));
 }
@@ -368,10 +325,7 @@ fn levels_left_out_at_the_fine_end_change_nothing_above_them() {
         };
         let coded = encode(&cloud, &model, &options, &mut Log::default()).unwrap();
         let decoder = Decoder::new(&model);
-        decoder
-            .exact(&coded.bytes, 4, &mut Log::default())
-            .unwrap()
-            .features
+        decoder.exact(&coded.bytes, 4, &mut Log::default()).unwrap().features
     };
     let all = features(6);
     assert!(features(5) == all && features(4) == all);

@@ -105,14 +105,9 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
             for rate in &plain.rates[1..] {
                 let level = rate.level;
                 let bytes = [&plain.bytes, &refined.bytes];
-                let exact =
-                    bytes.map(|bytes| decoder.exact(bytes, level, &mut Log::default()).unwrap());
+                let exact = bytes.map(|bytes| decoder.exact(bytes, level, &mut Log::default()).unwrap());
                 assert_eq!(exact[0], exact[1]);
-                let decode = |bytes: &Vec<u8>| {
-                    decoder
-                        .decode(bytes, Some(level), &mut Log::default())
-                        .unwrap()
-                };
+                let decode = |bytes: &Vec<u8>| decoder.decode(bytes, Some(level), &mut Log::default()).unwrap();
                 let [before, after] = bytes.map(decode);
                 let recoloured = Gaussians {
                     colour: after.colour.clone(),
@@ -165,11 +160,7 @@ fn every_level_that_is_drawn_may_have_a_residual_of_its_own() {
             .collect();
         let off = |encoded| {
             let gaussians = decode(encoded, level);
-            let pairs = gaussians
-                .colour
-                .as_flattened()
-                .iter()
-                .zip(want.as_flattened());
+            let pairs = gaussians.colour.as_flattened().iter().zip(want.as_flattened());
             pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>()
         };
         let (before, after) = (off(&finest), off(&all));
@@ -192,11 +183,7 @@ fn quick_heads_are_corrected_by_the_same_residual() {
         let decoder = Decoder::new(&model).with_heads(heads).unwrap();
         let decode = |bytes| decoder.decode(bytes, None, &mut Log::default()).unwrap();
         let (before, after) = (decode(&plain.bytes), decode(&bytes));
-        let pairs = before
-            .colour
-            .as_flattened()
-            .iter()
-            .zip(after.colour.as_flattened());
+        let pairs = before.colour.as_flattened().iter().zip(after.colour.as_flattened());
         for (before, after) in pairs {
             let want = (before - 0.1).max(0.0);
             assert!((after - want).abs() < 0.001, "{heads}: {before} to {after}");
@@ -210,16 +197,10 @@ fn what_is_wide_of_what_colours_are_off_is_coded_unless_said_otherwise() {
     let encoded = |filter, residual| encoded_with(&model, &cloud, filter, residual);
     let has = |encoded: &Encoded| {
         let stream = Stream::parse(&encoded.bytes, &Limits::default()).unwrap();
-        stream
-            .levels()
-            .iter()
-            .any(|level| !level.residual.is_empty())
+        stream.levels().iter().any(|level| !level.residual.is_empty())
     };
     assert_eq!(Options::default().residual, Residual::Coarse);
-    let (none, coarse) = (
-        encoded(true, Residual::None),
-        encoded(true, Residual::Coarse),
-    );
+    let (none, coarse) = (encoded(true, Residual::None), encoded(true, Residual::Coarse));
     assert!(has(&coarse) && !has(&none));
     assert!(!has(&encoded(false, Residual::Coarse)));
     let decoder = Decoder::new(&model);
@@ -248,12 +229,7 @@ fn what_is_wide_of_what_colours_are_off_is_coded_unless_said_otherwise() {
 }
 
 /// A cloud, coded with these corrections of its colours.
-fn encoded_with(
-    model: &Model,
-    cloud: &ColouredVoxels,
-    filter: bool,
-    residual: Residual,
-) -> Encoded {
+fn encoded_with(model: &Model, cloud: &ColouredVoxels, filter: bool, residual: Residual) -> Encoded {
     let options = Options {
         filter,
         residual,

@@ -41,10 +41,7 @@ fn models() -> Vec<(&'static str, Model)> {
     };
     let load = |bytes: &[u8]| Model::from_bytes(bytes).expect("a model loads");
     vec![
-        (
-            "tiny",
-            load(&untrained(&Shape::tiny().with_quick_heads(), 0)),
-        ),
+        ("tiny", load(&untrained(&Shape::tiny().with_quick_heads(), 0))),
         ("wide", load(&untrained(&wide, 0))),
         #[cfg(feature = "cli")]
         ("lite", load(b2p::embedded::MODEL)),
@@ -74,28 +71,18 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
                 residual: Residual::Fine(steps(4)),
                 ..Options::default()
             };
-            let bytes = encode(&cloud, &model, &options, &mut Log::default())
-                .unwrap()
-                .bytes;
+            let bytes = encode(&cloud, &model, &options, &mut Log::default()).unwrap().bytes;
             let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
             let levels = decoder.levels(&bytes).unwrap();
-            for (decoder, level) in decoders
-                .iter()
-                .flat_map(|d| levels.iter().map(move |l| (d, *l)))
-            {
+            for (decoder, level) in decoders.iter().flat_map(|d| levels.iter().map(move |l| (d, *l))) {
                 let most = decoder.memory(&header, level).unwrap();
                 let decode = || decoder.decode(&bytes, Some(level), &mut Log::default());
                 // Threads start, and weights are put in order, the first time.
                 decode().unwrap();
                 let (gaussians, held) = peak(decode);
                 let count = gaussians.unwrap().len();
-                println!(
-                    "{name}, {kind}, level {level}, {count} Gaussians: {held} of {most} bytes"
-                );
-                assert!(
-                    held <= most + Limits::OVERHEAD,
-                    "{name}, {kind}, level {level}: {held}"
-                );
+                println!("{name}, {kind}, level {level}, {count} Gaussians: {held} of {most} bytes");
+                assert!(held <= most + Limits::OVERHEAD, "{name}, {kind}, level {level}: {held}");
             }
         }
     }
@@ -128,10 +115,7 @@ fn decoding_version_3_holds_no_more_than_its_header_allows_to_foretell() {
                 let (gaussians, held) = peak(decode);
                 let count = gaussians.unwrap().len();
                 println!("{kind}, level {level}, {count} Gaussians: {held} of {most} bytes");
-                assert!(
-                    held <= most + Limits::OVERHEAD,
-                    "{kind}, level {level}: {held}"
-                );
+                assert!(held <= most + Limits::OVERHEAD, "{kind}, level {level}: {held}");
             }
             let limits = Limits {
                 max_bytes: decoder.memory(&header, header.top).unwrap() - 1,
@@ -150,22 +134,13 @@ fn a_decode_gives_back_all_that_it_reserved_whether_it_succeeds_or_fails() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let (_, model) = models().remove(0);
     let options = Options::default();
-    let bytes = encode(
-        &Ball::new(7, 50.0).cloud(),
-        &model,
-        &options,
-        &mut Log::default(),
-    )
-    .unwrap()
-    .bytes;
+    let bytes = encode(&Ball::new(7, 50.0).cloud(), &model, &options, &mut Log::default())
+        .unwrap()
+        .bytes;
     let (mut cut, mut damaged) = (bytes.clone(), bytes.clone());
     cut.truncate(bytes.len() * 9 / 10);
     damaged[bytes.len() * 9 / 10] ^= 1;
-    for (kind, bytes, sound) in [
-        ("whole", bytes, true),
-        ("cut", cut, false),
-        ("damaged", damaged, false),
-    ] {
+    for (kind, bytes, sound) in [("whole", bytes, true), ("cut", cut, false), ("damaged", damaged, false)] {
         let decode = || {
             let decoded = Decoder::new(&model).decode(&bytes, None, &mut Log::default());
             assert_eq!(decoded.is_ok(), sound, "{kind}");
@@ -186,9 +161,7 @@ fn a_stream_over_the_memory_limit_is_refused_almost_for_nothing() {
     let (_, model) = models().remove(0);
     let cloud = Ball::new(7, 50.0).cloud();
     let options = Options::default();
-    let bytes = encode(&cloud, &model, &options, &mut Log::default())
-        .unwrap()
-        .bytes;
+    let bytes = encode(&cloud, &model, &options, &mut Log::default()).unwrap().bytes;
     let header = Header::parse(&bytes, &Limits::default()).unwrap();
     let needed = Decoder::new(&model).memory(&header, 6).unwrap();
     let limits = |max_bytes| Limits {
@@ -247,10 +220,7 @@ fn a_bomb_of_a_hundred_bytes_reserves_nothing() {
                 }
             };
             let (refused, held) = peak(decode);
-            let expected = matches!(
-                refused,
-                Err(Error::LimitExceeded { .. } | Error::Truncated { .. })
-            );
+            let expected = matches!(refused, Err(Error::LimitExceeded { .. } | Error::Truncated { .. }));
             assert!(expected, "{refused:?}");
             assert!(held < 1 << 12, "{held} bytes");
         }
@@ -292,10 +262,7 @@ fn drawing_stays_within_the_memory_limit() {
         for max_bytes in [needed, 2 * needed, 1 << 30] {
             let (picture, held) = peak(|| draw(max_bytes));
             match picture {
-                Ok(_) => assert!(
-                    held <= max_bytes + Limits::OVERHEAD,
-                    "{held} of {max_bytes}"
-                ),
+                Ok(_) => assert!(held <= max_bytes + Limits::OVERHEAD, "{held} of {max_bytes}"),
                 // The fullest tile is known only when all Gaussians have been looked at.
                 Err(Error::LimitExceeded { .. }) => assert!(held <= max_bytes + Limits::OVERHEAD),
                 Err(error) => panic!("{error}"),
@@ -338,10 +305,7 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
     };
     let plain = Effects::default();
     let on = Choice::On;
-    let antialias = Effects {
-        antialias: on,
-        ..plain
-    };
+    let antialias = Effects { antialias: on, ..plain };
     let order = Effects { order: on, ..plain };
     // One thread: of several, each takes what it needs when the fullest tile first comes to it.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1);
@@ -359,8 +323,7 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
                 for channel in [Channel::Colour, Channel::Depth] {
                     let over = Background::WHITE;
                     let image = &mut image;
-                    let stats =
-                        renderer.draw_into(&gaussians, &camera, channel, over, &limits, image);
+                    let stats = renderer.draw_into(&gaussians, &camera, channel, over, &limits, image);
                     assert_eq!(stats.unwrap().crossing > 0, crossing);
                 }
                 let stats = renderer.ids_into(&gaussians, &camera, &limits, &mut ids);

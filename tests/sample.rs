@@ -90,9 +90,7 @@ fn all_heads_draw_the_scene_and_give_the_same_bits_with_every_instruction_set() 
             let decoder = StreamDecoder::new().with_heads_model(heads.clone());
             let decoder = decoder.with_heads(set).with_isa(isa);
             let mut log = b2p::log::Log::default();
-            decoder
-                .decode(b2p::embedded::SCENE, Some(7), &mut log)
-                .unwrap()
+            decoder.decode(b2p::embedded::SCENE, Some(7), &mut log).unwrap()
         };
         let gaussians = draw(b2p::Isa::detect());
         gaussians.check_lengths().unwrap();

@@ -72,10 +72,7 @@ const FORBIDDEN: [(&str, &str); 26] = [
     (".sin(", "libraries differ in the last bit"),
     (".cos(", "libraries differ in the last bit"),
     (".cbrt(", "libraries differ in the last bit"),
-    (
-        ".mul_add(",
-        "fused where the machine can, rounded twice elsewhere",
-    ),
+    (".mul_add(", "fused where the machine can, rounded twice elsewhere"),
     ("HashMap", "its order differs from run to run"),
     ("HashSet", "its order differs from run to run"),
     (".sum::<f32>", "a float sum depends on its order"),
@@ -122,9 +119,9 @@ fn code(file: &Path) -> Vec<(usize, String)> {
         .lines()
         .map(|line| line.split("//").next().unwrap_or("").to_owned());
     let lines = (1..).zip(lines).collect::<Vec<_>>();
-    let tests = lines.windows(2).position(|pair| {
-        pair[0].1.trim() == "#[cfg(test)]" && pair[1].1.trim_start().starts_with("mod tests {")
-    });
+    let tests = lines
+        .windows(2)
+        .position(|pair| pair[0].1.trim() == "#[cfg(test)]" && pair[1].1.trim_start().starts_with("mod tests {"));
     lines[..tests.unwrap_or(lines.len())].to_vec()
 }
 
@@ -157,10 +154,7 @@ fn the_exact_zone_uses_nothing_that_differs_between_machines() {
             }
         }
     }
-    assert!(
-        looked_at > 2000,
-        "only {looked_at} lines: has the exact zone moved?"
-    );
+    assert!(looked_at > 2000, "only {looked_at} lines: has the exact zone moved?");
     assert!(faults.is_empty(), "{}", faults.join("\n"));
 }
 
@@ -232,12 +226,7 @@ fn every_public_function_that_can_fail_says_how() {
 
 #[test]
 fn unsafe_stands_only_in_the_kernels_and_at_the_c_border() {
-    for library in [
-        "src/lib.rs",
-        "src/main.rs",
-        "lab/src/lib.rs",
-        "lab/src/bin/b2p-lab.rs",
-    ] {
+    for library in ["src/lib.rs", "src/main.rs", "lab/src/lib.rs", "lab/src/bin/b2p-lab.rs"] {
         let text = std::fs::read_to_string(root().join(library)).expect("a readable source");
         let forbids = text.contains("#![forbid(unsafe_code)]");
         assert!(forbids, "{library} does not forbid unsafe code");
@@ -273,13 +262,7 @@ fn no_file_has_grown_past_500_lines() {
 fn the_bare_decoder_stands_on_few_crates() {
     let tree = std::process::Command::new(env!("CARGO"))
         .current_dir(root())
-        .args([
-            "tree",
-            "--locked",
-            "--package",
-            "b2p",
-            "--no-default-features",
-        ])
+        .args(["tree", "--locked", "--package", "b2p", "--no-default-features"])
         .args(["--edges", "normal", "--prefix", "none", "--format", "{p}"])
         .output()
         .expect("cargo lists the crates");

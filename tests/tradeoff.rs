@@ -121,10 +121,7 @@ fn the_page_has_all_its_parts_and_more_precise_is_never_less_accurate() {
     }
     for row in ladder.iter().filter(|row| row["knob"] == "isa") {
         let apart = decibel(row) - decibel(default);
-        assert!(
-            apart.abs() < 0.5,
-            "instructions change last bits alone: {row}"
-        );
+        assert!(apart.abs() < 0.5, "instructions change last bits alone: {row}");
     }
 
     let combinations = report["combinations"].as_array().unwrap();
@@ -153,9 +150,7 @@ fn the_page_has_all_its_parts_and_more_precise_is_never_less_accurate() {
         assert!(worst(case, "exact") <= 2.0, "{case}");
         assert!(worst(case, "exact") <= worst(case, "fast") + 0.3, "{case}");
     }
-    let layers = cases
-        .iter()
-        .find(|case| case["name"] == "1000 layers of 1/300");
+    let layers = cases.iter().find(|case| case["name"] == "1000 layers of 1/300");
     let layers = layers.expect("the layers are there");
     assert!(worst(layers, "fast") > 100.0, "fast leaves all of them out");
     assert!(report["network_cases"].as_array().unwrap().len() >= 5);
@@ -201,16 +196,9 @@ fn a_budget_chooses_says_so_and_measures_once() {
     let render = ["render", "ball.b2p", "-o", "a.png", "--size", "64x48"];
     let drawn = succeeds(
         at,
-        &[
-            &render[..],
-            &model,
-            &["--budget", "1000s", "--min-psnr", "1"],
-        ]
-        .concat(),
+        &[&render[..], &model, &["--budget", "1000s", "--min-psnr", "1"]].concat(),
     );
-    let line = drawn
-        .lines()
-        .find(|line| line.starts_with("budget: level 5, "));
+    let line = drawn.lines().find(|line| line.starts_with("budget: level 5, "));
     assert!(line.is_some_and(|l| l.contains("; kept: ")), "{drawn}");
 }
 
@@ -228,13 +216,7 @@ fn a_hostile_cache_harms_nobody() {
     };
     let sound = std::fs::read_to_string(&path).unwrap();
     let costly = sound.replace("\"start\":", "\"start\": 1e300, \"begin\":");
-    for hostile in [
-        "",
-        "{\"exact\": 3}",
-        "[[[[",
-        &costly,
-        &sound[..sound.len() / 2],
-    ] {
+    for hostile in ["", "{\"exact\": 3}", "[[[[", &costly, &sound[..sound.len() / 2]] {
         std::fs::write(&path, hostile).unwrap();
         let text = succeeds(at, &arguments);
         assert!(text.starts_with("budget: level 5, "), "{text}");
@@ -276,10 +258,7 @@ fn a_budget_and_a_knob_exclude_each_other_and_pipes_and_gaussians_have_none() {
     misuse(&[&render[..], &["--min-psnr", "40"]].concat());
 
     let model = ["--model", "tiny.safetensors"];
-    succeeds(
-        at,
-        &[&["decode", "ball.b2p", "-o", "g.ply"], &model[..]].concat(),
-    );
+    succeeds(at, &[&["decode", "ball.b2p", "-o", "g.ply"], &model[..]].concat());
     for (input, word) in [("g.ply", "PLY"), ("-", "pipe")] {
         let arguments = ["render", input, "-o", "x.png", "--budget", "1s"];
         let output = b2p(at, &arguments);

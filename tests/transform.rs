@@ -62,9 +62,7 @@ fn told(decoding: &StreamDecoding) -> Option<(Vec<u64>, Vec<[u8; 3]>)> {
 fn means(cloud: &ColouredVoxels, level: u8) -> (Vec<u64>, Vec<[u8; 3]>) {
     let mut sums: BTreeMap<u64, ([u32; 3], u32)> = BTreeMap::new();
     for (key, colour) in cloud.voxels.keys().iter().zip(&cloud.colours) {
-        let (sum, count) = sums
-            .entry(key >> (3 * (cloud.voxels.depth() - level)))
-            .or_default();
+        let (sum, count) = sums.entry(key >> (3 * (cloud.voxels.depth() - level))).or_default();
         for (sum, c) in sum.iter_mut().zip(colour) {
             *sum += u32::from(*c);
         }
@@ -107,10 +105,7 @@ fn smaller_steps_take_more_bytes_and_are_nearer() {
         let decoded = points(&bytes, None).unwrap();
         assert_eq!(decoded.0, keys);
         let own = (bytes.len(), error(&decoded.1, &truth));
-        assert!(
-            own.0 > last.0 && own.1 < last.1,
-            "{step}: {own:?}, {last:?}"
-        );
+        assert!(own.0 > last.0 && own.1 < last.1, "{step}: {own:?}, {last:?}");
         assert!(own.1 < f64::from(step).powi(2), "{step}: {own:?}");
         last = own;
     }
@@ -155,10 +150,7 @@ fn streams_are_the_same_for_any_threads_and_instructions_and_so_is_what_they_dec
     for threads in [1, 2, 7] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
         let pool = pool.build().unwrap();
-        assert!(
-            pool.install(|| all(Isa::detect())) == scalar,
-            "{threads} threads"
-        );
+        assert!(pool.install(|| all(Isa::detect())) == scalar, "{threads} threads");
     }
 }
 
@@ -238,9 +230,7 @@ fn one_decoder_decodes_both_versions_and_says_which_model_version_2_needs() {
     let model = std::sync::Arc::new(Model::from_bytes(&tiny_model(3)).unwrap());
     let log = &mut Log::default();
     let options = b2p::encoder::Options::default();
-    let old = b2p::encoder::encode(&cloud, &model, &options, log)
-        .unwrap()
-        .bytes;
+    let old = b2p::encoder::encode(&cloud, &model, &options, log).unwrap().bytes;
     let new = stream(&cloud, &Options::default());
     let without = StreamDecoder::new();
     assert!(without.decode(&new, None, log).is_ok());
@@ -264,10 +254,7 @@ fn one_decoder_decodes_both_versions_and_says_which_model_version_2_needs() {
         Err(Error::Unsupported { .. })
     ));
     assert_eq!(
-        HeadSet::from(Heads::Quick)
-            .to_string()
-            .parse::<HeadSet>()
-            .unwrap(),
+        HeadSet::from(Heads::Quick).to_string().parse::<HeadSet>().unwrap(),
         HeadSet::Quick
     );
 }

@@ -15,12 +15,7 @@ fn model() -> Model {
     Model::from_bytes(b2p::embedded::MODEL).expect("the model inside the program loads")
 }
 
-fn within(
-    bits: f64,
-    cloud: &ColouredVoxels,
-    model: &Model,
-    options: &Options,
-) -> Result<(Encoded, Options), Error> {
+fn within(bits: f64, cloud: &ColouredVoxels, model: &Model, options: &Options) -> Result<(Encoded, Options), Error> {
     encode_within(cloud, model, options, bits, &mut Log::default())
 }
 
@@ -38,8 +33,7 @@ fn place(chosen: &Options) -> (u8, f32, i16) {
 }
 
 #[test]
-fn streams_take_no_more_than_was_asked_for_and_nearly_all_of_it_and_more_room_is_never_to_the_worse()
- {
+fn streams_take_no_more_than_was_asked_for_and_nearly_all_of_it_and_more_room_is_never_to_the_worse() {
     let (model, cloud) = (model(), Ball::new(6, 25.0).cloud());
     let coded = |options: &Options| {
         let coded = encode(&cloud, &model, options, &mut Log::default());
@@ -81,11 +75,7 @@ fn fewer_bits_than_can_be_are_refused_and_the_least_that_is_named_can_be_had() {
     assert_eq!(bits_of(&encoded, &cloud), least);
     assert!(chosen.bit_price >= 1.0);
     let said = |least: f64| Error::TooFewBits { asked, least }.to_string();
-    assert!(
-        said(0.12341).ends_with(" 0.1235"),
-        "rounded up: {}",
-        said(0.12341)
-    );
+    assert!(said(0.12341).ends_with(" 0.1235"), "rounded up: {}", said(0.12341));
 }
 
 #[test]
@@ -157,15 +147,9 @@ fn each_try_is_told_as_it_begins_and_there_are_at_most_seven() {
     let mut log = Log::with_listener(&listener);
     encode_within(&cloud, &model, &Options::default(), 8.0, &mut log).unwrap();
     let heard = heard.borrow();
-    let tries: Vec<_> = heard
-        .iter()
-        .filter(|step| step.starts_with("try "))
-        .collect();
+    let tries: Vec<_> = heard.iter().filter(|step| step.starts_with("try ")).collect();
     assert!((1..=7).contains(&tries.len()), "{heard:?}");
     for (i, step) in (1..).zip(tries) {
-        assert!(
-            step.starts_with(&format!("try {i} of 7: bit price ")),
-            "{step}"
-        );
+        assert!(step.starts_with(&format!("try {i} of 7: bit price ")), "{step}");
     }
 }

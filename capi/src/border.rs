@@ -68,11 +68,7 @@ impl From<Error> for Fault {
 ///
 /// # Safety
 /// `message` is NULL or leads to `size` writable bytes.
-pub unsafe fn guard(
-    message: *mut c_char,
-    size: usize,
-    run: impl FnOnce() -> Result<(), Fault>,
-) -> Status {
+pub unsafe fn guard(message: *mut c_char, size: usize, run: impl FnOnce() -> Result<(), Fault>) -> Status {
     let done = catch_unwind(AssertUnwindSafe(run));
     let (status, text) = match done {
         Ok(Ok(())) => (Status::Ok, String::new()),

@@ -47,11 +47,7 @@ pub struct Arrays {
 /// # Safety
 /// `cancel` is writable; `message` is NULL or leads to `size` bytes.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn b2p_cancel_new(
-    cancel: *mut *mut Cancel,
-    message: *mut c_char,
-    size: usize,
-) -> Status {
+pub unsafe extern "C" fn b2p_cancel_new(cancel: *mut *mut Cancel, message: *mut c_char, size: usize) -> Status {
     // SAFETY: the caller vouches for `cancel`.
     let run = || unsafe { give(cancel, "cancel", Cancel::default()) };
     // SAFETY: the caller vouches for `message`.
@@ -196,8 +192,7 @@ pub unsafe extern "C" fn b2p_decoding_use_heads_model(
 ) -> Status {
     let run = || {
         // SAFETY: the caller vouches for `decoding` and `heads`.
-        let (decoding, heads) =
-            unsafe { (changed(decoding, "decoding")?, borrowed(heads, "heads")?) };
+        let (decoding, heads) = unsafe { (changed(decoding, "decoding")?, borrowed(heads, "heads")?) };
         decoding.0.set_heads_model(Arc::clone(&heads.0));
         Ok(())
     };
@@ -219,12 +214,7 @@ pub unsafe extern "C" fn b2p_decoding_push(
 ) -> Status {
     let run = || {
         // SAFETY: the caller vouches for `decoding` and `bytes`.
-        let (decoding, bytes) = unsafe {
-            (
-                changed(decoding, "decoding")?,
-                slice(bytes, length, "bytes")?,
-            )
-        };
+        let (decoding, bytes) = unsafe { (changed(decoding, "decoding")?, slice(bytes, length, "bytes")?) };
         decoding.0.push(bytes);
         Ok(())
     };
@@ -246,13 +236,9 @@ pub unsafe extern "C" fn b2p_decoding_advance(
 ) -> Status {
     let run = || {
         // SAFETY: the caller vouches for `decoding` and `level`.
-        let (decoding, level) =
-            unsafe { (changed(decoding, "decoding")?, changed(level, "level")?) };
+        let (decoding, level) = unsafe { (changed(decoding, "decoding")?, changed(level, "level")?) };
         *level = -1;
-        *level = decoding
-            .0
-            .advance(&mut Log::default())?
-            .map_or(-1, i32::from);
+        *level = decoding.0.advance(&mut Log::default())?.map_or(-1, i32::from);
         Ok(())
     };
     // SAFETY: the caller vouches for `message`.
@@ -265,11 +251,7 @@ pub unsafe extern "C" fn b2p_decoding_advance(
 /// # Safety
 /// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn b2p_decoding_finish(
-    decoding: *mut Decoding,
-    message: *mut c_char,
-    size: usize,
-) -> Status {
+pub unsafe extern "C" fn b2p_decoding_finish(decoding: *mut Decoding, message: *mut c_char, size: usize) -> Status {
     let run = || {
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { changed(decoding, "decoding") }?;
@@ -287,9 +269,7 @@ pub unsafe extern "C" fn b2p_decoding_finish(
 pub unsafe extern "C" fn b2p_decoding_level(decoding: *const Decoding) -> i32 {
     // SAFETY: the caller vouches for `decoding`.
     let decoding = unsafe { decoding.as_ref() };
-    decoding
-        .and_then(|decoding| decoding.0.level())
-        .map_or(-1, i32::from)
+    decoding.and_then(|decoding| decoding.0.level()).map_or(-1, i32::from)
 }
 
 /// Frees a decoding. Gaussians that were made of it stay.
@@ -337,12 +317,7 @@ pub unsafe extern "C" fn b2p_gaussians_arrays(
 ) -> Status {
     let run = || {
         // SAFETY: the caller vouches for `gaussians` and `arrays`.
-        let (Gaussians(g), arrays) = unsafe {
-            (
-                borrowed(gaussians, "gaussians")?,
-                changed(arrays, "arrays")?,
-            )
-        };
+        let (Gaussians(g), arrays) = unsafe { (borrowed(gaussians, "gaussians")?, changed(arrays, "arrays")?) };
         *arrays = Arrays {
             count: g.len(),
             position: g.position.as_ptr().cast(),

@@ -90,9 +90,7 @@ pub unsafe extern "C" fn b2p_model_open(
         }
         // SAFETY: the caller vouches for a string.
         let path = unsafe { CStr::from_ptr(path) };
-        let path = path
-            .to_str()
-            .map_err(|_| Fault::usage("path is not UTF-8"))?;
+        let path = path.to_str().map_err(|_| Fault::usage("path is not UTF-8"))?;
         let loaded = b2p::network::Model::open(Path::new(path))?;
         // SAFETY: the caller vouches for `model`.
         unsafe { give(model, "model", Model(Arc::new(loaded))) }

@@ -90,17 +90,12 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     if Command::new("valgrind").arg("--version").output().is_ok() {
         let mut valgrind = Command::new("valgrind");
         valgrind.args(["-q", "--error-exitcode=9", "--leak-check=full"]);
-        valgrind
-            .args(["--errors-for-leak-kinds=definite"])
-            .arg(at("plain"));
+        valgrind.args(["--errors-for-leak-kinds=definite"]).arg(at("plain"));
         programs.push(("under valgrind", valgrind));
     } else {
         println!("NOT RUN: there is no valgrind");
     }
-    assert!(
-        programs.len() > 1,
-        "nothing here watches a program's memory"
-    );
+    assert!(programs.len() > 1, "nothing here watches a program's memory");
     for (how, mut program) in programs {
         program.args([at("model"), at("stream"), at("both"), at("new")]);
         let output = program.output().expect("the program starts");

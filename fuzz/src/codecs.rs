@@ -8,9 +8,8 @@ use std::sync::LazyLock;
 
 use b2p::bitstream::Slice;
 use b2p::entropy::{
-    Condition, Part, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level,
-    decode_passes, decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice,
-    quantise, quantise_passes,
+    Condition, Part, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
+    decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice, quantise, quantise_passes,
 };
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::{Cancel, Isa};
@@ -39,25 +38,11 @@ pub fn octree(bytes: &[u8]) {
     for level in 1..=depth {
         let encoded = codec::encode_level(Isa::detect(), &octree, &map, level, slice);
         let slices: Vec<_> = encoded.iter().map(|(n, code)| whole(*n, code)).collect();
-        codec::decode_level(
-            Isa::detect(),
-            &mut decoded,
-            &map,
-            &slices,
-            slice,
-            &Cancel::default(),
-        )
-        .expect("what was encoded decodes");
+        codec::decode_level(Isa::detect(), &mut decoded, &map, &slices, slice, &Cancel::default())
+            .expect("what was encoded decodes");
         assert_eq!(decoded, octree.truncated(level));
         let fewer = &slices[1..];
-        let refused = codec::decode_level(
-            Isa::detect(),
-            &mut decoded,
-            &map,
-            fewer,
-            slice,
-            &Cancel::default(),
-        );
+        let refused = codec::decode_level(Isa::detect(), &mut decoded, &map, fewer, slice, &Cancel::default());
         assert!(refused.is_err(), "a slice is missing");
         assert_eq!(decoded, octree.truncated(level));
         map = octree.child_map(level - 1, &map);
@@ -74,14 +59,9 @@ pub fn octree(bytes: &[u8]) {
     let Ok(masks) = codec::decode_slice(Isa::detect(), depth + 1, &map, 0..parents, &slice) else {
         return;
     };
-    assert_eq!(
-        masks.iter().map(|m| m.count_ones() as usize).sum::<usize>(),
-        voxels
-    );
+    assert_eq!(masks.iter().map(|m| m.count_ones() as usize).sum::<usize>(), voxels);
     let mut grown = octree.clone();
-    grown
-        .grow(masks)
-        .expect("one occupancy for every parent, none empty");
+    grown.grow(masks).expect("one occupancy for every parent, none empty");
     let again = codec::encode_level(Isa::detect(), &grown, &map, depth + 1, usize::MAX);
     assert_eq!(again[0].1, code, "another code for the same octree");
 }
@@ -120,8 +100,7 @@ fn occupancies(mut bytes: &[u8]) {
     while !bytes.is_empty() {
         let parents = octree.level(octree.depth()).len();
         let (masks, rest) = bytes.split_at(parents.min(bytes.len()));
-        let possible =
-            masks.len() == parents && !masks.contains(&0) && octree.depth() < morton::MAX_DEPTH;
+        let possible = masks.len() == parents && !masks.contains(&0) && octree.depth() < morton::MAX_DEPTH;
         let before = octree.clone();
         if octree.grow(masks.to_vec()).is_err() {
             assert!(!possible, "occupancies were refused");
@@ -149,19 +128,13 @@ fn tables(seed: u8) -> Rc<Tables> {
     thread_local! {
         static MADE: RefCell<BTreeMap<u8, Rc<Tables>>> = const { RefCell::new(BTreeMap::new()) };
     }
-    MADE.with_borrow_mut(|made| {
-        made.entry(seed)
-            .or_insert_with(|| Rc::new(make(seed)))
-            .clone()
-    })
+    MADE.with_borrow_mut(|made| made.entry(seed).or_insert_with(|| Rc::new(make(seed))).clone())
 }
 
 fn make(seed: u8) -> Tables {
     let mut state = u64::from(seed) + 1;
     let mut random = move |n: u64| {
-        state = state
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1);
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
         (state >> 33) % n
     };
     let mut rows = |count: usize| {
@@ -219,10 +192,7 @@ pub fn entropy(bytes: &[u8]) {
     }
     let condition = match prior {
         true => Condition::Prior,
-        false => Condition::Gauss {
-            mu: &mu,
-            sigma: &sigma,
-        },
+        false => Condition::Gauss { mu: &mu, sigma: &sigma },
     };
     let at = "here";
     let code = encode_slice(&tables, condition, &latents);
@@ -267,9 +237,7 @@ fn as_coefficients(values: &[i16], code: &[u8]) {
     let which = usize::from(code.first().copied().unwrap_or(0));
     let channels = [0..3, 0..1, 1..3, 0..0];
     let present = [&channels[which % 4], &channels[which / 4 % 4]];
-    let parts = |triples: &[[i16; 3]]| {
-        encode_coefficients(&two(present, triples.split_at(triples.len() / 2)))
-    };
+    let parts = |triples: &[[i16; 3]]| encode_coefficients(&two(present, triples.split_at(triples.len() / 2)));
     let decode = |code: &[u8], count: usize| {
         let mut triples = vec![[0; 3]; count];
         let mut parts = two(present, triples.split_at_mut(count / 2));
@@ -281,19 +249,13 @@ fn as_coefficients(values: &[i16], code: &[u8]) {
     let half = triples.len() / 2;
     for (i, triple) in triples.iter_mut().enumerate() {
         let present = present[usize::from(i >= half)];
-        (0..3)
-            .filter(|k| !present.contains(k))
-            .for_each(|k| triple[k] = 0);
+        (0..3).filter(|k| !present.contains(k)).for_each(|k| triple[k] = 0);
     }
     let decoded = decode(&parts(&triples), triples.len());
     assert_eq!(decoded.expect("what was encoded decodes"), triples);
     for count in [0, 1, 40, code.len()] {
         if let Ok(triples) = decode(code, count) {
-            assert_eq!(
-                parts(&triples),
-                code,
-                "another code for the same coefficients"
-            );
+            assert_eq!(parts(&triples), code, "another code for the same coefficients");
         }
     }
 }
@@ -340,11 +302,7 @@ fn in_passes(tables: &Tables, keys: &[u64], latents: &[i16], slice: usize, code:
             for channel in 0..k {
                 let before = || known[(v - 1 - slice.start) * k + channel];
                 mu.push(if lower { before().wrapping_mul(7) } else { 0 });
-                sigma.push(if lower {
-                    (keys[v] & 7) as u8 * 8
-                } else {
-                    UNPREDICTED
-                });
+                sigma.push(if lower { (keys[v] & 7) as u8 * 8 } else { UNPREDICTED });
             }
         }
         (mu, sigma)
@@ -440,9 +398,5 @@ fn is_sound(entries: &[u16], offsets: &[u32], low: &[i16]) -> bool {
 static FLAT: LazyLock<RawTable> = LazyLock::new(|| {
     let rows = 1024;
     let offsets = (0..=rows).map(|row| 2 * row).collect();
-    (
-        vec![32_767; 2 * rows as usize],
-        offsets,
-        vec![0; rows as usize],
-    )
+    (vec![32_767; 2 * rows as usize], offsets, vec![0; rows as usize])
 });

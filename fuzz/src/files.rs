@@ -35,14 +35,8 @@ pub fn model(bytes: &[u8]) {
     let text = 8 + usize::from(u16::from_le_bytes([file[0], file[1]]));
     for edit in bytes.chunks_exact(5) {
         let [place @ .., value] = edit else { continue };
-        let place = place
-            .iter()
-            .fold(0, |sum, byte| sum << 8 | usize::from(*byte));
-        let end = if place.is_multiple_of(2) {
-            text
-        } else {
-            file.len()
-        };
+        let place = place.iter().fold(0, |sum, byte| sum << 8 | usize::from(*byte));
+        let end = if place.is_multiple_of(2) { text } else { file.len() };
         file[place / 2 % end] = *value;
     }
     load(&file);
@@ -109,8 +103,7 @@ pub fn ply(bytes: &[u8]) {
     };
     if let Ok(cloud) = PointCloud::from_ply(bytes, &limits) {
         assert_eq!(cloud.positions.len(), cloud.colours.len());
-        let again =
-            PointCloud::from_ply(&cloud.to_ply(), &limits).expect("what is written is read");
+        let again = PointCloud::from_ply(&cloud.to_ply(), &limits).expect("what is written is read");
         assert_eq!(again.colours, cloud.colours);
         if let Ok(voxels) = voxelise(&cloud, None) {
             assert_eq!(voxels.voxels.len(), voxels.colours.len());

@@ -89,11 +89,7 @@ pub fn alone() {
 /// Whether an input is one of those, one in `n`, for which checks are made that take longer than all others: as good as at random, and
 /// always the same for the same bytes.
 fn one_in(n: u8, bytes: &[u8]) -> bool {
-    bytes
-        .iter()
-        .copied()
-        .fold(0, u8::wrapping_add)
-        .is_multiple_of(n)
+    bytes.iter().copied().fold(0, u8::wrapping_add).is_multiple_of(n)
 }
 
 /// Bytes as a source of numbers; zeros when they are used up.

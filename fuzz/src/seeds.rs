@@ -33,9 +33,7 @@ fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u
     let file = gaussians.ok().map(|gaussians| {
         let mut file = Vec::new();
         let name = Path::new("memory");
-        gaussians
-            .write_ply(&mut file, name)
-            .expect("memory takes it");
+        gaussians.write_ply(&mut file, name).expect("memory takes it");
         file
     });
     (stream.bytes, file)
@@ -80,10 +78,7 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
     for (weight, byte) in weights.as_flattened_mut().iter_mut().zip(noise(9, 57)) {
         *weight = byte as i8;
     }
-    let filter = ColourFilter {
-        exponent: 7,
-        weights,
-    };
+    let filter = ColourFilter { exponent: 7, weights };
     let slice = stream.header().slice_voxels as usize;
     let steps = |luma, chroma| Steps { luma, chroma };
     let precision = Precision {
@@ -111,9 +106,7 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
 fn noise(seed: u64, length: usize) -> Vec<u8> {
     let mut state = seed;
     let next = || {
-        state = state
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(seed | 1);
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(seed | 1);
         (state >> 40) as u8
     };
     std::iter::repeat_with(next).take(length).collect()
@@ -133,10 +126,7 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
         "header" | "stream" | "chunking" => {
             let coloured = coloured(&clouds[3].0);
             let new = (target == "header").then(transformed);
-            streams
-                .chain([coloured])
-                .chain(new.into_iter().flatten())
-                .collect()
+            streams.chain([coloured]).chain(new.into_iter().flatten()).collect()
         }
         "transform" => transformed(),
         "ply" => {
@@ -154,10 +144,7 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
         // No voxels; one at every level, and one level too many.
         "octree" => {
             let deepest = [&[0; 5][..], &[1; 22]].concat();
-            [vec![0, 0, 64], deepest]
-                .into_iter()
-                .chain(noises())
-                .collect()
+            [vec![0, 0, 64], deepest].into_iter().chain(noises()).collect()
         }
         "entropy" => faulty_tables().into_iter().chain(noises()).collect(),
         _ => noises().collect(),
@@ -166,9 +153,7 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
 
 fn noises() -> impl Iterator<Item = Vec<u8>> {
     let lengths = [0, 7, 60, 300, 1000];
-    lengths
-        .into_iter()
-        .map(|length| noise(length as u64, length))
+    lengths.into_iter().map(|length| noise(length as u64, length))
 }
 
 /// What the target `entropy` reads as tables of one row of three entries, and as symbols under it: one that is sound, and one with each

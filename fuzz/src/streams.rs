@@ -31,18 +31,15 @@ pub fn header(bytes: &[u8]) {
     // A later minor version is read like this one.
     written[10..12].copy_from_slice(&bytes[10..12]);
     let end = written.len() - 4;
-    assert_eq!(
-        written[..end],
-        bytes[..end],
-        "the header changed on its way"
-    );
+    assert_eq!(written[..end], bytes[..end], "the header changed on its way");
     assert!(header.points <= limits.max_points);
     let stream = within(most, || Stream::parse(bytes, &limits)).expect("the header is sound");
     assert!(stream.levels().len() <= header.voxels.len());
     for (level, voxels) in stream.levels().iter().zip(&header.voxels) {
-        let slices = level.geometry.last().map_or(1, |geometry| {
-            geometry.slices.iter().map(|slice| slice.voxels).sum()
-        });
+        let slices = level
+            .geometry
+            .last()
+            .map_or(1, |geometry| geometry.slices.iter().map(|slice| slice.voxels).sum());
         assert_eq!(slices, *voxels);
         let latents: u32 = level.features.iter().map(|slice| slice.voxels).sum();
         assert!(latents == *voxels || level.features.is_empty());
@@ -51,9 +48,7 @@ pub fn header(bytes: &[u8]) {
         }
         let residual: u32 = level.residual.iter().map(|slice| slice.voxels).sum();
         assert!(residual == *voxels || level.residual.is_empty());
-        let end = header
-            .prefix_bytes(level.level)
-            .expect("a level of the stream");
+        let end = header.prefix_bytes(level.level).expect("a level of the stream");
         assert!(end <= bytes.len() as u64);
     }
     let whole = stream.levels().len() == header.voxels.len();
@@ -224,13 +219,7 @@ fn gaussians(decoding: &Decoding<&Model>, log: &mut Log) -> Option<Gaussians> {
     };
     gaussians.check_lengths().expect("arrays of one length");
     assert!([voxels, 8 * voxels].contains(&gaussians.len()));
-    assert!(
-        gaussians
-            .position
-            .as_flattened()
-            .iter()
-            .all(|v| v.is_finite())
-    );
+    assert!(gaussians.position.as_flattened().iter().all(|v| v.is_finite()));
     assert!(
         gaussians
             .scale
@@ -264,10 +253,7 @@ pub fn chunking(bytes: &[u8]) {
 
 fn pieced(bytes: &[u8]) {
     let (sizes, level) = match bytes {
-        [.., a, b, c, level] => (
-            [*a, *b, *c],
-            [None, Some(2), Some(3)][usize::from(level % 3)],
-        ),
+        [.., a, b, c, level] => ([*a, *b, *c], [None, Some(2), Some(3)][usize::from(level % 3)]),
         _ => ([1; 3], None),
     };
     let decoder = Decoder::new(&*MODEL).with_limits(limits());

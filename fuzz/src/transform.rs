@@ -107,11 +107,7 @@ fn points(decoding: &StreamDecoding) -> Option<(Vec<u64>, Vec<[u8; 3]>)> {
 type Found = (Option<(Vec<u64>, Vec<[u8; 3]>)>, Option<Error>);
 
 fn pieced(decoder: &StreamDecoder, bytes: &[u8]) -> Found {
-    let sizes = bytes
-        .iter()
-        .rev()
-        .take(3)
-        .map(|size| usize::from(*size) + 1);
+    let sizes = bytes.iter().rev().take(3).map(|size| usize::from(*size) + 1);
     let sizes: Vec<usize> = sizes.collect();
     let (mut decoding, mut log) = (decoder.start(None), Log::default());
     let mut rest = bytes;

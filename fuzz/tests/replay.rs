@@ -14,9 +14,7 @@ fn alone(test: impl FnOnce() + Send) {
 }
 
 fn corpus(target: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("corpus")
-        .join(target)
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(target)
 }
 
 fn inputs(target: &str) -> Vec<Vec<u8>> {
@@ -87,9 +85,7 @@ fn every_target_holds_on_changed_seeds() {
             others.extend(inputs(name));
             let mut state = u64::from(rounds);
             let mut random = |below: usize| {
-                state = state
-                    .wrapping_mul(6_364_136_223_846_793_005)
-                    .wrapping_add(3);
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(3);
                 (state >> 33) as usize % below.max(1)
             };
             let runs = match name {

@@ -6,9 +6,7 @@ use std::collections::HashMap;
 use std::time::Instant;
 
 use b2p_kernels::f16;
-use b2p_kernels::{
-    ABSENT, ExactConv, FloatConv, Isa, Output, Plan, Precision, Requantise, Scale, Taps, ceiling,
-};
+use b2p_kernels::{ABSENT, ExactConv, FloatConv, Isa, Output, Plan, Precision, Requantise, Scale, Taps, ceiling};
 
 /// A bumpy closed surface of about `count` voxels, in Morton order.
 fn surface(count: usize) -> Vec<[i32; 3]> {
@@ -28,11 +26,7 @@ fn surface(count: usize) -> Vec<[i32; 3]> {
     }
     let key = |v: &[i32; 3]| -> u64 {
         (0..21)
-            .map(|i| {
-                (0..3)
-                    .map(|a| (v[a] as u64 >> i & 1) << (3 * i + a))
-                    .sum::<u64>()
-            })
+            .map(|i| (0..3).map(|a| (v[a] as u64 >> i & 1) << (3 * i + a)).sum::<u64>())
             .sum()
     };
     voxels.sort_by_cached_key(key);
@@ -105,9 +99,7 @@ impl Bench {
     }
 
     fn exact(&self, isa: Isa, [cin, cout]: [usize; 2], ceiling: f64) {
-        let weights: Vec<i16> = (0..27 * cin * cout)
-            .map(|i| (i * 7919 % 1023) as i16 - 511)
-            .collect();
+        let weights: Vec<i16> = (0..27 * cin * cout).map(|i| (i * 7919 % 1023) as i16 - 511).collect();
         let input: Vec<i16> = (0..self.voxels * cin)
             .map(|i| (i * 7907 % 4095) as i16 - 2047)
             .collect();
@@ -144,11 +136,7 @@ impl Bench {
         let input: Vec<f16> = (0..self.voxels * cin).map(value).collect();
         let scales = [
             ("float", Scale::Plain, Precision::F32),
-            (
-                "float invariant",
-                Scale::Invariant(vec![1.0; cout]),
-                Precision::F32,
-            ),
+            ("float invariant", Scale::Invariant(vec![1.0; cout]), Precision::F32),
             ("bf16", Scale::Plain, Precision::Bf16),
             ("half", Scale::Plain, Precision::Half),
         ];

@@ -54,8 +54,7 @@ impl Work for Calls {
                 Calls::Mix | Calls::MixAndLearn => {
                     let entries = &mut tables[at & 4095];
                     let (inputs, checks) = ([(at & 255) as i32, 20], [(at & 1) as u32; CONTEXTS]);
-                    let mixed =
-                        mixing::mix(instructions, *entries, checks, inputs, &stretch, &lanes);
+                    let mixed = mixing::mix(instructions, *entries, checks, inputs, &stretch, &lanes);
                     if let Calls::MixAndLearn = self {
                         let truths = [(at & 1) as i32 * 65_536, 30_000];
                         let error = truths[0] - 30_000;

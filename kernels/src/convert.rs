@@ -70,11 +70,7 @@ pub(crate) unsafe trait Halves: Registers {
 
     /// Adds what is given, and clamps between `floor` and [`LIMIT`].
     #[inline(always)]
-    unsafe fn settle(
-        mut q: [i16; PANEL],
-        residual: Option<&[i16; PANEL]>,
-        floor: i16,
-    ) -> [i16; PANEL] {
+    unsafe fn settle(mut q: [i16; PANEL], residual: Option<&[i16; PANEL]>, floor: i16) -> [i16; PANEL] {
         if let Some(residual) = residual {
             for (q, x) in q.iter_mut().zip(residual) {
                 *q = q.saturating_add(*x).min(LIMIT);
@@ -214,13 +210,8 @@ pub(crate) fn widen_one(from: f16) -> f32 {
     // Infinity and NaN keep the largest exponent: it moves up by the rest of the way.
     let normal = magnitude + REBIAS + if exponent == 0x1f << 23 { REBIAS } else { 0 };
     // A subnormal's mantissa is read as a normal number's, and the implied one taken off again.
-    let subnormal =
-        f32::from_bits(magnitude + REBIAS + (1 << 23)) - f32::from_bits(REBIAS + (1 << 23));
-    let value = if exponent == 0 {
-        subnormal.to_bits()
-    } else {
-        normal
-    };
+    let subnormal = f32::from_bits(magnitude + REBIAS + (1 << 23)) - f32::from_bits(REBIAS + (1 << 23));
+    let value = if exponent == 0 { subnormal.to_bits() } else { normal };
     f32::from_bits(value | sign)
 }
 
@@ -239,11 +230,7 @@ pub(crate) fn narrow_one(from: f32) -> f16 {
     let subnormal = (f32::from_bits(bits) + f32::from_bits(DENORMAL))
         .to_bits()
         .wrapping_sub(DENORMAL);
-    let magnitude = if bits < REBIAS + (1 << 23) {
-        subnormal
-    } else {
-        normal
-    };
+    let magnitude = if bits < REBIAS + (1 << 23) { subnormal } else { normal };
     f16::from_bits((magnitude | sign) as u16)
 }
 
@@ -271,15 +258,7 @@ mod tests {
     #[test]
     fn narrowing_rounds_to_even_and_saturates() {
         // Every f16, every midpoint between two, and their neighbours in f32.
-        let mut samples = vec![
-            f32::INFINITY,
-            1e30,
-            65519.9,
-            65520.0,
-            f32::MIN_POSITIVE,
-            1e-45,
-            0.0,
-        ];
+        let mut samples = vec![f32::INFINITY, 1e30, 65519.9, 65520.0, f32::MIN_POSITIVE, 1e-45, 0.0];
         for bits in 0..0x7bffu16 {
             let low = f16::from_bits(bits).to_f32();
             let middle = (low + f16::from_bits(bits + 1).to_f32()) / 2.0;
@@ -294,11 +273,7 @@ mod tests {
             to_f16(isa, &samples, &mut narrow);
             for (wide, narrow) in samples.iter().zip(narrow) {
                 let expected = f16::from_f32(wide.clamp(-MAX, MAX));
-                assert_eq!(
-                    narrow.to_bits(),
-                    expected.to_bits(),
-                    "{wide} became {narrow}"
-                );
+                assert_eq!(narrow.to_bits(), expected.to_bits(), "{wide} became {narrow}");
             }
         }
     }

@@ -68,13 +68,7 @@ impl ExactConv {
     /// # Panics
     /// If lengths don't match the extents, there are more than 54 taps, or a shift is above 31: the caller has checked what it
     /// read.
-    pub fn new(
-        volume: usize,
-        cin: usize,
-        cout: usize,
-        weights: &[i16],
-        requantise: Requantise,
-    ) -> Self {
+    pub fn new(volume: usize, cin: usize, cout: usize, weights: &[i16], requantise: Requantise) -> Self {
         let extents = Extents { volume, cin, cout };
         extents.check(weights.len());
         let finish = match requantise {
@@ -150,14 +144,7 @@ impl ExactConv {
     ///
     /// # Panics
     /// If `taps` are not this layer's, or name rows that `input` lacks, or `output` does not fit.
-    pub fn run(
-        &self,
-        isa: Isa,
-        taps: Taps<'_>,
-        input: &[i16],
-        first: usize,
-        output: Output<'_, i16>,
-    ) {
+    pub fn run(&self, isa: Isa, taps: Taps<'_>, input: &[i16], first: usize, output: Output<'_, i16>) {
         self.each_tile(isa, taps, input, first, output);
     }
 
@@ -165,18 +152,8 @@ impl ExactConv {
     ///
     /// # Panics
     /// As `run` does, and if the layer requantises by [`Requantise::Shift`], or there is a residual.
-    pub fn run_f32(
-        &self,
-        isa: Isa,
-        taps: Taps<'_>,
-        input: &[i16],
-        first: usize,
-        output: Output<'_, f32, i16>,
-    ) {
-        assert!(
-            output.residual.is_none(),
-            "nothing is added to real results"
-        );
+    pub fn run_f32(&self, isa: Isa, taps: Taps<'_>, input: &[i16], first: usize, output: Output<'_, f32, i16>) {
+        assert!(output.residual.is_none(), "nothing is added to real results");
         assert!(
             !matches!(self.finish, Finish::Shift { .. }),
             "shifted results are no real numbers"
@@ -223,14 +200,14 @@ impl ExactConv {
                 let plan = planner.plan(isa, group, &taps, [first, output.len()], tile);
                 #[cfg(target_arch = "x86_64")]
                 let done = isa.has_tiles()
-                    && self.tiles().is_some_and(|weights| {
-                        amx::integers::accumulate(isa, weights, plan, input, tiles, sums)
-                    });
+                    && self
+                        .tiles()
+                        .is_some_and(|weights| amx::integers::accumulate(isa, weights, plan, input, tiles, sums));
                 #[cfg(target_arch = "aarch64")]
                 let done = isa.has_dot()
-                    && self.digits().is_some_and(|weights| {
-                        dot::accumulate(isa, weights, plan, input, digits, sums)
-                    });
+                    && self
+                        .digits()
+                        .is_some_and(|weights| dot::accumulate(isa, weights, plan, input, digits, sums));
                 #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
                 let done = false;
                 if !done {

@@ -26,12 +26,10 @@ const WINDOW: [(u8, u8); 64] = {
 /// If there are fewer than 27.
 #[inline(always)]
 pub fn window(neighbours: &[u32], child: impl Fn(u32, u32) -> u32) -> [u32; 64] {
-    WINDOW.map(
-        |(neighbour, octant)| match neighbours[usize::from(neighbour)] {
-            ABSENT => ABSENT,
-            q => child(q, octant.into()),
-        },
-    )
+    WINDOW.map(|(neighbour, octant)| match neighbours[usize::from(neighbour)] {
+        ABSENT => ABSENT,
+        q => child(q, octant.into()),
+    })
 }
 
 /// Writes the 27 positions of the window around the child in `octant`.

@@ -33,11 +33,7 @@ impl Finish {
     /// # Safety
     /// The processor must have `R`'s instructions.
     #[inline(always)]
-    unsafe fn factors<'a, R: Registers>(
-        &'a self,
-        norms: &'a mut Norms,
-        mask: u64,
-    ) -> &'a [[f32; PANEL]] {
+    unsafe fn factors<'a, R: Registers>(&'a self, norms: &'a mut Norms, mask: u64) -> &'a [[f32; PANEL]] {
         match self {
             Finish::Shift { .. } => &[],
             Finish::Scale { scale, .. } => scale,

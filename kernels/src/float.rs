@@ -112,14 +112,7 @@ impl FloatConv {
     ///
     /// # Panics
     /// If lengths don't match the extents, or there are more than 54 taps: the caller has checked what it read.
-    pub fn new(
-        volume: usize,
-        cin: usize,
-        cout: usize,
-        weights: &[f16],
-        bias: Vec<f32>,
-        scale: Scale,
-    ) -> Self {
+    pub fn new(volume: usize, cin: usize, cout: usize, weights: &[f16], bias: Vec<f32>, scale: Scale) -> Self {
         let extents = Extents { volume, cin, cout };
         extents.check(weights.len());
         assert_eq!(bias.len(), cout, "one bias per channel");
@@ -172,8 +165,7 @@ impl FloatConv {
         }
         #[cfg(target_arch = "aarch64")]
         {
-            let half =
-                || half::Weights::new(self.extents, |tap, c, panel| self.weight(tap, c, panel));
+            let half = || half::Weights::new(self.extents, |tap, c, panel| self.weight(tap, c, panel));
             self.half = (precision == Precision::Half).then(half);
         }
         self
@@ -205,15 +197,11 @@ impl FloatConv {
     fn chosen(&self, isa: Isa) -> (Arithmetic, &[Lanes], Expand<f16>) {
         #[cfg(target_arch = "x86_64")]
         if self.precision() == Precision::Bf16 && isa.has_bf16() {
-            return (
-                Arithmetic::Brain,
-                &self.brain,
-                |isa, input, rows, cin, to| {
-                    assert!(isa.has_bf16());
-                    // SAFETY: the processor has AVX512_BF16, and what `Isa` stands for where it does.
-                    unsafe { machine::avx512::to_brain(input, rows, cin, to) };
-                },
-            );
+            return (Arithmetic::Brain, &self.brain, |isa, input, rows, cin, to| {
+                assert!(isa.has_bf16());
+                // SAFETY: the processor has AVX512_BF16, and what `Isa` stands for where it does.
+                unsafe { machine::avx512::to_brain(input, rows, cin, to) };
+            });
         }
         #[cfg(target_arch = "aarch64")]
         if let Some(half) = self.half(isa) {
@@ -257,8 +245,7 @@ impl FloatConv {
             for (row, output) in output.tiles() {
                 let plan = planner.plan(isa, group, &taps, [first + row, output.len()], tile);
                 #[cfg(target_arch = "x86_64")]
-                let done = isa.has_tiles()
-                    && matches!(self.precision, Precision::Bf16 | Precision::Fastest);
+                let done = isa.has_tiles() && matches!(self.precision, Precision::Bf16 | Precision::Fastest);
                 #[cfg(target_arch = "x86_64")]
                 if done {
                     amx::brain::accumulate(isa, self.tiles(), plan, input, tiles, sums);
@@ -304,9 +291,8 @@ impl FloatConv {
 impl FloatConv {
     /// The weights in tiles.
     fn tiles(&self) -> &amx::Weights {
-        self.tiles.get_or_init(|| {
-            amx::Weights::of_brain(self.extents, |tap, c, panel| self.weight(tap, c, panel))
-        })
+        self.tiles
+            .get_or_init(|| amx::Weights::of_brain(self.extents, |tap, c, panel| self.weight(tap, c, panel)))
     }
 }
 

@@ -63,9 +63,9 @@ fn unit(a: i16, b: i8) -> i32 {
 #[inline(always)]
 fn plain_sum(a: &Row, b: &Narrow, weights: &Row) -> i32 {
     let units = a.iter().zip(b).map(|(&a, &b)| unit(a, b));
-    units.zip(weights).fold(0i32, |sum, (unit, &weight)| {
-        sum.wrapping_add(unit * i32::from(weight))
-    })
+    units
+        .zip(weights)
+        .fold(0i32, |sum, (unit, &weight)| sum.wrapping_add(unit * i32::from(weight)))
 }
 
 #[inline(always)]
@@ -145,10 +145,7 @@ mod avx2 {
             }
         }
         let sum = _mm256_add_epi32(sums[0], sums[1]);
-        let sum = _mm_add_epi32(
-            _mm256_castsi256_si128(sum),
-            _mm256_extracti128_si256::<1>(sum),
-        );
+        let sum = _mm_add_epi32(_mm256_castsi256_si128(sum), _mm256_extracti128_si256::<1>(sum));
         let sum = _mm_add_epi32(sum, _mm_shuffle_epi32::<0b1110>(sum));
         let sum = _mm_add_epi32(sum, _mm_shuffle_epi32::<0b01>(sum));
         _mm_cvtsi128_si32(sum)

@@ -239,12 +239,7 @@ pub struct UnknownIsa(String);
 impl fmt::Display for UnknownIsa {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let have: Vec<_> = Isa::available().iter().map(|isa| isa.name()).collect();
-        write!(
-            f,
-            "no instruction set `{}` here, but {}",
-            self.0,
-            have.join(", ")
-        )
+        write!(f, "no instruction set `{}` here, but {}", self.0, have.join(", "))
     }
 }
 

@@ -9,9 +9,7 @@
 //! [`Precision::Fastest`] and [`Precision::Half`] depend on the machine.
 
 #[cfg(all(target_arch = "x86", not(target_feature = "sse2")))]
-compile_error!(
-    "x87 arithmetic does not round to f32 after every step: build for a target with SSE2"
-);
+compile_error!("x87 arithmetic does not round to f32 after every step: build for a target with SSE2");
 
 mod convert;
 mod double;

@@ -37,10 +37,7 @@ mod tests {
     #[test]
     fn a_mapped_file_holds_the_file_s_bytes() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("Cargo.toml");
-        assert_eq!(
-            &map_file(&path).unwrap()[..],
-            &std::fs::read(&path).unwrap()
-        );
+        assert_eq!(&map_file(&path).unwrap()[..], &std::fs::read(&path).unwrap());
     }
 
     #[test]

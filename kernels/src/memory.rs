@@ -56,10 +56,7 @@ fn ask_for_huge_pages<T>(block: &[T]) {
     let start = block.as_ptr().addr().next_multiple_of(HUGE);
     let end = block.as_ptr_range().end.addr() / HUGE * HUGE;
     if start < end {
-        let at = block
-            .as_ptr()
-            .cast::<u8>()
-            .wrapping_add(start - block.as_ptr().addr());
+        let at = block.as_ptr().cast::<u8>().wrapping_add(start - block.as_ptr().addr());
         // SAFETY: these pages belong to the block alone, and the advice changes nothing but how the system backs them.
         unsafe { libc::madvise(at.cast_mut().cast(), end - start, libc::MADV_HUGEPAGE) };
     }

@@ -102,13 +102,7 @@ mod plain {
     }
 
     #[inline(always)]
-    pub fn mix(
-        entries: Lanes,
-        checks: Lanes,
-        stretched: Lanes,
-        others: [i32; 2],
-        weights: &Lanes,
-    ) -> Mixed {
+    pub fn mix(entries: Lanes, checks: Lanes, stretched: Lanes, others: [i32; 2], weights: &Lanes) -> Mixed {
         let (mut seen, mut ones, mut inputs) = ([0; 8], [0; 8], [0; 8]);
         for i in 0..8 {
             let entry = entries[i] as u32;
@@ -135,12 +129,7 @@ mod plain {
     }
 
     #[inline(always)]
-    pub fn learn(
-        mixed: &Mixed,
-        error: i32,
-        [truth, first]: [i32; 2],
-        weights: &mut Lanes,
-    ) -> Lanes {
+    pub fn learn(mixed: &Mixed, error: i32, [truth, first]: [i32; 2], weights: &mut Lanes) -> Lanes {
         for (weight, input) in weights.iter_mut().zip(mixed.inputs) {
             let step = (3 * error * input + (1 << 15)) >> 16;
             *weight = (*weight + step).clamp(-HEAVIEST, HEAVIEST);
@@ -197,13 +186,7 @@ mod avx2 {
 
     #[inline]
     #[target_feature(enable = "avx2")]
-    pub fn mix(
-        entries: Lanes,
-        checks: Lanes,
-        stretched: Lanes,
-        [logit, bias]: [i32; 2],
-        weights: &Lanes,
-    ) -> Mixed {
+    pub fn mix(entries: Lanes, checks: Lanes, stretched: Lanes, [logit, bias]: [i32; 2], weights: &Lanes) -> Mixed {
         const LOGIT: i32 = 1 << OTHERS[0];
         const BIAS: i32 = 1 << OTHERS[1];
         let (entries, checks) = (vector(entries), vector(checks));
@@ -236,12 +219,7 @@ mod avx2 {
 
     #[inline]
     #[target_feature(enable = "avx2")]
-    pub fn learn(
-        mixed: &Mixed,
-        error: i32,
-        [truth, first]: [i32; 2],
-        weights: &mut Lanes,
-    ) -> Lanes {
+    pub fn learn(mixed: &Mixed, error: i32, [truth, first]: [i32; 2], weights: &mut Lanes) -> Lanes {
         let steps = _mm256_mullo_epi32(_mm256_set1_epi32(3 * error), load(&mixed.inputs));
         let steps = _mm256_srai_epi32::<16>(_mm256_add_epi32(steps, _mm256_set1_epi32(1 << 15)));
         let grown = _mm256_add_epi32(load(weights), steps);
@@ -275,8 +253,7 @@ mod tests {
 
     #[cfg(target_arch = "x86_64")]
     fn an_entry() -> impl Strategy<Value = u32> {
-        (16u32..=65_520, 0..=MOST as u32, 0u32..4)
-            .prop_map(|(one, seen, check)| one | seen << 16 | check << 24)
+        (16u32..=65_520, 0..=MOST as u32, 0u32..4).prop_map(|(one, seen, check)| one | seen << 16 | check << 24)
     }
 
     #[cfg(target_arch = "x86_64")]
@@ -315,14 +292,7 @@ mod tests {
             let entry = 65_520 | (seen as u32) << 16;
             let mut weights = [0, 0, 0, 0, 1, 0, 0, 0];
             let (entries, checks) = ([entry; CONTEXTS], [0; CONTEXTS]);
-            let mixed = mix(
-                instructions,
-                entries,
-                checks,
-                [-256, 0],
-                &[0; 4096],
-                &weights,
-            );
+            let mixed = mix(instructions, entries, checks, [-256, 0], &[0; 4096], &weights);
             assert_eq!(mixed.sum, 1024 * seen / (4 * seen + 1));
             let next = learn(instructions, &mixed, 0, [0, 16384], &mut weights)[4];
             let (one, count) = (if seen == 0 { 16384 } else { 65_520 }, (seen + 1).min(MOST));

@@ -54,9 +54,7 @@ impl<E: Energy> Gains<E> {
     /// The processor must have `R`'s instructions.
     #[inline(always)]
     unsafe fn factors<R: Registers>(&self, mask: u64, to: &mut [[f32; PANEL]]) {
-        let panels = self
-            .energy
-            .chunks_exact(self.energy.len() / self.gain.len());
+        let panels = self.energy.chunks_exact(self.energy.len() / self.gain.len());
         for ((to, gain), parts) in to.iter_mut().zip(&self.gain).zip(panels) {
             let chosen = parts.as_chunks::<{ 1 << PART }>().0.iter().enumerate();
             let chosen = chosen.map(|(part, energy)| {
@@ -83,9 +81,7 @@ pub(crate) trait Energy: Copy + Default + 'static {
     ///
     /// # Safety
     /// The processor must have `R`'s instructions.
-    unsafe fn sum<'a, R: Registers>(
-        panels: impl Iterator<Item = &'a [Self; PANEL]> + Clone,
-    ) -> [Self; PANEL];
+    unsafe fn sum<'a, R: Registers>(panels: impl Iterator<Item = &'a [Self; PANEL]> + Clone) -> [Self; PANEL];
     /// `gain` over the norm.
     fn factor(self, gain: f32) -> f32;
 }
@@ -97,9 +93,7 @@ impl Energy for u32 {
     }
 
     #[inline(always)]
-    unsafe fn sum<'a, R: Registers>(
-        panels: impl Iterator<Item = &'a [u32; PANEL]> + Clone,
-    ) -> [u32; PANEL] {
+    unsafe fn sum<'a, R: Registers>(panels: impl Iterator<Item = &'a [u32; PANEL]> + Clone) -> [u32; PANEL] {
         let mut sum = [0; PANEL];
         // Of its own accord the compiler adds one by one.
         for at in (0..size_of_val(&sum)).step_by(R::BYTES) {
@@ -130,9 +124,7 @@ impl Energy for f32 {
     }
 
     #[inline(always)]
-    unsafe fn sum<'a, R: Registers>(
-        panels: impl Iterator<Item = &'a [f32; PANEL]> + Clone,
-    ) -> [f32; PANEL] {
+    unsafe fn sum<'a, R: Registers>(panels: impl Iterator<Item = &'a [f32; PANEL]> + Clone) -> [f32; PANEL] {
         panels.fold([0.0; PANEL], |sum, panel| {
             std::array::from_fn(|lane| sum[lane] + panel[lane])
         })
@@ -160,11 +152,7 @@ impl Norms {
     /// # Safety
     /// The processor must have `R`'s instructions.
     #[inline(always)]
-    pub unsafe fn of<R: Registers, E: Energy>(
-        &mut self,
-        gains: &Gains<E>,
-        mask: u64,
-    ) -> &[[f32; PANEL]] {
+    pub unsafe fn of<R: Registers, E: Energy>(&mut self, gains: &Gains<E>, mask: u64) -> &[[f32; PANEL]] {
         let panels = gains.gain.len();
         if self.layer != gains.id {
             self.layer = gains.id;

@@ -257,10 +257,7 @@ impl Planner {
             scratch.fill(isa, taps, first, count, usize::MAX);
             tile.arrange(group, scratch, numbers);
         };
-        if let Taps::Map {
-            plan: Some(plan), ..
-        }
-        | Taps::AllChildren { plan, .. } = taps
+        if let Taps::Map { plan: Some(plan), .. } | Taps::AllChildren { plan, .. } = taps
             && first.is_multiple_of(TILE)
             && let Some(places) = plan.0.get(first / TILE)
         {
@@ -386,13 +383,7 @@ mod tests {
                 plan: None,
             };
             let mut planner = Planner::default();
-            let plan = planner.plan(
-                Isa::SCALAR,
-                MIN_GROUP,
-                &taps,
-                [0, count],
-                &mut TileTaps::default(),
-            );
+            let plan = planner.plan(Isa::SCALAR, MIN_GROUP, &taps, [0, count], &mut TileTaps::default());
             let mut found = vec![ABSENT; rows.len()];
             for group in 0..plan.groups() {
                 let (taps, places) = plan.steps(group, 0..volume);

@@ -14,17 +14,14 @@ pub fn tap(taps: &Taps<'_>, i: usize, k: usize) -> Option<usize> {
             let row = rows[i * volume + k];
             (row != ABSENT).then_some(row as usize)
         }
-        Taps::Octants { parents, octants } => {
-            (usize::from(octants[i]) == k).then(|| parents[i] as usize)
-        }
+        Taps::Octants { parents, octants } => (usize::from(octants[i]) == k).then(|| parents[i] as usize),
         Taps::Children => (i % 8 == k).then_some(i / 8),
         Taps::AllChildren { neighbours, .. } => {
             // Where the neighbour is, in steps of a child from the parent's corner.
             let axis = |bit: usize, step: usize| (i >> bit & 1) as i32 + (step % 3) as i32 - 1;
             let at = [axis(0, k), axis(1, k / 3), axis(2, k / 9)];
-            let sum = |part: fn(i32) -> i32, base: i32| {
-                at.iter().rev().fold(0, |sum, &x| sum * base + part(x)) as usize
-            };
+            let sum =
+                |part: fn(i32) -> i32, base: i32| at.iter().rev().fold(0, |sum, &x| sum * base + part(x)) as usize;
             let neighbour = neighbours[i / 8 * 27 + sum(|x| x.div_euclid(2) + 1, 3)];
             let octant = sum(|x| x.rem_euclid(2), 2);
             (neighbour != ABSENT).then(|| 8 * neighbour as usize + octant)
@@ -57,12 +54,8 @@ pub fn exact(
                 }
             }
             let mut q = match requantise {
-                Requantise::Shift { bias, shift } => {
-                    i64::from((sum + i64::from(bias[o])) as i32 >> shift[o])
-                }
-                Requantise::Scale { scale, bias } => {
-                    (sum as i32 as f32 * scale[o] + bias[o]).round_ties_even() as i64
-                }
+                Requantise::Shift { bias, shift } => i64::from((sum + i64::from(bias[o])) as i32 >> shift[o]),
+                Requantise::Scale { scale, bias } => (sum as i32 as f32 * scale[o] + bias[o]).round_ties_even() as i64,
                 Requantise::Invariant { gain, bias } => {
                     let scale = gain[o] / ((energy as u32).max(1) as f32).sqrt();
                     (sum as i32 as f32 * scale + bias[o]).round_ties_even() as i64

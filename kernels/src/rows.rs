@@ -43,20 +43,17 @@ impl<T, R> Output<'_, T, R> {
     /// The output cut into tiles, each with the number of its first row.
     pub(crate) fn tiles(&mut self) -> impl Iterator<Item = (usize, Output<'_, T, R>)> {
         let (stride, column, residual, relu) = (self.stride, self.column, self.residual, self.relu);
-        self.rows
-            .chunks_mut(TILE * stride)
-            .enumerate()
-            .map(move |(t, rows)| {
-                let residual = residual.map(|all| &all[t * TILE * stride..][..rows.len()]);
-                let output = Output {
-                    rows,
-                    stride,
-                    column,
-                    residual,
-                    relu,
-                };
-                (t * TILE, output)
-            })
+        self.rows.chunks_mut(TILE * stride).enumerate().map(move |(t, rows)| {
+            let residual = residual.map(|all| &all[t * TILE * stride..][..rows.len()]);
+            let output = Output {
+                rows,
+                stride,
+                column,
+                residual,
+                relu,
+            };
+            (t * TILE, output)
+        })
     }
 
     /// Rows.
@@ -176,9 +173,8 @@ impl Extents {
     /// Tap, input and panel of outputs of each panel of weights.
     #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
     pub fn each(self) -> impl Iterator<Item = (usize, usize, usize)> {
-        (0..self.volume).flat_map(move |tap| {
-            (0..self.cin).flat_map(move |c| (0..self.panels()).map(move |panel| (tap, c, panel)))
-        })
+        (0..self.volume)
+            .flat_map(move |tap| (0..self.cin).flat_map(move |c| (0..self.panels()).map(move |panel| (tap, c, panel))))
     }
 
     /// Calls `place(weight, tap · panels + panel, input, lane)` for each weight of `[tap][input][output]`.

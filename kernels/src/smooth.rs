@@ -34,13 +34,7 @@ pub fn responses<I: Instructions>(
 }
 
 #[inline(always)]
-fn plain(
-    values: &[Values],
-    own: &Values,
-    row: &[u32],
-    places: &[usize],
-    inverses: &Lanes,
-) -> (Lanes, i32) {
+fn plain(values: &[Values], own: &Values, row: &[u32], places: &[usize], inverses: &Lanes) -> (Lanes, i32) {
     let (mut sums, mut count) = ([0; 8], 0);
     for &place in places {
         if row[place] == ABSENT {
@@ -71,13 +65,7 @@ mod avx2 {
 
     #[inline]
     #[target_feature(enable = "avx2")]
-    pub fn responses(
-        values: &[Values],
-        own: &Values,
-        row: &[u32],
-        places: &[usize],
-        inverses: &Lanes,
-    ) -> (Lanes, i32) {
+    pub fn responses(values: &[Values], own: &Values, row: &[u32], places: &[usize], inverses: &Lanes) -> (Lanes, i32) {
         let own = load(own);
         // SAFETY: eight words are read.
         let inverses = unsafe { _mm256_loadu_si256(inverses.as_ptr().cast()) };

@@ -132,11 +132,7 @@ impl TileTaps {
                 end = (first + count).div_ceil(8);
             }
         }
-        assert!(
-            end <= inputs,
-            "a tap reads row {}, but the input has {inputs}",
-            end - 1
-        );
+        assert!(end <= inputs, "a tap reads row {}, but the input has {inputs}", end - 1);
         self.end = end;
     }
 

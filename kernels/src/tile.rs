@@ -74,9 +74,7 @@ pub(crate) struct Block {
 /// # Safety
 /// The processor must have `M`'s instructions, and the block's pointers what they promise, for `V` vectors' panels.
 #[inline(always)]
-pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize, const P: usize>(
-    block: &Block,
-) {
+pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
     for first in (0..block.group).step_by(R) {
         // SAFETY: the caller's promise, for some of the group's rows.
         unsafe { multiply::<M, R, V, P>(block, first) };
@@ -88,14 +86,8 @@ pub(crate) unsafe fn columns<M: Machine, const R: usize, const V: usize, const P
 /// # Safety
 /// As [`columns`], and the block must have these rows.
 #[inline(always)]
-#[expect(
-    clippy::needless_range_loop,
-    reason = "rows, vectors and parts are counted alike"
-)]
-unsafe fn multiply<M: Machine, const R: usize, const V: usize, const P: usize>(
-    block: &Block,
-    first: usize,
-) {
+#[expect(clippy::needless_range_loop, reason = "rows, vectors and parts are counted alike")]
+unsafe fn multiply<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block, first: usize) {
     // SAFETY: the caller's promise: vector v of a row lies in its panel v · LANES / PANEL, each row has `steps` words, and so
     // many lanes each panel.
     unsafe {
@@ -118,9 +110,7 @@ unsafe fn multiply<M: Machine, const R: usize, const V: usize, const P: usize>(
                 let place = usize::from(*block.places.add(t * block.group + first + r));
                 inputs[r] = inputs[r].add(place * block.steps);
             }
-            let mut weights = block
-                .weights
-                .add(usize::from(*block.taps.add(t)) * block.tap);
+            let mut weights = block.weights.add(usize::from(*block.taps.add(t)) * block.tap);
             let mut step = |part: usize, s: usize, weights: *const u32| {
                 let mut weight = [M::weight(weights); V];
                 for v in 1..V {
@@ -255,21 +245,11 @@ pub(crate) fn accumulate<T>(
 ///
 /// # Panics
 /// If there are more than [`TILE`] rows, or not whole groups.
-pub(crate) fn multiply_rows(
-    isa: Isa,
-    cout: usize,
-    weights: &[Lanes],
-    rows: &[u32],
-    products: &mut [Lanes],
-) {
+pub(crate) fn multiply_rows(isa: Isa, cout: usize, weights: &[Lanes], rows: &[u32], products: &mut [Lanes]) {
     let panels = cout.div_ceil(PANEL);
     let (steps, count) = (weights.len() / panels, products.len() / panels);
     assert!(count <= TILE && count.is_multiple_of(isa.group(cout)));
-    assert_eq!(
-        rows.len(),
-        count * steps,
-        "a row of words for each of products"
-    );
+    assert_eq!(rows.len(), count * steps, "a row of words for each of products");
     let half = usize::from((1..=PANEL / 2).contains(&(cout % PANEL)));
     let mut panel = 0;
     while panel < panels {

@@ -40,10 +40,7 @@ pub(crate) struct Buffers {
 impl Weights {
     /// Transforms the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs; nothing if sums could be too large, a
     /// weight does not fit 16 bits afterwards, or input channels are not whole panels.
-    pub fn new(
-        extents: Extents,
-        weights: impl Fn(usize, usize, usize) -> [i16; PANEL],
-    ) -> Option<Self> {
+    pub fn new(extents: Extents, weights: impl Fn(usize, usize, usize) -> [i16; PANEL]) -> Option<Self> {
         assert_eq!(extents.volume, 27, "a window is that of a 3³ kernel");
         let cin = extents.cin;
         if !cin.is_multiple_of(PANEL) {
@@ -76,11 +73,9 @@ impl Weights {
 /// Eightfold transformed weights: (2, 0, 0), (1, 1, 1), (1, −1, 1), (0, 0, 2) along each axis, one after the other.
 fn transformed(taps: &[i32; 27]) -> [i32; WINDOW] {
     let along = |[a, b, c]: [i32; 3]| [2 * a, a + b + c, a - b + c, 2 * c];
-    let x: [[i32; 4]; 9] =
-        std::array::from_fn(|i| along([taps[3 * i], taps[3 * i + 1], taps[3 * i + 2]]));
-    let y: [[[i32; 4]; 4]; 3] = std::array::from_fn(|z| {
-        std::array::from_fn(|i| along([x[3 * z][i], x[3 * z + 1][i], x[3 * z + 2][i]]))
-    });
+    let x: [[i32; 4]; 9] = std::array::from_fn(|i| along([taps[3 * i], taps[3 * i + 1], taps[3 * i + 2]]));
+    let y: [[[i32; 4]; 4]; 3] =
+        std::array::from_fn(|z| std::array::from_fn(|i| along([x[3 * z][i], x[3 * z + 1][i], x[3 * z + 2][i]])));
     std::array::from_fn(|at| {
         let [i, j] = [at & 3, at >> 2 & 3];
         along([y[0][i][j], y[1][i][j], y[2][i][j]])[at >> 4]
@@ -167,13 +162,7 @@ pub(crate) fn accumulate<'a>(
 /// # Safety
 /// The processor must have `H`'s instructions.
 #[inline(always)]
-unsafe fn forward<H: Halves>(
-    neighbours: &[u32],
-    input: &[i16],
-    cin: usize,
-    windows: &mut [u32],
-    masks: &mut Vec<u64>,
-) {
+unsafe fn forward<H: Halves>(neighbours: &[u32], input: &[i16], cin: usize, windows: &mut [u32], masks: &mut Vec<u64>) {
     // SAFETY: the caller's promise; rows of whole panels are of whole registers of a kind.
     unsafe {
         match (2 * cin).is_multiple_of(H::BYTES) {
@@ -252,14 +241,7 @@ unsafe fn forward_by<R: Registers>(
 #[inline(always)]
 unsafe fn differences<R: Registers>([a, b, c, d]: [R::Register; 4]) -> [R::Register; 4] {
     // SAFETY: the caller's promise.
-    unsafe {
-        [
-            R::sub16(a, c),
-            R::add16(b, c),
-            R::sub16(c, b),
-            R::sub16(b, d),
-        ]
-    }
+    unsafe { [R::sub16(a, c), R::add16(b, c), R::sub16(c, b), R::sub16(b, d)] }
 }
 
 /// Transforms products `[position][voxel][panel]`, positions [`GAP`] apart, back to the sums of eight children a voxel.

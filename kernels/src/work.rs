@@ -97,17 +97,13 @@ mod tests {
         #[inline(always)]
         fn run<I: Instructions>(self, _: I) -> i32 {
             let products = self.0.iter().zip(self.1);
-            products.fold(0, |sum, (&a, &b)| {
-                sum.wrapping_add(i32::from(a) * i32::from(b))
-            })
+            products.fold(0, |sum, (&a, &b)| sum.wrapping_add(i32::from(a) * i32::from(b)))
         }
     }
 
     #[test]
     fn work_comes_to_the_same_on_every_instruction_set() {
-        let a: Vec<i16> = (0..1000)
-            .map(|i| (i * 7919 % 65_536) as u16 as i16)
-            .collect();
+        let a: Vec<i16> = (0..1000).map(|i| (i * 7919 % 65_536) as u16 as i16).collect();
         let b: Vec<i16> = a.iter().rev().copied().collect();
         let expected = Sum(&a, &b).run(Baseline);
         for isa in Isa::available() {

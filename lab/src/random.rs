@@ -95,10 +95,7 @@ mod tests {
         for _ in 0..80_000 {
             counts[random.below(8) as usize] += 1;
         }
-        assert!(
-            counts.iter().all(|c| (9_600..10_400).contains(c)),
-            "{counts:?}"
-        );
+        assert!(counts.iter().all(|c| (9_600..10_400).contains(c)), "{counts:?}");
         let mean = (0..10_000).map(|_| random.normal()).sum::<f64>() / 10_000.0;
         assert!(mean.abs() < 0.05, "{mean}");
     }

@@ -100,13 +100,7 @@ impl Picture {
 }
 
 /// Draws a surface, unlit, with `samples` × `samples` samples a pixel.
-pub fn render(
-    surface: &Surface,
-    view: &View,
-    size: [u32; 2],
-    samples: u32,
-    clip: Option<Clip>,
-) -> Picture {
+pub fn render(surface: &Surface, view: &View, size: [u32; 2], samples: u32, clip: Option<Clip>) -> Picture {
     let [width, height] = size;
     let frame = Frame {
         surface,
@@ -133,11 +127,7 @@ pub fn render(
         .for_each(|(band, (pixels, members))| {
             frame.draw_band(band * BAND, pixels, &setups, members);
         });
-    Picture {
-        width,
-        height,
-        rgba,
-    }
+    Picture { width, height, rgba }
 }
 
 /// Rows of pixels drawn together.
@@ -190,10 +180,8 @@ impl Frame<'_> {
         let corners = self.surface.corners(face);
         let mut tested = false;
         if let Some(clip) = self.clip {
-            let outside = (0..3).any(|a| {
-                corners.iter().all(|c| c[a] < clip.low[a])
-                    || corners.iter().all(|c| c[a] >= clip.high[a])
-            });
+            let outside = (0..3)
+                .any(|a| corners.iter().all(|c| c[a] < clip.low[a]) || corners.iter().all(|c| c[a] >= clip.high[a]));
             if outside {
                 return None;
             }
@@ -334,11 +322,7 @@ impl Frame<'_> {
         let identity = |s: &Setup| {
             let bits = self.surface.corners(s.face).map(|c| c.map(f32::to_bits));
             let uvs = self.surface.corner_uvs(s.face);
-            (
-                bits,
-                uvs.map(|u| u.map(|c| c.map(f32::to_bits))),
-                s.face.part,
-            )
+            (bits, uvs.map(|u| u.map(|c| c.map(f32::to_bits))), s.face.part)
         };
         identity(a) < identity(b)
     }

@@ -127,12 +127,7 @@ fn only_what_lies_in_the_clip_box_is_drawn() {
 
 #[test]
 fn a_floor_that_passes_under_the_camera_reaches_the_horizon_and_no_further() {
-    let floor = plain_quad(
-        [-1e4, 1.0, -1e4],
-        [2e4, 0., 0.],
-        [0., 0., 2e4],
-        [0., 1., 0.],
-    );
+    let floor = plain_quad([-1e4, 1.0, -1e4], [2e4, 0., 0.], [0., 0., 2e4], [0., 1., 0.]);
     let picture = draw(vec![floor], None);
     for x in 0..16 {
         assert_eq!(pixel(&picture, x, 7), [0.0; 4]);
@@ -155,12 +150,7 @@ fn the_number_of_threads_changes_no_pixel() {
         .map(|i| {
             let t = i as f32;
             let corner = [-0.9 + 0.05 * t, -0.8 + 0.03 * t, 2.0 + (t * 0.7).sin()];
-            plain_quad(
-                corner,
-                [0.6, 0.2, 0.3],
-                [-0.1, 0.7, 0.2],
-                [t / 20., 0.5, 1.0],
-            )
+            plain_quad(corner, [0.6, 0.2, 0.3], [-0.1, 0.7, 0.2], [t / 20., 0.5, 1.0])
         })
         .collect();
     let with = |threads| {

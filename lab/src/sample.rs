@@ -233,8 +233,7 @@ impl<'a> Sampler<'a> {
                 let place = self.place(&corners, weights).to_array();
                 // Saturates below 0, which rounding may reach.
                 let voxel = place.map(|x| (x as u32).min(side - 1));
-                let inside =
-                    |b: VoxelBox| (0..3).all(|a| (b.low[a]..b.high[a]).contains(&voxel[a]));
+                let inside = |b: VoxelBox| (0..3).all(|a| (b.low[a]..b.high[a]).contains(&voxel[a]));
                 let weights = weights.map(|w| w as f32);
                 if !only.is_none_or(inside) || !self.surface.is_opaque(face, weights) {
                     continue;
@@ -275,9 +274,7 @@ impl<'a> Sampler<'a> {
 }
 
 fn corners(surface: &Surface, face: Face) -> [glam::DVec3; 3] {
-    surface
-        .corners(face)
-        .map(|p| glam::Vec3::from(p).as_dvec3())
+    surface.corners(face).map(|p| glam::Vec3::from(p).as_dvec3())
 }
 
 /// Writes a cloud as binary little-endian PLY: float x y z, uchar red green blue, and comments that map it back to the mesh.
@@ -335,9 +332,7 @@ mod tests {
     }
 
     fn sample(surface: &Surface, only: Option<VoxelBox>) -> Sampled {
-        Sampler::new(surface, Grid::unit(4), 50_000, 3)
-            .unwrap()
-            .cloud(only)
+        Sampler::new(surface, Grid::unit(4), 50_000, 3).unwrap().cloud(only)
     }
 
     #[test]
@@ -388,12 +383,8 @@ mod tests {
     fn points_follow_the_area_and_the_seed() {
         // A second quad of a third of the area.
         let mut both = mesh(quad([0.0; 3], [12.0, 0.0, 0.0], [0.0, 1.0, 0.0], None));
-        both.parts.push(quad(
-            [0.0, 8.0, 0.0],
-            [4.0, 0.0, 0.0],
-            [0.0, 1.0, 0.0],
-            None,
-        ));
+        both.parts
+            .push(quad([0.0, 8.0, 0.0], [4.0, 0.0, 0.0], [0.0, 1.0, 0.0], None));
         let surface = Surface::new(&both);
         let sampler = Sampler::new(&surface, Grid::unit(4), 40_000, 9).unwrap();
         assert_eq!(sampler.ends[1], 30_000);
@@ -432,12 +423,7 @@ mod tests {
         assert!(Grid::fit(unit, 22, 0.9).is_err());
         assert!(Grid::fit(unit, 10, 1.5).is_err());
         assert!(Grid::fit([[0.0; 3]; 2], 10, 0.9).is_err());
-        let flat = Surface::new(&mesh(quad(
-            [0.0; 3],
-            [1.0, 0.0, 0.0],
-            [2.0, 0.0, 0.0],
-            None,
-        )));
+        let flat = Surface::new(&mesh(quad([0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], None)));
         assert!(Sampler::new(&flat, Grid::unit(4), 10, 0).is_err());
     }
 

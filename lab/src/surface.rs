@@ -55,9 +55,10 @@ impl Surface {
             .parts
             .par_iter()
             .map(|part| {
-                let alpha = part.texture.as_ref().map_or(255, |t| {
-                    t.rgba.iter().map(|p| p[3]).min().unwrap_or_default()
-                });
+                let alpha = part
+                    .texture
+                    .as_ref()
+                    .map_or(255, |t| t.rgba.iter().map(|p| p[3]).min().unwrap_or_default());
                 Piece {
                     positions: part.positions.as_slice().into(),
                     normals: Arc::new([]),
@@ -93,9 +94,7 @@ impl Surface {
     /// The surface elsewhere, with all that is on it.
     pub fn translated(&self, by: [f32; 3]) -> Self {
         let mut surface = self.map(|p| std::array::from_fn(|a| p[a] + by[a]));
-        surface.photograph = surface
-            .photograph
-            .map(|photograph| photograph.translated(by));
+        surface.photograph = surface.photograph.map(|photograph| photograph.translated(by));
         surface
     }
 
@@ -131,8 +130,7 @@ impl Surface {
     /// The texture coordinates of a triangle's corners, if it has any.
     pub fn corner_uvs(&self, face: Face) -> Option<[[f32; 2]; 3]> {
         let piece = &self.parts[face.part as usize];
-        (!piece.uvs.is_empty())
-            .then(|| piece.triangles[face.triangle as usize].map(|v| piece.uvs[v as usize]))
+        (!piece.uvs.is_empty()).then(|| piece.triangles[face.triangle as usize].map(|v| piece.uvs[v as usize]))
     }
 
     /// The bounding box of all triangles: lowest and highest corner.
@@ -183,8 +181,7 @@ impl Surface {
             None => own(),
             Some(photograph) => {
                 let positions = self.corners(face);
-                let normals =
-                    piece.triangles[face.triangle as usize].map(|v| piece.normals[v as usize]);
+                let normals = piece.triangles[face.triangle as usize].map(|v| piece.normals[v as usize]);
                 let colour = photograph.colour(at.map(|b| mix(positions, b)), mix(normals, at[0]));
                 if photograph.shaded {
                     let map = own();
@@ -230,9 +227,7 @@ const ALPHA_TEST: f32 = 127.0;
 
 /// The mean of three corners' values.
 fn mix<const N: usize>(corners: [[f32; N]; 3], weights: [f32; 3]) -> [f32; N] {
-    std::array::from_fn(|i| {
-        corners[0][i] * weights[0] + corners[1][i] * weights[1] + corners[2][i] * weights[2]
-    })
+    std::array::from_fn(|i| corners[0][i] * weights[0] + corners[1][i] * weights[1] + corners[2][i] * weights[2])
 }
 
 /// A linear change of colour, in values 0 to 255.
@@ -320,11 +315,7 @@ impl Pyramid {
 }
 
 fn wrap(i: i32, n: i32) -> i32 {
-    if (0..n).contains(&i) {
-        i
-    } else {
-        i.rem_euclid(n)
-    }
+    if (0..n).contains(&i) { i } else { i.rem_euclid(n) }
 }
 
 fn next(i: i32, n: i32) -> i32 {
@@ -346,18 +337,12 @@ fn half(texture: &Texture) -> Texture {
             let colour = |i: usize| {
                 let weighted: u32 = block.iter().map(|p| p[i] * p[3]).sum();
                 let plain: u32 = block.iter().map(|p| p[i]).sum();
-                (weighted + alpha / 2)
-                    .checked_div(alpha)
-                    .unwrap_or((plain + 2) / 4)
+                (weighted + alpha / 2).checked_div(alpha).unwrap_or((plain + 2) / 4)
             };
             rgba.push([colour(0), colour(1), colour(2), (alpha + 2) / 4].map(|c| c as u8));
         }
     }
-    Texture {
-        width,
-        height,
-        rgba,
-    }
+    Texture { width, height, rgba }
 }
 
 #[cfg(test)]
@@ -366,9 +351,7 @@ mod tests {
     use crate::mesh::fixtures::{mesh, quad, texture};
 
     fn grid() -> Pyramid {
-        Pyramid::new(&texture(4, 4, |x, y| {
-            [(x * 10) as u8, (y * 20) as u8, 0, 255]
-        }))
+        Pyramid::new(&texture(4, 4, |x, y| [(x * 10) as u8, (y * 20) as u8, 0, 255]))
     }
 
     #[test]
@@ -381,10 +364,7 @@ mod tests {
     #[test]
     fn textures_repeat() {
         let grid = grid();
-        assert_eq!(
-            grid.bilinear(0, [0.375, 0.625]),
-            grid.bilinear(0, [5.375, -3.375])
-        );
+        assert_eq!(grid.bilinear(0, [0.375, 0.625]), grid.bilinear(0, [5.375, -3.375]));
         // Across the border: the mean of the last column and the first.
         assert_eq!(grid.bilinear(0, [0.0, 0.625])[0], 15.0);
     }
@@ -392,11 +372,7 @@ mod tests {
     #[test]
     fn a_distant_checkerboard_is_grey_and_a_near_one_sharp() {
         let board = Pyramid::new(&texture(64, 64, |x, y| {
-            if (x + y) % 2 == 0 {
-                [255; 4]
-            } else {
-                [0, 0, 0, 255]
-            }
+            if (x + y) % 2 == 0 { [255; 4] } else { [0, 0, 0, 255] }
         }));
         let at = [0.5 / 64.0, 0.5 / 64.0];
         let far = board.filtered(at, [at[0] + 0.25, at[1]], [at[0], at[1] + 0.25]);
@@ -407,13 +383,7 @@ mod tests {
 
     #[test]
     fn what_is_cut_away_does_not_bleed_into_coarser_levels() {
-        let half_seen = texture(2, 1, |x, _| {
-            if x == 0 {
-                [200, 100, 50, 255]
-            } else {
-                [0, 0, 0, 0]
-            }
-        });
+        let half_seen = texture(2, 1, |x, _| if x == 0 { [200, 100, 50, 255] } else { [0, 0, 0, 0] });
         let coarse = half(&half_seen);
         assert_eq!(coarse.rgba, [[200, 100, 50, 128]]);
     }

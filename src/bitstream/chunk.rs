@@ -118,8 +118,7 @@ impl Chunk<'_> {
     /// [`Error::Usage`] if the payload is 4 GiB or more.
     pub(super) fn write(&self, form: Form, prefix: &[u8], out: &mut Vec<u8>) -> Result<()> {
         let length = prefix.len() + self.payload.len();
-        let length = u32::try_from(length)
-            .map_err(|_| Error::Usage(format!("a chunk cannot hold {length} bytes")))?;
+        let length = u32::try_from(length).map_err(|_| Error::Usage(format!("a chunk cannot hold {length} bytes")))?;
         let start = out.len();
         out.extend([self.kind.code(), self.level]);
         match form {
@@ -169,9 +168,7 @@ impl<'a> Chunks<'a> {
         let found = crc32c::crc32c_append(crc32c::crc32c(head), payload);
         if found != expected {
             return Err(Error::ChecksumMismatch {
-                what: format!(
-                    "a chunk that calls itself type {code}, level {level}, slice {slice}"
-                ),
+                what: format!("a chunk that calls itself type {code}, level {level}, slice {slice}"),
                 offset: start as u64,
                 expected,
                 found,
@@ -243,11 +240,7 @@ impl<'a> Chunks<'a> {
     }
 
     /// The next chunk that is not ancillary; it must be of this kind, slice 0, with a level in `levels`.
-    pub(super) fn expect_up_to(
-        &mut self,
-        kind: ChunkKind,
-        levels: std::ops::RangeInclusive<u8>,
-    ) -> Result<Chunk<'a>> {
+    pub(super) fn expect_up_to(&mut self, kind: ChunkKind, levels: std::ops::RangeInclusive<u8>) -> Result<Chunk<'a>> {
         let (first, last) = (levels.start(), levels.end());
         let wanted = || format!("{kind} chunk of a level from {first} to {last}, slice 0");
         let fits = |chunk: &Chunk| levels.contains(&chunk.level) && chunk.slice == 0;
@@ -266,10 +259,7 @@ impl<'a> Chunks<'a> {
         if chunk.kind == kind && fits(&chunk) {
             return Ok(chunk);
         }
-        let found = format!(
-            "{} of level {}, slice {}",
-            chunk.kind, chunk.level, chunk.slice
-        );
+        let found = format!("{} of level {}, slice {}", chunk.kind, chunk.level, chunk.slice);
         Err(malformed(chunk.offset, "chunk", found, wanted()))
     }
 
@@ -287,12 +277,7 @@ impl<'a> Chunks<'a> {
             None => Ok(()),
             Some(chunk) => {
                 let found = format!("a {} chunk", chunk.kind);
-                Err(malformed(
-                    chunk.offset,
-                    "chunk after the section's last",
-                    found,
-                    "none",
-                ))
+                Err(malformed(chunk.offset, "chunk after the section's last", found, "none"))
             }
         }
     }

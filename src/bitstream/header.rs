@@ -265,12 +265,7 @@ impl Header {
         let end = self.stream_bytes();
         match length.saturating_sub(end) {
             0 => Ok(()),
-            rest => Err(malformed(
-                end,
-                "length of what follows the last section",
-                rest,
-                0,
-            )),
+            rest => Err(malformed(end, "length of what follows the last section", rest, 0)),
         }
     }
 
@@ -355,12 +350,7 @@ impl Header {
         limits.check_depth("bit depth of the stream", bits)?;
         if !self.placement.is_valid() {
             let value = format!("{:?}", self.placement);
-            return Err(malformed(
-                32,
-                "placement",
-                value,
-                "finite, the size positive",
-            ));
+            return Err(malformed(32, "placement", value, "finite, the size positive"));
         }
         self.check_slices()?;
         let fixed = self.format.fixed();
@@ -416,12 +406,7 @@ fn check_levels(format: &Format, base: u8, top: u8) -> Result<()> {
     let deepest = MAX_DEPTH - u8::from(!format.codes_the_finest());
     if base > top || top - base >= most || top > deepest {
         let expected = format!("1 to {most} levels, none deeper than {deepest}");
-        return Err(malformed(
-            21,
-            "levels",
-            format!("{base} to {top}"),
-            expected,
-        ));
+        return Err(malformed(21, "levels", format!("{base} to {top}"), expected));
     }
     Ok(())
 }

@@ -98,13 +98,7 @@ fn malformed(
     value: impl ToString,
     expected: impl ToString,
 ) -> Error {
-    Error::malformed(
-        Stage::Bitstream,
-        format!("byte {offset}"),
-        field,
-        value,
-        expected,
-    )
+    Error::malformed(Stage::Bitstream, format!("byte {offset}"), field, value, expected)
 }
 
 #[cfg(test)]

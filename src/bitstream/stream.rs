@@ -108,9 +108,7 @@ impl<'a> Stream<'a> {
     pub fn intact(self) -> Result<Self> {
         let end = self.deepest().map(|level| self.header.prefix_bytes(level));
         match self.damage {
-            Some(damage) if !end.is_some_and(|end| end.is_ok_and(|end| end == self.length)) => {
-                Err(damage)
-            }
+            Some(damage) if !end.is_some_and(|end| end.is_ok_and(|end| end == self.length)) => Err(damage),
             _ => Ok(self),
         }
     }
@@ -231,13 +229,7 @@ fn take_levels<'a>(bytes: &'a [u8], header: &Header, levels: &mut Vec<Level<'a>>
 }
 
 /// The section that starts at `at`, which then is where it ends.
-fn take_section<'a>(
-    form: Form,
-    bytes: &'a [u8],
-    at: &mut u64,
-    length: u32,
-    field: &'static str,
-) -> Result<Chunks<'a>> {
+fn take_section<'a>(form: Form, bytes: &'a [u8], at: &mut u64, length: u32, field: &'static str) -> Result<Chunks<'a>> {
     // Whatever starts beyond what a machine can address starts beyond the bytes.
     let start = usize::try_from(*at).unwrap_or(usize::MAX);
     *at += u64::from(length);
@@ -247,11 +239,7 @@ fn take_section<'a>(
 }
 
 /// The geometry section of a level of version 2.
-fn take_geometry<'a>(
-    chunks: &mut Chunks<'a>,
-    header: &Header,
-    level: u8,
-) -> Result<Vec<Geometry<'a>>> {
+fn take_geometry<'a>(chunks: &mut Chunks<'a>, header: &Header, level: u8) -> Result<Vec<Geometry<'a>>> {
     let first = if level == header.base { 1 } else { level };
     let mut counts = Counts::new(header, level)?;
     let geometry = (first..=level)
@@ -285,11 +273,7 @@ impl Counts {
     }
 
     /// The slices of the next level.
-    pub(super) fn take_level<'a>(
-        &mut self,
-        chunks: &mut Chunks<'a>,
-        level: u8,
-    ) -> Result<Geometry<'a>> {
+    pub(super) fn take_level<'a>(&mut self, chunks: &mut Chunks<'a>, level: u8) -> Result<Geometry<'a>> {
         let mut slices = Vec::new();
         let mut total = 0;
         // Ends with the section's chunks, however many parents are claimed.
@@ -340,12 +324,7 @@ fn take_features<'a>(
             let mut reader = Reader::new(chunk.payload, 0);
             let Ok(hash) = reader.u64("latent hash") else {
                 let field = "length of a level's first feature chunk";
-                return Err(malformed(
-                    chunk.offset,
-                    field,
-                    chunk.payload.len(),
-                    "8 or more",
-                ));
+                return Err(malformed(chunk.offset, field, chunk.payload.len(), "8 or more"));
             };
             latent_hash = hash;
             hash_bytes = reader.at();
@@ -355,17 +334,12 @@ fn take_features<'a>(
     Ok((slices, latent_hash))
 }
 
-fn take_filters<'a>(
-    chunks: &mut Chunks<'a>,
-    level: u8,
-    voxels: u32,
-) -> Result<[Option<Slice<'a>>; FILTERS]> {
+fn take_filters<'a>(chunks: &mut Chunks<'a>, level: u8, voxels: u32) -> Result<[Option<Slice<'a>>; FILTERS]> {
     let mut filters = [None; FILTERS];
     for (number, filter) in filters.iter_mut().enumerate() {
         let counts = u64::from(voxels)..=voxels.into();
         let next = chunks.peek()?;
-        let comes =
-            |next: Chunk| next.kind != ChunkKind::Residual && usize::from(next.slice) == number;
+        let comes = |next: Chunk| next.kind != ChunkKind::Residual && usize::from(next.slice) == number;
         if next.is_some_and(comes) {
             let chunk = chunks.expect(ChunkKind::Filter, level, number as u64, counts)?;
             *filter = Some(Slice::of(&chunk, 0));
@@ -374,12 +348,7 @@ fn take_filters<'a>(
     Ok(filters)
 }
 
-fn take_residual<'a>(
-    chunks: &mut Chunks<'a>,
-    slice_voxels: u32,
-    level: u8,
-    voxels: u32,
-) -> Result<Vec<Slice<'a>>> {
+fn take_residual<'a>(chunks: &mut Chunks<'a>, slice_voxels: u32, level: u8, voxels: u32) -> Result<Vec<Slice<'a>>> {
     let mut slices = Vec::new();
     let next = chunks.peek()?;
     if next.is_none_or(|next| next.kind != ChunkKind::Residual) {

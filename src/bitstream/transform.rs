@@ -42,11 +42,7 @@ pub struct ColourLevel<'a> {
 }
 
 /// The geometry section of `level`.
-pub(super) fn take_geometry<'a>(
-    chunks: &mut Chunks<'a>,
-    header: &Header,
-    level: u8,
-) -> Result<Vec<Geometry<'a>>> {
+pub(super) fn take_geometry<'a>(chunks: &mut Chunks<'a>, header: &Header, level: u8) -> Result<Vec<Geometry<'a>>> {
     let mut counts = Counts::new(header, level)?;
     let mut geometry = match level == header.base && level > 0 {
         true => take_trunk(chunks, &mut counts, header.slice_voxels, level)?,
@@ -96,11 +92,7 @@ fn take_trunk<'a>(
         counts.parents = voxels.into();
         geometry.push(Geometry {
             level,
-            slices: vec![Slice {
-                voxels,
-                bytes,
-                offset,
-            }],
+            slices: vec![Slice { voxels, bytes, offset }],
         });
     }
     let rest = chunk.payload.len() - reader.at();
@@ -132,9 +124,7 @@ pub(super) fn take_colours<'a>(
     level: u8,
 ) -> Result<Colours<'a>> {
     let sum = |part: &Geometry| part.slices.iter().map(|s| u64::from(s.voxels)).sum();
-    let counts: Vec<u64> = std::iter::once(above)
-        .chain(geometry.iter().map(sum))
-        .collect();
+    let counts: Vec<u64> = std::iter::once(above).chain(geometry.iter().map(sum)).collect();
     let voxels = |n: u8| counts[counts.len() - 1 - usize::from(level - n)];
     let mut hash = None;
     let trunk = match level == header.base {

@@ -44,14 +44,7 @@ impl Writer {
         let section = self.header.index(level.max(self.header.base))?;
         let start = self.body.len();
         for (slice, (count, bytes)) in slices.iter().enumerate() {
-            self.chunk(
-                ChunkKind::Geometry,
-                level,
-                slice,
-                *count,
-                &[],
-                bytes.as_ref(),
-            )?;
+            self.chunk(ChunkKind::Geometry, level, slice, *count, &[], bytes.as_ref())?;
         }
         let length = &mut self.header.sections[section].geometry;
         *length = extended(*length, self.body.len() - start)?;
@@ -62,26 +55,14 @@ impl Writer {
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level, the slices are more or fewer than its voxels fill, or the code is too long.
-    pub fn features(
-        &mut self,
-        level: u8,
-        latent_hash: u64,
-        slices: &[impl AsRef<[u8]>],
-    ) -> Result<()> {
+    pub fn features(&mut self, level: u8, latent_hash: u64, slices: &[impl AsRef<[u8]>]) -> Result<()> {
         let section = self.header.index(level)?;
         let counts = self.slices(section, slices.len())?;
         let start = self.body.len();
         for (slice, (&count, bytes)) in counts.iter().zip(slices).enumerate() {
             let hash = latent_hash.to_le_bytes();
             let prefix = if slice == 0 { &hash[..] } else { &[] };
-            self.chunk(
-                ChunkKind::Features,
-                level,
-                slice,
-                count,
-                prefix,
-                bytes.as_ref(),
-            )?;
+            self.chunk(ChunkKind::Features, level, slice, count, prefix, bytes.as_ref())?;
         }
         self.extend_colours(section, start)
     }
@@ -140,13 +121,7 @@ impl Writer {
     ///
     /// # Errors
     /// [`Error::Usage`] if the payload is too long.
-    pub fn colour_trunk(
-        &mut self,
-        level: u8,
-        voxels: u32,
-        hash: u64,
-        payload: &[u8],
-    ) -> Result<()> {
+    pub fn colour_trunk(&mut self, level: u8, voxels: u32, hash: u64, payload: &[u8]) -> Result<()> {
         let start = self.body.len();
         let kind = ChunkKind::ColourTrunk;
         self.chunk(kind, level, 0, voxels, &hash.to_le_bytes(), payload)?;
@@ -158,12 +133,7 @@ impl Writer {
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level or a payload is too long.
-    pub fn colours(
-        &mut self,
-        level: u8,
-        hash: Option<u64>,
-        slices: &[(u32, impl AsRef<[u8]>)],
-    ) -> Result<()> {
+    pub fn colours(&mut self, level: u8, hash: Option<u64>, slices: &[(u32, impl AsRef<[u8]>)]) -> Result<()> {
         let section = self.header.index(level.max(self.header.base))?;
         let start = self.body.len();
         for (slice, (count, bytes)) in slices.iter().enumerate() {

@@ -259,12 +259,7 @@ pub struct View {
     #[arg(long, value_name = "WxH", default_value = "1024x1024", value_parser = size)]
     pub size: (u32, u32),
     /// Horizontal field of view in degrees
-    #[arg(
-        long,
-        value_name = "DEG",
-        default_value_t = 45.0,
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "DEG", default_value_t = 45.0, allow_negative_numbers = true)]
     pub fov: f32,
     /// Azimuth and elevation in degrees and distance from the cube's centre; the cube reaches from −1 to 1
     #[arg(long, value_name = "AZ,EL,R", default_value = "0,0,3", value_parser = orbit, allow_hyphen_values = true)]
@@ -372,10 +367,7 @@ pub struct ModelArg {
 }
 
 use super::budget::BudgetArgs;
-use super::values::{
-    background, bits_per_point, bytes, effect, levels, orbit, per_voxel, price, residual, size,
-    step,
-};
+use super::values::{background, bits_per_point, bytes, effect, levels, orbit, per_voxel, price, residual, size, step};
 pub use b2p::pixels::{Background, Choice, Effect, Quality};
 
 #[cfg(test)]

@@ -54,9 +54,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         progress.say(&format!("run {run} of {}", args.repeat));
         let mut log = Log::default();
         let start = Instant::now();
-        let gaussians = decoder
-            .decode(&bytes, Some(level), &mut log)
-            .map_err(fail)?;
+        let gaussians = decoder.decode(&bytes, Some(level), &mut log).map_err(fail)?;
         let total = start.elapsed();
         drop(gaussians);
         if run > 0 {
@@ -126,18 +124,9 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
     }
 
     let mut rows = vec![
-        [
-            "stage",
-            "items",
-            "",
-            "median",
-            "GMAC",
-            "GMAC/s",
-            "of ceiling",
-            "MB",
-        ]
-        .map(String::from)
-        .to_vec(),
+        ["stage", "items", "", "median", "GMAC", "GMAC/s", "of ceiling", "MB"]
+            .map(String::from)
+            .to_vec(),
     ];
     for line in &lines {
         let mut row = vec![
@@ -167,9 +156,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         String::new(),
         milliseconds(loading),
     ]);
-    let memory = memory.map_or(String::new(), |bytes| {
-        format!(", peak memory {} MB", bytes / 1_000_000)
-    });
+    let memory = memory.map_or(String::new(), |bytes| format!(", peak memory {} MB", bytes / 1_000_000));
     Ok(format!(
         "level {level}, {heads} heads, {}, {}, {threads} threads, medians of {} runs{memory}\n{}\n\
          Ceilings, measured just now: {:.0} GMAC/s in integers, {:.0} in what Gaussians are generated in.\n\
@@ -197,10 +184,7 @@ impl Ceilings {
             Precision::F16 => cores as f64 * ceiling::f32(isa),
             Precision::Half => cores as f64 * ceiling::half(isa),
         };
-        Ceilings {
-            integers,
-            gaussians,
-        }
+        Ceilings { integers, gaussians }
     }
 
     /// How near a stage came.

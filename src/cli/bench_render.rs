@@ -91,10 +91,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         count(gaussians.len() as u64),
         count(stats.visible),
         args.repeat,
-        memory.map_or(String::new(), |bytes| format!(
-            ", peak memory {} MB",
-            bytes / 1_000_000
-        )),
+        memory.map_or(String::new(), |bytes| format!(", peak memory {} MB", bytes / 1_000_000)),
         table(&rows),
     ))
 }

@@ -63,9 +63,7 @@ pub fn choose(
         return Ok(None);
     }
     if input == Path::new(PIPE) {
-        return Err(Failure(
-            "a budget is for files: what a pipe brings is not known".into(),
-        ));
+        return Err(Failure("a budget is for files: what a pipe brings is not known".into()));
     }
     let stream = load::bytes(input)?;
     if stream.starts_with(load::PLY_MAGIC) {
@@ -87,9 +85,7 @@ pub fn choose(
     }
     let decoder = Decoder::new(&model).with_limits(limits.clone());
     let levels = decoder.levels(&stream).map_err(&fail)?;
-    let choice = budget
-        .choose(&calibration, &header, &levels, task)
-        .map_err(&fail)?;
+    let choice = budget.choose(&calibration, &header, &levels, task).map_err(&fail)?;
     Ok(Some(Chosen { choice, budget }))
 }
 
@@ -183,11 +179,7 @@ impl Chosen {
                 format!("; kept: {} of {}", milliseconds(took), milliseconds(time))
             }
             Some(time) => {
-                format!(
-                    "; not kept: {} of {}",
-                    milliseconds(took),
-                    milliseconds(time)
-                )
+                format!("; not kept: {} of {}", milliseconds(took), milliseconds(time))
             }
         };
         text + "\n"

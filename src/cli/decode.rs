@@ -32,40 +32,22 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String
         })?;
         let count = count(gaussians.len() as u64);
         let steps = steps(log.steps());
-        return Ok(format!(
-            "{told}{steps}\n{}: {count} Gaussians\n",
-            to.display()
-        ));
+        return Ok(format!("{told}{steps}\n{}: {count} Gaussians\n", to.display()));
     }
-    let chosen = budget::choose(
-        &args.budget,
-        &args.model,
-        input,
-        Task::Decode,
-        limits,
-        progress,
-    )?;
+    let chosen = budget::choose(&args.budget, &args.model, input, Task::Decode, limits, progress)?;
     let chosen_args = chosen.as_ref().map(|c| (c.detail(), c.model(&args.model)));
     let (detail, model) = match &chosen_args {
         Some((detail, model)) => (detail, model),
         None => (&args.detail, &args.model),
     };
-    pipe::each(
-        input,
-        detail,
-        model,
-        limits,
-        true,
-        &mut log,
-        &mut |gaussians, log| {
-            written = gaussians.len();
-            took = log.steps().iter().map(|step| step.time).sum();
-            log.step("write PLY", written, "Gaussians", || {
-                output::write_file(to, |w| gaussians.write_ply(w, to))
-            })?;
-            Ok(())
-        },
-    )?;
+    pipe::each(input, detail, model, limits, true, &mut log, &mut |gaussians, log| {
+        written = gaussians.len();
+        took = log.steps().iter().map(|step| step.time).sum();
+        log.step("write PLY", written, "Gaussians", || {
+            output::write_file(to, |w| gaussians.write_ply(w, to))
+        })?;
+        Ok(())
+    })?;
     let chosen = chosen.map_or(String::new(), |c| c.describe(Task::Decode, took));
     Ok(format!(
         "{chosen}{}\n{}: {} Gaussians\n",
@@ -88,10 +70,7 @@ fn points(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String>
     let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?;
     let decoding = decoder.whole(&bytes, args.detail.level, &mut log);
     let decoding = decoding.map_err(&fail)?;
-    let cloud = decoding
-        .points()
-        .map(|points| points.to_cloud())
-        .unwrap_or_default();
+    let cloud = decoding.points().map(|points| points.to_cloud()).unwrap_or_default();
     let (written, to) = (cloud.positions.len(), &args.output);
     log.step("write PLY", written, "points", || cloud.write(to))?;
     Ok(format!(

@@ -50,10 +50,9 @@ pub fn run(args: &Demo, progress: &Progress) -> Result<String> {
                 background: Background::WHITE,
             };
             for (path, camera) in render::cameras(&view, &path)? {
-                let stats =
-                    log.step(format!("draw {name}"), gaussians.len(), "Gaussians", || {
-                        render::draw(&mut renderer, &gaussians, &camera, &view, &path)
-                    })?;
+                let stats = log.step(format!("draw {name}"), gaussians.len(), "Gaussians", || {
+                    render::draw(&mut renderer, &gaussians, &camera, &view, &path)
+                })?;
                 lines += &render::describe(&path, &stats);
                 written.push(path);
             }

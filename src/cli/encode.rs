@@ -18,9 +18,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
     let mut log = Log::with_listener(&say);
     let in_cloud = Failure::in_file(&args.cloud);
     let cloud = log
-        .step("read cloud", 1, "file", || {
-            PointCloud::open(&args.cloud, limits)
-        })
+        .step("read cloud", 1, "file", || PointCloud::open(&args.cloud, limits))
         .map_err(&in_cloud)?;
     let points = cloud.positions.len();
     let (cloud, finest) = log
@@ -108,8 +106,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Cod
     let in_cloud = Failure::in_file(&args.cloud);
     let (encoded, chosen) = match args.bits_per_point {
         Some(most) => {
-            let (encoded, chosen) =
-                transform::encode_within(cloud, &options, most, log).map_err(in_cloud)?;
+            let (encoded, chosen) = transform::encode_within(cloud, &options, most, log).map_err(in_cloud)?;
             let level = chosen.levels.map_or(0, |levels| *levels.end());
             let how = chosen.fineness;
             (encoded, format!(" of at most {most}: level {level}, {how}"))
@@ -157,9 +154,7 @@ fn within(most: f64, chosen: &Options) -> String {
     let (price, residual) = (chosen.bit_price, chosen.residual);
     let more = match residual {
         Residual::Fine(Steps { luma: 1, .. }) => ", the finest there is",
-        Residual::None if chosen.filter || price > 2.0 => {
-            "; a model for fewer bits (--model) may be better"
-        }
+        Residual::None if chosen.filter || price > 2.0 => "; a model for fewer bits (--model) may be better",
         _ => "",
     };
     format!(" of at most {most}: bit price {price:.2}, {residual}{more}")

@@ -31,23 +31,13 @@ pub struct Kept {
 impl Kept {
     /// What was chosen, and whether the time was kept by what took `took`.
     pub fn describe(&self, took: Duration) -> String {
-        let kept = if took <= self.time {
-            "kept"
-        } else {
-            "not kept"
-        };
+        let kept = if took <= self.time { "kept" } else { "not kept" };
         let promise = match self.expected {
             true => String::new(),
-            false => format!(
-                ", which was not expected to take {}",
-                milliseconds(self.time)
-            ),
+            false => format!(", which was not expected to take {}", milliseconds(self.time)),
         };
         let (took, time) = (milliseconds(took), milliseconds(self.time));
-        format!(
-            "budget: level {}{promise}; {kept}: {took} of {time}\n",
-            self.level
-        )
+        format!("budget: level {}{promise}; {kept}: {took} of {time}\n", self.level)
     }
 }
 

@@ -50,12 +50,7 @@ pub fn model(arg: &ModelArg) -> Result<Model> {
 }
 
 /// What decodes the stream that starts with these bytes, with the heads asked for. A model is loaded only if it takes one.
-pub fn decoder(
-    bytes: &[u8],
-    detail: &DetailArg,
-    model_arg: &ModelArg,
-    limits: &Limits,
-) -> Result<StreamDecoder> {
+pub fn decoder(bytes: &[u8], detail: &DetailArg, model_arg: &ModelArg, limits: &Limits) -> Result<StreamDecoder> {
     let mut decoder = StreamDecoder::new()
         .with_isa(isa(model_arg.isa.as_deref())?)
         .with_limits(limits.clone());
@@ -148,32 +143,19 @@ impl<'p> Source<'p> {
             return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
         }
         let decoder = Box::new(decoder(&bytes, detail, model_arg, limits)?);
-        Ok(Source::Stream {
-            path,
-            bytes,
-            decoder,
-        })
+        Ok(Source::Stream { path, bytes, decoder })
     }
 
     /// The cube that they refer to.
     pub fn frame(&self) -> Result<Frame> {
         match self {
             Source::Gaussians(gaussians) => Ok(gaussians.frame),
-            Source::Stream {
-                path,
-                bytes,
-                decoder,
-            } => decoder.frame(bytes).map_err(Failure::in_file(path)),
+            Source::Stream { path, bytes, decoder } => decoder.frame(bytes).map_err(Failure::in_file(path)),
         }
     }
 
     /// The Gaussians of `level`; without one, of what `cameras` can show, and why that level.
-    pub fn gaussians(
-        self,
-        detail: &DetailArg,
-        cameras: &[Camera],
-        log: &mut Log,
-    ) -> Result<(Gaussians, Explanation)> {
+    pub fn gaussians(self, detail: &DetailArg, cameras: &[Camera], log: &mut Log) -> Result<(Gaussians, Explanation)> {
         let explain = |on, why| Explanation {
             name: "detail",
             on,
@@ -183,11 +165,7 @@ impl<'p> Source<'p> {
             Source::Gaussians(gaussians) => {
                 return Ok((gaussians, explain(false, "a PLY has no levels".into())));
             }
-            Source::Stream {
-                path,
-                bytes,
-                decoder,
-            } => (path, bytes, decoder),
+            Source::Stream { path, bytes, decoder } => (path, bytes, decoder),
         };
         let fail = Failure::in_file(path);
         let seen = match detail.level {
@@ -205,17 +183,8 @@ impl<'p> Source<'p> {
 }
 
 /// Gaussians as they stand in the PLY `bytes`, which came from `path`.
-pub fn ply(
-    path: &Path,
-    bytes: &[u8],
-    detail: &DetailArg,
-    limits: &Limits,
-    log: &mut Log,
-) -> Result<Gaussians> {
-    let asked = [
-        ("--level", detail.level.is_some()),
-        ("--heads", detail.heads.is_some()),
-    ];
+pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &mut Log) -> Result<Gaussians> {
+    let asked = [("--level", detail.level.is_some()), ("--heads", detail.heads.is_some())];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
         return Err(Failure(format!(
             "{}: {name} is for streams, this is a PLY",

@@ -98,9 +98,7 @@ impl<'a> Artist<'a> {
         };
         (self.image.width, self.image.height) = (self.ids.width, self.ids.height);
         self.image.pixels.clear();
-        self.image
-            .pixels
-            .extend(self.ids.indices.iter().map(colour));
+        self.image.pixels.extend(self.ids.indices.iter().map(colour));
         Ok(stats)
     }
 
@@ -125,11 +123,7 @@ pub fn format_of(args: &Render, pictures: usize) -> Result<Format> {
         return Ok(format);
     }
     if args.output == Path::new(PIPE) {
-        return Ok(if pictures == 1 {
-            Format::Png
-        } else {
-            Format::Y4m
-        });
+        return Ok(if pictures == 1 { Format::Png } else { Format::Y4m });
     }
     let ending = args.output.extension().unwrap_or_default();
     match ending.to_string_lossy().to_lowercase().as_str() {

@@ -98,9 +98,7 @@ pub fn each(
 }
 
 fn show_level(decoding: &StreamDecoding, log: &mut Log, show: &mut Show) -> Result<()> {
-    let gaussians = decoding
-        .gaussians(log)
-        .map_err(Failure::in_file(Path::new(PIPE)))?;
+    let gaussians = decoding.gaussians(log).map_err(Failure::in_file(Path::new(PIPE)))?;
     show(&gaussians, log)
 }
 

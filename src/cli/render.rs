@@ -112,12 +112,7 @@ enum For<'a> {
 }
 
 /// Draws these Gaussians into the pictures asked for.
-fn pictures(
-    drawing: &Drawing,
-    gaussians: &Gaussians,
-    cameras: &[(PathBuf, Camera)],
-    log: &mut Log,
-) -> Result<String> {
+fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camera)], log: &mut Log) -> Result<String> {
     let &Drawing { args, limits, .. } = drawing;
     let mut effects = Effects::default();
     for (effect, choice) in &args.effect {
@@ -130,12 +125,9 @@ fn pictures(
     let mut artist = Artist::new(renderer, gaussians, limits, args, format);
     let mut all = Vec::new();
     let mut each = |path: &Path, camera: &Camera, artist: &mut Artist| -> b2p::Result<()> {
-        let stats = log.step(
-            format!("draw {}", path.display()),
-            gaussians.len(),
-            "Gaussians",
-            || artist.draw(camera),
-        )?;
+        let stats = log.step(format!("draw {}", path.display()), gaussians.len(), "Gaussians", || {
+            artist.draw(camera)
+        })?;
         all.push((path.to_owned(), camera.size(), stats));
         Ok(())
     };
@@ -182,9 +174,7 @@ fn pictures(
             For::Kept(kept) => kept.describe(slowest),
         };
     }
-    if let (true, Some((_, camera)), Some((_, _, stats))) =
-        (args.verbose, cameras.first(), all.first())
-    {
+    if let (true, Some((_, camera)), Some((_, _, stats))) = (args.verbose, cameras.first(), all.first()) {
         if let Some(detail) = &drawing.detail {
             text += &format!("{detail}\n");
         }
@@ -218,12 +208,7 @@ fn pictures(
 }
 
 /// What an effect that is on costs, in words: how much sooner the picture is there without it.
-fn cost_of(
-    line: &Explanation,
-    artist: &mut Artist,
-    effects: Effects,
-    camera: &Camera,
-) -> Result<String> {
+fn cost_of(line: &Explanation, artist: &mut Artist, effects: Effects, camera: &Camera) -> Result<String> {
     let Ok(effect) = line.name.parse() else {
         return Ok(String::new());
     };
@@ -257,8 +242,7 @@ fn asked_for(args: &Render, frame: &Frame) -> Result<Vec<(PathBuf, Camera)>> {
         return Ok(cameras);
     };
     let text = |path: &Path| -> Result<String> {
-        String::from_utf8(load::bytes(path)?)
-            .map_err(|_| Failure(format!("{}: not a text", path.display())))
+        String::from_utf8(load::bytes(path)?).map_err(|_| Failure(format!("{}: not a text", path.display())))
     };
     let named = if path.extension().is_some_and(|ending| ending == "txt") {
         let lenses = text(&path.with_file_name("cameras.txt"))?;

@@ -36,22 +36,10 @@ pub fn table(rows: &[Vec<String>]) -> String {
 pub fn steps(steps: &[Step]) -> String {
     let mut rows: Vec<Vec<String>> = steps
         .iter()
-        .map(|s| {
-            vec![
-                s.name.clone(),
-                count(s.count),
-                s.unit.into(),
-                milliseconds(s.time),
-            ]
-        })
+        .map(|s| vec![s.name.clone(), count(s.count), s.unit.into(), milliseconds(s.time)])
         .collect();
     let total = steps.iter().map(|s| s.time).sum();
-    rows.push(vec![
-        "total".into(),
-        String::new(),
-        String::new(),
-        milliseconds(total),
-    ]);
+    rows.push(vec!["total".into(), String::new(), String::new(), milliseconds(total)]);
     table(&rows)
 }
 
@@ -79,10 +67,7 @@ mod tests {
 
     #[test]
     fn columns_line_up() {
-        let rows = [
-            vec!["a".to_string(), "1".into()],
-            vec!["bcd".into(), "1000".into()],
-        ];
+        let rows = [vec!["a".to_string(), "1".into()], vec!["bcd".into(), "1000".into()]];
         assert_eq!(table(&rows), "a       1\nbcd  1000\n");
     }
 

@@ -51,8 +51,8 @@ pub fn run(args: &Tradeoff, limits: &Limits, progress: &Progress) -> Result<Stri
         path: args.output.clone(),
         source,
     })?;
-    let json = serde_json::to_string_pretty(&report)
-        .map_err(|e| Failure(format!("the report cannot be written: {e}")))?;
+    let json =
+        serde_json::to_string_pretty(&report).map_err(|e| Failure(format!("the report cannot be written: {e}")))?;
     let files = [
         ("tradeoff.json", json),
         ("tradeoff.svg", tradeoff::plot(&report)),
@@ -87,11 +87,7 @@ fn summary(report: &Report) -> String {
         "{}, {} cores, {}; {} views of {width}×{height}, medians of {} repeats\n\
          Accuracy against pictures in double precision: PSNR in dB, MS-SSIM, the worst pixel of 255.\n\
          ~ cannot be told from the default's time.\n\n",
-        report.machine.processor,
-        report.machine.cores,
-        report.machine.isa,
-        report.views,
-        report.repeats,
+        report.machine.processor, report.machine.cores, report.machine.isa, report.views, report.repeats,
     );
     let head = [
         "one knob at a time",
@@ -124,11 +120,7 @@ fn summary(report: &Report) -> String {
         rows[0].extend(settings.iter().map(|error| error.setting.clone()));
         for case in cases {
             let mut row = vec![case.name.clone()];
-            row.extend(
-                case.errors
-                    .iter()
-                    .map(|error| format!("{:.2}", error.worst)),
-            );
+            row.extend(case.errors.iter().map(|error| format!("{:.2}", error.worst)));
             rows.push(row);
         }
         text += "\n";
@@ -137,11 +129,7 @@ fn summary(report: &Report) -> String {
     let head = ["effect", "scene", "called for", "off ms", "on ms", "worst"];
     let mut rows = vec![head.map(String::from).to_vec()];
     for cost in &report.effects {
-        let same = if cost.verdict == Verdict::Same {
-            "~"
-        } else {
-            ""
-        };
+        let same = if cost.verdict == Verdict::Same { "~" } else { "" };
         rows.push(vec![
             cost.effect.clone(),
             cost.scene.clone(),

@@ -21,19 +21,13 @@ pub fn bytes(text: &str) -> Result<u64, String> {
         _ => return Err(expected.into()),
     };
     let number: u64 = digits.parse().map_err(|_| expected)?;
-    number
-        .checked_mul(1 << (10 * power))
-        .ok_or_else(|| expected.into())
+    number.checked_mul(1 << (10 * power)).ok_or_else(|| expected.into())
 }
 
 pub fn levels(text: &str) -> Result<RangeInclusive<u8>, String> {
     let expected = "expected two levels such as 7..9";
     let (first, last) = text.split_once("..").ok_or(expected)?;
-    let number = |t: &str| {
-        t.trim_start_matches('=')
-            .parse::<u8>()
-            .map_err(|_| expected)
-    };
+    let number = |t: &str| t.trim_start_matches('=').parse::<u8>().map_err(|_| expected);
     let (first, last) = (number(first)?, number(last)?);
     if first > last {
         return Err(format!("level {first} comes after level {last}"));
@@ -106,14 +100,9 @@ pub fn size(text: &str) -> Result<(u32, u32), String> {
 pub fn orbit(text: &str) -> Result<[f32; 3], String> {
     let numbers: Vec<f32> = text
         .split(',')
-        .map(|t| {
-            t.trim()
-                .parse()
-                .map_err(|_| format!("'{t}' is not a number"))
-        })
+        .map(|t| t.trim().parse().map_err(|_| format!("'{t}' is not a number")))
         .collect::<Result<_, _>>()?;
-    <[f32; 3]>::try_from(numbers)
-        .map_err(|_| "expected three numbers: azimuth,elevation,distance".into())
+    <[f32; 3]>::try_from(numbers).map_err(|_| "expected three numbers: azimuth,elevation,distance".into())
 }
 
 pub fn effect(text: &str) -> Result<(Effect, Choice), String> {
@@ -135,9 +124,7 @@ pub fn background(text: &str) -> Result<Background, String> {
 }
 
 fn hex(text: &str) -> Option<[u8; 3]> {
-    let digits = text
-        .strip_prefix('#')
-        .filter(|d| d.len() == 6 && d.is_ascii())?;
+    let digits = text.strip_prefix('#').filter(|d| d.len() == 6 && d.is_ascii())?;
     let channel = |i: usize| u8::from_str_radix(&digits[2 * i..2 * i + 2], 16).ok();
     Some([channel(0)?, channel(1)?, channel(2)?])
 }

@@ -15,11 +15,6 @@ pub use voxelise::{ColouredVoxels, voxelise, voxelise_closed};
 use crate::error::{Error, Stage};
 
 /// Something in a file or among its points that is no cloud.
-fn malformed(
-    at: impl ToString,
-    field: impl ToString,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
+fn malformed(at: impl ToString, field: impl ToString, value: impl ToString, expected: impl ToString) -> Error {
     Error::malformed(Stage::Cloud, at, field, value, expected)
 }

@@ -79,48 +79,26 @@ impl PointCloud {
     }
 }
 
-fn fill_axis(
-    positions: &mut [[f64; 3]],
-    axis: usize,
-    name: &str,
-    column: &Column,
-    ply: &Ply,
-) -> Result<()> {
+fn fill_axis(positions: &mut [[f64; 3]], axis: usize, name: &str, column: &Column, ply: &Ply) -> Result<()> {
     for (row, position) in positions.iter_mut().enumerate() {
         let value = column.get(row);
         if !value.is_finite() {
             let at = ply.vertex_place(row);
-            return Err(malformed(
-                at,
-                format!("property {name}"),
-                value,
-                "a finite number",
-            ));
+            return Err(malformed(at, format!("property {name}"), value, "a finite number"));
         }
         position[axis] = value;
     }
     Ok(())
 }
 
-fn fill_channel(
-    colours: &mut [[u8; 3]],
-    channel: usize,
-    name: &str,
-    column: &Column,
-    ply: &Ply,
-) -> Result<()> {
+fn fill_channel(colours: &mut [[u8; 3]], channel: usize, name: &str, column: &Column, ply: &Ply) -> Result<()> {
     let scale = match column.scalar {
         Scalar::U8 => 1.0,
         Scalar::U16 => 255.0 / 65535.0,
         Scalar::F32 | Scalar::F64 => 255.0,
         other => {
             let expected = "uchar, ushort, float or double";
-            return Err(malformed(
-                "header",
-                format!("type of property {name}"),
-                other,
-                expected,
-            ));
+            return Err(malformed("header", format!("type of property {name}"), other, expected));
         }
     };
     if let Values::U8(values) = &column.values {
@@ -134,12 +112,7 @@ fn fill_channel(
         let byte = (value * scale).round();
         if !(0.0..=255.0).contains(&byte) {
             let at = ply.vertex_place(row);
-            return Err(malformed(
-                at,
-                format!("property {name}"),
-                value,
-                "a number from 0 to 1",
-            ));
+            return Err(malformed(at, format!("property {name}"), value, "a number from 0 to 1"));
         }
         colour[channel] = byte as u8;
     }
@@ -178,9 +151,7 @@ impl Hints {
 
 /// A number of a comment; Python may have wrapped it in `np.float64( )`.
 fn number(word: &str) -> Option<f64> {
-    let bare = word
-        .strip_prefix("np.float64(")
-        .and_then(|w| w.strip_suffix(')'));
+    let bare = word.strip_prefix("np.float64(").and_then(|w| w.strip_suffix(')'));
     bare.unwrap_or(word).parse().ok()
 }
 
@@ -191,10 +162,7 @@ mod tests {
     fn read(types: &str, rows: &str) -> Result<PointCloud> {
         let mut text = "ply\nformat ascii 1.0\nelement vertex ".to_owned();
         text += &format!("{}\n", rows.lines().count());
-        for (name, scalar) in ["blue", "z", "x", "green", "y", "red"]
-            .iter()
-            .zip(types.split(' '))
-        {
+        for (name, scalar) in ["blue", "z", "x", "green", "y", "red"].iter().zip(types.split(' ')) {
             text += &format!("property {scalar} {name}\n");
         }
         text += "end_header\n";
@@ -216,10 +184,7 @@ mod tests {
         let types = "uchar float float uchar float float";
         let error = |types: &str, rows: &str| read(types, rows).unwrap_err().to_string();
         let text = error(types, "1 2 3 4 5 0.5\n1 2 3 4 nan 0.5\n");
-        assert_eq!(
-            text,
-            "cloud: at line 12: property y is NaN, expected a finite number"
-        );
+        assert_eq!(text, "cloud: at line 12: property y is NaN, expected a finite number");
         let text = error(types, "1 2 3 4 5 1.1\n");
         assert!(text.contains("line 11: property red is 1.1"), "{text}");
         assert!(error(types, "1 2 3 4 5 nan\n").contains("property red"));
@@ -227,23 +192,14 @@ mod tests {
         let text = error("uchar float float uchar float int", "1 2 3 4 5 6\n");
         assert!(text.contains("type of property red is int"), "{text}");
         let bare = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n";
-        let text = PointCloud::from_ply(bare, &Limits::default())
-            .unwrap_err()
-            .to_string();
+        let text = PointCloud::from_ply(bare, &Limits::default()).unwrap_err().to_string();
         assert!(text.contains("property of vertex red is absent"), "{text}");
     }
 
     #[test]
     fn comments_tell_the_grid_and_free_text_does_not_disturb() {
-        let hints = |lines: &[&str]| {
-            Hints::from_comments(&lines.iter().map(|l| l.to_string()).collect::<Vec<_>>())
-        };
-        let grid = [
-            "bits 11",
-            "unit np.float64(0.5)",
-            "origin 1 2 3",
-            "shift 4 0 0",
-        ];
+        let hints = |lines: &[&str]| Hints::from_comments(&lines.iter().map(|l| l.to_string()).collect::<Vec<_>>());
+        let grid = ["bits 11", "unit np.float64(0.5)", "origin 1 2 3", "shift 4 0 0"];
         let placement = Placement {
             origin: [-1.0, 2.0, 3.0],
             voxel_size: 0.5,

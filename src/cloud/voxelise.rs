@@ -51,9 +51,7 @@ pub fn voxelise(cloud: &PointCloud, bits: Option<u8>) -> Result<ColouredVoxels> 
     if let Some(bits) = bits
         && !(1..=morton::MAX_DEPTH).contains(&bits)
     {
-        return Err(Error::Usage(format!(
-            "the bit depth is 1 to 21, not {bits}"
-        )));
+        return Err(Error::Usage(format!("the bit depth is 1 to 21, not {bits}")));
     }
     if cloud.positions.len() != cloud.colours.len() {
         return Err(Error::Usage(format!(
@@ -128,11 +126,7 @@ pub fn voxelise_closed(cloud: &PointCloud) -> Result<(ColouredVoxels, u8)> {
     let finest = voxelise(cloud, None)?;
     let depth = finest.voxels.depth();
     let is_closed = |bits: &u8| {
-        let drawn = finest
-            .voxels
-            .keys()
-            .iter()
-            .map(|key| key >> (3 * (depth + 1 - bits)));
+        let drawn = finest.voxels.keys().iter().map(|key| key >> (3 * (depth + 1 - bits)));
         let mut last = None;
         let count = drawn.filter(|&key| last.replace(key) != Some(key)).count();
         5 * count <= 2 * finest.voxels.len()
@@ -148,9 +142,7 @@ impl ColouredVoxels {
     pub fn to_cloud(&self) -> PointCloud {
         let voxels = 0..self.voxels.len();
         PointCloud {
-            positions: voxels
-                .map(|i| self.voxels.coordinate(i).map(f64::from))
-                .collect(),
+            positions: voxels.map(|i| self.voxels.coordinate(i).map(f64::from)).collect(),
             colours: self.colours.clone(),
             hints: Hints {
                 bits: Some(self.voxels.depth()),
@@ -255,10 +247,7 @@ mod tests {
         points.hints.bits = Some(1);
         assert_eq!(depth(&points, None), 1);
         for bits in [0, 22] {
-            assert!(matches!(
-                voxelise(&points, Some(bits)),
-                Err(Error::Usage(_))
-            ));
+            assert!(matches!(voxelise(&points, Some(bits)), Err(Error::Usage(_))));
         }
     }
 
@@ -287,10 +276,7 @@ mod tests {
             let voxels = |bits: u8| voxelise(&cloud, Some(bits)).unwrap().voxels.len();
             let depth = grid.voxels.depth();
             let is_closed = |bits: u8| 2 * voxels(10) >= 5 * voxels(bits - 1);
-            assert!(
-                is_closed(depth) && !is_closed(depth + 1),
-                "{points} at {depth}"
-            );
+            assert!(is_closed(depth) && !is_closed(depth + 1), "{points} at {depth}");
             assert!(depth > last);
             assert_eq!(grid, voxelise(&cloud, Some(depth)).unwrap());
             last = depth;
@@ -329,10 +315,7 @@ mod tests {
     fn the_longest_side_of_a_metric_cloud_spans_the_cube_and_the_others_are_centred() {
         let points = cloud(&[[-1.0, 0.25, 7.0], [3.0, 2.25, 7.0], [1.0, 1.25, 7.0]]);
         let grid = voxelise(&points, Some(4)).unwrap();
-        assert_eq!(
-            coordinates(&grid.voxels),
-            [[0, 4, 8], [8, 8, 8], [15, 12, 8]]
-        );
+        assert_eq!(coordinates(&grid.voxels), [[0, 4, 8], [8, 8, 8], [15, 12, 8]]);
         assert_eq!(grid.placement.voxel_size, 0.25);
         assert_eq!(grid.placement.origin, [-1.0, -0.75, 5.0]);
     }
@@ -348,20 +331,11 @@ mod tests {
     fn boxes_that_numbers_cannot_express_are_refused() {
         for far in [f64::MAX, f64::NAN, f64::INFINITY] {
             let points = cloud(&[[far, 0.0, 0.5], [-far, 0.0, 0.5]]);
-            assert!(matches!(
-                voxelise(&points, None),
-                Err(Error::Malformed { .. })
-            ));
+            assert!(matches!(voxelise(&points, None), Err(Error::Malformed { .. })));
         }
         let points = cloud(&[[5e-324, 0.0, 0.0], [0.0; 3]]);
-        assert!(matches!(
-            voxelise(&points, None),
-            Err(Error::Malformed { .. })
-        ));
-        assert!(matches!(
-            voxelise(&cloud(&[]), None),
-            Err(Error::Malformed { .. })
-        ));
+        assert!(matches!(voxelise(&points, None), Err(Error::Malformed { .. })));
+        assert!(matches!(voxelise(&cloud(&[]), None), Err(Error::Malformed { .. })));
     }
 
     proptest! {

@@ -21,10 +21,7 @@ impl PointCloud {
         }
         if let Some(p) = self.hints.placement {
             let [x, y, z] = p.origin;
-            header += &format!(
-                "comment unit {}\ncomment origin {x} {y} {z}\n",
-                p.voxel_size
-            );
+            header += &format!("comment unit {}\ncomment origin {x} {y} {z}\n", p.voxel_size);
         }
         header += &format!("element vertex {}\n", self.positions.len());
         for axis in ["x", "y", "z"] {

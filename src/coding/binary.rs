@@ -108,10 +108,7 @@ impl ReadWords<u32, Queue> for Words<'_> {
 
     #[inline(always)]
     fn read(&mut self) -> Result<Option<u32>, Infallible> {
-        let word = self
-            .bytes
-            .get(4 * self.next..)
-            .and_then(|rest| rest.first_chunk());
+        let word = self.bytes.get(4 * self.next..).and_then(|rest| rest.first_chunk());
         self.next += 1;
         Ok(Some(word.map_or(0, |word| u32::from_le_bytes(*word))))
     }

@@ -83,10 +83,7 @@ mod tests {
         for logit in -1000..=1000 {
             let x = f64::from(logit.clamp(-LIMIT, LIMIT)) / 64.0;
             let exact = 65536.0 / (1.0 + (-x).exp());
-            assert!(
-                (f64::from(squash(logit)) - exact).abs() < 0.500_001,
-                "{logit}"
-            );
+            assert!((f64::from(squash(logit)) - exact).abs() < 0.500_001, "{logit}");
             assert!((1..ONE).contains(&squash(logit)));
         }
     }

@@ -11,13 +11,7 @@ use crate::geometry::KernelMap;
 /// Where coefficients come from, or go to.
 pub(super) trait Source {
     /// The coefficient in these circumstances. An encoder chooses it for a difference of `wanted` that is left after prediction; a decoder reads it.
-    fn coefficient(
-        &mut self,
-        model: &mut Model,
-        c: &Circumstances,
-        wanted: i32,
-        quantiser: Quantiser,
-    ) -> i32;
+    fn coefficient(&mut self, model: &mut Model, c: &Circumstances, wanted: i32, quantiser: Quantiser) -> i32;
 }
 
 /// What a coefficient stands for.
@@ -81,14 +75,8 @@ pub(super) fn code<S: Source>(
     truth: Option<&[Ycc]>,
 ) -> Coded {
     let first = range.start;
-    let base = nodes
-        .first_child
-        .get(first)
-        .map_or(0, |&child| child as usize);
-    let count: usize = nodes.masks[range.clone()]
-        .iter()
-        .map(|m| m.count_ones() as usize)
-        .sum();
+    let base = nodes.first_child.get(first).map_or(0, |&child| child as usize);
+    let count: usize = nodes.masks[range.clone()].iter().map(|m| m.count_ones() as usize).sum();
     let mut coded = Coded {
         values: Vec::with_capacity(count),
         energies: vec![[0; 3]; range.len()],
@@ -137,9 +125,7 @@ pub(super) fn code<S: Source>(
         let values = inverse(mask, mean, &differences);
         let fraction = coding.steps.fraction();
         for octant in crate::geometry::ones(mask.into()) {
-            coded
-                .values
-                .push(values[octant].map(|x| clamp(x, fraction)));
+            coded.values.push(values[octant].map(|x| clamp(x, fraction)));
         }
     }
     coded
@@ -157,13 +143,7 @@ pub(super) fn spread(mask: u8, values: &[Ycc]) -> [[i32; 3]; 8] {
 
 /// Both predictions of a node's children, octant by octant: with the children that were coded before, and without.
 #[inline(always)]
-fn predict(
-    nodes: Nodes<'_>,
-    node: usize,
-    row: &[u32],
-    base: usize,
-    coded: &[Ycc],
-) -> ([[i32; 3]; 8], [[i32; 3]; 8]) {
+fn predict(nodes: Nodes<'_>, node: usize, row: &[u32], base: usize, coded: &[Ycc]) -> ([[i32; 3]; 8], [[i32; 3]; 8]) {
     let (mut near, mut far) = ([[0; 3]; 8], [[0; 3]; 8]);
     let around = NEAR.map(|k| row[k]);
     let own_first = nodes.first_child[node] as usize;
@@ -302,10 +282,8 @@ impl BlockCoder<'_> {
         let scale = self.scales.scale(weights);
         let mut shared = self.shared(slot, weights, scale);
         let predicted = self.predicted[slot];
-        let magnitudes: [u32; 3] = std::array::from_fn(|t| {
-            self.scales
-                .sixteenths(t, predicted[t].unsigned_abs(), scale)
-        });
+        let magnitudes: [u32; 3] =
+            std::array::from_fn(|t| self.scales.sixteenths(t, predicted[t].unsigned_abs(), scale));
         let mut differences = [0; 3];
         let mut luma = 0;
         for t in 0..3 {
@@ -366,24 +344,14 @@ impl BlockCoder<'_> {
             slot,
             axis: AXIS[slot],
             children: self.children,
-            heavy: usize::from(forward > 3000)
-                + usize::from(forward > 3700)
-                + usize::from(forward > 4200),
+            heavy: usize::from(forward > 3000) + usize::from(forward > 3700) + usize::from(forward > 4200),
             ..Circumstances::default()
         }
     }
 
     /// The circumstances of one channel.
     #[inline(always)]
-    fn circumstances(
-        &self,
-        c: &mut Circumstances,
-        t: usize,
-        slot: usize,
-        scale: Scale,
-        magnitude: u32,
-        across: u32,
-    ) {
+    fn circumstances(&self, c: &mut Circumstances, t: usize, slot: usize, scale: Scale, magnitude: u32, across: u32) {
         let scales = self.scales;
         let (predicted, parents) = (self.predicted[slot][t], self.parents[slot][t]);
         let mut beside = 0;
@@ -401,11 +369,7 @@ impl BlockCoder<'_> {
         c.parents = log(scales.sixteenths(t, parents.unsigned_abs(), scale));
         c.across = log(across);
         let first = self.done == 0;
-        let block = if first {
-            0
-        } else {
-            log(16 * self.sums[t] / self.done)
-        };
+        let block = if first { 0 } else { log(16 * self.sums[t] / self.done) };
         c.block = if first { 60 } else { block.min(55) };
         c.sign.predicted = signed_class(predicted < 0, magnitude);
         let shift = predicted - parents;

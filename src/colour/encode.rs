@@ -57,30 +57,21 @@ impl Truth {
     ///
     /// # Panics
     /// If there is not a colour for every voxel, or the octree is not that deep.
-    pub fn new(
-        voxels: &Voxels,
-        colours: &[[u8; 3]],
-        octree: &Octree,
-        top: u8,
-        lossless: bool,
-    ) -> Truth {
+    pub fn new(voxels: &Voxels, colours: &[[u8; 3]], octree: &Octree, top: u8, lossless: bool) -> Truth {
         assert_eq!(voxels.len(), colours.len(), "a colour for every voxel");
         let shift = 3 * (voxels.depth() - top);
         let fraction = if lossless { 0 } else { FRACTION };
         let means = octree.level(top).keys().par_iter().map(|key| {
             let first = voxels.keys().partition_point(|k| k >> shift < *key);
             let (mut sum, mut count) = ([0u64; 3], 0u64);
-            let inside = voxels.keys()[first..]
-                .iter()
-                .take_while(|k| *k >> shift == *key);
+            let inside = voxels.keys()[first..].iter().take_while(|k| *k >> shift == *key);
             for (_, colour) in inside.zip(&colours[first..]) {
                 for (sum, c) in sum.iter_mut().zip(colour) {
                     *sum += u64::from(*c);
                 }
                 count += 1;
             }
-            let mean =
-                sum.map(|sum| (((sum << (fraction + 1)) + count) / (2 * count).max(1)) as i32);
+            let mean = sum.map(|sum| (((sum << (fraction + 1)) + count) / (2 * count).max(1)) as i32);
             from_rgb(mean).map(|x| x as i16)
         });
         let mut levels: Vec<Vec<Ycc>> = vec![means.collect()];
@@ -127,26 +118,16 @@ pub fn encode_trunk(
     let root = truth.level(0)[0].map(|x| (x + half) >> fraction);
     let mut bytes = vec![options.steps.luma, options.steps.chroma, options.gain];
     bytes.push(root[0].clamp(0, 255) as u8);
-    bytes.extend(
-        root[1..]
-            .iter()
-            .flat_map(|x| x.clamp(&-255, &255).to_le_bytes()),
-    );
+    bytes.extend(root[1..].iter().flat_map(|x| x.clamp(&-255, &255).to_le_bytes()));
     let root = [
         root[0].clamp(0, 255),
         root[1].clamp(-255, 255),
         root[2].clamp(-255, 255),
     ];
     let mut source = Choosing::new(options.lambda);
-    let coloured = trunk(
-        isa,
-        octree,
-        maps,
-        options.coding(),
-        root,
-        &mut source,
-        |level| Some(truth.level(level)),
-    );
+    let coloured = trunk(isa, octree, maps, options.coding(), root, &mut source, |level| {
+        Some(truth.level(level))
+    });
     bytes.extend(source.coder.finish());
     (bytes, coloured)
 }
@@ -244,13 +225,7 @@ fn bits(model: &Model, c: &Circumstances, costs: &mut [f32]) {
 
 impl Source for Choosing {
     #[inline(always)]
-    fn coefficient(
-        &mut self,
-        model: &mut Model,
-        c: &Circumstances,
-        wanted: i32,
-        quantiser: Quantiser,
-    ) -> i32 {
+    fn coefficient(&mut self, model: &mut Model, c: &Circumstances, wanted: i32, quantiser: Quantiser) -> i32 {
         let Quantiser { scale, unit } = quantiser;
         let exact = unit == 1;
         let steps = wanted.unsigned_abs() as f32 * scale.forward as f32 / (4096.0 * unit as f32);
@@ -259,22 +234,12 @@ impl Source for Choosing {
         } else {
             self.choose(model, c, steps)
         };
-        model.code(
-            &mut self.coder,
-            c,
-            if wanted < 0 { -chosen } else { chosen },
-        )
+        model.code(&mut self.coder, c, if wanted < 0 { -chosen } else { chosen })
     }
 }
 
 /// The weights of a filter pass that bring values nearest to the truth, by least squares.
-pub(super) fn fit_pass(
-    isa: Isa,
-    values: &[Ycc],
-    map: &KernelMap,
-    steps: Steps,
-    truth: &[Ycc],
-) -> [[i8; TERMS]; 3] {
+pub(super) fn fit_pass(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, truth: &[Ycc]) -> [[i8; TERMS]; 3] {
     let values = &widen(values);
     let blocks: Vec<usize> = (0..values.len()).step_by(FIT_BLOCK).collect();
     let sums: Vec<_> = blocks

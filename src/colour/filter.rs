@@ -58,19 +58,11 @@ impl Filter {
         if !(1..=MAX_PASSES).contains(&passes) || rest.len() != passes * PASS_BYTES {
             let at = format!("byte {offset}");
             let value = format!("{passes} passes in {} bytes", bytes.len());
-            let expected =
-                format!("1 to {MAX_PASSES} passes of {PASS_BYTES} bytes after their number");
-            return Err(Error::malformed(
-                Stage::Colour,
-                at,
-                "colour filter",
-                value,
-                expected,
-            ));
+            let expected = format!("1 to {MAX_PASSES} passes of {PASS_BYTES} bytes after their number");
+            return Err(Error::malformed(Stage::Colour, at, "colour filter", value, expected));
         }
-        let pass = |bytes: &[u8]| -> Pass {
-            std::array::from_fn(|t| std::array::from_fn(|j| bytes[t * TERMS + j] as i8))
-        };
+        let pass =
+            |bytes: &[u8]| -> Pass { std::array::from_fn(|t| std::array::from_fn(|j| bytes[t * TERMS + j] as i8)) };
         Ok(Filter {
             passes: rest.chunks_exact(PASS_BYTES).map(pass).collect(),
         })
@@ -79,10 +71,7 @@ impl Filter {
     /// The payload.
     pub fn to_bytes(&self) -> Vec<u8> {
         let weights = self.passes.iter().flatten().flatten().map(|w| *w as u8);
-        [self.passes.len() as u8]
-            .into_iter()
-            .chain(weights)
-            .collect()
+        [self.passes.len() as u8].into_iter().chain(weights).collect()
     }
 
     /// The filtered colours of a level, whose 3³ kernel map is `map`, for display.
@@ -92,10 +81,7 @@ impl Filter {
     pub fn rgb(&self, isa: Isa, coloured: &Coloured, map: &KernelMap) -> Vec<[u8; 3]> {
         let fraction = coloured.steps().fraction();
         let values = self.apply(isa, coloured, map);
-        values
-            .par_iter()
-            .map(|ycc| display(*ycc, fraction))
-            .collect()
+        values.par_iter().map(|ycc| display(*ycc, fraction)).collect()
     }
 
     /// The filtered values of a level ([`Coloured::values`]).
@@ -111,11 +97,7 @@ impl Filter {
     /// The filter that brings a level's colours nearest to `truth`, if that is worth its bytes.
     #[cfg(feature = "encoder")]
     pub fn fit(isa: Isa, coloured: &Coloured, map: &KernelMap, truth: &[Ycc]) -> Option<Filter> {
-        assert_eq!(
-            truth.len(),
-            coloured.values.len(),
-            "a true colour for every voxel"
-        );
+        assert_eq!(truth.len(), coloured.values.len(), "a true colour for every voxel");
         if coloured.steps.is_lossless() {
             return None;
         }
@@ -178,10 +160,7 @@ impl Work for Task<'_> {
             for t in 0..3 {
                 let weighted = pass[t].iter().zip(terms[t]);
                 let sum = weighted.fold(0i32, |sum, (w, x)| sum.wrapping_add(i32::from(*w) * x));
-                out[t] = clamp(
-                    i32::from(values[voxel][t]) + ((sum + 32) >> 6),
-                    steps.fraction(),
-                );
+                out[t] = clamp(i32::from(values[voxel][t]) + ((sum + 32) >> 6), steps.fraction());
             }
         }
     }
@@ -220,16 +199,9 @@ impl Responses {
 
     /// The terms of one voxel.
     #[inline(always)]
-    pub fn terms<I: Instructions>(
-        &self,
-        instructions: I,
-        values: &[Values],
-        map: &KernelMap,
-        voxel: usize,
-    ) -> Terms {
+    pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], map: &KernelMap, voxel: usize) -> Terms {
         let (own, row) = (&values[voxel], map.row(voxel));
-        let sum =
-            |places: &[usize]| responses(instructions, values, own, row, places, &self.inverses);
+        let sum = |places: &[usize]| responses(instructions, values, own, row, places, &self.inverses);
         let (faces, face_count) = sum(&FACES);
         let (edges, edge_count) = sum(&EDGES);
         let (corners, corner_count) = sum(&CORNERS);

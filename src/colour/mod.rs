@@ -107,12 +107,7 @@ fn slices(nodes: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<usi
 ///
 /// # Panics
 /// If the octree is not as deep as there are maps.
-pub fn decode_trunk(
-    isa: Isa,
-    octree: &Octree,
-    maps: &[KernelMap],
-    payload: &Slice,
-) -> Result<Coloured> {
+pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Slice) -> Result<Coloured> {
     let depth = maps.len() - 1;
     let (coding, rest) = read_coding(payload, TRUNK_FIXED)?;
     let number = |at: usize| i16::from_le_bytes([payload.bytes[at], payload.bytes[at + 1]]);
@@ -129,10 +124,9 @@ pub fn decode_trunk(
     }
     let mut source = Reading(Decoder::new(rest));
     let coloured = trunk(isa, octree, maps, coding, root, &mut source, |_| None);
-    source.0.finish(&format!(
-        "byte {}, colours of levels 1 to {depth}",
-        payload.offset
-    ))?;
+    source
+        .0
+        .finish(&format!("byte {}, colours of levels 1 to {depth}", payload.offset))?;
     Ok(coloured)
 }
 
@@ -232,10 +226,9 @@ pub fn decode_level(
             coding,
             truth: None,
         });
-        source.0.finish(&format!(
-            "byte {}, colours of level {level}",
-            payload.offset
-        ))?;
+        source
+            .0
+            .finish(&format!("byte {}, colours of level {level}", payload.offset))?;
         // Nothing begins with what the others have learned.
         let model = if first { model } else { Model::empty() };
         Ok((coding.steps, coded, model))
@@ -296,11 +289,7 @@ fn nodes<'a>(
         (masks.len(), masks.len()),
         "maps and colours of the level above"
     );
-    assert_eq!(
-        children.len(),
-        octree.level(level).len(),
-        "the map of the level"
-    );
+    assert_eq!(children.len(), octree.level(level).len(), "the map of the level");
     Nodes {
         map,
         children,
@@ -337,13 +326,7 @@ fn read_coding<'a>(payload: &Slice<'a>, fixed: usize) -> Result<(Coding, &'a [u8
             expected,
         ));
     }
-    Ok((
-        Coding {
-            steps,
-            gain: head[2],
-        },
-        rest,
-    ))
+    Ok((Coding { steps, gain: head[2] }, rest))
 }
 
 /// The energies of a level's nodes, smoothed over their neighbours, for each of their children.
@@ -354,8 +337,7 @@ fn spread_energies(nodes: Nodes<'_>, energies: &[[u8; 3]]) -> Vec<[u8; 3]> {
         let (mut sums, mut weight) = ([0u32; 3], 0);
         for (k, &neighbour) in nodes.map.row(node).iter().enumerate() {
             if neighbour != KernelMap::ABSENT {
-                let off =
-                    usize::from(k % 3 != 1) + usize::from(k / 3 % 3 != 1) + usize::from(k / 9 != 1);
+                let off = usize::from(k % 3 != 1) + usize::from(k / 3 % 3 != 1) + usize::from(k / 9 != 1);
                 for (sum, energy) in sums.iter_mut().zip(energies[neighbour as usize]) {
                     *sum += WEIGHTS[off] * u32::from(energy);
                 }

@@ -258,28 +258,15 @@ impl Model {
         }
         inputs[UNIT] = unit / 2;
         inputs[BIAS] = 64;
-        let sets = [
-            kind,
-            kind * UNIT_CLASSES + fine / 4,
-            kind * 12 + c.axis * 4 + both,
-        ];
-        let weights = [
-            &self.by_kind[sets[0]],
-            &self.by_unit[sets[1]],
-            &self.by_others[sets[2]],
-        ];
+        let sets = [kind, kind * UNIT_CLASSES + fine / 4, kind * 12 + c.axis * 4 + both];
+        let weights = [&self.by_kind[sets[0]], &self.by_unit[sets[1]], &self.by_others[sets[2]]];
         let mut sum = 0i32;
         for lane in 0..LANES {
             let weight = weights[0][lane] + weights[1][lane] + weights[2][lane];
             sum = sum.wrapping_add(weight.wrapping_mul(inputs[lane]));
         }
         let one = squash(sum >> 16).clamp(24, ONE - 24);
-        Mixed {
-            at,
-            inputs,
-            sets,
-            one,
-        }
+        Mixed { at, inputs, sets, one }
     }
 
     #[inline(always)]

@@ -118,11 +118,7 @@ mod tests {
         let mut checked = 0;
         for (near, &at) in NEAR.iter().enumerate() {
             let at = at as f64;
-            let offset = [
-                at % 3.0 - 1.0,
-                (at / 3.0).floor() % 3.0 - 1.0,
-                (at / 9.0).floor() - 1.0,
-            ];
+            let offset = [at % 3.0 - 1.0, (at / 3.0).floor() % 3.0 - 1.0, (at / 9.0).floor() - 1.0];
             for mask in 1..256usize {
                 let children: Vec<usize> = (0..8).filter(|o| mask >> o & 1 == 1).collect();
                 for octant in 0..8usize {
@@ -136,10 +132,7 @@ mod tests {
                         .sum();
                     let exact = 4096.0 * (-square / 0.98).exp();
                     let weight = f64::from(WEIGHTS[near][mask][octant]);
-                    assert!(
-                        (weight - exact).abs() <= 0.009 * exact + 0.6,
-                        "{near} {mask} {octant}"
-                    );
+                    assert!((weight - exact).abs() <= 0.009 * exact + 0.6, "{near} {mask} {octant}");
                     checked += 1;
                 }
             }

@@ -33,8 +33,7 @@ impl Steps {
 
     /// Whether these are indices that a stream may have.
     pub fn is_valid(self) -> bool {
-        let lossy =
-            self.luma <= Steps::MAX && (self.chroma <= Steps::MAX || self.chroma == Steps::ABSENT);
+        let lossy = self.luma <= Steps::MAX && (self.chroma <= Steps::MAX || self.chroma == Steps::ABSENT);
         lossy || self == Steps::LOSSLESS
     }
 
@@ -149,10 +148,7 @@ mod tests {
         for luma in 0..=Steps::MAX {
             let steps = Steps { luma, chroma: luma };
             let exact = f32::from(luma) / 8.0 - 1.0;
-            assert!(
-                (steps.luma_step() / exact.exp2() - 1.0).abs() < 0.013,
-                "{luma}"
-            );
+            assert!((steps.luma_step() / exact.exp2() - 1.0).abs() < 0.013, "{luma}");
             if luma >= 8 {
                 assert_eq!(steps.above().luma_step() * 2.0, steps.luma_step());
             }

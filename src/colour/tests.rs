@@ -13,9 +13,7 @@ struct Case {
 impl Case {
     fn new(depth: u8, top: u8, keys: Vec<u64>, colour: impl Fn([u32; 3]) -> [u8; 3]) -> Case {
         let voxels = Voxels::new(depth, keys);
-        let colours = (0..voxels.len())
-            .map(|i| colour(voxels.coordinate(i)))
-            .collect();
+        let colours = (0..voxels.len()).map(|i| colour(voxels.coordinate(i))).collect();
         let octree = Octree::new(voxels.clone()).unwrap().truncated(top);
         let mut maps = vec![KernelMap::root()];
         for level in 0..top {
@@ -47,65 +45,30 @@ impl Case {
 
     fn truth(&self, steps: Steps) -> Truth {
         let top = self.octree.depth();
-        Truth::new(
-            &self.voxels,
-            &self.colours,
-            &self.octree,
-            top,
-            steps.is_lossless(),
-        )
+        Truth::new(&self.voxels, &self.colours, &self.octree, top, steps.is_lossless())
     }
 
     /// The payloads of the trunk and of every level below, and the colours of the last.
-    fn encode(
-        &self,
-        isa: Isa,
-        trunk: u8,
-        slice: usize,
-        steps: Steps,
-    ) -> (Vec<Vec<Vec<u8>>>, Coloured) {
+    fn encode(&self, isa: Isa, trunk: u8, slice: usize, steps: Steps) -> (Vec<Vec<Vec<u8>>>, Coloured) {
         let (truth, options) = (self.truth(steps), Options::new(steps));
-        let (bytes, mut coloured) = encode_trunk(
-            isa,
-            &self.octree,
-            &self.maps[..=usize::from(trunk)],
-            &truth,
-            options,
-        );
+        let (bytes, mut coloured) = encode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &truth, options);
         let mut payloads = vec![vec![bytes]];
         for level in trunk + 1..=self.octree.depth() {
             let [above, map] = [level - 1, level].map(|l| &self.maps[usize::from(l)]);
-            let (slices, next) = encode_level(
-                isa,
-                &self.octree,
-                level,
-                above,
-                map,
-                &coloured,
-                &truth,
-                slice,
-                options,
-            );
+            let (slices, next) = encode_level(isa, &self.octree, level, above, map, &coloured, &truth, slice, options);
             payloads.push(slices);
             coloured = next;
         }
         (payloads, coloured)
     }
 
-    fn decode(
-        &self,
-        isa: Isa,
-        trunk: u8,
-        slice: usize,
-        payloads: &[Vec<Vec<u8>>],
-    ) -> Result<Coloured> {
+    fn decode(&self, isa: Isa, trunk: u8, slice: usize, payloads: &[Vec<Vec<u8>>]) -> Result<Coloured> {
         let first = Slice {
             voxels: 0,
             bytes: &payloads[0][0],
             offset: 0,
         };
-        let mut coloured =
-            decode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &first)?;
+        let mut coloured = decode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &first)?;
         for (level, payloads) in (trunk + 1..=self.octree.depth()).zip(&payloads[1..]) {
             let [above, map] = [level - 1, level].map(|l| &self.maps[usize::from(l)]);
             let slices: Vec<_> = payloads
@@ -239,35 +202,16 @@ fn chroma_that_is_absent_stays_as_the_root_has_it_but_for_prediction() {
 #[test]
 fn a_wrong_number_of_slices_is_an_error() {
     let case = Case::bowl(5, 5);
-    let (mut payloads, _) = case.encode(
-        Isa::detect(),
-        3,
-        100,
-        Steps {
-            luma: 32,
-            chroma: 32,
-        },
-    );
+    let (mut payloads, _) = case.encode(Isa::detect(), 3, 100, Steps { luma: 32, chroma: 32 });
     payloads[1].pop();
     let error = case.decode(Isa::detect(), 3, 100, &payloads).unwrap_err();
-    assert!(
-        error.to_string().contains("number of colour slices"),
-        "{error}"
-    );
+    assert!(error.to_string().contains("number of colour slices"), "{error}");
 }
 
 #[test]
 fn steps_that_no_stream_has_are_an_error() {
     let case = Case::bowl(5, 5);
-    let (payloads, _) = case.encode(
-        Isa::detect(),
-        3,
-        100,
-        Steps {
-            luma: 32,
-            chroma: 32,
-        },
-    );
+    let (payloads, _) = case.encode(Isa::detect(), 3, 100, Steps { luma: 32, chroma: 32 });
     for (level, steps) in [(0, [88, 0]), (1, [255, 255]), (1, [0, 255])] {
         let mut payloads = payloads.clone();
         payloads[level][0][..2].copy_from_slice(&steps);
@@ -279,22 +223,13 @@ fn steps_that_no_stream_has_are_an_error() {
 /// A level of a bowl that is coded coarsely, its map, and its truth.
 fn noisy() -> (Coloured, KernelMap, Vec<Ycc>) {
     let case = Case::bowl(7, 6);
-    let steps = Steps {
-        luma: 44,
-        chroma: 52,
-    };
+    let steps = Steps { luma: 44, chroma: 52 };
     let (_, coloured) = case.encode(Isa::detect(), 3, 1 << 14, steps);
-    (
-        coloured,
-        case.maps[6].clone(),
-        case.truth(steps).level(6).to_vec(),
-    )
+    (coloured, case.maps[6].clone(), case.truth(steps).level(6).to_vec())
 }
 
 fn squared_error(values: &[[u8; 3]], truth: &[Ycc]) -> f64 {
-    let truth = truth
-        .iter()
-        .map(|ycc| space::display(*ycc, space::FRACTION));
+    let truth = truth.iter().map(|ycc| space::display(*ycc, space::FRACTION));
     let squares = values
         .iter()
         .zip(truth)
@@ -312,12 +247,7 @@ fn a_fitted_filter_brings_colours_nearer_and_its_payload_comes_back() {
     let bytes = filter.to_bytes();
     assert_eq!(Filter::parse(&bytes, 0).unwrap(), filter);
     for wrong in [&bytes[..bytes.len() - 1], &[], &[0], &[3]] {
-        assert!(
-            Filter::parse(wrong, 7)
-                .unwrap_err()
-                .to_string()
-                .contains("byte 7")
-        );
+        assert!(Filter::parse(wrong, 7).unwrap_err().to_string().contains("byte 7"));
     }
     for isa in Isa::available() {
         assert_eq!(filter.rgb(isa, &coloured, &map), filtered, "{isa}");
@@ -332,19 +262,14 @@ fn one_pass_is_what_its_definition_says() {
         .into_iter()
         .chain(weights.iter().flatten().map(|w| *w as u8))
         .collect();
-    let filtered = Filter::parse(&bytes, 0)
-        .unwrap()
-        .rgb(Isa::detect(), &coloured, &map);
+    let filtered = Filter::parse(&bytes, 0).unwrap().rgb(Isa::detect(), &coloured, &map);
     let units = coloured.steps().units().map(i64::from);
     for (voxel, own) in coloured.values().iter().enumerate() {
         let mut expected = *own;
         for t in 0..3 {
             let (mut terms, mut counts) = ([0i64; 5], 0);
             for (k, &neighbour) in map.row(voxel).iter().enumerate() {
-                let off = [k % 3, k / 3 % 3, k / 9]
-                    .iter()
-                    .filter(|x| **x != 1)
-                    .count();
+                let off = [k % 3, k / 3 % 3, k / 9].iter().filter(|x| **x != 1).count();
                 if neighbour == KernelMap::ABSENT || off == 0 {
                     continue;
                 }
@@ -362,10 +287,7 @@ fn one_pass_is_what_its_definition_says() {
             let sum: i64 = (0..5)
                 .map(|j| i64::from(weights[t][j]) * ((terms[j] * (65536 / counts.max(1))) >> 14))
                 .sum();
-            expected[t] = space::clamp(
-                (i64::from(own[t]) + ((sum + 32) >> 6)) as i32,
-                space::FRACTION,
-            );
+            expected[t] = space::clamp((i64::from(own[t]) + ((sum + 32) >> 6)) as i32, space::FRACTION);
         }
         assert_eq!(
             filtered[voxel],
@@ -378,10 +300,7 @@ fn one_pass_is_what_its_definition_says() {
 #[test]
 fn a_root_that_no_colour_has_is_an_error() {
     let case = Case::bowl(5, 5);
-    let steps = Steps {
-        luma: 32,
-        chroma: 32,
-    };
+    let steps = Steps { luma: 32, chroma: 32 };
     let (mut payloads, _) = case.encode(Isa::detect(), 3, 100, steps);
     for chroma in [i16::MIN, -256, 256, i16::MAX] {
         payloads[0][0][4..6].copy_from_slice(&chroma.to_le_bytes());

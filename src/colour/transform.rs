@@ -40,9 +40,7 @@ impl Joins {
 
     #[inline(always)]
     pub fn slots(&self) -> impl Iterator<Item = usize> + '_ {
-        self.slots[..self.count]
-            .iter()
-            .map(|&slot| usize::from(slot))
+        self.slots[..self.count].iter().map(|&slot| usize::from(slot))
     }
 
     /// How many children the two values of a slot stand for.
@@ -268,14 +266,8 @@ mod tests {
             for w in 1..5 {
                 let Scale { forward, inverse } = SCALE[v][w];
                 let exact = (v as f64 * w as f64 / (v + w) as f64).sqrt();
-                assert!(
-                    (f64::from(forward) / 4096.0 - exact).abs() < 1.3e-4,
-                    "{v} {w}"
-                );
-                assert!(
-                    (f64::from(inverse) / 4096.0 - 1.0 / exact).abs() < 1.3e-4,
-                    "{v} {w}"
-                );
+                assert!((f64::from(forward) / 4096.0 - exact).abs() < 1.3e-4, "{v} {w}");
+                assert!((f64::from(inverse) / 4096.0 - 1.0 / exact).abs() < 1.3e-4, "{v} {w}");
             }
         }
     }

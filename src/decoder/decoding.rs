@@ -132,9 +132,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
     }
 
     pub(super) fn into_exact(self) -> Result<Exact> {
-        self.reached
-            .map(|reached| reached.exact)
-            .ok_or_else(nothing_reached)
+        self.reached.map(|reached| reached.exact).ok_or_else(nothing_reached)
     }
 
     /// The Gaussians of the level reached.
@@ -155,19 +153,14 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
         let heads = decoder.heads;
         let children = shape.head(role, heads).map_or(1, |head| head.children);
         let voxels = reached.exact.octree.level(level);
-        let raw = log.step(
-            Module::Gaussians(role, heads).at(level),
-            voxels.len(),
-            "voxels",
-            || {
-                let Reached { exact, map, .. } = reached;
-                let mut pool = self.take_pool();
-                let model = &decoder.model;
-                let raw = model.generate_in(&mut pool, heads, role, &exact.features, map);
-                self.return_pool(pool);
-                raw
-            },
-        )?;
+        let raw = log.step(Module::Gaussians(role, heads).at(level), voxels.len(), "voxels", || {
+            let Reached { exact, map, .. } = reached;
+            let mut pool = self.take_pool();
+            let model = &decoder.model;
+            let raw = model.generate_in(&mut pool, heads, role, &exact.features, map);
+            self.return_pool(pool);
+            raw
+        })?;
         let frame = Frame {
             bits: header.bits,
             placement: header.placement,
@@ -197,10 +190,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
 
     fn take_pool(&self) -> Pool<i16> {
         let pool = self.pool.lock();
-        std::mem::replace(
-            &mut *pool.unwrap_or_else(PoisonError::into_inner),
-            Pool::new(),
-        )
+        std::mem::replace(&mut *pool.unwrap_or_else(PoisonError::into_inner), Pool::new())
     }
 
     fn return_pool(&self, pool: Pool<i16>) {
@@ -273,12 +263,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
 }
 
 /// What a level says that its colours are still off.
-fn residual(
-    header: &Header,
-    level: &Level,
-    octree: &Octree,
-    log: &mut Log,
-) -> Result<Option<ColourResidual>> {
+fn residual(header: &Header, level: &Level, octree: &Octree, log: &mut Log) -> Result<Option<ColourResidual>> {
     if level.residual.is_empty() {
         return Ok(None);
     }

@@ -125,12 +125,7 @@ impl<'b> Feed<'b> {
     }
 
     /// Reads the header, if it is whole.
-    fn open(
-        &mut self,
-        ended: bool,
-        limits: &Limits,
-        plan: impl FnOnce(&Header, Goal) -> Result<u8>,
-    ) -> Result<()> {
+    fn open(&mut self, ended: bool, limits: &Limits, plan: impl FnOnce(&Header, Goal) -> Result<u8>) -> Result<()> {
         if !ended && self.bytes.len() < MAGIC.len() {
             return Ok(());
         }

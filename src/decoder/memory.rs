@@ -40,8 +40,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         let (c, k) = (shape.channels as u64, shape.latents as u64);
         let levels = usize::from(level - header.base) + 1;
         let counts = || header.voxels[..levels].iter().copied().map(u64::from);
-        let octree =
-            NODE * (counts().sum::<u64>() + u64::from(header.base) * counts().min().unwrap_or(0));
+        let octree = NODE * (counts().sum::<u64>() + u64::from(header.base) * counts().min().unwrap_or(0));
         let features = 2 * (c + k) + MAP + RESIDUAL;
         // Of all levels the last is the largest.
         let parents = counts().nth_back(1).unwrap_or(0);
@@ -77,8 +76,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// Fails with [`crate::Error::LimitExceeded`] if decoding down to `level` takes more than is allowed.
     pub(super) fn check_memory(&self, header: &Header, level: u8) -> Result<()> {
         let bytes = self.memory(header, level)?;
-        self.limits
-            .check_bytes("memory to decode this stream", bytes)
+        self.limits.check_bytes("memory to decode this stream", bytes)
     }
 }
 

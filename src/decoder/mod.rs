@@ -173,9 +173,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         };
         Err(Error::Unsupported {
             what: "decoding to Gaussians",
-            detail: format!(
-                "level {level} has none; levels of this stream that have them: {names}"
-            ),
+            detail: format!("level {level} has none; levels of this stream that have them: {names}"),
         })
     }
 }

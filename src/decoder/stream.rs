@@ -147,12 +147,7 @@ impl StreamDecoder {
     ///
     /// # Errors
     /// Those of [`StreamDecoding::finish`].
-    pub fn whole<'b>(
-        &self,
-        bytes: &'b [u8],
-        level: Option<u8>,
-        log: &mut Log,
-    ) -> Result<StreamDecoding<'b>> {
+    pub fn whole<'b>(&self, bytes: &'b [u8], level: Option<u8>, log: &mut Log) -> Result<StreamDecoding<'b>> {
         let goal = Goal::Gaussians(level);
         let mut decoding = StreamDecoding::new(self.clone(), goal, Cow::Borrowed(bytes));
         decoding.finish(log)?;
@@ -291,10 +286,7 @@ impl StreamDecoder {
         };
         Ok(match self.network(header, level)? {
             Some((model, set)) => model.bytes(set, voxels, above),
-            None => super::memory::surfels(
-                voxels,
-                self.surfels_per_voxel(header, level)?.count() as u64,
-            ),
+            None => super::memory::surfels(voxels, self.surfels_per_voxel(header, level)?.count() as u64),
         })
     }
 

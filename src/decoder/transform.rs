@@ -139,11 +139,7 @@ impl<'b> Transform<'b> {
             next: next.as_ref(),
         };
         match growing.level(&mut octree, self.reached.as_ref(), &mut self.ahead, log) {
-            Ok(Step {
-                map,
-                coloured,
-                above,
-            }) => {
+            Ok(Step { map, coloured, above }) => {
                 let old = self.reached.take().map(|old| Above {
                     map: old.map,
                     coloured: Some(old.coloured),
@@ -211,13 +207,7 @@ struct Step {
 
 impl Growing<'_> {
     /// Grows `octree` to the level of the part.
-    fn level(
-        &self,
-        octree: &mut Octree,
-        above: Option<&Reached>,
-        ahead: &mut Ahead,
-        log: &mut Log,
-    ) -> Result<Step> {
+    fn level(&self, octree: &mut Octree, above: Option<&Reached>, ahead: &mut Ahead, log: &mut Log) -> Result<Step> {
         let level = self.part.level;
         let mut step = match &self.colours.trunk {
             Some(trunk) => Some(self.trunk(octree, trunk, ahead, log)?),
@@ -245,13 +235,7 @@ impl Growing<'_> {
     }
 
     /// The levels that the colour trunk holds.
-    fn trunk(
-        &self,
-        octree: &mut Octree,
-        trunk: &Trunk,
-        ahead: &mut Ahead,
-        log: &mut Log,
-    ) -> Result<Step> {
+    fn trunk(&self, octree: &mut Octree, trunk: &Trunk, ahead: &mut Ahead, log: &mut Log) -> Result<Step> {
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
         let (depth, count) = (trunk.level, trunk.slice.voxels as usize);
         let slice = self.header.slice_voxels as usize;
@@ -275,10 +259,7 @@ impl Growing<'_> {
         Ok(Step {
             map,
             coloured,
-            above: maps.pop().map(|map| Above {
-                map,
-                coloured: None,
-            }),
+            above: maps.pop().map(|map| Above { map, coloured: None }),
         })
     }
 
@@ -301,18 +282,15 @@ impl Growing<'_> {
         };
         let slices = &geometry.slices;
         let count = slices.iter().map(|s| s.voxels as usize).sum();
-        log.step(
-            format!("geometry of level {n}"),
-            count,
-            "voxels",
-            || match ahead.take() {
+        log.step(format!("geometry of level {n}"), count, "voxels", || {
+            match ahead.take() {
                 Some((level, masks)) if level == n => octree.grow(masks?),
                 _ => {
                     let slice = header.slice_voxels as usize;
                     codec::decode_level(isa, octree, above_map, slices, slice, cancel)
                 }
-            },
-        )?;
+            }
+        })?;
         let map = log.step(format!("kernel map of level {n}"), count, "voxels", || {
             Ok(octree.child_map(n - 1, above_map))
         })?;
@@ -320,11 +298,7 @@ impl Growing<'_> {
         let coloured = log.step(name, count, "voxels", || {
             let slice = header.colour_slice() as usize;
             let slices = &colours.slices;
-            let colours = || {
-                colour::decode_level(
-                    isa, octree, n, above_map, &map, above, slices, slice, cancel,
-                )
-            };
+            let colours = || colour::decode_level(isa, octree, n, above_map, &map, above, slices, slice, cancel);
             self.beside(n, &map, ahead, colours)
         })?;
         Ok((map, coloured))

@@ -39,10 +39,7 @@ pub(super) fn fit(
     let numbers = |i: usize| -> [f32; INPUTS + 3] {
         let mut numbers = [0.0; INPUTS + 3];
         numbers[..INPUTS].copy_from_slice(&surroundings.inputs(i, colours[i]));
-        for (missing, (wanted, own)) in numbers[INPUTS..]
-            .iter_mut()
-            .zip(wanted[i].iter().zip(colours[i]))
-        {
+        for (missing, (wanted, own)) in numbers[INPUTS..].iter_mut().zip(wanted[i].iter().zip(colours[i])) {
             *missing = wanted - own;
         }
         numbers
@@ -100,24 +97,17 @@ impl Sums {
 
     fn add_all(&mut self, other: &Sums) {
         let own = self.inputs.as_flattened_mut().iter_mut();
-        own.zip(other.inputs.as_flattened())
-            .for_each(|(a, b)| *a += b);
+        own.zip(other.inputs.as_flattened()).for_each(|(a, b)| *a += b);
         let own = self.wanted.as_flattened_mut().iter_mut();
-        own.zip(other.wanted.as_flattened())
-            .for_each(|(a, b)| *a += b);
+        own.zip(other.wanted.as_flattened()).for_each(|(a, b)| *a += b);
         self.squares += other.squares;
         self.pixels += other.pixels;
     }
 
     /// The filter, in steps of its weights, if it is worth its bytes.
     fn solve(&self, latents: usize) -> Option<ColourFilter> {
-        let reals = self
-            .wanted
-            .map(|wanted| least_squares(&self.inputs, &wanted));
-        let greatest = reals
-            .iter()
-            .flat_map(|w| &w[1..])
-            .fold(0.0, |m: f64, w| m.max(w.abs()));
+        let reals = self.wanted.map(|wanted| least_squares(&self.inputs, &wanted));
+        let greatest = reals.iter().flat_map(|w| &w[1..]).fold(0.0, |m: f64, w| m.max(w.abs()));
         let exponent = (127.0 / greatest.max(1e-3)).log2().floor().clamp(0.0, 15.0) as u8;
         let step = |k| f64::from(ColourFilter::step(exponent, k));
         let mut weights = [[0i8; INPUTS]; 3];
@@ -129,9 +119,7 @@ impl Sums {
             }
             let real = |k: usize, weights: &[i8; INPUTS]| f64::from(weights[k]) * step(k);
             // The first again, now that the others are rounded.
-            let others: f64 = (1..INPUTS)
-                .map(|k| self.inputs[0][k] * real(k, weights))
-                .sum();
+            let others: f64 = (1..INPUTS).map(|k| self.inputs[0][k] * real(k, weights)).sum();
             weights[0] = steps((wanted[0] - others) / self.inputs[0][0].max(1e-9), 0);
             for (k, (row, wanted)) in self.inputs.iter().zip(wanted).enumerate() {
                 let given = row.iter().enumerate().map(|(j, x)| x * real(j, weights));
@@ -161,11 +149,7 @@ pub(super) const CHUNK: usize = 16;
 fn least_squares(gram: &[[f64; INPUTS]; INPUTS], wanted: &[f64; INPUTS]) -> [f64; INPUTS] {
     let scale: [f64; INPUTS] = std::array::from_fn(|k| {
         let square = gram[k][k];
-        if square > 0.0 {
-            square.sqrt().recip()
-        } else {
-            0.0
-        }
+        if square > 0.0 { square.sqrt().recip() } else { 0.0 }
     });
     let mut lower = [[0.0; INPUTS]; INPUTS];
     for i in 0..INPUTS {

@@ -7,9 +7,7 @@ use super::colours::{self, CHUNK};
 use super::pooled;
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
-use crate::gaussians::{
-    ColourFilter, ColourResidual, Frame, Gaussians, Precision, Steps, Surroundings, activate,
-};
+use crate::gaussians::{ColourFilter, ColourResidual, Frame, Gaussians, Precision, Steps, Surroundings, activate};
 use crate::geometry::{KernelMap, Octree};
 use crate::network::{Heads, Model};
 
@@ -33,10 +31,7 @@ pub enum Residual {
 
 impl Residual {
     /// What is wide is told in these steps, if not more finely.
-    pub const COARSE: Steps = Steps {
-        luma: 32,
-        chroma: 24,
-    };
+    pub const COARSE: Steps = Steps { luma: 32, chroma: 24 };
 
     pub(super) fn precision(self, filter: bool) -> Option<Precision> {
         let finer = |own: u8, coarse: u8| if own == 0 { coarse } else { own.min(coarse) };
@@ -167,12 +162,7 @@ pub(crate) struct Left {
 
 impl Left {
     /// The payloads of a residual as finely told as this, for the voxels `keys` in slices; `None` if it has nothing fine and is not worth its bytes.
-    pub fn payloads(
-        &self,
-        keys: &[u64],
-        slice: usize,
-        precision: Precision,
-    ) -> Option<Vec<Vec<u8>>> {
+    pub fn payloads(&self, keys: &[u64], slice: usize, precision: Precision) -> Option<Vec<Vec<u8>>> {
         let before = missing(&self.gaussians, &self.wanted, self.children);
         let residual = ColourResidual::of(&before, keys, slice, precision);
         let payloads = residual.to_payloads(keys);
@@ -193,9 +183,7 @@ fn missing(gaussians: &Gaussians, wanted: &[[f32; 3]], children: usize) -> Vec<[
     let voxel = |first: usize| {
         let (mut sum, mut weights) = ([0.0; 3], 0.0);
         let own = first..first + children;
-        let colours = gaussians.colour[own.clone()]
-            .iter()
-            .zip(&wanted[own.clone()]);
+        let colours = gaussians.colour[own.clone()].iter().zip(&wanted[own.clone()]);
         for (weight, (own, wanted)) in gaussians.opacity[own].iter().zip(colours) {
             weights += weight;
             for (sum, (own, wanted)) in sum.iter_mut().zip(own.iter().zip(wanted)) {

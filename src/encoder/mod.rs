@@ -88,12 +88,7 @@ pub struct Rate {
 /// [`Error::Usage`] for levels that the cloud or the format does not have, [`Error::Malformed`] for slices that the format does not
 /// have, [`Error::Unsupported`] if the model can only decode; and,
 /// if encoder and decoder disagreed on this machine, whatever the decoder found.
-pub fn encode(
-    cloud: &ColouredVoxels,
-    model: &Model,
-    options: &Options,
-    log: &mut Log,
-) -> Result<Encoded> {
+pub fn encode(cloud: &ColouredVoxels, model: &Model, options: &Options, log: &mut Log) -> Result<Encoded> {
     let subject = Subject::new(cloud, model, options, log)?;
     let wants = options.residual.precision(options.filter).is_some();
     let coded = subject.code(options.bit_price, wants, log)?;
@@ -120,29 +115,19 @@ struct Subject<'a> {
 }
 
 impl<'a> Subject<'a> {
-    fn new(
-        cloud: &'a ColouredVoxels,
-        model: &'a Model,
-        options: &'a Options,
-        log: &mut Log,
-    ) -> Result<Self> {
+    fn new(cloud: &'a ColouredVoxels, model: &'a Model, options: &'a Options, log: &mut Log) -> Result<Self> {
         let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
         let (base, top) = (*levels.start(), *levels.end());
         // Networks have learned to see a level through all those below it, coded or not.
         let seen = cloud.voxels.depth().min(base + ROLES as u8);
-        let (finest, colours) = log.step("pool colours", cloud.voxels.len(), "voxels", || {
-            Ok(pooled(cloud, seen))
-        })?;
+        let (finest, colours) = log.step("pool colours", cloud.voxels.len(), "voxels", || Ok(pooled(cloud, seen)))?;
         let octree = Octree::new(finest)?;
         let maps = log.step("kernel maps", octree.level(seen).len(), "voxels", || {
             Ok(kernel_maps(&octree, base))
         })?;
         let features = log.step("features", colours.len(), "voxels", || {
             let maps: Vec<_> = maps.iter().rev().collect();
-            let occupancy: Vec<_> = (base..seen)
-                .rev()
-                .map(|level| octree.occupancy(level))
-                .collect();
+            let occupancy: Vec<_> = (base..seen).rev().map(|level| octree.occupancy(level)).collect();
             model.features(&colours, &maps, &occupancy)
         })?;
         let header = Header {
@@ -181,9 +166,7 @@ impl<'a> Subject<'a> {
             Ok(coding.quantise(model.tables(), &real, rounding, slice))
         };
         let Options {
-            filter,
-            every_level,
-            ..
+            filter, every_level, ..
         } = *self.options;
         let mut correct = |level: Level<'_>| {
             let residual = residual && (level.finest || every_level);
@@ -220,8 +203,7 @@ impl<'a> Subject<'a> {
         })?;
         if exact.octree != octree.truncated(top) || exact.features != features {
             return Err(Error::Usage(
-                "the stream does not decode to what was encoded: this machine computes wrongly"
-                    .into(),
+                "the stream does not decode to what was encoded: this machine computes wrongly".into(),
             ));
         }
         let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);

@@ -50,13 +50,7 @@ impl<'m> Skeleton<'m> {
     ///
     /// # Errors
     /// Those of [`Writer::new`].
-    pub fn new(
-        header: Header,
-        octree: Octree,
-        maps: Vec<KernelMap>,
-        model: &'m Model,
-        log: &mut Log,
-    ) -> Result<Self> {
+    pub fn new(header: Header, octree: Octree, maps: Vec<KernelMap>, model: &'m Model, log: &mut Log) -> Result<Self> {
         let levels = header.base..=header.top;
         let voxels = levels.clone().map(|level| octree.level(level).len() as u32);
         let header = Header {
@@ -68,8 +62,7 @@ impl<'m> Skeleton<'m> {
         let mut geometry = Vec::new();
         for (role, level) in levels.enumerate() {
             let (name, count) = (format!("geometry of level {level}"), header.voxels[role]);
-            let code =
-                |map: &KernelMap, n: u8| codec::encode_level(model.isa(), &octree, map, n, slice);
+            let code = |map: &KernelMap, n: u8| codec::encode_level(model.isa(), &octree, map, n, slice);
             let coded = log.step(name, count as usize, "voxels", || {
                 if role > 0 {
                     return Ok(vec![(level, code(&maps[role - 1], level))]);
@@ -123,8 +116,7 @@ impl<'m> Skeleton<'m> {
             let name = format!("features of level {level}");
             coded.features = log.step(name, count, "voxels", || {
                 let below = &coded.features;
-                let context =
-                    (role > 0).then(|| model.upsample(role, below, octree.occupancy(level - 1)));
+                let context = (role > 0).then(|| model.upsample(role, below, octree.occupancy(level - 1)));
                 let context = context.as_deref();
                 if !model.has_latents(role) {
                     return Ok(model.reconstruct(role, &[], context, map));

@@ -54,9 +54,7 @@ pub fn encode_within(
     let (mut tries, mut least, mut best) = (0, f64::INFINITY, None);
     let fits = |at: usize| -> Result<bool> {
         let Options {
-            bit_price,
-            residual,
-            ..
+            bit_price, residual, ..
         } = path[at];
         tries += 1;
         let name = format!("try {tries} of {most}: bit price {bit_price:.2}, {residual}");
@@ -163,9 +161,7 @@ mod tests {
     #[test]
     fn where_sizes_fall_more_room_still_never_leads_back() {
         let size = |at: usize| at + 13 * (at * 7 % 5);
-        let found: Vec<_> = (0..150)
-            .map(|room| last(64, |at| size(at) <= room).0)
-            .collect();
+        let found: Vec<_> = (0..150).map(|room| last(64, |at| size(at) <= room).0).collect();
         assert!(found.is_sorted(), "{found:?}");
         let fit = |(room, at): (usize, &Option<usize>)| at.is_none_or(|at| size(at) <= room);
         assert!(found.iter().enumerate().all(fit));
@@ -189,10 +185,7 @@ mod tests {
             [(2.0, coarse), (1.0, coarse)],
             [(1.0, fine(255, 95)), (1.0, fine(1, 1))],
         ];
-        assert_eq!(
-            parts.iter().map(|part| ends(part)).collect::<Vec<_>>(),
-            want
-        );
+        assert_eq!(parts.iter().map(|part| ends(part)).collect::<Vec<_>>(), want);
     }
 
     #[test]

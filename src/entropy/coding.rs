@@ -25,18 +25,10 @@ impl Coding<'_> {
     ///
     /// # Panics
     /// As [`quantise`] and [`quantise_passes`].
-    pub fn quantise(
-        self,
-        tables: &Tables,
-        latents: &[f32],
-        rounding: Rounding,
-        slice_voxels: usize,
-    ) -> Vec<i16> {
+    pub fn quantise(self, tables: &Tables, latents: &[f32], rounding: Rounding, slice_voxels: usize) -> Vec<i16> {
         match self {
             Coding::Known(condition) => quantise(tables, condition, latents, rounding),
-            Coding::Passes { keys, predict } => {
-                quantise_passes(tables, keys, predict, latents, rounding, slice_voxels)
-            }
+            Coding::Passes { keys, predict } => quantise_passes(tables, keys, predict, latents, rounding, slice_voxels),
         }
     }
 
@@ -47,9 +39,7 @@ impl Coding<'_> {
     pub fn encode(self, tables: &Tables, latents: &[i16], slice_voxels: usize) -> Vec<Vec<u8>> {
         match self {
             Coding::Known(condition) => encode_level(tables, condition, latents, slice_voxels),
-            Coding::Passes { keys, predict } => {
-                encode_passes(tables, keys, predict, latents, slice_voxels)
-            }
+            Coding::Passes { keys, predict } => encode_passes(tables, keys, predict, latents, slice_voxels),
         }
     }
 }

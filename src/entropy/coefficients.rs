@@ -30,9 +30,7 @@ use crate::error::{Error, Result, Stage};
 /// Where classes of activity begin.
 const CLASSES: [i32; 7] = [80, 240, 500, 1000, 1800, 3300, 6500];
 /// How likely 0 is at first, in each class.
-const FIRST: [u16; CLASSES.len() + 1] = [
-    64_000, 61_500, 58_000, 53_000, 47_000, 40_000, 32_000, 24_000,
-];
+const FIRST: [u16; CLASSES.len() + 1] = [64_000, 61_500, 58_000, 53_000, 47_000, 40_000, 32_000, 24_000];
 const LEAST: u32 = 64;
 const QUICK: u32 = 4;
 const SLOW: u32 = 7;
@@ -155,12 +153,7 @@ impl Model {
 
     /// The next triple, of these channels: the encoder's is `wanted`, the decoder's what it reads; `None` if that has a magnitude beyond 16 bits.
     #[inline]
-    fn triple(
-        &mut self,
-        decisions: &mut impl Decisions,
-        present: Range<usize>,
-        wanted: [i16; 3],
-    ) -> Option<[i16; 3]> {
+    fn triple(&mut self, decisions: &mut impl Decisions, present: Range<usize>, wanted: [i16; 3]) -> Option<[i16; 3]> {
         let all: i32 = self.activity.iter().sum();
         let any = &mut self.any[class(all)][0];
         let is = decisions.decide(*any, wanted != [0; 3]);
@@ -247,11 +240,7 @@ pub fn encode_coefficients(parts: &[Part<&[[i16; 3]]>]) -> Vec<u8> {
 ///
 /// # Errors
 /// [`Error::Malformed`], naming `at`, if the bytes are not what [`encode_coefficients`] makes of as many.
-pub fn decode_coefficients(
-    bytes: &[u8],
-    parts: &mut [Part<&mut [[i16; 3]]>],
-    at: &dyn Display,
-) -> Result<()> {
+pub fn decode_coefficients(bytes: &[u8], parts: &mut [Part<&mut [[i16; 3]]>], at: &dyn Display) -> Result<()> {
     let mut stack = slice::open(bytes, at)?;
     let mut model = Model::new();
     for Part { present, triples } in parts.iter_mut().filter(|part| !part.present.is_empty()) {
@@ -284,10 +273,7 @@ mod tests {
     }
 
     fn encode(triples: &[[i16; 3]]) -> Vec<u8> {
-        encode_coefficients(&[Part {
-            present: 0..3,
-            triples,
-        }])
+        encode_coefficients(&[Part { present: 0..3, triples }])
     }
 
     fn channels() -> impl Strategy<Value = Range<usize>> {
@@ -376,10 +362,7 @@ mod tests {
         let entropy = -(ones * (ones / all).log2() + (all - ones) * (1.0 - ones / all).log2());
         let signs = ones;
         let bits = 8.0 * encode(&triples).len() as f64;
-        assert!(
-            bits < 0.85 * (entropy + signs),
-            "{bits} of {entropy} + {signs}"
-        );
+        assert!(bits < 0.85 * (entropy + signs), "{bits} of {entropy} + {signs}");
     }
 
     #[test]

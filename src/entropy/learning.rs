@@ -254,8 +254,7 @@ impl<'a> Learning<'a> {
             *weight = grown.clamp(-LARGEST_WEIGHT, LARGEST_WEIGHT);
         }
         let residual = 16 * i32::from(y) - i32::from(latent.mean);
-        self.residuals[here.voxel * k + c] =
-            residual.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL) as i16;
+        self.residuals[here.voxel * k + c] = residual.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL) as i16;
         *here.surprise.get_or_insert(0) += slope;
         self.surprises[here.voxel] = here.surprise;
     }
@@ -382,8 +381,7 @@ mod tests {
                     }
                 };
                 for (set, input) in inputs[..4].iter_mut().enumerate() {
-                    let known =
-                        (nearby.iter()).filter(|near| near.0 == set && near.2.surprise.is_some());
+                    let known = (nearby.iter()).filter(|near| near.0 == set && near.2.surprise.is_some());
                     let r: i64 = known.clone().map(|near| near.2.residuals[c]).sum();
                     *input = (r * (65_536 / (known.count() as i64 + 1))) >> 12;
                 }

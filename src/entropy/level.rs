@@ -13,12 +13,7 @@ use crate::error::{Error, Result, Stage};
 ///
 /// # Panics
 /// As [`encode_slice`] does, and if `slice_voxels` is 0.
-pub fn encode_level(
-    tables: &Tables,
-    condition: Condition,
-    latents: &[i16],
-    slice_voxels: usize,
-) -> Vec<Vec<u8>> {
+pub fn encode_level(tables: &Tables, condition: Condition, latents: &[i16], slice_voxels: usize) -> Vec<Vec<u8>> {
     condition.check(tables, latents.len());
     let width = slice_voxels * tables.channels();
     latents
@@ -77,12 +72,7 @@ pub(super) fn place(level: u8, slice: usize, part: &Slice) -> String {
 ///
 /// # Errors
 /// [`Error::Malformed`] if it has more or fewer.
-pub(super) fn expect_slices(
-    slices: usize,
-    voxels: usize,
-    slice_voxels: usize,
-    level: u8,
-) -> Result<()> {
+pub(super) fn expect_slices(slices: usize, voxels: usize, slice_voxels: usize, level: u8) -> Result<()> {
     expect_number(slices, voxels.div_ceil(slice_voxels), level)
 }
 
@@ -128,13 +118,9 @@ mod tests {
     fn sample(voxels: usize) -> (Vec<i16>, Vec<u8>, Vec<i16>) {
         let mut random = Random(3);
         let count = voxels * tables().channels();
-        let mu = (0..count)
-            .map(|_| (random.next() % 1000) as i16 - 500)
-            .collect();
+        let mu = (0..count).map(|_| (random.next() % 1000) as i16 - 500).collect();
         let sigma = (0..count).map(|_| (random.next() % 64) as u8).collect();
-        let latents = (0..count)
-            .map(|_| (random.next() % 63) as i16 - 31)
-            .collect();
+        let latents = (0..count).map(|_| (random.next() % 63) as i16 - 31).collect();
         (mu, sigma, latents)
     }
 
@@ -142,22 +128,14 @@ mod tests {
     fn one_thread_and_two_make_the_same_bytes_and_latents() {
         let tables = tables();
         let (mu, sigma, latents) = sample(1000);
-        let gauss = Condition::Gauss {
-            mu: &mu,
-            sigma: &sigma,
-        };
+        let gauss = Condition::Gauss { mu: &mu, sigma: &sigma };
         for condition in [Condition::Prior, gauss] {
             let run = |threads| {
-                let pool = rayon::ThreadPoolBuilder::new()
-                    .num_threads(threads)
-                    .build()
-                    .unwrap();
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
                 pool.install(|| {
                     let bytes = encode_level(&tables, condition, &latents, 64);
                     let slices = slices_of(&bytes);
-                    let back =
-                        decode_level(&tables, condition, &slices, 1000, 64, 7, &Cancel::default())
-                            .unwrap();
+                    let back = decode_level(&tables, condition, &slices, 1000, 64, 7, &Cancel::default()).unwrap();
                     (bytes.clone(), back)
                 })
             };
@@ -175,17 +153,7 @@ mod tests {
         let bytes = encode_level(&tables, Condition::Prior, &latents, 40);
         let mut slices = slices_of(&bytes);
         slices[1].offset = 1000;
-        let decode = |slices: &[Slice]| {
-            decode_level(
-                &tables,
-                Condition::Prior,
-                slices,
-                100,
-                40,
-                7,
-                &Cancel::default(),
-            )
-        };
+        let decode = |slices: &[Slice]| decode_level(&tables, Condition::Prior, slices, 100, 40, 7, &Cancel::default());
         let error = decode(&slices[..2]).unwrap_err().to_string();
         assert!(
             error.contains("level 7: number of feature slices is 2, expected 3"),

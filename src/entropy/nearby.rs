@@ -265,16 +265,10 @@ mod tests {
     #[test]
     fn nothing_is_near_across_the_edge_of_the_cube() {
         let last = (1 << 21) - 1;
-        let mut keys: Vec<u64> = [
-            [0, 0, 0],
-            [last, 0, 0],
-            [0, last, 1],
-            [1, 2, last],
-            [last; 3],
-        ]
-        .into_iter()
-        .map(morton::encode)
-        .collect();
+        let mut keys: Vec<u64> = [[0, 0, 0], [last, 0, 0], [0, last, 1], [1, 2, last], [last; 3]]
+            .into_iter()
+            .map(morton::encode)
+            .collect();
         keys.sort_unstable();
         check(&keys);
     }

@@ -51,10 +51,7 @@ pub fn encode_passes(
                 order.push(latent);
                 Ok::<_, Infallible>(latent)
             });
-            let condition = Condition::Gauss {
-                mu: &mu,
-                sigma: &sigma,
-            };
+            let condition = Condition::Gauss { mu: &mu, sigma: &sigma };
             encode_slice(tables, condition, &order)
         })
         .collect()
@@ -75,11 +72,7 @@ pub(super) fn each_latent<E>(
     for voxels in passes(keys, &slice) {
         let (mu, sigma) = predict(slice.clone(), &voxels, latents);
         let count = voxels.len() * k;
-        assert_eq!(
-            (mu.len(), sigma.len()),
-            (count, count),
-            "one mean and scale per latent"
-        );
+        assert_eq!((mu.len(), sigma.len()), (count, count), "one mean and scale per latent");
         let parameters = mu.chunks_exact(k).zip(sigma.chunks_exact(k));
         for (&v, (mu, sigma)) in voxels.iter().zip(parameters) {
             let at = v as usize - slice.start;
@@ -173,11 +166,7 @@ mod tests {
                 let known = v > slice.start && keys[v - 1] & 7 < keys[v] & 7;
                 for c in 0..k {
                     let before = || latents[(v - 1 - slice.start) * k + c];
-                    mu.push(if known {
-                        before().clamp(-100, 100) * 16
-                    } else {
-                        0
-                    });
+                    mu.push(if known { before().clamp(-100, 100) * 16 } else { 0 });
                     sigma.push(if known { 20 } else { UNPREDICTED });
                 }
             }
@@ -246,13 +235,10 @@ mod tests {
         let keys: Vec<u64> = (0..4000).collect();
         let mut random = Random(6);
         // About normal, around 5 and some 3 wide; another channel is 0 throughout.
-        let wide =
-            |random: &mut Random| (0..12).map(|_| (random.next() % 4) as i16).sum::<i16>() - 13;
+        let wide = |random: &mut Random| (0..12).map(|_| (random.next() % 4) as i16).sum::<i16>() - 13;
         let latents: Vec<i16> = keys.iter().flat_map(|_| [wide(&mut random), 0]).collect();
         let constant = |mu: [i16; 2], sigma: [u8; 2]| {
-            move |_: Range<usize>, voxels: &[u32], _: &[i16]| {
-                (mu.repeat(voxels.len()), sigma.repeat(voxels.len()))
-            }
+            move |_: Range<usize>, voxels: &[u32], _: &[i16]| (mu.repeat(voxels.len()), sigma.repeat(voxels.len()))
         };
         let right = size(&tables, &keys, &constant([80, 0], [35, 0]), &latents);
         let wrong = constant([0, 0], [16, 30]);

@@ -52,19 +52,12 @@ impl Rounding<'_> {
 ///
 /// # Panics
 /// If the latents are not whole voxels, the condition has not one mean and scale for each, or there is not one price for each channel.
-pub fn quantise(
-    tables: &Tables,
-    condition: Condition,
-    latents: &[f32],
-    rounding: Rounding,
-) -> Vec<i16> {
+pub fn quantise(tables: &Tables, condition: Condition, latents: &[f32], rounding: Rounding) -> Vec<i16> {
     condition.check(tables, latents.len());
     let k = tables.channels();
     assert_eq!(rounding.prices.len(), k, "one price per channel");
     let mut out = vec![0; latents.len()];
-    let blocks = out
-        .par_chunks_mut(BLOCK * k)
-        .zip(latents.par_chunks(BLOCK * k));
+    let blocks = out.par_chunks_mut(BLOCK * k).zip(latents.par_chunks(BLOCK * k));
     blocks.enumerate().for_each(|(b, (out, latents))| {
         let first = b * BLOCK * k;
         let condition = condition.of(first..first + latents.len());
@@ -129,11 +122,7 @@ impl Row<'_> {
         } else {
             (entry as usize, 0)
         };
-        let more = if beyond > 0 {
-            2 + 2 * beyond.ilog2()
-        } else {
-            0
-        };
+        let more = if beyond > 0 { 2 + 2 * beyond.ilog2() } else { 0 };
         16.0 - f32::from(self.interval(entry).size).log2() + more as f32
     }
 }
@@ -165,10 +154,7 @@ mod tests {
     #[test]
     fn without_a_price_every_latent_goes_to_its_nearest_number_within_the_limit() {
         let (y, mu, sigma) = some(100 * K);
-        let condition = Condition::Gauss {
-            mu: &mu,
-            sigma: &sigma,
-        };
+        let condition = Condition::Gauss { mu: &mu, sigma: &sigma };
         let q = quantise(&tables(), condition, &y, at(5, &[0.0; K]));
         for (q, y) in q.iter().zip(&y) {
             assert_eq!(f32::from(*q), y.clamp(-5.0, 5.0).round_ties_even());
@@ -178,10 +164,7 @@ mod tests {
     #[test]
     fn the_dearer_a_bit_the_fewer_are_spent() {
         let (y, mu, sigma) = some(3000 * K);
-        let condition = Condition::Gauss {
-            mu: &mu,
-            sigma: &sigma,
-        };
+        let condition = Condition::Gauss { mu: &mu, sigma: &sigma };
         let lengths: Vec<usize> = [0.0, 0.05, 0.2, 1.0, 5.0]
             .into_iter()
             .map(|price| {
@@ -195,10 +178,7 @@ mod tests {
     #[test]
     fn no_whole_number_between_a_latent_and_what_it_became_would_have_been_better() {
         let (y, mu, sigma) = some(500 * K);
-        let condition = Condition::Gauss {
-            mu: &mu,
-            sigma: &sigma,
-        };
+        let condition = Condition::Gauss { mu: &mu, sigma: &sigma };
         let (tables, prices) = (tables(), [3.0; K]);
         let q = quantise(&tables, condition, &y, at(127, &prices));
         let mut far = 0;
@@ -206,9 +186,7 @@ mod tests {
             let (row, centre) = condition.row(&tables, i);
             let cost = |q: i32| (y - q as f32).powi(2) + 3.0 * row.bits(q - centre);
             let (near, q) = (y.round_ties_even() as i32, i32::from(q));
-            let best = (near.min(q)..=near.max(q))
-                .map(cost)
-                .fold(f32::MAX, f32::min);
+            let best = (near.min(q)..=near.max(q)).map(cost).fold(f32::MAX, f32::min);
             assert_eq!(cost(q), best, "{y} became {q}");
             far += usize::from((near - q).abs() > 1);
         }
@@ -235,9 +213,7 @@ mod tests {
                 [] => vec![0; K],
                 b => b.iter().map(|b| 16 * b).collect(),
             });
-            let sigma = befores
-                .iter()
-                .flat_map(|b| [if b.is_empty() { 40 } else { 20 }; K]);
+            let sigma = befores.iter().flat_map(|b| [if b.is_empty() { 40 } else { 20 }; K]);
             (mu.collect(), sigma.collect())
         };
         for learning in [false, true] {
@@ -247,24 +223,16 @@ mod tests {
             let mut known = vec![0; slice * K];
             for (i, latents) in q.chunks(slice * K).enumerate() {
                 let own = range(i, slice, keys.len());
-                let Ok(()) = each_latent(
-                    &tables,
-                    &keys,
-                    own,
-                    &predict,
-                    &mut known,
-                    |at, c, mu, sigma| {
-                        let first = i * slice;
-                        let off = |v: usize| y[v * K + c] - f32::from(q[v * K + c]);
-                        let before = first..first + at;
-                        let siblings = before.filter(|v| keys[*v] / 8 == keys[first + at] / 8);
-                        let wanted = y[(first + at) * K + c]
-                            + siblings.rev().map(|v| MADE_UP * off(v)).sum::<f32>();
-                        let rounded = rounding.round(c, row(&tables, c, mu, sigma), wanted);
-                        assert_eq!(latents[at * K + c], rounded);
-                        Ok::<_, Infallible>(rounded)
-                    },
-                );
+                let Ok(()) = each_latent(&tables, &keys, own, &predict, &mut known, |at, c, mu, sigma| {
+                    let first = i * slice;
+                    let off = |v: usize| y[v * K + c] - f32::from(q[v * K + c]);
+                    let before = first..first + at;
+                    let siblings = before.filter(|v| keys[*v] / 8 == keys[first + at] / 8);
+                    let wanted = y[(first + at) * K + c] + siblings.rev().map(|v| MADE_UP * off(v)).sum::<f32>();
+                    let rounded = rounding.round(c, row(&tables, c, mu, sigma), wanted);
+                    assert_eq!(latents[at * K + c], rounded);
+                    Ok::<_, Infallible>(rounded)
+                });
             }
             let free = quantise_passes(&tables, &keys, &predict, &y, at(127, &[0.0; K]), slice);
             let nearest = |(q, y): (&i16, &f32)| f32::from(*q) == y.round_ties_even();

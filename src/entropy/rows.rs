@@ -169,8 +169,7 @@ impl Row<'_> {
         let bucket = usize::from(quantile >> (PRECISION - BUCKET_BITS));
         let first = usize::from(self.buckets[bucket]);
         let last = usize::from(self.buckets[bucket + 1]);
-        let entry =
-            first + self.cumulative[first + 1..=last].partition_point(|&sum| sum <= quantile);
+        let entry = first + self.cumulative[first + 1..=last].partition_point(|&sum| sum <= quantile);
         (entry, self.interval(entry))
     }
 }
@@ -196,14 +195,8 @@ mod tests {
     #[test]
     fn every_quantile_finds_the_entry_it_lies_in() {
         let flat = [63u16; 1024];
-        let steep: Vec<u16> = std::iter::repeat_n(0, 300)
-            .chain([65_535 - 301, 0])
-            .collect();
-        let rows = rows(
-            &[&[0, 65_533, 0], &[32_767, 32_767], &flat, &steep],
-            &[0; 4],
-        )
-        .unwrap();
+        let steep: Vec<u16> = std::iter::repeat_n(0, 300).chain([65_535 - 301, 0]).collect();
+        let rows = rows(&[&[0, 65_533, 0], &[32_767, 32_767], &flat, &steep], &[0; 4]).unwrap();
         for index in 0..rows.len() {
             let row = rows.row(index);
             for quantile in 0..=u16::MAX {

@@ -47,11 +47,7 @@ impl<'a> Condition<'a> {
     }
 
     pub(super) fn check(&self, tables: &Tables, latents: usize) {
-        assert_eq!(
-            latents % tables.channels(),
-            0,
-            "latents come in whole voxels"
-        );
+        assert_eq!(latents % tables.channels(), 0, "latents come in whole voxels");
         if let Condition::Gauss { mu, sigma } = self {
             assert_eq!(
                 (mu.len(), sigma.len()),
@@ -237,12 +233,7 @@ pub(super) fn open(bytes: &[u8], at: &dyn Display) -> Result<Stack> {
     let (first, words) = bytes.split_at(LEAST_STATE_BYTES + more % WORD_BYTES);
     if first.last() == Some(&0) {
         let expected = "a first state in as few bytes as hold it";
-        return Err(malformed(
-            at,
-            "highest byte of the coder state",
-            0,
-            expected,
-        ));
+        return Err(malformed(at, "highest byte of the coder state", 0, expected));
     }
     let mut state = [0; 8];
     state[..first.len()].copy_from_slice(first);
@@ -272,24 +263,14 @@ fn pop_distance(stack: &mut Stack, at: &dyn Display) -> Result<(bool, i32)> {
         bits += 1;
         if bits > MAX_PREFIX {
             let expected = format!("at most {MAX_PREFIX}");
-            return Err(malformed(
-                at,
-                "ones before an escape's zero",
-                bits,
-                expected,
-            ));
+            return Err(malformed(at, "ones before an escape's zero", bits, expected));
         }
     }
     let distance = (0..bits).fold(1, |distance, _| distance << 1 | i32::from(bit()));
     Ok((above, distance))
 }
 
-fn malformed(
-    at: &dyn Display,
-    field: &str,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
+fn malformed(at: &dyn Display, field: &str, value: impl ToString, expected: impl ToString) -> Error {
     Error::malformed(Stage::Entropy, at, field, value, expected)
 }
 
@@ -348,10 +329,7 @@ mod tests {
         for sigma in 0..64 {
             for mu in -2047..=-2032 {
                 let (mu, sigma) = (vec![mu; values.len()], vec![sigma; values.len()]);
-                let condition = Condition::Gauss {
-                    mu: &mu,
-                    sigma: &sigma,
-                };
+                let condition = Condition::Gauss { mu: &mu, sigma: &sigma };
                 let bytes = encode_slice(&tables(), condition, &values);
                 assert_eq!(decode(condition, &bytes, values.len() / k).unwrap(), values);
             }
@@ -398,31 +376,19 @@ mod tests {
     #[test]
     fn the_size_is_what_the_probabilities_promise() {
         let (mu, sigma, latents, ideal) = drawn(16_384);
-        let condition = Condition::Gauss {
-            mu: &mu,
-            sigma: &sigma,
-        };
+        let condition = Condition::Gauss { mu: &mu, sigma: &sigma };
         let bits = 8.0 * encode_slice(&tables(), condition, &latents).len() as f64;
-        assert!(
-            bits > ideal && bits < 1.001 * ideal + 64.0,
-            "{bits} bits for {ideal}"
-        );
+        assert!(bits > ideal && bits < 1.001 * ideal + 64.0, "{bits} bits for {ideal}");
     }
 
     #[test]
     fn the_coder_alone_notices_nearly_every_damage() {
         let (mu, sigma, latents, _) = drawn(300);
         let voxels = latents.len() / tables().channels();
-        let condition = Condition::Gauss {
-            mu: &mu,
-            sigma: &sigma,
-        };
+        let condition = Condition::Gauss { mu: &mu, sigma: &sigma };
         let bytes = encode_slice(&tables(), condition, &latents);
         for length in 0..bytes.len() {
-            assert!(
-                decode(condition, &bytes[..length], voxels).is_err(),
-                "cut at {length}"
-            );
+            assert!(decode(condition, &bytes[..length], voxels).is_err(), "cut at {length}");
         }
         let longer = [&bytes[..], &[0; 4]].concat();
         assert!(decode(condition, &longer, voxels).is_err());
@@ -433,10 +399,7 @@ mod tests {
             missed += usize::from(decode(condition, &damaged, voxels).is_ok());
         }
         let share = missed as f64 / (8 * bytes.len()) as f64;
-        println!(
-            "{missed} of {} flipped bits went unnoticed",
-            8 * bytes.len()
-        );
+        println!("{missed} of {} flipped bits went unnoticed", 8 * bytes.len());
         assert!(share < 0.01, "{share}");
     }
 }

@@ -47,8 +47,7 @@ impl Stack {
     pub fn pop<T>(&mut self, find: impl FnOnce(u16) -> (T, Interval)) -> T {
         let quantile = self.state as u16;
         let (symbol, Interval { start, size }) = find(quantile);
-        self.state =
-            (self.state >> PRECISION) * u64::from(size) + u64::from(quantile.wrapping_sub(start));
+        self.state = (self.state >> PRECISION) * u64::from(size) + u64::from(quantile.wrapping_sub(start));
         if self.state >> u32::BITS == 0
             && let Some(word) = self.words.pop()
         {
@@ -93,10 +92,7 @@ mod tests {
     }
 
     impl EncoderModel<BITS> for Lone {
-        fn left_cumulative_and_probability(
-            &self,
-            _: impl Borrow<bool>,
-        ) -> Option<(u16, NonZeroU16)> {
+        fn left_cumulative_and_probability(&self, _: impl Borrow<bool>) -> Option<(u16, NonZeroU16)> {
             Some((self.0.start, NonZeroU16::new(self.0.size)?))
         }
     }
@@ -114,13 +110,7 @@ mod tests {
             let Interval { start, size } = self;
             let end = start.wrapping_add(size);
             if quantile < start {
-                (
-                    false,
-                    Interval {
-                        start: 0,
-                        size: start,
-                    },
-                )
+                (false, Interval { start: 0, size: start })
             } else if quantile - start < size {
                 (true, self)
             } else {

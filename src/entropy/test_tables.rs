@@ -10,10 +10,7 @@ pub(crate) struct Random(pub u64);
 
 impl Random {
     pub(crate) fn next(&mut self) -> u64 {
-        self.0 = self
-            .0
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1);
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
         self.0 >> 33
     }
 }
@@ -76,10 +73,7 @@ fn mass(d: i32, mean: f64, sigma: f64) -> f64 {
 fn row(masses: &[f64]) -> Vec<u16> {
     let total: f64 = masses.iter().sum();
     let free = 65_536 - (masses.len() as i64 + 1);
-    let mut row: Vec<i64> = masses
-        .iter()
-        .map(|m| (m / total * free as f64) as i64)
-        .collect();
+    let mut row: Vec<i64> = masses.iter().map(|m| (m / total * free as f64) as i64).collect();
     row.push(0);
     let rest = free - row.iter().sum::<i64>();
     *row.iter_mut().max().unwrap() += rest;

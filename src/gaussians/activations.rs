@@ -88,14 +88,7 @@ mod tests {
         assert!(worst(86.9, exp, f64::exp, |y| y) < 2e-7);
         assert!(worst(30.0, sigmoid, |x| 1.0 / (1.0 + (-x).exp()), |_| 1.0) < 1e-7);
         assert!(worst(12.0, tanh, f64::tanh, |_| 1.0) < 3e-7);
-        assert!(
-            worst(
-                60.0,
-                softplus,
-                |x| x.max(0.0) + (-x.abs()).exp().ln_1p(),
-                |y| y
-            ) < 5e-7
-        );
+        assert!(worst(60.0, softplus, |x| x.max(0.0) + (-x.abs()).exp().ln_1p(), |y| y) < 5e-7);
     }
 
     #[test]
@@ -106,10 +99,7 @@ mod tests {
         for i in 1..100_000 {
             let x = i as f32 * 0.037;
             let exact = f64::from(x).log2();
-            assert!(
-                (f64::from(log2(x)) - exact).abs() < 1e-7 * exact.abs().max(1.0),
-                "{x}"
-            );
+            assert!((f64::from(log2(x)) - exact).abs() < 1e-7 * exact.abs().max(1.0), "{x}");
         }
     }
 

@@ -78,11 +78,7 @@ impl ColourFilter {
         let exponent = bytes[0];
         if exponent > MAX_EXPONENT {
             let expected = format!("at most {MAX_EXPONENT}");
-            return Err(malformed(
-                "exponent of the colour filter",
-                exponent.into(),
-                expected,
-            ));
+            return Err(malformed("exponent of the colour filter", exponent.into(), expected));
         }
         let weight = |c: usize, k: usize| bytes[1 + c * INPUTS + k] as i8;
         let weights = std::array::from_fn(|c| std::array::from_fn(|k| weight(c, k)));
@@ -110,12 +106,10 @@ impl ColourFilter {
     /// # Panics
     /// If the surroundings are of other Gaussians.
     pub fn apply(&self, gaussians: &mut Gaussians, surroundings: &Surroundings) {
-        let weight =
-            |c: usize, k: usize| f32::from(self.weights[c][k]) * Self::step(self.exponent, k);
+        let weight = |c: usize, k: usize| f32::from(self.weights[c][k]) * Self::step(self.exponent, k);
         // A fourth channel makes a vector of it.
-        let weights: [[f32; 4]; INPUTS] = std::array::from_fn(|k| {
-            std::array::from_fn(|c| if c < 3 { weight(c, k) } else { 0.0 })
-        });
+        let weights: [[f32; 4]; INPUTS] =
+            std::array::from_fn(|k| std::array::from_fn(|c| if c < 3 { weight(c, k) } else { 0.0 }));
         let correct = |(i, colour): (usize, &mut [f32; 3])| {
             let mut sum = [0.0; 4];
             for (input, weights) in surroundings.inputs(i, *colour).iter().zip(&weights) {

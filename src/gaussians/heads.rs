@@ -24,13 +24,7 @@ const BLOCK: usize = 4096;
 ///
 /// # Panics
 /// If `raw` is not [`RAW`] numbers for each Gaussian of `voxels`.
-pub fn activate(
-    raw: &[f32],
-    voxels: &Voxels,
-    children: usize,
-    shape: &Shape,
-    frame: Frame,
-) -> Gaussians {
+pub fn activate(raw: &[f32], voxels: &Voxels, children: usize, shape: &Shape, frame: Frame) -> Gaussians {
     let count = voxels.len() * children;
     assert_eq!(raw.len(), count * RAW, "raw numbers for every Gaussian");
     let generated = voxels.depth() + u8::from(children == 8);
@@ -54,24 +48,22 @@ pub fn activate(
         .zip(gaussians.colour.par_chunks_mut(BLOCK))
         .zip(raw.par_chunks(BLOCK * RAW))
         .enumerate()
-        .for_each(
-            |(block, (((((position, scale), rotation), opacity), colour), raw))| {
-                for (g, raw) in raw.chunks(GROUP * RAW).enumerate() {
-                    let group = Group::new(raw, shape, children == 8);
-                    for j in 0..raw.len() / RAW {
-                        let to = g * GROUP + j;
-                        let centre = centre(voxels, children, block * BLOCK + to, edge);
-                        for axis in 0..3 {
-                            position[to][axis] = centre[axis] + group.offset[axis][j] * edge;
-                            scale[to][axis] = group.scale[axis][j] * edge;
-                            colour[to][axis] = group.colour[axis][j];
-                        }
-                        rotation[to] = group.rotation.map(|component| component[j]);
-                        opacity[to] = group.opacity[j];
+        .for_each(|(block, (((((position, scale), rotation), opacity), colour), raw))| {
+            for (g, raw) in raw.chunks(GROUP * RAW).enumerate() {
+                let group = Group::new(raw, shape, children == 8);
+                for j in 0..raw.len() / RAW {
+                    let to = g * GROUP + j;
+                    let centre = centre(voxels, children, block * BLOCK + to, edge);
+                    for axis in 0..3 {
+                        position[to][axis] = centre[axis] + group.offset[axis][j] * edge;
+                        scale[to][axis] = group.scale[axis][j] * edge;
+                        colour[to][axis] = group.colour[axis][j];
                     }
+                    rotation[to] = group.rotation.map(|component| component[j]);
+                    opacity[to] = group.opacity[j];
                 }
-            },
-        );
+            }
+        });
     gaussians
 }
 
@@ -152,13 +144,7 @@ mod tests {
     #[test]
     fn raw_zeros_give_opaque_grey_balls_at_the_voxel_centres() {
         let voxels = Voxels::new(2, vec![0, 63]);
-        let gaussians = activate(
-            &[0.0; 2 * RAW],
-            &voxels,
-            1,
-            &Shape::tiny(),
-            Frame::default(),
-        );
+        let gaussians = activate(&[0.0; 2 * RAW], &voxels, 1, &Shape::tiny(), Frame::default());
         assert_eq!(gaussians.position, [[-0.75; 3], [0.75; 3]]);
         assert_eq!(gaussians.rotation[0], [1.0, 0.0, 0.0, 0.0]);
         assert_eq!(gaussians.opacity, [1.0, 1.0]);
@@ -172,13 +158,7 @@ mod tests {
     #[test]
     fn eight_children_surround_their_parent_s_centre() {
         let voxels = Voxels::new(1, vec![7]);
-        let gaussians = activate(
-            &[0.0; 8 * RAW],
-            &voxels,
-            8,
-            &Shape::tiny(),
-            Frame::default(),
-        );
+        let gaussians = activate(&[0.0; 8 * RAW], &voxels, 8, &Shape::tiny(), Frame::default());
         assert_eq!(gaussians.position[0], [0.25; 3]);
         assert_eq!(gaussians.position[1], [0.75, 0.25, 0.25]);
         assert_eq!(gaussians.position[4], [0.25, 0.25, 0.75]);
@@ -202,13 +182,7 @@ mod tests {
     fn extreme_raw_numbers_stay_finite_and_in_range() {
         let voxels = Voxels::new(3, vec![5]);
         for extreme in [65504.0, -65504.0] {
-            let g = activate(
-                &[extreme; 8 * RAW],
-                &voxels,
-                8,
-                &Shape::tiny(),
-                Frame::default(),
-            );
+            let g = activate(&[extreme; 8 * RAW], &voxels, 8, &Shape::tiny(), Frame::default());
             assert!(g.position.iter().flatten().all(|v| v.abs() < 1.2));
             assert!(g.scale.iter().flatten().all(|v| v.is_finite() && *v >= 0.0));
             assert!(

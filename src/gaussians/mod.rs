@@ -84,20 +84,12 @@ impl Gaussians {
     /// nothing where they have a blur of their own. That keeps surfaces closed whatever the distance; by 0.3 more, silhouettes would
     /// grow the more, the smaller an object is seen.
     pub fn pixel_blur(&self) -> f32 {
-        if self.own_blur() > 0.0 {
-            1.0 / 16.0
-        } else {
-            0.3
-        }
+        if self.own_blur() > 0.0 { 1.0 / 16.0 } else { 0.3 }
     }
 
     /// [`Gaussians::blur`], where it is a variance; otherwise none.
     pub(crate) fn own_blur(&self) -> f32 {
-        if self.blur.is_finite() {
-            self.blur.max(0.0)
-        } else {
-            0.0
-        }
+        if self.blur.is_finite() { self.blur.max(0.0) } else { 0.0 }
     }
 
     /// Whether there are none.
@@ -117,10 +109,7 @@ impl Gaussians {
             self.colour.len(),
         ];
         if others == [self.len(); 4] {
-            let Harmonics {
-                count,
-                coefficients,
-            } = &self.harmonics;
+            let Harmonics { count, coefficients } = &self.harmonics;
             if coefficients.len() == self.len() * count && [0, 3, 8, 15].contains(count) {
                 return Ok(());
             }

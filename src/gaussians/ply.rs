@@ -30,8 +30,8 @@ const OPACITY_MARGIN: f64 = 1e-6;
 const LEAST_SCALE: f64 = f32::MIN_POSITIVE as f64;
 /// The properties written.
 const PROPERTIES: [&str; 14] = [
-    "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
-    "rot_0", "rot_1", "rot_2", "rot_3",
+    "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2",
+    "rot_3",
 ];
 /// Render modes of Gaussians that were made to be drawn with opacity compensation.
 const MIP: [&str; 2] = ["mip", "antialiased"];
@@ -64,9 +64,7 @@ impl Notes {
             ));
         }
         if let Some(mode) = &self.ignored_mode {
-            lines.push(format!(
-                "drawn as `default`, not in its render mode `{mode}`"
-            ));
+            lines.push(format!("drawn as `default`, not in its render mode `{mode}`"));
         }
         if self.flat {
             lines.push("without scale_2 the Gaussians are taken as flat discs".into());
@@ -125,21 +123,14 @@ impl Gaussians {
     /// The numbers of Gaussian `i` in the order of [`PROPERTIES`].
     fn row(&self, i: usize) -> [f32; 14] {
         let unit = self.frame.unit();
-        let [x, y, z] = self
-            .frame
-            .placement
-            .from_cube(self.frame.bits, self.position[i]);
+        let [x, y, z] = self.frame.placement.from_cube(self.frame.bits, self.position[i]);
         let [r, g, b] = self.colour[i].map(|c| (f64::from(c) - 0.5) / HARMONIC);
         let opacity = f64::from(self.opacity[i]).clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
         let opacity = (opacity / (1.0 - opacity)).ln();
         let [s0, s1, s2] = self.scale[i].map(|s| {
             let s = (f64::from(s) * unit).abs();
             // Not `max`, which would hide NaN.
-            if s < LEAST_SCALE {
-                LEAST_SCALE.ln()
-            } else {
-                s.ln()
-            }
+            if s < LEAST_SCALE { LEAST_SCALE.ln() } else { s.ln() }
         });
         let [q0, q1, q2, q3] = self.rotation[i].map(f64::from);
         [x, y, z, r, g, b, opacity, s0, s1, s2, q0, q1, q2, q3].map(|x| x as f32)
@@ -198,9 +189,7 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
     });
     let unit = frame.unit();
     let deviation = |i: usize, k: usize| {
-        let log = scale
-            .get(k)
-            .map_or(f64::NEG_INFINITY, |column| column.get(i));
+        let log = scale.get(k).map_or(f64::NEG_INFINITY, |column| column.get(i));
         let deviation = (log.exp() / unit) as f32;
         // What a finite logarithm stands for is finite: beyond the range of `f32` it is the end of the range.
         if log.is_finite() {
@@ -260,10 +249,7 @@ fn harmonics(ply: &Ply, count: usize, limits: &Limits) -> Result<Harmonics> {
             }
         }
     });
-    Ok(Harmonics {
-        count,
-        coefficients,
-    })
+    Ok(Harmonics { count, coefficients })
 }
 
 /// The render mode in the comments, if it isn't the default.
@@ -288,8 +274,7 @@ fn words<'a>(header: &'a Header, key: &str) -> Option<std::str::SplitAsciiWhites
 /// The blur that the comments name, in the units of the cube that they name too; otherwise none.
 fn blur(header: &Header) -> f32 {
     let blur = words(header, "blur").and_then(|mut words| words.next()?.parse().ok());
-    blur.filter(|blur: &f32| blur.is_finite() && *blur > 0.0)
-        .unwrap_or(0.0)
+    blur.filter(|blur: &f32| blur.is_finite() && *blur > 0.0).unwrap_or(0.0)
 }
 
 /// The cube that the comments name. Comments are free text: what cannot be understood is none.
@@ -308,9 +293,7 @@ fn named_frame(header: &Header) -> Option<Frame> {
 
 /// A cube around the central 99 % of the centres that are finite.
 fn fitted_frame(centres: impl Iterator<Item = [f64; 3]>) -> Frame {
-    let mut centres: Vec<[f64; 3]> = centres
-        .filter(|c| c.iter().all(|x| x.is_finite()))
-        .collect();
+    let mut centres: Vec<[f64; 3]> = centres.filter(|c| c.iter().all(|x| x.is_finite())).collect();
     if centres.is_empty() {
         return Frame::default();
     }
@@ -323,16 +306,10 @@ fn fitted_frame(centres: impl Iterator<Item = [f64; 3]>) -> Frame {
         (low, high)
     };
     let ranges = [range(0), range(1), range(2)];
-    let side = ranges
-        .iter()
-        .fold(0.0, |side: f64, (low, high)| side.max(high - low));
+    let side = ranges.iter().fold(0.0, |side: f64, (low, high)| side.max(high - low));
     let cubes = f64::from(1u32 << FITTED_BITS);
     // All in one place, or too far apart for a number.
-    let side = if side > 0.0 && side.is_finite() {
-        side
-    } else {
-        cubes
-    };
+    let side = if side > 0.0 && side.is_finite() { side } else { cubes };
     Frame {
         bits: FITTED_BITS,
         placement: Placement {

@@ -124,11 +124,7 @@ impl Precision {
 
     #[cfg(feature = "encoder")]
     fn to_bytes(self) -> [u8; FIXED] {
-        let Precision {
-            fine,
-            coarse,
-            boundary,
-        } = self;
+        let Precision { fine, coarse, boundary } = self;
         [fine.luma, fine.chroma, coarse.luma, coarse.chroma, boundary]
     }
 
@@ -176,12 +172,7 @@ impl ColourResidual {
     ///
     /// # Panics
     /// If there are payloads, but not one for every `slice` of the keys.
-    pub fn parse(
-        payloads: &[Slice],
-        keys: &[u64],
-        slice: usize,
-        level: u8,
-    ) -> Result<Option<Self>> {
+    pub fn parse(payloads: &[Slice], keys: &[u64], slice: usize, level: u8) -> Result<Option<Self>> {
         if payloads.is_empty() {
             return Ok(None);
         }
@@ -193,13 +184,7 @@ impl ColourResidual {
                 let field = "steps of the colour residual";
                 let expected = "four steps, not all 0, and a bit up to 63";
                 let found = format!("{:?}", &payload.bytes[..payload.bytes.len().min(FIXED)]);
-                return Err(Error::malformed(
-                    Stage::Gaussians,
-                    at,
-                    field,
-                    found,
-                    expected,
-                ));
+                return Err(Error::malformed(Stage::Gaussians, at, field, found, expected));
             };
             let mut parts = precision.parts(triples.split_at_mut(precision.coarse_of(keys)));
             decode_coefficients(&payload.bytes[FIXED..], &mut parts, &at)?;
@@ -242,11 +227,7 @@ impl ColourResidual {
             let coarse = precision.coarse_of(keys);
             let rounded = |(place, voxel): (usize, usize)| {
                 let fine = place >= coarse;
-                let steps = if fine {
-                    precision.fine
-                } else {
-                    precision.coarse
-                };
+                let steps = if fine { precision.fine } else { precision.coarse };
                 let units = steps.units();
                 let mut triple = [0; 3];
                 for k in steps.channels() {
@@ -272,9 +253,7 @@ impl ColourResidual {
     #[cfg(feature = "encoder")]
     pub fn to_payloads(&self, keys: &[u64]) -> Vec<Vec<u8>> {
         let slices = self.coefficients.par_chunks(self.slice);
-        let slices = slices
-            .zip(&self.precisions)
-            .zip(keys.par_chunks(self.slice));
+        let slices = slices.zip(&self.precisions).zip(keys.par_chunks(self.slice));
         let payload = |((triples, precision), keys): ((&[[i16; 3]], &Precision), &[u64])| {
             let parts = precision.parts(triples.split_at(precision.coarse_of(keys)));
             let mut bytes = precision.to_bytes().to_vec();
@@ -307,9 +286,7 @@ impl ColourResidual {
                 for (colours, value) in colours.chunks_mut(each).zip(values) {
                     for colour in colours {
                         for (k, x) in colour.iter_mut().enumerate() {
-                            let by = value[0] * BASIS[0][k]
-                                + value[1] * BASIS[1][k]
-                                + value[2] * BASIS[2][k];
+                            let by = value[0] * BASIS[0][k] + value[1] * BASIS[1][k] + value[2] * BASIS[2][k];
                             *x = (*x + by).clamp(0.0, 1.0);
                         }
                     }
@@ -324,11 +301,7 @@ fn differences(coefficients: &[[i16; 3]], keys: &[u64], precision: Precision) ->
     let coarse = precision.coarse_of(keys);
     let [coarse_units, fine_units] = [precision.coarse, precision.fine].map(Steps::units);
     let mut coefficients = coefficients.iter().enumerate().map(|(place, triple)| {
-        let units = if place < coarse {
-            coarse_units
-        } else {
-            fine_units
-        };
+        let units = if place < coarse { coarse_units } else { fine_units };
         each(|k| f32::from(triple[k]) * units[k])
     });
     values[0] = coefficients.next().unwrap_or_default();
@@ -365,11 +338,7 @@ fn joins(keys: &[u64]) -> Vec<Join> {
     // Voxels that the next may still join, with the bit at which they join themselves, higher ones first; and where their own join stands.
     let mut open: Vec<(usize, usize, usize)> = vec![(0, usize::MAX, usize::MAX)];
     for voxel in 1..=keys.len() {
-        let own = if voxel < keys.len() {
-            bit(voxel)
-        } else {
-            usize::MAX - 1
-        };
+        let own = if voxel < keys.len() { bit(voxel) } else { usize::MAX - 1 };
         while let Some(&(before, bit, place)) = open.last()
             && bit <= own
         {

@@ -113,13 +113,7 @@ impl Octree {
         let parents = &self.levels[self.links.len()];
         let depth = parents.depth() + 1;
         let fault = |field: &str, value: usize, expected: String| {
-            Error::malformed(
-                Stage::Geometry,
-                format!("level {depth}"),
-                field,
-                value,
-                expected,
-            )
+            Error::malformed(Stage::Geometry, format!("level {depth}"), field, value, expected)
         };
         if depth > morton::MAX_DEPTH {
             return Err(fault(
@@ -157,10 +151,7 @@ impl Octree {
             }
         }
         self.levels.push(Voxels::from_sorted(depth, keys));
-        self.links.push(Links {
-            occupancy,
-            first_child,
-        });
+        self.links.push(Links { occupancy, first_child });
         Ok(())
     }
 
@@ -239,10 +230,7 @@ mod tests {
 
     #[test]
     fn a_tree_of_nothing_is_refused() {
-        assert!(matches!(
-            Octree::new(Voxels::new(3, vec![])),
-            Err(Error::Usage(_))
-        ));
+        assert!(matches!(Octree::new(Voxels::new(3, vec![])), Err(Error::Usage(_))));
     }
 
     #[test]

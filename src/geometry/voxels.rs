@@ -25,10 +25,7 @@ impl Voxels {
     /// # Panics
     /// If the last key lies outside the level, or (debug only) the keys are not strictly ascending.
     pub fn from_sorted(depth: u8, keys: Vec<u64>) -> Self {
-        assert!(
-            depth <= morton::MAX_DEPTH,
-            "octree level {depth} is deeper than 21"
-        );
+        assert!(depth <= morton::MAX_DEPTH, "octree level {depth} is deeper than 21");
         assert!(
             keys.last().is_none_or(|&last| last >> (3 * depth) == 0),
             "a key lies outside level {depth}"

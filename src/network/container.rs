@@ -120,12 +120,7 @@ impl Contents {
     }
 }
 
-fn malformed(
-    at: usize,
-    field: impl ToString,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
+fn malformed(at: usize, field: impl ToString, value: impl ToString, expected: impl ToString) -> Error {
     let at = format!("byte {at} of the model file");
     Error::malformed(Stage::Network, at, field, value, expected)
 }
@@ -236,16 +231,8 @@ mod tests {
         };
         let huge = u64::MAX;
         for (json, data, text) in [
-            (
-                one("U8", "[4]", "[0,4]"),
-                3,
-                "bytes of tensors is 3, expected 4",
-            ),
-            (
-                one("U8", "[4]", "[0,4]"),
-                5,
-                "bytes of tensors is 5, expected 4",
-            ),
+            (one("U8", "[4]", "[0,4]"), 3, "bytes of tensors is 3, expected 4"),
+            (one("U8", "[4]", "[0,4]"), 5, "bytes of tensors is 5, expected 4"),
             (
                 one("U8", "[4]", "[1,5]"),
                 5,
@@ -253,16 +240,8 @@ mod tests {
             ),
             (one("U16", "[4]", "[0,4]"), 4, "expected (0, 8)"),
             (one("U8", "[4]", "[4,0]"), 4, "expected (0, 4)"),
-            (
-                one("U8", "[4294967296,4294967296]", "[0,0]"),
-                0,
-                "memory can hold",
-            ),
-            (
-                one("U8", &format!("[{huge}]"), &format!("[0,{huge}]")),
-                0,
-                "tensor",
-            ),
+            (one("U8", "[4294967296,4294967296]", "[0,0]"), 0, "memory can hold"),
+            (one("U8", &format!("[{huge}]"), &format!("[0,{huge}]")), 0, "tensor"),
             (one("X9", "[]", "[0,1]"), 1, "X9"),
             (one("U8", "[-1]", "[0,1]"), 1, "header"),
             ("[]".into(), 0, "header"),

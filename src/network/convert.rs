@@ -22,18 +22,10 @@ impl Model {
     ///
     /// # Panics
     /// If there are not one to three coded levels, or lengths disagree.
-    pub fn features(
-        &self,
-        colours: &[[f32; 3]],
-        maps: &[&KernelMap],
-        occupancy: &[&[u8]],
-    ) -> Result<Vec<Vec<f16>>> {
+    pub fn features(&self, colours: &[[f32; 3]], maps: &[&KernelMap], occupancy: &[&[u8]]) -> Result<Vec<Vec<f16>>> {
         let encoder = self.encoder()?;
         let coded = maps.len() - 1;
-        assert!(
-            (1..=ROLES).contains(&coded),
-            "one to three levels are coded"
-        );
+        assert!((1..=ROLES).contains(&coded), "one to three levels are coded");
         assert_eq!(occupancy.len(), coded, "one link between every two levels");
         let centred: Vec<f32> = colours.as_flattened().iter().map(|c| c - 0.5).collect();
         let mut x = vec![f16::ZERO; centred.len()];
@@ -62,17 +54,8 @@ impl Model {
     ///
     /// # Panics
     /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.
-    pub fn squeeze(
-        &self,
-        role: usize,
-        features: &[f16],
-        context: Option<&[i16]>,
-    ) -> Result<Vec<f32>> {
-        assert_eq!(
-            role > 0,
-            context.is_some(),
-            "all roles but 0 have a context"
-        );
+    pub fn squeeze(&self, role: usize, features: &[f16], context: Option<&[i16]>) -> Result<Vec<f32>> {
+        assert_eq!(role > 0, context.is_some(), "all roles but 0 have a context");
         let (fs, c) = (&self.encoder()?.fs[role], self.shape.channels);
         let Some(fs) = fs else {
             return Ok(Vec::new());
@@ -132,11 +115,7 @@ fn pool(isa: Isa, x: &[f16], occupancy: &[u8], c: usize) -> Vec<f16> {
     for block in occupancy.chunks(BLOCK) {
         starts.push(starts[starts.len() - 1] + block.iter().map(children).sum::<usize>());
     }
-    assert_eq!(
-        x.len(),
-        starts[starts.len() - 1] * c,
-        "one feature per child"
-    );
+    assert_eq!(x.len(), starts[starts.len() - 1] * c, "one feature per child");
     let mut out = vec![f16::ZERO; occupancy.len() * c];
     let blocks = out
         .par_chunks_mut(BLOCK * c)
@@ -168,9 +147,7 @@ mod tests {
         // More parents than one task takes.
         let occupancy: Vec<u8> = (0..3000u32).map(|i| (i * 37 % 255) as u8 + 1).collect();
         let count: u32 = occupancy.iter().map(|mask| mask.count_ones()).sum();
-        let x: Vec<f16> = (0..2 * count)
-            .map(|i| f16::from_f32((i % 64) as f32))
-            .collect();
+        let x: Vec<f16> = (0..2 * count).map(|i| f16::from_f32((i % 64) as f32)).collect();
         let pooled = pool(Isa::detect(), &x, &occupancy, 2);
         let mut rows = x.chunks_exact(2);
         for (got, mask) in pooled.chunks_exact(2).zip(&occupancy) {

@@ -96,14 +96,7 @@ impl Conv for Double {
         self.rows(isa, taps, input, first, output, |value| value);
     }
 
-    fn run_f32(
-        &self,
-        isa: Isa,
-        taps: Taps<'_>,
-        input: &[f64],
-        first: usize,
-        output: Output<'_, f32, f64>,
-    ) {
+    fn run_f32(&self, isa: Isa, taps: Taps<'_>, input: &[f64], first: usize, output: Output<'_, f32, f64>) {
         self.rows(isa, taps, input, first, output, |value| value as f32);
     }
 }
@@ -117,13 +110,7 @@ impl Model {
     ///
     /// # Panics
     /// If `g` and `map` disagree in length.
-    pub fn generate_in_double(
-        &self,
-        heads: Heads,
-        role: usize,
-        g: &[i16],
-        map: &KernelMap,
-    ) -> Result<Vec<f32>> {
+    pub fn generate_in_double(&self, heads: Heads, role: usize, g: &[i16], map: &KernelMap) -> Result<Vec<f32>> {
         let generator = self.generator(role, heads)?;
         self.check(g, self.shape.channels, map);
         let step = f64::from(self.g_scale[role]);

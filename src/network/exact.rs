@@ -23,13 +23,7 @@ impl Model {
         self.upsample_in(&mut Pool::new(), role, g, occupancy)
     }
 
-    pub(crate) fn upsample_in(
-        &self,
-        pool: &mut Pool<i16>,
-        role: usize,
-        g: &[i16],
-        occupancy: &[u8],
-    ) -> Vec<i16> {
+    pub(crate) fn upsample_in(&self, pool: &mut Pool<i16>, role: usize, g: &[i16], occupancy: &[u8]) -> Vec<i16> {
         assert!(role == 1 || role == 2, "role {role} has no context");
         let c = self.shape.channels;
         assert_eq!(g.len(), occupancy.len() * c, "one feature per parent");
@@ -68,12 +62,7 @@ impl Model {
     ///
     /// # Panics
     /// If `role` is not 1 or 2 or has no latents, or `context` and `map` disagree in length.
-    pub fn entropy_parameters(
-        &self,
-        role: usize,
-        context: &[i16],
-        map: &KernelMap,
-    ) -> (Vec<i16>, Vec<u8>) {
+    pub fn entropy_parameters(&self, role: usize, context: &[i16], map: &KernelMap) -> (Vec<i16>, Vec<u8>) {
         self.entropy_parameters_in(&mut Pool::new(), role, context, map)
     }
 
@@ -105,13 +94,7 @@ impl Model {
     ///
     /// # Panics
     /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.
-    pub fn reconstruct(
-        &self,
-        role: usize,
-        latents: &[i16],
-        context: Option<&[i16]>,
-        map: &KernelMap,
-    ) -> Vec<i16> {
+    pub fn reconstruct(&self, role: usize, latents: &[i16], context: Option<&[i16]>, map: &KernelMap) -> Vec<i16> {
         let context = context.map(<[i16]>::to_vec);
         self.reconstruct_in(&mut Pool::new(), role, latents, context, map)
     }
@@ -124,11 +107,7 @@ impl Model {
         context: Option<Vec<i16>>,
         map: &KernelMap,
     ) -> Vec<i16> {
-        assert_eq!(
-            role > 0,
-            context.is_some(),
-            "all roles but 0 have a context"
-        );
+        assert_eq!(role > 0, context.is_some(), "all roles but 0 have a context");
         let (c, k) = (self.shape.channels, self.shape.latents_of(role));
         self.check(latents, k, map);
         if let Some(context) = &context {
@@ -161,13 +140,7 @@ impl Model {
         features
     }
 
-    fn blocks(
-        &self,
-        pool: &mut Pool<i16>,
-        blocks: &[Inception<ExactConv>],
-        x: Vec<i16>,
-        map: &KernelMap,
-    ) -> Vec<i16> {
+    fn blocks(&self, pool: &mut Pool<i16>, blocks: &[Inception<ExactConv>], x: Vec<i16>, map: &KernelMap) -> Vec<i16> {
         blocks
             .iter()
             .fold(x, |x, block| block.apply(pool, self.isa, map.taps(), x))
@@ -182,10 +155,7 @@ impl Model {
 
 /// For every child the index of its parent and its octant, children ascending.
 fn children(occupancy: &[u8]) -> (Vec<u32>, Vec<u8>) {
-    let count = occupancy
-        .iter()
-        .map(|mask| mask.count_ones() as usize)
-        .sum();
+    let count = occupancy.iter().map(|mask| mask.count_ones() as usize).sum();
     let (mut parents, mut octants) = (Vec::with_capacity(count), Vec::with_capacity(count));
     for (parent, mask) in (0..).zip(occupancy) {
         for octant in (0..8).filter(|octant| mask >> octant & 1 == 1) {

@@ -101,8 +101,7 @@ impl Generator {
     /// The same of layers that take reals, made by `make`.
     pub fn of_layers<L>(&self, make: impl Fn(&Stored) -> L) -> Generate<L> {
         let any = vec![1.0; self.stored.head.scales()];
-        self.stored
-            .with_scales(1.0, &any, |layer, _, _| make(layer))
+        self.stored.with_scales(1.0, &any, |layer, _, _| make(layer))
     }
 
     fn float(&self) -> &Generate<FloatConv> {
@@ -142,13 +141,7 @@ impl Model {
     ///
     /// # Panics
     /// If `g` and `map` disagree in length.
-    pub fn generate_with(
-        &self,
-        heads: Heads,
-        role: usize,
-        g: &[i16],
-        map: &KernelMap,
-    ) -> Result<Vec<f32>> {
+    pub fn generate_with(&self, heads: Heads, role: usize, g: &[i16], map: &KernelMap) -> Result<Vec<f32>> {
         self.generate_in(&mut Pool::new(), heads, role, g, map)
     }
 
@@ -166,9 +159,7 @@ impl Model {
         pool.keep(3);
         self.check(g, self.shape.channels, map);
         match (&generator.scales, self.precision) {
-            (Some(scales), Precision::Int16) => {
-                Ok(self.run_generator(pool, generator.integer(scales), g, map, PART))
-            }
+            (Some(scales), Precision::Int16) => Ok(self.run_generator(pool, generator.integer(scales), g, map, PART)),
             (_, precision) => {
                 let g = reals(self.isa, g, self.g_scale[role]);
                 let layers = match precision {
@@ -269,15 +260,7 @@ impl Model {
                 to.copy_from_slice(&x[voxel as usize * h..][..h]);
             });
             let map = map.generated_children();
-            let mut y = apply(
-                pool,
-                isa,
-                &gg.layer4,
-                Taps::Children,
-                &parents,
-                rows(0),
-                false,
-            );
+            let mut y = apply(pool, isa, &gg.layer4, Taps::Children, &parents, rows(0), false);
             pool.give(parents);
             for (block, done) in gg.after.iter().zip((0..).step_by(2)) {
                 let rows = [rows(done + 1), rows(done + 2)];
@@ -327,13 +310,11 @@ mod tests {
             let integer = generator.integer(generator.scales.as_ref().unwrap());
             let whole = model.run_generator(&mut Pool::new(), integer, &g, map, map.len());
             let real = reals(model.isa, &g, model.g_scale[1]);
-            let whole_real =
-                model.run_generator(&mut Pool::new(), generator.float(), &real, map, map.len());
+            let whole_real = model.run_generator(&mut Pool::new(), generator.float(), &real, map, map.len());
             for part in [1, 37, 1000] {
                 let parts = model.run_generator(&mut Pool::new(), integer, &g, map, part);
                 assert!(parts == whole, "{blocks_after} blocks, {part} voxels");
-                let parts =
-                    model.run_generator(&mut Pool::new(), generator.float(), &real, map, part);
+                let parts = model.run_generator(&mut Pool::new(), generator.float(), &real, map, part);
                 assert!(parts == whole_real, "{blocks_after} blocks, {part} voxels");
             }
         }

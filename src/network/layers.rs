@@ -14,14 +14,7 @@ pub(crate) trait Conv: Sync {
     type Value: Zeros + Send + Sync;
 
     fn cout(&self) -> usize;
-    fn run(
-        &self,
-        isa: Isa,
-        taps: Taps<'_>,
-        input: &[Self::Value],
-        first: usize,
-        output: Output<'_, Self::Value>,
-    );
+    fn run(&self, isa: Isa, taps: Taps<'_>, input: &[Self::Value], first: usize, output: Output<'_, Self::Value>);
     /// As `run`, without rounding.
     fn run_f32(
         &self,
@@ -44,14 +37,7 @@ impl Conv for ExactConv {
         self.run(isa, taps, input, first, output);
     }
 
-    fn run_f32(
-        &self,
-        isa: Isa,
-        taps: Taps<'_>,
-        input: &[i16],
-        first: usize,
-        output: Output<'_, f32, i16>,
-    ) {
+    fn run_f32(&self, isa: Isa, taps: Taps<'_>, input: &[i16], first: usize, output: Output<'_, f32, i16>) {
         self.run_f32(isa, taps, input, first, output);
     }
 }
@@ -67,14 +53,7 @@ impl Conv for FloatConv {
         self.run(isa, taps, input, first, output);
     }
 
-    fn run_f32(
-        &self,
-        isa: Isa,
-        taps: Taps<'_>,
-        input: &[f16],
-        first: usize,
-        output: Output<'_, f32, f16>,
-    ) {
+    fn run_f32(&self, isa: Isa, taps: Taps<'_>, input: &[f16], first: usize, output: Output<'_, f32, f16>) {
         self.run(isa, taps, input, first, output);
     }
 }
@@ -112,8 +91,7 @@ impl<T: Zeros> Pool<T> {
 
     /// Gives all but some of the memory back to the system.
     pub fn keep(&mut self, buffers: usize) {
-        self.0
-            .sort_by_key(|buffer| std::cmp::Reverse(buffer.capacity()));
+        self.0.sort_by_key(|buffer| std::cmp::Reverse(buffer.capacity()));
         self.0.truncate(buffers);
     }
 
@@ -141,9 +119,7 @@ pub(crate) fn apply<C: Conv>(
         residual: None,
         relu,
     };
-    spread(output, |first, output| {
-        conv.run(isa, taps, input, first, output)
-    });
+    spread(output, |first, output| conv.run(isa, taps, input, first, output));
     out
 }
 
@@ -164,9 +140,7 @@ pub(crate) fn apply_added<C: Conv>(
         residual: Some(added),
         relu: true,
     };
-    spread(output, |first, output| {
-        conv.run(isa, taps, input, first, output)
-    });
+    spread(output, |first, output| conv.run(isa, taps, input, first, output));
     out
 }
 
@@ -193,21 +167,12 @@ pub(crate) fn apply_part<C: Conv>(
 }
 
 /// Output rows of a layer that ends in f32, as many as there is room for.
-pub(super) fn apply_f32<C: Conv>(
-    isa: Isa,
-    conv: &C,
-    taps: Taps<'_>,
-    input: &[C::Value],
-    out: &mut [f32],
-) {
+pub(super) fn apply_f32<C: Conv>(isa: Isa, conv: &C, taps: Taps<'_>, input: &[C::Value], out: &mut [f32]) {
     apply_part(isa, conv, taps, input, 0, out);
 }
 
 /// Calls `run(first row, part)` for parts of the output, in parallel.
-fn spread<T: Send, R: Sync>(
-    output: Output<'_, T, R>,
-    run: impl Fn(usize, Output<'_, T, R>) + Sync,
-) {
+fn spread<T: Send, R: Sync>(output: Output<'_, T, R>, run: impl Fn(usize, Output<'_, T, R>) + Sync) {
     let Output {
         rows,
         stride,
@@ -215,32 +180,24 @@ fn spread<T: Send, R: Sync>(
         residual,
         relu,
     } = output;
-    rows.par_chunks_mut(BLOCK * stride)
-        .enumerate()
-        .for_each(|(i, rows)| {
-            let residual = residual.map(|all| &all[i * BLOCK * stride..][..rows.len()]);
-            run(
-                i * BLOCK,
-                Output {
-                    rows,
-                    stride,
-                    column,
-                    residual,
-                    relu,
-                },
-            );
-        });
+    rows.par_chunks_mut(BLOCK * stride).enumerate().for_each(|(i, rows)| {
+        let residual = residual.map(|all| &all[i * BLOCK * stride..][..rows.len()]);
+        run(
+            i * BLOCK,
+            Output {
+                rows,
+                stride,
+                column,
+                residual,
+                relu,
+            },
+        );
+    });
 }
 
 impl<C: Conv> Inception<C> {
     /// `relu?(concat[a2(relu(a1(x))), b3(relu(b2(relu(b1(x)))))] + x)`, activations of both branches in ReLU.
-    pub fn apply(
-        &self,
-        pool: &mut Pool<C::Value>,
-        isa: Isa,
-        map: Taps<'_>,
-        x: Vec<C::Value>,
-    ) -> Vec<C::Value> {
+    pub fn apply(&self, pool: &mut Pool<C::Value>, isa: Isa, map: Taps<'_>, x: Vec<C::Value>) -> Vec<C::Value> {
         let (left, right) = (self.a2.cout(), self.b3.cout());
         let stride = left + right;
         let rows = x.len() / stride;
@@ -253,9 +210,7 @@ impl<C: Conv> Inception<C> {
                 residual: Some(&x[..]),
                 relu: self.relu,
             };
-            spread(output, |first, output| {
-                conv.run(isa, taps, input, first, output)
-            });
+            spread(output, |first, output| conv.run(isa, taps, input, first, output));
         };
         let a = apply(pool, isa, &self.a1, map, &x, rows, true);
         branch(&self.a2, map, &a, 0);
@@ -272,13 +227,7 @@ impl<C: Conv> Inception<C> {
 
 impl<C: Conv> ResBlock<C> {
     /// `relu?(c2(relu(c1(x))) + x)`.
-    pub fn apply(
-        &self,
-        pool: &mut Pool<C::Value>,
-        isa: Isa,
-        map: Taps<'_>,
-        x: Vec<C::Value>,
-    ) -> Vec<C::Value> {
+    pub fn apply(&self, pool: &mut Pool<C::Value>, isa: Isa, map: Taps<'_>, x: Vec<C::Value>) -> Vec<C::Value> {
         let rows = x.len() / self.c2.cout();
         self.apply_to_some(pool, isa, map, x, [rows, rows])
     }
@@ -304,9 +253,7 @@ impl<C: Conv> ResBlock<C> {
             residual: None,
             relu: true,
         };
-        spread(output, |first, output| {
-            self.c1.run(isa, map, &x, first, output)
-        });
+        spread(output, |first, output| self.c1.run(isa, map, &x, first, output));
         let mut out = pool.take(rows[1] * stride);
         let output = Output {
             rows: &mut out[..],
@@ -315,9 +262,7 @@ impl<C: Conv> ResBlock<C> {
             residual: Some(&x[..rows[1] * stride]),
             relu: self.relu,
         };
-        spread(output, |first, output| {
-            self.c2.run(isa, map, &inner, first, output)
-        });
+        spread(output, |first, output| self.c2.run(isa, map, &inner, first, output));
         pool.give(inner);
         pool.give(x);
         out
@@ -349,11 +294,9 @@ pub(super) fn concat<T: Zeros + Send + Sync>(
 pub(crate) fn reals(isa: Isa, q: &[i16], scale: f32) -> Vec<f16> {
     const CHUNK: usize = 4096;
     let mut out = f16::zeros(q.len());
-    out.par_chunks_mut(CHUNK)
-        .zip(q.par_chunks(CHUNK))
-        .for_each(|(out, q)| {
-            let real: Vec<f32> = q.iter().map(|&q| f32::from(q) * scale).collect();
-            to_f16(isa, &real, out);
-        });
+    out.par_chunks_mut(CHUNK).zip(q.par_chunks(CHUNK)).for_each(|(out, q)| {
+        let real: Vec<f32> = q.iter().map(|&q| f32::from(q) * scale).collect();
+        to_f16(isa, &real, out);
+    });
     out
 }

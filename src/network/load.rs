@@ -61,15 +61,10 @@ impl<'a> Tensors<'a> {
     /// # Errors
     /// [`Error::Malformed`] if there is none, or as [`Shape::from_json`].
     pub fn shape(&self) -> Result<Shape> {
-        let json = self.contents.metadata.get("b2p").ok_or_else(|| {
-            Error::malformed(
-                Stage::Network,
-                "metadata",
-                "b2p",
-                "missing",
-                "the model's description",
-            )
-        })?;
+        let json =
+            self.contents.metadata.get("b2p").ok_or_else(|| {
+                Error::malformed(Stage::Network, "metadata", "b2p", "missing", "the model's description")
+            })?;
         Shape::from_json(json)
     }
 
@@ -94,9 +89,7 @@ impl<'a> Tensors<'a> {
             one => price(one).map(|price| vec![vec![price; latents]; ROLES]),
         };
         prices.and_then(|p| p.try_into().ok()).ok_or_else(|| {
-            let expected = format!(
-                "a number from 0 to 100, or {latents} such numbers for each of {ROLES} roles"
-            );
+            let expected = format!("a number from 0 to 100, or {latents} such numbers for each of {ROLES} roles");
             let (field, said) = ("bit_price", said.to_string());
             Error::malformed(Stage::Network, "metadata", field, said, expected)
         })
@@ -117,12 +110,7 @@ impl<'a> Tensors<'a> {
         let found = self.contents.tensors.get(name);
         let found = found.map_or(&[][..], |info| &info.shape);
         if found != shape {
-            return Err(malformed(
-                name,
-                "shape",
-                format!("{found:?}"),
-                format!("{shape:?}"),
-            ));
+            return Err(malformed(name, "shape", format!("{found:?}"), format!("{shape:?}")));
         }
         Ok(entries.map(T::read).collect())
     }
@@ -194,12 +182,7 @@ impl<'a> Tensors<'a> {
             let bias = self.get(&format!("{name}.bias"), &[cout])?;
             let shift: Vec<u8> = self.get(&format!("{name}.shift"), &[cout])?;
             if let Some(shift) = shift.iter().find(|&&shift| shift > MAX_SHIFT) {
-                return Err(malformed(
-                    &format!("{name}.shift"),
-                    "shift",
-                    shift,
-                    "at most 30",
-                ));
+                return Err(malformed(&format!("{name}.shift"), "shift", shift, "at most 30"));
             }
             Requantise::Shift { bias, shift }
         };
@@ -277,19 +260,8 @@ impl<'a> Tensors<'a> {
 }
 
 /// An error that names a tensor.
-pub(crate) fn malformed(
-    name: &str,
-    field: &str,
-    value: impl ToString,
-    expected: impl ToString,
-) -> Error {
-    Error::malformed(
-        Stage::Network,
-        format!("tensor {name}"),
-        field,
-        value,
-        expected,
-    )
+pub(crate) fn malformed(name: &str, field: &str, value: impl ToString, expected: impl ToString) -> Error {
+    Error::malformed(Stage::Network, format!("tensor {name}"), field, value, expected)
 }
 
 /// A price of each of so many channels.

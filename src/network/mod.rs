@@ -102,9 +102,7 @@ pub struct Model {
 
 impl std::fmt::Debug for Model {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Model")
-            .field("id", &self.id)
-            .finish_non_exhaustive()
+        f.debug_struct("Model").field("id", &self.id).finish_non_exhaustive()
     }
 }
 
@@ -132,10 +130,7 @@ impl Model {
         let tables = tables(&tensors, &shape)?;
         let mut float = |spec: Spec| {
             let precision = convert::precision(&spec);
-            Ok(tensors
-                .stored_layer(spec)?
-                .float()
-                .with_precision(precision))
+            Ok(tensors.stored_layer(spec)?.float().with_precision(precision))
         };
         let encoder = match tensors.any("fc.") || tensors.any("fs.") {
             true => Some(shape.encoder(&mut float)?),
@@ -145,11 +140,7 @@ impl Model {
         let generators = generators(&tensors, &shape, &g_scale)?;
         let integers = generators.iter().all(Generator::has_integers);
         Ok(Model {
-            precision: if integers {
-                Precision::Int16
-            } else {
-                Precision::F16
-            },
+            precision: if integers { Precision::Int16 } else { Precision::F16 },
             generators,
             exact: shape.exact(&mut |spec| tensors.exact_layer(spec))?,
             encoder,
@@ -249,12 +240,7 @@ fn tables(tensors: &Tensors, shape: &Shape) -> Result<Tables> {
     .with_learning(shape.learning);
     match tables.channels() == shape.latents {
         true => Ok(tables),
-        false => Err(malformed(
-            "cdf.prior.low",
-            "rows",
-            tables.channels(),
-            shape.latents,
-        )),
+        false => Err(malformed("cdf.prior.low", "rows", tables.channels(), shape.latents)),
     }
 }
 

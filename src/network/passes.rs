@@ -94,34 +94,20 @@ impl Model {
     ///
     /// # Panics
     /// If the role has no passes, `level` is there for the base level or not for another, voxels are of several octants, or lengths disagree.
-    pub fn pass_parameters(
-        &self,
-        role: usize,
-        pass: &Pass,
-        level: Option<(&[i16], &[u8])>,
-    ) -> Parameters {
+    pub fn pass_parameters(&self, role: usize, pass: &Pass, level: Option<(&[i16], &[u8])>) -> Parameters {
         let k = self.shape.latents;
         let network = self.neighbours(role);
         let network = network.expect("the caller asks has_passes first");
         assert_eq!(pass.map.volume(), 27, "neighbours come from a 3³ map");
         assert_eq!(pass.octants.len(), pass.map.len(), "one octant per voxel");
-        assert_eq!(
-            pass.latents.len(),
-            pass.slice.len() * k,
-            "K latents per voxel"
-        );
+        assert_eq!(pass.latents.len(), pass.slice.len() * k, "K latents per voxel");
         assert_eq!(role > 0, level.is_some(), "all roles but 0 have parameters");
         let mut octants = pass.voxels.iter().map(|&v| pass.octants[v as usize]);
         let octant = octants.next();
-        assert!(
-            octants.all(|o| Some(o) == octant),
-            "a pass is of one octant"
-        );
+        assert!(octants.all(|o| Some(o) == octant), "a pass is of one octant");
         let mut mu = vec![0; pass.voxels.len() * k];
         let mut sigma = vec![UNPREDICTED; pass.voxels.len() * k];
-        let outputs = mu
-            .par_chunks_mut(BLOCK * k)
-            .zip(sigma.par_chunks_mut(BLOCK * k));
+        let outputs = mu.par_chunks_mut(BLOCK * k).zip(sigma.par_chunks_mut(BLOCK * k));
         outputs
             .zip(pass.voxels.par_chunks(BLOCK))
             .for_each(|((mu, sigma), voxels)| match level {
@@ -139,14 +125,7 @@ impl Model {
         }
     }
 
-    fn base(
-        &self,
-        network: &Neighbours<ExactConv>,
-        pass: &Pass,
-        voxels: &[u32],
-        mu: &mut [i16],
-        sigma: &mut [u8],
-    ) {
+    fn base(&self, network: &Neighbours<ExactConv>, pass: &Pass, voxels: &[u32], mu: &mut [i16], sigma: &mut [u8]) {
         let (k, shift) = (self.shape.latents, self.shape.latent_shift);
         let width = base_inputs(k);
         let mut inputs = vec![0; voxels.len() * width];
@@ -225,20 +204,12 @@ impl Model {
     }
 
     /// What a network says of `n` voxels: means and scale indices, not yet in their range.
-    fn predict(
-        &self,
-        network: &Neighbours<ExactConv>,
-        inputs: &[i16],
-        n: usize,
-    ) -> (Vec<i16>, Vec<i16>) {
+    fn predict(&self, network: &Neighbours<ExactConv>, inputs: &[i16], n: usize) -> (Vec<i16>, Vec<i16>) {
         let pool = &mut Pool::new();
         let mut layer = |conv, x: &[i16], relu| apply(pool, self.isa, conv, Taps::Same, x, n, relu);
         let x = layer(&network.lin1, inputs, true);
         let x = layer(&network.lin2, &x, true);
-        (
-            layer(&network.mu, &x, false),
-            layer(&network.sigma, &x, false),
-        )
+        (layer(&network.mu, &x, false), layer(&network.sigma, &x, false))
     }
 }
 
@@ -277,13 +248,7 @@ impl Gather {
 
     /// Fills what is known of a voxel's neighbours at the start of `input`, and its octant at the end; whether any neighbour is known.
     /// `add` adds the values of a voxel.
-    fn fill(
-        &mut self,
-        pass: &Pass,
-        voxel: usize,
-        add: impl Fn(usize, &mut [i32]),
-        input: &mut [i16],
-    ) -> bool {
+    fn fill(&mut self, pass: &Pass, voxel: usize, add: impl Fn(usize, &mut [i32]), input: &mut [i16]) -> bool {
         let k = self.channels;
         let row = pass.map.row(voxel);
         self.counts.fill(0);

@@ -11,9 +11,7 @@ use b2p_kernels::f16;
 use super::heads::Heads;
 use super::load::{Element, Tensors};
 use super::shape::Upsample;
-use super::structure::{
-    Convert, Encoder, Entropy, Exact, Generate, Inception, Reconstruct, ResBlock, Spec, Squeeze,
-};
+use super::structure::{Convert, Encoder, Entropy, Exact, Generate, Inception, Reconstruct, ResBlock, Spec, Squeeze};
 use super::{ROLES, Shape};
 
 /// One row of channels per voxel.
@@ -33,8 +31,7 @@ impl Sites {
 
     /// All eight children of every voxel.
     pub fn children(&self) -> Sites {
-        let child =
-            |v: &[i32; 3], o: i32| [2 * v[0] + o % 2, 2 * v[1] + o / 2 % 2, 2 * v[2] + o / 4];
+        let child = |v: &[i32; 3], o: i32| [2 * v[0] + o % 2, 2 * v[1] + o / 2 % 2, 2 * v[2] + o / 4];
         Sites::new(
             self.voxels
                 .iter()
@@ -63,9 +60,7 @@ impl Reach {
             Reach::Here => Some(v),
             Reach::Around => Some([v[0] + k % 3 - 1, v[1] + k / 3 % 3 - 1, v[2] + k / 9 - 1]),
             Reach::Ahead => Some([v[0] + k % 2, v[1] + k / 2 % 2, v[2] + k / 4]),
-            Reach::Up => {
-                (v[0] % 2 + 2 * (v[1] % 2) + 4 * (v[2] % 2) == k).then(|| v.map(|c| c / 2))
-            }
+            Reach::Up => (v[0] % 2 + 2 * (v[1] % 2) + 4 * (v[2] % 2) == k).then(|| v.map(|c| c / 2)),
         }
     }
 }
@@ -103,9 +98,7 @@ impl Layer {
             }
             // Sums of integers are exact in f64 up to 2^53.
             Finish::Shifted { bias, shift } => match mode {
-                Mode::Whole => {
-                    ((sum as i64 + i64::from(bias[o])) >> shift[o]).clamp(-2047, 2047) as f64
-                }
+                Mode::Whole => ((sum as i64 + i64::from(bias[o])) >> shift[o]).clamp(-2047, 2047) as f64,
                 Mode::Real => {
                     let half = if shift[o] > 0 {
                         f64::from(1 << (shift[o] - 1))
@@ -121,9 +114,7 @@ impl Layer {
                     let value = sum as f32 * scale + bias[o];
                     f64::from(value.round_ties_even().clamp(-2047.0, 2047.0))
                 }
-                Mode::Real => {
-                    sum * f64::from(gain[o]) / energy.max(1.0).sqrt() + f64::from(bias[o])
-                }
+                Mode::Real => sum * f64::from(gain[o]) / energy.max(1.0).sqrt() + f64::from(bias[o]),
             },
         }
     }
@@ -132,9 +123,7 @@ impl Layer {
     fn bound(&self, (mode, limit): (Mode, f64), value: f64) -> f64 {
         match (&self.finish, mode) {
             (Finish::Plain { .. } | Finish::Invariant { .. }, _) => value.clamp(-limit, limit),
-            (Finish::Shifted { .. } | Finish::Scaled { .. }, Mode::Whole) => {
-                value.clamp(-2047.0, 2047.0)
-            }
+            (Finish::Shifted { .. } | Finish::Scaled { .. }, Mode::Whole) => value.clamp(-2047.0, 2047.0),
             (_, Mode::Real) => value,
         }
     }
@@ -186,11 +175,7 @@ impl Oracle {
                     shift: all(&tensors, &list("shift")),
                 },
             };
-            Ok(Layer {
-                spec,
-                weights,
-                finish,
-            })
+            Ok(Layer { spec, weights, finish })
         };
         let exact = shape.exact(&mut integers).unwrap();
         let mut reals = |spec: Spec| {
@@ -207,11 +192,7 @@ impl Oracle {
                 },
                 false => Finish::Plain { bias },
             };
-            Ok(Layer {
-                spec,
-                weights,
-                finish,
-            })
+            Ok(Layer { spec, weights, finish })
         };
         Oracle {
             exact,
@@ -231,9 +212,7 @@ impl Oracle {
     }
 
     fn layer(&self, layer: &Layer, reach: Reach, from: &Sites, to: &Sites, x: &Rows) -> Rows {
-        let Spec {
-            volume, cin, cout, ..
-        } = layer.spec;
+        let Spec { volume, cin, cout, .. } = layer.spec;
         let row = |v: &[i32; 3]| {
             let sources: Vec<(usize, &Vec<f64>)> = (0..volume)
                 .filter_map(|k| Some((k, &x[*from.index.get(&reach.of(k as i32, *v)?)?])))
@@ -295,9 +274,7 @@ impl Oracle {
 
     pub fn upsample(&self, role: usize, parents: &Sites, children: &Sites, g: &Rows) -> Rows {
         match (self.shape.upsample, &self.exact.up) {
-            (Upsample::Learned, Some(up)) => {
-                self.layer(&up[role - 1], Reach::Up, parents, children, g)
-            }
+            (Upsample::Learned, Some(up)) => self.layer(&up[role - 1], Reach::Up, parents, children, g),
             _ => children
                 .voxels
                 .iter()
@@ -317,10 +294,7 @@ impl Oracle {
         let x = relu(self.around(conv_in, at, c));
         let x = self.inceptions(blocks, at, x);
         let mut sigma = self.here(sigma, at, &x);
-        sigma
-            .iter_mut()
-            .flatten()
-            .for_each(|s| *s = s.clamp(0.0, 63.0));
+        sigma.iter_mut().flatten().for_each(|s| *s = s.clamp(0.0, 63.0));
         (self.here(mu, at, &x), sigma)
     }
 
@@ -331,11 +305,7 @@ impl Oracle {
         let unit = f64::from(1 << self.shape.latent_shift);
         let y: Rows = latents
             .iter()
-            .map(|y| {
-                y.iter()
-                    .map(|y| (y * unit).clamp(-2047.0, 2047.0))
-                    .collect()
-            })
+            .map(|y| y.iter().map(|y| (y * unit).clamp(-2047.0, 2047.0)).collect())
             .collect();
         let x = c.map_or_else(|| y.clone(), |c| concat(&y, c));
         let x = relu(self.here(lin1, at, &x));
@@ -357,10 +327,7 @@ impl Oracle {
             .find(|gg| (gg.head.role, gg.head.heads) == (role, heads))
             .unwrap();
         let scale = f64::from(self.g_scale[role]);
-        let g: Rows = g
-            .iter()
-            .map(|g| g.iter().map(|q| q * scale).collect())
-            .collect();
+        let g: Rows = g.iter().map(|g| g.iter().map(|q| q * scale).collect()).collect();
         let x = relu(self.around(conv_in, at, &g));
         let x = self.res_blocks(before, at, x);
         if head.children == 8 {
@@ -375,10 +342,7 @@ impl Oracle {
 
     /// The features of the coded levels, finest first; `levels[0]` is the one that has colours.
     pub fn features(&self, levels: &[&Sites], colours: &Rows) -> Vec<Rows> {
-        let centred: Rows = colours
-            .iter()
-            .map(|c| c.iter().map(|c| c - 0.5).collect())
-            .collect();
+        let centred: Rows = colours.iter().map(|c| c.iter().map(|c| c - 0.5).collect()).collect();
         let mut x = self.convert(&self.encoder.fc[ROLES], levels[0], &centred);
         let mut out = Vec::new();
         for i in 1..levels.len() {
@@ -400,12 +364,7 @@ impl Oracle {
         let scale = f64::from(self.c_scale[role]);
         let x = match c {
             None => f.clone(),
-            Some(c) => concat(
-                f,
-                &c.iter()
-                    .map(|c| c.iter().map(|q| q * scale).collect())
-                    .collect(),
-            ),
+            Some(c) => concat(f, &c.iter().map(|c| c.iter().map(|q| q * scale).collect()).collect()),
         };
         self.here(lin2, at, &relu(self.here(lin1, at, &x)))
     }

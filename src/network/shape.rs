@@ -153,15 +153,8 @@ impl Shape {
     /// # Errors
     /// [`Error::Malformed`] if a field is missing or out of range, [`Error::Unsupported`] for another format.
     pub fn from_json(json: &str) -> Result<Self> {
-        let shape: Shape = serde_json::from_str(json).map_err(|error| {
-            Error::malformed(
-                Stage::Network,
-                "metadata",
-                "b2p",
-                error,
-                "a model's description",
-            )
-        })?;
+        let shape: Shape = serde_json::from_str(json)
+            .map_err(|error| Error::malformed(Stage::Network, "metadata", "b2p", error, "a model's description"))?;
         if shape.format != 1 {
             return Err(Error::Unsupported {
                 what: "the model file's format",
@@ -179,11 +172,7 @@ impl Shape {
 
     /// Latents per voxel of a role: K, or 0 if it has none.
     pub fn latents_of(&self, role: usize) -> usize {
-        if role < self.latent_roles {
-            self.latents
-        } else {
-            0
-        }
+        if role < self.latent_roles { self.latents } else { 0 }
     }
 
     /// The head of a role.
@@ -278,19 +267,9 @@ impl Shape {
         ] {
             require(blocks <= MAX_BLOCKS, field, &blocks, "at most 16")?;
         }
-        require(
-            self.latent_max > 0,
-            "latent_max",
-            &self.latent_max,
-            "at least 1",
-        )?;
+        require(self.latent_max > 0, "latent_max", &self.latent_max, "at least 1")?;
         let reach = i64::from(self.latent_max) << self.latent_shift.min(16);
-        require(
-            reach <= 2047,
-            "latent_max << latent_shift",
-            &reach,
-            "at most 2047",
-        )?;
+        require(reach <= 2047, "latent_max << latent_shift", &reach, "at most 2047")?;
         let ranges = [
             ("offset_range", self.offset_range, 0.0, 64.0, "0 to 64"),
             ("scale_range", self.scale_range, 1e-3, 64.0, "0.001 to 64"),
@@ -333,19 +312,9 @@ impl Shape {
                 "a multiple of 4 up to 256",
             )?;
             let blocks = head.blocks_before.max(head.blocks_after);
-            require(
-                blocks <= MAX_BLOCKS,
-                &field("blocks"),
-                &blocks,
-                "at most 16",
-            )?;
+            require(blocks <= MAX_BLOCKS, &field("blocks"), &blocks, "at most 16")?;
         }
-        let of = |heads| {
-            self.gg
-                .iter()
-                .filter(move |head| head.heads == heads)
-                .count()
-        };
+        let of = |heads| self.gg.iter().filter(move |head| head.heads == heads).count();
         let quick = of(Heads::Quick);
         require(
             quick == 0 || quick == of(Heads::Best),
@@ -372,10 +341,7 @@ mod tests {
 
     #[test]
     fn a_shape_survives_its_own_text() {
-        assert_eq!(
-            Shape::from_json(&Shape::tiny().to_json()).unwrap(),
-            Shape::tiny()
-        );
+        assert_eq!(Shape::from_json(&Shape::tiny().to_json()).unwrap(), Shape::tiny());
     }
 
     #[test]
@@ -459,14 +425,8 @@ mod tests {
             let key = field.rsplit('/').find(|part| part.parse::<u8>().is_err());
             let name = key.unwrap().split('_').next().unwrap();
             let error = altered(field, value).unwrap_err();
-            assert!(
-                matches!(error, Error::Malformed { .. }),
-                "{field} = {value}: {error}"
-            );
-            assert!(
-                error.to_string().contains(name),
-                "{field} = {value}: {error}"
-            );
+            assert!(matches!(error, Error::Malformed { .. }), "{field} = {value}: {error}");
+            assert!(error.to_string().contains(name), "{field} = {value}: {error}");
         }
         for (field, value) in [
             ("/channels", "-8"),
@@ -484,9 +444,6 @@ mod tests {
 
     #[test]
     fn another_format_is_not_supported() {
-        assert!(matches!(
-            altered("/format", "2"),
-            Err(Error::Unsupported { .. })
-        ));
+        assert!(matches!(altered("/format", "2"), Err(Error::Unsupported { .. })));
     }
 }

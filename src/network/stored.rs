@@ -26,9 +26,7 @@ const SMALL_SUM_LIMIT: u64 = 1 << 28;
 impl Stored {
     /// The layer in floats.
     pub fn float(&self) -> FloatConv {
-        let Spec {
-            volume, cin, cout, ..
-        } = self.spec;
+        let Spec { volume, cin, cout, .. } = self.spec;
         let scale = match &self.gain {
             Some(gain) => Scale::Invariant(gain.clone()),
             None => Scale::Plain,
@@ -39,9 +37,7 @@ impl Stored {
     /// The layer in integers: its input is in steps of `from`, its output in steps of `to`. A channel's largest weight becomes 2047,
     /// or seven eighths of that and so on until no sum can be too large.
     pub fn integer(&self, from: f32, to: f32) -> ExactConv {
-        let Spec {
-            volume, cin, cout, ..
-        } = self.spec;
+        let Spec { volume, cin, cout, .. } = self.spec;
         let real: Vec<f64> = self.weights.iter().map(|w| w.to_f64()).collect();
         let (mut peaks, mut totals) = (vec![0.0f64; cout], vec![0.0; cout]);
         for row in real.chunks_exact(cout) {
@@ -51,11 +47,7 @@ impl Stored {
             }
         }
         let scale = |top: u64, peak: f64| if peak > 0.0 { top as f64 / peak } else { 0.0 };
-        let limit = if volume == 27 {
-            SMALL_SUM_LIMIT
-        } else {
-            SUM_LIMIT
-        };
+        let limit = if volume == 27 { SMALL_SUM_LIMIT } else { SUM_LIMIT };
         // Rounding takes half a step off a weight at most, so that most tops are known to be too large.
         let lowered = |mut top: u64, o: usize| {
             let least = |top| totals[o] * scale(top, peaks[o]) - (volume * cin) as f64 / 2.0;
@@ -80,9 +72,8 @@ impl Stored {
                     *squares += q * q;
                 }
             }
-            let overflows = |[sum, squares]: [u64; 2]| {
-                sum * u64::from(LIMIT.unsigned_abs()) >= limit || squares >= SUM_LIMIT
-            };
+            let overflows =
+                |[sum, squares]: [u64; 2]| sum * u64::from(LIMIT.unsigned_abs()) >= limit || squares >= SUM_LIMIT;
             let over: Vec<usize> = (0..cout).filter(|&o| overflows(sums[o])).collect();
             if over.is_empty() {
                 break;
@@ -98,10 +89,7 @@ impl Stored {
         let bias = self.bias.iter().map(|b| b / to).collect();
         let requantise = match &self.gain {
             Some(gain) => Requantise::Invariant {
-                gain: gain
-                    .iter()
-                    .map(|g| (f64::from(*g) * ratio) as f32)
-                    .collect(),
+                gain: gain.iter().map(|g| (f64::from(*g) * ratio) as f32).collect(),
                 bias,
             },
             None => Requantise::Scale {

@@ -93,12 +93,7 @@ impl<L> Generate<L> {
     ///
     /// # Panics
     /// If there are not [`Generate::scales`] scales.
-    pub fn with_scales<M>(
-        &self,
-        input: f32,
-        scales: &[f32],
-        make: impl Fn(&L, f32, f32) -> M,
-    ) -> Generate<M> {
+    pub fn with_scales<M>(&self, input: f32, scales: &[f32], make: impl Fn(&L, f32, f32) -> M) -> Generate<M> {
         assert_eq!(scales.len(), self.head.scales(), "one scale per edge");
         let (before, after) = scales.split_at(1 + self.before.len());
         let blocks = |blocks: &[ResBlock<L>], scales: &[f32]| {
@@ -164,14 +159,7 @@ struct Maker<'a, F> {
 }
 
 impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
-    fn make(
-        &mut self,
-        name: &str,
-        volume: usize,
-        cin: usize,
-        cout: usize,
-        invariant: bool,
-    ) -> Result<L> {
+    fn make(&mut self, name: &str, volume: usize, cin: usize, cout: usize, invariant: bool) -> Result<L> {
         let name = name.to_owned();
         (self.layer)(Spec {
             name,
@@ -186,23 +174,12 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
         self.make(name, 1, cin, cout, false)
     }
 
-    fn inceptions(
-        &mut self,
-        module: &str,
-        count: usize,
-        invariant: bool,
-    ) -> Result<Vec<Inception<L>>> {
+    fn inceptions(&mut self, module: &str, count: usize, invariant: bool) -> Result<Vec<Inception<L>>> {
         let c = self.shape.channels;
         (0..count)
             .map(|b| {
                 let mut make = |part: &str, volume, cin, cout| {
-                    self.make(
-                        &format!("{module}.blocks.{b}.{part}"),
-                        volume,
-                        cin,
-                        cout,
-                        invariant,
-                    )
+                    self.make(&format!("{module}.blocks.{b}.{part}"), volume, cin, cout, invariant)
                 };
                 Ok(Inception {
                     a1: make("a1", 27, c, c / 4)?,
@@ -242,12 +219,7 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
         }))
     }
 
-    fn neighbours(
-        &mut self,
-        module: &str,
-        inputs: usize,
-        hidden: usize,
-    ) -> Result<Option<Neighbours<L>>> {
+    fn neighbours(&mut self, module: &str, inputs: usize, hidden: usize) -> Result<Option<Neighbours<L>>> {
         let k = self.shape.latents;
         if hidden == 0 {
             return Ok(None);
@@ -278,13 +250,7 @@ impl<L, F: FnMut(Spec) -> Result<L>> Maker<'_, F> {
         let (c, module) = (head.channels, head.module());
         Ok(Generate {
             head: head.clone(),
-            conv_in: self.make(
-                &format!("{module}.conv_in"),
-                27,
-                self.shape.channels,
-                c,
-                true,
-            )?,
+            conv_in: self.make(&format!("{module}.conv_in"), 27, self.shape.channels, c, true)?,
             before: self.res_blocks(&format!("{module}.before"), head.blocks_before, c)?,
             // With eight children each has one tap alone, so there is nothing to be invariant to.
             layer4: self.make(&format!("{module}.layer4"), 8, c, c, head.children == 1)?,
@@ -325,19 +291,12 @@ impl Shape {
         let [near1, near2] = self.near_channels;
         let up = match self.upsample {
             Upsample::Nearest => None,
-            Upsample::Learned => Some([
-                maker.make("up.1", 8, c, c, false)?,
-                maker.make("up.2", 8, c, c, false)?,
-            ]),
+            Upsample::Learned => Some([maker.make("up.1", 8, c, c, false)?, maker.make("up.2", 8, c, c, false)?]),
         };
         Ok(Exact {
             up,
             pem: [maker.entropy(1)?, maker.entropy(2)?],
-            fr: [
-                maker.reconstruct(0)?,
-                maker.reconstruct(1)?,
-                maker.reconstruct(2)?,
-            ],
+            fr: [maker.reconstruct(0)?, maker.reconstruct(1)?, maker.reconstruct(2)?],
             base: maker.neighbours("base", base_inputs(k), self.base_channels)?,
             near: [
                 maker.neighbours("near.1", near_inputs(k), near1)?,
@@ -347,19 +306,13 @@ impl Shape {
     }
 
     /// The generators, of layers that `layer` makes.
-    pub(crate) fn generators<L>(
-        &self,
-        layer: &mut impl FnMut(Spec) -> Result<L>,
-    ) -> Result<Vec<Generate<L>>> {
+    pub(crate) fn generators<L>(&self, layer: &mut impl FnMut(Spec) -> Result<L>) -> Result<Vec<Generate<L>>> {
         let mut maker = Maker { layer, shape: self };
         self.gg.iter().map(|head| maker.generate(head)).collect()
     }
 
     /// The encoder's own part, of layers that `layer` makes.
-    pub(crate) fn encoder<L>(
-        &self,
-        layer: &mut impl FnMut(Spec) -> Result<L>,
-    ) -> Result<Encoder<L>> {
+    pub(crate) fn encoder<L>(&self, layer: &mut impl FnMut(Spec) -> Result<L>) -> Result<Encoder<L>> {
         let mut maker = Maker { layer, shape: self };
         Ok(Encoder {
             fc: [

@@ -37,12 +37,7 @@ pub fn untrained(shape: &Shape, seed: u64) -> Vec<u8> {
     quick.into_iter().for_each(|spec| file.float_layer(spec));
     // Half the features' range stands for ±4.
     let step = 1.0 / 256.0;
-    file.put(
-        "g_scale",
-        Dtype::F32,
-        &[ROLES],
-        [step; ROLES].map(f32::to_le_bytes),
-    );
+    file.put("g_scale", Dtype::F32, &[ROLES], [step; ROLES].map(f32::to_le_bytes));
     let c_scale = [0.0, step, step].map(f32::to_le_bytes);
     file.put("c_scale", Dtype::F32, &[ROLES], c_scale);
     for head in &shape.gg {
@@ -107,9 +102,7 @@ impl File {
             cout,
             invariant,
         } = spec;
-        let weights: Vec<_> = (0..volume * cin * cout)
-            .map(|_| self.signed(WEIGHT) as i16)
-            .collect();
+        let weights: Vec<_> = (0..volume * cin * cout).map(|_| self.signed(WEIGHT) as i16).collect();
         let extents = [*volume, *cin, *cout];
         self.put(
             &format!("{name}.weight"),
@@ -119,18 +112,10 @@ impl File {
         );
         let last = name.rsplit('.').next().unwrap_or_default();
         if *invariant {
-            let gain = if matches!(last, "a2" | "b3") {
-                0.3
-            } else {
-                1.0
-            };
-            let gain: Vec<_> = (0..*cout)
-                .map(|_| (gain + 0.1 * self.unit()).to_le_bytes())
-                .collect();
+            let gain = if matches!(last, "a2" | "b3") { 0.3 } else { 1.0 };
+            let gain: Vec<_> = (0..*cout).map(|_| (gain + 0.1 * self.unit()).to_le_bytes()).collect();
             self.put(&format!("{name}.gain"), Dtype::F32, &[*cout], gain);
-            let bias: Vec<_> = (0..*cout)
-                .map(|_| (50.0 * self.unit()).to_le_bytes())
-                .collect();
+            let bias: Vec<_> = (0..*cout).map(|_| (50.0 * self.unit()).to_le_bytes()).collect();
             self.put(&format!("{name}.bias"), Dtype::F32, &[*cout], bias);
             return;
         }
@@ -146,10 +131,7 @@ impl File {
             _ => (keep, 0),
         };
         let bias: Vec<_> = (0..*cout)
-            .map(|_| {
-                ((centre << shift) + (1 << (shift - 1)) + (self.signed(16) << (shift - 4)))
-                    .to_le_bytes()
-            })
+            .map(|_| ((centre << shift) + (1 << (shift - 1)) + (self.signed(16) << (shift - 4))).to_le_bytes())
             .collect();
         self.put(&format!("{name}.bias"), Dtype::I32, &[*cout], bias);
         self.put(
@@ -181,21 +163,14 @@ impl File {
         let weights: Vec<_> = (0..volume * cin * cout)
             .map(|_| f16::from_f32(reach * self.unit()).to_le_bytes())
             .collect();
-        self.put(
-            &format!("{name}.weight"),
-            Dtype::F16,
-            &[*volume, *cin, *cout],
-            weights,
-        );
+        self.put(&format!("{name}.weight"), Dtype::F16, &[*volume, *cin, *cout], weights);
         if *invariant {
             let gain: Vec<_> = (0..*cout)
                 .map(|_| (strength + 0.1 * self.unit()).to_le_bytes())
                 .collect();
             self.put(&format!("{name}.gain"), Dtype::F32, &[*cout], gain);
         }
-        let bias: Vec<_> = (0..*cout)
-            .map(|_| (0.1 * self.unit()).to_le_bytes())
-            .collect();
+        let bias: Vec<_> = (0..*cout).map(|_| (0.1 * self.unit()).to_le_bytes()).collect();
         self.put(&format!("{name}.bias"), Dtype::F32, &[*cout], bias);
     }
 
@@ -204,19 +179,11 @@ impl File {
         for (_, row) in &rows {
             offsets.push(offsets.last().unwrap_or(&0) + row.len() as u32);
         }
-        let entries = rows
-            .iter()
-            .flat_map(|(_, row)| row)
-            .map(|p| p.to_le_bytes());
+        let entries = rows.iter().flat_map(|(_, row)| row).map(|p| p.to_le_bytes());
         let count = offsets.last().map_or(0, |&n| n as usize);
         self.put(name, Dtype::U16, &[count], entries);
         let offsets = offsets.into_iter().map(u32::to_le_bytes);
-        self.put(
-            &format!("{name}.offset"),
-            Dtype::U32,
-            &[rows.len() + 1],
-            offsets,
-        );
+        self.put(&format!("{name}.offset"), Dtype::U32, &[rows.len() + 1], offsets);
         let low = rows.iter().map(|(low, _)| low.to_le_bytes());
         self.put(&format!("{name}.low"), Dtype::I16, &[rows.len()], low);
     }
@@ -260,10 +227,7 @@ fn row(sigma: f64, mean: f64) -> (i16, Vec<u16>) {
         .collect();
     masses.push((1.0 - masses.iter().sum::<f64>()).max(0.0));
     let spare = 65536 - masses.len() as u32;
-    let mut row: Vec<u16> = masses
-        .iter()
-        .map(|mass| (mass * f64::from(spare)) as u16)
-        .collect();
+    let mut row: Vec<u16> = masses.iter().map(|mass| (mass * f64::from(spare)) as u16).collect();
     let rest = spare - row.iter().map(|&p| u32::from(p)).sum::<u32>();
     if let Some(largest) = row.iter_mut().max() {
         *largest += rest as u16;

@@ -132,10 +132,7 @@ impl Support {
         let along = |step: usize| if step % 3 == 1 { 4 } else { 1 };
         let mut pairs = 0;
         for row in map.rows().chunks_exact(27) {
-            let occupied = row
-                .iter()
-                .enumerate()
-                .filter(|(_, q)| **q != KernelMap::ABSENT);
+            let occupied = row.iter().enumerate().filter(|(_, q)| **q != KernelMap::ABSENT);
             pairs += occupied
                 .map(|(k, _)| along(k) * along(k / 3) * along(k / 9))
                 .sum::<u64>();
@@ -162,10 +159,7 @@ mod tests {
         let inception = c * c / 4 + c / 4 * (c / 2) + c * c / 4 + c / 4 * (c / 4) + c / 4 * (c / 2);
         let macs = |module| shape.work(module, &map).macs;
         assert_eq!(macs(Module::Context(1)), c * c);
-        assert_eq!(
-            macs(Module::Probabilities(1)),
-            c * c + inception + 2 * c * k
-        );
+        assert_eq!(macs(Module::Probabilities(1)), c * c + inception + 2 * c * k);
         assert_eq!(macs(Module::Features(2)), (k + c) * c + inception + c * c);
         let raw = RAW as u64;
         assert_eq!(

@@ -68,15 +68,7 @@ pub(super) trait Output: Sync {
     fn look(&self, _desk: &mut Desk) {}
 
     /// Writes the wanted `part` of the desk's tile into `rows` of `width` pixels each.
-    fn write(
-        &self,
-        desk: &mut Desk,
-        isa: Isa,
-        canvas: &Canvas,
-        part: Bounds,
-        rows: &mut [Self::Pixel],
-        width: usize,
-    );
+    fn write(&self, desk: &mut Desk, isa: Isa, canvas: &Canvas, part: Bounds, rows: &mut [Self::Pixel], width: usize);
 }
 
 /// Red, green, blue and alpha.
@@ -92,15 +84,7 @@ impl Output for Colours {
         [r, g, b, 1.0 + a]
     }
 
-    fn write(
-        &self,
-        desk: &mut Desk,
-        isa: Isa,
-        canvas: &Canvas,
-        part: Bounds,
-        rows: &mut [[f32; 4]],
-        width: usize,
-    ) {
+    fn write(&self, desk: &mut Desk, isa: Isa, canvas: &Canvas, part: Bounds, rows: &mut [[f32; 4]], width: usize) {
         let size = [part.x1 - part.x0, part.y1 - part.y0];
         let behind = canvas.background.behind();
         let touched = if canvas.shrink == 1 {
@@ -129,15 +113,7 @@ impl Output for Indices {
         u32::MAX
     }
 
-    fn write(
-        &self,
-        desk: &mut Desk,
-        _: Isa,
-        _: &Canvas,
-        _: Bounds,
-        rows: &mut [u32],
-        width: usize,
-    ) {
+    fn write(&self, desk: &mut Desk, _: Isa, _: &Canvas, _: Bounds, rows: &mut [u32], width: usize) {
         desk.touched += u64::from(desk.tile.write_ids(rows, width));
     }
 }
@@ -183,15 +159,7 @@ impl<F: Fn(usize) -> [f32; N] + Sync, const N: usize> Output for Mixed<F, N> {
         }
     }
 
-    fn write(
-        &self,
-        desk: &mut Desk,
-        _: Isa,
-        _: &Canvas,
-        part: Bounds,
-        rows: &mut [[f32; N]],
-        width: usize,
-    ) {
+    fn write(&self, desk: &mut Desk, _: Isa, _: &Canvas, part: Bounds, rows: &mut [[f32; N]], width: usize) {
         let (sums, _) = desk.sums.as_chunks::<N>();
         let columns = part.x0 as usize..part.x1 as usize;
         let lines = sums.chunks_exact(TILE as usize);
@@ -285,13 +253,7 @@ impl Canvas {
 }
 
 /// The mean of `times`×`times` samples for each pixel. Both are given row by row, with the lengths of their rows.
-fn shrink(
-    samples: &[[f32; 4]],
-    stride: usize,
-    times: usize,
-    pixels: &mut [[f32; 4]],
-    width: usize,
-) {
+fn shrink(samples: &[[f32; 4]], stride: usize, times: usize, pixels: &mut [[f32; 4]], width: usize) {
     let share = 1.0 / (times * times) as f32;
     let rows = samples.chunks_exact(stride * times);
     for (lines, row) in rows.zip(pixels.chunks_mut(width)) {

@@ -134,12 +134,7 @@ impl Effects {
     }
 
     /// Everything that was decided for a picture that took `stats`, in words. Looks at every Gaussian: it is meant for people.
-    pub fn explain(
-        &self,
-        gaussians: &Gaussians,
-        camera: &Camera,
-        stats: &Stats,
-    ) -> Vec<Explanation> {
+    pub fn explain(&self, gaussians: &Gaussians, camera: &Camera, stats: &Stats) -> Vec<Explanation> {
         let set = stats.effects;
         let forced = |choice, otherwise: &str| match choice {
             Choice::Auto => otherwise.to_owned(),
@@ -201,18 +196,12 @@ impl Effects {
             line(
                 "order",
                 set.order,
-                forced(
-                    self.order,
-                    "Gaussians are made for the order of their centres",
-                ),
+                forced(self.order, "Gaussians are made for the order of their centres"),
             ),
             line(
                 "orthographic",
                 orthographic,
-                format!(
-                    "the camera is {}",
-                    if orthographic { "one" } else { "a pinhole" }
-                ),
+                format!("the camera is {}", if orthographic { "one" } else { "a pinhole" }),
             ),
             line(
                 "off-centre",

@@ -38,13 +38,11 @@ impl Image {
                 file.extend(values.flat_map(f32::to_le_bytes));
             }
             if let Some(depth) = depth {
-                let values = depth.pixels[row].iter().map(|[z, _, _, alpha]| {
-                    if *alpha > 0.0 {
-                        z / alpha
-                    } else {
-                        f32::INFINITY
-                    }
-                });
+                let values = depth.pixels[row].iter().map(
+                    |[z, _, _, alpha]| {
+                        if *alpha > 0.0 { z / alpha } else { f32::INFINITY }
+                    },
+                );
                 file.extend(values.flat_map(f32::to_le_bytes));
             }
         }
@@ -134,10 +132,7 @@ mod tests {
             assert_eq!([word(at), word(at + 4)], [y as u32, 20]);
             for (k, expected) in expected.into_iter().enumerate() {
                 let found = f32::from_bits(word(at + 8 + 4 * k));
-                assert!(
-                    found == expected || (found - expected).abs() < 1e-6,
-                    "{y} {k}: {found}"
-                );
+                assert!(found == expected || (found - expected).abs() < 1e-6, "{y} {k}: {found}");
             }
         }
     }

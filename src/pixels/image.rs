@@ -49,9 +49,7 @@ impl Image {
         half.pixels = quarters(self.width, self.height)
             .map(|from| {
                 let from = from.map(|i| self.pixels[i]);
-                std::array::from_fn(|k| {
-                    0.25 * ((from[0][k] + from[1][k]) + (from[2][k] + from[3][k]))
-                })
+                std::array::from_fn(|k| 0.25 * ((from[0][k] + from[1][k]) + (from[2][k] + from[3][k])))
             })
             .collect();
         half
@@ -95,8 +93,7 @@ impl Image {
     /// [`Error::Unsupported`] if the picture is too large for the format.
     pub fn to_png16(&self) -> Result<Vec<u8>> {
         let mut file = Vec::new();
-        let failed =
-            |e: png::EncodingError| unsupported(format!("{}×{}: {e}", self.width, self.height));
+        let failed = |e: png::EncodingError| unsupported(format!("{}×{}: {e}", self.width, self.height));
         let mut encoder = png::Encoder::new(&mut file, self.width, self.height);
         encoder.set_color(png::ColorType::Rgba);
         encoder.set_depth(png::BitDepth::Sixteen);
@@ -119,21 +116,13 @@ impl Image {
     pub fn to_ppm(&self) -> Vec<u8> {
         let mut file = format!("P6\n{} {}\n255\n", self.width, self.height).into_bytes();
         let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
-        file.extend(
-            self.pixels
-                .iter()
-                .flat_map(|[r, g, b, _]| [r, g, b].map(|c| byte(*c))),
-        );
+        file.extend(self.pixels.iter().flat_map(|[r, g, b, _]| [r, g, b].map(|c| byte(*c))));
         file
     }
 
     /// What a YUV4MPEG2 stream of pictures of this size begins with, at 30 pictures a second.
     pub fn y4m_header(&self) -> Vec<u8> {
-        format!(
-            "YUV4MPEG2 W{} H{} F30:1 Ip A1:1 C444\n",
-            self.width, self.height
-        )
-        .into_bytes()
+        format!("YUV4MPEG2 W{} H{} F30:1 Ip A1:1 C444\n", self.width, self.height).into_bytes()
     }
 
     /// One picture of a YUV4MPEG2 stream: ITU-R BT.601, limited range, colour at full resolution; what is transparent over black.
@@ -204,11 +193,7 @@ mod tests {
     fn image(width: u32, height: u32, pixel: impl Fn(u32, u32) -> [f32; 4]) -> Image {
         let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
         let pixels = pixels.map(|(x, y)| pixel(x, y)).collect();
-        Image {
-            width,
-            height,
-            pixels,
-        }
+        Image { width, height, pixels }
     }
 
     #[test]
@@ -240,15 +225,10 @@ mod tests {
             _ => [0.25, 0.5, 0.0, 0.5],
         });
         let file = picture.to_png16().unwrap();
-        let mut reader = png::Decoder::new(std::io::Cursor::new(file))
-            .read_info()
-            .unwrap();
+        let mut reader = png::Decoder::new(std::io::Cursor::new(file)).read_info().unwrap();
         let mut bytes = [0; 16];
         reader.next_frame(&mut bytes).unwrap();
-        let values: Vec<u16> = bytes
-            .chunks(2)
-            .map(|b| u16::from_be_bytes([b[0], b[1]]))
-            .collect();
+        let values: Vec<u16> = bytes.chunks(2).map(|b| u16::from_be_bytes([b[0], b[1]])).collect();
         assert_eq!(values, [16384, 32768, 300, 65535, 32768, 65535, 0, 32768]);
     }
 

@@ -247,14 +247,7 @@ impl Renderer {
         limits: &Limits,
         image: &mut Image,
     ) -> Result<Stats> {
-        self.draw_into(
-            gaussians,
-            camera,
-            Channel::Colour,
-            background,
-            limits,
-            image,
-        )
+        self.draw_into(gaussians, camera, Channel::Colour, background, limits, image)
     }
 
     /// As [`Renderer::render_into`], of any channel.
@@ -270,10 +263,7 @@ impl Renderer {
         limits: &Limits,
         image: &mut Image,
     ) -> Result<Stats> {
-        let wanted = Wanted {
-            channel,
-            background,
-        };
+        let wanted = Wanted { channel, background };
         let pixels = &mut image.pixels;
         let stats = self.frame(gaussians, camera, wanted, &Colours, limits, pixels)?;
         [image.width, image.height] = camera.size();
@@ -324,10 +314,7 @@ impl Renderer {
         limits: &Limits,
         pixels: &mut Vec<O::Pixel>,
     ) -> Result<Stats> {
-        let Wanted {
-            channel,
-            background,
-        } = wanted;
+        let Wanted { channel, background } = wanted;
         camera.check()?;
         gaussians.check_lengths()?;
         if let Background::Colour(c) = background
@@ -391,8 +378,7 @@ impl Renderer {
             *pixels = bytemuck::zeroed_vec(count as usize);
         }
         pixels.resize(count as usize, bytemuck::Zeroable::zeroed());
-        self.desks
-            .resize_with(rayon::current_num_threads(), Mutex::default);
+        self.desks.resize_with(rayon::current_num_threads(), Mutex::default);
         let canvas = Canvas {
             grid,
             window: camera.window(),
@@ -406,8 +392,7 @@ impl Renderer {
         });
         let mut part = self.bins.next(None);
         while let Some(now) = part {
-            self.bins
-                .fill(now.clone(), &self.ellipses, &mut self.counts);
+            self.bins.fill(now.clone(), &self.ellipses, &mut self.counts);
             times.bin += lap();
             let [sorting, blending] = self.draw_part(&now, &canvas, floor, what, output, pixels);
             let drawn = lap();

@@ -113,12 +113,7 @@ impl Shape {
 }
 
 /// Draws `gaussians`, which must be finite but for those that no camera would show.
-pub fn render(
-    gaussians: &Gaussians,
-    camera: &Camera,
-    background: Background,
-    cutoffs: Cutoffs,
-) -> Image {
+pub fn render(gaussians: &Gaussians, camera: &Camera, background: Background, cutoffs: Cutoffs) -> Image {
     let mut seen: Vec<Seen> = (0..gaussians.len())
         .filter_map(|i| see(gaussians, camera, i, cutoffs))
         .collect();
@@ -127,9 +122,7 @@ pub fn render(
     let [width, height] = camera.size();
     let window = camera.window();
     let mut pixels = vec![[0.0; 4]; width as usize * height as usize];
-    let rows = pixels
-        .par_chunks_mut(width as usize)
-        .zip(window.y0..window.y1);
+    let rows = pixels.par_chunks_mut(width as usize).zip(window.y0..window.y1);
     rows.for_each(|(row, y)| {
         let y = f64::from(y) + 0.5;
         let mut sums = vec![(DVec3::ZERO, 1.0); row.len()];
@@ -166,11 +159,7 @@ pub fn render(
             *pixel = [r, g, b, alpha].map(|x| x as f32);
         }
     });
-    Image {
-        width,
-        height,
-        pixels,
-    }
+    Image { width, height, pixels }
 }
 
 fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Option<Seen> {
@@ -180,11 +169,8 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Op
     let rotation = DQuat::from_xyzw(x, y, z, w);
     let opacity = f64::from(gaussians.opacity[i]).min(1.0);
     let colour = DVec3::from(gaussians.colour[i].map(f64::from));
-    let finite = position.is_finite()
-        && scale.is_finite()
-        && rotation.is_finite()
-        && opacity.is_finite()
-        && colour.is_finite();
+    let finite =
+        position.is_finite() && scale.is_finite() && rotation.is_finite() && opacity.is_finite() && colour.is_finite();
     let t = camera.pose.transform_point3(position);
     if !(finite && rotation.length() > 0.0) {
         return None;
@@ -198,8 +184,7 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Op
     if crosses {
         let pinhole = camera.projection == Projection::Pinhole;
         let distance = if pinhole { t.z.max(camera.near) } else { 1.0 };
-        let blur =
-            f64::from(gaussians.pixel_blur()) * distance * distance / (camera.fx * camera.fy);
+        let blur = f64::from(gaussians.pixel_blur()) * distance * distance / (camera.fx * camera.fy);
         let variance = scale * scale + blur.max(gaussians.blur.into());
         let whiten = DMat3::from_diagonal(variance.map(|v| 1.0 / v.sqrt())) * axes.transpose();
         return Some(Seen {

@@ -23,12 +23,7 @@ pub enum Channel {
 }
 
 /// Fills `shades` with what each Gaussian is drawn as: whatever `channel` asks for, and of colours those of the view.
-pub(super) fn fill(
-    gaussians: &Gaussians,
-    camera: &Camera,
-    channel: Channel,
-    shades: &mut Vec<[f32; 3]>,
-) {
+pub(super) fn fill(gaussians: &Gaussians, camera: &Camera, channel: Channel, shades: &mut Vec<[f32; 3]>) {
     let rotation = camera.pose.matrix3;
     let eye = (rotation.transpose() * -camera.pose.translation).as_vec3();
     let along = rotation.row(2).as_vec3();
@@ -49,32 +44,24 @@ pub(super) fn fill(
             Channel::Normal => {
                 let [w, x, y, z] = gaussians.rotation[i].map(f64::from);
                 let scale = gaussians.scale[i];
-                let thinnest = (0..3).fold(0, |least, k| {
-                    if scale[k].abs() < scale[least].abs() {
-                        k
-                    } else {
-                        least
-                    }
-                });
+                let thinnest = (0..3).fold(
+                    0,
+                    |least, k| {
+                        if scale[k].abs() < scale[least].abs() { k } else { least }
+                    },
+                );
                 let turn = DQuat::from_xyzw(x, y, z, w).normalize();
                 let normal = rotation * (turn * DVec3::AXES[thinnest]);
                 let seen = rotation * towards(i).as_dvec3();
-                let normal = if normal.dot(seen) > 0.0 {
-                    -normal
-                } else {
-                    normal
-                };
+                let normal = if normal.dot(seen) > 0.0 { -normal } else { normal };
                 (normal * 0.5 + 0.5).as_vec3().into()
             }
         }
     };
     shades.resize(gaussians.len(), [0.0; 3]);
-    shades
-        .par_chunks_mut(BLOCK)
-        .enumerate()
-        .for_each(|(block, shades)| {
-            for (j, to) in shades.iter_mut().enumerate() {
-                *to = shade(block * BLOCK + j);
-            }
-        });
+    shades.par_chunks_mut(BLOCK).enumerate().for_each(|(block, shades)| {
+        for (j, to) in shades.iter_mut().enumerate() {
+            *to = shade(block * BLOCK + j);
+        }
+    });
 }

@@ -57,14 +57,7 @@ impl Camera {
     ///
     /// # Errors
     /// [`Error::Usage`] if that is no camera: see [`Camera::check`].
-    pub fn orbit(
-        azimuth: f64,
-        elevation: f64,
-        radius: f64,
-        fov: f64,
-        width: u32,
-        height: u32,
-    ) -> Result<Camera> {
+    pub fn orbit(azimuth: f64, elevation: f64, radius: f64, fov: f64, width: u32, height: u32) -> Result<Camera> {
         let (sin_az, cos_az) = azimuth.to_radians().sin_cos();
         let (sin_el, cos_el) = elevation.to_radians().sin_cos();
         let outwards = DVec3::new(cos_el * sin_az, sin_el, cos_el * cos_az);
@@ -185,23 +178,16 @@ impl Camera {
         let complaint = |what: String| Err(Error::Usage(format!("camera: {what}")));
         let rotation = self.pose.matrix3;
         let error = rotation * rotation.transpose() - DMat3::IDENTITY;
-        let largest = error
-            .to_cols_array()
-            .iter()
-            .fold(0.0, |m: f64, x| m.max(x.abs()));
+        let largest = error.to_cols_array().iter().fold(0.0, |m: f64, x| m.max(x.abs()));
         if !self.pose.is_finite() {
             return complaint("the pose holds a number that is not finite".into());
         }
         if !(largest <= ROTATION_TOLERANCE && rotation.determinant() > 0.0) {
-            return complaint(
-                "the pose is not a rotation and a translation: it scales, shears or mirrors".into(),
-            );
+            return complaint("the pose is not a rotation and a translation: it scales, shears or mirrors".into());
         }
         for (name, length) in [("fx", self.fx), ("fy", self.fy), ("near", self.near)] {
             if !(length >= f64::from(f32::MIN_POSITIVE) && length <= f64::from(f32::MAX)) {
-                return complaint(format!(
-                    "{name} is {length}, it must be positive and finite"
-                ));
+                return complaint(format!("{name} is {length}, it must be positive and finite"));
             }
         }
         for (name, centre) in [("cx", self.cx), ("cy", self.cy)] {
@@ -255,10 +241,7 @@ mod tests {
 
     fn pixel(camera: &Camera, p: [f64; 3]) -> [f64; 2] {
         let t = camera.pose.transform_point3(p.into());
-        [
-            camera.fx * t.x / t.z + camera.cx,
-            camera.fy * t.y / t.z + camera.cy,
-        ]
+        [camera.fx * t.x / t.z + camera.cx, camera.fy * t.y / t.z + camera.cy]
     }
 
     #[test]

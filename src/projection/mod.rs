@@ -169,10 +169,7 @@ impl Ellipses {
                     look(state, &room[..seen.visible as usize]);
                     tally = tally + seen;
                 }
-                *run = Run {
-                    first: begin,
-                    tally,
-                };
+                *run = Run { first: begin, tally };
             });
         self.crossing.clear();
         self.slopes.clear();
@@ -251,12 +248,7 @@ impl Ellipses {
 }
 
 /// Fills `crossing` with what `see` says of those of the runs' ellipses that cross the near plane, all of which are visible.
-fn fill_crossing(
-    runs: &[Run],
-    all: &[Ellipse],
-    crossing: &mut [Crossing],
-    see: &(impl Fn(u32) -> Crossing + Sync),
-) {
+fn fill_crossing(runs: &[Run], all: &[Ellipse], crossing: &mut [Crossing], see: &(impl Fn(u32) -> Crossing + Sync)) {
     match runs {
         [] => {}
         [run] => {

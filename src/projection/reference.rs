@@ -150,12 +150,7 @@ fn rotation_matrix(wxyz: [f32; 4]) -> Option<Mat3> {
     }
     let inverse = 1.0 / squared.sqrt();
     let unit = |x: f32| (f64::from(x) * inverse) as f32;
-    Some(Mat3::from_quat(Quat::from_xyzw(
-        unit(x),
-        unit(y),
-        unit(z),
-        unit(w),
-    )))
+    Some(Mat3::from_quat(Quat::from_xyzw(unit(x), unit(y), unit(z), unit(w))))
 }
 
 /// Gaussians of every kind that a kernel tells apart, in a number that no vector divides.
@@ -208,8 +203,7 @@ fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
         all.blur = blur;
         let camera = Camera::orbit(azimuth, 20.0, radius, 60.0, 310, 200).unwrap();
         let view = View::new(&camera);
-        let expected: Vec<Result<Ellipse, Invisible>> =
-            (0..all.len()).map(|i| view.see(&all, i)).collect();
+        let expected: Vec<Result<Ellipse, Invisible>> = (0..all.len()).map(|i| view.see(&all, i)).collect();
         let count = |what: Invisible| {
             let mut same = 0;
             for e in &expected {
@@ -228,14 +222,7 @@ fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
             };
             let mut ellipses = Ellipses::default();
             let dropped = ellipses
-                .project(
-                    &all,
-                    &camera,
-                    how,
-                    &mut Vec::<()>::new(),
-                    |_, _| {},
-                    |_, _| {},
-                )
+                .project(&all, &camera, how, &mut Vec::<()>::new(), |_, _| {}, |_, _| {})
                 .unwrap()
                 .dropped;
             assert_eq!(dropped.not_finite, count(Invisible::NotFinite), "{isa}");
@@ -263,25 +250,13 @@ fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
 fn assert_same(found: &Ellipse, expected: &Ellipse, isa: Isa) {
     let context = || format!("{isa}: {found:?}, not {expected:?}");
     let near = |a: f32, b: f32, size: f32| (a - b).abs() <= 3e-5 * size.abs() + 1e-30;
-    assert!(
-        near(found.depth, expected.depth, expected.depth),
-        "{}",
-        context()
-    );
+    assert!(near(found.depth, expected.depth, expected.depth), "{}", context());
     assert_eq!(found.colour, expected.colour);
     for k in 0..2 {
         let size = expected.centre[k].abs().max(1.0);
-        assert!(
-            near(found.centre[k], expected.centre[k], size),
-            "{}",
-            context()
-        );
+        assert!(near(found.centre[k], expected.centre[k], size), "{}", context());
     }
-    assert!(
-        (found.log_opacity - expected.log_opacity).abs() < 1e-5,
-        "{}",
-        context()
-    );
+    assert!((found.log_opacity - expected.log_opacity).abs() < 1e-5, "{}", context());
     // Of a needle, two steps nearly cancel where the ellipse is: their size is what counts.
     let size = |x: [f32; 2]| x[0].abs().max(x[1].abs());
     for (a, b) in [(found.u, expected.u), (found.v, expected.v)] {
@@ -294,10 +269,7 @@ fn assert_same(found: &Ellipse, expected: &Ellipse, isa: Isa) {
         );
     }
     let sides = |b: &Bounds| [b.x0, b.y0, b.x1, b.y1];
-    for (a, b) in sides(&found.bounds)
-        .into_iter()
-        .zip(sides(&expected.bounds))
-    {
+    for (a, b) in sides(&found.bounds).into_iter().zip(sides(&expected.bounds)) {
         assert!(a.abs_diff(b) <= 1, "{}", context());
     }
 }

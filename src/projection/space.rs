@@ -32,18 +32,10 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize) -> Seen {
 /// Gaussian `i`, which reaches over the near plane: each of its axes is widened by the pixel's blur as it is at its centre, or at the
 /// near plane if that is farther.
 pub(super) fn crossing(gaussians: &Gaussians, camera: &Camera, i: usize) -> Crossing {
-    let Seen {
-        centre,
-        axes,
-        scale,
-    } = see(gaussians, camera, i);
+    let Seen { centre, axes, scale } = see(gaussians, camera, i);
     let focal = DVec2::new(camera.fx, camera.fy);
     let pinhole = camera.projection == Projection::Pinhole;
-    let distance = if pinhole {
-        centre.z.max(camera.near)
-    } else {
-        1.0
-    };
+    let distance = if pinhole { centre.z.max(camera.near) } else { 1.0 };
     let pixel = distance * distance / (focal.x * focal.y);
     let blur = (f64::from(gaussians.pixel_blur()) * pixel).max(gaussians.own_blur().into());
     let measure = (scale * scale + blur).map(|variance| FORM_SCALE / variance.sqrt());
@@ -72,11 +64,7 @@ pub(super) fn crossing(gaussians: &Gaussians, camera: &Camera, i: usize) -> Cros
 
 /// How the depth of Gaussian `i` changes by pixel to the right and down: the mean depth of what of it is seen there.
 pub(super) fn slopes(gaussians: &Gaussians, camera: &Camera, i: usize) -> [f32; 2] {
-    let Seen {
-        centre,
-        axes,
-        scale,
-    } = see(gaussians, camera, i);
+    let Seen { centre, axes, scale } = see(gaussians, camera, i);
     let axes = axes * DMat3::from_diagonal(scale);
     let [right, down, ahead] = [0, 1, 2].map(|k| axes.row(k));
     let [[left, most], [top, bottom]] = camera.slope_ranges();
@@ -92,11 +80,7 @@ pub(super) fn slopes(gaussians: &Gaussians, camera: &Camera, i: usize) -> [f32; 
     };
     let own = f64::from(gaussians.own_blur()) * camera.fx * camera.fy / (near * near);
     let blur = own.max(gaussians.pixel_blur().into());
-    let (a, b, c) = (
-        m1.length_squared() + blur,
-        m1.dot(m2),
-        m2.length_squared() + blur,
-    );
+    let (a, b, c) = (m1.length_squared() + blur, m1.dot(m2), m2.length_squared() + blur);
     // By Cauchy and Binet, as everywhere.
     let determinant = m1.cross(m2).length_squared() + blur * (a + c - blur);
     let with = [m1.dot(ahead), m2.dot(ahead)];

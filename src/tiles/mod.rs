@@ -81,11 +81,7 @@ impl Grid {
     /// Bytes of the counts of as many runs, their sums, and where tiles start.
     pub fn bytes(&self, runs: usize) -> u64 {
         let tiles = (self.columns as u64 + 1) * (self.rows as u64 + 1);
-        let [counts, total, start] = [
-            runs * size_of::<u32>(),
-            size_of::<u32>(),
-            size_of::<usize>(),
-        ];
+        let [counts, total, start] = [runs * size_of::<u32>(), size_of::<u32>(), size_of::<usize>()];
         tiles * (counts + total + start) as u64
     }
 }
@@ -153,12 +149,7 @@ impl Count {
             if touch.columns.max(touch.rows) <= 2 {
                 let at = cursors[first];
                 let [wide, high] = [touch.columns == 2, touch.rows == 2];
-                for (off, there) in [
-                    (0, true),
-                    (1, wide),
-                    (stride, high),
-                    (stride + 1, wide & high),
-                ] {
+                for (off, there) in [(0, true), (1, wide), (stride, high), (stride + 1, wide & high)] {
                     let tile = if there { first + off } else { first };
                     let at = if there { cursors[tile] } else { at };
                     entries[at as usize].store(key, Ordering::Relaxed);
@@ -222,13 +213,7 @@ impl Bins {
     /// # Errors
     /// [`crate::Error::LimitExceeded`] before anything is reserved, if `reserved` bytes, the entries of the fullest tile, and room to
     /// sort it in every thread, are together more than `limits` allow.
-    pub fn plan(
-        &mut self,
-        grid: Grid,
-        counts: &mut [Count],
-        reserved: u64,
-        limits: &Limits,
-    ) -> Result<u64> {
+    pub fn plan(&mut self, grid: Grid, counts: &mut [Count], reserved: u64, limits: &Limits) -> Result<u64> {
         self.grid = grid;
         counts.par_iter_mut().for_each(|count| count.sum(grid));
         let counts = &*counts;
@@ -247,13 +232,8 @@ impl Bins {
         let entry = size_of::<u64>() as u64;
         let sorting = fullest * rayon::current_num_threads() as u64 * Nearest::BYTES;
         let reserved = reserved.saturating_add(sorting);
-        limits.check_bytes(
-            "bytes to draw the picture",
-            reserved.saturating_add(fullest * entry),
-        )?;
-        self.most = MOST_ENTRIES
-            .min((limits.max_bytes - reserved) / entry)
-            .max(fullest);
+        limits.check_bytes("bytes to draw the picture", reserved.saturating_add(fullest * entry))?;
+        self.most = MOST_ENTRIES.min((limits.max_bytes - reserved) / entry).max(fullest);
         Ok(counts.iter().map(|count| count.pairs).sum())
     }
 

@@ -16,12 +16,9 @@ fn gaussians(count: usize) -> Gaussians {
     };
     let mut all = Gaussians::default();
     for _ in 0..count {
-        all.position
-            .push(std::array::from_fn(|_| random(-1.0, 1.0)));
-        all.scale
-            .push(std::array::from_fn(|_| 10f32.powf(random(-3.0, -0.5))));
-        all.rotation
-            .push(std::array::from_fn(|_| random(-1.0, 1.0)));
+        all.position.push(std::array::from_fn(|_| random(-1.0, 1.0)));
+        all.scale.push(std::array::from_fn(|_| 10f32.powf(random(-3.0, -0.5))));
+        all.rotation.push(std::array::from_fn(|_| random(-1.0, 1.0)));
         all.opacity.push(random(0.0, 1.0));
         all.colour.push([0.0; 3]);
     }
@@ -85,9 +82,7 @@ fn every_tile_lists_just_the_ellipses_whose_bounds_touch_it_nearest_first() {
     for most in [u64::MAX, 20_000, 4000] {
         let mut scene = project(&all, 183, 150);
         let mut bins = Bins::default();
-        let pairs = bins
-            .plan(scene.grid, &mut scene.counts, 0, &Limits::default())
-            .unwrap();
+        let pairs = bins.plan(scene.grid, &mut scene.counts, 0, &Limits::default()).unwrap();
         bins.most = bins.most.min(most).max(3500);
         let (mut part, mut parts, mut listed, mut tiles) = (bins.next(None), 0, 0, 0);
         while let Some(now) = part {
@@ -162,9 +157,7 @@ fn lists_over_the_limit_are_refused_before_they_are_made() {
 fn tiles_are_put_in_order_whatever_their_depths_are() {
     let mut state = 1u64;
     let mut random = |below: u64| {
-        state = state
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1);
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
         (state >> 33) % below
     };
     let mut nearest = Nearest::default();

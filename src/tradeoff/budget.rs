@@ -62,13 +62,7 @@ impl Budget {
     ///
     /// # Errors
     /// [`Error::Usage`] if the calibration knows none of the levels.
-    pub fn choose(
-        &self,
-        calibration: &Calibration,
-        header: &Header,
-        levels: &[u8],
-        task: Task,
-    ) -> Result<Choice> {
+    pub fn choose(&self, calibration: &Calibration, header: &Header, levels: &[u8], task: Task) -> Result<Choice> {
         let of_level = |&level: &u8| {
             let role = usize::from(level.checked_sub(header.base)?);
             let draws = calibration.draws.iter().filter(move |d| d.role == role);
@@ -113,11 +107,7 @@ impl Budget {
         let here = voxels(draw.role)?;
         let nanoseconds = match task {
             Task::Decode => {
-                let exact = calibration
-                    .exact
-                    .iter()
-                    .zip(&header.voxels)
-                    .take(draw.role + 1);
+                let exact = calibration.exact.iter().zip(&header.voxels).take(draw.role + 1);
                 let exact: f64 = exact.map(|(cost, &n)| cost.of(f64::from(n))).sum();
                 calibration.start + exact + draw.generate.of(here)
             }
@@ -171,24 +161,23 @@ mod tests {
     }
 
     fn calibration() -> Calibration {
-        let draw =
-            |role, children, generator: [&str; 2], quality: &str, costs: [f64; 3], psnr| DrawCost {
-                role,
-                children,
-                heads: generator[0].into(),
-                precision: generator[1].into(),
-                quality: quality.into(),
-                generate: LevelCost {
-                    once: 2e6,
-                    per_voxel: costs[0],
-                },
-                draw: PictureCost {
-                    per_gaussian: costs[1],
-                    per_pixel: costs[2],
-                    ..PictureCost::default()
-                },
-                psnr,
-            };
+        let draw = |role, children, generator: [&str; 2], quality: &str, costs: [f64; 3], psnr| DrawCost {
+            role,
+            children,
+            heads: generator[0].into(),
+            precision: generator[1].into(),
+            quality: quality.into(),
+            generate: LevelCost {
+                once: 2e6,
+                per_voxel: costs[0],
+            },
+            draw: PictureCost {
+                per_gaussian: costs[1],
+                per_pixel: costs[2],
+                ..PictureCost::default()
+            },
+            psnr,
+        };
         let (best, quick, float) = (["best", "int16"], ["quick", "int16"], ["best", "f16"]);
         Calibration {
             machine: Machine::this(),
@@ -237,10 +226,7 @@ mod tests {
     #[test]
     fn a_time_that_nothing_keeps_gives_the_fastest_and_says_so() {
         let choice = choose(Some(5), Some(50.0), Task::Decode);
-        assert_eq!(
-            (choice.level, choice.in_time, choice.accurate),
-            (8, false, false)
-        );
+        assert_eq!((choice.level, choice.in_time, choice.accurate), (8, false, false));
     }
 
     #[test]
@@ -248,10 +234,7 @@ mod tests {
         let picture = Task::Picture { pixels: 1_000_000 };
         assert_eq!(choose(None, Some(40.0), picture).quality, Quality::Fast);
         let fine = choose(None, Some(50.0), picture);
-        assert_eq!(
-            (fine.quality, fine.precision),
-            (Quality::Exact, Precision::Int16)
-        );
+        assert_eq!((fine.quality, fine.precision), (Quality::Exact, Precision::Int16));
         let beyond = choose(None, Some(90.0), picture);
         assert_eq!((beyond.precision, beyond.accurate), (Precision::F16, false));
     }

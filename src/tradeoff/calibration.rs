@@ -153,9 +153,7 @@ impl PictureCost {
 
     /// Nanoseconds of a picture of so many Gaussians on a surface with the area of so many faces of the cube.
     pub fn of(&self, gaussians: f64, faces: f64, pixels: f64) -> f64 {
-        self.once
-            + self.per_gaussian * gaussians
-            + (self.per_pixel + self.per_face * faces) * pixels
+        self.once + self.per_gaussian * gaussians + (self.per_pixel + self.per_face * faces) * pixels
     }
 }
 
@@ -177,8 +175,7 @@ impl Calibration {
             let path = PathBuf::from(std::env::var_os(name)?);
             path.is_absolute().then_some(path)
         };
-        let cache =
-            absolute("XDG_CACHE_HOME").or_else(|| Some(absolute("HOME")?.join(".cache")))?;
+        let cache = absolute("XDG_CACHE_HOME").or_else(|| Some(absolute("HOME")?.join(".cache")))?;
         let model_name = model_name(model);
         let (isa, threads) = (model.isa(), rayon::current_num_threads());
         let name = format!("calibration-{}-{isa}-{threads}.json", &model_name[..8]);
@@ -232,10 +229,7 @@ impl Calibration {
                 d.psnr.abs(),
             ]
         });
-        let exact = self
-            .exact
-            .iter()
-            .flat_map(|cost| [cost.once, cost.per_voxel]);
+        let exact = self.exact.iter().flat_map(|cost| [cost.once, cost.per_voxel]);
         let mut numbers = numbers.chain(exact).chain([self.start]);
         self.draws.len() <= MOST_ENTRIES
             && self.exact.len() <= MOST_ENTRIES
@@ -244,11 +238,7 @@ impl Calibration {
 }
 
 pub(super) fn model_name(model: &Model) -> String {
-    model
-        .id()
-        .iter()
-        .map(|byte| format!("{byte:02x}"))
-        .collect()
+    model.id().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]
@@ -308,9 +298,7 @@ mod tests {
             drawn: [[0.0; 2]; 2],
             empty: 180.0,
         };
-        let PictureTimes {
-            gaussians, pixels, ..
-        } = times;
+        let PictureTimes { gaussians, pixels, .. } = times;
         times.drawn = gaussians.map(|g| pixels.map(|p| cost.of(g, 1.5, p)));
         assert_eq!(PictureCost::from_times(&times), cost);
         for (drawn, faces) in [
@@ -318,11 +306,7 @@ mod tests {
             ([[9.0, 14.0], [3.0, 4.0]], [1.0, 0.0]),
             ([[0.0, 900.0], [300.0, 350.0]], [2.0, 1.0]),
         ] {
-            let times = PictureTimes {
-                drawn,
-                faces,
-                ..times
-            };
+            let times = PictureTimes { drawn, faces, ..times };
             let cost = PictureCost::from_times(&times);
             for i in 0..2 {
                 for (p, time) in pixels.into_iter().zip(drawn[i]) {

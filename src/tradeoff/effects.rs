@@ -87,14 +87,7 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
             camera,
             auto,
         ),
-        case(
-            Effect::Harmonics,
-            "harmonics",
-            "plain colour",
-            &plain,
-            camera,
-            auto,
-        ),
+        case(Effect::Harmonics, "harmonics", "plain colour", &plain, camera, auto),
         case(
             Effect::Antialias,
             "antialias",
@@ -127,22 +120,8 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
             camera,
             auto,
         ),
-        case(
-            Effect::Near,
-            "near",
-            "from within the surface",
-            &plain,
-            inside,
-            auto,
-        ),
-        case(
-            Effect::Near,
-            "near",
-            "the stream",
-            &stream,
-            stream_camera()?,
-            auto,
-        ),
+        case(Effect::Near, "near", "from within the surface", &plain, inside, auto),
+        case(Effect::Near, "near", "the stream", &stream, stream_camera()?, auto),
         case(
             Effect::Order,
             "order",
@@ -151,14 +130,7 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
             camera,
             auto,
         ),
-        case(
-            Effect::Order,
-            "order",
-            "the stream",
-            &stream,
-            stream_camera()?,
-            auto,
-        ),
+        case(Effect::Order, "order", "the stream", &stream, stream_camera()?, auto),
     ])
 }
 
@@ -198,12 +170,7 @@ pub fn effect_costs(subject: &Subject<'_>, options: &Options) -> Result<Vec<Effe
 
 impl Case {
     /// Milliseconds of a picture after one that is not counted, the picture, and what it was drawn with.
-    fn draw(
-        &self,
-        subject: &Subject<'_>,
-        choice: Choice,
-        camera: &Camera,
-    ) -> Result<(f64, Image, EffectSet)> {
+    fn draw(&self, subject: &Subject<'_>, choice: Choice, camera: &Camera) -> Result<(f64, Image, EffectSet)> {
         let mut effects = self.others;
         effects.set(self.effect, choice);
         let mut renderer = Renderer::default();
@@ -235,12 +202,7 @@ impl Case {
     fn worst(&self, subject: &Subject<'_>) -> Result<f64> {
         let mut camera = self.camera;
         let shrink = f64::from(JUDGED) / f64::from(camera.width);
-        for length in [
-            &mut camera.fx,
-            &mut camera.fy,
-            &mut camera.cx,
-            &mut camera.cy,
-        ] {
+        for length in [&mut camera.fx, &mut camera.fy, &mut camera.cx, &mut camera.cy] {
             *length *= shrink;
         }
         (camera.width, camera.height) = (JUDGED, JUDGED);

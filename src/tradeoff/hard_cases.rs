@@ -115,21 +115,12 @@ pub fn network_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
                 let gaussians = activate(raw, voxels, head.children, model.shape(), frame);
                 let camera = Camera::orbit(20.0, 20.0, 2.6, 45.0, 96, 96)?;
                 // Drawing adds no error of its own.
-                Ok(reference::render(
-                    &gaussians,
-                    &camera,
-                    Background::WHITE,
-                    Cutoffs::NONE,
-                ))
+                Ok(reference::render(&gaussians, &camera, Background::WHITE, Cutoffs::NONE))
             };
             let truth = picture(&model.generate_in_double(head.heads, head.role, &g, &map)?)?;
             let error = |(precision, model): &(Precision, Model)| {
                 let raw = model.generate_with(head.heads, head.role, &g, &map)?;
-                Ok(CaseError::between(
-                    precision.to_string(),
-                    &truth,
-                    &picture(&raw)?,
-                ))
+                Ok(CaseError::between(precision.to_string(), &truth, &picture(&raw)?))
             };
             let errors = others.iter().map(error).collect::<Result<_>>()?;
             let heads = match head.heads {
@@ -150,14 +141,9 @@ pub fn network_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
         try_on("features of zero variance", &ball, &|n| vec![0; n * c])?;
         try_on("features at their ends, of random sign", &ball, &|n| {
             let signs = random(1000.0)(n);
-            signs
-                .iter()
-                .map(|s| if *s < 0 { -2047 } else { 2047 })
-                .collect()
+            signs.iter().map(|s| if *s < 0 { -2047 } else { 2047 }).collect()
         })?;
-        try_on("features all at their upper end", &ball, &|n| {
-            vec![2047; n * c]
-        })?;
+        try_on("features all at their upper end", &ball, &|n| vec![2047; n * c])?;
         try_on("features from extreme latents", &ball, &|n| {
             let k = model.shape().latents;
             let latent = |i: usize| [i16::MAX, i16::MIN][i % 2];
@@ -183,8 +169,5 @@ fn ball(depth: u8, radius: f32) -> Voxels {
         let squares = at.map(|v| (v as f32 + 0.5 - middle).powi(2));
         (squares.iter().sum::<f32>().sqrt() - radius).abs() < 0.6
     };
-    Voxels::new(
-        depth,
-        places.filter(on_surface).map(morton::encode).collect(),
-    )
+    Voxels::new(depth, places.filter(on_surface).map(morton::encode).collect())
 }

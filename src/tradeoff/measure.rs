@@ -50,9 +50,7 @@ pub(super) fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calib
     let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
     let levels = decoder.levels(subject.stream)?;
     let Some(&finest) = levels.last() else {
-        return Err(Error::Usage(
-            "the stream has no level with Gaussians".into(),
-        ));
+        return Err(Error::Usage("the stream has no level with Gaussians".into()));
     };
     say("calibrate: levels");
     let (all, octree) = decode_levels(&decoder, subject.stream, header.base, &levels)?;
@@ -93,16 +91,10 @@ pub(super) fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calib
         let mut draws: Option<[PictureCost; 3]> = None;
         for heads in model.shape().heads() {
             // Other heads than the best are for who lacks time: one precision is enough.
-            let some = if heads == Heads::Best {
-                precisions.len()
-            } else {
-                1
-            };
+            let some = if heads == Heads::Best { precisions.len() } else { 1 };
             for &precision in precisions.iter().take(some) {
                 let (depth, role) = (level.voxels.depth(), level.role);
-                say(&format!(
-                    "calibrate: level {depth}, {heads} heads, {precision}"
-                ));
+                say(&format!("calibrate: level {depth}, {heads} heads, {precision}"));
                 let precise = || (subject.model)()?.with_precision(precision);
                 let few = small.generate(&precise, heads)?;
                 let many = level.generate(&precise, heads)?;
@@ -168,13 +160,7 @@ fn start_time() -> Result<f64> {
 }
 
 /// A stream of as many levels as lead to `finest`, `coarser` levels above them; its latents are zero.
-fn without_features(
-    header: &Header,
-    finest: u8,
-    octree: &Octree,
-    coarser: u8,
-    model: &Model,
-) -> Result<Vec<u8>> {
+fn without_features(header: &Header, finest: u8, octree: &Octree, coarser: u8, model: &Model) -> Result<Vec<u8>> {
     let [base, top] = [header.base, finest].map(|level| level - coarser);
     let octree = octree.truncated(top);
     let header = Header {
@@ -238,12 +224,7 @@ struct Made {
 }
 
 /// These levels of a stream whose first is `base`, and the octree down to the last.
-fn decode_levels(
-    decoder: &Decoder<&Model>,
-    stream: &[u8],
-    base: u8,
-    levels: &[u8],
-) -> Result<(Vec<Level>, Octree)> {
+fn decode_levels(decoder: &Decoder<&Model>, stream: &[u8], base: u8, levels: &[u8]) -> Result<(Vec<Level>, Octree)> {
     let frame = decoder.frame(stream)?;
     let mut decoding = decoder.start(levels.last().copied());
     decoding.push(stream);
@@ -305,11 +286,7 @@ impl Level {
 
 /// What pictures of few and many Gaussians cost, of each of [`QUALITIES`], which take turns. An empty one costs the same in all, and none less
 /// than a coarser one.
-fn picture_costs(
-    limits: &Limits,
-    model: &Model,
-    [few, many]: [(&Gaussians, &Level); 2],
-) -> Result<[PictureCost; 3]> {
+fn picture_costs(limits: &Limits, model: &Model, [few, many]: [(&Gaussians, &Level); 2]) -> Result<[PictureCost; 3]> {
     let empty = Gaussians::default();
     let pictures = [few.0, many.0].map(|gaussians| SIDES.map(|side| (gaussians, side)));
     let mut rounds = [const { [const { Vec::new() }; 5] }; QUALITIES.len()];
@@ -351,13 +328,7 @@ fn camera(side: u32) -> Result<Camera> {
 }
 
 /// A picture by a new renderer.
-fn picture(
-    limits: &Limits,
-    model: &Model,
-    gaussians: &Gaussians,
-    quality: Quality,
-    side: u32,
-) -> Result<Image> {
+fn picture(limits: &Limits, model: &Model, gaussians: &Gaussians, quality: Quality, side: u32) -> Result<Image> {
     let mut renderer = Renderer::new(model.isa());
     renderer.set_quality(quality);
     let (image, _) = renderer.render(gaussians, &camera(side)?, Background::WHITE, limits)?;

@@ -50,11 +50,7 @@ pub fn psnr(mean_square: f64) -> f64 {
 /// The mean square of the differences, the largest in steps of eight bits, and where that is.
 pub(super) fn pixels_apart(truth: &Image, picture: &Image) -> (f64, f64, [u32; 2]) {
     let size = |image: &Image| (image.width, image.height);
-    assert_eq!(
-        size(truth),
-        size(picture),
-        "pictures to compare are of one size"
-    );
+    assert_eq!(size(truth), size(picture), "pictures to compare are of one size");
     let (mut squares, mut worst, mut place) = (0.0, 0.0f32, 0);
     for (i, (a, b)) in truth.pixels.iter().zip(&picture.pixels).enumerate() {
         for k in 0..3 {
@@ -95,18 +91,13 @@ pub fn resized(image: &Image, width: u32, height: u32) -> Image {
         let (above, below) = (row_of(above), row_of(below));
         let between = |&(left, right, across): &(usize, usize, f32)| -> [f32; 4] {
             std::array::from_fn(|k| {
-                let along =
-                    |row: &[[f32; 4]]| row[left][k] + across * (row[right][k] - row[left][k]);
+                let along = |row: &[[f32; 4]]| row[left][k] + across * (row[right][k] - row[left][k]);
                 along(above) + down * (along(below) - along(above))
             })
         };
         pixels.extend(columns.iter().map(between));
     }
-    Image {
-        width,
-        height,
-        pixels,
-    }
+    Image { width, height, pixels }
 }
 
 /// Weights of the five scales of [`ms_ssim`], the finest first (Wang, Simoncelli and Bovik 2003).
@@ -140,10 +131,7 @@ pub fn ms_ssim(channels: [[Plane; 2]; 3]) -> Option<f64> {
         product
     };
     let [r, g, b] = channels;
-    let (r, (g, b)) = rayon::join(
-        || of_channel(r),
-        || rayon::join(|| of_channel(g), || of_channel(b)),
-    );
+    let (r, (g, b)) = rayon::join(|| of_channel(r), || rayon::join(|| of_channel(g), || of_channel(b)));
     Some((r + g + b) / 3.0)
 }
 
@@ -199,11 +187,7 @@ impl Plane {
                 row.iter_mut().zip(from).for_each(|(r, f)| *r += w * f);
             }
         }
-        Plane {
-            width,
-            height,
-            values,
-        }
+        Plane { width, height, values }
     }
 
     /// Means over 2×2; an odd side gets a zero before its first and after its last pixel.
@@ -225,11 +209,7 @@ impl Plane {
             .flat_map(|y| (0..width).map(move |x| (x, y)))
             .map(|(x, y)| mean(x, y))
             .collect();
-        Plane {
-            width,
-            height,
-            values,
-        }
+        Plane { width, height, values }
     }
 }
 
@@ -249,11 +229,7 @@ mod tests {
     fn image(width: u32, height: u32, pixel: impl Fn(u32, u32) -> f32) -> Image {
         let places = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
         let pixels = places.map(|(x, y)| [pixel(x, y), 0.5, 0.0, 1.0]).collect();
-        Image {
-            width,
-            height,
-            pixels,
-        }
+        Image { width, height, pixels }
     }
 
     #[test]
@@ -287,9 +263,7 @@ mod tests {
 
     #[test]
     fn a_large_picture_has_a_structural_similarity_that_falls_with_noise() {
-        let truth = image(170, 165, |x, y| {
-            0.5 + 0.4 * (0.3 * x as f32 + 0.1 * y as f32).sin()
-        });
+        let truth = image(170, 165, |x, y| 0.5 + 0.4 * (0.3 * x as f32 + 0.1 * y as f32).sin());
         let noisy = |strength: f32| {
             let noise = |x: u32, y: u32| ((x * 7919 + y * 104_729) % 101) as f32 / 101.0 - 0.5;
             let mut noisy = truth.clone();

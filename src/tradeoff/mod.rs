@@ -92,16 +92,12 @@ impl Options {
 /// Those of decoding and drawing; [`Error::Usage`] if the stream has no level with Gaussians, or nothing is to be measured.
 pub fn run(subject: &Subject<'_>, options: &Options, say: &dyn Fn(&str)) -> Result<Report> {
     if options.views == 0 || options.repeats == 0 {
-        return Err(Error::Usage(
-            "no view or no repeat leaves nothing to measure".into(),
-        ));
+        return Err(Error::Usage("no view or no repeat leaves nothing to measure".into()));
     }
     let choices = Run::choices(subject)?;
     let ladder = choices.ladder();
     if ladder.is_empty() {
-        return Err(Error::Usage(
-            "the stream has no level with Gaussians".into(),
-        ));
+        return Err(Error::Usage("the stream has no level with Gaussians".into()));
     }
     let combinations = choices.combinations();
     let mut settings: Vec<Setting> = ladder.iter().map(|(_, setting)| *setting).collect();

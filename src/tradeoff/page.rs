@@ -53,11 +53,7 @@ pub fn page(report: &Report) -> Result<String> {
     html += "<h2>Combinations that no other beats</h2>\n<p>From stream to picture:</p>\n";
     html += &table(&front(report, |row| row.on_front, |row| row.total.median));
     html += "<p>Each further picture:</p>\n";
-    html += &table(&front(
-        report,
-        |row| row.on_picture_front,
-        |row| row.picture.median,
-    ));
+    html += &table(&front(report, |row| row.on_picture_front, |row| row.picture.median));
     html += "<h2>By stage</h2>\n";
     html += &stages(&report.ladder);
     html += &format!(
@@ -86,12 +82,7 @@ pub fn page(report: &Report) -> Result<String> {
 
 /// The combinations of a front, the fastest first.
 fn front(report: &Report, on: fn(&Row) -> bool, time: fn(&Row) -> f64) -> Vec<Row> {
-    let mut rows: Vec<Row> = report
-        .combinations
-        .iter()
-        .filter(|r| on(r))
-        .cloned()
-        .collect();
+    let mut rows: Vec<Row> = report.combinations.iter().filter(|r| on(r)).cloned().collect();
     rows.sort_by(|a, b| time(a).total_cmp(&time(b)));
     rows
 }
@@ -135,8 +126,7 @@ fn table(rows: &[Row]) -> String {
             decibel(row.psnr),
             row.ms_ssim.map_or("–".into(), |s| format!("{s:.5}")),
             row.worst,
-            row.cloud_psnr
-                .map_or(String::new(), |db| format!("<td>{db:.2}</td>")),
+            row.cloud_psnr.map_or(String::new(), |db| format!("<td>{db:.2}</td>")),
             row.most_memory / 1_000_000,
         );
     }
@@ -221,10 +211,7 @@ fn crops(rows: &[Row]) -> Result<String> {
 
 /// A picture as a PNG within the page.
 fn data_uri(image: &Image) -> Result<String> {
-    Ok(format!(
-        "data:image/png;base64,{}",
-        base64(&image.to_png()?)
-    ))
+    Ok(format!("data:image/png;base64,{}", base64(&image.to_png()?)))
 }
 
 /// RFC 4648, with padding.

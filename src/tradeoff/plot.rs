@@ -80,9 +80,7 @@ fn draw(panel: &Panel, report: &Report, left: f64) -> String {
     let times = || all().map(|row| (panel.time)(row).max(1e-3));
     let finite = || all().filter_map(|row| row.psnr);
     let bounds = |values: &mut dyn Iterator<Item = f64>| {
-        values.fold((f64::INFINITY, 0.0f64), |(low, high), v| {
-            (low.min(v), high.max(v))
-        })
+        values.fold((f64::INFINITY, 0.0f64), |(low, high), v| (low.min(v), high.max(v)))
     };
     let (fastest, slowest) = bounds(&mut times());
     let (worst, best) = bounds(&mut finite());
@@ -125,11 +123,7 @@ fn draw(panel: &Panel, report: &Report, left: f64) -> String {
             decibel(row.psnr)
         )
     };
-    let mut front: Vec<&Row> = report
-        .combinations
-        .iter()
-        .filter(|r| (panel.front)(r))
-        .collect();
+    let mut front: Vec<&Row> = report.combinations.iter().filter(|r| (panel.front)(r)).collect();
     front.sort_by(|a, b| (panel.time)(a).total_cmp(&(panel.time)(b)));
     let path: Vec<String> = front
         .iter()
@@ -162,9 +156,7 @@ fn draw(panel: &Panel, report: &Report, left: f64) -> String {
             false => x + 8.0,
         };
         let free = |y: &f64| {
-            let meets = |[from, to, other]: &[f64; 3]| {
-                start < *to && start + width > *from && (y - other).abs() < 11.0
-            };
+            let meets = |[from, to, other]: &[f64; 3]| start < *to && start + width > *from && (y - other).abs() < 11.0;
             !taken.iter().any(meets)
         };
         let places = (0..40).map(|i| {

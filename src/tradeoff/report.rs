@@ -147,10 +147,7 @@ pub struct Row {
     pub crop: Option<Crop>,
 }
 
-fn by_stage<S: Serializer>(
-    stages: &[Spread; STAGES.len()],
-    to: S,
-) -> std::result::Result<S::Ok, S::Error> {
+fn by_stage<S: Serializer>(stages: &[Spread; STAGES.len()], to: S) -> std::result::Result<S::Ok, S::Error> {
     to.collect_map(STAGES.iter().zip(stages))
 }
 
@@ -288,10 +285,7 @@ impl Report {
         };
         let front = pareto_front(&points(|row| row.total.median));
         let picture_front = pareto_front(&points(|row| row.picture.median));
-        for (row, (on, on_picture)) in combinations
-            .iter_mut()
-            .zip(front.into_iter().zip(picture_front))
-        {
+        for (row, (on, on_picture)) in combinations.iter_mut().zip(front.into_iter().zip(picture_front)) {
             (row.on_front, row.on_picture_front) = (on, on_picture);
         }
         let header = Header::parse(subject.stream, subject.limits)?;

@@ -93,11 +93,7 @@ impl<'a> Run<'a> {
     ///
     /// # Errors
     /// Those of [`Header::parse`], of reading the model, and [`crate::Error::Usage`] for a setting that the model does not have.
-    pub fn new(
-        subject: &'a Subject<'a>,
-        options: &'a Options,
-        settings: &[Setting],
-    ) -> Result<Self> {
+    pub fn new(subject: &'a Subject<'a>, options: &'a Options, settings: &[Setting]) -> Result<Self> {
         let header = Header::parse(subject.stream, subject.limits)?;
         let mut run = Run {
             subject,
@@ -135,9 +131,9 @@ impl<'a> Run<'a> {
             });
             if !run.pools.iter().any(|(threads, _)| *threads == how.threads) {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(how.threads);
-                let pool = pool.build().map_err(|e| {
-                    Error::Usage(format!("cannot start {} threads: {e}", how.threads))
-                })?;
+                let pool = pool
+                    .build()
+                    .map_err(|e| Error::Usage(format!("cannot start {} threads: {e}", how.threads)))?;
                 run.pools.push((how.threads, pool));
             }
         }
@@ -173,19 +169,11 @@ impl<'a> Run<'a> {
     /// Those of [`Decoder::decode`] and of [`Renderer::render_into`].
     pub fn measure(&mut self, truth: &Truth, say: &dyn Fn(&str)) -> Result<()> {
         for repeat in 0..self.options.repeats {
-            say(&format!(
-                "repeat {} of {}",
-                repeat + 1,
-                self.options.repeats
-            ));
+            say(&format!("repeat {} of {}", repeat + 1, self.options.repeats));
             // Forwards and backwards in turns: nobody always runs after the same neighbour.
             let forwards = repeat.is_multiple_of(2);
             for i in 0..self.decodings.len() {
-                let i = if forwards {
-                    i
-                } else {
-                    self.decodings.len() - 1 - i
-                };
+                let i = if forwards { i } else { self.decodings.len() - 1 - i };
                 let (lap, gaussians) = self.decode(self.decodings[i].how)?;
                 self.decodings[i].laps.push(lap);
                 let kind = kind(&self.decodings[i].how);
@@ -194,11 +182,7 @@ impl<'a> Run<'a> {
                 }
             }
             for i in 0..self.drawings.len() {
-                let i = if forwards {
-                    i
-                } else {
-                    self.drawings.len() - 1 - i
-                };
+                let i = if forwards { i } else { self.drawings.len() - 1 - i };
                 if repeat == 0 {
                     self.judge(i, truth)?;
                 }
@@ -254,9 +238,7 @@ impl<'a> Run<'a> {
             let (mut lap, mut images) = (Lap::default(), Vec::new());
             for camera in &cameras {
                 let mut image = Image::default();
-                let mut draw = || {
-                    renderer.render_into(gaussians, camera, Background::WHITE, limits, &mut image)
-                };
+                let mut draw = || renderer.render_into(gaussians, camera, Background::WHITE, limits, &mut image);
                 // The first brings memory and caches up to it, as when pictures follow one another.
                 draw()?;
                 let start = Instant::now();
@@ -295,14 +277,10 @@ impl<'a> Run<'a> {
             .zip(&images)
             .map(|(truth, image)| Distance::between(truth, image))
             .collect();
-        let Some((view, worst)) = (0..)
-            .zip(&each)
-            .max_by(|a, b| a.1.worst.total_cmp(&b.1.worst))
-        else {
+        let Some((view, worst)) = (0..).zip(&each).max_by(|a, b| a.1.worst.total_cmp(&b.1.worst)) else {
             return Ok(());
         };
-        let mean =
-            |of: &dyn Fn(&Distance) -> f64| each.iter().map(of).sum::<f64>() / each.len() as f64;
+        let mean = |of: &dyn Fn(&Distance) -> f64| each.iter().map(of).sum::<f64>() / each.len() as f64;
         let ms_ssim = each.iter().all(|d| d.ms_ssim.is_some());
         let drawing = &mut self.drawings[i];
         drawing.view = view;
@@ -312,12 +290,7 @@ impl<'a> Run<'a> {
             ms_ssim: ms_ssim.then(|| mean(&|d| d.ms_ssim.unwrap_or_default())),
             ..*worst
         });
-        drawing.crop = Some(Crop::around(
-            &truth.images[view],
-            &images[view],
-            worst.at,
-            CROP,
-        ));
+        drawing.crop = Some(Crop::around(&truth.images[view], &images[view], worst.at, CROP));
         Ok(())
     }
 

@@ -158,21 +158,13 @@ pub fn hard_scenes() -> Result<Vec<Scene>> {
         ..splat
     });
     Ok(vec![
-        scene(
-            "needles of 3000 × 0.1 px",
-            gather(needles),
-            straight(1000.0, 150, 130),
-        ),
+        scene("needles of 3000 × 0.1 px", gather(needles), straight(1000.0, 150, 130)),
         scene(
             "plates seen from their edges",
             gather(grazing),
             straight(120.0, 120, 120),
         ),
-        scene(
-            "1000 layers of 1/300",
-            gather(layers),
-            straight(50.0, 40, 40),
-        ),
+        scene("1000 layers of 1/300", gather(layers), straight(50.0, 40, 40)),
         scene(
             "20,000 splats far below a pixel",
             gather(surface(20_000, 0.008)),

@@ -133,13 +133,7 @@ impl Choices {
             push(Knob::Heads, with(Decode { heads, ..decode }));
         }
         for &precision in &self.precisions {
-            push(
-                Knob::Precision,
-                with(Decode {
-                    precision,
-                    ..decode
-                }),
-            );
+            push(Knob::Precision, with(Decode { precision, ..decode }));
         }
         for quality in QUALITIES {
             push(Knob::Quality, Setting { quality, ..default });
@@ -267,13 +261,7 @@ mod tests {
 
     #[test]
     fn the_front_is_what_nothing_beats() {
-        let points = [
-            (1.0, 30.0),
-            (2.0, 40.0),
-            (3.0, 35.0),
-            (2.5, 40.0),
-            (9.0, 50.0),
-        ];
+        let points = [(1.0, 30.0), (2.0, 40.0), (3.0, 35.0), (2.5, 40.0), (9.0, 50.0)];
         assert_eq!(pareto_front(&points), [true, true, false, false, true]);
         assert_eq!(pareto_front(&[(1.0, 5.0), (1.0, 5.0)]), [true, true]);
     }

@@ -58,11 +58,7 @@ pub fn of_cloud(cloud: &ColouredVoxels) -> Gaussians {
         scale: vec![[edge / 2.0; 3]; count],
         rotation: vec![[1.0, 0.0, 0.0, 0.0]; count],
         opacity: vec![1.0; count],
-        colour: (cloud
-            .colours
-            .iter()
-            .map(|c| c.map(|v| f32::from(v) / 255.0)))
-        .collect(),
+        colour: (cloud.colours.iter().map(|c| c.map(|v| f32::from(v) / 255.0))).collect(),
         frame: Frame {
             bits: cloud.voxels.depth(),
             placement: cloud.placement,
@@ -83,10 +79,7 @@ mod tests {
     #[test]
     fn a_cloud_is_seen_in_its_colours_where_it_is() {
         let cloud = ColouredVoxels {
-            voxels: Voxels::new(
-                2,
-                vec![morton::encode([0, 0, 0]), morton::encode([3, 3, 3])],
-            ),
+            voxels: Voxels::new(2, vec![morton::encode([0, 0, 0]), morton::encode([3, 3, 3])]),
             colours: vec![[255, 0, 0], [0, 51, 255]],
             placement: Placement::VOXEL_GRID,
         };

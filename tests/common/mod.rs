@@ -49,10 +49,7 @@ impl Ball {
         let mut voxels = self.voxels();
         voxels.sort_by_key(|(at, _)| morton::encode(*at));
         ColouredVoxels {
-            voxels: Voxels::new(
-                self.bits,
-                voxels.iter().map(|(at, _)| morton::encode(*at)).collect(),
-            ),
+            voxels: Voxels::new(self.bits, voxels.iter().map(|(at, _)| morton::encode(*at)).collect()),
             colours: voxels.iter().map(|(_, colour)| *colour).collect(),
             placement: Placement::VOXEL_GRID,
         }

@@ -64,10 +64,7 @@ pub fn whole(model: &Model, bytes: &[u8]) -> Levels {
         };
         Ok(level(n, &exact, gaussians.as_ref()))
     };
-    (header.base..=header.top)
-        .map(of)
-        .collect::<Result<_>>()
-        .map_err(told)
+    (header.base..=header.top).map(of).collect::<Result<_>>().map_err(told)
 }
 
 /// The same, each as it becomes whole while the stream comes in pieces.

@@ -143,17 +143,10 @@ fn gaussians_in_half_are_near_those_in_f16_on_machines_that_sum_in_f16() {
         ran.push(isa.to_string());
     }
     #[cfg(target_arch = "aarch64")]
-    assert_eq!(
-        !ran.is_empty(),
-        std::arch::is_aarch64_feature_detected!("fp16")
-    );
+    assert_eq!(!ran.is_empty(), std::arch::is_aarch64_feature_detected!("fp16"));
     println!(
         "half on {}",
-        if ran.is_empty() {
-            "none".into()
-        } else {
-            ran.join(", ")
-        }
+        if ran.is_empty() { "none".into() } else { ran.join(", ") }
     );
 }
 
@@ -162,11 +155,7 @@ fn gaussians_in_half_are_near_those_in_f16_on_machines_that_sum_in_f16() {
 fn the_generator_makes_the_same_streams_again() {
     for case in make::cases() {
         if case.anywhere {
-            assert!(
-                case.bytes == stream(&case.name),
-                "{} has changed",
-                case.name
-            );
+            assert!(case.bytes == stream(&case.name), "{} has changed", case.name);
         }
     }
 }
@@ -179,8 +168,7 @@ fn make_the_suite_anew() {
     let (mut text, mut size) = (String::new(), 0);
     for case in make::cases() {
         let bytes = case.bytes;
-        let levels =
-            whole(&model(case.model), &bytes).unwrap_or_else(|e| panic!("{}: {e}", case.name));
+        let levels = whole(&model(case.model), &bytes).unwrap_or_else(|e| panic!("{}: {e}", case.name));
         text += &format!("{} {} {}\n", case.name, case.model, levels.join(" "));
         size += bytes.len();
         std::fs::write(folder.join(format!("{}.b2p", case.name)), bytes).expect("a stream");

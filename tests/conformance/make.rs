@@ -60,31 +60,14 @@ impl Latents {
                 let magnitude = 1i32 << random.below(16);
                 (sign * (magnitude + random.below(3) as i32)).clamp(-32_768, 32_767) as i16
             }
-            Latents::Extremes => {
-                [i16::MIN, i16::MAX, 31, -31, 2047, -2047, 0][random.below(7) as usize]
-            }
+            Latents::Extremes => [i16::MIN, i16::MAX, 31, -31, 2047, -2047, 0][random.below(7) as usize],
         }
     }
 }
 
 /// A stream of these voxels, level `bits` of them, with made-up latents at the levels `base` to `top`.
-fn stream(
-    model: &Model,
-    bits: u8,
-    keys: &[u64],
-    levels: (u8, u8),
-    slice: u32,
-    latents: Latents,
-) -> Vec<u8> {
-    coloured(
-        model,
-        bits,
-        keys,
-        levels,
-        slice,
-        latents,
-        Corrections::default(),
-    )
+fn stream(model: &Model, bits: u8, keys: &[u64], levels: (u8, u8), slice: u32, latents: Latents) -> Vec<u8> {
+    coloured(model, bits, keys, levels, slice, latents, Corrections::default())
 }
 
 /// What all levels of a stream say of their colours.
@@ -166,9 +149,7 @@ fn coloured(
             correct(&mut writer, &mut random);
             continue;
         }
-        let parameters = context
-            .as_ref()
-            .map(|c| model.entropy_parameters(role, c, &map));
+        let parameters = context.as_ref().map(|c| model.entropy_parameters(role, c, &map));
         let count = octree.level(level).len() * model.shape().latents;
         let latents: Vec<i16> = (0..count).map(|_| latents.next(&mut random)).collect();
         let (tables, slice) = (model.tables(), slice as usize);
@@ -195,9 +176,7 @@ fn coloured(
 
 /// Puts a chunk that readers skip before every chunk of the stream.
 fn with_notes(bytes: &[u8]) -> Vec<u8> {
-    let note = [
-        200, 9, 1, 0, 5, 0, 0, 0, 4, 0, 0, 0, 0, 0, 0, 0, b'n', b'o', b't', b'e',
-    ];
+    let note = [200, 9, 1, 0, 5, 0, 0, 0, 4, 0, 0, 0, 0, 0, 0, 0, b'n', b'o', b't', b'e'];
     let (levels, header) = seal::header_end(bytes).expect("a header");
     let mut ends = Vec::new();
     let mut at = header + 4;
@@ -229,11 +208,7 @@ fn with_notes(bytes: &[u8]) -> Vec<u8> {
 /// Steps of luma and chromas, fine and coarse, and the boundary.
 fn precision(fine: [u8; 2], coarse: [u8; 2], boundary: u8) -> Precision {
     let [fine, coarse] = [fine, coarse].map(|[luma, chroma]| Steps { luma, chroma });
-    Precision {
-        fine,
-        coarse,
-        boundary,
-    }
+    Precision { fine, coarse, boundary }
 }
 
 fn cube(side: u32) -> Vec<u64> {
@@ -310,16 +285,10 @@ pub fn cases() -> Vec<Case> {
             add("checkerboard".into(), true, &|m| {
                 stream(m, 3, &checkerboard, (0, 2), 16_384, Small)
             });
-            let plane: Vec<u64> = (0..256)
-                .map(|i| morton::encode([i % 16, i / 16, 7]))
-                .collect();
-            add("plane".into(), true, &|m| {
-                stream(m, 4, &plane, (1, 3), 20, Small)
-            });
+            let plane: Vec<u64> = (0..256).map(|i| morton::encode([i % 16, i / 16, 7])).collect();
+            add("plane".into(), true, &|m| stream(m, 4, &plane, (1, 3), 20, Small));
             let line: Vec<u64> = (0..64).map(|i| morton::encode([i, 63 - i, 0])).collect();
-            add("diagonal".into(), true, &|m| {
-                stream(m, 6, &line, (3, 5), 9, Small)
-            });
+            add("diagonal".into(), true, &|m| stream(m, 6, &line, (3, 5), 9, Small));
             add("notes-between-chunks".into(), true, &|m| {
                 with_notes(&stream(m, 4, &sphere, (1, 3), 40, Small))
             });
@@ -344,12 +313,8 @@ pub fn cases() -> Vec<Case> {
         add("nothing-to-say".into(), true, &|m| {
             stream(m, 4, &sphere, (1, 3), 25, Zero)
         });
-        add("small".into(), true, &|m| {
-            stream(m, 4, &sphere, (1, 3), 16_384, Small)
-        });
-        add("escapes".into(), true, &|m| {
-            stream(m, 4, &cube(6), (1, 3), 50, Escapes)
-        });
+        add("small".into(), true, &|m| stream(m, 4, &sphere, (1, 3), 16_384, Small));
+        add("escapes".into(), true, &|m| stream(m, 4, &cube(6), (1, 3), 50, Escapes));
         add("extremes".into(), true, &|m| {
             stream(m, 4, &cube(5), (1, 3), 50, Extremes)
         });
@@ -361,9 +326,7 @@ pub fn cases() -> Vec<Case> {
             let corrections = Corrections { filter, residual };
             coloured(m, 5, &scattered(5, 90), (2, 4), 30, Small, corrections)
         };
-        add("filtered".into(), true, &|m| {
-            sphere_saying(m, Some((6, 20)), None)
-        });
+        add("filtered".into(), true, &|m| sphere_saying(m, Some((6, 20)), None));
         add("filtered-to-the-ends".into(), true, &|m| {
             scatter_saying(m, Some((0, 127)), None)
         });

@@ -54,13 +54,7 @@ pub fn model(name: &str) -> Model {
             },
             6,
         ),
-        "learning" => made(
-            Shape {
-                learning: true,
-                ..tiny
-            },
-            7,
-        ),
+        "learning" => made(Shape { learning: true, ..tiny }, 7),
         "lite" => {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/lite.safetensors");
             std::fs::read(path).expect("the model that ships")

@@ -62,15 +62,12 @@ fn in_pieces(decoder: &StreamDecoder, bytes: &[u8]) -> Levels {
 }
 
 #[test]
-fn every_stream_of_version_3_decodes_to_its_digests_with_every_instruction_set_and_number_of_threads()
- {
+fn every_stream_of_version_3_decodes_to_its_digests_with_every_instruction_set_and_number_of_threads() {
     let text = std::fs::read_to_string(own_folder().join("suite.txt")).expect("the suite is there");
     assert!(text.lines().count() >= 8);
     let pools = pools();
     for isa in Isa::available() {
-        let decoder = StreamDecoder::new()
-            .with_isa(isa)
-            .with_heads(HeadSet::Surfels);
+        let decoder = StreamDecoder::new().with_isa(isa).with_heads(HeadSet::Surfels);
         for line in text.lines() {
             let mut words = line.split(' ').map(str::to_owned);
             let name = words.next().expect("a name");
@@ -127,50 +124,18 @@ mod make {
         }
         vec![
             ("ball", code(&large, 3..=5, step(20.0), 32_768, true), false),
-            (
-                "fine-steps",
-                code(&ball, 2..=4, step(0.5), 100, true),
-                false,
-            ),
-            (
-                "coarse-steps",
-                code(&ball, 2..=4, step(400.0), 100, true),
-                false,
-            ),
-            (
-                "no-filter",
-                code(&ball, 2..=5, step(10.0), 60, false),
-                false,
-            ),
+            ("fine-steps", code(&ball, 2..=4, step(0.5), 100, true), false),
+            ("coarse-steps", code(&ball, 2..=4, step(400.0), 100, true), false),
+            ("no-filter", code(&ball, 2..=5, step(10.0), 60, false), false),
             ("grey", code(&grey, 2..=4, step(10.0), 60, true), false),
-            (
-                "lone-voxels",
-                code(&lone, 18..=20, step(10.0), 7, true),
-                false,
-            ),
-            (
-                "all-levels",
-                code(&ball, 0..=5, step(10.0), 32_768, true),
-                false,
-            ),
+            ("lone-voxels", code(&lone, 18..=20, step(10.0), 7, true), false),
+            ("all-levels", code(&ball, 0..=5, step(10.0), 32_768, true), false),
             ("slices-of-1", code(&root, 0..=1, step(3.0), 1, true), false),
             ("exact", code(&ball, 2..=4, lossless, 32_768, true), true),
             ("exact-slices", code(&ball, 2..=5, lossless, 20, true), true),
-            (
-                "exact-solid",
-                code(&solid, 0..=4, lossless, 300, true),
-                true,
-            ),
-            (
-                "exact-one-voxel",
-                code(&one, 7..=10, lossless, 9, true),
-                true,
-            ),
-            (
-                "exact-deepest",
-                code(&lone, 21..=21, lossless, 16, true),
-                true,
-            ),
+            ("exact-solid", code(&solid, 0..=4, lossless, 300, true), true),
+            ("exact-one-voxel", code(&one, 7..=10, lossless, 9, true), true),
+            ("exact-deepest", code(&lone, 21..=21, lossless, 16, true), true),
         ]
     }
 

@@ -17,10 +17,7 @@ fn levels(model: &Model, bytes: &[u8]) -> (Vec<Exact>, Option<String>) {
         match decoding.advance(&mut log) {
             Ok(Some(_)) => levels.extend(decoding.exact().cloned()),
             Ok(None) => {
-                return (
-                    levels,
-                    decoding.finish(&mut log).err().map(|e| e.to_string()),
-                );
+                return (levels, decoding.finish(&mut log).err().map(|e| e.to_string()));
             }
             Err(error) => return (levels, Some(error.to_string())),
         }
@@ -42,11 +39,7 @@ fn every_cut_is_noticed_and_leaves_the_whole_levels_before_it() {
         assert_eq!(error.is_none(), at_an_end, "{length} bytes: {error:?}");
         for (level, end) in &ends[1..] {
             let asked = decoded(&model, &bytes[..length], Some(*level));
-            assert_eq!(
-                asked.is_ok(),
-                *end <= length,
-                "level {level} of {length} bytes"
-            );
+            assert_eq!(asked.is_ok(), *end <= length, "level {level} of {length} bytes");
         }
     });
 }
@@ -72,10 +65,7 @@ fn all_are_noticed(changes: impl Fn(u8) -> Vec<u8> + Sync) {
             changes.len()
         })
         .sum();
-    println!(
-        "{tried} changes of a stream of {} bytes, all noticed",
-        bytes.len()
-    );
+    println!("{tried} changes of a stream of {} bytes, all noticed", bytes.len());
 }
 
 #[test]

@@ -42,9 +42,7 @@ fn result_and_error_are_those_of_the_whole_however_the_bytes_are_cut() {
                 assert_eq!(pieces, whole, "pieces of {size}, level {level:?}");
             }
             let splits = std::iter::from_fn(|| {
-                random = random
-                    .wrapping_mul(6_364_136_223_846_793_005)
-                    .wrapping_add(1);
+                random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
                 Some((random >> 33) as usize % 300)
             });
             let (_, pieces) = pushed(&model, &stream, level, splits);
@@ -61,11 +59,7 @@ fn every_level_is_given_with_its_last_byte() {
     assert_eq!(levels, ends(&bytes));
     assert!(result.is_ok());
     let (levels, _) = pushed(&model, &bytes, Some(2), repeat(1));
-    assert_eq!(
-        levels,
-        ends(&bytes)[..2],
-        "no level after the one asked for"
-    );
+    assert_eq!(levels, ends(&bytes)[..2], "no level after the one asked for");
 }
 
 #[test]
@@ -79,10 +73,7 @@ fn what_was_reached_before_the_damage_stays_usable() {
     decoding.push(&bytes);
     assert!(!decoding.is_drawable());
     assert_eq!(decoding.advance(&mut log).unwrap(), Some(1));
-    assert!(matches!(
-        decoding.gaussians(&mut log),
-        Err(Error::Unsupported { .. })
-    ));
+    assert!(matches!(decoding.gaussians(&mut log), Err(Error::Unsupported { .. })));
     assert_eq!(decoding.advance(&mut log).unwrap(), Some(2));
     let error = decoding.advance(&mut log).unwrap_err();
     assert!(matches!(error, Error::ChecksumMismatch { .. }), "{error}");
@@ -151,10 +142,7 @@ fn a_thrown_switch_stops_decoding_and_leaves_what_was_reached() {
                 stopped
             }
         };
-        assert!(
-            matches!(stopped, Err(Error::Cancelled)),
-            "{step}: {stopped:?}"
-        );
+        assert!(matches!(stopped, Err(Error::Cancelled)), "{step}: {stopped:?}");
     }
     cancel.cancel();
     let stopped = decoder.decode(&bytes, None, &mut Log::default());

@@ -24,15 +24,7 @@ fn lies(truth: u64, bits: u32) -> Vec<u64> {
         2 * truth,
         8 * truth,
     ];
-    lies.extend([
-        16_384,
-        16_385,
-        most / 8,
-        most / 2,
-        most / 2 + 1,
-        most - 1,
-        most,
-    ]);
+    lies.extend([16_384, 16_385, most / 8, most / 2, most / 2 + 1, most - 1, most]);
     lies.extend((0..bits).map(|bit| truth ^ 1 << bit));
     lies.retain(|lie| *lie != truth && *lie <= most);
     lies.sort_unstable();
@@ -91,9 +83,7 @@ fn no_lie_about_a_count_or_a_length_is_believed() {
 
 /// The byte that an error names.
 fn place(error: &str) -> Option<usize> {
-    let (_, rest) = error
-        .split_once("at: \"byte ")
-        .or(error.split_once("offset: "))?;
+    let (_, rest) = error.split_once("at: \"byte ").or(error.split_once("offset: "))?;
     let digits = rest.split(|c: char| !c.is_ascii_digit()).next();
     digits?.parse().ok()
 }
@@ -104,13 +94,8 @@ fn a_coder_s_bytes_changed_behind_the_checksums_are_refused() {
     let bytes = small_stream(&model);
     let starts = chunks(&bytes);
     // What latents of the base level are coded with, and where its voxels lie, nothing else depends on.
-    let first_feature = starts
-        .iter()
-        .position(|at| bytes[*at] == 2)
-        .expect("features");
-    let payload = |at: &usize| {
-        at + 16..at + 16 + usize::from(bytes[at + 8]) + 256 * usize::from(bytes[at + 9])
-    };
+    let first_feature = starts.iter().position(|at| bytes[*at] == 2).expect("features");
+    let payload = |at: &usize| at + 16..at + 16 + usize::from(bytes[at + 8]) + 256 * usize::from(bytes[at + 9]);
     // What corrects colours means something whatever its steps are, so nobody can tell that those were others.
     let coded = |at: &&usize| bytes[**at] <= 2;
     let tried: usize = starts[first_feature..]
@@ -128,10 +113,7 @@ fn a_coder_s_bytes_changed_behind_the_checksums_are_refused() {
                     };
                     // Counted from the start of the stream; what comes after the change may be found wrong instead.
                     if let Some(place) = place(&error) {
-                        assert!(
-                            (payload(at).start..=bytes.len()).contains(&place),
-                            "{error}"
-                        );
+                        assert!((payload(at).start..=bytes.len()).contains(&place), "{error}");
                     }
                 }
             }
@@ -156,18 +138,12 @@ fn a_colour_filter_of_another_length_or_exponent_is_refused_and_the_level_before
     for (wrong, told) in [
         (sound[1..].to_vec(), "length of the colour filter"),
         ([&sound[..], &[0]].concat(), "length of the colour filter"),
-        (
-            [&[16], &sound[1..]].concat(),
-            "exponent of the colour filter",
-        ),
+        ([&[16], &sound[1..]].concat(), "exponent of the colour filter"),
     ] {
         let bytes = with(&wrong);
         let error = decoded(&model, &bytes, Some(top)).unwrap_err();
         let named = error.contains("Malformed") && error.contains(told);
-        assert!(
-            named && place(&error).is_some_and(|at| at < bytes.len()),
-            "{error}"
-        );
+        assert!(named && place(&error).is_some_and(|at| at < bytes.len()), "{error}");
         assert_eq!(decoded(&model, &bytes, Some(top - 1)), before);
     }
 }
@@ -189,10 +165,7 @@ fn a_colour_residual_without_steps_or_with_another_code_is_refused_and_the_level
     let flipped = [&sound[1][..12], &[!sound[1][12]], &sound[1][13..]].concat();
     for (wrong, told) in [
         (vec![], "steps of the colour residual"),
-        (
-            [&[0; 4], &sound[1][4..]].concat(),
-            "steps of the colour residual",
-        ),
+        ([&[0; 4], &sound[1][4..]].concat(), "steps of the colour residual"),
         (
             [&sound[1][..4], &[64], &sound[1][5..]].concat(),
             "steps of the colour residual",
@@ -208,10 +181,7 @@ fn a_colour_residual_without_steps_or_with_another_code_is_refused_and_the_level
         let bytes = with_residual(&whole, &slices);
         let error = decoded(&model, &bytes, level).unwrap_err();
         let named = error.contains("Malformed") && error.contains(told);
-        assert!(
-            named && place(&error).is_some_and(|at| at < bytes.len()),
-            "{error}"
-        );
+        assert!(named && place(&error).is_some_and(|at| at < bytes.len()), "{error}");
         assert_eq!(decoded(&model, &bytes, Some(top.level - 1)), before);
     }
 }

@@ -15,9 +15,7 @@ const STACK: usize = 256 << 10;
 
 /// Runs it on a thread of so little stack, whose parallel work is done by threads of no more; overflowing it ends the process.
 fn on_small_stacks<T: Send>(run: impl FnOnce() -> T + Send) -> T {
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(2)
-        .stack_size(STACK);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).stack_size(STACK);
     let pool = pool.build().expect("threads start");
     pool.install(run)
 }

@@ -79,11 +79,7 @@ fn every_cut_is_noticed_and_leaves_the_whole_levels_before_it() {
         assert_eq!(error.is_none(), at_an_end, "{length} bytes: {error:?}");
         for (level, end) in &ends {
             let asked = pushed(&bytes[..length], Some(*level), [usize::MAX]).1;
-            assert_eq!(
-                asked.is_none(),
-                *end <= length,
-                "level {level} of {length} bytes"
-            );
+            assert_eq!(asked.is_none(), *end <= length, "level {level} of {length} bytes");
         }
     });
 }
@@ -121,9 +117,8 @@ fn levels_and_errors_are_those_of_the_whole_however_the_bytes_are_cut() {
     }
     for stream in variants {
         for level in [None, Some(2), Some(3), Some(9)] {
-            let only = |levels: Vec<(Found, usize)>| -> Vec<Found> {
-                levels.into_iter().map(|(found, _)| found).collect()
-            };
+            let only =
+                |levels: Vec<(Found, usize)>| -> Vec<Found> { levels.into_iter().map(|(found, _)| found).collect() };
             let (whole, error) = pushed(&stream, level, [usize::MAX]);
             let whole = only(whole);
             for size in [1, 7, 100] {
@@ -146,8 +141,7 @@ fn every_level_is_given_with_its_last_byte() {
 }
 
 #[test]
-fn what_is_wrong_behind_right_checksums_is_refused_or_told_by_the_hash_and_the_levels_before_stay()
-{
+fn what_is_wrong_behind_right_checksums_is_refused_or_told_by_the_hash_and_the_levels_before_stay() {
     let bytes = stream();
     let (whole, _) = levels(&bytes);
     let ends = ends(&bytes);

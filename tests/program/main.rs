@@ -59,16 +59,9 @@ fn fails(folder: &Path, arguments: &[&str], words: &[&str]) {
     let errors = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{arguments:?}: {errors}");
     for word in words {
-        assert!(
-            errors.contains(word),
-            "{arguments:?} should mention '{word}': {errors}"
-        );
+        assert!(errors.contains(word), "{arguments:?} should mention '{word}': {errors}");
     }
-    assert_eq!(
-        names_in(folder),
-        before,
-        "{arguments:?} left something behind"
-    );
+    assert_eq!(names_in(folder), before, "{arguments:?} left something behind");
 }
 
 /// A folder with `ball.ply`, a small coloured ball at 7 bits.
@@ -109,14 +102,8 @@ fn sparse_ball(points: usize) -> String {
          property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
     );
     for i in 0..points {
-        let (z, turn) = (
-            2.0 * (i as f64 + 0.5) / points as f64 - 1.0,
-            i as f64 * 2.399_963,
-        );
-        let (x, y) = (
-            (1.0 - z * z).sqrt() * turn.cos(),
-            (1.0 - z * z).sqrt() * turn.sin(),
-        );
+        let (z, turn) = (2.0 * (i as f64 + 0.5) / points as f64 - 1.0, i as f64 * 2.399_963);
+        let (x, y) = ((1.0 - z * z).sqrt() * turn.cos(), (1.0 - z * z).sqrt() * turn.sin());
         writeln!(ply, "{x} {y} {z} 200 80 {}", i % 256).expect("a String takes all");
     }
     ply
@@ -128,10 +115,7 @@ fn a_sparse_cloud_gets_as_many_bits_as_close_its_surface_unless_told_otherwise()
     let at = folder.path();
     std::fs::write(at.join("sparse.ply"), sparse_ball(6000)).unwrap();
     let bits = |arguments: &[&str]| {
-        let said = succeeds(
-            at,
-            &[&["encode", "sparse.ply", "-o", "s.b2p"], arguments].concat(),
-        );
+        let said = succeeds(at, &[&["encode", "sparse.ply", "-o", "s.b2p"], arguments].concat());
         let info = succeeds(at, &["info", "s.b2p", "--json"]);
         let info: serde_json::Value = serde_json::from_str(&info).expect("info prints JSON");
         (info["bits"].as_u64(), said.contains("--bits 10"))
@@ -150,8 +134,7 @@ fn a_cloud_becomes_a_stream_gaussians_and_pictures() {
 #[track_caller]
 fn becomes_pictures(at: &Path) {
     let info: serde_json::Value =
-        serde_json::from_str(&succeeds(at, &["info", "ball.b2p", "--json"]))
-            .expect("info prints JSON");
+        serde_json::from_str(&succeeds(at, &["info", "ball.b2p", "--json"])).expect("info prints JSON");
     assert_eq!(info["bits"], 7);
     assert_eq!(info["points"], Ball::new(7, 40.0).voxels().len());
     let levels: Vec<i64> = info["levels"]
@@ -165,26 +148,13 @@ fn becomes_pictures(at: &Path) {
     assert_eq!(info["total_bytes"], size);
 
     for level in ["5", "6"] {
-        succeeds(
-            at,
-            &["decode", "ball.b2p", "-o", "ball-g.ply", "--level", level],
-        );
-        let from_stream = [
-            "render", "ball.b2p", "-o", "a.png", "--size", "96x64", "--level", level,
-        ];
+        succeeds(at, &["decode", "ball.b2p", "-o", "ball-g.ply", "--level", level]);
+        let from_stream = ["render", "ball.b2p", "-o", "a.png", "--size", "96x64", "--level", level];
         succeeds(at, &from_stream);
-        succeeds(
-            at,
-            &["render", "ball-g.ply", "-o", "b.png", "--size", "96x64"],
-        );
+        succeeds(at, &["render", "ball-g.ply", "-o", "b.png", "--size", "96x64"]);
         let (a, b) = (png(&at.join("a.png")), png(&at.join("b.png")));
         assert_eq!((a.width(), a.height()), (96, 64));
-        let worst = a
-            .data()
-            .iter()
-            .zip(b.data())
-            .map(|(a, b)| a.abs_diff(*b))
-            .max();
+        let worst = a.data().iter().zip(b.data()).map(|(a, b)| a.abs_diff(*b)).max();
         assert!(
             worst <= Some(2),
             "level {level}: stream and exported Gaussians differ by {worst:?}"
@@ -203,11 +173,7 @@ fn a_residual_is_coded_as_finely_as_asked_for_and_told_by_info() {
         let info = succeeds(at, &["info", "ball.b2p", "--json"]);
         let info: Value = serde_json::from_str(&info).expect("info prints JSON");
         let of = |level: usize| info["levels"][level]["residual_bytes"].as_u64();
-        assert_eq!(
-            (of(0), of(1)),
-            (Some(0), Some(0)),
-            "coarser levels have none"
-        );
+        assert_eq!((of(0), of(1)), (Some(0), Some(0)), "coarser levels have none");
         of(2).expect("the level is whole")
     };
     let none = bytes(&["--residual", "none"]);
@@ -218,10 +184,7 @@ fn a_residual_is_coded_as_finely_as_asked_for_and_told_by_info() {
         let encode = ["encode", "ball.ply", "-o", "x.b2p", "--residual", wrong];
         let output = b2p(at, &encode);
         let errors = String::from_utf8_lossy(&output.stderr);
-        assert!(
-            !output.status.success() && errors.contains("1 to 255"),
-            "{errors}"
-        );
+        assert!(!output.status.success() && errors.contains("1 to 255"), "{errors}");
         assert!(!at.join("x.b2p").exists());
     }
 }
@@ -233,10 +196,7 @@ fn quick_heads_are_used_where_the_model_has_them() {
     let both = untrained(&Shape::tiny().with_quick_heads(), 1);
     std::fs::write(at.join("one.safetensors"), tiny_model(1)).unwrap();
     std::fs::write(at.join("both.safetensors"), both).unwrap();
-    let (one, both) = (
-        ["--model", "one.safetensors"],
-        ["--model", "both.safetensors"],
-    );
+    let (one, both) = (["--model", "one.safetensors"], ["--model", "both.safetensors"]);
     let with = |arguments: &[&str], model: &[&str]| succeeds(at, &[arguments, model].concat());
     let encode = ["encode", "ball.ply", "-o", "ball.b2p"];
     with(&[&encode[..], &["--colours", "learned"]].concat(), &one);
@@ -249,14 +209,9 @@ fn quick_heads_are_used_where_the_model_has_them() {
         "render", "ball.b2p", "--size", "40x30", "--heads", "quick", "-o", "a.png",
     ];
     with(&render, &both);
-    succeeds(
-        at,
-        &["render", "quick.ply", "--size", "40x30", "-o", "b.png"],
-    );
+    succeeds(at, &["render", "quick.ply", "--size", "40x30", "-o", "b.png"]);
     assert_eq!(png(&at.join("a.png")).data().len(), 4 * 40 * 30);
-    let bench = [
-        "bench", "ball.b2p", "--repeat", "1", "--heads", "quick", "--json",
-    ];
+    let bench = ["bench", "ball.b2p", "--repeat", "1", "--heads", "quick", "--json"];
     let bench: Value = serde_json::from_str(&with(&bench, &both)).unwrap();
     assert_eq!(bench["heads"], "quick");
     let info = |model| with(&["info", "ball.b2p"], model);
@@ -291,16 +246,8 @@ fn what_is_not_a_point_cloud_is_refused() {
     let folder = folder_with_cloud();
     let at = folder.path();
     std::fs::write(at.join("noise.ply"), b"this is no point cloud").unwrap();
-    fails(
-        at,
-        &["encode", "noise.ply", "-o", "x.b2p"],
-        &["noise.ply", "ply"],
-    );
-    fails(
-        at,
-        &["encode", "absent.ply", "-o", "x.b2p"],
-        &["absent.ply"],
-    );
+    fails(at, &["encode", "noise.ply", "-o", "x.b2p"], &["noise.ply", "ply"]);
+    fails(at, &["encode", "absent.ply", "-o", "x.b2p"], &["absent.ply"]);
 
     let header = |properties: &str, count: usize| {
         format!("ply\nformat ascii 1.0\nelement vertex {count}\n{properties}end_header\n")
@@ -308,22 +255,10 @@ fn what_is_not_a_point_cloud_is_refused() {
     let xyz = "property float x\nproperty float y\nproperty float z\n";
     let rgb = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
     std::fs::write(at.join("grey.ply"), header(xyz, 1) + "1 2 3\n").unwrap();
-    fails(
-        at,
-        &["encode", "grey.ply", "-o", "x.b2p"],
-        &["grey.ply", "red"],
-    );
+    fails(at, &["encode", "grey.ply", "-o", "x.b2p"], &["grey.ply", "red"]);
     let coloured = header(&format!("{xyz}{rgb}"), 2);
-    std::fs::write(
-        at.join("nan.ply"),
-        format!("{coloured}1 2 3 4 5 6\n1 nan 3 4 5 6\n"),
-    )
-    .unwrap();
-    fails(
-        at,
-        &["encode", "nan.ply", "-o", "x.b2p"],
-        &["nan.ply", "y", "line 12"],
-    );
+    std::fs::write(at.join("nan.ply"), format!("{coloured}1 2 3 4 5 6\n1 nan 3 4 5 6\n")).unwrap();
+    fails(at, &["encode", "nan.ply", "-o", "x.b2p"], &["nan.ply", "y", "line 12"]);
     std::fs::write(at.join("short.ply"), format!("{coloured}1 2 3 4 5 6\n")).unwrap();
     fails(at, &["encode", "short.ply", "-o", "x.b2p"], &["short.ply"]);
 }
@@ -334,11 +269,7 @@ fn a_damaged_stream_is_refused_and_nothing_is_written() {
     let at = folder.path();
     let stream = std::fs::read(at.join("ball.b2p")).unwrap();
 
-    fails(
-        at,
-        &["decode", "ball.ply", "-o", "x.ply"],
-        &["ball.ply", "b2p"],
-    );
+    fails(at, &["decode", "ball.ply", "-o", "x.ply"], &["ball.ply", "b2p"]);
     std::fs::write(at.join("cut.b2p"), &stream[..stream.len() - 1]).unwrap();
     fails(
         at,
@@ -361,14 +292,7 @@ fn another_model_is_recognised_before_anything_is_decoded() {
     let folder = folder_with_learned_stream();
     let at = folder.path();
     std::fs::write(at.join("other.safetensors"), tiny_model(1)).unwrap();
-    let arguments = [
-        "decode",
-        "ball.b2p",
-        "-o",
-        "x.ply",
-        "--model",
-        "other.safetensors",
-    ];
+    let arguments = ["decode", "ball.b2p", "-o", "x.ply", "--model", "other.safetensors"];
     fails(at, &arguments, &["model"]);
     let no_model = ["decode", "ball.b2p", "-o", "x.ply", "--model", "ball.ply"];
     fails(at, &no_model, &["ball.ply"]);
@@ -394,41 +318,19 @@ fn a_pipe_is_decoded_and_drawn_like_a_file() {
 fn drawn_like_a_file(at: &Path) {
     let stream = std::fs::read(at.join("ball.b2p")).unwrap();
     let size = ["--size", "48x32"];
-    succeeds(
-        at,
-        &[&["render", "ball.b2p", "-o", "file.png"], &size[..]].concat(),
-    );
-    let done = piped(
-        at,
-        &[&["render", "-", "-o", "pipe.png"], &size[..]].concat(),
-        &stream,
-    );
+    succeeds(at, &[&["render", "ball.b2p", "-o", "file.png"], &size[..]].concat());
+    let done = piped(at, &[&["render", "-", "-o", "pipe.png"], &size[..]].concat(), &stream);
     assert!(done.status.success());
     let [file, pipe] = ["file.png", "pipe.png"].map(|name| std::fs::read(at.join(name)).unwrap());
     assert!(file == pipe);
-    let done = piped(
-        at,
-        &[&["render", "-", "-o", "-"], &size[..]].concat(),
-        &stream,
-    );
-    assert!(
-        done.stdout == file,
-        "one picture on standard output, the finest"
-    );
+    let done = piped(at, &[&["render", "-", "-o", "-"], &size[..]].concat(), &stream);
+    assert!(done.stdout == file, "one picture on standard output, the finest");
 
     succeeds(at, &["decode", "ball.b2p", "-o", "file.ply"]);
-    assert!(
-        piped(at, &["decode", "-", "-o", "pipe.ply"], &stream)
-            .status
-            .success()
-    );
+    assert!(piped(at, &["decode", "-", "-o", "pipe.ply"], &stream).status.success());
     let [file, pipe] = ["file.ply", "pipe.ply"].map(|name| std::fs::read(at.join(name)).unwrap());
     assert!(file == pipe);
-    let done = piped(
-        at,
-        &[&["render", "-", "-o", "g.png"], &size[..]].concat(),
-        &file,
-    );
+    let done = piped(at, &[&["render", "-", "-o", "g.png"], &size[..]].concat(), &file);
     assert!(done.status.success(), "Gaussians come through a pipe too");
 }
 
@@ -445,32 +347,18 @@ fn breaks_off(at: &Path) {
     let done = piped(at, &["decode", "-", "-o", "cut.ply"], cut);
     let told = String::from_utf8_lossy(&done.stderr).into_owned();
     assert!(done.status.success(), "{told}");
-    assert!(
-        told.contains("truncated") && told.contains("level 5"),
-        "{told}"
-    );
-    succeeds(
-        at,
-        &["decode", "ball.b2p", "-o", "five.ply", "--level", "5"],
-    );
+    assert!(told.contains("truncated") && told.contains("level 5"), "{told}");
+    succeeds(at, &["decode", "ball.b2p", "-o", "five.ply", "--level", "5"]);
     let [cut_ply, five] = ["cut.ply", "five.ply"].map(|name| std::fs::read(at.join(name)).unwrap());
     assert!(cut_ply == five);
 
     let named = piped(at, &["decode", "-", "-o", "x.ply", "--level", "6"], cut);
-    assert_eq!(
-        named.status.code(),
-        Some(1),
-        "the level asked for is not there"
-    );
+    assert_eq!(named.status.code(), Some(1), "the level asked for is not there");
     let nothing = piped(at, &["decode", "-", "-o", "x.ply"], &stream[..100]);
     assert_eq!(nothing.status.code(), Some(1));
     let mut damaged = stream.clone();
     damaged[stream.len() - 1] ^= 1;
-    let damaged = piped(
-        at,
-        &["decode", "-", "-o", "y.ply", "--level", "6"],
-        &damaged,
-    );
+    let damaged = piped(at, &["decode", "-", "-o", "y.ply", "--level", "6"], &damaged);
     assert!(String::from_utf8_lossy(&damaged.stderr).contains("checksum"));
     assert!(!at.join("x.ply").exists() && !at.join("y.ply").exists());
 }
@@ -481,19 +369,11 @@ fn limits_can_be_set_and_say_how_to_raise_them() {
     let at = folder.path();
     let decode = ["decode", "ball.b2p", "-o", "x.ply"];
     for limit in [["--max-memory", "1M"], ["--max-points", "10"]] {
-        fails(
-            at,
-            &[&decode[..], &limit].concat(),
-            &["ball.b2p", "limit of", limit[0]],
-        );
+        fails(at, &[&decode[..], &limit].concat(), &["ball.b2p", "limit of", limit[0]]);
     }
     let render = ["render", "ball.b2p", "-o", "x.png"];
     let few = ["--max-pixels", "1000"];
-    fails(
-        at,
-        &[&render[..], &few].concat(),
-        &["1048576", "--max-pixels"],
-    );
+    fails(at, &[&render[..], &few].concat(), &["1048576", "--max-pixels"]);
     let roomy = ["--limits", "embedded", "--max-memory", "1G"];
     succeeds(at, &[&decode[..], &roomy].concat());
 }

@@ -25,11 +25,6 @@ fn an_output_that_is_a_fifo_or_a_link_stays_what_it_is() {
         });
         decode("fifo.ply");
         assert_eq!(reader.join().unwrap(), expected);
-        assert!(
-            std::fs::symlink_metadata(&fifo)
-                .unwrap()
-                .file_type()
-                .is_fifo()
-        );
+        assert!(std::fs::symlink_metadata(&fifo).unwrap().file_type().is_fifo());
     }
 }

@@ -12,9 +12,7 @@ fn several_views_are_numbered_and_differ() {
             "render", "ball.b2p", "-o", "turn.png", "--views", "3", "--size", "48x48",
         ],
     );
-    let pictures: Vec<_> = (0..3)
-        .map(|i| png(&at.join(format!("turn-{i:03}.png"))))
-        .collect();
+    let pictures: Vec<_> = (0..3).map(|i| png(&at.join(format!("turn-{i:03}.png")))).collect();
     assert!(pictures[0].data() != pictures[1].data());
     assert!(!at.join("turn.png").exists());
 }
@@ -87,10 +85,7 @@ fn a_small_picture_is_drawn_from_a_coarser_level_unless_one_is_named() {
             succeeds(folder.path(), &[&args[..], more].concat())
         };
         let small = draw(&["--size", "8x8"]);
-        assert!(
-            small.contains(&format!("detail on: level {coarsest}")),
-            "{small}"
-        );
+        assert!(small.contains(&format!("detail on: level {coarsest}")), "{small}");
         assert!(draw(&["--size", "400x400"]).contains("detail off: as fine as there is"));
         assert!(draw(&["--size", "8x8", "--level", "6"]).contains("detail off: level 6, forced"));
     }
@@ -99,16 +94,11 @@ fn a_small_picture_is_drawn_from_a_coarser_level_unless_one_is_named() {
 #[test]
 fn drawing_is_timed_stage_by_stage() {
     let folder = folder_with_stream();
-    let args = [
-        "bench", "ball.b2p", "--render", "--size", "64x48", "--repeat", "2",
-    ];
+    let args = ["bench", "ball.b2p", "--render", "--size", "64x48", "--repeat", "2"];
     assert!(succeeds(folder.path(), &args).contains("blend"));
     let json = succeeds(folder.path(), &[&args[..], &["--json"]].concat());
     let json: serde_json::Value = serde_json::from_str(&json).unwrap();
-    assert_eq!(
-        (json["width"].as_u64(), json["runs"].as_u64()),
-        (Some(64), Some(2))
-    );
+    assert_eq!((json["width"].as_u64(), json["runs"].as_u64()), (Some(64), Some(2)));
     let frame = json["median_ms"]["frame"].as_f64().unwrap();
     assert!(frame >= json["median_ms"]["project"].as_f64().unwrap());
 }
@@ -124,10 +114,7 @@ fn cameras_come_from_a_file_and_a_broken_one_is_named() {
         )
     };
     let file = |shots: &[String]| {
-        let text = format!(
-            r#"{{"camera_angle_x": 0.8, "frames": [{}]}}"#,
-            shots.join(",")
-        );
+        let text = format!(r#"{{"camera_angle_x": 0.8, "frames": [{}]}}"#, shots.join(","));
         std::fs::write(at.join("transforms.json"), text).unwrap();
     };
     let args = [
@@ -147,10 +134,7 @@ fn cameras_come_from_a_file_and_a_broken_one_is_named() {
     let done = b2p(at, &args);
     assert_eq!(done.status.code(), Some(1));
     let error = String::from_utf8(done.stderr).unwrap();
-    assert!(
-        error.contains("transforms.json") && error.contains("scales"),
-        "{error}"
-    );
+    assert!(error.contains("transforms.json") && error.contains("scales"), "{error}");
 }
 
 #[test]

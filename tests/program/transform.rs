@@ -51,14 +51,10 @@ fn bits_per_point_are_kept_to_and_what_is_said_makes_the_same_stream() {
         at,
         &[&["encode", "ball.ply", "-o", "by-hand.b2p"], &by_hand[..]].concat(),
     );
-    let [found, by_hand] =
-        ["ball.b2p", "by-hand.b2p"].map(|name| std::fs::read(at.join(name)).unwrap());
+    let [found, by_hand] = ["ball.b2p", "by-hand.b2p"].map(|name| std::fs::read(at.join(name)).unwrap());
     assert!(found == by_hand, "what is said makes the same stream");
     let said = succeeds(at, &[&encode[..], &["1000"]].concat());
-    assert!(
-        said.contains("of at most 1000: level 7, exact colours"),
-        "{said}"
-    );
+    assert!(said.contains("of at most 1000: level 7, exact colours"), "{said}");
 }
 
 #[test]
@@ -92,13 +88,8 @@ fn a_budget_chooses_the_finest_level_in_time() {
     let roomy = succeeds(at, &[&decode[..], &["100s"]].concat());
     assert!(roomy.contains("budget: level 6; kept"), "{roomy}");
     let tight = succeeds(at, &[&decode[..], &["0.001ms"]].concat());
-    assert!(
-        tight.contains("budget: level 4, which was not expected"),
-        "{tight}"
-    );
-    let render = [
-        "render", "ball.b2p", "-o", "x.png", "--size", "48x32", "--budget",
-    ];
+    assert!(tight.contains("budget: level 4, which was not expected"), "{tight}");
+    let render = ["render", "ball.b2p", "-o", "x.png", "--size", "48x32", "--budget"];
     let drawn = succeeds(at, &[&render[..], &["100s"]].concat());
     assert!(drawn.contains("budget: level 6; kept"), "{drawn}");
     let psnr = ["decode", "ball.b2p", "-o", "y.ply", "--min-psnr", "40"];
@@ -111,10 +102,7 @@ fn stages_are_timed() {
     let bench = ["bench", "ball.b2p", "--repeat", "1", "--json"];
     let bench: Value = serde_json::from_str(&succeeds(folder.path(), &bench)).unwrap();
     let stages = bench["stages"].as_array().expect("a list");
-    let names: Vec<_> = stages
-        .iter()
-        .filter_map(|stage| stage["stage"].as_str())
-        .collect();
+    let names: Vec<_> = stages.iter().filter_map(|stage| stage["stage"].as_str()).collect();
     assert!(names.contains(&"colours of level 6"), "{names:?}");
     assert_eq!(bench["level"], 6);
 }

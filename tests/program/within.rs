@@ -18,12 +18,8 @@ fn a_stream_of_at_most_so_many_bits_is_made_and_said_to_be() {
     );
     assert!(said.contains(&words), "{said}");
     let step = said.trim().rsplit("residual in steps of ").next().unwrap();
-    succeeds(
-        at,
-        &[&learned[..], &["-o", "by-hand.b2p", "--residual", step]].concat(),
-    );
-    let [found, by_hand] =
-        ["ball.b2p", "by-hand.b2p"].map(|name| std::fs::read(at.join(name)).unwrap());
+    succeeds(at, &[&learned[..], &["-o", "by-hand.b2p", "--residual", step]].concat());
+    let [found, by_hand] = ["ball.b2p", "by-hand.b2p"].map(|name| std::fs::read(at.join(name)).unwrap());
     assert!(found == by_hand, "what is said makes the same stream");
     succeeds(at, &["decode", "ball.b2p", "-o", "ball-g.ply"]);
 

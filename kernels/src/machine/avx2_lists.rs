@@ -73,8 +73,7 @@ pub(crate) unsafe fn fill_map(lists: Lists<'_>) -> usize {
             }
             let block = transpose(block);
             for (k, &entries) in (tap..tap + taps).zip(&block) {
-                let used =
-                    !_mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpeq_epi32(entries, absent)));
+                let used = !_mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpeq_epi32(entries, absent)));
                 let used = (used & 0xff) as usize;
                 ends = _mm256_max_epu32(ends, _mm256_sub_epi32(entries, absent));
                 let places = _mm_cvtsi64_si128(PLACES[used].cast_signed());

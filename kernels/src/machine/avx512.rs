@@ -181,10 +181,7 @@ pub(crate) unsafe fn to_brain(input: &[f16], rows: &[u32], cin: usize, to: &mut 
     for (to, &row) in to.chunks_exact_mut(words).zip(rows) {
         let from = &input[row as usize * cin..][..cin];
         for (to, from) in to.chunks_mut(PANEL).zip(from.chunks(2 * PANEL)) {
-            let (here, there) = (
-                u32::MAX >> (32 - from.len()),
-                u16::MAX >> (PANEL - to.len()),
-            );
+            let (here, there) = (u32::MAX >> (32 - from.len()), u16::MAX >> (PANEL - to.len()));
             // SAFETY: only the values that are there are read, and only the words that are there written. The types are 512 bits
             // of anything.
             unsafe {

@@ -46,10 +46,7 @@ pub(crate) struct Buffers {
 impl Weights {
     /// Cuts the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, into digits; nothing, if one is too large
     /// for that.
-    pub fn new(
-        extents: Extents,
-        weights: impl Fn(usize, usize, usize) -> [i16; PANEL],
-    ) -> Option<Weights> {
+    pub fn new(extents: Extents, weights: impl Fn(usize, usize, usize) -> [i16; PANEL]) -> Option<Weights> {
         let Extents { volume, cin, cout } = extents;
         let (steps, halves) = (cin.div_ceil(STEP), cout.div_ceil(HALF));
         let mut packed = vec![Half::default(); halves * volume * steps * DIGITS];
@@ -65,8 +62,7 @@ impl Weights {
                 let (high, low) = digits(weight);
                 let step = (half * volume + tap) * steps + channel / STEP;
                 for (k, digit) in [high, low, high + low].into_iter().enumerate() {
-                    packed[step * DIGITS + k].0[lane % HALF] |=
-                        u32::from(digit as u8) << (8 * (channel % STEP));
+                    packed[step * DIGITS + k].0[lane % HALF] |= u32::from(digit as u8) << (8 * (channel % STEP));
                 }
             }
         }
@@ -206,10 +202,7 @@ unsafe fn multiply(block: &Block) {
                 let place = usize::from(*block.places.add(t * ROWS + r));
                 *input = input.add(place * block.row);
             }
-            let mut weights = block
-                .weights
-                .add(usize::from(tap) * block.steps * DIGITS)
-                .cast::<i8>();
+            let mut weights = block.weights.add(usize::from(tap) * block.steps * DIGITS).cast::<i8>();
             for _ in 0..block.steps {
                 let mut digits = [vdupq_n_s8(0); ROWS];
                 for (digits, input) in digits.iter_mut().zip(&mut inputs) {

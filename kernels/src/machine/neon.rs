@@ -265,23 +265,13 @@ unsafe impl Registers for Convert {
     #[inline(always)]
     unsafe fn add32(a: int16x8_t, b: int16x8_t) -> int16x8_t {
         // SAFETY: the caller's promise.
-        unsafe {
-            vreinterpretq_s16_s32(vaddq_s32(
-                vreinterpretq_s32_s16(a),
-                vreinterpretq_s32_s16(b),
-            ))
-        }
+        unsafe { vreinterpretq_s16_s32(vaddq_s32(vreinterpretq_s32_s16(a), vreinterpretq_s32_s16(b))) }
     }
 
     #[inline(always)]
     unsafe fn sub32(a: int16x8_t, b: int16x8_t) -> int16x8_t {
         // SAFETY: the caller's promise.
-        unsafe {
-            vreinterpretq_s16_s32(vsubq_s32(
-                vreinterpretq_s32_s16(a),
-                vreinterpretq_s32_s16(b),
-            ))
-        }
+        unsafe { vreinterpretq_s16_s32(vsubq_s32(vreinterpretq_s32_s16(a), vreinterpretq_s32_s16(b))) }
     }
 
     #[inline(always)]

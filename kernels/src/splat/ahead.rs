@@ -40,13 +40,7 @@ impl<L: Lanes> Ahead<L> {
     /// The first and the end of the pixels along x (`k` 0) or y (1) that see the box around what reaches from `centre` by `half`: seen
     /// where it is widest, from nearest to farthest.
     #[inline(always)]
-    pub fn covered<const VARIANT: u8>(
-        &self,
-        camera: &Camera<L>,
-        k: usize,
-        centre: L,
-        half: L,
-    ) -> [L; 2] {
+    pub fn covered<const VARIANT: u8>(&self, camera: &Camera<L>, k: usize, centre: L, half: L) -> [L; 2] {
         let zero = L::splat(0.0);
         let half = centre.abs().add(half).mul_add(L::splat(MARGIN), half);
         let (mut first, mut end) = (centre.sub(half), centre.add(half));
@@ -58,9 +52,6 @@ impl<L: Lanes> Ahead<L> {
         let [low, high] = camera.window[k];
         let first = first.mul_add(focal, middle).sub(L::splat(1.5));
         let end = end.mul_add(focal, middle).add(L::splat(1.5));
-        [
-            first.max(low).min(high).ceil(),
-            end.max(low).min(high).floor(),
-        ]
+        [first.max(low).min(high).ceil(), end.max(low).min(high).floor()]
     }
 }

@@ -6,8 +6,7 @@ use std::arch::x86_64::*;
 
 use super::Ellipse;
 use super::lanes::{
-    Double, EXP2, LEAST_POWER, Lanes, Mask, ROUND, binary, four, instructions, numbered,
-    polynomial, three,
+    Double, EXP2, LEAST_POWER, Lanes, Mask, ROUND, binary, four, instructions, numbered, polynomial, three,
 };
 
 /// For each mask of eight lanes, the lanes that it holds, in order.
@@ -81,10 +80,7 @@ impl Lanes for Avx2 {
 
     #[inline(always)]
     fn abs(self) -> Self {
-        Avx2(instructions!(_mm256_andnot_ps(
-            _mm256_set1_ps(-0.0),
-            self.0
-        )))
+        Avx2(instructions!(_mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0)))
     }
 
     #[inline(always)]
@@ -131,9 +127,7 @@ impl Lanes for Avx2 {
 
     #[inline(always)]
     fn to_integer(self) -> Self {
-        Avx2(instructions!(_mm256_castsi256_ps(_mm256_cvttps_epi32(
-            self.0
-        ))))
+        Avx2(instructions!(_mm256_castsi256_ps(_mm256_cvttps_epi32(self.0))))
     }
 
     #[inline(always)]
@@ -224,9 +218,7 @@ impl Lanes for Avx2 {
 
     #[inline(always)]
     fn to_float(self) -> Self {
-        Avx2(instructions!(_mm256_cvtepi32_ps(_mm256_castps_si256(
-            self.0
-        ))))
+        Avx2(instructions!(_mm256_cvtepi32_ps(_mm256_castps_si256(self.0))))
     }
 
     #[inline(always)]
@@ -346,11 +338,9 @@ impl Double for Double8 {
             _mm256_castpd_ps(low),
             _mm256_castpd_ps(high)
         ));
-        Mask8(instructions!(_mm256_castpd_ps(_mm256_permute4x64_pd::<
-            0b11_01_10_00,
-        >(_mm256_castps_pd(
-            halves
-        )))))
+        Mask8(instructions!(_mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(
+            _mm256_castps_pd(halves)
+        ))))
     }
 }
 

@@ -5,9 +5,7 @@
 use std::arch::x86_64::*;
 
 use super::Ellipse;
-use super::lanes::{
-    Double, EXP2_ABOVE, Lanes, Mask, binary, four, instructions, numbered, polynomial, three,
-};
+use super::lanes::{Double, EXP2_ABOVE, Lanes, Mask, binary, four, instructions, numbered, polynomial, three};
 
 /// Sixteen floats.
 #[derive(Clone, Copy)]
@@ -81,16 +79,12 @@ impl Lanes for Avx512 {
 
     #[inline(always)]
     fn lt(self, other: Self) -> Mask16 {
-        Mask16(instructions!(_mm512_cmp_ps_mask::<_CMP_LT_OQ>(
-            self.0, other.0
-        )))
+        Mask16(instructions!(_mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, other.0)))
     }
 
     #[inline(always)]
     fn le(self, other: Self) -> Mask16 {
-        Mask16(instructions!(_mm512_cmp_ps_mask::<_CMP_LE_OQ>(
-            self.0, other.0
-        )))
+        Mask16(instructions!(_mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, other.0)))
     }
 
     #[inline(always)]
@@ -106,18 +100,16 @@ impl Lanes for Avx512 {
     #[inline(always)]
     fn exp2(self) -> Self {
         // What is beyond the integer below; scaling takes that integer by itself.
-        let f = instructions!(_mm512_reduce_ps::<
-            { _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC },
-        >(self.0));
+        let f = instructions!(_mm512_reduce_ps::<{ _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC }>(
+            self.0
+        ));
         let p = polynomial(Avx512(f), &EXP2_ABOVE);
         Avx512(instructions!(_mm512_scalef_ps(p.0, self.0)))
     }
 
     #[inline(always)]
     fn to_integer(self) -> Self {
-        Avx512(instructions!(_mm512_castsi512_ps(_mm512_cvttps_epi32(
-            self.0
-        ))))
+        Avx512(instructions!(_mm512_castsi512_ps(_mm512_cvttps_epi32(self.0))))
     }
 
     #[inline(always)]
@@ -130,10 +122,7 @@ impl Lanes for Avx512 {
 
     #[inline(always)]
     fn compress(self, which: u32) -> Self {
-        Avx512(instructions!(_mm512_maskz_compress_ps(
-            which as u16,
-            self.0
-        )))
+        Avx512(instructions!(_mm512_maskz_compress_ps(which as u16, self.0)))
     }
 
     #[inline(always)]
@@ -203,9 +192,7 @@ impl Lanes for Avx512 {
 
     #[inline(always)]
     fn to_float(self) -> Self {
-        Avx512(instructions!(_mm512_cvtepi32_ps(_mm512_castps_si512(
-            self.0
-        ))))
+        Avx512(instructions!(_mm512_cvtepi32_ps(_mm512_castps_si512(self.0))))
     }
 
     #[inline(always)]
@@ -239,10 +226,9 @@ impl Lanes for Avx512 {
     #[inline(always)]
     fn split(self) -> (Self, Self) {
         (
-            Avx512(instructions!(_mm512_getmant_ps::<
-                _MM_MANT_NORM_1_2,
-                _MM_MANT_SIGN_SRC,
-            >(self.0))),
+            Avx512(instructions!(
+                _mm512_getmant_ps::<_MM_MANT_NORM_1_2, _MM_MANT_SIGN_SRC>(self.0)
+            )),
             Avx512(instructions!(_mm512_getexp_ps(self.0))),
         )
     }

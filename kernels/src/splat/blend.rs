@@ -242,9 +242,7 @@ fn write(tile: &Tile, behind: [f32; 4], rows: &mut [[f32; 4]], stride: usize, co
             let end = (x1 - i * side).min(side);
             let pixels;
             (pixels, row) = row.split_at_mut(end - first);
-            let part = |from: &[f32; AREA]| -> [f32; SIDE as usize] {
-                std::array::from_fn(|i| from[lanes + i])
-            };
+            let part = |from: &[f32; AREA]| -> [f32; SIDE as usize] { std::array::from_fn(|i| from[lanes + i]) };
             let through = part(&block.through);
             let [r, g, b] = [0, 1, 2].map(|k| part(&block.colour[k]));
             let mixed: [[f32; 4]; SIDE as usize] = std::array::from_fn(|i| {

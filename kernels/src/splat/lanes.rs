@@ -108,13 +108,7 @@ pub(super) trait Double: Copy {
 pub(super) const EXP2: [f32; 5] = [9.582_853e-3, 5.590_642_6e-2, 2.402_41e-1, 6.931_242e-1, 1.0];
 /// As [`EXP2`], on `[0, 1]`.
 #[cfg(target_arch = "x86_64")]
-pub(super) const EXP2_ABOVE: [f32; 5] = [
-    1.342_679_7e-2,
-    5.224_229_4e-2,
-    2.412_802_9e-1,
-    6.930_448_4e-1,
-    1.0,
-];
+pub(super) const EXP2_ABOVE: [f32; 5] = [1.342_679_7e-2, 5.224_229_4e-2, 2.412_802_9e-1, 6.930_448_4e-1, 1.0];
 /// Relative error of [`Lanes::exp2`].
 #[cfg(test)]
 pub(super) const EXP2_ERROR: f64 = 3.1e-6;

@@ -1,9 +1,7 @@
 //! Which blocks of a tile each ellipse reaches.
 
 use super::Ellipse;
-use super::blend::{
-    ALL_BLOCKS, AREA, BLOCKS, IDS, ORDER, PLAIN, SHARES, SIDE, Scene, Share, TILE, Tile, rectangle,
-};
+use super::blend::{ALL_BLOCKS, AREA, BLOCKS, IDS, ORDER, PLAIN, SHARES, SIDE, Scene, Share, TILE, Tile, rectangle};
 use super::lanes::{Lanes, Mask, four};
 use super::pixels;
 
@@ -36,11 +34,7 @@ const fn lane_places(row: bool, step: f32, middle: f32) -> [f32; AREA] {
     let mut places = [0.0; AREA];
     let mut i = 0;
     while i < AREA {
-        let place = if row {
-            i / SIDE as usize
-        } else {
-            i % SIDE as usize
-        };
+        let place = if row { i / SIDE as usize } else { i % SIDE as usize };
         places[i] = place as f32 * step - middle;
         i += 1;
     }
@@ -163,12 +157,7 @@ impl Work {
 impl Tile {
     /// Blends ellipses, nearest first.
     #[inline(always)]
-    pub(super) fn work_through<L: Lanes, const WHAT: u8>(
-        &mut self,
-        keys: &[u64],
-        next: &[u64],
-        scene: Scene,
-    ) {
+    pub(super) fn work_through<L: Lanes, const WHAT: u8>(&mut self, keys: &[u64], next: &[u64], scene: Scene) {
         prefetch(scene.all, next);
         for turn in keys.chunks(SPLATS) {
             for (i, some) in turn.chunks(L::COUNT).enumerate() {
@@ -276,31 +265,18 @@ impl Tile {
                 pixels::blend::<L>(block, splat, [u, v])
             } else {
                 let more = &work.more[number];
-                let (x, y) = (
-                    SIDE * (place as u32 % BLOCKS),
-                    SIDE * (place as u32 / BLOCKS),
-                );
+                let (x, y) = (SIDE * (place as u32 % BLOCKS), SIDE * (place as u32 / BLOCKS));
                 let at = [x, y];
                 let crossing = scene.crossing.get(more.crossing);
                 match WHAT {
                     ORDER => {
                         let pending = &mut self.pending[place];
                         let corner = self.corner;
-                        pending.add::<L>(
-                            block,
-                            splat,
-                            [u, v],
-                            more,
-                            at,
-                            corner,
-                            crossing,
-                            self.least,
-                        )
+                        pending.add::<L>(block, splat, [u, v], more, at, corner, crossing, self.least)
                     }
                     IDS | SHARES => {
                         let form = [u, v];
-                        let weights =
-                            pixels::weigh::<L>(block, splat, form, at, self.corner, crossing);
+                        let weights = pixels::weigh::<L>(block, splat, form, at, self.corner, crossing);
                         let index = more.index;
                         match weights {
                             Some(weights) if WHAT == IDS => {
@@ -312,9 +288,7 @@ impl Tile {
                         weights.is_some()
                     }
                     _ => match crossing {
-                        Some(crossing) => {
-                            pixels::cross::<L>(block, splat, at, self.corner, crossing)
-                        }
+                        Some(crossing) => pixels::cross::<L>(block, splat, at, self.corner, crossing),
                         None => pixels::blend::<L>(block, splat, [u, v]),
                     },
                 }
@@ -332,9 +306,7 @@ impl Tile {
 fn more<const WHAT: u8>(ellipse: &Ellipse, place: usize, corner: [f32; 2], scene: Scene) -> More {
     let mut crossing = usize::MAX;
     if ellipse.crosses() {
-        let found = scene
-            .crossing
-            .binary_search_by_key(&ellipse.index, |c| c.index);
+        let found = scene.crossing.binary_search_by_key(&ellipse.index, |c| c.index);
         crossing = found.unwrap_or(usize::MAX);
     }
     let depth = if WHAT == ORDER {

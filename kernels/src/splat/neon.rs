@@ -5,9 +5,7 @@
 use std::arch::aarch64::*;
 
 use super::Ellipse;
-use super::lanes::{
-    Double, EXP2, LEAST_POWER, Lanes, Mask, ROUND, binary, four, instructions, numbered, polynomial,
-};
+use super::lanes::{Double, EXP2, LEAST_POWER, Lanes, Mask, ROUND, binary, four, instructions, numbered, polynomial};
 
 /// For each mask of four lanes, the bytes of the lanes that it holds, in order.
 static FIRST: [[u8; 16]; 16] = {
@@ -140,9 +138,7 @@ impl Lanes for Neon {
         let shifted = x.add(Self::splat(ROUND));
         let f = x.sub(shifted.sub(Self::splat(ROUND)));
         let p = polynomial(f, &EXP2);
-        p.add_integer(Self::of_integers(instructions!(vshlq_n_u32::<23>(
-            shifted.integers()
-        ))))
+        p.add_integer(Self::of_integers(instructions!(vshlq_n_u32::<23>(shifted.integers()))))
     }
 
     #[inline(always)]
@@ -257,10 +253,7 @@ impl Double for Double4 {
 
     #[inline(always)]
     fn to_lanes(self) -> Neon {
-        Neon(instructions!(vcvt_high_f32_f64(
-            vcvt_f32_f64(self.0),
-            self.1
-        )))
+        Neon(instructions!(vcvt_high_f32_f64(vcvt_f32_f64(self.0), self.1)))
     }
 
     #[inline(always)]

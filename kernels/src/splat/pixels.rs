@@ -59,23 +59,14 @@ fn planar<L: Lanes>(splat: &Splat, [u, v]: [f32; 2], lanes: usize) -> L {
 
 /// α of a Gaussian that reaches over the near plane, and the depth where it is greatest.
 #[inline(always)]
-fn spatial<L: Lanes>(
-    splat: &Splat,
-    at: [u32; 2],
-    corner: [u32; 2],
-    crossing: &Crossing,
-    lanes: usize,
-) -> (L, L) {
+fn spatial<L: Lanes>(splat: &Splat, at: [u32; 2], corner: [u32; 2], crossing: &Crossing, lanes: usize) -> (L, L) {
     let middle = |k: usize| L::splat((corner[k] + at[k]) as f32 + 0.5 * SIDE as f32);
     let x = L::load(&COLUMNS[lanes..]).add(middle(0));
     let y = L::load(&ROWS[lanes..]).add(middle(1));
     let zero = L::splat(0.0);
     let (mut from, mut along) = ([zero; 3], [zero; 3]);
     for k in 0..3 {
-        for (to, [a, b, c]) in [
-            (&mut from[k], crossing.from[k]),
-            (&mut along[k], crossing.along[k]),
-        ] {
+        for (to, [a, b, c]) in [(&mut from[k], crossing.from[k]), (&mut along[k], crossing.along[k])] {
             *to = x.mul_add(L::splat(a), y.mul_add(L::splat(b), L::splat(c)));
         }
     }
@@ -217,11 +208,7 @@ impl Pending {
                 }
             };
             // What is as good as nothing needs no place, and goes first.
-            let depth = L::select(
-                L::splat(least).le(alpha),
-                depth,
-                L::splat(f32::NEG_INFINITY),
-            );
+            let depth = L::select(L::splat(least).le(alpha), depth, L::splat(f32::NEG_INFINITY));
             let [r, g, b] = splat.colour;
             let mut new = [depth, alpha, L::splat(r), L::splat(g), L::splat(b)];
             let mut nearest = new;

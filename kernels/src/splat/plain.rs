@@ -157,9 +157,7 @@ impl Lanes for Plain {
 
     #[inline(always)]
     fn add_integer(self, other: Self) -> Self {
-        self.both(other, |a, b| {
-            f32::from_bits(a.to_bits().wrapping_add(b.to_bits()))
-        })
+        self.both(other, |a, b| f32::from_bits(a.to_bits().wrapping_add(b.to_bits())))
     }
 
     #[inline(always)]

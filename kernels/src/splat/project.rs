@@ -109,23 +109,12 @@ pub fn project(isa: Isa, view: &View, cloud: Cloud, first: u32, out: &mut [Ellip
     }
 }
 
-fn run<const VARIANT: u8>(
-    isa: Isa,
-    view: &View,
-    cloud: Cloud,
-    first: u32,
-    out: &mut [Ellipse],
-) -> Tally {
+fn run<const VARIANT: u8>(isa: Isa, view: &View, cloud: Cloud, first: u32, out: &mut [Ellipse]) -> Tally {
     by_level!(isa, fn body<const VARIANT: u8>(view: &View, cloud: Cloud, first: u32, out: &mut [Ellipse]) -> Tally)
 }
 
 #[inline(always)]
-fn body<L: Lanes, const VARIANT: u8>(
-    view: &View,
-    cloud: Cloud,
-    first: u32,
-    out: &mut [Ellipse],
-) -> Tally {
+fn body<L: Lanes, const VARIANT: u8>(view: &View, cloud: Cloud, first: u32, out: &mut [Ellipse]) -> Tally {
     let count = cloud.position.len();
     let lengths = [
         cloud.scale.len(),
@@ -228,14 +217,7 @@ impl<L: Lanes> Camera<L> {
     /// The centre is transformed in double precision: the sum of a rotated position and a distant camera's translation is the one
     /// place where digits are lost.
     #[inline(always)]
-    fn see<const VARIANT: u8>(
-        &self,
-        group: Cloud,
-        count: usize,
-        index: u32,
-        tally: &mut Tally,
-        out: &mut [Ellipse],
-    ) {
+    fn see<const VARIANT: u8>(&self, group: Cloud, count: usize, index: u32, tally: &mut Tally, out: &mut [Ellipse]) {
         let (zero, one) = (L::splat(0.0), L::splat(1.0));
         let position = L::deal3(group.position);
         let scale = L::deal3(group.scale);
@@ -441,9 +423,7 @@ fn rotation_matrix<L: Lanes>(mut q: [L; 4]) -> ([[L; 3]; 3], L::Mask) {
     let [w, x, y, z] = q;
     let largest = w.abs().max(x.abs()).max(y.abs().max(z.abs()));
     let mut length = squared(q);
-    let usual = L::splat(LENGTHS[0])
-        .le(length)
-        .and(length.le(L::splat(LENGTHS[1])));
+    let usual = L::splat(LENGTHS[0]).le(length).and(length.le(L::splat(LENGTHS[1])));
     if usual.bits() + 1 != 1 << L::COUNT {
         // Rare: brought to a length whose square is a normal number. The other lanes must not notice.
         q = four!(i => L::select(usual, q[i], q[i].div(largest)));

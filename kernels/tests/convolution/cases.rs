@@ -44,13 +44,7 @@ pub fn kernels(random: &mut Random, rows: usize) -> Vec<(Owned, usize)> {
         let rows = (0..rows * volume).map(|_| entry(random)).collect();
         (Owned::Map(volume, rows), inputs)
     };
-    let mut all = vec![
-        map(27, 40),
-        map(27, 0),
-        map(27, 100),
-        map(8, 60),
-        map(1, 100),
-    ];
+    let mut all = vec![map(27, 40), map(27, 0), map(27, 100), map(8, 60), map(1, 100)];
     all.push((Owned::Map(27, surface(rows)), rows));
     all.push((Owned::Same, rows));
     let parents = (0..rows).map(|_| random.below(inputs) as u32).collect();
@@ -121,12 +115,7 @@ pub fn cases(random: &mut Random) -> Vec<(Owned, usize, usize, [usize; 2])> {
 }
 
 /// All of a layer's rows, every one `stride` values of its own.
-pub fn whole<'a, T, R>(
-    rows: &'a mut [T],
-    stride: usize,
-    residual: Option<&'a [R]>,
-    relu: bool,
-) -> Output<'a, T, R> {
+pub fn whole<'a, T, R>(rows: &'a mut [T], stride: usize, residual: Option<&'a [R]>, relu: bool) -> Output<'a, T, R> {
     Output {
         rows,
         stride,

@@ -14,16 +14,7 @@ fn check_exact(
     residual: Option<&[i16]>,
     relu: bool,
 ) {
-    let expected = reference::exact(
-        [cin, cout],
-        weights,
-        requantise,
-        taps,
-        input,
-        rows,
-        residual,
-        relu,
-    );
+    let expected = reference::exact([cin, cout], weights, requantise, taps, input, rows, residual, relu);
     let conv = ExactConv::new(taps.volume(), cin, cout, weights, requantise.clone());
     for isa in Isa::available() {
         let mut out = vec![i16::MIN; rows * cout];
@@ -39,25 +30,17 @@ fn check_exact(
         }
         if let Some(i) = (0..out.len()).find(|&i| out[i] != expected[i]) {
             let (volume, got, want) = (taps.volume(), out[i], expected[i]);
-            panic!(
-                "{isa}: {cin} → {cout}, {volume} taps, {rows} rows: value {i} is {got}, not {want}"
-            );
+            panic!("{isa}: {cin} → {cout}, {volume} taps, {rows} rows: value {i} is {got}, not {want}");
         }
     }
 }
 
 /// A layer of random weights by random activations, both of the model's ranges, requantised in every way.
-fn check_random(
-    random: &mut Random,
-    taps: &Taps<'_>,
-    [rows, inputs]: [usize; 2],
-    [cin, cout]: [usize; 2],
-) {
+fn check_random(random: &mut Random, taps: &Taps<'_>, [rows, inputs]: [usize; 2], [cin, cout]: [usize; 2]) {
     let weights: Vec<i16> = (0..taps.volume() * cin * cout)
         .map(|_| random.signed(511) as i16)
         .collect();
-    let mut activations =
-        |n: usize| -> Vec<i16> { (0..n).map(|_| random.signed(2047) as i16).collect() };
+    let mut activations = |n: usize| -> Vec<i16> { (0..n).map(|_| random.signed(2047) as i16).collect() };
     let input = activations(inputs * cin);
     let residual = activations(rows * cout);
     let residual = (cin % 16 == 0).then_some(&residual[..]);
@@ -74,16 +57,7 @@ fn check_random(
         bias: (0..cout).map(|_| random.unit() * 300.0).collect(),
     };
     for (requantise, relu) in [(shift, false), (scale, false), (invariant, true)] {
-        check_exact(
-            [cin, cout],
-            &weights,
-            &requantise,
-            taps,
-            &input,
-            rows,
-            residual,
-            relu,
-        );
+        check_exact([cin, cout], &weights, &requantise, taps, &input, rows, residual, relu);
     }
 }
 
@@ -137,20 +111,9 @@ fn all_children_equal_their_definition_up_to_the_largest_sums() {
                 for (weights, requantise) in [(&weights, &scale), (&mixed, &invariant)] {
                     let input: Vec<i16> = match requantise {
                         Requantise::Scale { .. } => input.clone(),
-                        _ => (0..input.len())
-                            .map(|i| LIMIT - (i % 3) as i16 * LIMIT)
-                            .collect(),
+                        _ => (0..input.len()).map(|i| LIMIT - (i % 3) as i16 * LIMIT).collect(),
                     };
-                    check_exact(
-                        [cin, cout],
-                        weights,
-                        requantise,
-                        &taps,
-                        &input,
-                        rows,
-                        None,
-                        false,
-                    );
+                    check_exact([cin, cout], weights, requantise, &taps, &input, rows, None, false);
                 }
             }
         }
@@ -167,28 +130,14 @@ fn exact_layers_wrap_like_their_definition_at_the_extremes() {
         plan: None,
     };
     let [cin, cout] = [128, 48];
-    for (w, x) in [
-        (i16::MIN, i16::MIN),
-        (i16::MAX, i16::MIN),
-        (511, 2047),
-        (-511, 2047),
-    ] {
+    for (w, x) in [(i16::MIN, i16::MIN), (i16::MAX, i16::MIN), (511, 2047), (-511, 2047)] {
         let (weights, input) = (vec![w; 27 * cin * cout], vec![x; cin]);
         for (bias, shift) in [(i32::MAX, 0), (i32::MIN, 31), (1 << 29, 30), (-1, 1)] {
             let requantise = Requantise::Shift {
                 bias: vec![bias; cout],
                 shift: vec![shift; cout],
             };
-            check_exact(
-                [cin, cout],
-                &weights,
-                &requantise,
-                &taps,
-                &input,
-                rows,
-                None,
-                false,
-            );
+            check_exact([cin, cout], &weights, &requantise, &taps, &input, rows, None, false);
         }
         for (gain, bias) in [
             (f32::MAX, f32::MAX),
@@ -201,16 +150,7 @@ fn exact_layers_wrap_like_their_definition_at_the_extremes() {
                 gain: vec![gain; cout],
                 bias: vec![bias; cout],
             };
-            check_exact(
-                [cin, cout],
-                &weights,
-                &requantise,
-                &taps,
-                &input,
-                rows,
-                None,
-                true,
-            );
+            check_exact([cin, cout], &weights, &requantise, &taps, &input, rows, None, true);
         }
     }
 }
@@ -257,11 +197,7 @@ fn a_layer_writes_only_its_own_columns_and_rows_from_the_first_on() {
         shift: vec![9; 3],
     };
     let residual: Vec<i16> = (0..320 * 8).map(|_| random.signed(2047) as i16).collect();
-    let columns: Vec<i16> = residual
-        .chunks(8)
-        .flat_map(|row| &row[2..5])
-        .copied()
-        .collect();
+    let columns: Vec<i16> = residual.chunks(8).flat_map(|row| &row[2..5]).copied().collect();
     let whole = reference::exact(
         [4, 3],
         &weights,
@@ -303,12 +239,8 @@ fn a_plan_changes_nothing() {
     else {
         panic!("the sixth kernel is a surface's");
     };
-    let weights: Vec<i16> = (0..volume * cin * cout)
-        .map(|_| random.signed(2047) as i16)
-        .collect();
-    let input: Vec<i16> = (0..rows * cin)
-        .map(|_| random.signed(2047) as i16)
-        .collect();
+    let weights: Vec<i16> = (0..volume * cin * cout).map(|_| random.signed(2047) as i16).collect();
+    let input: Vec<i16> = (0..rows * cin).map(|_| random.signed(2047) as i16).collect();
     let requantise = Requantise::Invariant {
         gain: vec![0.5; cout],
         bias: vec![0.0; cout],

@@ -6,37 +6,16 @@ use b2p_kernels::{FloatConv, Isa, Precision, Scale, Taps, reference};
 use crate::cases::{Random, cases, kernels, whole};
 
 /// A layer of random values, plain and geometry-invariant.
-fn check_random(
-    random: &mut Random,
-    taps: &Taps<'_>,
-    [rows, inputs]: [usize; 2],
-    [cin, cout]: [usize; 2],
-) {
-    let mut values = |n: usize, scale: f32| -> Vec<f16> {
-        (0..n)
-            .map(|_| f16::from_f32(random.unit() * scale))
-            .collect()
-    };
+fn check_random(random: &mut Random, taps: &Taps<'_>, [rows, inputs]: [usize; 2], [cin, cout]: [usize; 2]) {
+    let mut values =
+        |n: usize, scale: f32| -> Vec<f16> { (0..n).map(|_| f16::from_f32(random.unit() * scale)).collect() };
     let weights = values(taps.volume() * cin * cout, 0.3);
     let input = values(inputs * cin, 4.0);
     let skip = values(rows * cout, 4.0);
     let bias: Vec<f32> = (0..cout).map(|_| random.unit()).collect();
     let invariant = Scale::Invariant((0..cout).map(|_| random.unit() * 2.0).collect());
-    for (scale, relu, residual) in [
-        (Scale::Plain, true, None),
-        (invariant, false, Some(&skip[..])),
-    ] {
-        let expected = reference::float(
-            [cin, cout],
-            &weights,
-            &bias,
-            &scale,
-            taps,
-            &input,
-            rows,
-            residual,
-            relu,
-        );
+    for (scale, relu, residual) in [(Scale::Plain, true, None), (invariant, false, Some(&skip[..]))] {
+        let expected = reference::float([cin, cout], &weights, &bias, &scale, taps, &input, rows, residual, relu);
         let conv = FloatConv::new(taps.volume(), cin, cout, &weights, bias.clone(), scale);
         let mut first: Option<Vec<f32>> = None;
         check_bf16(&conv, taps, &input, rows, residual, relu, &expected);
@@ -52,10 +31,7 @@ fn check_random(
             for ((&got, &half), want) in out.iter().zip(&halves).zip(&expected) {
                 let bound = want.magnitude * terms * f64::from(f32::EPSILON) / 2.0 + 1e-30;
                 let error = (f64::from(got) - want.value).abs();
-                assert!(
-                    error <= bound,
-                    "{isa}: {got} against {want:?}: {cin} → {cout}"
-                );
+                assert!(error <= bound, "{isa}: {got} against {want:?}: {cin} → {cout}");
                 assert_eq!(half, f16::from_f32(got), "{isa}");
             }
             assert!(
@@ -102,11 +78,8 @@ fn bf16_is_off_by_a_few_thousandths_and_half_by_less() {
     let mut random = Random(7);
     let [rows, cin, cout] = [600, 64, 64];
     let (taps, _) = kernels(&mut random, rows).swap_remove(5);
-    let mut values = |n: usize, low: f32| -> Vec<f16> {
-        (0..n)
-            .map(|_| f16::from_f32(random.unit().max(low)))
-            .collect()
-    };
+    let mut values =
+        |n: usize, low: f32| -> Vec<f16> { (0..n).map(|_| f16::from_f32(random.unit().max(low))).collect() };
     let weights = values(27 * cin * cout, -1.0);
     // Of any sign, and as a ReLU leaves them.
     for low in [-1.0, 0.0] {
@@ -123,23 +96,12 @@ fn bf16_is_off_by_a_few_thousandths_and_half_by_less() {
             false,
         );
         let conv = FloatConv::new(27, cin, cout, &weights, bias, Scale::Plain);
-        for precision in [
-            Precision::F32,
-            Precision::Bf16,
-            Precision::Fastest,
-            Precision::Half,
-        ] {
+        for precision in [Precision::F32, Precision::Bf16, Precision::Fastest, Precision::Half] {
             let conv = conv.clone().with_precision(precision);
             assert_eq!(conv.precision(), precision);
             for isa in Isa::available() {
                 let mut out = vec![0.0f32; rows * cout];
-                conv.run(
-                    isa,
-                    taps.taps(),
-                    &input,
-                    0,
-                    whole(&mut out, cout, None, false),
-                );
+                conv.run(isa, taps.taps(), &input, 0, whole(&mut out, cout, None, false));
                 let pairs = out.iter().zip(&expected);
                 let (error, size) = pairs.fold((0.0, 0.0), |(error, size), (&got, want)| {
                     let off = f64::from(got) - want.value;
@@ -190,8 +152,7 @@ fn a_row_s_bits_do_not_depend_on_the_rows_beside_it() {
     for (taps, inputs) in kernels(&mut random, 300) {
         let [cin, cout] = [20, 40];
         let taps = taps.taps();
-        let mut values =
-            |n: usize| -> Vec<f16> { (0..n).map(|_| f16::from_f32(random.unit())).collect() };
+        let mut values = |n: usize| -> Vec<f16> { (0..n).map(|_| f16::from_f32(random.unit())).collect() };
         let (weights, input) = (values(taps.volume() * cin * cout), values(inputs * cin));
         let gain = Scale::Invariant(vec![1.0; cout]);
         let conv = FloatConv::new(taps.volume(), cin, cout, &weights, vec![0.1; cout], gain);
@@ -221,32 +182,13 @@ fn float_layers_saturate_and_never_store_a_nan() {
         vec![0.0; 2],
         Scale::Plain,
     );
-    let infinite = FloatConv::new(
-        1,
-        1,
-        1,
-        &[f16::ZERO],
-        vec![0.0],
-        Scale::Invariant(vec![f32::MAX]),
-    );
+    let infinite = FloatConv::new(1, 1, 1, &[f16::ZERO], vec![0.0], Scale::Invariant(vec![f32::MAX]));
     for isa in Isa::available() {
         let mut out = [f16::ZERO; 2];
-        conv.run(
-            isa,
-            Taps::Same,
-            &[f16::MAX; 2],
-            0,
-            whole(&mut out, 2, None, false),
-        );
+        conv.run(isa, Taps::Same, &[f16::MAX; 2], 0, whole(&mut out, 2, None, false));
         assert_eq!(out, [f16::MAX, f16::ZERO], "{isa}");
         let mut out = [f16::NAN; 1];
-        infinite.run(
-            isa,
-            Taps::Same,
-            &[f16::ONE],
-            0,
-            whole(&mut out, 1, None, false),
-        );
+        infinite.run(isa, Taps::Same, &[f16::ONE], 0, whole(&mut out, 1, None, false));
         assert!(out[0].is_finite(), "{isa}: {}", out[0]);
     }
 }

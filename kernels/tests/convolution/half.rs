@@ -74,10 +74,7 @@ impl Layer {
             false,
         );
         let floors = floors(self.extents, &self.weights, &self.scale, taps, input, rows);
-        let (half, single) = (
-            self.conv(volume, Precision::Half),
-            self.conv(volume, Precision::F32),
-        );
+        let (half, single) = (self.conv(volume, Precision::Half), self.conv(volume, Precision::F32));
         for isa in Isa::available() {
             let run = |conv: &FloatConv| {
                 let mut out = vec![f32::NAN; rows * cout];
@@ -139,8 +136,7 @@ fn sums_in_half_stay_within_their_bound_for_every_width() {
         for extents in [[width, 5], [6, width]] {
             let (taps, inputs) = kernels(&mut random, 31).swap_remove(3);
             let (taps, [cin, cout]) = (taps.taps(), extents);
-            let mut values =
-                |n: usize| -> Vec<f16> { (0..n).map(|_| f16::from_f32(random.unit())).collect() };
+            let mut values = |n: usize| -> Vec<f16> { (0..n).map(|_| f16::from_f32(random.unit())).collect() };
             let layer = Layer {
                 extents,
                 weights: values(taps.volume() * cin * cout),
@@ -226,11 +222,7 @@ fn lone_voxels_and_sums_that_cancel_stay_within_their_bound() {
     for apart in [1, 2, 8, 16, 32] {
         for size in [f16::from_bits(1), f16::from_f32(0.0307), f16::MAX] {
             let sign = |c: usize| {
-                if (c / apart).is_multiple_of(2) {
-                    1.0
-                } else {
-                    -1.0
-                }
+                if (c / apart).is_multiple_of(2) { 1.0 } else { -1.0 }
             };
             let weight = |i: usize| f16::from_f32(size.to_f32() * sign(i / cout % cin));
             let layer = Layer {
@@ -300,9 +292,7 @@ fn sums_in_half_equal_their_definition_to_the_bit() {
         for i in 0..rows {
             for o in 0..cout {
                 let unit = unit(o);
-                let scaled: Vec<f64> = weights(o)
-                    .map(|w| rounded(w.to_f64() / f64::from(unit)))
-                    .collect();
+                let scaled: Vec<f64> = weights(o).map(|w| rounded(w.to_f64() / f64::from(unit))).collect();
                 let mut sum = 0.0f32;
                 for k in 0..27 {
                     let Some(row) = reference::tap(&taps, i, k) else {

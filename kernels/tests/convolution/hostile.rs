@@ -18,13 +18,7 @@ fn taps_of_another_kernel_are_refused() {
             shift: vec![0],
         },
     );
-    conv.run(
-        Isa::SCALAR,
-        Taps::Children,
-        &[1],
-        0,
-        whole(&mut [0; 8], 1, None, false),
-    );
+    conv.run(Isa::SCALAR, Taps::Children, &[1], 0, whole(&mut [0; 8], 1, None, false));
 }
 
 #[test]
@@ -57,10 +51,7 @@ fn a_tap_that_reads_beyond_the_input_panics_on_every_isa() {
                         float.run(isa, taps, &[f16::ONE; 12], 0, output);
                     }),
                 ];
-                assert!(
-                    refused.iter().all(Result::is_err),
-                    "{isa}: {bad} at {place}"
-                );
+                assert!(refused.iter().all(Result::is_err), "{isa}: {bad} at {place}");
             }
         }
     }

@@ -29,10 +29,7 @@ fn every_instruction_set_of_this_machine_is_tested() {
     #[cfg(target_arch = "aarch64")]
     let others = [
         ("neon", true),
-        (
-            "dotprod",
-            std::arch::is_aarch64_feature_detected!("dotprod"),
-        ),
+        ("dotprod", std::arch::is_aarch64_feature_detected!("dotprod")),
     ];
     #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
     let others: [(&str, bool); 0] = [];

@@ -85,9 +85,7 @@ impl Args {
         for Item { name, path, bpp } in &self.items {
             items.push((name.clone(), item::open(path, &limits)?, *bpp));
         }
-        let streams = items
-            .iter()
-            .any(|(_, c, _)| matches!(c, Content::Stream(_)));
+        let streams = items.iter().any(|(_, c, _)| matches!(c, Content::Stream(_)));
         let code = cloud.is_some() && !streams && !self.items_only;
         let mut bench = Bench::new(&surface, frame)?;
         if let Some(cloud) = cloud {
@@ -97,9 +95,7 @@ impl Args {
             Some(path) => Model::open(path)?,
             None => Model::from_bytes(b2p::embedded::MODEL)?,
         };
-        bench = bench
-            .with_model(model, self.levels.clone())
-            .with_heads(self.heads);
+        bench = bench.with_model(model, self.levels.clone()).with_heads(self.heads);
         if code {
             let stream = bench.encode()?;
             if let Some(folder) = &self.output {
@@ -128,11 +124,7 @@ impl Args {
             let json = report.to_json().map_err(failed)?;
             self.write(folder, "scores.md", report.to_markdown().as_bytes())?;
             self.write(folder, "scores.json", json.as_bytes())?;
-            self.write(
-                folder,
-                "sheet.png",
-                &self.sheet(bench.truth(), &entries).to_png()?,
-            )?;
+            self.write(folder, "sheet.png", &self.sheet(bench.truth(), &entries).to_png()?)?;
         }
         Ok(())
     }
@@ -157,11 +149,7 @@ impl Args {
         let step = 360 / VIEWS as u32;
         let row = |label: String, pictures: Vec<_>| SheetRow {
             label,
-            pictures: self
-                .columns
-                .iter()
-                .map(|c| pictures[(c / step) as usize])
-                .collect(),
+            pictures: self.columns.iter().map(|c| pictures[(c / step) as usize]).collect(),
         };
         let mut rows = vec![row("truth".into(), truth.pictures().collect())];
         for entry in entries {
@@ -177,10 +165,7 @@ fn label(row: &Row) -> String {
         None => String::new(),
     };
     let Row {
-        name,
-        drawn,
-        scores,
-        ..
+        name, drawn, scores, ..
     } = row;
     format!(
         "{name}, {drawn}{rate}: {:.2} dB, foreground {:.2} dB",

@@ -50,8 +50,9 @@ impl Cli {
 /// The mesh of a `.glb` file, or the one that `procedural:NAME` names.
 fn load_mesh(path: &Path) -> Result<Mesh> {
     match path.to_str() {
-        Some(name) if name.starts_with(procedural::PREFIX) => procedural::named(name)
-            .ok_or_else(|| LabError::Usage(format!("there is no mesh called {name}"))),
+        Some(name) if name.starts_with(procedural::PREFIX) => {
+            procedural::named(name).ok_or_else(|| LabError::Usage(format!("there is no mesh called {name}")))
+        }
         _ => glb::load(path),
     }
 }

@@ -43,10 +43,7 @@ impl Args {
             clouds.extend(views(&surface, &mut random.fork(i as u64))?);
         }
         clouds.extend(shapes(2, &mut random.fork(u64::MAX)));
-        let clouds: Vec<Samples> = clouds
-            .into_par_iter()
-            .map(Samples::new)
-            .collect::<Result<_>>()?;
+        let clouds: Vec<Samples> = clouds.into_par_iter().map(Samples::new).collect::<Result<_>>()?;
         let samples: usize = clouds.iter().map(Samples::len).sum();
         eprintln!("{} clouds, {samples} voxels", clouds.len());
 

@@ -19,13 +19,7 @@ pub struct Crop {
 }
 
 /// Where to cut: a cube around a random point of the surface, at a multiple of 8 voxels, within the grid.
-pub(super) fn place(
-    sampler: &Sampler,
-    grid: &Grid,
-    points: u64,
-    crop: u32,
-    random: &mut Random,
-) -> VoxelBox {
+pub(super) fn place(sampler: &Sampler, grid: &Grid, points: u64, crop: u32, random: &mut Random) -> VoxelBox {
     let side = 1u32 << grid.bits;
     if side <= crop {
         return whole(grid);
@@ -58,10 +52,7 @@ impl Crop {
             .zip(&cloud.rgb)
             .map(|(&key, &rgb)| {
                 let v = morton::decode(key);
-                (
-                    morton::encode(std::array::from_fn(|a| v[a] - origin[a])),
-                    rgb,
-                )
+                (morton::encode(std::array::from_fn(|a| v[a] - origin[a])), rgb)
             })
             .collect();
         voxels.sort_unstable();
@@ -104,12 +95,7 @@ impl Crop {
                 .flat_map(|v| level.coordinate(v))
                 .map(|x| x as i32)
                 .collect();
-            tensors.push(Tensor::new(
-                format!("xyz.{role}"),
-                "I32",
-                vec![level.len(), 3],
-                &flat,
-            ));
+            tensors.push(Tensor::new(format!("xyz.{role}"), "I32", vec![level.len(), 3], &flat));
             if role > 0 {
                 let parents = level.parent_indices();
                 tensors.push(Tensor::new(
@@ -120,19 +106,9 @@ impl Crop {
                 ));
             }
         }
-        tensors.push(Tensor::new(
-            "rgb".into(),
-            "U8",
-            vec![self.rgb.len(), 3],
-            &self.rgb,
-        ));
+        tensors.push(Tensor::new("rgb".into(), "U8", vec![self.rgb.len(), 3], &self.rgb));
         let cameras: Vec<f32> = views.iter().flat_map(camera_row).collect();
-        tensors.push(Tensor::new(
-            "camera".into(),
-            "F32",
-            vec![views.len(), 16],
-            &cameras,
-        ));
+        tensors.push(Tensor::new("camera".into(), "F32", vec![views.len(), 16], &cameras));
         let side = size as usize;
         tensors.push(Tensor::new(
             "image".into(),
@@ -168,12 +144,7 @@ struct Tensor {
 }
 
 impl Tensor {
-    fn new<T: bytemuck::NoUninit>(
-        name: String,
-        kind: &'static str,
-        shape: Vec<usize>,
-        data: &[T],
-    ) -> Self {
+    fn new<T: bytemuck::NoUninit>(name: String, kind: &'static str, shape: Vec<usize>, data: &[T]) -> Self {
         Tensor {
             name,
             kind,
@@ -188,8 +159,7 @@ fn assemble(name: &str, bits: u8, size: u32, mut tensors: Vec<Tensor>) -> Vec<u8
     // Wider items first keeps every tensor aligned to its items.
     tensors.sort_by_key(|t| t.kind == "U8");
     let quoted = serde_json::Value::from(name);
-    let mut header =
-        format!("{{\"__metadata__\":{{\"name\":{quoted},\"bits\":\"{bits}\",\"size\":\"{size}\"}}");
+    let mut header = format!("{{\"__metadata__\":{{\"name\":{quoted},\"bits\":\"{bits}\",\"size\":\"{size}\"}}");
     let mut offset = 0;
     for t in &tensors {
         let end = offset + t.bytes.len();

@@ -156,17 +156,11 @@ const TRIES_PER_OBJECT: usize = 8;
 const OBJECTS_TRIED: usize = 4;
 
 /// Makes sample `index`: its name and its file.
-fn sample(
-    objects: &[Object],
-    photos: &[Photo],
-    options: &Options,
-    index: usize,
-) -> Result<Option<(String, Vec<u8>)>> {
+fn sample(objects: &[Object], photos: &[Photo], options: &Options, index: usize) -> Result<Option<(String, Vec<u8>)>> {
     let mut random = Random::new(options.seed).fork(index as u64);
     for attempt in 0..TRIES_PER_OBJECT * OBJECTS_TRIED {
         let object = &objects[turn(objects, options.seed, index, attempt / TRIES_PER_OBJECT)];
-        let variant =
-            variant::Variant::random(object.kind, options, !photos.is_empty(), &mut random);
+        let variant = variant::Variant::random(object.kind, options, !photos.is_empty(), &mut random);
         let (surface, grid) = variant.apply(&object.surface, photos, &mut random)?;
         let sampler = Sampler::new(&surface, grid, variant.points, random.bits())?;
         let only = crop::place(&sampler, &grid, variant.points, options.crop, &mut random);
@@ -204,9 +198,7 @@ fn turn(objects: &[Object], seed: u64, index: usize, skipped: usize) -> usize {
         .collect();
     let round = (index / order.len()) as u64;
     let place = (index + skipped * 7) % order.len();
-    Random::new(seed ^ 0x6f_7264_6572)
-        .fork(round)
-        .shuffle(&mut order);
+    Random::new(seed ^ 0x6f_7264_6572).fork(round).shuffle(&mut order);
     order[place]
 }
 

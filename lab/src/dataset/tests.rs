@@ -76,21 +76,9 @@ fn samples_depend_on_the_seed_alone_not_on_threads_or_how_many_are_made() {
     let three = made(&options(), 1);
     assert_eq!(three.len(), 3);
     assert_eq!(three, made(&options(), 4));
-    let one = made(
-        &Options {
-            count: 1,
-            ..options()
-        },
-        1,
-    );
+    let one = made(&Options { count: 1, ..options() }, 1);
     assert_eq!(one[0], three[0]);
-    let other = made(
-        &Options {
-            seed: 6,
-            ..options()
-        },
-        1,
-    );
+    let other = made(&Options { seed: 6, ..options() }, 1);
     assert_ne!(other, three);
 }
 
@@ -104,10 +92,7 @@ fn a_samples_levels_fit_together_and_its_pictures_show_its_voxels() {
             words.iter().map(|b| i32::from_le_bytes(*b)).collect()
         };
         for role in 1..=3 {
-            let (xyz, above) = (
-                ints(&format!("xyz.{role}")),
-                ints(&format!("xyz.{}", role - 1)),
-            );
+            let (xyz, above) = (ints(&format!("xyz.{role}")), ints(&format!("xyz.{}", role - 1)));
             let (xyz, above) = (xyz.as_chunks::<3>().0, above.as_chunks::<3>().0);
             let parent = ints(&format!("parent.{role}"));
             assert_eq!(parent.len(), xyz.len());
@@ -170,10 +155,7 @@ fn project(camera: &[f32], voxel: [i32; 3]) -> Option<(usize, f32)> {
 
 #[test]
 fn a_samples_pictures_have_the_colours_of_its_voxels() {
-    let options = Options {
-        count: 8,
-        ..options()
-    };
+    let options = Options { count: 8, ..options() };
     let photographs = made(&options, 2);
     let photographs = photographs.iter().filter(|(name, _)| name.contains("tds_"));
     let mut samples = 0;
@@ -182,10 +164,7 @@ fn a_samples_pictures_have_the_colours_of_its_voxels() {
         let data = |tensor: &str| file.tensor(tensor).unwrap().data().to_vec();
         let words = |tensor: &str| data(tensor).as_chunks::<4>().0.to_vec();
         let xyz: Vec<i32> = words("xyz.3").into_iter().map(i32::from_le_bytes).collect();
-        let cameras: Vec<f32> = words("camera")
-            .into_iter()
-            .map(f32::from_le_bytes)
-            .collect();
+        let cameras: Vec<f32> = words("camera").into_iter().map(f32::from_le_bytes).collect();
         let (rgb, pixels) = (data("rgb"), words("image"));
         let (rgb, xyz) = (rgb.as_chunks::<3>().0, xyz.as_chunks::<3>().0);
         let mut differences = Vec::new();
@@ -200,15 +179,11 @@ fn a_samples_pictures_have_the_colours_of_its_voxels() {
             }
             let seen = pixels.iter().zip(nearest);
             let seen = seen.filter(|(p, (depth, _))| p[3] == 255 && depth.is_finite());
-            differences
-                .extend(seen.flat_map(|(p, (_, c))| (0..3).map(move |i| p[i].abs_diff(c[i]))));
+            differences.extend(seen.flat_map(|(p, (_, c))| (0..3).map(move |i| p[i].abs_diff(c[i]))));
         }
         differences.sort_unstable();
         let median = differences[differences.len() / 2];
-        assert!(
-            median <= 8,
-            "{name}: half of the pixels are off by {median}"
-        );
+        assert!(median <= 8, "{name}: half of the pixels are off by {median}");
         samples += 1;
     }
     assert!(samples >= 2, "{samples} samples with a photograph");
@@ -233,10 +208,7 @@ fn people_come_up_twice_a_round_and_the_rest_once() {
 fn crops_of_no_use_are_refused() {
     assert!(crop::is_sensible(6_000, 128) && !crop::is_sensible(5_999, 128));
     assert!(crop::is_sensible(70_000, 128) && !crop::is_sensible(70_001, 128));
-    let bad = Options {
-        crop: 100,
-        ..options()
-    };
+    let bad = Options { crop: 100, ..options() };
     let folder = tempfile::tempdir().unwrap();
     assert!(write(folder.path(), &objects(), &[], &bad, || ()).is_err());
     assert!(write(folder.path(), &[], &[], &options(), || ()).is_err());

@@ -86,12 +86,7 @@ impl Variant {
     ///
     /// # Errors
     /// If the object has no extent.
-    pub fn apply(
-        &self,
-        surface: &Surface,
-        photos: &[Photo],
-        random: &mut Random,
-    ) -> Result<(Surface, Grid)> {
+    pub fn apply(&self, surface: &Surface, photos: &[Photo], random: &mut Random) -> Result<(Surface, Grid)> {
         let turn = |p: [f32; 3]| self.rotation * glam::Vec3::from(p).as_dvec3();
         let turned = surface.map(|p| turn(p).as_vec3().into());
         let fitted = Grid::fit(turned.bounds(), self.bits, self.fill)?;

@@ -23,8 +23,7 @@ pub(super) fn random(crop: &Crop, options: &Options, random: &mut Random) -> Vec
             let distance = side * random.log_range(1.6, 16.0);
             let scale = random.log_range(0.55, 1.6);
             let jitter = side / 10.0;
-            let target: [f64; 3] =
-                std::array::from_fn(|i| middle[i] + random.range(-jitter, jitter));
+            let target: [f64; 3] = std::array::from_fn(|i| middle[i] + random.range(-jitter, jitter));
             let (sin_el, cos_el) = elevation.sin_cos();
             let direction = [cos_el * azimuth.sin(), sin_el, cos_el * azimuth.cos()];
             let eye = std::array::from_fn(|i| target[i] + distance * direction[i]);

@@ -139,10 +139,7 @@ impl Bench {
             Content::Cloud(cloud) => {
                 let points = Points::on_grid(&cloud, self.frame.bits, self.finest.as_ref());
                 let count = points.positions.len();
-                let draw = |side| {
-                    self.truth
-                        .judge(|camera| Ok(points.draw_squares(camera, side)))
-                };
+                let draw = |side| self.truth.judge(|camera| Ok(points.draw_squares(camera, side)));
                 let (side, squares) = best(SIDES, draw)?;
                 let draw = |sigma| self.gaussians(points.to_gaussians(self.frame, sigma));
                 let (sigma, round) = best(SIGMAS, draw)?;
@@ -192,16 +189,12 @@ impl Bench {
     }
 
     fn gaussians(&self, gaussians: Gaussians) -> Result<Judged> {
-        self.truth
-            .judge_gaussians(&into_frame(gaussians, self.frame))
+        self.truth.judge_gaussians(&into_frame(gaussians, self.frame))
     }
 }
 
 /// The best of some sizes, by PSNR over whole pictures. It has one peak over the sizes, which are in order: none after a fall is tried.
-fn best<const N: usize>(
-    sizes: [f64; N],
-    judge: impl Fn(f64) -> Result<Judged>,
-) -> Result<(f64, Judged)> {
+fn best<const N: usize>(sizes: [f64; N], judge: impl Fn(f64) -> Result<Judged>) -> Result<(f64, Judged)> {
     let mut best: Option<(f64, Judged)> = None;
     for size in sizes {
         let judged = judge(size)?;
@@ -250,9 +243,7 @@ mod tests {
             parts: vec![shapes::sphere().part(40.0, &paint, None)],
         });
         let grid = Grid::fit(surface.bounds(), BITS, 0.95).unwrap();
-        let sampled = Sampler::new(&surface, grid, 200_000, 0)
-            .unwrap()
-            .cloud(None);
+        let sampled = Sampler::new(&surface, grid, 200_000, 0).unwrap().cloud(None);
         let frame = Frame {
             bits: BITS,
             placement: grid.placement(),
@@ -276,19 +267,14 @@ mod tests {
         let bench = bench();
         let bytes = bench.encode().unwrap();
         let points = bench.points().unwrap();
-        let entries = bench
-            .judge("coded", Content::Stream(bytes.clone()), None)
-            .unwrap();
+        let entries = bench.judge("coded", Content::Stream(bytes.clone()), None).unwrap();
         let levels: Vec<_> = entries.iter().map(|e| e.row.level.unwrap()).collect();
         assert_eq!(levels, [4, 5]);
         for entry in &entries {
             let rate = entry.row.rate.as_ref().unwrap();
             let parts: f64 = rate.levels.iter().map(|l| l.geometry + l.features).sum();
             assert!(parts < rate.total);
-            assert!(
-                (rate.total - parts) * points as f64 / 8.0 < 200.0,
-                "a header is small"
-            );
+            assert!((rate.total - parts) * points as f64 / 8.0 < 200.0, "a header is small");
             assert_eq!(entry.pictures.len(), 2);
         }
         let whole = entries[1].row.rate.as_ref().unwrap().total;
@@ -299,9 +285,7 @@ mod tests {
     fn a_cloud_is_drawn_in_three_ways_and_keeps_the_rate_it_was_given() {
         let bench = bench();
         let cloud = bench.finest.clone().unwrap();
-        let entries = bench
-            .judge("cloud", Content::Cloud(cloud), Some(0.5))
-            .unwrap();
+        let entries = bench.judge("cloud", Content::Cloud(cloud), Some(0.5)).unwrap();
         assert!(entries[0].row.drawn.starts_with("squares x"));
         assert!(entries[1].row.drawn.starts_with("global Gaussian x"));
         assert!(entries[2].row.drawn.starts_with("surfels x"));
@@ -318,9 +302,7 @@ mod tests {
         let mut bench = bench();
         let bytes = bench.encode().unwrap();
         bench.model = None;
-        let error = bench
-            .judge("coded", Content::Stream(bytes), None)
-            .unwrap_err();
+        let error = bench.judge("coded", Content::Stream(bytes), None).unwrap_err();
         assert!(error.to_string().contains("--model"));
     }
 }

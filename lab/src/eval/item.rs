@@ -71,11 +71,8 @@ pub fn read(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     if !bytes.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]) {
         return Ok(bytes);
     }
-    let damaged = |error: &dyn std::fmt::Display| {
-        LabError::Usage(format!("{}: zstd: {error}", path.display()))
-    };
-    let unpacker =
-        ruzstd::decoding::StreamingDecoder::new(bytes.as_slice()).map_err(|e| damaged(&e))?;
+    let damaged = |error: &dyn std::fmt::Display| LabError::Usage(format!("{}: zstd: {error}", path.display()));
+    let unpacker = ruzstd::decoding::StreamingDecoder::new(bytes.as_slice()).map_err(|e| damaged(&e))?;
     let mut plain = Vec::new();
     unpacker
         .take(limits.max_bytes + 1)
@@ -196,9 +193,6 @@ mod tests {
         let path = folder.path().join("splats.ply");
         Gaussians::default().write_ply(&mut file, &path).unwrap();
         std::fs::write(&path, file).unwrap();
-        assert!(matches!(
-            open(&path, &limits).unwrap(),
-            Content::Gaussians(_)
-        ));
+        assert!(matches!(open(&path, &limits).unwrap(), Content::Gaussians(_)));
     }
 }

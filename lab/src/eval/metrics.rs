@@ -132,10 +132,7 @@ mod tests {
     #[test]
     fn ms_ssim_is_1_for_equal_pictures_symmetric_and_falls_with_noise() {
         let truth = scene(200, 170);
-        let (little, much) = (
-            noisy(200, 170, &truth, 8.0, 1),
-            noisy(200, 170, &truth, 60.0, 1),
-        );
+        let (little, much) = (noisy(200, 170, &truth, 8.0, 1), noisy(200, 170, &truth, 60.0, 1));
         let score = |p: &Picture| ms_ssim(&truth, p).unwrap();
         assert!((score(&truth) - 1.0).abs() < 1e-5);
         assert!((score(&little) - ms_ssim(&little, &truth).unwrap()).abs() < 1e-6);
@@ -144,10 +141,7 @@ mod tests {
 
     #[test]
     fn ms_ssim_of_a_constant_shift_is_that_of_the_means_at_the_coarsest_scale() {
-        let (a, b) = (
-            Picture::new(176, 176, [100; 3]),
-            Picture::new(176, 176, [120; 3]),
-        );
+        let (a, b) = (Picture::new(176, 176, [100; 3]), Picture::new(176, 176, [120; 3]));
         let c1 = 2.55f64 * 2.55;
         let means = (2.0 * 100.0 * 120.0 + c1) / (100.0 * 100.0 + 120.0 * 120.0 + c1);
         assert!((ms_ssim(&a, &b).unwrap() - means.powf(0.1333)).abs() < 1e-4);
@@ -162,9 +156,7 @@ mod tests {
         let picture = |f: &dyn Fn(usize, usize, usize) -> usize| Picture {
             width,
             height,
-            rgb: places()
-                .map(|(x, y)| [0, 1, 2].map(|k| f(x, y, k) as u8))
-                .collect(),
+            rgb: places().map(|(x, y)| [0, 1, 2].map(|k| f(x, y, k) as u8)).collect(),
         };
         let score = ms_ssim(&picture(&ramp), &picture(&tiled)).unwrap();
         assert!((score - 0.855834).abs() < 1e-5, "{score}");
@@ -184,10 +176,7 @@ mod tests {
         let reference = Ssimulacra2::new(&truth).unwrap();
         let score = |p: &Picture| reference.score(p).unwrap();
         assert_eq!(score(&truth), 100.0);
-        let (little, much) = (
-            noisy(64, 64, &truth, 8.0, 2),
-            noisy(64, 64, &truth, 60.0, 2),
-        );
+        let (little, much) = (noisy(64, 64, &truth, 8.0, 2), noisy(64, 64, &truth, 60.0, 2));
         assert!(score(&much) < score(&little) && score(&little) < 100.0);
         assert!(reference.score(&scene(64, 65)).is_err());
     }

@@ -63,10 +63,7 @@ impl Tree {
     /// If there are more than 2³² of them.
     pub fn new(points: &[[f32; 3]]) -> Tree {
         let count = u32::try_from(points.len()).expect("at most 2³² points");
-        let mut points: Vec<Point> = (0..count)
-            .zip(points)
-            .map(|(index, &at)| Point { at, index })
-            .collect();
+        let mut points: Vec<Point> = (0..count).zip(points).map(|(index, &at)| Point { at, index }).collect();
         arrange(&mut points, 0);
         Tree { points }
     }
@@ -84,14 +81,7 @@ impl Tree {
         }
     }
 
-    fn search(
-        &self,
-        range: Range<usize>,
-        depth: usize,
-        at: [f32; 3],
-        count: usize,
-        found: &mut Vec<Found>,
-    ) {
+    fn search(&self, range: Range<usize>, depth: usize, at: [f32; 3], count: usize, found: &mut Vec<Found>) {
         if range.len() <= LEAF {
             for point in &self.points[range] {
                 insert(point, at, count, found);
@@ -103,11 +93,7 @@ impl Tree {
         let (low, high) = (range.start..middle, middle + 1..range.end);
         let beyond = at[axis] - self.points[middle].at[axis];
         // Which half a point is in does not follow from its coordinate where that equals the median's: both are searched then.
-        let (near, far) = if beyond < 0.0 {
-            (low, high)
-        } else {
-            (high, low)
-        };
+        let (near, far) = if beyond < 0.0 { (low, high) } else { (high, low) };
         self.search(near, depth + 1, at, count, found);
         if found.len() < count || beyond * beyond < found[found.len() - 1].square {
             self.search(far, depth + 1, at, count, found);
@@ -128,13 +114,7 @@ fn insert(point: &Point, at: [f32; 3], count: usize, found: &mut Vec<Found>) {
     while place > 0 && found[place - 1].square > square {
         place -= 1;
     }
-    found.insert(
-        place,
-        Found {
-            square,
-            at: point.at,
-        },
-    );
+    found.insert(place, Found { square, at: point.at });
 }
 
 fn arrange(points: &mut [Point], depth: usize) {
@@ -144,10 +124,7 @@ fn arrange(points: &mut [Point], depth: usize) {
     let (axis, middle) = (depth % 3, points.len() / 2);
     points.select_nth_unstable_by(middle, |a, b| a.at[axis].total_cmp(&b.at[axis]));
     let (low, high) = points.split_at_mut(middle);
-    rayon::join(
-        || arrange(low, depth + 1),
-        || arrange(&mut high[1..], depth + 1),
-    );
+    rayon::join(|| arrange(low, depth + 1), || arrange(&mut high[1..], depth + 1));
 }
 
 #[cfg(test)]
@@ -157,9 +134,7 @@ mod tests {
 
     fn random(count: usize) -> Vec<[f32; 3]> {
         let mut rng = Rng::new(4);
-        (0..count)
-            .map(|_| (rng.direction() * rng.unit()).to_array())
-            .collect()
+        (0..count).map(|_| (rng.direction() * rng.unit()).to_array()).collect()
     }
 
     #[test]

@@ -98,11 +98,7 @@ impl Points {
             rotation: vec![[1.0, 0.0, 0.0, 0.0]; count],
             opacity: vec![1.0; count],
             blur: (OWN_BLUR * variance) as f32,
-            colour: self
-                .colours
-                .iter()
-                .map(|c| c.map(|v| f32::from(v) / 255.0))
-                .collect(),
+            colour: self.colours.iter().map(|c| c.map(|v| f32::from(v) / 255.0)).collect(),
             frame,
             ..Gaussians::default()
         }
@@ -144,11 +140,7 @@ fn cell_middle(coarse: &[[f64; 3]], step: u64, finest: &PointCloud) -> f64 {
     let known: HashSet<[i64; 3]> = coarse.iter().copied().map(key).collect();
     let found = |shift: f64| {
         let cell = |p: &[f64; 3]| key(p.map(|v| ((v + shift) / step).floor() * step));
-        finest
-            .positions
-            .iter()
-            .filter(|p| known.contains(&cell(p)))
-            .count()
+        finest.positions.iter().filter(|p| known.contains(&cell(p))).count()
     };
     if found(step / 2.0) > found(0.0) {
         0.0
@@ -204,12 +196,7 @@ mod tests {
 
     #[test]
     fn what_is_behind_the_camera_or_beside_the_picture_is_not_drawn() {
-        for position in [
-            [0.0, 0.0, 3.5],
-            [0.0, 0.0, 3.0],
-            [90.0, 0.0, 0.0],
-            [0.0, -90.0, 0.0],
-        ] {
+        for position in [[0.0, 0.0, 3.5], [0.0, 0.0, 3.0], [90.0, 0.0, 0.0], [0.0, -90.0, 0.0]] {
             assert_eq!(red(&one(position, 0.1).draw_squares(&camera(), 1.0)), 0);
         }
     }
@@ -263,15 +250,7 @@ mod tests {
             ..PointCloud::default()
         };
         let finest = cloud((3..29).map(|i| [f64::from(i), 7.0, 9.0]).collect());
-        let coarse = |f: fn(f64) -> f64| {
-            cloud(
-                finest
-                    .positions
-                    .iter()
-                    .map(|p| p.map(|v| 4.0 * f(v / 4.0)))
-                    .collect(),
-            )
-        };
+        let coarse = |f: fn(f64) -> f64| cloud(finest.positions.iter().map(|p| p.map(|v| 4.0 * f(v / 4.0))).collect());
         let cells_of = |cloud: &PointCloud| Points::on_grid(cloud, 5, Some(&finest)).positions[4];
         let voxels = |p: f32| (p + 1.0) * 16.0;
         // Voxel 7 is in [6, 10) rounded, in [4, 8) cut off.

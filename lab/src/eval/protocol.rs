@@ -125,11 +125,7 @@ impl Truth {
             .collect::<Result<_>>()?;
         let (pictures, views): (Vec<_>, Vec<_>) = judged.into_iter().unzip();
         let mean = Scores::mean(&views);
-        Ok(Judged {
-            pictures,
-            views,
-            mean,
-        })
+        Ok(Judged { pictures, views, mean })
     }
 
     /// Judges Gaussians, drawn by `b2p`'s renderer.
@@ -139,8 +135,7 @@ impl Truth {
     pub fn judge_gaussians(&self, gaussians: &Gaussians) -> Result<Judged> {
         self.judge(|camera| {
             let white = Background::WHITE;
-            let (image, _) =
-                Renderer::default().render(gaussians, camera, white, &Limits::default())?;
+            let (image, _) = Renderer::default().render(gaussians, camera, white, &Limits::default())?;
             Ok(image)
         })
     }
@@ -212,16 +207,14 @@ mod tests {
 
     /// A ball off the centre whose colour tells directions apart, and points all over it.
     fn ball() -> (Surface, Points) {
-        let place = Affine3A::from_translation(Vec3::new(0.3, 0.2, -0.1))
-            * Affine3A::from_scale(Vec3::splat(0.4));
+        let place = Affine3A::from_translation(Vec3::new(0.3, 0.2, -0.1)) * Affine3A::from_scale(Vec3::splat(0.4));
         let ball = shapes::sphere().placed(place);
         let colour = |p: Vec3| 0.5 + p.clamp(Vec3::splat(-0.5), Vec3::splat(0.5));
         let paint: Pattern = Arc::new(move |s| colour(s.position));
         let mesh = Mesh {
             parts: vec![ball.part(200.0, &paint, None)],
         };
-        let grid =
-            || (0..600).flat_map(|i| (0..300).map(move |j| (i as f32 / 600.0, j as f32 / 299.0)));
+        let grid = || (0..600).flat_map(|i| (0..300).map(move |j| (i as f32 / 600.0, j as f32 / 299.0)));
         let places = || grid().map(|(u, v)| ball.point(u, v));
         let points = Points {
             positions: places().map(|p| p.to_array()).collect(),

@@ -75,13 +75,7 @@ impl Report {
             let _ = writeln!(
                 text,
                 "| {} | {} | {bpp} | {:.2} | {:.2} | {:.4} | {:.2} | {} |",
-                row.name,
-                row.drawn,
-                s.psnr,
-                s.foreground_psnr,
-                s.ms_ssim,
-                s.ssimulacra2,
-                row.primitives
+                row.name, row.drawn, s.psnr, s.foreground_psnr, s.ms_ssim, s.ssimulacra2, row.primitives
             );
         }
         let mut levels = String::new();
@@ -89,21 +83,13 @@ impl Report {
             // A row of a deeper level tells those above it too.
             let count = |row: &Row| row.rate.as_ref().map_or(0, |rate| rate.levels.len());
             let same = |other: &&Row| other.name == row.name;
-            if self
-                .rows
-                .iter()
-                .filter(same)
-                .any(|other| count(other) > count(row))
-            {
+            if self.rows.iter().filter(same).any(|other| count(other) > count(row)) {
                 continue;
             }
             for level in row.rate.iter().flat_map(|r| &r.levels) {
                 let (name, number) = (&row.name, level.level);
                 let (geometry, features) = (level.geometry, level.features);
-                let _ = writeln!(
-                    levels,
-                    "| {name} | {number} | {geometry:.4} | {features:.4} |"
-                );
+                let _ = writeln!(levels, "| {name} | {number} | {geometry:.4} | {features:.4} |");
             }
         }
         if !levels.is_empty() {
@@ -154,9 +140,7 @@ mod tests {
     fn the_table_has_a_line_per_row_and_levels_only_for_streams() {
         let plain = report(26.1, Vec::new()).to_markdown();
         assert_eq!(plain.lines().count(), 3);
-        assert!(
-            plain.contains("| a | squares ×1 | 0.4000 | 26.10 | 25.00 | 0.9800 | 61.50 | 10 |")
-        );
+        assert!(plain.contains("| a | squares ×1 | 0.4000 | 26.10 | 25.00 | 0.9800 | 61.50 | 10 |"));
         let level = LevelRate {
             level: 8,
             geometry: 0.05,

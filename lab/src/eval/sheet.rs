@@ -75,10 +75,7 @@ mod tests {
 
     #[test]
     fn pictures_stand_under_their_label_cropped_and_side_by_side() {
-        let (a, b) = (
-            Picture::new(40, 30, [1, 2, 3]),
-            Picture::new(40, 30, [200, 0, 0]),
-        );
+        let (a, b) = (Picture::new(40, 30, [1, 2, 3]), Picture::new(40, 30, [200, 0, 0]));
         let row = SheetRow {
             label: "I".into(),
             pictures: vec![&a, &b],

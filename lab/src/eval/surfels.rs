@@ -57,9 +57,7 @@ impl<'a> Surfels<'a> {
 
     /// One opaque Gaussian a point, whose standard deviation in its plane is the `factor`-fold spacing of the points.
     pub fn to_gaussians(&self, frame: Frame, factor: f64) -> Gaussians {
-        let Points {
-            colours, spacing, ..
-        } = self.points;
+        let Points { colours, spacing, .. } = self.points;
         let wide = (factor * spacing) as f32;
         let voxel = 2.0 / f64::from(1u32 << frame.bits);
         let count = self.planes.len();
@@ -69,10 +67,7 @@ impl<'a> Surfels<'a> {
             rotation: self.planes.iter().map(|p| p.rotation).collect(),
             opacity: vec![1.0; count],
             blur: (BLUR * voxel * voxel) as f32,
-            colour: colours
-                .iter()
-                .map(|c| c.map(|v| f32::from(v) / 255.0))
-                .collect(),
+            colour: colours.iter().map(|c| c.map(|v| f32::from(v) / 255.0)).collect(),
             frame,
             ..Gaussians::default()
         }
@@ -121,10 +116,7 @@ fn least_axis(matrix: DMat3) -> DVec3 {
             }
         }
     }
-    let least = (1..3).fold(
-        0,
-        |least, k| if a[k][k] < a[least][least] { k } else { least },
-    );
+    let least = (1..3).fold(0, |least, k| if a[k][k] < a[least][least] { k } else { least });
     DVec3::from(axes[least]).normalize()
 }
 

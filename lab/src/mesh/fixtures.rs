@@ -28,9 +28,7 @@ pub fn texture(width: u32, height: u32, texel: impl Fn(u32, u32) -> [u8; 4]) -> 
     Texture {
         width,
         height,
-        rgba: (0..width * height)
-            .map(|i| texel(i % width, i / width))
-            .collect(),
+        rgba: (0..width * height).map(|i| texel(i % width, i / width)).collect(),
     }
 }
 

@@ -81,10 +81,7 @@ impl Reader<'_> {
 
     fn primitive(&mut self, primitive: &Primitive, transform: glam::DMat4) -> Result<(), String> {
         if primitive.mode() != gltf::mesh::Mode::Triangles {
-            return Err(format!(
-                "a primitive is {:?}, expected triangles",
-                primitive.mode()
-            ));
+            return Err(format!("a primitive is {:?}, expected triangles", primitive.mode()));
         }
         let position = primitive
             .get(&gltf::Semantic::Positions)
@@ -135,10 +132,7 @@ impl Reader<'_> {
             Some(accessor) => {
                 let data = self.bytes(&accessor, "indices")?;
                 let width = accessor.size();
-                let ok = matches!(
-                    accessor.data_type(),
-                    DataType::U8 | DataType::U16 | DataType::U32
-                );
+                let ok = matches!(accessor.data_type(), DataType::U8 | DataType::U16 | DataType::U32);
                 if accessor.dimensions() != Dimensions::Scalar || !ok {
                     return Err("indices are not unsigned integers".into());
                 }
@@ -154,9 +148,7 @@ impl Reader<'_> {
             return Err(format!("{} indices are not whole triangles", flat.len()));
         }
         if let Some(bad) = flat.iter().find(|&&i| i as usize >= vertices) {
-            return Err(format!(
-                "index {bad} is outside of the {vertices} positions"
-            ));
+            return Err(format!("index {bad} is outside of the {vertices} positions"));
         }
         Ok(flat.as_chunks::<3>().0.to_vec())
     }
@@ -170,9 +162,7 @@ impl Reader<'_> {
         if accessor.data_type() != DataType::F32 || accessor.dimensions() != dimensions {
             return Err(format!("{name} is not {N} 32-bit floats"));
         }
-        let value = |b: &[u8], i: usize| {
-            f32::from_le_bytes([b[4 * i], b[4 * i + 1], b[4 * i + 2], b[4 * i + 3]])
-        };
+        let value = |b: &[u8], i: usize| f32::from_le_bytes([b[4 * i], b[4 * i + 1], b[4 * i + 2], b[4 * i + 3]]);
         Ok(self
             .bytes(accessor, name)?
             .map(|b| std::array::from_fn(|i| value(b, i)))
@@ -180,17 +170,11 @@ impl Reader<'_> {
     }
 
     /// The bytes of each of an accessor's items.
-    fn bytes(
-        &self,
-        accessor: &Accessor,
-        name: &str,
-    ) -> Result<impl Iterator<Item = &[u8]>, String> {
+    fn bytes(&self, accessor: &Accessor, name: &str) -> Result<impl Iterator<Item = &[u8]>, String> {
         let view = match accessor.view() {
             Some(view) if accessor.sparse().is_none() => view,
             _ => {
-                return Err(format!(
-                    "{name} is sparse or has no data, which is not read"
-                ));
+                return Err(format!("{name} is sparse or has no data, which is not read"));
             }
         };
         let outside = || format!("{name} lies outside of the file");
@@ -199,10 +183,7 @@ impl Reader<'_> {
         if stride < size {
             return Err(format!("{name} has items of {size} bytes every {stride}"));
         }
-        let start = view
-            .offset()
-            .checked_add(accessor.offset())
-            .ok_or_else(outside)?;
+        let start = view.offset().checked_add(accessor.offset()).ok_or_else(outside)?;
         let length = match count {
             0 => 0,
             n => stride
@@ -224,8 +205,7 @@ impl Reader<'_> {
             .checked_add(view.length())
             .and_then(|end| self.blob.get(view.offset()..end))
             .ok_or("a texture lies outside of the file")?;
-        let picture =
-            image::load_from_memory(data).map_err(|e| format!("a texture cannot be read: {e}"))?;
+        let picture = image::load_from_memory(data).map_err(|e| format!("a texture cannot be read: {e}"))?;
         Ok(picture.into())
     }
 }

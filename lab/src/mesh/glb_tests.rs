@@ -54,16 +54,8 @@ fn a_triangle_is_read_with_its_colour() {
 
 #[test]
 fn a_nodes_transform_moves_its_mesh() {
-    let mesh = parse(&triangle(
-        r#","translation":[1,2,3],"scale":[2,2,2]"#,
-        [0, 1, 2],
-        0,
-    ))
-    .unwrap();
-    assert_eq!(
-        mesh.parts[0].positions,
-        [[1., 2., 3.], [3., 2., 3.], [1., 4., 3.]]
-    );
+    let mesh = parse(&triangle(r#","translation":[1,2,3],"scale":[2,2,2]"#, [0, 1, 2], 0)).unwrap();
+    assert_eq!(mesh.parts[0].positions, [[1., 2., 3.], [3., 2., 3.], [1., 4., 3.]]);
 }
 
 #[test]

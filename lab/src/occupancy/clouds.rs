@@ -114,11 +114,7 @@ fn curve(random: &mut Random) -> Vec<u64> {
         std::array::from_fn(|_| random.range(1.0, 20.0)),
         std::array::from_fn(|_| random.range(0.0, 6.3)),
     );
-    let at = |t: f64| {
-        DVec3::from_array(std::array::from_fn(|i| {
-            0.5 + 0.4 * (frequency[i] * t + phase[i]).sin()
-        }))
-    };
+    let at = |t: f64| DVec3::from_array(std::array::from_fn(|i| 0.5 + 0.4 * (frequency[i] * t + phase[i]).sin()));
     (0..100_000)
         .filter_map(|i| key(SIDE * at(f64::from(i) * 1e-5)))
         .collect()
@@ -224,10 +220,6 @@ mod tests {
 
     #[test]
     fn every_shape_has_voxels() {
-        assert!(
-            shapes(3, &mut Random::new(2))
-                .iter()
-                .all(|shape| shape.len() > 50)
-        );
+        assert!(shapes(3, &mut Random::new(2)).iter().all(|shape| shape.len() > 50));
     }
 }

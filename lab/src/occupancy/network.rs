@@ -99,17 +99,8 @@ impl Network {
             nats += f64::from(surprise.max(0.0) + (-surprise.abs()).exp().ln_1p());
 
             let error = 1.0 / (1.0 + (-logit).exp()) - f32::from(u8::from(bit));
-            let own: Row = std::array::from_fn(|unit| {
-                if hidden[unit] > 0.0 {
-                    error * output[unit]
-                } else {
-                    0.0
-                }
-            });
-            add(
-                row_of_mut(gradient, OUTPUT + octant),
-                &hidden.map(|h| error * h),
-            );
+            let own: Row = std::array::from_fn(|unit| if hidden[unit] > 0.0 { error * output[unit] } else { 0.0 });
+            add(row_of_mut(gradient, OUTPUT + octant), &hidden.map(|h| error * h));
             add(row_of_mut(gradient, node), &own);
             add(&mut back, &own);
             gradient[BIAS + octant] += error;
@@ -131,8 +122,7 @@ impl Network {
             let gradient = sum / BATCH as f32;
             self.mean[i] = MEAN * self.mean[i] + (1.0 - MEAN) * gradient;
             self.square[i] = SQUARE * self.square[i] + (1.0 - SQUARE) * gradient * gradient;
-            self.parameters[i] -=
-                rate * self.mean[i] / ((self.square[i] * correction).sqrt() + 1e-8);
+            self.parameters[i] -= rate * self.mean[i] / ((self.square[i] * correction).sqrt() + 1e-8);
         }
     }
 
@@ -193,10 +183,7 @@ mod tests {
         let mut gradient = vec![0.0; PARAMETERS];
         network.learn(&facts, occupancy, &mut gradient);
         let mut unused = vec![0.0; PARAMETERS];
-        for i in (0..PARAMETERS)
-            .filter(|&i| gradient[i].abs() > 0.05)
-            .step_by(97)
-        {
+        for i in (0..PARAMETERS).filter(|&i| gradient[i].abs() > 0.05).step_by(97) {
             let at = network.parameters[i];
             let mut length = |value| {
                 network.parameters[i] = value;
@@ -216,10 +203,7 @@ mod tests {
             .collect();
         let mut network = Network::new(1);
         let first = network.step(&clouds, 0.004);
-        let last = (0..30)
-            .map(|_| network.step(&clouds, 0.004))
-            .last()
-            .unwrap();
+        let last = (0..30).map(|_| network.step(&clouds, 0.004)).last().unwrap();
         assert!(last < 0.7 * first, "{first} {last}");
         assert_eq!(network.weights().len(), SIZE);
     }

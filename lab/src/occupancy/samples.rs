@@ -30,9 +30,7 @@ impl Samples {
             for (i, masks) in occupancy.chunks(SLICE).enumerate() {
                 let slice = i * SLICE..i * SLICE + masks.len();
                 for here in slice.clone() {
-                    facts(&map, &slice, here, masks, |fact| {
-                        samples.facts.push(fact as u8)
-                    });
+                    facts(&map, &slice, here, masks, |fact| samples.facts.push(fact as u8));
                     samples.ends.push(samples.facts.len());
                 }
             }

@@ -75,13 +75,7 @@ fn object_at(density: f32, name: &str, seed: u64) -> Option<Mesh> {
 }
 
 /// Patches placed and painted, with details up to `coarsest` in size; boxes and the like get several paints.
-fn painted(
-    rng: &mut Rng,
-    patches: &[Patch],
-    place: Affine3A,
-    coarsest: f32,
-    density: f32,
-) -> Vec<crate::mesh::Part> {
+fn painted(rng: &mut Rng, patches: &[Patch], place: Affine3A, coarsest: f32, density: f32) -> Vec<crate::mesh::Part> {
     let light = rng.chance(0.6).then(|| Light {
         to_key: rng.direction(),
         ..Light::studio()
@@ -114,9 +108,7 @@ fn heap(rng: &mut Rng, density: f32) -> Mesh {
     for _ in 0..120 {
         let radius = rng.range(0.12, 0.34);
         let reach = 1.0 - radius;
-        let centre = Vec3::from(std::array::from_fn::<f32, 3, _>(|_| {
-            rng.range(-reach, reach)
-        }));
+        let centre = Vec3::from(std::array::from_fn::<f32, 3, _>(|_| rng.range(-reach, reach)));
         if balls.iter().any(|(c, r)| c.distance(centre) < r + radius) {
             continue;
         }
@@ -124,8 +116,7 @@ fn heap(rng: &mut Rng, density: f32) -> Mesh {
         let patches = SHAPES[rng.below(SHAPES.len() as u32) as usize].1(rng);
         let turn = rotation(rng);
         let place = Affine3A::from_scale_rotation_translation(Vec3::splat(radius), turn, centre);
-        mesh.parts
-            .extend(painted(rng, &patches, place, 0.06, density));
+        mesh.parts.extend(painted(rng, &patches, place, 0.06, density));
     }
     mesh
 }
@@ -197,8 +188,7 @@ fn spring(rng: &mut Rng) -> Vec<Patch> {
     let radius = rng.range(0.03, 0.1);
     let (turns, width) = (rng.range(2.0, 6.0), rng.range(0.3, 0.6));
     let line = shapes::helix(turns);
-    let narrow: shapes::Curve =
-        std::sync::Arc::new(move |t| line(t) * Vec3::new(width, 0.75, width));
+    let narrow: shapes::Curve = std::sync::Arc::new(move |t| line(t) * Vec3::new(width, 0.75, width));
     vec![shapes::tube(narrow, [16, 360], move |_| radius)]
 }
 
@@ -236,8 +226,7 @@ fn leaves(rng: &mut Rng) -> Vec<Patch> {
         let height = -0.7 + 1.3 * i as f32 / count as f32;
         let (length, width) = (rng.range(0.4, 0.85), rng.range(0.12, 0.4));
         let leaf = shapes::leaf(length, width, rng.range(0.2, 1.6));
-        let turn =
-            Quat::from_rotation_y(2.4 * i as f32) * Quat::from_rotation_x(-rng.range(0.0, 1.0));
+        let turn = Quat::from_rotation_y(2.4 * i as f32) * Quat::from_rotation_x(-rng.range(0.0, 1.0));
         parts.push(leaf.placed(Affine3A::from_rotation_translation(turn, height * Vec3::Y)));
     }
     parts
@@ -267,11 +256,9 @@ fn cord(rng: &mut Rng) -> Vec<Patch> {
         points.push(rng.direction() * rng.range(0.3, 0.9));
     }
     let radius = rng.range(0.02, 0.09);
-    vec![shapes::tube(
-        shapes::through(&points),
-        [16, 320],
-        move |t| radius * (4.0 * t * (1.0 - t)).sqrt().max(0.02),
-    )]
+    vec![shapes::tube(shapes::through(&points), [16, 320], move |t| {
+        radius * (4.0 * t * (1.0 - t)).sqrt().max(0.02)
+    })]
 }
 
 /// Discs of falling radius upon each other, in one profile, so that nothing is hidden inside.
@@ -307,10 +294,7 @@ mod tests {
             let mesh = object_at(COARSE, name, 3).unwrap();
             let (lo, hi) = bounds(&mesh);
             assert!((hi - lo).max_element() > 0.8, "{name}: {lo} {hi}");
-            assert!(
-                hi.abs().max(lo.abs()).max_element() < 1.45,
-                "{name}: {lo} {hi}"
-            );
+            assert!(hi.abs().max(lo.abs()).max_element() < 1.45, "{name}: {lo} {hi}");
             for part in &mesh.parts {
                 let texture = part.texture.as_ref().unwrap();
                 let texels = (texture.width * texture.height) as usize;
@@ -322,11 +306,7 @@ mod tests {
 
     #[test]
     fn equal_seeds_give_equal_objects_and_others_do_not() {
-        let positions = |seed| {
-            object_at(COARSE, "lathe", seed).unwrap().parts[0]
-                .positions
-                .clone()
-        };
+        let positions = |seed| object_at(COARSE, "lathe", seed).unwrap().parts[0].positions.clone();
         assert_eq!(positions(1), positions(1));
         assert_ne!(positions(1), positions(2));
     }

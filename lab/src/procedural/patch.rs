@@ -58,12 +58,7 @@ impl Patch {
     /// Derivatives by u and v, from finite differences inside the square.
     fn tangents(&self, u: f32, v: f32) -> [Vec3; 2] {
         const STEP: f32 = 1.0 / 512.0;
-        let ends = |t: f32| {
-            (
-                (t - STEP).clamp(0.0, 1.0 - STEP),
-                (t + STEP).clamp(STEP, 1.0),
-            )
-        };
+        let ends = |t: f32| ((t - STEP).clamp(0.0, 1.0 - STEP), (t + STEP).clamp(STEP, 1.0));
         let ((u0, u1), (v0, v1)) = (ends(u), ends(v));
         [
             (self.point(u1, v) - self.point(u0, v)) / (u1 - u0),
@@ -105,21 +100,11 @@ impl Patch {
     pub fn part(&self, density: f32, pattern: &Pattern, light: Option<&Light>) -> Part {
         let lengths = self.lengths();
         let texels = |length: f32| (length * density).ceil().clamp(2.0, LARGEST_TEXTURE) as u32;
-        let texture = self.paint(
-            [texels(lengths.x), texels(lengths.y)],
-            lengths,
-            pattern,
-            light,
-        );
+        let texture = self.paint([texels(lengths.x), texels(lengths.y)], lengths, pattern, light);
         let [nu, nv] = self.steps;
         let grid = |n: u32| (0..=n).map(move |i| i as f32 / n as f32);
-        let corners: Vec<(f32, f32)> = grid(nv)
-            .flat_map(|v| grid(nu).map(move |u| (u, v)))
-            .collect();
-        let positions: Vec<[f32; 3]> = corners
-            .par_iter()
-            .map(|&(u, v)| self.point(u, v).to_array())
-            .collect();
+        let corners: Vec<(f32, f32)> = grid(nv).flat_map(|v| grid(nu).map(move |u| (u, v))).collect();
+        let positions: Vec<[f32; 3]> = corners.par_iter().map(|&(u, v)| self.point(u, v).to_array()).collect();
         let inset = |t: f32, n: u32| (0.5 + t * (n - 1) as f32) / n as f32;
         let uvs = corners
             .iter()
@@ -148,13 +133,7 @@ impl Patch {
     }
 
     /// Every texel is the mean of 2×2 looks at the pattern.
-    fn paint(
-        &self,
-        [width, height]: [u32; 2],
-        lengths: Vec2,
-        pattern: &Pattern,
-        light: Option<&Light>,
-    ) -> Texture {
+    fn paint(&self, [width, height]: [u32; 2], lengths: Vec2, pattern: &Pattern, light: Option<&Light>) -> Texture {
         let step = Vec2::new(1.0 / (width - 1) as f32, 1.0 / (height - 1) as f32);
         let texel = |x: u32, y: u32| {
             let uv = Vec2::new(x as f32, y as f32) * step;
@@ -179,9 +158,7 @@ impl Patch {
                 };
                 colour *= light.shade(position, normal);
             }
-            let [r, g, b] = (colour.clamp(Vec3::ZERO, Vec3::ONE) * 255.0)
-                .round()
-                .to_array();
+            let [r, g, b] = (colour.clamp(Vec3::ZERO, Vec3::ONE) * 255.0).round().to_array();
             [r as u8, g as u8, b as u8, 255]
         };
         let rgba = (0..height)
@@ -189,11 +166,7 @@ impl Patch {
             .flat_map_iter(|y| (0..width).map(move |x| (x, y)))
             .map(|(x, y)| texel(x, y))
             .collect();
-        Texture {
-            width,
-            height,
-            rgba,
-        }
+        Texture { width, height, rgba }
     }
 }
 

@@ -22,11 +22,7 @@ pub fn plain(colour: Vec3) -> Pattern {
 pub fn checker(size: f32, a: Vec3, b: Vec3) -> Pattern {
     pattern(move |s| {
         let cell = (s.st / size).floor();
-        if (cell.x + cell.y).rem_euclid(2.0) < 1.0 {
-            a
-        } else {
-            b
-        }
+        if (cell.x + cell.y).rem_euclid(2.0) < 1.0 { a } else { b }
     })
 }
 
@@ -191,11 +187,7 @@ pub fn palette(rng: &mut Rng) -> Vec<Vec3> {
                 3 => hsv(rng.unit(), rng.range(0.15, 0.4), rng.range(0.75, 0.95)),
                 4 => hsv(0.04 + 0.1 * rng.unit(), rng.range(0.3, 0.7), 0.25 + 0.6 * t),
                 5 => Vec3::splat((0.02 + 0.96 * t).clamp(0.0, 1.0)),
-                _ => hsv(
-                    near + 0.5 * (i % 2) as f32,
-                    0.5 + 0.4 * rng.unit(),
-                    0.3 + 0.65 * t,
-                ),
+                _ => hsv(near + 0.5 * (i % 2) as f32, 0.5 + 0.4 * rng.unit(), 0.3 + 0.65 * t),
             }
         })
         .collect()
@@ -237,11 +229,7 @@ pub fn any(rng: &mut Rng, size: f32) -> Pattern {
                 &lines,
                 size * 0.25,
                 a,
-                if a.distance(b) > 0.3 {
-                    b
-                } else {
-                    Vec3::ONE - a
-                },
+                if a.distance(b) > 0.3 { b } else { Vec3::ONE - a },
             )
         }
     }
@@ -284,10 +272,7 @@ mod tests {
             for i in 0..200 {
                 let colour = at(&pattern, i as f32 * 0.013 - 0.4, i as f32 * 0.0071);
                 assert!(colour.is_finite());
-                assert!(
-                    colour.min_element() >= 0.0 && colour.max_element() < 1.6,
-                    "{colour}"
-                );
+                assert!(colour.min_element() >= 0.0 && colour.max_element() < 1.6, "{colour}");
             }
         }
     }

@@ -69,11 +69,7 @@ pub fn value_noise(p: Vec3, seed: u32) -> f32 {
     let at = |i, j, k| lattice(x + i, y + j, z + k, seed);
     let lerp = |a: f32, b: f32, t: f32| a + (b - a) * t;
     let row = |j, k| lerp(at(0, j, k), at(1, j, k), t.x);
-    lerp(
-        lerp(row(0, 0), row(1, 0), t.y),
-        lerp(row(0, 1), row(1, 1), t.y),
-        t.z,
-    )
+    lerp(lerp(row(0, 0), row(1, 0), t.y), lerp(row(0, 1), row(1, 1), t.y), t.z)
 }
 
 /// Gradient (Perlin) noise, about in `[−1, 1]`, 0 on lattice points.
@@ -94,11 +90,7 @@ pub fn gradient_noise(p: Vec3, seed: u32) -> f32 {
     };
     let lerp = |a: f32, b: f32, t: f32| a + (b - a) * t;
     let row = |j, k| lerp(at(0, j, k), at(1, j, k), t.x);
-    lerp(
-        lerp(row(0, 0), row(1, 0), t.y),
-        lerp(row(0, 1), row(1, 1), t.y),
-        t.z,
-    )
+    lerp(lerp(row(0, 0), row(1, 0), t.y), lerp(row(0, 1), row(1, 1), t.y), t.z)
 }
 
 /// A sum of `octaves` of gradient noise, each twice as fine and half as strong; about in `[−1, 1]`.

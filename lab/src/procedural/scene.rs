@@ -88,16 +88,10 @@ impl Still {
     fn put(&mut self, own: Option<Thing>, patches: &[Patch], paint: &Pattern) {
         let other = |t: &Thing| own.is_none_or(|own| own as usize != *t as usize);
         let light = Light {
-            occluders: Thing::ALL
-                .into_iter()
-                .filter(other)
-                .map(Thing::ball)
-                .collect(),
+            occluders: Thing::ALL.into_iter().filter(other).map(Thing::ball).collect(),
             ..Light::studio()
         };
-        let parts = patches
-            .iter()
-            .map(|p| p.part(self.density, paint, Some(&light)));
+        let parts = patches.iter().map(|p| p.part(self.density, paint, Some(&light)));
         self.mesh.parts.extend(parts);
     }
 }
@@ -152,11 +146,7 @@ fn vase(still: &mut Still) {
         (0.090, MOUTH - 0.465),
         (0.093, FLOOR),
     ]);
-    still.put(
-        Some(Thing::Vase),
-        &[shapes::lathe([128, 160], body)],
-        &paint::vase(),
-    );
+    still.put(Some(Thing::Vase), &[shapes::lathe([128, 160], body)], &paint::vase());
     let raise = Affine3A::from_translation(Vec3::Y * (MOUTH - 0.010));
     let soil = shapes::disc(0.0, 0.073).placed(raise);
     let earth = pattern::speckle(0.006, Vec3::splat(0.5), Vec3::new(0.20, 0.13, 0.09), 2);
@@ -165,10 +155,7 @@ fn vase(still: &mut Still) {
 
 fn flowers(still: &mut Still) {
     let mut rng = Rng::new(20);
-    let stalk = pattern::gradient(
-        Vec3::Y,
-        vec![Vec3::new(0.20, 0.38, 0.14), Vec3::new(0.42, 0.62, 0.24)],
-    );
+    let stalk = pattern::gradient(Vec3::Y, vec![Vec3::new(0.20, 0.38, 0.14), Vec3::new(0.42, 0.62, 0.24)]);
     let hues = [0.96, 0.78, 0.04, 0.88, 0.60, 0.99, 0.08];
     for (i, &hue) in hues.iter().enumerate() {
         let azimuth = 51.4 * i as f32 + 15.0;
@@ -184,12 +171,11 @@ fn flowers(still: &mut Still) {
         let stem = shapes::tube(line.clone(), [12, 80], |_| 0.0065);
         still.put(None, &[stem], &stalk);
         for (k, along) in [0.28, 0.46, 0.66].into_iter().enumerate() {
-            let turn =
-                Quat::from_rotation_y(azimuth.to_radians() + 2.2 * k as f32 + rng.range(-0.4, 0.4))
-                    * Quat::from_rotation_x(-rng.range(0.5, 0.9));
+            let turn = Quat::from_rotation_y(azimuth.to_radians() + 2.2 * k as f32 + rng.range(-0.4, 0.4))
+                * Quat::from_rotation_x(-rng.range(0.5, 0.9));
             let size = rng.range(0.15, 0.23);
-            let leaf = shapes::leaf(size, 0.34 * size, 1.3)
-                .placed(Affine3A::from_rotation_translation(turn, line(along)));
+            let leaf =
+                shapes::leaf(size, 0.34 * size, 1.3).placed(Affine3A::from_rotation_translation(turn, line(along)));
             still.put(None, &[leaf], &paint::leaf());
         }
         let up = (head - bend).normalize() + 0.8 * out;
@@ -202,8 +188,7 @@ fn blossom(still: &mut Still, head: Vec3, up: Vec3, hue: f32, petals: u32) {
     let tilt = Affine3A::from_rotation_translation(Quat::from_rotation_arc(Vec3::Y, up), head);
     let sheets: Vec<Patch> = (0..petals)
         .map(|k| {
-            let turn = Quat::from_rotation_y(TAU * k as f32 / petals as f32)
-                * Quat::from_rotation_x(-0.35);
+            let turn = Quat::from_rotation_y(TAU * k as f32 / petals as f32) * Quat::from_rotation_x(-0.35);
             shapes::leaf(0.118, 0.052, 0.7).placed(tilt * Affine3A::from_quat(turn))
         })
         .collect();
@@ -222,24 +207,15 @@ fn plaque(still: &mut Still) {
     let size = Vec3::new(0.36, 0.28, 0.020);
     let lean = facing(-20.0) * Quat::from_rotation_x(-0.2);
     let place = Affine3A::from_rotation_translation(lean, at(-20.0, 0.315, 0.141));
-    let faces: Vec<Patch> = shapes::cuboid(size)
-        .iter()
-        .map(|f| f.placed(place))
-        .collect();
+    let faces: Vec<Patch> = shapes::cuboid(size).iter().map(|f| f.placed(place)).collect();
     still.put(own, &faces[..1], &paint::plaque(size.truncate()));
-    let wood = pattern::wood(
-        0.02,
-        Vec3::new(0.70, 0.47, 0.27),
-        Vec3::new(0.42, 0.24, 0.12),
-        4,
-    );
+    let wood = pattern::wood(0.02, Vec3::new(0.70, 0.47, 0.27), Vec3::new(0.42, 0.24, 0.12), 4);
     still.put(own, &faces[1..5], &wood);
 }
 
 fn knot_and_cube(still: &mut Still) {
     let stand = facing(42.0) * Quat::from_rotation_x(PI / 2.0);
-    let place =
-        Affine3A::from_scale_rotation_translation(Vec3::splat(0.11), stand, at(42.0, 0.32, 0.133));
+    let place = Affine3A::from_scale_rotation_translation(Vec3::splat(0.11), stand, at(42.0, 0.32, 0.133));
     let knot = shapes::tube(shapes::torus_knot(2, 3), [24, 400], |_| 0.22).placed(place);
     let bands = vec![
         hsv(0.0, 0.9, 0.85),
@@ -247,11 +223,7 @@ fn knot_and_cube(still: &mut Still) {
         hsv(0.60, 0.9, 0.55),
         Vec3::splat(0.97),
     ];
-    still.put(
-        Some(Thing::Knot),
-        &[knot],
-        &pattern::stripes(0.015, 0.9, bands),
-    );
+    still.put(Some(Thing::Knot), &[knot], &pattern::stripes(0.015, 0.9, bands));
 
     let turned = Affine3A::from_rotation_translation(facing(62.0), at(80.0, 0.35, 0.048));
     let faces: Vec<Patch> = shapes::cuboid(Vec3::splat(0.095))
@@ -272,11 +244,7 @@ fn stone_and_ring(still: &mut Still) {
         let rough = 1.0 + 0.28 * fractal(p * 1.4, 6, 41);
         base + p * rough * Vec3::new(0.112, 0.083, 0.10)
     });
-    still.put(
-        Some(Thing::Stone),
-        &[stone],
-        &paint::granite(base.y + 0.045),
-    );
+    still.put(Some(Thing::Stone), &[stone], &paint::granite(base.y + 0.045));
 
     let upright = facing(136.0) * Quat::from_rotation_x(PI / 2.0 - 0.25);
     let place = Affine3A::from_rotation_translation(upright, at(136.0, 0.395, 0.072));
@@ -288,8 +256,7 @@ fn stone_and_ring(still: &mut Still) {
 fn cage(still: &mut Still) {
     let radius = 0.122;
     let centre = at(160.0, 0.32, radius * 0.85 + 0.006);
-    let place =
-        Affine3A::from_scale_rotation_translation(Vec3::splat(radius), facing(20.0), centre);
+    let place = Affine3A::from_scale_rotation_translation(Vec3::splat(radius), facing(20.0), centre);
     let bars: Vec<Patch> = shapes::cage(0.04).iter().map(|b| b.placed(place)).collect();
     let brass = pattern::clouds(0.05, vec![hsv(0.11, 0.75, 0.55), hsv(0.13, 0.55, 0.95)], 51);
     still.put(Some(Thing::Cage), &bars, &brass);
@@ -331,14 +298,8 @@ fn books(still: &mut Still) {
     ];
     let mut base = 0.0;
     for (size, azimuth, cloth, title, dot) in stack {
-        let place = Affine3A::from_rotation_translation(
-            facing(azimuth),
-            at(204.0, 0.30, base + size.y / 2.0),
-        );
-        let faces: Vec<Patch> = shapes::cuboid(size)
-            .iter()
-            .map(|f| f.placed(place))
-            .collect();
+        let place = Affine3A::from_rotation_translation(facing(azimuth), at(204.0, 0.30, base + size.y / 2.0));
+        let faces: Vec<Patch> = shapes::cuboid(size).iter().map(|f| f.placed(place)).collect();
         still.put(
             own,
             &[faces[0].clone(), faces[4].clone()],
@@ -351,11 +312,7 @@ fn books(still: &mut Still) {
 
 fn mug(still: &mut Still) {
     let own = Some(Thing::Mug);
-    let place = Affine3A::from_scale_rotation_translation(
-        Vec3::splat(0.85),
-        facing(251.0),
-        at(251.0, 0.315, 0.0),
-    );
+    let place = Affine3A::from_scale_rotation_translation(Vec3::splat(0.85), facing(251.0), at(251.0, 0.315, 0.0));
     let body = shapes::smooth_profile(&[
         (0.070, 0.145),
         (0.074, 0.172),
@@ -377,13 +334,8 @@ fn mug(still: &mut Still) {
     ];
     let line: Vec<Vec3> = line.iter().map(|&(x, y)| Vec3::new(x, y, 0.0)).collect();
     let handle = shapes::tube(shapes::through(&line), [16, 64], |_| 0.010).placed(place);
-    still.put(
-        own,
-        &[handle],
-        &pattern::plain(Vec3::new(0.985, 0.98, 0.97)),
-    );
-    let coffee =
-        shapes::disc(0.0, 0.070).placed(place * Affine3A::from_translation(Vec3::Y * 0.145));
+    still.put(own, &[handle], &pattern::plain(Vec3::new(0.985, 0.98, 0.97)));
+    let coffee = shapes::disc(0.0, 0.070).placed(place * Affine3A::from_translation(Vec3::Y * 0.145));
     let brown = vec![Vec3::new(0.16, 0.08, 0.04), Vec3::new(0.36, 0.20, 0.10)];
     still.put(own, &[coffee], &pattern::clouds(0.04, brown, 61));
 }
@@ -392,14 +344,8 @@ fn tower(still: &mut Still) {
     let own = Some(Thing::Tower);
     let place = Affine3A::from_rotation_translation(facing(294.0), at(294.0, 0.325, 0.0));
     let (radius, height) = (0.058, 0.22);
-    let wall = shapes::lathe([96, 48], move |v| {
-        Vec2::new(radius + 0.006 * v * v, height * (1.0 - v))
-    });
-    still.put(
-        own,
-        &[wall.placed(place)],
-        &paint::tower(TAU * (radius + 0.006)),
-    );
+    let wall = shapes::lathe([96, 48], move |v| Vec2::new(radius + 0.006 * v * v, height * (1.0 - v)));
+    still.put(own, &[wall.placed(place)], &paint::tower(TAU * (radius + 0.006)));
     let roof = shapes::sharp_profile(&[(0.0, 0.35), (0.076, height - 0.008), (0.058, height)]);
     let slate = vec![hsv(0.58, 0.25, 0.50), hsv(0.60, 0.45, 0.22)];
     still.put(
@@ -410,18 +356,10 @@ fn tower(still: &mut Still) {
     let pole = shapes::rod(Vec3::Y * 0.345, Vec3::Y * 0.405, 0.0035).placed(place);
     still.put(own, &[pole], &pattern::plain(hsv(0.12, 0.6, 0.8)));
     let flag = Patch::new([24, 4], |u, v| {
-        Vec3::new(
-            0.070 * u,
-            0.402 - 0.036 * v,
-            0.008 * u * (TAU * 1.2 * u).sin(),
-        )
+        Vec3::new(0.070 * u, 0.402 - 0.036 * v, 0.008 * u * (TAU * 1.2 * u).sin())
     });
     let halves = vec![hsv(0.0, 0.9, 0.85), Vec3::splat(0.96), hsv(0.36, 0.8, 0.5)];
-    still.put(
-        own,
-        &[flag.placed(place)],
-        &pattern::stripes(0.0121, PI / 2.0, halves),
-    );
+    still.put(own, &[flag.placed(place)], &pattern::stripes(0.0121, PI / 2.0, halves));
 }
 
 fn marbles(still: &mut Still) {
@@ -429,19 +367,11 @@ fn marbles(still: &mut Still) {
     for azimuth in [5.0, 13.0, 61.0, 98.0, 182.0, 230.0, 272.0, 319.0, 325.0] {
         let radius = rng.range(0.015, 0.025);
         let centre = at(azimuth, rng.range(0.375, 0.395), radius);
-        let ball = shapes::sphere()
-            .placed(Affine3A::from_translation(centre) * Affine3A::from_scale(Vec3::splat(radius)));
+        let ball =
+            shapes::sphere().placed(Affine3A::from_translation(centre) * Affine3A::from_scale(Vec3::splat(radius)));
         let hue = rng.unit();
-        let swirl = vec![
-            hsv(hue, 0.9, 0.8),
-            Vec3::splat(0.95),
-            hsv(hue + 0.4, 0.9, 0.5),
-        ];
-        still.put(
-            None,
-            &[ball],
-            &pattern::marble(0.05, swirl, rng.bits() as u32),
-        );
+        let swirl = vec![hsv(hue, 0.9, 0.8), Vec3::splat(0.95), hsv(hue + 0.4, 0.9, 0.5)];
+        still.put(None, &[ball], &pattern::marble(0.05, swirl, rng.bits() as u32));
     }
 }
 
@@ -463,10 +393,7 @@ mod tests {
             (1.5..1.8).contains(&size.y) && size.y > size.x && size.y > size.z,
             "{size}"
         );
-        assert!(
-            lo.y >= FLOOR - 0.056,
-            "something hangs below the stone: {lo}"
-        );
+        assert!(lo.y >= FLOOR - 0.056, "something hangs below the stone: {lo}");
         for part in &mesh.parts {
             let corners = part.positions.len() as u32;
             assert!(part.triangles.iter().flatten().all(|&i| i < corners));

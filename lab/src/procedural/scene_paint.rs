@@ -34,9 +34,7 @@ pub fn vase() -> Pattern {
             let t = (s.uv.y - top) / (bottom - top);
             (0.0..1.0).contains(&t).then_some(t)
         };
-        let ring = [
-            0.03, 0.25, 0.262, 0.352, 0.364, 0.60, 0.612, 0.70, 0.712, 0.955,
-        ];
+        let ring = [0.03, 0.25, 0.262, 0.352, 0.364, 0.60, 0.612, 0.70, 0.712, 0.955];
         if ring.iter().any(|&y| (s.uv.y - y).abs() < 0.0032) {
             return COBALT;
         }
@@ -51,11 +49,7 @@ pub fn vase() -> Pattern {
         if let Some(t) = band(0.622, 0.69) {
             let x = ((s.uv.x * 36.0).fract() * 8.0) as u32;
             let row = MEANDER[(t * 7.0) as usize];
-            return if row >> (7 - x) & 1 == 1 {
-                COBALT
-            } else {
-                glaze
-            };
+            return if row >> (7 - x) & 1 == 1 { COBALT } else { glaze };
         }
         if let Some(t) = band(0.725, 0.94) {
             let x = (s.uv.x * 24.0).fract() - 0.5;
@@ -169,20 +163,13 @@ pub fn pages() -> Pattern {
 /// Bricks with dark windows that have light frames; for a lathe `around` and `height` long.
 pub fn tower(around: f32) -> Pattern {
     Arc::new(move |s: &Spot| {
-        let window = Vec2::new(
-            (s.uv.x * 6.0).fract() - 0.5,
-            (s.st.y / 0.085).fract() - 0.55,
-        );
+        let window = Vec2::new((s.uv.x * 6.0).fract() - 0.5, (s.st.y / 0.085).fract() - 0.55);
         let wide = window * Vec2::new(around / 6.0, 0.085);
         let inside = wide.x.abs() < 0.011 && wide.y.abs() < 0.018;
         let frame = wide.x.abs() < 0.015 && wide.y.abs() < 0.022;
         if inside {
             let bar = wide.x.abs() < 0.002 || wide.y.abs() < 0.002;
-            return if bar {
-                CREAM
-            } else {
-                Vec3::new(0.06, 0.09, 0.14)
-            };
+            return if bar { CREAM } else { Vec3::new(0.06, 0.09, 0.14) };
         }
         if frame {
             return CREAM;

@@ -41,11 +41,7 @@ pub fn superquadric(ns: f32, ew: f32) -> Patch {
         let (sin_u, cos_u) = (TAU * u).sin_cos();
         let (sin_v, cos_v) = pole_sin_cos(v);
         let ring = power(sin_v, ns);
-        Vec3::new(
-            ring * power(sin_u, ew),
-            power(cos_v, ns),
-            ring * power(cos_u, ew),
-        )
+        Vec3::new(ring * power(sin_u, ew), power(cos_v, ns), ring * power(cos_u, ew))
     })
 }
 
@@ -92,11 +88,7 @@ pub fn through(points: &[Vec3]) -> Curve {
 }
 
 /// A tube along a curve, without caps; u runs around it and v along it. If the curve closes, so does the tube.
-pub fn tube(
-    curve: Curve,
-    steps: [u32; 2],
-    radius: impl Fn(f32) -> f32 + Send + Sync + 'static,
-) -> Patch {
+pub fn tube(curve: Curve, steps: [u32; 2], radius: impl Fn(f32) -> f32 + Send + Sync + 'static) -> Patch {
     let frames = Frames::along(&curve, steps[1] as usize);
     Patch::new(steps, move |u, v| {
         let (centre, side, up) = frames.at(v);
@@ -114,9 +106,7 @@ struct Frames {
 
 impl Frames {
     fn along(curve: &Curve, steps: usize) -> Self {
-        let centres: Vec<Vec3> = (0..=steps)
-            .map(|i| curve(i as f32 / steps as f32))
-            .collect();
+        let centres: Vec<Vec3> = (0..=steps).map(|i| curve(i as f32 / steps as f32)).collect();
         let closed = centres[0].distance(centres[steps]) < 1e-4;
         let tangent = |i: usize| {
             let before = if i > 0 {
@@ -149,11 +139,7 @@ impl Frames {
             }
         }
         let sides = (0..=steps).map(|i| ups[i].cross(tangent(i))).collect();
-        Frames {
-            centres,
-            sides,
-            ups,
-        }
+        Frames { centres, sides, ups }
     }
 
     fn at(&self, v: f32) -> (Vec3, Vec3, Vec3) {
@@ -199,9 +185,7 @@ pub fn sharp_profile(points: &[(f32, f32)]) -> impl Fn(f32) -> Vec2 + Send + Syn
     move |t| {
         let total = reached[reached.len() - 1];
         let x = t.clamp(0.0, 1.0) * total;
-        let i = reached
-            .partition_point(|&r| r < x)
-            .clamp(1, points.len() - 1);
+        let i = reached.partition_point(|&r| r < x).clamp(1, points.len() - 1);
         let f = (x - reached[i - 1]) / (reached[i] - reached[i - 1]).max(1e-9);
         points[i - 1].lerp(points[i], f)
     }
@@ -233,9 +217,7 @@ pub fn panel(width: f32, height: f32) -> Patch {
 pub fn cuboid(size: Vec3) -> Vec<Patch> {
     let half = size / 2.0;
     let side = |turn: Quat, width: f32, height: f32, out: f32| {
-        panel(width, height).placed(
-            Affine3A::from_quat(turn) * Affine3A::from_translation(Vec3::new(0.0, 0.0, out)),
-        )
+        panel(width, height).placed(Affine3A::from_quat(turn) * Affine3A::from_translation(Vec3::new(0.0, 0.0, out)))
     };
     let around = |turns: f32| Quat::from_rotation_y(turns * PI / 2.0);
     vec![
@@ -250,9 +232,7 @@ pub fn cuboid(size: Vec3) -> Vec<Patch> {
 
 /// A flat round sheet that faces up, around the y axis; v runs outwards from `inner`.
 pub fn disc(inner: f32, outer: f32) -> Patch {
-    lathe([96, 12], move |v| {
-        Vec2::new(inner + (outer - inner) * v, 0.0)
-    })
+    lathe([96, 12], move |v| Vec2::new(inner + (outer - inner) * v, 0.0))
 }
 
 /// A thin leaf, one sheet: it grows from the origin along +z, `length` long and `width` wide, and its tip bends down by `droop`
@@ -312,10 +292,7 @@ mod tests {
 
     fn assert_volume(patches: &[Patch], expected: f32) {
         let found = volume(patches);
-        assert!(
-            (found / expected - 1.0).abs() < 0.02,
-            "{found}, expected {expected}"
-        );
+        assert!((found / expected - 1.0).abs() < 0.02, "{found}, expected {expected}");
     }
 
     #[test]

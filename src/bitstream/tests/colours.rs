@@ -31,11 +31,7 @@ fn filters_follow_latents_or_stand_where_there_are_none() {
     let [base, middle, top] = stream.levels() else {
         panic!("three levels")
     };
-    let codes = |level: &Level| {
-        level
-            .filters
-            .map(|f| f.map(|f| (f.voxels, f.bytes.to_vec())))
-    };
+    let codes = |level: &Level| level.filters.map(|f| f.map(|f| (f.voxels, f.bytes.to_vec())));
     assert_eq!(codes(base), [None, None]);
     assert_eq!(codes(middle), [Some((10, b"best".to_vec())), None]);
     assert_eq!(codes(top), [None, Some((20, b"quick".to_vec()))]);

@@ -90,10 +90,7 @@ fn what_is_written_is_read() {
     let [base, middle, top] = stream.levels() else {
         panic!("three levels")
     };
-    assert_eq!(
-        (base.level, base.voxels, base.latent_hash),
-        (2, 3, HASHES[0])
-    );
+    assert_eq!((base.level, base.voxels, base.latent_hash), (2, 3, HASHES[0]));
     assert_eq!(base.geometry.len(), 2);
     assert_eq!((base.geometry[0].level, base.geometry[1].level), (1, 2));
     assert_eq!(codes(&base.geometry[0].slices), ["one"]);
@@ -116,19 +113,13 @@ fn what_is_written_is_read() {
 fn the_first_bytes_are_those_that_the_format_describes() {
     let bytes = sample();
     assert_eq!(&bytes[..8], b"\x89B2P\r\n\x1a\n");
-    assert_eq!(
-        bytes[8..24],
-        [2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 128, 5, 2, 4, 0]
-    );
+    assert_eq!(bytes[8..24], [2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 128, 5, 2, 4, 0]);
     assert_eq!(bytes[24..32], 25u64.to_le_bytes());
     assert_eq!(bytes[56..64], 0.25f64.to_le_bytes());
     assert_eq!(bytes[64..84], *b"0123456789abcdef\x04\0\0\0");
     assert_eq!(bytes[84..96], [3, 0, 0, 0, 10, 0, 0, 0, 20, 0, 0, 0]);
     // Level 2: two chunks of geometry, one of features with the hash.
-    assert_eq!(
-        bytes[96..104],
-        [16 + 3 + 16 + 6, 0, 0, 0, 16 + 8 + 9, 0, 0, 0]
-    );
+    assert_eq!(bytes[96..104], [16 + 3 + 16 + 6, 0, 0, 0, 16 + 8 + 9, 0, 0, 0]);
     assert_eq!(bytes[124..136], [1, 1, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0]);
     assert_eq!(&bytes[140..143], b"one");
 }
@@ -153,10 +144,7 @@ fn a_prefix_gives_every_level_that_it_holds_and_no_other() {
         assert!(matches!(prefix.damage(), Some(Error::Truncated { .. })));
         assert_eq!(prefix.deepest(), [None, Some(2), Some(3)][count]);
         let deeper = 2 + count as u8;
-        assert!(matches!(
-            prefix.require(deeper),
-            Err(Error::Truncated { .. })
-        ));
+        assert!(matches!(prefix.require(deeper), Err(Error::Truncated { .. })));
     }
     for level in 2..=4 {
         let prefix = parse(&bytes[..ends[usize::from(level) - 2]]).unwrap();
@@ -190,13 +178,7 @@ fn what_follows_the_last_section_is_reported() {
     let bytes = [&sample()[..], b"!"].concat();
     let stream = parse(&bytes).unwrap();
     assert_eq!(stream.deepest(), Some(4));
-    assert!(
-        stream
-            .damage()
-            .unwrap()
-            .to_string()
-            .contains("what follows")
-    );
+    assert!(stream.damage().unwrap().to_string().contains("what follows"));
 }
 
 #[test]
@@ -206,9 +188,7 @@ fn errors_say_where_and_what() {
     damaged[130] ^= 4;
     let error = parse(&damaged).unwrap().require(2).unwrap_err().to_string();
     assert!(
-        error.starts_with(
-            "bitstream: checksum of a chunk that calls itself type 1, level 1, slice 0 at byte 124"
-        ),
+        error.starts_with("bitstream: checksum of a chunk that calls itself type 1, level 1, slice 0 at byte 124"),
         "{error}"
     );
     let error = parse(&bytes).unwrap().require(7).unwrap_err().to_string();
@@ -218,10 +198,7 @@ fn errors_say_where_and_what() {
     let header = parse(&bytes).unwrap().header().clone();
     assert!(header.check_model(b"0123456789abcdef").is_ok());
     let error = header.check_model(&[0xab; 16]).unwrap_err().to_string();
-    assert!(
-        error.contains("3031323334") && error.contains("abababab"),
-        "{error}"
-    );
+    assert!(error.contains("3031323334") && error.contains("abababab"), "{error}");
     let stream = parse(&bytes).unwrap();
     assert!(stream.levels()[0].check_latents(11).is_ok());
     assert!(matches!(
@@ -316,10 +293,7 @@ fn unknown_critical_things_are_refused_and_unknown_others_passed_over() {
         seal_header(&mut longer);
         let stream = parse(&longer).unwrap();
         assert!(stream.damage().is_none(), "{:?}", stream.damage());
-        assert_eq!(
-            stream.levels()[1].latent_hash,
-            whole.levels()[1].latent_hash
-        );
+        assert_eq!(stream.levels()[1].latent_hash, whole.levels()[1].latent_hash);
     }
 }
 
@@ -362,10 +336,7 @@ fn the_writer_refuses_what_the_reader_would() {
     let unfinished = Writer::new(header()).unwrap();
     assert!(unfinished.finish().is_err());
     let mut wrong = Writer::new(header()).unwrap();
-    assert!(matches!(
-        wrong.geometry(5, &[(1, b"")]),
-        Err(Error::Usage(_))
-    ));
+    assert!(matches!(wrong.geometry(5, &[(1, b"")]), Err(Error::Usage(_))));
     assert!(matches!(wrong.features(3, 0, &[b""]), Err(Error::Usage(_))));
     wrong.geometry(2, &[(3, b"")]).unwrap();
     assert!(wrong.finish().is_err());

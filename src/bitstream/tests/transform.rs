@@ -156,13 +156,7 @@ fn headers_that_the_format_forbids_are_refused() {
         let error = Writer::new(header).unwrap_err().to_string();
         assert!(error.contains(field), "{error}");
     };
-    refused(
-        Header {
-            bits: 3,
-            ..header()
-        },
-        "bit depth",
-    );
+    refused(Header { bits: 3, ..header() }, "bit depth");
     let slices = |colour_slice| Header {
         format: Format::Transform { colour_slice },
         ..header()
@@ -188,11 +182,7 @@ fn chunks_that_break_the_format_are_damage() {
     let [geometry, colours] = base();
     let trunk = |level, count, payload: &[u8]| vec![chunk(5, level, [0, count], payload)];
     told(0, vec![], "end of the section");
-    told(
-        0,
-        trunk(3, 3, b""),
-        "geometry trunk chunk of a level from 1 to 2",
-    );
+    told(0, trunk(3, 3, b""), "geometry trunk chunk of a level from 1 to 2");
     told(0, trunk(2, 4, b"\x02\x03one\x03\x06second"), "voxel count");
     told(0, trunk(2, 3, b"\x02\x03one\x03\x06second!"), "bytes after");
     told(
@@ -200,63 +190,27 @@ fn chunks_that_break_the_format_are_damage() {
         trunk(2, 3, b"\x02\x03one\x03\x07second"),
         "payload of the geometry trunk",
     );
-    told(
-        0,
-        trunk(2, 3, b"\x02\x03one"),
-        "payload of the geometry trunk",
-    );
-    told(
-        0,
-        trunk(2, 3, b"\x00\x03one\x03\x06second"),
-        "voxel count of level 1",
-    );
-    told(
-        0,
-        trunk(2, 3, b"\x09\x03one\x03\x06second"),
-        "voxel count of level 1",
-    );
-    told(
-        0,
-        trunk(2, 3, b"\x03\x03one\x03\x06second"),
-        "parents of level 2",
-    );
-    told(
-        0,
-        vec![geometry[0].clone(), geometry[0].clone()],
-        "section's last",
-    );
+    told(0, trunk(2, 3, b"\x02\x03one"), "payload of the geometry trunk");
+    told(0, trunk(2, 3, b"\x00\x03one\x03\x06second"), "voxel count of level 1");
+    told(0, trunk(2, 3, b"\x09\x03one\x03\x06second"), "voxel count of level 1");
+    told(0, trunk(2, 3, b"\x03\x03one\x03\x06second"), "parents of level 2");
+    told(0, vec![geometry[0].clone(), geometry[0].clone()], "section's last");
 
     told(1, vec![], "end of the section");
-    told(
-        1,
-        colours[1..].to_vec(),
-        "colour trunk chunk of a level from 0 to 2",
-    );
+    told(1, colours[1..].to_vec(), "colour trunk chunk of a level from 0 to 2");
     told(1, vec![chunk(6, 1, [0, 2], b"short")], "first colour chunk");
     let hash = [0; 8];
     told(1, vec![chunk(6, 1, [0, 3], &hash)], "colour trunk");
     told(1, vec![chunk(6, 1, [1, 2], &hash)], "slice 0");
     let after = |chunk: Vec<u8>| vec![colours[0].clone(), chunk];
-    told(
-        1,
-        after(colours[2].clone()),
-        "colour chunk of level 2, slice 0",
-    );
-    told(
-        1,
-        after(chunk(7, 2, [0, 3], b"two")),
-        "voxel count of the colour chunk",
-    );
+    told(1, after(colours[2].clone()), "colour chunk of level 2, slice 0");
+    told(1, after(chunk(7, 2, [0, 3], b"two")), "voxel count of the colour chunk");
     told(
         1,
         after(chunk(7, 2, [1, 2], b"two")),
         "colour chunk of level 2, slice 0",
     );
-    let filter = vec![
-        colours[0].clone(),
-        colours[1].clone(),
-        chunk(8, 2, [0, 4], b""),
-    ];
+    let filter = vec![colours[0].clone(), colours[1].clone(), chunk(8, 2, [0, 4], b"")];
     told(1, filter, "voxel count of the colour filter chunk");
     for kind in [0, 2, 3, 4, 9, 127] {
         told(1, after(chunk(kind, 2, [0, 2], b"two")), "type");

@@ -48,18 +48,11 @@ pub(super) fn columns(
     for _ in 0..rows {
         let row = lines.next_row()?;
         let line = lines.line;
-        let mut words = row
-            .split(|b| b.is_ascii_whitespace())
-            .filter(|w| !w.is_empty());
+        let mut words = row.split(|b| b.is_ascii_whitespace()).filter(|w| !w.is_empty());
         for (property, &slot) in element.properties.iter().zip(&slots) {
             let at = |word: Option<&[u8]>, expected: String| {
                 let field = format!("property {:.40}", property.name);
-                malformed(
-                    format!("line {line}"),
-                    field,
-                    shown(word.unwrap_or_default()),
-                    expected,
-                )
+                malformed(format!("line {line}"), field, shown(word.unwrap_or_default()), expected)
             };
             let mut next = |scalar: Scalar| {
                 let word = words.next();
@@ -85,12 +78,7 @@ pub(super) fn columns(
         }
         if let Some(word) = words.next() {
             let expected = format!("the end of a row of {}", element.name);
-            return Err(malformed(
-                format!("line {line}"),
-                "row",
-                shown(word),
-                expected,
-            ));
+            return Err(malformed(format!("line {line}"), "row", shown(word), expected));
         }
     }
     Ok(columns)
@@ -132,11 +120,7 @@ impl<'a> Lines<'a> {
         let left = (self.bytes.len() - self.at) as u64;
         if needed > left {
             let missing = needed - left;
-            return Err(truncated(
-                self.bytes.len(),
-                "rows of a PLY element",
-                missing,
-            ));
+            return Err(truncated(self.bytes.len(), "rows of a PLY element", missing));
         }
         Ok(())
     }
@@ -155,9 +139,7 @@ fn number(scalar: Scalar, word: &[u8]) -> Option<f64> {
         }
     };
     match scalar.range() {
-        Some((low, high)) => {
-            (value.fract() == 0.0 && low <= value && value <= high).then_some(value)
-        }
+        Some((low, high)) => (value.fract() == 0.0 && low <= value && value <= high).then_some(value),
         // Rounds the small integers that f32 cannot hold.
         None if scalar == Scalar::F32 => Some((value as f32).into()),
         None => Some(value),

@@ -47,16 +47,14 @@ pub(super) fn columns(
     let mut columns: Vec<Column> = wanted.iter().map(with_room).collect();
     let offsets: Vec<usize> = wanted.iter().map(|w| offset(element, w.0)).collect();
     let parts = columns.par_chunks_mut(TOGETHER);
-    parts
-        .zip(offsets.par_chunks(TOGETHER))
-        .for_each(|(columns, offsets)| {
-            // Some rows at a time, so that they are still in the cache for the last column.
-            for rows in rows.chunks(BLOCK * stride) {
-                for (column, &at) in columns.iter_mut().zip(offsets) {
-                    column.extend(rows, stride, at, big_endian);
-                }
+    parts.zip(offsets.par_chunks(TOGETHER)).for_each(|(columns, offsets)| {
+        // Some rows at a time, so that they are still in the cache for the last column.
+        for rows in rows.chunks(BLOCK * stride) {
+            for (column, &at) in columns.iter_mut().zip(offsets) {
+                column.extend(rows, stride, at, big_endian);
             }
-        });
+        }
+    });
     Ok(columns)
 }
 
@@ -76,11 +74,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Visits every scalar property of every row as (row's property, its bytes), passing over lists.
-    fn walk(
-        &mut self,
-        element: &Element,
-        mut visit: impl FnMut(usize, Scalar, &[u8]) -> Result<()>,
-    ) -> Result<()> {
+    fn walk(&mut self, element: &Element, mut visit: impl FnMut(usize, Scalar, &[u8]) -> Result<()>) -> Result<()> {
         // A row holds at least the count of a list, so the loop ends with the bytes.
         for _ in 0..element.count {
             for (i, property) in element.properties.iter().enumerate() {
@@ -95,12 +89,7 @@ impl<'a> Cursor<'a> {
                         let length = number(bytes, count, self.big_endian);
                         if length < 0.0 {
                             let field = format!("length of list {:.40}", property.name);
-                            return Err(malformed(
-                                format!("byte {at}"),
-                                field,
-                                length,
-                                "0 or more",
-                            ));
+                            return Err(malformed(format!("byte {at}"), field, length, "0 or more"));
                         }
                         self.take(length as u64 * item.size() as u64, "items of a PLY list")?;
                     }
@@ -111,11 +100,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Columns of an element whose rows vary in length.
-    fn listed_columns(
-        mut self,
-        element: &Element,
-        wanted: &[(usize, Scalar)],
-    ) -> Result<Vec<Column>> {
+    fn listed_columns(mut self, element: &Element, wanted: &[(usize, Scalar)]) -> Result<Vec<Column>> {
         let least: usize = element
             .properties
             .iter()

@@ -280,12 +280,7 @@ fn property_kind(words: &[&str]) -> Option<Kind> {
 
 /// Something that the header should declare and does not.
 pub(super) fn absent(what: &str, name: &str) -> Error {
-    malformed(
-        "header",
-        format!("{what} {name}"),
-        "absent",
-        "to be declared",
-    )
+    malformed("header", format!("{what} {name}"), "absent", "to be declared")
 }
 
 /// Bytes of a file as an error message may repeat them.

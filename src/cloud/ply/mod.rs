@@ -67,11 +67,7 @@ impl<'a> Ply<'a> {
     /// Where row `row` of the element `vertex` stands: a line of an ASCII file, a byte offset of a binary one; only the row's
     /// number if rows before it have no fixed size.
     pub(super) fn vertex_place(&self, row: usize) -> String {
-        let before = self
-            .header
-            .elements
-            .iter()
-            .take_while(|e| e.name != "vertex");
+        let before = self.header.elements.iter().take_while(|e| e.name != "vertex");
         let place = match self.header.format {
             Format::Ascii => {
                 let rows = before
@@ -87,10 +83,7 @@ impl<'a> Ply<'a> {
                 .collect::<Option<Vec<_>>>()
                 .and_then(|strides| {
                     let ((_, own), before) = strides.split_last()?;
-                    let skipped: usize = before
-                        .iter()
-                        .map(|(e, stride)| e.count as usize * stride)
-                        .sum();
+                    let skipped: usize = before.iter().map(|(e, stride)| e.count as usize * stride).sum();
                     Some(format!("byte {}", self.header.body + skipped + row * own))
                 }),
         };
@@ -115,20 +108,12 @@ impl<'a> Ply<'a> {
             wanted.push(property);
         }
         let width: u64 = wanted.iter().map(|w| w.1.width()).sum();
-        limits.check_bytes(
-            "bytes of the PLY file's columns",
-            element.count.saturating_mul(width),
-        )?;
+        limits.check_bytes("bytes of the PLY file's columns", element.count.saturating_mul(width))?;
         match self.header.format {
             Format::Ascii => ascii::columns(self.bytes, &self.header, before, element, &wanted),
-            Format::Binary { big_endian } => binary::columns(
-                self.bytes,
-                self.header.body,
-                big_endian,
-                before,
-                element,
-                &wanted,
-            ),
+            Format::Binary { big_endian } => {
+                binary::columns(self.bytes, self.header.body, big_endian, before, element, &wanted)
+            }
         }
     }
 }

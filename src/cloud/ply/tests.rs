@@ -71,8 +71,7 @@ fn many_columns_of_many_rows_are_read_like_few() {
     let value = |row: usize, column: usize| (row * 100 + column) as f32;
     for big_endian in [false, true] {
         let kind = if big_endian { "big" } else { "little" };
-        let mut bytes =
-            format!("ply\nformat binary_{kind}_endian 1.0\nelement vertex {rows}\n").into_bytes();
+        let mut bytes = format!("ply\nformat binary_{kind}_endian 1.0\nelement vertex {rows}\n").into_bytes();
         let names: Vec<String> = (0..columns).map(|i| format!("p{i}")).collect();
         for name in &names {
             bytes.extend(format!("property float {name}\n").bytes());
@@ -134,32 +133,23 @@ fn a_file_cut_anywhere_is_an_error() {
 
 #[test]
 fn errors_say_where_what_and_why() {
-    let header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty uchar y\nproperty float z\nend_header\n";
+    let header =
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty uchar y\nproperty float z\nend_header\n";
     let error = message(format!("{header}1 2 3\n4 256 6\n").as_bytes());
     assert_eq!(
         error,
         "cloud: at line 9: property y is \"256\", expected a number of type uchar"
     );
     let error = message(format!("{header}1 2 3\n4 5\n7").as_bytes());
-    assert!(
-        error.contains("line 9") && error.contains("property z"),
-        "{error}"
-    );
+    assert!(error.contains("line 9") && error.contains("property z"), "{error}");
     let error = message(format!("{header}1 2 3 4\n4 5 6\n").as_bytes());
-    assert!(
-        error.contains("line 8") && error.contains("end of a row"),
-        "{error}"
-    );
-    let error =
-        message(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n");
+    assert!(error.contains("line 8") && error.contains("end of a row"), "{error}");
+    let error = message(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n");
     assert!(error.contains("property of vertex y is absent"), "{error}");
     let error = message(b"ply\nformat ascii 1.0\nend_header\n");
     assert!(error.contains("element vertex is absent"), "{error}");
     let error = message(b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n");
-    assert!(
-        error.contains("line 3") && error.contains("many"),
-        "{error}"
-    );
+    assert!(error.contains("line 3") && error.contains("many"), "{error}");
     assert!(matches!(
         open(b"ply\nformat ascii 2.0\nend_header\n"),
         Err(Error::Unsupported { .. })
@@ -183,8 +173,7 @@ fn a_claimed_count_reserves_nothing_that_is_not_there() {
                      property float x\nproperty float y\nproperty float z\n{list}end_header\n1 2 3"
                 );
                 assert!(open(header.as_bytes()).is_err());
-                let header =
-                    header.replace(&format!("pad {count}\nproperty float a\n{list}"), "pad 0\n");
+                let header = header.replace(&format!("pad {count}\nproperty float a\n{list}"), "pad 0\n");
                 assert!(open(header.as_bytes()).is_err());
             }
         }
@@ -195,10 +184,7 @@ fn a_claimed_count_reserves_nothing_that_is_not_there() {
         ..Limits::default()
     };
     let result = Ply::open(&bytes).unwrap().vertex_columns(&XYZ, &limits);
-    assert!(matches!(
-        result,
-        Err(Error::LimitExceeded { needed: 2, .. })
-    ));
+    assert!(matches!(result, Err(Error::LimitExceeded { needed: 2, .. })));
 }
 
 #[test]
@@ -260,7 +246,8 @@ fn a_vertex_has_a_place_in_every_format() {
     let bytes = b"ply\nformat ascii 1.0\nelement list 1\nproperty uchar a\nelement vertex 2\nproperty int x\nend_header\n7\n\n1\n2";
     let ply = Ply::open(bytes).unwrap();
     assert_eq!(ply.vertex_place(1), "line 11");
-    let bytes = b"ply\nformat binary_little_endian 1.0\nelement list 2\nproperty uchar a\nelement vertex 2\nproperty float x\n\
+    let bytes =
+        b"ply\nformat binary_little_endian 1.0\nelement list 2\nproperty uchar a\nelement vertex 2\nproperty float x\n\
         property double y\nend_header\n..";
     let body = bytes.len() - 2;
     let ply = Ply::open(bytes).unwrap();

@@ -132,10 +132,7 @@ fn nearest(size: f32) -> Result<u8> {
         return Err(Error::Usage(format!("{what}, not {size}")));
     }
     let off = |luma: &u8| {
-        let steps = Steps {
-            luma: *luma,
-            chroma: 0,
-        };
+        let steps = Steps { luma: *luma, chroma: 0 };
         (steps.luma_step() / size).ln().abs()
     };
     let nearest = (0..=Steps::MAX).min_by(|a, b| off(a).total_cmp(&off(b)));
@@ -193,12 +190,7 @@ struct Layer {
 }
 
 impl<'a> Subject<'a> {
-    fn new(
-        cloud: &'a ColouredVoxels,
-        levels: RangeInclusive<u8>,
-        options: &'a Options,
-        log: &mut Log,
-    ) -> Result<Self> {
+    fn new(cloud: &'a ColouredVoxels, levels: RangeInclusive<u8>, options: &'a Options, log: &mut Log) -> Result<Self> {
         let (isa, top) = (options.isa.unwrap_or_else(Isa::detect), *levels.end());
         let subject = Subject {
             cloud,
@@ -222,9 +214,7 @@ impl<'a> Subject<'a> {
         let octree = log.step("octree", count, "voxels", || {
             Octree::new(Voxels::from_sorted(top, keys))
         })?;
-        let maps = log.step("kernel maps", count, "voxels", || {
-            Ok(super::kernel_maps(&octree, 0))
-        })?;
+        let maps = log.step("kernel maps", count, "voxels", || Ok(super::kernel_maps(&octree, 0)))?;
         let slice = options.slice_voxels as usize;
         let geometry = log.step("geometry", count, "voxels", || {
             let code = |level: u8| {
@@ -262,9 +252,7 @@ impl<'a> Subject<'a> {
 
     /// The colours that a stream whose last level is `top` approaches.
     fn truth(&self, top: u8, lossless: bool) -> Truth {
-        let ColouredVoxels {
-            voxels, colours, ..
-        } = self.cloud;
+        let ColouredVoxels { voxels, colours, .. } = self.cloud;
         Truth::new(voxels, colours, &self.octree, top, lossless)
     }
 
@@ -348,11 +336,7 @@ impl<'a> Subject<'a> {
         }
         self.write(&mut writer, base, trunk, &payload, &layers)?;
         let bytes = writer.finish()?;
-        Ok(Coded {
-            bytes,
-            top,
-            colours,
-        })
+        Ok(Coded { bytes, top, colours })
     }
 
     /// Bytes of the geometry of the levels 1 to `level`.
@@ -362,14 +346,7 @@ impl<'a> Subject<'a> {
     }
 
     /// Writes the sections of all levels.
-    fn write(
-        &self,
-        writer: &mut Writer,
-        base: u8,
-        trunk: u8,
-        payload: &[u8],
-        layers: &[Layer],
-    ) -> Result<()> {
+    fn write(&self, writer: &mut Writer, base: u8, trunk: u8, payload: &[u8], layers: &[Layer]) -> Result<()> {
         let slice = self.options.slice_voxels as usize;
         let voxels = |level: usize| self.octree.level(level as u8).len();
         // Levels of one slice each.
@@ -403,15 +380,9 @@ impl<'a> Subject<'a> {
 
     /// The stream, once it has been decoded to what was encoded.
     fn checked(&self, coded: Coded, log: &mut Log) -> Result<Encoded> {
-        let Coded {
-            bytes,
-            top,
-            colours,
-        } = coded;
+        let Coded { bytes, top, colours } = coded;
         let voxels = self.octree.level(top);
-        let decoder = StreamDecoder::new()
-            .with_isa(self.isa)
-            .with_limits(Limits::unlimited());
+        let decoder = StreamDecoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
         let same = log.step("decode again", voxels.len(), "voxels", || {
             let decoding = decoder.whole(&bytes, Some(top), &mut Log::default())?;
             let points = decoding.points();
@@ -419,8 +390,7 @@ impl<'a> Subject<'a> {
         })?;
         if !same {
             return Err(Error::Usage(
-                "the stream does not decode to what was encoded: this machine computes wrongly"
-                    .into(),
+                "the stream does not decode to what was encoded: this machine computes wrongly".into(),
             ));
         }
         let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);

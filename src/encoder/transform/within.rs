@@ -145,11 +145,7 @@ impl Search<'_> {
     }
 
     /// Codes at a place: the bytes, and the stream if it fits.
-    fn attempt_sized(
-        &mut self,
-        place: Place,
-        log: &mut Log,
-    ) -> Result<(f64, Option<(Place, Coded)>)> {
+    fn attempt_sized(&mut self, place: Place, log: &mut Log) -> Result<(f64, Option<(Place, Coded)>)> {
         self.tries += 1;
         let Place { top, steps } = place;
         let how = Fineness::of(steps);
@@ -196,9 +192,7 @@ fn between(fits: Option<Tried>, exceeds: Option<Tried>, room: f64, last: u8) -> 
     }
     let known = fits.or(exceeds)?;
     let slope = match (fits, exceeds) {
-        (Some(a), Some(b)) => {
-            (b.bytes / a.bytes).ln() / (f64::from(a.at) - f64::from(b.at)).max(1.0)
-        }
+        (Some(a), Some(b)) => (b.bytes / a.bytes).ln() / (f64::from(a.at) - f64::from(b.at)).max(1.0),
         _ => SLOPE,
     };
     let off = (known.bytes / room.max(1.0)).ln() / slope.max(0.01);
@@ -217,10 +211,7 @@ mod tests {
         let mut next = Some(FIRST);
         while let Some(at) = next {
             tries += 1;
-            let tried = Some(Tried {
-                at,
-                bytes: bytes(at),
-            });
+            let tried = Some(Tried { at, bytes: bytes(at) });
             match bytes(at) <= room {
                 true => fits = tried,
                 false => exceeds = tried,

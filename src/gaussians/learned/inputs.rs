@@ -91,10 +91,6 @@ fn luma_chroma([r, g, b]: [u8; 3]) -> [i32; 3] {
 
 /// A quarter of the logarithm of the quantisation step, in 512ths.
 fn coarseness(step: f32) -> i32 {
-    let step = if step.is_nan() {
-        1.0
-    } else {
-        step.clamp(1.0, COARSEST)
-    };
+    let step = if step.is_nan() { 1.0 } else { step.clamp(1.0, COARSEST) };
     ((log2(step) * 128.0 + 0.5) as i32).min(LIMIT.into())
 }

@@ -46,13 +46,9 @@ pub(super) fn model(bytes: &[u8]) -> Result<HeadsModel> {
     let tensors = Tensors::new(bytes)?;
     let json = tensors.metadata("b2p-heads");
     let json = json.ok_or_else(|| wrong("b2p-heads", "missing", "the heads' description"))?;
-    let description: Description = serde_json::from_str(json)
-        .map_err(|error| wrong("b2p-heads", error, "a description of heads"))?;
-    let Description {
-        version,
-        blur,
-        sets,
-    } = description;
+    let description: Description =
+        serde_json::from_str(json).map_err(|error| wrong("b2p-heads", error, "a description of heads"))?;
+    let Description { version, blur, sets } = description;
     if version != 1 {
         let detail = format!("version {version}, this program reads version 1");
         return Err(missing("this file of heads", detail));
@@ -76,9 +72,7 @@ pub(super) fn model(bytes: &[u8]) -> Result<HeadsModel> {
 
 /// The set that a name such as `best.8` stands for.
 fn named(name: &str) -> Result<Set> {
-    let all = Heads::ALL
-        .into_iter()
-        .flat_map(|heads| [(heads, 1), (heads, 8)]);
+    let all = Heads::ALL.into_iter().flat_map(|heads| [(heads, 1), (heads, 8)]);
     let mut named = all.filter(|(heads, k)| format!("{heads}.{k}") == name);
     let expected = "best.1, best.8, quick.1 or quick.8";
     named.next().ok_or_else(|| wrong("set", name, expected))
@@ -176,9 +170,7 @@ fn stored(tensors: &Tensors<'_>, spec: Spec) -> Result<Stored> {
             None => Ok(values),
         }
     };
-    let Spec {
-        volume, cin, cout, ..
-    } = spec;
+    let Spec { volume, cin, cout, .. } = spec;
     let weights = finite(&format!("{}.weight", spec.name), &[volume, cin, cout])?;
     let bias = match volume {
         27 => finite(&format!("{}.bias", spec.name), &[cout])?,
@@ -193,11 +185,5 @@ fn stored(tensors: &Tensors<'_>, spec: Spec) -> Result<Stored> {
 }
 
 fn wrong(field: &str, value: impl ToString, expected: impl ToString) -> Error {
-    Error::malformed(
-        Stage::Gaussians,
-        "metadata b2p-heads",
-        field,
-        value,
-        expected,
-    )
+    Error::malformed(Stage::Gaussians, "metadata b2p-heads", field, value, expected)
 }

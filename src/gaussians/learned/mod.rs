@@ -158,9 +158,7 @@ impl HeadsModel {
 
     fn find(&self, set: Set) -> Option<&Generator> {
         let mut generators = self.generators.iter();
-        generators
-            .find(|(of, _)| *of == set)
-            .map(|(_, generator)| generator)
+        generators.find(|(of, _)| *of == set).map(|(_, generator)| generator)
     }
 }
 

@@ -9,9 +9,7 @@ use super::inputs::{CHILD_STEP, Channels, PARENT_STEP};
 use super::load::{INPUTS, Shape};
 use super::{LevelInput, RAW};
 use crate::gaussians::{Frame, Gaussians};
-use crate::network::{
-    Conv, Pool, Precision, ResBlock, Stored, apply, apply_added, apply_part, reals,
-};
+use crate::network::{Conv, Pool, Precision, ResBlock, Stored, apply, apply_added, apply_part, reals};
 
 /// The layers.
 pub struct Net<L> {
@@ -122,15 +120,7 @@ fn run<C: Conv>(
 ) -> Gaussians {
     let pool = &mut Pool::new();
     let (above, map) = (input.above, input.map);
-    let mut h = apply(
-        pool,
-        isa,
-        &net.parent_in,
-        above.taps(),
-        parent,
-        above.len(),
-        true,
-    );
+    let mut h = apply(pool, isa, &net.parent_in, above.taps(), parent, above.len(), true);
     for block in &net.parent {
         h = block.apply(pool, isa, above.taps(), h);
     }

@@ -16,10 +16,7 @@ struct Random(u64);
 
 impl Random {
     fn next(&mut self) -> f32 {
-        self.0 = self
-            .0
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1);
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
         (self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0
     }
 }
@@ -52,9 +49,7 @@ impl Made {
             let size = gain * (6.0 / (9 * cin) as f32).sqrt();
             let mut numbers = |count: usize, size: f32| {
                 let number = || f16::from_f32(size * random.next());
-                std::iter::repeat_with(number)
-                    .take(count)
-                    .collect::<Vec<_>>()
+                std::iter::repeat_with(number).take(count).collect::<Vec<_>>()
             };
             let weights = numbers(volume * cin * cout, size);
             let bias = numbers(cout, 0.2);
@@ -77,10 +72,7 @@ impl Made {
 
     fn json(&self) -> serde_json::Value {
         let [parent_blocks, child_blocks] = self.blocks;
-        let layers = self
-            .tensors
-            .keys()
-            .filter_map(|name| name.strip_suffix(".bias"));
+        let layers = self.tensors.keys().filter_map(|name| name.strip_suffix(".bias"));
         let ranges: BTreeMap<_, _> = layers.map(|layer| (layer, 20.0)).collect();
         json!({
             "channels": self.channels, "gaussians": self.set.1, "ranges": ranges,
@@ -161,9 +153,7 @@ impl Cloud {
 
     fn draw(&self, model: &HeadsModel, isa: Isa, precision: Precision, set: Set) -> Gaussians {
         let frame = Frame::default();
-        model
-            .generate(isa, precision, set, self.input(), frame)
-            .unwrap()
+        model.generate(isa, precision, set, self.input(), frame).unwrap()
     }
 }
 
@@ -175,9 +165,7 @@ fn differences(a: &Gaussians, b: &Gaussians, level: u8) -> [f32; 4] {
         pairs.fold(0.0f32, |worst, (a, b)| worst.max((a - b).abs()))
     };
     let voxel = 2.0 / (1u32 << level) as f32;
-    let length = |of: fn(&Gaussians) -> &[[f32; 3]]| {
-        worst(of(a).as_flattened(), of(b).as_flattened()) / voxel
-    };
+    let length = |of: fn(&Gaussians) -> &[[f32; 3]]| worst(of(a).as_flattened(), of(b).as_flattened()) / voxel;
     [
         length(|g| &g.position).max(length(|g| &g.scale)),
         worst(a.rotation.as_flattened(), b.rotation.as_flattened()),
@@ -257,12 +245,7 @@ fn a_network_of_zeros_draws_balls_of_the_decoded_colours_in_the_anchors() {
         for (_, values) in made.tensors.values_mut() {
             values.fill(f16::ZERO);
         }
-        let drawn = cloud.draw(
-            &model(&[made]),
-            Isa::detect(),
-            Precision::Int16,
-            (Heads::Best, k),
-        );
+        let drawn = cloud.draw(&model(&[made]), Isa::detect(), Precision::Int16, (Heads::Best, k));
         assert_eq!(drawn.len(), k * cloud.maps[0].len());
         let unit = 0.25 / if k == 8 { 2.0 } else { 1.0 };
         for i in 0..drawn.len() {
@@ -303,19 +286,13 @@ fn what_is_not_seen_is_left_out() {
         }
     }
     for precision in [Precision::Int16, Precision::F16] {
-        let drawn = cloud.draw(
-            &model(std::slice::from_ref(&made)),
-            Isa::detect(),
-            precision,
-            made.set,
-        );
+        let drawn = cloud.draw(&model(std::slice::from_ref(&made)), Isa::detect(), precision, made.set);
         assert_eq!(drawn.len(), 2 * cloud.maps[0].len());
         assert!(drawn.opacity.iter().all(|&o| o >= 1.0 / 255.0));
         for (i, position) in drawn.position.iter().enumerate() {
             let voxel = cloud.octree.level(4).coordinate(i / 2);
             let octant = if i % 2 == 0 { 3 } else { 5 };
-            let place = [0, 1, 2]
-                .map(|a| (voxel[a] as f32 + (octant >> a & 1) as f32 * 0.5 + 0.25) / 8.0 - 1.0);
+            let place = [0, 1, 2].map(|a| (voxel[a] as f32 + (octant >> a & 1) as f32 * 0.5 + 0.25) / 8.0 - 1.0);
             assert_eq!(*position, place);
         }
     }
@@ -340,26 +317,15 @@ fn what_cannot_be_drawn_is_refused_and_says_why() {
     assert_eq!(model.sets().collect::<Vec<_>>(), [(Heads::Best, 1)]);
     let cloud = Cloud::surface(3);
     let draw = |set, level| {
-        let input = LevelInput {
-            level,
-            ..cloud.input()
-        };
+        let input = LevelInput { level, ..cloud.input() };
         let (isa, frame) = (Isa::detect(), Frame::default());
-        model
-            .generate(isa, Precision::Int16, set, input, frame)
-            .unwrap_err()
+        model.generate(isa, Precision::Int16, set, input, frame).unwrap_err()
     };
     let none_above = draw((Heads::Best, 1), 0);
-    assert!(
-        matches!(none_above, Error::Unsupported { .. }),
-        "{none_above}"
-    );
+    assert!(matches!(none_above, Error::Unsupported { .. }), "{none_above}");
     let no_such = draw((Heads::Quick, 8), 3);
     assert!(matches!(no_such, Error::Unsupported { .. }));
-    assert!(
-        no_such.to_string().contains("best.1, not quick.8"),
-        "{no_such}"
-    );
+    assert!(no_such.to_string().contains("best.1, not quick.8"), "{no_such}");
 }
 
 #[test]

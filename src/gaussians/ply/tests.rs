@@ -4,11 +4,7 @@ fn gaussians() -> Gaussians {
     Gaussians {
         position: vec![[0.0, 0.25, -0.999], [1.0, -1.0, 0.5], [1.3, 0.1, 0.2]],
         scale: vec![[0.001, 0.002, 0.5], [1e-6, 0.0, 3.0], [0.1; 3]],
-        rotation: vec![
-            [1.0, 0.0, 0.0, 0.0],
-            [0.5, -0.5, 0.5, 0.5],
-            [0.6, 0.8, 0.0, 0.0],
-        ],
+        rotation: vec![[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.5, 0.5], [0.6, 0.8, 0.0, 0.0]],
         opacity: vec![0.25, 1.0, 0.0],
         colour: vec![[0.0, 0.5, 1.0], [0.2, 0.4, 0.6], [1.5, -0.5, 0.25]],
         frame: Frame {
@@ -35,10 +31,7 @@ fn read_back(bytes: &[u8]) -> (Gaussians, Notes) {
 
 /// One Gaussian whose numbers the formulas below decide, after the header lines `extra`.
 fn ascii(extra: &str, properties: &[&str], rows: &[&str]) -> Vec<u8> {
-    let mut text = format!(
-        "ply\nformat ascii 1.0\n{extra}element vertex {}\n",
-        rows.len()
-    );
+    let mut text = format!("ply\nformat ascii 1.0\n{extra}element vertex {}\n", rows.len());
     for property in properties {
         text += &format!("property {property}\n");
     }
@@ -129,11 +122,8 @@ fn the_numbers_follow_the_convention_of_viewers() {
 
 #[test]
 fn properties_are_found_by_name_whatever_their_order_and_type() {
-    let mut properties =
-        FLOATS.map(|p| p.replace("float x", "int x").replace("float r", "double r"));
-    let mut row: Vec<&str> = "1 0.25 -0.5 0.5 0 -0.5 2 -3 -2 -1 1 0.5 0.25 0"
-        .split(' ')
-        .collect();
+    let mut properties = FLOATS.map(|p| p.replace("float x", "int x").replace("float r", "double r"));
+    let mut row: Vec<&str> = "1 0.25 -0.5 0.5 0 -0.5 2 -3 -2 -1 1 0.5 0.25 0".split(' ').collect();
     let straight = ascii(CUBE, &FLOATS, &[&row.join(" ")]);
     properties.reverse();
     row.reverse();
@@ -182,10 +172,7 @@ fn a_file_without_a_cube_gets_one_around_all_but_outliers() {
     assert!(notes.fitted && g.frame.is_valid());
     let side = 1024.0 * g.frame.placement.voxel_size;
     assert!((3.9..4.0).contains(&side), "{side}");
-    let inside = g
-        .position
-        .iter()
-        .filter(|p| p.iter().all(|x| x.abs() <= 1.0));
+    let inside = g.position.iter().filter(|p| p.iter().all(|x| x.abs() <= 1.0));
     assert!(inside.count() >= 985);
     assert!(g.position[2][0].is_nan());
     let middle = g.frame.placement.from_cube(10, [0.0; 3]);
@@ -246,10 +233,7 @@ fn what_is_no_file_of_gaussians_is_an_error() {
         read(&ascii(CUBE, &properties, &[]), &limits)
     };
     for name in ["z", "f_dc_1", "opacity", "scale_1", "rot_3"] {
-        assert!(
-            matches!(without(name), Err(Error::Malformed { .. })),
-            "{name}"
-        );
+        assert!(matches!(without(name), Err(Error::Malformed { .. })), "{name}");
     }
     let whole = written(&gaussians());
     assert!(matches!(
@@ -260,10 +244,7 @@ fn what_is_no_file_of_gaussians_is_an_error() {
         max_points: 2,
         ..limits
     };
-    assert!(matches!(
-        read(&whole, &few),
-        Err(Error::LimitExceeded { .. })
-    ));
+    assert!(matches!(read(&whole, &few), Err(Error::LimitExceeded { .. })));
 }
 
 #[test]
@@ -285,9 +266,7 @@ fn what_cannot_be_written_is_an_error() {
             Ok(())
         }
     }
-    let error = gaussians()
-        .write_ply(&mut Full, Path::new("full.ply"))
-        .unwrap_err();
+    let error = gaussians().write_ply(&mut Full, Path::new("full.ply")).unwrap_err();
     assert!(error.to_string().contains("full.ply"));
 }
 
@@ -297,11 +276,7 @@ fn view_dependent_colour_is_read_channel_by_channel() {
     properties.extend((0..9).map(|i| format!("float f_rest_{i}")));
     let names: Vec<&str> = properties.iter().map(String::as_str).collect();
     let row = "0 0 0 0 0 0 0 -1 -2 -3 1 0 0 0 1 2 3 4 5 6 7 8 9";
-    let (g, notes) = read_back(&ascii(
-        "comment SplatRenderMode: mip\n",
-        &names,
-        &[row, row],
-    ));
+    let (g, notes) = read_back(&ascii("comment SplatRenderMode: mip\n", &names, &[row, row]));
     assert_eq!((notes.ignored_harmonics, notes.ignored_mode), (0, None));
     assert!(g.compensated);
     assert_eq!(g.harmonics.count, 3);
@@ -312,13 +287,9 @@ fn view_dependent_colour_is_read_channel_by_channel() {
 #[test]
 fn view_dependent_colour_of_many_is_each_one_s_own() {
     let count = 2 * BLOCK + 7;
-    let mut bytes =
-        format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n").into_bytes();
+    let mut bytes = format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n").into_bytes();
     let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();
-    for name in PROPERTIES
-        .into_iter()
-        .chain(rest.iter().map(String::as_str))
-    {
+    for name in PROPERTIES.into_iter().chain(rest.iter().map(String::as_str)) {
         bytes.extend(format!("property float {name}\n").bytes());
     }
     bytes.extend(b"end_header\n");
@@ -329,8 +300,5 @@ fn view_dependent_colour_of_many_is_each_one_s_own() {
     }
     let (g, _) = read_back(&bytes);
     let of = |i| (0..3).map(move |k| [0, 3, 6].map(|channel| value(i, channel + k)));
-    assert_eq!(
-        g.harmonics.coefficients,
-        (0..count).flat_map(of).collect::<Vec<_>>()
-    );
+    assert_eq!(g.harmonics.coefficients, (0..count).flat_map(of).collect::<Vec<_>>());
 }

@@ -49,11 +49,7 @@ fn grey(count: usize) -> Gaussians {
 
 /// What the module's documentation says of one slice, word by word: coefficients in the order of the payload.
 fn by_definition(values: &[[f64; 3]], keys: &[u64]) -> Vec<[f64; 3]> {
-    let joins_at = |j: usize| {
-        (0..64)
-            .rev()
-            .find(|b| (keys[j] ^ keys[j - 1]) >> b & 1 == 1)
-    };
+    let joins_at = |j: usize| (0..64).rev().find(|b| (keys[j] ^ keys[j - 1]) >> b & 1 == 1);
     let mut x = values.to_vec();
     let mut order = Vec::new();
     for bit in 0..63 {
@@ -81,29 +77,18 @@ fn coefficients_are_those_of_the_definition_and_those_decode_to_the_colours() {
         let keys = keys(seed, count, depth);
         let missing = colours(seed, keys.len());
         let residual = ColourResidual::of(&missing, &keys, keys.len(), steps(1, 1));
-        let luma = |rgb: &[f32; 3]| {
-            BASIS.map(|unit| (0..3).map(|k| f64::from(unit[k] * rgb[k])).sum::<f64>())
-        };
+        let luma = |rgb: &[f32; 3]| BASIS.map(|unit| (0..3).map(|k| f64::from(unit[k] * rgb[k])).sum::<f64>());
         let values: Vec<_> = missing.iter().map(luma).collect();
-        for (found, want) in residual
-            .coefficients
-            .iter()
-            .zip(by_definition(&values, &keys))
-        {
+        for (found, want) in residual.coefficients.iter().zip(by_definition(&values, &keys)) {
             for (q, want) in found.iter().zip(want) {
                 let off = f64::from(*q) - 255.0 * want;
-                assert!(
-                    off.abs() < f64::from(ROUND_UP) + 1e-3,
-                    "{q} for {}",
-                    255.0 * want
-                );
+                assert!(off.abs() < f64::from(ROUND_UP) + 1e-3, "{q} for {}", 255.0 * want);
             }
         }
         let mut decoded = grey(keys.len());
         residual.apply(&mut decoded, &keys);
-        let squares = |(got, want): (&[f32; 3], &[f32; 3])| -> f32 {
-            (0..3).map(|k| (got[k] - 0.5 - want[k]).powi(2)).sum()
-        };
+        let squares =
+            |(got, want): (&[f32; 3], &[f32; 3])| -> f32 { (0..3).map(|k| (got[k] - 0.5 - want[k]).powi(2)).sum() };
         // The transform keeps squares, so those of the colours are those of the rounding.
         let off: f32 = decoded.colour.iter().zip(&missing).map(squares).sum();
         let most = 3.0 * keys.len() as f32 * (ROUND_UP / 255.0).powi(2);
@@ -114,26 +99,16 @@ fn coefficients_are_those_of_the_definition_and_those_decode_to_the_colours() {
 #[test]
 fn finer_steps_take_more_bytes_and_bring_colours_nearer() {
     let keys: Vec<u64> = (0..4096).collect();
-    let missing: Vec<_> = colours(7, 4096)
-        .iter()
-        .map(|c| c.map(|x| 0.3 * x))
-        .collect();
+    let missing: Vec<_> = colours(7, 4096).iter().map(|c| c.map(|x| 0.3 * x)).collect();
     let mut before = (usize::MAX, 0.0);
     for step in [1, 8, 40, 200] {
         let residual = ColourResidual::of(&missing, &keys, 1000, steps(step, step));
         let bytes = residual.to_payloads(&keys).iter().map(Vec::len).sum();
         let mut decoded = grey(keys.len());
         residual.apply(&mut decoded, &keys);
-        let pairs = decoded
-            .colour
-            .as_flattened()
-            .iter()
-            .zip(missing.as_flattened());
+        let pairs = decoded.colour.as_flattened().iter().zip(missing.as_flattened());
         let off: f32 = pairs.map(|(got, want)| (got - 0.5 - want).powi(2)).sum();
-        assert!(
-            bytes < before.0 && off > before.1,
-            "step {step}: {bytes}, {off}"
-        );
+        assert!(bytes < before.0 && off > before.1, "step {step}: {bytes}, {off}");
         before = (bytes, off);
     }
 }
@@ -171,10 +146,7 @@ fn all_gaussians_of_a_voxel_get_the_same_and_stay_colours() {
 #[test]
 fn chromas_are_told_more_finely_unless_said_otherwise() {
     for (luma, chroma) in [(1, 1), (2, 1), (8, 3), (64, 24), (255, 95)] {
-        assert_eq!(
-            Steps::from(NonZeroU8::new(luma).unwrap()),
-            Steps { luma, chroma }
-        );
+        assert_eq!(Steps::from(NonZeroU8::new(luma).unwrap()), Steps { luma, chroma });
     }
 }
 
@@ -203,9 +175,7 @@ fn a_payload_without_steps_or_code_is_refused() {
             bytes,
             offset: 100,
         };
-        let error = ColourResidual::parse(&[payload], &[0], 64, 3)
-            .unwrap_err()
-            .to_string();
+        let error = ColourResidual::parse(&[payload], &[0], 64, 3).unwrap_err().to_string();
         assert!(error.contains(wrong), "{error}");
         assert!(error.contains("byte 100, residual of level 3"), "{error}");
         let told = wrong != steps || error.contains("four steps, not all 0, and a bit up to 63");

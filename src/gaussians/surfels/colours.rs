@@ -7,12 +7,7 @@ use crate::geometry::KernelMap;
 const DAMPING: f32 = 0.3;
 
 /// The change of R, G and B per voxel along both axes of a disc's plane: least squares over the 26 neighbours that are there.
-pub fn gradient(
-    map: &KernelMap,
-    colours: &[[u8; 3]],
-    voxel: usize,
-    [u, v]: [[f32; 3]; 2],
-) -> [[f32; 3]; 2] {
+pub fn gradient(map: &KernelMap, colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3]; 2]) -> [[f32; 3]; 2] {
     let own = colours[voxel].map(f32::from);
     let (mut uu, mut uv, mut vv) = (DAMPING, 0.0, DAMPING);
     let (mut ru, mut rv) = ([0.0f32; 3], [0.0f32; 3]);
@@ -21,8 +16,7 @@ pub fn gradient(
             continue;
         }
         let offset = [k % 3, k / 3 % 3, k / 9].map(|step| step as f32 - 1.0);
-        let along =
-            |axis: [f32; 3]| offset[0] * axis[0] + offset[1] * axis[1] + offset[2] * axis[2];
+        let along = |axis: [f32; 3]| offset[0] * axis[0] + offset[1] * axis[1] + offset[2] * axis[2];
         let (a, b) = (along(u), along(v));
         uu += a * a;
         uv += a * b;

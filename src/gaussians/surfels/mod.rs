@@ -96,42 +96,30 @@ pub fn surfels(
         .zip(gaussians.scale.par_chunks_mut(block))
         .zip(gaussians.rotation.par_chunks_mut(block))
         .zip(gaussians.colour.par_chunks_mut(block))
-        .zip(
-            near[..voxels.len()]
-                .par_chunks(BLOCK)
-                .zip(far.par_chunks(BLOCK)),
-        )
+        .zip(near[..voxels.len()].par_chunks(BLOCK).zip(far.par_chunks(BLOCK)))
         .enumerate()
-        .for_each(
-            |(b, ((((position, scale), rotation), colour), (near, far)))| {
-                let first = b * BLOCK;
-                let coordinates: Vec<[u32; 3]> = (first..first + near.len())
-                    .map(|i| voxels.coordinate(i))
-                    .collect();
-                let coordinates = &coordinates;
-                let discs = isa.run(passes::Fit {
-                    coordinates,
-                    near,
-                    far,
-                });
-                let n = per_voxel.count();
-                for (j, (disc, &coordinate)) in discs.iter().zip(coordinates).enumerate() {
-                    let parts = match per_voxel {
-                        PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
-                        PerVoxel::Four => quarters(disc, map, colours, first + j),
-                    };
-                    let narrowed = if n == 1 { 1.0 } else { NARROWED };
-                    let radius = disc.radius * narrowed * edge;
-                    for (part, (offset, rgb)) in parts.into_iter().take(n).enumerate() {
-                        let to = j * n + part;
-                        position[to] = placed(coordinate, offset, edge);
-                        scale[to] = [radius, radius, disc.thickness * edge];
-                        rotation[to] = disc.rotation;
-                        colour[to] = rgb.map(|v| v / 255.0);
-                    }
+        .for_each(|(b, ((((position, scale), rotation), colour), (near, far)))| {
+            let first = b * BLOCK;
+            let coordinates: Vec<[u32; 3]> = (first..first + near.len()).map(|i| voxels.coordinate(i)).collect();
+            let coordinates = &coordinates;
+            let discs = isa.run(passes::Fit { coordinates, near, far });
+            let n = per_voxel.count();
+            for (j, (disc, &coordinate)) in discs.iter().zip(coordinates).enumerate() {
+                let parts = match per_voxel {
+                    PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
+                    PerVoxel::Four => quarters(disc, map, colours, first + j),
+                };
+                let narrowed = if n == 1 { 1.0 } else { NARROWED };
+                let radius = disc.radius * narrowed * edge;
+                for (part, (offset, rgb)) in parts.into_iter().take(n).enumerate() {
+                    let to = j * n + part;
+                    position[to] = placed(coordinate, offset, edge);
+                    scale[to] = [radius, radius, disc.thickness * edge];
+                    rotation[to] = disc.rotation;
+                    colour[to] = rgb.map(|v| v / 255.0);
                 }
-            },
-        );
+            }
+        });
     gaussians
 }
 
@@ -144,22 +132,11 @@ fn placed(coordinate: [u32; 3], offset: [f32; 3], edge: f32) -> [f32; 3] {
 }
 
 /// Centres, relative to the voxel's, and colours in 0..=255 of the four discs that take the place of a voxel's one.
-fn quarters(
-    disc: &Disc,
-    map: &KernelMap,
-    colours: &[[u8; 3]],
-    voxel: usize,
-) -> [([f32; 3], [f32; 3]); 4] {
+fn quarters(disc: &Disc, map: &KernelMap, colours: &[[u8; 3]], voxel: usize) -> [([f32; 3], [f32; 3]); 4] {
     let [u, v] = colours::plane(disc);
     let [along_u, along_v] = colours::gradient(map, colours, voxel, [u, v]);
     let own = colours[voxel].map(f32::from);
-    [
-        (-APART, -APART),
-        (APART, -APART),
-        (-APART, APART),
-        (APART, APART),
-    ]
-    .map(|(a, b)| {
+    [(-APART, -APART), (APART, -APART), (-APART, APART), (APART, APART)].map(|(a, b)| {
         let offset = [0, 1, 2].map(|axis| disc.centre[axis] + a * u[axis] + b * v[axis]);
         let rgb = [0, 1, 2].map(|c| own[c] + a * along_u[c] + b * along_v[c]);
         (offset, rgb.map(|v| v.clamp(0.0, 255.0)))

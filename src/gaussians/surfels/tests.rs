@@ -12,14 +12,7 @@ fn cloud(depth: u8, voxels: impl IntoIterator<Item = [u32; 3]>) -> (Voxels, Kern
 
 fn one_each(voxels: &Voxels, map: &KernelMap) -> Gaussians {
     let grey = vec![[128; 3]; voxels.len()];
-    surfels(
-        Isa::detect(),
-        voxels,
-        map,
-        &grey,
-        PerVoxel::One,
-        Frame::default(),
-    )
+    surfels(Isa::detect(), voxels, map, &grey, PerVoxel::One, Frame::default())
 }
 
 /// The walk counts from one voxel to all, by stepping between all pairs of voxels.
@@ -30,10 +23,7 @@ fn walks(coordinates: &[[u32; 3]], from: usize, steps: usize) -> Vec<f64> {
     for _ in 0..steps {
         let reached = coordinates.iter().map(|&to| {
             let neighbours = coordinates.iter().zip(&counts);
-            neighbours
-                .filter(|(q, _)| beside(**q, to))
-                .map(|(_, n)| n)
-                .sum()
+            neighbours.filter(|(q, _)| beside(**q, to)).map(|(_, n)| n).sum()
         });
         counts = reached.collect();
     }
@@ -53,8 +43,7 @@ fn distribution(coordinates: &[[u32; 3]], voxel: usize, steps: usize) -> ([f64; 
         terms.sum::<f64>() / total
     };
     let mean = [0, 1, 2].map(|a| mean_of(&|d| d[a]));
-    let covariance =
-        [0, 1, 2].map(|a| [0, 1, 2].map(|b| mean_of(&|d| (d[a] - mean[a]) * (d[b] - mean[b]))));
+    let covariance = [0, 1, 2].map(|a| [0, 1, 2].map(|b| mean_of(&|d| (d[a] - mean[a]) * (d[b] - mean[b]))));
     (mean, covariance)
 }
 
@@ -169,17 +158,8 @@ fn a_flat_face_is_flat() {
         let gaussians = one_each(&voxels, &map);
         let flat = (2 + axis) % 3;
         let height = 2.0 * 9.5 / 16.0 - 1.0;
-        assert!(
-            gaussians
-                .position
-                .iter()
-                .all(|p| (p[flat] - height).abs() < 1e-6)
-        );
-        let thin = gaussians
-            .scale
-            .iter()
-            .filter(|s| s[2] < 0.02 * s[0])
-            .count();
+        assert!(gaussians.position.iter().all(|p| (p[flat] - height).abs() < 1e-6));
+        let thin = gaussians.scale.iter().filter(|s| s[2] < 0.02 * s[0]).count();
         assert!(thin >= 14 * 14, "{thin} discs are thin");
     }
 }
@@ -198,9 +178,7 @@ fn a_staircase_becomes_a_slope() {
         }
         // Voxels of one step have the middles of their heights on the slope.
         let centre = [x, y, z].map(|v| f64::from(v) + 0.5);
-        let at: Vec<f64> = (0..3)
-            .map(|a| centre[a] + f64::from(disc.centre[a]))
-            .collect();
+        let at: Vec<f64> = (0..3).map(|a| centre[a] + f64::from(disc.centre[a])).collect();
         let off = (at[2] - 8.5 - (at[0] - 1.5) / 3.0) / 10f64.sqrt() * 3.0;
         assert!(off.abs() < 0.12, "voxel {i} is {off} off");
         let cosine = product(normal(disc), [-1.0, 0.0, 3.0]) / 10f64.sqrt();
@@ -265,14 +243,7 @@ fn four_discs_continue_a_gradient_of_colours_between_voxels() {
     });
     let colours: Vec<_> = colours.collect();
     let frame = Frame::default();
-    let four = surfels(
-        Isa::detect(),
-        &voxels,
-        &map,
-        &colours,
-        PerVoxel::Four,
-        frame,
-    );
+    let four = surfels(Isa::detect(), &voxels, &map, &colours, PerVoxel::Four, frame);
     assert_eq!(four.len(), 4 * voxels.len());
     for i in 0..four.len() {
         let [x, y, z] = voxels.coordinate(i / 4);

@@ -26,10 +26,7 @@ struct Interval {
 }
 
 impl Interval {
-    const ALL: Interval = Interval {
-        low: 0,
-        high: u32::MAX,
-    };
+    const ALL: Interval = Interval { low: 0, high: u32::MAX };
 
     #[inline(always)]
     fn split(self, one: u32) -> u32 {

@@ -69,14 +69,7 @@ impl<I: Instructions> Mixer<I> {
             checks[i] = hash as u32;
         }
         let inputs = [logit, BIAS];
-        let mixed = mixing::mix(
-            self.instructions,
-            entries,
-            checks,
-            inputs,
-            &STRETCH,
-            &self.weights,
-        );
+        let mixed = mixing::mix(self.instructions, entries, checks, inputs, &STRETCH, &self.weights);
         let one = squash(mixed.sum >> 16);
         Mixed { at, mixed, one }
     }

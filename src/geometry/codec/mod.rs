@@ -49,23 +49,13 @@ fn slices(parents: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<u
 ///
 /// # Panics
 /// If `level` is 0 or deeper than the octree, `map` is another level's, or `slice` is 0.
-pub fn encode_level(
-    isa: Isa,
-    octree: &Octree,
-    map: &KernelMap,
-    level: u8,
-    slice: usize,
-) -> Vec<(u32, Vec<u8>)> {
+pub fn encode_level(isa: Isa, octree: &Octree, map: &KernelMap, level: u8, slice: usize) -> Vec<(u32, Vec<u8>)> {
     let occupancy = octree.occupancy(level - 1);
     assert_eq!(map.len(), occupancy.len(), "one kernel map row per parent");
     let ranges: Vec<_> = slices(occupancy.len(), slice).collect();
     let encode = |parents: Range<usize>| {
         let masks = &occupancy[parents.clone()];
-        let work = Encode {
-            map,
-            parents,
-            masks,
-        };
+        let work = Encode { map, parents, masks };
         (count(masks) as u32, isa.run(work))
     };
     ranges.into_par_iter().map(encode).collect()
@@ -79,13 +69,7 @@ pub fn encode_level(
 ///
 /// # Panics
 /// If `map` has not that many rows.
-pub fn decode_slice(
-    isa: Isa,
-    level: u8,
-    map: &KernelMap,
-    parents: Range<usize>,
-    slice: &Slice,
-) -> Result<Vec<u8>> {
+pub fn decode_slice(isa: Isa, level: u8, map: &KernelMap, parents: Range<usize>, slice: &Slice) -> Result<Vec<u8>> {
     let masks = isa.run(Decode {
         level,
         map,
@@ -170,23 +154,11 @@ impl Work for Encode<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, instructions: I) -> Vec<u8> {
-        let Encode {
-            map,
-            parents,
-            masks,
-        } = self;
-        let (mut predictor, mut encoder) =
-            (Predictor::new(instructions, parents.len()), Encoder::new());
+        let Encode { map, parents, masks } = self;
+        let (mut predictor, mut encoder) = (Predictor::new(instructions, parents.len()), Encoder::new());
         let around = Neighbourhood::of_all(map, &parents);
         for ((here, &mask), around) in parents.clone().zip(masks).zip(around) {
-            predictor.code(
-                &mut encoder,
-                around,
-                map.row(here),
-                parents.start,
-                masks,
-                mask,
-            );
+            predictor.code(&mut encoder, around, map.row(here), parents.start, masks, mask);
         }
         encoder.finish()
     }
@@ -238,13 +210,7 @@ fn count(masks: &[u8]) -> usize {
     masks.iter().map(|mask| mask.count_ones() as usize).sum()
 }
 
-fn wrong_count(
-    level: u8,
-    parents: &Range<usize>,
-    slice: &Slice,
-    found: impl ToString,
-    expected: String,
-) -> Error {
+fn wrong_count(level: u8, parents: &Range<usize>, slice: &Slice, found: impl ToString, expected: String) -> Error {
     let at = format!("byte {}, level {level}, parents {parents:?}", slice.offset);
     Error::malformed(Stage::Geometry, at, "number of voxels", found, expected)
 }

@@ -53,13 +53,7 @@ const EARLIER_SLOT: [u8; 27] = {
 
 /// Tells the facts that hold for the voxel `here` of the voxels `slice`, whose 3³ kernel map is `map`, each by the number of its row: `occupancy` is
 /// that of the slice, up to `here` at least.
-pub fn facts(
-    map: &KernelMap,
-    slice: &Range<usize>,
-    here: usize,
-    occupancy: &[u8],
-    mut tell: impl FnMut(usize),
-) {
+pub fn facts(map: &KernelMap, slice: &Range<usize>, here: usize, occupancy: &[u8], mut tell: impl FnMut(usize)) {
     let around = Neighbourhood::at(map, slice, here);
     for k in ones(around.there & !around.earlier) {
         tell(k - usize::from(k > KernelMap::CENTRE));
@@ -221,16 +215,9 @@ mod tests {
         for (slot, k) in ones(MAY_BE_EARLIER).enumerate() {
             for mask in 0..=255u8 {
                 for unit in 0..WIDTH {
-                    let at = |row: usize| {
-                        i32::from(WEIGHTS[(PRESENCES + 9 * slot + row) * WIDTH + unit] as i8)
-                    };
-                    let expected =
-                        at(0) + ones(mask.into()).map(|octant| at(1 + octant)).sum::<i32>();
-                    let mut sum: i32 = network
-                        .children(k, mask)
-                        .map(|row| row[unit].into())
-                        .iter()
-                        .sum();
+                    let at = |row: usize| i32::from(WEIGHTS[(PRESENCES + 9 * slot + row) * WIDTH + unit] as i8);
+                    let expected = at(0) + ones(mask.into()).map(|octant| at(1 + octant)).sum::<i32>();
+                    let mut sum: i32 = network.children(k, mask).map(|row| row[unit].into()).iter().sum();
                     for rest in network.rest.iter().filter(|rest| rest.k == k) {
                         sum += i32::from(rest.row(mask)[unit]);
                     }

@@ -117,13 +117,7 @@ impl<I: Instructions> Predictor<I> {
             if error.abs() >= SURPRISE {
                 let e = error / 64;
                 self.bias[octant] = self.bias[octant].wrapping_add(4 * e);
-                hidden::learn(
-                    self.instructions,
-                    &facts,
-                    row,
-                    e as i16,
-                    &mut self.output[octant],
-                );
+                hidden::learn(self.instructions, &facts, row, e as i16, &mut self.output[octant]);
             }
         }
         coded

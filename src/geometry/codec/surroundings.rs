@@ -128,11 +128,7 @@ impl Surroundings {
     /// Sums up, once all neighbours have been added.
     #[inline(always)]
     pub fn sum_up(&mut self, neighbours: Neighbourhood) {
-        let Neighbourhood {
-            there,
-            earlier,
-            beyond,
-        } = neighbours;
+        let Neighbourhood { there, earlier, beyond } = neighbours;
         let bit = |mask: u32, k: usize| u64::from(mask >> k & 1);
         self.presence = there.into();
         self.beyond = beyond.into();
@@ -200,13 +196,7 @@ mod tests {
 
     /// 0 for an empty cell, 1 for one that is occupied, 2 for an unknown one: `at` is where it lies, in voxels of the children's level from the first child
     /// of the voxel `here`, of whose children those below `octant` are known.
-    fn state(
-        octree: &Octree,
-        slice: &Range<usize>,
-        here: usize,
-        octant: usize,
-        at: [i64; 3],
-    ) -> u64 {
+    fn state(octree: &Octree, slice: &Range<usize>, here: usize, octant: usize, at: [i64; 3]) -> u64 {
         let level = octree.depth() - 1;
         let own = octree.level(level).coordinate(here).map(i64::from);
         let side = 1i64 << level;
@@ -231,22 +221,9 @@ mod tests {
     }
 
     /// The words of the contexts, from their definition, cell by cell.
-    fn by_definition(
-        octree: &Octree,
-        slice: &Range<usize>,
-        here: usize,
-        octant: usize,
-    ) -> [u64; CONTEXTS] {
+    fn by_definition(octree: &Octree, slice: &Range<usize>, here: usize, octant: usize) -> [u64; CONTEXTS] {
         let child = [octant & 1, octant >> 1 & 1, octant >> 2].map(|x| x as i64);
-        let cell = |d: [i64; 3]| {
-            state(
-                octree,
-                slice,
-                here,
-                octant,
-                [0, 1, 2].map(|k| child[k] + d[k]),
-            )
-        };
+        let cell = |d: [i64; 3]| state(octree, slice, here, octant, [0, 1, 2].map(|k| child[k] + d[k]));
         let (mut near, mut faces) = ([0u64; 2], [0u64; 2]);
         for at in 0..27i64 {
             let d = [at % 3 - 1, at / 3 % 3 - 1, at / 9 - 1];
@@ -261,20 +238,12 @@ mod tests {
         let level = octree.depth() - 1;
         let (voxels, masks) = (octree.level(level), octree.occupancy(level));
         let place = |d: [i64; 3]| {
-            let at: [i64; 3] =
-                std::array::from_fn(|k| i64::from(voxels.coordinate(here)[k]) + d[k]);
+            let at: [i64; 3] = std::array::from_fn(|k| i64::from(voxels.coordinate(here)[k]) + d[k]);
             let inside = at.iter().all(|x| (0..1i64 << level).contains(x));
             let key = morton::encode(at.map(|x| if inside { x as u32 } else { 0 }));
             voxels.keys().binary_search(&key).ok().filter(|_| inside)
         };
-        let sides = [
-            [0, 0, -1],
-            [0, -1, 0],
-            [-1, 0, 0],
-            [1, 0, 0],
-            [0, 1, 0],
-            [0, 0, 1],
-        ];
+        let sides = [[0, 0, -1], [0, -1, 0], [-1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]];
         let (mut beside, mut far, mut behind, mut beyond, mut presence) = (0, 0, 0, 0, 0);
         for (i, d) in sides.into_iter().enumerate() {
             far |= cell(d.map(|x| 2 * x)) << (8 * i);
@@ -302,13 +271,7 @@ mod tests {
         };
         let two = words(2, &near);
         [
-            words(
-                1,
-                &[
-                    faces[0] + ((octant as u64) << 48) + (beside << 51),
-                    faces[1],
-                ],
-            ),
+            words(1, &[faces[0] + ((octant as u64) << 48) + (beside << 51), faces[1]]),
             two,
             words(3, &[two, far]),
             words(4, &[node + (behind << 8)]),

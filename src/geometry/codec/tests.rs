@@ -31,11 +31,7 @@ fn decode(levels: &[Vec<(u32, Vec<u8>)>], slice: usize) -> Result<Octree> {
 
 /// A slice as if it stood at byte `offset` of a stream.
 fn slice_at(offset: usize, voxels: u32, bytes: &[u8]) -> Slice<'_> {
-    Slice {
-        voxels,
-        bytes,
-        offset,
-    }
+    Slice { voxels, bytes, offset }
 }
 
 fn borrowed(encoded: &[(u32, Vec<u8>)]) -> Vec<Slice<'_>> {
@@ -122,8 +118,7 @@ fn full_cubes_lines_and_checkerboards_come_back() {
 #[test]
 fn a_surface_costs_less_than_half_of_its_occupancy_bytes() {
     let octree = bowl(8);
-    let (_, bytes) =
-        encode_level(Isa::detect(), &octree, &octree.kernel_map(7), 8, usize::MAX).remove(0);
+    let (_, bytes) = encode_level(Isa::detect(), &octree, &octree.kernel_map(7), 8, usize::MAX).remove(0);
     let (bits, parents) = (8 * bytes.len(), octree.level(7).len());
     assert!(bits < 4 * parents, "{bits} bits for {parents} parents");
 }
@@ -131,13 +126,8 @@ fn a_surface_costs_less_than_half_of_its_occupancy_bytes() {
 #[test]
 fn a_full_cube_costs_next_to_nothing() {
     let octree = Octree::new(Voxels::new(6, (0..1 << 18).collect())).unwrap();
-    let (_, bytes) =
-        encode_level(Isa::detect(), &octree, &octree.kernel_map(5), 6, usize::MAX).remove(0);
-    assert!(
-        8 * bytes.len() < octree.level(5).len() / 4,
-        "{}",
-        bytes.len()
-    );
+    let (_, bytes) = encode_level(Isa::detect(), &octree, &octree.kernel_map(5), 6, usize::MAX).remove(0);
+    assert!(8 * bytes.len() < octree.level(5).len() / 4, "{}", bytes.len());
 }
 
 #[test]
@@ -148,14 +138,7 @@ fn slices_do_not_need_each_other() {
     assert!(slices.len() > 2);
     for (i, (voxels, bytes)) in slices.iter().enumerate().rev() {
         let parents = i * 1000..map.len().min((i + 1) * 1000);
-        let masks = decode_slice(
-            Isa::detect(),
-            7,
-            &map,
-            parents.clone(),
-            &slice_at(0, *voxels, bytes),
-        )
-        .unwrap();
+        let masks = decode_slice(Isa::detect(), 7, &map, parents.clone(), &slice_at(0, *voxels, bytes)).unwrap();
         assert_eq!(masks, octree.occupancy(6)[parents]);
     }
 }
@@ -200,13 +183,7 @@ fn every_truncation_is_noticed() {
 fn bytes_left_over_are_refused() {
     let (_, map, voxels, mut bytes) = level_of_a_bowl();
     bytes.push(0);
-    let result = decode_slice(
-        Isa::detect(),
-        6,
-        &map,
-        0..map.len(),
-        &slice_at(0, voxels, &bytes),
-    );
+    let result = decode_slice(Isa::detect(), 6, &map, 0..map.len(), &slice_at(0, voxels, &bytes));
     assert!(matches!(result, Err(Error::Malformed { .. })));
 }
 
@@ -214,13 +191,7 @@ fn bytes_left_over_are_refused() {
 fn a_wrong_count_is_refused() {
     let (_, map, voxels, bytes) = level_of_a_bowl();
     for wrong in [0, 1, voxels - 1, voxels + 1, u32::MAX] {
-        let result = decode_slice(
-            Isa::detect(),
-            6,
-            &map,
-            0..map.len(),
-            &slice_at(0, wrong, &bytes),
-        );
+        let result = decode_slice(Isa::detect(), 6, &map, 0..map.len(), &slice_at(0, wrong, &bytes));
         assert!(matches!(result, Err(Error::Malformed { .. })), "{wrong}");
     }
 }
@@ -233,13 +204,7 @@ fn every_flipped_bit_is_noticed() {
     for bit in 0..8 * bytes.len() {
         let mut bytes = bytes.clone();
         bytes[bit / 8] ^= 1 << (bit % 8);
-        let result = decode_slice(
-            Isa::detect(),
-            5,
-            &map,
-            0..map.len(),
-            &slice_at(0, voxels, &bytes),
-        );
+        let result = decode_slice(Isa::detect(), 5, &map, 0..map.len(), &slice_at(0, voxels, &bytes));
         assert!(result.is_err(), "bit {bit}");
     }
 }

@@ -19,13 +19,7 @@ impl Oracle {
     }
 
     /// The same of a higher role's voxels, whose level has the parameters `mu` and `sigma`.
-    pub fn near(
-        &self,
-        role: usize,
-        at: &Sites,
-        latents: &Rows,
-        (mu, sigma): (&Rows, &Rows),
-    ) -> (Rows, Rows) {
+    pub fn near(&self, role: usize, at: &Sites, latents: &Rows, (mu, sigma): (&Rows, &Rows)) -> (Rows, Rows) {
         let network = self.exact.near[role - 1].as_ref().unwrap();
         let step = f64::from(1 << self.shape.latent_shift) / 16.0;
         let both = |y: (&Vec<f64>, &Vec<f64>)| {
@@ -37,8 +31,7 @@ impl Oracle {
             let parent = |w: &[i32; 3]| w.map(|w| w.div_euclid(2));
             let sets = (1..8).flat_map(|other| {
                 let all = before(at, *v, other).into_iter();
-                let (same, others): (Vec<_>, Vec<_>) =
-                    all.partition(|&w| parent(&at.voxels[w]) == parent(v));
+                let (same, others): (Vec<_>, Vec<_>) = all.partition(|&w| parent(&at.voxels[w]) == parent(v));
                 [same, others]
             });
             let mut own: Vec<f64> = mu[i]
@@ -60,30 +53,18 @@ impl Oracle {
             };
             old.iter().zip(change).zip(&known).map(one).collect()
         };
-        (
-            corrected(mu, &by, -2047.0, 2047.0),
-            corrected(sigma, &wider, 0.0, 63.0),
-        )
+        (corrected(mu, &by, -2047.0, 2047.0), corrected(sigma, &wider, 0.0, 63.0))
     }
 
     fn of_neighbours(&self, network: &Neighbours<Layer>, at: &Sites, x: &Rows) -> (Rows, Rows) {
         let x = relu(self.here(&network.lin1, at, x));
         let x = relu(self.here(&network.lin2, at, &x));
-        (
-            self.here(&network.mu, at, &x),
-            self.here(&network.sigma, at, &x),
-        )
+        (self.here(&network.mu, at, &x), self.here(&network.sigma, at, &x))
     }
 
     /// One voxel's inputs: of each set of voxels the mean of `values`, and whether there are any; `own`; the octant. Also whether
     /// anything is known.
-    fn known(
-        &self,
-        v: &[i32; 3],
-        sets: Vec<Vec<usize>>,
-        values: &Rows,
-        own: Vec<f64>,
-    ) -> (Vec<f64>, bool) {
+    fn known(&self, v: &[i32; 3], sets: Vec<Vec<usize>>, values: &Rows, own: Vec<f64>) -> (Vec<f64>, bool) {
         let unit = f64::from(1 << self.shape.latent_shift);
         let mut row = Vec::new();
         let any = sets.iter().any(|set| !set.is_empty());
@@ -118,7 +99,5 @@ fn before(at: &Sites, v: [i32; 3], other: i32) -> Vec<usize> {
 }
 
 fn each(rows: &Rows, f: impl Fn(f64) -> f64) -> Rows {
-    rows.iter()
-        .map(|row| row.iter().map(|&v| f(v)).collect())
-        .collect()
+    rows.iter().map(|row| row.iter().map(|&v| f(v)).collect()).collect()
 }

@@ -87,12 +87,7 @@ fn decode(model: &Model, cloud: &Cloud) -> Vec<Level<Vec<i16>, Vec<u8>>> {
                     false => Default::default(),
                 };
                 let g = model.reconstruct(role, &y, Some(&context), map);
-                Level {
-                    context,
-                    mu,
-                    sigma,
-                    g,
-                }
+                Level { context, mu, sigma, g }
             }
         });
     }
@@ -120,12 +115,7 @@ fn decode_by_definition(oracle: &Oracle, cloud: &Cloud) -> Vec<Level<Rows>> {
                     _ => oracle.entropy(role, &sites, &context),
                 };
                 let g = oracle.reconstruct(role, &sites, &y, Some(&context));
-                Level {
-                    context,
-                    mu,
-                    sigma,
-                    g,
-                }
+                Level { context, mu, sigma, g }
             }
         });
     }
@@ -143,10 +133,7 @@ fn the_exact_zone_equals_its_definition_to_the_bit_on_every_isa_and_thread_count
         for isa in Isa::available() {
             for threads in [1, 3] {
                 let model = Model::from_bytes(&bytes).unwrap().with_isa(isa);
-                let pool = rayon::ThreadPoolBuilder::new()
-                    .num_threads(threads)
-                    .build()
-                    .unwrap();
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
                 let got = pool.install(|| decode(&model, &cloud));
                 for (role, (got, want)) in got.iter().zip(&want).enumerate() {
                     let at = format!("{isa}, {threads} threads, {c} channels, role {role}");
@@ -165,20 +152,14 @@ fn made_up_models_use_their_range_and_stay_inside() {
     let cloud = Cloud::sheet();
     let model = Model::from_bytes(&untrained(&Shape::tiny(), 5)).unwrap();
     for (role, Level { mu, sigma, g, .. }) in decode(&model, &cloud).into_iter().enumerate() {
-        let deviation = |q: &[i16]| {
-            (q.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>() / q.len() as f64).sqrt()
-        };
+        let deviation = |q: &[i16]| (q.iter().map(|&q| f64::from(q).powi(2)).sum::<f64>() / q.len() as f64).sqrt();
         assert!(
             (30.0..1200.0).contains(&deviation(&g)),
             "role {role}: {}",
             deviation(&g)
         );
         let clipped = g.iter().filter(|q| q.abs() == 2047).count();
-        assert!(
-            clipped * 20 < g.len(),
-            "role {role}: {clipped} of {} saturate",
-            g.len()
-        );
+        assert!(clipped * 20 < g.len(), "role {role}: {clipped} of {} saturate", g.len());
         if role > 0 {
             assert!(
                 (2.0..400.0).contains(&deviation(&mu)),
@@ -197,17 +178,11 @@ fn made_up_models_use_their_range_and_stay_inside() {
 fn the_exact_zone_follows_the_real_function_it_rounds() {
     let cloud = Cloud::sheet();
     let bytes = untrained(&Shape::tiny(), 5);
-    let (whole, real) = (
-        Oracle::new(&bytes, Mode::Whole),
-        Oracle::new(&bytes, Mode::Real),
-    );
+    let (whole, real) = (Oracle::new(&bytes, Mode::Whole), Oracle::new(&bytes, Mode::Real));
     for role in 0..3 {
         // Inputs small enough that nothing on the way is cut off: there the real function goes its own way.
         let sites = cloud.sites(role);
-        let y: Vec<i16> = latents(cloud.len(role) * 4)
-            .into_iter()
-            .map(|y| y % 3)
-            .collect();
+        let y: Vec<i16> = latents(cloud.len(role) * 4).into_iter().map(|y| y % 3).collect();
         let c: Vec<i16> = (0..cloud.len(role) * 8)
             .map(|i| ((i * 7919) % 401) as i16 - 200)
             .collect();
@@ -226,10 +201,8 @@ fn the_exact_zone_follows_the_real_function_it_rounds() {
         let features = |oracle: &Oracle| oracle.reconstruct(role, &sites, &y, context);
         near("features", features(&whole), features(&real), 2.0);
         if role > 0 {
-            let ((mu, sigma), (real_mu, real_sigma)) = (
-                whole.entropy(role, &sites, &c),
-                real.entropy(role, &sites, &c),
-            );
+            let ((mu, sigma), (real_mu, real_sigma)) =
+                (whole.entropy(role, &sites, &c), real.entropy(role, &sites, &c));
             near("means", mu, real_mu, 1.0);
             near("scales", sigma, real_sigma, 1.0);
         }
@@ -256,16 +229,10 @@ fn generation_follows_its_definition_within_f16() {
             assert_eq!(got.len(), want.len() * RAW);
             let (off, peak) = error(&got, &want);
             println!("{heads}, role {role}: {:.2e} of {peak:.2}", off / peak);
-            assert!(
-                off < TOLERANCE * peak,
-                "role {role}: off by {off} of {peak}"
-            );
+            assert!(off < TOLERANCE * peak, "role {role}: off by {off} of {peak}");
             for isa in Isa::available() {
                 let other = in_floats(&bytes).with_isa(isa);
-                assert!(
-                    generate(&other).unwrap() == got,
-                    "{isa} rounds in another order"
-                );
+                assert!(generate(&other).unwrap() == got, "{isa} rounds in another order");
             }
         }
     }
@@ -278,9 +245,7 @@ fn in_floats(model: &[u8]) -> Model {
 
 /// Features that use the middle of their range.
 pub(super) fn some_features(count: usize) -> Vec<i16> {
-    (0..count)
-        .map(|i| ((i * 7919) % 1601) as i16 - 800)
-        .collect()
+    (0..count).map(|i| ((i * 7919) % 1601) as i16 - 800).collect()
 }
 
 /// Raw numbers in integers lie so near their definition, in parts of the largest: each of a dozen layers rounds to a step of 1/256
@@ -293,10 +258,7 @@ fn generation_in_integers_follows_its_definition_and_is_the_same_on_every_isa_an
     for (seed, shape) in (10..).zip(shapes()) {
         let bytes = untrained(&shape, seed);
         let oracle = Oracle::new(&bytes, Mode::Whole);
-        assert_eq!(
-            Model::from_bytes(&bytes).unwrap().precision(),
-            Precision::Int16
-        );
+        assert_eq!(Model::from_bytes(&bytes).unwrap().precision(), Precision::Int16);
         for &Head { role, heads, .. } in &shape.gg {
             let g = some_features(cloud.len(role) * shape.channels);
             let features = rows(&g, shape.channels);
@@ -310,10 +272,7 @@ fn generation_in_integers_follows_its_definition_and_is_the_same_on_every_isa_an
                     let generate = || model.generate_with(heads, role, &g, map).unwrap();
                     let got = pool.build().unwrap().install(generate);
                     let (off, peak) = error(&got, &want);
-                    println!(
-                        "{isa}, {heads}, role {role}: {:.2e} of {peak:.2}",
-                        off / peak
-                    );
+                    println!("{isa}, {heads}, role {role}: {:.2e} of {peak:.2}", off / peak);
                     assert!(off < INTEGER_TOLERANCE * peak, "off by {off} of {peak}");
                     let first = first.get_or_insert_with(|| got.clone());
                     assert!(*first == got, "{isa}, {threads} threads: other bits");
@@ -335,8 +294,7 @@ fn generation_in_integers_saturates_where_activations_leave_their_range() {
         let role = 1;
         let g = some_features(cloud.len(role) * shape.channels);
         let features = rows(&g, shape.channels);
-        let by_definition =
-            |oracle: Oracle| oracle.generate(Heads::Best, role, &cloud.sites(role), &features);
+        let by_definition = |oracle: Oracle| oracle.generate(Heads::Best, role, &cloud.sites(role), &features);
         let whole = by_definition(Oracle::new(&bytes, Mode::Whole));
         let bounded = by_definition(Oracle::new(&bytes, Mode::Whole).saturating(RANGE));
         let model = Model::from_bytes(&bytes).unwrap();
@@ -349,10 +307,7 @@ fn generation_in_integers_saturates_where_activations_leave_their_range() {
             off / peak,
             without / peak
         );
-        assert!(
-            without > INTEGER_TOLERANCE * peak,
-            "seed {seed} stays within its range"
-        );
+        assert!(without > INTEGER_TOLERANCE * peak, "seed {seed} stays within its range");
         assert!(off < INTEGER_TOLERANCE * peak, "off by {off} of {peak}");
     }
 }
@@ -367,10 +322,7 @@ fn conversion_and_squeezing_follow_their_definition_within_f16_or_bf16() {
     for (seed, shape) in (20..).zip(shapes()) {
         let bytes = untrained(&shape, seed);
         let oracle = Oracle::new(&bytes, Mode::Whole);
-        let mut want = oracle.features(
-            &sites.iter().collect::<Vec<_>>(),
-            &rows(colours.as_flattened(), 3),
-        );
+        let mut want = oracle.features(&sites.iter().collect::<Vec<_>>(), &rows(colours.as_flattened(), 3));
         want.reverse();
         for isa in Isa::available() {
             let model = Model::from_bytes(&bytes).unwrap().with_isa(isa);
@@ -379,33 +331,19 @@ fn conversion_and_squeezing_follow_their_definition_within_f16_or_bf16() {
             for role in 0..3 {
                 let (off, peak) = error(&got[role], &want[role]);
                 println!("{isa}, features {role}: {:.2e} of {peak:.2}", off / peak);
-                assert!(
-                    off < tolerance * peak,
-                    "{isa}, role {role}: off by {off} of {peak}"
-                );
-                let c: Option<Vec<i16>> = (role > 0).then(|| {
-                    (0..got[role].len())
-                        .map(|i| ((i * 7919) % 1601) as i16 - 800)
-                        .collect()
-                });
+                assert!(off < tolerance * peak, "{isa}, role {role}: off by {off} of {peak}");
+                let c: Option<Vec<i16>> =
+                    (role > 0).then(|| (0..got[role].len()).map(|i| ((i * 7919) % 1601) as i16 - 800).collect());
                 let y = model.squeeze(role, &got[role], c.as_deref()).unwrap();
                 if !model.has_latents(role) {
                     assert!(y.is_empty(), "{isa}, role {role} has no latents");
                     continue;
                 }
                 let c = c.map(|c| rows(&c, shape.channels));
-                let y_want = oracle.squeeze(
-                    role,
-                    &cloud.sites(role),
-                    &rows(&got[role], shape.channels),
-                    c.as_ref(),
-                );
+                let y_want = oracle.squeeze(role, &cloud.sites(role), &rows(&got[role], shape.channels), c.as_ref());
                 let (off, peak) = error(&y, &y_want);
                 println!("{isa}, latents {role}: {:.2e} of {peak:.2}", off / peak);
-                assert!(
-                    off < tolerance * peak,
-                    "{isa}, role {role}: off by {off} of {peak}"
-                );
+                assert!(off < tolerance * peak, "{isa}, role {role}: off by {off} of {peak}");
             }
         }
     }
@@ -415,26 +353,13 @@ fn conversion_and_squeezing_follow_their_definition_within_f16_or_bf16() {
 fn fewer_levels_start_from_the_same_first_conversion() {
     let cloud = Cloud::sheet();
     let bytes = untrained(&Shape::tiny(), 30);
-    let (model, oracle) = (
-        Model::from_bytes(&bytes).unwrap(),
-        Oracle::new(&bytes, Mode::Whole),
-    );
+    let (model, oracle) = (Model::from_bytes(&bytes).unwrap(), Oracle::new(&bytes, Mode::Whole));
     let colours = vec![[0.25, 0.5, 0.75]; cloud.len(3)];
     let got = model
-        .features(
-            &colours,
-            &[&cloud.maps[3], &cloud.maps[2]],
-            &[cloud.occupancy(2)],
-        )
+        .features(&colours, &[&cloud.maps[3], &cloud.maps[2]], &[cloud.occupancy(2)])
         .unwrap();
-    let want = oracle.features(
-        &[&cloud.sites(3), &cloud.sites(2)],
-        &rows(colours.as_flattened(), 3),
-    );
+    let want = oracle.features(&[&cloud.sites(3), &cloud.sites(2)], &rows(colours.as_flattened(), 3));
     assert_eq!((got.len(), want.len()), (1, 1));
     let (off, peak) = error(&got[0], &want[0]);
-    assert!(
-        off < TOLERANCE * coarser(model.isa()) * peak,
-        "off by {off} of {peak}"
-    );
+    assert!(off < TOLERANCE * coarser(model.isa()) * peak, "off by {off} of {peak}");
 }

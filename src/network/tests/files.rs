@@ -32,14 +32,7 @@ impl File {
         let view = SafeTensors::deserialize(&bytes).unwrap();
         let tensors = view
             .iter()
-            .map(|(name, t)| {
-                (
-                    name.to_owned(),
-                    t.dtype(),
-                    t.shape().to_vec(),
-                    t.data().to_vec(),
-                )
-            })
+            .map(|(name, t)| (name.to_owned(), t.dtype(), t.shape().to_vec(), t.data().to_vec()))
             .collect();
         File { json, tensors }
     }
@@ -58,27 +51,17 @@ impl File {
 
     /// Overwrites an entry.
     fn poke(mut self, name: &str, at: usize, entry: &[u8]) -> Self {
-        let (.., bytes) = self
-            .tensors
-            .iter_mut()
-            .find(|(other, ..)| other == name)
-            .unwrap();
+        let (.., bytes) = self.tensors.iter_mut().find(|(other, ..)| other == name).unwrap();
         bytes[at * entry.len()..][..entry.len()].copy_from_slice(entry);
         self
     }
 
     fn bytes(&self) -> Vec<u8> {
-        let views = self.tensors.iter().map(|(name, dtype, extents, bytes)| {
-            (
-                name,
-                TensorView::new(*dtype, extents.clone(), bytes).unwrap(),
-            )
-        });
-        safetensors::serialize(
-            views,
-            Some(HashMap::from([("b2p".to_owned(), self.json.clone())])),
-        )
-        .unwrap()
+        let views = self
+            .tensors
+            .iter()
+            .map(|(name, dtype, extents, bytes)| (name, TensorView::new(*dtype, extents.clone(), bytes).unwrap()));
+        safetensors::serialize(views, Some(HashMap::from([("b2p".to_owned(), self.json.clone())]))).unwrap()
     }
 
     fn load(&self) -> Result<Model> {
@@ -103,10 +86,7 @@ fn an_error_names_the_tensor_at_fault() {
             "up.1.weight",
             File::tiny().with("up.1.weight", Dtype::I16, &[8, 8, 4], &[0; 512]),
         ),
-        (
-            "up.1.weight",
-            File::tiny().with("up.1.weight", Dtype::I16, &[0], &[]),
-        ),
+        ("up.1.weight", File::tiny().with("up.1.weight", Dtype::I16, &[0], &[])),
         ("up.1.shift", File::tiny().poke("up.1.shift", 3, &[31])),
         (
             "fr.1.lin2.weight",
@@ -124,10 +104,7 @@ fn an_error_names_the_tensor_at_fault() {
             "fr.1.lin2.weight",
             File::tiny().poke("fr.1.lin2.bias", 5, &i32::MIN.to_le_bytes()),
         ),
-        (
-            "pem.1.conv_in.gain",
-            File::tiny().poke("pem.1.conv_in.gain", 0, &nan),
-        ),
+        ("pem.1.conv_in.gain", File::tiny().poke("pem.1.conv_in.gain", 0, &nan)),
         (
             "pem.1.conv_in.bias",
             File::tiny().poke("pem.1.conv_in.bias", 7, &f32::INFINITY.to_le_bytes()),
@@ -140,26 +117,11 @@ fn an_error_names_the_tensor_at_fault() {
             "gg.2.layer4.weight",
             File::tiny().poke("gg.2.layer4.weight", 9, &f16::INFINITY.to_le_bytes()),
         ),
-        (
-            "fs.0.lin2.bias",
-            File::tiny().poke("fs.0.lin2.bias", 0, &nan),
-        ),
-        (
-            "g_scale",
-            File::tiny().poke("g_scale", 0, &0f32.to_le_bytes()),
-        ),
-        (
-            "c_scale",
-            File::tiny().poke("c_scale", 2, &(-1f32).to_le_bytes()),
-        ),
-        (
-            "cdf.gauss",
-            File::tiny().poke("cdf.gauss", 0, &u16::MAX.to_le_bytes()),
-        ),
-        (
-            "gg.quick.1.conv_in.weight",
-            File::both().without("gg.quick.1.conv_in."),
-        ),
+        ("fs.0.lin2.bias", File::tiny().poke("fs.0.lin2.bias", 0, &nan)),
+        ("g_scale", File::tiny().poke("g_scale", 0, &0f32.to_le_bytes())),
+        ("c_scale", File::tiny().poke("c_scale", 2, &(-1f32).to_le_bytes())),
+        ("cdf.gauss", File::tiny().poke("cdf.gauss", 0, &u16::MAX.to_le_bytes())),
+        ("gg.quick.1.conv_in.weight", File::both().without("gg.quick.1.conv_in.")),
         ("gg.2.conv_in.weight", File::both().without("gg.2.")),
         (
             "gg.quick.2.after.0.c1.weight",
@@ -175,10 +137,7 @@ fn an_error_names_the_tensor_at_fault() {
         ),
     ];
     for (name, file) in cases {
-        let error = file
-            .load()
-            .err()
-            .unwrap_or_else(|| panic!("{name} should not load"));
+        let error = file.load().err().unwrap_or_else(|| panic!("{name} should not load"));
         assert!(matches!(error, Error::Malformed { .. }), "{name}: {error}");
         assert!(error.to_string().contains(name), "{name}: {error}");
     }
@@ -212,10 +171,7 @@ fn weights_that_could_overflow_a_sum_are_refused_though_each_is_small() {
     .err()
     .unwrap()
     .to_string();
-    assert!(
-        error.contains("pem.1.conv_in") && error.contains("2^31"),
-        "{error}"
-    );
+    assert!(error.contains("pem.1.conv_in") && error.contains("2^31"), "{error}");
 }
 
 #[test]
@@ -348,15 +304,9 @@ fn the_id_changes_with_whatever_bears_on_the_decoded_bits_and_nothing_else() {
 fn no_beginning_of_a_file_loads() {
     let bytes = untrained(&Shape::tiny(), 1);
     let header = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
-    for length in (0..header)
-        .step_by(13)
-        .chain((header..bytes.len()).step_by(997))
-    {
+    for length in (0..header).step_by(13).chain((header..bytes.len()).step_by(997)) {
         assert!(
-            matches!(
-                Model::from_bytes(&bytes[..length]),
-                Err(Error::Malformed { .. })
-            ),
+            matches!(Model::from_bytes(&bytes[..length]), Err(Error::Malformed { .. })),
             "{length} bytes"
         );
     }
@@ -399,18 +349,13 @@ fn what_a_bit_is_worth_is_for_the_model_to_say_and_changes_nothing_of_its_stream
     let id = Model::from_bytes(&plain.bytes()).unwrap().id();
     let saying = |price: &str| {
         let mut file = File::tiny();
-        file.json = file
-            .json
-            .replacen('{', &format!("{{\"bit_price\": {price}, "), 1);
+        file.json = file.json.replacen('{', &format!("{{\"bit_price\": {price}, "), 1);
         Model::from_bytes(&file.bytes())
     };
     let k = Model::from_bytes(&plain.bytes()).unwrap().shape().latents;
     let of_roles = |model: &Model| [0, 1, 2].map(|role| model.bit_prices(role).to_vec());
     let of = |price: f32| [0, 1, 2].map(|_| vec![price; k]);
-    assert_eq!(
-        of_roles(&Model::from_bytes(&plain.bytes()).unwrap()),
-        of(0.0)
-    );
+    assert_eq!(of_roles(&Model::from_bytes(&plain.bytes()).unwrap()), of(0.0));
     for (said, price) in [("0.25", 0.25), ("100", 100.0)] {
         let model = saying(said).unwrap();
         assert_eq!((model.id(), of_roles(&model)), (id, of(price)));
@@ -421,16 +366,11 @@ fn what_a_bit_is_worth_is_for_the_model_to_say_and_changes_nothing_of_its_stream
     let two_roles = format!("{:?}", &each[..2]);
     let too_many = format!("{:?}", each.clone().map(|role| [role, vec![1.0]].concat()));
     let too_dear = format!("{:?}", of(101.0));
-    let said = [
-        "-1", "101", "\"much\"", "null", "[]", &two_roles, &too_many, &too_dear,
-    ];
+    let said = ["-1", "101", "\"much\"", "null", "[]", &two_roles, &too_many, &too_dear];
     for wrong in said {
         let error = saying(wrong).expect_err("it is wrong");
         let text = error.to_string();
         assert!(matches!(error, Error::Malformed { .. }), "{text}");
-        assert!(
-            text.contains("bit_price") && text.contains("0 to 100"),
-            "{text}"
-        );
+        assert!(text.contains("bit_price") && text.contains("0 to 100"), "{text}");
     }
 }

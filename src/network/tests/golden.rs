@@ -42,11 +42,9 @@ fn the_exact_zone_computes_the_trainer_s_integers() {
     for role in 0..3 {
         let map = &cloud.maps[role];
         let octants = cloud.octree.level(cloud.level(role)).octants();
-        let passes = |level: Option<(&[i16], &[u8])>| {
-            all_passes(&model, role, &octants, map, &values("latent", role), level)
-        };
-        let context = (role > 0)
-            .then(|| model.upsample(role, &values("g", role - 1), cloud.occupancy(role - 1)));
+        let passes =
+            |level: Option<(&[i16], &[u8])>| all_passes(&model, role, &octants, map, &values("latent", role), level);
+        let context = (role > 0).then(|| model.upsample(role, &values("g", role - 1), cloud.occupancy(role - 1)));
         if let Some(context) = &context {
             assert_eq!(context, &values("c", role));
             let (mu, sigma) = model.entropy_parameters(role, context, map);
@@ -82,10 +80,7 @@ fn integer_distributions_are_those_that_the_float_network_predicts() {
         let real: Vec<f32> = golden(&format!("float.lnsigma.{role}"));
         for (&q, &real) in sigma.iter().zip(&real) {
             let index = (f64::from(real) - 0.11f64.ln()) * per_nat;
-            assert!(
-                (f64::from(q) - index).abs() < 1.0,
-                "role {role}: {q} for {index}"
-            );
+            assert!((f64::from(q) - index).abs() < 1.0, "role {role}: {q} for {index}");
         }
     }
 }
@@ -106,19 +101,13 @@ fn the_encoder_s_features_and_latents_are_the_trainer_s_within_f16_or_bf16() {
             let want = rows(&golden::<f32>(&format!("fc.{role}")), 16);
             let (off, peak) = error(features, &want);
             println!("{isa}, fc.{role}: {:.2e} of {peak:.2}", off / peak);
-            assert!(
-                off < tolerance * peak,
-                "{isa}, fc.{role}: off by {off} of {peak}"
-            );
+            assert!(off < tolerance * peak, "{isa}, fc.{role}: off by {off} of {peak}");
             let context: Option<Vec<i16>> = (role > 0).then(|| golden(&format!("c.{role}")));
             let y = model.squeeze(role, features, context.as_deref()).unwrap();
             let want = rows(&golden::<f32>(&format!("fs.{role}")), 4);
             let (off, peak) = error(&y, &want);
             println!("{isa}, fs.{role}: {:.2e} of {peak:.2}", off / peak);
-            assert!(
-                off < tolerance * peak,
-                "{isa}, fs.{role}: off by {off} of {peak}"
-            );
+            assert!(off < tolerance * peak, "{isa}, fs.{role}: off by {off} of {peak}");
             // Only what lies near a half may round the other way.
             let limit = f32::from(model.shape().latent_max);
             let round = |y: &f32| y.clamp(-limit, limit).round_ties_even() as i16;
@@ -129,10 +118,7 @@ fn the_encoder_s_features_and_latents_are_the_trainer_s_within_f16_or_bf16() {
                 .zip(want.iter().flatten())
             {
                 let margin = ((y - y.floor()) - 0.5).abs();
-                assert!(
-                    q == want || margin < tolerance * peak,
-                    "{isa}, fs.{role}: {q} for {y}"
-                );
+                assert!(q == want || margin < tolerance * peak, "{isa}, fs.{role}: {q} for {y}");
             }
         }
     }
@@ -179,11 +165,7 @@ fn generated_gaussians_are_the_trainer_s_within_f16() {
                 .collect(),
             32.0,
         );
-        close(
-            "opacity",
-            trained.opacity.iter().map(|&o| o.into()).collect(),
-            1.0,
-        );
+        close("opacity", trained.opacity.iter().map(|&o| o.into()).collect(), 1.0);
         close(
             "colour",
             trained.colour.iter().flatten().map(|&c| c.into()).collect(),
@@ -218,11 +200,7 @@ fn covariance(scale: [f32; 3], [w, x, y, z]: [f32; 4]) -> [f64; 6] {
             1.0 - 2.0 * (x * x + y * y),
         ],
     ];
-    let entry = |i: usize, j: usize| {
-        (0..3)
-            .map(|k| r[i][k] * r[j][k] * f64::from(scale[k]).powi(2))
-            .sum()
-    };
+    let entry = |i: usize, j: usize| (0..3).map(|k| r[i][k] * r[j][k] * f64::from(scale[k]).powi(2)).sum();
     [
         entry(0, 0),
         entry(0, 1),

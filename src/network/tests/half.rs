@@ -41,10 +41,7 @@ fn generation_in_half_follows_its_definition_or_is_refused() {
                 };
                 let got = generate(&model);
                 let (off, peak) = error(&got, &want);
-                println!(
-                    "{isa}, {heads}, role {role}: {:.2e} of {peak:.2}",
-                    off / peak
-                );
+                println!("{isa}, {heads}, role {role}: {:.2e} of {peak:.2}", off / peak);
                 assert!(off < TOLERANCE * peak, "off by {off} of {peak}");
                 assert!(got != floats, "{isa} sums in f32");
                 let without = model.with_isa(Isa::SCALAR);

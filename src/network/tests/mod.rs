@@ -23,9 +23,7 @@ impl Cloud {
     fn new(depth: u8, voxels: &[[u32; 3]]) -> Self {
         let keys = voxels.iter().map(|v| morton::encode(*v)).collect();
         let octree = Octree::new(Voxels::new(depth, keys)).unwrap();
-        let maps = (depth - 3..=depth)
-            .map(|level| octree.kernel_map(level))
-            .collect();
+        let maps = (depth - 3..=depth).map(|level| octree.kernel_map(level)).collect();
         Cloud { octree, maps }
     }
 

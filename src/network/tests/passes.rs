@@ -48,10 +48,7 @@ fn higher_levels_are_corrected_from_neighbours_as_defined_to_the_bit_on_every_is
     for (seed, shape) in (40..).zip(shapes()) {
         let bytes = untrained(&shape, seed);
         let oracle = Oracle::new(&bytes, Mode::Whole);
-        for role in [1, 2]
-            .into_iter()
-            .filter(|r| shape.near_channels[r - 1] > 0)
-        {
+        for role in [1, 2].into_iter().filter(|r| shape.near_channels[r - 1] > 0) {
             let (map, sites) = (&cloud.maps[role], cloud.sites(role));
             let octants = cloud.octree.level(cloud.level(role)).octants();
             let (k, y) = (shape.latents, latents(map.len() * shape.latents));
@@ -104,21 +101,11 @@ fn a_pass_is_predicted_from_earlier_voxels_of_its_slice_alone() {
                     y.fill(i16::MIN);
                 }
             }
-            assert!(
-                parameters(&y) == parameters(&later),
-                "role {role}, octant {octant}"
-            );
+            assert!(parameters(&y) == parameters(&later), "role {role}, octant {octant}");
             let at = |v: &u32| *v as usize * k..(*v as usize + 1) * k;
             let known = match level {
                 None => parameters(&y).1.iter().any(|&sigma| sigma != UNPREDICTED),
-                Some((mu, _)) => {
-                    parameters(&y).0
-                        != pass
-                            .iter()
-                            .flat_map(|v| &mu[at(v)])
-                            .copied()
-                            .collect::<Vec<_>>()
-                }
+                Some((mu, _)) => parameters(&y).0 != pass.iter().flat_map(|v| &mu[at(v)]).copied().collect::<Vec<_>>(),
             };
             assert_eq!(known, octant > 0, "role {role}, octant {octant}");
         }

@@ -40,11 +40,7 @@ fn an_object_with_a_blur_of_its_own_is_as_large_from_afar_as_from_close_up() {
     scene.blur = 1e-4;
     let ink = |side: u32| {
         let image = draw(&scene, &orbit(side, side));
-        let all = image
-            .pixels
-            .iter()
-            .map(|p| f64::from(1.0 - p[0]))
-            .sum::<f64>();
+        let all = image.pixels.iter().map(|p| f64::from(1.0 - p[0])).sum::<f64>();
         all / f64::from(side * side)
     };
     let (near, far) = (ink(512), ink(64));
@@ -93,10 +89,7 @@ fn a_better_quality_is_nearer_to_the_reference() {
         });
         let [(fast, _), (standard, _), (best, _)] = cost;
         // Between the better two only rounding is left.
-        assert!(
-            best <= standard + 1e-6 && standard < fast,
-            "{isa}: {cost:?}"
-        );
+        assert!(best <= standard + 1e-6 && standard < fast, "{isa}: {cost:?}");
         assert!(fast <= 10.0 / 255.0, "{isa}: {cost:?}");
     }
 }
@@ -123,11 +116,7 @@ fn a_decoded_surface_is_close_to_the_reference_from_near_and_far() {
         let (azimuth, elevation) = (60.0 * i as f64, 25.0 * i as f64 - 60.0);
         let camera = Camera::orbit(azimuth, elevation, radius, 45.0, 60, 50).unwrap();
         // From afar hundreds share a pixel, and what is left out of each adds up.
-        let quality = if radius < 5.0 {
-            Quality::Fine
-        } else {
-            Quality::Exact
-        };
+        let quality = if radius < 5.0 { Quality::Fine } else { Quality::Exact };
         assert_close_in(quality, &scene, &camera);
     }
 }

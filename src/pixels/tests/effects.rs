@@ -4,12 +4,7 @@ use super::*;
 use crate::gaussians::Harmonics;
 use crate::pixels::{Channel, Choice, Effects};
 
-pub(super) fn with(
-    scene: &Gaussians,
-    camera: &Camera,
-    isa: Isa,
-    effects: Effects,
-) -> (Image, Stats) {
+pub(super) fn with(scene: &Gaussians, camera: &Camera, isa: Isa, effects: Effects) -> (Image, Stats) {
     let mut renderer = Renderer::new(isa);
     renderer.set_effects(effects);
     renderer.set_quality(Quality::Fine);
@@ -40,10 +35,7 @@ fn with_opacity_compensation_pictures_are_close_to_the_reference() {
             let (image, stats) = with(&scene, &camera, isa, ANTIALIAS);
             assert!(stats.effects.antialias);
             let (largest, psnr) = difference(&image, &exact);
-            assert!(
-                largest <= 2.0 / 255.0 && psnr >= 60.0,
-                "{isa}: {largest} {psnr}"
-            );
+            assert!(largest <= 2.0 / 255.0 && psnr >= 60.0, "{isa}: {largest} {psnr}");
         }
     }
 }
@@ -67,10 +59,11 @@ fn effects_that_are_not_called_for_change_no_pixel_when_forced_either_way() {
 
 #[test]
 fn where_splats_are_much_larger_than_pixels_compensation_changes_next_to_nothing() {
-    let scene = scene(random_splats(5, 100).into_iter().map(|s| Splat {
-        scale: [0.3; 3],
-        ..s
-    }));
+    let scene = scene(
+        random_splats(5, 100)
+            .into_iter()
+            .map(|s| Splat { scale: [0.3; 3], ..s }),
+    );
     let camera = orbit(300, 200);
     let (off, _) = with(&scene, &camera, Isa::detect(), Effects::default());
     let (on, _) = with(&scene, &camera, Isa::detect(), ANTIALIAS);
@@ -100,10 +93,7 @@ fn harmonics_turn_the_colour_with_the_view_and_can_be_switched_off() {
     ] {
         let seen = middle(azimuth, elevation, Effects::default());
         for k in 0..3 {
-            assert!(
-                (seen[k] - expected[k]).abs() < 1e-3,
-                "{azimuth} {elevation}: {seen:?}"
-            );
+            assert!((seen[k] - expected[k]).abs() < 1e-3, "{azimuth} {elevation}: {seen:?}");
         }
         let off = Effects {
             harmonics: Choice::Off,

@@ -106,9 +106,7 @@ fn a_renderer_that_has_drawn_before_draws_the_same() {
     for (seed, count, size) in [(1, 400, 70), (2, 50, 33), (3, 300, 90), (4, 0, 20)] {
         let scene = scene(random_splats(seed, count));
         let camera = orbit(size, size + 5);
-        let (image, _) = renderer
-            .render(&scene, &camera, Background::WHITE, &limits)
-            .unwrap();
+        let (image, _) = renderer.render(&scene, &camera, Background::WHITE, &limits).unwrap();
         assert!(image == draw(&scene, &camera));
     }
 }
@@ -145,10 +143,7 @@ fn every_gaussian_is_counted_once() {
             opacity: 0.0,
             ..RED
         },
-        Splat {
-            opacity: 0.0,
-            ..RED
-        },
+        Splat { opacity: 0.0, ..RED },
         Splat {
             colour: [0.0, f32::INFINITY, 0.0],
             ..RED
@@ -178,10 +173,7 @@ fn a_picture_in_crops_is_the_picture_to_the_bit() {
         let camera = Camera::orbit(30.0, 10.0, radius, 70.0, 96, 80).unwrap();
         for isa in isas() {
             let (plain, on) = (Effects::default(), Choice::On);
-            let antialias = Effects {
-                antialias: on,
-                ..plain
-            };
+            let antialias = Effects { antialias: on, ..plain };
             let order = Effects { order: on, ..plain };
             for effects in [plain, antialias, order] {
                 let (whole, stats) = with(&scene, &camera, isa, effects);

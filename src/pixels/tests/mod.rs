@@ -133,21 +133,14 @@ fn isas() -> Vec<Isa> {
     }
     #[cfg(target_arch = "aarch64")]
     expected.extend(std::arch::is_aarch64_feature_detected!("neon").then_some("neon"));
-    assert_eq!(
-        names, expected,
-        "the sets that are run, and those that there are"
-    );
+    assert_eq!(names, expected, "the sets that are run, and those that there are");
     isas
 }
 
 /// With the best instructions; the picture on every other set is held to it, and the counts are.
 fn draw_on(scene: &Gaussians, camera: &Camera, background: Background) -> (Image, Stats) {
     let limits = Limits::default();
-    let on = |isa| {
-        Renderer::new(isa)
-            .render(scene, camera, background, &limits)
-            .unwrap()
-    };
+    let on = |isa| Renderer::new(isa).render(scene, camera, background, &limits).unwrap();
     let (image, stats) = on(Isa::detect());
     let peak = colours(scene);
     for isa in isas() {

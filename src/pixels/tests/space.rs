@@ -28,10 +28,7 @@ fn assert_cared_for(scene: &Gaussians, camera: &Camera) {
         let (image, stats) = with(scene, camera, isa, NONE);
         assert!(stats.effects.near && stats.crossing > 0, "{isa}");
         let (largest, psnr) = difference(&image, &exact);
-        assert!(
-            largest <= 2.0 / 255.0 && psnr >= 60.0,
-            "{isa}: {largest} {psnr}"
-        );
+        assert!(largest <= 2.0 / 255.0 && psnr >= 60.0, "{isa}: {largest} {psnr}");
     }
 }
 
@@ -77,12 +74,7 @@ fn splats_all_along_the_near_plane_are_close_to_the_reference() {
 #[test]
 fn what_reaches_over_the_near_plane_beside_the_picture_is_looked_at_nowhere() {
     let beside = |i: usize| Splat {
-        position: [
-            [5.0, 0.0, 0.25],
-            [-5.0, 0.0, 0.25],
-            [0.0, 5.0, 0.25],
-            [0.0, -5.0, 0.25],
-        ][i % 4],
+        position: [[5.0, 0.0, 0.25], [-5.0, 0.0, 0.25], [0.0, 5.0, 0.25], [0.0, -5.0, 0.25]][i % 4],
         ..RED
     };
     let mut camera = straight(30.0, 64, 64);
@@ -134,10 +126,7 @@ fn where_nothing_reaches_over_the_near_plane_care_changes_no_bit() {
     for isa in isas() {
         let (without, _) = with(&scene, &camera, isa, CARELESS);
         for choice in [Choice::Auto, Choice::On] {
-            let effects = Effects {
-                near: choice,
-                ..NONE
-            };
+            let effects = Effects { near: choice, ..NONE };
             let (image, stats) = with(&scene, &camera, isa, effects);
             assert!(image == without && !stats.effects.near);
         }
@@ -175,10 +164,7 @@ fn with_an_order_for_each_pixel_pictures_are_close_to_the_reference() {
             let (image, stats) = with(&scene, &camera, isa, ORDERED);
             assert!(stats.effects.order);
             let (largest, psnr) = difference(&image, &by_pixel);
-            assert!(
-                largest <= 2.0 / 255.0 && psnr >= 60.0,
-                "{isa}: {largest} {psnr}"
-            );
+            assert!(largest <= 2.0 / 255.0 && psnr >= 60.0, "{isa}: {largest} {psnr}");
         }
     }
 }
@@ -214,18 +200,12 @@ fn a_pixel_s_number_is_that_of_the_gaussian_that_it_shows_most_of() {
         scale: [0.02; 3],
         ..RED
     };
-    let scene = scene([
-        wall(3.0, 0.9, [0.0, 1.0, 0.0]),
-        wall(2.0, 0.3, [0.0, 0.0, 1.0]),
-        spot,
-    ]);
+    let scene = scene([wall(3.0, 0.9, [0.0, 1.0, 0.0]), wall(2.0, 0.3, [0.0, 0.0, 1.0]), spot]);
     let camera = straight(100.0, 40, 33);
     for isa in isas() {
         let mut ids = Ids::default();
         let limits = Limits::default();
-        let stats = Renderer::new(isa)
-            .ids_into(&scene, &camera, &limits, &mut ids)
-            .unwrap();
+        let stats = Renderer::new(isa).ids_into(&scene, &camera, &limits, &mut ids).unwrap();
         assert_eq!((ids.width, ids.height, stats.touched), (40, 33, 40 * 33));
         // Through the faint wall one sees mostly the one behind, and the spot is before both.
         assert_eq!(ids.indices[16 * 40 + 20], 2, "{isa}");
@@ -287,9 +267,7 @@ fn numbers_are_mixed_the_same_with_any_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
         let mut mixed = Vec::new();
         let numbers = |i: usize| [i as f32, 1.0];
-        let mix = || {
-            Renderer::default().mix_into(&scene, &camera, numbers, &Limits::default(), &mut mixed)
-        };
+        let mix = || Renderer::default().mix_into(&scene, &camera, numbers, &Limits::default(), &mut mixed);
         pool.build().unwrap().install(mix).unwrap();
         mixed
     };

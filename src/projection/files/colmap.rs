@@ -63,8 +63,7 @@ pub fn colmap(cameras: &str, images: &str, frame: &Frame) -> Result<Vec<Named>> 
             return Err(bad("images.txt", line));
         };
         let numbers: Option<Vec<f64>> = numbers.iter().map(|w| w.parse().ok()).collect();
-        let Some([w, x, y, z, tx, ty, tz]) = numbers.and_then(|n| <[f64; 7]>::try_from(n).ok())
-        else {
+        let Some([w, x, y, z, tx, ty, tz]) = numbers.and_then(|n| <[f64; 7]>::try_from(n).ok()) else {
             return Err(bad("images.txt", line));
         };
         let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());

@@ -74,9 +74,7 @@ pub(super) fn json_of(bytes: &[u8]) -> Result<&[u8]> {
     let short = || Error::Usage("binary glTF: it ends before its JSON does".into());
     let headers = bytes.get(..HEADERS).ok_or_else(short)?;
     if &headers[16..] != b"JSON" {
-        return Err(Error::Usage(
-            "binary glTF: its first chunk is no JSON".into(),
-        ));
+        return Err(Error::Usage("binary glTF: its first chunk is no JSON".into()));
     }
     let length = u32::from_le_bytes([headers[12], headers[13], headers[14], headers[15]]);
     bytes[HEADERS..].get(..length as usize).ok_or_else(short)
@@ -90,8 +88,7 @@ pub(super) fn cameras(file: Value, frame: &Frame, size: (u32, u32)) -> Result<Ve
     for (parent, node) in nodes.iter().enumerate() {
         for &child in &node.children {
             let place = parents.get_mut(child);
-            *place.ok_or_else(|| Error::Usage(format!("glTF: there is no node {child}")))? =
-                Some(parent);
+            *place.ok_or_else(|| Error::Usage(format!("glTF: there is no node {child}")))? = Some(parent);
         }
     }
     let mut named = Vec::new();

@@ -70,8 +70,7 @@ pub fn read(bytes: &[u8], frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>>
         true => gltf::json_of(bytes)?,
         false => bytes,
     };
-    let value: Value = serde_json::from_slice(text)
-        .map_err(|e| Error::Usage(format!("no file of cameras: {e}")))?;
+    let value: Value = serde_json::from_slice(text).map_err(|e| Error::Usage(format!("no file of cameras: {e}")))?;
     let has = |name: &str| value.get(name).is_some();
     if has("asset") {
         gltf::cameras(value, frame, size)
@@ -80,7 +79,8 @@ pub fn read(bytes: &[u8], frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>>
     } else if has("intrinsic") || has("parameters") {
         open3d::cameras(value, frame)
     } else {
-        let what = "no file of cameras: neither `frames` (NeRF), nor `intrinsic` or `parameters` (Open3D), nor `asset` (glTF)";
+        let what =
+            "no file of cameras: neither `frames` (NeRF), nor `intrinsic` or `parameters` (Open3D), nor `asset` (glTF)";
         Err(Error::Usage(what.into()))
     }
 }
@@ -134,9 +134,7 @@ fn pose(rotation: DMat3, translation: DVec3, frame: &Frame) -> DAffine3 {
 }
 
 fn checked(name: &str, camera: Camera) -> Result<Named> {
-    camera
-        .check()
-        .map_err(|e| Error::Usage(format!("{name}: {e}")))?;
+    camera.check().map_err(|e| Error::Usage(format!("{name}: {e}")))?;
     Ok((name.to_owned(), camera))
 }
 
@@ -184,9 +182,7 @@ mod tests {
         let open3d = r#"{"class_name": "PinholeCameraParameters",
             "extrinsic": [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, -5, 6, 17, 1],
             "intrinsic": {"width": 80, "height": 60, "intrinsic_matrix": [40, 0, 0, 0, 40, 0, 39.5, 29.5, 1]}}"#;
-        let many = format!(
-            r#"{{"class_name": "PinholeCameraTrajectory", "parameters": [{open3d}, {open3d}]}}"#
-        );
+        let many = format!(r#"{{"class_name": "PinholeCameraTrajectory", "parameters": [{open3d}, {open3d}]}}"#);
         for (file, count) in [(open3d, 1), (many.as_str(), 2)] {
             let named = read(file.as_bytes(), &FRAME, (1, 1)).unwrap();
             assert_eq!(named.len(), count);
@@ -233,40 +229,25 @@ mod tests {
             r#"[{"camera": 0, "children": [7]}]"#,
             r#"[{"camera": 0, "scale": [1, -1, 1]}]"#,
         ] {
-            assert!(
-                read(file(nodes).as_bytes(), &FRAME, (8, 8)).is_err(),
-                "{nodes}"
-            );
+            assert!(read(file(nodes).as_bytes(), &FRAME, (8, 8)).is_err(), "{nodes}");
         }
     }
 
     #[test]
     fn what_is_no_camera_is_an_error_that_names_it() {
-        let json = |m: &str| {
-            format!(r#"{{"fl_x": 50, "frames": [{{"file_path": "a", "transform_matrix": {m}}}]}}"#)
-        };
+        let json = |m: &str| format!(r#"{{"fl_x": 50, "frames": [{{"file_path": "a", "transform_matrix": {m}}}]}}"#);
         for matrix in [
             "[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]",
             "[[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
             "[[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]",
             "[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
         ] {
-            let error = read(json(matrix).as_bytes(), &FRAME, (8, 8))
-                .unwrap_err()
-                .to_string();
+            let error = read(json(matrix).as_bytes(), &FRAME, (8, 8)).unwrap_err().to_string();
             assert!(error.contains("a: "), "{error}");
         }
         assert!(read(b"{}", &FRAME, (8, 8)).is_err());
-        assert!(
-            read(br#"{"frames": []}"#, &FRAME, (8, 8))
-                .unwrap()
-                .is_empty()
-        );
-        let fish = colmap(
-            "1 OPENCV_FISHEYE 8 8 1 1 1 1\n",
-            "1 1 0 0 0 0 0 0 1 a\n",
-            &FRAME,
-        );
+        assert!(read(br#"{"frames": []}"#, &FRAME, (8, 8)).unwrap().is_empty());
+        let fish = colmap("1 OPENCV_FISHEYE 8 8 1 1 1 1\n", "1 1 0 0 0 0 0 0 1 a\n", &FRAME);
         assert!(matches!(fish, Err(Error::Unsupported { .. })));
         assert!(colmap("", "1 1 0 0 0 0 0 0 1 a\n", &FRAME).is_err());
         assert!(colmap("1 PINHOLE 8 8 1 1 1 1\n", "1 x 0 0 0 0 0 0 1 a\n", &FRAME).is_err());

@@ -13,10 +13,7 @@ const CHANNELS: usize = LINE / 2;
 
 impl Weights {
     /// Rounds the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, to bf16.
-    pub fn of_brain(
-        extents: Extents,
-        weights: impl Fn(usize, usize, usize) -> [f32; PANEL],
-    ) -> Weights {
+    pub fn of_brain(extents: Extents, weights: impl Fn(usize, usize, usize) -> [f32; PANEL]) -> Weights {
         let mut packed = Weights::new(extents, Scheme::Brain);
         for (tap, channel, panel) in extents.each() {
             let words = packed.words(0, tap, 2 * channel, panel);
@@ -73,8 +70,7 @@ unsafe fn round(input: &[f16], cin: usize, rows: &[u32], to: &mut [Lanes]) {
                 let halves = _mm512_maskz_loadu_epi16(here, from.cast());
                 let low = _mm512_cvtph_ps(_mm512_castsi512_si256(halves));
                 let high = _mm512_cvtph_ps(_mm512_extracti64x4_epi64::<1>(halves));
-                let pairs =
-                    std::mem::transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low));
+                let pairs = std::mem::transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low));
                 _mm512_store_si512(std::ptr::from_mut(to).cast(), pairs);
             }
         }

@@ -18,10 +18,7 @@ const WIDE: [usize; 2] = [17, 3];
 impl Weights {
     /// Cuts the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, into digits; nothing, if one is too large
     /// for that, or the layer too narrow to gain.
-    pub fn of_integers(
-        extents: Extents,
-        weights: impl Fn(usize, usize, usize) -> [i16; PANEL],
-    ) -> Option<Weights> {
+    pub fn of_integers(extents: Extents, weights: impl Fn(usize, usize, usize) -> [i16; PANEL]) -> Option<Weights> {
         let (cin, panels) = (extents.cin, extents.panels());
         if cin < WIDE[0] || cin > HALF && panels < WIDE[1] {
             return None;
@@ -34,10 +31,7 @@ impl Weights {
         let mut packed = Weights::new(extents, scheme);
         for (tap, channel, panel) in extents.each() {
             let weights = weights(tap, channel, panel);
-            if weights
-                .iter()
-                .any(|w| w.unsigned_abs() > REACH.unsigned_abs())
-            {
+            if weights.iter().any(|w| w.unsigned_abs() > REACH.unsigned_abs()) {
                 return None;
             }
             let [high, low] = [weights.map(|w| digits(w).0), weights.map(|w| digits(w).1)];
@@ -97,9 +91,7 @@ pub(crate) fn accumulate(
     // SAFETY: an `Isa` with tiles is only made where the processor has AVX-512. All rows of the plan lie below its end.
     let small = unsafe {
         match weights.scheme {
-            Scheme::Both | Scheme::Pairs => {
-                split_short_rows(input, cin, plan.inputs(), &mut buffers.rows)
-            }
+            Scheme::Both | Scheme::Pairs => split_short_rows(input, cin, plan.inputs(), &mut buffers.rows),
             _ => split_rows(input, cin, plan.inputs(), &mut buffers.rows),
         }
     };

@@ -128,19 +128,11 @@ pub(crate) struct Buffers {
 ///
 /// # Panics
 /// If the processor lacks AMX, the plan is another kernel's, or it reads beyond the input of so many rows.
-fn prepare(
-    isa: crate::Isa,
-    weights: &Weights,
-    plan: &PlanTile,
-    inputs: usize,
-    buffers: &mut Buffers,
-) {
+fn prepare(isa: crate::Isa, weights: &Weights, plan: &PlanTile, inputs: usize, buffers: &mut Buffers) {
     assert!(isa.has_tiles());
     plan.check(weights.extents.volume, inputs);
     let lines = (plan.inputs().len() + 1) * weights.chunks();
-    buffers
-        .rows
-        .resize(weights.passes() * lines, Lanes::default());
+    buffers.rows.resize(weights.passes() * lines, Lanes::default());
 }
 
 /// # Safety

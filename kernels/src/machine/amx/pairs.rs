@@ -91,12 +91,7 @@ struct Block {
 /// # Safety
 /// The processor must have AMX and AVX-512 F, BW and VL, `buffers.rows` the plan's input rows, high digits and low ones, and then one of zeros.
 #[target_feature(enable = "avx2,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512vl")]
-pub(super) unsafe fn multiply(
-    weights: &Weights,
-    plan: &PlanTile,
-    buffers: &mut Buffers,
-    sums: &mut [Lanes],
-) {
+pub(super) unsafe fn multiply(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, sums: &mut [Lanes]) {
     let Buffers {
         rows,
         gathered,
@@ -342,9 +337,8 @@ mod tests {
                 cout: 16 * panels,
             };
             let all = (0..14).flat_map(|pair| (0..3).map(move |product| (pair, product)));
-            let tiles = all.flat_map(|(pair, product)| {
-                (0..panels).map(move |panel| tile(extents, pair, product, panel))
-            });
+            let tiles =
+                all.flat_map(|(pair, product)| (0..panels).map(move |panel| tile(extents, pair, product, panel)));
             let mut tiles: Vec<_> = tiles.collect();
             tiles.sort_unstable();
             assert!(tiles.into_iter().eq(0..14 * 3 * panels));

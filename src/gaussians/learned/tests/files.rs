@@ -25,20 +25,12 @@ fn a_description_out_of_range_is_refused_with_the_field() {
         (&format!("{set}/channels"), json!(1u64 << 60), "channels"),
         (&format!("{set}/channels"), json!(-1), "b2p-heads"),
         (&format!("{set}/channels"), json!(3), "shape"),
-        (
-            &format!("{set}/parent_blocks"),
-            json!(1u64 << 40),
-            "parent_blocks",
-        ),
+        (&format!("{set}/parent_blocks"), json!(1u64 << 40), "parent_blocks"),
         (&format!("{set}/child_blocks"), json!(2), "range child.1."),
         (&format!("{set}/gaussians"), json!(8), "gaussians"),
         (&format!("{set}/ranges/parent.in"), json!(0), "range"),
         (&format!("{set}/ranges/parent.in"), json!(-2), "range"),
-        (
-            &format!("{set}/ranges/child.0.b"),
-            json!(1e30),
-            "range child.0.b",
-        ),
+        (&format!("{set}/ranges/child.0.b"), json!(1e30), "range child.0.b"),
         (&format!("{set}/ranges"), json!({}), "missing"),
         ("/sets", json!({"worst.1": {}}), "b2p-heads"),
         ("/sets", json!([]), "b2p-heads"),
@@ -53,10 +45,7 @@ fn a_description_out_of_range_is_refused_with_the_field() {
     let set = unknown["sets"]["quick.1"].take();
     unknown["sets"] = json!({"quick.2": set});
     let error = refused(&networks, &unknown).to_string();
-    assert!(
-        error.contains("quick.2") && error.contains("quick.8"),
-        "{error}"
-    );
+    assert!(error.contains("quick.2") && error.contains("quick.8"), "{error}");
 }
 
 #[test]
@@ -86,10 +75,7 @@ fn every_tensor_is_needed_and_must_have_its_shape_and_finite_entries() {
             alter(&mut networks[0]);
             let error = refused(&networks, &description);
             assert!(matches!(error, Error::Malformed { .. }));
-            assert!(
-                error.to_string().contains(&format!("quick.1.{name}")),
-                "{error}"
-            );
+            assert!(error.to_string().contains(&format!("quick.1.{name}")), "{error}");
         };
         altered(&|made| {
             made.tensors.remove(&name);
@@ -118,18 +104,12 @@ fn the_largest_weights_and_ranges_draw_finite_gaussians_without_overflow() {
     let mut networks = [Made::new((Heads::Best, 8), 32, [1, 1], 1)];
     for (_, values) in networks[0].tensors.values_mut() {
         for value in values {
-            *value = if value.to_f32() < 0.3 {
-                f16::MAX
-            } else {
-                f16::MIN
-            };
+            *value = if value.to_f32() < 0.3 { f16::MAX } else { f16::MIN };
         }
     }
     for range in [1e-6, 32_768.0] {
         let mut description = description(&networks);
-        let ranges = description["sets"]["best.8"]["ranges"]
-            .as_object_mut()
-            .unwrap();
+        let ranges = description["sets"]["best.8"]["ranges"].as_object_mut().unwrap();
         ranges.values_mut().for_each(|value| *value = json!(range));
         let model = HeadsModel::from_bytes(&file(&networks, &description)).unwrap();
         for precision in [Precision::Int16, Precision::F16] {
@@ -140,13 +120,7 @@ fn the_largest_weights_and_ranges_draw_finite_gaussians_without_overflow() {
                     .iter()
                     .all(|all| all.as_flattened().iter().all(|v| v.is_finite()))
             );
-            assert!(
-                expected
-                    .rotation
-                    .as_flattened()
-                    .iter()
-                    .all(|v| v.is_finite())
-            );
+            assert!(expected.rotation.as_flattened().iter().all(|v| v.is_finite()));
             if precision == Precision::Int16 {
                 for isa in Isa::available() {
                     assert!(cloud.draw(&model, isa, precision, (Heads::Best, 8)) == expected);

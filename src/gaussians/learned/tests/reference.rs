@@ -55,10 +55,7 @@ impl Made {
         for i in 0..count {
             let inner = relu(self.conv3(&format!("{side}.{i}.a"), level, &x));
             note(seen, format!("{side}.{i}.a"), &inner);
-            x = relu(sum(
-                &x,
-                &self.conv3(&format!("{side}.{i}.b"), level, &inner),
-            ));
+            x = relu(sum(&x, &self.conv3(&format!("{side}.{i}.b"), level, &inner)));
             note(seen, format!("{side}.{i}.b"), &x);
         }
         x
@@ -66,10 +63,7 @@ impl Made {
 }
 
 fn note(seen: &mut Ranges, layer: String, rows: &Rows) {
-    let largest = rows
-        .iter()
-        .flatten()
-        .fold(0.0f64, |most, v| most.max(v.abs()));
+    let largest = rows.iter().flatten().fold(0.0f64, |most, v| most.max(v.abs()));
     seen.insert(layer, largest);
 }
 
@@ -95,11 +89,7 @@ fn sum(a: &Rows, b: &Rows) -> Rows {
 fn luma_chroma([r, g, b]: [u8; 3]) -> [f64; 3] {
     let [r, g, b] = [r, g, b].map(f64::from);
     let luma = (r + 2.0 * g + b) / 4.0;
-    [
-        luma / 128.0 - 1.0,
-        (r - b) / 128.0,
-        (g - (r + b) / 2.0) / 128.0,
-    ]
+    [luma / 128.0 - 1.0, (r - b) / 128.0, (g - (r + b) / 2.0) / 128.0]
 }
 
 fn raw(made: &Made, input: &LevelInput<'_>, seen: &mut Ranges) -> Rows {
@@ -107,10 +97,7 @@ fn raw(made: &Made, input: &LevelInput<'_>, seen: &mut Ranges) -> Rows {
     let above = Level::new(octree.level(input.level - 1));
     let here = Level::new(octree.level(input.level));
     let s = f64::from(input.luma_step).log2() / 4.0;
-    let parents = octree
-        .occupancy(input.level - 1)
-        .iter()
-        .zip(input.colours_above);
+    let parents = octree.occupancy(input.level - 1).iter().zip(input.colours_above);
     let parents = parents.map(|(mask, &colour)| {
         let bits = (0..8).map(|octant| f64::from(mask >> octant & 1));
         bits.chain(luma_chroma(colour)).chain([s]).collect()
@@ -134,10 +121,7 @@ fn raw(made: &Made, input: &LevelInput<'_>, seen: &mut Ranges) -> Rows {
             out
         })
         .collect();
-    let x = relu(sum(
-        &made.conv3("child.in", &here, &children.collect()),
-        &up,
-    ));
+    let x = relu(sum(&made.conv3("child.in", &here, &children.collect()), &up));
     let x = made.blocks("child", &here, x, seen);
     made.conv3("out", &here, &x)
 }
@@ -156,11 +140,7 @@ pub fn gaussians(made: &Made, input: &LevelInput<'_>) -> (Gaussians, Ranges) {
         for (octant, raw) in raw.chunks(RAW).enumerate() {
             let bit = |axis: usize| (octant >> axis & 1) as f64;
             let anchor = |axis: usize| {
-                if k == 8 {
-                    (0.5 + bit(axis)) * unit
-                } else {
-                    unit / 2.0
-                }
+                if k == 8 { (0.5 + bit(axis)) * unit } else { unit / 2.0 }
             };
             let axes = [0, 1, 2];
             let position = axes.map(|a| corner[a] + anchor(a) + unit * raw[a].tanh());

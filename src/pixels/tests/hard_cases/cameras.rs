@@ -51,10 +51,7 @@ fn a_splat_behind_that_reaches_over_the_near_plane_is_drawn_as_what_of_it_is_in_
     for (scale, least, most) in [(3.0, 0.9, 1.0), (0.05, 0.0, 0.1), (0.03, 0.0, 0.0)] {
         assert_close(&scene([splat(scale)]), &camera);
         let image = draw_on(&scene([splat(scale)]), &camera, Background::BLACK).0;
-        assert!(
-            image.pixels.iter().all(|p| (least..=most).contains(&p[0])),
-            "{scale}"
-        );
+        assert!(image.pixels.iter().all(|p| (least..=most).contains(&p[0])), "{scale}");
     }
 }
 
@@ -117,14 +114,7 @@ fn zooming_keeps_the_mean_luminance_with_anti_aliasing_on() {
     for isa in isas() {
         // The whole sphere, with some black around it …
         let whole = mean(isa, 1.0, 600);
-        for (zoom, side) in [
-            (0.5, 300),
-            (0.2, 120),
-            (0.1, 60),
-            (0.05, 30),
-            (0.02, 12),
-            (0.01, 6),
-        ] {
+        for (zoom, side) in [(0.5, 300), (0.2, 120), (0.1, 60), (0.05, 30), (0.02, 12), (0.01, 6)] {
             let ratio = mean(isa, zoom, side) / whole;
             assert!((ratio - 1.0).abs() < 0.01, "{isa}, ×{zoom}: {ratio}");
         }
@@ -156,11 +146,7 @@ fn a_strip_of_65535_pixels_is_drawn_to_its_ends() {
         let camera = straight(30_000.0, width, height);
         let end = |i: u32| {
             let offset = (i as f32 + 0.5 - 32_767.5) / 30_000.0 * 2.0;
-            let (x, y) = if upright {
-                (0.0, offset)
-            } else {
-                (offset, 0.0)
-            };
+            let (x, y) = if upright { (0.0, offset) } else { (offset, 0.0) };
             Splat {
                 position: [x, y, 2.0],
                 scale: [sigma(1.0, 30_000.0); 3],

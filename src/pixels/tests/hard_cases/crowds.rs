@@ -54,11 +54,7 @@ fn a_hundred_thousand_splats_in_one_pixel_are_drawn_nearest_first() {
         position: [0.0, 0.0, 2.0 + i as f32 * 1e-5],
         scale: [1e-4; 3],
         opacity: 0.5,
-        colour: if i == 0 {
-            [0.0, 1.0, 0.0]
-        } else {
-            [1.0, 0.0, 0.0]
-        },
+        colour: if i == 0 { [0.0, 1.0, 0.0] } else { [1.0, 0.0, 0.0] },
         ..RED
     };
     // Farthest first.
@@ -142,10 +138,7 @@ fn a_thousand_faint_layers_are_drawn_and_the_fast_quality_says_that_it_dropped_t
             let drawn = renderer.render(&scene, &camera, Background::Transparent, &limits);
             drawn.unwrap()
         };
-        assert!(
-            difference(&on(Quality::Fine).0, &exact).0 <= 1.0 / 255.0,
-            "{isa}"
-        );
+        assert!(difference(&on(Quality::Fine).0, &exact).0 <= 1.0 / 255.0, "{isa}");
         let (image, stats) = on(Quality::Fast);
         assert_eq!(stats.dropped.too_faint, 1000);
         assert!(image.pixels.iter().all(|p| *p == [0.0; 4]));
@@ -164,12 +157,7 @@ fn white_on_white_stays_white() {
         };
         (0..count).map(layer).collect()
     };
-    let white = |splats: Vec<Splat>| {
-        splats.into_iter().map(|s| Splat {
-            colour: [1.0; 3],
-            ..s
-        })
-    };
+    let white = |splats: Vec<Splat>| splats.into_iter().map(|s| Splat { colour: [1.0; 3], ..s });
     // Each layer rounds once more: of thousands, most of them faint, a little is left.
     let scenes = [
         (scene(white(random_splats(9, 2000))), 2e-6),
@@ -180,10 +168,7 @@ fn white_on_white_stays_white() {
     ];
     for (i, (scene, tolerance)) in scenes.iter().enumerate() {
         for pixel in draw(scene, &camera).pixels {
-            assert!(
-                pixel.iter().all(|x| (x - 1.0).abs() <= *tolerance),
-                "{i}: {pixel:?}"
-            );
+            assert!(pixel.iter().all(|x| (x - 1.0).abs() <= *tolerance), "{i}: {pixel:?}");
         }
     }
 }

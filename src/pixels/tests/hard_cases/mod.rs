@@ -49,10 +49,7 @@ fn sigma(pixels: f32, focal: f64) -> f32 {
 }
 
 fn visible(splat: Splat, camera: &Camera) -> bool {
-    draw_on(&scene([splat]), camera, Background::WHITE)
-        .1
-        .visible
-        == 1
+    draw_on(&scene([splat]), camera, Background::WHITE).1.visible == 1
 }
 
 /// With no care for what reaches over the near plane.

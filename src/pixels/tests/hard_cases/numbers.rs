@@ -18,11 +18,7 @@ fn a_quaternion_of_any_length_is_normalised_and_none_is_dropped() {
         assert!(difference(&unit, &long).0 < 1e-5);
     }
     let rotation = [0.0, -0.0, 0.0, 0.0];
-    let (_, stats) = draw_on(
-        &scene([Splat { rotation, ..splat }]),
-        &camera,
-        Background::WHITE,
-    );
+    let (_, stats) = draw_on(&scene([Splat { rotation, ..splat }]), &camera, Background::WHITE);
     assert_eq!(stats.dropped.no_rotation, 1);
 }
 
@@ -52,16 +48,8 @@ fn what_is_not_finite_is_dropped_and_counted() {
 fn an_opacity_of_no_number_or_none_is_dropped_and_an_endless_one_is_no_opacity() {
     let camera = orbit(20, 20);
     let drawn = |opacity| {
-        let (_, stats) = draw_on(
-            &scene([Splat { opacity, ..RED }]),
-            &camera,
-            Background::WHITE,
-        );
-        (
-            stats.visible,
-            stats.dropped.not_finite,
-            stats.dropped.too_faint,
-        )
+        let (_, stats) = draw_on(&scene([Splat { opacity, ..RED }]), &camera, Background::WHITE);
+        (stats.visible, stats.dropped.not_finite, stats.dropped.too_faint)
     };
     assert_eq!(drawn(f32::NAN), (0, 1, 0));
     assert_eq!(drawn(0.0), (0, 0, 1));
@@ -83,25 +71,15 @@ fn depths_of_nothing_are_behind_and_depths_a_bit_apart_keep_their_order() {
     for z in [-0.0, 0.0, 1e-45, f32::MIN_POSITIVE] {
         for isa in isas() {
             let (_, stats) = careless(&scene([at(z, [1.0; 3])]), &camera, isa);
-            assert_eq!(
-                (stats.visible, stats.dropped.behind),
-                (0, 1),
-                "{isa}: {z:e}"
-            );
+            assert_eq!((stats.visible, stats.dropped.behind), (0, 1), "{isa}: {z:e}");
         }
     }
-    let (_, stats) = draw_on(
-        &scene([at(f32::INFINITY, [1.0; 3])]),
-        &camera,
-        Background::WHITE,
-    );
+    let (_, stats) = draw_on(&scene([at(f32::INFINITY, [1.0; 3])]), &camera, Background::WHITE);
     assert_eq!((stats.visible, stats.dropped.not_finite), (0, 1));
     for z in [1e-3, 1.0, 2.0, 1e6, f32::MAX / 2.0] {
         let (near, far) = (at(z, [1.0, 0.0, 0.0]), at(z.next_up(), [0.0, 1.0, 0.0]));
         for order in [[near, far], [far, near]] {
-            let [r, g, _, _] = draw_on(&scene(order), &camera, Background::BLACK)
-                .0
-                .pixel(8, 8);
+            let [r, g, _, _] = draw_on(&scene(order), &camera, Background::BLACK).0.pixel(8, 8);
             assert!(r > 1.5 * g, "{z:e}: {r} {g}");
         }
     }

@@ -48,10 +48,7 @@ fn an_enormous_splat_is_a_constant_colour() {
     let camera = straight(500.0, 64, 48);
     for scale in [[4.85e8; 3], [f32::MAX; 3], [f32::MAX, f32::MAX, 0.0]] {
         let splat = Splat { scale, ..AHEAD };
-        for pixel in draw_on(&scene([splat]), &camera, Background::BLACK)
-            .0
-            .pixels
-        {
+        for pixel in draw_on(&scene([splat]), &camera, Background::BLACK).0.pixels {
             assert!((pixel[0] - 0.99).abs() < 1e-5 && pixel[1] == 0.0);
         }
     }
