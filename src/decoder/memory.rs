@@ -2,11 +2,11 @@
 
 use std::ops::Deref;
 
-use super::Decoder;
-use crate::bitstream::{Header, MAX_TRUNK_VOXELS};
 use crate::colour::Coloured;
+use crate::container::{Header, MAX_TRUNK_VOXELS};
 use crate::error::Result;
-use crate::network::{AT_ONCE, Model, RAW};
+use crate::latents::Decoder;
+use crate::latents::network::{AT_ONCE, Model, RAW};
 
 /// Bytes of a row of a 3³ kernel map arranged for the kernels.
 const PLAN: u64 = 100;
@@ -74,7 +74,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     }
 
     /// Fails with [`crate::Error::LimitExceeded`] if decoding down to `level` takes more than is allowed.
-    pub(super) fn check_memory(&self, header: &Header, level: u8) -> Result<()> {
+    pub(crate) fn check_memory(&self, header: &Header, level: u8) -> Result<()> {
         let bytes = self.memory(header, level)?;
         self.limits.check_bytes("memory to decode this stream", bytes)
     }

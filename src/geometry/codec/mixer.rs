@@ -90,7 +90,7 @@ impl<I: Instructions> Mixer<I> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::entropy::test_tables::Random;
+    use crate::testing::Random;
     use b2p_kernels::Baseline;
     use b2p_kernels::mixing::HEAVIEST;
 
