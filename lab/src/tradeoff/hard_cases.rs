@@ -65,7 +65,7 @@ pub fn renderer_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
     let others = Isa::available().into_iter().filter(|isa| *isa != best);
     settings.extend(others.map(|isa| {
         let quality = Quality::default();
-        (format!("{}, {isa}", quality.to_string()), quality, isa)
+        (format!("{quality}, {isa}"), quality, isa)
     }));
     let of_scene = |scene: Scene| {
         let Scene {

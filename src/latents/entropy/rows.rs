@@ -4,8 +4,6 @@ use super::tables::RawRows;
 use crate::coding::ans::{Interval, PRECISION};
 use crate::error::{Error, Result, Stage};
 
-/// Probabilities are in units of 2⁻¹⁶.
-
 /// Quantiles are looked up by their highest bits first.
 const BUCKET_BITS: u32 = 6;
 const BUCKETS: usize = 1 << BUCKET_BITS;
