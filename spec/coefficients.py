@@ -109,12 +109,12 @@ class Model:
         both = 2 * (c.lum > 0) + (c.oth > 0)
         fine = (unit + 640) * 48 // 1281
         places = (
-            (c.axis * 7 + c.kids - 2) * 7 + c.beside,
+            (c.axis * 7 + c.kids - 2) * 7 + c.nmag,
             classed(c.gr, 8, 9) * 9 + classed(c.pr, 8, 9),
             (classed(c.pr, 5, 14) * 3 + c.axis) * 4 + c.heavy,
             ((classed(c.en, 8, 7) * 7 + classed(c.gr, 10, 7)) * 4 + c.lum) * 4 + c.oth,
             fine,
-            ((c.lum * 4 + c.oth) * 8 + classed(c.bl, 8, 8)) * 7 + c.beside,
+            ((c.lum * 4 + c.oth) * 8 + classed(c.bl, 8, 8)) * 7 + c.nmag,
             ((fine // 2 * 3 + c.axis) * 4 + min(c.kids - 2, 3)) * 4 + both,
             (classed(c.pa, 8, 9) * 9 + classed(c.ac, 8, 9)) * 4 + both,
         )
@@ -142,7 +142,7 @@ class Model:
 
     def sign(self, decoder, c):
         """5.8.7"""
-        places = (c.psign * 3 + c.axis, c.others * 7 + c.slot, c.bsign * 3 + c.axis, c.shift * 9 + c.psign)
+        places = (c.psign * 3 + c.axis, c.others * 7 + c.slot, c.nsign * 3 + c.axis, c.shift * 9 + c.psign)
         at = [c.t * size + place for size, place in zip(SIGN_SIZES, places)]
         inputs = [slot_input(slots[i]) for slots, i in zip(self.signs, at)]
         weights = self.sign_weights[c.t]

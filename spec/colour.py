@@ -227,10 +227,10 @@ class SliceDecoder:
         c = SimpleNamespace()  # 5.7.4
         c.kids = mask.bit_count()
         gradient, energy = self.gradient(i), self.above.energies[i]
-        beside = []
+        around = []
         for k in (4, 10, 12):
             j = self.nodes.near[i][k]
-            beside.append(self.blocks[j - self.first] if j >= self.first else EMPTY)
+            around.append(self.blocks[j - self.first] if j >= self.first else EMPTY)
         differences, sums, done = [[0] * 3 for _ in range(7)], [0, 0, 0], 0
         for slot, _, _, v, w in reversed(JOINS_OF[mask]):
             if v == 0 or w == 0:
@@ -247,7 +247,7 @@ class SliceDecoder:
                     differences[slot][t] = expected
                     continue
                 c.t = t
-                self.circumstances(c, a[slot], b[slot], magnitudes, gradient, energy, beside, sums, done)
+                self.circumstances(c, a[slot], b[slot], magnitudes, gradient, energy, around, sums, done)
                 follow = self.follow(t - 1, brought) if t > 0 else 0
                 expected += follow
                 q = self.model.coefficient(self.decoder, c)
@@ -271,12 +271,12 @@ class SliceDecoder:
         """5.7.2"""
         return min(4095, (x * self.fwd >> 8) * ((1 << 32) // max(self.units[t], 1)) >> 32)
 
-    def circumstances(self, c, a, b, magnitudes, gradient, energy, beside, sums, done):
+    def circumstances(self, c, a, b, magnitudes, gradient, energy, around, sums, done):
         """5.7.4 and the features of 5.8.4."""
         t = c.t
-        blocks = [block[c.slot][t] for block in beside]
-        c.beside = sum(min(abs(q), 2) for q in blocks)
-        c.bsign = 9 * sgn3(blocks[0]) + 3 * sgn3(blocks[1]) + sgn3(blocks[2])
+        blocks = [block[c.slot][t] for block in around]
+        c.nmag = sum(min(abs(q), 2) for q in blocks)
+        c.nsign = 9 * sgn3(blocks[0]) + 3 * sgn3(blocks[1]) + sgn3(blocks[2])
         c.en = log(energy[t])
         c.gr = log(self.sixteenths(t, gradient[t]))
         c.pr = log(magnitudes[t])
@@ -288,7 +288,7 @@ class SliceDecoder:
         s = a[t] - b[t]
         c.shift = signed(s < 0, self.sixteenths(t, abs(s)))
         kinds = (c.en - 24, c.gr - 24, c.pr - 24, run - 16, c.pa - 24, c.ac - 24)
-        c.features = (*kinds, 16 * c.lum, 16 * c.oth, 8 * c.heavy - 12, 8 * c.beside, 0 if done else 24, 32)
+        c.features = (*kinds, 16 * c.lum, 16 * c.oth, 8 * c.heavy - 12, 8 * c.nmag, 0 if done else 24, 32)
 
     def follow(self, c, x):
         """5.7.5"""

@@ -47,11 +47,9 @@ def parse_header(data):
     """2.2"""
     reader = Reader(data)
     require(reader.take(8) == MAGIC, "2.2.1", "magic")
-    major = reader.number("H")
-    reader.number("H")  # the minor version does not matter
+    major, _ = reader.number("H"), reader.number("H")  # the minor version does not matter
     require(major == 3, "2.2.1", f"major version {major}: this decoder reads 3")
-    critical = reader.number("I")
-    reader.number("I")  # optional flags do not matter
+    critical, _ = reader.number("I"), reader.number("I")  # optional flags do not matter
     bits, base, top, reserved = reader.take(4)
     require(base <= top <= 21 and top - base + 1 <= 21, "2.2.2", "levels")
     levels = top - base + 1

@@ -65,13 +65,12 @@ def mix(h, word):
 
 
 # 4.6.1: for each offset and octant the bit of the cell, 0 outside the 4^3 cells.
-CELL = []
-for _offset in OFFSETS:
-    CELL.append([])
+CELL = [[] for _ in OFFSETS]
+for _offset, _cells in zip(OFFSETS, CELL):
     for _octant in range(8):
         _x, _y, _z = (2 * d + o for d, o in zip(_offset, octant_xyz(_octant)))
         _inside = all(-1 <= c <= 2 for c in (_x, _y, _z))
-        CELL[-1].append(1 << (_x + 1 + 4 * (_y + 1) + 16 * (_z + 1)) if _inside else 0)
+        _cells.append(1 << (_x + 1 + 4 * (_y + 1) + 16 * (_z + 1)) if _inside else 0)
 ALL_CELLS = [sum(cells) for cells in CELL]
 OWN = 13
 FACE_BITS = sum(1 << bit for bit in (5, 17, 20, 22, 25, 37))
@@ -190,16 +189,16 @@ class Words:
 
     def __init__(self, voxels, near, known, unknown):
         self.sides = []
-        self.beside = self.behind = self.beyond = 0
+        self.faces = self.face_occ = self.second = 0
         for f, k in enumerate(FACES):
             there = near[k] != ABSENT
-            self.beside |= there << f
+            self.faces |= there << f
             self.sides.append((known.get(k), k in unknown))
             if f < 3:
-                self.behind |= (256 + known[k] if k in known else int(there)) << 9 * f
+                self.face_occ |= (256 + known[k] if k in known else int(there)) << 9 * f
             else:
-                beyond = int(voxels.near[near[k]][k] != ABSENT) if there else 2
-                self.beyond |= beyond << 2 * (f - 3)
+                second = int(voxels.near[near[k]][k] != ABSENT) if there else 2
+                self.second |= second << 2 * (f - 3)
         self.presence = sum(1 << k for k, j in enumerate(near) if j != ABSENT and k != 13)
 
     def contexts(self, octant, occupied, hidden, node):
@@ -210,14 +209,14 @@ class Words:
         far = 0
         for f, (mask, is_unknown) in enumerate(self.sides):
             far |= (2 * is_unknown if mask is None else mask >> octant & 1) << 8 * f
-        faces = (occupied & FACE_BITS) + (octant << 48) + (self.beside << 51)
+        first = (occupied & FACE_BITS) + (octant << 48) + (self.faces << 51)
         near = mix(mix(2, occupied & NEAR_BITS), hidden & NEAR_BITS)
         return [
-            mix(mix(1, faces), hidden & FACE_BITS),
+            mix(mix(1, first), hidden & FACE_BITS),
             near,
             mix(mix(3, near), far),
-            mix(4, node + (self.behind << 8)),
-            mix(5, node + (self.presence << 8) + (self.beyond << 35)),
+            mix(4, node + (self.face_occ << 8)),
+            mix(5, node + (self.presence << 8) + (self.second << 35)),
         ]
 
 
