@@ -45,5 +45,5 @@ pub use map::{MappedFile, map_file};
 pub use memory::{Zeros, give_back, zeros};
 pub use plan::Plan;
 pub use rows::Output;
-pub use simd::{Isa, Scalar as Baseline, Simd as Instructions, UnknownIsa, Work};
+pub use simd::{Isa, Scalar, Simd as Instructions, UnknownIsa, Work};
 pub use taps::{ABSENT, Taps};
