@@ -2,7 +2,7 @@
 
     python3 docs/budget.py --streams FOLDER --code --clouds NAME=CLOUD.ply …    codes each cloud at several sizes
     python3 docs/budget.py --streams FOLDER --clouds NAME …                     measures them; then does the rest
-    python3 docs/budget.py                              from docs/budget.json: the table between the marks of docs/MEASUREMENTS.md
+    python3 docs/budget.py                              from docs/budget.json: the table between the marks of docs/measurements.md
 
 Clouds are of 10 bits (`b2p-lab voxelize`); smaller sizes are made of them by dropping bits. Other clouds' figures of the same machine are kept. B2P names
 a `b2p` that is built already. Give it a quiet machine. Whatever is promised may take a fifth longer at most.
@@ -79,7 +79,7 @@ def measure(name, streams, repeat):
 
 
 def table(rows):
-    out = ["| time to keep | decodes promised | longest | at most a fifth over | pictures promised | longest | at most a fifth over |", "|---:|---:|---:|---|---:|---:|---|"]
+    out = ["| budget | decodes promised | longest | at most a fifth over | pictures promised | longest | at most a fifth over |", "|---:|---:|---:|---|---:|---:|---|"]
     for budget in BUDGETS:
         cells = []
         for decode in (True, False):
@@ -108,9 +108,9 @@ def main():
     for name in args.clouds:
         rows = [r for r in rows if r["cloud"] != name] + measure(name, args.streams.resolve(), args.repeat)
         KEPT.write_text("[\n" + ",\n".join(json.dumps(r) for r in rows) + "\n]\n")
-    text, readme = table(rows), HERE / "MEASUREMENTS.md"
-    marked = re.sub(r"(<!-- budget -->\n).*?(\n<!-- /budget -->)", lambda m: m[1] + "\n" + text + "\n" + m[2], readme.read_text(), flags=re.S)
-    readme.write_text(marked)
+    text, page = table(rows), HERE / "measurements.md"
+    marked = re.sub(r"(<!-- budget -->\n).*?(\n<!-- /budget -->)", lambda m: m[1] + "\n" + text + "\n" + m[2], page.read_text(), flags=re.S)
+    page.write_text(marked)
     over = sorted((r for r in rows if r["promised"]), key=lambda r: -r["took"] / r["budget"])
     print(text)
     for r in over[:10]:

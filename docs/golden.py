@@ -2,7 +2,7 @@
 
     python3 docs/golden.py CHECKOUT     a clone, with its history, of https://github.com/playcanvas/splat-transform
 
-Its scenes are grids of equal balls, made anew here by the parameters in its test/render-golden.cases.mjs; one with depth of field is left out, which b2p
+Its scenes are grids of equal balls, made here from the parameters in its test/render-golden.cases.mjs; one with depth of field is left out, which b2p
 has not. There are two generations of pictures, for since 958b004 it takes a constant off every Gaussian. Both renderers are also held to a model in
 double precision, which knows where theirs cuts off: what it tells of their difference is then known to be all of it. Wants numpy and a Pillow that reads
 WebP. B2P names a `b2p` that is built already. Ends with an error if a picture is farther than WITHIN from the model of it.

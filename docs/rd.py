@@ -1,8 +1,8 @@
 """Rate against distortion of b2p, MPEG's G-PCC (TMC13) and V-PCC (TMC2) on whole objects, by `b2p-lab eval`'s protocol.
 
     python3 docs/rd.py --data FOLDER --cache FOLDER [--series NAME …] [--objects NAME …]
-                          measures these series of SERIES, and TMC13 where the cache lacks it, then writes docs/rd.json and does the rest
-    python3 docs/rd.py    from docs/rd.json: tables, plot, and the list of what falls short
+                          measures these series of SERIES, and TMC13 where the cache lacks it, writes docs/rd.json, and goes on as below
+    python3 docs/rd.py    from docs/rd.json and docs/times.json: tables, plot, and the list of lower scores
 
 The data folder holds meshes (`val/*.glb`, `train/*.glb`), TMC13's decoded clouds (`gpcc/*.ply.zst`) with their rates (`SOURCES.md`), and
 V-PCC's scores (`vpcc.md`). The cache holds clouds, streams and TMC13's scores, so that only b2p is measured again: remove its `streams` when
@@ -23,6 +23,7 @@ from rd_tables import OBJECTS, PEER, VPCC
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 MEASURED = HERE / "rd.json"
+TIMES = HERE / "times.json"
 SCORES = ("psnr", "foreground_psnr", "ms_ssim", "ssimulacra2")
 LEVELS = {"s0.25": 8, "s0.5": 9, "s1": 10}
 
@@ -158,7 +159,7 @@ def main():
     if args.data:
         measure_all(args.data.resolve(), args.cache.resolve(), args.series, args.objects)
     rows = json.loads(MEASURED.read_text())
-    for path, marks in rd_tables.tables(rows).items():
+    for path, marks in rd_tables.tables(rows, json.loads(TIMES.read_text())).items():
         text = (ROOT / path).read_text()
         for mark, lines in marks.items():
             body = "\n".join(lines)

@@ -110,7 +110,7 @@ def signed(value, digits):
 
 def gains(rows, series, peer):
     """A line for each object, and the mean: differences at equal rates, and bits at equal foreground PSNR."""
-    heading = [f"`{series}` less {peer}", *(title for title, _ in SCORES.values()), "bits ratio"]
+    heading = [f"`{series}` minus {peer}", *(title for title, _ in SCORES.values()), "bits ratio"]
     out, columns, ratios = [cells(heading), "|---|" + "---:|" * 5], {score: [] for score in SCORES}, []
     for name, title in OBJECTS.items():
         ours, peers, line = of(rows, name, series), of(rows, name, peer), [title]
@@ -123,6 +123,21 @@ def gains(rows, series, peer):
     means = [signed(mean(columns[score]), digits) for score, (_, digits) in SCORES.items()]
     logs = mean([ratio and math.log(ratio) for ratio in ratios])
     return [*out, cells(["**mean**", *means, "–" if logs is None else f"{math.exp(logs):.2f}"])]
+
+
+def headline(rows, times):
+    """Means over all objects of what each set of heads gains on the peer, and times."""
+    out = [cells([f"compared with {PEER}", *(f"`{who}`" for who in OURS)]), "|---|" + "---:|" * len(OURS)]
+    ours = {who: [(of(rows, name, who), of(rows, name, PEER)) for name in OBJECTS] for who in OURS}
+    for score, (title, digits) in SCORES.items():
+        unit = ", dB" if "psnr" in score else ""
+        found = [[differences(*pair, score) for pair in ours[who]] for who in OURS]
+        means = [signed(mean([both and both[0] for both in column]), digits) for column in found]
+        out.append(cells([f"{title}{unit}", *means]))
+    logs = [mean([ratio and math.log(ratio) for ratio in (bits_ratio(*pair, "foreground_psnr") for pair in ours[who])]) for who in OURS]
+    out.append(cells(["bits at equal foreground PSNR", *("–" if log is None else f"× {math.exp(log):.2f}" for log in logs)]))
+    out.append(cells(["time to decode", *(f"{times['decode_ms'][who]} ms" for who in OURS)]))
+    return [*out, cells(["time to draw 1024×1024 pixels", f"{times['draw_ms']} ms", *[""] * len(OURS[1:])])]
 
 
 def cells(parts):
@@ -197,7 +212,7 @@ def shortfalls(rows):
     return out
 
 
-def tables(rows):
+def tables(rows, times):
     """Lines by file and mark."""
     series = "best" if any(row["series"] == "best" for row in rows) else "lite"
     more = [line for who in (*OURS[1:], *LEARNED) if any(row["series"] == who for row in rows) for line in (*gains(rows, who, PEER), "")]
@@ -206,10 +221,10 @@ def tables(rows):
     falls += [f"- `{who}`: {len(lines)} scores, listed by `python3 docs/rd.py`." for who, lines in short.items() if who != series]
     prices, residuals = ("0", "0.5", "1", "2", "4"), ("none", "coarse", "96", "48", "24")
     return {
-        "README.md": {"rd": gains(rows, series, PEER)},
-        "docs/MEASUREMENTS.md": {
+        "README.md": {"rd": headline(rows, times)},
+        "docs/measurements.md": {
             "rd-summary": summary(rows, series),
-            "rd-gains": [*gains(rows, series, VPCC), "", *more],
+            "rd-gains": [*gains(rows, series, PEER), "", *gains(rows, series, VPCC), "", *more[:-1]],
             "rd-short": falls or ["None."],
             "rd-all": every_point(rows),
         },

@@ -3,7 +3,7 @@
 #
 #     fuzz/campaign.sh [SECONDS [TARGET …]]    so many seconds a target (60), again and again until it is stopped; all targets by default
 #     fuzz/campaign.sh once [SECONDS [TARGET …]]
-#     fuzz/campaign.sh keep [TARGET …]         makes fuzz/corpus anew: the seeds, and as few inputs as cover all that is covered by any
+#     fuzz/campaign.sh keep [TARGET …]         rebuilds fuzz/corpus: the seeds, and the fewest inputs with the same coverage
 #     fuzz/campaign.sh total                   how often each target has run
 #
 # Inputs and the log of executions are kept in fuzz/target/campaign. An input that breaks a promise is left in fuzz/artifacts, and ends it.

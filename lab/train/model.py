@@ -65,12 +65,12 @@ class Entropy(nn.Module):
 
 
 def latents_of(cfg, role):
-    """How many latents a voxel of a role has: those from `latent_roles` on are told by the level below alone."""
+    """How many latents a voxel of a role has: roles from `latent_roles` on have none and derive from the level below."""
     return cfg["latents"] if role < cfg.get("latent_roles", 3) else 0
 
 
 def reconstructed(cfg, role):
-    """Whether a role has a network that makes its features. Where it has none, they are what the level below tells."""
+    """Whether a role has a network that makes its features. Without one, they are the features of the level below."""
     return role < cfg.get("fr_roles", 3)
 
 

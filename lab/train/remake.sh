@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Trains the models of models/ anew, from nothing: remake.sh MESHES PHOTOS OUT [SHARE]
+# Trains the models of models/ from nothing: remake.sh MESHES PHOTOS OUT [SHARE]
 # MESHES and PHOTOS are folders of glTF binaries and of pictures. SHARE scales the minutes of every step (1: about as the shipped models had, fourteen
 # hours on one core; 0.01 shows that it runs). PYTHON names the interpreter that has torch.
 set -euo pipefail

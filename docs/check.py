@@ -1,0 +1,106 @@
+#!/usr/bin/env python3
+"""Checks of the documents: `check.py [links] [words] [size]`, all of them by default.
+
+links  every relative link of a Markdown file leads to a file, and its anchor to a heading of it
+words  what the left column of docs/glossary.md replaces occurs in no tracked text file
+size   the README has at most 150 lines of at most 120 characters, tables and links aside
+"""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+GLOSSARY = "docs/glossary.md"
+# What may stand between the words of a phrase: the next line of a comment, or the underscores of a test's name.
+BREAK = r"(?:_|\s+(?:(?:///|//!|//|#|\*|>)\s*)?)"
+README_LINES, README_WIDTH = 150, 120
+
+
+def tracked(*patterns):
+    listed = subprocess.run(["git", "ls-files", "-z", "-co", "--exclude-standard", *patterns], cwd=ROOT, check=True, capture_output=True)
+    return [name for name in listed.stdout.decode().split("\0") if name and (ROOT / name).is_file()]
+
+
+def anchors(text):
+    """The anchors of a document's headings, as GitHub and mdBook make them."""
+    seen = {}
+    for heading in re.findall(r"^#{1,6}\s+(.*?)\s*#*$", without_code(text), re.M):
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).replace("`", "").lower()
+        name = re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
+        count = seen.get(name, 0)
+        seen[name] = count + 1
+        yield name if count == 0 else f"{name}-{count}"
+    yield from re.findall(r'<a (?:id|name)="([^"]+)"', text)
+
+
+def without_code(text):
+    text = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+    return re.sub(r"`[^`\n]*`", lambda code: code.group().replace("[", " ").replace("](", " "), text)
+
+
+def links():
+    for name in tracked("*.md"):
+        path = ROOT / name
+        text = path.read_text()
+        for target in re.findall(r"\]\(([^)\s]+)\)", without_code(text)):
+            if re.match(r"[a-z]+:", target):
+                continue
+            file, _, anchor = target.partition("#")
+            to = (path.parent / file).resolve() if file else path
+            if not to.exists():
+                yield f"{name}: no file for {target}"
+            elif anchor and to.suffix == ".md" and anchor not in set(anchors(to.read_text())):
+                yield f"{name}: no heading for {target}"
+
+
+def replaced():
+    """What is in code marks in the left column of the second table."""
+    table = (ROOT / GLOSSARY).read_text().split("## Replaced names")[1]
+    for row in re.findall(r"^\| (.*?) \|", table, re.M):
+        yield from re.findall(r"`([^`]+)`", row)
+
+
+def words():
+    patterns = []
+    for phrase in replaced():
+        body = BREAK.join(re.escape(word) for word in phrase.split())
+        code = re.search(r"[A-Z_.:*]", phrase)
+        patterns.append((phrase, re.compile(rf"(?<![^\W_]){body}(?![^\W_])", 0 if code else re.I)))
+    for name in tracked():
+        if name == GLOSSARY or name.startswith("fuzz/corpus/") or name.endswith((".lock", ".svg", ".json", ".txt")):
+            continue
+        try:
+            text = (ROOT / name).read_text()
+        except UnicodeDecodeError:
+            continue
+        for phrase, pattern in patterns:
+            if pattern.search(name):
+                yield f"{name}: its name has '{phrase}'"
+            for found in pattern.finditer(text):
+                yield f"{name}:{text.count(chr(10), 0, found.start()) + 1}: '{phrase}'"
+
+
+def size():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    if len(lines) > README_LINES:
+        yield f"README.md: {len(lines)} lines, at most {README_LINES}"
+    for number, line in enumerate(lines, 1):
+        if len(line) > README_WIDTH and not line.startswith("|"):
+            yield f"README.md:{number}: {len(line)} characters, at most {README_WIDTH}"
+
+
+def main():
+    checks = {"links": links, "words": words, "size": size}
+    asked = sys.argv[1:] or list(checks)
+    if unknown := [name for name in asked if name not in checks]:
+        sys.exit(f"no check {unknown[0]}; there are {', '.join(checks)}")
+    faults = [fault for name in asked for fault in checks[name]()]
+    print("\n".join(faults))
+    if faults:
+        sys.exit(f"documents: {len(faults)} faults")
+    print(f"documents: {', '.join(asked)} hold")
+
+
+main()
