@@ -60,6 +60,7 @@ pub mod gaussians;
 pub mod geometry;
 pub mod limits;
 pub mod log;
+mod memory;
 pub mod network;
 pub mod output;
 #[cfg(feature = "render")]

@@ -43,6 +43,8 @@ use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree};
 use crate::network::{Heads, Precision, missing};
 use network::Generator;
+#[cfg(test)]
+pub(crate) use network::TERMS;
 
 /// Raw numbers per Gaussian.
 const RAW: usize = 14;
