@@ -2,14 +2,15 @@
 
 mod common;
 
-use b2p::decoder::Decoder;
 use b2p::embedded::{MODEL, SAMPLE};
 use b2p::encoder::{Options, encode};
 use b2p::gaussians::Gaussians;
+use b2p::latents::Decoder;
+use b2p::latents::network::Model;
+use b2p::layers::Precision;
 use b2p::log::Log;
-use b2p::network::{Model, Precision};
-use b2p::pixels::{Background, render};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, render};
 use b2p::{Isa, Limits};
 use common::Ball;
 
@@ -81,7 +82,8 @@ fn gaussians_generated_in_integers_draw_the_pictures_of_those_generated_in_float
 
 #[test]
 fn all_heads_draw_the_scene_and_give_the_same_bits_with_every_instruction_set() {
-    use b2p::decoder::{HeadSet, StreamDecoder};
+    use b2p::decoder::StreamDecoder;
+    use b2p::gaussians::HeadSet;
     use b2p::gaussians::learned::HeadsModel;
 
     let heads = std::sync::Arc::new(HeadsModel::from_bytes(b2p::embedded::HEADS).unwrap());

@@ -4,10 +4,10 @@ mod common;
 
 use b2p::Error;
 use b2p::cloud::ColouredVoxels;
-use b2p::decoder::Decoder;
 use b2p::encoder::{Encoded, Options, Residual, encode, encode_within};
+use b2p::latents::Decoder;
+use b2p::latents::network::Model;
 use b2p::log::Log;
-use b2p::network::Model;
 use common::{Ball, cloud_of, tiny_model};
 
 /// The model inside the program: others that tests have do not say what a bit is worth.

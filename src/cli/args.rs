@@ -4,9 +4,9 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use b2p::Limits;
-use b2p::decoder::HeadSet;
 use b2p::encoder::Residual;
 use b2p::encoder::transform::Fineness;
+use b2p::gaussians::HeadSet;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 /// Coloured point clouds as small streams, decoded to 3D Gaussians and pictures on a plain CPU.
@@ -88,8 +88,6 @@ pub enum Command {
     Demo(Demo),
     /// Time the stages of decoding
     Bench(Bench),
-    /// Measure what accuracy costs in time on this machine: a table, JSON, a plot, and a page with all of them
-    Tradeoff(Tradeoff),
 }
 
 #[derive(Debug, Args)]
@@ -316,28 +314,6 @@ pub struct Bench {
     pub model: ModelArg,
 }
 
-#[derive(Debug, Args)]
-pub struct Tradeoff {
-    /// Stream to measure with, or cloud to be coded first, whose own pictures are then compared with as well [default: the sample that comes
-    /// with the program]
-    pub input: Option<PathBuf>,
-    /// Folder for tradeoff.html, tradeoff.json and tradeoff.svg
-    #[arg(short, long, value_name = "DIR", default_value = "b2p-tradeoff")]
-    pub output: PathBuf,
-    /// Pictures, once around
-    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=100))]
-    pub views: u32,
-    /// Width and height of the pictures in pixels
-    #[arg(long, value_name = "WxH", default_value = "512x512", value_parser = size)]
-    pub size: (u32, u32),
-    /// Times that everything is measured; medians are told
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
-    pub repeat: u32,
-    /// Model file [default: the one inside the program]
-    #[arg(long, value_name = "FILE")]
-    pub model: Option<PathBuf>,
-}
-
 /// Which of the Gaussians that a stream can be decoded to.
 #[derive(Debug, Args)]
 pub struct DetailArg {
@@ -368,7 +344,7 @@ pub struct ModelArg {
 
 use super::budget::BudgetArgs;
 use super::values::{background, bits_per_point, bytes, effect, levels, orbit, per_voxel, price, residual, size, step};
-pub use b2p::pixels::{Background, Choice, Effect, Quality};
+pub use b2p::renderer::{Background, Choice, Effect, Quality};
 
 #[cfg(test)]
 mod tests {

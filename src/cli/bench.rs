@@ -3,11 +3,13 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-use b2p::bitstream::Header;
-use b2p::decoder::Decoder;
+use b2p::container::Header;
+use b2p::gaussians::Heads;
 use b2p::geometry::{KernelMap, Octree};
+use b2p::latents::Decoder;
+use b2p::latents::network::{Module, Shape, Work};
+use b2p::layers::Precision;
 use b2p::log::{Log, Step};
-use b2p::network::{Heads, Module, Precision, Shape, Work};
 use b2p::{Isa, Limits, ceiling, embedded};
 use serde_json::json;
 

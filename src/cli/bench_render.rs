@@ -4,8 +4,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use b2p::log::Log;
-use b2p::pixels::{Background, Image, Renderer, Stats, Times};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, Image, Renderer, Stats, Times};
 use b2p::{Limits, embedded};
 use serde_json::json;
 

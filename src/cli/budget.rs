@@ -3,10 +3,11 @@
 use std::path::Path;
 use std::time::Duration;
 
-use b2p::bitstream::Header;
-use b2p::decoder::Decoder;
-use b2p::network::{Heads, Model};
-use b2p::tradeoff::{Budget, Calibration, Choice, Subject, Task, quality_name};
+use b2p::budget::{Budget, Calibration, Choice, Subject, Task};
+use b2p::container::Header;
+use b2p::gaussians::Heads;
+use b2p::latents::Decoder;
+use b2p::latents::network::Model;
 use b2p::{Limits, embedded};
 use clap::Args;
 
@@ -109,7 +110,6 @@ fn calibration(
     };
     let subject = Subject {
         stream,
-        cloud: None,
         model: &|| Ok(Model::from_bytes(&file)?.with_isa(model.isa())),
         limits,
     };
@@ -153,7 +153,7 @@ impl Chosen {
         } = self.choice;
         let quality = match task {
             Task::Decode => String::new(),
-            Task::Picture { .. } => format!(", {}", quality_name(quality)),
+            Task::Picture { .. } => format!(", {}", quality),
         };
         let heads = match heads {
             Heads::Best => String::new(),

@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use b2p::bitstream::version;
+use b2p::budget::Task;
+use b2p::container::version;
 use b2p::log::Log;
-use b2p::tradeoff::Task;
 use b2p::{Limits, output};
 
 use super::args::Decode;

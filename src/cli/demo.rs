@@ -6,7 +6,7 @@ use std::sync::Arc;
 use b2p::decoder::StreamDecoder;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::log::Log;
-use b2p::pixels::{Background, Renderer};
+use b2p::renderer::{Background, Renderer};
 use b2p::{Error, embedded, output};
 
 use super::args::{Demo, View};

@@ -3,7 +3,7 @@
 use b2p::cloud::{ColouredVoxels, PointCloud, voxelise, voxelise_closed};
 use b2p::encoder::transform::{self, Fineness};
 use b2p::encoder::{self, Encoded, Options, Residual};
-use b2p::gaussians::Steps;
+use b2p::latents::Steps;
 use b2p::log::Log;
 use b2p::{Error, Limits, output};
 

@@ -1,7 +1,7 @@
 //! `b2p info`: what a stream holds.
 
-use b2p::bitstream::Stream;
-use b2p::gaussians::{Precision, Steps};
+use b2p::container::Stream;
+use b2p::latents::{Precision, Steps};
 use b2p::{Limits, colour};
 use serde_json::json;
 

@@ -3,12 +3,12 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use b2p::bitstream::version;
+use b2p::container::version;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::pixels::{Background, Image, Renderer};
-use b2p::projection::Camera;
-use b2p::{Limits, bitstream::Header};
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, Image, Renderer};
+use b2p::{Limits, container::Header};
 
 use super::args::{DetailArg, ModelArg};
 use super::budget::BudgetArgs;

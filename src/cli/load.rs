@@ -4,14 +4,15 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::Arc;
 
-use b2p::bitstream::version;
-use b2p::decoder::{HeadSet, StreamDecoder};
+use b2p::container::version;
+use b2p::decoder::StreamDecoder;
+use b2p::gaussians::HeadSet;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::gaussians::{Frame, Gaussians, ply};
+use b2p::latents::network::Model;
 use b2p::log::Log;
-use b2p::network::Model;
-use b2p::pixels::Explanation;
-use b2p::projection::Camera;
+use b2p::renderer::Explanation;
+use b2p::renderer::camera::Camera;
 use b2p::{Error, Isa, Limits, UnknownIsa};
 
 use super::args::{DetailArg, ModelArg};
@@ -170,7 +171,10 @@ impl<'p> Source<'p> {
         let fail = Failure::in_file(path);
         let seen = match detail.level {
             Some(_) => None,
-            None => decoder.level_for(&bytes, cameras).map_err(&fail)?,
+            None => {
+                let pixels = cameras.iter().map(Camera::pixels_per_unit).fold(0.0, f64::max);
+                decoder.level_for(&bytes, pixels).map_err(&fail)?
+            }
         };
         let why = match (detail.level, seen) {
             (Some(level), _) => format!("level {level}, forced"),

@@ -15,7 +15,6 @@ mod pipe;
 mod progress;
 mod render;
 mod table;
-mod tradeoff;
 mod values;
 
 use std::path::Path;
@@ -96,7 +95,6 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Info(args) => info::run(args, &limits)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,
-        Command::Tradeoff(args) => tradeoff::run(args, &limits, &progress)?,
     };
     drop(progress);
     if !cli.quiet {

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use b2p::gaussians::Gaussians;
-use b2p::pixels::{Background, Channel, Ids, Image, Renderer, Stats};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, Channel, Ids, Image, Renderer, Stats};
 use b2p::{Error, Limits};
 
 use super::args::{Format, Render, Show};

@@ -4,11 +4,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use b2p::budget::Task;
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
-use b2p::pixels::{Choice, Effects, Explanation, Quality, Renderer, Stats};
-use b2p::projection::{Camera, files};
-use b2p::tradeoff::Task;
+use b2p::renderer::camera::{Camera, files};
+use b2p::renderer::{Choice, Effects, Explanation, Quality, Renderer, Stats};
 use b2p::{Error, Limits, output};
 use serde_json::json;
 

@@ -5,8 +5,8 @@ use std::ops::RangeInclusive;
 
 use b2p::encoder::Residual;
 use b2p::encoder::transform::Fineness;
-use b2p::gaussians::Steps;
-use b2p::pixels::{Background, Choice, Effect};
+use b2p::latents::Steps;
+use b2p::renderer::{Background, Choice, Effect};
 
 /// A number of bytes, with or without K, M, G or T for powers of 1024.
 pub fn bytes(text: &str) -> Result<u64, String> {

@@ -13,15 +13,15 @@ use std::ops::RangeInclusive;
 use b2p_kernels::f16;
 use rayon::prelude::*;
 
-use crate::bitstream::{Format, Header, MAX_SLICE_VOXELS, Section};
 use crate::cloud::ColouredVoxels;
-use crate::decoder::Decoder;
-use crate::entropy::{Coding, Rounding};
+use crate::container::{Format, Header, MAX_SLICE_VOXELS, Section};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels};
+use crate::latents::Decoder;
+use crate::latents::entropy::{Coding, Rounding};
+use crate::latents::network::{Model, ROLES};
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::{Model, ROLES};
 pub use corrections::Residual;
 use corrections::{Left, Level, corrections};
 pub(crate) use skeleton::Skeleton;
@@ -37,7 +37,7 @@ pub struct Options {
     /// Default: 1.
     pub bit_price: f32,
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
-    /// [`ColourFilter`](crate::gaussians::ColourFilter).
+    /// [`ColourFilter`](crate::latents::ColourFilter).
     pub filter: bool,
     /// How much is coded of what colours are then still off those of the cloud. Default: [`Residual::Coarse`].
     pub residual: Residual,

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use b2p::network::{Model, Shape, Upsample, untrained};
+use b2p::latents::network::{Model, Shape, Upsample, untrained};
 
 /// A model of the suite; `lite` is the one that ships.
 pub fn model(name: &str) -> Model {

@@ -5,8 +5,9 @@
 
 use std::path::PathBuf;
 
-use b2p::bitstream::Header;
-use b2p::decoder::{HeadSet, StreamDecoder, StreamDecoding};
+use b2p::container::Header;
+use b2p::decoder::{StreamDecoder, StreamDecoding};
+use b2p::gaussians::HeadSet;
 use b2p::log::Log;
 use b2p::{Error, Isa};
 

@@ -12,7 +12,7 @@ use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-use b2p::network::{Shape, untrained};
+use b2p::latents::network::{Shape, untrained};
 use common::{Ball, names_in, tiny_model};
 use serde_json::Value;
 

@@ -40,9 +40,12 @@ use b2p_kernels::{Isa, map_file};
 
 use super::{Frame, Gaussians};
 use crate::error::{Error, Result};
+use crate::gaussians::Heads;
 use crate::geometry::{KernelMap, Octree};
-use crate::network::{Heads, Precision, missing};
+use crate::layers::{Precision, missing};
 use network::Generator;
+#[cfg(test)]
+pub(crate) use network::TERMS;
 
 /// Raw numbers per Gaussian.
 const RAW: usize = 14;
