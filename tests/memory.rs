@@ -48,7 +48,7 @@ fn models() -> Vec<(&'static str, Model)> {
     vec![
         ("tiny", load(&untrained(&Shape::tiny().with_quick_heads(), 0))),
         ("wide", load(&untrained(&wide, 0))),
-        #[cfg(feature = "cli")]
+        #[cfg(feature = "embedded")]
         ("lite", load(b2p::embedded::MODEL)),
     ]
 }
