@@ -3,8 +3,12 @@
 A head reads level l - 1 ("parent") and level l ("child"); all sizes are relative to a voxel of level l, so the same weights serve every level.
 """
 
+import json
+
 import torch
 import torch.nn.functional as F
+from safetensors import safe_open
+from safetensors.torch import load_file
 from torch import nn
 
 import ops
@@ -74,6 +78,19 @@ class Head(nn.Module):
             inner = seen(f"{side}.{i}.a", block.a(x, kmap, True))
             x = seen(f"{side}.{i}.b", ops.residual([block.b(inner, kmap)], x, True))
         return x
+
+
+def saved_head(path):
+    """Shape and averaged weights of a checkpoint, or of a set of a model file: `MODEL.safetensors:best.1`."""
+    file, colon, name = path.partition(".safetensors:")
+    if not colon:
+        saved = torch.load(path, weights_only=False, map_location="cpu")
+        return saved["shape"], saved["average"]
+    file += ".safetensors"
+    with safe_open(file, "pt") as f:
+        shape = json.loads(f.metadata()["b2p-heads"])["sets"][name]
+    weights = {k.removeprefix(f"{name}."): v.float() for k, v in load_file(file).items() if k.startswith(f"{name}.")}
+    return {k: v for k, v in shape.items() if k != "ranges"}, weights
 
 
 class Level:

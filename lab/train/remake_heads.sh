@@ -35,6 +35,9 @@ make c2 --count 40 --seed 413 --bits 10 --crop 128 "$meshes"
 # Whole objects of a half of the scale, and objects of the project's own making.
 make h0 --count 40 --seed 403 --bits 9 --crop 512 --size 512 --views 5 "$out/things"
 make h1 --count 22 --seed 404 --bits 9 --crop 512 --size 512 --views 5 "$meshes"
+# Larger crops, of the flatter surfaces that level 9 has.
+make d0 --count 70 --seed 421 --bits 10 --crop 256 --size 288 --views 5 "$out/things"
+make d1 --count 40 --seed 423 --bits 10 --crop 256 --size 288 --views 5 "$meshes"
 make q2 --count 30 --seed 405 --bits 8 --crop 256 --size 256 --procedural
 
 cd "$here"
@@ -57,10 +60,11 @@ train start-best-8 best-8 16 "${taught[@]}" --lr 1.5e-3 --roles 1:1
 train best-1 best-1 50 --init "$out/start-best-1/last.pt" "${drawn1[@]}" --lr 7e-4 --imitate 0.2 --imitate-until 0.4 --average 0.998
 train best-8 best-8 50 --init "$out/start-best-8/last.pt" "${drawn8[@]}" --lr 7e-4 --imitate 0.2 --imitate-until 0.4 --average 0.998
 train whole-8 best-8 17 --init "$out/best-8/last.pt" --only q0,q1,q2,h0,h1 --roles 1:0.75,2:0.25 --most-voxels 9000 --views 2 --lr 4e-4 --decay-from 0.2
+train longer-1 best-1 49 --init "$out/best-1/last.pt" --only d0,d1,c0,c2,q0,q1 --roles 2:0.9,1:0.1 --most-voxels 60000 --views 2 --lr 5e-4 --average 0.996
 train start-quick-1 quick-1 8 "${taught[@]}" --lr 2e-3 --roles 2:1
 train start-quick-8 quick-8 8 "${taught[@]}" --lr 2e-3 --roles 1:1
 train quick-1 quick-1 21 --init "$out/start-quick-1/last.pt" --elder "$out/best-1/last.pt" "${drawn1[@]}" --lr 1.2e-3 --imitate 0.5 --imitate-until 0.4
 train quick-8 quick-8 21 --init "$out/start-quick-8/last.pt" --elder "$out/best-8/last.pt" "${drawn8[@]}" --lr 1.2e-3 --imitate 0.5 --imitate-until 0.4
 some=$(printf '%s,' "$out"/data/q1-000[0-5]*.safetensors)
-"$python" export_heads.py "$out/heads.safetensors" best.1="$out/best-1/last.pt" best.8="$out/whole-8/last.pt" \
+"$python" export_heads.py "$out/heads.safetensors" best.1="$out/longer-1/last.pt" best.8="$out/whole-8/last.pt" \
     quick.1="$out/quick-1/last.pt" quick.8="$out/quick-8/last.pt" --samples "${some%,}"

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from scipy.spatial import cKDTree
 
-from heads import Head, draw, parameters, per_voxel, place
+from heads import Head, draw, parameters, per_voxel, place, saved_head
 from octree_samples import Sample, decoded_colours
 
 
@@ -75,10 +75,10 @@ def compare(sample, step, heads, baselines):
 
 
 def load_head(paths):
-    """The averaged weights of a checkpoint; of several, joined by +, their mean."""
-    saved = [torch.load(path, weights_only=False, map_location="cpu") for path in paths.split("+")]
-    head = Head(saved[0]["shape"])
-    head.load_state_dict({k: torch.stack([s["average"][k] for s in saved]).mean(0) for k in saved[0]["average"]})
+    """The averaged weights of a checkpoint or a set of a model file (`saved_head`); of several, joined by +, their mean."""
+    shapes, weights = zip(*(saved_head(path) for path in paths.split("+")))
+    head = Head(shapes[0])
+    head.load_state_dict({k: torch.stack([w[k] for w in weights]).mean(0) for k in weights[0]})
     return head.eval()
 
 

@@ -14,7 +14,7 @@ import time
 import numpy as np
 import torch
 
-from heads import Head, draw, parameters, per_voxel, place, visible
+from heads import Head, draw, parameters, per_voxel, place, saved_head, visible
 from octree_samples import Sample, decoded_colours
 from train import atomic_save, distortion, imitation, keep_memory
 
@@ -87,21 +87,24 @@ class Trainer:
         self.step, self.used = 0, 0.0
         self.elder = None
         if args.elder:
-            saved = torch.load(args.elder, weights_only=False)
-            self.elder = Head(saved["shape"])
-            self.elder.load_state_dict(saved["average"])
+            shape, weights = saved_head(args.elder)
+            self.elder = Head(shape)
+            self.elder.load_state_dict(weights)
 
     def state(self):
         return {"shape": self.shape, "model": self.head.state_dict(), "average": self.average, "optimiser": self.optimiser.state_dict(),
                 "step": self.step, "used": self.used, "args": vars(self.args)}
 
-    def start_from(self, path, everything=False):
+    def start_from(self, path):
+        self.head.load_state_dict(saved_head(path)[1])
+        self.average = {k: v.clone() for k, v in self.head.state_dict().items()}
+
+    def resume(self, path):
+        self.start_from(path)
         s = torch.load(path, weights_only=False)
-        self.head.load_state_dict(s["model" if everything else "average"])
-        self.average = {k: v.clone() for k, v in s["average"].items()}
-        if everything:
-            self.optimiser.load_state_dict(s["optimiser"])
-            self.step, self.used = s["step"], s["used"]
+        self.head.load_state_dict(s["model"])
+        self.optimiser.load_state_dict(s["optimiser"])
+        self.step, self.used = s["step"], s["used"]
 
     def fraction(self):
         return self.used / (self.args.minutes * 60) if self.args.minutes else self.step / self.args.steps
@@ -171,8 +174,8 @@ def options():
     p.add_argument("--data", required=True, help="folder of samples of whole objects")
     p.add_argument("--out", required=True, help="folder of checkpoints and the log")
     p.add_argument("--teacher", help="folder that `teach.py` wrote")
-    p.add_argument("--elder", help="checkpoint of a head of as many Gaussians to imitate instead")
-    p.add_argument("--init", help="checkpoint to start from")
+    p.add_argument("--elder", help="checkpoint, or MODEL.safetensors:SET, of a head of as many Gaussians to imitate instead")
+    p.add_argument("--init", help="checkpoint, or MODEL.safetensors:SET, to start from")
     p.add_argument("--resume", action="store_true", help="go on from OUT/last.pt")
     p.add_argument("--roles", default="2:1", help="roles and how often they are drawn; 3 is a sample's finest level")
     p.add_argument("--most-voxels", type=int, default=80000, help="of a larger level the coarsest role is taken instead")
@@ -205,8 +208,10 @@ def main(argv=None):
     os.makedirs(args.out, exist_ok=True)
     last = os.path.join(args.out, "last.pt")
     trainer = Trainer(args)
-    if args.resume or args.init:
-        trainer.start_from(last if args.resume else args.init, args.resume)
+    if args.resume:
+        trainer.resume(last)
+    elif args.init:
+        trainer.start_from(args.init)
     files = [f for f in sorted(glob.glob(os.path.join(args.data, "*.safetensors"))) if not f.endswith(tuple(f"_{name}.safetensors" for name in HELD_OUT))]
     files = [f for f in files if any(part in os.path.basename(f) for part in args.only.split(","))]
     if args.draw_from >= 1:
