@@ -2,7 +2,7 @@
 
 use std::ops::Deref;
 
-use crate::colour::Coloured;
+use crate::colour::LevelColours;
 use crate::container::{Header, MAX_TRUNK_VOXELS};
 use crate::error::Result;
 use crate::latents::Decoder;
@@ -82,7 +82,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
 
 /// Bytes of a voxel's colours in version 3: decoded, in slices and joined; smoothed energies of its parents; as bytes, filtered and of the level
 /// above.
-const COLOURS: u64 = 3 * Coloured::bytes_per_voxel() as u64 + 3 + 3 * 3;
+const COLOURS: u64 = 3 * LevelColours::bytes_per_voxel() as u64 + 3 + 3 * 3;
 /// Bytes of the sums that surfels are made of.
 const SURFEL: u64 = 200;
 
@@ -110,7 +110,7 @@ pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
     // Of the level and the one above, joined from the slices that threads are at.
     let slices = parents.div_ceil(header.colour_slice().into());
     let learned = 3 + slices.min(rayon::current_num_threads() as u64);
-    let colours = (parents + voxels) * (MAP + COLOURS) + learned * Coloured::learned_bytes() as u64;
+    let colours = (parents + voxels) * (MAP + COLOURS) + learned * LevelColours::model_bytes() as u64;
     Ok(stream + octree + trunk + colours)
 }
 
