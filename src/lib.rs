@@ -63,6 +63,7 @@ pub mod latents;
 pub mod layers;
 pub mod limits;
 pub mod log;
+mod memory;
 #[cfg(feature = "encoder")]
 pub mod metrics;
 pub mod output;

@@ -56,12 +56,13 @@ const STAGES: [(&str, &[&str]); 13] = [
 ];
 
 /// What every stage may use.
-const COMMONS: [&str; 9] = [
+const COMMONS: [&str; 10] = [
     "Error",
     "cancel",
     "error",
     "limits",
     "log",
+    "memory",
     "output",
     "placement",
     "Isa",

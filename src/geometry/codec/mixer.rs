@@ -94,7 +94,7 @@ impl<I: Instructions> Mixer<I> {
 mod tests {
     use super::*;
     use crate::testing::Random;
-    use b2p_kernels::Baseline;
+    use b2p_kernels::Scalar;
     use b2p_kernels::mixing::HEAVIEST;
 
     /// Code length of a bit, in bits.
@@ -106,7 +106,7 @@ mod tests {
     /// Mean code length of a decision for an uninformed network alone, and with the mixer. The first context determines
     /// the bit but for noise of `noise` percent.
     fn code_lengths(noise: u64, network: i32) -> [f64; 2] {
-        let (mut mixer, mut random) = (Mixer::new(Baseline, 1 << 12), Random(5));
+        let (mut mixer, mut random) = (Mixer::new(Scalar::TOKEN, 1 << 12), Random(5));
         let mut sums = [0.0; 2];
         for _ in 0..4000 {
             let context = random.next() % 64;
@@ -139,7 +139,7 @@ mod tests {
 
     #[test]
     fn new_entries_do_not_change_the_network() {
-        let mixer = Mixer::new(Baseline, 1);
+        let mixer = Mixer::new(Scalar::TOKEN, 1);
         for logit in [-384, -1, 0, 77] {
             assert_eq!(mixer.predict(logit, [3; CONTEXTS]).one, squash(logit));
         }
@@ -147,7 +147,7 @@ mod tests {
 
     #[test]
     fn extremes_stay_within_their_ranges() {
-        let mut mixer = Mixer::new(Baseline, 4);
+        let mut mixer = Mixer::new(Scalar::TOKEN, 4);
         for i in 0..5000u64 {
             let logit = if i % 2 == 0 { -720 } else { 720 };
             let mixed = mixer.predict(logit, [(i % 3) << 60; CONTEXTS]);
@@ -165,7 +165,7 @@ mod tests {
     #[test]
     fn tables_grow_with_the_slice() {
         for (parents, bits) in [(1, 4), (16, 4), (17, 5), (16_384, 14)] {
-            let mixer = Mixer::new(Baseline, parents);
+            let mixer = Mixer::new(Scalar::TOKEN, parents);
             assert_eq!((mixer.bits, mixer.tables.len()), (bits, CONTEXTS << bits));
         }
     }
