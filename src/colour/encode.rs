@@ -1,4 +1,4 @@
-//! Choosing coefficients: rate–distortion optimised quantisation.
+//! The colour encoder: rate–distortion optimised quantisation (RDOQ) of coefficients, and the fit of the colour filter.
 
 use std::ops::Range;
 
@@ -6,29 +6,30 @@ use b2p_kernels::smooth::Values;
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
-use super::block::{Coding, Quantiser, Source};
+use super::block::{Coding, CoefficientCoder, Quantiser};
 use super::filter::{Responses, TERMS, solve, widen};
-use super::model::{BINS, Circumstances, Model};
+use super::model::{BINS, CoefficientContext, Model};
 use super::space::{FRACTION, from_rgb};
 use super::transform::forward;
-use super::{Coloured, Pass, Steps, Ycc, join, nodes, slices, trunk};
+use super::{CodeSlice, LevelColours, Steps, Ycc, join, nodes, slices, trunk};
 use crate::coding::ONE;
 use crate::coding::binary::Encoder;
 use crate::geometry::{KernelMap, Octree, Voxels};
 
-/// How a level is encoded.
+/// Encoding parameters of a level.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Options {
     /// The quantisation steps.
     pub steps: Steps,
-    /// What a bit costs in squared steps: the Lagrangian multiplier of rate–distortion optimised quantisation. 0 rounds to the nearest.
+    /// The Lagrangian multiplier of RDOQ: squared error, in squared steps, that one bit must save. 0 rounds to the
+    /// nearest integer.
     pub lambda: f32,
-    /// How much of the predicted differences is believed, in units of 1/256.
+    /// Factor of the predicted differences, in units of 1/256.
     pub gain: u8,
 }
 
 impl Options {
-    /// Good values for these steps.
+    /// Default λ and gain for these steps.
     pub fn new(steps: Steps) -> Options {
         Options {
             steps,
@@ -45,7 +46,7 @@ impl Options {
     }
 }
 
-/// The colours that a stream approaches: those of its finest level, and of the levels above the means that the transform makes of them.
+/// Original colours by level: those of the finest coded level, and the transform's means for the levels above.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Truth {
     levels: Vec<Vec<Ycc>>,
@@ -53,12 +54,13 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// The mean colours of a cloud's voxels in each voxel of `top`, and of the levels above. In lossless streams they are rounded to whole 255ths.
+    /// Averages the colours of a cloud's voxels in each voxel of level `top`, and transforms them up to the root. If
+    /// `lossless`, colours are rounded to whole 255ths.
     ///
     /// # Panics
-    /// If there is not a colour for every voxel, or the octree is not that deep.
+    /// If `colours` does not have one entry per voxel, or the octree is less deep than `top`.
     pub fn new(voxels: &Voxels, colours: &[[u8; 3]], octree: &Octree, top: u8, lossless: bool) -> Truth {
-        assert_eq!(voxels.len(), colours.len(), "a colour for every voxel");
+        assert_eq!(voxels.len(), colours.len(), "one colour per voxel");
         let shift = 3 * (voxels.depth() - top);
         let fraction = if lossless { 0 } else { FRACTION };
         let means = octree.level(top).keys().par_iter().map(|key| {
@@ -89,12 +91,12 @@ impl Truth {
         Truth { levels, lossless }
     }
 
-    /// The colours of a level, as [`Coloured::values`] has them.
+    /// The colours of a level, in the units of [`LevelColours::values`].
     pub fn level(&self, level: u8) -> &[Ycc] {
         &self.levels[usize::from(level)]
     }
 
-    /// Whether no voxel has a chroma.
+    /// Whether chroma is 0 in every voxel.
     pub fn is_grey(&self) -> bool {
         self.levels
             .last()
@@ -102,17 +104,18 @@ impl Truth {
     }
 }
 
-/// Codes the root and the levels 1 to K, whose kernel maps are `maps`, from that of level 0 on: the payload, and what it decodes to.
+/// Encodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K. Returns the
+/// payload and the colours that it decodes to.
 ///
 /// # Panics
-/// If the octree is not as deep as there are maps.
+/// If the octree has fewer than K levels.
 pub fn encode_trunk(
     isa: Isa,
     octree: &Octree,
     maps: &[KernelMap],
     truth: &Truth,
     options: Options,
-) -> (Vec<u8>, Coloured) {
+) -> (Vec<u8>, LevelColours) {
     let fraction = options.steps.fraction();
     let half = (1 << fraction) >> 1;
     let root = truth.level(0)[0].map(|x| (x + half) >> fraction);
@@ -124,18 +127,19 @@ pub fn encode_trunk(
         root[1].clamp(-255, 255),
         root[2].clamp(-255, 255),
     ];
-    let mut source = Choosing::new(options.lambda);
-    let coloured = trunk(isa, octree, maps, options.coding(), root, &mut source, |level| {
+    let mut coder = RdoEncoder::new(options.lambda);
+    let colours = trunk(isa, octree, maps, options.coding(), root, &mut coder, |level| {
         Some(truth.level(level))
     });
-    bytes.extend(source.coder.finish());
-    (bytes, coloured)
+    bytes.extend(coder.encoder.finish());
+    (bytes, colours)
 }
 
-/// Codes the colours of `level`, one payload for every `slice` nodes of the level above; and what they decode to.
+/// Encodes the colours of `level`. Returns one payload for every `slice` nodes of the level above, and the colours that
+/// they decode to.
 ///
 /// # Panics
-/// If maps or colours are another level's, or `slice` is 0.
+/// If maps or colours belong to another level, or `slice` is 0.
 #[allow(clippy::too_many_arguments)]
 pub fn encode_level(
     isa: Isa,
@@ -143,19 +147,19 @@ pub fn encode_level(
     level: u8,
     above_map: &KernelMap,
     map: &KernelMap,
-    above: &Coloured,
+    above: &LevelColours,
     truth: &Truth,
     slice: usize,
     options: Options,
-) -> (Vec<Vec<u8>>, Coloured) {
+) -> (Vec<Vec<u8>>, LevelColours) {
     let nodes = nodes(octree, level, above_map, map, above);
     let coding = options.coding();
     let encode = |range: Range<usize>| {
-        let (mut source, mut model) = (Choosing::new(options.lambda), above.model.clone());
+        let (mut coder, mut model) = (RdoEncoder::new(options.lambda), above.model.clone());
         let first = nodes.first_child[range.start] as usize;
         let truth = Some(&truth.level(level)[first..]);
-        let coded = isa.run(Pass {
-            source: &mut source,
+        let coded = isa.run(CodeSlice {
+            coder: &mut coder,
             model: &mut model,
             nodes,
             range,
@@ -163,7 +167,7 @@ pub fn encode_level(
             truth,
         });
         let mut bytes = vec![coding.steps.luma, coding.steps.chroma, coding.gain];
-        bytes.extend(source.coder.finish());
+        bytes.extend(coder.encoder.finish());
         (bytes, (coding.steps, coded, model))
     };
     let ranges: Vec<_> = slices(nodes.masks.len(), slice).collect();
@@ -171,50 +175,52 @@ pub fn encode_level(
     (payloads, join(nodes, coded))
 }
 
-/// Above this magnitude coefficients are rounded to the nearest.
+/// Above this magnitude coefficients are rounded to the nearest integer, without RDOQ.
 const LARGE: f32 = 12.0;
 
-/// Coefficients for an entropy stream, each the one whose squared error and price are least.
-struct Choosing {
-    coder: Encoder,
+/// Encodes coefficients, each the candidate of least Lagrangian cost.
+struct RdoEncoder {
+    encoder: Encoder,
     lambda: f32,
 }
 
-impl Choosing {
-    fn new(lambda: f32) -> Choosing {
-        Choosing {
-            coder: Encoder::default(),
+impl RdoEncoder {
+    fn new(lambda: f32) -> RdoEncoder {
+        RdoEncoder {
+            encoder: Encoder::default(),
             lambda,
         }
     }
 
+    /// The magnitude that minimises squared error + λ · bits. Candidates are the nearest integer, the one below it, and
+    /// 0.
     #[inline(always)]
-    fn choose(&self, model: &Model, c: &Circumstances, wanted: f32) -> i32 {
-        let nearest = wanted.round();
+    fn quantise(&self, model: &Model, c: &CoefficientContext, target: f32) -> i32 {
+        let nearest = target.round();
         if nearest == 0.0 || nearest > LARGE || self.lambda == 0.0 {
             return nearest as i32;
         }
-        let mut costs = [0.0; LARGE as usize + 1];
-        let costs = &mut costs[..=nearest as usize];
-        bits(model, c, costs);
-        let price = |value: i32| {
+        let mut bits = [0.0; LARGE as usize + 1];
+        let bits = &mut bits[..=nearest as usize];
+        estimate_bits(model, c, bits);
+        let cost = |value: i32| {
             let sign = if value == 0 { 0.0 } else { 1.0 };
-            let error = wanted - value as f32;
-            error * error + self.lambda * (costs[value as usize] + sign)
+            let error = target - value as f32;
+            error * error + self.lambda * (bits[value as usize] + sign)
         };
         let nearest = nearest as i32;
         let candidates = [nearest, nearest - 1, 0];
         candidates
             .into_iter()
-            .min_by(|a, b| price(*a).total_cmp(&price(*b)))
+            .min_by(|a, b| cost(*a).total_cmp(&cost(*b)))
             .unwrap_or(nearest)
     }
 }
 
-/// What coding the magnitudes 0 to `costs.len() − 1` would take, in bits, but for the sign. There are fewer than an escape needs.
+/// Estimates the bits of each magnitude 0 to `costs.len() − 1`, without the sign. All are below the escape.
 #[inline(always)]
-fn bits(model: &Model, c: &Circumstances, costs: &mut [f32]) {
-    let unit = model.prepare(c);
+fn estimate_bits(model: &Model, c: &CoefficientContext, costs: &mut [f32]) {
+    let unit = model.unit_logit(c);
     let mut sum = 0.0;
     for (magnitude, cost) in costs.iter_mut().enumerate() {
         let one = model.predict(c, unit, magnitude.min(BINS - 1)).one as f32 / ONE as f32;
@@ -223,22 +229,22 @@ fn bits(model: &Model, c: &Circumstances, costs: &mut [f32]) {
     }
 }
 
-impl Source for Choosing {
+impl CoefficientCoder for RdoEncoder {
     #[inline(always)]
-    fn coefficient(&mut self, model: &mut Model, c: &Circumstances, wanted: i32, quantiser: Quantiser) -> i32 {
+    fn coefficient(&mut self, model: &mut Model, c: &CoefficientContext, target: i32, quantiser: Quantiser) -> i32 {
         let Quantiser { scale, unit } = quantiser;
         let exact = unit == 1;
-        let steps = wanted.unsigned_abs() as f32 * scale.forward as f32 / (4096.0 * unit as f32);
+        let steps = target.unsigned_abs() as f32 * scale.forward as f32 / (4096.0 * unit as f32);
         let chosen = if exact {
-            wanted.abs()
+            target.abs()
         } else {
-            self.choose(model, c, steps)
+            self.quantise(model, c, steps)
         };
-        model.code(&mut self.coder, c, if wanted < 0 { -chosen } else { chosen })
+        model.code(&mut self.encoder, c, if target < 0 { -chosen } else { chosen })
     }
 }
 
-/// The weights of a filter pass that bring values nearest to the truth, by least squares.
+/// Fits the weights of a filter pass to the original colours `truth` by least squares.
 pub(super) fn fit_pass(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, truth: &[Ycc]) -> [[i8; TERMS]; 3] {
     let values = &widen(values);
     let blocks: Vec<usize> = (0..values.len()).step_by(FIT_BLOCK).collect();
@@ -254,7 +260,7 @@ pub(super) fn fit_pass(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, 
             })
         })
         .collect();
-    let mut total = Normal::default();
+    let mut total = NormalEquations::default();
     for sum in sums {
         for t in 0..3 {
             for i in 0..TERMS {
@@ -266,12 +272,13 @@ pub(super) fn fit_pass(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, 
     total.map(|(a, b)| solve(a, b))
 }
 
+/// Number of voxels of one task of [`fit_pass`].
 const FIT_BLOCK: usize = 16_384;
 
-/// Normal equations of each channel.
-type Normal = [([[f64; TERMS]; TERMS], [f64; TERMS]); 3];
+/// Normal equations of each channel: matrix and right-hand side.
+type NormalEquations = [([[f64; TERMS]; TERMS], [f64; TERMS]); 3];
 
-/// Adds up the normal equations of a block of voxels.
+/// Accumulates the normal equations of a block of voxels.
 struct Fit<'a> {
     first: usize,
     values: &'a [Values],
@@ -281,10 +288,10 @@ struct Fit<'a> {
 }
 
 impl Work for Fit<'_> {
-    type Output = Normal;
+    type Output = NormalEquations;
 
     #[inline(always)]
-    fn run<I: Instructions>(self, instructions: I) -> Normal {
+    fn run<I: Instructions>(self, instructions: I) -> NormalEquations {
         let Fit {
             first,
             values,
@@ -293,15 +300,15 @@ impl Work for Fit<'_> {
             truth,
         } = self;
         let responses = Responses::new(steps);
-        let mut sums = Normal::default();
+        let mut sums = NormalEquations::default();
         for voxel in first..values.len().min(first + FIT_BLOCK) {
             let terms = responses.terms(instructions, values, map, voxel);
             for t in 0..3 {
-                let missing = f64::from(truth[voxel][t]) - f64::from(values[voxel][t]);
+                let residual = f64::from(truth[voxel][t]) - f64::from(values[voxel][t]);
                 let x = terms[t].map(|x| f64::from(x) / 4.0);
                 let (a, b) = &mut sums[t];
                 for i in 0..TERMS {
-                    b[i] += x[i] * missing;
+                    b[i] += x[i] * residual;
                     for j in 0..TERMS {
                         a[i][j] += x[i] * x[j];
                     }

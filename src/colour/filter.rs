@@ -1,56 +1,54 @@
-//! The post filter: takes coding noise out of the colours of a level that is shown.
+//! The colour filter: an edge-preserving filter of a level's displayed colours (`docs/format.md`, clause 5.11).
 //!
-//! Nothing else is coded from filtered colours. A pass moves every voxel's colour, channel by channel, by five *terms* that the encoder weights. With `d` the difference of
-//! an occupied neighbour to the voxel, a *narrow* response is `n(d) = d·(1 − (d/c)²)` where `|d| < c`, and else 0, with c = 0.7 quantisation steps; the *wide* response `w(d)` is
-//! the same with c = 2.8 steps. Neighbours by a face, an edge and a corner count 20, 12 and 7 times; the terms are the sums over
+//! It reduces coding noise, as a fitted bilateral or adaptive loop filter does in video codecs. The encoder fits its
+//! weights by least squares. Colours of the next level are decoded from unfiltered colours.
 //!
-//! 1. faces of n, 2. edges of n, 3. corners of n, 4. faces of w, 5. edges and corners of w,
+//! A pass adds to every voxel's channel a weighted sum of five *terms*. With `d` the difference of an occupied
+//! neighbour to the voxel, the *narrow* response is `n(d) = d·(1 − (d/c)²)` where `|d| < c`, and else 0, with c = 0.7
+//! quantisation steps. The *wide* response `w(d)` is the same with c = 2.8 steps. Neighbours by a face, an edge and a
+//! corner have the weights 20, 12 and 7. The terms are the weighted means over all neighbours of
 //!
-//! each divided by the sum of the counts of all neighbours. This is an edge-preserving filter such as video codecs have after reconstruction (bilateral, fitted by least squares
-//! as in an adaptive loop filter).
-//!
-//! # Payload
-//! u8 number of passes, 1 or 2; for each pass, for Y, Co and Cg, five i8 weights in units of 1/16.
+//! 1. n of faces, 2. n of edges, 3. n of corners, 4. w of faces, 5. w of edges and corners.
 //!
 //! # Arithmetic
-//! Values and steps are in their fixed point units. With `x = min(4096, (|d|·r) >> 12)` and `r = min(⌊2²⁴ / c⌋, 2¹⁶)`, c the product of the step and 7 or 28, divided by 10 and rounded down, but at least 1:
-//! the response is `(d·(4096 − ((x·x) >> 12))) >> 12`. A term is `(sum·⌊2¹⁶ / counts⌋) >> 14`, four times the mean; a pass adds `(Σ weight·term + 32) >> 6`. All shifts round down; products of a
-//! sum and an inverse have 64 bits. Results are clamped as decoded colours are. A channel without a step stays as it is.
+//! Integers as in clause 5.11.3. Products of a sum and an inverse have 64 bits. Results are clamped as decoded colours.
 
 use b2p_kernels::smooth::{Lanes, Values, responses};
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
-use super::Coloured;
+use super::LevelColours;
 use super::space::{Steps, Ycc, clamp, display};
 use crate::error::{Error, Result, Stage};
 use crate::geometry::KernelMap;
 
+/// Number of terms of a pass and channel.
 pub(super) const TERMS: usize = 5;
-/// The most passes.
+/// Maximum number of passes.
 const MAX_PASSES: usize = 2;
-/// Bytes of a pass.
+/// Bytes of a pass in the payload.
 const PASS_BYTES: usize = 3 * TERMS;
-/// How often neighbours by a face, an edge and a corner count.
-const COUNTS: [i32; 3] = [20, 12, 7];
-/// Voxels of a task.
+/// Weights of neighbours by a face, an edge and a corner.
+const CLASS_WEIGHTS: [i32; 3] = [20, 12, 7];
+/// Number of voxels filtered by one task.
 const BLOCK: usize = 4096;
 
+/// Weights of a pass by channel and term, in units of 1/16.
 type Pass = [[i8; TERMS]; 3];
-/// Five terms of three channels, four times the mean each.
+/// Five terms of three channels: four times the mean.
 type Terms = [[i32; TERMS]; 3];
 
-/// The post filter of a level.
+/// The colour filter of a level.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Filter {
     passes: Vec<Pass>,
 }
 
 impl Filter {
-    /// Reads a payload that begins at byte `offset` of the stream.
+    /// Parses a payload, which starts at byte `offset` of the stream.
     ///
     /// # Errors
-    /// [`Error::Malformed`] if it is none.
+    /// [`Error::Malformed`] if the payload is invalid.
     pub fn parse(bytes: &[u8], offset: usize) -> Result<Filter> {
         let (passes, rest) = bytes
             .split_first()
@@ -68,59 +66,63 @@ impl Filter {
         })
     }
 
-    /// The payload.
+    /// Serialises the filter to a payload.
     pub fn to_bytes(&self) -> Vec<u8> {
         let weights = self.passes.iter().flatten().flatten().map(|w| *w as u8);
         [self.passes.len() as u8].into_iter().chain(weights).collect()
     }
 
-    /// The filtered colours of a level, whose 3³ kernel map is `map`, for display.
+    /// Filtered red, green and blue of every voxel of a level. `map` is the level's 3³ kernel map.
     ///
     /// # Panics
-    /// If the map is another level's.
-    pub fn rgb(&self, isa: Isa, coloured: &Coloured, map: &KernelMap) -> Vec<[u8; 3]> {
-        let fraction = coloured.steps().fraction();
-        let values = self.apply(isa, coloured, map);
+    /// If `map` belongs to another level.
+    pub fn rgb(&self, isa: Isa, colours: &LevelColours, map: &KernelMap) -> Vec<[u8; 3]> {
+        let fraction = colours.steps().fraction();
+        let values = self.apply(isa, colours, map);
         values.par_iter().map(|ycc| display(*ycc, fraction)).collect()
     }
 
-    /// The filtered values of a level ([`Coloured::values`]).
-    fn apply(&self, isa: Isa, coloured: &Coloured, map: &KernelMap) -> Vec<Ycc> {
-        assert_eq!(map.len(), coloured.values.len(), "the map of the level");
-        let mut values = coloured.values.clone();
+    /// Filtered [`LevelColours::values`] of a level.
+    fn apply(&self, isa: Isa, colours: &LevelColours, map: &KernelMap) -> Vec<Ycc> {
+        assert_eq!(map.len(), colours.values.len(), "the map must be that of the level");
+        let mut values = colours.values.clone();
         for pass in &self.passes {
-            values = filtered(isa, &values, map, coloured.steps, pass);
+            values = filtered(isa, &values, map, colours.steps, pass);
         }
         values
     }
 
-    /// The filter that brings a level's colours nearest to `truth`, if that is worth its bytes.
+    /// Fits a filter that minimises the squared error to the original colours `truth`. `None` if all weights round to
+    /// 0, or the colours are lossless.
+    ///
+    /// # Panics
+    /// If `truth` does not have one colour per voxel.
     #[cfg(feature = "encoder")]
-    pub fn fit(isa: Isa, coloured: &Coloured, map: &KernelMap, truth: &[Ycc]) -> Option<Filter> {
-        assert_eq!(truth.len(), coloured.values.len(), "a true colour for every voxel");
-        if coloured.steps.is_lossless() {
+    pub fn fit(isa: Isa, colours: &LevelColours, map: &KernelMap, truth: &[Ycc]) -> Option<Filter> {
+        assert_eq!(truth.len(), colours.values.len(), "one original colour per voxel");
+        if colours.steps.is_lossless() {
             return None;
         }
-        let mut values = coloured.values.clone();
+        let mut values = colours.values.clone();
         let mut passes = Vec::new();
         for _ in 0..MAX_PASSES {
-            let pass = super::encode::fit_pass(isa, &values, map, coloured.steps, truth);
+            let pass = super::encode::fit_pass(isa, &values, map, colours.steps, truth);
             if pass == Pass::default() {
                 break;
             }
-            values = filtered(isa, &values, map, coloured.steps, &pass);
+            values = filtered(isa, &values, map, colours.steps, &pass);
             passes.push(pass);
         }
         (!passes.is_empty()).then_some(Filter { passes })
     }
 }
 
-/// One pass over a level.
+/// Applies one pass to a level.
 fn filtered(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, pass: &Pass) -> Vec<Ycc> {
     let (values, mut out) = (&widen(values), vec![[0; 3]; values.len()]);
     let tasks = out.par_chunks_mut(BLOCK).enumerate();
     tasks.for_each(|(i, out)| {
-        isa.run(Task {
+        isa.run(FilterBlock {
             first: i * BLOCK,
             values,
             map,
@@ -132,7 +134,8 @@ fn filtered(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, pass: &Pass
     out
 }
 
-struct Task<'a> {
+/// One pass over a block of voxels, from voxel `first` on.
+struct FilterBlock<'a> {
     first: usize,
     values: &'a [Values],
     map: &'a KernelMap,
@@ -141,12 +144,12 @@ struct Task<'a> {
     out: &'a mut [Ycc],
 }
 
-impl Work for Task<'_> {
+impl Work for FilterBlock<'_> {
     type Output = ();
 
     #[inline(always)]
     fn run<I: Instructions>(self, instructions: I) {
-        let Task {
+        let FilterBlock {
             first,
             values,
             map,
@@ -154,9 +157,9 @@ impl Work for Task<'_> {
             pass,
             out,
         } = self;
-        let around = Responses::new(steps);
+        let kernel = Responses::new(steps);
         for (voxel, out) in (first..).zip(out) {
-            let terms = around.terms(instructions, values, map, voxel);
+            let terms = kernel.terms(instructions, values, map, voxel);
             for t in 0..3 {
                 let weighted = pass[t].iter().zip(terms[t]);
                 let sum = weighted.fold(0i32, |sum, (w, x)| sum.wrapping_add(i32::from(*w) * x));
@@ -166,7 +169,7 @@ impl Work for Task<'_> {
     }
 }
 
-/// Values as responses take them: Y, Co, Cg and a zero, twice.
+/// Values in the layout of [`responses`]: Y, Co, Cg and 0, twice.
 pub(super) fn widen(values: &[Ycc]) -> Vec<Values> {
     values
         .par_iter()
@@ -174,12 +177,14 @@ pub(super) fn widen(values: &[Ycc]) -> Vec<Values> {
         .collect()
 }
 
-/// The places in a 3³ row of the neighbours that share a face, an edge, or a corner.
+/// Offsets of the neighbours that share a face, as indices into a 3³ row.
 const FACES: [usize; 6] = [4, 10, 12, 14, 16, 22];
+/// Offsets of the neighbours that share only an edge.
 const EDGES: [usize; 12] = [1, 3, 5, 7, 9, 11, 15, 17, 19, 21, 23, 25];
+/// Offsets of the neighbours that share only a corner.
 const CORNERS: [usize; 8] = [0, 2, 6, 8, 18, 20, 24, 26];
 
-/// How neighbours' differences count: lanes 0 to 2 narrow responses of Y, Co and Cg, 4 to 6 wide ones.
+/// Response functions of a level: lanes 0 to 2 are the narrow responses of Y, Co and Cg, lanes 4 to 6 the wide ones.
 pub(super) struct Responses {
     inverses: Lanes,
 }
@@ -197,15 +202,15 @@ impl Responses {
         }
     }
 
-    /// The terms of one voxel.
+    /// Computes the terms of one voxel.
     #[inline(always)]
     pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], map: &KernelMap, voxel: usize) -> Terms {
         let (own, row) = (&values[voxel], map.row(voxel));
-        let sum = |places: &[usize]| responses(instructions, values, own, row, places, &self.inverses);
+        let sum = |offsets: &[usize]| responses(instructions, values, own, row, offsets, &self.inverses);
         let (faces, face_count) = sum(&FACES);
         let (edges, edge_count) = sum(&EDGES);
         let (corners, corner_count) = sum(&CORNERS);
-        let [face, edge, corner] = COUNTS;
+        let [face, edge, corner] = CLASS_WEIGHTS;
         let counts = face_count * face + edge_count * edge + corner_count * corner;
         let inverse = (1 << 16) / i64::from(counts.max(1));
         let mean = |sum: i32| ((i64::from(sum) * inverse) >> 14) as i32;
@@ -221,8 +226,8 @@ impl Responses {
     }
 }
 
-/// Weights in units of 1/16 that solve the normal equations `a·x = b`.
-#[allow(clippy::needless_range_loop)] // elimination, as it is written
+/// Solves the normal equations `a·x = b`, regularised, for weights in units of 1/16.
+#[allow(clippy::needless_range_loop)] // indices as in Gaussian elimination
 #[cfg(feature = "encoder")]
 pub(super) fn solve(mut a: [[f64; TERMS]; TERMS], mut b: [f64; TERMS]) -> [i8; TERMS] {
     let trace: f64 = (0..TERMS).map(|i| a[i][i]).sum();

@@ -1,18 +1,21 @@
-//! Colours of voxels as integer transform coefficients over the octree.
+//! Colours of voxels as integer transform coefficients over the octree (`docs/format.md`, clause 5).
 //!
-//! A level's colours are coded given those of the level above and the octree: every node's colour is the mean of its children's, and what the children
-//! differ by is transformed by butterflies (`transform`), less what neighbouring colours predict (`prediction`), quantised to a step (`space`), and coded
-//! under probabilities that mix what the slice has shown in several contexts (`model`, `block`). No model file is needed, and all is integer arithmetic: decoded
-//! colours are the same on every machine.
+//! A level's colours are coded given the octree and the colours of the level above. The colour of a node is the mean of
+//! its children's colours. The differences between the children are
+//!
+//! 1. transformed by two-point butterflies (`transform`),
+//! 2. predicted from neighbouring colours (`prediction`),
+//! 3. quantised with a step per channel (`space`), and
+//! 4. coded with a binary range coder, whose probabilities mix several adaptive contexts (`model`, `block`).
+//!
+//! No model file is needed. All arithmetic is on integers, so decoded colours are bit-exact on every machine.
 //!
 //! # Structure
-//! The levels 1 to K, the *trunk*, share one entropy stream, in turn; K is the deepest level of at most [`TRUNK_VOXELS`] voxels ([`trunk_depth`]), but at most the
-//! stream's first level. Every deeper level is cut into slices of nodes of the level above, each an entropy stream of its own: all slices of a level begin with what the
-//! first slice of the level above (or the trunk) had learned in the end, and see only coded children of their own slice. So they are coded in parallel.
-//!
-//! # Payloads
-//! A slice is: u8 index of luma's step, u8 index of chroma's ([`Steps`]), u8 gain of predictions in 256ths, then the range coder's words (`crate::coding`).
-//! The trunk's steps are those of level K; the level above has [half of them](Steps), and so on. After its gain follow the root's colour, u8 Y, i16 Co, i16 Cg.
+//! The levels 1 to K are the *trunk* and share one entropy stream. K is the deepest level of at most
+//! [`TRUNK_VOXELS`] voxels ([`trunk_depth`]), and at most the base level of the stream. Every deeper level is cut into
+//! slices of nodes of the level above, each with an entropy stream of its own. All slices of a level start from the
+//! adaptive model with which the first slice of the level above (or the trunk) ended. Their predictions use only those
+//! coded children that belong to the same slice. So the slices of a level are coded in parallel.
 
 mod block;
 #[cfg(feature = "encoder")]
@@ -38,38 +41,40 @@ use crate::coding::binary::Decoder;
 use crate::container::Slice;
 use crate::error::{Error, Result, Stage};
 use crate::geometry::{KernelMap, Octree};
-use block::{Coding, Nodes, Quantiser, Source};
-use model::{Circumstances, Model};
+use block::{Coding, CoefficientCoder, Nodes, Quantiser};
+use model::{CoefficientContext, Model};
 
-/// The most voxels of the trunk's deepest level.
+/// Maximum number of voxels of the trunk's deepest level.
 pub const TRUNK_VOXELS: usize = 16_384;
-/// Bytes of a slice before its entropy stream, and of the trunk.
-const SLICE_FIXED: usize = 3;
-const TRUNK_FIXED: usize = SLICE_FIXED + 5;
+/// Bytes of a slice before its entropy stream: step indices of luma and chroma, gain.
+const SLICE_HEADER: usize = 3;
+/// Bytes of the trunk before its entropy stream: those of a slice, then the root's colour.
+const TRUNK_HEADER: usize = SLICE_HEADER + 5;
 
-/// The decoded colours of a level, and what coding them has taught.
+/// Decoded colours of a level, with the coder state that the next level needs.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Coloured {
+pub struct LevelColours {
     steps: Steps,
     values: Vec<Ycc>,
-    /// How large coefficients were around the parent of each voxel.
+    /// Of each voxel and channel, the local coefficient energy around its parent: 16 times the mean magnitude.
     energies: Vec<[u8; 3]>,
-    /// What the first slice has learned.
+    /// The adaptive model at the end of the first slice.
     model: Model,
 }
 
-impl Coloured {
-    /// Y, Co and Cg of every voxel, in Morton order, in units of 2^−6 of a 255th; whole 255ths if the steps are lossless.
+impl LevelColours {
+    /// Y, Co and Cg of every voxel in Morton order, in units of 1/64 of a 255th, or of one 255th if the steps are
+    /// lossless.
     pub fn values(&self) -> &[Ycc] {
         &self.values
     }
 
-    /// The steps of the level (of its first slice).
+    /// The quantisation steps of the level: those of its first slice.
     pub fn steps(&self) -> Steps {
         self.steps
     }
 
-    /// Display colours, rounded to the nearest.
+    /// Red, green and blue of every voxel, rounded to the nearest integer.
     pub fn rgb(&self) -> Vec<[u8; 3]> {
         let fraction = self.steps.fraction();
         self.values
@@ -78,38 +83,38 @@ impl Coloured {
             .collect()
     }
 
-    /// Bytes of memory that a level of so many voxels takes, but for what is learned.
+    /// Bytes of memory per voxel, without the adaptive model.
     pub const fn bytes_per_voxel() -> usize {
         size_of::<Ycc>() + size_of::<[u8; 3]>()
     }
 
-    /// Bytes of what a slice learns.
-    pub const fn learned_bytes() -> usize {
+    /// Bytes of memory of the adaptive model.
+    pub const fn model_bytes() -> usize {
         Model::BYTES
     }
 }
 
-/// K: how deep the trunk of a stream is whose first level is `base`; `voxels` tells how many a level has.
+/// K, the depth of the trunk, in a stream with the base level `base`. `voxels` returns the number of voxels of a level.
 pub fn trunk_depth(base: u8, voxels: impl Fn(u8) -> usize) -> u8 {
     let fits = |level: &u8| voxels(*level) <= TRUNK_VOXELS;
     (0..=base).rev().find(fits).unwrap_or(0)
 }
 
-/// The ranges of nodes that slices of at most `slice` nodes cover.
+/// Ranges of nodes that the slices cover, of at most `slice` nodes each.
 fn slices(nodes: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<usize>> {
     (0..nodes.div_ceil(slice)).map(move |i| i * slice..nodes.min((i + 1) * slice))
 }
 
-/// Decodes the trunk: the root and the levels 1 to K, whose kernel maps are `maps`, from that of level 0 on.
+/// Decodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K.
 ///
 /// # Errors
-/// [`Error::Truncated`] or [`Error::Malformed`] if the payload is none.
+/// [`Error::Truncated`] or [`Error::Malformed`] if the payload is invalid.
 ///
 /// # Panics
-/// If the octree is not as deep as there are maps.
-pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Slice) -> Result<Coloured> {
+/// If the octree has fewer than K levels.
+pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Slice) -> Result<LevelColours> {
     let depth = maps.len() - 1;
-    let (coding, rest) = read_coding(payload, TRUNK_FIXED)?;
+    let (coding, rest) = read_coding(payload, TRUNK_HEADER)?;
     let number = |at: usize| i16::from_le_bytes([payload.bytes[at], payload.bytes[at + 1]]);
     let root = [payload.bytes[3].into(), number(4), number(6)];
     if root[1..].iter().any(|x| !(-255..=255).contains(x)) {
@@ -117,38 +122,39 @@ pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Sli
         return Err(Error::malformed(
             Stage::Colour,
             at,
-            "root's chroma",
+            "chroma of the root",
             format!("{:?}", &root[1..]),
             "−255 to 255",
         ));
     }
-    let mut source = Reading(Decoder::new(rest));
-    let coloured = trunk(isa, octree, maps, coding, root, &mut source, |_| None);
-    source
+    let mut coder = EntropyDecoder(Decoder::new(rest));
+    let colours = trunk(isa, octree, maps, coding, root, &mut coder, |_| None);
+    coder
         .0
         .finish(&format!("byte {}, colours of levels 1 to {depth}", payload.offset))?;
-    Ok(coloured)
+    Ok(colours)
 }
 
-/// Codes the levels 1 to K in turn, from a root of this colour; `coding` is that of level K, `truth` gives an encoder a level's colours.
-fn trunk<'t, S: Source>(
+/// Codes the levels 1 to K in turn, from a root of this colour. `coding` is that of level K. `truth` returns the
+/// original colours of a level to an encoder, and `None` to a decoder.
+fn trunk<'t, S: CoefficientCoder>(
     isa: Isa,
     octree: &Octree,
     maps: &[KernelMap],
     coding: Coding,
     root: [i16; 3],
-    source: &mut S,
+    coder: &mut S,
     truth: impl Fn(u8) -> Option<&'t [Ycc]>,
-) -> Coloured {
+) -> LevelColours {
     let depth = maps.len() - 1;
-    let mut coloured = start(coding.steps, root);
+    let mut colours = root_colours(coding.steps, root);
     for level in 1..=depth {
         let coding = coding_above(coding, depth - level);
-        let mut model = std::mem::replace(&mut coloured.model, Model::empty());
+        let mut model = std::mem::replace(&mut colours.model, Model::empty());
         let [above, map] = [&maps[level - 1], &maps[level]];
-        let nodes = nodes(octree, level as u8, above, map, &coloured);
-        let coded = isa.run(Pass {
-            source,
+        let nodes = nodes(octree, level as u8, above, map, &colours);
+        let coded = isa.run(CodeSlice {
+            coder,
             model: &mut model,
             nodes,
             range: 0..nodes.masks.len(),
@@ -156,24 +162,24 @@ fn trunk<'t, S: Source>(
             truth: truth(level as u8),
         });
         let energies = spread_energies(nodes, &coded.energies);
-        coloured = Coloured {
+        colours = LevelColours {
             steps: coding.steps,
             values: coded.values,
             energies,
             model,
         };
     }
-    coloured
+    colours
 }
 
-/// Decodes the colours of `level` from those of the level above and one payload for every `slice` nodes. `above_map` and `map` are the 3³ kernel
-/// maps of the level above and of `level`.
+/// Decodes the colours of `level` from those of the level above and one payload for every `slice` nodes. `above_map`
+/// and `map` are the 3³ kernel maps of the level above and of `level`.
 ///
 /// # Errors
-/// [`Error::Truncated`] or [`Error::Malformed`] if a payload is none, and [`Error::Cancelled`].
+/// [`Error::Truncated`] or [`Error::Malformed`] if a payload is invalid, and [`Error::Cancelled`].
 ///
 /// # Panics
-/// If the maps or colours are another level's, or `slice` is 0.
+/// If the maps or colours belong to another level, or `slice` is 0.
 #[allow(clippy::too_many_arguments)]
 pub fn decode_level(
     isa: Isa,
@@ -181,11 +187,11 @@ pub fn decode_level(
     level: u8,
     above_map: &KernelMap,
     map: &KernelMap,
-    above: &Coloured,
+    above: &LevelColours,
     payloads: &[Slice],
     slice: usize,
     cancel: &Cancel,
-) -> Result<Coloured> {
+) -> Result<LevelColours> {
     let nodes = nodes(octree, level, above_map, map, above);
     let ranges = slices(nodes.masks.len(), slice);
     if payloads.len() != ranges.len() {
@@ -201,13 +207,13 @@ pub fn decode_level(
     let decode = |(range, payload): (Range<usize>, &Slice)| {
         cancel.check()?;
         let first = range.start == 0;
-        let (coding, rest) = read_coding(payload, SLICE_FIXED)?;
+        let (coding, rest) = read_coding(payload, SLICE_HEADER)?;
         if coding.steps.is_lossless() != above.steps.is_lossless() {
             let at = format!("byte {}, level {level}", payload.offset);
             let expected = if above.steps.is_lossless() {
-                "exact, as above"
+                "lossless, as in the level above"
             } else {
-                "not exact, as above"
+                "lossy, as in the level above"
             };
             return Err(Error::malformed(
                 Stage::Colour,
@@ -217,30 +223,30 @@ pub fn decode_level(
                 expected,
             ));
         }
-        let (mut source, mut model) = (Reading(Decoder::new(rest)), above.model.clone());
-        let coded = isa.run(Pass {
-            source: &mut source,
+        let (mut coder, mut model) = (EntropyDecoder(Decoder::new(rest)), above.model.clone());
+        let coded = isa.run(CodeSlice {
+            coder: &mut coder,
             model: &mut model,
             nodes,
             range,
             coding,
             truth: None,
         });
-        source
+        coder
             .0
             .finish(&format!("byte {}, colours of level {level}", payload.offset))?;
-        // Nothing begins with what the others have learned.
+        // No slice of the next level starts from the models of the other slices.
         let model = if first { model } else { Model::empty() };
         Ok((coding.steps, coded, model))
     };
     let tasks: Vec<_> = ranges.zip(payloads).collect();
-    // All of them, so that the error is that of the first slice that has one.
+    // Collect all results first: the error returned is that of the first faulty slice, with any number of threads.
     let coded: Vec<Result<_>> = tasks.into_par_iter().map(decode).collect();
     Ok(join(nodes, coded.into_iter().collect::<Result<_>>()?))
 }
 
-/// Puts the slices of a level together.
-fn join(nodes: Nodes<'_>, slices: Vec<(Steps, block::Coded, Model)>) -> Coloured {
+/// Concatenates the slices of a level.
+fn join(nodes: Nodes<'_>, slices: Vec<(Steps, block::CodedSlice, Model)>) -> LevelColours {
     let (mut values, mut energies) = (Vec::new(), Vec::new());
     let mut first = None;
     for (steps, coded, model) in slices {
@@ -248,10 +254,10 @@ fn join(nodes: Nodes<'_>, slices: Vec<(Steps, block::Coded, Model)>) -> Coloured
         energies.extend(coded.energies);
         first.get_or_insert((steps, model));
     }
-    // A level has at least one node, and so a slice.
+    // A level has at least one node, hence at least one slice.
     let (steps, model) = first.unwrap_or_else(|| (Steps::LOSSLESS, Model::empty()));
     let energies = spread_energies(nodes, &energies);
-    Coloured {
+    LevelColours {
         steps,
         values,
         energies,
@@ -259,10 +265,10 @@ fn join(nodes: Nodes<'_>, slices: Vec<(Steps, block::Coded, Model)>) -> Coloured
     }
 }
 
-/// What is known of a root of this colour.
-fn start(steps: Steps, root: [i16; 3]) -> Coloured {
+/// The colours of level 0, with the initial model.
+fn root_colours(steps: Steps, root: [i16; 3]) -> LevelColours {
     let fraction = steps.fraction();
-    Coloured {
+    LevelColours {
         steps,
         values: vec![root.map(|x| space::clamp(i32::from(x) << fraction, fraction))],
         energies: vec![[0; 3]],
@@ -270,26 +276,31 @@ fn start(steps: Steps, root: [i16; 3]) -> Coloured {
     }
 }
 
-/// The coding of the level that is `up` levels above.
+/// The coding parameters of the level `up` levels above.
 fn coding_above(coding: Coding, up: usize) -> Coding {
     let steps = (0..up).fold(coding.steps, |steps, _| steps.above());
     Coding { steps, ..coding }
 }
 
+/// The nodes of level `level − 1`, whose children are coded. `map` is their kernel map, `children` that of `level`.
 fn nodes<'a>(
     octree: &'a Octree,
     level: u8,
     map: &'a KernelMap,
     children: &'a KernelMap,
-    above: &'a Coloured,
+    above: &'a LevelColours,
 ) -> Nodes<'a> {
     let masks = octree.occupancy(level - 1);
     assert_eq!(
         (map.len(), above.values.len()),
         (masks.len(), masks.len()),
-        "maps and colours of the level above"
+        "the map and the colours must be those of the level above"
     );
-    assert_eq!(children.len(), octree.level(level).len(), "the map of the level");
+    assert_eq!(
+        children.len(),
+        octree.level(level).len(),
+        "the map must be that of the level"
+    );
     Nodes {
         map,
         children,
@@ -300,17 +311,17 @@ fn nodes<'a>(
     }
 }
 
-/// The first bytes of a payload, of which `fixed` must be there, and what follows these.
-fn read_coding<'a>(payload: &Slice<'a>, fixed: usize) -> Result<(Coding, &'a [u8])> {
-    if payload.bytes.len() < fixed {
+/// Parses the `header` bytes before the entropy stream. Returns the coding parameters and the entropy stream.
+fn read_coding<'a>(payload: &Slice<'a>, header: usize) -> Result<(Coding, &'a [u8])> {
+    if payload.bytes.len() < header {
         return Err(Error::Truncated {
             stage: Stage::Colour,
             offset: (payload.offset + payload.bytes.len()) as u64,
             field: "steps of colours",
-            needed: (fixed - payload.bytes.len()) as u64,
+            needed: (header - payload.bytes.len()) as u64,
         });
     }
-    let (head, rest) = payload.bytes.split_at(fixed);
+    let (head, rest) = payload.bytes.split_at(header);
     let steps = Steps {
         luma: head[0],
         chroma: head[1],
@@ -329,19 +340,19 @@ fn read_coding<'a>(payload: &Slice<'a>, fixed: usize) -> Result<(Coding, &'a [u8
     Ok((Coding { steps, gain: head[2] }, rest))
 }
 
-/// The energies of a level's nodes, smoothed over their neighbours, for each of their children.
+/// Coefficient energies of a level's nodes, smoothed over their neighbours and copied to each child.
 fn spread_energies(nodes: Nodes<'_>, energies: &[[u8; 3]]) -> Vec<[u8; 3]> {
-    /// By how many coordinates differ.
+    /// By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
     const WEIGHTS: [u32; 4] = [40, 15, 7, 3];
     let smoothed = (0..energies.len()).into_par_iter().map(|node| {
         let (mut sums, mut weight) = ([0u32; 3], 0);
         for (k, &neighbour) in nodes.map.row(node).iter().enumerate() {
             if neighbour != KernelMap::ABSENT {
-                let off = usize::from(k % 3 != 1) + usize::from(k / 3 % 3 != 1) + usize::from(k / 9 != 1);
+                let axes = usize::from(k % 3 != 1) + usize::from(k / 3 % 3 != 1) + usize::from(k / 9 != 1);
                 for (sum, energy) in sums.iter_mut().zip(energies[neighbour as usize]) {
-                    *sum += WEIGHTS[off] * u32::from(energy);
+                    *sum += WEIGHTS[axes] * u32::from(energy);
                 }
-                weight += WEIGHTS[off];
+                weight += WEIGHTS[axes];
             }
         }
         sums.map(|sum| (sum / weight.max(1)) as u8)
@@ -353,19 +364,19 @@ fn spread_energies(nodes: Nodes<'_>, energies: &[[u8; 3]]) -> Vec<[u8; 3]> {
         .collect()
 }
 
-/// Coefficients from an entropy stream.
-struct Reading<'a>(Decoder<'a>);
+/// Decodes coefficients from an entropy stream.
+struct EntropyDecoder<'a>(Decoder<'a>);
 
-impl Source for Reading<'_> {
+impl CoefficientCoder for EntropyDecoder<'_> {
     #[inline(always)]
-    fn coefficient(&mut self, model: &mut Model, c: &Circumstances, _: i32, _: Quantiser) -> i32 {
+    fn coefficient(&mut self, model: &mut Model, c: &CoefficientContext, _: i32, _: Quantiser) -> i32 {
         model.code(&mut self.0, c, 0)
     }
 }
 
-/// Codes a slice, one way or the other.
-struct Pass<'a, S> {
-    source: &'a mut S,
+/// Encodes or decodes a slice.
+struct CodeSlice<'a, S> {
+    coder: &'a mut S,
     model: &'a mut Model,
     nodes: Nodes<'a>,
     range: Range<usize>,
@@ -373,20 +384,20 @@ struct Pass<'a, S> {
     truth: Option<&'a [Ycc]>,
 }
 
-impl<S: Source> Work for Pass<'_, S> {
-    type Output = block::Coded;
+impl<S: CoefficientCoder> Work for CodeSlice<'_, S> {
+    type Output = block::CodedSlice;
 
     #[inline(always)]
-    fn run<I: Instructions>(self, _: I) -> block::Coded {
-        let Pass {
-            source,
+    fn run<I: Instructions>(self, _: I) -> block::CodedSlice {
+        let CodeSlice {
+            coder,
             model,
             nodes,
             range,
             coding,
             truth,
         } = self;
-        block::code(source, model, nodes, range, coding, truth)
+        block::code(coder, model, nodes, range, coding, truth)
     }
 }
 

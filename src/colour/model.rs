@@ -1,37 +1,41 @@
-//! Probabilities of coefficients: contexts mixed in the logistic domain.
+//! Adaptive probability model of coefficients: context mixing in the logistic domain (`docs/format.md`, clause 5.8).
 //!
-//! Every binary decision about a magnitude is seen in [`CONTEXTS`] contexts, each with a *slot* that holds the probability of a 1 and how often it was met.
-//! Three sets of weights, chosen by different circumstances, are added up and mix what the slots say. All numbers are integers; logits are in units of 1/64.
+//! A magnitude is coded in unary, by binary decisions. Each decision is predicted from [`CONTEXTS`] contexts. Each
+//! context selects a *slot*, which holds an adaptive probability of a 1 and a count of its updates. A logistic unit
+//! adds a prediction from continuous features. A mixer combines the logits of all with the sum of three weight vectors,
+//! each selected by a part of the context. All numbers are integers; logits are in units of 1/64.
 
 use crate::coding::probability::{STRETCH, squash};
 use crate::coding::{ONE, binary::Coder};
 
-/// Contexts of a decision about a magnitude.
+/// Number of contexts of a magnitude decision.
 const CONTEXTS: usize = 8;
-/// Contexts of a sign.
+/// Number of contexts of a sign.
 const SIGN_CONTEXTS: usize = 4;
-/// Decisions of a magnitude that contexts tell apart: whether it is 0, 1, …
+/// Number of decisions of a magnitude with probabilities of their own: > 0, > 1, …; the last one serves all that
+/// follow.
 pub(super) const BINS: usize = 7;
-/// From this magnitude on the rest is an Exp-Golomb code.
+/// From this magnitude on, the remainder is an Exp-Golomb code.
 const ESCAPE: i32 = 18;
-/// The most ones that such a code begins with.
+/// Maximum number of leading ones of such a code.
 const MAX_PREFIX: u32 = 20;
-/// Lanes of a mixer: contexts, the logistic unit's logit, a constant, zeros.
+/// Lanes of a mixer: the contexts, half the logit of the logistic unit, a constant, then zeros.
 const LANES: usize = 16;
-const UNIT: usize = CONTEXTS;
-const BIAS: usize = CONTEXTS + 1;
-/// The largest magnitude of a weight: three sets of ten products stay within 32 bits.
-const HEAVIEST: i32 = 1 << 16;
-/// Inputs of the logistic unit.
+const UNIT_LANE: usize = CONTEXTS;
+const BIAS_LANE: usize = CONTEXTS + 1;
+/// Maximum magnitude of a weight, so that three sets of ten products fit in 32 bits.
+const MAX_WEIGHT: i32 = 1 << 16;
+/// Number of inputs of the logistic unit.
 pub(super) const FEATURES: usize = 12;
 
-/// How often a slot was met at most, in its low bits; the probability above them, in units of 2⁻²².
+/// Bits of a slot that hold its count. The bits above hold the probability of a 1 in units of 2⁻²².
 const COUNT_BITS: u32 = 10;
-const MOST: u32 = 120;
+/// The count saturates here.
+const MAX_COUNT: u32 = 120;
 
-/// How fast a slot follows after so many decisions, in units of 2⁻¹⁶: `65536·5 / (5·count + 8)`, rounded down.
-static RATE: [u32; MOST as usize + 1] = {
-    let mut table = [0; MOST as usize + 1];
+/// Adaptation rate of a slot by its count, in units of 2⁻¹⁶: `65536·5 / (5·count + 8)`, rounded down.
+static RATE: [u32; MAX_COUNT as usize + 1] = {
+    let mut table = [0; MAX_COUNT as usize + 1];
     let mut count = 0;
     while count < table.len() {
         table[count] = 65536 * 5 / (5 * count as u32 + 8);
@@ -40,9 +44,9 @@ static RATE: [u32; MOST as usize + 1] = {
     table
 };
 
-/// How far to trust a slot after so many decisions, in units of 1/256: `256·(10·count + 2) / (10·count + 17)`, rounded down.
-static TRUST: [i32; MOST as usize + 1] = {
-    let mut table = [0; MOST as usize + 1];
+/// Factor of a slot's logit by its count, in units of 1/256: `256·(10·count + 2) / (10·count + 17)`, rounded down.
+static CONFIDENCE: [i32; MAX_COUNT as usize + 1] = {
+    let mut table = [0; MAX_COUNT as usize + 1];
     let mut count = 0;
     while count < table.len() {
         table[count] = 256 * (10 * count as i32 + 2) / (10 * count as i32 + 17);
@@ -51,14 +55,16 @@ static TRUST: [i32; MOST as usize + 1] = {
     table
 };
 
+/// The mixer's input from a slot: its logit, attenuated while its count is low.
 #[inline(always)]
-fn said(slot: u32) -> i32 {
+fn slot_input(slot: u32) -> i32 {
     let one = slot >> (COUNT_BITS + 10);
-    (i32::from(STRETCH[one as usize]) * TRUST[(slot & ((1 << COUNT_BITS) - 1)) as usize]) >> 8
+    (i32::from(STRETCH[one as usize]) * CONFIDENCE[(slot & ((1 << COUNT_BITS) - 1)) as usize]) >> 8
 }
 
+/// Moves a slot's probability towards `bit` and increments its count.
 #[inline(always)]
-fn learn_slot(slot: &mut u32, bit: bool) {
+fn adapt_slot(slot: &mut u32, bit: bool) {
     let (one, count) = (*slot >> COUNT_BITS, *slot & ((1 << COUNT_BITS) - 1));
     let rate = u64::from(RATE[count as usize]);
     let one = if bit {
@@ -66,54 +72,64 @@ fn learn_slot(slot: &mut u32, bit: bool) {
     } else {
         one - ((u64::from(one) * rate) >> 16) as u32
     };
-    *slot = one << COUNT_BITS | (count + 1).min(MOST);
+    *slot = one << COUNT_BITS | (count + 1).min(MAX_COUNT);
 }
 
-const NEW: u32 = 1 << (21 + COUNT_BITS);
+/// Probability 1/2, count 0.
+const INITIAL_SLOT: u32 = 1 << (21 + COUNT_BITS);
 
-/// Circumstances of one coefficient of one channel, as numbers of classes.
+/// Context of one coefficient (`docs/format.md`, 5.7.4).
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Circumstances {
-    /// 0 to 2: Y, Co, Cg.
+pub(super) struct CoefficientContext {
+    /// Channel: 0 Y, 1 Co, 2 Cg.
     pub channel: usize,
-    /// 0 to 6.
+    /// Slot of the transform, 0 to 6.
     pub slot: usize,
-    /// 0 to 2.
+    /// Axis of the slot: 0 x, 1 y, 2 z.
     pub axis: usize,
-    /// Children of the node, 2 to 8.
+    /// Number of children of the node, 2 to 8.
     pub children: usize,
-    /// |q| of Y and of Co of the same coefficient, up to 3.
+    /// `min(|q|, 3)` of Y in the same slot, 0 while Y is coded.
     pub luma: usize,
-    pub other: usize,
-    /// |q| of the same slot in the blocks at x − 1, y − 1 and z − 1, each up to 2, added up: 0 to 6.
-    pub beside: usize,
-    /// Logarithms of features, in eighths of an octave from about −8: see `block`.
+    /// `min(|q|, 3)` of Co in the same slot, 0 until it is coded.
+    pub co: usize,
+    /// Sum of `min(|q|, 2)` of the same slot and channel in the blocks at z − 1, y − 1 and x − 1: 0 to 6.
+    pub neighbour_magnitudes: usize,
+    /// Local coefficient energy. This and the next five are logarithms in eighths of an octave (`block::log_class`).
     pub energy: i32,
+    /// Mean absolute difference to the face neighbours.
     pub gradient: i32,
-    pub predicted: i32,
+    /// Magnitude of the prediction that includes children coded before.
+    pub near: i32,
+    /// Mean magnitude of this channel in the node's slots coded so far; 60 if there are none.
     pub block: i32,
-    pub parents: i32,
-    pub across: i32,
-    /// How heavy the join is: 0 to 3.
-    pub heavy: usize,
+    /// Magnitude of the prediction from the level above alone.
+    pub far: i32,
+    /// Magnitude of luma's prediction; for luma the greater of the chroma channels'.
+    pub cross_channel: i32,
+    /// Class of the slot's scale `√(vw / (v + w))`: 0 to 3.
+    pub weight_class: usize,
     /// Inputs of the logistic unit.
     pub features: [i32; FEATURES],
-    /// Classes of what the sign may follow.
-    pub sign: SignCircumstances,
+    /// Context of the sign.
+    pub sign: SignContext,
 }
 
+/// Context of a sign.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct SignCircumstances {
-    /// Classes of the prediction, 0 to 8, and of how both predictions differ.
-    pub predicted: usize,
+pub(super) struct SignContext {
+    /// Class of the prediction that includes children coded before: 0 to 8, 4 near 0.
+    pub near: usize,
+    /// Class of the difference between both predictions: 0 to 8, 4 near 0.
     pub shift: usize,
-    /// Signs (0 none, 1 plus, 2 minus) of Y and Co of the same coefficient: luma + 3·other.
-    pub others: usize,
-    /// Signs of the same slot in three blocks: 0 to 26.
-    pub beside: usize,
+    /// Signs (0 zero, 1 plus, 2 minus) of Y and Co in the same slot: `Y + 3·Co`.
+    pub channels: usize,
+    /// Signs of the same slot and channel in the three neighbouring blocks, in base 3: 0 to 26.
+    pub neighbours: usize,
 }
 
-const SIZES: [usize; CONTEXTS] = [
+/// Number of slots of each context, for one decision.
+const CONTEXT_SIZES: [usize; CONTEXTS] = [
     3 * 7 * 7,
     9 * 9,
     14 * 3 * 4,
@@ -123,18 +139,22 @@ const SIZES: [usize; CONTEXTS] = [
     24 * 3 * 4 * 4,
     9 * 9 * 4,
 ];
-const KINDS: usize = 3 * BINS;
+/// Number of decisions: [`BINS`] of each channel.
+const DECISIONS: usize = 3 * BINS;
 
-const STARTS: [usize; CONTEXTS + 1] = {
+/// Index of each context's first slot, and the number of all slots.
+const CONTEXT_STARTS: [usize; CONTEXTS + 1] = {
     let mut starts = [0; CONTEXTS + 1];
     let mut i = 0;
     while i < CONTEXTS {
-        starts[i + 1] = starts[i] + SIZES[i] * KINDS;
+        starts[i + 1] = starts[i] + CONTEXT_SIZES[i] * DECISIONS;
         i += 1;
     }
     starts
 };
+/// Number of slots of each sign context, for one channel.
 const SIGN_SIZES: [usize; SIGN_CONTEXTS] = [9 * 3, 9 * 7, 27 * 3, 9 * 9];
+/// Index of each sign context's first slot, and the number of all.
 const SIGN_STARTS: [usize; SIGN_CONTEXTS + 1] = {
     let mut starts = [0; SIGN_CONTEXTS + 1];
     let mut i = 0;
@@ -144,9 +164,10 @@ const SIGN_STARTS: [usize; SIGN_CONTEXTS + 1] = {
     }
     starts
 };
-const UNIT_CLASSES: usize = 12;
+/// Number of classes of the unit's logit that select mixer weights.
+const LOGIT_CLASSES: usize = 12;
 
-/// A class from 0 to `classes − 1` of a logarithm, each `width` eighths of an octave wide.
+/// Class of a logarithm, 0 to `classes − 1`, each `width` eighths of an octave wide.
 #[inline(always)]
 fn class(log: i32, width: i32, classes: i32) -> usize {
     (log / width).clamp(0, classes - 1) as usize
@@ -154,80 +175,89 @@ fn class(log: i32, width: i32, classes: i32) -> usize {
 
 type Lanes = [i32; LANES];
 
-/// What a slice has learned of coefficients.
+/// Adaptive state of the coefficient coder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Model {
+    /// Slots of magnitude decisions.
     slots: Vec<u32>,
+    /// Slots of signs.
     signs: Vec<u32>,
-    /// Weights by kind; by kind and class of the unit's logit; by kind, axis and what other channels are.
-    by_kind: Vec<Lanes>,
-    by_unit: Vec<Lanes>,
-    by_others: Vec<Lanes>,
+    /// Mixer weights by decision.
+    by_decision: Vec<Lanes>,
+    /// Mixer weights by decision and class of the unit's logit.
+    by_logit: Vec<Lanes>,
+    /// Mixer weights by decision, axis, and which channels of the slot are not 0.
+    by_channels: Vec<Lanes>,
+    /// Mixer weights of signs by channel.
     sign_weights: [[i32; 8]; 3],
-    /// The logistic unit of each channel, and how often it has learned.
+    /// Weights of the logistic unit of each channel.
     units: [[i32; FEATURES]; 3],
-    learned: [u32; 3],
-    /// Sums of products of what luma and each chroma brought, for predicting the one from the other.
-    pub cross: [Cross; 2],
+    /// Number of adaptations of each unit, at most 4096.
+    adaptations: [u32; 3],
+    /// Regressions of Co and Cg on Y.
+    pub chroma_from_luma: [ChromaFromLuma; 2],
 }
 
-/// How a chroma follows luma.
+/// Decaying sums for the linear regression of a chroma channel on luma.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Cross {
+pub(super) struct ChromaFromLuma {
+    /// Sum of luma · chroma.
     pub product: i64,
+    /// Sum of luma².
     pub square: i64,
 }
 
-/// One prediction of a decision, to be learned from.
-pub(super) struct Mixed {
+/// Prediction of one decision, with what [`Model::adapt`] needs afterwards.
+pub(super) struct Prediction {
     at: [usize; CONTEXTS],
     inputs: Lanes,
     sets: [usize; 3],
-    /// In units of 2⁻¹⁶.
+    /// Probability of a 1 in units of 2⁻¹⁶.
     pub one: u32,
 }
 
 impl Model {
-    /// Bytes of memory that it takes.
-    pub const BYTES: usize = (STARTS[CONTEXTS] + SIGN_STARTS[SIGN_CONTEXTS]) * size_of::<u32>()
-        + KINDS * (1 + UNIT_CLASSES + 12) * size_of::<Lanes>()
+    /// Bytes of memory of a model.
+    pub const BYTES: usize = (CONTEXT_STARTS[CONTEXTS] + SIGN_STARTS[SIGN_CONTEXTS]) * size_of::<u32>()
+        + DECISIONS * (1 + LOGIT_CLASSES + 12) * size_of::<Lanes>()
         + size_of::<Model>();
 
-    /// Nothing, to take the place of one that has been taken out.
+    /// A placeholder without memory, which cannot code.
     pub fn empty() -> Model {
         Model {
             slots: Vec::new(),
             signs: Vec::new(),
-            by_kind: Vec::new(),
-            by_unit: Vec::new(),
-            by_others: Vec::new(),
+            by_decision: Vec::new(),
+            by_logit: Vec::new(),
+            by_channels: Vec::new(),
             sign_weights: [[0; 8]; 3],
             units: [[0; FEATURES]; 3],
-            learned: [0; 3],
-            cross: [Cross::default(); 2],
+            adaptations: [0; 3],
+            chroma_from_luma: [ChromaFromLuma::default(); 2],
         }
     }
 
+    /// The initial model.
     pub fn new() -> Model {
         let mut weights = [0; LANES];
         weights[..CONTEXTS].fill(6554);
-        weights[UNIT] = 6554;
+        weights[UNIT_LANE] = 6554;
         Model {
-            slots: vec![NEW; STARTS[CONTEXTS]],
-            signs: vec![NEW; SIGN_STARTS[SIGN_CONTEXTS]],
-            by_kind: vec![weights; KINDS],
-            by_unit: vec![weights; KINDS * UNIT_CLASSES],
-            by_others: vec![weights; KINDS * 12],
+            slots: vec![INITIAL_SLOT; CONTEXT_STARTS[CONTEXTS]],
+            signs: vec![INITIAL_SLOT; SIGN_STARTS[SIGN_CONTEXTS]],
+            by_decision: vec![weights; DECISIONS],
+            by_logit: vec![weights; DECISIONS * LOGIT_CLASSES],
+            by_channels: vec![weights; DECISIONS * 12],
             sign_weights: [[24_000, 24_000, 24_000, 24_000, 0, 0, 0, 0]; 3],
             units: [[0; FEATURES]; 3],
-            learned: [0; 3],
-            cross: [Cross::default(); 2],
+            adaptations: [0; 3],
+            chroma_from_luma: [ChromaFromLuma::default(); 2],
         }
     }
 
-    /// The logit that the channel's logistic unit makes of the features.
+    /// Logit of the channel's logistic unit, −640 to 640.
     #[inline(always)]
-    pub fn prepare(&self, c: &Circumstances) -> i32 {
+    pub fn unit_logit(&self, c: &CoefficientContext) -> i32 {
         let sum = self.units[c.channel]
             .iter()
             .zip(c.features)
@@ -235,93 +265,105 @@ impl Model {
         (sum >> 16).clamp(-640, 640)
     }
 
-    /// The probability of decision `bin`, given [`Model::prepare`]'s logit.
+    /// Predicts decision `bin` of a magnitude. `unit` is the result of [`Model::unit_logit`].
     #[inline(always)]
-    pub fn predict(&self, c: &Circumstances, unit: i32, bin: usize) -> Mixed {
-        let kind = c.channel * BINS + bin;
-        let both = usize::from(c.luma > 0) * 2 + usize::from(c.other > 0);
-        let fine = ((unit + 640) * 48 / 1281) as usize;
-        let places = [
-            (c.axis * 7 + c.children - 2) * 7 + c.beside,
-            class(c.gradient, 8, 9) * 9 + class(c.predicted, 8, 9),
-            (class(c.predicted, 5, 14) * 3 + c.axis) * 4 + c.heavy,
-            ((class(c.energy, 8, 7) * 7 + class(c.gradient, 10, 7)) * 4 + c.luma) * 4 + c.other,
-            fine,
-            ((c.luma * 4 + c.other) * 8 + class(c.block, 8, 8)) * 7 + c.beside,
-            ((fine / 2 * 3 + c.axis) * 4 + (c.children - 2).min(3)) * 4 + both,
-            (class(c.parents, 8, 9) * 9 + class(c.across, 8, 9)) * 4 + both,
+    pub fn predict(&self, c: &CoefficientContext, unit: i32, bin: usize) -> Prediction {
+        let decision = c.channel * BINS + bin;
+        let significant = usize::from(c.luma > 0) * 2 + usize::from(c.co > 0);
+        let logit_class = ((unit + 640) * 48 / 1281) as usize;
+        let offsets = [
+            (c.axis * 7 + c.children - 2) * 7 + c.neighbour_magnitudes,
+            class(c.gradient, 8, 9) * 9 + class(c.near, 8, 9),
+            (class(c.near, 5, 14) * 3 + c.axis) * 4 + c.weight_class,
+            ((class(c.energy, 8, 7) * 7 + class(c.gradient, 10, 7)) * 4 + c.luma) * 4 + c.co,
+            logit_class,
+            ((c.luma * 4 + c.co) * 8 + class(c.block, 8, 8)) * 7 + c.neighbour_magnitudes,
+            ((logit_class / 2 * 3 + c.axis) * 4 + (c.children - 2).min(3)) * 4 + significant,
+            (class(c.far, 8, 9) * 9 + class(c.cross_channel, 8, 9)) * 4 + significant,
         ];
         let (mut at, mut inputs) = ([0; CONTEXTS], [0; LANES]);
         for i in 0..CONTEXTS {
-            at[i] = STARTS[i] + kind * SIZES[i] + places[i];
-            inputs[i] = said(self.slots[at[i]]);
+            at[i] = CONTEXT_STARTS[i] + decision * CONTEXT_SIZES[i] + offsets[i];
+            inputs[i] = slot_input(self.slots[at[i]]);
         }
-        inputs[UNIT] = unit / 2;
-        inputs[BIAS] = 64;
-        let sets = [kind, kind * UNIT_CLASSES + fine / 4, kind * 12 + c.axis * 4 + both];
-        let weights = [&self.by_kind[sets[0]], &self.by_unit[sets[1]], &self.by_others[sets[2]]];
+        inputs[UNIT_LANE] = unit / 2;
+        inputs[BIAS_LANE] = 64;
+        let sets = [
+            decision,
+            decision * LOGIT_CLASSES + logit_class / 4,
+            decision * 12 + c.axis * 4 + significant,
+        ];
+        let weights = [
+            &self.by_decision[sets[0]],
+            &self.by_logit[sets[1]],
+            &self.by_channels[sets[2]],
+        ];
         let mut sum = 0i32;
         for lane in 0..LANES {
             let weight = weights[0][lane] + weights[1][lane] + weights[2][lane];
             sum = sum.wrapping_add(weight.wrapping_mul(inputs[lane]));
         }
         let one = squash(sum >> 16).clamp(24, ONE - 24);
-        Mixed { at, inputs, sets, one }
+        Prediction { at, inputs, sets, one }
     }
 
+    /// Updates slots and mixer weights with the coded `bit`.
     #[inline(always)]
-    fn learn(&mut self, mixed: &Mixed, bit: bool) {
-        let error = if bit { ONE as i32 } else { 0 } - mixed.one as i32;
-        for at in mixed.at {
-            learn_slot(&mut self.slots[at], bit);
+    fn adapt(&mut self, prediction: &Prediction, bit: bool) {
+        let error = if bit { ONE as i32 } else { 0 } - prediction.one as i32;
+        for at in prediction.at {
+            adapt_slot(&mut self.slots[at], bit);
         }
         let sets = [
-            &mut self.by_kind[mixed.sets[0]],
-            &mut self.by_unit[mixed.sets[1]],
-            &mut self.by_others[mixed.sets[2]],
+            &mut self.by_decision[prediction.sets[0]],
+            &mut self.by_logit[prediction.sets[1]],
+            &mut self.by_channels[prediction.sets[2]],
         ];
         for weights in sets {
-            for (weight, input) in weights.iter_mut().zip(mixed.inputs) {
-                let step = (error * input * LEARN + (1 << 15)) >> 16;
-                *weight = (*weight + step).clamp(-HEAVIEST, HEAVIEST);
+            for (weight, input) in weights.iter_mut().zip(prediction.inputs) {
+                let step = (error * input * MIXER_RATE + (1 << 15)) >> 16;
+                *weight = (*weight + step).clamp(-MAX_WEIGHT, MAX_WEIGHT);
             }
         }
     }
 
+    /// Updates the logistic unit with the coded `bit` of the first decision.
     #[inline(always)]
-    fn learn_unit(&mut self, c: &Circumstances, unit: i32, bit: bool) {
+    fn adapt_unit(&mut self, c: &CoefficientContext, unit: i32, bit: bool) {
         let t = c.channel;
         let error = if bit { ONE as i32 } else { 0 } - squash(unit) as i32;
-        self.learned[t] = (self.learned[t] + 1).min(1 << 12);
-        let rate = UNIT_RATE + (UNIT_FAST >> (self.learned[t] >> 6).min(12));
+        self.adaptations[t] = (self.adaptations[t] + 1).min(1 << 12);
+        let rate = UNIT_RATE + (UNIT_RATE_START >> (self.adaptations[t] >> 6).min(12));
         for (weight, x) in self.units[t].iter_mut().zip(c.features) {
             *weight += ((error >> 4) * x * rate) >> 8;
             *weight = (*weight).clamp(-(1 << 20), 1 << 20);
         }
     }
 
+    /// Indices of the slots of a sign.
     #[inline(always)]
-    fn sign_places(c: &Circumstances) -> [usize; SIGN_CONTEXTS] {
+    fn sign_slots(c: &CoefficientContext) -> [usize; SIGN_CONTEXTS] {
         let s = &c.sign;
-        let places = [
-            s.predicted * 3 + c.axis,
-            s.others * 7 + c.slot,
-            s.beside * 3 + c.axis,
-            s.shift * 9 + s.predicted,
+        let offsets = [
+            s.near * 3 + c.axis,
+            s.channels * 7 + c.slot,
+            s.neighbours * 3 + c.axis,
+            s.shift * 9 + s.near,
         ];
         let mut at = [0; SIGN_CONTEXTS];
         for i in 0..SIGN_CONTEXTS {
-            at[i] = SIGN_STARTS[i] + c.channel * SIGN_SIZES[i] + places[i];
+            at[i] = SIGN_STARTS[i] + c.channel * SIGN_SIZES[i] + offsets[i];
         }
         at
     }
 
+    /// Codes a sign and adapts to it.
     #[inline(always)]
-    fn sign<C: Coder>(&mut self, coder: &mut C, c: &Circumstances, negative: bool) -> bool {
-        let at = Model::sign_places(c);
+    fn sign<C: Coder>(&mut self, coder: &mut C, c: &CoefficientContext, negative: bool) -> bool {
+        let at = Model::sign_slots(c);
         let mut inputs = [0; SIGN_CONTEXTS];
         for i in 0..SIGN_CONTEXTS {
-            inputs[i] = said(self.signs[at[i]]);
+            inputs[i] = slot_input(self.signs[at[i]]);
         }
         let weights = &mut self.sign_weights[c.channel];
         let sum = (0..SIGN_CONTEXTS).fold(0i32, |sum, i| sum.wrapping_add(weights[i] * inputs[i]));
@@ -330,25 +372,26 @@ impl Model {
         let error = if bit { ONE as i32 } else { 0 } - one as i32;
         for i in 0..SIGN_CONTEXTS {
             let step = (error * inputs[i] * 10 + (1 << 15)) >> 16;
-            weights[i] = (weights[i] + step).clamp(-HEAVIEST, HEAVIEST);
-            learn_slot(&mut self.signs[at[i]], bit);
+            weights[i] = (weights[i] + step).clamp(-MAX_WEIGHT, MAX_WEIGHT);
+            adapt_slot(&mut self.signs[at[i]], bit);
         }
         bit
     }
 
-    /// Codes a coefficient: an encoder `value`, a decoder what it reads.
+    /// Codes a coefficient and adapts to it. An encoder codes and returns `value`; a decoder ignores it and returns the
+    /// decoded coefficient.
     #[inline(always)]
-    pub fn code<C: Coder>(&mut self, coder: &mut C, c: &Circumstances, value: i32) -> i32 {
-        let unit = self.prepare(c);
+    pub fn code<C: Coder>(&mut self, coder: &mut C, c: &CoefficientContext, value: i32) -> i32 {
+        let unit = self.unit_logit(c);
         let wanted = value.abs();
         let mut magnitude = 0;
         while magnitude < ESCAPE {
             let bin = (magnitude as usize).min(BINS - 1);
-            let mixed = self.predict(c, unit, bin);
-            let more = coder.code(wanted > magnitude, mixed.one);
-            self.learn(&mixed, more);
+            let prediction = self.predict(c, unit, bin);
+            let more = coder.code(wanted > magnitude, prediction.one);
+            self.adapt(&prediction, more);
             if magnitude == 0 {
-                self.learn_unit(c, unit, more);
+                self.adapt_unit(c, unit, more);
             }
             if !more {
                 break;
@@ -369,12 +412,14 @@ impl Model {
     }
 }
 
-/// Learning rates, in units that [`Model::learn`] and [`Model::learn_unit`] tell.
-const LEARN: i32 = 7;
+/// Learning rate of mixer weights ([`Model::adapt`]).
+const MIXER_RATE: i32 = 7;
+/// Final learning rate of the logistic unit ([`Model::adapt_unit`]).
 const UNIT_RATE: i32 = 4;
-const UNIT_FAST: i32 = 64;
+/// Addition to that rate at first, halved every 64 adaptations.
+const UNIT_RATE_START: i32 = 64;
 
-/// Codes a number from 0 on as an Exp-Golomb code of even decisions.
+/// Codes a number of at least 0 as an Exp-Golomb code of equiprobable decisions.
 #[inline(never)]
 fn escape<C: Coder>(coder: &mut C, value: i32) -> i32 {
     let value = (value.max(0) + 1) as u32;

@@ -1,25 +1,31 @@
-//! What a node's children are likely to look like: means of decoded colours nearby, weighted by distance.
+//! Prediction of a node's children: means of decoded colours nearby, weighted by distance (`docs/format.md`, clause
+//! 5.6).
 //!
-//! Two predictions are made of every child. The first is the mean of the node and of its six face neighbours, each with the weight
-//! `round(4096·e^(−k/64))`, where `k = ⌊(6400·d + 49·n²) / (98·n²)⌋`: `n` is how many children that node has, and `d / n²` the squared distance, in children,
-//! from the child's centre to the mean of theirs. (So the weight is a Gaussian of standard deviation 0.7.) The second adds to these the children that were coded before in the same slice and touch the
-//! child, with weights of 831 (by a face), 113 (by an edge) and 15 (by a corner). A mean is `(sum·⌊2³² / weight⌋ + 2³¹) >> 32`, with the sums of weighted colours and of weights.
+//! Every child has two predictions. The *far* one is the mean of the node and of its six face neighbours. The weight of
+//! each is a Gaussian of standard deviation 0.7 children, of the distance from the child's centre to the mean of that
+//! node's children: `round(4096·e^(−k/64))` with `k = ⌊(6400·d + 49·n²) / (98·n²)⌋`, where `n` is the number of
+//! children of that node and `d / n²` the squared distance in units of children.
+//!
+//! The *near* prediction adds the children that were coded before in the same slice and touch the child, with the
+//! weights 831 (by a face), 113 (by an edge) and 15 (by a corner).
+//!
+//! A mean is `(sum·⌊2³² / weight⌋ + 2³¹) >> 32`, with the sums of weighted colours and of weights.
 
-/// The place in a 3³ kernel map row of the node itself and of its face neighbours.
-pub(super) const NEAR: [usize; 7] = [13, 4, 10, 12, 14, 16, 22];
-/// Face neighbours that come before the node in Morton order: at z − 1, y − 1, x − 1.
-pub(super) const BEFORE: [usize; 3] = [4, 10, 12];
+/// Offsets of the node itself and of its face neighbours, as indices into a 3³ kernel map row.
+pub(super) const SELF_AND_FACES: [usize; 7] = [13, 4, 10, 12, 14, 16, 22];
+/// Offsets of the face neighbours that precede the node in Morton order: at z − 1, y − 1, x − 1.
+pub(super) const EARLIER_FACES: [usize; 3] = [4, 10, 12];
 
-/// Weights of children that were coded before, by how many coordinates differ.
-const TOUCHING: [i32; 4] = [0, 831, 113, 15];
+/// Weights of children coded before, by the number of coordinates in which they differ.
+const CHILD_WEIGHTS_BY_AXES: [i32; 4] = [0, 831, 113, 15];
 
-/// By place in a 3³ row.
-pub(super) static TOUCHING_AT: [i32; 27] = {
+/// Weights of children coded before, by offset in a 3³ row.
+pub(super) static CHILD_WEIGHTS: [i32; 27] = {
     let mut weights = [0; 27];
     let mut k = 0;
     while k < 27 {
-        let off = (k % 3 != 1) as usize + (k / 3 % 3 != 1) as usize + (k / 9 != 1) as usize;
-        weights[k] = TOUCHING[off];
+        let axes = (k % 3 != 1) as usize + (k / 3 % 3 != 1) as usize + (k / 9 != 1) as usize;
+        weights[k] = CHILD_WEIGHTS_BY_AXES[axes];
         k += 1;
     }
     weights
@@ -27,14 +33,14 @@ pub(super) static TOUCHING_AT: [i32; 27] = {
 
 /// `e^(−1/64)` in units of 2⁻⁶², rounded down.
 const DECAY: u128 = 4_540_188_453_729_421_604;
-/// Beyond this distance all weights are 0.
-const FAR: usize = 600;
+/// Length of [`GAUSSIAN`]. All weights from this `k` on are 0.
+const GAUSSIAN_SIZE: usize = 600;
 
 /// `round(4096·e^(−k/64))`, the power in units of 2⁻⁶², rounded down after each factor.
-const GAUSSIAN: [u16; FAR] = {
-    let mut table = [0; FAR];
+const GAUSSIAN: [u16; GAUSSIAN_SIZE] = {
+    let mut table = [0; GAUSSIAN_SIZE];
     let (mut k, mut power) = (0, 1u128 << 62);
-    while k < FAR {
+    while k < GAUSSIAN_SIZE {
         table[k] = ((power + (1 << 49)) >> 50) as u16;
         power = (power * DECAY) >> 62;
         k += 1;
@@ -42,12 +48,12 @@ const GAUSSIAN: [u16; FAR] = {
     table
 };
 
-/// The weight of a node, by its place in [`NEAR`], its occupancy, and the octant of the child that is predicted.
-pub(super) static WEIGHTS: [[[u16; 8]; 256]; 7] = {
+/// Weight of a node by its index in [`SELF_AND_FACES`], its occupancy, and the octant of the predicted child.
+pub(super) static NODE_WEIGHTS: [[[u16; 8]; 256]; 7] = {
     let mut table = [[[0; 8]; 256]; 7];
-    let mut near = 0;
-    while near < 7 {
-        let at = NEAR[near] as i64;
+    let mut node = 0;
+    while node < 7 {
+        let at = SELF_AND_FACES[node] as i64;
         let offset = [at % 3 - 1, at / 3 % 3 - 1, at / 9 - 1];
         let mut mask = 1;
         while mask < 256 {
@@ -71,26 +77,26 @@ pub(super) static WEIGHTS: [[[u16; 8]; 256]; 7] = {
                     axis += 1;
                 }
                 let k = (6400 * square + 49 * count * count) / (98 * count * count);
-                if k < FAR as i64 {
-                    table[near][mask][octant as usize] = GAUSSIAN[k as usize];
+                if k < GAUSSIAN_SIZE as i64 {
+                    table[node][mask][octant as usize] = GAUSSIAN[k as usize];
                 }
                 octant += 1;
             }
             mask += 1;
         }
-        near += 1;
+        node += 1;
     }
     table
 };
 
-/// A weighted mean in the making.
+/// Accumulator of a weighted mean of colours.
 #[derive(Clone, Copy, Default)]
-pub(super) struct Mean {
+pub(super) struct WeightedMean {
     sums: [i32; 3],
     weight: i32,
 }
 
-impl Mean {
+impl WeightedMean {
     #[inline(always)]
     pub fn add(&mut self, value: [i16; 3], weight: i32) {
         for (sum, x) in self.sums.iter_mut().zip(value) {
@@ -99,7 +105,7 @@ impl Mean {
         self.weight += weight;
     }
 
-    /// The mean. Something must have been added whose weight is not 0.
+    /// The mean. At least one value of non-zero weight must have been added.
     #[inline(always)]
     pub fn value(self) -> [i32; 3] {
         let inverse = (1i64 << 32) / i64::from(self.weight.max(1));
@@ -108,7 +114,7 @@ impl Mean {
     }
 }
 
-#[allow(clippy::needless_range_loop)] // tables are indexed as their definitions are
+#[allow(clippy::needless_range_loop)] // indices as in the tables' definitions
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -116,7 +122,7 @@ mod tests {
     #[test]
     fn weights_are_gaussians_of_the_distance() {
         let mut checked = 0;
-        for (near, &at) in NEAR.iter().enumerate() {
+        for (node, &at) in SELF_AND_FACES.iter().enumerate() {
             let at = at as f64;
             let offset = [at % 3.0 - 1.0, (at / 3.0).floor() % 3.0 - 1.0, (at / 9.0).floor() - 1.0];
             for mask in 1..256usize {
@@ -131,8 +137,8 @@ mod tests {
                         })
                         .sum();
                     let exact = 4096.0 * (-square / 0.98).exp();
-                    let weight = f64::from(WEIGHTS[near][mask][octant]);
-                    assert!((weight - exact).abs() <= 0.009 * exact + 0.6, "{near} {mask} {octant}");
+                    let weight = f64::from(NODE_WEIGHTS[node][mask][octant]);
+                    assert!((weight - exact).abs() <= 0.009 * exact + 0.6, "{node} {mask} {octant}");
                     checked += 1;
                 }
             }
@@ -141,10 +147,10 @@ mod tests {
     }
 
     #[test]
-    fn a_node_always_has_a_say_about_its_own_children() {
+    fn the_node_itself_always_has_weight_for_its_children() {
         for mask in 1..256 {
             for octant in (0..8).filter(|o| mask >> o & 1 == 1) {
-                assert!(WEIGHTS[0][mask][octant] > 1000);
+                assert!(NODE_WEIGHTS[0][mask][octant] > 1000);
             }
         }
     }
@@ -152,7 +158,7 @@ mod tests {
     #[test]
     fn sums_stay_within_32_bits() {
         let parents: i64 = 7 * 4096;
-        let children: i64 = TOUCHING_AT.iter().map(|&w| i64::from(w)).sum();
+        let children: i64 = CHILD_WEIGHTS.iter().map(|&w| i64::from(w)).sum();
         assert!((parents + children) * (1 << 14) < i64::from(i32::MAX));
     }
 }

@@ -1,53 +1,54 @@
-//! YCoCg-R in fixed point, and the quantisation steps of its channels.
+//! YCoCg-R in fixed point, and the quantisation steps of its channels (`docs/format.md`, clauses 5.1 and 5.2).
 
-/// Y, Co and Cg of a voxel, in units of 2^−fraction of one 255th.
+/// Y, Co and Cg of a voxel in units of `2^−fraction` of one 255th.
 pub type Ycc = [i16; 3];
 
 /// Fractional bits of lossy colours. Lossless colours have none.
 pub const FRACTION: u32 = 6;
 
-/// How finely a slice's coefficients are quantised.
+/// Quantisation steps of a slice, as indices.
 ///
-/// An index `i` below [`Steps::ABSENT`] stands for a step of about `2^(i/8 − 1)` 255ths, exactly
+/// An index `i` from 0 to [`Steps::MAX`] is a step of about `2^(i/8 − 1)` 255ths, exactly
 /// `[32, 35, 38, 41, 45, 49, 54, 59][i mod 8] · 2^⌊i/8⌋ / 64`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Steps {
-    /// Index of luma's step: 0 to 87, or [`Steps::EXACT`].
+    /// Index of Y's step: 0 to 87, or [`Steps::EXACT`].
     pub luma: u8,
-    /// Index of Cg's step: 0 to 87, [`Steps::ABSENT`], or [`Steps::EXACT`] if luma's is. Co's step is two indices greater.
+    /// Index of Cg's step: 0 to 87, [`Steps::ABSENT`], or [`Steps::EXACT`] exactly if luma's is. Co's index is greater
+    /// by 2.
     pub chroma: u8,
 }
 
 impl Steps {
-    /// The greatest index of a step.
+    /// Maximum index of a step.
     pub const MAX: u8 = 87;
-    /// As a chroma index: chroma coefficients are all 0 and are not coded.
+    /// Chroma index: chroma has no coefficients.
     pub const ABSENT: u8 = 254;
-    /// As both indices: coefficients are integers, and colours exact.
+    /// Both indices: coding is lossless, with steps of 1.
     pub const EXACT: u8 = 255;
-    /// Exact colours.
+    /// Steps of lossless colours.
     pub const LOSSLESS: Steps = Steps {
         luma: Steps::EXACT,
         chroma: Steps::EXACT,
     };
 
-    /// Whether these are indices that a stream may have.
+    /// Whether the format allows these indices.
     pub fn is_valid(self) -> bool {
         let lossy = self.luma <= Steps::MAX && (self.chroma <= Steps::MAX || self.chroma == Steps::ABSENT);
         lossy || self == Steps::LOSSLESS
     }
 
-    /// Whether colours are exact.
+    /// Whether coding is lossless.
     pub fn is_lossless(self) -> bool {
         self == Steps::LOSSLESS
     }
 
-    /// Fractional bits of the colours that are coded in these steps.
+    /// Number of fractional bits of the coded colours: 0 if lossless, else [`FRACTION`].
     pub(crate) fn fraction(self) -> u32 {
         if self.is_lossless() { 0 } else { FRACTION }
     }
 
-    /// The steps of the level above: half as large, down to the finest there is.
+    /// The steps of the level above: half as large, but not below index 0.
     pub(crate) fn above(self) -> Steps {
         if self.is_lossless() {
             return self;
@@ -63,22 +64,22 @@ impl Steps {
         }
     }
 
-    /// The steps of Y, Co and Cg in units of 2^−[`Steps::fraction`]; 0 for a channel without coefficients.
+    /// Steps of Y, Co and Cg in units of `2^−fraction` ([`Steps::fraction`]); 0 for a channel without coefficients.
     pub(crate) fn units(self) -> [i32; 3] {
         if self.is_lossless() {
             return [1; 3];
         }
-        let chroma = |more: u8| {
+        let chroma = |index_offset: u8| {
             if self.chroma == Steps::ABSENT {
                 0
             } else {
-                units(self.chroma + more)
+                units(self.chroma + index_offset)
             }
         };
         [units(self.luma), chroma(2), chroma(0)]
     }
 
-    /// The step of luma in 255ths; 1 for exact colours.
+    /// Step of luma in 255ths; 1 if lossless.
     pub fn luma_step(self) -> f32 {
         if self.is_lossless() {
             1.0
@@ -88,13 +89,13 @@ impl Steps {
     }
 }
 
-/// The step of an index, in 64ths of a 255th.
+/// Step of an index in units of 1/64 of a 255th.
 fn units(index: u8) -> i32 {
     const MANTISSA: [i32; 8] = [32, 35, 38, 41, 45, 49, 54, 59];
     MANTISSA[usize::from(index % 8)] << (index / 8)
 }
 
-/// YCoCg of red, green and blue. Shifts round down, so that [`to_rgb`] undoes it exactly.
+/// Converts RGB to YCoCg-R. Exactly reversible by [`to_rgb`].
 #[cfg(any(test, feature = "encoder"))]
 pub(crate) fn from_rgb([r, g, b]: [i32; 3]) -> [i32; 3] {
     let co = r - b;
@@ -103,20 +104,20 @@ pub(crate) fn from_rgb([r, g, b]: [i32; 3]) -> [i32; 3] {
     [t + (cg >> 1), co, cg]
 }
 
-/// Red, green and blue of YCoCg.
+/// Converts YCoCg-R to RGB.
 pub(crate) fn to_rgb([y, co, cg]: [i32; 3]) -> [i32; 3] {
     let t = y - (cg >> 1);
     let b = t - (co >> 1);
     [b + co, cg + t, b]
 }
 
-/// The nearest display colour.
+/// Converts to 8-bit RGB, rounded to the nearest integer.
 pub(crate) fn display(ycc: Ycc, fraction: u32) -> [u8; 3] {
     let half = (1 << fraction) >> 1;
     to_rgb(ycc.map(i32::from)).map(|x| ((x + half) >> fraction).clamp(0, 255) as u8)
 }
 
-/// The values that channels are kept within: what valid colours have, and a little more.
+/// Clamps a channel to ±256 (in units of one 255th), slightly beyond the range of valid colours.
 #[inline(always)]
 pub(crate) fn clamp(value: i32, fraction: u32) -> i16 {
     let limit = 256 << fraction;
@@ -128,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_sixth_display_colour_comes_back() {
+    fn every_sixth_display_colour_survives_the_round_trip() {
         for r in (0..256).step_by(6).chain([255]) {
             for g in (0..256).step_by(6).chain([255]) {
                 for b in (0..256).step_by(6).chain([255]) {

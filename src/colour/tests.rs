@@ -2,7 +2,7 @@ use super::*;
 use crate::geometry::Voxels;
 use proptest::prelude::*;
 
-/// A cloud, its octree down to `top`, and the kernel maps of all levels.
+/// A cloud, its octree down to level `top`, and the kernel maps of all levels.
 struct Case {
     voxels: Voxels,
     colours: Vec<[u8; 3]>,
@@ -27,7 +27,7 @@ impl Case {
         }
     }
 
-    /// A bowl with a pattern on it.
+    /// A paraboloid with a colour pattern.
     fn bowl(depth: u8, top: u8) -> Case {
         let side = 1u32 << depth;
         let keys = (0..side * side).map(|i| {
@@ -48,27 +48,27 @@ impl Case {
         Truth::new(&self.voxels, &self.colours, &self.octree, top, steps.is_lossless())
     }
 
-    /// The payloads of the trunk and of every level below, and the colours of the last.
-    fn encode(&self, isa: Isa, trunk: u8, slice: usize, steps: Steps) -> (Vec<Vec<Vec<u8>>>, Coloured) {
+    /// The payloads of the trunk and of every level below, and the colours of the last level.
+    fn encode(&self, isa: Isa, trunk: u8, slice: usize, steps: Steps) -> (Vec<Vec<Vec<u8>>>, LevelColours) {
         let (truth, options) = (self.truth(steps), Options::new(steps));
-        let (bytes, mut coloured) = encode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &truth, options);
+        let (bytes, mut colours) = encode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &truth, options);
         let mut payloads = vec![vec![bytes]];
         for level in trunk + 1..=self.octree.depth() {
             let [above, map] = [level - 1, level].map(|l| &self.maps[usize::from(l)]);
-            let (slices, next) = encode_level(isa, &self.octree, level, above, map, &coloured, &truth, slice, options);
+            let (slices, next) = encode_level(isa, &self.octree, level, above, map, &colours, &truth, slice, options);
             payloads.push(slices);
-            coloured = next;
+            colours = next;
         }
-        (payloads, coloured)
+        (payloads, colours)
     }
 
-    fn decode(&self, isa: Isa, trunk: u8, slice: usize, payloads: &[Vec<Vec<u8>>]) -> Result<Coloured> {
+    fn decode(&self, isa: Isa, trunk: u8, slice: usize, payloads: &[Vec<Vec<u8>>]) -> Result<LevelColours> {
         let first = Slice {
             voxels: 0,
             bytes: &payloads[0][0],
             offset: 0,
         };
-        let mut coloured = decode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &first)?;
+        let mut colours = decode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &first)?;
         for (level, payloads) in (trunk + 1..=self.octree.depth()).zip(&payloads[1..]) {
             let [above, map] = [level - 1, level].map(|l| &self.maps[usize::from(l)]);
             let slices: Vec<_> = payloads
@@ -79,19 +79,19 @@ impl Case {
                     offset: 0,
                 })
                 .collect();
-            coloured = decode_level(
+            colours = decode_level(
                 isa,
                 &self.octree,
                 level,
                 above,
                 map,
-                &coloured,
+                &colours,
                 &slices,
                 slice,
                 &Cancel::default(),
             )?;
         }
-        Ok(coloured)
+        Ok(colours)
     }
 }
 
@@ -110,25 +110,25 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
     #[test]
-    fn colours_decode_to_what_was_coded_with_every_instruction_set(
+    fn encoding_and_decoding_agree_on_every_instruction_set(
         keys in prop::collection::vec(0u64..1 << 12, 1..400), noise: u32, slice in 1usize..60, trunk in 0u8..=4, steps in some_steps()
     ) {
         let case = Case::new(4, 4, keys, |xyz| {
             let hash = xyz.iter().fold(noise, |h, x| (h ^ x).wrapping_mul(0x9E37_79B1));
             hash.to_le_bytes()[..3].try_into().unwrap()
         });
-        let (payloads, coloured) = case.encode(Isa::detect(), trunk, slice, steps);
+        let (payloads, colours) = case.encode(Isa::detect(), trunk, slice, steps);
         for isa in Isa::available() {
             prop_assert_eq!(&case.encode(isa, trunk, slice, steps).0, &payloads);
-            prop_assert_eq!(&case.decode(isa, trunk, slice, &payloads).unwrap(), &coloured);
+            prop_assert_eq!(&case.decode(isa, trunk, slice, &payloads).unwrap(), &colours);
         }
         if steps.is_lossless() {
-            prop_assert_eq!(coloured.rgb(), case.colours);
+            prop_assert_eq!(colours.rgb(), case.colours);
         }
     }
 
     #[test]
-    fn damaged_payloads_decode_to_something_or_an_error(
+    fn damaged_payloads_never_panic(
         place in 0usize..10_000, with: u8, cut in 0usize..10_000
     ) {
         let case = Case::bowl(5, 5);
@@ -146,7 +146,7 @@ proptest! {
 }
 
 #[test]
-fn the_error_of_a_voxel_follows_the_step() {
+fn the_error_grows_with_the_step() {
     let case = Case::bowl(7, 6);
     let truth = case.truth(Steps { luma: 0, chroma: 0 });
     let mut last = 0.0;
@@ -155,10 +155,10 @@ fn the_error_of_a_voxel_follows_the_step() {
             luma: index,
             chroma: index,
         };
-        let (payloads, coloured) = case.encode(Isa::detect(), 3, 1 << 14, steps);
-        let pairs = coloured.values().iter().zip(truth.level(6));
+        let (payloads, colours) = case.encode(Isa::detect(), 3, 1 << 14, steps);
+        let pairs = colours.values().iter().zip(truth.level(6));
         let sum: f64 = pairs.map(|(a, b)| f64::from(a[0] - b[0]).powi(2)).sum();
-        let error = (sum / coloured.values().len() as f64).sqrt() / 64.0;
+        let error = (sum / colours.values().len() as f64).sqrt() / 64.0;
         assert!(
             error > last && error < 0.8 * f64::from(steps.luma_step()),
             "{index}: {error}"
@@ -169,7 +169,7 @@ fn the_error_of_a_voxel_follows_the_step() {
 }
 
 #[test]
-fn coarser_steps_take_fewer_bytes() {
+fn coarser_steps_need_fewer_bytes() {
     let case = Case::bowl(7, 6);
     let bytes = |index| {
         let steps = Steps {
@@ -188,15 +188,15 @@ fn coarser_steps_take_fewer_bytes() {
 }
 
 #[test]
-fn chroma_that_is_absent_stays_as_the_root_has_it_but_for_prediction() {
+fn absent_chroma_keeps_the_value_of_the_root() {
     let case = Case::bowl(5, 5);
     let steps = Steps {
         luma: 24,
         chroma: Steps::ABSENT,
     };
-    let (_, coloured) = case.encode(Isa::detect(), 4, 1 << 14, steps);
-    let root = coloured.values()[0][1..].to_vec();
-    assert!(coloured.values().iter().all(|ycc| ycc[1..] == root[..]));
+    let (_, colours) = case.encode(Isa::detect(), 4, 1 << 14, steps);
+    let root = colours.values()[0][1..].to_vec();
+    assert!(colours.values().iter().all(|ycc| ycc[1..] == root[..]));
 }
 
 #[test]
@@ -209,7 +209,7 @@ fn a_wrong_number_of_slices_is_an_error() {
 }
 
 #[test]
-fn steps_that_no_stream_has_are_an_error() {
+fn invalid_steps_are_an_error() {
     let case = Case::bowl(5, 5);
     let (payloads, _) = case.encode(Isa::detect(), 3, 100, Steps { luma: 32, chroma: 32 });
     for (level, steps) in [(0, [88, 0]), (1, [255, 255]), (1, [0, 255])] {
@@ -220,12 +220,12 @@ fn steps_that_no_stream_has_are_an_error() {
     }
 }
 
-/// A level of a bowl that is coded coarsely, its map, and its truth.
-fn noisy() -> (Coloured, KernelMap, Vec<Ycc>) {
+/// A coarsely coded level of a paraboloid, its kernel map, and its original colours.
+fn noisy() -> (LevelColours, KernelMap, Vec<Ycc>) {
     let case = Case::bowl(7, 6);
     let steps = Steps { luma: 44, chroma: 52 };
-    let (_, coloured) = case.encode(Isa::detect(), 3, 1 << 14, steps);
-    (coloured, case.maps[6].clone(), case.truth(steps).level(6).to_vec())
+    let (_, colours) = case.encode(Isa::detect(), 3, 1 << 14, steps);
+    (colours, case.maps[6].clone(), case.truth(steps).level(6).to_vec())
 }
 
 fn squared_error(values: &[[u8; 3]], truth: &[Ycc]) -> f64 {
@@ -238,11 +238,11 @@ fn squared_error(values: &[[u8; 3]], truth: &[Ycc]) -> f64 {
 }
 
 #[test]
-fn a_fitted_filter_brings_colours_nearer_and_its_payload_comes_back() {
-    let (coloured, map, truth) = noisy();
-    let filter = Filter::fit(Isa::detect(), &coloured, &map, &truth).expect("noise to take out");
-    let before = squared_error(&coloured.rgb(), &truth);
-    let filtered = filter.rgb(Isa::detect(), &coloured, &map);
+fn a_fitted_filter_reduces_the_error_and_its_payload_round_trips() {
+    let (colours, map, truth) = noisy();
+    let filter = Filter::fit(Isa::detect(), &colours, &map, &truth).expect("noise to remove");
+    let before = squared_error(&colours.rgb(), &truth);
+    let filtered = filter.rgb(Isa::detect(), &colours, &map);
     assert!(squared_error(&filtered, &truth) < 0.95 * before);
     let bytes = filter.to_bytes();
     assert_eq!(Filter::parse(&bytes, 0).unwrap(), filter);
@@ -250,39 +250,39 @@ fn a_fitted_filter_brings_colours_nearer_and_its_payload_comes_back() {
         assert!(Filter::parse(wrong, 7).unwrap_err().to_string().contains("byte 7"));
     }
     for isa in Isa::available() {
-        assert_eq!(filter.rgb(isa, &coloured, &map), filtered, "{isa}");
+        assert_eq!(filter.rgb(isa, &colours, &map), filtered, "{isa}");
     }
 }
 
 #[test]
-fn one_pass_is_what_its_definition_says() {
-    let (coloured, map, _) = noisy();
+fn one_pass_matches_its_definition() {
+    let (colours, map, _) = noisy();
     let weights = [[10i8, -3, 40, 7, 127], [-128, 0, 1, 2, 3], [0; 5]];
     let bytes: Vec<u8> = [1]
         .into_iter()
         .chain(weights.iter().flatten().map(|w| *w as u8))
         .collect();
-    let filtered = Filter::parse(&bytes, 0).unwrap().rgb(Isa::detect(), &coloured, &map);
-    let units = coloured.steps().units().map(i64::from);
-    for (voxel, own) in coloured.values().iter().enumerate() {
+    let filtered = Filter::parse(&bytes, 0).unwrap().rgb(Isa::detect(), &colours, &map);
+    let units = colours.steps().units().map(i64::from);
+    for (voxel, own) in colours.values().iter().enumerate() {
         let mut expected = *own;
         for t in 0..3 {
             let (mut terms, mut counts) = ([0i64; 5], 0);
             for (k, &neighbour) in map.row(voxel).iter().enumerate() {
-                let off = [k % 3, k / 3 % 3, k / 9].iter().filter(|x| **x != 1).count();
-                if neighbour == KernelMap::ABSENT || off == 0 {
+                let axes = [k % 3, k / 3 % 3, k / 9].iter().filter(|x| **x != 1).count();
+                if neighbour == KernelMap::ABSENT || axes == 0 {
                     continue;
                 }
-                let count = [20, 12, 7][off - 1];
+                let count = [20, 12, 7][axes - 1];
                 counts += count;
-                let d = i64::from(coloured.values()[neighbour as usize][t]) - i64::from(own[t]);
+                let d = i64::from(colours.values()[neighbour as usize][t]) - i64::from(own[t]);
                 let response = |tenths: i64| {
                     let r = ((1 << 24) / (units[t] * tenths / 10).max(1)).min(1 << 16);
                     let x = ((d.abs() * r) >> 12).min(4096);
                     count * ((d * (4096 - ((x * x) >> 12))) >> 12)
                 };
-                terms[off - 1] += response(7);
-                terms[if off == 1 { 3 } else { 4 }] += response(28);
+                terms[axes - 1] += response(7);
+                terms[if axes == 1 { 3 } else { 4 }] += response(28);
             }
             let sum: i64 = (0..5)
                 .map(|j| i64::from(weights[t][j]) * ((terms[j] * (65536 / counts.max(1))) >> 14))
@@ -298,13 +298,13 @@ fn one_pass_is_what_its_definition_says() {
 }
 
 #[test]
-fn a_root_that_no_colour_has_is_an_error() {
+fn a_root_with_invalid_chroma_is_an_error() {
     let case = Case::bowl(5, 5);
     let steps = Steps { luma: 32, chroma: 32 };
     let (mut payloads, _) = case.encode(Isa::detect(), 3, 100, steps);
     for chroma in [i16::MIN, -256, 256, i16::MAX] {
         payloads[0][0][4..6].copy_from_slice(&chroma.to_le_bytes());
         let error = case.decode(Isa::detect(), 3, 100, &payloads).unwrap_err();
-        assert!(error.to_string().contains("root's chroma"), "{error}");
+        assert!(error.to_string().contains("chroma of the root"), "{error}");
     }
 }

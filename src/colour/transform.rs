@@ -1,14 +1,15 @@
-//! The transform of a node's children: up to seven two-point butterflies, as in RAHT.
+//! The transform of a node's children: up to seven two-point butterflies, as in RAHT (`docs/format.md`, clause 5.5).
 //!
-//! Children are joined along z, then y, then x. Two values a and b that stand for `v` and `w` children become their difference `b − a` and their
-//! mean `a + ⌊(b − a)·w / (v + w)⌋`; a value without a partner passes through. In the end the mean of all is left in place 0, and each join
-//! has left a difference in its *slot*: 0 along x, 1 and 2 along y, 3 to 6 along z. Means are integers of the same scale, so the
-//! transform is undone exactly (de Queiroz and Chou, doi 10.1109/TIP.2016.2575005; without their normalisation, which is in [`SCALE`]).
+//! Children are joined pairwise along z, then y, then x. Let a and b be values that represent `v` and `w` children. A
+//! join replaces them by their difference `b − a` and their mean `a + ⌊(b − a)·w / (v + w)⌋`. A value without a partner
+//! passes through. The mean of all children ends in octant 0. Each join leaves a difference in its *slot*: 0 along x, 1
+//! and 2 along y, 3 to 6 along z. All means are integers of one scale, so the transform is exactly reversible. RAHT (de
+//! Queiroz and Chou, doi 10.1109/TIP.2016.2575005) normalises the differences; here [`SCALE`] does so in quantisation.
 
-/// A join: its slot, and the places of its two values.
+/// A join: its slot, and the octants of its two values.
 type Join = (usize, usize, usize);
 
-/// All joins in the order of the transform.
+/// All joins in the order of the forward transform.
 const JOINS: [Join; 7] = [
     (3, 0, 4),
     (4, 1, 5),
@@ -19,15 +20,15 @@ const JOINS: [Join; 7] = [
     (0, 0, 1),
 ];
 
-/// Of every slot, along which axis it joins: 2 for z, 1 for y, 0 for x.
+/// Axis of every slot: 0 x, 1 y, 2 z.
 pub(super) const AXIS: [usize; 7] = [0, 1, 1, 2, 2, 2, 2];
 
-/// The joins of a node whose children are known, in the order in which coefficients are coded: the last join of the transform first.
+/// Active joins of a node, in the order in which their coefficients are coded: that of the inverse transform.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Joins {
     pub count: usize,
     slots: [u8; 7],
-    /// Of each slot, how many children its two values stand for.
+    /// Number of children that the two values of each slot represent; 0 for an inactive slot.
     weights: [[u8; 2]; 7],
 }
 
@@ -43,23 +44,23 @@ impl Joins {
         self.slots[..self.count].iter().map(|&slot| usize::from(slot))
     }
 
-    /// How many children the two values of a slot stand for.
+    /// Number of children that the two values of a slot represent.
     #[inline(always)]
     pub fn weights(&self, slot: usize) -> [usize; 2] {
         self.weights[slot].map(usize::from)
     }
 }
 
-/// The joins of every occupancy.
+/// Active joins by occupancy.
 pub(super) static JOINS_OF: [Joins; 256] = {
     let mut all = [Joins::NONE; 256];
     let mut mask = 0;
     while mask < 256 {
         let mut weights = [0u8; 8];
-        let mut place = 0;
-        while place < 8 {
-            weights[place] = (mask >> place & 1) as u8;
-            place += 1;
+        let mut octant = 0;
+        while octant < 8 {
+            weights[octant] = (mask >> octant & 1) as u8;
+            octant += 1;
         }
         let mut joins = Joins::NONE;
         let mut slots = [0u8; 7];
@@ -85,26 +86,27 @@ pub(super) static JOINS_OF: [Joins; 256] = {
     all
 };
 
-/// The place of the two values of each slot.
+/// Octants of the two values of each slot.
 #[cfg(test)]
-const PLACES: [[usize; 2]; 7] = {
-    let mut places = [[0; 2]; 7];
+const OCTANTS: [[usize; 2]; 7] = {
+    let mut octants = [[0; 2]; 7];
     let mut i = 0;
     while i < 7 {
         let (slot, a, b) = JOINS[i];
-        places[slot] = [a, b];
+        octants[slot] = [a, b];
         i += 1;
     }
-    places
+    octants
 };
 
-/// Transforms the values of the children in `mask`, place by octant: the mean, and the difference of each slot.
+/// Transforms the values of the children in `mask`, indexed by octant. Returns the mean and the difference of each
+/// slot.
 #[inline(always)]
 pub(super) fn forward(mask: u8, mut values: [[i32; 3]; 8]) -> ([i32; 3], [[i32; 3]; 7]) {
     let mut differences = [[0; 3]; 7];
-    let mut there = mask;
+    let mut occupied = mask;
     for (slot, a, b) in JOINS {
-        match (there >> a & 1, there >> b & 1) {
+        match (occupied >> a & 1, occupied >> b & 1) {
             (1, 1) => {
                 let [v, w] = JOINS_OF[usize::from(mask)].weights(slot).map(|w| w as i32);
                 for k in 0..3 {
@@ -116,12 +118,12 @@ pub(super) fn forward(mask: u8, mut values: [[i32; 3]; 8]) -> ([i32; 3], [[i32; 
             (0, 1) => values[a] = values[b],
             _ => (),
         }
-        there |= (there >> b & 1) << a;
+        occupied |= (occupied >> b & 1) << a;
     }
     (values[0], differences)
 }
 
-/// Undoes [`forward`].
+/// Inverse of [`forward`]: values of the children by octant.
 #[inline(always)]
 pub(super) fn inverse(mask: u8, mean: [i32; 3], differences: &[[i32; 3]; 7]) -> [[i32; 3]; 8] {
     let mut values = [[0; 3]; 8];
@@ -141,7 +143,7 @@ pub(super) fn inverse(mask: u8, mean: [i32; 3], differences: &[[i32; 3]; 7]) -> 
     values
 }
 
-/// Of every place that is the second of joins, the children that its value can stand for when its last join comes.
+/// For the second octant of every join, the children that its value can represent at that join.
 const REACH: [u8; 8] = [
     0xff,
     0b1010_1010,
@@ -153,10 +155,10 @@ const REACH: [u8; 8] = [
     1 << 7,
 ];
 
-/// By how much the mean lies above the first of two values.
+/// Difference of the mean to the first of two values.
 #[inline(always)]
 fn share(difference: i32, v: i32, w: i32) -> i32 {
-    // A division by a constant is a multiplication; sums are at most 8.
+    // The compiler turns a division by a constant into a multiplication. `v + w` is at most 8.
     let product = difference * w;
     match v + w {
         2 => product >> 1,
@@ -169,14 +171,14 @@ fn share(difference: i32, v: i32, w: i32) -> i32 {
     }
 }
 
-/// What makes differences orthonormal, `√(vw / (v + w))`, and its inverse, in units of 2⁻¹², of weights up to 4.
+/// Factor that makes a difference orthonormal, `√(vw / (v + w))`, and its inverse, in units of 2⁻¹².
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Scale {
     pub forward: i32,
     pub inverse: i32,
 }
 
-/// [`Scale`] by the weights of both values.
+/// [`Scale`] by the numbers of children `v` and `w`, each 1 to 4.
 pub(super) static SCALE: [[Scale; 5]; 5] = {
     let mut table = [[Scale {
         forward: 1 << 12,
@@ -200,25 +202,25 @@ pub(super) static SCALE: [[Scale; 5]; 5] = {
 
 /// `round(2¹²·√(numerator / denominator))`.
 const fn nearest_root(numerator: u64, denominator: u64) -> u64 {
-    // (2·root ± 1)² is compared, so that halves round as they should.
+    // ⌊√(4·square)⌋ = ⌊2·√square⌋: halving it, rounded up, rounds the root to the nearest integer.
     let square = (numerator << 26) / denominator;
     let twice = square.isqrt();
     twice.div_ceil(2)
 }
 
-/// [`SCALE`] of lossless colours, whose differences are coded as they are.
+/// Scale of lossless colours, whose differences are not scaled.
 pub(super) const UNSCALED: Scale = Scale {
     forward: 1 << 12,
     inverse: 1 << 12,
 };
 
-/// The place of the first value of each slot, and of the second.
+/// Octants of the first and the second value of a slot.
 #[cfg(test)]
-pub(super) const fn places(slot: usize) -> [usize; 2] {
-    PLACES[slot]
+pub(super) const fn octants(slot: usize) -> [usize; 2] {
+    OCTANTS[slot]
 }
 
-#[allow(clippy::needless_range_loop)] // tables are indexed as their definitions are
+#[allow(clippy::needless_range_loop)] // indices as in the tables' definitions
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -254,7 +256,7 @@ mod tests {
             let joins = &JOINS_OF[usize::from(mask)];
             assert_eq!(joins.count, mask.count_ones() as usize - 1);
             for slot in joins.slots() {
-                let [a, b] = places(slot);
+                let [a, b] = octants(slot);
                 assert!(a < b && joins.weights(slot).iter().all(|w| (1..=4).contains(w)));
             }
         }

@@ -1,58 +1,58 @@
-//! Chunks: typed, numbered, checked pieces of a section.
+//! Chunks: the typed, numbered and checksummed parts of a section (`docs/format.md`, clauses 3.1 and 8.1).
 
 use super::malformed;
 use super::reader::{Reader, put_varint};
 use crate::error::{Error, Result};
 
-/// How the bytes of a chunk before its payload are written.
+/// Encoding of a chunk's header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Form {
-    /// Of version 2: all numbers in their full width.
+    /// Version 2: numbers of fixed width.
     Fixed,
-    /// Of version 3: numbers as short as they are.
+    /// Version 3: numbers as varints.
     Short,
 }
 
-/// Bytes of a chunk of version 2 before its checksum.
-const FIXED: usize = 12;
-/// Chunk types from here on may be skipped.
+/// Bytes of a chunk header of version 2, without the checksum.
+const FIXED_HEADER: usize = 12;
+/// Chunk types from here on are ancillary: a reader skips them.
 const ANCILLARY: u8 = 128;
 
-/// What a chunk holds.
+/// The kind of a chunk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ChunkKind {
     /// A slice of the octree.
     Geometry,
-    /// A slice of the latents.
+    /// A slice of the latents (version 2).
     Features,
-    /// A correction of colours.
+    /// A colour filter (version 2).
     Filter,
-    /// A slice of what colours are still off.
+    /// A slice of the colour residual (version 2).
     Residual,
-    /// The first levels of the octree, in one.
+    /// The first levels of the octree (version 3).
     GeometryTrunk,
-    /// The colours of the first levels, in one.
+    /// The colours of the first levels (version 3).
     ColourTrunk,
-    /// A slice of the colours of a level.
+    /// A slice of the colours of a level (version 3).
     Colours,
-    /// The filter of the colours of a level.
+    /// The colour filter of a level (version 3).
     PostFilter,
-    /// Something that a reader may skip: its type, 128 to 255.
+    /// A chunk that a reader skips, of type 128 to 255.
     Ancillary(u8),
 }
 
-/// One chunk whose checksum is right.
+/// A chunk with a valid checksum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chunk<'a> {
-    /// What it holds.
+    /// The kind.
     pub kind: ChunkKind,
-    /// The level that it belongs to.
+    /// The level.
     pub level: u8,
-    /// Its number within level and kind.
+    /// Slice number within the level and kind.
     pub slice: u16,
-    /// How many voxels it describes; of a slice of colours, how many parents.
+    /// Number of voxels of the slice; for [`ChunkKind::Colours`], of parents.
     pub count: u32,
-    /// Its content.
+    /// The payload.
     pub payload: &'a [u8],
     /// Byte offset of the chunk in the stream.
     pub offset: usize,
@@ -60,7 +60,7 @@ pub struct Chunk<'a> {
     pub payload_at: usize,
 }
 
-/// The chunks of a section.
+/// Iterator over the chunks of a section.
 #[derive(Debug, Clone)]
 pub struct Chunks<'a> {
     form: Form,
@@ -68,7 +68,7 @@ pub struct Chunks<'a> {
     end: usize,
 }
 
-/// The kinds of each form with their codes and names.
+/// Form, type number and name of each kind.
 const KINDS: [(Form, u8, ChunkKind, &str); 9] = [
     (Form::Fixed, 1, ChunkKind::Geometry, "geometry"),
     (Form::Fixed, 2, ChunkKind::Features, "feature"),
@@ -112,7 +112,7 @@ impl std::fmt::Display for ChunkKind {
 }
 
 impl Chunk<'_> {
-    /// Appends the chunk to `out`, `prefix` before its payload. The offsets play no part.
+    /// Appends the chunk to `out`. Its payload is `prefix`, then `self.payload`. The offsets are ignored.
     ///
     /// # Errors
     /// [`Error::Usage`] if the payload is 4 GiB or more.
@@ -146,7 +146,7 @@ impl Chunk<'_> {
 }
 
 impl<'a> Chunks<'a> {
-    /// The chunks of the section `range` of a stream, which lies within its bytes.
+    /// The chunks of the section `range`, which must lie within the stream.
     pub(super) fn new(form: Form, stream: &'a [u8], range: std::ops::Range<usize>) -> Self {
         Chunks {
             form,
@@ -158,8 +158,8 @@ impl<'a> Chunks<'a> {
     fn read(&mut self) -> Result<Chunk<'a>> {
         let start = self.reader.at();
         let [code, level, slice, count, length] = match self.form {
-            Form::Fixed => self.fixed_head()?,
-            Form::Short => self.short_head()?,
+            Form::Fixed => self.fixed_header()?,
+            Form::Short => self.short_header()?,
         };
         let head = self.reader.since(start);
         let expected = self.reader.u32("chunk checksum")?;
@@ -168,7 +168,7 @@ impl<'a> Chunks<'a> {
         let found = crc32c::crc32c_append(crc32c::crc32c(head), payload);
         if found != expected {
             return Err(Error::ChecksumMismatch {
-                what: format!("a chunk that calls itself type {code}, level {level}, slice {slice}"),
+                what: format!("a chunk of stated type {code}, level {level}, slice {slice}"),
                 offset: start as u64,
                 expected,
                 found,
@@ -177,7 +177,7 @@ impl<'a> Chunks<'a> {
         let Some(kind) = ChunkKind::of(self.form, code as u8) else {
             return Err(Error::Unsupported {
                 what: "this chunk type",
-                detail: format!("byte {start} has type {code}, which only a later version knows"),
+                detail: format!("byte {start} has type {code}, which this version does not define"),
             });
         };
         let Ok(slice) = slice.try_into() else {
@@ -194,10 +194,10 @@ impl<'a> Chunks<'a> {
         })
     }
 
-    /// Type, level, slice, count and length of a chunk.
-    fn fixed_head(&mut self) -> Result<[u32; 5]> {
-        // Together, so that one error tells how much of it is missing.
-        let head: [u8; FIXED] = self.reader.array("chunk header")?;
+    /// Reads type, level, slice, count and length in the form of version 2.
+    fn fixed_header(&mut self) -> Result<[u32; 5]> {
+        // Read at once, so that the error states all missing bytes.
+        let head: [u8; FIXED_HEADER] = self.reader.array("chunk header")?;
         let mut head = Reader::new(&head, 0);
         let field = "chunk header";
         Ok([
@@ -209,7 +209,8 @@ impl<'a> Chunks<'a> {
         ])
     }
 
-    fn short_head(&mut self) -> Result<[u32; 5]> {
+    /// Reads type, level, slice, count and length in the form of version 3.
+    fn short_header(&mut self) -> Result<[u32; 5]> {
         let reader = &mut self.reader;
         Ok([
             reader.u8("chunk type")?.into(),
@@ -220,7 +221,7 @@ impl<'a> Chunks<'a> {
         ])
     }
 
-    /// The next chunk that is not ancillary; it must be this one, with a count in `counts`.
+    /// Reads the next critical chunk, which must have this kind, level and slice, and a count in `counts`.
     pub(super) fn expect(
         &mut self,
         kind: ChunkKind,
@@ -228,50 +229,50 @@ impl<'a> Chunks<'a> {
         slice: u64,
         counts: std::ops::RangeInclusive<u64>,
     ) -> Result<Chunk<'a>> {
-        let wanted = || format!("{kind} chunk of level {level}, slice {slice}");
+        let expected_chunk = || format!("{kind} chunk of level {level}, slice {slice}");
         let fits = |chunk: &Chunk| chunk.level == level && u64::from(chunk.slice) == slice;
-        let chunk = self.expect_kind(kind, fits, wanted)?;
+        let chunk = self.expect_kind(kind, fits, expected_chunk)?;
         if !counts.contains(&chunk.count.into()) {
-            let field = format!("voxel count of the {}", wanted());
+            let field = format!("voxel count of the {}", expected_chunk());
             let expected = format!("{} to {}", counts.start(), counts.end());
             return Err(malformed(chunk.offset, field, chunk.count, expected));
         }
         Ok(chunk)
     }
 
-    /// The next chunk that is not ancillary; it must be of this kind, slice 0, with a level in `levels`.
+    /// Reads the next critical chunk, which must have this kind, slice 0, and a level in `levels`.
     pub(super) fn expect_up_to(&mut self, kind: ChunkKind, levels: std::ops::RangeInclusive<u8>) -> Result<Chunk<'a>> {
         let (first, last) = (levels.start(), levels.end());
-        let wanted = || format!("{kind} chunk of a level from {first} to {last}, slice 0");
+        let expected_chunk = || format!("{kind} chunk of a level from {first} to {last}, slice 0");
         let fits = |chunk: &Chunk| levels.contains(&chunk.level) && chunk.slice == 0;
-        self.expect_kind(kind, fits, wanted)
+        self.expect_kind(kind, fits, expected_chunk)
     }
 
     fn expect_kind(
         &mut self,
         kind: ChunkKind,
         fits: impl Fn(&Chunk) -> bool,
-        wanted: impl Fn() -> String,
+        expected_chunk: impl Fn() -> String,
     ) -> Result<Chunk<'a>> {
         let Some(chunk) = self.next_critical()? else {
-            return Err(malformed(self.end, "end of the section", "here", wanted()));
+            return Err(malformed(self.end, "end of the section", "here", expected_chunk()));
         };
         if chunk.kind == kind && fits(&chunk) {
             return Ok(chunk);
         }
         let found = format!("{} of level {}, slice {}", chunk.kind, chunk.level, chunk.slice);
-        Err(malformed(chunk.offset, "chunk", found, wanted()))
+        Err(malformed(chunk.offset, "chunk", found, expected_chunk()))
     }
 
-    /// The next chunk that is not ancillary, without taking it.
+    /// The next critical chunk, without consuming it.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// Those of reading that chunk.
     pub(super) fn peek(&self) -> Result<Option<Chunk<'a>>> {
         self.clone().next_critical()
     }
 
-    /// Fails unless nothing but ancillary chunks is left.
+    /// Checks that only ancillary chunks remain.
     pub(super) fn finish(&mut self) -> Result<()> {
         match self.next_critical()? {
             None => Ok(()),
@@ -302,7 +303,7 @@ impl<'a> Iterator for Chunks<'a> {
         }
         let chunk = self.read();
         if chunk.is_err() {
-            // Where the next one starts is not known.
+            // The start of the next chunk is unknown.
             self.end = self.reader.at();
         }
         Some(chunk)

@@ -1,4 +1,4 @@
-//! The bytes of a stream as they arrive, and which level they allow to decode next.
+//! A stream that arrives in parts, and the next level that can be decoded from them.
 
 use std::borrow::Cow;
 
@@ -6,39 +6,40 @@ use super::{Header, Level, MAGIC};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 
-/// Where decoding is to end.
+/// The level at which decoding ends.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Goal {
-    /// A level with Gaussians; without one named, the finest that has them, and the rest of the stream must be sound.
+    /// The given level, which must have Gaussians. `None` is the finest level that has them; then the rest of the
+    /// stream must be valid, too.
     Gaussians(Option<u8>),
-    /// A level, Gaussians or not.
+    /// The given level, with or without Gaussians.
     Exact(u8),
 }
 
-/// A stream as far as it has come.
+/// The received part of a stream.
 #[derive(Debug)]
 pub(crate) struct Feed<'b> {
     goal: Goal,
-    /// The stream as far as it is needed.
+    /// The received bytes, without those that decoding does not need.
     bytes: Cow<'b, [u8]>,
-    /// How much of the stream has come, needed or not.
+    /// Number of received bytes, needed or not.
     length: u64,
     opened: Option<Opened>,
     failed: bool,
 }
 
-/// What is known once the header is there.
+/// State after the header was parsed.
 #[derive(Debug)]
 struct Opened {
     header: Header,
     /// The last level to decode.
     last: u8,
-    /// Bytes of the stream that can be of use.
+    /// Number of bytes that decoding can need.
     end: u64,
 }
 
 pub(crate) fn failed_before() -> Error {
-    Error::Usage("decoding has failed before, and goes no further".into())
+    Error::Usage("decoding has failed before and cannot continue".into())
 }
 
 impl<'b> Feed<'b> {
@@ -52,7 +53,7 @@ impl<'b> Feed<'b> {
         }
     }
 
-    /// Takes the next bytes. No more are kept than the header, once it is there, says are needed.
+    /// Appends received bytes. After the header was parsed, bytes that decoding does not need are dropped.
     pub(crate) fn push(&mut self, bytes: &[u8]) {
         self.length += bytes.len() as u64;
         let room = match &self.opened {
@@ -82,13 +83,14 @@ impl<'b> Feed<'b> {
         }
     }
 
-    /// Nothing is decoded any more.
+    /// Stops all further decoding.
     pub(crate) fn fail(&mut self) {
         self.failed = true;
     }
 
-    /// The level to decode next, if that is possible already: `reached` is the one decoded last, and `ended` tells that all bytes have come.
-    /// `plan` is asked once for the last level to decode, and holds what that takes against the limits.
+    /// The level to decode next, if enough bytes have been received. `reached` is the level decoded last, `ended`
+    /// whether all bytes have been received. `plan` is called once: it returns the last level to decode and checks its
+    /// cost against the limits.
     pub(crate) fn next_level(
         &mut self,
         ended: bool,
@@ -110,21 +112,21 @@ impl<'b> Feed<'b> {
             }
             return Ok(None);
         }
-        let whole = self.length >= header.prefix_bytes(next)?;
+        let complete = self.length >= header.prefix_bytes(next)?;
         let cut_before = next > header.base && self.length == header.prefix_bytes(next - 1)?;
-        let wait = !whole && (!ended || (!named && cut_before));
+        let wait = !complete && (!ended || (!named && cut_before));
         Ok((!wait).then_some(next))
     }
 
-    /// The level after `level`, if it is to be decoded and all its bytes have come.
+    /// The level after `level`, if it is to be decoded and all its bytes have been received.
     pub(crate) fn after(&self, level: u8) -> Option<u8> {
         let Opened { header, last, .. } = self.opened.as_ref()?;
         let next = level + 1;
-        let whole = next <= *last && self.length >= header.prefix_bytes(next).ok()?;
-        whole.then_some(next)
+        let complete = next <= *last && self.length >= header.prefix_bytes(next).ok()?;
+        complete.then_some(next)
     }
 
-    /// Reads the header, if it is whole.
+    /// Parses the header, if it is complete.
     fn open(&mut self, ended: bool, limits: &Limits, plan: impl FnOnce(&Header, Goal) -> Result<u8>) -> Result<()> {
         if !ended && self.bytes.len() < MAGIC.len() {
             return Ok(());
@@ -142,7 +144,7 @@ impl<'b> Feed<'b> {
         Ok(())
     }
 
-    /// Fails unless the levels from `next` on are sound, or the stream ends between two of them.
+    /// Checks that the levels from `next` on are valid, or that the stream ends between two of them.
     fn check_rest(&self, header: &Header, next: u8) -> Result<()> {
         for level in next..=header.top {
             if self.length == header.prefix_bytes(level - 1)? {

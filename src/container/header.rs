@@ -1,4 +1,4 @@
-//! The header: everything a reader must know before it reserves memory.
+//! The header: all that a reader must know before it allocates memory (`docs/format.md`, clause 2.2).
 
 use super::malformed;
 use super::reader::Reader;
@@ -6,25 +6,25 @@ use crate::error::{Error, Result};
 use crate::limits::{Limits, MAX_DEPTH};
 use crate::placement::Placement;
 
-/// The first bytes: not text, and changed by whatever changes line ends.
+/// The first bytes of a stream. They are not text, and detect conversion of line ends.
 pub const MAGIC: [u8; 8] = [0x89, b'B', b'2', b'P', b'\r', b'\n', 0x1a, b'\n'];
-/// The most voxels of a slice.
+/// Maximum number of voxels of a slice.
 pub const MAX_SLICE_VOXELS: u32 = 16_384;
-/// The most parents of a slice of colours in version 3.
+/// Maximum number of parents of a slice of colours (version 3).
 pub const MAX_COLOUR_SLICE: u32 = 65_536;
 
-/// The minor version that is written.
+/// The minor version written.
 const MINOR: u16 = 0;
 
-/// What differs between the versions of the format.
+/// Version of the format, with the fields that only it has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// Version 2: learned latents.
     Learned {
-        /// The hash of the exact part of the model that they were coded with.
+        /// Identity of the model that they were coded with: a hash of its exact part.
         model: [u8; 16],
     },
-    /// Version 3: transform coefficients, which no model file is needed for.
+    /// Version 3: transform coefficients, decoded without a model file.
     Transform {
         /// Parents per slice of colours, 1 to [`MAX_COLOUR_SLICE`].
         colour_slice: u32,
@@ -40,7 +40,7 @@ impl Format {
         }
     }
 
-    /// The most levels of a stream.
+    /// Maximum number of levels of a stream.
     fn max_levels(&self) -> u8 {
         match self {
             Format::Learned { .. } => 3,
@@ -48,13 +48,13 @@ impl Format {
         }
     }
 
-    /// Whether the finest level of the cloud, N, may be coded.
-    fn codes_the_finest(&self) -> bool {
+    /// Whether the finest level of the cloud, N, can be coded.
+    fn codes_finest_level(&self) -> bool {
         matches!(self, Format::Transform { .. })
     }
 
-    /// Bytes before the arrays.
-    fn fixed(&self) -> usize {
+    /// Bytes of the header before its arrays.
+    fn fixed_bytes(&self) -> usize {
         match self {
             Format::Learned { .. } => 84,
             Format::Transform { .. } => 72,
@@ -62,7 +62,8 @@ impl Format {
     }
 }
 
-/// The major version of a stream that starts with these bytes; `None` if they are too few or none of a stream's.
+/// The major version of a stream that starts with these bytes. `None` if they are too few, or not the start of a
+/// stream.
 pub fn version(bytes: &[u8]) -> Option<u16> {
     let rest = bytes.strip_prefix(&MAGIC)?;
     Some(u16::from_le_bytes([*rest.first()?, *rest.get(1)?]))
@@ -75,71 +76,71 @@ pub struct Header {
     pub optional_flags: u32,
     /// N: the cloud's voxels are those of this level.
     pub bits: u8,
-    /// L: the level whose latents are coded without prediction.
+    /// L: the first level that has a colour section.
     pub base: u8,
     /// M: the last level.
     pub top: u8,
-    /// Occupied voxels at level N.
+    /// Number of occupied voxels of level N.
     pub points: u64,
-    /// Where the cube lies in the world.
+    /// Placement of the cube in the world.
     pub placement: Placement,
-    /// How colours are coded: the version of the stream.
+    /// The version, which defines how colours are coded.
     pub format: Format,
     /// S: voxels per slice of the geometry and, in version 2, of the features.
     pub slice_voxels: u32,
-    /// Voxels of level L, …, M.
+    /// Number of voxels of level L, …, M.
     pub voxels: Vec<u32>,
-    /// Bytes of level L, …, M.
+    /// Section lengths of level L, …, M.
     pub sections: Vec<Section>,
 }
 
-/// How long a level's sections are.
+/// Lengths of a level's sections, in bytes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Section {
-    /// Bytes of the geometry.
+    /// Bytes of the geometry section.
     pub geometry: u32,
-    /// Bytes of the colours: in version 2, the features.
+    /// Bytes of the colour section.
     pub colours: u32,
 }
 
 impl Section {
-    /// Bytes of both.
+    /// Bytes of both sections.
     pub fn bytes(&self) -> u64 {
         u64::from(self.geometry) + u64::from(self.colours)
     }
 }
 
 impl Header {
-    /// Reads the header from the start of a stream. Levels need not follow.
+    /// Parses the header at the start of `bytes`. The levels need not follow.
     ///
     /// # Errors
-    /// [`Error::Truncated`], [`Error::ChecksumMismatch`], [`Error::Unsupported`] for another version or unknown critical flags,
-    /// [`Error::Malformed`] for what the format forbids, [`Error::LimitExceeded`].
+    /// [`Error::Truncated`], [`Error::ChecksumMismatch`], [`Error::Unsupported`] for another version or unknown
+    /// critical flags, [`Error::Malformed`] for values that the format forbids, [`Error::LimitExceeded`].
     pub fn parse(bytes: &[u8], limits: &Limits) -> Result<Self> {
-        let known = bytes.len().min(MAGIC.len());
-        if bytes[..known] != MAGIC[..known] {
-            let found = format!("{:02x?}", &bytes[..known]);
+        let length = bytes.len().min(MAGIC.len());
+        if bytes[..length] != MAGIC[..length] {
+            let found = format!("{:02x?}", &bytes[..length]);
             return Err(malformed(0, "magic", found, format!("{MAGIC:02x?}")));
         }
         let mut reader = Reader::new(bytes, 0);
         reader.take(MAGIC.len(), "magic")?;
         let major = reader.u16("version")?;
         reader.u16("version")?;
-        // What follows is read in place of these.
+        // Placeholders: the fields are read below.
         let mut format = match major {
             2 => Format::Learned { model: [0; 16] },
             3 => Format::Transform { colour_slice: 0 },
             _ => {
                 return Err(Error::Unsupported {
                     what: "this stream version",
-                    detail: format!("found {major}, 2 or 3 would do"),
+                    detail: format!("found version {major}, supported are 2 and 3"),
                 });
             }
         };
         let critical_flags = reader.u32("critical flags")?;
         let optional_flags = reader.u32("optional flags")?;
         let [bits, base, top, reserved] = reader.array("levels")?;
-        // The checksum's place depends on these two, so they are looked at before it is.
+        // The position of the checksum depends on `base` and `top`, so they are checked first.
         check_levels(&format, base, top)?;
         let levels = usize::from(top - base + 1);
         let points = reader.u64("points")?;
@@ -179,7 +180,7 @@ impl Header {
         if critical_flags != 0 {
             return Err(Error::Unsupported {
                 what: "this stream",
-                detail: format!("it needs the unknown features {critical_flags:#010x}"),
+                detail: format!("it has the unknown critical flags {critical_flags:#010x}"),
             });
         }
         if reserved != 0 {
@@ -204,7 +205,7 @@ impl Header {
         Ok(header)
     }
 
-    /// The header's bytes.
+    /// Serialises the header.
     pub fn write(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(self.bytes());
         bytes.extend(MAGIC);
@@ -236,12 +237,12 @@ impl Header {
         bytes
     }
 
-    /// Length of the header itself.
+    /// Length of the header in bytes.
     pub fn bytes(&self) -> usize {
-        self.format.fixed() + 12 * self.voxels.len() + 4
+        self.format.fixed_bytes() + 12 * self.voxels.len() + 4
     }
 
-    /// Length of the stream up to and with `level`: what a reader must fetch to decode that level.
+    /// Length of the stream up to and including `level`, in bytes: the prefix that decodes to that level.
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level.
@@ -251,25 +252,25 @@ impl Header {
         Ok(self.bytes() as u64 + sections)
     }
 
-    /// Length of the whole stream.
+    /// Length of the whole stream in bytes.
     pub fn stream_bytes(&self) -> u64 {
         let sections: u64 = self.sections.iter().map(Section::bytes).sum();
         self.bytes() as u64 + sections
     }
 
-    /// Sees that nothing follows the last section in a stream of `length` bytes.
+    /// Checks that nothing follows the last section in a stream of `length` bytes.
     ///
     /// # Errors
-    /// [`Error::Malformed`] if something does.
+    /// [`Error::Malformed`] if bytes follow.
     pub fn check_end(&self, length: u64) -> Result<()> {
         let end = self.stream_bytes();
         match length.saturating_sub(end) {
             0 => Ok(()),
-            rest => Err(malformed(end, "length of what follows the last section", rest, 0)),
+            rest => Err(malformed(end, "number of bytes after the last section", rest, 0)),
         }
     }
 
-    /// Parents per slice of colours; in version 2, as of the geometry.
+    /// Parents per slice of colours; in version 2, that of the geometry.
     pub fn colour_slice(&self) -> u32 {
         match self.format {
             Format::Learned { .. } => self.slice_voxels,
@@ -277,7 +278,7 @@ impl Header {
         }
     }
 
-    /// Where the sections of `level` start.
+    /// Byte offset of the sections of `level`.
     pub(super) fn start(&self, level: u8) -> Result<u64> {
         match self.index(level)? {
             0 => Ok(self.bytes() as u64),
@@ -285,7 +286,7 @@ impl Header {
         }
     }
 
-    /// The voxels of the level before `level`; of the base level, the root.
+    /// Number of voxels of the level above `level`; 1, the root, for the base level.
     pub(super) fn parents(&self, level: u8) -> Result<u64> {
         match self.index(level)? {
             0 => Ok(1),
@@ -293,7 +294,7 @@ impl Header {
         }
     }
 
-    /// How many voxels `level` has.
+    /// Number of voxels of `level`.
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level.
@@ -301,7 +302,7 @@ impl Header {
         Ok(self.voxels[self.index(level)?])
     }
 
-    /// The id of the model that the stream was coded with, hexadecimal; none in version 3.
+    /// Identity of the model that the stream was coded with, in hexadecimal. `None` in version 3.
     pub fn model(&self) -> Option<String> {
         match &self.format {
             Format::Learned { model } => Some(hex(model)),
@@ -309,10 +310,10 @@ impl Header {
         }
     }
 
-    /// Sees that the stream was made with the model of that id.
+    /// Checks that the stream was coded with the model of identity `loaded`.
     ///
     /// # Errors
-    /// [`Error::ModelMismatch`] if it was made with another, [`Error::Unsupported`] if it was made with none, being of version 3.
+    /// [`Error::ModelMismatch`] if it was coded with another model, [`Error::Unsupported`] if it has version 3.
     pub fn check_model(&self, loaded: &[u8; 16]) -> Result<()> {
         match &self.format {
             Format::Learned { model } if model == loaded => Ok(()),
@@ -322,12 +323,12 @@ impl Header {
             }),
             Format::Transform { .. } => Err(Error::Unsupported {
                 what: "this stream",
-                detail: "it has version 3, which has no learned latents; version 2 would do".into(),
+                detail: "it has version 3, which has no latents; version 2 is required".into(),
             }),
         }
     }
 
-    /// Position of a level in `voxels` and `sections`.
+    /// Index of a level in `voxels` and `sections`.
     pub(super) fn index(&self, level: u8) -> Result<usize> {
         if (self.base..=self.top).contains(&level) {
             return Ok(usize::from(level - self.base));
@@ -338,27 +339,32 @@ impl Header {
         )))
     }
 
-    /// Whether the format and `limits` allow all of this.
+    /// Checks all fields against the format and `limits`.
     pub(super) fn check(&self, limits: &Limits) -> Result<()> {
         let (bits, base, top) = (self.bits, self.base, self.top);
         check_levels(&self.format, base, top)?;
-        let least = top + u8::from(!self.format.codes_the_finest());
-        if !(1..=MAX_DEPTH).contains(&bits) || bits < least {
-            let expected = format!("{} to {MAX_DEPTH}", least.max(1));
+        let min_bits = top + u8::from(!self.format.codes_finest_level());
+        if !(1..=MAX_DEPTH).contains(&bits) || bits < min_bits {
+            let expected = format!("{} to {MAX_DEPTH}", min_bits.max(1));
             return Err(malformed(20, "bit depth", bits, expected));
         }
         limits.check_depth("bit depth of the stream", bits)?;
         if !self.placement.is_valid() {
             let value = format!("{:?}", self.placement);
-            return Err(malformed(32, "placement", value, "finite, the size positive"));
+            return Err(malformed(
+                32,
+                "placement",
+                value,
+                "finite numbers and a voxel size above 0",
+            ));
         }
         self.check_slices()?;
-        let fixed = self.format.fixed();
+        let fixed_bytes = self.format.fixed_bytes();
         let levels = usize::from(top - base + 1);
         let lengths = (self.voxels.len(), self.sections.len());
         if lengths != (levels, levels) {
             let value = format!("{lengths:?}");
-            return Err(malformed(fixed, "voxel counts and sections", value, levels));
+            return Err(malformed(fixed_bytes, "voxel counts and sections", value, levels));
         }
         let mut allowed = 1..=1u64 << (3 * base);
         for (i, &count) in self.voxels.iter().enumerate() {
@@ -366,25 +372,25 @@ impl Header {
             if !allowed.contains(&count) {
                 let field = format!("voxel count of level {}", usize::from(base) + i);
                 let expected = format!("{} to {}", allowed.start(), allowed.end());
-                return Err(malformed(fixed + 4 * i, field, count, expected));
+                return Err(malformed(fixed_bytes + 4 * i, field, count, expected));
             }
             limits.check_points("voxel count of a level", count)?;
             allowed = count..=8 * count;
         }
         let finest = *allowed.start();
-        let most = u128::from(finest) << (3 * (bits - top));
-        if self.points < finest || u128::from(self.points) > most {
-            let expected = format!("{finest} to {most}");
+        let max = u128::from(finest) << (3 * (bits - top));
+        if self.points < finest || u128::from(self.points) > max {
+            let expected = format!("{finest} to {max}");
             return Err(malformed(24, "points", self.points, expected));
         }
         limits.check_points("points of the stream", self.points)
     }
 
     fn check_slices(&self) -> Result<()> {
-        let at = self.format.fixed() - 4;
-        let check = |at, field, value, most| match (1..=most).contains(&value) {
+        let at = self.format.fixed_bytes() - 4;
+        let check = |at, field, value, max| match (1..=max).contains(&value) {
             true => Ok(()),
-            false => Err(malformed(at, field, value, format!("1 to {most}"))),
+            false => Err(malformed(at, field, value, format!("1 to {max}"))),
         };
         match self.format {
             Format::Learned { .. } => check(at, "slice size", self.slice_voxels, MAX_SLICE_VOXELS),
@@ -402,10 +408,10 @@ fn hex(id: &[u8; 16]) -> String {
 }
 
 fn check_levels(format: &Format, base: u8, top: u8) -> Result<()> {
-    let most = format.max_levels();
-    let deepest = MAX_DEPTH - u8::from(!format.codes_the_finest());
-    if base > top || top - base >= most || top > deepest {
-        let expected = format!("1 to {most} levels, none deeper than {deepest}");
+    let max = format.max_levels();
+    let deepest = MAX_DEPTH - u8::from(!format.codes_finest_level());
+    if base > top || top - base >= max || top > deepest {
+        let expected = format!("1 to {max} levels, none deeper than {deepest}");
         return Err(malformed(21, "levels", format!("{base} to {top}"), expected));
     }
     Ok(())

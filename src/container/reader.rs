@@ -1,9 +1,9 @@
-//! Little-endian numbers from bytes that may end too early.
+//! Reads little-endian numbers from bytes, with an error where they end early.
 
 use super::malformed;
 use crate::error::{Error, Result, Stage};
 
-/// A place in a byte string.
+/// A position in a byte string.
 #[derive(Debug, Clone)]
 pub struct Reader<'a> {
     bytes: &'a [u8],
@@ -23,7 +23,7 @@ macro_rules! numbers {
 }
 
 impl<'a> Reader<'a> {
-    /// Starts at byte `at`; errors count from byte 0.
+    /// Starts at byte `at`. Offsets in errors count from byte 0.
     pub fn new(bytes: &'a [u8], at: usize) -> Self {
         Reader { bytes, at }
     }
@@ -33,7 +33,7 @@ impl<'a> Reader<'a> {
         self.at
     }
 
-    /// The bytes from `start` up to here.
+    /// The bytes from `start` to the current position.
     pub(super) fn since(&self, start: usize) -> &'a [u8] {
         &self.bytes[start..self.at]
     }
@@ -66,11 +66,11 @@ impl<'a> Reader<'a> {
         Ok(array)
     }
 
-    /// The next number below 2³² in LEB128: seven bits a byte, the lowest first, the top bit set in all bytes but the last, which is not
-    /// zero unless it is the only one.
+    /// The next varint: an unsigned LEB128 number below 2³² in its shortest form (`docs/format.md`, 1.4.2).
     ///
     /// # Errors
-    /// [`Error::Truncated`], [`Error::Malformed`] for a number that is too large or longer than it need be; both name `field`.
+    /// [`Error::Truncated`], [`Error::Malformed`] for a number that is too large or not in its shortest form. Both name
+    /// `field`.
     pub fn varint(&mut self, field: &'static str) -> Result<u32> {
         let (start, mut number) = (self.at, 0u64);
         for shift in (0..35).step_by(7) {
@@ -83,7 +83,7 @@ impl<'a> Reader<'a> {
                 }
             }
         }
-        let expected = "a number below 2^32 in as few bytes as it takes";
+        let expected = "a number below 2^32 in its shortest form";
         let value = format!("{:02x?}", &self.bytes[start..self.at]);
         Err(malformed(start, field, value, expected))
     }
@@ -91,7 +91,7 @@ impl<'a> Reader<'a> {
     numbers!(u8, u16, u32, u64, f64);
 }
 
-/// Appends what [`Reader::varint`] reads.
+/// Appends a varint in the form that [`Reader::varint`] reads.
 pub fn put_varint(out: &mut Vec<u8>, mut number: u32) {
     while number >= 0x80 {
         out.push(number as u8 | 0x80);

@@ -1,4 +1,4 @@
-//! A stream taken apart: its header, and its whole levels.
+//! Splits a stream into its header and its complete levels.
 
 use super::chunk::{Chunk, ChunkKind, Chunks, Form};
 use super::header::{Format, Header};
@@ -8,10 +8,10 @@ use super::transform::{self, Colours};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 
-/// A stream whose header is sound, with the levels that are whole.
+/// A stream with a valid header, and its complete levels.
 ///
-/// A level is whole if all chunks of it and of the levels before are there, in order, with the right checksums and possible voxel
-/// counts. Whether their payloads decode is for the stages that read them.
+/// A level is complete if all its chunks, and those of the levels before, are present, in order, with valid checksums
+/// and possible voxel counts. The payloads are checked by the stages that decode them.
 #[derive(Debug)]
 pub struct Stream<'a> {
     header: Header,
@@ -20,55 +20,56 @@ pub struct Stream<'a> {
     length: u64,
 }
 
-/// The most colour filters of a level.
+/// Maximum number of colour filters of a level (version 2).
 pub(super) const FILTERS: usize = 2;
 
-/// A whole level.
+/// A complete level.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Level<'a> {
-    /// Its number.
+    /// The level.
     pub level: u8,
-    /// How many voxels it has.
+    /// Number of voxels.
     pub voxels: u32,
-    /// The octree from the level before to this one; in the base level from level 0, one entry per level.
+    /// Occupancies of the level above; in the base level, of all levels from level 0 on, one entry per level.
     pub geometry: Vec<Geometry<'a>>,
-    /// The latents, one entry per slice; none if the level has no latents.
+    /// The latents, one entry per slice; empty if the level has none.
     pub features: Vec<Slice<'a>>,
     /// XXH3-64 of the latents, 0 if there are none.
     pub latent_hash: u64,
-    /// Corrections of the colours that the best and the quick heads generate.
+    /// Colour filters for the best and for the quick heads.
     pub filters: [Option<Slice<'a>>; FILTERS],
-    /// What the colours are still off, one entry per slice; none if the stream does not say.
+    /// The colour residual, one entry per slice; empty if the stream has none.
     pub residual: Vec<Slice<'a>>,
-    /// The colours of version 3, in which the four fields above are empty.
+    /// The colours of version 3. Its streams leave the four fields above empty.
     pub colours: Option<Colours<'a>>,
 }
 
-/// The octree of one level, given the level before.
+/// The geometry of one level, given the level above.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Geometry<'a> {
     /// The level.
     pub level: u8,
-    /// One entry for every slice of parents; counts are those of their children.
+    /// One entry per slice of parents, with the number of their children.
     pub slices: Vec<Slice<'a>>,
 }
 
-/// An independently coded part of a level.
+/// An independently decodable part of a level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Slice<'a> {
-    /// How many voxels it describes; of a slice of colours, how many parents.
+    /// Number of voxels; for a slice of colours of version 3, of parents.
     pub voxels: u32,
-    /// Its code.
+    /// The payload.
     pub bytes: &'a [u8],
     /// Byte offset of `bytes` in the stream.
     pub offset: usize,
 }
 
 impl<'a> Stream<'a> {
-    /// Takes a stream, or a prefix of one, apart. Reserves no more than a small multiple of the bytes given.
+    /// Parses a stream or a prefix of one. Allocates at most a small multiple of the length of `bytes`.
     ///
     /// # Errors
-    /// Those of [`Header::parse`]. Anything wrong later is [`Stream::damage`], and leaves the whole levels before it usable.
+    /// Those of [`Header::parse`]. Later errors are reported by [`Stream::damage`]; the complete levels before stay
+    /// usable.
     pub fn parse(bytes: &'a [u8], limits: &Limits) -> Result<Self> {
         let header = Header::parse(bytes, limits)?;
         let mut levels = Vec::new();
@@ -86,22 +87,22 @@ impl<'a> Stream<'a> {
         &self.header
     }
 
-    /// The whole levels, from the base level on.
+    /// The complete levels, from the base level on.
     pub fn levels(&self) -> &[Level<'a>] {
         &self.levels
     }
 
-    /// The deepest whole level.
+    /// The deepest complete level.
     pub fn deepest(&self) -> Option<u8> {
         self.levels.last().map(|level| level.level)
     }
 
-    /// What is wrong with the first level that is not whole, or with what follows the last one.
+    /// The error in the first incomplete level, or in bytes after the last level.
     pub fn damage(&self) -> Option<&Error> {
         self.damage.as_ref()
     }
 
-    /// The stream, if it is whole or ends just where one of its levels ends.
+    /// The stream, if it is complete or ends exactly where one of its levels ends.
     ///
     /// # Errors
     /// The [`Stream::damage`].
@@ -113,10 +114,10 @@ impl<'a> Stream<'a> {
         }
     }
 
-    /// The stream, if `level` is whole.
+    /// The stream, if `level` is complete.
     ///
     /// # Errors
-    /// [`Error::Usage`] if the header tells of no such level, else the damage.
+    /// [`Error::Usage`] if the header has no such level, else the damage.
     pub fn require(self, level: u8) -> Result<Self> {
         let index = self.header.index(level)?;
         match self.damage {
@@ -127,11 +128,11 @@ impl<'a> Stream<'a> {
 }
 
 impl<'a> Level<'a> {
-    /// Takes level `level` out of a stream with this header, or out of a prefix of one; the levels before it have been taken.
+    /// Reads level `level` of a stream or of a prefix of one. The levels before must have been read.
     ///
     /// # Errors
-    /// [`Error::Usage`] if the header tells of no such level; else what is wrong with it: [`Error::Truncated`],
-    /// [`Error::ChecksumMismatch`], [`Error::Malformed`], [`Error::Unsupported`] for chunks that are not known and not to be skipped.
+    /// [`Error::Usage`] if the header has no such level. For an incomplete level [`Error::Truncated`],
+    /// [`Error::ChecksumMismatch`], [`Error::Malformed`], or [`Error::Unsupported`] for unknown critical chunks.
     pub fn read(bytes: &'a [u8], header: &Header, level: u8) -> Result<Self> {
         if let Format::Learned { .. } = header.format {
             return Self::read_learned(bytes, header, level);
@@ -160,6 +161,7 @@ impl<'a> Level<'a> {
         })
     }
 
+    /// [`Level::read`] for version 2.
     fn read_learned(bytes: &'a [u8], header: &Header, level: u8) -> Result<Self> {
         let index = header.index(level)?;
         let (voxels, section) = (header.voxels[index], header.sections[index]);
@@ -190,7 +192,7 @@ impl<'a> Level<'a> {
         })
     }
 
-    /// Sees that decoded latents with the hash `found` are those that were coded.
+    /// Checks the hash `found` of the decoded latents.
     ///
     /// # Errors
     /// [`Error::DeterminismMismatch`] if they are not.
@@ -198,7 +200,7 @@ impl<'a> Level<'a> {
         self.check_hash("latents", self.latent_hash, found)
     }
 
-    /// Sees that decoded colours with the hash `found` are those that were coded.
+    /// Checks the hash `found` of the decoded colours.
     ///
     /// # Errors
     /// [`Error::DeterminismMismatch`] if they are not.
@@ -220,7 +222,7 @@ impl<'a> Level<'a> {
     }
 }
 
-/// Fills `levels` until the first fault.
+/// Appends levels to `levels` until the first error.
 fn take_levels<'a>(bytes: &'a [u8], header: &Header, levels: &mut Vec<Level<'a>>) -> Result<()> {
     for level in header.base..=header.top {
         levels.push(Level::read(bytes, header, level)?);
@@ -228,9 +230,9 @@ fn take_levels<'a>(bytes: &'a [u8], header: &Header, levels: &mut Vec<Level<'a>>
     header.check_end(bytes.len() as u64)
 }
 
-/// The section that starts at `at`, which then is where it ends.
+/// The chunks of the section of `length` bytes that starts at `at`. Advances `at` to its end.
 fn take_section<'a>(form: Form, bytes: &'a [u8], at: &mut u64, length: u32, field: &'static str) -> Result<Chunks<'a>> {
-    // Whatever starts beyond what a machine can address starts beyond the bytes.
+    // An offset that does not fit in `usize` is beyond the end of the bytes.
     let start = usize::try_from(*at).unwrap_or(usize::MAX);
     *at += u64::from(length);
     let mut reader = Reader::new(bytes, start);
@@ -238,7 +240,7 @@ fn take_section<'a>(form: Form, bytes: &'a [u8], at: &mut u64, length: u32, fiel
     Ok(Chunks::new(form, bytes, start..reader.at()))
 }
 
-/// The geometry section of a level of version 2.
+/// Reads the geometry section of a level of version 2.
 fn take_geometry<'a>(chunks: &mut Chunks<'a>, header: &Header, level: u8) -> Result<Vec<Geometry<'a>>> {
     let first = if level == header.base { 1 } else { level };
     let mut counts = Counts::new(header, level)?;
@@ -249,15 +251,16 @@ fn take_geometry<'a>(chunks: &mut Chunks<'a>, header: &Header, level: u8) -> Res
     Ok(geometry)
 }
 
-/// What is known of the voxels while a geometry section is read.
+/// Voxel counts while a geometry section is read.
 pub(super) struct Counts {
     slice_voxels: u32,
-    /// Of the level that was read last.
+    /// Number of voxels of the level read last.
     pub parents: u64,
-    /// The level that the section ends with, and its voxels as the header tells.
+    /// The last level of the section.
     level: u8,
-    most: u32,
-    /// Where the section starts.
+    /// Number of voxels of that level according to the header.
+    max: u32,
+    /// Byte offset of the section.
     start: u64,
 }
 
@@ -267,16 +270,16 @@ impl Counts {
             slice_voxels: header.slice_voxels,
             parents: header.parents(level)?,
             level,
-            most: header.voxels(level)?,
+            max: header.voxels(level)?,
             start: header.start(level)?,
         })
     }
 
-    /// The slices of the next level.
+    /// Reads the slices of the next level.
     pub(super) fn take_level<'a>(&mut self, chunks: &mut Chunks<'a>, level: u8) -> Result<Geometry<'a>> {
         let mut slices = Vec::new();
         let mut total = 0;
-        // Ends with the section's chunks, however many parents are claimed.
+        // An excessive number of parents ends this loop with an error when the chunks run out.
         for (slice, parents) in sliced(self.parents, self.slice_voxels) {
             let counts = parents..=8 * parents;
             let chunk = chunks.expect(ChunkKind::Geometry, level, slice, counts)?;
@@ -288,23 +291,23 @@ impl Counts {
         Ok(Geometry { level, slices })
     }
 
-    /// No level has more voxels than the one that ends the section.
+    /// Checks that a level has at most as many voxels as the section's last level.
     pub(super) fn check_total(&self, level: u8, offset: usize, total: u64) -> Result<()> {
-        if total <= u64::from(self.most) {
+        if total <= u64::from(self.max) {
             return Ok(());
         }
         let field = format!("voxel count of level {level}");
-        let expected = format!("at most {}, as the header tells", self.most);
+        let expected = format!("at most {}, as in the header", self.max);
         Err(malformed(offset, field, total, expected))
     }
 
-    /// Sees that the section ended with as many voxels as the header tells.
+    /// Checks that the section's last level has as many voxels as the header states.
     pub(super) fn finish(&self) -> Result<()> {
-        if self.parents == u64::from(self.most) {
+        if self.parents == u64::from(self.max) {
             return Ok(());
         }
         let field = format!("voxel count of level {}", self.level);
-        let expected = format!("{}, as the header tells", self.most);
+        let expected = format!("{}, as in the header", self.max);
         Err(malformed(self.start, field, self.parents, expected))
     }
 }
@@ -339,8 +342,8 @@ fn take_filters<'a>(chunks: &mut Chunks<'a>, level: u8, voxels: u32) -> Result<[
     for (number, filter) in filters.iter_mut().enumerate() {
         let counts = u64::from(voxels)..=voxels.into();
         let next = chunks.peek()?;
-        let comes = |next: Chunk| next.kind != ChunkKind::Residual && usize::from(next.slice) == number;
-        if next.is_some_and(comes) {
+        let is_filter = |next: Chunk| next.kind != ChunkKind::Residual && usize::from(next.slice) == number;
+        if next.is_some_and(is_filter) {
             let chunk = chunks.expect(ChunkKind::Filter, level, number as u64, counts)?;
             *filter = Some(Slice::of(&chunk, 0));
         }
@@ -362,7 +365,7 @@ fn take_residual<'a>(chunks: &mut Chunks<'a>, slice_voxels: u32, level: u8, voxe
 }
 
 impl<'a> Slice<'a> {
-    /// A chunk's payload without its first bytes.
+    /// A chunk's payload without its first `skip` bytes.
     pub(super) fn of(chunk: &Chunk<'a>, skip: usize) -> Self {
         Slice {
             voxels: chunk.count,
@@ -372,7 +375,7 @@ impl<'a> Slice<'a> {
     }
 }
 
-/// Numbers of the slices that `voxels` fill, and how many voxels each has.
+/// Number and voxel count of each slice of a level of `voxels` voxels.
 pub(super) fn sliced(voxels: u64, slice_voxels: u32) -> impl Iterator<Item = (u64, u64)> {
     let size = u64::from(slice_voxels);
     (0..voxels.div_ceil(size)).map(move |i| (i, size.min(voxels - i * size)))

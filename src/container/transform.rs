@@ -1,4 +1,4 @@
-//! What the sections of version 3 hold.
+//! Reads the sections of version 3 (`docs/format.md`, clauses 3.2 and 3.3).
 
 use super::chunk::{Chunk, ChunkKind, Chunks};
 use super::header::Header;
@@ -7,41 +7,41 @@ use super::reader::Reader;
 use super::stream::{Counts, Geometry, Slice, sliced};
 use crate::error::Result;
 
-/// The most voxels of the last level of a colour trunk.
+/// Maximum number of voxels of the last level of a colour trunk.
 pub const MAX_TRUNK_VOXELS: u32 = 65_536;
 
 /// The colours of a level as transform coefficients.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Colours<'a> {
-    /// In the base level: the colours of the root and of the first levels.
+    /// The colours of the root and of the first levels, in the base level only.
     pub trunk: Option<Trunk<'a>>,
-    /// The levels that follow the trunk up to this level; of a level that is not the base level, this level.
+    /// In the base level, the levels after the trunk up to this level; else this level alone.
     pub levels: Vec<ColourLevel<'a>>,
     /// XXH3-64 of the colours decoded at this level.
     pub hash: u64,
-    /// The filter of the colours of this level, if it has one.
+    /// The colour filter of this level.
     pub filter: Option<Slice<'a>>,
 }
 
-/// The colours of the root and of the first levels, in one payload.
+/// The colours of the root and of the first levels in one payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Trunk<'a> {
-    /// K: it holds the levels 0 to K.
+    /// K: the trunk holds the levels 0 to K.
     pub level: u8,
-    /// The payload; its count is the number of the voxels of level K.
+    /// The payload, with the number of voxels of level K.
     pub slice: Slice<'a>,
 }
 
-/// The colours of a level, given those of the level before.
+/// The colours of a level, given those of the level above.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ColourLevel<'a> {
     /// The level.
     pub level: u8,
-    /// One entry for every slice of parents; counts are those of the parents.
+    /// One entry per slice of parents, with their number.
     pub slices: Vec<Slice<'a>>,
 }
 
-/// The geometry section of `level`.
+/// Reads the geometry section of `level`.
 pub(super) fn take_geometry<'a>(chunks: &mut Chunks<'a>, header: &Header, level: u8) -> Result<Vec<Geometry<'a>>> {
     let mut counts = Counts::new(header, level)?;
     let mut geometry = match level == header.base && level > 0 {
@@ -59,14 +59,14 @@ pub(super) fn take_geometry<'a>(chunks: &mut Chunks<'a>, header: &Header, level:
     Ok(geometry)
 }
 
-/// The levels from 1 on that one chunk holds, each in one slice.
+/// Reads the geometry trunk: the levels from 1 on, at most to `deepest`, each of one slice.
 fn take_trunk<'a>(
     chunks: &mut Chunks<'a>,
     counts: &mut Counts,
     slice_voxels: u32,
-    most: u8,
+    deepest: u8,
 ) -> Result<Vec<Geometry<'a>>> {
-    let chunk = chunks.expect_up_to(ChunkKind::GeometryTrunk, 1..=most)?;
+    let chunk = chunks.expect_up_to(ChunkKind::GeometryTrunk, 1..=deepest)?;
     let mut reader = Reader::new(chunk.payload, 0);
     let at = |reader: &Reader| chunk.payload_at + reader.at();
     let mut geometry = Vec::new();
@@ -105,7 +105,7 @@ fn take_trunk<'a>(
     Ok(geometry)
 }
 
-/// What was read of a payload whose checksum is right: if it is too short, that is no cut stream.
+/// Converts the error of a payload that ends early: its checksum is valid, so the stream is malformed, not truncated.
 fn in_trunk<T>(chunk: &Chunk, read: Result<T>, offset: usize) -> Result<T> {
     read.map_err(|_| {
         let length = chunk.payload.len();
@@ -115,7 +115,8 @@ fn in_trunk<T>(chunk: &Chunk, read: Result<T>, offset: usize) -> Result<T> {
     })
 }
 
-/// The colour section of `level`, whose geometry section held `geometry`, the children of `above` voxels first.
+/// Reads the colour section of `level`. `geometry` is its geometry section, `above` the number of voxels of the level
+/// above the first level of that section.
 pub(super) fn take_colours<'a>(
     chunks: &mut Chunks<'a>,
     geometry: &[Geometry<'a>],
@@ -156,14 +157,14 @@ pub(super) fn take_colours<'a>(
     })
 }
 
-/// The chunk of the first levels, of at most `most`, which have so many `voxels`.
+/// Reads the colour trunk, at most to level `deepest`. `voxels` returns the number of voxels of a level.
 fn take_colour_trunk<'a>(
     chunks: &mut Chunks<'a>,
     voxels: impl Fn(u8) -> u64,
-    most: u8,
+    deepest: u8,
     hash: &mut Option<u64>,
 ) -> Result<Trunk<'a>> {
-    let chunk = chunks.expect_up_to(ChunkKind::ColourTrunk, 0..=most)?;
+    let chunk = chunks.expect_up_to(ChunkKind::ColourTrunk, 0..=deepest)?;
     let expected = voxels(chunk.level);
     if u64::from(chunk.count) != expected {
         let field = "voxel count of the colour trunk";
@@ -181,7 +182,7 @@ fn take_colour_trunk<'a>(
     })
 }
 
-/// Reads the hash that the first chunk of a section starts with; how many bytes it takes in this chunk.
+/// Reads the hash at the start of the first chunk of a section. Returns its length in this chunk.
 fn take_hash(chunk: &Chunk, hash: &mut Option<u64>) -> Result<usize> {
     if hash.is_some() {
         return Ok(0);

@@ -1,4 +1,4 @@
-//! Streams out.
+//! Writes streams.
 
 use super::chunk::{Chunk, ChunkKind, Form};
 use super::header::{Format, Header, Section};
@@ -7,14 +7,14 @@ use super::stream::{Stream, sliced};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 
-/// Puts a stream together, level by level.
+/// Builds a stream, level by level.
 #[derive(Debug)]
 pub struct Writer {
     header: Header,
     body: Vec<u8>,
 }
 
-/// What may be written is for the format to say, what may be read for the reader.
+/// No limits: the writer checks only what the format forbids.
 const UNLIMITED: Limits = Limits {
     max_points: u64::MAX,
     max_depth: u8::MAX,
@@ -23,7 +23,7 @@ const UNLIMITED: Limits = Limits {
 };
 
 impl Writer {
-    /// Starts a stream. The header's `sections` need not be right: the writer fills them in.
+    /// Starts a stream. The header's `sections` are ignored: the writer sets them.
     ///
     /// # Errors
     /// [`Error::Malformed`] if the format forbids the header.
@@ -36,10 +36,10 @@ impl Writer {
         })
     }
 
-    /// Adds the geometry of `level`: for every slice of its parents the number of their children, and the code.
+    /// Adds the geometry of `level`: for each slice of parents the number of their children, and the payload.
     ///
     /// # Errors
-    /// [`Error::Usage`] if the stream has no such level or the code is too long.
+    /// [`Error::Usage`] if the stream has no such level or a payload is too long.
     pub fn geometry(&mut self, level: u8, slices: &[(u32, impl AsRef<[u8]>)]) -> Result<()> {
         let section = self.header.index(level.max(self.header.base))?;
         let start = self.body.len();
@@ -51,10 +51,10 @@ impl Writer {
         Ok(())
     }
 
-    /// Adds the features of `level`: the hash of its latents, and for every slice of its voxels the code.
+    /// Version 2: adds the latents of `level`: their hash, and the payload of each slice of voxels.
     ///
     /// # Errors
-    /// [`Error::Usage`] if the stream has no such level, the slices are more or fewer than its voxels fill, or the code is too long.
+    /// [`Error::Usage`] if the stream has no such level, the number of slices is wrong, or a payload is too long.
     pub fn features(&mut self, level: u8, latent_hash: u64, slices: &[impl AsRef<[u8]>]) -> Result<()> {
         let section = self.header.index(level)?;
         let counts = self.slices(section, slices.len())?;
@@ -67,7 +67,8 @@ impl Writer {
         self.extend_colours(section, start)
     }
 
-    /// Adds a colour filter for the best heads of `level` (`slice` 0) or its quick ones (1), after its features.
+    /// Version 2: adds a colour filter for the best heads of `level` (`slice` 0) or the quick ones (1), after its
+    /// latents.
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level.
@@ -78,10 +79,10 @@ impl Writer {
         self.extend_colours(section, start)
     }
 
-    /// Adds the colour residual of `level`, after its filters: for every slice of its voxels the payload.
+    /// Version 2: adds the colour residual of `level`, after its filters: the payload of each slice of voxels.
     ///
     /// # Errors
-    /// [`Error::Usage`] if the stream has no such level, the slices are more or fewer than its voxels fill, or a payload is too long.
+    /// [`Error::Usage`] if the stream has no such level, the number of slices is wrong, or a payload is too long.
     pub fn residual(&mut self, level: u8, slices: &[impl AsRef<[u8]>]) -> Result<()> {
         let section = self.header.index(level)?;
         let counts = self.slices(section, slices.len())?;
@@ -93,11 +94,11 @@ impl Writer {
         self.extend_colours(section, start)
     }
 
-    /// Version 3: adds the first levels of the octree, 1 to the number of `levels`, each of one slice: its voxels, and the code. Nothing if
-    /// there are none, as where the base level is 0.
+    /// Version 3: adds the geometry trunk. `levels` has the number of voxels and the payload of level 1 and the
+    /// following, each of one slice. Adds nothing if it is empty, as for base level 0.
     ///
     /// # Errors
-    /// [`Error::Usage`] if the code is too long.
+    /// [`Error::Usage`] if a payload is too long.
     pub fn geometry_trunk(&mut self, levels: &[(u32, impl AsRef<[u8]>)]) -> Result<()> {
         let Some((count, _)) = levels.last() else {
             return Ok(());
@@ -116,8 +117,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Version 3: adds the colours of the levels 0 to `level`, the last of which has so many voxels, and the hash of the colours of the base
-    /// level.
+    /// Version 3: adds the colour trunk: the colours of the levels 0 to `level`, which has `voxels` voxels. `hash` is
+    /// that of the colours of the base level.
     ///
     /// # Errors
     /// [`Error::Usage`] if the payload is too long.
@@ -128,8 +129,8 @@ impl Writer {
         self.extend_colours(0, start)
     }
 
-    /// Version 3: adds the colours of `level`: for every slice of its parents their number, and the payload. `hash` is that of the level's
-    /// colours; the levels between the trunk and the base level have none.
+    /// Version 3: adds the colours of `level`: for each slice of parents their number, and the payload. `hash` is that
+    /// of the level's colours; `None` for the levels between the trunk and the base level.
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level or a payload is too long.
@@ -145,7 +146,7 @@ impl Writer {
         self.extend_colours(section, start)
     }
 
-    /// Version 3: adds the filter of the colours of `level`, after these.
+    /// Version 3: adds the colour filter of `level`, after its colours.
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level.
@@ -162,7 +163,10 @@ impl Writer {
         Ok(())
     }
 
-    /// The voxels of each slice of a level, of which there must be so many.
+    /// Voxel counts of the slices of a level.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if their number is not `found`.
     fn slices(&self, section: usize, found: usize) -> Result<Vec<u32>> {
         let voxels = self.header.voxels[section].into();
         let counts: Vec<u32> = sliced(voxels, self.header.slice_voxels)
@@ -170,17 +174,18 @@ impl Writer {
             .collect();
         if counts.len() != found {
             return Err(Error::Usage(format!(
-                "{voxels} voxels fill {} slices, not {found}",
+                "{voxels} voxels need {} slices, not {found}",
                 counts.len(),
             )));
         }
         Ok(counts)
     }
 
-    /// The stream, read once to see that every level is whole.
+    /// Returns the stream, after parsing it to check that every level is complete.
     ///
     /// # Errors
-    /// Those of [`Stream::parse`], or the [`Stream::damage`]: levels missing, out of order, or with other voxel counts than the header's.
+    /// Those of [`Stream::parse`], or the [`Stream::damage`]: levels that are missing, out of order, or have other
+    /// voxel counts than in the header.
     pub fn finish(self) -> Result<Vec<u8>> {
         let mut bytes = self.header.write();
         bytes.extend(self.body);
@@ -216,9 +221,10 @@ impl Writer {
     }
 }
 
+/// `length + by`, which must fit in 32 bits.
 fn extended(length: u32, by: usize) -> Result<u32> {
     u32::try_from(by)
         .ok()
         .and_then(|by| length.checked_add(by))
-        .ok_or_else(|| Error::Usage("a section cannot hold 4 GiB".into()))
+        .ok_or_else(|| Error::Usage("a section must be shorter than 4 GiB".into()))
 }

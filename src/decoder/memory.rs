@@ -2,7 +2,7 @@
 
 use std::ops::Deref;
 
-use crate::colour::Coloured;
+use crate::colour::LevelColours;
 use crate::container::{Header, MAX_TRUNK_VOXELS};
 use crate::error::Result;
 use crate::latents::Decoder;
@@ -129,13 +129,13 @@ const TRUNK: Term = Term {
 const COLOURS: Term = Term {
     each: "voxel of the level and of the level above",
     takes: "kernel map, colours decoded, in slices and joined, smoothed energies, colours as bytes and filtered",
-    fixed: MAP + PLAN + 3 * Coloured::bytes_per_voxel() as u64 + 3 + 3 * 3,
+    fixed: MAP + PLAN + 3 * LevelColours::bytes_per_voxel() as u64 + 3 + 3 * 3,
     by: NOTHING,
 };
 const CONTEXTS: Term = Term {
     each: "slice of colours decoded at a time, at most one on each thread, and 3 more",
     takes: "adaptive contexts",
-    fixed: Coloured::learned_bytes() as u64,
+    fixed: LevelColours::model_bytes() as u64,
     by: NOTHING,
 };
 const SURFEL_SUMS: Term = Term {

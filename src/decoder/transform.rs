@@ -7,7 +7,7 @@ use b2p_kernels::Isa;
 use xxhash_rust::xxh3::Xxh3Default;
 
 use super::stream::StreamDecoder;
-use crate::colour::{self, Coloured, Filter};
+use crate::colour::{self, Filter, LevelColours};
 use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
@@ -38,7 +38,7 @@ pub(super) struct Reached {
     /// Level 0 has none.
     pub above: Option<Above>,
     /// Decoded, before the filter: what the next level is coded from.
-    pub coloured: Coloured,
+    pub coloured: LevelColours,
     filter: Option<Filter>,
     /// Filtered, as they are drawn, once they are asked for.
     filtered: OnceLock<Vec<[u8; 3]>>,
@@ -49,7 +49,7 @@ pub(super) struct Reached {
 pub(super) struct Above {
     pub map: KernelMap,
     /// Before the filter; not known of the last level but one of a trunk.
-    coloured: Option<Coloured>,
+    coloured: Option<LevelColours>,
 }
 
 impl Reached {
@@ -201,7 +201,7 @@ struct Growing<'a> {
 /// The kernel map and the colours of a level on the way to the one that a section is of, and of the level above if the section has it.
 struct Step {
     map: KernelMap,
-    coloured: Coloured,
+    coloured: LevelColours,
     above: Option<Above>,
 }
 
@@ -269,10 +269,10 @@ impl Growing<'_> {
         octree: &mut Octree,
         n: u8,
         above_map: &KernelMap,
-        above: &Coloured,
+        above: &LevelColours,
         ahead: &mut Ahead,
         log: &mut Log,
-    ) -> Result<(KernelMap, Coloured)> {
+    ) -> Result<(KernelMap, LevelColours)> {
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
         let header = self.header;
         let geometry = self.part.geometry.iter().find(|part| part.level == n);
@@ -326,8 +326,8 @@ impl Growing<'_> {
         n: u8,
         map: &KernelMap,
         ahead: &mut Ahead,
-        colours: impl FnOnce() -> Result<Coloured> + Send,
-    ) -> Result<Coloured> {
+        colours: impl FnOnce() -> Result<LevelColours> + Send,
+    ) -> Result<LevelColours> {
         let Some(next) = self.after(n) else {
             return colours();
         };
@@ -342,7 +342,7 @@ impl Growing<'_> {
 
 /// What a stream says of the colours of a level, to tell whether they were decoded as they were coded: XXH3-64 of Y, Co and Cg of every voxel
 /// as 16-bit numbers, little-endian.
-pub fn colour_hash(coloured: &Coloured) -> u64 {
+pub fn colour_hash(coloured: &LevelColours) -> u64 {
     let mut hasher = Xxh3Default::new();
     let mut bytes = Vec::with_capacity(6 * 1024);
     for part in coloured.values().chunks(1024) {

@@ -1,4 +1,4 @@
-//! Which voxels are occupied, at every octree level.
+//! Geometry: the occupied voxels of every octree level, their neighbours, and the lossless codec.
 
 pub mod codec;
 pub mod morton;
@@ -10,14 +10,14 @@ pub use neighbours::KernelMap;
 pub use octree::{MAX_VOXELS, Octree};
 pub use voxels::Voxels;
 
-/// The places of the ones in a mask, ascending.
+/// Positions of the set bits of a mask, ascending.
 #[inline(always)]
 pub(crate) fn ones(mut mask: u32) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
-        let place = mask.trailing_zeros() as usize;
+        let position = mask.trailing_zeros() as usize;
         (mask != 0).then(|| {
             mask &= mask - 1;
-            place
+            position
         })
     })
 }

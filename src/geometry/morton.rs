@@ -1,7 +1,7 @@
-//! Morton keys: the order of voxels at every level.
+//! Morton keys: interleaved coordinates, which define the order of voxels (`docs/format.md`, 2.3).
 //!
-//! Bits of x, y and z are interleaved, x lowest, so a key's lowest three bits are the voxel's octant in its parent
-//! (`x + 2y + 4z`), and `key >> 3` is the parent's key.
+//! Bits of x, y and z are interleaved, x lowest. The lowest three bits of a key are the voxel's octant in its parent
+//! (`x + 2y + 4z`); `key >> 3` is the parent's key.
 
 pub use crate::limits::MAX_DEPTH;
 
@@ -10,11 +10,12 @@ pub fn encode([x, y, z]: [u32; 3]) -> u64 {
     spread(x) | spread(y) << 1 | spread(z) << 2
 }
 
-/// The coordinates of a key.
+/// De-interleaves the coordinates of a key.
 pub fn decode(key: u64) -> [u32; 3] {
     [compact(key), compact(key >> 1), compact(key >> 2)]
 }
 
+/// Moves bit `i` to bit `3i`.
 fn spread(v: u32) -> u64 {
     let mut v = u64::from(v) & 0x1f_ffff;
     v = (v | v << 32) & 0x001f_0000_0000_ffff;
@@ -24,6 +25,7 @@ fn spread(v: u32) -> u64 {
     (v | v << 2) & 0x1249_2492_4924_9249
 }
 
+/// Moves bit `3i` to bit `i`.
 fn compact(v: u64) -> u32 {
     let mut v = v & 0x1249_2492_4924_9249;
     v = (v | v >> 2) & 0x10c3_0c30_c30c_30c3;
@@ -38,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn decoding_undoes_encoding() {
+    fn decoding_inverts_encoding() {
         let samples = [0, 1, 2, 3, 77, 1023, 0x10_0000, 0x1f_ffff];
         for x in samples {
             for y in samples {

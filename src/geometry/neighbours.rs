@@ -1,8 +1,8 @@
-//! Kernel maps: for every voxel, which of its neighbours are occupied and where they are.
+//! Kernel maps: the indices of every voxel's occupied neighbours.
 //!
-//! A kernel map is built from the one of the level above, so nothing is searched or hashed: the neighbour of a child lies in its
-//! parent or in one of its parent's 26 neighbours, whose children are found from its occupancy by counting bits. The window around up to
-//! eight siblings is looked up once per parent.
+//! A kernel map is built from that of the level above, without searching or hashing. The neighbour of a child lies in
+//! its parent or in one of its parent's 26 neighbours, whose children are found by counting bits of the occupancy. The
+//! window around up to eight siblings is looked up once per parent.
 
 use std::sync::OnceLock;
 
@@ -11,13 +11,14 @@ use rayon::prelude::*;
 
 /// The neighbours of every voxel under a 3³ or 2³ kernel.
 ///
-/// Row `i` holds `volume` indices of input voxels in the kernel's offset order (x fastest), [`KernelMap::ABSENT`] where none is:
-/// offsets −1, 0, 1 along each axis for 3³, `k = (dx+1) + 3(dy+1) + 9(dz+1)`; 0, 1 for 2³, `k = dx + 2dy + 4dz`.
+/// Row `i` holds `volume` indices of input voxels in the kernel's offset order (x fastest), [`KernelMap::ABSENT`] where
+/// none is: offsets −1, 0, 1 along each axis for 3³, `k = (dx+1) + 3(dy+1) + 9(dz+1)`; 0, 1 for 2³, `k = dx + 2dy +
+/// 4dz`.
 #[derive(Debug, Clone)]
 pub struct KernelMap {
     volume: usize,
     rows: Vec<u32>,
-    /// The same as layers read it.
+    /// Layout of the map for convolution layers, built on first use.
     plan: OnceLock<Plan>,
 }
 
@@ -30,12 +31,15 @@ impl PartialEq for KernelMap {
 impl Eq for KernelMap {}
 
 impl KernelMap {
-    /// Marks an unoccupied neighbour.
+    /// Index of an unoccupied neighbour.
     pub const ABSENT: u32 = u32::MAX;
-    /// The place of the voxel itself in a 3³ row.
+    /// Index of the voxel itself in a 3³ row.
     pub const CENTRE: usize = 13;
 
-    /// Wraps rows of `volume` indices each.
+    /// A map of rows of `volume` indices each.
+    ///
+    /// # Panics
+    /// If the last row is incomplete.
     pub fn new(volume: usize, rows: Vec<u32>) -> Self {
         assert_eq!(rows.len() % volume, 0, "kernel map rows must be whole");
         KernelMap {
@@ -45,7 +49,7 @@ impl KernelMap {
         }
     }
 
-    /// The map as layers take it.
+    /// The map in the form of convolution layers.
     pub fn taps(&self) -> Taps<'_> {
         let plan = || Plan::new(self.len());
         Taps::Map {
@@ -55,18 +59,18 @@ impl KernelMap {
         }
     }
 
-    /// The 3³ map of level 0: one voxel, alone.
+    /// The 3³ map of level 0, which has one voxel.
     pub fn root() -> Self {
         let mut rows = vec![Self::ABSENT; 27];
         rows[Self::CENTRE] = 0;
         KernelMap::new(27, rows)
     }
 
-    /// The neighbours of the voxels that arise when *every* voxel of this 3³ map's level has all eight children: the child in octant
-    /// `o` of voxel `i` has index `8i + o`.
+    /// The neighbours of all eight children of *every* voxel of this 3³ map. The child in octant `o` of voxel `i` has
+    /// the index `8i + o`.
     ///
     /// # Panics
-    /// If this is not a 3³ map, or of more than 2²⁹ − 1 voxels.
+    /// If this is not a 3³ map, or has more than 2²⁹ − 1 voxels.
     pub fn generated_children(&self) -> GeneratedChildren<'_> {
         assert_eq!(self.volume, 27, "children come from a 3³ map");
         assert!(self.len() < 1 << 29, "child indices must fit 32 bits");
@@ -105,12 +109,12 @@ impl KernelMap {
         self.rows.is_empty()
     }
 
-    /// The neighbours of voxel `i`.
+    /// Row of voxel `i`.
     pub fn row(&self, i: usize) -> &[u32] {
         &self.rows[i * self.volume..(i + 1) * self.volume]
     }
 
-    /// All rows, one after the other.
+    /// All rows, concatenated.
     pub fn rows(&self) -> &[u32] {
         &self.rows
     }
@@ -124,7 +128,7 @@ pub struct GeneratedChildren<'a> {
 }
 
 impl GeneratedChildren<'_> {
-    /// The neighbours as layers take them.
+    /// The neighbours in the form of convolution layers.
     pub fn taps(&self) -> Taps<'_> {
         Taps::AllChildren {
             neighbours: &self.parents.rows,
@@ -133,13 +137,13 @@ impl GeneratedChildren<'_> {
     }
 }
 
-/// Parents that one task handles.
+/// Number of parents of one task.
 const BLOCK: usize = 1024;
 
-/// The 3³ map of the children of the voxels of `map`, which have these occupancies and first children.
+/// The 3³ map of the children of the voxels of `map`, given the occupancy and the first child of each.
 ///
 /// # Panics
-/// If `map` is not a 3³ map, or not of as many voxels.
+/// If `map` is not a 3³ map, or the numbers of voxels differ.
 pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]) -> KernelMap {
     assert_eq!(map.volume, 27, "children come from a 3³ map");
     assert_eq!(map.len(), occupancy.len(), "one occupancy per voxel");
@@ -182,8 +186,8 @@ mod tests {
     use b2p_kernels::reference::tap;
     use proptest::prelude::*;
 
-    /// The definition, by binary search.
-    fn searched(voxels: &Voxels, offsets: std::ops::RangeInclusive<i64>) -> KernelMap {
+    /// Kernel map by definition, with a binary search for every neighbour.
+    fn by_search(voxels: &Voxels, offsets: std::ops::RangeInclusive<i64>) -> KernelMap {
         let width = offsets.clone().count();
         let side = 1i64 << voxels.depth();
         let mut rows = Vec::new();
@@ -212,8 +216,8 @@ mod tests {
         for level in 0..=octree.depth() {
             let map = octree.kernel_map(level);
             let voxels = octree.level(level);
-            assert_eq!(map, searched(voxels, -1..=1));
-            assert_eq!(map.forward(), searched(voxels, 0..=1));
+            assert_eq!(map, by_search(voxels, -1..=1));
+            assert_eq!(map.forward(), by_search(voxels, 0..=1));
             if voxels.depth() < morton::MAX_DEPTH {
                 let all = voxels.keys().iter().flat_map(|k| k << 3..=k << 3 | 7);
                 let all = Voxels::from_sorted(voxels.depth() + 1, all.collect());
@@ -222,14 +226,14 @@ mod tests {
                     let taps = children.taps();
                     (0..27).map(move |k| tap(&taps, i, k).map_or(KernelMap::ABSENT, |i| i as u32))
                 });
-                assert_eq!(KernelMap::new(27, rows.collect()), searched(&all, -1..=1));
+                assert_eq!(KernelMap::new(27, rows.collect()), by_search(&all, -1..=1));
             }
         }
     }
 
     proptest! {
         #[test]
-        fn the_map_from_above_is_what_searching_finds(
+        fn the_map_built_from_the_level_above_matches_a_search(
             keys in prop::collection::vec(0u64..1 << 12, 1..300)
         ) {
             check(Voxels::new(4, keys));
@@ -237,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn the_map_holds_for_full_empty_and_far_apart() {
+    fn maps_of_extreme_clouds_match_a_search() {
         check(Voxels::new(0, vec![0]));
         check(Voxels::new(3, (0..512).collect()));
         check(Voxels::new(21, vec![0, (1 << 63) - 1]));
@@ -245,13 +249,13 @@ mod tests {
     }
 
     #[test]
-    fn many_blocks_join_without_a_seam() {
+    fn maps_of_several_blocks_match_a_search() {
         let bowl = (0..1u32 << 14).map(|i| {
             let [x, y] = [i % 128, i / 128];
             morton::encode([x, y, (x * x + y * y) / 256])
         });
         let octree = Octree::new(Voxels::new(7, bowl.collect())).unwrap();
         assert!(octree.level(6).len() > 2 * BLOCK);
-        assert_eq!(octree.kernel_map(7), searched(octree.level(7), -1..=1));
+        assert_eq!(octree.kernel_map(7), by_search(octree.level(7), -1..=1));
     }
 }

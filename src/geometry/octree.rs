@@ -1,22 +1,22 @@
-//! The octree of a cloud: its voxels at every level, and who is whose child.
+//! The octree of a cloud: its voxels at every level, and the links between levels.
 
 use super::{KernelMap, Voxels, morton, neighbours};
 use crate::error::{Error, Result, Stage};
 
-/// The most voxels a level may have: indices are `u32`, and [`KernelMap::ABSENT`] is not one.
+/// Maximum number of voxels of a level: indices are `u32`, without [`KernelMap::ABSENT`].
 pub const MAX_VOXELS: usize = (u32::MAX - 1) as usize;
 
 /// The voxels of all levels from the root, level 0, to the deepest, with the links from each level to the next.
 ///
-/// The children of a voxel are consecutive in the next level, in the order of their octants, so its links are one byte, the
-/// *occupancy* (bit `x + 2y + 4z` for the child in that octant), and the index of its first child.
+/// The children of a voxel are consecutive in the next level, in the order of their octants. So its links are one byte,
+/// the *occupancy* (bit `x + 2y + 4z` is the child in that octant), and the index of its first child.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Octree {
     levels: Vec<Voxels>,
     links: Vec<Links>,
 }
 
-/// From the voxels of one level to those of the next.
+/// Links from the voxels of one level to those of the next.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Links {
     occupancy: Vec<u8>,
@@ -24,7 +24,7 @@ struct Links {
 }
 
 impl Octree {
-    /// The octree that consists of the root voxel alone.
+    /// The octree of the root voxel alone.
     pub fn root() -> Self {
         Octree {
             levels: vec![Voxels::from_sorted(0, vec![0])],
@@ -32,7 +32,7 @@ impl Octree {
         }
     }
 
-    /// The octree above `deepest`.
+    /// Builds the octree whose deepest level is `deepest`.
     ///
     /// # Errors
     /// [`Error::Usage`] if there are no voxels or more than [`MAX_VOXELS`].
@@ -73,7 +73,7 @@ impl Octree {
         &self.levels[usize::from(level)]
     }
 
-    /// For every voxel of `level` which of its eight children are occupied. Never zero.
+    /// Occupancy of every voxel of `level`: an 8-bit mask of its children, never 0.
     ///
     /// # Panics
     /// If there is no deeper level.
@@ -81,7 +81,7 @@ impl Octree {
         &self.links[usize::from(level)].occupancy
     }
 
-    /// For every voxel of `level` the index of its first child in the next.
+    /// Index of the first child of every voxel of `level`, in the next level.
     ///
     /// # Panics
     /// If there is no deeper level.
@@ -89,7 +89,7 @@ impl Octree {
         &self.links[usize::from(level)].first_child
     }
 
-    /// The same octree without the levels below `level`.
+    /// A copy of the octree without the levels below `level`.
     pub fn truncated(&self, level: u8) -> Octree {
         let level = usize::from(level);
         Octree {
@@ -104,11 +104,12 @@ impl Octree {
         self.links.truncate(usize::from(level));
     }
 
-    /// Adds the next level: one occupancy for every voxel of the deepest.
+    /// Adds a level. `occupancy` has one mask for every voxel of the deepest level.
     ///
     /// # Errors
-    /// [`Error::Malformed`] if the number of occupancies is not the number of voxels, if one of them is zero, if the level would
-    /// be deeper than [`morton::MAX_DEPTH`] or have more than [`MAX_VOXELS`] voxels. The octree is unchanged then.
+    /// [`Error::Malformed`] if the number of occupancies is not the number of voxels, if one of them is zero, if the
+    /// level would be deeper than [`morton::MAX_DEPTH`] or have more than [`MAX_VOXELS`] voxels. The octree is then
+    /// unchanged.
     pub fn grow(&mut self, occupancy: Vec<u8>) -> Result<()> {
         let parents = &self.levels[self.links.len()];
         let depth = parents.depth() + 1;
@@ -163,7 +164,7 @@ impl Octree {
         (0..level).fold(KernelMap::root(), |map, above| self.child_map(above, &map))
     }
 
-    /// The 3³ kernel map of level `level + 1` from that of `level`.
+    /// The 3³ kernel map of level `level + 1`. `map` is that of `level`.
     ///
     /// # Panics
     /// If the octree is not that deep, or `map` is not the 3³ kernel map of `level`.
@@ -172,7 +173,7 @@ impl Octree {
     }
 }
 
-/// The parents of one level's voxels, and the links back.
+/// The parents of a level's voxels, and the links to the voxels.
 fn gather(children: &Voxels) -> (Voxels, Links) {
     let mut keys: Vec<u64> = Vec::new();
     let mut links = Links {
@@ -199,7 +200,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn growing_from_the_root_gives_back_every_level(
+        fn growing_from_the_root_rebuilds_every_level(
             keys in prop::collection::vec(0u64..1 << 15, 1..200)
         ) {
             let octree = Octree::new(Voxels::new(5, keys)).unwrap();
@@ -229,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tree_of_nothing_is_refused() {
+    fn an_empty_octree_is_refused() {
         assert!(matches!(Octree::new(Voxels::new(3, vec![])), Err(Error::Usage(_))));
     }
 
@@ -250,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn no_level_is_deeper_than_a_key_can_address() {
+    fn levels_deeper_than_morton_keys_are_refused() {
         let mut octree = Octree::root();
         for _ in 0..morton::MAX_DEPTH {
             octree.grow(vec![0x80]).unwrap();

@@ -10,20 +10,20 @@ pub struct Voxels {
 }
 
 impl Voxels {
-    /// Sorts and merges `keys`, which address level `depth`.
+    /// Sorts and deduplicates Morton keys of level `depth`.
     ///
     /// # Panics
-    /// If a key lies outside the level: keys are the caller's own, never a file's.
+    /// If a key lies outside the level. Keys from untrusted input must be checked before.
     pub fn new(depth: u8, mut keys: Vec<u64>) -> Self {
         keys.sort_unstable();
         keys.dedup();
         Self::from_sorted(depth, keys)
     }
 
-    /// Takes keys that are already ascending and unique.
+    /// Voxels from keys that are already strictly ascending.
     ///
     /// # Panics
-    /// If the last key lies outside the level, or (debug only) the keys are not strictly ascending.
+    /// If the last key lies outside the level, or (debug builds only) the keys are not strictly ascending.
     pub fn from_sorted(depth: u8, keys: Vec<u64>) -> Self {
         assert!(depth <= morton::MAX_DEPTH, "octree level {depth} is deeper than 21");
         assert!(
@@ -34,7 +34,7 @@ impl Voxels {
         Voxels { depth, keys }
     }
 
-    /// The octree level: coordinates are below `2^depth`.
+    /// The octree level. Coordinates are below `2^depth`.
     pub fn depth(&self) -> u8 {
         self.depth
     }
@@ -44,17 +44,17 @@ impl Voxels {
         &self.keys
     }
 
-    /// Every voxel's place in its parent, `x + 2y + 4z`.
+    /// Octant of every voxel in its parent, `x + 2y + 4z`.
     pub fn octants(&self) -> Vec<u8> {
         self.keys.iter().map(|key| (key & 7) as u8).collect()
     }
 
-    /// How many voxels.
+    /// Number of voxels.
     pub fn len(&self) -> usize {
         self.keys.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no voxels.
     pub fn is_empty(&self) -> bool {
         self.keys.is_empty()
     }
@@ -64,14 +64,14 @@ impl Voxels {
         morton::decode(self.keys[i])
     }
 
-    /// The occupied voxels one level up; none for level 0's parent, so `depth` must be above 0.
+    /// The occupied voxels one level up. Level 0 has no level above, so `depth` must be at least 1.
     pub fn parents(&self) -> Voxels {
         let mut keys: Vec<u64> = self.keys.iter().map(|k| k >> 3).collect();
         keys.dedup();
         Voxels::from_sorted(self.depth - 1, keys)
     }
 
-    /// For every voxel the index of its parent in [`Voxels::parents`].
+    /// Index of every voxel's parent in [`Voxels::parents`].
     pub fn parent_indices(&self) -> Vec<u32> {
         let mut index = 0u32;
         let mut last = self.keys.first().map_or(0, |k| k >> 3);

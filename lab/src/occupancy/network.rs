@@ -1,13 +1,13 @@
 //! The network in floats, its gradient, and its weights as the codec reads them.
 
-use b2p::geometry::codec::network::{FACTS, NODES, SIZE, WIDTH};
+use b2p::geometry::codec::network::{FEATURES, NODES, SIZE, WIDTH};
 use rayon::prelude::*;
 
 use super::Samples;
 use crate::random::Random;
 
-/// Rows: the facts', the children's (node 1 first), the outputs'; then the eight output biases.
-const OUTPUT: usize = FACTS + NODES;
+/// Rows: the features', the children's (node 1 first), the outputs'; then the eight output biases.
+const OUTPUT: usize = FEATURES + NODES;
 const BIAS: usize = (OUTPUT + 8) * WIDTH;
 const PARAMETERS: usize = BIAS + 8;
 
@@ -36,7 +36,7 @@ impl Network {
         let mut random = Random::new(seed);
         let mut parameters = vec![0.0; PARAMETERS];
         for (i, parameter) in parameters[..BIAS].iter_mut().enumerate() {
-            let is_node = (FACTS..OUTPUT).contains(&(i / WIDTH));
+            let is_node = (FEATURES..OUTPUT).contains(&(i / WIDTH));
             *parameter = random.normal() as f32 * if is_node { 0.3 } else { 0.15 };
         }
         Network {
@@ -62,7 +62,7 @@ impl Network {
                 let mut gradient = vec![0.0; PARAMETERS];
                 let bits = shard
                     .iter()
-                    .map(|&(facts, occupancy)| self.learn(facts, occupancy, &mut gradient))
+                    .map(|&(features, occupancy)| self.learn(features, occupancy, &mut gradient))
                     .sum();
                 (bits, gradient)
             })
@@ -76,10 +76,10 @@ impl Network {
     }
 
     /// The length of the code of one sample, whose gradient is added to `gradient`.
-    fn learn(&self, facts: &[u8], occupancy: u8, gradient: &mut [f32]) -> f64 {
+    fn learn(&self, features: &[u8], occupancy: u8, gradient: &mut [f32]) -> f64 {
         let mut sum = [0.0; WIDTH];
-        for &fact in facts {
-            let row = self.row(fact.into());
+        for &feature in features {
+            let row = self.row(feature.into());
             (0..WIDTH).for_each(|unit| sum[unit] += row[unit]);
         }
         let mut back = [0.0; WIDTH];
@@ -89,7 +89,7 @@ impl Network {
             if octant == 7 && below == 0 {
                 break;
             }
-            let node = FACTS + (1 << octant | below) - 1;
+            let node = FEATURES + (1 << octant | below) - 1;
             let row = self.row(node);
             let hidden: Row = std::array::from_fn(|unit| (sum[unit] + row[unit]).max(0.0));
             let output = self.row(OUTPUT + octant);
@@ -105,8 +105,8 @@ impl Network {
             add(&mut back, &own);
             gradient[BIAS + octant] += error;
         }
-        for &fact in facts {
-            add(row_of_mut(gradient, fact.into()), &back);
+        for &feature in features {
+            add(row_of_mut(gradient, feature.into()), &back);
         }
         nats / std::f64::consts::LN_2
     }
@@ -179,15 +179,15 @@ mod tests {
     #[test]
     fn the_gradient_is_the_slope_of_the_length() {
         let mut network = Network::new(3);
-        let (facts, occupancy) = ([0u8, 30, 33, 190], 0b1001_0110);
+        let (features, occupancy) = ([0u8, 30, 33, 190], 0b1001_0110);
         let mut gradient = vec![0.0; PARAMETERS];
-        network.learn(&facts, occupancy, &mut gradient);
+        network.learn(&features, occupancy, &mut gradient);
         let mut unused = vec![0.0; PARAMETERS];
         for i in (0..PARAMETERS).filter(|&i| gradient[i].abs() > 0.05).step_by(97) {
             let at = network.parameters[i];
             let mut length = |value| {
                 network.parameters[i] = value;
-                network.learn(&facts, occupancy, &mut unused) * std::f64::consts::LN_2
+                network.learn(&features, occupancy, &mut unused) * std::f64::consts::LN_2
             };
             let slope = (length(at + 1e-3) - length(at - 1e-3)) / 2e-3;
             network.parameters[i] = at;

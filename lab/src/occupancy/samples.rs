@@ -1,6 +1,6 @@
 //! What the codec knows and codes, voxel by voxel.
 
-use b2p::geometry::codec::network::facts;
+use b2p::geometry::codec::network::features;
 use b2p::geometry::{KernelMap, Octree, Voxels};
 
 use crate::error::Result;
@@ -8,10 +8,10 @@ use crate::error::Result;
 /// Parents per slice, as in a stream.
 const SLICE: usize = 16_384;
 
-/// For every voxel of an octree's levels but the deepest: the facts known when its children are coded, and which children it has.
+/// For every voxel of an octree's levels but the deepest: the features known when its children are coded, and which children it has.
 #[derive(Debug, Default)]
 pub struct Samples {
-    facts: Vec<u8>,
+    features: Vec<u8>,
     ends: Vec<usize>,
     occupancy: Vec<u8>,
 }
@@ -30,8 +30,10 @@ impl Samples {
             for (i, masks) in occupancy.chunks(SLICE).enumerate() {
                 let slice = i * SLICE..i * SLICE + masks.len();
                 for here in slice.clone() {
-                    facts(&map, &slice, here, masks, |fact| samples.facts.push(fact as u8));
-                    samples.ends.push(samples.facts.len());
+                    features(&map, &slice, here, masks, |feature| {
+                        samples.features.push(feature as u8)
+                    });
+                    samples.ends.push(samples.features.len());
                 }
             }
             samples.occupancy.extend(occupancy);
@@ -50,9 +52,9 @@ impl Samples {
         self.occupancy.is_empty()
     }
 
-    /// The facts of sample `i` and its occupancy.
+    /// The features of sample `i` and its occupancy.
     pub fn get(&self, i: usize) -> (&[u8], u8) {
         let start = if i == 0 { 0 } else { self.ends[i - 1] };
-        (&self.facts[start..self.ends[i]], self.occupancy[i])
+        (&self.features[start..self.ends[i]], self.occupancy[i])
     }
 }

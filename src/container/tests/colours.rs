@@ -25,7 +25,7 @@ fn filtered(filters: &[(u8, usize, &[u8])]) -> Result<Vec<u8>> {
 }
 
 #[test]
-fn filters_follow_latents_or_stand_where_there_are_none() {
+fn filters_follow_latents_or_start_the_section() {
     let bytes = filtered(&[(3, 0, b"best"), (4, 1, b"quick")]).unwrap();
     let stream = parse(&bytes).unwrap().intact().unwrap();
     let [base, middle, top] = stream.levels() else {
@@ -42,7 +42,7 @@ fn filters_follow_latents_or_stand_where_there_are_none() {
 }
 
 #[test]
-fn filters_out_of_order_twice_or_of_unknown_heads_are_refused() {
+fn filters_out_of_order_repeated_or_of_unknown_heads_are_refused() {
     for filters in [
         [(3, 1, &b"quick"[..]), (3, 0, b"best")],
         [(3, 0, b"best"), (3, 0, b"best")],
@@ -102,7 +102,7 @@ fn a_residual_has_a_chunk_for_every_slice_after_the_filters() {
 }
 
 #[test]
-fn a_residual_with_slices_missing_too_many_or_of_other_sizes_is_refused() {
+fn a_residual_with_wrong_slices_is_refused() {
     for slices in [&SLICES[..4], &[SLICES, SLICES].concat()] {
         assert!(matches!(refined(slices), Err(Error::Usage(_))));
     }
@@ -111,7 +111,7 @@ fn a_residual_with_slices_missing_too_many_or_of_other_sizes_is_refused() {
     let error = |bytes: &[u8]| parse(bytes).unwrap().require(4).unwrap_err().to_string();
     // The last chunk is an ancillary one instead, the third has fewer voxels, the second comes twice.
     let last = whole.len() - size;
-    for (at, byte, value, told) in [
+    for (at, byte, value, message) in [
         (last, 0, 200, "residual chunk of level 4, slice 4"),
         (last - 2 * size, 4, 3, "is 3, expected 4 to 4"),
         (last - 3 * size, 2, 0, "slice 1"),
@@ -119,6 +119,6 @@ fn a_residual_with_slices_missing_too_many_or_of_other_sizes_is_refused() {
         let mut bytes = whole.clone();
         bytes[at + byte] = value;
         seal_chunks(&mut bytes, at);
-        assert!(error(&bytes).contains(told), "{}", error(&bytes));
+        assert!(error(&bytes).contains(message), "{}", error(&bytes));
     }
 }

@@ -73,7 +73,7 @@ fn seal_chunks(bytes: &mut [u8], mut at: usize) {
 }
 
 #[test]
-fn what_is_written_is_read() {
+fn reading_inverts_writing() {
     let bytes = sample();
     let stream = parse(&bytes).unwrap().require(4).unwrap();
     assert!(stream.damage().is_none());
@@ -110,7 +110,7 @@ fn what_is_written_is_read() {
 }
 
 #[test]
-fn the_first_bytes_are_those_that_the_format_describes() {
+fn the_first_bytes_match_the_specification() {
     let bytes = sample();
     assert_eq!(&bytes[..8], b"\x89B2P\r\n\x1a\n");
     assert_eq!(bytes[8..24], [2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 128, 5, 2, 4, 0]);
@@ -125,7 +125,7 @@ fn the_first_bytes_are_those_that_the_format_describes() {
 }
 
 #[test]
-fn a_prefix_gives_every_level_that_it_holds_and_no_other() {
+fn a_prefix_has_exactly_its_complete_levels() {
     let bytes = sample();
     let whole = parse(&bytes).unwrap();
     let ends: Vec<usize> = (2..=4)
@@ -153,7 +153,7 @@ fn a_prefix_gives_every_level_that_it_holds_and_no_other() {
 }
 
 #[test]
-fn no_flipped_bit_goes_unnoticed_and_the_levels_before_it_survive() {
+fn every_flipped_bit_is_detected_and_earlier_levels_survive() {
     let bytes = sample();
     let whole = parse(&bytes).unwrap();
     let end = |level: &Level| whole.header().prefix_bytes(level.level).unwrap() as usize;
@@ -174,7 +174,7 @@ fn no_flipped_bit_goes_unnoticed_and_the_levels_before_it_survive() {
 }
 
 #[test]
-fn what_follows_the_last_section_is_reported() {
+fn bytes_after_the_last_section_are_reported() {
     let bytes = [&sample()[..], b"!"].concat();
     let stream = parse(&bytes).unwrap();
     assert_eq!(stream.deepest(), Some(4));
@@ -182,13 +182,13 @@ fn what_follows_the_last_section_is_reported() {
 }
 
 #[test]
-fn errors_say_where_and_what() {
+fn errors_state_the_offset_and_the_field() {
     let bytes = sample();
     let mut damaged = bytes.clone();
     damaged[130] ^= 4;
     let error = parse(&damaged).unwrap().require(2).unwrap_err().to_string();
     assert!(
-        error.starts_with("bitstream: checksum of a chunk that calls itself type 1, level 1, slice 0 at byte 124"),
+        error.starts_with("bitstream: checksum of a chunk of stated type 1, level 1, slice 0 at byte 124"),
         "{error}"
     );
     let error = parse(&bytes).unwrap().require(7).unwrap_err().to_string();
@@ -208,7 +208,7 @@ fn errors_say_where_and_what() {
 }
 
 #[test]
-fn limits_hold_before_anything_is_reserved() {
+fn limits_are_checked_before_allocation() {
     let bytes = sample();
     let limited = |limits| Stream::parse(&bytes, &limits).map(|_| ());
     let points = Limits {
@@ -225,7 +225,7 @@ fn limits_hold_before_anything_is_reserved() {
 }
 
 #[test]
-fn a_header_that_the_format_forbids_is_neither_written_nor_read() {
+fn invalid_headers_are_neither_written_nor_read() {
     type Change = fn(&mut Header);
     let forbidden: [(usize, u8, Change); 9] = [
         (20, 4, |h| h.bits = 4),
@@ -254,7 +254,7 @@ fn a_header_that_the_format_forbids_is_neither_written_nor_read() {
 }
 
 #[test]
-fn unknown_critical_things_are_refused_and_unknown_others_passed_over() {
+fn unknown_critical_parts_are_refused_and_optional_ones_ignored() {
     let refused = |offset: usize, value: u8| {
         let mut bytes = sample();
         bytes[offset] = value;
@@ -300,7 +300,7 @@ fn unknown_critical_things_are_refused_and_unknown_others_passed_over() {
 #[test]
 fn chunks_out_of_order_or_with_impossible_counts_are_damage() {
     // Offset, value, and what the message tells; the checksum is right every time.
-    for (offset, value, told) in [
+    for (offset, value, message) in [
         (
             125,
             2,
@@ -319,7 +319,7 @@ fn chunks_out_of_order_or_with_impossible_counts_are_damage() {
         bytes[offset] = value;
         seal_chunks(&mut bytes, 124);
         let error = parse(&bytes).unwrap().require(2).unwrap_err().to_string();
-        assert!(error.contains(told), "{offset} = {value}: {error}");
+        assert!(error.contains(message), "{offset} = {value}: {error}");
     }
     // Sections that end between other chunks than their level's.
     for (from, to, by) in [(96, 100, 22), (100, 96, 33)] {
@@ -332,7 +332,7 @@ fn chunks_out_of_order_or_with_impossible_counts_are_damage() {
 }
 
 #[test]
-fn the_writer_refuses_what_the_reader_would() {
+fn the_writer_refuses_invalid_levels() {
     let unfinished = Writer::new(header()).unwrap();
     assert!(unfinished.finish().is_err());
     let mut wrong = Writer::new(header()).unwrap();
@@ -362,7 +362,7 @@ fn a_stream_may_start_at_the_root() {
 
 proptest! {
     #[test]
-    fn damage_with_right_checksums_never_panics(
+    fn damage_with_valid_checksums_never_panics(
         edits in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6),
         small in any::<bool>(),
     ) {

@@ -84,7 +84,7 @@ fn only_base() -> Header {
 }
 
 #[test]
-fn what_is_written_is_read() {
+fn reading_inverts_writing() {
     let bytes = sample();
     let stream = parse(&bytes).unwrap();
     assert!(stream.damage().is_none(), "{:?}", stream.damage());
@@ -114,7 +114,7 @@ fn what_is_written_is_read() {
 }
 
 #[test]
-fn the_bytes_are_those_that_the_format_describes() {
+fn the_bytes_match_the_specification() {
     let [geometry, colours] = base();
     let mut writer = Writer::new(only_base()).unwrap();
     writer.geometry_trunk(&[(2, "one"), (3, "second")]).unwrap();
@@ -130,7 +130,7 @@ fn the_bytes_are_those_that_the_format_describes() {
 }
 
 #[test]
-fn every_level_of_the_cloud_may_be_coded_and_the_root_alone() {
+fn all_levels_from_the_root_to_the_finest_can_be_coded() {
     let header = Header {
         bits: 1,
         base: 0,
@@ -151,7 +151,7 @@ fn every_level_of_the_cloud_may_be_coded_and_the_root_alone() {
 }
 
 #[test]
-fn headers_that_the_format_forbids_are_refused() {
+fn invalid_headers_are_refused() {
     let refused = |header: Header, field: &str| {
         let error = Writer::new(header).unwrap_err().to_string();
         assert!(error.contains(field), "{error}");
@@ -171,8 +171,8 @@ fn headers_that_the_format_forbids_are_refused() {
 }
 
 #[test]
-fn chunks_that_break_the_format_are_damage() {
-    let told = |section: usize, chunks: Vec<Vec<u8>>, words: &str| {
+fn invalid_chunks_are_damage() {
+    let message = |section: usize, chunks: Vec<Vec<u8>>, words: &str| {
         let mut sections = base();
         sections[section] = chunks;
         let bytes = stream(only_base(), &sections);
@@ -181,44 +181,44 @@ fn chunks_that_break_the_format_are_damage() {
     };
     let [geometry, colours] = base();
     let trunk = |level, count, payload: &[u8]| vec![chunk(5, level, [0, count], payload)];
-    told(0, vec![], "end of the section");
-    told(0, trunk(3, 3, b""), "geometry trunk chunk of a level from 1 to 2");
-    told(0, trunk(2, 4, b"\x02\x03one\x03\x06second"), "voxel count");
-    told(0, trunk(2, 3, b"\x02\x03one\x03\x06second!"), "bytes after");
-    told(
+    message(0, vec![], "end of the section");
+    message(0, trunk(3, 3, b""), "geometry trunk chunk of a level from 1 to 2");
+    message(0, trunk(2, 4, b"\x02\x03one\x03\x06second"), "voxel count");
+    message(0, trunk(2, 3, b"\x02\x03one\x03\x06second!"), "bytes after");
+    message(
         0,
         trunk(2, 3, b"\x02\x03one\x03\x07second"),
         "payload of the geometry trunk",
     );
-    told(0, trunk(2, 3, b"\x02\x03one"), "payload of the geometry trunk");
-    told(0, trunk(2, 3, b"\x00\x03one\x03\x06second"), "voxel count of level 1");
-    told(0, trunk(2, 3, b"\x09\x03one\x03\x06second"), "voxel count of level 1");
-    told(0, trunk(2, 3, b"\x03\x03one\x03\x06second"), "parents of level 2");
-    told(0, vec![geometry[0].clone(), geometry[0].clone()], "section's last");
+    message(0, trunk(2, 3, b"\x02\x03one"), "payload of the geometry trunk");
+    message(0, trunk(2, 3, b"\x00\x03one\x03\x06second"), "voxel count of level 1");
+    message(0, trunk(2, 3, b"\x09\x03one\x03\x06second"), "voxel count of level 1");
+    message(0, trunk(2, 3, b"\x03\x03one\x03\x06second"), "parents of level 2");
+    message(0, vec![geometry[0].clone(), geometry[0].clone()], "section's last");
 
-    told(1, vec![], "end of the section");
-    told(1, colours[1..].to_vec(), "colour trunk chunk of a level from 0 to 2");
-    told(1, vec![chunk(6, 1, [0, 2], b"short")], "first colour chunk");
+    message(1, vec![], "end of the section");
+    message(1, colours[1..].to_vec(), "colour trunk chunk of a level from 0 to 2");
+    message(1, vec![chunk(6, 1, [0, 2], b"short")], "first colour chunk");
     let hash = [0; 8];
-    told(1, vec![chunk(6, 1, [0, 3], &hash)], "colour trunk");
-    told(1, vec![chunk(6, 1, [1, 2], &hash)], "slice 0");
+    message(1, vec![chunk(6, 1, [0, 3], &hash)], "colour trunk");
+    message(1, vec![chunk(6, 1, [1, 2], &hash)], "slice 0");
     let after = |chunk: Vec<u8>| vec![colours[0].clone(), chunk];
-    told(1, after(colours[2].clone()), "colour chunk of level 2, slice 0");
-    told(1, after(chunk(7, 2, [0, 3], b"two")), "voxel count of the colour chunk");
-    told(
+    message(1, after(colours[2].clone()), "colour chunk of level 2, slice 0");
+    message(1, after(chunk(7, 2, [0, 3], b"two")), "voxel count of the colour chunk");
+    message(
         1,
         after(chunk(7, 2, [1, 2], b"two")),
         "colour chunk of level 2, slice 0",
     );
     let filter = vec![colours[0].clone(), colours[1].clone(), chunk(8, 2, [0, 4], b"")];
-    told(1, filter, "voxel count of the colour filter chunk");
+    message(1, filter, "voxel count of the colour filter chunk");
     for kind in [0, 2, 3, 4, 9, 127] {
-        told(1, after(chunk(kind, 2, [0, 2], b"two")), "type");
+        message(1, after(chunk(kind, 2, [0, 2], b"two")), "type");
     }
 }
 
 #[test]
-fn numbers_are_as_short_as_they_can_be() {
+fn varints_have_their_shortest_form() {
     let [geometry, mut colours] = base();
     // The same slice in two bytes.
     let long = [7, 2, 0x80, 0, 2, 3];
@@ -248,7 +248,7 @@ fn numbers_are_as_short_as_they_can_be() {
 }
 
 #[test]
-fn no_flipped_bit_goes_unnoticed_and_the_levels_before_it_survive() {
+fn every_flipped_bit_is_detected_and_earlier_levels_survive() {
     let bytes = sample();
     let whole = parse(&bytes).unwrap();
     for bit in 0..8 * bytes.len() {
@@ -264,7 +264,7 @@ fn no_flipped_bit_goes_unnoticed_and_the_levels_before_it_survive() {
 }
 
 #[test]
-fn ancillary_chunks_are_passed_over() {
+fn ancillary_chunks_are_skipped() {
     let [mut geometry, mut colours] = base();
     let note = chunk(200, 99, [9, 9], b"a note");
     geometry.insert(0, note.clone());
@@ -277,7 +277,7 @@ fn ancillary_chunks_are_passed_over() {
 
 proptest! {
     #[test]
-    fn damage_with_right_checksums_never_panics(
+    fn damage_with_valid_checksums_never_panics(
         at in 0usize..1000,
         value in any::<u8>(),
         cut in 0usize..1000,

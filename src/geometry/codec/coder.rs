@@ -1,21 +1,22 @@
-//! A binary arithmetic coder: carry-less, 32 bits, byte by byte.
+//! Carry-less binary arithmetic coder of 32 bits with byte-wise renormalisation (`docs/format.md`, clause 4.2).
 //!
-//! The state is an interval `low..=high` of `u32`, at first all of it. A bit that is 1 with probability `one / 65536` splits it at
-//! `mid = low + ((high − low) · one >> 16)` (64-bit product): 1 keeps `low..=mid`, 0 keeps `mid+1..=high`. Then, while the top bytes
-//! of `low` and `high` agree, that byte goes out, and `low = low << 8`, `high = high << 8 | 255`. The encoder ends with the four
-//! bytes of `low`, most significant first. The decoder holds the 32 bits of the input that begin where the interval's do, starts by
-//! reading four bytes, and reads one for every byte that went out.
+//! The state is an interval `low..=high` of `u32`, at first all of it. A bit that is 1 with probability `one / 65536`
+//! splits it at `mid = low + ((high − low) · one >> 16)` (64-bit product): 1 keeps `low..=mid`, 0 keeps `mid+1..=high`.
+//! Then, while the top bytes of `low` and `high` agree, that byte is emitted, and `low = low << 8`, `high = high << 8 |
+//! 255`. The encoder ends with the four bytes of `low`, most significant first. The decoder keeps the 32 bits of the
+//! input that correspond to the interval. It starts by reading four bytes, and reads one more for every byte that the
+//! encoder emitted.
 //!
-//! So the decoder reads exactly the bytes that the encoder wrote, and ends holding exactly `low`. Every truncation makes it read past
-//! the end, and other damage goes unnoticed only if it leaves both the number of bytes and the last 32 bits as they were.
+//! So the decoder reads exactly the bytes that the encoder wrote, and its value ends equal to `low`. Every truncation
+//! makes it read past the end. Other damage goes unnoticed only if the number of bytes and the last 32 bits both match.
 
 use crate::coding::ONE;
 use crate::error::{Error, Result, Stage};
 
-/// What codes bits, one way or the other.
+/// Encodes or decodes bits.
 pub(super) trait Coder {
-    /// Codes a bit that is 1 with probability `one / 65536`, `one` in `1..=65535`. An encoder takes `bit` and returns it; a decoder
-    /// returns the bit it read, whatever `bit` is.
+    /// Codes a bit that is 1 with probability `one / 65536`, with `one` in `1..=65535`. An encoder writes `bit` and
+    /// returns it. A decoder ignores `bit` and returns the bit that it read.
     fn code(&mut self, bit: bool, one: u32) -> bool;
 }
 
@@ -36,7 +37,7 @@ impl Interval {
     }
 
     #[inline(always)]
-    fn keep(&mut self, bit: bool, mid: u32) {
+    fn narrow(&mut self, bit: bool, mid: u32) {
         if bit {
             self.high = mid;
         } else {
@@ -56,7 +57,7 @@ impl Interval {
     }
 }
 
-/// Writes bits.
+/// Encodes bits to bytes.
 #[derive(Debug)]
 pub(super) struct Encoder {
     interval: Interval,
@@ -81,7 +82,7 @@ impl Coder for Encoder {
     #[inline(always)]
     fn code(&mut self, bit: bool, one: u32) -> bool {
         let mid = self.interval.split(one);
-        self.interval.keep(bit, mid);
+        self.interval.narrow(bit, mid);
         while self.interval.top_byte_is_settled() {
             self.bytes.push((self.interval.low >> 24) as u8);
             self.interval.shift();
@@ -90,19 +91,19 @@ impl Coder for Encoder {
     }
 }
 
-/// Reads bits. Past the end it reads zeros and remembers that it did.
+/// Decodes bits from bytes. Bytes past the end read as zeros; [`Decoder::finish`] reports them.
 #[derive(Debug)]
 pub(super) struct Decoder<'a> {
     interval: Interval,
     value: u32,
     bytes: &'a [u8],
     next: usize,
-    /// Where the bytes lie in the stream.
+    /// Byte offset of `bytes` in the stream.
     offset: usize,
 }
 
 impl<'a> Decoder<'a> {
-    /// Reads `bytes`, whose first is byte `offset` of the stream.
+    /// A decoder of `bytes`, which start at byte `offset` of the stream.
     pub fn new(bytes: &'a [u8], offset: usize) -> Self {
         let mut decoder = Decoder {
             interval: Interval::ALL,
@@ -124,10 +125,10 @@ impl<'a> Decoder<'a> {
         self.next += 1;
     }
 
-    /// Sees that no bits were read that are not there.
+    /// Checks that no bytes past the end were read.
     ///
     /// # Errors
-    /// [`Error::Truncated`] if they were.
+    /// [`Error::Truncated`] if some were.
     pub fn check_not_past_end(&self) -> Result<()> {
         if self.next <= self.bytes.len() {
             return Ok(());
@@ -140,7 +141,7 @@ impl<'a> Decoder<'a> {
         })
     }
 
-    /// Sees that everything was read, and ended as an encoder ends.
+    /// Checks that all bytes were read, and that the final state is that of an encoder.
     ///
     /// # Errors
     /// [`Error::Truncated`] or [`Error::Malformed`] if not.
@@ -173,7 +174,7 @@ impl Coder for Decoder<'_> {
     fn code(&mut self, _: bool, one: u32) -> bool {
         let mid = self.interval.split(one);
         let bit = self.value <= mid;
-        self.interval.keep(bit, mid);
+        self.interval.narrow(bit, mid);
         while self.interval.top_byte_is_settled() {
             self.interval.shift();
             self.read();
@@ -210,13 +211,13 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_was_written_is_read(bits in some_bits()) {
+        fn decoding_inverts_encoding(bits in some_bits()) {
             let read = decode(&encode(&bits), &bits).unwrap();
             prop_assert!(read.iter().eq(bits.iter().map(|(bit, _)| bit)));
         }
 
         #[test]
-        fn every_truncation_is_noticed(bits in some_bits()) {
+        fn every_truncation_is_detected(bits in some_bits()) {
             let bytes = encode(&bits);
             for end in 0..bytes.len() {
                 let noticed = matches!(decode(&bytes[..end], &bits), Err(Error::Truncated { .. }));

@@ -1,32 +1,32 @@
-//! The octree codec: lossless, level by level.
+//! The lossless octree codec (`docs/format.md`, clause 4).
 //!
-//! A level is coded, given the level above, as the occupancy of each of the parents: which of their eight children are there. The
-//! parents, in Morton order, are cut into slices of so many (16,384 in a stream); each slice is an entropy stream of its own, so the slices of a
-//! level decode in any order and in parallel. Within a slice, parent after parent and child after child by ascending octant, each
-//! child is one binary decision, whose probability comes from a small integer network (`network`) that sees
+//! A level is coded given the level above, as the occupancy of each parent: an 8-bit mask of its children. The parents,
+//! in Morton order, are cut into slices of at most 16,384. Each slice is an entropy stream of its own, so the slices of
+//! a level decode in any order and in parallel. Within a slice, each child is one binary decision, parent by parent and
+//! octant by octant. Its probability comes from a small integer network (`network`), whose binary input features are
 //!
 //! - which of the parent's 26 neighbours are occupied,
-//! - which children those neighbours have that come earlier in the slice,
-//! - which children the parent itself has in the octants below,
+//! - which children those neighbours have that precede the parent in the slice,
+//! - which children the parent has in lower octants.
 //!
-//! and whose output layer goes on learning as it codes (`predictor`). Where the network is in doubt, five tables of what the slice has shown in like
-//! `surroundings` have their say (`mixer`): what a cloud repeats, it tells once. The decisions go through a binary arithmetic coder (`coder`,
-//! `probability`). If a parent has none of its first seven children, the eighth is not coded: it must be there.
+//! The output layer of the network is backward-adaptive (`predictor`). Where the network is uncertain, a mixer combines
+//! its prediction with those of five adaptive contexts (`contexts`, `mixer`). The decisions are coded by a binary
+//! arithmetic coder (`coder`, [`crate::coding::probability`]). If a parent has none of its first seven children, the
+//! eighth is implied and not coded.
 //!
 //! # Exactness
-//! Integers throughout: an encoder and a decoder anywhere, with any number of threads, agree on every bit. A stream is fully
-//! determined by what it codes.
+//! All arithmetic is on integers. Encoder and decoder are bit-exact on every machine and with any number of threads.
 //!
-//! # Hostile input
-//! A decoder is told how many voxels to expect, and fails as soon as there are more, or in the end fewer. It reserves memory for the
-//! parents it was given and the voxels it was told, no more.
+//! # Untrusted input
+//! The caller states the expected number of voxels. A decoder fails as soon as a slice has more, or fewer at its end.
+//! It allocates memory for the given parents and the expected voxels only.
 
 mod coder;
+mod contexts;
 mod mixer;
 mod neighbourhood;
 pub mod network;
 mod predictor;
-mod surroundings;
 
 use super::{KernelMap, Octree};
 use crate::cancel::Cancel;
@@ -39,16 +39,16 @@ use predictor::Predictor;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// The slices of so many parents: which parents each has, at most `slice`.
+/// Ranges of parents that the slices cover, of at most `slice` parents each.
 fn slices(parents: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<usize>> {
     (0..parents.div_ceil(slice)).map(move |i| i * slice..parents.min((i + 1) * slice))
 }
 
-/// Codes level `level` of `octree` in slices of `slice` parents: for each the number of children, and the code. `map` is the 3³
-/// kernel map of the level above; any `isa` gives the same.
+/// Encodes level `level` of `octree` in slices of `slice` parents. Returns the number of children and the entropy
+/// stream of each slice. `map` is the 3³ kernel map of the level above. The result does not depend on `isa`.
 ///
 /// # Panics
-/// If `level` is 0 or deeper than the octree, `map` is another level's, or `slice` is 0.
+/// If `level` is 0 or deeper than the octree, `map` belongs to another level, or `slice` is 0.
 pub fn encode_level(isa: Isa, octree: &Octree, map: &KernelMap, level: u8, slice: usize) -> Vec<(u32, Vec<u8>)> {
     let occupancy = octree.occupancy(level - 1);
     assert_eq!(map.len(), occupancy.len(), "one kernel map row per parent");
@@ -61,14 +61,15 @@ pub fn encode_level(isa: Isa, octree: &Octree, map: &KernelMap, level: u8, slice
     ranges.into_par_iter().map(encode).collect()
 }
 
-/// The occupancies of the parents `parents`, whose children are the slice's voxels of level `level`; `map` is the 3³ kernel map of
+/// Decodes one slice of level `level`. Returns the occupancies of its parents `parents`. `map` is the 3³ kernel map of
 /// the level above.
 ///
 /// # Errors
-/// [`Error::Truncated`] if the code ends early, [`Error::Malformed`] if it does not hold exactly so many voxels or goes on after them.
+/// [`Error::Truncated`] if the entropy stream ends early. [`Error::Malformed`] if it does not hold exactly
+/// `slice.voxels` voxels, or has bytes after them.
 ///
 /// # Panics
-/// If `map` has not that many rows.
+/// If `parents` exceeds the rows of `map`.
 pub fn decode_slice(isa: Isa, level: u8, map: &KernelMap, parents: Range<usize>, slice: &Slice) -> Result<Vec<u8>> {
     let masks = isa.run(Decode {
         level,
@@ -85,14 +86,14 @@ pub fn decode_slice(isa: Isa, level: u8, map: &KernelMap, parents: Range<usize>,
     }
 }
 
-/// Adds to `octree` the level that these slices hold, each of the children of `slice` parents. `map` is the 3³ kernel map of what is
-/// now the deepest level.
+/// Decodes the next level from its slices, of `slice` parents each, and adds it to `octree`. `map` is the 3³ kernel map
+/// of the level that is the deepest before.
 ///
 /// # Errors
-/// Those of [`decode_masks`] and [`Octree::grow`]. The octree is unchanged then.
+/// Those of [`decode_masks`] and [`Octree::grow`]. The octree is then unchanged.
 ///
 /// # Panics
-/// If `map` is another level's, or `slice` is 0.
+/// If `map` belongs to another level, or `slice` is 0.
 pub fn decode_level(
     isa: Isa,
     octree: &mut Octree,
@@ -105,11 +106,11 @@ pub fn decode_level(
     octree.grow(decode_masks(isa, level, map, encoded, slice, cancel)?)
 }
 
-/// The occupancies of all parents of `level`, whose 3³ kernel map is `map`, from slices of the children of `slice` parents each: what
-/// [`Octree::grow`] adds that level with.
+/// Decodes the slices of `level`, of `slice` parents each. Returns the occupancies of all parents, as [`Octree::grow`]
+/// takes them. `map` is the 3³ kernel map of the parents.
 ///
 /// # Errors
-/// Those of [`decode_slice`], [`Error::Malformed`] if there are more or fewer slices than there should be, and [`Error::Cancelled`].
+/// Those of [`decode_slice`], [`Error::Malformed`] if the number of slices is wrong, and [`Error::Cancelled`].
 ///
 /// # Panics
 /// If `slice` is 0.
@@ -136,13 +137,13 @@ pub fn decode_masks(
         cancel.check()?;
         decode_slice(isa, level, map, parents, slice)
     };
-    // All of them, so that the error is that of the first slice that has one.
+    // Collect all results first: the error returned is that of the first faulty slice, with any number of threads.
     let masks: Vec<Result<_>> = tasks.into_par_iter().map(decode).collect();
     let masks: Result<Vec<_>> = masks.into_iter().collect();
     Ok(masks?.concat())
 }
 
-/// Codes the occupancies of one slice.
+/// Encodes the occupancies of one slice.
 struct Encode<'a> {
     map: &'a KernelMap,
     parents: Range<usize>,
@@ -156,15 +157,15 @@ impl Work for Encode<'_> {
     fn run<I: Instructions>(self, instructions: I) -> Vec<u8> {
         let Encode { map, parents, masks } = self;
         let (mut predictor, mut encoder) = (Predictor::new(instructions, parents.len()), Encoder::new());
-        let around = Neighbourhood::of_all(map, &parents);
-        for ((here, &mask), around) in parents.clone().zip(masks).zip(around) {
-            predictor.code(&mut encoder, around, map.row(here), parents.start, masks, mask);
+        let neighbourhoods = Neighbourhood::of_all(map, &parents);
+        for ((parent, &mask), neighbourhood) in parents.clone().zip(masks).zip(neighbourhoods) {
+            predictor.code(&mut encoder, neighbourhood, map.row(parent), parents.start, masks, mask);
         }
         encoder.finish()
     }
 }
 
-/// Decodes the occupancies of one slice, unless they come to more than its voxels.
+/// Decodes the occupancies of one slice. Stops with an error as soon as they exceed its voxel count.
 struct Decode<'a> {
     level: u8,
     map: &'a KernelMap,
@@ -187,14 +188,14 @@ impl Work for Decode<'_> {
         let mut decoder = Decoder::new(slice.bytes, slice.offset);
         let mut masks = Vec::with_capacity(parents.len());
         let mut found = 0;
-        let around = Neighbourhood::of_all(map, &parents);
-        for (here, around) in parents.clone().zip(around) {
-            let (row, first) = (map.row(here), parents.start);
-            let mask = predictor.code(&mut decoder, around, row, first, &masks, 0);
+        let neighbourhoods = Neighbourhood::of_all(map, &parents);
+        for (parent, neighbourhood) in parents.clone().zip(neighbourhoods) {
+            let (row, first) = (map.row(parent), parents.start);
+            let mask = predictor.code(&mut decoder, neighbourhood, row, first, &masks, 0);
             decoder.check_not_past_end()?;
             masks.push(mask);
             found += mask.count_ones() as usize;
-            let at_least = found + (parents.end - here - 1);
+            let at_least = found + (parents.end - parent - 1);
             if at_least > slice.voxels as usize {
                 let found = format!("at least {at_least}");
                 let expected = format!("at most {}", slice.voxels);
@@ -206,6 +207,7 @@ impl Work for Decode<'_> {
     }
 }
 
+/// Number of children that `masks` have.
 fn count(masks: &[u8]) -> usize {
     masks.iter().map(|mask| mask.count_ones() as usize).sum()
 }

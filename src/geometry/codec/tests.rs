@@ -2,7 +2,7 @@ use super::*;
 use crate::geometry::{Voxels, morton};
 use proptest::prelude::*;
 
-/// The slices of every level from 1 on.
+/// The slices of every level from level 1 on.
 fn encode(octree: &Octree, slice: usize) -> Vec<Vec<(u32, Vec<u8>)>> {
     let mut map = KernelMap::root();
     let mut levels = Vec::new();
@@ -29,7 +29,7 @@ fn decode(levels: &[Vec<(u32, Vec<u8>)>], slice: usize) -> Result<Octree> {
     Ok(octree)
 }
 
-/// A slice as if it stood at byte `offset` of a stream.
+/// A slice that starts at byte `offset` of a stream.
 fn slice_at(offset: usize, voxels: u32, bytes: &[u8]) -> Slice<'_> {
     Slice { voxels, bytes, offset }
 }
@@ -47,7 +47,7 @@ fn check(voxels: Voxels, slice: usize) {
     assert_eq!(decode(&encode(&octree, slice), slice).unwrap(), octree);
 }
 
-/// A bowl, 2^`depth` wide: a surface with every slope.
+/// A paraboloid of width 2^`depth`: a surface with all slopes.
 fn bowl(depth: u8) -> Octree {
     let side = 1u32 << depth;
     let column = |i: u32| {
@@ -57,7 +57,7 @@ fn bowl(depth: u8) -> Octree {
     Octree::new(Voxels::new(depth, (0..side * side).map(column).collect())).unwrap()
 }
 
-/// Level 6 of a bowl, its kernel map above, and one slice of it all.
+/// A paraboloid of depth 6, the kernel map of level 5, and all of level 6 in one slice.
 fn level_of_a_bowl() -> (Octree, KernelMap, u32, Vec<u8>) {
     let octree = bowl(6);
     let map = octree.kernel_map(5);
@@ -67,7 +67,7 @@ fn level_of_a_bowl() -> (Octree, KernelMap, u32, Vec<u8>) {
 
 proptest! {
     #[test]
-    fn any_cloud_comes_back(
+    fn any_cloud_round_trips(
         depth in 1u8..=7, keys in prop::collection::vec(any::<u64>(), 1..500), slice in 1usize..100
     ) {
         let keys = keys.iter().map(|k| k & ((1 << (3 * depth)) - 1)).collect();
@@ -75,12 +75,12 @@ proptest! {
     }
 
     #[test]
-    fn points_in_the_deepest_octree_come_back(keys in prop::collection::vec(0u64..1 << 63, 1..20)) {
+    fn points_in_the_deepest_octree_round_trip(keys in prop::collection::vec(0u64..1 << 63, 1..20)) {
         check(Voxels::new(21, keys), 16);
     }
 
     #[test]
-    fn any_bytes_decode_to_as_many_voxels_as_declared_or_to_an_error(
+    fn any_bytes_decode_to_the_declared_count_or_an_error(
         bytes in prop::collection::vec(any::<u8>(), 0..200), voxels in 0u32..600
     ) {
         let octree = bowl(4).truncated(3);
@@ -94,7 +94,7 @@ proptest! {
 }
 
 #[test]
-fn one_point_comes_back_from_every_depth() {
+fn one_point_round_trips_at_every_depth() {
     for depth in 1..=21 {
         check(Voxels::new(depth, vec![(1 << (3 * depth)) - 1]), 1);
         check(Voxels::new(depth, vec![0]), 16_384);
@@ -102,12 +102,12 @@ fn one_point_comes_back_from_every_depth() {
 }
 
 #[test]
-fn opposite_corners_come_back() {
+fn opposite_corners_round_trip() {
     check(Voxels::new(21, vec![0, (1 << 63) - 1]), 16_384);
 }
 
 #[test]
-fn full_cubes_lines_and_checkerboards_come_back() {
+fn full_cubes_lines_and_checkerboards_round_trip() {
     check(Voxels::new(5, (0..1 << 15).collect()), 1000);
     let diagonal = (0..1 << 10).map(|i| morton::encode([i, i, 1023 - i]));
     check(Voxels::new(10, diagonal.collect()), 100);
@@ -116,7 +116,7 @@ fn full_cubes_lines_and_checkerboards_come_back() {
 }
 
 #[test]
-fn a_surface_costs_less_than_half_of_its_occupancy_bytes() {
+fn a_surface_needs_less_than_half_of_its_occupancy_bytes() {
     let octree = bowl(8);
     let (_, bytes) = encode_level(Isa::detect(), &octree, &octree.kernel_map(7), 8, usize::MAX).remove(0);
     let (bits, parents) = (8 * bytes.len(), octree.level(7).len());
@@ -124,14 +124,14 @@ fn a_surface_costs_less_than_half_of_its_occupancy_bytes() {
 }
 
 #[test]
-fn a_full_cube_costs_next_to_nothing() {
+fn a_full_cube_needs_few_bits() {
     let octree = Octree::new(Voxels::new(6, (0..1 << 18).collect())).unwrap();
     let (_, bytes) = encode_level(Isa::detect(), &octree, &octree.kernel_map(5), 6, usize::MAX).remove(0);
     assert!(8 * bytes.len() < octree.level(5).len() / 4, "{}", bytes.len());
 }
 
 #[test]
-fn slices_do_not_need_each_other() {
+fn slices_decode_independently() {
     let octree = bowl(7);
     let map = octree.kernel_map(6);
     let slices = encode_level(Isa::detect(), &octree, &map, 7, 1000);
@@ -165,7 +165,7 @@ fn every_instruction_set_gives_the_same_bytes_and_voxels() {
 }
 
 #[test]
-fn every_truncation_is_noticed() {
+fn every_truncation_is_detected() {
     let (_, map, voxels, bytes) = level_of_a_bowl();
     for end in 0..bytes.len() {
         let result = decode_slice(
@@ -180,7 +180,7 @@ fn every_truncation_is_noticed() {
 }
 
 #[test]
-fn bytes_left_over_are_refused() {
+fn surplus_bytes_are_refused() {
     let (_, map, voxels, mut bytes) = level_of_a_bowl();
     bytes.push(0);
     let result = decode_slice(Isa::detect(), 6, &map, 0..map.len(), &slice_at(0, voxels, &bytes));
@@ -197,7 +197,7 @@ fn a_wrong_count_is_refused() {
 }
 
 #[test]
-fn every_flipped_bit_is_noticed() {
+fn every_flipped_bit_is_detected() {
     let octree = bowl(5);
     let map = octree.kernel_map(4);
     let (voxels, bytes) = encode_level(Isa::detect(), &octree, &map, 5, usize::MAX).remove(0);
@@ -227,7 +227,7 @@ fn a_missing_slice_is_refused() {
 }
 
 #[test]
-fn faults_are_placed_in_the_stream() {
+fn errors_state_the_byte_offset() {
     let (_, map, voxels, bytes) = level_of_a_bowl();
     let fault = |voxels: u32, bytes: &[u8]| {
         let slice = slice_at(1000, voxels, bytes);

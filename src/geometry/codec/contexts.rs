@@ -1,38 +1,44 @@
-//! What is known around a voxel whose children are being coded, child by child, and the contexts that come of it.
+//! Contexts of a child: hashes of the known occupancy around it (`docs/format.md`, clause 4.6).
 //!
-//! *Cells* are voxels of the children's level. A cell is *occupied* if it is known to be, *unknown* if its parent is occupied but its own
-//! occupancy is not known yet (see `network`: the children of a voxel that comes later, or in another slice; of this voxel's children those not
-//! yet coded), and else empty. The 4³ cells around this voxel's children, of coordinates −1 to 2 where the children have 0 and 1, are numbered
-//! `(x + 1) + 4(y + 1) + 16(z + 1)`; two masks of 64 bits tell which are occupied and which are unknown.
+//! *Cells* are voxels of the children's level. A cell is *occupied* if it is known to be, and *unknown* if its parent
+//! is occupied but its own occupancy is not known: the children of a voxel that follows or is in another slice, and own
+//! children not yet coded. Else it is empty. The 4³ cells around this voxel's children, of coordinates −1 to 2 where
+//! the children have 0 and 1, are numbered `(x + 1) + 4(y + 1) + 16(z + 1)`. Two masks of 64 bits hold the occupied and
+//! the unknown cells.
 //!
-//! For the child in octant `c = x + 2y + 4z`, both masks are shifted right by `x + 4y + 16z`: the 3³ cells around the child then have the bits
-//! `i + 4j + 16k`, each 0 to 2, the child itself bit 21. The *near* cells are these but for the child, its *faces* the bits 5, 17, 20, 22, 25, 37.
+//! For the child in octant `c = x + 2y + 4z`, both masks are shifted right by `x + 4y + 16z`: the 3³ cells around the
+//! child then have the bits `i + 4j + 16k`, each 0 to 2, the child itself bit 21. The *near* cells are these without
+//! the child, its *face cells* the bits 5, 17, 20, 22, 25, 37.
 //!
-//! Of the 3³ neighbours of the voxel (offset order, bit 13 never set) 27 bits tell the *presence*. Six of them share a face with it, at places 4, 10, 12, 14, 16, 22; in this
-//! order, from the lowest bit up:
-//! - *beside* is 1 bit: the neighbour is there;
-//! - *far* are 8 bits: of its child in octant `c`, occupied (1) or unknown (2);
-//! - *behind*, of the first three alone, are 9 bits: 0 if it is not there, 1 if its children are unknown, else 256 plus its occupancy;
-//! - *beyond*, of the last three alone, are 2 bits: 2 if it is not there, else 1 if the next in that direction is.
+//! *presence* is a mask of 27 bits of the voxel's occupied neighbours (offset order, bit 13 never set). For the six
+//! face neighbours, at the offsets 4, 10, 12, 14, 16, 22, in this order from the lowest bit up:
+//! - *faces* has 1 bit: the neighbour is occupied;
+//! - *far* has 8 bits: its child in octant `c` is occupied (1) or unknown (2);
+//! - *face occupancies*, of the first three alone, has 9 bits: 0 if the neighbour is absent, 1 if its children are
+//!   unknown, else 256 plus its occupancy;
+//! - *second*, of the last three alone, has 2 bits: 2 if the neighbour is absent, else 1 if the voxel two away in that
+//!   direction is occupied, else 0.
 //!
 //! # Contexts
-//! With *node* as in `network` (`1 << c | occupancy of the octants below`), five contexts each have a hash of 64 bits: a sequence of words goes into `h`, at first the number of the
-//! context, by `h = (h ^ word)·0x9E3779B97F4A7C15`, then `h = h ^ (h >> 32)`.
+//! With *node* as in `network` (`1 << c | occupancy of the octants below`), each of five contexts has a hash of 64
+//! bits. It starts from the number of the context. A word is added by `h = (h ^ word)·0x9E3779B97F4A7C15`, then `h = h
+//! ^ (h >> 32)`.
 //!
 //! | context | words |
 //! |---|---|
-//! | 1 | occupied faces + (c << 48) + (beside << 51); unknown faces |
+//! | 1 | occupied face cells + (c << 48) + (faces << 51); unknown face cells |
 //! | 2 | occupied near cells; unknown near cells |
-//! | 3 | what context 2 has come to, as the first word; far |
-//! | 4 | node + (behind << 8) |
-//! | 5 | node + (presence << 8) + (beyond << 35) |
+//! | 3 | the hash of context 2; far |
+//! | 4 | node + (face occupancies << 8) |
+//! | 5 | node + (presence << 8) + (second << 35) |
 
-use super::neighbourhood::{AFTER, Neighbourhood};
+use super::neighbourhood::{LATER_FACES, Neighbourhood};
 use b2p_kernels::mixing::CONTEXTS;
 
-/// The neighbours that share a face and can come earlier, by their places in a 3³ row.
-const BEFORE: [usize; 3] = [4, 10, 12];
+/// Offsets of the face neighbours that can precede in Morton order, as indices into a 3³ row.
+const EARLIER_FACES: [usize; 3] = [4, 10, 12];
 
+/// Near cells, in the shifted masks.
 const NEAR: u64 = {
     let (mut mask, mut at) = (0, 0);
     while at < 27 {
@@ -43,16 +49,18 @@ const NEAR: u64 = {
     }
     mask
 };
+/// Face cells, in the shifted masks.
 const FACES: u64 = 1 << 5 | 1 << 17 | 1 << 20 | 1 << 22 | 1 << 25 | 1 << 37;
-/// This voxel's own children.
+/// Cells of this voxel's own children, in the masks before the shift.
 const OWN: u64 = 0b0110_0110 << 20 | 0b0110_0110 << 36;
 
-/// Where place `at` of 3³ cells lies among 4³.
+/// Index among 4³ cells of the cell with the index `at` among 3³.
 const fn cell_of(at: usize) -> usize {
     at % 3 + 4 * (at / 3 % 3) + 16 * (at / 9)
 }
 
-/// Of the neighbour at each offset, which of the 4³ cells any half of its occupancy makes: the low four octants, the high four.
+/// Cells of a neighbour's children, by its offset, by half of its occupancy (low or high four octants), and by these
+/// four bits.
 static CELLS: [[[u64; 16]; 2]; 27] = {
     let mut cells = [[[0; 16]; 2]; 27];
     let mut k = 0;
@@ -78,46 +86,47 @@ static CELLS: [[[u64; 16]; 2]; 27] = {
     cells
 };
 
-/// What is known around one voxel.
+/// What present known contexts one voxel.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Surroundings {
+pub(super) struct Contexts {
     occupied: u64,
     unknown: u64,
     presence: u64,
-    beside: u64,
-    beyond: u64,
-    behind: u64,
-    /// Of the neighbours in the six directions a byte each: their occupancies, 0 unless known, and 2 where they are there but not known.
-    known: u64,
-    veiled: u64,
-    /// The occupancies of the neighbours that are known.
+    faces_present: u64,
+    second: u64,
+    face_occupancies: u64,
+    /// Occupancies of the face neighbours, one byte each; 0 unless known.
+    known_faces: u64,
+    /// For each face neighbour one byte: 2 if it is occupied but its children are unknown.
+    unknown_faces: u64,
+    /// Occupancies of the neighbours with known children, by offset.
     masks: [u8; 27],
 }
 
-impl Surroundings {
-    /// What is known before any neighbour's children are.
+impl Contexts {
+    /// The state before any neighbour is added.
     #[inline(always)]
     pub fn new() -> Self {
-        Surroundings {
+        Contexts {
             occupied: 0,
             unknown: OWN,
             presence: 0,
-            beside: 0,
-            beyond: 0,
-            behind: 0,
-            known: 0,
-            veiled: 0,
+            faces_present: 0,
+            second: 0,
+            face_occupancies: 0,
+            known_faces: 0,
+            unknown_faces: 0,
             masks: [0; 27],
         }
     }
 
-    /// Adds the neighbour at offset `k`, whose children are not known.
+    /// Adds the neighbour at offset `k`, whose children are unknown.
     #[inline(always)]
     pub fn add_presence(&mut self, k: usize) {
         self.unknown |= CELLS[k][0][15] | CELLS[k][1][15];
     }
 
-    /// Adds the neighbour at offset `k`, which has these children.
+    /// Adds the neighbour at offset `k`, of occupancy `mask`.
     #[inline(always)]
     pub fn add_children(&mut self, k: usize, mask: u8) {
         self.masks[k] = mask;
@@ -125,62 +134,63 @@ impl Surroundings {
         self.occupied |= CELLS[k][0][low] | CELLS[k][1][high];
     }
 
-    /// Sums up, once all neighbours have been added.
+    /// Sets what depends on the face neighbours, after all neighbours have been added.
     #[inline(always)]
-    pub fn sum_up(&mut self, neighbours: Neighbourhood) {
-        let Neighbourhood { there, earlier, beyond } = neighbours;
+    pub fn set_faces(&mut self, neighbours: Neighbourhood) {
+        let Neighbourhood { there, known, second } = neighbours;
         let bit = |mask: u32, k: usize| u64::from(mask >> k & 1);
         self.presence = there.into();
-        self.beyond = beyond.into();
-        for (i, k) in BEFORE.into_iter().enumerate() {
-            let (is, mask) = (bit(there, k), u64::from(self.masks[k]));
-            let known = bit(earlier, k);
-            self.known |= mask << (8 * i);
-            self.veiled |= (is & !known) << (8 * i + 1);
-            self.behind |= (known << 8 | mask | is & !known) << (9 * i);
-            self.beside |= is << i;
+        self.second = second.into();
+        for (i, k) in EARLIER_FACES.into_iter().enumerate() {
+            let (present, mask) = (bit(there, k), u64::from(self.masks[k]));
+            let known = bit(known, k);
+            self.known_faces |= mask << (8 * i);
+            self.unknown_faces |= (present & !known) << (8 * i + 1);
+            self.face_occupancies |= (known << 8 | mask | present & !known) << (9 * i);
+            self.faces_present |= present << i;
         }
-        for (i, k) in (3..).zip(AFTER) {
-            let is = bit(there, k);
-            self.veiled |= is << (8 * i + 1);
-            self.beside |= is << i;
+        for (i, k) in (3..).zip(LATER_FACES) {
+            let present = bit(there, k);
+            self.unknown_faces |= present << (8 * i + 1);
+            self.faces_present |= present << i;
         }
     }
 
-    /// The contexts of the child of `node` in `octant`.
+    /// Hashes of the five contexts of the child in `octant`. `node` is `1 << octant | occupancy of the octants below`.
     #[inline(always)]
-    pub fn contexts(&self, octant: usize, node: usize) -> [u64; CONTEXTS] {
+    pub fn hashes(&self, octant: usize, node: usize) -> [u64; CONTEXTS] {
         let shift = (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2);
         let (occupied, unknown) = (self.occupied >> shift, self.unknown >> shift);
-        let far = self.known >> octant & 0x0101_0101_0101 | self.veiled;
+        let far = self.known_faces >> octant & 0x0101_0101_0101 | self.unknown_faces;
         let node = node as u64;
         let near = hash(hash(2, occupied & NEAR), unknown & NEAR);
-        let faces = occupied & FACES | (octant as u64) << 48 | self.beside << 51;
+        let faces = occupied & FACES | (octant as u64) << 48 | self.faces_present << 51;
         [
             hash(hash(1, faces), unknown & FACES),
             near,
             hash(hash(3, near), far),
-            hash(4, node | self.behind << 8),
-            hash(5, node | self.presence << 8 | self.beyond << 35),
+            hash(4, node | self.face_occupancies << 8),
+            hash(5, node | self.presence << 8 | self.second << 35),
         ]
     }
 
-    /// Learns whether the child in `octant` is there.
+    /// Sets whether the child in `octant` is occupied.
     #[inline(always)]
-    pub fn learn(&mut self, octant: usize, there: bool) {
+    pub fn set_child(&mut self, octant: usize, there: bool) {
         let cell = 21 + (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2);
         self.unknown &= !(1 << cell);
         self.occupied |= u64::from(there) << cell;
     }
 
-    /// Learns that what was said of the child in `octant` is wrong.
+    /// Corrects the child in `octant`, which was set wrongly.
     #[inline(always)]
-    pub fn unlearn(&mut self, octant: usize) {
+    pub fn flip_child(&mut self, octant: usize) {
         let cell = 21 + (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2);
         self.occupied ^= 1 << cell;
     }
 }
 
+/// Adds a word to a hash.
 #[inline(always)]
 fn hash(h: u64, word: u64) -> u64 {
     let h = (h ^ word).wrapping_mul(0x9E37_79B9_7F4A_7C15);
@@ -194,8 +204,8 @@ mod tests {
     use proptest::prelude::*;
     use std::ops::Range;
 
-    /// 0 for an empty cell, 1 for one that is occupied, 2 for an unknown one: `at` is where it lies, in voxels of the children's level from the first child
-    /// of the voxel `here`, of whose children those below `octant` are known.
+    /// State of a cell: 0 empty, 1 occupied, 2 unknown. `at` is its position, in voxels of the children's level, from
+    /// the child in octant 0 of the voxel `here`, of whose children those below `octant` are known.
     fn state(octree: &Octree, slice: &Range<usize>, here: usize, octant: usize, at: [i64; 3]) -> u64 {
         let level = octree.depth() - 1;
         let own = octree.level(level).coordinate(here).map(i64::from);
@@ -220,7 +230,7 @@ mod tests {
         }
     }
 
-    /// The words of the contexts, from their definition, cell by cell.
+    /// The hashes of the contexts from their definition, cell by cell.
     fn by_definition(octree: &Octree, slice: &Range<usize>, here: usize, octant: usize) -> [u64; CONTEXTS] {
         let child = [octant & 1, octant >> 1 & 1, octant >> 2].map(|x| x as i64);
         let cell = |d: [i64; 3]| state(octree, slice, here, octant, [0, 1, 2].map(|k| child[k] + d[k]));
@@ -230,9 +240,9 @@ mod tests {
             let distance: i64 = d.iter().map(|x| x.abs()).sum();
             let bit = d[0] + 1 + 4 * (d[1] + 1) + 16 * (d[2] + 1);
             for (which, of) in [1, 2].into_iter().enumerate() {
-                let is = u64::from(distance > 0 && cell(d) == of) << bit;
-                near[which] |= is;
-                faces[which] |= if distance == 1 { is } else { 0 };
+                let present = u64::from(distance > 0 && cell(d) == of) << bit;
+                near[which] |= present;
+                faces[which] |= if distance == 1 { present } else { 0 };
             }
         }
         let level = octree.depth() - 1;
@@ -244,18 +254,18 @@ mod tests {
             voxels.keys().binary_search(&key).ok().filter(|_| inside)
         };
         let sides = [[0, 0, -1], [0, -1, 0], [-1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]];
-        let (mut beside, mut far, mut behind, mut beyond, mut presence) = (0, 0, 0, 0, 0);
+        let (mut faces_present, mut far, mut face_occupancies, mut second, mut presence) = (0, 0, 0, 0, 0);
         for (i, d) in sides.into_iter().enumerate() {
             far |= cell(d.map(|x| 2 * x)) << (8 * i);
-            beside |= u64::from(place(d).is_some()) << i;
+            faces_present |= u64::from(place(d).is_some()) << i;
             if i < 3 {
-                behind |= place(d).map_or(0, |n| match slice.contains(&n) && n < here {
+                face_occupancies |= place(d).map_or(0, |n| match slice.contains(&n) && n < here {
                     true => 256 + u64::from(masks[n]),
                     false => 1,
                 }) << (9 * i);
             } else {
                 let more = u64::from(place(d.map(|x| 2 * x)).is_some());
-                beyond |= if place(d).is_some() { more } else { 2 } << (2 * (i - 3));
+                second |= if place(d).is_some() { more } else { 2 } << (2 * (i - 3));
             }
         }
         for k in (0..27i64).filter(|&k| k != 13) {
@@ -271,34 +281,37 @@ mod tests {
         };
         let two = words(2, &near);
         [
-            words(1, &[faces[0] + ((octant as u64) << 48) + (beside << 51), faces[1]]),
+            words(
+                1,
+                &[faces[0] + ((octant as u64) << 48) + (faces_present << 51), faces[1]],
+            ),
             two,
             words(3, &[two, far]),
-            words(4, &[node + (behind << 8)]),
-            words(5, &[node + (presence << 8) + (beyond << 35)]),
+            words(4, &[node + (face_occupancies << 8)]),
+            words(5, &[node + (presence << 8) + (second << 35)]),
         ]
     }
 
     proptest! {
         #[test]
-        fn contexts_are_those_of_the_definition(keys in prop::collection::vec(0u64..1 << 12, 1..700), slice in 1usize..200) {
+        fn hashes_match_their_definition(keys in prop::collection::vec(0u64..1 << 12, 1..700), slice in 1usize..200) {
             let octree = Octree::new(Voxels::new(4, keys)).unwrap();
             let (map, masks) = (octree.kernel_map(3), octree.occupancy(3));
             for here in 0..masks.len() {
                 let first = here / slice * slice;
                 let slice = first..masks.len().min(first + slice);
                 let neighbours = Neighbourhood::of_all(&map, &slice)[here - first];
-                let mut around = Surroundings::new();
-                ones(neighbours.there & !neighbours.earlier).for_each(|k| around.add_presence(k));
-                for k in ones(neighbours.earlier) {
-                    around.add_children(k, masks[map.row(here)[k] as usize]);
+                let mut contexts = Contexts::new();
+                ones(neighbours.there & !neighbours.known).for_each(|k| contexts.add_presence(k));
+                for k in ones(neighbours.known) {
+                    contexts.add_children(k, masks[map.row(here)[k] as usize]);
                 }
-                around.sum_up(neighbours);
+                contexts.set_faces(neighbours);
                 for octant in 0..8 {
                     let node = 1 << octant | usize::from(masks[here]) & ((1 << octant) - 1);
                     let want = by_definition(&octree, &slice, here, octant);
-                    prop_assert_eq!(around.contexts(octant, node), want);
-                    around.learn(octant, masks[here] >> octant & 1 == 1);
+                    prop_assert_eq!(contexts.hashes(octant, node), want);
+                    contexts.set_child(octant, masks[here] >> octant & 1 == 1);
                 }
             }
         }
