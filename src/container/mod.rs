@@ -50,8 +50,8 @@
 //! The colour section of level L starts with the colour trunk, slice 0: its level K, 0 ≤ K ≤ L, says that it holds the colours of the levels 0
 //! to K, its count is the voxels of level K, at most 65,536. Then follow the chunks of the levels K + 1 to L, and in any other level's section those of this level alone.
 //! Level ℓ has a chunk for every C voxels of level ℓ − 1 (the last one for what is left), slices numbered from 0; its count is that of these
-//! parents. The payload of a section's first chunk is preceded by u64: XXH3-64 of the colours of the section's level as decoded, before the
-//! filter, red, green, blue of one voxel after the other, a byte each. At the end of the section may stand the colour filter of its level, slice 0, whose count is the
+//! parents. The payload of a section's first chunk is preceded by u64: XXH3-64 of the decoded colours of the section's
+//! level before the post filter: Y, Co and Cg of each voxel as i16, little-endian. At the end of the section may stand the colour filter of its level, slice 0, whose count is the
 //! level's voxels. The payloads are those of [`crate::colour`].
 //!
 //! # Version 2

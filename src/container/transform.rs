@@ -17,7 +17,7 @@ pub struct Colours<'a> {
     pub trunk: Option<Trunk<'a>>,
     /// The levels that follow the trunk up to this level; of a level that is not the base level, this level.
     pub levels: Vec<ColourLevel<'a>>,
-    /// XXH3-64 of the colours decoded at this level.
+    /// XXH3-64 of this level's decoded Y, Co and Cg before the post filter, each as i16, little-endian.
     pub hash: u64,
     /// The filter of the colours of this level, if it has one.
     pub filter: Option<Slice<'a>>,
