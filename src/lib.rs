@@ -43,8 +43,6 @@
 //! ```
 #![forbid(unsafe_code)]
 
-#[cfg(feature = "cli")]
-pub mod budget;
 pub mod cancel;
 #[cfg(feature = "ply")]
 pub mod cloud;
@@ -52,7 +50,7 @@ mod coding;
 pub mod colour;
 pub mod container;
 pub mod decoder;
-#[cfg(feature = "cli")]
+#[cfg(feature = "embedded")]
 pub mod embedded;
 #[cfg(feature = "encoder")]
 pub mod encoder;
@@ -63,6 +61,7 @@ pub mod latents;
 pub mod layers;
 pub mod limits;
 pub mod log;
+mod memory;
 #[cfg(feature = "encoder")]
 pub mod metrics;
 pub mod output;

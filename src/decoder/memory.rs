@@ -1,4 +1,4 @@
-//! What decoding needs, known from the header alone.
+//! What decoding needs, known from the header alone: upper bounds as sums of terms.
 
 use std::ops::Deref;
 
@@ -7,70 +7,194 @@ use crate::container::{Header, MAX_TRUNK_VOXELS};
 use crate::error::Result;
 use crate::latents::Decoder;
 use crate::latents::network::{AT_ONCE, Model, RAW};
+use crate::memory::{NOTHING, Sizes, Term, total};
 
-/// Bytes of a row of a 3³ kernel map arranged for the kernels.
+/// Bytes of a row of a 3³ kernel map, and of the same arranged for the kernels.
+const MAP: u64 = 27 * 4;
 const PLAN: u64 = 100;
-/// Bytes of a row of a 3³ kernel map, and of the same arranged.
-const MAP: u64 = 27 * 4 + PLAN;
-/// Bytes of a voxel in the octree: its key, its occupancy, its first child.
-const NODE: u64 = 8 + 1 + 4;
-/// Bytes of a Gaussian.
+/// Bytes of a Gaussian, and of the network's output for it.
 const GAUSSIAN: u64 = 14 * 4;
-/// Bytes of a voxel in a colour residual, which any stream may have.
+const OUTPUT: u64 = 4 * RAW as u64;
+/// Bytes of a voxel in a colour residual, which any stream of version 2 may have.
 const RESIDUAL: u64 = 3 * 2;
-/// Bytes of a voxel and its parent where passes learn: what lies nearby, what surprised, and of a latent its residual.
-const NEARBY: u64 = 144;
-/// Slices of a stream in memory, over their bytes in the stream.
-const SLICES: u64 = 4;
+
+const SLICES: Term = Term {
+    each: "byte of the stream up to the end of the level",
+    takes: "slices in memory",
+    fixed: 4,
+    by: NOTHING,
+};
+const OCTREE: Term = Term {
+    each: "voxel of all levels",
+    takes: "key, occupancy and first child in the octree",
+    fixed: 8 + 1 + 4,
+    by: NOTHING,
+};
+
+// Version 2.
+
+const ABOVE: Term = Term {
+    each: "voxel of the level above",
+    takes: "kernel map, features, latents, colour residual",
+    fixed: MAP + PLAN + RESIDUAL,
+    by: Sizes {
+        channels: 2,
+        latents: 2,
+        ..NOTHING
+    },
+};
+const EXACT: Term = Term {
+    each: "voxel of the level",
+    takes: "kernel map, context, four tensors of a block, latents with means and scales, colour residual",
+    fixed: MAP + PLAN + RESIDUAL + 16,
+    by: Sizes {
+        channels: 10,
+        latents: 7,
+        ..NOTHING
+    },
+};
+const BASE: Term = Term {
+    each: "voxel of the base level, if a network of B channels predicts it",
+    takes: "inputs and two hidden layers of that network, means and scales",
+    fixed: 20,
+    by: Sizes {
+        latents: 17,
+        base: 4,
+        ..NOTHING
+    },
+};
+const BASE_LEARNING: Term = Term {
+    each: "the same, if corrections are learned",
+    ..LEARNING
+};
+const NEAR: Term = Term {
+    each: "voxel of the level, if a network corrects its prediction or that of a level below",
+    takes: "octants, order of a pass, means and scales",
+    fixed: 9,
+    by: Sizes { latents: 3, ..NOTHING },
+};
+const NEAR_LEARNING: Term = Term {
+    each: "the same, if corrections are learned",
+    ..LEARNING
+};
+const LEARNING: Term = Term {
+    each: "",
+    takes: "residuals and likelihood gradients of the neighbourhood, residuals of the latents",
+    fixed: 144,
+    by: Sizes { latents: 2, ..NOTHING },
+};
+const GENERATOR: Term = Term {
+    each: "voxel of the level",
+    takes: "features and hidden layers of the generator",
+    fixed: 40,
+    by: Sizes {
+        channels: 2,
+        generator: 6,
+        ..NOTHING
+    },
+};
+const GAUSSIANS: Term = Term {
+    each: "Gaussian",
+    takes: "itself and the generator's output",
+    fixed: OUTPUT + GAUSSIAN,
+    by: NOTHING,
+};
+const EIGHT: Term = Term {
+    each: "Gaussian of a part of at most 131,072 voxels, if each voxel has eight",
+    takes: "kernel map and hidden layers",
+    fixed: PLAN,
+    by: Sizes {
+        generator: 6,
+        ..NOTHING
+    },
+};
+const ONE: Term = Term {
+    each: "Gaussian, if each voxel has one",
+    takes: "kernel map and hidden layers",
+    fixed: MAP + PLAN,
+    by: Sizes {
+        generator: 6,
+        ..NOTHING
+    },
+};
+
+// Version 3.
+
+const TRUNK: Term = Term {
+    each: "voxel of the levels above the base, at most 65,536 in each",
+    takes: "kernel map",
+    fixed: MAP,
+    by: NOTHING,
+};
+const COLOURS: Term = Term {
+    each: "voxel of the level and of the level above",
+    takes: "kernel map, colours decoded, in slices and joined, smoothed energies, colours as bytes and filtered",
+    fixed: MAP + PLAN + 3 * Coloured::bytes_per_voxel() as u64 + 3 + 3 * 3,
+    by: NOTHING,
+};
+const CONTEXTS: Term = Term {
+    each: "slice of colours decoded at a time, at most one on each thread, and 3 more",
+    takes: "adaptive contexts",
+    fixed: Coloured::learned_bytes() as u64,
+    by: NOTHING,
+};
+const SURFEL_SUMS: Term = Term {
+    each: "voxel of the level, with surfels",
+    takes: "sums that surfels are made of",
+    fixed: 200,
+    by: NOTHING,
+};
+const SURFELS: Term = Term {
+    each: "surfel",
+    takes: "itself",
+    fixed: GAUSSIAN,
+    by: NOTHING,
+};
 
 impl<M: Deref<Target = Model> + Clone> Decoder<M> {
-    /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included, beyond
-    /// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and the model itself.
+    /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included,
+    /// beyond [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and the model itself.
     ///
-    /// That is linear in the voxels: with C channels and K latents, 230 + 10·C + 7·K bytes for each voxel of a level, the level above it
-    /// with its features, 112 bytes for each Gaussian, 100 + 6·H bytes more for each that a generator of H channels makes at once, 208 + 6·H if it
-    /// makes one for each voxel, where a network of B channels predicts the base level 20 + 17·K + 4·B bytes for each of its voxels, where
-    /// others correct the levels above it 9 + 3·K for each of the last one's, and where passes learn 144 + 2·K for each of these.
+    /// `SECURITY.md` shows the terms of the sum.
     ///
     /// # Errors
     /// [`crate::Error::Usage`] if the stream has no such level.
     pub fn memory(&self, header: &Header, level: u8) -> Result<u64> {
-        let stream = SLICES * header.prefix_bytes(level)?;
         let shape = self.model.shape();
-        let (c, k) = (shape.channels as u64, shape.latents as u64);
         let levels = usize::from(level - header.base) + 1;
+        let head = shape.head(levels - 1, self.heads);
+        let sizes = Sizes {
+            channels: shape.channels as u64,
+            latents: shape.latents as u64,
+            generator: head.map_or(0, |head| head.channels as u64),
+            base: shape.base_channels as u64,
+        };
         let counts = || header.voxels[..levels].iter().copied().map(u64::from);
-        let octree = NODE * (counts().sum::<u64>() + u64::from(header.base) * counts().min().unwrap_or(0));
-        let features = 2 * (c + k) + MAP + RESIDUAL;
+        // Levels above the base have no more voxels than the level with the fewest.
+        let all = counts().sum::<u64>() + u64::from(header.base) * counts().min().unwrap_or(0);
         // Of all levels the last is the largest.
         let parents = counts().nth_back(1).unwrap_or(0);
         let voxels = counts().next_back().unwrap_or(0);
-        // Context, four tensors of a block, latents with their means and scales.
-        let exact = parents * features + voxels * (MAP + RESIDUAL + 16 + 10 * c + 7 * k);
-        let learning = match shape.learning {
-            true => NEARBY + 2 * k,
-            false => 0,
-        };
-        let base = match shape.base_bytes() as u64 {
-            0 => 0,
-            bytes => counts().next().unwrap_or(0) * (bytes + learning),
-        };
-        // Octants, the order of a pass, its means and scales.
-        let near = match shape.corrects_up_to(levels - 1) {
-            true => voxels * (9 + 3 * k + learning),
-            false => 0,
-        };
-        let head = shape.head(levels - 1, self.heads).map_or(0, |head| {
-            let (h, children) = (head.channels as u64, head.children as u64);
-            let (at_once, map) = match children {
-                1 => (voxels, MAP),
-                _ => (voxels.min(AT_ONCE as u64) * children, PLAN),
-            };
-            voxels * (6 * h + 2 * c + 40)
-                + voxels * children * (4 * RAW as u64 + GAUSSIAN)
-                + at_once * (map + 3 * 2 * h)
-        });
-        Ok(stream + octree + base + exact + near + head)
+        let only_if = |condition: bool, count: u64| if condition { count } else { 0 };
+        let base = only_if(shape.base_channels > 0, counts().next().unwrap_or(0));
+        let near = only_if(shape.corrects_up_to(levels - 1), voxels);
+        let children = head.map_or(0, |head| head.children as u64);
+        let at_a_time = voxels.min(AT_ONCE as u64) * children;
+        let terms = [
+            (SLICES, header.prefix_bytes(level)?),
+            (OCTREE, all),
+            (ABOVE, parents),
+            (EXACT, voxels),
+            (BASE, base),
+            (BASE_LEARNING, only_if(shape.learning, base)),
+            (NEAR, near),
+            (NEAR_LEARNING, only_if(shape.learning, near)),
+            (GENERATOR, only_if(children > 0, voxels)),
+            (GAUSSIANS, voxels * children),
+            (EIGHT, only_if(children > 1, at_a_time)),
+            (ONE, only_if(children == 1, voxels)),
+        ];
+        Ok(total(&terms, sizes))
     }
 
     /// Fails with [`crate::Error::LimitExceeded`] if decoding down to `level` takes more than is allowed.
@@ -80,21 +204,12 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     }
 }
 
-/// Bytes of a voxel's colours in version 3: decoded, in slices and joined; smoothed energies of its parents; as bytes, filtered and of the level
-/// above.
-const COLOURS: u64 = 3 * Coloured::bytes_per_voxel() as u64 + 3 + 3 * 3;
-/// Bytes of the sums that surfels are made of.
-const SURFEL: u64 = 200;
-
-/// Bytes of memory that decoding the colours of a stream of version 3 with this header down to `level` takes at most, beyond
-/// [`Limits::OVERHEAD`](crate::Limits::OVERHEAD).
-///
-/// That is linear in the voxels, but for what slices of colours learn, one on each thread.
+/// Bytes of memory that decoding the colours of a stream of version 3 with this header down to `level` takes at most,
+/// beyond [`Limits::OVERHEAD`](crate::Limits::OVERHEAD).
 ///
 /// # Errors
 /// [`crate::Error::Usage`] if the stream has no such level.
 pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
-    let stream = SLICES * header.prefix_bytes(level)?;
     let levels = usize::from(level - header.base) + 1;
     let counts = || header.voxels[..levels].iter().copied().map(u64::from);
     let base = counts().next().unwrap_or(0);
@@ -103,18 +218,66 @@ pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
         let level = |n: u64| most.min(1 << (3 * n).min(60));
         (0..u64::from(header.base)).map(level).sum()
     };
-    let octree = NODE * (counts().sum::<u64>() + above(base));
-    let trunk = (MAP - PLAN) * above(base.min(MAX_TRUNK_VOXELS.into()));
     let parents = counts().nth_back(1).unwrap_or(base);
     let voxels = counts().next_back().unwrap_or(0);
     // Of the level and the one above, joined from the slices that threads are at.
     let slices = parents.div_ceil(header.colour_slice().into());
-    let learned = 3 + slices.min(rayon::current_num_threads() as u64);
-    let colours = (parents + voxels) * (MAP + COLOURS) + learned * Coloured::learned_bytes() as u64;
-    Ok(stream + octree + trunk + colours)
+    let terms = [
+        (SLICES, header.prefix_bytes(level)?),
+        (OCTREE, counts().sum::<u64>() + above(base)),
+        (TRUNK, above(base.min(MAX_TRUNK_VOXELS.into()))),
+        (COLOURS, parents + voxels),
+        (CONTEXTS, 3 + slices.min(rayon::current_num_threads() as u64)),
+    ];
+    Ok(total(&terms, NOTHING))
 }
 
 /// Bytes that making so many surfels of each of so many voxels takes at most, themselves included.
 pub(super) fn surfels(voxels: u64, per_voxel: u64) -> u64 {
-    voxels * (SURFEL + per_voxel * GAUSSIAN)
+    total(&[(SURFEL_SUMS, voxels), (SURFELS, voxels * per_voxel)], NOTHING)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gaussians::learned;
+
+    /// `214 + 2·C + 2·K`, with a comma at thousands.
+    fn bytes(term: &Term) -> String {
+        let Sizes {
+            channels,
+            latents,
+            generator,
+            base,
+        } = term.by;
+        let fixed = match term.fixed {
+            1000.. => format!("{},{:03}", term.fixed / 1000, term.fixed % 1000),
+            _ => term.fixed.to_string(),
+        };
+        let by = [(channels, 'C'), (latents, 'K'), (generator, 'H'), (base, 'B')];
+        let by = by.iter().filter(|(times, _)| *times > 0);
+        by.fold(fixed, |text, (times, of)| format!("{text} + {times}·{of}"))
+    }
+
+    fn table(terms: &[Term]) -> String {
+        let row = |term: &Term| format!("| {} | {} | {} |\n", bytes(term), term.each, term.takes);
+        let rows: String = terms.iter().map(row).collect();
+        format!("| bytes | for each | of |\n|---|---|---|\n{rows}")
+    }
+
+    /// What contexts take depends on the size of addresses.
+    #[cfg(target_pointer_width = "64")]
+    #[test]
+    fn security_md_shows_the_terms_that_are_summed() {
+        let text = include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/SECURITY.md"));
+        let base = [BASE, BASE_LEARNING, NEAR, NEAR_LEARNING];
+        let drawing = [GENERATOR, GAUSSIANS, EIGHT, ONE];
+        let version_2 = [&[SLICES, OCTREE, ABOVE, EXACT][..], &base, &drawing].concat();
+        let version_3 = [SLICES, OCTREE, TRUNK, COLOURS, CONTEXTS, SURFEL_SUMS, SURFELS];
+        let version_3 = [&version_3[..], &learned::TERMS].concat();
+        let tables = [table(&version_2), table(&version_3)];
+        let missing = tables.iter().filter(|table| !text.contains(*table));
+        let missing: Vec<_> = missing.map(String::as_str).collect();
+        assert!(missing.is_empty(), "SECURITY.md should have\n\n{}", missing.join("\n"));
+    }
 }

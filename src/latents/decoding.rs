@@ -23,7 +23,7 @@ use crate::log::Log;
 /// gives those of the level that was reached. After an error what was reached before stays usable, and nothing more is decoded.
 ///
 /// ```
-/// # #[cfg(feature = "cli")]
+/// # #[cfg(feature = "embedded")]
 /// # fn main() -> b2p::Result<()> {
 /// use b2p::{latents::Decoder, log::Log, latents::network::Model};
 ///
@@ -40,7 +40,7 @@ use crate::log::Log;
 /// # assert!(gaussians.len() > 0);
 /// # Ok(())
 /// # }
-/// # #[cfg(not(feature = "cli"))]
+/// # #[cfg(not(feature = "embedded"))]
 /// # fn main() {}
 /// ```
 #[derive(Debug)]

@@ -6,6 +6,8 @@ use serde::Serialize;
 mod machine;
 mod spread;
 
+#[doc(hidden)]
+pub use b2p_kernels::give_back;
 pub use machine::Machine;
 pub use spread::{Spread, Verdict};
 

@@ -48,6 +48,8 @@ use crate::gaussians::Heads;
 use crate::geometry::{KernelMap, Octree};
 use crate::layers::{Precision, missing};
 use network::Generator;
+#[cfg(test)]
+pub(crate) use network::TERMS;
 
 /// Network outputs per Gaussian.
 const RAW: usize = 14;

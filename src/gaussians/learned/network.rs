@@ -10,6 +10,7 @@ use super::load::{INPUTS, Shape};
 use super::{LevelInput, RAW};
 use crate::gaussians::{Frame, Gaussians};
 use crate::layers::{Conv, Pool, Precision, ResBlock, Stored, apply, apply_added, apply_part, reals};
+use crate::memory::{NOTHING, Sizes, Term, total};
 
 /// The layers of a network.
 pub struct Net<L> {
@@ -146,19 +147,51 @@ fn run<C: Conv>(
     drawing.gaussians
 }
 
+const ABOVE: Term = Term {
+    each: "voxel of the level above, with learned heads of H channels",
+    takes: "inputs as integers and as f16; input, inner rows and output of a block",
+    fixed: 4 * INPUTS[0] as u64,
+    by: ROWS,
+};
+const VOXEL: Term = Term {
+    each: "voxel of the level, with learned heads of H channels",
+    takes: "the same, octant and parent",
+    fixed: 4 * INPUTS[1] as u64 + 5,
+    by: ROWS,
+};
+const ROWS: Sizes = Sizes {
+    generator: 3 * 2,
+    ..NOTHING
+};
+const OUTPUTS: Term = Term {
+    each: "Gaussian of a part of at most 16,384 voxels, with learned heads",
+    takes: "the network's output",
+    fixed: 4 * RAW as u64,
+    by: NOTHING,
+};
+const GAUSSIANS: Term = Term {
+    each: "Gaussian of learned heads",
+    takes: "itself",
+    fixed: size_of::<[f32; 14]>() as u64,
+    by: NOTHING,
+};
+
+/// The terms that [`bytes`] adds.
+#[cfg(test)]
+pub const TERMS: [Term; 4] = [ABOVE, VOXEL, OUTPUTS, GAUSSIANS];
+
 /// Maximum memory in bytes of evaluating the network, Gaussians included.
 pub fn bytes(shape: &Shape, voxels: u64, above: u64) -> u64 {
-    let (c, k) = (shape.channels as u64, shape.gaussians as u64);
-    // Channels as integers and as f16, the octant and the parent of each voxel.
-    let [parent, child] = INPUTS.map(|channels| 4 * channels as u64);
-    let inputs = parent
-        .saturating_mul(above)
-        .saturating_add((child + 5).saturating_mul(voxels));
-    // A block's input, inner rows and output, of both sides.
-    let rows = voxels.saturating_add(above);
-    let activations = (3 * 2 * c).saturating_mul(rows);
-    let raw = (4 * RAW as u64 * k) * voxels.min(PART as u64);
-    let gaussians = (size_of::<[f32; 14]>() as u64 * k).saturating_mul(voxels);
-    let parts = [inputs, activations, raw, gaussians];
-    parts.into_iter().fold(0, u64::saturating_add)
+    let sizes = Sizes {
+        generator: shape.channels as u64,
+        ..NOTHING
+    };
+    let of_each = shape.gaussians as u64;
+    let terms = [
+        (ABOVE, above),
+        (VOXEL, voxels),
+        (OUTPUTS, voxels.min(PART as u64) * of_each),
+        (GAUSSIANS, voxels.saturating_mul(of_each)),
+    ];
+    total(&terms, sizes)
 }

@@ -21,10 +21,13 @@
 //! Contexts start with both numbers at [`FIRST`] of their class. A slice is coded as latents are ([`super`]), by itself.
 
 use std::fmt::Display;
+use std::num::NonZeroU16;
 use std::ops::Range;
 
+use constriction::stream::model::{DecoderModel, EntropyModel};
+
 use super::slice::{self, END_STATE};
-use crate::coding::ans::{Interval, Stack};
+use crate::coding::ans::{BITS, Interval, Stack};
 use crate::error::{Error, Result, Stage};
 
 /// Where classes of activity begin.
@@ -85,6 +88,21 @@ impl Context {
     }
 }
 
+/// Symbols are the two outcomes.
+impl EntropyModel<BITS> for Context {
+    type Symbol = bool;
+    type Probability = u16;
+}
+
+impl DecoderModel<BITS> for Context {
+    #[inline(always)]
+    fn quantile_function(&self, quantile: u16) -> (bool, u16, NonZeroU16) {
+        let bit = quantile >= self.interval(true).start;
+        let (start, size) = self.interval(bit).parts();
+        (bit, start, size)
+    }
+}
+
 /// Contexts of one kind of decision: one for each class and `N` other circumstances.
 type Contexts<const N: usize> = [[Context; N]; FIRST.len()];
 
@@ -117,10 +135,7 @@ impl Decisions for Record {
 impl Decisions for Stack {
     #[inline]
     fn decide(&mut self, context: Context, _: bool) -> bool {
-        self.pop(|quantile| {
-            let bit = quantile >= context.interval(true).start;
-            (bit, context.interval(bit))
-        })
+        self.pop(context)
     }
 
     #[inline]
@@ -231,7 +246,7 @@ pub fn encode_coefficients(parts: &[Part<&[[i16; 3]]>]) -> Vec<u8> {
         }
     }
     let mut stack = Stack::new(END_STATE, Vec::new());
-    record.0.iter().rev().for_each(|&one| stack.push(one));
+    record.0.iter().rev().for_each(|&one| stack.push((), one));
     slice::sealed(stack)
 }
 
@@ -395,7 +410,7 @@ mod tests {
             record.even(true);
         });
         let mut stack = Stack::new(END_STATE, Vec::new());
-        record.0.iter().rev().for_each(|&one| stack.push(one));
+        record.0.iter().rev().for_each(|&one| stack.push((), one));
         let error = decode(&slice::sealed(stack), 1).unwrap_err().to_string();
         assert!(error.contains("15 bits"), "{error}");
     }

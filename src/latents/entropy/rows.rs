@@ -1,7 +1,12 @@
 //! Rows of integer probabilities, and how the coder looks things up in them.
 
+use std::borrow::Borrow;
+use std::num::NonZeroU16;
+
+use constriction::stream::model::{DecoderModel, EncoderModel, EntropyModel};
+
 use super::tables::RawRows;
-use crate::coding::ans::{Interval, PRECISION};
+use crate::coding::ans::{BITS, Interval, PRECISION};
 use crate::error::{Error, Result, Stage};
 
 /// Quantiles are looked up by their highest bits first.
@@ -168,6 +173,28 @@ impl Row<'_> {
         let last = usize::from(self.buckets[bucket + 1]);
         let entry = first + self.cumulative[first + 1..=last].partition_point(|&sum| sum <= quantile);
         (entry, self.interval(entry))
+    }
+}
+
+/// Symbols are the entries.
+impl EntropyModel<BITS> for Row<'_> {
+    type Symbol = usize;
+    type Probability = u16;
+}
+
+impl EncoderModel<BITS> for Row<'_> {
+    #[inline(always)]
+    fn left_cumulative_and_probability(&self, entry: impl Borrow<usize>) -> Option<(u16, NonZeroU16)> {
+        Some(self.interval(*entry.borrow()).parts())
+    }
+}
+
+impl DecoderModel<BITS> for Row<'_> {
+    #[inline(always)]
+    fn quantile_function(&self, quantile: u16) -> (usize, u16, NonZeroU16) {
+        let (entry, interval) = self.find(quantile);
+        let (start, size) = interval.parts();
+        (entry, start, size)
     }
 }
 

@@ -89,12 +89,12 @@ pub fn encode_slice(tables: &Tables, condition: Condition, latents: &[i16]) -> V
         let entry = i32::from(latent) - centre - row.low();
         let values = row.escape() as i32;
         if (0..values).contains(&entry) {
-            stack.push(row.interval(entry as usize));
+            stack.push(entry as usize, row);
         } else {
             let above = entry >= values;
             let distance = if above { entry - values + 1 } else { -entry };
             push_distance(&mut stack, above, distance as u32);
-            stack.push(row.interval(row.escape()));
+            stack.push(row.escape(), row);
         }
     }
     sealed(stack)
@@ -186,7 +186,7 @@ impl<'a> Reader<'a> {
 
     #[inline]
     fn under(&mut self, row: Row, centre: i32) -> Result<i16> {
-        let entry = self.stack.pop(|quantile| row.find(quantile));
+        let entry = self.stack.pop(row);
         let value = if entry < row.escape() {
             centre + row.low() + entry as i32
         } else {

@@ -43,14 +43,6 @@ impl Shape {
     pub(crate) fn corrects_up_to(&self, role: usize) -> bool {
         self.near_channels.iter().take(role).any(|&near| near > 0)
     }
-
-    /// Bytes that predicting one voxel of the base level takes at most: the network's inputs, two hidden layers, means and scales.
-    pub(crate) fn base_bytes(&self) -> usize {
-        match self.base_channels {
-            0 => 0,
-            hidden => 2 * (base_inputs(self.latents) + 2 * hidden) + 3 * self.latents,
-        }
-    }
 }
 
 impl Model {

@@ -1,4 +1,5 @@
 //! The `b2p` program: arguments in, one stage after the other, files out.
+#![forbid(unsafe_code)]
 
 mod args;
 mod bench;
@@ -61,7 +62,7 @@ impl Failure {
 }
 
 /// Runs the program; the exit code is 0 for success, 1 for failure, 2 (from the argument parser) for misuse, 130 after Ctrl-C.
-pub fn main() -> ExitCode {
+fn main() -> ExitCode {
     let cli = Cli::parse();
     let interrupted = ctrlc::set_handler(|| {
         output::remove_unfinished();

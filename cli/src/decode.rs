@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use b2p::budget::Task;
+use super::budget::Task;
 use b2p::container::version;
 use b2p::log::Log;
 use b2p::{Limits, output};

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use b2p::budget::Task;
+use super::budget::Task;
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
 use b2p::renderer::camera::{Camera, files};

@@ -1,5 +1,6 @@
 //! Streams of at most so many bits.
 
+#[path = "../../tests/common/mod.rs"]
 mod common;
 
 use b2p::Error;

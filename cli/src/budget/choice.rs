@@ -1,19 +1,15 @@
 //! A time to keep, or an accuracy, instead of knobs to turn.
 
-mod calibration;
-mod measure;
-
 use std::time::Duration;
 
-use crate::container::Header;
-use crate::error::{Error, Result};
-use crate::gaussians::Heads;
-use crate::latents::network::Model;
-use crate::layers::Precision;
-use crate::limits::Limits;
-use crate::renderer::Quality;
-
-pub use calibration::{Calibration, DrawCost, LevelCost, PictureCost};
+use super::calibration::{Calibration, DrawCost};
+use b2p::Limits;
+use b2p::container::Header;
+use b2p::gaussians::Heads;
+use b2p::latents::network::Model;
+use b2p::layers::Precision;
+use b2p::renderer::Quality;
+use b2p::{Error, Result};
 
 /// A time is promised only if the estimate, so many times and with so many nanoseconds more, keeps it: in short tasks it shows when a thread
 /// wakes late, or a page is long in coming.
@@ -157,11 +153,11 @@ pub(super) fn faces(voxels: f64, level: u8) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::{LevelCost, PictureCost};
-    use crate::container::{Format, Section};
-    use crate::latents::network::Shape;
-    use crate::metrics::Machine;
-    use crate::placement::Placement;
+    use crate::budget::calibration::{LevelCost, PictureCost};
+    use b2p::container::{Format, Section};
+    use b2p::latents::network::Shape;
+    use b2p::metrics::Machine;
+    use b2p::placement::Placement;
 
     fn header() -> Header {
         Header {

@@ -1,5 +1,6 @@
 //! The sample and the model that ship: what every user decodes first.
 
+#[path = "../../tests/common/mod.rs"]
 mod common;
 
 use b2p::embedded::{MODEL, SAMPLE};

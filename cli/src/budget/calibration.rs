@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::Subject;
+use super::choice::Subject;
 use super::measure::measure;
-use crate::error::{Error, Result};
-use crate::latents::network::{Head, Model};
-use crate::metrics::Machine;
-use crate::output;
+use b2p::latents::network::{Head, Model};
+use b2p::metrics::Machine;
+use b2p::output;
+use b2p::{Error, Result};
 
 /// What is longer is no calibration.
 const MOST_BYTES: u64 = 1 << 16;
@@ -162,8 +162,8 @@ impl Calibration {
     /// done.
     ///
     /// # Errors
-    /// Those of [`Decoder::decode`](crate::latents::Decoder::decode) and
-    /// [`Renderer::render`](crate::renderer::Renderer::render); [`Error::Usage`] if no level has Gaussians, or threads cannot be started.
+    /// Those of [`Decoder::decode`](b2p::latents::Decoder::decode) and
+    /// [`Renderer::render`](b2p::renderer::Renderer::render); [`Error::Usage`] if no level has Gaussians, or threads cannot be started.
     pub fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
         measure(subject, say)
     }
@@ -244,7 +244,7 @@ pub(super) fn model_name(model: &Model) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::latents::network::{Shape, untrained};
+    use b2p::latents::network::{Shape, untrained};
 
     const LINE: LevelCost = LevelCost {
         once: 2.0,

@@ -1,9 +1,12 @@
 //! `--budget` and `--min-psnr`: level, precision and quality chosen by what they cost on this machine.
 
+mod calibration;
+mod choice;
+mod measure;
+
 use std::path::Path;
 use std::time::Duration;
 
-use b2p::budget::{Budget, Calibration, Choice, Subject, Task};
 use b2p::container::Header;
 use b2p::gaussians::Heads;
 use b2p::latents::Decoder;
@@ -11,6 +14,9 @@ use b2p::latents::network::Model;
 use b2p::{Limits, embedded};
 use clap::Args;
 
+use self::calibration::Calibration;
+pub use self::choice::Task;
+use self::choice::{Budget, Choice, Subject};
 use super::args::{DetailArg, ModelArg};
 use super::pipe::PIPE;
 use super::progress::Progress;

@@ -1,6 +1,6 @@
 //! Budgets from outside: what must hold whatever the machine.
-#![cfg(feature = "cli")]
 
+#[path = "../../tests/common/mod.rs"]
 mod common;
 
 use std::path::Path;

@@ -5,28 +5,27 @@
 
 use std::time::{Duration, Instant};
 
-use b2p_kernels::give_back;
+use b2p::metrics::give_back;
 
-use super::Subject;
 use super::calibration::{Calibration, DrawCost, LevelCost, PictureCost, PictureTimes, model_name};
-use super::faces;
-use crate::container::Header;
-use crate::encoder::{Skeleton, kernel_maps};
-use crate::error::{Error, Result};
-use crate::gaussians::Heads;
-use crate::gaussians::{Frame, Gaussians};
-use crate::geometry::{KernelMap, Octree, Voxels};
-use crate::latents::Decoder;
-use crate::latents::activate;
-use crate::latents::entropy::Coding;
-use crate::latents::network::Model;
-use crate::layers::Precision;
-use crate::limits::Limits;
-use crate::log::{Log, Step};
-use crate::metrics::{Machine, Spread, pixels_apart, psnr};
-use crate::renderer::camera::Camera;
-use crate::renderer::reference::{self, Cutoffs};
-use crate::renderer::{Background, Image, Quality, Renderer};
+use super::choice::Subject;
+use super::choice::faces;
+use b2p::Limits;
+use b2p::container::Header;
+use b2p::encoder::with_zero_latents;
+use b2p::gaussians::Heads;
+use b2p::gaussians::{Frame, Gaussians};
+use b2p::geometry::{KernelMap, Octree, Voxels};
+use b2p::latents::Decoder;
+use b2p::latents::activate;
+use b2p::latents::network::Model;
+use b2p::layers::Precision;
+use b2p::log::{Log, Step};
+use b2p::metrics::{Machine, Spread, pixels_apart, psnr};
+use b2p::renderer::camera::Camera;
+use b2p::renderer::reference::{self, Cutoffs};
+use b2p::renderer::{Background, Image, Quality, Renderer};
+use b2p::{Error, Result};
 
 /// Times that everything is measured, unless that takes longer than [`PATIENCE`]. The third quartile counts: what is promised on it is to be kept.
 const REPEATS: usize = 5;
@@ -172,16 +171,7 @@ fn without_features(header: &Header, finest: u8, octree: &Octree, coarser: u8, m
         sections: Vec::new(),
         ..header.clone()
     };
-    let maps = kernel_maps(&octree, base);
-    let log = &mut Log::default();
-    let skeleton = Skeleton::new(header, octree, maps, model, log)?;
-    let latents = model.shape().latents;
-    let mut zero = |role: usize, _: Coding<'_>, _: Option<&[i16]>| {
-        let voxels = skeleton.octree.level(base + role as u8).len();
-        Ok(vec![0; voxels * latents])
-    };
-    let coded = skeleton.code(&mut zero, None, log)?;
-    skeleton.stream(&coded, &[])
+    with_zero_latents(header, octree, model)
 }
 
 /// Of each level of a stream down to `finest`, its voxels, and the nanoseconds that it takes in the exact zone.
