@@ -1,8 +1,8 @@
-//! Point clouds: in from PLY files, onto the voxel grid, and out again.
+//! Point clouds: PLY files and voxelisation.
 //!
-//! A cloud is read whatever its number types and the order of its properties. [`voxelise`] then gives the
-//! octree's finest level: as it stands if the coordinates already are a voxel grid's, else fitted to one; [`voxelise_closed`] a coarser one where points
-//! lie too far apart for that.
+//! The reader accepts any number types and any order of properties. [`voxelise`] makes the octree's finest level: it
+//! keeps coordinates that are voxels already, and fits a grid to all others. [`voxelise_closed`] chooses a coarser
+//! level if the points are too sparse for that one.
 
 pub mod ply;
 mod points;
@@ -14,7 +14,7 @@ pub use voxelise::{ColouredVoxels, voxelise, voxelise_closed};
 
 use crate::error::{Error, Stage};
 
-/// Something in a file or among its points that is no cloud.
+/// An error in a file or in its points.
 fn malformed(at: impl ToString, field: impl ToString, value: impl ToString, expected: impl ToString) -> Error {
     Error::malformed(Stage::Cloud, at, field, value, expected)
 }

@@ -1,4 +1,4 @@
-//! Coloured points as a file has them.
+//! Coloured points as stored in a file.
 
 use std::path::Path;
 
@@ -8,23 +8,24 @@ use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::placement::Placement;
 
-/// Coloured points, and what the file says of their grid.
+/// Coloured points, with the file's hints at their voxel grid.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointCloud {
-    /// Coordinates, finite.
+    /// Finite coordinates.
     pub positions: Vec<[f64; 3]>,
     /// sRGB colours, one per point.
     pub colours: Vec<[u8; 3]>,
-    /// What the comments say.
+    /// Voxel grid in the file's comments.
     pub hints: Hints,
 }
 
-/// What a file's comments say of the voxel grid: `bits B`, `unit U`, `origin X Y Z`, `shift X Y Z`.
+/// The voxel grid in a file's comments: `bits B`, `unit U`, `origin X Y Z`, `shift X Y Z`.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Hints {
     /// The bit depth `B`, 1 to 21.
     pub bits: Option<u8>,
-    /// Where the grid lies: voxel `v` is centred on `(v + ½ − shift)·unit + origin`. Present if unit and origin are.
+    /// Placement of the grid, if both unit and origin are given: the centre of voxel `v` is `(v + ½ − shift)·unit +
+    /// origin`.
     pub placement: Option<Placement>,
 }
 
@@ -32,7 +33,7 @@ impl PointCloud {
     /// Reads a PLY file.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::LimitExceeded`] for a file larger than allowed, or as [`PointCloud::from_ply`].
+    /// [`Error::Io`], [`Error::LimitExceeded`] for a file that is too large, and those of [`PointCloud::from_ply`].
     pub fn open(path: impl AsRef<Path>, limits: &Limits) -> Result<Self> {
         let path = path.as_ref();
         let failed = |source| Error::Io {
@@ -44,13 +45,15 @@ impl PointCloud {
         Self::from_ply(&std::fs::read(path).map_err(failed)?, limits)
     }
 
-    /// Reads a whole PLY file in memory.
+    /// Reads a PLY file from memory.
     ///
-    /// Wants `x y z` of any number type and `red green blue`, each `uchar`, `ushort` (0 to 65535) or `float`/`double` (0 to 1).
+    /// Requires `x y z` of any number type and `red green blue`, each `uchar`, `ushort` (0 to 65535) or
+    /// `float`/`double` (0 to 1).
     ///
     /// # Errors
     /// [`Error::Malformed`] if one is absent, there are no points, a coordinate is not finite or a colour out of range;
-    /// [`Error::Truncated`] if the file ends early; [`Error::LimitExceeded`] if there are more points than `limits` allow.
+    /// [`Error::Truncated`] if the file ends early; [`Error::LimitExceeded`] if there are more points than `limits`
+    /// allow.
     pub fn from_ply(bytes: &[u8], limits: &Limits) -> Result<Self> {
         let ply = Ply::open(bytes)?;
         let names = ["x", "y", "z", "red", "green", "blue"];
@@ -120,7 +123,7 @@ fn fill_channel(colours: &mut [[u8; 3]], channel: usize, name: &str, column: &Co
 }
 
 impl Hints {
-    /// Comments are free text, so what cannot be understood is passed over.
+    /// Comments are free text: those that do not parse are ignored.
     fn from_comments(comments: &[String]) -> Self {
         let mut bits = None;
         let (mut unit, mut origin, mut shift) = (None, None, [0.0; 3]);
@@ -149,7 +152,7 @@ impl Hints {
     }
 }
 
-/// A number of a comment; Python may have wrapped it in `np.float64( )`.
+/// Parses a number, with or without Python's `np.float64( )` around it.
 fn number(word: &str) -> Option<f64> {
     let bare = word.strip_prefix("np.float64(").and_then(|w| w.strip_suffix(')'));
     bare.unwrap_or(word).parse().ok()
@@ -171,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_are_found_by_name_and_colours_brought_to_bytes() {
+    fn columns_are_found_by_name_and_colours_converted_to_bytes() {
         let types = "uchar float double ushort int float";
         let cloud = read(types, "7 1.5 -2.25 65535 9 0.5\n0 0 0 128 0 1\n").unwrap();
         assert_eq!(cloud.positions, [[-2.25, 9.0, 1.5], [0.0; 3]]);
@@ -180,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_cloud_is_refused_by_name_and_row() {
+    fn errors_name_the_property_and_the_row() {
         let types = "uchar float float uchar float float";
         let error = |types: &str, rows: &str| read(types, rows).unwrap_err().to_string();
         let text = error(types, "1 2 3 4 5 0.5\n1 2 3 4 nan 0.5\n");
@@ -197,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn comments_tell_the_grid_and_free_text_does_not_disturb() {
+    fn the_grid_is_read_from_comments_and_free_text_is_ignored() {
         let hints = |lines: &[&str]| Hints::from_comments(&lines.iter().map(|l| l.to_string()).collect::<Vec<_>>());
         let grid = ["bits 11", "unit np.float64(0.5)", "origin 1 2 3", "shift 4 0 0"];
         let placement = Placement {

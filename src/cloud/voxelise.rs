@@ -1,4 +1,4 @@
-//! From points to the occupied voxels of the finest level.
+//! Voxelisation: from points to the occupied voxels of the finest level.
 
 use rayon::prelude::*;
 
@@ -7,46 +7,46 @@ use crate::error::{Error, Result};
 use crate::geometry::{Voxels, morton};
 use crate::placement::Placement;
 
-/// Where errors say they are: a cloud in memory has no lines.
+/// Location in errors, since a cloud in memory has no lines.
 const POINTS: &str = "the points";
-/// The bit depth of a cloud that does not say, and is told, no other.
+/// The bit depth if neither the caller nor the cloud specifies one.
 const DEFAULT_BITS: u8 = 10;
 
-/// The least depth that [`voxelise_closed`] comes down to.
+/// The minimum depth that [`voxelise_closed`] tries.
 const LEAST_CLOSED: u8 = 5;
 
-/// Occupied voxels of the finest level, each with its colour.
+/// Occupied voxels of the finest level with one colour each.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ColouredVoxels {
-    /// The voxels; their depth is the bit depth N.
+    /// The voxels. Their depth is the bit depth N.
     pub voxels: Voxels,
-    /// One sRGB colour per voxel: the mean of its points, rounded, halves up.
+    /// One sRGB colour per voxel: the mean of its points, halves rounded up.
     pub colours: Vec<[u8; 3]>,
-    /// Where the grid lies in the world.
+    /// Placement of the grid in the world.
     pub placement: Placement,
 }
 
-/// How coordinates become voxels.
+/// Conversion from coordinates to voxels.
 enum Grid {
-    /// Coordinates are voxels already, of a grid `shift` levels finer.
+    /// Coordinates are voxels of a grid that is `shift` levels finer.
     Integer { shift: u8 },
     /// `(coordinate − origin) / voxel_size`, rounded down.
     Fitted(Placement),
 }
 
-/// Puts a cloud on the voxel grid of depth `bits`.
+/// Voxelises a cloud on a grid of depth `bits`.
 ///
-/// If every coordinate is a whole number from 0 below 2²¹, the cloud is a voxel grid already. Its depth is `bits`, else the depth
-/// that its comments tell, if those hold its coordinates, else 10 or the least that holds them. Where `bits` are too few, the
-/// coordinates lose just as many low bits as makes them fit. The placement is that of the comments, else
-/// [`Placement::VOXEL_GRID`].
+/// If every coordinate is an integer in `0..2²¹`, the cloud is a voxel grid already. Its depth is `bits`. Without
+/// `bits` it is the depth in the comments if the coordinates fit that, else the minimum that they fit, but at least 10.
+/// If the coordinates do not fit `bits`, their lowest bits are dropped until they fit. The placement is that of the
+/// comments, or [`Placement::VOXEL_GRID`].
 ///
-/// Any other cloud is fitted to a grid of `bits` or 10: the longest side of its bounding box spans the whole cube, and the box lies
-/// in the cube's middle. Points that share a voxel merge.
+/// Any other cloud is fitted to a grid of depth `bits`, by default 10: the longest side of its bounding box spans the
+/// cube, and the box is centred in the cube. Points in the same voxel are merged.
 ///
 /// # Errors
 /// [`Error::Usage`] if `bits` is not 1 to 21 or colours and points differ in number; [`Error::Malformed`] if there
-/// are no points or the bounding box is not one of finite numbers.
+/// are no points or the bounding box is not finite.
 pub fn voxelise(cloud: &PointCloud, bits: Option<u8>) -> Result<ColouredVoxels> {
     if let Some(bits) = bits
         && !(1..=morton::MAX_DEPTH).contains(&bits)
@@ -91,14 +91,14 @@ pub fn voxelise(cloud: &PointCloud, bits: Option<u8>) -> Result<ColouredVoxels> 
             let voxel = std::array::from_fn(|i| match &grid {
                 Grid::Integer { shift } => position[i] as u32 >> shift,
                 Grid::Fitted(p) => {
-                    // The far side of the box belongs to the last voxel.
+                    // The upper faces of the box belong to the last voxel.
                     ((position[i] - p.origin[i]) / p.voxel_size).clamp(0.0, last) as u32
                 }
             });
             (morton::encode(voxel), colour)
         })
         .collect();
-    // Means are of integer sums, so the order of points within a voxel does not matter.
+    // Means are computed from integer sums, so the order of points within a voxel does not matter.
     points.par_sort_unstable_by_key(|point| point.0);
 
     let mut keys = Vec::new();
@@ -114,11 +114,13 @@ pub fn voxelise(cloud: &PointCloud, bits: Option<u8>) -> Result<ColouredVoxels> 
     })
 }
 
-/// Puts a cloud on the finest voxel grid on which its surfaces are closed, and tells the depth that [`voxelise`] would choose.
+/// Voxelises a cloud on the finest grid on which its surfaces are closed. Also returns the depth that [`voxelise`]
+/// chooses.
 ///
-/// The finest level of a stream that is drawn is N − 1. Where its voxels have fewer than 2.5 of the cloud's each, points at random on a surface
-/// leave more than one in nine of the surface's voxels empty: pictures are full of holes, and streams large. So depths are tried from `voxelise`'s own down to 5,
-/// until there are as many; if there never are, the points are those of no surface, and keep their depth.
+/// The finest drawn level of a stream is N − 1. If its voxels contain fewer than 2.5 voxels of level N on average,
+/// random points on a surface leave more than one in nine of the surface's voxels empty: pictures have holes, and
+/// streams are large. The depths from that of [`voxelise`] down to 5 are tried until the average is reached. If it
+/// never is, the points do not form a surface and keep their depth.
 ///
 /// # Errors
 /// Those of [`voxelise`].
@@ -138,7 +140,7 @@ pub fn voxelise_closed(cloud: &PointCloud) -> Result<(ColouredVoxels, u8)> {
 }
 
 impl ColouredVoxels {
-    /// The voxels as points with whole coordinates, the grid in the hints: [`voxelise`] makes the same voxels of them.
+    /// The voxels as points with integer coordinates and the grid in the hints. [`voxelise`] restores the same voxels.
     pub fn to_cloud(&self) -> PointCloud {
         let voxels = 0..self.voxels.len();
         PointCloud {
@@ -178,7 +180,7 @@ fn is_grid(positions: &[[f64; 3]]) -> bool {
         .all(|&x| x.fract() == 0.0 && (0.0..end).contains(&x))
 }
 
-/// Depth of an integer grid, and by how many bits its coordinates are to be shortened.
+/// Depth of an integer grid, and the number of low bits to drop from its coordinates.
 fn grid_depth(largest: u32, bits: Option<u8>, hints: &Hints) -> (u8, u8) {
     let needed = (u32::BITS - largest.leading_zeros()).max(1) as u8;
     match (bits, hints.bits) {
@@ -188,7 +190,7 @@ fn grid_depth(largest: u32, bits: Option<u8>, hints: &Hints) -> (u8, u8) {
     }
 }
 
-/// The cube around the bounding box. A box without extent gets a cube one unit a side.
+/// The cube around the bounding box. For a box without extent its side is one unit.
 fn fit(low: [f64; 3], high: [f64; 3], depth: u8) -> Placement {
     let longest = (0..3).map(|i| high[i] - low[i]).fold(0.0, f64::max);
     let side = if longest > 0.0 { longest } else { 1.0 };
@@ -225,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_coordinates_are_taken_as_they_are() {
+    fn integer_coordinates_are_kept() {
         let grid = voxelise(&cloud(&[[5.0, 0.0, 1.0], [4.0, 0.0, 0.0]]), None).unwrap();
         assert_eq!(grid.voxels.depth(), 10);
         assert_eq!(coordinates(&grid.voxels), [[4, 0, 0], [5, 0, 1]]);
@@ -234,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn the_depth_is_the_asked_one_else_the_comments_else_the_least_from_ten() {
+    fn the_depth_is_the_caller_s_else_the_comments_else_the_least_from_ten() {
         let mut points = cloud(&[[0.0; 3], [1500.0, 3.0, 0.0]]);
         let depth = |points: &PointCloud, bits| voxelise(points, bits).unwrap().voxels.depth();
         assert_eq!(depth(&points, None), 11);
@@ -251,7 +253,7 @@ mod tests {
         }
     }
 
-    /// Points at random on a sphere of radius 1.
+    /// Random points on a sphere of radius 1.
     fn sphere(count: usize) -> PointCloud {
         let mut random = Random(3);
         let mut draw = || (random.next() % 2001) as f64 / 1000.0 - 1.0;
@@ -267,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn sparse_surfaces_are_put_on_the_finest_grid_that_closes_them() {
+    fn sparse_surfaces_get_the_finest_grid_that_closes_them() {
         let mut last = 0;
         for points in [3_000, 12_000, 60_000, 250_000] {
             let cloud = sphere(points);
@@ -284,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn closed_grids_and_points_of_no_surface_keep_their_depth() {
+    fn closed_grids_and_points_without_a_surface_keep_their_depth() {
         let plane = (0..90_000).map(|i| [f64::from(i % 300), f64::from(i / 300), 7.0]);
         let grid = cloud(&plane.collect::<Vec<_>>());
         let alone = cloud(&[[0.0; 3], [0.5, 0.25, 0.125], [1.0; 3]]);
@@ -328,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn boxes_that_numbers_cannot_express_are_refused() {
+    fn boxes_that_overflow_are_refused() {
         for far in [f64::MAX, f64::NAN, f64::INFINITY] {
             let points = cloud(&[[far, 0.0, 0.5], [-far, 0.0, 0.5]]);
             assert!(matches!(voxelise(&points, None), Err(Error::Malformed { .. })));

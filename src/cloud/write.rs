@@ -1,4 +1,4 @@
-//! Coloured points as a PLY file.
+//! Writing of point clouds as PLY files.
 
 use std::path::Path;
 
@@ -7,8 +7,9 @@ use crate::error::{Error, Result};
 use crate::output::write_file;
 
 impl PointCloud {
-    /// The cloud as a binary little-endian PLY: `float x y z` (`double` if `float` would round a coordinate) and
-    /// `uchar red green blue`, with comments for the hints. [`PointCloud::from_ply`] reads back an equal cloud.
+    /// Encodes the cloud as a binary little-endian PLY file: `float x y z` (`double` if `float` would round a
+    /// coordinate) and `uchar red green blue`, with the hints as comments. [`PointCloud::from_ply`] restores an equal
+    /// cloud.
     pub fn to_ply(&self) -> Vec<u8> {
         let single = |&x: &f64| f64::from(x as f32) == x;
         let scalar = match self.positions.iter().flatten().all(single) {
@@ -43,7 +44,7 @@ impl PointCloud {
         bytes
     }
 
-    /// Writes [`PointCloud::to_ply`] to a file, whole or not at all.
+    /// Writes [`PointCloud::to_ply`] to a file atomically.
     ///
     /// # Errors
     /// [`Error::Io`](crate::Error::Io).

@@ -17,7 +17,7 @@ pub struct Colours<'a> {
     pub trunk: Option<Trunk<'a>>,
     /// In the base level, the levels after the trunk up to this level; else this level alone.
     pub levels: Vec<ColourLevel<'a>>,
-    /// XXH3-64 of the colours decoded at this level.
+    /// XXH3-64 of this level's decoded Y, Co and Cg before the post filter, each as i16, little-endian.
     pub hash: u64,
     /// The colour filter of this level.
     pub filter: Option<Slice<'a>>,

@@ -1,11 +1,11 @@
-//! Colour that depends on where it is seen from: real spherical harmonics of degree 1 to 3, as splat files hold them.
+//! View-dependent colour: real spherical harmonics of degree 1 to 3, in the convention of splat files.
 
-/// What view-dependent colour adds to [`Gaussians::colour`](super::Gaussians::colour).
+/// View-dependent part of the colour, which is added to [`Gaussians::colour`](super::Gaussians::colour).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Harmonics {
-    /// Coefficients per Gaussian: 0 (no such colour), 3, 8 or 15, for degree 0 to 3.
+    /// Coefficients per Gaussian: 0, 3, 8 or 15 for degree 0 to 3.
     pub count: usize,
-    /// [`Harmonics::count`] per Gaussian, ascending in degree and order; red, green and blue of each.
+    /// [`Harmonics::count`] RGB coefficients per Gaussian, by ascending degree and order.
     pub coefficients: Vec<[f32; 3]>,
 }
 
@@ -22,10 +22,11 @@ const C3: [f32; 7] = [
 ];
 
 impl Harmonics {
-    /// The colour of Gaussian `i`, whose constant part is `colour`, seen along the unit vector `from the eye to it`; not negative.
+    /// Evaluates the colour of Gaussian `i` along a unit vector from the eye to it, and clamps it to 0 from below.
+    /// `colour` is the coefficient of degree 0.
     ///
     /// # Panics
-    /// If it has no coefficients.
+    /// If Gaussian `i` has no coefficients.
     pub fn seen(&self, i: usize, colour: [f32; 3], [x, y, z]: [f32; 3]) -> [f32; 3] {
         let coefficients = &self.coefficients[i * self.count..][..self.count];
         let (xx, yy, zz) = (x * x, y * y, z * z);
@@ -52,7 +53,7 @@ impl Harmonics {
                 sum[k] += b * c[k];
             }
         }
-        // Not `max`, which would hide NaN.
+        // `max` would replace NaN.
         sum.map(|s| if s < 0.0 { 0.0 } else { s })
     }
 }
@@ -63,7 +64,7 @@ mod tests {
 
     #[test]
     fn the_basis_is_orthonormal_over_the_sphere() {
-        // A spiral of directions, evenly spread: the mean of products is the integral over 4π.
+        // Directions on a spiral sample the sphere evenly, so the mean of the products is their integral over 4π.
         let count = 20_000;
         let golden = std::f32::consts::PI * (3.0 - 5f32.sqrt());
         let mut products = [[0.0f64; 15]; 15];

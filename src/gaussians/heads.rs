@@ -1,4 +1,4 @@
-//! What draws a level.
+//! Names of the heads, which make Gaussians from a decoded level.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,19 +7,19 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
 
-/// Which of a model's Gaussian generators are used. What a stream holds bears on neither, so that any stream of the model decodes with both.
+/// Quality of a model's heads. Streams do not depend on it: every stream of a model can be drawn with either.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Heads {
-    /// Those that every model has.
+    /// The accurate heads, which every model has.
     #[default]
     Best,
-    /// Thinner ones for weak machines, which only some models have: less accurate in a fraction of the time.
+    /// Heads with fewer channels for slow machines: less accurate, several times faster. Only some models have them.
     Quick,
 }
 
 impl Heads {
-    /// All, the default first.
+    /// All values, the default first.
     pub const ALL: [Heads; 2] = [Heads::Best, Heads::Quick];
 
     fn name(self) -> &'static str {
@@ -52,20 +52,20 @@ impl FromStr for Heads {
     }
 }
 
-/// What makes Gaussians of a level.
+/// Method that makes the Gaussians of a level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum HeadSet {
-    /// The best heads of a model.
+    /// The accurate learned heads of a model.
     Best,
-    /// Its quick ones: less accurate in a fraction of the time.
+    /// The fast learned heads of a model: less accurate, several times faster.
     Quick,
-    /// Opaque discs in closed form; no model file is needed. Of streams of version 3 alone.
+    /// Opaque discs in closed form, without a model file. Streams of version 3 only.
     #[default]
     Surfels,
 }
 
 impl HeadSet {
-    /// All, the most accurate first.
+    /// All values, the most accurate first.
     pub const ALL: [HeadSet; 3] = [HeadSet::Best, HeadSet::Quick, HeadSet::Surfels];
 
     fn name(self) -> &'static str {
@@ -76,7 +76,7 @@ impl HeadSet {
         }
     }
 
-    /// The heads of a model; surfels have none.
+    /// The learned heads, or `None` for surfels.
     pub fn learned(self) -> Option<Heads> {
         match self {
             HeadSet::Best => Some(Heads::Best),

@@ -17,25 +17,25 @@ use crate::placement::Placement;
 /// Renderable Gaussians, one array per parameter, all of the same length.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Gaussians {
-    /// Centres in the cube frame: the voxel cube is `[−1, 1]³`.
+    /// Centres in the cube frame, in which the voxel cube is `[−1, 1]³`.
     pub position: Vec<[f32; 3]>,
-    /// Standard deviations along the Gaussian's own axes, in cube-frame units, linear (no logarithm).
+    /// Standard deviations along the Gaussian's own axes, in cube-frame units (not logarithms).
     pub scale: Vec<[f32; 3]>,
     /// Unit quaternions w, x, y, z from the Gaussian's axes to the cube frame's.
     pub rotation: Vec<[f32; 4]>,
-    /// Opacity at the centre, linear, in `[0, 1]`.
+    /// Opacity at the centre, in `[0, 1]` (not a logit).
     pub opacity: Vec<f32>,
     /// Display-referred (sRGB) colour in `[0, 1]`.
     pub colour: Vec<[f32; 3]>,
-    /// View-dependent colour; a stream's Gaussians have none.
+    /// View-dependent colour. Decoded streams have none.
     pub harmonics: Harmonics,
-    /// Whether they were made to be drawn with opacity compensation (anti-aliasing).
+    /// Whether the Gaussians were trained for rendering with opacity compensation (anti-aliasing).
     pub compensated: bool,
-    /// Pictures widen every Gaussian by this variance, in cube-frame units squared: a stream's Gaussians were trained with about so much, and
-    /// leave gaps without it when seen from close up. Zero for none; then, and wherever it comes to less, the pixel's blur takes its place
-    /// ([`Gaussians::pixel_blur`]).
+    /// Variance that the renderer adds to every Gaussian, in cube-frame units squared, or 0. A stream's Gaussians were
+    /// trained with about this variance and leave gaps without it in close-ups. Where its projection is smaller than
+    /// [`Gaussians::pixel_blur`], the renderer adds that instead.
     pub blur: f32,
-    /// Where the cube lies in the world.
+    /// The cube's position and size in the world.
     pub frame: Frame,
 }
 
@@ -44,7 +44,7 @@ pub struct Gaussians {
 pub struct Frame {
     /// Bit depth: the cube is `2^bits` finest voxels a side.
     pub bits: u8,
-    /// Its place in the world.
+    /// Position and voxel size in the world.
     pub placement: Placement,
 }
 
@@ -63,26 +63,26 @@ impl Frame {
         f64::from(1u32 << (self.bits - 1)) * self.placement.voxel_size
     }
 
-    /// Whether it is a cube: 1 to 21 bits, and a valid placement.
+    /// Whether the frame has 1 to 21 bits and a valid placement.
     pub fn is_valid(&self) -> bool {
         (1..=21).contains(&self.bits) && self.placement.is_valid()
     }
 }
 
 impl Gaussians {
-    /// How many Gaussians.
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.position.len()
     }
 
-    /// The variance, in px², that pictures widen every Gaussian by at least: 0.3, which 3D Gaussian Splatting trains with, or next to
-    /// nothing where they have a blur of their own. That keeps surfaces closed whatever the distance; by 0.3 more, silhouettes would
-    /// grow the more, the smaller an object is seen.
+    /// Minimum variance that the renderer adds to every projected Gaussian, in px²: 0.3, with which 3D Gaussian
+    /// Splatting is trained, or 1/16 for Gaussians with a [`blur`](Gaussians::blur). The blur closes surfaces at any
+    /// distance; another 0.3 px² would enlarge silhouettes, and more so for objects that are small in the picture.
     pub fn pixel_blur(&self) -> f32 {
         if self.own_blur() > 0.0 { 1.0 / 16.0 } else { 0.3 }
     }
 
-    /// [`Gaussians::blur`], where it is a variance; otherwise none.
+    /// [`Gaussians::blur`], or 0 if that is negative or not finite.
     pub(crate) fn own_blur(&self) -> f32 {
         if self.blur.is_finite() { self.blur.max(0.0) } else { 0.0 }
     }
@@ -92,7 +92,7 @@ impl Gaussians {
         self.position.is_empty()
     }
 
-    /// Whether every Gaussian has all its parameters.
+    /// Checks that all arrays have the same length.
     ///
     /// # Errors
     /// [`Error::Usage`] if the arrays differ in length.

@@ -1,15 +1,15 @@
-//! Gaussians as a PLY file, the way splat viewers have them.
+//! Gaussians as PLY files in the convention of splat viewers.
 //!
-//! Per Gaussian, as `float`: `x y z` in world units; `f_dc_0..2`, with colour = ½ + 0.2820948·f_dc; `opacity`, the logit; `scale_0..2`,
-//! the natural logarithms of the standard deviations in world units; `rot_0..3`, the quaternion w, x, y, z. A logarithm has no zero
-//! and a logit no end: opacities are written within [10⁻⁶, 1 − 10⁻⁶] and deviations of at least 10⁻³⁸. Comments hold the cube, so
-//! that reading gives back the same frame. Positions are single precision: with an origin a million voxels away they keep a
-//! sixteenth of a voxel.
+//! Per Gaussian, as `float`: `x y z` in world units; `f_dc_0..2`, with colour = ½ + 0.2820948·f_dc; `opacity`, the
+//! logit; `scale_0..2`, the natural logarithms of the standard deviations in world units; `rot_0..3`, the quaternion w,
+//! x, y, z. Logits and logarithms must be finite: the writer clamps opacities to [10⁻⁶, 1 − 10⁻⁶] and deviations to at
+//! least 10⁻³⁸. Comments hold the cube, so that the reader restores the frame. Positions are single precision: at an
+//! origin a million voxels away they resolve a sixteenth of a voxel.
 //!
-//! View-dependent colour (`f_rest_*`) is read, and not written: this crate's Gaussians have none. The comment `SplatRenderMode: mip`
-//! says that they were made to be drawn with opacity compensation.
+//! View-dependent colour (`f_rest_*`) is read but not written, since decoded Gaussians have none. The comment
+//! `SplatRenderMode: mip` marks Gaussians that were trained for rendering with opacity compensation.
 //!
-//! Files of other programs are read as well: number types, byte order and the order of the properties are free.
+//! The reader accepts files of other programs: any number types, byte order and order of properties.
 
 use std::io::Write;
 use std::path::Path;
@@ -22,39 +22,39 @@ use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::placement::Placement;
 
-/// The constant spherical harmonic: `1/(2√π)`.
+/// The spherical harmonic of degree 0: `1/(2√π)`.
 const HARMONIC: f64 = 0.282_094_791_773_878_14;
-/// The least opacity written; the greatest is 1 less this.
+/// Minimum opacity written. The maximum is 1 minus this.
 const OPACITY_MARGIN: f64 = 1e-6;
-/// The least standard deviation written.
+/// Minimum standard deviation written.
 const LEAST_SCALE: f64 = f32::MIN_POSITIVE as f64;
 /// The properties written.
 const PROPERTIES: [&str; 14] = [
     "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2",
     "rot_3",
 ];
-/// Render modes of Gaussians that were made to be drawn with opacity compensation.
+/// Render modes that imply opacity compensation.
 const MIP: [&str; 2] = ["mip", "antialiased"];
-/// Rows between two writes.
+/// Rows per write.
 const BLOCK: usize = 1024;
-/// Bit depth of a cube that is fitted to a file which names none.
+/// Bit depth of the cube that is fitted to a file without one.
 const FITTED_BITS: u8 = 10;
 
-/// What reading a file of another program had to leave out or make up.
+/// Properties of a file that the reader ignored or had to guess.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Notes {
-    /// Coefficients of view-dependent colour per Gaussian that were ignored (`f_rest_*`), because they are not all of a degree.
+    /// Ignored coefficients of view-dependent colour per Gaussian (`f_rest_*`): their number fits no degree.
     pub ignored_harmonics: usize,
-    /// A render mode other than `default` and `mip`, which was not followed.
+    /// Ignored render mode: neither `default` nor one with opacity compensation.
     pub ignored_mode: Option<String>,
-    /// There is no `scale_2`: the Gaussians are discs.
+    /// The file lacks `scale_2`: the Gaussians are discs.
     pub flat: bool,
-    /// The file names no cube: one was fitted to the centres.
+    /// The file names no cube, so one was fitted to the centres.
     pub fitted: bool,
 }
 
 impl Notes {
-    /// One sentence for each thing.
+    /// One sentence per note.
     pub fn warnings(&self) -> Vec<String> {
         let mut lines = Vec::new();
         if self.ignored_harmonics > 0 {
@@ -67,20 +67,20 @@ impl Notes {
             lines.push(format!("drawn as `default`, not in its render mode `{mode}`"));
         }
         if self.flat {
-            lines.push("without scale_2 the Gaussians are taken as flat discs".into());
+            lines.push("the file has no scale_2: the Gaussians are read as flat discs".into());
         }
         if self.fitted {
-            lines.push("the file names no cube: one was fitted to the Gaussians' centres".into());
+            lines.push("the file names no cube: fitted one to the Gaussians' centres".into());
         }
         lines
     }
 }
 
 impl Gaussians {
-    /// Writes a binary little-endian PLY, block by block. `path` is only for the error.
+    /// Writes a binary little-endian PLY file block by block. `path` appears in error messages only.
     ///
     /// # Errors
-    /// [`Error::Io`] if `to` fails; [`Error::Usage`] if the arrays differ in length or the frame is none.
+    /// [`Error::Io`] if `to` fails; [`Error::Usage`] if the arrays differ in length or the frame is invalid.
     pub fn write_ply<W: Write + ?Sized>(&self, to: &mut W, path: &Path) -> Result<()> {
         self.check_lengths()?;
         let Frame { bits, placement } = self.frame;
@@ -120,7 +120,7 @@ impl Gaussians {
         Ok(())
     }
 
-    /// The numbers of Gaussian `i` in the order of [`PROPERTIES`].
+    /// The values of Gaussian `i` in the order of [`PROPERTIES`].
     fn row(&self, i: usize) -> [f32; 14] {
         let unit = self.frame.unit();
         let [x, y, z] = self.frame.placement.from_cube(self.frame.bits, self.position[i]);
@@ -129,14 +129,14 @@ impl Gaussians {
         let opacity = (opacity / (1.0 - opacity)).ln();
         let [s0, s1, s2] = self.scale[i].map(|s| {
             let s = (f64::from(s) * unit).abs();
-            // Not `max`, which would hide NaN.
+            // `max` would replace NaN.
             if s < LEAST_SCALE { LEAST_SCALE.ln() } else { s.ln() }
         });
         let [q0, q1, q2, q3] = self.rotation[i].map(f64::from);
         [x, y, z, r, g, b, opacity, s0, s1, s2, q0, q1, q2, q3].map(|x| x as f32)
     }
 
-    /// [`read`], for callers that have no use for its notes.
+    /// As [`read`], without the notes.
     ///
     /// # Errors
     /// As [`read`].
@@ -147,11 +147,12 @@ impl Gaussians {
 
 /// Reads Gaussians from a whole PLY file in memory.
 ///
-/// Numbers that are not finite are kept: projection drops and counts such Gaussians. Quaternions are not normalised, projection
-/// does. A file without this crate's comments is placed in a cube of 2¹⁰ voxels a side around the central 99 % of its centres.
+/// Values that are not finite are kept: the projection drops and counts such Gaussians. The projection also normalises
+/// the quaternions. A file without this crate's comments gets a cube of 2¹⁰ voxels a side around the central 99 % of
+/// its centres.
 ///
 /// # Errors
-/// Those of [`Ply::vertex_columns`]: a property that is absent, a file that ends early, more than `limits` allow.
+/// As [`Ply::vertex_columns`]: an absent property, a truncated file, or more data than `limits` allow.
 pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
     let ply = Ply::open(bytes)?;
     let has = |name: &str| ply.element("vertex").is_some_and(|vertex| vertex.has(name));
@@ -191,7 +192,7 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
     let deviation = |i: usize, k: usize| {
         let log = scale.get(k).map_or(f64::NEG_INFINITY, |column| column.get(i));
         let deviation = (log.exp() / unit) as f32;
-        // What a finite logarithm stands for is finite: beyond the range of `f32` it is the end of the range.
+        // A finite logarithm gives a finite deviation: clamp it to the range of `f32`.
         if log.is_finite() {
             deviation.min(f32::MAX)
         } else {
@@ -232,7 +233,7 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
     Ok((gaussians, notes))
 }
 
-/// The coefficients `f_rest_*`, `count` for each of red, green and blue, in this order.
+/// Reads the properties `f_rest_*`: `count` coefficients of red, then of green, then of blue.
 fn harmonics(ply: &Ply, count: usize, limits: &Limits) -> Result<Harmonics> {
     let names: Vec<String> = (0..3 * count).map(|i| format!("f_rest_{i}")).collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
@@ -252,7 +253,7 @@ fn harmonics(ply: &Ply, count: usize, limits: &Limits) -> Result<Harmonics> {
     Ok(Harmonics { count, coefficients })
 }
 
-/// The render mode in the comments, if it isn't the default.
+/// The render mode in the comments, if it is not the default.
 fn render_mode(header: &Header) -> Option<String> {
     let modes = header.comments.iter();
     let mode = modes
@@ -262,7 +263,7 @@ fn render_mode(header: &Header) -> Option<String> {
     (mode != "default").then(|| mode.to_owned())
 }
 
-/// The last comment of this crate about `key`.
+/// The values of the last comment `b2p KEY …`.
 fn words<'a>(header: &'a Header, key: &str) -> Option<std::str::SplitAsciiWhitespace<'a>> {
     let mut comments = header.comments.iter().rev();
     comments.find_map(|comment| {
@@ -271,13 +272,13 @@ fn words<'a>(header: &'a Header, key: &str) -> Option<std::str::SplitAsciiWhites
     })
 }
 
-/// The blur that the comments name, in the units of the cube that they name too; otherwise none.
+/// The blur in the comments, in cube-frame units squared, or 0.
 fn blur(header: &Header) -> f32 {
     let blur = words(header, "blur").and_then(|mut words| words.next()?.parse().ok());
     blur.filter(|blur: &f32| blur.is_finite() && *blur > 0.0).unwrap_or(0.0)
 }
 
-/// The cube that the comments name. Comments are free text: what cannot be understood is none.
+/// The cube in the comments. Comments are free text: those that do not parse are ignored.
 fn named_frame(header: &Header) -> Option<Frame> {
     let words = |key: &str| words(header, key);
     let mut origin = words("origin")?.map(|word| word.parse().ok());
@@ -291,7 +292,7 @@ fn named_frame(header: &Header) -> Option<Frame> {
     frame.is_valid().then_some(frame)
 }
 
-/// A cube around the central 99 % of the centres that are finite.
+/// A cube around the central 99 % of the finite centres.
 fn fitted_frame(centres: impl Iterator<Item = [f64; 3]>) -> Frame {
     let mut centres: Vec<[f64; 3]> = centres.filter(|c| c.iter().all(|x| x.is_finite())).collect();
     if centres.is_empty() {
@@ -308,7 +309,7 @@ fn fitted_frame(centres: impl Iterator<Item = [f64; 3]>) -> Frame {
     let ranges = [range(0), range(1), range(2)];
     let side = ranges.iter().fold(0.0, |side: f64, (low, high)| side.max(high - low));
     let cubes = f64::from(1u32 << FITTED_BITS);
-    // All in one place, or too far apart for a number.
+    // All centres coincide, or their extent overflows.
     let side = if side > 0.0 && side.is_finite() { side } else { cubes };
     Frame {
         bits: FITTED_BITS,

@@ -1,4 +1,4 @@
-//! Rows of an ASCII file: one a line, blank lines passed over.
+//! Rows of an ASCII file: one per line; blank lines are skipped.
 
 use super::header::{Element, Header, Kind, Scalar, shown};
 use super::{Column, truncated};
@@ -11,7 +11,7 @@ struct Lines<'a> {
     line: usize,
 }
 
-/// Reads the properties `wanted` (position, type) of `element`, which follows `before`.
+/// Reads the properties `wanted` (index, type) of `element`, which follows the elements `before`.
 pub(super) fn columns(
     bytes: &[u8],
     header: &Header,
@@ -69,7 +69,7 @@ pub(super) fn columns(
                     if length < 0.0 {
                         return Err(at(None, format!("0 or more items, not {length}")));
                     }
-                    // Ends with the line's words, however long the list claims to be.
+                    // Bounded by the words of the line, whatever the declared length of the list.
                     for _ in 0..length as u64 {
                         next(item)?;
                     }
@@ -84,7 +84,7 @@ pub(super) fn columns(
     Ok(columns)
 }
 
-/// The number of the line that holds row `row` of all rows in the file.
+/// Line number of row `row`, counted over all elements.
 pub(super) fn line_of(header: &Header, bytes: &[u8], row: usize) -> Option<usize> {
     let mut lines = Lines {
         bytes,
@@ -113,7 +113,8 @@ impl<'a> Lines<'a> {
         Err(truncated(self.at, "rows of a PLY element", 1))
     }
 
-    /// Fails unless the bytes left can hold the rows: every number takes a digit and a separator, the last one may end the file.
+    /// Fails unless the remaining bytes can hold the rows: each number takes a digit and a separator, except at the end
+    /// of the file.
     fn check_rows(&self, element: &Element) -> Result<()> {
         let width = 2 * element.properties.len() as u64;
         let needed = element.count.saturating_mul(width).saturating_sub(1);
@@ -126,7 +127,7 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// The number that a word spells, if `scalar` holds it.
+/// Parses a word as a value of `scalar`.
 fn number(scalar: Scalar, word: &[u8]) -> Option<f64> {
     let value = match small_integer(word) {
         Some(value) => value,
@@ -140,13 +141,14 @@ fn number(scalar: Scalar, word: &[u8]) -> Option<f64> {
     };
     match scalar.range() {
         Some((low, high)) => (value.fract() == 0.0 && low <= value && value <= high).then_some(value),
-        // Rounds the small integers that f32 cannot hold.
+        // Values of type f32 are rounded to f32.
         None if scalar == Scalar::F32 => Some((value as f32).into()),
         None => Some(value),
     }
 }
 
-/// Most words of a voxelised cloud are short runs of digits; going round the general parser makes reading several times faster.
+/// Fast path: most words of a voxelised cloud are short integers. Without the general parser, reading is several times
+/// faster.
 fn small_integer(word: &[u8]) -> Option<f64> {
     if word.is_empty() || word.len() > 9 {
         return None;

@@ -7,7 +7,7 @@ use super::{Column, Values, truncated};
 use crate::cloud::malformed;
 use crate::error::Result;
 
-/// Rows and columns that a thread reads together.
+/// Rows and columns per task.
 const BLOCK: usize = 512;
 const TOGETHER: usize = 16;
 
@@ -17,7 +17,8 @@ struct Cursor<'a> {
     big_endian: bool,
 }
 
-/// Reads the properties `wanted` (position, type) of `element`, which follows `before` from byte `body` on.
+/// Reads the properties `wanted` (index, type) of `element`, which follows the elements `before`; the rows begin at
+/// byte `body`.
 pub(super) fn columns(
     bytes: &[u8],
     body: usize,
@@ -48,7 +49,7 @@ pub(super) fn columns(
     let offsets: Vec<usize> = wanted.iter().map(|w| offset(element, w.0)).collect();
     let parts = columns.par_chunks_mut(TOGETHER);
     parts.zip(offsets.par_chunks(TOGETHER)).for_each(|(columns, offsets)| {
-        // Some rows at a time, so that they are still in the cache for the last column.
+        // In blocks of rows, which stay in the cache for all columns.
         for rows in rows.chunks(BLOCK * stride) {
             for (column, &at) in columns.iter_mut().zip(offsets) {
                 column.extend(rows, stride, at, big_endian);
@@ -73,9 +74,9 @@ impl<'a> Cursor<'a> {
         self.take(count.saturating_mul(stride as u64), "rows of a PLY element")
     }
 
-    /// Visits every scalar property of every row as (row's property, its bytes), passing over lists.
+    /// Visits every scalar property of every row with its index, type and bytes. Lists are skipped.
     fn walk(&mut self, element: &Element, mut visit: impl FnMut(usize, Scalar, &[u8]) -> Result<()>) -> Result<()> {
-        // A row holds at least the count of a list, so the loop ends with the bytes.
+        // Each row has at least the count of a list, so the bytes bound the loop.
         for _ in 0..element.count {
             for (i, property) in element.properties.iter().enumerate() {
                 match property.kind {
@@ -109,7 +110,7 @@ impl<'a> Cursor<'a> {
                 Kind::List { count, .. } => count.size(),
             })
             .sum();
-        // Looked ahead at, not consumed: the rows must at least be there before columns are reserved.
+        // Checked before columns are allocated: the file must be long enough for the rows.
         let start = self.at;
         self.take_rows(element.count, least)?;
         self.at = start;
@@ -145,7 +146,7 @@ fn offset(element: &Element, property: usize) -> usize {
         .sum()
 }
 
-/// One number from exactly its bytes.
+/// Decodes one number. `bytes` has the length of `scalar`.
 fn number(bytes: &[u8], scalar: Scalar, big_endian: bool) -> f64 {
     let mut column = Column::with_capacity(scalar, 1);
     column.extend(bytes, bytes.len(), 0, big_endian);
@@ -153,7 +154,7 @@ fn number(bytes: &[u8], scalar: Scalar, big_endian: bool) -> f64 {
 }
 
 impl Column {
-    /// Adds a property of `rows` of `stride` bytes, `at` bytes from each row's start.
+    /// Appends a property of `rows` of `stride` bytes each, at offset `at` in each row.
     fn extend(&mut self, rows: &[u8], stride: usize, at: usize, big_endian: bool) {
         macro_rules! add {
             ($to:ident, $file:ty as $memory:ty) => {

@@ -1,12 +1,12 @@
-//! The header: what the file declares.
+//! The header, which declares elements and properties.
 
 use crate::cloud::malformed;
 use crate::error::{Error, Result};
 
-/// How the rows are written.
+/// Encoding of the rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// One row a line.
+    /// One row per line.
     Ascii,
     /// Rows without padding.
     Binary {
@@ -29,12 +29,12 @@ pub enum Scalar {
     F64,
 }
 
-/// What a property holds per row.
+/// Kind of a property.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// One number.
+    /// One number per row.
     Scalar(Scalar),
-    /// A count, and that many numbers.
+    /// A count and as many numbers per row.
     List {
         /// The integer type of the count.
         count: Scalar,
@@ -43,21 +43,21 @@ pub enum Kind {
     },
 }
 
-/// A named value of every row.
+/// A named value in every row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Property {
     /// Its name.
     pub name: String,
-    /// What it holds.
+    /// Its kind.
     pub kind: Kind,
 }
 
-/// Rows of the same properties.
+/// Rows with the same properties.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Element {
     /// Its name.
     pub name: String,
-    /// How many rows the header claims.
+    /// Declared number of rows.
     pub count: u64,
     /// The properties in the order of the file.
     pub properties: Vec<Property>,
@@ -66,7 +66,7 @@ pub struct Element {
 /// Everything up to `end_header`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Header {
-    /// How the rows are written.
+    /// Encoding of the rows.
     pub format: Format,
     /// The comments without the word `comment`, trimmed.
     pub comments: Vec<String>,
@@ -74,12 +74,12 @@ pub struct Header {
     pub elements: Vec<Element>,
     /// Byte offset of the first row.
     pub body: usize,
-    /// Lines that the header takes.
+    /// Number of lines of the header.
     pub lines: usize,
 }
 
 impl Scalar {
-    /// The type of that name, in either spelling (`uchar`, `uint8`).
+    /// Parses a type's name in either spelling (`uchar`, `uint8`).
     fn named(name: &str) -> Option<Scalar> {
         Some(match name {
             "char" | "int8" => Scalar::I8,
@@ -94,7 +94,7 @@ impl Scalar {
         })
     }
 
-    /// Bytes in a binary file.
+    /// Size in a binary file, in bytes.
     pub fn size(self) -> usize {
         match self {
             Scalar::I8 | Scalar::U8 => 1,
@@ -104,7 +104,7 @@ impl Scalar {
         }
     }
 
-    /// The least and the greatest value of an integer type.
+    /// Minimum and maximum of an integer type.
     pub fn range(self) -> Option<(f64, f64)> {
         Some(match self {
             Scalar::I8 => (i8::MIN.into(), i8::MAX.into()),
@@ -117,7 +117,7 @@ impl Scalar {
         })
     }
 
-    /// Bytes of a value in a column in memory.
+    /// Bytes per value of a column in memory.
     pub(super) fn width(self) -> u64 {
         match self {
             Scalar::U8 => 1,
@@ -143,7 +143,7 @@ impl std::fmt::Display for Scalar {
 }
 
 impl Element {
-    /// Position and type of the scalar property `name`.
+    /// Index and type of the scalar property `name`.
     pub(super) fn scalar(&self, name: &str) -> Result<(usize, Scalar)> {
         let mut found = None;
         for (i, property) in self.properties.iter().enumerate() {
@@ -164,12 +164,12 @@ impl Element {
         found.ok_or_else(|| absent(&format!("property of {}", self.name), name))
     }
 
-    /// Whether the element has a property of that name.
+    /// Whether the element has a property `name`.
     pub fn has(&self, name: &str) -> bool {
         self.properties.iter().any(|p| p.name == name)
     }
 
-    /// Bytes of a row in a binary file, unless lists make it vary.
+    /// Bytes per row of a binary file, or `None` if the element has lists.
     pub(super) fn stride(&self) -> Option<usize> {
         self.properties.iter().try_fold(0, |sum, p| match p.kind {
             Kind::Scalar(scalar) => Some(sum + scalar.size()),
@@ -179,10 +179,10 @@ impl Element {
 }
 
 impl Header {
-    /// Reads from `ply` to `end_header`. Lines end with LF or CR LF; bytes after the header are not looked at.
+    /// Reads from `ply` to `end_header`. Lines end with LF or CR LF; bytes after the header are ignored.
     ///
     /// # Errors
-    /// [`Error::Malformed`], naming the line, if it is no PLY header; [`Error::Truncated`] if it does not end.
+    /// [`Error::Malformed`], naming the line, if the header is invalid; [`Error::Truncated`] if it does not end.
     pub fn parse(bytes: &[u8]) -> Result<Header> {
         if !bytes.starts_with(b"ply") {
             let start = &bytes[..bytes.len().min(8)];
@@ -203,7 +203,7 @@ impl Header {
             lines += 1;
             let text = String::from_utf8_lossy(line);
             let at = || format!("line {lines}");
-            // No line but a comment has more than five words; the sixth is there to be refused.
+            // Only comments have more than five words. The sixth word makes other lines invalid.
             let words: Vec<&str> = text.split_ascii_whitespace().take(6).collect();
             match words[..] {
                 ["ply"] if lines == 1 => {}
@@ -278,12 +278,12 @@ fn property_kind(words: &[&str]) -> Option<Kind> {
     }
 }
 
-/// Something that the header should declare and does not.
+/// A declaration that the header lacks.
 pub(super) fn absent(what: &str, name: &str) -> Error {
     malformed("header", format!("{what} {name}"), "absent", "to be declared")
 }
 
-/// Bytes of a file as an error message may repeat them.
+/// Escaped bytes of a file for an error message.
 pub(super) fn shown(bytes: &[u8]) -> String {
     let text = String::from_utf8_lossy(&bytes[..bytes.len().min(40)]);
     format!("{text:?}")

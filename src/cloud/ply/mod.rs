@@ -1,7 +1,8 @@
-//! PLY files: a header that describes columns, and rows of them.
+//! PLY files: a header that declares columns, then rows.
 //!
-//! ASCII and both binary formats, elements and properties in any order, list properties skipped. Columns are read by name, without
-//! a look-up per row. Nothing is reserved that neither the [`Limits`] nor the bytes present allow.
+//! The reader supports ASCII and both binary formats, with elements and properties in any order. It skips list
+//! properties. Columns are selected by name once per file. Allocations are bounded by the [`Limits`] and by the length
+//! of the file.
 
 mod ascii;
 mod binary;
@@ -12,10 +13,10 @@ pub use header::{Element, Format, Header, Kind, Property, Scalar};
 use crate::error::{Error, Result, Stage};
 use crate::limits::Limits;
 
-/// A PLY file in memory whose header has been read.
+/// A PLY file in memory with a parsed header.
 #[derive(Debug, Clone)]
 pub struct Ply<'a> {
-    /// What the file declares.
+    /// The parsed header.
     pub header: Header,
     bytes: &'a [u8],
 }
@@ -25,7 +26,7 @@ pub struct Ply<'a> {
 pub struct Column {
     /// The type in the file.
     pub scalar: Scalar,
-    /// The values, in the narrowest of three types that holds the file's type exactly.
+    /// The values in the narrowest of three types that represents the file's type exactly.
     pub values: Values,
 }
 
@@ -41,7 +42,7 @@ pub enum Values {
 }
 
 impl<'a> Ply<'a> {
-    /// Reads the header of a whole file.
+    /// Parses the header of a file.
     ///
     /// # Errors
     /// Those of [`Header::parse`].
@@ -50,22 +51,22 @@ impl<'a> Ply<'a> {
         Ok(Ply { header, bytes })
     }
 
-    /// The element of that name.
+    /// The element `name`.
     pub fn element(&self, name: &str) -> Option<&Element> {
         self.header.elements.iter().find(|e| e.name == name)
     }
 
-    /// The scalar properties `names` (distinct) of the element `vertex`, in that order.
+    /// Reads the scalar properties `names`, which must be distinct, of the element `vertex`, in that order.
     ///
     /// # Errors
-    /// [`Error::Malformed`] if one is absent, a list, or holds what its type cannot; [`Error::Truncated`] if the
+    /// [`Error::Malformed`] if one is absent, a list, or has a value outside its type; [`Error::Truncated`] if the
     /// file ends early; [`Error::LimitExceeded`] if there are more rows, or more bytes in them, than `limits` allow.
     pub fn vertex_columns(&self, names: &[&str], limits: &Limits) -> Result<Vec<Column>> {
         self.columns("vertex", names, limits)
     }
 
-    /// Where row `row` of the element `vertex` stands: a line of an ASCII file, a byte offset of a binary one; only the row's
-    /// number if rows before it have no fixed size.
+    /// Location of row `row` of the element `vertex` for messages: the line of an ASCII file or the byte offset of a
+    /// binary one; the row's number if earlier rows vary in size.
     pub(super) fn vertex_place(&self, row: usize) -> String {
         let before = self.header.elements.iter().take_while(|e| e.name != "vertex");
         let place = match self.header.format {
@@ -128,7 +129,7 @@ impl Column {
         Column { scalar, values }
     }
 
-    /// `value` is one that `self.scalar` holds, so no conversion loses anything.
+    /// `value` is in the range of `self.scalar`, so that the conversion is exact.
     fn push(&mut self, value: f64) {
         match &mut self.values {
             Values::U8(v) => v.push(value as u8),
@@ -137,7 +138,7 @@ impl Column {
         }
     }
 
-    /// How many rows.
+    /// Number of rows.
     pub fn len(&self) -> usize {
         match &self.values {
             Values::U8(v) => v.len(),
@@ -151,7 +152,7 @@ impl Column {
         self.len() == 0
     }
 
-    /// The value of row `i`, exactly.
+    /// The exact value of row `i`.
     pub fn get(&self, i: usize) -> f64 {
         match &self.values {
             Values::U8(v) => v[i].into(),
@@ -160,7 +161,7 @@ impl Column {
         }
     }
 
-    /// All values as `f32`, rounded where they are `int`, `uint` or `double`.
+    /// All values as `f32`. Values of `int`, `uint` and `double` are rounded.
     pub fn into_f32(self) -> Vec<f32> {
         match self.values {
             Values::U8(v) => v.into_iter().map(f32::from).collect(),
@@ -170,7 +171,7 @@ impl Column {
     }
 }
 
-/// The end of the file came too early.
+/// The file ends early.
 fn truncated(offset: usize, field: &'static str, needed: u64) -> Error {
     Error::Truncated {
         stage: Stage::Cloud,

@@ -11,8 +11,8 @@ fn message(bytes: &[u8]) -> String {
     open(bytes).unwrap_err().to_string()
 }
 
-/// Two vertices (1.5, −2, 3) and (4, 5, 6) after a face element with a list, in every format; y is a short, z an int, and a
-/// property nobody asks for stands between.
+/// Two vertices (1.5, −2, 3) and (4, 5, 6) after a face element with a list, in every format; y is a short, z an int,
+/// and a property that is not read is between them.
 fn sample(format: &str, line_end: &str) -> Vec<u8> {
     let header = format!(
         "ply\nformat {format} 1.0\ncomment made by  hand \nobj_info none\nelement face 2\n\
@@ -66,7 +66,7 @@ fn every_format_reads_the_same_columns() {
 }
 
 #[test]
-fn many_columns_of_many_rows_are_read_like_few() {
+fn many_columns_of_many_rows_are_read_as_few_are() {
     let (columns, rows) = (37, 1300);
     let value = |row: usize, column: usize| (row * 100 + column) as f32;
     for big_endian in [false, true] {
@@ -88,7 +88,7 @@ fn many_columns_of_many_rows_are_read_like_few() {
             }
         }
         let ply = Ply::open(&bytes).unwrap();
-        // Not in the order of the file, and not all.
+        // A subset, in another order than in the file.
         let wanted: Vec<usize> = (1..columns).rev().collect();
         let names: Vec<&str> = wanted.iter().map(|&i| names[i].as_str()).collect();
         let read = ply.vertex_columns(&names, &Limits::default()).unwrap();
@@ -100,7 +100,7 @@ fn many_columns_of_many_rows_are_read_like_few() {
 }
 
 #[test]
-fn lists_inside_the_vertices_are_passed_over() {
+fn lists_in_vertices_are_skipped() {
     let header = "element vertex 2\nproperty list uchar ushort tags\nproperty uchar x\n\
                   property uint y\nproperty list ushort double more\nproperty char z\nend_header\n";
     let ascii = format!("ply\nformat ascii 1.0\n{header}2 8 9 1 4000000000 0 -3\n0 4 5 1 0.5 6\n");
@@ -132,7 +132,7 @@ fn a_file_cut_anywhere_is_an_error() {
 }
 
 #[test]
-fn errors_say_where_what_and_why() {
+fn errors_name_location_value_and_reason() {
     let header =
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty uchar y\nproperty float z\nend_header\n";
     let error = message(format!("{header}1 2 3\n4 256 6\n").as_bytes());
@@ -164,7 +164,7 @@ fn errors_say_where_what_and_why() {
 }
 
 #[test]
-fn a_claimed_count_reserves_nothing_that_is_not_there() {
+fn a_declared_count_does_not_allocate_beyond_the_file() {
     for format in FORMATS {
         for list in ["", "property list int int l\n"] {
             for count in [1u64 << 25, u64::MAX] {
@@ -242,7 +242,7 @@ proptest! {
 }
 
 #[test]
-fn a_vertex_has_a_place_in_every_format() {
+fn a_vertex_has_a_location_in_every_format() {
     let bytes = b"ply\nformat ascii 1.0\nelement list 1\nproperty uchar a\nelement vertex 2\nproperty int x\nend_header\n7\n\n1\n2";
     let ply = Ply::open(bytes).unwrap();
     assert_eq!(ply.vertex_place(1), "line 11");

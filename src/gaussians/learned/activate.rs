@@ -1,9 +1,10 @@
-//! From raw numbers to Gaussians.
+//! Activation of the network's outputs to Gaussians.
 //!
-//! Of a Gaussian's 14 raw numbers, in this order: offset 3, scale 3, quaternion 4 (w first), opacity 1, colour 3. The unit u is a voxel's edge
-//! for one Gaussian a voxel, and half of it for eight; the anchor is the centre of the voxel or of its octant.
-//! position = anchor + u·tanh(offset), σ = u·softplus(scale − 0.31), rotation = normalise(quaternion + (1, 0, 0, 0)),
-//! opacity = 1 of one, sigmoid(opacity + 2) of eight, colour = clamp(decoded colour / 255 + colour, 0, 1).
+//! The 14 outputs of a Gaussian are, in this order: offset 3, scale 3, quaternion 4 (w first), opacity 1, colour 3. The
+//! unit u is the voxel's edge for one Gaussian per voxel, and half of it for eight. The anchor is the centre of the
+//! voxel or of its octant. position = anchor + u·tanh(offset), σ = u·softplus(scale − 0.31), rotation =
+//! normalise(quaternion + (1, 0, 0, 0)), opacity = 1 for one, sigmoid(opacity + 2) for eight, colour = clamp(decoded
+//! colour / 255 + colour, 0, 1).
 
 use rayon::prelude::*;
 
@@ -13,26 +14,26 @@ use crate::geometry::Voxels;
 use crate::layers::activations::{GROUP, Lane, normalised};
 use crate::layers::activations::{sigmoid, softplus, tanh};
 
-/// Voxels whose raw numbers are in memory at once; a multiple of 512, as layers need it.
+/// Voxels whose outputs are in memory at once: a multiple of 512, as layers require.
 pub const PART: usize = 16_384;
-/// Voxels that one task activates.
+/// Voxels per task.
 const BLOCK: usize = 256;
 
 const SCALE_BIAS: f32 = -0.31;
 const OPACITY_BIAS: f32 = 2.0;
-/// The raw opacity that becomes 1/255, ln(1/254) − 2: less is not drawn.
+/// The output that gives an opacity of 1/255: ln(1/254) − 2. Fainter Gaussians are not drawn.
 const FAINTEST: f32 = -5.537_334_3 - OPACITY_BIAS;
 
-/// Gaussians of a level as they come, part by part.
+/// The Gaussians of a level, built part by part.
 pub struct Drawing<'a> {
     voxels: &'a Voxels,
     colours: &'a [[u8; 3]],
-    /// Gaussians a voxel.
+    /// Gaussians per voxel.
     count: usize,
     pub gaussians: Gaussians,
 }
 
-/// One part's places in the arrays.
+/// One part's slices of the arrays of Gaussians.
 struct Rows<'a> {
     position: &'a mut [[f32; 3]],
     scale: &'a mut [[f32; 3]],
@@ -42,7 +43,7 @@ struct Rows<'a> {
 }
 
 impl<'a> Drawing<'a> {
-    /// None so far, and room for all; `blur` in squares of half the unit.
+    /// No Gaussians yet, with capacity for all. `blur` is in squares of half the unit.
     pub fn new(input: &LevelInput<'a>, count: usize, blur: f32, frame: Frame) -> Self {
         let voxels = input.octree.level(input.level);
         let half = 1.0 / (1u32 << (voxels.depth() + u8::from(count == 8))) as f32;
@@ -64,7 +65,7 @@ impl<'a> Drawing<'a> {
         }
     }
 
-    /// Adds those of the voxels from `first` on, of which these are the raw numbers.
+    /// Appends the Gaussians of the voxels from `first` on, whose outputs are `raw`.
     pub fn add(&mut self, first: usize, raw: &[f32]) {
         let block = BLOCK * self.count * RAW;
         let drawn = |raw: &&[f32]| self.count == 1 || raw[10] >= FAINTEST;
@@ -131,7 +132,7 @@ impl<'a> Rows<'a> {
         (rows, others)
     }
 
-    /// Activates the raw numbers of the voxels from `first` on, `count` Gaussians each, of those that are drawn.
+    /// Activates the outputs of the voxels from `first` on, `count` Gaussians each, and skips those that are too faint.
     fn fill(self, voxels: &Voxels, colours: &[[u8; 3]], count: usize, first: usize, raw: &[f32]) {
         let unit = 2.0 / (1u64 << voxels.depth()) as f32 / if count == 8 { 2.0 } else { 1.0 };
         let mut to = 0;
@@ -160,7 +161,7 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// Where offsets count from, in units.
+/// Origin of a Gaussian's offset, in units.
 fn anchor(voxel: [u32; 3], octant: usize, count: usize) -> [f64; 3] {
     std::array::from_fn(|axis| match count {
         8 => f64::from(2 * voxel[axis] + (octant as u32 >> axis & 1)) + 0.5,
@@ -168,7 +169,7 @@ fn anchor(voxel: [u32; 3], octant: usize, count: usize) -> [f64; 3] {
     })
 }
 
-/// Activated numbers of some Gaussians, each kind apart; offsets and scales in units, what is added to the decoded colours.
+/// Activated outputs of a group of Gaussians. Offsets and scales are in units; `colour` is added to the decoded colour.
 struct Group {
     offset: [Lane; 3],
     scale: [Lane; 3],
@@ -178,7 +179,7 @@ struct Group {
 }
 
 impl Group {
-    /// Up to [`GROUP`] Gaussians; what is missing is as if raw numbers were zero.
+    /// Activates up to [`GROUP`] Gaussians. Missing ones are activated from zeros.
     fn new(raw: &[f32], translucent: bool) -> Group {
         let mut lanes: [Lane; RAW] = [[0.0; GROUP]; RAW];
         for (j, raw) in raw.chunks_exact(RAW).enumerate() {

@@ -1,4 +1,5 @@
-//! What the network reads, as integers: colours, their differences, occupancy and the quantisation step are multiples of 1/512.
+//! Inputs of the network as integers: colours, their differences, occupancy and quantisation step are multiples of
+//! 1/512.
 
 use b2p_kernels::{LIMIT, zeros};
 use rayon::prelude::*;
@@ -7,35 +8,35 @@ use super::LevelInput;
 use super::load::INPUTS;
 use crate::layers::activations::log2;
 
-/// The real value of a parent channel's step, which holds every value exactly (the logarithm's rounded).
+/// Scale of a parent's channels. All values are exact multiples, except the logarithm, which is rounded.
 pub const PARENT_STEP: f32 = 1.0 / 512.0;
-/// The real value of a child channel's step in integers: twice as large, so that differences up to the largest of luma fit ±2047.
+/// Scale of a child's channels in integers: twice as large, so that all differences of luma fit ±2047.
 pub const CHILD_STEP: f32 = 1.0 / 256.0;
-/// The coarsest step that heads are told of.
+/// Maximum quantisation step. Larger ones are clamped.
 const COARSEST: f32 = 65_536.0;
-/// Rows that one task makes at least.
+/// Minimum rows per task.
 const BLOCK: usize = 1024;
 
-/// Input channels of both levels, and how they hang together.
+/// Input channels of both levels, and the links between them.
 pub struct Channels {
-    /// [parents, 12], in steps of [`PARENT_STEP`].
+    /// `[parents, 12]`, in units of [`PARENT_STEP`].
     pub parent: Vec<i16>,
-    /// [children, 7].
+    /// `[children, 7]`.
     pub child: Vec<i16>,
-    /// The parent of each child.
+    /// Row of each child's parent.
     pub parents: Vec<u32>,
-    /// The place of each child in its parent.
+    /// Octant of each child in its parent.
     pub octants: Vec<u8>,
 }
 
 impl Channels {
-    /// Children in steps of [`CHILD_STEP`] within ±[`LIMIT`].
+    /// Children in units of [`CHILD_STEP`], clamped to ±[`LIMIT`].
     pub fn within_limit(input: &LevelInput<'_>) -> Self {
         let limit = i32::from(LIMIT);
         Channels::new(input, |v| ((v + 1) >> 1).clamp(-limit, limit) as i16)
     }
 
-    /// Children in steps of [`PARENT_STEP`], exact.
+    /// Children in units of [`PARENT_STEP`], exact.
     pub fn fine(input: &LevelInput<'_>) -> Self {
         // Four times the largest difference is 4 · 2040.
         Channels::new(input, |v| v as i16)
@@ -83,13 +84,13 @@ impl Channels {
     }
 }
 
-/// y, co, cg in 512ths.
+/// y, co, cg in units of 1/512.
 fn luma_chroma([r, g, b]: [u8; 3]) -> [i32; 3] {
     let [r, g, b] = [r, g, b].map(i32::from);
     [r + 2 * g + b - 512, 4 * (r - b), 4 * g - 2 * (r + b)]
 }
 
-/// A quarter of the logarithm of the quantisation step, in 512ths.
+/// `log2(step) / 4` in units of 1/512.
 fn coarseness(step: f32) -> i32 {
     let step = if step.is_nan() { 1.0 } else { step.clamp(1.0, COARSEST) };
     ((log2(step) * 128.0 + 0.5) as i32).min(LIMIT.into())

@@ -1,4 +1,4 @@
-//! Model files of heads: everything checked before it is used.
+//! Model files of heads. Everything is checked before use.
 
 use std::collections::BTreeMap;
 
@@ -11,17 +11,17 @@ use crate::error::{Error, Result, Stage};
 use crate::gaussians::Heads;
 use crate::layers::{ResBlock, Spec, Stored, Tensors, malformed, missing};
 
-/// Channels of a parent and of a child.
+/// Input channels of a parent and of a child.
 pub const INPUTS: [usize; 2] = [12, 7];
-/// The most channels of a network, and the most blocks of one side.
+/// Maximum channels of a network, and residual blocks per side.
 const MOST: (usize, usize) = (256, 16);
-/// The widest blur, in squares of half the unit.
+/// Maximum blur, in squares of half the unit.
 const WIDEST: f64 = 16.0;
-/// The largest range: 2047 steps of it still fit f16 when it is stretched by [`HEADROOM`].
+/// Maximum range: times [`HEADROOM`] it still fits f16.
 const LARGEST: f64 = 32_768.0;
-/// The least range: far below anything that a network with weights in f16 would have.
+/// Minimum range: far below that of any network with f16 weights.
 const LEAST: f64 = 1e-6;
-/// Activations may be larger than they were over the data that ranges come from: one in 10,000 was, there.
+/// Activations may exceed the range, which is their 99.99 % quantile over the calibration data.
 const HEADROOM: f64 = 1.5;
 
 #[derive(Deserialize)]
@@ -31,18 +31,18 @@ struct Description {
     sets: BTreeMap<String, Shape>,
 }
 
-/// A network's extents.
+/// Topology of a network.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Shape {
     pub channels: usize,
     pub parent_blocks: usize,
     pub child_blocks: usize,
-    /// Gaussians a voxel: 1 or 8.
+    /// Gaussians per voxel: 1 or 8.
     pub gaussians: usize,
     ranges: BTreeMap<String, f64>,
 }
 
-/// The model in a file.
+/// Loads a model from the content of its file.
 pub(super) fn model(bytes: &[u8]) -> Result<HeadsModel> {
     let tensors = Tensors::new(bytes)?;
     let json = tensors.metadata("b2p-heads");
@@ -71,7 +71,7 @@ pub(super) fn model(bytes: &[u8]) -> Result<HeadsModel> {
     })
 }
 
-/// The set that a name such as `best.8` stands for.
+/// Parses the name of a set, such as `best.8`.
 fn named(name: &str) -> Result<Set> {
     let all = Heads::ALL.into_iter().flat_map(|heads| [(heads, 1), (heads, 8)]);
     let mut named = all.filter(|(heads, k)| format!("{heads}.{k}") == name);
@@ -96,7 +96,7 @@ impl Shape {
         Ok(())
     }
 
-    /// The layer's range, stretched, as the real value of one of 2047 steps.
+    /// Scale of the activations of `layers`: their largest range with headroom, divided by [`LIMIT`].
     fn step(&self, set: &str, layers: &[String]) -> Result<f32> {
         let mut most = 0.0f64;
         for layer in layers {
@@ -111,7 +111,7 @@ impl Shape {
         Ok((most * HEADROOM / f64::from(LIMIT)) as f32)
     }
 
-    /// The steps of every layer's output. What a block's input and output are added up in is one step for a whole side.
+    /// Scales of all layers' outputs. The residual sums of a side share one scale.
     fn steps(&self, set: &str) -> Result<Steps> {
         let side = |side: &str, blocks: usize| -> Result<_> {
             let sums = (0..blocks).map(|i| format!("{side}.{i}.b"));
@@ -125,7 +125,7 @@ impl Shape {
         })
     }
 
-    /// The layers as stored.
+    /// Reads the layers of a network.
     fn net(&self, set: &str, tensors: &Tensors<'_>) -> Result<Net<Stored>> {
         let c = self.channels;
         let layer = |name: String, volume, cin, cout| {
@@ -162,7 +162,7 @@ impl Shape {
     }
 }
 
-/// A layer of f16 weights and biases; the one with a matrix per octant has no biases.
+/// Reads a layer of f16 weights and biases. The layer with a matrix per octant has no biases.
 fn stored(tensors: &Tensors<'_>, spec: Spec) -> Result<Stored> {
     let finite = |tensor: &str, extents: &[usize]| -> Result<Vec<f16>> {
         let values: Vec<f16> = tensors.get(tensor, extents)?;

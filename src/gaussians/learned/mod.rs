@@ -1,31 +1,35 @@
 //! Learned heads: Gaussians of any octree level from its occupancy and its decoded colours.
 //!
-//! Nothing that is decoded depends on them, so any heads draw any stream, and the same weights serve every level: all lengths count in voxels
-//! of the level. There are up to four networks: [`Heads::Best`] and [`Heads::Quick`], each for one Gaussian a voxel and for eight.
+//! Decoding does not depend on the heads, so any heads draw any stream. The same weights serve every level, since all
+//! lengths are in voxels of the level. A model has up to four networks: [`Heads::Best`] and [`Heads::Quick`], each for
+//! one and for eight Gaussians per voxel.
 //!
 //! # The network
-//! It reads level ℓ − 1 ("parent") and level ℓ ("child"). Of a colour with R, G, B in 0..=255, y = (R + 2G + B) / 512 − 1,
-//! co = (R − B) / 128, cg = (G − (R + B) / 2) / 128; s = log2(step) / 4, `step` being the quantisation step of level ℓ's luma.
+//! The inputs are level ℓ − 1 ("parent") and level ℓ ("child"). For a colour with R, G, B in 0..=255, y = (R + 2G + B)
+//! / 512 − 1, co = (R − B) / 128, cg = (G − (R + B) / 2) / 128; s = log2(step) / 4, `step` being the quantisation step
+//! of level ℓ's luma.
 //! - A parent's 12 channels: 8 occupancy bits (octant x + 2y + 4z), y, co, cg, s.
-//! - A child's 7 channels: four times the difference of its y, co, cg from the parent's; its y, co, cg; s.
+//! - A child's 7 channels: four times the difference of its y, co, cg to the parent's; its y, co, cg; s.
 //!
 //! ```text
 //! h = relu(conv3(parent));  P times: h = relu(h + conv3(relu(conv3(h))))
 //! x = relu(conv3(child) + up[octant](h[parent]));  B times: x = relu(x + conv3(relu(conv3(x))))
 //! raw = conv3(x)
 //! ```
-//! `conv3` is a plain submanifold convolution with bias, `up` has one matrix per octant and no bias. Of a Gaussian's 14 raw numbers see
-//! `activate.rs`.
+//! `conv3` is a plain submanifold convolution with bias, `up` has one matrix per octant and no bias. `activate.rs`
+//! defines a Gaussian's 14 outputs.
 //!
 //! # The model file
-//! Safetensors, all tensors f16: `SET.parent.in.weight` [27, 12, C] and `.bias` \[C\], `SET.parent.I.a`, `SET.parent.I.b`, `SET.up.weight`
-//! [8, C, C], `SET.child.in`, `SET.child.I.a`, `SET.child.I.b`, `SET.out` [27, C, 14·K], `SET` being `best.1`, `best.8`, `quick.1` or
-//! `quick.8`. The metadata's `b2p-heads` is JSON: `version` 1, `blur` (see [`Gaussians::blur`]; in squares of half the unit), and `sets`, for
-//! each `channels`, `parent_blocks`, `child_blocks`, `gaussians`, and `ranges`: how large the outputs of each layer but the last get.
+//! Safetensors, all tensors f16: `SET.parent.in.weight` [27, 12, C] and `.bias` \[C\], `SET.parent.I.a`,
+//! `SET.parent.I.b`, `SET.up.weight` [8, C, C], `SET.child.in`, `SET.child.I.a`, `SET.child.I.b`, `SET.out` [27, C,
+//! 14·K], `SET` being `best.1`, `best.8`, `quick.1` or `quick.8`. The metadata's `b2p-heads` is JSON: `version` 1,
+//! `blur` (see [`Gaussians::blur`]; in squares of half the unit), and `sets`, for each `channels`, `parent_blocks`,
+//! `child_blocks`, `gaussians`, and `ranges`: the largest outputs of each layer but the last.
 //!
 //! # Precision
-//! In [`Precision::Int16`], the default, activations are integers in ±2047 in steps that follow from `ranges`, weights likewise; every sum fits
-//! 32 bits by construction, and the Gaussians are the same bits on every machine. [`Precision::F16`] stores f16 and sums in f32.
+//! In [`Precision::Int16`], the default, activations and weights are integers in ±2047, scaled by `ranges`. Every sum
+//! fits 32 bits by construction, and the Gaussians are bit-exact on every machine. [`Precision::F16`] stores f16 and
+//! sums in f32.
 
 mod activate;
 mod inputs;
@@ -47,36 +51,35 @@ use network::Generator;
 #[cfg(test)]
 pub(crate) use network::TERMS;
 
-/// Raw numbers per Gaussian.
+/// Network outputs per Gaussian.
 const RAW: usize = 14;
 
-/// One of a model's networks: which quality, and how many Gaussians a voxel, 1 or 8.
+/// Key of one of a model's networks: quality, and Gaussians per voxel (1 or 8).
 pub type Set = (Heads, usize);
 
-/// Heads, ready to run.
+/// A model of heads.
 pub struct HeadsModel {
-    /// In squares of half the unit.
+    /// Variance in squares of half the unit.
     blur: f32,
     generators: Vec<(Set, Generator)>,
 }
 
-/// What heads read of a level.
+/// Inputs of the heads for a level.
 #[derive(Debug, Clone, Copy)]
 pub struct LevelInput<'a> {
     /// The octree, down to `level` or deeper.
     pub octree: &'a Octree,
     /// The level to draw.
     pub level: u8,
-    /// Its 3³ kernel map.
+    /// 3³ kernel map of `level`.
     pub map: &'a KernelMap,
     /// The 3³ kernel map of the level above.
     pub above: &'a KernelMap,
-    /// Its voxels' decoded sRGB colours.
+    /// Decoded sRGB colours of the voxels of `level`.
     pub colours: &'a [[u8; 3]],
-    /// Those of the level above.
+    /// Decoded sRGB colours of the level above.
     pub colours_above: &'a [[u8; 3]],
-    /// The quantisation step of the level's luma (R + 2G + B) / 4, in its units: 1 for lossless, at most 2¹⁶. What is beyond is taken as the
-    /// nearest of both.
+    /// Quantisation step of the level's luma (R + 2G + B) / 4, in units of luma: 1 for lossless. Clamped to `1..=2¹⁶`.
     pub luma_step: f32,
 }
 
@@ -93,7 +96,7 @@ impl HeadsModel {
     /// Loads a model file.
     ///
     /// # Errors
-    /// [`Error::Io`], or as [`HeadsModel::from_bytes`].
+    /// [`Error::Io`], and those of [`HeadsModel::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
         let bytes = map_file(path).map_err(|source| Error::Io {
             path: path.to_owned(),
@@ -102,22 +105,22 @@ impl HeadsModel {
         HeadsModel::from_bytes(&bytes)
     }
 
-    /// Loads a model file's content. Memory is bounded by its length.
+    /// Loads a model from the content of its file. Memory is bounded by its length.
     ///
     /// # Errors
-    /// [`Error::Malformed`], naming field or tensor, if anything is missing, of another type or shape, not finite, or out of range;
-    /// [`Error::Unsupported`] for another version.
+    /// [`Error::Malformed`], with the field or tensor that is missing, of another type or shape, not finite, or out of
+    /// range; [`Error::Unsupported`] for another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         load::model(bytes)
     }
 
-    /// The networks that it has.
+    /// The networks of the model.
     pub fn sets(&self) -> impl Iterator<Item = Set> + '_ {
         self.generators.iter().map(|(set, _)| *set)
     }
 
-    /// Bytes that drawing a level of so many voxels with so many above it takes at most, its Gaussians included; none for a set that the
-    /// model does not have.
+    /// Maximum memory in bytes of [`HeadsModel::generate`] for a level of `voxels` voxels and `above` voxels in the
+    /// level above, Gaussians included; 0 if the model does not have the set.
     pub fn bytes(&self, set: Set, voxels: u64, above: u64) -> u64 {
         match self.find(set) {
             Some(generator) => network::bytes(generator.shape(), voxels, above),
@@ -125,14 +128,15 @@ impl HeadsModel {
         }
     }
 
-    /// The Gaussians of a level: those of its first voxel first, one each or eight, of which those with an opacity below 1/255 are left out.
+    /// Makes the Gaussians of a level voxel by voxel, one or eight each. Of eight, those with an opacity below 1/255
+    /// are omitted.
     ///
     /// # Errors
-    /// [`Error::Unsupported`] for level 0, which has none above it, for a set that the model does not have, and for [`Precision::Half`]
-    /// where `isa` has no arithmetic in f16.
+    /// [`Error::Unsupported`] for level 0, which has no level above, for a set that the model does not have, and for
+    /// [`Precision::Half`] if `isa` has no f16 arithmetic.
     ///
     /// # Panics
-    /// If the octree is not that deep, or the kernel maps or colours are not those of its levels in number.
+    /// If the octree is less deep, or if the kernel maps or colours do not match its levels in length.
     pub fn generate(
         &self,
         isa: Isa,

@@ -1,4 +1,4 @@
-//! Running the network, in integers or in floats.
+//! Evaluation of the network in integers or in floats.
 
 use std::sync::OnceLock;
 
@@ -12,7 +12,7 @@ use crate::gaussians::{Frame, Gaussians};
 use crate::layers::{Conv, Pool, Precision, ResBlock, Stored, apply, apply_added, apply_part, reals};
 use crate::memory::{NOTHING, Sizes, Term, total};
 
-/// The layers.
+/// The layers of a network.
 pub struct Net<L> {
     pub parent_in: L,
     pub parent: Vec<ResBlock<L>>,
@@ -22,14 +22,15 @@ pub struct Net<L> {
     pub out: L,
 }
 
-/// The real values of one integer step: of each side's sums, and of the inside of each of its blocks.
+/// Scales of integer activations: for each side that of its residual sums, and that inside each of its blocks.
 pub struct Steps {
     pub parent: (f32, Vec<f32>),
     pub child: (f32, Vec<f32>),
 }
 
 impl<L> Net<L> {
-    /// The same network of other layers; `make` is told the steps of a layer's input and output. The last layer's output is real.
+    /// Converts every layer by `make`, whose arguments are a layer and the scales of its input and output. The scale of
+    /// the network's output is 1.
     fn with_steps<M>(&self, steps: &Steps, make: impl Fn(&L, f32, f32) -> M) -> Net<M> {
         let blocks = |blocks: &[ResBlock<L>], (sum, inner): &(f32, Vec<f32>)| {
             let blocks = blocks.iter().zip(inner);
@@ -52,7 +53,7 @@ impl<L> Net<L> {
     }
 }
 
-/// A network: its layers as stored, and ready to run in the precisions that were asked for.
+/// A network: its layers as stored, and as converted on first use to each precision.
 pub struct Generator {
     shape: Shape,
     steps: Steps,
@@ -78,7 +79,7 @@ impl Generator {
         &self.shape
     }
 
-    /// The Gaussians of a level; `blur` in squares of half the unit.
+    /// Makes the Gaussians of a level. `blur` is in squares of half the unit.
     pub fn generate(
         &self,
         isa: Isa,
@@ -110,7 +111,7 @@ impl Generator {
     }
 }
 
-/// Runs all layers on the parents' and the children's channels.
+/// Evaluates all layers on the channels of parents and children.
 fn run<C: Conv>(
     isa: Isa,
     net: &Net<C>,
@@ -175,11 +176,11 @@ const GAUSSIANS: Term = Term {
     by: NOTHING,
 };
 
-/// What [`bytes`] sums.
+/// The terms that [`bytes`] adds.
 #[cfg(test)]
 pub const TERMS: [Term; 4] = [ABOVE, VOXEL, OUTPUTS, GAUSSIANS];
 
-/// Bytes that drawing takes at most, with its Gaussians.
+/// Maximum memory in bytes of evaluating the network, Gaussians included.
 pub fn bytes(shape: &Shape, voxels: u64, above: u64) -> u64 {
     let sizes = Sizes {
         generator: shape.channels as u64,

@@ -185,7 +185,7 @@ fn all_sets() -> [Made; 4] {
 }
 
 #[test]
-fn every_precision_is_close_to_the_definition_with_every_instruction_set() {
+fn every_precision_matches_the_definition_on_every_instruction_set() {
     let cloud = Cloud::surface(5);
     let networks = all_sets();
     let mut description = description(&networks);
@@ -216,7 +216,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     #[test]
-    fn integers_give_the_same_bits_with_every_instruction_set_and_number_of_threads(
+    fn integers_are_bit_exact_on_every_instruction_set_and_number_of_threads(
         keys in prop::collection::vec(0u64..1 << 12, 1..400), seed in any::<u64>()
     ) {
         let cloud = Cloud::new(keys, 4, seed);
@@ -238,7 +238,7 @@ proptest! {
 }
 
 #[test]
-fn a_network_of_zeros_draws_balls_of_the_decoded_colours_in_the_anchors() {
+fn a_network_of_zeros_gives_spheres_of_the_decoded_colours_at_the_anchors() {
     let cloud = Cloud::surface(3);
     for k in [1, 8] {
         let mut made = Made::new((Heads::Best, k), 16, [1, 1], 9);
@@ -272,7 +272,7 @@ fn a_network_of_zeros_draws_balls_of_the_decoded_colours_in_the_anchors() {
 }
 
 #[test]
-fn what_is_not_seen_is_left_out() {
+fn faint_gaussians_are_omitted() {
     let cloud = Cloud::surface(4);
     let mut made = Made::new((Heads::Best, 8), 16, [1, 1], 9);
     for (name, (_, values)) in &mut made.tensors {
@@ -299,7 +299,7 @@ fn what_is_not_seen_is_left_out() {
 }
 
 #[test]
-fn parts_do_not_show() {
+fn the_division_into_parts_does_not_change_the_result() {
     // More voxels than one part has, of which each sees the same neighbours as its image in a smaller cloud.
     let cloud = Cloud::surface(8);
     assert!(cloud.maps[0].len() > 2 * activate::PART);
@@ -312,7 +312,7 @@ fn parts_do_not_show() {
 }
 
 #[test]
-fn what_cannot_be_drawn_is_refused_and_says_why() {
+fn invalid_requests_are_refused_with_the_reason() {
     let model = model(&[Made::new((Heads::Best, 1), 4, [0, 0], 1)]);
     assert_eq!(model.sets().collect::<Vec<_>>(), [(Heads::Best, 1)]);
     let cloud = Cloud::surface(3);
@@ -329,7 +329,7 @@ fn what_cannot_be_drawn_is_refused_and_says_why() {
 }
 
 #[test]
-fn steps_beyond_their_range_are_taken_as_its_ends() {
+fn steps_are_clamped_to_their_range() {
     let mut cloud = Cloud::surface(3);
     let made = Made::new((Heads::Best, 1), 8, [1, 1], 1);
     let model = model(std::slice::from_ref(&made));

@@ -65,7 +65,7 @@ fn assert_near(a: f32, b: f32, tolerance: f32) {
 }
 
 #[test]
-fn what_is_written_is_read_back() {
+fn written_gaussians_are_read_back() {
     let before = gaussians();
     let (after, notes) = read_back(&written(&before));
     assert_eq!(notes, Notes::default());
@@ -84,7 +84,7 @@ fn what_is_written_is_read_back() {
 }
 
 #[test]
-fn blocks_join_without_a_seam() {
+fn rows_of_several_blocks_are_read_back() {
     let mut many = Gaussians::default();
     for i in 0..2 * BLOCK + 1 {
         many.position.push([i as f32 / 4096.0, 0.0, 0.0]);
@@ -99,7 +99,7 @@ fn blocks_join_without_a_seam() {
 }
 
 #[test]
-fn no_gaussians_are_a_file_too() {
+fn an_empty_file_is_valid() {
     let none = Gaussians::default();
     let (after, notes) = read_back(&written(&none));
     assert_eq!((after, notes), (none, Notes::default()));
@@ -133,7 +133,7 @@ fn properties_are_found_by_name_whatever_their_order_and_type() {
 }
 
 #[test]
-fn what_is_left_out_of_a_foreign_file_is_told() {
+fn properties_that_are_ignored_are_noted() {
     let mut properties = FLOATS.to_vec();
     properties.retain(|p| !p.ends_with("scale_2"));
     properties.extend(["float f_rest_0", "float f_rest_1", "float nx"]);
@@ -191,7 +191,7 @@ fn centres_in_one_place_or_none_still_get_a_cube() {
 }
 
 #[test]
-fn extreme_numbers_mean_what_they_say() {
+fn extreme_values_are_kept() {
     let rows = [
         "0 0 0 0 0 0 inf 20 1000 -1000 1 0 0 0",
         "0 0 0 0 0 0 -inf inf nan -inf 1 0 0 0",
@@ -210,7 +210,7 @@ fn extreme_numbers_mean_what_they_say() {
 }
 
 #[test]
-fn a_cube_that_makes_no_sense_is_not_followed() {
+fn an_invalid_cube_is_ignored() {
     for bad in [
         CUBE.replace("bits 1", "bits 0"),
         CUBE.replace("bits 1", "bits 22"),
@@ -225,7 +225,7 @@ fn a_cube_that_makes_no_sense_is_not_followed() {
 }
 
 #[test]
-fn what_is_no_file_of_gaussians_is_an_error() {
+fn a_file_without_gaussians_is_an_error() {
     let limits = Limits::default();
     let without = |name: &str| {
         let mut properties = FLOATS.to_vec();
@@ -248,7 +248,7 @@ fn what_is_no_file_of_gaussians_is_an_error() {
 }
 
 #[test]
-fn what_cannot_be_written_is_an_error() {
+fn gaussians_that_cannot_be_written_are_an_error() {
     let write = |gaussians: &Gaussians| gaussians.write_ply(&mut Vec::new(), Path::new("x"));
     let mut uneven = gaussians();
     uneven.opacity.pop();
@@ -285,7 +285,7 @@ fn view_dependent_colour_is_read_channel_by_channel() {
 }
 
 #[test]
-fn view_dependent_colour_of_many_is_each_one_s_own() {
+fn view_dependent_colour_is_assigned_to_its_gaussian() {
     let count = 2 * BLOCK + 7;
     let mut bytes = format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n").into_bytes();
     let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();

@@ -1,12 +1,13 @@
-//! How colours run along the surface.
+//! Colour gradients along the surface.
 
 use super::discs::Disc;
 use crate::geometry::KernelMap;
 
-/// What is added to the sums of squares that a gradient is divided by: few neighbours tell less of it than noise does.
+/// Ridge regularisation of the least squares, since the colours of few neighbours are mostly noise.
 const DAMPING: f32 = 0.3;
 
-/// The change of R, G and B per voxel along both axes of a disc's plane: least squares over the 26 neighbours that are there.
+/// The gradient of R, G and B per voxel along both axes `u`, `v` of a disc's plane, by least squares over the occupied
+/// ones of the 26 neighbours.
 pub fn gradient(map: &KernelMap, colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3]; 2]) -> [[f32; 3]; 2] {
     let own = colours[voxel].map(f32::from);
     let (mut uu, mut uv, mut vv) = (DAMPING, 0.0, DAMPING);
@@ -35,7 +36,7 @@ pub fn gradient(map: &KernelMap, colours: &[[u8; 3]], voxel: usize, [u, v]: [[f3
     ]
 }
 
-/// The two axes of a disc's plane: what its rotation turns x and y into.
+/// The axes of a disc's plane: the rotated x and y.
 pub fn plane(disc: &Disc) -> [[f32; 3]; 2] {
     let [w, x, y, _] = disc.rotation;
     [

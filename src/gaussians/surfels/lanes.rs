@@ -1,18 +1,18 @@
-//! Numbers of several voxels side by side, so that loops over them become vector instructions.
+//! Structure-of-arrays values of several voxels, so that the compiler vectorises the loops over them.
 
-/// Voxels whose numbers are computed side by side.
+/// Voxels per group.
 pub const GROUP: usize = 16;
 
-/// One number of each.
+/// One value per voxel of a group.
 pub type Lane = [f32; GROUP];
 
-/// A lane of what `f` makes of each voxel's number.
+/// The values of `f` for each voxel of a group.
 #[inline(always)]
 pub fn lane(f: impl Fn(usize) -> f32) -> Lane {
     std::array::from_fn(f)
 }
 
-/// Scalar products of two vectors, summed x first.
+/// Scalar products, summed in the order x, y, z.
 #[inline(always)]
 pub fn dot(a: &[Lane; 3], b: &[Lane; 3]) -> Lane {
     lane(|j| a[0][j] * b[0][j] + a[1][j] * b[1][j] + a[2][j] * b[2][j])

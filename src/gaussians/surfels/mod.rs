@@ -1,12 +1,14 @@
 //! Surfels: opaque discs in closed form, from the voxels of a level and their colours. No network, no model file.
 //!
-//! A voxel's normal is the least axis of the covariance of its neighbourhood (`moments.rs`). Its disc lies in the plane through the
-//! neighbourhood's mean, which takes the staircase of voxels away, or nearer to the voxel where the neighbourhood is no plane. It is as wide as the
-//! voxels of such a plane are apart, and next to nothing thick, so that silhouettes do not grow; the fewer neighbours lie beside the
-//! voxel, the rounder it is. With [`PerVoxel::Four`] four smaller discs follow the colours' gradient.
+//! A voxel's normal is the eigenvector with the smallest eigenvalue of the covariance of its neighbourhood
+//! (`moments.rs`). The disc lies in the plane through the mean of the neighbourhood, which smooths the staircase of
+//! voxels away. If the neighbourhood is not planar, the disc lies nearer to the voxel. Its radius follows from the
+//! distance of a plane's voxels; its thickness is negligible, so that silhouettes do not grow. With fewer neighbours in
+//! the plane the disc becomes rounder. [`PerVoxel::Four`] makes four smaller discs with colours along the local
+//! gradient.
 //!
-//! Sums are of integers; the rest is IEEE f32 additions, multiplications, divisions and square roots in a fixed order. So the Gaussians
-//! are the same bits on every machine and for any number of threads.
+//! All sums are integer sums. The rest is IEEE f32 additions, multiplications, divisions and square roots in a fixed
+//! order, so that the Gaussians are bit-exact on every machine and for any number of threads.
 
 mod colours;
 mod discs;
@@ -24,28 +26,29 @@ use super::{Frame, Gaussians};
 use crate::geometry::{KernelMap, Voxels};
 use discs::Disc;
 
-/// Voxels that one task handles.
+/// Voxels per task.
 const BLOCK: usize = 1024;
 /// [`Gaussians::blur`], in voxels squared.
 const BLUR: f32 = 0.003;
-/// Where the four discs of a voxel lie along the axes of their plane, in voxels from its disc's centre.
-const APART: f32 = 0.25;
-/// How wide they are beside the one disc.
-const NARROWED: f32 = 0.6;
+/// Offset of the four discs along both axes of their plane from the centre of the single disc, in voxels.
+const OFFSET: f32 = 0.25;
+/// Radius of each of the four discs over that of the single disc.
+const SHRINK: f32 = 0.6;
 
-/// Discs for each voxel.
+/// Number of discs per voxel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PerVoxel {
-    /// One, of the voxel's colour: where voxels are small in pictures.
+    /// One disc with the voxel's colour, for voxels that are small in the picture.
     #[default]
     One,
-    /// Four, of colours interpolated between neighbours: where voxels are large. At level 8 of six 10-bit objects they gained 0.2 dB over whole
-    /// pictures, 0.35 dB over the foreground and 2 of SSIMULACRA2; at level 9 −0.3, +0.2 and 0.5, for twice the time.
+    /// Four discs with colours interpolated between neighbours, for voxels that are large in the picture. At level 8 of
+    /// six 10-bit objects they gained 0.2 dB over whole pictures, 0.35 dB over the foreground and 2 points of
+    /// SSIMULACRA2; at level 9 −0.3 dB, +0.2 dB and 0.5 points, for twice the time.
     Four,
 }
 
 impl PerVoxel {
-    /// How many.
+    /// 1 or 4.
     pub fn count(self) -> usize {
         match self {
             PerVoxel::One => 1,
@@ -54,12 +57,13 @@ impl PerVoxel {
     }
 }
 
-/// The discs of `voxels`, those of the first voxel first.
+/// Makes the discs of `voxels`, voxel by voxel.
 ///
-/// `map` is the voxels' 3³ kernel map, `colours` are theirs, sRGB. `frame` says where the cube lies; the Gaussians are in cube-frame units.
+/// `map` is the 3³ kernel map of the voxels, `colours` holds one sRGB colour per voxel. `frame` is the cube's frame;
+/// the Gaussians are in cube-frame units.
 ///
 /// # Panics
-/// If `map` is not a 3³ map, or it, `voxels` and `colours` disagree in length.
+/// If `map` is not a 3³ map, or if `map`, `voxels` and `colours` differ in length.
 pub fn surfels(
     isa: Isa,
     voxels: &Voxels,
@@ -71,8 +75,8 @@ pub fn surfels(
     assert_eq!(map.volume(), 27, "surfels need a 3³ map");
     assert_eq!(map.len(), voxels.len(), "one row of the map per voxel");
     assert_eq!(colours.len(), voxels.len(), "one colour per voxel");
-    let alone = moments::of_voxels(voxels);
-    let near = moments::step(isa, map, &alone);
+    let own = moments::of_voxels(voxels);
+    let near = moments::step(isa, map, &own);
     let mut far = moments::step(isa, map, &near);
     for _ in 2..moments::ROUNDS {
         far = moments::step(isa, map, &far);
@@ -109,11 +113,11 @@ pub fn surfels(
                     PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
                     PerVoxel::Four => quarters(disc, map, colours, first + j),
                 };
-                let narrowed = if n == 1 { 1.0 } else { NARROWED };
-                let radius = disc.radius * narrowed * edge;
+                let shrink = if n == 1 { 1.0 } else { SHRINK };
+                let radius = disc.radius * shrink * edge;
                 for (part, (offset, rgb)) in parts.into_iter().take(n).enumerate() {
                     let to = j * n + part;
-                    position[to] = placed(coordinate, offset, edge);
+                    position[to] = cube_point(coordinate, offset, edge);
                     scale[to] = [radius, radius, disc.thickness * edge];
                     rotation[to] = disc.rotation;
                     colour[to] = rgb.map(|v| v / 255.0);
@@ -123,20 +127,28 @@ pub fn surfels(
     gaussians
 }
 
-/// A place in the cube frame, `offset` voxels from the centre of a voxel; `edge` is a voxel's. Exact centres down to level 20.
-fn placed(coordinate: [u32; 3], offset: [f32; 3], edge: f32) -> [f32; 3] {
+/// The point `offset` voxels from a voxel's centre, in the cube frame. `edge` is the voxel's edge. Centres are exact up
+/// to level 20.
+fn cube_point(coordinate: [u32; 3], offset: [f32; 3], edge: f32) -> [f32; 3] {
     std::array::from_fn(|axis| {
         let centre = (f64::from(coordinate[axis]) + 0.5) * f64::from(edge) - 1.0;
         centre as f32 + offset[axis] * edge
     })
 }
 
-/// Centres, relative to the voxel's, and colours in 0..=255 of the four discs that take the place of a voxel's one.
+/// Centres relative to the voxel's centre, in voxels, and colours in 0..=255 of the four discs that replace a voxel's
+/// disc.
 fn quarters(disc: &Disc, map: &KernelMap, colours: &[[u8; 3]], voxel: usize) -> [([f32; 3], [f32; 3]); 4] {
     let [u, v] = colours::plane(disc);
     let [along_u, along_v] = colours::gradient(map, colours, voxel, [u, v]);
     let own = colours[voxel].map(f32::from);
-    [(-APART, -APART), (APART, -APART), (-APART, APART), (APART, APART)].map(|(a, b)| {
+    [
+        (-OFFSET, -OFFSET),
+        (OFFSET, -OFFSET),
+        (-OFFSET, OFFSET),
+        (OFFSET, OFFSET),
+    ]
+    .map(|(a, b)| {
         let offset = [0, 1, 2].map(|axis| disc.centre[axis] + a * u[axis] + b * v[axis]);
         let rgb = [0, 1, 2].map(|c| own[c] + a * along_u[c] + b * along_v[c]);
         (offset, rgb.map(|v| v.clamp(0.0, 255.0)))

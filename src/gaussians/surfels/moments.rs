@@ -1,11 +1,13 @@
-//! How the voxels around every voxel are distributed, in integers.
+//! Moments of the voxel distribution around every voxel, in integers.
 //!
-//! The neighbourhood is what a walk of [`ROUNDS`] steps reaches, each to one of the 27 positions around a voxel that are occupied; a voxel
-//! counts as often as there are walks to it. On a plane the weights along an axis are those of three box filters, 1 3 6 7 6 3 1, and a sheet
-//! behind another one counts only if voxels join them. Counts and sums come from adding up the 27 neighbours' own, once a step.
+//! A neighbourhood consists of the ends of all walks of [`ROUNDS`] steps over occupied voxels, where a step leads to
+//! one of the 27 positions around a voxel. The weight of a voxel is the number of walks that end there. On a plane the
+//! weights along an axis are those of three box filters, 1 3 6 7 6 3 1. A second sheet counts only if voxels connect it
+//! to the first. Each step replaces the moments of a voxel by the sum over its 27 neighbours.
 //!
-//! Sums are of absolute coordinates, modulo 2¹⁶, so that a step is additions alone; [`around`] moves them to the voxel. There they are
-//! below 2¹⁶ (n ≤ 27³, Σx² ≤ 2 · 27³), or within ±2¹⁵ (|Σx| ≤ 5/9 · 27³, |Σxy| ≤ 5/4 · 27³), and so exact.
+//! The sums are of absolute coordinates modulo 2¹⁶, so that a step consists of additions only. [`centred`] moves them
+//! to the voxel's own coordinate, where they are exact: below 2¹⁶ (n ≤ 27³, Σx² ≤ 2 · 27³) or within ±2¹⁵ (|Σx| ≤ 5/9 ·
+//! 27³, |Σxy| ≤ 5/4 · 27³).
 
 use b2p_kernels::{Isa, zeros};
 use rayon::prelude::*;
@@ -16,12 +18,12 @@ use crate::geometry::{KernelMap, Voxels};
 
 /// Steps of a walk.
 pub const ROUNDS: usize = 3;
-/// n, Σx, Σy, Σz, Σxx, Σyy, Σzz, Σxy, Σxz, Σyz; the rest of 32 bytes is unused.
+/// n, Σx, Σy, Σz, Σxx, Σyy, Σzz, Σxy, Σxz, Σyz, and six unused values that pad it to 32 bytes.
 pub type Moments = [u16; 16];
-/// Voxels that one task handles.
+/// Voxels per task.
 const BLOCK: usize = 1024;
 
-/// The moments of each voxel alone, and zeros at the end.
+/// The moments of each single voxel, then one element of zeros.
 pub fn of_voxels(voxels: &Voxels) -> Vec<Moments> {
     let of_voxel = |i: usize| {
         let [x, y, z] = voxels.coordinate(i).map(|v| v as u16);
@@ -35,12 +37,12 @@ pub fn of_voxels(voxels: &Voxels) -> Vec<Moments> {
         moments
     };
     let mut moments: Vec<Moments> = zeros(voxels.len() + 1);
-    let alone = moments[..voxels.len()].par_iter_mut().with_min_len(BLOCK);
-    alone.enumerate().for_each(|(i, to)| *to = of_voxel(i));
+    let own = moments[..voxels.len()].par_iter_mut().with_min_len(BLOCK);
+    own.enumerate().for_each(|(i, to)| *to = of_voxel(i));
     moments
 }
 
-/// One step: for every voxel the sum over those of its 27 neighbours that are there, and zeros at the end.
+/// One step: for every voxel the sum over the occupied ones of its 27 neighbours, then one element of zeros.
 pub fn step(isa: Isa, map: &KernelMap, from: &[Moments]) -> Vec<Moments> {
     let mut to: Vec<Moments> = zeros(from.len());
     let blocks = to[..map.len()].par_chunks_mut(BLOCK);
@@ -50,9 +52,9 @@ pub fn step(isa: Isa, map: &KernelMap, from: &[Moments]) -> Vec<Moments> {
     to
 }
 
-/// Moments of one group of voxels, relative to each voxel's own coordinate.
-pub struct Around {
-    /// Voxels in the neighbourhood, with their weights.
+/// Moments of a group of voxels, each relative to its voxel's coordinate.
+pub struct CentredMoments {
+    /// Sum of the weights.
     pub count: Lane,
     /// Σx, Σy, Σz.
     pub sum: [Lane; 3],
@@ -60,10 +62,11 @@ pub struct Around {
     pub square: [Lane; 6],
 }
 
-/// The moments of up to [`GROUP`] voxels around their own `coordinates`; what is missing is as if it were alone.
+/// Moves the moments of up to [`GROUP`] voxels to their `coordinates`. Missing voxels get the moments of a single
+/// voxel.
 #[inline(always)]
-pub fn around(moments: &[Moments], coordinates: &[[u32; 3]]) -> Around {
-    let mut lanes = Around {
+pub fn centred(moments: &[Moments], coordinates: &[[u32; 3]]) -> CentredMoments {
+    let mut lanes = CentredMoments {
         count: [1.0; GROUP],
         sum: [[0.0; GROUP]; 3],
         square: [[0.0; GROUP]; 6],
@@ -89,5 +92,5 @@ pub fn around(moments: &[Moments], coordinates: &[[u32; 3]]) -> Around {
     lanes
 }
 
-/// The axes of the six products.
+/// The axes of the six second moments.
 pub const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)];

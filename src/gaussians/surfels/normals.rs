@@ -1,48 +1,51 @@
-//! Principal axes of symmetric 3×3 matrices, by Jacobi rotations in plain IEEE f32: no trigonometry, no branch, a fixed number of sweeps.
+//! Eigenvectors of symmetric 3×3 matrices by Jacobi rotations in IEEE f32: without trigonometry or branches, and with a
+//! fixed number of sweeps.
 
 use super::lanes::{GROUP, Lane, lane};
 
-/// Sweeps over the three off-diagonal entries. They vanish cubically near the end; after four they are below f32's resolution of the trace.
+/// Sweeps over the three off-diagonal entries. Convergence is cubic: after four sweeps the entries are below the
+/// resolution of f32 relative to the trace.
 const SWEEPS: usize = 4;
 
-/// What is needed of a covariance's axes.
+/// The smallest eigenvalue with its eigenvector, and the middle eigenvalue.
 pub struct Normals {
-    /// The unit vector along the least axis, its z not negative.
+    /// Unit eigenvector of the smallest eigenvalue, with z ≥ 0.
     pub normal: [Lane; 3],
-    /// The variance along it.
+    /// Smallest eigenvalue.
     pub least: Lane,
-    /// The variance along the middle axis.
+    /// Middle eigenvalue.
     pub middle: Lane,
 }
 
-/// A rotation that makes an off-diagonal entry zero: cosine and sine, and the tangent. The identity where the entry is zero already.
+/// Cosine, sine and tangent of the rotation that zeroes the off-diagonal entry `off`; the identity if it is zero
+/// already.
 #[inline(always)]
 fn rotation(p: f32, q: f32, off: f32) -> [f32; 3] {
     let difference = q - p;
     let double = 2.0 * off;
-    // tan θ = 2b / (d ± √(d² + 4b²)), the smaller of the two angles; the added least number keeps 0 / 0 away.
+    // tan θ = 2b / (d ± √(d² + 4b²)), the smaller of the two angles. TINY prevents 0 / 0.
     let root = (difference * difference + double * double).sqrt();
     let tangent = double / (difference + root.copysign(difference) + TINY.copysign(difference));
     let cosine = 1.0 / (tangent * tangent + 1.0).sqrt();
     [cosine, tangent * cosine, tangent]
 }
 
-/// Far below any difference of variances that are not equal: those are fractions of counts.
+/// Far below the difference of any two unequal variances, which are fractions of counts.
 const TINY: f32 = 1e-20;
 
-/// The axes of covariances given as xx, yy, zz, xy, xz, yz.
+/// Decomposes covariances xx, yy, zz, xy, xz, yz.
 #[inline(always)]
 pub fn normals(covariance: [Lane; 6]) -> Normals {
     let [xx, yy, zz, xy, xz, yz] = covariance;
     let mut diagonal = [xx, yy, zz];
     let mut off = [xy, xz, yz];
-    // The components of the axes: x, y, z of each, then which axis.
+    // Indexed by component, then by axis.
     let mut axes = [[[0.0; GROUP]; 3]; 3];
     for (k, component) in axes.iter_mut().enumerate() {
         component[k] = [1.0; GROUP];
     }
     for _ in 0..SWEEPS {
-        // The axes p, q of each entry, and the places of the entries that p and q share with the third axis.
+        // Each entry with its axes p, q, and the entries of p and q with the third axis.
         for (entry, p, q, with_p, with_q) in [(0, 0, 1, 1, 2), (1, 0, 2, 0, 2), (2, 1, 2, 0, 1)] {
             for j in 0..GROUP {
                 let [c, s, t] = rotation(diagonal[p][j], diagonal[q][j], off[entry][j]);
@@ -64,7 +67,7 @@ pub fn normals(covariance: [Lane; 6]) -> Normals {
     least(&diagonal, &axes)
 }
 
-/// The least axis; of equal ones z, then y.
+/// Selects the axis of the smallest variance: of equal ones z, then y.
 #[inline(always)]
 fn least(variance: &[Lane; 3], axes: &[[Lane; 3]; 3]) -> Normals {
     let [x, y, z] = variance;

@@ -1,16 +1,16 @@
-//! The loops that are compiled for every instruction set.
+//! The loops over voxels, compiled once per instruction set.
 
 use b2p_kernels::{Instructions, Work};
 
 use super::discs::{Disc, discs};
 use super::lanes::GROUP;
-use super::moments::{Moments, around};
+use super::moments::{Moments, centred};
 
-/// Sums of moments over neighbours.
+/// Sums the moments of all neighbours.
 pub struct Sum<'a> {
-    /// One of each voxel, and zeros at the end for neighbours that are not there.
+    /// Moments of each voxel, then zeros for absent neighbours.
     pub from: &'a [Moments],
-    /// 27 indices for each row of `to`.
+    /// 27 indices into `from` per element of `to`.
     pub rows: &'a [u32],
     pub to: &'a mut [Moments],
 }
@@ -20,12 +20,12 @@ impl Work for Sum<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
-        let nothing = self.from.len() - 1;
+        let absent = self.from.len() - 1;
         for (to, row) in self.to.iter_mut().zip(self.rows.chunks_exact(27)) {
             let mut sum = [0u16; 16];
             for &q in row {
-                // No branch: which neighbours are there cannot be predicted.
-                let from = &self.from[nothing.min(q as usize)];
+                // No branch: the presence of neighbours is unpredictable.
+                let from = &self.from[absent.min(q as usize)];
                 for (sum, value) in sum.iter_mut().zip(from) {
                     *sum = sum.wrapping_add(*value);
                 }
@@ -35,7 +35,7 @@ impl Work for Sum<'_> {
     }
 }
 
-/// The discs of consecutive voxels.
+/// Fits the discs of consecutive voxels.
 pub struct Fit<'a> {
     pub coordinates: &'a [[u32; 3]],
     /// Moments after one step.
@@ -52,7 +52,7 @@ impl Work for Fit<'_> {
         let mut out = Vec::with_capacity(self.coordinates.len().next_multiple_of(GROUP));
         let groups = self.near.chunks(GROUP).zip(self.far.chunks(GROUP));
         for (coordinates, (near, far)) in self.coordinates.chunks(GROUP).zip(groups) {
-            out.extend(discs(&around(near, coordinates), &around(far, coordinates)));
+            out.extend(discs(&centred(near, coordinates), &centred(far, coordinates)));
         }
         out.truncate(self.coordinates.len());
         out

@@ -71,7 +71,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
     #[test]
-    fn discs_are_those_of_the_definition(
+    fn discs_match_the_definition(
         keys in prop::collection::vec(0u64..512, 1..150), far_out in prop::bool::ANY
     ) {
         // Far from the origin, sums of absolute coordinates wrap.
@@ -128,7 +128,7 @@ proptest! {
 }
 
 #[test]
-fn a_lone_voxel_is_a_round_blob_in_its_middle() {
+fn an_isolated_voxel_becomes_a_sphere_at_its_centre() {
     let (voxels, map) = cloud(3, [[5, 2, 7]]);
     let blob = one_each(&voxels, &map);
     let [x, y, z] = blob.scale[0];
@@ -138,7 +138,7 @@ fn a_lone_voxel_is_a_round_blob_in_its_middle() {
 }
 
 #[test]
-fn a_row_of_voxels_is_as_thick_as_a_voxel_from_all_sides() {
+fn a_row_of_voxels_is_as_thick_as_a_voxel() {
     let (voxels, map) = cloud(5, (3..25).map(|x| [x, 4, 4]));
     for scale in one_each(&voxels, &map).scale {
         assert!(scale.iter().all(|s| (s / (2.0 / 32.0) - 0.4).abs() < 0.01));
@@ -165,7 +165,7 @@ fn a_flat_face_is_flat() {
 }
 
 #[test]
-fn a_staircase_becomes_a_slope() {
+fn a_staircase_becomes_a_plane() {
     // A plane of slope 1/3, and every voxel that it cuts.
     let on = |i: u32| (i % 48, i / 48);
     let voxels = (0..48 * 48).map(on).map(|(x, y)| [x, y, 8 + x / 3]);
@@ -187,7 +187,7 @@ fn a_staircase_becomes_a_slope() {
 }
 
 #[test]
-fn sheets_that_nothing_joins_do_not_see_each_other() {
+fn unconnected_sheets_do_not_affect_each_other() {
     let sheet = |z: u32| (0..400).map(move |i| [i % 20, i / 20, z]);
     let (alone, map) = cloud(5, sheet(8));
     let one = one_each(&alone, &map);
@@ -202,7 +202,7 @@ fn sheets_that_nothing_joins_do_not_see_each_other() {
 }
 
 #[test]
-fn two_sheets_that_touch_and_a_full_cube_stay_finite_and_within_their_voxels() {
+fn touching_sheets_and_a_full_cube_give_finite_discs_within_their_voxels() {
     let sheets = (0..800).map(|i| [i % 20, i / 20 % 20, 8 + i / 400]);
     let full = (0..4096).map(|i| [i % 16, i / 16 % 16, i / 256]);
     for (voxels, map) in [cloud(5, sheets), cloud(5, full)] {
@@ -215,7 +215,7 @@ fn two_sheets_that_touch_and_a_full_cube_stay_finite_and_within_their_voxels() {
 }
 
 #[test]
-fn a_ball_shrinks_to_under_its_surface_and_faces_outwards() {
+fn discs_of_a_ball_lie_below_its_surface_and_face_outwards() {
     const RADIUS: f64 = 12.0;
     let middle = 15.7;
     let from = |c: [u32; 3]| c.map(|v| f64::from(v) + 0.5 - middle);
@@ -235,7 +235,7 @@ fn a_ball_shrinks_to_under_its_surface_and_faces_outwards() {
 }
 
 #[test]
-fn four_discs_continue_a_gradient_of_colours_between_voxels() {
+fn four_discs_follow_the_colour_gradient() {
     let (voxels, map) = cloud(5, (0..900).map(|i| [i % 30, i / 30, 7]));
     let colours = (0..voxels.len()).map(|i| {
         let [x, y, _] = voxels.coordinate(i);

@@ -4,8 +4,9 @@
 //! encoder starts from its colours. All modules are those of the paper's appendix (arXiv 2406.05915); where it is silent, here
 //! is what holds:
 //!
-//! - **Geometry-invariant convolution**: output channel `o` is `gain_o · (Σ W x)_o / √(Σ W²_o + 1e-8) + bias_o`, both sums over
-//!   the taps that read an occupied voxel.
+//! - **Geometry-invariant convolution**: output channel `o` is `gain_o · (Σ W x)_o / √D_o + bias_o`, with `D_o = Σ W²_o` and both sums
+//!   over the taps that read an occupied voxel. The integer code divides by `√max(D_o, 1)`, the float code by
+//!   `√(D_o + 1e-8)`.
 //! - **Context**: `c` of a voxel is a linear layer, one per octant, of its parent's feature `g` (or a copy of it).
 //! - **Base level**: no context. Beyond the paper, a small network predicts its latents from those of neighbours that were coded
 //!   before ([`Model::pass_parameters`]); without one, they have one distribution per channel.
@@ -19,7 +20,7 @@
 //!
 //! Activations are `i16` in ±2047, weights `i16` in ±511, sums `i32`; loading proves per output channel that no sum can overflow.
 //! A sum becomes an activation by `clamp((sum + bias) >> shift)`, the rounding constant being part of the bias; in
-//! geometry-invariant layers by `clamp(round_ties_even(f32(sum) · (gain / √f32(D)) + bias))`, `D` being the sum of the squared
+//! geometry-invariant layers by `clamp(round_ties_even(f32(sum) · (gain / √f32(max(D, 1))) + bias))`, `D` being the sum of the squared
 //! weights of the taps that read something: one square root, one division, one product, one sum of IEEE f32, in that order, never
 //! fused. A residual is added after that and clamped again, then the ReLU follows. No transcendental function, no float sum.
 //!
