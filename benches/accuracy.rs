@@ -5,13 +5,13 @@
 
 use std::time::{Duration, Instant};
 
-use b2p::decoder::Decoder;
 use b2p::gaussians::{Gaussians, ply};
+use b2p::latents::Decoder;
+use b2p::latents::network::Model;
 use b2p::log::Log;
-use b2p::network::Model;
-use b2p::pixels::reference::{self, Cutoffs};
-use b2p::pixels::{Background, Image, Quality, Renderer};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::reference::{self, Cutoffs};
+use b2p::renderer::{Background, Image, Quality, Renderer};
 use b2p::{Error, Limits, Result};
 
 /// Floors of α, as what they are the inverse of.

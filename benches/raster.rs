@@ -9,8 +9,8 @@
 use std::time::{Duration, Instant};
 
 use b2p::gaussians::{Gaussians, Harmonics, ply};
-use b2p::pixels::{Background, Channel, Choice, Effects, Image, Quality, Renderer, Stats};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, Channel, Choice, Effects, Image, Quality, Renderer, Stats};
 use b2p::{Error, Limits, Result};
 use b2p_kernels::Isa;
 

@@ -1,11 +1,11 @@
-"""Whether `--budget` keeps what it promises: never more than a fifth over, where anything can keep the time at all.
+"""Whether `--budget` keeps its promises: a promised task may take at most a fifth more than its budget.
 
     python3 docs/budget.py --streams FOLDER --code --clouds NAME=CLOUD.ply …    codes each cloud at several sizes
     python3 docs/budget.py --streams FOLDER --clouds NAME …                     measures them; then does the rest
     python3 docs/budget.py                              from docs/budget.json: the table between the marks of docs/measurements.md
 
-Clouds are of 10 bits (`b2p-lab voxelize`); smaller sizes are made of them by dropping bits. Other clouds' figures of the same machine are kept. B2P names
-a `b2p` that is built already. Give it a quiet machine. Whatever is promised may take a fifth longer at most.
+Clouds have 10 bits (`b2p-lab voxelize`); smaller sizes drop low bits. Rows of other clouds stay in the file. B2P names a
+`b2p` that is built already. Run it on a quiet machine.
 """
 
 import argparse

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Checks of the documents: `check.py [links] [words] [size]`, all of them by default.
 
-links  every relative link of a Markdown file leads to a file, and its anchor to a heading of it
+links  every relative link of a Markdown file leads to a file, and its anchor to a heading of it; links of the book stay
+       within it, and its summary lists every chapter
 words  what the left column of docs/glossary.md replaces occurs in no tracked text file
 size   the README has at most 150 lines of at most 120 characters, tables and links aside
 """
@@ -12,6 +13,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+BOOK = ROOT / "docs"
 GLOSSARY = "docs/glossary.md"
 # What may stand between the words of a phrase: the next line of a comment, or the underscores of a test's name.
 BREAK = r"(?:_|\s+(?:(?:///|//!|//|#|\*|>)\s*)?)"
@@ -51,8 +53,13 @@ def links():
             to = (path.parent / file).resolve() if file else path
             if not to.exists():
                 yield f"{name}: no file for {target}"
+            elif path.parent == BOOK and not to.is_relative_to(BOOK):
+                yield f"{name}: {target} leaves the book; name the file in code marks"
             elif anchor and to.suffix == ".md" and anchor not in set(anchors(to.read_text())):
                 yield f"{name}: no heading for {target}"
+    listed = set(re.findall(r"\]\(([\w-]+\.md)\)", (BOOK / "SUMMARY.md").read_text()))
+    for chapter in sorted({path.name for path in BOOK.glob("*.md")} - listed - {"SUMMARY.md"}):
+        yield f"docs/SUMMARY.md: lacks {chapter}"
 
 
 def replaced():

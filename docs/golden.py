@@ -1,11 +1,12 @@
-"""Our pictures beside the golden ones of another renderer: those that splat-transform (PlayCanvas, MIT) is tested with.
+"""Compares pictures of b2p with the golden pictures of another renderer, splat-transform (PlayCanvas, MIT).
 
     python3 docs/golden.py CHECKOUT     a clone, with its history, of https://github.com/playcanvas/splat-transform
 
-Its scenes are grids of equal balls, made here from the parameters in its test/render-golden.cases.mjs; one with depth of field is left out, which b2p
-has not. There are two generations of pictures, for since 958b004 it takes a constant off every Gaussian. Both renderers are also held to a model in
-double precision, which knows where theirs cuts off: what it tells of their difference is then known to be all of it. Wants numpy and a Pillow that reads
-WebP. B2P names a `b2p` that is built already. Ends with an error if a picture is farther than WITHIN from the model of it.
+Its scenes are grids of equal balls, made here from the parameters in its test/render-golden.cases.mjs. A third scene has
+depth of field, which b2p lacks. There are two generations of pictures, because since 958b004 splat-transform subtracts a
+constant from every Gaussian. Each renderer is also compared with a double-precision model that has its cut-offs, which
+shows that the cut-offs explain the whole difference. Needs numpy and a Pillow that reads WebP. B2P names a `b2p` that is
+built already. Fails if a picture differs by more than WITHIN from its model.
 """
 
 import argparse
@@ -28,7 +29,7 @@ FOV = 60.0  # degrees, vertical
 OPACITY = 0.9
 NEAR = 0.2
 NOTHING = 9  # standard deviations, beyond which alpha is below 10^-17
-WITHIN = 1  # of 255: how far a picture may be from the model of its renderer
+WITHIN = 1  # of 255: largest difference between a picture and the model of its renderer
 PICTURE = "test/fixtures/golden-render/{}.webp"
 
 
@@ -52,10 +53,10 @@ SCENES = (
 class Cuts:
     """What a renderer leaves out of alpha = 0.9 * exp(-d^2 / 2), at most 0.99, of every Gaussian at every pixel."""
 
-    sigmas: float = math.inf  # beside a square of so many standard deviations of the longer axis, a Gaussian is nothing
-    rim: bool = False  # its value there is taken off everywhere, so that the cut is not seen
-    least: float = 0.0  # an alpha below this is none
-    through: float = 0.0  # a pixel that lets less light through is finished
+    sigmas: float = math.inf  # half the side of the square outside which a Gaussian is 0, in deviations of its longer axis
+    rim: bool = False  # subtracts the value at the edge of that square everywhere, which hides the edge
+    least: float = 0.0  # smallest alpha that is drawn
+    through: float = 0.0  # transmittance below which a pixel is finished
 
 
 NONE = Cuts()

@@ -1,4 +1,4 @@
-"""How time and memory grow with the cloud: the procedural scene at several bit depths, decoded to its finest level.
+"""Time and memory against the size of the cloud: the procedural scene at several bit depths, decoded to its finest level.
 
     python3 docs/scaling.py [BITS …]      measures (default 7 to 13; the last two take some minutes), then does the rest
     python3 docs/scaling.py --plot        from docs/scaling.json: docs/scaling.svg, and the table on standard output
@@ -13,7 +13,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
-# At 13 bits the surface has more voxels than can be encoded in 24 GB: so many samples stand for it.
+# Samples of the surface at 13 bits: all of its voxels would not encode in 24 GB.
 SPARSE = 48_000_000
 SERIES = {"ms": ("decode, two threads", "#1d4ed8"), "ms_one": ("decode, one thread", "#c2410c"), "mb": ("memory", "#15803d")}
 

@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
-# Goes on with the fuzzing campaign: every target in turn, from where it was left, guided by coverage, on stable Rust.
+# Continues the fuzzing campaign: every target in turn, guided by coverage, on stable Rust.
 #
-#     fuzz/campaign.sh [SECONDS [TARGET …]]    so many seconds a target (60), again and again until it is stopped; all targets by default
+#     fuzz/campaign.sh [SECONDS [TARGET …]]    SECONDS per target (60), in turn until it is stopped; all targets by default
 #     fuzz/campaign.sh once [SECONDS [TARGET …]]
 #     fuzz/campaign.sh keep [TARGET …]         rebuilds fuzz/corpus: the seeds, and the fewest inputs with the same coverage
-#     fuzz/campaign.sh total                   how often each target has run
+#     fuzz/campaign.sh total                   executions of each target
 #
-# Inputs and the log of executions are kept in fuzz/target/campaign. An input that breaks a promise is left in fuzz/artifacts, and ends it.
+# Inputs and the log of executions are in fuzz/target/campaign. An input that fails an assertion is written to
+# fuzz/artifacts and ends the campaign.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -19,7 +20,7 @@ build() { RUSTC_WRAPPER=$PWD/rustc.sh cargo build --locked --release --bins --ta
 
 program() { echo "target/fuzzers/release/$1"; }
 
-# What longer inputs have is more of the same, and slower.
+# Longer inputs repeat the same code and run slower.
 longest() {
     case $1 in
         octree | entropy | header) echo 400 ;;
@@ -28,7 +29,7 @@ longest() {
     esac
 }
 
-# Runs a target for so many seconds, and writes down how often. What runs faster is changed more often.
+# Runs a target and logs its executions. Faster inputs are mutated more often.
 run() {
     local seconds=$1 target=$2
     mkdir -p "$work/$target"
@@ -49,7 +50,7 @@ total() {
     done
 }
 
-# Only where inputs lead counts here, not how often: that is for the campaign to remember.
+# Keeps inputs by the code that they reach, not by how often they reach it.
 keep() {
     local target least
     for target in "$@"; do

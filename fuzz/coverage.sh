@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Which share of each module's lines the fuzz targets reach on the corpus that is committed.
+# The share of each module's lines that the fuzz targets reach with the committed corpus.
 #
 #     fuzz/coverage.sh           a table by module, then the files
-#     fuzz/coverage.sh FILE …    the lines of these files that are never reached, for example src/geometry/octree.rs
+#     fuzz/coverage.sh FILE …    lines of these files that are not reached, for example src/geometry/octree.rs
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

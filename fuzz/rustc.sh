@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# The compiler, made to count where an input leads in what reads inputs: `b2p` itself. The kernels go the same way whatever the numbers are, and run at
-# full speed. Comparisons are not traced: that costs half of the executions, and what it helps to pass, checksums and lengths, our mutator puts right.
+# The compiler with coverage counters in `b2p` and the fuzz targets. The kernels have no branches that depend on input, so
+# they run without counters. Comparisons are not traced: tracing halves the executions, and the mutator already recomputes
+# the checksums and lengths that it would help to pass.
 case " $* " in
     *" --crate-name b2p "* | *" --crate-name b2p_fuzz "*)
         exec "$@" -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=3 \

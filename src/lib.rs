@@ -19,7 +19,7 @@
 //! # fn main() -> b2p::Result<()> {
 //! use b2p::cloud::{PointCloud, voxelise};
 //! use b2p::encoder::transform;
-//! use b2p::{Limits, decoder::StreamDecoder, log::Log, pixels, projection::Camera};
+//! use b2p::{Limits, decoder::StreamDecoder, log::Log, renderer, renderer::camera::Camera};
 //!
 //! let place = |i: u32| [i % 40, i / 40, 20].map(f64::from);
 //! let cloud = PointCloud {
@@ -33,7 +33,7 @@
 //!
 //! let gaussians = StreamDecoder::new().decode(&stream, None, &mut log)?;
 //! let camera = Camera::orbit(20.0, 20.0, 2.6, 45.0, 160, 120)?;
-//! let (image, stats) = pixels::render(&gaussians, &camera, pixels::Background::WHITE, &Limits::default())?;
+//! let (image, stats) = renderer::render(&gaussians, &camera, renderer::Background::WHITE, &Limits::default())?;
 //! assert_eq!((image.width, image.height), (160, 120));
 //! assert!(stats.visible > 0);
 //! # Ok(())
@@ -43,35 +43,33 @@
 //! ```
 #![forbid(unsafe_code)]
 
-pub mod bitstream;
 pub mod cancel;
 #[cfg(feature = "ply")]
 pub mod cloud;
 mod coding;
 pub mod colour;
+pub mod container;
 pub mod decoder;
-#[cfg(feature = "cli")]
+#[cfg(feature = "embedded")]
 pub mod embedded;
 #[cfg(feature = "encoder")]
 pub mod encoder;
-pub mod entropy;
 pub mod error;
 pub mod gaussians;
 pub mod geometry;
+pub mod latents;
+pub mod layers;
 pub mod limits;
 pub mod log;
 mod memory;
-pub mod network;
+#[cfg(feature = "encoder")]
+pub mod metrics;
 pub mod output;
-#[cfg(feature = "render")]
-pub mod pixels;
 pub mod placement;
 #[cfg(feature = "render")]
-pub mod projection;
-#[cfg(feature = "render")]
-pub mod tiles;
-#[cfg(feature = "tradeoff")]
-pub mod tradeoff;
+pub mod renderer;
+#[cfg(test)]
+mod testing;
 
 pub use b2p_kernels::{Isa, UnknownIsa, ceiling};
 pub use cancel::Cancel;

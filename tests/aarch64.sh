@@ -32,9 +32,9 @@ export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUSTFLAGS="-C target-feature=+crt-
 if [ "${1:-}" = program ]; then
     out=$(mktemp -d)
     trap 'rm -rf "$out"' EXIT
-    cargo build --locked --release -p b2p --target $target
+    cargo build --locked --release -p b2p-cli --target $target
     there=${CARGO_TARGET_DIR:-target}/$target/release/b2p
-    cargo build --locked --release -p b2p
+    cargo build --locked --release -p b2p-cli
     # STREAM PROCESSOR INSTRUCTIONS
     same() {
         "${CARGO_TARGET_DIR:-target}/release/b2p" -q decode "$1" -o "$out/here.ply"
@@ -56,7 +56,7 @@ fi
 
 if [ "${1:-}" = renderer ]; then
     export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="timeout 1800 qemu-aarch64 -cpu max"
-    cargo test --locked --target $target -p b2p --no-default-features --features render --lib -- projection tiles pixels
+    cargo test --locked --target $target -p b2p --no-default-features --features render --lib -- renderer
     exit
 fi
 

@@ -2,13 +2,14 @@
 
 mod common;
 
-use b2p::bitstream::{Header, Stream, Writer};
 use b2p::cloud::ColouredVoxels;
-use b2p::decoder::Decoder;
+use b2p::container::{Header, Stream, Writer};
 use b2p::encoder::{Encoded, Options, encode};
+use b2p::gaussians::Heads;
 use b2p::geometry::Octree;
+use b2p::latents::Decoder;
+use b2p::latents::network::{Model, Shape, untrained};
 use b2p::log::Log;
-use b2p::network::{Heads, Model, Shape, untrained};
 use b2p::{Error, Limits, Placement};
 use common::{Ball, cloud_of, tiny_model};
 
@@ -155,7 +156,7 @@ fn a_stream_cut_after_a_level_is_the_coarser_stream() {
     let (model, cloud) = (model(), ball(7, 45.0));
     let encoded = coded(&cloud, &model);
     let decoder = Decoder::new(&model);
-    let stream = b2p::bitstream::Header::parse(&encoded.bytes, &Limits::default()).unwrap();
+    let stream = b2p::container::Header::parse(&encoded.bytes, &Limits::default()).unwrap();
     let whole = decoder.decode(&encoded.bytes, Some(5), &mut Log::default()).unwrap();
     let cut = &encoded.bytes[..stream.prefix_bytes(5).unwrap() as usize];
     assert_eq!(decoder.decode(cut, Some(5), &mut Log::default()).unwrap(), whole);

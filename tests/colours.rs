@@ -3,15 +3,17 @@
 mod common;
 
 use b2p::Limits;
-use b2p::bitstream::Stream;
 use b2p::cloud::ColouredVoxels;
-use b2p::decoder::Decoder;
+use b2p::container::Stream;
 use b2p::encoder::{Encoded, Options, Residual, encode};
-use b2p::gaussians::{ColourFilter, ColourResidual, Gaussians};
+use b2p::gaussians::Gaussians;
+use b2p::gaussians::Heads;
+use b2p::latents::Decoder;
+use b2p::latents::network::{Model, Shape, untrained};
+use b2p::latents::{ColourFilter, ColourResidual};
 use b2p::log::Log;
-use b2p::network::{Heads, Model, Shape, untrained};
-use b2p::pixels::{Background, render};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, render};
 use common::{Ball, all_in, steps, tiny_model, with_filter, with_residual};
 
 fn model() -> Model {

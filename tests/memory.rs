@@ -5,17 +5,20 @@ mod common;
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-use b2p::bitstream::{Format, Header};
 use b2p::cloud::ColouredVoxels;
-use b2p::decoder::{Decoder, StreamDecoder};
+use b2p::container::{Format, Header};
+use b2p::decoder::StreamDecoder;
 use b2p::encoder::transform::{self, Fineness};
 use b2p::encoder::{Options, Residual, encode};
+use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::gaussians::{Gaussians, Harmonics};
+use b2p::latents::Decoder;
+use b2p::latents::network::{Model, Shape, untrained};
+use b2p::layers::Precision;
 use b2p::log::Log;
-use b2p::network::{Heads, Model, Precision, Shape, untrained};
-use b2p::pixels::{Background, Channel, Choice, Effects, Ids, Image, Renderer, render};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, Channel, Choice, Effects, Ids, Image, Renderer, render};
 use b2p::{Error, Limits};
 use common::{Ball, cloud_of, steps};
 use peak_alloc::PeakAlloc;
@@ -45,7 +48,7 @@ fn models() -> Vec<(&'static str, Model)> {
     vec![
         ("tiny", load(&untrained(&Shape::tiny().with_quick_heads(), 0))),
         ("wide", load(&untrained(&wide, 0))),
-        #[cfg(feature = "cli")]
+        #[cfg(feature = "embedded")]
         ("lite", load(b2p::embedded::MODEL)),
     ]
 }
@@ -237,7 +240,7 @@ fn a_bomb_of_a_hundred_bytes_reserves_nothing() {
         slice_voxels: 1,
         voxels: vec![1 << 26; 3],
         sections: vec![
-            b2p::bitstream::Section {
+            b2p::container::Section {
                 geometry: u32::MAX,
                 colours: u32::MAX
             };

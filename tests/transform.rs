@@ -4,12 +4,14 @@ mod common;
 
 use std::collections::BTreeMap;
 
-use b2p::bitstream::{Header, Stream};
 use b2p::cloud::{ColouredVoxels, voxelise};
-use b2p::decoder::{HeadSet, StreamDecoder, StreamDecoding};
+use b2p::container::{Header, Stream};
+use b2p::decoder::{StreamDecoder, StreamDecoding};
 use b2p::encoder::transform::{Fineness, Options, encode, encode_within};
+use b2p::gaussians::HeadSet;
+use b2p::gaussians::Heads;
+use b2p::latents::network::Model;
 use b2p::log::Log;
-use b2p::network::{Heads, Model};
 use b2p::{Cancel, Error, Isa, Limits};
 use common::{Ball, cloud_of, tiny_model};
 
@@ -238,7 +240,7 @@ fn one_decoder_decodes_both_versions_and_says_which_model_version_2_needs() {
     let missing = without.decode(&old, None, log).unwrap_err();
     assert!(matches!(&missing, Error::ModelMissing { expected } if *expected == id));
     let both = without.with_model(model.clone());
-    let expected = b2p::decoder::Decoder::new(&*model);
+    let expected = b2p::latents::Decoder::new(&*model);
     assert_eq!(
         both.decode(&old, None, log).unwrap(),
         expected.decode(&old, None, log).unwrap()

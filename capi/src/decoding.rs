@@ -3,7 +3,8 @@
 use std::ffi::c_char;
 use std::sync::Arc;
 
-use b2p::decoder::{HeadSet, StreamDecoder, StreamDecoding};
+use b2p::decoder::{StreamDecoder, StreamDecoding};
+use b2p::gaussians::HeadSet;
 use b2p::log::Log;
 
 use crate::border::{Fault, Status, borrowed, changed, give, guard, slice, take};

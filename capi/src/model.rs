@@ -7,7 +7,7 @@ use std::sync::Arc;
 use crate::border::{Fault, Status, give, guard, slice, take};
 
 /// A model, ready to run. Any number of decodings share it, in any threads.
-pub struct Model(pub(crate) Arc<b2p::network::Model>);
+pub struct Model(pub(crate) Arc<b2p::latents::network::Model>);
 
 /// Learned heads that draw streams of version 3, ready to run. Any number of decodings share them, in any threads.
 pub struct HeadsModel(pub(crate) Arc<b2p::gaussians::learned::HeadsModel>);
@@ -91,7 +91,7 @@ pub unsafe extern "C" fn b2p_model_open(
         // SAFETY: the caller vouches for a string.
         let path = unsafe { CStr::from_ptr(path) };
         let path = path.to_str().map_err(|_| Fault::usage("path is not UTF-8"))?;
-        let loaded = b2p::network::Model::open(Path::new(path))?;
+        let loaded = b2p::latents::network::Model::open(Path::new(path))?;
         // SAFETY: the caller vouches for `model`.
         unsafe { give(model, "model", Model(Arc::new(loaded))) }
     };
@@ -114,7 +114,7 @@ pub unsafe extern "C" fn b2p_model_from_bytes(
     let run = || {
         // SAFETY: the caller vouches for `bytes`.
         let bytes = unsafe { slice(bytes, length, "bytes") }?;
-        let loaded = b2p::network::Model::from_bytes(bytes)?;
+        let loaded = b2p::latents::network::Model::from_bytes(bytes)?;
         // SAFETY: the caller vouches for `model`.
         unsafe { give(model, "model", Model(Arc::new(loaded))) }
     };

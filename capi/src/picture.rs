@@ -2,7 +2,7 @@
 
 use std::ffi::c_char;
 
-use b2p::pixels::{Background, render};
+use b2p::renderer::{Background, render};
 
 use crate::border::{Fault, Status, borrowed, changed, guard};
 use crate::decoding::Gaussians;
@@ -58,7 +58,7 @@ pub unsafe extern "C" fn b2p_render(
             let text = format!("the picture has {needed} bytes, the buffer {length}");
             return Err(Fault::usage(text));
         }
-        let camera = b2p::projection::Camera::orbit(
+        let camera = b2p::renderer::camera::Camera::orbit(
             view.azimuth,
             view.elevation,
             view.distance,

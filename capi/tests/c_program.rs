@@ -7,12 +7,13 @@ mod common;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use b2p::decoder::Decoder;
 use b2p::encoder::transform;
+use b2p::gaussians::Heads;
+use b2p::latents::Decoder;
+use b2p::latents::network::{Model, Shape, untrained};
 use b2p::log::Log;
-use b2p::network::{Heads, Model, Shape, untrained};
-use b2p::pixels::{Background, render};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, render};
 
 /// Where cargo put the static library: beside this test, or a folder above.
 fn library() -> PathBuf {

@@ -14,7 +14,7 @@ mod transform;
 
 use std::sync::LazyLock;
 
-use b2p::network::{Model, Shape, untrained};
+use b2p::latents::network::{Model, Shape, untrained};
 use peak_alloc::PeakAlloc;
 
 pub use codecs::{entropy, octree};

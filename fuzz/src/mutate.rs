@@ -41,7 +41,7 @@ fn with_other_payload(bytes: &[u8], most: usize, which: u32, change: Change) -> 
         _ => change(&mut changed, length, room),
     };
     let mut stream = seal::with_payload(bytes, place, &changed[..now]);
-    if b2p::bitstream::version(&stream) == Some(2) {
+    if b2p::container::version(&stream) == Some(2) {
         stream[MODEL_ID..MODEL_ID + 16].copy_from_slice(&MODEL.id());
         seal::seal(&mut stream);
     }
@@ -51,7 +51,7 @@ fn with_other_payload(bytes: &[u8], most: usize, which: u32, change: Change) -> 
 #[cfg(test)]
 mod tests {
     use b2p::Limits;
-    use b2p::bitstream::Stream;
+    use b2p::container::Stream;
 
     use super::*;
     use crate::seeds::seeds;
@@ -61,7 +61,7 @@ mod tests {
         let mut changed = 0;
         for stream in [seeds("stream"), seeds("transform")].concat() {
             // What the trunk of the geometry holds is read with the container.
-            let trunk = usize::from(b2p::bitstream::version(&stream) == Some(3));
+            let trunk = usize::from(b2p::container::version(&stream) == Some(3));
             let parsed = Stream::parse(&stream, &Limits::default()).expect("a stream");
             assert!(parsed.damage().is_none());
             for which in trunk as u32..seal::chunks(&stream).len() as u32 {

@@ -1,10 +1,11 @@
 //! Streams from strangers.
 
-use b2p::bitstream::{Header, Level, Slice, Stream, Writer};
-use b2p::decoder::{Decoder, Decoding, Exact, StreamDecoder};
+use b2p::container::{Header, Level, Slice, Stream, Writer};
+use b2p::latents::{Decoder, Decoding, Exact};
+use b2p::decoder::StreamDecoder;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::network::Model;
+use b2p::latents::network::Model;
 use b2p::{Error, Limits};
 
 use crate::{MODEL, giving_back, one_in, transform, within};
@@ -147,7 +148,7 @@ fn requests(bytes: &[u8], header: &Header, deepest: Option<u8>) {
 /// What the decoder says.
 pub fn deepest(bytes: &[u8]) -> Result<Option<u8>, Error> {
     let log = &mut Log::default();
-    if b2p::bitstream::version(bytes) == Some(3) {
+    if b2p::container::version(bytes) == Some(3) {
         let decoder = StreamDecoder::new().with_limits(transform::limits());
         return Ok(decoder.whole(bytes, None, log)?.level());
     }

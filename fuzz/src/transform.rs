@@ -1,6 +1,6 @@
 //! Streams of version 3 from strangers.
 
-use b2p::bitstream::{Colours, Level, Writer};
+use b2p::container::{Colours, Level, Writer};
 use b2p::decoder::{StreamDecoder, StreamDecoding};
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;

@@ -7,10 +7,10 @@
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-use crate::isa::Isa;
 #[cfg(target_arch = "x86_64")]
 use crate::machine::amx;
 use crate::rows::{Lanes, PANEL};
+use crate::simd::Isa;
 use crate::tile::{Arithmetic, Machine, spin};
 
 /// f32 multiply-adds: the bound of [`crate::FloatConv`].
@@ -26,7 +26,7 @@ pub fn i16(isa: Isa) -> f64 {
         return best(|| amx::spin(isa, ROUNDS)) / 3.0;
     }
     #[cfg(target_arch = "aarch64")]
-    if isa.has_dot() {
+    if isa.dot().is_some() {
         return best(|| crate::machine::dot::spin(isa, ROUNDS));
     }
     measure(isa, Arithmetic::Integer)

@@ -4,9 +4,9 @@ use crate::f16;
 
 use crate::exact::LIMIT;
 use crate::finish::scaled;
-use crate::isa::Isa;
 use crate::machine::with_halves;
 use crate::rows::{Lanes, PANEL, panel, store};
+use crate::simd::Isa;
 use crate::winograd::Registers;
 
 /// The largest finite f16.
@@ -81,6 +81,30 @@ pub(crate) unsafe trait Halves: Registers {
         }
         q
     }
+}
+
+/// The conversions of an instruction set.
+pub(crate) trait HasHalves {
+    type Halves: Halves;
+}
+
+impl HasHalves for crate::simd::Scalar {
+    type Halves = Portable;
+}
+
+#[cfg(target_arch = "x86_64")]
+impl HasHalves for crate::simd::Avx2 {
+    type Halves = crate::machine::avx2::Convert;
+}
+
+#[cfg(target_arch = "x86_64")]
+impl HasHalves for crate::simd::Avx512 {
+    type Halves = crate::machine::avx512::Convert;
+}
+
+#[cfg(target_arch = "aarch64")]
+impl HasHalves for crate::simd::Neon {
+    type Halves = crate::machine::neon::Convert;
 }
 
 /// In integer steps that any compiler turns into SIMD.

@@ -1,6 +1,6 @@
 //! Sums in double precision: what other precisions are measured against, with the vectors that the machine has.
 
-use crate::isa::{Isa, dispatch};
+use crate::simd::{Isa, Simd, dispatch};
 
 /// Adds to each sum `o` the products `input[c] · weights[c][o]`, one input after the other: the same bits with any instructions.
 ///
@@ -15,7 +15,7 @@ pub fn add_products(isa: Isa, input: &[f64], weights: &[f64], sums: &mut [f64]) 
 const BLOCK: usize = 32;
 
 #[inline(always)]
-fn products(input: &[f64], weights: &[f64], sums: &mut [f64]) {
+fn products<S: Simd>(_: S, input: &[f64], weights: &[f64], sums: &mut [f64]) {
     let add = |x: f64, weights: &[f64], sums: &mut [f64]| {
         for (sum, w) in sums.iter_mut().zip(weights) {
             *sum += x * w;

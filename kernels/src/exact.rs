@@ -3,14 +3,14 @@
 use std::sync::OnceLock;
 
 use crate::finish::{Finish, Tile, Value, finish_tile};
-use crate::isa::{Isa, dispatch};
 #[cfg(target_arch = "x86_64")]
 use crate::machine::amx;
 #[cfg(target_arch = "aarch64")]
 use crate::machine::dot;
-use crate::machine::{fetch, halves_mut, with_halves};
+use crate::machine::{halves_mut, with_halves};
 use crate::norms::{Energy, Gains, Norms};
 use crate::rows::{AHEAD, Extents, IN_ORDER, Lanes, Output, PANEL, Scratch, panels, with_scratch};
+use crate::simd::{Isa, Simd, dispatch, prefetch};
 use crate::taps::Taps;
 use crate::tile::{Arithmetic, accumulate};
 use crate::winograd;
@@ -181,7 +181,7 @@ impl ExactConv {
         {
             return self.each_family(isa, weights, neighbours, input, first, output);
         }
-        let group = isa.group(self.extents.cout);
+        let group = crate::tile::group(isa, self.extents.cout);
         with_scratch(|scratch| {
             for (row, output) in output.tiles() {
                 let (first, cout) = (first + row, self.extents.cout);
@@ -204,7 +204,7 @@ impl ExactConv {
                         .tiles()
                         .is_some_and(|weights| amx::integers::accumulate(isa, weights, plan, input, tiles, sums));
                 #[cfg(target_arch = "aarch64")]
-                let done = isa.has_dot()
+                let done = isa.dot().is_some()
                     && self
                         .digits()
                         .is_some_and(|weights| dot::accumulate(isa, weights, plan, input, digits, sums));
@@ -318,11 +318,11 @@ fn pair_up(isa: Isa, input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
 }
 
 #[inline(always)]
-fn pair_rows(input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
+fn pair_rows<S: Simd>(_: S, input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
     let to = halves_mut(to).chunks_exact_mut(cin.next_multiple_of(2));
     for (i, (to, &row)) in to.zip(rows).enumerate() {
         if let Some(&next) = rows.get(i + AHEAD) {
-            fetch(&input[next as usize * cin..][..cin]);
+            prefetch(&input[next as usize * cin..][..cin]);
         }
         let (to, odd) = to.split_at_mut(cin);
         let from = &input[row as usize * cin..][..cin];

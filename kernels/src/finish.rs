@@ -2,9 +2,9 @@
 
 use crate::convert::Halves;
 use crate::exact::LIMIT;
-use crate::machine::fetch;
 use crate::norms::{Gains, Norms};
 use crate::rows::{Lanes, Output, PANEL, part, store_part};
+use crate::simd::prefetch;
 use crate::winograd::Registers;
 
 /// By how many rows memory is asked for what is added.
@@ -137,7 +137,7 @@ pub(crate) unsafe fn finish_tile<H: Halves, T: Value>(
         let first = row * stride + column;
         let ahead = first + AHEAD * stride;
         if let Some(next) = residual.and_then(|all| all.get(ahead..ahead + cout)) {
-            fetch(next);
+            prefetch(next);
         }
         let residual = residual.map(|all| all[first..][..cout].as_chunks::<PANEL>());
         let (whole, rest) = rows[first..][..cout].as_chunks_mut::<PANEL>();

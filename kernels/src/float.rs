@@ -6,7 +6,6 @@ use std::sync::OnceLock;
 use ::half::{bf16, f16};
 
 use crate::convert::{self, Halves};
-use crate::isa::Isa;
 #[cfg(target_arch = "x86_64")]
 use crate::machine::amx;
 #[cfg(target_arch = "aarch64")]
@@ -15,6 +14,7 @@ use crate::machine::{self, with_halves};
 use crate::norms::{Gains, Norms};
 use crate::plan::PlanTile;
 use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
+use crate::simd::Isa;
 use crate::taps::Taps;
 use crate::tile::{Arithmetic, Expand, accumulate};
 
@@ -228,7 +228,7 @@ impl FloatConv {
             self.extents.volume,
             "these taps belong to another kernel"
         );
-        let group = isa.group(self.extents.cout);
+        let group = crate::tile::group(isa, self.extents.cout);
         with_scratch(|scratch| {
             let Scratch {
                 taps: tile,

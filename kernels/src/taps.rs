@@ -1,11 +1,12 @@
 //! Which input rows each output row reads, and through which tap of the kernel.
 
 use crate::family;
-use crate::isa::{Isa, Level};
+
 #[cfg(target_arch = "x86_64")]
 use crate::machine;
 use crate::plan::Plan;
 use crate::rows::TILE;
+use crate::simd::{Isa, Level};
 
 /// Marks a tap that reads nothing.
 pub const ABSENT: u32 = u32::MAX;
@@ -147,13 +148,13 @@ impl TileTaps {
             room: ROOM,
         };
         match isa.level() {
-            Level::Scalar => fill_map(lists),
+            Level::Scalar(_) => fill_map(lists),
             #[cfg(target_arch = "aarch64")]
-            Level::Neon | Level::NeonDot => fill_map(lists),
+            Level::Neon(_) | Level::NeonDot(..) => fill_map(lists),
             #[cfg(target_arch = "x86_64")]
             // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
             // tile's rows and eight more.
-            Level::Avx2 | Level::AvxVnni | Level::Avx512 | Level::Amx => unsafe {
+            Level::Avx2(_) | Level::AvxVnni(..) | Level::Avx512(_) | Level::Amx(..) => unsafe {
                 machine::avx2_lists::fill_map(lists)
             },
         }

@@ -1,11 +1,30 @@
 //! The loop at the heart of both convolutions: the sums of a group's rows stay in registers while its taps go by.
 
-#[cfg(target_arch = "x86_64")]
-use crate::isa::WIDE;
-use crate::isa::{Isa, Level};
 use crate::machine;
 use crate::plan::PlanTile;
 use crate::rows::{Extents, IN_ORDER, Lanes, PANEL, TILE};
+use crate::simd::{Isa, Level};
+
+/// The smallest [`group`].
+pub(crate) const MIN_GROUP: usize = 4;
+/// Panels that AVX-512 multiplies at once, by the rows of the smallest group, where a layer has so many.
+#[cfg(target_arch = "x86_64")]
+pub(crate) const WIDE: usize = 4;
+
+/// Output rows of a layer of `cout` channels that are multiplied by the same taps: those of a matrix tile, or as many as keep the
+/// registers busy. A multiple of [`MIN_GROUP`].
+pub(crate) fn group(isa: Isa, cout: usize) -> usize {
+    match isa.level() {
+        #[cfg(target_arch = "x86_64")]
+        Level::Amx(..) => 16,
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512(_) if !cout.is_multiple_of(WIDE * PANEL) => 8,
+        _ => {
+            let _ = cout;
+            MIN_GROUP
+        }
+    }
+}
 
 /// [`Lanes`] of weights that the first cache holds besides rows and sums.
 const CACHED: usize = 256;
@@ -248,7 +267,7 @@ pub(crate) fn accumulate<T>(
 pub(crate) fn multiply_rows(isa: Isa, cout: usize, weights: &[Lanes], rows: &[u32], products: &mut [Lanes]) {
     let panels = cout.div_ceil(PANEL);
     let (steps, count) = (weights.len() / panels, products.len() / panels);
-    assert!(count <= TILE && count.is_multiple_of(isa.group(cout)));
+    assert!(count <= TILE && count.is_multiple_of(group(isa, cout)));
     assert_eq!(rows.len(), count * steps, "a row of words for each of products");
     let half = usize::from((1..=PANEL / 2).contains(&(cout % PANEL)));
     let mut panel = 0;
@@ -281,7 +300,7 @@ static FIRST: [u8; 1] = [0];
 fn width(isa: Isa, whole: usize) -> usize {
     match isa.level() {
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 | Level::Amx => match whole {
+        Level::Avx512(_) | Level::Amx(..) => match whole {
             WIDE.. => WIDE,
             _ => whole.clamp(1, 2),
         },
@@ -301,15 +320,15 @@ unsafe fn run(isa: Isa, arithmetic: Arithmetic, block: &Block, whole: usize) {
     // rest is the caller's promise.
     unsafe {
         match isa.level() {
-            Level::Scalar => machine::scalar::run(arithmetic, block, whole),
+            Level::Scalar(_) => machine::scalar::run(arithmetic, block, whole),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => machine::avx2::run(arithmetic, block, whole),
+            Level::Avx2(_) => machine::avx2::run(arithmetic, block, whole),
             #[cfg(target_arch = "x86_64")]
-            Level::AvxVnni => machine::avx2::run_vnni(arithmetic, block, whole),
+            Level::AvxVnni(..) => machine::avx2::run_vnni(arithmetic, block, whole),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 | Level::Amx => machine::avx512::run(arithmetic, block, whole),
+            Level::Avx512(_) | Level::Amx(..) => machine::avx512::run(arithmetic, block, whole),
             #[cfg(target_arch = "aarch64")]
-            Level::Neon | Level::NeonDot => machine::neon::run(arithmetic, block, whole),
+            Level::Neon(_) | Level::NeonDot(..) => machine::neon::run(arithmetic, block, whole),
         }
     }
 }
@@ -323,15 +342,15 @@ pub(crate) fn spin(isa: Isa, arithmetic: Arithmetic, rounds: usize) -> usize {
     // SAFETY: an `Isa` is only made where the processor has its instructions; what it may lack has just been asked about.
     let words = unsafe {
         match isa.level() {
-            Level::Scalar => machine::scalar::spin(arithmetic, rounds),
+            Level::Scalar(_) => machine::scalar::spin(arithmetic, rounds),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => machine::avx2::spin(arithmetic, rounds),
+            Level::Avx2(_) => machine::avx2::spin(arithmetic, rounds),
             #[cfg(target_arch = "x86_64")]
-            Level::AvxVnni => machine::avx2::spin_vnni(arithmetic, rounds),
+            Level::AvxVnni(..) => machine::avx2::spin_vnni(arithmetic, rounds),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 | Level::Amx => machine::avx512::spin(arithmetic, rounds),
+            Level::Avx512(_) | Level::Amx(..) => machine::avx512::spin(arithmetic, rounds),
             #[cfg(target_arch = "aarch64")]
-            Level::Neon | Level::NeonDot => machine::neon::spin(arithmetic, rounds),
+            Level::Neon(_) | Level::NeonDot(..) => machine::neon::spin(arithmetic, rounds),
         }
     };
     match arithmetic {

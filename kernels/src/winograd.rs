@@ -8,15 +8,15 @@
 use crate::convert::Halves;
 use crate::exact::LIMIT;
 use crate::family::{copy_mask, window};
-use crate::isa::Isa;
 use crate::machine::{with_halves, words_mut};
 use crate::rows::{Extents, Lanes, PANEL};
+use crate::simd::Isa;
 use crate::taps::ABSENT;
 use crate::tile::multiply_rows;
 
 /// Positions of the window.
 const WINDOW: usize = 64;
-/// Voxels whose children are computed together: their windows and products fit the second cache. A multiple of every [`Isa::group`].
+/// Voxels whose children are computed together: their windows and products fit the second cache. A multiple of every [`crate::tile::group`].
 const PART: usize = 16;
 /// Sums must stay below this, either side of zero.
 const SUM_LIMIT: i64 = 1 << 28;

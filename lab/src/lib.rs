@@ -12,6 +12,7 @@ pub mod random;
 pub mod raster;
 pub mod sample;
 pub mod surface;
+pub mod tradeoff;
 pub mod triplanar;
 
 pub use error::{LabError, Result};

@@ -209,7 +209,7 @@ fn mean(points: &[(u64, [u8; 3])]) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::entropy::test_tables::Random;
+    use crate::testing::Random;
     use proptest::prelude::*;
 
     fn cloud(positions: &[[f64; 3]]) -> PointCloud {

@@ -1,5 +1,6 @@
 //! Entropy coding of binary decisions: probabilities in integers, and a range coder.
 
+pub(crate) mod ans;
 pub(crate) mod binary;
 pub(crate) mod probability;
 

@@ -33,9 +33,9 @@ use std::ops::Range;
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
-use crate::bitstream::Slice;
 use crate::cancel::Cancel;
 use crate::coding::binary::Decoder;
+use crate::container::Slice;
 use crate::error::{Error, Result, Stage};
 use crate::geometry::{KernelMap, Octree};
 use block::{Coding, Nodes, Quantiser, Source};

@@ -2,12 +2,12 @@
 
 use std::ops::Deref;
 
-use super::Decoder;
-use crate::bitstream::{Header, MAX_TRUNK_VOXELS};
 use crate::colour::Coloured;
+use crate::container::{Header, MAX_TRUNK_VOXELS};
 use crate::error::Result;
+use crate::latents::Decoder;
+use crate::latents::network::{AT_ONCE, Model, RAW};
 use crate::memory::{NOTHING, Sizes, Term, total};
-use crate::network::{AT_ONCE, Model, RAW};
 
 /// Bytes of a row of a 3³ kernel map, and of the same arranged for the kernels.
 const MAP: u64 = 27 * 4;
@@ -198,7 +198,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     }
 
     /// Fails with [`crate::Error::LimitExceeded`] if decoding down to `level` takes more than is allowed.
-    pub(super) fn check_memory(&self, header: &Header, level: u8) -> Result<()> {
+    pub(crate) fn check_memory(&self, header: &Header, level: u8) -> Result<()> {
         let bytes = self.memory(header, level)?;
         self.limits.check_bytes("memory to decode this stream", bytes)
     }

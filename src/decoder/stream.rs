@@ -5,27 +5,27 @@ use std::sync::Arc;
 
 use b2p_kernels::Isa;
 
-use super::feed::Goal;
+use super::StreamDecoding;
 use super::transform::Reached;
-use super::{Decoder, HeadSet, StreamDecoding};
-#[cfg(feature = "render")]
-use crate::bitstream::Stream;
-use crate::bitstream::{Format, Header};
 use crate::cancel::Cancel;
 #[cfg(feature = "ply")]
 use crate::cloud::{ColouredVoxels, PointCloud};
+use crate::container::feed::Goal;
+use crate::container::{Format, Header, Stream};
 use crate::error::{Error, Result};
+use crate::gaussians::HeadSet;
+use crate::gaussians::Heads;
 use crate::gaussians::learned::{HeadsModel, LevelInput, Set};
 use crate::gaussians::surfels::{PerVoxel, surfels};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::Voxels;
+use crate::latents::Decoder;
+use crate::latents::network::Model;
+use crate::layers::Precision;
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::{Heads, Model, Precision};
 #[cfg(feature = "ply")]
 use crate::placement::Placement;
-#[cfg(feature = "render")]
-use crate::projection::Camera;
 
 /// Decodes streams of either version. Version 3 needs no model; version 2 needs the one that the stream was coded with.
 #[derive(Debug, Clone, Default)]
@@ -178,16 +178,16 @@ impl StreamDecoder {
         })
     }
 
-    /// The coarsest level with Gaussians whose voxels are nowhere wider than a pixel in the pictures that `cameras` take: what is finer
-    /// is hardly seen. `None` if no level before the finest whole one does, so that the stream as it is serves best.
+    /// The coarsest level with Gaussians whose voxels are nowhere wider than a pixel, in pictures where a cube-frame unit takes `pixels_per_unit`
+    /// pixels at most: what is finer is hardly seen. `None` if no level before the finest whole one does, so that the stream as it is serves best.
     ///
     /// # Errors
     /// Those of [`Stream::parse`], [`Error::ModelMissing`], and the damage of a stream that is cut or damaged elsewhere than right after a
     /// level.
-    #[cfg(feature = "render")]
-    pub fn level_for(&self, bytes: &[u8], cameras: &[Camera]) -> Result<Option<u8>> {
+    pub fn level_for(&self, bytes: &[u8], pixels_per_unit: f64) -> Result<Option<u8>> {
         let stream = Stream::parse(bytes, &self.limits)?.intact()?;
-        let coarsest = coarsest_seen(&self.levels(bytes)?, cameras);
+        let seen = |level: &u8| 2.0 / f64::from(1u32 << level) * pixels_per_unit <= 1.0;
+        let coarsest = self.levels(bytes)?.into_iter().find(seen);
         Ok(coarsest.filter(|level| Some(*level) < stream.deepest()))
     }
 
@@ -378,13 +378,4 @@ pub(super) fn learned_heads(heads: Option<HeadSet>) -> Result<Heads> {
         what: "drawing surfels",
         detail: "the stream has version 2, whose model has its own heads".into(),
     })
-}
-
-/// The coarsest of `levels` whose voxels are nowhere wider than a pixel in the pictures that `cameras` take.
-#[cfg(feature = "render")]
-pub(super) fn coarsest_seen(levels: &[u8], cameras: &[Camera]) -> Option<u8> {
-    let pixels = cameras.iter().map(Camera::pixels_per_unit);
-    let pixels = pixels.fold(0.0, f64::max);
-    let seen = |level: &u8| 2.0 / f64::from(1u32 << level) * pixels <= 1.0;
-    levels.iter().copied().find(seen)
 }

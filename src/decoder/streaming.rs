@@ -3,17 +3,17 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use super::decoding::nothing_reached;
-use super::feed::{Goal, failed_before};
 use super::stream::{Points, StreamDecoder, learned_heads};
 use super::transform::Transform;
-use super::{Decoding, HeadSet};
-use crate::bitstream::{Header, MAGIC, version};
+use crate::container::feed::{Goal, failed_before};
+use crate::container::{Header, MAGIC, version};
 use crate::error::{Error, Result};
+use crate::gaussians::HeadSet;
 use crate::gaussians::learned::HeadsModel;
 use crate::gaussians::{Frame, Gaussians};
+use crate::latents::network::Model;
+use crate::latents::{Decoding, nothing_reached};
 use crate::log::Log;
-use crate::network::Model;
 
 /// A stream of either version that is decoded level by level as its bytes arrive.
 ///

@@ -6,14 +6,14 @@ use std::sync::OnceLock;
 use b2p_kernels::Isa;
 use xxhash_rust::xxh3::Xxh3Default;
 
-use super::decoding::nothing_reached;
-use super::feed::{Feed, Goal};
 use super::stream::StreamDecoder;
-use crate::bitstream::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::colour::{self, Coloured, Filter};
+use crate::container::feed::{Feed, Goal};
+use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
 use crate::gaussians::Gaussians;
 use crate::geometry::{KernelMap, Octree, codec};
+use crate::latents::nothing_reached;
 use crate::log::Log;
 
 /// A stream of version 3 that is decoded level by level.

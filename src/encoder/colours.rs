@@ -6,10 +6,11 @@
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::gaussians::{COLOUR_INPUTS as INPUTS, ColourFilter, Gaussians, Surroundings};
+use crate::gaussians::Gaussians;
+use crate::latents::{COLOUR_INPUTS as INPUTS, ColourFilter, Surroundings};
 use crate::limits::Limits;
-use crate::pixels::{Quality, Renderer};
-use crate::projection::Camera;
+use crate::renderer::camera::Camera;
+use crate::renderer::{Quality, Renderer};
 
 /// Cameras, once around the cloud, from above and below by turns.
 const VIEWS: usize = 3;

@@ -7,9 +7,11 @@ use super::colours::{self, CHUNK};
 use super::pooled;
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
-use crate::gaussians::{ColourFilter, ColourResidual, Frame, Gaussians, Precision, Steps, Surroundings, activate};
+use crate::gaussians::Heads;
+use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::{KernelMap, Octree};
-use crate::network::{Heads, Model};
+use crate::latents::network::Model;
+use crate::latents::{ColourFilter, ColourResidual, Precision, Steps, Surroundings, activate};
 
 /// How many times as much a decibel of what is wide is worth: pictures from afar and up close show it, where what is narrow blurs or is too fine to trouble.
 const WIDE: usize = 6;

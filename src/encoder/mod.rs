@@ -13,19 +13,18 @@ use std::ops::RangeInclusive;
 use b2p_kernels::f16;
 use rayon::prelude::*;
 
-use crate::bitstream::{Format, Header, MAX_SLICE_VOXELS, Section};
 use crate::cloud::ColouredVoxels;
-use crate::decoder::Decoder;
-use crate::entropy::{Coding, Rounding};
+use crate::container::{Format, Header, MAX_SLICE_VOXELS, Section};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels};
+use crate::latents::Decoder;
+use crate::latents::entropy::{Coding, Rounding};
+use crate::latents::network::{Model, ROLES};
 use crate::limits::Limits;
 use crate::log::Log;
-use crate::network::{Model, ROLES};
 pub use corrections::Residual;
 use corrections::{Left, Level, corrections};
-pub(crate) use skeleton::Skeleton;
-use skeleton::{Coded, Correct};
+use skeleton::{Coded, Correct, Skeleton};
 pub use within::encode_within;
 
 /// What may be chosen about a stream; [`encode_within`] chooses what decides its size.
@@ -37,7 +36,7 @@ pub struct Options {
     /// Default: 1.
     pub bit_price: f32,
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
-    /// [`ColourFilter`](crate::gaussians::ColourFilter).
+    /// [`ColourFilter`](crate::latents::ColourFilter).
     pub filter: bool,
     /// How much is coded of what colours are then still off those of the cloud. Default: [`Residual::Coarse`].
     pub residual: Residual,
@@ -259,8 +258,27 @@ fn pooled(cloud: &ColouredVoxels, level: u8) -> (Voxels, Vec<[f32; 3]>) {
     (Voxels::from_sorted(level, keys), colours)
 }
 
+/// A stream of version 2 of this octree whose latents are all zero: what geometry and entropy coding cost, for calibrations.
+///
+/// # Errors
+/// Those of [`encode`].
+#[doc(hidden)]
+pub fn with_zero_latents(header: Header, octree: Octree, model: &Model) -> Result<Vec<u8>> {
+    let base = header.base;
+    let maps = kernel_maps(&octree, base);
+    let log = &mut Log::default();
+    let skeleton = Skeleton::new(header, octree, maps, model, log)?;
+    let latents = model.shape().latents;
+    let mut zero = |role: usize, _: Coding<'_>, _: Option<&[i16]>| {
+        let voxels = skeleton.octree.level(base + role as u8).len();
+        Ok(vec![0; voxels * latents])
+    };
+    let coded = skeleton.code(&mut zero, None, log)?;
+    skeleton.stream(&coded, &[])
+}
+
 /// The kernel maps of `base` and all deeper levels, in this order.
-pub(crate) fn kernel_maps(octree: &Octree, base: u8) -> Vec<KernelMap> {
+fn kernel_maps(octree: &Octree, base: u8) -> Vec<KernelMap> {
     let mut maps = vec![octree.kernel_map(base)];
     for level in base..octree.depth() {
         let next = octree.child_map(level, &maps[maps.len() - 1]);

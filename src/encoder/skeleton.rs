@@ -1,13 +1,14 @@
 //! The levels of a stream: what all streams of a cloud have in common, what its latents say, and both put together.
 
 use super::corrections::{Corrections, Left, Level};
-use crate::bitstream::{Header, Writer};
-use crate::entropy::{Coding, Condition, latent_hash};
+use crate::container::{Header, Writer};
 use crate::error::Result;
-use crate::gaussians::ColourFilter;
+use crate::gaussians::Heads;
 use crate::geometry::{KernelMap, Octree, codec};
+use crate::latents::ColourFilter;
+use crate::latents::entropy::{Coding, Condition, latent_hash};
+use crate::latents::network::Model;
 use crate::log::Log;
-use crate::network::{Heads, Model};
 
 /// A role's latents, K per voxel of its level, given what they are coded under and its context.
 pub(crate) type Latents<'a> = dyn FnMut(usize, Coding<'_>, Option<&[i16]>) -> Result<Vec<i16>> + 'a;

@@ -10,9 +10,9 @@ use std::num::NonZeroU8;
 use super::{Encoded, Options, Residual, Subject};
 use crate::cloud::ColouredVoxels;
 use crate::error::{Error, Result};
-use crate::gaussians::Steps;
+use crate::latents::Steps;
+use crate::latents::network::Model;
 use crate::log::Log;
-use crate::network::Model;
 
 /// Prices of a bit, each about a fifth above the next.
 const PRICES: [f32; 9] = [4.0, 3.36, 2.83, 2.38, 2.0, 1.68, 1.41, 1.19, USUAL];

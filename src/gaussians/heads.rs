@@ -1,201 +1,114 @@
-//! From the network's raw numbers to Gaussians.
-//!
-//! Activations after the paper's semantics (offset, scale, rotation, opacity, colour; its §"3D Gaussian generation"), which leaves
-//! their functions open. With `u` the edge of a generated voxel in the cube frame:
-//! position = voxel centre + tanh(raw)·range·u, σ = softplus(raw + bias)·range·u, rotation = normalise(raw + (1, 0, 0, 0)),
-//! opacity = sigmoid(raw + bias) where it is learned, else 1, colour = clamp(½ + raw, 0, 1). Equal raw numbers give equal bits on every
-//! machine.
+//! What draws a level.
 
-use b2p_kernels::zeros;
-use rayon::prelude::*;
+use std::fmt;
+use std::str::FromStr;
 
-use super::activations::{sigmoid, softplus, tanh};
-use super::{Frame, Gaussians};
-use crate::geometry::Voxels;
-use crate::network::{RAW, Shape};
+use serde::{Deserialize, Serialize};
 
-/// Gaussians per parallel task.
-const BLOCK: usize = 4096;
+use crate::error::{Error, Result};
 
-/// Activates raw numbers, [`RAW`] per Gaussian.
-///
-/// With `children` 8, voxel `p` generates Gaussians `8p + octant`, one for each child whether occupied or not, with learned opacity;
-/// with 1, voxel `p` generates Gaussian `p`, opaque.
-///
-/// # Panics
-/// If `raw` is not [`RAW`] numbers for each Gaussian of `voxels`.
-pub fn activate(raw: &[f32], voxels: &Voxels, children: usize, shape: &Shape, frame: Frame) -> Gaussians {
-    let count = voxels.len() * children;
-    assert_eq!(raw.len(), count * RAW, "raw numbers for every Gaussian");
-    let generated = voxels.depth() + u8::from(children == 8);
-    let edge = 2.0 / (1u32 << generated) as f32;
-    let mut gaussians = Gaussians {
-        blur: shape.blur * edge * edge,
-        position: zeros(count),
-        scale: zeros(count),
-        rotation: zeros(count),
-        opacity: zeros(count),
-        colour: zeros(count),
-        frame,
-        ..Gaussians::default()
-    };
-    gaussians
-        .position
-        .par_chunks_mut(BLOCK)
-        .zip(gaussians.scale.par_chunks_mut(BLOCK))
-        .zip(gaussians.rotation.par_chunks_mut(BLOCK))
-        .zip(gaussians.opacity.par_chunks_mut(BLOCK))
-        .zip(gaussians.colour.par_chunks_mut(BLOCK))
-        .zip(raw.par_chunks(BLOCK * RAW))
-        .enumerate()
-        .for_each(|(block, (((((position, scale), rotation), opacity), colour), raw))| {
-            for (g, raw) in raw.chunks(GROUP * RAW).enumerate() {
-                let group = Group::new(raw, shape, children == 8);
-                for j in 0..raw.len() / RAW {
-                    let to = g * GROUP + j;
-                    let centre = centre(voxels, children, block * BLOCK + to, edge);
-                    for axis in 0..3 {
-                        position[to][axis] = centre[axis] + group.offset[axis][j] * edge;
-                        scale[to][axis] = group.scale[axis][j] * edge;
-                        colour[to][axis] = group.colour[axis][j];
-                    }
-                    rotation[to] = group.rotation.map(|component| component[j]);
-                    opacity[to] = group.opacity[j];
-                }
-            }
-        });
-    gaussians
+/// Which of a model's Gaussian generators are used. What a stream holds bears on neither, so that any stream of the model decodes with both.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Heads {
+    /// Those that every model has.
+    #[default]
+    Best,
+    /// Thinner ones for weak machines, which only some models have: less accurate in a fraction of the time.
+    Quick,
 }
 
-/// Gaussians whose numbers are computed side by side.
-pub(super) const GROUP: usize = 16;
+impl Heads {
+    /// All, the default first.
+    pub const ALL: [Heads; 2] = [Heads::Best, Heads::Quick];
 
-pub(super) type Lane = [f32; GROUP];
-
-/// Activated numbers, each kind apart; positions and scales in voxels.
-struct Group {
-    offset: [Lane; 3],
-    scale: [Lane; 3],
-    rotation: [Lane; 4],
-    opacity: Lane,
-    colour: [Lane; 3],
-}
-
-impl Group {
-    /// Up to [`GROUP`] Gaussians; what is missing is as if raw numbers were zero.
-    fn new(raw: &[f32], shape: &Shape, translucent: bool) -> Group {
-        let mut lanes = [[0.0; GROUP]; RAW];
-        for (j, raw) in raw.chunks_exact(RAW).enumerate() {
-            for (lane, &raw) in lanes.iter_mut().zip(raw) {
-                lane[j] = raw;
-            }
+    fn name(self) -> &'static str {
+        match self {
+            Heads::Best => "best",
+            Heads::Quick => "quick",
         }
-        let three = |first: usize| [lanes[first], lanes[first + 1], lanes[first + 2]];
-        let offset = |x: f32| tanh(x) * shape.offset_range;
-        let scale = |x: f32| softplus(x + shape.scale_bias) * shape.scale_range;
-        let opacity = match translucent {
-            true => lanes[10].map(|x| sigmoid(x + shape.opacity_bias)),
-            false => [1.0; GROUP],
-        };
-        let rotation = [lanes[6].map(|w| w + 1.0), lanes[7], lanes[8], lanes[9]];
-        Group {
-            offset: three(0).map(|lane| lane.map(offset)),
-            scale: three(3).map(|lane| lane.map(scale)),
-            rotation: normalised(rotation),
-            opacity,
-            colour: three(11).map(|lane| lane.map(|x| (0.5 + x).clamp(0.0, 1.0))),
+    }
+
+    pub(crate) fn is_best(&self) -> bool {
+        *self == Heads::Best
+    }
+}
+
+impl fmt::Display for Heads {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Heads {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        let all = Heads::ALL;
+        all.into_iter().find(|h| h.name() == name).ok_or_else(|| {
+            let names = all.map(Heads::name).join(", ");
+            Error::Usage(format!("no heads `{name}`, but {names}"))
+        })
+    }
+}
+
+/// What makes Gaussians of a level.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum HeadSet {
+    /// The best heads of a model.
+    Best,
+    /// Its quick ones: less accurate in a fraction of the time.
+    Quick,
+    /// Opaque discs in closed form; no model file is needed. Of streams of version 3 alone.
+    #[default]
+    Surfels,
+}
+
+impl HeadSet {
+    /// All, the most accurate first.
+    pub const ALL: [HeadSet; 3] = [HeadSet::Best, HeadSet::Quick, HeadSet::Surfels];
+
+    fn name(self) -> &'static str {
+        match self {
+            HeadSet::Best => "best",
+            HeadSet::Quick => "quick",
+            HeadSet::Surfels => "surfels",
+        }
+    }
+
+    /// The heads of a model; surfels have none.
+    pub fn learned(self) -> Option<Heads> {
+        match self {
+            HeadSet::Best => Some(Heads::Best),
+            HeadSet::Quick => Some(Heads::Quick),
+            HeadSet::Surfels => None,
         }
     }
 }
 
-/// The centre of the voxel that Gaussian `i` belongs to. Exact in f32 down to level 20, and within half a voxel at 21 and 22.
-fn centre(voxels: &Voxels, children: usize, i: usize, edge: f32) -> [f32; 3] {
-    let parent = voxels.coordinate(i / children);
-    let coordinate = match children {
-        8 => std::array::from_fn(|axis| 2 * parent[axis] + (i as u32 >> axis & 1)),
-        _ => parent,
-    };
-    coordinate.map(|v| ((f64::from(v) + 0.5) * f64::from(edge) - 1.0) as f32)
+impl From<Heads> for HeadSet {
+    fn from(heads: Heads) -> Self {
+        match heads {
+            Heads::Best => HeadSet::Best,
+            Heads::Quick => HeadSet::Quick,
+        }
+    }
 }
 
-/// The unit quaternions along `q`; the identity for zero.
-pub(super) fn normalised(mut q: [Lane; 4]) -> [Lane; 4] {
-    let mut norm = [0.0f64; GROUP];
-    for component in &q {
-        for (norm, x) in norm.iter_mut().zip(component) {
-            *norm += f64::from(*x).powi(2);
-        }
+impl fmt::Display for HeadSet {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
     }
-    let norm = norm.map(f64::sqrt);
-    for (i, component) in q.iter_mut().enumerate() {
-        let identity = if i == 0 { 1.0 } else { 0.0 };
-        for (x, norm) in component.iter_mut().zip(norm) {
-            let unit = (f64::from(*x) / norm) as f32;
-            *x = if norm > 0.0 { unit } else { identity };
-        }
-    }
-    q
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+impl FromStr for HeadSet {
+    type Err = Error;
 
-    #[test]
-    fn raw_zeros_give_opaque_grey_balls_at_the_voxel_centres() {
-        let voxels = Voxels::new(2, vec![0, 63]);
-        let gaussians = activate(&[0.0; 2 * RAW], &voxels, 1, &Shape::tiny(), Frame::default());
-        assert_eq!(gaussians.position, [[-0.75; 3], [0.75; 3]]);
-        assert_eq!(gaussians.rotation[0], [1.0, 0.0, 0.0, 0.0]);
-        assert_eq!(gaussians.opacity, [1.0, 1.0]);
-        assert_eq!(gaussians.colour[1], [0.5; 3]);
-        assert!(
-            (gaussians.scale[0][0] / 0.5 - 0.55).abs() < 0.01,
-            "σ is about half a voxel"
-        );
-    }
-
-    #[test]
-    fn eight_children_surround_their_parent_s_centre() {
-        let voxels = Voxels::new(1, vec![7]);
-        let gaussians = activate(&[0.0; 8 * RAW], &voxels, 8, &Shape::tiny(), Frame::default());
-        assert_eq!(gaussians.position[0], [0.25; 3]);
-        assert_eq!(gaussians.position[1], [0.75, 0.25, 0.25]);
-        assert_eq!(gaussians.position[4], [0.25, 0.25, 0.75]);
-        assert!(gaussians.opacity.iter().all(|o| (0.85..0.9).contains(o)));
-    }
-
-    #[test]
-    fn the_model_says_how_blurred_its_gaussians_are_in_generated_voxels() {
-        let shape = Shape {
-            blur: 0.25,
-            ..Shape::tiny()
-        };
-        for (children, edge) in [(1, 1.0), (8, 0.5)] {
-            let (raw, voxels) = (vec![0.0; children * RAW], Voxels::new(1, vec![7]));
-            let gaussians = activate(&raw, &voxels, children, &shape, Frame::default());
-            assert_eq!(gaussians.blur, 0.25 * edge * edge);
-        }
-    }
-
-    #[test]
-    fn extreme_raw_numbers_stay_finite_and_in_range() {
-        let voxels = Voxels::new(3, vec![5]);
-        for extreme in [65504.0, -65504.0] {
-            let g = activate(&[extreme; 8 * RAW], &voxels, 8, &Shape::tiny(), Frame::default());
-            assert!(g.position.iter().flatten().all(|v| v.abs() < 1.2));
-            assert!(g.scale.iter().flatten().all(|v| v.is_finite() && *v >= 0.0));
-            assert!(
-                g.rotation
-                    .iter()
-                    .all(|q| (q.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-5)
-            );
-            assert!(
-                g.opacity
-                    .iter()
-                    .chain(g.colour.iter().flatten())
-                    .all(|v| (0.0..=1.0).contains(v))
-            );
-        }
+    fn from_str(name: &str) -> Result<Self> {
+        let all = HeadSet::ALL;
+        all.into_iter().find(|h| h.name() == name).ok_or_else(|| {
+            let names = all.map(HeadSet::name).join(", ");
+            Error::Usage(format!("no heads `{name}`, but {names}"))
+        })
     }
 }

@@ -1,17 +1,12 @@
 //! 3D Gaussians in memory.
 
-mod activations;
-mod filter;
 mod harmonics;
 mod heads;
 pub mod learned;
-mod residual;
 pub mod surfels;
 
-pub use filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundings};
 pub use harmonics::Harmonics;
-pub use heads::activate;
-pub use residual::{BASIS as COLOUR_BASIS, ColourResidual, Precision, Steps};
+pub use heads::{HeadSet, Heads};
 
 #[cfg(feature = "ply")]
 pub mod ply;

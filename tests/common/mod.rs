@@ -3,13 +3,14 @@
 
 use std::path::Path;
 
-use b2p::bitstream::{Stream, Writer};
 use b2p::cloud::ColouredVoxels;
+use b2p::container::{Stream, Writer};
 use b2p::encoder::{Options, encode};
-use b2p::gaussians::{Precision, Steps};
+use b2p::gaussians::Heads;
 use b2p::geometry::{Voxels, morton};
+use b2p::latents::network::Model;
+use b2p::latents::{Precision, Steps};
 use b2p::log::Log;
-use b2p::network::{Heads, Model};
 use b2p::{Limits, Placement};
 
 /// A coloured ball's surface on a voxel grid.
@@ -73,7 +74,7 @@ impl Ball {
 
 /// A small model with random weights.
 pub fn tiny_model(seed: u64) -> Vec<u8> {
-    b2p::network::untrained(&b2p::network::Shape::tiny(), seed)
+    b2p::latents::network::untrained(&b2p::latents::network::Shape::tiny(), seed)
 }
 
 /// A cloud of these voxels, its colours from their places.

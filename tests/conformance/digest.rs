@@ -1,9 +1,9 @@
 //! What a stream decodes to, as hashes.
 
-use b2p::decoder::{Decoder, Decoding, Exact};
 use b2p::gaussians::Gaussians;
+use b2p::latents::network::Model;
+use b2p::latents::{Decoder, Decoding, Exact};
 use b2p::log::Log;
-use b2p::network::Model;
 use b2p::{Error, Result};
 use sha2::{Digest, Sha256};
 
@@ -53,7 +53,7 @@ pub type Levels = std::result::Result<Vec<String>, String>;
 
 /// The digests of all levels, each decoded on its own from the whole stream.
 pub fn whole(model: &Model, bytes: &[u8]) -> Levels {
-    let header = b2p::bitstream::Header::parse(bytes, &Default::default()).map_err(told)?;
+    let header = b2p::container::Header::parse(bytes, &Default::default()).map_err(told)?;
     let decoder = Decoder::new(model);
     let drawable = decoder.levels(bytes).map_err(told)?;
     let of = |n: u8| {

@@ -1,7 +1,7 @@
 //! What a stream of version 3 decodes to, as hashes.
 
 use b2p::Error;
-use b2p::bitstream::Header;
+use b2p::container::Header;
 use b2p::decoder::{StreamDecoder, StreamDecoding};
 use b2p::log::Log;
 

@@ -27,9 +27,10 @@ mod transform;
 use std::path::{Path, PathBuf};
 
 use b2p::Isa;
-use b2p::decoder::Decoder;
+use b2p::latents::Decoder;
+use b2p::latents::network::Model;
+use b2p::layers::Precision;
 use b2p::log::Log;
-use b2p::network::{Model, Precision};
 use digest::{Levels, in_pieces, whole};
 use models::model;
 

@@ -1,13 +1,13 @@
 //! The streams of the suite: what is unusual about them is in their names.
 
 use b2p::Placement;
-use b2p::bitstream::{Format, Header, Writer};
+use b2p::container::{Format, Header, Writer};
 use b2p::encoder::{Options, Residual, encode};
-use b2p::entropy::{Condition, encode_level, encode_passes, latent_hash};
-use b2p::gaussians::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
+use b2p::latents::entropy::{Condition, encode_level, encode_passes, latent_hash};
+use b2p::latents::network::Model;
+use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::log::Log;
-use b2p::network::Model;
 
 use crate::common::{Ball, cloud_of, steps};
 use crate::models::model;

@@ -1,6 +1,6 @@
 //! The models that the streams of the suite are coded with.
 
-use b2p::network::{Model, Shape, Upsample, untrained};
+use b2p::latents::network::{Model, Shape, Upsample, untrained};
 
 /// A model of the suite; `lite` is the one that ships.
 pub fn model(name: &str) -> Model {

@@ -6,7 +6,8 @@
 use std::path::PathBuf;
 
 use b2p::Isa;
-use b2p::decoder::{HeadSet, StreamDecoder};
+use b2p::decoder::StreamDecoder;
+use b2p::gaussians::HeadSet;
 
 use crate::digest_transform::{in_pieces, whole};
 use crate::{folder, pools};

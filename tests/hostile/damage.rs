@@ -1,8 +1,8 @@
 //! Every way to cut a small stream, and every way to change one bit or to lose one byte of it.
 
-use b2p::decoder::{Decoder, Exact};
+use b2p::latents::network::Model;
+use b2p::latents::{Decoder, Exact};
 use b2p::log::Log;
-use b2p::network::Model;
 use rayon::prelude::*;
 
 use crate::common::small_stream;

@@ -2,7 +2,7 @@
 
 use std::iter::repeat;
 
-use b2p::decoder::Decoder;
+use b2p::latents::Decoder;
 use b2p::log::Log;
 use b2p::{Cancel, Error, Limits};
 

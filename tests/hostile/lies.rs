@@ -1,10 +1,10 @@
 //! Streams whose checksums are right and whose numbers are not.
 
 use b2p::Limits;
-use b2p::bitstream::Header;
-use b2p::bitstream::Stream;
-use b2p::gaussians::{ColourFilter, ColourResidual};
-use b2p::network::Heads;
+use b2p::container::Header;
+use b2p::container::Stream;
+use b2p::gaussians::Heads;
+use b2p::latents::{ColourFilter, ColourResidual};
 use rayon::prelude::*;
 
 use crate::common::{all_in, small_stream, with_filter, with_residual};

@@ -10,10 +10,10 @@ mod seal;
 mod stack;
 mod transform;
 
-use b2p::decoder::Decoder;
 use b2p::gaussians::Gaussians;
+use b2p::latents::Decoder;
+use b2p::latents::network::Model;
 use b2p::log::Log;
-use b2p::network::Model;
 
 fn model() -> Model {
     Model::from_bytes(&common::tiny_model(0)).expect("an untrained model loads")
@@ -54,7 +54,7 @@ fn pushed(
 
 /// Where each level of an undamaged stream ends.
 fn ends(bytes: &[u8]) -> Vec<(u8, usize)> {
-    let header = b2p::bitstream::Header::parse(bytes, &b2p::Limits::default()).unwrap();
+    let header = b2p::container::Header::parse(bytes, &b2p::Limits::default()).unwrap();
     let end = |level| (level, header.prefix_bytes(level).unwrap() as usize);
     (header.base..=header.top).map(end).collect()
 }

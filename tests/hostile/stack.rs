@@ -4,8 +4,8 @@ use b2p::Limits;
 use b2p::encoder::{Options, encode};
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::pixels::{Background, render};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, render};
 
 use crate::common::{Ball, cloud_of};
 use crate::{decoded, model};

@@ -2,7 +2,7 @@
 
 use std::iter::repeat;
 
-use b2p::bitstream::Header;
+use b2p::container::Header;
 use b2p::decoder::{StreamDecoder, StreamDecoding};
 use b2p::encoder::transform::{Options, encode};
 use b2p::log::Log;

@@ -24,7 +24,8 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-use b2p::decoder::{HeadSet, StreamDecoder};
+use b2p::decoder::StreamDecoder;
+use b2p::gaussians::HeadSet;
 
 type Result<T = ()> = std::result::Result<T, Box<dyn Error>>;
 

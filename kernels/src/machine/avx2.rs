@@ -9,6 +9,7 @@ use crate::convert::{Halves, MAX};
 use crate::exact::LIMIT;
 use crate::machine::machine;
 use crate::rows::{Lanes, PANEL};
+use crate::simd::avx2::{with_avx_vnni, with_avx2};
 use crate::tile::{Arithmetic, Block, Machine, columns};
 use crate::winograd::Registers;
 
@@ -40,12 +41,13 @@ pub(crate) unsafe fn run_vnni(arithmetic: Arithmetic, block: &Block, whole: usiz
     }
 }
 
-/// # Safety
-/// As [`run_vnni`].
-#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avxvnni")]
-unsafe fn wide_vnni<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
-    // SAFETY: the caller's promise.
-    unsafe { columns::<M, R, V, P>(block) }
+with_avx_vnni! {
+    /// # Safety
+    /// As [`run_vnni`].
+    unsafe fn wide_vnni<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
+        // SAFETY: the caller's promise.
+        unsafe { columns::<M, R, V, P>(block) }
+    }
 }
 
 /// # Safety
@@ -60,20 +62,22 @@ pub(crate) unsafe fn spin_vnni(arithmetic: Arithmetic, rounds: usize) -> usize {
     }
 }
 
-/// # Safety
-/// As [`run_vnni`].
-#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avxvnni")]
-unsafe fn spinning_vnni<M: Machine>(rounds: usize) -> usize {
-    // SAFETY: the caller's promise.
-    unsafe { ceiling::rounds::<M>(rounds) }
+with_avx_vnni! {
+    /// # Safety
+    /// As [`run_vnni`].
+    unsafe fn spinning_vnni<M: Machine>(rounds: usize) -> usize {
+        // SAFETY: the caller's promise.
+        unsafe { ceiling::rounds::<M>(rounds) }
+    }
 }
 
-/// # Safety
-/// As [`run`].
-#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
-unsafe fn wide<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
-    // SAFETY: the caller's promise.
-    unsafe { columns::<M, R, V, P>(block) }
+with_avx2! {
+    /// # Safety
+    /// As [`run`].
+    unsafe fn wide<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
+        // SAFETY: the caller's promise.
+        unsafe { columns::<M, R, V, P>(block) }
+    }
 }
 
 /// # Safety
@@ -89,12 +93,13 @@ pub(crate) unsafe fn spin(arithmetic: Arithmetic, rounds: usize) -> usize {
     }
 }
 
-/// # Safety
-/// As [`run`].
-#[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
-unsafe fn spinning<M: Machine>(rounds: usize) -> usize {
-    // SAFETY: the caller's promise.
-    unsafe { ceiling::rounds::<M>(rounds) }
+with_avx2! {
+    /// # Safety
+    /// As [`run`].
+    unsafe fn spinning<M: Machine>(rounds: usize) -> usize {
+        // SAFETY: the caller's promise.
+        unsafe { ceiling::rounds::<M>(rounds) }
+    }
 }
 
 machine!(

@@ -7,10 +7,11 @@ use crate::f16;
 use crate::ceiling;
 use crate::convert::{Halves, MAX};
 use crate::exact::LIMIT;
-use crate::isa::{MIN_GROUP, WIDE};
+
 use crate::machine::machine;
 use crate::rows::{Lanes, PANEL};
-use crate::tile::{Arithmetic, Block, Machine, columns};
+use crate::simd::avx512::{with_avx512, with_bf16};
+use crate::tile::{Arithmetic, Block, MIN_GROUP, Machine, WIDE, columns};
 use crate::winograd::Registers;
 
 /// # Safety
@@ -36,24 +37,22 @@ pub(crate) unsafe fn run(arithmetic: Arithmetic, block: &Block, whole: usize) {
     }
 }
 
-/// # Safety
-/// As [`run`].
-#[target_feature(
-    enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni"
-)]
-unsafe fn wide<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
-    // SAFETY: the caller's promise.
-    unsafe { columns::<M, R, V, P>(block) }
+with_avx512! {
+    /// # Safety
+    /// As [`run`].
+    unsafe fn wide<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
+        // SAFETY: the caller's promise.
+        unsafe { columns::<M, R, V, P>(block) }
+    }
 }
 
-/// # Safety
-/// As [`run`] for bf16.
-#[target_feature(
-    enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni,avx512bf16"
-)]
-unsafe fn wide_brain<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
-    // SAFETY: the caller's promise.
-    unsafe { columns::<M, R, V, P>(block) }
+with_bf16! {
+    /// # Safety
+    /// As [`run`] for bf16.
+    unsafe fn wide_brain<M: Machine, const R: usize, const V: usize, const P: usize>(block: &Block) {
+        // SAFETY: the caller's promise.
+        unsafe { columns::<M, R, V, P>(block) }
+    }
 }
 
 /// # Safety
@@ -69,24 +68,22 @@ pub(crate) unsafe fn spin(arithmetic: Arithmetic, rounds: usize) -> usize {
     }
 }
 
-/// # Safety
-/// As [`run`].
-#[target_feature(
-    enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni"
-)]
-unsafe fn spinning<M: Machine>(rounds: usize) -> usize {
-    // SAFETY: the caller's promise.
-    unsafe { ceiling::rounds::<M>(rounds) }
+with_avx512! {
+    /// # Safety
+    /// As [`run`].
+    unsafe fn spinning<M: Machine>(rounds: usize) -> usize {
+        // SAFETY: the caller's promise.
+        unsafe { ceiling::rounds::<M>(rounds) }
+    }
 }
 
-/// # Safety
-/// As [`run`] for bf16.
-#[target_feature(
-    enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni,avx512bf16"
-)]
-unsafe fn spinning_brain(rounds: usize) -> usize {
-    // SAFETY: the caller's promise.
-    unsafe { ceiling::rounds::<Brain>(rounds) }
+with_bf16! {
+    /// # Safety
+    /// As [`run`] for bf16.
+    unsafe fn spinning_brain(rounds: usize) -> usize {
+        // SAFETY: the caller's promise.
+        unsafe { ceiling::rounds::<Brain>(rounds) }
+    }
 }
 
 machine!(
@@ -169,28 +166,27 @@ unsafe fn spread8_f32(at: *const f32) -> __m256 {
     _mm256_set1_ps(unsafe { at.read_unaligned() })
 }
 
-/// Rows of f16 as pairs of bf16, rounded to even; an odd row's last pair has a zero.
-///
-/// # Safety
-/// The processor must also have AVX512_BF16.
-#[target_feature(
-    enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni,avx512bf16"
-)]
-pub(crate) unsafe fn to_brain(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
-    let words = cin.div_ceil(2);
-    for (to, &row) in to.chunks_exact_mut(words).zip(rows) {
-        let from = &input[row as usize * cin..][..cin];
-        for (to, from) in to.chunks_mut(PANEL).zip(from.chunks(2 * PANEL)) {
-            let (here, there) = (u32::MAX >> (32 - from.len()), u16::MAX >> (PANEL - to.len()));
-            // SAFETY: only the values that are there are read, and only the words that are there written. The types are 512 bits
-            // of anything.
-            unsafe {
-                let halves = _mm512_maskz_loadu_epi16(here, from.as_ptr().cast());
-                let low = _mm512_cvtph_ps(_mm512_castsi512_si256(halves));
-                let high = _mm512_cvtph_ps(_mm512_extracti64x4_epi64::<1>(halves));
-                let pairs = _mm512_cvtne2ps_pbh(high, low);
-                let pairs = std::mem::transmute::<__m512bh, __m512i>(pairs);
-                _mm512_mask_storeu_epi32(to.as_mut_ptr().cast(), there, pairs);
+with_bf16! {
+    /// Rows of f16 as pairs of bf16, rounded to even; an odd row's last pair has a zero.
+    ///
+    /// # Safety
+    /// The processor must also have AVX512_BF16.
+    pub(crate) unsafe fn to_brain(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
+        let words = cin.div_ceil(2);
+        for (to, &row) in to.chunks_exact_mut(words).zip(rows) {
+            let from = &input[row as usize * cin..][..cin];
+            for (to, from) in to.chunks_mut(PANEL).zip(from.chunks(2 * PANEL)) {
+                let (here, there) = (u32::MAX >> (32 - from.len()), u16::MAX >> (PANEL - to.len()));
+                // SAFETY: only the values that are there are read, and only the words that are there written. The types are 512 bits
+                // of anything.
+                unsafe {
+                    let halves = _mm512_maskz_loadu_epi16(here, from.as_ptr().cast());
+                    let low = _mm512_cvtph_ps(_mm512_castsi512_si256(halves));
+                    let high = _mm512_cvtph_ps(_mm512_extracti64x4_epi64::<1>(halves));
+                    let pairs = _mm512_cvtne2ps_pbh(high, low);
+                    let pairs = std::mem::transmute::<__m512bh, __m512i>(pairs);
+                    _mm512_mask_storeu_epi32(to.as_mut_ptr().cast(), there, pairs);
+                }
             }
         }
     }

@@ -7,9 +7,10 @@ use std::arch::aarch64::*;
 use std::arch::asm;
 
 use crate::Isa;
-use crate::machine::{REACH, digits, fetch};
+use crate::machine::{REACH, digits};
 use crate::plan::PlanTile;
 use crate::rows::{AHEAD, Extents, Lanes, PANEL};
+use crate::simd::prefetch;
 
 /// `high`, `low` and their sum.
 const DIGITS: usize = 3;
@@ -86,7 +87,7 @@ pub(crate) fn accumulate(
     buffers: &mut Buffers,
     sums: &mut Vec<Lanes>,
 ) -> bool {
-    assert!(isa.has_dot() && plan.group() == ROWS);
+    assert!(isa.dot().is_some() && plan.group() == ROWS);
     let Extents { volume, cin, .. } = weights.extents;
     plan.check(volume, input.len() / cin);
     let row = cin.div_ceil(2 * STEP) * 2 * DIGITS;
@@ -162,7 +163,7 @@ unsafe fn split_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [u32]) ->
     let each = to.chunks_exact_mut(cin.div_ceil(EIGHT) * WORDS);
     for (i, (to, &row)) in each.zip(rows).enumerate() {
         if let Some(&next) = rows.get(i + AHEAD) {
-            fetch(&input[next as usize * cin..][..cin]);
+            prefetch(&input[next as usize * cin..][..cin]);
         }
         let from = &input[row as usize * cin..][..cin];
         let (whole, rest) = from.as_chunks::<EIGHT>();
@@ -257,7 +258,7 @@ fn add_products<const WORD: u32>(sums: &mut int32x4_t, weights: int8x16_t, facto
 
 /// Multiplies for as long as `rounds` say, and gives the number of products of numbers: see [`crate::ceiling`].
 pub(crate) fn spin(isa: Isa, rounds: usize) -> usize {
-    assert!(isa.has_dot());
+    assert!(isa.dot().is_some());
     // SAFETY: the processor has the instruction.
     unsafe { spinning(rounds) }
 }

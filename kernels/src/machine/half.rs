@@ -14,9 +14,9 @@
 use std::arch::aarch64::*;
 use std::arch::asm;
 
-use crate::isa::Isa;
 use crate::machine::{halves_mut, neon};
 use crate::rows::{Extents, Lanes, PANEL};
+use crate::simd::Isa;
 use crate::tile::Block;
 use crate::{ceiling, f16};
 

@@ -50,19 +50,6 @@ pub(crate) fn floats_mut(words: &mut [u32]) -> &mut [f32] {
     unsafe { std::slice::from_raw_parts_mut(words.as_mut_ptr().cast(), words.len()) }
 }
 
-/// Asks for a row to be brought into the cache, if the machine can be asked.
-#[inline(always)]
-pub(crate) fn fetch<T>(row: &[T]) {
-    #[cfg(target_arch = "x86_64")]
-    for line in (0..size_of_val(row)).step_by(64) {
-        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // SAFETY: SSE is part of the baseline; a fetch reads nothing, and may be of any address.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(row.as_ptr().cast::<i8>().wrapping_add(line)) };
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = row;
-}
-
 /// A [`Machine`](crate::tile::Machine) of `$lanes` words: the intrinsics that make zeros, load, store, spread and add words, and
 /// the multiplication.
 #[cfg(target_arch = "x86_64")]
@@ -132,43 +119,12 @@ use machine;
 /// Calls the unsafe `$body::<H, …>(args…)` as compiled for `$isa`, `H` being its conversions of f16.
 macro_rules! with_halves {
     ($isa:expr, fn $body:ident <$($g:ident: $bound:path),*> ($($arg:ident: $ty:ty),* $(,)?)) => {{
-        #[inline(never)]
-        fn scalar <$($g: $bound),*> ($($arg: $ty),*) {
-            // SAFETY: plain Rust.
-            unsafe { $body::<$crate::convert::Portable, $($g),*>($($arg),*) }
+        #[inline(always)]
+        fn call<S: $crate::simd::Simd + $crate::convert::HasHalves, $($g: $bound),*> (_: S, $($arg: $ty),*) {
+            // SAFETY: the token of these conversions.
+            unsafe { $body::<S::Halves, $($g),*>($($arg),*) }
         }
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt")]
-        fn avx2 <$($g: $bound),*> ($($arg: $ty),*) {
-            // SAFETY: this function has the features.
-            unsafe { $body::<$crate::machine::avx2::Convert, $($g),*>($($arg),*) }
-        }
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(
-            enable = "avx2,fma,f16c,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx512vnni"
-        )]
-        fn avx512 <$($g: $bound),*> ($($arg: $ty),*) {
-            // SAFETY: this function has the features.
-            unsafe { $body::<$crate::machine::avx512::Convert, $($g),*>($($arg),*) }
-        }
-        #[cfg(target_arch = "aarch64")]
-        #[target_feature(enable = "neon")]
-        fn neon <$($g: $bound),*> ($($arg: $ty),*) {
-            // SAFETY: this function has the feature.
-            unsafe { $body::<$crate::machine::neon::Convert, $($g),*>($($arg),*) }
-        }
-        match $crate::isa::Isa::level($isa) {
-            $crate::isa::Level::Scalar => scalar $(::<$g>)* ($($arg),*),
-            #[cfg(target_arch = "x86_64")]
-            // SAFETY: an `Isa` of this level is only made where the processor has these features.
-            $crate::isa::Level::Avx2 | $crate::isa::Level::AvxVnni => unsafe { avx2 $(::<$g>)* ($($arg),*) },
-            #[cfg(target_arch = "x86_64")]
-            // SAFETY: as above.
-            $crate::isa::Level::Avx512 | $crate::isa::Level::Amx => unsafe { avx512 $(::<$g>)* ($($arg),*) },
-            #[cfg(target_arch = "aarch64")]
-            // SAFETY: an `Isa` of this level is only made where the processor has this feature.
-            $crate::isa::Level::Neon | $crate::isa::Level::NeonDot => unsafe { neon $(::<$g>)* ($($arg),*) },
-        }
+        $crate::simd::dispatch!($isa, fn call<$($g: $bound),*>($($arg: $ty),*))
     }};
 }
 pub(crate) use with_halves;

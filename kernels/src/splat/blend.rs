@@ -13,7 +13,7 @@ use super::layout::Work;
 use super::pixels::{Best, Pending};
 use super::{Bounds, Crossing, Ellipse};
 use crate::Isa;
-use crate::isa::dispatch;
+use crate::simd::{Simd, dispatch};
 
 /// Side of a tile in pixels.
 pub const TILE: u32 = 32;
@@ -223,7 +223,7 @@ impl Tile {
 }
 
 #[inline(always)]
-fn write(tile: &Tile, behind: [f32; 4], rows: &mut [[f32; 4]], stride: usize, count: &mut u32) {
+fn write<S: Simd>(_: S, tile: &Tile, behind: [f32; 4], rows: &mut [[f32; 4]], stride: usize, count: &mut u32) {
     let side = SIDE as usize;
     let [x0, y0, x1, y1] = {
         let Bounds { x0, y0, x1, y1 } = tile.part;

@@ -104,6 +104,30 @@ pub(super) trait Double: Copy {
     fn lt(self, other: Self) -> Self::Mask;
 }
 
+/// The lanes of an instruction set.
+pub(super) trait HasLanes: crate::simd::Simd {
+    type Lanes: Lanes;
+}
+
+impl HasLanes for crate::simd::Scalar {
+    type Lanes = super::plain::Plain;
+}
+
+#[cfg(target_arch = "x86_64")]
+impl HasLanes for crate::simd::Avx2 {
+    type Lanes = super::avx2::Avx2;
+}
+
+#[cfg(target_arch = "x86_64")]
+impl HasLanes for crate::simd::Avx512 {
+    type Lanes = super::avx512::Avx512;
+}
+
+#[cfg(target_arch = "aarch64")]
+impl HasLanes for crate::simd::Neon {
+    type Lanes = super::neon::Neon;
+}
+
 /// The polynomial of degree 4 through (0, 1) that is nearest to `2^f` on `[−½, ½]`, in relative error; highest power first.
 pub(super) const EXP2: [f32; 5] = [9.582_853e-3, 5.590_642_6e-2, 2.402_41e-1, 6.931_242e-1, 1.0];
 /// As [`EXP2`], on `[0, 1]`.
@@ -120,53 +144,11 @@ pub(super) const ROUND: f32 = 12_582_912.0;
 /// Calls `$body::<L>(args…)` with the lanes `L` of `$isa`, as compiled for it.
 macro_rules! by_level {
     ($isa:expr, fn $body:ident $(<const $flag:ident: u8>)? ($($arg:ident: $ty:ty),* $(,)?) $(-> $out:ty)?) => {{
-        #[inline(never)]
-        fn scalar $(<const $flag: u8>)? ($($arg: $ty),*) $(-> $out)? {
-            $body::<$crate::splat::plain::Plain $(, $flag)?>($($arg),*)
+        #[inline(always)]
+        fn call<S: $crate::splat::lanes::HasLanes $(, const $flag: u8)?>(_: S, $($arg: $ty),*) $(-> $out)? {
+            $body::<S::Lanes $(, $flag)?>($($arg),*)
         }
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt")]
-        fn avx2 $(<const $flag: u8>)? ($($arg: $ty),*) $(-> $out)? {
-            $body::<$crate::splat::avx2::Avx2 $(, $flag)?>($($arg),*)
-        }
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(
-            enable = "avx2,fma,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512cd,avx512dq,avx512vl"
-        )]
-        fn avx512 $(<const $flag: u8>)? ($($arg: $ty),*) $(-> $out)? {
-            $body::<$crate::splat::avx512::Avx512 $(, $flag)?>($($arg),*)
-        }
-        #[cfg(target_arch = "x86_64")]
-        {
-            let level = $crate::isa::Isa::level($isa);
-            if level >= $crate::isa::Level::Avx512 {
-                // SAFETY: an `Isa` of this level or above is only made where the processor has these features.
-                unsafe { avx512 $(::<$flag>)? ($($arg),*) }
-            } else if level >= $crate::isa::Level::Avx2 {
-                // SAFETY: as above.
-                unsafe { avx2 $(::<$flag>)? ($($arg),*) }
-            } else {
-                scalar $(::<$flag>)? ($($arg),*)
-            }
-        }
-        #[cfg(target_arch = "aarch64")]
-        {
-            #[target_feature(enable = "neon")]
-            fn neon $(<const $flag: u8>)? ($($arg: $ty),*) $(-> $out)? {
-                $body::<$crate::splat::neon::Neon $(, $flag)?>($($arg),*)
-            }
-            if $crate::isa::Isa::level($isa) >= $crate::isa::Level::Neon {
-                // SAFETY: an `Isa` of this level is only made where the processor has NEON.
-                unsafe { neon $(::<$flag>)? ($($arg),*) }
-            } else {
-                scalar $(::<$flag>)? ($($arg),*)
-            }
-        }
-        #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
-        {
-            let _ = $isa;
-            scalar $(::<$flag>)? ($($arg),*)
-        }
+        $crate::simd::dispatch!($isa, fn call $(<; const $flag: u8>)? ($($arg: $ty),*) $(-> $out)?)
     }};
 }
 pub(super) use by_level;

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use b2p::Limits;
 use b2p::cloud::PointCloud;
 use b2p::gaussians::Frame;
-use b2p::network::{Heads, Model};
+use b2p::gaussians::Heads;
+use b2p::latents::network::Model;
 
 use super::load_mesh;
 use crate::error::{LabError, Result};

@@ -4,6 +4,7 @@ pub mod dataset;
 pub mod eval;
 pub mod occupancy;
 pub mod scene;
+pub mod tradeoff;
 pub mod voxelize;
 
 use std::path::Path;
@@ -29,6 +30,7 @@ enum Command {
     Scene(scene::Args),
     Eval(eval::Args),
     Occupancy(occupancy::Args),
+    Tradeoff(tradeoff::Args),
 }
 
 impl Cli {
@@ -43,6 +45,7 @@ impl Cli {
             Command::Scene(args) => args.run(),
             Command::Eval(args) => args.run(),
             Command::Occupancy(args) => args.run(),
+            Command::Tradeoff(args) => args.run(),
         }
     }
 }

@@ -1,13 +1,14 @@
 //! One object, and everything that is judged by it.
 
 use b2p::Limits;
-use b2p::bitstream::Header;
 use b2p::cloud::{PointCloud, voxelise};
-use b2p::decoder::Decoder;
+use b2p::container::Header;
 use b2p::encoder::{Options, encode};
+use b2p::gaussians::Heads;
 use b2p::gaussians::{Frame, Gaussians};
+use b2p::latents::Decoder;
+use b2p::latents::network::Model;
 use b2p::log::Log;
-use b2p::network::{Heads, Model};
 
 use super::item::Content;
 use super::picture::Picture;
@@ -226,7 +227,7 @@ fn rate_of(header: &Header, level: u8, points: Option<u64>) -> Result<Rate> {
 
 #[cfg(test)]
 mod tests {
-    use b2p::network::{Shape, untrained};
+    use b2p::latents::network::{Shape, untrained};
     use glam::Vec3;
 
     use super::*;

@@ -4,9 +4,9 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use b2p::Limits;
-use b2p::bitstream::MAGIC;
 use b2p::cloud::PointCloud;
 use b2p::cloud::ply::Ply;
+use b2p::container::MAGIC;
 use b2p::gaussians::Gaussians;
 
 use crate::error::{LabError, Result};

@@ -1,6 +1,6 @@
 //! How far a picture is from the truth.
 
-use b2p::tradeoff::Plane;
+use b2p::metrics::Plane;
 use fast_ssim2::{PixelDescriptor, PixelSlice, Ssimulacra2Error, Ssimulacra2Reference};
 
 use super::picture::Picture;
@@ -46,7 +46,7 @@ fn assert_same_size(a: &Picture, b: &Picture) {
     );
 }
 
-/// Multi-scale structural similarity: see [`b2p::tradeoff::ms_ssim`]. None if a side is 160 pixels or less.
+/// Multi-scale structural similarity: see [`b2p::metrics::ms_ssim`]. None if a side is 160 pixels or less.
 ///
 /// # Panics
 /// If the pictures differ in size.
@@ -57,7 +57,7 @@ pub fn ms_ssim(a: &Picture, b: &Picture) -> Option<f64> {
         height: p.height,
         values: p.rgb.iter().map(|c| f32::from(c[k])).collect(),
     };
-    b2p::tradeoff::ms_ssim([0, 1, 2].map(|k| [plane(a, k), plane(b, k)]))
+    b2p::metrics::ms_ssim([0, 1, 2].map(|k| [plane(a, k), plane(b, k)]))
 }
 
 /// The truth, prepared for SSIMULACRA2.

@@ -1,6 +1,6 @@
 //! Eight-bit pictures, as metrics compare them.
 
-use b2p::pixels::Image;
+use b2p::renderer::Image;
 
 use crate::error::{LabError, Result};
 

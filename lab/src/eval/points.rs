@@ -4,8 +4,8 @@ use std::collections::HashSet;
 
 use b2p::cloud::PointCloud;
 use b2p::gaussians::{Frame, Gaussians};
-use b2p::pixels::Image;
-use b2p::projection::Camera;
+use b2p::renderer::Image;
+use b2p::renderer::camera::Camera;
 
 use super::nearest::mean_nearest_distance;
 

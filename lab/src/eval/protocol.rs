@@ -4,8 +4,8 @@
 //! 45°. Methods are drawn at 1024² on white and averaged 2×2 to 512², then rounded to 8 bits. The truth is the mesh itself, unlit, at
 //! 512² with 4×4 samples a pixel. The foreground is where the mesh covers more than half of a pixel.
 
-use b2p::pixels::{Background, Image, Renderer};
-use b2p::projection::Camera;
+use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, Image, Renderer};
 use b2p::{Limits, gaussians::Gaussians};
 use rayon::prelude::*;
 use serde::Serialize;

@@ -20,7 +20,10 @@ pub fn load(path: &Path) -> Result<Mesh> {
     })
 }
 
-/// Reads a mesh from a file's bytes; the error says what is wrong.
+/// Reads a mesh from a file's bytes.
+///
+/// # Errors
+/// What is wrong with the file, in words.
 pub fn parse(bytes: &[u8]) -> Result<Mesh, String> {
     let gltf = Gltf::from_slice(bytes).map_err(|e| format!("not a usable glTF file: {e}"))?;
     let blob = gltf

@@ -9,9 +9,9 @@ use b2p_kernels::Isa;
 use rayon::prelude::*;
 
 use super::{Encoded, rates};
-use crate::bitstream::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{self, Filter, Steps, Truth};
+use crate::container::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
 use crate::decoder::{StreamDecoder, colour_hash};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};

@@ -8,10 +8,10 @@
 use rayon::prelude::*;
 
 use super::{LevelInput, RAW};
-use crate::gaussians::activations::{sigmoid, softplus, tanh};
-use crate::gaussians::heads::{GROUP, Lane, normalised};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::Voxels;
+use crate::layers::activations::{GROUP, Lane, normalised};
+use crate::layers::activations::{sigmoid, softplus, tanh};
 
 /// Voxels whose raw numbers are in memory at once; a multiple of 512, as layers need it.
 pub const PART: usize = 16_384;

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::LevelInput;
 use super::load::INPUTS;
-use crate::gaussians::activations::log2;
+use crate::layers::activations::log2;
 
 /// The real value of a parent channel's step, which holds every value exactly (the logarithm's rounded).
 pub const PARENT_STEP: f32 = 1.0 / 512.0;

@@ -8,7 +8,8 @@ use serde::Deserialize;
 use super::network::{Generator, Net, Steps};
 use super::{HeadsModel, RAW, Set};
 use crate::error::{Error, Result, Stage};
-use crate::network::{Heads, ResBlock, Spec, Stored, Tensors, malformed, missing};
+use crate::gaussians::Heads;
+use crate::layers::{ResBlock, Spec, Stored, Tensors, malformed, missing};
 
 /// Channels of a parent and of a child.
 pub const INPUTS: [usize; 2] = [12, 7];

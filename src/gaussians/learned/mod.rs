@@ -40,8 +40,9 @@ use b2p_kernels::{Isa, map_file};
 
 use super::{Frame, Gaussians};
 use crate::error::{Error, Result};
+use crate::gaussians::Heads;
 use crate::geometry::{KernelMap, Octree};
-use crate::network::{Heads, Precision, missing};
+use crate::layers::{Precision, missing};
 use network::Generator;
 #[cfg(test)]
 pub(crate) use network::TERMS;

@@ -9,8 +9,8 @@ use super::inputs::{CHILD_STEP, Channels, PARENT_STEP};
 use super::load::{INPUTS, Shape};
 use super::{LevelInput, RAW};
 use crate::gaussians::{Frame, Gaussians};
+use crate::layers::{Conv, Pool, Precision, ResBlock, Stored, apply, apply_added, apply_part, reals};
 use crate::memory::{NOTHING, Sizes, Term, total};
-use crate::network::{Conv, Pool, Precision, ResBlock, Stored, apply, apply_added, apply_part, reals};
 
 /// The layers.
 pub struct Net<L> {

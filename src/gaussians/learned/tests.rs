@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::*;
 use crate::geometry::{Voxels, morton};
-use crate::network::{Dtype, File};
+use crate::layers::{Dtype, File};
 
 mod files;
 mod reference;

@@ -90,8 +90,8 @@ impl<I: Instructions> Mixer<I> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::entropy::test_tables::Random;
-    use b2p_kernels::Baseline;
+    use crate::testing::Random;
+    use b2p_kernels::Scalar;
     use b2p_kernels::mixing::HEAVIEST;
 
     /// What a bit costs, in bits.
@@ -102,7 +102,7 @@ mod tests {
 
     /// Bits per decision that a network without a clue and one with the mixer behind it take, where the first context tells all but `noise` in 100.
     fn costs(noise: u64, network: i32) -> [f64; 2] {
-        let (mut mixer, mut random) = (Mixer::new(Baseline, 1 << 12), Random(5));
+        let (mut mixer, mut random) = (Mixer::new(Scalar::TOKEN, 1 << 12), Random(5));
         let mut sums = [0.0; 2];
         for _ in 0..4000 {
             let context = random.next() % 64;
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn nothing_seen_changes_nothing() {
-        let mixer = Mixer::new(Baseline, 1);
+        let mixer = Mixer::new(Scalar::TOKEN, 1);
         for logit in [-384, -1, 0, 77] {
             assert_eq!(mixer.predict(logit, [3; CONTEXTS]).one, squash(logit));
         }
@@ -143,7 +143,7 @@ mod tests {
 
     #[test]
     fn extremes_stay_within_their_ranges() {
-        let mut mixer = Mixer::new(Baseline, 4);
+        let mut mixer = Mixer::new(Scalar::TOKEN, 4);
         for i in 0..5000u64 {
             let logit = if i % 2 == 0 { -720 } else { 720 };
             let mixed = mixer.predict(logit, [(i % 3) << 60; CONTEXTS]);
@@ -161,7 +161,7 @@ mod tests {
     #[test]
     fn tables_grow_with_the_slice() {
         for (parents, bits) in [(1, 4), (16, 4), (17, 5), (16_384, 14)] {
-            let mixer = Mixer::new(Baseline, parents);
+            let mixer = Mixer::new(Scalar::TOKEN, parents);
             assert_eq!((mixer.bits, mixer.tables.len()), (bits, CONTEXTS << bits));
         }
     }

@@ -29,8 +29,8 @@ mod predictor;
 mod surroundings;
 
 use super::{KernelMap, Octree};
-use crate::bitstream::Slice;
 use crate::cancel::Cancel;
+use crate::container::Slice;
 use crate::error::{Error, Result, Stage};
 use b2p_kernels::{Instructions, Isa, Work};
 use coder::{Decoder, Encoder};

@@ -6,9 +6,10 @@
 use std::arch::x86_64::*;
 
 use super::{Buffers, LINE, Scheme, TILE, Weights, multiply, pairs, prepare};
-use crate::machine::{REACH, digits, fetch};
+use crate::machine::{REACH, digits};
 use crate::plan::PlanTile;
 use crate::rows::{AHEAD, Extents, Lanes, PANEL};
+use crate::simd::prefetch;
 
 /// Input channels whose two digits fit a tile row.
 const HALF: usize = LINE / 2;
@@ -160,7 +161,7 @@ unsafe fn split_short_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [La
     let there = u32::MAX >> (HALF - cin);
     for (i, (to, &row)) in to.iter_mut().zip(rows).enumerate() {
         if let Some(&next) = rows.get(i + AHEAD) {
-            fetch(&input[next as usize * cin..][..cin]);
+            prefetch(&input[next as usize * cin..][..cin]);
         }
         // SAFETY: of the row's values only those that are there are read, and a whole line written.
         unsafe {

@@ -1,0 +1,358 @@
+//! What can be asked of the program.
+
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+
+use b2p::Limits;
+use b2p::encoder::Residual;
+use b2p::encoder::transform::Fineness;
+use b2p::gaussians::HeadSet;
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+/// Coloured point clouds as small streams, decoded to 3D Gaussians and pictures on a plain CPU.
+#[derive(Debug, Parser)]
+#[command(name = "b2p", version, about, max_term_width = 110)]
+pub struct Cli {
+    /// Threads to use [default: one per core]
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    pub threads: Option<u16>,
+
+    /// Print nothing but warnings and errors
+    #[arg(short, long, global = true)]
+    pub quiet: bool,
+
+    #[command(flatten)]
+    pub limits: LimitArgs,
+
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// What an input may ask for.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Limits")]
+pub struct LimitArgs {
+    /// Where limits start from: what suits a board with 512 MB, anything, or input that is trusted
+    #[arg(long, global = true, value_enum, value_name = "PRESET", default_value_t = Preset::Default)]
+    pub limits: Preset,
+    /// Memory that one input may make the program reserve, such as 500M or 4G
+    #[arg(long, global = true, value_name = "BYTES", value_parser = bytes)]
+    pub max_memory: Option<u64>,
+    /// Voxels of a level, and points of a cloud
+    #[arg(long, global = true, value_name = "N")]
+    pub max_points: Option<u64>,
+    /// Pixels of a picture
+    #[arg(long, global = true, value_name = "N")]
+    pub max_pixels: Option<u64>,
+}
+
+/// Limits by name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Preset {
+    /// 2²⁰ points, 2²² pixels, 192 MiB
+    Embedded,
+    /// 2²⁶ points, 2²⁸ pixels, 2 GiB
+    Default,
+    /// Those of the format
+    Unlimited,
+}
+
+impl LimitArgs {
+    /// The limits that they name.
+    pub fn limits(&self) -> Limits {
+        let preset = match self.limits {
+            Preset::Embedded => Limits::embedded(),
+            Preset::Default => Limits::default(),
+            Preset::Unlimited => Limits::unlimited(),
+        };
+        Limits {
+            max_points: self.max_points.unwrap_or(preset.max_points),
+            max_pixels: self.max_pixels.unwrap_or(preset.max_pixels),
+            max_bytes: self.max_memory.unwrap_or(preset.max_bytes),
+            ..preset
+        }
+    }
+}
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Code a coloured point cloud into a stream
+    Encode(Encode),
+    /// Decode a stream to 3D Gaussians
+    Decode(Decode),
+    /// Draw a stream, or Gaussians, into a picture
+    Render(Render),
+    /// Say what a stream holds
+    Info(Info),
+    /// Decode and draw the sample that comes with the program
+    Demo(Demo),
+    /// Time the stages of decoding
+    Bench(Bench),
+}
+
+#[derive(Debug, Args)]
+pub struct Encode {
+    /// Point cloud: PLY, ascii or binary, with x y z and red green blue
+    pub cloud: PathBuf,
+    /// Stream to write
+    #[arg(short, long, value_name = "OUT.b2p")]
+    pub output: PathBuf,
+    /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs; less if its points lie too far apart for that]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
+    pub bits: Option<u8>,
+    /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last below N
+    /// [default: N−3..N−1; with --bits-per-point up to N]
+    #[arg(long, value_name = "L..M", value_parser = levels)]
+    pub levels: Option<RangeInclusive<u8>>,
+    /// Make the best stream of at most X bits for each point of the cloud, the whole file counted: chooses the quantisation step, and
+    /// leaves out the finest levels if they do not fit
+    #[arg(long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["step", "lossless", "bit_price", "residual"])]
+    pub bits_per_point: Option<f64>,
+    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma twice that of luma unless said; coarser
+    /// levels have finer steps [default: 20]
+    #[arg(long, value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
+    pub step: Option<Fineness>,
+    /// Code the mean colours of the finest level's voxels exactly
+    #[arg(long)]
+    pub lossless: bool,
+    /// How colours are coded
+    #[arg(long, value_enum, value_name = "HOW", default_value_t = Colours::Transform)]
+    pub colours: Colours,
+    /// Leave out colour filters: encoding and decoding take less time, pictures are less accurate
+    #[arg(long)]
+    pub no_filter: bool,
+    #[command(flatten)]
+    pub learned: LearnedArgs,
+    #[command(flatten)]
+    pub model: ModelArg,
+}
+
+/// How colours are coded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Colours {
+    /// As transform coefficients (version 3): no model file is needed to decode them
+    Transform,
+    /// As latents of a learned model (version 2), which decoding needs, too
+    Learned,
+}
+
+/// What may be chosen about learned streams.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "With --colours learned")]
+pub struct LearnedArgs {
+    /// Price of a bit in the rate-distortion optimisation of latents, times what the model says: 0 rounds to the nearest, more saves bits
+    /// and costs quality
+    #[arg(long, value_name = "X", value_parser = price, default_value_t = 1.0)]
+    pub bit_price: f32,
+    /// Residual of the finest level's colours. `coarse`: low frequencies, where they are worth it and filters are made; `none`: nothing;
+    /// else all of it, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
+    #[arg(long, value_name = "coarse|none|STEP[,CHROMA]", value_parser = residual, default_value = "coarse")]
+    pub residual: Residual,
+    /// Give each level that is drawn a residual of its own, not the finest alone: better pictures of coarser levels, for bytes that the finest does not need
+    #[arg(long)]
+    pub every_level: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct Decode {
+    /// Stream to decode. `-`: standard input, decoded as it comes
+    pub input: PathBuf,
+    /// File to write: Gaussians as a PLY with the property names of 3D Gaussian splatting
+    #[arg(short, long, value_name = "OUT.ply")]
+    pub output: PathBuf,
+    /// Write the level's voxels with their colours instead, as a PLY of points (of learned streams there are none)
+    #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
+    pub points: bool,
+    #[command(flatten)]
+    pub detail: DetailArg,
+    #[command(flatten)]
+    pub model: ModelArg,
+    #[command(flatten)]
+    pub budget: BudgetArgs,
+}
+
+#[derive(Debug, Args)]
+pub struct Render {
+    /// Stream, or PLY of Gaussians. `-`: standard input, drawn as it comes
+    pub input: PathBuf,
+    /// Picture to write: .png, .ppm, .exr, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
+    #[arg(short, long, value_name = "OUT.png")]
+    pub output: PathBuf,
+    /// What is written [default: by the ending; to standard output png, and y4m of several pictures]
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    pub format: Option<Format>,
+    /// Cameras of a file in place of --orbit: NeRF's transforms.json, COLMAP's images.txt beside its cameras.txt, Open3D's pinhole JSON,
+    /// glTF's camera nodes
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov"])]
+    pub camera: Option<PathBuf>,
+    /// Parallel rays; the cube's centre stays as large as it is
+    #[arg(long, conflicts_with = "camera")]
+    pub orthographic: bool,
+    /// What is drawn
+    #[arg(long, value_enum, value_name = "WHAT", default_value_t = Show::Colour)]
+    pub show: Show,
+    /// Force an effect (harmonics, antialias, supersample, near, order) on or off
+    #[arg(long, value_name = "NAME=on|off|auto", value_parser = effect)]
+    pub effect: Vec<(Effect, Choice)>,
+    /// How much of what is faint may be left out: fast, fine, exact
+    #[arg(long, value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
+    pub quality: Quality,
+    /// Print what each picture took, and what was not drawn and why, as JSON
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    pub stats: Option<StatsFormat>,
+    /// Say which effects are on, why, and what each costs
+    #[arg(short, long)]
+    pub verbose: bool,
+    #[command(flatten)]
+    pub detail: DetailArg,
+    #[command(flatten)]
+    pub view: View,
+    #[command(flatten)]
+    pub model: ModelArg,
+    #[command(flatten)]
+    pub budget: BudgetArgs,
+}
+
+/// Kinds of pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    /// Eight bits a channel
+    Png,
+    /// Sixteen bits a channel
+    Png16,
+    /// Eight bits a channel, no transparency
+    Ppm,
+    /// A video of all pictures, 30 a second
+    Y4m,
+    /// OpenEXR: linear light, alpha, and of colours the depth
+    Exr,
+}
+
+/// What a picture shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Show {
+    /// Colours
+    Colour,
+    /// Distance along the viewing direction, the farthest white
+    Depth,
+    /// Normals in the camera's axes
+    Normal,
+    /// How much of a pixel is covered
+    Alpha,
+    /// The Gaussian that a pixel shows most of: its number plus one, the lowest eight bits red
+    Id,
+}
+
+/// How numbers are printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum StatsFormat {
+    /// One object per picture, in an array
+    Json,
+}
+
+/// Where the camera stands and what it sees.
+#[derive(Debug, Args)]
+pub struct View {
+    /// Width and height in pixels
+    #[arg(long, value_name = "WxH", default_value = "1024x1024", value_parser = size)]
+    pub size: (u32, u32),
+    /// Horizontal field of view in degrees
+    #[arg(long, value_name = "DEG", default_value_t = 45.0, allow_negative_numbers = true)]
+    pub fov: f32,
+    /// Azimuth and elevation in degrees and distance from the cube's centre; the cube reaches from −1 to 1
+    #[arg(long, value_name = "AZ,EL,R", default_value = "0,0,3", value_parser = orbit, allow_hyphen_values = true)]
+    pub orbit: [f32; 3],
+    /// Draw N pictures, turning once around the object
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub views: u32,
+    /// white, black, grey, #rrggbb, or transparent
+    #[arg(long, value_name = "COLOUR", default_value = "white", value_parser = background)]
+    pub background: Background,
+}
+
+#[derive(Debug, Args)]
+pub struct Info {
+    /// Stream to describe
+    pub input: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+    /// Model file to look for the stream's model in [default: the one inside the program]
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct Demo {
+    /// Folder for the pictures and the Gaussians
+    #[arg(short, long, value_name = "DIR", default_value = "b2p-demo")]
+    pub output: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub struct Bench {
+    /// Stream to decode, or, to render, PLY of Gaussians [default: the sample that comes with the program]
+    pub input: Option<PathBuf>,
+    /// Time drawing instead, stage by stage, seen from the front
+    #[arg(long)]
+    pub render: bool,
+    /// Width and height in pixels of what is drawn
+    #[arg(long, value_name = "WxH", default_value = "1024x1024", value_parser = size, requires = "render")]
+    pub size: (u32, u32),
+    /// What is drawn leaves out as much as this quality does: fast, fine, exact
+    #[arg(long, value_name = "NAME", default_value = "fine", requires = "render")]
+    pub quality: Quality,
+    /// Times that it is decoded or drawn; medians are told
+    #[arg(long, value_name = "N", default_value_t = 7, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub repeat: u32,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub detail: DetailArg,
+    #[command(flatten)]
+    pub model: ModelArg,
+}
+
+/// Which of the Gaussians that a stream can be decoded to.
+#[derive(Debug, Args)]
+pub struct DetailArg {
+    /// Octree level to decode to [default: the finest with Gaussians; to draw, the finest that can be seen]
+    #[arg(long, value_name = "M")]
+    pub level: Option<u8>,
+    /// Heads that make Gaussians: best; quick, less accurate in a fraction of the time; or surfels, which need no model file (learned
+    /// streams have none) [default: the best there are]
+    #[arg(long, value_name = "NAME")]
+    pub heads: Option<HeadSet>,
+    /// Gaussians that heads make of a voxel of streams of version 3: 1 or 8, of surfels 1 or 4 [default: 1 from level N−1 on, else more]
+    #[arg(long, value_name = "N", value_parser = per_voxel)]
+    pub per_voxel: Option<usize>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub struct ModelArg {
+    /// Model file: of learned streams the model that they were coded with [default: the one inside the program], of others heads
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
+    /// Use no better instructions than these: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
+    #[arg(long, value_name = "NAME")]
+    pub isa: Option<String>,
+    /// Generate Gaussians in int16 (the same bits everywhere), f16, or half (f16 with sums in f16 too, on processors that have them) [default: int16 if the model has it]
+    #[arg(long, value_name = "NAME")]
+    pub precision: Option<String>,
+}
+
+use super::budget::BudgetArgs;
+use super::values::{background, bits_per_point, bytes, effect, levels, orbit, per_voxel, price, residual, size, step};
+pub use b2p::renderer::{Background, Choice, Effect, Quality};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+}

@@ -1,0 +1,188 @@
+//! `b2p info`: what a stream holds.
+
+use b2p::container::{Level, Section, Stream};
+use b2p::latents::{Precision, Steps};
+use b2p::{Limits, colour};
+use serde_json::json;
+
+use super::args::Info;
+use super::table::{count, table};
+use super::{Failure, Result, load};
+
+/// Describes a stream as text or JSON. A cut or damaged stream is described with what is wrong; its model is described if it is the one at hand.
+pub fn run(args: &Info, limits: &Limits) -> Result<String> {
+    let bytes = load::bytes(&args.input)?;
+    let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
+    let header = stream.header();
+    let at_hand = match header.model() {
+        Some(_) => Some(load::from_file(args.model.as_deref())?),
+        None => None,
+    };
+    let at_hand = at_hand.filter(|at_hand| header.check_model(&at_hand.id()).is_ok());
+    let known = at_hand.map(|at_hand| {
+        let shape = at_hand.shape();
+        let heads: Vec<_> = shape.heads().iter().map(ToString::to_string).collect();
+        (shape.name.clone(), heads)
+    });
+    let levels = levels(&stream)?;
+    Ok(match args.json {
+        true => json(&stream, bytes.len(), &levels, known),
+        false => text(args, &stream, bytes.len(), &levels, known),
+    })
+}
+
+/// Name and heads of a model.
+type Known = Option<(String, Vec<String>)>;
+
+/// What a stream says of a level. What stands in its chunks is not known of a level that is not whole.
+struct Described {
+    level: u8,
+    voxels: u32,
+    section: Section,
+    /// Bytes of the stream up to its end.
+    prefix: u64,
+    /// Quantisation steps of the colours in version 3.
+    steps: Option<colour::Steps>,
+    residual: Option<usize>,
+    precision: Option<Precision>,
+    whole: bool,
+}
+
+fn levels(stream: &Stream) -> Result<Vec<Described>> {
+    let header = stream.header();
+    let counted = header.voxels.iter().zip(&header.sections);
+    let levels = (header.base..).zip(counted).enumerate();
+    let describe = |(i, (level, (&voxels, &section)))| {
+        let found: Option<&Level> = stream.levels().get(i);
+        let residual = |found: &Level| found.residual.iter().map(|slice| slice.bytes.len() + 16).sum();
+        let precision = |found: &Level| Precision::read(found.residual.first()?.bytes);
+        Ok(Described {
+            level,
+            voxels,
+            section,
+            prefix: header.prefix_bytes(level)?,
+            steps: found.and_then(steps),
+            residual: found.map(residual),
+            precision: found.and_then(precision),
+            whole: found.is_some(),
+        })
+    };
+    levels.map(describe).collect()
+}
+
+/// The steps of a level of version 3.
+fn steps(level: &Level) -> Option<colour::Steps> {
+    let colours = level.colours.as_ref()?;
+    let trunk = colours.trunk.map(|trunk| trunk.slice);
+    let last = colours.levels.last().and_then(|level| level.slices.first());
+    let &[luma, chroma, ..] = last.or(trunk.as_ref())?.bytes else {
+        return None;
+    };
+    let steps = colour::Steps { luma, chroma };
+    steps.is_valid().then_some(steps)
+}
+
+fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> String {
+    let header = stream.header();
+    let level = |of: &Described| {
+        json!({
+            "level": of.level,
+            "voxels": of.voxels,
+            "geometry_bytes": of.section.geometry,
+            "colour_bytes": of.section.colours,
+            "luma_step": of.steps.map(|steps| steps.luma_step()),
+            "lossless": of.steps.map(|steps| steps.is_lossless()),
+            "residual_bytes": of.residual,
+            "residual_steps": of.precision.map(|told| json!({
+                "fine": [told.fine.luma, told.fine.chroma],
+                "coarse": [told.coarse.luma, told.coarse.chroma],
+                "boundary": told.boundary,
+            })),
+            "whole": of.whole,
+        })
+    };
+    let levels: Vec<_> = levels.iter().map(level).collect();
+    let description = json!({
+        "version": header.format.version(),
+        "bits": header.bits,
+        "points": header.points,
+        "levels": levels,
+        "total_bytes": bytes,
+        "model": header.model(),
+        "model_name": known.as_ref().map(|(name, _)| name),
+        "heads": known.as_ref().map(|(_, heads)| heads),
+        "origin": header.placement.origin,
+        "voxel_size": header.placement.voxel_size,
+        "damage": stream.damage().map(ToString::to_string),
+    });
+    format!("{description:#}\n")
+}
+
+fn text(args: &Info, stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> String {
+    let header = stream.header();
+    let coded = match (header.model(), known, &args.model) {
+        (None, ..) => "transform coefficients, no model needed".into(),
+        (Some(id), Some((name, heads)), _) => {
+            format!("model {id}: {name}, heads: {}", heads.join(", "))
+        }
+        (Some(id), None, None) => format!("model {id}, which is not the one inside the program"),
+        (Some(id), None, Some(path)) => format!("model {id}, which is not {}", path.display()),
+    };
+    let mut text = format!(
+        "version {}, {} points at {} bits, {} bytes\n{coded}\n{}\n",
+        header.format.version(),
+        count(header.points),
+        header.bits,
+        count(bytes as u64),
+        table(&rows(levels, header.points)),
+    );
+    if let Some(damage) = stream.damage() {
+        text += &format!("damage: {damage}\n");
+    }
+    text
+}
+
+/// The table's rows, titles first.
+fn rows(levels: &[Described], points: u64) -> Vec<Vec<String>> {
+    let titles = [
+        "level",
+        "voxels",
+        "geometry bytes",
+        "colour bytes",
+        "step",
+        "residual bytes",
+        "its steps",
+        "bits/point up to here",
+    ];
+    let mut rows = vec![titles.map(String::from).to_vec()];
+    for of in levels {
+        let missing = if of.whole { "" } else { " (not whole)" };
+        rows.push(vec![
+            format!("{}{missing}", of.level),
+            count(of.voxels.into()),
+            count(of.section.geometry.into()),
+            count(of.section.colours.into()),
+            of.steps.map_or("-".into(), step_told),
+            of.residual.map_or("?".into(), |bytes| count(bytes as u64)),
+            of.precision.map_or("-".into(), told),
+            format!("{:.4}", of.prefix as f64 * 8.0 / points.max(1) as f64),
+        ]);
+    }
+    rows
+}
+
+/// A step of luma in 255ths.
+fn step_told(steps: colour::Steps) -> String {
+    match steps.is_lossless() {
+        true => "exact".into(),
+        false => format!("{:.2}", steps.luma_step()),
+    }
+}
+
+/// The bands of a residual with their steps of luma and chroma.
+fn told(precision: Precision) -> String {
+    let bands = [("fine", precision.fine), ("coarse", precision.coarse)];
+    let bands = bands.iter().filter(|(_, steps)| *steps != Steps::NONE);
+    let told = bands.map(|(band, steps)| format!("{band} {},{}", steps.luma, steps.chroma));
+    told.collect::<Vec<_>>().join(" ")
+}

@@ -1,0 +1,166 @@
+//! The values of arguments, as they are written.
+
+use std::num::NonZeroU8;
+use std::ops::RangeInclusive;
+
+use b2p::encoder::Residual;
+use b2p::encoder::transform::Fineness;
+use b2p::latents::Steps;
+use b2p::renderer::{Background, Choice, Effect};
+
+/// A number of bytes, with or without K, M, G or T for powers of 1024.
+pub fn bytes(text: &str) -> Result<u64, String> {
+    let expected = "expected bytes such as 500M or 4G";
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let power = match text[digits.len()..].to_ascii_uppercase().as_str() {
+        "" => 0,
+        "K" => 1,
+        "M" => 2,
+        "G" => 3,
+        "T" => 4,
+        _ => return Err(expected.into()),
+    };
+    let number: u64 = digits.parse().map_err(|_| expected)?;
+    number.checked_mul(1 << (10 * power)).ok_or_else(|| expected.into())
+}
+
+pub fn levels(text: &str) -> Result<RangeInclusive<u8>, String> {
+    let expected = "expected two levels such as 7..9";
+    let (first, last) = text.split_once("..").ok_or(expected)?;
+    let number = |t: &str| t.trim_start_matches('=').parse::<u8>().map_err(|_| expected);
+    let (first, last) = (number(first)?, number(last)?);
+    if first > last {
+        return Err(format!("level {first} comes after level {last}"));
+    }
+    Ok(first..=last)
+}
+
+pub fn price(text: &str) -> Result<f32, String> {
+    match text.parse() {
+        Ok(price) if (0.0..=100.0).contains(&price) => Ok(price),
+        _ => Err("expected a number from 0 to 100".into()),
+    }
+}
+
+pub fn step(text: &str) -> Result<Fineness, String> {
+    let size = |text: &str| match text.parse() {
+        Ok(step) if (0.5..=1000.0).contains(&step) => Ok(step),
+        _ => Err("expected one or two numbers from 0.5 to 1000 such as 16 or 16,24"),
+    };
+    Ok(match text.split_once(',') {
+        None => Fineness::Step(size(text)?),
+        Some((luma, chroma)) => Fineness::Steps {
+            luma: size(luma)?,
+            chroma: size(chroma)?,
+        },
+    })
+}
+
+pub fn per_voxel(text: &str) -> Result<usize, String> {
+    match text {
+        "1" => Ok(1),
+        "4" => Ok(4),
+        "8" => Ok(8),
+        _ => Err("expected 1, 4 or 8".into()),
+    }
+}
+
+pub fn bits_per_point(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(bits) if bits > 0.0 && f64::is_finite(bits) => Ok(bits),
+        _ => Err("expected a number above 0 such as 0.3".into()),
+    }
+}
+
+pub fn residual(text: &str) -> Result<Residual, String> {
+    match text {
+        "none" => return Ok(Residual::None),
+        "coarse" => return Ok(Residual::Coarse),
+        _ => {}
+    }
+    let expected = |_| "expected coarse, none, or a step from 1 to 255, or two, such as 64,32";
+    let (luma, chroma) = text.split_once(',').unwrap_or((text, ""));
+    let luma: NonZeroU8 = luma.parse().map_err(expected)?;
+    let mut steps = Steps::from(luma);
+    if text.contains(',') {
+        steps.chroma = chroma.parse::<NonZeroU8>().map_err(expected)?.get();
+    }
+    Ok(Residual::Fine(steps))
+}
+
+pub fn size(text: &str) -> Result<(u32, u32), String> {
+    let expected = "expected a size such as 1024x1024, both above 0";
+    let (w, h) = text.split_once('x').ok_or(expected)?;
+    match (w.parse(), h.parse()) {
+        (Ok(w), Ok(h)) if w > 0 && h > 0 => Ok((w, h)),
+        _ => Err(expected.into()),
+    }
+}
+
+pub fn orbit(text: &str) -> Result<[f32; 3], String> {
+    let numbers: Vec<f32> = text
+        .split(',')
+        .map(|t| t.trim().parse().map_err(|_| format!("'{t}' is not a number")))
+        .collect::<Result<_, _>>()?;
+    <[f32; 3]>::try_from(numbers).map_err(|_| "expected three numbers: azimuth,elevation,distance".into())
+}
+
+pub fn effect(text: &str) -> Result<(Effect, Choice), String> {
+    let (name, choice) = text
+        .split_once('=')
+        .ok_or("expected an effect and a choice such as antialias=on")?;
+    Ok((name.parse()?, choice.parse()?))
+}
+
+pub fn background(text: &str) -> Result<Background, String> {
+    let named = match text {
+        "transparent" => return Ok(Background::Transparent),
+        "white" => [255; 3],
+        "black" => [0; 3],
+        "grey" | "gray" => [128; 3],
+        _ => hex(text).ok_or("expected white, black, grey, #rrggbb or transparent")?,
+    };
+    Ok(Background::Colour(named.map(|v| f32::from(v) / 255.0)))
+}
+
+fn hex(text: &str) -> Option<[u8; 3]> {
+    let digits = text.strip_prefix('#').filter(|d| d.len() == 6 && d.is_ascii())?;
+    let channel = |i: usize| u8::from_str_radix(&digits[2 * i..2 * i + 2], 16).ok();
+    Some([channel(0)?, channel(1)?, channel(2)?])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_read_as_written() {
+        assert_eq!(levels("7..9"), Ok(7..=9));
+        assert_eq!(size("640x480"), Ok((640, 480)));
+        assert_eq!(orbit("-30, 10,2.5"), Ok([-30.0, 10.0, 2.5]));
+        assert_eq!(hex("#ff0080"), Some([255, 0, 128]));
+        assert_eq!(bits_per_point("0.25"), Ok(0.25));
+        assert_eq!(bytes("512"), Ok(512));
+        assert_eq!(bytes("3k"), Ok(3 << 10));
+        assert_eq!(bytes("2G"), Ok(2 << 30));
+    }
+
+    #[test]
+    fn nonsense_is_refused_with_an_example() {
+        assert!(bytes("2GB").unwrap_err().contains("500M"));
+        assert!(bytes("-1").is_err() && bytes("99999999T").is_err());
+        assert!(levels("9..7").unwrap_err().contains("after"));
+        assert!(levels("9").unwrap_err().contains("7..9"));
+        for wrong in ["0", "-1", "nan", "inf", "1e999", "few"] {
+            assert!(bits_per_point(wrong).unwrap_err().contains("above 0"));
+        }
+        assert!(step("0").unwrap_err().contains("0.5") && step("8,inf").is_err());
+        assert!(size("0x4").unwrap_err().contains("1024x1024"));
+        assert!(orbit("1,2").unwrap_err().contains("three"));
+        assert!(effect("antialias").unwrap_err().contains("antialias=on"));
+        assert!(effect("glow=on").unwrap_err().contains("glow"));
+        assert!(effect("antialias=maybe").is_err());
+        assert!(background("#ff00").is_err());
+        assert!(background("#ää").is_err());
+    }
+}

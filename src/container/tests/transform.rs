@@ -1,0 +1,298 @@
+//! Version 3.
+
+use super::*;
+use crate::container::reader::put_varint;
+
+const HASHES: [u64; 3] = [7, u64::MAX, 0x0123_4567_89ab_cdef];
+
+fn header() -> Header {
+    Header {
+        format: Format::Transform { colour_slice: 3 },
+        bits: 4,
+        points: 20,
+        slice_voxels: 2,
+        ..super::header()
+    }
+}
+
+/// Levels 2 to 4 of 3, 10 and 20 voxels: level 1 has 2.
+fn writer() -> Result<Writer> {
+    let mut writer = Writer::new(header())?;
+    writer.geometry_trunk(&[(2, "one"), (3, "second")])?;
+    writer.colour_trunk(1, 2, HASHES[0], b"trunk")?;
+    writer.colours(2, None, &[(2, "two")])?;
+    writer.post_filter(2, b"filter")?;
+    writer.geometry(3, &[(6, "a"), (4, "b")])?;
+    writer.colours(3, Some(HASHES[1]), &[(3, "")])?;
+    let five: Vec<_> = [4, 4, 4, 4, 4].map(|count| (count, "x")).into();
+    writer.geometry(4, &five)?;
+    let four = [(3, "p"), (3, "q"), (3, "r"), (1, "s")];
+    writer.colours(4, Some(HASHES[2]), &four)?;
+    writer.post_filter(4, b"")?;
+    Ok(writer)
+}
+
+fn sample() -> Vec<u8> {
+    writer().unwrap().finish().unwrap()
+}
+
+/// A chunk of version 3.
+fn chunk(kind: u8, level: u8, numbers: [u32; 2], payload: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![kind, level];
+    for number in [numbers[0], numbers[1], payload.len() as u32] {
+        put_varint(&mut bytes, number);
+    }
+    let sum = crc32c::crc32c_append(crc32c::crc32c(&bytes), payload);
+    bytes.extend(sum.to_le_bytes());
+    bytes.extend(payload);
+    bytes
+}
+
+/// A stream with this header whose sections, two a level, hold these chunks.
+fn stream(header: Header, sections: &[Vec<Vec<u8>>]) -> Vec<u8> {
+    let sections: Vec<Vec<u8>> = sections.iter().map(|chunks| chunks.concat()).collect();
+    let lengths = sections.chunks(2).map(|pair| Section {
+        geometry: pair[0].len() as u32,
+        colours: pair[1].len() as u32,
+    });
+    let header = Header {
+        sections: lengths.collect(),
+        ..header
+    };
+    [vec![header.write()], sections].concat().concat()
+}
+
+/// The sections of the sample's base level.
+fn base() -> [Vec<Vec<u8>>; 2] {
+    let hash = HASHES[0].to_le_bytes();
+    [
+        vec![chunk(5, 2, [0, 3], b"\x02\x03one\x03\x06second")],
+        vec![
+            chunk(6, 1, [0, 2], &[&hash[..], b"trunk"].concat()),
+            chunk(7, 2, [0, 2], b"two"),
+            chunk(8, 2, [0, 3], b"filter"),
+        ],
+    ]
+}
+
+fn only_base() -> Header {
+    Header {
+        top: 2,
+        voxels: vec![3],
+        ..header()
+    }
+}
+
+#[test]
+fn what_is_written_is_read() {
+    let bytes = sample();
+    let stream = parse(&bytes).unwrap();
+    assert!(stream.damage().is_none(), "{:?}", stream.damage());
+    let [base, middle, top] = stream.levels() else {
+        panic!("three levels")
+    };
+    let geometry = |level: &Level| -> Vec<(u8, Vec<u32>)> {
+        let counts = |part: &Geometry| part.slices.iter().map(|s| s.voxels).collect();
+        let parts = level.geometry.iter();
+        parts.map(|part| (part.level, counts(part))).collect()
+    };
+    assert_eq!(geometry(base), [(1, vec![2]), (2, vec![3])]);
+    assert_eq!(geometry(middle), [(3, vec![6, 4])]);
+    let colours = [base, middle, top].map(|level| level.colours.as_ref().unwrap());
+    assert_eq!(colours.map(|colours| colours.hash), HASHES);
+    let trunk = colours[0].trunk.unwrap();
+    assert_eq!((trunk.level, trunk.slice.bytes), (1, &b"trunk"[..]));
+    assert!(colours[1].trunk.is_none() && colours[1].filter.is_none());
+    assert_eq!(colours[0].filter.unwrap().bytes, b"filter");
+    let slices = &colours[2].levels[0].slices;
+    let found: Vec<_> = slices.iter().map(|s| (s.voxels, s.bytes)).collect();
+    assert_eq!(found[2..], [(3, &b"r"[..]), (1, &b"s"[..])]);
+    for slice in slices.iter().chain(&base.geometry[1].slices) {
+        let there = &bytes[slice.offset..slice.offset + slice.bytes.len()];
+        assert_eq!(there, slice.bytes, "offsets lead to the code");
+    }
+}
+
+#[test]
+fn the_bytes_are_those_that_the_format_describes() {
+    let [geometry, colours] = base();
+    let mut writer = Writer::new(only_base()).unwrap();
+    writer.geometry_trunk(&[(2, "one"), (3, "second")]).unwrap();
+    writer.colour_trunk(1, 2, HASHES[0], b"trunk").unwrap();
+    writer.colours(2, None, &[(2, "two")]).unwrap();
+    writer.post_filter(2, b"filter").unwrap();
+    let bytes = writer.finish().unwrap();
+    assert_eq!(bytes, stream(only_base(), &[geometry, colours]));
+    assert_eq!(bytes[8..12], [3, 0, 0, 0], "version");
+    assert_eq!(bytes[64..72], [2, 0, 0, 0, 3, 0, 0, 0], "slice sizes");
+    assert_eq!(bytes[72..76], [3, 0, 0, 0], "voxels of the base level");
+    assert_eq!(only_base().bytes(), 72 + 12 + 4);
+}
+
+#[test]
+fn every_level_of_the_cloud_may_be_coded_and_the_root_alone() {
+    let header = Header {
+        bits: 1,
+        base: 0,
+        top: 1,
+        points: 8,
+        voxels: vec![1, 8],
+        ..header()
+    };
+    let mut writer = Writer::new(header).unwrap();
+    writer.geometry_trunk(&[] as &[(u32, &str)]).unwrap();
+    writer.colour_trunk(0, 1, 1, b"root").unwrap();
+    writer.geometry(1, &[(8, "all")]).unwrap();
+    writer.colours(1, Some(2), &[(1, "c")]).unwrap();
+    let bytes = writer.finish().unwrap();
+    let stream = parse(&bytes).unwrap();
+    assert_eq!(stream.levels().len(), 2);
+    assert!(stream.levels()[0].geometry.is_empty());
+}
+
+#[test]
+fn headers_that_the_format_forbids_are_refused() {
+    let refused = |header: Header, field: &str| {
+        let error = Writer::new(header).unwrap_err().to_string();
+        assert!(error.contains(field), "{error}");
+    };
+    refused(Header { bits: 3, ..header() }, "bit depth");
+    let slices = |colour_slice| Header {
+        format: Format::Transform { colour_slice },
+        ..header()
+    };
+    refused(slices(0), "slice size of the colours");
+    refused(slices(65_537), "slice size of the colours");
+    let geometry = Header {
+        slice_voxels: 16_385,
+        ..header()
+    };
+    refused(geometry, "slice size");
+}
+
+#[test]
+fn chunks_that_break_the_format_are_damage() {
+    let told = |section: usize, chunks: Vec<Vec<u8>>, words: &str| {
+        let mut sections = base();
+        sections[section] = chunks;
+        let bytes = stream(only_base(), &sections);
+        let error = parse(&bytes).unwrap().require(2).unwrap_err().to_string();
+        assert!(error.contains(words), "{error} should tell of {words}");
+    };
+    let [geometry, colours] = base();
+    let trunk = |level, count, payload: &[u8]| vec![chunk(5, level, [0, count], payload)];
+    told(0, vec![], "end of the section");
+    told(0, trunk(3, 3, b""), "geometry trunk chunk of a level from 1 to 2");
+    told(0, trunk(2, 4, b"\x02\x03one\x03\x06second"), "voxel count");
+    told(0, trunk(2, 3, b"\x02\x03one\x03\x06second!"), "bytes after");
+    told(
+        0,
+        trunk(2, 3, b"\x02\x03one\x03\x07second"),
+        "payload of the geometry trunk",
+    );
+    told(0, trunk(2, 3, b"\x02\x03one"), "payload of the geometry trunk");
+    told(0, trunk(2, 3, b"\x00\x03one\x03\x06second"), "voxel count of level 1");
+    told(0, trunk(2, 3, b"\x09\x03one\x03\x06second"), "voxel count of level 1");
+    told(0, trunk(2, 3, b"\x03\x03one\x03\x06second"), "parents of level 2");
+    told(0, vec![geometry[0].clone(), geometry[0].clone()], "section's last");
+
+    told(1, vec![], "end of the section");
+    told(1, colours[1..].to_vec(), "colour trunk chunk of a level from 0 to 2");
+    told(1, vec![chunk(6, 1, [0, 2], b"short")], "first colour chunk");
+    let hash = [0; 8];
+    told(1, vec![chunk(6, 1, [0, 3], &hash)], "colour trunk");
+    told(1, vec![chunk(6, 1, [1, 2], &hash)], "slice 0");
+    let after = |chunk: Vec<u8>| vec![colours[0].clone(), chunk];
+    told(1, after(colours[2].clone()), "colour chunk of level 2, slice 0");
+    told(1, after(chunk(7, 2, [0, 3], b"two")), "voxel count of the colour chunk");
+    told(
+        1,
+        after(chunk(7, 2, [1, 2], b"two")),
+        "colour chunk of level 2, slice 0",
+    );
+    let filter = vec![colours[0].clone(), colours[1].clone(), chunk(8, 2, [0, 4], b"")];
+    told(1, filter, "voxel count of the colour filter chunk");
+    for kind in [0, 2, 3, 4, 9, 127] {
+        told(1, after(chunk(kind, 2, [0, 2], b"two")), "type");
+    }
+}
+
+#[test]
+fn numbers_are_as_short_as_they_can_be() {
+    let [geometry, mut colours] = base();
+    // The same slice in two bytes.
+    let long = [7, 2, 0x80, 0, 2, 3];
+    let sum = crc32c::crc32c_append(crc32c::crc32c(&long), b"two");
+    colours[1] = [&long[..], &sum.to_le_bytes(), b"two"].concat();
+    let bytes = stream(only_base(), &[geometry, colours]);
+    let error = parse(&bytes).unwrap().require(2).unwrap_err().to_string();
+    assert!(error.contains("chunk slice"), "{error}");
+    for (bytes, number) in [
+        (&[0][..], Some(0)),
+        (&[0x7f], Some(127)),
+        (&[0x80, 1], Some(128)),
+        (&[0xff, 0xff, 0xff, 0xff, 0x0f], Some(u32::MAX)),
+        (&[0xff, 0xff, 0xff, 0xff, 0x1f], None),
+        (&[0xff, 0xff, 0xff, 0xff, 0xff, 1], None),
+        (&[0x80, 0], None),
+        (&[0x80], None),
+    ] {
+        let read = Reader::new(bytes, 0).varint("number").ok();
+        assert_eq!(read, number, "{bytes:02x?}");
+        if let Some(number) = number {
+            let mut written = Vec::new();
+            put_varint(&mut written, number);
+            assert_eq!(written, bytes);
+        }
+    }
+}
+
+#[test]
+fn no_flipped_bit_goes_unnoticed_and_the_levels_before_it_survive() {
+    let bytes = sample();
+    let whole = parse(&bytes).unwrap();
+    for bit in 0..8 * bytes.len() {
+        let mut flipped = bytes.clone();
+        flipped[bit / 8] ^= 1 << (bit % 8);
+        let Ok(stream) = parse(&flipped) else {
+            continue;
+        };
+        assert!(stream.damage().is_some(), "bit {bit}");
+        let levels = stream.levels().len();
+        assert_eq!(stream.levels(), &whole.levels()[..levels], "bit {bit}");
+    }
+}
+
+#[test]
+fn ancillary_chunks_are_passed_over() {
+    let [mut geometry, mut colours] = base();
+    let note = chunk(200, 99, [9, 9], b"a note");
+    geometry.insert(0, note.clone());
+    geometry.push(note.clone());
+    colours.insert(1, note);
+    let bytes = stream(only_base(), &[geometry, colours]);
+    let stream = parse(&bytes).unwrap();
+    assert!(stream.damage().is_none(), "{:?}", stream.damage());
+}
+
+proptest! {
+    #[test]
+    fn damage_with_right_checksums_never_panics(
+        at in 0usize..1000,
+        value in any::<u8>(),
+        cut in 0usize..1000,
+    ) {
+        let [geometry, colours] = base();
+        let mut sections = [geometry, colours];
+        let which = at % 2;
+        let count = sections[which].len();
+        let chosen = &mut sections[which][at / 2 % count];
+        let place = at / 7 % chosen.len();
+        chosen[place] = value;
+        let bytes = stream(only_base(), &sections);
+        let length = bytes.len() - cut % 20;
+        if let Ok(stream) = parse(&bytes[..length]) {
+            prop_assert!(stream.levels().len() <= 1);
+        }
+    }
+}
