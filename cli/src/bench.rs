@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use b2p::container::Header;
-use b2p::gaussians::Heads;
+use b2p::gaussians::{HeadSet, Heads};
 use b2p::geometry::{KernelMap, Octree};
 use b2p::latents::Decoder;
 use b2p::latents::network::{Module, Shape, Work};
@@ -24,6 +24,9 @@ struct Line {
     median: Duration,
     work: Option<Work>,
 }
+
+/// How long a run took, and its steps.
+type Run = (Duration, Vec<Step>);
 
 /// Decodes again and again; prints a table or JSON.
 pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String> {
@@ -50,20 +53,14 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
             .ok_or_else(|| Failure("the stream has no level with Gaussians".into()))?,
     };
 
-    // The first run warms caches and memory up, and is not counted.
-    let mut runs: Vec<(Duration, Vec<Step>)> = Vec::new();
-    for run in 0..=args.repeat {
-        progress.say(&format!("run {run} of {}", args.repeat));
+    let runs = timed(args, progress, || {
         let mut log = Log::default();
         let start = Instant::now();
         let gaussians = decoder.decode(&bytes, Some(level), &mut log).map_err(fail)?;
         let total = start.elapsed();
         drop(gaussians);
-        if run > 0 {
-            runs.push((total, log.steps().to_vec()));
-        }
-    }
-    let total = median(runs.iter().map(|run| run.0));
+        Ok((total, log.steps().to_vec()))
+    })?;
     let header = Header::parse(&bytes, limits).map_err(fail)?;
     let heads = decoder.heads_for(&header);
     // Of version 3, no more is known than the times.
@@ -76,100 +73,145 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         }
         _ => HashMap::new(),
     };
-    let lines: Vec<Line> = runs[0]
-        .1
-        .iter()
-        .enumerate()
-        .map(|(i, step)| Line {
-            step: step.clone(),
-            median: median(runs.iter().map(|run| run.1[i].time)),
-            work: works.get(&step.name).copied(),
-        })
-        .collect();
-
     let threads = rayon::current_num_threads();
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
     let isa = load::isa(args.model.isa.as_deref())?;
     let precision = model.map_or(Precision::Int16, |model| model.precision());
-    let ceilings = Ceilings::measure(isa, precision, threads.min(cores));
-    let memory = peak_memory();
-    if args.json {
-        let stages: Vec<_> = lines
-            .iter()
-            .map(|line| {
-                json!({
-                    "stage": line.step.name,
-                    "count": line.step.count,
-                    "unit": line.step.unit,
-                    "median_ms": line.median.as_secs_f64() * 1e3,
-                    "gmac": line.work.map(|w| w.macs as f64 / 1e9),
-                    "gmac_per_s": line.work.map(|w| rate(w, line.median)),
-                    "share_of_ceiling": ceilings.share(line),
-                    "mbytes": line.work.map(|w| w.bytes as f64 / 1e6),
-                })
-            })
-            .collect();
-        let report = json!({
-            "level": level,
-            "isa": isa.to_string(),
-            "precision": precision.to_string(),
-            "heads": heads.to_string(),
-            "threads": threads,
-            "runs": args.repeat,
-            "load_model_ms": loading.as_secs_f64() * 1e3,
-            "decode_ms": total.as_secs_f64() * 1e3,
-            "peak_memory_bytes": memory,
-            "ceiling_gmac_per_s": { "integers": ceilings.integers, "gaussians": ceilings.gaussians },
-            "stages": stages,
-        });
-        return Ok(format!("{report:#}\n"));
-    }
-
-    let mut rows = vec![
-        ["stage", "items", "", "median", "GMAC", "GMAC/s", "of ceiling", "MB"]
-            .map(String::from)
-            .to_vec(),
-    ];
-    for line in &lines {
-        let mut row = vec![
-            line.step.name.clone(),
-            count(line.step.count),
-            line.step.unit.into(),
-            milliseconds(line.median),
-        ];
-        if let Some(work) = line.work {
-            row.push(format!("{:.2}", work.macs as f64 / 1e9));
-            row.push(format!("{:.1}", rate(work, line.median)));
-            let share = ceilings.share(line).unwrap_or_default();
-            row.push(format!("{:.0} %", 100.0 * share));
-            row.push(format!("{:.0}", work.bytes as f64 / 1e6));
-        }
-        rows.push(row);
-    }
-    rows.push(vec![
-        "decode, bytes to Gaussians".into(),
-        String::new(),
-        String::new(),
-        milliseconds(total),
-    ]);
-    rows.push(vec![
-        "load model".into(),
-        String::new(),
-        String::new(),
-        milliseconds(loading),
-    ]);
-    let memory = memory.map_or(String::new(), |bytes| format!(", peak memory {} MB", bytes / 1_000_000));
-    Ok(format!(
-        "level {level}, {heads} heads, {}, {}, {threads} threads, medians of {} runs{memory}\n{}\n\
-         Ceilings, measured just now: {:.0} GMAC/s in integers, {:.0} in what Gaussians are generated in.\n\
-         MB: what a stage's layers must read and write at least once.\n",
+    let report = Report {
+        level,
+        heads,
         isa,
         precision,
-        args.repeat,
-        table(&rows),
-        ceilings.integers,
-        ceilings.gaussians,
-    ))
+        threads,
+        runs: args.repeat,
+        loading,
+        total: median(runs.iter().map(|run| run.0)),
+        lines: lines(&runs, &works),
+        ceilings: Ceilings::measure(isa, precision, threads.min(cores)),
+        memory: peak_memory(),
+    };
+    Ok(match args.json {
+        true => report.json(),
+        false => report.text(),
+    })
+}
+
+/// What each run took, but for the first, which warms caches and memory up.
+fn timed(args: &Bench, progress: &Progress, mut run: impl FnMut() -> Result<Run>) -> Result<Vec<Run>> {
+    let mut runs = Vec::new();
+    for i in 0..=args.repeat {
+        progress.say(&format!("run {i} of {}", args.repeat));
+        let run = run()?;
+        if i > 0 {
+            runs.push(run);
+        }
+    }
+    Ok(runs)
+}
+
+/// Medians of each step over the runs.
+fn lines(runs: &[Run], works: &HashMap<String, Work>) -> Vec<Line> {
+    let line = |(i, step): (usize, &Step)| Line {
+        step: step.clone(),
+        median: median(runs.iter().map(|run| run.1[i].time)),
+        work: works.get(&step.name).copied(),
+    };
+    runs[0].1.iter().enumerate().map(line).collect()
+}
+
+/// All that was measured.
+struct Report {
+    level: u8,
+    heads: HeadSet,
+    isa: Isa,
+    precision: Precision,
+    threads: usize,
+    runs: u32,
+    loading: Duration,
+    total: Duration,
+    lines: Vec<Line>,
+    ceilings: Ceilings,
+    memory: Option<u64>,
+}
+
+impl Report {
+    fn json(&self) -> String {
+        let stage = |line: &Line| {
+            json!({
+                "stage": line.step.name,
+                "count": line.step.count,
+                "unit": line.step.unit,
+                "median_ms": line.median.as_secs_f64() * 1e3,
+                "gmac": line.work.map(|w| w.macs as f64 / 1e9),
+                "gmac_per_s": line.work.map(|w| rate(w, line.median)),
+                "share_of_ceiling": self.ceilings.share(line),
+                "mbytes": line.work.map(|w| w.bytes as f64 / 1e6),
+            })
+        };
+        let stages: Vec<_> = self.lines.iter().map(stage).collect();
+        let Ceilings { integers, gaussians } = self.ceilings;
+        let report = json!({
+            "level": self.level,
+            "isa": self.isa.to_string(),
+            "precision": self.precision.to_string(),
+            "heads": self.heads.to_string(),
+            "threads": self.threads,
+            "runs": self.runs,
+            "load_model_ms": self.loading.as_secs_f64() * 1e3,
+            "decode_ms": self.total.as_secs_f64() * 1e3,
+            "peak_memory_bytes": self.memory,
+            "ceiling_gmac_per_s": { "integers": integers, "gaussians": gaussians },
+            "stages": stages,
+        });
+        format!("{report:#}\n")
+    }
+
+    fn text(&self) -> String {
+        let memory = self
+            .memory
+            .map(|bytes| format!(", peak memory {} MB", bytes / 1_000_000));
+        format!(
+            "level {}, {} heads, {}, {}, {} threads, medians of {} runs{}\n{}\n\
+             Ceilings, measured just now: {:.0} GMAC/s in integers, {:.0} in what Gaussians are generated in.\n\
+             MB: what a stage's layers must read and write at least once.\n",
+            self.level,
+            self.heads,
+            self.isa,
+            self.precision,
+            self.threads,
+            self.runs,
+            memory.unwrap_or_default(),
+            table(&self.rows()),
+            self.ceilings.integers,
+            self.ceilings.gaussians,
+        )
+    }
+
+    /// The table's rows, titles first.
+    fn rows(&self) -> Vec<Vec<String>> {
+        let titles = ["stage", "items", "", "median", "GMAC", "GMAC/s", "of ceiling", "MB"];
+        let mut rows = vec![titles.map(String::from).to_vec()];
+        for line in &self.lines {
+            let mut row = vec![
+                line.step.name.clone(),
+                count(line.step.count),
+                line.step.unit.into(),
+                milliseconds(line.median),
+            ];
+            if let Some(work) = line.work {
+                row.push(format!("{:.2}", work.macs as f64 / 1e9));
+                row.push(format!("{:.1}", rate(work, line.median)));
+                let share = self.ceilings.share(line).unwrap_or_default();
+                row.push(format!("{:.0} %", 100.0 * share));
+                row.push(format!("{:.0}", work.bytes as f64 / 1e6));
+            }
+            rows.push(row);
+        }
+        for (name, time) in [("decode, bytes to Gaussians", self.total), ("load model", self.loading)] {
+            rows.push(vec![name.into(), String::new(), String::new(), milliseconds(time)]);
+        }
+        rows
+    }
 }
 
 /// What all threads could multiply and add if nothing had to be fetched, in 10⁹ a second.

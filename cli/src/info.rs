@@ -1,6 +1,6 @@
 //! `b2p info`: what a stream holds.
 
-use b2p::container::Stream;
+use b2p::container::{Level, Section, Stream};
 use b2p::latents::{Precision, Steps};
 use b2p::{Limits, colour};
 use serde_json::json;
@@ -14,9 +14,7 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
     let bytes = load::bytes(&args.input)?;
     let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
     let header = stream.header();
-    let whole = stream.levels().len();
-    let model = header.model();
-    let at_hand = match model {
+    let at_hand = match header.model() {
         Some(_) => Some(load::from_file(args.model.as_deref())?),
         None => None,
     };
@@ -26,102 +24,103 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
         let heads: Vec<_> = shape.heads().iter().map(ToString::to_string).collect();
         (shape.name.clone(), heads)
     });
-    let levels = || {
-        (header.base..)
-            .zip(header.voxels.iter().zip(&header.sections))
-            .enumerate()
+    let levels = levels(&stream)?;
+    Ok(match args.json {
+        true => json(&stream, bytes.len(), &levels, known),
+        false => text(args, &stream, bytes.len(), &levels, known),
+    })
+}
+
+/// Name and heads of a model.
+type Known = Option<(String, Vec<String>)>;
+
+/// What a stream says of a level. What stands in its chunks is not known of a level that is not whole.
+struct Described {
+    level: u8,
+    voxels: u32,
+    section: Section,
+    /// Bytes of the stream up to its end.
+    prefix: u64,
+    /// Quantisation steps of the colours in version 3.
+    steps: Option<colour::Steps>,
+    residual: Option<usize>,
+    precision: Option<Precision>,
+    whole: bool,
+}
+
+fn levels(stream: &Stream) -> Result<Vec<Described>> {
+    let header = stream.header();
+    let counted = header.voxels.iter().zip(&header.sections);
+    let levels = (header.base..).zip(counted).enumerate();
+    let describe = |(i, (level, (&voxels, &section)))| {
+        let found: Option<&Level> = stream.levels().get(i);
+        let residual = |found: &Level| found.residual.iter().map(|slice| slice.bytes.len() + 16).sum();
+        let precision = |found: &Level| Precision::read(found.residual.first()?.bytes);
+        Ok(Described {
+            level,
+            voxels,
+            section,
+            prefix: header.prefix_bytes(level)?,
+            steps: found.and_then(steps),
+            residual: found.map(residual),
+            precision: found.and_then(precision),
+            whole: found.is_some(),
+        })
     };
+    levels.map(describe).collect()
+}
 
-    // Of a level that is not whole it is not known.
-    let residual = |i: usize| {
-        let level = stream.levels().get(i)?;
-        let bytes = level.residual.iter().map(|slice| slice.bytes.len() + 16);
-        Some(bytes.sum::<usize>())
+/// The steps of a level of version 3.
+fn steps(level: &Level) -> Option<colour::Steps> {
+    let colours = level.colours.as_ref()?;
+    let trunk = colours.trunk.map(|trunk| trunk.slice);
+    let last = colours.levels.last().and_then(|level| level.slices.first());
+    let &[luma, chroma, ..] = last.or(trunk.as_ref())?.bytes else {
+        return None;
     };
+    let steps = colour::Steps { luma, chroma };
+    steps.is_valid().then_some(steps)
+}
 
-    let precision = |i: usize| {
-        let level = stream.levels().get(i)?;
-        Precision::read(level.residual.first()?.bytes)
+fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> String {
+    let header = stream.header();
+    let level = |of: &Described| {
+        json!({
+            "level": of.level,
+            "voxels": of.voxels,
+            "geometry_bytes": of.section.geometry,
+            "colour_bytes": of.section.colours,
+            "luma_step": of.steps.map(|steps| steps.luma_step()),
+            "lossless": of.steps.map(|steps| steps.is_lossless()),
+            "residual_bytes": of.residual,
+            "residual_steps": of.precision.map(|told| json!({
+                "fine": [told.fine.luma, told.fine.chroma],
+                "coarse": [told.coarse.luma, told.coarse.chroma],
+                "boundary": told.boundary,
+            })),
+            "whole": of.whole,
+        })
     };
+    let levels: Vec<_> = levels.iter().map(level).collect();
+    let description = json!({
+        "version": header.format.version(),
+        "bits": header.bits,
+        "points": header.points,
+        "levels": levels,
+        "total_bytes": bytes,
+        "model": header.model(),
+        "model_name": known.as_ref().map(|(name, _)| name),
+        "heads": known.as_ref().map(|(_, heads)| heads),
+        "origin": header.placement.origin,
+        "voxel_size": header.placement.voxel_size,
+        "damage": stream.damage().map(ToString::to_string),
+    });
+    format!("{description:#}\n")
+}
 
-    // Luma's step of a level of version 3, in 255ths.
-    let step = |i: usize| {
-        let colours = stream.levels().get(i)?.colours.as_ref()?;
-        let trunk = colours.trunk.map(|trunk| trunk.slice);
-        let last = colours.levels.last().and_then(|level| level.slices.first());
-        let &[luma, chroma, ..] = last.or(trunk.as_ref())?.bytes else {
-            return None;
-        };
-        let steps = colour::Steps { luma, chroma };
-        steps.is_valid().then_some(steps)
-    };
-
-    if args.json {
-        let levels: Vec<_> = levels()
-            .map(|(i, (level, (voxels, section)))| {
-                json!({
-                    "level": level,
-                    "voxels": voxels,
-                    "geometry_bytes": section.geometry,
-                    "colour_bytes": section.colours,
-                    "luma_step": step(i).map(|steps| steps.luma_step()),
-                    "lossless": step(i).map(|steps| steps.is_lossless()),
-                    "residual_bytes": residual(i),
-                    "residual_steps": precision(i).map(|told| json!({
-                        "fine": [told.fine.luma, told.fine.chroma],
-                        "coarse": [told.coarse.luma, told.coarse.chroma],
-                        "boundary": told.boundary,
-                    })),
-                    "whole": i < whole,
-                })
-            })
-            .collect();
-        let description = json!({
-            "version": header.format.version(),
-            "bits": header.bits,
-            "points": header.points,
-            "levels": levels,
-            "total_bytes": bytes.len(),
-            "model": model,
-            "model_name": known.as_ref().map(|(name, _)| name),
-            "heads": known.as_ref().map(|(_, heads)| heads),
-            "origin": header.placement.origin,
-            "voxel_size": header.placement.voxel_size,
-            "damage": stream.damage().map(ToString::to_string),
-        });
-        return Ok(format!("{description:#}\n"));
-    }
-
-    let bpp = |bytes: u64| format!("{:.4}", bytes as f64 * 8.0 / header.points.max(1) as f64);
-    let mut rows = vec![
-        [
-            "level",
-            "voxels",
-            "geometry bytes",
-            "colour bytes",
-            "step",
-            "residual bytes",
-            "its steps",
-            "bits/point up to here",
-        ]
-        .map(String::from)
-        .to_vec(),
-    ];
-    for (i, (level, (&voxels, section))) in levels() {
-        let prefix = header.prefix_bytes(level)?;
-        let missing = if i < whole { "" } else { " (not whole)" };
-        rows.push(vec![
-            format!("{level}{missing}"),
-            count(voxels.into()),
-            count(section.geometry.into()),
-            count(section.colours.into()),
-            step(i).map_or("-".into(), step_told),
-            residual(i).map_or("?".into(), |bytes| count(bytes as u64)),
-            precision(i).map_or("-".into(), told),
-            bpp(prefix),
-        ]);
-    }
-    let coded = match (&model, &known, &args.model) {
+fn text(args: &Info, stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> String {
+    let header = stream.header();
+    let coded = match (header.model(), known, &args.model) {
         (None, ..) => "transform coefficients, no model needed".into(),
         (Some(id), Some((name, heads)), _) => {
             format!("model {id}: {name}, heads: {}", heads.join(", "))
@@ -134,13 +133,42 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
         header.format.version(),
         count(header.points),
         header.bits,
-        count(bytes.len() as u64),
-        table(&rows),
+        count(bytes as u64),
+        table(&rows(levels, header.points)),
     );
     if let Some(damage) = stream.damage() {
         text += &format!("damage: {damage}\n");
     }
-    Ok(text)
+    text
+}
+
+/// The table's rows, titles first.
+fn rows(levels: &[Described], points: u64) -> Vec<Vec<String>> {
+    let titles = [
+        "level",
+        "voxels",
+        "geometry bytes",
+        "colour bytes",
+        "step",
+        "residual bytes",
+        "its steps",
+        "bits/point up to here",
+    ];
+    let mut rows = vec![titles.map(String::from).to_vec()];
+    for of in levels {
+        let missing = if of.whole { "" } else { " (not whole)" };
+        rows.push(vec![
+            format!("{}{missing}", of.level),
+            count(of.voxels.into()),
+            count(of.section.geometry.into()),
+            count(of.section.colours.into()),
+            of.steps.map_or("-".into(), step_told),
+            of.residual.map_or("?".into(), |bytes| count(bytes as u64)),
+            of.precision.map_or("-".into(), told),
+            format!("{:.4}", of.prefix as f64 * 8.0 / points.max(1) as f64),
+        ]);
+    }
+    rows
 }
 
 /// A step of luma in 255ths.

@@ -111,6 +111,9 @@ enum For<'a> {
     Kept(&'a Kept),
 }
 
+/// A picture's file, its size, and how it was drawn.
+type Drawn = (PathBuf, [u32; 2], Stats);
+
 /// Draws these Gaussians into the pictures asked for.
 fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camera)], log: &mut Log) -> Result<String> {
     let &Drawing { args, limits, .. } = drawing;
@@ -123,57 +126,12 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camer
     renderer.set_quality(drawing.quality);
     let format = format_of(args, cameras.len())?;
     let mut artist = Artist::new(renderer, gaussians, limits, args, format);
-    let mut all = Vec::new();
-    let mut each = |path: &Path, camera: &Camera, artist: &mut Artist| -> b2p::Result<()> {
-        let stats = log.step(format!("draw {}", path.display()), gaussians.len(), "Gaussians", || {
-            artist.draw(camera)
-        })?;
-        all.push((path.to_owned(), camera.size(), stats));
-        Ok(())
+    let all = match format {
+        Format::Y4m => video(args, cameras, &mut artist, log)?,
+        _ => stills(args, cameras, &mut artist, log)?,
     };
 
-    let to_stdout = args.output == Path::new(PIPE);
-    if format == Format::Y4m {
-        let mut video = |to: &mut dyn Write| -> b2p::Result<()> {
-            for (i, (path, camera)) in cameras.iter().enumerate() {
-                let last = (artist.image.width, artist.image.height);
-                each(path, camera, &mut artist)?;
-                if i == 0 {
-                    write(to, &artist.image.y4m_header(), &args.output)?;
-                } else if last != (artist.image.width, artist.image.height) {
-                    let what = "the pictures of a video are all of one size";
-                    return Err(Error::Usage(format!("{what}: {} is not", path.display())));
-                }
-                write(to, &artist.file()?, &args.output)?;
-            }
-            Ok(())
-        };
-        if to_stdout {
-            video(&mut std::io::stdout().lock())?;
-        } else {
-            output::write_file(&args.output, video)?;
-        }
-    } else {
-        for (path, camera) in cameras {
-            each(path, camera, &mut artist)?;
-            let file = artist.file()?;
-            if to_stdout {
-                write(&mut std::io::stdout().lock(), &file, path)?;
-            } else {
-                output::write_file(path, |w| write(w, &file, path))?;
-            }
-        }
-    }
-
-    let mut text = String::new();
-    if let Some(chosen) = &drawing.chosen {
-        let slowest = all.iter().map(|(.., stats)| stats.times.total()).max();
-        let slowest = slowest.unwrap_or_default();
-        text += &match chosen {
-            For::Chosen(chosen, task) => chosen.describe(*task, slowest),
-            For::Kept(kept) => kept.describe(slowest),
-        };
-    }
+    let mut text = chosen(drawing, &all);
     if let (true, Some((_, camera)), Some((_, _, stats))) = (args.verbose, cameras.first(), all.first()) {
         if let Some(detail) = &drawing.detail {
             text += &format!("{detail}\n");
@@ -197,7 +155,7 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camer
         }
         text = format!("{}\n{text}", steps(log.steps()));
     }
-    if to_stdout {
+    if args.output == Path::new(PIPE) {
         // Standard output is the picture's. Nobody to tell if even this fails.
         if args.stats.is_some() || args.verbose || drawing.chosen.is_some() {
             let _ = std::io::stderr().write_all(text.as_bytes());
@@ -205,6 +163,66 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camer
         return Ok(String::new());
     }
     Ok(text)
+}
+
+/// Draws one picture into the artist's image.
+fn draw_logged(path: &Path, camera: &Camera, artist: &mut Artist, log: &mut Log) -> b2p::Result<Drawn> {
+    let count = artist.gaussians.len();
+    let drawn = log.step(format!("draw {}", path.display()), count, "Gaussians", || {
+        artist.draw(camera)
+    });
+    Ok((path.to_owned(), camera.size(), drawn?))
+}
+
+/// Draws all pictures into one file.
+fn video(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log: &mut Log) -> Result<Vec<Drawn>> {
+    let mut all = Vec::new();
+    let mut frames = |to: &mut dyn Write| -> b2p::Result<()> {
+        for (i, (path, camera)) in cameras.iter().enumerate() {
+            let last = (artist.image.width, artist.image.height);
+            all.push(draw_logged(path, camera, artist, log)?);
+            if i == 0 {
+                write(to, &artist.image.y4m_header(), &args.output)?;
+            } else if last != (artist.image.width, artist.image.height) {
+                let what = "the pictures of a video are all of one size";
+                return Err(Error::Usage(format!("{what}: {} is not", path.display())));
+            }
+            write(to, &artist.file()?, &args.output)?;
+        }
+        Ok(())
+    };
+    if args.output == Path::new(PIPE) {
+        frames(&mut std::io::stdout().lock())?;
+    } else {
+        output::write_file(&args.output, frames)?;
+    }
+    Ok(all)
+}
+
+/// Draws each picture into a file of its own.
+fn stills(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log: &mut Log) -> Result<Vec<Drawn>> {
+    let mut all = Vec::new();
+    for (path, camera) in cameras {
+        all.push(draw_logged(path, camera, artist, log)?);
+        let file = artist.file()?;
+        if args.output == Path::new(PIPE) {
+            write(&mut std::io::stdout().lock(), &file, path)?;
+        } else {
+            output::write_file(path, |w| write(w, &file, path))?;
+        }
+    }
+    Ok(all)
+}
+
+/// What was chosen for a budget, and how long the slowest picture took.
+fn chosen(drawing: &Drawing, all: &[Drawn]) -> String {
+    let slowest = all.iter().map(|(.., stats)| stats.times.total()).max();
+    let slowest = slowest.unwrap_or_default();
+    match &drawing.chosen {
+        None => String::new(),
+        Some(For::Chosen(chosen, task)) => chosen.describe(*task, slowest),
+        Some(For::Kept(kept)) => kept.describe(slowest),
+    }
 }
 
 /// What an effect that is on costs, in words: how much sooner the picture is there without it.

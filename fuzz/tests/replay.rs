@@ -116,15 +116,3 @@ fn every_target_holds_on_changed_seeds() {
         }
     });
 }
-
-#[test]
-#[ignore = "writes the seeds into the corpus"]
-fn make_the_seeds() {
-    for (name, _) in TARGETS {
-        let folder = corpus(name);
-        std::fs::create_dir_all(&folder).expect("a folder");
-        for (i, seed) in seeds(name).iter().enumerate() {
-            std::fs::write(folder.join(format!("seed-{i}")), seed).expect("written");
-        }
-    }
-}

@@ -117,26 +117,8 @@ impl Header {
     /// [`Error::Truncated`], [`Error::ChecksumMismatch`], [`Error::Unsupported`] for another version or unknown
     /// critical flags, [`Error::Malformed`] for values that the format forbids, [`Error::LimitExceeded`].
     pub fn parse(bytes: &[u8], limits: &Limits) -> Result<Self> {
-        let length = bytes.len().min(MAGIC.len());
-        if bytes[..length] != MAGIC[..length] {
-            let found = format!("{:02x?}", &bytes[..length]);
-            return Err(malformed(0, "magic", found, format!("{MAGIC:02x?}")));
-        }
         let mut reader = Reader::new(bytes, 0);
-        reader.take(MAGIC.len(), "magic")?;
-        let major = reader.u16("version")?;
-        reader.u16("version")?;
-        // Placeholders: the fields are read below.
-        let mut format = match major {
-            2 => Format::Learned { model: [0; 16] },
-            3 => Format::Transform { colour_slice: 0 },
-            _ => {
-                return Err(Error::Unsupported {
-                    what: "this stream version",
-                    detail: format!("found version {major}, supported are 2 and 3"),
-                });
-            }
-        };
+        let mut format = read_version(&mut reader, bytes)?;
         let critical_flags = reader.u32("critical flags")?;
         let optional_flags = reader.u32("optional flags")?;
         let [bits, base, top, reserved] = reader.array("levels")?;
@@ -156,27 +138,16 @@ impl Header {
         if let Format::Transform { colour_slice } = &mut format {
             *colour_slice = reader.u32("slice size of the colours")?;
         }
-        let mut voxels = Vec::with_capacity(levels);
-        for _ in 0..levels {
-            voxels.push(reader.u32("voxel counts")?);
-        }
-        let mut sections = Vec::with_capacity(levels);
-        for _ in 0..levels {
-            sections.push(Section {
+        let voxels = (0..levels).map(|_| reader.u32("voxel counts"));
+        let voxels = voxels.collect::<Result<Vec<u32>>>()?;
+        let mut section = |_| -> Result<Section> {
+            Ok(Section {
                 geometry: reader.u32("section lengths")?,
                 colours: reader.u32("section lengths")?,
-            });
-        }
-        let found = crc32c::crc32c(&bytes[..reader.at()]);
-        let expected = reader.u32("header checksum")?;
-        if found != expected {
-            return Err(Error::ChecksumMismatch {
-                what: "the header".into(),
-                offset: 0,
-                expected,
-                found,
-            });
-        }
+            })
+        };
+        let sections = (0..levels).map(&mut section).collect::<Result<Vec<_>>>()?;
+        check_sum(&mut reader, bytes)?;
         if critical_flags != 0 {
             return Err(Error::Unsupported {
                 what: "this stream",
@@ -405,6 +376,41 @@ impl Header {
 
 fn hex(id: &[u8; 16]) -> String {
     id.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// Reads magic and version: a format whose model or slice size is yet to be read.
+fn read_version(reader: &mut Reader, bytes: &[u8]) -> Result<Format> {
+    let known = bytes.len().min(MAGIC.len());
+    if bytes[..known] != MAGIC[..known] {
+        let found = format!("{:02x?}", &bytes[..known]);
+        return Err(malformed(0, "magic", found, format!("{MAGIC:02x?}")));
+    }
+    reader.take(MAGIC.len(), "magic")?;
+    let major = reader.u16("version")?;
+    reader.u16("version")?;
+    match major {
+        2 => Ok(Format::Learned { model: [0; 16] }),
+        3 => Ok(Format::Transform { colour_slice: 0 }),
+        _ => Err(Error::Unsupported {
+            what: "this stream version",
+            detail: format!("found version {major}, supported are 2 and 3"),
+        }),
+    }
+}
+
+/// Reads the checksum of all that was read before.
+fn check_sum(reader: &mut Reader, bytes: &[u8]) -> Result<()> {
+    let found = crc32c::crc32c(&bytes[..reader.at()]);
+    let expected = reader.u32("header checksum")?;
+    if found == expected {
+        return Ok(());
+    }
+    Err(Error::ChecksumMismatch {
+        what: "the header".into(),
+        offset: 0,
+        expected,
+        found,
+    })
 }
 
 fn check_levels(format: &Format, base: u8, top: u8) -> Result<()> {

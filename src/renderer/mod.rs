@@ -51,7 +51,7 @@ use crate::error::Result;
 use crate::gaussians::Gaussians;
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
-use crate::renderer::projection::{Dropped, Ellipse, Ellipses, How};
+use crate::renderer::projection::{Dropped, Ellipse, Ellipses, How, Seen};
 use crate::renderer::tiles::{Bins, Count, Grid, Part, TILE};
 use canvas::{Canvas, Colours, Contents, Desk, Indices, Mixed, Output};
 
@@ -329,10 +329,48 @@ impl Renderer {
         limits: &Limits,
         pixels: &mut Vec<O::Pixel>,
     ) -> Result<Stats> {
-        let Wanted { channel, background } = wanted;
+        let mut plan = self.plan::<O>(gaussians, camera, &wanted, limits)?;
+        let (mut times, mut laps) = (Times::default(), Laps(Instant::now()));
+        let seen = self.project(gaussians, camera, wanted.channel, &mut plan, limits)?;
+        times.project = laps.lap();
+        let pairs = self.bins.plan(plan.grid, &mut self.counts, plan.bytes, limits)?;
+        times.bin = laps.lap();
+        if pixels.capacity() < plan.pixels {
+            // What is outgrown goes first, and zeros come as tiles are drawn, from the threads that draw them.
+            *pixels = Vec::new();
+            *pixels = bytemuck::zeroed_vec(plan.pixels);
+        }
+        pixels.resize(plan.pixels, bytemuck::Zeroable::zeroed());
+        let canvas = Canvas {
+            grid: plan.grid,
+            window: camera.window(),
+            shrink: plan.effects.supersample,
+            background: wanted.background,
+        };
+        self.draw_parts(&plan, &canvas, output, pixels, &mut times, &mut laps);
+        let samples = u64::from(plan.effects.supersample).pow(2);
+        Ok(Stats {
+            touched: self.take_touched() / samples,
+            visible: self.ellipses.len() as u64,
+            dropped: seen.dropped,
+            crossing: seen.crossing,
+            pairs,
+            effects: plan.effects,
+            times,
+        })
+    }
+
+    /// Checks all that is asked for, and derives how to draw it.
+    fn plan<O: Output>(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        wanted: &Wanted,
+        limits: &Limits,
+    ) -> Result<Plan> {
         camera.check()?;
         gaussians.check_lengths()?;
-        if let Background::Colour(c) = background
+        if let Background::Colour(c) = wanted.background
             && !c.iter().all(|x| x.is_finite())
         {
             let what = format!("the background {c:?} is not a colour");
@@ -348,8 +386,7 @@ impl Renderer {
         }
         let fine = camera.magnified(effects.supersample);
         let grid = Grid::new(fine.window());
-        let floor = self.quality.floor();
-        let shaded = effects.harmonics || channel != Channel::Colour;
+        let shaded = effects.harmonics || wanted.channel != Channel::Colour;
         let each = Ellipses::BYTES
             + Count::BYTES
             + u64::from(shaded) * size_of::<[f32; 3]>() as u64
@@ -357,50 +394,63 @@ impl Renderer {
         let bytes = count * size_of::<O::Pixel>() as u64
             + gaussians.len() as u64 * each
             + grid.bytes(Ellipses::runs_of(gaussians.len()));
-        limits.check_bytes("bytes to draw the picture", bytes)?;
+        limits.check_bytes(BYTES, bytes)?;
+        Ok(Plan {
+            effects,
+            fine,
+            grid,
+            shaded,
+            pixels: count as usize,
+            bytes,
+        })
+    }
 
-        let mut times = Times::default();
-        let mut clock = Instant::now();
-        let mut lap = || std::mem::replace(&mut clock, Instant::now()).elapsed();
-        if shaded {
+    /// Finds the ellipses and counts them by tile. Completes the plan: whether any cross the near plane, and their bytes.
+    fn project(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        channel: Channel,
+        plan: &mut Plan,
+        limits: &Limits,
+    ) -> Result<Seen> {
+        if plan.shaded {
             shade::fill(gaussians, camera, channel, &mut self.shades);
         }
         let how = How {
             isa: self.isa,
-            compensated: effects.antialias,
-            floor,
+            compensated: plan.effects.antialias,
+            floor: self.quality.floor(),
             near_care: self.effects.near != Choice::Off,
-            slopes: effects.order,
-            colours: shaded.then_some(&self.shades),
+            slopes: plan.effects.order,
+            colours: plan.shaded.then_some(&self.shades),
         };
+        let grid = plan.grid;
         let start = |count: &mut Count, length| count.start(grid, length);
         let look = |count: &mut Count, ellipses: &[Ellipse]| count.count(grid, ellipses);
-        let seen = self
-            .ellipses
-            .project(gaussians, &fine, how, &mut self.counts, start, look)?;
-        effects.near = how.near_care && seen.crossing > 0;
-        let crossing = if effects.near { seen.crossing } else { 0 };
-        let bytes = bytes + crossing * size_of::<Crossing>() as u64;
-        limits.check_bytes("bytes to draw the picture", bytes)?;
-        self.ellipses.look_closer(gaussians, &fine, how);
-        times.project = lap();
-        let pairs = self.bins.plan(grid, &mut self.counts, bytes, limits)?;
-        times.bin = lap();
-
-        if pixels.capacity() < count as usize {
-            // What is outgrown goes first, and zeros come as tiles are drawn, from the threads that draw them.
-            *pixels = Vec::new();
-            *pixels = bytemuck::zeroed_vec(count as usize);
+        let counts = &mut self.counts;
+        let seen = self.ellipses.project(gaussians, &plan.fine, how, counts, start, look)?;
+        plan.effects.near = how.near_care && seen.crossing > 0;
+        if plan.effects.near {
+            plan.bytes += seen.crossing * size_of::<Crossing>() as u64;
         }
-        pixels.resize(count as usize, bytemuck::Zeroable::zeroed());
+        limits.check_bytes(BYTES, plan.bytes)?;
+        self.ellipses.look_closer(gaussians, &plan.fine, how);
+        Ok(seen)
+    }
+
+    /// Draws the picture in as many parts as its limits call for.
+    fn draw_parts<O: Output>(
+        &mut self,
+        plan: &Plan,
+        canvas: &Canvas,
+        output: &O,
+        pixels: &mut [O::Pixel],
+        times: &mut Times,
+        laps: &mut Laps,
+    ) {
         self.desks.resize_with(rayon::current_num_threads(), Mutex::default);
-        let canvas = Canvas {
-            grid,
-            window: camera.window(),
-            shrink: effects.supersample,
-            background,
-        };
-        let what = O::LOOP.unwrap_or(match (effects.order, effects.near) {
+        let what = O::LOOP.unwrap_or(match (plan.effects.order, plan.effects.near) {
             (true, _) => Loop::Order,
             (_, true) => Loop::Care,
             _ => Loop::Plain,
@@ -408,28 +458,23 @@ impl Renderer {
         let mut part = self.bins.next(None);
         while let Some(now) = part {
             self.bins.fill(now.clone(), &self.ellipses, &mut self.counts);
-            times.bin += lap();
-            let [sorting, blending] = self.draw_part(&now, &canvas, floor, what, output, pixels);
-            let drawn = lap();
+            times.bin += laps.lap();
+            let [sorting, blending] = self.draw_part(&now, canvas, self.quality.floor(), what, output, pixels);
+            let drawn = laps.lap();
             let share = sorting.as_secs_f64() / (sorting + blending).as_secs_f64().max(1e-9);
             times.sort += drawn.mul_f64(share);
             times.blend += drawn.mul_f64(1.0 - share);
             part = self.bins.next(Some(&now));
         }
+    }
+
+    /// Blocks that all threads have touched since this was asked last.
+    fn take_touched(&mut self) -> u64 {
         let touched = |desk: &mut Mutex<Desk>| {
             let desk = desk.get_mut().unwrap_or_else(|e| e.into_inner());
             std::mem::take(&mut desk.touched)
         };
-        let samples = u64::from(effects.supersample).pow(2);
-        Ok(Stats {
-            touched: self.desks.iter_mut().map(touched).sum::<u64>() / samples,
-            visible: self.ellipses.len() as u64,
-            dropped: seen.dropped,
-            crossing: seen.crossing,
-            pairs,
-            effects,
-            times,
-        })
+        self.desks.iter_mut().map(touched).sum()
     }
 
     /// Draws a part of the picture; returns the threads' time for sorting and for the pixels.
@@ -476,6 +521,31 @@ impl Renderer {
             let times = [&mut desk.sorting, &mut desk.blending].map(std::mem::take);
             [sum[0] + times[0], sum[1] + times[1]]
         })
+    }
+}
+
+/// What errors call the memory that a picture takes.
+const BYTES: &str = "bytes to draw the picture";
+
+/// How a picture is drawn.
+struct Plan {
+    effects: EffectSet,
+    /// The camera, with as many pixels as there are samples.
+    fine: Camera,
+    grid: Grid,
+    /// Whether the Gaussians' colours are not what is drawn.
+    shaded: bool,
+    pixels: usize,
+    /// Bytes of memory that drawing takes, but for what lists of tiles take.
+    bytes: u64,
+}
+
+/// A clock that tells the time since it was asked last.
+struct Laps(Instant);
+
+impl Laps {
+    fn lap(&mut self) -> Duration {
+        std::mem::replace(&mut self.0, Instant::now()).elapsed()
     }
 }
 

@@ -7,18 +7,17 @@
 //!
 //! The suite of version 3 is beside it: see `transform`.
 //!
-//! After a change of the format or of the shipped model, this makes streams and digests anew:
-//!
-//! ```text
-//! cargo test --test conformance -- --ignored make_the_suite_anew
-//! ```
+//! After a change of the format or of the shipped model, `cargo xtask conformance` makes streams and digests anew.
 
 #[cfg(feature = "encoder")]
 #[path = "../common/mod.rs"]
 mod common;
 mod digest;
+mod digest_transform;
 #[cfg(feature = "encoder")]
 mod make;
+#[cfg(feature = "encoder")]
+mod make_transform;
 mod models;
 #[cfg(feature = "encoder")]
 #[path = "../common/seal.rs"]
@@ -35,8 +34,13 @@ use b2p::log::Log;
 use digest::{Levels, in_pieces, whole};
 use models::model;
 
+/// The repository.
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
 fn folder() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/conformance")
+    root().join("tests/data/conformance")
 }
 
 /// A line of the suite.
@@ -154,26 +158,13 @@ fn gaussians_in_half_are_near_those_in_f16_on_machines_that_sum_in_f16() {
 #[cfg(feature = "encoder")]
 #[test]
 fn the_generator_makes_the_same_streams_again() {
-    for case in make::cases() {
+    let suite = suite();
+    let cases = make::cases();
+    assert_eq!(cases.len(), suite.len());
+    for (case, line) in cases.iter().zip(&suite) {
+        assert_eq!((&case.name, case.model), (&line.name, &line.model[..]));
         if case.anywhere {
             assert!(case.bytes == stream(&case.name), "{} has changed", case.name);
         }
     }
-}
-
-#[cfg(feature = "encoder")]
-#[test]
-#[ignore = "overwrites the suite"]
-fn make_the_suite_anew() {
-    let folder = folder();
-    let (mut text, mut size) = (String::new(), 0);
-    for case in make::cases() {
-        let bytes = case.bytes;
-        let levels = whole(&model(case.model), &bytes).unwrap_or_else(|e| panic!("{}: {e}", case.name));
-        text += &format!("{} {} {}\n", case.name, case.model, levels.join(" "));
-        size += bytes.len();
-        std::fs::write(folder.join(format!("{}.b2p", case.name)), bytes).expect("a stream");
-    }
-    println!("{} streams, {size} bytes", text.lines().count());
-    std::fs::write(folder.join("suite.txt"), text).expect("a list");
 }

@@ -1,7 +1,5 @@
 //! The models that the streams of the suite are coded with.
 
-use std::path::Path;
-
 use b2p::latents::network::{Model, Shape, Upsample, untrained};
 
 /// A model of the suite; `lite` is the one that ships.
@@ -56,7 +54,7 @@ pub fn model(name: &str) -> Model {
         ),
         "learning" => made(Shape { learning: true, ..tiny }, 7),
         "lite" => {
-            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/lite.safetensors");
+            let path = crate::root().join("models/lite.safetensors");
             std::fs::read(path).expect("the model that ships")
         }
         _ => panic!("the suite has no model {name}"),

@@ -210,17 +210,7 @@ impl Header {
                 _ if lines == 1 => return Err(malformed(at(), "magic", shown(line), "\"ply\"")),
                 [] | ["obj_info", ..] => {}
                 ["comment", ..] => comments.push(text["comment".len()..].trim().to_owned()),
-                ["format", name, "1.0"] if format.is_none() => {
-                    format = Some(match name {
-                        "ascii" => Format::Ascii,
-                        "binary_little_endian" => Format::Binary { big_endian: false },
-                        "binary_big_endian" => Format::Binary { big_endian: true },
-                        _ => {
-                            let names = "ascii, binary_little_endian or binary_big_endian";
-                            return Err(malformed(at(), "format", shown(name.as_bytes()), names));
-                        }
-                    });
-                }
+                ["format", name, "1.0"] if format.is_none() => format = Some(format_named(name, at)?),
                 ["format", _, version] if version != "1.0" => {
                     return Err(Error::Unsupported {
                         what: "this PLY version",
@@ -239,13 +229,7 @@ impl Header {
                     let Some(element) = elements.last_mut() else {
                         return Err(malformed(at(), "property", shown(line), "an element first"));
                     };
-                    let Some(kind) = property_kind(kind) else {
-                        let field = format!("type of property {name:.40}");
-                        let expected = "a number type, or list, integer type, number type";
-                        return Err(malformed(at(), field, shown(line), expected));
-                    };
-                    let name = name.to_owned();
-                    element.properties.push(Property { name, kind });
+                    element.properties.push(property(kind, name, line, at)?);
                 }
                 ["end_header"] => break,
                 _ => {
@@ -265,6 +249,29 @@ impl Header {
             lines,
         })
     }
+}
+
+fn format_named(name: &str, at: impl Fn() -> String) -> Result<Format> {
+    match name {
+        "ascii" => Ok(Format::Ascii),
+        "binary_little_endian" => Ok(Format::Binary { big_endian: false }),
+        "binary_big_endian" => Ok(Format::Binary { big_endian: true }),
+        _ => {
+            let names = "ascii, binary_little_endian or binary_big_endian";
+            Err(malformed(at(), "format", shown(name.as_bytes()), names))
+        }
+    }
+}
+
+/// A property whose type is these words of `line`.
+fn property(kind: &[&str], name: &str, line: &[u8], at: impl Fn() -> String) -> Result<Property> {
+    let Some(kind) = property_kind(kind) else {
+        let field = format!("type of property {name:.40}");
+        let expected = "a number type, or list, integer type, number type";
+        return Err(malformed(at(), field, shown(line), expected));
+    };
+    let name = name.to_owned();
+    Ok(Property { name, kind })
 }
 
 fn property_kind(words: &[&str]) -> Option<Kind> {

@@ -224,25 +224,14 @@ impl Shape {
     }
 
     fn check(&self) -> Result<()> {
-        let require = |ok: bool, field: &str, value: &dyn ToString, expected: &str| match ok {
-            true => Ok(()),
-            false => Err(Error::malformed(
-                Stage::Network,
-                "metadata",
-                field,
-                value.to_string(),
-                expected,
-            )),
-        };
-        let channels = |n: usize| n > 0 && n <= MAX_CHANNELS && n.is_multiple_of(4);
         require(
-            channels(self.channels),
+            are_channels(self.channels),
             "channels",
             &self.channels,
             "a multiple of 4 up to 256",
         )?;
         require(
-            self.base_channels == 0 || channels(self.base_channels),
+            self.base_channels == 0 || are_channels(self.base_channels),
             "base_channels",
             &self.base_channels,
             "0, or a multiple of 4 up to 256",
@@ -255,7 +244,7 @@ impl Shape {
         require(roles, "fr_roles", &self.fr_roles, "latent_roles to 3")?;
         for (role, near) in (1..).zip(self.near_channels) {
             require(
-                near == 0 || (channels(near) && role < self.latent_roles),
+                near == 0 || (are_channels(near) && role < self.latent_roles),
                 "near_channels",
                 &near,
                 "0, or for a role that has latents a multiple of 4 up to 256",
@@ -281,6 +270,10 @@ impl Shape {
         for (field, value, low, high, expected) in ranges {
             require((low..=high).contains(&value), field, &value, expected)?;
         }
+        self.check_heads()
+    }
+
+    fn check_heads(&self) -> Result<()> {
         for (i, head) in self.gg.iter().enumerate() {
             let field = |name: &str| format!("gg[{i}].{name}");
             let before = |heads| {
@@ -307,7 +300,7 @@ impl Shape {
                 "8 for role 1, 1 for role 2",
             )?;
             require(
-                channels(head.channels),
+                are_channels(head.channels),
                 &field("channels"),
                 &head.channels,
                 "a multiple of 4 up to 256",
@@ -324,6 +317,24 @@ impl Shape {
             "none, or one for each role that has Gaussians",
         )
     }
+}
+
+/// Fails with [`Error::Malformed`] unless `ok`.
+fn require(ok: bool, field: &str, value: &dyn ToString, expected: &str) -> Result<()> {
+    match ok {
+        true => Ok(()),
+        false => Err(Error::malformed(
+            Stage::Network,
+            "metadata",
+            field,
+            value.to_string(),
+            expected,
+        )),
+    }
+}
+
+fn are_channels(n: usize) -> bool {
+    n > 0 && n <= MAX_CHANNELS && n.is_multiple_of(4)
 }
 
 #[cfg(test)]

@@ -1,0 +1,50 @@
+//! The streams of the suite of version 3: what is unusual about them is in their names.
+
+use b2p::cloud::ColouredVoxels;
+use b2p::encoder::transform::{Fineness, Options, encode};
+use b2p::log::Log;
+
+use crate::common::{Ball, cloud_of};
+
+/// A stream of the suite, what is unusual about it in its name, and whether no float had a part in it, so that every machine makes the
+/// same bytes.
+pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
+    let code = |cloud: &ColouredVoxels, levels, fineness, slice: u32, filter| {
+        let options = Options {
+            levels: Some(levels),
+            fineness,
+            filter,
+            slice_voxels: slice.min(16_384),
+            colour_slice: slice,
+            ..Options::default()
+        };
+        let encoded = encode(cloud, &options, &mut Log::default());
+        encoded.expect("a small cloud is coded").bytes
+    };
+    let (step, lossless) = (Fineness::Step, Fineness::Lossless);
+    let (ball, large) = (Ball::new(5, 11.5).cloud(), Ball::new(6, 24.0).cloud());
+    let far = |i: u64| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 1;
+    let lone = cloud_of(21, (0..40).map(far).collect());
+    let solid = cloud_of(4, (0..1 << 12).collect());
+    let one = cloud_of(10, vec![12_345]);
+    let root = cloud_of(1, vec![0, 3, 5]);
+    let mut grey = Ball::new(5, 9.5).cloud();
+    for colour in &mut grey.colours {
+        *colour = [colour[1]; 3];
+    }
+    vec![
+        ("ball", code(&large, 3..=5, step(20.0), 32_768, true), false),
+        ("fine-steps", code(&ball, 2..=4, step(0.5), 100, true), false),
+        ("coarse-steps", code(&ball, 2..=4, step(400.0), 100, true), false),
+        ("no-filter", code(&ball, 2..=5, step(10.0), 60, false), false),
+        ("grey", code(&grey, 2..=4, step(10.0), 60, true), false),
+        ("lone-voxels", code(&lone, 18..=20, step(10.0), 7, true), false),
+        ("all-levels", code(&ball, 0..=5, step(10.0), 32_768, true), false),
+        ("slices-of-1", code(&root, 0..=1, step(3.0), 1, true), false),
+        ("exact", code(&ball, 2..=4, lossless, 32_768, true), true),
+        ("exact-slices", code(&ball, 2..=5, lossless, 20, true), true),
+        ("exact-solid", code(&solid, 0..=4, lossless, 300, true), true),
+        ("exact-one-voxel", code(&one, 7..=10, lossless, 9, true), true),
+        ("exact-deepest", code(&lone, 21..=21, lossless, 16, true), true),
+    ]
+}

@@ -1,0 +1,149 @@
+//! Makes generated files anew that are kept in the repository: `cargo xtask conformance`, `seeds` or `sample`.
+//!
+//! Tests compare with these files and never write them. What streams a suite has is defined beside its test.
+
+#[path = "../../tests/common/mod.rs"]
+mod common;
+#[path = "../../tests/conformance/digest.rs"]
+#[allow(dead_code, reason = "the test decodes in pieces, too")]
+mod digest;
+#[path = "../../tests/conformance/digest_transform.rs"]
+#[allow(dead_code, reason = "the test decodes in pieces, too")]
+mod digest_transform;
+#[path = "../../tests/conformance/make.rs"]
+#[allow(dead_code, reason = "the test knows which streams every machine makes alike")]
+mod make;
+#[path = "../../tests/conformance/make_transform.rs"]
+mod make_transform;
+#[path = "../../tests/conformance/models.rs"]
+mod models;
+#[path = "../../tests/common/seal.rs"]
+mod seal;
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+
+use b2p::decoder::StreamDecoder;
+use b2p::gaussians::HeadSet;
+
+type Result<T = ()> = std::result::Result<T, Box<dyn Error>>;
+
+const USAGE: &str = "usage: cargo xtask TASK
+
+conformance  writes the streams and digests of both conformance suites into tests/data/conformance
+seeds        writes the seeds of the fuzz targets into fuzz/corpus
+sample       renders the sample scene and codes it as models/scene.b2p and models/sample.b2p";
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let done = match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        ["conformance"] => conformance().and_then(|()| conformance_transform()),
+        ["seeds"] => cargo(&[
+            "run",
+            "--locked",
+            "--manifest-path",
+            "fuzz/Cargo.toml",
+            "--example",
+            "seeds",
+        ]),
+        ["sample"] => sample(),
+        _ => Err(USAGE.into()),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The repository.
+fn root() -> &'static Path {
+    let own = Path::new(env!("CARGO_MANIFEST_DIR"));
+    own.parent().unwrap_or(own)
+}
+
+fn suite() -> PathBuf {
+    root().join("tests/data/conformance")
+}
+
+/// Writes the streams and digests of version 2.
+fn conformance() -> Result {
+    let (mut text, mut size) = (String::new(), 0);
+    for case in make::cases() {
+        let levels = digest::whole(&models::model(case.model), &case.bytes);
+        let levels = levels.map_err(|error| format!("{}: {error}", case.name))?;
+        text += &format!("{} {} {}\n", case.name, case.model, levels.join(" "));
+        size += case.bytes.len();
+        std::fs::write(suite().join(format!("{}.b2p", case.name)), case.bytes)?;
+    }
+    std::fs::write(suite().join("suite.txt"), &text)?;
+    println!("version 2: {} streams, {size} bytes", text.lines().count());
+    Ok(())
+}
+
+/// Writes the streams and digests of version 3, in place of all that are there.
+fn conformance_transform() -> Result {
+    let folder = suite().join("version-3");
+    let decoder = StreamDecoder::new().with_heads(HeadSet::Surfels);
+    let (mut text, mut streams) = (String::new(), Vec::new());
+    for (name, bytes, _) in make_transform::cases() {
+        let levels = digest_transform::whole(&decoder, &bytes).map_err(|error| format!("{name}: {error}"))?;
+        text += &format!("{name} {}\n", levels.join(" "));
+        streams.push((name, bytes));
+    }
+    if folder.exists() {
+        std::fs::remove_dir_all(&folder)?;
+    }
+    std::fs::create_dir_all(&folder)?;
+    for (name, bytes) in &streams {
+        std::fs::write(folder.join(format!("{name}.b2p")), bytes)?;
+    }
+    std::fs::write(folder.join("suite.txt"), text)?;
+    println!("version 3: {} streams", streams.len());
+    Ok(())
+}
+
+/// Makes the sample scene's cloud, and codes it as the streams inside the program.
+fn sample() -> Result {
+    let folder = root().join("target/xtask");
+    std::fs::create_dir_all(&folder)?;
+    let cloud = path(&folder.join("scene.ply"))?;
+    let run = ["run", "--release", "--locked"];
+    cargo(&[&run[..], &["--package", "b2p-lab", "--", "scene", "-o", &cloud]].concat())?;
+    for (stream, colours) in [("scene", "transform"), ("sample", "learned")] {
+        let stream = path(&root().join(format!("models/{stream}.b2p")))?;
+        let encode = [
+            "--bin",
+            "b2p",
+            "--",
+            "encode",
+            &cloud,
+            "-o",
+            &stream,
+            "--colours",
+            colours,
+        ];
+        cargo(&[&run[..], &encode].concat())?;
+    }
+    Ok(())
+}
+
+fn path(path: &Path) -> Result<String> {
+    let text = path
+        .to_str()
+        .ok_or_else(|| format!("{} is not UTF-8", path.display()))?;
+    Ok(text.to_owned())
+}
+
+/// Runs cargo in the repository.
+fn cargo(arguments: &[&str]) -> Result {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let status = Command::new(cargo).args(arguments).current_dir(root()).status()?;
+    match status.success() {
+        true => Ok(()),
+        false => Err(format!("cargo {}: {status}", arguments.join(" ")).into()),
+    }
+}
