@@ -11,7 +11,7 @@
 //! first slice of the level above (or the trunk) had learned in the end, and see only coded children of their own slice. So they are coded in parallel.
 //!
 //! # Payloads
-//! A slice is: u8 index of luma's step, u8 index of chroma's ([`Steps`]), u8 gain of predictions in 256ths, then the range coder's words ([`crate::coding`]).
+//! A slice is: u8 index of luma's step, u8 index of chroma's ([`Steps`]), u8 gain of predictions in 256ths, then the range coder's words (`crate::coding`).
 //! The trunk's steps are those of level K; the level above has [half of them](Steps), and so on. After its gain follow the root's colour, u8 Y, i16 Co, i16 Cg.
 
 mod block;

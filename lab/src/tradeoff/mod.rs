@@ -1,5 +1,4 @@
-//! What accuracy costs in time: every knob that trades one for the other, measured on the same stream in one run, and budgets to be told
-//! instead of knobs ([`Budget`]).
+//! Accuracy against time: every setting that trades one for the other, measured on the same stream in one run.
 //!
 //! The truth is the finest level of the stream, its Gaussians generated in double precision and drawn by [`b2p::renderer::reference`], in
 //! double precision and without any cut-off. Against it stand, one knob at a time and in combination, the coarser levels, the

@@ -18,7 +18,7 @@
 //! `activate.rs`.
 //!
 //! # The model file
-//! Safetensors, all tensors f16: `SET.parent.in.weight` [27, 12, C] and `.bias` [C], `SET.parent.I.a`, `SET.parent.I.b`, `SET.up.weight`
+//! Safetensors, all tensors f16: `SET.parent.in.weight` [27, 12, C] and `.bias` \[C\], `SET.parent.I.a`, `SET.parent.I.b`, `SET.up.weight`
 //! [8, C, C], `SET.child.in`, `SET.child.I.a`, `SET.child.I.b`, `SET.out` [27, C, 14·K], `SET` being `best.1`, `best.8`, `quick.1` or
 //! `quick.8`. The metadata's `b2p-heads` is JSON: `version` 1, `blur` (see [`Gaussians::blur`]; in squares of half the unit), and `sets`, for
 //! each `channels`, `parent_blocks`, `child_blocks`, `gaussians`, and `ranges`: how large the outputs of each layer but the last get.

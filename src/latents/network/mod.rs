@@ -37,7 +37,7 @@
 //! one step of role r's features `g`, `c_scale[r]` that of its context. `gg.r.scale`, which may be left out, has the same for a generator:
 //! of the chain of residual blocks before layer 4 (what enters it, every branch, every sum), of the inside of each of its blocks, and
 //! of the same after layer 4. Where `gg` of the metadata has further generators that say `"heads": "quick"`, their layers are `gg.quick.r.*`
-//! ([`Heads`]). Tables: see [`crate::latents::entropy::Tables`]. A file without `fc.*` and `fs.*` can decode only.
+//! (quick heads). Tables: see [`crate::latents::entropy::Tables`]. A file without `fc.*` and `fs.*` can decode only.
 //! The JSON may also say at which `bit_price` latents are best rounded: one for all, or K for each of the three roles.
 
 mod children;
