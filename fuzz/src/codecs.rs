@@ -7,11 +7,11 @@ use std::rc::Rc;
 use std::sync::LazyLock;
 
 use b2p::container::Slice;
+use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::latents::entropy::{
     Condition, Part, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
     decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice, quantise, quantise_passes,
 };
-use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::{Cancel, Isa};
 
 use crate::Source;

@@ -5,9 +5,9 @@ use std::sync::LazyLock;
 
 use b2p::Limits;
 use b2p::cloud::{PointCloud, voxelise, voxelise_closed};
-use b2p::latents::entropy::UNPREDICTED;
 use b2p::gaussians::Gaussians;
 use b2p::geometry::{KernelMap, Octree, Voxels};
+use b2p::latents::entropy::UNPREDICTED;
 use b2p::latents::network::{Model, Pass, Shape, untrained};
 
 use crate::one_in;

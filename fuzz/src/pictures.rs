@@ -6,8 +6,8 @@ use b2p::gaussians::Gaussians;
 use b2p::geometry::{Octree, Voxels};
 use b2p::latents::network::{Model, Shape, untrained};
 use b2p::layers::Precision;
-use b2p::renderer::{Background, Renderer};
 use b2p::renderer::camera::Camera;
+use b2p::renderer::{Background, Renderer};
 use b2p::{Isa, Limits};
 
 use crate::{Source, one_in};

@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
-use b2p::container::{Level, Stream};
 use b2p::cloud::{ColouredVoxels, PointCloud};
-use b2p::latents::Decoder;
+use b2p::container::{Level, Stream};
 use b2p::encoder::{Options, encode, transform};
-use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::geometry::Voxels;
+use b2p::latents::Decoder;
+use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::log::Log;
 use b2p::{Limits, Placement};
 

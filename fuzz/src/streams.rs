@@ -1,11 +1,11 @@
 //! Streams from strangers.
 
 use b2p::container::{Header, Level, Slice, Stream, Writer};
-use b2p::latents::{Decoder, Decoding, Exact};
 use b2p::decoder::StreamDecoder;
 use b2p::gaussians::Gaussians;
-use b2p::log::Log;
 use b2p::latents::network::Model;
+use b2p::latents::{Decoder, Decoding, Exact};
+use b2p::log::Log;
 use b2p::{Error, Limits};
 
 use crate::{MODEL, giving_back, one_in, transform, within};
