@@ -265,9 +265,13 @@ fn a_bomb_of_a_hundred_bytes_reserves_nothing() {
                     decoder.decode(&bytes, None, &mut Log::default())
                 }
             };
-            let (refused, held) = peak(decode);
-            let expected = matches!(refused, Err(Error::LimitExceeded { .. } | Error::Truncated { .. }));
-            assert!(expected, "{refused:?}");
+            // The least of three: the harness may start another test's thread meanwhile, which counts too.
+            let runs = [(); 3].map(|()| peak(decode));
+            for (refused, _) in &runs {
+                let expected = matches!(refused, Err(Error::LimitExceeded { .. } | Error::Truncated { .. }));
+                assert!(expected, "{refused:?}");
+            }
+            let held = runs.iter().map(|(_, held)| *held).min().unwrap();
             assert!(held < 1 << 12, "{held} bytes");
         }
     }

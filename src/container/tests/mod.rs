@@ -178,7 +178,13 @@ fn bytes_after_the_last_section_are_reported() {
     let bytes = [&sample()[..], b"!"].concat();
     let stream = parse(&bytes).unwrap();
     assert_eq!(stream.deepest(), Some(4));
-    assert!(stream.damage().unwrap().to_string().contains("what follows"));
+    assert!(
+        stream
+            .damage()
+            .unwrap()
+            .to_string()
+            .contains("bytes after the last section")
+    );
 }
 
 #[test]
