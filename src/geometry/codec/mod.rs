@@ -11,7 +11,7 @@
 //!
 //! The output layer of the network is backward-adaptive (`predictor`). Where the network is uncertain, a mixer combines
 //! its prediction with those of five adaptive contexts (`contexts`, `mixer`). The decisions are coded by a binary
-//! arithmetic coder (`coder`, [`crate::coding::probability`]). If a parent has none of its first seven children, the
+//! arithmetic coder (`coder`, `coding::probability`). If a parent has none of its first seven children, the
 //! eighth is implied and not coded.
 //!
 //! # Exactness
