@@ -123,5 +123,6 @@ pub use renderer::camera::{Camera, Projection};
 pub use renderer::projection::Dropped;
 #[cfg(feature = "render")]
 pub use renderer::{
-    Background, Channel, Choice, Effect, EffectSet, Effects, Explanation, Ids, Image, Quality, Renderer, Stats, Times,
+    Background, Channel, Effect, EffectMode, EffectSet, Effects, Explanation, Ids, Image, Quality, Renderer, Stats,
+    Times,
 };

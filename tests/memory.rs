@@ -18,7 +18,7 @@ use b2p::latents::network::{Model, Shape, untrained};
 use b2p::layers::Precision;
 use b2p::log::Log;
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Channel, Choice, Effect, Effects, Ids, Image, Renderer, render};
+use b2p::renderer::{Background, Channel, Effect, EffectMode, Effects, Ids, Image, Renderer, render};
 use b2p::{Error, Limits};
 use common::{Ball, cloud_of, steps};
 use peak_alloc::PeakAlloc;
@@ -344,7 +344,7 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
         coefficients: vec![[0.01; 3]; 3 * gaussians.len()],
     };
     let plain = Effects::default();
-    let on = Choice::On;
+    let on = EffectMode::On;
     let antialias = plain.with(Effect::Antialias, on);
     let order = plain.with(Effect::Order, on);
     // One thread: of several, each takes what it needs when the fullest tile first comes to it.

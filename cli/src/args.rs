@@ -189,9 +189,8 @@ pub struct Render {
     /// What is drawn
     #[arg(long, value_enum, value_name = "WHAT", default_value_t = Show::Colour)]
     pub show: Show,
-    /// Force an effect (harmonics, antialias, supersample, near, order) on or off
-    #[arg(long, value_name = "NAME=on|off|auto", value_parser = effect)]
-    pub effect: Vec<(Effect, Choice)>,
+    #[arg(long, value_name = "NAME=on|off|auto", value_parser = effect, help = effect_help())]
+    pub effect: Vec<(Effect, EffectMode)>,
     /// How much of what is faint may be left out: fast, fine, exact
     #[arg(long, value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
     pub quality: Quality,
@@ -342,7 +341,13 @@ pub struct ModelArg {
 
 use super::budget::BudgetArgs;
 use super::values::{background, bits_per_point, bytes, effect, levels, orbit, per_voxel, price, residual, size, step};
-pub use b2p::renderer::{Background, Choice, Effect, Quality};
+pub use b2p::renderer::{Background, Effect, EffectMode, Quality};
+
+/// The help of `--effect`.
+fn effect_help() -> String {
+    let names = Effect::ALL.map(Effect::name).join(", ");
+    format!("Force an effect ({names}) on or off")
+}
 
 #[cfg(test)]
 mod tests {

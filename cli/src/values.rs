@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use b2p::encoder::Residual;
 use b2p::encoder::transform::Fineness;
 use b2p::latents::Steps;
-use b2p::renderer::{Background, Choice, Effect};
+use b2p::renderer::{Background, Effect, EffectMode};
 
 /// A number of bytes, with or without K, M, G or T for powers of 1024.
 pub fn bytes(text: &str) -> Result<u64, String> {
@@ -105,7 +105,7 @@ pub fn orbit(text: &str) -> Result<[f32; 3], String> {
     <[f32; 3]>::try_from(numbers).map_err(|_| "expected three numbers: azimuth,elevation,distance".into())
 }
 
-pub fn effect(text: &str) -> Result<(Effect, Choice), String> {
+pub fn effect(text: &str) -> Result<(Effect, EffectMode), String> {
     let (name, choice) = text
         .split_once('=')
         .ok_or("expected an effect and a choice such as antialias=on")?;

@@ -7,7 +7,7 @@ use b2p::container::{Level, Stream};
 use b2p::encoder::{Options, encode, transform};
 use b2p::geometry::Voxels;
 use b2p::latents::LatentDecoder;
-use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
+use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, ResidualSteps, Steps};
 use b2p::log::Log;
 use b2p::{Limits, Placement};
 
@@ -81,7 +81,7 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
     let filter = ColourFilter { exponent: 7, weights };
     let slice = stream.header().slice_voxels as usize;
     let steps = |luma, chroma| Steps { luma, chroma };
-    let precision = Precision {
+    let precision = ResidualSteps {
         fine: steps(30, 12),
         coarse: steps(10, 4),
         boundary: 3,

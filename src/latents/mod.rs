@@ -15,4 +15,4 @@ pub use colour_filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundi
 pub use decoder::{Exact, LatentDecoder, LatentDecoder as Decoder};
 pub(crate) use decoding::nothing_reached;
 pub use decoding::{LatentDecoding, LatentDecoding as Decoding};
-pub use residual::{BASIS as COLOUR_BASIS, ColourResidual, Precision, Steps};
+pub use residual::{BASIS as COLOUR_BASIS, ColourResidual, ResidualSteps, Steps};

@@ -41,7 +41,7 @@ use crate::error::{Error, Result, Stage};
 use crate::gaussians::Gaussians;
 #[cfg(feature = "encoder")]
 use crate::latents::entropy::encode_coefficients;
-use crate::latents::entropy::{Part, decode_coefficients};
+use crate::latents::entropy::{SlicePart, decode_coefficients};
 
 /// The unit vectors of luma and two chromas, in red, green and blue.
 #[allow(clippy::excessive_precision)] // the nearest f32, as the format has it
@@ -94,25 +94,25 @@ impl Steps {
 
 /// How finely a residual is told, by how wide what it tells is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Precision {
-    /// Where voxels join below [`Precision::boundary`].
+pub struct ResidualSteps {
+    /// Where voxels join below [`ResidualSteps::boundary`].
     pub fine: Steps,
     /// Where they join there or above, and for the first voxel.
     pub coarse: Steps,
-    /// A bit of Morton keys, at most [`Precision::MAX_BOUNDARY`]: 3·n for what is wider than 2ⁿ voxels.
+    /// A bit of Morton keys, at most [`ResidualSteps::MAX_BOUNDARY`]: 3·n for what is wider than 2ⁿ voxels.
     pub boundary: u8,
 }
 
-impl Precision {
+impl ResidualSteps {
     /// The highest bit.
     pub const MAX_BOUNDARY: u8 = 63;
 
     /// That of the payload of a residual's chunk; `None` if it is none that can be.
-    pub fn read(payload: &[u8]) -> Option<Precision> {
+    pub fn read(payload: &[u8]) -> Option<ResidualSteps> {
         let fixed = *payload.first_chunk::<FIXED>()?;
         let [luma, chroma, coarse_luma, coarse_chroma, boundary] = fixed;
         let told = [luma, chroma, coarse_luma, coarse_chroma] != [0; 4];
-        (told && boundary <= Precision::MAX_BOUNDARY).then_some(Precision {
+        (told && boundary <= ResidualSteps::MAX_BOUNDARY).then_some(ResidualSteps {
             fine: Steps { luma, chroma },
             coarse: Steps {
                 luma: coarse_luma,
@@ -124,7 +124,7 @@ impl Precision {
 
     #[cfg(feature = "encoder")]
     fn to_bytes(self) -> [u8; FIXED] {
-        let Precision { fine, coarse, boundary } = self;
+        let ResidualSteps { fine, coarse, boundary } = self;
         [fine.luma, fine.chroma, coarse.luma, coarse.chroma, boundary]
     }
 
@@ -136,8 +136,8 @@ impl Precision {
     }
 
     /// The parts that coarse and fine triples are coded in.
-    fn parts<T>(self, (coarse, fine): (T, T)) -> [Part<T>; 2] {
-        [(self.coarse, coarse), (self.fine, fine)].map(|(steps, triples)| Part {
+    fn parts<T>(self, (coarse, fine): (T, T)) -> [SlicePart<T>; 2] {
+        [(self.coarse, coarse), (self.fine, fine)].map(|(steps, triples)| SlicePart {
             present: steps.channels(),
             triples,
         })
@@ -150,7 +150,7 @@ pub struct ColourResidual {
     /// Voxels of a slice.
     slice: usize,
     /// One for each slice.
-    precisions: Vec<Precision>,
+    precisions: Vec<ResidualSteps>,
     /// Three for each voxel, in the order in which they are coded.
     coefficients: Vec<[i16; 3]>,
 }
@@ -180,7 +180,7 @@ impl ColourResidual {
         let mut coefficients = vec![[0; 3]; keys.len()];
         let parse = |((payload, keys), triples): ((&Slice, &[u64]), &mut [[i16; 3]])| {
             let at = format!("byte {}, residual of level {level}", payload.offset);
-            let Some(precision) = Precision::read(payload.bytes) else {
+            let Some(precision) = ResidualSteps::read(payload.bytes) else {
                 let field = "steps of the colour residual";
                 let expected = "four steps, not all 0, and a bit up to 63";
                 let found = format!("{:?}", &payload.bytes[..payload.bytes.len().min(FIXED)]);
@@ -193,7 +193,7 @@ impl ColourResidual {
         let parts = payloads.par_iter().zip(keys.par_chunks(slice));
         let parts = parts.zip(coefficients.par_chunks_mut(slice));
         // All of them, so that the first fault is always the same.
-        let precisions: Vec<Result<Precision>> = parts.map(parse).collect();
+        let precisions: Vec<Result<ResidualSteps>> = parts.map(parse).collect();
         Ok(Some(ColourResidual {
             slice,
             precisions: precisions.into_iter().collect::<Result<_>>()?,
@@ -206,10 +206,10 @@ impl ColourResidual {
     /// # Panics
     /// If there are more or fewer of the one than of the other, a slice has none, or the precision is none that can be written.
     #[cfg(feature = "encoder")]
-    pub fn of(missing: &[[f32; 3]], keys: &[u64], slice: usize, precision: Precision) -> Self {
+    pub fn of(missing: &[[f32; 3]], keys: &[u64], slice: usize, precision: ResidualSteps) -> Self {
         assert_eq!(missing.len(), keys.len(), "a difference for every voxel");
         assert!(slice > 0, "slices of something");
-        let written = Precision::read(&precision.to_bytes());
+        let written = ResidualSteps::read(&precision.to_bytes());
         assert!(written.is_some(), "steps and a boundary: {precision:?}");
         let part = |(missing, keys): (&[[f32; 3]], &[u64])| {
             let mut values: Vec<_> = missing
@@ -254,7 +254,7 @@ impl ColourResidual {
     pub fn to_payloads(&self, keys: &[u64]) -> Vec<Vec<u8>> {
         let slices = self.coefficients.par_chunks(self.slice);
         let slices = slices.zip(&self.precisions).zip(keys.par_chunks(self.slice));
-        let payload = |((triples, precision), keys): ((&[[i16; 3]], &Precision), &[u64])| {
+        let payload = |((triples, precision), keys): ((&[[i16; 3]], &ResidualSteps), &[u64])| {
             let parts = precision.parts(triples.split_at(precision.coarse_of(keys)));
             let mut bytes = precision.to_bytes().to_vec();
             bytes.extend(encode_coefficients(&parts));
@@ -296,7 +296,7 @@ impl ColourResidual {
 }
 
 /// The luma and chromas of a slice's voxels.
-fn differences(coefficients: &[[i16; 3]], keys: &[u64], precision: Precision) -> Vec<[f32; 3]> {
+fn differences(coefficients: &[[i16; 3]], keys: &[u64], precision: ResidualSteps) -> Vec<[f32; 3]> {
     let mut values = vec![[0.0; 3]; keys.len()];
     let coarse = precision.coarse_of(keys);
     let [coarse_units, fine_units] = [precision.coarse, precision.fine].map(Steps::units);

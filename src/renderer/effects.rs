@@ -3,6 +3,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use serde::Serialize;
+
 use crate::gaussians::Gaussians;
 use crate::renderer::camera::{Camera, Projection};
 
@@ -17,7 +19,7 @@ pub const MOST_SAMPLES: u32 = 32;
 /// Whether an effect is on.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Choice {
+pub enum EffectMode {
     /// Where the scene calls for it.
     #[default]
     Auto,
@@ -48,24 +50,46 @@ pub enum Effect {
     Order,
 }
 
+impl Effect {
+    /// All effects.
+    pub const ALL: [Effect; 5] = [
+        Effect::Harmonics,
+        Effect::Antialias,
+        Effect::Supersample,
+        Effect::Near,
+        Effect::Order,
+    ];
+
+    /// The name, in lower case.
+    pub fn name(self) -> &'static str {
+        match self {
+            Effect::Harmonics => "harmonics",
+            Effect::Antialias => "antialias",
+            Effect::Supersample => "supersample",
+            Effect::Near => "near",
+            Effect::Order => "order",
+        }
+    }
+}
+
 /// The caller's choice for each effect.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Effects {
     /// [`Effect::Harmonics`].
-    pub harmonics: Choice,
+    pub harmonics: EffectMode,
     /// [`Effect::Antialias`].
-    pub antialias: Choice,
+    pub antialias: EffectMode,
     /// [`Effect::Supersample`].
-    pub supersample: Choice,
+    pub supersample: EffectMode,
     /// [`Effect::Near`].
-    pub near: Choice,
+    pub near: EffectMode,
     /// [`Effect::Order`].
-    pub order: Choice,
+    pub order: EffectMode,
 }
 
 /// Which effects a picture is drawn with. What is off is not in the loops.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct EffectSet {
     /// [`Effect::Harmonics`].
@@ -93,6 +117,11 @@ impl Default for EffectSet {
 }
 
 impl EffectSet {
+    /// Whether an effect changes the colours of Gaussians, so that they are shaded for each view.
+    pub(super) fn shades(&self) -> bool {
+        self.harmonics
+    }
+
     /// Whether the picture is drawn with this effect.
     pub fn is_on(&self, effect: Effect) -> bool {
         match effect {
@@ -117,15 +146,24 @@ pub struct Explanation {
 }
 
 impl Effects {
+    /// Every effect where the scene calls for it.
+    pub const AUTO: Effects = Effects {
+        harmonics: EffectMode::Auto,
+        antialias: EffectMode::Auto,
+        supersample: EffectMode::Auto,
+        near: EffectMode::Auto,
+        order: EffectMode::Auto,
+    };
+
     /// The same choices with another one for `effect`.
-    pub fn with(mut self, effect: Effect, choice: Choice) -> Self {
+    pub fn with(mut self, effect: Effect, choice: EffectMode) -> Self {
         self.set(effect, choice);
         self
     }
 
     /// Sets one.
     #[doc(hidden)]
-    pub fn set(&mut self, effect: Effect, choice: Choice) {
+    pub fn set(&mut self, effect: Effect, choice: EffectMode) {
         match effect {
             Effect::Harmonics => self.harmonics = choice,
             Effect::Antialias => self.antialias = choice,
@@ -139,9 +177,9 @@ impl Effects {
     /// anything reaches over the near plane is found out only while drawing.
     pub fn derive(&self, gaussians: &Gaussians, camera: &Camera) -> EffectSet {
         let decide = |choice, called_for| match choice {
-            Choice::Auto => called_for,
-            Choice::On => true,
-            Choice::Off => false,
+            EffectMode::Auto => called_for,
+            EffectMode::On => true,
+            EffectMode::Off => false,
         };
         let some = gaussians.harmonics.count > 0;
         let antialias = decide(self.antialias, gaussians.compensated);
@@ -161,8 +199,8 @@ impl Effects {
     pub fn explain(&self, gaussians: &Gaussians, camera: &Camera, stats: &Stats) -> Vec<Explanation> {
         let set = stats.effects;
         let forced = |choice, otherwise: &str| match choice {
-            Choice::Auto => otherwise.to_owned(),
-            Choice::On | Choice::Off => "forced".to_owned(),
+            EffectMode::Auto => otherwise.to_owned(),
+            EffectMode::On | EffectMode::Off => "forced".to_owned(),
         };
         let varying = gaussians.opacity.iter().filter(|o| **o != 1.0).count();
         let orthographic = camera.projection == Projection::Orthographic;
@@ -202,8 +240,8 @@ impl Effects {
                     set.supersample,
                     typical_width(gaussians, camera),
                     match (self.supersample, set.antialias) {
-                        (Choice::Off, _) => ", forced",
-                        (Choice::Auto, false) => ", without anti-aliasing none are called for",
+                        (EffectMode::Off, _) => ", forced",
+                        (EffectMode::Auto, false) => ", without anti-aliasing none are called for",
                         _ => "",
                     }
                 ),
@@ -213,7 +251,7 @@ impl Effects {
                 set.near,
                 match (self.near, stats.crossing) {
                     (_, 0) => "no Gaussian in view reaches over the near plane".into(),
-                    (Choice::Off, n) => format!("forced; {n} Gaussians reach over the near plane"),
+                    (EffectMode::Off, n) => format!("forced; {n} Gaussians reach over the near plane"),
                     (_, n) => format!("{n} Gaussians in view reach over the near plane"),
                 },
             ),
@@ -257,27 +295,22 @@ impl FromStr for Effect {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        match name {
-            "harmonics" => Ok(Effect::Harmonics),
-            "antialias" => Ok(Effect::Antialias),
-            "supersample" => Ok(Effect::Supersample),
-            "near" => Ok(Effect::Near),
-            "order" => Ok(Effect::Order),
-            _ => Err(format!(
-                "no effect `{name}`, but harmonics, antialias, supersample, near and order"
-            )),
-        }
+        let mut all = Effect::ALL.into_iter();
+        all.find(|effect| effect.name() == name).ok_or_else(|| {
+            let names = Effect::ALL.map(Effect::name).join(", ");
+            format!("no effect `{name}`, but {names}")
+        })
     }
 }
 
-impl FromStr for Choice {
+impl FromStr for EffectMode {
     type Err = String;
 
     fn from_str(word: &str) -> Result<Self, String> {
         match word {
-            "auto" => Ok(Choice::Auto),
-            "on" => Ok(Choice::On),
-            "off" => Ok(Choice::Off),
+            "auto" => Ok(EffectMode::Auto),
+            "on" => Ok(EffectMode::On),
+            "off" => Ok(EffectMode::Off),
             _ => Err(format!("`{word}` is not on, off or auto")),
         }
     }

@@ -40,7 +40,9 @@ use b2p_kernels::Isa;
 use b2p_kernels::splat::{Crossing, Loop, Scene};
 use rayon::prelude::*;
 
-pub use effects::{Choice, Effect, EffectSet, Effects, Explanation, MOST_SAMPLES, RESOLVED};
+#[doc(hidden)]
+pub use effects::EffectMode as Choice;
+pub use effects::{Effect, EffectMode, EffectSet, Effects, Explanation, MOST_SAMPLES, RESOLVED};
 pub use image::{Ids, Image, box_half};
 pub use shade::Channel;
 
@@ -49,7 +51,7 @@ use crate::gaussians::Gaussians;
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
 use crate::renderer::projection::{Dropped, Ellipse, Ellipses, How, Seen};
-use crate::renderer::tiles::{Bins, Count, Grid, Part, TILE};
+use crate::renderer::tiles::{Bins, Count, Grid, TILE, TileBand};
 use canvas::{Canvas, Colours, Contents, Desk, Indices, Mixed, Output};
 
 /// What is seen where the Gaussians let light through.
@@ -464,7 +466,7 @@ impl Renderer {
         }
         let fine = camera.magnified(effects.supersample);
         let grid = Grid::new(fine.window());
-        let shaded = effects.harmonics || wanted.channel != Channel::Colour;
+        let shaded = effects.shades() || wanted.channel != Channel::Colour;
         let each = Ellipses::BYTES
             + Count::BYTES
             + u64::from(shaded) * size_of::<[f32; 3]>() as u64
@@ -493,13 +495,13 @@ impl Renderer {
         limits: &Limits,
     ) -> Result<Seen> {
         if plan.shaded {
-            shade::fill(gaussians, camera, channel, &mut self.shades);
+            shade::fill(gaussians, camera, channel, &plan.effects, &mut self.shades);
         }
         let how = How {
             isa: self.isa,
             compensated: plan.effects.antialias,
             floor: self.quality.floor(),
-            near_care: self.effects.near != Choice::Off,
+            near_care: self.effects.near != EffectMode::Off,
             slopes: plan.effects.order,
             colours: plan.shaded.then_some(&self.shades),
         };
@@ -558,7 +560,7 @@ impl Renderer {
     /// Draws a part of the picture; returns the threads' time for sorting and for the pixels.
     fn draw_part<O: Output>(
         &self,
-        part: &Part,
+        part: &TileBand,
         canvas: &Canvas,
         floor: f32,
         what: Loop,

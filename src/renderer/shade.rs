@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use crate::gaussians::Gaussians;
 use crate::renderer::camera::{Camera, Projection};
+use crate::renderer::effects::EffectSet;
 
 /// Gaussians per parallel task.
 const BLOCK: usize = 4096;
@@ -24,7 +25,13 @@ pub enum Channel {
 }
 
 /// Fills `shades` with what each Gaussian is drawn as: whatever `channel` asks for, and of colours those of the view.
-pub(super) fn fill(gaussians: &Gaussians, camera: &Camera, channel: Channel, shades: &mut Vec<[f32; 3]>) {
+pub(super) fn fill(
+    gaussians: &Gaussians,
+    camera: &Camera,
+    channel: Channel,
+    effects: &EffectSet,
+    shades: &mut Vec<[f32; 3]>,
+) {
     let rotation = camera.pose.matrix3;
     let eye = (rotation.transpose() * -camera.pose.translation).as_vec3();
     let along = rotation.row(2).as_vec3();
@@ -34,10 +41,11 @@ pub(super) fn fill(gaussians: &Gaussians, camera: &Camera, channel: Channel, sha
     };
     let shade = |i: usize| -> [f32; 3] {
         match channel {
-            Channel::Colour => {
+            Channel::Colour if effects.harmonics => {
                 let towards = towards(i).into();
                 gaussians.harmonics.seen(i, gaussians.colour[i], towards)
             }
+            Channel::Colour => gaussians.colour[i],
             Channel::Depth => {
                 let centre = DVec3::from(gaussians.position[i].map(f64::from));
                 [camera.pose.transform_point3(centre).z as f32; 3]

@@ -228,7 +228,7 @@ fn magnitude(decisions: &mut impl Decisions, contexts: &mut [Context], wanted: u
 
 /// Triples of a slice, `T` being a slice of them, of which the same channels are present.
 #[derive(Debug, Clone)]
-pub struct Part<T> {
+pub struct SlicePart<T> {
     /// The channels: `0..3`, `0..1`, `1..3`, or none.
     pub present: Range<usize>,
     /// The triples.
@@ -236,9 +236,9 @@ pub struct Part<T> {
 }
 
 /// Codes the coefficients of one slice; those of channels that are not present must be 0. Of −2¹⁵ the code is that of −2¹⁵ + 1: magnitudes have 15 bits.
-pub fn encode_coefficients(parts: &[Part<&[[i16; 3]]>]) -> Vec<u8> {
+pub fn encode_coefficients(parts: &[SlicePart<&[[i16; 3]]>]) -> Vec<u8> {
     let (mut model, mut record) = (Model::new(), Record(Vec::new()));
-    for Part { present, triples } in parts.iter().filter(|part| !part.present.is_empty()) {
+    for SlicePart { present, triples } in parts.iter().filter(|part| !part.present.is_empty()) {
         for triple in *triples {
             let within = triple.map(|value| value.max(-i16::MAX));
             let coded = model.triple(&mut record, present.clone(), within);
@@ -255,10 +255,10 @@ pub fn encode_coefficients(parts: &[Part<&[[i16; 3]]>]) -> Vec<u8> {
 ///
 /// # Errors
 /// [`Error::Malformed`], naming `at`, if the bytes are not what [`encode_coefficients`] makes of as many.
-pub fn decode_coefficients(bytes: &[u8], parts: &mut [Part<&mut [[i16; 3]]>], at: &dyn Display) -> Result<()> {
+pub fn decode_coefficients(bytes: &[u8], parts: &mut [SlicePart<&mut [[i16; 3]]>], at: &dyn Display) -> Result<()> {
     let mut stack = slice::open(bytes, at)?;
     let mut model = Model::new();
-    for Part { present, triples } in parts.iter_mut().filter(|part| !part.present.is_empty()) {
+    for SlicePart { present, triples } in parts.iter_mut().filter(|part| !part.present.is_empty()) {
         for triple in triples.iter_mut() {
             let read = model.triple(&mut stack, present.clone(), [0; 3]);
             *triple = read.ok_or_else(|| {
@@ -279,7 +279,7 @@ mod tests {
     /// All channels of as many triples.
     fn decode(bytes: &[u8], count: usize) -> Result<Vec<[i16; 3]>> {
         let mut triples = vec![[0; 3]; count];
-        let whole = Part {
+        let whole = SlicePart {
             present: 0..3,
             triples: &mut triples[..],
         };
@@ -288,7 +288,7 @@ mod tests {
     }
 
     fn encode(triples: &[[i16; 3]]) -> Vec<u8> {
-        encode_coefficients(&[Part { present: 0..3, triples }])
+        encode_coefficients(&[SlicePart { present: 0..3, triples }])
     }
 
     fn channels() -> impl Strategy<Value = Range<usize>> {
@@ -318,13 +318,13 @@ mod tests {
                 }
             }
             let part = |(present, triples): &(Range<usize>, Vec<[i16; 3]>)| (present.clone(), triples.clone());
-            let bytes = encode_coefficients(&parts.each_ref().map(|(present, triples)| Part {
+            let bytes = encode_coefficients(&parts.each_ref().map(|(present, triples)| SlicePart {
                 present: present.clone(),
                 triples: &triples[..],
             }));
             let mut decoded = parts.each_ref().map(part);
             decoded.iter_mut().for_each(|(_, triples)| triples.fill([0; 3]));
-            let mut room = decoded.each_mut().map(|(present, triples)| Part {
+            let mut room = decoded.each_mut().map(|(present, triples)| SlicePart {
                 present: present.clone(),
                 triples: &mut triples[..],
             });

@@ -45,7 +45,7 @@ mod slice;
 mod tables;
 
 pub use coding::Coding;
-pub use coefficients::{Part, decode_coefficients, encode_coefficients};
+pub use coefficients::{SlicePart, decode_coefficients, encode_coefficients};
 pub use level::{decode_level, encode_level, expect_no_latents, latent_hash};
 pub use octants::{Predict, decode_passes, encode_passes};
 pub use quantise::{Rounding, quantise, quantise_passes};

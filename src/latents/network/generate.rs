@@ -6,7 +6,7 @@ use b2p_kernels::{ExactConv, FloatConv, Precision as Sums, Taps, zeros};
 use rayon::prelude::*;
 
 use super::Model;
-use super::children::{Part, Parts};
+use super::children::{VoxelPart, VoxelParts};
 use super::head::Head;
 use super::structure::{Generate, RAW};
 use crate::error::{Error, Result};
@@ -200,11 +200,11 @@ impl Model {
     ) {
         let (isa, h, n) = (self.isa, gg.head.channels, map.len());
         let layers = 2 * gg.after.len() + 1;
-        let mut parts = Parts::new(map);
+        let mut parts = VoxelParts::new(map);
         let (mut first, mut rest) = (0, out);
         while first < n {
             let rows = first..n.min(first + part);
-            let Part { voxels, ends, map } = parts.part(rows, layers.div_ceil(2), AROUND * part);
+            let VoxelPart { voxels, ends, map } = parts.part(rows, layers.div_ceil(2), AROUND * part);
             let (out, after) = rest.split_at_mut(ends[0] * 8 * RAW);
             (first, rest) = (first + ends[0], after);
             // After that many layers, the children whose results some later layer reads.

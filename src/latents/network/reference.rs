@@ -2,7 +2,7 @@
 //!
 //! Shares with it the list of modules and layers (`structure.rs`) and nothing else.
 
-mod passes;
+mod neighbours;
 
 use std::collections::HashMap;
 

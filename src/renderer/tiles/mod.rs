@@ -168,7 +168,7 @@ impl Count {
     }
 
     /// As [`Count::deal`], of the tiles of `part` alone.
-    fn deal_part(&mut self, stride: usize, place: usize, entries: &[AtomicU64], part: &Part) {
+    fn deal_part(&mut self, stride: usize, place: usize, entries: &[AtomicU64], part: &TileBand) {
         for (i, touch) in self.touches.iter().enumerate() {
             let key = u64::from(touch.depth) << 32 | (place + i) as u64;
             let [row, column] = [touch.first as usize / stride, touch.first as usize % stride];
@@ -186,7 +186,7 @@ impl Count {
 
 /// Tiles that are drawn together: whole rows, or some of one row.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Part {
+pub struct TileBand {
     /// Rows of tiles.
     pub rows: Range<usize>,
     /// Columns of tiles.
@@ -204,7 +204,7 @@ pub struct Bins {
     /// The depth's bits above, the place below. Atomic because threads write side by side, each entry once.
     entries: Vec<AtomicU64>,
     most: u64,
-    part: Option<Part>,
+    part: Option<TileBand>,
 }
 
 impl Bins {
@@ -238,7 +238,7 @@ impl Bins {
     }
 
     /// The part that follows `last`, or the first.
-    pub fn next(&self, last: Option<&Part>) -> Option<Part> {
+    pub fn next(&self, last: Option<&TileBand>) -> Option<TileBand> {
         let Grid { columns, rows, .. } = self.grid;
         let (mut row, mut column) = match last {
             None => (0, 0),
@@ -259,7 +259,7 @@ impl Bins {
                 row += 1;
             }
             if row > start {
-                return Some(Part {
+                return Some(TileBand {
                     rows: start..row,
                     columns: 0..columns,
                 });
@@ -273,14 +273,14 @@ impl Bins {
             }
             column += 1;
         }
-        Some(Part {
+        Some(TileBand {
             rows: row..row + 1,
             columns: first..column,
         })
     }
 
     /// Deals the ellipses out to the tiles of `part`; the memory is reused.
-    pub fn fill(&mut self, part: Part, ellipses: &Ellipses, counts: &mut [Count]) {
+    pub fn fill(&mut self, part: TileBand, ellipses: &Ellipses, counts: &mut [Count]) {
         let Grid { columns, .. } = self.grid;
         let stride = columns + 1;
         // Where each tile starts, and within it, each run.

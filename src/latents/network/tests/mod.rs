@@ -4,7 +4,7 @@ mod definition;
 mod files;
 mod golden;
 mod half;
-mod passes;
+mod predict;
 
 use b2p_kernels::Isa;
 
