@@ -57,6 +57,7 @@ pub mod encoder;
 pub mod error;
 pub mod gaussians;
 pub mod geometry;
+pub mod input;
 pub mod latents;
 pub mod layers;
 pub mod limits;

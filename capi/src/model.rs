@@ -42,13 +42,15 @@ impl From<Limits> for b2p::Limits {
         b2p::Limits {
             max_points: limits.max_points,
             max_pixels: limits.max_pixels,
+            // As in the presets.
+            max_pairs: limits.max_pixels.saturating_mul(4),
             max_bytes: limits.max_bytes,
             max_depth: limits.max_depth,
         }
     }
 }
 
-/// Limits for anything: 2^26 points, 2^28 pixels, 2 GiB. What NULL stands for.
+/// Limits for anything: 2^26 points, 2^26 pixels, 2 GiB. What NULL stands for.
 #[unsafe(no_mangle)]
 pub extern "C" fn b2p_limits_default() -> Limits {
     b2p::Limits::default().into()

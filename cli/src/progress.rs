@@ -22,12 +22,15 @@ impl Progress {
         if let Ok(style) = ProgressStyle::with_template("{spinner} {msg} ({elapsed})") {
             bar.set_style(style);
         }
-        bar.enable_steady_tick(Duration::from_millis(100));
         Progress { bar }
     }
 
     /// Says what is being done.
     pub fn say(&self, step: &str) {
+        // From the first step on: before, the user may be asked something.
+        if !self.bar.is_hidden() && self.bar.message().is_empty() {
+            self.bar.enable_steady_tick(Duration::from_millis(100));
+        }
         self.bar.set_message(step.to_owned());
     }
 }

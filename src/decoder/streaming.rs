@@ -11,6 +11,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::HeadSet;
 use crate::gaussians::learned::HeadsModel;
 use crate::gaussians::{Frame, Gaussians};
+use crate::geometry::Voxels;
 use crate::latents::network::Model;
 use crate::latents::{Decoding, nothing_reached};
 use crate::log::Log;
@@ -136,6 +137,16 @@ impl<'b> StreamDecoding<'b> {
                 _ => false,
             },
         }
+    }
+
+    /// The voxels of the level reached, once there is one.
+    pub fn voxels(&self) -> Option<&Voxels> {
+        let octree = match &self.state {
+            State::Start(_) | State::Refused => return None,
+            State::Learned(decoding) => &decoding.exact()?.octree,
+            State::Transform(decoding) => &decoding.reached()?.octree,
+        };
+        Some(octree.level(self.level()?))
     }
 
     /// The voxels of the level reached with their colours, if the stream has version 3.
