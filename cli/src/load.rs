@@ -157,7 +157,7 @@ pub fn extent(bytes: &[u8], decoder: &StreamDecoder, limits: &Limits) -> Extent 
         });
         Some(Extent::of(spheres))
     };
-    base().unwrap_or(Extent::CUBE)
+    base().unwrap_or(Extent::cube())
 }
 
 /// Gaussians from a stream, or as they stand in a PLY.

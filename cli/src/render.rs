@@ -50,7 +50,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     };
     let source = Source::open(input, detail, model, limits, &mut log)?;
     let frame = source.frame()?;
-    let mut cameras = shots(args, &frame, &Extent::CUBE, limits)?;
+    let mut cameras = shots(args, &frame, &Extent::cube(), limits)?;
     permit(args, &cameras)?;
     // What keeps the object in view is nearer than what keeps the cube in view.
     if detail.level.is_none() && source.level_for(&cameras)?.is_some() {
@@ -76,7 +76,7 @@ fn from_pipe(args: &Render, limits: &Limits, log: &mut Log) -> Result<Said> {
     let mut show = |gaussians: &Gaussians, log: &mut Log| {
         // Pictures of coarser levels are this program's own.
         if !permitted {
-            permit(args, &shots(args, &gaussians.frame, &Extent::CUBE, limits)?)?;
+            permit(args, &shots(args, &gaussians.frame, &Extent::cube(), limits)?)?;
             permitted = true;
         }
         let drawing = Drawing {
@@ -118,7 +118,8 @@ fn within_time(args: &Render, bytes: &[u8], limits: &Limits, log: &mut Log) -> R
 fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
     let mut outputs: Vec<&Path> = cameras.iter().map(|shot| shot.path.as_path()).collect();
     outputs.dedup();
-    if !manners::is_pipe(&args.output) && cameras.len() > 1 && format_of(args, cameras.len())? == Format::Y4m {
+    let is_video = args.output.turntable.is_some() || args.contact_sheet;
+    if !is_video && !manners::is_pipe(&args.output) && cameras.len() > 1 && format_of(args, cameras.len())? == Format::Y4m {
         outputs = vec![&args.output];
     }
     let inputs = [Some(&args.input), args.camera.as_ref(), args.model.model.as_ref()];
