@@ -161,6 +161,7 @@ pub enum Error {
 
 impl Error {
     /// A [`Error::Malformed`].
+    #[doc(hidden)]
     pub fn malformed(
         stage: Stage,
         at: impl ToString,

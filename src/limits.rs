@@ -82,6 +82,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_points(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_points, "max_points")
     }
@@ -90,6 +91,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_depth(&self, what: &'static str, depth: u8) -> Result<()> {
         check(what, depth.into(), self.max_depth.into(), "max_depth")
     }
@@ -98,6 +100,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_pixels(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_pixels, "max_pixels")
     }
@@ -106,6 +109,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_bytes(&self, what: &'static str, bytes: u64) -> Result<()> {
         let addressable = isize::MAX as u64;
         check(what, bytes, self.max_bytes.min(addressable), "max_bytes")

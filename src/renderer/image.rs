@@ -122,11 +122,13 @@ impl Image {
     }
 
     /// What a YUV4MPEG2 stream of pictures of this size begins with, at 30 pictures a second.
+    #[doc(hidden)]
     pub fn y4m_header(&self) -> Vec<u8> {
         format!("YUV4MPEG2 W{} H{} F30:1 Ip A1:1 C444\n", self.width, self.height).into_bytes()
     }
 
     /// One picture of a YUV4MPEG2 stream: ITU-R BT.601, limited range, colour at full resolution; what is transparent over black.
+    #[doc(hidden)]
     pub fn to_y4m_frame(&self) -> Vec<u8> {
         let rows = [
             [65.481, 128.553, 24.966, 16.0],

@@ -117,12 +117,14 @@ impl HeadsModel {
     }
 
     /// The networks of the model.
+    #[doc(hidden)]
     pub fn sets(&self) -> impl Iterator<Item = Set> + '_ {
         self.generators.iter().map(|(set, _)| *set)
     }
 
     /// Maximum memory in bytes of [`HeadsModel::generate`] for a level of `voxels` voxels and `above` voxels in the
     /// level above, Gaussians included; 0 if the model does not have the set.
+    #[doc(hidden)]
     pub fn bytes(&self, set: Set, voxels: u64, above: u64) -> u64 {
         match self.find(set) {
             Some(generator) => network::bytes(generator.shape(), voxels, above),
@@ -139,6 +141,7 @@ impl HeadsModel {
     ///
     /// # Panics
     /// If the octree is less deep, or if the kernel maps or colours do not match its levels in length.
+    #[doc(hidden)]
     pub fn generate(
         &self,
         isa: Isa,

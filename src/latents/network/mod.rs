@@ -185,6 +185,7 @@ impl Model {
     }
 
     /// The model's extents.
+    #[doc(hidden)]
     pub fn shape(&self) -> &Shape {
         &self.shape
     }
@@ -195,6 +196,7 @@ impl Model {
     }
 
     /// The probability tables.
+    #[doc(hidden)]
     pub fn tables(&self) -> &Tables {
         &self.tables
     }
@@ -203,6 +205,7 @@ impl Model {
     ///
     /// # Panics
     /// If `role` is above 2.
+    #[doc(hidden)]
     pub fn bit_prices(&self, role: usize) -> &[f32] {
         &self.bit_prices[role]
     }
