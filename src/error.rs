@@ -169,6 +169,7 @@ pub enum Error {
 
 impl Error {
     /// A [`Error::Malformed`].
+    #[doc(hidden)]
     pub fn malformed(
         stage: Stage,
         at: impl ToString,

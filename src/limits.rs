@@ -7,6 +7,7 @@ pub const MAX_DEPTH: u8 = 21;
 
 /// Bounds that are checked before memory is reserved. Finite by default: 2²⁶ points, 21 levels, 2²⁶ pixels, 2²⁸ pairs, 2 GiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Limits {
     /// Voxels of any one level, and points of any one cloud.
     pub max_points: u64,
@@ -58,10 +59,41 @@ impl Limits {
         }
     }
 
+    /// The same limits with other [`Limits::max_points`].
+    pub fn with_max_points(mut self, points: u64) -> Self {
+        self.max_points = points;
+        self
+    }
+
+    /// The same limits with other [`Limits::max_depth`].
+    pub fn with_max_depth(mut self, depth: u8) -> Self {
+        self.max_depth = depth;
+        self
+    }
+
+    /// The same limits with other [`Limits::max_pixels`].
+    pub fn with_max_pixels(mut self, pixels: u64) -> Self {
+        self.max_pixels = pixels;
+        self
+    }
+
+    /// The same limits with other [`Limits::max_pairs`].
+    pub fn with_max_pairs(mut self, pairs: u64) -> Self {
+        self.max_pairs = pairs;
+        self
+    }
+
+    /// The same limits with other [`Limits::max_bytes`].
+    pub fn with_max_bytes(mut self, bytes: u64) -> Self {
+        self.max_bytes = bytes;
+        self
+    }
+
     /// Holds `count` points against the limit.
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_points(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_points, "max_points")
     }
@@ -70,6 +102,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_depth(&self, what: &'static str, depth: u8) -> Result<()> {
         check(what, depth.into(), self.max_depth.into(), "max_depth")
     }
@@ -78,6 +111,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_pixels(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_pixels, "max_pixels")
     }
@@ -86,6 +120,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_pairs(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_pairs, "max_pairs")
     }
@@ -94,6 +129,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_bytes(&self, what: &'static str, bytes: u64) -> Result<()> {
         let addressable = isize::MAX as u64;
         check(what, bytes, self.max_bytes.min(addressable), "max_bytes")

@@ -112,18 +112,24 @@ pub enum Preset {
 impl LimitArgs {
     /// The limits that they name.
     pub fn limits(&self) -> Limits {
-        let preset = match self.limits {
+        let limits = match self.limits {
             Preset::Embedded => Limits::embedded(),
             Preset::Default => Limits::default(),
             Preset::Unlimited => Limits::unlimited(),
         };
-        Limits {
-            max_points: self.max_points.unwrap_or(preset.max_points),
-            max_pixels: self.max_pixels.unwrap_or(preset.max_pixels),
-            max_pairs: self.max_pairs.unwrap_or(preset.max_pairs),
-            max_bytes: self.max_memory.unwrap_or(preset.max_bytes),
-            ..preset
-        }
+        let [points, pixels] = [
+            self.max_points.unwrap_or(limits.max_points),
+            self.max_pixels.unwrap_or(limits.max_pixels),
+        ];
+        let [pairs, bytes] = [
+            self.max_pairs.unwrap_or(limits.max_pairs),
+            self.max_memory.unwrap_or(limits.max_bytes),
+        ];
+        limits
+            .with_max_points(points)
+            .with_max_pixels(pixels)
+            .with_max_pairs(pairs)
+            .with_max_bytes(bytes)
     }
 }
 

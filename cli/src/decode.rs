@@ -21,14 +21,13 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.input.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;
-    let say = |step: &str| progress.say(step);
-    let mut log = Log::with_listener(&say);
+    let log = progress.log();
     if args.points {
-        return points(args, limits, &mut log);
+        return points(args, limits, &log);
     }
     let (input, to) = (&args.input, &args.output);
     let mut written = 0;
-    let mut write = |gaussians: &Gaussians, log: &mut Log| {
+    let mut write = |gaussians: &Gaussians, log: &Log| {
         written = gaussians.len();
         log.step("write PLY", written, "Gaussians", || {
             Ok(manners::write(to, |w| gaussians.write_ply(w, to)))
@@ -36,9 +35,9 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
     };
     let chosen = if let Some(bytes) = keep::stream(&args.budget, input, limits)? {
         let (budget, start) = (&args.budget, Instant::now());
-        let kept = keep::decode(budget, input, &bytes, &args.model, limits, &mut log)?;
+        let kept = keep::decode(budget, input, &bytes, &args.model, limits, &log)?;
         let told = kept.describe(start.elapsed());
-        write(&kept.gaussians, &mut log)?;
+        write(&kept.gaussians, &log)?;
         told
     } else {
         let chosen = budget::choose(&args.budget, &args.model, input, Task::Decode, limits, progress)?;
@@ -50,7 +49,7 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
         let mut took = Duration::ZERO;
         // What has gone to standard output cannot be replaced by something finer.
         let early = !manners::is_pipe(to);
-        pipe::each(input, detail, model, limits, early, &mut log, &mut |gaussians, log| {
+        pipe::each(input, detail, model, limits, early, &log, &mut |gaussians, log| {
             took = log.steps().iter().map(|step| step.time).sum();
             write(gaussians, log)
         })?;
@@ -64,7 +63,7 @@ fn said(args: &Decode, chosen: &str, written: usize, thing: &str, log: &Log) -> 
     let to = &args.output;
     let report = format!(
         "{chosen}{}\n{}: {}\n",
-        steps(log.steps()),
+        steps(&log.steps()),
         to.display(),
         counted(written as u64, thing)
     );
@@ -74,14 +73,14 @@ fn said(args: &Decode, chosen: &str, written: usize, thing: &str, log: &Log) -> 
             "count": written,
             "of": format!("{}s", thing.to_lowercase()),
             "budget": (!chosen.is_empty()).then(|| chosen.trim()),
-            "steps": steps_json(log.steps()),
+            "steps": steps_json(&log.steps()),
         })
     };
     Said::report(report, json).beside(to)
 }
 
 /// Decodes a stream into a PLY of points.
-fn points(args: &Decode, limits: &Limits, log: &mut Log) -> Result<Said> {
+fn points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
     let bytes = load::bytes(&args.input, limits)?;
     kinds::check_stream(&args.input, &bytes)?;
     let bytes = load::whole_levels(&args.input, bytes, &args.detail, limits)?;
@@ -90,9 +89,9 @@ fn points(args: &Decode, limits: &Limits, log: &mut Log) -> Result<Said> {
         let what = "a stream of version 2 holds no colours of voxels, but Gaussians";
         return Err(Failure(format!("{}: {what}", args.input.display())));
     }
-    let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?;
+    let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?.with_log(log);
     load::reserve_for(&args.input, &bytes, &decoder, args.detail.level, limits)?;
-    let decoding = decoder.whole(&bytes, args.detail.level, log);
+    let decoding = decoder.whole(&bytes);
     let decoding = decoding.map_err(&fail)?;
     let cloud = decoding.points().map(|points| points.to_cloud()).unwrap_or_default();
     let (written, to) = (cloud.positions.len(), &args.output);

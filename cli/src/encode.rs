@@ -21,8 +21,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.cloud.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;
-    let say = |step: &str| progress.say(step);
-    let mut log = Log::with_listener(&say);
+    let log = progress.log();
     let in_cloud = Failure::in_file(&args.cloud);
     let cloud = log
         .step("read cloud", 1, "file", || Ok(read(args, limits)))
@@ -35,8 +34,8 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         })
         .map_err(&in_cloud)?;
     let coded = match args.colours {
-        Colours::Transform => transform(args, &cloud, &mut log)?,
-        Colours::Learned => learned(args, &cloud, &mut log)?,
+        Colours::Transform => transform(args, &cloud, &log)?,
+        Colours::Learned => learned(args, &cloud, &log)?,
     };
     let Coded { encoded, chosen } = coded;
     let to = &args.output;
@@ -65,7 +64,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
             "bits": depth,
             "bits_per_point": encoded.bytes.len() as f64 * 8.0 / voxels as f64,
             "levels": encoded.rates.iter().map(level).collect::<Vec<_>>(),
-            "steps": steps_json(log.steps()),
+            "steps": steps_json(&log.steps()),
         })
     };
 
@@ -91,7 +90,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
     };
     let report = format!(
         "{}\n{}\n{}: {} for {} at {}, {} bits per point{}\n{coarser}",
-        steps(log.steps()),
+        steps(&log.steps()),
         table(&rows),
         to.display(),
         counted(encoded.bytes.len() as u64, "byte"),
@@ -117,7 +116,7 @@ struct Coded {
 }
 
 /// Codes a stream of version 3.
-fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded> {
+fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
     let model = &args.model;
     let learned = &args.learned;
     let asked = [
@@ -164,7 +163,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Cod
 }
 
 /// Codes a stream of version 2.
-fn learned(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded> {
+fn learned(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
     if args.step.is_some() || args.lossless {
         let what = "--step and --lossless are for --colours transform";
         return Err(Failure(what.into()));

@@ -1,10 +1,8 @@
 //! Files in: models, streams, Gaussians.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use b2p::container::{Header, Stream, version};
-use b2p::decoder::StreamDecoder;
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::gaussians::{Frame, Gaussians, ply};
@@ -12,7 +10,7 @@ use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::renderer::Explanation;
 use b2p::renderer::camera::Extent;
-use b2p::{Error, Isa, Limits, UnknownIsa, input};
+use b2p::{Decoder, Error, Isa, Limits, UnknownIsa, input};
 
 use super::args::{DetailArg, ModelArg};
 use super::views::Shot;
@@ -51,10 +49,11 @@ pub fn model(arg: &ModelArg) -> Result<Model> {
 }
 
 /// What decodes the stream that starts with these bytes, with the heads asked for. A model is loaded only if it takes one.
-pub fn decoder(bytes: &[u8], detail: &DetailArg, model_arg: &ModelArg, limits: &Limits) -> Result<StreamDecoder> {
-    let mut decoder = StreamDecoder::new()
+pub fn decoder(bytes: &[u8], detail: &DetailArg, model_arg: &ModelArg, limits: &Limits) -> Result<Decoder> {
+    let mut decoder = Decoder::new()
         .with_isa(isa(model_arg.isa.as_deref())?)
-        .with_limits(limits.clone());
+        .with_limits(limits.clone())
+        .with_level(detail.level);
     if let Some(heads) = detail.heads {
         decoder = decoder.with_heads(heads);
     }
@@ -62,13 +61,13 @@ pub fn decoder(bytes: &[u8], detail: &DetailArg, model_arg: &ModelArg, limits: &
         decoder = decoder.with_per_voxel(count);
     }
     if version(bytes) == Some(2) {
-        return Ok(decoder.with_model(Arc::new(model(model_arg)?)));
+        return Ok(decoder.with_model(model(model_arg)?));
     }
     if let Some(name) = &model_arg.precision {
         decoder = decoder.with_precision(name.parse()?);
     }
     if detail.heads != Some(HeadSet::Surfels) {
-        decoder = decoder.with_heads_model(Arc::new(heads(model_arg.model.as_deref())?));
+        decoder = decoder.with_heads_model(heads(model_arg.model.as_deref())?);
     }
     Ok(decoder)
 }
@@ -101,13 +100,7 @@ pub fn reserve(what: &'static str, bytes: u64) -> Result<()> {
 }
 
 /// The same for a stream, decoded down to `level` or as far as it goes.
-pub fn reserve_for(
-    path: &Path,
-    bytes: &[u8],
-    decoder: &StreamDecoder,
-    level: Option<u8>,
-    limits: &Limits,
-) -> Result<()> {
+pub fn reserve_for(path: &Path, bytes: &[u8], decoder: &Decoder, level: Option<u8>, limits: &Limits) -> Result<()> {
     let Ok(header) = Header::parse(bytes, limits) else {
         // What is wrong is said when it is decoded.
         return Ok(());
@@ -143,12 +136,12 @@ pub fn whole_levels(path: &Path, mut bytes: Vec<u8>, detail: &DetailArg, limits:
 }
 
 /// The part of the cube that a stream's object takes, as its base level tells; the whole cube if that cannot be known.
-pub fn extent(bytes: &[u8], decoder: &StreamDecoder, limits: &Limits) -> Extent {
+pub fn extent(bytes: &[u8], decoder: &Decoder, limits: &Limits) -> Extent {
     let base = || {
         let header = Header::parse(bytes, limits).ok()?;
-        let mut decoding = decoder.start(None);
+        let mut decoding = decoder.clone().with_level(None).start();
         decoding.push(bytes.get(..header.prefix_bytes(header.base).ok()? as usize)?);
-        decoding.advance(&mut Log::default()).ok()??;
+        decoding.advance().ok()??;
         let voxels = decoding.voxels()?;
         let half = f64::from(1u32 << voxels.depth()) / 2.0;
         let spheres = (0..voxels.len()).map(|i| {
@@ -166,7 +159,7 @@ pub fn gaussians(
     detail: &DetailArg,
     model_arg: &ModelArg,
     limits: &Limits,
-    log: &mut Log,
+    log: &Log,
 ) -> Result<Gaussians> {
     let bytes = bytes(path, limits)?;
     if bytes.starts_with(PLY_MAGIC) {
@@ -176,7 +169,7 @@ pub fn gaussians(
     let bytes = whole_levels(path, bytes, detail, limits)?;
     let decoder = decoder(&bytes, detail, model_arg, limits)?;
     reserve_for(path, &bytes, &decoder, detail.level, limits)?;
-    let gaussians = decoder.decode(&bytes, detail.level, log);
+    let gaussians = decoder.with_log(log).decode(&bytes);
     gaussians.map_err(Failure::in_file(path))
 }
 
@@ -188,19 +181,13 @@ pub enum Source<'p> {
     Stream {
         path: &'p Path,
         bytes: Vec<u8>,
-        decoder: Box<StreamDecoder>,
+        decoder: Box<Decoder>,
     },
 }
 
 impl<'p> Source<'p> {
     /// Reads a file.
-    pub fn open(
-        path: &'p Path,
-        detail: &DetailArg,
-        model_arg: &ModelArg,
-        limits: &Limits,
-        log: &mut Log,
-    ) -> Result<Self> {
+    pub fn open(path: &'p Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Self> {
         let bytes = bytes(path, limits)?;
         if bytes.starts_with(PLY_MAGIC) {
             return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
@@ -239,7 +226,7 @@ impl<'p> Source<'p> {
     }
 
     /// The Gaussians of `level`; without one, of what `cameras` can show, and why that level.
-    pub fn gaussians(self, detail: &DetailArg, cameras: &[Shot], log: &mut Log) -> Result<(Gaussians, Explanation)> {
+    pub fn gaussians(self, detail: &DetailArg, cameras: &[Shot], log: &Log) -> Result<(Gaussians, Explanation)> {
         let seen = match detail.level {
             Some(_) => None,
             None => self.level_for(cameras)?,
@@ -261,13 +248,14 @@ impl<'p> Source<'p> {
             (None, Some(level)) => format!("level {level}: its voxels already fall under a pixel"),
             (None, None) => "as fine as there is".into(),
         };
-        let gaussians = decoder.decode(&bytes, detail.level.or(seen), log);
+        let decoder = decoder.with_level(detail.level.or(seen)).with_log(log);
+        let gaussians = decoder.decode(&bytes);
         Ok((gaussians.map_err(&fail)?, explain(seen.is_some(), why)))
     }
 }
 
 /// Gaussians as they stand in the PLY `bytes`, which came from `path`.
-pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &mut Log) -> Result<Gaussians> {
+pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Gaussians> {
     let asked = [("--level", detail.level.is_some()), ("--heads", detail.heads.is_some())];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
         return Err(Failure(format!(

@@ -96,10 +96,8 @@ impl<'a> Artist<'a> {
         self.limits.check_pixels("pixels of the picture", pixels)?;
         let beside = pixels.saturating_mul(each);
         self.limits.check_bytes("bytes to draw the picture", beside)?;
-        Ok(Limits {
-            max_bytes: self.limits.max_bytes - beside,
-            ..self.limits.clone()
-        })
+        let left = self.limits.max_bytes - beside;
+        Ok(self.limits.clone().with_max_bytes(left))
     }
 
     /// The number of the Gaussian plus one, its lowest eight bits in red, the next in green and in blue.

@@ -28,16 +28,15 @@ const TRIALS: usize = 3;
 
 /// Draws one picture, or several: on a circle, or with the cameras of a file.
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> {
-    let say = |step: &str| progress.say(step);
-    let mut log = Log::with_listener(&say);
+    let log = progress.log();
     if let Some(path) = &args.output.turntable {
         turntable::kind_of(path)?;
     }
     if manners::is_pipe(&args.input) && !args.budget.is_given() {
-        return from_pipe(args, limits, &mut log);
+        return from_pipe(args, limits, &log);
     }
     if let Some(bytes) = keep::stream(&args.budget, &args.input, limits)? {
-        return within_time(args, &bytes, limits, &mut log);
+        return within_time(args, &bytes, limits, &log);
     }
     let pixels = u64::from(args.view.size.0) * u64::from(args.view.size.1);
     let task = Task::Picture { pixels };
@@ -48,7 +47,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         Some((detail, model)) => (detail, model),
         None => (&args.detail, &args.model),
     };
-    let source = Source::open(input, detail, model, limits, &mut log)?;
+    let source = Source::open(input, detail, model, limits, &log)?;
     let frame = source.frame()?;
     let mut cameras = shots(args, &frame, &Extent::cube(), limits)?;
     permit(args, &cameras)?;
@@ -56,7 +55,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     if detail.level.is_none() && source.level_for(&cameras)?.is_some() {
         cameras = shots(args, &frame, &source.extent(limits), limits)?;
     }
-    let (gaussians, detail) = source.gaussians(detail, &cameras, &mut log)?;
+    let (gaussians, detail) = source.gaussians(detail, &cameras, &log)?;
     let drawing = Drawing {
         args,
         quality: chosen.as_ref().map_or(args.quality, |c| c.choice.quality),
@@ -64,16 +63,16 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         detail: Some(detail),
         chosen: chosen.as_ref().map(|chosen| For::Chosen(chosen, task)),
     };
-    pictures(&drawing, &gaussians, &mut log)
+    pictures(&drawing, &gaussians, &log)
 }
 
 /// Draws what comes on standard input, each level as it is complete.
-fn from_pipe(args: &Render, limits: &Limits, log: &mut Log) -> Result<Said> {
+fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
     let mut said = Said::default();
     // What has gone to standard output cannot be replaced by something finer.
     let early = !manners::is_pipe(&args.output);
     let mut permitted = false;
-    let mut show = |gaussians: &Gaussians, log: &mut Log| {
+    let mut show = |gaussians: &Gaussians, log: &Log| {
         // Pictures of coarser levels are this program's own.
         if !permitted {
             permit(args, &shots(args, &gaussians.frame, &Extent::cube(), limits)?)?;
@@ -94,7 +93,7 @@ fn from_pipe(args: &Render, limits: &Limits, log: &mut Log) -> Result<Said> {
 }
 
 /// Draws the finest level that is drawn within the budget.
-fn within_time(args: &Render, bytes: &[u8], limits: &Limits, log: &mut Log) -> Result<Said> {
+fn within_time(args: &Render, bytes: &[u8], limits: &Limits, log: &Log) -> Result<Said> {
     let decoder = load::decoder(bytes, &args.detail, &args.model, limits)?;
     let frame = decoder.frame(bytes).map_err(Failure::in_file(&args.input))?;
     let cameras = shots(args, &frame, &load::extent(bytes, &decoder, limits), limits)?;
@@ -119,7 +118,11 @@ fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
     let mut outputs: Vec<&Path> = cameras.iter().map(|shot| shot.path.as_path()).collect();
     outputs.dedup();
     let is_video = args.output.turntable.is_some() || args.contact_sheet;
-    if !is_video && !manners::is_pipe(&args.output) && cameras.len() > 1 && format_of(args, cameras.len())? == Format::Y4m {
+    if !is_video
+        && !manners::is_pipe(&args.output)
+        && cameras.len() > 1
+        && format_of(args, cameras.len())? == Format::Y4m
+    {
         outputs = vec![&args.output];
     }
     let inputs = [Some(&args.input), args.camera.as_ref(), args.model.model.as_ref()];
@@ -146,14 +149,14 @@ enum For<'a> {
 type Drawn = (PathBuf, [u32; 2], Stats);
 
 /// Draws these Gaussians into the pictures asked for.
-fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &mut Log) -> Result<Said> {
+fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &Log) -> Result<Said> {
     let &Drawing { args, limits, .. } = drawing;
     let cameras = &shots(args, &gaussians.frame, &Extent::of_gaussians(gaussians), limits)?[..];
     let mut effects = Effects::default();
     for (effect, choice) in &args.effect {
         effects.set(*effect, *choice);
     }
-    let mut renderer = Renderer::new(load::isa(args.model.isa.as_deref())?);
+    let mut renderer = Renderer::new().with_isa(load::isa(args.model.isa.as_deref())?);
     renderer.set_effects(effects);
     renderer.set_quality(drawing.quality);
     let many = if args.contact_sheet { 1 } else { cameras.len() };
@@ -202,7 +205,7 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &mut Log) -> Result<S
     }
     let many = all.len() > 8;
     if manners::verbose() || !many {
-        report = format!("{}\n{report}", steps(log.steps()));
+        report = format!("{}\n{report}", steps(&log.steps()));
     }
     Ok(Said {
         report,
@@ -211,7 +214,7 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &mut Log) -> Result<S
 }
 
 /// Draws one picture into the artist's image.
-fn draw_logged(shot: &Shot, artist: &mut Artist, log: &mut Log) -> b2p::Result<Drawn> {
+fn draw_logged(shot: &Shot, artist: &mut Artist, log: &Log) -> b2p::Result<Drawn> {
     let count = artist.gaussians.len();
     let name = format!("draw {}", shot.path.display());
     let drawn = log.step(name, count, "Gaussians", || artist.draw(&shot.camera));
@@ -219,7 +222,7 @@ fn draw_logged(shot: &Shot, artist: &mut Artist, log: &mut Log) -> b2p::Result<D
 }
 
 /// Draws all pictures into one file.
-fn video(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &mut Log) -> Result<Vec<Drawn>> {
+fn video(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
     let to = &args.output;
     manners::write(to, |w| {
@@ -243,7 +246,7 @@ fn video(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &mut Log) ->
 }
 
 /// Draws one turn into a video.
-fn turn(cameras: &[Shot], artist: &mut Artist, log: &mut Log) -> Result<Vec<Drawn>> {
+fn turn(cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
     let Some(first) = cameras.first() else { return Ok(all) };
     turntable::write(&first.path, cameras.len() as u32, |i, image| {
@@ -256,12 +259,12 @@ fn turn(cameras: &[Shot], artist: &mut Artist, log: &mut Log) -> Result<Vec<Draw
 }
 
 /// Draws all views into one picture.
-fn sheet(cameras: &[Shot], artist: &mut Artist, limits: &Limits, log: &mut Log) -> Result<Vec<Drawn>> {
+fn sheet(cameras: &[Shot], artist: &mut Artist, limits: &Limits, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
     let Some(first) = cameras.first() else { return Ok(all) };
     let paper = match artist.args.view.background {
-        Background::Transparent => [0.0; 4],
         Background::Colour([r, g, b]) => [r, g, b, 1.0],
+        _ => [0.0; 4],
     };
     let mut sheet = Sheet::new(cameras.len() as u32, first.camera.size(), paper, limits)?;
     for shot in cameras {
@@ -278,7 +281,7 @@ fn sheet(cameras: &[Shot], artist: &mut Artist, limits: &Limits, log: &mut Log) 
 }
 
 /// Draws each picture into a file of its own.
-fn stills(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &mut Log) -> Result<Vec<Drawn>> {
+fn stills(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
     for shot in cameras {
         all.push(draw_logged(shot, artist, log)?);

@@ -142,10 +142,7 @@ mod tests {
             .filter(|p| **p == [0.0, 0.0, 0.0, 1.0])
             .count();
         assert!(ink > 5 * 20, "{ink}");
-        let tight = Limits {
-            max_pixels: 1000,
-            ..limits
-        };
+        let tight = limits.with_max_pixels(1000);
         assert!(Sheet::new(5, size, paper, &tight).is_err());
     }
 

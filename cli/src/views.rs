@@ -53,10 +53,7 @@ pub fn shots(args: &Render, frame: &Frame, extent: &Extent, limits: &Limits) -> 
 
 /// The cameras of a file, with their names.
 fn from_file(path: &Path, size: (u32, u32), frame: &Frame, limits: &Limits) -> Result<Vec<files::Named>> {
-    let limits = Limits {
-        max_bytes: limits.max_bytes / CAMERA_FILE_SHARE,
-        ..limits.clone()
-    };
+    let limits = limits.clone().with_max_bytes(limits.max_bytes / CAMERA_FILE_SHARE);
     let text = |path: &Path| -> Result<String> {
         let text = String::from_utf8(load::bytes(path, &limits)?);
         text.map_err(|_| Failure(format!("{}: not a text", path.display())))
@@ -112,14 +109,11 @@ fn circle(args: &Render, frame: &Frame, extent: &Extent) -> Result<Vec<files::Na
         let camera = match args.orthographic {
             true => {
                 // Parallel rays see what is behind the camera's place no more than a pinhole does: it stands outside the cube.
-                let far = at(azimuth, radius.max(4.0))?;
-                let focal = camera.fx / radius;
-                Camera {
-                    fx: focal,
-                    fy: focal,
-                    projection,
-                    ..far
-                }
+                let mut far = at(azimuth, radius.max(4.0))?;
+                far.fx = camera.fx / radius;
+                far.fy = far.fx;
+                far.projection = projection;
+                far
             }
             false => camera,
         };

@@ -62,6 +62,7 @@ impl Image {
     ///
     /// # Errors
     /// [`Error::Unsupported`] if a side is 0 or a row longer than 2²⁹ pixels; never for a picture of a [`Renderer`](super::Renderer).
+    #[doc(hidden)]
     pub fn to_pixmap(&self) -> Result<Pixmap> {
         let mut bytes = vec![0; self.pixels.len() * 4];
         bytes
@@ -174,11 +175,13 @@ impl Image {
     }
 
     /// What a YUV4MPEG2 stream of pictures of this size begins with, at 30 pictures a second.
+    #[doc(hidden)]
     pub fn y4m_header(&self) -> Vec<u8> {
         format!("YUV4MPEG2 W{} H{} F30:1 Ip A1:1 C444\n", self.width, self.height).into_bytes()
     }
 
     /// One picture of a YUV4MPEG2 stream: ITU-R BT.601, limited range, colour at full resolution; what is transparent over black.
+    #[doc(hidden)]
     pub fn to_y4m_frame(&self) -> Vec<u8> {
         let mut file = Vec::new();
         // A vector takes all.

@@ -212,12 +212,19 @@ mod tests {
 
     #[test]
     fn an_extent_is_around_what_is_finite_and_within_the_cube() {
-        let odd = [([f64::NAN, 0.0, 0.0], 0.1), ([0.2; 3], f64::INFINITY), ([7.0, 0.0, 0.0], 0.1)];
+        let odd = [
+            ([f64::NAN, 0.0, 0.0], 0.1),
+            ([0.2; 3], f64::INFINITY),
+            ([7.0, 0.0, 0.0], 0.1),
+        ];
         let spheres = [([0.0, 0.5, -0.5], 0.25)].into_iter().chain(odd);
         let extent = Extent::of(spheres);
         assert_eq!(extent, Extent::of([([0.0, 0.5, -0.5], 0.25)].into_iter()));
         let middle = extent.middle();
-        assert!((0..3).all(|axis| (middle[axis] - [0.0, 0.5, -0.5][axis]).abs() < 1e-9), "{middle:?}");
+        assert!(
+            (0..3).all(|axis| (middle[axis] - [0.0, 0.5, -0.5][axis]).abs() < 1e-9),
+            "{middle:?}"
+        );
         assert_eq!(Extent::of(odd.into_iter()), Extent::cube());
         assert_eq!(Extent::cube().middle(), [0.0; 3]);
     }
