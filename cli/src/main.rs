@@ -102,10 +102,10 @@ fn main() -> ExitCode {
         output::remove_unfinished();
         std::process::exit(130);
     });
-    let done = interrupted
-        .map_err(|e| Failure(format!("no handler for Ctrl-C: {e}")))
-        .and_then(|()| run(&cli));
-    match done {
+    if let Err(error) = interrupted {
+        manners::warn(&format!("Ctrl-C may leave a temporary file behind: {error}"));
+    }
+    match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure(message)) if message == Failure::READER_GONE => ExitCode::from(BROKEN_PIPE),
         Err(Failure(message)) => {

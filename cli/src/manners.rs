@@ -1,6 +1,6 @@
 //! What holds for every command: who is told what, in which colours, and what may be overwritten.
 
-use std::io::{IsTerminal, Write};
+use std::io::{ErrorKind, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -200,7 +200,36 @@ pub fn write(to: &Path, fill: impl FnOnce(&mut dyn Write) -> b2p::Result<()>) ->
         return Ok(output::write_file(to, fill)?);
     }
     check_open()?;
-    let mut out = std::io::BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
-    fill(&mut out)?;
-    out.flush().map_err(|source| Failure::writing(to, source))
+    let mut reader = Reader { gone: false };
+    let mut out = std::io::BufWriter::with_capacity(1 << 16, &mut reader);
+    let filled = fill(&mut out).map_err(Failure::from);
+    // What could not be written is not tried once more.
+    let flushed = match &filled {
+        Ok(()) => out.flush().map_err(|source| Failure::writing(to, source)),
+        Err(_) => Ok(()),
+    };
+    drop(out.into_parts());
+    match reader.gone {
+        true => Err(Failure(Failure::READER_GONE.into())),
+        false => filled.and(flushed),
+    }
+}
+
+/// Standard output. It remembers that its reader has gone, which encoders may say in words of their own.
+struct Reader {
+    gone: bool,
+}
+
+impl Write for Reader {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let written = std::io::stdout().write(bytes);
+        self.gone |= written.as_ref().is_err_and(|e| e.kind() == ErrorKind::BrokenPipe);
+        written
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        let flushed = std::io::stdout().flush();
+        self.gone |= flushed.as_ref().is_err_and(|e| e.kind() == ErrorKind::BrokenPipe);
+        flushed
+    }
 }

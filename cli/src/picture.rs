@@ -19,6 +19,8 @@ pub struct Artist<'a> {
     pub args: &'a Render,
     pub format: Format,
     pub image: Image,
+    /// Bytes that are held beside the picture.
+    pub beside: u64,
     distances: Vec<f32>,
     ids: Ids,
 }
@@ -38,6 +40,7 @@ impl<'a> Artist<'a> {
             args,
             format,
             image: Image::default(),
+            beside: 0,
             distances: Vec::new(),
             ids: Ids::default(),
         }
@@ -54,9 +57,9 @@ impl<'a> Artist<'a> {
             Show::Id => return self.draw_ids(camera),
         };
         let gaussians = self.gaussians;
-        let mut limits = self.limits.clone();
+        let each = if self.needs_depth() { size_of::<f32>() } else { 0 };
+        let limits = self.limits_beside(camera, each as u64)?;
         if self.needs_depth() {
-            limits = self.limits_beside(camera, size_of::<f32>() as u64)?;
             let (nothing, image) = (Background::Transparent, &mut self.image);
             self.renderer
                 .draw_into(gaussians, camera, Channel::Depth, nothing, &limits, image)?;
@@ -94,7 +97,7 @@ impl<'a> Artist<'a> {
         let [width, height] = camera.size();
         let pixels = u64::from(width) * u64::from(height);
         self.limits.check_pixels("pixels of the picture", pixels)?;
-        let beside = pixels.saturating_mul(each);
+        let beside = pixels.saturating_mul(each).saturating_add(self.beside);
         self.limits.check_bytes("bytes to draw the picture", beside)?;
         let left = self.limits.max_bytes - beside;
         Ok(self.limits.clone().with_max_bytes(left))

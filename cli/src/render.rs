@@ -249,6 +249,8 @@ fn video(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &Log) -> Res
 fn turn(cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
     let Some(first) = cameras.first() else { return Ok(all) };
+    let [width, height] = first.camera.size();
+    artist.beside = u64::from(width) * u64::from(height) * turntable::BYTES_PER_PIXEL;
     turntable::write(&first.path, cameras.len() as u32, |i, image| {
         let drawn = draw_logged(&cameras[i as usize], artist, log)?;
         all.push(drawn);
@@ -267,6 +269,7 @@ fn sheet(cameras: &[Shot], artist: &mut Artist, limits: &Limits, log: &Log) -> R
         _ => [0.0; 4],
     };
     let mut sheet = Sheet::new(cameras.len() as u32, first.camera.size(), paper, limits)?;
+    artist.beside = (sheet.image.pixels.len() * size_of::<[f32; 4]>()) as u64;
     for shot in cameras {
         all.push(draw_logged(shot, artist, log)?);
         sheet.add(&artist.image, &shot.label);

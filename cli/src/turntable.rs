@@ -14,6 +14,9 @@ const RATE: u16 = 30;
 /// Hundredths of a second of a GIF's frame; viewers slow down what is shorter.
 const GIF_DELAY: u16 = 3;
 
+/// Bytes a pixel that a frame takes beside its picture: the frame before, and two copies in eight bits.
+pub const BYTES_PER_PIXEL: u64 = 16 + 2 * 4;
+
 /// Kinds of videos.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {

@@ -155,3 +155,85 @@ fn too_little_memory_is_an_error_and_no_abort() {
         assert!(errors.contains(words), "{arguments}: {errors}");
     }
 }
+
+#[cfg(target_os = "linux")]
+#[test]
+fn threads_that_the_system_refuses_are_done_without_or_named() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    // The limit does not hold for root; another user must be able to reach the program.
+    let program = at.join("b2p");
+    std::fs::copy(env!("CARGO_BIN_EXE_b2p"), &program).unwrap();
+    let allowed = [
+        "chmod a+rwx . b2p ball.b2p",
+        "setpriv --reuid=65534 --clear-groups true",
+    ];
+    for command in allowed {
+        let done = Command::new("sh")
+            .current_dir(at)
+            .args(["-c", command])
+            .output()
+            .expect("a shell");
+        if !done.status.success() {
+            eprintln!("skipped: `{command}` is not permitted here");
+            return;
+        }
+    }
+    let run = |arguments: &str| {
+        let script = format!("ulimit -u 1; exec ./b2p {arguments}");
+        let script = ["--reuid=65534", "--clear-groups", "bash", "-c", &script];
+        Command::new("setpriv")
+            .current_dir(at)
+            .args(script)
+            .output()
+            .expect("setpriv runs")
+    };
+    let done = run("decode ball.b2p few.ply");
+    let errors = String::from_utf8_lossy(&done.stderr);
+    assert!(
+        done.status.success() && errors.contains("works in one thread"),
+        "{errors}"
+    );
+    succeeds(at, &["decode", "ball.b2p", "many.ply"]);
+    let [few, many] = ["few.ply", "many.ply"].map(|name| std::fs::read(at.join(name)).unwrap());
+    assert!(few == many);
+    let named = run("decode ball.b2p x.ply --threads 4");
+    let errors = String::from_utf8_lossy(&named.stderr);
+    assert_eq!(named.status.code(), Some(1), "{errors}");
+    assert!(errors.contains("cannot start 4 threads"), "{errors}");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_model_file_is_read_whatever_it_is_not_mapped() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    std::fs::write(at.join("tiny.safetensors"), tiny_model(1)).unwrap();
+    let encode = [
+        "encode",
+        "ball.ply",
+        "l.b2p",
+        "--colours",
+        "learned",
+        "--model",
+        "tiny.safetensors",
+    ];
+    succeeds(at, &encode);
+    let fifo = Command::new("bash")
+        .current_dir(at)
+        .env("B2P", env!("CARGO_BIN_EXE_b2p"))
+        .args(["-c", "\"$B2P\" decode l.b2p x.ply --model <(cat tiny.safetensors)"])
+        .output()
+        .expect("a shell");
+    let errors = String::from_utf8_lossy(&fifo.stderr);
+    assert!(fifo.status.success(), "a FIFO cannot be mapped: {errors}");
+}
+
+#[test]
+fn a_stream_that_learned_heads_do_not_draw_is_not_written_without_a_word() {
+    let folder = folder_with_cloud();
+    let encode = ["encode", "ball.ply", "x.b2p", "--levels", "0..0"];
+    let done = b2p(folder.path(), &encode);
+    let said = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success() && said.contains("--heads surfels"), "{said}");
+}

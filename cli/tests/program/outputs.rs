@@ -229,7 +229,7 @@ mod standard_output {
     #[test]
     fn a_reader_that_has_gone_ends_the_program_quietly_but_not_with_0() {
         let folder = folder_with_stream();
-        for command in ["info ball.b2p", "render ball.b2p - --size 64x64", "decode ball.b2p -"] {
+        for command in ["info ball.b2p", "render ball.b2p - --size 700x700", "decode ball.b2p -"] {
             let script = format!("(sleep 0.3; \"$B2P\" {command} -q; echo $? >&2) | true");
             let done = shell(folder.path(), &script);
             assert_eq!(String::from_utf8_lossy(&done.stderr).trim(), "141", "{command}");
