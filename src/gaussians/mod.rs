@@ -63,9 +63,15 @@ impl Frame {
         f64::from(1u32 << (self.bits - 1)) * self.placement.voxel_size
     }
 
-    /// Whether the frame has 1 to 21 bits and a valid placement.
+    /// Whether the frame has 1 to 21 bits and a valid placement, and its corners and voxels can be told in single
+    /// precision, as files of Gaussians do.
     pub fn is_valid(&self) -> bool {
-        (1..=21).contains(&self.bits) && self.placement.is_valid()
+        let Placement { origin, voxel_size } = self.placement;
+        let single = |x: f64| (x as f32).is_finite();
+        (1..=21).contains(&self.bits)
+            && self.placement.is_valid()
+            && (voxel_size as f32).is_normal()
+            && origin.iter().all(|x| single(*x) && single(x + 2.0 * self.unit()))
     }
 }
 
