@@ -30,7 +30,9 @@ mod taps;
 mod tile;
 mod winograd;
 
+pub mod butterflies;
 pub mod ceiling;
+pub mod coefficients;
 pub mod hidden;
 pub mod mixing;
 pub mod reference;
