@@ -31,12 +31,15 @@ const DATA_URI: &str = "data:application/octet-stream;base64,";
 /// Names of the coefficients by degree.
 const DEGREES: [(usize, usize); 3] = [(1, 3), (2, 5), (3, 7)];
 
+/// The bytes of a row, of which number and values are given.
+type Bytes<'r> = Box<dyn Fn(usize, &Row) -> Vec<u8> + 'r>;
+
 /// An attribute: name, type and number of components, and its bytes of a row.
 struct Attribute<'r> {
     name: String,
     kind: &'static str,
     width: usize,
-    bytes: Box<dyn Fn(usize, &Row) -> Vec<u8> + 'r>,
+    bytes: Bytes<'r>,
 }
 
 impl<'r> Attribute<'r> {
