@@ -28,7 +28,7 @@
 //! | bound what untrusted input may ask for | [`Limits`] |
 //! | stop, or observe | [`Cancel`], [`Log`] |
 //!
-//! Options are set by `with_…` methods. Decoders, models and logs are cheap to clone. Bad input gives an [`Error`], and
+//! Options are set by `with_…` methods. Decoders, models and logs are cheap to clone. Bad input gives an [`Error`];
 //! nothing panics.
 //!
 //! # Streams
@@ -109,7 +109,7 @@ pub use cloud::{ColouredVoxels, Hints, PointCloud, voxelise, voxelise_closed};
 pub use container::{Format, Header};
 pub use decoder::{Decoder, Decoding, Points};
 #[cfg(feature = "encoder")]
-pub use encoder::{Encoded, Encoder, Rate, transform::Fineness};
+pub use encoder::{Encoded, Encoder, Rate, transform::QualityTarget};
 pub use error::{Error, Result, Stage};
 pub use gaussians::learned::HeadsModel;
 pub use gaussians::{Frame, Gaussians, Harmonics, HeadSet};
@@ -120,7 +120,7 @@ pub use limits::Limits;
 pub use log::{Log, Step};
 pub use placement::Placement;
 #[cfg(feature = "render")]
-pub use renderer::camera::{Camera, Projection};
+pub use renderer::camera::{Camera, Extent, Projection};
 #[cfg(feature = "render")]
 pub use renderer::projection::Dropped;
 #[cfg(feature = "render")]

@@ -8,7 +8,7 @@ use std::sync::Mutex;
 use b2p::Decoder;
 use b2p::cloud::ColouredVoxels;
 use b2p::container::{Format, Header};
-use b2p::encoder::transform::{self, Fineness};
+use b2p::encoder::transform::{self, QualityTarget};
 use b2p::encoder::{Options, Residual, encode};
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
@@ -97,9 +97,9 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
 fn transformed(cloud: &ColouredVoxels) -> [Vec<u8>; 3] {
     let top = cloud.voxels.depth();
     [
-        (top.saturating_sub(3)..=top, 30_000, Fineness::Step(4.0)),
-        (top.saturating_sub(1)..=top, 500, Fineness::Lossless),
-        (1..=top - 1, 16_384, Fineness::Step(20.0)),
+        (top.saturating_sub(3)..=top, 30_000, QualityTarget::Step(4.0)),
+        (top.saturating_sub(1)..=top, 500, QualityTarget::Lossless),
+        (1..=top - 1, 16_384, QualityTarget::Step(20.0)),
     ]
     .map(|(levels, slice, fineness)| {
         let options = transform::Options {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use b2p::Limits;
 use b2p::encoder::Residual;
-use b2p::encoder::transform::Fineness;
+use b2p::encoder::transform::QualityTarget;
 use b2p::gaussians::HeadSet;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -179,7 +179,7 @@ pub struct Encode {
     /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma twice that of luma unless said; coarser
     /// levels have finer steps [default: 20]
     #[arg(long, help_heading = "Advanced", value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
-    pub step: Option<Fineness>,
+    pub step: Option<QualityTarget>,
     /// Code the mean colours of the finest level's voxels exactly
     #[arg(long, help_heading = "Advanced")]
     pub lossless: bool,

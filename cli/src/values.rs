@@ -4,7 +4,7 @@ use std::num::NonZeroU8;
 use std::ops::RangeInclusive;
 
 use b2p::encoder::Residual;
-use b2p::encoder::transform::Fineness;
+use b2p::encoder::transform::QualityTarget;
 use b2p::latents::Steps;
 use b2p::renderer::{Background, Effect, EffectMode};
 
@@ -42,14 +42,14 @@ pub fn price(text: &str) -> Result<f32, String> {
     }
 }
 
-pub fn step(text: &str) -> Result<Fineness, String> {
+pub fn step(text: &str) -> Result<QualityTarget, String> {
     let size = |text: &str| match text.parse() {
         Ok(step) if (0.5..=1000.0).contains(&step) => Ok(step),
         _ => Err("expected one or two numbers from 0.5 to 1000 such as 16 or 16,24"),
     };
     Ok(match text.split_once(',') {
-        None => Fineness::Step(size(text)?),
-        Some((luma, chroma)) => Fineness::Steps {
+        None => QualityTarget::Step(size(text)?),
+        Some((luma, chroma)) => QualityTarget::Steps {
             luma: size(luma)?,
             chroma: size(chroma)?,
         },

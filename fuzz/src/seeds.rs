@@ -61,8 +61,8 @@ fn transformed() -> Vec<Vec<u8>> {
         let stream = transform::encode(&cloud, &options, &Log::default());
         stream.expect("a small cloud is coded").bytes
     };
-    let step = transform::Fineness::Step;
-    let lossless = transform::Fineness::Lossless;
+    let step = transform::QualityTarget::Step;
+    let lossless = transform::QualityTarget::Lossless;
     vec![
         coded(1, vec![0, 7], 0..=1, 16_384, step(8.0)),
         coded(2, vec![0, 5, 63], 1..=2, 2, lossless),

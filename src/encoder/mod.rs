@@ -5,9 +5,9 @@
 mod builder;
 mod colours;
 mod corrections;
+mod rate_control;
 mod skeleton;
 pub mod transform;
-mod within;
 
 use std::ops::RangeInclusive;
 
@@ -26,10 +26,10 @@ use crate::log::Log;
 pub use builder::Encoder;
 pub use corrections::Residual;
 use corrections::{Left, Level, corrections};
+pub use rate_control::encode_to_rate;
 use skeleton::{Coded, Correct, Skeleton};
-pub use within::encode_within;
 
-/// What may be chosen about a stream; [`encode_within`] chooses what decides its size.
+/// What may be chosen about a stream; [`encode_to_rate`] chooses what decides its size.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.

@@ -195,82 +195,60 @@ impl Effects {
         }
     }
 
-    /// Everything that was decided for a picture that took `stats`, in words. Looks at every Gaussian: it is meant for people.
+    /// Why each effect is on or off in a picture that took `stats`, in words. Looks at every Gaussian: it is meant for
+    /// people.
     pub fn explain(&self, gaussians: &Gaussians, camera: &Camera, stats: &Stats) -> Vec<Explanation> {
-        let set = stats.effects;
+        let set = &stats.effects;
+        let effects = Effect::ALL.map(|effect| Explanation {
+            name: effect.name(),
+            on: set.is_on(effect),
+            why: self.reason(effect, gaussians, camera, stats),
+        });
+        let line = |name, on, why| Explanation { name, on, why };
+        let varying = gaussians.opacity.iter().filter(|o| **o != 1.0).count();
+        let opacity = format!("{varying} of {} Gaussians are not opaque", gaussians.len());
+        let orthographic = camera.projection == Projection::Orthographic;
+        let kind = format!("the camera is {}", if orthographic { "one" } else { "a pinhole" });
+        let middle = [camera.width, camera.height].map(|side| f64::from(side) / 2.0);
+        let principal = format!("the principal point is {}, {}", camera.cx, camera.cy);
+        let mut all = vec![line("opacity", varying > 0, opacity)];
+        all.extend(effects);
+        all.push(line("orthographic", orthographic, kind));
+        all.push(line("off-centre", [camera.cx, camera.cy] != middle, principal));
+        all
+    }
+
+    /// Why an effect is on or off in a picture that took `stats`.
+    fn reason(&self, effect: Effect, gaussians: &Gaussians, camera: &Camera, stats: &Stats) -> String {
+        let set = &stats.effects;
         let forced = |choice, otherwise: &str| match choice {
             EffectMode::Auto => otherwise.to_owned(),
             EffectMode::On | EffectMode::Off => "forced".to_owned(),
         };
-        let varying = gaussians.opacity.iter().filter(|o| **o != 1.0).count();
-        let orthographic = camera.projection == Projection::Orthographic;
-        let middle = [camera.width, camera.height].map(|side| f64::from(side) / 2.0);
-        let line = |name, on, why| Explanation { name, on, why };
-        vec![
-            line(
-                "opacity",
-                varying > 0,
-                format!("{varying} of {} Gaussians are not opaque", gaussians.len()),
+        match effect {
+            Effect::Harmonics => match gaussians.harmonics.count {
+                0 => "no Gaussian has any".into(),
+                n => forced(self.harmonics, &format!("{n} coefficients a Gaussian")),
+            },
+            Effect::Antialias if gaussians.compensated => forced(self.antialias, "the file says so"),
+            Effect::Antialias => forced(self.antialias, "nothing says that the Gaussians were made for it"),
+            Effect::Supersample => format!(
+                "{0}×{0} samples a pixel; the typical splat is {1:.2} px wide{2}",
+                set.supersample,
+                typical_width(gaussians, camera),
+                match (self.supersample, set.antialias) {
+                    (EffectMode::Off, _) => ", forced",
+                    (EffectMode::Auto, false) => ", without anti-aliasing none are called for",
+                    _ => "",
+                }
             ),
-            line(
-                "harmonics",
-                set.harmonics,
-                match gaussians.harmonics.count {
-                    0 => "no Gaussian has any".into(),
-                    n => forced(self.harmonics, &format!("{n} coefficients a Gaussian")),
-                },
-            ),
-            line(
-                "antialias",
-                set.antialias,
-                forced(
-                    self.antialias,
-                    if gaussians.compensated {
-                        "the file says so"
-                    } else {
-                        "nothing says that the Gaussians were made for it"
-                    },
-                ),
-            ),
-            line(
-                "supersample",
-                set.supersample > 1,
-                format!(
-                    "{0}×{0} samples a pixel; the typical splat is {1:.2} px wide{2}",
-                    set.supersample,
-                    typical_width(gaussians, camera),
-                    match (self.supersample, set.antialias) {
-                        (EffectMode::Off, _) => ", forced",
-                        (EffectMode::Auto, false) => ", without anti-aliasing none are called for",
-                        _ => "",
-                    }
-                ),
-            ),
-            line(
-                "near",
-                set.near,
-                match (self.near, stats.crossing) {
-                    (_, 0) => "no Gaussian in view reaches over the near plane".into(),
-                    (EffectMode::Off, n) => format!("forced; {n} Gaussians reach over the near plane"),
-                    (_, n) => format!("{n} Gaussians in view reach over the near plane"),
-                },
-            ),
-            line(
-                "order",
-                set.order,
-                forced(self.order, "Gaussians are made for the order of their centres"),
-            ),
-            line(
-                "orthographic",
-                orthographic,
-                format!("the camera is {}", if orthographic { "one" } else { "a pinhole" }),
-            ),
-            line(
-                "off-centre",
-                [camera.cx, camera.cy] != middle,
-                format!("the principal point is {}, {}", camera.cx, camera.cy),
-            ),
-        ]
+            Effect::Near => match (self.near, stats.crossing) {
+                (_, 0) => "no Gaussian in view reaches over the near plane".into(),
+                (EffectMode::Off, n) => format!("forced; {n} Gaussians reach over the near plane"),
+                (_, n) => format!("{n} Gaussians in view reach over the near plane"),
+            },
+            Effect::Order => forced(self.order, "Gaussians are made for the order of their centres"),
+        }
     }
 }
 

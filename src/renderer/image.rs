@@ -193,6 +193,7 @@ impl Image {
     ///
     /// # Errors
     /// [`Error::Io`] if `to` fails.
+    #[doc(hidden)]
     pub fn write_y4m_frame(&self, to: &mut dyn Write, path: &Path) -> Result<()> {
         let rows = [
             [65.481, 128.553, 24.966, 16.0],

@@ -4,7 +4,7 @@
 //! steps, then the next level, and so on; at the end of the path are the exact colours of the finest level. A level is on the path from the greatest step that its
 //! geometry is worth.
 
-use super::{Coded, Fineness, MAX_CHROMA, Options, Subject, choose_levels, steps_of};
+use super::{Coded, MAX_CHROMA, Options, QualityTarget, Subject, choose_levels, steps_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth};
 use crate::encoder::Encoded;
@@ -35,7 +35,7 @@ struct Place {
 /// # Errors
 /// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if the smallest stream has more, and those of
 /// [`encode`](super::encode).
-pub fn encode_within(
+pub fn encode_to_rate(
     cloud: &ColouredVoxels,
     options: &Options,
     bits_per_point: f64,
@@ -77,7 +77,7 @@ pub fn encode_within(
     let encoded = subject.checked(coded, log)?;
     let chosen = Options {
         levels: Some(*levels.start().min(&place.top)..=place.top),
-        fineness: Fineness::of(place.steps),
+        fineness: QualityTarget::of(place.steps),
         ..options.clone()
     };
     Ok((encoded, chosen))
@@ -153,7 +153,7 @@ impl Search<'_> {
     fn attempt_sized(&mut self, place: Place, log: &Log) -> Result<(f64, Option<(Place, Coded)>)> {
         self.tries += 1;
         let Place { top, steps } = place;
-        let how = Fineness::of(steps);
+        let how = QualityTarget::of(steps);
         let name = format!("try {}: level {top}, {how}", self.tries);
         let points = self.subject.cloud.voxels.len();
         let coded = log.step(name, points, "points", || {

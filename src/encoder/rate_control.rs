@@ -32,7 +32,7 @@ const COARSE: f32 = 2.0;
 ///
 /// # Errors
 /// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if no such stream was found, and those of [`encode`](super::encode).
-pub fn encode_within(
+pub fn encode_to_rate(
     cloud: &ColouredVoxels,
     model: &Model,
     options: &Options,
