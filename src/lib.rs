@@ -33,10 +33,10 @@
 //!
 //! # Streams
 //!
-//! A stream is scalable: a lossless octree and its colours, level by level. A stream cut after a level is a valid coarser
-//! stream. Version 3 codes colours as transform coefficients and needs no model file; how it is drawn, as surfels in
-//! closed form or with learned heads, is the decoder's choice. Version 2, *Bits-to-Photon*, codes latents, from which the
-//! [`Model`] that coded them generates Gaussians.
+//! A stream is scalable: a lossless octree and its colours, level by level. A stream cut after a level is a valid
+//! coarser stream. Version 3 codes colours as transform coefficients and needs no model file; how it is drawn, as
+//! surfels in closed form or with learned heads, is the decoder's choice. Version 2, *Bits-to-Photon*, codes latents,
+//! from which the [`Model`] that coded them generates Gaussians.
 //!
 //! ```text
 //! bytes → container → per level: geometry → colour → gaussians → renderer → picture
@@ -44,8 +44,8 @@
 //! ```
 //!
 //! Each stage is a folder of `src/` and imports only earlier stages; `docs/architecture.md` describes them, and
-//! `docs/format.md` the format. Modules are public for the program, the tests and the tools of this repository. They are
-//! not documented here, and change without notice: what this page lists is the interface.
+//! `docs/format.md` the format. Modules are public for the program, the tests and the tools of this repository. They
+//! are not documented here, and change without notice: what this page lists is the interface.
 //!
 //! # Features
 //!

@@ -84,7 +84,8 @@ impl Encoder {
         self
     }
 
-    /// The same encoder with λ of the rate–distortion optimised quantisation of version 2 scaled by this factor. Default: 1.
+    /// The same encoder with λ of the rate–distortion optimised quantisation of version 2 scaled by this factor.
+    /// Default: 1.
     pub fn with_lambda_scale(mut self, factor: f32) -> Self {
         self.lambda_scale = Some(factor);
         self

@@ -13,7 +13,8 @@ use crate::geometry::{KernelMap, Octree};
 use crate::latents::network::Model;
 use crate::latents::{ColourFilter, ColourResidual, ResidualSteps, Steps, Surroundings, activate};
 
-/// How many times as much a decibel of what is wide is worth: pictures from afar and up close show it, where what is narrow blurs or is too fine to trouble.
+/// How many times as much a decibel of what is wide is worth: pictures from afar and up close show it, where what is
+/// narrow blurs or is too fine to trouble.
 const WIDE: usize = 6;
 
 /// The bit of Morton keys from which on voxels eight of their own apart join.
@@ -24,7 +25,8 @@ const BOUNDARY: u8 = 9;
 pub enum Residual {
     /// Nothing.
     None,
-    /// What is at least eight of its voxels wide and so shows as blotches from close up: where [`filter`](super::Options::filter) is on, and it is worth its bytes.
+    /// What is at least eight of its voxels wide and so shows as blotches from close up: where
+    /// [`filter`](super::Options::filter) is on, and it is worth its bytes.
     #[default]
     Coarse,
     /// All of it, in these steps.
@@ -163,7 +165,8 @@ pub(crate) struct Left {
 }
 
 impl Left {
-    /// The payloads of a residual as finely told as this, for the voxels `keys` in slices; `None` if it has nothing fine and is not worth its bytes.
+    /// The payloads of a residual as finely told as this, for the voxels `keys` in slices; `None` if it has nothing
+    /// fine and is not worth its bytes.
     pub fn payloads(&self, keys: &[u64], slice: usize, precision: ResidualSteps) -> Option<Vec<Vec<u8>>> {
         let before = missing(&self.gaussians, &self.wanted, self.children);
         let residual = ColourResidual::of(&before, keys, slice, precision);

@@ -1,4 +1,5 @@
-//! What only streams of version 2 need: learned features, the entropy coder of their latents, and what corrects the colours of their Gaussians.
+//! What only streams of version 2 need: learned features, the entropy coder of their latents, and what corrects the
+//! colours of their Gaussians.
 //!
 //! Nothing on the way of version 3 depends on it.
 

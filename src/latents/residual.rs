@@ -1,16 +1,19 @@
 //! The colour residual: what a stream's colours are still off, voxel by voxel.
 //!
-//! Latents say what the networks have learned to make colours of; past some rate more of them hardly help. What is left of a level's colours, the
-//! cloud's less the generated ones, a stream may code as it is, as finely as wanted: transformed over the octree, rounded, and coded by
-//! [`crate::latents::entropy::decode_coefficients`]. That is beyond the paper; the transform is that of G-PCC's attributes (de Queiroz and Chou,
-//! [doi 10.1109/TIP.2016.2575005](https://doi.org/10.1109/TIP.2016.2575005)).
+//! Latents say what the networks have learned to make colours of; past some rate more of them hardly help. What is left
+//! of a level's colours, the cloud's less the generated ones, a stream may code as it is, as finely as wanted:
+//! transformed over the octree, rounded, and coded by [`crate::latents::entropy::decode_coefficients`]. That is beyond
+//! the paper; the transform is that of G-PCC's attributes (de Queiroz and Chou, [doi
+//! 10.1109/TIP.2016.2575005](https://doi.org/10.1109/TIP.2016.2575005)).
 //!
 //! # Transform
-//! Of the voxels of a slice, in Morton order, each but the first *joins at* the highest bit in which its key differs from that of the voxel before.
-//! Bits are taken from the lowest up, and of one bit the voxels that join there in turn: where voxel j joins at bit b, its *left* is the last
-//! voxel before it that joins above b (or the first), `v` is how many voxels there are from the left to j, and `w` how many from j to the next that joins at b or above. With
-//! a = √(v / (v + w)) and c = √(w / (v + w)) the values x of the left and y of j become a·x + c·y and a·y − c·x. Undone, from the highest bit
-//! down: x = a·l − c·h, y = c·l + a·h. In the end the first voxel has the mean times the root of their number, and the others what they differ by.
+//! Of the voxels of a slice, in Morton order, each but the first *joins at* the highest bit in which its key differs
+//! from that of the voxel before. Bits are taken from the lowest up, and of one bit the voxels that join there in turn:
+//! where voxel j joins at bit b, its *left* is the last voxel before it that joins above b (or the first), `v` is how
+//! many voxels there are from the left to j, and `w` how many from j to the next that joins at b or above. With a = √(v
+//! / (v + w)) and c = √(w / (v + w)) the values x of the left and y of j become a·x + c·y and a·y − c·x. Undone, from
+//! the highest bit down: x = a·l − c·h, y = c·l + a·h. In the end the first voxel has the mean times the root of their
+//! number, and the others what they differ by.
 //!
 //! # Payload
 //! One chunk for each slice of the level's voxels, independent of the others:
@@ -24,12 +27,14 @@
 //! | 4 | u8 | boundary, 0 to 63 |
 //! | 5 | | coefficients, a triple for each voxel: first the first voxel's, then those of voxels that join at higher bits before those at lower ones, of one bit in order |
 //!
-//! *Coarse* are the triples of the first voxel and of those that join at the boundary or above, the others are fine: so the coarse ones come first. A step of 0
-//! says that the coefficients it is for are not told, and 0; not all four may be 0. Coefficients are coded in two parts, coarse and fine; of each
-//! those channels are present whose step is not 0. A boundary of 3·n parts what is wider than 2ⁿ voxels from what is not.
+//! *Coarse* are the triples of the first voxel and of those that join at the boundary or above, the others are fine: so
+//! the coarse ones come first. A step of 0 says that the coefficients it is for are not told, and 0; not all four may
+//! be 0. Coefficients are coded in two parts, coarse and fine; of each those channels are present whose step is not 0.
+//! A boundary of 3·n parts what is wider than 2ⁿ voxels from what is not.
 //!
-//! A coefficient q of step s stands for q·(s/255). The three are those of a luma and two chromas, whose vectors are [`BASIS`]; a voxel's sum of the three, in turn, is added to the colour of
-//! each of its Gaussians, which then is clamped to `[0, 1]`. All in f32: equal streams give equal bits on every machine.
+//! A coefficient q of step s stands for q·(s/255). The three are those of a luma and two chromas, whose vectors are
+//! [`BASIS`]; a voxel's sum of the three, in turn, is added to the colour of each of its Gaussians, which then is
+//! clamped to `[0, 1]`. All in f32: equal streams give equal bits on every machine.
 
 use std::num::NonZeroU8;
 use std::ops::Range;
@@ -67,8 +72,8 @@ pub struct Steps {
 }
 
 impl From<NonZeroU8> for Steps {
-    /// Those that go well with a step of luma: chromas three eighths as coarse. That is as good at equal rates as equal steps, pictures' PSNR being
-    /// what counts, and leaves fewer blotches.
+    /// Those that go well with a step of luma: chromas three eighths as coarse. That is as good at equal rates as equal
+    /// steps, pictures' PSNR being what counts, and leaves fewer blotches.
     fn from(luma: NonZeroU8) -> Steps {
         let luma = luma.get();
         let chroma = (u16::from(luma) * 3 / 8).max(1) as u8;
@@ -165,7 +170,8 @@ struct Join {
 }
 
 impl ColourResidual {
-    /// Reads the payloads of the residual chunks of `level`, one for every `slice` of its voxels, whose Morton keys are `keys`; `None` if there are none.
+    /// Reads the payloads of the residual chunks of `level`, one for every `slice` of its voxels, whose Morton keys are
+    /// `keys`; `None` if there are none.
     ///
     /// # Errors
     /// [`Error::Malformed`] if one tells nothing, or of a boundary beyond keys, or its coefficients do not decode.
@@ -201,10 +207,12 @@ impl ColourResidual {
         }))
     }
 
-    /// The residual, as finely told as this, that brings colours nearer to what they are `missing`, voxel by voxel; `keys` are the voxels' Morton keys.
+    /// The residual, as finely told as this, that brings colours nearer to what they are `missing`, voxel by voxel;
+    /// `keys` are the voxels' Morton keys.
     ///
     /// # Panics
-    /// If there are more or fewer of the one than of the other, a slice has none, or the precision is none that can be written.
+    /// If there are more or fewer of the one than of the other, a slice has none, or the precision is none that can be
+    /// written.
     #[cfg(feature = "encoder")]
     pub fn of(missing: &[[f32; 3]], keys: &[u64], slice: usize, precision: ResidualSteps) -> Self {
         assert_eq!(missing.len(), keys.len(), "a difference for every voxel");
@@ -335,7 +343,8 @@ fn joins(keys: &[u64]) -> Vec<Join> {
         weights: [0.0; 2],
     };
     let mut joins = vec![none; keys.len().saturating_sub(1)];
-    // Voxels that the next may still join, with the bit at which they join themselves, higher ones first; and where their own join stands.
+    // Voxels that the next may still join, with the bit at which they join themselves, higher ones first; and where
+    // their own join stands.
     let mut open: Vec<(usize, usize, usize)> = vec![(0, usize::MAX, usize::MAX)];
     for voxel in 1..=keys.len() {
         let own = if voxel < keys.len() { bit(voxel) } else { usize::MAX - 1 };

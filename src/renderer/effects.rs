@@ -35,18 +35,19 @@ pub enum EffectMode {
 pub enum Effect {
     /// Colour that depends on the direction of view.
     Harmonics,
-    /// Opacity is taken back by as much as the pixel's blur widens a splat (the Mip filter): what is smaller than a pixel is dimmed
-    /// and not grown. Called for by files made that way; a stream's Gaussians are trained without.
+    /// Opacity is taken back by as much as the pixel's blur widens a splat (the Mip filter): what is smaller than a
+    /// pixel is dimmed and not grown. Called for by files made that way; a stream's Gaussians are trained without.
     Antialias,
-    /// Each pixel is the mean of several samples a side, as many as it takes to bring the typical splat to [`RESOLVED`] of them, and
-    /// at most [`MOST_SAMPLES`]. A crowd of dimmed splats lets through what the crowd itself would not, and only what is resolved is
-    /// free of that. Called for by anti-aliasing where splats fall under a pixel.
+    /// Each pixel is the mean of several samples a side, as many as it takes to bring the typical splat to [`RESOLVED`]
+    /// of them, and at most [`MOST_SAMPLES`]. A crowd of dimmed splats lets through what the crowd itself would not,
+    /// and only what is resolved is free of that. Called for by anti-aliasing where splats fall under a pixel.
     Supersample,
-    /// What reaches over the near plane is drawn as what of it is beyond the plane, evaluated in space along each pixel's ray: it has no
-    /// sensible image in the plane, and its centre may be behind. Called for where there are such Gaussians.
+    /// What reaches over the near plane is drawn as what of it is beyond the plane, evaluated in space along each
+    /// pixel's ray: it has no sensible image in the plane, and its centre may be behind. Called for where there are
+    /// such Gaussians.
     Near,
-    /// In each pixel, splats are blended in the order of their depths there, not in that of their centres, as far as the
-    /// eight nearest of them tell. Called for by nothing: Gaussians are made for the order of their centres.
+    /// In each pixel, splats are blended in the order of their depths there, not in that of their centres, as far as
+    /// the eight nearest of them tell. Called for by nothing: Gaussians are made for the order of their centres.
     Order,
 }
 
@@ -173,8 +174,8 @@ impl Effects {
         }
     }
 
-    /// What `gaussians` seen by `camera` call for, where it is not forced. Harmonics that there are none of cannot be forced on. Whether
-    /// anything reaches over the near plane is found out only while drawing.
+    /// What `gaussians` seen by `camera` call for, where it is not forced. Harmonics that there are none of cannot be
+    /// forced on. Whether anything reaches over the near plane is found out only while drawing.
     pub fn derive(&self, gaussians: &Gaussians, camera: &Camera) -> EffectSet {
         let decide = |choice, called_for| match choice {
             EffectMode::Auto => called_for,

@@ -15,9 +15,9 @@
 //! # Ok::<(), b2p::Error>(())
 //! ```
 //!
-//! Splats are drawn front to back in the order of their depth along the viewing direction, one order for the whole picture. The
-//! picture is the same to the bit for any number of threads: a tile is drawn by one thread, in an order that is a function of the
-//! input alone. Work runs on the rayon pool that the caller is in.
+//! Splats are drawn front to back in the order of their depth along the viewing direction, one order for the whole
+//! picture. The picture is the same to the bit for any number of threads: a tile is drawn by one thread, in an order
+//! that is a function of the input alone. Work runs on the rayon pool that the caller is in.
 
 pub mod camera;
 mod canvas;
@@ -86,13 +86,13 @@ impl Background {
     }
 }
 
-/// How much of splats may be left out. A splat is looked at in all the blocks of 4×4 pixels where its α may reach a floor; what is
-/// left out adds up where many tails overlap, as beside the silhouette of a crowd.
+/// How much of splats may be left out. A splat is looked at in all the blocks of 4×4 pixels where its α may reach a
+/// floor; what is left out adds up where many tails overlap, as beside the silhouette of a crowd.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 #[non_exhaustive]
 pub enum Quality {
-    /// A floor of 1/255, as is usual: beside silhouettes, pictures are off by several steps of eight bits, and by many where splats are
-    /// far smaller than pixels.
+    /// A floor of 1/255, as is usual: beside silhouettes, pictures are off by several steps of eight bits, and by many
+    /// where splats are far smaller than pixels.
     Fast,
     /// A floor of 1/16384.
     #[default]
@@ -324,9 +324,9 @@ impl Renderer {
     /// `image` is reused. After an error its content is unspecified.
     ///
     /// # Errors
-    /// [`crate::Error::Usage`] if the camera is none, the background is not finite, or the arrays of `gaussians` differ in length;
-    /// [`crate::Error::LimitExceeded`] if the picture, the memory or the work to draw it is over the `limits`;
-    /// [`crate::Error::OutOfMemory`].
+    /// [`crate::Error::Usage`] if the camera is none, the background is not finite, or the arrays of `gaussians` differ
+    /// in length; [`crate::Error::LimitExceeded`] if the picture, the memory or the work to draw it is over the
+    /// `limits`; [`crate::Error::OutOfMemory`].
     pub fn render_into(&mut self, gaussians: &Gaussians, camera: &Camera, image: &mut Image) -> Result<Stats> {
         let (channel, background) = (self.channel, self.background);
         let limits = self.limits.clone();
@@ -364,7 +364,8 @@ impl Renderer {
         Ok(stats)
     }
 
-    /// Which Gaussian each pixel shows most of; one sample a pixel, whatever the effects. Otherwise as [`Renderer::render_into`].
+    /// Which Gaussian each pixel shows most of; one sample a pixel, whatever the effects. Otherwise as
+    /// [`Renderer::render_into`].
     ///
     /// # Errors
     /// As [`Renderer::render_into`].
@@ -382,8 +383,9 @@ impl Renderer {
         Ok(stats)
     }
 
-    /// A picture of any `numbers` that each Gaussian, by its index, has `N` of, mixed as colours are: in each of `pixels`, row by row, the
-    /// sum over the Gaussians there of what they contribute, of which a 1 makes the opacity. One sample a pixel, whatever the effects.
+    /// A picture of any `numbers` that each Gaussian, by its index, has `N` of, mixed as colours are: in each of
+    /// `pixels`, row by row, the sum over the Gaussians there of what they contribute, of which a 1 makes the opacity.
+    /// One sample a pixel, whatever the effects.
     ///
     /// # Errors
     /// As [`Renderer::render_into`].
@@ -489,7 +491,8 @@ impl Renderer {
         })
     }
 
-    /// Finds the ellipses and counts them by tile. Completes the plan: whether any cross the near plane, and their bytes.
+    /// Finds the ellipses and counts them by tile. Completes the plan: whether any cross the near plane, and their
+    /// bytes.
     fn project(
         &mut self,
         gaussians: &Gaussians,

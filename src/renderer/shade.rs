@@ -17,10 +17,11 @@ pub enum Channel {
     /// Colours.
     #[default]
     Colour,
-    /// In all three channels, the distance of the centres along the viewing direction, in cube-frame units. Premultiplied as colours
-    /// are: divided by alpha it is the mean of what is seen.
+    /// In all three channels, the distance of the centres along the viewing direction, in cube-frame units.
+    /// Premultiplied as colours are: divided by alpha it is the mean of what is seen.
     Depth,
-    /// The axis along which a Gaussian is thinnest, turned to the eye, in the camera's axes, from [−1, 1] to [0, 1]. Premultiplied.
+    /// The axis along which a Gaussian is thinnest, turned to the eye, in the camera's axes, from [−1, 1] to [0, 1].
+    /// Premultiplied.
     Normal,
 }
 

@@ -1,24 +1,31 @@
-//! Coefficients of colours as bytes: triples of whole numbers, most of them zero, under probabilities that follow what was coded.
+//! Coefficients of colours as bytes: triples of whole numbers, most of them zero, under probabilities that follow what
+//! was coded.
 //!
-//! The triples of a slice come in parts, and of each part only some channels are *present*: all three, the first, the last two, or none. Those that
-//! are not are 0 without a decision; a part without any takes no decision at all and leaves everything below as it is.
+//! The triples of a slice come in parts, and of each part only some channels are *present*: all three, the first, the
+//! last two, or none. Those that are not are 0 without a decision; a part without any takes no decision at all and
+//! leaves everything below as it is.
 //!
-//! A triple is coded in decisions between 0 and 1, each under the probability of its context. A context holds two numbers of 16 bits, *quick* and *slow*,
-//! how likely 0 is in units of 2⁻¹⁶; the decision's row has the two entries `p` and `2¹⁶ − p`, where `p` is half of their sum, rounded down, but at
-//! least 64 and at most 2¹⁶ − 64. After a 0 they grow by `(65535 − quick) >> r` and `(65535 − slow) >> t`, after a 1 they shrink by
-//! `quick >> r` and `slow >> t`. With d as the decisions made in the context before, and b as the bits of d + 2 (⌊log₂(d + 2)⌋ + 1), r is b, but at most 4, and t is b, but at most 7.
+//! A triple is coded in decisions between 0 and 1, each under the probability of its context. A context holds two
+//! numbers of 16 bits, *quick* and *slow*, how likely 0 is in units of 2⁻¹⁶; the decision's row has the two entries `p`
+//! and `2¹⁶ − p`, where `p` is half of their sum, rounded down, but at least 64 and at most 2¹⁶ − 64. After a 0 they
+//! grow by `(65535 − quick) >> r` and `(65535 − slow) >> t`, after a 1 they shrink by `quick >> r` and `slow >> t`.
+//! With d as the decisions made in the context before, and b as the bits of d + 2 (⌊log₂(d + 2)⌋ + 1), r is b, but at
+//! most 4, and t is b, but at most 7.
 //!
-//! The *activity* of a channel is the running mean of its magnitudes, in units of 2⁻¹²: 0 at first, and after a triple with the
-//! magnitude `m` it grows by `(4096·min(m, 15) − activity) >> 2`, rounded down. The *class* of a number is how many of [`CLASSES`] it reaches.
+//! The *activity* of a channel is the running mean of its magnitudes, in units of 2⁻¹²: 0 at first, and after a triple
+//! with the magnitude `m` it grows by `(4096·min(m, 15) − activity) >> 2`, rounded down. The *class* of a number is how
+//! many of [`CLASSES`] it reaches.
 //!
 //! 1. Is anything not 0? Context: the class of the sum of the three activities.
-//! 2. For each channel present: is it not 0? Context: the channel; the class of its activity; the sum of magnitudes before it in the triple, at most 2.
-//!    Left out for the last channel present, if the others are 0: then it is not.
-//! 3. If it is not: is it negative? That is an equiprobable bit. Then its magnitude less 1 in as many ones, at most 14, and, unless there are 14, a
-//!    zero. Context: whether it is the first channel; the class as before; how many ones came before it, at most 3. After 14 ones, what is left, less 14, plus 1, is `e`, which follows
-//!    as distances from a row do: `⌊log₂ e⌋` ones, a zero, and the lowest bits of `e`.
+//! 2. For each channel present: is it not 0? Context: the channel; the class of its activity; the sum of magnitudes
+//!    before it in the triple, at most 2. Left out for the last channel present, if the others are 0: then it is not.
+//! 3. If it is not: is it negative? That is an equiprobable bit. Then its magnitude less 1 in as many ones, at most 14,
+//!    and, unless there are 14, a zero. Context: whether it is the first channel; the class as before; how many ones
+//!    came before it, at most 3. After 14 ones, what is left, less 14, plus 1, is `e`, which follows as distances from
+//!    a row do: `⌊log₂ e⌋` ones, a zero, and the lowest bits of `e`.
 //!
-//! Contexts start with both numbers at [`FIRST`] of their class. A slice is coded as latents are ([`super`]), by itself.
+//! Contexts start with both numbers at [`FIRST`] of their class. A slice is coded as latents are ([`super`]), by
+//! itself.
 
 use std::fmt::Display;
 use std::num::NonZeroU16;
@@ -166,7 +173,8 @@ impl Model {
         }
     }
 
-    /// The next triple, of these channels: the encoder's is `wanted`, the decoder's what it reads; `None` if that has a magnitude beyond 16 bits.
+    /// The next triple, of these channels: the encoder's is `wanted`, the decoder's what it reads; `None` if that has a
+    /// magnitude beyond 16 bits.
     #[inline]
     fn triple(&mut self, decisions: &mut impl Decisions, present: Range<usize>, wanted: [i16; 3]) -> Option<[i16; 3]> {
         let all: i32 = self.activity.iter().sum();
@@ -235,7 +243,8 @@ pub struct SlicePart<T> {
     pub triples: T,
 }
 
-/// Codes the coefficients of one slice; those of channels that are not present must be 0. Of −2¹⁵ the code is that of −2¹⁵ + 1: magnitudes have 15 bits.
+/// Codes the coefficients of one slice; those of channels that are not present must be 0. Of −2¹⁵ the code is that of
+/// −2¹⁵ + 1: magnitudes have 15 bits.
 pub fn encode_coefficients(parts: &[SlicePart<&[[i16; 3]]>]) -> Vec<u8> {
     let (mut model, mut record) = (Model::new(), Record(Vec::new()));
     for SlicePart { present, triples } in parts.iter().filter(|part| !part.present.is_empty()) {
@@ -250,8 +259,8 @@ pub fn encode_coefficients(parts: &[SlicePart<&[[i16; 3]]>]) -> Vec<u8> {
     slice::sealed(stack)
 }
 
-/// Decodes as many triples as there is room for, which the caller has held against its limits: the work is bounded by that, whatever the bytes.
-/// Triples of parts without channels are left as they are.
+/// Decodes as many triples as there is room for, which the caller has held against its limits: the work is bounded by
+/// that, whatever the bytes. Triples of parts without channels are left as they are.
 ///
 /// # Errors
 /// [`Error::Malformed`], naming `at`, if the bytes are not what [`encode_coefficients`] makes of as many.

@@ -1,4 +1,5 @@
-//! A level's voxels in parts, each with what lies around it: their children are eight times as many, and need not all be in memory at once.
+//! A level's voxels in parts, each with what lies around it: their children are eight times as many, and need not all
+//! be in memory at once.
 
 use std::ops::Range;
 
@@ -32,10 +33,11 @@ impl<'a> VoxelParts<'a> {
         }
     }
 
-    /// The part of these rows, with at least one ring around it: of fewer of them, down to one, if with the rings they were more than `most`.
+    /// The part of these rows, with at least one ring around it: of fewer of them, down to one, if with the rings they
+    /// were more than `most`.
     ///
-    /// Two steps from child to neighbouring child lead to a neighbour of the parent at most: what `2n` layers of 3³ make of the children of
-    /// the part and of `n` rings is, for the part itself, what they make of all children.
+    /// Two steps from child to neighbouring child lead to a neighbour of the parent at most: what `2n` layers of 3³
+    /// make of the children of the part and of `n` rings is, for the part itself, what they make of all children.
     pub fn part(&mut self, mut rows: Range<usize>, rings: usize, most: usize) -> VoxelPart {
         let (mut voxels, mut ends) = self.surround(rows.clone(), rings);
         while voxels.len() > most && rows.len() > 1 {

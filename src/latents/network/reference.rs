@@ -1,4 +1,5 @@
-//! The network by its definition, in f64 and with voxels found by their coordinates: what tests hold the real one against.
+//! The network by its definition, in f64 and with voxels found by their coordinates: what tests hold the real one
+//! against.
 //!
 //! Shares with it the list of modules and layers (`structure.rs`) and nothing else.
 

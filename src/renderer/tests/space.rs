@@ -1,4 +1,5 @@
-//! Effects that need to know where a splat is in space: care for the near plane, an order for each pixel; and whose a pixel is.
+//! Effects that need to know where a splat is in space: care for the near plane, an order for each pixel; and whose a
+//! pixel is.
 
 use super::effects::with;
 use super::*;

@@ -72,7 +72,8 @@ impl Cloud {
     }
 }
 
-/// By how much the encoder is coarser than f16 with these instructions: tiles hold bf16, of eight significant bits instead of eleven.
+/// By how much the encoder is coarser than f16 with these instructions: tiles hold bf16, of eight significant bits
+/// instead of eleven.
 fn coarser(isa: Isa) -> f64 {
     if isa.has_tiles() { 8.0 } else { 1.0 }
 }
