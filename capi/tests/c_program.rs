@@ -27,14 +27,14 @@ fn library() -> PathBuf {
     found.expect("the static library is built with the test")
 }
 
-fn compile(to: &Path, more: &[&str]) -> Output {
+fn compile(source: &str, to: &Path, more: &[&str]) -> Output {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     Command::new("cc")
         .args(["-std=c11", "-Wall", "-Wextra", "-Werror", "-O1", "-g"])
         .args(more)
         .arg("-I")
         .arg(here.join("include"))
-        .arg(here.join("tests/use.c"))
+        .arg(here.join(source))
         .arg(library())
         .args(["-lpthread", "-ldl", "-lm", "-o"])
         .arg(to)
@@ -82,9 +82,9 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     let expected = format!("{best:016x}\n{quick:016x}\n");
 
     let sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
-    printed(compile(&at("plain"), &[]));
+    printed(compile("tests/use.c", &at("plain"), &[]));
     let mut programs = vec![("alone", Command::new(at("plain")))];
-    match compile(&at("watched"), &sanitizers).status.success() {
+    match compile("tests/use.c", &at("watched"), &sanitizers).status.success() {
         true => programs.push(("with sanitizers", Command::new(at("watched")))),
         false => println!("NOT RUN: this compiler has no AddressSanitizer"),
     }
@@ -103,4 +103,20 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
         assert_eq!(printed(output), expected, "{how}");
         println!("ran {how}");
     }
+}
+
+#[test]
+fn the_example_in_c_decodes_the_sample_scene_and_draws_it() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name);
+    printed(compile("examples/decode.c", &at("decode"), &[]));
+    let scene = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/scene.b2p");
+    let mut example = Command::new(at("decode"));
+    let text = printed(example.arg(scene).arg(at("scene.ppm")).output().expect("it starts"));
+    assert!(
+        text.contains("level 7 is complete") && text.contains(" Gaussians"),
+        "{text}"
+    );
+    let picture = std::fs::read(at("scene.ppm")).expect("a picture");
+    assert_eq!(picture.len(), "P6\n640 480\n255\n".len() + 3 * 640 * 480);
 }

@@ -1,6 +1,6 @@
 //! Streams of version 3: colours as transform coefficients.
 
-mod within;
+mod rate_control;
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -17,12 +17,12 @@ use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
-pub use within::encode_within;
+pub use rate_control::encode_to_rate;
 
 /// How exactly colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
-pub enum Fineness {
+pub enum QualityTarget {
     /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice that.
     Step(f32),
     /// The same with a size for each.
@@ -36,18 +36,18 @@ pub enum Fineness {
     Lossless,
 }
 
-/// What may be chosen about a stream of version 3; [`encode_within`] chooses how exactly colours are coded, and may leave out the finest levels.
+/// What may be chosen about a stream of version 3; [`encode_to_rate`] chooses how exactly colours are coded, and may leave out the finest levels.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The levels that a stream may be cut after, the last one at most the bit depth N. Default: N−3 to N−1.
     pub levels: Option<RangeInclusive<u8>>,
     /// How exactly colours are coded.
-    pub fineness: Fineness,
+    pub fineness: QualityTarget,
     /// Whether levels have a filter that the decoder runs on their colours.
     pub filter: bool,
     /// Whether quantisation is rate–distortion optimised; otherwise coefficients are rounded to the nearest.
     pub optimised: bool,
-    /// Streams that [`encode_within`] tries for a level at most, once one fits.
+    /// Streams that [`encode_to_rate`] tries for a level at most, once one fits.
     pub tries: usize,
     /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
@@ -61,7 +61,7 @@ impl Default for Options {
     fn default() -> Self {
         Options {
             levels: None,
-            fineness: Fineness::Step(20.0),
+            fineness: QualityTarget::Step(20.0),
             filter: true,
             optimised: true,
             tries: usize::MAX,
@@ -93,26 +93,26 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     subject.checked(coded, log)
 }
 
-impl fmt::Display for Fineness {
+impl fmt::Display for QualityTarget {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Fineness::Step(luma) => write!(f, "step {luma:.2}"),
-            Fineness::Steps { luma, chroma } => write!(f, "step {luma:.2},{chroma:.2}"),
-            Fineness::Lossless => f.write_str("exact colours"),
+            QualityTarget::Step(luma) => write!(f, "step {luma:.2}"),
+            QualityTarget::Steps { luma, chroma } => write!(f, "step {luma:.2},{chroma:.2}"),
+            QualityTarget::Lossless => f.write_str("exact colours"),
         }
     }
 }
 
-impl Fineness {
+impl QualityTarget {
     /// The steps of the finest level.
     fn steps(self) -> Result<Steps> {
         match self {
-            Fineness::Lossless => Ok(Steps::LOSSLESS),
-            Fineness::Step(step) => {
+            QualityTarget::Lossless => Ok(Steps::LOSSLESS),
+            QualityTarget::Step(step) => {
                 let luma = nearest(step)?;
                 Ok(steps_of(luma, luma))
             }
-            Fineness::Steps { luma, chroma } => Ok(Steps {
+            QualityTarget::Steps { luma, chroma } => Ok(Steps {
                 luma: nearest(luma)?,
                 chroma: nearest(chroma)?.min(MAX_CHROMA),
             }),
@@ -123,8 +123,8 @@ impl Fineness {
     fn of(steps: Steps) -> Self {
         let size = |luma| Steps { luma, ..steps }.luma_step();
         match steps.is_lossless() {
-            true => Fineness::Lossless,
-            false => Fineness::Steps {
+            true => QualityTarget::Lossless,
+            false => QualityTarget::Steps {
                 luma: size(steps.luma),
                 chroma: size(steps.chroma),
             },
