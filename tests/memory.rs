@@ -129,6 +129,10 @@ fn decoding_version_3_holds_no_more_than_its_header_allows_to_foretell() {
                 let count = gaussians.unwrap().len();
                 println!("{kind}, level {level}, {count} Gaussians: {held} of {most} bytes");
                 assert!(held <= most + Limits::OVERHEAD, "{kind}, level {level}: {held}");
+                assert!(
+                    most <= 2 * held + Limits::OVERHEAD,
+                    "{kind}, level {level}: {held} of {most}"
+                );
             }
             let limits = Limits::default().with_max_bytes(decoder.memory(&header, header.top).unwrap() - 1);
             let strict = Decoder::new().with_limits(limits);
@@ -168,6 +172,7 @@ fn drawing_version_3_with_learned_heads_holds_no_more_than_its_header_allows_to_
                     let (drawn, held) = peak(decode);
                     println!("{of}, {} Gaussians: {held} of {most} bytes", drawn.unwrap().len());
                     assert!(held <= most + Limits::OVERHEAD, "{of}: {held} of {most}");
+                    assert!(most <= 2 * held + Limits::OVERHEAD, "{of}: {held} of {most}");
                 }
             }
         }

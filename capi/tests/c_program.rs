@@ -7,6 +7,7 @@ mod common;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use b2p::decoder::StreamDecoder;
 use b2p::encoder::transform;
 use b2p::gaussians::Heads;
 use b2p::latents::Decoder;
@@ -79,7 +80,15 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     };
     let (best, quick) = (sum(&model, Heads::Best), sum(&both, Heads::Quick));
     assert_ne!(best, quick);
-    let expected = format!("{best:016x}\n{quick:016x}\n");
+    let decoding = StreamDecoder::new().whole(&new.bytes);
+    let decoding = decoding.expect("a stream");
+    let points = decoding.points().expect("points");
+    let coordinates = (0..points.voxels.len()).flat_map(|i| points.voxels.coordinate(i));
+    let colours = points.colours.as_flattened().iter().map(|c| u32::from(*c));
+    let sum = coordinates.zip(colours).flat_map(|(c, colour)| [c, colour]);
+    let sum = sum.fold(0u64, |sum, x| sum.wrapping_mul(31).wrapping_add(x.into()));
+    let points = format!("{} {sum:016x}\n", points.voxels.len());
+    let expected = format!("{points}{best:016x}\n{quick:016x}\n");
 
     let sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
     printed(compile("tests/use.c", &at("plain"), &[]));

@@ -11,7 +11,9 @@ use rayon::prelude::*;
 use super::{Encoded, rates};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{self, Filter, Steps, Truth};
-use crate::container::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
+#[cfg(doc)]
+use crate::container::MAX_COLOUR_SLICE;
+use crate::container::{Format, Header, MAX_SLICE_VOXELS, Writer};
 use crate::decoder::{Decoder, colour_hash};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
@@ -51,7 +53,8 @@ pub struct Options {
     pub tries: usize,
     /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
-    /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`].
+    /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`]: fewer let more threads decode a level, and cost
+    /// bits.
     pub colour_slice: u32,
     /// The instructions to use; any give the same stream. Default: the best of this machine.
     pub isa: Option<Isa>,
@@ -66,11 +69,14 @@ impl Default for Options {
             optimised: true,
             tries: usize::MAX,
             slice_voxels: MAX_SLICE_VOXELS,
-            colour_slice: MAX_COLOUR_SLICE / 2,
+            colour_slice: COLOUR_SLICE,
             isa: None,
         }
     }
 }
+
+/// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.
+const COLOUR_SLICE: u32 = 8192;
 
 /// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green and blue comes of both.
 const CHROMA: u8 = 8;

@@ -75,12 +75,15 @@ pub fn surfels(
     assert_eq!(map.volume(), 27, "surfels need a 3³ map");
     assert_eq!(map.len(), voxels.len(), "one row of the map per voxel");
     assert_eq!(colours.len(), voxels.len(), "one colour per voxel");
-    let own = moments::of_voxels(voxels);
-    let near = moments::step(isa, map, &own);
+    // Memory that was touched before is faster than fresh memory.
+    let mut spare = moments::of_voxels(voxels);
+    let near = moments::step(isa, map, &spare);
     let mut far = moments::step(isa, map, &near);
     for _ in 2..moments::ROUNDS {
-        far = moments::step(isa, map, &far);
+        moments::step_into(isa, map, &far, &mut spare);
+        std::mem::swap(&mut far, &mut spare);
     }
+    drop(spare);
     let count = voxels.len() * per_voxel.count();
     let edge = 2.0 / (1u32 << voxels.depth()) as f32;
     let mut gaussians = Gaussians {
