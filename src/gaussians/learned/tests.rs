@@ -148,6 +148,7 @@ impl Cloud {
             colours: &self.colours[0],
             colours_above: &self.colours[1],
             luma_step: self.step,
+            without: None,
         }
     }
 

@@ -12,7 +12,15 @@ fn cloud(depth: u8, voxels: impl IntoIterator<Item = [u32; 3]>) -> (Voxels, Kern
 
 fn one_each(voxels: &Voxels, map: &KernelMap) -> Gaussians {
     let grey = vec![[128; 3]; voxels.len()];
-    surfels(Isa::detect(), voxels, map, &grey, PerVoxel::One, Frame::default())
+    surfels(
+        Isa::detect(),
+        voxels,
+        map,
+        &grey,
+        PerVoxel::One,
+        Choice::ALL,
+        Frame::default(),
+    )
 }
 
 /// The walk counts from one voxel to all, by stepping between all pairs of voxels.
@@ -117,7 +125,7 @@ proptest! {
         let colour = |i: usize| [i * 7, i * 31, i * 101].map(|v| (v as u8).wrapping_mul(seed));
         let colours: Vec<_> = (0..voxels.len()).map(colour).collect();
         for per_voxel in [PerVoxel::One, PerVoxel::Four] {
-            let made = |isa| surfels(isa, &voxels, &map, &colours, per_voxel, Frame::default());
+            let made = |isa| surfels(isa, &voxels, &map, &colours, per_voxel, Choice::ALL, Frame::default());
             let expected = made(Isa::available()[0]);
             prop_assert!(expected.check_lengths().is_ok());
             for isa in Isa::available() {
@@ -243,7 +251,15 @@ fn four_discs_follow_the_colour_gradient() {
     });
     let colours: Vec<_> = colours.collect();
     let frame = Frame::default();
-    let four = surfels(Isa::detect(), &voxels, &map, &colours, PerVoxel::Four, frame);
+    let four = surfels(
+        Isa::detect(),
+        &voxels,
+        &map,
+        &colours,
+        PerVoxel::Four,
+        Choice::ALL,
+        frame,
+    );
     assert_eq!(four.len(), 4 * voxels.len());
     for i in 0..four.len() {
         let [x, y, z] = voxels.coordinate(i / 4);
