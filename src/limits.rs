@@ -7,6 +7,7 @@ pub const MAX_DEPTH: u8 = 21;
 
 /// Bounds that are checked before memory is reserved. Finite by default: 2²⁶ points, 21 levels, 2²⁸ pixels, 2 GiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Limits {
     /// Voxels of any one level, and points of any one cloud.
     pub max_points: u64,
@@ -51,6 +52,30 @@ impl Limits {
             max_pixels: u64::MAX,
             max_bytes: u64::MAX,
         }
+    }
+
+    /// The same limits with other [`Limits::max_points`].
+    pub fn with_max_points(mut self, points: u64) -> Self {
+        self.max_points = points;
+        self
+    }
+
+    /// The same limits with other [`Limits::max_depth`].
+    pub fn with_max_depth(mut self, depth: u8) -> Self {
+        self.max_depth = depth;
+        self
+    }
+
+    /// The same limits with other [`Limits::max_pixels`].
+    pub fn with_max_pixels(mut self, pixels: u64) -> Self {
+        self.max_pixels = pixels;
+        self
+    }
+
+    /// The same limits with other [`Limits::max_bytes`].
+    pub fn with_max_bytes(mut self, bytes: u64) -> Self {
+        self.max_bytes = bytes;
+        self
     }
 
     /// Holds `count` points against the limit.

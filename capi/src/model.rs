@@ -2,15 +2,14 @@
 
 use std::ffi::{CStr, c_char};
 use std::path::Path;
-use std::sync::Arc;
 
 use crate::border::{Fault, Status, give, guard, slice, take};
 
 /// A model, ready to run. Any number of decodings share it, in any threads.
-pub struct Model(pub(crate) Arc<b2p::latents::network::Model>);
+pub struct Model(pub(crate) b2p::Model);
 
 /// Learned heads that draw streams of version 3, ready to run. Any number of decodings share them, in any threads.
-pub struct HeadsModel(pub(crate) Arc<b2p::gaussians::learned::HeadsModel>);
+pub struct HeadsModel(pub(crate) b2p::HeadsModel);
 
 /// What an input may ask for.
 #[repr(C)]
@@ -39,12 +38,11 @@ impl From<b2p::Limits> for Limits {
 
 impl From<Limits> for b2p::Limits {
     fn from(limits: Limits) -> Self {
-        b2p::Limits {
-            max_points: limits.max_points,
-            max_pixels: limits.max_pixels,
-            max_bytes: limits.max_bytes,
-            max_depth: limits.max_depth,
-        }
+        b2p::Limits::default()
+            .with_max_points(limits.max_points)
+            .with_max_pixels(limits.max_pixels)
+            .with_max_bytes(limits.max_bytes)
+            .with_max_depth(limits.max_depth)
     }
 }
 
@@ -93,7 +91,7 @@ pub unsafe extern "C" fn b2p_model_open(
         let path = path.to_str().map_err(|_| Fault::usage("path is not UTF-8"))?;
         let loaded = b2p::latents::network::Model::open(Path::new(path))?;
         // SAFETY: the caller vouches for `model`.
-        unsafe { give(model, "model", Model(Arc::new(loaded))) }
+        unsafe { give(model, "model", Model(loaded)) }
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -116,7 +114,7 @@ pub unsafe extern "C" fn b2p_model_from_bytes(
         let bytes = unsafe { slice(bytes, length, "bytes") }?;
         let loaded = b2p::latents::network::Model::from_bytes(bytes)?;
         // SAFETY: the caller vouches for `model`.
-        unsafe { give(model, "model", Model(Arc::new(loaded))) }
+        unsafe { give(model, "model", Model(loaded)) }
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -149,7 +147,7 @@ pub unsafe extern "C" fn b2p_heads_model_from_bytes(
         let bytes = unsafe { slice(bytes, length, "bytes") }?;
         let loaded = b2p::gaussians::learned::HeadsModel::from_bytes(bytes)?;
         // SAFETY: the caller vouches for `heads`.
-        unsafe { give(heads, "heads", HeadsModel(Arc::new(loaded))) }
+        unsafe { give(heads, "heads", HeadsModel(loaded)) }
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }

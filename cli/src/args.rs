@@ -60,17 +60,15 @@ pub enum Preset {
 impl LimitArgs {
     /// The limits that they name.
     pub fn limits(&self) -> Limits {
-        let preset = match self.limits {
+        let mut limits = match self.limits {
             Preset::Embedded => Limits::embedded(),
             Preset::Default => Limits::default(),
             Preset::Unlimited => Limits::unlimited(),
         };
-        Limits {
-            max_points: self.max_points.unwrap_or(preset.max_points),
-            max_pixels: self.max_pixels.unwrap_or(preset.max_pixels),
-            max_bytes: self.max_memory.unwrap_or(preset.max_bytes),
-            ..preset
-        }
+        limits.max_points = self.max_points.unwrap_or(limits.max_points);
+        limits.max_pixels = self.max_pixels.unwrap_or(limits.max_pixels);
+        limits.max_bytes = self.max_memory.unwrap_or(limits.max_bytes);
+        limits
     }
 }
 

@@ -54,12 +54,13 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
     };
 
     let runs = timed(args, progress, || {
-        let mut log = Log::default();
+        let log = Log::new();
+        let decoder = decoder.clone().with_level(level).with_log(&log);
         let start = Instant::now();
-        let gaussians = decoder.decode(&bytes, Some(level), &mut log).map_err(fail)?;
+        let gaussians = decoder.decode(&bytes).map_err(fail)?;
         let total = start.elapsed();
         drop(gaussians);
-        Ok((total, log.steps().to_vec()))
+        Ok((total, log.steps()))
     })?;
     let header = Header::parse(&bytes, limits).map_err(fail)?;
     let heads = decoder.heads_for(&header);
@@ -67,7 +68,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
     let works = match (model, heads.learned()) {
         (Some(model), Some(heads)) if header.model().is_some() => {
             let exact = Decoder::new(model).with_limits(limits.clone());
-            let exact = exact.exact(&bytes, level, &mut Log::default());
+            let exact = exact.exact(&bytes, level, &Log::default());
             let octree = exact.map_err(fail)?.octree;
             works(model.shape(), heads, &octree, header.base)
         }

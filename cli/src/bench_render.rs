@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use b2p::log::Log;
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Image, Renderer, Stats, Times};
+use b2p::renderer::{Image, Renderer, Stats, Times};
 use b2p::{Limits, embedded};
 use serde_json::json;
 
@@ -31,28 +31,27 @@ const STAGES: [Stage; 5] = [
 pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String> {
     let (width, height) = args.size;
     let camera = Camera::orbit(0.0, 0.0, 3.0, 45.0, width, height)?;
-    let mut log = Log::default();
+    let log = Log::default();
     let gaussians = match &args.input {
         Some(path) => {
-            let source = Source::open(path, &args.detail, &args.model, limits, &mut log)?;
-            source.gaussians(&args.detail, &[camera], &mut log)?.0
+            let source = Source::open(path, &args.detail, &args.model, limits, &log)?;
+            source.gaussians(&args.detail, &[camera], &log)?.0
         }
         None => {
             let sample = embedded::SAMPLE;
             let decoder = load::decoder(sample, &args.detail, &args.model, limits)?;
-            decoder.decode(embedded::SAMPLE, args.detail.level, &mut log)?
+            decoder.with_log(&log).decode(sample)?
         }
     };
     let isa = load::isa(args.model.isa.as_deref())?;
-    let mut renderer = Renderer::new(isa);
-    renderer.set_quality(args.quality);
+    let renderer = Renderer::new().with_isa(isa).with_limits(limits.clone());
+    let mut renderer = renderer.with_quality(args.quality);
     let mut image = Image::default();
     // The first is not counted.
     let mut all: Vec<Stats> = Vec::new();
     for run in 0..=args.repeat {
         progress.say(&format!("run {run} of {}", args.repeat));
-        let background = Background::WHITE;
-        let stats = renderer.render_into(&gaussians, &camera, background, limits, &mut image)?;
+        let stats = renderer.render_into(&gaussians, &camera, &mut image)?;
         if run > 0 {
             all.push(stats);
         }

@@ -4,7 +4,6 @@ use std::time::{Duration, Instant};
 
 use super::budget::Task;
 use b2p::container::version;
-use b2p::log::Log;
 use b2p::{Limits, output};
 
 use super::args::Decode;
@@ -17,21 +16,20 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String
     if args.points {
         return points(args, limits, progress);
     }
-    let say = |step: &str| progress.say(step);
-    let mut log = Log::with_listener(&say);
+    let log = progress.log();
     let mut written = 0;
     let mut took = Duration::ZERO;
     let (input, to) = (&args.input, &args.output);
     if let Some(bytes) = keep::stream(&args.budget, input)? {
         let (budget, start) = (&args.budget, Instant::now());
-        let kept = keep::decode(budget, input, &bytes, &args.model, limits, &mut log)?;
+        let kept = keep::decode(budget, input, &bytes, &args.model, limits, &log)?;
         let told = kept.describe(start.elapsed());
         let gaussians = kept.gaussians;
         log.step("write PLY", gaussians.len(), "Gaussians", || {
             output::write_file(to, |w| gaussians.write_ply(w, to))
         })?;
         let count = count(gaussians.len() as u64);
-        let steps = steps(log.steps());
+        let steps = steps(&log.steps());
         return Ok(format!("{told}{steps}\n{}: {count} Gaussians\n", to.display()));
     }
     let chosen = budget::choose(&args.budget, &args.model, input, Task::Decode, limits, progress)?;
@@ -40,7 +38,7 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String
         Some((detail, model)) => (detail, model),
         None => (&args.detail, &args.model),
     };
-    pipe::each(input, detail, model, limits, true, &mut log, &mut |gaussians, log| {
+    pipe::each(input, detail, model, limits, true, &log, &mut |gaussians, log| {
         written = gaussians.len();
         took = log.steps().iter().map(|step| step.time).sum();
         log.step("write PLY", written, "Gaussians", || {
@@ -51,7 +49,7 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String
     let chosen = chosen.map_or(String::new(), |c| c.describe(Task::Decode, took));
     Ok(format!(
         "{chosen}{}\n{}: {} Gaussians\n",
-        steps(log.steps()),
+        steps(&log.steps()),
         to.display(),
         count(written as u64),
     ))
@@ -59,23 +57,22 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String
 
 /// Decodes a stream into a PLY of points.
 fn points(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String> {
-    let say = |step: &str| progress.say(step);
-    let mut log = Log::with_listener(&say);
+    let log = progress.log();
     let bytes = load::bytes(&args.input)?;
     let fail = Failure::in_file(&args.input);
     if version(&bytes) == Some(2) {
         let what = "a stream of version 2 holds no colours of voxels, but Gaussians";
         return Err(Failure(format!("{}: {what}", args.input.display())));
     }
-    let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?;
-    let decoding = decoder.whole(&bytes, args.detail.level, &mut log);
+    let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?.with_log(&log);
+    let decoding = decoder.whole(&bytes);
     let decoding = decoding.map_err(&fail)?;
     let cloud = decoding.points().map(|points| points.to_cloud()).unwrap_or_default();
     let (written, to) = (cloud.positions.len(), &args.output);
     log.step("write PLY", written, "points", || cloud.write(to))?;
     Ok(format!(
         "{}\n{}: {} points\n",
-        steps(log.steps()),
+        steps(&log.steps()),
         to.display(),
         count(written as u64),
     ))

@@ -1,13 +1,8 @@
 //! `b2p demo`: the sample inside the program, decoded and drawn.
 
 use std::path::Path;
-use std::sync::Arc;
 
-use b2p::decoder::StreamDecoder;
-use b2p::gaussians::learned::HeadsModel;
-use b2p::log::Log;
-use b2p::renderer::{Background, Renderer};
-use b2p::{Error, embedded, output};
+use b2p::{Background, Decoder, Error, HeadsModel, Renderer, embedded, output};
 
 use super::args::{Demo, View};
 use super::progress::Progress;
@@ -19,26 +14,26 @@ const VIEWS: [(&str, [f32; 3]); 2] = [("front", [20.0, 20.0, 2.6]), ("close", [-
 
 /// Decodes the sample to each of its levels that has Gaussians, and draws each from two sides.
 pub fn run(args: &Demo, progress: &Progress) -> Result<String> {
-    let say = |step: &str| progress.say(step);
     std::fs::create_dir_all(&args.output).map_err(|source| Error::Io {
         path: args.output.clone(),
         source,
     })?;
-    let mut log = Log::with_listener(&say);
+    let log = progress.log();
     let decoder = log.step("load", embedded::HEADS.len(), "bytes", || {
         let heads = HeadsModel::from_bytes(embedded::HEADS)?;
-        Ok(StreamDecoder::new().with_heads_model(Arc::new(heads)))
+        Ok(Decoder::new().with_heads_model(heads))
     })?;
     let mut text = format!(
         "The sample: {} bytes of stream inside the program.\n\n{}",
         count(embedded::SCENE.len() as u64),
-        steps(log.steps()),
+        steps(&log.steps()),
     );
     let mut renderer = Renderer::default();
     let mut written = Vec::new();
     for level in decoder.levels(embedded::SCENE)? {
-        let mut log = Log::with_listener(&say);
-        let gaussians = decoder.decode(embedded::SCENE, Some(level), &mut log)?;
+        let log = progress.log();
+        let decoder = decoder.clone().with_level(level).with_log(&log);
+        let gaussians = decoder.decode(embedded::SCENE)?;
         let mut lines = String::new();
         for (name, orbit) in VIEWS {
             let path = args.output.join(format!("level-{level}-{name}.png"));
@@ -62,7 +57,7 @@ pub fn run(args: &Demo, progress: &Progress) -> Result<String> {
             write_ply(&gaussians, &path)
         })?;
         written.push(path);
-        text += &format!("\nLevel {level}\n{}{lines}", steps(log.steps()));
+        text += &format!("\nLevel {level}\n{}{lines}", steps(&log.steps()));
     }
     text += "\nWritten:\n";
     for path in written {

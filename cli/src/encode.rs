@@ -14,8 +14,7 @@ use super::{Failure, Result, load};
 
 /// Codes a cloud and says what it cost.
 pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String> {
-    let say = |step: &str| progress.say(step);
-    let mut log = Log::with_listener(&say);
+    let log = progress.log();
     let in_cloud = Failure::in_file(&args.cloud);
     let cloud = log
         .step("read cloud", 1, "file", || PointCloud::open(&args.cloud, limits))
@@ -28,8 +27,8 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         })
         .map_err(&in_cloud)?;
     let coded = match args.colours {
-        Colours::Transform => transform(args, &cloud, &mut log)?,
-        Colours::Learned => learned(args, &cloud, &mut log)?,
+        Colours::Transform => transform(args, &cloud, &log)?,
+        Colours::Learned => learned(args, &cloud, &log)?,
     };
     let Coded { encoded, chosen } = coded;
     output::write_file(&args.output, |w| {
@@ -62,7 +61,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
     };
     Ok(format!(
         "{}\n{}\n{}: {} bytes for {} points at {depth} bits, {} bits per point{}\n{coarser}",
-        steps(log.steps()),
+        steps(&log.steps()),
         table(&rows),
         args.output.display(),
         count(encoded.bytes.len() as u64),
@@ -79,7 +78,7 @@ struct Coded {
 }
 
 /// Codes a stream of version 3.
-fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded> {
+fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
     let model = &args.model;
     let learned = &args.learned;
     let asked = [
@@ -120,7 +119,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Cod
 }
 
 /// Codes a stream of version 2.
-fn learned(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded> {
+fn learned(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
     if args.step.is_some() || args.lossless {
         let what = "--step and --lossless are for --colours transform";
         return Err(Failure(what.into()));

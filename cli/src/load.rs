@@ -2,10 +2,8 @@
 
 use std::io::Read;
 use std::path::Path;
-use std::sync::Arc;
 
 use b2p::container::version;
-use b2p::decoder::StreamDecoder;
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::gaussians::{Frame, Gaussians, ply};
@@ -13,7 +11,7 @@ use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::renderer::Explanation;
 use b2p::renderer::camera::Camera;
-use b2p::{Error, Isa, Limits, UnknownIsa};
+use b2p::{Decoder, Error, Isa, Limits, UnknownIsa};
 
 use super::args::{DetailArg, ModelArg};
 use super::{Failure, Result, pipe};
@@ -51,10 +49,11 @@ pub fn model(arg: &ModelArg) -> Result<Model> {
 }
 
 /// What decodes the stream that starts with these bytes, with the heads asked for. A model is loaded only if it takes one.
-pub fn decoder(bytes: &[u8], detail: &DetailArg, model_arg: &ModelArg, limits: &Limits) -> Result<StreamDecoder> {
-    let mut decoder = StreamDecoder::new()
+pub fn decoder(bytes: &[u8], detail: &DetailArg, model_arg: &ModelArg, limits: &Limits) -> Result<Decoder> {
+    let mut decoder = Decoder::new()
         .with_isa(isa(model_arg.isa.as_deref())?)
-        .with_limits(limits.clone());
+        .with_limits(limits.clone())
+        .with_level(detail.level);
     if let Some(heads) = detail.heads {
         decoder = decoder.with_heads(heads);
     }
@@ -62,13 +61,13 @@ pub fn decoder(bytes: &[u8], detail: &DetailArg, model_arg: &ModelArg, limits: &
         decoder = decoder.with_per_voxel(count);
     }
     if version(bytes) == Some(2) {
-        return Ok(decoder.with_model(Arc::new(model(model_arg)?)));
+        return Ok(decoder.with_model(model(model_arg)?));
     }
     if let Some(name) = &model_arg.precision {
         decoder = decoder.with_precision(name.parse()?);
     }
     if detail.heads != Some(HeadSet::Surfels) {
-        decoder = decoder.with_heads_model(Arc::new(heads(model_arg.model.as_deref())?));
+        decoder = decoder.with_heads_model(heads(model_arg.model.as_deref())?);
     }
     Ok(decoder)
 }
@@ -107,14 +106,14 @@ pub fn gaussians(
     detail: &DetailArg,
     model_arg: &ModelArg,
     limits: &Limits,
-    log: &mut Log,
+    log: &Log,
 ) -> Result<Gaussians> {
     let bytes = bytes(path)?;
     if bytes.starts_with(PLY_MAGIC) {
         return ply(path, &bytes, detail, limits, log);
     }
-    let decoder = decoder(&bytes, detail, model_arg, limits)?;
-    let gaussians = decoder.decode(&bytes, detail.level, log);
+    let decoder = decoder(&bytes, detail, model_arg, limits)?.with_log(log);
+    let gaussians = decoder.decode(&bytes);
     gaussians.map_err(Failure::in_file(path))
 }
 
@@ -126,19 +125,13 @@ pub enum Source<'p> {
     Stream {
         path: &'p Path,
         bytes: Vec<u8>,
-        decoder: Box<StreamDecoder>,
+        decoder: Box<Decoder>,
     },
 }
 
 impl<'p> Source<'p> {
     /// Reads a file.
-    pub fn open(
-        path: &'p Path,
-        detail: &DetailArg,
-        model_arg: &ModelArg,
-        limits: &Limits,
-        log: &mut Log,
-    ) -> Result<Self> {
+    pub fn open(path: &'p Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Self> {
         let bytes = bytes(path)?;
         if bytes.starts_with(PLY_MAGIC) {
             return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
@@ -156,7 +149,7 @@ impl<'p> Source<'p> {
     }
 
     /// The Gaussians of `level`; without one, of what `cameras` can show, and why that level.
-    pub fn gaussians(self, detail: &DetailArg, cameras: &[Camera], log: &mut Log) -> Result<(Gaussians, Explanation)> {
+    pub fn gaussians(self, detail: &DetailArg, cameras: &[Camera], log: &Log) -> Result<(Gaussians, Explanation)> {
         let explain = |on, why| Explanation {
             name: "detail",
             on,
@@ -181,13 +174,14 @@ impl<'p> Source<'p> {
             (None, Some(level)) => format!("level {level}: its voxels already fall under a pixel"),
             (None, None) => "as fine as there is".into(),
         };
-        let gaussians = decoder.decode(&bytes, detail.level.or(seen), log);
+        let decoder = decoder.with_level(detail.level.or(seen)).with_log(log);
+        let gaussians = decoder.decode(&bytes);
         Ok((gaussians.map_err(&fail)?, explain(seen.is_some(), why)))
     }
 }
 
 /// Gaussians as they stand in the PLY `bytes`, which came from `path`.
-pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &mut Log) -> Result<Gaussians> {
+pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Gaussians> {
     let asked = [("--level", detail.level.is_some()), ("--heads", detail.heads.is_some())];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
         return Err(Failure(format!(

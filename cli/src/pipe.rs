@@ -4,11 +4,10 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 
-use b2p::decoder::StreamDecoding;
 use b2p::error::Stage;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::{Error, Limits};
+use b2p::{Decoding, Error, Limits};
 
 use super::args::{DetailArg, ModelArg};
 use super::{Failure, Result, load};
@@ -26,7 +25,7 @@ const STREAM_START: usize = 10;
 type Piece = std::io::Result<Vec<u8>>;
 
 /// What is done with Gaussians.
-pub type Show<'a> = dyn FnMut(&Gaussians, &mut Log) -> Result<()> + 'a;
+pub type Show<'a> = dyn FnMut(&Gaussians, &Log) -> Result<()> + 'a;
 
 /// Shows the Gaussians of a file, or of standard input: then also those of coarser levels, if `early` and nothing finer has come
 /// meanwhile; and if the stream is cut and no level was named, what its finest whole level has.
@@ -36,7 +35,7 @@ pub fn each(
     model_arg: &ModelArg,
     limits: &Limits,
     early: bool,
-    log: &mut Log,
+    log: &Log,
     show: &mut Show,
 ) -> Result<()> {
     if path != Path::new(PIPE) {
@@ -57,14 +56,14 @@ pub fn each(
         }
         return show(&load::ply(path, &start, detail, limits, log)?, log);
     }
-    let decoder = load::decoder(&start, detail, model_arg, limits)?;
-    let mut decoding = decoder.start(detail.level);
+    let decoder = load::decoder(&start, detail, model_arg, limits)?.with_log(log);
+    let mut decoding = decoder.start();
     let mut shown = None;
     let in_pipe = Failure::in_file(path);
     let mut piece = Some(start);
     while let Some(bytes) = piece {
         decoding.push(&bytes);
-        while decoding.advance(log).map_err(&in_pipe)?.is_some() {}
+        while decoding.advance().map_err(&in_pipe)?.is_some() {}
         piece = match pieces.try_recv() {
             Err(TryRecvError::Empty) => {
                 if early && decoding.is_drawable() && shown != decoding.level() {
@@ -78,7 +77,7 @@ pub fn each(
         .transpose()
         .map_err(broken)?;
     }
-    match decoding.finish(log) {
+    match decoding.finish() {
         Err(
             error @ Error::Truncated {
                 stage: Stage::Bitstream,
@@ -97,8 +96,8 @@ pub fn each(
     }
 }
 
-fn show_level(decoding: &StreamDecoding, log: &mut Log, show: &mut Show) -> Result<()> {
-    let gaussians = decoding.gaussians(log).map_err(Failure::in_file(Path::new(PIPE)))?;
+fn show_level(decoding: &Decoding, log: &Log, show: &mut Show) -> Result<()> {
+    let gaussians = decoding.gaussians().map_err(Failure::in_file(Path::new(PIPE)))?;
     show(&gaussians, log)
 }
 

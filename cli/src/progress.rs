@@ -3,6 +3,7 @@
 use std::io::IsTerminal;
 use std::time::Duration;
 
+use b2p::Log;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Shows the step at hand on standard error if that is a terminal.
@@ -24,6 +25,12 @@ impl Progress {
         }
         bar.enable_steady_tick(Duration::from_millis(100));
         Progress { bar }
+    }
+
+    /// A log that shows each step as it begins.
+    pub fn log(&self) -> Log {
+        let bar = self.bar.clone();
+        Log::with_listener(move |step| bar.set_message(step.to_owned()))
     }
 
     /// Says what is being done.

@@ -8,7 +8,7 @@ use super::budget::Task;
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
 use b2p::renderer::camera::{Camera, files};
-use b2p::renderer::{Choice, Effects, Explanation, Quality, Renderer, Stats};
+use b2p::renderer::{Channel, Choice, Effects, Explanation, Image, Quality, Renderer, Stats};
 use b2p::{Error, Limits, output};
 use serde_json::json;
 
@@ -27,13 +27,12 @@ const TRIALS: usize = 3;
 
 /// Draws one picture, or several: on a circle, or with the cameras of a file.
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String> {
-    let say = |step: &str| progress.say(step);
-    let mut log = Log::with_listener(&say);
+    let log = progress.log();
     if args.input == Path::new(PIPE) && !args.budget.is_given() {
         let mut text = String::new();
         // What has gone to standard output cannot be replaced by something finer.
         let early = args.output != Path::new(PIPE);
-        let mut show = |gaussians: &Gaussians, log: &mut Log| {
+        let mut show = |gaussians: &Gaussians, log: &Log| {
             let cameras = asked_for(args, &gaussians.frame)?;
             let drawing = Drawing {
                 args,
@@ -45,15 +44,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
             text = pictures(&drawing, gaussians, &cameras, log)?;
             Ok(())
         };
-        pipe::each(
-            &args.input,
-            &args.detail,
-            &args.model,
-            limits,
-            early,
-            &mut log,
-            &mut show,
-        )?;
+        pipe::each(&args.input, &args.detail, &args.model, limits, early, &log, &mut show)?;
         return Ok(text);
     }
     if let Some(bytes) = keep::stream(&args.budget, &args.input)? {
@@ -63,7 +54,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
             return Ok(String::new());
         };
         let (budget, model) = (&args.budget, &args.model);
-        let kept = keep::draw(budget, &args.input, &bytes, model, camera, limits, &mut log)?;
+        let kept = keep::draw(budget, &args.input, &bytes, model, camera, limits, &log)?;
         let drawing = Drawing {
             args,
             quality: args.quality,
@@ -71,7 +62,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
             detail: None,
             chosen: Some(For::Kept(&kept)),
         };
-        return pictures(&drawing, &kept.gaussians, &cameras, &mut log);
+        return pictures(&drawing, &kept.gaussians, &cameras, &log);
     }
     let pixels = u64::from(args.view.size.0) * u64::from(args.view.size.1);
     let task = Task::Picture { pixels };
@@ -82,10 +73,10 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
         Some((detail, model)) => (detail, model),
         None => (&args.detail, &args.model),
     };
-    let source = Source::open(input, detail, model, limits, &mut log)?;
+    let source = Source::open(input, detail, model, limits, &log)?;
     let cameras = asked_for(args, &source.frame()?)?;
     let views: Vec<Camera> = cameras.iter().map(|(_, camera)| *camera).collect();
-    let (gaussians, detail) = source.gaussians(detail, &views, &mut log)?;
+    let (gaussians, detail) = source.gaussians(detail, &views, &log)?;
     let drawing = Drawing {
         args,
         quality: chosen.as_ref().map_or(args.quality, |c| c.choice.quality),
@@ -93,7 +84,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
         detail: Some(detail),
         chosen: chosen.as_ref().map(|chosen| For::Chosen(chosen, task)),
     };
-    pictures(&drawing, &gaussians, &cameras, &mut log)
+    pictures(&drawing, &gaussians, &cameras, &log)
 }
 
 /// How pictures are drawn.
@@ -115,13 +106,13 @@ enum For<'a> {
 type Drawn = (PathBuf, [u32; 2], Stats);
 
 /// Draws these Gaussians into the pictures asked for.
-fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camera)], log: &mut Log) -> Result<String> {
+fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camera)], log: &Log) -> Result<String> {
     let &Drawing { args, limits, .. } = drawing;
     let mut effects = Effects::default();
     for (effect, choice) in &args.effect {
         effects.set(*effect, *choice);
     }
-    let mut renderer = Renderer::new(load::isa(args.model.isa.as_deref())?);
+    let mut renderer = Renderer::new().with_isa(load::isa(args.model.isa.as_deref())?);
     renderer.set_effects(effects);
     renderer.set_quality(drawing.quality);
     let format = format_of(args, cameras.len())?;
@@ -153,7 +144,7 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camer
         for (path, _, stats) in &all {
             text += &describe(path, stats);
         }
-        text = format!("{}\n{text}", steps(log.steps()));
+        text = format!("{}\n{text}", steps(&log.steps()));
     }
     if args.output == Path::new(PIPE) {
         // Standard output is the picture's. Nobody to tell if even this fails.
@@ -166,7 +157,7 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camer
 }
 
 /// Draws one picture into the artist's image.
-fn draw_logged(path: &Path, camera: &Camera, artist: &mut Artist, log: &mut Log) -> b2p::Result<Drawn> {
+fn draw_logged(path: &Path, camera: &Camera, artist: &mut Artist, log: &Log) -> b2p::Result<Drawn> {
     let count = artist.gaussians.len();
     let drawn = log.step(format!("draw {}", path.display()), count, "Gaussians", || {
         artist.draw(camera)
@@ -175,7 +166,7 @@ fn draw_logged(path: &Path, camera: &Camera, artist: &mut Artist, log: &mut Log)
 }
 
 /// Draws all pictures into one file.
-fn video(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log: &mut Log) -> Result<Vec<Drawn>> {
+fn video(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
     let mut frames = |to: &mut dyn Write| -> b2p::Result<()> {
         for (i, (path, camera)) in cameras.iter().enumerate() {
@@ -200,7 +191,7 @@ fn video(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log:
 }
 
 /// Draws each picture into a file of its own.
-fn stills(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log: &mut Log) -> Result<Vec<Drawn>> {
+fn stills(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
     for (path, camera) in cameras {
         all.push(draw_logged(path, camera, artist, log)?);
@@ -319,7 +310,9 @@ pub fn draw(
     view: &View,
     path: &Path,
 ) -> b2p::Result<Stats> {
-    let (image, stats) = renderer.render(gaussians, camera, view.background, &Limits::default())?;
+    let mut image = Image::default();
+    let (channel, limits) = (Channel::Colour, Limits::default());
+    let stats = renderer.draw_into(gaussians, camera, channel, view.background, &limits, &mut image)?;
     let png = image.to_png()?;
     output::write_file(path, |w| write(w, &png, path))?;
     Ok(stats)

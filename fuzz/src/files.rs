@@ -97,10 +97,7 @@ fn passes(model: &Model, role: usize, octree: &Octree, map: &KernelMap) {
 
 /// Any bytes as a point cloud and as Gaussians: an error, or arrays of equal length that are the same after writing and reading again.
 pub fn ply(bytes: &[u8]) {
-    let limits = Limits {
-        max_points: 1 << 16,
-        ..Limits::default()
-    };
+    let limits = Limits::default().with_max_points(1 << 16);
     if let Ok(cloud) = PointCloud::from_ply(bytes, &limits) {
         assert_eq!(cloud.positions.len(), cloud.colours.len());
         let again = PointCloud::from_ply(&cloud.to_ply(), &limits).expect("what is written is read");

@@ -6,7 +6,7 @@ use b2p::cloud::{ColouredVoxels, PointCloud};
 use b2p::container::{Level, Stream};
 use b2p::encoder::{Options, encode, transform};
 use b2p::geometry::Voxels;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::log::Log;
 use b2p::{Limits, Placement};
@@ -27,9 +27,9 @@ fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u
         slice_voxels,
         ..Options::default()
     };
-    let mut log = Log::default();
-    let stream = encode(&cloud, &MODEL, &options, &mut log).expect("a small cloud is coded");
-    let gaussians = Decoder::new(&*MODEL).decode(&stream.bytes, None, &mut log);
+    let log = Log::default();
+    let stream = encode(&cloud, &MODEL, &options, &log).expect("a small cloud is coded");
+    let gaussians = LatentDecoder::new(&*MODEL).decode(&stream.bytes, None, &log);
     let file = gaussians.ok().map(|gaussians| {
         let mut file = Vec::new();
         let name = Path::new("memory");
@@ -56,7 +56,7 @@ fn transformed() -> Vec<Vec<u8>> {
             colour_slice: slice,
             ..transform::Options::default()
         };
-        let stream = transform::encode(&cloud, &options, &mut Log::default());
+        let stream = transform::encode(&cloud, &options, &Log::default());
         stream.expect("a small cloud is coded").bytes
     };
     let step = transform::Fineness::Step;

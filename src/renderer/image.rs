@@ -59,6 +59,7 @@ impl Image {
     ///
     /// # Errors
     /// [`Error::Unsupported`] if a side is 0 or a row longer than 2²⁹ pixels; never for a picture of a [`Renderer`](super::Renderer).
+    #[doc(hidden)]
     pub fn to_pixmap(&self) -> Result<Pixmap> {
         let mut bytes = vec![0; self.pixels.len() * 4];
         bytes

@@ -12,7 +12,7 @@ use super::{Encoded, rates};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{self, Filter, Steps, Truth};
 use crate::container::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
-use crate::decoder::{StreamDecoder, colour_hash};
+use crate::decoder::{Decoder, colour_hash};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
@@ -21,6 +21,7 @@ pub use within::encode_within;
 
 /// How exactly colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum Fineness {
     /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice that.
     Step(f32),
@@ -77,7 +78,7 @@ const FILTER_SHARE: usize = 100;
 /// # Errors
 /// [`Error::Usage`] for levels that the cloud does not have and steps that the format does not have, [`Error::Malformed`] for slices that the
 /// format does not have; and, if encoder and decoder disagreed on this machine, whatever the decoder found.
-pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &mut Log) -> Result<Encoded> {
+pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<Encoded> {
     let steps = options.fineness.steps()?;
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
     let subject = Subject::new(cloud, levels, options, log)?;
@@ -190,7 +191,7 @@ struct Layer {
 }
 
 impl<'a> Subject<'a> {
-    fn new(cloud: &'a ColouredVoxels, levels: RangeInclusive<u8>, options: &'a Options, log: &mut Log) -> Result<Self> {
+    fn new(cloud: &'a ColouredVoxels, levels: RangeInclusive<u8>, options: &'a Options, log: &Log) -> Result<Self> {
         let (isa, top) = (options.isa.unwrap_or_else(Isa::detect), *levels.end());
         let subject = Subject {
             cloud,
@@ -267,7 +268,7 @@ impl<'a> Subject<'a> {
     }
 
     /// Codes the colours of the levels down to `top`.
-    fn code(&self, top: u8, steps: Steps, log: &mut Log) -> Result<Coded> {
+    fn code(&self, top: u8, steps: Steps, log: &Log) -> Result<Coded> {
         let truth = log.step("mean colours", self.cloud.voxels.len(), "voxels", || {
             Ok(self.truth(top, steps.is_lossless()))
         })?;
@@ -275,7 +276,7 @@ impl<'a> Subject<'a> {
     }
 
     /// The same, of colours that have been computed.
-    fn code_towards(&self, truth: &Truth, top: u8, steps: Steps, log: &mut Log) -> Result<Coded> {
+    fn code_towards(&self, truth: &Truth, top: u8, steps: Steps, log: &Log) -> Result<Coded> {
         let (octree, maps, isa) = (&self.octree, &self.maps, self.isa);
         let slice = self.options.colour_slice as usize;
         let header = self.header(top, |level| octree.level(level).len());
@@ -379,12 +380,12 @@ impl<'a> Subject<'a> {
     }
 
     /// The stream, once it has been decoded to what was encoded.
-    fn checked(&self, coded: Coded, log: &mut Log) -> Result<Encoded> {
+    fn checked(&self, coded: Coded, log: &Log) -> Result<Encoded> {
         let Coded { bytes, top, colours } = coded;
         let voxels = self.octree.level(top);
-        let decoder = StreamDecoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
+        let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
         let same = log.step("decode again", voxels.len(), "voxels", || {
-            let decoding = decoder.whole(&bytes, Some(top), &mut Log::default())?;
+            let decoding = decoder.with_level(top).whole(&bytes)?;
             let points = decoding.points();
             Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == colours))
         })?;

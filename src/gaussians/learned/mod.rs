@@ -39,6 +39,7 @@ mod network;
 mod tests;
 
 use std::path::Path;
+use std::sync::Arc;
 
 use b2p_kernels::{Isa, map_file};
 
@@ -57,11 +58,12 @@ const RAW: usize = 14;
 /// Key of one of a model's networks: quality, and Gaussians per voxel (1 or 8).
 pub type Set = (Heads, usize);
 
-/// A model of heads.
+/// A model of learned heads, which draw streams of version 3. Clones share the weights.
+#[derive(Clone)]
 pub struct HeadsModel {
     /// Variance in squares of half the unit.
     blur: f32,
-    generators: Vec<(Set, Generator)>,
+    generators: Arc<[(Set, Generator)]>,
 }
 
 /// Inputs of the heads for a level.

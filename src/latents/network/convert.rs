@@ -78,7 +78,7 @@ impl Model {
     }
 
     fn encoder(&self) -> Result<&Encoder<FloatConv>> {
-        self.encoder.as_ref().ok_or_else(|| {
+        self.encoder.as_deref().ok_or_else(|| {
             missing(
                 "encoding",
                 format!("model {} has the decoder's layers only", self.shape.name),

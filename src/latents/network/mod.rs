@@ -60,6 +60,7 @@ mod untrained;
 mod work;
 
 use std::path::Path;
+use std::sync::Arc;
 
 use b2p_kernels::{ExactConv, FloatConv, Isa, map_file};
 
@@ -77,19 +78,20 @@ pub use structure::{RAW, ROLES};
 pub use untrained::untrained;
 pub use work::{Module, Work};
 
-/// A model, ready to run.
+/// A model of learned colours, which codes and decodes streams of version 2. Clones share the weights.
+#[derive(Clone)]
 pub struct Model {
-    shape: Shape,
+    shape: Arc<Shape>,
     id: [u8; 16],
     isa: Isa,
-    tables: Tables,
-    exact: Exact<ExactConv>,
-    generators: Vec<Generator>,
+    tables: Arc<Tables>,
+    exact: Arc<Exact<ExactConv>>,
+    generators: Arc<[Generator]>,
     precision: Precision,
-    encoder: Option<Encoder<FloatConv>>,
-    bit_prices: [Vec<f32>; ROLES],
-    g_scale: Vec<f32>,
-    c_scale: Vec<f32>,
+    encoder: Option<Arc<Encoder<FloatConv>>>,
+    bit_prices: Arc<[Vec<f32>; ROLES]>,
+    g_scale: Arc<[f32]>,
+    c_scale: Arc<[f32]>,
 }
 
 impl std::fmt::Debug for Model {
@@ -133,16 +135,16 @@ impl Model {
         let integers = generators.iter().all(Generator::has_integers);
         Ok(Model {
             precision: if integers { Precision::Int16 } else { Precision::F16 },
-            generators,
-            exact: shape.exact(&mut |spec| tensors.exact_layer(spec))?,
-            encoder,
-            g_scale,
-            c_scale: scales(&tensors, "c_scale", ROLES, 1)?,
+            generators: generators.into(),
+            exact: Arc::new(shape.exact(&mut |spec| tensors.exact_layer(spec))?),
+            encoder: encoder.map(Arc::new),
+            g_scale: g_scale.into(),
+            c_scale: scales(&tensors, "c_scale", ROLES, 1)?.into(),
             id: tensors.id(&shape),
-            bit_prices: tensors.bit_prices(shape.latents)?,
+            bit_prices: Arc::new(tensors.bit_prices(shape.latents)?),
             isa: Isa::detect(),
-            tables,
-            shape,
+            tables: Arc::new(tables),
+            shape: Arc::new(shape),
         })
     }
 

@@ -2,6 +2,8 @@
 
 pub mod files;
 
+use std::ops::Range;
+
 use glam::{DAffine3, DMat3, DVec3};
 
 use b2p_kernels::splat::{Bounds, TILE};
@@ -13,8 +15,10 @@ const ROTATION_TOLERANCE: f64 = 1e-3;
 
 /// A pinhole camera. Camera axes: x right, y down, z forward. Pixel `i` covers `[i, i + 1]`, its centre is `i + ½`.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct Camera {
     /// From the cube frame to the camera: a rotation and a translation.
+    #[doc(hidden)]
     pub pose: DAffine3,
     /// Focal length along x, in pixels.
     pub fx: f64,
@@ -32,12 +36,14 @@ pub struct Camera {
     pub near: f64,
     /// How rays go.
     pub projection: Projection,
-    /// The part of the picture that is drawn, if not all of it: see [`Camera::crop`].
+    /// The part of the picture that is drawn, if not all of it: see [`Camera::with_crop`].
+    #[doc(hidden)]
     pub crop: Option<Bounds>,
 }
 
 /// How a camera's rays go.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Projection {
     /// Through one point.
     #[default]
@@ -78,7 +84,21 @@ impl Camera {
         Ok(camera)
     }
 
+    /// A pinhole camera of square pixels with its principal point in the middle, and `focal` in pixels. `rotation` (three
+    /// rows) and `translation` take points of the cube frame to camera axes: x right, y down, z forward.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if that is no camera: see [`Camera::check`].
+    pub fn new(rotation: [[f64; 3]; 3], translation: [f64; 3], focal: f64, width: u32, height: u32) -> Result<Camera> {
+        let rotation = DMat3::from_cols_array_2d(&rotation).transpose();
+        let pose = DAffine3::from_mat3_translation(rotation, translation.into());
+        let camera = Self::centred(pose, focal, width, height);
+        camera.check()?;
+        Ok(camera)
+    }
+
     /// A pinhole camera of square pixels with its principal point in the middle; unchecked.
+    #[doc(hidden)]
     pub fn centred(pose: DAffine3, focal: f64, width: u32, height: u32) -> Camera {
         Camera {
             pose,
@@ -106,10 +126,24 @@ impl Camera {
         Ok(self)
     }
 
+    /// The camera that draws only these columns and rows of this one's picture: the pixels are equal to the bit.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if that is empty or reaches out of the picture.
+    pub fn with_crop(self, columns: Range<u32>, rows: Range<u32>) -> Result<Camera> {
+        self.crop(Bounds {
+            x0: columns.start,
+            y0: rows.start,
+            x1: columns.end,
+            y1: rows.end,
+        })
+    }
+
     /// The camera that draws only the pixels `x0 ≤ x < x1`, `y0 ≤ y < y1` of this one's picture: to the bit what the whole shows there.
     ///
     /// # Errors
     /// [`Error::Usage`] if that is empty or reaches out of the picture.
+    #[doc(hidden)]
     pub fn crop(mut self, part: Bounds) -> Result<Camera> {
         self.crop = Some(part);
         self.check()?;
@@ -144,6 +178,7 @@ impl Camera {
     }
 
     /// The pixels that are drawn.
+    #[doc(hidden)]
     pub fn window(&self) -> Bounds {
         self.crop.unwrap_or(Bounds {
             x0: 0,

@@ -60,6 +60,17 @@ impl Lens {
     }
 }
 
+impl Camera {
+    /// The cameras of a file, with the names of their pictures: NeRF's `transforms.json`, Open3D's JSON, or glTF. `frame`
+    /// is that of the Gaussians; `size` is for files without one.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the file is none of these, or one of its cameras is invalid ([`Camera::check`]).
+    pub fn from_file(bytes: &[u8], frame: &Frame, size: (u32, u32)) -> Result<Vec<(String, Camera)>> {
+        read(bytes, frame, size)
+    }
+}
+
 /// The cameras of a file that is no text of COLMAP's, told apart by what it holds: binary or JSON glTF, Open3D's JSON, NeRF's. `size` is for
 /// files that name none.
 ///
