@@ -383,8 +383,9 @@ impl Decoder {
         let (octree, level) = (&reached.octree, reached.level);
         let (map, colours) = (&reached.map, reached.colours(self.isa()));
         let map_of_heads = reached.head_map.as_ref();
-        let size = map_of_heads.map_or(1.0, HeadMap::size);
+        let [mixed, alone] = map_of_heads.map_or([1.0; 2], HeadMap::sizes);
         let discs = |only: Option<&[bool]>| {
+            let size = if only.is_some() { mixed } else { alone };
             let choice = Choice { only, size };
             let per_voxel = self.surfels_per_voxel(header, level)?;
             let voxels = octree.level(level);

@@ -8,16 +8,16 @@ use crate::geometry::Octree;
 
 /// Levels between a block and its voxels.
 const BLOCK: u8 = 3;
-/// [`HeadMap::size`] of surfels of the usual size.
-const USUAL: u8 = 64;
+/// A size of surfels that is the usual one.
+const USUAL: f32 = 64.0;
 /// Shift of the adaptation of probabilities.
 const RATE: u32 = 4;
 
 /// The choice for a level.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HeadMap {
-    /// Factor of the surfels' radii, in 64ths; not 0.
-    size: u8,
+    /// Factors of the surfels' radii, in 64ths, not 0: among learned Gaussians, and where all voxels are surfels.
+    sizes: [u8; 2],
     blocks: Blocks,
 }
 
@@ -74,24 +74,28 @@ impl HeadMap {
         blocks
     }
 
-    /// A map with surfels in these blocks, of `size` 64ths of the usual radius.
+    /// A map with surfels in these blocks, of `mixed` 64ths of the usual radius, and of `alone` 64ths where a decoder
+    /// makes nothing but surfels.
     ///
     /// # Panics
-    /// If the size is 0.
+    /// If a size is 0.
     #[cfg(feature = "encoder")]
-    pub fn new(size: u8, surfels: Vec<bool>) -> Self {
-        assert!(size > 0, "a surfel has a size");
+    pub fn new(mixed: u8, alone: u8, surfels: Vec<bool>) -> Self {
+        assert!(mixed > 0 && alone > 0, "a surfel has a size");
         let blocks = match surfels.iter().filter(|&&on| on).count() {
             0 => Blocks::Learned,
             on if on == surfels.len() => Blocks::Surfels,
             _ => Blocks::Each(surfels),
         };
-        HeadMap { size, blocks }
+        HeadMap {
+            sizes: [mixed, alone],
+            blocks,
+        }
     }
 
     /// Parses the payload of a level with so many blocks. `None` if it is none: a map is only advice.
     pub fn parse(bytes: &[u8], blocks: usize) -> Option<Self> {
-        let (&[size, how], code) = bytes.split_first_chunk()?;
+        let (&[mixed, alone, how], code) = bytes.split_first_chunk()?;
         let blocks = match how {
             0 if code.is_empty() => Blocks::Learned,
             1 if code.is_empty() => Blocks::Surfels,
@@ -104,7 +108,8 @@ impl HeadMap {
             }
             _ => return None,
         };
-        (size > 0).then_some(HeadMap { size, blocks })
+        let sizes = [mixed, alone];
+        (!sizes.contains(&0)).then_some(HeadMap { sizes, blocks })
     }
 
     /// The payload.
@@ -126,12 +131,18 @@ impl HeadMap {
             2 => encoder.finish(),
             _ => Vec::new(),
         };
-        [[self.size, how].as_slice(), &code].concat()
+        [&self.sizes[..], &[how], &code].concat()
     }
 
-    /// Factor of the surfels' radii.
-    pub fn size(&self) -> f32 {
-        f32::from(self.size) / f32::from(USUAL)
+    /// Factors of the surfels' radii: among learned Gaussians, and where all voxels are surfels.
+    pub fn sizes(&self) -> [f32; 2] {
+        self.sizes.map(|size| f32::from(size) / USUAL)
+    }
+
+    /// Upper bound of [`HeadMap::to_bytes`] that is seldom exceeded.
+    #[cfg(feature = "encoder")]
+    pub fn usual_bytes(blocks: usize) -> usize {
+        16 + blocks / 8
     }
 
     /// For every voxel of the level whether a surfel takes the place of its learned Gaussians; `None` if nowhere.
