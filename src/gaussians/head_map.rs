@@ -1,4 +1,4 @@
-//! Where surfels take the place of learned Gaussians: the encoder's choice, block by block (`docs/format.md`, clause 6.4).
+//! Where surfels take the place of learned Gaussians: the encoder's choice, block by block (`docs/format.md`, clause 7.5).
 //!
 //! The encoder draws a level in both ways and compares the pictures with the cloud. A block is a voxel three levels
 //! above. Nothing that is decoded depends on the map, so a decoder may ignore it.
@@ -166,4 +166,52 @@ impl HeadMap {
 /// The level whose voxels are the blocks of `level`.
 fn block_level(level: u8) -> u8 {
     level.saturating_sub(BLOCK)
+}
+
+#[cfg(all(test, feature = "encoder"))]
+mod tests {
+    use super::*;
+    use crate::geometry::{Voxels, morton};
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_block_holds_the_voxels_below_a_voxel_three_levels_above() {
+        let keys = (0..4000).map(|i: u32| morton::encode([i % 40, i / 40 % 50, (i * 7 / 40) % 60]));
+        let octree = Octree::new(Voxels::new(6, keys.collect())).unwrap();
+        for level in 0..=6 {
+            let above = octree.level(level.saturating_sub(3));
+            let blocks = HeadMap::block_of(&octree, level);
+            assert_eq!(blocks.len(), octree.level(level).len());
+            for (voxel, &block) in blocks.iter().enumerate() {
+                let coordinate = octree.level(level).coordinate(voxel);
+                let shift = level.min(3);
+                assert_eq!(coordinate.map(|v| v >> shift), above.coordinate(block as usize));
+            }
+        }
+    }
+
+    #[test]
+    fn a_uniform_map_takes_three_bytes() {
+        for on in [false, true] {
+            let map = HeadMap::new(54, 64, vec![on; 1000]);
+            assert_eq!(map.to_bytes(), [54, 64, u8::from(on)]);
+            assert_eq!(HeadMap::parse(&map.to_bytes(), 1000), Some(map));
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn a_map_survives_its_bytes(blocks in prop::collection::vec(any::<bool>(), 1..300)) {
+            let map = HeadMap::new(54, 74, blocks.clone());
+            prop_assert_eq!(map.sizes(), [54.0 / 64.0, 74.0 / 64.0]);
+            prop_assert_eq!(HeadMap::parse(&map.to_bytes(), blocks.len()), Some(map));
+        }
+
+        #[test]
+        fn any_bytes_are_a_map_or_none(bytes in prop::collection::vec(any::<u8>(), 0..80), blocks in 1usize..300) {
+            if let Some(HeadMap { blocks: Blocks::Each(each), .. }) = HeadMap::parse(&bytes, blocks) {
+                prop_assert_eq!(each.len(), blocks);
+            }
+        }
+    }
 }

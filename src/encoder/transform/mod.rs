@@ -466,9 +466,10 @@ impl<'a> Subject<'a> {
         })
     }
 
-    /// Whether a level may have a head map: heads read the level above, and the cloud says nothing of its own level.
+    /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its own
+    /// does the cloud tell more than the best heads.
     fn has_head_map(&self, level: u8) -> bool {
-        (1..self.cloud.voxels.depth()).contains(&level)
+        (1..self.cloud.voxels.depth().saturating_sub(1)).contains(&level)
     }
 
     fn has_head_maps(&self, top: u8) -> bool {

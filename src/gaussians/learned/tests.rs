@@ -213,6 +213,35 @@ fn every_precision_matches_the_definition_on_every_instruction_set() {
     }
 }
 
+#[test]
+fn voxels_to_leave_out_get_no_gaussians_and_the_others_do_not_change() {
+    let cloud = Cloud::surface(6);
+    let model = model(&all_sets());
+    let voxels = cloud.octree.level(6);
+    let without: Vec<bool> = (0..voxels.len()).map(|i| i % 3 == 0 || i / 200 % 2 == 0).collect();
+    for set in [(Heads::Best, 1), (Heads::Best, 8)] {
+        let draw = |without| {
+            let input = LevelInput {
+                without,
+                ..cloud.input()
+            };
+            let precision = Precision::Int16;
+            model
+                .generate(Isa::detect(), precision, set, input, Frame::default())
+                .unwrap()
+        };
+        let kept: Vec<bool> = without.iter().map(|&out| !out).collect();
+        let all = draw(None);
+        let [with, rest] = [&kept, &without].map(|out| draw(Some(out)));
+        assert_eq!(with.len() + rest.len(), all.len());
+        let mut parts = [with.position.iter().peekable(), rest.position.iter().peekable()];
+        for position in &all.position {
+            let part = parts.iter_mut().find(|part| part.peek() == Some(&position));
+            assert!(part.is_some_and(|part| part.next().is_some()));
+        }
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 

@@ -275,3 +275,37 @@ fn four_discs_follow_the_colour_gradient() {
         assert_eq!(blue, 100.0);
     }
 }
+
+#[test]
+fn a_choice_of_voxels_gives_their_discs_in_another_size() {
+    let (voxels, map) = cloud(6, (0..3000).map(|i| [i % 60, i / 60, (i % 60 + i / 60) / 4]));
+    let colours: Vec<_> = (0..voxels.len()).map(|i| [i as u8, (i / 7) as u8, 9]).collect();
+    let only: Vec<bool> = (0..voxels.len()).map(|i| i % 3 == 0 || i / 500 % 2 == 0).collect();
+    for per_voxel in [PerVoxel::One, PerVoxel::Four] {
+        let make = |choice| {
+            surfels(
+                Isa::detect(),
+                &voxels,
+                &map,
+                &colours,
+                per_voxel,
+                choice,
+                Frame::default(),
+            )
+        };
+        let all = make(Choice::ALL);
+        let some = make(Choice {
+            only: Some(&only),
+            size: 0.5,
+        });
+        let n = per_voxel.count();
+        let chosen: Vec<usize> = (0..all.len()).filter(|i| only[i / n]).collect();
+        assert_eq!(some.len(), chosen.len());
+        for (to, &from) in chosen.iter().enumerate() {
+            assert_eq!(some.position[to], all.position[from]);
+            assert_eq!(some.colour[to], all.colour[from]);
+            let [u, v, thickness] = all.scale[from];
+            assert_eq!(some.scale[to], [0.5 * u, 0.5 * v, thickness]);
+        }
+    }
+}
