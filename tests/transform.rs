@@ -9,6 +9,7 @@ use b2p::container::{Header, Stream};
 use b2p::encoder::transform::{Options, QualityTarget, encode, encode_to_rate};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::Heads;
+use b2p::gaussians::learned::HeadsModel;
 use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::{Cancel, Error, Isa, Limits};
@@ -198,6 +199,50 @@ fn as_many_bits_as_asked_for_are_used_and_more_bits_are_never_worse() {
     assert!(lossless, "20 bits are enough for exact colours");
     let found = encode_to_rate(&cloud, &Options::default(), 0.001, &Log::default());
     assert!(matches!(found, Err(Error::TooFewBits { .. })));
+}
+
+#[test]
+fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_learned_gaussians() {
+    let cloud = Ball::new(8, 100.0).cloud();
+    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
+    let options = Options {
+        heads: Some(heads.clone()),
+        ..Options::default()
+    };
+    let found = encode_to_rate(&cloud, &options, 1.0, &Log::default());
+    let (encoded, chosen) = found.unwrap();
+    assert!(encoded.bytes.len() * 8 <= cloud.voxels.len());
+    assert_eq!(encoded.bytes, stream(&cloud, &chosen));
+    let without = Options { heads: None, ..chosen };
+    let plain = stream(&cloud, &without);
+    let parsed = Stream::parse(&encoded.bytes, &Limits::default()).unwrap();
+    assert!(parsed.damage().is_none());
+    let map = |level: &b2p::container::Level| level.colours.as_ref().is_some_and(|colours| colours.head_map.is_some());
+    for level in parsed.levels() {
+        assert_eq!(map(level), level.level < 7, "level {}", level.level);
+        let level = Some(level.level);
+        assert_eq!(points(&encoded.bytes, level), points(&plain, level));
+        let decoder = Decoder::new().with_level(level).with_heads_model(heads.clone());
+        let learned = decoder.decode(&plain).unwrap();
+        let surfels = Decoder::new().with_level(level).decode(&plain).unwrap();
+        // A ball is smooth: most of it, if not all, is better as surfels.
+        let mixed = decoder.decode(&encoded.bytes).unwrap();
+        let from = |of: &b2p::gaussians::Gaussians| {
+            let positions: Vec<_> = of.position.iter().map(|p| p.map(f32::to_bits)).collect();
+            let all: std::collections::HashSet<_> = positions.into_iter().collect();
+            let count = mixed
+                .position
+                .iter()
+                .filter(|p| all.contains(&p.map(f32::to_bits)))
+                .count();
+            count as f64 / mixed.len() as f64
+        };
+        let (learned, surfels) = (from(&learned), from(&surfels));
+        assert!(learned + surfels > 0.999, "{level:?}: {learned} + {surfels}");
+        if level < Some(7) {
+            assert!(surfels > 0.3, "{level:?}: {surfels}");
+        }
+    }
 }
 
 #[test]

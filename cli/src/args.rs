@@ -189,6 +189,9 @@ pub struct Encode {
     /// Leave out colour filters: encoding and decoding take less time, pictures are less accurate
     #[arg(long, help_heading = "Advanced")]
     pub no_filter: bool,
+    /// Do not look where surfels draw better than learned heads: encoding takes less time
+    #[arg(long)]
+    pub no_head_maps: bool,
     #[command(flatten)]
     pub learned: LearnedArgs,
     #[command(flatten)]

@@ -151,6 +151,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> 
         levels: args.levels.clone(),
         filter: !args.no_filter,
         isa: Some(load::isa(model.isa.as_deref())?),
+        heads: (!args.no_head_maps).then(|| load::heads(None)).transpose()?,
         ..transform::Options::default()
     };
     if let Some(quality) = args.quality {

@@ -8,6 +8,7 @@ use super::transform::{self, QualityTarget};
 use super::{Encoded, Options, encode, encode_to_rate};
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
+use crate::gaussians::learned::HeadsModel;
 use crate::latents::network::Model;
 use crate::log::Log;
 
@@ -60,6 +61,13 @@ impl Encoder {
     /// The same encoder with or without filters, which the decoder runs on the colours of each level. Default: with.
     pub fn with_filter(mut self, filter: bool) -> Self {
         self.options.filter = filter;
+        self
+    }
+
+    /// The same encoder with head maps: streams of version 3 say where surfels draw better than the best of these heads.
+    /// Decoders with learned heads follow it. The two finest levels of a cloud have none. Default: without.
+    pub fn with_heads_model(mut self, heads: HeadsModel) -> Self {
+        self.options.heads = Some(heads);
         self
     }
 

@@ -1,5 +1,6 @@
 //! Streams of version 3: colours as transform coefficients.
 
+mod head_maps;
 mod rate_control;
 
 use std::fmt;
@@ -14,8 +15,10 @@ use crate::colour::{self, Filter, Steps, Truth};
 #[cfg(doc)]
 use crate::container::MAX_COLOUR_SLICE;
 use crate::container::{Format, Header, MAX_SLICE_VOXELS, Writer};
-use crate::decoder::{Decoder, colour_hash};
+use crate::decoder::{Decoder, Decoding, colour_hash};
 use crate::error::{Error, Result};
+use crate::gaussians::learned::HeadsModel;
+use crate::gaussians::{HeadMap, HeadSet};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -56,7 +59,9 @@ pub struct Options {
     /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`]: fewer let more threads decode a level, and cost
     /// bits.
     pub colour_slice: u32,
-    /// The instructions to use; any give the same stream. Default: the best of this machine.
+    /// Heads whose pictures are compared with those of surfels, so that the stream says where surfels are better; `None` for no head maps.
+    pub heads: Option<HeadsModel>,
+    /// The instructions to use; any give the same stream, but for head maps. Default: the best of this machine.
     pub isa: Option<Isa>,
 }
 
@@ -70,6 +75,7 @@ impl Default for Options {
             tries: usize::MAX,
             slice_voxels: MAX_SLICE_VOXELS,
             colour_slice: COLOUR_SLICE,
+            heads: None,
             isa: None,
         }
     }
@@ -96,7 +102,7 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     let subject = Subject::new(cloud, levels, options, log)?;
     let top = *subject.levels.end();
     let coded = subject.code(top, steps, log)?;
-    subject.checked(coded, log)
+    subject.checked(coded, options.heads.as_ref(), usize::MAX, log)
 }
 
 impl fmt::Display for QualityTarget {
@@ -192,6 +198,9 @@ struct Coded {
     top: u8,
     /// The colours of the finest level, filtered.
     colours: Vec<[u8; 3]>,
+    /// Last level and payload of the colour trunk.
+    trunk: (u8, Vec<u8>),
+    layers: Vec<Layer>,
 }
 
 /// The colours of a level in a stream.
@@ -199,6 +208,7 @@ struct Layer {
     level: u8,
     hash: u64,
     filter: Option<Vec<u8>>,
+    head_map: Option<Vec<u8>>,
     slices: Vec<(u32, Vec<u8>)>,
 }
 
@@ -295,9 +305,7 @@ impl<'a> Subject<'a> {
     fn code_towards(&self, truth: &Truth, top: u8, steps: Steps, log: &Log) -> Result<Coded> {
         let (octree, maps, isa) = (&self.octree, &self.maps, self.isa);
         let slice = self.options.colour_slice as usize;
-        let header = self.header(top, |level| octree.level(level).len());
-        let base = header.base;
-        let mut writer = Writer::new(header)?;
+        let base = *self.levels.start().min(&top);
         let trunk = colour::trunk_depth(base, |level| octree.level(level).len());
         let count = octree.level(trunk).len();
         let name = format!("colours of levels 0 to {trunk}");
@@ -348,12 +356,19 @@ impl<'a> Subject<'a> {
                 level,
                 hash: colour_hash(&coloured),
                 filter: filter.map(|filter| filter.to_bytes()),
+                head_map: None,
                 slices,
             });
         }
-        self.write(&mut writer, base, trunk, &payload, &layers)?;
-        let bytes = writer.finish()?;
-        Ok(Coded { bytes, top, colours })
+        let mut coded = Coded {
+            bytes: Vec::new(),
+            top,
+            colours,
+            trunk: (trunk, payload),
+            layers,
+        };
+        coded.bytes = self.written(&coded)?;
+        Ok(coded)
     }
 
     /// Bytes of the geometry of the levels 1 to `level`.
@@ -362,8 +377,19 @@ impl<'a> Subject<'a> {
         levels.map(|(_, bytes)| bytes.len()).sum()
     }
 
+    /// The stream of what was coded.
+    fn written(&self, coded: &Coded) -> Result<Vec<u8>> {
+        let header = self.header(coded.top, |level| self.octree.level(level).len());
+        let base = header.base;
+        let mut writer = Writer::new(header)?;
+        self.write(&mut writer, base, coded)?;
+        writer.finish()
+    }
+
     /// Writes the sections of all levels.
-    fn write(&self, writer: &mut Writer, base: u8, trunk: u8, payload: &[u8], layers: &[Layer]) -> Result<()> {
+    fn write(&self, writer: &mut Writer, base: u8, coded: &Coded) -> Result<()> {
+        let Coded { trunk, layers, .. } = coded;
+        let (trunk, payload) = (trunk.0, &trunk.1);
         let slice = self.options.slice_voxels as usize;
         let voxels = |level: usize| self.octree.level(level as u8).len();
         // Levels of one slice each.
@@ -391,27 +417,89 @@ impl<'a> Subject<'a> {
             if let Some(filter) = &layer.filter {
                 writer.post_filter(level, filter)?;
             }
+            if let Some(map) = &layer.head_map {
+                writer.head_map(level, map)?;
+            }
         }
         Ok(())
     }
 
-    /// The stream, once it has been decoded to what was encoded.
-    fn checked(&self, coded: Coded, log: &Log) -> Result<Encoded> {
-        let Coded { bytes, top, colours } = coded;
+    /// The stream, once it has been decoded to what was encoded; with head maps, if there are heads and the stream has at most
+    /// `most` bytes with them.
+    fn checked(&self, mut coded: Coded, heads: Option<&HeadsModel>, most: usize, log: &Log) -> Result<Encoded> {
+        let top = coded.top;
         let voxels = self.octree.level(top);
         let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
+        let mut decoding = decoder.with_level(top).start();
+        decoding.push(&coded.bytes);
+        let reference = match heads.filter(|_| self.has_head_maps(top)) {
+            Some(heads) => {
+                decoding.set_heads_model(heads.clone());
+                Some(head_maps::Reference::new(self.isa, self.cloud)?)
+            }
+            None => None,
+        };
+        let mut maps = Vec::new();
         let same = log.step("decode again", voxels.len(), "voxels", || {
-            let decoding = decoder.with_level(top).whole(&bytes)?;
+            while let Some(level) = decoding.advance()? {
+                if let Some(reference) = reference.as_ref().filter(|_| self.has_head_map(level)) {
+                    maps.push((level, self.head_map(reference, &mut decoding, level)?));
+                }
+            }
             let points = decoding.points();
-            Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == colours))
+            Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == coded.colours))
         })?;
         if !same {
             return Err(Error::Usage(
                 "the stream does not decode to what was encoded: this machine computes wrongly".into(),
             ));
         }
+        for (level, map) in maps {
+            let layer = coded.layers.iter_mut().find(|layer| layer.level == level);
+            layer
+                .into_iter()
+                .for_each(|layer| layer.head_map = Some(map.to_bytes()));
+        }
+        let mapped = self.written(&coded)?;
+        if mapped.len() <= most {
+            coded.bytes = mapped;
+        }
+        let bytes = coded.bytes;
         let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);
         Ok(Encoded { bytes, rates })
+    }
+
+    /// Compares the ways to draw the level that was decoded.
+    fn head_map(&self, reference: &head_maps::Reference, decoding: &mut Decoding<'_>, level: u8) -> Result<HeadMap> {
+        decoding.set_heads(HeadSet::Best)?;
+        let learned = decoding.gaussians()?;
+        decoding.set_heads(HeadSet::Surfels)?;
+        reference.head_map(&head_maps::Candidates {
+            octree: &self.octree,
+            level,
+            learned,
+            surfels: decoding.gaussians()?,
+        })
+    }
+
+    /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its own
+    /// does the cloud tell more than the best heads.
+    fn has_head_map(&self, level: u8) -> bool {
+        (1..self.cloud.voxels.depth().saturating_sub(1)).contains(&level)
+    }
+
+    fn has_head_maps(&self, top: u8) -> bool {
+        (*self.levels.start().min(&top)..=top).any(|level| self.has_head_map(level))
+    }
+
+    /// Bytes to set aside for the head maps of a stream whose last level is `top`.
+    fn head_map_bytes(&self, top: u8) -> usize {
+        /// Of a chunk without its payload.
+        const CHUNK: usize = 12;
+        let levels = *self.levels.start().min(&top)..=top;
+        let mapped = levels.filter(|level| self.has_head_map(*level));
+        let bytes = |level| CHUNK + HeadMap::usual_bytes(HeadMap::block_count(&self.octree, level));
+        mapped.map(bytes).sum()
     }
 }
 

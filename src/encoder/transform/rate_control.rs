@@ -74,8 +74,11 @@ pub fn encode_to_rate(
         asked: bits_per_point,
         least: bits(search.least),
     })?;
-    let encoded = subject.checked(coded, log)?;
+    let maps = search.head_map_bytes(place.top) > 0;
+    let heads = options.heads.as_ref().filter(|_| maps);
+    let encoded = subject.checked(coded, heads, room as usize, log)?;
     let chosen = Options {
+        heads: heads.cloned(),
         levels: Some(*levels.start().min(&place.top)..=place.top),
         fineness: QualityTarget::of(place.steps),
         ..options.clone()
@@ -146,6 +149,15 @@ impl Search<'_> {
         Ok(Some(best))
     }
 
+    /// Bytes to set aside for head maps: none where they might take more than 2 % of the stream.
+    fn head_map_bytes(&self, top: u8) -> usize {
+        let bytes = match self.subject.options.heads {
+            Some(_) => self.subject.head_map_bytes(top),
+            None => 0,
+        };
+        if 50.0 * bytes as f64 <= self.room { bytes } else { 0 }
+    }
+
     fn attempt(&mut self, place: Place, log: &Log) -> Result<Option<(Place, Coded)>> {
         Ok(self.attempt_sized(place, log)?.1)
     }
@@ -170,7 +182,7 @@ impl Search<'_> {
                 None => self.subject.code(top, steps, log),
             }
         })?;
-        let size = coded.bytes.len() as f64;
+        let size = (coded.bytes.len() + self.head_map_bytes(top)) as f64;
         self.least = self.least.min(size);
         Ok((size, (size <= self.room).then_some((place, coded))))
     }
