@@ -43,6 +43,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+pub mod axes;
 pub mod cancel;
 #[cfg(feature = "ply")]
 pub mod cloud;
@@ -71,6 +72,7 @@ pub mod renderer;
 #[cfg(test)]
 mod testing;
 
+pub use axes::{Axes, Up};
 pub use b2p_kernels::{Isa, UnknownIsa, ceiling};
 pub use cancel::Cancel;
 pub use error::{Error, Result};

@@ -43,8 +43,9 @@ const STAGES: [(&str, &[&str]); 12] = [
 ];
 
 /// What every stage may use.
-const COMMONS: [&str; 10] = [
+const COMMONS: [&str; 11] = [
     "Error",
+    "axes",
     "cancel",
     "error",
     "limits",

@@ -92,12 +92,12 @@ pub enum Command {
 
 #[derive(Debug, Args)]
 pub struct Encode {
-    /// Point cloud: PLY, ascii or binary, with x y z and red green blue
+    /// Point cloud: PLY, LAS, LAZ, PCD, E57, XYZ, CSV, OBJ, glTF or GLB, recognised by content. `-`: standard input
     pub cloud: PathBuf,
     /// Stream to write
     #[arg(short, long, value_name = "OUT.b2p")]
     pub output: PathBuf,
-    /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs; less if its points lie too far apart for that]
+    /// Bit depth N of the voxel grid, 1 to 21 [default: by the spacing of the points; at most what a cloud of integers needs]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
     pub bits: Option<u8>,
     /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last below N
@@ -121,6 +121,8 @@ pub struct Encode {
     /// Leave out colour filters: encoding and decoding take less time, pictures are less accurate
     #[arg(long)]
     pub no_filter: bool,
+    #[command(flatten)]
+    pub read: ReadArgs,
     #[command(flatten)]
     pub learned: LearnedArgs,
     #[command(flatten)]
@@ -160,9 +162,12 @@ pub struct Decode {
     /// File to write: Gaussians as a PLY with the property names of 3D Gaussian splatting
     #[arg(short, long, value_name = "OUT.ply")]
     pub output: PathBuf,
-    /// Write the level's voxels with their colours instead, as a PLY of points (of learned streams there are none)
+    /// Write the level's voxels with their colours instead, as points: PLY, or LAS, LAZ, PCD, E57 or XYZ by the ending (of learned
+    /// streams there are none)
     #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
     pub points: bool,
+    #[command(flatten)]
+    pub write: WriteArgs,
     #[command(flatten)]
     pub detail: DetailArg,
     #[command(flatten)]
@@ -173,7 +178,7 @@ pub struct Decode {
 
 #[derive(Debug, Args)]
 pub struct Render {
-    /// Stream, or PLY of Gaussians. `-`: standard input, drawn as it comes
+    /// Stream, PLY of Gaussians, or point cloud. `-`: standard input, drawn as it comes
     pub input: PathBuf,
     /// Picture to write: .png, .ppm, .exr, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
     #[arg(short, long, value_name = "OUT.png")]
@@ -185,6 +190,9 @@ pub struct Render {
     /// glTF's camera nodes
     #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov"])]
     pub camera: Option<PathBuf>,
+    /// Axis that points up in the pictures of --orbit: x, y, z, -x, -y, -z, or auto [default: what the input says, else y]
+    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true, conflicts_with = "camera")]
+    pub up: Option<UpArg>,
     /// Parallel rays; the cube's centre stays as large as it is
     #[arg(long, conflicts_with = "camera")]
     pub orthographic: bool,
@@ -343,6 +351,7 @@ pub struct ModelArg {
 }
 
 use super::budget::BudgetArgs;
+use super::cloud::{ReadArgs, UpArg, WriteArgs, up};
 use super::values::{background, bits_per_point, bytes, effect, levels, orbit, per_voxel, price, residual, size, step};
 pub use b2p::renderer::{Background, Choice, Effect, Quality};
 

@@ -1,16 +1,17 @@
 //! `b2p decode`: stream to Gaussians in a file.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use super::budget::Task;
 use b2p::container::version;
 use b2p::log::Log;
-use b2p::{Limits, output};
+use b2p::{Error, Limits, output};
 
 use super::args::Decode;
 use super::progress::Progress;
 use super::table::{count, steps};
-use super::{Failure, Result, budget, keep, load, pipe};
+use super::{Failure, Result, budget, cloud, keep, load, pipe};
 
 /// Decodes a stream into a PLY.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String> {
@@ -57,7 +58,7 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String
     ))
 }
 
-/// Decodes a stream into a PLY of points.
+/// Decodes a stream into a file of points.
 fn points(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String> {
     let say = |step: &str| progress.say(step);
     let mut log = Log::with_listener(&say);
@@ -70,9 +71,24 @@ fn points(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String>
     let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?;
     let decoding = decoder.whole(&bytes, args.detail.level, &mut log);
     let decoding = decoding.map_err(&fail)?;
-    let cloud = decoding.points().map(|points| points.to_cloud()).unwrap_or_default();
-    let (written, to) = (cloud.positions.len(), &args.output);
-    log.step("write PLY", written, "points", || cloud.write(to))?;
+    let voxels = decoding.points().map(|points| points.to_voxels());
+    let voxels = voxels.ok_or_else(|| Failure(format!("{}: no level is whole", args.input.display())))?;
+    let (written, to) = (voxels.voxels.len(), &args.output);
+    let encoded = cloud::encoded(&voxels, &cloud::axes(&bytes), to, args.write)?;
+    let write = |path: &Path, bytes: &[u8]| {
+        output::write_file(path, |w| {
+            w.write_all(bytes).map_err(|source| Error::Io {
+                path: path.to_owned(),
+                source,
+            })
+        })
+    };
+    log.step("write points", written, "points", || write(to, &encoded.bytes))?;
+    if let Some(text) = &encoded.sidecar {
+        let mut path = to.clone().into_os_string();
+        path.push(".json");
+        write(path.as_ref(), text.as_bytes())?;
+    }
     Ok(format!(
         "{}\n{}: {} points\n",
         steps(log.steps()),

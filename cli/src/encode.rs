@@ -1,6 +1,7 @@
 //! `b2p encode`: point cloud to stream.
 
-use b2p::cloud::{ColouredVoxels, PointCloud, voxelise, voxelise_closed};
+use b2p::cloud::ColouredVoxels;
+use b2p::container;
 use b2p::encoder::transform::{self, Fineness};
 use b2p::encoder::{self, Encoded, Options, Residual};
 use b2p::latents::Steps;
@@ -8,6 +9,7 @@ use b2p::log::Log;
 use b2p::{Error, Limits, output};
 
 use super::args::{Colours, Encode};
+use super::cloud;
 use super::progress::Progress;
 use super::table::{count, steps, table};
 use super::{Failure, Result, load};
@@ -17,21 +19,24 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
     let say = |step: &str| progress.say(step);
     let mut log = Log::with_listener(&say);
     let in_cloud = Failure::in_file(&args.cloud);
-    let cloud = log
-        .step("read cloud", 1, "file", || PointCloud::open(&args.cloud, limits))
+    let points = log
+        .step("read cloud", 1, "file", || cloud::read(&args.cloud, &args.read, limits))
         .map_err(&in_cloud)?;
-    let points = cloud.positions.len();
-    let (cloud, finest) = log
-        .step("voxelise", points, "points", || match args.bits {
-            Some(bits) => Ok((voxelise(&cloud, Some(bits))?, bits)),
-            None => voxelise_closed(&cloud),
+    let count_of_points = points.positions.len();
+    let (cloud, report) = log
+        .step("voxelise", count_of_points, "points", || {
+            cloud::grid(&points, args.bits)
         })
         .map_err(&in_cloud)?;
+    let axes = points.axes;
+    drop((points.positions, points.colours));
     let coded = match args.colours {
         Colours::Transform => transform(args, &cloud, &mut log)?,
         Colours::Learned => learned(args, &cloud, &mut log)?,
     };
-    let Coded { encoded, chosen } = coded;
+    let Coded { mut encoded, chosen } = coded;
+    let axes = cloud::affordable(&axes, encoded.bytes.len());
+    encoded.bytes = container::with_axes(&encoded.bytes, &axes)?;
     output::write_file(&args.output, |w| {
         w.write_all(&encoded.bytes).map_err(|source| Error::Io {
             path: args.output.clone(),
@@ -54,14 +59,9 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         ]);
     }
     let depth = cloud.voxels.depth();
-    let coarser = match depth < finest {
-        true => format!(
-            "The points lie too far apart for {finest} bits: surfaces would have holes. --bits {finest} codes them all the same.\n"
-        ),
-        false => String::new(),
-    };
+    let grid = cloud::describe(&report);
     Ok(format!(
-        "{}\n{}\n{}: {} bytes for {} points at {depth} bits, {} bits per point{}\n{coarser}",
+        "{}\n{}\n{grid}{}: {} bytes for {} points at {depth} bits, {} bits per point{}\n",
         steps(log.steps()),
         table(&rows),
         args.output.display(),

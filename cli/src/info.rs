@@ -2,16 +2,19 @@
 
 use b2p::container::{Level, Section, Stream};
 use b2p::latents::{Precision, Steps};
-use b2p::{Limits, colour};
+use b2p::{Axes, Limits, colour};
 use serde_json::json;
 
 use super::args::Info;
 use super::table::{count, table};
-use super::{Failure, Result, load};
+use super::{Failure, Result, cloud, load};
 
 /// Describes a stream as text or JSON. A cut or damaged stream is described with what is wrong; its model is described if it is the one at hand.
 pub fn run(args: &Info, limits: &Limits) -> Result<String> {
     let bytes = load::bytes(&args.input)?;
+    if let Some(text) = cloud::info(&args.input, &bytes, args.json, limits)? {
+        return Ok(text);
+    }
     let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
     let header = stream.header();
     let at_hand = match header.model() {
@@ -25,9 +28,10 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
         (shape.name.clone(), heads)
     });
     let levels = levels(&stream)?;
+    let axes = cloud::axes(&bytes);
     Ok(match args.json {
-        true => json(&stream, bytes.len(), &levels, known),
-        false => text(args, &stream, bytes.len(), &levels, known),
+        true => json(&stream, bytes.len(), &axes, &levels, known),
+        false => text(args, &stream, bytes.len(), &levels, known) + &cloud::described(&axes),
     })
 }
 
@@ -82,7 +86,7 @@ fn steps(level: &Level) -> Option<colour::Steps> {
     steps.is_valid().then_some(steps)
 }
 
-fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> String {
+fn json(stream: &Stream, bytes: usize, axes: &Axes, levels: &[Described], known: Known) -> String {
     let header = stream.header();
     let level = |of: &Described| {
         json!({
@@ -113,6 +117,9 @@ fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> St
         "heads": known.as_ref().map(|(_, heads)| heads),
         "origin": header.placement.origin,
         "voxel_size": header.placement.voxel_size,
+        "up": axes.up.map(|up| up.to_string()),
+        "metres_per_unit": axes.metres_per_unit,
+        "crs": axes.crs,
         "damage": stream.damage().map(ToString::to_string),
     });
     format!("{description:#}\n")

@@ -16,7 +16,7 @@ use b2p::renderer::camera::Camera;
 use b2p::{Error, Isa, Limits, UnknownIsa};
 
 use super::args::{DetailArg, ModelArg};
-use super::{Failure, Result, pipe};
+use super::{Failure, Result, cloud, pipe};
 
 /// A stream or Gaussians, told apart by their first bytes.
 pub const PLY_MAGIC: &[u8] = b"ply";
@@ -110,7 +110,7 @@ pub fn gaussians(
     log: &mut Log,
 ) -> Result<Gaussians> {
     let bytes = bytes(path)?;
-    if bytes.starts_with(PLY_MAGIC) {
+    if bytes.starts_with(PLY_MAGIC) || cloud::is_cloud(&bytes) {
         return ply(path, &bytes, detail, limits, log);
     }
     let decoder = decoder(&bytes, detail, model_arg, limits)?;
@@ -140,7 +140,7 @@ impl<'p> Source<'p> {
         log: &mut Log,
     ) -> Result<Self> {
         let bytes = bytes(path)?;
-        if bytes.starts_with(PLY_MAGIC) {
+        if bytes.starts_with(PLY_MAGIC) || cloud::is_cloud(&bytes) {
             return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
         }
         let decoder = Box::new(decoder(&bytes, detail, model_arg, limits)?);
@@ -186,7 +186,7 @@ impl<'p> Source<'p> {
     }
 }
 
-/// Gaussians as they stand in the PLY `bytes`, which came from `path`.
+/// Gaussians as they stand in the PLY `bytes`, which came from `path`; those of a point cloud are surfels.
 pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &mut Log) -> Result<Gaussians> {
     let asked = [("--level", detail.level.is_some()), ("--heads", detail.heads.is_some())];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
@@ -194,6 +194,9 @@ pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: 
             "{}: {name} is for streams, this is a PLY",
             path.display()
         )));
+    }
+    if let Some(surfels) = cloud::drawable(path, bytes, isa(None)?, limits, log)? {
+        return Ok(surfels);
     }
     let (gaussians, notes) = log
         .step("read Gaussians", 1, "file", || ply::read(bytes, limits))

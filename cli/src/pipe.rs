@@ -11,7 +11,7 @@ use b2p::log::Log;
 use b2p::{Error, Limits};
 
 use super::args::{DetailArg, ModelArg};
-use super::{Failure, Result, load};
+use super::{Failure, Result, cloud, load};
 
 /// The input that is standard input, and the output that is standard output.
 pub const PIPE: &str = "-";
@@ -51,7 +51,7 @@ pub fn each(
             Err(_) => break,
         }
     }
-    if start.starts_with(load::PLY_MAGIC) {
+    if start.starts_with(load::PLY_MAGIC) || cloud::is_cloud(&start) {
         for piece in pieces {
             start.extend(piece.map_err(broken)?);
         }

@@ -20,7 +20,7 @@ use super::picture::{Artist, format_of};
 use super::pipe::{self, PIPE};
 use super::progress::Progress;
 use super::table::{count, milliseconds, steps};
-use super::{Failure, Result, load};
+use super::{Failure, Result, cloud, load};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
@@ -252,6 +252,11 @@ fn cost_of(line: &Explanation, artist: &mut Artist, effects: Effects, camera: &C
 fn asked_for(args: &Render, frame: &Frame) -> Result<Vec<(PathBuf, Camera)>> {
     let Some(path) = &args.camera else {
         let mut cameras = cameras(&args.view, &args.output)?;
+        if let Some(up) = cloud::up_of(&args.input, args.up) {
+            for (_, camera) in &mut cameras {
+                *camera = camera.with_up(up);
+            }
+        }
         if args.orthographic {
             for (_, camera) in &mut cameras {
                 *camera = camera.orthographic(args.view.orbit[2].into())?;

@@ -1,5 +1,6 @@
 //! The program from outside: files in, files out, errors that say what is wrong, and nothing half-written.
 
+mod clouds;
 #[path = "../../../tests/common/mod.rs"]
 mod common;
 #[cfg(unix)]

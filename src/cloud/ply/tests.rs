@@ -51,8 +51,14 @@ const FORMATS: [&str; 3] = ["ascii", "binary_little_endian", "binary_big_endian"
 #[test]
 fn every_format_reads_the_same_columns() {
     for format in FORMATS {
-        for line_end in ["\n", "\r\n"] {
-            let bytes = sample(format, line_end);
+        for (mark, line_end) in [
+            ("", "\n"),
+            ("", "\r\n"),
+            ("", "\r"),
+            ("\u{feff}", "\n"),
+            ("\u{feff}", "\r"),
+        ] {
+            let bytes = [mark.as_bytes(), &sample(format, line_end)].concat();
             let ply = Ply::open(&bytes).unwrap();
             assert_eq!(ply.header.comments, ["made by  hand"]);
             assert_eq!(ply.element("vertex").unwrap().count, 2);
@@ -117,6 +123,21 @@ fn lists_in_vertices_are_skipped() {
         assert_eq!(columns[1].values, Values::F64(vec![4e9, 5.0]));
         assert_eq!(columns[2].values, Values::F32(vec![-3.0, 6.0]));
     }
+}
+
+#[test]
+fn negative_lengths_of_lists_are_refused() {
+    let header = |format| {
+        format!(
+            "ply\nformat {format} 1.0\nelement vertex 1\nproperty list char uchar tags\nproperty uchar x\n\
+             property uchar y\nproperty uchar z\nend_header\n"
+        )
+    };
+    let error = message((header("ascii") + "-1 1 2 3\n").as_bytes());
+    assert!(error.contains("property tags") && error.contains("not -1"), "{error}");
+    let binary = [header("binary_little_endian").as_bytes(), &[0xff, 1, 2, 3]].concat();
+    let error = message(&binary);
+    assert!(error.contains("length of list tags is -1"), "{error}");
 }
 
 #[test]

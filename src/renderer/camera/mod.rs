@@ -6,6 +6,7 @@ use glam::{DAffine3, DMat3, DVec3};
 
 use b2p_kernels::splat::{Bounds, TILE};
 
+use crate::axes::Up;
 use crate::error::{Error, Result};
 
 /// How far `R·Rᵀ` of a pose may be from the identity, so that a rotation printed with four decimals still is one.
@@ -104,6 +105,13 @@ impl Camera {
         self.fy /= distance;
         self.check()?;
         Ok(self)
+    }
+
+    /// The camera of [`Camera::orbit`] with another axis up: the world is turned so that `up` becomes +y.
+    pub fn with_up(mut self, up: Up) -> Camera {
+        let [x, y, z] = up.to_y().map(DVec3::from_array);
+        self.pose.matrix3 *= DMat3::from_cols(x, y, z).transpose();
+        self
     }
 
     /// The camera that draws only the pixels `x0 ≤ x < x1`, `y0 ≤ y < y1` of this one's picture: to the bit what the whole shows there.
@@ -260,6 +268,23 @@ mod tests {
         assert!(pixel(&from_plus_x, [0.0, 0.0, 0.5])[0] < 32.0);
         let from_above = Camera::orbit(0.0, 90.0, 3.0, 45.0, 64, 48).unwrap();
         assert!(pixel(&from_above, [0.0, 0.0, -0.5])[1] < 24.0);
+    }
+
+    #[test]
+    fn with_another_axis_up_that_axis_is_up_in_the_picture() {
+        for (up, at) in [
+            (Up::X, [0.5, 0.0, 0.0]),
+            (Up::MinusX, [-0.5, 0.0, 0.0]),
+            (Up::MinusY, [0.0, -0.5, 0.0]),
+            (Up::Z, [0.0, 0.0, 0.5]),
+            (Up::MinusZ, [0.0, 0.0, -0.5]),
+        ] {
+            let turned = camera().with_up(up);
+            let [x, y] = pixel(&turned, at);
+            assert!((x - 32.0).abs() < 1e-9 && y < 24.0, "{up}");
+            turned.check().unwrap();
+        }
+        assert_eq!(camera().with_up(Up::Y), camera());
     }
 
     #[test]
