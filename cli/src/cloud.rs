@@ -22,7 +22,7 @@ use super::{Failure, Result};
 /// Voxels of the finest level for one of the level above from which on surfaces are closed at the finest level.
 const CLOSED: usize = 3;
 /// Share of a stream, one in so many bytes, that a coordinate system may take.
-const CRS_SHARE: usize = 20;
+const CRS_SHARE: f64 = 20.0;
 
 /// Bytes of a stream that hold its header and its axes.
 const START: u64 = 1 << 18;
@@ -151,14 +151,11 @@ pub fn describe(report: &GridReport) -> String {
     text
 }
 
-/// The axes that a stream of about `bytes` bytes can afford to carry.
-pub fn affordable(axes: &Axes, bytes: usize) -> Axes {
-    let mut axes = axes.clone();
-    if !axes.crs.is_empty() && axes.crs.len() > bytes / CRS_SHARE {
-        eprintln!(
-            "b2p: left out the coordinate system: its {} bytes are too many for this stream",
-            axes.crs.len()
-        );
+/// The axes that a stream of at most `bytes` bytes can afford to carry.
+pub fn affordable(mut axes: Axes, bytes: f64) -> Axes {
+    let length = axes.crs.len();
+    if length as f64 > bytes / CRS_SHARE {
+        eprintln!("b2p: left out the coordinate system: its {length} bytes are too many at this rate");
         axes.crs.clear();
     }
     axes

@@ -30,12 +30,18 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         .map_err(&in_cloud)?;
     let axes = points.axes;
     drop((points.positions, points.colours));
+    let voxels = cloud.voxels.len() as f64;
+    let axes = match args.bits_per_point {
+        Some(most) => cloud::affordable(axes, most * voxels / 8.0),
+        None => axes,
+    };
+    // The rate counts the whole file.
+    let reserved = container::axes_bytes(&axes) as f64 * 8.0 / voxels;
     let coded = match args.colours {
-        Colours::Transform => transform(args, &cloud, &mut log)?,
-        Colours::Learned => learned(args, &cloud, &mut log)?,
+        Colours::Transform => transform(args, &cloud, reserved, &mut log)?,
+        Colours::Learned => learned(args, &cloud, reserved, &mut log)?,
     };
     let Coded { mut encoded, chosen } = coded;
-    let axes = cloud::affordable(&axes, encoded.bytes.len());
     encoded.bytes = container::with_axes(&encoded.bytes, &axes)?;
     output::write_file(&args.output, |w| {
         w.write_all(&encoded.bytes).map_err(|source| Error::Io {
@@ -78,8 +84,8 @@ struct Coded {
     chosen: String,
 }
 
-/// Codes a stream of version 3.
-fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded> {
+/// Codes a stream of version 3, which keeps `reserved` bits per point free.
+fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &mut Log) -> Result<Coded> {
     let model = &args.model;
     let learned = &args.learned;
     let asked = [
@@ -106,7 +112,8 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Cod
     let in_cloud = Failure::in_file(&args.cloud);
     let (encoded, chosen) = match args.bits_per_point {
         Some(most) => {
-            let (encoded, chosen) = transform::encode_within(cloud, &options, most, log).map_err(in_cloud)?;
+            let (encoded, chosen) =
+                transform::encode_within(cloud, &options, most - reserved, log).map_err(in_cloud)?;
             let level = chosen.levels.map_or(0, |levels| *levels.end());
             let how = chosen.fineness;
             (encoded, format!(" of at most {most}: level {level}, {how}"))
@@ -119,8 +126,8 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Cod
     Ok(Coded { encoded, chosen })
 }
 
-/// Codes a stream of version 2.
-fn learned(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded> {
+/// Codes a stream of version 2, which keeps `reserved` bits per point free.
+fn learned(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &mut Log) -> Result<Coded> {
     if args.step.is_some() || args.lossless {
         let what = "--step and --lossless are for --colours transform";
         return Err(Failure(what.into()));
@@ -137,7 +144,7 @@ fn learned(args: &Encode, cloud: &ColouredVoxels, log: &mut Log) -> Result<Coded
     let in_cloud = Failure::in_file(&args.cloud);
     let (encoded, chosen) = match args.bits_per_point {
         Some(most) => {
-            let found = encoder::encode_within(cloud, &model, &options, most, log);
+            let found = encoder::encode_within(cloud, &model, &options, most - reserved, log);
             let (encoded, chosen) = found.map_err(in_cloud)?;
             (encoded, within(most, &chosen))
         }

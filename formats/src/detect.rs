@@ -6,6 +6,9 @@ use std::io::Read;
 /// Bytes from the start of a file that are enough to recognise any kind.
 pub const ENOUGH: usize = 4096;
 
+/// Bytes of a header in text that are searched, if they are there.
+const LONGEST_HEADER: usize = 1 << 20;
+
 /// A kind of file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
@@ -200,6 +203,7 @@ impl fmt::Display for Kind {
 
 /// The kind of a PLY file, by the properties that its header declares.
 fn ply(bytes: &[u8]) -> Kind {
+    let bytes = &bytes[..bytes.len().min(LONGEST_HEADER)];
     let end = bytes
         .windows(10)
         .position(|w| w == b"end_header")
@@ -239,6 +243,7 @@ fn gzip(bytes: &[u8]) -> Kind {
 
 /// The kind of a file that may be text.
 fn text_kind(bytes: &[u8]) -> Option<Kind> {
+    let longest = &bytes[..bytes.len().min(LONGEST_HEADER)];
     let bytes = &bytes[..bytes.len().min(ENOUGH)];
     if bytes.iter().any(|b| *b < 9 || (14..32).contains(b))
         && !bytes.starts_with(b"# .PCD")
@@ -246,9 +251,8 @@ fn text_kind(bytes: &[u8]) -> Option<Kind> {
     {
         return None;
     }
-    let trimmed = bytes.trim_ascii_start();
-    if trimmed.starts_with(b"{") {
-        return Some(json(trimmed));
+    if bytes.trim_ascii_start().starts_with(b"{") {
+        return Some(json(longest));
     }
     let lines = bytes.split(|b| matches!(b, b'\n' | b'\r')).map(<[u8]>::trim_ascii);
     let mut numbers = 0;

@@ -44,7 +44,7 @@ pub(super) fn describe(bytes: &[u8]) -> String {
 /// [`Error::Malformed`], [`Error::Truncated`], [`Error::LimitExceeded`].
 pub(super) fn read(bytes: Vec<u8>, limits: &Limits, notes: &mut Vec<Note>) -> Result<RawPoints> {
     let start = Start::parse(&bytes)?;
-    start.check(&bytes, limits)?;
+    let chunks = start.check(&bytes, limits)?;
     let length = bytes.len();
     let mut raw = guarded("LAS", || {
         let failed = |e: las::Error| {
@@ -56,6 +56,7 @@ pub(super) fn read(bytes: Vec<u8>, limits: &Limits, notes: &mut Vec<Note>) -> Re
             )
         };
         let mut reader = Reader::new(Cursor::new(bytes)).map_err(failed)?;
+        check_points(reader.header(), chunks)?;
         points(&mut reader, notes).map_err(failed)
     })?;
     // Colours that are all 0 were never set.
@@ -69,6 +70,26 @@ pub(super) fn read(bytes: Vec<u8>, limits: &Limits, notes: &mut Vec<Note>) -> Re
         };
     }
     Ok(raw.0)
+}
+
+/// Checks that so many chunks can hold the points of a LAZ file.
+fn check_points(header: &Header, chunks: Option<u64>) -> Result<()> {
+    let Some((chunks, vlr)) = chunks.zip(header.laz_vlr().ok()) else {
+        return Ok(());
+    };
+    let most = chunks.saturating_mul(vlr.chunk_size().into());
+    match vlr.uses_variable_size_chunks() || header.number_of_points() <= most {
+        true => Ok(()),
+        false => {
+            let expected = format!("at most {most}, which its chunks hold");
+            Err(malformed(
+                "the file",
+                "number of points",
+                header.number_of_points(),
+                expected,
+            ))
+        }
+    }
 }
 
 /// The points, and their intensities unless all have colours.
@@ -182,7 +203,8 @@ impl Start {
     }
 
     /// Checks the counts by which memory is allocated against the limits and the length of the file.
-    fn check(&self, bytes: &[u8], limits: &Limits) -> Result<()> {
+    /// Returns the number of chunks of a LAZ file.
+    fn check(&self, bytes: &[u8], limits: &Limits) -> Result<Option<u64>> {
         limits.check_points("number of points", self.points)?;
         limits.check_bytes(
             "bytes of the point cloud",
@@ -203,9 +225,10 @@ impl Start {
                 (needed - room) as usize,
             ));
         }
-        if self.compressed {
-            self.check_chunks(bytes)?;
-        }
+        let chunks = match self.compressed {
+            true => Some(self.check_chunks(bytes)?),
+            false => None,
+        };
         // The first extended record: its length is allocated at once.
         if self.version >= [1, 4] && bytes.len() >= 247 && u32_at(bytes, 243) > 0 {
             let at = u64_at(bytes, 235).saturating_add(20);
@@ -223,11 +246,11 @@ impl Start {
                 ));
             }
         }
-        Ok(())
+        Ok(chunks)
     }
 
     /// Checks the number of chunks of a LAZ file.
-    fn check_chunks(&self, bytes: &[u8]) -> Result<()> {
+    fn check_chunks(&self, bytes: &[u8]) -> Result<u64> {
         let missing = |at: usize| {
             truncated(
                 bytes.len(),
@@ -251,7 +274,7 @@ impl Start {
         // A chunk has a point at least, and its point some bytes.
         let most = self.points.min(bytes.len() as u64) + 1;
         match chunks <= most {
-            true => Ok(()),
+            true => Ok(chunks),
             false => Err(malformed(
                 format!("byte {}", table + 4),
                 "number of LAZ chunks",
