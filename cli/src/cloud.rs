@@ -171,11 +171,7 @@ pub fn up_of(path: &Path, asked: Option<UpArg>) -> Option<Up> {
     if let Some(up) = asked.and_then(|asked| asked.0) {
         return Some(up);
     }
-    // What is read from a pipe would be missing afterwards.
-    let is_file = std::fs::metadata(path).is_ok_and(|data| data.is_file());
-    let file = std::fs::File::open(path).ok().filter(|_| is_file)?;
-    let mut start = Vec::new();
-    file.take(START).read_to_end(&mut start).ok()?;
+    let start = start_of(path)?;
     match Kind::of(&start) {
         Kind::Stream => axes(&start).up,
         Kind::Las | Kind::E57 => Some(Up::Z),
@@ -187,6 +183,27 @@ pub fn up_of(path: &Path, asked: Option<UpArg>) -> Option<Up> {
                 .next()
         }
         _ => None,
+    }
+}
+
+/// The first bytes of a regular file. What is read from a pipe would be missing afterwards.
+fn start_of(path: &Path) -> Option<Vec<u8>> {
+    let is_file = std::fs::metadata(path).is_ok_and(|data| data.is_file());
+    let file = std::fs::File::open(path).ok().filter(|_| is_file)?;
+    let mut start = Vec::new();
+    file.take(START).read_to_end(&mut start).ok()?;
+    Some(start)
+}
+
+/// Refuses a file of points where a stream is expected.
+pub fn refuse(path: &Path) -> Result<()> {
+    match start_of(path) {
+        Some(start) if is_cloud(&start) => Err(Failure(format!(
+            "{}: this is {}, not a b2p stream: code it with `b2p encode`, or draw it with `b2p render`",
+            path.display(),
+            Kind::of(&start)
+        ))),
+        _ => Ok(()),
     }
 }
 
@@ -252,9 +269,9 @@ pub fn info(path: &Path, bytes: &[u8], as_json: bool, limits: &Limits) -> Result
     let (grid, report) = voxelise_closed(cloud).map_err(&fail)?;
     let mut corners = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
     for position in &cloud.positions {
-        for axis in 0..3 {
-            corners[0][axis] = corners[0][axis].min(position[axis]);
-            corners[1][axis] = corners[1][axis].max(position[axis]);
+        for (axis, x) in position.iter().enumerate() {
+            corners[0][axis] = corners[0][axis].min(*x);
+            corners[1][axis] = corners[1][axis].max(*x);
         }
     }
     let format = clouds::describe(bytes);

@@ -15,6 +15,7 @@ use super::{Failure, Result, budget, cloud, keep, load, pipe};
 
 /// Decodes a stream into a PLY.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String> {
+    cloud::refuse(&args.input)?;
     if args.points {
         return points(args, limits, progress);
     }

@@ -16,9 +16,9 @@ const LEAST_NEAR: u32 = 5;
 pub(super) fn bounds(positions: &[[f64; 3]]) -> ([f64; 3], [f64; 3]) {
     let mut corners = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
     for position in positions {
-        for axis in 0..3 {
-            corners.0[axis] = corners.0[axis].min(position[axis]);
-            corners.1[axis] = corners.1[axis].max(position[axis]);
+        for (axis, x) in position.iter().enumerate() {
+            corners.0[axis] = corners.0[axis].min(*x);
+            corners.1[axis] = corners.1[axis].max(*x);
         }
     }
     corners

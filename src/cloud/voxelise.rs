@@ -314,8 +314,8 @@ fn grid_of(cloud: &PointCloud, low: [f64; 3], high: [f64; 3], bits: Option<u8>) 
     };
     let largest = (0..3).map(|i| high[i] - offset[i]).fold(0.0, f64::max) as u32;
     let mut placement = hints.placement.unwrap_or(Placement::VOXEL_GRID);
-    for i in 0..3 {
-        placement.origin[i] += offset[i] * placement.voxel_size;
+    for (origin, offset) in placement.origin.iter_mut().zip(offset) {
+        *origin += offset * placement.voxel_size;
     }
     (Grid::Integer(offset), grid_depth(largest, bits, hints), placement)
 }
@@ -326,8 +326,8 @@ fn hinted(cloud: &PointCloud, bits: Option<u8>) -> Option<(Grid, u8, Placement)>
     let end = f64::from(1u32 << morton::MAX_DEPTH);
     let largest = cloud.positions.par_iter().map(|position| {
         let mut largest = 0u32;
-        for i in 0..3 {
-            let at = (position[i] - placement.origin[i]) / placement.voxel_size;
+        for (coordinate, origin) in position.iter().zip(placement.origin) {
+            let at = (coordinate - origin) / placement.voxel_size;
             let voxel = at.floor();
             if !((0.0..end).contains(&voxel) && (at - voxel - 0.5).abs() <= CENTRE) {
                 return None;

@@ -151,7 +151,9 @@ fn a_cloud_with_z_up_is_drawn_upright() {
     std::fs::write(at.join("room.xyz"), rows).unwrap();
     succeeds(
         at,
-        &["encode", "room.xyz", "-o", "room.b2p", "--up", "z", "--step", "4"],
+        &[
+            "encode", "room.xyz", "-o", "room.b2p", "--up", "z", "--bits", "6", "--levels", "3..6",
+        ],
     );
     succeeds(
         at,
@@ -182,6 +184,11 @@ fn what_is_no_cloud_is_named_with_what_to_do() {
         at,
         &["encode", "mesh.obj", "-o", "x.b2p"],
         &["mesh.obj", "this is a mesh", "voxelize"],
+    );
+    fails(
+        at,
+        &["decode", "ball.ply", "-o", "x.ply"],
+        &["ball.ply", "a PLY file", "b2p encode"],
     );
     fails(
         at,

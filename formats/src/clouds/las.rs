@@ -186,11 +186,9 @@ impl Start {
         let version = [bytes[24], bytes[25]];
         let format = bytes[104];
         let legacy = u64::from(u32_at(bytes, 107));
+        // Readers differ in which of the two they prefer.
         let points = match version {
-            [1, 4..=255] if bytes.len() >= 255 => match u64_at(bytes, 247) {
-                0 => legacy,
-                points => points,
-            },
+            [1, 4..=255] if bytes.len() >= 255 => legacy.max(u64_at(bytes, 247)),
             _ => legacy,
         };
         Ok(Start {
@@ -422,6 +420,10 @@ mod tests {
                 let size = if at == 96 { 4 } else { 8 };
                 bytes[at..at + size].copy_from_slice(&value.to_le_bytes()[..size]);
                 bytes[243] = u8::from(at == 235);
+                if at == 247 && value < 1 << 32 {
+                    // The number for older readers, which the crate prefers.
+                    bytes[107..111].copy_from_slice(&(value as u32).to_le_bytes());
+                }
                 assert!(parse(bytes).is_err(), "{compressed} {at} {value}");
             }
         }
