@@ -1,7 +1,7 @@
 //! Point clouds in: of any format, with what was mended; and as surfels to draw.
 
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use b2p::axes::{Axes, Up};
 use b2p::cloud::{ColourRange, ColouredVoxels, GridReport, PointCloud, ReadOptions, voxelise, voxelise_closed};
@@ -17,7 +17,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::table::count;
-use super::{Failure, Result};
+use super::{Failure, Result, manners};
 
 /// Voxels of the finest level for one of the level above from which on surfaces are closed at the finest level.
 const CLOSED: usize = 3;
@@ -109,15 +109,15 @@ impl ReadArgs {
 }
 
 /// Reads the points of a file, and says on standard error what was mended.
-pub fn read(path: &Path, args: &ReadArgs, limits: &Limits) -> b2p::Result<PointCloud> {
-    let read = clouds::open(path, limits, &args.options())?;
+pub fn read(path: &Path, args: &ReadArgs, limits: &Limits) -> Result<PointCloud> {
+    let read = clouds::open(path, limits, &args.options()).map_err(Failure::in_file(path))?;
     say(path, &read.notes);
     Ok(read.cloud)
 }
 
 fn say(path: &Path, notes: &[b2p::cloud::Note]) {
     for note in notes {
-        eprintln!("b2p: {}: {note}", path.display());
+        manners::warn(&format!("{}: {note}", path.display()));
     }
 }
 
@@ -155,7 +155,9 @@ pub fn describe(report: &GridReport) -> String {
 pub fn affordable(mut axes: Axes, bytes: f64) -> Axes {
     let length = axes.crs.len();
     if length as f64 > bytes / CRS_SHARE {
-        eprintln!("b2p: left out the coordinate system: its {length} bytes are too many at this rate");
+        manners::warn(&format!(
+            "left out the coordinate system: its {length} bytes are too many at this rate"
+        ));
         axes.crs.clear();
     }
     axes
@@ -214,7 +216,7 @@ pub fn is_cloud(bytes: &[u8]) -> bool {
 }
 
 /// Points as surfels, if the file holds points.
-pub fn drawable(path: &Path, bytes: &[u8], isa: Isa, limits: &Limits, log: &mut Log) -> Result<Option<Gaussians>> {
+pub fn drawable(path: &Path, bytes: &[u8], isa: Isa, limits: &Limits, log: &Log) -> Result<Option<Gaussians>> {
     if !is_cloud(bytes) {
         return Ok(None);
     }
@@ -316,6 +318,13 @@ pub fn described(axes: &Axes) -> String {
         text += &format!("coordinate system: {}\n", axes.crs);
     }
     text
+}
+
+/// The file beside a file of points that holds the offset of local coordinates.
+pub fn sidecar(path: &Path) -> PathBuf {
+    let mut path = path.to_owned().into_os_string();
+    path.push(".json");
+    path.into()
 }
 
 /// Points as a file of the format that its ending names, PLY for any other.

@@ -15,7 +15,7 @@ mod voxelise;
 mod write;
 
 pub use colours::{ColourRange, RawColours, Stored};
-pub use points::{Coordinates, Hints, PointCloud, is_a_mesh, read_bounded};
+pub use points::{Coordinates, Hints, PointCloud, is_a_mesh};
 pub use raw::{Note, RawPoints, ReadOptions};
 
 pub use voxelise::{ColouredVoxels, GridReport, voxelise, voxelise_closed};

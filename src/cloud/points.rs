@@ -1,11 +1,11 @@
 //! Coloured points as stored in a file.
 
-use std::io::Read;
 use std::path::Path;
 
 use super::raw::{Note, ReadOptions};
 use crate::axes::Axes;
 use crate::error::{Error, Result};
+use crate::input;
 use crate::limits::Limits;
 use crate::placement::Placement;
 
@@ -50,13 +50,7 @@ impl PointCloud {
     /// # Errors
     /// [`Error::Io`], [`Error::LimitExceeded`] for a file that is too large, and those of [`PointCloud::from_ply`].
     pub fn open(path: impl AsRef<Path>, limits: &Limits) -> Result<Self> {
-        let path = path.as_ref();
-        let file = std::fs::File::open(path).map_err(|source| Error::Io {
-            path: path.to_owned(),
-            source,
-        })?;
-        let size = file.metadata().map_or(0, |data| data.len());
-        Self::from_ply(&read_bounded(file, size, path, limits)?, limits)
+        Self::from_ply(&input::read_file(path.as_ref(), limits)?, limits)
     }
 
     /// Reads a PLY file from memory, and refuses what would have to be mended or guessed.
@@ -87,30 +81,6 @@ impl PointCloud {
     pub fn read_ply(bytes: &[u8], limits: &Limits, options: &ReadOptions) -> Result<(Self, Vec<Note>)> {
         super::dialects::read(bytes, limits, options)?.finish(options)
     }
-}
-
-/// Reads `from` to its end, but no more than the limits allow. `size` is the expected length, 0 if it is not known;
-/// `path` is for messages.
-///
-/// # Errors
-/// [`Error::Io`]; [`Error::LimitExceeded`] as soon as `size` or what has been read is over the limit.
-pub fn read_bounded(from: impl Read, size: u64, path: &Path, limits: &Limits) -> Result<Vec<u8>> {
-    let what = "size of the input in bytes";
-    limits.check_bytes(what, size)?;
-    let mut bytes = Vec::new();
-    let most = limits.max_bytes.saturating_add(1);
-    let mut bounded = from.take(most);
-    let failed = |source| Error::Io {
-        path: path.to_owned(),
-        source,
-    };
-    let room = usize::try_from(size).unwrap_or(usize::MAX);
-    bytes
-        .try_reserve_exact(room)
-        .map_err(|e| failed(std::io::Error::other(e)))?;
-    bounded.read_to_end(&mut bytes).map_err(failed)?;
-    limits.check_bytes(what, bytes.len() as u64)?;
-    Ok(bytes)
 }
 
 /// The error of reading a mesh as points.

@@ -4,6 +4,9 @@ use std::path::{Path, PathBuf};
 
 use b2p::cloud::{Note, RawColours, RawPoints, ReadOptions, Stored, is_a_mesh};
 use b2p::{Axes, Limits, Result, Up};
+use base64::Engine as _;
+use base64::alphabet::STANDARD;
+use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use gltf::buffer::Source;
 use gltf::mesh::Mode;
 use gltf::mesh::util::ReadColors;
@@ -74,7 +77,7 @@ fn buffers(file: &Gltf, folder: Option<&Path>, limits: &Limits) -> Result<Vec<Ve
             Source::Uri(uri) => match uri.strip_prefix("data:") {
                 Some(data) => {
                     let (_, code) = data.split_once(";base64,").ok_or_else(|| bad("a data URI", "base64"))?;
-                    base64(code.as_bytes()).ok_or_else(|| bad("a data URI", "valid base64"))?
+                    decoded(code.as_bytes()).ok_or_else(|| bad("a data URI", "valid base64"))?
                 }
                 None => read_file(
                     &beside(uri, folder).ok_or_else(|| bad(uri, "the name of a file beside it"))?,
@@ -102,27 +105,9 @@ fn beside(uri: &str, folder: Option<&Path>) -> Option<PathBuf> {
 }
 
 /// Decodes base64, with or without padding.
-fn base64(code: &[u8]) -> Option<Vec<u8>> {
-    let code = code.trim_ascii_end();
-    let mut bytes = Vec::with_capacity(code.len() / 4 * 3);
-    let (mut value, mut bits) = (0u32, 0);
-    for byte in code.iter().take_while(|b| **b != b'=') {
-        let digit = match byte {
-            b'A'..=b'Z' => byte - b'A',
-            b'a'..=b'z' => byte - b'a' + 26,
-            b'0'..=b'9' => byte - b'0' + 52,
-            b'+' | b'-' => 62,
-            b'/' | b'_' => 63,
-            _ => return None,
-        };
-        value = value << 6 | u32::from(digit);
-        bits += 6;
-        if bits >= 8 {
-            bits -= 8;
-            bytes.push((value >> bits) as u8);
-        }
-    }
-    Some(bytes)
+fn decoded(code: &[u8]) -> Option<Vec<u8>> {
+    let config = GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent);
+    GeneralPurpose::new(&STANDARD, config).decode(code.trim_ascii()).ok()
 }
 
 struct Scene<'a> {
@@ -311,26 +296,14 @@ mod tests {
         Ok(raw.finish(&options)?.0)
     }
 
-    fn encoded(bytes: &[u8]) -> String {
-        const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-        let mut text = String::new();
-        for three in bytes.chunks(3) {
-            let value = three.iter().fold(0u32, |v, b| v << 8 | u32::from(*b)) << (8 * (3 - three.len()));
-            for i in 0..=three.len() {
-                text.push(DIGITS[(value >> (18 - 6 * i)) as usize & 63].into());
-            }
-        }
-        while text.len() % 4 != 0 {
-            text.push('=');
-        }
-        text
-    }
-
     #[test]
     fn points_are_read_with_their_nodes_from_any_kind_of_buffer() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("points 1.bin"), data()).unwrap();
-        let uri = format!("data:application/octet-stream;base64,{}", encoded(&data()));
+        let uri = format!(
+            "data:application/octet-stream;base64,{}",
+            ::base64::engine::general_purpose::STANDARD.encode(data())
+        );
         let files = [
             glb(&scene(0, "")),
             scene(0, &uri).into_bytes(),

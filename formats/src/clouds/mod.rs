@@ -25,9 +25,9 @@ pub use write::{Encoded, PointFormat, WriteOptions, encode};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
-use b2p::cloud::{Note, PointCloud, RawPoints, ReadOptions, read_bounded};
+use b2p::cloud::{Note, PointCloud, RawPoints, ReadOptions};
 use b2p::error::Stage;
-use b2p::{Error, Limits, Result};
+use b2p::{Error, Limits, Result, input};
 
 use crate::detect::{Group, Kind};
 
@@ -63,15 +63,10 @@ pub fn open(path: &Path, limits: &Limits, options: &ReadOptions) -> Result<Readi
 /// # Errors
 /// [`Error::Io`]; [`Error::LimitExceeded`] if there is more, before it is read where the length is known.
 pub fn read_file(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
-    if path == Path::new(PIPE) {
-        return read_bounded(std::io::stdin().lock(), 0, path, limits);
+    match path == Path::new(PIPE) {
+        true => input::read_all(std::io::stdin().lock(), 0, path, limits),
+        false => input::read_file(path, limits),
     }
-    let file = std::fs::File::open(path).map_err(|source| Error::Io {
-        path: path.to_owned(),
-        source,
-    })?;
-    let size = file.metadata().map_or(0, |data| data.len());
-    read_bounded(file, size, path, limits)
 }
 
 /// Reads a point cloud from memory. `folder` is where files lie that it may name.
@@ -211,10 +206,7 @@ mod tests {
 
     #[test]
     fn a_file_larger_than_the_limit_is_refused_before_it_is_read() {
-        let limits = Limits {
-            max_bytes: 1000,
-            ..Limits::default()
-        };
+        let limits = Limits::default().with_max_bytes(1000);
         let file = tempfile::NamedTempFile::new().unwrap();
         file.as_file().set_len(1 << 40).unwrap();
         let result = open(file.path(), &limits, &ReadOptions::default());
