@@ -43,7 +43,7 @@ pub(super) fn read(bytes: &[u8], limits: &Limits, notes: &mut Vec<Note>) -> Resu
     let mut rows = Rows { bytes, at: 0, line: 0 };
     let mut names: Option<Vec<String>> = None;
     let mut first = None;
-    while let Some((line, row)) = rows.next() {
+    for (line, row) in rows.by_ref() {
         match row_of_numbers(row) {
             Some(0..=2) => {} // The number of points.
             Some(_) => {
