@@ -217,7 +217,7 @@ fn rows(levels: &[Described], points: u64) -> Vec<Vec<String>> {
             count(of.section.colours.into()),
             format!("{:.4}", bits(of.section.geometry.into(), points)),
             format!("{:.4}", bits(of.section.colours.into(), points)),
-            of.steps.map_or("-".into(), step_told),
+            of.steps.map_or("-".into(), step_text),
             of.residual.map_or("?".into(), |bytes| count(bytes as u64)),
             of.precision.map_or("-".into(), told),
             format!("{:.4}", bits(of.prefix, points)),
@@ -227,7 +227,7 @@ fn rows(levels: &[Described], points: u64) -> Vec<Vec<String>> {
 }
 
 /// A step of luma in 255ths.
-fn step_told(steps: colour::Steps) -> String {
+fn step_text(steps: colour::Steps) -> String {
     match steps.is_lossless() {
         true => "exact".into(),
         false => format!("{:.2}", steps.luma_step()),
