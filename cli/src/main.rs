@@ -5,6 +5,7 @@ mod args;
 mod bench;
 mod bench_render;
 mod budget;
+mod cloud;
 mod cut;
 mod decode;
 mod demo;
