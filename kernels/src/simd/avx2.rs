@@ -60,9 +60,23 @@ impl Simd for Avx2 {
     }
 }
 
+impl AvxVnni {
+    /// Runs `work` in a function that is compiled with the features of this set.
+    #[inline(always)]
+    pub fn vectorize<W: Work>(self, avx2: Avx2, work: W) -> W::Output {
+        with_avx_vnni! {
+            fn run<W: Work>(avx2: Avx2, work: W) -> W::Output {
+                work.run(avx2)
+            }
+        }
+        // SAFETY: the token proves the features.
+        unsafe { run(avx2, work) }
+    }
+}
+
 /// Eight f32.
 #[derive(Clone, Copy)]
-pub struct F32x8(__m256);
+pub struct F32x8(pub(super) __m256);
 
 /// Eight f64.
 #[derive(Clone, Copy)]
@@ -70,7 +84,7 @@ pub struct F64x8(__m256d, __m256d);
 
 /// Eight i32.
 #[derive(Clone, Copy)]
-pub struct I32x8(__m256i);
+pub struct I32x8(pub(super) __m256i);
 
 /// Sixteen i16.
 #[derive(Clone, Copy)]

@@ -114,17 +114,19 @@ pub(crate) use define_set;
 macro_rules! feature_macro {
     ($dollar:tt $with:ident [] $($feature:tt),+) => {
         /// Compiles a function with the features of the set.
+        #[allow(unused_macros, reason = "as below")]
         macro_rules! $with {
             ($dollar($dollar item:tt)*) => {
                 $(#[target_feature(enable = $feature)])+
                 $dollar($dollar item)*
             };
         }
-        #[allow(unused_imports, reason = "not all sets are used outside their file")]
+        #[allow(unused_imports, reason = "not all sets are used outside their file, or without features")]
         pub(crate) use $with;
     };
     ($dollar:tt $with:ident [$module:ident::$base:ident] $($feature:tt),+) => {
         /// Compiles a function with the features of the set.
+        #[allow(unused_macros, reason = "as below")]
         macro_rules! $with {
             ($dollar($dollar item:tt)*) => {
                 $crate::simd::$module::$base! {
@@ -133,7 +135,7 @@ macro_rules! feature_macro {
                 }
             };
         }
-        #[allow(unused_imports, reason = "not all sets are used outside their file")]
+        #[allow(unused_imports, reason = "not all sets are used outside their file, or without features")]
         pub(crate) use $with;
     };
 }
@@ -144,7 +146,8 @@ pub(crate) use feature_macro;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! methods {
     ($with:ident $vector:ident: $trait:path {
-        $(type $output:ident = $output_type:ty;)?
+        $(type $output:ident = $output_type:ty;)*
+        $(const $constant:ident: $constant_type:ty = $value:expr;)?
         $(fn $name:ident($first:ident $(: $first_ty:ty)? $(, $arg:ident: $ty:ty)* $(,)?) $(-> $out:ty)? $body:block)*
     }) => {
         impl $vector {
@@ -155,7 +158,8 @@ macro_rules! methods {
         }
 
         impl $trait for $vector {
-            $(type $output = $output_type;)?
+            $(type $output = $output_type;)*
+            $(const $constant: $constant_type = $value;)?
             $(#[inline(always)]
             fn $name($first $(: $first_ty)? $(, $arg: $ty)*) $(-> $out)? {
                 // SAFETY: among the arguments is the set's token, or a vector, which is only made from the token or other vectors.

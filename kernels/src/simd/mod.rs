@@ -39,6 +39,8 @@ pub use avx2::Avx2;
 pub use avx512::Avx512;
 pub use dispatch::Work;
 pub(crate) use dispatch::dispatch;
+#[cfg(target_arch = "x86_64")]
+pub(crate) use isa::Amx;
 pub(crate) use isa::Level;
 pub use isa::{Isa, UnknownIsa};
 #[cfg(target_arch = "aarch64")]

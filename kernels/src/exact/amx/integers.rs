@@ -5,11 +5,14 @@
 
 use std::arch::x86_64::*;
 
+use bytemuck::must_cast;
+
 use super::{Buffers, LINE, Scheme, TILE, Weights, multiply, pairs, prepare};
-use crate::machine::{REACH, digits};
-use crate::plan::PlanTile;
-use crate::rows::{AHEAD, Extents, Lanes, PANEL};
-use crate::simd::prefetch;
+use crate::exact::digits::{REACH, digits};
+use crate::simd::avx512::with_avx512;
+use crate::simd::{Amx, prefetch};
+use crate::sparse::plan::PlanTile;
+use crate::sparse::rows::{AHEAD, Extents, PANEL, Words};
 
 /// Input channels whose two digits fit a tile row.
 const HALF: usize = LINE / 2;
@@ -78,18 +81,18 @@ fn add(words: &mut [u32; PANEL], byte: usize, digits: [i8; PANEL]) {
 /// digits.
 ///
 /// # Panics
-/// If the processor lacks AMX, or the plan reads beyond the input.
+/// If the plan reads beyond the input.
 pub(crate) fn accumulate(
-    isa: crate::Isa,
+    amx: Amx,
     weights: &Weights,
     plan: &PlanTile,
     input: &[i16],
     buffers: &mut Buffers,
-    sums: &mut Vec<Lanes>,
+    sums: &mut Vec<Words>,
 ) -> bool {
     let cin = weights.extents.cin;
-    prepare(isa, weights, plan, input.len() / cin, buffers);
-    // SAFETY: an `Isa` with tiles is only made where the processor has AVX-512. All rows of the plan lie below its end.
+    prepare(weights, plan, input.len() / cin, buffers);
+    // SAFETY: the token proves AVX-512.
     let small = unsafe {
         match weights.scheme {
             Scheme::Both | Scheme::Pairs => split_short_rows(input, cin, plan.inputs(), &mut buffers.rows),
@@ -99,94 +102,87 @@ pub(crate) fn accumulate(
     if small {
         sums.resize(
             plan.groups() * plan.group() * weights.extents.panels(),
-            Lanes::default(),
+            Words::default(),
         );
-        // SAFETY: as above, and it has AMX; `rows` has just been filled for this plan and these weights.
-        unsafe {
-            match weights.scheme {
-                Scheme::Pairs => pairs::multiply(weights, plan, buffers, sums),
-                _ => multiply(weights, plan, buffers, sums),
-            }
+        match weights.scheme {
+            Scheme::Pairs => pairs::multiply(amx, weights, plan, buffers, sums),
+            _ => multiply(amx, weights, plan, buffers, sums),
         }
     }
     small
 }
 
-/// Writes rows as tile rows of 64 channels, first the high digits of all rows, then the low ones, then their sums. Zeros follow each
-/// time. Tells whether all were small enough.
-///
-/// # Safety
-/// The processor must have AVX-512 F, BW and VL; the input must have the rows.
-#[target_feature(enable = "avx512f,avx512bw,avx512vl")]
-unsafe fn split_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) -> bool {
-    let chunks = cin.div_ceil(LINE);
-    let (highs, rest) = to.split_at_mut((rows.len() + 1) * chunks);
-    let (lows, both) = rest.split_at_mut(highs.len());
-    let mut largest = _mm512_setzero_si512();
-    for chunk in 0..chunks {
-        let there = u64::MAX >> LINE.saturating_sub(cin - chunk * LINE);
-        for (i, &row) in rows.iter().enumerate() {
-            // SAFETY: of the row's values only those that are there are read, and whole lines written.
-            unsafe {
-                let from = input.as_ptr().add(row as usize * cin + chunk * LINE);
-                let a = _mm512_maskz_loadu_epi16(there as u32, from);
-                let b = _mm512_maskz_loadu_epi16((there >> 32) as u32, from.wrapping_add(32));
+with_avx512! {
+    /// Writes rows as tile rows of 64 channels, first the high digits of all rows, then the low ones, then their sums. Zeros follow each
+    /// time. Tells whether all were small enough.
+    fn split_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Words]) -> bool {
+        let chunks = cin.div_ceil(LINE);
+        let (highs, rest) = to.split_at_mut((rows.len() + 1) * chunks);
+        let (lows, both) = rest.split_at_mut(highs.len());
+        let mut largest = _mm512_setzero_si512();
+        for chunk in 0..chunks {
+            let there = u64::MAX >> LINE.saturating_sub(cin - chunk * LINE);
+            for (i, &row) in rows.iter().enumerate() {
+                let from = &input[row as usize * cin + chunk * LINE..][..(cin - chunk * LINE).min(LINE)];
+                // SAFETY: only the values of `from` are read.
+                let (a, b) = unsafe {
+                    (
+                        _mm512_maskz_loadu_epi16(there as u32, from.as_ptr()),
+                        _mm512_maskz_loadu_epi16((there >> 32) as u32, from.as_ptr().wrapping_add(32)),
+                    )
+                };
                 largest = _mm512_max_epu16(largest, _mm512_abs_epi16(a));
                 largest = _mm512_max_epu16(largest, _mm512_abs_epi16(b));
                 let ((high_a, low_a), (high_b, low_b)) = (split(a), split(b));
                 let high = _mm512_packs_epi16(high_a, high_b);
                 let low = _mm512_packs_epi16(low_a, low_b);
                 let at = i * chunks + chunk;
-                _mm512_store_si512(std::ptr::from_mut(&mut highs[at]).cast(), high);
-                _mm512_store_si512(std::ptr::from_mut(&mut lows[at]).cast(), low);
-                let sum = _mm512_add_epi8(high, low);
-                _mm512_store_si512(std::ptr::from_mut(&mut both[at]).cast(), sum);
+                highs[at] = must_cast(high);
+                lows[at] = must_cast(low);
+                both[at] = must_cast(_mm512_add_epi8(high, low));
             }
         }
+        for zeros in [highs, lows, both] {
+            zeros[rows.len() * chunks..].fill(Words::default());
+        }
+        within_reach(largest)
     }
-    for zeros in [highs, lows, both] {
-        zeros[rows.len() * chunks..].fill(Lanes::default());
-    }
-    within_reach(largest)
 }
 
-/// Writes rows as a tile row each, first the high digits, then the low ones. A row of zeros follows. Tells whether all were small enough.
-///
-/// # Safety
-/// The processor must have AVX-512 F, BW and VL; the input must have the rows, of at most 32 channels.
-#[target_feature(enable = "avx512f,avx512bw,avx512vl")]
-unsafe fn split_short_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Lanes]) -> bool {
-    let (to, zeros) = to.split_at_mut(rows.len());
-    let mut largest = _mm512_setzero_si512();
-    let there = u32::MAX >> (HALF - cin);
-    for (i, (to, &row)) in to.iter_mut().zip(rows).enumerate() {
-        if let Some(&next) = rows.get(i + AHEAD) {
-            prefetch(&input[next as usize * cin..][..cin]);
-        }
-        // SAFETY: of the row's values only those that are there are read, and a whole line written.
-        unsafe {
-            let x = _mm512_maskz_loadu_epi16(there, input.as_ptr().add(row as usize * cin));
+with_avx512! {
+    /// Writes rows as a tile row each, first the high digits, then the low ones. A row of zeros follows. Tells whether all were small enough.
+    fn split_short_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Words]) -> bool {
+        let (to, zeros) = to.split_at_mut(rows.len());
+        let mut largest = _mm512_setzero_si512();
+        let there = u32::MAX >> (HALF - cin);
+        for (i, (to, &row)) in to.iter_mut().zip(rows).enumerate() {
+            if let Some(&next) = rows.get(i + AHEAD) {
+                prefetch(&input[next as usize * cin..][..cin]);
+            }
+            let from = &input[row as usize * cin..][..cin.min(HALF)];
+            // SAFETY: only the values of `from` are read.
+            let x = unsafe { _mm512_maskz_loadu_epi16(there, from.as_ptr()) };
             largest = _mm512_max_epu16(largest, _mm512_abs_epi16(x));
             let (high, low) = split(x);
-            let to = std::ptr::from_mut(to).cast::<__m256i>();
-            _mm256_store_si256(to, _mm512_cvtepi16_epi8(high));
-            _mm256_store_si256(to.add(1), _mm512_cvtepi16_epi8(low));
+            *to = must_cast([_mm512_cvtepi16_epi8(high), _mm512_cvtepi16_epi8(low)]);
         }
+        zeros.fill(Words::default());
+        within_reach(largest)
     }
-    zeros.fill(Lanes::default());
-    within_reach(largest)
 }
 
-/// [`digits`] of 32 numbers.
-#[target_feature(enable = "avx512f,avx512bw")]
-#[inline]
-fn split(x: __m512i) -> (__m512i, __m512i) {
-    let high = _mm512_srai_epi16::<6>(_mm512_add_epi16(x, _mm512_set1_epi16(32)));
-    (high, _mm512_sub_epi16(x, _mm512_slli_epi16::<6>(high)))
+with_avx512! {
+    /// [`digits`] of 32 numbers.
+    #[inline]
+    fn split(x: __m512i) -> (__m512i, __m512i) {
+        let high = _mm512_srai_epi16::<6>(_mm512_add_epi16(x, _mm512_set1_epi16(32)));
+        (high, _mm512_sub_epi16(x, _mm512_slli_epi16::<6>(high)))
+    }
 }
 
-#[target_feature(enable = "avx512f,avx512bw")]
-#[inline]
-fn within_reach(largest: __m512i) -> bool {
-    _mm512_cmpgt_epu16_mask(largest, _mm512_set1_epi16(REACH)) == 0
+with_avx512! {
+    #[inline]
+    fn within_reach(largest: __m512i) -> bool {
+        _mm512_cmpgt_epu16_mask(largest, _mm512_set1_epi16(REACH)) == 0
+    }
 }

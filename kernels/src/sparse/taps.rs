@@ -1,11 +1,12 @@
 //! Which input rows each output row reads, and through which tap of the kernel.
 
-use crate::family;
-
+use super::children;
 #[cfg(target_arch = "x86_64")]
-use crate::machine;
-use crate::plan::Plan;
-use crate::rows::TILE;
+use super::lists;
+use super::plan::Plan;
+use super::rows::TILE;
+#[cfg(target_arch = "x86_64")]
+use crate::simd::Simd;
 use crate::simd::{Isa, Level};
 
 /// Marks a tap that reads nothing.
@@ -113,7 +114,7 @@ impl TileTaps {
             Taps::AllChildren { neighbours, .. } => {
                 let mut map = std::mem::take(&mut self.map);
                 map.resize(count * volume, ABSENT);
-                family::rows_of_all(neighbours, first, &mut map);
+                children::rows_of_all(neighbours, first, &mut map);
                 end = self.fill_from(isa, &map);
                 self.map = map;
             }
@@ -152,11 +153,9 @@ impl TileTaps {
             #[cfg(target_arch = "aarch64")]
             Level::Neon(_) | Level::NeonDot(..) => fill_map(lists),
             #[cfg(target_arch = "x86_64")]
-            // SAFETY: an `Isa` of these levels is only made where the processor has AVX2. Every list has room for the
-            // tile's rows and eight more.
-            Level::Avx2(_) | Level::AvxVnni(..) | Level::Avx512(_) | Level::Amx(..) => unsafe {
-                machine::avx2_lists::fill_map(lists)
-            },
+            Level::Avx2(token) | Level::AvxVnni(_, token) => lists::fill_map(token, lists),
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512(token) | Level::Amx(_, token) => lists::fill_map(token.narrow(), lists),
         }
     }
 

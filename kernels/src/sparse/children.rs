@@ -1,7 +1,7 @@
 //! The 3³ neighbours of voxels' children, from those of the voxels: a child's neighbour lies in its parent or in one of its parent's 26
 //! neighbours, and the neighbours of all eight siblings fill a window of 4³ positions around them.
 
-use crate::taps::ABSENT;
+use super::taps::ABSENT;
 
 /// For every position of the window, x fastest: the parent's neighbour it lies in and its octant there.
 const WINDOW: [(u8, u8); 64] = {

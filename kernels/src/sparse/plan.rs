@@ -3,10 +3,10 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use crate::rows::TILE;
+use super::MIN_GROUP;
+use super::rows::TILE;
+use super::taps::{Taps, TileTaps};
 use crate::simd::Isa;
-use crate::taps::{Taps, TileTaps};
-use crate::tile::MIN_GROUP;
 
 /// A kernel map arranged for the layers that read it, part by part as they first do, in the smallest groups and in larger ones. It pays where a
 /// map serves several layers; results are the same without.
@@ -22,7 +22,7 @@ impl Plan {
 
 /// Up to [`TILE`] rows of a kernel map, arranged.
 ///
-/// Rows are sorted by which taps they use, and cut into groups of [`crate::tile::group`]: what a group multiplies is the taps that any of its rows
+/// Rows are sorted by which taps they use, and cut into groups of [`super::group`]: what a group multiplies is the taps that any of its rows
 /// uses.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct PlanTile {

@@ -14,11 +14,14 @@
 use std::arch::aarch64::*;
 use std::arch::asm;
 
-use crate::machine::{halves_mut, neon};
-use crate::rows::{Extents, Lanes, PANEL};
+use bytemuck::{must_cast, must_cast_slice_mut};
+
+use crate::f16;
 use crate::simd::Isa;
-use crate::tile::Block;
-use crate::{ceiling, f16};
+use crate::simd::neon::{NeonHalf, with_neon_half};
+use crate::sparse::Block;
+use crate::sparse::peak::some_words;
+use crate::sparse::rows::{Extents, PANEL, Words};
 
 /// Products that are summed in f16.
 const BLOCK: usize = 16;
@@ -33,7 +36,7 @@ const ROWS: usize = 4;
 #[derive(Debug, Clone)]
 pub(crate) struct Weights {
     /// Per tap, panel and two input channels, in whole blocks: the weights of the one for all outputs, then those of the other.
-    pub lanes: Vec<Lanes>,
+    pub words: Vec<Words>,
     /// What a sum of each output channel is to be multiplied by: powers of two.
     pub units: Vec<[f32; PANEL]>,
 }
@@ -50,16 +53,16 @@ impl Weights {
         }
         let units: Vec<_> = peaks.into_iter().map(|peaks| peaks.map(unit)).collect();
         let steps = steps(extents.cin);
-        let mut lanes = vec![Lanes::default(); extents.volume * panels * steps];
+        let mut words = vec![Words::default(); extents.volume * panels * steps];
         for (tap, channel, panel) in extents.each() {
-            let step = &mut lanes[(tap * panels + panel) * steps + channel / 2].0;
+            let step = &mut words[(tap * panels + panel) * steps + channel / 2].0;
             let weights = weights(tap, channel, panel).into_iter().zip(units[panel]);
             for (lane, (weight, unit)) in weights.enumerate() {
                 let bits = f16::from_f32(weight / unit).to_bits();
                 step[(channel % 2 * PANEL + lane) / 2] |= u32::from(bits) << (lane % 2 * 16);
             }
         }
-        Weights { lanes, units }
+        Weights { words, units }
     }
 }
 
@@ -79,7 +82,7 @@ fn steps(cin: usize) -> usize {
 
 /// Writes rows as they are, and zeros up to whole blocks.
 pub(crate) fn gather(_: Isa, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
-    let each = halves_mut(to).chunks_exact_mut(2 * steps(cin));
+    let each = must_cast_slice_mut::<_, i16>(to).chunks_exact_mut(2 * steps(cin));
     for (to, &row) in each.zip(rows) {
         let (to, rest) = to.split_at_mut(cin);
         for (to, from) in to.iter_mut().zip(&input[row as usize * cin..][..cin]) {
@@ -94,63 +97,71 @@ type Products = [[uint16x8_t; 2]; ROWS];
 
 /// Sums a block's products for a panel; of half a panel the rest is zeros.
 ///
-/// # Safety
-/// The processor must have `fp16`, and the block's pointers what they promise for a whole panel, in whole blocks of [`BLOCK`] inputs.
-pub(crate) unsafe fn run(block: &Block) {
+/// # Panics
+/// If the block reads or writes beyond its slices, or has no whole blocks of [`BLOCK`] inputs.
+pub(super) fn multiply(isa: Isa, mut block: Block<'_>, _whole: usize) {
+    assert!(isa.has_half() && (2 * block.steps).is_multiple_of(BLOCK));
     for first in (0..block.group).step_by(ROWS) {
-        // SAFETY: the caller's promise, for some of the group's rows.
-        unsafe { multiply(block, first) };
+        // SAFETY: the processor has `fp16`.
+        unsafe { multiply_rows(&mut block, first) };
     }
 }
 
-/// The sums of the rows from `first` on.
-///
-/// # Safety
-/// As [`run`], and the block must have these rows.
-#[target_feature(enable = "neon,fp16")]
-unsafe fn multiply(block: &Block, first: usize) {
-    // SAFETY: the caller's promise: each row has `steps` words, whole blocks of them, and so many lanes the panel of each tap.
-    unsafe {
-        let mut outputs = [block.sums.cast::<f32>(); ROWS];
-        for (r, output) in outputs.iter_mut().enumerate() {
-            *output = output.add((first + r) * block.stride);
-        }
+with_neon_half! {
+    /// The sums of the rows from `first` on.
+    fn multiply_rows(block: &mut Block<'_>, first: usize) {
         let mut sums = [[vdupq_n_f32(0.0); 4]; ROWS];
         if block.more {
-            for (sums, from) in sums.iter_mut().zip(outputs) {
-                for (v, sum) in sums.iter_mut().enumerate() {
-                    *sum = vld1q_f32(from.add(v * 4));
-                }
+            for (r, sums) in sums.iter_mut().enumerate() {
+                *sums = must_cast(block.sums[(first + r) * block.stride]);
             }
         }
         let mut products: Products = [[vdupq_n_u16(0); 2]; ROWS];
-        for t in 0..block.count {
-            let mut inputs = [block.inputs.cast::<u16>(); ROWS];
+        for (t, &tap) in block.taps.iter().enumerate() {
+            let mut inputs = [std::ptr::null::<u16>(); ROWS];
             for (r, input) in inputs.iter_mut().enumerate() {
-                let place = usize::from(*block.places.add(t * block.group + first + r));
-                *input = input.add(place * block.steps * 2);
+                let place = usize::from(block.places[t * block.group + first + r]);
+                *input = block.inputs[place * block.steps..][..block.steps].as_ptr().cast();
             }
-            let tap = usize::from(*block.taps.add(t));
-            let mut weights = block.weights.add(tap * block.tap).cast::<u16>();
+            let mut weights = block.weights[usize::from(tap) * block.tap..][..block.steps].as_ptr().cast::<u16>();
             for _ in 0..block.steps * 2 / BLOCK {
-                begin(&mut products, &mut inputs, &mut weights);
-                for _ in 1..BLOCK / EIGHT {
-                    add(&mut products, &mut inputs, &mut weights);
+                // SAFETY: of each row and of the weights, as many inputs are read as they were just cut to: whole blocks.
+                unsafe {
+                    begin(&mut products, &mut inputs, &mut weights);
+                    for _ in 1..BLOCK / EIGHT {
+                        add(&mut products, &mut inputs, &mut weights);
+                    }
                 }
                 for (sums, &[left, right]) in sums.iter_mut().zip(&products) {
-                    let [a, b] = neon::widened(left);
-                    let [c, d] = neon::widened(right);
+                    let [a, b] = widened(left);
+                    let [c, d] = widened(right);
                     for (sum, block) in sums.iter_mut().zip([a, b, c, d]) {
                         *sum = vaddq_f32(*sum, block);
                     }
                 }
             }
         }
-        for (sums, to) in sums.iter().zip(outputs) {
-            for (v, &sum) in sums.iter().enumerate() {
-                vst1q_f32(to.add(v * 4), sum);
-            }
+        for (r, sums) in sums.into_iter().enumerate() {
+            block.sums[(first + r) * block.stride] = must_cast(sums);
         }
+    }
+}
+
+with_neon_half! {
+    /// Eight f16 as f32.
+    #[inline]
+    fn widened(narrow: uint16x8_t) -> [float32x4_t; 2] {
+        let (low, high);
+        // SAFETY: instructions between registers, which any NEON has.
+        unsafe {
+            asm!(
+                "fcvtl {low:v}.4s, {narrow:v}.4h",
+                "fcvtl2 {high:v}.4s, {narrow:v}.8h",
+                low = out(vreg) low, high = lateout(vreg) high, narrow = in(vreg) narrow,
+                options(pure, nomem, nostack, preserves_flags),
+            );
+        }
+        [low, high]
     }
 }
 
@@ -191,12 +202,11 @@ macro_rules! channel {
 /// The next eight input channels. All in one piece, with as many registers as are left beside the sums: of single instructions compilers
 /// make an order that takes more.
 macro_rules! eight {
-    ($(#[$doc:meta])* $name:ident, $first:literal) => {
+    ($(#[$doc:meta])* $name:ident, $first:literal) => { with_neon_half! {
         $(#[$doc])*
         ///
         /// # Safety
-        /// The processor must have `fp16`, and there must be eight inputs of each row, and eight panels of weights, which it steps over.
-        #[target_feature(enable = "neon,fp16")]
+        /// There must be eight inputs of each row, and eight panels of weights, which it steps over.
         #[inline]
         unsafe fn $name(products: &mut Products, inputs: &mut [*const u16; ROWS], weights: &mut *const u16) {
             let [[al, ar], [bl, br], [cl, cr], [dl, dr]] = products;
@@ -240,7 +250,7 @@ macro_rules! eight {
                 *weights = weights.add(EIGHT * PANEL);
             }
         }
-    };
+    } };
 }
 
 eight! {
@@ -252,20 +262,23 @@ eight! {
     add, "fmla"
 }
 
-/// Multiplies for as long as `rounds` say, and gives the number of words multiplied, two products each: see [`crate::ceiling`].
-///
-/// # Safety
-/// The processor must have `fp16`.
-#[target_feature(enable = "neon,fp16")]
-pub(crate) unsafe fn spin(rounds: usize) -> usize {
-    let words: [Lanes; EIGHT / 2] = ceiling::some_words();
-    let from: *const u16 = words.as_ptr().cast();
-    let mut sums: Products = [[vdupq_n_u16(0); 2]; ROWS];
-    for _ in 0..rounds {
-        let from = std::hint::black_box(from);
-        // SAFETY: the words are eight panels of weights, of which any eight are factors too.
-        unsafe { add(&mut sums, &mut [from; ROWS], &mut { from }) };
+/// Multiply-adds for as long as `rounds` say; the result is the number of words multiplied, two products each.
+pub(super) fn batch(_: NeonHalf, rounds: usize) -> usize {
+    // SAFETY: the token proves `fp16`.
+    unsafe { run_batch(rounds) }
+}
+
+with_neon_half! {
+    fn run_batch(rounds: usize) -> usize {
+        let words: [Words; EIGHT / 2] = some_words();
+        let from: *const u16 = words.as_ptr().cast();
+        let mut sums: Products = [[vdupq_n_u16(0); 2]; ROWS];
+        for _ in 0..rounds {
+            let from = std::hint::black_box(from);
+            // SAFETY: the words are eight panels of weights, of which any eight are factors too.
+            unsafe { add(&mut sums, &mut [from; ROWS], &mut { from }) };
+        }
+        std::hint::black_box(sums);
+        rounds * EIGHT * ROWS * PANEL / 2
     }
-    std::hint::black_box(sums);
-    rounds * EIGHT * ROWS * PANEL / 2
 }

@@ -1,19 +1,23 @@
 //! Sparse convolution in integers: the same bits on every machine.
 
+use std::cell::RefCell;
 use std::sync::OnceLock;
 
-use crate::finish::{Finish, Tile, Value, finish_tile};
+use bytemuck::must_cast_slice_mut;
+
 #[cfg(target_arch = "x86_64")]
-use crate::machine::amx;
+use super::amx;
 #[cfg(target_arch = "aarch64")]
-use crate::machine::dot;
-use crate::machine::{halves_mut, with_halves};
-use crate::norms::{Energy, Gains, Norms};
-use crate::rows::{AHEAD, Extents, IN_ORDER, Lanes, Output, PANEL, Scratch, panels, with_scratch};
+use super::dot;
+use super::epilogue::{Epilogue, Tile, Value, write_tile};
+use super::kernel::multiply;
+use super::norms::{Energy, Gains, Norms};
+use super::winograd;
 use crate::simd::{Isa, Simd, dispatch, prefetch};
-use crate::taps::Taps;
-use crate::tile::{Arithmetic, accumulate};
-use crate::winograd;
+use crate::sparse::plan::PlanTile;
+use crate::sparse::rows::{AHEAD, Extents, IN_ORDER, Output, PANEL, Scratch, Words, panels, with_scratch};
+use crate::sparse::taps::Taps;
+use crate::sparse::{accumulate, group};
 
 /// The largest magnitude of an activation.
 pub const LIMIT: i16 = 2047;
@@ -50,8 +54,8 @@ pub enum Requantise {
 pub struct ExactConv {
     extents: Extents,
     /// Per tap, panel and pair of input channels: each output channel's two weights, side by side.
-    weights: Vec<Lanes>,
-    finish: Finish,
+    weights: Vec<Words>,
+    epilogue: Epilogue,
     /// What [`Isa::has_tiles`] multiplies, once it is needed: nothing, if weights are too large for it.
     #[cfg(target_arch = "x86_64")]
     tiles: OnceLock<Option<amx::Weights>>,
@@ -71,15 +75,15 @@ impl ExactConv {
     pub fn new(volume: usize, cin: usize, cout: usize, weights: &[i16], requantise: Requantise) -> Self {
         let extents = Extents { volume, cin, cout };
         extents.check(weights.len());
-        let finish = match requantise {
+        let epilogue = match requantise {
             Requantise::Shift { bias, shift } => {
                 assert!(
                     bias.len() == cout && shift.len() == cout,
                     "one bias and shift per channel"
                 );
                 assert!(shift.iter().all(|&s| s < 32), "a shift is above 31");
-                let shift: Vec<u32> = shift.into_iter().map(u32::from).collect();
-                Finish::Shift {
+                let shift: Vec<i32> = shift.into_iter().map(i32::from).collect();
+                Epilogue::Shift {
                     bias: panels(&bias),
                     shift: panels(&shift),
                 }
@@ -89,7 +93,7 @@ impl ExactConv {
                     scale.len() == cout && bias.len() == cout,
                     "one scale and bias per channel"
                 );
-                Finish::Scale {
+                Epilogue::Scale {
                     scale: panels(&scale),
                     bias: panels(&bias),
                 }
@@ -104,21 +108,21 @@ impl ExactConv {
                     let sum = &mut energy[panel][lane];
                     *sum = sum.add(u32::from(w.unsigned_abs()).pow(2));
                 });
-                Finish::Invariant {
+                Epilogue::Invariant {
                     gains: Gains::new(energy, panels(&gain)),
                     bias: panels(&bias),
                 }
             }
         };
         let steps = cin.div_ceil(2);
-        let mut packed = vec![Lanes::default(); volume * extents.panels() * steps];
+        let mut packed = vec![Words::default(); volume * extents.panels() * steps];
         extents.place(weights, |w, panel, c, lane| {
             packed[panel * steps + c / 2].0[lane] |= place(w, c % 2);
         });
         ExactConv {
             extents,
             weights: packed,
-            finish,
+            epilogue,
             #[cfg(target_arch = "x86_64")]
             tiles: OnceLock::new(),
             #[cfg(target_arch = "aarch64")]
@@ -155,7 +159,7 @@ impl ExactConv {
     pub fn run_f32(&self, isa: Isa, taps: Taps<'_>, input: &[i16], first: usize, output: Output<'_, f32, i16>) {
         assert!(output.residual.is_none(), "nothing is added to real results");
         assert!(
-            !matches!(self.finish, Finish::Shift { .. }),
+            !matches!(self.epilogue, Epilogue::Shift { .. }),
             "shifted results are no real numbers"
         );
         self.each_tile(isa, taps, input, first, output);
@@ -179,65 +183,75 @@ impl ExactConv {
             && output.len().is_multiple_of(8)
             && let Some(weights) = self.winograd()
         {
-            return self.each_family(isa, weights, neighbours, input, first, output);
+            return self.each_parent(isa, weights, neighbours, input, first, output);
         }
-        let group = crate::tile::group(isa, self.extents.cout);
+        let group = group(isa, self.extents.cout);
         with_scratch(|scratch| {
-            for (row, output) in output.tiles() {
-                let (first, cout) = (first + row, self.extents.cout);
-                let Scratch {
-                    taps: tile,
-                    sums,
-                    expanded,
-                    norms,
-                    planner,
-                    winograd: _,
-                    #[cfg(target_arch = "x86_64")]
-                    tiles,
-                    #[cfg(target_arch = "aarch64")]
-                    digits,
-                } = scratch;
-                let plan = planner.plan(isa, group, &taps, [first, output.len()], tile);
-                #[cfg(target_arch = "x86_64")]
-                let done = isa.has_tiles()
-                    && self
-                        .tiles()
-                        .is_some_and(|weights| amx::integers::accumulate(isa, weights, plan, input, tiles, sums));
-                #[cfg(target_arch = "aarch64")]
-                let done = isa.dot().is_some()
-                    && self
-                        .digits()
-                        .is_some_and(|weights| dot::accumulate(isa, weights, plan, input, digits, sums));
-                #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
-                let done = false;
-                if !done {
-                    accumulate(
-                        isa,
-                        Arithmetic::Integer,
-                        self.extents,
-                        &self.weights,
-                        plan,
-                        (input, pair_up),
-                        expanded,
-                        sums,
-                    );
-                }
-                let (positions, masks) = (plan.positions(), plan.masks());
-                let (layer, tile) = (
-                    &self.finish,
-                    Tile {
+            let Scratch {
+                taps: tile,
+                planner,
+                expanded,
+                sums,
+            } = scratch;
+            with_own(|own| {
+                for (row, output) in output.tiles() {
+                    let plan = planner.plan(isa, group, &taps, [first + row, output.len()], tile);
+                    self.sum(isa, plan, input, expanded, own, sums);
+                    let tile = Tile {
                         output,
-                        cout,
-                        positions,
-                        masks,
-                    },
-                );
-                let sums = &sums[..];
-                with_halves!(isa, fn finish_tile<T: Value>(
-                    layer: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, T>,
-                ));
-            }
+                        cout: self.extents.cout,
+                        positions: plan.positions(),
+                        masks: plan.masks(),
+                    };
+                    self.write(isa, sums, &mut own.norms, tile);
+                }
+            });
         });
+    }
+
+    /// The sums of a tile.
+    fn sum(
+        &self,
+        isa: Isa,
+        plan: &PlanTile,
+        input: &[i16],
+        expanded: &mut Vec<Words>,
+        own: &mut Own,
+        sums: &mut Vec<Words>,
+    ) {
+        #[cfg(target_arch = "x86_64")]
+        if let Some(amx) = isa.tiles()
+            && let Some(weights) = self.tiles()
+            && amx::integers::accumulate(amx, weights, plan, input, &mut own.tiles, sums)
+        {
+            return;
+        }
+        #[cfg(target_arch = "aarch64")]
+        if let Some(token) = isa.dot()
+            && let Some(weights) = self.digits()
+            && dot::accumulate(token, weights, plan, input, &mut own.digits, sums)
+        {
+            return;
+        }
+        let _ = own;
+        accumulate(
+            isa,
+            multiply,
+            self.extents,
+            &self.weights,
+            plan,
+            (input, pair_up),
+            expanded,
+            sums,
+        );
+    }
+
+    /// Writes a tile's results.
+    fn write<T: Value>(&self, isa: Isa, sums: &[Words], norms: &mut Norms, tile: Tile<'_, T>) {
+        let layer = &self.epilogue;
+        dispatch!(isa, fn write_tile<T: Value>(
+            layer: &Epilogue, sums: &[Words], norms: &mut Norms, tile: Tile<'_, T>,
+        ));
     }
 
     /// The weights of a tap, from an input channel to a panel of output channels.
@@ -249,7 +263,7 @@ impl ExactConv {
     }
 
     /// All children of voxels, by minimal filtering.
-    fn each_family<T: Value>(
+    fn each_parent<T: Value>(
         &self,
         isa: Isa,
         weights: &winograd::Weights,
@@ -258,28 +272,21 @@ impl ExactConv {
         first: usize,
         mut output: Output<'_, T, i16>,
     ) {
-        with_scratch(|scratch| {
-            for (row, output) in output.tiles() {
-                let voxels = (first + row) / 8..(first + row + output.len()) / 8;
-                let neighbours = &neighbours[voxels.start * 27..voxels.end * 27];
-                let Scratch {
-                    sums,
-                    norms,
-                    winograd: buffers,
-                    ..
-                } = scratch;
-                let masks = winograd::accumulate(isa, weights, neighbours, input, buffers, sums);
-                let tile = Tile {
-                    output,
-                    cout: self.extents.cout,
-                    positions: &IN_ORDER[..masks.len()],
-                    masks,
-                };
-                let (layer, sums) = (&self.finish, &sums[..]);
-                with_halves!(isa, fn finish_tile<T: Value>(
-                    layer: &Finish, sums: &[Lanes], norms: &mut Norms, tile: Tile<'_, T>,
-                ));
-            }
+        with_scratch(|Scratch { sums, .. }| {
+            with_own(|own| {
+                for (row, output) in output.tiles() {
+                    let voxels = (first + row) / 8..(first + row + output.len()) / 8;
+                    let neighbours = &neighbours[voxels.start * 27..voxels.end * 27];
+                    let masks = winograd::accumulate(isa, weights, neighbours, input, &mut own.winograd, sums);
+                    let tile = Tile {
+                        output,
+                        cout: self.extents.cout,
+                        positions: &IN_ORDER[..masks.len()],
+                        masks,
+                    };
+                    self.write(isa, sums, &mut own.norms, tile);
+                }
+            });
         });
     }
 
@@ -307,6 +314,23 @@ impl ExactConv {
     }
 }
 
+/// Per-thread scratch of integer layers, besides [`Scratch`].
+#[derive(Default)]
+struct Own {
+    norms: Norms,
+    winograd: winograd::Buffers,
+    #[cfg(target_arch = "x86_64")]
+    tiles: amx::Buffers,
+    #[cfg(target_arch = "aarch64")]
+    digits: dot::Buffers,
+}
+
+/// Lends this thread's [`Own`].
+fn with_own(run: impl FnOnce(&mut Own)) {
+    thread_local!(static OWN: RefCell<Own> = RefCell::default());
+    OWN.with_borrow_mut(run);
+}
+
 /// The half of a word that the pair's first or second value takes.
 pub(crate) fn place(value: i16, which: usize) -> u32 {
     u32::from(value as u16) << (16 * (which ^ usize::from(cfg!(target_endian = "big"))))
@@ -319,7 +343,7 @@ fn pair_up(isa: Isa, input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
 
 #[inline(always)]
 fn pair_rows<S: Simd>(_: S, input: &[i16], rows: &[u32], cin: usize, to: &mut [u32]) {
-    let to = halves_mut(to).chunks_exact_mut(cin.next_multiple_of(2));
+    let to = must_cast_slice_mut::<_, i16>(to).chunks_exact_mut(cin.next_multiple_of(2));
     for (i, (to, &row)) in to.zip(rows).enumerate() {
         if let Some(&next) = rows.get(i + AHEAD) {
             prefetch(&input[next as usize * cin..][..cin]);

@@ -1,22 +1,23 @@
 //! Sparse convolution in floats: f16 in memory, f32 in between.
 
+use std::cell::RefCell;
 #[cfg(target_arch = "x86_64")]
 use std::sync::OnceLock;
 
 use ::half::{bf16, f16};
+use bytemuck::must_cast_slice_mut;
 
-use crate::convert::{self, Halves};
-#[cfg(target_arch = "x86_64")]
-use crate::machine::amx;
 #[cfg(target_arch = "aarch64")]
-use crate::machine::half;
-use crate::machine::{self, with_halves};
-use crate::norms::{Gains, Norms};
-use crate::plan::PlanTile;
-use crate::rows::{Extents, Lanes, Output, PANEL, Scratch, panel, panels, store, with_scratch};
-use crate::simd::Isa;
-use crate::taps::Taps;
-use crate::tile::{Arithmetic, Expand, accumulate};
+use super::half;
+use super::{convert, kernel};
+#[cfg(target_arch = "x86_64")]
+use crate::exact::amx;
+use crate::exact::norms::{Gains, Norms};
+use crate::simd::{F32Vector, Isa, Simd, dispatch};
+use crate::sparse::plan::PlanTile;
+use crate::sparse::rows::{Extents, Output, PANEL, Scratch, Words, panel, panels, store, with_scratch};
+use crate::sparse::taps::Taps;
+use crate::sparse::{Expand, Multiply, accumulate, group};
 
 /// What happens to sums.
 #[derive(Debug, Clone)]
@@ -51,9 +52,9 @@ pub enum Precision {
 pub struct FloatConv {
     extents: Extents,
     /// Per tap, panel and input channel: each output channel's weight.
-    weights: Vec<Lanes>,
+    weights: Vec<Words>,
     /// Per tap, panel and pair of input channels: each output channel's two weights in bf16. Empty unless asked for.
-    brain: Vec<Lanes>,
+    brain: Vec<Words>,
     /// What [`Isa::has_half`] multiplies, if it was asked for.
     #[cfg(target_arch = "aarch64")]
     half: Option<half::Weights>,
@@ -72,36 +73,29 @@ impl FloatOut for f32 {}
 impl FloatOut for f16 {}
 
 mod sealed {
+    use super::{F32Vector, PANEL, Simd, convert};
     use crate::f16;
-
-    use super::{Halves, PANEL};
 
     pub trait Sealed: Sized {
         /// Writes a panel, or as much of it as there is.
-        ///
-        /// # Safety
-        /// The processor must have `H`'s instructions.
-        #[expect(private_bounds, reason = "only this crate calls it")]
-        unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [Self]);
+        fn store<S: Simd>(simd: S, from: &[f32; PANEL], to: &mut [Self]);
     }
 
     impl Sealed for f32 {
         #[inline(always)]
-        #[expect(private_bounds, reason = "only this crate calls it")]
-        unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [f32]) {
-            super::store(from, to);
+        fn store<S: Simd>(_: S, from: &[f32; PANEL], to: &mut [f32]) {
+            super::store(*from, to);
         }
     }
 
     impl Sealed for f16 {
         #[inline(always)]
-        #[expect(private_bounds, reason = "only this crate calls it")]
-        unsafe fn store<H: Halves>(from: [f32; PANEL], to: &mut [f16]) {
-            match to.as_mut_array() {
-                // SAFETY: the caller's promise.
-                Some(to) => unsafe { H::narrow(&from, to) },
-                // SAFETY: the caller's promise.
-                None => unsafe { crate::convert::narrow::<H>(&from[..to.len()], to) },
+        fn store<S: Simd>(simd: S, from: &[f32; PANEL], to: &mut [f16]) {
+            let Some(to) = to.as_mut_array::<PANEL>() else {
+                return convert::narrow(simd, &from[..to.len()], to);
+            };
+            for at in (0..PANEL).step_by(S::LANES) {
+                S::F32::load(simd, &from[at..]).store_f16(&mut to[at..]);
             }
         }
     }
@@ -127,7 +121,7 @@ impl FloatConv {
                 Some(Gains::new(energy, panels(&gain)))
             }
         };
-        let mut packed = vec![Lanes::default(); volume * extents.panels() * cin];
+        let mut packed = vec![Words::default(); volume * extents.panels() * cin];
         extents.place(weights, |w, panel, c, lane| {
             packed[panel * cin + c].0[lane] = w.to_f32().to_bits();
         });
@@ -152,14 +146,14 @@ impl FloatConv {
         self.precision = precision;
         self.brain = match precision {
             Precision::F32 | Precision::Fastest | Precision::Half => Vec::new(),
-            Precision::Bf16 => vec![Lanes::default(); volume * self.extents.panels() * pairs],
+            Precision::Bf16 => vec![Words::default(); volume * self.extents.panels() * pairs],
         };
         let panels = self.brain.chunks_exact_mut(pairs);
         for (to, from) in panels.zip(self.weights.chunks_exact(cin)) {
             for (c, from) in from.iter().enumerate() {
                 for (to, from) in to[c / 2].0.iter_mut().zip(from.f32()) {
                     // The only machines with bf16 keep the first value in the low half.
-                    *to |= u32::from(bf16::from_f32(from).to_bits()) << (c % 2 * 16);
+                    *to |= u32::from(bf16::from_f32(*from).to_bits()) << (c % 2 * 16);
                 }
             }
         }
@@ -175,7 +169,7 @@ impl FloatConv {
     #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
     fn weight(&self, tap: usize, channel: usize, panel: usize) -> [f32; PANEL] {
         let Extents { cin, .. } = self.extents;
-        self.weights[(tap * self.extents.panels() + panel) * cin + channel].f32()
+        *self.weights[(tap * self.extents.panels() + panel) * cin + channel].f32()
     }
 
     /// What it computes in, where the machine can.
@@ -193,22 +187,18 @@ impl FloatConv {
         self.extents.cin
     }
 
-    /// What to multiply, and how to prepare what it is multiplied by.
-    fn chosen(&self, isa: Isa) -> (Arithmetic, &[Lanes], Expand<f16>) {
+    /// What to multiply by which micro-kernel, and how to prepare what it is multiplied by.
+    fn chosen(&self, isa: Isa) -> (Multiply, &[Words], Expand<f16>) {
         #[cfg(target_arch = "x86_64")]
         if self.precision() == Precision::Bf16 && isa.has_bf16() {
-            return (Arithmetic::Brain, &self.brain, |isa, input, rows, cin, to| {
-                assert!(isa.has_bf16());
-                // SAFETY: the processor has AVX512_BF16, and what `Isa` stands for where it does.
-                unsafe { machine::avx512::to_brain(input, rows, cin, to) };
-            });
+            return (super::bf16::multiply, &self.brain, super::bf16::expand);
         }
         #[cfg(target_arch = "aarch64")]
         if let Some(half) = self.half(isa) {
-            return (Arithmetic::Half, &half.lanes, half::gather);
+            return (half::multiply, &half.words, half::gather);
         }
         let _ = isa;
-        (Arithmetic::Float, &self.weights, widen)
+        (kernel::multiply, &self.weights, widen)
     }
 
     /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations each.
@@ -228,55 +218,76 @@ impl FloatConv {
             self.extents.volume,
             "these taps belong to another kernel"
         );
-        let group = crate::tile::group(isa, self.extents.cout);
+        let group = group(isa, self.extents.cout);
         with_scratch(|scratch| {
             let Scratch {
                 taps: tile,
-                sums,
-                expanded,
-                norms,
                 planner,
-                winograd: _,
-                #[cfg(target_arch = "x86_64")]
-                tiles,
-                #[cfg(target_arch = "aarch64")]
-                    digits: _,
+                expanded,
+                sums,
             } = scratch;
-            for (row, output) in output.tiles() {
-                let plan = planner.plan(isa, group, &taps, [first + row, output.len()], tile);
-                #[cfg(target_arch = "x86_64")]
-                let done = isa.has_tiles() && matches!(self.precision, Precision::Bf16 | Precision::Fastest);
-                #[cfg(target_arch = "x86_64")]
-                if done {
-                    amx::brain::accumulate(isa, self.tiles(), plan, input, tiles, sums);
+            with_own(|own| {
+                for (row, output) in output.tiles() {
+                    let plan = planner.plan(isa, group, &taps, [first + row, output.len()], tile);
+                    self.sum(isa, plan, input, expanded, own, sums);
+                    #[cfg(target_arch = "aarch64")]
+                    let units = self.half(isa).map(|half| &half.units[..]);
+                    #[cfg(not(target_arch = "aarch64"))]
+                    let units = None;
+                    let (conv, norms, sums) = (self, &mut own.norms, &sums[..]);
+                    dispatch!(isa, fn write_tile<T: FloatOut>(
+                        conv: &FloatConv, units: Option<&[[f32; PANEL]]>, norms: &mut Norms, sums: &[Words], plan: &PlanTile,
+                        output: Output<'_, T, f16>,
+                    ));
                 }
-                #[cfg(not(target_arch = "x86_64"))]
-                let done = false;
-                if !done {
-                    let (arithmetic, weights, expand) = self.chosen(isa);
-                    accumulate(
-                        isa,
-                        arithmetic,
-                        self.extents,
-                        weights,
-                        plan,
-                        (input, expand),
-                        expanded,
-                        sums,
-                    );
-                }
-                #[cfg(target_arch = "aarch64")]
-                let units = self.half(isa).map(|half| &half.units[..]);
-                #[cfg(not(target_arch = "aarch64"))]
-                let units = None;
-                let (conv, norms, sums) = (self, &mut *norms, &sums[..]);
-                with_halves!(isa, fn finish_tile<T: FloatOut>(
-                    conv: &FloatConv, units: Option<&[[f32; PANEL]]>, norms: &mut Norms, sums: &[Lanes], plan: &PlanTile,
-                    output: Output<'_, T, f16>,
-                ));
-            }
+            });
         });
     }
+
+    /// The sums of a tile.
+    fn sum(
+        &self,
+        isa: Isa,
+        plan: &PlanTile,
+        input: &[f16],
+        expanded: &mut Vec<Words>,
+        own: &mut Own,
+        sums: &mut Vec<Words>,
+    ) {
+        #[cfg(target_arch = "x86_64")]
+        if let Some(tokens) = isa.tiles().zip(isa.bf16())
+            && matches!(self.precision, Precision::Bf16 | Precision::Fastest)
+        {
+            super::amx::accumulate(tokens, self.tiles(), plan, input, &mut own.tiles, sums);
+            return;
+        }
+        let _ = own;
+        let (multiply, weights, expand) = self.chosen(isa);
+        accumulate(
+            isa,
+            multiply,
+            self.extents,
+            weights,
+            plan,
+            (input, expand),
+            expanded,
+            sums,
+        );
+    }
+}
+
+/// Per-thread scratch of float layers, besides [`Scratch`].
+#[derive(Default)]
+struct Own {
+    norms: Norms,
+    #[cfg(target_arch = "x86_64")]
+    tiles: amx::Buffers,
+}
+
+/// Lends this thread's [`Own`].
+fn with_own(run: impl FnOnce(&mut Own)) {
+    thread_local!(static OWN: RefCell<Own> = RefCell::default());
+    OWN.with_borrow_mut(run);
 }
 
 #[cfg(target_arch = "aarch64")]
@@ -292,35 +303,31 @@ impl FloatConv {
     /// The weights in tiles.
     fn tiles(&self) -> &amx::Weights {
         self.tiles
-            .get_or_init(|| amx::Weights::of_brain(self.extents, |tap, c, panel| self.weight(tap, c, panel)))
+            .get_or_init(|| super::amx::weights(self.extents, |tap, c, panel| self.weight(tap, c, panel)))
     }
 }
 
 /// Rows as f32.
 fn widen(isa: Isa, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
-    with_halves!(isa, fn widen_rows<>(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]));
+    dispatch!(isa, fn widen_rows(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]));
 }
 
-/// # Safety
-/// The processor must have `H`'s instructions.
 #[inline(always)]
-unsafe fn widen_rows<H: Halves>(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
-    for (to, &row) in machine::floats_mut(to).chunks_exact_mut(cin).zip(rows) {
-        // SAFETY: the caller's promise.
-        unsafe { convert::widen::<H>(&input[row as usize * cin..][..cin], to) };
+fn widen_rows<S: Simd>(simd: S, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
+    let to: &mut [f32] = must_cast_slice_mut(to);
+    for (to, &row) in to.chunks_exact_mut(cin).zip(rows) {
+        convert::widen(simd, &input[row as usize * cin..][..cin], to);
     }
 }
 
 /// Sums are multiplied by their channels' `units`, if they have any, before all else.
-///
-/// # Safety
-/// The processor must have `H`'s instructions.
 #[inline(always)]
-unsafe fn finish_tile<H: Halves, T: FloatOut>(
+fn write_tile<S: Simd, T: FloatOut>(
+    simd: S,
     conv: &FloatConv,
     units: Option<&[[f32; PANEL]]>,
     norms: &mut Norms,
-    sums: &[Lanes],
+    sums: &[Words],
     plan: &PlanTile,
     output: Output<'_, T, f16>,
 ) {
@@ -337,13 +344,10 @@ unsafe fn finish_tile<H: Halves, T: FloatOut>(
         let sums = &sums[usize::from(position) * panels..][..panels];
         let residual = residual.map(|all| &all[row * stride + column..][..cout]);
         let row = &mut rows[row * stride + column..][..cout];
-        let factors = conv.invariant.as_ref().map(|gains| {
-            // SAFETY: the caller's promise.
-            unsafe { norms.of::<H, _>(gains, mask) }
-        });
+        let factors = conv.invariant.as_ref().map(|gains| norms.of(simd, gains, mask));
         let panels = row.chunks_mut(PANEL).zip(sums).zip(&conv.bias);
         for (p, ((row, sums), bias)) in panels.enumerate() {
-            let mut sums = sums.f32();
+            let mut sums = *sums.f32();
             if let Some(units) = units {
                 for (sum, unit) in sums.iter_mut().zip(&units[p]) {
                     *sum *= unit;
@@ -358,18 +362,16 @@ unsafe fn finish_tile<H: Halves, T: FloatOut>(
                 *sum += bias;
             }
             if let Some(residual) = residual {
-                let mut skip = [0.0; PANEL];
-                // SAFETY: the caller's promise.
-                unsafe { H::widen(&panel(&residual[p * PANEL..][..row.len()]), &mut skip) };
-                for (sum, x) in sums.iter_mut().zip(skip) {
-                    *sum += x;
+                let skip = panel(&residual[p * PANEL..][..row.len()]);
+                for at in (0..PANEL).step_by(S::LANES) {
+                    let sum = S::F32::load(simd, &sums[at..]) + S::F32::load_f16(simd, &skip[at..]);
+                    sum.store(&mut sums[at..]);
                 }
             }
             if relu {
                 sums.iter_mut().for_each(|sum| *sum = sum.max(0.0));
             }
-            // SAFETY: the caller's promise.
-            unsafe { T::store::<H>(sums, row) };
+            T::store(simd, &sums, row);
         }
     }
 }

@@ -1,10 +1,11 @@
-//! What both convolutions share: where they write, the extents of their weights, and the memory that a thread reuses.
+//! What both convolutions share: words of 32 bits in panels, the extents of weights, where a layer writes, and per-thread scratch.
 
 use std::cell::RefCell;
 
-use crate::norms::Norms;
-use crate::plan::Planner;
-use crate::taps::TileTaps;
+use bytemuck::{Pod, Zeroable};
+
+use super::plan::Planner;
+use super::taps::TileTaps;
 
 /// Channels of one weight panel.
 pub(crate) const PANEL: usize = 16;
@@ -62,20 +63,35 @@ impl<T, R> Output<'_, T, R> {
     }
 }
 
-/// Sixteen 32-bit words: a panel's sums, or its weights of one step. Floats are kept as their bits.
+/// Sixteen words of 32 bits: a panel's sums, or its weights of one step. Floats are kept as their bits.
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(crate) struct Lanes(pub [u32; PANEL]);
+pub(crate) struct Words(pub [u32; PANEL]);
 
-impl Lanes {
+// SAFETY: all bits zero are sixteen zeros.
+unsafe impl Zeroable for Words {}
+
+// SAFETY: sixteen u32 and nothing else: 64 bytes are their size and their alignment, so there is no padding.
+unsafe impl Pod for Words {}
+
+impl Words {
+    /// The words as signed integers.
     #[inline(always)]
-    pub fn i32(&self) -> [i32; PANEL] {
-        std::array::from_fn(|j| self.0[j] as i32)
+    pub fn i32(&self) -> &[i32; PANEL] {
+        bytemuck::must_cast_ref(&self.0)
     }
 
+    /// The words as signed integers.
     #[inline(always)]
-    pub fn f32(&self) -> [f32; PANEL] {
-        std::array::from_fn(|j| f32::from_bits(self.0[j]))
+    pub fn i32_mut(&mut self) -> &mut [i32; PANEL] {
+        bytemuck::must_cast_mut(&mut self.0)
+    }
+
+    /// The words as floats.
+    #[cfg(feature = "close")]
+    #[inline(always)]
+    pub fn f32(&self) -> &[f32; PANEL] {
+        bytemuck::must_cast_ref(&self.0)
     }
 }
 
@@ -90,6 +106,7 @@ pub(crate) fn panels<T: Copy + Default>(values: &[T]) -> Vec<[T; PANEL]> {
 }
 
 /// At most a panel's values, and zeros after them.
+#[cfg(feature = "close")]
 #[inline(always)]
 pub(crate) fn panel<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
     match <&[T; PANEL]>::try_from(from) {
@@ -99,6 +116,7 @@ pub(crate) fn panel<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
 }
 
 /// Writes a panel's values, or as many of them as there is room for.
+#[cfg(feature = "close")]
 #[inline(always)]
 pub(crate) fn store<T: Copy>(from: [T; PANEL], to: &mut [T]) {
     match <&mut [T; PANEL]>::try_from(&mut *to) {
@@ -188,19 +206,13 @@ impl Extents {
     }
 }
 
-/// What a thread needs for any layer, kept from one call to the next.
+/// Per-thread scratch of any layer, kept from one call to the next.
 #[derive(Default)]
 pub(crate) struct Scratch {
     pub taps: TileTaps,
-    pub sums: Vec<Lanes>,
-    pub expanded: Vec<Lanes>,
-    pub norms: Norms,
     pub planner: Planner,
-    pub winograd: crate::winograd::Buffers,
-    #[cfg(target_arch = "x86_64")]
-    pub tiles: crate::machine::amx::Buffers,
-    #[cfg(target_arch = "aarch64")]
-    pub digits: crate::machine::dot::Buffers,
+    pub expanded: Vec<Words>,
+    pub sums: Vec<Words>,
 }
 
 /// Lends this thread's [`Scratch`].

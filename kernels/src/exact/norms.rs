@@ -2,8 +2,10 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::rows::PANEL;
-use crate::winograd::Registers;
+use bytemuck::{must_cast_mut, must_cast_ref};
+
+use crate::simd::{I32Vector, Simd};
+use crate::sparse::rows::PANEL;
 
 /// Sets of taps that are remembered at once.
 const SLOTS: usize = 1024;
@@ -49,11 +51,8 @@ impl<E: Energy> Gains<E> {
     }
 
     /// The gains over the norms of the weights of some taps.
-    ///
-    /// # Safety
-    /// The processor must have `R`'s instructions.
     #[inline(always)]
-    unsafe fn factors<R: Registers>(&self, mask: u64, to: &mut [[f32; PANEL]]) {
+    fn factors<S: Simd>(&self, simd: S, mask: u64, to: &mut [[f32; PANEL]]) {
         let panels = self.energy.chunks_exact(self.energy.len() / self.gain.len());
         for ((to, gain), parts) in to.iter_mut().zip(&self.gain).zip(panels) {
             let chosen = parts.as_chunks::<{ 1 << PART }>().0.iter().enumerate();
@@ -61,8 +60,7 @@ impl<E: Energy> Gains<E> {
                 let some = (mask >> (part * PART)) as usize % (1 << PART);
                 &energy[some]
             });
-            // SAFETY: the caller's promise.
-            let sum = unsafe { E::sum::<R>(chosen) };
+            let sum = E::sum(simd, chosen);
             *to = std::array::from_fn(|lane| sum[lane].factor(gain[lane]));
         }
     }
@@ -78,10 +76,7 @@ fn add<E: Energy>(sum: &mut [E; PANEL], other: &[E; PANEL]) {
 pub(crate) trait Energy: Copy + Default + 'static {
     fn add(self, other: Self) -> Self;
     /// Of some panels.
-    ///
-    /// # Safety
-    /// The processor must have `R`'s instructions.
-    unsafe fn sum<'a, R: Registers>(panels: impl Iterator<Item = &'a [Self; PANEL]> + Clone) -> [Self; PANEL];
+    fn sum<'a, S: Simd>(simd: S, panels: impl Iterator<Item = &'a [Self; PANEL]> + Clone) -> [Self; PANEL];
     /// `gain` over the norm.
     fn factor(self, gain: f32) -> f32;
 }
@@ -93,20 +88,15 @@ impl Energy for u32 {
     }
 
     #[inline(always)]
-    unsafe fn sum<'a, R: Registers>(panels: impl Iterator<Item = &'a [u32; PANEL]> + Clone) -> [u32; PANEL] {
+    fn sum<'a, S: Simd>(simd: S, panels: impl Iterator<Item = &'a [u32; PANEL]> + Clone) -> [u32; PANEL] {
         let mut sum = [0; PANEL];
         // Of its own accord the compiler adds one by one.
-        for at in (0..size_of_val(&sum)).step_by(R::BYTES) {
-            let mut panels = panels.clone().map(|panel| panel.as_ptr().cast::<u8>());
-            let Some(first) = panels.next() else {
-                break;
-            };
-            // SAFETY: the caller's promise, and a panel holds a whole number of registers.
-            unsafe {
-                let first = R::read(first.add(at));
-                let sum_of = panels.fold(first, |sum, panel| R::add32(sum, R::read(panel.add(at))));
-                R::write(sum.as_mut_ptr().cast::<u8>().add(at), sum_of);
-            }
+        for at in (0..PANEL).step_by(S::LANES) {
+            let load = |panel: &[u32; PANEL]| S::I32::load(simd, &must_cast_ref::<_, [i32; PANEL]>(panel)[at..]);
+            let all = panels
+                .clone()
+                .fold(S::I32::splat(simd, 0), |sum, panel| sum + load(panel));
+            all.store(&mut must_cast_mut::<_, [i32; PANEL]>(&mut sum)[at..]);
         }
         sum
     }
@@ -124,7 +114,7 @@ impl Energy for f32 {
     }
 
     #[inline(always)]
-    unsafe fn sum<'a, R: Registers>(panels: impl Iterator<Item = &'a [f32; PANEL]> + Clone) -> [f32; PANEL] {
+    fn sum<'a, S: Simd>(_: S, panels: impl Iterator<Item = &'a [f32; PANEL]> + Clone) -> [f32; PANEL] {
         panels.fold([0.0; PANEL], |sum, panel| {
             std::array::from_fn(|lane| sum[lane] + panel[lane])
         })
@@ -148,11 +138,8 @@ pub(crate) struct Norms {
 
 impl Norms {
     /// The layer's factors for a set of taps.
-    ///
-    /// # Safety
-    /// The processor must have `R`'s instructions.
     #[inline(always)]
-    pub unsafe fn of<R: Registers, E: Energy>(&mut self, gains: &Gains<E>, mask: u64) -> &[[f32; PANEL]] {
+    pub fn of<S: Simd, E: Energy>(&mut self, simd: S, gains: &Gains<E>, mask: u64) -> &[[f32; PANEL]] {
         let panels = gains.gain.len();
         if self.layer != gains.id {
             self.layer = gains.id;
@@ -163,8 +150,7 @@ impl Norms {
         let slot = (mask.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32) as usize % SLOTS;
         let factors = &mut self.factors[slot * panels..][..panels];
         if self.masks[slot] != mask {
-            // SAFETY: the caller's promise.
-            unsafe { gains.factors::<R>(mask, factors) };
+            gains.factors(simd, mask, factors);
             self.masks[slot] = mask;
         }
         factors

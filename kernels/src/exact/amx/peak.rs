@@ -1,27 +1,27 @@
-//! Loops of tile products alone: see [`crate::ceiling`].
+//! Peak throughput of tiles: loops of their products alone.
 
 use std::arch::asm;
 
 use super::{LINE, TILE, configure, release};
-use crate::ceiling::some_words;
-use crate::rows::{Lanes, PANEL};
+use crate::simd::Amx;
+use crate::sparse::peak::some_words;
+use crate::sparse::rows::{PANEL, Words};
 
 /// As many tiles of bytes between −32 and 31: the digits of numbers are no larger.
-fn some_digits<const N: usize>() -> [Lanes; N] {
+fn some_digits<const N: usize>() -> [Words; N] {
     let digits = |word: u32| {
         let of = |byte: u8| ((byte << 2) as i8 >> 2) as u8;
         u32::from_le_bytes(word.to_le_bytes().map(of))
     };
     // Their lower bytes are as good as any.
-    some_words().map(|words: Lanes| Lanes(words.0.map(|word| digits(word ^ word << 8))))
+    some_words().map(|words: Words| Words(words.0.map(|word| digits(word ^ word << 8))))
 }
 
 /// A function that multiplies tiles of `$words` `4 · rounds` times, and gives the number of products of `$bytes` bytes.
-macro_rules! spin {
+macro_rules! batch {
     ($name:ident, $multiply:literal, $bytes:literal, $words:expr) => {
-        pub(crate) fn $name(isa: crate::Isa, rounds: usize) -> usize {
-            assert!(isa.has_tiles());
-            let words: [Lanes; 4 * TILE] = $words;
+        pub(crate) fn $name(_: Amx, rounds: usize) -> usize {
+            let words: [Words; 4 * TILE] = $words;
             configure();
             // SAFETY: tiles are configured, and four of them read; the registers that are written are named.
             unsafe {
@@ -50,5 +50,6 @@ macro_rules! spin {
         }
     };
 }
-spin!(spin, "tdpbssd", 1, some_digits());
-spin!(spin_brain, "tdpbf16ps", 2, some_words());
+batch!(bytes, "tdpbssd", 1, some_digits());
+#[cfg(feature = "close")]
+batch!(bf16, "tdpbf16ps", 2, some_words());

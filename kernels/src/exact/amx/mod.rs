@@ -1,29 +1,28 @@
 //! AMX: tiles of 16 rows by 64 bytes, multiplied and summed in 32 bits.
 //!
-//! Here is what multiplies a plan's groups by tiles of weights; [`integers`] and [`brain`] cut numbers into what tiles hold.
+//! This is what multiplies a plan's groups by tiles of weights; [`integers`], and `close` for bf16, cut numbers into what tiles hold.
 
-pub(crate) mod brain;
 pub(crate) mod integers;
 mod pairs;
-mod spin;
+pub(crate) mod peak;
 
 use std::arch::asm;
 
-pub(crate) use spin::{spin, spin_brain};
-
-use crate::plan::PlanTile;
-use crate::rows::{Extents, Lanes, PANEL};
+use crate::simd::Amx;
+use crate::simd::avx512::with_avx512;
+use crate::sparse::plan::PlanTile;
+use crate::sparse::rows::{Extents, PANEL, Words};
 
 /// Bytes of a tile row.
-const LINE: usize = 64;
-/// [`Lanes`] of a tile, and rows of a group.
+pub(crate) const LINE: usize = 64;
+/// [`Words`] of a tile, and rows of a group.
 const TILE: usize = 16;
 /// Tiles of weights that the first cache holds besides rows and products.
 const CACHED: usize = 28;
 
 /// What is in the tiles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Scheme {
+pub(crate) enum Scheme {
     /// High digits, low ones and their sums in three passes of a tile row each 64 channels.
     Digits,
     /// 32 high digits and 32 low ones in a tile row, which meet three tiles of weights: columns of high, mixed and low products.
@@ -31,22 +30,22 @@ enum Scheme {
     /// 32 channels of two taps in a tile row, of one digit: see [`pairs`].
     Pairs,
     /// 32 channels in bf16.
-    Brain,
+    Bf16,
 }
 
 /// A layer's weights in tiles.
 #[derive(Debug, Clone)]
 pub(crate) struct Weights {
-    extents: Extents,
+    pub extents: Extents,
     scheme: Scheme,
     /// `[pass][tap][chunk][column]` tiles: four input bytes of one output channel are a word.
-    tiles: Vec<Lanes>,
+    tiles: Vec<Words>,
     /// Of each tap, its pair and half, if taps are multiplied in pairs.
     homes: Vec<[usize; 2]>,
 }
 
 impl Weights {
-    fn new(extents: Extents, scheme: Scheme) -> Weights {
+    pub fn new(extents: Extents, scheme: Scheme) -> Weights {
         let mut weights = Weights {
             extents,
             scheme,
@@ -58,7 +57,7 @@ impl Weights {
             _ => extents.volume,
         };
         let tiles = weights.passes() * taps * weights.chunks() * weights.columns();
-        weights.tiles.resize(tiles * TILE, Lanes::default());
+        weights.tiles.resize(tiles * TILE, Words::default());
         weights
     }
 
@@ -66,7 +65,7 @@ impl Weights {
     fn passes(&self) -> usize {
         match self.scheme {
             Scheme::Digits => 3,
-            Scheme::Both | Scheme::Pairs | Scheme::Brain => 1,
+            Scheme::Both | Scheme::Pairs | Scheme::Bf16 => 1,
         }
     }
 
@@ -74,7 +73,7 @@ impl Weights {
     fn chunks(&self) -> usize {
         match self.scheme {
             Scheme::Digits => self.extents.cin.div_ceil(LINE),
-            Scheme::Both | Scheme::Pairs | Scheme::Brain => self.extents.cin.div_ceil(LINE / 2),
+            Scheme::Both | Scheme::Pairs | Scheme::Bf16 => self.extents.cin.div_ceil(LINE / 2),
         }
     }
 
@@ -82,7 +81,7 @@ impl Weights {
     fn columns(&self) -> usize {
         match self.scheme {
             Scheme::Both | Scheme::Pairs => 3 * self.extents.panels(),
-            Scheme::Digits | Scheme::Brain => self.extents.panels(),
+            Scheme::Digits | Scheme::Bf16 => self.extents.panels(),
         }
     }
 
@@ -98,12 +97,12 @@ impl Weights {
         match self.scheme {
             // Rows are short: their sums would be stored and loaded too often.
             Scheme::Both | Scheme::Pairs => self.extents.volume,
-            Scheme::Digits | Scheme::Brain => (CACHED / width).max(1),
+            Scheme::Digits | Scheme::Bf16 => (CACHED / width).max(1),
         }
     }
 
     /// The words, one for each output channel of a column, that multiply the bytes from `byte` on of a tap's tile rows.
-    fn words(&mut self, pass: usize, tap: usize, byte: usize, column: usize) -> &mut [u32; PANEL] {
+    pub fn words(&mut self, pass: usize, tap: usize, byte: usize, column: usize) -> &mut [u32; PANEL] {
         let (chunk, byte) = (byte / LINE, byte % LINE);
         let tap = pass * self.extents.volume + tap;
         let tile = (tap * self.chunks() + chunk) * self.columns() + column;
@@ -115,11 +114,11 @@ impl Weights {
 #[derive(Default)]
 pub(crate) struct Buffers {
     /// The input rows that a tile reads, as tile rows, and a row of zeros: `[pass][row][chunk]`.
-    rows: Vec<Lanes>,
+    pub rows: Vec<Words>,
     /// What a group multiplies now, and what next.
-    gathered: Vec<Lanes>,
+    gathered: Vec<Words>,
     /// The products: `[pass][block of columns][group][column]` tiles.
-    products: Vec<Lanes>,
+    products: Vec<Words>,
     /// What [`pairs`] multiplies.
     steps: pairs::Steps,
 }
@@ -127,72 +126,80 @@ pub(crate) struct Buffers {
 /// Room for a plan's input rows, once it is known that they are there.
 ///
 /// # Panics
-/// If the processor lacks AMX, the plan is another kernel's, or it reads beyond the input of so many rows.
-fn prepare(isa: crate::Isa, weights: &Weights, plan: &PlanTile, inputs: usize, buffers: &mut Buffers) {
-    assert!(isa.has_tiles());
+/// If the plan is another kernel's, or it reads beyond the input of so many rows.
+pub(crate) fn prepare(weights: &Weights, plan: &PlanTile, inputs: usize, buffers: &mut Buffers) {
     plan.check(weights.extents.volume, inputs);
     let lines = (plan.inputs().len() + 1) * weights.chunks();
-    buffers.rows.resize(weights.passes() * lines, Lanes::default());
+    buffers.rows.resize(weights.passes() * lines, Words::default());
 }
 
-/// # Safety
-/// The processor must have AMX and AVX-512 F and BW, `buffers.rows` the plan's input rows in tile rows as the weights' scheme has them.
+/// The sums of all groups, of `buffers.rows`: the plan's input rows in tile rows as the weights' scheme has them, and then one of zeros.
 ///
 /// Weights of all taps are more than the first cache holds: for as many taps as do fit, all groups are multiplied by them, and their sums
 /// stored and loaded again with the next taps.
-#[target_feature(enable = "avx2,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512vl")]
-unsafe fn multiply(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, sums: &mut [Lanes]) {
-    let Buffers {
-        rows,
-        gathered,
-        products,
-        ..
-    } = buffers;
-    let Extents { volume, .. } = weights.extents;
-    let (chunks, columns, passes) = (weights.chunks(), weights.columns(), weights.passes());
-    let panels = weights.extents.panels();
-    let (per_tap, lines) = (chunks * columns * TILE, rows.len() / passes);
-    let (width, groups) = (weights.width(), plan.groups());
-    gathered.resize(2 * TILE, Lanes::default());
-    products.resize(passes * columns * groups * TILE, Lanes::default());
-    configure();
-    for pass in 0..passes {
-        for column in (0..columns).step_by(width) {
-            let width = width.min(columns - column);
-            let first = (pass * columns + column) * groups * TILE;
-            let products = &mut products[first..][..width * groups * TILE];
-            let taps = weights.taps(width);
-            for (tap, chunk) in (0..volume)
-                .step_by(taps)
-                .flat_map(|tap| (0..chunks).map(move |chunk| (tap, chunk)))
-            {
-                let tile = (pass * volume * chunks + chunk) * columns + column;
-                for (group, to) in products.chunks_exact_mut(width * TILE).enumerate() {
-                    let (taps, places) = plan.steps(group, tap..(tap + taps).min(volume));
-                    let block = Block {
-                        steps: taps.len(),
-                        taps: taps.as_ptr(),
-                        places: places.as_ptr(),
-                        rows: rows[pass * lines + chunk..].as_ptr(),
-                        row: chunks * LINE,
-                        gathered: gathered.as_mut_ptr(),
-                        weights: weights.tiles[tile * TILE..].as_ptr(),
-                        tap: per_tap * LINE,
-                        to: to.as_mut_ptr(),
-                        more: usize::from(tap + chunk > 0),
-                    };
-                    // SAFETY: all rows that the places name are there, and one of zeros; so are the weights of all taps from this
-                    // chunk and column on, room for two tiles and for the products. Tiles are configured.
-                    unsafe { block.run(width, weights.scheme) };
+///
+/// # Panics
+/// If there are fewer rows.
+pub(crate) fn multiply(_: Amx, weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, sums: &mut [Words]) {
+    // SAFETY: the token proves AMX and AVX-512.
+    unsafe { multiply_groups(weights, plan, buffers, sums) }
+}
+
+with_avx512! {
+    fn multiply_groups(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, sums: &mut [Words]) {
+        let Buffers {
+            rows,
+            gathered,
+            products,
+            ..
+        } = buffers;
+        let Extents { volume, .. } = weights.extents;
+        let (chunks, columns, passes) = (weights.chunks(), weights.columns(), weights.passes());
+        let panels = weights.extents.panels();
+        let (per_tap, lines) = (chunks * columns * TILE, rows.len() / passes);
+        assert!(lines >= (plan.inputs().len() + 1) * chunks, "a tile row of zeros after the plan's");
+        let (width, groups) = (weights.width(), plan.groups());
+        gathered.resize(2 * TILE, Words::default());
+        products.resize(passes * columns * groups * TILE, Words::default());
+        configure();
+        for pass in 0..passes {
+            for column in (0..columns).step_by(width) {
+                let width = width.min(columns - column);
+                let first = (pass * columns + column) * groups * TILE;
+                let products = &mut products[first..][..width * groups * TILE];
+                let taps = weights.taps(width);
+                for (tap, chunk) in (0..volume)
+                    .step_by(taps)
+                    .flat_map(|tap| (0..chunks).map(move |chunk| (tap, chunk)))
+                {
+                    let tile = (pass * volume * chunks + chunk) * columns + column;
+                    for (group, to) in products.chunks_exact_mut(width * TILE).enumerate() {
+                        let (taps, places) = plan.steps(group, tap..(tap + taps).min(volume));
+                        let block = Block {
+                            steps: taps.len(),
+                            taps: taps.as_ptr(),
+                            places: places.as_ptr(),
+                            rows: rows[pass * lines + chunk..].as_ptr(),
+                            row: chunks * LINE,
+                            gathered: gathered.as_mut_ptr(),
+                            weights: weights.tiles[tile * TILE..].as_ptr(),
+                            tap: per_tap * LINE,
+                            to: to.as_mut_ptr(),
+                            more: usize::from(tap + chunk > 0),
+                        };
+                        // SAFETY: all rows that the places name are there, and one of zeros; so are the weights of all taps from this
+                        // chunk and column on, room for two tiles and for the products. Tiles are configured.
+                        unsafe { block.run(width, weights.scheme) };
+                    }
                 }
             }
         }
-    }
-    release();
-    for group in 0..groups {
-        let first = group * TILE * panels;
-        let sums = &mut sums[first..][..TILE * panels];
-        combine(weights, [group, groups], products, sums);
+        release();
+        for group in 0..groups {
+            let first = group * TILE * panels;
+            let sums = &mut sums[first..][..TILE * panels];
+            combine(weights, [group, groups], products, sums);
+        }
     }
 }
 
@@ -205,17 +212,17 @@ struct Block {
     /// For each step, and one more, which sixteen of the rows to multiply.
     places: *const u16,
     /// Input rows.
-    rows: *const Lanes,
+    rows: *const Words,
     /// Bytes from one to the next.
     row: usize,
     /// Room for two tiles.
-    gathered: *mut Lanes,
+    gathered: *mut Words,
     /// Tiles of weights of the first tap.
-    weights: *const Lanes,
+    weights: *const Words,
     /// Bytes from one tap's to the next's.
     tap: usize,
     /// The products, a tile for each column.
-    to: *mut Lanes,
+    to: *mut Words,
     /// Whether there already are some to add to, or 0.
     more: usize,
 }
@@ -227,10 +234,10 @@ impl Block {
         // SAFETY: the caller's promise.
         unsafe {
             match (columns, scheme) {
-                (1, Scheme::Brain) => one_brain(self),
-                (2, Scheme::Brain) => two_brain(self),
-                (3, Scheme::Brain) => three_brain(self),
-                (_, Scheme::Brain) => four_brain(self),
+                (1, Scheme::Bf16) => one_bf16(self),
+                (2, Scheme::Bf16) => two_bf16(self),
+                (3, Scheme::Bf16) => three_bf16(self),
+                (_, Scheme::Bf16) => four_bf16(self),
                 (1, _) => one(self),
                 (2, _) => two(self),
                 (3, _) => three(self),
@@ -423,55 +430,56 @@ columns!(
 );
 columns!(
     /// One column of bf16.
-    one_brain, "tdpbf16ps", "4", ("0", "5", "0")
+    one_bf16, "tdpbf16ps", "4", ("0", "5", "0")
 );
 columns!(
     /// Two columns of bf16.
-    two_brain, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024")
+    two_bf16, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024")
 );
 columns!(
     /// Three columns of bf16.
-    three_brain, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048")
+    three_bf16, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048")
 );
 columns!(
     /// Four columns of bf16.
-    four_brain, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048"), ("3", "5", "3072")
+    four_bf16, "tdpbf16ps", "4", ("0", "5", "0"), ("1", "6", "1024"), ("2", "7", "2048"), ("3", "5", "3072")
 );
 
-/// Puts together the products of a group.
-#[target_feature(enable = "avx512f")]
-#[inline]
-fn combine(weights: &Weights, [group, groups]: [usize; 2], products: &[Lanes], sums: &mut [Lanes]) {
-    let panels = weights.extents.panels();
-    let (columns, block) = (weights.columns(), weights.width());
-    // The tile of a pass's column: blocks of columns, then groups, then the block's columns.
-    let tile = |pass: usize, column: usize| {
-        let first = column - column % block;
-        let width = block.min(columns - first);
-        let tile = (pass * columns + first) * groups + group * width + column - first;
-        &products[tile * TILE..][..TILE]
-    };
-    for panel in 0..panels {
-        let [high, low, mixed] = match weights.scheme {
-            Scheme::Digits => [0, 1, 2].map(|pass| tile(pass, panel)),
-            Scheme::Both => [0, 2, 1].map(|digit| tile(0, digit * panels + panel)),
-            Scheme::Brain => [tile(0, panel); 3],
-            Scheme::Pairs => unreachable!("`pairs` puts its own together"),
+with_avx512! {
+    /// Puts together the products of a group.
+    #[inline]
+    fn combine(weights: &Weights, [group, groups]: [usize; 2], products: &[Words], sums: &mut [Words]) {
+        let panels = weights.extents.panels();
+        let (columns, block) = (weights.columns(), weights.width());
+        // The tile of a pass's column: blocks of columns, then groups, then the block's columns.
+        let tile = |pass: usize, column: usize| {
+            let first = column - column % block;
+            let width = block.min(columns - first);
+            let tile = (pass * columns + first) * groups + group * width + column - first;
+            &products[tile * TILE..][..TILE]
         };
-        for (at, sums) in sums.chunks_exact_mut(panels).enumerate() {
-            let (high, low, mixed) = (high[at].0, low[at].0, mixed[at].0);
-            let sum = &mut sums[panel];
-            sum.0 = std::array::from_fn(|lane: usize| {
-                let (high, low) = (high[lane], low[lane]);
-                if weights.scheme == Scheme::Brain {
-                    return high;
-                }
-                let mut mixed = mixed[lane];
-                if weights.scheme == Scheme::Digits {
-                    mixed = mixed.wrapping_sub(high).wrapping_sub(low);
-                }
-                (high << 12).wrapping_add(mixed << 6).wrapping_add(low)
-            });
+        for panel in 0..panels {
+            let [high, low, mixed] = match weights.scheme {
+                Scheme::Digits => [0, 1, 2].map(|pass| tile(pass, panel)),
+                Scheme::Both => [0, 2, 1].map(|digit| tile(0, digit * panels + panel)),
+                Scheme::Bf16 => [tile(0, panel); 3],
+                Scheme::Pairs => unreachable!("`pairs` puts its own together"),
+            };
+            for (at, sums) in sums.chunks_exact_mut(panels).enumerate() {
+                let (high, low, mixed) = (high[at].0, low[at].0, mixed[at].0);
+                let sum = &mut sums[panel];
+                sum.0 = std::array::from_fn(|lane: usize| {
+                    let (high, low) = (high[lane], low[lane]);
+                    if weights.scheme == Scheme::Bf16 {
+                        return high;
+                    }
+                    let mut mixed = mixed[lane];
+                    if weights.scheme == Scheme::Digits {
+                        mixed = mixed.wrapping_sub(high).wrapping_sub(low);
+                    }
+                    (high << 12).wrapping_add(mixed << 6).wrapping_add(low)
+                });
+            }
         }
     }
 }

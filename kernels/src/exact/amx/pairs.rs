@@ -3,14 +3,16 @@
 use std::arch::asm;
 
 use super::{Buffers, LINE, TILE, Weights, configure, release};
-use crate::plan::PlanTile;
-use crate::rows::{Extents, Lanes, MOST_TAPS};
+use crate::simd::Amx;
+use crate::simd::avx512::with_avx512;
+use crate::sparse::plan::PlanTile;
+use crate::sparse::rows::{Extents, MOST_TAPS, Words};
 
 /// Panels whose sums of three products fit the tiles, beside one of rows and one of weights.
 const WIDTH: usize = 2;
 /// Products of digits: high, low, and of their sums.
 const PRODUCTS: usize = 3;
-/// [`Lanes`] of a group's products.
+/// [`Words`] of a group's products.
 const STORED: usize = WIDTH * PRODUCTS * TILE;
 
 /// The taps of a 3³ kernel in pairs that few groups need: on surfaces a voxel has both neighbours or none more often than not.
@@ -58,7 +60,7 @@ pub(super) fn tile(extents: Extents, pair: usize, product: usize, panel: usize) 
 struct Step {
     /// For each tap, which sixteen of the rows.
     places: [*const u16; 2],
-    weights: *const Lanes,
+    weights: *const Words,
 }
 
 /// Memory that a thread reuses.
@@ -76,121 +78,130 @@ struct Block {
     steps: *const Step,
     count: usize,
     /// Input rows, high digits and low ones.
-    rows: *const Lanes,
+    rows: *const Words,
     /// Room for three tiles each: the rows of the first step, those of the second, and nothing yet.
-    gathered: [*mut Lanes; 3],
+    gathered: [*mut Words; 3],
     /// Where the products go.
-    to: *mut Lanes,
+    to: *mut Words,
 }
 
-/// The sums of all groups: `sums[row · panels + panel]`.
+/// The sums of all groups: `sums[row · panels + panel]`, of `buffers.rows`: the plan's input rows, high digits and low ones, and then one
+/// of zeros.
 ///
 /// What a step multiplies is gathered two steps before, in whatever group they are: what has just been written to memory takes long to come
 /// back as a tile.
 ///
-/// # Safety
-/// The processor must have AMX and AVX-512 F, BW and VL, `buffers.rows` the plan's input rows, high digits and low ones, and then one of zeros.
-#[target_feature(enable = "avx2,bmi1,bmi2,popcnt,lzcnt,avx512f,avx512bw,avx512vl")]
-pub(super) unsafe fn multiply(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, sums: &mut [Lanes]) {
-    let Buffers {
-        rows,
-        gathered,
-        products,
-        steps: Steps { all: steps, counts },
-    } = buffers;
-    let extents = weights.extents;
-    let panels = extents.panels();
-    let nothing = [plan.inputs().len() as u16; TILE];
-    gathered.resize(3 * PRODUCTS * TILE, Lanes::default());
-    products.resize(2 * STORED, Lanes::default());
-    let rows = rows.as_ptr();
-    let mut gathered = [0, 1, 2].map(|i| gathered[i * PRODUCTS * TILE..].as_mut_ptr());
-    configure();
-    // Each group's products are put together while the next one's are made.
-    let mut made: Option<[usize; 2]> = None;
-    let mut turn = 0;
-    for panel in (0..panels).step_by(WIDTH) {
-        steps.clear();
-        counts.clear();
-        for group in 0..plan.groups() {
-            let (taps, places) = plan.steps(group, 0..extents.volume);
-            let mut halves = [[nothing.as_ptr(); 2]; MOST_TAPS.div_ceil(2)];
-            let mut used = 0u32;
-            for (&tap, places) in taps.iter().zip(places.chunks_exact(TILE)) {
-                let [pair, half] = weights.homes[usize::from(tap)];
-                halves[pair][half] = places.as_ptr();
-                used |= 1 << pair;
-            }
-            counts.push(used.count_ones() as usize);
-            while used != 0 {
-                let pair = used.trailing_zeros() as usize;
-                steps.push(Step {
-                    places: halves[pair],
-                    weights: weights.tiles[tile(extents, pair, 0, panel) * TILE..].as_ptr(),
-                });
-                used &= used - 1;
-            }
-        }
-        let end = Step {
-            places: [nothing.as_ptr(); 2],
-            weights: weights.tiles.as_ptr(),
-        };
-        steps.extend([end; 2]);
-        for (step, to) in steps.iter().zip(gathered).take(2) {
-            // SAFETY: the places name rows that are there, and the tiles are there.
-            unsafe { gather(step, rows, to) };
-        }
-        let mut first = 0;
-        for (group, &count) in counts.iter().enumerate() {
-            let mut block = Block {
-                steps: steps[first..].as_ptr(),
-                count,
-                rows,
-                gathered,
-                to: products[turn * STORED..].as_mut_ptr(),
-            };
-            // SAFETY: the places name rows that are there, the weights are those of whole pairs, there is room for the tiles, and they
-            // are configured; the first two steps' rows are gathered.
-            unsafe {
-                match panels - panel {
-                    1 => one(&mut block),
-                    _ => two(&mut block),
-                }
-            }
-            gathered = block.gathered;
-            first += count;
-            if let Some(of) = made.replace([group, panel]) {
-                combine(panels, of, &products[(1 - turn) * STORED..], sums);
-            }
-            turn = 1 - turn;
-        }
-    }
-    release();
-    if let Some(of) = made {
-        combine(panels, of, &products[(1 - turn) * STORED..], sums);
-    }
-    // They point into the plan.
-    steps.clear();
+/// # Panics
+/// If there are fewer rows.
+pub(super) fn multiply(_: Amx, weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, sums: &mut [Words]) {
+    // SAFETY: the token proves AMX and AVX-512.
+    unsafe { multiply_groups(weights, plan, buffers, sums) }
 }
 
-/// Puts a group's products of a block of panels together.
-#[target_feature(enable = "avx512f")]
-#[inline]
-fn combine(panels: usize, [group, panel]: [usize; 2], products: &[Lanes], sums: &mut [Lanes]) {
-    let width = WIDTH.min(panels - panel);
-    let sums = &mut sums[group * TILE * panels..][..TILE * panels];
-    for at in 0..width {
-        let [high, low, both] = [0, 1, 2].map(|product| {
-            let tile = &products[(product * width + at) * TILE..];
-            &tile[..TILE]
-        });
-        for (row, sums) in sums.chunks_exact_mut(panels).enumerate() {
-            let (high, low, both) = (&high[row].0, &low[row].0, &both[row].0);
-            sums[panel + at].0 = std::array::from_fn(|lane: usize| {
-                let (high, low) = (high[lane], low[lane]);
-                let mixed = both[lane].wrapping_sub(high).wrapping_sub(low);
-                (high << 12).wrapping_add(mixed << 6).wrapping_add(low)
+with_avx512! {
+    fn multiply_groups(weights: &Weights, plan: &PlanTile, buffers: &mut Buffers, sums: &mut [Words]) {
+        let Buffers {
+            rows,
+            gathered,
+            products,
+            steps: Steps { all: steps, counts },
+        } = buffers;
+        let extents = weights.extents;
+        let panels = extents.panels();
+        let nothing = [plan.inputs().len() as u16; TILE];
+        gathered.resize(3 * PRODUCTS * TILE, Words::default());
+        products.resize(2 * STORED, Words::default());
+        assert!(rows.len() > plan.inputs().len(), "a tile row of zeros after the plan's");
+        let rows = rows.as_ptr();
+        let mut gathered = [0, 1, 2].map(|i| gathered[i * PRODUCTS * TILE..].as_mut_ptr());
+        configure();
+        // Each group's products are put together while the next one's are made.
+        let mut made: Option<[usize; 2]> = None;
+        let mut turn = 0;
+        for panel in (0..panels).step_by(WIDTH) {
+            steps.clear();
+            counts.clear();
+            for group in 0..plan.groups() {
+                let (taps, places) = plan.steps(group, 0..extents.volume);
+                let mut halves = [[nothing.as_ptr(); 2]; MOST_TAPS.div_ceil(2)];
+                let mut used = 0u32;
+                for (&tap, places) in taps.iter().zip(places.chunks_exact(TILE)) {
+                    let [pair, half] = weights.homes[usize::from(tap)];
+                    halves[pair][half] = places.as_ptr();
+                    used |= 1 << pair;
+                }
+                counts.push(used.count_ones() as usize);
+                while used != 0 {
+                    let pair = used.trailing_zeros() as usize;
+                    steps.push(Step {
+                        places: halves[pair],
+                        weights: weights.tiles[tile(extents, pair, 0, panel) * TILE..].as_ptr(),
+                    });
+                    used &= used - 1;
+                }
+            }
+            let end = Step {
+                places: [nothing.as_ptr(); 2],
+                weights: weights.tiles.as_ptr(),
+            };
+            steps.extend([end; 2]);
+            for (step, to) in steps.iter().zip(gathered).take(2) {
+                // SAFETY: the places name rows that are there, and the tiles are there.
+                unsafe { gather(step, rows, to) };
+            }
+            let mut first = 0;
+            for (group, &count) in counts.iter().enumerate() {
+                let mut block = Block {
+                    steps: steps[first..].as_ptr(),
+                    count,
+                    rows,
+                    gathered,
+                    to: products[turn * STORED..].as_mut_ptr(),
+                };
+                // SAFETY: the places name rows that are there, the weights are those of whole pairs, there is room for the tiles, and they
+                // are configured; the first two steps' rows are gathered.
+                unsafe {
+                    match panels - panel {
+                        1 => one(&mut block),
+                        _ => two(&mut block),
+                    }
+                }
+                gathered = block.gathered;
+                first += count;
+                if let Some(of) = made.replace([group, panel]) {
+                    combine(panels, of, &products[(1 - turn) * STORED..], sums);
+                }
+                turn = 1 - turn;
+            }
+        }
+        release();
+        if let Some(of) = made {
+            combine(panels, of, &products[(1 - turn) * STORED..], sums);
+        }
+        // They point into the plan.
+        steps.clear();
+    }
+}
+
+with_avx512! {
+    /// Puts a group's products of a block of panels together.
+    #[inline]
+    fn combine(panels: usize, [group, panel]: [usize; 2], products: &[Words], sums: &mut [Words]) {
+        let width = WIDTH.min(panels - panel);
+        let sums = &mut sums[group * TILE * panels..][..TILE * panels];
+        for at in 0..width {
+            let [high, low, both] = [0, 1, 2].map(|product| {
+                let tile = &products[(product * width + at) * TILE..];
+                &tile[..TILE]
             });
+            for (row, sums) in sums.chunks_exact_mut(panels).enumerate() {
+                let (high, low, both) = (&high[row].0, &low[row].0, &both[row].0);
+                sums[panel + at].0 = std::array::from_fn(|lane: usize| {
+                    let (high, low) = (high[lane], low[lane]);
+                    let mixed = both[lane].wrapping_sub(high).wrapping_sub(low);
+                    (high << 12).wrapping_add(mixed << 6).wrapping_add(low)
+                });
+            }
         }
     }
 }
@@ -229,7 +240,7 @@ macro_rules! gather {
 ///
 /// # Safety
 /// The processor must have AVX-512 F and BW, the places name rows that are there, and `to` have room for three tiles.
-unsafe fn gather(step: &Step, rows: *const Lanes, to: *mut Lanes) {
+unsafe fn gather(step: &Step, rows: *const Words, to: *mut Words) {
     // SAFETY: the caller's promise. All registers that are written are named.
     unsafe {
         asm!(
