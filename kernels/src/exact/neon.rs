@@ -11,7 +11,7 @@ use crate::sparse::{Block, MIN_GROUP, Microkernel, columns, peak};
 
 /// Pairs of i16, eight at a time.
 #[derive(Clone, Copy)]
-struct Pairs(#[expect(dead_code, reason = "the proof of NEON")] Neon);
+struct Pairs(Neon);
 
 methods! { with_neon Pairs: Microkernel {
     type Sum = [int32x4_t; 2];

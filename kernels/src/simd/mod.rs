@@ -20,7 +20,7 @@
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
-mod dispatch;
+pub(crate) mod dispatch;
 mod isa;
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod neon;

@@ -9,7 +9,9 @@ pub(crate) mod plan;
 pub(crate) mod rows;
 pub(crate) mod taps;
 
-use crate::simd::{Isa, Level};
+use crate::simd::Isa;
+#[cfg(target_arch = "x86_64")]
+use crate::simd::Level;
 use plan::PlanTile;
 use rows::{Extents, IN_ORDER, PANEL, TILE, Words};
 
