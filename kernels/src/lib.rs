@@ -18,10 +18,10 @@ mod map;
 mod memory;
 mod simd;
 mod sparse;
-#[cfg(feature = "close")]
-pub mod splat;
 
 pub use ::half::f16;
+#[cfg(feature = "close")]
+pub use close::splat;
 #[cfg(feature = "close")]
 pub use close::{
     conv::{FloatConv, FloatOut, Precision, Scale},

@@ -1,4 +1,4 @@
-//! What may differ between machines in its last bits: convolution in floats and conversions of f16.
+//! What may differ between machines in its last bits: convolution in floats, conversions of f16, and splatting.
 
 #[cfg(target_arch = "x86_64")]
 mod amx;
@@ -11,3 +11,4 @@ mod half;
 mod kernel;
 pub(crate) mod peak;
 pub(crate) mod reference;
+pub mod splat;

@@ -294,7 +294,7 @@ const EXP2: [f32; 5] = [9.582_853e-3, 5.590_642_6e-2, 2.402_41e-1, 6.931_242e-1,
 #[cfg(target_arch = "x86_64")]
 const EXP2_ABOVE: [f32; 5] = [1.342_679_7e-2, 5.224_229_4e-2, 2.412_802_9e-1, 6.930_448_4e-1, 1.0];
 /// The least exponent of a normal number.
-const LEAST_EXPONENT: f32 = -126.0;
+pub(crate) const LEAST_EXPONENT: f32 = -126.0;
 /// Adding this to a small float leaves its nearest integer in the low bits: `1.5·2²³`.
 const ROUND: f32 = 12_582_912.0;
 

@@ -8,119 +8,29 @@
 //! floor are found all at once, a block to a lane (`layout.rs`), and of these the ones that still let light through are blended, a
 //! pixel to a lane (`pixels.rs`). Within such a block every pixel is blended, however faint.
 
-use super::lanes::{Lanes, by_level};
-use super::layout::Work;
-use super::pixels::{Best, Pending};
-use super::{Bounds, Crossing, Ellipse};
-use crate::Isa;
-use crate::simd::{Simd, dispatch};
-
-/// Side of a tile in pixels.
-pub const TILE: u32 = 32;
-
-/// Side of a block in pixels, and of a window in blocks.
-pub(super) const SIDE: u32 = 4;
-/// Pixels of a block, and blocks of a window.
-pub(super) const AREA: usize = 16;
-/// Blocks side by side in a tile, and all of them.
-pub(super) const BLOCKS: u32 = TILE / SIDE;
-pub(super) const ALL_BLOCKS: usize = (BLOCKS * BLOCKS) as usize;
-
-/// What the loop over a tile's splats does beyond blending ellipses. Each is compiled by itself.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Loop {
-    /// Nothing.
-    #[default]
-    Plain,
-    /// Blends [`Crossing`] Gaussians too.
-    Care,
-    /// That, and puts the splats of each pixel in the order of their depths there, as far as [`super::WAITING`] of them reach.
-    Order,
-    /// As `Care`, and keeps which Gaussian each pixel shows most of.
-    Ids,
-    /// As `Care`, and keeps how much of each Gaussian each pixel shows, for whoever mixes something else than colours.
-    Shares,
-}
-
-pub(super) const PLAIN: u8 = 0;
-pub(super) const CARE: u8 = 1;
-pub(super) const ORDER: u8 = 2;
-pub(super) const IDS: u8 = 3;
-pub(super) const SHARES: u8 = 4;
-
-/// What there is to blend.
-#[derive(Debug, Clone, Copy)]
-pub struct Scene<'a> {
-    /// The ellipses.
-    pub all: &'a [Ellipse],
-    /// Those of them that cross the near plane, by index; not for [`Loop::Plain`].
-    pub crossing: &'a [Crossing],
-    /// For each ellipse, how its depth changes by pixel to the right and down; for [`Loop::Order`] alone.
-    pub slopes: &'a [[f32; 2]],
-}
-
-/// 4×4 pixels.
-#[derive(Debug, Clone, Copy)]
-#[repr(C, align(64))]
-pub(super) struct Block {
-    /// Transmittance: the share of what lies behind that is still seen.
-    pub through: [f32; AREA],
-    /// Red, green and blue so far.
-    pub colour: [[f32; AREA]; 3],
-}
-
-const CLEAR: Block = Block {
-    through: [1.0; AREA],
-    colour: [[0.0; AREA]; 3],
+use super::block::{
+    ALL_BLOCKS, AREA, BLOCKS, CARE, CLEAR, IDS, Loop, ORDER, PLAIN, SHARES, SIDE, Scene, Share, TILE, rectangle,
 };
-
-/// How much of a Gaussian the pixels of a block show.
-#[derive(Debug, Clone, Copy)]
-pub struct Share {
-    /// The Gaussian's index in the input.
-    pub index: u32,
-    /// Column and row of the block's first pixel in the tile.
-    pub at: [u32; 2],
-    /// Of each of its 4×4 pixels, row by row.
-    pub weights: [f32; AREA],
-}
+use super::ellipse::Bounds;
+use super::layout::Canvas;
+use super::pixels::{Best, Pending};
+use crate::simd::{Isa, Simd, dispatch};
 
 /// A tile being drawn: [`TILE`]² pixels.
 #[derive(Debug, Clone)]
 pub struct Tile {
-    pub(super) blocks: [Block; ALL_BLOCKS],
-    /// The blocks, row by row, that are in the picture and still let light through.
-    pub(super) open: u64,
-    pub(super) corner: [u32; 2],
+    canvas: Canvas,
     /// The pixels that are wanted.
     part: Bounds,
-    /// `log₂` of the least α that is drawn, and it itself.
-    pub(super) floor: f32,
-    pub(super) least: f32,
-    pub(super) work: Work,
     what: Loop,
-    /// For each block, with [`Loop::Order`].
-    pub(super) pending: Vec<Pending>,
-    /// For each block, with [`Loop::Ids`].
-    pub(super) best: Vec<Best>,
-    /// Of what was blended last, with [`Loop::Shares`].
-    pub(super) shares: Vec<Share>,
 }
 
 impl Default for Tile {
     fn default() -> Self {
         Tile {
-            blocks: [CLEAR; ALL_BLOCKS],
-            open: 0,
-            corner: [0; 2],
+            canvas: Canvas::CLEAR,
             part: Bounds::default(),
-            floor: 0.0,
-            least: 1.0,
-            work: Work::NONE,
             what: Loop::Plain,
-            pending: Vec::new(),
-            best: Vec::new(),
-            shares: Vec::new(),
         }
     }
 }
@@ -134,21 +44,22 @@ impl Tile {
     pub fn start(&mut self, corner: [u32; 2], part: Bounds, floor: f32, what: Loop) {
         let Bounds { x0, y0, x1, y1 } = part;
         assert!(x0 < x1 && x1 <= TILE && y0 < y1 && y1 <= TILE);
-        self.blocks.fill(CLEAR);
-        self.corner = corner;
-        self.floor = floor.log2();
-        self.least = floor;
-        self.work.items = 0;
+        let canvas = &mut self.canvas;
+        canvas.blocks.fill(CLEAR);
+        canvas.corner = corner;
+        canvas.floor = floor.log2();
+        canvas.least = floor;
+        canvas.work.items = 0;
         let (first, end) = (|at: u32| at / SIDE, |at: u32| at.div_ceil(SIDE));
-        self.open = rectangle(first(x0), end(x1), first(y0), end(y1));
+        canvas.open = rectangle(first(x0), end(x1), first(y0), end(y1));
         self.part = part;
         self.what = what;
-        self.pending.clear();
-        self.best.clear();
+        canvas.pending.clear();
+        canvas.best.clear();
         match what {
             Loop::Plain | Loop::Care | Loop::Shares => {}
-            Loop::Order => self.pending.resize(ALL_BLOCKS, Pending::NONE),
-            Loop::Ids => self.best.resize(ALL_BLOCKS, Best::NONE),
+            Loop::Order => canvas.pending.resize(ALL_BLOCKS, Pending::NONE),
+            Loop::Ids => canvas.best.resize(ALL_BLOCKS, Best::NONE),
         }
     }
 
@@ -158,8 +69,8 @@ impl Tile {
     /// # Panics
     /// If there is no such ellipse, or the scene lacks what the loop needs of it.
     pub fn blend(&mut self, isa: Isa, keys: &[u64], next: &[u64], scene: Scene) -> bool {
-        self.shares.clear();
-        if self.open != 0 {
+        self.canvas.shares.clear();
+        if self.canvas.open != 0 {
             match self.what {
                 Loop::Plain => self.run::<PLAIN>(isa, keys, next, scene),
                 Loop::Care => self.run::<CARE>(isa, keys, next, scene),
@@ -168,25 +79,25 @@ impl Tile {
                 Loop::Shares => self.run::<SHARES>(isa, keys, next, scene),
             }
         }
-        self.open != 0
+        self.canvas.open != 0
     }
 
     /// With [`Loop::Shares`], how much the pixels show of what the last call of [`Tile::blend`] put on them: in each pixel, all shares of a
     /// picture and the transmittance that is left are together 1.
     pub fn shares(&self) -> &[Share] {
-        &self.shares
+        &self.canvas.shares
     }
 
     fn run<const WHAT: u8>(&mut self, isa: Isa, keys: &[u64], next: &[u64], scene: Scene) {
-        let tile = self;
-        by_level!(isa, fn body<const WHAT: u8>(tile: &mut Tile, keys: &[u64], next: &[u64], scene: Scene));
+        let canvas = &mut self.canvas;
+        dispatch!(isa, fn body<; const WHAT: u8>(canvas: &mut Canvas, keys: &[u64], next: &[u64], scene: Scene));
     }
 
     /// Blends what still waits for something nearer. To be called when there is nothing more to blend.
     pub fn finish(&mut self, isa: Isa) {
         if self.what == Loop::Order {
-            let tile = self;
-            by_level!(isa, fn flush(tile: &mut Tile));
+            let canvas = &mut self.canvas;
+            dispatch!(isa, fn flush(canvas: &mut Canvas));
         }
     }
 
@@ -213,8 +124,8 @@ impl Tile {
         let Bounds { x0, y0, x1, y1 } = self.part;
         for (y, row) in (y0..y1).zip(rows.chunks_mut(stride)) {
             for (x, id) in (x0..x1).zip(row) {
-                let block = &self.best[(y / SIDE * BLOCKS + x / SIDE) as usize];
-                *id = block.id[(y % SIDE * SIDE + x % SIDE) as usize].to_bits();
+                let block = &self.canvas.best[(y / SIDE * BLOCKS + x / SIDE) as usize];
+                *id = block.id((y % SIDE * SIDE + x % SIDE) as usize);
                 drawn += u32::from(*id != u32::MAX);
             }
         }
@@ -230,7 +141,7 @@ fn write<S: Simd>(_: S, tile: &Tile, behind: [f32; 4], rows: &mut [[f32; 4]], st
         [x0 as usize, y0 as usize, x1 as usize, y1 as usize]
     };
     for (y, row) in (y0..y1).zip(rows.chunks_mut(stride)) {
-        let blocks = &tile.blocks[y / side * BLOCKS as usize..][..BLOCKS as usize];
+        let blocks = &tile.canvas.blocks[y / side * BLOCKS as usize..][..BLOCKS as usize];
         let lanes = y % side * side;
         let mut row = &mut row[..x1 - x0];
         for (i, block) in blocks.iter().enumerate().skip(x0 / side) {
@@ -264,25 +175,14 @@ fn write<S: Simd>(_: S, tile: &Tile, behind: [f32; 4], rows: &mut [[f32; 4]], st
     }
 }
 
-/// The bits of the blocks in the columns `x0..x1` and the rows `y0..y1`.
 #[inline(always)]
-pub(super) fn rectangle(x0: u32, x1: u32, y0: u32, y1: u32) -> u64 {
-    if x0 >= x1 || y0 >= y1 {
-        return 0;
-    }
-    let row = (0xff >> (BLOCKS - (x1 - x0))) << x0;
-    let rows = (!0 >> (BLOCKS * (BLOCKS - (y1 - y0)))) << (BLOCKS * y0);
-    (row * 0x0101_0101_0101_0101) & rows
+fn body<S: Simd, const WHAT: u8>(simd: S, canvas: &mut Canvas, keys: &[u64], next: &[u64], scene: Scene) {
+    canvas.work_through::<_, WHAT>(simd, keys, next, scene);
 }
 
 #[inline(always)]
-fn body<L: Lanes, const WHAT: u8>(tile: &mut Tile, keys: &[u64], next: &[u64], scene: Scene) {
-    tile.work_through::<L, WHAT>(keys, next, scene);
-}
-
-#[inline(always)]
-fn flush<L: Lanes>(tile: &mut Tile) {
-    for (block, pending) in tile.blocks.iter_mut().zip(&tile.pending) {
-        pending.blend::<L>(block);
+fn flush<S: Simd>(simd: S, canvas: &mut Canvas) {
+    for (block, pending) in canvas.blocks.iter_mut().zip(&canvas.pending) {
+        pending.blend(simd, block);
     }
 }

@@ -1,23 +1,25 @@
 //! The parts held to their stated errors, on every instruction set that this machine has.
 
-use super::lanes::{EXP2_ERROR, Lanes, by_level};
 use super::project::log2;
-use crate::Isa;
+use crate::simd::{F32Vector, Isa, Simd, dispatch};
+
+/// Relative error of [`F32Vector::exp2`].
+const EXP2_ERROR: f64 = 3.1e-6;
 
 #[inline(always)]
-fn powers<L: Lanes>(x: &[f32], to: &mut [f32]) {
+fn powers<S: Simd>(simd: S, x: &[f32], to: &mut [f32]) {
     for (x, to) in x.chunks_exact(16).zip(to.chunks_exact_mut(16)) {
-        for at in (0..16).step_by(L::COUNT) {
-            L::load(&x[at..]).exp2().store(&mut to[at..]);
+        for at in (0..16).step_by(S::LANES) {
+            S::F32::load(simd, &x[at..]).exp2().store(&mut to[at..]);
         }
     }
 }
 
 #[inline(always)]
-fn logarithms<L: Lanes>(x: &[f32], to: &mut [f32]) {
+fn logarithms<S: Simd>(simd: S, x: &[f32], to: &mut [f32]) {
     for (x, to) in x.chunks_exact(16).zip(to.chunks_exact_mut(16)) {
-        for at in (0..16).step_by(L::COUNT) {
-            log2(L::load(&x[at..])).store(&mut to[at..]);
+        for at in (0..16).step_by(S::LANES) {
+            log2(simd, S::F32::load(simd, &x[at..])).store(&mut to[at..]);
         }
     }
 }
@@ -28,7 +30,7 @@ fn powers_are_within_their_error_and_exact_for_integers() {
     for isa in Isa::available() {
         let (x, mut to) = (&x[..], vec![0.0; x.len()]);
         let out = &mut to[..];
-        by_level!(isa, fn powers(x: &[f32], out: &mut [f32]));
+        dispatch!(isa, fn powers(x: &[f32], out: &mut [f32]));
         let mut largest = 0.0f64;
         for (x, y) in x.iter().zip(&to) {
             let exact = f64::from(*x).exp2();
@@ -47,7 +49,7 @@ fn logarithms_are_within_their_error_and_exact_for_powers_of_two() {
     for isa in Isa::available() {
         let (x, mut to) = (&x[..], vec![0.0; x.len()]);
         let out = &mut to[..];
-        by_level!(isa, fn logarithms(x: &[f32], out: &mut [f32]));
+        dispatch!(isa, fn logarithms(x: &[f32], out: &mut [f32]));
         for (x, y) in x.iter().zip(&to) {
             let exact = f64::from(*x).log2();
             let error = (f64::from(*y) - exact).abs();

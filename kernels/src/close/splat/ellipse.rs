@@ -1,33 +1,12 @@
-//! Splats: Gaussians onto the picture ([`project`]), and into the pixels of one tile ([`Tile`]).
-//!
-//! Each kernel is one body over lanes of floats, compiled for plain Rust, AVX2, AVX-512 and NEON. Between these the last bits differ,
-//! because only some multiply and add in one rounding; on each of them the result is a function of the input alone.
+//! What is drawn: ellipses, and Gaussians that reach over the near plane.
 
-mod ahead;
-#[cfg(target_arch = "x86_64")]
-mod avx2;
-#[cfg(target_arch = "x86_64")]
-mod avx512;
-mod blend;
-mod lanes;
-mod layout;
-#[cfg(target_arch = "aarch64")]
-mod neon;
-mod pixels;
-mod plain;
-mod project;
-
-#[cfg(test)]
-mod tests;
-
-pub use blend::{Loop, Scene, Share, TILE, Tile};
-pub use project::{Cloud, Tally, View, project};
+use bytemuck::{Pod, Zeroable};
 
 /// The greatest α of one ellipse.
 pub const ALPHA_CEILING: f32 = 0.99;
 /// A pixel that lets less light through than this is finished: what is not drawn is less than a quarter of a step of eight bits.
 pub const FINISHED: f32 = 1.0 / 1024.0;
-/// With [`Loop::Order`], so many splats of a pixel wait for one that may be nearer.
+/// With [`super::Loop::Order`], so many splats of a pixel wait for one that may be nearer.
 pub const WAITING: usize = 8;
 /// Standard deviations above this are drawn as this.
 pub const MAX_SCALE: f32 = 1e4;
@@ -37,7 +16,7 @@ pub const MIN_COMPENSATION: f32 = 0.005;
 /// A splat on the picture: `α(x, y) = 2^(log_opacity − u² − v²)` with `(u, v)` linear in the pixel's distance to the centre.
 ///
 /// One cache line.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub struct Ellipse {
     /// The centre in pixels.
@@ -76,7 +55,7 @@ pub struct Crossing {
 }
 
 /// The pixels `x0 ≤ x < x1`, `y0 ≤ y < y1`. Never empty for a visible splat.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 #[allow(missing_docs)]
 pub struct Bounds {
@@ -87,26 +66,6 @@ pub struct Bounds {
 }
 
 impl Ellipse {
-    /// From the bits of its fields, in their order.
-    #[inline(always)]
-    fn from_fields(f: [f32; 16]) -> Self {
-        Ellipse {
-            centre: [f[0], f[1]],
-            u: [f[2], f[3]],
-            v: [f[4], f[5]],
-            log_opacity: f[6],
-            colour: [f[7], f[8], f[9]],
-            bounds: Bounds {
-                x0: f[10].to_bits(),
-                y0: f[11].to_bits(),
-                x1: f[12].to_bits(),
-                y1: f[13].to_bits(),
-            },
-            depth: f[14],
-            index: f[15].to_bits(),
-        }
-    }
-
     /// Whether it stands for a [`Crossing`].
     pub fn crosses(&self) -> bool {
         self.u == [0.0; 2] && self.v == [0.0; 2]
@@ -114,18 +73,7 @@ impl Ellipse {
 
     /// The bits of its fields, in their order.
     #[inline(always)]
-    fn fields(&self) -> &[f32; 16] {
-        const { assert!(size_of::<Ellipse>() == size_of::<[f32; 16]>()) };
-        // SAFETY: of the same size and no stricter alignment, without padding; any bits are an `f32`.
-        unsafe { &*std::ptr::from_ref(self).cast() }
-    }
-
-    /// The bits of its fields, in their order.
-    #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
-    #[inline(always)]
-    fn as_fields_mut(&mut self) -> &mut [f32; 16] {
-        const { assert!(size_of::<Ellipse>() == size_of::<[f32; 16]>()) };
-        // SAFETY: of the same size and no stricter alignment, without padding; any bits are an `f32` and any are a `u32`.
-        unsafe { &mut *std::ptr::from_mut(self).cast() }
+    pub(super) fn fields(&self) -> &[f32; 16] {
+        bytemuck::must_cast_ref(self)
     }
 }

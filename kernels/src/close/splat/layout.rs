@@ -1,9 +1,12 @@
 //! Which blocks of a tile each ellipse reaches.
 
-use super::Ellipse;
-use super::blend::{ALL_BLOCKS, AREA, BLOCKS, IDS, ORDER, PLAIN, SHARES, SIDE, Scene, Share, TILE, Tile, rectangle};
-use super::lanes::{Lanes, Mask, four};
-use super::pixels;
+use super::block::{
+    ALL_BLOCKS, AREA, BLOCKS, Block, CLEAR, COLUMNS, IDS, More, ORDER, PLAIN, ROWS, SHARES, SIDE, Scene, Share, Splat,
+    TILE, lane_places, rectangle,
+};
+use super::ellipse::Ellipse;
+use super::pixels::{self, Best, Pending};
+use crate::simd::{F32Vector, I32Vector, MaskVector, Simd, four, prefetch};
 
 /// Ellipses whose blocks are laid out before they are blended, and the most blocks.
 const SPLATS: usize = 32;
@@ -11,49 +14,21 @@ const ITEMS: usize = 512;
 /// By so much, in powers of two, a block may be beyond an ellipse and still be looked at, for the sake of rounding.
 const SLACK: f32 = 1e-3;
 
-/// Column and row of the pixels of a block, counted from its middle.
-pub(super) const COLUMNS: [f32; AREA] = lane_places(false, 1.0, 1.5);
-pub(super) const ROWS: [f32; AREA] = lane_places(true, 1.0, 1.5);
 /// Column and row, in pixels, of the blocks of a window, counted from its first.
 const BLOCK_COLUMNS: [f32; AREA] = lane_places(false, SIDE as f32, 0.0);
 const BLOCK_ROWS: [f32; AREA] = lane_places(true, SIDE as f32, 0.0);
 /// The number in the tile of each block of a window, less the first's.
-const PLACES: [f32; AREA] = {
-    let mut places = [0.0; AREA];
+const PLACES: [i32; AREA] = {
+    let mut places = [0; AREA];
     let mut i = 0;
     while i < AREA {
-        places[i] = f32::from_bits(i as u32 / SIDE * BLOCKS + i as u32 % SIDE);
+        places[i] = (i as u32 / SIDE * BLOCKS + i as u32 % SIDE) as i32;
         i += 1;
     }
     places
 };
 /// The bits of a window of so many columns.
 const WINDOW: [u64; 5] = [0, 0x0101_0101, 0x0303_0303, 0x0707_0707, 0x0f0f_0f0f];
-
-const fn lane_places(row: bool, step: f32, middle: f32) -> [f32; AREA] {
-    let mut places = [0.0; AREA];
-    let mut i = 0;
-    while i < AREA {
-        let place = if row { i / SIDE as usize } else { i % SIDE as usize };
-        places[i] = place as f32 * step - middle;
-        i += 1;
-    }
-    places
-}
-
-/// Asks for the ellipses that the lower halves of `keys` number.
-#[inline(always)]
-fn prefetch(all: &[Ellipse], keys: &[u64]) {
-    #[cfg(target_arch = "x86_64")]
-    for &key in keys {
-        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        let ellipse = all.as_ptr().wrapping_add(key as u32 as usize);
-        // SAFETY: a hint: no address is wrong.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(ellipse.cast()) }
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = (all, keys);
-}
 
 /// Numbers in a [`Batch`].
 const FORMS: usize = 9;
@@ -66,29 +41,29 @@ struct Batch([[f32; AREA]; FORMS]);
 
 impl Batch {
     #[inline(always)]
-    fn fill<L: Lanes>(&mut self, fields: [L; 16], [left, top]: [f32; 2], floor: f32) {
+    fn fill<S: Simd>(&mut self, simd: S, fields: [S::F32; 16], [left, top]: [f32; 2], floor: f32) {
         let [cx, cy, ux, uy, vx, vy, log_opacity, ..] = fields;
         let [.., x0, y0, x1, y1, _, _] = fields;
         let middle = 0.5 * (SIDE - 1) as f32;
-        let dx = L::splat(left + 0.5 + middle).sub(cx);
-        let dy = L::splat(top + 0.5 + middle).sub(cy);
-        let half = L::splat(middle);
-        let (zero, side) = (L::splat(0.0), L::splat(TILE as f32));
-        let inverse = L::splat(1.0 / SIDE as f32);
-        let within = |at: L, corner: f32| {
-            let at = at.to_float().sub(L::splat(corner));
-            at.max(zero).min(side).mul(inverse)
+        let dx = S::F32::splat(simd, left + 0.5 + middle) - cx;
+        let dy = S::F32::splat(simd, top + 0.5 + middle) - cy;
+        let half = S::F32::splat(simd, middle);
+        let (zero, side) = (S::F32::splat(simd, 0.0), S::F32::splat(simd, TILE as f32));
+        let inverse = S::F32::splat(simd, 1.0 / SIDE as f32);
+        let within = |at: S::F32, corner: f32| {
+            let at = at.to_bits().to_f32() - S::F32::splat(simd, corner);
+            at.max(zero).min(side) * inverse
         };
         let forms = [
-            ux.mul_add(dx, uy.mul(dy)),
-            vx.mul_add(dx, vy.mul(dy)),
-            ux.abs().add(uy.abs()).mul(half),
-            vx.abs().add(vy.abs()).mul(half),
-            log_opacity.add(L::splat(SLACK - floor)),
-            within(x0, left).floor().to_integer(),
-            within(y0, top).floor().to_integer(),
-            within(x1, left).ceil().to_integer(),
-            within(y1, top).ceil().to_integer(),
+            ux.mul_add(dx, uy * dy),
+            vx.mul_add(dx, vy * dy),
+            (ux.abs() + uy.abs()) * half,
+            (vx.abs() + vy.abs()) * half,
+            log_opacity + S::F32::splat(simd, SLACK - floor),
+            within(x0, left).floor().truncate_to_i32().as_f32(),
+            within(y0, top).floor().truncate_to_i32().as_f32(),
+            within(x1, left).ceil().truncate_to_i32().as_f32(),
+            within(y1, top).ceil().truncate_to_i32().as_f32(),
         ];
         for (row, form) in self.0.iter_mut().zip(forms) {
             form.store(row);
@@ -112,28 +87,6 @@ pub(super) struct Work {
     more: [More; SPLATS],
 }
 
-/// What all blocks of an ellipse share.
-#[derive(Debug, Clone, Copy)]
-#[repr(C, align(64))]
-pub(super) struct Splat {
-    /// The form at the pixels of a block, less what it is in the middle.
-    pub u: [f32; AREA],
-    pub v: [f32; AREA],
-    pub log_opacity: f32,
-    pub colour: [f32; 3],
-}
-
-/// What the loops of effects know of an ellipse besides.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct More {
-    /// Its place among the [`super::Crossing`], or [`usize::MAX`].
-    pub crossing: usize,
-    /// Depth at the tile's first pixel's corner, and its change by pixel to the right and down.
-    pub depth: [f32; 3],
-    /// The Gaussian's index in the input.
-    pub index: u32,
-}
-
 impl Work {
     pub const NONE: Work = Work {
         u: [0.0; ITEMS],
@@ -154,16 +107,51 @@ impl Work {
     };
 }
 
-impl Tile {
+/// The blocks of a tile, and what the loops over its splats keep.
+#[derive(Debug, Clone)]
+pub(super) struct Canvas {
+    pub blocks: [Block; ALL_BLOCKS],
+    /// The blocks, row by row, that are in the picture and still let light through.
+    pub open: u64,
+    pub corner: [u32; 2],
+    /// `log₂` of the least α that is drawn, and it itself.
+    pub floor: f32,
+    pub least: f32,
+    pub work: Work,
+    /// For each block, with [`super::Loop::Order`].
+    pub pending: Vec<Pending>,
+    /// For each block, with [`super::Loop::Ids`].
+    pub best: Vec<Best>,
+    /// Of what was blended last, with [`super::Loop::Shares`].
+    pub shares: Vec<Share>,
+}
+
+impl Canvas {
+    pub const CLEAR: Canvas = Canvas {
+        blocks: [CLEAR; ALL_BLOCKS],
+        open: 0,
+        corner: [0; 2],
+        floor: 0.0,
+        least: 1.0,
+        work: Work::NONE,
+        pending: Vec::new(),
+        best: Vec::new(),
+        shares: Vec::new(),
+    };
+
     /// Blends ellipses, nearest first.
     #[inline(always)]
-    pub(super) fn work_through<L: Lanes, const WHAT: u8>(&mut self, keys: &[u64], next: &[u64], scene: Scene) {
-        prefetch(scene.all, next);
-        for turn in keys.chunks(SPLATS) {
-            for (i, some) in turn.chunks(L::COUNT).enumerate() {
-                self.lay_out::<L, WHAT>(i * L::COUNT, some, scene);
+    pub(super) fn work_through<S: Simd, const WHAT: u8>(&mut self, simd: S, keys: &[u64], next: &[u64], scene: Scene) {
+        for &key in next {
+            if let Some(ellipse) = scene.all.get(numbered(key)) {
+                prefetch(std::slice::from_ref(ellipse));
             }
-            self.work_off::<L, WHAT>(scene);
+        }
+        for turn in keys.chunks(SPLATS) {
+            for (i, some) in turn.chunks(S::LANES).enumerate() {
+                self.lay_out::<_, WHAT>(simd, i * S::LANES, some, scene);
+            }
+            self.work_off::<_, WHAT>(simd, scene);
             if self.open == 0 {
                 return;
             }
@@ -172,11 +160,11 @@ impl Tile {
 
     /// Adds the blocks of at most as many ellipses as there are lanes to the work; the first is the turn's `first`.
     #[inline(always)]
-    fn lay_out<L: Lanes, const WHAT: u8>(&mut self, first: usize, keys: &[u64], scene: Scene) {
-        let fields = L::gather(scene.all, keys);
+    fn lay_out<S: Simd, const WHAT: u8>(&mut self, simd: S, first: usize, keys: &[u64], scene: Scene) {
+        let fields = gather(simd, scene.all, keys);
         let corner = [self.corner[0] as f32, self.corner[1] as f32];
         let mut batch = Batch([[0.0; AREA]; FORMS]);
-        batch.fill(fields, corner, self.floor);
+        batch.fill(simd, fields, corner, self.floor);
         for (i, &key) in keys.iter().enumerate() {
             let [x0, y0, x1, y1] = four!(k => batch.0[5 + k][i].to_bits());
             let wanted = self.open & rectangle(x0, x1, y0, y1);
@@ -184,7 +172,7 @@ impl Tile {
                 continue;
             }
             let number = first + i;
-            let place = key as u32 as usize;
+            let place = numbered(key);
             let ellipse = &scene.all[place];
             let splat = &mut self.work.splats[number];
             splat.log_opacity = ellipse.log_opacity;
@@ -193,55 +181,58 @@ impl Tile {
                 self.work.more[number] = more::<WHAT>(ellipse, place, corner, scene);
             }
             let ([ux, uy], [vx, vy]) = (ellipse.u, ellipse.v);
-            let lanes_u = [L::splat(ux), L::splat(uy)];
-            let lanes_v = [L::splat(vx), L::splat(vy)];
-            for part in 0..AREA / L::COUNT {
-                let lanes = part * L::COUNT;
-                let (column, row) = (L::load(&COLUMNS[lanes..]), L::load(&ROWS[lanes..]));
-                let steps = column.mul_add(lanes_u[0], row.mul(lanes_u[1]));
+            let lanes_u = [S::F32::splat(simd, ux), S::F32::splat(simd, uy)];
+            let lanes_v = [S::F32::splat(simd, vx), S::F32::splat(simd, vy)];
+            for part in 0..AREA / S::LANES {
+                let lanes = part * S::LANES;
+                let (column, row) = (
+                    S::F32::load(simd, &COLUMNS[lanes..]),
+                    S::F32::load(simd, &ROWS[lanes..]),
+                );
+                let steps = column.mul_add(lanes_u[0], row * lanes_u[1]);
                 steps.store(&mut splat.u[lanes..]);
-                let steps = column.mul_add(lanes_v[0], row.mul(lanes_v[1]));
+                let steps = column.mul_add(lanes_v[0], row * lanes_v[1]);
                 steps.store(&mut splat.v[lanes..]);
             }
             let [u, v, half_u, half_v] = four!(k => batch.0[k][i]);
             let reach = batch.0[4][i];
-            let (half_u, half_v) = (L::splat(half_u), L::splat(half_v));
-            let reach = L::splat(reach);
+            let (half_u, half_v) = (S::F32::splat(simd, half_u), S::F32::splat(simd, half_v));
+            let reach = S::F32::splat(simd, reach);
             let mut y = y0;
             while y < y1 {
                 let mut x = x0;
                 while x < x1 {
                     // A window: the form in the middle of each of its blocks …
                     let (px, py) = ((SIDE * x) as i32 as f32, (SIDE * y) as i32 as f32);
-                    let at_u = L::splat(u + (ux * px + uy * py));
-                    let at_v = L::splat(v + (vx * px + vy * py));
+                    let at_u = S::F32::splat(simd, u + (ux * px + uy * py));
+                    let at_v = S::F32::splat(simd, v + (vx * px + vy * py));
                     let place = y * BLOCKS + x;
                     let wanted = wanted >> place & WINDOW[(BLOCKS - x).min(SIDE) as usize];
                     let wanted = packed(wanted);
-                    for part in 0..AREA / L::COUNT {
-                        let lanes = part * L::COUNT;
-                        let column = L::load(&BLOCK_COLUMNS[lanes..]);
-                        let row = L::load(&BLOCK_ROWS[lanes..]);
+                    for part in 0..AREA / S::LANES {
+                        let lanes = part * S::LANES;
+                        let column = S::F32::load(simd, &BLOCK_COLUMNS[lanes..]);
+                        let row = S::F32::load(simd, &BLOCK_ROWS[lanes..]);
                         let bu = column.mul_add(lanes_u[0], row.mul_add(lanes_u[1], at_u));
                         let bv = column.mul_add(lanes_v[0], row.mul_add(lanes_v[1], at_v));
                         // … and the least that it can be anywhere in the block.
-                        let zero = L::splat(0.0);
-                        let least_u = bu.abs().sub(half_u).max(zero);
-                        let least_v = bv.abs().sub(half_v).max(zero);
-                        let least = least_u.mul_add(least_u, least_v.mul(least_v));
+                        let zero = S::F32::splat(simd, 0.0);
+                        let least_u = (bu.abs() - half_u).max(zero);
+                        let least_v = (bv.abs() - half_v).max(zero);
+                        let least = least_u.mul_add(least_u, least_v * least_v);
                         let which = least.le(reach).bits() & wanted >> lanes;
 
                         let work = &mut self.work;
                         let at = work.items;
                         bu.compress(which).store(&mut work.u[at..]);
                         bv.compress(which).store(&mut work.v[at..]);
-                        let place = L::splat(f32::from_bits((number as u32) << 8 | place));
-                        let place = L::load(&PLACES[lanes..]).add_integer(place);
+                        let place = S::I32::splat(simd, ((number as u32) << 8 | place) as i32);
+                        let place = (S::I32::load(simd, &PLACES[lanes..]) + place).as_f32();
                         place.compress(which).store(&mut work.place[at..]);
                         work.items += which.count_ones() as usize;
                     }
                     if self.work.items > ITEMS - 2 * AREA {
-                        self.work_off::<L, WHAT>(scene);
+                        self.work_off::<_, WHAT>(simd, scene);
                     }
                     x += SIDE;
                 }
@@ -252,7 +243,7 @@ impl Tile {
 
     /// Blends what has been laid out.
     #[inline(always)]
-    fn work_off<L: Lanes, const WHAT: u8>(&mut self, scene: Scene) {
+    fn work_off<S: Simd, const WHAT: u8>(&mut self, simd: S, scene: Scene) {
         let work = &self.work;
         let items = work.items.min(ITEMS);
         let lists = work.u[..items].iter().zip(&work.v[..items]);
@@ -262,7 +253,7 @@ impl Tile {
             let place = place % ALL_BLOCKS;
             let (splat, block) = (&work.splats[number], &mut self.blocks[place]);
             let open = if WHAT == PLAIN {
-                pixels::blend::<L>(block, splat, [u, v])
+                pixels::blend(simd, block, splat, [u, v])
             } else {
                 let more = &work.more[number];
                 let (x, y) = (SIDE * (place as u32 % BLOCKS), SIDE * (place as u32 / BLOCKS));
@@ -272,15 +263,15 @@ impl Tile {
                     ORDER => {
                         let pending = &mut self.pending[place];
                         let corner = self.corner;
-                        pending.add::<L>(block, splat, [u, v], more, at, corner, crossing, self.least)
+                        pending.add(simd, block, splat, [u, v], more, at, corner, crossing, self.least)
                     }
                     IDS | SHARES => {
                         let form = [u, v];
-                        let weights = pixels::weigh::<L>(block, splat, form, at, self.corner, crossing);
+                        let weights = pixels::weigh(simd, block, splat, form, at, self.corner, crossing);
                         let index = more.index;
                         match weights {
                             Some(weights) if WHAT == IDS => {
-                                self.best[place].note::<L>(&weights, index);
+                                self.best[place].note(simd, &weights, index);
                             }
                             Some(weights) => self.shares.push(Share { index, at, weights }),
                             None => {}
@@ -288,8 +279,8 @@ impl Tile {
                         weights.is_some()
                     }
                     _ => match crossing {
-                        Some(crossing) => pixels::cross::<L>(block, splat, at, self.corner, crossing),
-                        None => pixels::blend::<L>(block, splat, [u, v]),
+                        Some(crossing) => pixels::cross(simd, block, splat, at, self.corner, crossing),
+                        None => pixels::blend(simd, block, splat, [u, v]),
                     },
                 }
             };
@@ -299,6 +290,24 @@ impl Tile {
         }
         self.work.items = 0;
     }
+}
+
+/// The ellipse that a key numbers.
+#[inline(always)]
+fn numbered(key: u64) -> usize {
+    key as u32 as usize
+}
+
+/// Field `k` of the ellipse that key `i` numbers in lane `i` of vector `k`. Where there are fewer keys than lanes, those of the last.
+#[inline(always)]
+fn gather<S: Simd>(simd: S, all: &[Ellipse], keys: &[u64]) -> [S::F32; 16] {
+    let mut records = [&[0.0; 16]; 16];
+    let mut lane = 0;
+    while lane < S::LANES {
+        records[lane] = all[numbered(keys[lane.min(keys.len() - 1)])].fields();
+        lane += 1;
+    }
+    S::F32::load_records(simd, &records)
 }
 
 /// What the loop needs to know of an ellipse besides.
