@@ -27,8 +27,9 @@ pub use close::{
     conv::{FloatConv, FloatOut, Precision, Scale},
     convert::{to_f16, to_f32},
 };
-pub use exact::conv::{ExactConv, LIMIT, Requantise};
+pub use exact::conv::ExactConv;
 pub use exact::double::add_products;
+pub use exact::requantise::{LIMIT, Requantise};
 pub use exact::{hidden, mixing, smooth};
 pub use map::{MappedFile, map_file};
 pub use memory::{Zeros, give_back, zeros};

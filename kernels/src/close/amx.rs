@@ -3,7 +3,7 @@
 use ::half::{bf16, f16};
 
 use crate::exact::amx::{Buffers, LINE, Scheme, Weights, multiply, prepare};
-use crate::simd::Amx;
+use crate::simd::amx::Amx;
 use crate::simd::avx512::Bf16;
 use crate::sparse::plan::PlanTile;
 use crate::sparse::rows::{Extents, PANEL, Words};

@@ -1,11 +1,12 @@
 //! The micro-kernel of AVX512_BF16: pairs of bf16, summed in f32.
 
 use bytemuck::{must_cast_slice, must_cast_slice_mut};
+use half::f16;
 
-use crate::f16;
-use crate::simd::avx512::{Bf16, Bf16Vectors};
-use crate::simd::{Avx512, F32Vector, I32Vector, Isa, Level, Simd, Work};
-use crate::sparse::{Block, MIN_GROUP, Microkernel, WIDE, columns, peak};
+use crate::simd::avx512::{Avx512, Bf16, Bf16Vectors};
+use crate::simd::{F32Vector, I32Vector, Isa, Simd, Work};
+use crate::sparse::microkernel::{Block, MIN_GROUP, Microkernel, WIDE, columns};
+use crate::sparse::peak;
 
 /// Pairs of bf16.
 #[derive(Clone, Copy)]
@@ -53,27 +54,24 @@ impl<S: Bf16Vectors> Microkernel for Pairs<S> {
     }
 }
 
-/// Both tokens.
-fn tokens(isa: Isa) -> (Bf16, Avx512) {
-    match (isa.bf16(), isa.level()) {
-        (Some(bf16), Level::Avx512(avx512) | Level::Amx(_, avx512)) => (bf16, avx512),
-        _ => unreachable!("asked for before"),
-    }
+/// The token, of a set that has been asked for it.
+fn token(isa: Isa) -> Bf16 {
+    isa.bf16().expect("asked for before")
 }
 
-/// Multiplies a block in bf16: see [`crate::sparse::Multiply`]. Only where [`Isa::has_bf16`].
+/// Multiplies a block in bf16: see [`crate::sparse::accumulate::Multiply`]. Only where [`Isa::has_bf16`].
 pub(super) fn multiply(isa: Isa, mut block: Block<'_>, whole: usize) {
-    let (bf16, avx512) = tokens(isa);
+    let bf16 = token(isa);
     let work = MultiplyBlock {
-        tokens: (bf16, avx512),
+        bf16,
         block: &mut block,
         whole,
     };
-    bf16.vectorize(avx512, work);
+    bf16.vectorize(work);
 }
 
 struct MultiplyBlock<'a, 'b> {
-    tokens: (Bf16, Avx512),
+    bf16: Bf16,
     block: &'a mut Block<'b>,
     whole: usize,
 }
@@ -83,7 +81,7 @@ impl Work for MultiplyBlock<'_, '_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
-        let (bf16, avx512) = self.tokens;
+        let (bf16, avx512) = (self.bf16, self.bf16.base());
         let (kernel, narrow) = (Pairs(bf16, avx512), Pairs(bf16, avx512.narrow()));
         match self.whole {
             0 => columns::<_, 8, 1, 1>(narrow, self.block),
@@ -96,9 +94,9 @@ impl Work for MultiplyBlock<'_, '_> {
 
 /// Multiply-adds in bf16 for as long as `rounds` say; the result is their number.
 pub(super) fn batch(isa: Isa, rounds: usize) -> usize {
-    let (bf16, avx512) = tokens(isa);
-    let kernel = Pairs(bf16, avx512);
-    2 * bf16.vectorize(avx512, Batch { kernel, rounds })
+    let bf16 = token(isa);
+    let kernel = Pairs(bf16, bf16.base());
+    2 * bf16.vectorize(Batch { kernel, rounds })
 }
 
 struct Batch {
@@ -117,6 +115,5 @@ impl Work for Batch {
 
 /// Rows of f16 as pairs of bf16, rounded to even; an odd row's last pair has a zero.
 pub(super) fn expand(isa: Isa, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
-    let (bf16, _) = tokens(isa);
-    bf16.round_rows(input, rows, cin, to);
+    token(isa).round_rows(input, rows, cin, to);
 }

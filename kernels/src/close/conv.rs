@@ -14,10 +14,11 @@ use super::{convert, kernel};
 use crate::exact::amx;
 use crate::exact::norms::{Gains, Norms};
 use crate::simd::{F32Vector, Isa, Simd, dispatch};
+use crate::sparse::accumulate::{Expand, Multiply, accumulate, group};
 use crate::sparse::plan::PlanTile;
-use crate::sparse::rows::{Extents, Output, PANEL, Scratch, Words, panel, panels, store, with_scratch};
+use crate::sparse::rows::{Extents, Output, PANEL, Words, panel, panels, store};
+use crate::sparse::scratch::{Scratch, with_scratch};
 use crate::sparse::taps::Taps;
-use crate::sparse::{Expand, Multiply, accumulate, group};
 
 /// What happens to sums.
 #[derive(Debug, Clone)]
@@ -74,7 +75,7 @@ impl FloatOut for f16 {}
 
 mod sealed {
     use super::{F32Vector, PANEL, Simd, convert};
-    use crate::f16;
+    use ::half::f16;
 
     pub trait Sealed: Sized {
         /// Writes a panel, or as much of it as there is.

@@ -1,7 +1,7 @@
 //! f16 ↔ f32, exact one way and rounded to even the other.
 
-use crate::f16;
 use crate::simd::{F32Vector, Isa, Simd, dispatch};
+use ::half::f16;
 
 /// Values of the longest vector.
 const LONGEST: usize = 16;

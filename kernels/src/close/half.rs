@@ -16,12 +16,12 @@ use std::arch::asm;
 
 use bytemuck::{must_cast, must_cast_slice_mut};
 
-use crate::f16;
 use crate::simd::Isa;
 use crate::simd::neon::{NeonHalf, with_neon_half};
-use crate::sparse::Block;
+use crate::sparse::microkernel::Block;
 use crate::sparse::peak::some_words;
 use crate::sparse::rows::{Extents, PANEL, Words};
+use ::half::f16;
 
 /// Products that are summed in f16.
 const BLOCK: usize = 16;

@@ -3,7 +3,8 @@
 use bytemuck::{must_cast_slice, must_cast_slice_mut};
 
 use crate::simd::{F32Vector, Isa, Simd, Work, dispatch};
-use crate::sparse::{Block, MIN_GROUP, Microkernel, WIDE, columns, peak};
+use crate::sparse::microkernel::{Block, MIN_GROUP, Microkernel, WIDE, columns};
+use crate::sparse::peak;
 
 /// f32.
 #[derive(Clone, Copy)]
@@ -51,7 +52,7 @@ impl<S: Simd> Microkernel for Float<S> {
     }
 }
 
-/// Multiplies a block in f32: see [`crate::sparse::Multiply`].
+/// Multiplies a block in f32: see [`crate::sparse::accumulate::Multiply`].
 pub(super) fn multiply(isa: Isa, mut block: Block<'_>, whole: usize) {
     let block = &mut block;
     dispatch!(isa, fn multiply_with(block: &mut Block<'_>, whole: usize));

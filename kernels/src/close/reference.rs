@@ -2,8 +2,8 @@
 
 use super::conv::Scale;
 use crate::exact::reference::tap;
-use crate::f16;
 use crate::sparse::taps::Taps;
+use ::half::f16;
 
 /// A value, and how large the terms it was summed from are: what a bound on its rounding error scales with.
 #[derive(Debug, Clone, Copy, PartialEq)]

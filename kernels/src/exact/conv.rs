@@ -10,44 +10,16 @@ use super::amx;
 #[cfg(target_arch = "aarch64")]
 use super::dot;
 use super::epilogue::{Epilogue, Tile, Value, write_tile};
-use super::kernel::multiply;
+use super::kernel::{multiply, place};
 use super::norms::{Energy, Gains, Norms};
+use super::requantise::Requantise;
 use super::winograd;
 use crate::simd::{Isa, Simd, dispatch, prefetch};
+use crate::sparse::accumulate::{accumulate, group};
 use crate::sparse::plan::PlanTile;
-use crate::sparse::rows::{AHEAD, Extents, IN_ORDER, Output, PANEL, Scratch, Words, panels, with_scratch};
+use crate::sparse::rows::{AHEAD, Extents, IN_ORDER, Output, PANEL, Words, panels};
+use crate::sparse::scratch::{Scratch, with_scratch};
 use crate::sparse::taps::Taps;
-use crate::sparse::{accumulate, group};
-
-/// The largest magnitude of an activation.
-pub const LIMIT: i16 = 2047;
-
-/// How sums become activations again.
-#[derive(Debug, Clone)]
-pub enum Requantise {
-    /// `clamp((sum + bias) >> shift)`, all wrapping; the rounding constant is part of the bias.
-    Shift {
-        /// One per output channel.
-        bias: Vec<i32>,
-        /// One per output channel, at most 31.
-        shift: Vec<u8>,
-    },
-    /// `clamp(round(sum · scale + bias))` in f32, halves to even.
-    Scale {
-        /// One per output channel.
-        scale: Vec<f32>,
-        /// One per output channel.
-        bias: Vec<f32>,
-    },
-    /// `clamp(round(sum · (gain / √D) + bias))` in f32, halves to even, with
-    /// `D = max(1, Σ weight²)` over the output channel's weights in the taps that read something.
-    Invariant {
-        /// One per output channel.
-        gain: Vec<f32>,
-        /// One per output channel.
-        bias: Vec<f32>,
-    },
-}
 
 /// A sparse convolution of i16 activations by i16 weights, summed in wrapping i32.
 #[derive(Debug, Clone)]
@@ -142,9 +114,9 @@ impl ExactConv {
     }
 
     /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations each, within
-    /// ±[`LIMIT`].
+    /// ±[`LIMIT`](super::requantise::LIMIT).
     ///
-    /// The residual is added after requantising, and the sum clamped to ±[`LIMIT`] again.
+    /// The residual is added after requantising, and the sum clamped to ±[`LIMIT`](super::requantise::LIMIT) again.
     ///
     /// # Panics
     /// If `taps` are not this layer's, or name rows that `input` lacks, or `output` does not fit.
@@ -329,11 +301,6 @@ struct Own {
 fn with_own(run: impl FnOnce(&mut Own)) {
     thread_local!(static OWN: RefCell<Own> = RefCell::default());
     OWN.with_borrow_mut(run);
-}
-
-/// The half of a word that the pair's first or second value takes.
-pub(crate) fn place(value: i16, which: usize) -> u32 {
-    u32::from(value as u16) << (16 * (which ^ usize::from(cfg!(target_endian = "big"))))
 }
 
 /// Rows of activations as pairs; the last has a zero if their number is odd.

@@ -1,14 +1,14 @@
 //! The epilogue of a layer: from integer sums to activations or real numbers.
 
-use super::conv::LIMIT;
 use super::norms::{Gains, Norms};
+use super::requantise::LIMIT;
 use crate::simd::{F32Vector, I32Vector, Simd, prefetch};
 use crate::sparse::rows::{Output, PANEL, Words, part, store_part};
 
 /// By how many rows memory is asked for what is added.
 const AHEAD: usize = 16;
 
-/// [`Requantise`](super::conv::Requantise) in panels.
+/// [`Requantise`](super::requantise::Requantise) in panels.
 #[derive(Debug, Clone)]
 pub(crate) enum Epilogue {
     Shift {

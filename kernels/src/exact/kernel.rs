@@ -2,8 +2,9 @@
 
 use bytemuck::{must_cast_slice, must_cast_slice_mut};
 
-use crate::simd::{I32Vector, Isa, Level, Simd, Work, dispatch};
-use crate::sparse::{Block, MIN_GROUP, Microkernel, WIDE, columns, peak};
+use crate::simd::{I32Vector, Isa, Simd, Work, dispatch};
+use crate::sparse::microkernel::{Block, MIN_GROUP, Microkernel, WIDE, columns};
+use crate::sparse::peak;
 
 /// Pairs of i16.
 #[derive(Clone, Copy)]
@@ -51,16 +52,18 @@ impl<S: Simd> Microkernel for Pairs<S> {
     }
 }
 
-/// Multiplies a block: see [`crate::sparse::Multiply`].
+/// Multiplies a block: see [`crate::sparse::accumulate::Multiply`].
 pub(super) fn multiply(isa: Isa, mut block: Block<'_>, whole: usize) {
     let block = &mut block;
-    match isa.level() {
-        #[cfg(target_arch = "x86_64")]
-        Level::AvxVnni(vnni, avx2) => vnni.vectorize(avx2, MultiplyVnni { block, whole }),
-        #[cfg(target_arch = "aarch64")]
-        Level::Neon(neon) | Level::NeonDot(_, neon) => neon.vectorize(super::neon::Multiply { neon, block, whole }),
-        _ => dispatch!(isa, fn multiply_with(block: &mut Block<'_>, whole: usize)),
+    #[cfg(target_arch = "x86_64")]
+    if let Some(vnni) = isa.vnni() {
+        return vnni.vectorize(MultiplyVnni { block, whole });
     }
+    #[cfg(target_arch = "aarch64")]
+    if let Some(neon) = isa.neon() {
+        return neon.vectorize(super::neon::Multiply { neon, block, whole });
+    }
+    dispatch!(isa, fn multiply_with(block: &mut Block<'_>, whole: usize));
 }
 
 #[inline(always)]
@@ -100,14 +103,15 @@ impl Work for MultiplyVnni<'_, '_> {
 
 /// Multiply-adds for as long as `rounds` say; the result is their number.
 pub(super) fn batch(isa: Isa, rounds: usize) -> usize {
-    let words = match isa.level() {
-        #[cfg(target_arch = "x86_64")]
-        Level::AvxVnni(vnni, avx2) => vnni.vectorize(avx2, Batch(rounds)),
-        #[cfg(target_arch = "aarch64")]
-        Level::Neon(neon) | Level::NeonDot(_, neon) => neon.vectorize(super::neon::Batch { neon, rounds }),
-        _ => isa.run(Batch(rounds)),
-    };
-    2 * words
+    #[cfg(target_arch = "x86_64")]
+    if let Some(vnni) = isa.vnni() {
+        return 2 * vnni.vectorize(Batch(rounds));
+    }
+    #[cfg(target_arch = "aarch64")]
+    if let Some(neon) = isa.neon() {
+        return 2 * neon.vectorize(super::neon::Batch { neon, rounds });
+    }
+    2 * isa.run(Batch(rounds))
 }
 
 struct Batch(usize);
@@ -119,4 +123,9 @@ impl Work for Batch {
     fn run<S: Simd>(self, simd: S) -> usize {
         peak::rounds(Pairs(simd), self.0)
     }
+}
+
+/// The half of a word that the pair's first or second value takes.
+pub(super) fn place(value: i16, which: usize) -> u32 {
+    u32::from(value as u16) << (16 * (which ^ usize::from(cfg!(target_endian = "big"))))
 }

@@ -20,5 +20,6 @@ mod neon;
 pub(crate) mod norms;
 pub(crate) mod peak;
 pub(crate) mod reference;
+pub(crate) mod requantise;
 pub mod smooth;
 mod winograd;

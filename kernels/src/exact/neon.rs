@@ -4,10 +4,12 @@ use std::arch::aarch64::*;
 
 use bytemuck::{must_cast, must_cast_ref};
 
-use crate::simd::dispatch::methods;
+use crate::simd::macros::methods;
+use crate::simd::neon::Neon;
 use crate::simd::neon::with_neon;
-use crate::simd::{Neon, Simd, Work};
-use crate::sparse::{Block, MIN_GROUP, Microkernel, columns, peak};
+use crate::simd::{Simd, Work};
+use crate::sparse::microkernel::{Block, MIN_GROUP, Microkernel, columns};
+use crate::sparse::peak;
 
 /// Pairs of i16, eight at a time.
 #[derive(Clone, Copy)]
@@ -55,7 +57,7 @@ methods! { with_neon Pairs: Microkernel {
     }
 }}
 
-/// Multiplies a block: see [`crate::sparse::Multiply`].
+/// Multiplies a block: see [`crate::sparse::accumulate::Multiply`].
 pub(super) struct Multiply<'a, 'b> {
     pub neon: Neon,
     pub block: &'a mut Block<'b>,

@@ -1,6 +1,6 @@
 //! The convolution as its definition reads: a triple loop over i64. What the kernels are tested against.
 
-use super::conv::{LIMIT, Requantise};
+use super::requantise::{LIMIT, Requantise};
 use crate::sparse::taps::{ABSENT, Taps};
 
 /// The input row that output row `i` reads through tap `k`.

@@ -7,17 +7,17 @@
 
 use bytemuck::{must_cast_slice, must_cast_slice_mut};
 
-use super::conv::{LIMIT, place};
-use super::kernel::multiply;
+use super::kernel::{multiply, place};
+use super::requantise::LIMIT;
 use crate::simd::{I16Vector, I32Vector, Isa, Simd, dispatch, four};
+use crate::sparse::accumulate::multiply_rows;
 use crate::sparse::children::{copy_mask, window};
-use crate::sparse::multiply_rows;
 use crate::sparse::rows::{Extents, PANEL, Words};
 use crate::sparse::taps::ABSENT;
 
 /// Positions of the window.
 const WINDOW: usize = 64;
-/// Voxels whose children are computed together: their windows and products fit the second cache. A multiple of every [`crate::sparse::group`].
+/// Voxels whose children are computed together: their windows and products fit the second cache. A multiple of every [`crate::sparse::accumulate::group`].
 const PART: usize = 16;
 /// Sums must stay below this, either side of zero.
 const SUM_LIMIT: i64 = 1 << 28;

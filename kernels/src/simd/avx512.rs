@@ -3,16 +3,18 @@
 use std::arch::x86_64::*;
 
 use bytemuck::must_cast;
+use half::f16;
 
 use super::avx2::Avx2;
 #[cfg(feature = "close")]
 use super::avx2::{F32x8, I32x8};
-use super::dispatch::{define_set, methods, operators};
-use super::{
-    EXP2_ABOVE, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, MaskVector, Simd, Work, first, first_mut, four,
-    polynomial, three,
+#[cfg(feature = "close")]
+use super::macros::vectorize;
+use super::macros::{define_set, five, four, methods, operators, three};
+use super::vector::{
+    EXP2_ABOVE, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, MaskVector, Simd, first, first_mut, polynomial,
+    sealed,
 };
-use crate::f16;
 
 define_set! { $ with_avx512, is_x86_feature_detected,
     /// Proof of AVX-512 F, BW, CD, DQ, VL and VNNI, and of AVX2.
@@ -20,7 +22,7 @@ define_set! { $ with_avx512, is_x86_feature_detected,
     extends avx2::Avx2, with_avx2;
 }
 
-impl super::sealed::Sealed for Avx512 {}
+impl sealed::Sealed for Avx512 {}
 
 impl Simd for Avx512 {
     const LANES: usize = 16;
@@ -33,18 +35,7 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn narrow(self) -> Avx2 {
-        Avx2::of(self)
-    }
-
-    #[inline(always)]
-    fn vectorize<W: Work>(self, work: W) -> W::Output {
-        with_avx512! {
-            fn run<W: Work>(token: Avx512, work: W) -> W::Output {
-                work.run(token)
-            }
-        }
-        // SAFETY: the token proves the features.
-        unsafe { run(self, work) }
+        self.base()
     }
 }
 
@@ -232,7 +223,7 @@ methods! { with_avx512 F32x16: F32Vector<Avx512> {
     fn exp2(self) -> Self {
         // What is beyond the integer below; scaling takes that integer by itself.
         let f = _mm512_reduce_ps::<{ _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC }>(self.0);
-        let p = polynomial(Avx512(()), F32x16(f), &EXP2_ABOVE);
+        let p = polynomial::<Avx512>(F32x16(f), five!(i => F32x16(_mm512_set1_ps(EXP2_ABOVE[i]))));
         F32x16(_mm512_scalef_ps(p.0, self.0))
     }
 
@@ -476,19 +467,10 @@ define_set! { $ with_bf16, is_x86_feature_detected,
 }
 
 #[cfg(feature = "close")]
-impl Bf16 {
-    /// Runs `work` in a function that is compiled with the features of this set.
-    #[inline(always)]
-    pub fn vectorize<W: Work>(self, avx512: Avx512, work: W) -> W::Output {
-        with_bf16! {
-            fn run<W: Work>(avx512: Avx512, work: W) -> W::Output {
-                work.run(avx512)
-            }
-        }
-        // SAFETY: the token proves the features.
-        unsafe { run(avx512, work) }
-    }
+vectorize! { with_bf16 Bf16, base: Avx512 }
 
+#[cfg(feature = "close")]
+impl Bf16 {
     /// Rows of f16 as pairs of bf16, rounded to even: row `i` of `to` is row `rows[i]` of `input`, of `cin` values each. An odd row's last
     /// pair has a zero.
     ///

@@ -2,11 +2,13 @@
 
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Sub};
 
-use super::{
-    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, Work, first,
-    first_mut, four, three,
+use half::f16;
+
+use super::macros::{four, three};
+use super::vector::{
+    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, first,
+    first_mut, sealed,
 };
-use crate::f16;
 
 /// What every processor of the target has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -15,9 +17,14 @@ pub struct Scalar(());
 impl Scalar {
     /// The token: there is nothing to prove.
     pub const TOKEN: Scalar = Scalar(());
+
+    /// The token, as the other sets give theirs.
+    pub(crate) fn new() -> Option<Self> {
+        Some(Self::TOKEN)
+    }
 }
 
-impl super::sealed::Sealed for Scalar {}
+impl sealed::Sealed for Scalar {}
 
 impl Simd for Scalar {
     const LANES: usize = 4;
@@ -32,12 +39,16 @@ impl Simd for Scalar {
     fn narrow(self) -> Self {
         self
     }
-
-    #[inline(always)]
-    fn vectorize<W: Work>(self, work: W) -> W::Output {
-        work.run(self)
-    }
 }
+
+/// Compiles a function as it is, apart from what calls it.
+macro_rules! with_scalar {
+    ($($item:tt)*) => {
+        #[inline(never)]
+        $($item)*
+    };
+}
+pub(crate) use with_scalar;
 
 /// Four f32.
 #[derive(Clone, Copy)]

@@ -7,7 +7,7 @@
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-use super::Microkernel;
+use super::microkernel::Microkernel;
 use super::rows::{PANEL, Words};
 
 /// Rounds of one batch, some 50 µs of them.

@@ -1,11 +1,6 @@
-//! What both convolutions share: words of 32 bits in panels, the extents of weights, where a layer writes, and per-thread scratch.
-
-use std::cell::RefCell;
+//! What both convolutions share: words of 32 bits in panels, the extents of weights, and where a layer writes.
 
 use bytemuck::{Pod, Zeroable};
-
-use super::plan::Planner;
-use super::taps::TileTaps;
 
 /// Channels of one weight panel.
 pub(crate) const PANEL: usize = 16;
@@ -65,14 +60,8 @@ impl<T, R> Output<'_, T, R> {
 
 /// Sixteen words of 32 bits: a panel's sums, or its weights of one step. Floats are kept as their bits.
 #[repr(C, align(64))]
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub(crate) struct Words(pub [u32; PANEL]);
-
-// SAFETY: all bits zero are sixteen zeros.
-unsafe impl Zeroable for Words {}
-
-// SAFETY: sixteen u32 and nothing else: 64 bytes are their size and their alignment, so there is no padding.
-unsafe impl Pod for Words {}
 
 impl Words {
     /// The words as signed integers.
@@ -204,19 +193,4 @@ impl Extents {
             }
         }
     }
-}
-
-/// Per-thread scratch of any layer, kept from one call to the next.
-#[derive(Default)]
-pub(crate) struct Scratch {
-    pub taps: TileTaps,
-    pub planner: Planner,
-    pub expanded: Vec<Words>,
-    pub sums: Vec<Words>,
-}
-
-/// Lends this thread's [`Scratch`].
-pub(crate) fn with_scratch(run: impl FnOnce(&mut Scratch)) {
-    thread_local!(static SCRATCH: RefCell<Scratch> = RefCell::default());
-    SCRATCH.with_borrow_mut(run);
 }

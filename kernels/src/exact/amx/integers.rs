@@ -7,10 +7,14 @@ use std::arch::x86_64::*;
 
 use bytemuck::must_cast;
 
-use super::{Buffers, LINE, Scheme, TILE, Weights, multiply, pairs, prepare};
+use super::multiply::{multiply, prepare};
+use super::tiles::{LINE, TILE};
+use super::weights::{Buffers, Scheme, Weights};
+use super::{pairing, pairs};
 use crate::exact::digits::{REACH, digits};
+use crate::simd::amx::Amx;
 use crate::simd::avx512::with_avx512;
-use crate::simd::{Amx, prefetch};
+use crate::simd::prefetch;
 use crate::sparse::plan::PlanTile;
 use crate::sparse::rows::{AHEAD, Extents, PANEL, Words};
 
@@ -47,7 +51,7 @@ impl Weights {
                 let [pair, half] = packed.homes[tap];
                 for (product, digits) in [high, low, sums].into_iter().enumerate() {
                     let byte = half * HALF + channel;
-                    let tile = pairs::tile(extents, pair, product, panel);
+                    let tile = pairing::tile(extents, pair, product, panel);
                     add(&mut packed.tiles[tile * TILE + byte / 4].0, byte, digits);
                 }
                 continue;

@@ -2,8 +2,8 @@
 
 use std::arch::asm;
 
-use super::{LINE, TILE, configure, release};
-use crate::simd::Amx;
+use super::tiles::{LINE, TILE, configure, release};
+use crate::simd::amx::Amx;
 use crate::sparse::peak::some_words;
 use crate::sparse::rows::{PANEL, Words};
 
