@@ -60,13 +60,9 @@ fn token(isa: Isa) -> Bf16 {
 }
 
 /// Multiplies a block in bf16: see [`crate::sparse::accumulate::Multiply`]. Only where [`Isa::has_bf16`].
-pub(super) fn multiply(isa: Isa, mut block: Block<'_>, whole: usize) {
+pub(super) fn multiply(isa: Isa, block: &mut Block<'_>, whole: usize) {
     let bf16 = token(isa);
-    let work = MultiplyBlock {
-        bf16,
-        block: &mut block,
-        whole,
-    };
+    let work = MultiplyBlock { bf16, block, whole };
     bf16.vectorize(work);
 }
 

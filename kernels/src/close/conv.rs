@@ -16,7 +16,7 @@ use crate::exact::norms::{Gains, Norms};
 use crate::simd::{F32Vector, Isa, Simd, dispatch};
 use crate::sparse::accumulate::{Expand, Multiply, accumulate, group};
 use crate::sparse::plan::PlanTile;
-use crate::sparse::rows::{Extents, Output, PANEL, Words, panel, panels, store};
+use crate::sparse::rows::{Extents, Output, PANEL, Words, panel, panels, store_part};
 use crate::sparse::scratch::{Scratch, with_scratch};
 use crate::sparse::taps::Taps;
 
@@ -74,30 +74,25 @@ impl FloatOut for f32 {}
 impl FloatOut for f16 {}
 
 mod sealed {
-    use super::{F32Vector, PANEL, Simd, convert};
+    use super::{F32Vector, Simd};
     use ::half::f16;
 
-    pub trait Sealed: Sized {
-        /// Writes a panel, or as much of it as there is.
-        fn store<S: Simd>(simd: S, from: &[f32; PANEL], to: &mut [Self]);
+    pub trait Sealed: Default {
+        /// Writes a vector.
+        fn store<S: Simd>(simd: S, from: S::F32, to: &mut [Self]);
     }
 
     impl Sealed for f32 {
         #[inline(always)]
-        fn store<S: Simd>(_: S, from: &[f32; PANEL], to: &mut [f32]) {
-            super::store(*from, to);
+        fn store<S: Simd>(_: S, from: S::F32, to: &mut [f32]) {
+            from.store(to);
         }
     }
 
     impl Sealed for f16 {
         #[inline(always)]
-        fn store<S: Simd>(simd: S, from: &[f32; PANEL], to: &mut [f16]) {
-            let Some(to) = to.as_mut_array::<PANEL>() else {
-                return convert::narrow(simd, &from[..to.len()], to);
-            };
-            for at in (0..PANEL).step_by(S::LANES) {
-                S::F32::load(simd, &from[at..]).store_f16(&mut to[at..]);
-            }
+        fn store<S: Simd>(_: S, from: S::F32, to: &mut [f16]) {
+            from.store_f16(to);
         }
     }
 }
@@ -348,31 +343,34 @@ fn write_tile<S: Simd, T: FloatOut>(
         let factors = conv.invariant.as_ref().map(|gains| norms.of(simd, gains, mask));
         let panels = row.chunks_mut(PANEL).zip(sums).zip(&conv.bias);
         for (p, ((row, sums), bias)) in panels.enumerate() {
-            let mut sums = *sums.f32();
-            if let Some(units) = units {
-                for (sum, unit) in sums.iter_mut().zip(&units[p]) {
-                    *sum *= unit;
+            let (sums, units) = (sums.f32(), units.map(|units| &units[p]));
+            let factors = factors.map(|factors| &factors[p]);
+            let skip = residual.map(|residual| panel(&residual[p * PANEL..][..row.len()]));
+            let mut part = [T::default(); PANEL];
+            let (whole, to) = match row.as_mut_array::<PANEL>() {
+                Some(row) => (true, row),
+                None => (false, &mut part),
+            };
+            for at in (0..PANEL).step_by(S::LANES) {
+                let mut sum = S::F32::load(simd, &sums[at..]);
+                if let Some(units) = units {
+                    sum = sum * S::F32::load(simd, &units[at..]);
                 }
-            }
-            if let Some(factors) = factors {
-                for (sum, factor) in sums.iter_mut().zip(&factors[p]) {
-                    *sum *= factor;
+                if let Some(factors) = factors {
+                    sum = sum * S::F32::load(simd, &factors[at..]);
                 }
-            }
-            for (sum, bias) in sums.iter_mut().zip(bias) {
-                *sum += bias;
-            }
-            if let Some(residual) = residual {
-                let skip = panel(&residual[p * PANEL..][..row.len()]);
-                for at in (0..PANEL).step_by(S::LANES) {
-                    let sum = S::F32::load(simd, &sums[at..]) + S::F32::load_f16(simd, &skip[at..]);
-                    sum.store(&mut sums[at..]);
+                sum = sum + S::F32::load(simd, &bias[at..]);
+                if let Some(skip) = &skip {
+                    sum = sum + S::F32::load_f16(simd, &skip[at..]);
                 }
+                if relu {
+                    sum = sum.max(S::F32::splat(simd, 0.0));
+                }
+                T::store(simd, sum, &mut to[at..]);
             }
-            if relu {
-                sums.iter_mut().for_each(|sum| *sum = sum.max(0.0));
+            if !whole {
+                store_part(part, row);
             }
-            T::store(simd, &sums, row);
         }
     }
 }

@@ -99,11 +99,11 @@ type Products = [[uint16x8_t; 2]; ROWS];
 ///
 /// # Panics
 /// If the block reads or writes beyond its slices, or has no whole blocks of [`BLOCK`] inputs.
-pub(super) fn multiply(isa: Isa, mut block: Block<'_>, _whole: usize) {
+pub(super) fn multiply(isa: Isa, block: &mut Block<'_>, _whole: usize) {
     assert!(isa.has_half() && (2 * block.steps).is_multiple_of(BLOCK));
     for first in (0..block.group).step_by(ROWS) {
         // SAFETY: the processor has `fp16`.
-        unsafe { multiply_rows(&mut block, first) };
+        unsafe { multiply_rows(block, first) };
     }
 }
 
@@ -120,7 +120,7 @@ with_neon_half! {
         for (t, &tap) in block.taps.iter().enumerate() {
             let mut inputs = [std::ptr::null::<u16>(); ROWS];
             for (r, input) in inputs.iter_mut().enumerate() {
-                let place = usize::from(block.places[t * block.group + first + r]);
+                let place = usize::from(block.places.all()[t * block.group + first + r]);
                 *input = block.inputs[place * block.steps..][..block.steps].as_ptr().cast();
             }
             let mut weights = block.weights[usize::from(tap) * block.tap..][..block.steps].as_ptr().cast::<u16>();

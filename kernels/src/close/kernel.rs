@@ -53,8 +53,7 @@ impl<S: Simd> Microkernel for Float<S> {
 }
 
 /// Multiplies a block in f32: see [`crate::sparse::accumulate::Multiply`].
-pub(super) fn multiply(isa: Isa, mut block: Block<'_>, whole: usize) {
-    let block = &mut block;
+pub(super) fn multiply(isa: Isa, block: &mut Block<'_>, whole: usize) {
     dispatch!(isa, fn multiply_with(block: &mut Block<'_>, whole: usize));
 }
 

@@ -113,7 +113,7 @@ pub(crate) fn accumulate(
                 }
                 let block = Block {
                     taps,
-                    places: places.as_ptr(),
+                    places: places.all().as_ptr(),
                     rows: buffers.rows.as_ptr(),
                     row,
                     weights: weights.as_ptr(),

@@ -53,8 +53,7 @@ impl<S: Simd> Microkernel for Pairs<S> {
 }
 
 /// Multiplies a block: see [`crate::sparse::accumulate::Multiply`].
-pub(super) fn multiply(isa: Isa, mut block: Block<'_>, whole: usize) {
-    let block = &mut block;
+pub(super) fn multiply(isa: Isa, block: &mut Block<'_>, whole: usize) {
     #[cfg(target_arch = "x86_64")]
     if let Some(vnni) = isa.vnni() {
         return vnni.vectorize(MultiplyVnni { block, whole });

@@ -477,13 +477,8 @@ impl Bf16 {
     /// # Panics
     /// If the input lacks a row.
     pub fn round_rows(self, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
-        let words = cin.div_ceil(2);
-        for (to, &row) in to.chunks_exact_mut(words).zip(rows) {
-            let from = &input[row as usize * cin..][..cin];
-            for (to, from) in to.chunks_mut(16).zip(from.chunks(32)) {
-                to.copy_from_slice(&self.round(from)[..to.len()]);
-            }
-        }
+        // SAFETY: the token proves the features.
+        unsafe { round_rows(input, rows, cin, to) }
     }
 
     /// Up to 32 f16 as pairs of bf16, rounded to even, and zeros after them.
@@ -491,6 +486,20 @@ impl Bf16 {
     pub fn round(self, from: &[f16]) -> [u32; 16] {
         // SAFETY: the token proves the features.
         unsafe { round_f16(from) }
+    }
+}
+
+#[cfg(feature = "close")]
+with_bf16! {
+    fn round_rows(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
+        for (to, &row) in to.chunks_exact_mut(cin.div_ceil(2)).zip(rows) {
+            let from = &input[row as usize * cin..][..cin];
+            for (to, from) in to.chunks_mut(16).zip(from.chunks(32)) {
+                let here = u16::MAX >> (16 - to.len());
+                // SAFETY: only the words of `to` are written.
+                unsafe { _mm512_mask_storeu_epi32(to.as_mut_ptr().cast(), here, must_cast(round_f16(from))) };
+            }
+        }
     }
 }
 

@@ -1,8 +1,8 @@
 //! The sums of a tile: its groups of rows by all taps and panels, as long as weights stay in the first cache.
 
 use super::microkernel::{Block, MIN_GROUP, WIDE};
-use super::plan::PlanTile;
-use super::rows::{Extents, IN_ORDER, PANEL, TILE, Words};
+use super::plan::{Places, PlanTile};
+use super::rows::{Extents, PANEL, TILE, Words};
 use crate::simd::Isa;
 
 /// [`Words`] of weights that the first cache holds besides rows and sums.
@@ -21,7 +21,7 @@ pub(crate) fn group(isa: Isa, cout: usize) -> usize {
 }
 
 /// Multiplies the panels of a block, of which so many whole ones are left, or none and a half one: as many as [`width`] says.
-pub(crate) type Multiply = fn(Isa, Block<'_>, usize);
+pub(crate) type Multiply = fn(Isa, &mut Block<'_>, usize);
 
 /// Writes rows of the input, of so many values each, as words.
 pub(crate) type Expand<T> = fn(Isa, &[T], &[u32], usize, &mut [u32]);
@@ -66,7 +66,7 @@ pub(crate) fn accumulate<T>(
                 if tap > 0 && taps.is_empty() {
                     continue;
                 }
-                let block = Block {
+                let mut block = Block {
                     group,
                     taps,
                     places,
@@ -78,7 +78,7 @@ pub(crate) fn accumulate<T>(
                     stride: panels,
                     more: tap > 0,
                 };
-                multiply(isa, block, whole);
+                multiply(isa, &mut block, whole);
             }
         }
         panel += width;
@@ -104,10 +104,10 @@ pub(crate) fn multiply_rows(
     let mut panel = 0;
     while panel < panels {
         let whole = whole(cout, panel);
-        let block = Block {
+        let mut block = Block {
             group: count,
             taps: &[0],
-            places: &IN_ORDER[..count],
+            places: Places::in_order(count),
             inputs: rows,
             steps,
             weights: &weights[panel * steps..],
@@ -116,7 +116,7 @@ pub(crate) fn multiply_rows(
             stride: panels,
             more: false,
         };
-        multiply(isa, block, whole);
+        multiply(isa, &mut block, whole);
         panel += width(isa, whole);
     }
 }

@@ -1,5 +1,6 @@
 //! The register-blocked loop that multiplies rows by weights.
 
+use super::plan::Places;
 use super::rows::{PANEL, Words};
 
 /// The smallest [`group`].
@@ -40,7 +41,7 @@ pub(crate) struct Block<'a> {
     /// Its taps.
     pub taps: &'a [u8],
     /// For each tap and row, which of `inputs` it reads.
-    pub places: &'a [u16],
+    pub places: Places<'a>,
     /// Input rows, `steps` words each.
     pub inputs: &'a [u32],
     /// Steps.
@@ -67,15 +68,37 @@ pub(crate) fn columns<K: Microkernel, const R: usize, const V: usize, const P: u
     kernel: K,
     block: &mut Block<'_>,
 ) {
-    for first in (0..block.group).step_by(R) {
-        multiply::<K, R, V, P>(kernel, block, first);
+    let (group, steps) = (block.group, block.steps);
+    let places = &block.places.all()[..block.taps.len() * group];
+    let rows = places.is_empty() || (block.places.most() + 1).saturating_mul(steps) <= block.inputs.len();
+    assert!(rows, "a place names a row that is not there");
+    assert!(group.is_multiple_of(R), "whole groups");
+    // Up to the end of the last panel, the weights of a tap.
+    let panels = ((V * K::LANES).div_ceil(PANEL)).saturating_mul(steps);
+    let taps = (block.weights.len() + block.tap).saturating_sub(panels) / block.tap;
+    for first in (0..group).step_by(R) {
+        // SAFETY: there are places for all taps and rows of the group, `first + R` among them at most, and rows for all places; below
+        // `taps`, a tap has weights of all panels.
+        unsafe { multiply::<K, R, V, P>(kernel, block, first, taps) };
     }
 }
 
 /// Sums the products of `R` rows from `first` on.
+///
+/// # Safety
+/// The block must have a place for each tap and each row of the group, and these rows; the places must name whole rows of `inputs`, and
+/// each of the first `taps` taps have `steps` weights of the panels of `V` vectors.
+///
+/// # Panics
+/// If a tap is not among the first `taps`.
 #[inline(always)]
 #[expect(clippy::needless_range_loop, reason = "rows, vectors and parts are counted alike")]
-fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usize>(k: K, block: &mut Block<'_>, first: usize) {
+unsafe fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usize>(
+    k: K,
+    block: &mut Block<'_>,
+    first: usize,
+    taps: usize,
+) {
     let steps = block.steps;
     let mut sums = [[[k.zero(); V]; R]; P];
     if block.more {
@@ -87,17 +110,24 @@ fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usize>(k: K
             }
         }
     }
-    for (t, &tap) in block.taps.iter().enumerate() {
-        let places = &block.places[t * block.group + first..][..R];
+    for (&tap, places) in block.taps.iter().zip(block.places.all().chunks_exact(block.group)) {
         let mut inputs = [(&[][..], &[][..]); R];
         for r in 0..R {
-            let row = &block.inputs[usize::from(places[r]) * steps..][..steps];
+            // SAFETY: the caller's promise of places and rows.
+            let row = unsafe {
+                let place = usize::from(*places.get_unchecked(first + r));
+                std::slice::from_raw_parts(block.inputs.as_ptr().add(place * steps), steps)
+            };
             inputs[r] = row.as_chunks::<P>();
         }
-        let tap = &block.weights[usize::from(tap) * block.tap..];
+        let tap = usize::from(tap);
+        assert!(tap < taps, "a tap that has no weights");
         let mut weights = [(&[][..], &[][..]); V];
         for v in 0..V {
-            weights[v] = tap[v * K::LANES / PANEL * steps..][..steps].as_chunks::<P>();
+            let start = tap * block.tap + v * K::LANES / PANEL * steps;
+            // SAFETY: the caller's promise of weights, for the tap is one of those.
+            let panel = unsafe { block.weights.get_unchecked(start..start + steps) };
+            weights[v] = panel.as_chunks::<P>();
         }
         for s in 0..steps / P {
             for part in 0..P {

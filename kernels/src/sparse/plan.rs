@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use super::rows::TILE;
+use super::rows::{IN_ORDER, TILE};
 
 /// A kernel map arranged for the layers that read it, part by part as they first do, in the smallest groups and in larger ones. It pays where a
 /// map serves several layers; results are the same without.
@@ -44,7 +44,57 @@ pub(crate) struct PlanTile {
     /// Each step's tap; they ascend within a group.
     pub(super) taps: Vec<u8>,
     /// For each step and row of its group, which of `inputs` it reads; their number for nothing. One more step, of nothing, comes last.
-    pub(super) places: Vec<u16>,
+    pub(super) places: Clamped,
+}
+
+/// Numbers of rows that are there: the greatest is known.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Clamped {
+    places: Vec<u16>,
+    most: u16,
+}
+
+impl Clamped {
+    /// The least of each place and `most`.
+    pub fn new(mut places: Vec<u16>, most: u16) -> Self {
+        for place in &mut places {
+            *place = (*place).min(most);
+        }
+        Clamped { places, most }
+    }
+
+    /// The memory of places, to be used again.
+    pub fn take(&mut self) -> Vec<u16> {
+        std::mem::take(&mut self.places)
+    }
+}
+
+/// Some numbers of rows, with a bound of them.
+#[derive(Clone, Copy)]
+pub(crate) struct Places<'a> {
+    places: &'a [u16],
+    most: u16,
+}
+
+impl<'a> Places<'a> {
+    /// The first rows in order, at most [`TILE`].
+    pub fn in_order(rows: usize) -> Places<'static> {
+        let places = &IN_ORDER[..rows];
+        let most = places.last().copied().unwrap_or(0);
+        Places { places, most }
+    }
+
+    /// All of them.
+    #[inline(always)]
+    pub fn all(self) -> &'a [u16] {
+        self.places
+    }
+
+    /// None is above.
+    #[inline(always)]
+    pub fn most(self) -> usize {
+        self.most.into()
+    }
 }
 
 impl PlanTile {
@@ -91,9 +141,13 @@ impl PlanTile {
 
     /// What a group multiplies of some taps, ascending: the taps it uses, and for each of them the places of the input rows, followed by
     /// one more.
-    pub(crate) fn steps(&self, group: usize, taps: Range<usize>) -> (&[u8], &[u16]) {
+    pub(crate) fn steps(&self, group: usize, taps: Range<usize>) -> (&[u8], Places<'_>) {
         let (start, end) = (self.step(group, taps.start), self.step(group, taps.end));
         let places = start * self.group..(end + 1) * self.group;
-        (&self.taps[start..end], &self.places[places])
+        let places = Places {
+            places: &self.places.places[places],
+            most: self.places.most,
+        };
+        (&self.taps[start..end], places)
     }
 }

@@ -1,7 +1,7 @@
 //! Arranging kernel maps: rows of like taps together, and short numbers for the input rows.
 
 use super::microkernel::MIN_GROUP;
-use super::plan::PlanTile;
+use super::plan::{Clamped, PlanTile};
 use super::rows::TILE;
 use super::taps::Taps;
 use super::tile_taps::TileTaps;
@@ -38,8 +38,9 @@ impl PlanTile {
 
         let near = (0..volume).find_map(|k| taps.of(k).inputs.first());
         numbers.clear(near.copied().unwrap_or(0), &mut self.inputs);
-        self.places.clear();
-        self.places.resize((self.taps.len() + 1) * group, u16::MAX);
+        let mut places = self.places.take();
+        places.clear();
+        places.resize((self.taps.len() + 1) * group, u16::MAX);
         for k in 0..volume {
             let mut homes = [0; TILE / MIN_GROUP];
             for (group, home) in homes.iter_mut().take(self.unions.len()).enumerate() {
@@ -49,13 +50,10 @@ impl PlanTile {
             for (&input, &row) in pairs.inputs.iter().zip(pairs.rows) {
                 let at = usize::from(self.positions[row as usize]);
                 let place = numbers.of(input, &mut self.inputs);
-                self.places[homes[at / group] * group + at % group] = place;
+                places[homes[at / group] * group + at % group] = place;
             }
         }
-        let none = self.inputs.len() as u16;
-        for place in &mut self.places {
-            *place = (*place).min(none);
-        }
+        self.places = Clamped::new(places, self.inputs.len() as u16);
     }
 
     /// Arranges `count` rows from `first` on, of which each reads the input row of its own number, through the only tap.
@@ -74,7 +72,7 @@ impl PlanTile {
                 unions: vec![1; groups],
                 starts: (0..groups as u32).collect(),
                 taps: vec![0; groups],
-                places: (0..rows).map(|row| row.min(count) as u16).collect(),
+                places: Clamped::new((0..rows as u16).collect(), count as u16),
             };
         }
         self.end = first + count;
@@ -297,7 +295,7 @@ mod tests {
             for group in 0..plan.groups() {
                 let (taps, places) = plan.steps(group, 0..volume);
                 assert!(taps.is_sorted_by(|a, b| a < b));
-                let places = places.chunks_exact(plan.group);
+                let places = places.all().chunks_exact(plan.group);
                 for (&tap, places) in taps.iter().zip(places) {
                     for (&row, &place) in plan.order[group * plan.group..].iter().zip(places) {
                         if let Some(&input) = plan.inputs().get(usize::from(place)) {

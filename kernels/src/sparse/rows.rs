@@ -104,16 +104,6 @@ pub(crate) fn panel<T: Copy + Default>(from: &[T]) -> [T; PANEL] {
     }
 }
 
-/// Writes a panel's values, or as many of them as there is room for.
-#[cfg(feature = "close")]
-#[inline(always)]
-pub(crate) fn store<T: Copy>(from: [T; PANEL], to: &mut [T]) {
-    match <&mut [T; PANEL]>::try_from(&mut *to) {
-        Ok(to) => *to = from,
-        Err(_) => store_part(from, to),
-    }
-}
-
 /// Values of half a panel, which many layers end with.
 const HALF: usize = PANEL / 2;
 

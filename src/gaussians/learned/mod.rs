@@ -40,7 +40,7 @@ mod tests;
 
 use std::path::Path;
 
-use b2p_kernels::{Isa, map_file};
+use b2p_kernels::Isa;
 
 use super::{Frame, Gaussians};
 use crate::error::{Error, Result};
@@ -98,7 +98,7 @@ impl HeadsModel {
     /// # Errors
     /// [`Error::Io`], and those of [`HeadsModel::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
-        let bytes = map_file(path).map_err(|source| Error::Io {
+        let bytes = std::fs::read(path).map_err(|source| Error::Io {
             path: path.to_owned(),
             source,
         })?;

@@ -61,7 +61,7 @@ mod work;
 
 use std::path::Path;
 
-use b2p_kernels::{ExactConv, FloatConv, Isa, map_file};
+use b2p_kernels::{ExactConv, FloatConv, Isa};
 
 use crate::error::{Error, Result};
 use crate::latents::entropy::{RawRows, Tables};
@@ -104,7 +104,7 @@ impl Model {
     /// # Errors
     /// [`Error::Io`], or as [`Model::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
-        let bytes = map_file(path).map_err(|source| Error::Io {
+        let bytes = std::fs::read(path).map_err(|source| Error::Io {
             path: path.to_owned(),
             source,
         })?;

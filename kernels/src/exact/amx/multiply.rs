@@ -64,7 +64,7 @@ with_avx512! {
                         let block = Block {
                             steps: taps.len(),
                             taps: taps.as_ptr(),
-                            places: places.as_ptr(),
+                            places: places.all().as_ptr(),
                             rows: rows[pass * lines + chunk..].as_ptr(),
                             row: chunks * LINE,
                             gathered: gathered.as_mut_ptr(),

@@ -66,7 +66,7 @@ with_avx512! {
                 let (taps, places) = plan.steps(group, 0..extents.volume);
                 let mut halves = [[nothing.as_ptr(); 2]; MOST_TAPS.div_ceil(2)];
                 let mut used = 0u32;
-                for (&tap, places) in taps.iter().zip(places.chunks_exact(TILE)) {
+                for (&tap, places) in taps.iter().zip(places.all().chunks_exact(TILE)) {
                     let [pair, half] = weights.homes[usize::from(tap)];
                     halves[pair][half] = places.as_ptr();
                     used |= 1 << pair;
