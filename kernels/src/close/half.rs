@@ -120,7 +120,7 @@ with_neon_half! {
         for (t, &tap) in block.taps.iter().enumerate() {
             let mut inputs = [std::ptr::null::<u16>(); ROWS];
             for (r, input) in inputs.iter_mut().enumerate() {
-                let place = usize::from(block.places.all()[t * block.group + first + r]);
+                let place = usize::from(block.places()[t * block.group + first + r]);
                 *input = block.inputs[place * block.steps..][..block.steps].as_ptr().cast();
             }
             let mut weights = block.weights[usize::from(tap) * block.tap..][..block.steps].as_ptr().cast::<u16>();

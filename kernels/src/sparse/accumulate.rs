@@ -69,10 +69,12 @@ pub(crate) fn accumulate<T>(
                 let mut block = Block {
                     group,
                     taps,
-                    places,
+                    places: places.all(),
+                    most: places.most(),
                     inputs: rows,
                     steps,
                     weights: &weights[panel * steps..],
+                    volume,
                     tap: panels * steps,
                     sums: &mut sums[panel..],
                     stride: panels,
@@ -103,14 +105,16 @@ pub(crate) fn multiply_rows(
     assert_eq!(rows.len(), count * steps, "a row of words for each of products");
     let mut panel = 0;
     while panel < panels {
-        let whole = whole(cout, panel);
+        let (whole, places) = (whole(cout, panel), Places::in_order(count));
         let mut block = Block {
             group: count,
             taps: &[0],
-            places: Places::in_order(count),
+            places: places.all(),
+            most: places.most(),
             inputs: rows,
             steps,
             weights: &weights[panel * steps..],
+            volume: 1,
             tap: panels * steps,
             sums: &mut products[panel..],
             stride: panels,

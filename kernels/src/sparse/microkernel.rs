@@ -1,6 +1,5 @@
 //! The register-blocked loop that multiplies rows by weights.
 
-use super::plan::Places;
 use super::rows::{PANEL, Words};
 
 /// The smallest [`group`].
@@ -41,13 +40,17 @@ pub(crate) struct Block<'a> {
     /// Its taps.
     pub taps: &'a [u8],
     /// For each tap and row, which of `inputs` it reads.
-    pub places: Places<'a>,
+    pub(super) places: &'a [u16],
+    /// None of them is above: both are those of a [`Places`](super::plan::Places).
+    pub(super) most: usize,
     /// Input rows, `steps` words each.
     pub inputs: &'a [u32],
     /// Steps.
     pub steps: usize,
     /// The first panel's weights of tap 0, `steps` [`Words`] a panel; those of the next panel follow.
     pub weights: &'a [Words],
+    /// Taps that there are weights for.
+    pub volume: usize,
     /// [`Words`] from one tap's weights to the next's.
     pub tap: usize,
     /// The first panel's sums of the group's rows, each `stride` [`Words`] after the last's; those of the next panel follow.
@@ -56,6 +59,14 @@ pub(crate) struct Block<'a> {
     pub stride: usize,
     /// Whether there are sums to add to.
     pub more: bool,
+}
+
+impl Block<'_> {
+    /// Which of `inputs` each tap and row reads.
+    #[cfg(all(target_arch = "aarch64", feature = "close"))]
+    pub fn places(&self) -> &[u16] {
+        self.places
+    }
 }
 
 /// Sums a block's products, for `V` vectors of channels from the first panel on, `R` rows at once, which divide the group. Each sum is
@@ -69,17 +80,20 @@ pub(crate) fn columns<K: Microkernel, const R: usize, const V: usize, const P: u
     block: &mut Block<'_>,
 ) {
     let (group, steps) = (block.group, block.steps);
-    let places = &block.places.all()[..block.taps.len() * group];
-    let rows = places.is_empty() || (block.places.most() + 1).saturating_mul(steps) <= block.inputs.len();
+    let places = &block.places[..block.taps.len() * group];
+    let rows = places.is_empty() || (block.most + 1).saturating_mul(steps) <= block.inputs.len();
     assert!(rows, "a place names a row that is not there");
     assert!(group.is_multiple_of(R), "whole groups");
-    // Up to the end of the last panel, the weights of a tap.
-    let panels = ((V * K::LANES).div_ceil(PANEL)).saturating_mul(steps);
-    let taps = (block.weights.len() + block.tap).saturating_sub(panels) / block.tap;
+    let last = block.volume.saturating_sub(1).saturating_mul(block.tap);
+    let panels = (V * K::LANES).div_ceil(PANEL).saturating_mul(steps);
+    assert!(
+        last.saturating_add(panels) <= block.weights.len(),
+        "weights of all taps"
+    );
     for first in (0..group).step_by(R) {
-        // SAFETY: there are places for all taps and rows of the group, `first + R` among them at most, and rows for all places; below
-        // `taps`, a tap has weights of all panels.
-        unsafe { multiply::<K, R, V, P>(kernel, block, first, taps) };
+        // SAFETY: there are places for all taps and rows of the group, `first + R` among them at most, and rows for all places; all
+        // taps have weights of all panels.
+        unsafe { multiply::<K, R, V, P>(kernel, block, first) };
     }
 }
 
@@ -87,17 +101,16 @@ pub(crate) fn columns<K: Microkernel, const R: usize, const V: usize, const P: u
 ///
 /// # Safety
 /// The block must have a place for each tap and each row of the group, and these rows; the places must name whole rows of `inputs`, and
-/// each of the first `taps` taps have `steps` weights of the panels of `V` vectors.
+/// each of the `volume` taps have `steps` weights of the panels of `V` vectors.
 ///
 /// # Panics
-/// If a tap is not among the first `taps`.
+/// If a tap is none of the `volume`.
 #[inline(always)]
 #[expect(clippy::needless_range_loop, reason = "rows, vectors and parts are counted alike")]
 unsafe fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usize>(
     k: K,
     block: &mut Block<'_>,
     first: usize,
-    taps: usize,
 ) {
     let steps = block.steps;
     let mut sums = [[[k.zero(); V]; R]; P];
@@ -110,7 +123,7 @@ unsafe fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usiz
             }
         }
     }
-    for (&tap, places) in block.taps.iter().zip(block.places.all().chunks_exact(block.group)) {
+    for (&tap, places) in block.taps.iter().zip(block.places.chunks_exact(block.group)) {
         let mut inputs = [(&[][..], &[][..]); R];
         for r in 0..R {
             // SAFETY: the caller's promise of places and rows.
@@ -121,7 +134,7 @@ unsafe fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usiz
             inputs[r] = row.as_chunks::<P>();
         }
         let tap = usize::from(tap);
-        assert!(tap < taps, "a tap that has no weights");
+        assert!(tap < block.volume, "a tap that has no weights");
         let mut weights = [(&[][..], &[][..]); V];
         for v in 0..V {
             let start = tap * block.tap + v * K::LANES / PANEL * steps;
