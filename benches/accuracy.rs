@@ -32,7 +32,7 @@ fn gaussians(path: Option<&String>) -> Result<Gaussians> {
         }
         None => {
             let model = Model::from_bytes(b2p::embedded::MODEL)?;
-            Decoder::new(&model).decode(b2p::embedded::SAMPLE, None, &mut Log::default())
+            Decoder::new(&model).decode(b2p::embedded::SAMPLE, None, &Log::default())
         }
     }
 }
@@ -58,13 +58,13 @@ fn main() -> Result<()> {
             let camera = Camera::orbit(360.0 * turns, 60.0 * turns - 20.0, distance, 45.0, size, size)?;
             let exact = reference::render(&scene, &camera, Background::WHITE, Cutoffs::NONE);
             for (floor, (largest, square, time)) in FLOORS.iter().zip(&mut worst) {
-                let mut renderer = Renderer::default();
-                renderer.set_quality(Quality::Floor(1.0 / floor));
+                let renderer = Renderer::new().with_limits(limits.clone());
+                let mut renderer = renderer.with_quality(Quality::Floor(1.0 / floor));
                 let mut image = Image::default();
                 let mut least = Duration::MAX;
                 for _ in 0..FRAMES {
                     let start = Instant::now();
-                    renderer.render_into(&scene, &camera, Background::WHITE, &limits, &mut image)?;
+                    renderer.render_into(&scene, &camera, &mut image)?;
                     least = least.min(start.elapsed());
                 }
                 let (l, s) = difference(&image, &exact);

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use b2p::gaussians::{Gaussians, Harmonics, ply};
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Channel, Choice, Effects, Image, Quality, Renderer, Stats};
+use b2p::renderer::{Background, Channel, Choice, Effect, Effects, Image, Quality, Renderer, Stats};
 use b2p::{Error, Limits, Result};
 use b2p_kernels::Isa;
 
@@ -200,7 +200,7 @@ fn measure(
     (what, effects, channel): (&str, Effects, Channel),
 ) -> Result<()> {
     let mut azimuth = 20.0;
-    let mut renderer = Renderer::new(isa);
+    let mut renderer = Renderer::new().with_isa(isa);
     renderer.set_effects(effects);
     renderer.set_quality(quality);
     let mut image = Image::default();
@@ -247,18 +247,9 @@ fn measure(
 /// What is drawn: the plain picture, one without care for the near plane too where something reaches over it, or one with each effect.
 fn variants(forced: bool, within: bool) -> Vec<(&'static str, Effects, Channel)> {
     let none = Effects::default();
-    let careless = Effects {
-        near: Choice::Off,
-        ..none
-    };
-    let antialias = Effects {
-        antialias: Choice::On,
-        ..none
-    };
-    let order = Effects {
-        order: Choice::On,
-        ..none
-    };
+    let careless = none.with(Effect::Near, Choice::Off);
+    let antialias = none.with(Effect::Antialias, Choice::On);
+    let order = none.with(Effect::Order, Choice::On);
     if forced {
         vec![
             (", antialias", antialias, Channel::Colour),

@@ -1,78 +1,129 @@
 //! Coloured point clouds as small streams, decoded to 3D Gaussians and pictures on a CPU.
 //!
-//! A stream is scalable: an octree and its colours, level by level, so that what ends after a level is a coarser stream. Version 3 codes
-//! colours as transform coefficients and needs no model file; what draws it, discs in closed form or learned heads, is the decoder's choice.
-//! Version 2, *Bits-to-Photon*, codes learned features, from which the model that coded them generates Gaussians.
-//!
-//! ```text
-//! bytes → bitstream → geometry → colour ────────────→ gaussians → projection → tiles → pixels    (version 3)
-//! bytes → bitstream → geometry → entropy → network → gaussians → projection → tiles → pixels    (version 2)
-//!         ╰─────────── exact: bit-equal everywhere ───────────╯╰──── close: bounded error ────╯
-//! ```
-//!
-//! A stage imports only from the stages to its left, the `b2p-kernels` crate, and the commons ([`error`], [`limits`], [`cancel`], [`placement`]).
-//!
-//! Cloud to stream to picture:
+//! Three lines from bytes to a picture:
 //!
 //! ```
-//! # #[cfg(feature = "encoder")]
+//! # #[cfg(all(feature = "embedded", feature = "render"))]
 //! # fn main() -> b2p::Result<()> {
-//! use b2p::cloud::{PointCloud, voxelise};
-//! use b2p::encoder::transform;
-//! use b2p::{Limits, decoder::StreamDecoder, log::Log, renderer, renderer::camera::Camera};
+//! # let bytes = b2p::embedded::SCENE;
+//! use b2p::{Camera, Decoder, Renderer};
 //!
-//! let place = |i: u32| [i % 40, i / 40, 20].map(f64::from);
-//! let cloud = PointCloud {
-//!     positions: (0..1600).map(place).collect(),
-//!     colours: (0..1600).map(|i| [200, (i % 40 * 6) as u8, 40]).collect(),
-//!     ..PointCloud::default()
-//! };
-//! let mut log = Log::default();
-//! let options = transform::Options::default();
-//! let stream = transform::encode(&voxelise(&cloud, Some(6))?, &options, &mut log)?.bytes;
-//!
-//! let gaussians = StreamDecoder::new().decode(&stream, None, &mut log)?;
-//! let camera = Camera::orbit(20.0, 20.0, 2.6, 45.0, 160, 120)?;
-//! let (image, stats) = renderer::render(&gaussians, &camera, renderer::Background::WHITE, &Limits::default())?;
-//! assert_eq!((image.width, image.height), (160, 120));
-//! assert!(stats.visible > 0);
+//! let gaussians = Decoder::new().decode(bytes)?;
+//! let camera = Camera::orbit(20.0, 20.0, 2.6, 45.0, 640, 480)?;
+//! let png = Renderer::new().render(&gaussians, &camera)?.to_png()?;
+//! # assert!(png.len() > 1000);
 //! # Ok(())
 //! # }
-//! # #[cfg(not(feature = "encoder"))]
+//! # #[cfg(not(all(feature = "embedded", feature = "render")))]
 //! # fn main() {}
 //! ```
+//!
+//! | to | use |
+//! |---|---|
+//! | decode a stream, whole or as it arrives | [`Decoder`], [`Decoding`] |
+//! | draw with learned heads | [`HeadsModel`], [`HeadSet`] |
+//! | read and write Gaussians | [`Gaussians`] |
+//! | draw | `Renderer`, `Camera`, `Image` |
+//! | read, voxelise and encode a cloud | `PointCloud`, `voxelise`, `Encoder` |
+//! | bound what untrusted input may ask for | [`Limits`] |
+//! | stop, or observe | [`Cancel`], [`Log`] |
+//!
+//! Options are set by `with_…` methods. Decoders, models and logs are cheap to clone. Bad input gives an [`Error`], and
+//! nothing panics.
+//!
+//! # Streams
+//!
+//! A stream is scalable: a lossless octree and its colours, level by level. A stream cut after a level is a valid coarser
+//! stream. Version 3 codes colours as transform coefficients and needs no model file; how it is drawn, as surfels in
+//! closed form or with learned heads, is the decoder's choice. Version 2, *Bits-to-Photon*, codes latents, from which the
+//! [`Model`] that coded them generates Gaussians.
+//!
+//! ```text
+//! bytes → container → per level: geometry → colour → gaussians → renderer → picture
+//!         ╰────── bit-exact on every machine ─────╯ ╰── bounded error ──╯
+//! ```
+//!
+//! Each stage is a folder of `src/` and imports only earlier stages; `docs/architecture.md` describes them, and
+//! `docs/format.md` the format. Modules are public for the program, the tests and the tools of this repository. They are
+//! not documented here, and change without notice: what this page lists is the interface.
+//!
+//! # Features
+//!
+//! Without any, the library is the bare decoder: streams and models in, Gaussians in memory out. `ply` adds PLY files,
+//! `render` pictures, `encoder` (default) all of it, and `embedded` the models and samples that the program contains.
 #![forbid(unsafe_code)]
 
+#[doc(hidden)]
 pub mod cancel;
 #[cfg(feature = "ply")]
+#[doc(hidden)]
 pub mod cloud;
 mod coding;
+#[doc(hidden)]
 pub mod colour;
+#[doc(hidden)]
 pub mod container;
+#[doc(hidden)]
 pub mod decoder;
 #[cfg(feature = "embedded")]
 pub mod embedded;
 #[cfg(feature = "encoder")]
+#[doc(hidden)]
 pub mod encoder;
+#[doc(hidden)]
 pub mod error;
+#[doc(hidden)]
 pub mod gaussians;
+#[doc(hidden)]
 pub mod geometry;
+#[doc(hidden)]
+pub mod input;
+#[doc(hidden)]
 pub mod latents;
+#[doc(hidden)]
 pub mod layers;
+#[doc(hidden)]
 pub mod limits;
+#[doc(hidden)]
 pub mod log;
 mod memory;
 #[cfg(feature = "encoder")]
+#[doc(hidden)]
 pub mod metrics;
+#[doc(hidden)]
 pub mod output;
+#[doc(hidden)]
 pub mod placement;
 #[cfg(feature = "render")]
+#[doc(hidden)]
 pub mod renderer;
 #[cfg(test)]
 mod testing;
 
-pub use b2p_kernels::{Isa, UnknownIsa, ceiling};
+#[doc(hidden)]
+pub use b2p_kernels::ceiling;
+pub use b2p_kernels::{Isa, UnknownIsa};
 pub use cancel::Cancel;
-pub use error::{Error, Result};
+#[cfg(feature = "ply")]
+pub use cloud::{ColouredVoxels, Hints, PointCloud, voxelise, voxelise_closed};
+pub use container::{Format, Header};
+pub use decoder::{Decoder, Decoding, Points};
+#[cfg(feature = "encoder")]
+pub use encoder::{Encoded, Encoder, Rate, transform::Fineness};
+pub use error::{Error, Result, Stage};
+pub use gaussians::learned::HeadsModel;
+pub use gaussians::{Frame, Gaussians, Harmonics, HeadSet};
+pub use geometry::Voxels;
+pub use latents::network::Model;
+pub use layers::Precision;
 pub use limits::Limits;
+pub use log::{Log, Step};
 pub use placement::Placement;
+#[cfg(feature = "render")]
+pub use renderer::camera::{Camera, Projection};
+#[cfg(feature = "render")]
+pub use renderer::projection::Dropped;
+#[cfg(feature = "render")]
+pub use renderer::{
+    Background, Channel, Choice, Effect, EffectSet, Effects, Explanation, Ids, Image, Quality, Renderer, Stats, Times,
+};

@@ -1,15 +1,18 @@
-//! What a run does, step by step: how many of what, and how long it took.
+//! Progress of a run: the steps that were taken, with counts and times.
 
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use crate::error::Result;
 
 /// One finished step.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Step {
     /// What was done, for example `features of level 9`.
     pub name: String,
-    /// How many [`Step::unit`]s it worked on.
+    /// Number of [`Step::unit`]s that it worked on.
     pub count: u64,
     /// What was counted, for example `voxels`.
     pub unit: &'static str,
@@ -17,50 +20,107 @@ pub struct Step {
     pub time: Duration,
 }
 
-/// Collects steps, and tells a listener when each begins.
-#[derive(Default)]
-pub struct Log<'a> {
-    listener: Option<&'a dyn Fn(&str)>,
-    steps: Vec<Step>,
+/// Called with the name of a step when it begins.
+type Listener = dyn Fn(&str) + Send + Sync;
+
+/// An optional observer of decoders and encoders: it collects finished steps, and calls a listener when one begins.
+///
+/// Clones share what they collect.
+///
+/// ```
+/// # #[cfg(feature = "embedded")]
+/// # fn main() -> b2p::Result<()> {
+/// let log = b2p::Log::new();
+/// b2p::Decoder::new().with_log(&log).decode(b2p::embedded::SCENE)?;
+/// for step in log.steps() {
+///     println!("{}: {} {} in {:?}", step.name, step.count, step.unit, step.time);
+/// }
+/// # assert!(!log.steps().is_empty());
+/// # Ok(())
+/// # }
+/// # #[cfg(not(feature = "embedded"))]
+/// # fn main() {}
+/// ```
+#[derive(Clone)]
+pub struct Log {
+    listener: Option<Arc<Listener>>,
+    /// None for a log that collects nothing.
+    steps: Option<Arc<Mutex<Vec<Step>>>>,
 }
 
-impl<'a> Log<'a> {
-    /// A log whose `listener` hears the name of every step as it begins.
-    pub fn with_listener(listener: &'a dyn Fn(&str)) -> Self {
+impl Default for Log {
+    fn default() -> Self {
+        Log::new()
+    }
+}
+
+impl fmt::Debug for Log {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Log")
+            .field("steps", &self.steps().len())
+            .finish_non_exhaustive()
+    }
+}
+
+impl Log {
+    /// A log without a listener.
+    pub fn new() -> Self {
         Log {
-            listener: Some(listener),
-            steps: Vec::new(),
+            listener: None,
+            steps: Some(Arc::default()),
+        }
+    }
+
+    /// A log whose `listener` is called with the name of every step when it begins.
+    pub fn with_listener(listener: impl Fn(&str) + Send + Sync + 'static) -> Self {
+        Log {
+            listener: Some(Arc::new(listener)),
+            ..Log::new()
+        }
+    }
+
+    /// A log that neither collects nor calls.
+    pub(crate) const fn off() -> Self {
+        Log {
+            listener: None,
+            steps: None,
         }
     }
 
     /// The finished steps, in order.
-    pub fn steps(&self) -> &[Step] {
-        &self.steps
+    pub fn steps(&self) -> Vec<Step> {
+        match &self.steps {
+            Some(steps) => steps.lock().unwrap_or_else(PoisonError::into_inner).clone(),
+            None => Vec::new(),
+        }
     }
 
     /// Runs a step that works on `count` items.
     ///
     /// # Errors
     /// The [`crate::Error`] of `run`; the step is then not recorded.
+    #[doc(hidden)]
     pub fn step<T>(
-        &mut self,
+        &self,
         name: impl Into<String>,
         count: usize,
         unit: &'static str,
         run: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
         let name = name.into();
-        if let Some(listener) = self.listener {
+        if let Some(listener) = &self.listener {
             listener(&name);
         }
         let start = now();
         let value = run()?;
-        self.steps.push(Step {
-            name,
-            count: count as u64,
-            unit,
-            time: start.map_or(Duration::ZERO, |start| start.elapsed()),
-        });
+        if let Some(steps) = &self.steps {
+            steps.lock().unwrap_or_else(PoisonError::into_inner).push(Step {
+                name,
+                count: count as u64,
+                unit,
+                time: start.map_or(Duration::ZERO, |start| start.elapsed()),
+            });
+        }
         Ok(value)
     }
 }

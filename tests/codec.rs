@@ -7,7 +7,7 @@ use b2p::container::{Header, Stream, Writer};
 use b2p::encoder::{Encoded, Options, encode};
 use b2p::gaussians::Heads;
 use b2p::geometry::Octree;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Model, Shape, untrained};
 use b2p::log::Log;
 use b2p::{Error, Limits, Placement};
@@ -22,7 +22,7 @@ fn ball(bits: u8, radius: f32) -> ColouredVoxels {
 }
 
 fn coded(cloud: &ColouredVoxels, model: &Model) -> Encoded {
-    encode(cloud, model, &Options::default(), &mut Log::default()).unwrap()
+    encode(cloud, model, &Options::default(), &Log::default()).unwrap()
 }
 
 #[test]
@@ -31,7 +31,9 @@ fn every_level_decodes_to_the_voxels_that_were_encoded() {
     let bytes = coded(&cloud, &model).bytes;
     let octree = Octree::new(cloud.voxels.clone()).unwrap();
     for level in 4..=6 {
-        let exact = Decoder::new(&model).exact(&bytes, level, &mut Log::default()).unwrap();
+        let exact = LatentDecoder::new(&model)
+            .exact(&bytes, level, &Log::default())
+            .unwrap();
         assert_eq!(exact.octree, octree.truncated(level));
     }
 }
@@ -41,8 +43,8 @@ fn a_head_gives_one_gaussian_per_voxel_or_one_per_child() {
     let (model, cloud) = (model(), ball(7, 45.0));
     let bytes = coded(&cloud, &model).bytes;
     let octree = Octree::new(cloud.voxels.clone()).unwrap();
-    let decoder = Decoder::new(&model);
-    let count = |level| decoder.decode(&bytes, Some(level), &mut Log::default()).unwrap().len();
+    let decoder = LatentDecoder::new(&model);
+    let count = |level| decoder.decode(&bytes, Some(level), &Log::default()).unwrap().len();
     assert_eq!(count(5), 8 * octree.level(5).len());
     assert_eq!(count(6), octree.level(6).len());
     assert_eq!(decoder.levels(&bytes).unwrap(), [5, 6]);
@@ -53,18 +55,18 @@ fn whichever_heads_are_used_the_same_is_decoded_and_only_gaussians_differ() {
     let shape = Shape::tiny().with_quick_heads();
     let both = Model::from_bytes(&untrained(&shape, 0)).unwrap();
     let bytes = coded(&ball(6, 20.0), &model()).bytes;
-    let log = &mut Log::default();
-    let best = Decoder::new(&both);
+    let log = &Log::default();
+    let best = LatentDecoder::new(&both);
     let quick = best.clone().with_heads(Heads::Quick).unwrap();
     for level in quick.levels(&bytes).unwrap() {
-        let exact = |decoder: &Decoder<_>| decoder.exact(&bytes, level, &mut Log::default());
+        let exact = |decoder: &LatentDecoder| decoder.exact(&bytes, level, &Log::default());
         assert_eq!(exact(&quick).unwrap(), exact(&best).unwrap());
         let thin = quick.decode(&bytes, Some(level), log).unwrap();
         let thick = best.decode(&bytes, Some(level), log).unwrap();
         assert_eq!(thin.len(), thick.len());
         assert!(thin.position != thick.position);
         let model = model();
-        let before = Decoder::new(&model).decode(&bytes, Some(level), log);
+        let before = LatentDecoder::new(&model).decode(&bytes, Some(level), log);
         assert_eq!(before.unwrap(), thick, "quick heads change nothing else");
         let mut decoding = best.start(Some(level));
         decoding.push(&bytes);
@@ -77,7 +79,7 @@ fn whichever_heads_are_used_the_same_is_decoded_and_only_gaussians_differ() {
     let header = Header::parse(&bytes, &Limits::default()).unwrap();
     assert!(quick.memory(&header, 5).unwrap() < best.memory(&header, 5).unwrap());
     let model = model();
-    let error = Decoder::new(&model).with_heads(Heads::Quick).err().unwrap();
+    let error = LatentDecoder::new(&model).with_heads(Heads::Quick).err().unwrap();
     assert!(matches!(error, Error::Unsupported { .. }), "{error}");
 }
 
@@ -95,15 +97,15 @@ fn levels_without_latents_cost_their_geometry_alone_and_are_not_predicted() {
             filter: false,
             ..Options::default()
         };
-        let mut log = Log::default();
-        let encoded = encode(&ball(7, 45.0), &model, &options, &mut log).unwrap();
-        let decoder = Decoder::new(&model);
-        let mut log = Log::default();
-        assert!(!decoder.decode(&encoded.bytes, None, &mut log).unwrap().is_empty());
+        let log = Log::default();
+        let encoded = encode(&ball(7, 45.0), &model, &options, &log).unwrap();
+        let decoder = LatentDecoder::new(&model);
+        let log = Log::default();
+        assert!(!decoder.decode(&encoded.bytes, None, &log).unwrap().is_empty());
         for (role, rate) in encoded.rates.iter().enumerate() {
             let has = role < roles;
             assert_eq!(rate.colour_bytes > 0, has, "role {role} of {roles}");
-            let exact = decoder.exact(&encoded.bytes, rate.level, &mut Log::default());
+            let exact = decoder.exact(&encoded.bytes, rate.level, &Log::default());
             assert_eq!(exact.unwrap().latents.is_empty(), !has);
             let asked = |step: &str| {
                 let name = format!("{step} of level {}", rate.level);
@@ -142,7 +144,7 @@ fn latents_where_the_model_has_none_are_refused_and_so_is_their_absence_elsewher
             }
         }
         let claims = writer.finish().unwrap();
-        let (decoder, log) = (Decoder::new(&model), &mut Log::default());
+        let (decoder, log) = (LatentDecoder::new(&model), &Log::default());
         assert!(decoder.exact(&claims, 3, log).is_ok());
         let error = decoder.decode(&claims, None, log).unwrap_err();
         assert!(matches!(error, Error::Malformed { .. }), "{error}");
@@ -155,17 +157,17 @@ fn latents_where_the_model_has_none_are_refused_and_so_is_their_absence_elsewher
 fn a_stream_cut_after_a_level_is_the_coarser_stream() {
     let (model, cloud) = (model(), ball(7, 45.0));
     let encoded = coded(&cloud, &model);
-    let decoder = Decoder::new(&model);
+    let decoder = LatentDecoder::new(&model);
     let stream = b2p::container::Header::parse(&encoded.bytes, &Limits::default()).unwrap();
-    let whole = decoder.decode(&encoded.bytes, Some(5), &mut Log::default()).unwrap();
+    let whole = decoder.decode(&encoded.bytes, Some(5), &Log::default()).unwrap();
     let cut = &encoded.bytes[..stream.prefix_bytes(5).unwrap() as usize];
-    assert_eq!(decoder.decode(cut, Some(5), &mut Log::default()).unwrap(), whole);
+    assert_eq!(decoder.decode(cut, Some(5), &Log::default()).unwrap(), whole);
     assert_eq!(
-        decoder.decode(cut, None, &mut Log::default()).unwrap(),
+        decoder.decode(cut, None, &Log::default()).unwrap(),
         whole,
         "the default is the finest there is"
     );
-    let error = decoder.decode(cut, Some(6), &mut Log::default()).unwrap_err();
+    let error = decoder.decode(cut, Some(6), &Log::default()).unwrap_err();
     assert!(matches!(error, Error::Truncated { .. }), "{error}");
     let rates: usize = encoded.rates.iter().map(|r| r.geometry_bytes + r.colour_bytes).sum();
     assert!(
@@ -185,9 +187,9 @@ fn streams_and_decoded_latents_are_the_same_for_any_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let bytes = coded(&cloud, &model).bytes;
-            let exact = Decoder::new(&model).exact(&bytes, 7, &mut Log::default()).unwrap();
-            let gaussians = Decoder::new(&model)
-                .decode(&bytes, Some(7), &mut Log::default())
+            let exact = LatentDecoder::new(&model).exact(&bytes, 7, &Log::default()).unwrap();
+            let gaussians = LatentDecoder::new(&model)
+                .decode(&bytes, Some(7), &Log::default())
                 .unwrap();
             (bytes, exact, gaussians)
         })
@@ -203,7 +205,7 @@ fn the_exact_zone_is_the_same_on_every_instruction_set_of_this_machine() {
     let bytes = coded(&cloud, &model()).bytes;
     let exact = |isa| {
         let model = model().with_isa(isa);
-        Decoder::new(&model).exact(&bytes, 6, &mut Log::default()).unwrap()
+        LatentDecoder::new(&model).exact(&bytes, 6, &Log::default()).unwrap()
     };
     let plain = exact(b2p_kernels::Isa::SCALAR);
     for isa in b2p_kernels::Isa::available() {
@@ -230,10 +232,10 @@ fn unusual_clouds_survive() {
     ];
     for (name, cloud) in clouds {
         let bytes = coded(&cloud, &model).bytes;
-        let decoder = Decoder::new(&model);
+        let decoder = LatentDecoder::new(&model);
         let top = *decoder.levels(&bytes).unwrap().last().expect("a level with Gaussians");
         let gaussians = decoder
-            .decode(&bytes, None, &mut Log::default())
+            .decode(&bytes, None, &Log::default())
             .unwrap_or_else(|e| panic!("{name}: {e}"));
         assert!(!gaussians.is_empty(), "{name}");
         assert!(gaussians.position.iter().flatten().all(|v| v.abs() <= 1.5), "{name}");
@@ -245,8 +247,8 @@ fn unusual_clouds_survive() {
 fn a_cloud_of_one_bit_has_no_level_with_gaussians() {
     let model = model();
     let bytes = coded(&cloud_of(1, vec![0, 7]), &model).bytes;
-    let error = Decoder::new(&model)
-        .decode(&bytes, None, &mut Log::default())
+    let error = LatentDecoder::new(&model)
+        .decode(&bytes, None, &Log::default())
         .unwrap_err();
     assert!(matches!(error, Error::Unsupported { .. }), "{error}");
 }
@@ -258,17 +260,17 @@ fn fewer_levels_make_a_shorter_stream_that_still_draws() {
         levels: Some(4..=5),
         ..Options::default()
     };
-    let short = encode(&cloud, &model, &options, &mut Log::default()).unwrap();
+    let short = encode(&cloud, &model, &options, &Log::default()).unwrap();
     assert!(short.bytes.len() < coded(&cloud, &model).bytes.len());
-    assert_eq!(Decoder::new(&model).levels(&short.bytes).unwrap(), [5]);
+    assert_eq!(LatentDecoder::new(&model).levels(&short.bytes).unwrap(), [5]);
 }
 
 #[test]
 fn a_stream_of_another_model_is_told_apart() {
     let bytes = coded(&ball(6, 20.0), &model()).bytes;
     let other = Model::from_bytes(&tiny_model(1)).unwrap();
-    let error = Decoder::new(&other)
-        .decode(&bytes, None, &mut Log::default())
+    let error = LatentDecoder::new(&other)
+        .decode(&bytes, None, &Log::default())
         .unwrap_err();
     assert!(matches!(error, Error::ModelMismatch { .. }), "{error}");
 }
@@ -277,13 +279,10 @@ fn a_stream_of_another_model_is_told_apart() {
 fn memory_over_the_limit_is_refused_before_it_is_reserved() {
     let model = model();
     let bytes = coded(&ball(7, 45.0), &model).bytes;
-    let limits = Limits {
-        max_bytes: 1 << 16,
-        ..Limits::default()
-    };
-    let error = Decoder::new(&model)
+    let limits = Limits::default().with_max_bytes(1 << 16);
+    let error = LatentDecoder::new(&model)
         .with_limits(limits)
-        .decode(&bytes, None, &mut Log::default())
+        .decode(&bytes, None, &Log::default())
         .unwrap_err();
     assert!(matches!(error, Error::LimitExceeded { .. }), "{error}");
 }
@@ -297,7 +296,9 @@ fn the_placement_of_the_cloud_comes_back_with_the_gaussians() {
         voxel_size: 0.125,
     };
     let bytes = coded(&cloud, &model).bytes;
-    let gaussians = Decoder::new(&model).decode(&bytes, None, &mut Log::default()).unwrap();
+    let gaussians = LatentDecoder::new(&model)
+        .decode(&bytes, None, &Log::default())
+        .unwrap();
     assert_eq!(gaussians.frame.placement, cloud.placement);
     assert_eq!(gaussians.frame.bits, 6);
 }
@@ -310,7 +311,7 @@ fn a_bit_costs_nothing_where_the_model_does_not_say() {
             bit_price,
             ..Options::default()
         };
-        encode(&cloud, &model, &options, &mut Log::default()).unwrap().bytes
+        encode(&cloud, &model, &options, &Log::default()).unwrap().bytes
     };
     assert!(bytes(1.0) == bytes(0.0));
 }
@@ -324,9 +325,9 @@ fn levels_left_out_at_the_fine_end_change_nothing_above_them() {
             filter: false,
             ..Options::default()
         };
-        let coded = encode(&cloud, &model, &options, &mut Log::default()).unwrap();
-        let decoder = Decoder::new(&model);
-        decoder.exact(&coded.bytes, 4, &mut Log::default()).unwrap().features
+        let coded = encode(&cloud, &model, &options, &Log::default()).unwrap();
+        let decoder = LatentDecoder::new(&model);
+        decoder.exact(&coded.bytes, 4, &Log::default()).unwrap().features
     };
     let all = features(6);
     assert!(features(5) == all && features(4) == all);
@@ -337,10 +338,10 @@ fn nothing_may_follow_the_last_level() {
     let model = model();
     let mut bytes = coded(&ball(5, 10.0), &model).bytes;
     bytes.push(0);
-    let decoder = Decoder::new(&model);
-    assert!(decoder.decode(&bytes, None, &mut Log::default()).is_err());
+    let decoder = LatentDecoder::new(&model);
+    assert!(decoder.decode(&bytes, None, &Log::default()).is_err());
     assert!(
-        decoder.decode(&bytes, Some(4), &mut Log::default()).is_ok(),
+        decoder.decode(&bytes, Some(4), &Log::default()).is_ok(),
         "asked for, a whole level decodes"
     );
 }

@@ -8,7 +8,7 @@ use b2p::container::Stream;
 use b2p::encoder::{Encoded, Options, Residual, encode};
 use b2p::gaussians::Gaussians;
 use b2p::gaussians::Heads;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Model, Shape, untrained};
 use b2p::latents::{ColourFilter, ColourResidual};
 use b2p::log::Log;
@@ -32,7 +32,7 @@ fn plain_with_both_heads() -> (Model, Encoded) {
         filter: false,
         ..Options::default()
     };
-    let plain = encode(&ball(6, 20.0), &model, &options, &mut Log::default()).unwrap();
+    let plain = encode(&ball(6, 20.0), &model, &options, &Log::default()).unwrap();
     (model, plain)
 }
 
@@ -41,13 +41,13 @@ fn filters_bring_the_colours_of_gaussians_nearer_to_the_cloud_s_and_change_nothi
     let (model, cloud) = (model(), ball(8, 90.0));
     let with = |filter| encoded_with(&model, &cloud, filter, Residual::None);
     let (plain, filtered) = (with(false), with(true));
-    let decoder = Decoder::new(&model);
+    let decoder = LatentDecoder::new(&model);
     for rate in &filtered.rates[1..] {
         let level = rate.level;
         let bytes = [&plain.bytes, &filtered.bytes];
-        let exact = bytes.map(|bytes| decoder.exact(bytes, level, &mut Log::default()).unwrap());
+        let exact = bytes.map(|bytes| decoder.exact(bytes, level, &Log::default()).unwrap());
         assert_eq!(exact[0], exact[1]);
-        let decode = |bytes: &Vec<u8>| decoder.decode(bytes, Some(level), &mut Log::default());
+        let decode = |bytes: &Vec<u8>| decoder.decode(bytes, Some(level), &Log::default());
         let [before, after] = bytes.map(|bytes| decode(bytes).unwrap());
         assert_ne!(before.colour, after.colour, "level {level}");
         let recoloured = Gaussians {
@@ -81,8 +81,8 @@ fn a_filter_for_one_set_of_heads_leaves_the_other_s_colours_as_they_are() {
     for filtered in Heads::ALL {
         let bytes = with_filter(&plain.bytes, filtered, &filter.to_bytes());
         for heads in Heads::ALL {
-            let decoder = Decoder::new(&model).with_heads(heads).unwrap();
-            let decode = |bytes| decoder.decode(bytes, None, &mut Log::default()).unwrap();
+            let decoder = LatentDecoder::new(&model).with_heads(heads).unwrap();
+            let decode = |bytes| decoder.decode(bytes, None, &Log::default()).unwrap();
             let mut want = decode(&plain.bytes);
             if heads == filtered {
                 let reds = want.colour.iter_mut().map(|colour| &mut colour[0]);
@@ -96,7 +96,7 @@ fn a_filter_for_one_set_of_heads_leaves_the_other_s_colours_as_they_are() {
 #[test]
 fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_nothing_else() {
     let (model, cloud) = (model(), ball(7, 45.0));
-    let decoder = Decoder::new(&model);
+    let decoder = LatentDecoder::new(&model);
     let mut last = f64::INFINITY;
     let encoded = |filter, residual| encoded_with(&model, &cloud, filter, residual);
     for filter in [true, false] {
@@ -107,9 +107,9 @@ fn a_residual_brings_the_finest_colours_as_near_as_its_step_says_and_changes_not
             for rate in &plain.rates[1..] {
                 let level = rate.level;
                 let bytes = [&plain.bytes, &refined.bytes];
-                let exact = bytes.map(|bytes| decoder.exact(bytes, level, &mut Log::default()).unwrap());
+                let exact = bytes.map(|bytes| decoder.exact(bytes, level, &Log::default()).unwrap());
                 assert_eq!(exact[0], exact[1]);
-                let decode = |bytes: &Vec<u8>| decoder.decode(bytes, Some(level), &mut Log::default()).unwrap();
+                let decode = |bytes: &Vec<u8>| decoder.decode(bytes, Some(level), &Log::default()).unwrap();
                 let [before, after] = bytes.map(decode);
                 let recoloured = Gaussians {
                     colour: after.colour.clone(),
@@ -142,15 +142,15 @@ fn every_level_that_is_drawn_may_have_a_residual_of_its_own() {
             every_level,
             ..Options::default()
         };
-        encode(&cloud, &model, &options, &mut Log::default()).unwrap()
+        encode(&cloud, &model, &options, &Log::default()).unwrap()
     };
     let decode = |encoded: &Encoded, level| {
-        let decoder = Decoder::new(&model);
-        let decoded = decoder.decode(&encoded.bytes, Some(level), &mut Log::default());
+        let decoder = LatentDecoder::new(&model);
+        let decoded = decoder.decode(&encoded.bytes, Some(level), &Log::default());
         decoded.unwrap()
     };
     let (finest, all) = (encoded(false), encoded(true));
-    let levels = Decoder::new(&model).levels(&all.bytes).unwrap();
+    let levels = LatentDecoder::new(&model).levels(&all.bytes).unwrap();
     let (&last, coarser) = levels.split_last().unwrap();
     assert_eq!(decode(&finest, last), decode(&all, last));
     assert!(!coarser.is_empty());
@@ -174,7 +174,7 @@ fn every_level_that_is_drawn_may_have_a_residual_of_its_own() {
 fn quick_heads_are_corrected_by_the_same_residual() {
     let (model, plain) = plain_with_both_heads();
     let level = plain.rates.last().unwrap().level;
-    let octree = Decoder::new(&model).exact(&plain.bytes, level, &mut Log::default());
+    let octree = LatentDecoder::new(&model).exact(&plain.bytes, level, &Log::default());
     let keys = octree.unwrap().octree.level(level).keys().to_vec();
     // A tenth less of everything.
     let missing = vec![[-0.1; 3]; keys.len()];
@@ -182,8 +182,8 @@ fn quick_heads_are_corrected_by_the_same_residual() {
     let residual = ColourResidual::of(&missing, &keys, slice, all_in(1)).to_payloads(&keys);
     let bytes = with_residual(&plain.bytes, &residual);
     for heads in Heads::ALL {
-        let decoder = Decoder::new(&model).with_heads(heads).unwrap();
-        let decode = |bytes| decoder.decode(bytes, None, &mut Log::default()).unwrap();
+        let decoder = LatentDecoder::new(&model).with_heads(heads).unwrap();
+        let decode = |bytes| decoder.decode(bytes, None, &Log::default()).unwrap();
         let (before, after) = (decode(&plain.bytes), decode(&bytes));
         let pairs = before.colour.as_flattened().iter().zip(after.colour.as_flattened());
         for (before, after) in pairs {
@@ -205,14 +205,14 @@ fn what_is_wide_of_what_colours_are_off_is_coded_unless_said_otherwise() {
     let (none, coarse) = (encoded(true, Residual::None), encoded(true, Residual::Coarse));
     assert!(has(&coarse) && !has(&none));
     assert!(!has(&encoded(false, Residual::Coarse)));
-    let decoder = Decoder::new(&model);
+    let decoder = LatentDecoder::new(&model);
     let finest = none.rates.last().unwrap().level;
     let keys = cloud.voxels.keys();
     let mut voxels: Vec<u64> = keys.iter().map(|key| key >> 3).collect();
     voxels.dedup();
     let want = colours_at(&cloud, finest);
     let off = |encoded: &Encoded| {
-        let decoded = decoder.decode(&encoded.bytes, None, &mut Log::default());
+        let decoded = decoder.decode(&encoded.bytes, None, &Log::default());
         let colours = decoded.unwrap().colour;
         assert_eq!(colours.len(), voxels.len(), "one Gaussian for each voxel");
         let missing = colours.iter().zip(&want);
@@ -237,7 +237,7 @@ fn encoded_with(model: &Model, cloud: &ColouredVoxels, filter: bool, residual: R
         residual,
         ..Options::default()
     };
-    encode(cloud, model, &options, &mut Log::default()).unwrap()
+    encode(cloud, model, &options, &Log::default()).unwrap()
 }
 
 /// The mean colours of a level's voxels.

@@ -3,22 +3,22 @@
 mod common;
 
 use std::path::Path;
-use std::sync::{Arc, Mutex};
+use std::sync::Mutex;
 
+use b2p::Decoder;
 use b2p::cloud::ColouredVoxels;
 use b2p::container::{Format, Header};
-use b2p::decoder::StreamDecoder;
 use b2p::encoder::transform::{self, Fineness};
 use b2p::encoder::{Options, Residual, encode};
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::gaussians::{Gaussians, Harmonics};
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Model, Shape, untrained};
 use b2p::layers::Precision;
 use b2p::log::Log;
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Channel, Choice, Effects, Ids, Image, Renderer, render};
+use b2p::renderer::{Background, Channel, Choice, Effect, Effects, Ids, Image, Renderer, render};
 use b2p::{Error, Limits};
 use common::{Ball, cloud_of, steps};
 use peak_alloc::PeakAlloc;
@@ -68,7 +68,7 @@ fn clouds() -> Vec<(&'static str, ColouredVoxels)> {
 fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     for (name, model) in models() {
-        let decoder = Decoder::new(&model).with_limits(Limits::unlimited());
+        let decoder = LatentDecoder::new(&model).with_limits(Limits::unlimited());
         let with = |heads: &Heads| decoder.clone().with_heads(*heads).unwrap();
         let decoders: Vec<_> = model.shape().heads().iter().map(with).collect();
         for (kind, cloud) in clouds() {
@@ -76,12 +76,12 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
                 residual: Residual::Fine(steps(4)),
                 ..Options::default()
             };
-            let bytes = encode(&cloud, &model, &options, &mut Log::default()).unwrap().bytes;
+            let bytes = encode(&cloud, &model, &options, &Log::default()).unwrap().bytes;
             let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
             let levels = decoder.levels(&bytes).unwrap();
             for (decoder, level) in decoders.iter().flat_map(|d| levels.iter().map(move |l| (d, *l))) {
                 let most = decoder.memory(&header, level).unwrap();
-                let decode = || decoder.decode(&bytes, Some(level), &mut Log::default());
+                let decode = || decoder.decode(&bytes, Some(level), &Log::default());
                 // Threads start, and weights are put in order, the first time.
                 decode().unwrap();
                 let (gaussians, held) = peak(decode);
@@ -108,7 +108,7 @@ fn transformed(cloud: &ColouredVoxels) -> [Vec<u8>; 3] {
             colour_slice: slice,
             ..transform::Options::default()
         };
-        let encoded = transform::encode(cloud, &options, &mut Log::default());
+        let encoded = transform::encode(cloud, &options, &Log::default());
         encoded.unwrap().bytes
     })
 }
@@ -116,25 +116,23 @@ fn transformed(cloud: &ColouredVoxels) -> [Vec<u8>; 3] {
 #[test]
 fn decoding_version_3_holds_no_more_than_its_header_allows_to_foretell() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
-    let decoder = StreamDecoder::new().with_limits(Limits::unlimited());
+    let decoder = Decoder::new().with_limits(Limits::unlimited());
     for (kind, cloud) in clouds() {
         for bytes in transformed(&cloud) {
             let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
             for level in header.base..=header.top {
                 let most = decoder.memory(&header, level).unwrap();
-                let decode = || decoder.decode(&bytes, Some(level), &mut Log::default());
+                let decoder = decoder.clone().with_level(level);
+                let decode = || decoder.decode(&bytes);
                 decode().unwrap();
                 let (gaussians, held) = peak(decode);
                 let count = gaussians.unwrap().len();
                 println!("{kind}, level {level}, {count} Gaussians: {held} of {most} bytes");
                 assert!(held <= most + Limits::OVERHEAD, "{kind}, level {level}: {held}");
             }
-            let limits = Limits {
-                max_bytes: decoder.memory(&header, header.top).unwrap() - 1,
-                ..Limits::default()
-            };
-            let strict = StreamDecoder::new().with_limits(limits);
-            let (refused, held) = peak(|| strict.decode(&bytes, None, &mut Log::default()));
+            let limits = Limits::default().with_max_bytes(decoder.memory(&header, header.top).unwrap() - 1);
+            let strict = Decoder::new().with_limits(limits);
+            let (refused, held) = peak(|| strict.decode(&bytes));
             assert!(matches!(refused, Err(Error::LimitExceeded { .. })));
             assert!(held < 1 << 12, "{held} bytes to refuse");
         }
@@ -146,7 +144,7 @@ fn decoding_version_3_holds_no_more_than_its_header_allows_to_foretell() {
 fn drawing_version_3_with_learned_heads_holds_no_more_than_its_header_allows_to_foretell() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let heads = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/heads.safetensors");
-    let heads = Arc::new(HeadsModel::open(&heads).expect("the heads that ship load"));
+    let heads = HeadsModel::open(&heads).expect("the heads that ship load");
     let sets: Vec<_> = heads.sets().collect();
     assert_eq!(sets.len(), 4, "{sets:?}");
     let mut clouds = clouds();
@@ -157,13 +155,14 @@ fn drawing_version_3_with_learned_heads_holds_no_more_than_its_header_allows_to_
         let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
         for (set, gaussians) in sets.iter().copied() {
             for precision in [Precision::Int16, Precision::F16] {
-                let decoder = StreamDecoder::new().with_limits(Limits::unlimited());
+                let decoder = Decoder::new().with_limits(Limits::unlimited());
                 let decoder = decoder.with_heads_model(heads.clone()).with_heads(set.into());
                 let decoder = decoder.with_precision(precision).with_per_voxel(gaussians);
                 for level in header.base.max(1)..=header.top {
                     let of = format!("{kind}, {set}.{gaussians} in {precision}, level {level}");
                     let most = decoder.memory(&header, level).unwrap();
-                    let decode = || decoder.decode(&bytes, Some(level), &mut Log::default());
+                    let decoder = decoder.clone().with_level(level);
+                    let decode = || decoder.decode(&bytes);
                     // Weights are put in order the first time.
                     decode().unwrap();
                     let (drawn, held) = peak(decode);
@@ -180,7 +179,7 @@ fn a_decode_gives_back_all_that_it_reserved_whether_it_succeeds_or_fails() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let (_, model) = models().remove(0);
     let options = Options::default();
-    let bytes = encode(&Ball::new(7, 50.0).cloud(), &model, &options, &mut Log::default())
+    let bytes = encode(&Ball::new(7, 50.0).cloud(), &model, &options, &Log::default())
         .unwrap()
         .bytes;
     let (mut cut, mut damaged) = (bytes.clone(), bytes.clone());
@@ -188,7 +187,7 @@ fn a_decode_gives_back_all_that_it_reserved_whether_it_succeeds_or_fails() {
     damaged[bytes.len() * 9 / 10] ^= 1;
     for (kind, bytes, sound) in [("whole", bytes, true), ("cut", cut, false), ("damaged", damaged, false)] {
         let decode = || {
-            let decoded = Decoder::new(&model).decode(&bytes, None, &mut Log::default());
+            let decoded = LatentDecoder::new(&model).decode(&bytes, None, &Log::default());
             assert_eq!(decoded.is_ok(), sound, "{kind}");
         };
         // What is prepared at the first use stays, and so does an odd block of the threads' queues.
@@ -207,16 +206,13 @@ fn a_stream_over_the_memory_limit_is_refused_almost_for_nothing() {
     let (_, model) = models().remove(0);
     let cloud = Ball::new(7, 50.0).cloud();
     let options = Options::default();
-    let bytes = encode(&cloud, &model, &options, &mut Log::default()).unwrap().bytes;
+    let bytes = encode(&cloud, &model, &options, &Log::default()).unwrap().bytes;
     let header = Header::parse(&bytes, &Limits::default()).unwrap();
-    let needed = Decoder::new(&model).memory(&header, 6).unwrap();
-    let limits = |max_bytes| Limits {
-        max_bytes,
-        ..Limits::default()
-    };
+    let needed = LatentDecoder::new(&model).memory(&header, 6).unwrap();
+    let limits = |max_bytes| Limits::default().with_max_bytes(max_bytes);
     let decode = |max_bytes| {
-        let decoder = Decoder::new(&model).with_limits(limits(max_bytes));
-        decoder.decode(&bytes, None, &mut Log::default())
+        let decoder = LatentDecoder::new(&model).with_limits(limits(max_bytes));
+        decoder.decode(&bytes, None, &Log::default())
     };
     assert!(decode(needed).is_ok());
     let (refused, held) = peak(|| decode(needed - 1));
@@ -257,12 +253,12 @@ fn a_bomb_of_a_hundred_bytes_reserves_nothing() {
         for limits in [Limits::default(), Limits::unlimited()] {
             let decode = || match format {
                 Format::Learned { .. } => {
-                    let decoder = Decoder::new(&model).with_limits(limits.clone());
-                    decoder.decode(&bytes, None, &mut Log::default())
+                    let decoder = LatentDecoder::new(&model).with_limits(limits.clone());
+                    decoder.decode(&bytes, None, &Log::default())
                 }
                 Format::Transform { .. } => {
-                    let decoder = StreamDecoder::new().with_limits(limits.clone());
-                    decoder.decode(&bytes, None, &mut Log::default())
+                    let decoder = Decoder::new().with_limits(limits.clone());
+                    decoder.decode(&bytes)
                 }
             };
             // The least of three: the harness may start another test's thread meanwhile, which counts too.
@@ -300,10 +296,7 @@ fn drawing_stays_within_the_memory_limit() {
     for (count, scale) in [(1, 0.01), (20_000, 0.005), (20_000, 0.5)] {
         let gaussians = splats(count, scale);
         let draw = |max_bytes: u64| {
-            let limits = Limits {
-                max_bytes,
-                ..Limits::default()
-            };
+            let limits = Limits::default().with_max_bytes(max_bytes);
             render(&gaussians, &camera, Background::WHITE, &limits)
         };
         let Err(Error::LimitExceeded { needed, .. }) = draw(1 << 16) else {
@@ -328,10 +321,7 @@ fn gaussians_over_the_near_plane_are_refused_before_their_memory_is_taken() {
     let gaussians = splats(100_000, 0.9);
     let camera = Camera::orbit(10.0, 10.0, 0.5, 45.0, 32, 32).unwrap();
     let draw = |max_bytes| {
-        let limits = Limits {
-            max_bytes,
-            ..Limits::default()
-        };
+        let limits = Limits::default().with_max_bytes(max_bytes);
         render(&gaussians, &camera, Background::WHITE, &limits)
     };
     let (_, stats) = draw(1 << 30).unwrap();
@@ -355,8 +345,8 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
     };
     let plain = Effects::default();
     let on = Choice::On;
-    let antialias = Effects { antialias: on, ..plain };
-    let order = Effects { order: on, ..plain };
+    let antialias = plain.with(Effect::Antialias, on);
+    let order = plain.with(Effect::Order, on);
     // One thread: of several, each takes what it needs when the fullest tile first comes to it.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1);
     let pool = pool.build().unwrap();
@@ -389,5 +379,36 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
                 assert_eq!(held, 0, "{effects:?} at {distance}");
             });
         }
+    }
+}
+
+#[test]
+fn a_picture_becomes_a_file_row_by_row() {
+    let _quiet = QUIET.lock().unwrap();
+    let (width, height) = (1500, 1500);
+    let pixels = (0..width * height).map(|i: u32| [(i % 251) as f32 / 251.0, (i % 83) as f32 / 83.0, 0.5, 1.0]);
+    let image = Image {
+        width,
+        height,
+        pixels: pixels.collect(),
+    };
+    let distances = vec![1.0; image.pixels.len()];
+    let path = Path::new("x");
+    type Write<'a> = Box<dyn Fn(&mut dyn std::io::Write) -> b2p::Result<()> + 'a>;
+    let formats: [(&str, Write); 5] = [
+        ("png", Box::new(|to| image.write_png(to, path))),
+        ("png16", Box::new(|to| image.write_png16(to, path))),
+        ("ppm", Box::new(|to| image.write_ppm(to, path))),
+        ("y4m", Box::new(|to| image.write_y4m_frame(to, path))),
+        ("exr", Box::new(|to| image.write_exr(to, path, Some(&distances)))),
+    ];
+    for (name, write) in formats {
+        let (written, bytes) = peak(|| write(&mut std::io::sink()));
+        written.unwrap();
+        assert!(
+            bytes < 2 << 20,
+            "{name}: {bytes} bytes for a picture of {}",
+            16 * image.pixels.len()
+        );
     }
 }

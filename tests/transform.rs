@@ -6,17 +6,17 @@ use std::collections::BTreeMap;
 
 use b2p::cloud::{ColouredVoxels, voxelise};
 use b2p::container::{Header, Stream};
-use b2p::decoder::{StreamDecoder, StreamDecoding};
 use b2p::encoder::transform::{Fineness, Options, encode, encode_within};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::Heads;
 use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::{Cancel, Error, Isa, Limits};
+use b2p::{Decoder, Decoding};
 use common::{Ball, cloud_of, tiny_model};
 
 fn stream(cloud: &ColouredVoxels, options: &Options) -> Vec<u8> {
-    let encoded = encode(cloud, options, &mut Log::default());
+    let encoded = encode(cloud, options, &Log::default());
     encoded.expect("a cloud can be coded").bytes
 }
 
@@ -50,12 +50,12 @@ fn clouds() -> Vec<ColouredVoxels> {
 
 /// Voxels and colours of `level`, or of the finest.
 fn points(bytes: &[u8], level: Option<u8>) -> Result<(Vec<u64>, Vec<[u8; 3]>), String> {
-    let decoding = StreamDecoder::new().whole(bytes, level, &mut Log::default());
+    let decoding = Decoder::new().with_level(level).whole(bytes);
     let decoding = decoding.map_err(|error| error.to_string())?;
     Ok(told(&decoding).expect("a level"))
 }
 
-fn told(decoding: &StreamDecoding) -> Option<(Vec<u64>, Vec<[u8; 3]>)> {
+fn told(decoding: &Decoding) -> Option<(Vec<u64>, Vec<[u8; 3]>)> {
     let points = decoding.points()?;
     Some((points.voxels.keys().to_vec(), points.colours.to_vec()))
 }
@@ -123,9 +123,9 @@ fn every_prefix_that_ends_after_a_level_is_that_level() {
             let prefix = points(&bytes[..end], None).unwrap();
             assert_eq!(Ok(&prefix), points(&bytes, Some(level)).as_ref());
             assert_eq!(prefix.0.len(), header.voxels(level).unwrap() as usize);
-            let drawn = |bytes: &[u8], level| {
-                let decoder = StreamDecoder::new();
-                decoder.decode(bytes, level, &mut Log::default()).unwrap()
+            let drawn = |bytes: &[u8], level: Option<u8>| {
+                let decoder = Decoder::new();
+                decoder.with_level(level).decode(bytes).unwrap()
             };
             assert_eq!(drawn(&bytes[..end], None), drawn(&bytes, Some(level)));
         }
@@ -141,8 +141,8 @@ fn streams_are_the_same_for_any_threads_and_instructions_and_so_is_what_they_dec
             ..sliced()
         };
         let bytes = stream(&cloud, &options);
-        let decoder = StreamDecoder::new().with_isa(isa);
-        let gaussians = decoder.decode(&bytes, None, &mut Log::default()).unwrap();
+        let decoder = Decoder::new().with_isa(isa);
+        let gaussians = decoder.decode(&bytes).unwrap();
         (points(&bytes, None).unwrap(), gaussians, bytes)
     };
     let scalar = all(Isa::SCALAR);
@@ -162,9 +162,7 @@ fn points_are_a_cloud_on_the_grid_of_their_level() {
     cloud.placement.origin = [1.0, -2.0, 0.5];
     cloud.placement.voxel_size = 0.25;
     let bytes = stream(&cloud, &Options::default());
-    let decoding = StreamDecoder::new()
-        .whole(&bytes, Some(4), &mut Log::default())
-        .unwrap();
+    let decoding = Decoder::new().with_level(4).whole(&bytes).unwrap();
     let points = decoding.points().unwrap().to_cloud();
     let grid = voxelise(&points, None).unwrap();
     assert_eq!(grid.voxels.depth(), 4);
@@ -180,7 +178,7 @@ fn as_many_bits_as_asked_for_are_used_and_more_bits_are_never_worse() {
     let mut last = f64::INFINITY;
     let mut lossless = false;
     for most in [0.3, 0.6, 1.2, 2.4, 5.0, 20.0] {
-        let found = encode_within(&cloud, &Options::default(), most, &mut Log::default());
+        let found = encode_within(&cloud, &Options::default(), most, &Log::default());
         let (encoded, chosen) = found.unwrap();
         let bits = encoded.bytes.len() as f64 * 8.0 / cloud.voxels.len() as f64;
         assert!(bits <= most, "{bits} of {most}");
@@ -198,14 +196,14 @@ fn as_many_bits_as_asked_for_are_used_and_more_bits_are_never_worse() {
         last = off;
     }
     assert!(lossless, "20 bits are enough for exact colours");
-    let found = encode_within(&cloud, &Options::default(), 0.001, &mut Log::default());
+    let found = encode_within(&cloud, &Options::default(), 0.001, &Log::default());
     assert!(matches!(found, Err(Error::TooFewBits { .. })));
 }
 
 #[test]
 fn levels_and_steps_that_do_not_exist_are_refused() {
     let cloud = Ball::new(4, 5.0).cloud();
-    let refused = |options: Options| encode(&cloud, &options, &mut Log::default()).is_err();
+    let refused = |options: Options| encode(&cloud, &options, &Log::default()).is_err();
     for levels in [3..=5, 5..=5] {
         let options = Options {
             levels: Some(levels),
@@ -229,28 +227,22 @@ fn levels_and_steps_that_do_not_exist_are_refused() {
 #[test]
 fn one_decoder_decodes_both_versions_and_says_which_model_version_2_needs() {
     let cloud = Ball::new(5, 12.0).cloud();
-    let model = std::sync::Arc::new(Model::from_bytes(&tiny_model(3)).unwrap());
-    let log = &mut Log::default();
+    let model = Model::from_bytes(&tiny_model(3)).unwrap();
+    let log = &Log::default();
     let options = b2p::encoder::Options::default();
     let old = b2p::encoder::encode(&cloud, &model, &options, log).unwrap().bytes;
     let new = stream(&cloud, &Options::default());
-    let without = StreamDecoder::new();
-    assert!(without.decode(&new, None, log).is_ok());
+    let without = Decoder::new();
+    assert!(without.decode(&new).is_ok());
     let id: String = model.id().iter().map(|b| format!("{b:02x}")).collect();
-    let missing = without.decode(&old, None, log).unwrap_err();
+    let missing = without.decode(&old).unwrap_err();
     assert!(matches!(&missing, Error::ModelMissing { expected } if *expected == id));
     let both = without.with_model(model.clone());
-    let expected = b2p::latents::Decoder::new(&*model);
-    assert_eq!(
-        both.decode(&old, None, log).unwrap(),
-        expected.decode(&old, None, log).unwrap()
-    );
-    assert!(both.decode(&new, None, log).is_ok());
+    let expected = b2p::latents::LatentDecoder::new(&model);
+    assert_eq!(both.decode(&old).unwrap(), expected.decode(&old, None, log).unwrap());
+    assert!(both.decode(&new).is_ok());
     let surfels = both.clone().with_heads(HeadSet::Surfels);
-    assert!(matches!(
-        surfels.decode(&old, None, log),
-        Err(Error::Unsupported { .. })
-    ));
+    assert!(matches!(surfels.decode(&old), Err(Error::Unsupported { .. })));
     assert!(matches!(
         expected.decode(&new, None, log),
         Err(Error::Unsupported { .. })
@@ -266,8 +258,8 @@ fn a_cancelled_decode_ends_with_cancelled() {
     let bytes = stream(&Ball::new(5, 12.0).cloud(), &Options::default());
     let cancel = Cancel::default();
     cancel.cancel();
-    let decoder = StreamDecoder::new().with_cancel(cancel);
-    let decoded = decoder.decode(&bytes, None, &mut Log::default());
+    let decoder = Decoder::new().with_cancel(cancel);
+    let decoded = decoder.decode(&bytes);
     assert!(matches!(decoded, Err(Error::Cancelled)));
 }
 

@@ -1,11 +1,8 @@
 //! Streams in pieces, and the Gaussians that come of them.
 
 use std::ffi::c_char;
-use std::sync::Arc;
 
-use b2p::decoder::{StreamDecoder, StreamDecoding};
 use b2p::gaussians::HeadSet;
-use b2p::log::Log;
 
 use crate::border::{Fault, Status, borrowed, changed, give, guard, slice, take};
 use crate::model::{HeadsModel, Limits, Model};
@@ -15,7 +12,7 @@ use crate::model::{HeadsModel, Limits, Model};
 pub struct Cancel(b2p::Cancel);
 
 /// A stream that is decoded as its bytes arrive.
-pub struct Decoding(StreamDecoding<'static>);
+pub struct Decoding(b2p::Decoding<'static>);
 
 /// Gaussians of a level.
 pub struct Gaussians(pub(crate) b2p::gaussians::Gaussians);
@@ -109,9 +106,9 @@ pub unsafe extern "C" fn b2p_decoding_start(
     let run = || {
         // SAFETY: the caller vouches for `model`, `limits` and `cancel`.
         let (model, limits, cancel) = unsafe { (model.as_ref(), limits.as_ref(), cancel.as_ref()) };
-        let mut decoder = StreamDecoder::new();
+        let mut decoder = b2p::Decoder::new();
         if let Some(model) = model {
-            decoder = decoder.with_model(Arc::clone(&model.0));
+            decoder = decoder.with_model(model.0.clone());
         }
         if let Some(limits) = limits {
             decoder = decoder.with_limits((*limits).into());
@@ -124,7 +121,7 @@ pub unsafe extern "C" fn b2p_decoding_start(
             _ => Some(u8::try_from(level).map_err(|_| Fault::usage("level is above 255"))?),
         };
         // SAFETY: the caller vouches for `decoding`.
-        unsafe { give(decoding, "decoding", Decoding(decoder.start(level))) }
+        unsafe { give(decoding, "decoding", Decoding(decoder.with_level(level).start())) }
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -194,7 +191,7 @@ pub unsafe extern "C" fn b2p_decoding_use_heads_model(
     let run = || {
         // SAFETY: the caller vouches for `decoding` and `heads`.
         let (decoding, heads) = unsafe { (changed(decoding, "decoding")?, borrowed(heads, "heads")?) };
-        decoding.0.set_heads_model(Arc::clone(&heads.0));
+        decoding.0.set_heads_model(heads.0.clone());
         Ok(())
     };
     // SAFETY: the caller vouches for `message`.
@@ -239,7 +236,7 @@ pub unsafe extern "C" fn b2p_decoding_advance(
         // SAFETY: the caller vouches for `decoding` and `level`.
         let (decoding, level) = unsafe { (changed(decoding, "decoding")?, changed(level, "level")?) };
         *level = -1;
-        *level = decoding.0.advance(&mut Log::default())?.map_or(-1, i32::from);
+        *level = decoding.0.advance()?.map_or(-1, i32::from);
         Ok(())
     };
     // SAFETY: the caller vouches for `message`.
@@ -256,7 +253,7 @@ pub unsafe extern "C" fn b2p_decoding_finish(decoding: *mut Decoding, message: *
     let run = || {
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { changed(decoding, "decoding") }?;
-        Ok(decoding.0.finish(&mut Log::default())?)
+        Ok(decoding.0.finish()?)
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -297,7 +294,7 @@ pub unsafe extern "C" fn b2p_decoding_gaussians(
     let run = || {
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { borrowed(decoding, "decoding") }?;
-        let made = decoding.0.gaussians(&mut Log::default())?;
+        let made = decoding.0.gaussians()?;
         // SAFETY: the caller vouches for `gaussians`.
         unsafe { give(gaussians, "gaussians", Gaussians(made)) }
     };

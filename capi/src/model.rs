@@ -2,15 +2,14 @@
 
 use std::ffi::{CStr, c_char};
 use std::path::Path;
-use std::sync::Arc;
 
 use crate::border::{Fault, Status, give, guard, slice, take};
 
 /// A model, ready to run. Any number of decodings share it, in any threads.
-pub struct Model(pub(crate) Arc<b2p::latents::network::Model>);
+pub struct Model(pub(crate) b2p::Model);
 
 /// Learned heads that draw streams of version 3, ready to run. Any number of decodings share them, in any threads.
-pub struct HeadsModel(pub(crate) Arc<b2p::gaussians::learned::HeadsModel>);
+pub struct HeadsModel(pub(crate) b2p::HeadsModel);
 
 /// What an input may ask for.
 #[repr(C)]
@@ -39,16 +38,17 @@ impl From<b2p::Limits> for Limits {
 
 impl From<Limits> for b2p::Limits {
     fn from(limits: Limits) -> Self {
-        b2p::Limits {
-            max_points: limits.max_points,
-            max_pixels: limits.max_pixels,
-            max_bytes: limits.max_bytes,
-            max_depth: limits.max_depth,
-        }
+        b2p::Limits::default()
+            .with_max_points(limits.max_points)
+            .with_max_pixels(limits.max_pixels)
+            // As in the presets.
+            .with_max_pairs(limits.max_pixels.saturating_mul(4))
+            .with_max_bytes(limits.max_bytes)
+            .with_max_depth(limits.max_depth)
     }
 }
 
-/// Limits for anything: 2^26 points, 2^28 pixels, 2 GiB. What NULL stands for.
+/// Limits for anything: 2^26 points, 2^26 pixels, 2 GiB. What NULL stands for.
 #[unsafe(no_mangle)]
 pub extern "C" fn b2p_limits_default() -> Limits {
     b2p::Limits::default().into()
@@ -93,7 +93,7 @@ pub unsafe extern "C" fn b2p_model_open(
         let path = path.to_str().map_err(|_| Fault::usage("path is not UTF-8"))?;
         let loaded = b2p::latents::network::Model::open(Path::new(path))?;
         // SAFETY: the caller vouches for `model`.
-        unsafe { give(model, "model", Model(Arc::new(loaded))) }
+        unsafe { give(model, "model", Model(loaded)) }
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -116,7 +116,7 @@ pub unsafe extern "C" fn b2p_model_from_bytes(
         let bytes = unsafe { slice(bytes, length, "bytes") }?;
         let loaded = b2p::latents::network::Model::from_bytes(bytes)?;
         // SAFETY: the caller vouches for `model`.
-        unsafe { give(model, "model", Model(Arc::new(loaded))) }
+        unsafe { give(model, "model", Model(loaded)) }
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -149,7 +149,7 @@ pub unsafe extern "C" fn b2p_heads_model_from_bytes(
         let bytes = unsafe { slice(bytes, length, "bytes") }?;
         let loaded = b2p::gaussians::learned::HeadsModel::from_bytes(bytes)?;
         // SAFETY: the caller vouches for `heads`.
-        unsafe { give(heads, "heads", HeadsModel(Arc::new(loaded))) }
+        unsafe { give(heads, "heads", HeadsModel(loaded)) }
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }

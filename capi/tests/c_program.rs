@@ -62,7 +62,7 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     std::fs::write(at("both"), &file_of_both).expect("written");
     std::fs::write(at("stream"), &stream).expect("written");
     let cloud = common::Ball::new(4, 4.5).cloud();
-    let (options, log) = (transform::Options::default(), &mut Log::default());
+    let (options, log) = (transform::Options::default(), &Log::default());
     let new = transform::encode(&cloud, &options, log).expect("a ball can be coded");
     std::fs::write(at("new"), &new.bytes).expect("written");
 
@@ -70,7 +70,7 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     let limits = b2p::Limits::default();
     let sum = |model: &Model, heads| {
         let decoder = Decoder::new(model).with_heads(heads).expect("heads");
-        let gaussians = decoder.decode(&stream, None, &mut Log::default());
+        let gaussians = decoder.decode(&stream, None, &Log::default());
         let gaussians = gaussians.expect("a stream");
         let drawn = render(&gaussians, &camera, Background::WHITE, &limits);
         let picture = drawn.expect("a picture").0.to_pixmap().expect("bytes");

@@ -14,6 +14,7 @@ use b2p::{Isa, Limits, ceiling, embedded};
 use serde_json::json;
 
 use super::args::Bench;
+use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{count, milliseconds, table};
 use super::{Failure, Result, bench_render, load};
@@ -29,12 +30,12 @@ struct Line {
 type Run = (Duration, Vec<Step>);
 
 /// Decodes again and again; prints a table or JSON.
-pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String> {
+pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
     if args.render {
         return bench_render::run(args, limits, progress);
     }
     let bytes = match &args.input {
-        Some(path) => load::bytes(path)?,
+        Some(path) => load::bytes(path, limits)?,
         None => embedded::SAMPLE.to_vec(),
     };
     let start = Instant::now();
@@ -54,12 +55,13 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
     };
 
     let runs = timed(args, progress, || {
-        let mut log = Log::default();
+        let log = Log::new();
+        let decoder = decoder.clone().with_level(level).with_log(&log);
         let start = Instant::now();
-        let gaussians = decoder.decode(&bytes, Some(level), &mut log).map_err(fail)?;
+        let gaussians = decoder.decode(&bytes).map_err(fail)?;
         let total = start.elapsed();
         drop(gaussians);
-        Ok((total, log.steps().to_vec()))
+        Ok((total, log.steps()))
     })?;
     let header = Header::parse(&bytes, limits).map_err(fail)?;
     let heads = decoder.heads_for(&header);
@@ -67,7 +69,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
     let works = match (model, heads.learned()) {
         (Some(model), Some(heads)) if header.model().is_some() => {
             let exact = Decoder::new(model).with_limits(limits.clone());
-            let exact = exact.exact(&bytes, level, &mut Log::default());
+            let exact = exact.exact(&bytes, level, &Log::default());
             let octree = exact.map_err(fail)?.octree;
             works(model.shape(), heads, &octree, header.base)
         }
@@ -90,10 +92,10 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         ceilings: Ceilings::measure(isa, precision, threads.min(cores)),
         memory: peak_memory(),
     };
-    Ok(match args.json {
+    Ok(Said::result(match manners::json() {
         true => report.json(),
         false => report.text(),
-    })
+    }))
 }
 
 /// What each run took, but for the first, which warms caches and memory up.

@@ -7,7 +7,7 @@ use b2p::container::version;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Image, Renderer};
+use b2p::renderer::{Image, Renderer};
 use b2p::{Limits, container::Header};
 
 use super::args::{DetailArg, ModelArg};
@@ -42,11 +42,11 @@ impl Kept {
 }
 
 /// The bytes of a file, if a budget is asked for and it is a stream of version 3.
-pub fn stream(args: &BudgetArgs, input: &Path) -> Result<Option<Vec<u8>>> {
+pub fn stream(args: &BudgetArgs, input: &Path, limits: &Limits) -> Result<Option<Vec<u8>>> {
     if !args.is_given() || input == Path::new(PIPE) {
         return Ok(None);
     }
-    let bytes = load::bytes(input)?;
+    let bytes = load::bytes(input, limits)?;
     if version(&bytes) != Some(3) {
         return Ok(None);
     }
@@ -64,20 +64,20 @@ pub fn decode(
     bytes: &[u8],
     model: &ModelArg,
     limits: &Limits,
-    log: &mut Log,
+    log: &Log,
 ) -> Result<Kept> {
     let time = args.budget.unwrap_or(Duration::MAX);
     let (fail, start) = (Failure::in_file(input), Instant::now());
-    let decoder = load::decoder(bytes, &no_detail(), model, limits)?;
+    let decoder = load::decoder(bytes, &no_detail(), model, limits)?.with_log(log);
     let header = Header::parse(bytes, limits).map_err(&fail)?;
     let voxels = |level: u8| header.voxels(level).map(f64::from);
-    let mut decoding = decoder.start(None);
+    let mut decoding = decoder.start();
     decoding.push(bytes);
     let (mut spent, mut per_gaussian) = (Duration::ZERO, None);
     let mut expected = false;
     loop {
         let begun = Instant::now();
-        let Some(level) = decoding.advance(log).map_err(&fail)? else {
+        let Some(level) = decoding.advance().map_err(&fail)? else {
             break;
         };
         spent = begun.elapsed().max(spent);
@@ -86,7 +86,7 @@ pub fn decode(
             Some(each) => each,
             None => {
                 let begun = Instant::now();
-                decoding.gaussians(log).map_err(&fail)?;
+                decoding.gaussians().map_err(&fail)?;
                 *per_gaussian.insert(begun.elapsed().as_secs_f64() / here)
             }
         };
@@ -105,7 +105,7 @@ pub fn decode(
         }
     }
     let level = decoding.level().unwrap_or(header.base);
-    let gaussians = decoding.gaussians(log).map_err(&fail)?;
+    let gaussians = decoding.gaussians().map_err(&fail)?;
     Ok(Kept {
         gaussians,
         level,
@@ -122,24 +122,25 @@ pub fn draw(
     model: &ModelArg,
     camera: &Camera,
     limits: &Limits,
-    log: &mut Log,
+    log: &Log,
 ) -> Result<Kept> {
     let time = args.budget.unwrap_or(Duration::MAX);
     let fail = Failure::in_file(input);
-    let decoder = load::decoder(bytes, &no_detail(), model, limits)?;
+    let decoder = load::decoder(bytes, &no_detail(), model, limits)?.with_log(log);
     let header = Header::parse(bytes, limits).map_err(&fail)?;
-    let mut renderer = Renderer::new(load::isa(model.isa.as_deref())?);
+    let mut renderer = Renderer::new()
+        .with_isa(load::isa(model.isa.as_deref())?)
+        .with_limits(limits.clone());
     let mut image = Image::default();
-    let mut decoding = decoder.start(None);
+    let mut decoding = decoder.start();
     decoding.push(bytes);
     let mut best = None;
-    while let Some(level) = decoding.advance(log).map_err(&fail)? {
-        let gaussians = decoding.gaussians(log).map_err(&fail)?;
+    while let Some(level) = decoding.advance().map_err(&fail)? {
+        let gaussians = decoding.gaussians().map_err(&fail)?;
         let mut least = Duration::MAX;
         // The first picture warms up.
         for _ in 0..3 {
-            let over = Background::WHITE;
-            let drawn = renderer.render_into(&gaussians, camera, over, limits, &mut image)?;
+            let drawn = renderer.render_into(&gaussians, camera, &mut image)?;
             least = least.min(drawn.times.total());
         }
         let expected = least.mul_f64(MARGIN) <= time;

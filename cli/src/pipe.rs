@@ -4,14 +4,13 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 
-use b2p::decoder::StreamDecoding;
 use b2p::error::Stage;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::{Error, Limits};
+use b2p::{Decoding, Error, Limits};
 
 use super::args::{DetailArg, ModelArg};
-use super::{Failure, Result, load};
+use super::{Failure, Result, kinds, load, manners};
 
 /// The input that is standard input, and the output that is standard output.
 pub const PIPE: &str = "-";
@@ -26,7 +25,7 @@ const STREAM_START: usize = 10;
 type Piece = std::io::Result<Vec<u8>>;
 
 /// What is done with Gaussians.
-pub type Show<'a> = dyn FnMut(&Gaussians, &mut Log) -> Result<()> + 'a;
+pub type Show<'a> = dyn FnMut(&Gaussians, &Log) -> Result<()> + 'a;
 
 /// Shows the Gaussians of a file, or of standard input: then also those of coarser levels, if `early` and nothing finer has come
 /// meanwhile; and if the stream is cut and no level was named, what its finest whole level has.
@@ -36,14 +35,14 @@ pub fn each(
     model_arg: &ModelArg,
     limits: &Limits,
     early: bool,
-    log: &mut Log,
+    log: &Log,
     show: &mut Show,
 ) -> Result<()> {
     if path != Path::new(PIPE) {
         let gaussians = load::gaussians(path, detail, model_arg, limits, log)?;
         return show(&gaussians, log);
     }
-    let pieces = pieces();
+    let pieces = pieces()?;
     let mut start = Vec::new();
     while start.len() < STREAM_START {
         match pieces.recv() {
@@ -54,17 +53,29 @@ pub fn each(
     if start.starts_with(load::PLY_MAGIC) {
         for piece in pieces {
             start.extend(piece.map_err(broken)?);
+            let length = start.len() as u64;
+            let checked = limits.check_bytes("size of the input, as far as it was read,", length);
+            checked.map_err(Failure::in_file(path))?;
         }
         return show(&load::ply(path, &start, detail, limits, log)?, log);
     }
-    let decoder = load::decoder(&start, detail, model_arg, limits)?;
-    let mut decoding = decoder.start(detail.level);
+    kinds::check_stream(path, &start)?;
+    let decoder = load::decoder(&start, detail, model_arg, limits)?.with_log(log);
+    let mut decoding = decoder.start();
     let mut shown = None;
     let in_pipe = Failure::in_file(path);
     let mut piece = Some(start);
+    let mut length = 0;
     while let Some(bytes) = piece {
+        length += bytes.len() as u64;
         decoding.push(&bytes);
-        while decoding.advance(log).map_err(&in_pipe)?.is_some() {}
+        while decoding.advance().map_err(&in_pipe)?.is_some() {}
+        if let Some(header) = decoding.header()
+            && length > header.stream_bytes()
+        {
+            // What follows the stream may have no end.
+            break;
+        }
         piece = match pieces.try_recv() {
             Err(TryRecvError::Empty) => {
                 if early && decoding.is_drawable() && shown != decoding.level() {
@@ -78,7 +89,7 @@ pub fn each(
         .transpose()
         .map_err(broken)?;
     }
-    match decoding.finish(log) {
+    match decoding.finish() {
         Err(
             error @ Error::Truncated {
                 stage: Stage::Bitstream,
@@ -86,8 +97,8 @@ pub fn each(
             },
         ) if detail.level.is_none() && decoding.is_drawable() => {
             let finest = decoding.level().unwrap_or_default();
-            let what = format!("what follows is level {finest}, the finest that is whole");
-            eprintln!("b2p: {}: {error}; {what}", path.display());
+            let what = format!("what follows is level {finest}, the finest that is complete");
+            manners::warn(&format!("{}: {error}; {what}", path.display()));
         }
         done => done.map_err(&in_pipe)?,
     }
@@ -97,15 +108,15 @@ pub fn each(
     }
 }
 
-fn show_level(decoding: &StreamDecoding, log: &mut Log, show: &mut Show) -> Result<()> {
-    let gaussians = decoding.gaussians(log).map_err(Failure::in_file(Path::new(PIPE)))?;
+fn show_level(decoding: &Decoding, log: &Log, show: &mut Show) -> Result<()> {
+    let gaussians = decoding.gaussians().map_err(Failure::in_file(Path::new(PIPE)))?;
     show(&gaussians, log)
 }
 
 /// Standard input, read by a thread of its own so that it can be known whether something waits.
-fn pieces() -> Receiver<Piece> {
+fn pieces() -> Result<Receiver<Piece>> {
     let (sender, receiver) = sync_channel(WAITING);
-    std::thread::spawn(move || {
+    let read = move || {
         let mut input = std::io::stdin().lock();
         loop {
             let mut bytes = vec![0; PIECE];
@@ -119,8 +130,10 @@ fn pieces() -> Receiver<Piece> {
                 return;
             }
         }
-    });
-    receiver
+    };
+    let started = std::thread::Builder::new().spawn(read);
+    started.map_err(|e| Failure(format!("cannot start a thread to read: {e}")))?;
+    Ok(receiver)
 }
 
 fn broken(source: std::io::Error) -> Failure {

@@ -21,7 +21,7 @@ fn model() -> Model {
 
 fn decoded(model: &Model, level: u8) -> Gaussians {
     Decoder::new(model)
-        .decode(SAMPLE, Some(level), &mut Log::default())
+        .decode(SAMPLE, Some(level), &Log::default())
         .expect("the sample inside the program decodes")
 }
 
@@ -42,7 +42,7 @@ fn the_dearer_a_bit_the_shorter_the_stream() {
             bit_price,
             ..Options::default()
         };
-        let encoded = encode(&cloud, &model, &options, &mut Log::default());
+        let encoded = encode(&cloud, &model, &options, &Log::default());
         encoded.expect("the model encodes").bytes.len()
     };
     let lengths = [0.0, Options::default().bit_price, 4.0].map(length);
@@ -83,17 +83,14 @@ fn gaussians_generated_in_integers_draw_the_pictures_of_those_generated_in_float
 
 #[test]
 fn all_heads_draw_the_scene_and_give_the_same_bits_with_every_instruction_set() {
-    use b2p::decoder::StreamDecoder;
-    use b2p::gaussians::HeadSet;
-    use b2p::gaussians::learned::HeadsModel;
+    use b2p::{Decoder, HeadSet, HeadsModel};
 
-    let heads = std::sync::Arc::new(HeadsModel::from_bytes(b2p::embedded::HEADS).unwrap());
+    let heads = HeadsModel::from_bytes(b2p::embedded::HEADS).unwrap();
     for set in [HeadSet::Best, HeadSet::Quick, HeadSet::Surfels] {
         let draw = |isa| {
-            let decoder = StreamDecoder::new().with_heads_model(heads.clone());
+            let decoder = Decoder::new().with_heads_model(heads.clone());
             let decoder = decoder.with_heads(set).with_isa(isa);
-            let mut log = b2p::log::Log::default();
-            decoder.decode(b2p::embedded::SCENE, Some(7), &mut log).unwrap()
+            decoder.with_level(7).decode(b2p::embedded::SCENE).unwrap()
         };
         let gaussians = draw(b2p::Isa::detect());
         gaussians.check_lengths().unwrap();

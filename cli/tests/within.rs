@@ -17,7 +17,7 @@ fn model() -> Model {
 }
 
 fn within(bits: f64, cloud: &ColouredVoxels, model: &Model, options: &Options) -> Result<(Encoded, Options), Error> {
-    encode_within(cloud, model, options, bits, &mut Log::default())
+    encode_within(cloud, model, options, bits, &Log::default())
 }
 
 fn bits_of(encoded: &Encoded, cloud: &ColouredVoxels) -> f64 {
@@ -37,7 +37,7 @@ fn place(chosen: &Options) -> (u8, f32, i16) {
 fn streams_take_no_more_than_was_asked_for_and_nearly_all_of_it_and_more_room_is_never_to_the_worse() {
     let (model, cloud) = (model(), Ball::new(6, 25.0).cloud());
     let coded = |options: &Options| {
-        let coded = encode(&cloud, &model, options, &mut Log::default());
+        let coded = encode(&cloud, &model, options, &Log::default());
         coded.unwrap()
     };
     let usual = bits_of(&coded(&Options::default()), &cloud);
@@ -56,7 +56,7 @@ fn streams_take_no_more_than_was_asked_for_and_nearly_all_of_it_and_more_room_is
             let (before, now) = (place(&last), place(&chosen));
             assert!(now >= before, "{before:?} then {now:?}");
         }
-        let decoded = Decoder::new(&model).decode(&encoded.bytes, None, &mut Log::default());
+        let decoded = Decoder::new(&model).decode(&encoded.bytes, None, &Log::default());
         assert!(!decoded.unwrap().is_empty());
         last = Some(chosen);
     }
@@ -86,7 +86,7 @@ fn with_more_room_than_can_be_used_the_finest_comes_out() {
     for cloud in [Ball::new(5, 10.0).cloud(), one_bit] {
         let (encoded, chosen) = within(1e6, &cloud, &model, &Options::default()).unwrap();
         assert_eq!(place(&chosen), (2, -1.0, -1));
-        let finest = encode(&cloud, &model, &chosen, &mut Log::default());
+        let finest = encode(&cloud, &model, &chosen, &Log::default());
         assert!(encoded.bytes == finest.unwrap().bytes);
     }
 }
@@ -113,7 +113,7 @@ fn what_else_was_chosen_stays_chosen() {
         };
         assert_eq!(format!("{others:?}"), format!("{options:?}"));
         assert_ne!(chosen.residual, Residual::Coarse, "that goes with filters");
-        let again = encode(&cloud, &model, &chosen, &mut Log::default());
+        let again = encode(&cloud, &model, &chosen, &Log::default());
         assert!(encoded.bytes == again.unwrap().bytes);
         fine += usize::from(matches!(chosen.residual, Residual::Fine(_)));
     }
@@ -143,11 +143,10 @@ fn bits_that_are_no_number_above_0_are_refused() {
 #[test]
 fn each_try_is_told_as_it_begins_and_there_are_at_most_seven() {
     let (model, cloud) = (model(), Ball::new(5, 10.0).cloud());
-    let heard = std::cell::RefCell::new(Vec::new());
-    let listener = |step: &str| heard.borrow_mut().push(step.to_owned());
-    let mut log = Log::with_listener(&listener);
-    encode_within(&cloud, &model, &Options::default(), 8.0, &mut log).unwrap();
-    let heard = heard.borrow();
+    let (sender, heard) = std::sync::mpsc::channel();
+    let log = Log::with_listener(move |step| sender.send(step.to_owned()).unwrap());
+    encode_within(&cloud, &model, &Options::default(), 8.0, &log).unwrap();
+    let heard: Vec<String> = heard.try_iter().collect();
     let tries: Vec<_> = heard.iter().filter(|step| step.starts_with("try ")).collect();
     assert!((1..=7).contains(&tries.len()), "{heard:?}");
     for (i, step) in (1..).zip(tries) {

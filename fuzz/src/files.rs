@@ -9,8 +9,9 @@ use b2p::gaussians::Gaussians;
 use b2p::geometry::{KernelMap, Octree, Voxels};
 use b2p::latents::entropy::UNPREDICTED;
 use b2p::latents::network::{Model, Pass, Shape, untrained};
+use b2p_formats::splats;
 
-use crate::one_in;
+use crate::{one_in, within};
 
 /// A model file that bytes are edits of.
 static FILE: LazyLock<Vec<u8>> = LazyLock::new(|| {
@@ -97,10 +98,7 @@ fn passes(model: &Model, role: usize, octree: &Octree, map: &KernelMap) {
 
 /// Any bytes as a point cloud and as Gaussians: an error, or arrays of equal length that are the same after writing and reading again.
 pub fn ply(bytes: &[u8]) {
-    let limits = Limits {
-        max_points: 1 << 16,
-        ..Limits::default()
-    };
+    let limits = Limits::default().with_max_points(1 << 16);
     if let Ok(cloud) = PointCloud::from_ply(bytes, &limits) {
         assert_eq!(cloud.positions.len(), cloud.colours.len());
         let again = PointCloud::from_ply(&cloud.to_ply(), &limits).expect("what is written is read");
@@ -124,5 +122,40 @@ pub fn ply(bytes: &[u8]) {
             .expect("memory takes it");
         let again = Gaussians::from_ply(&file, &limits).expect("what is written is read");
         assert_eq!(again.len(), gaussians.len());
+    }
+}
+
+/// Memory that a file of splats may ask for, and what its reader takes besides, of which the tables of compressed data are most.
+const SPLAT_MEMORY: u64 = 1 << 20;
+const SPLAT_OVERHEAD: u64 = 16 << 20;
+
+/// Any bytes as splats, of the format that the first byte names: an error, or Gaussians that are as many after writing and reading
+/// again, for memory within the limits.
+pub fn splats(bytes: &[u8]) {
+    let [first, file @ ..] = bytes else { return };
+    let format = splats::Format::all().nth(usize::from(*first) % 9).expect("one of nine");
+    let limits = Limits::default().with_max_points(1 << 12).with_max_bytes(SPLAT_MEMORY);
+    let options = splats::Options::default();
+    let _ = splats::Format::of_bytes(file);
+    let read = within((SPLAT_MEMORY + SPLAT_OVERHEAD) as usize + 8 * bytes.len(), || {
+        splats::read(file, format, &options, &limits)
+    });
+    let Ok(read) = read else { return };
+    read.gaussians.check_lengths().expect("arrays of one length");
+    let whole = read.gaussians.len();
+    for to in splats::Format::all() {
+        if !one_in(4, bytes) && to != format {
+            continue;
+        }
+        let mut written = Vec::new();
+        let Ok(warnings) = splats::write(&read.gaussians, read.axes, to, &mut written, Path::new("memory")) else {
+            // Coordinates may be outside what the format holds.
+            continue;
+        };
+        let limits = Limits::default();
+        let again = splats::read(&written, to, &options, &limits)
+            .expect("what is written is read")
+            .gaussians;
+        assert!(again.len() <= whole && (again.len() == whole || !warnings.is_empty()));
     }
 }

@@ -7,7 +7,7 @@ use b2p::geometry::{Octree, Voxels};
 use b2p::latents::network::{Model, Shape, untrained};
 use b2p::layers::Precision;
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Renderer};
+use b2p::renderer::{Image, Renderer};
 use b2p::{Isa, Limits};
 
 use crate::{Source, one_in};
@@ -118,16 +118,17 @@ pub fn render(bytes: &[u8]) {
         g.opacity.push(number());
         g.colour.push([number(), number(), number()]);
     }
-    let limits = Limits {
-        max_bytes: 64 << 20,
-        ..Limits::default()
-    };
+    let limits = Limits::default().with_max_bytes(64 << 20);
     let fov = 10.0 + angles[0] / 8.0;
     let Ok(camera) = Camera::orbit(angles[0], angles[1], distance, fov, width, height) else {
         return;
     };
-    let mut renderer = Renderer::default();
-    let draw = |renderer: &mut Renderer| renderer.render(&g, &camera, Background::WHITE, &limits);
+    let mut renderer = Renderer::new().with_limits(limits.clone());
+    let draw = |renderer: &mut Renderer| {
+        let mut image = Image::default();
+        let stats = renderer.render_into(&g, &camera, &mut image)?;
+        Ok::<_, b2p::Error>((image, stats))
+    };
     let Ok((image, stats)) = draw(&mut renderer) else {
         return;
     };

@@ -5,11 +5,13 @@ use std::path::Path;
 use b2p::cloud::{ColouredVoxels, PointCloud};
 use b2p::container::{Level, Stream};
 use b2p::encoder::{Options, encode, transform};
+use b2p::gaussians::{Gaussians, Harmonics};
 use b2p::geometry::Voxels;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
 use b2p::log::Log;
 use b2p::{Limits, Placement};
+use b2p_formats::splats::{Axes, Format, write};
 
 use crate::MODEL;
 use crate::streams::{Colours, rewritten};
@@ -27,9 +29,9 @@ fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u
         slice_voxels,
         ..Options::default()
     };
-    let mut log = Log::default();
-    let stream = encode(&cloud, &MODEL, &options, &mut log).expect("a small cloud is coded");
-    let gaussians = Decoder::new(&*MODEL).decode(&stream.bytes, None, &mut log);
+    let log = Log::default();
+    let stream = encode(&cloud, &MODEL, &options, &log).expect("a small cloud is coded");
+    let gaussians = LatentDecoder::new(&*MODEL).decode(&stream.bytes, None, &log);
     let file = gaussians.ok().map(|gaussians| {
         let mut file = Vec::new();
         let name = Path::new("memory");
@@ -56,7 +58,7 @@ fn transformed() -> Vec<Vec<u8>> {
             colour_slice: slice,
             ..transform::Options::default()
         };
-        let stream = transform::encode(&cloud, &options, &mut Log::default());
+        let stream = transform::encode(&cloud, &options, &Log::default());
         stream.expect("a small cloud is coded").bytes
     };
     let step = transform::Fineness::Step;
@@ -102,6 +104,30 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
     rewritten(&stream, Some(&colours))
 }
 
+/// The Gaussians of a PLY file in each format, and with view-dependent colour.
+fn splats(file: &Option<Vec<u8>>) -> Vec<Vec<u8>> {
+    let file = file.as_ref().expect("Gaussians of a small cloud");
+    let mut gaussians = Gaussians::from_ply(file, &Limits::default()).expect("a file of ours");
+    let mut seeds = Vec::new();
+    for count in [0, 3] {
+        let noise = noise(11, 3 * count * gaussians.len());
+        let coefficients = noise
+            .chunks(3)
+            .map(|c| [0, 1, 2].map(|k| f32::from(c[k]) / 128.0 - 1.0));
+        gaussians.harmonics = Harmonics {
+            count,
+            coefficients: coefficients.collect(),
+        };
+        for (number, format) in (0u8..).zip(Format::all()) {
+            let mut bytes = vec![number];
+            let written = write(&gaussians, Axes::of(format), format, &mut bytes, Path::new("memory"));
+            written.expect("memory takes it");
+            seeds.push(bytes);
+        }
+    }
+    seeds
+}
+
 /// Pseudo-random bytes.
 fn noise(seed: u64, length: usize) -> Vec<u8> {
     let mut state = seed;
@@ -140,6 +166,7 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
             let files = clouds.iter().take(2).filter_map(|(_, file)| file.clone());
             files.chain([cloud.to_ply(), ascii.into()]).collect()
         }
+        "splats" => splats(&clouds[0].1),
         "model" => vec![vec![], noise(1, 5), noise(2, 40)],
         // No voxels; one at every level, and one level too many.
         "octree" => {

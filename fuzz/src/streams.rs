@@ -1,10 +1,9 @@
 //! Streams from strangers.
 
+use b2p::Decoder;
 use b2p::container::{Header, Level, Slice, Stream, Writer};
-use b2p::decoder::StreamDecoder;
 use b2p::gaussians::Gaussians;
-use b2p::latents::network::Model;
-use b2p::latents::{Decoder, Decoding, Exact};
+use b2p::latents::{Exact, LatentDecoder, LatentDecoding};
 use b2p::log::Log;
 use b2p::{Error, Limits};
 
@@ -12,11 +11,7 @@ use crate::{MODEL, giving_back, one_in, transform, within};
 
 /// So little that a level of it is decoded in a fraction of a millisecond.
 pub(crate) fn limits() -> Limits {
-    Limits {
-        max_points: 1 << 8,
-        max_bytes: 2 << 20,
-        ..Limits::default()
-    }
+    Limits::default().with_max_points(1 << 8).with_max_bytes(2 << 20)
 }
 
 /// Any bytes: an error, or a header that is within the limits and is written back as it was read, whose levels, where they are whole,
@@ -147,12 +142,12 @@ fn requests(bytes: &[u8], header: &Header, deepest: Option<u8>) {
 /// # Errors
 /// What the decoder says.
 pub fn deepest(bytes: &[u8]) -> Result<Option<u8>, Error> {
-    let log = &mut Log::default();
+    let log = &Log::default();
     if b2p::container::version(bytes) == Some(3) {
-        let decoder = StreamDecoder::new().with_limits(transform::limits());
-        return Ok(decoder.whole(bytes, None, log)?.level());
+        let decoder = Decoder::new().with_limits(transform::limits());
+        return Ok(decoder.whole(bytes)?.level());
     }
-    let mut decoding = Decoder::new(&*MODEL).with_limits(limits()).start(None);
+    let mut decoding = LatentDecoder::new(&*MODEL).with_limits(limits()).start(None);
     decoding.push(bytes);
     decoding.finish(log)?;
     Ok(decoding.level())
@@ -166,14 +161,14 @@ pub fn stream(bytes: &[u8]) {
 }
 
 fn decoded(bytes: &[u8]) {
-    let decoder = Decoder::new(&*MODEL).with_limits(limits());
-    let (mut decoding, mut log) = (decoder.start(None), Log::default());
+    let decoder = LatentDecoder::new(&*MODEL).with_limits(limits());
+    let (mut decoding, log) = (decoder.start(None), Log::default());
     decoding.push(bytes);
     let most = (limits().max_bytes + Limits::OVERHEAD) as usize;
     let thorough = one_in(4, bytes);
     let mut reached: Option<(Exact, Option<Gaussians>)> = None;
     let error = loop {
-        match within(most, || decoding.advance(&mut log)) {
+        match within(most, || decoding.advance(&log)) {
             Ok(Some(level)) => {
                 let header = decoding.header().expect("a level has a header before it");
                 let voxels = header.voxels(level).expect("a level of the stream") as usize;
@@ -182,23 +177,23 @@ fn decoded(bytes: &[u8]) {
                 assert_eq!(exact.octree.level(level).len(), voxels);
                 let latents = MODEL.shape().latents_of(usize::from(level - header.base));
                 assert_eq!(exact.latents.len(), voxels * latents);
-                let seen = thorough.then(|| gaussians(&decoding, &mut log));
+                let seen = thorough.then(|| gaussians(&decoding, &log));
                 reached = Some((exact.clone(), seen.flatten()));
             }
-            Ok(None) => break decoding.finish(&mut log).err(),
+            Ok(None) => break decoding.finish(&log).err(),
             Err(error) => break Some(error),
         }
     };
     let exact = reached.as_ref().map(|(exact, _)| exact);
     assert_eq!(decoding.exact(), exact, "damage reached back");
-    let last = gaussians(&decoding, &mut log);
+    let last = gaussians(&decoding, &log);
     if let (true, Some((_, seen))) = (thorough, &reached) {
         assert_eq!(last, *seen, "damage reached back");
     }
     match error {
         Some(error) => check(&error),
         None if thorough && last.is_some() => {
-            let whole = decoder.decode(bytes, None, &mut log).ok();
+            let whole = decoder.decode(bytes, None, &log).ok();
             assert_eq!(whole, last, "decoding twice gives two results");
         }
         None => (),
@@ -206,7 +201,7 @@ fn decoded(bytes: &[u8]) {
 }
 
 /// The Gaussians of the level reached, if it has any.
-fn gaussians(decoding: &Decoding<&Model>, log: &mut Log) -> Option<Gaussians> {
+fn gaussians(decoding: &LatentDecoding, log: &Log) -> Option<Gaussians> {
     if !decoding.is_drawable() {
         return None;
     }
@@ -257,11 +252,11 @@ fn pieced(bytes: &[u8]) {
         [.., a, b, c, level] => ([*a, *b, *c], [None, Some(2), Some(3)][usize::from(level % 3)]),
         _ => ([1; 3], None),
     };
-    let decoder = Decoder::new(&*MODEL).with_limits(limits());
-    let mut log = Log::default();
+    let decoder = LatentDecoder::new(&*MODEL).with_limits(limits());
+    let log = Log::default();
     let mut whole = decoder.start(level);
     whole.push(bytes);
-    let expected = whole.finish(&mut log).map_err(|error| error.to_string());
+    let expected = whole.finish(&log).map_err(|error| error.to_string());
     let mut pieces = decoder.start(level);
     let mut rest = bytes;
     let mut sizes = sizes.into_iter().cycle();
@@ -271,9 +266,9 @@ fn pieced(bytes: &[u8]) {
             let (piece, after) = rest.split_at(size);
             pieces.push(piece);
             rest = after;
-            while pieces.advance(&mut log)?.is_some() {}
+            while pieces.advance(&log)?.is_some() {}
         }
-        pieces.finish(&mut log)
+        pieces.finish(&log)
     })();
     assert_eq!(result.map_err(|error| error.to_string()), expected);
     assert_eq!(pieces.level(), whole.level());

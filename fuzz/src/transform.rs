@@ -1,9 +1,8 @@
 //! Streams of version 3 from strangers.
 
 use b2p::container::{Colours, Level, Writer};
-use b2p::decoder::{StreamDecoder, StreamDecoding};
 use b2p::gaussians::Gaussians;
-use b2p::log::Log;
+use b2p::{Decoder, Decoding};
 use b2p::{Error, Limits};
 
 use crate::streams::check;
@@ -11,11 +10,7 @@ use crate::{giving_back, one_in, within};
 
 /// So little that a level of it is decoded in a fraction of a millisecond, what its coefficients teach apart.
 pub(crate) fn limits() -> Limits {
-    Limits {
-        max_points: 1 << 8,
-        max_bytes: 16 << 20,
-        ..Limits::default()
-    }
+    Limits::default().with_max_points(1 << 8).with_max_bytes(16 << 20)
 }
 
 /// Writes a level as it was read.
@@ -61,13 +56,13 @@ pub fn transform(bytes: &[u8]) {
 }
 
 fn decoded(bytes: &[u8]) {
-    let decoder = StreamDecoder::new().with_limits(limits());
-    let (mut decoding, mut log) = (decoder.start(None), Log::default());
+    let decoder = Decoder::new().with_limits(limits());
+    let mut decoding = decoder.start();
     decoding.push(bytes);
     let most = (limits().max_bytes + Limits::OVERHEAD) as usize;
     let mut reached = None;
     let error = loop {
-        match within(most, || decoding.advance(&mut log)) {
+        match within(most, || decoding.advance()) {
             Ok(Some(level)) => {
                 let header = decoding.header().expect("a level has a header before it");
                 let voxels = header.voxels(level).expect("a level of the stream") as usize;
@@ -75,7 +70,7 @@ fn decoded(bytes: &[u8]) {
                 assert_eq!((found.0.len(), found.1.len()), (voxels, voxels));
                 reached = Some(found);
             }
-            Ok(None) => break decoding.finish(&mut log).err(),
+            Ok(None) => break decoding.finish().err(),
             Err(error) => break Some(error),
         }
     };
@@ -87,7 +82,7 @@ fn decoded(bytes: &[u8]) {
         }
     }
     if reached.is_some() && one_in(2, bytes) {
-        let gaussians = within(most, || decoding.gaussians(&mut log));
+        let gaussians = within(most, || decoding.gaussians());
         finite(&gaussians.expect("every level is drawn"));
     }
     if one_in(3, bytes) {
@@ -99,17 +94,17 @@ fn decoded(bytes: &[u8]) {
 }
 
 /// The voxels and colours of the level reached.
-fn points(decoding: &StreamDecoding) -> Option<(Vec<u64>, Vec<[u8; 3]>)> {
+fn points(decoding: &Decoding) -> Option<(Vec<u64>, Vec<[u8; 3]>)> {
     let points = decoding.points()?;
     Some((points.voxels.keys().to_vec(), points.colours.to_vec()))
 }
 
 type Found = (Option<(Vec<u64>, Vec<[u8; 3]>)>, Option<Error>);
 
-fn pieced(decoder: &StreamDecoder, bytes: &[u8]) -> Found {
+fn pieced(decoder: &Decoder, bytes: &[u8]) -> Found {
     let sizes = bytes.iter().rev().take(3).map(|size| usize::from(*size) + 1);
     let sizes: Vec<usize> = sizes.collect();
-    let (mut decoding, mut log) = (decoder.start(None), Log::default());
+    let mut decoding = decoder.start();
     let mut rest = bytes;
     let mut sizes = sizes.into_iter().cycle();
     let result = (|| {
@@ -118,9 +113,9 @@ fn pieced(decoder: &StreamDecoder, bytes: &[u8]) -> Found {
             let (piece, after) = rest.split_at(size);
             decoding.push(piece);
             rest = after;
-            while decoding.advance(&mut log)?.is_some() {}
+            while decoding.advance()?.is_some() {}
         }
-        decoding.finish(&mut log)
+        decoding.finish()
     })();
     (points(&decoding), result.err())
 }

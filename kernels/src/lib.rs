@@ -18,6 +18,8 @@ mod map;
 mod memory;
 mod simd;
 mod sparse;
+#[cfg(feature = "startup")]
+mod startup;
 
 pub use ::half::f16;
 #[cfg(feature = "close")]
@@ -30,7 +32,7 @@ pub use close::{
 pub use exact::conv::ExactConv;
 pub use exact::double::add_products;
 pub use exact::requantise::{LIMIT, Requantise};
-pub use exact::{hidden, mixing, smooth};
+pub use exact::{butterflies, coefficients, hidden, mixing, smooth};
 pub use map::{MappedFile, map_file};
 pub use memory::{Zeros, give_back, zeros};
 pub use simd::{Isa, Scalar, Simd, Simd as Instructions, UnknownIsa, Work};
@@ -38,6 +40,8 @@ pub use sparse::children::{copy_row, window};
 pub use sparse::plan::Plan;
 pub use sparse::rows::Output;
 pub use sparse::taps::{ABSENT, Taps};
+#[cfg(feature = "startup")]
+pub use startup::stdout_was_closed;
 
 /// Peak throughput of one core, to judge the kernels by.
 ///

@@ -1,12 +1,10 @@
 //! What decoding needs, known from the header alone: upper bounds as sums of terms.
 
-use std::ops::Deref;
-
 use crate::colour::LevelColours;
 use crate::container::{Header, MAX_TRUNK_VOXELS};
 use crate::error::Result;
-use crate::latents::Decoder;
-use crate::latents::network::{AT_ONCE, Model, RAW};
+use crate::latents::LatentDecoder;
+use crate::latents::network::{AT_ONCE, RAW};
 use crate::memory::{NOTHING, Sizes, Term, total};
 
 /// Bytes of a row of a 3³ kernel map, and of the same arranged for the kernels.
@@ -151,7 +149,7 @@ const SURFELS: Term = Term {
     by: NOTHING,
 };
 
-impl<M: Deref<Target = Model> + Clone> Decoder<M> {
+impl LatentDecoder {
     /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included,
     /// beyond [`Limits::OVERHEAD`](crate::Limits::OVERHEAD) and the model itself.
     ///
@@ -160,6 +158,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// # Errors
     /// [`crate::Error::Usage`] if the stream has no such level.
     pub fn memory(&self, header: &Header, level: u8) -> Result<u64> {
+        header.voxels(level)?;
         let shape = self.model.shape();
         let levels = usize::from(level - header.base) + 1;
         let head = shape.head(levels - 1, self.heads);

@@ -1,11 +1,10 @@
 //! Streams of either version to Gaussians.
 
 use std::borrow::Cow;
-use std::sync::Arc;
 
 use b2p_kernels::Isa;
 
-use super::StreamDecoding;
+use super::Decoding;
 use super::transform::Reached;
 use crate::cancel::Cancel;
 #[cfg(feature = "ply")]
@@ -19,7 +18,7 @@ use crate::gaussians::learned::{HeadsModel, LevelInput, Set};
 use crate::gaussians::surfels::{PerVoxel, surfels};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::Voxels;
-use crate::latents::Decoder;
+use crate::latents::LatentDecoder;
 use crate::latents::network::Model;
 use crate::layers::Precision;
 use crate::limits::Limits;
@@ -29,21 +28,25 @@ use crate::placement::Placement;
 
 /// Decodes streams of either version. Version 3 needs no model; version 2 needs the one that the stream was coded with.
 #[derive(Debug, Clone, Default)]
-pub struct StreamDecoder {
-    pub(super) model: Option<Arc<Model>>,
+pub struct Decoder {
+    pub(super) model: Option<Model>,
     /// Asked for; otherwise the best there are.
     pub(super) heads: Option<HeadSet>,
-    pub(super) heads_model: Option<Arc<HeadsModel>>,
+    pub(super) heads_model: Option<HeadsModel>,
     /// Gaussians a voxel, if asked for.
     per_voxel: Option<usize>,
     precision: Precision,
     isa: Option<Isa>,
     limits: Limits,
     cancel: Cancel,
+    /// The last level, if not the finest that can be drawn.
+    level: Option<u8>,
+    log: Option<Log>,
 }
 
 /// The voxels of a level with their colours.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct Points<'a> {
     /// The voxels.
     pub voxels: &'a Voxels,
@@ -71,14 +74,14 @@ impl Points<'_> {
     }
 }
 
-impl StreamDecoder {
+impl Decoder {
     /// A decoder with default limits and without a model, which makes Gaussians with the best heads there are.
     pub fn new() -> Self {
         Self::default()
     }
 
     /// The same decoder, which decodes streams of version 2 that this model coded.
-    pub fn with_model(mut self, model: Arc<Model>) -> Self {
+    pub fn with_model(mut self, model: Model) -> Self {
         self.model = Some(model);
         self
     }
@@ -91,7 +94,7 @@ impl StreamDecoder {
     }
 
     /// The same decoder, which draws streams of version 3 with the heads of this model.
-    pub fn with_heads_model(mut self, heads: Arc<HeadsModel>) -> Self {
+    pub fn with_heads_model(mut self, heads: HeadsModel) -> Self {
         self.heads_model = Some(heads);
         self
     }
@@ -127,30 +130,43 @@ impl StreamDecoder {
         self
     }
 
-    /// Begins to decode a stream whose bytes are still to come, down to `level`: by default the finest that can be drawn.
-    pub fn start(&self, level: Option<u8>) -> StreamDecoding<'static> {
-        StreamDecoding::new(self.clone(), Goal::Gaussians(level), Cow::Owned(Vec::new()))
+    /// The same decoder, which decodes down to this level; `None` stands for the finest that can be drawn, the default.
+    pub fn with_level(mut self, level: impl Into<Option<u8>>) -> Self {
+        self.level = level.into();
+        self
     }
 
-    /// Decodes a stream to the Gaussians of `level`: by default the finest that can be drawn.
-    ///
-    /// A stream cut exactly after a level is a coarser stream. From one that is cut or damaged elsewhere, a level before the damage
-    /// is decoded only when asked for.
-    ///
-    /// # Errors
-    /// Those of [`StreamDecoding::finish`] and [`StreamDecoding::gaussians`].
-    pub fn decode(&self, bytes: &[u8], level: Option<u8>, log: &mut Log) -> Result<Gaussians> {
-        self.whole(bytes, level, log)?.gaussians(log)
+    /// The same decoder, whose steps `log` collects.
+    pub fn with_log(mut self, log: &Log) -> Self {
+        self.log = Some(log.clone());
+        self
     }
 
-    /// The same, before Gaussians are made: [`StreamDecoding::points`] are there then, if the stream has version 3.
+    /// Begins to decode a stream whose bytes are still to come.
+    pub fn start(&self) -> Decoding<'static> {
+        let goal = Goal::Gaussians(self.level);
+        Decoding::new(self.clone(), goal, Cow::Owned(Vec::new()))
+    }
+
+    /// Decodes a stream to Gaussians.
+    ///
+    /// A stream cut exactly after a level is a coarser stream. From one that is cut or damaged elsewhere, a level before
+    /// the damage is decoded only when [asked for](Decoder::with_level).
     ///
     /// # Errors
-    /// Those of [`StreamDecoding::finish`].
-    pub fn whole<'b>(&self, bytes: &'b [u8], level: Option<u8>, log: &mut Log) -> Result<StreamDecoding<'b>> {
-        let goal = Goal::Gaussians(level);
-        let mut decoding = StreamDecoding::new(self.clone(), goal, Cow::Borrowed(bytes));
-        decoding.finish(log)?;
+    /// Those of [`Decoding::finish`] and [`Decoding::gaussians`].
+    pub fn decode(&self, bytes: &[u8]) -> Result<Gaussians> {
+        self.whole(bytes)?.gaussians()
+    }
+
+    /// Decodes a whole stream, but makes no Gaussians yet. [`Decoding::points`] are the voxels with their colours.
+    ///
+    /// # Errors
+    /// Those of [`Decoding::finish`].
+    pub fn whole<'b>(&self, bytes: &'b [u8]) -> Result<Decoding<'b>> {
+        let goal = Goal::Gaussians(self.level);
+        let mut decoding = Decoding::new(self.clone(), goal, Cow::Borrowed(bytes));
+        decoding.finish()?;
         Ok(decoding)
     }
 
@@ -196,6 +212,7 @@ impl StreamDecoder {
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level, [`Error::ModelMissing`].
+    #[doc(hidden)]
     pub fn memory(&self, header: &Header, level: u8) -> Result<u64> {
         match header.format {
             Format::Learned { .. } => self.learned(header)?.memory(header, level),
@@ -207,11 +224,13 @@ impl StreamDecoder {
     }
 
     /// The model that decodes streams of version 2.
+    #[doc(hidden)]
     pub fn model(&self) -> Option<&Model> {
-        self.model.as_deref()
+        self.model.as_ref()
     }
 
     /// The heads that draw a stream with this header, if it can be drawn.
+    #[doc(hidden)]
     pub fn heads_for(&self, header: &Header) -> HeadSet {
         match header.format {
             Format::Learned { .. } => self.heads.unwrap_or(HeadSet::Best),
@@ -220,12 +239,12 @@ impl StreamDecoder {
     }
 
     /// What decodes a stream of version 2.
-    pub(super) fn learned(&self, header: &Header) -> Result<Decoder<Arc<Model>>> {
+    pub(super) fn learned(&self, header: &Header) -> Result<LatentDecoder> {
         let Some(model) = &self.model else {
             let expected = header.model().unwrap_or_default();
             return Err(Error::ModelMissing { expected });
         };
-        let decoder = Decoder::new(Arc::clone(model))
+        let decoder = LatentDecoder::new(model)
             .with_limits(self.limits.clone())
             .with_cancel(self.cancel.clone());
         decoder.with_heads(learned_heads(self.heads)?)
@@ -288,6 +307,10 @@ impl StreamDecoder {
             Some((model, set)) => model.bytes(set, voxels, above),
             None => super::memory::surfels(voxels, self.surfels_per_voxel(header, level)?.count() as u64),
         })
+    }
+
+    pub(super) fn log(&self) -> Log {
+        self.log.clone().unwrap_or(Log::off())
     }
 
     pub(super) fn isa(&self) -> Isa {

@@ -1,9 +1,8 @@
 //! Streams of either version as they arrive.
 
 use std::borrow::Cow;
-use std::sync::Arc;
 
-use super::stream::{Points, StreamDecoder, learned_heads};
+use super::stream::{Decoder, Points, learned_heads};
 use super::transform::Transform;
 use crate::container::feed::{Goal, failed_before};
 use crate::container::{Header, MAGIC, version};
@@ -11,18 +10,17 @@ use crate::error::{Error, Result};
 use crate::gaussians::HeadSet;
 use crate::gaussians::learned::HeadsModel;
 use crate::gaussians::{Frame, Gaussians};
-use crate::latents::network::Model;
-use crate::latents::{Decoding, nothing_reached};
-use crate::log::Log;
+use crate::geometry::Voxels;
+use crate::latents::{LatentDecoding, nothing_reached};
 
 /// A stream of either version that is decoded level by level as its bytes arrive.
 ///
-/// Bytes are pushed in pieces of any size; [`StreamDecoding::advance`] decodes a level as soon as it is whole, and
-/// [`StreamDecoding::gaussians`] gives those of the level that was reached. After an error what was reached before stays usable, and nothing
+/// Bytes are pushed in pieces of any size; [`Decoding::advance`] decodes a level as soon as it is whole, and
+/// [`Decoding::gaussians`] gives those of the level that was reached. After an error what was reached before stays usable, and nothing
 /// more is decoded.
 #[derive(Debug)]
-pub struct StreamDecoding<'b> {
-    decoder: StreamDecoder,
+pub struct Decoding<'b> {
+    decoder: Decoder,
     goal: Goal,
     state: State<'b>,
 }
@@ -32,15 +30,15 @@ pub struct StreamDecoding<'b> {
 enum State<'b> {
     /// Not its version.
     Start(Cow<'b, [u8]>),
-    Learned(Box<Decoding<'b, Arc<Model>>>),
+    Learned(Box<LatentDecoding<'b>>),
     Transform(Box<Transform<'b>>),
     /// No stream that this decoder decodes.
     Refused,
 }
 
-impl<'b> StreamDecoding<'b> {
-    pub(super) fn new(decoder: StreamDecoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
-        StreamDecoding {
+impl<'b> Decoding<'b> {
+    pub(super) fn new(decoder: Decoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
+        Decoding {
             decoder,
             goal,
             state: State::Start(bytes),
@@ -66,21 +64,21 @@ impl<'b> StreamDecoding<'b> {
     /// - [`Error::DeterminismMismatch`], if all checksums hold but what was decoded is not what was coded;
     /// - [`Error::LimitExceeded`], before anything is reserved; [`Error::Cancelled`];
     /// - [`Error::Usage`] if the stream has no level to end with, or decoding has failed before.
-    pub fn advance(&mut self, log: &mut Log) -> Result<Option<u8>> {
-        self.step(false, log)
+    pub fn advance(&mut self) -> Result<Option<u8>> {
+        self.step(false)
     }
 
     /// Decodes what is left, knowing that no more bytes will come.
     ///
     /// # Errors
-    /// Those of [`StreamDecoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
+    /// Those of [`Decoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
     /// the stream must be whole, or end just where one of its levels ends.
-    pub fn finish(&mut self, log: &mut Log) -> Result<()> {
-        while self.step(true, log)?.is_some() {}
+    pub fn finish(&mut self) -> Result<()> {
+        while self.step(true)?.is_some() {}
         Ok(())
     }
 
-    /// The header, once [`StreamDecoding::advance`] found it whole.
+    /// The header, once [`Decoding::advance`] found it whole.
     pub fn header(&self) -> Option<&Header> {
         match &self.state {
             State::Start(_) | State::Refused => None,
@@ -119,14 +117,14 @@ impl<'b> StreamDecoding<'b> {
     }
 
     /// Draws streams of version 3 with the heads of this model from now on; what has been decoded stays.
-    pub fn set_heads_model(&mut self, heads: Arc<HeadsModel>) {
+    pub fn set_heads_model(&mut self, heads: HeadsModel) {
         if let State::Transform(decoding) = &mut self.state {
-            decoding.decoder.heads_model = Some(Arc::clone(&heads));
+            decoding.decoder.heads_model = Some(heads.clone());
         }
         self.decoder.heads_model = Some(heads);
     }
 
-    /// Whether the level reached has Gaussians: [`StreamDecoding::gaussians`] will not fail with [`Error::Unsupported`].
+    /// Whether the level reached has Gaussians: [`Decoding::gaussians`] will not fail with [`Error::Unsupported`].
     pub fn is_drawable(&self) -> bool {
         match &self.state {
             State::Start(_) | State::Refused => false,
@@ -136,6 +134,16 @@ impl<'b> StreamDecoding<'b> {
                 _ => false,
             },
         }
+    }
+
+    /// The voxels of the level reached, once there is one.
+    pub fn voxels(&self) -> Option<&Voxels> {
+        let octree = match &self.state {
+            State::Start(_) | State::Refused => return None,
+            State::Learned(decoding) => &decoding.exact()?.octree,
+            State::Transform(decoding) => &decoding.reached()?.octree,
+        };
+        Some(octree.level(self.level()?))
     }
 
     /// The voxels of the level reached with their colours, if the stream has version 3.
@@ -159,7 +167,8 @@ impl<'b> StreamDecoding<'b> {
     /// # Errors
     /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`]; [`Error::Cancelled`];
     /// [`Error::Usage`] if no level has been reached.
-    pub fn gaussians(&self, log: &mut Log) -> Result<Gaussians> {
+    pub fn gaussians(&self) -> Result<Gaussians> {
+        let log = &self.decoder.log();
         match &self.state {
             State::Start(_) | State::Refused => Err(nothing_reached()),
             State::Learned(decoding) => decoding.gaussians(log),
@@ -167,7 +176,8 @@ impl<'b> StreamDecoding<'b> {
         }
     }
 
-    fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
+    fn step(&mut self, ended: bool) -> Result<Option<u8>> {
+        let log = &self.decoder.log();
         if let Err(error) = self.open(ended) {
             self.state = State::Refused;
             return Err(error);
@@ -197,7 +207,7 @@ impl<'b> StreamDecoding<'b> {
             };
             let decoder = self.decoder.learned(&header)?;
             let bytes = std::mem::take(bytes);
-            let decoding = Decoding::new(decoder, self.goal, bytes);
+            let decoding = LatentDecoding::new(decoder, self.goal, bytes);
             self.state = State::Learned(Box::new(decoding));
             return Ok(());
         }

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 use b2p_kernels::Isa;
 use xxhash_rust::xxh3::Xxh3Default;
 
-use super::stream::StreamDecoder;
+use super::stream::Decoder;
 use crate::colour::{self, Filter, LevelColours};
 use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
@@ -19,7 +19,7 @@ use crate::log::Log;
 /// A stream of version 3 that is decoded level by level.
 #[derive(Debug)]
 pub(super) struct Transform<'b> {
-    pub decoder: StreamDecoder,
+    pub decoder: Decoder,
     feed: Feed<'b>,
     reached: Option<Reached>,
     ahead: Ahead,
@@ -72,7 +72,7 @@ impl Reached {
 }
 
 impl<'b> Transform<'b> {
-    pub(super) fn new(decoder: StreamDecoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
+    pub(super) fn new(decoder: Decoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
         Transform {
             decoder,
             feed: Feed::new(goal, bytes),
@@ -98,7 +98,7 @@ impl<'b> Transform<'b> {
     }
 
     /// Takes the next step; `ended` tells that all bytes have come.
-    pub(super) fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
+    pub(super) fn step(&mut self, ended: bool, log: &Log) -> Result<Option<u8>> {
         self.feed.check_usable()?;
         let (decoder, level) = (&self.decoder, self.level());
         let plan = |header: &Header, goal| decoder.plan(header, goal);
@@ -114,7 +114,7 @@ impl<'b> Transform<'b> {
     }
 
     /// Decodes a level, all or nothing.
-    fn decode(&mut self, level: u8, log: &mut Log) -> Result<()> {
+    fn decode(&mut self, level: u8, log: &Log) -> Result<()> {
         let Some(header) = self.feed.header() else {
             return Err(nothing_reached());
         };
@@ -166,7 +166,7 @@ impl<'b> Transform<'b> {
     }
 
     /// The Gaussians of the level reached.
-    pub(super) fn gaussians(&self, log: &mut Log) -> Result<Gaussians> {
+    pub(super) fn gaussians(&self, log: &Log) -> Result<Gaussians> {
         let (Some(header), Some(reached)) = (self.header(), &self.reached) else {
             return Err(nothing_reached());
         };
@@ -190,7 +190,7 @@ impl<'b> Transform<'b> {
 
 /// One level, and what it is decoded with.
 struct Growing<'a> {
-    decoder: &'a StreamDecoder,
+    decoder: &'a Decoder,
     header: &'a Header,
     part: &'a Level<'a>,
     colours: &'a Colours<'a>,
@@ -207,7 +207,7 @@ struct Step {
 
 impl Growing<'_> {
     /// Grows `octree` to the level of the part.
-    fn level(&self, octree: &mut Octree, above: Option<&Reached>, ahead: &mut Ahead, log: &mut Log) -> Result<Step> {
+    fn level(&self, octree: &mut Octree, above: Option<&Reached>, ahead: &mut Ahead, log: &Log) -> Result<Step> {
         let level = self.part.level;
         let mut step = match &self.colours.trunk {
             Some(trunk) => Some(self.trunk(octree, trunk, ahead, log)?),
@@ -235,7 +235,7 @@ impl Growing<'_> {
     }
 
     /// The levels that the colour trunk holds.
-    fn trunk(&self, octree: &mut Octree, trunk: &Trunk, ahead: &mut Ahead, log: &mut Log) -> Result<Step> {
+    fn trunk(&self, octree: &mut Octree, trunk: &Trunk, ahead: &mut Ahead, log: &Log) -> Result<Step> {
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
         let (depth, count) = (trunk.level, trunk.slice.voxels as usize);
         let slice = self.header.slice_voxels as usize;
@@ -271,7 +271,7 @@ impl Growing<'_> {
         above_map: &KernelMap,
         above: &LevelColours,
         ahead: &mut Ahead,
-        log: &mut Log,
+        log: &Log,
     ) -> Result<(KernelMap, LevelColours)> {
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
         let header = self.header;

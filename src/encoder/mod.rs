@@ -2,6 +2,7 @@
 //!
 //! Both run the decoder in the loop: what a level is predicted from is what the decoder will have.
 
+mod builder;
 mod colours;
 mod corrections;
 mod skeleton;
@@ -22,6 +23,7 @@ use crate::latents::entropy::{Coding, Rounding};
 use crate::latents::network::{Model, ROLES};
 use crate::limits::Limits;
 use crate::log::Log;
+pub use builder::Encoder;
 pub use corrections::Residual;
 use corrections::{Left, Level, corrections};
 use skeleton::{Coded, Correct, Skeleton};
@@ -61,6 +63,7 @@ impl Default for Options {
 
 /// A finished stream.
 #[derive(Debug, Clone)]
+#[non_exhaustive]
 pub struct Encoded {
     /// The stream.
     pub bytes: Vec<u8>,
@@ -70,6 +73,7 @@ pub struct Encoded {
 
 /// What a level took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Rate {
     /// The octree level.
     pub level: u8,
@@ -87,7 +91,7 @@ pub struct Rate {
 /// [`Error::Usage`] for levels that the cloud or the format does not have, [`Error::Malformed`] for slices that the format does not
 /// have, [`Error::Unsupported`] if the model can only decode; and,
 /// if encoder and decoder disagreed on this machine, whatever the decoder found.
-pub fn encode(cloud: &ColouredVoxels, model: &Model, options: &Options, log: &mut Log) -> Result<Encoded> {
+pub fn encode(cloud: &ColouredVoxels, model: &Model, options: &Options, log: &Log) -> Result<Encoded> {
     let subject = Subject::new(cloud, model, options, log)?;
     let wants = options.residual.precision(options.filter).is_some();
     let coded = subject.code(options.bit_price, wants, log)?;
@@ -114,7 +118,7 @@ struct Subject<'a> {
 }
 
 impl<'a> Subject<'a> {
-    fn new(cloud: &'a ColouredVoxels, model: &'a Model, options: &'a Options, log: &mut Log) -> Result<Self> {
+    fn new(cloud: &'a ColouredVoxels, model: &'a Model, options: &'a Options, log: &Log) -> Result<Self> {
         let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
         let (base, top) = (*levels.start(), *levels.end());
         // Networks have learned to see a level through all those below it, coded or not.
@@ -151,7 +155,7 @@ impl<'a> Subject<'a> {
     }
 
     /// Codes everything but a residual, and keeps, if one is wanted, what it is to be of.
-    fn code(&self, bit_price: f32, residual: bool, log: &mut Log) -> Result<Coded> {
+    fn code(&self, bit_price: f32, residual: bool, log: &Log) -> Result<Coded> {
         let model = self.model;
         let slice = self.options.slice_voxels as usize;
         let mut squeezed = |role: usize, coding: Coding<'_>, context: Option<&[i16]>| {
@@ -192,13 +196,13 @@ impl<'a> Subject<'a> {
     }
 
     /// The stream, once it has been decoded to what was encoded.
-    fn checked(&self, bytes: Vec<u8>, features: &[i16], log: &mut Log) -> Result<Encoded> {
+    fn checked(&self, bytes: Vec<u8>, features: &[i16], log: &Log) -> Result<Encoded> {
         let Skeleton { header, octree, .. } = &self.skeleton;
         let top = header.top;
         let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
             Decoder::new(self.model)
                 .with_limits(Limits::unlimited())
-                .exact(&bytes, top, &mut Log::default())
+                .exact(&bytes, top, &Log::off())
         })?;
         if exact.octree != octree.truncated(top) || exact.features != features {
             return Err(Error::Usage(
@@ -266,7 +270,7 @@ fn pooled(cloud: &ColouredVoxels, level: u8) -> (Voxels, Vec<[f32; 3]>) {
 pub fn with_zero_latents(header: Header, octree: Octree, model: &Model) -> Result<Vec<u8>> {
     let base = header.base;
     let maps = kernel_maps(&octree, base);
-    let log = &mut Log::default();
+    let log = &Log::off();
     let skeleton = Skeleton::new(header, octree, maps, model, log)?;
     let latents = model.shape().latents;
     let mut zero = |role: usize, _: Coding<'_>, _: Option<&[i16]>| {

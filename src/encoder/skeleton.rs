@@ -51,7 +51,7 @@ impl<'m> Skeleton<'m> {
     ///
     /// # Errors
     /// Those of [`Writer::new`].
-    pub fn new(header: Header, octree: Octree, maps: Vec<KernelMap>, model: &'m Model, log: &mut Log) -> Result<Self> {
+    pub fn new(header: Header, octree: Octree, maps: Vec<KernelMap>, model: &'m Model, log: &Log) -> Result<Self> {
         let levels = header.base..=header.top;
         let voxels = levels.clone().map(|level| octree.level(level).len() as u32);
         let header = Header {
@@ -91,12 +91,7 @@ impl<'m> Skeleton<'m> {
     ///
     /// # Errors
     /// Those of [`Latents`] and of [`Correct`].
-    pub fn code(
-        &self,
-        latents: &mut Latents<'_>,
-        mut correct: Option<&mut Correct<'_>>,
-        log: &mut Log,
-    ) -> Result<Coded> {
+    pub fn code(&self, latents: &mut Latents<'_>, mut correct: Option<&mut Correct<'_>>, log: &Log) -> Result<Coded> {
         let (octree, model) = (&self.octree, self.model);
         let (base, slice) = (self.header.base, self.header.slice_voxels as usize);
         let levels = base..=self.header.top;

@@ -37,7 +37,7 @@ pub fn encode_within(
     model: &Model,
     options: &Options,
     bits_per_point: f64,
-    log: &mut Log,
+    log: &Log,
 ) -> Result<(Encoded, Options)> {
     if !(bits_per_point.is_finite() && bits_per_point > 0.0) {
         return Err(Error::Usage(format!(
@@ -62,7 +62,7 @@ pub fn encode_within(
             let known = coded.iter().position(|(price, _)| *price == bit_price);
             let own = known.unwrap_or(coded.len());
             if known.is_none() {
-                let new = subject.code(bit_price, options.filter, &mut Log::default())?;
+                let new = subject.code(bit_price, options.filter, &Log::off())?;
                 coded.push((bit_price, new));
             }
             Ok((own, subject.stream(&coded[own].1, residual)?))

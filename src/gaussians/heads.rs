@@ -54,6 +54,7 @@ impl FromStr for Heads {
 
 /// Method that makes the Gaussians of a level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+#[non_exhaustive]
 pub enum HeadSet {
     /// The accurate learned heads of a model.
     Best,

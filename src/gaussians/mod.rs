@@ -39,6 +39,9 @@ pub struct Gaussians {
     pub frame: Frame,
 }
 
+/// Bit depth of the cube that is fitted to Gaussians without one.
+const FITTED_BITS: u8 = 10;
+
 /// The cube that the Gaussians' coordinates refer to.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Frame {
@@ -63,9 +66,62 @@ impl Frame {
         f64::from(1u32 << (self.bits - 1)) * self.placement.voxel_size
     }
 
-    /// Whether the frame has 1 to 21 bits and a valid placement.
+    /// A cube of 2¹⁰ voxels a side around the central 99 % of the finite `centres`, in world units.
+    pub fn fitted(centres: impl Iterator<Item = [f64; 3]>) -> Self {
+        let mut centres: Vec<[f64; 3]> = centres.filter(|c| c.iter().all(|x| x.is_finite())).collect();
+        if centres.is_empty() {
+            return Frame::default();
+        }
+        let outer = centres.len() / 200;
+        let last = centres.len() - 1 - outer;
+        let mut range = |axis: usize| {
+            let order = |a: &[f64; 3], b: &[f64; 3]| a[axis].total_cmp(&b[axis]);
+            let low = centres.select_nth_unstable_by(outer, order).1[axis];
+            let high = centres.select_nth_unstable_by(last, order).1[axis];
+            (low, high)
+        };
+        let ranges = [range(0), range(1), range(2)];
+        let side = ranges.iter().fold(0.0, |side: f64, (low, high)| side.max(high - low));
+        let cubes = f64::from(1u32 << FITTED_BITS);
+        // All centres coincide, or their extent overflows.
+        let side = if side > 0.0 && side.is_finite() { side } else { cubes };
+        Frame {
+            bits: FITTED_BITS,
+            placement: Placement {
+                origin: ranges.map(|(low, high)| 0.5 * low + 0.5 * high - 0.5 * side),
+                voxel_size: side / cubes,
+            },
+        }
+    }
+
+    /// What files in single precision subtract from world coordinates: zeros, or a round number per axis for a cube so
+    /// far from the origin that single precision does not resolve 1/32 of its voxels.
+    pub fn offset(&self) -> [f64; 3] {
+        let side = 2.0 * self.unit();
+        let farthest = |low: f64| low.abs().max((low + side).abs());
+        let Placement { origin, voxel_size } = self.placement;
+        let far = |low: f64| farthest(low) > 16.0 * side && farthest(low) * f64::from(f32::EPSILON) > voxel_size / 32.0;
+        if !origin.iter().any(|&low| far(low)) {
+            return [0.0; 3];
+        }
+        let digits = side.log10().floor();
+        let power = 10f64.powf(digits.abs());
+        origin.map(|low| match (far(low), digits < 0.0) {
+            (false, _) => 0.0,
+            (true, true) => ((low + side / 2.0) * power).round() / power,
+            (true, false) => ((low + side / 2.0) / power).round() * power,
+        })
+    }
+
+    /// Whether the frame has 1 to 21 bits and a valid placement, and its corners and voxels can be told in single
+    /// precision, as files of Gaussians do.
     pub fn is_valid(&self) -> bool {
-        (1..=21).contains(&self.bits) && self.placement.is_valid()
+        let Placement { origin, voxel_size } = self.placement;
+        let single = |x: f64| (x as f32).is_finite();
+        (1..=21).contains(&self.bits)
+            && self.placement.is_valid()
+            && (voxel_size as f32).is_normal()
+            && origin.iter().all(|x| single(*x) && single(x + 2.0 * self.unit()))
     }
 }
 
@@ -78,6 +134,7 @@ impl Gaussians {
     /// Minimum variance that the renderer adds to every projected Gaussian, in px²: 0.3, with which 3D Gaussian
     /// Splatting is trained, or 1/16 for Gaussians with a [`blur`](Gaussians::blur). The blur closes surfaces at any
     /// distance; another 0.3 px² would enlarge silhouettes, and more so for objects that are small in the picture.
+    #[doc(hidden)]
     pub fn pixel_blur(&self) -> f32 {
         if self.own_blur() > 0.0 { 1.0 / 16.0 } else { 0.3 }
     }

@@ -3,11 +3,12 @@
 //! Per Gaussian, as `float`: `x y z` in world units; `f_dc_0..2`, with colour = ½ + 0.2820948·f_dc; `opacity`, the
 //! logit; `scale_0..2`, the natural logarithms of the standard deviations in world units; `rot_0..3`, the quaternion w,
 //! x, y, z. Logits and logarithms must be finite: the writer clamps opacities to [10⁻⁶, 1 − 10⁻⁶] and deviations to at
-//! least 10⁻³⁸. Comments hold the cube, so that the reader restores the frame. Positions are single precision: at an
-//! origin a million voxels away they resolve a sixteenth of a voxel.
+//! least 10⁻³⁸. Comments hold the cube, so that the reader restores the frame. Positions are single precision, which does
+//! not resolve the voxels of a cube far from the origin: [`Frame::offset`] is subtracted from them, and written as a
+//! comment, too.
 //!
-//! View-dependent colour (`f_rest_*`) is read but not written, since decoded Gaussians have none. The comment
-//! `SplatRenderMode: mip` marks Gaussians that were trained for rendering with opacity compensation.
+//! View-dependent colour is `f_rest_*`. The comment `SplatRenderMode: mip` marks Gaussians that were trained for
+//! rendering with opacity compensation.
 //!
 //! The reader accepts files of other programs: any number types, byte order and order of properties.
 
@@ -37,8 +38,6 @@ const PROPERTIES: [&str; 14] = [
 const MIP: [&str; 2] = ["mip", "antialiased"];
 /// Rows per write.
 const BLOCK: usize = 1024;
-/// Bit depth of the cube that is fitted to a file without one.
-const FITTED_BITS: u8 = 10;
 
 /// Properties of a file that the reader ignored or had to guess.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -83,7 +82,6 @@ impl Gaussians {
     /// [`Error::Io`] if `to` fails; [`Error::Usage`] if the arrays differ in length or the frame is invalid.
     pub fn write_ply<W: Write + ?Sized>(&self, to: &mut W, path: &Path) -> Result<()> {
         self.check_lengths()?;
-        let Frame { bits, placement } = self.frame;
         if !self.frame.is_valid() {
             return Err(Error::Usage(format!("{:?} is no cube", self.frame)));
         }
@@ -91,39 +89,42 @@ impl Gaussians {
             path: path.to_owned(),
             source,
         };
-        let [x, y, z] = placement.origin;
-        let blur = match self.blur > 0.0 {
-            true => format!("comment b2p blur {}\n", self.blur),
-            false => String::new(),
-        };
         let mut header = format!(
-            "ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: default\n\
-             comment b2p bits {bits}\ncomment b2p origin {x} {y} {z}\n\
-             comment b2p voxel_size {}\n{blur}element vertex {}\n",
-            placement.voxel_size,
+            "ply\nformat binary_little_endian 1.0\n{}element vertex {}\n",
+            comments(self, self.blur),
             self.len()
         );
         for name in PROPERTIES {
             header += &format!("property float {name}\n");
         }
+        let rest = self.harmonics.count;
+        for i in 0..3 * rest {
+            header += &format!("property float f_rest_{i}\n");
+        }
         header += "end_header\n";
         to.write_all(header.as_bytes()).map_err(io)?;
 
-        let mut bytes = Vec::with_capacity(BLOCK * size_of::<[f32; 14]>());
+        let offset = self.frame.offset();
+        let mut bytes = Vec::with_capacity(BLOCK * (PROPERTIES.len() + 3 * rest) * size_of::<f32>());
         for first in (0..self.len()).step_by(BLOCK) {
             bytes.clear();
             for i in first..self.len().min(first + BLOCK) {
-                bytes.extend(self.row(i).into_iter().flat_map(f32::to_le_bytes));
+                bytes.extend(self.row(i, offset).into_iter().flat_map(f32::to_le_bytes));
+                let coefficients = &self.harmonics.coefficients[i * rest..][..rest];
+                for channel in 0..3 {
+                    bytes.extend(coefficients.iter().flat_map(|c| c[channel].to_le_bytes()));
+                }
             }
             to.write_all(&bytes).map_err(io)?;
         }
         Ok(())
     }
 
-    /// The values of Gaussian `i` in the order of [`PROPERTIES`].
-    fn row(&self, i: usize) -> [f32; 14] {
+    /// The values of Gaussian `i` in the order of [`PROPERTIES`], its place less `offset`.
+    fn row(&self, i: usize, offset: [f64; 3]) -> [f32; 14] {
         let unit = self.frame.unit();
-        let [x, y, z] = self.frame.placement.from_cube(self.frame.bits, self.position[i]);
+        let world = self.frame.placement.from_cube(self.frame.bits, self.position[i]);
+        let [x, y, z] = std::array::from_fn(|k| world[k] - offset[k]);
         let [r, g, b] = self.colour[i].map(|c| (f64::from(c) - 0.5) / HARMONIC);
         let opacity = f64::from(self.opacity[i]).clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
         let opacity = (opacity / (1.0 - opacity)).ln();
@@ -145,6 +146,61 @@ impl Gaussians {
     }
 }
 
+/// The comments of a file of these Gaussians that this crate understands, each a line of the header: render mode, cube,
+/// `blur` if there is any, and what was subtracted from all coordinates.
+pub fn comments(gaussians: &Gaussians, blur: f32) -> String {
+    let Frame { bits, placement } = gaussians.frame;
+    let [x, y, z] = placement.origin;
+    let mode = if gaussians.compensated { MIP[0] } else { "default" };
+    let mut lines = format!(
+        "comment SplatRenderMode: {mode}\ncomment b2p bits {bits}\ncomment b2p origin {x} {y} {z}\n\
+         comment b2p voxel_size {}\n",
+        placement.voxel_size
+    );
+    if blur > 0.0 {
+        lines += &format!("comment b2p blur {blur}\n");
+    }
+    let [x, y, z] = gaussians.frame.offset();
+    if [x, y, z] != [0.0; 3] {
+        lines += &format!("comment b2p offset {x} {y} {z}\n");
+    }
+    lines
+}
+
+/// What the comments of a file's header say: see [`comments`].
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Comments {
+    /// The cube.
+    pub frame: Option<Frame>,
+    /// The blur, or 0.
+    pub blur: f32,
+    /// What was subtracted from all coordinates.
+    pub offset: [f64; 3],
+    /// Trained for rendering with opacity compensation.
+    pub compensated: bool,
+    /// The render mode, if it is neither the default nor that.
+    pub ignored_mode: Option<String>,
+}
+
+impl Comments {
+    /// Reads a header. Comments are free text: those that do not parse are ignored.
+    pub fn of(header: &Header) -> Self {
+        let mode = render_mode(header);
+        let compensated = mode.as_deref().is_some_and(|mode| MIP.contains(&mode));
+        let frame = named_frame(header);
+        let offset = words(header, "offset")
+            .and_then(three)
+            .filter(|o| o.iter().all(|x| x.is_finite()));
+        Comments {
+            blur: if frame.is_some() { blur(header) } else { 0.0 },
+            frame,
+            offset: offset.unwrap_or_default(),
+            compensated,
+            ignored_mode: mode.filter(|_| !compensated),
+        }
+    }
+}
+
 /// Reads Gaussians from a whole PLY file in memory.
 ///
 /// Values that are not finite are kept: the projection drops and counts such Gaussians. The projection also normalises
@@ -156,15 +212,14 @@ impl Gaussians {
 pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
     let ply = Ply::open(bytes)?;
     let has = |name: &str| ply.element("vertex").is_some_and(|vertex| vertex.has(name));
-    let mode = render_mode(&ply.header);
-    let compensated = mode.as_deref().is_some_and(|mode| MIP.contains(&mode));
+    let told = Comments::of(&ply.header);
     let rest = ply.element("vertex").map_or(0, |vertex| {
         let names = vertex.properties.iter().map(|p| &p.name);
         names.filter(|name| name.starts_with("f_rest_")).count()
     });
     let whole = [9, 24, 45].contains(&rest) && (0..rest).all(|i| has(&format!("f_rest_{i}")));
     let mut notes = Notes {
-        ignored_mode: mode.filter(|_| !compensated),
+        ignored_mode: told.ignored_mode,
         ignored_harmonics: if whole { 0 } else { rest },
         flat: !has("scale_2") && has("scale_1"),
         fitted: false,
@@ -182,11 +237,11 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
     let scale = columns.split_off(7);
     let opacity = columns.split_off(6);
     let colour = columns.split_off(3);
-    let centre = |i: usize| -> [f64; 3] { std::array::from_fn(|k| columns[k].get(i)) };
+    let centre = |i: usize| -> [f64; 3] { std::array::from_fn(|k| columns[k].get(i) + told.offset[k]) };
 
-    let frame = named_frame(&ply.header).unwrap_or_else(|| {
+    let frame = told.frame.unwrap_or_else(|| {
         notes.fitted = true;
-        fitted_frame((0..count).map(centre))
+        Frame::fitted((0..count).map(centre))
     });
     let unit = frame.unit();
     let deviation = |i: usize, k: usize| {
@@ -205,9 +260,9 @@ pub fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Notes)> {
         Harmonics::default()
     };
     let gaussians = Gaussians {
-        blur: if notes.fitted { 0.0 } else { blur(&ply.header) },
+        blur: told.blur,
         harmonics,
-        compensated,
+        compensated: told.compensated,
         position: (0..count)
             .into_par_iter()
             .map(|i| frame.placement.to_cube(frame.bits, centre(i)))
@@ -272,6 +327,12 @@ fn words<'a>(header: &'a Header, key: &str) -> Option<std::str::SplitAsciiWhites
     })
 }
 
+/// The first three numbers.
+fn three(words: std::str::SplitAsciiWhitespace) -> Option<[f64; 3]> {
+    let mut numbers = words.map(|word| word.parse().ok());
+    Some([numbers.next()??, numbers.next()??, numbers.next()??])
+}
+
 /// The blur in the comments, in cube-frame units squared, or 0.
 fn blur(header: &Header) -> f32 {
     let blur = words(header, "blur").and_then(|mut words| words.next()?.parse().ok());
@@ -281,43 +342,14 @@ fn blur(header: &Header) -> f32 {
 /// The cube in the comments. Comments are free text: those that do not parse are ignored.
 fn named_frame(header: &Header) -> Option<Frame> {
     let words = |key: &str| words(header, key);
-    let mut origin = words("origin")?.map(|word| word.parse().ok());
     let frame = Frame {
         bits: words("bits")?.next()?.parse().ok()?,
         placement: Placement {
-            origin: [origin.next()??, origin.next()??, origin.next()??],
+            origin: three(words("origin")?)?,
             voxel_size: words("voxel_size")?.next()?.parse().ok()?,
         },
     };
     frame.is_valid().then_some(frame)
-}
-
-/// A cube around the central 99 % of the finite centres.
-fn fitted_frame(centres: impl Iterator<Item = [f64; 3]>) -> Frame {
-    let mut centres: Vec<[f64; 3]> = centres.filter(|c| c.iter().all(|x| x.is_finite())).collect();
-    if centres.is_empty() {
-        return Frame::default();
-    }
-    let outer = centres.len() / 200;
-    let last = centres.len() - 1 - outer;
-    let mut range = |axis: usize| {
-        let order = |a: &[f64; 3], b: &[f64; 3]| a[axis].total_cmp(&b[axis]);
-        let low = centres.select_nth_unstable_by(outer, order).1[axis];
-        let high = centres.select_nth_unstable_by(last, order).1[axis];
-        (low, high)
-    };
-    let ranges = [range(0), range(1), range(2)];
-    let side = ranges.iter().fold(0.0, |side: f64, (low, high)| side.max(high - low));
-    let cubes = f64::from(1u32 << FITTED_BITS);
-    // All centres coincide, or their extent overflows.
-    let side = if side > 0.0 && side.is_finite() { side } else { cubes };
-    Frame {
-        bits: FITTED_BITS,
-        placement: Placement {
-            origin: ranges.map(|(low, high)| 0.5 * low + 0.5 * high - 0.5 * side),
-            voxel_size: side / cubes,
-        },
-    }
 }
 
 #[cfg(test)]

@@ -1,9 +1,8 @@
 //! Decoding streams of version 2.
 
 use std::borrow::Cow;
-use std::ops::Deref;
 
-use super::Decoding;
+use super::LatentDecoding;
 use super::network::Model;
 use crate::cancel::Cancel;
 use crate::container::Header;
@@ -14,10 +13,10 @@ use crate::geometry::Octree;
 use crate::limits::Limits;
 use crate::log::Log;
 
-/// Decodes streams with one model: `M` is a `&Model`, or an `Arc<Model>` for decoders that outlive the place they were made in.
+/// Decodes streams with one model.
 #[derive(Debug, Clone)]
-pub struct Decoder<M> {
-    pub(crate) model: M,
+pub struct LatentDecoder {
+    pub(crate) model: Model,
     pub(crate) heads: Heads,
     pub(crate) limits: Limits,
     pub(super) cancel: Cancel,
@@ -34,11 +33,11 @@ pub struct Exact {
     pub features: Vec<i16>,
 }
 
-impl<M: Deref<Target = Model> + Clone> Decoder<M> {
+impl LatentDecoder {
     /// A decoder with default limits and the model's best heads.
-    pub fn new(model: M) -> Self {
-        Decoder {
-            model,
+    pub fn new(model: &Model) -> Self {
+        LatentDecoder {
+            model: model.clone(),
             heads: Heads::Best,
             limits: Limits::default(),
             cancel: Cancel::default(),
@@ -78,8 +77,8 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
 
     /// Begins to decode a stream whose bytes are still to come, down to `level`: by default the finest that the stream has and the
     /// model has a head for.
-    pub fn start(&self, level: Option<u8>) -> Decoding<'static, M> {
-        Decoding::new(self.clone(), Goal::Gaussians(level), Cow::Owned(Vec::new()))
+    pub fn start(&self, level: Option<u8>) -> LatentDecoding<'static> {
+        LatentDecoding::new(self.clone(), Goal::Gaussians(level), Cow::Owned(Vec::new()))
     }
 
     /// Decodes a stream to the Gaussians of `level`: by default the finest that the stream has and the model has a head for.
@@ -88,10 +87,10 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// is decoded only when asked for.
     ///
     /// # Errors
-    /// Those of [`Decoding::finish`] and [`Decoding::gaussians`].
-    pub fn decode(&self, bytes: &[u8], level: Option<u8>, log: &mut Log) -> Result<Gaussians> {
+    /// Those of [`LatentDecoding::finish`] and [`LatentDecoding::gaussians`].
+    pub fn decode(&self, bytes: &[u8], level: Option<u8>, log: &Log) -> Result<Gaussians> {
         let goal = Goal::Gaussians(level);
-        let mut decoding = Decoding::new(self.clone(), goal, Cow::Borrowed(bytes));
+        let mut decoding = LatentDecoding::new(self.clone(), goal, Cow::Borrowed(bytes));
         decoding.finish(log)?;
         decoding.gaussians(log)
     }
@@ -99,10 +98,10 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
     /// Decodes a stream's exact zone down to `level`, which need not have a head.
     ///
     /// # Errors
-    /// Those of [`Decoding::finish`].
-    pub fn exact(&self, bytes: &[u8], level: u8, log: &mut Log) -> Result<Exact> {
+    /// Those of [`LatentDecoding::finish`].
+    pub fn exact(&self, bytes: &[u8], level: u8, log: &Log) -> Result<Exact> {
         let goal = Goal::Exact(level);
-        let mut decoding = Decoding::new(self.clone(), goal, Cow::Borrowed(bytes));
+        let mut decoding = LatentDecoding::new(self.clone(), goal, Cow::Borrowed(bytes));
         decoding.finish(log)?;
         decoding.into_exact()
     }

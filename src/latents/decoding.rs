@@ -1,10 +1,9 @@
 //! One stream on its way to Gaussians.
 
 use std::borrow::Cow;
-use std::ops::Deref;
 use std::sync::{Mutex, PoisonError};
 
-use super::{Decoder, Exact};
+use super::{Exact, LatentDecoder};
 use crate::container::feed::{Feed, Goal};
 use crate::container::{Header, Level};
 use crate::error::{Error, Result};
@@ -12,31 +11,31 @@ use crate::gaussians::Heads;
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::latents::entropy::{Condition, decode_level, decode_passes, expect_no_latents, latent_hash};
-use crate::latents::network::{Model, Module};
+use crate::latents::network::Module;
 use crate::latents::{ColourFilter, ColourResidual, Surroundings, activate};
 use crate::layers::Pool;
 use crate::log::Log;
 
 /// A stream that is decoded level by level as its bytes arrive.
 ///
-/// Bytes are pushed in pieces of any size; [`Decoding::advance`] decodes a level as soon as it is whole, and [`Decoding::gaussians`]
+/// Bytes are pushed in pieces of any size; [`LatentDecoding::advance`] decodes a level as soon as it is whole, and [`LatentDecoding::gaussians`]
 /// gives those of the level that was reached. After an error what was reached before stays usable, and nothing more is decoded.
 ///
 /// ```
 /// # #[cfg(feature = "embedded")]
 /// # fn main() -> b2p::Result<()> {
-/// use b2p::{latents::Decoder, log::Log, latents::network::Model};
+/// use b2p::{Log, Model, latents::LatentDecoder};
 ///
 /// let model = Model::from_bytes(b2p::embedded::MODEL)?;
-/// let (mut decoding, mut log) = (Decoder::new(&model).start(Some(8)), Log::default());
+/// let (mut decoding, log) = (LatentDecoder::new(&model).start(Some(8)), Log::new());
 /// for packet in b2p::embedded::SAMPLE.chunks(1400) {
 ///     decoding.push(packet);
-///     while let Some(level) = decoding.advance(&mut log)? {
+///     while let Some(level) = decoding.advance(&log)? {
 ///         println!("level {level} is there");
 ///     }
 /// }
-/// decoding.finish(&mut log)?;
-/// let gaussians = decoding.gaussians(&mut log)?;
+/// decoding.finish(&log)?;
+/// let gaussians = decoding.gaussians(&log)?;
 /// # assert!(gaussians.len() > 0);
 /// # Ok(())
 /// # }
@@ -44,8 +43,8 @@ use crate::log::Log;
 /// # fn main() {}
 /// ```
 #[derive(Debug)]
-pub struct Decoding<'b, M> {
-    decoder: Decoder<M>,
+pub struct LatentDecoding<'b> {
+    decoder: LatentDecoder,
     feed: Feed<'b>,
     reached: Option<Reached>,
     /// Between two steps, what the last has left.
@@ -66,9 +65,9 @@ struct Reached {
     residual: Option<ColourResidual>,
 }
 
-impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
-    pub(crate) fn new(decoder: Decoder<M>, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
-        Decoding {
+impl<'b> LatentDecoding<'b> {
+    pub(crate) fn new(decoder: LatentDecoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
+        LatentDecoding {
             decoder,
             feed: Feed::new(goal, bytes),
             reached: None,
@@ -89,21 +88,21 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
     /// - [`Error::ModelMismatch`]; [`Error::DeterminismMismatch`], if all checksums hold but the latents are not those that were coded;
     /// - [`Error::LimitExceeded`], before anything is reserved; [`Error::Cancelled`];
     /// - [`Error::Usage`] if the stream has no level to end with, or decoding has failed before.
-    pub fn advance(&mut self, log: &mut Log) -> Result<Option<u8>> {
+    pub fn advance(&mut self, log: &Log) -> Result<Option<u8>> {
         self.step(false, log)
     }
 
     /// Decodes what is left, knowing that no more bytes will come.
     ///
     /// # Errors
-    /// Those of [`Decoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
+    /// Those of [`LatentDecoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
     /// the stream must be whole, or end just where one of its levels ends.
-    pub fn finish(&mut self, log: &mut Log) -> Result<()> {
+    pub fn finish(&mut self, log: &Log) -> Result<()> {
         while self.step(true, log)?.is_some() {}
         Ok(())
     }
 
-    /// The header, once [`Decoding::advance`] found it whole.
+    /// The header, once [`LatentDecoding::advance`] found it whole.
     pub fn header(&self) -> Option<&Header> {
         self.feed.header()
     }
@@ -122,7 +121,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
         Ok(())
     }
 
-    /// Whether the level reached has Gaussians: [`Decoding::gaussians`] will not fail with [`Error::Unsupported`].
+    /// Whether the level reached has Gaussians: [`LatentDecoding::gaussians`] will not fail with [`Error::Unsupported`].
     pub fn is_drawable(&self) -> bool {
         let level = self.level();
         self.header()
@@ -143,7 +142,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
     /// # Errors
     /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`]; [`Error::Cancelled`];
     /// [`Error::Usage`] if no level has been reached.
-    pub fn gaussians(&self, log: &mut Log) -> Result<Gaussians> {
+    pub fn gaussians(&self, log: &Log) -> Result<Gaussians> {
         let (Some(header), Some(reached)) = (self.header(), &self.reached) else {
             return Err(nothing_reached());
         };
@@ -201,7 +200,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
     }
 
     /// Takes the next step; `ended` tells that all bytes have come.
-    pub(crate) fn step(&mut self, ended: bool, log: &mut Log) -> Result<Option<u8>> {
+    pub(crate) fn step(&mut self, ended: bool, log: &Log) -> Result<Option<u8>> {
         self.feed.check_usable()?;
         let (decoder, level) = (&self.decoder, self.level());
         let plan = |header: &Header, goal| decoder.plan(header, goal);
@@ -217,7 +216,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
     }
 
     /// Decodes a level, all or nothing.
-    fn decode(&mut self, level: u8, log: &mut Log) -> Result<()> {
+    fn decode(&mut self, level: u8, log: &Log) -> Result<()> {
         let Some(header) = self.feed.header() else {
             return Err(nothing_reached());
         };
@@ -266,7 +265,7 @@ impl<'b, M: Deref<Target = Model> + Clone> Decoding<'b, M> {
 }
 
 /// What a level says that its colours are still off.
-fn residual(header: &Header, level: &Level, octree: &Octree, log: &mut Log) -> Result<Option<ColourResidual>> {
+fn residual(header: &Header, level: &Level, octree: &Octree, log: &Log) -> Result<Option<ColourResidual>> {
     if level.residual.is_empty() {
         return Ok(None);
     }
@@ -281,7 +280,7 @@ pub(crate) fn nothing_reached() -> Error {
     Error::Usage("no level has been decoded yet".into())
 }
 
-impl<M: Deref<Target = Model> + Clone> Decoder<M> {
+impl LatentDecoder {
     /// The last level to decode of a stream with this header, if that is possible and allowed.
     fn plan(&self, header: &Header, goal: Goal) -> Result<u8> {
         header.check_model(&self.model.id())?;
@@ -306,7 +305,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         level: &Level,
         octree: &mut Octree,
         above: Option<&Reached>,
-        log: &mut Log,
+        log: &Log,
     ) -> Result<(Vec<i16>, Vec<i16>, KernelMap)> {
         let (n, count) = (level.level, level.voxels as usize);
         let (role, slice) = (usize::from(n - header.base), header.slice_voxels as usize);
@@ -358,7 +357,7 @@ impl<M: Deref<Target = Model> + Clone> Decoder<M> {
         context: Option<&[i16]>,
         octree: &Octree,
         map: &KernelMap,
-        log: &mut Log,
+        log: &Log,
     ) -> Result<Vec<i16>> {
         let (n, count) = (level.level, level.voxels as usize);
         let (role, slice) = (usize::from(n - header.base), header.slice_voxels as usize);

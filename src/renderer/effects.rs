@@ -16,6 +16,7 @@ pub const MOST_SAMPLES: u32 = 32;
 
 /// Whether an effect is on.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Choice {
     /// Where the scene calls for it.
     #[default]
@@ -28,6 +29,7 @@ pub enum Choice {
 
 /// The effects that can be forced.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Effect {
     /// Colour that depends on the direction of view.
     Harmonics,
@@ -42,12 +44,13 @@ pub enum Effect {
     /// sensible image in the plane, and its centre may be behind. Called for where there are such Gaussians.
     Near,
     /// In each pixel, splats are blended in the order of their depths there, not in that of their centres, as far as the
-    /// [`b2p_kernels::splat::WAITING`] nearest of them tell. Called for by nothing: Gaussians are made for the order of their centres.
+    /// eight nearest of them tell. Called for by nothing: Gaussians are made for the order of their centres.
     Order,
 }
 
 /// The caller's choice for each effect.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Effects {
     /// [`Effect::Harmonics`].
     pub harmonics: Choice,
@@ -63,6 +66,7 @@ pub struct Effects {
 
 /// Which effects a picture is drawn with. What is off is not in the loops.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct EffectSet {
     /// [`Effect::Harmonics`].
     pub harmonics: bool,
@@ -88,6 +92,19 @@ impl Default for EffectSet {
     }
 }
 
+impl EffectSet {
+    /// Whether the picture is drawn with this effect.
+    pub fn is_on(&self, effect: Effect) -> bool {
+        match effect {
+            Effect::Harmonics => self.harmonics,
+            Effect::Antialias => self.antialias,
+            Effect::Supersample => self.supersample > 1,
+            Effect::Near => self.near,
+            Effect::Order => self.order,
+        }
+    }
+}
+
 /// Something that changes how a picture is drawn, whether it does, and why.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Explanation {
@@ -100,7 +117,14 @@ pub struct Explanation {
 }
 
 impl Effects {
+    /// The same choices with another one for `effect`.
+    pub fn with(mut self, effect: Effect, choice: Choice) -> Self {
+        self.set(effect, choice);
+        self
+    }
+
     /// Sets one.
+    #[doc(hidden)]
     pub fn set(&mut self, effect: Effect, choice: Choice) {
         match effect {
             Effect::Harmonics => self.harmonics = choice,

@@ -1,9 +1,7 @@
 //! From Gaussians and a camera to a picture.
 //!
 //! ```
-//! use b2p::gaussians::Gaussians;
-//! use b2p::renderer::{Background, render};
-//! use b2p::renderer::camera::Camera;
+//! use b2p::{Camera, Gaussians, Renderer};
 //!
 //! let mut gaussians = Gaussians::default();
 //! gaussians.position.push([0.0; 3]);
@@ -12,8 +10,7 @@
 //! gaussians.opacity.push(1.0);
 //! gaussians.colour.push([1.0, 0.0, 0.0]);
 //! let camera = Camera::orbit(0.0, 0.0, 3.0, 45.0, 64, 48)?;
-//! let (image, stats) = render(&gaussians, &camera, Background::WHITE, &Default::default())?;
-//! assert_eq!(stats.visible, 1);
+//! let image = Renderer::new().render(&gaussians, &camera)?;
 //! assert!(image.pixel(32, 24)[1] < 0.1 && image.pixel(0, 0) == [1.0; 4]);
 //! # Ok::<(), b2p::Error>(())
 //! ```
@@ -57,11 +54,19 @@ use canvas::{Canvas, Colours, Contents, Desk, Indices, Mixed, Output};
 
 /// What is seen where the Gaussians let light through.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum Background {
     /// Nothing: the picture keeps its transparency.
     Transparent,
     /// A colour, red, green and blue in `[0, 1]`: the picture is opaque.
     Colour([f32; 3]),
+}
+
+impl Default for Background {
+    /// White.
+    fn default() -> Self {
+        Background::WHITE
+    }
 }
 
 impl Background {
@@ -82,6 +87,7 @@ impl Background {
 /// How much of splats may be left out. A splat is looked at in all the blocks of 4×4 pixels where its α may reach a floor; what is
 /// left out adds up where many tails overlap, as beside the silhouette of a crowd.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[non_exhaustive]
 pub enum Quality {
     /// A floor of 1/255, as is usual: beside silhouettes, pictures are off by several steps of eight bits, and by many where splats are
     /// far smaller than pixels.
@@ -136,6 +142,7 @@ impl std::str::FromStr for Quality {
 
 /// What a picture took.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Stats {
     /// Gaussians drawn.
     pub visible: u64,
@@ -157,6 +164,7 @@ pub struct Stats {
 ///
 /// The last two run as one, tile by tile: their time is divided in proportion to what the threads spent on each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Times {
     /// From Gaussians to ellipses, and before that to the colours of the view, if that is called for.
     pub project: Duration,
@@ -175,12 +183,33 @@ impl Times {
     }
 }
 
-/// Draws pictures one after the other, reusing its memory.
+/// Draws pictures of Gaussians, one after the other, and reuses its memory.
+///
+/// The order of splats is that of their depths along the viewing direction, one order for the whole picture. For one
+/// instruction set, pictures are equal to the bit for any number of threads. Work runs in the rayon pool of the caller.
+///
+/// ```
+/// use b2p::{Camera, Gaussians, Renderer};
+///
+/// let mut gaussians = Gaussians::default();
+/// gaussians.position.push([0.0; 3]);
+/// gaussians.scale.push([0.1; 3]);
+/// gaussians.rotation.push([1.0, 0.0, 0.0, 0.0]);
+/// gaussians.opacity.push(1.0);
+/// gaussians.colour.push([1.0, 0.0, 0.0]);
+/// let camera = Camera::orbit(0.0, 0.0, 3.0, 45.0, 64, 48)?;
+/// let image = Renderer::new().render(&gaussians, &camera)?;
+/// assert!(image.pixel(32, 24)[1] < 0.1 && image.pixel(0, 0) == [1.0; 4]);
+/// # Ok::<(), b2p::Error>(())
+/// ```
 #[derive(Debug)]
 pub struct Renderer {
     isa: Isa,
     quality: Quality,
     effects: Effects,
+    background: Background,
+    channel: Channel,
+    limits: Limits,
     shades: Vec<[f32; 3]>,
     ellipses: Ellipses,
     counts: Vec<Count>,
@@ -191,7 +220,7 @@ pub struct Renderer {
 
 impl Default for Renderer {
     fn default() -> Self {
-        Renderer::new(Isa::detect())
+        Renderer::new()
     }
 }
 
@@ -199,22 +228,30 @@ impl Default for Renderer {
 ///
 /// # Errors
 /// As [`Renderer::render`].
+#[doc(hidden)]
 pub fn render(
     gaussians: &Gaussians,
     camera: &Camera,
     background: Background,
     limits: &Limits,
 ) -> Result<(Image, Stats)> {
-    Renderer::default().render(gaussians, camera, background, limits)
+    let mut renderer = Renderer::new().with_background(background).with_limits(limits.clone());
+    let mut image = Image::default();
+    let stats = renderer.render_into(gaussians, camera, &mut image)?;
+    Ok((image, stats))
 }
 
 impl Renderer {
-    /// With the instructions of `isa`; [`Renderer::default`] takes the best that the machine has.
-    pub fn new(isa: Isa) -> Self {
+    /// A renderer of colours on white, with default quality, effects and limits, and the best instruction set of the
+    /// machine.
+    pub fn new() -> Self {
         Renderer {
-            isa,
+            isa: Isa::detect(),
             quality: Quality::default(),
             effects: Effects::default(),
+            background: Background::default(),
+            channel: Channel::default(),
+            limits: Limits::default(),
             shades: Vec::new(),
             ellipses: Ellipses::default(),
             counts: Vec::new(),
@@ -223,52 +260,92 @@ impl Renderer {
         }
     }
 
-    /// How much may be left out from now on.
+    /// The same renderer with kernels of this instruction set.
+    pub fn with_isa(mut self, isa: Isa) -> Self {
+        self.isa = isa;
+        self
+    }
+
+    /// The same renderer on another background.
+    pub fn with_background(mut self, background: Background) -> Self {
+        self.background = background;
+        self
+    }
+
+    /// The same renderer of another channel: depth or normals in place of colours.
+    pub fn with_channel(mut self, channel: Channel) -> Self {
+        self.channel = channel;
+        self
+    }
+
+    /// The same renderer with another quality.
+    pub fn with_quality(mut self, quality: Quality) -> Self {
+        self.quality = quality;
+        self
+    }
+
+    /// The same renderer with effects forced on or off.
+    pub fn with_effects(mut self, effects: Effects) -> Self {
+        self.effects = effects;
+        self
+    }
+
+    /// The same renderer under other limits.
+    pub fn with_limits(mut self, limits: Limits) -> Self {
+        self.limits = limits;
+        self
+    }
+
+    /// Sets the quality of the pictures that follow.
+    #[doc(hidden)]
     pub fn set_quality(&mut self, quality: Quality) {
         self.quality = quality;
     }
 
-    /// Forces effects on or off from now on.
+    /// Forces effects on or off in the pictures that follow.
+    #[doc(hidden)]
     pub fn set_effects(&mut self, effects: Effects) {
         self.effects = effects;
     }
 
-    /// One picture.
+    /// Draws a picture.
     ///
     /// # Errors
     /// As [`Renderer::render_into`].
-    pub fn render(
-        &mut self,
-        gaussians: &Gaussians,
-        camera: &Camera,
-        background: Background,
-        limits: &Limits,
-    ) -> Result<(Image, Stats)> {
+    pub fn render(&mut self, gaussians: &Gaussians, camera: &Camera) -> Result<Image> {
         let mut image = Image::default();
-        let stats = self.render_into(gaussians, camera, background, limits, &mut image)?;
-        Ok((image, stats))
+        self.render_into(gaussians, camera, &mut image)?;
+        Ok(image)
     }
 
-    /// One picture into `image`, whose size becomes the camera's. Its memory is reused, and after an error it holds nothing sensible.
+    /// Draws a picture into `image`, whose size becomes the camera's, and returns counts and times. The memory of
+    /// `image` is reused. After an error its content is unspecified.
     ///
     /// # Errors
     /// [`crate::Error::Usage`] if the camera is none, the background is not finite, or the arrays of `gaussians` differ in length;
-    /// [`crate::Error::LimitExceeded`] if the picture or the memory to draw it is over the `limits`.
-    pub fn render_into(
-        &mut self,
-        gaussians: &Gaussians,
-        camera: &Camera,
-        background: Background,
-        limits: &Limits,
-        image: &mut Image,
-    ) -> Result<Stats> {
-        self.draw_into(gaussians, camera, Channel::Colour, background, limits, image)
+    /// [`crate::Error::LimitExceeded`] if the picture, the memory or the work to draw it is over the `limits`;
+    /// [`crate::Error::OutOfMemory`].
+    pub fn render_into(&mut self, gaussians: &Gaussians, camera: &Camera, image: &mut Image) -> Result<Stats> {
+        let (channel, background) = (self.channel, self.background);
+        let limits = self.limits.clone();
+        self.draw_into(gaussians, camera, channel, background, &limits, image)
     }
 
-    /// As [`Renderer::render_into`], of any channel.
+    /// Finds which Gaussian each pixel shows most of: one sample per pixel, whatever the effects.
     ///
     /// # Errors
     /// As [`Renderer::render_into`].
+    pub fn ids(&mut self, gaussians: &Gaussians, camera: &Camera) -> Result<Ids> {
+        let (mut ids, limits) = (Ids::default(), self.limits.clone());
+        self.ids_into(gaussians, camera, &limits, &mut ids)?;
+        Ok(ids)
+    }
+
+    /// As [`Renderer::render_into`], with channel, background and limits given one by one.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_into`].
+    #[doc(hidden)]
     pub fn draw_into(
         &mut self,
         gaussians: &Gaussians,
@@ -289,6 +366,7 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render_into`].
+    #[doc(hidden)]
     pub fn ids_into(
         &mut self,
         gaussians: &Gaussians,
@@ -307,6 +385,7 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render_into`].
+    #[doc(hidden)]
     pub fn mix_into<const N: usize>(
         &mut self,
         gaussians: &Gaussians,
@@ -338,7 +417,10 @@ impl Renderer {
         if pixels.capacity() < plan.pixels {
             // What is outgrown goes first, and zeros come as tiles are drawn, from the threads that draw them.
             *pixels = Vec::new();
-            *pixels = bytemuck::zeroed_vec(plan.pixels);
+            *pixels = bytemuck::try_zeroed_vec(plan.pixels).map_err(|()| crate::Error::OutOfMemory {
+                what: "the pixels of the picture",
+                bytes: (plan.pixels * size_of::<O::Pixel>()) as u64,
+            })?;
         }
         pixels.resize(plan.pixels, bytemuck::Zeroable::zeroed());
         let canvas = Canvas {
@@ -347,7 +429,7 @@ impl Renderer {
             shrink: plan.effects.supersample,
             background: wanted.background,
         };
-        self.draw_parts(&plan, &canvas, output, pixels, &mut times, &mut laps);
+        self.draw_parts(&plan, &canvas, output, pixels, &mut times, &mut laps)?;
         let samples = u64::from(plan.effects.supersample).pow(2);
         Ok(Stats {
             touched: self.take_touched() / samples,
@@ -448,7 +530,7 @@ impl Renderer {
         pixels: &mut [O::Pixel],
         times: &mut Times,
         laps: &mut Laps,
-    ) {
+    ) -> Result<()> {
         self.desks.resize_with(rayon::current_num_threads(), Mutex::default);
         let what = O::LOOP.unwrap_or(match (plan.effects.order, plan.effects.near) {
             (true, _) => Loop::Order,
@@ -457,7 +539,7 @@ impl Renderer {
         });
         let mut part = self.bins.next(None);
         while let Some(now) = part {
-            self.bins.fill(now.clone(), &self.ellipses, &mut self.counts);
+            self.bins.fill(now.clone(), &self.ellipses, &mut self.counts)?;
             times.bin += laps.lap();
             let [sorting, blending] = self.draw_part(&now, canvas, self.quality.floor(), what, output, pixels);
             let drawn = laps.lap();
@@ -466,6 +548,7 @@ impl Renderer {
             times.blend += drawn.mul_f64(1.0 - share);
             part = self.bins.next(Some(&now));
         }
+        Ok(())
     }
 
     /// Blocks that all threads have touched since this was asked last.

@@ -11,6 +11,7 @@ const BLOCK: usize = 4096;
 
 /// What a picture shows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Channel {
     /// Colours.
     #[default]

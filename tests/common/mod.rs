@@ -99,7 +99,7 @@ pub fn small_stream(model: &Model) -> Vec<u8> {
         ..Options::default()
     };
     let cloud = Ball::new(4, 4.5).cloud();
-    let encoded = encode(&cloud, model, &options, &mut Log::default());
+    let encoded = encode(&cloud, model, &options, &Log::default());
     encoded.expect("a ball can be coded").bytes
 }
 

@@ -2,7 +2,7 @@
 
 use b2p::gaussians::Gaussians;
 use b2p::latents::network::Model;
-use b2p::latents::{Decoder, Decoding, Exact};
+use b2p::latents::{Exact, LatentDecoder, LatentDecoding};
 use b2p::log::Log;
 use b2p::{Error, Result};
 use sha2::{Digest, Sha256};
@@ -38,7 +38,7 @@ pub fn gaussians_hash(g: &Gaussians) -> String {
     hash(floats.flat_map(|x| x.to_le_bytes()))
 }
 
-fn reached(decoding: &Decoding<&Model>, log: &mut Log) -> Result<String> {
+fn reached(decoding: &LatentDecoding, log: &Log) -> Result<String> {
     let gaussians = match decoding.gaussians(log) {
         Err(Error::Unsupported { .. }) => None,
         gaussians => Some(gaussians?),
@@ -54,12 +54,12 @@ pub type Levels = std::result::Result<Vec<String>, String>;
 /// The digests of all levels, each decoded on its own from the whole stream.
 pub fn whole(model: &Model, bytes: &[u8]) -> Levels {
     let header = b2p::container::Header::parse(bytes, &Default::default()).map_err(told)?;
-    let decoder = Decoder::new(model);
+    let decoder = LatentDecoder::new(model);
     let drawable = decoder.levels(bytes).map_err(told)?;
     let of = |n: u8| {
-        let exact = decoder.exact(bytes, n, &mut Log::default())?;
+        let exact = decoder.exact(bytes, n, &Log::default())?;
         let gaussians = match drawable.contains(&n) {
-            true => Some(decoder.decode(bytes, Some(n), &mut Log::default())?),
+            true => Some(decoder.decode(bytes, Some(n), &Log::default())?),
             false => None,
         };
         Ok(level(n, &exact, gaussians.as_ref()))
@@ -69,15 +69,15 @@ pub fn whole(model: &Model, bytes: &[u8]) -> Levels {
 
 /// The same, each as it becomes whole while the stream comes in pieces.
 pub fn in_pieces(model: &Model, bytes: &[u8]) -> Levels {
-    let (mut decoding, mut log) = (Decoder::new(model).start(None), Log::default());
+    let (mut decoding, log) = (LatentDecoder::new(model).start(None), Log::default());
     let mut levels = Vec::new();
     for piece in bytes.chunks(61) {
         decoding.push(piece);
-        while decoding.advance(&mut log).map_err(told)?.is_some() {
-            levels.push(reached(&decoding, &mut log).map_err(told)?);
+        while decoding.advance(&log).map_err(told)?.is_some() {
+            levels.push(reached(&decoding, &log).map_err(told)?);
         }
     }
-    decoding.finish(&mut log).map_err(told)?;
+    decoding.finish(&log).map_err(told)?;
     Ok(levels)
 }
 

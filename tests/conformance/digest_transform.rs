@@ -2,28 +2,27 @@
 
 use b2p::Error;
 use b2p::container::Header;
-use b2p::decoder::{StreamDecoder, StreamDecoding};
-use b2p::log::Log;
+use b2p::{Decoder, Decoding};
 
 use crate::digest::{Levels, gaussians_hash, hash};
 
 /// The digest of the level reached.
-fn reached(decoding: &StreamDecoding, log: &mut Log) -> b2p::Result<String> {
+fn reached(decoding: &Decoding) -> b2p::Result<String> {
     let points = decoding.points().expect("a level has been reached");
     let (level, keys) = (points.voxels.depth(), points.voxels.keys());
     Ok(format!(
         "{level}={},{},{}",
         hash(keys.iter().flat_map(|key| key.to_le_bytes())),
         hash(points.colours.iter().flatten().copied()),
-        gaussians_hash(&decoding.gaussians(log)?),
+        gaussians_hash(&decoding.gaussians()?),
     ))
 }
 
 /// The digests of all levels, each decoded on its own from the whole stream.
-pub fn whole(decoder: &StreamDecoder, bytes: &[u8]) -> Levels {
+pub fn whole(decoder: &Decoder, bytes: &[u8]) -> Levels {
     let of = |level: u8| {
-        let log = &mut Log::default();
-        reached(&decoder.whole(bytes, Some(level), log)?, log)
+        let decoder = decoder.clone().with_level(level);
+        reached(&decoder.whole(bytes)?)
     };
     let header = Header::parse(bytes, &Default::default());
     let levels = header.and_then(|header| (header.base..=header.top).map(of).collect());
@@ -31,17 +30,17 @@ pub fn whole(decoder: &StreamDecoder, bytes: &[u8]) -> Levels {
 }
 
 /// The same, each as it becomes whole while the stream comes in pieces.
-pub fn in_pieces(decoder: &StreamDecoder, bytes: &[u8]) -> Levels {
-    let (mut decoding, mut log) = (decoder.start(None), Log::default());
+pub fn in_pieces(decoder: &Decoder, bytes: &[u8]) -> Levels {
+    let mut decoding = decoder.start();
     let mut decode = || {
         let mut levels = Vec::new();
         for piece in bytes.chunks(61) {
             decoding.push(piece);
-            while decoding.advance(&mut log)?.is_some() {
-                levels.push(reached(&decoding, &mut log)?);
+            while decoding.advance()?.is_some() {
+                levels.push(reached(&decoding)?);
             }
         }
-        decoding.finish(&mut log)?;
+        decoding.finish()?;
         Ok(levels)
     };
     decode().map_err(|error: Error| error.to_string())

@@ -27,7 +27,7 @@ mod transform;
 use std::path::{Path, PathBuf};
 
 use b2p::Isa;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::layers::Precision;
 use b2p::log::Log;
@@ -127,7 +127,7 @@ fn gaussians_in_half_are_near_those_in_f16_on_machines_that_sum_in_f16() {
     let bytes = stream("lite-encoded-sphere");
     let colours = |isa, precision| -> b2p::Result<Vec<f32>> {
         let model = model("lite").with_isa(isa).with_precision(precision)?;
-        let gaussians = Decoder::new(&model).decode(&bytes, None, &mut Log::default())?;
+        let gaussians = LatentDecoder::new(&model).decode(&bytes, None, &Log::default())?;
         Ok(gaussians.colour.as_flattened().to_vec())
     };
     let floats = colours(Isa::SCALAR, Precision::F16).expect("f16 is everywhere");

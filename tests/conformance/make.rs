@@ -356,7 +356,7 @@ pub fn cases() -> Vec<Case> {
                 bit_price: 0.0,
                 ..Options::default()
             };
-            encode(&cloud, m, &options, &mut Log::default())
+            encode(&cloud, m, &options, &Log::default())
                 .expect("the model encodes")
                 .bytes
         };

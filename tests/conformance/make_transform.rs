@@ -18,7 +18,7 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
             colour_slice: slice,
             ..Options::default()
         };
-        let encoded = encode(cloud, &options, &mut Log::default());
+        let encoded = encode(cloud, &options, &Log::default());
         encoded.expect("a small cloud is coded").bytes
     };
     let (step, lossless) = (Fineness::Step, Fineness::Lossless);

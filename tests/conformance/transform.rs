@@ -5,8 +5,8 @@
 
 use std::path::PathBuf;
 
+use b2p::Decoder;
 use b2p::Isa;
-use b2p::decoder::StreamDecoder;
 use b2p::gaussians::HeadSet;
 
 use crate::digest_transform::{in_pieces, whole};
@@ -26,7 +26,7 @@ fn every_stream_of_version_3_decodes_to_its_digests_with_every_instruction_set_a
     assert!(text.lines().count() >= 8);
     let pools = pools();
     for isa in Isa::available() {
-        let decoder = StreamDecoder::new().with_isa(isa).with_heads(HeadSet::Surfels);
+        let decoder = Decoder::new().with_isa(isa).with_heads(HeadSet::Surfels);
         for line in text.lines() {
             let mut words = line.split(' ').map(str::to_owned);
             let name = words.next().expect("a name");

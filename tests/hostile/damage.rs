@@ -1,7 +1,7 @@
 //! Every way to cut a small stream, and every way to change one bit or to lose one byte of it.
 
 use b2p::latents::network::Model;
-use b2p::latents::{Decoder, Exact};
+use b2p::latents::{Exact, LatentDecoder};
 use b2p::log::Log;
 use rayon::prelude::*;
 
@@ -10,14 +10,14 @@ use crate::{decoded, ends, model};
 
 /// The exact zone of every level that can be had of a stream, and the error that ended it.
 fn levels(model: &Model, bytes: &[u8]) -> (Vec<Exact>, Option<String>) {
-    let mut decoding = Decoder::new(model).start(None);
-    let (mut levels, mut log) = (Vec::new(), Log::default());
+    let mut decoding = LatentDecoder::new(model).start(None);
+    let (mut levels, log) = (Vec::new(), Log::default());
     decoding.push(bytes);
     loop {
-        match decoding.advance(&mut log) {
+        match decoding.advance(&log) {
             Ok(Some(_)) => levels.extend(decoding.exact().cloned()),
             Ok(None) => {
-                return (levels, decoding.finish(&mut log).err().map(|e| e.to_string()));
+                return (levels, decoding.finish(&log).err().map(|e| e.to_string()));
             }
             Err(error) => return (levels, Some(error.to_string())),
         }

@@ -2,7 +2,7 @@
 
 use std::iter::repeat;
 
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::log::Log;
 use b2p::{Cancel, Error, Limits};
 
@@ -69,18 +69,18 @@ fn what_was_reached_before_the_damage_stays_usable() {
     let coarser = decoded(&model, &bytes, Some(2)).unwrap();
     let last = bytes.len() - 1;
     bytes[last] ^= 1;
-    let (mut decoding, mut log) = (Decoder::new(&model).start(None), Log::default());
+    let (mut decoding, log) = (LatentDecoder::new(&model).start(None), Log::default());
     decoding.push(&bytes);
     assert!(!decoding.is_drawable());
-    assert_eq!(decoding.advance(&mut log).unwrap(), Some(1));
-    assert!(matches!(decoding.gaussians(&mut log), Err(Error::Unsupported { .. })));
-    assert_eq!(decoding.advance(&mut log).unwrap(), Some(2));
-    let error = decoding.advance(&mut log).unwrap_err();
+    assert_eq!(decoding.advance(&log).unwrap(), Some(1));
+    assert!(matches!(decoding.gaussians(&log), Err(Error::Unsupported { .. })));
+    assert_eq!(decoding.advance(&log).unwrap(), Some(2));
+    let error = decoding.advance(&log).unwrap_err();
     assert!(matches!(error, Error::ChecksumMismatch { .. }), "{error}");
     assert_eq!((decoding.level(), decoding.is_drawable()), (Some(2), true));
-    assert_eq!(decoding.gaussians(&mut log).unwrap(), coarser);
+    assert_eq!(decoding.gaussians(&log).unwrap(), coarser);
     assert_eq!(decoding.exact().unwrap().octree.depth(), 2);
-    assert!(matches!(decoding.finish(&mut log), Err(Error::Usage(_))));
+    assert!(matches!(decoding.finish(&log), Err(Error::Usage(_))));
 }
 
 #[test]
@@ -89,9 +89,9 @@ fn a_longer_prefix_never_loses_points() {
     let bytes = small_stream(&model);
     let mut before = 0;
     for length in 0..=bytes.len() {
-        let (mut decoding, mut log) = (Decoder::new(&model).start(None), Log::default());
+        let (mut decoding, log) = (LatentDecoder::new(&model).start(None), Log::default());
         decoding.push(&bytes[..length]);
-        while decoding.advance(&mut log).unwrap().is_some() {}
+        while decoding.advance(&log).unwrap().is_some() {}
         let points = decoding
             .exact()
             .map_or(0, |exact| exact.octree.level(exact.octree.depth()).len());
@@ -105,14 +105,11 @@ fn a_longer_prefix_never_loses_points() {
 fn limits_are_held_against_the_header_before_anything_else_comes() {
     let model = model();
     let bytes = small_stream(&model);
-    let limits = Limits {
-        max_bytes: 1 << 12,
-        ..Limits::default()
-    };
-    let decoder = Decoder::new(&model).with_limits(limits);
+    let limits = Limits::default().with_max_bytes(1 << 12);
+    let decoder = LatentDecoder::new(&model).with_limits(limits);
     let mut decoding = decoder.start(None);
     decoding.push(&bytes[..124]);
-    let error = decoding.advance(&mut Log::default()).unwrap_err();
+    let error = decoding.advance(&Log::default()).unwrap_err();
     assert!(matches!(error, Error::LimitExceeded { .. }), "{error}");
 }
 
@@ -121,22 +118,22 @@ fn a_thrown_switch_stops_decoding_and_leaves_what_was_reached() {
     let model = model();
     let bytes = small_stream(&model);
     let cancel = Cancel::default();
-    let decoder = Decoder::new(&model).with_cancel(cancel.clone());
+    let decoder = LatentDecoder::new(&model).with_cancel(cancel.clone());
     for step in ["geometry", "probabilities", "features"] {
         let cancel = Cancel::default();
         let decoder = decoder.clone().with_cancel(cancel.clone());
-        let listener = |name: &str| {
+        let listener = move |name: &str| {
             if name == format!("{step} of level 3") {
                 cancel.cancel();
             }
         };
-        let mut log = Log::with_listener(&listener);
+        let log = Log::with_listener(listener);
         let mut decoding = decoder.start(None);
         decoding.push(&bytes);
-        let stopped = decoding.finish(&mut log);
+        let stopped = decoding.finish(&log);
         // Nothing follows the last level's features but the Gaussians.
         let stopped = match step {
-            "features" => stopped.and_then(|()| decoding.gaussians(&mut log).map(|_| ())),
+            "features" => stopped.and_then(|()| decoding.gaussians(&log).map(|_| ())),
             _ => {
                 assert_eq!(decoding.level(), Some(2));
                 stopped
@@ -145,6 +142,6 @@ fn a_thrown_switch_stops_decoding_and_leaves_what_was_reached() {
         assert!(matches!(stopped, Err(Error::Cancelled)), "{step}: {stopped:?}");
     }
     cancel.cancel();
-    let stopped = decoder.decode(&bytes, None, &mut Log::default());
+    let stopped = decoder.decode(&bytes, None, &Log::default());
     assert!(matches!(stopped, Err(Error::Cancelled)));
 }

@@ -11,7 +11,7 @@ mod stack;
 mod transform;
 
 use b2p::gaussians::Gaussians;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::log::Log;
 
@@ -21,8 +21,8 @@ fn model() -> Model {
 
 /// The Gaussians, or the error in all its detail.
 fn decoded(model: &Model, bytes: &[u8], level: Option<u8>) -> Result<Gaussians, String> {
-    Decoder::new(model)
-        .decode(bytes, level, &mut Log::default())
+    LatentDecoder::new(model)
+        .decode(bytes, level, &Log::default())
         .map_err(|error| format!("{error:?}"))
 }
 
@@ -33,8 +33,8 @@ fn pushed(
     level: Option<u8>,
     sizes: impl IntoIterator<Item = usize>,
 ) -> (Vec<(u8, usize)>, Result<Gaussians, String>) {
-    let mut decoding = Decoder::new(model).start(level);
-    let (mut levels, mut log) = (Vec::new(), Log::default());
+    let mut decoding = LatentDecoder::new(model).start(level);
+    let (mut levels, log) = (Vec::new(), Log::default());
     let mut sizes = sizes.into_iter();
     let mut at = 0;
     let result = (|| {
@@ -42,12 +42,12 @@ fn pushed(
             let size = sizes.next().unwrap_or(usize::MAX).min(bytes.len() - at);
             decoding.push(&bytes[at..at + size]);
             at += size;
-            while let Some(level) = decoding.advance(&mut log)? {
+            while let Some(level) = decoding.advance(&log)? {
                 levels.push((level, at));
             }
         }
-        decoding.finish(&mut log)?;
-        decoding.gaussians(&mut log)
+        decoding.finish(&log)?;
+        decoding.gaussians(&log)
     })();
     (levels, result.map_err(|error| format!("{error:?}")))
 }

@@ -30,7 +30,7 @@ fn the_deepest_octree_and_the_widest_level_are_decoded_on_small_stacks() {
         Ball::new(7, 50.0).cloud(),
     ];
     for cloud in clouds {
-        let encoded = encode(&cloud, &model, &Options::default(), &mut Log::default());
+        let encoded = encode(&cloud, &model, &Options::default(), &Log::default());
         let bytes = encoded.expect("the cloud can be coded").bytes;
         let of = |bytes: &[u8]| decoded(&model, bytes, None);
         let expected = of(&bytes);

@@ -3,9 +3,9 @@
 use std::iter::repeat;
 
 use b2p::container::Header;
-use b2p::decoder::{StreamDecoder, StreamDecoding};
 use b2p::encoder::transform::{Options, encode};
 use b2p::log::Log;
+use b2p::{Decoder, Decoding};
 use b2p::{Error, Limits};
 use rayon::prelude::*;
 
@@ -25,11 +25,11 @@ fn stream() -> Vec<u8> {
         ..Options::default()
     };
     let cloud = Ball::new(5, 9.5).cloud();
-    let encoded = encode(&cloud, &options, &mut Log::default());
+    let encoded = encode(&cloud, &options, &Log::default());
     encoded.expect("a ball can be coded").bytes
 }
 
-fn found(decoding: &StreamDecoding) -> Option<Found> {
+fn found(decoding: &Decoding) -> Option<Found> {
     let points = decoding.points()?;
     Some((points.voxels.keys().to_vec(), points.colours.to_vec()))
 }
@@ -40,16 +40,16 @@ fn pushed(
     level: Option<u8>,
     sizes: impl IntoIterator<Item = usize>,
 ) -> (Vec<(Found, usize)>, Option<String>) {
-    let mut decoding = StreamDecoder::new().start(level);
-    let (mut levels, mut log) = (Vec::new(), Log::default());
+    let mut decoding = Decoder::new().with_level(level).start();
+    let mut levels = Vec::new();
     let (mut sizes, mut at) = (sizes.into_iter(), 0);
     let result = (|| {
         loop {
-            while decoding.advance(&mut log)?.is_some() {
+            while decoding.advance()?.is_some() {
                 levels.extend(found(&decoding).map(|found| (found, at)));
             }
             if at == bytes.len() {
-                return decoding.finish(&mut log);
+                return decoding.finish();
             }
             let size = sizes.next().unwrap_or(usize::MAX).min(bytes.len() - at);
             decoding.push(&bytes[at..at + size]);
@@ -167,24 +167,15 @@ fn limits_are_held_against_the_header_before_anything_else_comes() {
     let bytes = stream();
     let header = Header::parse(&bytes, &Limits::default()).unwrap();
     for limits in [
-        Limits {
-            max_bytes: 1 << 12,
-            ..Limits::default()
-        },
-        Limits {
-            max_points: 20,
-            ..Limits::default()
-        },
-        Limits {
-            max_depth: 3,
-            ..Limits::default()
-        },
+        Limits::default().with_max_bytes(1 << 12),
+        Limits::default().with_max_points(20),
+        Limits::default().with_max_depth(3),
     ] {
-        let mut decoding = StreamDecoder::new().with_limits(limits).start(None);
+        let mut decoding = Decoder::new().with_limits(limits).start();
         decoding.push(&bytes[..header.bytes()]);
-        let error = decoding.advance(&mut Log::default()).unwrap_err();
+        let error = decoding.advance().unwrap_err();
         assert!(matches!(error, Error::LimitExceeded { .. }), "{error}");
-        let again = decoding.advance(&mut Log::default()).unwrap_err();
+        let again = decoding.advance().unwrap_err();
         assert!(matches!(again, Error::Usage(_)), "{again}");
     }
 }
@@ -193,18 +184,17 @@ fn limits_are_held_against_the_header_before_anything_else_comes() {
 fn what_was_reached_before_the_damage_stays_usable() {
     let mut bytes = stream();
     let (end, last) = (ends(&bytes)[1].1, bytes.len() - 1);
-    let decoder = StreamDecoder::new();
-    let mut log = Log::default();
-    let coarser = decoder.decode(&bytes[..end], None, &mut log).unwrap();
+    let decoder = Decoder::new();
+    let coarser = decoder.decode(&bytes[..end]).unwrap();
     bytes[last] ^= 1;
-    let mut decoding = decoder.start(None);
+    let mut decoding = decoder.start();
     decoding.push(&bytes);
     assert!(!decoding.is_drawable());
-    assert_eq!(decoding.advance(&mut log).unwrap(), Some(2));
-    assert_eq!(decoding.advance(&mut log).unwrap(), Some(3));
-    let error = decoding.advance(&mut log).unwrap_err();
+    assert_eq!(decoding.advance().unwrap(), Some(2));
+    assert_eq!(decoding.advance().unwrap(), Some(3));
+    let error = decoding.advance().unwrap_err();
     assert!(matches!(error, Error::ChecksumMismatch { .. }), "{error}");
     assert_eq!((decoding.level(), decoding.is_drawable()), (Some(3), true));
-    assert_eq!(decoding.gaussians(&mut log).unwrap(), coarser);
-    assert!(matches!(decoding.finish(&mut log), Err(Error::Usage(_))));
+    assert_eq!(decoding.gaussians().unwrap(), coarser);
+    assert!(matches!(decoding.finish(), Err(Error::Usage(_))));
 }

@@ -24,7 +24,7 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-use b2p::decoder::StreamDecoder;
+use b2p::Decoder;
 use b2p::gaussians::HeadSet;
 
 type Result<T = ()> = std::result::Result<T, Box<dyn Error>>;
@@ -87,7 +87,7 @@ fn conformance() -> Result {
 /// Writes the streams and digests of version 3, in place of all that are there.
 fn conformance_transform() -> Result {
     let folder = suite().join("version-3");
-    let decoder = StreamDecoder::new().with_heads(HeadSet::Surfels);
+    let decoder = Decoder::new().with_heads(HeadSet::Surfels);
     let (mut text, mut streams) = (String::new(), Vec::new());
     for (name, bytes, _) in make_transform::cases() {
         let levels = digest_transform::whole(&decoder, &bytes).map_err(|error| format!("{name}: {error}"))?;
@@ -120,6 +120,7 @@ fn sample() -> Result {
             "b2p",
             "--",
             "encode",
+            "--force",
             &cloud,
             "-o",
             &stream,

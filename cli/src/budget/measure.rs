@@ -181,9 +181,9 @@ fn exact_times(subject: &Subject<'_>, stream: &[u8], finest: u8) -> Result<Vec<[
         let model = (subject.model)()?;
         let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
         cold(|| {
-            let mut log = Log::default();
-            decoder.exact(stream, finest, &mut log)?;
-            Ok(log.steps().to_vec())
+            let log = Log::default();
+            decoder.exact(stream, finest, &log)?;
+            Ok(log.steps())
         })
     })?;
     let levels = (header.base..=finest).zip(&header.voxels);
@@ -215,12 +215,12 @@ struct Made {
 }
 
 /// These levels of a stream whose first is `base`, and the octree down to the last.
-fn decode_levels(decoder: &Decoder<&Model>, stream: &[u8], base: u8, levels: &[u8]) -> Result<(Vec<Level>, Octree)> {
+fn decode_levels(decoder: &Decoder, stream: &[u8], base: u8, levels: &[u8]) -> Result<(Vec<Level>, Octree)> {
     let frame = decoder.frame(stream)?;
     let mut decoding = decoder.start(levels.last().copied());
     decoding.push(stream);
     let (mut all, mut octree) = (Vec::new(), Octree::root());
-    while let Some(level) = decoding.advance(&mut Log::default())? {
+    while let Some(level) = decoding.advance(&Log::default())? {
         let Some(exact) = decoding.exact().filter(|_| levels.contains(&level)) else {
             continue;
         };
@@ -320,8 +320,6 @@ fn camera(side: u32) -> Result<Camera> {
 
 /// A picture by a new renderer.
 fn picture(limits: &Limits, model: &Model, gaussians: &Gaussians, quality: Quality, side: u32) -> Result<Image> {
-    let mut renderer = Renderer::new(model.isa());
-    renderer.set_quality(quality);
-    let (image, _) = renderer.render(gaussians, &camera(side)?, Background::WHITE, limits)?;
-    Ok(image)
+    let renderer = Renderer::new().with_isa(model.isa()).with_limits(limits.clone());
+    renderer.with_quality(quality).render(gaussians, &camera(side)?)
 }

@@ -49,7 +49,7 @@ impl<S: Bf16Vectors> Microkernel for Pairs<S> {
     }
 
     #[inline(always)]
-    fn mul_add(self, sum: S::F32, weight: S::I32, factor: S::I32) -> S::F32 {
+    fn add_product(self, sum: S::F32, weight: S::I32, factor: S::I32) -> S::F32 {
         S::dot_bf16(self.0, sum, weight, factor)
     }
 }

@@ -47,7 +47,7 @@ impl<S: Simd> Microkernel for Float<S> {
     }
 
     #[inline(always)]
-    fn mul_add(self, sum: S::F32, weight: S::F32, factor: S::F32) -> S::F32 {
+    fn add_product(self, sum: S::F32, weight: S::F32, factor: S::F32) -> S::F32 {
         weight.mul_add(factor, sum)
     }
 }

@@ -47,7 +47,7 @@ impl<S: Simd> Microkernel for Pairs<S> {
     }
 
     #[inline(always)]
-    fn mul_add(self, sum: S::I32, weight: S::I16, factor: S::I16) -> S::I32 {
+    fn add_product(self, sum: S::I32, weight: S::I16, factor: S::I16) -> S::I32 {
         sum.dot_pairs(weight, factor)
     }
 }

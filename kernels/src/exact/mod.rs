@@ -5,6 +5,8 @@
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod amx;
+pub mod butterflies;
+pub mod coefficients;
 pub(crate) mod conv;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod digits;

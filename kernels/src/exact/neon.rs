@@ -47,7 +47,7 @@ methods! { with_neon Pairs: Microkernel {
         [vaddq_s32(a[0], b[0]), vaddq_s32(a[1], b[1])]
     }
 
-    fn mul_add(self, sum: [int32x4_t; 2], weight: int16x8x2_t, factor: int16x4_t) -> [int32x4_t; 2] {
+    fn add_product(self, sum: [int32x4_t; 2], weight: int16x8x2_t, factor: int16x4_t) -> [int32x4_t; 2] {
         let low = vmlal_lane_s16::<0>(sum[0], vget_low_s16(weight.0), factor);
         let high = vmlal_high_lane_s16::<0>(sum[1], weight.0, factor);
         [

@@ -51,11 +51,15 @@ pub(crate) mod vector;
 pub(crate) use dispatch::{dispatch, match_level};
 pub use isa::{Isa, UnknownIsa};
 pub(crate) use isa::{Level, define_level};
-pub(crate) use macros::{four, three};
+pub(crate) use macros::four;
+#[cfg(feature = "close")]
+pub(crate) use macros::three;
 pub(crate) use prefetch::prefetch;
 pub use scalar::Scalar;
 #[cfg(all(test, feature = "close"))]
 pub(crate) use vector::F16_MAX;
 #[cfg(feature = "close")]
 pub(crate) use vector::LEAST_EXPONENT;
-pub use vector::{F32Vector, F64Vector, I16Vector, I32Vector, MaskVector, Simd, Work};
+pub use vector::{F32Vector, I16Vector, I32Vector, Simd, Work};
+#[cfg(any(test, feature = "close"))]
+pub use vector::{F64Vector, MaskVector};

@@ -30,7 +30,7 @@ pub(crate) trait Microkernel: Copy {
     /// `a + b`.
     fn add(self, a: Self::Sum, b: Self::Sum) -> Self::Sum;
     /// `sum + weight · factor`.
-    fn mul_add(self, sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum;
+    fn add_product(self, sum: Self::Sum, weight: Self::Weight, factor: Self::Factor) -> Self::Sum;
 }
 
 /// A group's rows, some taps and some panels.
@@ -151,7 +151,7 @@ unsafe fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usiz
                 for r in 0..R {
                     let factor = k.factor(inputs[r].0[s][part]);
                     for v in 0..V {
-                        sums[part][r][v] = k.mul_add(sums[part][r][v], weight[v], factor);
+                        sums[part][r][v] = k.add_product(sums[part][r][v], weight[v], factor);
                     }
                 }
             }
@@ -164,7 +164,7 @@ unsafe fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usiz
                 let factor = k.factor(inputs[r].1[s]);
                 for v in 0..V {
                     let weight = k.weight(&weights[v].1[s].0[v * K::LANES % PANEL..]);
-                    sums[0][r][v] = k.mul_add(sums[0][r][v], weight, factor);
+                    sums[0][r][v] = k.add_product(sums[0][r][v], weight, factor);
                 }
             }
         }

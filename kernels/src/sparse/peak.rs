@@ -53,7 +53,7 @@ pub(crate) fn rounds<K: Microkernel>(kernel: K, rounds: usize) -> usize {
         for (r, sums) in sums.iter_mut().enumerate() {
             let factor = kernel.factor(from[0].0[r]);
             for (sum, &weight) in sums.iter_mut().zip(&weights) {
-                *sum = kernel.mul_add(*sum, weight, factor);
+                *sum = kernel.add_product(*sum, weight, factor);
             }
         }
     }

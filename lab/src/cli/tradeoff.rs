@@ -102,7 +102,7 @@ fn size(text: &str) -> Result<[u32; 2], String> {
 /// A point cloud's stream, and its voxels.
 fn coded(ply: &[u8], model: &[u8], limits: &Limits) -> b2p::Result<(Vec<u8>, ColouredVoxels)> {
     let (cloud, _) = voxelise_closed(&PointCloud::from_ply(ply, limits)?)?;
-    let (model, log) = (Model::from_bytes(model)?, &mut Log::default());
+    let (model, log) = (Model::from_bytes(model)?, &Log::default());
     let coded = encoder::encode(&cloud, &model, &encoder::Options::default(), log)?;
     Ok((coded.bytes, cloud))
 }

@@ -112,7 +112,7 @@ impl Bench {
         let cloud = cloud.ok_or_else(|| LabError::Usage("there is no cloud to code".into()))?;
         let voxels = voxelise(cloud, Some(self.frame.bits))?;
         let options = Options::default();
-        Ok(encode(&voxels, self.model()?, &options, &mut Log::default())?.bytes)
+        Ok(encode(&voxels, self.model()?, &options, &Log::default())?.bytes)
     }
 
     /// Judges an item in every way there is to draw it. `bpp` is its rate, where it does not tell.
@@ -174,7 +174,7 @@ impl Bench {
                     .into_iter()
                     .map(|level| {
                         let rate = rate_of(&header, level, self.points)?;
-                        let gaussians = decoder.decode(&bytes, Some(level), &mut Log::default())?;
+                        let gaussians = decoder.decode(&bytes, Some(level), &Log::default())?;
                         let (how, count) = (format!("level {level}"), gaussians.len());
                         let judged = self.gaussians(gaussians)?;
                         Ok(entry(&how, count, Some(level), Some(rate), judged))

@@ -166,10 +166,7 @@ mod tests {
         let path = folder.path().join("a.ply.zst");
         std::fs::write(&path, &packed).unwrap();
         assert_eq!(read(&path, &Limits::default()).unwrap(), text);
-        let tight = Limits {
-            max_bytes: 10,
-            ..Limits::default()
-        };
+        let tight = Limits::default().with_max_bytes(10);
         let refusal = read(&path, &tight).unwrap_err().to_string();
         assert!(refusal.contains("max_bytes"), "{refusal}");
         std::fs::write(&path, &packed[..12]).unwrap();

@@ -4,9 +4,9 @@
 //! 45°. Methods are drawn at 1024² on white and averaged 2×2 to 512², then rounded to 8 bits. The truth is the mesh itself, unlit, at
 //! 512² with 4×4 samples a pixel. The foreground is where the mesh covers more than half of a pixel.
 
+use b2p::Gaussians;
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Image, Renderer};
-use b2p::{Limits, gaussians::Gaussians};
+use b2p::renderer::{Image, Renderer};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -133,11 +133,7 @@ impl Truth {
     /// # Errors
     /// If they cannot be drawn.
     pub fn judge_gaussians(&self, gaussians: &Gaussians) -> Result<Judged> {
-        self.judge(|camera| {
-            let white = Background::WHITE;
-            let (image, _) = Renderer::default().render(gaussians, camera, white, &Limits::default())?;
-            Ok(image)
-        })
+        self.judge(|camera| Ok(Renderer::new().render(gaussians, camera)?))
     }
 }
 
@@ -233,10 +229,7 @@ mod tests {
         for index in [0, 4, 9] {
             let view = TrueView::new(&surface, index).unwrap();
             let squares = points.draw_squares(&view.camera, 1.0).box_half();
-            let white = Background::WHITE;
-            let (splats, _) = Renderer::default()
-                .render(&gaussians, &view.camera, white, &Limits::default())
-                .unwrap();
+            let splats = Renderer::new().render(&gaussians, &view.camera).unwrap();
             for image in [squares, splats.box_half()] {
                 let scores = view.compare(&Picture::from(&image)).unwrap();
                 assert!(scores.psnr > 28.0, "view {index}: {scores:?}");

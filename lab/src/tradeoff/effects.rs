@@ -14,7 +14,7 @@ use b2p::metrics::pixels_apart;
 use b2p::metrics::{Spread, Verdict};
 use b2p::renderer::camera::Camera;
 use b2p::renderer::reference::{self, Cutoffs};
-use b2p::renderer::{Background, Choice, Effect, EffectSet, Effects, Image, Quality, Renderer};
+use b2p::renderer::{Background, Choice, Effect, EffectSet, Effects, Image, Renderer};
 
 /// Splats of the scenes made for it.
 const COUNT: usize = 60_000;
@@ -52,7 +52,7 @@ struct Case {
 fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
     let model = (subject.model)()?;
     let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
-    let stream = decoder.decode(subject.stream, None, &mut Log::default())?;
+    let stream = decoder.decode(subject.stream, None, &Log::default())?;
     let side = options.size[0].min(options.size[1]);
     let stream_camera = || Camera::orbit(20.0, 20.0, 2.6, 45.0, side, side);
     let (plain, camera) = crowd(COUNT, 2.0, side)?;
@@ -61,10 +61,7 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
         compensated: true,
         ..plain.clone()
     };
-    let unsampled = Effects {
-        supersample: Choice::Off,
-        ..Effects::default()
-    };
+    let unsampled = Effects::default().with(Effect::Supersample, Choice::Off);
     // The near plane touches the surface.
     let inside = Camera::orbit(0.0, 0.0, 0.8 + Camera::NEAR, 90.0, side, side)?;
     let case = |effect, name, scene, gaussians: &Gaussians, camera, others| Case {
@@ -173,14 +170,10 @@ impl Case {
     fn draw(&self, subject: &Subject<'_>, choice: Choice, camera: &Camera) -> Result<(f64, Image, EffectSet)> {
         let mut effects = self.others;
         effects.set(self.effect, choice);
-        let mut renderer = Renderer::default();
-        renderer.set_effects(effects);
-        renderer.set_quality(Quality::default());
+        let renderer = Renderer::new().with_effects(effects);
+        let mut renderer = renderer.with_limits(subject.limits.clone());
         let mut image = Image::default();
-        let mut draw = || {
-            let (gaussians, white) = (&self.gaussians, Background::WHITE);
-            renderer.render_into(gaussians, camera, white, subject.limits, &mut image)
-        };
+        let mut draw = || renderer.render_into(&self.gaussians, camera, &mut image);
         draw()?;
         let start = Instant::now();
         let stats = draw()?;
@@ -189,13 +182,7 @@ impl Case {
     }
 
     fn is_on(&self, set: EffectSet) -> bool {
-        match self.effect {
-            Effect::Harmonics => set.harmonics,
-            Effect::Antialias => set.antialias,
-            Effect::Supersample => set.supersample > 1,
-            Effect::Near => set.near,
-            Effect::Order => set.order,
-        }
+        set.is_on(self.effect)
     }
 
     /// The worst pixel of a small picture with the effect on.

@@ -75,11 +75,10 @@ pub fn renderer_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
         } = scene;
         let truth = reference::render(&gaussians, &camera, Background::WHITE, Cutoffs::NONE);
         let error = |(setting, quality, isa): &(String, Quality, Isa)| {
-            let mut renderer = Renderer::new(*isa);
-            renderer.set_quality(*quality);
-            let limits = subject.limits;
-            let drawn = renderer.render(&gaussians, &camera, Background::WHITE, limits)?;
-            Ok(CaseError::between(setting.clone(), &truth, &drawn.0))
+            let renderer = Renderer::new().with_isa(*isa).with_quality(*quality);
+            let limits = subject.limits.clone();
+            let drawn = renderer.with_limits(limits).render(&gaussians, &camera)?;
+            Ok(CaseError::between(setting.clone(), &truth, &drawn))
         };
         Ok(HardCase {
             name: name.into(),

@@ -210,16 +210,16 @@ impl<'a> Run<'a> {
         };
         let Subject { stream, limits, .. } = self.subject;
         self.pool(how.threads)?.install(|| {
-            let mut log = Log::default();
+            let log = Log::default();
             let decoder = Decoder::new(model).with_limits((*limits).clone());
             let decoder = decoder.with_heads(how.heads)?;
             let start = Instant::now();
-            let gaussians = decoder.decode(stream, Some(how.level), &mut log)?;
+            let gaussians = decoder.decode(stream, Some(how.level), &log)?;
             let mut lap = Lap {
                 total: milliseconds(start),
                 ..Lap::default()
             };
-            for step in log.steps() {
+            for step in &log.steps() {
                 lap.stages[stage_of(step)] += step.time.as_secs_f64() * 1e3;
             }
             Ok((lap, gaussians))
@@ -235,12 +235,12 @@ impl<'a> Run<'a> {
         let cameras = self.options.cameras(how.shrink)?;
         let limits = self.subject.limits;
         self.pool(how.decode.threads)?.install(|| {
-            let mut renderer = Renderer::new(how.decode.isa);
-            renderer.set_quality(how.quality);
+            let renderer = Renderer::new().with_isa(how.decode.isa).with_quality(how.quality);
+            let mut renderer = renderer.with_limits(limits.clone());
             let (mut lap, mut images) = (Lap::default(), Vec::new());
             for camera in &cameras {
                 let mut image = Image::default();
-                let mut draw = || renderer.render_into(gaussians, camera, Background::WHITE, limits, &mut image);
+                let mut draw = || renderer.render_into(gaussians, camera, &mut image);
                 // The first brings memory and caches up to it, as when pictures follow one another.
                 draw()?;
                 let start = Instant::now();
@@ -316,14 +316,10 @@ impl<'a> Run<'a> {
         let cloud = self.subject.cloud.map(|cloud| {
             say("draw the cloud");
             let gaussians = of_cloud(cloud);
-            let mut renderer = Renderer::new(model.isa());
-            renderer.set_quality(Quality::Exact);
-            let mut draw = |camera| {
-                let limits = self.subject.limits;
-                let drawn = renderer.render(&gaussians, camera, Background::WHITE, limits)?;
-                Ok(drawn.0)
-            };
-            cameras.iter().map(&mut draw).collect::<Result<_>>()
+            let renderer = Renderer::new().with_isa(model.isa()).with_quality(Quality::Exact);
+            let mut renderer = renderer.with_limits(self.subject.limits.clone());
+            let mut draw = |camera| renderer.render(&gaussians, camera);
+            cameras.iter().map(&mut draw).collect::<Result<_, _>>()
         });
         Ok(Truth {
             images,

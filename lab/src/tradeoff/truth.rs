@@ -20,7 +20,7 @@ use b2p::log::Log;
 pub fn in_double(subject: &Subject<'_>, model: &Model, level: u8) -> Result<(Gaussians, f64)> {
     let header = Header::parse(subject.stream, subject.limits)?;
     let decoder = Decoder::new(model).with_limits(subject.limits.clone());
-    let exact = decoder.exact(subject.stream, level, &mut Log::default())?;
+    let exact = decoder.exact(subject.stream, level, &Log::default())?;
     let role = usize::from(level.saturating_sub(header.base));
     let map = exact.octree.kernel_map(level);
     let start = Instant::now();

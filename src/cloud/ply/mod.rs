@@ -91,7 +91,11 @@ impl<'a> Ply<'a> {
         place.unwrap_or_else(|| format!("vertex {row}"))
     }
 
-    fn columns(&self, element: &str, names: &[&str], limits: &Limits) -> Result<Vec<Column>> {
+    /// As [`Ply::vertex_columns`], of the element `element`.
+    ///
+    /// # Errors
+    /// As [`Ply::vertex_columns`].
+    pub fn columns(&self, element: &str, names: &[&str], limits: &Limits) -> Result<Vec<Column>> {
         let position = self.header.elements.iter().position(|e| e.name == element);
         let Some(position) = position else {
             return Err(header::absent("element", element));

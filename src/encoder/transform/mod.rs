@@ -12,7 +12,7 @@ use super::{Encoded, rates};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{self, Filter, Steps, Truth};
 use crate::container::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
-use crate::decoder::{StreamDecoder, colour_hash};
+use crate::decoder::{Decoder, colour_hash};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
@@ -21,6 +21,7 @@ pub use within::encode_within;
 
 /// How exactly colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum Fineness {
     /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice that.
     Step(f32),
@@ -44,6 +45,10 @@ pub struct Options {
     pub fineness: Fineness,
     /// Whether levels have a filter that the decoder runs on their colours.
     pub filter: bool,
+    /// Whether quantisation is rate–distortion optimised; otherwise coefficients are rounded to the nearest.
+    pub optimised: bool,
+    /// Streams that [`encode_within`] tries for a level at most, once one fits.
+    pub tries: usize,
     /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
     /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`].
@@ -58,6 +63,8 @@ impl Default for Options {
             levels: None,
             fineness: Fineness::Step(20.0),
             filter: true,
+            optimised: true,
+            tries: usize::MAX,
             slice_voxels: MAX_SLICE_VOXELS,
             colour_slice: MAX_COLOUR_SLICE / 2,
             isa: None,
@@ -77,7 +84,7 @@ const FILTER_SHARE: usize = 100;
 /// # Errors
 /// [`Error::Usage`] for levels that the cloud does not have and steps that the format does not have, [`Error::Malformed`] for slices that the
 /// format does not have; and, if encoder and decoder disagreed on this machine, whatever the decoder found.
-pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &mut Log) -> Result<Encoded> {
+pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<Encoded> {
     let steps = options.fineness.steps()?;
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
     let subject = Subject::new(cloud, levels, options, log)?;
@@ -190,7 +197,7 @@ struct Layer {
 }
 
 impl<'a> Subject<'a> {
-    fn new(cloud: &'a ColouredVoxels, levels: RangeInclusive<u8>, options: &'a Options, log: &mut Log) -> Result<Self> {
+    fn new(cloud: &'a ColouredVoxels, levels: RangeInclusive<u8>, options: &'a Options, log: &Log) -> Result<Self> {
         let (isa, top) = (options.isa.unwrap_or_else(Isa::detect), *levels.end());
         let subject = Subject {
             cloud,
@@ -263,11 +270,15 @@ impl<'a> Subject<'a> {
         if self.grey && !steps.is_lossless() {
             steps.chroma = Steps::ABSENT;
         }
-        colour::Options::new(steps)
+        let mut coding = colour::Options::new(steps);
+        if !self.options.optimised {
+            coding.lambda = 0.0;
+        }
+        coding
     }
 
     /// Codes the colours of the levels down to `top`.
-    fn code(&self, top: u8, steps: Steps, log: &mut Log) -> Result<Coded> {
+    fn code(&self, top: u8, steps: Steps, log: &Log) -> Result<Coded> {
         let truth = log.step("mean colours", self.cloud.voxels.len(), "voxels", || {
             Ok(self.truth(top, steps.is_lossless()))
         })?;
@@ -275,7 +286,7 @@ impl<'a> Subject<'a> {
     }
 
     /// The same, of colours that have been computed.
-    fn code_towards(&self, truth: &Truth, top: u8, steps: Steps, log: &mut Log) -> Result<Coded> {
+    fn code_towards(&self, truth: &Truth, top: u8, steps: Steps, log: &Log) -> Result<Coded> {
         let (octree, maps, isa) = (&self.octree, &self.maps, self.isa);
         let slice = self.options.colour_slice as usize;
         let header = self.header(top, |level| octree.level(level).len());
@@ -379,12 +390,12 @@ impl<'a> Subject<'a> {
     }
 
     /// The stream, once it has been decoded to what was encoded.
-    fn checked(&self, coded: Coded, log: &mut Log) -> Result<Encoded> {
+    fn checked(&self, coded: Coded, log: &Log) -> Result<Encoded> {
         let Coded { bytes, top, colours } = coded;
         let voxels = self.octree.level(top);
-        let decoder = StreamDecoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
+        let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
         let same = log.step("decode again", voxels.len(), "voxels", || {
-            let decoding = decoder.whole(&bytes, Some(top), &mut Log::default())?;
+            let decoding = decoder.with_level(top).whole(&bytes)?;
             let points = decoding.points();
             Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == colours))
         })?;

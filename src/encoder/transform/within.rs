@@ -39,7 +39,7 @@ pub fn encode_within(
     cloud: &ColouredVoxels,
     options: &Options,
     bits_per_point: f64,
-    log: &mut Log,
+    log: &Log,
 ) -> Result<(Encoded, Options)> {
     if !(bits_per_point.is_finite() && bits_per_point > 0.0) {
         return Err(Error::Usage(format!(
@@ -97,7 +97,7 @@ struct Search<'a> {
 
 impl Search<'_> {
     /// The largest stream with the last level `top` that fits, if there is one; `only` tells that no coarser level could take its place.
-    fn level(&mut self, top: u8, only: bool, log: &mut Log) -> Result<Option<(Place, Coded)>> {
+    fn level(&mut self, top: u8, only: bool, log: &Log) -> Result<Option<(Place, Coded)>> {
         let last = match top == self.subject.cloud.voxels.depth() {
             _ if only => 2 * MAX_CHROMA,
             true => COARSEST_OF_ALL,
@@ -113,7 +113,12 @@ impl Search<'_> {
         let (mut fits, mut exceeds): (Option<Tried>, Option<Tried>) = (None, None);
         let mut best = None;
         let mut next = Some(FIRST);
+        let mut tries = 0;
         while let Some(at) = next {
+            if best.is_some() && tries >= self.subject.options.tries {
+                break;
+            }
+            tries += 1;
             let (size, found) = self.attempt_sized(place(at), log)?;
             let tried = Some(Tried {
                 at,
@@ -140,19 +145,19 @@ impl Search<'_> {
         Ok(Some(best))
     }
 
-    fn attempt(&mut self, place: Place, log: &mut Log) -> Result<Option<(Place, Coded)>> {
+    fn attempt(&mut self, place: Place, log: &Log) -> Result<Option<(Place, Coded)>> {
         Ok(self.attempt_sized(place, log)?.1)
     }
 
     /// Codes at a place: the bytes, and the stream if it fits.
-    fn attempt_sized(&mut self, place: Place, log: &mut Log) -> Result<(f64, Option<(Place, Coded)>)> {
+    fn attempt_sized(&mut self, place: Place, log: &Log) -> Result<(f64, Option<(Place, Coded)>)> {
         self.tries += 1;
         let Place { top, steps } = place;
         let how = Fineness::of(steps);
         let name = format!("try {}: level {top}, {how}", self.tries);
         let points = self.subject.cloud.voxels.len();
         let coded = log.step(name, points, "points", || {
-            let log = &mut Log::default();
+            let log = &Log::off();
             if steps.is_lossless() {
                 return self.subject.code(top, steps, log);
             }

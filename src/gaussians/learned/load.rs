@@ -67,7 +67,7 @@ pub(super) fn model(bytes: &[u8]) -> Result<HeadsModel> {
     }
     Ok(HeadsModel {
         blur: blur as f32,
-        generators,
+        generators: generators.into(),
     })
 }
 

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use serde_json::json;
 
 use super::*;
+use crate::error::Error;
 use crate::geometry::{Voxels, morton};
 use crate::layers::{Dtype, File};
 

@@ -256,6 +256,17 @@ fn gaussians_that_cannot_be_written_are_an_error() {
     let mut nowhere = gaussians();
     nowhere.frame.bits = 0;
     assert!(matches!(write(&nowhere), Err(Error::Usage(_))));
+    // Single precision has neither such places nor such voxels.
+    for (origin, voxel_size) in [
+        ([1e300, 0.0, 0.0], 1.0),
+        ([0.0, -1e39, 0.0], 1.0),
+        ([0.0; 3], 1e38),
+        ([0.0; 3], 1e-60),
+    ] {
+        let mut far = gaussians();
+        far.frame.placement = Placement { origin, voxel_size };
+        assert!(matches!(write(&far), Err(Error::Usage(_))), "{origin:?} {voxel_size}");
+    }
 
     struct Full;
     impl Write for Full {
@@ -301,4 +312,72 @@ fn view_dependent_colour_is_assigned_to_its_gaussian() {
     let (g, _) = read_back(&bytes);
     let of = |i| (0..3).map(move |k| [0, 3, 6].map(|channel| value(i, channel + k)));
     assert_eq!(g.harmonics.coefficients, (0..count).flat_map(of).collect::<Vec<_>>());
+}
+
+#[test]
+fn opacities_of_nothing_and_of_all_are_written_as_finite_numbers() {
+    let mut extremes = gaussians();
+    let values = [0.0, 1.0, -0.5, 1.5];
+    for (opacity, value) in extremes.opacity.iter_mut().zip(values.into_iter().cycle()) {
+        *opacity = value;
+    }
+    let mut file = Vec::new();
+    extremes.write_ply(&mut file, Path::new("x")).unwrap();
+    let ply = Ply::open(&file).unwrap();
+    let column = &ply.vertex_columns(&["opacity"], &Limits::default()).unwrap()[0];
+    for i in 0..extremes.len() {
+        let logit: f64 = column.get(i);
+        assert!(logit.is_finite() && (13.0..14.0).contains(&logit.abs()), "{logit}");
+    }
+}
+
+#[test]
+fn view_dependent_colour_and_its_render_mode_are_written() {
+    let mut before = gaussians();
+    before.compensated = true;
+    before.harmonics = Harmonics {
+        count: 3,
+        coefficients: (0..9).map(|i| [i as f32, 0.5 * i as f32, -0.25 * i as f32]).collect(),
+    };
+    let (after, notes) = read_back(&written(&before));
+    assert_eq!(notes, Notes::default());
+    assert!(after.compensated);
+    assert_eq!(after.harmonics, before.harmonics);
+}
+
+#[test]
+fn a_cube_far_from_the_origin_is_written_without_stripes() {
+    // A cube of 100 m with voxels of 10 cm at UTM coordinates, where single precision resolves half a metre.
+    let frame = Frame {
+        bits: 10,
+        placement: Placement {
+            origin: [500_123.4, 4_649_876.5, 12.0],
+            voxel_size: 0.1,
+        },
+    };
+    assert_eq!(frame.offset(), [500_200.0, 4_649_900.0, 0.0]);
+    let before = Gaussians { frame, ..gaussians() };
+    let file = written(&before);
+    let ply = Ply::open(&file).unwrap();
+    assert!(ply.header.comments.contains(&"b2p offset 500200 4649900 0".to_owned()));
+    let columns = ply.vertex_columns(&["x", "y"], &Limits::default()).unwrap();
+    assert!((0..3).all(|i| columns[0].get(i).abs() < 200.0 && columns[1].get(i).abs() < 200.0));
+    let (after, _) = read_back(&file);
+    assert_eq!(after.frame, frame);
+    for (after, before) in after.position.as_flattened().iter().zip(before.position.as_flattened()) {
+        assert_near(*after, *before, 1e-6);
+    }
+}
+
+#[test]
+fn a_cube_near_the_origin_keeps_its_coordinates() {
+    for (origin, voxel_size) in [([-0.5; 3], 1.0), ([-3.0, 2.0, 900.0], 1.0), ([0.0, 0.0, 60.0], 0.001)] {
+        let placement = Placement { origin, voxel_size };
+        assert_eq!(Frame { bits: 10, placement }.offset(), [0.0; 3]);
+    }
+    let placement = Placement {
+        origin: [11.576_123, 48.137_1, 0.0],
+        voxel_size: 1e-7,
+    };
+    assert_eq!(Frame { bits: 10, placement }.offset(), [11.576_2, 48.137_2, 0.0]);
 }

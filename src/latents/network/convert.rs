@@ -12,6 +12,7 @@ use crate::layers::Spec;
 use crate::layers::missing;
 use crate::layers::{Pool, apply, apply_f32, concat, reals};
 
+#[doc(hidden)]
 impl Model {
     /// The encoder's features of every coded level, finest first: [voxels, C] each.
     ///
@@ -78,7 +79,7 @@ impl Model {
     }
 
     fn encoder(&self) -> Result<&Encoder<FloatConv>> {
-        self.encoder.as_ref().ok_or_else(|| {
+        self.encoder.as_deref().ok_or_else(|| {
             missing(
                 "encoding",
                 format!("model {} has the decoder's layers only", self.shape.name),

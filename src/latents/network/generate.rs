@@ -73,6 +73,7 @@ impl Generator {
     }
 }
 
+#[doc(hidden)]
 impl Model {
     /// [`Model::generate_with`] the best heads.
     ///
@@ -85,7 +86,7 @@ impl Model {
         self.generate_with(Heads::Best, role, g, map)
     }
 
-    /// The raw parameters of the Gaussians of a role's level, [`RAW`] numbers each: see [`crate::latents::activate`].
+    /// The raw parameters of the Gaussians of a role's level, [`RAW`] numbers each: see `latents::activate`.
     ///
     /// `g` holds its features [voxels, C], `map` is its 3³ kernel map. Role 2 gives one Gaussian per voxel, role 1 eight, those of
     /// all eight children of the first voxel first. All numbers are finite.

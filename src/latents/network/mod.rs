@@ -60,12 +60,15 @@ mod untrained;
 mod work;
 
 use std::path::Path;
+use std::sync::Arc;
 
 use b2p_kernels::{ExactConv, FloatConv, Isa};
 
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::input;
 use crate::latents::entropy::{RawRows, Tables};
 use crate::layers::{Precision, Spec, Stored, Tensors, malformed, missing};
+use crate::limits::Limits;
 use generate::Generator;
 use structure::{Encoder, Exact, Generate};
 
@@ -77,19 +80,20 @@ pub use structure::{RAW, ROLES};
 pub use untrained::untrained;
 pub use work::{Module, Work};
 
-/// A model, ready to run.
+/// A model of learned colours, which codes and decodes streams of version 2. Clones share the weights.
+#[derive(Clone)]
 pub struct Model {
-    shape: Shape,
+    shape: Arc<Shape>,
     id: [u8; 16],
     isa: Isa,
-    tables: Tables,
-    exact: Exact<ExactConv>,
-    generators: Vec<Generator>,
+    tables: Arc<Tables>,
+    exact: Arc<Exact<ExactConv>>,
+    generators: Arc<[Generator]>,
     precision: Precision,
-    encoder: Option<Encoder<FloatConv>>,
-    bit_prices: [Vec<f32>; ROLES],
-    g_scale: Vec<f32>,
-    c_scale: Vec<f32>,
+    encoder: Option<Arc<Encoder<FloatConv>>>,
+    bit_prices: Arc<[Vec<f32>; ROLES]>,
+    g_scale: Arc<[f32]>,
+    c_scale: Arc<[f32]>,
 }
 
 impl std::fmt::Debug for Model {
@@ -102,12 +106,10 @@ impl Model {
     /// Loads a model file.
     ///
     /// # Errors
-    /// [`Error::Io`], or as [`Model::from_bytes`].
+    /// [`Error::Io`], [`Error::LimitExceeded`] for a file of more than 2 GiB, or as [`Model::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
-        let bytes = std::fs::read(path).map_err(|source| Error::Io {
-            path: path.to_owned(),
-            source,
-        })?;
+        // Read, not mapped: another program may shorten the file meanwhile.
+        let bytes = input::read_file(path, &Limits::default())?;
         Model::from_bytes(&bytes)
     }
 
@@ -133,16 +135,16 @@ impl Model {
         let integers = generators.iter().all(Generator::has_integers);
         Ok(Model {
             precision: if integers { Precision::Int16 } else { Precision::F16 },
-            generators,
-            exact: shape.exact(&mut |spec| tensors.exact_layer(spec))?,
-            encoder,
-            g_scale,
-            c_scale: scales(&tensors, "c_scale", ROLES, 1)?,
+            generators: generators.into(),
+            exact: Arc::new(shape.exact(&mut |spec| tensors.exact_layer(spec))?),
+            encoder: encoder.map(Arc::new),
+            g_scale: g_scale.into(),
+            c_scale: scales(&tensors, "c_scale", ROLES, 1)?.into(),
             id: tensors.id(&shape),
-            bit_prices: tensors.bit_prices(shape.latents)?,
+            bit_prices: Arc::new(tensors.bit_prices(shape.latents)?),
             isa: Isa::detect(),
-            tables,
-            shape,
+            tables: Arc::new(tables),
+            shape: Arc::new(shape),
         })
     }
 
@@ -183,6 +185,7 @@ impl Model {
     }
 
     /// The model's extents.
+    #[doc(hidden)]
     pub fn shape(&self) -> &Shape {
         &self.shape
     }
@@ -193,6 +196,7 @@ impl Model {
     }
 
     /// The probability tables.
+    #[doc(hidden)]
     pub fn tables(&self) -> &Tables {
         &self.tables
     }
@@ -201,6 +205,7 @@ impl Model {
     ///
     /// # Panics
     /// If `role` is above 2.
+    #[doc(hidden)]
     pub fn bit_prices(&self, role: usize) -> &[f32] {
         &self.bit_prices[role]
     }

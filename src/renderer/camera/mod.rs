@@ -1,20 +1,27 @@
 //! Pinhole cameras in the cube frame.
 
 pub mod files;
+mod framing;
 
-use glam::{DAffine3, DMat3, DVec3};
+use std::ops::Range;
+
+use glam::{DAffine3, DMat3};
 
 use b2p_kernels::splat::{Bounds, TILE};
 
 use crate::error::{Error, Result};
+
+pub use framing::Extent;
 
 /// How far `R·Rᵀ` of a pose may be from the identity, so that a rotation printed with four decimals still is one.
 const ROTATION_TOLERANCE: f64 = 1e-3;
 
 /// A pinhole camera. Camera axes: x right, y down, z forward. Pixel `i` covers `[i, i + 1]`, its centre is `i + ½`.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct Camera {
     /// From the cube frame to the camera: a rotation and a translation.
+    #[doc(hidden)]
     pub pose: DAffine3,
     /// Focal length along x, in pixels.
     pub fx: f64,
@@ -32,12 +39,14 @@ pub struct Camera {
     pub near: f64,
     /// How rays go.
     pub projection: Projection,
-    /// The part of the picture that is drawn, if not all of it: see [`Camera::crop`].
+    /// The part of the picture that is drawn, if not all of it: see [`Camera::with_crop`].
+    #[doc(hidden)]
     pub crop: Option<Bounds>,
 }
 
 /// How a camera's rays go.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Projection {
     /// Through one point.
     #[default]
@@ -60,25 +69,24 @@ impl Camera {
     /// # Errors
     /// [`Error::Usage`] if that is no camera: see [`Camera::check`].
     pub fn orbit(azimuth: f64, elevation: f64, radius: f64, fov: f64, width: u32, height: u32) -> Result<Camera> {
-        let (sin_az, cos_az) = azimuth.to_radians().sin_cos();
-        let (sin_el, cos_el) = elevation.to_radians().sin_cos();
-        let outwards = DVec3::new(cos_el * sin_az, sin_el, cos_el * cos_az);
-        let right = DVec3::new(cos_az, 0.0, -sin_az);
-        let down = right.cross(outwards);
-        let rotation = DMat3::from_cols(right, down, -outwards).transpose();
-        if !(fov > 0.0 && fov < 180.0) {
-            return Err(Error::Usage(format!(
-                "the field of view is {fov}°, it must lie between 0° and 180°"
-            )));
-        }
-        let focal = f64::from(width) / 2.0 / (fov.to_radians() / 2.0).tan();
-        let pose = DAffine3::from_mat3_translation(rotation, DVec3::new(0.0, 0.0, radius));
+        Self::orbit_around([0.0; 3], azimuth, elevation, radius, fov, width, height)
+    }
+
+    /// A pinhole camera of square pixels with its principal point in the middle, and `focal` in pixels. `rotation` (three
+    /// rows) and `translation` take points of the cube frame to camera axes: x right, y down, z forward.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if that is no camera: see [`Camera::check`].
+    pub fn new(rotation: [[f64; 3]; 3], translation: [f64; 3], focal: f64, width: u32, height: u32) -> Result<Camera> {
+        let rotation = DMat3::from_cols_array_2d(&rotation).transpose();
+        let pose = DAffine3::from_mat3_translation(rotation, translation.into());
         let camera = Self::centred(pose, focal, width, height);
         camera.check()?;
         Ok(camera)
     }
 
     /// A pinhole camera of square pixels with its principal point in the middle; unchecked.
+    #[doc(hidden)]
     pub fn centred(pose: DAffine3, focal: f64, width: u32, height: u32) -> Camera {
         Camera {
             pose,
@@ -106,10 +114,24 @@ impl Camera {
         Ok(self)
     }
 
+    /// The camera that draws only these columns and rows of this one's picture: the pixels are equal to the bit.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if that is empty or reaches out of the picture.
+    pub fn with_crop(self, columns: Range<u32>, rows: Range<u32>) -> Result<Camera> {
+        self.crop(Bounds {
+            x0: columns.start,
+            y0: rows.start,
+            x1: columns.end,
+            y1: rows.end,
+        })
+    }
+
     /// The camera that draws only the pixels `x0 ≤ x < x1`, `y0 ≤ y < y1` of this one's picture: to the bit what the whole shows there.
     ///
     /// # Errors
     /// [`Error::Usage`] if that is empty or reaches out of the picture.
+    #[doc(hidden)]
     pub fn crop(mut self, part: Bounds) -> Result<Camera> {
         self.crop = Some(part);
         self.check()?;
@@ -144,6 +166,7 @@ impl Camera {
     }
 
     /// The pixels that are drawn.
+    #[doc(hidden)]
     pub fn window(&self) -> Bounds {
         self.crop.unwrap_or(Bounds {
             x0: 0,

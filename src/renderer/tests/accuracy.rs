@@ -59,10 +59,9 @@ fn with_hardly_any_cut_off_only_rounding_is_left() {
         };
         let exact = reference::render(&scene, &camera, Background::WHITE, through);
         for isa in isas() {
-            let mut renderer = Renderer::new(isa);
-            renderer.set_quality(Quality::Exact);
-            let drawn = renderer.render(&scene, &camera, Background::WHITE, &Limits::default());
-            let (largest, psnr) = difference(&drawn.unwrap().0, &exact);
+            let mut renderer = Renderer::new().with_isa(isa).with_quality(Quality::Exact);
+            let drawn = renderer.render(&scene, &camera);
+            let (largest, psnr) = difference(&drawn.unwrap(), &exact);
             worst = worst.max(largest);
             assert!(
                 largest <= 0.3 / 255.0 && psnr >= 80.0,
@@ -82,10 +81,8 @@ fn a_better_quality_is_nearer_to_the_reference() {
     let exact = reference::render(&scene, &camera, Background::WHITE, Cutoffs::NONE);
     for isa in isas() {
         let cost = [Quality::Fast, Quality::Fine, Quality::Exact].map(|quality| {
-            let mut renderer = Renderer::new(isa);
-            renderer.set_quality(quality);
-            let drawn = renderer.render(&scene, &camera, Background::WHITE, &Limits::default());
-            difference(&drawn.unwrap().0, &exact)
+            let mut renderer = Renderer::new().with_isa(isa).with_quality(quality);
+            difference(&renderer.render(&scene, &camera).unwrap(), &exact)
         });
         let [(fast, _), (standard, _), (best, _)] = cost;
         // Between the better two only rounding is left.

@@ -5,12 +5,9 @@ use crate::gaussians::Harmonics;
 use crate::renderer::{Channel, Choice, Effects};
 
 pub(super) fn with(scene: &Gaussians, camera: &Camera, isa: Isa, effects: Effects) -> (Image, Stats) {
-    let mut renderer = Renderer::new(isa);
-    renderer.set_effects(effects);
-    renderer.set_quality(Quality::Fine);
-    renderer
-        .render(scene, camera, Background::BLACK, &Limits::default())
-        .unwrap()
+    let renderer = Renderer::new().with_isa(isa).with_effects(effects);
+    let renderer = renderer.with_quality(Quality::Fine).with_background(Background::BLACK);
+    drawn(renderer, scene, camera)
 }
 
 pub(super) const ANTIALIAS: Effects = Effects {

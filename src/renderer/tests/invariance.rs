@@ -101,12 +101,11 @@ fn any_number_of_threads_draws_the_same_bits() {
 
 #[test]
 fn a_renderer_that_has_drawn_before_draws_the_same() {
-    let mut renderer = Renderer::default();
-    let limits = Limits::default();
+    let mut renderer = Renderer::new();
     for (seed, count, size) in [(1, 400, 70), (2, 50, 33), (3, 300, 90), (4, 0, 20)] {
         let scene = scene(random_splats(seed, count));
         let camera = orbit(size, size + 5);
-        let (image, _) = renderer.render(&scene, &camera, Background::WHITE, &limits).unwrap();
+        let image = renderer.render(&scene, &camera).unwrap();
         assert!(image == draw(&scene, &camera));
     }
 }

@@ -137,10 +137,16 @@ fn isas() -> Vec<Isa> {
     isas
 }
 
+/// A picture, and what it took.
+fn drawn(mut renderer: Renderer, scene: &Gaussians, camera: &Camera) -> (Image, Stats) {
+    let mut image = Image::default();
+    let stats = renderer.render_into(scene, camera, &mut image).unwrap();
+    (image, stats)
+}
+
 /// With the best instructions; the picture on every other set is held to it, and the counts are.
 fn draw_on(scene: &Gaussians, camera: &Camera, background: Background) -> (Image, Stats) {
-    let limits = Limits::default();
-    let on = |isa| Renderer::new(isa).render(scene, camera, background, &limits).unwrap();
+    let on = |isa| drawn(Renderer::new().with_isa(isa).with_background(background), scene, camera);
     let (image, stats) = on(Isa::detect());
     let peak = colours(scene);
     for isa in isas() {
@@ -189,10 +195,9 @@ fn assert_close_in(quality: Quality, scene: &Gaussians, camera: &Camera) {
     for background in [Background::WHITE, Background::Transparent] {
         let exact = reference::render(scene, camera, background, Cutoffs::NONE);
         for isa in isas() {
-            let mut renderer = Renderer::new(isa);
-            renderer.set_quality(quality);
-            let drawn = renderer.render(scene, camera, background, &Limits::default());
-            let (largest, psnr) = difference(&drawn.unwrap().0, &exact);
+            let renderer = Renderer::new().with_isa(isa).with_quality(quality);
+            let (image, _) = drawn(renderer.with_background(background), scene, camera);
+            let (largest, psnr) = difference(&image, &exact);
             assert!(
                 largest <= 2.0 / 255.0 && psnr >= 60.0,
                 "{isa}: {:.3}/255, {psnr:.1} dB",

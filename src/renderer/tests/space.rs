@@ -205,14 +205,18 @@ fn a_pixel_s_number_is_that_of_the_gaussian_that_it_shows_most_of() {
     for isa in isas() {
         let mut ids = Ids::default();
         let limits = Limits::default();
-        let stats = Renderer::new(isa).ids_into(&scene, &camera, &limits, &mut ids).unwrap();
+        let stats = Renderer::new()
+            .with_isa(isa)
+            .ids_into(&scene, &camera, &limits, &mut ids)
+            .unwrap();
         assert_eq!((ids.width, ids.height, stats.touched), (40, 33, 40 * 33));
         // Through the faint wall one sees mostly the one behind, and the spot is before both.
         assert_eq!(ids.indices[16 * 40 + 20], 2, "{isa}");
         assert_eq!(ids.indices[0], 0, "{isa}");
 
         let nothing = Gaussians::default();
-        Renderer::new(isa)
+        Renderer::new()
+            .with_isa(isa)
             .ids_into(&nothing, &camera, &limits, &mut ids)
             .unwrap();
         assert!(ids.indices.iter().all(|id| *id == u32::MAX));
@@ -235,10 +239,9 @@ fn numbers_are_mixed_as_colours_are() {
         let both = |isa| [(isa, camera), (isa, crop)];
         for (isa, camera) in isas().into_iter().flat_map(both) {
             let scene = scene(splats.clone());
-            let mut renderer = Renderer::new(isa);
+            let mut renderer = Renderer::new().with_isa(isa).with_background(Background::Transparent);
             let (limits, mut image) = (Limits::default(), Image::default());
-            let back = Background::Transparent;
-            let stats = renderer.render_into(&scene, &camera, back, &limits, &mut image);
+            let stats = renderer.render_into(&scene, &camera, &mut image);
             assert_eq!(stats.unwrap().crossing > 0, crossing);
             let numbers = |i: usize| {
                 let [r, g, b] = scene.colour[i];

@@ -132,11 +132,8 @@ fn a_thousand_faint_layers_are_drawn_and_the_fast_quality_says_that_it_dropped_t
     assert!((exact.pixel(4, 4)[3] - 0.9646).abs() < 1e-3);
     for isa in isas() {
         let on = |quality| {
-            let mut renderer = Renderer::new(isa);
-            renderer.set_quality(quality);
-            let limits = Limits::default();
-            let drawn = renderer.render(&scene, &camera, Background::Transparent, &limits);
-            drawn.unwrap()
+            let renderer = Renderer::new().with_isa(isa).with_quality(quality);
+            drawn(renderer.with_background(Background::Transparent), &scene, &camera)
         };
         assert!(difference(&on(Quality::Fine).0, &exact).0 <= 1.0 / 255.0, "{isa}");
         let (image, stats) = on(Quality::Fast);
@@ -182,10 +179,8 @@ fn on_every_instruction_set_any_number_of_threads_draws_the_same_bits() {
         let on = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
             let pool = pool.build().unwrap();
-            let limits = Limits::default();
-            pool.install(|| Renderer::new(isa).render(&scene, &camera, Background::BLACK, &limits))
-                .unwrap()
-                .0
+            let mut renderer = Renderer::new().with_isa(isa).with_background(Background::BLACK);
+            pool.install(|| renderer.render(&scene, &camera)).unwrap()
         };
         assert!(on(1) == on(3) && on(1) == on(16), "{isa}");
     }

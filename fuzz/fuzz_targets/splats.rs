@@ -1,0 +1,6 @@
+//! Splats of any format: see [`b2p_fuzz::splats`].
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(init: b2p_fuzz::alone(), |bytes: &[u8]| b2p_fuzz::splats(bytes));
