@@ -85,7 +85,7 @@ const NOT_EXACT: [&str; 5] = [
     "src/colour/encode.rs",
     "src/latents/entropy/quantise.rs",
     "src/latents/network/reference.rs",
-    "src/latents/network/reference/passes.rs",
+    "src/latents/network/reference/neighbours.rs",
     "src/latents/network/untrained.rs",
 ];
 

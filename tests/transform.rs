@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use b2p::cloud::{ColouredVoxels, voxelise};
 use b2p::container::{Header, Stream};
-use b2p::encoder::transform::{Fineness, Options, encode, encode_within};
+use b2p::encoder::transform::{Options, QualityTarget, encode, encode_to_rate};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
@@ -21,7 +21,7 @@ fn stream(cloud: &ColouredVoxels, options: &Options) -> Vec<u8> {
     encoded.expect("a cloud can be coded").bytes
 }
 
-fn with(fineness: Fineness) -> Options {
+fn with(fineness: QualityTarget) -> Options {
     Options {
         fineness,
         ..Options::default()
@@ -89,7 +89,7 @@ fn lossless_streams_decode_to_the_mean_colours_of_the_finest_level() {
         for top in [bits, bits - 1] {
             let options = Options {
                 levels: Some(top.saturating_sub(2)..=top),
-                ..with(Fineness::Lossless)
+                ..with(QualityTarget::Lossless)
             };
             let bytes = stream(&cloud, &options);
             let decoded = points(&bytes, None).unwrap();
@@ -104,7 +104,7 @@ fn smaller_steps_take_more_bytes_and_are_nearer() {
     let (keys, truth) = means(&cloud, 6);
     let mut last = (0, f64::INFINITY);
     for step in [128.0, 32.0, 8.0, 2.0] {
-        let bytes = stream(&cloud, &with(Fineness::Step(step)));
+        let bytes = stream(&cloud, &with(QualityTarget::Step(step)));
         let decoded = points(&bytes, None).unwrap();
         assert_eq!(decoded.0, keys);
         let own = (bytes.len(), error(&decoded.1, &truth));
@@ -179,12 +179,12 @@ fn as_many_bits_as_asked_for_are_used_and_more_bits_are_never_worse() {
     let mut last = f64::INFINITY;
     let mut lossless = false;
     for most in [0.3, 0.6, 1.2, 2.4, 5.0, 20.0] {
-        let found = encode_within(&cloud, &Options::default(), most, &Log::default());
+        let found = encode_to_rate(&cloud, &Options::default(), most, &Log::default());
         let (encoded, chosen) = found.unwrap();
         let bits = encoded.bytes.len() as f64 * 8.0 / cloud.voxels.len() as f64;
         assert!(bits <= most, "{bits} of {most}");
         assert_eq!(encoded.bytes, stream(&cloud, &chosen), "{chosen:?}");
-        lossless = chosen.fineness == Fineness::Lossless;
+        lossless = chosen.fineness == QualityTarget::Lossless;
         // Colours of the cloud as the finest level of the stream has them.
         let (keys, colours) = points(&encoded.bytes, None).unwrap();
         let shift = 3 * (finest - chosen.levels.unwrap().end());
@@ -197,7 +197,7 @@ fn as_many_bits_as_asked_for_are_used_and_more_bits_are_never_worse() {
         last = off;
     }
     assert!(lossless, "20 bits are enough for exact colours");
-    let found = encode_within(&cloud, &Options::default(), 0.001, &Log::default());
+    let found = encode_to_rate(&cloud, &Options::default(), 0.001, &Log::default());
     assert!(matches!(found, Err(Error::TooFewBits { .. })));
 }
 
@@ -209,7 +209,7 @@ fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_
         heads: Some(heads.clone()),
         ..Options::default()
     };
-    let found = encode_within(&cloud, &options, 1.0, &Log::default());
+    let found = encode_to_rate(&cloud, &options, 1.0, &Log::default());
     let (encoded, chosen) = found.unwrap();
     assert!(encoded.bytes.len() * 8 <= cloud.voxels.len());
     assert_eq!(encoded.bytes, stream(&cloud, &chosen));
@@ -257,7 +257,7 @@ fn levels_and_steps_that_do_not_exist_are_refused() {
         assert!(refused(options));
     }
     for step in [0.0, 0.4, 1001.0, f32::NAN] {
-        assert!(refused(with(Fineness::Step(step))), "{step}");
+        assert!(refused(with(QualityTarget::Step(step))), "{step}");
     }
     assert!(refused(Options {
         slice_voxels: 16_385,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use b2p::Limits;
 use b2p::encoder::Residual;
-use b2p::encoder::transform::Fineness;
+use b2p::encoder::transform::QualityTarget;
 use b2p::gaussians::HeadSet;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -179,7 +179,7 @@ pub struct Encode {
     /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma twice that of luma unless said; coarser
     /// levels have finer steps [default: 20]
     #[arg(long, help_heading = "Advanced", value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
-    pub step: Option<Fineness>,
+    pub step: Option<QualityTarget>,
     /// Code the mean colours of the finest level's voxels exactly
     #[arg(long, help_heading = "Advanced")]
     pub lossless: bool,
@@ -265,9 +265,8 @@ pub struct Render {
     /// What is drawn
     #[arg(long, value_enum, value_name = "WHAT", default_value_t = Show::Colour)]
     pub show: Show,
-    /// Force an effect (harmonics, antialias, supersample, near, order) on or off
-    #[arg(long, help_heading = "Advanced", value_name = "NAME=on|off|auto", value_parser = effect)]
-    pub effect: Vec<(Effect, Choice)>,
+    #[arg(long, help_heading = "Advanced", value_name = "NAME=on|off|auto", value_parser = effect, help = effect_help())]
+    pub effect: Vec<(Effect, EffectMode)>,
     /// How much of what is faint may be left out: fast, fine, exact
     #[arg(long, help_heading = "Advanced", value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
     pub quality: Quality,
@@ -458,7 +457,13 @@ pub use super::values::Orbit;
 use super::values::{
     background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,
 };
-pub use b2p::renderer::{Background, Choice, Effect, Quality};
+pub use b2p::renderer::{Background, Effect, EffectMode, Quality};
+
+/// The help of `--effect`.
+fn effect_help() -> String {
+    let names = Effect::ALL.map(Effect::name).join(", ");
+    format!("Force an effect ({names}) on or off")
+}
 
 #[cfg(test)]
 mod tests {

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use b2p::cloud::{ColouredVoxels, PointCloud, voxelise, voxelise_closed};
-use b2p::encoder::transform::{self, Fineness};
+use b2p::encoder::transform::{self, QualityTarget};
 use b2p::encoder::{self, Encoded, Options, Rate, Residual};
 use b2p::latents::Steps;
 use b2p::log::Log;
@@ -162,13 +162,13 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> 
     }
     match args.step {
         Some(step) => options.fineness = step,
-        None if args.lossless => options.fineness = Fineness::Lossless,
+        None if args.lossless => options.fineness = QualityTarget::Lossless,
         None => {}
     }
     let in_cloud = Failure::in_file(&args.cloud);
     let (encoded, chosen) = match args.bits_per_point {
         Some(most) => {
-            let (encoded, chosen) = transform::encode_within(cloud, &options, most, log).map_err(in_cloud)?;
+            let (encoded, chosen) = transform::encode_to_rate(cloud, &options, most, log).map_err(in_cloud)?;
             let level = chosen.levels.map_or(0, |levels| *levels.end());
             let how = chosen.fineness;
             (encoded, format!(" of at most {most}: level {level}, {how}"))
@@ -203,7 +203,7 @@ fn learned(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
     let in_cloud = Failure::in_file(&args.cloud);
     let (encoded, chosen) = match args.bits_per_point {
         Some(most) => {
-            let found = encoder::encode_within(cloud, &model, &options, most, log);
+            let found = encoder::encode_to_rate(cloud, &model, &options, most, log);
             let (encoded, chosen) = found.map_err(in_cloud)?;
             (encoded, within(most, &chosen))
         }

@@ -1,7 +1,7 @@
 //! `b2p info`: what a stream holds.
 
 use b2p::container::{Level, Section, Stream};
-use b2p::latents::{Precision, Steps};
+use b2p::latents::{ResidualSteps, Steps};
 use b2p::{Limits, colour};
 use serde_json::json;
 
@@ -68,7 +68,7 @@ struct Described {
     /// Quantisation steps of the colours in version 3.
     steps: Option<colour::Steps>,
     residual: Option<usize>,
-    precision: Option<Precision>,
+    precision: Option<ResidualSteps>,
     whole: bool,
 }
 
@@ -79,7 +79,7 @@ fn levels(stream: &Stream) -> Result<Vec<Described>> {
     let describe = |(i, (level, (&voxels, &section)))| {
         let found: Option<&Level> = stream.levels().get(i);
         let residual = |found: &Level| found.residual.iter().map(|slice| slice.bytes.len() + 16).sum();
-        let precision = |found: &Level| Precision::read(found.residual.first()?.bytes);
+        let precision = |found: &Level| ResidualSteps::read(found.residual.first()?.bytes);
         Ok(Described {
             level,
             voxels,
@@ -228,7 +228,7 @@ fn step_told(steps: colour::Steps) -> String {
 }
 
 /// The bands of a residual with their steps of luma and chroma.
-fn told(precision: Precision) -> String {
+fn told(precision: ResidualSteps) -> String {
     let bands = [("fine", precision.fine), ("coarse", precision.coarse)];
     let bands = bands.iter().filter(|(_, steps)| *steps != Steps::NONE);
     let told = bands.map(|(band, steps)| format!("{band} {},{}", steps.luma, steps.chroma));

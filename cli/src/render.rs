@@ -7,7 +7,7 @@ use super::budget::Task;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
 use b2p::renderer::camera::{Camera, Extent};
-use b2p::renderer::{Background, Choice, Effects, Explanation, Quality, Renderer, Stats};
+use b2p::renderer::{Background, EffectMode, Effects, Explanation, Quality, Renderer, Stats};
 use b2p::{Error, Limits};
 use serde_json::json;
 
@@ -325,7 +325,7 @@ fn cost_of(line: &Explanation, artist: &mut Artist, effects: Effects, camera: &C
         Ok(least)
     };
     let mut without = effects;
-    without.set(effect, Choice::Off);
+    without.set(effect, EffectMode::Off);
     let [without, with] = [least(without)?, least(effects)?];
     let cost = with.as_secs_f64() - without.as_secs_f64();
     Ok(format!("; {:+.2} ms of {}", cost * 1e3, milliseconds(with)))
@@ -367,13 +367,7 @@ fn numbers(path: &Path, [width, height]: [u32; 2], stats: &Stats) -> serde_json:
         "pairs": stats.pairs,
         "overlap": stats.pairs as f64 / stats.visible.max(1) as f64,
         "coverage": stats.touched as f64 / (f64::from(width) * f64::from(height)),
-        "effects": {
-            "harmonics": effects.harmonics,
-            "antialias": effects.antialias,
-            "supersample": effects.supersample,
-            "near": effects.near,
-            "order": effects.order,
-        },
+        "effects": effects,
         "ms": {
             "project": ms(times.project),
             "bin": ms(times.bin),

@@ -8,7 +8,7 @@ use b2p::encoder::{Options, encode, transform};
 use b2p::gaussians::{Gaussians, Harmonics};
 use b2p::geometry::Voxels;
 use b2p::latents::LatentDecoder;
-use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
+use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, ResidualSteps, Steps};
 use b2p::log::Log;
 use b2p::{Limits, Placement};
 use b2p_formats::splats::{Axes, Format, write};
@@ -61,8 +61,8 @@ fn transformed() -> Vec<Vec<u8>> {
         let stream = transform::encode(&cloud, &options, &Log::default());
         stream.expect("a small cloud is coded").bytes
     };
-    let step = transform::Fineness::Step;
-    let lossless = transform::Fineness::Lossless;
+    let step = transform::QualityTarget::Step;
+    let lossless = transform::QualityTarget::Lossless;
     vec![
         coded(1, vec![0, 7], 0..=1, 16_384, step(8.0)),
         coded(2, vec![0, 5, 63], 1..=2, 2, lossless),
@@ -83,7 +83,7 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
     let filter = ColourFilter { exponent: 7, weights };
     let slice = stream.header().slice_voxels as usize;
     let steps = |luma, chroma| Steps { luma, chroma };
-    let precision = Precision {
+    let precision = ResidualSteps {
         fine: steps(30, 12),
         coarse: steps(10, 4),
         boundary: 3,

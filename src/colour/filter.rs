@@ -13,6 +13,8 @@
 //! # Arithmetic
 //! Integers as in clause 5.11.3. Products of a sum and an inverse have 64 bits. Results are clamped as decoded colours.
 
+use std::ops::Range;
+
 use b2p_kernels::smooth::{Lanes, Values, responses};
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
@@ -178,11 +180,22 @@ pub(super) fn widen(values: &[Ycc]) -> Vec<Values> {
 }
 
 /// Offsets of the neighbours that share a face, as indices into a 3³ row.
-const FACES: [usize; 6] = [4, 10, 12, 14, 16, 22];
+pub(super) const FACES: [usize; 6] = [4, 10, 12, 14, 16, 22];
 /// Offsets of the neighbours that share only an edge.
-const EDGES: [usize; 12] = [1, 3, 5, 7, 9, 11, 15, 17, 19, 21, 23, 25];
+pub(super) const EDGES: [usize; 12] = [1, 3, 5, 7, 9, 11, 15, 17, 19, 21, 23, 25];
 /// Offsets of the neighbours that share only a corner.
-const CORNERS: [usize; 8] = [0, 2, 6, 8, 18, 20, 24, 26];
+pub(super) const CORNERS: [usize; 8] = [0, 2, 6, 8, 18, 20, 24, 26];
+
+/// All places of a row.
+const PLACES: [usize; 27] = {
+    let mut places = [0; 27];
+    let mut k = 0;
+    while k < 27 {
+        places[k] = k;
+        k += 1;
+    }
+    places
+};
 
 /// Response functions of a level: lanes 0 to 2 are the narrow responses of Y, Co and Cg, lanes 4 to 6 the wide ones.
 pub(super) struct Responses {
@@ -206,20 +219,27 @@ impl Responses {
     #[inline(always)]
     pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], map: &KernelMap, voxel: usize) -> Terms {
         let (own, row) = (&values[voxel], map.row(voxel));
-        // An absent neighbour is replaced by the voxel itself, to which there is no response: no branches, for the
-        // presence of neighbours is unpredictable.
-        let mut filled = [voxel as u32; 27];
-        for (to, &q) in filled.iter_mut().zip(row) {
-            *to = if q == KernelMap::ABSENT { *to } else { q };
-        }
-        let sum = |offsets: &[usize]| responses(instructions, values, own, &filled, offsets, &self.inverses).0;
-        let (faces, edges, corners) = (sum(&FACES), sum(&EDGES), sum(&CORNERS));
-        let [face, edge, corner] = CLASS_WEIGHTS;
-        let count = |offsets: &[usize]| {
-            let present = offsets.iter().map(|k| i32::from(row[*k] != KernelMap::ABSENT));
-            present.sum::<i32>()
+        // Those that are present come together first, without branches: their presence is unpredictable.
+        let mut present = [0; 32];
+        let mut count = 0;
+        let mut gather = |offsets: &[usize]| {
+            let first = count;
+            for &k in offsets {
+                present[count & 31] = row[k];
+                count += usize::from(row[k] != KernelMap::ABSENT);
+            }
+            first..count
         };
-        let counts = count(&FACES) * face + count(&EDGES) * edge + count(&CORNERS) * corner;
+        let classes = (gather(&FACES), gather(&EDGES), gather(&CORNERS));
+        let sum = |class: Range<usize>| {
+            let places = &PLACES[class];
+            responses(instructions, values, own, &present, places, &self.inverses)
+        };
+        let (faces, face_count) = sum(classes.0);
+        let (edges, edge_count) = sum(classes.1);
+        let (corners, corner_count) = sum(classes.2);
+        let [face, edge, corner] = CLASS_WEIGHTS;
+        let counts = face_count * face + edge_count * edge + corner_count * corner;
         let inverse = i64::from((1u32 << 16) / counts.max(1) as u32);
         let mean = |sum: i32| ((i64::from(sum) * inverse) >> 14) as i32;
         std::array::from_fn(|t| {

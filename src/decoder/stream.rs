@@ -217,7 +217,7 @@ impl Decoder {
             Format::Learned { .. } => self.learned(header)?.memory(header, level),
             Format::Transform { .. } => {
                 let drawing = self.drawing_bytes(header, level)?;
-                Ok(drawing + super::memory::transform(header, level)?)
+                super::memory::transform(header, level, drawing)
             }
         }
     }

@@ -4,8 +4,8 @@ use std::ops::RangeInclusive;
 
 use b2p_kernels::Isa;
 
-use super::transform::{self, Fineness};
-use super::{Encoded, Options, encode, encode_within};
+use super::transform::{self, QualityTarget};
+use super::{Encoded, Options, encode, encode_to_rate};
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
 use crate::gaussians::learned::HeadsModel;
@@ -53,7 +53,7 @@ impl Encoder {
     }
 
     /// The same encoder with another quality of colours. Without effect on streams of version 2.
-    pub fn with_quality(mut self, quality: Fineness) -> Self {
+    pub fn with_quality(mut self, quality: QualityTarget) -> Self {
         self.options.fineness = quality;
         self
     }
@@ -92,7 +92,8 @@ impl Encoder {
         self
     }
 
-    /// The same encoder with λ of the rate–distortion optimised quantisation of version 2 scaled by this factor. Default: 1.
+    /// The same encoder with λ of the rate–distortion optimised quantisation of version 2 scaled by this factor.
+    /// Default: 1.
     pub fn with_lambda_scale(mut self, factor: f32) -> Self {
         self.lambda_scale = Some(factor);
         self
@@ -126,8 +127,8 @@ impl Encoder {
     /// [`Encoder::encode`].
     pub fn encode_to_rate(&self, cloud: &ColouredVoxels, bits_per_point: f64) -> Result<Encoded> {
         Ok(match &self.model {
-            None => transform::encode_within(cloud, &self.options, bits_per_point, &self.log())?.0,
-            Some(model) => encode_within(cloud, model, &self.learned(), bits_per_point, &self.log())?.0,
+            None => transform::encode_to_rate(cloud, &self.options, bits_per_point, &self.log())?.0,
+            Some(model) => encode_to_rate(cloud, model, &self.learned(), bits_per_point, &self.log())?.0,
         })
     }
 

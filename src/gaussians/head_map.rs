@@ -178,7 +178,7 @@ mod tests {
     fn a_block_holds_the_voxels_below_a_voxel_three_levels_above() {
         let keys = (0..4000).map(|i: u32| morton::encode([i % 40, i / 40 % 50, (i * 7 / 40) % 60]));
         let octree = Octree::new(Voxels::new(6, keys.collect())).unwrap();
-        for level in 0..=6 {
+        for level in 0..=6u8 {
             let above = octree.level(level.saturating_sub(3));
             let blocks = HeadMap::block_of(&octree, level);
             assert_eq!(blocks.len(), octree.level(level).len());

@@ -1,7 +1,7 @@
 //! Streams of version 3: colours as transform coefficients.
 
 mod head_maps;
-mod within;
+mod rate_control;
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -12,7 +12,9 @@ use rayon::prelude::*;
 use super::{Encoded, rates};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{self, Filter, Steps, Truth};
-use crate::container::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
+#[cfg(doc)]
+use crate::container::MAX_COLOUR_SLICE;
+use crate::container::{Format, Header, MAX_SLICE_VOXELS, Writer};
 use crate::decoder::{Decoder, Decoding, colour_hash};
 use crate::error::{Error, Result};
 use crate::gaussians::learned::HeadsModel;
@@ -20,12 +22,12 @@ use crate::gaussians::{HeadMap, HeadSet};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
-pub use within::encode_within;
+pub use rate_control::encode_to_rate;
 
 /// How exactly colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
-pub enum Fineness {
+pub enum QualityTarget {
     /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice that.
     Step(f32),
     /// The same with a size for each.
@@ -39,22 +41,23 @@ pub enum Fineness {
     Lossless,
 }
 
-/// What may be chosen about a stream of version 3; [`encode_within`] chooses how exactly colours are coded, and may leave out the finest levels.
+/// What may be chosen about a stream of version 3; [`encode_to_rate`] chooses how exactly colours are coded, and may leave out the finest levels.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The levels that a stream may be cut after, the last one at most the bit depth N. Default: N−3 to N−1.
     pub levels: Option<RangeInclusive<u8>>,
     /// How exactly colours are coded.
-    pub fineness: Fineness,
+    pub fineness: QualityTarget,
     /// Whether levels have a filter that the decoder runs on their colours.
     pub filter: bool,
     /// Whether quantisation is rate–distortion optimised; otherwise coefficients are rounded to the nearest.
     pub optimised: bool,
-    /// Streams that [`encode_within`] tries for a level at most, once one fits.
+    /// Streams that [`encode_to_rate`] tries for a level at most, once one fits.
     pub tries: usize,
     /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
-    /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`].
+    /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`]: fewer let more threads decode a level, and cost
+    /// bits.
     pub colour_slice: u32,
     /// Heads whose pictures are compared with those of surfels, so that the stream says where surfels are better; `None` for no head maps.
     pub heads: Option<HeadsModel>,
@@ -66,17 +69,20 @@ impl Default for Options {
     fn default() -> Self {
         Options {
             levels: None,
-            fineness: Fineness::Step(20.0),
+            fineness: QualityTarget::Step(20.0),
             filter: true,
             optimised: true,
             tries: usize::MAX,
             slice_voxels: MAX_SLICE_VOXELS,
-            colour_slice: MAX_COLOUR_SLICE / 2,
+            colour_slice: COLOUR_SLICE,
             heads: None,
             isa: None,
         }
     }
 }
+
+/// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.
+const COLOUR_SLICE: u32 = 8192;
 
 /// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green and blue comes of both.
 const CHROMA: u8 = 8;
@@ -99,26 +105,26 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     subject.checked(coded, options.heads.as_ref(), usize::MAX, log)
 }
 
-impl fmt::Display for Fineness {
+impl fmt::Display for QualityTarget {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Fineness::Step(luma) => write!(f, "step {luma:.2}"),
-            Fineness::Steps { luma, chroma } => write!(f, "step {luma:.2},{chroma:.2}"),
-            Fineness::Lossless => f.write_str("exact colours"),
+            QualityTarget::Step(luma) => write!(f, "step {luma:.2}"),
+            QualityTarget::Steps { luma, chroma } => write!(f, "step {luma:.2},{chroma:.2}"),
+            QualityTarget::Lossless => f.write_str("exact colours"),
         }
     }
 }
 
-impl Fineness {
+impl QualityTarget {
     /// The steps of the finest level.
     fn steps(self) -> Result<Steps> {
         match self {
-            Fineness::Lossless => Ok(Steps::LOSSLESS),
-            Fineness::Step(step) => {
+            QualityTarget::Lossless => Ok(Steps::LOSSLESS),
+            QualityTarget::Step(step) => {
                 let luma = nearest(step)?;
                 Ok(steps_of(luma, luma))
             }
-            Fineness::Steps { luma, chroma } => Ok(Steps {
+            QualityTarget::Steps { luma, chroma } => Ok(Steps {
                 luma: nearest(luma)?,
                 chroma: nearest(chroma)?.min(MAX_CHROMA),
             }),
@@ -129,8 +135,8 @@ impl Fineness {
     fn of(steps: Steps) -> Self {
         let size = |luma| Steps { luma, ..steps }.luma_step();
         match steps.is_lossless() {
-            true => Fineness::Lossless,
-            false => Fineness::Steps {
+            true => QualityTarget::Lossless,
+            false => QualityTarget::Steps {
                 luma: size(steps.luma),
                 chroma: size(steps.chroma),
             },

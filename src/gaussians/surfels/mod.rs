@@ -98,12 +98,15 @@ pub fn surfels(
         assert_eq!(only.len(), voxels.len(), "one choice per voxel");
         only.iter().filter(|&&on| on).count()
     });
-    let own = moments::of_voxels(voxels);
-    let near = moments::step(isa, map, &own);
+    // Memory that was touched before is faster than fresh memory.
+    let mut spare = moments::of_voxels(voxels);
+    let near = moments::step(isa, map, &spare);
     let mut far = moments::step(isa, map, &near);
     for _ in 2..moments::ROUNDS {
-        far = moments::step(isa, map, &far);
+        moments::step_into(isa, map, &far, &mut spare);
+        std::mem::swap(&mut far, &mut spare);
     }
+    drop(spare);
     let n = per_voxel.count();
     let count = chosen * n;
     let edge = 2.0 / (1u32 << voxels.depth()) as f32;

@@ -11,8 +11,8 @@ const SHARE: f64 = 0.95;
 /// Standard deviations of a Gaussian that count as part of the object.
 const REACH: f64 = 1.5;
 
-/// Directions in which an object's outermost points are looked for, beside the axes: so many, spread evenly, miss less than 2 % of
-/// the radius of a ball.
+/// Directions in which an object's outermost points are looked for, beside the axes: so many, spread evenly, miss less
+/// than 2 % of the radius of a ball.
 const DIRECTIONS: usize = 96;
 /// Points that are looked at in these directions; along the axes all are.
 const LOOKED_AT: usize = 1 << 16;
@@ -32,8 +32,8 @@ impl Extent {
         }
     }
 
-    /// The part that `spheres` take, each a centre and a radius, as far as it lies in the cube; the cube if there are none. What is not
-    /// finite does not count.
+    /// The part that `spheres` take, each a centre and a radius, as far as it lies in the cube; the cube if there are
+    /// none. What is not finite does not count.
     pub fn of(spheres: impl Iterator<Item = ([f64; 3], f64)> + Clone) -> Extent {
         let spheres = spheres
             .map(|(centre, radius)| (DVec3::from(centre), radius))
@@ -114,8 +114,9 @@ impl Camera {
         Ok(camera)
     }
 
-    /// The least radius from which [`Camera::orbit_around`] `target` has the whole of `extent` in view; with parallel rays, the
-    /// distance for [`Camera::orthographic`]. `self` has the view's direction, focal length and size, whatever its distance is.
+    /// The least radius from which [`Camera::orbit_around`] `target` has the whole of `extent` in view; with parallel
+    /// rays, the distance for [`Camera::orthographic`]. `self` has the view's direction, focal length and size,
+    /// whatever its distance is.
     pub fn radius_for(&self, extent: &Extent, target: [f64; 3], projection: Projection) -> f64 {
         let half = [self.width, self.height].map(|side| SHARE * f64::from(side) / 2.0);
         let needed = |point: DVec3| {
