@@ -54,6 +54,8 @@
 #![forbid(unsafe_code)]
 
 #[doc(hidden)]
+pub mod axes;
+#[doc(hidden)]
 pub mod cancel;
 #[cfg(feature = "ply")]
 #[doc(hidden)]
@@ -100,12 +102,16 @@ pub mod renderer;
 #[cfg(test)]
 mod testing;
 
+pub use axes::{Axes, Up};
 #[doc(hidden)]
 pub use b2p_kernels::ceiling;
 pub use b2p_kernels::{Isa, UnknownIsa};
 pub use cancel::Cancel;
 #[cfg(feature = "ply")]
-pub use cloud::{ColouredVoxels, Hints, PointCloud, voxelise, voxelise_closed};
+pub use cloud::{
+    ColourRange, ColouredVoxels, Coordinates, GridReport, Hints, Note, PointCloud, RawColours, RawPoints, ReadOptions,
+    Stored, voxelise, voxelise_closed,
+};
 pub use container::{Format, Header};
 pub use decoder::{Decoder, Decoding, Points};
 #[cfg(feature = "encoder")]

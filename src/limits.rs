@@ -35,7 +35,7 @@ impl Default for Limits {
 }
 
 impl Limits {
-    /// What the library takes beyond `max_bytes`, however small the input: threads and their desks.
+    /// What the library takes beyond `max_bytes`, however small the input: threads and their scratch.
     pub const OVERHEAD: u64 = 4 << 20;
 
     /// For boards with 512 MB of memory: 2²⁰ points, pictures of 2²² pixels and 2²⁴ pairs, 192 MiB.

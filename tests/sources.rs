@@ -43,9 +43,10 @@ const STAGES: [(&str, &[&str]); 12] = [
 ];
 
 /// What every stage may use.
-const COMMONS: [&str; 11] = [
+const COMMONS: [&str; 12] = [
     "input",
     "Error",
+    "axes",
     "cancel",
     "error",
     "limits",

@@ -5,14 +5,14 @@ mod common;
 use std::collections::BTreeMap;
 
 use b2p::cloud::{ColouredVoxels, voxelise};
-use b2p::container::{Header, Stream};
+use b2p::container::{self, Header, Stream};
 use b2p::encoder::transform::{Options, QualityTarget, encode, encode_to_rate};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::latents::network::Model;
 use b2p::log::Log;
-use b2p::{Cancel, Error, Isa, Limits};
+use b2p::{Axes, Cancel, Error, Isa, Limits, Up};
 use b2p::{Decoder, Decoding};
 use common::{Ball, cloud_of, tiny_model};
 
@@ -170,6 +170,28 @@ fn points_are_a_cloud_on_the_grid_of_their_level() {
     assert_eq!(grid.placement.origin, cloud.placement.origin);
     assert_eq!(grid.placement.voxel_size, 1.0);
     assert_eq!(told(&decoding).unwrap().1, grid.colours);
+}
+
+#[test]
+fn axes_in_a_stream_leave_what_is_decoded_unchanged() {
+    let axes = Axes {
+        up: Some(Up::Z),
+        metres_per_unit: Some(1.0),
+        crs: "EPSG:32633".into(),
+    };
+    for cloud in clouds() {
+        let levels = 0..=cloud.voxels.depth();
+        let from_root = Options {
+            levels: (cloud.voxels.depth() < 21).then_some(levels),
+            ..Options::default()
+        };
+        for options in [Options::default(), from_root] {
+            let plain = stream(&cloud, &options);
+            let marked = container::with_axes(&plain, &axes).unwrap();
+            assert_eq!(container::axes(&marked).unwrap(), axes);
+            assert_eq!(points(&marked, None), points(&plain, None));
+        }
+    }
 }
 
 #[test]

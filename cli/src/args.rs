@@ -153,7 +153,7 @@ pub enum Command {
 
 #[derive(Debug, Args)]
 pub struct Encode {
-    /// Point cloud: PLY, ascii or binary, with x y z and red green blue. `-`: standard input
+    /// Point cloud: PLY, LAS, LAZ, PCD, E57, XYZ, CSV, OBJ, glTF or GLB, recognised by content. `-`: standard input
     #[arg(value_name = "IN")]
     pub cloud: PathBuf,
     #[command(flatten)]
@@ -169,7 +169,7 @@ pub struct Encode {
     /// 2 + EFFORT tries for a level, of 9 as many as it takes [default: 9]
     #[arg(short, long, value_name = "0..9", value_parser = clap::value_parser!(u8).range(0..=9))]
     pub effort: Option<u8>,
-    /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs; less if its points lie too far apart for that]
+    /// Bit depth N of the voxel grid, 1 to 21 [default: by the spacing of the points; at most what a cloud of integers needs]
     #[arg(long, help_heading = "Advanced", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
     pub bits: Option<u8>,
     /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last below N
@@ -192,6 +192,8 @@ pub struct Encode {
     /// Do not look where surfels draw better than learned heads: encoding takes less time
     #[arg(long)]
     pub no_head_maps: bool,
+    #[command(flatten)]
+    pub read: ReadArgs,
     #[command(flatten)]
     pub learned: LearnedArgs,
     #[command(flatten)]
@@ -231,9 +233,12 @@ pub struct Decode {
     pub input: PathBuf,
     #[command(flatten)]
     pub output: Output,
-    /// Write the level's voxels with their colours instead, as a PLY of points (of learned streams there are none)
+    /// Write the level's voxels with their colours instead, as points: PLY, or LAS, LAZ, PCD, E57 or XYZ by the ending (of learned
+    /// streams there are none)
     #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
     pub points: bool,
+    #[command(flatten)]
+    pub write: WriteArgs,
     #[command(flatten)]
     pub detail: DetailArg,
     #[command(flatten)]
@@ -244,7 +249,7 @@ pub struct Decode {
 
 #[derive(Debug, Args)]
 pub struct Render {
-    /// Stream, or PLY of Gaussians. `-`: standard input, drawn as it comes
+    /// Stream, PLY of Gaussians, or point cloud. `-`: standard input, drawn as it comes
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
@@ -259,6 +264,9 @@ pub struct Render {
     /// glTF's camera nodes
     #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov", "look_at"])]
     pub camera: Option<PathBuf>,
+    /// Axis that points up in the pictures of --orbit: x, y, z, -x, -y, -z, or auto [default: what the input says, else y]
+    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true, conflicts_with = "camera")]
+    pub up: Option<UpArg>,
     /// Parallel rays; the cube's centre stays as large as it is
     #[arg(long, conflicts_with = "camera")]
     pub orthographic: bool,
@@ -453,6 +461,7 @@ pub struct ModelArg {
 }
 
 use super::budget::BudgetArgs;
+use super::cloud::{ReadArgs, UpArg, WriteArgs, up};
 pub use super::values::Orbit;
 use super::values::{
     background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,

@@ -14,7 +14,7 @@ use b2p::{Decoder, Error, Isa, Limits, UnknownIsa, input};
 
 use super::args::{DetailArg, ModelArg};
 use super::views::Shot;
-use super::{Failure, Result, kinds, manners};
+use super::{Failure, Result, cloud, kinds, manners};
 
 /// A stream or Gaussians, told apart by their first bytes.
 pub const PLY_MAGIC: &[u8] = b"ply";
@@ -162,7 +162,7 @@ pub fn gaussians(
     log: &Log,
 ) -> Result<Gaussians> {
     let bytes = bytes(path, limits)?;
-    if bytes.starts_with(PLY_MAGIC) {
+    if bytes.starts_with(PLY_MAGIC) || cloud::is_cloud(&bytes) {
         return ply(path, &bytes, detail, limits, log);
     }
     kinds::check_stream(path, &bytes)?;
@@ -189,7 +189,7 @@ impl<'p> Source<'p> {
     /// Reads a file.
     pub fn open(path: &'p Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Self> {
         let bytes = bytes(path, limits)?;
-        if bytes.starts_with(PLY_MAGIC) {
+        if bytes.starts_with(PLY_MAGIC) || cloud::is_cloud(&bytes) {
             return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
         }
         kinds::check_stream(path, &bytes)?;
@@ -254,7 +254,7 @@ impl<'p> Source<'p> {
     }
 }
 
-/// Gaussians as they stand in the PLY `bytes`, which came from `path`.
+/// Gaussians as they stand in the PLY `bytes`, which came from `path`; those of a point cloud are surfels.
 pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Gaussians> {
     let asked = [("--level", detail.level.is_some()), ("--heads", detail.heads.is_some())];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
@@ -263,7 +263,9 @@ pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: 
             path.display()
         )));
     }
-    kinds::check_gaussians(path, bytes)?;
+    if let Some(surfels) = cloud::drawable(path, bytes, isa(None)?, limits, log)? {
+        return Ok(surfels);
+    }
     let (gaussians, notes) = log
         .step("read Gaussians", 1, "file", || ply::read(bytes, limits))
         .map_err(Failure::in_file(path))?;

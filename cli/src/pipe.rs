@@ -10,7 +10,7 @@ use b2p::log::Log;
 use b2p::{Decoding, Error, Limits};
 
 use super::args::{DetailArg, ModelArg};
-use super::{Failure, Result, kinds, load, manners};
+use super::{Failure, Result, cloud, kinds, load, manners};
 
 /// The input that is standard input, and the output that is standard output.
 pub const PIPE: &str = "-";
@@ -50,7 +50,7 @@ pub fn each(
             Err(_) => break,
         }
     }
-    if start.starts_with(load::PLY_MAGIC) {
+    if start.starts_with(load::PLY_MAGIC) || cloud::is_cloud(&start) {
         for piece in pieces {
             start.extend(piece.map_err(broken)?);
             let length = start.len() as u64;

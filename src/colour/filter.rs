@@ -13,8 +13,6 @@
 //! # Arithmetic
 //! Integers as in clause 5.11.3. Products of a sum and an inverse have 64 bits. Results are clamped as decoded colours.
 
-use std::ops::Range;
-
 use b2p_kernels::smooth::{Lanes, Values, responses};
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
@@ -215,29 +213,34 @@ impl Responses {
         }
     }
 
+    /// The sums of the responses to the neighbours at these offsets, and how many of them are present.
+    ///
+    /// A function, as closures are not always inlined, and would then be compiled for the baseline of the target.
+    #[inline(always)]
+    fn sum<I: Instructions, const N: usize>(
+        &self,
+        instructions: I,
+        values: &[Values],
+        own: &Values,
+        row: &[u32],
+        offsets: &[usize; N],
+    ) -> (Lanes, i32) {
+        // Those that are present come together first, without branches: their presence is unpredictable.
+        let (mut present, mut count) = ([0; N], 0);
+        for &k in offsets {
+            present[count.min(N - 1)] = row[k];
+            count += usize::from(row[k] != KernelMap::ABSENT);
+        }
+        responses(instructions, values, own, &present, &PLACES[..count], &self.inverses)
+    }
+
     /// Computes the terms of one voxel.
     #[inline(always)]
     pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], map: &KernelMap, voxel: usize) -> Terms {
         let (own, row) = (&values[voxel], map.row(voxel));
-        // Those that are present come together first, without branches: their presence is unpredictable.
-        let mut present = [0; 32];
-        let mut count = 0;
-        let mut gather = |offsets: &[usize]| {
-            let first = count;
-            for &k in offsets {
-                present[count & 31] = row[k];
-                count += usize::from(row[k] != KernelMap::ABSENT);
-            }
-            first..count
-        };
-        let classes = (gather(&FACES), gather(&EDGES), gather(&CORNERS));
-        let sum = |class: Range<usize>| {
-            let places = &PLACES[class];
-            responses(instructions, values, own, &present, places, &self.inverses)
-        };
-        let (faces, face_count) = sum(classes.0);
-        let (edges, edge_count) = sum(classes.1);
-        let (corners, corner_count) = sum(classes.2);
+        let (faces, face_count) = self.sum(instructions, values, own, row, &FACES);
+        let (edges, edge_count) = self.sum(instructions, values, own, row, &EDGES);
+        let (corners, corner_count) = self.sum(instructions, values, own, row, &CORNERS);
         let [face, edge, corner] = CLASS_WEIGHTS;
         let counts = face_count * face + edge_count * edge + corner_count * corner;
         let inverse = i64::from((1u32 << 16) / counts.max(1) as u32);

@@ -59,6 +59,12 @@ impl Points<'_> {
     /// The points as a cloud with whole coordinates, whose hints say where the grid lies.
     #[cfg(feature = "ply")]
     pub fn to_cloud(&self) -> PointCloud {
+        self.to_voxels().to_cloud()
+    }
+
+    /// The points as voxels of the level's own grid.
+    #[cfg(feature = "ply")]
+    pub fn to_voxels(&self) -> ColouredVoxels {
         let Frame { bits, placement } = self.frame;
         let coarser = bits - self.voxels.depth();
         ColouredVoxels {
@@ -69,7 +75,6 @@ impl Points<'_> {
                 ..placement
             },
         }
-        .to_cloud()
     }
 }
 

@@ -12,10 +12,10 @@ const SHARE: f64 = 0.95;
 const REACH: f64 = 1.5;
 
 /// Directions in which an object's outermost points are looked for, beside the axes: so many, spread evenly, miss less
-/// than 2 % of the radius of a ball.
-const DIRECTIONS: usize = 96;
+/// than 3 % of the radius of a ball.
+const DIRECTIONS: usize = 64;
 /// Points that are looked at in these directions; along the axes all are.
-const LOOKED_AT: usize = 1 << 16;
+const LOOKED_AT: usize = 1 << 15;
 
 /// The part of the cube that an object takes, by its outermost points.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,8 +46,8 @@ impl Extent {
         };
         let axes = DVec3::AXES.into_iter().flat_map(|axis| [axis, -axis]);
         let on_axes = axes.map(|axis| outermost(axis, &mut spheres.clone()));
-        let some = spheres.clone().step_by(count.div_ceil(LOOKED_AT).max(1));
-        let around = (0..DIRECTIONS).map(|i| outermost(spread(i, DIRECTIONS), &mut some.clone()));
+        let some: Vec<_> = spheres.clone().step_by(count.div_ceil(LOOKED_AT).max(1)).collect();
+        let around = (0..DIRECTIONS).map(|i| outermost(spread(i, DIRECTIONS), &mut some.iter().copied()));
         let points = on_axes.chain(around).flatten();
         let points: Vec<DVec3> = points.map(|point| point.clamp(DVec3::NEG_ONE, DVec3::ONE)).collect();
         match points.is_empty() {
