@@ -149,13 +149,13 @@ impl Search<'_> {
         Ok(Some(best))
     }
 
-    /// Bytes to set aside for head maps: none where they might take more than 2 % of the stream.
+    /// Bytes to set aside for head maps: none where they might take more than 6 % of the stream.
     fn head_map_bytes(&self, top: u8) -> usize {
         let bytes = match self.subject.options.heads {
             Some(_) => self.subject.head_map_bytes(top),
             None => 0,
         };
-        if 50.0 * bytes as f64 <= self.room { bytes } else { 0 }
+        if 16.0 * bytes as f64 <= self.room { bytes } else { 0 }
     }
 
     fn attempt(&mut self, place: Place, log: &Log) -> Result<Option<(Place, Coded)>> {
