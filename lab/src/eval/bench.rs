@@ -6,7 +6,7 @@ use b2p::container::Header;
 use b2p::encoder::{Options, encode};
 use b2p::gaussians::Heads;
 use b2p::gaussians::{Frame, Gaussians};
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::log::Log;
 
@@ -166,7 +166,7 @@ impl Bench {
             }
             Content::Stream(bytes) => {
                 let header = Header::parse(&bytes, &Limits::default())?;
-                let decoder = Decoder::new(self.model()?).with_heads(self.heads)?;
+                let decoder = LatentDecoder::new(self.model()?).with_heads(self.heads)?;
                 let levels = match &self.levels {
                     Some(levels) => levels.clone(),
                     None => decoder.levels(&bytes)?,
