@@ -244,10 +244,10 @@ fn measure(
     Ok(())
 }
 
-/// What is drawn: the plain picture, one without care for the near plane too where something reaches over it, or one with each effect.
+/// What is drawn: the plain picture, one without ray-space evaluation too where something crosses the near plane, or one with each effect.
 fn variants(forced: bool, within: bool) -> Vec<(&'static str, Effects, Channel)> {
     let none = Effects::default();
-    let careless = none.with(Effect::Near, EffectMode::Off);
+    let without_ray_space = none.with(Effect::Near, EffectMode::Off);
     let antialias = none.with(Effect::Antialias, EffectMode::On);
     let order = none.with(Effect::Order, EffectMode::On);
     if forced {
@@ -259,7 +259,10 @@ fn variants(forced: bool, within: bool) -> Vec<(&'static str, Effects, Channel)>
             (", normals", none, Channel::Normal),
         ]
     } else if within {
-        vec![("", none, Channel::Colour), (", no care", careless, Channel::Colour)]
+        vec![
+            ("", none, Channel::Colour),
+            (", no ray space", without_ray_space, Channel::Colour),
+        ]
     } else {
         vec![("", none, Channel::Colour)]
     }

@@ -104,7 +104,7 @@ mod testing;
 
 pub use axes::{Axes, Up};
 #[doc(hidden)]
-pub use b2p_kernels::ceiling;
+pub use b2p_kernels::peak as peak_throughput;
 pub use b2p_kernels::{Isa, UnknownIsa};
 pub use cancel::Cancel;
 #[cfg(feature = "ply")]

@@ -266,7 +266,7 @@ fn fewer_levels_make_a_shorter_stream_that_still_draws() {
 }
 
 #[test]
-fn a_stream_of_another_model_is_told_apart() {
+fn a_stream_of_another_model_is_detected() {
     let bytes = coded(&ball(6, 20.0), &model()).bytes;
     let other = Model::from_bytes(&tiny_model(1)).unwrap();
     let error = LatentDecoder::new(&other)

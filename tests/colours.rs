@@ -194,7 +194,7 @@ fn quick_heads_are_corrected_by_the_same_residual() {
 }
 
 #[test]
-fn what_is_wide_of_what_colours_are_off_is_coded_unless_said_otherwise() {
+fn the_low_frequency_band_of_the_colour_residual_is_coded_by_default() {
     let (model, cloud) = (model(), ball(8, 90.0));
     let encoded = |filter, residual| encoded_with(&model, &cloud, filter, residual);
     let has = |encoded: &Encoded| {

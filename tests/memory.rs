@@ -65,7 +65,7 @@ fn clouds() -> Vec<(&'static str, ColouredVoxels)> {
 }
 
 #[test]
-fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
+fn decoding_holds_no_more_than_the_bound_that_its_header_gives() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     for (name, model) in models() {
         let decoder = LatentDecoder::new(&model).with_limits(Limits::unlimited());
@@ -114,7 +114,7 @@ fn transformed(cloud: &ColouredVoxels) -> [Vec<u8>; 3] {
 }
 
 #[test]
-fn decoding_version_3_holds_no_more_than_its_header_allows_to_foretell() {
+fn decoding_version_3_holds_no_more_than_the_bound_that_its_header_gives() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let decoder = Decoder::new().with_limits(Limits::unlimited());
     for (kind, cloud) in clouds() {
@@ -145,7 +145,7 @@ fn decoding_version_3_holds_no_more_than_its_header_allows_to_foretell() {
 
 /// With each network of the heads that ship, in each precision that every machine has.
 #[test]
-fn drawing_version_3_with_learned_heads_holds_no_more_than_its_header_allows_to_foretell() {
+fn drawing_version_3_with_learned_heads_holds_no_more_than_the_bound_that_its_header_gives() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let heads = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/heads.safetensors");
     let heads = HeadsModel::open(&heads).expect("the heads that ship load");
@@ -355,7 +355,7 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
     // One thread: of several, each takes what it needs when the fullest tile first comes to it.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1);
     let pool = pool.build().unwrap();
-    // From afar, and from among them, where some reach over the near plane.
+    // From a distance, and from among them, where some reach over the near plane.
     for (distance, crossing) in [(3.0, false), (0.8, true)] {
         let camera = Camera::orbit(10.0, 10.0, distance, 45.0, 200, 150).unwrap();
         for effects in [plain, antialias, order] {

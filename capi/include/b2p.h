@@ -10,7 +10,7 @@
 // Rules. Every object is freed by the function named after it, once; NULL is ignored there. Functions that can fail return a status,
 // and put a text of at most `size` bytes, zero at the end, into `message`, which may be NULL. What takes a `const` object may be
 // called from several threads at once, everything else from one thread at a time. There is no global state. Nothing of Rust
-// unwinds across the border: a defect inside the library is reported as B2P_STATUS_INTERNAL.
+// unwinds across the FFI boundary: a defect inside the library is reported as B2P_STATUS_INTERNAL.
 
 // How a function ended.
 typedef enum b2p_status {

@@ -4,7 +4,7 @@ use std::ffi::c_char;
 
 use b2p::gaussians::HeadSet;
 
-use crate::border::{Fault, Status, borrowed, changed, give, guard, slice, take};
+use crate::boundary::{Fault, Status, borrowed, changed, give, guard, slice, take};
 use crate::model::{HeadsModel, Limits, Model};
 
 /// A switch that stops decodings from another thread.

@@ -3,7 +3,7 @@
 use std::ffi::{CStr, c_char};
 use std::path::Path;
 
-use crate::border::{Fault, Status, give, guard, slice, take};
+use crate::boundary::{Fault, Status, give, guard, slice, take};
 
 /// A model, ready to run. Any number of decodings share it, in any threads.
 pub struct Model(pub(crate) b2p::Model);

@@ -4,7 +4,7 @@ use std::ffi::c_char;
 
 use b2p::renderer::{Background, render};
 
-use crate::border::{Fault, Status, borrowed, changed, guard};
+use crate::boundary::{Fault, Status, borrowed, changed, guard};
 use crate::decoding::Gaussians;
 use crate::model::Limits;
 

@@ -2,7 +2,7 @@
 
 use std::ffi::c_char;
 
-use crate::border::{Fault, Status, borrowed, changed, give, guard, take};
+use crate::boundary::{Fault, Status, borrowed, changed, give, guard, take};
 use crate::decoding::Decoding;
 
 /// The voxels of a level with their colours.

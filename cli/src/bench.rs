@@ -10,7 +10,7 @@ use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Module, Shape, Work};
 use b2p::layers::Precision;
 use b2p::log::{Log, Step};
-use b2p::{Isa, Limits, ceiling, embedded};
+use b2p::{Isa, Limits, embedded, peak_throughput};
 use serde_json::json;
 
 use super::args::Bench;
@@ -89,7 +89,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
         loading,
         total: median(runs.iter().map(|run| run.0)),
         lines: lines(&runs, &works),
-        ceilings: Ceilings::measure(isa, precision, threads.min(cores)),
+        peak: PeakThroughput::measure(isa, precision, threads.min(cores)),
         memory: peak_memory(),
     };
     Ok(Said::result(match manners::json() {
@@ -132,7 +132,7 @@ struct Report {
     loading: Duration,
     total: Duration,
     lines: Vec<Line>,
-    ceilings: Ceilings,
+    peak: PeakThroughput,
     memory: Option<u64>,
 }
 
@@ -146,12 +146,12 @@ impl Report {
                 "median_ms": line.median.as_secs_f64() * 1e3,
                 "gmac": line.work.map(|w| w.macs as f64 / 1e9),
                 "gmac_per_s": line.work.map(|w| rate(w, line.median)),
-                "share_of_ceiling": self.ceilings.share(line),
+                "share_of_ceiling": self.peak.share(line),
                 "mbytes": line.work.map(|w| w.bytes as f64 / 1e6),
             })
         };
         let stages: Vec<_> = self.lines.iter().map(stage).collect();
-        let Ceilings { integers, gaussians } = self.ceilings;
+        let PeakThroughput { integers, gaussians } = self.peak;
         let report = json!({
             "level": self.level,
             "isa": self.isa.to_string(),
@@ -174,7 +174,7 @@ impl Report {
             .map(|bytes| format!(", peak memory {} MB", bytes / 1_000_000));
         format!(
             "level {}, {} heads, {}, {}, {} threads, medians of {} runs{}\n{}\n\
-             Ceilings, measured just now: {:.0} GMAC/s in integers, {:.0} in what Gaussians are generated in.\n\
+             Peak throughput, measured just now: {:.0} GMAC/s in integers, {:.0} in what Gaussians are generated in.\n\
              MB: what a stage's layers must read and write at least once.\n",
             self.level,
             self.heads,
@@ -184,8 +184,8 @@ impl Report {
             self.runs,
             memory.unwrap_or_default(),
             table(&self.rows()),
-            self.ceilings.integers,
-            self.ceilings.gaussians,
+            self.peak.integers,
+            self.peak.gaussians,
         )
     }
 
@@ -203,7 +203,7 @@ impl Report {
             if let Some(work) = line.work {
                 row.push(format!("{:.2}", work.macs as f64 / 1e9));
                 row.push(format!("{:.1}", rate(work, line.median)));
-                let share = self.ceilings.share(line).unwrap_or_default();
+                let share = self.peak.share(line).unwrap_or_default();
                 row.push(format!("{:.0} %", 100.0 * share));
                 row.push(format!("{:.0}", work.bytes as f64 / 1e6));
             }
@@ -217,20 +217,20 @@ impl Report {
 }
 
 /// What all threads could multiply and add if nothing had to be fetched, in 10⁹ a second.
-struct Ceilings {
+struct PeakThroughput {
     integers: f64,
     gaussians: f64,
 }
 
-impl Ceilings {
+impl PeakThroughput {
     fn measure(isa: Isa, precision: Precision, cores: usize) -> Self {
-        let integers = cores as f64 * ceiling::i16(isa);
+        let integers = cores as f64 * peak_throughput::i16(isa);
         let gaussians = match precision {
             Precision::Int16 => integers,
-            Precision::F16 => cores as f64 * ceiling::f32(isa),
-            Precision::Half => cores as f64 * ceiling::half(isa),
+            Precision::F16 => cores as f64 * peak_throughput::f32(isa),
+            Precision::Half => cores as f64 * peak_throughput::half(isa),
         };
-        Ceilings { integers, gaussians }
+        PeakThroughput { integers, gaussians }
     }
 
     /// How near a stage came.

@@ -76,7 +76,7 @@ fn a_budget_chooses_says_so_and_measures_once() {
     let accurate = with(&["--min-psnr", "199"]);
     assert!(accurate.contains("not the 199 dB asked for"), "{accurate}");
     with(&["--budget", "1s", "--calibrate"]);
-    assert!(kept() != first, "measured anew");
+    assert!(kept() != first, "measured again");
 
     let render = ["render", "ball.b2p", "-o", "a.png", "--size", "64x48"];
     let drawn = succeeds(

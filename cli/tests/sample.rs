@@ -35,7 +35,7 @@ fn bits(g: &Gaussians) -> Vec<u32> {
 }
 
 #[test]
-fn the_dearer_a_bit_the_shorter_the_stream() {
+fn the_higher_lambda_the_shorter_the_stream() {
     let (model, cloud) = (model(), Ball::new(7, 45.0).cloud());
     let length = |bit_price| {
         let options = Options {

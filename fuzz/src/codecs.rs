@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 use b2p::container::Slice;
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::latents::entropy::{
-    Condition, SlicePart, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
+    Condition, RawRows, Rounding, SlicePart, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
     decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice, quantise, quantise_passes,
 };
 use b2p::{Cancel, Isa};
@@ -335,14 +335,14 @@ fn in_passes(tables: &Tables, keys: &[u64], latents: &[i16], slice: usize, code:
     }
 }
 
-/// Numbers as a table, some of them put right: an error, or a table under which symbols of each of its rows come back.
+/// Numbers as a table, some of them corrected: an error, or a table under which symbols of each of its rows come back.
 fn any_table(mut source: Source, how: u8) {
     let rows = usize::from(source.byte() % 4);
     let (mut entries, mut offsets, mut low) = (Vec::new(), vec![0u32], Vec::new());
     for _ in 0..rows {
         let length = usize::from(source.byte() % 8);
         let mut row: Vec<u16> = (0..length).map(|_| source.u16()).collect();
-        // One in four is left as it comes, as the last entry of the others makes up for what the sum lacks.
+        // One in four is left unchanged, as the last entry of the others makes up for what the sum lacks.
         if !how.is_multiple_of(4)
             && let Some((last, others)) = row.split_last_mut()
         {

@@ -11,7 +11,7 @@ pub type Change<'a> = &'a mut dyn FnMut(&mut [u8], usize, usize) -> usize;
 
 /// Changes the stream that the first `size` bytes of `data` are, and says how many they are then, `most` at the most.
 ///
-/// The seed tells how. One in four is changed anywhere; one in four too, and then has its checksums put right; in the other half the
+/// The seed tells how. One in four is changed anywhere; one in four too, and then has its checksums recomputed; in the other half the
 /// payload of one chunk is changed, and every length, every checksum and the model's identity fit what comes out.
 pub fn mutate(data: &mut [u8], size: usize, most: usize, seed: u32, change: Change) -> usize {
     if !seed.is_multiple_of(2)

@@ -1,4 +1,4 @@
-//! Streams from strangers.
+//! Untrusted streams.
 
 use b2p::Decoder;
 use b2p::container::{self, Header, Level, Slice, Stream, Writer};

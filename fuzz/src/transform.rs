@@ -1,4 +1,4 @@
-//! Streams of version 3 from strangers.
+//! Untrusted streams of version 3.
 
 use b2p::container::{Colours, Level, Writer};
 use b2p::gaussians::Gaussians;

@@ -30,7 +30,7 @@ impl Work for Calls {
         let rows: Vec<Narrow> = (0..256)
             .map(|r| std::array::from_fn(|u| ((r * 7919 + u * 31) % 200) as i8))
             .collect();
-        let facts: Row = std::array::from_fn(|u| (u as i16 - 64) * 7);
+        let features: Row = std::array::from_fn(|u| (u as i16 - 64) * 7);
         let (mut weights, mut lanes): (Row, Lanes) = ([5; WIDTH], [9830; 8]);
         let stretch: [i16; 4096] = std::array::from_fn(|i| (i as i16 - 2048) / 3);
         let mut tables = vec![[40_000 | 3 << 16; CONTEXTS]; 4096];
@@ -46,9 +46,9 @@ impl Work for Calls {
                     }
                     hidden::add_up(instructions, &some)[at & 127].into()
                 }
-                Calls::Sum => hidden::sum(instructions, &facts, row, &weights).into(),
+                Calls::Sum => hidden::sum(instructions, &features, row, &weights).into(),
                 Calls::Learn => {
-                    hidden::learn(instructions, &facts, row, 300, &mut weights);
+                    hidden::learn(instructions, &features, row, 300, &mut weights);
                     0
                 }
                 Calls::Mix | Calls::MixAndLearn => {

@@ -52,7 +52,6 @@ pub mod peak {
     pub use crate::close::peak::{bf16, f32, half};
     pub use crate::exact::peak::i16;
 }
-pub use peak as ceiling;
 
 /// The convolutions as their definitions read: what the kernels are tested against.
 pub mod reference {

@@ -165,7 +165,7 @@ pub fn trace(surface: &Surface, view: &View, size: [u32; 2]) -> Vec<Option<Hit>>
             frame.draw_line(&setups, member, y, line);
         }
     });
-    let hit = |s: Seen| Hit {
+    let hit = |s: Sample| Hit {
         face: setups[s.setup as usize].face,
         depth: 1.0 / s.nearness,
     };
@@ -211,13 +211,13 @@ impl Setup {
 
 /// What a sample sees so far.
 #[derive(Clone, Copy)]
-struct Seen {
+struct Sample {
     /// 1 / depth; 0 is the background.
     nearness: f64,
     setup: u32,
 }
 
-const NOTHING: Seen = Seen {
+const NOTHING: Sample = Sample {
     nearness: 0.0,
     setup: u32::MAX,
 };
@@ -336,7 +336,7 @@ impl Frame<'_> {
         }
     }
 
-    fn draw_line(&self, setups: &[Setup], member: u32, y: usize, line: &mut [Seen]) {
+    fn draw_line(&self, setups: &[Setup], member: u32, y: usize, line: &mut [Sample]) {
         let setup = &setups[member as usize];
         let farthest = 1.0 / self.view.near;
         let [first, end] = span(setup, y as f64);
@@ -353,7 +353,7 @@ impl Frame<'_> {
             if setup.tested && !self.passes(setup, lambda.map(|l| (l / nearness) as f32)) {
                 continue;
             }
-            *seen = Seen {
+            *seen = Sample {
                 nearness,
                 setup: member,
             };

@@ -365,7 +365,7 @@ mod tests {
     fn textures_repeat() {
         let grid = grid();
         assert_eq!(grid.bilinear(0, [0.375, 0.625]), grid.bilinear(0, [5.375, -3.375]));
-        // Across the border: the mean of the last column and the first.
+        // Across the edge: the mean of the last column and the first.
         assert_eq!(grid.bilinear(0, [0.0, 0.625])[0], 15.0);
     }
 

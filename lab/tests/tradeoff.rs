@@ -71,7 +71,7 @@ fn the_page_has_all_its_parts_and_more_precise_is_never_less_accurate() {
         let row = rows.find(|row| row["knob"] == knob && row[what] == value);
         decibel(row.unwrap_or(default))
     };
-    // A coarser level, thinner heads, a smaller picture, a higher floor of α: none is nearer to the truth.
+    // A coarser level, thinner heads, a smaller picture, a higher minimum α: none is nearer to the truth.
     assert!(of("heads", "heads", "quick".into()) < decibel(default));
     assert!(of("level", "level", 5.into()) < decibel(default));
     assert!(of("size", "size", vec![84, 84].into()) < decibel(default));

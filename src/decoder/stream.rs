@@ -116,7 +116,7 @@ impl Decoder {
         self
     }
 
-    /// The same decoder, which uses no better instructions than these; results are the same.
+    /// The same decoder, which uses at most this instruction set; results are the same.
     pub fn with_isa(mut self, isa: Isa) -> Self {
         self.isa = Some(isa);
         self

@@ -130,7 +130,7 @@ impl<'b> Transform<'b> {
             Some(above) => std::mem::replace(&mut above.octree, Octree::root()),
             None => Octree::root(),
         };
-        // What is wrong with it is told when it is its turn.
+        // Its faults are reported when it is its turn.
         let next = self.feed.after(level);
         let next = next.and_then(|next| Level::read(self.feed.bytes(), header, next).ok());
         let growing = Growing {
@@ -259,7 +259,7 @@ impl Growing<'_> {
         let name = self.named(format!("colours of levels 0 to {depth}"), depth);
         let coloured = log.step(name, count, "voxels", || {
             let colours = || colour::decode_trunk(isa, octree, &maps, &trunk.slice);
-            self.beside(depth, &maps[maps.len() - 1], ahead, colours)
+            self.with_next_occupancies(depth, &maps[maps.len() - 1], ahead, colours)
         })?;
         let map = maps.pop().unwrap_or_else(KernelMap::root);
         Ok(Step {
@@ -305,7 +305,7 @@ impl Growing<'_> {
             let slice = header.colour_slice() as usize;
             let slices = &colours.slices;
             let colours = || colour::decode_level(isa, octree, n, above_map, &map, above, slices, slice, cancel);
-            self.beside(n, &map, ahead, colours)
+            self.with_next_occupancies(n, &map, ahead, colours)
         })?;
         Ok((map, coloured))
     }
@@ -327,7 +327,7 @@ impl Growing<'_> {
 
     /// Decodes the colours of level `n`, and beside them the occupancies of the level after it, if it is there. `map` is the kernel map of level
     /// `n`.
-    fn beside(
+    fn with_next_occupancies(
         &self,
         n: u8,
         map: &KernelMap,

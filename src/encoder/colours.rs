@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::error::Result;
 use crate::gaussians::Gaussians;
-use crate::latents::{COLOUR_INPUTS as INPUTS, ColourFilter, Surroundings};
+use crate::latents::{COLOUR_INPUTS as INPUTS, ColourContexts, ColourFilter};
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
 use crate::renderer::{Quality, Renderer};
@@ -30,7 +30,7 @@ const DECIBEL: f64 = 0.12;
 /// Those of [`Renderer::render`].
 pub(super) fn fit(
     gaussians: &Gaussians,
-    surroundings: &Surroundings,
+    contexts: &ColourContexts,
     wanted: &[[f32; 3]],
     level: u8,
     latents: usize,
@@ -41,7 +41,7 @@ pub(super) fn fit(
     let colours = &gaussians.colour;
     let numbers = |i: usize| -> [f32; INPUTS + 3] {
         let mut numbers = [0.0; INPUTS + 3];
-        numbers[..INPUTS].copy_from_slice(&surroundings.inputs(i, colours[i]));
+        numbers[..INPUTS].copy_from_slice(&contexts.inputs(i, colours[i]));
         for (missing, (wanted, own)) in numbers[INPUTS..].iter_mut().zip(wanted[i].iter().zip(colours[i])) {
             *missing = wanted - own;
         }
@@ -137,7 +137,7 @@ impl Sums {
     }
 }
 
-/// Whether squares of what colours are off that become less, from the first to the second, are worth so many `bytes`
+/// Whether a fall of the squared colour error, from the first to the second, is worth so many `bytes`
 /// beside `latents` bytes of latents.
 pub(super) fn worth([before, after]: [f64; 2], bytes: usize, latents: usize) -> bool {
     let gain = 10.0 * (before / after.max(1e-9)).log10();
@@ -190,7 +190,7 @@ mod tests {
     use crate::geometry::{Octree, Voxels, morton};
 
     /// Eight balls for every voxel of a disc across the cube, of smooth colours, and what surrounds them.
-    fn scene() -> (Gaussians, Surroundings) {
+    fn scene() -> (Gaussians, ColourContexts) {
         let at = (0..1024u32).map(|i| [i % 32, i / 32, 16]);
         let voxels = Voxels::new(5, at.map(morton::encode).collect());
         let octree = Octree::new(voxels).unwrap();
@@ -210,7 +210,7 @@ mod tests {
             gaussians.colour.push([wave(5.0), wave(9.0), wave(13.0)]);
         }
         let map = octree.kernel_map(5);
-        let around = Surroundings::of_level(&gaussians, &octree, 5, &map, None);
+        let around = ColourContexts::of_level(&gaussians, &octree, 5, &map, None);
         (gaussians, around)
     }
 
@@ -274,7 +274,7 @@ mod tests {
             colour: (0..32).map(|i| [of(i), of(2 * i), of(3 * i)]).collect(),
             ..Gaussians::default()
         };
-        let around = Surroundings::of_level(&few, &octree, 5, &octree.kernel_map(5), None);
+        let around = ColourContexts::of_level(&few, &octree, 5, &octree.kernel_map(5), None);
         let wanted: Vec<_> = (0..32).map(|i| [of(5 * i), of(7 * i), of(9 * i)]).collect();
         assert_eq!(fit(&few, &around, &wanted, 6, 1 << 8).unwrap(), None);
     }

@@ -11,10 +11,10 @@ use crate::gaussians::Heads;
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::{KernelMap, Octree};
 use crate::latents::network::Model;
-use crate::latents::{ColourFilter, ColourResidual, ResidualSteps, Steps, Surroundings, activate};
+use crate::latents::{ColourContexts, ColourFilter, ColourResidual, ResidualSteps, Steps, activate};
 
-/// How many times as much a decibel of what is wide is worth: pictures from afar and up close show it, where what is
-/// narrow blurs or is too fine to trouble.
+/// Weight of a decibel of the low-frequency band: pictures show it at any distance, where high frequencies blur or are
+/// too fine to matter.
 const WIDE: usize = 6;
 
 /// The bit of Morton keys from which on voxels eight of their own apart join.
@@ -34,7 +34,7 @@ pub enum Residual {
 }
 
 impl Residual {
-    /// What is wide is told in these steps, if not more finely.
+    /// The largest steps of the low-frequency band.
     pub const COARSE: Steps = Steps { luma: 32, chroma: 24 };
 
     pub(super) fn precision(self, filter: bool) -> Option<ResidualSteps> {
@@ -91,7 +91,7 @@ pub(crate) struct Level<'a> {
 #[derive(Default)]
 pub(crate) struct Corrections {
     pub filters: Vec<(Heads, ColourFilter)>,
-    pub left: Option<Left>,
+    pub left: Option<ColourError>,
 }
 
 /// The filters that are worth it, and what is left for a residual, if one is wanted.
@@ -126,7 +126,7 @@ pub(super) fn corrections(
         drop(raw);
         if filter {
             let above = at.role.checked_sub(1).map(|role| &at.maps[role]);
-            let around = Surroundings::of_level(&gaussians, at.octree, at.level, map, above);
+            let around = ColourContexts::of_level(&gaussians, at.octree, at.level, map, above);
             let filter = colours::fit(&gaussians, &around, &wanted, drawn, at.latents)?;
             if let (Some(filter), true) = (&filter, keep) {
                 filter.apply(&mut gaussians, &around);
@@ -141,7 +141,7 @@ pub(super) fn corrections(
             });
         }
     }
-    found.left = kept.map(|gaussians| Left {
+    found.left = kept.map(|gaussians| ColourError {
         level: at.level,
         children: at.children,
         gaussians,
@@ -151,8 +151,8 @@ pub(super) fn corrections(
     Ok(found)
 }
 
-/// What a residual is of: the colours that are drawn of a level, with its filter, and those of the cloud.
-pub(crate) struct Left {
+/// The colour error that a residual codes: between a level's drawn colours, filtered, and those of the cloud.
+pub(crate) struct ColourError {
     pub level: u8,
     /// Gaussians of each voxel.
     children: usize,
@@ -164,8 +164,8 @@ pub(crate) struct Left {
     latents: usize,
 }
 
-impl Left {
-    /// The payloads of a residual as finely told as this, for the voxels `keys` in slices; `None` if it has nothing
+impl ColourError {
+    /// The payloads of a residual of this precision, for the voxels `keys` in slices; `None` if it has nothing
     /// fine and is not worth its bytes.
     pub fn payloads(&self, keys: &[u64], slice: usize, precision: ResidualSteps) -> Option<Vec<Vec<u8>>> {
         let before = missing(&self.gaussians, &self.wanted, self.children);

@@ -25,7 +25,7 @@ use crate::limits::Limits;
 use crate::log::Log;
 pub use builder::Encoder;
 pub use corrections::Residual;
-use corrections::{Left, Level, corrections};
+use corrections::{ColourError, Level, corrections};
 pub use rate_control::encode_to_rate;
 use skeleton::{Coded, Correct, Skeleton};
 
@@ -34,13 +34,13 @@ use skeleton::{Coded, Correct, Skeleton};
 pub struct Options {
     /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.
     pub levels: Option<RangeInclusive<u8>>,
-    /// How dear a bit is when latents are rounded, times what the model says ([`Model::bit_prices`]): 0 rounds to the
-    /// nearest, more saves bits. Default: 1.
+    /// Scale of λ in the rate–distortion optimised quantisation of latents, relative to the model's
+    /// ([`Model::bit_prices`]): 0 rounds to the nearest, more saves bits. Default: 1.
     pub bit_price: f32,
     /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its
     /// bytes: see [`ColourFilter`](crate::latents::ColourFilter).
     pub filter: bool,
-    /// How much is coded of what colours are then still off those of the cloud. Default: [`Residual::Coarse`].
+    /// How much is coded of the remaining colour error. Default: [`Residual::Coarse`].
     pub residual: Residual,
     /// Whether every level that is drawn has such a residual, one of its own, and not the finest alone: the stream of
     /// the finest is larger for it, and no better.
@@ -93,7 +93,7 @@ pub struct Rate {
 /// format does not have, [`Error::Unsupported`] if the model can only decode; and, if encoder and decoder disagreed on
 /// this machine, whatever the decoder found.
 pub fn encode(cloud: &ColouredVoxels, model: &Model, options: &Options, log: &Log) -> Result<Encoded> {
-    let subject = Subject::new(cloud, model, options, log)?;
+    let subject = EncoderInput::new(cloud, model, options, log)?;
     let wants = options.residual.precision(options.filter).is_some();
     let coded = subject.code(options.bit_price, wants, log)?;
     let stream = || subject.stream(&coded, options.residual);
@@ -108,8 +108,8 @@ pub fn encode(cloud: &ColouredVoxels, model: &Model, options: &Options, log: &Lo
     subject.checked(bytes, &coded.features, log)
 }
 
-/// A cloud and what all its streams share, whatever a bit is worth and however fine the residual.
-struct Subject<'a> {
+/// A cloud and what all its streams share, for any λ and any residual.
+struct EncoderInput<'a> {
     cloud: &'a ColouredVoxels,
     model: &'a Model,
     options: &'a Options,
@@ -118,7 +118,7 @@ struct Subject<'a> {
     features: Vec<Vec<f16>>,
 }
 
-impl<'a> Subject<'a> {
+impl<'a> EncoderInput<'a> {
     fn new(cloud: &'a ColouredVoxels, model: &'a Model, options: &'a Options, log: &Log) -> Result<Self> {
         let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
         let (base, top) = (*levels.start(), *levels.end());
@@ -146,7 +146,7 @@ impl<'a> Subject<'a> {
             voxels: Vec::new(),
             sections: Vec::new(),
         };
-        Ok(Subject {
+        Ok(EncoderInput {
             cloud,
             model,
             options,
@@ -187,7 +187,7 @@ impl<'a> Subject<'a> {
     fn stream(&self, coded: &Coded, residual: Residual) -> Result<Vec<u8>> {
         let precision = residual.precision(self.options.filter);
         let slice = self.options.slice_voxels as usize;
-        let payloads = |left: &Left| {
+        let payloads = |left: &ColourError| {
             let keys = self.skeleton.octree.level(left.level).keys();
             let payloads = left.payloads(keys, slice, precision?)?;
             Some((left.level, payloads))

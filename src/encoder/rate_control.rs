@@ -1,38 +1,38 @@
 //! The best stream of at most so many bits.
 //!
-//! Streams of more and more bits are on one path. First bits become less dear, down to the price that the model was
-//! made for. Then what is wide of what colours are off is told too, from twice that price down again: where a bit is
-//! dearer than that, it takes more than it makes up for. From there on a fine residual, in smaller and smaller steps,
-//! brings more for its bits than latents of bits that are cheaper still. Sizes along the path hardly ever fall, so it
-//! is halved until the last that fits is found.
+//! Streams of more and more bits are on one path. First λ falls to the value that the model was made for. Then the
+//! low-frequency band of the colour residual is coded as well, with λ from twice that value down again: at a higher λ
+//! the band costs more than it gains. From there on a fine residual, in smaller and smaller steps, gains more for its
+//! bits than latents at a still lower λ. Sizes along the path hardly ever fall, so it is halved until the last that
+//! fits is found.
 
 use std::iter::successors;
 use std::num::NonZeroU8;
 
-use super::{Encoded, Options, Residual, Subject};
+use super::{Encoded, EncoderInput, Options, Residual};
 use crate::cloud::ColouredVoxels;
 use crate::error::{Error, Result};
 use crate::latents::Steps;
 use crate::latents::network::Model;
 use crate::log::Log;
 
-/// Prices of a bit, each about a fifth above the next.
+/// Scales of λ, each about a fifth above the next.
 const PRICES: [f32; 9] = [4.0, 3.36, 2.83, 2.38, 2.0, 1.68, 1.41, 1.19, USUAL];
 
-/// The price of a bit with a fine residual.
+/// The scale of λ with a fine residual.
 const USUAL: f32 = 1.0;
 
-/// The highest price of a bit with a coarse residual.
+/// The highest scale of λ with a coarse residual.
 const COARSE: f32 = 2.0;
 
 /// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and
 /// says with which options: [`encode`](super::encode) makes the same stream of them. `options` say what else is to be;
-/// their price of a bit and residual count for nothing.
+/// their scale of λ and residual are ignored.
 ///
-/// From few bits to many it chooses prices of a bit from 4 down to 1 without a residual; from 2 to 1 with
+/// From few bits to many it chooses scales of λ from 4 down to 1 without a residual; from 2 to 1 with
 /// [`Residual::Coarse`], where filters are made; and 1 with [`Residual::Fine`], in steps from 255 down to 1. More bits
 /// never lead back on this path; with more than its end takes, that comes out. It takes at most seven tries, those at a
-/// price that was tried before of the residual alone.
+/// scale that was tried before of the residual alone.
 ///
 /// # Errors
 /// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if no such stream was found, and
@@ -51,7 +51,7 @@ pub fn encode_to_rate(
     }
     let points = cloud.voxels.len();
     let bits = |stream: &[u8]| stream.len() as f64 * 8.0 / points as f64;
-    let subject = Subject::new(cloud, model, options, log)?;
+    let subject = EncoderInput::new(cloud, model, options, log)?;
     // One for each price so far.
     let mut coded = vec![(USUAL, subject.code(USUAL, true, log)?)];
     let path = path(options);
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn bits_become_less_dear_and_then_steps_smaller() {
+    fn lambda_falls_and_then_steps_get_smaller() {
         let path = path(&Options::default());
         let parts: Vec<_> = path
             .chunk_by(|a, b| discriminant(&a.residual) == discriminant(&b.residual))
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wide_is_told_only_beside_filters() {
+    fn the_low_frequency_band_is_coded_only_beside_filters() {
         let options = Options {
             filter: false,
             levels: Some(3..=4),

@@ -1,6 +1,6 @@
 //! The levels of a stream: what all streams of a cloud have in common, what its latents say, and both put together.
 
-use super::corrections::{Corrections, Left, Level};
+use super::corrections::{ColourError, Corrections, Level};
 use crate::container::{Header, Writer};
 use crate::error::Result;
 use crate::gaussians::Heads;
@@ -36,7 +36,7 @@ pub(crate) struct Coded {
     /// The features of the last level.
     pub features: Vec<i16>,
     /// What residuals would be of, level by level.
-    pub left: Vec<Left>,
+    pub left: Vec<ColourError>,
 }
 
 #[derive(Default)]

@@ -2,10 +2,10 @@
 //!
 //! Heads have learned from other clouds. What they get wrong about one cloud as a whole, the encoder sees, and says in
 //! 58 bytes a level: a colour becomes itself plus a quadratic function of itself and of how it differs from its
-//! surroundings, clamped to `[0, 1]`. That is beyond the paper; video codecs filter their pictures likewise (the
+//! neighbourhood, clamped to `[0, 1]`. That is beyond the paper; video codecs filter their pictures likewise (the
 //! adaptive loop filter of H.266, the restoration of AV1).
 //!
-//! # Surroundings
+//! # Contexts
 //! The Gaussians of a *group* are the eight of a voxel, or, where a voxel has one, those of the voxels with the same
 //! parent. Colours are taken relative to ½. Of each group the first mean is that of its Gaussians, weighted by their
 //! opacities; the second, of the first means of the group and those of its neighbours under the 3³ kernel, weighted by
@@ -48,7 +48,7 @@ pub enum Groups<'a> {
 
 /// The three means around every Gaussian: see the module's documentation.
 #[derive(Debug)]
-pub struct Surroundings {
+pub struct ColourContexts {
     means: Vec<[[f32; 3]; 3]>,
     /// The group of every Gaussian, where they are not eights.
     groups: Option<Vec<u32>>,
@@ -106,15 +106,15 @@ impl ColourFilter {
     /// Corrects the colours of a level.
     ///
     /// # Panics
-    /// If the surroundings are of other Gaussians.
-    pub fn apply(&self, gaussians: &mut Gaussians, surroundings: &Surroundings) {
+    /// If the contexts are of other Gaussians.
+    pub fn apply(&self, gaussians: &mut Gaussians, contexts: &ColourContexts) {
         let weight = |c: usize, k: usize| f32::from(self.weights[c][k]) * Self::step(self.exponent, k);
         // A fourth channel makes a vector of it.
         let weights: [[f32; 4]; INPUTS] =
             std::array::from_fn(|k| std::array::from_fn(|c| if c < 3 { weight(c, k) } else { 0.0 }));
         let correct = |(i, colour): (usize, &mut [f32; 3])| {
             let mut sum = [0.0; 4];
-            for (input, weights) in surroundings.inputs(i, *colour).iter().zip(&weights) {
+            for (input, weights) in contexts.inputs(i, *colour).iter().zip(&weights) {
                 for (sum, weight) in sum.iter_mut().zip(weights) {
                     *sum += input * weight;
                 }
@@ -128,7 +128,7 @@ impl ColourFilter {
     }
 }
 
-impl Surroundings {
+impl ColourContexts {
     /// Those of the Gaussians that the voxels of `level` generate, eight each or one. `map` is the level's 3³ kernel
     /// map, `above` that of the level above.
     ///
@@ -144,9 +144,9 @@ impl Surroundings {
         match above {
             Some(above) if gaussians.len() == map.len() => {
                 let first = octree.first_child(level - 1);
-                Surroundings::new(gaussians, Groups::Siblings(first), above)
+                ColourContexts::new(gaussians, Groups::Siblings(first), above)
             }
-            _ => Surroundings::new(gaussians, Groups::Eights, map),
+            _ => ColourContexts::new(gaussians, Groups::Eights, map),
         }
     }
 
@@ -194,7 +194,7 @@ impl Surroundings {
                 Some(of)
             }
         };
-        Surroundings { means, groups }
+        ColourContexts { means, groups }
     }
 
     /// What Gaussian `i` of this colour is corrected by.
@@ -301,7 +301,7 @@ mod tests {
     fn a_filter_of_zeros_changes_nothing() {
         let mut some = gaussians(&[[0.1, 0.9, 0.3]; 8], 0.5);
         let before = some.clone();
-        let around = Surroundings::new(&some, Groups::Eights, &KernelMap::root());
+        let around = ColourContexts::new(&some, Groups::Eights, &KernelMap::root());
         filter(0, &[]).apply(&mut some, &around);
         assert_eq!(some, before);
     }
@@ -311,7 +311,7 @@ mod tests {
         let mut colours = [[0.25; 3]; 8];
         colours[3] = [0.75; 3];
         let mut some = gaussians(&colours, 1.0);
-        let around = Surroundings::new(&some, Groups::Siblings(&[0]), &KernelMap::root());
+        let around = ColourContexts::new(&some, Groups::Siblings(&[0]), &KernelMap::root());
         filter(1, &[(0, 10, 2)]).apply(&mut some, &around);
         let mean = 0.25 + 0.5 / 8.0;
         for (i, colour) in some.colour.iter().enumerate() {
@@ -328,7 +328,7 @@ mod tests {
         some.opacity[0] = 1.0;
         some.opacity[8] = 0.5;
         some.colour[8] = [1.0; 3];
-        let around = Surroundings::new(&some, Groups::Eights, &octree.kernel_map(2));
+        let around = ColourContexts::new(&some, Groups::Eights, &octree.kernel_map(2));
         let second = |group: usize| around.inputs(8 * group + 1, [0.5; 3])[13];
         assert_eq!(second(0), 0.5 * (2.0 * 0.5) / (4.0 + 2.0 * 0.5));
         assert_eq!(second(1), 0.5 * (4.0 * 0.5) / (2.0 + 4.0 * 0.5) - 0.5);
@@ -339,7 +339,7 @@ mod tests {
         let colours = [[0.0, 1.0, 0.5]; 8];
         for weight in [-128, 127] {
             let mut some = gaussians(&colours, 1.0);
-            let around = Surroundings::new(&some, Groups::Eights, &KernelMap::root());
+            let around = ColourContexts::new(&some, Groups::Eights, &KernelMap::root());
             let all = ColourFilter {
                 exponent: 0,
                 weights: [[weight; INPUTS]; 3],

@@ -12,7 +12,7 @@ use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::latents::entropy::{Condition, decode_level, decode_passes, expect_no_latents, latent_hash};
 use crate::latents::network::Module;
-use crate::latents::{ColourFilter, ColourResidual, Surroundings, activate};
+use crate::latents::{ColourContexts, ColourFilter, ColourResidual, activate};
 use crate::layers::Pool;
 use crate::log::Log;
 
@@ -62,7 +62,7 @@ struct Reached {
     above: Option<KernelMap>,
     /// What the stream says of the colours, for each set of heads.
     filters: [Option<ColourFilter>; Heads::ALL.len()],
-    /// And what they are still off.
+    /// And the remaining error.
     residual: Option<ColourResidual>,
 }
 
@@ -182,7 +182,7 @@ impl<'b> LatentDecoding<'b> {
             log.step("filter colours", count, "Gaussians", || {
                 let (octree, map) = (&reached.exact.octree, &reached.map);
                 let above = reached.above.as_ref();
-                let around = Surroundings::of_level(&gaussians, octree, level, map, above);
+                let around = ColourContexts::of_level(&gaussians, octree, level, map, above);
                 filter.apply(&mut gaussians, &around);
                 Ok(())
             })?;
@@ -270,7 +270,7 @@ impl<'b> LatentDecoding<'b> {
     }
 }
 
-/// What a level says that its colours are still off.
+/// Decodes the colour residual of a level, if it has one.
 fn residual(header: &Header, level: &Level, octree: &Octree, log: &Log) -> Result<Option<ColourResidual>> {
     if level.residual.is_empty() {
         return Ok(None);

@@ -12,7 +12,7 @@ pub mod network;
 mod residual;
 
 pub use activate::activate;
-pub use colour_filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundings};
+pub use colour_filter::{ColourContexts, ColourFilter, Groups, INPUTS as COLOUR_INPUTS};
 pub use decoder::{Exact, LatentDecoder};
 pub use decoding::LatentDecoding;
 pub(crate) use decoding::nothing_reached;

@@ -1,4 +1,4 @@
-//! The colour residual: what a stream's colours are still off, voxel by voxel.
+//! The colour residual: the remaining error of a stream's colours, voxel by voxel.
 //!
 //! Latents say what the networks have learned to make colours of; past some rate more of them hardly help. What is left
 //! of a level's colours, the cloud's less the generated ones, a stream may code as it is, as finely as wanted:
@@ -28,7 +28,7 @@
 //! | 5 | | coefficients, a triple for each voxel: first the first voxel's, then those of voxels that join at higher bits before those at lower ones, of one bit in order |
 //!
 //! *Coarse* are the triples of the first voxel and of those that join at the boundary or above, the others are fine: so
-//! the coarse ones come first. A step of 0 says that the coefficients it is for are not told, and 0; not all four may
+//! the coarse ones come first. A step of 0 says that its coefficients are not coded, and 0; not all four may
 //! be 0. Coefficients are coded in two parts, coarse and fine; of each those channels are present whose step is not 0.
 //! A boundary of 3·n parts what is wider than 2ⁿ voxels from what is not.
 //!
@@ -62,7 +62,7 @@ const ROUND_UP: f32 = 0.67;
 /// Bytes of a payload before its coefficients.
 const FIXED: usize = 5;
 
-/// How finely coefficients are told, in 255ths; 0: not at all, they are 0.
+/// Quantisation steps of coefficients, in 255ths; 0: they are not coded, and 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Steps {
     /// Of luma.
@@ -91,13 +91,13 @@ impl Steps {
         [luma, chroma, chroma]
     }
 
-    /// The channels that are told.
+    /// The channels that are coded.
     fn channels(self) -> Range<usize> {
         usize::from(self.luma == 0)..if self.chroma == 0 { 1 } else { 3 }
     }
 }
 
-/// How finely a residual is told, by how wide what it tells is.
+/// Quantisation steps of a residual, by spatial frequency.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ResidualSteps {
     /// Where voxels join below [`ResidualSteps::boundary`].
@@ -116,8 +116,8 @@ impl ResidualSteps {
     pub fn read(payload: &[u8]) -> Option<ResidualSteps> {
         let fixed = *payload.first_chunk::<FIXED>()?;
         let [luma, chroma, coarse_luma, coarse_chroma, boundary] = fixed;
-        let told = [luma, chroma, coarse_luma, coarse_chroma] != [0; 4];
-        (told && boundary <= ResidualSteps::MAX_BOUNDARY).then_some(ResidualSteps {
+        let coded = [luma, chroma, coarse_luma, coarse_chroma] != [0; 4];
+        (coded && boundary <= ResidualSteps::MAX_BOUNDARY).then_some(ResidualSteps {
             fine: Steps { luma, chroma },
             coarse: Steps {
                 luma: coarse_luma,
@@ -207,7 +207,7 @@ impl ColourResidual {
         }))
     }
 
-    /// The residual, as finely told as this, that brings colours nearer to what they are `missing`, voxel by voxel;
+    /// The residual, quantised in these steps, that brings colours nearer to what they are `missing`, voxel by voxel;
     /// `keys` are the voxels' Morton keys.
     ///
     /// # Panics

@@ -3,12 +3,12 @@
 use crate::renderer::Image;
 use serde::Serialize;
 
-mod machine;
+mod environment;
 mod spread;
 
 #[doc(hidden)]
 pub use b2p_kernels::give_back;
-pub use machine::Machine;
+pub use environment::Machine;
 pub use spread::{Spread, Verdict};
 
 /// How far a picture is from what it should be: colours of pictures without transparency, in `[0, 1]`, not rounded to

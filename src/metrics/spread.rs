@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn what_overlaps_is_not_told_apart() {
+    fn overlapping_spreads_are_not_distinguished() {
         let spread = |low, high| Spread {
             low,
             median: (low + high) / 2.0,

@@ -37,9 +37,9 @@ pub(super) struct Contents<'a> {
     pub what: Loop,
 }
 
-/// What a thread needs to draw tiles.
+/// Buffers that one thread reuses from tile to tile.
 #[derive(Debug, Default)]
-pub(super) struct Desk {
+pub(super) struct Scratch {
     nearest: Nearest,
     tile: Tile,
     samples: Vec<[f32; 4]>,
@@ -61,14 +61,22 @@ pub(super) trait Output: Sync {
     /// Where nothing is drawn.
     fn empty(&self, background: Background) -> Self::Pixel;
 
-    /// Before anything is put on the desk's tile.
-    fn start(&self, _desk: &mut Desk) {}
+    /// Before anything is drawn on the tile.
+    fn start(&self, _scratch: &mut Scratch) {}
 
-    /// After some splats were put on it.
-    fn look(&self, _desk: &mut Desk) {}
+    /// After some splats were drawn on it.
+    fn look(&self, _scratch: &mut Scratch) {}
 
-    /// Writes the wanted `part` of the desk's tile into `rows` of `width` pixels each.
-    fn write(&self, desk: &mut Desk, isa: Isa, canvas: &Canvas, part: Bounds, rows: &mut [Self::Pixel], width: usize);
+    /// Writes the wanted `part` of the tile into `rows` of `width` pixels each.
+    fn write(
+        &self,
+        scratch: &mut Scratch,
+        isa: Isa,
+        canvas: &Canvas,
+        part: Bounds,
+        rows: &mut [Self::Pixel],
+        width: usize,
+    );
 }
 
 /// Red, green, blue and alpha.
@@ -84,20 +92,28 @@ impl Output for Colours {
         [r, g, b, 1.0 + a]
     }
 
-    fn write(&self, desk: &mut Desk, isa: Isa, canvas: &Canvas, part: Bounds, rows: &mut [[f32; 4]], width: usize) {
+    fn write(
+        &self,
+        scratch: &mut Scratch,
+        isa: Isa,
+        canvas: &Canvas,
+        part: Bounds,
+        rows: &mut [[f32; 4]],
+        width: usize,
+    ) {
         let size = [part.x1 - part.x0, part.y1 - part.y0];
         let behind = canvas.background.behind();
         let touched = if canvas.shrink == 1 {
-            desk.tile.write(isa, behind, rows, width)
+            scratch.tile.write(isa, behind, rows, width)
         } else {
-            desk.samples.resize((TILE * TILE) as usize, [0.0; 4]);
+            scratch.samples.resize((TILE * TILE) as usize, [0.0; 4]);
             let stride = size[0] as usize;
-            let touched = desk.tile.write(isa, behind, &mut desk.samples, stride);
-            let samples = &desk.samples[..stride * size[1] as usize];
+            let touched = scratch.tile.write(isa, behind, &mut scratch.samples, stride);
+            let samples = &scratch.samples[..stride * size[1] as usize];
             shrink(samples, stride, canvas.shrink as usize, rows, width);
             touched
         };
-        desk.touched += u64::from(touched);
+        scratch.touched += u64::from(touched);
     }
 }
 
@@ -113,8 +129,8 @@ impl Output for Indices {
         u32::MAX
     }
 
-    fn write(&self, desk: &mut Desk, _: Isa, _: &Canvas, _: Bounds, rows: &mut [u32], width: usize) {
-        desk.touched += u64::from(desk.tile.write_ids(rows, width));
+    fn write(&self, scratch: &mut Scratch, _: Isa, _: &Canvas, _: Bounds, rows: &mut [u32], width: usize) {
+        scratch.touched += u64::from(scratch.tile.write_ids(rows, width));
     }
 }
 
@@ -130,15 +146,15 @@ impl<F: Fn(usize) -> [f32; N] + Sync, const N: usize> Output for Mixed<F, N> {
         [0.0; N]
     }
 
-    fn start(&self, desk: &mut Desk) {
-        desk.sums.clear();
-        desk.sums.resize((TILE * TILE) as usize * N, 0.0);
+    fn start(&self, scratch: &mut Scratch) {
+        scratch.sums.clear();
+        scratch.sums.resize((TILE * TILE) as usize * N, 0.0);
     }
 
-    fn look(&self, desk: &mut Desk) {
-        let (sums, _) = desk.sums.as_chunks_mut::<N>();
+    fn look(&self, scratch: &mut Scratch) {
+        let (sums, _) = scratch.sums.as_chunks_mut::<N>();
         let mut last = None;
-        for share in desk.tile.shares() {
+        for share in scratch.tile.shares() {
             // The blocks of a Gaussian come one after the other.
             let numbers = match last {
                 Some((index, numbers)) if index == share.index => numbers,
@@ -159,8 +175,8 @@ impl<F: Fn(usize) -> [f32; N] + Sync, const N: usize> Output for Mixed<F, N> {
         }
     }
 
-    fn write(&self, desk: &mut Desk, _: Isa, _: &Canvas, part: Bounds, rows: &mut [[f32; N]], width: usize) {
-        let (sums, _) = desk.sums.as_chunks::<N>();
+    fn write(&self, scratch: &mut Scratch, _: Isa, _: &Canvas, part: Bounds, rows: &mut [[f32; N]], width: usize) {
+        let (sums, _) = scratch.sums.as_chunks::<N>();
         let columns = part.x0 as usize..part.x1 as usize;
         let lines = sums.chunks_exact(TILE as usize);
         let lines = lines.take(part.y1 as usize).skip(part.y0 as usize);
@@ -170,7 +186,7 @@ impl<F: Fn(usize) -> [f32; N] + Sync, const N: usize> Output for Mixed<F, N> {
     }
 }
 
-impl Desk {
+impl Scratch {
     /// Draws a tile into `band`, the pixels of its row of tiles.
     pub fn draw<O: Output>(
         &mut self,

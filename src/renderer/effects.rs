@@ -9,7 +9,7 @@ use crate::gaussians::Gaussians;
 use crate::renderer::camera::{Camera, Projection};
 
 use super::Stats;
-use super::survey::typical_width;
+use super::splat_sizes::typical_width;
 
 /// Standard deviations of splats from this many samples on count as resolved.
 pub const RESOLVED: f64 = 1.5;
@@ -39,7 +39,7 @@ pub enum Effect {
     /// pixel is dimmed and not grown. Called for by files made that way; a stream's Gaussians are trained without.
     Antialias,
     /// Each pixel is the mean of several samples a side, as many as it takes to bring the typical splat to [`RESOLVED`]
-    /// of them, and at most [`MOST_SAMPLES`]. A crowd of dimmed splats lets through what the crowd itself would not,
+    /// of them, and at most [`MOST_SAMPLES`]. Many overlapping dimmed splats transmit light that the undimmed would not,
     /// and only what is resolved is free of that. Called for by anti-aliasing where splats fall under a pixel.
     Supersample,
     /// What reaches over the near plane is drawn as what of it is beyond the plane, evaluated in space along each
@@ -99,7 +99,7 @@ pub struct EffectSet {
     pub antialias: bool,
     /// [`Effect::Supersample`]: samples along each side of a pixel, a power of two; 1 if it is off.
     pub supersample: u32,
-    /// [`Effect::Near`]: whether there was anything to take care of, once a picture is drawn.
+    /// [`Effect::Near`]: whether anything crossed the near plane, once a picture is drawn.
     pub near: bool,
     /// [`Effect::Order`].
     pub order: bool,

@@ -28,7 +28,7 @@ pub mod projection;
 #[doc(hidden)]
 pub mod reference;
 mod shade;
-mod survey;
+mod splat_sizes;
 #[cfg(test)]
 mod tests;
 pub mod tiles;
@@ -48,9 +48,9 @@ use crate::error::Result;
 use crate::gaussians::Gaussians;
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
-use crate::renderer::projection::{Dropped, Ellipse, Ellipses, How, Seen};
+use crate::renderer::projection::{Dropped, Ellipse, Ellipses, Projected, ProjectionOptions};
 use crate::renderer::tiles::{Bins, Count, Grid, TILE, TileBand};
-use canvas::{Canvas, Colours, Contents, Desk, Indices, Mixed, Output};
+use canvas::{Canvas, Colours, Contents, Indices, Mixed, Output, Scratch};
 
 /// What is seen where the Gaussians let light through.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -85,7 +85,7 @@ impl Background {
 }
 
 /// How much of splats may be left out. A splat is looked at in all the blocks of 4×4 pixels where its α may reach a
-/// floor; what is left out adds up where many tails overlap, as beside the silhouette of a crowd.
+/// floor; what is left out adds up where many tails overlap, as beside the silhouette of many overlapping splats.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 #[non_exhaustive]
 pub enum Quality {
@@ -101,7 +101,7 @@ pub enum Quality {
     Floor(f32),
 }
 
-/// The lowest floor of α.
+/// The least value of the minimum α.
 pub const LEAST_FLOOR: f32 = 1.0 / (1 << 20) as f32;
 
 impl Quality {
@@ -148,7 +148,7 @@ pub struct Stats {
     pub visible: u64,
     /// Gaussians not drawn, and why.
     pub dropped: Dropped,
-    /// Gaussians that reach over the near plane: of those drawn with care for it the visible ones, else all.
+    /// Gaussians that reach over the near plane: the visible ones if they are evaluated in ray space, else all.
     pub crossing: u64,
     /// Pairs of a Gaussian and a tile of 32×32 pixels that it may touch.
     pub pairs: u64,
@@ -214,8 +214,8 @@ pub struct Renderer {
     ellipses: Ellipses,
     counts: Vec<Count>,
     bins: Bins,
-    /// One for each thread.
-    desks: Vec<Mutex<Desk>>,
+    /// Per-thread scratch.
+    scratch: Vec<Mutex<Scratch>>,
 }
 
 impl Default for Renderer {
@@ -256,7 +256,7 @@ impl Renderer {
             ellipses: Ellipses::default(),
             counts: Vec::new(),
             bins: Bins::default(),
-            desks: Vec::new(),
+            scratch: Vec::new(),
         }
     }
 
@@ -355,9 +355,9 @@ impl Renderer {
         limits: &Limits,
         image: &mut Image,
     ) -> Result<Stats> {
-        let wanted = Wanted { channel, background };
+        let options = OutputOptions { channel, background };
         let pixels = &mut image.pixels;
-        let stats = self.frame(gaussians, camera, wanted, &Colours, limits, pixels)?;
+        let stats = self.frame(gaussians, camera, options, &Colours, limits, pixels)?;
         [image.width, image.height] = camera.size();
         Ok(stats)
     }
@@ -375,8 +375,8 @@ impl Renderer {
         limits: &Limits,
         ids: &mut Ids,
     ) -> Result<Stats> {
-        let (wanted, indices) = (Wanted::default(), &mut ids.indices);
-        let stats = self.frame(gaussians, camera, wanted, &Indices, limits, indices)?;
+        let (options, indices) = (OutputOptions::default(), &mut ids.indices);
+        let stats = self.frame(gaussians, camera, options, &Indices, limits, indices)?;
         [ids.width, ids.height] = camera.size();
         Ok(stats)
     }
@@ -396,8 +396,8 @@ impl Renderer {
         limits: &Limits,
         pixels: &mut Vec<[f32; N]>,
     ) -> Result<()> {
-        let (wanted, mixed) = (Wanted::default(), Mixed(numbers));
-        self.frame(gaussians, camera, wanted, &mixed, limits, pixels)?;
+        let (options, mixed) = (OutputOptions::default(), Mixed(numbers));
+        self.frame(gaussians, camera, options, &mixed, limits, pixels)?;
         Ok(())
     }
 
@@ -405,14 +405,14 @@ impl Renderer {
         &mut self,
         gaussians: &Gaussians,
         camera: &Camera,
-        wanted: Wanted,
+        options: OutputOptions,
         output: &O,
         limits: &Limits,
         pixels: &mut Vec<O::Pixel>,
     ) -> Result<Stats> {
-        let mut plan = self.plan::<O>(gaussians, camera, &wanted, limits)?;
+        let mut plan = self.plan::<O>(gaussians, camera, &options, limits)?;
         let (mut times, mut laps) = (Times::default(), Laps(Instant::now()));
-        let seen = self.project(gaussians, camera, wanted.channel, &mut plan, limits)?;
+        let seen = self.project(gaussians, camera, options.channel, &mut plan, limits)?;
         times.project = laps.lap();
         let pairs = self.bins.plan(plan.grid, &mut self.counts, plan.bytes, limits)?;
         times.bin = laps.lap();
@@ -429,7 +429,7 @@ impl Renderer {
             grid: plan.grid,
             window: camera.window(),
             shrink: plan.effects.supersample,
-            background: wanted.background,
+            background: options.background,
         };
         self.draw_parts(&plan, &canvas, output, pixels, &mut times, &mut laps)?;
         let samples = u64::from(plan.effects.supersample).pow(2);
@@ -449,12 +449,12 @@ impl Renderer {
         &self,
         gaussians: &Gaussians,
         camera: &Camera,
-        wanted: &Wanted,
+        options: &OutputOptions,
         limits: &Limits,
     ) -> Result<Plan> {
         camera.check()?;
         gaussians.check_lengths()?;
-        if let Background::Colour(c) = wanted.background
+        if let Background::Colour(c) = options.background
             && !c.iter().all(|x| x.is_finite())
         {
             let what = format!("the background {c:?} is not a colour");
@@ -470,7 +470,7 @@ impl Renderer {
         }
         let fine = camera.magnified(effects.supersample);
         let grid = Grid::new(fine.window());
-        let shaded = effects.shades() || wanted.channel != Channel::Colour;
+        let shaded = effects.shades() || options.channel != Channel::Colour;
         let each = Ellipses::BYTES
             + Count::BYTES
             + u64::from(shaded) * size_of::<[f32; 3]>() as u64
@@ -498,15 +498,15 @@ impl Renderer {
         channel: Channel,
         plan: &mut Plan,
         limits: &Limits,
-    ) -> Result<Seen> {
+    ) -> Result<Projected> {
         if plan.shaded {
             shade::fill(gaussians, camera, channel, &plan.effects, &mut self.shades);
         }
-        let how = How {
+        let projection = ProjectionOptions {
             isa: self.isa,
             compensated: plan.effects.antialias,
             floor: self.quality.floor(),
-            near_care: self.effects.near != EffectMode::Off,
+            ray_space: self.effects.near != EffectMode::Off,
             slopes: plan.effects.order,
             colours: plan.shaded.then_some(&self.shades),
         };
@@ -514,13 +514,15 @@ impl Renderer {
         let start = |count: &mut Count, length| count.start(grid, length);
         let look = |count: &mut Count, ellipses: &[Ellipse]| count.count(grid, ellipses);
         let counts = &mut self.counts;
-        let seen = self.ellipses.project(gaussians, &plan.fine, how, counts, start, look)?;
-        plan.effects.near = how.near_care && seen.crossing > 0;
+        let seen = self
+            .ellipses
+            .project(gaussians, &plan.fine, projection, counts, start, look)?;
+        plan.effects.near = projection.ray_space && seen.crossing > 0;
         if plan.effects.near {
             plan.bytes += seen.crossing * size_of::<Crossing>() as u64;
         }
         limits.check_bytes(BYTES, plan.bytes)?;
-        self.ellipses.look_closer(gaussians, &plan.fine, how);
+        self.ellipses.fill_effect_data(gaussians, &plan.fine, projection);
         Ok(seen)
     }
 
@@ -534,10 +536,10 @@ impl Renderer {
         times: &mut Times,
         laps: &mut Laps,
     ) -> Result<()> {
-        self.desks.resize_with(rayon::current_num_threads(), Mutex::default);
+        self.scratch.resize_with(rayon::current_num_threads(), Mutex::default);
         let what = O::LOOP.unwrap_or(match (plan.effects.order, plan.effects.near) {
             (true, _) => Loop::Order,
-            (_, true) => Loop::Care,
+            (_, true) => Loop::RaySpace,
             _ => Loop::Plain,
         });
         let mut part = self.bins.next(None);
@@ -556,11 +558,11 @@ impl Renderer {
 
     /// Blocks that all threads have touched since this was asked last.
     fn take_touched(&mut self) -> u64 {
-        let touched = |desk: &mut Mutex<Desk>| {
-            let desk = desk.get_mut().unwrap_or_else(|e| e.into_inner());
-            std::mem::take(&mut desk.touched)
+        let touched = |scratch: &mut Mutex<Scratch>| {
+            let scratch = scratch.get_mut().unwrap_or_else(|e| e.into_inner());
+            std::mem::take(&mut scratch.touched)
         };
-        self.desks.iter_mut().map(touched).sum()
+        self.scratch.iter_mut().map(touched).sum()
     }
 
     /// Draws a part of the picture; returns the threads' time for sorting and for the pixels.
@@ -596,15 +598,15 @@ impl Renderer {
             .with_max_len(1)
             .for_each(|(band, row)| {
                 let thread = rayon::current_thread_index().unwrap_or(0);
-                // Only this thread uses this desk, and a panic would have ended the drawing.
-                let mut desk = self.desks[thread].lock().unwrap_or_else(|e| e.into_inner());
+                // Only this thread uses this scratch, and a panic would have ended the drawing.
+                let mut scratch = self.scratch[thread].lock().unwrap_or_else(|e| e.into_inner());
                 for column in part.columns.clone() {
-                    desk.draw([column, row], canvas, &contents, output, band);
+                    scratch.draw([column, row], canvas, &contents, output, band);
                 }
             });
-        self.desks.iter().fold(Default::default(), |sum, desk| {
-            let desk = &mut *desk.lock().unwrap_or_else(|e| e.into_inner());
-            let times = [&mut desk.sorting, &mut desk.blending].map(std::mem::take);
+        self.scratch.iter().fold(Default::default(), |sum, scratch| {
+            let scratch = &mut *scratch.lock().unwrap_or_else(|e| e.into_inner());
+            let times = [&mut scratch.sorting, &mut scratch.blending].map(std::mem::take);
             [sum[0] + times[0], sum[1] + times[1]]
         })
     }
@@ -635,15 +637,15 @@ impl Laps {
     }
 }
 
-/// What a picture is to show.
-struct Wanted {
+/// What to draw, on what background.
+struct OutputOptions {
     channel: Channel,
     background: Background,
 }
 
-impl Default for Wanted {
+impl Default for OutputOptions {
     fn default() -> Self {
-        Wanted {
+        OutputOptions {
             channel: Channel::Colour,
             background: Background::Transparent,
         }

@@ -1,7 +1,7 @@
 //! What the pictures should be: double precision, every Gaussian at every pixel, the textbook formulas.
 //!
 //! Slow, and meant for tests. It shares with the renderer only the definitions: the camera, the widened Jacobian's
-//! range, the blur, the visibility `z > near`, the ceiling of α, and the order by the depth as an `f32` and then by
+//! range, the blur, the visibility `z > near`, the maximum α, and the order by the depth as an `f32` and then by
 //! index.
 
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
@@ -21,7 +21,7 @@ pub struct Cutoffs {
     /// Whether opacity is taken back by as much as the blur widens.
     pub compensated: bool,
     /// Whether what reaches over the near plane is evaluated in space.
-    pub near_care: bool,
+    pub ray_space: bool,
     /// Whether each pixel has an order of its own.
     pub ordered: bool,
 }
@@ -32,7 +32,7 @@ impl Cutoffs {
         alpha: 0.0,
         through: 1e-9,
         compensated: false,
-        near_care: true,
+        ray_space: true,
         ordered: false,
     };
 }
@@ -41,7 +41,7 @@ impl Cutoffs {
 /// looked at for.
 const NOTHING: f64 = 1e-12;
 
-struct Seen {
+struct Projected {
     depth: f32,
     shape: Shape,
     opacity: f64,
@@ -116,7 +116,7 @@ impl Shape {
 
 /// Draws `gaussians`, which must be finite but for those that no camera would show.
 pub fn render(gaussians: &Gaussians, camera: &Camera, background: Background, cutoffs: Cutoffs) -> Image {
-    let mut seen: Vec<Seen> = (0..gaussians.len())
+    let mut seen: Vec<Projected> = (0..gaussians.len())
         .filter_map(|i| see(gaussians, camera, i, cutoffs))
         .collect();
     // Stable: ties keep the order of the input.
@@ -128,7 +128,7 @@ pub fn render(gaussians: &Gaussians, camera: &Camera, background: Background, cu
     rows.for_each(|(row, y)| {
         let y = f64::from(y) + 0.5;
         let mut sums = vec![(DVec3::ZERO, 1.0); row.len()];
-        let blend = |(colour, through): &mut (DVec3, f64), s: &Seen, alpha: f64| {
+        let blend = |(colour, through): &mut (DVec3, f64), s: &Projected, alpha: f64| {
             if alpha >= cutoffs.alpha && *through >= cutoffs.through {
                 let weight = alpha.min(0.99) * *through;
                 *colour += s.colour * weight;
@@ -164,7 +164,7 @@ pub fn render(gaussians: &Gaussians, camera: &Camera, background: Background, cu
     Image { width, height, pixels }
 }
 
-fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Option<Seen> {
+fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Option<Projected> {
     let position = DVec3::from(gaussians.position[i].map(f64::from));
     let scale = DVec3::from(gaussians.scale[i].map(|s| f64::from(s).abs().min(1e4)));
     let [w, x, y, z] = gaussians.rotation[i].map(f64::from);
@@ -179,7 +179,7 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Op
     }
     let axes = camera.pose.matrix3 * DMat3::from_quat(rotation.normalize());
     let reach = 3.0 * (axes.row(2) * scale).length();
-    let crosses = cutoffs.near_care && (t.z - camera.near).abs() < reach;
+    let crosses = cutoffs.ray_space && (t.z - camera.near).abs() < reach;
     if !(t.z > camera.near || crosses) {
         return None;
     }
@@ -189,7 +189,7 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Op
         let blur = f64::from(gaussians.pixel_blur()) * distance * distance / (camera.fx * camera.fy);
         let variance = scale * scale + blur.max(gaussians.blur.into());
         let whiten = DMat3::from_diagonal(variance.map(|v| 1.0 / v.sqrt())) * axes.transpose();
-        return Some(Seen {
+        return Some(Projected {
             depth: (t.z as f32).max(camera.near as f32),
             shape: Shape::Solid { whiten, centre: t },
             opacity,
@@ -229,7 +229,7 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize, cutoffs: Cutoffs) -> Op
     let far = (2.0 * (opacity / NOTHING).ln().max(0.0)).sqrt();
     let ahead = sigma.z_axis;
     let conic = covariance.inverse();
-    Some(Seen {
+    Some(Projected {
         depth: t.z as f32,
         shape: Shape::Flat {
             reach: DVec2::new((a + blur).sqrt(), (c + blur).sqrt()) * far,

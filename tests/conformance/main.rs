@@ -7,7 +7,7 @@
 //!
 //! The suite of version 3 is beside it: see `transform`.
 //!
-//! After a change of the format or of the shipped model, `cargo xtask conformance` makes streams and digests anew.
+//! After a change of the format or of the shipped model, `cargo xtask conformance` makes streams and digests again.
 
 #[cfg(feature = "encoder")]
 #[path = "../common/mod.rs"]
@@ -143,7 +143,7 @@ fn gaussians_in_half_are_near_those_in_f16_on_machines_that_sum_in_f16() {
         let pairs = floats.iter().zip(&half);
         let squares: f32 = pairs.map(|(a, b)| (a - b).powi(2)).sum();
         let off = (squares / floats.len() as f32).sqrt();
-        println!("{isa}: colours are off by {off:.1e}");
+        println!("{isa}: colours have an error of {off:.1e}");
         assert!((1e-6..3e-3).contains(&off), "{isa}: {off}");
         ran.push(isa.to_string());
     }

@@ -1,4 +1,4 @@
-//! Streams from strangers: cut, damaged, lying, arriving in any pieces.
+//! Untrusted streams: cut, damaged, lying, arriving in any pieces.
 
 #[path = "../common/mod.rs"]
 mod common;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::choice::Subject;
+use super::choice::CalibrationInput;
 use super::measure::measure;
 use b2p::latents::network::{Head, Model};
 use b2p::metrics::Machine;
@@ -158,13 +158,13 @@ impl PictureCost {
 }
 
 impl Calibration {
-    /// Measures with a stream and its model, with as many threads as the rayon pool that the caller is in has; `say` is told what is being
+    /// Measures with a stream and its model, with as many threads as the rayon pool that the caller is in has; `say` receives what is being
     /// done.
     ///
     /// # Errors
     /// Those of [`LatentDecoder::decode`](b2p::latents::LatentDecoder::decode) and
     /// [`Renderer::render`](b2p::renderer::Renderer::render); [`Error::Usage`] if no level has Gaussians, or threads cannot be started.
-    pub fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
+    pub fn measure(subject: &CalibrationInput<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
         measure(subject, say)
     }
 

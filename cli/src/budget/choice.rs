@@ -1,4 +1,4 @@
-//! A time to keep, or an accuracy, instead of knobs to turn.
+//! A time budget or a least accuracy, in place of single settings.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ const MARGIN: f64 = 1.1;
 const SPARE: f64 = 1e6;
 
 /// A stream to measure with.
-pub struct Subject<'a> {
+pub struct CalibrationInput<'a> {
     /// The stream.
     pub stream: &'a [u8],
     /// Loads the model that it was coded with.
@@ -26,7 +26,7 @@ pub struct Subject<'a> {
     pub limits: &'a Limits,
 }
 
-/// What is asked for. With a time, the most accurate setting that keeps it; with an accuracy alone, the fastest that has it.
+/// What is asked for. With a time, the most accurate setting that fits it; with an accuracy alone, the fastest that has it.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Budget {
     /// The time that the task may take.
@@ -62,7 +62,7 @@ pub struct Choice {
     pub expected: Duration,
     /// PSNR in dB of the setting in the calibration.
     pub psnr: f64,
-    /// Whether that keeps the time asked for, with a tenth and a millisecond to spare.
+    /// Whether that fits the time budget, with a tenth and a millisecond to spare.
     pub in_time: bool,
     /// Whether it has the accuracy asked for.
     pub accurate: bool,
@@ -71,7 +71,7 @@ pub struct Choice {
 impl Budget {
     /// The setting for a stream with this header, of which `levels` can be decoded to Gaussians.
     ///
-    /// If none both keeps the time and has the accuracy, the time comes first; if none keeps the time either, it is the fastest.
+    /// If no setting both fits the budget and has the accuracy, the budget comes first; if none fits it either, it is the fastest.
     ///
     /// # Errors
     /// [`Error::Usage`] if the calibration knows none of the levels.
@@ -100,7 +100,7 @@ impl Budget {
         let chosen = best.or_else(in_time).or_else(fastest);
         chosen.copied().ok_or_else(|| {
             Error::Usage(format!(
-                "nothing is known of what the levels {levels:?} of this stream take: calibrate anew"
+                "nothing is known of what the levels {levels:?} of this stream take: calibrate again"
             ))
         })
     }
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn the_most_accurate_setting_that_keeps_the_time_is_taken() {
+    fn the_most_accurate_setting_that_fits_the_budget_is_taken() {
         // Level 8: 62 + 200 ms, with quick heads 62 + 50; level 9: 262 + 200 ms, and 262 + 600 ms in f16.
         let with = |time| choose(Some(time), None, Task::Decode);
         let named = |c: Choice| (c.level, c.heads, c.precision, c.in_time);

@@ -1,6 +1,6 @@
 //! What decoding and drawing cost, measured as a process that does it once has it.
 //!
-//! Threads have just started, memory is fresh from the system, models are as they come from the file and renderers are new. What is paid
+//! Threads have just started, memory is fresh from the system, models are freshly loaded and renderers are new. What is paid
 //! however few the voxels are comes from a second stream: the same geometry, some levels coarser.
 
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use b2p::metrics::give_back;
 
 use super::calibration::{Calibration, DrawCost, LevelCost, PictureCost, PictureTimes, model_name};
-use super::choice::Subject;
+use super::choice::CalibrationInput;
 use super::choice::faces;
 use b2p::Limits;
 use b2p::container::Header;
@@ -44,7 +44,7 @@ const QUALITIES: [(&str, Quality); 3] = [
 const EQUAL: f64 = 200.0;
 
 /// [`Calibration::measure`].
-pub(super) fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
+pub(super) fn measure(subject: &CalibrationInput<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
     let header = Header::parse(subject.stream, subject.limits)?;
     let model = (subject.model)()?;
     let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
@@ -175,7 +175,7 @@ fn without_features(header: &Header, finest: u8, octree: &Octree, coarser: u8, m
 }
 
 /// Of each level of a stream down to `finest`, its voxels, and the nanoseconds that it takes in the exact zone.
-fn exact_times(subject: &Subject<'_>, stream: &[u8], finest: u8) -> Result<Vec<[f64; 2]>> {
+fn exact_times(subject: &CalibrationInput<'_>, stream: &[u8], finest: u8) -> Result<Vec<[f64; 2]>> {
     let header = Header::parse(stream, subject.limits)?;
     let runs = repeated(|| {
         let model = (subject.model)()?;
@@ -253,7 +253,7 @@ impl Level {
         Ok(self.gaussians(model, Heads::Best, &raw))
     }
 
-    /// Generates Gaussians, each time with a model as it comes from the file.
+    /// Generates Gaussians, each time with a freshly loaded model.
     fn generate(&self, model: &dyn Fn() -> Result<Model>, heads: Heads) -> Result<Made> {
         let runs = repeated(|| {
             let fresh = model()?;

@@ -16,7 +16,7 @@ use clap::Args;
 
 use self::calibration::Calibration;
 pub use self::choice::Task;
-use self::choice::{Budget, Choice, Subject};
+use self::choice::{Budget, CalibrationInput, Choice};
 use super::args::{DetailArg, ModelArg};
 use super::pipe::PIPE;
 use super::progress::Progress;
@@ -35,7 +35,7 @@ pub struct BudgetArgs {
     /// Least PSNR in dB against double precision, as it was for the sample
     #[arg(long, value_name = "DB", value_parser = decibel, conflicts_with_all = ["level", "precision", "heads"])]
     pub min_psnr: Option<f64>,
-    /// Measure this machine anew
+    /// Measure this machine again
     #[arg(long)]
     pub calibrate: bool,
 }
@@ -114,7 +114,7 @@ fn calibration(
         Some(path) => load::bytes(path, limits)?,
         None => embedded::MODEL.to_vec(),
     };
-    let subject = Subject {
+    let subject = CalibrationInput {
         stream,
         model: &|| Ok(Model::from_bytes(&file)?.with_isa(model.isa())),
         limits,

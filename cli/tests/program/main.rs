@@ -9,8 +9,8 @@ mod framing;
 mod knobs;
 mod outputs;
 mod pictures;
+mod rate_control;
 mod transform;
-mod within;
 
 use std::io::Write;
 use std::path::Path;

@@ -55,7 +55,7 @@ pub struct FloatConv {
     /// Per tap, panel and input channel: each output channel's weight.
     weights: Vec<Words>,
     /// Per tap, panel and pair of input channels: each output channel's two weights in bf16. Empty unless asked for.
-    brain: Vec<Words>,
+    bf16_weights: Vec<Words>,
     /// What [`Isa::has_half`] multiplies, if it was asked for.
     #[cfg(target_arch = "aarch64")]
     half: Option<half::Weights>,
@@ -124,7 +124,7 @@ impl FloatConv {
         FloatConv {
             extents,
             weights: packed,
-            brain: Vec::new(),
+            bf16_weights: Vec::new(),
             #[cfg(target_arch = "aarch64")]
             half: None,
             precision: Precision::F32,
@@ -140,11 +140,11 @@ impl FloatConv {
         let Extents { volume, cin, .. } = self.extents;
         let pairs = cin.div_ceil(2);
         self.precision = precision;
-        self.brain = match precision {
+        self.bf16_weights = match precision {
             Precision::F32 | Precision::Fastest | Precision::Half => Vec::new(),
             Precision::Bf16 => vec![Words::default(); volume * self.extents.panels() * pairs],
         };
-        let panels = self.brain.chunks_exact_mut(pairs);
+        let panels = self.bf16_weights.chunks_exact_mut(pairs);
         for (to, from) in panels.zip(self.weights.chunks_exact(cin)) {
             for (c, from) in from.iter().enumerate() {
                 for (to, from) in to[c / 2].0.iter_mut().zip(from.f32()) {
@@ -187,7 +187,7 @@ impl FloatConv {
     fn chosen(&self, isa: Isa) -> (Multiply, &[Words], Expand<f16>) {
         #[cfg(target_arch = "x86_64")]
         if self.precision() == Precision::Bf16 && isa.has_bf16() {
-            return (super::bf16::multiply, &self.brain, super::bf16::expand);
+            return (super::bf16::multiply, &self.bf16_weights, super::bf16::expand);
         }
         #[cfg(target_arch = "aarch64")]
         if let Some(half) = self.half(isa) {

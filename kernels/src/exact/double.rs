@@ -2,7 +2,7 @@
 
 use crate::simd::{Isa, Simd, dispatch};
 
-/// Adds to each sum `o` the products `input[c] · weights[c][o]`, one input after the other: the same bits with any instructions.
+/// Adds to each sum `o` the products `input[c] · weights[c][o]`, one input after the other: the same bits on any instruction set.
 ///
 /// # Panics
 /// If there are no sums, or not a weight for each of them and each input.
@@ -44,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn products_are_added_up_in_their_order_with_any_instructions() {
+    fn products_are_added_up_in_their_order_on_any_instruction_set() {
         let value = |i: usize| (i * 7919 % 1009) as f64 / 3.0 - 150.0;
         for [inputs, outputs] in [[1, 1], [7, 14], [64, 64], [5, 40]] {
             let input: Vec<f64> = (0..inputs).map(value).collect();

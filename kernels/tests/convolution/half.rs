@@ -251,7 +251,7 @@ fn fused(sum: f64, a: f64, b: f64) -> f64 {
     let total = sum + product;
     let added = total - sum;
     let lost = (sum - (total - added)) + (product - added);
-    // What does not fit is told by the last bit, with which nothing is halfway between two f16.
+    // The last bit says whether anything did not fit, with which nothing is halfway between two f16.
     let bits = total.to_bits();
     let odd = match (lost > 0.0) == (total > 0.0) {
         true => bits + 1,

@@ -10,7 +10,7 @@ use b2p::{Limits, embedded, encoder};
 
 use crate::error::{LabError, Result};
 use crate::sample::write_bytes;
-use crate::tradeoff::{self, Options, Report, Row, Subject};
+use crate::tradeoff::{self, MeasuredInput, Options, Report, Row};
 
 /// Measure what accuracy costs in time on this machine: a table, JSON, a plot, and a page with all of them
 #[derive(Debug, clap::Args)]
@@ -27,7 +27,7 @@ pub struct Args {
     /// Width and height of the pictures in pixels
     #[arg(long, value_name = "WxH", default_value = "512x512", value_parser = size)]
     size: [u32; 2],
-    /// Times that everything is measured; medians are told
+    /// Times that everything is measured; medians are reported
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
     /// Model file [default: the one inside the program]
@@ -57,7 +57,7 @@ impl Args {
             }
             false => (stream, None),
         };
-        let subject = Subject {
+        let subject = MeasuredInput {
             stream: &stream,
             model: &|| Model::from_bytes(&file),
             cloud: cloud.as_ref(),

@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ply_of_gaussians_is_told_from_one_of_points() {
+    fn a_ply_of_gaussians_is_distinguished_from_one_of_points() {
         let folder = tempfile::tempdir().unwrap();
         let limits = Limits::default();
         let points = PointCloud {

@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn levels_are_told_once_by_the_deepest_row_of_an_item() {
+    fn levels_are_reported_once_by_the_deepest_row_of_an_item() {
         let level = |level| LevelRate {
             level,
             geometry: 0.05,

@@ -95,8 +95,8 @@ impl Network {
             let output = self.row(OUTPUT + octant);
             let logit = dot(&hidden, output) + self.parameters[BIAS + octant];
             let bit = occupancy >> octant & 1 == 1;
-            let surprise = if bit { -logit } else { logit };
-            nats += f64::from(surprise.max(0.0) + (-surprise.abs()).exp().ln_1p());
+            let against = if bit { -logit } else { logit };
+            nats += f64::from(against.max(0.0) + (-against.abs()).exp().ln_1p());
 
             let error = 1.0 / (1.0 + (-logit).exp()) - f32::from(u8::from(bit));
             let own: Row = std::array::from_fn(|unit| if hidden[unit] > 0.0 { error * output[unit] } else { 0.0 });

@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_darkens_only_what_faces_it_and_less_from_afar() {
+    fn a_ball_darkens_only_what_faces_it_and_less_from_a_distance() {
         let mut light = Light::studio();
         let open = light.shade(Vec3::ZERO, Vec3::Y);
         light.occluders.push((Vec3::Y, 0.5));

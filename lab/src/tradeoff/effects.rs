@@ -4,8 +4,8 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use super::scenes::{crowd, interleaved, iridescent};
-use super::{Options, Subject};
+use super::scenes::{dense_surface, interleaved, iridescent};
+use super::{MeasuredInput, Options};
 use b2p::Result;
 use b2p::gaussians::Gaussians;
 use b2p::latents::LatentDecoder;
@@ -49,14 +49,14 @@ struct Case {
     others: Effects,
 }
 
-fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
+fn cases(subject: &MeasuredInput<'_>, options: &Options) -> Result<Vec<Case>> {
     let model = (subject.model)()?;
     let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
     let stream = decoder.decode(subject.stream, None, &Log::default())?;
     let side = options.size[0].min(options.size[1]);
     let stream_camera = || Camera::orbit(20.0, 20.0, 2.6, 45.0, side, side);
-    let (plain, camera) = crowd(COUNT, 2.0, side)?;
-    let (_, far) = crowd(COUNT, 0.4, side)?;
+    let (plain, camera) = dense_surface(COUNT, 2.0, side)?;
+    let (_, far) = dense_surface(COUNT, 0.4, side)?;
     let compensated = Gaussians {
         compensated: true,
         ..plain.clone()
@@ -136,7 +136,7 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
 /// # Errors
 /// Those of [`LatentDecoder::decode`](b2p::latents::LatentDecoder::decode) and
 /// [`Renderer::render`](b2p::renderer::Renderer::render).
-pub fn effect_costs(subject: &Subject<'_>, options: &Options) -> Result<Vec<EffectCost>> {
+pub fn effect_costs(subject: &MeasuredInput<'_>, options: &Options) -> Result<Vec<EffectCost>> {
     let cases = cases(subject, options)?;
     let mut times = vec![[Vec::new(), Vec::new()]; cases.len()];
     let mut called_for = vec![false; cases.len()];
@@ -167,7 +167,12 @@ pub fn effect_costs(subject: &Subject<'_>, options: &Options) -> Result<Vec<Effe
 
 impl Case {
     /// Milliseconds of a picture after one that is not counted, the picture, and what it was drawn with.
-    fn draw(&self, subject: &Subject<'_>, choice: EffectMode, camera: &Camera) -> Result<(f64, Image, EffectSet)> {
+    fn draw(
+        &self,
+        subject: &MeasuredInput<'_>,
+        choice: EffectMode,
+        camera: &Camera,
+    ) -> Result<(f64, Image, EffectSet)> {
         let mut effects = self.others;
         effects.set(self.effect, choice);
         let renderer = Renderer::new().with_effects(effects);
@@ -186,7 +191,7 @@ impl Case {
     }
 
     /// The worst pixel of a small picture with the effect on.
-    fn worst(&self, subject: &Subject<'_>) -> Result<f64> {
+    fn worst(&self, subject: &MeasuredInput<'_>) -> Result<f64> {
         let mut camera = self.camera;
         let shrink = f64::from(JUDGED) / f64::from(camera.width);
         for length in [&mut camera.fx, &mut camera.fy, &mut camera.cx, &mut camera.cy] {
@@ -196,7 +201,7 @@ impl Case {
         let (_, image, set) = self.draw(subject, EffectMode::On, &camera)?;
         let cutoffs = Cutoffs {
             compensated: set.antialias,
-            near_care: true,
+            ray_space: true,
             ordered: set.order,
             ..Cutoffs::NONE
         };

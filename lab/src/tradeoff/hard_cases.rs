@@ -3,7 +3,7 @@
 use b2p::Isa;
 use serde::Serialize;
 
-use super::Subject;
+use super::MeasuredInput;
 use super::scenes::{Random, Scene, hard_scenes};
 use super::setting::QUALITIES;
 use b2p::Result;
@@ -56,7 +56,7 @@ impl CaseError {
 ///
 /// # Errors
 /// Those of [`Renderer::render`](b2p::renderer::Renderer::render).
-pub fn renderer_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
+pub fn renderer_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
     let best = Isa::detect();
     let mut settings: Vec<(String, Quality, Isa)> = QUALITIES
         .iter()
@@ -96,7 +96,7 @@ const LEVEL: u8 = 5;
 /// # Errors
 /// Those of [`Model::from_bytes`](b2p::latents::network::Model::from_bytes), of [`Model::generate`](b2p::latents::network::Model::generate), and of
 /// [`Renderer::render`](b2p::renderer::Renderer::render).
-pub fn network_cases(subject: &Subject<'_>) -> Result<Vec<HardCase>> {
+pub fn network_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
     let model = (subject.model)()?;
     let mut others = Vec::new();
     for precision in Precision::ALL {

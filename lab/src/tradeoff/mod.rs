@@ -40,7 +40,7 @@ pub use truth::of_cloud;
 use run::Run;
 
 /// What is decoded, and with what.
-pub struct Subject<'a> {
+pub struct MeasuredInput<'a> {
     /// A stream.
     pub stream: &'a [u8],
     /// Loads the model that it was coded with.
@@ -74,11 +74,11 @@ impl Options {
     }
 }
 
-/// Measures all settings; `say` is told what is being done.
+/// Measures all settings; `say` receives what is being done.
 ///
 /// # Errors
 /// Those of decoding and drawing; [`Error::Usage`] if the stream has no level with Gaussians, or nothing is to be measured.
-pub fn run(subject: &Subject<'_>, options: &Options, say: &dyn Fn(&str)) -> Result<Report> {
+pub fn run(subject: &MeasuredInput<'_>, options: &Options, say: &dyn Fn(&str)) -> Result<Report> {
     if options.views == 0 || options.repeats == 0 {
         return Err(Error::Usage("no view or no repeat leaves nothing to measure".into()));
     }

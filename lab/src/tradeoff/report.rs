@@ -6,7 +6,7 @@ use super::effects::EffectCost;
 use super::hard_cases::HardCase;
 use super::run::Truth;
 use super::setting::{Knob, Setting, pareto_front};
-use super::{Options, Subject};
+use super::{MeasuredInput, Options};
 use b2p::Result;
 use b2p::container::Header;
 use b2p::gaussians::Heads;
@@ -136,7 +136,7 @@ pub struct Row {
     pub worst: f64,
     /// View, column and row where it is.
     pub worst_at: [u32; 3],
-    /// Bytes of memory that decoding takes at most, as foretold from the stream's header.
+    /// Bytes of memory that decoding takes at most, an upper bound from the stream's header.
     pub most_memory: u64,
     /// Whether no combination decodes and draws a picture as well in less time.
     pub on_front: bool,
@@ -266,7 +266,7 @@ pub struct Report {
 
 impl Report {
     pub(super) fn new(
-        subject: &Subject<'_>,
+        subject: &MeasuredInput<'_>,
         options: &Options,
         truth: &Truth,
         mut ladder: Vec<Row>,

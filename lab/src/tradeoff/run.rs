@@ -7,7 +7,7 @@ use rayon::ThreadPool;
 use super::report::{Crop, Measured, STAGES};
 use super::setting::{Choices, Decode, Setting};
 use super::truth::{in_double, of_cloud};
-use super::{Options, Subject};
+use super::{MeasuredInput, Options};
 use b2p::container::Header;
 use b2p::gaussians::Gaussians;
 use b2p::gaussians::Heads;
@@ -50,7 +50,7 @@ struct Drawing {
 
 /// All that is measured.
 pub(super) struct Run<'a> {
-    subject: &'a Subject<'a>,
+    subject: &'a MeasuredInput<'a>,
     options: &'a Options,
     models: Vec<(Decode, Model)>,
     pools: Vec<(usize, ThreadPool)>,
@@ -95,7 +95,7 @@ impl<'a> Run<'a> {
     ///
     /// # Errors
     /// Those of [`Header::parse`], of reading the model, and [`crate::Error::Usage`] for a setting that the model does not have.
-    pub fn new(subject: &'a Subject<'a>, options: &'a Options, settings: &[Setting]) -> Result<Self> {
+    pub fn new(subject: &'a MeasuredInput<'a>, options: &'a Options, settings: &[Setting]) -> Result<Self> {
         let header = Header::parse(subject.stream, subject.limits)?;
         let mut run = Run {
             subject,
@@ -146,7 +146,7 @@ impl<'a> Run<'a> {
     ///
     /// # Errors
     /// Those of reading the model, and of [`LatentDecoder::levels`].
-    pub fn choices(subject: &Subject<'_>) -> Result<Choices> {
+    pub fn choices(subject: &MeasuredInput<'_>) -> Result<Choices> {
         let model = (subject.model)()?;
         let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
         let levels = decoder.levels(subject.stream)?;
@@ -208,7 +208,7 @@ impl<'a> Run<'a> {
         let Some((_, model)) = models.find(|(other, _)| *other == how) else {
             return Err(Error::Usage("no model was loaded for this setting".into()));
         };
-        let Subject { stream, limits, .. } = self.subject;
+        let MeasuredInput { stream, limits, .. } = self.subject;
         self.pool(how.threads)?.install(|| {
             let log = Log::default();
             let decoder = LatentDecoder::new(model).with_limits((*limits).clone());

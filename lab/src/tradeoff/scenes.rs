@@ -171,7 +171,7 @@ pub fn hard_scenes() -> Result<Vec<Scene>> {
             orbit(40.0, 48)?,
         ),
         scene(
-            "the silhouette of a crowd",
+            "the silhouette of many overlapping splats",
             gather(surface(6000, 0.02)),
             orbit(3.0, 120)?,
         ),
@@ -198,7 +198,7 @@ pub fn hard_scenes() -> Result<Vec<Scene>> {
 ///
 /// # Errors
 /// As [`Camera::check`].
-pub fn crowd(count: usize, pixels: f64, side: u32) -> Result<(Gaussians, Camera)> {
+pub fn dense_surface(count: usize, pixels: f64, side: u32) -> Result<(Gaussians, Camera)> {
     let width = 0.8 * (4.0 * std::f64::consts::PI / count as f64).sqrt() / 2.0;
     let camera = orbit(3.0, side)?;
     let radius = (width * camera.fx / pixels).max(1.0);
@@ -244,9 +244,9 @@ mod tests {
     }
 
     #[test]
-    fn a_crowd_is_as_wide_as_asked_for() {
+    fn a_dense_surface_has_splats_as_wide_as_asked_for() {
         for pixels in [0.2, 1.0, 3.0] {
-            let (gaussians, camera) = crowd(10_000, pixels, 256).unwrap();
+            let (gaussians, camera) = dense_surface(10_000, pixels, 256).unwrap();
             let seen = f64::from(gaussians.scale[0][0]) * camera.fx / camera.pose.translation.z;
             assert!((seen / pixels - 1.0).abs() < 0.1, "{seen} {pixels}");
         }

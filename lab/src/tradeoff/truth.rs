@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use super::Subject;
+use super::MeasuredInput;
 use b2p::Result;
 use b2p::cloud::ColouredVoxels;
 use b2p::container::{Header, Stream};
@@ -10,14 +10,14 @@ use b2p::gaussians::Heads;
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
-use b2p::latents::{ColourFilter, ColourResidual, Surroundings, activate};
+use b2p::latents::{ColourContexts, ColourFilter, ColourResidual, activate};
 use b2p::log::Log;
 
 /// The Gaussians that the best heads have for a level, generated in double precision; and how many milliseconds that took.
 ///
 /// # Errors
 /// Those of [`LatentDecoder::exact`] and [`Model::generate_in_double`].
-pub fn in_double(subject: &Subject<'_>, model: &Model, level: u8) -> Result<(Gaussians, f64)> {
+pub fn in_double(subject: &MeasuredInput<'_>, model: &Model, level: u8) -> Result<(Gaussians, f64)> {
     let header = Header::parse(subject.stream, subject.limits)?;
     let decoder = LatentDecoder::new(model).with_limits(subject.limits.clone());
     let exact = decoder.exact(subject.stream, level, &Log::default())?;
@@ -36,7 +36,7 @@ pub fn in_double(subject: &Subject<'_>, model: &Model, level: u8) -> Result<(Gau
     };
     if let Some(filter) = said.filters[0] {
         let above = level.checked_sub(1).map(|up| exact.octree.kernel_map(up));
-        let around = Surroundings::of_level(&gaussians, &exact.octree, level, &map, above.as_ref());
+        let around = ColourContexts::of_level(&gaussians, &exact.octree, level, &map, above.as_ref());
         ColourFilter::parse(&filter, level)?.apply(&mut gaussians, &around);
     }
     let slice = header.slice_voxels as usize;

@@ -99,7 +99,7 @@ const FILTER_SHARE: usize = 100;
 pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<Encoded> {
     let steps = options.fineness.steps()?;
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
-    let subject = Subject::new(cloud, levels, options, log)?;
+    let subject = EncoderInput::new(cloud, levels, options, log)?;
     let top = *subject.levels.end();
     let coded = subject.code(top, steps, log)?;
     subject.checked(coded, options.heads.as_ref(), usize::MAX, log)
@@ -179,7 +179,7 @@ fn choose_levels(bits: u8, wanted: Option<RangeInclusive<u8>>) -> Result<RangeIn
 }
 
 /// A cloud and what all its streams share, however exactly colours are coded.
-struct Subject<'a> {
+struct EncoderInput<'a> {
     cloud: &'a ColouredVoxels,
     options: &'a Options,
     isa: Isa,
@@ -212,10 +212,10 @@ struct Layer {
     slices: Vec<(u32, Vec<u8>)>,
 }
 
-impl<'a> Subject<'a> {
+impl<'a> EncoderInput<'a> {
     fn new(cloud: &'a ColouredVoxels, levels: RangeInclusive<u8>, options: &'a Options, log: &Log) -> Result<Self> {
         let (isa, top) = (options.isa.unwrap_or_else(Isa::detect), *levels.end());
-        let subject = Subject {
+        let subject = EncoderInput {
             cloud,
             options,
             isa,
@@ -246,7 +246,7 @@ impl<'a> Subject<'a> {
             };
             Ok((1..=top).into_par_iter().map(code).collect())
         })?;
-        Ok(Subject {
+        Ok(EncoderInput {
             octree,
             maps,
             geometry,

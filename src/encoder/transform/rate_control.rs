@@ -4,7 +4,7 @@
 //! in smaller and smaller steps, then the next level, and so on; at the end of the path are the exact colours of the
 //! finest level. A level is on the path from the greatest step that its geometry is worth.
 
-use super::{Coded, MAX_CHROMA, Options, QualityTarget, Subject, choose_levels, steps_of};
+use super::{Coded, EncoderInput, MAX_CHROMA, Options, QualityTarget, choose_levels, steps_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth};
 use crate::encoder::Encoded;
@@ -49,7 +49,7 @@ pub fn encode_to_rate(
     let depth = cloud.voxels.depth();
     let wanted = options.levels.clone();
     let levels = choose_levels(depth, wanted.or(Some(depth.saturating_sub(3)..=depth)))?;
-    let subject = Subject::new(cloud, levels.clone(), options, log)?;
+    let subject = EncoderInput::new(cloud, levels.clone(), options, log)?;
     let room = bits_per_point * cloud.voxels.len() as f64 / 8.0;
     let mut search = Search {
         subject: &subject,
@@ -88,7 +88,7 @@ pub fn encode_to_rate(
 
 /// What was found on the way.
 struct Search<'a> {
-    subject: &'a Subject<'a>,
+    subject: &'a EncoderInput<'a>,
     /// Bytes that a stream may have.
     room: f64,
     /// Of the smallest stream so far.
@@ -114,7 +114,7 @@ impl Search<'_> {
         };
         let fixed = self.subject.geometry_bytes(top) as f64;
         // Bytes of the finest place that fits and of the coarsest that does not, beyond the geometry's.
-        let (mut fits, mut exceeds): (Option<Tried>, Option<Tried>) = (None, None);
+        let (mut fits, mut exceeds): (Option<Candidate>, Option<Candidate>) = (None, None);
         let mut best = None;
         let mut next = Some(FIRST);
         let mut tries = 0;
@@ -124,7 +124,7 @@ impl Search<'_> {
             }
             tries += 1;
             let (size, found) = self.attempt_sized(place(at), log)?;
-            let tried = Some(Tried {
+            let tried = Some(Candidate {
                 at,
                 bytes: (size - fixed).max(1.0),
             });
@@ -188,16 +188,16 @@ impl Search<'_> {
     }
 }
 
-/// A place that was tried.
+/// A candidate that was tried.
 #[derive(Debug, Clone, Copy)]
-struct Tried {
+struct Candidate {
     at: u8,
     bytes: f64,
 }
 
 /// The place to try next, from the one that fits and the one that does not, near where the room ends: bytes are about a
 /// power of the step. `None` if nothing is between them.
-fn between(fits: Option<Tried>, exceeds: Option<Tried>, room: f64, last: u8) -> Option<u8> {
+fn between(fits: Option<Candidate>, exceeds: Option<Candidate>, room: f64, last: u8) -> Option<u8> {
     /// How much the logarithm of the bytes falls from one place to the next, more or less.
     const SLOPE: f64 = 0.038;
     let low = exceeds.map_or(0, |tried| tried.at + 1);
@@ -229,14 +229,14 @@ mod tests {
         let mut next = Some(FIRST);
         while let Some(at) = next {
             tries += 1;
-            let tried = Some(Tried { at, bytes: bytes(at) });
+            let tried = Some(Candidate { at, bytes: bytes(at) });
             match bytes(at) <= room {
                 true => fits = tried,
                 false => exceeds = tried,
             }
             next = between(fits, exceeds, room, COARSEST);
         }
-        (fits.map(|tried: Tried| tried.at), tries)
+        (fits.map(|tried: Candidate| tried.at), tries)
     }
 
     #[test]

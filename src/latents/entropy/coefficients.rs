@@ -44,7 +44,7 @@ const FIRST: [u16; CLASSES.len() + 1] = [64_000, 61_500, 58_000, 53_000, 47_000,
 const LEAST: u32 = 64;
 const QUICK: u32 = 4;
 const SLOW: u32 = 7;
-/// Ones of a magnitude before the rest is told otherwise.
+/// Ones of a magnitude before the rest is coded otherwise.
 const ONES: u32 = 14;
 /// Ones that contexts tell apart.
 const COUNTED: u32 = 3;
@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_costs_next_to_nothing() {
+    fn zeros_cost_hardly_anything() {
         let bytes = encode(&vec![[0; 3]; 16_384]);
         assert!(bytes.len() < 40, "{}", bytes.len());
     }

@@ -1,7 +1,7 @@
 //! What a slice teaches about its own predictions while it is coded: means that were too low or too high, here or
 //! nearby; scales that were too narrow or too wide; and means where nothing is predicted.
 //!
-//! All of it starts anew in every slice, and is learned latent by latent in the order of coding, by the encoder and the
+//! All of it starts from its first values in every slice, and is learned latent by latent in the order of coding, by the encoder and the
 //! decoder alike. Shifts to the right round down.
 //!
 //! # Where nothing is predicted
@@ -27,19 +27,19 @@
 //! its input, that kept within ±256, and is kept within ±2¹⁹.
 //!
 //! # Scales
-//! A latent's *slope* tells how much likelier a wider scale would have made it: with `p₊` and `p₋` what its entry (the
-//! last one, if it has none of its own there) has of 2¹⁶ in the rows of the scale indices `σ′ + 1` and `σ′ − 1` (kept
-//! in 0 to 63) and of `μ′`, it is `2¹²·(p₊ − p₋) / (p₊ + p₋)`, rounded towards zero. A voxel's surprise is the sum of
-//! the slopes of its latents that have residuals.
+//! A latent's *gradient*, of its log-likelihood with respect to scale, is positive where a wider scale would have made
+//! it likelier: with `p₊` and `p₋` what its entry (the last one, if it has none of its own there) has of 2¹⁶ in the
+//! rows of the scale indices `σ′ + 1` and `σ′ − 1` (kept in 0 to 63) and of `μ′`, it is `2¹²·(p₊ − p₋) / (p₊ + p₋)`,
+//! rounded towards zero. A voxel's gradient sum is that of its latents that have residuals.
 //!
-//! Places are of six kinds: by whether the mean surprise of the voxels nearby that have residuals is at least −256, 0,
-//! 256 and 768, and those where there are none. Every channel has an offset for each kind, and one for all, in units of
+//! Places are of six kinds: by whether the mean gradient sum of the voxels nearby that have residuals is at least −256,
+//! 0, 256 and 768, and those where there are none. Every channel has an offset for each kind, and one for all, in units of
 //! 2⁻¹⁶ of a scale index, at first 0. `σ′ = σ + (both offsets + 2¹⁵) >> 16`, kept in 0 to 63, is used, and then they
-//! grow by 24 and 36 times the slope, and are kept within ±2²².
+//! grow by 24 and 36 times the gradient, and are kept within ±2²².
 
 use b2p_kernels::LIMIT;
 
-use super::nearby::{Near, Nearby};
+use super::neighbourhood::{CausalNeighbourhood, Neighbour};
 use super::slice::UNPREDICTED;
 use super::tables::{SCALES, Tables};
 
@@ -66,18 +66,18 @@ const MEAN_SHIFT: u32 = 10;
 const SCALE_SHIFT: u32 = 16;
 const LARGEST_MEAN_OFFSET: i32 = 2048 << MEAN_SHIFT;
 const LARGEST_SCALE_OFFSET: i32 = 64 << SCALE_SHIFT;
-/// What errors, in sixteenths, and slopes move them by.
+/// What errors, in sixteenths, and gradients move them by.
 const MEAN_RATE: i32 = 32;
 const SCALE_RATE: i32 = 36;
 const PLACE_RATE: i32 = 24;
 /// Errors beyond this, a step of a latent, say no more.
 const LARGEST_ERROR: i32 = 16;
-/// A slope of 1.
-const SLOPE_SHIFT: u32 = 12;
+/// A gradient of 1.
+const GRADIENT_SHIFT: u32 = 12;
 
-/// Mean surprises that part kinds of places.
-const SURPRISES: [i32; 4] = [-256, 0, 256, 768];
-const PLACES: usize = SURPRISES.len() + 2;
+/// Mean gradient sums that separate kinds of places.
+const GRADIENT_BOUNDS: [i32; 4] = [-256, 0, 256, 768];
+const PLACES: usize = GRADIENT_BOUNDS.len() + 2;
 /// The kind of places where nothing is known nearby.
 const STRANGE: usize = PLACES - 1;
 
@@ -85,14 +85,14 @@ const STRANGE: usize = PLACES - 1;
 #[derive(Debug)]
 pub(super) struct Learning<'a> {
     tables: &'a Tables,
-    nearby: Nearby,
+    neighbourhood: CausalNeighbourhood,
     /// Where latents are predicted, and where not.
     channels: Vec<[Channel; 2]>,
     /// Of the latents coded so far, [voxels, K].
     residuals: Vec<i16>,
-    /// Voxel by voxel, of those that have residuals.
-    surprises: Vec<Option<i32>>,
-    here: Here,
+    /// Of each voxel that has residuals.
+    gradient_sums: Vec<Option<i32>>,
+    here: VoxelState,
 }
 
 /// What was learned of one channel.
@@ -106,16 +106,16 @@ struct Channel {
 
 /// The voxel at hand.
 #[derive(Debug, Default)]
-struct Here {
+struct VoxelState {
     voxel: usize,
-    /// Sums of residuals nearby, [sets, K], and what a mean of each set takes them times.
+    /// Sums of residuals in the causal neighbourhood, [sets, K], and the factor of each set's mean.
     sums: Vec<i32>,
     factors: [i32; SETS],
     /// The kind of place.
     place: usize,
     /// The latents two away and what each counts, if something is not predicted.
     two_away: Vec<(usize, i32)>,
-    surprise: Option<i32>,
+    gradient_sum: Option<i32>,
     /// None if the prior codes it.
     latent: Option<Latent>,
 }
@@ -143,13 +143,13 @@ impl<'a> Learning<'a> {
         };
         tables.learning().then(|| Learning {
             tables,
-            nearby: Nearby::new(keys),
+            neighbourhood: CausalNeighbourhood::new(keys),
             channels: vec![[channel(FIRST_WEIGHTS), channel([0; INPUTS])]; k],
             residuals: vec![0; keys.len() * k],
-            surprises: vec![None; keys.len()],
-            here: Here {
+            gradient_sums: vec![None; keys.len()],
+            here: VoxelState {
                 sums: vec![0; SETS * k],
-                ..Here::default()
+                ..VoxelState::default()
             },
         })
     }
@@ -158,19 +158,19 @@ impl<'a> Learning<'a> {
     pub fn look_around(&mut self, voxel: usize, sigma: &[u8]) {
         let k = self.channels.len();
         let here = &mut self.here;
-        (here.voxel, here.surprise) = (voxel, None);
+        (here.voxel, here.gradient_sum) = (voxel, None);
         here.sums.fill(0);
         here.two_away.clear();
         let unpredicted = sigma.contains(&UNPREDICTED);
-        let (mut counts, mut surprises) = ([0; SETS], 0);
-        self.nearby.before(voxel, |near| {
+        let (mut counts, mut total) = ([0; SETS], 0);
+        self.neighbourhood.before(voxel, |near| {
             if unpredicted && near.two {
                 here.two_away.push((near.voxel, 8 >> near.axes));
             }
-            if let Some(surprise) = self.surprises[near.voxel] {
+            if let Some(gradient_sum) = self.gradient_sums[near.voxel] {
                 let set = set(near);
                 counts[set] += 1;
-                surprises += surprise;
+                total += gradient_sum;
                 let residuals = &self.residuals[near.voxel * k..][..k];
                 for (sum, &residual) in here.sums[set * k..][..k].iter_mut().zip(residuals) {
                     *sum += i32::from(residual);
@@ -181,8 +181,8 @@ impl<'a> Learning<'a> {
         let known: i32 = counts.iter().sum();
         here.place = match known {
             0 => STRANGE,
-            _ => (SURPRISES.iter())
-                .filter(|&&surprise| surprises >= known * surprise)
+            _ => (GRADIENT_BOUNDS.iter())
+                .filter(|&&bound| total >= known * bound)
                 .count(),
         };
     }
@@ -243,9 +243,9 @@ impl<'a> Learning<'a> {
             return;
         };
         let channel = &mut self.channels[c][usize::from(latent.unpredicted)];
-        let slope = slope(self.tables, &latent, y);
+        let gradient = gradient(self.tables, &latent, y);
         let grow = |offset: &mut i32, rate: i32| {
-            let grown = *offset + rate * slope;
+            let grown = *offset + rate * gradient;
             *offset = grown.clamp(-LARGEST_SCALE_OFFSET, LARGEST_SCALE_OFFSET);
         };
         grow(&mut channel.scale, SCALE_RATE);
@@ -261,13 +261,13 @@ impl<'a> Learning<'a> {
         }
         let residual = 16 * i32::from(y) - i32::from(latent.mean);
         self.residuals[here.voxel * k + c] = residual.clamp(-LARGEST_RESIDUAL, LARGEST_RESIDUAL) as i16;
-        *here.surprise.get_or_insert(0) += slope;
-        self.surprises[here.voxel] = here.surprise;
+        *here.gradient_sum.get_or_insert(0) += gradient;
+        self.gradient_sums[here.voxel] = here.gradient_sum;
     }
 }
 
 /// Which set a voxel nearby is of.
-fn set(near: Near) -> usize {
+fn set(near: Neighbour) -> usize {
     2 * usize::from(near.two) + usize::from(near.axes > 1)
 }
 
@@ -282,14 +282,14 @@ fn mean(latents: impl Iterator<Item = (i16, i32)>) -> i16 {
 }
 
 /// How much likelier a wider scale would have made a latent, from −1 to 1.
-fn slope(tables: &Tables, coded: &Latent, latent: i16) -> i32 {
+fn gradient(tables: &Tables, coded: &Latent, latent: i16) -> i32 {
     let part = |sigma: u8| {
         let (row, centre) = tables.gauss(coded.mu, sigma);
         row.part(i32::from(latent) - centre) as i32
     };
     let wider = part((coded.sigma + 1).min(SCALES as u8 - 1));
     let narrower = part(coded.sigma.saturating_sub(1));
-    ((wider - narrower) << SLOPE_SHIFT) / (wider + narrower)
+    ((wider - narrower) << GRADIENT_SHIFT) / (wider + narrower)
 }
 
 #[cfg(test)]
@@ -335,7 +335,7 @@ mod tests {
             at: [i64; 3],
             y: [i16; 2],
             residuals: [i64; 2],
-            surprise: Option<i64>,
+            gradient_sum: Option<i64>,
         }
         let tables = tables();
         let within = |x: i64, most: i64| x.clamp(-most, most);
@@ -357,14 +357,14 @@ mod tests {
                     near.then_some((set, axes as i64, other))
                 })
                 .collect();
-            let told: Vec<i64> = nearby.iter().filter_map(|n| n.2.surprise).collect();
+            let told: Vec<i64> = nearby.iter().filter_map(|n| n.2.gradient_sum).collect();
             let at_least = |least: &&i64| told.iter().sum::<i64>() >= told.len() as i64 * **least;
             let kind = match told.len() {
                 0 => 5,
                 _ => [-256, 0, 256, 768].iter().filter(at_least).count(),
             };
             let (mut m, mut s) = ([0; 2], [0; 2]);
-            let (mut residuals, mut surprise) = ([0; 2], None);
+            let (mut residuals, mut gradient_sum) = ([0; 2], None);
             for c in 0..2 {
                 let mut inputs = [0; 6];
                 let mut two_away = (0, 0);
@@ -388,7 +388,7 @@ mod tests {
                     }
                 };
                 for (set, input) in inputs[..4].iter_mut().enumerate() {
-                    let known = (nearby.iter()).filter(|near| near.0 == set && near.2.surprise.is_some());
+                    let known = (nearby.iter()).filter(|near| near.0 == set && near.2.gradient_sum.is_some());
                     let r: i64 = known.clone().map(|near| near.2.residuals[c]).sum();
                     *input = (r * (65_536 / (known.count() as i64 + 1))) >> 12;
                 }
@@ -404,8 +404,8 @@ mod tests {
                     i64::from(row.part(i32::from(y[c]) - centre))
                 };
                 let (more, less) = (has(s[c] + 1), has(s[c] - 1));
-                let slope = 4096 * (more - less) / (more + less);
-                let grown = |x: i64, rate: i64| within(x + rate * slope, 1 << 22);
+                let gradient = 4096 * (more - less) / (more + less);
+                let grown = |x: i64, rate: i64| within(x + rate * gradient, 1 << 22);
                 all[u][c] = grown(all[u][c], 36);
                 kinds[u][c][kind] = grown(kinds[u][c][kind], 24);
                 let error = within(16 * i64::from(y[c]) - m[c], 16);
@@ -414,14 +414,14 @@ mod tests {
                     *weight = within(*weight + error * within(input, 256), 1 << 19);
                 }
                 residuals[c] = within(16 * i64::from(y[c]) - mean, 1023);
-                *surprise.get_or_insert(0) += slope;
+                *gradient_sum.get_or_insert(0) += gradient;
             }
             used.push((m, s));
             done.push(Done {
                 at,
                 y,
                 residuals,
-                surprise,
+                gradient_sum,
             });
         }
         used

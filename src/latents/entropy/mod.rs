@@ -39,7 +39,7 @@ mod coding;
 mod coefficients;
 mod learning;
 mod level;
-mod nearby;
+mod neighbourhood;
 mod octants;
 mod quantise;
 mod rows;

@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn passes_that_learn_find_the_mean_and_scale_that_a_prediction_lacks() {
+    fn backward_adaptation_finds_the_mean_and_scale_that_a_prediction_lacks() {
         let tables = tables();
         let keys: Vec<u64> = (0..4000).collect();
         let mut random = Random(6);
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn passes_that_learn_predict_voxels_without_neighbours_from_those_two_away() {
+    fn backward_adaptation_predicts_voxels_without_neighbours_from_those_two_away() {
         let tables = tables();
         // A plane of voxels whose latents rise slowly.
         let mut voxels: Vec<(u64, i16)> = (0..64 * 64)

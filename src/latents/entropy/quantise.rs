@@ -23,7 +23,7 @@ const MADE_UP: f32 = 0.05;
 pub struct Rounding<'a> {
     /// Latents are kept within ± this.
     pub limit: i16,
-    /// For each channel what a bit is worth, in squared latent steps, at least 0: at 0 every latent goes to its nearest
+    /// For each channel λ, in squared latent steps a bit, at least 0: at 0 every latent goes to its nearest
     /// whole number.
     pub prices: &'a [f32],
 }
@@ -72,7 +72,7 @@ pub fn quantise(tables: &Tables, condition: Condition, latents: &[f32], rounding
 }
 
 /// Rounds the latents [voxels, K] of a level that is coded by [`super::encode_passes`], in the order of coding: each
-/// pass is predicted from those before it as they were rounded. What bits are too dear for stays away from a whole
+/// pass is predicted from those before it as they were rounded. What costs more bits than it gains stays away from a whole
 /// smooth place, which shows; so where there is a price, a twentieth of what the latents of siblings (voxels of one
 /// parent) before it are off, all of them together, counts as a latent's own.
 ///
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dearer_a_bit_the_fewer_are_spent() {
+    fn the_higher_lambda_the_fewer_bits_are_spent() {
         let (y, mu, sigma) = some(3000 * K);
         let condition = Condition::Gauss { mu: &mu, sigma: &sigma };
         let lengths: Vec<usize> = [0.0, 0.05, 0.2, 1.0, 5.0]

@@ -56,7 +56,7 @@ impl Tables {
         })
     }
 
-    /// The same tables, for passes that learn from what they have coded, or do not, as at first.
+    /// The same tables, with or without backward adaptation (at first without).
     pub fn with_learning(self, learning: bool) -> Self {
         Tables { learning, ..self }
     }

@@ -31,8 +31,8 @@ impl Tensors<'_> {
         Shape::from_json(json)
     }
 
-    /// What a bit is worth when latents are rounded, in squared latent steps, for each of a role's K channels, if the
-    /// description says: 0 if it does not.
+    /// λ of rate–distortion optimised quantisation, in squared latent steps a bit, for each of a role's K channels, as
+    /// the description gives it: 0 if it does not.
     ///
     /// # Errors
     /// [`Error::Malformed`] if it is neither a number from 0 to 100 nor K such numbers for each role.

@@ -50,7 +50,7 @@ pub(super) enum Reach {
     /// −1, 0, 1 along each axis, x fastest.
     Around,
     /// 0, 1 along each axis, x fastest.
-    Ahead,
+    Extent,
     /// The parent, through the tap of one's octant.
     Up,
 }
@@ -60,7 +60,7 @@ impl Reach {
         match self {
             Reach::Here => Some(v),
             Reach::Around => Some([v[0] + k % 3 - 1, v[1] + k / 3 % 3 - 1, v[2] + k / 9 - 1]),
-            Reach::Ahead => Some([v[0] + k % 2, v[1] + k / 2 % 2, v[2] + k / 4]),
+            Reach::Extent => Some([v[0] + k % 2, v[1] + k / 2 % 2, v[2] + k / 4]),
             Reach::Up => (v[0] % 2 + 2 * (v[1] % 2) + 4 * (v[2] % 2) == k).then(|| v.map(|c| c / 2)),
         }
     }
@@ -70,10 +70,10 @@ impl Reach {
 pub(super) struct Layer {
     spec: Spec,
     weights: Vec<f64>,
-    finish: Finish,
+    epilogue: Epilogue,
 }
 
-enum Finish {
+enum Epilogue {
     Plain { bias: Vec<f32> },
     Invariant { gain: Vec<f32>, bias: Vec<f32> },
     Shifted { bias: Vec<i32>, shift: Vec<u8> },
@@ -90,15 +90,15 @@ pub(super) enum Mode {
 }
 
 impl Layer {
-    fn finish(&self, (mode, limit): (Mode, f64), o: usize, sum: f64, energy: f64) -> f64 {
-        match &self.finish {
-            Finish::Plain { bias } => (sum + f64::from(bias[o])).clamp(-limit, limit),
-            Finish::Invariant { gain, bias } => {
+    fn epilogue(&self, (mode, limit): (Mode, f64), o: usize, sum: f64, energy: f64) -> f64 {
+        match &self.epilogue {
+            Epilogue::Plain { bias } => (sum + f64::from(bias[o])).clamp(-limit, limit),
+            Epilogue::Invariant { gain, bias } => {
                 let value = sum * f64::from(gain[o]) / (energy + 1e-8).sqrt();
                 (value + f64::from(bias[o])).clamp(-limit, limit)
             }
             // Sums of integers are exact in f64 up to 2^53.
-            Finish::Shifted { bias, shift } => match mode {
+            Epilogue::Shifted { bias, shift } => match mode {
                 Mode::Whole => ((sum as i64 + i64::from(bias[o])) >> shift[o]).clamp(-2047, 2047) as f64,
                 Mode::Real => {
                     let half = if shift[o] > 0 {
@@ -109,7 +109,7 @@ impl Layer {
                     (sum + f64::from(bias[o]) - half) / 2f64.powi(shift[o].into())
                 }
             },
-            Finish::Scaled { gain, bias } => match mode {
+            Epilogue::Scaled { gain, bias } => match mode {
                 Mode::Whole => {
                     let scale = gain[o] / (energy.max(1.0) as f32).sqrt();
                     let value = sum as f32 * scale + bias[o];
@@ -122,9 +122,9 @@ impl Layer {
 
     /// What a sum with a residual becomes.
     fn bound(&self, (mode, limit): (Mode, f64), value: f64) -> f64 {
-        match (&self.finish, mode) {
-            (Finish::Plain { .. } | Finish::Invariant { .. }, _) => value.clamp(-limit, limit),
-            (Finish::Shifted { .. } | Finish::Scaled { .. }, Mode::Whole) => value.clamp(-2047.0, 2047.0),
+        match (&self.epilogue, mode) {
+            (Epilogue::Plain { .. } | Epilogue::Invariant { .. }, _) => value.clamp(-limit, limit),
+            (Epilogue::Shifted { .. } | Epilogue::Scaled { .. }, Mode::Whole) => value.clamp(-2047.0, 2047.0),
             (_, Mode::Real) => value,
         }
     }
@@ -166,17 +166,21 @@ impl Oracle {
                 .into_iter()
                 .map(f64::from)
                 .collect();
-            let finish = match spec.invariant {
-                true => Finish::Scaled {
+            let epilogue = match spec.invariant {
+                true => Epilogue::Scaled {
                     gain: all(&tensors, &list("gain")),
                     bias: all(&tensors, &list("bias")),
                 },
-                false => Finish::Shifted {
+                false => Epilogue::Shifted {
                     bias: all(&tensors, &list("bias")),
                     shift: all(&tensors, &list("shift")),
                 },
             };
-            Ok(Layer { spec, weights, finish })
+            Ok(Layer {
+                spec,
+                weights,
+                epilogue,
+            })
         };
         let exact = shape.exact(&mut integers).unwrap();
         let mut reals = |spec: Spec| {
@@ -186,14 +190,18 @@ impl Oracle {
                 .map(f64::from)
                 .collect();
             let bias = all(&tensors, &list("bias"));
-            let finish = match spec.invariant {
-                true => Finish::Invariant {
+            let epilogue = match spec.invariant {
+                true => Epilogue::Invariant {
                     gain: all(&tensors, &list("gain")),
                     bias,
                 },
-                false => Finish::Plain { bias },
+                false => Epilogue::Plain { bias },
             };
-            Ok(Layer { spec, weights, finish })
+            Ok(Layer {
+                spec,
+                weights,
+                epilogue,
+            })
         };
         Oracle {
             exact,
@@ -228,7 +236,7 @@ impl Oracle {
                         energy += w * w;
                     }
                 }
-                layer.finish((self.mode, self.limit), o, sum, energy)
+                layer.epilogue((self.mode, self.limit), o, sum, energy)
             };
             (0..cout).map(channel).collect()
         };
@@ -336,7 +344,7 @@ impl Oracle {
             let x = self.layer(layer4, Reach::Up, at, &children, &x);
             self.around(conv_out, &children, &self.res_blocks(after, &children, x))
         } else {
-            let x = self.layer(layer4, Reach::Ahead, at, at, &x);
+            let x = self.layer(layer4, Reach::Extent, at, at, &x);
             self.around(conv_out, at, &self.res_blocks(after, at, x))
         }
     }

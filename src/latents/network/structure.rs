@@ -59,7 +59,7 @@ pub(crate) struct Generate<L> {
 }
 
 impl<L> Generate<L> {
-    /// The same network of other layers; `make` is told the steps of a layer's input and output.
+    /// The same network of other layers; `make` gets the steps of a layer's input and output.
     ///
     /// `scales`: the steps of the chain before layer 4, of the inside of each of its blocks, and the same after it. The
     /// generator's input comes in steps of `input`, its output in steps of 1.

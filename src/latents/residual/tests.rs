@@ -144,7 +144,7 @@ fn all_gaussians_of_a_voxel_get_the_same_and_stay_colours() {
 }
 
 #[test]
-fn chromas_are_told_more_finely_unless_said_otherwise() {
+fn chromas_are_quantised_more_finely_by_default() {
     for (luma, chroma) in [(1, 1), (2, 1), (8, 3), (64, 24), (255, 95)] {
         assert_eq!(Steps::from(NonZeroU8::new(luma).unwrap()), Steps { luma, chroma });
     }

@@ -47,7 +47,7 @@ pub struct Ellipses {
 
 /// How Gaussians are projected.
 #[derive(Debug, Clone, Copy)]
-pub struct How<'a> {
+pub struct ProjectionOptions<'a> {
     /// With which instructions.
     pub isa: Isa,
     /// Opacity is taken back by as much as the blur widens.
@@ -55,7 +55,7 @@ pub struct How<'a> {
     /// The least α that is drawn, in `(0, 1]`.
     pub floor: f32,
     /// Gaussians that reach over the near plane are drawn, whatever side their centres are on.
-    pub near_care: bool,
+    pub ray_space: bool,
     /// How depths change across ellipses is found out too.
     pub slopes: bool,
     /// In place of the Gaussians' colours, one for each.
@@ -101,7 +101,7 @@ impl Ellipses {
 
     /// Projects, reusing memory; counts what is not visible. While they are still in the cache, the ellipses of a run
     /// are shown to `look`, some at a time, together with a state of the run's own: `states` is given one for each run,
-    /// to which first `start` is told the run's length.
+    /// which `start` first prepares for the run's length.
     ///
     /// # Errors
     /// [`Error::Usage`] if the camera is none ([`Camera::check`]) or the arrays of `gaussians` differ in length;
@@ -110,14 +110,14 @@ impl Ellipses {
         &mut self,
         gaussians: &Gaussians,
         camera: &Camera,
-        how: How,
+        options: ProjectionOptions,
         states: &mut Vec<S>,
         start: impl Fn(&mut S, usize) + Sync,
         look: impl Fn(&mut S, &[Ellipse]) + Sync,
-    ) -> Result<Seen> {
+    ) -> Result<Projected> {
         camera.check()?;
         gaussians.check_lengths()?;
-        let colours = how.colours.unwrap_or(&gaussians.colour);
+        let colours = options.colours.unwrap_or(&gaussians.colour);
         if colours.len() != gaussians.len() {
             let what = format!("{} colours of {} Gaussians", colours.len(), gaussians.len());
             return Err(Error::Usage(what));
@@ -129,7 +129,7 @@ impl Ellipses {
                 detail: format!("there are {count}"),
             });
         }
-        let view = view(camera, how, gaussians);
+        let view = view(camera, options, gaussians);
         let length = run_length(count);
         if self.all.len() < count {
             if self.all.capacity() < count {
@@ -165,7 +165,7 @@ impl Ellipses {
                         colour: &colours[piece],
                     };
                     let room = &mut ellipses[tally.visible as usize..];
-                    let seen = splat::project(how.isa, &view, cloud, first as u32, room);
+                    let seen = splat::project(options.isa, &view, cloud, first as u32, room);
                     look(state, &room[..seen.visible as usize]);
                     tally = tally + seen;
                 }
@@ -174,7 +174,7 @@ impl Ellipses {
         self.crossing.clear();
         self.slopes.clear();
         self.visible = self.runs.iter().map(|run| run.tally.visible as usize).sum();
-        let mut seen = Seen::default();
+        let mut seen = Projected::default();
         for run in &self.runs {
             seen.dropped.add(run.tally.into());
             seen.crossing += u64::from(run.tally.crossing);
@@ -188,12 +188,12 @@ fn run_length(gaussians: usize) -> usize {
     gaussians.div_ceil(most).max(LEAST_RUN).next_multiple_of(16)
 }
 
-/// What projecting found out.
+/// Counts that projection returns.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Seen {
+pub struct Projected {
     /// Gaussians that are not drawn.
     pub dropped: Dropped,
-    /// Gaussians that reach over the near plane; with care for it, those that are visible.
+    /// Gaussians that reach over the near plane; in ray-space evaluation, those that are visible.
     pub crossing: u64,
 }
 
@@ -225,17 +225,17 @@ impl Ellipses {
         &self.slopes
     }
 
-    /// Finds out, reusing memory, what effects need to know of those last projected beyond their ellipses.
-    /// [`Seen::crossing`] says how many [`Crossing`] that may take.
-    pub fn look_closer(&mut self, gaussians: &Gaussians, camera: &Camera, how: How) {
-        if how.near_care {
+    /// Computes, reusing memory, what effects need of the Gaussians last projected beyond their ellipses.
+    /// [`Projected::crossing`] says how many [`Crossing`] that may take.
+    pub fn fill_effect_data(&mut self, gaussians: &Gaussians, camera: &Camera, options: ProjectionOptions) {
+        if options.ray_space {
             let crossing = self.runs.iter().map(|run| run.tally.crossing as usize);
             self.crossing.resize(crossing.sum(), Crossing::default());
             fill_crossing(&self.runs, &self.all, &mut self.crossing, &|index| {
                 space::crossing(gaussians, camera, index as usize)
             });
         }
-        if how.slopes {
+        if options.slopes {
             self.slopes.resize(self.all.len(), [0.0; 2]);
             let length = run_length(self.all.len());
             let runs = self.runs.par_iter().zip(self.slopes.par_chunks_mut(length));
@@ -281,14 +281,16 @@ impl Run {
 impl Dropped {
     /// All of them.
     pub fn total(&self) -> u64 {
-        self.not_finite + self.no_rotation + self.too_faint + self.behind + self.outside
+        let Dropped { behind, .. } = self;
+        self.not_finite + self.no_rotation + self.too_faint + behind + self.outside
     }
 
     fn add(&mut self, other: Dropped) {
+        let Dropped { behind, .. } = self;
         self.not_finite += other.not_finite;
         self.no_rotation += other.no_rotation;
         self.too_faint += other.too_faint;
-        self.behind += other.behind;
+        *behind += other.behind;
         self.outside += other.outside;
     }
 }
@@ -306,20 +308,20 @@ impl From<Tally> for Dropped {
 }
 
 /// The camera as the kernel has it.
-fn view(camera: &Camera, how: How, gaussians: &Gaussians) -> View {
+fn view(camera: &Camera, options: ProjectionOptions, gaussians: &Gaussians) -> View {
     let rotation = camera.pose.matrix3;
     View {
         rotation: std::array::from_fn(|i| rotation.row(i).into()),
         translation: camera.pose.translation.into(),
         near: camera.near,
-        near_care: how.near_care,
+        ray_space: options.ray_space,
         focal: [camera.fx, camera.fy],
         centre: [camera.cx, camera.cy],
         slopes: camera.slope_ranges(),
         window: camera.tiled_window(),
-        floor: how.floor,
+        floor: options.floor,
         orthographic: camera.projection == Projection::Orthographic,
-        compensated: how.compensated,
+        compensated: options.compensated,
         blur: gaussians.own_blur().into(),
         pixel_blur: gaussians.pixel_blur(),
     }

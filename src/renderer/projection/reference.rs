@@ -2,7 +2,7 @@
 
 use glam::{DAffine3, Mat3, Quat, Vec3};
 
-use super::{Bounds, Camera, Ellipse, Ellipses, How, MAX_SCALE};
+use super::{Bounds, Camera, Ellipse, Ellipses, MAX_SCALE, ProjectionOptions};
 use crate::gaussians::Gaussians;
 use b2p_kernels::Isa;
 
@@ -213,17 +213,17 @@ fn on_every_instruction_set_the_kernel_sees_what_plain_rust_sees_one_by_one() {
             same
         };
         for isa in Isa::available() {
-            let how = How {
+            let options = ProjectionOptions {
                 isa,
                 compensated: false,
                 floor: FLOOR,
-                near_care: false,
+                ray_space: false,
                 slopes: false,
                 colours: None,
             };
             let mut ellipses = Ellipses::default();
             let dropped = ellipses
-                .project(&all, &camera, how, &mut Vec::<()>::new(), |_, _| {}, |_, _| {})
+                .project(&all, &camera, options, &mut Vec::<()>::new(), |_, _| {}, |_, _| {})
                 .unwrap()
                 .dropped;
             assert_eq!(dropped.not_finite, count(Invisible::NotFinite), "{isa}");

@@ -9,20 +9,20 @@ use crate::gaussians::Gaussians;
 /// `√(log₂(e)/2)`: with it `exp(−½d²) = 2^−(d·FORM_SCALE)²`.
 const FORM_SCALE: f64 = 0.849_321_800_288_019_3;
 
-/// A Gaussian before a camera.
-struct Seen {
+/// A Gaussian in camera space.
+struct ViewGaussian {
     centre: DVec3,
     /// From the Gaussian's axes to the camera's; not scaled.
     axes: DMat3,
     scale: DVec3,
 }
 
-fn see(gaussians: &Gaussians, camera: &Camera, i: usize) -> Seen {
+fn see(gaussians: &Gaussians, camera: &Camera, i: usize) -> ViewGaussian {
     let [w, x, y, z] = gaussians.rotation[i].map(f64::from);
     let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
     let scale = gaussians.scale[i].map(|s| f64::from(s.abs().min(MAX_SCALE)));
     let position = DVec3::from(gaussians.position[i].map(f64::from));
-    Seen {
+    ViewGaussian {
         centre: camera.pose.transform_point3(position),
         axes: camera.pose.matrix3 * rotation,
         scale: scale.into(),
@@ -32,7 +32,7 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize) -> Seen {
 /// Gaussian `i`, which reaches over the near plane: each of its axes is widened by the pixel's blur as it is at its
 /// centre, or at the near plane if that is farther.
 pub(super) fn crossing(gaussians: &Gaussians, camera: &Camera, i: usize) -> Crossing {
-    let Seen { centre, axes, scale } = see(gaussians, camera, i);
+    let ViewGaussian { centre, axes, scale } = see(gaussians, camera, i);
     let focal = DVec2::new(camera.fx, camera.fy);
     let pinhole = camera.projection == Projection::Pinhole;
     let distance = if pinhole { centre.z.max(camera.near) } else { 1.0 };
@@ -64,7 +64,7 @@ pub(super) fn crossing(gaussians: &Gaussians, camera: &Camera, i: usize) -> Cros
 
 /// How the depth of Gaussian `i` changes by pixel to the right and down: the mean depth of what of it is seen there.
 pub(super) fn slopes(gaussians: &Gaussians, camera: &Camera, i: usize) -> [f32; 2] {
-    let Seen { centre, axes, scale } = see(gaussians, camera, i);
+    let ViewGaussian { centre, axes, scale } = see(gaussians, camera, i);
     let axes = axes * DMat3::from_diagonal(scale);
     let [right, down, ahead] = [0, 1, 2].map(|k| axes.row(k));
     let [[left, most], [top, bottom]] = camera.slope_ranges();

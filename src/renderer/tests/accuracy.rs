@@ -20,12 +20,12 @@ fn gaussians_with_a_blur_of_their_own_are_close_to_the_reference() {
 }
 
 #[test]
-fn gaussians_with_a_blur_of_their_own_close_gaps_from_close_up_and_stay_slim_from_afar() {
+fn gaussians_with_a_blur_of_their_own_close_gaps_from_close_up_and_stay_slim_from_a_distance() {
     let small = surface_splats(2000, 0.8, 1e-3);
     let mut scene = scene(small);
     let (far, near) = (orbit(64, 64), orbit(640, 640));
     let [before_far, before_near] = [&far, &near].map(|camera| draw(&scene, camera));
-    // A deviation of 0.01: a quarter of a pixel from afar, two and a half from close up.
+    // A deviation of 0.01: a quarter of a pixel from a distance, two and a half from close up.
     scene.blur = 1e-4;
     let ink = |image: &Image| image.pixels.iter().map(|p| 1.0 - p[0]).sum::<f32>();
     let covered = |image: &Image| image.pixels.iter().filter(|p| p[0] < 0.9).count();
@@ -34,9 +34,9 @@ fn gaussians_with_a_blur_of_their_own_close_gaps_from_close_up_and_stay_slim_fro
 }
 
 #[test]
-fn an_object_with_a_blur_of_its_own_is_as_large_from_afar_as_from_close_up() {
+fn an_object_with_a_blur_of_its_own_is_as_large_from_a_distance_as_from_close_up() {
     let mut scene = scene(surface_splats(40_000, 0.8, 1e-3));
-    // From afar a fifteenth of a pixel squared.
+    // From a distance a fifteenth of a pixel squared.
     scene.blur = 1e-4;
     let ink = |side: u32| {
         let image = draw(&scene, &orbit(side, side));
@@ -53,11 +53,11 @@ fn with_hardly_any_cut_off_only_rounding_is_left() {
     for seed in 0..6 {
         let scene = scene(random_splats(seed, 600));
         let camera = orbit(75, 50);
-        let through = Cutoffs {
+        let transmittance = Cutoffs {
             through: 1.0 / 1024.0,
             ..Cutoffs::NONE
         };
-        let exact = reference::render(&scene, &camera, Background::WHITE, through);
+        let exact = reference::render(&scene, &camera, Background::WHITE, transmittance);
         for isa in isas() {
             let mut renderer = Renderer::new().with_isa(isa).with_quality(Quality::Exact);
             let drawn = renderer.render(&scene, &camera);
@@ -112,7 +112,7 @@ fn a_decoded_surface_is_close_to_the_reference_from_near_and_far() {
     for (i, radius) in [0.9, 1.3, 2.0, 3.0, 6.0, 20.0].into_iter().enumerate() {
         let (azimuth, elevation) = (60.0 * i as f64, 25.0 * i as f64 - 60.0);
         let camera = Camera::orbit(azimuth, elevation, radius, 45.0, 60, 50).unwrap();
-        // From afar hundreds share a pixel, and what is left out of each adds up.
+        // From a distance hundreds share a pixel, and what is left out of each adds up.
         let quality = if radius < 5.0 { Quality::Fine } else { Quality::Exact };
         assert_close_in(quality, &scene, &camera);
     }

@@ -53,7 +53,7 @@ fn effects_that_are_not_called_for_change_no_pixel_when_forced_either_way() {
 }
 
 #[test]
-fn where_splats_are_much_larger_than_pixels_compensation_changes_next_to_nothing() {
+fn where_splats_are_much_larger_than_pixels_compensation_changes_little() {
     let scene = scene(
         random_splats(5, 100)
             .into_iter()

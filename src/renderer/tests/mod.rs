@@ -144,7 +144,7 @@ fn drawn(mut renderer: Renderer, scene: &Gaussians, camera: &Camera) -> (Image, 
     (image, stats)
 }
 
-/// With the best instructions; the picture on every other set is held to it, and the counts are.
+/// On the best instruction set; the picture on every other set is held to it, and the counts are.
 fn draw_on(scene: &Gaussians, camera: &Camera, background: Background) -> (Image, Stats) {
     let on = |isa| drawn(Renderer::new().with_isa(isa).with_background(background), scene, camera);
     let (image, stats) = on(Isa::detect());

@@ -1,4 +1,4 @@
-//! Effects that need to know where a splat is in space: care for the near plane, an order for each pixel; and whose a
+//! Effects that need to know where a splat is in space: ray-space evaluation, an order for each pixel; and whose a
 //! pixel is.
 
 use super::effects::with;
@@ -6,7 +6,7 @@ use super::*;
 use crate::renderer::projection::Bounds;
 use crate::renderer::{EffectMode, Effects, Ids};
 
-const CARELESS: Effects = Effects {
+const WITHOUT_RAY_SPACE: Effects = Effects {
     near: EffectMode::Off,
     ..Effects::AUTO
 };
@@ -16,7 +16,7 @@ const ORDERED: Effects = Effects {
 };
 
 /// Whether something reaches over the near plane, and the picture is close to the reference on every instruction set.
-fn assert_cared_for(scene: &Gaussians, camera: &Camera) {
+fn assert_evaluated_along_rays(scene: &Gaussians, camera: &Camera) {
     let exact = reference::render(scene, camera, Background::BLACK, Cutoffs::NONE);
     for isa in isas() {
         let (image, stats) = with(scene, camera, isa, Effects::AUTO);
@@ -34,7 +34,7 @@ fn what_reaches_over_the_near_plane_is_close_to_the_reference() {
         let mut camera = Camera::orbit(70.0, -20.0, 0.7, 80.0, 60, 50).unwrap();
         camera.near = near;
         for camera in [camera, camera.orthographic(1.0).unwrap()] {
-            assert_cared_for(&scene, &camera);
+            assert_evaluated_along_rays(&scene, &camera);
         }
     }
 }
@@ -60,7 +60,7 @@ fn splats_all_along_the_near_plane_are_close_to_the_reference() {
         };
         let scene = scene((0..800).map(splat).collect::<Vec<_>>());
         for camera in [camera, camera.orthographic(1.0).unwrap()] {
-            assert_cared_for(&scene, &camera);
+            assert_evaluated_along_rays(&scene, &camera);
         }
     }
 }
@@ -114,11 +114,11 @@ fn walking_through_a_splat_changes_the_picture_little_by_little() {
 }
 
 #[test]
-fn where_nothing_reaches_over_the_near_plane_care_changes_no_bit() {
+fn where_nothing_reaches_over_the_near_plane_ray_space_changes_no_bit() {
     let scene = scene(random_splats(4, 300));
     let camera = orbit(75, 50);
     for isa in isas() {
-        let (without, _) = with(&scene, &camera, isa, CARELESS);
+        let (without, _) = with(&scene, &camera, isa, WITHOUT_RAY_SPACE);
         for choice in [EffectMode::Auto, EffectMode::On] {
             let effects = Effects {
                 near: choice,
@@ -130,7 +130,7 @@ fn where_nothing_reaches_over_the_near_plane_care_changes_no_bit() {
     }
 }
 
-/// Two discs that cut through each other, a slanted one in front of both, and a crowd of all shapes.
+/// Two discs that cut through each other, a slanted one in front of both, and many overlapping splats of all shapes.
 #[test]
 fn with_an_order_for_each_pixel_pictures_are_close_to_the_reference() {
     let exact = Cutoffs {
@@ -150,8 +150,8 @@ fn with_an_order_for_each_pixel_pictures_are_close_to_the_reference() {
         disc(0.3, 1.2, [0.0, 0.0, 1.0]),
     ];
     // Blur apart, few enough lie behind each other to be told apart.
-    let crowd = random_splats(5, 100);
-    for (splats, differs) in [(crossed, 0.3), (crowd, 0.003)] {
+    let overlapping = random_splats(5, 100);
+    for (splats, differs) in [(crossed, 0.3), (overlapping, 0.003)] {
         let scene = scene(splats);
         let camera = Camera::orbit(10.0, 5.0, 3.0, 45.0, 75, 50).unwrap();
         let by_pixel = reference::render(&scene, &camera, Background::BLACK, exact);
@@ -167,7 +167,7 @@ fn with_an_order_for_each_pixel_pictures_are_close_to_the_reference() {
 }
 
 #[test]
-fn where_depths_do_not_interleave_an_order_for_each_pixel_changes_next_to_nothing() {
+fn where_depths_do_not_interleave_an_order_for_each_pixel_changes_little() {
     let layer = |i: usize| Splat {
         position: [0.0, 0.0, 1.0 + i as f32 * 0.05],
         scale: [1.0, 1.0, 0.0],
@@ -223,7 +223,7 @@ fn a_pixel_s_number_is_that_of_the_gaussian_that_it_shows_most_of() {
 #[test]
 fn numbers_are_mixed_as_colours_are() {
     let splats = random_splats(9, 300);
-    // From afar, and from among them, where some reach over the near plane.
+    // From a distance, and from among them, where some reach over the near plane.
     for (distance, crossing) in [(4.0, false), (0.7, true)] {
         let camera = Camera::orbit(20.0, 10.0, distance, 50.0, 70, 45).unwrap();
         let part = Bounds {

@@ -6,7 +6,7 @@ use super::*;
 use crate::error::Error;
 use crate::gaussians::Gaussians;
 use crate::renderer::camera::Camera;
-use crate::renderer::projection::How;
+use crate::renderer::projection::ProjectionOptions;
 
 /// A small generator: the shapes need no quality, only variety.
 fn gaussians(count: usize) -> Gaussians {
@@ -39,11 +39,11 @@ fn project(all: &Gaussians, width: u32, height: u32) -> Scene {
         ellipses: Ellipses::default(),
         counts: Vec::new(),
     };
-    let how = How {
+    let options = ProjectionOptions {
         isa: Isa::SCALAR,
         compensated: false,
         floor: 1.0 / 255.0,
-        near_care: false,
+        ray_space: false,
         slopes: false,
         colours: None,
     };
@@ -52,7 +52,7 @@ fn project(all: &Gaussians, width: u32, height: u32) -> Scene {
         .project(
             all,
             &camera,
-            how,
+            options,
             &mut scene.counts,
             |count, length| count.start(scene.grid, length),
             |count, e| count.count(scene.grid, e),

@@ -20,17 +20,17 @@ pub enum Loop {
     #[default]
     Plain,
     /// Blends [`Crossing`] Gaussians too.
-    Care,
+    RaySpace,
     /// That, and puts the splats of each pixel in the order of their depths there, as far as [`super::WAITING`] of them reach.
     Order,
-    /// As `Care`, and keeps which Gaussian each pixel shows most of.
+    /// As `RaySpace`, and keeps which Gaussian each pixel shows most of.
     Ids,
-    /// As `Care`, and keeps how much of each Gaussian each pixel shows, for whoever mixes something else than colours.
+    /// As `RaySpace`, and keeps how much of each Gaussian each pixel shows, for whoever mixes something else than colours.
     Shares,
 }
 
 pub(super) const PLAIN: u8 = 0;
-pub(super) const CARE: u8 = 1;
+pub(super) const RAY_SPACE: u8 = 1;
 pub(super) const ORDER: u8 = 2;
 pub(super) const IDS: u8 = 3;
 pub(super) const SHARES: u8 = 4;
@@ -108,9 +108,9 @@ pub(super) struct Splat {
     pub colour: [f32; 3],
 }
 
-/// What the loops of effects know of an ellipse besides.
+/// Per-splat data that only the loops of effects need.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct More {
+pub(super) struct EffectData {
     /// Its place among the [`super::Crossing`], or [`usize::MAX`].
     pub crossing: usize,
     /// Depth at the tile's first pixel's corner, and its change by pixel to the right and down.

@@ -17,7 +17,7 @@ pub struct View {
     /// What is not farther than this along z is not drawn.
     pub near: f64,
     /// Gaussians that reach over the near plane are drawn whatever side of it their centres are on: see [`super::Crossing`].
-    pub near_care: bool,
+    pub ray_space: bool,
     /// Pixels per unit of slope, or, of an orthographic camera, per unit of length.
     pub focal: [f64; 2],
     /// The principal point, in pixels.
@@ -44,7 +44,7 @@ pub(super) struct Camera<S: Simd> {
     pub rotation: [[S::F64; 3]; 3],
     pub translation: [S::F64; 3],
     pub near: S::F64,
-    pub near_care: bool,
+    pub ray_space: bool,
     pub near_plane: S::F32,
     pub focal: [S::F64; 2],
     pub centre: [S::F64; 2],
@@ -72,7 +72,7 @@ impl<S: Simd> Camera<S> {
             rotation: three!(i => three!(k => S::F64::splat(simd, view.rotation[i][k]))),
             translation: three!(i => S::F64::splat(simd, view.translation[i])),
             near: S::F64::splat(simd, view.near),
-            near_care: view.near_care,
+            ray_space: view.ray_space,
             near_plane: S::F32::splat(simd, view.near as f32),
             focal: pair(view.focal),
             centre: pair(view.centre),

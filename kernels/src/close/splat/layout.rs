@@ -1,8 +1,8 @@
 //! Which blocks of a tile each ellipse reaches.
 
 use super::block::{
-    ALL_BLOCKS, AREA, BLOCKS, Block, CLEAR, COLUMNS, IDS, More, ORDER, PLAIN, ROWS, SHARES, SIDE, Scene, Share, Splat,
-    TILE, lane_places, rectangle,
+    ALL_BLOCKS, AREA, BLOCKS, Block, CLEAR, COLUMNS, EffectData, IDS, ORDER, PLAIN, ROWS, SHARES, SIDE, Scene, Share,
+    Splat, TILE, lane_places, rectangle,
 };
 use super::ellipse::Ellipse;
 use super::pixels::{self, Best, Pending};
@@ -83,8 +83,8 @@ pub(super) struct Work {
     place: [f32; ITEMS],
     pub items: usize,
     splats: [Splat; SPLATS],
-    /// Where effects call for more of a splat.
-    more: [More; SPLATS],
+    /// For loops of effects only.
+    effect_data: [EffectData; SPLATS],
 }
 
 impl Work {
@@ -99,7 +99,7 @@ impl Work {
             log_opacity: 0.0,
             colour: [0.0; 3],
         }; SPLATS],
-        more: [More {
+        effect_data: [EffectData {
             crossing: usize::MAX,
             depth: [0.0; 3],
             index: 0,
@@ -178,7 +178,7 @@ impl Canvas {
             splat.log_opacity = ellipse.log_opacity;
             splat.colour = ellipse.colour;
             if WHAT != PLAIN {
-                self.work.more[number] = more::<WHAT>(ellipse, place, corner, scene);
+                self.work.effect_data[number] = effect_data::<WHAT>(ellipse, place, corner, scene);
             }
             let ([ux, uy], [vx, vy]) = (ellipse.u, ellipse.v);
             let lanes_u = [S::F32::splat(simd, ux), S::F32::splat(simd, uy)];
@@ -255,20 +255,20 @@ impl Canvas {
             let open = if WHAT == PLAIN {
                 pixels::blend(simd, block, splat, [u, v])
             } else {
-                let more = &work.more[number];
+                let data = &work.effect_data[number];
                 let (x, y) = (SIDE * (place as u32 % BLOCKS), SIDE * (place as u32 / BLOCKS));
                 let at = [x, y];
-                let crossing = scene.crossing.get(more.crossing);
+                let crossing = scene.crossing.get(data.crossing);
                 match WHAT {
                     ORDER => {
                         let pending = &mut self.pending[place];
                         let corner = self.corner;
-                        pending.add(simd, block, splat, [u, v], more, at, corner, crossing, self.least)
+                        pending.add(simd, block, splat, [u, v], data, at, corner, crossing, self.least)
                     }
                     IDS | SHARES => {
                         let form = [u, v];
                         let weights = pixels::weigh(simd, block, splat, form, at, self.corner, crossing);
-                        let index = more.index;
+                        let index = data.index;
                         match weights {
                             Some(weights) if WHAT == IDS => {
                                 self.best[place].note(simd, &weights, index);
@@ -312,7 +312,7 @@ fn gather<S: Simd>(simd: S, all: &[Ellipse], keys: &[u64]) -> [S::F32; 16] {
 
 /// What the loop needs to know of an ellipse besides.
 #[inline(always)]
-fn more<const WHAT: u8>(ellipse: &Ellipse, place: usize, corner: [f32; 2], scene: Scene) -> More {
+fn effect_data<const WHAT: u8>(ellipse: &Ellipse, place: usize, corner: [f32; 2], scene: Scene) -> EffectData {
     let mut crossing = usize::MAX;
     if ellipse.crosses() {
         let found = scene.crossing.binary_search_by_key(&ellipse.index, |c| c.index);
@@ -326,7 +326,7 @@ fn more<const WHAT: u8>(ellipse: &Ellipse, place: usize, corner: [f32; 2], scene
     } else {
         [0.0; 3]
     };
-    More {
+    EffectData {
         crossing,
         depth,
         index: ellipse.index,

@@ -3,10 +3,10 @@
 //! Each kernel is one body over the vectors of any instruction set. Between sets the last bits differ, because only some multiply and
 //! add in one rounding; in each of them the result is a function of the input alone.
 
-mod ahead;
 mod block;
 mod camera;
 mod ellipse;
+mod extent;
 mod layout;
 mod pixels;
 mod project;

@@ -2,7 +2,7 @@
 
 use bytemuck::must_cast_slice_mut;
 
-use super::block::{AREA, Block, COLUMNS, More, ROWS, SIDE, Splat};
+use super::block::{AREA, Block, COLUMNS, EffectData, ROWS, SIDE, Splat};
 use super::ellipse::{ALPHA_CEILING, Crossing, FINISHED, WAITING};
 use crate::simd::{F32Vector, I32Vector, LEAST_EXPONENT, MaskVector, Simd};
 
@@ -46,8 +46,8 @@ pub(super) fn cross<S: Simd>(
 /// The transmittance, and where it is not finished.
 #[inline(always)]
 fn light<S: Simd>(simd: S, block: &Block, lanes: usize) -> (S::F32, S::Mask) {
-    let through = S::F32::load(simd, &block.through[lanes..]);
-    (through, S::F32::splat(simd, FINISHED).le(through))
+    let transmittance = S::F32::load(simd, &block.through[lanes..]);
+    (transmittance, S::F32::splat(simd, FINISHED).le(transmittance))
 }
 
 /// α of an ellipse.
@@ -96,8 +96,8 @@ fn spatial<S: Simd>(
     (alpha.keep(drawn), depth)
 }
 
-/// Lets light through a layer of `alpha`; returns what stays there. That is the difference between what was and what is let through,
-/// rounded as they are, so that the sum of all that stays, and what is let through in the end, is 1.
+/// Blends a layer of `alpha`; returns its weight: the difference between the transmittances before and after it,
+/// rounded as they are, so that all weights and the last transmittance add up to 1.
 #[inline(always)]
 fn pass<S: Simd>(_: S, block: &mut Block, lanes: usize, through: S::F32, alpha: S::F32) -> S::F32 {
     let left = alpha.neg_mul_add(through, through);
@@ -204,7 +204,7 @@ impl Pending {
         block: &mut Block,
         splat: &Splat,
         form: [f32; 2],
-        more: &More,
+        data: &EffectData,
         at: [u32; 2],
         corner: [u32; 2],
         crossing: Option<&Crossing>,
@@ -218,7 +218,7 @@ impl Pending {
             let (alpha, depth) = match crossing {
                 Some(crossing) => spatial(simd, splat, at, corner, crossing, lanes),
                 None => {
-                    let [first, right, down] = more.depth;
+                    let [first, right, down] = data.depth;
                     let middle = |k: usize| at[k] as f32 + 0.5 * SIDE as f32;
                     let first = S::F32::splat(simd, first + right * middle(0) + down * middle(1));
                     let depth = S::F32::load(simd, &COLUMNS[lanes..]).mul_add(S::F32::splat(simd, right), first);

@@ -6,7 +6,7 @@
 //! for `p = a`, `v = dx/√p` and `u = (dy − (b/p)·dx)/√(det/p)`. So the exponent cannot be positive, and a needle of 3000 × 0.1 px
 //! keeps its α to 2·10⁻⁴ where the textbook form is wrong by 1.
 
-use super::ahead::Ahead;
+use super::extent::Extent;
 use bytemuck::must_cast_slice_mut;
 
 use super::camera::{COMPENSATED, Camera, ORTHOGRAPHIC, View};
@@ -51,12 +51,13 @@ impl std::ops::Add for Tally {
     type Output = Tally;
 
     fn add(self, other: Tally) -> Tally {
+        let Tally { behind, .. } = self;
         Tally {
             visible: self.visible + other.visible,
             not_finite: self.not_finite + other.not_finite,
             no_rotation: self.no_rotation + other.no_rotation,
             too_faint: self.too_faint + other.too_faint,
-            behind: self.behind + other.behind,
+            behind: behind + other.behind,
             outside: self.outside + other.outside,
             crossing: self.crossing + other.crossing,
         }
@@ -228,14 +229,14 @@ impl<S: Simd> Camera<S> {
         let beyond = depth - self.near_plane;
         let crossing = (beyond * beyond).lt(variance * S::F32::splat(simd, REACH * REACH));
         let mut crossed = left & crossing.bits();
-        if self.near_care && crossed != 0 {
+        if self.ray_space && crossed != 0 {
             log_opacity = S::F32::select(crossing, log2(simd, uncompensated), log_opacity);
             let sigmas = self.reach(log_opacity);
-            let ahead = Ahead::new::<VARIANT>(self, depth, variance, sigmas);
+            let extent = Extent::new::<VARIANT>(self, depth, variance, sigmas);
             let rows = three!(k => three!(i => dot(simd, self.rows[k], axes[i]) * scale[i]));
-            let halves = three!(k => ((dot(simd, rows[k], rows[k]) + ahead.blur) * sigmas).sqrt());
-            let across = ahead.covered::<VARIANT>(self, 0, seen[0].to_f32(), halves[0]);
-            let along = ahead.covered::<VARIANT>(self, 1, seen[1].to_f32(), halves[1]);
+            let halves = three!(k => ((dot(simd, rows[k], rows[k]) + extent.blur) * sigmas).sqrt());
+            let across = extent.covered::<VARIANT>(self, 0, seen[0].to_f32(), halves[0]);
+            let along = extent.covered::<VARIANT>(self, 1, seen[1].to_f32(), halves[1]);
             let visible = across[0].lt(across[1]).and(along[0].lt(along[1])).bits();
             tally.outside += (crossed & !visible).count_ones();
             left &= visible | !crossed;
@@ -246,20 +247,20 @@ impl<S: Simd> Camera<S> {
             y1 = S::F32::select(crossing, along[1], y1);
         }
         tally.crossing += crossed.count_ones();
-        let cared = if self.near_care { crossed } else { 0 };
+        let along_rays = if self.ray_space { crossed } else { 0 };
         for (mask, missing) in [
             (ahead, &mut tally.behind),
             (representable, &mut tally.not_finite),
             (inside, &mut tally.outside),
         ] {
-            let bits = mask.bits() | cared;
+            let bits = mask.bits() | along_rays;
             *missing += (left & !bits).count_ones();
             left &= bits;
         }
 
         let (mut across, mut lengthwise) = (across, lengthwise);
         let mut tilted = zero - slope * across;
-        if cared != 0 {
+        if along_rays != 0 {
             // They may be anywhere, and have no form in the plane.
             let either = |yes, no| S::F32::select(crossing, yes, no);
             for form in [&mut x, &mut y, &mut across, &mut lengthwise, &mut tilted] {

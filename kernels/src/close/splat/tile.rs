@@ -1,15 +1,15 @@
 //! The pixels of one tile, front to back.
 //!
-//! For each ellipse in order: `α = min(0.99, opacity·exp(−½d²))`; a pixel that lets through less than [`super::FINISHED`] is finished. Otherwise
+//! For each ellipse in order: `α = min(0.99, opacity·exp(−½d²))`; a pixel of a transmittance below [`super::FINISHED`] is finished. Otherwise
 //! `T` becomes `T' = T − α·T`, and the colour gains `(T − T')·colour`: a weight that is the difference of what is stored keeps the
 //! weights' sum at 1 to a few units in the last place, however many layers there are.
 //!
 //! Splats are a few pixels wide, so a tile is cut into blocks of 4×4 pixels. For each splat, the blocks in which its α may reach the
-//! floor are found all at once, a block to a lane (`layout.rs`), and of these the ones that still let light through are blended, a
+//! floor are found all at once, a block to a lane (`layout.rs`), and of these the ones that are not finished are blended, a
 //! pixel to a lane (`pixels.rs`). Within such a block every pixel is blended, however faint.
 
 use super::block::{
-    ALL_BLOCKS, AREA, BLOCKS, CARE, CLEAR, IDS, Loop, ORDER, PLAIN, SHARES, SIDE, Scene, Share, TILE, rectangle,
+    ALL_BLOCKS, AREA, BLOCKS, CLEAR, IDS, Loop, ORDER, PLAIN, RAY_SPACE, SHARES, SIDE, Scene, Share, TILE, rectangle,
 };
 use super::ellipse::Bounds;
 use super::layout::Canvas;
@@ -57,7 +57,7 @@ impl Tile {
         canvas.pending.clear();
         canvas.best.clear();
         match what {
-            Loop::Plain | Loop::Care | Loop::Shares => {}
+            Loop::Plain | Loop::RaySpace | Loop::Shares => {}
             Loop::Order => canvas.pending.resize(ALL_BLOCKS, Pending::NONE),
             Loop::Ids => canvas.best.resize(ALL_BLOCKS, Best::NONE),
         }
@@ -73,7 +73,7 @@ impl Tile {
         if self.canvas.open != 0 {
             match self.what {
                 Loop::Plain => self.run::<PLAIN>(isa, keys, next, scene),
-                Loop::Care => self.run::<CARE>(isa, keys, next, scene),
+                Loop::RaySpace => self.run::<RAY_SPACE>(isa, keys, next, scene),
                 Loop::Order => self.run::<ORDER>(isa, keys, next, scene),
                 Loop::Ids => self.run::<IDS>(isa, keys, next, scene),
                 Loop::Shares => self.run::<SHARES>(isa, keys, next, scene),
@@ -154,10 +154,10 @@ fn write<S: Simd>(_: S, tile: &Tile, behind: [f32; 4], rows: &mut [[f32; 4]], st
             let pixels;
             (pixels, row) = row.split_at_mut(end - first);
             let part = |from: &[f32; AREA]| -> [f32; SIDE as usize] { std::array::from_fn(|i| from[lanes + i]) };
-            let through = part(&block.through);
+            let transmittance = part(&block.through);
             let [r, g, b] = [0, 1, 2].map(|k| part(&block.colour[k]));
             let mixed: [[f32; 4]; SIDE as usize] = std::array::from_fn(|i| {
-                let t = through[i];
+                let t = transmittance[i];
                 [
                     r[i] + t * behind[0],
                     g[i] + t * behind[1],
@@ -169,7 +169,7 @@ fn write<S: Simd>(_: S, tile: &Tile, behind: [f32; 4], rows: &mut [[f32; 4]], st
                 Ok(pixels) => *pixels = mixed,
                 Err(_) => pixels.copy_from_slice(&mixed[first..end]),
             }
-            let seen = &through[first..end];
+            let seen = &transmittance[first..end];
             *count += seen.iter().map(|&t| u32::from(t < 1.0)).sum::<u32>();
         }
     }

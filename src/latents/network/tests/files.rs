@@ -346,7 +346,7 @@ fn a_model_is_the_same_from_a_file_and_from_memory() {
 }
 
 #[test]
-fn what_a_bit_is_worth_is_for_the_model_to_say_and_changes_nothing_of_its_streams() {
+fn lambda_is_given_by_the_model_and_changes_nothing_of_its_streams() {
     let plain = File::tiny();
     let id = Model::from_bytes(&plain.bytes()).unwrap().id();
     let saying = |price: &str| {
@@ -367,8 +367,8 @@ fn what_a_bit_is_worth_is_for_the_model_to_say_and_changes_nothing_of_its_stream
     assert_eq!((model.id(), of_roles(&model)), (id, each.clone()));
     let two_roles = format!("{:?}", &each[..2]);
     let too_many = format!("{:?}", each.clone().map(|role| [role, vec![1.0]].concat()));
-    let too_dear = format!("{:?}", of(101.0));
-    let said = ["-1", "101", "\"much\"", "null", "[]", &two_roles, &too_many, &too_dear];
+    let too_large = format!("{:?}", of(101.0));
+    let said = ["-1", "101", "\"much\"", "null", "[]", &two_roles, &too_many, &too_large];
     for wrong in said {
         let error = saying(wrong).expect_err("it is wrong");
         let text = error.to_string();

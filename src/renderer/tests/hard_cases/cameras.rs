@@ -3,7 +3,7 @@
 use super::*;
 use crate::error::Error;
 
-/// Case 8, without care for what reaches over.
+/// Case 8, without ray-space evaluation.
 #[test]
 fn a_splat_is_drawn_when_its_centre_is_beyond_the_near_plane() {
     let mut camera = straight(50.0, 20, 20);
@@ -14,7 +14,7 @@ fn a_splat_is_drawn_when_its_centre_is_beyond_the_near_plane() {
         ..RED
     };
     for isa in isas() {
-        let visible = |z| careless(&scene([at(z)]), &camera, isa).1.visible == 1;
+        let visible = |z| without_ray_space(&scene([at(z)]), &camera, isa).1.visible == 1;
         for z in [0.0, -2.0, 0.25f32.next_down(), 0.25] {
             assert!(!visible(z), "{isa}: {z}");
         }
@@ -22,7 +22,7 @@ fn a_splat_is_drawn_when_its_centre_is_beyond_the_near_plane() {
     }
 }
 
-/// Case 9, without care.
+/// Case 9, without ray-space evaluation.
 #[test]
 fn a_splat_behind_that_reaches_over_the_near_plane_is_not_mirrored_into_view() {
     let camera = straight(50.0, 20, 20);
@@ -32,13 +32,13 @@ fn a_splat_behind_that_reaches_over_the_near_plane_is_not_mirrored_into_view() {
         ..RED
     };
     for isa in isas() {
-        let (image, stats) = careless(&scene([splat]), &camera, isa);
+        let (image, stats) = without_ray_space(&scene([splat]), &camera, isa);
         assert_eq!((stats.dropped.behind, stats.crossing), (1, 1));
         assert!(image.pixels.iter().all(|p| *p == [0.0, 0.0, 0.0, 1.0]));
     }
 }
 
-/// Case 9, with care: what of it is in front.
+/// Case 9, with ray-space evaluation: what of it is in front.
 #[test]
 fn a_splat_behind_that_reaches_over_the_near_plane_is_drawn_as_what_of_it_is_in_front() {
     let camera = straight(50.0, 20, 20);

@@ -13,24 +13,24 @@
 //! | 9 | a centre behind, an ellipsoid that reaches in front of the near plane | `cameras` |
 //! | 10 | a centre outside of the field of view | `cameras` |
 //! | 11 | a principal point outside of the picture | `cameras` |
-//! | 12 | 10⁴ splats that all cover all pixels | `crowds` |
-//! | 13 | 10⁶ splats in one pixel | `crowds` |
-//! | 14 | coincident splats | `crowds` |
+//! | 12 | 10⁴ splats that all cover all pixels | `overlaps` |
+//! | 13 | 10⁶ splats in one pixel | `overlaps` |
+//! | 14 | coincident splats | `overlaps` |
 //! | 15 | depths of −0, subnormal, ∞, and one bit apart | `numbers` |
-//! | 16 | an outlier a million times as far as the rest | `crowds` |
-//! | 17 | α = 1 everywhere | `crowds` |
+//! | 16 | an outlier a million times as far as the rest | `overlaps` |
+//! | 17 | α = 1 everywhere | `overlaps` |
 //! | 18 | opaque points far below a pixel, with anti-aliasing | `shapes` |
-//! | 19 | a thousand layers of α = 1/300 | `crowds` |
-//! | 20 | white on white | `crowds` |
+//! | 19 | a thousand layers of α = 1/300 | `overlaps` |
+//! | 20 | white on white | `overlaps` |
 //! | 21 | zooms from ×0.01 to ×100 | `cameras` |
 //! | 22 | nothing to draw; sides of 1, of 65535, and of no whole tile | `cameras` |
 //! | 23 | colours beyond [0, 1], up to 10³⁰ | `numbers` |
 //! | 24 | cameras that are none | `cameras` |
-//! | 25 | every instruction set, any number of threads | `crowds` |
+//! | 25 | every instruction set, any number of threads | `overlaps` |
 
 mod cameras;
-mod crowds;
 mod numbers;
+mod overlaps;
 mod shapes;
 
 use super::effects::with;
@@ -52,8 +52,8 @@ fn visible(splat: Splat, camera: &Camera) -> bool {
     draw_on(&scene([splat]), camera, Background::WHITE).1.visible == 1
 }
 
-/// With no care for what reaches over the near plane.
-fn careless(scene: &Gaussians, camera: &Camera, isa: Isa) -> (Image, Stats) {
+/// Without ray-space evaluation of what crosses the near plane.
+fn without_ray_space(scene: &Gaussians, camera: &Camera, isa: Isa) -> (Image, Stats) {
     let effects = Effects {
         near: EffectMode::Off,
         ..Effects::default()

@@ -10,7 +10,7 @@ pub struct Machine {
     pub processor: String,
     /// Logical processors that this process may use.
     pub cores: usize,
-    /// The best instructions that the kernels have for it.
+    /// The best instruction set that the kernels support on it.
     pub isa: String,
     /// The program's version.
     pub version: String,

@@ -1,12 +1,13 @@
-//! Which voxels of a slice lie near each other, one or two away along any of the axes.
+//! The causal neighbourhood of a voxel in its slice: those one or two away along any of the axes that are coded before
+//! it.
 
 use crate::geometry::ones;
 
 /// The voxels of a slice, by their parents.
 #[derive(Debug)]
-pub(super) struct Nearby {
+pub(super) struct CausalNeighbourhood {
     parents: Vec<Parent>,
-    around: Vec<Around>,
+    around: Vec<ParentNeighbourhood>,
     /// Each voxel's octant, and the number of its parent.
     voxels: Vec<(u8, u32)>,
 }
@@ -19,9 +20,9 @@ struct Parent {
     mask: u8,
 }
 
-/// What lies around a parent, in the order of a 3³ kernel.
+/// The neighbourhood of a parent, in the order of a 3³ kernel.
 #[derive(Debug)]
-struct Around {
+struct ParentNeighbourhood {
     /// Where there are parents, itself among them; and where those that come before it.
     present: u32,
     earlier: u32,
@@ -35,7 +36,7 @@ const X: u64 = 0x1249_2492_4924_9249;
 
 /// A voxel near another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Near {
+pub(super) struct Neighbour {
     /// Its number in the slice.
     pub voxel: usize,
     /// Whether it is two away, along each of the axes along which it differs.
@@ -102,24 +103,24 @@ static BELOW: [u32; 256] = {
     table
 };
 
-impl Nearby {
+impl CausalNeighbourhood {
     /// Of voxels with these Morton keys, ascending.
     pub fn new(keys: &[u64]) -> Self {
-        let families = || keys.chunk_by(|a, b| a >> 3 == b >> 3);
-        let count = families().count();
+        let siblings = || keys.chunk_by(|a, b| a >> 3 == b >> 3);
+        let count = siblings().count();
         let (mut above, mut parents) = (Vec::with_capacity(count), Vec::with_capacity(count));
-        let mut around: Vec<Around> = Vec::with_capacity(count);
+        let mut around: Vec<ParentNeighbourhood> = Vec::with_capacity(count);
         let mut voxels = Vec::with_capacity(keys.len());
-        for (p, family) in families().enumerate() {
-            above.push(family[0] >> 3);
+        for (p, children) in siblings().enumerate() {
+            above.push(children[0] >> 3);
             let first = voxels.len() as u32;
-            let octants = family.iter().map(|key| (key & 7) as u8);
+            let octants = children.iter().map(|key| (key & 7) as u8);
             voxels.extend(octants.clone().map(|octant| (octant, p as u32)));
             let mask = octants.fold(0, |mask, octant| mask | 1 << octant);
             parents.push(Parent { first, mask });
             let (present, mut numbers) = (1 << CENTRE, [0; 27]);
             numbers[CENTRE] = p as u32;
-            around.push(Around {
+            around.push(ParentNeighbourhood {
                 present,
                 earlier: 0,
                 numbers,
@@ -143,7 +144,7 @@ impl Nearby {
                 }
             }
         }
-        Nearby {
+        CausalNeighbourhood {
             parents,
             around,
             voxels,
@@ -152,14 +153,14 @@ impl Nearby {
 
     /// Visits the voxels near one that come before it, octant by octant, and in Morton order within an octant.
     #[inline]
-    pub fn before(&self, voxel: usize, mut visit: impl FnMut(Near)) {
+    pub fn before(&self, voxel: usize, mut visit: impl FnMut(Neighbour)) {
         let (octant, own) = self.voxels[voxel];
         let octant = usize::from(octant);
         let around = &self.around[own as usize];
         for tap in ones(around.present & WITH_ONE_AWAY[octant]) {
             let parent = self.parents[around.numbers[tap] as usize];
             for other in ones(u32::from(ONE_AWAY[octant][tap] & parent.mask)) {
-                visit(Near {
+                visit(Neighbour {
                     voxel: parent.child(other),
                     two: false,
                     axes: u32::from(ONES[octant ^ other]),
@@ -169,7 +170,7 @@ impl Nearby {
         for tap in ones(around.earlier) {
             let parent = self.parents[around.numbers[tap] as usize];
             if parent.mask >> octant & 1 == 1 {
-                visit(Near {
+                visit(Neighbour {
                     voxel: parent.child(octant),
                     two: true,
                     axes: u32::from(AXES[tap]),
@@ -221,7 +222,7 @@ mod tests {
     use proptest::prelude::*;
 
     /// By definition: all voxels, one by one.
-    fn searched(keys: &[u64], voxel: usize) -> Vec<Near> {
+    fn searched(keys: &[u64], voxel: usize) -> Vec<Neighbour> {
         let at = morton::decode(keys[voxel]).map(i64::from);
         let mut near = Vec::new();
         for (other, &key) in keys.iter().enumerate() {
@@ -231,7 +232,7 @@ mod tests {
             let before = (key & 7, key) < (keys[voxel] & 7, keys[voxel]);
             for (two, d) in [(false, 1), (true, 2)] {
                 if before && away.iter().all(|&a| a == 0 || a == d) {
-                    near.push(Near {
+                    near.push(Neighbour {
                         voxel: other,
                         two,
                         axes,
@@ -243,10 +244,10 @@ mod tests {
     }
 
     fn check(keys: &[u64]) {
-        let nearby = Nearby::new(keys);
+        let neighbourhood = CausalNeighbourhood::new(keys);
         for voxel in 0..keys.len() {
             let mut found = Vec::new();
-            nearby.before(voxel, |near| found.push(near));
+            neighbourhood.before(voxel, |near| found.push(near));
             found.sort_by_key(|near| near.voxel);
             assert_eq!(found, searched(keys, voxel), "voxel {voxel}");
         }
@@ -254,7 +255,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn voxels_near_by_are_those_that_searching_finds(
+        fn neighbours_are_those_that_searching_finds(
             keys in prop::collection::btree_set(0u64..1 << 12, 0..300),
             far in prop::collection::btree_set(0u64..1 << 63, 0..20),
         ) {

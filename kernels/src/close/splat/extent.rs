@@ -1,6 +1,6 @@
 //! Where in the picture a Gaussian may be seen that reaches over the near plane.
 //!
-//! What may reach the floor of α is an ellipsoid; the picture of the box around its part beyond the plane bounds it from outside. Without,
+//! What may reach the minimum α is an ellipsoid; the picture of the box around its part beyond the plane bounds it from outside. Without,
 //! all that lies beside the camera, of which a room has thousands, would be looked at in every pixel.
 
 use super::camera::{Camera, ORTHOGRAPHIC};
@@ -9,8 +9,8 @@ use crate::simd::{F32Vector, F64Vector, Simd};
 /// Boxes around what reaches over the near plane are so much larger, as a factor, for the sake of rounding.
 const MARGIN: f32 = 1e-4;
 
-/// Gaussians that reach over the near plane, as [`super::Crossing`] has them: what of them lies beyond it.
-pub(super) struct Ahead<S: Simd> {
+/// The part beyond the near plane of Gaussians that cross it, given as [`super::Crossing`].
+pub(super) struct Extent<S: Simd> {
     /// Variance of the pixel's blur, or the Gaussians' own, that every axis is widened by.
     pub blur: S::F32,
     /// The depths between which α may reach the floor.
@@ -18,7 +18,7 @@ pub(super) struct Ahead<S: Simd> {
     farthest: S::F32,
 }
 
-impl<S: Simd> Ahead<S> {
+impl<S: Simd> Extent<S> {
     /// `variance`: along z. `sigmas`: squared, where α is at the floor.
     #[inline(always)]
     pub fn new<const VARIANT: u8>(camera: &Camera<S>, depth: S::F32, variance: S::F32, sigmas: S::F32) -> Self {
@@ -31,7 +31,7 @@ impl<S: Simd> Ahead<S> {
         let half = ((variance + blur) * sigmas).sqrt();
         let half = half.mul_add(S::F32::splat(simd, MARGIN), half);
         let nearest = (depth - half).max(camera.near_plane);
-        Ahead {
+        Extent {
             blur,
             nearest,
             farthest: (depth + half).max(nearest),

@@ -1,4 +1,4 @@
-//! Across the border: statuses, messages, pointers.
+//! The FFI boundary: statuses, messages, pointers.
 
 use std::ffi::c_char;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -141,7 +141,7 @@ pub unsafe fn give<T>(out: *mut *mut T, name: &str, value: T) -> Result<(), Faul
 /// `object` is NULL or came from [`give`], and is not used any more.
 pub unsafe fn take<T>(object: *mut T) {
     if !object.is_null() {
-        // SAFETY: it came from `Box::into_raw`. A panic while it is dropped would be a defect, and must not cross the border.
+        // SAFETY: it came from `Box::into_raw`. A panic while it is dropped would be a defect, and must not cross the FFI boundary.
         let dropped = catch_unwind(AssertUnwindSafe(|| drop(unsafe { Box::from_raw(object) })));
         debug_assert!(dropped.is_ok());
     }

@@ -1,18 +1,18 @@
-//! How wide splats are, told from some of them.
+//! Typical splat size, from a sample of the splats.
 
 use glam::DVec3;
 
 use crate::gaussians::Gaussians;
 use crate::renderer::camera::{Camera, Projection};
 
-/// At most so many Gaussians are asked.
-const ASKED: usize = 1024;
+/// At most so many Gaussians are sampled.
+const SAMPLED: usize = 1024;
 
 /// The median width, in pixels, of every so many-th of the Gaussians in the picture. Infinite if there are none.
 pub(super) fn typical_width(gaussians: &Gaussians, camera: &Camera) -> f64 {
-    let step = gaussians.len().div_ceil(ASKED).max(1);
+    let step = gaussians.len().div_ceil(SAMPLED).max(1);
     let all = (0..gaussians.len()).step_by(step);
-    let (mut widths, mut seen) = ([0.0; ASKED], 0);
+    let (mut widths, mut seen) = ([0.0; SAMPLED], 0);
     for width in all.filter_map(|i| width(gaussians, camera, i)) {
         widths[seen] = width;
         seen += 1;
