@@ -253,7 +253,14 @@ mod tests {
     fn colours_have_many_types_and_what_is_guessed_is_reported() {
         let read = |scalar: &str, row: &str| {
             let colours = ["red", "green", "blue"].map(|name| format!("{scalar} {name}"));
-            let all = ["float x", "float y", "float z", &colours[0], &colours[1], &colours[2]];
+            let all = [
+                "float x",
+                "float y",
+                "float z",
+                colours[0].as_str(),
+                colours[1].as_str(),
+                colours[2].as_str(),
+            ];
             let (cloud, notes) = open(&file(&all, &format!("0 0 0 {row}\n")));
             (cloud.colours[0], notes.len())
         };
