@@ -6,7 +6,7 @@
 use std::time::{Duration, Instant};
 
 use b2p::gaussians::{Gaussians, ply};
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::renderer::camera::Camera;
@@ -32,7 +32,7 @@ fn gaussians(path: Option<&String>) -> Result<Gaussians> {
         }
         None => {
             let model = Model::from_bytes(b2p::embedded::MODEL)?;
-            Decoder::new(&model).decode(b2p::embedded::SAMPLE, None, &Log::default())
+            LatentDecoder::new(&model).decode(b2p::embedded::SAMPLE, None, &Log::default())
         }
     }
 }

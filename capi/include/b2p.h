@@ -65,6 +65,9 @@ typedef struct b2p_heads_model b2p_heads_model;
 // A model, ready to run. Any number of decodings share it, in any threads.
 typedef struct b2p_model b2p_model;
 
+// The voxels of a level with their colours.
+typedef struct b2p_points b2p_points;
+
 // What an input may ask for.
 typedef struct b2p_limits {
   // Voxels of a level.
@@ -97,6 +100,23 @@ typedef struct b2p_arrays {
   // One unit of the cube frame in the world's.
   double unit;
 } b2p_arrays;
+
+// Where the numbers of points lie, until these are freed. A voxel with coordinates `c` covers `origin + c * voxel_size` to
+// `origin + (c + 1) * voxel_size` in the world, along each axis; its point is the middle.
+typedef struct b2p_point_arrays {
+  // How many points.
+  size_t count;
+  // Coordinates x, y, z of voxels, below 2^level: 3 * count numbers.
+  const uint32_t *coordinate;
+  // Red, green, blue, display-referred: 3 * count bytes.
+  const uint8_t *colour;
+  // The level of the octree.
+  uint8_t level;
+  // The world coordinates of the cube's lowest corner.
+  double origin[3];
+  // The edge of a voxel of this level in the world.
+  double voxel_size;
+} b2p_point_arrays;
 
 // A camera on a sphere around the cube's centre, looking at it, and what is behind the Gaussians.
 typedef struct b2p_camera {
@@ -300,6 +320,31 @@ enum b2p_status b2p_gaussians_arrays(const struct b2p_gaussians *gaussians,
 // # Safety
 // `gaussians` is NULL or came from this library, and is not used any more.
 void b2p_gaussians_free(struct b2p_gaussians *gaussians);
+
+// The points of the deepest level decoded so far, in Morton order. Fails with UNSUPPORTED for streams of version 2, whose colours
+// are those of Gaussians, and with USAGE.
+//
+// # Safety
+// `decoding` is a decoding; `points` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_points(const struct b2p_decoding *decoding,
+                                    struct b2p_points **points,
+                                    char *message,
+                                    size_t size);
+
+// Where the numbers of the points lie. Fails with USAGE.
+//
+// # Safety
+// `points` are points; `arrays` is writable; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_points_arrays(const struct b2p_points *points,
+                                  struct b2p_point_arrays *arrays,
+                                  char *message,
+                                  size_t size);
+
+// Frees points, and with them what b2p_points_arrays told.
+//
+// # Safety
+// `points` is NULL or came from this library, and is not used any more.
+void b2p_points_free(struct b2p_points *points);
 
 // Draws Gaussians into `pixels`: 4 * width * height bytes of red, green, blue, alpha, premultiplied, row by row from the top left.
 // `limits` may be NULL. Fails with USAGE if the camera is none or `length` is another, and with LIMIT.

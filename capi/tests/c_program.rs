@@ -7,10 +7,10 @@ mod common;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use b2p::decoder::StreamDecoder;
+use b2p::Decoder;
 use b2p::encoder::transform;
 use b2p::gaussians::Heads;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Model, Shape, untrained};
 use b2p::log::Log;
 use b2p::renderer::camera::Camera;
@@ -70,7 +70,7 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     let camera = Camera::orbit(20.0, 10.0, 3.0, 45.0, 40, 30).expect("a camera");
     let limits = b2p::Limits::default();
     let sum = |model: &Model, heads| {
-        let decoder = Decoder::new(model).with_heads(heads).expect("heads");
+        let decoder = LatentDecoder::new(model).with_heads(heads).expect("heads");
         let gaussians = decoder.decode(&stream, None, &Log::default());
         let gaussians = gaussians.expect("a stream");
         let drawn = render(&gaussians, &camera, Background::WHITE, &limits);
@@ -80,7 +80,7 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     };
     let (best, quick) = (sum(&model, Heads::Best), sum(&both, Heads::Quick));
     assert_ne!(best, quick);
-    let decoding = StreamDecoder::new().whole(&new.bytes);
+    let decoding = Decoder::new().whole(&new.bytes);
     let decoding = decoding.expect("a stream");
     let points = decoding.points().expect("points");
     let coordinates = (0..points.voxels.len()).flat_map(|i| points.voxels.coordinate(i));

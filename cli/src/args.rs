@@ -158,7 +158,7 @@ pub struct Encode {
     pub cloud: PathBuf,
     #[command(flatten)]
     pub output: Output,
-    /// Quality, from 0 to 100: chooses quantisation step and finest level. 100 is lossless, 48 the default
+    /// Quality, from 0 to 100: chooses quantisation step and finest level. 100 is lossless, 38 the default
     #[arg(short = 'Q', long, value_name = "0..100", value_parser = clap::value_parser!(u8).range(0..=100), conflicts_with_all = ["step", "lossless", "bits_per_point"])]
     pub quality: Option<u8>,
     /// Make the best stream of at most X bits for each point of the cloud, the whole file counted: chooses the quantisation step, and

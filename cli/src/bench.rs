@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use b2p::container::Header;
 use b2p::gaussians::{HeadSet, Heads};
 use b2p::geometry::{KernelMap, Octree};
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Module, Shape, Work};
 use b2p::layers::Precision;
 use b2p::log::{Log, Step};
@@ -68,7 +68,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
     // Of version 3, no more is known than the times.
     let works = match (model, heads.learned()) {
         (Some(model), Some(heads)) if header.model().is_some() => {
-            let exact = Decoder::new(model).with_limits(limits.clone());
+            let exact = LatentDecoder::new(model).with_limits(limits.clone());
             let exact = exact.exact(&bytes, level, &Log::default());
             let octree = exact.map_err(fail)?.octree;
             works(model.shape(), heads, &octree, header.base)

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use b2p::axes::{Axes, Up};
 use b2p::cloud::{ColourRange, ColouredVoxels, GridReport, PointCloud, ReadOptions, voxelise, voxelise_closed};
 use b2p::container;
-use b2p::gaussians::surfels::{Choice, PerVoxel, surfels};
+use b2p::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::geometry::Octree;
 use b2p::log::Log;
@@ -244,7 +244,7 @@ pub fn drawable(path: &Path, bytes: &[u8], isa: Isa, limits: &Limits, log: &Log)
             &map,
             &grid.colours,
             PerVoxel::One,
-            Choice::ALL,
+            SurfelSelection::ALL,
             frame,
         ))
     });

@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 use b2p::encoder::transform::{Options, QualityTarget};
 
 /// A stretch of the scale, from one quality to the next stretch's: how many levels above the cloud's own the finest coded level is, and
-/// the quantisation steps of luma at both ends. Rate control takes the same path: a finer level as soon as it is worth its geometry.
+/// the quantisation steps of luma at both ends. Streams of the sample are about as long where a stretch ends as where the next begins.
 struct Stretch {
     from: u8,
     above: u8,
@@ -16,12 +16,12 @@ const STRETCHES: [Stretch; 3] = [
     Stretch {
         from: 0,
         above: 2,
-        steps: [64.0, 24.0],
+        steps: [64.0, 9.0],
     },
     Stretch {
         from: 20,
         above: 1,
-        steps: [64.0, 8.0],
+        steps: [64.0, 2.5],
     },
     Stretch {
         from: 70,
@@ -89,11 +89,11 @@ mod tests {
     }
 
     #[test]
-    fn the_default_is_a_quality_of_about_48() {
+    fn the_default_is_a_quality_of_about_38() {
         let QualityTarget::Step(usual) = Options::default().fineness else {
             panic!("a step");
         };
-        let (above, step) = place(48);
+        let (above, step) = place(38);
         assert_eq!(above, 1);
         assert!((step / usual).ln().abs() < 0.05, "{step}");
     }

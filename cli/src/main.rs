@@ -184,7 +184,7 @@ fn start_threads(asked: Option<u16>) -> Result<()> {
         true => pool.use_current_thread().build_global(),
         false => {
             let begin = |worker| match waiting.pop() {
-                Some(thread) => thread.send(worker).map_err(std::io::Error::other),
+                Some(thread) => thread.send(worker).map_err(|e| std::io::Error::other(e.to_string())),
                 None => Err(std::io::Error::other("there are too few threads")),
             };
             pool.spawn_handler(begin).build_global()

@@ -6,7 +6,7 @@ mod common;
 use b2p::Error;
 use b2p::cloud::ColouredVoxels;
 use b2p::encoder::{Encoded, Options, Residual, encode, encode_to_rate};
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::log::Log;
 use common::{Ball, cloud_of, tiny_model};
@@ -56,7 +56,7 @@ fn streams_take_no_more_than_was_asked_for_and_nearly_all_of_it_and_more_room_is
             let (before, now) = (place(&last), place(&chosen));
             assert!(now >= before, "{before:?} then {now:?}");
         }
-        let decoded = Decoder::new(&model).decode(&encoded.bytes, None, &Log::default());
+        let decoded = LatentDecoder::new(&model).decode(&encoded.bytes, None, &Log::default());
         assert!(!decoded.unwrap().is_empty());
         last = Some(chosen);
     }

@@ -6,7 +6,7 @@ mod common;
 use b2p::embedded::{MODEL, SAMPLE};
 use b2p::encoder::{Options, encode};
 use b2p::gaussians::Gaussians;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::layers::Precision;
 use b2p::log::Log;
@@ -20,7 +20,7 @@ fn model() -> Model {
 }
 
 fn decoded(model: &Model, level: u8) -> Gaussians {
-    Decoder::new(model)
+    LatentDecoder::new(model)
         .decode(SAMPLE, Some(level), &Log::default())
         .expect("the sample inside the program decodes")
 }
@@ -52,7 +52,7 @@ fn the_dearer_a_bit_the_shorter_the_stream() {
 #[test]
 fn the_sample_decodes_to_the_same_bits_with_every_instruction_set() {
     assert_eq!(model().precision(), Precision::Int16);
-    let level = Decoder::new(&model()).levels(SAMPLE).unwrap()[0];
+    let level = LatentDecoder::new(&model()).levels(SAMPLE).unwrap()[0];
     let best = bits(&decoded(&model(), level));
     for isa in Isa::available() {
         println!("ran on {isa}");
@@ -64,7 +64,7 @@ fn the_sample_decodes_to_the_same_bits_with_every_instruction_set() {
 #[test]
 fn gaussians_generated_in_integers_draw_the_pictures_of_those_generated_in_floats() {
     let floats = model().with_precision(Precision::F16).unwrap();
-    for level in Decoder::new(&floats).levels(SAMPLE).unwrap() {
+    for level in LatentDecoder::new(&floats).levels(SAMPLE).unwrap() {
         let camera = Camera::orbit(30.0, 10.0, 3.0, 45.0, 512, 512).unwrap();
         let [a, b] = [&model(), &floats].map(|model| {
             let g = decoded(model, level);

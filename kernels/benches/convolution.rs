@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use std::time::Instant;
 
 use b2p_kernels::f16;
-use b2p_kernels::{ABSENT, ExactConv, FloatConv, Isa, Output, Plan, Precision, Requantise, Scale, Taps, ceiling};
+use b2p_kernels::{ABSENT, ExactConv, FloatConv, Isa, Output, Plan, Precision, Requantise, Scale, Taps, peak};
 
 /// A bumpy closed surface of about `count` voxels, in Morton order.
 fn surface(count: usize) -> Vec<[i32; 3]> {
@@ -143,8 +143,8 @@ impl Bench {
         for (what, scale, precision) in scales {
             let ceiling = match precision {
                 Precision::F32 => ceiling,
-                Precision::Bf16 if isa.has_bf16() => ceiling::bf16(isa),
-                Precision::Half if isa.has_half() => ceiling::half(isa),
+                Precision::Bf16 if isa.has_bf16() => peak::bf16(isa),
+                Precision::Half if isa.has_half() => peak::half(isa),
                 Precision::Bf16 | Precision::Half | Precision::Fastest => continue,
             };
             let conv = FloatConv::new(27, cin, cout, &weights, vec![0.0; cout], scale);
@@ -195,14 +195,14 @@ fn main() {
         if !only.is_empty() && !only.contains(&isa) {
             continue;
         }
-        let (float, exact) = (ceiling::f32(isa), ceiling::i16(isa));
+        let (float, exact) = (peak::f32(isa), peak::i16(isa));
         let name = isa.to_string();
         println!("{name:>7} at best: f32 {float:.1} GMAC/s, i16 {exact:.1} GMAC/s");
         if isa.has_bf16() {
-            println!("{name:>7} at best: bf16 {:.1} GMAC/s", ceiling::bf16(isa));
+            println!("{name:>7} at best: bf16 {:.1} GMAC/s", peak::bf16(isa));
         }
         if isa.has_half() {
-            println!("{name:>7} at best: half {:.1} GMAC/s", ceiling::half(isa));
+            println!("{name:>7} at best: half {:.1} GMAC/s", peak::half(isa));
         }
         for &layer in &layers {
             bench.exact(isa, layer, exact);

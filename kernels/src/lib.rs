@@ -11,45 +11,52 @@
 #[cfg(all(target_arch = "x86", not(target_feature = "sse2")))]
 compile_error!("x87 arithmetic does not round to f32 after every step: build for a target with SSE2");
 
-mod convert;
-mod double;
+#[cfg(feature = "close")]
+mod close;
 mod exact;
-mod family;
-mod finish;
-mod float;
-mod machine;
 mod map;
 mod memory;
-mod norms;
-mod plan;
-mod rows;
 mod simd;
+mod sparse;
 #[cfg(feature = "startup")]
 mod startup;
-mod taps;
-mod tile;
-mod winograd;
-
-pub mod butterflies;
-pub mod ceiling;
-pub mod coefficients;
-pub mod hidden;
-pub mod mixing;
-pub mod reference;
-pub mod smooth;
-pub mod splat;
 
 pub use ::half::f16;
-pub use convert::{to_f16, to_f32};
-pub use double::add_products;
-pub use exact::{ExactConv, LIMIT, Requantise};
-pub use family::{copy_row, window};
-pub use float::{FloatConv, FloatOut, Precision, Scale};
+#[cfg(feature = "close")]
+pub use close::splat;
+#[cfg(feature = "close")]
+pub use close::{
+    conv::{FloatConv, FloatOut, Precision, Scale},
+    convert::{to_f16, to_f32},
+};
+pub use exact::conv::ExactConv;
+pub use exact::double::add_products;
+pub use exact::requantise::{LIMIT, Requantise};
+pub use exact::{butterflies, coefficients, hidden, mixing, smooth};
 pub use map::{MappedFile, map_file};
 pub use memory::{Zeros, give_back, zeros};
-pub use plan::Plan;
-pub use rows::Output;
-pub use simd::{Isa, Scalar, Simd as Instructions, UnknownIsa, Work};
+pub use simd::{Isa, Scalar, Simd, Simd as Instructions, UnknownIsa, Work};
+pub use sparse::children::{copy_row, window};
+pub use sparse::plan::Plan;
+pub use sparse::rows::Output;
+pub use sparse::taps::{ABSENT, Taps};
 #[cfg(feature = "startup")]
 pub use startup::stdout_was_closed;
-pub use taps::{ABSENT, Taps};
+
+/// Peak throughput of one core, to judge the kernels by.
+///
+/// Each function measures for about 10 ms and gives the best rate seen, in 10⁹ multiply-adds per second. For `scalar` it tells what the
+/// compiler makes of such a loop, which is no bound.
+pub mod peak {
+    #[cfg(feature = "close")]
+    pub use crate::close::peak::{bf16, f32, half};
+    pub use crate::exact::peak::i16;
+}
+pub use peak as ceiling;
+
+/// The convolutions as their definitions read: what the kernels are tested against.
+pub mod reference {
+    #[cfg(feature = "close")]
+    pub use crate::close::reference::{Value, float};
+    pub use crate::exact::reference::{exact, tap};
+}

@@ -1,6 +1,7 @@
 //! The laboratory of `b2p`: what is needed to make data, train, and judge, and never to decode.
 #![forbid(unsafe_code)]
 
+pub mod capture;
 pub mod cli;
 pub mod dataset;
 pub mod error;

@@ -130,6 +130,48 @@ pub fn render(surface: &Surface, view: &View, size: [u32; 2], samples: u32, clip
     Picture { width, height, rgba }
 }
 
+/// What the ray through a pixel's centre meets first.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hit {
+    /// The triangle.
+    pub face: Face,
+    /// Distance along the view's axis.
+    pub depth: f64,
+}
+
+/// What each pixel sees, row by row from the top: one ray through its centre. Both sides of a triangle are hit.
+pub fn trace(surface: &Surface, view: &View, size: [u32; 2]) -> Vec<Option<Hit>> {
+    let extent = size.map(|s| s as usize);
+    let frame = Frame {
+        surface,
+        view,
+        width: extent[0],
+        samples: 1,
+        extent,
+        clip: None,
+    };
+    let faces: Vec<Face> = surface.faces().collect();
+    let setups: Vec<Setup> = faces.par_iter().filter_map(|&f| frame.setup(f)).collect();
+    let mut seen = vec![NOTHING; extent[0] * extent[1]];
+    let mut by_row: Vec<Vec<u32>> = vec![Vec::new(); extent[1]];
+    for (i, setup) in setups.iter().enumerate() {
+        for row in &mut by_row[setup.y[0]..setup.y[1]] {
+            row.push(i as u32);
+        }
+    }
+    let rows = seen.par_chunks_mut(extent[0].max(1)).zip(&by_row).enumerate();
+    rows.for_each(|(y, (line, members))| {
+        for &member in members {
+            frame.draw_line(&setups, member, y, line);
+        }
+    });
+    let hit = |s: Seen| Hit {
+        face: setups[s.setup as usize].face,
+        depth: 1.0 / s.nearness,
+    };
+    seen.into_iter().map(|s| (s.nearness > 0.0).then(|| hit(s))).collect()
+}
+
 /// Rows of pixels drawn together.
 const BAND: usize = 8;
 
@@ -174,6 +216,11 @@ struct Seen {
     nearness: f64,
     setup: u32,
 }
+
+const NOTHING: Seen = Seen {
+    nearness: 0.0,
+    setup: u32::MAX,
+};
 
 impl Frame<'_> {
     fn setup(&self, face: Face) -> Option<Setup> {
@@ -258,11 +305,7 @@ impl Frame<'_> {
         let rows = pixels.len() / self.width;
         let (first, end) = (row * self.samples, (row + rows) * self.samples);
         let across = self.extent[0];
-        let nothing = Seen {
-            nearness: 0.0,
-            setup: u32::MAX,
-        };
-        let mut seen = vec![nothing; across * (end - first)];
+        let mut seen = vec![NOTHING; across * (end - first)];
         for &member in members {
             let setup = &setups[member as usize];
             for y in setup.y[0].max(first)..setup.y[1].min(end) {

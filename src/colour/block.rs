@@ -6,7 +6,7 @@ use b2p_kernels::Instructions;
 use b2p_kernels::butterflies;
 
 use super::model::{ChromaFromLuma, CoefficientContext, FEATURES, Model, SignContext};
-use super::prediction::{Around, Coded, EARLIER_FACES};
+use super::prediction::{Coded, EARLIER_FACES, FaceNeighbours};
 use super::space::{Steps, Ycc, clamp};
 use super::transform::{AXIS, FRACTIONS, JOINS, JOINS_OF, SCALE, Scale, UNSCALED, forward};
 use crate::geometry::KernelMap;
@@ -107,7 +107,7 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
             continue;
         }
         let row = nodes.map.row(node);
-        let around = Around::new(nodes.map, nodes.masks, nodes.values, node);
+        let around = FaceNeighbours::new(nodes.map, nodes.masks, nodes.values, node);
         let joins = &JOINS_OF[usize::from(mask)];
         let fractions = &FRACTIONS[usize::from(mask)];
         let predicted = predict(nodes, node, &around, &coded);
@@ -180,7 +180,7 @@ pub(super) fn spread(mask: u8, values: &[Ycc]) -> [[i32; 3]; 8] {
 /// Both predictions of a node's children, by octant, in four lanes each: `near`, which includes the children coded
 /// before, then `far`, from the nodes of the level above alone (`docs/format.md`, 5.6.5).
 #[inline(always)]
-fn predict(nodes: Nodes<'_>, node: usize, around: &Around, coded: &Coded) -> [Lanes; 8] {
+fn predict(nodes: Nodes<'_>, node: usize, around: &FaceNeighbours, coded: &Coded) -> [Lanes; 8] {
     let mut predicted = [[0; 8]; 8];
     let sums = around.sums();
     let first = nodes.first_child[node] as usize;

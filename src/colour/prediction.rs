@@ -101,17 +101,17 @@ pub(super) static NODE_WEIGHTS: [[[u16; 8]; 256]; 7] = {
 };
 
 /// A node and its six face neighbours. One that is absent has the node's own colour, and no weight.
-pub(super) struct Around {
+pub(super) struct FaceNeighbours {
     masks: [u8; 7],
     values: [[i16; 3]; 7],
     present: u32,
 }
 
-impl Around {
+impl FaceNeighbours {
     #[inline(always)]
-    pub fn new(map: &KernelMap, masks: &[u8], values: &[[i16; 3]], node: usize) -> Around {
+    pub fn new(map: &KernelMap, masks: &[u8], values: &[[i16; 3]], node: usize) -> FaceNeighbours {
         let row = map.row(node);
-        let mut around = Around {
+        let mut around = FaceNeighbours {
             masks: [0; 7],
             values: [[0; 3]; 7],
             present: 0,
@@ -288,7 +288,7 @@ mod tests {
                     *value = [(step - 16_384) as i16; 3];
                 }
                 values[present as usize - 1][1] = -16_384;
-                let around = Around {
+                let around = FaceNeighbours {
                     masks: [1; 7],
                     values,
                     present,

@@ -10,7 +10,7 @@ mod stream;
 mod streaming;
 mod transform;
 
-pub use stream::{Decoder, Decoder as StreamDecoder, Points};
-pub use streaming::{Decoding, Decoding as StreamDecoding};
+pub use stream::{Decoder, Points};
+pub use streaming::Decoding;
 #[cfg(feature = "encoder")]
 pub(crate) use transform::colour_hash;

@@ -13,7 +13,7 @@ use crate::container::feed::Goal;
 use crate::container::{Format, Header, Stream};
 use crate::error::{Error, Result};
 use crate::gaussians::learned::{HeadsModel, LevelInput, Set};
-use crate::gaussians::surfels::{Choice, PerVoxel, surfels};
+use crate::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
 use crate::gaussians::{Frame, Gaussians};
 use crate::gaussians::{HeadMap, HeadSet, Heads};
 use crate::geometry::Voxels;
@@ -391,7 +391,7 @@ impl Decoder {
         let [mixed, alone] = map_of_heads.map_or([1.0; 2], HeadMap::sizes);
         let discs = |only: Option<&[bool]>| {
             let size = if only.is_some() { mixed } else { alone };
-            let choice = Choice { only, size };
+            let choice = SurfelSelection { only, size };
             let per_voxel = self.surfels_per_voxel(header, level)?;
             let voxels = octree.level(level);
             Ok(surfels(self.isa(), voxels, map, colours, per_voxel, choice, frame))

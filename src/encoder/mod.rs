@@ -18,7 +18,7 @@ use crate::cloud::ColouredVoxels;
 use crate::container::{Format, Header, MAX_SLICE_VOXELS, Section};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, Voxels};
-use crate::latents::Decoder;
+use crate::latents::LatentDecoder;
 use crate::latents::entropy::{Coding, Rounding};
 use crate::latents::network::{Model, ROLES};
 use crate::limits::Limits;
@@ -201,7 +201,7 @@ impl<'a> Subject<'a> {
         let Skeleton { header, octree, .. } = &self.skeleton;
         let top = header.top;
         let exact = log.step("decode again", octree.level(top).len(), "voxels", || {
-            Decoder::new(self.model)
+            LatentDecoder::new(self.model)
                 .with_limits(Limits::unlimited())
                 .exact(&bytes, top, &Log::off())
         })?;

@@ -1,10 +1,10 @@
 //! From the network's raw numbers to Gaussians.
 //!
 //! Activations after the paper's semantics (offset, scale, rotation, opacity, colour; its §"3D Gaussian generation"),
-//! which leaves their functions open. With `u` the edge of a generated voxel in the cube frame: position = voxel centre
-//! + tanh(raw)·range·u, σ = softplus(raw + bias)·range·u, rotation = normalise(raw + (1, 0, 0, 0)), opacity =
-//! sigmoid(raw + bias) where it is learned, else 1, colour = clamp(½ + raw, 0, 1). Equal raw numbers give equal bits on
-//! every machine.
+//! which leaves their functions open. With `u` the edge of a generated voxel in the cube frame: position =
+//! voxel centre + tanh(raw)·range·u, σ = softplus(raw + bias)·range·u, rotation = normalise(raw + (1, 0, 0, 0)),
+//! opacity = sigmoid(raw + bias) where it is learned, else 1, colour = clamp(½ + raw, 0, 1). Equal raw numbers give
+//! equal bits on every machine.
 
 use b2p_kernels::zeros;
 use rayon::prelude::*;

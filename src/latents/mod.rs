@@ -13,7 +13,7 @@ mod residual;
 
 pub use activate::activate;
 pub use colour_filter::{ColourFilter, Groups, INPUTS as COLOUR_INPUTS, Surroundings};
-pub use decoder::{Exact, LatentDecoder, LatentDecoder as Decoder};
+pub use decoder::{Exact, LatentDecoder};
+pub use decoding::LatentDecoding;
 pub(crate) use decoding::nothing_reached;
-pub use decoding::{LatentDecoding, LatentDecoding as Decoding};
 pub use residual::{BASIS as COLOUR_BASIS, ColourResidual, ResidualSteps, Steps};

@@ -39,7 +39,7 @@ impl Image {
     /// only.
     ///
     /// # Errors
-    /// [`Error::Io`] if `to` fails.
+    /// [`Error::Io`](crate::Error::Io) if `to` fails.
     ///
     /// # Panics
     /// If there are fewer distances than pixels.

@@ -40,8 +40,6 @@ use b2p_kernels::Isa;
 use b2p_kernels::splat::{Crossing, Loop, Scene};
 use rayon::prelude::*;
 
-#[doc(hidden)]
-pub use effects::EffectMode as Choice;
 pub use effects::{Effect, EffectMode, EffectSet, Effects, Explanation, MOST_SAMPLES, RESOLVED};
 pub use image::{Ids, Image, box_half};
 pub use shade::Channel;

@@ -162,7 +162,7 @@ impl Calibration {
     /// done.
     ///
     /// # Errors
-    /// Those of [`Decoder::decode`](b2p::latents::Decoder::decode) and
+    /// Those of [`LatentDecoder::decode`](b2p::latents::LatentDecoder::decode) and
     /// [`Renderer::render`](b2p::renderer::Renderer::render); [`Error::Usage`] if no level has Gaussians, or threads cannot be started.
     pub fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
         measure(subject, say)

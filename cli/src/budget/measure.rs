@@ -16,7 +16,7 @@ use b2p::encoder::with_zero_latents;
 use b2p::gaussians::Heads;
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::geometry::{KernelMap, Octree, Voxels};
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::activate;
 use b2p::latents::network::Model;
 use b2p::layers::Precision;
@@ -47,7 +47,7 @@ const EQUAL: f64 = 200.0;
 pub(super) fn measure(subject: &Subject<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
     let header = Header::parse(subject.stream, subject.limits)?;
     let model = (subject.model)()?;
-    let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
+    let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
     let levels = decoder.levels(subject.stream)?;
     let Some(&finest) = levels.last() else {
         return Err(Error::Usage("the stream has no level with Gaussians".into()));
@@ -179,7 +179,7 @@ fn exact_times(subject: &Subject<'_>, stream: &[u8], finest: u8) -> Result<Vec<[
     let header = Header::parse(stream, subject.limits)?;
     let runs = repeated(|| {
         let model = (subject.model)()?;
-        let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
+        let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
         cold(|| {
             let log = Log::default();
             decoder.exact(stream, finest, &log)?;
@@ -215,7 +215,7 @@ struct Made {
 }
 
 /// These levels of a stream whose first is `base`, and the octree down to the last.
-fn decode_levels(decoder: &Decoder, stream: &[u8], base: u8, levels: &[u8]) -> Result<(Vec<Level>, Octree)> {
+fn decode_levels(decoder: &LatentDecoder, stream: &[u8], base: u8, levels: &[u8]) -> Result<(Vec<Level>, Octree)> {
     let frame = decoder.frame(stream)?;
     let mut decoding = decoder.start(levels.last().copied());
     decoding.push(stream);

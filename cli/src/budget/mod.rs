@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use b2p::container::Header;
 use b2p::gaussians::Heads;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::{Limits, embedded};
 use clap::Args;
@@ -90,7 +90,7 @@ pub fn choose(
     if budget == Budget::default() {
         return Ok(None);
     }
-    let decoder = Decoder::new(&model).with_limits(limits.clone());
+    let decoder = LatentDecoder::new(&model).with_limits(limits.clone());
     let levels = decoder.levels(&stream).map_err(&fail)?;
     let choice = budget.choose(&calibration, &header, &levels, task).map_err(&fail)?;
     Ok(Some(Chosen { choice, budget }))

@@ -3,13 +3,13 @@
 use std::arch::x86_64::*;
 
 use bytemuck::must_cast;
+use half::f16;
 
-use super::dispatch::{define_set, methods, operators};
-use super::{
-    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, Work, first,
-    first_mut, four, polynomial,
+use super::macros::{define_set, five, four, methods, operators, vectorize};
+use super::vector::{
+    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, first,
+    first_mut, polynomial, sealed,
 };
-use crate::f16;
 
 define_set! { $ with_avx2, is_x86_feature_detected,
     /// Proof of AVX2, and of what all processors with AVX2 have besides.
@@ -24,15 +24,7 @@ define_set! { $ with_avx_vnni, is_x86_feature_detected,
     extends avx2::Avx2, with_avx2;
 }
 
-impl super::sealed::Sealed for Avx2 {}
-
-impl Avx2 {
-    /// AVX-512 includes AVX2.
-    #[inline(always)]
-    pub(super) fn of(_: super::Avx512) -> Self {
-        Avx2(())
-    }
-}
+impl sealed::Sealed for Avx2 {}
 
 impl Simd for Avx2 {
     const LANES: usize = 8;
@@ -47,22 +39,13 @@ impl Simd for Avx2 {
     fn narrow(self) -> Self {
         self
     }
-
-    #[inline(always)]
-    fn vectorize<W: Work>(self, work: W) -> W::Output {
-        with_avx2! {
-            fn run<W: Work>(token: Avx2, work: W) -> W::Output {
-                work.run(token)
-            }
-        }
-        // SAFETY: the token proves the features.
-        unsafe { run(self, work) }
-    }
 }
+
+vectorize! { with_avx_vnni AvxVnni, base: Avx2 }
 
 /// Eight f32.
 #[derive(Clone, Copy)]
-pub struct F32x8(__m256);
+pub struct F32x8(pub(super) __m256);
 
 /// Eight f64.
 #[derive(Clone, Copy)]
@@ -70,7 +53,7 @@ pub struct F64x8(__m256d, __m256d);
 
 /// Eight i32.
 #[derive(Clone, Copy)]
-pub struct I32x8(__m256i);
+pub struct I32x8(pub(super) __m256i);
 
 /// Sixteen i16.
 #[derive(Clone, Copy)]
@@ -231,7 +214,7 @@ methods! { with_avx2 F32x8: F32Vector<Avx2> {
         let round = F32x8(_mm256_set1_ps(ROUND));
         let x = F32x8(_mm256_max_ps(self.0, _mm256_set1_ps(LEAST_EXPONENT)));
         let shifted = x + round;
-        let p = polynomial(Avx2(()), x - (shifted - round), &EXP2);
+        let p = polynomial::<Avx2>(x - (shifted - round), five!(i => F32x8(_mm256_set1_ps(EXP2[i]))));
         let exponent = _mm256_slli_epi32::<23>(_mm256_castps_si256(shifted.0));
         F32x8(_mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.0), exponent)))
     }

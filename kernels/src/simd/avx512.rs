@@ -3,14 +3,18 @@
 use std::arch::x86_64::*;
 
 use bytemuck::must_cast;
+use half::f16;
 
 use super::avx2::Avx2;
-use super::dispatch::{define_set, methods, operators};
-use super::{
-    EXP2_ABOVE, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, MaskVector, Simd, Work, first, first_mut, four,
-    polynomial, three,
+#[cfg(feature = "close")]
+use super::avx2::{F32x8, I32x8};
+#[cfg(feature = "close")]
+use super::macros::vectorize;
+use super::macros::{define_set, five, four, methods, operators, three};
+use super::vector::{
+    EXP2_ABOVE, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, MaskVector, Simd, first, first_mut, polynomial,
+    sealed,
 };
-use crate::f16;
 
 define_set! { $ with_avx512, is_x86_feature_detected,
     /// Proof of AVX-512 F, BW, CD, DQ, VL and VNNI, and of AVX2.
@@ -18,7 +22,7 @@ define_set! { $ with_avx512, is_x86_feature_detected,
     extends avx2::Avx2, with_avx2;
 }
 
-impl super::sealed::Sealed for Avx512 {}
+impl sealed::Sealed for Avx512 {}
 
 impl Simd for Avx512 {
     const LANES: usize = 16;
@@ -31,18 +35,7 @@ impl Simd for Avx512 {
 
     #[inline(always)]
     fn narrow(self) -> Avx2 {
-        Avx2::of(self)
-    }
-
-    #[inline(always)]
-    fn vectorize<W: Work>(self, work: W) -> W::Output {
-        with_avx512! {
-            fn run<W: Work>(token: Avx512, work: W) -> W::Output {
-                work.run(token)
-            }
-        }
-        // SAFETY: the token proves the features.
-        unsafe { run(self, work) }
+        self.base()
     }
 }
 
@@ -230,7 +223,7 @@ methods! { with_avx512 F32x16: F32Vector<Avx512> {
     fn exp2(self) -> Self {
         // What is beyond the integer below; scaling takes that integer by itself.
         let f = _mm512_reduce_ps::<{ _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC }>(self.0);
-        let p = polynomial(Avx512(()), F32x16(f), &EXP2_ABOVE);
+        let p = polynomial::<Avx512>(F32x16(f), five!(i => F32x16(_mm512_set1_ps(EXP2_ABOVE[i]))));
         F32x16(_mm512_scalef_ps(p.0, self.0))
     }
 
@@ -471,4 +464,80 @@ define_set! { $ with_bf16, is_x86_feature_detected,
     /// Proof of AVX512_BF16 and AVX-512.
     pub(crate) struct Bf16 = "avx512bf16";
     extends avx512::Avx512, with_avx512;
+}
+
+#[cfg(feature = "close")]
+vectorize! { with_bf16 Bf16, base: Avx512 }
+
+#[cfg(feature = "close")]
+impl Bf16 {
+    /// Rows of f16 as pairs of bf16, rounded to even: row `i` of `to` is row `rows[i]` of `input`, of `cin` values each. An odd row's last
+    /// pair has a zero.
+    ///
+    /// # Panics
+    /// If the input lacks a row.
+    pub fn round_rows(self, input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
+        // SAFETY: the token proves the features.
+        unsafe { round_rows(input, rows, cin, to) }
+    }
+
+    /// Up to 32 f16 as pairs of bf16, rounded to even, and zeros after them.
+    #[inline(always)]
+    pub fn round(self, from: &[f16]) -> [u32; 16] {
+        // SAFETY: the token proves the features.
+        unsafe { round_f16(from) }
+    }
+}
+
+#[cfg(feature = "close")]
+with_bf16! {
+    fn round_rows(input: &[f16], rows: &[u32], cin: usize, to: &mut [u32]) {
+        for (to, &row) in to.chunks_exact_mut(cin.div_ceil(2)).zip(rows) {
+            let from = &input[row as usize * cin..][..cin];
+            for (to, from) in to.chunks_mut(16).zip(from.chunks(32)) {
+                let here = u16::MAX >> (16 - to.len());
+                // SAFETY: only the words of `to` are written.
+                unsafe { _mm512_mask_storeu_epi32(to.as_mut_ptr().cast(), here, must_cast(round_f16(from))) };
+            }
+        }
+    }
+}
+
+#[cfg(feature = "close")]
+with_bf16! {
+    /// Up to 32 f16 as pairs of bf16, and zeros after them.
+    #[inline]
+    fn round_f16(from: &[f16]) -> [u32; 16] {
+        let here = u32::MAX >> 32usize.saturating_sub(from.len());
+        // SAFETY: of 32 values only those of `from` are read.
+        let halves = unsafe { _mm512_maskz_loadu_epi16(here, from.as_ptr().cast()) };
+        let low = _mm512_cvtph_ps(_mm512_castsi512_si256(halves));
+        let high = _mm512_cvtph_ps(_mm512_extracti64x4_epi64::<1>(halves));
+        must_cast(_mm512_cvtne2ps_pbh(high, low))
+    }
+}
+
+/// Vectors of pairs of bf16, as the bits of i32.
+#[cfg(feature = "close")]
+pub(crate) trait Bf16Vectors: Simd {
+    /// `sum + a₀·b₀ + a₁·b₁`.
+    fn dot_bf16(bf16: Bf16, sum: Self::F32, a: Self::I32, b: Self::I32) -> Self::F32;
+}
+
+#[cfg(feature = "close")]
+impl Bf16Vectors for Avx512 {
+    #[inline(always)]
+    fn dot_bf16(_: Bf16, sum: F32x16, a: I32x16, b: I32x16) -> F32x16 {
+        // SAFETY: the token proves the features.
+        F32x16(unsafe { _mm512_dpbf16_ps(sum.0, must_cast(a.0), must_cast(b.0)) })
+    }
+}
+
+#[cfg(feature = "close")]
+impl Bf16Vectors for Avx2 {
+    #[inline(always)]
+    fn dot_bf16(_: Bf16, sum: F32x8, a: I32x8, b: I32x8) -> F32x8 {
+        // SAFETY: the token proves the features.
+        F32x8(unsafe { _mm256_dpbf16_ps(sum.0, must_cast(a.0), must_cast(b.0)) })
+    }
 }

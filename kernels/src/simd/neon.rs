@@ -4,13 +4,13 @@ use std::arch::aarch64::*;
 use std::arch::asm;
 
 use bytemuck::must_cast;
+use half::f16;
 
-use super::dispatch::{define_set, methods, operators};
-use super::{
-    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, Work, first,
-    first_mut, four, polynomial,
+use super::macros::{define_set, five, four, methods, operators, vectorize};
+use super::vector::{
+    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, first,
+    first_mut, polynomial, sealed,
 };
-use crate::f16;
 
 define_set! { $ with_neon, is_aarch64_feature_detected,
     /// Proof of NEON.
@@ -29,7 +29,7 @@ define_set! { $ with_neon_half, is_aarch64_feature_detected,
     extends neon::Neon, with_neon;
 }
 
-impl super::sealed::Sealed for Neon {}
+impl sealed::Sealed for Neon {}
 
 impl Simd for Neon {
     const LANES: usize = 4;
@@ -44,18 +44,9 @@ impl Simd for Neon {
     fn narrow(self) -> Self {
         self
     }
-
-    #[inline(always)]
-    fn vectorize<W: Work>(self, work: W) -> W::Output {
-        with_neon! {
-            fn run<W: Work>(token: Neon, work: W) -> W::Output {
-                work.run(token)
-            }
-        }
-        // SAFETY: the token proves the features.
-        unsafe { run(self, work) }
-    }
 }
+
+vectorize! { with_neon Neon, narrow: Neon }
 
 /// Four f32.
 #[derive(Clone, Copy)]
@@ -225,7 +216,7 @@ methods! { with_neon F32x4: F32Vector<Neon> {
         let (round, least) = (F32x4(vdupq_n_f32(ROUND)), vdupq_n_f32(LEAST_EXPONENT));
         let x = F32x4(vbslq_f32(vcltq_f32(least, self.0), self.0, least));
         let shifted = x + round;
-        let p = polynomial(Neon(()), x - (shifted - round), &EXP2);
+        let p = polynomial::<Neon>(x - (shifted - round), five!(i => F32x4(vdupq_n_f32(EXP2[i]))));
         let exponent = vshlq_n_u32::<23>(vreinterpretq_u32_f32(shifted.0));
         F32x4(vreinterpretq_f32_u32(vaddq_u32(vreinterpretq_u32_f32(p.0), exponent)))
     }

@@ -2,11 +2,13 @@
 
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Sub};
 
-use super::{
-    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, Work, first,
-    first_mut, four, three,
+use half::f16;
+
+use super::macros::{four, three};
+use super::vector::{
+    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, first,
+    first_mut, sealed,
 };
-use crate::f16;
 
 /// What every processor of the target has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -15,9 +17,14 @@ pub struct Scalar(());
 impl Scalar {
     /// The token: there is nothing to prove.
     pub const TOKEN: Scalar = Scalar(());
+
+    /// The token, as the other sets give theirs.
+    pub(crate) fn new() -> Option<Self> {
+        Some(Self::TOKEN)
+    }
 }
 
-impl super::sealed::Sealed for Scalar {}
+impl sealed::Sealed for Scalar {}
 
 impl Simd for Scalar {
     const LANES: usize = 4;
@@ -32,12 +39,16 @@ impl Simd for Scalar {
     fn narrow(self) -> Self {
         self
     }
-
-    #[inline(always)]
-    fn vectorize<W: Work>(self, work: W) -> W::Output {
-        work.run(self)
-    }
 }
+
+/// Compiles a function as it is, apart from what calls it.
+macro_rules! with_scalar {
+    ($($item:tt)*) => {
+        #[inline(never)]
+        $($item)*
+    };
+}
+pub(crate) use with_scalar;
 
 /// Four f32.
 #[derive(Clone, Copy)]
@@ -436,9 +447,7 @@ impl I32Vector<Scalar> for I32x4 {
 
     #[inline(always)]
     fn dot_pairs(self, a: I16x8, b: I16x8) -> Self {
-        // In one expression a lane: compilers turn it into the pairwise products that most processors have.
-        let product = |i: usize| i32::from(a.0[i]) * i32::from(b.0[i]);
-        self + I32x4(four!(i => product(2 * i).wrapping_add(product(2 * i + 1))))
+        self + dot_pairs(a, b)
     }
 
     #[inline(always)]
@@ -455,6 +464,25 @@ impl I32Vector<Scalar> for I32x4 {
     fn as_i16(self) -> I16x8 {
         I16x8(bytemuck::must_cast(self.0))
     }
+}
+
+/// `a₀·b₀ + a₁·b₁` in each lane.
+#[cfg(not(all(target_arch = "x86_64", target_feature = "sse2")))]
+#[inline(always)]
+fn dot_pairs(a: I16x8, b: I16x8) -> I32x4 {
+    let product = |i: usize| i32::from(a.0[i]) * i32::from(b.0[i]);
+    I32x4(four!(i => product(2 * i).wrapping_add(product(2 * i + 1))))
+}
+
+/// `a₀·b₀ + a₁·b₁` in each lane: compilers do not always find the instruction by themselves.
+#[cfg(all(target_arch = "x86_64", target_feature = "sse2"))]
+#[inline(always)]
+fn dot_pairs(a: I16x8, b: I16x8) -> I32x4 {
+    use bytemuck::must_cast;
+    // SAFETY: the target has SSE2.
+    I32x4(must_cast(unsafe {
+        std::arch::x86_64::_mm_madd_epi16(must_cast(a.0), must_cast(b.0))
+    }))
 }
 
 impl I16x8 {

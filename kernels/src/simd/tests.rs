@@ -2,8 +2,9 @@
 
 use proptest::prelude::*;
 
+use half::f16;
+
 use super::{F32Vector, F64Vector, I16Vector, I32Vector, Isa, MaskVector, Scalar, Simd, Work};
-use crate::f16;
 
 /// Values of the longest vectors.
 const LONGEST: usize = 32;

@@ -1,5 +1,6 @@
 //! The program's subcommands.
 
+pub mod capture;
 pub mod dataset;
 pub mod eval;
 pub mod occupancy;
@@ -26,6 +27,7 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Voxelize(voxelize::Args),
+    Capture(capture::Args),
     Dataset(dataset::Args),
     Scene(scene::Args),
     Eval(eval::Args),
@@ -41,6 +43,7 @@ impl Cli {
     pub fn run(self) -> Result<()> {
         match self.command {
             Command::Voxelize(args) => args.run(),
+            Command::Capture(args) => args.run(),
             Command::Dataset(args) => args.run(),
             Command::Scene(args) => args.run(),
             Command::Eval(args) => args.run(),

@@ -6,7 +6,7 @@ use b2p::container::Header;
 use b2p::encoder::{Options, encode};
 use b2p::gaussians::Heads;
 use b2p::gaussians::{Frame, Gaussians};
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::log::Log;
 
@@ -25,7 +25,7 @@ const SIDES: [f64; 3] = [1.0, 1.3, 1.7];
 /// Standard deviations of round Gaussians that are tried, as multiples of the mean distance to the nearest point; the paper's is the first.
 const SIGMAS: [f64; 4] = [1.0, 0.5, 0.35, 0.25];
 /// Standard deviations of surfels in their plane that are tried, as multiples of the points' spacing.
-const WIDTHS: [f64; 5] = [0.36, 0.42, 0.5, 0.6, 0.72];
+const WIDTHS: [f64; 8] = [0.36, 0.42, 0.5, 0.6, 0.72, 1.0, 1.4, 2.0];
 
 /// A mesh's pictures, and what else is known of it.
 pub struct Bench {
@@ -137,7 +137,8 @@ impl Bench {
             pictures: judged.pictures,
         };
         match content {
-            Content::Cloud(cloud) => {
+            Content::Cloud(mut cloud) => {
+                self.onto_grid(&mut cloud);
                 let points = Points::on_grid(&cloud, self.frame.bits, self.finest.as_ref());
                 let count = points.positions.len();
                 let draw = |side| self.truth.judge(|camera| Ok(points.draw_squares(camera, side)));
@@ -165,7 +166,7 @@ impl Bench {
             }
             Content::Stream(bytes) => {
                 let header = Header::parse(&bytes, &Limits::default())?;
-                let decoder = Decoder::new(self.model()?).with_heads(self.heads)?;
+                let decoder = LatentDecoder::new(self.model()?).with_heads(self.heads)?;
                 let levels = match &self.levels {
                     Some(levels) => levels.clone(),
                     None => decoder.levels(&bytes)?,
@@ -181,6 +182,18 @@ impl Bench {
                     })
                     .collect()
             }
+        }
+    }
+
+    /// Moves points that are not on a grid from the mesh's space to voxel coordinates.
+    fn onto_grid(&self, cloud: &mut PointCloud) {
+        if cloud.positions.iter().flatten().all(|x| x.fract() == 0.0) {
+            return;
+        }
+        let half_side = f64::from(1u32 << self.frame.bits) / 2.0;
+        for position in &mut cloud.positions {
+            let in_cube = self.frame.placement.to_cube(self.frame.bits, *position);
+            *position = in_cube.map(|x| (f64::from(x) + 1.0) * half_side - 0.5);
         }
     }
 

@@ -8,7 +8,7 @@ use super::scenes::{crowd, interleaved, iridescent};
 use super::{Options, Subject};
 use b2p::Result;
 use b2p::gaussians::Gaussians;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::log::Log;
 use b2p::metrics::pixels_apart;
 use b2p::metrics::{Spread, Verdict};
@@ -51,7 +51,7 @@ struct Case {
 
 fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
     let model = (subject.model)()?;
-    let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
+    let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
     let stream = decoder.decode(subject.stream, None, &Log::default())?;
     let side = options.size[0].min(options.size[1]);
     let stream_camera = || Camera::orbit(20.0, 20.0, 2.6, 45.0, side, side);
@@ -134,7 +134,7 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
 /// Every effect on a scene that calls for it and on one that doesn't, on and off in turns.
 ///
 /// # Errors
-/// Those of [`Decoder::decode`](b2p::latents::Decoder::decode) and
+/// Those of [`LatentDecoder::decode`](b2p::latents::LatentDecoder::decode) and
 /// [`Renderer::render`](b2p::renderer::Renderer::render).
 pub fn effect_costs(subject: &Subject<'_>, options: &Options) -> Result<Vec<EffectCost>> {
     let cases = cases(subject, options)?;

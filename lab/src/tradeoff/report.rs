@@ -44,7 +44,7 @@ pub struct Measured {
     pub from_cloud: Option<f64>,
     /// The view that has the worst pixel.
     pub view: usize,
-    /// Bytes of memory that decoding takes at most: [`b2p::latents::Decoder::memory`].
+    /// Bytes of memory that decoding takes at most: [`b2p::latents::LatentDecoder::memory`].
     pub memory: u64,
     /// The surroundings of the worst pixel.
     pub crop: Option<Crop>,

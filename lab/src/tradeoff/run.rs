@@ -11,7 +11,7 @@ use super::{Options, Subject};
 use b2p::container::Header;
 use b2p::gaussians::Gaussians;
 use b2p::gaussians::Heads;
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::layers::Precision;
 use b2p::log::{Log, Step};
@@ -123,7 +123,7 @@ impl<'a> Run<'a> {
             }
             let model = (subject.model)()?;
             let model = model.with_isa(how.isa).with_precision(how.precision)?;
-            let decoder = Decoder::new(&model).with_heads(how.heads)?;
+            let decoder = LatentDecoder::new(&model).with_heads(how.heads)?;
             let memory = decoder.memory(&header, how.level)?;
             run.models.push((how, model));
             run.decodings.push(Decoding {
@@ -145,10 +145,10 @@ impl<'a> Run<'a> {
     /// What there is to choose from for a stream.
     ///
     /// # Errors
-    /// Those of reading the model, and of [`Decoder::levels`].
+    /// Those of reading the model, and of [`LatentDecoder::levels`].
     pub fn choices(subject: &Subject<'_>) -> Result<Choices> {
         let model = (subject.model)()?;
-        let decoder = Decoder::new(&model).with_limits(subject.limits.clone());
+        let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
         let levels = decoder.levels(subject.stream)?;
         let mut precisions = vec![model.precision()];
         for precision in Precision::ALL {
@@ -168,7 +168,7 @@ impl<'a> Run<'a> {
     /// Runs everything once in each repeat.
     ///
     /// # Errors
-    /// Those of [`Decoder::decode`] and of [`Renderer::render_into`].
+    /// Those of [`LatentDecoder::decode`] and of [`Renderer::render_into`].
     pub fn measure(&mut self, truth: &Truth, say: &dyn Fn(&str)) -> Result<()> {
         for repeat in 0..self.options.repeats {
             say(&format!("repeat {} of {}", repeat + 1, self.options.repeats));
@@ -211,7 +211,7 @@ impl<'a> Run<'a> {
         let Subject { stream, limits, .. } = self.subject;
         self.pool(how.threads)?.install(|| {
             let log = Log::default();
-            let decoder = Decoder::new(model).with_limits((*limits).clone());
+            let decoder = LatentDecoder::new(model).with_limits((*limits).clone());
             let decoder = decoder.with_heads(how.heads)?;
             let start = Instant::now();
             let gaussians = decoder.decode(stream, Some(how.level), &log)?;
@@ -299,7 +299,7 @@ impl<'a> Run<'a> {
     /// The pictures of the finest level, generated and drawn in double precision without any cut-off.
     ///
     /// # Errors
-    /// Those of [`Decoder::exact`] and [`Model::generate_in_double`], and of drawing the cloud.
+    /// Those of [`LatentDecoder::exact`] and [`Model::generate_in_double`], and of drawing the cloud.
     pub fn truth(&self, choices: &Choices, say: &dyn Fn(&str)) -> Result<Truth> {
         let model = (self.subject.model)()?;
         let level = choices.levels.last().copied().unwrap_or_default();

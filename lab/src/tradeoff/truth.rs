@@ -8,7 +8,7 @@ use b2p::cloud::ColouredVoxels;
 use b2p::container::{Header, Stream};
 use b2p::gaussians::Heads;
 use b2p::gaussians::{Frame, Gaussians};
-use b2p::latents::Decoder;
+use b2p::latents::LatentDecoder;
 use b2p::latents::network::Model;
 use b2p::latents::{ColourFilter, ColourResidual, Surroundings, activate};
 use b2p::log::Log;
@@ -16,10 +16,10 @@ use b2p::log::Log;
 /// The Gaussians that the best heads have for a level, generated in double precision; and how many milliseconds that took.
 ///
 /// # Errors
-/// Those of [`Decoder::exact`] and [`Model::generate_in_double`].
+/// Those of [`LatentDecoder::exact`] and [`Model::generate_in_double`].
 pub fn in_double(subject: &Subject<'_>, model: &Model, level: u8) -> Result<(Gaussians, f64)> {
     let header = Header::parse(subject.stream, subject.limits)?;
-    let decoder = Decoder::new(model).with_limits(subject.limits.clone());
+    let decoder = LatentDecoder::new(model).with_limits(subject.limits.clone());
     let exact = decoder.exact(subject.stream, level, &Log::default())?;
     let role = usize::from(level.saturating_sub(header.base));
     let map = exact.octree.kernel_map(level);

@@ -7,7 +7,7 @@ use b2p_kernels::Isa;
 
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
-use crate::gaussians::surfels::{Choice, PerVoxel, surfels};
+use crate::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
 use crate::gaussians::{Frame, Gaussians, HeadMap};
 use crate::geometry::Octree;
 use crate::limits::Limits;
@@ -56,9 +56,9 @@ impl Reference {
         for level in 0..octree.depth() {
             map = octree.child_map(level, &map);
         }
-        let choice = Choice {
+        let choice = SurfelSelection {
             size: REFERENCE,
-            ..Choice::ALL
+            ..SurfelSelection::ALL
         };
         let frame = Frame {
             bits: cloud.voxels.depth(),

@@ -59,16 +59,16 @@ impl PerVoxel {
 
 /// Which voxels become surfels, and of what size.
 #[derive(Debug, Clone, Copy)]
-pub struct Choice<'a> {
+pub struct SurfelSelection<'a> {
     /// For every voxel whether it becomes surfels; `None` for all.
     pub only: Option<&'a [bool]>,
     /// Factor of the radii.
     pub size: f32,
 }
 
-impl Choice<'_> {
+impl SurfelSelection<'_> {
     /// All voxels, in the usual size.
-    pub const ALL: Choice<'static> = Choice { only: None, size: 1.0 };
+    pub const ALL: SurfelSelection<'static> = SurfelSelection { only: None, size: 1.0 };
 
     fn has(&self, voxel: usize) -> bool {
         self.only.is_none_or(|only| only[voxel])
@@ -88,7 +88,7 @@ pub fn surfels(
     map: &KernelMap,
     colours: &[[u8; 3]],
     per_voxel: PerVoxel,
-    choice: Choice<'_>,
+    choice: SurfelSelection<'_>,
     frame: Frame,
 ) -> Gaussians {
     assert_eq!(map.volume(), 27, "surfels need a 3³ map");
@@ -172,7 +172,7 @@ impl<'a> Rows<'a> {
     }
 
     /// First voxel and rows of every block.
-    fn tasks(mut self, voxels: usize, per_voxel: usize, choice: Choice<'_>) -> Vec<(usize, Rows<'a>)> {
+    fn tasks(mut self, voxels: usize, per_voxel: usize, choice: SurfelSelection<'_>) -> Vec<(usize, Rows<'a>)> {
         let mut tasks = Vec::with_capacity(voxels.div_ceil(BLOCK));
         for first in (0..voxels).step_by(BLOCK) {
             let block = first..(first + BLOCK).min(voxels);

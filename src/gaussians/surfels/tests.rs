@@ -18,7 +18,7 @@ fn one_each(voxels: &Voxels, map: &KernelMap) -> Gaussians {
         map,
         &grey,
         PerVoxel::One,
-        Choice::ALL,
+        SurfelSelection::ALL,
         Frame::default(),
     )
 }
@@ -125,7 +125,7 @@ proptest! {
         let colour = |i: usize| [i * 7, i * 31, i * 101].map(|v| (v as u8).wrapping_mul(seed));
         let colours: Vec<_> = (0..voxels.len()).map(colour).collect();
         for per_voxel in [PerVoxel::One, PerVoxel::Four] {
-            let made = |isa| surfels(isa, &voxels, &map, &colours, per_voxel, Choice::ALL, Frame::default());
+            let made = |isa| surfels(isa, &voxels, &map, &colours, per_voxel, SurfelSelection::ALL, Frame::default());
             let expected = made(Isa::available()[0]);
             prop_assert!(expected.check_lengths().is_ok());
             for isa in Isa::available() {
@@ -257,7 +257,7 @@ fn four_discs_follow_the_colour_gradient() {
         &map,
         &colours,
         PerVoxel::Four,
-        Choice::ALL,
+        SurfelSelection::ALL,
         frame,
     );
     assert_eq!(four.len(), 4 * voxels.len());
@@ -293,8 +293,8 @@ fn a_choice_of_voxels_gives_their_discs_in_another_size() {
                 Frame::default(),
             )
         };
-        let all = make(Choice::ALL);
-        let some = make(Choice {
+        let all = make(SurfelSelection::ALL);
+        let some = make(SurfelSelection {
             only: Some(&only),
             size: 0.5,
         });

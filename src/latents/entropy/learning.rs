@@ -21,8 +21,8 @@
 //!
 //! # Means
 //! Every channel has an offset, in units of 2⁻¹⁰ of a sixteenth, at first 0, and a weight for every input, in units of
-//! 2⁻¹⁸, at first ⅛ for what is one away, ¼ for what is two away, and 0; where nothing is predicted all are 0. `μ′ = μ
-//! + (Σ (weight >> 6)·input + 2⁶·offset + 2¹⁵) >> 16`, kept within ±2047, is used. Then with the error `16·y − μ′`,
+//! 2⁻¹⁸, at first ⅛ for what is one away, ¼ for what is two away, and 0; where nothing is predicted all are 0.
+//! `μ′ = μ + (Σ (weight >> 6)·input + 2⁶·offset + 2¹⁵) >> 16`, kept within ±2047, is used. Then with the error `16·y − μ′`,
 //! kept within ±16, the offset grows by 32 times the error, and is kept within ±2²¹; every weight by the error times
 //! its input, that kept within ±256, and is kept within ±2¹⁹.
 //!

@@ -106,7 +106,7 @@ impl Model {
     /// Loads a model file.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::LimitExceeded`] for a file of more than 2 GiB, or as [`Model::from_bytes`].
+    /// [`Error::Io`](crate::Error::Io), [`Error::LimitExceeded`](crate::Error::LimitExceeded) for a file of more than 2 GiB, or as [`Model::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
         // Read, not mapped: another program may shorten the file meanwhile.
         let bytes = input::read_file(path, &Limits::default())?;
@@ -116,8 +116,8 @@ impl Model {
     /// Loads a model file's content. Memory is bounded by its length.
     ///
     /// # Errors
-    /// [`Error::Malformed`], naming field or tensor, if anything is missing, of another type or extent, not finite, out of range,
-    /// or could overflow a sum; [`Error::Unsupported`] for another format.
+    /// [`Error::Malformed`](crate::Error::Malformed), naming field or tensor, if anything is missing, of another type or extent, not finite, out of range,
+    /// or could overflow a sum; [`Error::Unsupported`](crate::Error::Unsupported) for another format.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let tensors = Tensors::new(bytes)?;
         let shape = tensors.shape()?;
@@ -151,7 +151,7 @@ impl Model {
     /// Generates Gaussians in that precision.
     ///
     /// # Errors
-    /// [`Error::Unsupported`] if the model file lacks what integers need, or the instructions lack what [`Precision::Half`] needs.
+    /// [`Error::Unsupported`](crate::Error::Unsupported) if the model file lacks what integers need, or the instructions lack what [`Precision::Half`] needs.
     pub fn with_precision(self, precision: Precision) -> Result<Self> {
         if precision == Precision::Half && !self.isa.has_half() {
             let detail = format!("{} has no arithmetic in f16, take f16 or int16", self.isa);
