@@ -28,8 +28,8 @@ LINE = re.compile(r"budget: (?P<choice>.*); expected (?P<expected>[\d.]+) ms and
 
 def b2p(*args):
     program = [os.environ["B2P"]] if "B2P" in os.environ else ["cargo", "run", "--release", "--quiet", "--"]
-    done = subprocess.run([*program, *map(str, args)], cwd=ROOT, check=True, capture_output=True, text=True)
-    return done.stdout
+    done = subprocess.run([*program, *map(str, args), "--force"], cwd=ROOT, check=True, capture_output=True, text=True)
+    return done.stderr
 
 
 def coarser(source, bits, to):

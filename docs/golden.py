@@ -143,7 +143,7 @@ def ours(scene, folder):
     width, height = scene.size
     camera.write_text(json.dumps({"fl_x": focal(scene), "w": width, "h": height, "frames": [{"transform_matrix": matrix.tolist()}]}))
     program = [os.environ["B2P"]] if "B2P" in os.environ else ["cargo", "run", "--release", "--quiet", "--"]
-    command = [*program, "render", splats, "--camera", camera, "--background", "black", "-q", "-o", picture]
+    command = [*program, "render", splats, "--camera", camera, "--background", "black", "-q", "--force", "-o", picture]
     subprocess.run([str(word) for word in command], cwd=ROOT, check=True)
     return np.asarray(Image.open(picture).convert("RGB"), float)
 

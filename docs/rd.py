@@ -120,9 +120,9 @@ def measure(data, cache, name, series, rates):
         for i, (label, encode, level, decode) in enumerate(SERIES[series](rates)):
             stream = streams / (re.sub(r"[^\w.]+", "-", "-".join(Path(part).name for part in encode)) + ".b2p")
             if not stream.exists():
-                run("b2p", "encode", cloud, "-o", stream, *encode)
+                run("b2p", "encode", cloud, "--force", "-o", stream, *encode)
             gaussians = folder / f"{i}.ply"
-            run("b2p", "decode", stream, "-o", gaussians, *decode, *(("--level", level) if level else ()))
+            run("b2p", "decode", stream, "--force", "-o", gaussians, *decode, *(("--level", level) if level else ()))
             coded = json.loads(run("b2p", "info", stream, "--json"))["levels"]
             parts = lambda part: sum(bytes for key, bytes in part.items() if key.endswith("_bytes"))
             finer = sum(parts(part) for part in coded if level and part["level"] > level)

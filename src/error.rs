@@ -117,6 +117,14 @@ pub enum Error {
         /// The field of `Limits` that rules it.
         option: &'static str,
     },
+    /// The machine has no memory for what the limits allow.
+    #[error("no memory for {what}: {bytes} bytes are not to be had")]
+    OutOfMemory {
+        /// What takes it.
+        what: &'static str,
+        /// How many bytes were asked for at once.
+        bytes: u64,
+    },
     /// Well-formed, but this decoder cannot do it.
     #[error("{what} is not supported: {detail}")]
     Unsupported {
@@ -161,6 +169,7 @@ pub enum Error {
 
 impl Error {
     /// A [`Error::Malformed`].
+    #[doc(hidden)]
     pub fn malformed(
         stage: Stage,
         at: impl ToString,

@@ -77,6 +77,8 @@ pub mod gaussians;
 #[doc(hidden)]
 pub mod geometry;
 #[doc(hidden)]
+pub mod input;
+#[doc(hidden)]
 pub mod latents;
 #[doc(hidden)]
 pub mod layers;

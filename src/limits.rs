@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 /// The deepest octree level: what a Morton key of 64 bits addresses.
 pub const MAX_DEPTH: u8 = 21;
 
-/// Bounds that are checked before memory is reserved. Finite by default: 2²⁶ points, 21 levels, 2²⁸ pixels, 2 GiB.
+/// Bounds that are checked before memory is reserved. Finite by default: 2²⁶ points, 21 levels, 2²⁶ pixels, 2²⁸ pairs, 2 GiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Limits {
@@ -13,8 +13,10 @@ pub struct Limits {
     pub max_points: u64,
     /// Octree levels.
     pub max_depth: u8,
-    /// Pixels of one picture.
+    /// Pixels of one picture. A pixel takes 16 bytes of `max_bytes`.
     pub max_pixels: u64,
+    /// Pairs of a Gaussian and a tile of 32×32 pixels that it touches, in one picture: the work of drawing it.
+    pub max_pairs: u64,
     /// Bytes that one input may make the library reserve, estimated from its counts.
     pub max_bytes: u64,
 }
@@ -24,7 +26,8 @@ impl Default for Limits {
         Limits {
             max_points: 1 << 26,
             max_depth: 21,
-            max_pixels: 1 << 28,
+            max_pixels: 1 << 26,
+            max_pairs: 1 << 28,
             max_bytes: 2 << 30,
         }
     }
@@ -34,12 +37,13 @@ impl Limits {
     /// What the library takes beyond `max_bytes`, however small the input: threads and their desks.
     pub const OVERHEAD: u64 = 4 << 20;
 
-    /// For boards with 512 MB of memory: 2²⁰ points, pictures of 2²² pixels, 192 MiB.
+    /// For boards with 512 MB of memory: 2²⁰ points, pictures of 2²² pixels and 2²⁴ pairs, 192 MiB.
     pub fn embedded() -> Self {
         Limits {
             max_points: 1 << 20,
             max_depth: 21,
             max_pixels: 1 << 22,
+            max_pairs: 1 << 24,
             max_bytes: 192 << 20,
         }
     }
@@ -50,6 +54,7 @@ impl Limits {
             max_points: u64::MAX,
             max_depth: u8::MAX,
             max_pixels: u64::MAX,
+            max_pairs: u64::MAX,
             max_bytes: u64::MAX,
         }
     }
@@ -72,6 +77,12 @@ impl Limits {
         self
     }
 
+    /// The same limits with other [`Limits::max_pairs`].
+    pub fn with_max_pairs(mut self, pairs: u64) -> Self {
+        self.max_pairs = pairs;
+        self
+    }
+
     /// The same limits with other [`Limits::max_bytes`].
     pub fn with_max_bytes(mut self, bytes: u64) -> Self {
         self.max_bytes = bytes;
@@ -82,6 +93,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_points(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_points, "max_points")
     }
@@ -90,6 +102,7 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_depth(&self, what: &'static str, depth: u8) -> Result<()> {
         check(what, depth.into(), self.max_depth.into(), "max_depth")
     }
@@ -98,14 +111,25 @@ impl Limits {
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_pixels(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_pixels, "max_pixels")
+    }
+
+    /// Holds `count` pairs of Gaussians and tiles against the limit.
+    ///
+    /// # Errors
+    /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
+    pub fn check_pairs(&self, what: &'static str, count: u64) -> Result<()> {
+        check(what, count, self.max_pairs, "max_pairs")
     }
 
     /// Holds `bytes` against the limit, which is never more than the machine can address.
     ///
     /// # Errors
     /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
     pub fn check_bytes(&self, what: &'static str, bytes: u64) -> Result<()> {
         let addressable = isize::MAX as u64;
         check(what, bytes, self.max_bytes.min(addressable), "max_bytes")
@@ -122,4 +146,17 @@ fn check(what: &'static str, needed: u64, limit: u64, option: &'static str) -> R
         limit,
         option,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_largest_picture_of_each_preset_fits_its_memory_twice_over() {
+        for limits in [Limits::default(), Limits::embedded()] {
+            let pixel = size_of::<[f32; 4]>() as u64;
+            assert!(2 * limits.max_pixels * pixel <= limits.max_bytes, "{limits:?}");
+        }
+    }
 }

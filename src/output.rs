@@ -5,6 +5,7 @@
 //! because a rename would put a regular file in their place. Temporary files of writes in progress are listed, so that an
 //! interrupted program can remove them before it exits ([`remove_unfinished`]).
 
+use std::ffi::{OsStr, OsString};
 use std::fs::{File, Metadata, OpenOptions};
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::io::{self, BufWriter, ErrorKind, Write};
@@ -46,6 +47,16 @@ pub fn write_file(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) 
     }
 }
 
+/// The regular file whose contents [`write_file`] would replace, if there is one: behind symbolic links, but not behind the
+/// redirection of a shell, such as `/dev/stdout` leads to.
+pub fn replaced(path: &Path) -> Option<PathBuf> {
+    let found = std::fs::metadata(path).ok()?;
+    match resolve(path, true) {
+        Ok(Resolved::File(file)) if found.is_file() => Some(file),
+        _ => None,
+    }
+}
+
 /// Removes the temporary files of all writes in progress; for a handler that ends the process.
 pub fn remove_unfinished() {
     for path in lock().iter() {
@@ -82,21 +93,37 @@ impl Target {
             Err(error) if error.kind() == ErrorKind::NotFound => None,
             Err(error) => return Err(error),
         };
-        let mut path = path.to_owned();
-        for _ in 0..MAX_LINKS {
-            let is_link = |found: Metadata| found.is_symlink();
-            if !std::fs::symlink_metadata(&path).is_ok_and(is_link) {
-                return Ok(Target::Replace { path, existing });
-            }
-            if existing.is_some() && is_descriptor(&path) {
-                // The redirection of a shell: whoever made it decided what becomes of earlier contents.
-                return OpenOptions::new().append(true).open(path).map(Target::Open);
-            }
-            // An absolute link replaces the folder.
-            path = folder_of(&path).join(std::fs::read_link(&path)?);
+        match resolve(path, existing.is_some())? {
+            Resolved::File(path) => Ok(Target::Replace { path, existing }),
+            // Whoever made the redirection decided what becomes of earlier contents.
+            Resolved::Descriptor(path) => OpenOptions::new().append(true).open(path).map(Target::Open),
         }
-        Err(io::Error::other("too many symbolic links"))
     }
+}
+
+/// What is behind symbolic links.
+enum Resolved {
+    /// A path that is no link.
+    File(PathBuf),
+    /// A link to an open file: the redirection of a shell.
+    Descriptor(PathBuf),
+}
+
+/// Follows symbolic links; `exists` tells whether there is a file behind them.
+fn resolve(path: &Path, exists: bool) -> io::Result<Resolved> {
+    let mut path = path.to_owned();
+    for _ in 0..MAX_LINKS {
+        let is_link = |found: Metadata| found.is_symlink();
+        if !std::fs::symlink_metadata(&path).is_ok_and(is_link) {
+            return Ok(Resolved::File(path));
+        }
+        if exists && is_descriptor(&path) {
+            return Ok(Resolved::Descriptor(path));
+        }
+        // An absolute link replaces the folder.
+        path = folder_of(&path).join(std::fs::read_link(&path)?);
+    }
+    Err(io::Error::other("too many symbolic links"))
 }
 
 /// Whether a link is one of the kernel's links to open files, such as `/dev/stdout` leads to.
@@ -111,21 +138,63 @@ fn folder_of(path: &Path) -> &Path {
     }
 }
 
-/// A file that is removed unless it is renamed.
-struct Temporary {
+/// A file that is removed unless it is renamed; for outputs that another program writes.
+#[derive(Debug)]
+pub struct Temporary {
     path: PathBuf,
     renamed: bool,
 }
 
 impl Temporary {
+    /// An empty file of that ending in `folder`.
+    ///
+    /// # Errors
+    /// What the system says.
+    pub fn in_folder(folder: &Path, ending: &OsStr) -> io::Result<Self> {
+        let (temporary, _) = Self::create(&folder.join("name"), ending)?;
+        Ok(temporary)
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Synchronises the file and gives it its name: a symbolic link stays, and its target is replaced.
+    ///
+    /// # Errors
+    /// What the system says; the file is then removed.
+    pub fn keep_as(mut self, destination: &Path) -> io::Result<()> {
+        File::open(&self.path)?.sync_all()?;
+        let existing = std::fs::metadata(destination).ok();
+        match resolve(destination, existing.is_some())? {
+            Resolved::File(file) if existing.as_ref().is_none_or(Metadata::is_file) => {
+                if let Some(existing) = existing {
+                    // As in `write_file`.
+                    let _ = std::fs::set_permissions(&self.path, existing.permissions());
+                }
+                self.rename(&file)
+            }
+            Resolved::File(direct) | Resolved::Descriptor(direct) => {
+                let mut to = OpenOptions::new().append(true).open(direct)?;
+                io::copy(&mut File::open(&self.path)?, &mut to).map(drop)
+            }
+        }
+    }
+
     /// Creates a file that did not exist, under a name that cannot be guessed. It is short, whatever the destination's is.
     fn beside(destination: &Path) -> io::Result<(Self, File)> {
+        Self::create(destination, OsStr::new("tmp"))
+    }
+
+    fn create(destination: &Path, ending: &OsStr) -> io::Result<(Self, File)> {
         // Held over the creation, so that the list names every temporary file and no other file.
         let mut unfinished = lock();
         let mut last = None;
         for _ in 0..MAX_NAMES {
             // Each `RandomState` has keys of its own, from the system's random numbers.
-            let name = format!(".b2p-{:016x}.tmp", RandomState::new().build_hasher().finish());
+            let mut name = OsString::from(format!(".b2p-{:016x}.", RandomState::new().build_hasher().finish()));
+            name.push(ending);
             let path = destination.with_file_name(name);
             match OpenOptions::new().write(true).create_new(true).open(&path) {
                 Ok(file) => {

@@ -37,8 +37,8 @@ if [ "${1:-}" = program ]; then
     cargo build --locked --release -p b2p-cli
     # STREAM PROCESSOR INSTRUCTIONS
     same() {
-        "${CARGO_TARGET_DIR:-target}/release/b2p" -q decode "$1" -o "$out/here.ply"
-        timeout 3600 qemu-aarch64 -cpu "$2" "$there" -q decode "$1" -o "$out/there.ply" --isa "$3"
+        "${CARGO_TARGET_DIR:-target}/release/b2p" -q --force decode "$1" -o "$out/here.ply"
+        timeout 3600 qemu-aarch64 -cpu "$2" "$there" -q --force decode "$1" -o "$out/there.ply" --isa "$3"
         cmp "$out/here.ply" "$out/there.ply"
         echo "$1, $2, $3: the same Gaussians to the bit"
     }

@@ -381,3 +381,34 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
         }
     }
 }
+
+#[test]
+fn a_picture_becomes_a_file_row_by_row() {
+    let _quiet = QUIET.lock().unwrap();
+    let (width, height) = (1500, 1500);
+    let pixels = (0..width * height).map(|i: u32| [(i % 251) as f32 / 251.0, (i % 83) as f32 / 83.0, 0.5, 1.0]);
+    let image = Image {
+        width,
+        height,
+        pixels: pixels.collect(),
+    };
+    let distances = vec![1.0; image.pixels.len()];
+    let path = Path::new("x");
+    type Write<'a> = Box<dyn Fn(&mut dyn std::io::Write) -> b2p::Result<()> + 'a>;
+    let formats: [(&str, Write); 5] = [
+        ("png", Box::new(|to| image.write_png(to, path))),
+        ("png16", Box::new(|to| image.write_png16(to, path))),
+        ("ppm", Box::new(|to| image.write_ppm(to, path))),
+        ("y4m", Box::new(|to| image.write_y4m_frame(to, path))),
+        ("exr", Box::new(|to| image.write_exr(to, path, Some(&distances)))),
+    ];
+    for (name, write) in formats {
+        let (written, bytes) = peak(|| write(&mut std::io::sink()));
+        written.unwrap();
+        assert!(
+            bytes < 2 << 20,
+            "{name}: {bytes} bytes for a picture of {}",
+            16 * image.pixels.len()
+        );
+    }
+}

@@ -43,7 +43,8 @@ const STAGES: [(&str, &[&str]); 12] = [
 ];
 
 /// What every stage may use.
-const COMMONS: [&str; 10] = [
+const COMMONS: [&str; 11] = [
+    "input",
     "Error",
     "cancel",
     "error",

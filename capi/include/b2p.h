@@ -122,7 +122,7 @@ typedef struct b2p_camera {
 extern "C" {
 #endif // __cplusplus
 
-// Limits for anything: 2^26 points, 2^28 pixels, 2 GiB. What NULL stands for.
+// Limits for anything: 2^26 points, 2^26 pixels, 2 GiB. What NULL stands for.
 struct b2p_limits b2p_limits_default(void);
 
 // Limits for boards with 512 MB of memory.

@@ -41,12 +41,14 @@ impl From<Limits> for b2p::Limits {
         b2p::Limits::default()
             .with_max_points(limits.max_points)
             .with_max_pixels(limits.max_pixels)
+            // As in the presets.
+            .with_max_pairs(limits.max_pixels.saturating_mul(4))
             .with_max_bytes(limits.max_bytes)
             .with_max_depth(limits.max_depth)
     }
 }
 
-/// Limits for anything: 2^26 points, 2^28 pixels, 2 GiB. What NULL stands for.
+/// Limits for anything: 2^26 points, 2^26 pixels, 2 GiB. What NULL stands for.
 #[unsafe(no_mangle)]
 pub extern "C" fn b2p_limits_default() -> Limits {
     b2p::Limits::default().into()

@@ -1,7 +1,7 @@
 //! What can be asked of the program.
 
 use std::ops::RangeInclusive;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use b2p::Limits;
 use b2p::encoder::Residual;
@@ -13,19 +13,46 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 #[derive(Debug, Parser)]
 #[command(name = "b2p", version, about, max_term_width = 110)]
 pub struct Cli {
-    /// Threads to use [default: one per core]
-    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    /// Threads to use, at most 1024 [default: one per core]
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
 
-    /// Print nothing but warnings and errors
+    /// Print results, warnings and errors, but no reports
     #[arg(short, long, global = true)]
     pub quiet: bool,
+
+    /// Say more: the time of each step, effects and their reasons
+    #[arg(short, long, global = true)]
+    pub verbose: bool,
+
+    /// Overwrite existing files. Without it the program asks on a terminal, and refuses elsewhere
+    #[arg(short, long, global = true)]
+    pub force: bool,
+
+    /// Print JSON to standard output instead of a report
+    #[arg(long, global = true)]
+    pub json: bool,
+
+    /// Colours of messages
+    #[arg(long, global = true, value_enum, value_name = "WHEN", default_value_t = Colour::Auto)]
+    pub color: Colour,
 
     #[command(flatten)]
     pub limits: LimitArgs,
 
     #[command(subcommand)]
     pub command: Command,
+}
+
+/// When messages have colours.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Colour {
+    /// On a terminal, unless NO_COLOR is set
+    Auto,
+    /// Always
+    Always,
+    /// Never
+    Never,
 }
 
 /// What an input may ask for.
@@ -44,14 +71,39 @@ pub struct LimitArgs {
     /// Pixels of a picture
     #[arg(long, global = true, value_name = "N")]
     pub max_pixels: Option<u64>,
+    /// Pairs of a Gaussian and a tile of 32×32 pixels that it touches: the work of a picture
+    #[arg(long, global = true, value_name = "N")]
+    pub max_pairs: Option<u64>,
+}
+
+/// Where the output goes.
+#[derive(Debug, Args)]
+#[group(required = true, multiple = false)]
+pub struct Output {
+    /// File to write; `-`: standard output
+    #[arg(value_name = "OUT")]
+    to: Option<PathBuf>,
+    /// The same as an option
+    #[arg(short, long = "output", value_name = "OUT")]
+    output: Option<PathBuf>,
+}
+
+impl std::ops::Deref for Output {
+    type Target = Path;
+
+    fn deref(&self) -> &Path {
+        let given = self.to.as_deref().or(self.output.as_deref());
+        // The parser requires one.
+        given.unwrap_or(Path::new(""))
+    }
 }
 
 /// Limits by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
-    /// 2²⁰ points, 2²² pixels, 192 MiB
+    /// 2²⁰ points, 2²² pixels, 2²⁴ pairs, 192 MiB
     Embedded,
-    /// 2²⁶ points, 2²⁸ pixels, 2 GiB
+    /// 2²⁶ points, 2²⁶ pixels, 2²⁸ pairs, 2 GiB
     Default,
     /// Those of the format
     Unlimited,
@@ -60,15 +112,24 @@ pub enum Preset {
 impl LimitArgs {
     /// The limits that they name.
     pub fn limits(&self) -> Limits {
-        let mut limits = match self.limits {
+        let limits = match self.limits {
             Preset::Embedded => Limits::embedded(),
             Preset::Default => Limits::default(),
             Preset::Unlimited => Limits::unlimited(),
         };
-        limits.max_points = self.max_points.unwrap_or(limits.max_points);
-        limits.max_pixels = self.max_pixels.unwrap_or(limits.max_pixels);
-        limits.max_bytes = self.max_memory.unwrap_or(limits.max_bytes);
+        let [points, pixels] = [
+            self.max_points.unwrap_or(limits.max_points),
+            self.max_pixels.unwrap_or(limits.max_pixels),
+        ];
+        let [pairs, bytes] = [
+            self.max_pairs.unwrap_or(limits.max_pairs),
+            self.max_memory.unwrap_or(limits.max_bytes),
+        ];
         limits
+            .with_max_points(points)
+            .with_max_pixels(pixels)
+            .with_max_pairs(pairs)
+            .with_max_bytes(bytes)
     }
 }
 
@@ -78,10 +139,14 @@ pub enum Command {
     Encode(Encode),
     /// Decode a stream to 3D Gaussians
     Decode(Decode),
+    /// Convert Gaussians from one file format to another
+    Convert(Convert),
     /// Draw a stream, or Gaussians, into a picture
     Render(Render),
     /// Say what a stream holds
     Info(Info),
+    /// Cut a stream after a level: a shorter stream
+    Cut(Cut),
     /// Decode and draw the sample that comes with the program
     Demo(Demo),
     /// Time the stages of decoding
@@ -90,34 +155,41 @@ pub enum Command {
 
 #[derive(Debug, Args)]
 pub struct Encode {
-    /// Point cloud: PLY, ascii or binary, with x y z and red green blue
+    /// Point cloud: PLY, ascii or binary, with x y z and red green blue. `-`: standard input
+    #[arg(value_name = "IN")]
     pub cloud: PathBuf,
-    /// Stream to write
-    #[arg(short, long, value_name = "OUT.b2p")]
-    pub output: PathBuf,
+    #[command(flatten)]
+    pub output: Output,
+    /// Quality, from 0 to 100: chooses quantisation step and finest level. 100 is lossless, 48 the default
+    #[arg(short = 'Q', long, value_name = "0..100", value_parser = clap::value_parser!(u8).range(0..=100), conflicts_with_all = ["step", "lossless", "bits_per_point"])]
+    pub quality: Option<u8>,
+    /// Make the best stream of at most X bits for each point of the cloud, the whole file counted: chooses the quantisation step, and
+    /// leaves out the finest levels if they do not fit
+    #[arg(short, long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["step", "lossless", "bit_price", "residual"])]
+    pub bits_per_point: Option<f64>,
+    /// Effort, from 0 (quick) to 9: rate–distortion optimised quantisation from 1 on, colour filters from 2 on; with --bits-per-point
+    /// 2 + EFFORT tries for a level, of 9 as many as it takes [default: 9]
+    #[arg(short, long, value_name = "0..9", value_parser = clap::value_parser!(u8).range(0..=9))]
+    pub effort: Option<u8>,
     /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs; less if its points lie too far apart for that]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
+    #[arg(long, help_heading = "Advanced", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
     pub bits: Option<u8>,
     /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last below N
     /// [default: N−3..N−1; with --bits-per-point up to N]
-    #[arg(long, value_name = "L..M", value_parser = levels)]
+    #[arg(long, help_heading = "Advanced", value_name = "L..M", value_parser = levels)]
     pub levels: Option<RangeInclusive<u8>>,
-    /// Make the best stream of at most X bits for each point of the cloud, the whole file counted: chooses the quantisation step, and
-    /// leaves out the finest levels if they do not fit
-    #[arg(long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["step", "lossless", "bit_price", "residual"])]
-    pub bits_per_point: Option<f64>,
     /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma twice that of luma unless said; coarser
     /// levels have finer steps [default: 20]
-    #[arg(long, value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
+    #[arg(long, help_heading = "Advanced", value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
     pub step: Option<Fineness>,
     /// Code the mean colours of the finest level's voxels exactly
-    #[arg(long)]
+    #[arg(long, help_heading = "Advanced")]
     pub lossless: bool,
     /// How colours are coded
-    #[arg(long, value_enum, value_name = "HOW", default_value_t = Colours::Transform)]
+    #[arg(long, help_heading = "Advanced", value_enum, value_name = "HOW", default_value_t = Colours::Transform)]
     pub colours: Colours,
     /// Leave out colour filters: encoding and decoding take less time, pictures are less accurate
-    #[arg(long)]
+    #[arg(long, help_heading = "Advanced")]
     pub no_filter: bool,
     #[command(flatten)]
     pub learned: LearnedArgs,
@@ -153,14 +225,17 @@ pub struct LearnedArgs {
 
 #[derive(Debug, Args)]
 pub struct Decode {
-    /// Stream to decode. `-`: standard input, decoded as it comes
+    /// Stream to decode to Gaussians. `-`: standard input, decoded as it comes
+    #[arg(value_name = "IN")]
     pub input: PathBuf,
-    /// File to write: Gaussians as a PLY with the property names of 3D Gaussian splatting
-    #[arg(short, long, value_name = "OUT.ply")]
-    pub output: PathBuf,
+    #[command(flatten)]
+    pub output: Output,
     /// Write the level's voxels with their colours instead, as a PLY of points (of learned streams there are none)
     #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
     pub points: bool,
+    /// Format of the Gaussians: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
+    #[arg(long, value_name = "NAME", conflicts_with = "points")]
+    pub format: Option<SplatFormat>,
     #[command(flatten)]
     pub detail: DetailArg,
     #[command(flatten)]
@@ -170,18 +245,39 @@ pub struct Decode {
 }
 
 #[derive(Debug, Args)]
-pub struct Render {
-    /// Stream, or PLY of Gaussians. `-`: standard input, drawn as it comes
+pub struct Convert {
+    /// Gaussians: PLY, compressed PLY, SPZ, SOG, .splat, glTF, CSV or NumPy archive. `-`: standard input
+    #[arg(value_name = "IN")]
     pub input: PathBuf,
-    /// Picture to write: .png, .ppm, .exr, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
-    #[arg(short, long, value_name = "OUT.png")]
-    pub output: PathBuf,
+    #[command(flatten)]
+    pub output: Output,
+    /// Format of the output: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
+    #[arg(long, value_name = "NAME", conflicts_with = "points")]
+    pub format: Option<SplatFormat>,
+    /// Format of the input [default: by its contents, of .splat and .csv by the ending]
+    #[arg(long, value_name = "NAME")]
+    pub from: Option<SplatFormat>,
+    /// Write a PLY of points instead: the centres with their colours
+    #[arg(long)]
+    pub points: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct Render {
+    /// Stream, or Gaussians in any format that `convert` reads. `-`: standard input, drawn as it comes
+    #[arg(value_name = "IN")]
+    pub input: PathBuf,
+    #[command(flatten)]
+    pub output: Picture,
+    /// Draw all views into one picture, a grid with their angles below them [default: 8 views]
+    #[arg(long, conflicts_with_all = ["camera", "turntable"])]
+    pub contact_sheet: bool,
     /// What is written [default: by the ending; to standard output png, and y4m of several pictures]
-    #[arg(long, value_enum, value_name = "FORMAT")]
+    #[arg(long, help_heading = "Advanced", value_enum, value_name = "FORMAT")]
     pub format: Option<Format>,
     /// Cameras of a file in place of --orbit: NeRF's transforms.json, COLMAP's images.txt beside its cameras.txt, Open3D's pinhole JSON,
     /// glTF's camera nodes
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov", "look_at"])]
     pub camera: Option<PathBuf>,
     /// Parallel rays; the cube's centre stays as large as it is
     #[arg(long, conflicts_with = "camera")]
@@ -190,17 +286,14 @@ pub struct Render {
     #[arg(long, value_enum, value_name = "WHAT", default_value_t = Show::Colour)]
     pub show: Show,
     /// Force an effect (harmonics, antialias, supersample, near, order) on or off
-    #[arg(long, value_name = "NAME=on|off|auto", value_parser = effect)]
+    #[arg(long, help_heading = "Advanced", value_name = "NAME=on|off|auto", value_parser = effect)]
     pub effect: Vec<(Effect, Choice)>,
     /// How much of what is faint may be left out: fast, fine, exact
-    #[arg(long, value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
+    #[arg(long, help_heading = "Advanced", value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
     pub quality: Quality,
-    /// Print what each picture took, and what was not drawn and why, as JSON
-    #[arg(long, value_enum, value_name = "FORMAT")]
+    /// The same as --json
+    #[arg(long, hide = true, value_enum, value_name = "FORMAT")]
     pub stats: Option<StatsFormat>,
-    /// Say which effects are on, why, and what each costs
-    #[arg(short, long)]
-    pub verbose: bool,
     #[command(flatten)]
     pub detail: DetailArg,
     #[command(flatten)]
@@ -209,6 +302,35 @@ pub struct Render {
     pub model: ModelArg,
     #[command(flatten)]
     pub budget: BudgetArgs,
+}
+
+/// Where pictures go.
+#[derive(Debug, Args)]
+#[group(required = true, multiple = false)]
+pub struct Picture {
+    /// Picture to write: .png, .ppm, .exr, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
+    #[arg(value_name = "OUT")]
+    to: Option<PathBuf>,
+    /// The same as an option
+    #[arg(short, long = "output", value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// Draw a video of one turn around the object: .gif, .webp, animated .png, or with FFmpeg .mp4, .webm and .mkv
+    #[arg(long, value_name = "FILE")]
+    pub turntable: Option<PathBuf>,
+}
+
+impl std::ops::Deref for Picture {
+    type Target = Path;
+
+    fn deref(&self) -> &Path {
+        let given = [&self.to, &self.output, &self.turntable];
+        // The parser requires one.
+        given
+            .into_iter()
+            .flatten()
+            .next()
+            .map_or(Path::new(""), PathBuf::as_path)
+    }
 }
 
 /// Kinds of pictures.
@@ -257,12 +379,16 @@ pub struct View {
     /// Horizontal field of view in degrees
     #[arg(long, value_name = "DEG", default_value_t = 45.0, allow_negative_numbers = true)]
     pub fov: f32,
-    /// Azimuth and elevation in degrees and distance from the cube's centre; the cube reaches from −1 to 1
-    #[arg(long, value_name = "AZ,EL,R", default_value = "0,0,3", value_parser = orbit, allow_hyphen_values = true)]
-    pub orbit: [f32; 3],
-    /// Draw N pictures, turning once around the object
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    pub views: u32,
+    /// Azimuth and elevation of the camera in degrees. It keeps the whole object in view, unless a distance is given: R from the cube's
+    /// centre, the cube reaching from −1 to 1
+    #[arg(long, value_name = "AZ,EL[,R]", default_value = "0,0", value_parser = orbit, allow_hyphen_values = true)]
+    pub orbit: Orbit,
+    /// Point to look at, in the units of the cloud [default: the middle of the object; with a distance the cube's centre]
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
+    pub look_at: Option<[f64; 3]>,
+    /// Draw N pictures, turning once around the object [default: 1; of a contact sheet 8, of a turntable 120]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub views: Option<u32>,
     /// white, black, grey, #rrggbb, or transparent
     #[arg(long, value_name = "COLOUR", default_value = "white", value_parser = background)]
     pub background: Background,
@@ -270,14 +396,24 @@ pub struct View {
 
 #[derive(Debug, Args)]
 pub struct Info {
-    /// Stream to describe
+    /// Stream to describe. `-`: standard input
+    #[arg(value_name = "IN")]
     pub input: PathBuf,
-    /// Print JSON
-    #[arg(long)]
-    pub json: bool,
     /// Model file to look for the stream's model in [default: the one inside the program]
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct Cut {
+    /// Stream to cut. `-`: standard input
+    #[arg(value_name = "IN")]
+    pub input: PathBuf,
+    #[command(flatten)]
+    pub output: Output,
+    /// Last level to keep
+    #[arg(long, value_name = "M")]
+    pub level: u8,
 }
 
 #[derive(Debug, Args)]
@@ -303,9 +439,6 @@ pub struct Bench {
     /// Times that it is decoded or drawn; medians are told
     #[arg(long, value_name = "N", default_value_t = 7, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub repeat: u32,
-    /// Print JSON
-    #[arg(long)]
-    pub json: bool,
     #[command(flatten)]
     pub detail: DetailArg,
     #[command(flatten)]
@@ -323,26 +456,30 @@ pub struct DetailArg {
     #[arg(long, value_name = "NAME")]
     pub heads: Option<HeadSet>,
     /// Gaussians that heads make of a voxel of streams of version 3: 1 or 8, of surfels 1 or 4 [default: 1 from level N−1 on, else more]
-    #[arg(long, value_name = "N", value_parser = per_voxel)]
+    #[arg(long, help_heading = "Advanced", value_name = "N", value_parser = per_voxel)]
     pub per_voxel: Option<usize>,
 }
 
 #[derive(Debug, Clone, Args)]
 pub struct ModelArg {
     /// Model file: of learned streams the model that they were coded with [default: the one inside the program], of others heads
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Advanced", value_name = "FILE")]
     pub model: Option<PathBuf>,
     /// Use no better instructions than these: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, help_heading = "Advanced", value_name = "NAME")]
     pub isa: Option<String>,
     /// Generate Gaussians in int16 (the same bits everywhere), f16, or half (f16 with sums in f16 too, on processors that have them) [default: int16 if the model has it]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, help_heading = "Advanced", value_name = "NAME")]
     pub precision: Option<String>,
 }
 
 use super::budget::BudgetArgs;
-use super::values::{background, bits_per_point, bytes, effect, levels, orbit, per_voxel, price, residual, size, step};
+pub use super::values::Orbit;
+use super::values::{
+    background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,
+};
 pub use b2p::renderer::{Background, Choice, Effect, Quality};
+pub use b2p_formats::splats::Format as SplatFormat;
 
 #[cfg(test)]
 mod tests {

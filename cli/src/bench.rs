@@ -14,6 +14,7 @@ use b2p::{Isa, Limits, ceiling, embedded};
 use serde_json::json;
 
 use super::args::Bench;
+use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{count, milliseconds, table};
 use super::{Failure, Result, bench_render, load};
@@ -29,12 +30,12 @@ struct Line {
 type Run = (Duration, Vec<Step>);
 
 /// Decodes again and again; prints a table or JSON.
-pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String> {
+pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
     if args.render {
         return bench_render::run(args, limits, progress);
     }
     let bytes = match &args.input {
-        Some(path) => load::bytes(path)?,
+        Some(path) => load::bytes(path, limits)?,
         None => embedded::SAMPLE.to_vec(),
     };
     let start = Instant::now();
@@ -91,10 +92,10 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         ceilings: Ceilings::measure(isa, precision, threads.min(cores)),
         memory: peak_memory(),
     };
-    Ok(match args.json {
+    Ok(Said::result(match manners::json() {
         true => report.json(),
         false => report.text(),
-    })
+    }))
 }
 
 /// What each run took, but for the first, which warms caches and memory up.

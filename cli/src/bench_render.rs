@@ -13,8 +13,10 @@ use super::Result;
 use super::args::Bench;
 use super::bench::{median, peak_memory};
 use super::load::{self, Source};
+use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{count, milliseconds, table};
+use super::views::Shot;
 
 /// A stage's name, and where its time is.
 type Stage = (&'static str, fn(&Times) -> Duration);
@@ -28,14 +30,19 @@ const STAGES: [Stage; 5] = [
 ];
 
 /// Draws the same picture again and again; prints a table or JSON.
-pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String> {
+pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
     let (width, height) = args.size;
     let camera = Camera::orbit(0.0, 0.0, 3.0, 45.0, width, height)?;
     let log = Log::default();
     let gaussians = match &args.input {
         Some(path) => {
             let source = Source::open(path, &args.detail, &args.model, limits, &log)?;
-            source.gaussians(&args.detail, &[camera], &log)?.0
+            let shot = Shot {
+                path: path.clone(),
+                camera,
+                label: String::new(),
+            };
+            source.gaussians(&args.detail, &[shot], &log)?.0
         }
         None => {
             let sample = embedded::SAMPLE;
@@ -60,7 +67,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
     let threads = rayon::current_num_threads();
     let (stats, memory) = (all[0], peak_memory());
     let input = args.input.as_deref().unwrap_or(Path::new("sample"));
-    if args.json {
+    if manners::json() {
         let stages: serde_json::Map<_, _> = medians
             .iter()
             .map(|(name, time)| ((*name).to_owned(), json!(time.as_secs_f64() * 1e3)))
@@ -78,13 +85,13 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
             "peak_memory_bytes": memory,
             "median_ms": stages,
         });
-        return Ok(format!("{report:#}\n"));
+        return Ok(Said::result(format!("{report:#}\n")));
     }
     let rows: Vec<Vec<String>> = medians
         .iter()
         .map(|(name, time)| vec![(*name).to_owned(), milliseconds(*time)])
         .collect();
-    Ok(format!(
+    Ok(Said::result(format!(
         "{}: {} Gaussians, {} of them drawn, {width}×{height}, {isa}, {threads} threads, medians of {} runs{}\n{}",
         input.display(),
         count(gaussians.len() as u64),
@@ -92,5 +99,5 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<String>
         args.repeat,
         memory.map_or(String::new(), |bytes| format!(", peak memory {} MB", bytes / 1_000_000)),
         table(&rows),
-    ))
+    )))
 }

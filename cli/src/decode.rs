@@ -1,79 +1,112 @@
 //! `b2p decode`: stream to Gaussians in a file.
 
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use super::budget::Task;
+use b2p::Limits;
 use b2p::container::version;
-use b2p::{Limits, output};
+use b2p::gaussians::Gaussians;
+use b2p::log::Log;
+use b2p_formats::splats::Axes;
+use serde_json::json;
 
-use super::args::Decode;
+use super::args::{Decode, SplatFormat};
+use super::manners::{self, Said};
 use super::progress::Progress;
-use super::table::{count, steps};
-use super::{Failure, Result, budget, keep, load, pipe};
+use super::table::{counted, steps, steps_json};
+use super::{Failure, Result, budget, convert, keep, kinds, load, pipe};
 
-/// Decodes a stream into a PLY.
-pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String> {
-    if args.points {
-        return points(args, limits, progress);
-    }
+/// Decodes a stream into a file of Gaussians.
+pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
+    let model = args.model.model.iter().map(PathBuf::as_path);
+    let inputs: Vec<&Path> = model.chain([args.input.as_path()]).collect();
+    manners::permit(&[&args.output], &inputs)?;
     let log = progress.log();
-    let mut written = 0;
-    let mut took = Duration::ZERO;
+    if args.points {
+        return points(args, limits, &log);
+    }
     let (input, to) = (&args.input, &args.output);
-    if let Some(bytes) = keep::stream(&args.budget, input)? {
+    if let Some(SplatFormat::Glb | SplatFormat::Gltf) = SplatFormat::of_path(input) {
+        let what = "this is glTF: `b2p convert` turns its axes to those of the output";
+        return Err(Failure(format!("{}: {what}", input.display())));
+    }
+    let format = convert::output_format(to, args.format)?;
+    let mut written = 0;
+    let mut write = |gaussians: &Gaussians, log: &Log| {
+        written = gaussians.len();
+        convert::write(gaussians, Axes::Ply, format, to, log)
+    };
+    let chosen = if let Some(bytes) = keep::stream(&args.budget, input, limits)? {
         let (budget, start) = (&args.budget, Instant::now());
         let kept = keep::decode(budget, input, &bytes, &args.model, limits, &log)?;
         let told = kept.describe(start.elapsed());
-        let gaussians = kept.gaussians;
-        log.step("write PLY", gaussians.len(), "Gaussians", || {
-            output::write_file(to, |w| gaussians.write_ply(w, to))
+        write(&kept.gaussians, &log)?;
+        told
+    } else {
+        let chosen = budget::choose(&args.budget, &args.model, input, Task::Decode, limits, progress)?;
+        let chosen_args = chosen.as_ref().map(|c| (c.detail(), c.model(&args.model)));
+        let (detail, model) = match &chosen_args {
+            Some((detail, model)) => (detail, model),
+            None => (&args.detail, &args.model),
+        };
+        let mut took = Duration::ZERO;
+        // What has gone to standard output cannot be replaced by something finer.
+        let early = !manners::is_pipe(to);
+        pipe::each(input, detail, model, limits, early, &log, &mut |gaussians, log| {
+            took = log.steps().iter().map(|step| step.time).sum();
+            write(gaussians, log)
         })?;
-        let count = count(gaussians.len() as u64);
-        let steps = steps(&log.steps());
-        return Ok(format!("{told}{steps}\n{}: {count} Gaussians\n", to.display()));
-    }
-    let chosen = budget::choose(&args.budget, &args.model, input, Task::Decode, limits, progress)?;
-    let chosen_args = chosen.as_ref().map(|c| (c.detail(), c.model(&args.model)));
-    let (detail, model) = match &chosen_args {
-        Some((detail, model)) => (detail, model),
-        None => (&args.detail, &args.model),
+        chosen.map_or(String::new(), |c| c.describe(Task::Decode, took))
     };
-    pipe::each(input, detail, model, limits, true, &log, &mut |gaussians, log| {
-        written = gaussians.len();
-        took = log.steps().iter().map(|step| step.time).sum();
-        log.step("write PLY", written, "Gaussians", || {
-            output::write_file(to, |w| gaussians.write_ply(w, to))
-        })?;
-        Ok(())
-    })?;
-    let chosen = chosen.map_or(String::new(), |c| c.describe(Task::Decode, took));
-    Ok(format!(
-        "{chosen}{}\n{}: {} Gaussians\n",
+    Ok(said(args, &chosen, written, "Gaussian", &log))
+}
+
+/// What was written.
+fn said(args: &Decode, chosen: &str, written: usize, thing: &str, log: &Log) -> Said {
+    let to = &args.output;
+    let report = format!(
+        "{chosen}{}\n{}: {}\n",
         steps(&log.steps()),
         to.display(),
-        count(written as u64),
-    ))
+        counted(written as u64, thing)
+    );
+    let json = || {
+        json!({
+            "output": to.display().to_string(),
+            "count": written,
+            "of": format!("{}s", thing.to_lowercase()),
+            "budget": (!chosen.is_empty()).then(|| chosen.trim()),
+            "steps": steps_json(&log.steps()),
+        })
+    };
+    Said::report(report, json).beside(to)
 }
 
 /// Decodes a stream into a PLY of points.
-fn points(args: &Decode, limits: &Limits, progress: &Progress) -> Result<String> {
-    let log = progress.log();
-    let bytes = load::bytes(&args.input)?;
+fn points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
+    let bytes = load::bytes(&args.input, limits)?;
+    kinds::check_stream(&args.input, &bytes)?;
+    let bytes = load::whole_levels(&args.input, bytes, &args.detail, limits)?;
     let fail = Failure::in_file(&args.input);
     if version(&bytes) == Some(2) {
         let what = "a stream of version 2 holds no colours of voxels, but Gaussians";
         return Err(Failure(format!("{}: {what}", args.input.display())));
     }
-    let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?.with_log(&log);
+    let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?.with_log(log);
+    load::reserve_for(&args.input, &bytes, &decoder, args.detail.level, limits)?;
     let decoding = decoder.whole(&bytes);
     let decoding = decoding.map_err(&fail)?;
     let cloud = decoding.points().map(|points| points.to_cloud()).unwrap_or_default();
     let (written, to) = (cloud.positions.len(), &args.output);
-    log.step("write PLY", written, "points", || cloud.write(to))?;
-    Ok(format!(
-        "{}\n{}: {} points\n",
-        steps(&log.steps()),
-        to.display(),
-        count(written as u64),
-    ))
+    log.step("write PLY", written, "points", || {
+        Ok(manners::write(to, |w| {
+            let io = |source| b2p::Error::Io {
+                path: to.to_path_buf(),
+                source,
+            };
+            w.write_all(&cloud.to_ply()).map_err(io)
+        }))
+    })??;
+    Ok(said(args, "", written, "point", log))
 }

@@ -1,24 +1,31 @@
 //! `b2p encode`: point cloud to stream.
 
+use std::path::{Path, PathBuf};
+
 use b2p::cloud::{ColouredVoxels, PointCloud, voxelise, voxelise_closed};
 use b2p::encoder::transform::{self, Fineness};
-use b2p::encoder::{self, Encoded, Options, Residual};
+use b2p::encoder::{self, Encoded, Options, Rate, Residual};
 use b2p::latents::Steps;
 use b2p::log::Log;
-use b2p::{Error, Limits, output};
+use b2p::{Decoder, Error, Limits};
+use serde_json::json;
 
 use super::args::{Colours, Encode};
+use super::manners::{self, Said};
 use super::progress::Progress;
-use super::table::{count, steps, table};
-use super::{Failure, Result, load};
+use super::table::{count, counted, steps, steps_json, table};
+use super::{Failure, Result, kinds, knobs, load};
 
 /// Codes a cloud and says what it cost.
-pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String> {
+pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> {
+    let model = args.model.model.iter().map(PathBuf::as_path);
+    let inputs: Vec<&Path> = model.chain([args.cloud.as_path()]).collect();
+    manners::permit(&[&args.output], &inputs)?;
     let log = progress.log();
     let in_cloud = Failure::in_file(&args.cloud);
     let cloud = log
-        .step("read cloud", 1, "file", || PointCloud::open(&args.cloud, limits))
-        .map_err(&in_cloud)?;
+        .step("read cloud", 1, "file", || Ok(read(args, limits)))
+        .map_err(&in_cloud)??;
     let points = cloud.positions.len();
     let (cloud, finest) = log
         .step("voxelise", points, "points", || match args.bits {
@@ -31,14 +38,38 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
         Colours::Learned => learned(args, &cloud, &log)?,
     };
     let Coded { encoded, chosen } = coded;
-    output::write_file(&args.output, |w| {
+    let to = &args.output;
+    manners::write(to, |w| {
         w.write_all(&encoded.bytes).map_err(|source| Error::Io {
-            path: args.output.clone(),
+            path: to.to_path_buf(),
             source,
         })
     })?;
+    warn_if_undrawable(args, &encoded.bytes, limits)?;
+    let voxels = cloud.voxels.len();
+    let depth = cloud.voxels.depth();
+    let json = || {
+        let level = |rate: &Rate| {
+            json!({
+                "level": rate.level,
+                "voxels": rate.voxels,
+                "geometry_bytes": rate.geometry_bytes,
+                "colour_bytes": rate.colour_bytes,
+            })
+        };
+        json!({
+            "output": to.display().to_string(),
+            "bytes": encoded.bytes.len(),
+            "points": points,
+            "voxels": voxels,
+            "bits": depth,
+            "bits_per_point": encoded.bytes.len() as f64 * 8.0 / voxels as f64,
+            "levels": encoded.rates.iter().map(level).collect::<Vec<_>>(),
+            "steps": steps_json(&log.steps()),
+        })
+    };
 
-    let bpp = |bytes: usize| format!("{:.4}", bytes as f64 * 8.0 / cloud.voxels.len() as f64);
+    let bpp = |bytes: usize| format!("{:.4}", bytes as f64 * 8.0 / voxels as f64);
     let mut rows = vec![
         ["level", "voxels", "geometry bpp", "colour bpp"]
             .map(String::from)
@@ -52,23 +83,48 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<String
             bpp(rate.colour_bytes),
         ]);
     }
-    let depth = cloud.voxels.depth();
     let coarser = match depth < finest {
         true => format!(
             "The points lie too far apart for {finest} bits: surfaces would have holes. --bits {finest} codes them all the same.\n"
         ),
         false => String::new(),
     };
-    Ok(format!(
-        "{}\n{}\n{}: {} bytes for {} points at {depth} bits, {} bits per point{}\n{coarser}",
+    let report = format!(
+        "{}\n{}\n{}: {} for {} at {}, {} bits per point{}\n{coarser}",
         steps(&log.steps()),
         table(&rows),
-        args.output.display(),
-        count(encoded.bytes.len() as u64),
-        count(cloud.voxels.len() as u64),
+        to.display(),
+        counted(encoded.bytes.len() as u64, "byte"),
+        counted(voxels as u64, "point"),
+        counted(depth.into(), "bit"),
         bpp(encoded.bytes.len()),
         chosen,
-    ))
+    );
+    Ok(Said::report(report, json).beside(to))
+}
+
+/// Warns of a stream that the program's own heads do not draw.
+fn warn_if_undrawable(args: &Encode, bytes: &[u8], limits: &Limits) -> Result<()> {
+    let decoder = match args.colours {
+        // The model at hand has coded it.
+        Colours::Learned => Decoder::new().with_model(load::model(&args.model)?),
+        Colours::Transform => Decoder::new().with_heads_model(load::heads(None)?),
+    };
+    if decoder.with_limits(limits.clone()).levels(bytes)?.is_empty() {
+        let what = match args.colours {
+            Colours::Learned => "no level of the stream has Gaussians; code finer levels (--levels)",
+            Colours::Transform => "no level of the stream is drawn with learned heads; --heads surfels draws it",
+        };
+        manners::warn(&format!("{}: {what}", args.output.display()));
+    }
+    Ok(())
+}
+
+/// The cloud of a file, or of standard input.
+fn read(args: &Encode, limits: &Limits) -> Result<PointCloud> {
+    let bytes = load::bytes(&args.cloud, limits)?;
+    kinds::check_cloud(&args.cloud, &bytes)?;
+    PointCloud::from_ply(&bytes, limits).map_err(Failure::in_file(&args.cloud))
 }
 
 /// A stream, and what was chosen about it in words.
@@ -97,6 +153,12 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> 
         isa: Some(load::isa(model.isa.as_deref())?),
         ..transform::Options::default()
     };
+    if let Some(quality) = args.quality {
+        knobs::set_quality(&mut options, quality, cloud.voxels.depth(), args.levels.clone());
+    }
+    if let Some(effort) = args.effort {
+        knobs::set_effort(&mut options, effort);
+    }
     match args.step {
         Some(step) => options.fineness = step,
         None if args.lossless => options.fineness = Fineness::Lossless,
@@ -122,6 +184,10 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> 
 fn learned(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
     if args.step.is_some() || args.lossless {
         let what = "--step and --lossless are for --colours transform";
+        return Err(Failure(what.into()));
+    }
+    if args.quality.is_some() || args.effort.is_some() {
+        let what = "--quality and --effort are for --colours transform";
         return Err(Failure(what.into()));
     }
     let model = load::model(&args.model)?;

@@ -6,12 +6,14 @@ use b2p::{Limits, colour};
 use serde_json::json;
 
 use super::args::Info;
-use super::table::{count, table};
-use super::{Failure, Result, load};
+use super::manners::{self, Said};
+use super::table::{count, counted, table};
+use super::{Failure, Result, kinds, load};
 
 /// Describes a stream as text or JSON. A cut or damaged stream is described with what is wrong; its model is described if it is the one at hand.
-pub fn run(args: &Info, limits: &Limits) -> Result<String> {
-    let bytes = load::bytes(&args.input)?;
+pub fn run(args: &Info, limits: &Limits) -> Result<Said> {
+    let bytes = load::bytes(&args.input, limits)?;
+    kinds::check_stream(&args.input, &bytes)?;
     let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
     let header = stream.header();
     let at_hand = match header.model() {
@@ -25,10 +27,32 @@ pub fn run(args: &Info, limits: &Limits) -> Result<String> {
         (shape.name.clone(), heads)
     });
     let levels = levels(&stream)?;
-    Ok(match args.json {
-        true => json(&stream, bytes.len(), &levels, known),
-        false => text(args, &stream, bytes.len(), &levels, known),
-    })
+    let state = State::of(&stream, bytes.len());
+    Ok(Said::result(match manners::json() {
+        true => json(&stream, bytes.len(), &levels, known, &state),
+        false => text(args, &stream, bytes.len(), &levels, known, &state),
+    }))
+}
+
+/// How much of a stream is there.
+enum State {
+    /// All that the header counts.
+    Whole,
+    /// It ends after this level: a coarser stream.
+    CutAfter(u8),
+    /// It ends within a level, or is damaged; complete levels may be there.
+    Damaged(String),
+}
+
+impl State {
+    fn of(stream: &Stream, bytes: usize) -> Self {
+        let end = |level: u8| stream.header().prefix_bytes(level).ok();
+        match (stream.damage(), stream.deepest()) {
+            (None, _) => State::Whole,
+            (Some(_), Some(level)) if end(level) == Some(bytes as u64) => State::CutAfter(level),
+            (Some(damage), _) => State::Damaged(damage.to_string()),
+        }
+    }
 }
 
 /// Name and heads of a model.
@@ -82,7 +106,7 @@ fn steps(level: &Level) -> Option<colour::Steps> {
     steps.is_valid().then_some(steps)
 }
 
-fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> String {
+fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known, state: &State) -> String {
     let header = stream.header();
     let level = |of: &Described| {
         json!({
@@ -90,6 +114,8 @@ fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> St
             "voxels": of.voxels,
             "geometry_bytes": of.section.geometry,
             "colour_bytes": of.section.colours,
+            "geometry_bits_per_point": bits(of.section.geometry.into(), header.points),
+            "colour_bits_per_point": bits(of.section.colours.into(), header.points),
             "luma_step": of.steps.map(|steps| steps.luma_step()),
             "lossless": of.steps.map(|steps| steps.is_lossless()),
             "residual_bytes": of.residual,
@@ -113,33 +139,51 @@ fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> St
         "heads": known.as_ref().map(|(_, heads)| heads),
         "origin": header.placement.origin,
         "voxel_size": header.placement.voxel_size,
-        "damage": stream.damage().map(ToString::to_string),
+        "complete_to_level": stream.deepest(),
+        "top_level": header.top,
+        "damage": match state {
+            State::Damaged(damage) => Some(damage),
+            State::Whole | State::CutAfter(_) => None,
+        },
     });
     format!("{description:#}\n")
 }
 
-fn text(args: &Info, stream: &Stream, bytes: usize, levels: &[Described], known: Known) -> String {
+fn text(args: &Info, stream: &Stream, bytes: usize, levels: &[Described], known: Known, state: &State) -> String {
     let header = stream.header();
     let coded = match (header.model(), known, &args.model) {
-        (None, ..) => "transform coefficients, no model needed".into(),
+        (None, ..) => "colours: transform coefficients, no model needed".into(),
         (Some(id), Some((name, heads)), _) => {
-            format!("model {id}: {name}, heads: {}", heads.join(", "))
+            format!("colours: learned, model {id}: {name}, heads: {}", heads.join(", "))
         }
-        (Some(id), None, None) => format!("model {id}, which is not the one inside the program"),
-        (Some(id), None, Some(path)) => format!("model {id}, which is not {}", path.display()),
+        (Some(id), None, None) => format!("colours: learned, model {id}, which is not the one inside the program"),
+        (Some(id), None, Some(path)) => format!("colours: learned, model {id}, which is not {}", path.display()),
     };
+    let placement = header.placement;
+    let [x, y, z] = placement.origin;
     let mut text = format!(
-        "version {}, {} points at {} bits, {} bytes\n{coded}\n{}\n",
+        "version {}, {} at {}, {}, {:.4} bits per point\n{coded}\n\
+         grid: voxels of {}, {} along each side, from {x} {y} {z}\n\n{}\n",
         header.format.version(),
-        count(header.points),
-        header.bits,
-        count(bytes as u64),
+        counted(header.points, "point"),
+        counted(header.bits.into(), "bit"),
+        counted(bytes as u64, "byte"),
+        bits(bytes as u64, header.points),
+        placement.voxel_size,
+        count(1 << header.bits),
         table(&rows(levels, header.points)),
     );
-    if let Some(damage) = stream.damage() {
-        text += &format!("damage: {damage}\n");
+    match state {
+        State::Whole => {}
+        State::CutAfter(level) => text += &format!("cut: complete to level {level} of {}\n", header.top),
+        State::Damaged(damage) => text += &format!("damage: {damage}\n"),
     }
     text
+}
+
+/// Bits for each point.
+fn bits(bytes: u64, points: u64) -> f64 {
+    bytes as f64 * 8.0 / points.max(1) as f64
 }
 
 /// The table's rows, titles first.
@@ -149,23 +193,27 @@ fn rows(levels: &[Described], points: u64) -> Vec<Vec<String>> {
         "voxels",
         "geometry bytes",
         "colour bytes",
+        "geometry bpp",
+        "colour bpp",
         "step",
         "residual bytes",
         "its steps",
-        "bits/point up to here",
+        "bpp up to here",
     ];
     let mut rows = vec![titles.map(String::from).to_vec()];
     for of in levels {
-        let missing = if of.whole { "" } else { " (not whole)" };
+        let missing = if of.whole { "" } else { " (not complete)" };
         rows.push(vec![
             format!("{}{missing}", of.level),
             count(of.voxels.into()),
             count(of.section.geometry.into()),
             count(of.section.colours.into()),
+            format!("{:.4}", bits(of.section.geometry.into(), points)),
+            format!("{:.4}", bits(of.section.colours.into(), points)),
             of.steps.map_or("-".into(), step_told),
             of.residual.map_or("?".into(), |bytes| count(bytes as u64)),
             of.precision.map_or("-".into(), told),
-            format!("{:.4}", of.prefix as f64 * 8.0 / points.max(1) as f64),
+            format!("{:.4}", bits(of.prefix, points)),
         ]);
     }
     rows

@@ -42,11 +42,11 @@ impl Kept {
 }
 
 /// The bytes of a file, if a budget is asked for and it is a stream of version 3.
-pub fn stream(args: &BudgetArgs, input: &Path) -> Result<Option<Vec<u8>>> {
+pub fn stream(args: &BudgetArgs, input: &Path, limits: &Limits) -> Result<Option<Vec<u8>>> {
     if !args.is_given() || input == Path::new(PIPE) {
         return Ok(None);
     }
-    let bytes = load::bytes(input)?;
+    let bytes = load::bytes(input, limits)?;
     if version(&bytes) != Some(3) {
         return Ok(None);
     }

@@ -1,20 +1,21 @@
 //! Files in: models, streams, Gaussians.
 
-use std::io::Read;
 use std::path::Path;
 
-use b2p::container::version;
+use b2p::container::{Header, Stream, version};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::learned::HeadsModel;
-use b2p::gaussians::{Frame, Gaussians, ply};
+use b2p::gaussians::{Frame, Gaussians};
 use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::renderer::Explanation;
-use b2p::renderer::camera::Camera;
-use b2p::{Decoder, Error, Isa, Limits, UnknownIsa};
+use b2p::renderer::camera::Extent;
+use b2p::{Decoder, Error, Isa, Limits, UnknownIsa, input};
+use b2p_formats::splats::Format;
 
 use super::args::{DetailArg, ModelArg};
-use super::{Failure, Result, pipe};
+use super::views::Shot;
+use super::{Failure, Result, convert, kinds, manners};
 
 /// A stream or Gaussians, told apart by their first bytes.
 pub const PLY_MAGIC: &[u8] = b"ply";
@@ -82,25 +83,78 @@ pub fn isa(name: Option<&str>) -> Result<Isa> {
     }
 }
 
-/// The bytes of a file, or of standard input.
-pub fn bytes(path: &Path) -> Result<Vec<u8>> {
-    let bytes = match path == Path::new(pipe::PIPE) {
-        true => {
-            let mut bytes = Vec::new();
-            let mut input = std::io::stdin().lock();
-            input.read_to_end(&mut bytes).map(|_| bytes)
-        }
-        false => std::fs::read(path),
+/// The bytes of a file, or of standard input, no more than the limits allow.
+pub fn bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
+    let bytes = match manners::is_pipe(path) {
+        true => input::read_all(std::io::stdin().lock(), 0, path, limits),
+        false => input::read_file(path, limits),
     };
-    bytes.map_err(|source| {
-        Failure::from(Error::Io {
-            path: path.to_owned(),
-            source,
-        })
-    })
+    bytes.map_err(Failure::in_file(path))
 }
 
-/// Gaussians from a stream, or as they stand in a PLY.
+/// Fails, before anything is begun, unless the machine has this much memory to give.
+pub fn reserve(what: &'static str, bytes: u64) -> Result<()> {
+    let mut trial = Vec::<u8>::new();
+    let bytes_here = usize::try_from(bytes).unwrap_or(usize::MAX);
+    let had = trial.try_reserve_exact(bytes_here);
+    had.map_err(|_| Failure::from(Error::OutOfMemory { what, bytes }))
+}
+
+/// The same for a stream, decoded down to `level` or as far as it goes.
+pub fn reserve_for(path: &Path, bytes: &[u8], decoder: &Decoder, level: Option<u8>, limits: &Limits) -> Result<()> {
+    let Ok(header) = Header::parse(bytes, limits) else {
+        // What is wrong is said when it is decoded.
+        return Ok(());
+    };
+    let memory = decoder.memory(&header, level.unwrap_or(header.top));
+    match memory {
+        Ok(memory) if limits.check_bytes("", memory).is_ok() => {
+            reserve("decoding", memory).map_err(|Failure(text)| Failure(format!("{}: {text}", path.display())))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The bytes of a stream's file. If it is cut within a level and none was named, those up to the finest complete level, with a warning.
+pub fn whole_levels(path: &Path, mut bytes: Vec<u8>, detail: &DetailArg, limits: &Limits) -> Result<Vec<u8>> {
+    if detail.level.is_some() {
+        return Ok(bytes);
+    }
+    let Ok(stream) = Stream::parse(&bytes, limits) else {
+        return Ok(bytes);
+    };
+    let (Some(error @ Error::Truncated { .. }), Some(finest)) = (stream.damage(), stream.deepest()) else {
+        return Ok(bytes);
+    };
+    let end = stream.header().prefix_bytes(finest).map_err(Failure::in_file(path))?;
+    if end < bytes.len() as u64 {
+        let what = format!("what follows is level {finest}, the finest that is complete");
+        manners::warn(&format!("{}: {error}; {what}", path.display()));
+    }
+    let end = end as usize;
+    bytes.truncate(end);
+    Ok(bytes)
+}
+
+/// The part of the cube that a stream's object takes, as its base level tells; the whole cube if that cannot be known.
+pub fn extent(bytes: &[u8], decoder: &Decoder, limits: &Limits) -> Extent {
+    let base = || {
+        let header = Header::parse(bytes, limits).ok()?;
+        let mut decoding = decoder.clone().with_level(None).start();
+        decoding.push(bytes.get(..header.prefix_bytes(header.base).ok()? as usize)?);
+        decoding.advance().ok()??;
+        let voxels = decoding.voxels()?;
+        let half = f64::from(1u32 << voxels.depth()) / 2.0;
+        let spheres = (0..voxels.len()).map(|i| {
+            let centre = voxels.coordinate(i).map(|x| (f64::from(x) + 0.5) / half - 1.0);
+            (centre, 0.5 / half)
+        });
+        Some(Extent::of(spheres))
+    };
+    base().unwrap_or(Extent::cube())
+}
+
+/// Gaussians from a stream, or as they stand in a file.
 pub fn gaussians(
     path: &Path,
     detail: &DetailArg,
@@ -108,18 +162,21 @@ pub fn gaussians(
     limits: &Limits,
     log: &Log,
 ) -> Result<Gaussians> {
-    let bytes = bytes(path)?;
-    if bytes.starts_with(PLY_MAGIC) {
-        return ply(path, &bytes, detail, limits, log);
+    let bytes = bytes(path, limits)?;
+    if let Some(format) = convert::format_of(path, &bytes, None) {
+        return splats(path, &bytes, format, detail, limits, log);
     }
-    let decoder = decoder(&bytes, detail, model_arg, limits)?.with_log(log);
-    let gaussians = decoder.decode(&bytes);
+    kinds::check_stream(path, &bytes)?;
+    let bytes = whole_levels(path, bytes, detail, limits)?;
+    let decoder = decoder(&bytes, detail, model_arg, limits)?;
+    reserve_for(path, &bytes, &decoder, detail.level, limits)?;
+    let gaussians = decoder.with_log(log).decode(&bytes);
     gaussians.map_err(Failure::in_file(path))
 }
 
 /// Where Gaussians come from.
 pub enum Source<'p> {
-    /// A PLY that has been read.
+    /// A file of them that has been read.
     Gaussians(Gaussians),
     /// A stream, and what decodes it.
     Stream {
@@ -132,11 +189,15 @@ pub enum Source<'p> {
 impl<'p> Source<'p> {
     /// Reads a file.
     pub fn open(path: &'p Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Self> {
-        let bytes = bytes(path)?;
-        if bytes.starts_with(PLY_MAGIC) {
-            return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
+        let bytes = bytes(path, limits)?;
+        if let Some(format) = convert::format_of(path, &bytes, None) {
+            let gaussians = splats(path, &bytes, format, detail, limits, log)?;
+            return Ok(Source::Gaussians(gaussians));
         }
+        kinds::check_stream(path, &bytes)?;
+        let bytes = whole_levels(path, bytes, detail, limits)?;
         let decoder = Box::new(decoder(&bytes, detail, model_arg, limits)?);
+        reserve_for(path, &bytes, &decoder, detail.level, limits)?;
         Ok(Source::Stream { path, bytes, decoder })
     }
 
@@ -148,8 +209,30 @@ impl<'p> Source<'p> {
         }
     }
 
+    /// The part of the cube that the object takes, if that can be known before it is decoded.
+    pub fn extent(&self, limits: &Limits) -> Extent {
+        match self {
+            Source::Gaussians(gaussians) => Extent::of_gaussians(gaussians),
+            Source::Stream { bytes, decoder, .. } => extent(bytes, decoder, limits),
+        }
+    }
+
+    /// The level that has all that `cameras` can show, if there are finer ones.
+    pub fn level_for(&self, cameras: &[Shot]) -> Result<Option<u8>> {
+        let Source::Stream { path, bytes, decoder } = self else {
+            return Ok(None);
+        };
+        let pixels = cameras.iter().map(|shot| shot.camera.pixels_per_unit());
+        let level = decoder.level_for(bytes, pixels.fold(0.0, f64::max));
+        level.map_err(Failure::in_file(path))
+    }
+
     /// The Gaussians of `level`; without one, of what `cameras` can show, and why that level.
-    pub fn gaussians(self, detail: &DetailArg, cameras: &[Camera], log: &Log) -> Result<(Gaussians, Explanation)> {
+    pub fn gaussians(self, detail: &DetailArg, cameras: &[Shot], log: &Log) -> Result<(Gaussians, Explanation)> {
+        let seen = match detail.level {
+            Some(_) => None,
+            None => self.level_for(cameras)?,
+        };
         let explain = |on, why| Explanation {
             name: "detail",
             on,
@@ -157,18 +240,11 @@ impl<'p> Source<'p> {
         };
         let (path, bytes, decoder) = match self {
             Source::Gaussians(gaussians) => {
-                return Ok((gaussians, explain(false, "a PLY has no levels".into())));
+                return Ok((gaussians, explain(false, "files of Gaussians have no levels".into())));
             }
             Source::Stream { path, bytes, decoder } => (path, bytes, decoder),
         };
         let fail = Failure::in_file(path);
-        let seen = match detail.level {
-            Some(_) => None,
-            None => {
-                let pixels = cameras.iter().map(Camera::pixels_per_unit).fold(0.0, f64::max);
-                decoder.level_for(&bytes, pixels).map_err(&fail)?
-            }
-        };
         let why = match (detail.level, seen) {
             (Some(level), _) => format!("level {level}, forced"),
             (None, Some(level)) => format!("level {level}: its voxels already fall under a pixel"),
@@ -180,20 +256,21 @@ impl<'p> Source<'p> {
     }
 }
 
-/// Gaussians as they stand in the PLY `bytes`, which came from `path`.
-pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Gaussians> {
+/// Gaussians as they stand in the file `bytes`, which came from `path`.
+pub fn splats(
+    path: &Path,
+    bytes: &[u8],
+    format: Format,
+    detail: &DetailArg,
+    limits: &Limits,
+    log: &Log,
+) -> Result<Gaussians> {
     let asked = [("--level", detail.level.is_some()), ("--heads", detail.heads.is_some())];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
         return Err(Failure(format!(
-            "{}: {name} is for streams, this is a PLY",
+            "{}: {name} is for streams, these are Gaussians",
             path.display()
         )));
     }
-    let (gaussians, notes) = log
-        .step("read Gaussians", 1, "file", || ply::read(bytes, limits))
-        .map_err(Failure::in_file(path))?;
-    for warning in notes.warnings() {
-        eprintln!("b2p: {}: {warning}", path.display());
-    }
-    Ok(gaussians)
+    convert::read(path, bytes, format, limits, log).map(|splats| splats.gaussians)
 }

@@ -5,24 +5,34 @@ mod args;
 mod bench;
 mod bench_render;
 mod budget;
+mod convert;
+mod cut;
 mod decode;
 mod demo;
 mod encode;
 mod info;
 mod keep;
+mod kinds;
+mod knobs;
 mod load;
+mod manners;
 mod picture;
 mod pipe;
 mod progress;
 mod render;
+mod sheet;
 mod table;
+mod turntable;
 mod values;
+mod views;
 
+use std::io::ErrorKind;
 use std::path::Path;
 use std::process::ExitCode;
 
 use args::{Cli, Command};
-use clap::Parser;
+use clap::{ColorChoice, CommandFactory, FromArgMatches};
+use manners::Said;
 
 use b2p::{Error, output};
 
@@ -35,6 +45,10 @@ struct Failure(String);
 
 impl From<Error> for Failure {
     fn from(error: Error) -> Self {
+        let error = match error {
+            Error::Io { path, source } if manners::is_pipe(&path) => return Failure::writing(&path, source),
+            error => error,
+        };
         let text = error.to_string();
         // What the library calls a field is an argument here.
         Failure(match error {
@@ -42,6 +56,7 @@ impl From<Error> for Failure {
                 "max_bytes" => text.replace(option, "--max-memory"),
                 "max_points" => text.replace(option, "--max-points"),
                 "max_pixels" => text.replace(option, "--max-pixels"),
+                "max_pairs" => text.replace(option, "--max-pairs"),
                 _ => text,
             },
             Error::TooFewBits { .. } => format!("{text}; code coarser levels (--levels)"),
@@ -52,60 +67,108 @@ impl From<Error> for Failure {
 }
 
 impl Failure {
+    /// The reader of standard output has gone: there is nothing to say.
+    const READER_GONE: &str = "";
+
+    /// What the system said when `path` was written.
+    fn writing(path: &Path, source: std::io::Error) -> Failure {
+        if source.kind() == ErrorKind::BrokenPipe {
+            return Failure(Failure::READER_GONE.into());
+        }
+        let name = match manners::is_pipe(path) {
+            true => "standard input or output".into(),
+            false => path.display().to_string(),
+        };
+        Failure(format!("{name}: {source}"))
+    }
+
     /// An error that concerns the contents of a file.
     fn in_file(path: &Path) -> impl Fn(Error) -> Failure + '_ {
         move |error| match error {
-            Error::Io { .. } => Failure(error.to_string()),
+            Error::Io { .. } => Failure::from(error),
             _ => Failure(format!("{}: {}", path.display(), Failure::from(error).0)),
         }
     }
 }
 
-/// Runs the program; the exit code is 0 for success, 1 for failure, 2 (from the argument parser) for misuse, 130 after Ctrl-C.
+/// What a shell gives for a program that SIGPIPE ended.
+const BROKEN_PIPE: u8 = 128 + 13;
+
+/// Runs the program; the exit code is 0 for success, 1 for failure, 2 (from the argument parser) for misuse, 130 after Ctrl-C, 141
+/// if the reader of standard output has gone.
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = parse();
+    manners::set(&cli);
     let interrupted = ctrlc::set_handler(|| {
         output::remove_unfinished();
         std::process::exit(130);
     });
-    let done = interrupted
-        .map_err(|e| Failure(format!("no handler for Ctrl-C: {e}")))
-        .and_then(|()| run(&cli));
-    match done {
+    if let Err(error) = interrupted {
+        manners::warn(&format!("Ctrl-C may leave a temporary file behind: {error}"));
+    }
+    match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
+        Err(Failure(message)) if message == Failure::READER_GONE => ExitCode::from(BROKEN_PIPE),
         Err(Failure(message)) => {
-            eprintln!("b2p: {message}");
+            manners::complain(&message);
             ExitCode::FAILURE
         }
     }
 }
 
+/// The arguments; help and usage errors are coloured as they say.
+fn parse() -> Cli {
+    let arguments: Vec<_> = std::env::args_os().collect();
+    let given = arguments.iter().zip(arguments.iter().skip(1).map(Some).chain([None]));
+    let chosen = given.filter_map(|(argument, next)| match argument.to_str()?.strip_prefix("--color")? {
+        "" => next?.to_str(),
+        value => value.strip_prefix('='),
+    });
+    let colour = match chosen.last() {
+        Some("always") => ColorChoice::Always,
+        Some("never") => ColorChoice::Never,
+        _ => ColorChoice::Auto,
+    };
+    let matches = Cli::command().color(colour).get_matches_from(&arguments);
+    Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+}
+
 fn run(cli: &Cli) -> Result<()> {
-    if let Some(threads) = cli.threads {
-        rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.into())
-            .build_global()
-            .map_err(|e| Failure(format!("cannot start {threads} threads: {e}")))?;
-    }
+    start_threads(cli.threads)?;
     let progress = progress::Progress::new(cli.quiet);
     let limits = cli.limits.limits();
-    let text = match &cli.command {
+    let said: Said = match &cli.command {
         Command::Encode(args) => encode::run(args, &limits, &progress)?,
         Command::Decode(args) => decode::run(args, &limits, &progress)?,
+        Command::Convert(args) => convert::run(args, &limits, &progress)?,
         Command::Render(args) => render::run(args, &limits, &progress)?,
         Command::Info(args) => info::run(args, &limits)?,
+        Command::Cut(args) => cut::run(args, &limits)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,
     };
     drop(progress);
-    if !cli.quiet {
-        print(&text);
-    }
-    Ok(())
+    said.say()
 }
 
-/// Prints without failing when the reader of a pipe has gone.
-fn print(text: &str) {
-    use std::io::Write;
-    let _ = std::io::stdout().write_all(text.as_bytes());
+/// Starts the threads at once, so that none that the system refuses is missed later. Unless a number was asked for, one is enough.
+fn start_threads(count: Option<u16>) -> Result<()> {
+    let pool = || rayon::ThreadPoolBuilder::new();
+    let count = usize::from(count.unwrap_or(0));
+    let Err(error) = pool().num_threads(count).build_global() else {
+        return Ok(());
+    };
+    let failed = |error| match count {
+        0 => Failure(format!("cannot start threads: {error}")),
+        _ => Failure(format!("cannot start {count} threads: {error}")),
+    };
+    if count > 0 {
+        return Err(failed(error));
+    }
+    manners::warn(&format!("works in one thread: {error}"));
+    pool()
+        .num_threads(1)
+        .use_current_thread()
+        .build_global()
+        .map_err(failed)
 }

@@ -1,5 +1,6 @@
 //! What a picture shows, and the file that it becomes.
 
+use std::io::Write;
 use std::path::Path;
 
 use b2p::gaussians::Gaussians;
@@ -8,8 +9,7 @@ use b2p::renderer::{Background, Channel, Ids, Image, Renderer, Stats};
 use b2p::{Error, Limits};
 
 use super::args::{Format, Render, Show};
-use super::pipe::PIPE;
-use super::{Failure, Result};
+use super::{Failure, Result, manners};
 
 /// Draws pictures one after the other, with what else their files need.
 pub struct Artist<'a> {
@@ -19,7 +19,9 @@ pub struct Artist<'a> {
     pub args: &'a Render,
     pub format: Format,
     pub image: Image,
-    depth: Image,
+    /// Bytes that are held beside the picture.
+    pub beside: u64,
+    distances: Vec<f32>,
     ids: Ids,
 }
 
@@ -38,12 +40,14 @@ impl<'a> Artist<'a> {
             args,
             format,
             image: Image::default(),
-            depth: Image::default(),
+            beside: 0,
+            distances: Vec::new(),
             ids: Ids::default(),
         }
     }
 
-    /// Draws what is asked for.
+    /// Draws what is asked for. Beside the picture, an OpenEXR file needs the distances, and numbers their own picture: the memory of
+    /// both is within the limits.
     pub fn draw(&mut self, camera: &Camera) -> b2p::Result<Stats> {
         let (channel, background) = match self.args.show {
             Show::Colour => (Channel::Colour, self.args.view.background),
@@ -52,15 +56,19 @@ impl<'a> Artist<'a> {
             Show::Alpha => (Channel::Colour, Background::Transparent),
             Show::Id => return self.draw_ids(camera),
         };
-        let (gaussians, limits) = (self.gaussians, self.limits);
-        let mut draw = |channel, background, image: &mut Image| {
+        let gaussians = self.gaussians;
+        let each = if self.needs_depth() { size_of::<f32>() } else { 0 };
+        let limits = self.limits_beside(camera, each as u64)?;
+        if self.needs_depth() {
+            let (nothing, image) = (Background::Transparent, &mut self.image);
             self.renderer
-                .draw_into(gaussians, camera, channel, background, limits, image)
-        };
-        let stats = draw(channel, background, &mut self.image)?;
-        if self.format == Format::Exr && self.args.show == Show::Colour {
-            draw(Channel::Depth, Background::Transparent, &mut self.depth)?;
+                .draw_into(gaussians, camera, Channel::Depth, nothing, &limits, image)?;
+            self.distances = self.image.distances();
         }
+        let image = &mut self.image;
+        let stats = self
+            .renderer
+            .draw_into(gaussians, camera, channel, background, &limits, image)?;
         match self.args.show {
             Show::Alpha => {
                 for pixel in &mut self.image.pixels {
@@ -80,6 +88,21 @@ impl<'a> Artist<'a> {
         Ok(stats)
     }
 
+    fn needs_depth(&self) -> bool {
+        self.format == Format::Exr && self.args.show == Show::Colour
+    }
+
+    /// The limits that are left for drawing beside what takes `each` bytes a pixel.
+    fn limits_beside(&self, camera: &Camera, each: u64) -> b2p::Result<Limits> {
+        let [width, height] = camera.size();
+        let pixels = u64::from(width) * u64::from(height);
+        self.limits.check_pixels("pixels of the picture", pixels)?;
+        let beside = pixels.saturating_mul(each).saturating_add(self.beside);
+        self.limits.check_bytes("bytes to draw the picture", beside)?;
+        let left = self.limits.max_bytes - beside;
+        Ok(self.limits.clone().with_max_bytes(left))
+    }
+
     /// The number of the Gaussian plus one, its lowest eight bits in red, the next in green and in blue.
     fn draw_ids(&mut self, camera: &Camera) -> b2p::Result<Stats> {
         if self.gaussians.len() >= 1 << 24 {
@@ -88,9 +111,8 @@ impl<'a> Artist<'a> {
                 detail: format!("there are {}", self.gaussians.len()),
             });
         }
-        let stats = self
-            .renderer
-            .ids_into(self.gaussians, camera, self.limits, &mut self.ids)?;
+        let limits = self.limits_beside(camera, size_of::<[f32; 4]>() as u64)?;
+        let stats = self.renderer.ids_into(self.gaussians, camera, &limits, &mut self.ids)?;
         let colour = |id: &u32| {
             let bytes = id.wrapping_add(1).to_le_bytes();
             let [r, g, b] = [0, 1, 2].map(|k| f32::from(bytes[k]) / 255.0);
@@ -102,16 +124,16 @@ impl<'a> Artist<'a> {
         Ok(stats)
     }
 
-    /// The picture drawn last, as a file. Of a video, one frame.
-    pub fn file(&self) -> b2p::Result<Vec<u8>> {
+    /// Writes the picture drawn last as a file. Of a video, one frame.
+    pub fn write(&self, to: &mut dyn Write, path: &Path) -> b2p::Result<()> {
         match self.format {
-            Format::Png => self.image.to_png(),
-            Format::Png16 => self.image.to_png16(),
-            Format::Ppm => Ok(self.image.to_ppm()),
-            Format::Y4m => Ok(self.image.to_y4m_frame()),
+            Format::Png => self.image.write_png(to, path),
+            Format::Png16 => self.image.write_png16(to, path),
+            Format::Ppm => self.image.write_ppm(to, path),
+            Format::Y4m => self.image.write_y4m_frame(to, path),
             Format::Exr => {
-                let depth = self.args.show == Show::Colour;
-                Ok(self.image.to_exr(depth.then_some(&self.depth)))
+                let distances = self.needs_depth().then_some(&self.distances[..]);
+                self.image.write_exr(to, path, distances)
             }
         }
     }
@@ -122,7 +144,7 @@ pub fn format_of(args: &Render, pictures: usize) -> Result<Format> {
     if let Some(format) = args.format {
         return Ok(format);
     }
-    if args.output == Path::new(PIPE) {
+    if manners::is_pipe(&args.output) {
         return Ok(if pictures == 1 { Format::Png } else { Format::Y4m });
     }
     let ending = args.output.extension().unwrap_or_default();

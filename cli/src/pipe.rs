@@ -10,7 +10,7 @@ use b2p::log::Log;
 use b2p::{Decoding, Error, Limits};
 
 use super::args::{DetailArg, ModelArg};
-use super::{Failure, Result, load};
+use super::{Failure, Result, convert, kinds, load, manners};
 
 /// The input that is standard input, and the output that is standard output.
 pub const PIPE: &str = "-";
@@ -42,7 +42,7 @@ pub fn each(
         let gaussians = load::gaussians(path, detail, model_arg, limits, log)?;
         return show(&gaussians, log);
     }
-    let pieces = pieces();
+    let pieces = pieces()?;
     let mut start = Vec::new();
     while start.len() < STREAM_START {
         match pieces.recv() {
@@ -50,20 +50,35 @@ pub fn each(
             Err(_) => break,
         }
     }
-    if start.starts_with(load::PLY_MAGIC) {
+    if convert::may_be(&start) {
         for piece in pieces {
             start.extend(piece.map_err(broken)?);
+            let length = start.len() as u64;
+            let checked = limits.check_bytes("size of the input, as far as it was read,", length);
+            checked.map_err(Failure::in_file(path))?;
         }
-        return show(&load::ply(path, &start, detail, limits, log)?, log);
+        let Some(format) = convert::format_of(path, &start, None) else {
+            return kinds::check_stream(path, &start);
+        };
+        return show(&load::splats(path, &start, format, detail, limits, log)?, log);
     }
+    kinds::check_stream(path, &start)?;
     let decoder = load::decoder(&start, detail, model_arg, limits)?.with_log(log);
     let mut decoding = decoder.start();
     let mut shown = None;
     let in_pipe = Failure::in_file(path);
     let mut piece = Some(start);
+    let mut length = 0;
     while let Some(bytes) = piece {
+        length += bytes.len() as u64;
         decoding.push(&bytes);
         while decoding.advance().map_err(&in_pipe)?.is_some() {}
+        if let Some(header) = decoding.header()
+            && length > header.stream_bytes()
+        {
+            // What follows the stream may have no end.
+            break;
+        }
         piece = match pieces.try_recv() {
             Err(TryRecvError::Empty) => {
                 if early && decoding.is_drawable() && shown != decoding.level() {
@@ -85,8 +100,8 @@ pub fn each(
             },
         ) if detail.level.is_none() && decoding.is_drawable() => {
             let finest = decoding.level().unwrap_or_default();
-            let what = format!("what follows is level {finest}, the finest that is whole");
-            eprintln!("b2p: {}: {error}; {what}", path.display());
+            let what = format!("what follows is level {finest}, the finest that is complete");
+            manners::warn(&format!("{}: {error}; {what}", path.display()));
         }
         done => done.map_err(&in_pipe)?,
     }
@@ -102,9 +117,9 @@ fn show_level(decoding: &Decoding, log: &Log, show: &mut Show) -> Result<()> {
 }
 
 /// Standard input, read by a thread of its own so that it can be known whether something waits.
-fn pieces() -> Receiver<Piece> {
+fn pieces() -> Result<Receiver<Piece>> {
     let (sender, receiver) = sync_channel(WAITING);
-    std::thread::spawn(move || {
+    let read = move || {
         let mut input = std::io::stdin().lock();
         loop {
             let mut bytes = vec![0; PIECE];
@@ -118,8 +133,10 @@ fn pieces() -> Receiver<Piece> {
                 return;
             }
         }
-    });
-    receiver
+    };
+    let started = std::thread::Builder::new().spawn(read);
+    started.map_err(|e| Failure(format!("cannot start a thread to read: {e}")))?;
+    Ok(receiver)
 }
 
 fn broken(source: std::io::Error) -> Failure {

@@ -23,20 +23,27 @@ impl Progress {
         if let Ok(style) = ProgressStyle::with_template("{spinner} {msg} ({elapsed})") {
             bar.set_style(style);
         }
-        bar.enable_steady_tick(Duration::from_millis(100));
         Progress { bar }
     }
 
     /// A log that shows each step as it begins.
     pub fn log(&self) -> Log {
         let bar = self.bar.clone();
-        Log::with_listener(move |step| bar.set_message(step.to_owned()))
+        Log::with_listener(move |step| show(&bar, step))
     }
 
     /// Says what is being done.
     pub fn say(&self, step: &str) {
-        self.bar.set_message(step.to_owned());
+        show(&self.bar, step);
     }
+}
+
+fn show(bar: &ProgressBar, step: &str) {
+    // From the first step on: before, the user may be asked something.
+    if !bar.is_hidden() && bar.message().is_empty() {
+        bar.enable_steady_tick(Duration::from_millis(100));
+    }
+    bar.set_message(step.to_owned());
 }
 
 impl Drop for Progress {

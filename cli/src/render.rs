@@ -1,68 +1,42 @@
 //! `b2p render`: stream or Gaussians to pictures.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::budget::Task;
-use b2p::gaussians::{Frame, Gaussians};
+use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::renderer::camera::{Camera, files};
-use b2p::renderer::{Channel, Choice, Effects, Explanation, Image, Quality, Renderer, Stats};
-use b2p::{Error, Limits, output};
+use b2p::renderer::camera::{Camera, Extent};
+use b2p::renderer::{Background, Choice, Effects, Explanation, Quality, Renderer, Stats};
+use b2p::{Error, Limits};
 use serde_json::json;
 
-use super::args::{Format, Render, View};
+use super::args::{Format, Render};
 use super::budget::{self, Chosen};
 use super::keep::{self, Kept};
 use super::load::Source;
+use super::manners::{self, Said};
 use super::picture::{Artist, format_of};
-use super::pipe::{self, PIPE};
 use super::progress::Progress;
-use super::table::{count, milliseconds, steps};
-use super::{Failure, Result, load};
+use super::sheet::Sheet;
+use super::table::{count, counted, milliseconds, steps};
+use super::views::{Shot, shots};
+use super::{Failure, Result, load, pipe, turntable};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
 
 /// Draws one picture, or several: on a circle, or with the cameras of a file.
-pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String> {
+pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> {
     let log = progress.log();
-    if args.input == Path::new(PIPE) && !args.budget.is_given() {
-        let mut text = String::new();
-        // What has gone to standard output cannot be replaced by something finer.
-        let early = args.output != Path::new(PIPE);
-        let mut show = |gaussians: &Gaussians, log: &Log| {
-            let cameras = asked_for(args, &gaussians.frame)?;
-            let drawing = Drawing {
-                args,
-                quality: args.quality,
-                limits,
-                detail: None,
-                chosen: None,
-            };
-            text = pictures(&drawing, gaussians, &cameras, log)?;
-            Ok(())
-        };
-        pipe::each(&args.input, &args.detail, &args.model, limits, early, &log, &mut show)?;
-        return Ok(text);
+    if let Some(path) = &args.output.turntable {
+        turntable::kind_of(path)?;
     }
-    if let Some(bytes) = keep::stream(&args.budget, &args.input)? {
-        let frame = load::decoder(&bytes, &args.detail, &args.model, limits)?.frame(&bytes);
-        let cameras = asked_for(args, &frame.map_err(Failure::in_file(&args.input))?)?;
-        let Some((_, camera)) = cameras.first() else {
-            return Ok(String::new());
-        };
-        let (budget, model) = (&args.budget, &args.model);
-        let kept = keep::draw(budget, &args.input, &bytes, model, camera, limits, &log)?;
-        let drawing = Drawing {
-            args,
-            quality: args.quality,
-            limits,
-            detail: None,
-            chosen: Some(For::Kept(&kept)),
-        };
-        return pictures(&drawing, &kept.gaussians, &cameras, &log);
+    if manners::is_pipe(&args.input) && !args.budget.is_given() {
+        return from_pipe(args, limits, &log);
+    }
+    if let Some(bytes) = keep::stream(&args.budget, &args.input, limits)? {
+        return within_time(args, &bytes, limits, &log);
     }
     let pixels = u64::from(args.view.size.0) * u64::from(args.view.size.1);
     let task = Task::Picture { pixels };
@@ -74,9 +48,14 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
         None => (&args.detail, &args.model),
     };
     let source = Source::open(input, detail, model, limits, &log)?;
-    let cameras = asked_for(args, &source.frame()?)?;
-    let views: Vec<Camera> = cameras.iter().map(|(_, camera)| *camera).collect();
-    let (gaussians, detail) = source.gaussians(detail, &views, &log)?;
+    let frame = source.frame()?;
+    let mut cameras = shots(args, &frame, &Extent::cube(), limits)?;
+    permit(args, &cameras)?;
+    // What keeps the object in view is nearer than what keeps the cube in view.
+    if detail.level.is_none() && source.level_for(&cameras)?.is_some() {
+        cameras = shots(args, &frame, &source.extent(limits), limits)?;
+    }
+    let (gaussians, detail) = source.gaussians(detail, &cameras, &log)?;
     let drawing = Drawing {
         args,
         quality: chosen.as_ref().map_or(args.quality, |c| c.choice.quality),
@@ -84,7 +63,71 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<String
         detail: Some(detail),
         chosen: chosen.as_ref().map(|chosen| For::Chosen(chosen, task)),
     };
-    pictures(&drawing, &gaussians, &cameras, &log)
+    pictures(&drawing, &gaussians, &log)
+}
+
+/// Draws what comes on standard input, each level as it is complete.
+fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
+    let mut said = Said::default();
+    // What has gone to standard output cannot be replaced by something finer.
+    let early = !manners::is_pipe(&args.output);
+    let mut permitted = false;
+    let mut show = |gaussians: &Gaussians, log: &Log| {
+        // Pictures of coarser levels are this program's own.
+        if !permitted {
+            permit(args, &shots(args, &gaussians.frame, &Extent::cube(), limits)?)?;
+            permitted = true;
+        }
+        let drawing = Drawing {
+            args,
+            quality: args.quality,
+            limits,
+            detail: None,
+            chosen: None,
+        };
+        said = pictures(&drawing, gaussians, log)?;
+        Ok(())
+    };
+    pipe::each(&args.input, &args.detail, &args.model, limits, early, log, &mut show)?;
+    Ok(said)
+}
+
+/// Draws the finest level that is drawn within the budget.
+fn within_time(args: &Render, bytes: &[u8], limits: &Limits, log: &Log) -> Result<Said> {
+    let decoder = load::decoder(bytes, &args.detail, &args.model, limits)?;
+    let frame = decoder.frame(bytes).map_err(Failure::in_file(&args.input))?;
+    let cameras = shots(args, &frame, &load::extent(bytes, &decoder, limits), limits)?;
+    permit(args, &cameras)?;
+    let Some(Shot { camera, .. }) = cameras.first() else {
+        return Ok(Said::default());
+    };
+    let (budget, model) = (&args.budget, &args.model);
+    let kept = keep::draw(budget, &args.input, bytes, model, camera, limits, log)?;
+    let drawing = Drawing {
+        args,
+        quality: args.quality,
+        limits,
+        detail: None,
+        chosen: Some(For::Kept(&kept)),
+    };
+    pictures(&drawing, &kept.gaussians, log)
+}
+
+/// Whether the pictures may be written.
+fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
+    let mut outputs: Vec<&Path> = cameras.iter().map(|shot| shot.path.as_path()).collect();
+    outputs.dedup();
+    let is_video = args.output.turntable.is_some() || args.contact_sheet;
+    if !is_video
+        && !manners::is_pipe(&args.output)
+        && cameras.len() > 1
+        && format_of(args, cameras.len())? == Format::Y4m
+    {
+        outputs = vec![&args.output];
+    }
+    let inputs = [Some(&args.input), args.camera.as_ref(), args.model.model.as_ref()];
+    let inputs: Vec<&Path> = inputs.into_iter().flatten().map(PathBuf::as_path).collect();
+    manners::permit(&outputs, &inputs)
 }
 
 /// How pictures are drawn.
@@ -106,8 +149,9 @@ enum For<'a> {
 type Drawn = (PathBuf, [u32; 2], Stats);
 
 /// Draws these Gaussians into the pictures asked for.
-fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camera)], log: &Log) -> Result<String> {
+fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &Log) -> Result<Said> {
     let &Drawing { args, limits, .. } = drawing;
+    let cameras = &shots(args, &gaussians.frame, &Extent::of_gaussians(gaussians), limits)?[..];
     let mut effects = Effects::default();
     for (effect, choice) in &args.effect {
         effects.set(*effect, *choice);
@@ -115,92 +159,140 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, cameras: &[(PathBuf, Camer
     let mut renderer = Renderer::new().with_isa(load::isa(args.model.isa.as_deref())?);
     renderer.set_effects(effects);
     renderer.set_quality(drawing.quality);
-    let format = format_of(args, cameras.len())?;
+    let many = if args.contact_sheet { 1 } else { cameras.len() };
+    let format = match &args.output.turntable {
+        Some(_) => Format::Y4m,
+        None => format_of(args, many)?,
+    };
     let mut artist = Artist::new(renderer, gaussians, limits, args, format);
     let all = match format {
+        _ if args.contact_sheet => sheet(cameras, &mut artist, limits, log)?,
+        _ if args.output.turntable.is_some() => turn(cameras, &mut artist, log)?,
         Format::Y4m => video(args, cameras, &mut artist, log)?,
         _ => stills(args, cameras, &mut artist, log)?,
     };
 
-    let mut text = chosen(drawing, &all);
-    if let (true, Some((_, camera)), Some((_, _, stats))) = (args.verbose, cameras.first(), all.first()) {
+    let mut report = chosen(drawing, &all);
+    if let (true, Some(Shot { camera, .. }), Some((_, _, stats))) = (manners::verbose(), cameras.first(), all.first()) {
         if let Some(detail) = &drawing.detail {
-            text += &format!("{detail}\n");
+            report += &format!("{detail}\n");
         }
         for line in effects.explain(gaussians, camera, stats) {
             let cost = cost_of(&line, &mut artist, effects, camera)?;
-            text += &format!("{line}{cost}\n");
+            report += &format!("{line}{cost}\n");
         }
     }
-    if args.stats.is_some() {
+    let to = &args.output;
+    if manners::json() || args.stats.is_some() {
         let all: Vec<_> = all
             .iter()
             .map(|(path, size, stats)| numbers(path, *size, stats))
             .collect();
-        // What a program reads is nothing but the numbers.
-        let _ = std::io::stderr().write_all(text.as_bytes());
-        text = format!("{:#}\n", json!(all));
-    } else {
-        for (path, _, stats) in &all {
-            text += &describe(path, stats);
-        }
-        text = format!("{}\n{text}", steps(&log.steps()));
+        let result = format!("{:#}\n", json!(all));
+        return Ok(Said { result, report }.beside(to));
     }
-    if args.output == Path::new(PIPE) {
-        // Standard output is the picture's. Nobody to tell if even this fails.
-        if args.stats.is_some() || args.verbose || drawing.chosen.is_some() {
-            let _ = std::io::stderr().write_all(text.as_bytes());
+    // Of many frames in one file, one line.
+    let distinct = all
+        .first()
+        .map(|(path, ..)| all.iter().all(|(other, ..)| other == path));
+    match distinct {
+        Some(true) if all.len() > 1 => report += &format!("{}: {}\n", to.display(), counted(all.len() as u64, "view")),
+        _ => {
+            for (path, _, stats) in &all {
+                report += &describe(path, stats);
+            }
         }
-        return Ok(String::new());
     }
-    Ok(text)
+    let many = all.len() > 8;
+    if manners::verbose() || !many {
+        report = format!("{}\n{report}", steps(&log.steps()));
+    }
+    Ok(Said {
+        report,
+        result: String::new(),
+    })
 }
 
 /// Draws one picture into the artist's image.
-fn draw_logged(path: &Path, camera: &Camera, artist: &mut Artist, log: &Log) -> b2p::Result<Drawn> {
+fn draw_logged(shot: &Shot, artist: &mut Artist, log: &Log) -> b2p::Result<Drawn> {
     let count = artist.gaussians.len();
-    let drawn = log.step(format!("draw {}", path.display()), count, "Gaussians", || {
-        artist.draw(camera)
-    });
-    Ok((path.to_owned(), camera.size(), drawn?))
+    let name = format!("draw {}", shot.path.display());
+    let drawn = log.step(name, count, "Gaussians", || artist.draw(&shot.camera));
+    Ok((shot.path.clone(), shot.camera.size(), drawn?))
 }
 
 /// Draws all pictures into one file.
-fn video(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
+fn video(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
-    let mut frames = |to: &mut dyn Write| -> b2p::Result<()> {
-        for (i, (path, camera)) in cameras.iter().enumerate() {
+    let to = &args.output;
+    manners::write(to, |w| {
+        for (i, shot) in cameras.iter().enumerate() {
             let last = (artist.image.width, artist.image.height);
-            all.push(draw_logged(path, camera, artist, log)?);
+            all.push(draw_logged(shot, artist, log)?);
             if i == 0 {
-                write(to, &artist.image.y4m_header(), &args.output)?;
+                w.write_all(&artist.image.y4m_header()).map_err(|source| Error::Io {
+                    path: to.to_path_buf(),
+                    source,
+                })?;
             } else if last != (artist.image.width, artist.image.height) {
                 let what = "the pictures of a video are all of one size";
-                return Err(Error::Usage(format!("{what}: {} is not", path.display())));
+                return Err(Error::Usage(format!("{what}: {} is not", shot.label)));
             }
-            write(to, &artist.file()?, &args.output)?;
+            artist.write(w, to)?;
         }
         Ok(())
+    })?;
+    Ok(all)
+}
+
+/// Draws one turn into a video.
+fn turn(cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
+    let mut all = Vec::new();
+    let Some(first) = cameras.first() else { return Ok(all) };
+    let [width, height] = first.camera.size();
+    artist.beside = u64::from(width) * u64::from(height) * turntable::BYTES_PER_PIXEL;
+    turntable::write(&first.path, cameras.len() as u32, |i, image| {
+        let drawn = draw_logged(&cameras[i as usize], artist, log)?;
+        all.push(drawn);
+        std::mem::swap(image, &mut artist.image);
+        Ok(())
+    })?;
+    Ok(all)
+}
+
+/// Draws all views into one picture.
+fn sheet(cameras: &[Shot], artist: &mut Artist, limits: &Limits, log: &Log) -> Result<Vec<Drawn>> {
+    let mut all = Vec::new();
+    let Some(first) = cameras.first() else { return Ok(all) };
+    let paper = match artist.args.view.background {
+        Background::Colour([r, g, b]) => [r, g, b, 1.0],
+        _ => [0.0; 4],
     };
-    if args.output == Path::new(PIPE) {
-        frames(&mut std::io::stdout().lock())?;
-    } else {
-        output::write_file(&args.output, frames)?;
+    let mut sheet = Sheet::new(cameras.len() as u32, first.camera.size(), paper, limits)?;
+    artist.beside = (sheet.image.pixels.len() * size_of::<[f32; 4]>()) as u64;
+    for shot in cameras {
+        all.push(draw_logged(shot, artist, log)?);
+        sheet.add(&artist.image, &shot.label);
     }
+    artist.image = sheet.image;
+    if artist.format == Format::Exr {
+        let what = "a contact sheet is written as .png or .ppm";
+        return Err(Failure(what.into()));
+    }
+    manners::write(&first.path, |w| artist.write(w, &first.path))?;
     Ok(all)
 }
 
 /// Draws each picture into a file of its own.
-fn stills(args: &Render, cameras: &[(PathBuf, Camera)], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
+fn stills(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> {
     let mut all = Vec::new();
-    for (path, camera) in cameras {
-        all.push(draw_logged(path, camera, artist, log)?);
-        let file = artist.file()?;
-        if args.output == Path::new(PIPE) {
-            write(&mut std::io::stdout().lock(), &file, path)?;
-        } else {
-            output::write_file(path, |w| write(w, &file, path))?;
-        }
+    for shot in cameras {
+        all.push(draw_logged(shot, artist, log)?);
+        let to = match manners::is_pipe(&args.output) {
+            true => &args.output,
+            false => shot.path.as_path(),
+        };
+        manners::write(to, |w| artist.write(w, to))?;
     }
     Ok(all)
 }
@@ -239,92 +331,13 @@ fn cost_of(line: &Explanation, artist: &mut Artist, effects: Effects, camera: &C
     Ok(format!("; {:+.2} ms of {}", cost * 1e3, milliseconds(with)))
 }
 
-/// The cameras of the file, or of the circle.
-fn asked_for(args: &Render, frame: &Frame) -> Result<Vec<(PathBuf, Camera)>> {
-    let Some(path) = &args.camera else {
-        let mut cameras = cameras(&args.view, &args.output)?;
-        if args.orthographic {
-            for (_, camera) in &mut cameras {
-                *camera = camera.orthographic(args.view.orbit[2].into())?;
-            }
-        }
-        return Ok(cameras);
-    };
-    let text = |path: &Path| -> Result<String> {
-        String::from_utf8(load::bytes(path)?).map_err(|_| Failure(format!("{}: not a text", path.display())))
-    };
-    let named = if path.extension().is_some_and(|ending| ending == "txt") {
-        let lenses = text(&path.with_file_name("cameras.txt"))?;
-        files::colmap(&lenses, &text(path)?, frame)
-    } else {
-        files::read(&load::bytes(path)?, frame, args.view.size)
-    };
-    let named = named.map_err(Failure::in_file(path))?;
-    if named.is_empty() {
-        return Err(Failure(format!("{}: no cameras", path.display())));
-    }
-    let several = named.len() > 1;
-    let path = |i: usize| {
-        if several {
-            numbered(&args.output, i as u32)
-        } else {
-            args.output.clone()
-        }
-    };
-    let cameras = named.into_iter().enumerate();
-    Ok(cameras.map(|(i, (_, camera))| (path(i), camera)).collect())
-}
-
-fn write(to: &mut dyn Write, bytes: &[u8], path: &Path) -> b2p::Result<()> {
-    to.write_all(bytes)
-        .and_then(|()| to.flush())
-        .map_err(|source| Error::Io {
-            path: path.to_owned(),
-            source,
-        })
-}
-
-/// The pictures on a circle: where each goes and where its camera stands.
-pub fn cameras(view: &View, output: &Path) -> Result<Vec<(PathBuf, Camera)>> {
-    let [azimuth, elevation, radius] = view.orbit.map(f64::from);
-    let (width, height) = view.size;
-    (0..view.views)
-        .map(|i| {
-            let turned = azimuth + 360.0 * f64::from(i) / f64::from(view.views);
-            let camera = Camera::orbit(turned, elevation, radius, view.fov.into(), width, height)?;
-            let path = if view.views == 1 {
-                output.to_owned()
-            } else {
-                numbered(output, i)
-            };
-            Ok((path, camera))
-        })
-        .collect()
-}
-
-/// Draws into a file.
-pub fn draw(
-    renderer: &mut Renderer,
-    gaussians: &Gaussians,
-    camera: &Camera,
-    view: &View,
-    path: &Path,
-) -> b2p::Result<Stats> {
-    let mut image = Image::default();
-    let (channel, limits) = (Channel::Colour, Limits::default());
-    let stats = renderer.draw_into(gaussians, camera, channel, view.background, &limits, &mut image)?;
-    let png = image.to_png()?;
-    output::write_file(path, |w| write(w, &png, path))?;
-    Ok(stats)
-}
-
 /// What a picture took.
 pub fn describe(path: &Path, stats: &Stats) -> String {
     let times = stats.times;
     format!(
-        "{}: {} Gaussians drawn, {} dropped; project {}, bin {}, sort {}, blend {}\n",
+        "{}: {} drawn, {} dropped; project {}, bin {}, sort {}, blend {}\n",
         path.display(),
-        count(stats.visible),
+        counted(stats.visible, "Gaussian"),
         count(stats.dropped.total()),
         milliseconds(times.project),
         milliseconds(times.bin),
@@ -369,14 +382,4 @@ fn numbers(path: &Path, [width, height]: [u32; 2], stats: &Stats) -> serde_json:
             "total": ms(times.total()),
         },
     })
-}
-
-fn numbered(path: &Path, i: u32) -> PathBuf {
-    let mut name = path.file_stem().unwrap_or_default().to_owned();
-    name.push(format!("-{i:03}"));
-    if let Some(ending) = path.extension() {
-        name.push(".");
-        name.push(ending);
-    }
-    path.with_file_name(name)
 }

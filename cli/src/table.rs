@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use b2p::log::Step;
+use serde_json::{Value, json};
 
 /// Lays rows out in columns, the first to the left, the others to the right.
 pub fn table(rows: &[Vec<String>]) -> String {
@@ -61,6 +62,25 @@ pub fn count(n: u64) -> String {
     text
 }
 
+/// A number of things: `1 point`, `2 points`.
+pub fn counted(n: u64, thing: &str) -> String {
+    let ending = if n == 1 { "" } else { "s" };
+    format!("{} {thing}{ending}", count(n))
+}
+
+/// What was done, for programs.
+pub fn steps_json(steps: &[Step]) -> Value {
+    let step = |step: &Step| {
+        json!({
+            "step": step.name,
+            "count": step.count,
+            "unit": step.unit,
+            "ms": step.time.as_secs_f64() * 1e3,
+        })
+    };
+    steps.iter().map(step).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -75,5 +95,7 @@ mod tests {
     fn thousands_are_apart() {
         assert_eq!(count(1_234_567), "1 234 567");
         assert_eq!(count(999), "999");
+        assert_eq!(counted(1, "point"), "1 point");
+        assert_eq!(counted(2000, "point"), "2 000 points");
     }
 }

@@ -97,12 +97,37 @@ pub fn size(text: &str) -> Result<(u32, u32), String> {
     }
 }
 
-pub fn orbit(text: &str) -> Result<[f32; 3], String> {
-    let numbers: Vec<f32> = text
-        .split(',')
-        .map(|t| t.trim().parse().map_err(|_| format!("'{t}' is not a number")))
-        .collect::<Result<_, _>>()?;
-    <[f32; 3]>::try_from(numbers).map_err(|_| "expected three numbers: azimuth,elevation,distance".into())
+/// Where a camera stands: azimuth and elevation in degrees, and its distance if one is given.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Orbit {
+    pub azimuth: f64,
+    pub elevation: f64,
+    pub distance: Option<f64>,
+}
+
+fn numbers(text: &str) -> Result<Vec<f64>, String> {
+    let number = |t: &str| match t.trim().parse() {
+        Ok(number) if f64::is_finite(number) => Ok(number),
+        _ => Err(format!("'{t}' is not a number")),
+    };
+    text.split(',').map(number).collect()
+}
+
+pub fn orbit(text: &str) -> Result<Orbit, String> {
+    let (azimuth, elevation, distance) = match numbers(text)?[..] {
+        [azimuth, elevation] => (azimuth, elevation, None),
+        [azimuth, elevation, distance] => (azimuth, elevation, Some(distance)),
+        _ => return Err("expected two or three numbers: azimuth,elevation or azimuth,elevation,distance".into()),
+    };
+    Ok(Orbit {
+        azimuth,
+        elevation,
+        distance,
+    })
+}
+
+pub fn point(text: &str) -> Result<[f64; 3], String> {
+    <[f64; 3]>::try_from(numbers(text)?).map_err(|_| "expected three numbers: x,y,z".into())
 }
 
 pub fn effect(text: &str) -> Result<(Effect, Choice), String> {
@@ -137,7 +162,14 @@ mod tests {
     fn values_are_read_as_written() {
         assert_eq!(levels("7..9"), Ok(7..=9));
         assert_eq!(size("640x480"), Ok((640, 480)));
-        assert_eq!(orbit("-30, 10,2.5"), Ok([-30.0, 10.0, 2.5]));
+        let from = |azimuth, elevation, distance| Orbit {
+            azimuth,
+            elevation,
+            distance,
+        };
+        assert_eq!(orbit("-30, 10,2.5"), Ok(from(-30.0, 10.0, Some(2.5))));
+        assert_eq!(orbit("20,-5"), Ok(from(20.0, -5.0, None)));
+        assert_eq!(point("1,-2,3e5"), Ok([1.0, -2.0, 3e5]));
         assert_eq!(hex("#ff0080"), Some([255, 0, 128]));
         assert_eq!(bits_per_point("0.25"), Ok(0.25));
         assert_eq!(bytes("512"), Ok(512));
@@ -156,7 +188,8 @@ mod tests {
         }
         assert!(step("0").unwrap_err().contains("0.5") && step("8,inf").is_err());
         assert!(size("0x4").unwrap_err().contains("1024x1024"));
-        assert!(orbit("1,2").unwrap_err().contains("three"));
+        assert!(orbit("1").unwrap_err().contains("three"));
+        assert!(orbit("1,inf").is_err() && point("1,2").is_err());
         assert!(effect("antialias").unwrap_err().contains("antialias=on"));
         assert!(effect("glow=on").unwrap_err().contains("glow"));
         assert!(effect("antialias=maybe").is_err());

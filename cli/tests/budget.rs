@@ -15,16 +15,19 @@ fn b2p(folder: &Path, arguments: &[&str]) -> Output {
         .current_dir(folder)
         .env("XDG_CACHE_HOME", folder.join("cache"))
         .args(arguments)
+        .arg("--force")
         .output()
         .expect("the program starts")
 }
 
+/// The report of a command that must succeed, without warnings.
 #[track_caller]
 fn succeeds(folder: &Path, arguments: &[&str]) -> String {
     let output = b2p(folder, arguments);
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{arguments:?} failed: {errors}");
-    String::from_utf8(output.stdout).expect("output is UTF-8")
+    let report = errors.lines().filter(|line| !line.starts_with("b2p: "));
+    report.map(|line| format!("{line}\n")).collect()
 }
 
 /// A folder with `ball.b2p`, and a small model `tiny.safetensors` that it is coded with.

@@ -104,7 +104,9 @@ fn sample(count: usize, harmonics: usize) -> Gaussians {
         g.colour.push([0; 3].map(|_| random()));
     }
     // Few of them, which a palette holds exactly.
-    let few: Vec<[f32; 3]> = (0..5 * harmonics).map(|_| [0; 3].map(|_| 0.8 * random() - 0.4)).collect();
+    let few: Vec<[f32; 3]> = (0..5 * harmonics)
+        .map(|_| [0; 3].map(|_| 0.8 * random() - 0.4))
+        .collect();
     let own = |i: usize| few[i % 5 * harmonics..][..harmonics].to_vec();
     g.harmonics.coefficients = (0..count).flat_map(own).collect();
     g.harmonics.count = harmonics;

@@ -24,11 +24,15 @@ mod norms;
 mod plan;
 mod rows;
 mod simd;
+#[cfg(feature = "startup")]
+mod startup;
 mod taps;
 mod tile;
 mod winograd;
 
+pub mod butterflies;
 pub mod ceiling;
+pub mod coefficients;
 pub mod hidden;
 pub mod mixing;
 pub mod reference;
@@ -46,4 +50,6 @@ pub use memory::{Zeros, give_back, zeros};
 pub use plan::Plan;
 pub use rows::Output;
 pub use simd::{Isa, Scalar, Simd as Instructions, UnknownIsa, Work};
+#[cfg(feature = "startup")]
+pub use startup::stdout_was_closed;
 pub use taps::{ABSENT, Taps};

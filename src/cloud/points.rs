@@ -4,7 +4,8 @@ use std::path::Path;
 
 use super::malformed;
 use super::ply::{Column, Ply, Scalar, Values};
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::input;
 use crate::limits::Limits;
 use crate::placement::Placement;
 
@@ -35,14 +36,7 @@ impl PointCloud {
     /// # Errors
     /// [`Error::Io`], [`Error::LimitExceeded`] for a file that is too large, and those of [`PointCloud::from_ply`].
     pub fn open(path: impl AsRef<Path>, limits: &Limits) -> Result<Self> {
-        let path = path.as_ref();
-        let failed = |source| Error::Io {
-            path: path.to_owned(),
-            source,
-        };
-        let size = std::fs::metadata(path).map_err(failed)?.len();
-        limits.check_bytes("size of the PLY file", size)?;
-        Self::from_ply(&std::fs::read(path).map_err(failed)?, limits)
+        Self::from_ply(&input::read_file(path.as_ref(), limits)?, limits)
     }
 
     /// Reads a PLY file from memory.

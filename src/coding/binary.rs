@@ -5,19 +5,15 @@
 
 #[cfg(feature = "encoder")]
 use std::borrow::Borrow;
-use std::convert::Infallible;
+#[cfg(feature = "encoder")]
 use std::num::NonZeroU16;
 
-use constriction::Queue;
-use constriction::backends::ReadWords;
 #[cfg(feature = "encoder")]
 use constriction::stream::Encode;
 #[cfg(feature = "encoder")]
-use constriction::stream::model::EncoderModel;
-use constriction::stream::model::{DecoderModel, EntropyModel};
+use constriction::stream::model::{EncoderModel, EntropyModel};
 #[cfg(feature = "encoder")]
 use constriction::stream::queue::RangeEncoder;
-use constriction::stream::{Decode, queue::RangeDecoder};
 
 use super::ONE;
 use crate::error::{Error, Result, Stage};
@@ -34,14 +30,17 @@ pub(crate) trait Coder {
 }
 
 /// The distribution of one decision.
+#[cfg(feature = "encoder")]
 #[derive(Clone, Copy)]
 struct Decision(u16);
 
+#[cfg(feature = "encoder")]
 impl EntropyModel<PRECISION> for Decision {
     type Symbol = bool;
     type Probability = u16;
 }
 
+#[cfg(feature = "encoder")]
 impl Decision {
     #[inline(always)]
     fn interval(self, bit: bool) -> (u16, NonZeroU16) {
@@ -58,15 +57,6 @@ impl EncoderModel<PRECISION> for Decision {
     #[inline(always)]
     fn left_cumulative_and_probability(&self, bit: impl Borrow<bool>) -> Option<(u16, NonZeroU16)> {
         Some(self.interval(*bit.borrow()))
-    }
-}
-
-impl DecoderModel<PRECISION> for Decision {
-    #[inline(always)]
-    fn quantile_function(&self, quantile: u16) -> (bool, u16, NonZeroU16) {
-        let bit = quantile >= self.0.wrapping_neg();
-        let (start, size) = self.interval(bit);
-        (bit, start, size)
     }
 }
 
@@ -96,45 +86,43 @@ impl Coder for Encoder {
     }
 }
 
-/// Little-endian words; zeros after the last.
-#[derive(Debug)]
-struct Words<'a> {
-    bytes: &'a [u8],
-    next: usize,
-}
-
-impl ReadWords<u32, Queue> for Words<'_> {
-    type ReadError = Infallible;
-
-    #[inline(always)]
-    fn read(&mut self) -> Result<Option<u32>, Infallible> {
-        let word = self.bytes.get(4 * self.next..).and_then(|rest| rest.first_chunk());
-        self.next += 1;
-        Ok(Some(word.map_or(0, |word| u32::from_le_bytes(*word))))
-    }
-
-    fn maybe_exhausted(&self) -> bool {
-        4 * self.next >= self.bytes.len()
-    }
-}
-
 /// Reads decisions. Past the end it reads zeros, and [`Decoder::finish`] says so.
+///
+/// It reads what [`RangeDecoder`] reads (a test compares them), with a multiplication in place of its division.
+///
+/// [`RangeDecoder`]: constriction::stream::queue::RangeDecoder
 #[derive(Debug)]
 pub(crate) struct Decoder<'a> {
-    coder: RangeDecoder<u32, u64, Words<'a>>,
-    words: usize,
+    bytes: &'a [u8],
+    /// Number of words read, those past the end included.
+    read: usize,
+    /// `point − lower` of the format, always below `range`.
+    offset: u64,
+    range: u64,
     damaged: bool,
 }
 
 impl<'a> Decoder<'a> {
     /// Reads `bytes`.
     pub fn new(bytes: &'a [u8]) -> Self {
-        let Ok(coder) = RangeDecoder::with_backend(Words { bytes, next: 0 });
-        Decoder {
-            coder,
-            words: bytes.len().div_ceil(4),
+        let mut decoder = Decoder {
+            bytes,
+            read: 0,
+            offset: 0,
+            range: u64::MAX,
             damaged: !bytes.len().is_multiple_of(4),
-        }
+        };
+        decoder.offset = decoder.word() << 32;
+        decoder.offset |= decoder.word();
+        decoder
+    }
+
+    /// The next word, little-endian.
+    #[inline(always)]
+    fn word(&mut self) -> u64 {
+        let word = self.bytes.get(4 * self.read..).and_then(|rest| rest.first_chunk());
+        self.read += 1;
+        word.map_or(0, |word| u32::from_le_bytes(*word)).into()
     }
 
     /// Sees that everything was read, and no more.
@@ -142,18 +130,12 @@ impl<'a> Decoder<'a> {
     /// # Errors
     /// [`Error::Malformed`] if not, with `at` as the place.
     pub fn finish(self, at: &str) -> Result<()> {
-        let (Words { next: read, .. }, ..) = self.coder.into_raw_parts();
-        if !self.damaged && (self.words..=self.words + LOOKAHEAD).contains(&read) {
+        let (words, read) = (self.bytes.len().div_ceil(4), self.read);
+        if !self.damaged && (words..=words + LOOKAHEAD).contains(&read) {
             return Ok(());
         }
         let expected = format!("{} to {read} of 4 bytes", read.saturating_sub(LOOKAHEAD));
-        Err(Error::malformed(
-            Stage::Colour,
-            at,
-            "number of words",
-            self.words,
-            expected,
-        ))
+        Err(Error::malformed(Stage::Colour, at, "number of words", words, expected))
     }
 }
 
@@ -161,13 +143,21 @@ impl Coder for Decoder<'_> {
     #[inline(always)]
     fn code(&mut self, _: bool, one: u32) -> bool {
         debug_assert!(0 < one && one < ONE);
-        match self.coder.decode_symbol(Decision(one as u16)) {
-            Ok(bit) => bit,
-            Err(_) => {
-                self.damaged = true;
-                false
-            }
+        let scale = self.range >> PRECISION;
+        if self.offset >= scale << PRECISION {
+            self.damaged = true;
+            return false;
         }
+        let zero = u64::from(ONE - one);
+        let split = scale * zero;
+        let bit = self.offset >= split;
+        self.offset -= if bit { split } else { 0 };
+        self.range = scale * if bit { one.into() } else { zero };
+        if self.range < 1 << 32 {
+            self.range <<= 32;
+            self.offset = self.offset << 32 | self.word();
+        }
+        bit
     }
 }
 
@@ -175,7 +165,18 @@ impl Coder for Decoder<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use constriction::stream::model::DecoderModel;
+    use constriction::stream::{Decode, queue::RangeDecoder};
     use proptest::prelude::*;
+
+    impl DecoderModel<PRECISION> for Decision {
+        #[inline(always)]
+        fn quantile_function(&self, quantile: u16) -> (bool, u16, NonZeroU16) {
+            let bit = quantile >= self.0.wrapping_neg();
+            let (start, size) = self.interval(bit);
+            (bit, start, size)
+        }
+    }
 
     fn decisions() -> impl Strategy<Value = Vec<(bool, u32)>> {
         let one = prop_oneof![1..ONE, Just(1), Just(ONE - 1), Just(ONE / 2)];
@@ -203,6 +204,25 @@ mod tests {
         fn what_was_written_is_read(decisions in decisions()) {
             let read = decode(&encode(&decisions), &decisions).unwrap();
             prop_assert!(read.iter().eq(decisions.iter().map(|(bit, _)| bit)));
+        }
+
+        #[test]
+        fn any_words_decode_as_constriction_decodes_them(
+            words in prop::collection::vec(any::<u32>(), 0..16), decisions in decisions()
+        ) {
+            let bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+            let mut reference = RangeDecoder::<u32, u64, _>::from_compressed(words).unwrap();
+            let mut decoder = Decoder::new(&bytes);
+            for (_, one) in decisions {
+                let bit = decoder.code(false, one);
+                match reference.decode_symbol(Decision(one as u16)) {
+                    Ok(expected) => prop_assert_eq!(bit, expected),
+                    Err(_) => {
+                        prop_assert!(decoder.damaged);
+                        break;
+                    }
+                }
+            }
         }
 
         #[test]

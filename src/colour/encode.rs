@@ -172,7 +172,7 @@ pub fn encode_level(
     };
     let ranges: Vec<_> = slices(nodes.masks.len(), slice).collect();
     let (payloads, coded): (Vec<_>, Vec<_>) = ranges.into_par_iter().map(encode).unzip();
-    (payloads, join(nodes, coded))
+    (payloads, join(isa, nodes, coded))
 }
 
 /// Above this magnitude coefficients are rounded to the nearest integer, without RDOQ.
@@ -195,14 +195,14 @@ impl RdoEncoder {
     /// The magnitude that minimises squared error + λ · bits. Candidates are the nearest integer, the one below it, and
     /// 0.
     #[inline(always)]
-    fn quantise(&self, model: &Model, c: &CoefficientContext, target: f32) -> i32 {
+    fn quantise<I: Instructions>(&self, simd: I, model: &Model, c: &CoefficientContext, target: f32) -> i32 {
         let nearest = target.round();
         if nearest == 0.0 || nearest > LARGE || self.lambda == 0.0 {
             return nearest as i32;
         }
         let mut bits = [0.0; LARGE as usize + 1];
         let bits = &mut bits[..=nearest as usize];
-        estimate_bits(model, c, bits);
+        estimate_bits(simd, model, c, bits);
         let cost = |value: i32| {
             let sign = if value == 0 { 0.0 } else { 1.0 };
             let error = target - value as f32;
@@ -219,11 +219,11 @@ impl RdoEncoder {
 
 /// Estimates the bits of each magnitude 0 to `costs.len() − 1`, without the sign. All are below the escape.
 #[inline(always)]
-fn estimate_bits(model: &Model, c: &CoefficientContext, costs: &mut [f32]) {
-    let unit = model.unit_logit(c);
+fn estimate_bits<I: Instructions>(simd: I, model: &Model, c: &CoefficientContext, costs: &mut [f32]) {
+    let decisions = model.magnitude(simd, c);
     let mut sum = 0.0;
     for (magnitude, cost) in costs.iter_mut().enumerate() {
-        let one = model.predict(c, unit, magnitude.min(BINS - 1)).one as f32 / ONE as f32;
+        let one = model.predict(simd, &decisions, magnitude.min(BINS - 1)).one as f32 / ONE as f32;
         *cost = sum - (1.0 - one).log2();
         sum -= one.log2();
     }
@@ -231,16 +231,23 @@ fn estimate_bits(model: &Model, c: &CoefficientContext, costs: &mut [f32]) {
 
 impl CoefficientCoder for RdoEncoder {
     #[inline(always)]
-    fn coefficient(&mut self, model: &mut Model, c: &CoefficientContext, target: i32, quantiser: Quantiser) -> i32 {
+    fn coefficient<I: Instructions>(
+        &mut self,
+        simd: I,
+        model: &mut Model,
+        c: &CoefficientContext,
+        target: i32,
+        quantiser: Quantiser,
+    ) -> i32 {
         let Quantiser { scale, unit } = quantiser;
         let exact = unit == 1;
         let steps = target.unsigned_abs() as f32 * scale.forward as f32 / (4096.0 * unit as f32);
         let chosen = if exact {
             target.abs()
         } else {
-            self.quantise(model, c, steps)
+            self.quantise(simd, model, c, steps)
         };
-        model.code(&mut self.encoder, c, if target < 0 { -chosen } else { chosen })
+        model.code(simd, &mut self.encoder, c, if target < 0 { -chosen } else { chosen })
     }
 }
 

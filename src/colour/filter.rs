@@ -206,13 +206,21 @@ impl Responses {
     #[inline(always)]
     pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], map: &KernelMap, voxel: usize) -> Terms {
         let (own, row) = (&values[voxel], map.row(voxel));
-        let sum = |offsets: &[usize]| responses(instructions, values, own, row, offsets, &self.inverses);
-        let (faces, face_count) = sum(&FACES);
-        let (edges, edge_count) = sum(&EDGES);
-        let (corners, corner_count) = sum(&CORNERS);
+        // An absent neighbour is replaced by the voxel itself, to which there is no response: no branches, for the
+        // presence of neighbours is unpredictable.
+        let mut filled = [voxel as u32; 27];
+        for (to, &q) in filled.iter_mut().zip(row) {
+            *to = if q == KernelMap::ABSENT { *to } else { q };
+        }
+        let sum = |offsets: &[usize]| responses(instructions, values, own, &filled, offsets, &self.inverses).0;
+        let (faces, edges, corners) = (sum(&FACES), sum(&EDGES), sum(&CORNERS));
         let [face, edge, corner] = CLASS_WEIGHTS;
-        let counts = face_count * face + edge_count * edge + corner_count * corner;
-        let inverse = (1 << 16) / i64::from(counts.max(1));
+        let count = |offsets: &[usize]| {
+            let present = offsets.iter().map(|k| i32::from(row[*k] != KernelMap::ABSENT));
+            present.sum::<i32>()
+        };
+        let counts = count(&FACES) * face + count(&EDGES) * edge + count(&CORNERS) * corner;
+        let inverse = i64::from((1u32 << 16) / counts.max(1) as u32);
         let mean = |sum: i32| ((i64::from(sum) * inverse) >> 14) as i32;
         std::array::from_fn(|t| {
             [

@@ -161,7 +161,7 @@ fn trunk<'t, S: CoefficientCoder>(
             coding,
             truth: truth(level as u8),
         });
-        let energies = spread_energies(nodes, &coded.energies);
+        let energies = spread_energies(isa, nodes, &coded.energies);
         colours = LevelColours {
             steps: coding.steps,
             values: coded.values,
@@ -242,11 +242,11 @@ pub fn decode_level(
     let tasks: Vec<_> = ranges.zip(payloads).collect();
     // Collect all results first: the error returned is that of the first faulty slice, with any number of threads.
     let coded: Vec<Result<_>> = tasks.into_par_iter().map(decode).collect();
-    Ok(join(nodes, coded.into_iter().collect::<Result<_>>()?))
+    Ok(join(isa, nodes, coded.into_iter().collect::<Result<_>>()?))
 }
 
 /// Concatenates the slices of a level.
-fn join(nodes: Nodes<'_>, slices: Vec<(Steps, block::CodedSlice, Model)>) -> LevelColours {
+fn join(isa: Isa, nodes: Nodes<'_>, slices: Vec<(Steps, block::CodedSlice, Model)>) -> LevelColours {
     let (mut values, mut energies) = (Vec::new(), Vec::new());
     let mut first = None;
     for (steps, coded, model) in slices {
@@ -256,7 +256,7 @@ fn join(nodes: Nodes<'_>, slices: Vec<(Steps, block::CodedSlice, Model)>) -> Lev
     }
     // A level has at least one node, hence at least one slice.
     let (steps, model) = first.unwrap_or_else(|| (Steps::LOSSLESS, Model::empty()));
-    let energies = spread_energies(nodes, &energies);
+    let energies = spread_energies(isa, nodes, &energies);
     LevelColours {
         steps,
         values,
@@ -341,27 +341,79 @@ fn read_coding<'a>(payload: &Slice<'a>, header: usize) -> Result<(Coding, &'a [u
 }
 
 /// Coefficient energies of a level's nodes, smoothed over their neighbours and copied to each child.
-fn spread_energies(nodes: Nodes<'_>, energies: &[[u8; 3]]) -> Vec<[u8; 3]> {
-    /// By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
-    const WEIGHTS: [u32; 4] = [40, 15, 7, 3];
-    let smoothed = (0..energies.len()).into_par_iter().map(|node| {
-        let (mut sums, mut weight) = ([0u32; 3], 0);
-        for (k, &neighbour) in nodes.map.row(node).iter().enumerate() {
-            if neighbour != KernelMap::ABSENT {
+fn spread_energies(isa: Isa, nodes: Nodes<'_>, energies: &[[u8; 3]]) -> Vec<[u8; 3]> {
+    /// Nodes per task.
+    const BLOCK: usize = 2048;
+    // The last one stands for absent neighbours.
+    let mut padded = vec![[0; 4]; energies.len() + 1];
+    for (to, &[y, co, cg]) in padded.iter_mut().zip(energies) {
+        *to = [y.into(), co.into(), cg.into(), 1];
+    }
+    let count = |masks: &[u8]| masks.iter().map(|mask| mask.count_ones() as usize).sum::<usize>();
+    let mut spread = vec![[0; 3]; count(nodes.masks)];
+    let mut tasks = Vec::with_capacity(nodes.masks.len().div_ceil(BLOCK));
+    let mut rest = &mut spread[..];
+    for (masks, rows) in nodes.masks.chunks(BLOCK).zip(nodes.map.rows().chunks(27 * BLOCK)) {
+        let (out, after) = rest.split_at_mut(count(masks));
+        tasks.push((masks, rows, out));
+        rest = after;
+    }
+    let energies = &padded[..];
+    tasks.into_par_iter().for_each(|(masks, rows, out)| {
+        isa.run(Smooth {
+            energies,
+            rows,
+            masks,
+            out,
+        })
+    });
+    spread
+}
+
+/// Smooths the energies of consecutive nodes and copies them to their children.
+struct Smooth<'a> {
+    /// Energies of Y, Co and Cg, and 1, of every node, then zeros.
+    energies: &'a [[u16; 4]],
+    /// Kernel map rows of the nodes.
+    rows: &'a [u32],
+    masks: &'a [u8],
+    out: &'a mut [[u8; 3]],
+}
+
+impl Work for Smooth<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        /// By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
+        const WEIGHTS: [u32; 4] = [40, 15, 7, 3];
+        let absent = self.energies.len() - 1;
+        let mut out = self.out.iter_mut();
+        for (row, mask) in self.rows.chunks_exact(27).zip(self.masks) {
+            let mut by_axes = [[0u16; 4]; 4];
+            for (k, &neighbour) in row.iter().enumerate() {
                 let axes = usize::from(k % 3 != 1) + usize::from(k / 3 % 3 != 1) + usize::from(k / 9 != 1);
-                for (sum, energy) in sums.iter_mut().zip(energies[neighbour as usize]) {
-                    *sum += WEIGHTS[axes] * u32::from(energy);
+                // No branch: the presence of neighbours is unpredictable.
+                let energies = &self.energies[absent.min(neighbour as usize)];
+                for (sum, energy) in by_axes[axes].iter_mut().zip(energies) {
+                    *sum += energy;
                 }
-                weight += WEIGHTS[axes];
+            }
+            let mut sums = [0; 4];
+            for (by_axes, weight) in by_axes.iter().zip(WEIGHTS) {
+                for (sum, energy) in sums.iter_mut().zip(by_axes) {
+                    *sum += weight * u32::from(*energy);
+                }
+            }
+            let [y, co, cg, weight] = sums;
+            let smoothed = [y, co, cg].map(|sum| (sum / weight.max(1)) as u8);
+            for _ in 0..mask.count_ones() {
+                if let Some(to) = out.next() {
+                    *to = smoothed;
+                }
             }
         }
-        sums.map(|sum| (sum / weight.max(1)) as u8)
-    });
-    let smoothed: Vec<[u8; 3]> = smoothed.collect();
-    let children = smoothed.iter().zip(nodes.masks);
-    children
-        .flat_map(|(energy, mask)| std::iter::repeat_n(*energy, mask.count_ones() as usize))
-        .collect()
+    }
 }
 
 /// Decodes coefficients from an entropy stream.
@@ -369,8 +421,15 @@ struct EntropyDecoder<'a>(Decoder<'a>);
 
 impl CoefficientCoder for EntropyDecoder<'_> {
     #[inline(always)]
-    fn coefficient(&mut self, model: &mut Model, c: &CoefficientContext, _: i32, _: Quantiser) -> i32 {
-        model.code(&mut self.0, c, 0)
+    fn coefficient<I: Instructions>(
+        &mut self,
+        simd: I,
+        model: &mut Model,
+        c: &CoefficientContext,
+        _: i32,
+        _: Quantiser,
+    ) -> i32 {
+        model.code(simd, &mut self.0, c, 0)
     }
 }
 
@@ -388,7 +447,7 @@ impl<S: CoefficientCoder> Work for CodeSlice<'_, S> {
     type Output = block::CodedSlice;
 
     #[inline(always)]
-    fn run<I: Instructions>(self, _: I) -> block::CodedSlice {
+    fn run<I: Instructions>(self, simd: I) -> block::CodedSlice {
         let CodeSlice {
             coder,
             model,
@@ -397,7 +456,7 @@ impl<S: CoefficientCoder> Work for CodeSlice<'_, S> {
             coding,
             truth,
         } = self;
-        block::code(coder, model, nodes, range, coding, truth)
+        block::code(simd, coder, model, nodes, range, coding, truth)
     }
 }
 

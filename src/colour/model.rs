@@ -5,11 +5,14 @@
 //! adds a prediction from continuous features. A mixer combines the logits of all with the sum of three weight vectors,
 //! each selected by a part of the context. All numbers are integers; logits are in units of 1/64.
 
+use b2p_kernels::Instructions;
+use b2p_kernels::coefficients::{
+    CONTEXTS, COUNT_BITS, LANES, Lanes, MAX_COUNT, MAX_WEIGHT, Mixed, Slots, adapt, adapt_unit, dot, mix,
+};
+
 use crate::coding::probability::{STRETCH, squash};
 use crate::coding::{ONE, binary::Coder};
 
-/// Number of contexts of a magnitude decision.
-const CONTEXTS: usize = 8;
 /// Number of contexts of a sign.
 const SIGN_CONTEXTS: usize = 4;
 /// Number of decisions of a magnitude with probabilities of their own: > 0, > 1, …; the last one serves all that
@@ -19,19 +22,10 @@ pub(super) const BINS: usize = 7;
 const ESCAPE: i32 = 18;
 /// Maximum number of leading ones of such a code.
 const MAX_PREFIX: u32 = 20;
-/// Lanes of a mixer: the contexts, half the logit of the logistic unit, a constant, then zeros.
-const LANES: usize = 16;
+/// Lane of a mixer for half the logit of the logistic unit. The next one is a constant.
 const UNIT_LANE: usize = CONTEXTS;
-const BIAS_LANE: usize = CONTEXTS + 1;
-/// Maximum magnitude of a weight, so that three sets of ten products fit in 32 bits.
-const MAX_WEIGHT: i32 = 1 << 16;
-/// Number of inputs of the logistic unit.
+/// Number of inputs of the logistic unit. Zeros follow in its lanes.
 pub(super) const FEATURES: usize = 12;
-
-/// Bits of a slot that hold its count. The bits above hold the probability of a 1 in units of 2⁻²².
-const COUNT_BITS: u32 = 10;
-/// The count saturates here.
-const MAX_COUNT: u32 = 120;
 
 /// Adaptation rate of a slot by its count, in units of 2⁻¹⁶: `65536·5 / (5·count + 8)`, rounded down.
 static RATE: [u32; MAX_COUNT as usize + 1] = {
@@ -110,7 +104,7 @@ pub(super) struct CoefficientContext {
     /// Class of the slot's scale `√(vw / (v + w))`: 0 to 3.
     pub weight_class: usize,
     /// Inputs of the logistic unit.
-    pub features: [i32; FEATURES],
+    pub features: Lanes,
     /// Context of the sign.
     pub sign: SignContext,
 }
@@ -167,13 +161,11 @@ const SIGN_STARTS: [usize; SIGN_CONTEXTS + 1] = {
 /// Number of classes of the unit's logit that select mixer weights.
 const LOGIT_CLASSES: usize = 12;
 
-/// Class of a logarithm, 0 to `classes − 1`, each `width` eighths of an octave wide.
+/// Class of a logarithm of at least 0: 0 to `classes − 1`, each `width` eighths of an octave wide.
 #[inline(always)]
-fn class(log: i32, width: i32, classes: i32) -> usize {
-    (log / width).clamp(0, classes - 1) as usize
+fn class(log: i32, width: u32, classes: u32) -> usize {
+    (log as u32 / width).min(classes - 1) as usize
 }
-
-type Lanes = [i32; LANES];
 
 /// Adaptive state of the coefficient coder.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -191,7 +183,7 @@ pub(super) struct Model {
     /// Mixer weights of signs by channel.
     sign_weights: [[i32; 8]; 3],
     /// Weights of the logistic unit of each channel.
-    units: [[i32; FEATURES]; 3],
+    units: [Lanes; 3],
     /// Number of adaptations of each unit, at most 4096.
     adaptations: [u32; 3],
     /// Regressions of Co and Cg on Y.
@@ -210,10 +202,21 @@ pub(super) struct ChromaFromLuma {
 /// Prediction of one decision, with what [`Model::adapt`] needs afterwards.
 pub(super) struct Prediction {
     at: [usize; CONTEXTS],
-    inputs: Lanes,
+    mixed: Mixed,
     sets: [usize; 3],
     /// Probability of a 1 in units of 2⁻¹⁶.
     pub one: u32,
+}
+
+/// What all decisions of a magnitude share.
+pub(super) struct Magnitude {
+    /// Logit of the channel's logistic unit, −640 to 640.
+    unit: i32,
+    /// Of every context, the slot of the first decision of a group of [`CONTEXT_SIZES`].
+    offsets: [usize; CONTEXTS],
+    /// The second and third set of mixer weights of the first decision.
+    sets: [usize; 2],
+    first_decision: usize,
 }
 
 impl Model {
@@ -231,7 +234,7 @@ impl Model {
             by_logit: Vec::new(),
             by_channels: Vec::new(),
             sign_weights: [[0; 8]; 3],
-            units: [[0; FEATURES]; 3],
+            units: [[0; LANES]; 3],
             adaptations: [0; 3],
             chroma_from_luma: [ChromaFromLuma::default(); 2],
         }
@@ -249,95 +252,83 @@ impl Model {
             by_logit: vec![weights; DECISIONS * LOGIT_CLASSES],
             by_channels: vec![weights; DECISIONS * 12],
             sign_weights: [[24_000, 24_000, 24_000, 24_000, 0, 0, 0, 0]; 3],
-            units: [[0; FEATURES]; 3],
+            units: [[0; LANES]; 3],
             adaptations: [0; 3],
             chroma_from_luma: [ChromaFromLuma::default(); 2],
         }
     }
 
-    /// Logit of the channel's logistic unit, −640 to 640.
+    /// Prepares the decisions of a magnitude.
     #[inline(always)]
-    pub fn unit_logit(&self, c: &CoefficientContext) -> i32 {
-        let sum = self.units[c.channel]
-            .iter()
-            .zip(c.features)
-            .fold(0i32, |sum, (w, x)| sum.wrapping_add(w.wrapping_mul(x)));
-        (sum >> 16).clamp(-640, 640)
+    pub fn magnitude<I: Instructions>(&self, simd: I, c: &CoefficientContext) -> Magnitude {
+        let unit = (dot(simd, &self.units[c.channel], &c.features) >> 16).clamp(-640, 640);
+        let significant = usize::from(c.luma > 0) * 2 + usize::from(c.co > 0);
+        let logit_class = ((unit + 640) as u32 * 48 / 1281) as usize;
+        Magnitude {
+            unit,
+            offsets: [
+                (c.axis * 7 + c.children - 2) * 7 + c.neighbour_magnitudes,
+                class(c.gradient, 8, 9) * 9 + class(c.near, 8, 9),
+                (class(c.near, 5, 14) * 3 + c.axis) * 4 + c.weight_class,
+                ((class(c.energy, 8, 7) * 7 + class(c.gradient, 10, 7)) * 4 + c.luma) * 4 + c.co,
+                logit_class,
+                ((c.luma * 4 + c.co) * 8 + class(c.block, 8, 8)) * 7 + c.neighbour_magnitudes,
+                ((logit_class / 2 * 3 + c.axis) * 4 + (c.children - 2).min(3)) * 4 + significant,
+                (class(c.far, 8, 9) * 9 + class(c.cross_channel, 8, 9)) * 4 + significant,
+            ],
+            sets: [logit_class / 4, c.axis * 4 + significant],
+            first_decision: c.channel * BINS,
+        }
     }
 
-    /// Predicts decision `bin` of a magnitude. `unit` is the result of [`Model::unit_logit`].
+    /// Predicts decision `bin` of a magnitude.
     #[inline(always)]
-    pub fn predict(&self, c: &CoefficientContext, unit: i32, bin: usize) -> Prediction {
-        let decision = c.channel * BINS + bin;
-        let significant = usize::from(c.luma > 0) * 2 + usize::from(c.co > 0);
-        let logit_class = ((unit + 640) * 48 / 1281) as usize;
-        let offsets = [
-            (c.axis * 7 + c.children - 2) * 7 + c.neighbour_magnitudes,
-            class(c.gradient, 8, 9) * 9 + class(c.near, 8, 9),
-            (class(c.near, 5, 14) * 3 + c.axis) * 4 + c.weight_class,
-            ((class(c.energy, 8, 7) * 7 + class(c.gradient, 10, 7)) * 4 + c.luma) * 4 + c.co,
-            logit_class,
-            ((c.luma * 4 + c.co) * 8 + class(c.block, 8, 8)) * 7 + c.neighbour_magnitudes,
-            ((logit_class / 2 * 3 + c.axis) * 4 + (c.children - 2).min(3)) * 4 + significant,
-            (class(c.far, 8, 9) * 9 + class(c.cross_channel, 8, 9)) * 4 + significant,
-        ];
-        let (mut at, mut inputs) = ([0; CONTEXTS], [0; LANES]);
+    pub fn predict<I: Instructions>(&self, simd: I, magnitude: &Magnitude, bin: usize) -> Prediction {
+        let decision = magnitude.first_decision + bin;
+        let (mut at, mut slots): (_, Slots) = ([0; CONTEXTS], [0; CONTEXTS]);
         for i in 0..CONTEXTS {
-            at[i] = CONTEXT_STARTS[i] + decision * CONTEXT_SIZES[i] + offsets[i];
-            inputs[i] = slot_input(self.slots[at[i]]);
+            at[i] = CONTEXT_STARTS[i] + decision * CONTEXT_SIZES[i] + magnitude.offsets[i];
+            slots[i] = self.slots[at[i]];
         }
-        inputs[UNIT_LANE] = unit / 2;
-        inputs[BIAS_LANE] = 64;
+        let [by_logit, by_channels] = magnitude.sets;
         let sets = [
             decision,
-            decision * LOGIT_CLASSES + logit_class / 4,
-            decision * 12 + c.axis * 4 + significant,
+            decision * LOGIT_CLASSES + by_logit,
+            decision * 12 + by_channels,
         ];
         let weights = [
             &self.by_decision[sets[0]],
             &self.by_logit[sets[1]],
             &self.by_channels[sets[2]],
         ];
-        let mut sum = 0i32;
-        for lane in 0..LANES {
-            let weight = weights[0][lane] + weights[1][lane] + weights[2][lane];
-            sum = sum.wrapping_add(weight.wrapping_mul(inputs[lane]));
-        }
-        let one = squash(sum >> 16).clamp(24, ONE - 24);
-        Prediction { at, inputs, sets, one }
+        let mixed = mix(simd, &slots, [magnitude.unit / 2, BIAS], &STRETCH, weights);
+        let one = squash(mixed.sum >> 16).clamp(24, ONE - 24);
+        Prediction { at, mixed, sets, one }
     }
 
     /// Updates slots and mixer weights with the coded `bit`.
     #[inline(always)]
-    fn adapt(&mut self, prediction: &Prediction, bit: bool) {
+    fn adapt<I: Instructions>(&mut self, simd: I, prediction: &Prediction, bit: bool) {
         let error = if bit { ONE as i32 } else { 0 } - prediction.one as i32;
-        for at in prediction.at {
-            adapt_slot(&mut self.slots[at], bit);
-        }
         let sets = [
             &mut self.by_decision[prediction.sets[0]],
             &mut self.by_logit[prediction.sets[1]],
             &mut self.by_channels[prediction.sets[2]],
         ];
-        for weights in sets {
-            for (weight, input) in weights.iter_mut().zip(prediction.inputs) {
-                let step = (error * input * MIXER_RATE + (1 << 15)) >> 16;
-                *weight = (*weight + step).clamp(-MAX_WEIGHT, MAX_WEIGHT);
-            }
+        let slots = adapt(simd, &prediction.mixed, error, bit, sets);
+        for (at, slot) in prediction.at.into_iter().zip(slots) {
+            self.slots[at] = slot;
         }
     }
 
     /// Updates the logistic unit with the coded `bit` of the first decision.
     #[inline(always)]
-    fn adapt_unit(&mut self, c: &CoefficientContext, unit: i32, bit: bool) {
+    fn adapt_unit<I: Instructions>(&mut self, simd: I, c: &CoefficientContext, unit: i32, bit: bool) {
         let t = c.channel;
         let error = if bit { ONE as i32 } else { 0 } - squash(unit) as i32;
         self.adaptations[t] = (self.adaptations[t] + 1).min(1 << 12);
         let rate = UNIT_RATE + (UNIT_RATE_START >> (self.adaptations[t] >> 6).min(12));
-        for (weight, x) in self.units[t].iter_mut().zip(c.features) {
-            *weight += ((error >> 4) * x * rate) >> 8;
-            *weight = (*weight).clamp(-(1 << 20), 1 << 20);
-        }
+        adapt_unit(simd, &mut self.units[t], &c.features, [error >> 4, rate], 1 << 20);
     }
 
     /// Indices of the slots of a sign.
@@ -381,17 +372,23 @@ impl Model {
     /// Codes a coefficient and adapts to it. An encoder codes and returns `value`; a decoder ignores it and returns the
     /// decoded coefficient.
     #[inline(always)]
-    pub fn code<C: Coder>(&mut self, coder: &mut C, c: &CoefficientContext, value: i32) -> i32 {
-        let unit = self.unit_logit(c);
+    pub fn code<I: Instructions, C: Coder>(
+        &mut self,
+        simd: I,
+        coder: &mut C,
+        c: &CoefficientContext,
+        value: i32,
+    ) -> i32 {
+        let decisions = self.magnitude(simd, c);
         let wanted = value.abs();
         let mut magnitude = 0;
         while magnitude < ESCAPE {
             let bin = (magnitude as usize).min(BINS - 1);
-            let prediction = self.predict(c, unit, bin);
+            let prediction = self.predict(simd, &decisions, bin);
             let more = coder.code(wanted > magnitude, prediction.one);
-            self.adapt(&prediction, more);
+            self.adapt(simd, &prediction, more);
             if magnitude == 0 {
-                self.adapt_unit(c, unit, more);
+                self.adapt_unit(simd, c, decisions.unit, more);
             }
             if !more {
                 break;
@@ -412,8 +409,8 @@ impl Model {
     }
 }
 
-/// Learning rate of mixer weights ([`Model::adapt`]).
-const MIXER_RATE: i32 = 7;
+/// The constant input of a mixer.
+const BIAS: i32 = 64;
 /// Final learning rate of the logistic unit ([`Model::adapt_unit`]).
 const UNIT_RATE: i32 = 4;
 /// Addition to that rate at first, halved every 64 adaptations.

@@ -11,6 +11,8 @@
 //!
 //! A mean is `(sum·⌊2³² / weight⌋ + 2³¹) >> 32`, with the sums of weighted colours and of weights.
 
+use crate::geometry::KernelMap;
+
 /// Offsets of the node itself and of its face neighbours, as indices into a 3³ kernel map row.
 pub(super) const SELF_AND_FACES: [usize; 7] = [13, 4, 10, 12, 14, 16, 22];
 /// Offsets of the face neighbours that precede the node in Morton order: at z − 1, y − 1, x − 1.
@@ -19,8 +21,17 @@ pub(super) const EARLIER_FACES: [usize; 3] = [4, 10, 12];
 /// Weights of children coded before, by the number of coordinates in which they differ.
 const CHILD_WEIGHTS_BY_AXES: [i32; 4] = [0, 831, 113, 15];
 
+/// Offsets in a 3³ row at which children may be coded before: those with a negative component, by the number of
+/// coordinates in which they differ.
+const BEFORE: (&[usize; 3], &[usize; 9], &[usize; 7]) = (
+    &EARLIER_FACES,
+    &[1, 3, 5, 7, 9, 11, 15, 19, 21],
+    &[0, 2, 6, 8, 18, 20, 24],
+);
+
 /// Weights of children coded before, by offset in a 3³ row.
-pub(super) static CHILD_WEIGHTS: [i32; 27] = {
+#[cfg(test)]
+static CHILD_WEIGHTS: [i32; 27] = {
     let mut weights = [0; 27];
     let mut k = 0;
     while k < 27 {
@@ -89,28 +100,126 @@ pub(super) static NODE_WEIGHTS: [[[u16; 8]; 256]; 7] = {
     table
 };
 
-/// Accumulator of a weighted mean of colours.
-#[derive(Clone, Copy, Default)]
-pub(super) struct WeightedMean {
-    sums: [i32; 3],
-    weight: i32,
+/// A node and its six face neighbours. One that is absent has the node's own colour, and no weight.
+pub(super) struct Around {
+    masks: [u8; 7],
+    values: [[i16; 3]; 7],
+    present: u32,
 }
 
-impl WeightedMean {
+impl Around {
     #[inline(always)]
-    pub fn add(&mut self, value: [i16; 3], weight: i32) {
-        for (sum, x) in self.sums.iter_mut().zip(value) {
-            *sum += i32::from(x) * weight;
+    pub fn new(map: &KernelMap, masks: &[u8], values: &[[i16; 3]], node: usize) -> Around {
+        let row = map.row(node);
+        let mut around = Around {
+            masks: [0; 7],
+            values: [[0; 3]; 7],
+            present: 0,
+        };
+        for (i, k) in SELF_AND_FACES.into_iter().enumerate() {
+            // Selects instead of branches: the presence of neighbours is unpredictable.
+            let present = row[k] != KernelMap::ABSENT;
+            let at = if present { row[k] as usize } else { node };
+            around.masks[i] = if present { masks[at] } else { 0 };
+            around.values[i] = values[at];
+            around.present += u32::from(present);
         }
-        self.weight += weight;
+        around
     }
 
-    /// The mean. At least one value of non-zero weight must have been added.
+    /// Sums of weighted Y, Co and Cg, and of weights, for a child in each octant.
     #[inline(always)]
-    pub fn value(self) -> [i32; 3] {
-        let inverse = (1i64 << 32) / i64::from(self.weight.max(1));
-        self.sums
-            .map(|sum| ((i64::from(sum) * inverse + (1 << 31)) >> 32) as i32)
+    pub fn sums(&self) -> [[i32; 8]; 4] {
+        let mut sums = [[0; 8]; 4];
+        for (i, weights) in NODE_WEIGHTS.iter().enumerate() {
+            let weights = &weights[usize::from(self.masks[i])];
+            let [y, co, cg] = self.values[i].map(i32::from);
+            for octant in 0..8 {
+                let weight = i32::from(weights[octant]);
+                sums[0][octant] += y * weight;
+                sums[1][octant] += co * weight;
+                sums[2][octant] += cg * weight;
+                sums[3][octant] += weight;
+            }
+        }
+        sums
+    }
+
+    /// The mean absolute difference of the present face neighbours to the node, by channel.
+    #[inline(always)]
+    pub fn gradient(&self) -> [i32; 3] {
+        /// `⌈2²⁰ / n⌉`, for exact quotients of up to six differences below 2¹⁶.
+        const INVERSES: [u64; 7] = [0, 1 << 20, 1 << 19, 349_526, 1 << 18, 209_716, 174_763];
+        let mut sums = [0u32; 3];
+        for value in &self.values[1..] {
+            for t in 0..3 {
+                sums[t] += u32::from(self.values[0][t].abs_diff(value[t]));
+            }
+        }
+        // The node itself is present.
+        let inverse = INVERSES[(self.present as usize).saturating_sub(1).min(6)];
+        sums.map(|sum| ((u64::from(sum) * inverse) >> 20) as i32)
+    }
+}
+
+/// The children of a slice's nodes that were coded so far.
+pub(super) struct Coded {
+    /// Index of the first child.
+    base: usize,
+    len: usize,
+    /// Y, Co, Cg and 1 of each; zeros from `len` on.
+    values: Vec<[i16; 4]>,
+}
+
+impl Coded {
+    /// None yet of the `count` children from `base` on.
+    pub fn new(base: usize, count: usize) -> Coded {
+        Coded {
+            base,
+            len: 0,
+            values: vec![[0; 4]; count + 1],
+        }
+    }
+
+    /// # Panics
+    /// If all children were coded.
+    #[inline(always)]
+    pub fn push(&mut self, [y, co, cg]: [i16; 3]) {
+        self.values[self.len] = [y, co, cg, 1];
+        self.len += 1;
+    }
+
+    /// `sums` of weighted Y, Co and Cg and of weights, plus those of the coded children at the offsets of a child's row.
+    #[inline(always)]
+    pub fn sums(&self, row: &[u32], sums: [i32; 4]) -> [i32; 4] {
+        let (faces, edges, corners) = BEFORE;
+        let [faces, edges, corners] = [
+            self.unweighted(row, faces),
+            self.unweighted(row, edges),
+            self.unweighted(row, corners),
+        ];
+        let [_, face, edge, corner] = CHILD_WEIGHTS_BY_AXES;
+        std::array::from_fn(|i| sums[i] + face * faces[i] + edge * edges[i] + corner * corners[i])
+    }
+
+    #[inline(always)]
+    fn unweighted<const N: usize>(&self, row: &[u32], offsets: &[usize; N]) -> [i32; 4] {
+        let values = &self.values[..=self.len];
+        let mut sums = [0; 4];
+        for &k in offsets {
+            // The children of other slices wrap or lie beyond, as absent ones do: they read the zeros after the last.
+            let value = &values[(row[k] as usize).wrapping_sub(self.base).min(self.len)];
+            for i in 0..4 {
+                sums[i] += i32::from(value[i]);
+            }
+        }
+        sums
+    }
+
+    /// Y, Co and Cg of all children.
+    pub fn into_values(self) -> Vec<[i16; 3]> {
+        let values = self.values[..self.len].iter();
+        values.map(|&[y, co, cg, _]| [y, co, cg]).collect()
     }
 }
 
@@ -151,6 +260,41 @@ mod tests {
         for mask in 1..256 {
             for octant in (0..8).filter(|o| mask >> o & 1 == 1) {
                 assert!(NODE_WEIGHTS[0][mask][octant] > 1000);
+            }
+        }
+    }
+
+    #[test]
+    fn offsets_before_are_those_with_a_negative_component() {
+        let (faces, edges, corners) = BEFORE;
+        let mut all = [&faces[..], edges, corners].concat();
+        for (offsets, axes) in [(&faces[..], 1), (edges, 2), (corners, 3)] {
+            for k in offsets {
+                assert_eq!(CHILD_WEIGHTS[*k], CHILD_WEIGHTS_BY_AXES[axes]);
+            }
+        }
+        all.sort();
+        let before = (0..27).filter(|k| k % 3 == 0 || k / 3 % 3 == 0 || *k < 9);
+        assert!(all.into_iter().eq(before));
+    }
+
+    #[test]
+    fn gradients_are_quotients_rounded_down() {
+        for present in 1..=7u32 {
+            for step in [0, 1, 2, 3, 5, 7, 11, 1000, 32_767, 32_768i32] {
+                let mut values = [[-16_384; 3]; 7];
+                for value in &mut values[1..present as usize] {
+                    *value = [(step - 16_384) as i16; 3];
+                }
+                values[present as usize - 1][1] = -16_384;
+                let around = Around {
+                    masks: [1; 7],
+                    values,
+                    present,
+                };
+                let faces = present as i32 - 1;
+                let sums = [faces * step, (faces - 1).max(0) * step, faces * step];
+                assert_eq!(around.gradient(), sums.map(|sum| sum / faces.max(1)));
             }
         }
     }

@@ -6,11 +6,10 @@
 //! and 2 along y, 3 to 6 along z. All means are integers of one scale, so the transform is exactly reversible. RAHT (de
 //! Queiroz and Chou, doi 10.1109/TIP.2016.2575005) normalises the differences; here [`SCALE`] does so in quantisation.
 
-/// A join: its slot, and the octants of its two values.
-type Join = (usize, usize, usize);
+use b2p_kernels::butterflies::Join;
 
 /// All joins in the order of the forward transform.
-const JOINS: [Join; 7] = [
+pub(super) const JOINS: [Join; 7] = [
     (3, 0, 4),
     (4, 1, 5),
     (5, 2, 6),
@@ -86,6 +85,32 @@ pub(super) static JOINS_OF: [Joins; 256] = {
     all
 };
 
+/// Fraction of the difference that each join of [`JOINS`] adds to its first value, by occupancy: `w / (v + w)`, and 0
+/// where no child is joined. A second value without a first replaces it.
+pub(super) static FRACTIONS: [[f32; 7]; 256] = {
+    let mut all = [[0.0; 7]; 256];
+    let mut mask = 0;
+    while mask < 256 {
+        let mut weights = [0u8; 8];
+        let mut octant = 0;
+        while octant < 8 {
+            weights[octant] = (mask >> octant & 1) as u8;
+            octant += 1;
+        }
+        let mut i = 0;
+        while i < 7 {
+            let (_, a, b) = JOINS[i];
+            if weights[b] > 0 {
+                all[mask][i] = weights[b] as f32 / (weights[a] + weights[b]) as f32;
+            }
+            weights[a] += weights[b];
+            i += 1;
+        }
+        mask += 1;
+    }
+    all
+};
+
 /// Octants of the two values of each slot.
 #[cfg(test)]
 const OCTANTS: [[usize; 2]; 7] = {
@@ -124,7 +149,7 @@ pub(super) fn forward(mask: u8, mut values: [[i32; 3]; 8]) -> ([i32; 3], [[i32; 
 }
 
 /// Inverse of [`forward`]: values of the children by octant.
-#[inline(always)]
+#[cfg(test)]
 pub(super) fn inverse(mask: u8, mean: [i32; 3], differences: &[[i32; 3]; 7]) -> [[i32; 3]; 8] {
     let mut values = [[0; 3]; 8];
     values[0] = mean;
@@ -144,6 +169,7 @@ pub(super) fn inverse(mask: u8, mean: [i32; 3], differences: &[[i32; 3]; 7]) -> 
 }
 
 /// For the second octant of every join, the children that its value can represent at that join.
+#[cfg(test)]
 const REACH: [u8; 8] = [
     0xff,
     0b1010_1010,
@@ -224,6 +250,7 @@ pub(super) const fn octants(slot: usize) -> [usize; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use b2p_kernels::{Instructions, Isa, Work, butterflies};
     use proptest::prelude::*;
 
     proptest! {
@@ -246,6 +273,59 @@ mod tests {
                 let sum: i32 = children.iter().map(|&o| values[o][k]).sum();
                 let exact = f64::from(sum) / children.len() as f64;
                 prop_assert!((f64::from(mean[k]) - exact).abs() < 3.0);
+            }
+        }
+    }
+
+    struct There(u8, [[i32; 8]; 8]);
+
+    impl Work for There {
+        type Output = [[i32; 8]; 7];
+
+        #[inline(always)]
+        fn run<I: Instructions>(self, simd: I) -> [[i32; 8]; 7] {
+            butterflies::forward(simd, &JOINS, &FRACTIONS[usize::from(self.0)], self.1)
+        }
+    }
+
+    struct Back<'a>(u8, [i32; 8], &'a [[i32; 8]; 7]);
+
+    impl Work for Back<'_> {
+        type Output = [[i32; 8]; 8];
+
+        #[inline(always)]
+        fn run<I: Instructions>(self, simd: I) -> [[i32; 8]; 8] {
+            butterflies::inverse(simd, &JOINS, &FRACTIONS[usize::from(self.0)], self.1, self.2)
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn kernels_transform_every_occupancy_as_plain_code_does(
+            values in prop::array::uniform8(prop::array::uniform3(-16384i32..=16384)),
+            chosen in prop::array::uniform7(prop::array::uniform3(-65536i32..=65536)),
+        ) {
+            let wide = |[y, co, cg]: [i32; 3]| [y, co, cg, 0, y, co, cg, 0];
+            for (mask, isa) in (1..=255u8).flat_map(|mask| Isa::available().into_iter().map(move |isa| (mask, isa))) {
+                let joins = &JOINS_OF[usize::from(mask)];
+                let mut children = values;
+                let mut differences = [[0; 3]; 7];
+                for octant in (0..8).filter(|o| mask >> o & 1 == 0) {
+                    children[octant] = [0; 3];
+                }
+                for slot in joins.slots() {
+                    differences[slot] = chosen[slot];
+                }
+                let (_, expected) = forward(mask, children);
+                let there = isa.run(There(mask, children.map(wide)));
+                for slot in joins.slots() {
+                    prop_assert_eq!(there[slot], wide(expected[slot]), "{}", isa);
+                }
+                let expected = inverse(mask, values[0], &differences);
+                let back = isa.run(Back(mask, wide(values[0]), &differences.map(wide)));
+                for octant in (0..8).filter(|o| mask >> o & 1 == 1) {
+                    prop_assert_eq!(back[octant], wide(expected[octant]), "{}", isa);
+                }
             }
         }
     }

@@ -73,6 +73,7 @@ pub fn version(bytes: &[u8]) -> Option<u16> {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Header {
     /// Flags that a reader may ignore.
+    #[doc(hidden)]
     pub optional_flags: u32,
     /// N: the cloud's voxels are those of this level.
     pub bits: u8,
@@ -91,6 +92,7 @@ pub struct Header {
     /// Number of voxels of level L, …, M.
     pub voxels: Vec<u32>,
     /// Section lengths of level L, …, M.
+    #[doc(hidden)]
     pub sections: Vec<Section>,
 }
 
@@ -105,6 +107,7 @@ pub struct Section {
 
 impl Section {
     /// Bytes of both sections.
+    #[doc(hidden)]
     pub fn bytes(&self) -> u64 {
         u64::from(self.geometry) + u64::from(self.colours)
     }
@@ -177,6 +180,7 @@ impl Header {
     }
 
     /// Serialises the header.
+    #[doc(hidden)]
     pub fn write(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(self.bytes());
         bytes.extend(MAGIC);
@@ -217,6 +221,7 @@ impl Header {
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level.
+    #[doc(hidden)]
     pub fn prefix_bytes(&self, level: u8) -> Result<u64> {
         let last = self.index(level)?;
         let sections: u64 = self.sections[..=last].iter().map(Section::bytes).sum();
@@ -233,6 +238,7 @@ impl Header {
     ///
     /// # Errors
     /// [`Error::Malformed`] if bytes follow.
+    #[doc(hidden)]
     pub fn check_end(&self, length: u64) -> Result<()> {
         let end = self.stream_bytes();
         match length.saturating_sub(end) {
@@ -242,6 +248,7 @@ impl Header {
     }
 
     /// Parents per slice of colours; in version 2, that of the geometry.
+    #[doc(hidden)]
     pub fn colour_slice(&self) -> u32 {
         match self.format {
             Format::Learned { .. } => self.slice_voxels,
@@ -285,6 +292,7 @@ impl Header {
     ///
     /// # Errors
     /// [`Error::ModelMismatch`] if it was coded with another model, [`Error::Unsupported`] if it has version 3.
+    #[doc(hidden)]
     pub fn check_model(&self, loaded: &[u8; 16]) -> Result<()> {
         match &self.format {
             Format::Learned { model } if model == loaded => Ok(()),

@@ -158,6 +158,7 @@ impl LatentDecoder {
     /// # Errors
     /// [`crate::Error::Usage`] if the stream has no such level.
     pub fn memory(&self, header: &Header, level: u8) -> Result<u64> {
+        header.voxels(level)?;
         let shape = self.model.shape();
         let levels = usize::from(level - header.base) + 1;
         let head = shape.head(levels - 1, self.heads);

@@ -10,6 +10,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::HeadSet;
 use crate::gaussians::learned::HeadsModel;
 use crate::gaussians::{Frame, Gaussians};
+use crate::geometry::Voxels;
 use crate::latents::{LatentDecoding, nothing_reached};
 
 /// A stream of either version that is decoded level by level as its bytes arrive.
@@ -133,6 +134,16 @@ impl<'b> Decoding<'b> {
                 _ => false,
             },
         }
+    }
+
+    /// The voxels of the level reached, once there is one.
+    pub fn voxels(&self) -> Option<&Voxels> {
+        let octree = match &self.state {
+            State::Start(_) | State::Refused => return None,
+            State::Learned(decoding) => &decoding.exact()?.octree,
+            State::Transform(decoding) => &decoding.reached()?.octree,
+        };
+        Some(octree.level(self.level()?))
     }
 
     /// The voxels of the level reached with their colours, if the stream has version 3.

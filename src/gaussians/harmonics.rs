@@ -27,6 +27,7 @@ impl Harmonics {
     ///
     /// # Panics
     /// If Gaussian `i` has no coefficients.
+    #[doc(hidden)]
     pub fn seen(&self, i: usize, colour: [f32; 3], [x, y, z]: [f32; 3]) -> [f32; 3] {
         let coefficients = &self.coefficients[i * self.count..][..self.count];
         let (xx, yy, zz) = (x * x, y * y, z * z);

@@ -113,9 +113,15 @@ impl Frame {
         })
     }
 
-    /// Whether the frame has 1 to 21 bits and a valid placement.
+    /// Whether the frame has 1 to 21 bits and a valid placement, and its corners and voxels can be told in single
+    /// precision, as files of Gaussians do.
     pub fn is_valid(&self) -> bool {
-        (1..=21).contains(&self.bits) && self.placement.is_valid()
+        let Placement { origin, voxel_size } = self.placement;
+        let single = |x: f64| (x as f32).is_finite();
+        (1..=21).contains(&self.bits)
+            && self.placement.is_valid()
+            && (voxel_size as f32).is_normal()
+            && origin.iter().all(|x| single(*x) && single(x + 2.0 * self.unit()))
     }
 }
 
@@ -128,6 +134,7 @@ impl Gaussians {
     /// Minimum variance that the renderer adds to every projected Gaussian, in px²: 0.3, with which 3D Gaussian
     /// Splatting is trained, or 1/16 for Gaussians with a [`blur`](Gaussians::blur). The blur closes surfaces at any
     /// distance; another 0.3 px² would enlarge silhouettes, and more so for objects that are small in the picture.
+    #[doc(hidden)]
     pub fn pixel_blur(&self) -> f32 {
         if self.own_blur() > 0.0 { 1.0 / 16.0 } else { 0.3 }
     }

@@ -6,8 +6,10 @@
 
 use std::sync::OnceLock;
 
-use b2p_kernels::{Plan, Taps, copy_row, window, zeros};
+use b2p_kernels::{Plan, Taps, copy_row, zeros};
 use rayon::prelude::*;
+
+use super::ones;
 
 /// The neighbours of every voxel under a 3³ or 2³ kernel.
 ///
@@ -161,22 +163,69 @@ pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]
     tasks.into_par_iter().for_each(|(parents, masks, block)| {
         let mut rows = block.chunks_exact_mut(27);
         for (parent, &mask) in parents.chunks_exact(27).zip(masks) {
-            let window = window(parent, |q, octant| {
-                let mask = u32::from(occupancy[q as usize]);
-                let before = (mask & ((1 << octant) - 1)).count_ones();
-                if mask >> octant & 1 == 1 {
-                    first_child[q as usize] + before
-                } else {
-                    KernelMap::ABSENT
-                }
-            });
-            let occupied = (0..8).filter(|octant| mask >> octant & 1 == 1);
-            for (octant, row) in occupied.zip(&mut rows) {
+            let window = window(parent, occupancy, first_child);
+            for (octant, row) in ones(mask.into()).zip(&mut rows) {
                 copy_row(&window, octant, row);
             }
         }
     });
     KernelMap::new(27, rows)
+}
+
+/// Of every occupancy, the number of children before each octant, −1 where there is no child.
+static RANKS: [[i32; 8]; 256] = {
+    let mut ranks = [[-1; 8]; 256];
+    let mut mask = 0;
+    while mask < 256 {
+        let (mut octant, mut rank) = (0, 0);
+        while octant < 8 {
+            if mask >> octant & 1 == 1 {
+                ranks[mask][octant] = rank;
+                rank += 1;
+            }
+            octant += 1;
+        }
+        mask += 1;
+    }
+    ranks
+};
+
+/// For every position of the window of 4³ children around a voxel's children, x fastest: eight times the offset of the
+/// neighbour that it lies in, plus the octant there.
+const WINDOW: [u8; 64] = {
+    let mut window = [0; 64];
+    let mut i = 0;
+    while i < 64 {
+        // Window position 0..4 along an axis is child coordinate −1..2: parent offset −1, 0, 0, 1, octant 1, 0, 1, 0.
+        let [x, y, z] = [i & 3, i >> 2 & 3, i >> 4];
+        let neighbour = ((x + 1) >> 1) + 3 * ((y + 1) >> 1) + 9 * ((z + 1) >> 1);
+        let octant = ((x + 1) & 1) + 2 * ((y + 1) & 1) + 4 * ((z + 1) & 1);
+        window[i] = (8 * neighbour + octant) as u8;
+        i += 1;
+    }
+    window
+};
+
+/// The children in the window around the children of a voxel with these 27 neighbours. It has no branches: the presence
+/// of neighbours is unpredictable.
+#[inline(always)]
+fn window(neighbours: &[u32], occupancy: &[u8], first_child: &[u32]) -> [u32; 64] {
+    let mut children = [[0; 8]; 27];
+    for (children, &q) in children.iter_mut().zip(neighbours) {
+        let present = q != KernelMap::ABSENT;
+        let q = if present { q as usize } else { 0 };
+        let mask = if present { occupancy[q] } else { 0 };
+        let first = first_child[q];
+        for (child, rank) in children.iter_mut().zip(RANKS[usize::from(mask)]) {
+            // All bits are set, as in ABSENT, where the rank is negative.
+            *child = first.wrapping_add(rank as u32) | (rank >> 31) as u32;
+        }
+    }
+    let mut window = [0; 64];
+    for (to, from) in window.iter_mut().zip(WINDOW) {
+        *to = children[usize::from(from) >> 3][usize::from(from) & 7];
+    }
+    window
 }
 
 #[cfg(test)]

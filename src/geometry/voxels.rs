@@ -24,6 +24,7 @@ impl Voxels {
     ///
     /// # Panics
     /// If the last key lies outside the level, or (debug builds only) the keys are not strictly ascending.
+    #[doc(hidden)]
     pub fn from_sorted(depth: u8, keys: Vec<u64>) -> Self {
         assert!(depth <= morton::MAX_DEPTH, "octree level {depth} is deeper than 21");
         assert!(
@@ -45,6 +46,7 @@ impl Voxels {
     }
 
     /// Octant of every voxel in its parent, `x + 2y + 4z`.
+    #[doc(hidden)]
     pub fn octants(&self) -> Vec<u8> {
         self.keys.iter().map(|key| (key & 7) as u8).collect()
     }
@@ -65,6 +67,7 @@ impl Voxels {
     }
 
     /// The occupied voxels one level up. Level 0 has no level above, so `depth` must be at least 1.
+    #[doc(hidden)]
     pub fn parents(&self) -> Voxels {
         let mut keys: Vec<u64> = self.keys.iter().map(|k| k >> 3).collect();
         keys.dedup();
@@ -72,6 +75,7 @@ impl Voxels {
     }
 
     /// Index of every voxel's parent in [`Voxels::parents`].
+    #[doc(hidden)]
     pub fn parent_indices(&self) -> Vec<u32> {
         let mut index = 0u32;
         let mut last = self.keys.first().map_or(0, |k| k >> 3);

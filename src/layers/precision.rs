@@ -14,7 +14,7 @@ pub enum Precision {
     Int16,
     /// f16 in memory, sums in f32.
     F16,
-    /// The same, but products are summed in f16 before they are in f32 ([`b2p_kernels::Precision::Half`]). Only where [`crate::Isa::has_half`].
+    /// The same, but products are summed in f16 before they are in f32 (`b2p_kernels::Precision::Half`). Only where [`crate::Isa::has_half`].
     Half,
 }
 

@@ -91,6 +91,17 @@ fn a_name_as_long_as_file_systems_allow_can_be_written() {
     assert_eq!(std::fs::read(&path).unwrap(), b"long");
 }
 
+#[test]
+fn what_would_be_replaced_is_a_regular_file_that_is_there() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("out");
+    assert_eq!(replaced(&path), None);
+    std::fs::write(&path, b"old").unwrap();
+    assert_eq!(replaced(&path), Some(path));
+    assert_eq!(replaced(folder.path()), None);
+    assert_eq!(replaced(Path::new("/dev/null")), None);
+}
+
 #[cfg(unix)]
 mod special {
     use std::os::unix::fs::{FileTypeExt, PermissionsExt, symlink};
@@ -161,6 +172,7 @@ mod special {
             assert_eq!(std::fs::read(at("sub/file")).unwrap(), link.as_bytes());
             assert!(!at("sub/file").is_symlink());
         }
+        assert_eq!(replaced(&at("relative")), Some(at("sub/../sub/file")));
         let failed = write_file(&at("absolute"), |_| Err(Error::Usage("stop".into())));
         assert!(failed.is_err());
         assert_eq!(std::fs::read(at("sub/file")).unwrap(), b"absolute");
@@ -211,6 +223,7 @@ mod special {
         if !link.exists() {
             return;
         }
+        assert_eq!(replaced(&link), None);
         write(&link, b"through").unwrap();
         assert_eq!(file.metadata().unwrap().len(), 7);
         assert_eq!(std::fs::read(&path).unwrap(), b"through");

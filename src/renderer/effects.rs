@@ -44,7 +44,7 @@ pub enum Effect {
     /// sensible image in the plane, and its centre may be behind. Called for where there are such Gaussians.
     Near,
     /// In each pixel, splats are blended in the order of their depths there, not in that of their centres, as far as the
-    /// [`b2p_kernels::splat::WAITING`] nearest of them tell. Called for by nothing: Gaussians are made for the order of their centres.
+    /// eight nearest of them tell. Called for by nothing: Gaussians are made for the order of their centres.
     Order,
 }
 

@@ -1,6 +1,11 @@
 //! OpenEXR files: one part of scan lines, 32-bit floats, not compressed (openexr.com, "OpenEXR File Layout").
 
+use std::io::Write;
+use std::path::Path;
+
 use super::Image;
+use super::image::io_error;
+use crate::error::Result;
 
 const MAGIC: u32 = 20_000_630;
 /// Version 2, no flags: scan lines, names of up to 31 bytes.
@@ -15,7 +20,28 @@ impl Image {
     /// # Panics
     /// If the pictures differ in size.
     pub fn to_exr(&self, depth: Option<&Image>) -> Vec<u8> {
-        let names: &[u8] = match depth {
+        let distances = depth.map(Image::distances);
+        let mut file = Vec::new();
+        // A vector takes all.
+        let _ = self.write_exr(&mut file, Path::new(""), distances.as_deref());
+        file
+    }
+
+    /// Of a picture drawn of [`Channel::Depth`](super::Channel::Depth) on nothing: the distance of each pixel, ∞ where nothing is.
+    pub fn distances(&self) -> Vec<f32> {
+        let distance = |[z, _, _, alpha]: &[f32; 4]| if *alpha > 0.0 { z / alpha } else { f32::INFINITY };
+        self.pixels.iter().map(distance).collect()
+    }
+
+    /// As [`Image::to_exr`], row by row into `to`, with the distances of the pixels. `path` appears in error messages only.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if `to` fails.
+    ///
+    /// # Panics
+    /// If there are fewer distances than pixels.
+    pub fn write_exr(&self, to: &mut dyn Write, path: &Path, distances: Option<&[f32]>) -> Result<()> {
+        let names: &[u8] = match distances {
             Some(_) => b"ABGRZ",
             None => b"ABGR",
         };
@@ -27,8 +53,9 @@ impl Image {
         for y in 0..height {
             file.extend(((start + y * (8 + line)) as u64).to_le_bytes());
         }
-        file.reserve(height * (8 + line));
+        to.write_all(&file).map_err(io_error(path))?;
         for y in 0..height {
+            file.clear();
             file.extend((y as u32).to_le_bytes());
             file.extend((line as u32).to_le_bytes());
             let row = y * width..(y + 1) * width;
@@ -37,16 +64,12 @@ impl Image {
                 let values = pixels.iter().map(|p| linear(p)[k]);
                 file.extend(values.flat_map(f32::to_le_bytes));
             }
-            if let Some(depth) = depth {
-                let values = depth.pixels[row].iter().map(
-                    |[z, _, _, alpha]| {
-                        if *alpha > 0.0 { z / alpha } else { f32::INFINITY }
-                    },
-                );
-                file.extend(values.flat_map(f32::to_le_bytes));
+            if let Some(distances) = distances {
+                file.extend(distances[row].iter().flat_map(|z| z.to_le_bytes()));
             }
+            to.write_all(&file).map_err(io_error(path))?;
         }
-        file
+        Ok(())
     }
 }
 

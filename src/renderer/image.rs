@@ -1,7 +1,10 @@
 //! Pictures.
 
+use std::io::Write;
+use std::path::Path;
+
 use rayon::prelude::*;
-use tiny_skia::{IntSize, Pixmap};
+use tiny_skia::{IntSize, Pixmap, PremultipliedColorU8};
 
 use crate::error::{Error, Result};
 
@@ -66,12 +69,7 @@ impl Image {
             .par_chunks_exact_mut(4)
             .zip(self.pixels.par_iter())
             .with_min_len(1 << 14)
-            .for_each(|(bytes, &[r, g, b, alpha])| {
-                let alpha = alpha.clamp(0.0, 1.0);
-                for (byte, value) in bytes.iter_mut().zip([r, g, b, alpha]) {
-                    *byte = (value.clamp(0.0, alpha) * 255.0 + 0.5) as u8;
-                }
-            });
+            .for_each(|(bytes, pixel)| bytes.copy_from_slice(&eight_bits(pixel)));
         pixmap(bytes, self.width, self.height)
     }
 
@@ -80,9 +78,19 @@ impl Image {
     /// # Errors
     /// [`Error::Unsupported`] if the picture is too large for the format.
     pub fn to_png(&self) -> Result<Vec<u8>> {
-        self.to_pixmap()?.encode_png().map_err(|e| {
-            let size = format!("{}×{}: {e}", self.width, self.height);
-            unsupported(size)
+        in_memory(|file| self.write_png(file, Path::new("")))
+    }
+
+    /// As [`Image::to_png`], row by row into `to`. `path` appears in error messages only.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if the picture is too large for the format, [`Error::Io`] if `to` fails.
+    pub fn write_png(&self, to: &mut dyn Write, path: &Path) -> Result<()> {
+        self.stream_png(to, path, png::BitDepth::Eight, 4, |pixel, bytes| {
+            let [r, g, b, a] = eight_bits(pixel);
+            let straight = PremultipliedColorU8::from_rgba(r, g, b, a).map(|c| c.demultiply());
+            let straight = straight.map_or([0; 4], |c| [c.red(), c.green(), c.blue(), c.alpha()]);
+            bytes.copy_from_slice(&straight);
         })
     }
 }
@@ -93,54 +101,136 @@ impl Image {
     /// # Errors
     /// [`Error::Unsupported`] if the picture is too large for the format.
     pub fn to_png16(&self) -> Result<Vec<u8>> {
-        let mut file = Vec::new();
-        let failed = |e: png::EncodingError| unsupported(format!("{}×{}: {e}", self.width, self.height));
-        let mut encoder = png::Encoder::new(&mut file, self.width, self.height);
-        encoder.set_color(png::ColorType::Rgba);
-        encoder.set_depth(png::BitDepth::Sixteen);
-        let mut writer = encoder.write_header().map_err(failed)?;
-        let mut bytes = Vec::with_capacity(self.pixels.len() * 8);
-        for &[r, g, b, alpha] in &self.pixels {
+        in_memory(|file| self.write_png16(file, Path::new("")))
+    }
+
+    /// As [`Image::to_png16`], row by row into `to`. `path` appears in error messages only.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] if the picture is too large for the format, [`Error::Io`] if `to` fails.
+    pub fn write_png16(&self, to: &mut dyn Write, path: &Path) -> Result<()> {
+        self.stream_png(to, path, png::BitDepth::Sixteen, 8, |&[r, g, b, alpha], bytes| {
             let alpha = alpha.clamp(0.0, 1.0);
             let straight = [r, g, b].map(|c| if alpha > 0.0 { c / alpha } else { 0.0 });
-            for value in [straight[0], straight[1], straight[2], alpha] {
+            let values = [straight[0], straight[1], straight[2], alpha];
+            for (bytes, value) in bytes.chunks_exact_mut(2).zip(values) {
                 let value = (value.clamp(0.0, 1.0) * 65535.0 + 0.5) as u16;
-                bytes.extend(value.to_be_bytes());
+                bytes.copy_from_slice(&value.to_be_bytes());
             }
+        })
+    }
+
+    /// Writes a PNG file whose pixels of `size` bytes `fill` makes.
+    fn stream_png(
+        &self,
+        to: &mut dyn Write,
+        path: &Path,
+        depth: png::BitDepth,
+        size: usize,
+        fill: impl Fn(&[f32; 4], &mut [u8]),
+    ) -> Result<()> {
+        let failed = |error: png::EncodingError| match error {
+            png::EncodingError::IoError(source) => io_error(path)(source),
+            other => unsupported(format!("{}×{}: {other}", self.width, self.height)),
+        };
+        let mut encoder = png::Encoder::new(to, self.width, self.height);
+        encoder.set_color(png::ColorType::Rgba);
+        encoder.set_depth(depth);
+        let mut writer = encoder.write_header().map_err(failed)?;
+        let mut stream = writer.stream_writer().map_err(failed)?;
+        let mut row = vec![0; self.width as usize * size];
+        for pixels in self.pixels.chunks(self.width as usize) {
+            for (pixel, bytes) in pixels.iter().zip(row.chunks_exact_mut(size)) {
+                fill(pixel, bytes);
+            }
+            stream.write_all(&row).map_err(io_error(path))?;
         }
-        writer.write_image_data(&bytes).map_err(failed)?;
-        writer.finish().map_err(failed)?;
-        Ok(file)
+        stream.finish().map_err(failed)?;
+        writer.finish().map_err(failed)
     }
 
     /// A binary PPM file: eight bits a channel, what is transparent over black.
     pub fn to_ppm(&self) -> Vec<u8> {
-        let mut file = format!("P6\n{} {}\n255\n", self.width, self.height).into_bytes();
-        let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
-        file.extend(self.pixels.iter().flat_map(|[r, g, b, _]| [r, g, b].map(|c| byte(*c))));
+        let mut file = Vec::new();
+        // A vector takes all.
+        let _ = self.write_ppm(&mut file, Path::new(""));
         file
     }
 
+    /// As [`Image::to_ppm`], row by row into `to`. `path` appears in error messages only.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if `to` fails.
+    pub fn write_ppm(&self, to: &mut dyn Write, path: &Path) -> Result<()> {
+        let header = format!("P6\n{} {}\n255\n", self.width, self.height);
+        to.write_all(header.as_bytes()).map_err(io_error(path))?;
+        let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+        let mut row = Vec::with_capacity(3 * self.width as usize);
+        for pixels in self.pixels.chunks(self.width.max(1) as usize) {
+            row.clear();
+            row.extend(pixels.iter().flat_map(|[r, g, b, _]| [r, g, b].map(|c| byte(*c))));
+            to.write_all(&row).map_err(io_error(path))?;
+        }
+        Ok(())
+    }
+
     /// What a YUV4MPEG2 stream of pictures of this size begins with, at 30 pictures a second.
+    #[doc(hidden)]
     pub fn y4m_header(&self) -> Vec<u8> {
         format!("YUV4MPEG2 W{} H{} F30:1 Ip A1:1 C444\n", self.width, self.height).into_bytes()
     }
 
     /// One picture of a YUV4MPEG2 stream: ITU-R BT.601, limited range, colour at full resolution; what is transparent over black.
+    #[doc(hidden)]
     pub fn to_y4m_frame(&self) -> Vec<u8> {
+        let mut file = Vec::new();
+        // A vector takes all.
+        let _ = self.write_y4m_frame(&mut file, Path::new(""));
+        file
+    }
+
+    /// As [`Image::to_y4m_frame`], row by row into `to`. `path` appears in error messages only.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if `to` fails.
+    pub fn write_y4m_frame(&self, to: &mut dyn Write, path: &Path) -> Result<()> {
         let rows = [
             [65.481, 128.553, 24.966, 16.0],
             [-37.797, -74.203, 112.0, 128.0],
             [112.0, -93.786, -18.214, 128.0],
         ];
-        let mut frame = b"FRAME\n".to_vec();
+        to.write_all(b"FRAME\n").map_err(io_error(path))?;
+        let mut row = Vec::with_capacity(self.width as usize);
         for [kr, kg, kb, offset] in rows {
-            frame.extend(self.pixels.iter().map(|p| -> u8 {
-                let [r, g, b] = [p[0], p[1], p[2]].map(|c| c.clamp(0.0, 1.0));
-                (kr * r + kg * g + kb * b + offset + 0.5) as u8
-            }));
+            for pixels in self.pixels.chunks(self.width.max(1) as usize) {
+                row.clear();
+                row.extend(pixels.iter().map(|p| -> u8 {
+                    let [r, g, b] = [p[0], p[1], p[2]].map(|c| c.clamp(0.0, 1.0));
+                    (kr * r + kg * g + kb * b + offset + 0.5) as u8
+                }));
+                to.write_all(&row).map_err(io_error(path))?;
+            }
         }
-        frame
+        Ok(())
+    }
+}
+
+/// Eight bits a channel, premultiplied.
+fn eight_bits(&[r, g, b, alpha]: &[f32; 4]) -> [u8; 4] {
+    let alpha = alpha.clamp(0.0, 1.0);
+    [r, g, b, alpha].map(|value| (value.clamp(0.0, alpha) * 255.0 + 0.5) as u8)
+}
+
+fn in_memory(write: impl FnOnce(&mut Vec<u8>) -> Result<()>) -> Result<Vec<u8>> {
+    let mut file = Vec::new();
+    write(&mut file)?;
+    Ok(file)
+}
+
+pub(super) fn io_error(path: &Path) -> impl Fn(std::io::Error) -> Error + '_ {
+    |source| Error::Io {
+        path: path.to_owned(),
+        source,
     }
 }
 

@@ -323,7 +323,8 @@ impl Renderer {
     ///
     /// # Errors
     /// [`crate::Error::Usage`] if the camera is none, the background is not finite, or the arrays of `gaussians` differ in length;
-    /// [`crate::Error::LimitExceeded`] if the picture or the memory to draw it is over the `limits`.
+    /// [`crate::Error::LimitExceeded`] if the picture, the memory or the work to draw it is over the `limits`;
+    /// [`crate::Error::OutOfMemory`].
     pub fn render_into(&mut self, gaussians: &Gaussians, camera: &Camera, image: &mut Image) -> Result<Stats> {
         let (channel, background) = (self.channel, self.background);
         let limits = self.limits.clone();
@@ -416,7 +417,10 @@ impl Renderer {
         if pixels.capacity() < plan.pixels {
             // What is outgrown goes first, and zeros come as tiles are drawn, from the threads that draw them.
             *pixels = Vec::new();
-            *pixels = bytemuck::zeroed_vec(plan.pixels);
+            *pixels = bytemuck::try_zeroed_vec(plan.pixels).map_err(|()| crate::Error::OutOfMemory {
+                what: "the pixels of the picture",
+                bytes: (plan.pixels * size_of::<O::Pixel>()) as u64,
+            })?;
         }
         pixels.resize(plan.pixels, bytemuck::Zeroable::zeroed());
         let canvas = Canvas {
@@ -425,7 +429,7 @@ impl Renderer {
             shrink: plan.effects.supersample,
             background: wanted.background,
         };
-        self.draw_parts(&plan, &canvas, output, pixels, &mut times, &mut laps);
+        self.draw_parts(&plan, &canvas, output, pixels, &mut times, &mut laps)?;
         let samples = u64::from(plan.effects.supersample).pow(2);
         Ok(Stats {
             touched: self.take_touched() / samples,
@@ -526,7 +530,7 @@ impl Renderer {
         pixels: &mut [O::Pixel],
         times: &mut Times,
         laps: &mut Laps,
-    ) {
+    ) -> Result<()> {
         self.desks.resize_with(rayon::current_num_threads(), Mutex::default);
         let what = O::LOOP.unwrap_or(match (plan.effects.order, plan.effects.near) {
             (true, _) => Loop::Order,
@@ -535,7 +539,7 @@ impl Renderer {
         });
         let mut part = self.bins.next(None);
         while let Some(now) = part {
-            self.bins.fill(now.clone(), &self.ellipses, &mut self.counts);
+            self.bins.fill(now.clone(), &self.ellipses, &mut self.counts)?;
             times.bin += laps.lap();
             let [sorting, blending] = self.draw_part(&now, canvas, self.quality.floor(), what, output, pixels);
             let drawn = laps.lap();
@@ -544,6 +548,7 @@ impl Renderer {
             times.blend += drawn.mul_f64(1.0 - share);
             part = self.bins.next(Some(&now));
         }
+        Ok(())
     }
 
     /// Blocks that all threads have touched since this was asked last.

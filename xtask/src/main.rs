@@ -120,6 +120,7 @@ fn sample() -> Result {
             "b2p",
             "--",
             "encode",
+            "--force",
             &cloud,
             "-o",
             &stream,

@@ -72,7 +72,7 @@ pub fn choose(
     if input == Path::new(PIPE) {
         return Err(Failure("a budget is for files: what a pipe brings is not known".into()));
     }
-    let stream = load::bytes(input)?;
+    let stream = load::bytes(input, limits)?;
     if stream.starts_with(load::PLY_MAGIC) {
         let what = "a budget is for streams, this is a PLY";
         return Err(Failure(format!("{}: {what}", input.display())));
@@ -111,7 +111,7 @@ fn calibration(
         return Ok(kept);
     }
     let file = match &model_arg.model {
-        Some(path) => load::bytes(path)?,
+        Some(path) => load::bytes(path, limits)?,
         None => embedded::MODEL.to_vec(),
     };
     let subject = Subject {
@@ -121,8 +121,8 @@ fn calibration(
     };
     let calibration = Calibration::measure(&subject, &|step| progress.say(step))?;
     match path.map(|path| calibration.save(&path)) {
-        None => eprintln!("b2p: no folder for the calibration is known, it is not kept"),
-        Some(Err(error)) => eprintln!("b2p: the calibration is not kept: {error}"),
+        None => super::manners::warn("no folder for the calibration is known, it is not kept"),
+        Some(Err(error)) => super::manners::warn(&format!("the calibration is not kept: {error}")),
         Some(Ok(())) => {}
     }
     Ok(calibration)

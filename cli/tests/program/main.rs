@@ -2,7 +2,10 @@
 
 #[path = "../../../tests/common/mod.rs"]
 mod common;
-#[cfg(unix)]
+mod cutting;
+mod edges;
+mod framing;
+mod knobs;
 mod outputs;
 mod pictures;
 mod transform;
@@ -16,10 +19,17 @@ use b2p::latents::network::{Shape, untrained};
 use common::{Ball, names_in, tiny_model};
 use serde_json::Value;
 
+/// Runs the program, which may overwrite files: most tests write the same file again and again.
 fn b2p(folder: &Path, arguments: &[&str]) -> Output {
+    plain(folder, &[arguments, &["--force"]].concat())
+}
+
+/// Runs the program with these arguments alone.
+fn plain(folder: &Path, arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_b2p"))
         .current_dir(folder)
         .args(arguments)
+        .stdin(Stdio::null())
         .output()
         .expect("the program starts")
 }
@@ -29,6 +39,7 @@ fn piped(folder: &Path, arguments: &[&str], input: &[u8]) -> Output {
     let mut child = Command::new(env!("CARGO_BIN_EXE_b2p"))
         .current_dir(folder)
         .args(arguments)
+        .arg("--force")
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -43,12 +54,16 @@ fn piped(folder: &Path, arguments: &[&str], input: &[u8]) -> Output {
     child.wait_with_output().expect("the program ends")
 }
 
+/// Runs a command that must succeed: its result, or its report if it has no result.
 #[track_caller]
 fn succeeds(folder: &Path, arguments: &[&str]) -> String {
     let output = b2p(folder, arguments);
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{arguments:?} failed: {errors}");
-    String::from_utf8(output.stdout).expect("output is UTF-8")
+    match output.stdout.is_empty() {
+        true => errors.into_owned(),
+        false => String::from_utf8(output.stdout).expect("output is UTF-8"),
+    }
 }
 
 /// Runs a command that must fail, mention every one of `words`, and leave the folder as it was.

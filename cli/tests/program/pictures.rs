@@ -61,7 +61,7 @@ fn effects_are_explained_and_forced() {
         let args = ["render", "ball.b2p", "-o", name, "--size", "16x16", "-v"];
         let done = b2p(at, &[&args[..], more].concat());
         assert!(done.status.success());
-        String::from_utf8(done.stdout).unwrap()
+        String::from_utf8(done.stderr).unwrap()
     };
     assert!(draw("a.png", &[]).contains("antialias off: "));
     assert!(draw("b.png", &["--effect", "antialias=on"]).contains("antialias on: forced"));

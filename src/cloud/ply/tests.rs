@@ -120,6 +120,22 @@ fn lists_in_vertices_are_skipped() {
 }
 
 #[test]
+fn a_list_of_fewer_than_no_items_is_refused() {
+    let header = "element vertex 1\nproperty list char uchar tags\nproperty uchar x\nproperty uchar y\n\
+                  property uchar z\nend_header\n";
+    let ascii = format!("ply\nformat ascii 1.0\n{header}-1 7 8 9\n").into_bytes();
+    let mut binary = format!("ply\nformat binary_little_endian 1.0\n{header}").into_bytes();
+    binary.extend([0xff, 7, 8, 9]);
+    for bytes in [ascii, binary] {
+        let error = open(&bytes).unwrap_err().to_string();
+        assert!(
+            error.contains("tags") || error.contains("0 or more items, not -1"),
+            "{error}"
+        );
+    }
+}
+
+#[test]
 fn a_file_cut_anywhere_is_an_error() {
     for format in FORMATS {
         let bytes = sample(format, "\n");

@@ -253,6 +253,28 @@ fn invalid_headers_are_neither_written_nor_read() {
         seal_header(&mut bytes);
         assert!(parse(&bytes).is_err(), "{offset} = {value}");
     }
+    for (slice, valid) in [
+        (MAX_SLICE_VOXELS, true),
+        (MAX_SLICE_VOXELS + 1, false),
+        (u32::MAX, false),
+    ] {
+        let mut header = header();
+        header.slice_voxels = slice;
+        assert_eq!(Writer::new(header).is_ok(), valid, "slices of {slice}");
+        let mut bytes = sample();
+        bytes[80..84].copy_from_slice(&slice.to_le_bytes());
+        seal_header(&mut bytes);
+        assert_eq!(
+            Header::parse(&bytes, &Limits::default()).is_ok(),
+            valid,
+            "slices of {slice}"
+        );
+    }
+    for (slice, valid) in [(MAX_COLOUR_SLICE, true), (MAX_COLOUR_SLICE + 1, false), (0, false)] {
+        let mut header = header();
+        header.format = Format::Transform { colour_slice: slice };
+        assert_eq!(Writer::new(header).is_ok(), valid, "slices of {slice}");
+    }
     let mut bytes = sample();
     bytes[32..40].copy_from_slice(&f64::NAN.to_le_bytes());
     seal_header(&mut bytes);

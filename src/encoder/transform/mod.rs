@@ -45,6 +45,10 @@ pub struct Options {
     pub fineness: Fineness,
     /// Whether levels have a filter that the decoder runs on their colours.
     pub filter: bool,
+    /// Whether quantisation is rate–distortion optimised; otherwise coefficients are rounded to the nearest.
+    pub optimised: bool,
+    /// Streams that [`encode_within`] tries for a level at most, once one fits.
+    pub tries: usize,
     /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
     /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`].
@@ -59,6 +63,8 @@ impl Default for Options {
             levels: None,
             fineness: Fineness::Step(20.0),
             filter: true,
+            optimised: true,
+            tries: usize::MAX,
             slice_voxels: MAX_SLICE_VOXELS,
             colour_slice: MAX_COLOUR_SLICE / 2,
             isa: None,
@@ -264,7 +270,11 @@ impl<'a> Subject<'a> {
         if self.grey && !steps.is_lossless() {
             steps.chroma = Steps::ABSENT;
         }
-        colour::Options::new(steps)
+        let mut coding = colour::Options::new(steps);
+        if !self.options.optimised {
+            coding.lambda = 0.0;
+        }
+        coding
     }
 
     /// Codes the colours of the levels down to `top`.

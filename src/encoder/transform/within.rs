@@ -113,7 +113,12 @@ impl Search<'_> {
         let (mut fits, mut exceeds): (Option<Tried>, Option<Tried>) = (None, None);
         let mut best = None;
         let mut next = Some(FIRST);
+        let mut tries = 0;
         while let Some(at) = next {
+            if best.is_some() && tries >= self.subject.options.tries {
+                break;
+            }
+            tries += 1;
             let (size, found) = self.attempt_sized(place(at), log)?;
             let tried = Some(Tried {
                 at,

@@ -41,13 +41,15 @@ mod tests;
 use std::path::Path;
 use std::sync::Arc;
 
-use b2p_kernels::{Isa, map_file};
+use b2p_kernels::Isa;
 
 use super::{Frame, Gaussians};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::gaussians::Heads;
 use crate::geometry::{KernelMap, Octree};
+use crate::input;
 use crate::layers::{Precision, missing};
+use crate::limits::Limits;
 use network::Generator;
 #[cfg(test)]
 pub(crate) use network::TERMS;
@@ -98,12 +100,10 @@ impl HeadsModel {
     /// Loads a model file.
     ///
     /// # Errors
-    /// [`Error::Io`], and those of [`HeadsModel::from_bytes`].
+    /// [`Error::Io`], [`Error::LimitExceeded`] for a file of more than 2 GiB, and those of [`HeadsModel::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
-        let bytes = map_file(path).map_err(|source| Error::Io {
-            path: path.to_owned(),
-            source,
-        })?;
+        // Read, not mapped: another program may shorten the file meanwhile.
+        let bytes = input::read_file(path, &Limits::default())?;
         HeadsModel::from_bytes(&bytes)
     }
 
@@ -117,12 +117,14 @@ impl HeadsModel {
     }
 
     /// The networks of the model.
+    #[doc(hidden)]
     pub fn sets(&self) -> impl Iterator<Item = Set> + '_ {
         self.generators.iter().map(|(set, _)| *set)
     }
 
     /// Maximum memory in bytes of [`HeadsModel::generate`] for a level of `voxels` voxels and `above` voxels in the
     /// level above, Gaussians included; 0 if the model does not have the set.
+    #[doc(hidden)]
     pub fn bytes(&self, set: Set, voxels: u64, above: u64) -> u64 {
         match self.find(set) {
             Some(generator) => network::bytes(generator.shape(), voxels, above),
@@ -139,6 +141,7 @@ impl HeadsModel {
     ///
     /// # Panics
     /// If the octree is less deep, or if the kernel maps or colours do not match its levels in length.
+    #[doc(hidden)]
     pub fn generate(
         &self,
         isa: Isa,

@@ -1,6 +1,6 @@
 //! The disc of a voxel: centre, radius, thickness and orientation.
 
-use super::lanes::{GROUP, Lane, dot, lane};
+use super::lanes::{GROUP, Lane, axes, dot, lane};
 use super::moments::{CentredMoments, PAIRS};
 use super::normals::normals;
 
@@ -20,7 +20,7 @@ const THICK: f32 = 0.4;
 const INWARDS: f32 = 0.2;
 
 /// A voxel's disc. Lengths are in voxels.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Disc {
     /// Centre, relative to the voxel's centre.
     pub centre: [f32; 3],
@@ -35,37 +35,42 @@ pub struct Disc {
 /// The discs of [`GROUP`] voxels, from their moments after one step (`near`) and after all steps (`far`).
 #[inline(always)]
 pub fn discs(near: &CentredMoments, far: &CentredMoments) -> [Disc; GROUP] {
-    let mean = |m: &CentredMoments| [0, 1, 2].map(|axis| lane(|j| m.sum[axis][j] / m.count[j]));
+    let mean = |m: &CentredMoments| axes(|axis| lane(|j| m.sum[axis][j] / m.count[j]));
     let (near, centre) = (mean(near), mean(far));
-    let covariance = std::array::from_fn(|k| {
-        let (a, b) = PAIRS[k];
-        lane(|j| far.square[k][j] / far.count[j] - centre[a][j] * centre[b][j])
-    });
-    let axes = normals(covariance);
-    let normal = axes.normal;
+    let mut covariance = [[0.0; GROUP]; 6];
+    for (k, (entry, (a, b))) in covariance.iter_mut().zip(PAIRS).enumerate() {
+        *entry = lane(|j| far.square[k][j] / far.count[j] - centre[a][j] * centre[b][j]);
+    }
+    let system = normals(covariance);
+    let normal = system.normal;
     let (low, high) = (dot(&near, &normal), dot(&centre, &normal));
     let density = density(&normal);
     // The centres of the voxels that a plane cuts are uniformly distributed along its normal, over an interval as long
     // as the density. Its variance is density² / 12.
     let thick = lane(|j| {
-        let excess = axes.least[j] - density[j] * density[j] / 12.0;
+        let excess = system.least[j] - density[j] * density[j] / 12.0;
         (excess / THICK).clamp(0.0, 1.0)
     });
     let height = lane(|j| high[j] + thick[j] * (low[j] - high[j]));
-    let place = [0, 1, 2].map(|axis| {
+    let place = axes(|axis| {
         let (n, mean) = (&normal[axis], &centre[axis]);
         lane(|j| n[j] * height[j] + INWARDS * (mean[j] - high[j] * n[j]))
     });
-    let flat = lane(|j| (axes.middle[j] / SURFACE).min(1.0));
+    let flat = lane(|j| (system.middle[j] / SURFACE).min(1.0));
     let radius = lane(|j| SPHERE + flat[j] * (RADIUS / density[j].sqrt() - SPHERE));
     let thickness = lane(|j| SPHERE + flat[j] * (THICKNESS - SPHERE));
     let rotation = rotation_to(&normal);
-    std::array::from_fn(|j| Disc {
-        centre: place.map(|axis| axis[j]),
-        rotation: rotation.map(|component| component[j]),
-        radius: radius[j],
-        thickness: thickness[j],
-    })
+    let mut discs = [Disc::default(); GROUP];
+    for (j, disc) in discs.iter_mut().enumerate() {
+        let ([x, y, z], [w, i, k, l]) = (&place, &rotation);
+        *disc = Disc {
+            centre: [x[j], y[j], z[j]],
+            rotation: [w[j], i[j], k[j], l[j]],
+            radius: radius[j],
+            thickness: thickness[j],
+        };
+    }
+    discs
 }
 
 /// Number of voxels per unit area that a plane with this normal cuts.

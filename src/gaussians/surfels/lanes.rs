@@ -9,7 +9,18 @@ pub type Lane = [f32; GROUP];
 /// The values of `f` for each voxel of a group.
 #[inline(always)]
 pub fn lane(f: impl Fn(usize) -> f32) -> Lane {
-    std::array::from_fn(f)
+    // A loop: `from_fn` is not always inlined, and would then be compiled for the baseline of the target.
+    let mut lane = [0.0; GROUP];
+    for (j, value) in lane.iter_mut().enumerate() {
+        *value = f(j);
+    }
+    lane
+}
+
+/// The values of `f` for each axis.
+#[inline(always)]
+pub fn axes(f: impl Fn(usize) -> Lane) -> [Lane; 3] {
+    [f(0), f(1), f(2)]
 }
 
 /// Scalar products, summed in the order x, y, z.

@@ -72,9 +72,10 @@ pub fn centred(moments: &[Moments], coordinates: &[[u32; 3]]) -> CentredMoments 
         square: [[0.0; GROUP]; 6],
     };
     for (j, (m, coordinate)) in moments.iter().zip(coordinates).enumerate() {
-        let c = coordinate.map(|v| v as u16);
+        let c = [coordinate[0] as u16, coordinate[1] as u16, coordinate[2] as u16];
         let (n, times) = (m[0], u16::wrapping_mul);
-        let sum = [0, 1, 2].map(|a| m[1 + a].wrapping_sub(times(n, c[a])));
+        let moved = |a: usize| m[1 + a].wrapping_sub(times(n, c[a]));
+        let sum = [moved(0), moved(1), moved(2)];
         lanes.count[j] = f32::from(n);
         for (lane, sum) in lanes.sum.iter_mut().zip(sum) {
             lane[j] = f32::from(sum as i16);

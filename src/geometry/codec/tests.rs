@@ -29,6 +29,20 @@ fn decode(levels: &[Vec<(u32, Vec<u8>)>], slice: usize) -> Result<Octree> {
     Ok(octree)
 }
 
+#[test]
+fn a_thrown_switch_stops_before_the_first_slice_and_between_slices() {
+    let octree = bowl(6);
+    let levels = encode(&octree, 100);
+    let encoded = &levels[5];
+    assert!(encoded.len() > 2, "several slices");
+    let map = octree.kernel_map(5);
+    let cancel = Cancel::default();
+    let decode = || decode_masks(Isa::detect(), 6, &map, &borrowed(encoded), 100, &cancel);
+    assert_eq!(decode().unwrap(), octree.occupancy(5));
+    cancel.cancel();
+    assert!(matches!(decode(), Err(Error::Cancelled)));
+}
+
 /// A slice that starts at byte `offset` of a stream.
 fn slice_at(offset: usize, voxels: u32, bytes: &[u8]) -> Slice<'_> {
     Slice { voxels, bytes, offset }

@@ -285,6 +285,19 @@ mod tests {
         decode_slice(&tables(), condition, bytes, voxels, &"slice 0")
     }
 
+    #[test]
+    fn a_first_state_in_more_bytes_than_hold_it_is_refused() {
+        // Nothing but the state, which has five bytes.
+        let bytes = sealed(Stack::new(END_STATE, Vec::new()));
+        assert_eq!(bytes.len(), LEAST_STATE_BYTES);
+        assert!(open(&bytes, &"slice 0").is_ok());
+        for zeros in 1..4 {
+            let padded = [&bytes[..], &[0; 3][..zeros]].concat();
+            let error = open(&padded, &"slice 0").unwrap_err().to_string();
+            assert!(error.contains("highest byte of the coder state"), "{error}");
+        }
+    }
+
     proptest! {
         #[test]
         fn any_latents_come_back_under_any_prediction(

@@ -12,6 +12,7 @@ use crate::layers::Spec;
 use crate::layers::missing;
 use crate::layers::{Pool, apply, apply_f32, concat, reals};
 
+#[doc(hidden)]
 impl Model {
     /// The encoder's features of every coded level, finest first: [voxels, C] each.
     ///

@@ -11,6 +11,7 @@ use crate::layers::{Pool, apply, concat};
 /// Standard deviations that a latent may have.
 pub(super) const SIGMAS: i16 = 64;
 
+#[doc(hidden)]
 impl Model {
     /// The context of a role's voxels: their parents' features, upsampled.
     ///

@@ -73,6 +73,7 @@ impl Generator {
     }
 }
 
+#[doc(hidden)]
 impl Model {
     /// [`Model::generate_with`] the best heads.
     ///

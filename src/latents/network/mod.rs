@@ -62,11 +62,13 @@ mod work;
 use std::path::Path;
 use std::sync::Arc;
 
-use b2p_kernels::{ExactConv, FloatConv, Isa, map_file};
+use b2p_kernels::{ExactConv, FloatConv, Isa};
 
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::input;
 use crate::latents::entropy::{RawRows, Tables};
 use crate::layers::{Precision, Spec, Stored, Tensors, malformed, missing};
+use crate::limits::Limits;
 use generate::Generator;
 use structure::{Encoder, Exact, Generate};
 
@@ -104,12 +106,10 @@ impl Model {
     /// Loads a model file.
     ///
     /// # Errors
-    /// [`Error::Io`], or as [`Model::from_bytes`].
+    /// [`Error::Io`], [`Error::LimitExceeded`] for a file of more than 2 GiB, or as [`Model::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
-        let bytes = map_file(path).map_err(|source| Error::Io {
-            path: path.to_owned(),
-            source,
-        })?;
+        // Read, not mapped: another program may shorten the file meanwhile.
+        let bytes = input::read_file(path, &Limits::default())?;
         Model::from_bytes(&bytes)
     }
 
@@ -185,6 +185,7 @@ impl Model {
     }
 
     /// The model's extents.
+    #[doc(hidden)]
     pub fn shape(&self) -> &Shape {
         &self.shape
     }
@@ -195,6 +196,7 @@ impl Model {
     }
 
     /// The probability tables.
+    #[doc(hidden)]
     pub fn tables(&self) -> &Tables {
         &self.tables
     }
@@ -203,6 +205,7 @@ impl Model {
     ///
     /// # Panics
     /// If `role` is above 2.
+    #[doc(hidden)]
     pub fn bit_prices(&self, role: usize) -> &[f32] {
         &self.bit_prices[role]
     }

@@ -45,6 +45,7 @@ impl Shape {
     }
 }
 
+#[doc(hidden)]
 impl Model {
     /// Whether the latents of a role are coded in passes, octant by octant, and predicted from neighbours.
     pub fn has_passes(&self, role: usize) -> bool {

@@ -1,14 +1,17 @@
 //! Pinhole cameras in the cube frame.
 
 pub mod files;
+mod framing;
 
 use std::ops::Range;
 
-use glam::{DAffine3, DMat3, DVec3};
+use glam::{DAffine3, DMat3};
 
 use b2p_kernels::splat::{Bounds, TILE};
 
 use crate::error::{Error, Result};
+
+pub use framing::Extent;
 
 /// How far `R·Rᵀ` of a pose may be from the identity, so that a rotation printed with four decimals still is one.
 const ROTATION_TOLERANCE: f64 = 1e-3;
@@ -66,22 +69,7 @@ impl Camera {
     /// # Errors
     /// [`Error::Usage`] if that is no camera: see [`Camera::check`].
     pub fn orbit(azimuth: f64, elevation: f64, radius: f64, fov: f64, width: u32, height: u32) -> Result<Camera> {
-        let (sin_az, cos_az) = azimuth.to_radians().sin_cos();
-        let (sin_el, cos_el) = elevation.to_radians().sin_cos();
-        let outwards = DVec3::new(cos_el * sin_az, sin_el, cos_el * cos_az);
-        let right = DVec3::new(cos_az, 0.0, -sin_az);
-        let down = right.cross(outwards);
-        let rotation = DMat3::from_cols(right, down, -outwards).transpose();
-        if !(fov > 0.0 && fov < 180.0) {
-            return Err(Error::Usage(format!(
-                "the field of view is {fov}°, it must lie between 0° and 180°"
-            )));
-        }
-        let focal = f64::from(width) / 2.0 / (fov.to_radians() / 2.0).tan();
-        let pose = DAffine3::from_mat3_translation(rotation, DVec3::new(0.0, 0.0, radius));
-        let camera = Self::centred(pose, focal, width, height);
-        camera.check()?;
-        Ok(camera)
+        Self::orbit_around([0.0; 3], azimuth, elevation, radius, fov, width, height)
     }
 
     /// A pinhole camera of square pixels with its principal point in the middle, and `focal` in pixels. `rotation` (three

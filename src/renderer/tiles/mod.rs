@@ -212,11 +212,13 @@ impl Bins {
     ///
     /// # Errors
     /// [`crate::Error::LimitExceeded`] before anything is reserved, if `reserved` bytes, the entries of the fullest tile, and room to
-    /// sort it in every thread, are together more than `limits` allow.
+    /// sort it in every thread, are together more than `limits` allow; or if there are more pairs of an ellipse and a tile.
     pub fn plan(&mut self, grid: Grid, counts: &mut [Count], reserved: u64, limits: &Limits) -> Result<u64> {
         self.grid = grid;
         counts.par_iter_mut().for_each(|count| count.sum(grid));
         let counts = &*counts;
+        let pairs = counts.iter().map(|count| count.pairs).sum();
+        limits.check_pairs("pairs of Gaussians and tiles to draw", pairs)?;
         self.totals.clear();
         self.totals.resize(grid.columns * grid.rows, 0);
         let rows = self.totals.par_chunks_mut(grid.columns).enumerate();
@@ -234,7 +236,7 @@ impl Bins {
         let reserved = reserved.saturating_add(sorting);
         limits.check_bytes("bytes to draw the picture", reserved.saturating_add(fullest * entry))?;
         self.most = MOST_ENTRIES.min((limits.max_bytes - reserved) / entry).max(fullest);
-        Ok(counts.iter().map(|count| count.pairs).sum())
+        Ok(pairs)
     }
 
     /// The part that follows `last`, or the first.
@@ -280,7 +282,10 @@ impl Bins {
     }
 
     /// Deals the ellipses out to the tiles of `part`; the memory is reused.
-    pub fn fill(&mut self, part: Part, ellipses: &Ellipses, counts: &mut [Count]) {
+    ///
+    /// # Errors
+    /// [`crate::Error::OutOfMemory`].
+    pub fn fill(&mut self, part: Part, ellipses: &Ellipses, counts: &mut [Count]) -> Result<()> {
         let Grid { columns, .. } = self.grid;
         let stride = columns + 1;
         // Where each tile starts, and within it, each run.
@@ -300,7 +305,10 @@ impl Bins {
         if self.entries.len() < next {
             // What is outgrown goes before its successor comes, which has no room to spare: memory is what was planned.
             self.entries = Vec::new();
-            self.entries = bytemuck::zeroed_vec(next);
+            self.entries = bytemuck::try_zeroed_vec(next).map_err(|()| crate::Error::OutOfMemory {
+                what: "the lists of the tiles",
+                bytes: (next * size_of::<u64>()) as u64,
+            })?;
         }
         let entries = &self.entries[..];
         let whole = part.rows.len() == self.grid.rows && part.columns.len() == columns;
@@ -313,6 +321,7 @@ impl Bins {
             }
         });
         self.part = Some(part);
+        Ok(())
     }
 
     /// The ellipses of a tile of the part last filled.

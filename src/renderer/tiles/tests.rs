@@ -87,7 +87,7 @@ fn every_tile_lists_just_the_ellipses_whose_bounds_touch_it_nearest_first() {
         bins.most = bins.most.min(most).max(3500);
         let (mut part, mut parts, mut listed, mut tiles) = (bins.next(None), 0, 0, 0);
         while let Some(now) = part {
-            bins.fill(now.clone(), &scene.ellipses, &mut scene.counts);
+            bins.fill(now.clone(), &scene.ellipses, &mut scene.counts).unwrap();
             for row in now.rows.clone() {
                 for column in now.columns.clone() {
                     let mut nearest = Nearest::default();
@@ -152,6 +152,36 @@ fn lists_over_the_limit_are_refused_before_they_are_made() {
     assert_eq!(plan(100, needed + 100).unwrap(), entries);
     let error = plan(100, needed + 99).unwrap_err();
     assert!(matches!(error, Error::LimitExceeded { needed: n, .. } if n == needed + 100));
+}
+
+#[test]
+fn more_pairs_than_are_allowed_are_refused_before_they_are_listed() {
+    let all = gaussians(300);
+    let pairs = project(&all, 64, 64)
+        .counts
+        .iter()
+        .map(|count| count.pairs)
+        .sum::<u64>();
+    let plan = |max_pairs| {
+        let mut scene = project(&all, 64, 64);
+        let limits = Limits {
+            max_pairs,
+            ..Limits::default()
+        };
+        Bins::default().plan(scene.grid, &mut scene.counts, 0, &limits)
+    };
+    assert_eq!(plan(pairs).unwrap(), pairs);
+    let error = plan(pairs - 1).unwrap_err();
+    assert!(
+        matches!(
+            error,
+            Error::LimitExceeded {
+                option: "max_pairs",
+                ..
+            }
+        ),
+        "{error}"
+    );
 }
 
 #[test]

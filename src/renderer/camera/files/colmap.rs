@@ -1,8 +1,10 @@
 //! COLMAP's text files.
 
+use std::collections::HashMap;
+
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 
-use super::{Named, checked, pose};
+use super::{Named, check_count, checked, pose};
 use crate::error::{Error, Result};
 use crate::gaussians::Frame;
 use crate::renderer::camera::{Camera, Projection};
@@ -10,16 +12,20 @@ use crate::renderer::camera::{Camera, Projection};
 /// The cameras of COLMAP's text files, in the order of the images.
 ///
 /// # Errors
-/// [`Error::Usage`] if a line cannot be understood, a lens distorts, or one of them is no camera.
+/// [`Error::Usage`] if a line cannot be understood, a lens distorts, one of them is no camera, or there are over
+/// [`MAX_CAMERAS`](super::MAX_CAMERAS).
 pub fn colmap(cameras: &str, images: &str, frame: &Frame) -> Result<Vec<Named>> {
     let bad = |file: &str, line: &str| Error::Usage(format!("{file}: cannot read `{line}`"));
+    let mut lenses = HashMap::new();
+    for line in cameras.lines() {
+        if let Some(id) = line.split_whitespace().next() {
+            lenses.entry(id).or_insert(line);
+        }
+    }
     let lens = |id: &str| -> Result<Camera> {
-        let words = cameras.lines().map(|l| l.split_whitespace());
-        let mut words = words.filter(|w| w.clone().next() == Some(id));
-        let line: Vec<&str> = words
-            .next()
-            .ok_or_else(|| Error::Usage(format!("cameras.txt: no camera {id}")))?
-            .collect();
+        let line = lenses.get(id);
+        let line = line.ok_or_else(|| Error::Usage(format!("cameras.txt: no camera {id}")))?;
+        let line: Vec<&str> = line.split_whitespace().collect();
         let numbers: Option<Vec<f64>> = line.iter().skip(2).map(|w| w.parse().ok()).collect();
         let numbers = numbers.ok_or_else(|| bad("cameras.txt", &line.join(" ")))?;
         let (fx, fy, cx, cy, width, height) = match (line.get(1).copied(), &numbers[..]) {
@@ -70,6 +76,7 @@ pub fn colmap(cameras: &str, images: &str, frame: &Frame) -> Result<Vec<Named>> 
         let mut camera = lens(id)?;
         camera.pose = pose(rotation, DVec3::new(tx, ty, tz), frame);
         named.push(checked(name, camera)?);
+        check_count("images.txt", named.len())?;
         lines.next();
     }
     Ok(named)

@@ -4,13 +4,15 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::{Named, checked, parsed, pose};
+use super::{Named, check_count, checked, is_angle, no_angle, parsed, pose};
 use crate::error::{Error, Result};
 use crate::gaussians::Frame;
 use crate::renderer::camera::{Camera, Projection};
 
 /// What a binary file begins with.
 pub(super) const MAGIC: &[u8] = b"glTF";
+/// Nodes that a camera is below at most.
+const MAX_DEPTH: usize = 1000;
 /// The header of the file, and of its first chunk, which is the JSON.
 const HEADERS: usize = 20;
 
@@ -55,6 +57,25 @@ struct Node {
     scale: Option<[f64; 3]>,
 }
 
+impl Lens {
+    /// Fails unless the numbers are such as glTF allows.
+    fn check(&self, name: &str) -> Result<()> {
+        let near = match self {
+            Lens::Perspective { perspective } if !is_angle(perspective.yfov) => {
+                return Err(no_angle(&format!("glTF: {name}"), "yfov", perspective.yfov));
+            }
+            Lens::Perspective { perspective } => perspective.znear,
+            Lens::Orthographic { orthographic } => orthographic.znear,
+        };
+        if near >= 0.0 && near.is_finite() {
+            return Ok(());
+        }
+        Err(Error::Usage(format!(
+            "glTF: {name}: znear is {near}, it must be 0 or more"
+        )))
+    }
+}
+
 impl Node {
     /// To the parent's space.
     fn transform(&self) -> DMat4 {
@@ -97,19 +118,21 @@ pub(super) fn cameras(file: Value, frame: &Frame, size: (u32, u32)) -> Result<Ve
         let name = node.name.clone().unwrap_or_else(|| format!("node {i}"));
         let missing = || Error::Usage(format!("glTF: {name}: there is no camera {camera}"));
         let lens = cameras.get(camera).ok_or_else(missing)?;
+        lens.check(&name)?;
         let mut transform = node.transform();
         let mut above = parents[i];
-        for _ in 0..nodes.len() {
+        for _ in 0..nodes.len().min(MAX_DEPTH) {
             let Some(parent) = above else { break };
             transform = nodes[parent].transform() * transform;
             above = parents[parent];
         }
         if above.is_some() {
-            let what = format!("glTF: {name} is among its own children");
+            let what = format!("glTF: {name} is among its own children, or below more than {MAX_DEPTH} nodes");
             return Err(Error::Usage(what));
         }
         let camera = seen(*lens, transform, frame, size);
         named.push(checked(&name, camera)?);
+        check_count("glTF", named.len())?;
     }
     Ok(named)
 }

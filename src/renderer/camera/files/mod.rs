@@ -15,6 +15,9 @@ use super::{Camera, Projection};
 use crate::error::{Error, Result};
 use crate::gaussians::Frame;
 
+/// Cameras of one file at most.
+pub const MAX_CAMERAS: usize = 100_000;
+
 pub use colmap::colmap;
 
 /// A camera and the name of the picture that was taken with it.
@@ -75,7 +78,7 @@ impl Camera {
 /// files that name none.
 ///
 /// # Errors
-/// [`Error::Usage`] if it is none of these, or one of its cameras is none ([`Camera::check`]).
+/// [`Error::Usage`] if it is none of these, one of its cameras is none ([`Camera::check`]), or there are over [`MAX_CAMERAS`].
 pub fn read(bytes: &[u8], frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
     let text = match bytes.starts_with(gltf::MAGIC) {
         true => gltf::json_of(bytes)?,
@@ -109,6 +112,11 @@ fn nerf(file: Value, frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
         let side = |given: Option<f64>, otherwise: u32| given.map_or(otherwise, |side| side as u32);
         let (width, height) = (side(lens.w, size.0), side(lens.h, size.1));
         let wide = file.camera_angle_x;
+        if let Some(angle) = wide
+            && !is_angle(angle)
+        {
+            return Err(no_angle("transforms.json", "camera_angle_x", angle));
+        }
         let wide = wide.map(|angle| f64::from(width) / 2.0 / (angle / 2.0).tan());
         let Some(fx) = lens.fl_x.or(lens.fl_y).or(wide) else {
             return Err(Error::Usage(format!(
@@ -134,7 +142,29 @@ fn nerf(file: Value, frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
         };
         checked(&shot.file_path, named)
     };
+    check_count("transforms.json", file.frames.len())?;
     file.frames.iter().map(camera).collect()
+}
+
+/// Fails if a file has more cameras than are taken.
+fn check_count(file: &str, count: usize) -> Result<()> {
+    if count <= MAX_CAMERAS {
+        return Ok(());
+    }
+    Err(Error::Usage(format!(
+        "{file}: there are {count} cameras, {MAX_CAMERAS} are taken at most"
+    )))
+}
+
+/// Whether a pinhole can see so much, in radians.
+fn is_angle(angle: f64) -> bool {
+    angle > 0.0 && angle < std::f64::consts::PI
+}
+
+fn no_angle(name: &str, field: &str, angle: f64) -> Error {
+    Error::Usage(format!(
+        "{name}: {field} is {angle}, it must be between 0 and π (half a turn)"
+    ))
 }
 
 /// From the cube to the camera, in cube-frame units, of what is from the world to the camera in the world's.
@@ -262,5 +292,68 @@ mod tests {
         assert!(matches!(fish, Err(Error::Unsupported { .. })));
         assert!(colmap("", "1 1 0 0 0 0 0 0 1 a\n", &FRAME).is_err());
         assert!(colmap("1 PINHOLE 8 8 1 1 1 1\n", "1 x 0 0 0 0 0 0 1 a\n", &FRAME).is_err());
+    }
+
+    #[test]
+    fn lenses_of_gltf_that_see_nothing_or_all_around_are_refused() {
+        let file = |lens: &str| {
+            format!(r#"{{"asset": {{}}, "nodes": [{{"name": "eye", "camera": 0}}], "cameras": [{lens}]}}"#)
+        };
+        let perspective = |yfov: &str, znear: &str| {
+            file(&format!(
+                r#"{{"type": "perspective", "perspective": {{"yfov": {yfov}, "znear": {znear}}}}}"#
+            ))
+        };
+        assert!(read(perspective("1", "0.1").as_bytes(), &FRAME, (8, 8)).is_ok());
+        for (yfov, znear, field) in [
+            ("1e9", "0.1", "yfov"),
+            ("3.15", "0.1", "yfov"),
+            ("0", "0.1", "yfov"),
+            ("-1", "0.1", "yfov"),
+            ("1", "-0.1", "znear"),
+        ] {
+            let error = read(perspective(yfov, znear).as_bytes(), &FRAME, (8, 8))
+                .unwrap_err()
+                .to_string();
+            assert!(error.contains("eye") && error.contains(field), "{error}");
+        }
+        let flat = file(r#"{"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 1, "znear": -1, "zfar": 9}}"#);
+        assert!(read(flat.as_bytes(), &FRAME, (8, 8)).is_err());
+        let nerf = r#"{"camera_angle_x": 4, "frames": [{"transform_matrix":
+            [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}]}"#;
+        let error = read(nerf.as_bytes(), &FRAME, (8, 8)).unwrap_err().to_string();
+        assert!(error.contains("camera_angle_x is 4"), "{error}");
+    }
+
+    #[test]
+    fn a_file_of_more_cameras_than_are_taken_is_refused_whatever_its_kind() {
+        let many = MAX_CAMERAS + 1;
+        let shot = r#"{"transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}"#;
+        let nerf = format!(r#"{{"fl_x": 9, "frames": [{}]}}"#, vec![shot; many].join(","));
+        let lens = r#"{"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}"#;
+        let nodes = vec![r#"{"camera": 0}"#; many].join(",");
+        let gltf = format!(r#"{{"asset": {{}}, "cameras": [{lens}], "nodes": [{nodes}]}}"#);
+        for file in [nerf, gltf] {
+            let error = read(file.as_bytes(), &FRAME, (8, 8)).unwrap_err().to_string();
+            assert!(error.contains("100000 are taken"), "{error}");
+        }
+        let images = "1 1 0 0 0 0 0 0 7 a\n\n".repeat(many);
+        let lenses: String = (0..many).map(|i| format!("{i} SIMPLE_PINHOLE 8 8 9 4 4\n")).collect();
+        let error = colmap(&lenses, &images, &FRAME).unwrap_err().to_string();
+        assert!(error.contains("100000 are taken"), "{error}");
+    }
+
+    #[test]
+    fn a_camera_below_very_many_nodes_is_refused_at_once() {
+        let count = 50_000;
+        let below = (1..count).map(|i| format!(r#"{{"children": [{i}], "camera": 0}}"#));
+        let nodes: Vec<String> = below.collect();
+        let lens = r#"{"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}"#;
+        let file = format!(
+            r#"{{"asset": {{}}, "cameras": [{lens}], "nodes": [{}, {{}}]}}"#,
+            nodes.join(",")
+        );
+        let error = read(file.as_bytes(), &FRAME, (8, 8)).unwrap_err().to_string();
+        assert!(error.contains("below more than 1000 nodes"), "{error}");
     }
 }

@@ -4,7 +4,7 @@ use glam::{DMat3, DMat4, DVec3};
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::{Named, checked, parsed, pose};
+use super::{Named, check_count, checked, parsed, pose};
 use crate::error::Result;
 use crate::gaussians::Frame;
 use crate::renderer::camera::{Camera, Projection};
@@ -35,6 +35,7 @@ pub(super) fn cameras(file: Value, frame: &Frame) -> Result<Vec<Named>> {
         Some(_) => parsed::<Trajectory>(what, file)?.parameters,
         None => vec![parsed(what, file)?],
     };
+    check_count(what, all.len())?;
     let camera = |(i, parameters): (usize, &Parameters)| {
         let extrinsic = DMat4::from_cols_array(&parameters.extrinsic);
         let rotation = DMat3::from_mat4(extrinsic);

@@ -1,0 +1,109 @@
+//! `--quality` and `--effort`: what they stand for.
+
+use std::ops::RangeInclusive;
+
+use b2p::encoder::transform::{Fineness, Options};
+
+/// A stretch of the scale, from one quality to the next stretch's: how many levels above the cloud's own the finest coded level is, and
+/// the quantisation steps of luma at both ends. Rate control takes the same path: a finer level as soon as it is worth its geometry.
+struct Stretch {
+    from: u8,
+    above: u8,
+    steps: [f32; 2],
+}
+
+const STRETCHES: [Stretch; 3] = [
+    Stretch {
+        from: 0,
+        above: 2,
+        steps: [64.0, 24.0],
+    },
+    Stretch {
+        from: 20,
+        above: 1,
+        steps: [64.0, 8.0],
+    },
+    Stretch {
+        from: 70,
+        above: 0,
+        steps: [23.0, 1.0],
+    },
+];
+
+/// The level above the cloud's own, and the step of luma, of a quality below 100.
+fn place(quality: u8) -> (u8, f32) {
+    let i = STRETCHES
+        .iter()
+        .rposition(|stretch| stretch.from <= quality)
+        .unwrap_or(0);
+    let Stretch { from, above, steps } = STRETCHES[i];
+    let end = STRETCHES.get(i + 1).map_or(100, |next| next.from);
+    let share = f32::from(quality - from) / f32::from(end - from - 1);
+    (above, steps[0] * (steps[1] / steps[0]).powf(share))
+}
+
+/// Sets what a quality stands for, for a cloud of bit depth `bits` whose levels `levels` were asked for.
+pub fn set_quality(options: &mut Options, quality: u8, bits: u8, levels: Option<RangeInclusive<u8>>) {
+    let (above, fineness) = match quality {
+        100.. => (0, Fineness::Lossless),
+        _ => {
+            let (above, step) = place(quality);
+            (above, Fineness::Step(step))
+        }
+    };
+    options.fineness = fineness;
+    let top = bits.saturating_sub(above);
+    options.levels = Some(levels.unwrap_or(bits.saturating_sub(3).min(top)..=top));
+}
+
+/// Sets what an effort stands for.
+pub fn set_effort(options: &mut Options, effort: u8) {
+    options.optimised = effort > 0;
+    options.filter &= effort > 1;
+    options.tries = match effort {
+        9.. => usize::MAX,
+        _ => 2 + usize::from(effort),
+    };
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_quality_is_a_finer_level_or_a_finer_step() {
+        let mut last = (2, f32::INFINITY);
+        for quality in 0..100 {
+            let (above, step) = place(quality);
+            assert!(
+                above < last.0 || (above == last.0 && step < last.1),
+                "{quality}: {above} {step}"
+            );
+            last = (above, step);
+        }
+        assert_eq!(last, (0, 1.0));
+        let mut options = Options::default();
+        set_quality(&mut options, 100, 10, None);
+        assert_eq!(options.fineness, Fineness::Lossless);
+        assert_eq!(options.levels, Some(7..=10));
+    }
+
+    #[test]
+    fn the_default_is_a_quality_of_about_48() {
+        let Fineness::Step(usual) = Options::default().fineness else {
+            panic!("a step");
+        };
+        let (above, step) = place(48);
+        assert_eq!(above, 1);
+        assert!((step / usual).ln().abs() < 0.05, "{step}");
+    }
+
+    #[test]
+    fn levels_that_are_asked_for_stay() {
+        let mut options = Options::default();
+        set_quality(&mut options, 90, 10, Some(5..=7));
+        assert_eq!(options.levels, Some(5..=7));
+        set_quality(&mut options, 90, 1, None);
+        assert_eq!(options.levels, Some(0..=1));
+    }
+}

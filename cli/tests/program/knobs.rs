@@ -1,0 +1,50 @@
+//! `--quality` and `--effort`.
+
+use super::*;
+
+#[test]
+fn more_quality_takes_more_bytes_and_its_ends_are_coarse_and_lossless() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    let bytes = |quality: &str| {
+        succeeds(at, &["encode", "ball.ply", "q.b2p", "--quality", quality]);
+        std::fs::metadata(at.join("q.b2p")).unwrap().len()
+    };
+    let sizes: Vec<u64> = ["0", "15", "30", "45", "60", "75", "90", "100"].map(bytes).to_vec();
+    assert!(sizes.is_sorted_by(|a, b| a < b), "{sizes:?}");
+    let info: Value = serde_json::from_str(&succeeds(at, &["info", "q.b2p", "--json"])).unwrap();
+    assert_eq!(info["top_level"], 7);
+    assert_eq!(info["levels"].as_array().unwrap().last().unwrap()["lossless"], true);
+    for conflict in [["--step", "8"], ["--bits-per-point", "1"]] {
+        let done = b2p(
+            at,
+            &[&["encode", "ball.ply", "q.b2p", "-Q", "50"], &conflict[..]].concat(),
+        );
+        assert_eq!(done.status.code(), Some(2), "{conflict:?}");
+    }
+    assert_eq!(
+        b2p(at, &["encode", "ball.ply", "q.b2p", "--quality", "101"])
+            .status
+            .code(),
+        Some(2)
+    );
+    let learned = ["encode", "ball.ply", "q.b2p", "--colours", "learned", "--quality", "50"];
+    fails(at, &learned, &["--quality", "--colours transform"]);
+}
+
+#[test]
+fn little_effort_leaves_steps_out_and_all_effort_is_the_default() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    let coded = |effort: &[&str]| {
+        let encode = ["encode", "ball.ply", "e.b2p", "--bits-per-point", "1", "-v"];
+        let said = succeeds(at, &[&encode, effort].concat());
+        (std::fs::read(at.join("e.b2p")).unwrap(), said)
+    };
+    let tries = |said: &str| said.lines().filter(|line| line.starts_with("try ")).count();
+    let (usual, _) = coded(&[]);
+    let (most, said) = coded(&["--effort", "9"]);
+    assert!(usual == most);
+    let (least, quick) = coded(&["--effort", "0"]);
+    assert!(least != most && tries(&quick) <= tries(&said), "{quick}{said}");
+}
