@@ -117,6 +117,12 @@ pub fn output_format(to: &Path, asked: Option<Format>) -> Result<Format> {
 /// Writes Gaussians, with warnings about what the format does not keep. What was subtracted from coordinates far from the origin
 /// stands in a file beside.
 pub fn write(g: &Gaussians, axes: Axes, format: Format, to: &Path, log: &Log) -> Result<()> {
+    let offset = splats::offset(g, axes, format);
+    let beside = sidecar(to);
+    let is_far = offset != [0.0; 3];
+    if is_far && !manners::is_pipe(to) && offset_beside(to).is_none() {
+        manners::permit(&[&beside], &[])?;
+    }
     let name = format!("write {format}");
     let mut warnings = Vec::new();
     log.step(name, g.len(), "Gaussians", || {
@@ -128,17 +134,15 @@ pub fn write(g: &Gaussians, axes: Axes, format: Format, to: &Path, log: &Log) ->
     for warning in warnings {
         manners::warn(&format!("{}: {warning}", to.display()));
     }
-    let offset = g.frame.offset();
-    if offset == [0.0; 3] || format == Format::Csv {
+    if !is_far {
         return Ok(());
     }
     let [x, y, z] = offset;
     let what = format!("coordinates are less an offset of {x} {y} {z}");
-    if manners::is_pipe(to) {
+    if manners::is_pipe(to) || !std::fs::metadata(to).is_ok_and(|file| file.is_file()) {
         manners::warn(&what);
         return Ok(());
     }
-    let beside = sidecar(to);
     let text = json!({ "file": to.file_name().map(|name| name.to_string_lossy()), "offset": offset });
     output::write_file(&beside, |w| {
         let io = |source| b2p::Error::Io {

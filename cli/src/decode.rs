@@ -11,7 +11,7 @@ use b2p::log::Log;
 use b2p_formats::splats::Axes;
 use serde_json::json;
 
-use super::args::{Decode, SplatFormat};
+use super::args::Decode;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
@@ -27,10 +27,6 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
         return points(args, limits, &log);
     }
     let (input, to) = (&args.input, &args.output);
-    if let Some(SplatFormat::Glb | SplatFormat::Gltf) = SplatFormat::of_path(input) {
-        let what = "this is glTF: `b2p convert` turns its axes to those of the output";
-        return Err(Failure(format!("{}: {what}", input.display())));
-    }
     let format = convert::output_format(to, args.format)?;
     let mut written = 0;
     let mut write = |gaussians: &Gaussians, log: &Log| {

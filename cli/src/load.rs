@@ -272,5 +272,6 @@ pub fn splats(
             path.display()
         )));
     }
-    convert::read(path, bytes, format, limits, log).map(|splats| splats.gaussians)
+    let splats = convert::read(path, bytes, format, limits, log)?;
+    splats.into_ply_axes().map_err(Failure::in_file(path))
 }

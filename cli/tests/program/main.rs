@@ -2,6 +2,7 @@
 
 #[path = "../../../tests/common/mod.rs"]
 mod common;
+mod converting;
 mod cutting;
 mod edges;
 mod framing;
