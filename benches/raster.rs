@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use b2p::gaussians::{Gaussians, Harmonics, ply};
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Channel, Choice, Effect, Effects, Image, Quality, Renderer, Stats};
+use b2p::renderer::{Background, Channel, Effect, EffectMode, Effects, Image, Quality, Renderer, Stats};
 use b2p::{Error, Limits, Result};
 use b2p_kernels::Isa;
 
@@ -247,9 +247,9 @@ fn measure(
 /// What is drawn: the plain picture, one without care for the near plane too where something reaches over it, or one with each effect.
 fn variants(forced: bool, within: bool) -> Vec<(&'static str, Effects, Channel)> {
     let none = Effects::default();
-    let careless = none.with(Effect::Near, Choice::Off);
-    let antialias = none.with(Effect::Antialias, Choice::On);
-    let order = none.with(Effect::Order, Choice::On);
+    let careless = none.with(Effect::Near, EffectMode::Off);
+    let antialias = none.with(Effect::Antialias, EffectMode::On);
+    let order = none.with(Effect::Order, EffectMode::On);
     if forced {
         vec![
             (", antialias", antialias, Channel::Colour),

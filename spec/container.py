@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from base import Reader, crc32c, require
 
 MAGIC = bytes.fromhex("89423250 0D0A1A0A")
-GEOMETRY, GEOMETRY_TRUNK, COLOUR_TRUNK, COLOURS, FILTER = 1, 5, 6, 7, 8
+GEOMETRY, GEOMETRY_TRUNK, COLOUR_TRUNK, COLOURS, FILTER, HEAD_MAP = 1, 5, 6, 7, 8, 128
 
 
 @dataclass
@@ -41,6 +41,7 @@ class Level:
     colours: dict = field(default_factory=dict)  # level -> [payload]
     colour_hash: int = None
     filter: bytes = None
+    head_map: bytes = None
 
 
 def parse_header(data):
@@ -79,12 +80,14 @@ class Chunks:
 
     def __init__(self, data, start, end):
         require(end <= len(data), "2.1.1", "section beyond the end of the stream")
-        self.chunks = []
+        self.chunks, self.head_maps = [], []
         reader = Reader(data, start, end)
         while reader.at < end:
             chunk = self.read(reader)
             if chunk.kind < 128:
                 self.chunks.append(chunk)
+            elif chunk.kind == HEAD_MAP:
+                self.head_maps.append(chunk)
         self.chunks.reverse()
 
     @staticmethod
@@ -164,6 +167,8 @@ def read_geometry_trunk(chunks, header, counts, result):
 def read_colours(chunks, header, counts, result):
     """3.3"""
     level = result.level
+    maps = [chunk.payload for chunk in chunks.head_maps if chunk.level == level]
+    result.head_map = maps[0] if maps else None
 
     def payload(chunk):
         if result.colour_hash is not None:

@@ -14,6 +14,7 @@ sys.dont_write_bytecode = True
 import colour
 import container
 import geometry
+import head_map
 import surfels
 from base import Refused, require
 from octree import Voxels
@@ -48,6 +49,9 @@ class Decoder:
         require(found == part.colour_hash, "5.10.1", f"colour hash of level {level}")
         if part.filter is not None:
             values = colour.filtered(voxels, self.coloured, part.filter)
+        blocks = len(self.levels[max(level - 3, 0)])
+        sizes = part.head_map and head_map.parse(part.head_map, blocks)
+        self.size = sizes[1] if sizes else 64
         fraction = self.coloured.steps.fraction()
         return voxels, [colour.display(value, fraction) for value in values]
 
@@ -59,7 +63,7 @@ def digests(data):
         voxels, colours = decoder.decode(level)
         keys = b"".join(struct.pack("<Q", key) for key in voxels.keys)
         count = 4 if level + 1 < decoder.header.bits else 1
-        gaussians = surfels.surfels(voxels, colours, count)
+        gaussians = surfels.surfels(voxels, colours, count, decoder.size)
         parts = [keys, bytes(x for rgb in colours for x in rgb), gaussians.tobytes()]
         yield f"{level}=" + ",".join(hashlib.sha256(part).hexdigest() for part in parts)
 

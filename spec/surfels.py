@@ -131,8 +131,8 @@ def quarters(voxels, colours, place, rotation):
         yield offset, np.clip(colours + a * gu + b * gv, F(0), F(255))
 
 
-def surfels(voxels, colours, count):
-    """6.6: one or four Gaussians for each voxel."""
+def surfels(voxels, colours, count, size):
+    """6.6: one or four Gaussians for each voxel; `size` in 64ths."""
     place, radius, thickness, rotation = discs(voxels)
     colours = np.array(colours, dtype=F).T
     edge = F(2) / F(1 << voxels.level)
@@ -140,7 +140,7 @@ def surfels(voxels, colours, count):
     if count == 4:
         parts, narrow = list(quarters(voxels, colours, place, rotation)), F(0.6)
     centre = (np.array(voxels.coordinates, dtype=np.float64) + 0.5) * np.float64(edge) - 1
-    r = radius * narrow * edge
+    r = radius * narrow * (F(size) / F(64)) * edge
 
     def rows(arrays):
         return np.stack([np.stack(list(a), axis=1) for a in arrays], axis=1).reshape(-1, len(arrays[0]))

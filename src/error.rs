@@ -147,8 +147,8 @@ pub enum Error {
         /// What it may hold.
         expected: String,
     },
-    /// Of the streams that the encoder may choose from, none is as small as was asked for. Coarser levels take less, and so does, of learned
-    /// streams, a model that was trained for fewer bits.
+    /// Of the streams that the encoder may choose from, none is as small as was asked for. Coarser levels take less,
+    /// and so does, of learned streams, a model that was trained for fewer bits.
     #[error(
         "{asked} bits per point are too few: the smallest stream of these levels has {:.4}",
         (least * 1e4).ceil() / 1e4

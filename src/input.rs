@@ -25,7 +25,8 @@ pub fn read_file(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     read_all(file, length, path, limits)
 }
 
-/// Reads `from` to its end, at most `max_bytes` of `limits`. `expected` bytes are probably there; `path` appears in error messages only.
+/// Reads `from` to its end, at most `max_bytes` of `limits`. `expected` bytes are probably there; `path` appears in
+/// error messages only.
 ///
 /// # Errors
 /// [`Error::Io`] naming `path`, [`Error::OutOfMemory`], [`Error::LimitExceeded`] if there are more bytes.

@@ -28,15 +28,15 @@
 //! | bound what untrusted input may ask for | [`Limits`] |
 //! | stop, or observe | [`Cancel`], [`Log`] |
 //!
-//! Options are set by `with_…` methods. Decoders, models and logs are cheap to clone. Bad input gives an [`Error`], and
+//! Options are set by `with_…` methods. Decoders, models and logs are cheap to clone. Bad input gives an [`Error`];
 //! nothing panics.
 //!
 //! # Streams
 //!
-//! A stream is scalable: a lossless octree and its colours, level by level. A stream cut after a level is a valid coarser
-//! stream. Version 3 codes colours as transform coefficients and needs no model file; how it is drawn, as surfels in
-//! closed form or with learned heads, is the decoder's choice. Version 2, *Bits-to-Photon*, codes latents, from which the
-//! [`Model`] that coded them generates Gaussians.
+//! A stream is scalable: a lossless octree and its colours, level by level. A stream cut after a level is a valid
+//! coarser stream. Version 3 codes colours as transform coefficients and needs no model file; how it is drawn, as
+//! surfels in closed form or with learned heads, is the decoder's choice. Version 2, *Bits-to-Photon*, codes latents,
+//! from which the [`Model`] that coded them generates Gaussians.
 //!
 //! ```text
 //! bytes → container → per level: geometry → colour → gaussians → renderer → picture
@@ -44,8 +44,8 @@
 //! ```
 //!
 //! Each stage is a folder of `src/` and imports only earlier stages; `docs/architecture.md` describes them, and
-//! `docs/format.md` the format. Modules are public for the program, the tests and the tools of this repository. They are
-//! not documented here, and change without notice: what this page lists is the interface.
+//! `docs/format.md` the format. Modules are public for the program, the tests and the tools of this repository. They
+//! are not documented here, and change without notice: what this page lists is the interface.
 //!
 //! # Features
 //!
@@ -53,6 +53,8 @@
 //! `render` pictures, `encoder` (default) all of it, and `embedded` the models and samples that the program contains.
 #![forbid(unsafe_code)]
 
+#[doc(hidden)]
+pub mod axes;
 #[doc(hidden)]
 pub mod cancel;
 #[cfg(feature = "ply")]
@@ -100,16 +102,20 @@ pub mod renderer;
 #[cfg(test)]
 mod testing;
 
+pub use axes::{Axes, Up};
 #[doc(hidden)]
 pub use b2p_kernels::ceiling;
 pub use b2p_kernels::{Isa, UnknownIsa};
 pub use cancel::Cancel;
 #[cfg(feature = "ply")]
-pub use cloud::{ColouredVoxels, Hints, PointCloud, voxelise, voxelise_closed};
+pub use cloud::{
+    ColourRange, ColouredVoxels, Coordinates, GridReport, Hints, Note, PointCloud, RawColours, RawPoints, ReadOptions,
+    Stored, voxelise, voxelise_closed,
+};
 pub use container::{Format, Header};
 pub use decoder::{Decoder, Decoding, Points};
 #[cfg(feature = "encoder")]
-pub use encoder::{Encoded, Encoder, Rate, transform::Fineness};
+pub use encoder::{Encoded, Encoder, Rate, transform::QualityTarget};
 pub use error::{Error, Result, Stage};
 pub use gaussians::learned::HeadsModel;
 pub use gaussians::{Frame, Gaussians, Harmonics, HeadSet};
@@ -120,10 +126,11 @@ pub use limits::Limits;
 pub use log::{Log, Step};
 pub use placement::Placement;
 #[cfg(feature = "render")]
-pub use renderer::camera::{Camera, Projection};
+pub use renderer::camera::{Camera, Extent, Projection};
 #[cfg(feature = "render")]
 pub use renderer::projection::Dropped;
 #[cfg(feature = "render")]
 pub use renderer::{
-    Background, Channel, Choice, Effect, EffectSet, Effects, Explanation, Ids, Image, Quality, Renderer, Stats, Times,
+    Background, Channel, Effect, EffectMode, EffectSet, Effects, Explanation, Ids, Image, Quality, Renderer, Stats,
+    Times,
 };

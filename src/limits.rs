@@ -5,7 +5,8 @@ use crate::error::{Error, Result};
 /// The deepest octree level: what a Morton key of 64 bits addresses.
 pub const MAX_DEPTH: u8 = 21;
 
-/// Bounds that are checked before memory is reserved. Finite by default: 2²⁶ points, 21 levels, 2²⁶ pixels, 2²⁸ pairs, 2 GiB.
+/// Bounds that are checked before memory is reserved. Finite by default: 2²⁶ points, 21 levels, 2²⁶ pixels, 2²⁸ pairs,
+/// 2 GiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Limits {
@@ -34,7 +35,7 @@ impl Default for Limits {
 }
 
 impl Limits {
-    /// What the library takes beyond `max_bytes`, however small the input: threads and their desks.
+    /// What the library takes beyond `max_bytes`, however small the input: threads and their scratch.
     pub const OVERHEAD: u64 = 4 << 20;
 
     /// For boards with 512 MB of memory: 2²⁰ points, pictures of 2²² pixels and 2²⁴ pairs, 192 MiB.

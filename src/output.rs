@@ -1,9 +1,9 @@
 //! Output files that appear whole or not at all.
 //!
-//! A regular file is written under a temporary name in the same folder, synchronised, and renamed when complete. A symbolic link
-//! stays: the file that it points to is replaced. Devices, FIFOs and other files that are not regular are written into directly,
-//! because a rename would put a regular file in their place. Temporary files of writes in progress are listed, so that an
-//! interrupted program can remove them before it exits ([`remove_unfinished`]).
+//! A regular file is written under a temporary name in the same folder, synchronised, and renamed when complete. A
+//! symbolic link stays: the file that it points to is replaced. Devices, FIFOs and other files that are not regular are
+//! written into directly, because a rename would put a regular file in their place. Temporary files of writes in
+//! progress are listed, so that an interrupted program can remove them before it exits ([`remove_unfinished`]).
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{File, Metadata, OpenOptions};
@@ -21,8 +21,8 @@ const MAX_LINKS: usize = 40;
 /// Random names that are tried before giving up.
 const MAX_NAMES: usize = 16;
 
-/// Writes `path` through `fill`. A regular file, or one that does not exist yet, appears whole or not at all; what is written into
-/// a device or a FIFO cannot be taken back.
+/// Writes `path` through `fill`. A regular file, or one that does not exist yet, appears whole or not at all; what is
+/// written into a device or a FIFO cannot be taken back.
 ///
 /// # Errors
 /// [`Error::Io`] naming `path`, or whatever `fill` fails with; a regular file is then as it was.
@@ -47,8 +47,8 @@ pub fn write_file(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) 
     }
 }
 
-/// The regular file whose contents [`write_file`] would replace, if there is one: behind symbolic links, but not behind the
-/// redirection of a shell, such as `/dev/stdout` leads to.
+/// The regular file whose contents [`write_file`] would replace, if there is one: behind symbolic links, but not behind
+/// the redirection of a shell, such as `/dev/stdout` leads to.
 pub fn replaced(path: &Path) -> Option<PathBuf> {
     let found = std::fs::metadata(path).ok()?;
     match resolve(path, true) {
@@ -182,7 +182,8 @@ impl Temporary {
         }
     }
 
-    /// Creates a file that did not exist, under a name that cannot be guessed. It is short, whatever the destination's is.
+    /// Creates a file that did not exist, under a name that cannot be guessed. It is short, whatever the destination's
+    /// is.
     fn beside(destination: &Path) -> io::Result<(Self, File)> {
         Self::create(destination, OsStr::new("tmp"))
     }

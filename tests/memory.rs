@@ -8,7 +8,7 @@ use std::sync::Mutex;
 use b2p::Decoder;
 use b2p::cloud::ColouredVoxels;
 use b2p::container::{Format, Header};
-use b2p::encoder::transform::{self, Fineness};
+use b2p::encoder::transform::{self, QualityTarget};
 use b2p::encoder::{Options, Residual, encode};
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
@@ -18,7 +18,7 @@ use b2p::latents::network::{Model, Shape, untrained};
 use b2p::layers::Precision;
 use b2p::log::Log;
 use b2p::renderer::camera::Camera;
-use b2p::renderer::{Background, Channel, Choice, Effect, Effects, Ids, Image, Renderer, render};
+use b2p::renderer::{Background, Channel, Effect, EffectMode, Effects, Ids, Image, Renderer, render};
 use b2p::{Error, Limits};
 use common::{Ball, cloud_of, steps};
 use peak_alloc::PeakAlloc;
@@ -97,9 +97,9 @@ fn decoding_holds_no_more_than_its_header_allows_to_foretell() {
 fn transformed(cloud: &ColouredVoxels) -> [Vec<u8>; 3] {
     let top = cloud.voxels.depth();
     [
-        (top.saturating_sub(3)..=top, 30_000, Fineness::Step(4.0)),
-        (top.saturating_sub(1)..=top, 500, Fineness::Lossless),
-        (1..=top - 1, 16_384, Fineness::Step(20.0)),
+        (top.saturating_sub(3)..=top, 30_000, QualityTarget::Step(4.0)),
+        (top.saturating_sub(1)..=top, 500, QualityTarget::Lossless),
+        (1..=top - 1, 16_384, QualityTarget::Step(20.0)),
     ]
     .map(|(levels, slice, fineness)| {
         let options = transform::Options {
@@ -129,6 +129,10 @@ fn decoding_version_3_holds_no_more_than_its_header_allows_to_foretell() {
                 let count = gaussians.unwrap().len();
                 println!("{kind}, level {level}, {count} Gaussians: {held} of {most} bytes");
                 assert!(held <= most + Limits::OVERHEAD, "{kind}, level {level}: {held}");
+                assert!(
+                    most <= 2 * held + Limits::OVERHEAD,
+                    "{kind}, level {level}: {held} of {most}"
+                );
             }
             let limits = Limits::default().with_max_bytes(decoder.memory(&header, header.top).unwrap() - 1);
             let strict = Decoder::new().with_limits(limits);
@@ -168,6 +172,7 @@ fn drawing_version_3_with_learned_heads_holds_no_more_than_its_header_allows_to_
                     let (drawn, held) = peak(decode);
                     println!("{of}, {} Gaussians: {held} of {most} bytes", drawn.unwrap().len());
                     assert!(held <= most + Limits::OVERHEAD, "{of}: {held} of {most}");
+                    assert!(most <= 2 * held + Limits::OVERHEAD, "{of}: {held} of {most}");
                 }
             }
         }
@@ -344,7 +349,7 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
         coefficients: vec![[0.01; 3]; 3 * gaussians.len()],
     };
     let plain = Effects::default();
-    let on = Choice::On;
+    let on = EffectMode::On;
     let antialias = plain.with(Effect::Antialias, on);
     let order = plain.with(Effect::Order, on);
     // One thread: of several, each takes what it needs when the fullest tile first comes to it.

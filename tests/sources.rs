@@ -43,9 +43,10 @@ const STAGES: [(&str, &[&str]); 12] = [
 ];
 
 /// What every stage may use.
-const COMMONS: [&str; 11] = [
+const COMMONS: [&str; 12] = [
     "input",
     "Error",
+    "axes",
     "cancel",
     "error",
     "limits",
@@ -85,7 +86,7 @@ const NOT_EXACT: [&str; 5] = [
     "src/colour/encode.rs",
     "src/latents/entropy/quantise.rs",
     "src/latents/network/reference.rs",
-    "src/latents/network/reference/passes.rs",
+    "src/latents/network/reference/neighbours.rs",
     "src/latents/network/untrained.rs",
 ];
 

@@ -5,13 +5,14 @@ mod common;
 use std::collections::BTreeMap;
 
 use b2p::cloud::{ColouredVoxels, voxelise};
-use b2p::container::{Header, Stream};
-use b2p::encoder::transform::{Fineness, Options, encode, encode_within};
+use b2p::container::{self, Header, Stream};
+use b2p::encoder::transform::{Options, QualityTarget, encode, encode_to_rate};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::Heads;
+use b2p::gaussians::learned::HeadsModel;
 use b2p::latents::network::Model;
 use b2p::log::Log;
-use b2p::{Cancel, Error, Isa, Limits};
+use b2p::{Axes, Cancel, Error, Isa, Limits, Up};
 use b2p::{Decoder, Decoding};
 use common::{Ball, cloud_of, tiny_model};
 
@@ -20,7 +21,7 @@ fn stream(cloud: &ColouredVoxels, options: &Options) -> Vec<u8> {
     encoded.expect("a cloud can be coded").bytes
 }
 
-fn with(fineness: Fineness) -> Options {
+fn with(fineness: QualityTarget) -> Options {
     Options {
         fineness,
         ..Options::default()
@@ -88,7 +89,7 @@ fn lossless_streams_decode_to_the_mean_colours_of_the_finest_level() {
         for top in [bits, bits - 1] {
             let options = Options {
                 levels: Some(top.saturating_sub(2)..=top),
-                ..with(Fineness::Lossless)
+                ..with(QualityTarget::Lossless)
             };
             let bytes = stream(&cloud, &options);
             let decoded = points(&bytes, None).unwrap();
@@ -103,7 +104,7 @@ fn smaller_steps_take_more_bytes_and_are_nearer() {
     let (keys, truth) = means(&cloud, 6);
     let mut last = (0, f64::INFINITY);
     for step in [128.0, 32.0, 8.0, 2.0] {
-        let bytes = stream(&cloud, &with(Fineness::Step(step)));
+        let bytes = stream(&cloud, &with(QualityTarget::Step(step)));
         let decoded = points(&bytes, None).unwrap();
         assert_eq!(decoded.0, keys);
         let own = (bytes.len(), error(&decoded.1, &truth));
@@ -172,18 +173,40 @@ fn points_are_a_cloud_on_the_grid_of_their_level() {
 }
 
 #[test]
+fn axes_in_a_stream_leave_what_is_decoded_unchanged() {
+    let axes = Axes {
+        up: Some(Up::Z),
+        metres_per_unit: Some(1.0),
+        crs: "EPSG:32633".into(),
+    };
+    for cloud in clouds() {
+        let levels = 0..=cloud.voxels.depth();
+        let from_root = Options {
+            levels: (cloud.voxels.depth() < 21).then_some(levels),
+            ..Options::default()
+        };
+        for options in [Options::default(), from_root] {
+            let plain = stream(&cloud, &options);
+            let marked = container::with_axes(&plain, &axes).unwrap();
+            assert_eq!(container::axes(&marked).unwrap(), axes);
+            assert_eq!(points(&marked, None), points(&plain, None));
+        }
+    }
+}
+
+#[test]
 fn as_many_bits_as_asked_for_are_used_and_more_bits_are_never_worse() {
     let cloud = Ball::new(7, 50.0).cloud();
     let finest = cloud.voxels.depth();
     let mut last = f64::INFINITY;
     let mut lossless = false;
     for most in [0.3, 0.6, 1.2, 2.4, 5.0, 20.0] {
-        let found = encode_within(&cloud, &Options::default(), most, &Log::default());
+        let found = encode_to_rate(&cloud, &Options::default(), most, &Log::default());
         let (encoded, chosen) = found.unwrap();
         let bits = encoded.bytes.len() as f64 * 8.0 / cloud.voxels.len() as f64;
         assert!(bits <= most, "{bits} of {most}");
         assert_eq!(encoded.bytes, stream(&cloud, &chosen), "{chosen:?}");
-        lossless = chosen.fineness == Fineness::Lossless;
+        lossless = chosen.fineness == QualityTarget::Lossless;
         // Colours of the cloud as the finest level of the stream has them.
         let (keys, colours) = points(&encoded.bytes, None).unwrap();
         let shift = 3 * (finest - chosen.levels.unwrap().end());
@@ -196,8 +219,52 @@ fn as_many_bits_as_asked_for_are_used_and_more_bits_are_never_worse() {
         last = off;
     }
     assert!(lossless, "20 bits are enough for exact colours");
-    let found = encode_within(&cloud, &Options::default(), 0.001, &Log::default());
+    let found = encode_to_rate(&cloud, &Options::default(), 0.001, &Log::default());
     assert!(matches!(found, Err(Error::TooFewBits { .. })));
+}
+
+#[test]
+fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_learned_gaussians() {
+    let cloud = Ball::new(8, 100.0).cloud();
+    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
+    let options = Options {
+        heads: Some(heads.clone()),
+        ..Options::default()
+    };
+    let found = encode_to_rate(&cloud, &options, 1.0, &Log::default());
+    let (encoded, chosen) = found.unwrap();
+    assert!(encoded.bytes.len() * 8 <= cloud.voxels.len());
+    assert_eq!(encoded.bytes, stream(&cloud, &chosen));
+    let without = Options { heads: None, ..chosen };
+    let plain = stream(&cloud, &without);
+    let parsed = Stream::parse(&encoded.bytes, &Limits::default()).unwrap();
+    assert!(parsed.damage().is_none());
+    let map = |level: &b2p::container::Level| level.colours.as_ref().is_some_and(|colours| colours.head_map.is_some());
+    for level in parsed.levels() {
+        assert_eq!(map(level), level.level < 7, "level {}", level.level);
+        let level = Some(level.level);
+        assert_eq!(points(&encoded.bytes, level), points(&plain, level));
+        let decoder = Decoder::new().with_level(level).with_heads_model(heads.clone());
+        let learned = decoder.decode(&plain).unwrap();
+        let surfels = Decoder::new().with_level(level).decode(&plain).unwrap();
+        // A ball is smooth: most of it, if not all, is better as surfels.
+        let mixed = decoder.decode(&encoded.bytes).unwrap();
+        let from = |of: &b2p::gaussians::Gaussians| {
+            let positions: Vec<_> = of.position.iter().map(|p| p.map(f32::to_bits)).collect();
+            let all: std::collections::HashSet<_> = positions.into_iter().collect();
+            let count = mixed
+                .position
+                .iter()
+                .filter(|p| all.contains(&p.map(f32::to_bits)))
+                .count();
+            count as f64 / mixed.len() as f64
+        };
+        let (learned, surfels) = (from(&learned), from(&surfels));
+        assert!(learned + surfels > 0.999, "{level:?}: {learned} + {surfels}");
+        if level < Some(7) {
+            assert!(surfels > 0.3, "{level:?}: {surfels}");
+        }
+    }
 }
 
 #[test]
@@ -212,7 +279,7 @@ fn levels_and_steps_that_do_not_exist_are_refused() {
         assert!(refused(options));
     }
     for step in [0.0, 0.4, 1001.0, f32::NAN] {
-        assert!(refused(with(Fineness::Step(step))), "{step}");
+        assert!(refused(with(QualityTarget::Step(step))), "{step}");
     }
     assert!(refused(Options {
         slice_voxels: 16_385,

@@ -12,7 +12,7 @@ use crate::model::{HeadsModel, Limits, Model};
 pub struct Cancel(b2p::Cancel);
 
 /// A stream that is decoded as its bytes arrive.
-pub struct Decoding(b2p::Decoding<'static>);
+pub struct Decoding(pub(crate) b2p::Decoding<'static>);
 
 /// Gaussians of a level.
 pub struct Gaussians(pub(crate) b2p::gaussians::Gaussians);

@@ -7,8 +7,10 @@ mod border;
 mod decoding;
 mod model;
 mod picture;
+mod points;
 
 pub use border::Status;
 pub use decoding::{Arrays, Cancel, Decoding, Gaussians};
 pub use model::{Limits, Model};
 pub use picture::Camera;
+pub use points::{PointArrays, Points};

@@ -7,6 +7,7 @@ mod common;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use b2p::decoder::StreamDecoder;
 use b2p::encoder::transform;
 use b2p::gaussians::Heads;
 use b2p::latents::Decoder;
@@ -27,14 +28,14 @@ fn library() -> PathBuf {
     found.expect("the static library is built with the test")
 }
 
-fn compile(to: &Path, more: &[&str]) -> Output {
+fn compile(source: &str, to: &Path, more: &[&str]) -> Output {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     Command::new("cc")
         .args(["-std=c11", "-Wall", "-Wextra", "-Werror", "-O1", "-g"])
         .args(more)
         .arg("-I")
         .arg(here.join("include"))
-        .arg(here.join("tests/use.c"))
+        .arg(here.join(source))
         .arg(library())
         .args(["-lpthread", "-ldl", "-lm", "-o"])
         .arg(to)
@@ -79,12 +80,20 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     };
     let (best, quick) = (sum(&model, Heads::Best), sum(&both, Heads::Quick));
     assert_ne!(best, quick);
-    let expected = format!("{best:016x}\n{quick:016x}\n");
+    let decoding = StreamDecoder::new().whole(&new.bytes);
+    let decoding = decoding.expect("a stream");
+    let points = decoding.points().expect("points");
+    let coordinates = (0..points.voxels.len()).flat_map(|i| points.voxels.coordinate(i));
+    let colours = points.colours.as_flattened().iter().map(|c| u32::from(*c));
+    let sum = coordinates.zip(colours).flat_map(|(c, colour)| [c, colour]);
+    let sum = sum.fold(0u64, |sum, x| sum.wrapping_mul(31).wrapping_add(x.into()));
+    let points = format!("{} {sum:016x}\n", points.voxels.len());
+    let expected = format!("{points}{best:016x}\n{quick:016x}\n");
 
     let sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
-    printed(compile(&at("plain"), &[]));
+    printed(compile("tests/use.c", &at("plain"), &[]));
     let mut programs = vec![("alone", Command::new(at("plain")))];
-    match compile(&at("watched"), &sanitizers).status.success() {
+    match compile("tests/use.c", &at("watched"), &sanitizers).status.success() {
         true => programs.push(("with sanitizers", Command::new(at("watched")))),
         false => println!("NOT RUN: this compiler has no AddressSanitizer"),
     }
@@ -103,4 +112,20 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
         assert_eq!(printed(output), expected, "{how}");
         println!("ran {how}");
     }
+}
+
+#[test]
+fn the_example_in_c_decodes_the_sample_scene_and_draws_it() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name);
+    printed(compile("examples/decode.c", &at("decode"), &[]));
+    let scene = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/scene.b2p");
+    let mut example = Command::new(at("decode"));
+    let text = printed(example.arg(scene).arg(at("scene.ppm")).output().expect("it starts"));
+    assert!(
+        text.contains("level 7 is complete") && text.contains(" Gaussians"),
+        "{text}"
+    );
+    let picture = std::fs::read(at("scene.ppm")).expect("a picture");
+    assert_eq!(picture.len(), "P6\n640 480\n255\n".len() + 3 * 640 * 480);
 }

@@ -123,9 +123,12 @@ static void mistakes(const b2p_model *model, file stream) {
     CHECK(b2p_decoding_use_quick_heads(decoding, true, message, sizeof message) == B2P_STATUS_UNSUPPORTED);
     CHECK(strstr(message, "quick"));
     CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_USAGE);
+    b2p_points *points = NULL;
+    CHECK(b2p_decoding_points(decoding, &points, message, sizeof message) == B2P_STATUS_USAGE);
     CHECK(b2p_decoding_push(decoding, stream.bytes, stream.length - 1, NULL, 0) == B2P_STATUS_OK);
     CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_TRUNCATED);
     CHECK(b2p_decoding_level(decoding) >= 0);
+    CHECK(b2p_decoding_points(decoding, &points, message, sizeof message) == B2P_STATUS_UNSUPPORTED && points == NULL);
     CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_OK);
     b2p_gaussians_free(gaussians);
     b2p_decoding_free(decoding);
@@ -160,6 +163,31 @@ static void mistakes(const b2p_model *model, file stream) {
     b2p_cancel_throw(NULL);
 }
 
+/* The voxels of a decoded level, printed for the caller to compare. */
+static void points(b2p_decoding *decoding, const b2p_arrays *frame) {
+    b2p_points *voxels = NULL;
+    CHECK(b2p_decoding_points(decoding, NULL, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_points(NULL, &voxels, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_points(decoding, &voxels, message, sizeof message) == B2P_STATUS_OK);
+    b2p_point_arrays arrays;
+    CHECK(b2p_points_arrays(voxels, NULL, NULL, 0) == B2P_STATUS_USAGE);
+    CHECK(b2p_points_arrays(voxels, &arrays, NULL, 0) == B2P_STATUS_OK);
+    CHECK(arrays.count > 0 && arrays.level == b2p_decoding_level(decoding));
+    uint64_t sum = 0;
+    for (size_t i = 0; i < 3 * arrays.count; i++) {
+        CHECK(arrays.coordinate[i] < 1u << arrays.level);
+        sum = sum * 31 + arrays.coordinate[i];
+        sum = sum * 31 + arrays.colour[i];
+    }
+    for (int axis = 0; axis < 3; axis++) {
+        CHECK(arrays.origin[axis] == frame->origin[axis]);
+    }
+    CHECK(arrays.voxel_size * (1u << arrays.level) == 2 * frame->unit);
+    printf("%zu %016llx\n", arrays.count, (unsigned long long)sum);
+    b2p_points_free(voxels);
+    b2p_points_free(NULL);
+}
+
 /* A stream of version 3 without a model, in two pieces. */
 static void without_model(file stream) {
     b2p_decoding *decoding = NULL;
@@ -180,6 +208,7 @@ static void without_model(file stream) {
     b2p_arrays arrays;
     CHECK(b2p_gaussians_arrays(gaussians, &arrays, NULL, 0) == B2P_STATUS_OK && arrays.count > 0);
     b2p_gaussians_free(gaussians);
+    points(decoding, &arrays);
     b2p_decoding_free(decoding);
 }
 

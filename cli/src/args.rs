@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use b2p::Limits;
 use b2p::encoder::Residual;
-use b2p::encoder::transform::Fineness;
+use b2p::encoder::transform::QualityTarget;
 use b2p::gaussians::HeadSet;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -155,7 +155,7 @@ pub enum Command {
 
 #[derive(Debug, Args)]
 pub struct Encode {
-    /// Point cloud: PLY, ascii or binary, with x y z and red green blue. `-`: standard input
+    /// Point cloud: PLY, LAS, LAZ, PCD, E57, XYZ, CSV, OBJ, glTF or GLB, recognised by content. `-`: standard input
     #[arg(value_name = "IN")]
     pub cloud: PathBuf,
     #[command(flatten)]
@@ -171,7 +171,7 @@ pub struct Encode {
     /// 2 + EFFORT tries for a level, of 9 as many as it takes [default: 9]
     #[arg(short, long, value_name = "0..9", value_parser = clap::value_parser!(u8).range(0..=9))]
     pub effort: Option<u8>,
-    /// Bit depth N of the voxel grid, 1 to 21 [default: 10, or what a cloud of integers needs; less if its points lie too far apart for that]
+    /// Bit depth N of the voxel grid, 1 to 21 [default: by the spacing of the points; at most what a cloud of integers needs]
     #[arg(long, help_heading = "Advanced", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
     pub bits: Option<u8>,
     /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last below N
@@ -181,7 +181,7 @@ pub struct Encode {
     /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma twice that of luma unless said; coarser
     /// levels have finer steps [default: 20]
     #[arg(long, help_heading = "Advanced", value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
-    pub step: Option<Fineness>,
+    pub step: Option<QualityTarget>,
     /// Code the mean colours of the finest level's voxels exactly
     #[arg(long, help_heading = "Advanced")]
     pub lossless: bool,
@@ -191,6 +191,11 @@ pub struct Encode {
     /// Leave out colour filters: encoding and decoding take less time, pictures are less accurate
     #[arg(long, help_heading = "Advanced")]
     pub no_filter: bool,
+    /// Do not look where surfels draw better than learned heads: encoding takes less time
+    #[arg(long)]
+    pub no_head_maps: bool,
+    #[command(flatten)]
+    pub read: ReadArgs,
     #[command(flatten)]
     pub learned: LearnedArgs,
     #[command(flatten)]
@@ -230,12 +235,15 @@ pub struct Decode {
     pub input: PathBuf,
     #[command(flatten)]
     pub output: Output,
-    /// Write the level's voxels with their colours instead, as a PLY of points (of learned streams there are none)
+    /// Write the level's voxels with their colours instead, as points: PLY, or LAS, LAZ, PCD, E57 or XYZ by the ending (of learned
+    /// streams there are none)
     #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
     pub points: bool,
     /// Format of the Gaussians: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
     #[arg(long, value_name = "NAME", conflicts_with = "points")]
     pub format: Option<SplatFormat>,
+    #[command(flatten)]
+    pub write: WriteArgs,
     #[command(flatten)]
     pub detail: DetailArg,
     #[command(flatten)]
@@ -264,7 +272,7 @@ pub struct Convert {
 
 #[derive(Debug, Args)]
 pub struct Render {
-    /// Stream, or Gaussians in any format that `convert` reads. `-`: standard input, drawn as it comes
+    /// Stream, Gaussians in any format that `convert` reads, or point cloud. `-`: standard input, drawn as it comes
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
@@ -279,15 +287,17 @@ pub struct Render {
     /// glTF's camera nodes
     #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov", "look_at"])]
     pub camera: Option<PathBuf>,
+    /// Axis that points up in the pictures of --orbit: x, y, z, -x, -y, -z, or auto [default: what the input says, else y]
+    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true, conflicts_with = "camera")]
+    pub up: Option<UpArg>,
     /// Parallel rays; the cube's centre stays as large as it is
     #[arg(long, conflicts_with = "camera")]
     pub orthographic: bool,
     /// What is drawn
     #[arg(long, value_enum, value_name = "WHAT", default_value_t = Show::Colour)]
     pub show: Show,
-    /// Force an effect (harmonics, antialias, supersample, near, order) on or off
-    #[arg(long, help_heading = "Advanced", value_name = "NAME=on|off|auto", value_parser = effect)]
-    pub effect: Vec<(Effect, Choice)>,
+    #[arg(long, help_heading = "Advanced", value_name = "NAME=on|off|auto", value_parser = effect, help = effect_help())]
+    pub effect: Vec<(Effect, EffectMode)>,
     /// How much of what is faint may be left out: fast, fine, exact
     #[arg(long, help_heading = "Advanced", value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
     pub quality: Quality,
@@ -474,12 +484,19 @@ pub struct ModelArg {
 }
 
 use super::budget::BudgetArgs;
+use super::cloud::{ReadArgs, UpArg, WriteArgs, up};
 pub use super::values::Orbit;
 use super::values::{
     background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,
 };
-pub use b2p::renderer::{Background, Choice, Effect, Quality};
+pub use b2p::renderer::{Background, Effect, EffectMode, Quality};
 pub use b2p_formats::splats::Format as SplatFormat;
+
+/// The help of `--effect`.
+fn effect_help() -> String {
+    let names = Effect::ALL.map(Effect::name).join(", ");
+    format!("Force an effect ({names}) on or off")
+}
 
 #[cfg(test)]
 mod tests {

@@ -6,6 +6,7 @@ use b2p::cloud::PointCloud;
 use b2p::container::MAGIC;
 use b2p::gaussians::Gaussians;
 use b2p::{Limits, Log, input, output};
+use b2p_formats::detect::Kind;
 use b2p_formats::splats::{self, Axes, Format, Splats};
 use serde_json::{Value, json};
 
@@ -13,7 +14,7 @@ use super::args::Convert;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, kinds, load};
+use super::{Failure, Result, cloud, load};
 
 /// Converts a file.
 pub fn run(args: &Convert, limits: &Limits, progress: &Progress) -> Result<Said> {
@@ -74,15 +75,17 @@ pub fn may_be(start: &[u8]) -> bool {
 
 /// The format of a file of splats: the one asked for, or that of its contents; `.splat` and CSV files are known by their names.
 pub fn format_of(path: &Path, bytes: &[u8], asked: Option<Format>) -> Option<Format> {
+    if asked.is_some() || bytes.starts_with(&MAGIC) {
+        return asked;
+    }
     let named = || Format::of_path(path).filter(|format| matches!(format, Format::Splat | Format::Csv));
-    asked.or_else(|| Format::of_bytes(bytes)).or_else(named)
+    let found = Format::of_bytes(bytes).filter(|&format| format != Format::Ply || Kind::of(bytes) == Kind::GaussianPly);
+    let is_cloud = || cloud::is_cloud(bytes);
+    found.or_else(|| named().filter(|_| !is_cloud()))
 }
 
 /// Splats as they stand in a file, with warnings about what was ignored.
 pub fn read(path: &Path, bytes: &[u8], format: Format, limits: &Limits, log: &Log) -> Result<Splats> {
-    if format == Format::Ply {
-        kinds::check_gaussians(path, bytes)?;
-    }
     let options = splats::Options {
         offset: match format {
             Format::Spz | Format::Splat => offset_beside(path).unwrap_or_default(),

@@ -15,13 +15,14 @@ use super::args::Decode;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, convert, keep, kinds, load, pipe};
+use super::{Failure, Result, budget, cloud, convert, keep, kinds, load, pipe};
 
 /// Decodes a stream into a file of Gaussians.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.input.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;
+    cloud::refuse(&args.input)?;
     let log = progress.log();
     if args.points {
         return points(args, limits, &log);
@@ -79,7 +80,7 @@ fn said(args: &Decode, chosen: &str, written: usize, thing: &str, log: &Log) -> 
     Said::report(report, json).beside(to)
 }
 
-/// Decodes a stream into a PLY of points.
+/// Decodes a stream into a file of points.
 fn points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
     let bytes = load::bytes(&args.input, limits)?;
     kinds::check_stream(&args.input, &bytes)?;
@@ -93,16 +94,23 @@ fn points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
     load::reserve_for(&args.input, &bytes, &decoder, args.detail.level, limits)?;
     let decoding = decoder.whole(&bytes);
     let decoding = decoding.map_err(&fail)?;
-    let cloud = decoding.points().map(|points| points.to_cloud()).unwrap_or_default();
-    let (written, to) = (cloud.positions.len(), &args.output);
-    log.step("write PLY", written, "points", || {
-        Ok(manners::write(to, |w| {
-            let io = |source| b2p::Error::Io {
-                path: to.to_path_buf(),
+    let voxels = decoding.points().map(|points| points.to_voxels());
+    let voxels = voxels.ok_or_else(|| Failure(format!("{}: no level is complete", args.input.display())))?;
+    let (written, to): (usize, &Path) = (voxels.voxels.len(), &args.output);
+    let encoded = cloud::encoded(&voxels, &cloud::axes(&bytes), to, args.write)?;
+    let write = |path: &Path, bytes: &[u8]| {
+        manners::write(path, |w| {
+            w.write_all(bytes).map_err(|source| b2p::Error::Io {
+                path: path.to_path_buf(),
                 source,
-            };
-            w.write_all(&cloud.to_ply()).map_err(io)
-        }))
-    })??;
+            })
+        })
+    };
+    log.step("write points", written, "points", || Ok(write(to, &encoded.bytes)))??;
+    if let Some(text) = encoded.sidecar.as_ref().filter(|_| !manners::is_pipe(to)) {
+        let path = cloud::sidecar(to);
+        manners::permit(&[&path], &[&args.input])?;
+        write(&path, text.as_bytes())?;
+    }
     Ok(said(args, "", written, "point", log))
 }

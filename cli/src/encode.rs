@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use b2p::cloud::{ColouredVoxels, PointCloud, voxelise, voxelise_closed};
-use b2p::encoder::transform::{self, Fineness};
+use b2p::cloud::ColouredVoxels;
+use b2p::container;
+use b2p::encoder::transform::{self, QualityTarget};
 use b2p::encoder::{self, Encoded, Options, Rate, Residual};
 use b2p::latents::Steps;
 use b2p::log::Log;
@@ -14,7 +15,7 @@ use super::args::{Colours, Encode};
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{count, counted, steps, steps_json, table};
-use super::{Failure, Result, kinds, knobs, load};
+use super::{Failure, Result, cloud, knobs, load};
 
 /// Codes a cloud and says what it cost.
 pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> {
@@ -24,20 +25,30 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
     let log = progress.log();
     let in_cloud = Failure::in_file(&args.cloud);
     let cloud = log
-        .step("read cloud", 1, "file", || Ok(read(args, limits)))
+        .step("read cloud", 1, "file", || {
+            Ok(cloud::read(&args.cloud, &args.read, limits))
+        })
         .map_err(&in_cloud)??;
     let points = cloud.positions.len();
-    let (cloud, finest) = log
-        .step("voxelise", points, "points", || match args.bits {
-            Some(bits) => Ok((voxelise(&cloud, Some(bits))?, bits)),
-            None => voxelise_closed(&cloud),
-        })
+    let (grid, found) = log
+        .step("voxelise", points, "points", || cloud::grid(&cloud, args.bits))
         .map_err(&in_cloud)?;
-    let coded = match args.colours {
-        Colours::Transform => transform(args, &cloud, &log)?,
-        Colours::Learned => learned(args, &cloud, &log)?,
+    let axes = cloud.axes;
+    drop((cloud.positions, cloud.colours));
+    let cloud = grid;
+    let voxels = cloud.voxels.len();
+    let axes = match args.bits_per_point {
+        Some(most) => cloud::affordable(axes, most * voxels as f64 / 8.0),
+        None => axes,
     };
-    let Coded { encoded, chosen } = coded;
+    // The rate counts the whole file.
+    let reserved = container::axes_bytes(&axes) as f64 * 8.0 / voxels as f64;
+    let coded = match args.colours {
+        Colours::Transform => transform(args, &cloud, reserved, &log)?,
+        Colours::Learned => learned(args, &cloud, reserved, &log)?,
+    };
+    let Coded { mut encoded, chosen } = coded;
+    encoded.bytes = container::with_axes(&encoded.bytes, &axes)?;
     let to = &args.output;
     manners::write(to, |w| {
         w.write_all(&encoded.bytes).map_err(|source| Error::Io {
@@ -46,7 +57,6 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         })
     })?;
     warn_if_undrawable(args, &encoded.bytes, limits)?;
-    let voxels = cloud.voxels.len();
     let depth = cloud.voxels.depth();
     let json = || {
         let level = |rate: &Rate| {
@@ -83,16 +93,11 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
             bpp(rate.colour_bytes),
         ]);
     }
-    let coarser = match depth < finest {
-        true => format!(
-            "The points lie too far apart for {finest} bits: surfaces would have holes. --bits {finest} codes them all the same.\n"
-        ),
-        false => String::new(),
-    };
     let report = format!(
-        "{}\n{}\n{}: {} for {} at {}, {} bits per point{}\n{coarser}",
+        "{}\n{}\n{}{}: {} for {} at {}, {} bits per point{}\n",
         steps(&log.steps()),
         table(&rows),
+        cloud::describe(&found),
         to.display(),
         counted(encoded.bytes.len() as u64, "byte"),
         counted(voxels as u64, "point"),
@@ -120,21 +125,14 @@ fn warn_if_undrawable(args: &Encode, bytes: &[u8], limits: &Limits) -> Result<()
     Ok(())
 }
 
-/// The cloud of a file, or of standard input.
-fn read(args: &Encode, limits: &Limits) -> Result<PointCloud> {
-    let bytes = load::bytes(&args.cloud, limits)?;
-    kinds::check_cloud(&args.cloud, &bytes)?;
-    PointCloud::from_ply(&bytes, limits).map_err(Failure::in_file(&args.cloud))
-}
-
 /// A stream, and what was chosen about it in words.
 struct Coded {
     encoded: Encoded,
     chosen: String,
 }
 
-/// Codes a stream of version 3.
-fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
+/// Codes a stream of version 3, which keeps `reserved` bits per point free.
+fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) -> Result<Coded> {
     let model = &args.model;
     let learned = &args.learned;
     let asked = [
@@ -151,6 +149,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> 
         levels: args.levels.clone(),
         filter: !args.no_filter,
         isa: Some(load::isa(model.isa.as_deref())?),
+        heads: (!args.no_head_maps).then(|| load::heads(None)).transpose()?,
         ..transform::Options::default()
     };
     if let Some(quality) = args.quality {
@@ -161,13 +160,14 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> 
     }
     match args.step {
         Some(step) => options.fineness = step,
-        None if args.lossless => options.fineness = Fineness::Lossless,
+        None if args.lossless => options.fineness = QualityTarget::Lossless,
         None => {}
     }
     let in_cloud = Failure::in_file(&args.cloud);
     let (encoded, chosen) = match args.bits_per_point {
         Some(most) => {
-            let (encoded, chosen) = transform::encode_within(cloud, &options, most, log).map_err(in_cloud)?;
+            let (encoded, chosen) =
+                transform::encode_to_rate(cloud, &options, most - reserved, log).map_err(in_cloud)?;
             let level = chosen.levels.map_or(0, |levels| *levels.end());
             let how = chosen.fineness;
             (encoded, format!(" of at most {most}: level {level}, {how}"))
@@ -180,8 +180,8 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> 
     Ok(Coded { encoded, chosen })
 }
 
-/// Codes a stream of version 2.
-fn learned(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
+/// Codes a stream of version 2, which keeps `reserved` bits per point free.
+fn learned(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) -> Result<Coded> {
     if args.step.is_some() || args.lossless {
         let what = "--step and --lossless are for --colours transform";
         return Err(Failure(what.into()));
@@ -202,7 +202,7 @@ fn learned(args: &Encode, cloud: &ColouredVoxels, log: &Log) -> Result<Coded> {
     let in_cloud = Failure::in_file(&args.cloud);
     let (encoded, chosen) = match args.bits_per_point {
         Some(most) => {
-            let found = encoder::encode_within(cloud, &model, &options, most, log);
+            let found = encoder::encode_to_rate(cloud, &model, &options, most - reserved, log);
             let (encoded, chosen) = found.map_err(in_cloud)?;
             (encoded, within(most, &chosen))
         }

@@ -1,18 +1,21 @@
 //! `b2p info`: what a stream holds.
 
 use b2p::container::{Level, Section, Stream};
-use b2p::latents::{Precision, Steps};
-use b2p::{Limits, colour};
+use b2p::latents::{ResidualSteps, Steps};
+use b2p::{Axes, Limits, colour};
 use serde_json::json;
 
 use super::args::Info;
 use super::manners::{self, Said};
 use super::table::{count, counted, table};
-use super::{Failure, Result, kinds, load};
+use super::{Failure, Result, cloud, kinds, load};
 
 /// Describes a stream as text or JSON. A cut or damaged stream is described with what is wrong; its model is described if it is the one at hand.
 pub fn run(args: &Info, limits: &Limits) -> Result<Said> {
     let bytes = load::bytes(&args.input, limits)?;
+    if let Some(text) = cloud::info(&args.input, &bytes, manners::json(), limits)? {
+        return Ok(Said::result(text));
+    }
     kinds::check_stream(&args.input, &bytes)?;
     let stream = Stream::parse(&bytes, limits).map_err(Failure::in_file(&args.input))?;
     let header = stream.header();
@@ -28,9 +31,10 @@ pub fn run(args: &Info, limits: &Limits) -> Result<Said> {
     });
     let levels = levels(&stream)?;
     let state = State::of(&stream, bytes.len());
+    let axes = cloud::axes(&bytes);
     Ok(Said::result(match manners::json() {
-        true => json(&stream, bytes.len(), &levels, known, &state),
-        false => text(args, &stream, bytes.len(), &levels, known, &state),
+        true => json(&stream, bytes.len(), &axes, &levels, known, &state),
+        false => text(args, &stream, bytes.len(), &levels, known, &state) + &cloud::described(&axes),
     }))
 }
 
@@ -68,7 +72,7 @@ struct Described {
     /// Quantisation steps of the colours in version 3.
     steps: Option<colour::Steps>,
     residual: Option<usize>,
-    precision: Option<Precision>,
+    precision: Option<ResidualSteps>,
     whole: bool,
 }
 
@@ -79,7 +83,7 @@ fn levels(stream: &Stream) -> Result<Vec<Described>> {
     let describe = |(i, (level, (&voxels, &section)))| {
         let found: Option<&Level> = stream.levels().get(i);
         let residual = |found: &Level| found.residual.iter().map(|slice| slice.bytes.len() + 16).sum();
-        let precision = |found: &Level| Precision::read(found.residual.first()?.bytes);
+        let precision = |found: &Level| ResidualSteps::read(found.residual.first()?.bytes);
         Ok(Described {
             level,
             voxels,
@@ -106,7 +110,7 @@ fn steps(level: &Level) -> Option<colour::Steps> {
     steps.is_valid().then_some(steps)
 }
 
-fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known, state: &State) -> String {
+fn json(stream: &Stream, bytes: usize, axes: &Axes, levels: &[Described], known: Known, state: &State) -> String {
     let header = stream.header();
     let level = |of: &Described| {
         json!({
@@ -137,6 +141,9 @@ fn json(stream: &Stream, bytes: usize, levels: &[Described], known: Known, state
         "model": header.model(),
         "model_name": known.as_ref().map(|(name, _)| name),
         "heads": known.as_ref().map(|(_, heads)| heads),
+        "up": axes.up.map(|up| up.to_string()),
+        "metres_per_unit": axes.metres_per_unit,
+        "crs": axes.crs,
         "origin": header.placement.origin,
         "voxel_size": header.placement.voxel_size,
         "complete_to_level": stream.deepest(),
@@ -210,7 +217,7 @@ fn rows(levels: &[Described], points: u64) -> Vec<Vec<String>> {
             count(of.section.colours.into()),
             format!("{:.4}", bits(of.section.geometry.into(), points)),
             format!("{:.4}", bits(of.section.colours.into(), points)),
-            of.steps.map_or("-".into(), step_told),
+            of.steps.map_or("-".into(), step_text),
             of.residual.map_or("?".into(), |bytes| count(bytes as u64)),
             of.precision.map_or("-".into(), told),
             format!("{:.4}", bits(of.prefix, points)),
@@ -220,7 +227,7 @@ fn rows(levels: &[Described], points: u64) -> Vec<Vec<String>> {
 }
 
 /// A step of luma in 255ths.
-fn step_told(steps: colour::Steps) -> String {
+fn step_text(steps: colour::Steps) -> String {
     match steps.is_lossless() {
         true => "exact".into(),
         false => format!("{:.2}", steps.luma_step()),
@@ -228,7 +235,7 @@ fn step_told(steps: colour::Steps) -> String {
 }
 
 /// The bands of a residual with their steps of luma and chroma.
-fn told(precision: Precision) -> String {
+fn told(precision: ResidualSteps) -> String {
     let bands = [("fine", precision.fine), ("coarse", precision.coarse)];
     let bands = bands.iter().filter(|(_, steps)| *steps != Steps::NONE);
     let told = bands.map(|(band, steps)| format!("{band} {},{}", steps.luma, steps.chroma));

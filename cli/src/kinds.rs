@@ -88,53 +88,6 @@ pub fn check_stream(path: &Path, bytes: &[u8]) -> Result<()> {
     }
 }
 
-/// Fails with what to do if these bytes are plainly no point cloud.
-pub fn check_cloud(path: &Path, bytes: &[u8]) -> Result<()> {
-    if bytes.starts_with(b"ply") {
-        let words = ply_words(bytes).unwrap_or_default();
-        let has = |word: &str| words.iter().any(|w| w == word);
-        if has("f_dc_0") {
-            return Err(wrong(
-                path,
-                "these are Gaussians, no point cloud: draw them with `b2p render`",
-            ));
-        }
-        if has("element face") && !has("red") && !has("r") && !has("diffuse_red") {
-            let what = "this is a mesh without colours of its vertices: sample it to a coloured point cloud first, such as with \
-                        CloudCompare or Open3D's sample_points_uniformly";
-            return Err(wrong(path, what));
-        }
-        return Ok(());
-    }
-    match told(bytes) {
-        Some(what) if !bytes.starts_with(b"LASF") => Err(wrong(path, &format!("no PLY: {what}"))),
-        Some(what) => Err(wrong(
-            path,
-            &what.replace(": `b2p encode` codes it", ": convert it to PLY first"),
-        )),
-        None => Ok(()),
-    }
-}
-
-/// Fails with what to do if a PLY holds no Gaussians.
-pub fn check_gaussians(path: &Path, bytes: &[u8]) -> Result<()> {
-    let Some(words) = ply_words(bytes) else { return Ok(()) };
-    let has = |word: &str| words.iter().any(|w| w == word);
-    if !has("f_dc_0") && has("red") && has("x") {
-        return Err(wrong(
-            path,
-            "this is a point cloud, not Gaussians: code it first with `b2p encode`",
-        ));
-    }
-    if !has("f_dc_0") && has("element face") {
-        return Err(wrong(
-            path,
-            "this is a mesh, not Gaussians: sample it to a coloured point cloud and code that",
-        ));
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -150,25 +103,17 @@ mod tests {
         las.resize(24, 0);
         las.extend([1, 2]);
         assert!(said(check_stream(path, &las)).contains("this is LAS 1.2"));
-        assert!(said(check_cloud(path, &las)).contains("this is LAS 1.2"));
         let ply = |lines: &str| format!("ply\nformat ascii 1.0\n{lines}end_header\n").into_bytes();
         let splats = ply("element vertex 1\nproperty float x\nproperty float f_dc_0\n");
-        assert!(said(check_cloud(path, &splats)).contains("b2p render"));
         assert!(said(check_stream(path, &splats)).contains("b2p render"));
-        let mesh = ply("element vertex 3\nproperty float x\nelement face 1\nproperty list uchar int vertex_indices\n");
-        assert!(said(check_cloud(path, &mesh)).contains("sample it"));
-        let cloud = ply("element vertex 1\nproperty float x\nproperty uchar red\n");
-        assert!(said(check_gaussians(path, &cloud)).contains("b2p encode"));
         assert!(said(check_stream(path, b"\x89PNG\r\n")).contains("picture"));
-        assert!(check_stream(path, &MAGIC).is_ok() && check_cloud(path, &cloud).is_ok());
-        assert!(check_gaussians(path, &splats).is_ok());
+        assert!(check_stream(path, &MAGIC).is_ok());
     }
 
     #[test]
     fn what_looks_like_nothing_known_is_left_to_its_reader() {
         for bytes in [&b""[..], b"x", b"\0\0\0\0"] {
             assert!(check_stream(Path::new("f"), bytes).is_ok());
-            assert!(check_cloud(Path::new("f"), bytes).is_ok());
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::ops::RangeInclusive;
 
-use b2p::encoder::transform::{Fineness, Options};
+use b2p::encoder::transform::{Options, QualityTarget};
 
 /// A stretch of the scale, from one quality to the next stretch's: how many levels above the cloud's own the finest coded level is, and
 /// the quantisation steps of luma at both ends. Rate control takes the same path: a finer level as soon as it is worth its geometry.
@@ -45,10 +45,10 @@ fn place(quality: u8) -> (u8, f32) {
 /// Sets what a quality stands for, for a cloud of bit depth `bits` whose levels `levels` were asked for.
 pub fn set_quality(options: &mut Options, quality: u8, bits: u8, levels: Option<RangeInclusive<u8>>) {
     let (above, fineness) = match quality {
-        100.. => (0, Fineness::Lossless),
+        100.. => (0, QualityTarget::Lossless),
         _ => {
             let (above, step) = place(quality);
-            (above, Fineness::Step(step))
+            (above, QualityTarget::Step(step))
         }
     };
     options.fineness = fineness;
@@ -84,13 +84,13 @@ mod tests {
         assert_eq!(last, (0, 1.0));
         let mut options = Options::default();
         set_quality(&mut options, 100, 10, None);
-        assert_eq!(options.fineness, Fineness::Lossless);
+        assert_eq!(options.fineness, QualityTarget::Lossless);
         assert_eq!(options.levels, Some(7..=10));
     }
 
     #[test]
     fn the_default_is_a_quality_of_about_48() {
-        let Fineness::Step(usual) = Options::default().fineness else {
+        let QualityTarget::Step(usual) = Options::default().fineness else {
             panic!("a step");
         };
         let (above, step) = place(48);

@@ -11,11 +11,10 @@ use b2p::log::Log;
 use b2p::renderer::Explanation;
 use b2p::renderer::camera::Extent;
 use b2p::{Decoder, Error, Isa, Limits, UnknownIsa, input};
-use b2p_formats::splats::Format;
 
 use super::args::{DetailArg, ModelArg};
 use super::views::Shot;
-use super::{Failure, Result, convert, kinds, manners};
+use super::{Failure, Result, cloud, convert, kinds, manners};
 
 /// A stream or Gaussians, told apart by their first bytes.
 pub const PLY_MAGIC: &[u8] = b"ply";
@@ -163,8 +162,8 @@ pub fn gaussians(
     log: &Log,
 ) -> Result<Gaussians> {
     let bytes = bytes(path, limits)?;
-    if let Some(format) = convert::format_of(path, &bytes, None) {
-        return splats(path, &bytes, format, detail, limits, log);
+    if let Some(gaussians) = other(path, &bytes, detail, limits, log)? {
+        return Ok(gaussians);
     }
     kinds::check_stream(path, &bytes)?;
     let bytes = whole_levels(path, bytes, detail, limits)?;
@@ -190,8 +189,7 @@ impl<'p> Source<'p> {
     /// Reads a file.
     pub fn open(path: &'p Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Self> {
         let bytes = bytes(path, limits)?;
-        if let Some(format) = convert::format_of(path, &bytes, None) {
-            let gaussians = splats(path, &bytes, format, detail, limits, log)?;
+        if let Some(gaussians) = other(path, &bytes, detail, limits, log)? {
             return Ok(Source::Gaussians(gaussians));
         }
         kinds::check_stream(path, &bytes)?;
@@ -256,15 +254,12 @@ impl<'p> Source<'p> {
     }
 }
 
-/// Gaussians as they stand in the file `bytes`, which came from `path`.
-pub fn splats(
-    path: &Path,
-    bytes: &[u8],
-    format: Format,
-    detail: &DetailArg,
-    limits: &Limits,
-    log: &Log,
-) -> Result<Gaussians> {
+/// Gaussians as they stand in the file `bytes`, which came from `path`, or surfels of its points. `None` if it has neither.
+pub fn other(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Option<Gaussians>> {
+    let format = convert::format_of(path, bytes, None);
+    if format.is_none() && !cloud::is_cloud(bytes) {
+        return Ok(None);
+    }
     let asked = [("--level", detail.level.is_some()), ("--heads", detail.heads.is_some())];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
         return Err(Failure(format!(
@@ -272,6 +267,9 @@ pub fn splats(
             path.display()
         )));
     }
+    let Some(format) = format else {
+        return cloud::drawable(path, bytes, isa(None)?, limits, log);
+    };
     let splats = convert::read(path, bytes, format, limits, log)?;
-    splats.into_ply_axes().map_err(Failure::in_file(path))
+    splats.into_ply_axes().map(Some).map_err(Failure::in_file(path))
 }

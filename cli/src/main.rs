@@ -5,6 +5,7 @@ mod args;
 mod bench;
 mod bench_render;
 mod budget;
+mod cloud;
 mod convert;
 mod cut;
 mod decode;
@@ -29,6 +30,7 @@ mod views;
 use std::io::ErrorKind;
 use std::path::Path;
 use std::process::ExitCode;
+use std::sync::mpsc::sync_channel;
 
 use args::{Cli, Command};
 use clap::{ColorChoice, CommandFactory, FromArgMatches};
@@ -91,6 +93,8 @@ impl Failure {
     }
 }
 
+/// The most threads that are started.
+const MOST_THREADS: usize = 1024;
 /// What a shell gives for a program that SIGPIPE ended.
 const BROKEN_PIPE: u8 = 128 + 13;
 
@@ -151,24 +155,42 @@ fn run(cli: &Cli) -> Result<()> {
     said.say()
 }
 
-/// Starts the threads at once, so that none that the system refuses is missed later. Unless a number was asked for, one is enough.
-fn start_threads(count: Option<u16>) -> Result<()> {
-    let pool = || rayon::ThreadPoolBuilder::new();
-    let count = usize::from(count.unwrap_or(0));
-    let Err(error) = pool().num_threads(count).build_global() else {
-        return Ok(());
+/// Starts the threads at once, so that none that the system refuses is missed later. Unless a number was asked for, fewer will do.
+fn start_threads(asked: Option<u16>) -> Result<()> {
+    let usual = || {
+        let named = std::env::var("RAYON_NUM_THREADS").ok().and_then(|n| n.parse().ok());
+        let cores = || std::thread::available_parallelism().map_or(1, usize::from);
+        named.filter(|n| *n > 0).unwrap_or_else(cores).min(MOST_THREADS)
     };
-    let failed = |error| match count {
-        0 => Failure(format!("cannot start threads: {error}")),
-        _ => Failure(format!("cannot start {count} threads: {error}")),
-    };
-    if count > 0 {
-        return Err(failed(error));
+    let wanted = asked.map_or_else(usual, usize::from);
+    let mut waiting = Vec::new();
+    for _ in 0..wanted {
+        let (sender, receiver) = sync_channel::<rayon::ThreadBuilder>(1);
+        let work = move || {
+            if let Ok(worker) = receiver.recv() {
+                worker.run();
+            }
+        };
+        match std::thread::Builder::new().spawn(work) {
+            Ok(_) => waiting.push(sender),
+            Err(error) if asked.is_some() => return Err(Failure(format!("cannot start {wanted} threads: {error}"))),
+            Err(error) => {
+                let count = table::counted(waiting.len().max(1) as u64, "thread");
+                manners::warn(&format!("works in {count} of {wanted}: {error}"));
+                break;
+            }
+        }
     }
-    manners::warn(&format!("works in one thread: {error}"));
-    pool()
-        .num_threads(1)
-        .use_current_thread()
-        .build_global()
-        .map_err(failed)
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(waiting.len().max(1));
+    let built = match waiting.is_empty() {
+        true => pool.use_current_thread().build_global(),
+        false => {
+            let begin = |worker| match waiting.pop() {
+                Some(thread) => thread.send(worker).map_err(|e| std::io::Error::other(e.to_string())),
+                None => Err(std::io::Error::other("there are too few threads")),
+            };
+            pool.spawn_handler(begin).build_global()
+        }
+    };
+    built.map_err(|error| Failure(format!("cannot start threads: {error}")))
 }

@@ -1,4 +1,4 @@
-//! What holds for every command: who is told what, in which colours, and what may be overwritten.
+//! What holds for every command: where results and reports go, in which colours, and what may be overwritten.
 
 use std::io::{ErrorKind, IsTerminal, Write};
 use std::path::{Path, PathBuf};

@@ -20,7 +20,7 @@ pub struct Artist<'a> {
     pub format: Format,
     pub image: Image,
     /// Bytes that are held beside the picture.
-    pub beside: u64,
+    pub other_bytes: u64,
     distances: Vec<f32>,
     ids: Ids,
 }
@@ -40,7 +40,7 @@ impl<'a> Artist<'a> {
             args,
             format,
             image: Image::default(),
-            beside: 0,
+            other_bytes: 0,
             distances: Vec::new(),
             ids: Ids::default(),
         }
@@ -97,7 +97,7 @@ impl<'a> Artist<'a> {
         let [width, height] = camera.size();
         let pixels = u64::from(width) * u64::from(height);
         self.limits.check_pixels("pixels of the picture", pixels)?;
-        let beside = pixels.saturating_mul(each).saturating_add(self.beside);
+        let beside = pixels.saturating_mul(each).saturating_add(self.other_bytes);
         self.limits.check_bytes("bytes to draw the picture", beside)?;
         let left = self.limits.max_bytes - beside;
         Ok(self.limits.clone().with_max_bytes(left))

@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::budget::Task;
-use b2p::gaussians::Gaussians;
+use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
 use b2p::renderer::camera::{Camera, Extent};
-use b2p::renderer::{Background, Choice, Effects, Explanation, Quality, Renderer, Stats};
+use b2p::renderer::{Background, EffectMode, Effects, Explanation, Quality, Renderer, Stats};
 use b2p::{Error, Limits};
 use serde_json::json;
 
@@ -32,6 +32,10 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     if let Some(path) = &args.output.turntable {
         turntable::kind_of(path)?;
     }
+    if args.camera.is_none() {
+        // Where pictures go is known at once; a file of cameras needs to know the cube.
+        permit(args, &shots(args, &Frame::default(), &Extent::cube(), limits)?)?;
+    }
     if manners::is_pipe(&args.input) && !args.budget.is_given() {
         return from_pipe(args, limits, &log);
     }
@@ -50,7 +54,9 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     let source = Source::open(input, detail, model, limits, &log)?;
     let frame = source.frame()?;
     let mut cameras = shots(args, &frame, &Extent::cube(), limits)?;
-    permit(args, &cameras)?;
+    if args.camera.is_some() {
+        permit(args, &cameras)?;
+    }
     // What keeps the object in view is nearer than what keeps the cube in view.
     if detail.level.is_none() && source.level_for(&cameras)?.is_some() {
         cameras = shots(args, &frame, &source.extent(limits), limits)?;
@@ -71,7 +77,7 @@ fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
     let mut said = Said::default();
     // What has gone to standard output cannot be replaced by something finer.
     let early = !manners::is_pipe(&args.output);
-    let mut permitted = false;
+    let mut permitted = args.camera.is_none();
     let mut show = |gaussians: &Gaussians, log: &Log| {
         // Pictures of coarser levels are this program's own.
         if !permitted {
@@ -97,7 +103,9 @@ fn within_time(args: &Render, bytes: &[u8], limits: &Limits, log: &Log) -> Resul
     let decoder = load::decoder(bytes, &args.detail, &args.model, limits)?;
     let frame = decoder.frame(bytes).map_err(Failure::in_file(&args.input))?;
     let cameras = shots(args, &frame, &load::extent(bytes, &decoder, limits), limits)?;
-    permit(args, &cameras)?;
+    if args.camera.is_some() {
+        permit(args, &cameras)?;
+    }
     let Some(Shot { camera, .. }) = cameras.first() else {
         return Ok(Said::default());
     };
@@ -250,7 +258,7 @@ fn turn(cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> 
     let mut all = Vec::new();
     let Some(first) = cameras.first() else { return Ok(all) };
     let [width, height] = first.camera.size();
-    artist.beside = u64::from(width) * u64::from(height) * turntable::BYTES_PER_PIXEL;
+    artist.other_bytes = u64::from(width) * u64::from(height) * turntable::BYTES_PER_PIXEL;
     turntable::write(&first.path, cameras.len() as u32, |i, image| {
         let drawn = draw_logged(&cameras[i as usize], artist, log)?;
         all.push(drawn);
@@ -269,7 +277,7 @@ fn sheet(cameras: &[Shot], artist: &mut Artist, limits: &Limits, log: &Log) -> R
         _ => [0.0; 4],
     };
     let mut sheet = Sheet::new(cameras.len() as u32, first.camera.size(), paper, limits)?;
-    artist.beside = (sheet.image.pixels.len() * size_of::<[f32; 4]>()) as u64;
+    artist.other_bytes = (sheet.image.pixels.len() * size_of::<[f32; 4]>()) as u64;
     for shot in cameras {
         all.push(draw_logged(shot, artist, log)?);
         sheet.add(&artist.image, &shot.label);
@@ -325,7 +333,7 @@ fn cost_of(line: &Explanation, artist: &mut Artist, effects: Effects, camera: &C
         Ok(least)
     };
     let mut without = effects;
-    without.set(effect, Choice::Off);
+    without.set(effect, EffectMode::Off);
     let [without, with] = [least(without)?, least(effects)?];
     let cost = with.as_secs_f64() - without.as_secs_f64();
     Ok(format!("; {:+.2} ms of {}", cost * 1e3, milliseconds(with)))
@@ -367,13 +375,7 @@ fn numbers(path: &Path, [width, height]: [u32; 2], stats: &Stats) -> serde_json:
         "pairs": stats.pairs,
         "overlap": stats.pairs as f64 / stats.visible.max(1) as f64,
         "coverage": stats.touched as f64 / (f64::from(width) * f64::from(height)),
-        "effects": {
-            "harmonics": effects.harmonics,
-            "antialias": effects.antialias,
-            "supersample": effects.supersample,
-            "near": effects.near,
-            "order": effects.order,
-        },
+        "effects": effects,
         "ms": {
             "project": ms(times.project),
             "bin": ms(times.bin),

@@ -4,9 +4,9 @@ use std::num::NonZeroU8;
 use std::ops::RangeInclusive;
 
 use b2p::encoder::Residual;
-use b2p::encoder::transform::Fineness;
+use b2p::encoder::transform::QualityTarget;
 use b2p::latents::Steps;
-use b2p::renderer::{Background, Choice, Effect};
+use b2p::renderer::{Background, Effect, EffectMode};
 
 /// A number of bytes, with or without K, M, G or T for powers of 1024.
 pub fn bytes(text: &str) -> Result<u64, String> {
@@ -42,14 +42,14 @@ pub fn price(text: &str) -> Result<f32, String> {
     }
 }
 
-pub fn step(text: &str) -> Result<Fineness, String> {
+pub fn step(text: &str) -> Result<QualityTarget, String> {
     let size = |text: &str| match text.parse() {
         Ok(step) if (0.5..=1000.0).contains(&step) => Ok(step),
         _ => Err("expected one or two numbers from 0.5 to 1000 such as 16 or 16,24"),
     };
     Ok(match text.split_once(',') {
-        None => Fineness::Step(size(text)?),
-        Some((luma, chroma)) => Fineness::Steps {
+        None => QualityTarget::Step(size(text)?),
+        Some((luma, chroma)) => QualityTarget::Steps {
             luma: size(luma)?,
             chroma: size(chroma)?,
         },
@@ -130,7 +130,7 @@ pub fn point(text: &str) -> Result<[f64; 3], String> {
     <[f64; 3]>::try_from(numbers(text)?).map_err(|_| "expected three numbers: x,y,z".into())
 }
 
-pub fn effect(text: &str) -> Result<(Effect, Choice), String> {
+pub fn effect(text: &str) -> Result<(Effect, EffectMode), String> {
     let (name, choice) = text
         .split_once('=')
         .ok_or("expected an effect and a choice such as antialias=on")?;

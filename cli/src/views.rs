@@ -7,7 +7,7 @@ use b2p::gaussians::Frame;
 use b2p::renderer::camera::{Camera, Extent, Projection, files};
 
 use super::args::{Render, View};
-use super::{Failure, Result, load};
+use super::{Failure, Result, cloud, load};
 
 /// Pictures of a contact sheet and of a turntable, unless a number is given.
 const ON_SHEET: u32 = 8;
@@ -77,17 +77,12 @@ fn circle(args: &Render, frame: &Frame, extent: &Extent) -> Result<Vec<files::Na
     let count = count(args);
     let azimuths = (0..count).map(|i| view.orbit.azimuth + 360.0 * f64::from(i) / f64::from(count));
     let target = target(view, frame, extent);
+    let up = cloud::up_of(&args.input, args.up);
     let at = |azimuth: f64, radius: f64| {
         let (width, height) = view.size;
-        Camera::orbit_around(
-            target,
-            azimuth,
-            view.orbit.elevation,
-            radius,
-            view.fov.into(),
-            width,
-            height,
-        )
+        let (elevation, fov) = (view.orbit.elevation, view.fov.into());
+        let camera = Camera::orbit_around(target, azimuth, elevation, radius, fov, width, height);
+        camera.map(|camera| up.map_or(camera, |up| camera.with_up(up, target)))
     };
     let projection = match args.orthographic {
         true => Projection::Orthographic,

@@ -121,6 +121,7 @@ fn a_hostile_cache_harms_nobody() {
         .env_remove("XDG_CACHE_HOME")
         .env_remove("HOME")
         .args(&arguments)
+        .arg("--force")
         .output()
         .unwrap();
     assert!(output.status.success());

@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 use b2p::container::Slice;
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::latents::entropy::{
-    Condition, Part, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
+    Condition, SlicePart, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
     decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice, quantise, quantise_passes,
 };
 use b2p::{Cancel, Isa};
@@ -261,8 +261,8 @@ fn as_coefficients(values: &[i16], code: &[u8]) {
 }
 
 /// Two parts of triples, of which these channels are present.
-fn two<T>(present: [&Range<usize>; 2], (first, second): (T, T)) -> [Part<T>; 2] {
-    let part = |present: &Range<usize>, triples| Part {
+fn two<T>(present: [&Range<usize>; 2], (first, second): (T, T)) -> [SlicePart<T>; 2] {
+    let part = |present: &Range<usize>, triples| SlicePart {
         present: present.clone(),
         triples,
     };

@@ -4,11 +4,13 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 use b2p::Limits;
-use b2p::cloud::{PointCloud, voxelise, voxelise_closed};
+use b2p::cloud::{PointCloud, ReadOptions, voxelise, voxelise_closed};
 use b2p::gaussians::Gaussians;
 use b2p::geometry::{KernelMap, Octree, Voxels};
 use b2p::latents::entropy::UNPREDICTED;
 use b2p::latents::network::{Model, Pass, Shape, untrained};
+use b2p_formats::clouds::{self, PointFormat, WriteOptions};
+use b2p_formats::detect::Kind;
 use b2p_formats::splats;
 
 use crate::{one_in, within};
@@ -96,6 +98,39 @@ fn passes(model: &Model, role: usize, octree: &Octree, map: &KernelMap) {
     }
 }
 
+/// Any bytes as a file of points that a parser of this project reads: an error, or finite points of which every format that holds
+/// the grid gives back the same voxels.
+pub fn clouds(bytes: &[u8]) {
+    let limits = Limits::default().with_max_points(1 << 16);
+    // Other crates' parsers may panic inside of the reader, which a fuzzer counts.
+    if matches!(Kind::of(bytes), Kind::Las | Kind::E57 | Kind::Glb | Kind::Gltf) {
+        return;
+    }
+    let options = ReadOptions {
+        drop_outliers: one_in(2, bytes),
+        vertices: one_in(3, bytes),
+        ..ReadOptions::default()
+    };
+    let Ok(read) = clouds::read(bytes.to_vec(), None, &limits, &options) else {
+        return;
+    };
+    let cloud = read.cloud;
+    assert_eq!(cloud.positions.len(), cloud.colours.len());
+    assert!(cloud.positions.as_flattened().iter().all(|x| x.is_finite()));
+    let Ok((voxels, _)) = voxelise_closed(&cloud) else {
+        return;
+    };
+    let format = PointFormat::Ply;
+    for local in [false, true] {
+        let options = WriteOptions { double: true, local };
+        let file = clouds::encode(&voxels, &cloud.axes, format, options).expect("PLY holds all voxels");
+        // Points may be so far from the origin that numbers do not separate them.
+        if let Ok(again) = PointCloud::from_ply(&file.bytes, &limits) {
+            assert_eq!(again.colours, voxels.colours);
+        }
+    }
+}
+
 /// Any bytes as a point cloud and as Gaussians: an error, or arrays of equal length that are the same after writing and reading again.
 pub fn ply(bytes: &[u8]) {
     let limits = Limits::default().with_max_points(1 << 16);
@@ -107,10 +142,10 @@ pub fn ply(bytes: &[u8]) {
             assert_eq!(voxels.voxels.len(), voxels.colours.len());
             assert!(voxels.voxels.len() <= cloud.positions.len());
             // A coarser grid may be larger than numbers can express.
-            if let Ok((closed, depth)) = voxelise_closed(&cloud) {
-                assert_eq!(depth, voxels.voxels.depth());
-                assert!(closed.voxels.depth() <= depth);
-                assert!(closed.voxels.len() <= voxels.voxels.len());
+            if let Ok((closed, report)) = voxelise_closed(&cloud) {
+                assert_eq!(report.finest, voxels.voxels.depth());
+                assert_eq!(report.voxels, closed.voxels.len() as u64);
+                assert!(closed.voxels.len() <= cloud.positions.len());
             }
         }
     }

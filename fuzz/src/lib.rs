@@ -18,7 +18,7 @@ use b2p::latents::network::{Model, Shape, untrained};
 use peak_alloc::PeakAlloc;
 
 pub use codecs::{entropy, octree};
-pub use files::{model, ply, splats};
+pub use files::{clouds, model, ply, splats};
 pub use mutate::{Change, mutate};
 pub use pictures::{backends, render};
 pub use streams::{chunking, deepest, header, stream};
@@ -28,7 +28,7 @@ pub use transform::transform;
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All targets.
-pub const TARGETS: [Target; 11] = [
+pub const TARGETS: [Target; 12] = [
     ("header", header),
     ("stream", stream),
     ("transform", transform),
@@ -39,6 +39,7 @@ pub const TARGETS: [Target; 11] = [
     ("model", model),
     ("ply", ply),
     ("splats", splats),
+    ("clouds", clouds),
     ("render", render),
 ];
 

@@ -8,7 +8,7 @@ use b2p::encoder::{Options, encode, transform};
 use b2p::gaussians::{Gaussians, Harmonics};
 use b2p::geometry::Voxels;
 use b2p::latents::LatentDecoder;
-use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
+use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, ResidualSteps, Steps};
 use b2p::log::Log;
 use b2p::{Limits, Placement};
 use b2p_formats::splats::{Axes, Format, write};
@@ -61,8 +61,8 @@ fn transformed() -> Vec<Vec<u8>> {
         let stream = transform::encode(&cloud, &options, &Log::default());
         stream.expect("a small cloud is coded").bytes
     };
-    let step = transform::Fineness::Step;
-    let lossless = transform::Fineness::Lossless;
+    let step = transform::QualityTarget::Step;
+    let lossless = transform::QualityTarget::Lossless;
     vec![
         coded(1, vec![0, 7], 0..=1, 16_384, step(8.0)),
         coded(2, vec![0, 5, 63], 1..=2, 2, lossless),
@@ -83,7 +83,7 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
     let filter = ColourFilter { exponent: 7, weights };
     let slice = stream.header().slice_voxels as usize;
     let steps = |luma, chroma| Steps { luma, chroma };
-    let precision = Precision {
+    let precision = ResidualSteps {
         fine: steps(30, 12),
         coarse: steps(10, 4),
         boundary: 3,
@@ -166,6 +166,7 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
             let files = clouds.iter().take(2).filter_map(|(_, file)| file.clone());
             files.chain([cloud.to_ply(), ascii.into()]).collect()
         }
+        "clouds" => point_files(),
         "splats" => splats(&clouds[0].1),
         "model" => vec![vec![], noise(1, 5), noise(2, 40)],
         // No voxels; one at every level, and one level too many.
@@ -176,6 +177,35 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
         "entropy" => faulty_tables().into_iter().chain(noises()).collect(),
         _ => noises().collect(),
     }
+}
+
+/// Files of points in the formats whose parsers are this project's own.
+fn point_files() -> Vec<Vec<u8>> {
+    let pcd = |data: &str| {
+        format!(
+            "# .PCD v.7\nVERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\n\
+             POINTS 2\nDATA {data}\n"
+        )
+    };
+    let rows = noise(5, 32);
+    // One run of literals.
+    let packed = [&[33, 0, 0, 0, 32, 0, 0, 0, 31][..], &rows].concat();
+    let texts = [
+        "x,y,z,red,green,blue\n0,1,2,10,20,30\n5,nan,1,0,0,255\n",
+        "2\n1.5 2 3 -100 10 20 30\n4 5 6 7 40 50 60\n",
+        "1 2 3 0 0 1\n4 5 6 1 0 0\n",
+        "# a\nv 1 2 3 0.5 0 1\nv 2 2 2 1 1 1\nf 1 2 1\n",
+        "ply\nformat ascii 1.0\ncomment coordinates local\ncomment offset 500000 4000000 1\nelement vertex 2\nproperty float x\n\
+         property float y\nproperty float z\nproperty ushort r\nproperty ushort g\nproperty ushort b\nend_header\n\
+         0 1 2 200 3 4\n1 2 3 4 5 6\n",
+        "\u{feff}ply\rformat ascii 1.0\rcomment up z\relement vertex 1\rproperty double X\rproperty double Y\rproperty double Z\r\
+         property float intensity\rend_header\r1 2 3 0.5\r",
+    ];
+    let mut files: Vec<Vec<u8>> = texts.iter().map(|text| text.as_bytes().to_vec()).collect();
+    files.push((pcd("ascii") + "1 2 3 255\n4 5 6 65280\n").into_bytes());
+    files.push([pcd("binary").as_bytes(), &rows].concat());
+    files.push([pcd("binary_compressed").as_bytes(), &packed].concat());
+    files
 }
 
 fn noises() -> impl Iterator<Item = Vec<u8>> {

@@ -1,11 +1,11 @@
 //! Streams from strangers.
 
 use b2p::Decoder;
-use b2p::container::{Header, Level, Slice, Stream, Writer};
+use b2p::container::{self, Header, Level, Slice, Stream, Writer};
 use b2p::gaussians::Gaussians;
 use b2p::latents::{Exact, LatentDecoder, LatentDecoding};
 use b2p::log::Log;
-use b2p::{Error, Limits};
+use b2p::{Axes, Error, Limits};
 
 use crate::{MODEL, giving_back, one_in, transform, within};
 
@@ -46,6 +46,11 @@ pub fn header(bytes: &[u8]) {
         assert!(residual == *voxels || level.residual.is_empty());
         let end = header.prefix_bytes(level.level).expect("a level of the stream");
         assert!(end <= bytes.len() as u64);
+    }
+    let axes = container::axes(bytes).expect("the header is sound");
+    assert!(axes.crs.len() <= Axes::MAX_CRS);
+    if let Ok(marked) = container::with_axes(bytes, &axes) {
+        assert_eq!(container::axes(&marked).expect("a sound header"), axes);
     }
     let whole = stream.levels().len() == header.voxels.len();
     let exact = bytes.len() as u64 == header.stream_bytes();

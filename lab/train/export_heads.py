@@ -11,7 +11,8 @@ import os
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from heads import BLUR
 from octree_samples import Sample, decoded_colours
@@ -45,15 +46,24 @@ def ranges(head, samples, quantile=0.9999):
     return {k: round(v, 5) for k, v in found.items()}
 
 
+def kept(path, but):
+    """Tensors and descriptions of the sets of a model file except those named `but`."""
+    with safe_open(path, "pt") as f:
+        sets = json.loads(f.metadata()["b2p-heads"])["sets"]
+    sets = {name: shape for name, shape in sets.items() if name not in but}
+    return {k: v for k, v in load_file(path).items() if k.startswith(tuple(f"{name}." for name in sets))}, sets
+
+
 def main(argv=None):
     p = argparse.ArgumentParser()
     p.add_argument("out")
     p.add_argument("sets", nargs="+", metavar="NAME=CHECKPOINT")
+    p.add_argument("--keep", metavar="MODEL.safetensors", help="copy the other sets of this file, as they are")
     p.add_argument("--samples", required=True, help="sample files that ranges come from, comma-separated")
     args = p.parse_args(argv)
     torch.set_num_threads(1)
     samples = [Sample(path) for path in args.samples.split(",")]
-    tensors, sets = {}, {}
+    tensors, sets = kept(args.keep, [s.split("=")[0] for s in args.sets]) if args.keep else ({}, {})
     for name, path in (s.split("=") for s in args.sets):
         head = rounded(load_head(path))
         tensors |= {f"{name}.{k}": v.half().contiguous() for k, v in head.state_dict().items()}

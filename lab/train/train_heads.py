@@ -14,6 +14,7 @@ import time
 import numpy as np
 import torch
 
+import ops
 from heads import Head, draw, parameters, per_voxel, place, saved_head, visible
 from octree_samples import Sample, decoded_colours
 from train import atomic_save, distortion, imitation, keep_memory
@@ -197,6 +198,7 @@ def options():
     p.add_argument("--keep", type=int, default=400, help="samples to keep in memory")
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--threads", type=int, default=1)
+    p.add_argument("--precision", choices=["f32", "bf16"], default="f32", help="operands of convolutions; bf16 where the processor has AVX512-BF16")
     p.add_argument("--save-minutes", type=float, default=2)
     return p
 
@@ -204,6 +206,7 @@ def options():
 def main(argv=None):
     args = options().parse_args(argv)
     torch.set_num_threads(args.threads)
+    ops.extension().set_bf16(args.precision == "bf16")
     keep_memory()
     os.makedirs(args.out, exist_ok=True)
     last = os.path.join(args.out, "last.pt")

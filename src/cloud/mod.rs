@@ -1,20 +1,42 @@
-//! Point clouds: PLY files and voxelisation.
+//! Point clouds: PLY files, colours of any range, and voxelisation.
 //!
-//! The reader accepts any number types and any order of properties. [`voxelise`] makes the octree's finest level: it
-//! keeps coordinates that are voxels already, and fits a grid to all others. [`voxelise_closed`] chooses a coarser
-//! level if the points are too sparse for that one.
+//! A reader of a file format makes [`RawPoints`]. [`RawPoints::finish`] makes a [`PointCloud`] of them: it leaves out bad
+//! points, converts colours, and reports what it did. [`voxelise`] makes the octree's finest level: it keeps
+//! coordinates that are voxels already, and fits a grid to all others. [`voxelise_closed`] chooses the level by the
+//! spacing of the points.
 
+mod colours;
+mod dialects;
 pub mod ply;
 mod points;
+mod raw;
+mod select;
 mod voxelise;
 mod write;
 
-pub use points::{Hints, PointCloud};
-pub use voxelise::{ColouredVoxels, voxelise, voxelise_closed};
+pub use colours::{ColourRange, RawColours, Stored};
+pub use points::{Coordinates, Hints, PointCloud, is_a_mesh};
+pub use raw::{Note, RawPoints, ReadOptions};
+
+pub use voxelise::{ColouredVoxels, GridReport, voxelise, voxelise_closed};
+pub use write::axes_comments;
 
 use crate::error::{Error, Stage};
 
 /// An error in a file or in its points.
 fn malformed(at: impl ToString, field: impl ToString, value: impl ToString, expected: impl ToString) -> Error {
     Error::malformed(Stage::Cloud, at, field, value, expected)
+}
+
+/// A number with commas between groups of three digits.
+pub(crate) fn grouped(count: u64) -> String {
+    let digits = count.to_string();
+    let mut text = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
 }

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use super::malformed;
-use super::ply::{Column, Ply, Scalar, Values};
-use crate::error::Result;
+use super::raw::{Note, ReadOptions};
+use crate::axes::Axes;
+use crate::error::{Error, Result};
 use crate::input;
 use crate::limits::Limits;
 use crate::placement::Placement;
@@ -18,9 +18,11 @@ pub struct PointCloud {
     pub colours: Vec<[u8; 3]>,
     /// Voxel grid in the file's comments.
     pub hints: Hints,
+    /// What is known of the coordinates.
+    pub axes: Axes,
 }
 
-/// The voxel grid in a file's comments: `bits B`, `unit U`, `origin X Y Z`, `shift X Y Z`.
+/// The voxel grid in a file's comments: `bits B`, `unit U`, `origin X Y Z`, `shift X Y Z`, `coordinates world`.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Hints {
     /// The bit depth `B`, 1 to 21.
@@ -28,6 +30,18 @@ pub struct Hints {
     /// Placement of the grid, if both unit and origin are given: the centre of voxel `v` is `(v + ½ − shift)·unit +
     /// origin`.
     pub placement: Option<Placement>,
+    /// What the coordinates are.
+    pub coordinates: Coordinates,
+}
+
+/// What the coordinates of points with hints are.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Coordinates {
+    /// Voxels, if they are integers.
+    #[default]
+    Voxels,
+    /// Places in the world, also if they are integers.
+    World,
 }
 
 impl PointCloud {
@@ -39,91 +53,58 @@ impl PointCloud {
         Self::from_ply(&input::read_file(path.as_ref(), limits)?, limits)
     }
 
-    /// Reads a PLY file from memory.
+    /// Reads a PLY file from memory, and refuses what would have to be mended or guessed.
     ///
-    /// Requires `x y z` of any number type and `red green blue`, each `uchar`, `ushort` (0 to 65535) or
-    /// `float`/`double` (0 to 1).
+    /// Requires `x y z` of any number type and colours (see [`PointCloud::read_ply`]).
     ///
     /// # Errors
     /// [`Error::Malformed`] if one is absent, there are no points, a coordinate is not finite or a colour out of range;
     /// [`Error::Truncated`] if the file ends early; [`Error::LimitExceeded`] if there are more points than `limits`
     /// allow.
     pub fn from_ply(bytes: &[u8], limits: &Limits) -> Result<Self> {
-        let ply = Ply::open(bytes)?;
-        let names = ["x", "y", "z", "red", "green", "blue"];
-        let columns = ply.vertex_columns(&names, limits)?;
-        let count = columns[0].len();
-        if count == 0 {
-            let field = "count of element vertex";
-            return Err(malformed("header", field, 0, "at least one point"));
-        }
-        let memory = std::mem::size_of::<([f64; 3], [u8; 3])>() as u64;
-        limits.check_bytes("bytes of the point cloud", count as u64 * memory)?;
+        let options = ReadOptions {
+            strict: true,
+            vertices: true,
+            ..ReadOptions::default()
+        };
+        Ok(Self::read_ply(bytes, limits, &options)?.0)
+    }
 
-        let mut positions = vec![[0.0; 3]; count];
-        let mut colours = vec![[0; 3]; count];
-        for (axis, (name, column)) in names.iter().zip(&columns).enumerate() {
-            match axis {
-                0..3 => fill_axis(&mut positions, axis, name, column, &ply)?,
-                _ => fill_channel(&mut colours, axis - 3, name, column, &ply)?,
-            }
-        }
-        Ok(PointCloud {
-            positions,
-            colours,
-            hints: Hints::from_comments(&ply.header.comments),
-        })
+    /// Reads a PLY file from memory. Also returns what was mended or guessed.
+    ///
+    /// Properties are found by these names, in any case: `x y z`; `red green blue`, `r g b` or `diffuse_red` and the
+    /// others; else `intensity`, `grey`, `gray`, `scalar_intensity` or `reflectance`; `nx ny nz`. All number types are
+    /// accepted; the range of colours follows from type and maximum.
+    ///
+    /// # Errors
+    /// Those of [`PointCloud::from_ply`] that `options` do not have mended; [`Error::Unsupported`] for a mesh.
+    pub fn read_ply(bytes: &[u8], limits: &Limits, options: &ReadOptions) -> Result<(Self, Vec<Note>)> {
+        super::dialects::read(bytes, limits, options)?.finish(options)
     }
 }
 
-fn fill_axis(positions: &mut [[f64; 3]], axis: usize, name: &str, column: &Column, ply: &Ply) -> Result<()> {
-    for (row, position) in positions.iter_mut().enumerate() {
-        let value = column.get(row);
-        if !value.is_finite() {
-            let at = ply.vertex_place(row);
-            return Err(malformed(at, format!("property {name}"), value, "a finite number"));
-        }
-        position[axis] = value;
+/// The error of reading a mesh as points.
+pub fn is_a_mesh(detail: &str) -> Error {
+    Error::Unsupported {
+        what: "a mesh as a point cloud",
+        detail: format!(
+            "this is a mesh{detail}: sample it first with `b2p-lab voxelize`, or take its vertices with --vertices"
+        ),
     }
-    Ok(())
-}
-
-fn fill_channel(colours: &mut [[u8; 3]], channel: usize, name: &str, column: &Column, ply: &Ply) -> Result<()> {
-    let scale = match column.scalar {
-        Scalar::U8 => 1.0,
-        Scalar::U16 => 255.0 / 65535.0,
-        Scalar::F32 | Scalar::F64 => 255.0,
-        other => {
-            let expected = "uchar, ushort, float or double";
-            return Err(malformed("header", format!("type of property {name}"), other, expected));
-        }
-    };
-    if let Values::U8(values) = &column.values {
-        for (colour, &value) in colours.iter_mut().zip(values) {
-            colour[channel] = value;
-        }
-        return Ok(());
-    }
-    for (row, colour) in colours.iter_mut().enumerate() {
-        let value = column.get(row);
-        let byte = (value * scale).round();
-        if !(0.0..=255.0).contains(&byte) {
-            let at = ply.vertex_place(row);
-            return Err(malformed(at, format!("property {name}"), value, "a number from 0 to 1"));
-        }
-        colour[channel] = byte as u8;
-    }
-    Ok(())
 }
 
 impl Hints {
     /// Comments are free text: those that do not parse are ignored.
-    fn from_comments(comments: &[String]) -> Self {
+    pub(super) fn from_comments(comments: &[String]) -> Self {
         let mut bits = None;
+        let mut coordinates = Coordinates::Voxels;
         let (mut unit, mut origin, mut shift) = (None, None, [0.0; 3]);
         for comment in comments {
             let mut words = comment.split_ascii_whitespace();
             let Some(key) = words.next() else { continue };
+            if comment == "coordinates world" {
+                coordinates = Coordinates::World;
+            }
             let values: Option<Vec<f64>> = words.take(4).map(number).collect();
             match (key, values.as_deref()) {
                 ("bits", Some(&[b])) if b.fract() == 0.0 && (1.0..=21.0).contains(&b) => {
@@ -142,6 +123,7 @@ impl Hints {
         Hints {
             bits,
             placement: placement.filter(Placement::is_valid),
+            coordinates,
         }
     }
 }
@@ -182,15 +164,13 @@ mod tests {
         let error = |types: &str, rows: &str| read(types, rows).unwrap_err().to_string();
         let text = error(types, "1 2 3 4 5 0.5\n1 2 3 4 nan 0.5\n");
         assert_eq!(text, "cloud: at line 12: property y is NaN, expected a finite number");
-        let text = error(types, "1 2 3 4 5 1.1\n");
-        assert!(text.contains("line 11: property red is 1.1"), "{text}");
-        assert!(error(types, "1 2 3 4 5 nan\n").contains("property red"));
+        let text = error("float float float float float float", "0 2 3 0 5 1.1\n");
+        assert!(text.contains("point 0: red is 1.1"), "{text}");
+        assert!(error("float float float float float float", "1 2 3 4 5 nan\n").contains("NaN"));
         assert!(error(types, "").contains("at least one point"));
-        let text = error("uchar float float uchar float int", "1 2 3 4 5 6\n");
-        assert!(text.contains("type of property red is int"), "{text}");
-        let bare = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n";
+        let bare = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nproperty uchar r\nend_header\n1 2 3 4\n";
         let text = PointCloud::from_ply(bare, &Limits::default()).unwrap_err().to_string();
-        assert!(text.contains("property of vertex red is absent"), "{text}");
+        assert!(text.contains("property of vertex g is absent"), "{text}");
     }
 
     #[test]
@@ -201,6 +181,7 @@ mod tests {
             origin: [-1.0, 2.0, 3.0],
             voxel_size: 0.5,
         };
+        assert_eq!(hints(&["coordinates world"]).coordinates, Coordinates::World);
         assert_eq!(hints(&grid).bits, Some(11));
         assert_eq!(hints(&grid).placement, Some(placement));
         let text = [

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use super::PointCloud;
+use super::{Coordinates, PointCloud};
+use crate::axes::Axes;
 use crate::error::{Error, Result};
 use crate::output::write_file;
 
@@ -24,6 +25,10 @@ impl PointCloud {
             let [x, y, z] = p.origin;
             header += &format!("comment unit {}\ncomment origin {x} {y} {z}\n", p.voxel_size);
         }
+        if self.hints.coordinates == Coordinates::World {
+            header += "comment coordinates world\n";
+        }
+        header += &axes_comments(&self.axes);
         header += &format!("element vertex {}\n", self.positions.len());
         for axis in ["x", "y", "z"] {
             header += &format!("property {scalar} {axis}\n");
@@ -59,9 +64,27 @@ impl PointCloud {
     }
 }
 
+/// Comments of a PLY header that say what is known of the coordinates.
+pub fn axes_comments(axes: &Axes) -> String {
+    let mut text = String::new();
+    if let Some(up) = axes.up {
+        text += &format!("comment up {up}\n");
+    }
+    if let Some(metres) = axes.metres_per_unit {
+        text += &format!("comment metres_per_unit {metres}\n");
+    }
+    // A line is what the header can hold.
+    let crs = axes.crs.split_whitespace().collect::<Vec<_>>().join(" ");
+    if !crs.is_empty() {
+        text += &format!("comment crs {crs}\n");
+    }
+    text
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Up;
     use crate::cloud::Hints;
     use crate::{Limits, Placement};
 
@@ -77,6 +100,12 @@ mod tests {
                         origin: [0.1, -1e-300, 1e300],
                         voxel_size: 0.3,
                     }),
+                    coordinates: Coordinates::World,
+                },
+                axes: Axes {
+                    up: Some(Up::MinusY),
+                    metres_per_unit: Some(0.1),
+                    crs: "EPSG:32633".into(),
                 },
             };
             let file = tempfile::NamedTempFile::new().unwrap();

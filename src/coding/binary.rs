@@ -1,7 +1,8 @@
 //! Binary decisions through constriction's range coder.
 //!
-//! The coder is [`constriction::stream::queue`] with words of 32 bits, a state of 64 bits and probabilities of 16 bits. A decision that is 1
-//! with probability `one / 65536` splits the interval at `65536 − one`: below lies 0, above 1. Words are little-endian.
+//! The coder is [`constriction::stream::queue`] with words of 32 bits, a state of 64 bits and probabilities of 16 bits.
+//! A decision that is 1 with probability `one / 65536` splits the interval at `65536 − one`: below lies 0, above 1.
+//! Words are little-endian.
 
 #[cfg(feature = "encoder")]
 use std::borrow::Borrow;
@@ -24,8 +25,8 @@ const LOOKAHEAD: usize = 2;
 
 /// Codes decisions, one way or the other.
 pub(crate) trait Coder {
-    /// Codes a decision that is 1 with probability `one / 65536`, `one` in `1..=65535`. An encoder takes `bit` and returns it; a decoder
-    /// returns what it reads, whatever `bit` is.
+    /// Codes a decision that is 1 with probability `one / 65536`, `one` in `1..=65535`. An encoder takes `bit` and
+    /// returns it; a decoder returns what it reads, whatever `bit` is.
     fn code(&mut self, bit: bool, one: u32) -> bool;
 }
 

@@ -8,8 +8,8 @@ pub(crate) const LIMIT: i32 = 720;
 /// `e^(−1/64)` in units of 2^−62, rounded down.
 const DECAY: u64 = 4_540_188_453_729_421_604;
 
-/// Entry `k` is `round(2^16 / (1 + E))` with `E = e^(−k/64)` in units of 2^−62: `E` of `k = 0` is 2^62, and each next one is the last
-/// times `DECAY`, divided by 2^62, rounded down.
+/// Entry `k` is `round(2^16 / (1 + E))` with `E = e^(−k/64)` in units of 2^−62: `E` of `k = 0` is 2^62, and each next
+/// one is the last times `DECAY`, divided by 2^62, rounded down.
 const SQUASH: [u16; LIMIT as usize + 1] = {
     let mut table = [0; LIMIT as usize + 1];
     let mut power = 1u128 << 62;

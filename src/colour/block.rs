@@ -205,7 +205,8 @@ fn mean([y, co, cg, weight]: [i32; 4]) -> [i32; 3] {
 /// Quantisation steps of the channels, and their inverses.
 struct Scales {
     units: [i32; 3],
-    /// `⌊2³² / unit⌋` in lanes of Y, Co, Cg and 0, twice; 0 where the unit is 1, or 0 for a channel without coefficients.
+    /// `⌊2³² / unit⌋` in lanes of Y, Co, Cg and 0, twice; 0 where the unit is 1, or 0 for a channel without
+    /// coefficients.
     inverses: [u32; 8],
     /// All bits set in those lanes.
     units_of_one: [u32; 8],

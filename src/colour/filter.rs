@@ -178,11 +178,22 @@ pub(super) fn widen(values: &[Ycc]) -> Vec<Values> {
 }
 
 /// Offsets of the neighbours that share a face, as indices into a 3³ row.
-const FACES: [usize; 6] = [4, 10, 12, 14, 16, 22];
+pub(super) const FACES: [usize; 6] = [4, 10, 12, 14, 16, 22];
 /// Offsets of the neighbours that share only an edge.
-const EDGES: [usize; 12] = [1, 3, 5, 7, 9, 11, 15, 17, 19, 21, 23, 25];
+pub(super) const EDGES: [usize; 12] = [1, 3, 5, 7, 9, 11, 15, 17, 19, 21, 23, 25];
 /// Offsets of the neighbours that share only a corner.
-const CORNERS: [usize; 8] = [0, 2, 6, 8, 18, 20, 24, 26];
+pub(super) const CORNERS: [usize; 8] = [0, 2, 6, 8, 18, 20, 24, 26];
+
+/// All places of a row.
+const PLACES: [usize; 27] = {
+    let mut places = [0; 27];
+    let mut k = 0;
+    while k < 27 {
+        places[k] = k;
+        k += 1;
+    }
+    places
+};
 
 /// Response functions of a level: lanes 0 to 2 are the narrow responses of Y, Co and Cg, lanes 4 to 6 the wide ones.
 pub(super) struct Responses {
@@ -202,24 +213,36 @@ impl Responses {
         }
     }
 
+    /// The sums of the responses to the neighbours at these offsets, and how many of them are present.
+    ///
+    /// A function, as closures are not always inlined, and would then be compiled for the baseline of the target.
+    #[inline(always)]
+    fn sum<I: Instructions, const N: usize>(
+        &self,
+        instructions: I,
+        values: &[Values],
+        own: &Values,
+        row: &[u32],
+        offsets: &[usize; N],
+    ) -> (Lanes, i32) {
+        // Those that are present come together first, without branches: their presence is unpredictable.
+        let (mut present, mut count) = ([0; N], 0);
+        for &k in offsets {
+            present[count.min(N - 1)] = row[k];
+            count += usize::from(row[k] != KernelMap::ABSENT);
+        }
+        responses(instructions, values, own, &present, &PLACES[..count], &self.inverses)
+    }
+
     /// Computes the terms of one voxel.
     #[inline(always)]
     pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], map: &KernelMap, voxel: usize) -> Terms {
         let (own, row) = (&values[voxel], map.row(voxel));
-        // An absent neighbour is replaced by the voxel itself, to which there is no response: no branches, for the
-        // presence of neighbours is unpredictable.
-        let mut filled = [voxel as u32; 27];
-        for (to, &q) in filled.iter_mut().zip(row) {
-            *to = if q == KernelMap::ABSENT { *to } else { q };
-        }
-        let sum = |offsets: &[usize]| responses(instructions, values, own, &filled, offsets, &self.inverses).0;
-        let (faces, edges, corners) = (sum(&FACES), sum(&EDGES), sum(&CORNERS));
+        let (faces, face_count) = self.sum(instructions, values, own, row, &FACES);
+        let (edges, edge_count) = self.sum(instructions, values, own, row, &EDGES);
+        let (corners, corner_count) = self.sum(instructions, values, own, row, &CORNERS);
         let [face, edge, corner] = CLASS_WEIGHTS;
-        let count = |offsets: &[usize]| {
-            let present = offsets.iter().map(|k| i32::from(row[*k] != KernelMap::ABSENT));
-            present.sum::<i32>()
-        };
-        let counts = count(&FACES) * face + count(&EDGES) * edge + count(&CORNERS) * corner;
+        let counts = face_count * face + edge_count * edge + corner_count * corner;
         let inverse = i64::from((1u32 << 16) / counts.max(1) as u32);
         let mean = |sum: i32| ((i64::from(sum) * inverse) >> 14) as i32;
         std::array::from_fn(|t| {

@@ -247,7 +247,9 @@ pub fn decode_level(
 
 /// Concatenates the slices of a level.
 fn join(isa: Isa, nodes: Nodes<'_>, slices: Vec<(Steps, block::CodedSlice, Model)>) -> LevelColours {
-    let (mut values, mut energies) = (Vec::new(), Vec::new());
+    let children = slices.iter().map(|(_, coded, _)| coded.values.len()).sum();
+    let mut values = Vec::with_capacity(children);
+    let mut energies = Vec::with_capacity(nodes.masks.len());
     let mut first = None;
     for (steps, coded, model) in slices {
         values.extend(coded.values);
@@ -385,26 +387,20 @@ impl Work for Smooth<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
-        /// By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
-        const WEIGHTS: [u32; 4] = [40, 15, 7, 3];
-        let absent = self.energies.len() - 1;
-        let mut out = self.out.iter_mut();
-        for (row, mask) in self.rows.chunks_exact(27).zip(self.masks) {
-            let mut by_axes = [[0u16; 4]; 4];
-            for (k, &neighbour) in row.iter().enumerate() {
-                let axes = usize::from(k % 3 != 1) + usize::from(k / 3 % 3 != 1) + usize::from(k / 9 != 1);
-                // No branch: the presence of neighbours is unpredictable.
-                let energies = &self.energies[absent.min(neighbour as usize)];
-                for (sum, energy) in by_axes[axes].iter_mut().zip(energies) {
-                    *sum += energy;
-                }
-            }
-            let mut sums = [0; 4];
-            for (by_axes, weight) in by_axes.iter().zip(WEIGHTS) {
-                for (sum, energy) in sums.iter_mut().zip(by_axes) {
-                    *sum += weight * u32::from(*energy);
-                }
-            }
+        let Smooth {
+            energies,
+            rows,
+            masks,
+            out,
+        } = self;
+        let mut out = out.iter_mut();
+        for (row, mask) in rows.chunks_exact(27).zip(masks) {
+            let mut sums = [0u32; 4];
+            // By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
+            add_energies(energies, row, &[KernelMap::CENTRE], 40, &mut sums);
+            add_energies(energies, row, &filter::FACES, 15, &mut sums);
+            add_energies(energies, row, &filter::EDGES, 7, &mut sums);
+            add_energies(energies, row, &filter::CORNERS, 3, &mut sums);
             let [y, co, cg, weight] = sums;
             let smoothed = [y, co, cg].map(|sum| (sum / weight.max(1)) as u8);
             for _ in 0..mask.count_ones() {
@@ -430,6 +426,30 @@ impl CoefficientCoder for EntropyDecoder<'_> {
         _: Quantiser,
     ) -> i32 {
         model.code(simd, &mut self.0, c, 0)
+    }
+}
+
+/// Adds the weighted energies, and the weight, of the neighbours at these offsets. The last of `energies` stands for
+/// absent neighbours.
+#[inline(always)]
+fn add_energies<const N: usize>(
+    energies: &[[u16; 4]],
+    row: &[u32],
+    offsets: &[usize; N],
+    weight: u32,
+    sums: &mut [u32; 4],
+) {
+    let absent = energies.len() - 1;
+    let mut unweighted = [0u16; 4];
+    for &k in offsets {
+        // No branch: the presence of neighbours is unpredictable.
+        let energies = &energies[absent.min(row[k] as usize)];
+        for i in 0..4 {
+            unweighted[i] += energies[i];
+        }
+    }
+    for i in 0..4 {
+        sums[i] += weight * u32::from(unweighted[i]);
     }
 }
 

@@ -189,7 +189,8 @@ impl Coded {
         self.len += 1;
     }
 
-    /// `sums` of weighted Y, Co and Cg and of weights, plus those of the coded children at the offsets of a child's row.
+    /// `sums` of weighted Y, Co and Cg and of weights, plus those of the coded children at the offsets of a child's
+    /// row.
     #[inline(always)]
     pub fn sums(&self, row: &[u32], sums: [i32; 4]) -> [i32; 4] {
         let (faces, edges, corners) = BEFORE;

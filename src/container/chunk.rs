@@ -37,6 +37,8 @@ pub enum ChunkKind {
     Colours,
     /// The colour filter of a level (version 3).
     PostFilter,
+    /// Where surfels take the place of learned Gaussians (version 3). Ancillary.
+    HeadMap,
     /// A chunk that a reader skips, of type 128 to 255.
     Ancillary(u8),
 }
@@ -69,7 +71,7 @@ pub struct Chunks<'a> {
 }
 
 /// Form, type number and name of each kind.
-const KINDS: [(Form, u8, ChunkKind, &str); 9] = [
+const KINDS: [(Form, u8, ChunkKind, &str); 10] = [
     (Form::Fixed, 1, ChunkKind::Geometry, "geometry"),
     (Form::Fixed, 2, ChunkKind::Features, "feature"),
     (Form::Fixed, 3, ChunkKind::Filter, "filter"),
@@ -79,6 +81,7 @@ const KINDS: [(Form, u8, ChunkKind, &str); 9] = [
     (Form::Short, 6, ChunkKind::ColourTrunk, "colour trunk"),
     (Form::Short, 7, ChunkKind::Colours, "colour"),
     (Form::Short, 8, ChunkKind::PostFilter, "colour filter"),
+    (Form::Short, ANCILLARY, ChunkKind::HeadMap, "head map"),
 ];
 
 impl ChunkKind {
@@ -91,11 +94,12 @@ impl ChunkKind {
     }
 
     fn of(form: Form, code: u8) -> Option<Self> {
-        if code >= ANCILLARY {
-            return Some(ChunkKind::Ancillary(code));
-        }
         let own = KINDS.iter().find(|kind| kind.0 == form && kind.1 == code);
-        own.map(|(_, _, kind, _)| *kind)
+        match own {
+            Some((_, _, kind, _)) => Some(*kind),
+            None if code >= ANCILLARY => Some(ChunkKind::Ancillary(code)),
+            None => None,
+        }
     }
 }
 
@@ -272,6 +276,12 @@ impl<'a> Chunks<'a> {
         self.clone().next_critical()
     }
 
+    /// The first head map among the chunks from here on that are whole.
+    pub(super) fn head_map(&self, level: u8) -> Option<Chunk<'a>> {
+        let mut chunks = self.clone().map_while(Result::ok);
+        chunks.find(|chunk| chunk.kind == ChunkKind::HeadMap && chunk.level == level)
+    }
+
     /// Checks that only ancillary chunks remain.
     pub(super) fn finish(&mut self) -> Result<()> {
         match self.next_critical()? {
@@ -286,7 +296,7 @@ impl<'a> Chunks<'a> {
     fn next_critical(&mut self) -> Result<Option<Chunk<'a>>> {
         for chunk in self.by_ref() {
             let chunk = chunk?;
-            if !matches!(chunk.kind, ChunkKind::Ancillary(_)) {
+            if !matches!(chunk.kind, ChunkKind::Ancillary(_) | ChunkKind::HeadMap) {
                 return Ok(Some(chunk));
             }
         }

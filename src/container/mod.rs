@@ -11,6 +11,7 @@
 //! - [`Writer`] builds a stream level by level.
 //! - `feed` keeps a stream that arrives in parts, and returns which level can be decoded next.
 
+mod axes;
 mod chunk;
 pub(crate) mod feed;
 mod header;
@@ -19,6 +20,7 @@ mod stream;
 mod transform;
 mod writer;
 
+pub use axes::{axes, axes_bytes, with_axes};
 pub use header::{Format, Header, MAGIC, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Section, version};
 pub use reader::{Reader, put_varint};
 pub use stream::{Geometry, Level, Slice, Stream};

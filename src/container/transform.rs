@@ -21,6 +21,8 @@ pub struct Colours<'a> {
     pub hash: u64,
     /// The colour filter of this level.
     pub filter: Option<Slice<'a>>,
+    /// Where surfels take the place of learned Gaussians.
+    pub head_map: Option<Slice<'a>>,
 }
 
 /// The colours of the root and of the first levels in one payload.
@@ -125,6 +127,7 @@ pub(super) fn take_colours<'a>(
     level: u8,
 ) -> Result<Colours<'a>> {
     let sum = |part: &Geometry| part.slices.iter().map(|s| u64::from(s.voxels)).sum();
+    let head_map = chunks.head_map(level).map(|chunk| Slice::of(&chunk, 0));
     let counts: Vec<u64> = std::iter::once(above).chain(geometry.iter().map(sum)).collect();
     let voxels = |n: u8| counts[counts.len() - 1 - usize::from(level - n)];
     let mut hash = None;
@@ -154,6 +157,7 @@ pub(super) fn take_colours<'a>(
         levels,
         hash: hash.unwrap_or_default(),
         filter,
+        head_map,
     })
 }
 

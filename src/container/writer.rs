@@ -158,6 +158,16 @@ impl Writer {
         self.extend_colours(section, start)
     }
 
+    /// Version 3: adds the head map of `level`, as the last chunk of its section.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the stream has no such level.
+    pub fn head_map(&mut self, level: u8, payload: &[u8]) -> Result<()> {
+        let (section, start) = (self.header.index(level)?, self.body.len());
+        self.chunk(ChunkKind::HeadMap, level, 0, 0, &[], payload)?;
+        self.extend_colours(section, start)
+    }
+
     fn extend_colours(&mut self, section: usize, start: usize) -> Result<()> {
         let length = &mut self.header.sections[section].colours;
         *length = extended(*length, self.body.len() - start)?;

@@ -124,10 +124,28 @@ const TRUNK: Term = Term {
     fixed: MAP,
     by: NOTHING,
 };
-const COLOURS: Term = Term {
-    each: "voxel of the level and of the level above",
-    takes: "kernel map, colours decoded, in slices and joined, smoothed energies, colours as bytes and filtered",
-    fixed: MAP + PLAN + 3 * LevelColours::bytes_per_voxel() as u64 + 3 + 3 * 3,
+const KEPT: Term = Term {
+    each: "voxel of the level and of the two levels above",
+    takes: "kernel map, colours decoded and as bytes",
+    fixed: MAP + LevelColours::bytes_per_voxel() as u64 + 3,
+    by: NOTHING,
+};
+const CODING: Term = Term {
+    each: "voxel of the level, while its colours are decoded",
+    takes: "colours in slices",
+    fixed: 8 + 6,
+    by: NOTHING,
+};
+const CODING_ABOVE: Term = Term {
+    each: "voxel of the level above, at the same time",
+    takes: "coefficients, energies in slices and joined",
+    fixed: 32 + 3 + 3 + 8,
+    by: NOTHING,
+};
+const FILTERING: Term = Term {
+    each: "voxel of the level, while its colours are filtered",
+    takes: "colours before and after a pass, and as the pass reads them",
+    fixed: 6 + 6 + 16,
     by: NOTHING,
 };
 const CONTEXTS: Term = Term {
@@ -139,7 +157,7 @@ const CONTEXTS: Term = Term {
 const SURFEL_SUMS: Term = Term {
     each: "voxel of the level, with surfels",
     takes: "sums that surfels are made of",
-    fixed: 200,
+    fixed: 2 * 32,
     by: NOTHING,
 };
 const SURFELS: Term = Term {
@@ -203,12 +221,12 @@ impl LatentDecoder {
     }
 }
 
-/// Bytes of memory that decoding the colours of a stream of version 3 with this header down to `level` takes at most,
-/// beyond [`Limits::OVERHEAD`](crate::Limits::OVERHEAD).
+/// Bytes of memory that decoding a stream of version 3 with this header down to `level` takes at most, and drawing it
+/// with so many bytes of `drawing`, beyond [`Limits::OVERHEAD`](crate::Limits::OVERHEAD).
 ///
 /// # Errors
 /// [`crate::Error::Usage`] if the stream has no such level.
-pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
+pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64> {
     let levels = usize::from(level - header.base) + 1;
     let counts = || header.voxels[..levels].iter().copied().map(u64::from);
     let base = counts().next().unwrap_or(0);
@@ -217,18 +235,20 @@ pub(super) fn transform(header: &Header, level: u8) -> Result<u64> {
         let level = |n: u64| most.min(1 << (3 * n).min(60));
         (0..u64::from(header.base)).map(level).sum()
     };
-    let parents = counts().nth_back(1).unwrap_or(base);
+    let [grandparents, parents] = [2, 1].map(|up| counts().nth_back(up).unwrap_or(base));
     let voxels = counts().next_back().unwrap_or(0);
-    // Of the level and the one above, joined from the slices that threads are at.
     let slices = parents.div_ceil(header.colour_slice().into());
     let terms = [
         (SLICES, header.prefix_bytes(level)?),
         (OCTREE, counts().sum::<u64>() + above(base)),
         (TRUNK, above(base.min(MAX_TRUNK_VOXELS.into()))),
-        (COLOURS, parents + voxels),
+        (KEPT, grandparents + parents + voxels),
         (CONTEXTS, 3 + slices.min(rayon::current_num_threads() as u64)),
     ];
-    Ok(total(&terms, NOTHING))
+    // These do not coexist.
+    let coding = total(&[(CODING, voxels), (CODING_ABOVE, parents)], NOTHING);
+    let filtering = total(&[(FILTERING, voxels)], NOTHING);
+    Ok(total(&terms, NOTHING).saturating_add(coding.max(filtering).max(drawing)))
 }
 
 /// Bytes that making so many surfels of each of so many voxels takes at most, themselves included.
@@ -272,8 +292,9 @@ mod tests {
         let base = [BASE, BASE_LEARNING, NEAR, NEAR_LEARNING];
         let drawing = [GENERATOR, GAUSSIANS, EIGHT, ONE];
         let version_2 = [&[SLICES, OCTREE, ABOVE, EXACT][..], &base, &drawing].concat();
-        let version_3 = [SLICES, OCTREE, TRUNK, COLOURS, CONTEXTS, SURFEL_SUMS, SURFELS];
-        let version_3 = [&version_3[..], &learned::TERMS].concat();
+        let version_3 = [SLICES, OCTREE, TRUNK, KEPT, CONTEXTS];
+        let coding = [CODING, CODING_ABOVE, FILTERING, SURFEL_SUMS, SURFELS];
+        let version_3 = [&version_3[..], &coding, &learned::TERMS].concat();
         let tables = [table(&version_2), table(&version_3)];
         let missing = tables.iter().filter(|table| !text.contains(*table));
         let missing: Vec<_> = missing.map(String::as_str).collect();

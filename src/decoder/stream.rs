@@ -12,11 +12,10 @@ use crate::cloud::{ColouredVoxels, PointCloud};
 use crate::container::feed::Goal;
 use crate::container::{Format, Header, Stream};
 use crate::error::{Error, Result};
-use crate::gaussians::HeadSet;
-use crate::gaussians::Heads;
 use crate::gaussians::learned::{HeadsModel, LevelInput, Set};
-use crate::gaussians::surfels::{PerVoxel, surfels};
+use crate::gaussians::surfels::{Choice, PerVoxel, surfels};
 use crate::gaussians::{Frame, Gaussians};
+use crate::gaussians::{HeadMap, HeadSet, Heads};
 use crate::geometry::Voxels;
 use crate::latents::LatentDecoder;
 use crate::latents::network::Model;
@@ -60,6 +59,12 @@ impl Points<'_> {
     /// The points as a cloud with whole coordinates, whose hints say where the grid lies.
     #[cfg(feature = "ply")]
     pub fn to_cloud(&self) -> PointCloud {
+        self.to_voxels().to_cloud()
+    }
+
+    /// The points as voxels of the level's own grid.
+    #[cfg(feature = "ply")]
+    pub fn to_voxels(&self) -> ColouredVoxels {
         let Frame { bits, placement } = self.frame;
         let coarser = bits - self.voxels.depth();
         ColouredVoxels {
@@ -70,7 +75,6 @@ impl Points<'_> {
                 ..placement
             },
         }
-        .to_cloud()
     }
 }
 
@@ -218,7 +222,7 @@ impl Decoder {
             Format::Learned { .. } => self.learned(header)?.memory(header, level),
             Format::Transform { .. } => {
                 let drawing = self.drawing_bytes(header, level)?;
-                Ok(drawing + super::memory::transform(header, level)?)
+                super::memory::transform(header, level, drawing)
             }
         }
     }
@@ -286,7 +290,13 @@ impl Decoder {
 
     fn surfels_per_voxel(&self, header: &Header, level: u8) -> Result<PerVoxel> {
         let wide = level + 1 < header.bits;
-        match self.per_voxel.unwrap_or(if wide { 4 } else { 1 }) {
+        let usual = if wide { 4 } else { 1 };
+        let asked = match (self.per_voxel, self.heads().learned()) {
+            // Among learned Gaussians, eight of a voxel stand for four surfels.
+            (Some(8), Some(_)) => Some(4),
+            (asked, _) => asked,
+        };
+        match asked.unwrap_or(usual) {
             1 => Ok(PerVoxel::One),
             4 => Ok(PerVoxel::Four),
             count => Err(Error::Unsupported {
@@ -303,9 +313,11 @@ impl Decoder {
             true => header.voxels(level - 1)?.into(),
             false => voxels,
         };
+        let surfels = super::memory::surfels(voxels, self.surfels_per_voxel(header, level)?.count() as u64);
         Ok(match self.network(header, level)? {
-            Some((model, set)) => model.bytes(set, voxels, above),
-            None => super::memory::surfels(voxels, self.surfels_per_voxel(header, level)?.count() as u64),
+            // Some voxels may become surfels after all.
+            Some((model, set)) => model.bytes(set, voxels, above) + surfels,
+            None => surfels,
         })
     }
 
@@ -375,12 +387,23 @@ impl Decoder {
         };
         let (octree, level) = (&reached.octree, reached.level);
         let (map, colours) = (&reached.map, reached.colours(self.isa()));
+        let map_of_heads = reached.head_map.as_ref();
+        let [mixed, alone] = map_of_heads.map_or([1.0; 2], HeadMap::sizes);
+        let discs = |only: Option<&[bool]>| {
+            let size = if only.is_some() { mixed } else { alone };
+            let choice = Choice { only, size };
+            let per_voxel = self.surfels_per_voxel(header, level)?;
+            let voxels = octree.level(level);
+            Ok(surfels(self.isa(), voxels, map, colours, per_voxel, choice, frame))
+        };
         let network = self.network(header, level)?;
         let (Some((model, set)), Some(above)) = (network, &reached.above) else {
-            let voxels = octree.level(level);
-            let per_voxel = self.surfels_per_voxel(header, level)?;
-            return Ok(surfels(self.isa(), voxels, map, colours, per_voxel, frame));
+            return discs(None);
         };
+        if map_of_heads.is_some_and(HeadMap::is_all_surfels) {
+            return discs(None);
+        }
+        let chosen = map_of_heads.and_then(|heads| heads.surfels(octree, level));
         let input = LevelInput {
             octree,
             level,
@@ -389,8 +412,13 @@ impl Decoder {
             colours,
             colours_above: &reached.colours_above(above),
             luma_step: reached.coloured.steps().luma_step(),
+            without: chosen.as_deref(),
         };
-        model.generate(self.isa(), self.precision, set, input, frame)
+        let mut gaussians = model.generate(self.isa(), self.precision, set, input, frame)?;
+        if let Some(chosen) = &chosen {
+            gaussians.append(discs(Some(chosen))?);
+        }
+        Ok(gaussians)
     }
 }
 

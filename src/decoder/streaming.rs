@@ -16,8 +16,8 @@ use crate::latents::{LatentDecoding, nothing_reached};
 /// A stream of either version that is decoded level by level as its bytes arrive.
 ///
 /// Bytes are pushed in pieces of any size; [`Decoding::advance`] decodes a level as soon as it is whole, and
-/// [`Decoding::gaussians`] gives those of the level that was reached. After an error what was reached before stays usable, and nothing
-/// more is decoded.
+/// [`Decoding::gaussians`] gives those of the level that was reached. After an error what was reached before stays
+/// usable, and nothing more is decoded.
 #[derive(Debug)]
 pub struct Decoding<'b> {
     decoder: Decoder,
@@ -45,7 +45,8 @@ impl<'b> Decoding<'b> {
         }
     }
 
-    /// Takes the next bytes of the stream. No more are kept than the stream's header, once it is there, says are needed.
+    /// Takes the next bytes of the stream. No more are kept than the stream's header, once it is there, says are
+    /// needed.
     pub fn push(&mut self, bytes: &[u8]) {
         match &mut self.state {
             State::Start(start) => start.to_mut().extend_from_slice(bytes),
@@ -55,11 +56,13 @@ impl<'b> Decoding<'b> {
         }
     }
 
-    /// Decodes the next level, if all its bytes have come and it is not beyond the one that decoding is to end with: `None` otherwise.
+    /// Decodes the next level, if all its bytes have come and it is not beyond the one that decoding is to end with:
+    /// `None` otherwise.
     ///
     /// # Errors
     /// - [`Error::ChecksumMismatch`], [`Error::Malformed`]: the bytes are damaged, or no stream;
-    /// - [`Error::Unsupported`]: a later version or a critical feature of one, or a level to end with that has no Gaussians;
+    /// - [`Error::Unsupported`]: a later version or a critical feature of one, or a level to end with that has no
+    ///   Gaussians;
     /// - [`Error::ModelMissing`], [`Error::ModelMismatch`]: a stream of version 2 without its model;
     /// - [`Error::DeterminismMismatch`], if all checksums hold but what was decoded is not what was coded;
     /// - [`Error::LimitExceeded`], before anything is reserved; [`Error::Cancelled`];
@@ -71,8 +74,8 @@ impl<'b> Decoding<'b> {
     /// Decodes what is left, knowing that no more bytes will come.
     ///
     /// # Errors
-    /// Those of [`Decoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
-    /// the stream must be whole, or end just where one of its levels ends.
+    /// Those of [`Decoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such
+    /// level was named, the stream must be whole, or end just where one of its levels ends.
     pub fn finish(&mut self) -> Result<()> {
         while self.step(true)?.is_some() {}
         Ok(())
@@ -165,8 +168,8 @@ impl<'b> Decoding<'b> {
     /// The Gaussians of the level reached.
     ///
     /// # Errors
-    /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`]; [`Error::Cancelled`];
-    /// [`Error::Usage`] if no level has been reached.
+    /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`];
+    /// [`Error::Cancelled`]; [`Error::Usage`] if no level has been reached.
     pub fn gaussians(&self) -> Result<Gaussians> {
         let log = &self.decoder.log();
         match &self.state {
@@ -190,7 +193,8 @@ impl<'b> Decoding<'b> {
         }
     }
 
-    /// Finds out the version, if enough has come. What is no stream, or one of an unknown version, is for the header's parser to refuse.
+    /// Finds out the version, if enough has come. What is no stream, or one of an unknown version, is for the header's
+    /// parser to refuse.
     fn open(&mut self, ended: bool) -> Result<()> {
         let State::Start(bytes) = &mut self.state else {
             return Ok(());

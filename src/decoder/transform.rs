@@ -11,7 +11,7 @@ use crate::colour::{self, Filter, LevelColours};
 use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Gaussians, HeadMap};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::latents::nothing_reached;
 use crate::log::Log;
@@ -40,6 +40,8 @@ pub(super) struct Reached {
     /// Decoded, before the filter: what the next level is coded from.
     pub coloured: LevelColours,
     filter: Option<Filter>,
+    /// Where the encoder advises surfels in place of learned Gaussians.
+    pub head_map: Option<HeadMap>,
     /// Filtered, as they are drawn, once they are asked for.
     filtered: OnceLock<Vec<[u8; 3]>>,
 }
@@ -144,6 +146,9 @@ impl<'b> Transform<'b> {
                     map: old.map,
                     coloured: Some(old.coloured),
                 });
+                let blocks = HeadMap::block_count(&octree, level);
+                let head_map = colours.head_map.as_ref();
+                let head_map = head_map.and_then(|map| HeadMap::parse(map.bytes, blocks));
                 self.reached = Some(Reached {
                     level,
                     octree,
@@ -151,6 +156,7 @@ impl<'b> Transform<'b> {
                     above: above.or(old),
                     coloured,
                     filter,
+                    head_map,
                     filtered: OnceLock::new(),
                 });
                 Ok(())

@@ -4,10 +4,11 @@ use std::ops::RangeInclusive;
 
 use b2p_kernels::Isa;
 
-use super::transform::{self, Fineness};
-use super::{Encoded, Options, encode, encode_within};
+use super::transform::{self, QualityTarget};
+use super::{Encoded, Options, encode, encode_to_rate};
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
+use crate::gaussians::learned::HeadsModel;
 use crate::latents::network::Model;
 use crate::log::Log;
 
@@ -52,7 +53,7 @@ impl Encoder {
     }
 
     /// The same encoder with another quality of colours. Without effect on streams of version 2.
-    pub fn with_quality(mut self, quality: Fineness) -> Self {
+    pub fn with_quality(mut self, quality: QualityTarget) -> Self {
         self.options.fineness = quality;
         self
     }
@@ -60,6 +61,13 @@ impl Encoder {
     /// The same encoder with or without filters, which the decoder runs on the colours of each level. Default: with.
     pub fn with_filter(mut self, filter: bool) -> Self {
         self.options.filter = filter;
+        self
+    }
+
+    /// The same encoder with head maps: streams of version 3 say where surfels draw better than the best of these heads.
+    /// Decoders with learned heads follow it. The two finest levels of a cloud have none. Default: without.
+    pub fn with_heads_model(mut self, heads: HeadsModel) -> Self {
+        self.options.heads = Some(heads);
         self
     }
 
@@ -84,7 +92,8 @@ impl Encoder {
         self
     }
 
-    /// The same encoder with λ of the rate–distortion optimised quantisation of version 2 scaled by this factor. Default: 1.
+    /// The same encoder with λ of the rate–distortion optimised quantisation of version 2 scaled by this factor.
+    /// Default: 1.
     pub fn with_lambda_scale(mut self, factor: f32) -> Self {
         self.lambda_scale = Some(factor);
         self
@@ -118,8 +127,8 @@ impl Encoder {
     /// [`Encoder::encode`].
     pub fn encode_to_rate(&self, cloud: &ColouredVoxels, bits_per_point: f64) -> Result<Encoded> {
         Ok(match &self.model {
-            None => transform::encode_within(cloud, &self.options, bits_per_point, &self.log())?.0,
-            Some(model) => encode_within(cloud, model, &self.learned(), bits_per_point, &self.log())?.0,
+            None => transform::encode_to_rate(cloud, &self.options, bits_per_point, &self.log())?.0,
+            Some(model) => encode_to_rate(cloud, model, &self.learned(), bits_per_point, &self.log())?.0,
         })
     }
 

@@ -1,7 +1,8 @@
 //! What is wrong with the colours that heads generate for one cloud, fitted to pictures.
 //!
-//! Pictures are linear in the colours of Gaussians, so the weights of a [`ColourFilter`] that bring pictures of the Gaussians nearest to pictures of
-//! the same Gaussians in the cloud's colours are a linear least-squares problem, with an equation for each pixel inside the silhouette.
+//! Pictures are linear in the colours of Gaussians, so the weights of a [`ColourFilter`] that bring pictures of the
+//! Gaussians nearest to pictures of the same Gaussians in the cloud's colours are a linear least-squares problem, with
+//! an equation for each pixel inside the silhouette.
 
 use rayon::prelude::*;
 
@@ -18,11 +19,12 @@ const VIEWS: usize = 3;
 const OPAQUE: f32 = 0.9;
 /// Of the mean square of each input, added against inputs that go together.
 const DAMPING: f64 = 1e-4;
-/// The share of the latents' bytes that a decibel of what these pictures differ by is worth: from `lite-low` to `lite` it takes 9 to 17 % more.
+/// The share of the latents' bytes that a decibel of what these pictures differ by is worth: from `lite-low` to `lite`
+/// it takes 9 to 17 % more.
 const DECIBEL: f64 = 0.12;
 
-/// The filter that brings pictures of Gaussians nearest to those of the same Gaussians of the colours `wanted`, unless it is not worth its bytes
-/// beside `latents` bytes of latents. A voxel of level `level` is about a pixel wide.
+/// The filter that brings pictures of Gaussians nearest to those of the same Gaussians of the colours `wanted`, unless
+/// it is not worth its bytes beside `latents` bytes of latents. A voxel of level `level` is about a pixel wide.
 ///
 /// # Errors
 /// Those of [`Renderer::render`].
@@ -135,7 +137,8 @@ impl Sums {
     }
 }
 
-/// Whether squares of what colours are off that become less, from the first to the second, are worth so many `bytes` beside `latents` bytes of latents.
+/// Whether squares of what colours are off that become less, from the first to the second, are worth so many `bytes`
+/// beside `latents` bytes of latents.
 pub(super) fn worth([before, after]: [f64; 2], bytes: usize, latents: usize) -> bool {
     let gain = 10.0 * (before / after.max(1e-9)).log10();
     gain * DECIBEL * latents as f64 > bytes as f64

@@ -11,9 +11,10 @@ use crate::gaussians::Heads;
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::{KernelMap, Octree};
 use crate::latents::network::Model;
-use crate::latents::{ColourFilter, ColourResidual, Precision, Steps, Surroundings, activate};
+use crate::latents::{ColourFilter, ColourResidual, ResidualSteps, Steps, Surroundings, activate};
 
-/// How many times as much a decibel of what is wide is worth: pictures from afar and up close show it, where what is narrow blurs or is too fine to trouble.
+/// How many times as much a decibel of what is wide is worth: pictures from afar and up close show it, where what is
+/// narrow blurs or is too fine to trouble.
 const WIDE: usize = 6;
 
 /// The bit of Morton keys from which on voxels eight of their own apart join.
@@ -24,7 +25,8 @@ const BOUNDARY: u8 = 9;
 pub enum Residual {
     /// Nothing.
     None,
-    /// What is at least eight of its voxels wide and so shows as blotches from close up: where [`filter`](super::Options::filter) is on, and it is worth its bytes.
+    /// What is at least eight of its voxels wide and so shows as blotches from close up: where
+    /// [`filter`](super::Options::filter) is on, and it is worth its bytes.
     #[default]
     Coarse,
     /// All of it, in these steps.
@@ -35,7 +37,7 @@ impl Residual {
     /// What is wide is told in these steps, if not more finely.
     pub const COARSE: Steps = Steps { luma: 32, chroma: 24 };
 
-    pub(super) fn precision(self, filter: bool) -> Option<Precision> {
+    pub(super) fn precision(self, filter: bool) -> Option<ResidualSteps> {
         let finer = |own: u8, coarse: u8| if own == 0 { coarse } else { own.min(coarse) };
         let (fine, coarse) = match self {
             Residual::Fine(fine) => {
@@ -46,7 +48,7 @@ impl Residual {
             Residual::Coarse if filter => (Steps::NONE, Self::COARSE),
             Residual::Coarse | Residual::None => return None,
         };
-        Some(Precision {
+        Some(ResidualSteps {
             fine,
             coarse,
             boundary: BOUNDARY,
@@ -163,8 +165,9 @@ pub(crate) struct Left {
 }
 
 impl Left {
-    /// The payloads of a residual as finely told as this, for the voxels `keys` in slices; `None` if it has nothing fine and is not worth its bytes.
-    pub fn payloads(&self, keys: &[u64], slice: usize, precision: Precision) -> Option<Vec<Vec<u8>>> {
+    /// The payloads of a residual as finely told as this, for the voxels `keys` in slices; `None` if it has nothing
+    /// fine and is not worth its bytes.
+    pub fn payloads(&self, keys: &[u64], slice: usize, precision: ResidualSteps) -> Option<Vec<Vec<u8>>> {
         let before = missing(&self.gaussians, &self.wanted, self.children);
         let residual = ColourResidual::of(&before, keys, slice, precision);
         let payloads = residual.to_payloads(keys);

@@ -5,9 +5,9 @@
 mod builder;
 mod colours;
 mod corrections;
+mod rate_control;
 mod skeleton;
 pub mod transform;
-mod within;
 
 use std::ops::RangeInclusive;
 
@@ -26,23 +26,24 @@ use crate::log::Log;
 pub use builder::Encoder;
 pub use corrections::Residual;
 use corrections::{Left, Level, corrections};
+pub use rate_control::encode_to_rate;
 use skeleton::{Coded, Correct, Skeleton};
-pub use within::encode_within;
 
-/// What may be chosen about a stream; [`encode_within`] chooses what decides its size.
+/// What may be chosen about a stream; [`encode_to_rate`] chooses what decides its size.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The levels whose features are coded: at most three, the last below the bit depth N. Default: N−3 to N−1.
     pub levels: Option<RangeInclusive<u8>>,
-    /// How dear a bit is when latents are rounded, times what the model says ([`Model::bit_prices`]): 0 rounds to the nearest, more saves bits.
-    /// Default: 1.
+    /// How dear a bit is when latents are rounded, times what the model says ([`Model::bit_prices`]): 0 rounds to the
+    /// nearest, more saves bits. Default: 1.
     pub bit_price: f32,
-    /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its bytes: see
-    /// [`ColourFilter`](crate::latents::ColourFilter).
+    /// Whether colours that the heads generate are compared with the cloud's, and corrected where that is worth its
+    /// bytes: see [`ColourFilter`](crate::latents::ColourFilter).
     pub filter: bool,
     /// How much is coded of what colours are then still off those of the cloud. Default: [`Residual::Coarse`].
     pub residual: Residual,
-    /// Whether every level that is drawn has such a residual, one of its own, and not the finest alone: the stream of the finest is larger for it, and no better.
+    /// Whether every level that is drawn has such a residual, one of its own, and not the finest alone: the stream of
+    /// the finest is larger for it, and no better.
     pub every_level: bool,
     /// Voxels per slice, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
@@ -88,9 +89,9 @@ pub struct Rate {
 /// Codes a cloud, then decodes the stream and compares before giving it out.
 ///
 /// # Errors
-/// [`Error::Usage`] for levels that the cloud or the format does not have, [`Error::Malformed`] for slices that the format does not
-/// have, [`Error::Unsupported`] if the model can only decode; and,
-/// if encoder and decoder disagreed on this machine, whatever the decoder found.
+/// [`Error::Usage`] for levels that the cloud or the format does not have, [`Error::Malformed`] for slices that the
+/// format does not have, [`Error::Unsupported`] if the model can only decode; and, if encoder and decoder disagreed on
+/// this machine, whatever the decoder found.
 pub fn encode(cloud: &ColouredVoxels, model: &Model, options: &Options, log: &Log) -> Result<Encoded> {
     let subject = Subject::new(cloud, model, options, log)?;
     let wants = options.residual.precision(options.filter).is_some();
@@ -262,7 +263,8 @@ fn pooled(cloud: &ColouredVoxels, level: u8) -> (Voxels, Vec<[f32; 3]>) {
     (Voxels::from_sorted(level, keys), colours)
 }
 
-/// A stream of version 2 of this octree whose latents are all zero: what geometry and entropy coding cost, for calibrations.
+/// A stream of version 2 of this octree whose latents are all zero: what geometry and entropy coding cost, for
+/// calibrations.
 ///
 /// # Errors
 /// Those of [`encode`].

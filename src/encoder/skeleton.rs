@@ -47,7 +47,8 @@ struct CodedLevel {
 }
 
 impl<'m> Skeleton<'m> {
-    /// Codes the geometry of the `header`'s levels of an octree; voxels and sections are filled in. `maps` are the levels' 3³ kernel maps.
+    /// Codes the geometry of the `header`'s levels of an octree; voxels and sections are filled in. `maps` are the
+    /// levels' 3³ kernel maps.
     ///
     /// # Errors
     /// Those of [`Writer::new`].

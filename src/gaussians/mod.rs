@@ -1,11 +1,13 @@
 //! 3D Gaussians in memory.
 
 mod harmonics;
+mod head_map;
 mod heads;
 pub mod learned;
 pub mod surfels;
 
 pub use harmonics::Harmonics;
+pub use head_map::HeadMap;
 pub use heads::{HeadSet, Heads};
 
 #[cfg(feature = "ply")]
@@ -147,6 +149,15 @@ impl Gaussians {
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.position.is_empty()
+    }
+
+    /// Appends other Gaussians of the same frame, without harmonics.
+    pub(crate) fn append(&mut self, mut other: Gaussians) {
+        self.position.append(&mut other.position);
+        self.scale.append(&mut other.scale);
+        self.rotation.append(&mut other.rotation);
+        self.opacity.append(&mut other.opacity);
+        self.colour.append(&mut other.colour);
     }
 
     /// Checks that all arrays have the same length.

@@ -11,6 +11,7 @@ pub fn encode([x, y, z]: [u32; 3]) -> u64 {
 }
 
 /// De-interleaves the coordinates of a key.
+#[inline]
 pub fn decode(key: u64) -> [u32; 3] {
     [compact(key), compact(key >> 1), compact(key >> 2)]
 }
@@ -26,6 +27,7 @@ fn spread(v: u32) -> u64 {
 }
 
 /// Moves bit `3i` to bit `i`.
+#[inline]
 fn compact(v: u64) -> u32 {
     let mut v = v & 0x1249_2492_4924_9249;
     v = (v | v >> 2) & 0x10c3_0c30_c30c_30c3;

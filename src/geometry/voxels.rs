@@ -62,6 +62,7 @@ impl Voxels {
     }
 
     /// Coordinates of voxel `i`.
+    #[inline]
     pub fn coordinate(&self, i: usize) -> [u32; 3] {
         morton::decode(self.keys[i])
     }

@@ -1,10 +1,10 @@
 //! From the network's raw numbers to Gaussians.
 //!
-//! Activations after the paper's semantics (offset, scale, rotation, opacity, colour; its §"3D Gaussian generation"), which leaves
-//! their functions open. With `u` the edge of a generated voxel in the cube frame:
-//! position = voxel centre + tanh(raw)·range·u, σ = softplus(raw + bias)·range·u, rotation = normalise(raw + (1, 0, 0, 0)),
-//! opacity = sigmoid(raw + bias) where it is learned, else 1, colour = clamp(½ + raw, 0, 1). Equal raw numbers give equal bits on every
-//! machine.
+//! Activations after the paper's semantics (offset, scale, rotation, opacity, colour; its §"3D Gaussian generation"),
+//! which leaves their functions open. With `u` the edge of a generated voxel in the cube frame: position = voxel centre
+//! + tanh(raw)·range·u, σ = softplus(raw + bias)·range·u, rotation = normalise(raw + (1, 0, 0, 0)), opacity =
+//! sigmoid(raw + bias) where it is learned, else 1, colour = clamp(½ + raw, 0, 1). Equal raw numbers give equal bits on
+//! every machine.
 
 use b2p_kernels::zeros;
 use rayon::prelude::*;
@@ -19,8 +19,8 @@ const BLOCK: usize = 4096;
 
 /// Activates raw numbers, [`RAW`] per Gaussian.
 ///
-/// With `children` 8, voxel `p` generates Gaussians `8p + octant`, one for each child whether occupied or not, with learned opacity;
-/// with 1, voxel `p` generates Gaussian `p`, opaque.
+/// With `children` 8, voxel `p` generates Gaussians `8p + octant`, one for each child whether occupied or not, with
+/// learned opacity; with 1, voxel `p` generates Gaussian `p`, opaque.
 ///
 /// # Panics
 /// If `raw` is not [`RAW`] numbers for each Gaussian of `voxels`.
@@ -103,7 +103,8 @@ impl Group {
     }
 }
 
-/// The centre of the voxel that Gaussian `i` belongs to. Exact in f32 down to level 20, and within half a voxel at 21 and 22.
+/// The centre of the voxel that Gaussian `i` belongs to. Exact in f32 down to level 20, and within half a voxel at 21
+/// and 22.
 fn centre(voxels: &Voxels, children: usize, i: usize, edge: f32) -> [f32; 3] {
     let parent = voxels.coordinate(i / children);
     let coordinate = match children {

@@ -1,14 +1,16 @@
 //! The colour filter: how a stream corrects the colours that its heads generate.
 //!
-//! Heads have learned from other clouds. What they get wrong about one cloud as a whole, the encoder sees, and says in 58 bytes a level: a colour
-//! becomes itself plus a quadratic function of itself and of how it differs from its surroundings, clamped to `[0, 1]`. That is beyond the
-//! paper; video codecs filter their pictures likewise (the adaptive loop filter of H.266, the restoration of AV1).
+//! Heads have learned from other clouds. What they get wrong about one cloud as a whole, the encoder sees, and says in
+//! 58 bytes a level: a colour becomes itself plus a quadratic function of itself and of how it differs from its
+//! surroundings, clamped to `[0, 1]`. That is beyond the paper; video codecs filter their pictures likewise (the
+//! adaptive loop filter of H.266, the restoration of AV1).
 //!
 //! # Surroundings
-//! The Gaussians of a *group* are the eight of a voxel, or, where a voxel has one, those of the voxels with the same parent. Colours are
-//! taken relative to ½. Of each group the first mean is that of its Gaussians, weighted by their opacities; the second, of the first means of
-//! the group and those of its neighbours under the 3³ kernel, weighted by their sums of opacities and 4, 2, 1 or ½, as they differ along none to
-//! three axes; the third, of the second means likewise. Sums run in the order of Gaussians and of kernel offsets; a mean of no weight is 0.
+//! The Gaussians of a *group* are the eight of a voxel, or, where a voxel has one, those of the voxels with the same
+//! parent. Colours are taken relative to ½. Of each group the first mean is that of its Gaussians, weighted by their
+//! opacities; the second, of the first means of the group and those of its neighbours under the 3³ kernel, weighted by
+//! their sums of opacities and 4, 2, 1 or ½, as they differ along none to three axes; the third, of the second means
+//! likewise. Sums run in the order of Gaussians and of kernel offsets; a mean of no weight is 0.
 //!
 //! # Payload
 //! | offset | type | field |
@@ -16,9 +18,9 @@
 //! | 0 | u8 | exponent e, at most 15 |
 //! | 1 + 19·c | i8 × 19 | weights of channel c (red, green, blue), for the inputs below |
 //!
-//! The inputs: 1; r, g, b; r², g², b², rg, rb, gb; r, g, b of the first mean less the colour; of the second less the first; of the third less
-//! the second. The first weight counts steps of 2⁻¹⁰, the others of 2⁻ᵉ. The products are added in this order, in f32, and the sum to the
-//! colour: equal streams give equal bits on every machine.
+//! The inputs: 1; r, g, b; r², g², b², rg, rb, gb; r, g, b of the first mean less the colour; of the second less the
+//! first; of the third less the second. The first weight counts steps of 2⁻¹⁰, the others of 2⁻ᵉ. The products are
+//! added in this order, in f32, and the sum to the colour: equal streams give equal bits on every machine.
 
 use rayon::prelude::*;
 
@@ -127,7 +129,8 @@ impl ColourFilter {
 }
 
 impl Surroundings {
-    /// Those of the Gaussians that the voxels of `level` generate, eight each or one. `map` is the level's 3³ kernel map, `above` that of the level above.
+    /// Those of the Gaussians that the voxels of `level` generate, eight each or one. `map` is the level's 3³ kernel
+    /// map, `above` that of the level above.
     ///
     /// # Panics
     /// If they are of other levels, or voxels have one Gaussian each and there is no level above.
@@ -320,7 +323,8 @@ mod tests {
     fn neighbours_count_by_their_opacities_and_how_near_they_are() {
         let octree = Octree::new(Voxels::new(2, vec![0, 1, 3, 7])).unwrap();
         let mut some = gaussians(&[[0.5; 3]; 32], 0.0);
-        // Of the four voxels in a corner, the second is bright and half as opaque as the first; the others have nothing.
+        // Of the four voxels in a corner, the second is bright and half as opaque as the first; the others have
+        // nothing.
         some.opacity[0] = 1.0;
         some.opacity[8] = 0.5;
         some.colour[8] = [1.0; 3];

@@ -66,7 +66,8 @@ impl LatentDecoder {
         self
     }
 
-    /// The levels of a stream that can be decoded to Gaussians: those in its header for whose role the model has a head.
+    /// The levels of a stream that can be decoded to Gaussians: those in its header for whose role the model has a
+    /// head.
     ///
     /// # Errors
     /// Those of [`Header::parse`].
@@ -75,16 +76,17 @@ impl LatentDecoder {
         Ok(self.drawable(&header).collect())
     }
 
-    /// Begins to decode a stream whose bytes are still to come, down to `level`: by default the finest that the stream has and the
-    /// model has a head for.
+    /// Begins to decode a stream whose bytes are still to come, down to `level`: by default the finest that the stream
+    /// has and the model has a head for.
     pub fn start(&self, level: Option<u8>) -> LatentDecoding<'static> {
         LatentDecoding::new(self.clone(), Goal::Gaussians(level), Cow::Owned(Vec::new()))
     }
 
-    /// Decodes a stream to the Gaussians of `level`: by default the finest that the stream has and the model has a head for.
+    /// Decodes a stream to the Gaussians of `level`: by default the finest that the stream has and the model has a head
+    /// for.
     ///
-    /// A stream cut exactly after a level is a coarser stream. From one that is cut or damaged elsewhere, a level before the damage
-    /// is decoded only when asked for.
+    /// A stream cut exactly after a level is a coarser stream. From one that is cut or damaged elsewhere, a level
+    /// before the damage is decoded only when asked for.
     ///
     /// # Errors
     /// Those of [`LatentDecoding::finish`] and [`LatentDecoding::gaussians`].

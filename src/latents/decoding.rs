@@ -18,8 +18,9 @@ use crate::log::Log;
 
 /// A stream that is decoded level by level as its bytes arrive.
 ///
-/// Bytes are pushed in pieces of any size; [`LatentDecoding::advance`] decodes a level as soon as it is whole, and [`LatentDecoding::gaussians`]
-/// gives those of the level that was reached. After an error what was reached before stays usable, and nothing more is decoded.
+/// Bytes are pushed in pieces of any size; [`LatentDecoding::advance`] decodes a level as soon as it is whole, and
+/// [`LatentDecoding::gaussians`] gives those of the level that was reached. After an error what was reached before
+/// stays usable, and nothing more is decoded.
 ///
 /// ```
 /// # #[cfg(feature = "embedded")]
@@ -75,17 +76,21 @@ impl<'b> LatentDecoding<'b> {
         }
     }
 
-    /// Takes the next bytes of the stream. No more are kept than the stream's header, once it is there, says are needed.
+    /// Takes the next bytes of the stream. No more are kept than the stream's header, once it is there, says are
+    /// needed.
     pub fn push(&mut self, bytes: &[u8]) {
         self.feed.push(bytes);
     }
 
-    /// Decodes the next level, if all its bytes have come and it is not beyond the one that decoding is to end with: `None` otherwise.
+    /// Decodes the next level, if all its bytes have come and it is not beyond the one that decoding is to end with:
+    /// `None` otherwise.
     ///
     /// # Errors
     /// - [`Error::ChecksumMismatch`], [`Error::Malformed`]: the bytes are damaged, or no stream;
-    /// - [`Error::Unsupported`]: a later version or a critical feature of one, or a level to end with that has no Gaussians;
-    /// - [`Error::ModelMismatch`]; [`Error::DeterminismMismatch`], if all checksums hold but the latents are not those that were coded;
+    /// - [`Error::Unsupported`]: a later version or a critical feature of one, or a level to end with that has no
+    ///   Gaussians;
+    /// - [`Error::ModelMismatch`]; [`Error::DeterminismMismatch`], if all checksums hold but the latents are not those
+    ///   that were coded;
     /// - [`Error::LimitExceeded`], before anything is reserved; [`Error::Cancelled`];
     /// - [`Error::Usage`] if the stream has no level to end with, or decoding has failed before.
     pub fn advance(&mut self, log: &Log) -> Result<Option<u8>> {
@@ -95,8 +100,8 @@ impl<'b> LatentDecoding<'b> {
     /// Decodes what is left, knowing that no more bytes will come.
     ///
     /// # Errors
-    /// Those of [`LatentDecoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no such level was named,
-    /// the stream must be whole, or end just where one of its levels ends.
+    /// Those of [`LatentDecoding::advance`], and [`Error::Truncated`] if the level to end with is not whole. Where no
+    /// such level was named, the stream must be whole, or end just where one of its levels ends.
     pub fn finish(&mut self, log: &Log) -> Result<()> {
         while self.step(true, log)?.is_some() {}
         Ok(())
@@ -121,7 +126,8 @@ impl<'b> LatentDecoding<'b> {
         Ok(())
     }
 
-    /// Whether the level reached has Gaussians: [`LatentDecoding::gaussians`] will not fail with [`Error::Unsupported`].
+    /// Whether the level reached has Gaussians: [`LatentDecoding::gaussians`] will not fail with
+    /// [`Error::Unsupported`].
     pub fn is_drawable(&self) -> bool {
         let level = self.level();
         self.header()
@@ -140,8 +146,8 @@ impl<'b> LatentDecoding<'b> {
     /// The Gaussians of the level reached.
     ///
     /// # Errors
-    /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`]; [`Error::Cancelled`];
-    /// [`Error::Usage`] if no level has been reached.
+    /// [`Error::Unsupported`] if it has none, naming the levels that have; [`Error::LimitExceeded`];
+    /// [`Error::Cancelled`]; [`Error::Usage`] if no level has been reached.
     pub fn gaussians(&self, log: &Log) -> Result<Gaussians> {
         let (Some(header), Some(reached)) = (self.header(), &self.reached) else {
             return Err(nothing_reached());

@@ -1,16 +1,19 @@
 //! The colour residual: what a stream's colours are still off, voxel by voxel.
 //!
-//! Latents say what the networks have learned to make colours of; past some rate more of them hardly help. What is left of a level's colours, the
-//! cloud's less the generated ones, a stream may code as it is, as finely as wanted: transformed over the octree, rounded, and coded by
-//! [`crate::latents::entropy::decode_coefficients`]. That is beyond the paper; the transform is that of G-PCC's attributes (de Queiroz and Chou,
-//! [doi 10.1109/TIP.2016.2575005](https://doi.org/10.1109/TIP.2016.2575005)).
+//! Latents say what the networks have learned to make colours of; past some rate more of them hardly help. What is left
+//! of a level's colours, the cloud's less the generated ones, a stream may code as it is, as finely as wanted:
+//! transformed over the octree, rounded, and coded by [`crate::latents::entropy::decode_coefficients`]. That is beyond
+//! the paper; the transform is that of G-PCC's attributes (de Queiroz and Chou, [doi
+//! 10.1109/TIP.2016.2575005](https://doi.org/10.1109/TIP.2016.2575005)).
 //!
 //! # Transform
-//! Of the voxels of a slice, in Morton order, each but the first *joins at* the highest bit in which its key differs from that of the voxel before.
-//! Bits are taken from the lowest up, and of one bit the voxels that join there in turn: where voxel j joins at bit b, its *left* is the last
-//! voxel before it that joins above b (or the first), `v` is how many voxels there are from the left to j, and `w` how many from j to the next that joins at b or above. With
-//! a = √(v / (v + w)) and c = √(w / (v + w)) the values x of the left and y of j become a·x + c·y and a·y − c·x. Undone, from the highest bit
-//! down: x = a·l − c·h, y = c·l + a·h. In the end the first voxel has the mean times the root of their number, and the others what they differ by.
+//! Of the voxels of a slice, in Morton order, each but the first *joins at* the highest bit in which its key differs
+//! from that of the voxel before. Bits are taken from the lowest up, and of one bit the voxels that join there in turn:
+//! where voxel j joins at bit b, its *left* is the last voxel before it that joins above b (or the first), `v` is how
+//! many voxels there are from the left to j, and `w` how many from j to the next that joins at b or above. With a = √(v
+//! / (v + w)) and c = √(w / (v + w)) the values x of the left and y of j become a·x + c·y and a·y − c·x. Undone, from
+//! the highest bit down: x = a·l − c·h, y = c·l + a·h. In the end the first voxel has the mean times the root of their
+//! number, and the others what they differ by.
 //!
 //! # Payload
 //! One chunk for each slice of the level's voxels, independent of the others:
@@ -24,12 +27,14 @@
 //! | 4 | u8 | boundary, 0 to 63 |
 //! | 5 | | coefficients, a triple for each voxel: first the first voxel's, then those of voxels that join at higher bits before those at lower ones, of one bit in order |
 //!
-//! *Coarse* are the triples of the first voxel and of those that join at the boundary or above, the others are fine: so the coarse ones come first. A step of 0
-//! says that the coefficients it is for are not told, and 0; not all four may be 0. Coefficients are coded in two parts, coarse and fine; of each
-//! those channels are present whose step is not 0. A boundary of 3·n parts what is wider than 2ⁿ voxels from what is not.
+//! *Coarse* are the triples of the first voxel and of those that join at the boundary or above, the others are fine: so
+//! the coarse ones come first. A step of 0 says that the coefficients it is for are not told, and 0; not all four may
+//! be 0. Coefficients are coded in two parts, coarse and fine; of each those channels are present whose step is not 0.
+//! A boundary of 3·n parts what is wider than 2ⁿ voxels from what is not.
 //!
-//! A coefficient q of step s stands for q·(s/255). The three are those of a luma and two chromas, whose vectors are [`BASIS`]; a voxel's sum of the three, in turn, is added to the colour of
-//! each of its Gaussians, which then is clamped to `[0, 1]`. All in f32: equal streams give equal bits on every machine.
+//! A coefficient q of step s stands for q·(s/255). The three are those of a luma and two chromas, whose vectors are
+//! [`BASIS`]; a voxel's sum of the three, in turn, is added to the colour of each of its Gaussians, which then is
+//! clamped to `[0, 1]`. All in f32: equal streams give equal bits on every machine.
 
 use std::num::NonZeroU8;
 use std::ops::Range;
@@ -41,7 +46,7 @@ use crate::error::{Error, Result, Stage};
 use crate::gaussians::Gaussians;
 #[cfg(feature = "encoder")]
 use crate::latents::entropy::encode_coefficients;
-use crate::latents::entropy::{Part, decode_coefficients};
+use crate::latents::entropy::{SlicePart, decode_coefficients};
 
 /// The unit vectors of luma and two chromas, in red, green and blue.
 #[allow(clippy::excessive_precision)] // the nearest f32, as the format has it
@@ -67,8 +72,8 @@ pub struct Steps {
 }
 
 impl From<NonZeroU8> for Steps {
-    /// Those that go well with a step of luma: chromas three eighths as coarse. That is as good at equal rates as equal steps, pictures' PSNR being
-    /// what counts, and leaves fewer blotches.
+    /// Those that go well with a step of luma: chromas three eighths as coarse. That is as good at equal rates as equal
+    /// steps, pictures' PSNR being what counts, and leaves fewer blotches.
     fn from(luma: NonZeroU8) -> Steps {
         let luma = luma.get();
         let chroma = (u16::from(luma) * 3 / 8).max(1) as u8;
@@ -94,25 +99,25 @@ impl Steps {
 
 /// How finely a residual is told, by how wide what it tells is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Precision {
-    /// Where voxels join below [`Precision::boundary`].
+pub struct ResidualSteps {
+    /// Where voxels join below [`ResidualSteps::boundary`].
     pub fine: Steps,
     /// Where they join there or above, and for the first voxel.
     pub coarse: Steps,
-    /// A bit of Morton keys, at most [`Precision::MAX_BOUNDARY`]: 3·n for what is wider than 2ⁿ voxels.
+    /// A bit of Morton keys, at most [`ResidualSteps::MAX_BOUNDARY`]: 3·n for what is wider than 2ⁿ voxels.
     pub boundary: u8,
 }
 
-impl Precision {
+impl ResidualSteps {
     /// The highest bit.
     pub const MAX_BOUNDARY: u8 = 63;
 
     /// That of the payload of a residual's chunk; `None` if it is none that can be.
-    pub fn read(payload: &[u8]) -> Option<Precision> {
+    pub fn read(payload: &[u8]) -> Option<ResidualSteps> {
         let fixed = *payload.first_chunk::<FIXED>()?;
         let [luma, chroma, coarse_luma, coarse_chroma, boundary] = fixed;
         let told = [luma, chroma, coarse_luma, coarse_chroma] != [0; 4];
-        (told && boundary <= Precision::MAX_BOUNDARY).then_some(Precision {
+        (told && boundary <= ResidualSteps::MAX_BOUNDARY).then_some(ResidualSteps {
             fine: Steps { luma, chroma },
             coarse: Steps {
                 luma: coarse_luma,
@@ -124,7 +129,7 @@ impl Precision {
 
     #[cfg(feature = "encoder")]
     fn to_bytes(self) -> [u8; FIXED] {
-        let Precision { fine, coarse, boundary } = self;
+        let ResidualSteps { fine, coarse, boundary } = self;
         [fine.luma, fine.chroma, coarse.luma, coarse.chroma, boundary]
     }
 
@@ -136,8 +141,8 @@ impl Precision {
     }
 
     /// The parts that coarse and fine triples are coded in.
-    fn parts<T>(self, (coarse, fine): (T, T)) -> [Part<T>; 2] {
-        [(self.coarse, coarse), (self.fine, fine)].map(|(steps, triples)| Part {
+    fn parts<T>(self, (coarse, fine): (T, T)) -> [SlicePart<T>; 2] {
+        [(self.coarse, coarse), (self.fine, fine)].map(|(steps, triples)| SlicePart {
             present: steps.channels(),
             triples,
         })
@@ -150,7 +155,7 @@ pub struct ColourResidual {
     /// Voxels of a slice.
     slice: usize,
     /// One for each slice.
-    precisions: Vec<Precision>,
+    precisions: Vec<ResidualSteps>,
     /// Three for each voxel, in the order in which they are coded.
     coefficients: Vec<[i16; 3]>,
 }
@@ -165,7 +170,8 @@ struct Join {
 }
 
 impl ColourResidual {
-    /// Reads the payloads of the residual chunks of `level`, one for every `slice` of its voxels, whose Morton keys are `keys`; `None` if there are none.
+    /// Reads the payloads of the residual chunks of `level`, one for every `slice` of its voxels, whose Morton keys are
+    /// `keys`; `None` if there are none.
     ///
     /// # Errors
     /// [`Error::Malformed`] if one tells nothing, or of a boundary beyond keys, or its coefficients do not decode.
@@ -180,7 +186,7 @@ impl ColourResidual {
         let mut coefficients = vec![[0; 3]; keys.len()];
         let parse = |((payload, keys), triples): ((&Slice, &[u64]), &mut [[i16; 3]])| {
             let at = format!("byte {}, residual of level {level}", payload.offset);
-            let Some(precision) = Precision::read(payload.bytes) else {
+            let Some(precision) = ResidualSteps::read(payload.bytes) else {
                 let field = "steps of the colour residual";
                 let expected = "four steps, not all 0, and a bit up to 63";
                 let found = format!("{:?}", &payload.bytes[..payload.bytes.len().min(FIXED)]);
@@ -193,7 +199,7 @@ impl ColourResidual {
         let parts = payloads.par_iter().zip(keys.par_chunks(slice));
         let parts = parts.zip(coefficients.par_chunks_mut(slice));
         // All of them, so that the first fault is always the same.
-        let precisions: Vec<Result<Precision>> = parts.map(parse).collect();
+        let precisions: Vec<Result<ResidualSteps>> = parts.map(parse).collect();
         Ok(Some(ColourResidual {
             slice,
             precisions: precisions.into_iter().collect::<Result<_>>()?,
@@ -201,15 +207,17 @@ impl ColourResidual {
         }))
     }
 
-    /// The residual, as finely told as this, that brings colours nearer to what they are `missing`, voxel by voxel; `keys` are the voxels' Morton keys.
+    /// The residual, as finely told as this, that brings colours nearer to what they are `missing`, voxel by voxel;
+    /// `keys` are the voxels' Morton keys.
     ///
     /// # Panics
-    /// If there are more or fewer of the one than of the other, a slice has none, or the precision is none that can be written.
+    /// If there are more or fewer of the one than of the other, a slice has none, or the precision is none that can be
+    /// written.
     #[cfg(feature = "encoder")]
-    pub fn of(missing: &[[f32; 3]], keys: &[u64], slice: usize, precision: Precision) -> Self {
+    pub fn of(missing: &[[f32; 3]], keys: &[u64], slice: usize, precision: ResidualSteps) -> Self {
         assert_eq!(missing.len(), keys.len(), "a difference for every voxel");
         assert!(slice > 0, "slices of something");
-        let written = Precision::read(&precision.to_bytes());
+        let written = ResidualSteps::read(&precision.to_bytes());
         assert!(written.is_some(), "steps and a boundary: {precision:?}");
         let part = |(missing, keys): (&[[f32; 3]], &[u64])| {
             let mut values: Vec<_> = missing
@@ -254,7 +262,7 @@ impl ColourResidual {
     pub fn to_payloads(&self, keys: &[u64]) -> Vec<Vec<u8>> {
         let slices = self.coefficients.par_chunks(self.slice);
         let slices = slices.zip(&self.precisions).zip(keys.par_chunks(self.slice));
-        let payload = |((triples, precision), keys): ((&[[i16; 3]], &Precision), &[u64])| {
+        let payload = |((triples, precision), keys): ((&[[i16; 3]], &ResidualSteps), &[u64])| {
             let parts = precision.parts(triples.split_at(precision.coarse_of(keys)));
             let mut bytes = precision.to_bytes().to_vec();
             bytes.extend(encode_coefficients(&parts));
@@ -296,7 +304,7 @@ impl ColourResidual {
 }
 
 /// The luma and chromas of a slice's voxels.
-fn differences(coefficients: &[[i16; 3]], keys: &[u64], precision: Precision) -> Vec<[f32; 3]> {
+fn differences(coefficients: &[[i16; 3]], keys: &[u64], precision: ResidualSteps) -> Vec<[f32; 3]> {
     let mut values = vec![[0.0; 3]; keys.len()];
     let coarse = precision.coarse_of(keys);
     let [coarse_units, fine_units] = [precision.coarse, precision.fine].map(Steps::units);
@@ -335,7 +343,8 @@ fn joins(keys: &[u64]) -> Vec<Join> {
         weights: [0.0; 2],
     };
     let mut joins = vec![none; keys.len().saturating_sub(1)];
-    // Voxels that the next may still join, with the bit at which they join themselves, higher ones first; and where their own join stands.
+    // Voxels that the next may still join, with the bit at which they join themselves, higher ones first; and where
+    // their own join stands.
     let mut open: Vec<(usize, usize, usize)> = vec![(0, usize::MAX, usize::MAX)];
     for voxel in 1..=keys.len() {
         let own = if voxel < keys.len() { bit(voxel) } else { usize::MAX - 1 };

@@ -1,5 +1,6 @@
-//! The functions between raw numbers and Gaussians, in IEEE f32 additions, multiplications and divisions alone: the same bits on
-//! every machine, which no mathematical library promises. No branch, so that loops over them become vector instructions.
+//! The functions between raw numbers and Gaussians, in IEEE f32 additions, multiplications and divisions alone: the
+//! same bits on every machine, which no mathematical library promises. No branch, so that loops over them become vector
+//! instructions.
 
 /// Adding this to a small float leaves its nearest integer in the low bits: `1.5·2²³`.
 const ROUND: f32 = 12_582_912.0;

@@ -1,5 +1,5 @@
-//! What networks of both versions are made of: sparse convolutions over a level, the memory that they run in, and the files that hold their
-//! weights.
+//! What networks of both versions are made of: sparse convolutions over a level, the memory that they run in, and the
+//! files that hold their weights.
 
 pub(crate) mod activations;
 mod precision;

@@ -8,13 +8,14 @@ use crate::error::{Error, Result};
 /// What Gaussians are generated in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Precision {
-    /// Activations in ±2047 with a scale per layer, weights in ±2047 with a scale per channel, sums in 32 bits: the same bits on every
-    /// machine and with any instruction set.
+    /// Activations in ±2047 with a scale per layer, weights in ±2047 with a scale per channel, sums in 32 bits: the
+    /// same bits on every machine and with any instruction set.
     #[default]
     Int16,
     /// f16 in memory, sums in f32.
     F16,
-    /// The same, but products are summed in f16 before they are in f32 (`b2p_kernels::Precision::Half`). Only where [`crate::Isa::has_half`].
+    /// The same, but products are summed in f16 before they are in f32 (`b2p_kernels::Precision::Half`). Only where
+    /// [`crate::Isa::has_half`].
     Half,
 }
 

@@ -73,8 +73,8 @@ impl Conv for FloatConv {
     }
 }
 
-/// Memory of results that have been read, for the next ones: what is fresh from the system costs a fault every page when it is first
-/// written.
+/// Memory of results that have been read, for the next ones: what is fresh from the system costs a fault every page
+/// when it is first written.
 #[derive(Debug)]
 pub(crate) struct Pool<T>(Vec<Vec<T>>);
 
@@ -159,7 +159,8 @@ pub(crate) fn apply_added<C: Conv>(
     out
 }
 
-/// Output rows of a layer that ends in f32, from row `first` on, as many as there is room for. `first` is a multiple of 512.
+/// Output rows of a layer that ends in f32, from row `first` on, as many as there is room for. `first` is a multiple of
+/// 512.
 pub(crate) fn apply_part<C: Conv>(
     isa: Isa,
     conv: &C,
@@ -247,8 +248,8 @@ impl<C: Conv> ResBlock<C> {
         self.apply_to_some(pool, isa, map, x, [rows, rows])
     }
 
-    /// As `apply`, but the inner layer computes its first `rows[0]` rows only, the others being zero, and the outer one as many as are asked
-    /// for, the first `rows[1]`.
+    /// As `apply`, but the inner layer computes its first `rows[0]` rows only, the others being zero, and the outer one
+    /// as many as are asked for, the first `rows[1]`.
     pub fn apply_to_some(
         &self,
         pool: &mut Pool<C::Value>,

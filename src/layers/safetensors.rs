@@ -1,5 +1,5 @@
-//! The safetensors container: the length of a table of contents in eight bytes, the table in JSON, then the tensors end to end. See
-//! <https://github.com/huggingface/safetensors>.
+//! The safetensors container: the length of a table of contents in eight bytes, the table in JSON, then the tensors end
+//! to end. See <https://github.com/huggingface/safetensors>.
 
 use std::collections::BTreeMap;
 use std::ops::Range;

@@ -30,7 +30,8 @@ pub(crate) struct Stored {
 const WEIGHT: u64 = 2047;
 /// Sums of squared weights stay below this, and those of products.
 const SUM_LIMIT: u64 = 1 << 31;
-/// Sums of products of 3³ kernels stay below this, with which all children of a voxel are computed at once ([`ExactConv`]).
+/// Sums of products of 3³ kernels stay below this, with which all children of a voxel are computed at once
+/// ([`ExactConv`]).
 const SMALL_SUM_LIMIT: u64 = 1 << 28;
 
 impl Stored {
@@ -44,8 +45,8 @@ impl Stored {
         FloatConv::new(volume, cin, cout, &self.weights, self.bias.clone(), scale)
     }
 
-    /// The layer in integers: its input is in steps of `from`, its output in steps of `to`. A channel's largest weight becomes 2047,
-    /// or seven eighths of that and so on until no sum can be too large.
+    /// The layer in integers: its input is in steps of `from`, its output in steps of `to`. A channel's largest weight
+    /// becomes 2047, or seven eighths of that and so on until no sum can be too large.
     pub fn integer(&self, from: f32, to: f32) -> ExactConv {
         let Spec { volume, cin, cout, .. } = self.spec;
         let real: Vec<f64> = self.weights.iter().map(|w| w.to_f64()).collect();
@@ -111,8 +112,8 @@ impl Stored {
     }
 }
 
-/// To the nearest integer, halves to even, of numbers below 2⁵¹; `f64::round_ties_even` is a call unless instructions beyond the least are
-/// compiled for.
+/// To the nearest integer, halves to even, of numbers below 2⁵¹; `f64::round_ties_even` is a call unless instructions
+/// beyond the least are compiled for.
 fn rounded(x: f64) -> f64 {
     const ONES: f64 = 1.5 * (1u64 << 52) as f64;
     x + ONES - ONES

@@ -11,7 +11,8 @@ pub use b2p_kernels::give_back;
 pub use machine::Machine;
 pub use spread::{Spread, Verdict};
 
-/// How far a picture is from what it should be: colours of pictures without transparency, in `[0, 1]`, not rounded to eight bits.
+/// How far a picture is from what it should be: colours of pictures without transparency, in `[0, 1]`, not rounded to
+/// eight bits.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Distance {
     /// Mean of the squared differences over pixels and channels.
@@ -79,7 +80,8 @@ fn shown(value: f32) -> f32 {
     value.clamp(0.0, 1.0)
 }
 
-/// The picture at another size, each pixel interpolated between the four nearest: how a viewer shows a small picture large.
+/// The picture at another size, each pixel interpolated between the four nearest: how a viewer shows a small picture
+/// large.
 pub fn resized(image: &Image, width: u32, height: u32) -> Image {
     // Left and right neighbour, and the weight of the right one, of every column (or row).
     let places = |from: u32, to: u32| -> Vec<(usize, usize, f32)> {
@@ -113,10 +115,12 @@ const SCALES: [f64; 5] = [0.0448, 0.2856, 0.3001, 0.2363, 0.1333];
 /// Half the taps of its window, without the middle one.
 const REACH: usize = 5;
 
-/// Multi-scale structural similarity of pairs of planes, one pair for each of three channels, and their mean: 1 for equal pictures.
+/// Multi-scale structural similarity of pairs of planes, one pair for each of three channels, and their mean: 1 for
+/// equal pictures.
 ///
 /// As the `pytorch_msssim` package computes it for a data range of 255: Gaussian window of 11 taps, σ 1.5, no padding;
-/// K = 0.01, 0.03; means over 2×2 from scale to scale, with zeros around odd sides. None if a side is 160 pixels or less.
+/// K = 0.01, 0.03; means over 2×2 from scale to scale, with zeros around odd sides. None if a side is 160 pixels or
+/// less.
 ///
 /// # Panics
 /// If a plane lacks values, or planes of a pair differ in size.

@@ -227,8 +227,8 @@ impl Canvas {
         self.within(self.grid.first[1] + row, self.window.y0, self.window.y1)
     }
 
-    /// Of the pixels of the tile that has the place `tile` in a row or column of the whole picture, those between `low` and `high`,
-    /// counted from `low`.
+    /// Of the pixels of the tile that has the place `tile` in a row or column of the whole picture, those between `low`
+    /// and `high`, counted from `low`.
     fn within(&self, tile: usize, low: u32, high: u32) -> Range<usize> {
         let side = TILE / self.shrink;
         let first = tile as u32 * side;

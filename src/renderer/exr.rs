@@ -14,8 +14,9 @@ const VERSION: u32 = 2;
 const FLOAT: u32 = 2;
 
 impl Image {
-    /// An OpenEXR file: linear light premultiplied by alpha in R, G, B, and A; with `depth`, a picture of the same size drawn of
-    /// [`Channel::Depth`](super::Channel::Depth) on nothing, distances along the viewing direction in Z, ∞ where nothing is.
+    /// An OpenEXR file: linear light premultiplied by alpha in R, G, B, and A; with `depth`, a picture of the same size
+    /// drawn of [`Channel::Depth`](super::Channel::Depth) on nothing, distances along the viewing direction in Z, ∞
+    /// where nothing is.
     ///
     /// # Panics
     /// If the pictures differ in size.
@@ -27,13 +28,15 @@ impl Image {
         file
     }
 
-    /// Of a picture drawn of [`Channel::Depth`](super::Channel::Depth) on nothing: the distance of each pixel, ∞ where nothing is.
+    /// Of a picture drawn of [`Channel::Depth`](super::Channel::Depth) on nothing: the distance of each pixel, ∞ where
+    /// nothing is.
     pub fn distances(&self) -> Vec<f32> {
         let distance = |[z, _, _, alpha]: &[f32; 4]| if *alpha > 0.0 { z / alpha } else { f32::INFINITY };
         self.pixels.iter().map(distance).collect()
     }
 
-    /// As [`Image::to_exr`], row by row into `to`, with the distances of the pixels. `path` appears in error messages only.
+    /// As [`Image::to_exr`], row by row into `to`, with the distances of the pixels. `path` appears in error messages
+    /// only.
     ///
     /// # Errors
     /// [`Error::Io`] if `to` fails.

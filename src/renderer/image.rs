@@ -10,7 +10,8 @@ use crate::error::{Error, Result};
 
 /// A picture in floats: premultiplied red, green, blue, and alpha, row by row from the top left.
 ///
-/// The colours are display-referred (sRGB) values, blended as they are; they may lie outside `[0, 1]` if Gaussians' colours do.
+/// The colours are display-referred (sRGB) values, blended as they are; they may lie outside `[0, 1]` if Gaussians'
+/// colours do.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Image {
     /// Pixels in a row, at least 1 once something is drawn.
@@ -58,10 +59,12 @@ impl Image {
         half
     }
 
-    /// Eight bits a channel, premultiplied: clamped (alpha to `[0, 1]`, colours to `[0, alpha]`), then rounded to the nearest.
+    /// Eight bits a channel, premultiplied: clamped (alpha to `[0, 1]`, colours to `[0, alpha]`), then rounded to the
+    /// nearest.
     ///
     /// # Errors
-    /// [`Error::Unsupported`] if a side is 0 or a row longer than 2²⁹ pixels; never for a picture of a [`Renderer`](super::Renderer).
+    /// [`Error::Unsupported`] if a side is 0 or a row longer than 2²⁹ pixels; never for a picture of a
+    /// [`Renderer`](super::Renderer).
     #[doc(hidden)]
     pub fn to_pixmap(&self) -> Result<Pixmap> {
         let mut bytes = vec![0; self.pixels.len() * 4];
@@ -180,7 +183,8 @@ impl Image {
         format!("YUV4MPEG2 W{} H{} F30:1 Ip A1:1 C444\n", self.width, self.height).into_bytes()
     }
 
-    /// One picture of a YUV4MPEG2 stream: ITU-R BT.601, limited range, colour at full resolution; what is transparent over black.
+    /// One picture of a YUV4MPEG2 stream: ITU-R BT.601, limited range, colour at full resolution; what is transparent
+    /// over black.
     #[doc(hidden)]
     pub fn to_y4m_frame(&self) -> Vec<u8> {
         let mut file = Vec::new();
@@ -193,6 +197,7 @@ impl Image {
     ///
     /// # Errors
     /// [`Error::Io`] if `to` fails.
+    #[doc(hidden)]
     pub fn write_y4m_frame(&self, to: &mut dyn Write, path: &Path) -> Result<()> {
         let rows = [
             [65.481, 128.553, 24.966, 16.0],

@@ -15,9 +15,9 @@
 //! # Ok::<(), b2p::Error>(())
 //! ```
 //!
-//! Splats are drawn front to back in the order of their depth along the viewing direction, one order for the whole picture. The
-//! picture is the same to the bit for any number of threads: a tile is drawn by one thread, in an order that is a function of the
-//! input alone. Work runs on the rayon pool that the caller is in.
+//! Splats are drawn front to back in the order of their depth along the viewing direction, one order for the whole
+//! picture. The picture is the same to the bit for any number of threads: a tile is drawn by one thread, in an order
+//! that is a function of the input alone. Work runs on the rayon pool that the caller is in.
 
 pub mod camera;
 mod canvas;
@@ -40,7 +40,9 @@ use b2p_kernels::Isa;
 use b2p_kernels::splat::{Crossing, Loop, Scene};
 use rayon::prelude::*;
 
-pub use effects::{Choice, Effect, EffectSet, Effects, Explanation, MOST_SAMPLES, RESOLVED};
+#[doc(hidden)]
+pub use effects::EffectMode as Choice;
+pub use effects::{Effect, EffectMode, EffectSet, Effects, Explanation, MOST_SAMPLES, RESOLVED};
 pub use image::{Ids, Image, box_half};
 pub use shade::Channel;
 
@@ -49,7 +51,7 @@ use crate::gaussians::Gaussians;
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
 use crate::renderer::projection::{Dropped, Ellipse, Ellipses, How, Seen};
-use crate::renderer::tiles::{Bins, Count, Grid, Part, TILE};
+use crate::renderer::tiles::{Bins, Count, Grid, TILE, TileBand};
 use canvas::{Canvas, Colours, Contents, Desk, Indices, Mixed, Output};
 
 /// What is seen where the Gaussians let light through.
@@ -84,13 +86,13 @@ impl Background {
     }
 }
 
-/// How much of splats may be left out. A splat is looked at in all the blocks of 4×4 pixels where its α may reach a floor; what is
-/// left out adds up where many tails overlap, as beside the silhouette of a crowd.
+/// How much of splats may be left out. A splat is looked at in all the blocks of 4×4 pixels where its α may reach a
+/// floor; what is left out adds up where many tails overlap, as beside the silhouette of a crowd.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 #[non_exhaustive]
 pub enum Quality {
-    /// A floor of 1/255, as is usual: beside silhouettes, pictures are off by several steps of eight bits, and by many where splats are
-    /// far smaller than pixels.
+    /// A floor of 1/255, as is usual: beside silhouettes, pictures are off by several steps of eight bits, and by many
+    /// where splats are far smaller than pixels.
     Fast,
     /// A floor of 1/16384.
     #[default]
@@ -322,9 +324,9 @@ impl Renderer {
     /// `image` is reused. After an error its content is unspecified.
     ///
     /// # Errors
-    /// [`crate::Error::Usage`] if the camera is none, the background is not finite, or the arrays of `gaussians` differ in length;
-    /// [`crate::Error::LimitExceeded`] if the picture, the memory or the work to draw it is over the `limits`;
-    /// [`crate::Error::OutOfMemory`].
+    /// [`crate::Error::Usage`] if the camera is none, the background is not finite, or the arrays of `gaussians` differ
+    /// in length; [`crate::Error::LimitExceeded`] if the picture, the memory or the work to draw it is over the
+    /// `limits`; [`crate::Error::OutOfMemory`].
     pub fn render_into(&mut self, gaussians: &Gaussians, camera: &Camera, image: &mut Image) -> Result<Stats> {
         let (channel, background) = (self.channel, self.background);
         let limits = self.limits.clone();
@@ -362,7 +364,8 @@ impl Renderer {
         Ok(stats)
     }
 
-    /// Which Gaussian each pixel shows most of; one sample a pixel, whatever the effects. Otherwise as [`Renderer::render_into`].
+    /// Which Gaussian each pixel shows most of; one sample a pixel, whatever the effects. Otherwise as
+    /// [`Renderer::render_into`].
     ///
     /// # Errors
     /// As [`Renderer::render_into`].
@@ -380,8 +383,9 @@ impl Renderer {
         Ok(stats)
     }
 
-    /// A picture of any `numbers` that each Gaussian, by its index, has `N` of, mixed as colours are: in each of `pixels`, row by row, the
-    /// sum over the Gaussians there of what they contribute, of which a 1 makes the opacity. One sample a pixel, whatever the effects.
+    /// A picture of any `numbers` that each Gaussian, by its index, has `N` of, mixed as colours are: in each of
+    /// `pixels`, row by row, the sum over the Gaussians there of what they contribute, of which a 1 makes the opacity.
+    /// One sample a pixel, whatever the effects.
     ///
     /// # Errors
     /// As [`Renderer::render_into`].
@@ -468,7 +472,7 @@ impl Renderer {
         }
         let fine = camera.magnified(effects.supersample);
         let grid = Grid::new(fine.window());
-        let shaded = effects.harmonics || wanted.channel != Channel::Colour;
+        let shaded = effects.shades() || wanted.channel != Channel::Colour;
         let each = Ellipses::BYTES
             + Count::BYTES
             + u64::from(shaded) * size_of::<[f32; 3]>() as u64
@@ -487,7 +491,8 @@ impl Renderer {
         })
     }
 
-    /// Finds the ellipses and counts them by tile. Completes the plan: whether any cross the near plane, and their bytes.
+    /// Finds the ellipses and counts them by tile. Completes the plan: whether any cross the near plane, and their
+    /// bytes.
     fn project(
         &mut self,
         gaussians: &Gaussians,
@@ -497,13 +502,13 @@ impl Renderer {
         limits: &Limits,
     ) -> Result<Seen> {
         if plan.shaded {
-            shade::fill(gaussians, camera, channel, &mut self.shades);
+            shade::fill(gaussians, camera, channel, &plan.effects, &mut self.shades);
         }
         let how = How {
             isa: self.isa,
             compensated: plan.effects.antialias,
             floor: self.quality.floor(),
-            near_care: self.effects.near != Choice::Off,
+            near_care: self.effects.near != EffectMode::Off,
             slopes: plan.effects.order,
             colours: plan.shaded.then_some(&self.shades),
         };
@@ -563,7 +568,7 @@ impl Renderer {
     /// Draws a part of the picture; returns the threads' time for sorting and for the pixels.
     fn draw_part<O: Output>(
         &self,
-        part: &Part,
+        part: &TileBand,
         canvas: &Canvas,
         floor: f32,
         what: Loop,

@@ -1,7 +1,8 @@
 //! What the pictures should be: double precision, every Gaussian at every pixel, the textbook formulas.
 //!
-//! Slow, and meant for tests. It shares with the renderer only the definitions: the camera, the widened Jacobian's range, the blur,
-//! the visibility `z > near`, the ceiling of α, and the order by the depth as an `f32` and then by index.
+//! Slow, and meant for tests. It shares with the renderer only the definitions: the camera, the widened Jacobian's
+//! range, the blur, the visibility `z > near`, the ceiling of α, and the order by the depth as an `f32` and then by
+//! index.
 
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
@@ -36,7 +37,8 @@ impl Cutoffs {
     };
 }
 
-/// An α below this is none: a million of them change a channel by 10⁻⁶ of its range. It bounds which pixels a splat is looked at for.
+/// An α below this is none: a million of them change a channel by 10⁻⁶ of its range. It bounds which pixels a splat is
+/// looked at for.
 const NOTHING: f64 = 1e-12;
 
 struct Seen {

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use crate::gaussians::Gaussians;
 use crate::renderer::camera::{Camera, Projection};
+use crate::renderer::effects::EffectSet;
 
 /// Gaussians per parallel task.
 const BLOCK: usize = 4096;
@@ -16,15 +17,22 @@ pub enum Channel {
     /// Colours.
     #[default]
     Colour,
-    /// In all three channels, the distance of the centres along the viewing direction, in cube-frame units. Premultiplied as colours
-    /// are: divided by alpha it is the mean of what is seen.
+    /// In all three channels, the distance of the centres along the viewing direction, in cube-frame units.
+    /// Premultiplied as colours are: divided by alpha it is the mean of what is seen.
     Depth,
-    /// The axis along which a Gaussian is thinnest, turned to the eye, in the camera's axes, from [−1, 1] to [0, 1]. Premultiplied.
+    /// The axis along which a Gaussian is thinnest, turned to the eye, in the camera's axes, from [−1, 1] to [0, 1].
+    /// Premultiplied.
     Normal,
 }
 
 /// Fills `shades` with what each Gaussian is drawn as: whatever `channel` asks for, and of colours those of the view.
-pub(super) fn fill(gaussians: &Gaussians, camera: &Camera, channel: Channel, shades: &mut Vec<[f32; 3]>) {
+pub(super) fn fill(
+    gaussians: &Gaussians,
+    camera: &Camera,
+    channel: Channel,
+    effects: &EffectSet,
+    shades: &mut Vec<[f32; 3]>,
+) {
     let rotation = camera.pose.matrix3;
     let eye = (rotation.transpose() * -camera.pose.translation).as_vec3();
     let along = rotation.row(2).as_vec3();
@@ -34,10 +42,11 @@ pub(super) fn fill(gaussians: &Gaussians, camera: &Camera, channel: Channel, sha
     };
     let shade = |i: usize| -> [f32; 3] {
         match channel {
-            Channel::Colour => {
+            Channel::Colour if effects.harmonics => {
                 let towards = towards(i).into();
                 gaussians.harmonics.seen(i, gaussians.colour[i], towards)
             }
+            Channel::Colour => gaussians.colour[i],
             Channel::Depth => {
                 let centre = DVec3::from(gaussians.position[i].map(f64::from));
                 [camera.pose.transform_point3(centre).z as f32; 3]

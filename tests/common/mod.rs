@@ -9,7 +9,7 @@ use b2p::encoder::{Options, encode};
 use b2p::gaussians::Heads;
 use b2p::geometry::{Voxels, morton};
 use b2p::latents::network::Model;
-use b2p::latents::{Precision, Steps};
+use b2p::latents::{ResidualSteps, Steps};
 use b2p::log::Log;
 use b2p::{Limits, Placement};
 
@@ -138,8 +138,8 @@ pub fn steps(step: u8) -> Steps {
 }
 
 /// Everything in the same step.
-pub fn all_in(step: u8) -> Precision {
-    Precision {
+pub fn all_in(step: u8) -> ResidualSteps {
+    ResidualSteps {
         fine: steps(step),
         coarse: steps(step),
         boundary: 9,

@@ -6,7 +6,7 @@ use b2p::encoder::{Options, Residual, encode};
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::latents::entropy::{Condition, encode_level, encode_passes, latent_hash};
 use b2p::latents::network::Model;
-use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, Precision, Steps};
+use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, ResidualSteps, Steps};
 use b2p::log::Log;
 
 use crate::common::{Ball, cloud_of, steps};
@@ -76,7 +76,7 @@ struct Corrections {
     /// Filters for both sets of heads, of this exponent and weights up to as much.
     filter: Option<(u8, i8)>,
     /// As finely as this, what is up to so much in each channel.
-    residual: Option<(Precision, f32)>,
+    residual: Option<(ResidualSteps, f32)>,
 }
 
 /// The same, and all its levels correct colours.
@@ -206,9 +206,9 @@ fn with_notes(bytes: &[u8]) -> Vec<u8> {
 }
 
 /// Steps of luma and chromas, fine and coarse, and the boundary.
-fn precision(fine: [u8; 2], coarse: [u8; 2], boundary: u8) -> Precision {
+fn precision(fine: [u8; 2], coarse: [u8; 2], boundary: u8) -> ResidualSteps {
     let [fine, coarse] = [fine, coarse].map(|[luma, chroma]| Steps { luma, chroma });
-    Precision { fine, coarse, boundary }
+    ResidualSteps { fine, coarse, boundary }
 }
 
 fn cube(side: u32) -> Vec<u64> {

@@ -1,7 +1,7 @@
 //! The streams of the suite of version 3: what is unusual about them is in their names.
 
 use b2p::cloud::ColouredVoxels;
-use b2p::encoder::transform::{Fineness, Options, encode};
+use b2p::encoder::transform::{Options, QualityTarget, encode};
 use b2p::log::Log;
 
 use crate::common::{Ball, cloud_of};
@@ -21,7 +21,7 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         let encoded = encode(cloud, &options, &Log::default());
         encoded.expect("a small cloud is coded").bytes
     };
-    let (step, lossless) = (Fineness::Step, Fineness::Lossless);
+    let (step, lossless) = (QualityTarget::Step, QualityTarget::Lossless);
     let (ball, large) = (Ball::new(5, 11.5).cloud(), Ball::new(6, 24.0).cloud());
     let far = |i: u64| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 1;
     let lone = cloud_of(21, (0..40).map(far).collect());

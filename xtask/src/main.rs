@@ -1,4 +1,4 @@
-//! Makes generated files anew that are kept in the repository: `cargo xtask conformance`, `seeds` or `sample`.
+//! Regenerates generated files that are kept in the repository: `cargo xtask conformance`, `seeds` or `sample`.
 //!
 //! Tests compare with these files and never write them. What streams a suite has is defined beside its test.
 

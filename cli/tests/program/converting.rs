@@ -121,7 +121,7 @@ fn what_cannot_be_converted_is_named() {
     fails(
         at,
         &["convert", "ball.ply", "x.spz"],
-        &["ball.ply", "this is a point cloud", "b2p encode"],
+        &["ball.ply", "not Gaussians", "b2p encode"],
     );
     fails(
         at,

@@ -94,7 +94,7 @@ fn info_tells_bits_by_part_model_and_grid() {
 }
 
 #[test]
-fn a_file_of_a_wrong_kind_is_told_with_what_to_do() {
+fn an_error_says_what_a_file_of_a_wrong_kind_is_and_what_to_do() {
     let folder = folder_with_stream();
     let at = folder.path();
     let mut las = b"LASF".to_vec();

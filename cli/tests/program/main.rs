@@ -1,5 +1,6 @@
 //! The program from outside: files in, files out, errors that say what is wrong, and nothing half-written.
 
+mod clouds;
 #[path = "../../../tests/common/mod.rs"]
 mod common;
 mod converting;
@@ -271,10 +272,18 @@ fn what_is_not_a_point_cloud_is_refused() {
     let xyz = "property float x\nproperty float y\nproperty float z\n";
     let rgb = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
     std::fs::write(at.join("grey.ply"), header(xyz, 1) + "1 2 3\n").unwrap();
-    fails(at, &["encode", "grey.ply", "-o", "x.b2p"], &["grey.ply", "red"]);
+    fails(
+        at,
+        &["encode", "grey.ply", "-o", "x.b2p", "--strict"],
+        &["grey.ply", "no colours"],
+    );
     let coloured = header(&format!("{xyz}{rgb}"), 2);
     std::fs::write(at.join("nan.ply"), format!("{coloured}1 2 3 4 5 6\n1 nan 3 4 5 6\n")).unwrap();
-    fails(at, &["encode", "nan.ply", "-o", "x.b2p"], &["nan.ply", "y", "line 12"]);
+    fails(
+        at,
+        &["encode", "nan.ply", "-o", "x.b2p", "--strict"],
+        &["nan.ply", "y", "line 12"],
+    );
     std::fs::write(at.join("short.ply"), format!("{coloured}1 2 3 4 5 6\n")).unwrap();
     fails(at, &["encode", "short.ply", "-o", "x.b2p"], &["short.ply"]);
 }

@@ -1,4 +1,4 @@
-//! Who is told what, and what is overwritten.
+//! Where results and reports go, and what is overwritten.
 
 use super::*;
 
@@ -105,26 +105,26 @@ fn a_dash_is_standard_input_and_output_for_every_command() {
     let folder = folder_with_stream();
     let at = folder.path();
     let [cloud, stream] = ["ball.ply", "ball.b2p"].map(|name| std::fs::read(at.join(name)).unwrap());
-    let through = |arguments: &[&str], input: &[u8]| {
+    let fed = |arguments: &[&str], input: &[u8]| {
         let done = piped(at, arguments, input);
         let errors = String::from_utf8_lossy(&done.stderr);
         assert!(done.status.success(), "{arguments:?}: {errors}");
         done.stdout
     };
-    assert_eq!(through(&["encode", "-", "-", "--bits", "7"], &cloud), stream);
+    assert_eq!(fed(&["encode", "-", "-", "--bits", "7"], &cloud), stream);
     assert_eq!(
-        through(&["encode", "-", "-o", "-", "--bits", "7", "--json"], &cloud),
+        fed(&["encode", "-", "-o", "-", "--bits", "7", "--json"], &cloud),
         stream
     );
     succeeds(at, &["decode", "ball.b2p", "g.ply"]);
     succeeds(at, &["decode", "ball.b2p", "p.ply", "--points"]);
     succeeds(at, &["cut", "ball.b2p", "c.b2p", "--level", "5"]);
     let file = |name: &str| std::fs::read(at.join(name)).unwrap();
-    assert_eq!(through(&["decode", "-", "-"], &stream), file("g.ply"));
-    assert_eq!(through(&["decode", "-", "-o", "-", "--points"], &stream), file("p.ply"));
-    assert_eq!(through(&["cut", "-", "-", "--level", "5"], &stream), file("c.b2p"));
-    assert!(through(&["info", "-"], &stream).starts_with(b"version 3"));
-    assert!(through(&["render", "-", "-", "--size", "8x8"], &stream).starts_with(b"\x89PNG"));
+    assert_eq!(fed(&["decode", "-", "-"], &stream), file("g.ply"));
+    assert_eq!(fed(&["decode", "-", "-o", "-", "--points"], &stream), file("p.ply"));
+    assert_eq!(fed(&["cut", "-", "-", "--level", "5"], &stream), file("c.b2p"));
+    assert!(fed(&["info", "-"], &stream).starts_with(b"version 3"));
+    assert!(fed(&["render", "-", "-", "--size", "8x8"], &stream).starts_with(b"\x89PNG"));
     assert!(!at.join("-").exists());
 }
 
@@ -252,5 +252,42 @@ mod standard_output {
             "\"$B2P\" info ball.b2p > /dev/null; \"$B2P\" info ball.b2p <> /dev/null >&0",
         );
         assert!(ignored.status.success(), "a null device is not closed");
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn on_a_terminal_the_program_asks_before_it_overwrites() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let answer = |answer: &str| {
+        std::fs::write(at.join("there.ply"), b"old").unwrap();
+        // `script` gives the program a terminal, and this pipe what is typed.
+        let command = format!("'{}' decode ball.b2p there.ply", env!("CARGO_BIN_EXE_b2p"));
+        let started = Command::new("script")
+            .current_dir(at)
+            .args(["-qec", &command, "/dev/null"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn();
+        let Ok(mut child) = started else {
+            eprintln!("skipped: `script` is not installed");
+            return None;
+        };
+        let mut typed = child.stdin.take().expect("a pipe");
+        typed.write_all(answer.as_bytes()).unwrap();
+        let done = child.wait_with_output().unwrap();
+        drop(typed);
+        let said = String::from_utf8_lossy(&done.stdout).into_owned();
+        assert!(said.contains("there.ply exists already; overwrite? [y/N]"), "{said}");
+        let replaced = std::fs::read(at.join("there.ply")).unwrap() != b"old";
+        assert_eq!(done.status.success(), replaced, "{said}");
+        Some(replaced)
+    };
+    if let Some(replaced) = answer("y\n") {
+        assert!(replaced);
+        assert_eq!(answer("n\n"), Some(false));
+        assert_eq!(answer("\n"), Some(false));
     }
 }

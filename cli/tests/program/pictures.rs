@@ -81,7 +81,7 @@ fn a_small_picture_is_drawn_from_a_coarser_level_unless_one_is_named() {
     for (colours, coarsest) in [("transform", 4), ("learned", 5)] {
         let folder = folder_coded(colours);
         let draw = |more: &[&str]| {
-            let args = ["render", "ball.b2p", "-o", "a.png", "-v"];
+            let args = ["render", "ball.b2p", "-o", "a.png", "-v", "--orbit", "0,0,3"];
             succeeds(folder.path(), &[&args[..], more].concat())
         };
         let small = draw(&["--size", "8x8"]);

@@ -13,7 +13,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
 
-pub(super) use read::{is_json, read};
+pub(super) use read::{has_splats, read};
 
 use super::Format;
 use super::details::frame_to_json;

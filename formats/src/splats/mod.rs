@@ -116,10 +116,10 @@ impl Format {
             return details::kind_of_archive(bytes);
         }
         if bytes.starts_with(b"glTF") {
-            return Some(Format::Glb);
+            return gltf::has_splats(bytes).then_some(Format::Glb);
         }
         let first = bytes.iter().find(|byte| !byte.is_ascii_whitespace());
-        if first == Some(&b'{') && gltf::is_json(bytes) {
+        if first == Some(&b'{') && gltf::has_splats(bytes) {
             return Some(Format::Gltf);
         }
         csv::is_csv(bytes).then_some(Format::Csv)

@@ -14,7 +14,7 @@ use b2p::metrics::pixels_apart;
 use b2p::metrics::{Spread, Verdict};
 use b2p::renderer::camera::Camera;
 use b2p::renderer::reference::{self, Cutoffs};
-use b2p::renderer::{Background, Choice, Effect, EffectSet, Effects, Image, Renderer};
+use b2p::renderer::{Background, Effect, EffectMode, EffectSet, Effects, Image, Renderer};
 
 /// Splats of the scenes made for it.
 const COUNT: usize = 60_000;
@@ -61,7 +61,7 @@ fn cases(subject: &Subject<'_>, options: &Options) -> Result<Vec<Case>> {
         compensated: true,
         ..plain.clone()
     };
-    let unsampled = Effects::default().with(Effect::Supersample, Choice::Off);
+    let unsampled = Effects::default().with(Effect::Supersample, EffectMode::Off);
     // The near plane touches the surface.
     let inside = Camera::orbit(0.0, 0.0, 0.8 + Camera::NEAR, 90.0, side, side)?;
     let case = |effect, name, scene, gaussians: &Gaussians, camera, others| Case {
@@ -143,9 +143,9 @@ pub fn effect_costs(subject: &Subject<'_>, options: &Options) -> Result<Vec<Effe
     for repeat in 0..options.repeats {
         for (i, case) in cases.iter().enumerate() {
             if repeat == 0 {
-                called_for[i] = case.is_on(case.draw(subject, Choice::Auto, &case.camera)?.2);
+                called_for[i] = case.is_on(case.draw(subject, EffectMode::Auto, &case.camera)?.2);
             }
-            for (choice, times) in [Choice::Off, Choice::On].into_iter().zip(&mut times[i]) {
+            for (choice, times) in [EffectMode::Off, EffectMode::On].into_iter().zip(&mut times[i]) {
                 times.push(case.draw(subject, choice, &case.camera)?.0);
             }
         }
@@ -167,7 +167,7 @@ pub fn effect_costs(subject: &Subject<'_>, options: &Options) -> Result<Vec<Effe
 
 impl Case {
     /// Milliseconds of a picture after one that is not counted, the picture, and what it was drawn with.
-    fn draw(&self, subject: &Subject<'_>, choice: Choice, camera: &Camera) -> Result<(f64, Image, EffectSet)> {
+    fn draw(&self, subject: &Subject<'_>, choice: EffectMode, camera: &Camera) -> Result<(f64, Image, EffectSet)> {
         let mut effects = self.others;
         effects.set(self.effect, choice);
         let renderer = Renderer::new().with_effects(effects);
@@ -193,7 +193,7 @@ impl Case {
             *length *= shrink;
         }
         (camera.width, camera.height) = (JUDGED, JUDGED);
-        let (_, image, set) = self.draw(subject, Choice::On, &camera)?;
+        let (_, image, set) = self.draw(subject, EffectMode::On, &camera)?;
         let cutoffs = Cutoffs {
             compensated: set.antialias,
             near_care: true,

@@ -9,6 +9,7 @@ struct Lines<'a> {
     bytes: &'a [u8],
     at: usize,
     line: usize,
+    line_end: u8,
 }
 
 /// Reads the properties `wanted` (index, type) of `element`, which follows the elements `before`.
@@ -23,6 +24,7 @@ pub(super) fn columns(
         bytes,
         at: header.body,
         line: header.lines,
+        line_end: header.line_end,
     };
     for element in before {
         lines.check_rows(element)?;
@@ -90,6 +92,7 @@ pub(super) fn line_of(header: &Header, bytes: &[u8], row: usize) -> Option<usize
         bytes,
         at: header.body,
         line: header.lines,
+        line_end: header.line_end,
     };
     for _ in 0..=row {
         lines.next_row().ok()?;
@@ -102,7 +105,7 @@ impl<'a> Lines<'a> {
     fn next_row(&mut self) -> Result<&'a [u8]> {
         while self.at < self.bytes.len() {
             let rest = &self.bytes[self.at..];
-            let length = rest.iter().position(|&b| b == b'\n').unwrap_or(rest.len());
+            let length = rest.iter().position(|&b| b == self.line_end).unwrap_or(rest.len());
             self.at = (self.at + length + 1).min(self.bytes.len());
             self.line += 1;
             let row = rest[..length].trim_ascii();

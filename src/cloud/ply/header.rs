@@ -76,7 +76,12 @@ pub struct Header {
     pub body: usize,
     /// Number of lines of the header.
     pub lines: usize,
+    /// The last byte of a line: LF, or CR in a file without LF.
+    pub line_end: u8,
 }
+
+/// The byte-order mark that some programs put before text.
+const MARK: &[u8] = b"\xef\xbb\xbf";
 
 impl Scalar {
     /// Parses a type's name in either spelling (`uchar`, `uint8`).
@@ -179,22 +184,28 @@ impl Element {
 }
 
 impl Header {
-    /// Reads from `ply` to `end_header`. Lines end with LF or CR LF; bytes after the header are ignored.
+    /// Reads from `ply` to `end_header`. Lines end with LF, CR LF or CR, as the first does; bytes after the header are
+    /// ignored, as is a byte-order mark before it.
     ///
     /// # Errors
     /// [`Error::Malformed`], naming the line, if the header is invalid; [`Error::Truncated`] if it does not end.
     pub fn parse(bytes: &[u8]) -> Result<Header> {
-        if !bytes.starts_with(b"ply") {
+        let text = bytes.strip_prefix(MARK).unwrap_or(bytes);
+        if !text.starts_with(b"ply") {
             let start = &bytes[..bytes.len().min(8)];
             return Err(malformed("byte 0", "magic", shown(start), "\"ply\""));
         }
+        let line_end = match text {
+            [b'p', b'l', b'y', b'\r', next, ..] if *next != b'\n' => b'\r',
+            _ => b'\n',
+        };
         let mut format = None;
         let mut comments = Vec::new();
         let mut elements: Vec<Element> = Vec::new();
-        let (mut body, mut lines) = (0, 0);
+        let (mut body, mut lines) = (bytes.len() - text.len(), 0);
         loop {
             let rest = &bytes[body..];
-            let Some(length) = rest.iter().position(|&b| b == b'\n') else {
+            let Some(length) = rest.iter().position(|&b| b == line_end) else {
                 let needed = "end_header\n".len() as u64;
                 return Err(super::truncated(bytes.len(), "header", needed));
             };
@@ -247,6 +258,7 @@ impl Header {
             elements,
             body,
             lines,
+            line_end,
         })
     }
 }

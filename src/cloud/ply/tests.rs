@@ -51,8 +51,14 @@ const FORMATS: [&str; 3] = ["ascii", "binary_little_endian", "binary_big_endian"
 #[test]
 fn every_format_reads_the_same_columns() {
     for format in FORMATS {
-        for line_end in ["\n", "\r\n"] {
-            let bytes = sample(format, line_end);
+        for (mark, line_end) in [
+            ("", "\n"),
+            ("", "\r\n"),
+            ("", "\r"),
+            ("\u{feff}", "\n"),
+            ("\u{feff}", "\r"),
+        ] {
+            let bytes = [mark.as_bytes(), &sample(format, line_end)].concat();
             let ply = Ply::open(&bytes).unwrap();
             assert_eq!(ply.header.comments, ["made by  hand"]);
             assert_eq!(ply.element("vertex").unwrap().count, 2);

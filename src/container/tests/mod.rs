@@ -1,3 +1,4 @@
+mod axes;
 mod colours;
 mod transform;
 

@@ -32,7 +32,7 @@ fn writer() -> Result<Writer> {
     Ok(writer)
 }
 
-fn sample() -> Vec<u8> {
+pub(super) fn sample() -> Vec<u8> {
     writer().unwrap().finish().unwrap()
 }
 

@@ -1,6 +1,7 @@
 //! Streams of version 3: colours as transform coefficients.
 
-mod within;
+mod head_maps;
+mod rate_control;
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -11,18 +12,22 @@ use rayon::prelude::*;
 use super::{Encoded, rates};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{self, Filter, Steps, Truth};
-use crate::container::{Format, Header, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Writer};
-use crate::decoder::{Decoder, colour_hash};
+#[cfg(doc)]
+use crate::container::MAX_COLOUR_SLICE;
+use crate::container::{Format, Header, MAX_SLICE_VOXELS, Writer};
+use crate::decoder::{Decoder, Decoding, colour_hash};
 use crate::error::{Error, Result};
+use crate::gaussians::learned::HeadsModel;
+use crate::gaussians::{HeadMap, HeadSet};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
-pub use within::encode_within;
+pub use rate_control::encode_to_rate;
 
 /// How exactly colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
-pub enum Fineness {
+pub enum QualityTarget {
     /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice that.
     Step(f32),
     /// The same with a size for each.
@@ -36,24 +41,27 @@ pub enum Fineness {
     Lossless,
 }
 
-/// What may be chosen about a stream of version 3; [`encode_within`] chooses how exactly colours are coded, and may leave out the finest levels.
+/// What may be chosen about a stream of version 3; [`encode_to_rate`] chooses how exactly colours are coded, and may leave out the finest levels.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The levels that a stream may be cut after, the last one at most the bit depth N. Default: N−3 to N−1.
     pub levels: Option<RangeInclusive<u8>>,
     /// How exactly colours are coded.
-    pub fineness: Fineness,
+    pub fineness: QualityTarget,
     /// Whether levels have a filter that the decoder runs on their colours.
     pub filter: bool,
     /// Whether quantisation is rate–distortion optimised; otherwise coefficients are rounded to the nearest.
     pub optimised: bool,
-    /// Streams that [`encode_within`] tries for a level at most, once one fits.
+    /// Streams that [`encode_to_rate`] tries for a level at most, once one fits.
     pub tries: usize,
     /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
     pub slice_voxels: u32,
-    /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`].
+    /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`]: fewer let more threads decode a level, and cost
+    /// bits.
     pub colour_slice: u32,
-    /// The instructions to use; any give the same stream. Default: the best of this machine.
+    /// Heads whose pictures are compared with those of surfels, so that the stream says where surfels are better; `None` for no head maps.
+    pub heads: Option<HeadsModel>,
+    /// The instructions to use; any give the same stream, but for head maps. Default: the best of this machine.
     pub isa: Option<Isa>,
 }
 
@@ -61,16 +69,20 @@ impl Default for Options {
     fn default() -> Self {
         Options {
             levels: None,
-            fineness: Fineness::Step(20.0),
+            fineness: QualityTarget::Step(20.0),
             filter: true,
             optimised: true,
             tries: usize::MAX,
             slice_voxels: MAX_SLICE_VOXELS,
-            colour_slice: MAX_COLOUR_SLICE / 2,
+            colour_slice: COLOUR_SLICE,
+            heads: None,
             isa: None,
         }
     }
 }
+
+/// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.
+const COLOUR_SLICE: u32 = 8192;
 
 /// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green and blue comes of both.
 const CHROMA: u8 = 8;
@@ -90,29 +102,29 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     let subject = Subject::new(cloud, levels, options, log)?;
     let top = *subject.levels.end();
     let coded = subject.code(top, steps, log)?;
-    subject.checked(coded, log)
+    subject.checked(coded, options.heads.as_ref(), usize::MAX, log)
 }
 
-impl fmt::Display for Fineness {
+impl fmt::Display for QualityTarget {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Fineness::Step(luma) => write!(f, "step {luma:.2}"),
-            Fineness::Steps { luma, chroma } => write!(f, "step {luma:.2},{chroma:.2}"),
-            Fineness::Lossless => f.write_str("exact colours"),
+            QualityTarget::Step(luma) => write!(f, "step {luma:.2}"),
+            QualityTarget::Steps { luma, chroma } => write!(f, "step {luma:.2},{chroma:.2}"),
+            QualityTarget::Lossless => f.write_str("exact colours"),
         }
     }
 }
 
-impl Fineness {
+impl QualityTarget {
     /// The steps of the finest level.
     fn steps(self) -> Result<Steps> {
         match self {
-            Fineness::Lossless => Ok(Steps::LOSSLESS),
-            Fineness::Step(step) => {
+            QualityTarget::Lossless => Ok(Steps::LOSSLESS),
+            QualityTarget::Step(step) => {
                 let luma = nearest(step)?;
                 Ok(steps_of(luma, luma))
             }
-            Fineness::Steps { luma, chroma } => Ok(Steps {
+            QualityTarget::Steps { luma, chroma } => Ok(Steps {
                 luma: nearest(luma)?,
                 chroma: nearest(chroma)?.min(MAX_CHROMA),
             }),
@@ -123,8 +135,8 @@ impl Fineness {
     fn of(steps: Steps) -> Self {
         let size = |luma| Steps { luma, ..steps }.luma_step();
         match steps.is_lossless() {
-            true => Fineness::Lossless,
-            false => Fineness::Steps {
+            true => QualityTarget::Lossless,
+            false => QualityTarget::Steps {
                 luma: size(steps.luma),
                 chroma: size(steps.chroma),
             },
@@ -186,6 +198,9 @@ struct Coded {
     top: u8,
     /// The colours of the finest level, filtered.
     colours: Vec<[u8; 3]>,
+    /// Last level and payload of the colour trunk.
+    trunk: (u8, Vec<u8>),
+    layers: Vec<Layer>,
 }
 
 /// The colours of a level in a stream.
@@ -193,6 +208,7 @@ struct Layer {
     level: u8,
     hash: u64,
     filter: Option<Vec<u8>>,
+    head_map: Option<Vec<u8>>,
     slices: Vec<(u32, Vec<u8>)>,
 }
 
@@ -289,9 +305,7 @@ impl<'a> Subject<'a> {
     fn code_towards(&self, truth: &Truth, top: u8, steps: Steps, log: &Log) -> Result<Coded> {
         let (octree, maps, isa) = (&self.octree, &self.maps, self.isa);
         let slice = self.options.colour_slice as usize;
-        let header = self.header(top, |level| octree.level(level).len());
-        let base = header.base;
-        let mut writer = Writer::new(header)?;
+        let base = *self.levels.start().min(&top);
         let trunk = colour::trunk_depth(base, |level| octree.level(level).len());
         let count = octree.level(trunk).len();
         let name = format!("colours of levels 0 to {trunk}");
@@ -342,12 +356,19 @@ impl<'a> Subject<'a> {
                 level,
                 hash: colour_hash(&coloured),
                 filter: filter.map(|filter| filter.to_bytes()),
+                head_map: None,
                 slices,
             });
         }
-        self.write(&mut writer, base, trunk, &payload, &layers)?;
-        let bytes = writer.finish()?;
-        Ok(Coded { bytes, top, colours })
+        let mut coded = Coded {
+            bytes: Vec::new(),
+            top,
+            colours,
+            trunk: (trunk, payload),
+            layers,
+        };
+        coded.bytes = self.written(&coded)?;
+        Ok(coded)
     }
 
     /// Bytes of the geometry of the levels 1 to `level`.
@@ -356,8 +377,19 @@ impl<'a> Subject<'a> {
         levels.map(|(_, bytes)| bytes.len()).sum()
     }
 
+    /// The stream of what was coded.
+    fn written(&self, coded: &Coded) -> Result<Vec<u8>> {
+        let header = self.header(coded.top, |level| self.octree.level(level).len());
+        let base = header.base;
+        let mut writer = Writer::new(header)?;
+        self.write(&mut writer, base, coded)?;
+        writer.finish()
+    }
+
     /// Writes the sections of all levels.
-    fn write(&self, writer: &mut Writer, base: u8, trunk: u8, payload: &[u8], layers: &[Layer]) -> Result<()> {
+    fn write(&self, writer: &mut Writer, base: u8, coded: &Coded) -> Result<()> {
+        let Coded { trunk, layers, .. } = coded;
+        let (trunk, payload) = (trunk.0, &trunk.1);
         let slice = self.options.slice_voxels as usize;
         let voxels = |level: usize| self.octree.level(level as u8).len();
         // Levels of one slice each.
@@ -385,27 +417,89 @@ impl<'a> Subject<'a> {
             if let Some(filter) = &layer.filter {
                 writer.post_filter(level, filter)?;
             }
+            if let Some(map) = &layer.head_map {
+                writer.head_map(level, map)?;
+            }
         }
         Ok(())
     }
 
-    /// The stream, once it has been decoded to what was encoded.
-    fn checked(&self, coded: Coded, log: &Log) -> Result<Encoded> {
-        let Coded { bytes, top, colours } = coded;
+    /// The stream, once it has been decoded to what was encoded; with head maps, if there are heads and the stream has at most
+    /// `most` bytes with them.
+    fn checked(&self, mut coded: Coded, heads: Option<&HeadsModel>, most: usize, log: &Log) -> Result<Encoded> {
+        let top = coded.top;
         let voxels = self.octree.level(top);
         let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
+        let mut decoding = decoder.with_level(top).start();
+        decoding.push(&coded.bytes);
+        let reference = match heads.filter(|_| self.has_head_maps(top)) {
+            Some(heads) => {
+                decoding.set_heads_model(heads.clone());
+                Some(head_maps::Reference::new(self.isa, self.cloud)?)
+            }
+            None => None,
+        };
+        let mut maps = Vec::new();
         let same = log.step("decode again", voxels.len(), "voxels", || {
-            let decoding = decoder.with_level(top).whole(&bytes)?;
+            while let Some(level) = decoding.advance()? {
+                if let Some(reference) = reference.as_ref().filter(|_| self.has_head_map(level)) {
+                    maps.push((level, self.head_map(reference, &mut decoding, level)?));
+                }
+            }
             let points = decoding.points();
-            Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == colours))
+            Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == coded.colours))
         })?;
         if !same {
             return Err(Error::Usage(
                 "the stream does not decode to what was encoded: this machine computes wrongly".into(),
             ));
         }
+        for (level, map) in maps {
+            let layer = coded.layers.iter_mut().find(|layer| layer.level == level);
+            layer
+                .into_iter()
+                .for_each(|layer| layer.head_map = Some(map.to_bytes()));
+        }
+        let mapped = self.written(&coded)?;
+        if mapped.len() <= most {
+            coded.bytes = mapped;
+        }
+        let bytes = coded.bytes;
         let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);
         Ok(Encoded { bytes, rates })
+    }
+
+    /// Compares the ways to draw the level that was decoded.
+    fn head_map(&self, reference: &head_maps::Reference, decoding: &mut Decoding<'_>, level: u8) -> Result<HeadMap> {
+        decoding.set_heads(HeadSet::Best)?;
+        let learned = decoding.gaussians()?;
+        decoding.set_heads(HeadSet::Surfels)?;
+        reference.head_map(&head_maps::Candidates {
+            octree: &self.octree,
+            level,
+            learned,
+            surfels: decoding.gaussians()?,
+        })
+    }
+
+    /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its own
+    /// does the cloud tell more than the best heads.
+    fn has_head_map(&self, level: u8) -> bool {
+        (1..self.cloud.voxels.depth().saturating_sub(1)).contains(&level)
+    }
+
+    fn has_head_maps(&self, top: u8) -> bool {
+        (*self.levels.start().min(&top)..=top).any(|level| self.has_head_map(level))
+    }
+
+    /// Bytes to set aside for the head maps of a stream whose last level is `top`.
+    fn head_map_bytes(&self, top: u8) -> usize {
+        /// Of a chunk without its payload.
+        const CHUNK: usize = 12;
+        let levels = *self.levels.start().min(&top)..=top;
+        let mapped = levels.filter(|level| self.has_head_map(*level));
+        let bytes = |level| CHUNK + HeadMap::usual_bytes(HeadMap::block_count(&self.octree, level));
+        mapped.map(bytes).sum()
     }
 }
 

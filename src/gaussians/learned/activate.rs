@@ -28,6 +28,7 @@ const FAINTEST: f32 = -5.537_334_3 - OPACITY_BIAS;
 pub struct Drawing<'a> {
     voxels: &'a Voxels,
     colours: &'a [[u8; 3]],
+    without: Option<&'a [bool]>,
     /// Gaussians per voxel.
     count: usize,
     pub gaussians: Gaussians,
@@ -51,6 +52,7 @@ impl<'a> Drawing<'a> {
         Drawing {
             voxels,
             colours: input.colours,
+            without: input.without,
             count,
             gaussians: Gaussians {
                 position: Vec::with_capacity(all),
@@ -68,10 +70,19 @@ impl<'a> Drawing<'a> {
     /// Appends the Gaussians of the voxels from `first` on, whose outputs are `raw`.
     pub fn add(&mut self, first: usize, raw: &[f32]) {
         let block = BLOCK * self.count * RAW;
-        let drawn = |raw: &&[f32]| self.count == 1 || raw[10] >= FAINTEST;
+        let (voxels, colours, count) = (self.voxels, self.colours, self.count);
+        let drawn = Drawn {
+            without: self.without,
+            count,
+        };
         let counts: Vec<usize> = raw
             .par_chunks(block)
-            .map(|raw| raw.chunks_exact(RAW).filter(drawn).count())
+            .enumerate()
+            .map(|(b, raw)| {
+                let voxel = first + b * BLOCK;
+                let raw = raw.chunks_exact(RAW).enumerate();
+                raw.filter(|(i, raw)| drawn.has(voxel + i / count, raw)).count()
+            })
             .collect();
         let before = self.gaussians.len();
         let after = before + counts.iter().sum::<usize>();
@@ -101,10 +112,22 @@ impl<'a> Drawing<'a> {
             tasks.push((first + b * BLOCK, raw, rows));
             rest = others;
         }
-        let (voxels, colours, count) = (self.voxels, self.colours, self.count);
         tasks.into_par_iter().for_each(|(first, raw, rows)| {
-            rows.fill(voxels, colours, count, first, raw);
+            rows.fill(voxels, colours, drawn, first, raw);
         });
+    }
+}
+
+/// Which Gaussians are drawn.
+#[derive(Clone, Copy)]
+struct Drawn<'a> {
+    without: Option<&'a [bool]>,
+    count: usize,
+}
+
+impl Drawn<'_> {
+    fn has(&self, voxel: usize, raw: &[f32]) -> bool {
+        (self.count == 1 || raw[10] >= FAINTEST) && self.without.is_none_or(|without| !without[voxel])
     }
 }
 
@@ -133,17 +156,18 @@ impl<'a> Rows<'a> {
     }
 
     /// Activates the outputs of the voxels from `first` on, `count` Gaussians each, and skips those that are too faint.
-    fn fill(self, voxels: &Voxels, colours: &[[u8; 3]], count: usize, first: usize, raw: &[f32]) {
+    fn fill(self, voxels: &Voxels, colours: &[[u8; 3]], drawn: Drawn<'_>, first: usize, raw: &[f32]) {
+        let count = drawn.count;
         let unit = 2.0 / (1u64 << voxels.depth()) as f32 / if count == 8 { 2.0 } else { 1.0 };
         let mut to = 0;
         for (g, raw) in raw.chunks(GROUP * RAW).enumerate() {
             let group = Group::new(raw, count == 8);
             for (j, raw) in raw.chunks_exact(RAW).enumerate() {
-                if count == 8 && raw[10] < FAINTEST {
-                    continue;
-                }
                 let gaussian = g * GROUP + j;
                 let (voxel, octant) = (first + gaussian / count, gaussian % count);
+                if !drawn.has(voxel, raw) {
+                    continue;
+                }
                 let anchor = anchor(voxels.coordinate(voxel), octant, count);
                 let decoded = colours[voxel].map(|v| f32::from(v) / 255.0);
                 for axis in 0..3 {

@@ -85,6 +85,8 @@ pub struct LevelInput<'a> {
     pub colours_above: &'a [[u8; 3]],
     /// Quantisation step of the level's luma (R + 2G + B) / 4, in units of luma: 1 for lossless. Clamped to `1..=2¹⁶`.
     pub luma_step: f32,
+    /// For every voxel whether it gets no Gaussians; `None` for none.
+    pub without: Option<&'a [bool]>,
 }
 
 impl std::fmt::Debug for HeadsModel {
@@ -184,6 +186,8 @@ impl LevelInput<'_> {
             self.map.volume() == 27 && self.above.volume() == 27,
             "heads need 3³ maps"
         );
+        let without = self.without.map_or(voxels, <[bool]>::len);
+        assert_eq!(without, voxels, "one choice per voxel");
         assert_eq!(
             [self.map.len(), self.colours.len()],
             [voxels; 2],

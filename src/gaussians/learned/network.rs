@@ -147,16 +147,18 @@ fn run<C: Conv>(
     drawing.gaussians
 }
 
+/// Bytes of a voxel's row of a kernel map as it is arranged for layers.
+const PLAN: u64 = 100;
 const ABOVE: Term = Term {
     each: "voxel of the level above, with learned heads of H channels",
-    takes: "inputs as integers and as f16; input, inner rows and output of a block",
-    fixed: 4 * INPUTS[0] as u64,
+    takes: "kernel map arranged for layers, inputs as integers and as f16; input, inner rows and output of a block",
+    fixed: PLAN + 4 * INPUTS[0] as u64,
     by: ROWS,
 };
 const VOXEL: Term = Term {
     each: "voxel of the level, with learned heads of H channels",
     takes: "the same, octant and parent",
-    fixed: 4 * INPUTS[1] as u64 + 5,
+    fixed: PLAN + 4 * INPUTS[1] as u64 + 5,
     by: ROWS,
 };
 const ROWS: Sizes = Sizes {

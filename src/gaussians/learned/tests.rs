@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use serde_json::json;
 
 use super::*;
+use crate::error::Error;
 use crate::geometry::{Voxels, morton};
 use crate::layers::{Dtype, File};
 
@@ -148,6 +149,7 @@ impl Cloud {
             colours: &self.colours[0],
             colours_above: &self.colours[1],
             luma_step: self.step,
+            without: None,
         }
     }
 
@@ -208,6 +210,35 @@ fn every_precision_matches_the_definition_on_every_instruction_set() {
                 let fine = off.iter().zip(limits).all(|(off, limit)| *off < limit);
                 assert!(fine, "{:?} in {precision} with {isa}: {off:?}", made.set);
             }
+        }
+    }
+}
+
+#[test]
+fn voxels_to_leave_out_get_no_gaussians_and_the_others_do_not_change() {
+    let cloud = Cloud::surface(6);
+    let model = model(&all_sets());
+    let voxels = cloud.octree.level(6);
+    let without: Vec<bool> = (0..voxels.len()).map(|i| i % 3 == 0 || i / 200 % 2 == 0).collect();
+    for set in [(Heads::Best, 1), (Heads::Best, 8)] {
+        let draw = |without| {
+            let input = LevelInput {
+                without,
+                ..cloud.input()
+            };
+            let precision = Precision::Int16;
+            model
+                .generate(Isa::detect(), precision, set, input, Frame::default())
+                .unwrap()
+        };
+        let kept: Vec<bool> = without.iter().map(|&out| !out).collect();
+        let all = draw(None);
+        let [with, rest] = [&kept, &without].map(|out| draw(Some(out)));
+        assert_eq!(with.len() + rest.len(), all.len());
+        let mut parts = [with.position.iter().peekable(), rest.position.iter().peekable()];
+        for position in &all.position {
+            let found = parts.iter_mut().any(|part| part.next_if_eq(&position).is_some());
+            assert!(found);
         }
     }
 }

@@ -57,31 +57,58 @@ impl PerVoxel {
     }
 }
 
+/// Which voxels become surfels, and of what size.
+#[derive(Debug, Clone, Copy)]
+pub struct Choice<'a> {
+    /// For every voxel whether it becomes surfels; `None` for all.
+    pub only: Option<&'a [bool]>,
+    /// Factor of the radii.
+    pub size: f32,
+}
+
+impl Choice<'_> {
+    /// All voxels, in the usual size.
+    pub const ALL: Choice<'static> = Choice { only: None, size: 1.0 };
+
+    fn has(&self, voxel: usize) -> bool {
+        self.only.is_none_or(|only| only[voxel])
+    }
+}
+
 /// Makes the discs of `voxels`, voxel by voxel.
 ///
 /// `map` is the 3³ kernel map of the voxels, `colours` holds one sRGB colour per voxel. `frame` is the cube's frame;
 /// the Gaussians are in cube-frame units.
 ///
 /// # Panics
-/// If `map` is not a 3³ map, or if `map`, `voxels` and `colours` differ in length.
+/// If `map` is not a 3³ map, or if `map`, `voxels`, `colours` and the choice differ in length.
 pub fn surfels(
     isa: Isa,
     voxels: &Voxels,
     map: &KernelMap,
     colours: &[[u8; 3]],
     per_voxel: PerVoxel,
+    choice: Choice<'_>,
     frame: Frame,
 ) -> Gaussians {
     assert_eq!(map.volume(), 27, "surfels need a 3³ map");
     assert_eq!(map.len(), voxels.len(), "one row of the map per voxel");
     assert_eq!(colours.len(), voxels.len(), "one colour per voxel");
-    let own = moments::of_voxels(voxels);
-    let near = moments::step(isa, map, &own);
+    let chosen = choice.only.map_or(voxels.len(), |only| {
+        assert_eq!(only.len(), voxels.len(), "one choice per voxel");
+        only.iter().filter(|&&on| on).count()
+    });
+    // Memory that was touched before is faster than fresh memory.
+    let mut spare = moments::of_voxels(voxels);
+    let near = moments::step(isa, map, &spare);
     let mut far = moments::step(isa, map, &near);
     for _ in 2..moments::ROUNDS {
-        far = moments::step(isa, map, &far);
+        moments::step_into(isa, map, &far, &mut spare);
+        std::mem::swap(&mut far, &mut spare);
     }
-    let count = voxels.len() * per_voxel.count();
+    drop(spare);
+    let n = per_voxel.count();
+    let count = chosen * n;
     let edge = 2.0 / (1u32 << voxels.depth()) as f32;
     let mut gaussians = Gaussians {
         blur: BLUR * edge * edge,
@@ -93,38 +120,89 @@ pub fn surfels(
         frame,
         ..Gaussians::default()
     };
-    let block = BLOCK * per_voxel.count();
-    gaussians
-        .position
-        .par_chunks_mut(block)
-        .zip(gaussians.scale.par_chunks_mut(block))
-        .zip(gaussians.rotation.par_chunks_mut(block))
-        .zip(gaussians.colour.par_chunks_mut(block))
-        .zip(near[..voxels.len()].par_chunks(BLOCK).zip(far.par_chunks(BLOCK)))
-        .enumerate()
-        .for_each(|(b, ((((position, scale), rotation), colour), (near, far)))| {
-            let first = b * BLOCK;
-            let coordinates: Vec<[u32; 3]> = (first..first + near.len()).map(|i| voxels.coordinate(i)).collect();
-            let coordinates = &coordinates;
-            let discs = isa.run(passes::Fit { coordinates, near, far });
-            let n = per_voxel.count();
-            for (j, (disc, &coordinate)) in discs.iter().zip(coordinates).enumerate() {
-                let parts = match per_voxel {
-                    PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
-                    PerVoxel::Four => quarters(disc, map, colours, first + j),
-                };
-                let shrink = if n == 1 { 1.0 } else { SHRINK };
-                let radius = disc.radius * shrink * edge;
-                for (part, (offset, rgb)) in parts.into_iter().take(n).enumerate() {
-                    let to = j * n + part;
-                    position[to] = cube_point(coordinate, offset, edge);
-                    scale[to] = [radius, radius, disc.thickness * edge];
-                    rotation[to] = disc.rotation;
-                    colour[to] = rgb.map(|v| v / 255.0);
-                }
-            }
+    let tasks = Rows::of(&mut gaussians).tasks(voxels.len(), n, choice);
+    tasks.into_par_iter().for_each(|(first, rows)| {
+        let last = (first + BLOCK).min(voxels.len());
+        let coordinates: Vec<[u32; 3]> = (first..last).map(|i| voxels.coordinate(i)).collect();
+        let (near, far) = (&near[first..last], &far[first..last]);
+        let discs = isa.run(passes::Fit {
+            coordinates: &coordinates,
+            near,
+            far,
         });
+        let mut to = 0;
+        for (j, (disc, &coordinate)) in discs.iter().zip(&coordinates).enumerate() {
+            if !choice.has(first + j) {
+                continue;
+            }
+            let parts = match per_voxel {
+                PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
+                PerVoxel::Four => quarters(disc, map, colours, first + j),
+            };
+            let shrink = if n == 1 { 1.0 } else { SHRINK };
+            let radius = disc.radius * shrink * choice.size * edge;
+            for (offset, rgb) in parts.into_iter().take(n) {
+                rows.position[to] = cube_point(coordinate, offset, edge);
+                rows.scale[to] = [radius, radius, disc.thickness * edge];
+                rows.rotation[to] = disc.rotation;
+                rows.colour[to] = rgb.map(|v| v / 255.0);
+                to += 1;
+            }
+        }
+    });
     gaussians
+}
+
+/// The arrays that surfels are written to.
+struct Rows<'a> {
+    position: &'a mut [[f32; 3]],
+    scale: &'a mut [[f32; 3]],
+    rotation: &'a mut [[f32; 4]],
+    colour: &'a mut [[f32; 3]],
+}
+
+impl<'a> Rows<'a> {
+    fn of(gaussians: &'a mut Gaussians) -> Self {
+        Rows {
+            position: &mut gaussians.position,
+            scale: &mut gaussians.scale,
+            rotation: &mut gaussians.rotation,
+            colour: &mut gaussians.colour,
+        }
+    }
+
+    /// First voxel and rows of every block.
+    fn tasks(mut self, voxels: usize, per_voxel: usize, choice: Choice<'_>) -> Vec<(usize, Rows<'a>)> {
+        let mut tasks = Vec::with_capacity(voxels.div_ceil(BLOCK));
+        for first in (0..voxels).step_by(BLOCK) {
+            let block = first..(first + BLOCK).min(voxels);
+            let count = per_voxel * block.filter(|&voxel| choice.has(voxel)).count();
+            let (rows, rest) = self.split_at(count);
+            tasks.push((first, rows));
+            self = rest;
+        }
+        tasks
+    }
+
+    fn split_at(self, count: usize) -> (Rows<'a>, Rows<'a>) {
+        let (position, positions) = self.position.split_at_mut(count);
+        let (scale, scales) = self.scale.split_at_mut(count);
+        let (rotation, rotations) = self.rotation.split_at_mut(count);
+        let (colour, colours) = self.colour.split_at_mut(count);
+        let rows = Rows {
+            position,
+            scale,
+            rotation,
+            colour,
+        };
+        let rest = Rows {
+            position: positions,
+            scale: scales,
+            rotation: rotations,
+            colour: colours,
+        };
+        (rows, rest)
+    }
 }
 
 /// The point `offset` voxels from a voxel's centre, in the cube frame. `edge` is the voxel's edge. Centres are exact up

@@ -45,11 +45,20 @@ pub fn of_voxels(voxels: &Voxels) -> Vec<Moments> {
 /// One step: for every voxel the sum over the occupied ones of its 27 neighbours, then one element of zeros.
 pub fn step(isa: Isa, map: &KernelMap, from: &[Moments]) -> Vec<Moments> {
     let mut to: Vec<Moments> = zeros(from.len());
+    step_into(isa, map, from, &mut to);
+    to
+}
+
+/// [`step`] into `to`, whose last element must be zeros.
+///
+/// # Panics
+/// If `to` does not have one element for each of `from`.
+pub fn step_into(isa: Isa, map: &KernelMap, from: &[Moments], to: &mut [Moments]) {
+    assert_eq!(to.len(), from.len(), "one element per voxel, and zeros");
     let blocks = to[..map.len()].par_chunks_mut(BLOCK);
     blocks
         .zip(map.rows().par_chunks(27 * BLOCK))
         .for_each(|(to, rows)| isa.run(passes::Sum { from, rows, to }));
-    to
 }
 
 /// Moments of a group of voxels, each relative to its voxel's coordinate.

@@ -12,7 +12,15 @@ fn cloud(depth: u8, voxels: impl IntoIterator<Item = [u32; 3]>) -> (Voxels, Kern
 
 fn one_each(voxels: &Voxels, map: &KernelMap) -> Gaussians {
     let grey = vec![[128; 3]; voxels.len()];
-    surfels(Isa::detect(), voxels, map, &grey, PerVoxel::One, Frame::default())
+    surfels(
+        Isa::detect(),
+        voxels,
+        map,
+        &grey,
+        PerVoxel::One,
+        Choice::ALL,
+        Frame::default(),
+    )
 }
 
 /// The walk counts from one voxel to all, by stepping between all pairs of voxels.
@@ -117,7 +125,7 @@ proptest! {
         let colour = |i: usize| [i * 7, i * 31, i * 101].map(|v| (v as u8).wrapping_mul(seed));
         let colours: Vec<_> = (0..voxels.len()).map(colour).collect();
         for per_voxel in [PerVoxel::One, PerVoxel::Four] {
-            let made = |isa| surfels(isa, &voxels, &map, &colours, per_voxel, Frame::default());
+            let made = |isa| surfels(isa, &voxels, &map, &colours, per_voxel, Choice::ALL, Frame::default());
             let expected = made(Isa::available()[0]);
             prop_assert!(expected.check_lengths().is_ok());
             for isa in Isa::available() {
@@ -243,7 +251,15 @@ fn four_discs_follow_the_colour_gradient() {
     });
     let colours: Vec<_> = colours.collect();
     let frame = Frame::default();
-    let four = surfels(Isa::detect(), &voxels, &map, &colours, PerVoxel::Four, frame);
+    let four = surfels(
+        Isa::detect(),
+        &voxels,
+        &map,
+        &colours,
+        PerVoxel::Four,
+        Choice::ALL,
+        frame,
+    );
     assert_eq!(four.len(), 4 * voxels.len());
     for i in 0..four.len() {
         let [x, y, z] = voxels.coordinate(i / 4);
@@ -257,5 +273,39 @@ fn four_discs_follow_the_colour_gradient() {
         let [red, green, blue] = four.colour[i].map(|v| v * 255.0);
         assert!((red - 8.0 * place[0]).abs() < 0.25 && (green - 6.0 * place[1]).abs() < 0.25);
         assert_eq!(blue, 100.0);
+    }
+}
+
+#[test]
+fn a_choice_of_voxels_gives_their_discs_in_another_size() {
+    let (voxels, map) = cloud(6, (0..3000).map(|i| [i % 60, i / 60, (i % 60 + i / 60) / 4]));
+    let colours: Vec<_> = (0..voxels.len()).map(|i| [i as u8, (i / 7) as u8, 9]).collect();
+    let only: Vec<bool> = (0..voxels.len()).map(|i| i % 3 == 0 || i / 500 % 2 == 0).collect();
+    for per_voxel in [PerVoxel::One, PerVoxel::Four] {
+        let make = |choice| {
+            surfels(
+                Isa::detect(),
+                &voxels,
+                &map,
+                &colours,
+                per_voxel,
+                choice,
+                Frame::default(),
+            )
+        };
+        let all = make(Choice::ALL);
+        let some = make(Choice {
+            only: Some(&only),
+            size: 0.5,
+        });
+        let n = per_voxel.count();
+        let chosen: Vec<usize> = (0..all.len()).filter(|i| only[i / n]).collect();
+        assert_eq!(some.len(), chosen.len());
+        for (to, &from) in chosen.iter().enumerate() {
+            assert_eq!(some.position[to], all.position[from]);
+            assert_eq!(some.colour[to], all.colour[from]);
+            let [u, v, thickness] = all.scale[from];
+            assert_eq!(some.scale[to], [0.5 * u, 0.5 * v, thickness]);
+        }
     }
 }

@@ -72,8 +72,8 @@ pub fn features(map: &KernelMap, slice: &Range<usize>, voxel: usize, occupancy: 
 #[derive(Debug)]
 pub(super) struct Network {
     presence: [Narrow; 27],
-    /// For each of [`BEFORE_OFFSETS`] the sums of the rows of its children, by half of the occupancy and the four bits of
-    /// that half. The known row is split between both halves so that sums fit in `i8`.
+    /// For each of [`BEFORE_OFFSETS`] the sums of the rows of its children, by half of the occupancy and the four bits
+    /// of that half. The known row is split between both halves so that sums fit in `i8`.
     halves: Vec<[[Narrow; 16]; 2]>,
     /// What exceeds `i8` in these sums.
     pub remainders: Vec<Remainder>,
@@ -161,8 +161,8 @@ impl Network {
         &self.presence[k]
     }
 
-    /// Rows to add for a neighbour of occupancy `mask` at offset `k`, one of [`BEFORE_OFFSETS`]. The [`Remainder`]s must
-    /// be added, too.
+    /// Rows to add for a neighbour of occupancy `mask` at offset `k`, one of [`BEFORE_OFFSETS`]. The [`Remainder`]s
+    /// must be added, too.
     #[inline(always)]
     pub fn children(&self, k: usize, mask: u8) -> [&Narrow; 2] {
         let [low, high] = &self.halves[usize::from(BEFORE_INDEX[k])];
@@ -176,9 +176,9 @@ impl Network {
     }
 }
 
-/// Sums of the rows `children`, by half and by the four bits of that half, with `known` split between the halves. Returns
-/// for each half the sums clamped to `i8`, and their remainders. At most 26 + 19·8 + 1 rows are added for a child, so all
-/// totals stay within ±22,733.
+/// Sums of the rows `children`, by half and by the four bits of that half, with `known` split between the halves.
+/// Returns for each half the sums clamped to `i8`, and their remainders. At most 26 + 19·8 + 1 rows are added for a
+/// child, so all totals stay within ±22,733.
 fn split(known: &Narrow, children: &[Narrow; 8]) -> [([Narrow; 16], [Narrow; 16]); 2] {
     let sum = |half: usize, mask: usize, unit: usize| -> i32 {
         ones(mask as u32)

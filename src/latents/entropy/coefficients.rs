@@ -1,24 +1,31 @@
-//! Coefficients of colours as bytes: triples of whole numbers, most of them zero, under probabilities that follow what was coded.
+//! Coefficients of colours as bytes: triples of whole numbers, most of them zero, under probabilities that follow what
+//! was coded.
 //!
-//! The triples of a slice come in parts, and of each part only some channels are *present*: all three, the first, the last two, or none. Those that
-//! are not are 0 without a decision; a part without any takes no decision at all and leaves everything below as it is.
+//! The triples of a slice come in parts, and of each part only some channels are *present*: all three, the first, the
+//! last two, or none. Those that are not are 0 without a decision; a part without any takes no decision at all and
+//! leaves everything below as it is.
 //!
-//! A triple is coded in decisions between 0 and 1, each under the probability of its context. A context holds two numbers of 16 bits, *quick* and *slow*,
-//! how likely 0 is in units of 2⁻¹⁶; the decision's row has the two entries `p` and `2¹⁶ − p`, where `p` is half of their sum, rounded down, but at
-//! least 64 and at most 2¹⁶ − 64. After a 0 they grow by `(65535 − quick) >> r` and `(65535 − slow) >> t`, after a 1 they shrink by
-//! `quick >> r` and `slow >> t`. With d as the decisions made in the context before, and b as the bits of d + 2 (⌊log₂(d + 2)⌋ + 1), r is b, but at most 4, and t is b, but at most 7.
+//! A triple is coded in decisions between 0 and 1, each under the probability of its context. A context holds two
+//! numbers of 16 bits, *quick* and *slow*, how likely 0 is in units of 2⁻¹⁶; the decision's row has the two entries `p`
+//! and `2¹⁶ − p`, where `p` is half of their sum, rounded down, but at least 64 and at most 2¹⁶ − 64. After a 0 they
+//! grow by `(65535 − quick) >> r` and `(65535 − slow) >> t`, after a 1 they shrink by `quick >> r` and `slow >> t`.
+//! With d as the decisions made in the context before, and b as the bits of d + 2 (⌊log₂(d + 2)⌋ + 1), r is b, but at
+//! most 4, and t is b, but at most 7.
 //!
-//! The *activity* of a channel is the running mean of its magnitudes, in units of 2⁻¹²: 0 at first, and after a triple with the
-//! magnitude `m` it grows by `(4096·min(m, 15) − activity) >> 2`, rounded down. The *class* of a number is how many of [`CLASSES`] it reaches.
+//! The *activity* of a channel is the running mean of its magnitudes, in units of 2⁻¹²: 0 at first, and after a triple
+//! with the magnitude `m` it grows by `(4096·min(m, 15) − activity) >> 2`, rounded down. The *class* of a number is how
+//! many of [`CLASSES`] it reaches.
 //!
 //! 1. Is anything not 0? Context: the class of the sum of the three activities.
-//! 2. For each channel present: is it not 0? Context: the channel; the class of its activity; the sum of magnitudes before it in the triple, at most 2.
-//!    Left out for the last channel present, if the others are 0: then it is not.
-//! 3. If it is not: is it negative? That is an equiprobable bit. Then its magnitude less 1 in as many ones, at most 14, and, unless there are 14, a
-//!    zero. Context: whether it is the first channel; the class as before; how many ones came before it, at most 3. After 14 ones, what is left, less 14, plus 1, is `e`, which follows
-//!    as distances from a row do: `⌊log₂ e⌋` ones, a zero, and the lowest bits of `e`.
+//! 2. For each channel present: is it not 0? Context: the channel; the class of its activity; the sum of magnitudes
+//!    before it in the triple, at most 2. Left out for the last channel present, if the others are 0: then it is not.
+//! 3. If it is not: is it negative? That is an equiprobable bit. Then its magnitude less 1 in as many ones, at most 14,
+//!    and, unless there are 14, a zero. Context: whether it is the first channel; the class as before; how many ones
+//!    came before it, at most 3. After 14 ones, what is left, less 14, plus 1, is `e`, which follows as distances from
+//!    a row do: `⌊log₂ e⌋` ones, a zero, and the lowest bits of `e`.
 //!
-//! Contexts start with both numbers at [`FIRST`] of their class. A slice is coded as latents are ([`super`]), by itself.
+//! Contexts start with both numbers at [`FIRST`] of their class. A slice is coded as latents are ([`super`]), by
+//! itself.
 
 use std::fmt::Display;
 use std::num::NonZeroU16;
@@ -166,7 +173,8 @@ impl Model {
         }
     }
 
-    /// The next triple, of these channels: the encoder's is `wanted`, the decoder's what it reads; `None` if that has a magnitude beyond 16 bits.
+    /// The next triple, of these channels: the encoder's is `wanted`, the decoder's what it reads; `None` if that has a
+    /// magnitude beyond 16 bits.
     #[inline]
     fn triple(&mut self, decisions: &mut impl Decisions, present: Range<usize>, wanted: [i16; 3]) -> Option<[i16; 3]> {
         let all: i32 = self.activity.iter().sum();
@@ -228,17 +236,18 @@ fn magnitude(decisions: &mut impl Decisions, contexts: &mut [Context], wanted: u
 
 /// Triples of a slice, `T` being a slice of them, of which the same channels are present.
 #[derive(Debug, Clone)]
-pub struct Part<T> {
+pub struct SlicePart<T> {
     /// The channels: `0..3`, `0..1`, `1..3`, or none.
     pub present: Range<usize>,
     /// The triples.
     pub triples: T,
 }
 
-/// Codes the coefficients of one slice; those of channels that are not present must be 0. Of −2¹⁵ the code is that of −2¹⁵ + 1: magnitudes have 15 bits.
-pub fn encode_coefficients(parts: &[Part<&[[i16; 3]]>]) -> Vec<u8> {
+/// Codes the coefficients of one slice; those of channels that are not present must be 0. Of −2¹⁵ the code is that of
+/// −2¹⁵ + 1: magnitudes have 15 bits.
+pub fn encode_coefficients(parts: &[SlicePart<&[[i16; 3]]>]) -> Vec<u8> {
     let (mut model, mut record) = (Model::new(), Record(Vec::new()));
-    for Part { present, triples } in parts.iter().filter(|part| !part.present.is_empty()) {
+    for SlicePart { present, triples } in parts.iter().filter(|part| !part.present.is_empty()) {
         for triple in *triples {
             let within = triple.map(|value| value.max(-i16::MAX));
             let coded = model.triple(&mut record, present.clone(), within);
@@ -250,15 +259,15 @@ pub fn encode_coefficients(parts: &[Part<&[[i16; 3]]>]) -> Vec<u8> {
     slice::sealed(stack)
 }
 
-/// Decodes as many triples as there is room for, which the caller has held against its limits: the work is bounded by that, whatever the bytes.
-/// Triples of parts without channels are left as they are.
+/// Decodes as many triples as there is room for, which the caller has held against its limits: the work is bounded by
+/// that, whatever the bytes. Triples of parts without channels are left as they are.
 ///
 /// # Errors
 /// [`Error::Malformed`], naming `at`, if the bytes are not what [`encode_coefficients`] makes of as many.
-pub fn decode_coefficients(bytes: &[u8], parts: &mut [Part<&mut [[i16; 3]]>], at: &dyn Display) -> Result<()> {
+pub fn decode_coefficients(bytes: &[u8], parts: &mut [SlicePart<&mut [[i16; 3]]>], at: &dyn Display) -> Result<()> {
     let mut stack = slice::open(bytes, at)?;
     let mut model = Model::new();
-    for Part { present, triples } in parts.iter_mut().filter(|part| !part.present.is_empty()) {
+    for SlicePart { present, triples } in parts.iter_mut().filter(|part| !part.present.is_empty()) {
         for triple in triples.iter_mut() {
             let read = model.triple(&mut stack, present.clone(), [0; 3]);
             *triple = read.ok_or_else(|| {
@@ -279,7 +288,7 @@ mod tests {
     /// All channels of as many triples.
     fn decode(bytes: &[u8], count: usize) -> Result<Vec<[i16; 3]>> {
         let mut triples = vec![[0; 3]; count];
-        let whole = Part {
+        let whole = SlicePart {
             present: 0..3,
             triples: &mut triples[..],
         };
@@ -288,7 +297,7 @@ mod tests {
     }
 
     fn encode(triples: &[[i16; 3]]) -> Vec<u8> {
-        encode_coefficients(&[Part { present: 0..3, triples }])
+        encode_coefficients(&[SlicePart { present: 0..3, triples }])
     }
 
     fn channels() -> impl Strategy<Value = Range<usize>> {
@@ -318,13 +327,13 @@ mod tests {
                 }
             }
             let part = |(present, triples): &(Range<usize>, Vec<[i16; 3]>)| (present.clone(), triples.clone());
-            let bytes = encode_coefficients(&parts.each_ref().map(|(present, triples)| Part {
+            let bytes = encode_coefficients(&parts.each_ref().map(|(present, triples)| SlicePart {
                 present: present.clone(),
                 triples: &triples[..],
             }));
             let mut decoded = parts.each_ref().map(part);
             decoded.iter_mut().for_each(|(_, triples)| triples.fill([0; 3]));
-            let mut room = decoded.each_mut().map(|(present, triples)| Part {
+            let mut room = decoded.each_mut().map(|(present, triples)| SlicePart {
                 present: present.clone(),
                 triples: &mut triples[..],
             });

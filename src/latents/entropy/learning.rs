@@ -1,35 +1,41 @@
-//! What a slice teaches about its own predictions while it is coded: means that were too low or too high, here or nearby; scales that were too
-//! narrow or too wide; and means where nothing is predicted.
+//! What a slice teaches about its own predictions while it is coded: means that were too low or too high, here or
+//! nearby; scales that were too narrow or too wide; and means where nothing is predicted.
 //!
-//! All of it starts anew in every slice, and is learned latent by latent in the order of coding, by the encoder and the decoder alike.
-//! Shifts to the right round down.
+//! All of it starts anew in every slice, and is learned latent by latent in the order of coding, by the encoder and the
+//! decoder alike. Shifts to the right round down.
 //!
 //! # Where nothing is predicted
-//! `μ` is the mean of the latents two away along each of the axes along which they differ, in the same slice, of those that were coded before; those count four that
-//! differ along one axis, two along two, one along three; in sixteenths, rounded to the nearest, halves up, and kept to 16 bits. `σ` is the first scale whose likeliest value, with a whole mean, is
-//! no likelier than that of the channel's prior, 63 if there is none. If there are no such voxels, the prior codes the latent, and nothing is learned from it.
-//! Else all that follows holds as for a latent that is predicted, with weights and offsets of their own.
+//! `μ` is the mean of the latents two away along each of the axes along which they differ, in the same slice, of those
+//! that were coded before; those count four that differ along one axis, two along two, one along three; in sixteenths,
+//! rounded to the nearest, halves up, and kept to 16 bits. `σ` is the first scale whose likeliest value, with a whole
+//! mean, is no likelier than that of the channel's prior, 63 if there is none. If there are no such voxels, the prior
+//! codes the latent, and nothing is learned from it. Else all that follows holds as for a latent that is predicted,
+//! with weights and offsets of their own.
 //!
 //! # Residuals
-//! A latent's residual is `16·y − μ`, kept within ±1023. Nearby are the voxels one or two away along each of the axes along which they differ, in the same slice, of
-//! those that were coded before. They make four sets: one away along one axis, one away along more, two away along one, two away along
-//! more. With `n` the voxels of a set that have residuals, and `r` the sum of these in a channel, the set's input is
-//! `(r·⌊2¹⁶ / (n + 1)⌋) >> 12`. Two more inputs are 16 times the residuals of the voxel's own latents one and two channels before; 0 if there are none.
+//! A latent's residual is `16·y − μ`, kept within ±1023. Nearby are the voxels one or two away along each of the axes
+//! along which they differ, in the same slice, of those that were coded before. They make four sets: one away along one
+//! axis, one away along more, two away along one, two away along more. With `n` the voxels of a set that have
+//! residuals, and `r` the sum of these in a channel, the set's input is `(r·⌊2¹⁶ / (n + 1)⌋) >> 12`. Two more inputs
+//! are 16 times the residuals of the voxel's own latents one and two channels before; 0 if there are none.
 //!
 //! # Means
-//! Every channel has an offset, in units of 2⁻¹⁰ of a sixteenth, at first 0, and a weight for every input, in units of 2⁻¹⁸, at first ⅛ for what is one away,
-//! ¼ for what is two away, and 0; where nothing is predicted all are 0. `μ′ = μ + (Σ (weight >> 6)·input + 2⁶·offset + 2¹⁵) >> 16`, kept within ±2047, is used.
-//! Then with the error `16·y − μ′`, kept within ±16, the offset grows by 32 times the error, and is kept within ±2²¹; every weight
-//! by the error times its input, that kept within ±256, and is kept within ±2¹⁹.
+//! Every channel has an offset, in units of 2⁻¹⁰ of a sixteenth, at first 0, and a weight for every input, in units of
+//! 2⁻¹⁸, at first ⅛ for what is one away, ¼ for what is two away, and 0; where nothing is predicted all are 0. `μ′ = μ
+//! + (Σ (weight >> 6)·input + 2⁶·offset + 2¹⁵) >> 16`, kept within ±2047, is used. Then with the error `16·y − μ′`,
+//! kept within ±16, the offset grows by 32 times the error, and is kept within ±2²¹; every weight by the error times
+//! its input, that kept within ±256, and is kept within ±2¹⁹.
 //!
 //! # Scales
-//! A latent's *slope* tells how much likelier a wider scale would have made it: with `p₊` and `p₋` what its entry (the last one, if it has none of its own there)
-//! has of 2¹⁶ in the rows of the scale indices `σ′ + 1` and `σ′ − 1` (kept in 0 to 63) and of `μ′`, it is `2¹²·(p₊ − p₋) / (p₊ + p₋)`, rounded towards
-//! zero. A voxel's surprise is the sum of the slopes of its latents that have residuals.
+//! A latent's *slope* tells how much likelier a wider scale would have made it: with `p₊` and `p₋` what its entry (the
+//! last one, if it has none of its own there) has of 2¹⁶ in the rows of the scale indices `σ′ + 1` and `σ′ − 1` (kept
+//! in 0 to 63) and of `μ′`, it is `2¹²·(p₊ − p₋) / (p₊ + p₋)`, rounded towards zero. A voxel's surprise is the sum of
+//! the slopes of its latents that have residuals.
 //!
-//! Places are of six kinds: by whether the mean surprise of the voxels nearby that have residuals is at least −256, 0, 256 and 768, and those where there are none. Every
-//! channel has an offset for each kind, and one for all, in units of 2⁻¹⁶ of a scale index, at first 0. `σ′ = σ + (both offsets + 2¹⁵) >> 16`, kept in 0
-//! to 63, is used, and then they grow by 24 and 36 times the slope, and are kept within ±2²².
+//! Places are of six kinds: by whether the mean surprise of the voxels nearby that have residuals is at least −256, 0,
+//! 256 and 768, and those where there are none. Every channel has an offset for each kind, and one for all, in units of
+//! 2⁻¹⁶ of a scale index, at first 0. `σ′ = σ + (both offsets + 2¹⁵) >> 16`, kept in 0 to 63, is used, and then they
+//! grow by 24 and 36 times the slope, and are kept within ±2²².
 
 use b2p_kernels::LIMIT;
 
@@ -181,8 +187,8 @@ impl<'a> Learning<'a> {
         };
     }
 
-    /// The mean and scale index that the voxel's next latent, of channel `c`, is coded under, for those that were predicted. `coded` are the
-    /// slice's latents so far, [voxels, K].
+    /// The mean and scale index that the voxel's next latent, of channel `c`, is coded under, for those that were
+    /// predicted. `coded` are the slice's latents so far, [voxels, K].
     pub fn prepare(&mut self, c: usize, mu: i16, sigma: u8, coded: &[i16]) -> (i16, u8) {
         let k = self.channels.len();
         let here = &mut self.here;

@@ -29,8 +29,8 @@ pub fn encode_level(tables: &Tables, condition: Condition, latents: &[i16], slic
 /// Decodes the latents of a level of `voxels` voxels, whose number the caller has held against its limits.
 ///
 /// # Errors
-/// [`Error::Malformed`] if there are more or fewer slices than the voxels fill; else the error of the first slice that has one;
-/// [`Error::Cancelled`].
+/// [`Error::Malformed`] if there are more or fewer slices than the voxels fill; else the error of the first slice that
+/// has one; [`Error::Cancelled`].
 ///
 /// # Panics
 /// As [`encode_level`] does.

@@ -186,7 +186,8 @@ impl Parent {
     }
 }
 
-/// The bits of an axis of a key, one less, as they are, or one more for a step of 0, 1 or 2. Beyond the cube no key is that of a parent.
+/// The bits of an axis of a key, one less, as they are, or one more for a step of 0, 1 or 2. Beyond the cube no key is
+/// that of a parent.
 fn moved(key: u64, axis: u32, step: u32) -> u64 {
     let (bits, one) = (X << axis, 1 << axis);
     match step {

@@ -1,4 +1,5 @@
-//! A level that nothing below predicts, predicted from itself: its voxels are coded octant by octant, and each pass from those before it.
+//! A level that nothing below predicts, predicted from itself: its voxels are coded octant by octant, and each pass
+//! from those before it.
 
 use std::convert::Infallible;
 use std::ops::Range;
@@ -18,13 +19,13 @@ const PASSES: u64 = 8;
 
 /// What predicts a pass.
 ///
-/// Called with the range of the level's voxels that a slice holds, the voxels of the pass, ascending, and the latents of the slice so
-/// far, [voxels, K]; it may look at those of lower octants alone. Gives means in sixteenths and scale indices for all latents of the
-/// pass, [`super::UNPREDICTED`] where it knows nothing.
+/// Called with the range of the level's voxels that a slice holds, the voxels of the pass, ascending, and the latents
+/// of the slice so far, [voxels, K]; it may look at those of lower octants alone. Gives means in sixteenths and scale
+/// indices for all latents of the pass, [`super::UNPREDICTED`] where it knows nothing.
 pub type Predict<'a> = dyn Fn(Range<usize>, &[u32], &[i16]) -> (Vec<i16>, Vec<u8>) + Sync + 'a;
 
-/// Codes a level's latents in slices of `slice_voxels` voxels; `keys` are the Morton keys of its voxels, ascending, whose lowest three bits are
-/// a voxel's octant.
+/// Codes a level's latents in slices of `slice_voxels` voxels; `keys` are the Morton keys of its voxels, ascending,
+/// whose lowest three bits are a voxel's octant.
 ///
 /// # Panics
 /// If the latents are not K per key, `slice_voxels` is 0, or `predict` gives other than one mean and scale per latent.
@@ -57,8 +58,8 @@ pub fn encode_passes(
         .collect()
 }
 
-/// Goes through a slice in the order of coding. `latents` are those of the slice so far, [voxels, K]; `code` gets each latent's voxel
-/// in the slice, its channel, its mean in sixteenths and its scale index, and says what it is, or fails.
+/// Goes through a slice in the order of coding. `latents` are those of the slice so far, [voxels, K]; `code` gets each
+/// latent's voxel in the slice, its channel, its mean in sixteenths and its scale index, and says what it is, or fails.
 pub(super) fn each_latent<E>(
     tables: &Tables,
     keys: &[u64],
@@ -95,7 +96,8 @@ pub(super) fn each_latent<E>(
     Ok(())
 }
 
-/// Decodes what [`encode_passes`] made. The work is bounded by the number of voxels, which the caller has held against its limits.
+/// Decodes what [`encode_passes`] made. The work is bounded by the number of voxels, which the caller has held against
+/// its limits.
 ///
 /// # Errors
 /// As [`super::decode_level`].

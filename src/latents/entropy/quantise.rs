@@ -17,12 +17,14 @@ const MADE_UP: f32 = 0.05;
 
 /// How real latents become whole ones.
 ///
-/// Each becomes the whole number of small `(y − q)² + price · bits(q)` that is found from the nearest one on, either way, as long as the next is better.
+/// Each becomes the whole number of small `(y − q)² + price · bits(q)` that is found from the nearest one on, either
+/// way, as long as the next is better.
 #[derive(Debug, Clone, Copy)]
 pub struct Rounding<'a> {
     /// Latents are kept within ± this.
     pub limit: i16,
-    /// For each channel what a bit is worth, in squared latent steps, at least 0: at 0 every latent goes to its nearest whole number.
+    /// For each channel what a bit is worth, in squared latent steps, at least 0: at 0 every latent goes to its nearest
+    /// whole number.
     pub prices: &'a [f32],
 }
 
@@ -51,7 +53,8 @@ impl Rounding<'_> {
 /// Rounds the latents [voxels, K] of a level that is coded by [`super::encode_level`].
 ///
 /// # Panics
-/// If the latents are not whole voxels, the condition has not one mean and scale for each, or there is not one price for each channel.
+/// If the latents are not whole voxels, the condition has not one mean and scale for each, or there is not one price
+/// for each channel.
 pub fn quantise(tables: &Tables, condition: Condition, latents: &[f32], rounding: Rounding) -> Vec<i16> {
     condition.check(tables, latents.len());
     let k = tables.channels();
@@ -68,9 +71,10 @@ pub fn quantise(tables: &Tables, condition: Condition, latents: &[f32], rounding
     out
 }
 
-/// Rounds the latents [voxels, K] of a level that is coded by [`super::encode_passes`], in the order of coding: each pass is predicted
-/// from those before it as they were rounded. What bits are too dear for stays away from a whole smooth place, which shows; so where there is a price, a twentieth
-/// of what the latents of siblings (voxels of one parent) before it are off, all of them together, counts as a latent's own.
+/// Rounds the latents [voxels, K] of a level that is coded by [`super::encode_passes`], in the order of coding: each
+/// pass is predicted from those before it as they were rounded. What bits are too dear for stays away from a whole
+/// smooth place, which shows; so where there is a price, a twentieth of what the latents of siblings (voxels of one
+/// parent) before it are off, all of them together, counts as a latent's own.
 ///
 /// # Panics
 /// As [`super::encode_passes`] does, and if there is not one price for each channel.

@@ -79,7 +79,8 @@ pub(super) fn row(tables: &Tables, channel: usize, mu: i16, sigma: u8) -> (Row<'
 /// Codes the latents of one slice, voxel by voxel. Never fails: every `i16` has a code under every row.
 ///
 /// # Panics
-/// If the latents are not whole voxels, the condition has not one mean and scale for each, or a scale index is above 63.
+/// If the latents are not whole voxels, the condition has not one mean and scale for each, or a scale index is above
+/// 63.
 pub fn encode_slice(tables: &Tables, condition: Condition, latents: &[i16]) -> Vec<u8> {
     condition.check(tables, latents.len());
     let mut stack = Stack::new(END_STATE, Vec::new());
@@ -357,8 +358,8 @@ mod tests {
             encode_slice(&tables(), Condition::Prior, &[]),
             [0xb9, 0x79, 0x37, 0x9e, 1]
         );
-        // By hand: both channels of one voxel, the second read last so put on first. Their rows are -1, 0, 1 and the escape
-        // with 16384, 32768, 16383 and 1 of 65536.
+        // By hand: both channels of one voxel, the second read last so put on first. Their rows are -1, 0, 1 and the
+        // escape with 16384, 32768, 16383 and 1 of 65536.
         let state = END_STATE;
         let state = (state / 32_768) << 16 | (16_384 + state % 32_768);
         let state = (state / 16_383) << 16 | (49_152 + state % 16_383);

@@ -35,8 +35,8 @@ impl Tables {
     /// Checks and takes the tables `cdf.gauss` (1024 rows) and `cdf.prior` (one row per channel).
     ///
     /// # Errors
-    /// [`crate::Error::Malformed`], naming table and row, unless offsets ascend from 0 to the number of entries, every row has at
-    /// least two entries that sum to 65,536, and stands for values that `i16` holds.
+    /// [`crate::Error::Malformed`], naming table and row, unless offsets ascend from 0 to the number of entries, every
+    /// row has at least two entries that sum to 65,536, and stands for values that `i16` holds.
     pub fn new(gauss: RawRows, prior: RawRows) -> Result<Self> {
         let gauss = Rows::new(gauss, Some(SCALES * FRACTIONS))?;
         let prior = Rows::new(prior, None)?;

@@ -1,4 +1,5 @@
-//! A level's voxels in parts, each with what lies around it: their children are eight times as many, and need not all be in memory at once.
+//! A level's voxels in parts, each with what lies around it: their children are eight times as many, and need not all
+//! be in memory at once.
 
 use std::ops::Range;
 
@@ -8,7 +9,7 @@ use rayon::prelude::*;
 use crate::geometry::KernelMap;
 
 /// Some voxels of a level, one after the other, and rings of neighbours around them.
-pub(super) struct Part {
+pub(super) struct VoxelPart {
     /// The voxels' rows in the level: first those of the part, then ring by ring.
     pub voxels: Vec<u32>,
     /// How many voxels there are without any ring, with one, and so on.
@@ -18,25 +19,26 @@ pub(super) struct Part {
 }
 
 /// Cuts a level into parts.
-pub(super) struct Parts<'a> {
+pub(super) struct VoxelParts<'a> {
     map: &'a KernelMap,
     /// For each voxel, its place in the present part.
     places: Vec<u32>,
 }
 
-impl<'a> Parts<'a> {
+impl<'a> VoxelParts<'a> {
     pub fn new(map: &'a KernelMap) -> Self {
-        Parts {
+        VoxelParts {
             map,
             places: vec![KernelMap::ABSENT; map.len()],
         }
     }
 
-    /// The part of these rows, with at least one ring around it: of fewer of them, down to one, if with the rings they were more than `most`.
+    /// The part of these rows, with at least one ring around it: of fewer of them, down to one, if with the rings they
+    /// were more than `most`.
     ///
-    /// Two steps from child to neighbouring child lead to a neighbour of the parent at most: what `2n` layers of 3³ make of the children of
-    /// the part and of `n` rings is, for the part itself, what they make of all children.
-    pub fn part(&mut self, mut rows: Range<usize>, rings: usize, most: usize) -> Part {
+    /// Two steps from child to neighbouring child lead to a neighbour of the parent at most: what `2n` layers of 3³
+    /// make of the children of the part and of `n` rings is, for the part itself, what they make of all children.
+    pub fn part(&mut self, mut rows: Range<usize>, rings: usize, most: usize) -> VoxelPart {
         let (mut voxels, mut ends) = self.surround(rows.clone(), rings);
         while voxels.len() > most && rows.len() > 1 {
             self.forget(&voxels);
@@ -56,7 +58,7 @@ impl<'a> Parts<'a> {
             }
         });
         self.forget(&voxels);
-        Part {
+        VoxelPart {
             voxels,
             ends,
             map: KernelMap::new(27, near),
@@ -65,7 +67,7 @@ impl<'a> Parts<'a> {
 
     /// Gives rows and the rings around them their places, ring by ring, and tells how many there are with each.
     fn surround(&mut self, rows: Range<usize>, rings: usize) -> (Vec<u32>, Vec<usize>) {
-        let Parts { map, places } = self;
+        let VoxelParts { map, places } = self;
         let mut voxels: Vec<u32> = (rows.start as u32..rows.end as u32).collect();
         for (&voxel, place) in voxels.iter().zip(0..) {
             places[voxel as usize] = place;
@@ -108,7 +110,7 @@ mod tests {
         });
         let octree = Octree::new(Voxels::new(6, bowl.collect())).unwrap();
         let map = &octree.kernel_map(6);
-        let mut parts = Parts::new(map);
+        let mut parts = VoxelParts::new(map);
         for (rows, rings) in [(0..100, 1), (700..1400, 3), (4000..map.len(), 2)] {
             let part = parts.part(rows.clone(), rings, map.len());
             assert_eq!(part.ends.len(), rings + 1);
@@ -133,7 +135,7 @@ mod tests {
     fn a_part_whose_surroundings_are_too_many_is_made_smaller() {
         let octree = Octree::new(Voxels::new(4, (0..1 << 12).collect())).unwrap();
         let map = &octree.kernel_map(4);
-        let mut parts = Parts::new(map);
+        let mut parts = VoxelParts::new(map);
         let whole = parts.part(0..512, 3, map.len());
         assert_eq!((whole.ends[0], whole.voxels.len()), (512, 11 * 11 * 11));
         let part = parts.part(0..512, 3, 1000);

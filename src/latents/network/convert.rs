@@ -16,9 +16,9 @@ use crate::layers::{Pool, apply, apply_f32, concat, reals};
 impl Model {
     /// The encoder's features of every coded level, finest first: [voxels, C] each.
     ///
-    /// `colours` are those of the level above the finest coded one, in 0..=1, and `maps[0]` is its 3³ kernel map; the maps of the
-    /// coded levels follow, down to the base level's, and `occupancy[i]` says which children in `maps[i]` the voxels of
-    /// `maps[i + 1]` have.
+    /// `colours` are those of the level above the finest coded one, in 0..=1, and `maps[0]` is its 3³ kernel map; the
+    /// maps of the coded levels follow, down to the base level's, and `occupancy[i]` says which children in `maps[i]`
+    /// the voxels of `maps[i + 1]` have.
     ///
     /// # Errors
     /// [`crate::Error::Unsupported`] if the model can only decode.
@@ -49,8 +49,8 @@ impl Model {
         Ok(out)
     }
 
-    /// The latents [voxels, K] of a role before they are rounded and bounded ([`crate::latents::entropy::quantise`]), from its encoder features
-    /// and, above role 0, its context. None of a role that has none.
+    /// The latents [voxels, K] of a role before they are rounded and bounded ([`crate::latents::entropy::quantise`]),
+    /// from its encoder features and, above role 0, its context. None of a role that has none.
     ///
     /// # Errors
     /// [`crate::Error::Unsupported`] if the model can only decode.
@@ -88,8 +88,8 @@ impl Model {
     }
 }
 
-/// What a layer of the encoder is computed in. The finest level has most of the voxels, and what is made of it is averaged before anything
-/// comes of it: that may be off a little, but for the colours themselves.
+/// What a layer of the encoder is computed in. The finest level has most of the voxels, and what is made of it is
+/// averaged before anything comes of it: that may be off a little, but for the colours themselves.
 pub(super) fn precision(layer: &Spec) -> Precision {
     match layer.name.starts_with("fc.3.") && layer.cin > 3 {
         true => Precision::Fastest,

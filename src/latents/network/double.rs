@@ -104,8 +104,8 @@ impl Conv for Double {
 
 #[doc(hidden)]
 impl Model {
-    /// As [`Model::generate_with`], with the weights of the file and everything else in double precision, rounded to `f32` at the end: slow,
-    /// and what [`super::Precision`]s are measured against.
+    /// As [`Model::generate_with`], with the weights of the file and everything else in double precision, rounded to
+    /// `f32` at the end: slow, and what [`super::Precision`]s are measured against.
     ///
     /// # Errors
     /// As [`Model::generate_with`].

@@ -15,8 +15,8 @@ pub(super) const SIGMAS: i16 = 64;
 impl Model {
     /// The context of a role's voxels: their parents' features, upsampled.
     ///
-    /// `g` holds the features [parents, C] of the role below; bit `x + 2y + 4z` of `occupancy[p]` tells whether parent `p` has
-    /// the child in that octant. Gives [children, C].
+    /// `g` holds the features [parents, C] of the role below; bit `x + 2y + 4z` of `occupancy[p]` tells whether parent
+    /// `p` has the child in that octant. Gives [children, C].
     ///
     /// # Panics
     /// If `role` is not 1 or 2, or `g` and `occupancy` disagree in length.
@@ -57,7 +57,8 @@ impl Model {
         role < self.shape.fr_roles
     }
 
-    /// How the latents of a role are distributed: means in sixteenths, in ±2047, and scale indices below 64, [voxels, K] each.
+    /// How the latents of a role are distributed: means in sixteenths, in ±2047, and scale indices below 64, [voxels,
+    /// K] each.
     ///
     /// `context` is [`Model::upsample`]'s, `map` the level's 3³ kernel map.
     ///
@@ -90,8 +91,8 @@ impl Model {
         (mu, indices)
     }
 
-    /// The features [voxels, C] of a role, from its latents [voxels, K], none if it has none, and, above role 0, its context [voxels, C]:
-    /// the context itself where the model has nothing that reconstructs.
+    /// The features [voxels, C] of a role, from its latents [voxels, K], none if it has none, and, above role 0, its
+    /// context [voxels, C]: the context itself where the model has nothing that reconstructs.
     ///
     /// # Panics
     /// If `role` is above 2, the context is there for role 0 or not for another, or lengths disagree.

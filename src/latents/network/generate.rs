@@ -6,7 +6,7 @@ use b2p_kernels::{ExactConv, FloatConv, Precision as Sums, Taps, zeros};
 use rayon::prelude::*;
 
 use super::Model;
-use super::children::{Part, Parts};
+use super::children::{VoxelPart, VoxelParts};
 use super::head::Head;
 use super::structure::{Generate, RAW};
 use crate::error::{Error, Result};
@@ -88,8 +88,8 @@ impl Model {
 
     /// The raw parameters of the Gaussians of a role's level, [`RAW`] numbers each: see `latents::activate`.
     ///
-    /// `g` holds its features [voxels, C], `map` is its 3³ kernel map. Role 2 gives one Gaussian per voxel, role 1 eight, those of
-    /// all eight children of the first voxel first. All numbers are finite.
+    /// `g` holds its features [voxels, C], `map` is its 3³ kernel map. Role 2 gives one Gaussian per voxel, role 1
+    /// eight, those of all eight children of the first voxel first. All numbers are finite.
     ///
     /// # Errors
     /// [`crate::Error::Unsupported`], naming the roles that have one, if the model has no such generator for `role`.
@@ -200,11 +200,11 @@ impl Model {
     ) {
         let (isa, h, n) = (self.isa, gg.head.channels, map.len());
         let layers = 2 * gg.after.len() + 1;
-        let mut parts = Parts::new(map);
+        let mut parts = VoxelParts::new(map);
         let (mut first, mut rest) = (0, out);
         while first < n {
             let rows = first..n.min(first + part);
-            let Part { voxels, ends, map } = parts.part(rows, layers.div_ceil(2), AROUND * part);
+            let VoxelPart { voxels, ends, map } = parts.part(rows, layers.div_ceil(2), AROUND * part);
             let (out, after) = rest.split_at_mut(ends[0] * 8 * RAW);
             (first, rest) = (first + ends[0], after);
             // After that many layers, the children whose results some later layer reads.
@@ -232,11 +232,12 @@ fn no_such_heads(heads: Heads) -> Error {
     missing("generating Gaussians with these heads", detail)
 }
 
-/// Voxels whose children are generated at once. Fewer need less memory, and more time for the rings around them: of a body's 59,046 voxels at
-/// level 8 (`lite`) parts of 16,384 take 165 MB in all and an eighth longer than all at once with 249 MB.
+/// Voxels whose children are generated at once. Fewer need less memory, and more time for the rings around them: of a
+/// body's 59,046 voxels at level 8 (`lite`) parts of 16,384 take 165 MB in all and an eighth longer than all at once
+/// with 249 MB.
 const PART: usize = 32768;
-/// How many times as many voxels as a part has may be in memory with it and the rings around it: more are only in streams that are
-/// made for it, whose parts are smaller then.
+/// How many times as many voxels as a part has may be in memory with it and the rings around it: more are only in
+/// streams that are made for it, whose parts are smaller then.
 const AROUND: usize = 4;
 /// As many voxels at most are in memory with their children.
 pub(crate) const AT_ONCE: usize = AROUND * PART;

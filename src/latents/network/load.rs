@@ -31,8 +31,8 @@ impl Tensors<'_> {
         Shape::from_json(json)
     }
 
-    /// What a bit is worth when latents are rounded, in squared latent steps, for each of a role's K channels, if the description says: 0 if it
-    /// does not.
+    /// What a bit is worth when latents are rounded, in squared latent steps, for each of a role's K channels, if the
+    /// description says: 0 if it does not.
     ///
     /// # Errors
     /// [`Error::Malformed`] if it is neither a number from 0 to 100 nor K such numbers for each role.
@@ -53,8 +53,8 @@ impl Tensors<'_> {
         })
     }
 
-    /// What a stream calls the model: XXH3-128 of the description's exact part, and of name, type, extents and bytes of every
-    /// tensor that bears on the decoded bits, in the order of their names.
+    /// What a stream calls the model: XXH3-128 of the description's exact part, and of name, type, extents and bytes of
+    /// every tensor that bears on the decoded bits, in the order of their names.
     pub fn id(&self, shape: &Shape) -> [u8; 16] {
         const EXACT: [&str; 6] = ["up.", "base.", "near.", "pem.", "fr.", "cdf."];
         let mut hash = Xxh3Default::new();

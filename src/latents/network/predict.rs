@@ -1,4 +1,5 @@
-//! Latents that are predicted from those of neighbours which were coded before them: a level's voxels are coded octant by octant.
+//! Latents that are predicted from those of neighbours which were coded before them: a level's voxels are coded octant
+//! by octant.
 
 use std::ops::Range;
 
@@ -13,7 +14,8 @@ use super::{Model, Shape};
 use crate::geometry::KernelMap;
 use crate::latents::entropy::UNPREDICTED;
 
-/// Sets of neighbours that lie in another octant than the voxel itself: one for every set of axes along which they differ.
+/// Sets of neighbours that lie in another octant than the voxel itself: one for every set of axes along which they
+/// differ.
 const OTHERS: usize = 7;
 /// A scale index enters a network shifted left by this.
 const SIGMA_SHIFT: u8 = 3;
@@ -52,8 +54,9 @@ impl Model {
         self.neighbours(role).is_some()
     }
 
-    /// What predicts the passes over a level for [`crate::latents::entropy::encode_passes`] and [`crate::latents::entropy::decode_passes`]: [`Model::pass_parameters`] of
-    /// a role, for a level with these octants, this 3³ kernel map, and these parameters of all its voxels, if it has any.
+    /// What predicts the passes over a level for [`crate::latents::entropy::encode_passes`] and
+    /// [`crate::latents::entropy::decode_passes`]: [`Model::pass_parameters`] of a role, for a level with these
+    /// octants, this 3³ kernel map, and these parameters of all its voxels, if it has any.
     pub fn passes<'a>(
         &'a self,
         role: usize,
@@ -74,20 +77,24 @@ impl Model {
         }
     }
 
-    /// How the latents of a pass are distributed: means in sixteenths, in ±2047, and scale indices below 64; [voxels, K] each.
+    /// How the latents of a pass are distributed: means in sixteenths, in ±2047, and scale indices below 64; [voxels,
+    /// K] each.
     ///
-    /// `level` is what [`Model::entropy_parameters`] gave for all voxels of the level; the base level has none. A voxel with no neighbour
-    /// that was coded before keeps the level's parameters; of the base level its scale index is [`UNPREDICTED`].
+    /// `level` is what [`Model::entropy_parameters`] gave for all voxels of the level; the base level has none. A voxel
+    /// with no neighbour that was coded before keeps the level's parameters; of the base level its scale index is
+    /// [`UNPREDICTED`].
     ///
-    /// Inputs of the network, in steps of 2^−shift, as latents have elsewhere. For each set of axes `s = 1 … 7` (1 = x, 2 = y, 4 = z) the
-    /// neighbours that differ along just these axes, if their octant is the lower one: the means of their latents, rounded to the
-    /// nearest (halves up), and 1 if there are any; zeros else. Above the base level it is not latents that count but what is left of
-    /// them without their means (rounded down), and those of the voxel's parent make a set by themselves, before the others; then
-    /// come the voxel's own means (rounded down) and scale indices (in eighths). Last the bits x, y, z of the octant. The network's results are, above
-    /// the base level, added to the level's.
+    /// Inputs of the network, in steps of 2^−shift, as latents have elsewhere. For each set of axes `s = 1 … 7` (1 = x,
+    /// 2 = y, 4 = z) the neighbours that differ along just these axes, if their octant is the lower one: the means of
+    /// their latents, rounded to the nearest (halves up), and 1 if there are any; zeros else. Above the base level it
+    /// is not latents that count but what is left of them without their means (rounded down), and those of the voxel's
+    /// parent make a set by themselves, before the others; then come the voxel's own means (rounded down) and scale
+    /// indices (in eighths). Last the bits x, y, z of the octant. The network's results are, above the base level,
+    /// added to the level's.
     ///
     /// # Panics
-    /// If the role has no passes, `level` is there for the base level or not for another, voxels are of several octants, or lengths disagree.
+    /// If the role has no passes, `level` is there for the base level or not for another, voxels are of several
+    /// octants, or lengths disagree.
     pub fn pass_parameters(&self, role: usize, pass: &Pass, level: Option<(&[i16], &[u8])>) -> Parameters {
         let k = self.shape.latents;
         let network = self.neighbours(role);
@@ -240,8 +247,8 @@ impl Gather {
         }
     }
 
-    /// Fills what is known of a voxel's neighbours at the start of `input`, and its octant at the end; whether any neighbour is known.
-    /// `add` adds the values of a voxel.
+    /// Fills what is known of a voxel's neighbours at the start of `input`, and its octant at the end; whether any
+    /// neighbour is known. `add` adds the values of a voxel.
     fn fill(&mut self, pass: &Pass, voxel: usize, add: impl Fn(usize, &mut [i32]), input: &mut [i16]) -> bool {
         let k = self.channels;
         let row = pass.map.row(voxel);

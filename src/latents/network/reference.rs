@@ -1,8 +1,9 @@
-//! The network by its definition, in f64 and with voxels found by their coordinates: what tests hold the real one against.
+//! The network by its definition, in f64 and with voxels found by their coordinates: what tests hold the real one
+//! against.
 //!
 //! Shares with it the list of modules and layers (`structure.rs`) and nothing else.
 
-mod passes;
+mod neighbours;
 
 use std::collections::HashMap;
 

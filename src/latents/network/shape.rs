@@ -19,7 +19,8 @@ pub struct Shape {
     pub channels: usize,
     /// K: latents per voxel.
     pub latents: usize,
-    /// How many roles have latents, the first ones: what is known of the levels of others comes from the level below alone.
+    /// How many roles have latents, the first ones: what is known of the levels of others comes from the level below
+    /// alone.
     #[serde(default = "all_roles")]
     pub latent_roles: usize,
     /// Whether what predicts from neighbours learns from what is coded: see [`crate::latents::entropy`].
@@ -37,10 +38,12 @@ pub struct Shape {
     pub pem_blocks: usize,
     /// Inception blocks of each feature reconstruction (FR).
     pub fr_blocks: usize,
-    /// How many roles have one: at least those that have latents. The features of others are what the level below tells.
+    /// How many roles have one: at least those that have latents. The features of others are what the level below
+    /// tells.
     #[serde(default = "all_roles")]
     pub fr_roles: usize,
-    /// The Gaussian generators (GG): one for each role that has Gaussians, and if there are quick ones, another for each of these.
+    /// The Gaussian generators (GG): one for each role that has Gaussians, and if there are quick ones, another for
+    /// each of these.
     pub gg: Vec<Head>,
     /// How a feature gets to the children.
     pub upsample: Upsample,
@@ -60,7 +63,8 @@ pub struct Shape {
     pub scale_bias: f32,
     /// Added to the raw opacity before the sigmoid.
     pub opacity_bias: f32,
-    /// Variance that pictures widen the Gaussians by, in squared voxels ([`crate::gaussians::Gaussians::blur`]): about what they were trained with.
+    /// Variance that pictures widen the Gaussians by, in squared voxels ([`crate::gaussians::Gaussians::blur`]): about
+    /// what they were trained with.
     #[serde(default = "first_blur")]
     pub blur: f32,
     /// The weight of distortion against rate that the model was trained with.

@@ -1,7 +1,7 @@
 //! What the network consists of: its modules, their layers, and what those are called in a model file.
 //!
-//! Written once, for any kind of layer `L`: the layers that run, the ones that tests compute by definition, the ones to be made up.
-//! Every constructor asks its `layer` function for one layer after the other.
+//! Written once, for any kind of layer `L`: the layers that run, the ones that tests compute by definition, the ones to
+//! be made up. Every constructor asks its `layer` function for one layer after the other.
 
 use super::head::Head;
 use super::shape::{Shape, Upsample};
@@ -13,13 +13,14 @@ pub const RAW: usize = 14;
 /// Levels that a stream may code: roles 0, 1, 2. The level above them, which the encoder starts from, has role 3.
 pub const ROLES: usize = 3;
 
-/// What is known of a voxel of the base level: from each of the seven sets of neighbours that lie in one other octant the mean of each of
-/// `latents` latents and whether there are any, and the three bits of its own octant.
+/// What is known of a voxel of the base level: from each of the seven sets of neighbours that lie in one other octant
+/// the mean of each of `latents` latents and whether there are any, and the three bits of its own octant.
 pub(super) fn base_inputs(latents: usize) -> usize {
     7 * (latents + 1) + 3
 }
 
-/// What is known of a voxel above the base level: the same, of neighbours of the same parent and of others; its own means and scales.
+/// What is known of a voxel above the base level: the same, of neighbours of the same parent and of others; its own
+/// means and scales.
 pub(super) fn near_inputs(latents: usize) -> usize {
     2 * 7 * (latents + 1) + 2 * latents + 3
 }
@@ -60,8 +61,8 @@ pub(crate) struct Generate<L> {
 impl<L> Generate<L> {
     /// The same network of other layers; `make` is told the steps of a layer's input and output.
     ///
-    /// `scales`: the steps of the chain before layer 4, of the inside of each of its blocks, and the same after it. The generator's
-    /// input comes in steps of `input`, its output in steps of 1.
+    /// `scales`: the steps of the chain before layer 4, of the inside of each of its blocks, and the same after it. The
+    /// generator's input comes in steps of `input`, its output in steps of 1.
     ///
     /// # Panics
     /// If there are not [`Generate::scales`] scales.

@@ -14,8 +14,8 @@ const WEIGHT: i32 = 127;
 /// Magnitude of the largest value that a table row covers; the escape has the rest.
 const REACH: i32 = 24;
 
-/// The content of a model file of that shape with pseudo-random weights, scaled so that activations neither fade nor saturate, and
-/// with sound tables: Gaussian ones, and for the base level a Gaussian of σ = 3 in every channel.
+/// The content of a model file of that shape with pseudo-random weights, scaled so that activations neither fade nor
+/// saturate, and with sound tables: Gaussian ones, and for the base level a Gaussian of σ = 3 in every channel.
 ///
 /// # Panics
 /// If the shape is one that loading would refuse.
@@ -218,7 +218,8 @@ fn gauss_rows() -> Vec<(i16, Vec<u16>)> {
     rows
 }
 
-/// A table row of N(mean, sigma): the lowest value, and the probabilities of the values and of the escape in 2⁻¹⁶, less 1 each.
+/// A table row of N(mean, sigma): the lowest value, and the probabilities of the values and of the escape in 2⁻¹⁶, less
+/// 1 each.
 fn row(sigma: f64, mean: f64) -> (i16, Vec<u16>) {
     let reach = ((5.0 * sigma) as i32 + 2).min(REACH);
     let below = |edge: f64| normal_cdf((edge - mean) / sigma);

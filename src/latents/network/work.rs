@@ -128,7 +128,8 @@ impl Support {
 
     /// Of all eight children of every voxel.
     fn of_children(map: &KernelMap) -> Support {
-        // Along an axis, of a voxel's two children each reads itself and the other, and one of them one of the neighbour's.
+        // Along an axis, of a voxel's two children each reads itself and the other, and one of them one of the
+        // neighbour's.
         let along = |step: usize| if step % 3 == 1 { 4 } else { 1 };
         let mut pairs = 0;
         for row in map.rows().chunks_exact(27) {

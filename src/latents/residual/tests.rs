@@ -10,9 +10,9 @@ fn keys(seed: u64, count: usize, depth: u32) -> Vec<u64> {
 }
 
 /// Both bands in the same steps.
-fn steps(luma: u8, chroma: u8) -> Precision {
+fn steps(luma: u8, chroma: u8) -> ResidualSteps {
     let steps = Steps { luma, chroma };
-    Precision {
+    ResidualSteps {
         fine: steps,
         coarse: steps,
         boundary: 6,
@@ -187,12 +187,12 @@ proptest! {
     #[test]
     fn bands_of_any_steps_come_back_and_are_zero_where_they_have_none(
         own in any::<[bool; 4]>().prop_filter("some step", |own| own.contains(&true)),
-        boundary in 0..=Precision::MAX_BOUNDARY,
+        boundary in 0..=ResidualSteps::MAX_BOUNDARY,
         seed in any::<u64>(),
         count in 1..200usize,
     ) {
         let [a, b, c, d] = std::array::from_fn(|i| [3, 5, 7, 11][i] * u8::from(own[i]));
-        let precision = Precision {
+        let precision = ResidualSteps {
             fine: Steps { luma: a, chroma: b },
             coarse: Steps { luma: c, chroma: d },
             boundary,
@@ -216,7 +216,7 @@ fn the_coarse_band_alone_is_the_mean_of_each_cell() {
     // All of four cells of 4³ voxels, which join at bits 6 and 7.
     let keys: Vec<u64> = (0..256).collect();
     let missing = colours(5, keys.len());
-    let precision = Precision {
+    let precision = ResidualSteps {
         fine: Steps::NONE,
         ..steps(1, 1)
     };

@@ -5,10 +5,11 @@ mod framing;
 
 use std::ops::Range;
 
-use glam::{DAffine3, DMat3};
+use glam::{DAffine3, DMat3, DVec3};
 
 use b2p_kernels::splat::{Bounds, TILE};
 
+use crate::axes::Up;
 use crate::error::{Error, Result};
 
 pub use framing::Extent;
@@ -112,6 +113,16 @@ impl Camera {
         self.fy /= distance;
         self.check()?;
         Ok(self)
+    }
+
+    /// The camera of [`Camera::orbit_around`] `target` with another axis up: the world is turned about the target so that
+    /// `up` becomes +y.
+    pub fn with_up(mut self, up: Up, target: [f64; 3]) -> Camera {
+        let target = DVec3::from(target);
+        let before = self.pose.matrix3 * target;
+        self.pose.matrix3 *= DMat3::from_cols_array_2d(&up.to_y()).transpose();
+        self.pose.translation += before - self.pose.matrix3 * target;
+        self
     }
 
     /// The camera that draws only these columns and rows of this one's picture: the pixels are equal to the bit.
@@ -283,6 +294,23 @@ mod tests {
         assert!(pixel(&from_plus_x, [0.0, 0.0, 0.5])[0] < 32.0);
         let from_above = Camera::orbit(0.0, 90.0, 3.0, 45.0, 64, 48).unwrap();
         assert!(pixel(&from_above, [0.0, 0.0, -0.5])[1] < 24.0);
+    }
+
+    #[test]
+    fn with_another_axis_up_that_axis_is_up_in_the_picture() {
+        for (up, at) in [
+            (Up::X, [0.5, 0.0, 0.0]),
+            (Up::MinusX, [-0.5, 0.0, 0.0]),
+            (Up::MinusY, [0.0, -0.5, 0.0]),
+            (Up::Z, [0.0, 0.0, 0.5]),
+            (Up::MinusZ, [0.0, 0.0, -0.5]),
+        ] {
+            let turned = camera().with_up(up, [0.0; 3]);
+            let [x, y] = pixel(&turned, at);
+            assert!((x - 32.0).abs() < 1e-9 && y < 24.0, "{up}");
+            turned.check().unwrap();
+        }
+        assert_eq!(camera().with_up(Up::Y, [0.1, 0.2, 0.3]), camera());
     }
 
     #[test]

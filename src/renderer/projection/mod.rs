@@ -1,12 +1,13 @@
 //! From Gaussians to ellipses on the picture.
 //!
-//! A Gaussian with axes `R·S` is seen as the image of its centre and the 2×2 covariance `M·Mᵀ + b·I`, where `M = J·W·R·S` and `J`
-//! is the derivative of the pinhole projection at the centre (EWA splatting), and `b` the Gaussians' own blur ([`Gaussians::blur`]) at that distance, or the pixel's
-//! ([`Gaussians::pixel_blur`]) if that is more. The covariance is never formed and inverted, which loses a long thin ellipse to cancellation in single precision; the kernel has the formulas
-//! ([`b2p_kernels::splat`]).
+//! A Gaussian with axes `R·S` is seen as the image of its centre and the 2×2 covariance `M·Mᵀ + b·I`, where `M =
+//! J·W·R·S` and `J` is the derivative of the pinhole projection at the centre (EWA splatting), and `b` the Gaussians'
+//! own blur ([`Gaussians::blur`]) at that distance, or the pixel's ([`Gaussians::pixel_blur`]) if that is more. The
+//! covariance is never formed and inverted, which loses a long thin ellipse to cancellation in single precision; the
+//! kernel has the formulas ([`b2p_kernels::splat`]).
 //!
-//! [`Ellipses::project`] is the sole gate of visibility: its conditions are phrased so that NaN fails them, and everything after it
-//! may assume finite numbers, a depth beyond the near plane, and at least one pixel.
+//! [`Ellipses::project`] is the sole gate of visibility: its conditions are phrased so that NaN fails them, and
+//! everything after it may assume finite numbers, a depth beyond the near plane, and at least one pixel.
 
 #[cfg(test)]
 mod reference;
@@ -28,7 +29,8 @@ use crate::renderer::camera::{Camera, Projection};
 /// Gaussians are projected in runs of at least so many, and at most [`RUNS`] runs a thread.
 const LEAST_RUN: usize = 2048;
 const RUNS: usize = 4;
-/// Gaussians that are projected before anybody looks at them: their ellipses take 32 KB. A multiple of all numbers of lanes.
+/// Gaussians that are projected before anybody looks at them: their ellipses take 32 KB. A multiple of all numbers of
+/// lanes.
 const PIECE: usize = 512;
 /// The most runs: what is kept for each of them is kept for every tile.
 const MOST_RUNS: usize = 64;
@@ -97,9 +99,9 @@ impl Ellipses {
             .map(|run| run.first..run.first + run.tally.visible as usize)
     }
 
-    /// Projects, reusing memory; counts what is not visible. While they are still in the cache, the ellipses of a run are shown to
-    /// `look`, some at a time, together with a state of the run's own: `states` is given one for each run, to which first `start`
-    /// is told the run's length.
+    /// Projects, reusing memory; counts what is not visible. While they are still in the cache, the ellipses of a run
+    /// are shown to `look`, some at a time, together with a state of the run's own: `states` is given one for each run,
+    /// to which first `start` is told the run's length.
     ///
     /// # Errors
     /// [`Error::Usage`] if the camera is none ([`Camera::check`]) or the arrays of `gaussians` differ in length;
@@ -204,7 +206,8 @@ pub struct Dropped {
     pub no_rotation: u64,
     /// The opacity is below the least that is drawn.
     pub too_faint: u64,
-    /// The centre is not beyond the near plane. A Gaussian that only reaches over it is dropped as well, never mirrored.
+    /// The centre is not beyond the near plane. A Gaussian that only reaches over it is dropped as well, never
+    /// mirrored.
     pub behind: u64,
     /// No pixel within reach.
     pub outside: u64,
@@ -222,8 +225,8 @@ impl Ellipses {
         &self.slopes
     }
 
-    /// Finds out, reusing memory, what effects need to know of those last projected beyond their ellipses. [`Seen::crossing`] says how many
-    /// [`Crossing`] that may take.
+    /// Finds out, reusing memory, what effects need to know of those last projected beyond their ellipses.
+    /// [`Seen::crossing`] says how many [`Crossing`] that may take.
     pub fn look_closer(&mut self, gaussians: &Gaussians, camera: &Camera, how: How) {
         if how.near_care {
             let crossing = self.runs.iter().map(|run| run.tally.crossing as usize);
@@ -245,7 +248,8 @@ impl Ellipses {
     }
 }
 
-/// Fills `crossing` with what `see` says of those of the runs' ellipses that cross the near plane, all of which are visible.
+/// Fills `crossing` with what `see` says of those of the runs' ellipses that cross the near plane, all of which are
+/// visible.
 fn fill_crossing(runs: &[Run], all: &[Ellipse], crossing: &mut [Crossing], see: &(impl Fn(u32) -> Crossing + Sync)) {
     match runs {
         [] => {}

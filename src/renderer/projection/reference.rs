@@ -128,7 +128,8 @@ fn require(holds: bool, otherwise: Invisible) -> Result<(), Invisible> {
     if holds { Ok(()) } else { Err(otherwise) }
 }
 
-/// `1/√p` and `1/√(det/p)`, both times [`FORM_SCALE`], and `b/p`; `p` is the variance (blur included) of the row `long`.
+/// `1/√p` and `1/√(det/p)`, both times [`FORM_SCALE`], and `b/p`; `p` is the variance (blur included) of the row
+/// `long`.
 fn factors(long: Vec3, short: Vec3, p: f32, blur: f32) -> (f32, f32, f32) {
     let inverse = 1.0 / p;
     let root = inverse.sqrt();

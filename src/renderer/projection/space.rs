@@ -29,8 +29,8 @@ fn see(gaussians: &Gaussians, camera: &Camera, i: usize) -> Seen {
     }
 }
 
-/// Gaussian `i`, which reaches over the near plane: each of its axes is widened by the pixel's blur as it is at its centre, or at the
-/// near plane if that is farther.
+/// Gaussian `i`, which reaches over the near plane: each of its axes is widened by the pixel's blur as it is at its
+/// centre, or at the near plane if that is farther.
 pub(super) fn crossing(gaussians: &Gaussians, camera: &Camera, i: usize) -> Crossing {
     let Seen { centre, axes, scale } = see(gaussians, camera, i);
     let focal = DVec2::new(camera.fx, camera.fy);

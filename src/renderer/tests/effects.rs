@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::gaussians::Harmonics;
-use crate::renderer::{Channel, Choice, Effects};
+use crate::renderer::{Channel, EffectMode, Effects};
 
 pub(super) fn with(scene: &Gaussians, camera: &Camera, isa: Isa, effects: Effects) -> (Image, Stats) {
     let renderer = Renderer::new().with_isa(isa).with_effects(effects);
@@ -11,11 +11,9 @@ pub(super) fn with(scene: &Gaussians, camera: &Camera, isa: Isa, effects: Effect
 }
 
 pub(super) const ANTIALIAS: Effects = Effects {
-    antialias: Choice::On,
-    harmonics: Choice::Auto,
-    supersample: Choice::Off,
-    near: Choice::Auto,
-    order: Choice::Auto,
+    antialias: EffectMode::On,
+    supersample: EffectMode::Off,
+    ..Effects::AUTO
 };
 
 #[test]
@@ -43,10 +41,10 @@ fn effects_that_are_not_called_for_change_no_pixel_when_forced_either_way() {
     let scene = scene(random_splats(4, 300));
     let camera = orbit(75, 50);
     let (plain, _) = with(&scene, &camera, Isa::detect(), Effects::default());
-    for harmonics in [Choice::On, Choice::Off] {
+    for harmonics in [EffectMode::On, EffectMode::Off] {
         let forced = Effects {
             harmonics,
-            antialias: Choice::Off,
+            antialias: EffectMode::Off,
             ..Effects::default()
         };
         let (image, stats) = with(&scene, &camera, Isa::detect(), forced);
@@ -93,7 +91,7 @@ fn harmonics_turn_the_colour_with_the_view_and_can_be_switched_off() {
             assert!((seen[k] - expected[k]).abs() < 1e-3, "{azimuth} {elevation}: {seen:?}");
         }
         let off = Effects {
-            harmonics: Choice::Off,
+            harmonics: EffectMode::Off,
             ..Effects::default()
         };
         assert!((middle(azimuth, elevation, off)[0] - half).abs() < 1e-3);

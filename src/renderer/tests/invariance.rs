@@ -3,7 +3,7 @@
 use super::effects::with;
 use super::*;
 use crate::renderer::projection::Bounds;
-use crate::renderer::{Choice, Effects};
+use crate::renderer::{EffectMode, Effects};
 
 #[test]
 fn nothing_to_draw_gives_the_background() {
@@ -171,7 +171,7 @@ fn a_picture_in_crops_is_the_picture_to_the_bit() {
     for radius in [3.0, 0.6] {
         let camera = Camera::orbit(30.0, 10.0, radius, 70.0, 96, 80).unwrap();
         for isa in isas() {
-            let (plain, on) = (Effects::default(), Choice::On);
+            let (plain, on) = (Effects::default(), EffectMode::On);
             let antialias = Effects { antialias: on, ..plain };
             let order = Effects { order: on, ..plain };
             for effects in [plain, antialias, order] {

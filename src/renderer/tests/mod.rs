@@ -185,7 +185,8 @@ fn difference(a: &Image, b: &Image) -> (f32, f64) {
     (largest, -10.0 * (squares / a.len() as f64).log10())
 }
 
-/// Whether the renderer keeps what it promises of fine quality on every instruction set: at most 2/255 off anywhere, and 60 dB, from the reference.
+/// Whether the renderer keeps what it promises of fine quality on every instruction set: at most 2/255 off anywhere,
+/// and 60 dB, from the reference.
 fn assert_close(scene: &Gaussians, camera: &Camera) {
     assert_close_in(Quality::Fine, scene, camera);
 }

@@ -1,31 +1,25 @@
-//! Effects that need to know where a splat is in space: care for the near plane, an order for each pixel; and whose a pixel is.
+//! Effects that need to know where a splat is in space: care for the near plane, an order for each pixel; and whose a
+//! pixel is.
 
 use super::effects::with;
 use super::*;
 use crate::renderer::projection::Bounds;
-use crate::renderer::{Choice, Effects, Ids};
+use crate::renderer::{EffectMode, Effects, Ids};
 
 const CARELESS: Effects = Effects {
-    near: Choice::Off,
-    ..NONE
+    near: EffectMode::Off,
+    ..Effects::AUTO
 };
 const ORDERED: Effects = Effects {
-    order: Choice::On,
-    ..NONE
-};
-const NONE: Effects = Effects {
-    harmonics: Choice::Auto,
-    antialias: Choice::Auto,
-    supersample: Choice::Auto,
-    near: Choice::Auto,
-    order: Choice::Auto,
+    order: EffectMode::On,
+    ..Effects::AUTO
 };
 
 /// Whether something reaches over the near plane, and the picture is close to the reference on every instruction set.
 fn assert_cared_for(scene: &Gaussians, camera: &Camera) {
     let exact = reference::render(scene, camera, Background::BLACK, Cutoffs::NONE);
     for isa in isas() {
-        let (image, stats) = with(scene, camera, isa, NONE);
+        let (image, stats) = with(scene, camera, isa, Effects::AUTO);
         assert!(stats.effects.near && stats.crossing > 0, "{isa}");
         let (largest, psnr) = difference(&image, &exact);
         assert!(largest <= 2.0 / 255.0 && psnr >= 60.0, "{isa}: {largest} {psnr}");
@@ -81,7 +75,7 @@ fn what_reaches_over_the_near_plane_beside_the_picture_is_looked_at_nowhere() {
     camera.near = 0.25;
     for camera in [camera, camera.orthographic(1.0).unwrap()] {
         for isa in isas() {
-            let (image, stats) = with(&scene((0..100).map(beside)), &camera, isa, NONE);
+            let (image, stats) = with(&scene((0..100).map(beside)), &camera, isa, Effects::AUTO);
             assert_eq!(
                 (stats.pairs, stats.crossing, stats.dropped.outside),
                 (0, 0, 100),
@@ -107,7 +101,7 @@ fn walking_through_a_splat_changes_the_picture_little_by_little() {
         for step in 0..240 {
             // Up to the splat, through it, and on.
             camera.pose.translation.z = 0.75 - f64::from(step) * 0.006;
-            let image = with(&scene([splat]), &camera, isa, NONE).0;
+            let image = with(&scene([splat]), &camera, isa, Effects::AUTO).0;
             if let Some(last) = last {
                 let (largest, _) = difference(&last, &image);
                 assert!(largest < 0.03, "{isa} {step}: {largest}");
@@ -125,8 +119,11 @@ fn where_nothing_reaches_over_the_near_plane_care_changes_no_bit() {
     let camera = orbit(75, 50);
     for isa in isas() {
         let (without, _) = with(&scene, &camera, isa, CARELESS);
-        for choice in [Choice::Auto, Choice::On] {
-            let effects = Effects { near: choice, ..NONE };
+        for choice in [EffectMode::Auto, EffectMode::On] {
+            let effects = Effects {
+                near: choice,
+                ..Effects::AUTO
+            };
             let (image, stats) = with(&scene, &camera, isa, effects);
             assert!(image == without && !stats.effects.near);
         }
@@ -181,7 +178,7 @@ fn where_depths_do_not_interleave_an_order_for_each_pixel_changes_next_to_nothin
     let scene = scene((0..60).map(layer));
     let camera = straight(40.0, 40, 30);
     for isa in isas() {
-        let [off, on] = [NONE, ORDERED].map(|effects| with(&scene, &camera, isa, effects).0);
+        let [off, on] = [Effects::AUTO, ORDERED].map(|effects| with(&scene, &camera, isa, effects).0);
         assert!(difference(&off, &on).0 < 1e-5, "{isa}");
     }
 }

@@ -1,11 +1,12 @@
 //! Which ellipses touch which square of the picture, nearest first.
 //!
-//! The ellipses are dealt out to the tiles whose squares their bounds touch ([`Bins`]): counted run by run while they are projected,
-//! then written, each as its depth and its place, in the order of the input. Each tile is put in the order of drawing only when it
-//! is drawn ([`Nearest`]): by the bits of the depth, which for positive floats is the order of the depths, without loss, and then by
-//! place. So nothing depends on the order in which the threads write.
+//! The ellipses are dealt out to the tiles whose squares their bounds touch ([`Bins`]): counted run by run while they
+//! are projected, then written, each as its depth and its place, in the order of the input. Each tile is put in the
+//! order of drawing only when it is drawn ([`Nearest`]): by the bits of the depth, which for positive floats is the
+//! order of the depths, without loss, and then by place. So nothing depends on the order in which the threads write.
 //!
-//! An ellipse that fills the picture costs an entry for each tile: where there are too many, the picture is drawn in parts.
+//! An ellipse that fills the picture costs an entry for each tile: where there are too many, the picture is drawn in
+//! parts.
 
 mod nearest;
 #[cfg(test)]
@@ -29,8 +30,8 @@ const MOST_ENTRIES: u64 = 1 << 25;
 /// How many ellipses of one run touch each tile.
 #[derive(Debug, Default)]
 pub struct Count {
-    /// One row and one column more than there are tiles: first, where counts begin and end; then counts; then where the run's next
-    /// entry goes.
+    /// One row and one column more than there are tiles: first, where counts begin and end; then counts; then where the
+    /// run's next entry goes.
     tiles: Vec<u32>,
     /// For each ellipse of the run.
     touches: Vec<Touch>,
@@ -42,7 +43,8 @@ pub struct Count {
 struct Touch {
     /// The depth's bits.
     depth: u32,
-    /// Of the tiles that it may touch, the place of the first in [`Count::tiles`], and how many columns and rows they are.
+    /// Of the tiles that it may touch, the place of the first in [`Count::tiles`], and how many columns and rows they
+    /// are.
     first: u32,
     columns: u32,
     rows: u32,
@@ -99,8 +101,8 @@ impl Count {
         self.pairs = 0;
     }
 
-    /// Counts the next ellipses of the run. Each is noted at the corners of what it touches; running sums will give every tile's
-    /// count.
+    /// Counts the next ellipses of the run. Each is noted at the corners of what it touches; running sums will give
+    /// every tile's count.
     pub fn count(&mut self, grid: Grid, ellipses: &[Ellipse]) {
         let stride = grid.columns + 1;
         let tiles = &mut self.tiles[..];
@@ -138,9 +140,9 @@ impl Count {
         }
     }
 
-    /// Writes the keys of the run's ellipses, the first of which has the place `place`, to where the counts say by now. What touches
-    /// up to 2×2 tiles, which is nearly everything, is written four times, some of them to where it already is: without a branch
-    /// that may go either way.
+    /// Writes the keys of the run's ellipses, the first of which has the place `place`, to where the counts say by now.
+    /// What touches up to 2×2 tiles, which is nearly everything, is written four times, some of them to where it
+    /// already is: without a branch that may go either way.
     fn deal(&mut self, stride: usize, place: usize, entries: &[AtomicU64]) {
         let cursors = &mut self.tiles[..];
         for (i, touch) in self.touches.iter().enumerate() {
@@ -168,7 +170,7 @@ impl Count {
     }
 
     /// As [`Count::deal`], of the tiles of `part` alone.
-    fn deal_part(&mut self, stride: usize, place: usize, entries: &[AtomicU64], part: &Part) {
+    fn deal_part(&mut self, stride: usize, place: usize, entries: &[AtomicU64], part: &TileBand) {
         for (i, touch) in self.touches.iter().enumerate() {
             let key = u64::from(touch.depth) << 32 | (place + i) as u64;
             let [row, column] = [touch.first as usize / stride, touch.first as usize % stride];
@@ -186,7 +188,7 @@ impl Count {
 
 /// Tiles that are drawn together: whole rows, or some of one row.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Part {
+pub struct TileBand {
     /// Rows of tiles.
     pub rows: Range<usize>,
     /// Columns of tiles.
@@ -204,15 +206,16 @@ pub struct Bins {
     /// The depth's bits above, the place below. Atomic because threads write side by side, each entry once.
     entries: Vec<AtomicU64>,
     most: u64,
-    part: Option<Part>,
+    part: Option<TileBand>,
 }
 
 impl Bins {
     /// Sums up the `counts` of the runs, and decides how much is drawn at once.
     ///
     /// # Errors
-    /// [`crate::Error::LimitExceeded`] before anything is reserved, if `reserved` bytes, the entries of the fullest tile, and room to
-    /// sort it in every thread, are together more than `limits` allow; or if there are more pairs of an ellipse and a tile.
+    /// [`crate::Error::LimitExceeded`] before anything is reserved, if `reserved` bytes, the entries of the fullest
+    /// tile, and room to sort it in every thread, are together more than `limits` allow; or if there are more pairs of
+    /// an ellipse and a tile.
     pub fn plan(&mut self, grid: Grid, counts: &mut [Count], reserved: u64, limits: &Limits) -> Result<u64> {
         self.grid = grid;
         counts.par_iter_mut().for_each(|count| count.sum(grid));
@@ -240,7 +243,7 @@ impl Bins {
     }
 
     /// The part that follows `last`, or the first.
-    pub fn next(&self, last: Option<&Part>) -> Option<Part> {
+    pub fn next(&self, last: Option<&TileBand>) -> Option<TileBand> {
         let Grid { columns, rows, .. } = self.grid;
         let (mut row, mut column) = match last {
             None => (0, 0),
@@ -261,7 +264,7 @@ impl Bins {
                 row += 1;
             }
             if row > start {
-                return Some(Part {
+                return Some(TileBand {
                     rows: start..row,
                     columns: 0..columns,
                 });
@@ -275,7 +278,7 @@ impl Bins {
             }
             column += 1;
         }
-        Some(Part {
+        Some(TileBand {
             rows: row..row + 1,
             columns: first..column,
         })
@@ -285,7 +288,7 @@ impl Bins {
     ///
     /// # Errors
     /// [`crate::Error::OutOfMemory`].
-    pub fn fill(&mut self, part: Part, ellipses: &Ellipses, counts: &mut [Count]) -> Result<()> {
+    pub fn fill(&mut self, part: TileBand, ellipses: &Ellipses, counts: &mut [Count]) -> Result<()> {
         let Grid { columns, .. } = self.grid;
         let stride = columns + 1;
         // Where each tile starts, and within it, each run.

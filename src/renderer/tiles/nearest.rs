@@ -4,7 +4,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// So many are simply sorted.
 const FEW: usize = 128;
-/// The most bits that are sorted by in one pass, if there are fewer than [`MANY`], and if not: counters fit the first cache.
+/// The most bits that are sorted by in one pass, if there are fewer than [`MANY`], and if not: counters fit the first
+/// cache.
 const DIGITS: [u32; 2] = [8, 11];
 const MANY: usize = 1024;
 /// So many are handed out at a time: vectors are full then.
@@ -23,8 +24,8 @@ impl Nearest {
     /// Bytes that are needed for each entry of the fullest tile.
     pub const BYTES: u64 = 2 * size_of::<u64>() as u64;
 
-    /// Takes a tile's `entries`, of which those of equal depth are in order, and puts all of them in order: by digits of the depth less
-    /// the least, the lowest first, in passes that keep the order of equals.
+    /// Takes a tile's `entries`, of which those of equal depth are in order, and puts all of them in order: by digits
+    /// of the depth less the least, the lowest first, in passes that keep the order of equals.
     pub fn take(&mut self, entries: &[AtomicU64]) {
         let count = entries.len();
         self.keys.clear();
@@ -74,8 +75,8 @@ impl Nearest {
         }
     }
 
-    /// Hands out the keys of the tile taken last, nearest first, some at a time, as long as `draw` says to go on. With each it is
-    /// shown those that come next; it begins with these alone.
+    /// Hands out the keys of the tile taken last, nearest first, some at a time, as long as `draw` says to go on. With
+    /// each it is shown those that come next; it begins with these alone.
     pub fn each(&self, mut draw: impl FnMut(&[u64], &[u64]) -> bool) {
         let mut now = &self.keys[..0];
         let mut rest = &self.keys[..];

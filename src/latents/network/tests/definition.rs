@@ -211,8 +211,8 @@ fn the_exact_zone_follows_the_real_function_it_rounds() {
     }
 }
 
-/// f16 keeps 11 bits: half a unit of the last is 2⁻¹² of a value. About ten layers are stored on the way to any result here, and a
-/// layer's sum weighs the errors of its inputs as it does the inputs.
+/// f16 keeps 11 bits: half a unit of the last is 2⁻¹² of a value. About ten layers are stored on the way to any result
+/// here, and a layer's sum weighs the errors of its inputs as it does the inputs.
 const TOLERANCE: f64 = 10.0 / 4096.0;
 
 #[test]
@@ -250,8 +250,8 @@ pub(super) fn some_features(count: usize) -> Vec<i16> {
     (0..count).map(|i| ((i * 7919) % 1601) as i16 - 800).collect()
 }
 
-/// Raw numbers in integers lie so near their definition, in parts of the largest: each of a dozen layers rounds to a step of 1/256
-/// where the largest is about 4.
+/// Raw numbers in integers lie so near their definition, in parts of the largest: each of a dozen layers rounds to a
+/// step of 1/256 where the largest is about 4.
 const INTEGER_TOLERANCE: f64 = 0.01;
 
 #[test]

@@ -86,7 +86,8 @@ fn integer_distributions_are_those_that_the_float_network_predicts() {
     }
 }
 
-/// f16 keeps 11 bits: half a unit of the last is 2⁻¹² of a value. About ten layers are stored on the way to any of these results.
+/// f16 keeps 11 bits: half a unit of the last is 2⁻¹² of a value. About ten layers are stored on the way to any of
+/// these results.
 const TOLERANCE: f64 = 10.0 / 4096.0;
 
 #[test]
@@ -138,7 +139,8 @@ fn generated_gaussians_are_the_trainer_s_within_f16() {
 
         let voxels = cloud.octree.level(cloud.level(role));
         let children = if role == 1 { 8 } else { 1 };
-        // The trainer's own raw numbers, so that only the activations are compared. Its unit is the finest voxel, 1/32 of the cube.
+        // The trainer's own raw numbers, so that only the activations are compared. Its unit is the finest voxel, 1/32
+        // of the cube.
         let trained = activate(
             &golden::<f32>(&format!("raw.{role}")),
             voxels,

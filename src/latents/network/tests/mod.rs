@@ -4,7 +4,7 @@ mod definition;
 mod files;
 mod golden;
 mod half;
-mod passes;
+mod predict;
 
 use b2p_kernels::Isa;
 
@@ -72,7 +72,8 @@ impl Cloud {
     }
 }
 
-/// By how much the encoder is coarser than f16 with these instructions: tiles hold bf16, of eight significant bits instead of eleven.
+/// By how much the encoder is coarser than f16 with these instructions: tiles hold bf16, of eight significant bits
+/// instead of eleven.
 fn coarser(isa: Isa) -> f64 {
     if isa.has_tiles() { 8.0 } else { 1.0 }
 }

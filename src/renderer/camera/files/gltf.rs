@@ -101,8 +101,8 @@ pub(super) fn json_of(bytes: &[u8]) -> Result<&[u8]> {
     bytes[HEADERS..].get(..length as usize).ok_or_else(short)
 }
 
-/// The cameras, in the order of their nodes: OpenGL axes, from the camera to the world, whatever its scale. Pixels are square; a
-/// pinhole's field of view is that of the picture's height.
+/// The cameras, in the order of their nodes: OpenGL axes, from the camera to the world, whatever its scale. Pixels are
+/// square; a pinhole's field of view is that of the picture's height.
 pub(super) fn cameras(file: Value, frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
     let Scene { cameras, nodes } = parsed("glTF", file)?;
     let mut parents = vec![None; nodes.len()];

@@ -1,5 +1,5 @@
-//! Cameras from files: NeRF's `transforms.json`, COLMAP's `cameras.txt` with `images.txt`, Open3D's pinhole cameras, and the camera nodes
-//! of glTF.
+//! Cameras from files: NeRF's `transforms.json`, COLMAP's `cameras.txt` with `images.txt`, Open3D's pinhole cameras,
+//! and the camera nodes of glTF.
 //!
 //! Both speak of the world; the cube that the Gaussians refer to says where it is.
 
@@ -64,8 +64,8 @@ impl Lens {
 }
 
 impl Camera {
-    /// The cameras of a file, with the names of their pictures: NeRF's `transforms.json`, Open3D's JSON, or glTF. `frame`
-    /// is that of the Gaussians; `size` is for files without one.
+    /// The cameras of a file, with the names of their pictures: NeRF's `transforms.json`, Open3D's JSON, or glTF.
+    /// `frame` is that of the Gaussians; `size` is for files without one.
     ///
     /// # Errors
     /// [`Error::Usage`] if the file is none of these, or one of its cameras is invalid ([`Camera::check`]).
@@ -74,11 +74,12 @@ impl Camera {
     }
 }
 
-/// The cameras of a file that is no text of COLMAP's, told apart by what it holds: binary or JSON glTF, Open3D's JSON, NeRF's. `size` is for
-/// files that name none.
+/// The cameras of a file that is no text of COLMAP's, told apart by what it holds: binary or JSON glTF, Open3D's JSON,
+/// NeRF's. `size` is for files that name none.
 ///
 /// # Errors
-/// [`Error::Usage`] if it is none of these, one of its cameras is none ([`Camera::check`]), or there are over [`MAX_CAMERAS`].
+/// [`Error::Usage`] if it is none of these, one of its cameras is none ([`Camera::check`]), or there are over
+/// [`MAX_CAMERAS`].
 pub fn read(bytes: &[u8], frame: &Frame, size: (u32, u32)) -> Result<Vec<Named>> {
     let text = match bytes.starts_with(gltf::MAGIC) {
         true => gltf::json_of(bytes)?,
@@ -230,7 +231,8 @@ mod tests {
             assert_is_the_orbit(&named[count - 1].1);
         }
 
-        // Half the height over the distance is the tangent of half the angle: 30/40. The parent lifts what its child moves back.
+        // Half the height over the distance is the tangent of half the angle: 30/40. The parent lifts what its child
+        // moves back.
         let gltf = r#"{"asset": {"version": "2.0"},
             "cameras": [{"type": "perspective", "perspective": {"yfov": 1.2870022175866872, "znear": 0.04}}],
             "nodes": [{"translation": [5, 6, 7], "scale": [2, 2, 2], "children": [1]},

@@ -99,7 +99,7 @@ fn a_principal_point_outside_the_picture_flips_nothing() {
 fn zooming_keeps_the_mean_luminance_with_anti_aliasing_on() {
     let scene = scene(surface_splats(20_000, 0.8, 0.012));
     let antialias = Effects {
-        antialias: Choice::On,
+        antialias: EffectMode::On,
         ..Effects::default()
     };
     // The mean of the middle of a picture, `side` pixels wide, under `zoom`.

@@ -35,7 +35,7 @@ mod shapes;
 
 use super::effects::with;
 use super::*;
-use crate::renderer::{Choice, Effects};
+use crate::renderer::{EffectMode, Effects};
 
 /// A splat two units in front of a camera at the origin that looks along +z.
 const AHEAD: Splat = Splat {
@@ -55,7 +55,7 @@ fn visible(splat: Splat, camera: &Camera) -> bool {
 /// With no care for what reaches over the near plane.
 fn careless(scene: &Gaussians, camera: &Camera, isa: Isa) -> (Image, Stats) {
     let effects = Effects {
-        near: Choice::Off,
+        near: EffectMode::Off,
         ..Effects::default()
     };
     with(scene, camera, isa, effects)

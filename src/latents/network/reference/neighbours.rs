@@ -4,7 +4,8 @@ use super::super::structure::Neighbours;
 use super::{Layer, Oracle, Rows, Sites, relu};
 
 impl Oracle {
-    /// Means in sixteenths, scale indices, and whether anything is known, of base-level voxels whose latents are `latents`.
+    /// Means in sixteenths, scale indices, and whether anything is known, of base-level voxels whose latents are
+    /// `latents`.
     pub fn base(&self, at: &Sites, latents: &Rows) -> (Rows, Rows, Vec<bool>) {
         let network = self.exact.base.as_ref().unwrap();
         let unit = f64::from(1 << self.shape.latent_shift);
@@ -62,8 +63,8 @@ impl Oracle {
         (self.here(&network.mu, at, &x), self.here(&network.sigma, at, &x))
     }
 
-    /// One voxel's inputs: of each set of voxels the mean of `values`, and whether there are any; `own`; the octant. Also whether
-    /// anything is known.
+    /// One voxel's inputs: of each set of voxels the mean of `values`, and whether there are any; `own`; the octant.
+    /// Also whether anything is known.
     fn known(&self, v: &[i32; 3], sets: Vec<Vec<usize>>, values: &Rows, own: Vec<f64>) -> (Vec<f64>, bool) {
         let unit = f64::from(1 << self.shape.latent_shift);
         let mut row = Vec::new();

@@ -1,8 +1,10 @@
 //! The best stream of at most so many bits.
 //!
-//! Streams of more and more bits are on one path. First bits become less dear, down to the price that the model was made for. Then what is wide of what colours are off is
-//! told too, from twice that price down again: where a bit is dearer than that, it takes more than it makes up for. From there on a fine residual, in smaller and smaller
-//! steps, brings more for its bits than latents of bits that are cheaper still. Sizes along the path hardly ever fall, so it is halved until the last that fits is found.
+//! Streams of more and more bits are on one path. First bits become less dear, down to the price that the model was
+//! made for. Then what is wide of what colours are off is told too, from twice that price down again: where a bit is
+//! dearer than that, it takes more than it makes up for. From there on a fine residual, in smaller and smaller steps,
+//! brings more for its bits than latents of bits that are cheaper still. Sizes along the path hardly ever fall, so it
+//! is halved until the last that fits is found.
 
 use std::iter::successors;
 use std::num::NonZeroU8;
@@ -23,16 +25,19 @@ const USUAL: f32 = 1.0;
 /// The highest price of a bit with a coarse residual.
 const COARSE: f32 = 2.0;
 
-/// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and says with which options:
-/// [`encode`](super::encode) makes the same stream of them. `options` say what else is to be; their price of a bit and residual count for nothing.
+/// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and
+/// says with which options: [`encode`](super::encode) makes the same stream of them. `options` say what else is to be;
+/// their price of a bit and residual count for nothing.
 ///
-/// From few bits to many it chooses prices of a bit from 4 down to 1 without a residual; from 2 to 1 with [`Residual::Coarse`], where filters are made; and 1 with
-/// [`Residual::Fine`], in steps from 255 down to 1. More bits never lead back on this path; with more than its end takes, that comes out. It takes at most seven tries,
-/// those at a price that was tried before of the residual alone.
+/// From few bits to many it chooses prices of a bit from 4 down to 1 without a residual; from 2 to 1 with
+/// [`Residual::Coarse`], where filters are made; and 1 with [`Residual::Fine`], in steps from 255 down to 1. More bits
+/// never lead back on this path; with more than its end takes, that comes out. It takes at most seven tries, those at a
+/// price that was tried before of the residual alone.
 ///
 /// # Errors
-/// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if no such stream was found, and those of [`encode`](super::encode).
-pub fn encode_within(
+/// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if no such stream was found, and
+/// those of [`encode`](super::encode).
+pub fn encode_to_rate(
     cloud: &ColouredVoxels,
     model: &Model,
     options: &Options,
@@ -113,7 +118,8 @@ fn path(options: &Options) -> Vec<Options> {
     plain.chain(wide).chain(fine).map(with).collect()
 }
 
-/// Of luma from 255 down to 1, each by a sixteenth or by one; where that makes those of chroma an eighth smaller or more, luma's go first.
+/// Of luma from 255 down to 1, each by a sixteenth or by one; where that makes those of chroma an eighth smaller or
+/// more, luma's go first.
 fn steps() -> impl Iterator<Item = Steps> {
     let next = |step: &NonZeroU8| NonZeroU8::new(step.get() - (step.get() / 16).max(1));
     let lumas = successors(Some(NonZeroU8::MAX), next);

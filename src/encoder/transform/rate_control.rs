@@ -1,10 +1,10 @@
 //! The best stream of at most so many bits.
 //!
-//! Streams of more and more bits are on one path, which a level and a quantisation step make: first the coarsest level in smaller and smaller
-//! steps, then the next level, and so on; at the end of the path are the exact colours of the finest level. A level is on the path from the greatest step that its
-//! geometry is worth.
+//! Streams of more and more bits are on one path, which a level and a quantisation step make: first the coarsest level
+//! in smaller and smaller steps, then the next level, and so on; at the end of the path are the exact colours of the
+//! finest level. A level is on the path from the greatest step that its geometry is worth.
 
-use super::{Coded, Fineness, MAX_CHROMA, Options, Subject, choose_levels, steps_of};
+use super::{Coded, MAX_CHROMA, Options, QualityTarget, Subject, choose_levels, steps_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth};
 use crate::encoder::Encoded;
@@ -14,8 +14,8 @@ use crate::log::Log;
 /// The coarsest place of a level that the stream could do without: a step of luma of 64 255ths.
 const COARSEST: u8 = 112;
 
-/// The same of the level of the cloud's own voxels, whose geometry takes most: a step of luma of 23. In coarser steps the level above makes better pictures
-/// of the same bits.
+/// The same of the level of the cloud's own voxels, whose geometry takes most: a step of luma of 23. In coarser steps
+/// the level above makes better pictures of the same bits.
 const COARSEST_OF_ALL: u8 = 88;
 
 /// The place that is tried first: a step of luma of 11.
@@ -28,14 +28,14 @@ struct Place {
     steps: Steps,
 }
 
-/// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and says with which options:
-/// [`encode`](super::encode) makes the same stream of them. `options` say what else is to be; of their levels (N − 3 to N of a cloud of N bits by default), the
-/// finest may be left out.
+/// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and
+/// says with which options: [`encode`](super::encode) makes the same stream of them. `options` say what else is to be;
+/// of their levels (N − 3 to N of a cloud of N bits by default), the finest may be left out.
 ///
 /// # Errors
-/// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if the smallest stream has more, and those of
-/// [`encode`](super::encode).
-pub fn encode_within(
+/// [`Error::Usage`] if the bits are no finite number above 0, [`Error::TooFewBits`] if the smallest stream has more,
+/// and those of [`encode`](super::encode).
+pub fn encode_to_rate(
     cloud: &ColouredVoxels,
     options: &Options,
     bits_per_point: f64,
@@ -74,10 +74,13 @@ pub fn encode_within(
         asked: bits_per_point,
         least: bits(search.least),
     })?;
-    let encoded = subject.checked(coded, log)?;
+    let maps = search.head_map_bytes(place.top) > 0;
+    let heads = options.heads.as_ref().filter(|_| maps);
+    let encoded = subject.checked(coded, heads, room as usize, log)?;
     let chosen = Options {
+        heads: heads.cloned(),
         levels: Some(*levels.start().min(&place.top)..=place.top),
-        fineness: Fineness::of(place.steps),
+        fineness: QualityTarget::of(place.steps),
         ..options.clone()
     };
     Ok((encoded, chosen))
@@ -96,7 +99,8 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// The largest stream with the last level `top` that fits, if there is one; `only` tells that no coarser level could take its place.
+    /// The largest stream with the last level `top` that fits, if there is one; `only` tells that no coarser level
+    /// could take its place.
     fn level(&mut self, top: u8, only: bool, log: &Log) -> Result<Option<(Place, Coded)>> {
         let last = match top == self.subject.cloud.voxels.depth() {
             _ if only => 2 * MAX_CHROMA,
@@ -145,6 +149,15 @@ impl Search<'_> {
         Ok(Some(best))
     }
 
+    /// Bytes to set aside for head maps: none where they might take more than 2 % of the stream.
+    fn head_map_bytes(&self, top: u8) -> usize {
+        let bytes = match self.subject.options.heads {
+            Some(_) => self.subject.head_map_bytes(top),
+            None => 0,
+        };
+        if 50.0 * bytes as f64 <= self.room { bytes } else { 0 }
+    }
+
     fn attempt(&mut self, place: Place, log: &Log) -> Result<Option<(Place, Coded)>> {
         Ok(self.attempt_sized(place, log)?.1)
     }
@@ -153,7 +166,7 @@ impl Search<'_> {
     fn attempt_sized(&mut self, place: Place, log: &Log) -> Result<(f64, Option<(Place, Coded)>)> {
         self.tries += 1;
         let Place { top, steps } = place;
-        let how = Fineness::of(steps);
+        let how = QualityTarget::of(steps);
         let name = format!("try {}: level {top}, {how}", self.tries);
         let points = self.subject.cloud.voxels.len();
         let coded = log.step(name, points, "points", || {
@@ -169,7 +182,7 @@ impl Search<'_> {
                 None => self.subject.code(top, steps, log),
             }
         })?;
-        let size = coded.bytes.len() as f64;
+        let size = (coded.bytes.len() + self.head_map_bytes(top)) as f64;
         self.least = self.least.min(size);
         Ok((size, (size <= self.room).then_some((place, coded))))
     }
@@ -182,8 +195,8 @@ struct Tried {
     bytes: f64,
 }
 
-/// The place to try next, from the one that fits and the one that does not, near where the room ends: bytes are about a power of the step.
-/// `None` if nothing is between them.
+/// The place to try next, from the one that fits and the one that does not, near where the room ends: bytes are about a
+/// power of the step. `None` if nothing is between them.
 fn between(fits: Option<Tried>, exceeds: Option<Tried>, room: f64, last: u8) -> Option<u8> {
     /// How much the logarithm of the bytes falls from one place to the next, more or less.
     const SLOPE: f64 = 0.038;

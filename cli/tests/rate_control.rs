@@ -5,7 +5,7 @@ mod common;
 
 use b2p::Error;
 use b2p::cloud::ColouredVoxels;
-use b2p::encoder::{Encoded, Options, Residual, encode, encode_within};
+use b2p::encoder::{Encoded, Options, Residual, encode, encode_to_rate};
 use b2p::latents::Decoder;
 use b2p::latents::network::Model;
 use b2p::log::Log;
@@ -17,7 +17,7 @@ fn model() -> Model {
 }
 
 fn within(bits: f64, cloud: &ColouredVoxels, model: &Model, options: &Options) -> Result<(Encoded, Options), Error> {
-    encode_within(cloud, model, options, bits, &Log::default())
+    encode_to_rate(cloud, model, options, bits, &Log::default())
 }
 
 fn bits_of(encoded: &Encoded, cloud: &ColouredVoxels) -> f64 {
@@ -145,7 +145,7 @@ fn each_try_is_told_as_it_begins_and_there_are_at_most_seven() {
     let (model, cloud) = (model(), Ball::new(5, 10.0).cloud());
     let (sender, heard) = std::sync::mpsc::channel();
     let log = Log::with_listener(move |step| sender.send(step.to_owned()).unwrap());
-    encode_within(&cloud, &model, &Options::default(), 8.0, &log).unwrap();
+    encode_to_rate(&cloud, &model, &Options::default(), 8.0, &log).unwrap();
     let heard: Vec<String> = heard.try_iter().collect();
     let tries: Vec<_> = heard.iter().filter(|step| step.starts_with("try ")).collect();
     assert!((1..=7).contains(&tries.len()), "{heard:?}");
