@@ -1,4 +1,5 @@
-//! `b2p convert`: splats of one format to another, or to points at their centres; and what other commands read and write of splats.
+//! `b2p convert`: splats of one format to another, or to points at their centres; and what other commands read and
+//! write of splats.
 
 use std::path::{Path, PathBuf};
 
@@ -73,7 +74,8 @@ pub fn may_be(start: &[u8]) -> bool {
     starts.iter().any(|known| start.starts_with(known))
 }
 
-/// The format of a file of splats: the one asked for, or that of its contents; `.splat` and CSV files are known by their names.
+/// The format of a file of splats: the one asked for, or that of its contents; `.splat` and CSV files are known by
+/// their names.
 pub fn format_of(path: &Path, bytes: &[u8], asked: Option<Format>) -> Option<Format> {
     if asked.is_some() || bytes.starts_with(&MAGIC) {
         return asked;
@@ -117,8 +119,8 @@ pub fn output_format(to: &Path, asked: Option<Format>) -> Result<Format> {
     Ok(known.unwrap_or(Format::Ply))
 }
 
-/// Writes Gaussians, with warnings about what the format does not keep. What was subtracted from coordinates far from the origin
-/// stands in a file beside.
+/// Writes Gaussians, with warnings about what the format does not keep. What was subtracted from coordinates far from
+/// the origin stands in a file beside.
 pub fn write(g: &Gaussians, axes: Axes, format: Format, to: &Path, log: &Log) -> Result<()> {
     let offset = splats::offset(g, axes, format);
     let beside = sidecar(to);

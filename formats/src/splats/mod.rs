@@ -11,7 +11,8 @@
 //! | [`Format::Csv`] | `.csv` | decimal | decimal logarithm | decimal | decimal, logit | decimal |
 //! | [`Format::Npz`] | `.npz` | float | float | float | float | float |
 //!
-//! Coordinates are those of the world. A cube far from the origin is written less an offset ([`offset`]), which SPZ and `.splat` cannot state: [`Options::offset`] restores it.
+//! Coordinates are those of the world. A cube far from the origin is written less an offset ([`offset`]), which SPZ and
+//! `.splat` cannot state: [`Options::offset`] restores it.
 //! All formats but glTF share the axes of PLY files. glTF defines +y as up, where programs take −y of a PLY file as up,
 //! so [`write()`] turns by 180° about z, as other programs do.
 //!
@@ -233,8 +234,8 @@ pub fn read(bytes: &[u8], format: Format, options: &Options, limits: &Limits) ->
     })
 }
 
-/// What [`write()`] subtracts from the coordinates in a file of this format, in the axes of the file. Zeros for formats that
-/// hold the coordinates of the world: CSV, whose numbers are decimal, and glTF, whose node has the offset.
+/// What [`write()`] subtracts from the coordinates in a file of this format, in the axes of the file. Zeros for formats
+/// that hold the coordinates of the world: CSV, whose numbers are decimal, and glTF, whose node has the offset.
 pub fn offset(gaussians: &Gaussians, axes: Axes, format: Format) -> [f64; 3] {
     match format {
         Format::Csv | Format::Glb | Format::Gltf => [0.0; 3],
