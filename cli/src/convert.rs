@@ -28,6 +28,14 @@ pub fn run(args: &Convert, limits: &Limits, progress: &Progress) -> Result<Said>
             let what = "this is a stream of b2p: `b2p decode` writes its Gaussians in any of these formats";
             return Err(Failure(format!("{}: {what}", input.display())));
         }
+        if cloud::is_cloud(&bytes) {
+            let kind = Kind::of(&bytes);
+            let what = "`b2p encode` codes points, and `b2p decode` makes Gaussians of them";
+            return Err(Failure(format!(
+                "{}: this is {kind}, not Gaussians: {what}",
+                input.display()
+            )));
+        }
         let names: Vec<_> = Format::all().map(Format::name).collect();
         let what = format!(
             "no splats that are known by their contents; --from says which of {}",

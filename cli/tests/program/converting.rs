@@ -102,7 +102,7 @@ fn coordinates_far_from_the_origin_are_local_with_the_offset_beside() {
         assert_eq!(beside.exists(), !whole, "{format}");
         let errors = String::from_utf8_lossy(&output.stderr);
         assert_eq!(
-            errors.contains("less an offset of 500120 4649880 0"),
+            errors.contains("less an offset of 500124 4649877 0"),
             !whole,
             "{errors}"
         );
