@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from base import Reader, crc32c, require
 
 MAGIC = bytes.fromhex("89423250 0D0A1A0A")
-GEOMETRY, GEOMETRY_TRUNK, COLOUR_TRUNK, COLOURS, FILTER, HEAD_MAP = 1, 5, 6, 7, 8, 128
+GEOMETRY, GEOMETRY_TRUNK, COLOUR_TRUNK, COLOURS, FILTER, HEAD_MAP = 1, 5, 6, 7, 8, 129
 
 
 @dataclass

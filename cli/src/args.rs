@@ -139,6 +139,8 @@ pub enum Command {
     Encode(Encode),
     /// Decode a stream to 3D Gaussians
     Decode(Decode),
+    /// Convert Gaussians from one file format to another
+    Convert(Convert),
     /// Draw a stream, or Gaussians, into a picture
     Render(Render),
     /// Say what a stream holds
@@ -228,7 +230,7 @@ pub struct LearnedArgs {
 
 #[derive(Debug, Args)]
 pub struct Decode {
-    /// Stream to decode to a PLY with the property names of 3D Gaussian splatting. `-`: standard input, decoded as it comes
+    /// Stream to decode to Gaussians. `-`: standard input, decoded as it comes
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
@@ -237,6 +239,9 @@ pub struct Decode {
     /// streams there are none)
     #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
     pub points: bool,
+    /// Format of the Gaussians: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
+    #[arg(long, value_name = "NAME", conflicts_with = "points")]
+    pub format: Option<SplatFormat>,
     #[command(flatten)]
     pub write: WriteArgs,
     #[command(flatten)]
@@ -248,8 +253,26 @@ pub struct Decode {
 }
 
 #[derive(Debug, Args)]
+pub struct Convert {
+    /// Gaussians: PLY, compressed PLY, SPZ, SOG, .splat, glTF, CSV or NumPy archive. `-`: standard input
+    #[arg(value_name = "IN")]
+    pub input: PathBuf,
+    #[command(flatten)]
+    pub output: Output,
+    /// Format of the output: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
+    #[arg(long, value_name = "NAME", conflicts_with = "points")]
+    pub format: Option<SplatFormat>,
+    /// Format of the input [default: by its contents, of .splat and .csv by the ending]
+    #[arg(long, value_name = "NAME")]
+    pub from: Option<SplatFormat>,
+    /// Write a PLY of points instead: the centres with their colours
+    #[arg(long)]
+    pub points: bool,
+}
+
+#[derive(Debug, Args)]
 pub struct Render {
-    /// Stream, PLY of Gaussians, or point cloud. `-`: standard input, drawn as it comes
+    /// Stream, Gaussians in any format that `convert` reads, or point cloud. `-`: standard input, drawn as it comes
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
@@ -467,6 +490,7 @@ use super::values::{
     background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,
 };
 pub use b2p::renderer::{Background, Effect, EffectMode, Quality};
+pub use b2p_formats::splats::Format as SplatFormat;
 
 /// The help of `--effect`.
 fn effect_help() -> String {

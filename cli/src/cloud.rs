@@ -203,7 +203,7 @@ pub fn refuse(path: &Path) -> Result<()> {
         Some(start) if is_cloud(&start) => Err(Failure(format!(
             "{}: this is {}, not a b2p stream: code it with `b2p encode`, or draw it with `b2p render`",
             path.display(),
-            Kind::of(&start)
+            clouds::describe(&start)
         ))),
         _ => Ok(()),
     }

@@ -8,15 +8,16 @@ use b2p::Limits;
 use b2p::container::version;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
+use b2p_formats::splats::Axes;
 use serde_json::json;
 
 use super::args::Decode;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, cloud, keep, kinds, load, pipe};
+use super::{Failure, Result, budget, cloud, convert, keep, kinds, load, pipe};
 
-/// Decodes a stream into a PLY.
+/// Decodes a stream into a file of Gaussians.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.input.as_path()]).collect();
@@ -27,12 +28,11 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
         return points(args, limits, &log);
     }
     let (input, to) = (&args.input, &args.output);
+    let format = convert::output_format(to, args.format)?;
     let mut written = 0;
     let mut write = |gaussians: &Gaussians, log: &Log| {
         written = gaussians.len();
-        log.step("write PLY", written, "Gaussians", || {
-            Ok(manners::write(to, |w| gaussians.write_ply(w, to)))
-        })?
+        convert::write(gaussians, Axes::Ply, format, to, log)
     };
     let chosen = if let Some(bytes) = keep::stream(&args.budget, input, limits)? {
         let (budget, start) = (&args.budget, Instant::now());

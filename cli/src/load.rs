@@ -5,7 +5,7 @@ use std::path::Path;
 use b2p::container::{Header, Stream, version};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::learned::HeadsModel;
-use b2p::gaussians::{Frame, Gaussians, ply};
+use b2p::gaussians::{Frame, Gaussians};
 use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::renderer::Explanation;
@@ -14,7 +14,7 @@ use b2p::{Decoder, Error, Isa, Limits, UnknownIsa, input};
 
 use super::args::{DetailArg, ModelArg};
 use super::views::Shot;
-use super::{Failure, Result, cloud, kinds, manners};
+use super::{Failure, Result, cloud, convert, kinds, manners};
 
 /// A stream or Gaussians, told apart by their first bytes.
 pub const PLY_MAGIC: &[u8] = b"ply";
@@ -153,7 +153,7 @@ pub fn extent(bytes: &[u8], decoder: &Decoder, limits: &Limits) -> Extent {
     base().unwrap_or(Extent::cube())
 }
 
-/// Gaussians from a stream, or as they stand in a PLY.
+/// Gaussians from a stream, or as they stand in a file.
 pub fn gaussians(
     path: &Path,
     detail: &DetailArg,
@@ -162,8 +162,8 @@ pub fn gaussians(
     log: &Log,
 ) -> Result<Gaussians> {
     let bytes = bytes(path, limits)?;
-    if bytes.starts_with(PLY_MAGIC) || cloud::is_cloud(&bytes) {
-        return ply(path, &bytes, detail, limits, log);
+    if let Some(gaussians) = other(path, &bytes, detail, limits, log)? {
+        return Ok(gaussians);
     }
     kinds::check_stream(path, &bytes)?;
     let bytes = whole_levels(path, bytes, detail, limits)?;
@@ -175,7 +175,7 @@ pub fn gaussians(
 
 /// Where Gaussians come from.
 pub enum Source<'p> {
-    /// A PLY that has been read.
+    /// A file of them that has been read.
     Gaussians(Gaussians),
     /// A stream, and what decodes it.
     Stream {
@@ -189,8 +189,8 @@ impl<'p> Source<'p> {
     /// Reads a file.
     pub fn open(path: &'p Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Self> {
         let bytes = bytes(path, limits)?;
-        if bytes.starts_with(PLY_MAGIC) || cloud::is_cloud(&bytes) {
-            return Ok(Source::Gaussians(ply(path, &bytes, detail, limits, log)?));
+        if let Some(gaussians) = other(path, &bytes, detail, limits, log)? {
+            return Ok(Source::Gaussians(gaussians));
         }
         kinds::check_stream(path, &bytes)?;
         let bytes = whole_levels(path, bytes, detail, limits)?;
@@ -238,7 +238,7 @@ impl<'p> Source<'p> {
         };
         let (path, bytes, decoder) = match self {
             Source::Gaussians(gaussians) => {
-                return Ok((gaussians, explain(false, "a PLY has no levels".into())));
+                return Ok((gaussians, explain(false, "files of Gaussians have no levels".into())));
             }
             Source::Stream { path, bytes, decoder } => (path, bytes, decoder),
         };
@@ -254,23 +254,22 @@ impl<'p> Source<'p> {
     }
 }
 
-/// Gaussians as they stand in the PLY `bytes`, which came from `path`; those of a point cloud are surfels.
-pub fn ply(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Gaussians> {
+/// Gaussians as they stand in the file `bytes`, which came from `path`, or surfels of its points. `None` if it has neither.
+pub fn other(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Option<Gaussians>> {
+    let format = convert::format_of(path, bytes, None);
+    if format.is_none() && !cloud::is_cloud(bytes) {
+        return Ok(None);
+    }
     let asked = [("--level", detail.level.is_some()), ("--heads", detail.heads.is_some())];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {
         return Err(Failure(format!(
-            "{}: {name} is for streams, this is a PLY",
+            "{}: {name} is for streams, these are Gaussians",
             path.display()
         )));
     }
-    if let Some(surfels) = cloud::drawable(path, bytes, isa(None)?, limits, log)? {
-        return Ok(surfels);
-    }
-    let (gaussians, notes) = log
-        .step("read Gaussians", 1, "file", || ply::read(bytes, limits))
-        .map_err(Failure::in_file(path))?;
-    for warning in notes.warnings() {
-        manners::warn(&format!("{}: {warning}", path.display()));
-    }
-    Ok(gaussians)
+    let Some(format) = format else {
+        return cloud::drawable(path, bytes, isa(None)?, limits, log);
+    };
+    let splats = convert::read(path, bytes, format, limits, log)?;
+    splats.into_ply_axes().map(Some).map_err(Failure::in_file(path))
 }

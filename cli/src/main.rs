@@ -6,6 +6,7 @@ mod bench;
 mod bench_render;
 mod budget;
 mod cloud;
+mod convert;
 mod cut;
 mod decode;
 mod demo;
@@ -143,6 +144,7 @@ fn run(cli: &Cli) -> Result<()> {
     let said: Said = match &cli.command {
         Command::Encode(args) => encode::run(args, &limits, &progress)?,
         Command::Decode(args) => decode::run(args, &limits, &progress)?,
+        Command::Convert(args) => convert::run(args, &limits, &progress)?,
         Command::Render(args) => render::run(args, &limits, &progress)?,
         Command::Info(args) => info::run(args, &limits)?,
         Command::Cut(args) => cut::run(args, &limits)?,

@@ -10,7 +10,7 @@ use b2p::log::Log;
 use b2p::{Decoding, Error, Limits};
 
 use super::args::{DetailArg, ModelArg};
-use super::{Failure, Result, cloud, kinds, load, manners};
+use super::{Failure, Result, cloud, convert, kinds, load, manners};
 
 /// The input that is standard input, and the output that is standard output.
 pub const PIPE: &str = "-";
@@ -50,14 +50,19 @@ pub fn each(
             Err(_) => break,
         }
     }
-    if start.starts_with(load::PLY_MAGIC) || cloud::is_cloud(&start) {
+    if convert::may_be(&start) || cloud::is_cloud(&start) {
         for piece in pieces {
             start.extend(piece.map_err(broken)?);
             let length = start.len() as u64;
             let checked = limits.check_bytes("size of the input, as far as it was read,", length);
             checked.map_err(Failure::in_file(path))?;
         }
-        return show(&load::ply(path, &start, detail, limits, log)?, log);
+        if let Some(gaussians) = load::other(path, &start, detail, limits, log)? {
+            return show(&gaussians, log);
+        }
+        kinds::check_stream(path, &start)?;
+        let what = "neither a stream, nor Gaussians or points that are known by their contents";
+        return Err(Failure(format!("standard input: {what}")));
     }
     kinds::check_stream(path, &start)?;
     let decoder = load::decoder(&start, detail, model_arg, limits)?.with_log(log);

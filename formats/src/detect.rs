@@ -152,7 +152,7 @@ impl Kind {
     pub fn name(self) -> &'static str {
         use Kind::*;
         match self {
-            Stream => "a b2p stream",
+            Stream => "a stream of b2p",
             Ply => "a PLY file",
             GaussianPly => "a PLY file of Gaussians",
             CompressedPly => "a compressed PLY file of Gaussians",

@@ -41,8 +41,9 @@ pub(super) fn read(bytes: &[u8], limits: &Limits, options: &ReadOptions) -> Resu
     let ply = Ply::open(bytes)?;
     let faces = ["face", "tristrips"].iter().find_map(|name| ply.element(name));
     if let Some(faces) = faces.filter(|faces| faces.count > 0 && !options.vertices) {
-        let count = super::grouped(faces.count);
-        return Err(is_a_mesh(&format!(" of {count} {}s", faces.name)));
+        let (count, name) = (super::grouped(faces.count), &faces.name);
+        let plural = if faces.count == 1 { "" } else { "s" };
+        return Err(is_a_mesh(&format!(" of {count} {name}{plural}")));
     }
     let names = Names::of(&ply);
     let all: Vec<&str> = [&names.axes, &names.colours, &names.normals]
@@ -208,4 +209,119 @@ fn add_offset(raw: &mut RawPoints, comments: &[String]) {
         *position = std::array::from_fn(|axis| position[axis] + offset[axis]);
     }
     raw.hints.coordinates = Coordinates::World;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cloud::{Note, PointCloud};
+
+    /// A cloud of properties `type name`, and its rows.
+    fn file(properties: &[&str], rows: &str) -> String {
+        let mut text = format!("ply\nformat ascii 1.0\nelement vertex {}\n", rows.lines().count());
+        for property in properties {
+            text += &format!("property {property}\n");
+        }
+        text + "end_header\n" + rows
+    }
+
+    fn open(text: &str) -> (PointCloud, Vec<Note>) {
+        PointCloud::read_ply(text.as_bytes(), &Limits::default(), &ReadOptions::default()).unwrap()
+    }
+
+    #[test]
+    fn colours_have_many_names() {
+        for names in [
+            ["red", "green", "blue"],
+            ["Red", "Green", "Blue"],
+            ["r", "g", "b"],
+            ["R", "G", "B"],
+            ["diffuse_red", "diffuse_green", "diffuse_blue"],
+        ] {
+            for axes in [["x", "y", "z"], ["X", "Y", "Z"]] {
+                let axes = axes.map(|axis| format!("float {axis}"));
+                let colours = names.map(|name| format!("uchar {name}"));
+                let all: Vec<&str> = axes.iter().chain(&colours).map(String::as_str).collect();
+                let (cloud, notes) = open(&file(&all, "1 2 3 10 20 30\n"));
+                assert_eq!((cloud.positions[0], cloud.colours[0]), ([1.0, 2.0, 3.0], [10, 20, 30]));
+                assert_eq!(notes, [], "{names:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn colours_have_many_types_and_what_is_guessed_is_reported() {
+        let read = |scalar: &str, row: &str| {
+            let colours = ["red", "green", "blue"].map(|name| format!("{scalar} {name}"));
+            let all = [
+                "float x",
+                "float y",
+                "float z",
+                colours[0].as_str(),
+                colours[1].as_str(),
+                colours[2].as_str(),
+            ];
+            let (cloud, notes) = open(&file(&all, &format!("0 0 0 {row}\n")));
+            (cloud.colours[0], notes.len())
+        };
+        assert_eq!(read("uchar", "10 20 30"), ([10, 20, 30], 0));
+        assert_eq!(read("ushort", "65535 257 0"), ([255, 1, 0], 0));
+        // Eight bits in fields of sixteen: black, if taken as sixteen.
+        assert_eq!(read("ushort", "255 128 1"), ([255, 128, 1], 1));
+        assert_eq!(read("float", "1 0.5 0"), ([255, 128, 0], 0));
+        assert_eq!(read("double", "255 128 0"), ([255, 128, 0], 1));
+        assert_eq!(read("int", "255 128 0"), ([255, 128, 0], 0));
+    }
+
+    #[test]
+    fn without_colours_grey_values_serve_then_normals_then_heights() {
+        let (cloud, notes) = open(&file(
+            &["float x", "float y", "float z", "uchar Intensity"],
+            "0 0 0 77\n",
+        ));
+        assert_eq!(cloud.colours, [[77; 3]]);
+        assert!(notes[0].to_string().contains("Intensity"), "{notes:?}");
+        let normals = ["float x", "float y", "float z", "float nx", "float ny", "float nz"];
+        let (_, notes) = open(&file(&normals, "0 0 0 0 0 1\n"));
+        assert_eq!(notes, [Note::Shaded { by: "normals" }]);
+        let (cloud, notes) = open(&file(&["float x", "float y", "float z"], "0 0 0\n0 0 1\n"));
+        assert_eq!(notes, [Note::Shaded { by: "height" }]);
+        assert!(cloud.colours[0][0] < cloud.colours[1][0]);
+    }
+
+    #[test]
+    fn points_that_are_not_finite_are_left_out_and_counted() {
+        let all = [
+            "float x",
+            "float y",
+            "float z",
+            "uchar red",
+            "uchar green",
+            "uchar blue",
+        ];
+        let (cloud, notes) = open(&file(&all, "nan nan nan 0 0 0\n1 2 3 4 5 6\n0 inf 0 1 1 1\n"));
+        assert_eq!(
+            (cloud.positions, cloud.colours),
+            (vec![[1.0, 2.0, 3.0]], vec![[4, 5, 6]])
+        );
+        assert_eq!(notes, [Note::NotFinite { left_out: 2, of: 3 }]);
+    }
+
+    #[test]
+    fn comments_of_our_writer_are_understood() {
+        let text = file(
+            &["float x", "float y", "float z", "uchar r", "uchar g", "uchar b"],
+            "1 2 3 4 5 6\n",
+        );
+        let comments = "comment coordinates local\ncomment offset 500000 4000000 0.5\ncomment up -z\n\
+                        comment metres_per_unit 0.3048\ncomment crs EPSG:32633\n";
+        let (cloud, _) = open(&text.replace("element", &format!("{comments}element")));
+        assert_eq!(cloud.positions, [[500_001.0, 4_000_002.0, 3.5]]);
+        assert_eq!(cloud.axes.up, Some(crate::axes::Up::MinusZ));
+        assert_eq!(cloud.axes.metres_per_unit, Some(0.3048));
+        assert_eq!(cloud.axes.crs, "EPSG:32633");
+        // Free text is none of them.
+        let (cloud, _) = open(&text.replace("element", "comment up to date\ncomment offset print\nelement"));
+        assert!(cloud.axes.is_empty());
+    }
 }

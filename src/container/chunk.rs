@@ -17,6 +17,8 @@ pub(super) enum Form {
 const FIXED_HEADER: usize = 12;
 /// Chunk types from here on are ancillary: a reader skips them.
 const ANCILLARY: u8 = 128;
+/// The type of head maps; axes have 128.
+const HEAD_MAP: u8 = 129;
 
 /// The kind of a chunk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -81,7 +83,7 @@ const KINDS: [(Form, u8, ChunkKind, &str); 10] = [
     (Form::Short, 6, ChunkKind::ColourTrunk, "colour trunk"),
     (Form::Short, 7, ChunkKind::Colours, "colour"),
     (Form::Short, 8, ChunkKind::PostFilter, "colour filter"),
-    (Form::Short, ANCILLARY, ChunkKind::HeadMap, "head map"),
+    (Form::Short, HEAD_MAP, ChunkKind::HeadMap, "head map"),
 ];
 
 impl ChunkKind {

@@ -91,7 +91,7 @@ impl Gaussians {
         };
         let mut header = format!(
             "ply\nformat binary_little_endian 1.0\n{}element vertex {}\n",
-            comments(self, self.blur),
+            comments(&self.frame, self.compensated, self.blur),
             self.len()
         );
         for name in PROPERTIES {
@@ -146,12 +146,12 @@ impl Gaussians {
     }
 }
 
-/// The comments of a file of these Gaussians that this crate understands, each a line of the header: render mode, cube,
-/// `blur` if there is any, and what was subtracted from all coordinates.
-pub fn comments(gaussians: &Gaussians, blur: f32) -> String {
-    let Frame { bits, placement } = gaussians.frame;
+/// The comments that [`Comments`] reads, each a line of a header: render mode, cube, `blur` if there is any, and the
+/// offset of the cube, which was subtracted from all coordinates.
+pub fn comments(frame: &Frame, compensated: bool, blur: f32) -> String {
+    let Frame { bits, placement } = *frame;
     let [x, y, z] = placement.origin;
-    let mode = if gaussians.compensated { MIP[0] } else { "default" };
+    let mode = if compensated { MIP[0] } else { "default" };
     let mut lines = format!(
         "comment SplatRenderMode: {mode}\ncomment b2p bits {bits}\ncomment b2p origin {x} {y} {z}\n\
          comment b2p voxel_size {}\n",
@@ -160,7 +160,7 @@ pub fn comments(gaussians: &Gaussians, blur: f32) -> String {
     if blur > 0.0 {
         lines += &format!("comment b2p blur {blur}\n");
     }
-    let [x, y, z] = gaussians.frame.offset();
+    let [x, y, z] = frame.offset();
     if [x, y, z] != [0.0; 3] {
         lines += &format!("comment b2p offset {x} {y} {z}\n");
     }

@@ -3,6 +3,7 @@
 mod clouds;
 #[path = "../../../tests/common/mod.rs"]
 mod common;
+mod converting;
 mod cutting;
 mod edges;
 mod framing;

@@ -45,12 +45,21 @@ pub(super) fn describe(bytes: &[u8]) -> String {
 pub(super) fn read(bytes: Vec<u8>, limits: &Limits, notes: &mut Vec<Note>) -> Result<RawPoints> {
     let start = Start::parse(&bytes)?;
     let chunks = start.check(&bytes, limits)?;
+    let name = describe(&bytes);
+    if start.points == 0 {
+        return Err(malformed(
+            format!("the header of {name}"),
+            "number of points",
+            0,
+            "at least one",
+        ));
+    }
     let length = bytes.len();
     let mut raw = guarded("LAS", || {
         let failed = |e: las::Error| {
             malformed(
                 format!("byte {} of {length}", start.offset),
-                "LAS data",
+                format!("{name} data"),
                 e,
                 "a valid file",
             )

@@ -165,7 +165,7 @@ mod tests {
     #[test]
     fn a_file_of_the_wrong_kind_says_what_it_is_and_what_to_do() {
         for (bytes, what, advice) in [
-            (&b2p::container::MAGIC[..], "a b2p stream", "decode"),
+            (&b2p::container::MAGIC[..], "a stream of b2p", "decode"),
             (b"NGSP\x04\0\0\0", "an SPZ file", "render"),
             (
                 b"solid cube\n",
@@ -190,7 +190,7 @@ mod tests {
                     property list uchar int vertex_indices\nend_header\n0 0 0 1 2 3\n1 0 0 4 5 6\n0 1 0 7 8 9\n3 0 1 2\n";
         let error = refusal(text.as_bytes());
         assert!(
-            error.contains("this is a mesh of 1 faces") && error.contains("voxelize"),
+            error.contains("this is a mesh of 1 face:") && error.contains("voxelize"),
             "{error}"
         );
         let options = ReadOptions {

@@ -63,7 +63,8 @@ pub(super) fn read(bytes: &[u8], limits: &Limits, options: &ReadOptions) -> Resu
         limits.check_bytes("bytes of the point cloud", 36 * count)?;
     }
     if faces > 0 && !options.vertices {
-        return Err(is_a_mesh(&format!(" of {faces} faces")));
+        let plural = if faces == 1 { "" } else { "s" };
+        return Err(is_a_mesh(&format!(" of {faces} face{plural}")));
     }
     if !colours.is_empty() {
         // Floats of 0 and 1 alone are more usual than bytes of 0 and 1.
@@ -105,7 +106,7 @@ mod tests {
         let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
         let error = parse(text, &ReadOptions::default()).unwrap_err().to_string();
         assert!(
-            error.contains("mesh of 1 faces") && error.contains("voxelize"),
+            error.contains("mesh of 1 face:") && error.contains("voxelize"),
             "{error}"
         );
         let vertices = ReadOptions {

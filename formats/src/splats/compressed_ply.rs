@@ -150,11 +150,7 @@ pub(super) fn write(rows: &mut Rows, to: &mut dyn Write) -> io::Result<()> {
         .map(|first| Block::of(rows, first))
         .collect();
     let coefficients = 3 * rows.harmonics();
-    let told = if rows.is_turned() {
-        String::new()
-    } else {
-        comments(rows.gaussians, 0.0)
-    };
+    let told = comments(&rows.frame(), rows.gaussians.compensated, 0.0);
     let mut header = format!(
         "ply\nformat binary_little_endian 1.0\n{told}element chunk {}\n",
         blocks.len()

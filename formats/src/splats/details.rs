@@ -2,7 +2,7 @@
 
 use std::io::{Cursor, Read, Write};
 
-use b2p::gaussians::{Frame, Gaussians};
+use b2p::gaussians::Frame;
 use b2p::{Limits, Placement, Result};
 use serde_json::{Value, json};
 use zip::ZipArchive;
@@ -107,14 +107,14 @@ impl<'a> ArchiveWriter<'a> {
     }
 }
 
-/// The cube of the Gaussians for formats that hold JSON.
-pub(super) fn frame_to_json(gaussians: &Gaussians) -> Value {
-    let Frame { bits, placement } = gaussians.frame;
+/// The cube for formats that hold JSON, and its offset.
+pub(super) fn frame_to_json(frame: Frame) -> Value {
+    let Frame { bits, placement } = frame;
     json!({
         "bits": bits,
         "origin": placement.origin,
         "voxel_size": placement.voxel_size,
-        "offset": gaussians.frame.offset(),
+        "offset": frame.offset(),
     })
 }
 

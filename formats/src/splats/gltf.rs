@@ -13,7 +13,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
 
-pub(super) use read::{is_json, read};
+pub(super) use read::{has_splats, read};
 
 use super::Format;
 use super::details::frame_to_json;
@@ -179,10 +179,7 @@ fn document(rows: &Rows, attributes: &[Attribute], size: u64, uri: Option<String
         buffer["uri"] = uri.into();
     }
     let mut asset = json!({ "version": "2.0", "generator": concat!("b2p ", env!("CARGO_PKG_VERSION")) });
-    let mut details = json!({ "antialiased": rows.gaussians.compensated });
-    if !rows.is_turned() {
-        details["cube"] = frame_to_json(rows.gaussians);
-    }
+    let details = json!({ "antialiased": rows.gaussians.compensated, "cube": frame_to_json(rows.frame()) });
     asset["extras"] = json!({ "b2p": details });
     json!({
         "asset": asset,

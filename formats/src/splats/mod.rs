@@ -11,10 +11,10 @@
 //! | [`Format::Csv`] | `.csv` | decimal | decimal logarithm | decimal | decimal, logit | decimal |
 //! | [`Format::Npz`] | `.npz` | float | float | float | float | float |
 //!
-//! Coordinates are those of the world. A cube far from the origin is written less an offset ([`Frame::offset`]
-//! (b2p::gaussians::Frame::offset)), which every format but SPZ and `.splat` states; [`Options::offset`] restores it.
+//! Coordinates are those of the world. A cube far from the origin is written less an offset ([`offset`]), which SPZ and
+//! `.splat` cannot state: [`Options::offset`] restores it.
 //! All formats but glTF share the axes of PLY files. glTF defines +y as up, where programs take −y of a PLY file as up,
-//! so [`convert axes`](Axes) turns by 180° about z, as other programs do.
+//! so [`write()`] turns by 180° about z, as other programs do.
 //!
 //! Only PLY states the [`blur`](Gaussians::blur); all other writers add it to the squared scales, which draws the same.
 //! Gaussians with a number that is not finite, or without a rotation, are left out and counted.
@@ -117,10 +117,10 @@ impl Format {
             return details::kind_of_archive(bytes);
         }
         if bytes.starts_with(b"glTF") {
-            return Some(Format::Glb);
+            return gltf::has_splats(bytes).then_some(Format::Glb);
         }
         let first = bytes.iter().find(|byte| !byte.is_ascii_whitespace());
-        if first == Some(&b'{') && gltf::is_json(bytes) {
+        if first == Some(&b'{') && gltf::has_splats(bytes) {
             return Some(Format::Gltf);
         }
         csv::is_csv(bytes).then_some(Format::Csv)
@@ -185,6 +185,19 @@ pub struct Splats {
     pub warnings: Vec<String>,
 }
 
+impl Splats {
+    /// The Gaussians in the axes of PLY files. Those that are turned lose the ones with numbers that are not finite.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the cube that was fitted to them is not valid.
+    pub fn into_ply_axes(self) -> Result<Gaussians> {
+        match self.axes {
+            Axes::Ply => Ok(self.gaussians),
+            Axes::Gltf => Rows::new(&self.gaussians, true)?.to_gaussians(),
+        }
+    }
+}
+
 /// What a file cannot say itself.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Options {
@@ -219,6 +232,16 @@ pub fn read(bytes: &[u8], format: Format, options: &Options, limits: &Limits) ->
         axes: Axes::of(format),
         warnings,
     })
+}
+
+/// What [`write()`] subtracts from the coordinates in a file of this format, in the axes of the file. Zeros for formats
+/// that hold the coordinates of the world: CSV, whose numbers are decimal, and glTF, whose node has the offset.
+pub fn offset(gaussians: &Gaussians, axes: Axes, format: Format) -> [f64; 3] {
+    match format {
+        Format::Csv | Format::Glb | Format::Gltf => [0.0; 3],
+        _ if axes == Axes::of(format) => gaussians.frame.offset(),
+        _ => rows::turned_frame(gaussians.frame).offset(),
+    }
 }
 
 /// Writes Gaussians whose coordinates have the axes `axes`. Returns what the format could not keep, a sentence each.

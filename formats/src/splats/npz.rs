@@ -202,11 +202,9 @@ fn write_archive(rows: &Rows, to: &mut dyn Write) -> io::Result<()> {
         to.write_all(&numbers.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>())
     };
     doubles("offset", &rows.offset())?;
-    if !rows.is_turned() {
-        let Frame { bits, placement } = rows.gaussians.frame;
-        let [x, y, z] = placement.origin;
-        doubles("cube", &[f64::from(bits), x, y, z, placement.voxel_size])?;
-    }
+    let Frame { bits, placement } = rows.frame();
+    let [x, y, z] = placement.origin;
+    doubles("cube", &[f64::from(bits), x, y, z, placement.voxel_size])?;
     let to = archive.start("antialiased.npy", 0)?;
     to.write_all(&header("|b1", &[]))?;
     to.write_all(&[u8::from(rows.gaussians.compensated)])?;

@@ -1,7 +1,7 @@
 //! Gaussians as rows of numbers in world units, as all writers but that of PLY take them.
 
-use b2p::gaussians::{Gaussians, Harmonics};
-use b2p::{Error, Result};
+use b2p::gaussians::{Frame, Gaussians, Harmonics};
+use b2p::{Error, Placement, Result};
 use rayon::prelude::*;
 
 use super::builder::Builder;
@@ -51,6 +51,7 @@ impl Row {
 pub(super) struct Rows<'a> {
     pub gaussians: &'a Gaussians,
     turn: Option<Turn>,
+    frame: Frame,
     offset: [f64; 3],
     unit: f64,
     order: Vec<u32>,
@@ -75,10 +76,16 @@ impl<'a> Rows<'a> {
             let what = "with numbers that are not finite, or without a rotation, are left out";
             warnings.push(format!("{lost} of {} Gaussians {what}", gaussians.len()));
         }
+        let frame = if turned {
+            turned_frame(gaussians.frame)
+        } else {
+            gaussians.frame
+        };
         Ok(Rows {
             gaussians,
             turn: turned.then(Turn::half_about_z),
-            offset: gaussians.frame.offset(),
+            offset: frame.offset(),
+            frame,
             unit: gaussians.frame.unit(),
             order,
             warnings,
@@ -89,17 +96,14 @@ impl<'a> Rows<'a> {
         self.order.len()
     }
 
-    /// What is subtracted from the coordinates, in the axes of the file.
+    /// What is subtracted from the coordinates.
     pub fn offset(&self) -> [f64; 3] {
-        match &self.turn {
-            Some(turn) => turn.point(self.offset),
-            None => self.offset,
-        }
+        self.offset
     }
 
-    /// Whether the axes of the file are not those of the Gaussians: their cube does not apply then.
-    pub fn is_turned(&self) -> bool {
-        self.turn.is_some()
+    /// The cube, in the axes of the file.
+    pub fn frame(&self) -> Frame {
+        self.frame
     }
 
     /// Adds a sentence about what the format does not keep.
@@ -121,14 +125,13 @@ impl<'a> Rows<'a> {
         let i = self.order[i] as usize;
         let blur = f64::from(g.blur.max(0.0)) * self.unit * self.unit;
         let world = g.frame.placement.from_cube(g.frame.bits, g.position[i]);
-        let position = std::array::from_fn(|k| world[k] - self.offset[k]);
         let rotation = unit(g.rotation[i].map(f64::from));
-        let (position, rotation) = match &self.turn {
-            Some(turn) => (turn.point(position), turn.rotation(rotation)),
-            None => (position, rotation),
+        let (world, rotation) = match &self.turn {
+            Some(turn) => (turn.point(world), turn.rotation(rotation)),
+            None => (world, rotation),
         };
         Row {
-            position,
+            position: std::array::from_fn(|k| world[k] - self.offset[k]),
             scale: g.scale[i].map(|s| {
                 let s = f64::from(s).abs() * self.unit;
                 if blur > 0.0 { (s * s + blur).sqrt() } else { s }
@@ -182,7 +185,7 @@ impl<'a> Rows<'a> {
         self.order = order.into_iter().map(|(_, i)| i).collect();
     }
 
-    /// The rows as Gaussians with a fitted cube.
+    /// The rows as Gaussians.
     pub fn to_gaussians(&self) -> Result<Gaussians> {
         let mut builder = Builder::new(self.len() as u64, self.harmonics(), &b2p::Limits::unlimited())?;
         builder.offset = self.offset();
@@ -191,7 +194,19 @@ impl<'a> Rows<'a> {
             builder.push(self.row(i));
             builder.push_coefficients(self.coefficients(i));
         }
-        Ok(builder.finish(None))
+        Ok(builder.finish(Some(self.frame)))
+    }
+}
+
+/// The cube after half a turn about z.
+pub(super) fn turned_frame(frame: Frame) -> Frame {
+    let side = 2.0 * frame.unit();
+    let Placement { origin, voxel_size } = frame.placement;
+    let [x, y, z] = origin;
+    let origin = [-x - side, -y - side, z];
+    Frame {
+        placement: Placement { origin, voxel_size },
+        ..frame
     }
 }
 

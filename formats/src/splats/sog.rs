@@ -223,9 +223,7 @@ pub(super) fn write(rows: &mut Rows, to: &mut dyn Write, io: &dyn Fn(io::Error) 
     if rows.gaussians.compensated {
         meta["model"] = ANTIALIASED.into();
     }
-    if !rows.is_turned() {
-        meta["b2p"] = frame_to_json(rows.gaussians);
-    }
+    meta["b2p"] = frame_to_json(rows.frame());
     let mut archive = ArchiveWriter::new(to);
     let mut add = |name: &str, bytes: &[u8]| archive.start(name, bytes.len() as u64)?.write_all(bytes);
     let mut picture = |name: &str, pixels: &[[u8; 4]]| {

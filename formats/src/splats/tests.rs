@@ -358,6 +358,17 @@ fn gltf_is_turned_by_180_degrees_about_z_and_back() {
             assert!((expected - found).abs() < 1e-5, "{a:?} {b:?}");
         }
     }
+    // So does its cube, and all of it back.
+    let back = turned.clone().into_ply_axes().unwrap();
+    let near = |a: [f64; 3], b: [f64; 3]| (0..3).all(|k| (a[k] - b[k]).abs() < 1e-9);
+    assert!(near(back.frame.placement.origin, before.frame.placement.origin));
+    assert!(
+        back.position
+            .as_flattened()
+            .iter()
+            .zip(before.position.as_flattened())
+            .all(|(a, b)| (a - b).abs() < 1e-5)
+    );
     // Each format of PLY's axes takes it back.
     let (extent, farthest) = bounds_of(&before);
     for format in [Format::Ply, Format::Spz, Format::Csv, Format::Npz, Format::Splat] {

@@ -315,23 +315,6 @@ fn view_dependent_colour_is_assigned_to_its_gaussian() {
 }
 
 #[test]
-fn opacities_of_nothing_and_of_all_are_written_as_finite_numbers() {
-    let mut extremes = gaussians();
-    let values = [0.0, 1.0, -0.5, 1.5];
-    for (opacity, value) in extremes.opacity.iter_mut().zip(values.into_iter().cycle()) {
-        *opacity = value;
-    }
-    let mut file = Vec::new();
-    extremes.write_ply(&mut file, Path::new("x")).unwrap();
-    let ply = Ply::open(&file).unwrap();
-    let column = &ply.vertex_columns(&["opacity"], &Limits::default()).unwrap()[0];
-    for i in 0..extremes.len() {
-        let logit: f64 = column.get(i);
-        assert!(logit.is_finite() && (13.0..14.0).contains(&logit.abs()), "{logit}");
-    }
-}
-
-#[test]
 fn view_dependent_colour_and_its_render_mode_are_written() {
     let mut before = gaussians();
     before.compensated = true;
@@ -380,4 +363,21 @@ fn a_cube_near_the_origin_keeps_its_coordinates() {
         voxel_size: 1e-7,
     };
     assert_eq!(Frame { bits: 10, placement }.offset(), [11.576_2, 48.137_2, 0.0]);
+}
+
+#[test]
+fn opacities_of_nothing_and_of_all_are_written_as_finite_numbers() {
+    let mut extremes = gaussians();
+    let values = [0.0, 1.0, -0.5, 1.5];
+    for (opacity, value) in extremes.opacity.iter_mut().zip(values.into_iter().cycle()) {
+        *opacity = value;
+    }
+    let mut file = Vec::new();
+    extremes.write_ply(&mut file, Path::new("x")).unwrap();
+    let ply = Ply::open(&file).unwrap();
+    let column = &ply.vertex_columns(&["opacity"], &Limits::default()).unwrap()[0];
+    for i in 0..extremes.len() {
+        let logit: f64 = column.get(i);
+        assert!(logit.is_finite() && (13.0..14.0).contains(&logit.abs()), "{logit}");
+    }
 }

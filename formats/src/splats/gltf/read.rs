@@ -22,10 +22,15 @@ const JSON_FACTOR: u64 = 16;
 /// By how much the axes of a node may differ in length, relatively.
 const TOLERANCE: f64 = 1e-4;
 
-/// Whether text is glTF, as far as its start tells.
-pub(in crate::splats) fn is_json(bytes: &[u8]) -> bool {
-    let name = b"\"asset\"";
-    bytes.windows(name.len()).any(|window| window == name)
+/// Whether a document names the extension: meshes and points do not.
+pub(in crate::splats) fn has_splats(bytes: &[u8]) -> bool {
+    let text = if bytes.starts_with(MAGIC) {
+        chunks(bytes).map_or(&[][..], |(text, _)| text)
+    } else {
+        bytes
+    };
+    text.windows(EXTENSION.len())
+        .any(|window| window == EXTENSION.as_bytes())
 }
 
 /// A document with its buffers.
