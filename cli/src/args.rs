@@ -178,7 +178,7 @@ pub struct Encode {
     /// [default: N−3..N−1; with --bits-per-point up to N]
     #[arg(long, help_heading = "Advanced", value_name = "L..M", value_parser = levels)]
     pub levels: Option<RangeInclusive<u8>>,
-    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma twice that of luma unless said; coarser
+    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma by default twice that of luma; coarser
     /// levels have finer steps [default: 20]
     #[arg(long, help_heading = "Advanced", value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
     pub step: Option<QualityTarget>,
@@ -215,12 +215,12 @@ pub enum Colours {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "With --colours learned")]
 pub struct LearnedArgs {
-    /// Price of a bit in the rate-distortion optimisation of latents, times what the model says: 0 rounds to the nearest, more saves bits
-    /// and costs quality
-    #[arg(long, value_name = "X", value_parser = price, default_value_t = 1.0)]
+    /// Rate-distortion trade-off, a factor on the model's Lagrangian λ: 0 rounds latents to the nearest, higher gives smaller files and
+    /// costs quality
+    #[arg(long = "lambda-scale", alias = "bit-price", value_name = "X", value_parser = price, default_value_t = 1.0)]
     pub bit_price: f32,
     /// Residual of the finest level's colours. `coarse`: low frequencies, where they are worth it and filters are made; `none`: nothing;
-    /// else all of it, in steps of STEP/255, 1 to 255, of chroma 3/8 of it unless said: 24 doubles some streams
+    /// else all of it, in steps of STEP/255, 1 to 255, of chroma by default 3/8 of it: 24 doubles some streams
     #[arg(long, value_name = "coarse|none|STEP[,CHROMA]", value_parser = residual, default_value = "coarse")]
     pub residual: Residual,
     /// Give each level that is drawn a residual of its own, not the finest alone: better pictures of coarser levels, for bytes that the finest does not need
@@ -230,7 +230,7 @@ pub struct LearnedArgs {
 
 #[derive(Debug, Args)]
 pub struct Decode {
-    /// Stream to decode to Gaussians. `-`: standard input, decoded as it comes
+    /// Stream to decode to Gaussians. `-`: standard input, decoded as it arrives
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
@@ -272,7 +272,7 @@ pub struct Convert {
 
 #[derive(Debug, Args)]
 pub struct Render {
-    /// Stream, Gaussians in any format that `convert` reads, or point cloud. `-`: standard input, drawn as it comes
+    /// Stream, Gaussians in any format that `convert` reads, or point cloud. `-`: standard input, drawn as it arrives
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
@@ -446,7 +446,7 @@ pub struct Bench {
     /// What is drawn leaves out as much as this quality does: fast, fine, exact
     #[arg(long, value_name = "NAME", default_value = "fine", requires = "render")]
     pub quality: Quality,
-    /// Times that it is decoded or drawn; medians are told
+    /// Times that it is decoded or drawn; medians are reported
     #[arg(long, value_name = "N", default_value_t = 7, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub repeat: u32,
     #[command(flatten)]
@@ -475,7 +475,7 @@ pub struct ModelArg {
     /// Model file: of learned streams the model that they were coded with [default: the one inside the program], of others heads
     #[arg(long, help_heading = "Advanced", value_name = "FILE")]
     pub model: Option<PathBuf>,
-    /// Use no better instructions than these: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
+    /// Use at most this instruction set: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
     #[arg(long, help_heading = "Advanced", value_name = "NAME")]
     pub isa: Option<String>,
     /// Generate Gaussians in int16 (the same bits everywhere), f16, or half (f16 with sums in f16 too, on processors that have them) [default: int16 if the model has it]

@@ -139,7 +139,7 @@ pub fn describe(report: &GridReport) -> String {
     let (bits, finest) = (report.bits, report.finest);
     if report.is_coarser() {
         text += &format!(
-            "The points lie too far apart for {finest} bits: surfaces would have holes. --bits {finest} codes them all the same.\n"
+            "Using {bits} bits: at {finest}, gaps between points would show as holes. Force {finest} with --bits {finest}.\n"
         );
     }
     if report.merges_most() && bits < 21 {

@@ -138,7 +138,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) ->
     let asked = [
         ("--model", model.model.is_some()),
         ("--precision", model.precision.is_some()),
-        ("--bit-price", learned.bit_price != 1.0),
+        ("--lambda-scale", learned.bit_price != 1.0),
         ("--residual", learned.residual != Residual::Coarse),
         ("--every-level", learned.every_level),
     ];
@@ -222,5 +222,5 @@ fn within(most: f64, chosen: &Options) -> String {
         Residual::None if chosen.filter || price > 2.0 => "; a model for fewer bits (--model) may be better",
         _ => "",
     };
-    format!(" of at most {most}: bit price {price:.2}, {residual}{more}")
+    format!(" of at most {most}: λ scale {price:.2}, {residual}{more}")
 }

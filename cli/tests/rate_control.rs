@@ -150,6 +150,6 @@ fn each_try_is_reported_as_it_begins_and_there_are_at_most_seven() {
     let tries: Vec<_> = heard.iter().filter(|step| step.starts_with("try ")).collect();
     assert!((1..=7).contains(&tries.len()), "{heard:?}");
     for (i, step) in (1..).zip(tries) {
-        assert!(step.starts_with(&format!("try {i} of 7: bit price ")), "{step}");
+        assert!(step.starts_with(&format!("try {i} of 7: λ scale ")), "{step}");
     }
 }

@@ -62,7 +62,7 @@ pub fn encode_to_rate(
             bit_price, residual, ..
         } = path[at];
         tries += 1;
-        let name = format!("try {tries} of {most}: bit price {bit_price:.2}, {residual}");
+        let name = format!("try {tries} of {most}: λ scale {bit_price:.2}, {residual}");
         let (own, stream) = log.step(name, points, "points", || {
             let known = coded.iter().position(|(price, _)| *price == bit_price);
             let own = known.unwrap_or(coded.len());

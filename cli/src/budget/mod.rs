@@ -177,13 +177,14 @@ impl Chosen {
         if let Some(time) = self.budget.time
             && !self.choice.in_time
         {
-            text += &format!(", nothing promises {}", milliseconds(time));
+            text += &format!(", no setting fits {}", milliseconds(time));
         }
         text += &match self.budget.time {
             None => format!("; took {}", milliseconds(took)),
             Some(time) if took <= time => {
                 format!("; kept: {} of {}", milliseconds(took), milliseconds(time))
             }
+            Some(_) if !self.choice.in_time => format!("; took {}", milliseconds(took)),
             Some(time) => {
                 format!("; not kept: {} of {}", milliseconds(took), milliseconds(time))
             }

@@ -12,10 +12,7 @@ fn a_stream_of_at_most_so_many_bits_is_made_and_said_to_be() {
     let said = succeeds(at, &[&encode[..], &["1.2"]].concat());
     let bits = |name: &str| std::fs::metadata(at.join(name)).unwrap().len() as f64 * 8.0 / points;
     assert!((1.0..=1.2).contains(&bits("ball.b2p")), "{said}");
-    let words = format!(
-        "{:.4} bits per point of at most 1.2: bit price 1.00, ",
-        bits("ball.b2p")
-    );
+    let words = format!("{:.4} bits per point of at most 1.2: λ scale 1.00, ", bits("ball.b2p"));
     assert!(said.contains(&words), "{said}");
     let step = said.trim().rsplit("residual in steps of ").next().unwrap();
     succeeds(at, &[&learned[..], &["-o", "by-hand.b2p", "--residual", step]].concat());
@@ -25,7 +22,7 @@ fn a_stream_of_at_most_so_many_bits_is_made_and_said_to_be() {
 
     let said = succeeds(at, &[&encode[..], &["1000"]].concat());
     assert!(
-        said.contains("of at most 1000: bit price 1.00, residual in steps of 1, the finest"),
+        said.contains("of at most 1000: λ scale 1.00, residual in steps of 1, the finest"),
         "{said}"
     );
     assert!(
@@ -59,7 +56,9 @@ fn what_the_number_of_bits_decides_cannot_be_asked_for_as_well() {
         assert!(errors.contains(words), "{errors}");
         assert!(!at.join("x.b2p").exists());
     };
-    refused(&["1", "--bit-price", "1"], "--bit-price");
+    refused(&["1", "--lambda-scale", "1"], "--lambda-scale");
+    // The option's older name.
+    refused(&["1", "--bit-price", "1"], "--lambda-scale");
     refused(&["1", "--residual", "coarse"], "--residual");
     for wrong in ["0", "nan", "inf", "some"] {
         refused(&[wrong], "0");

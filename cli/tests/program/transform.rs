@@ -65,7 +65,7 @@ fn options_of_the_other_way_to_code_colours_are_refused() {
     let refused = |more: &[&str], words: &[&str]| {
         fails(at, &[&encode[..], more].concat(), words);
     };
-    refused(&["--bit-price", "2"], &["--bit-price", "--colours learned"]);
+    refused(&["--lambda-scale", "2"], &["--lambda-scale", "--colours learned"]);
     refused(&["--model", "m"], &["--model", "--colours learned"]);
     let learned = ["--colours", "learned", "--step", "8"];
     refused(&learned, &["--step", "--colours transform"]);
