@@ -1,5 +1,5 @@
-//! What each cut-off costs in accuracy and saves in time: pictures of a PLY of Gaussians from 24 views near and far, against double
-//! precision without cut-offs.
+//! What each cut-off costs in accuracy and saves in time: pictures of a PLY of Gaussians from 24 views near and far,
+//! against double precision without cut-offs.
 //!
 //! `accuracy FILE.ply [SIZE]`; without a file, the sample that comes with the program.
 

@@ -1,10 +1,10 @@
-//! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes, and a room full of splats of all
-//! shapes, seen from within. The first picture's time,
-//! least and median time of those after it, and the stages of the fastest.
+//! How long pictures take: a body-like surface of small discs, as a decoder makes them, at several sizes, and a room
+//! full of splats of all shapes, seen from within. The first picture's time, least and median time of those after it,
+//! and the stages of the fastest.
 //!
-//! `raster [--threads N] [--isa NAME] [--effects] [--quality NAME] [--turn DEGREES] [SCENE…]`; `--effects` draws with each effect instead
-//! of the plain pictures, `--quality` in that quality; with `--turn` the camera goes around by so much from picture to picture; a scene
-//! is a name of [`SCENES`] or a PLY file, drawn at 1024×1024.
+//! `raster [--threads N] [--isa NAME] [--effects] [--quality NAME] [--turn DEGREES] [SCENE…]`; `--effects` draws with
+//! each effect instead of the plain pictures, `--quality` in that quality; with `--turn` the camera goes around by so
+//! much from picture to picture; a scene is a name of [`SCENES`] or a PLY file, drawn at 1024×1024.
 
 use std::time::{Duration, Instant};
 
@@ -121,7 +121,8 @@ impl Limb {
     }
 }
 
-/// The `first` of `count` discs of σ = 0.4, 0.9 and 1.1 voxels on a body, in Morton order; the voxels' edge goes with the density.
+/// The `first` of `count` discs of σ = 0.4, 0.9 and 1.1 voxels on a body, in Morton order; the voxels' edge goes with
+/// the density.
 fn body(count: usize, first: usize) -> Gaussians {
     let mut random = Random(1);
     let total: f64 = BODY.iter().map(Limb::area).sum();
@@ -244,7 +245,8 @@ fn measure(
     Ok(())
 }
 
-/// What is drawn: the plain picture, one without ray-space evaluation too where something crosses the near plane, or one with each effect.
+/// What is drawn: the plain picture, one without ray-space evaluation too where something crosses the near plane, or
+/// one with each effect.
 fn variants(forced: bool, within: bool) -> Vec<(&'static str, Effects, Channel)> {
     let none = Effects::default();
     let without_ray_space = none.with(Effect::Near, EffectMode::Off);

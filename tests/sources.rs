@@ -3,7 +3,8 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// The folders of `src/`, each with those that it may import beside the commons: an arrow only leads to a folder further up.
+/// The folders of `src/`, each with those that it may import beside the commons: an arrow only leads to a folder
+/// further up.
 const STAGES: [(&str, &[&str]); 12] = [
     ("coding", &[]),
     ("container", &[]),
@@ -82,8 +83,8 @@ const NOT_EXACT: [&str; 5] = [
     "src/latents/network/untrained.rs",
 ];
 
-/// The folders of `kernels/src`, each importing only from those before it. Without the feature `close`, that folder is not compiled:
-/// nothing else can name it.
+/// The folders of `kernels/src`, each importing only from those before it. Without the feature `close`, that folder is
+/// not compiled: nothing else can name it.
 const KERNELS: [&str; 4] = ["simd", "sparse", "exact", "close"];
 
 /// What differs between machines, mathematical libraries, runs, or orders of summation.

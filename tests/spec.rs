@@ -1,5 +1,6 @@
-//! Holds `docs/format.md` against the streams: the Python decoder in `spec/`, written from that document, must decode every
-//! conformance stream of version 3 to its digests. Needs Python 3.10 with numpy; without them the test says so and passes.
+//! Holds `docs/format.md` against the streams: the Python decoder in `spec/`, written from that document, must decode
+//! every conformance stream of version 3 to its digests. Needs Python 3.10 with numpy; without them the test says so
+//! and passes.
 
 use std::path::Path;
 use std::process::Command;

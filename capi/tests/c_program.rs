@@ -1,5 +1,5 @@
-//! A C program built against the header and the static library: it runs, with AddressSanitizer watching where the compiler has it, and
-//! draws what Rust draws.
+//! A C program built against the header and the static library: it runs, with AddressSanitizer watching where the
+//! compiler has it, and draws what Rust draws.
 
 #[path = "../../tests/common/mod.rs"]
 mod common;

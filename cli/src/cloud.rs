@@ -46,7 +46,8 @@ pub struct ReadArgs {
     /// Axis that points up: x, y, z, -x, -y, -z, or auto [default: what the file or its format says]
     #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
     pub up: Option<UpArg>,
-    /// Length of a unit: m, cm, mm, km, in, ft, us-ft, or a number of metres [default: what the file or its format says]
+    /// Length of a unit: m, cm, mm, km, in, ft, us-ft, or a number of metres [default: what the file or its format
+    /// says]
     #[arg(long, value_name = "UNIT", value_parser = unit)]
     pub unit: Option<f64>,
     /// Take the vertices of a mesh as points

@@ -10,7 +10,8 @@ use super::manners::{self, Said};
 use super::table::{count, counted, table};
 use super::{Failure, Result, cloud, kinds, load};
 
-/// Describes a stream as text or JSON. A cut or damaged stream is described with what is wrong; its model is described if it is the one at hand.
+/// Describes a stream as text or JSON. A cut or damaged stream is described with what is wrong; its model is described
+/// if it is the one at hand.
 pub fn run(args: &Info, limits: &Limits) -> Result<Said> {
     let bytes = load::bytes(&args.input, limits)?;
     if let Some(text) = cloud::info(&args.input, &bytes, manners::json(), limits)? {

@@ -1,4 +1,5 @@
-//! `--budget` for streams of version 3: no calibration is needed, for the coarser levels tell what the finer ones will take.
+//! `--budget` for streams of version 3: no calibration is needed, for the coarser levels tell what the finer ones will
+//! take.
 
 use std::path::Path;
 use std::time::{Duration, Instant};

@@ -67,8 +67,8 @@ fn wrong(path: &Path, what: &str) -> Failure {
     Failure(format!("{}: {what}", path.display()))
 }
 
-/// Fails with what to do if these bytes are plainly no stream. What looks like nothing known is left to the reader, which says where
-/// it is wrong.
+/// Fails with what to do if these bytes are plainly no stream. What looks like nothing known is left to the reader,
+/// which says where it is wrong.
 pub fn check_stream(path: &Path, bytes: &[u8]) -> Result<()> {
     if bytes.starts_with(&MAGIC) {
         return Ok(());

@@ -4,8 +4,9 @@ use std::ops::RangeInclusive;
 
 use b2p::encoder::transform::{Options, QualityTarget};
 
-/// A stretch of the scale, from one quality to the next stretch's: how many levels above the cloud's own the finest coded level is, and
-/// the quantisation steps of luma at both ends. Streams of the sample are about as long where a stretch ends as where the next begins.
+/// A stretch of the scale, from one quality to the next stretch's: how many levels above the cloud's own the finest
+/// coded level is, and the quantisation steps of luma at both ends. Streams of the sample are about as long where a
+/// stretch ends as where the next begins.
 struct Stretch {
     from: u8,
     above: u8,

@@ -98,8 +98,8 @@ const MOST_THREADS: usize = 1024;
 /// What a shell gives for a program that SIGPIPE ended.
 const BROKEN_PIPE: u8 = 128 + 13;
 
-/// Runs the program; the exit code is 0 for success, 1 for failure, 2 (from the argument parser) for misuse, 130 after Ctrl-C, 141
-/// if the reader of standard output has gone.
+/// Runs the program; the exit code is 0 for success, 1 for failure, 2 (from the argument parser) for misuse, 130 after
+/// Ctrl-C, 141 if the reader of standard output has gone.
 fn main() -> ExitCode {
     let cli = parse();
     manners::set(&cli);
@@ -155,7 +155,8 @@ fn run(cli: &Cli) -> Result<()> {
     said.say()
 }
 
-/// Starts the threads at once, so that none that the system refuses is missed later. Unless a number was asked for, fewer will do.
+/// Starts the threads at once, so that none that the system refuses is missed later. Unless a number was asked for,
+/// fewer will do.
 fn start_threads(asked: Option<u16>) -> Result<()> {
     let usual = || {
         let named = std::env::var("RAYON_NUM_THREADS").ok().and_then(|n| n.parse().ok());

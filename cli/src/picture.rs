@@ -46,8 +46,8 @@ impl<'a> Artist<'a> {
         }
     }
 
-    /// Draws what is asked for. Beside the picture, an OpenEXR file needs the distances, and numbers their own picture: the memory of
-    /// both is within the limits.
+    /// Draws what is asked for. Beside the picture, an OpenEXR file needs the distances, and numbers their own picture:
+    /// the memory of both is within the limits.
     pub fn draw(&mut self, camera: &Camera) -> b2p::Result<Stats> {
         let (channel, background) = match self.args.show {
             Show::Colour => (Channel::Colour, self.args.view.background),

@@ -27,8 +27,8 @@ type Piece = std::io::Result<Vec<u8>>;
 /// What is done with Gaussians.
 pub type Show<'a> = dyn FnMut(&Gaussians, &Log) -> Result<()> + 'a;
 
-/// Shows the Gaussians of a file, or of standard input: then also those of coarser levels, if `early` and nothing finer has come
-/// meanwhile; and if the stream is cut and no level was named, what its finest whole level has.
+/// Shows the Gaussians of a file, or of standard input: then also those of coarser levels, if `early` and nothing finer
+/// has come meanwhile; and if the stream is cut and no level was named, what its finest whole level has.
 pub fn each(
     path: &Path,
     detail: &DetailArg,

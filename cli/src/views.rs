@@ -103,7 +103,8 @@ fn circle(args: &Render, frame: &Frame, extent: &Extent) -> Result<Vec<files::Na
         let camera = at(azimuth, radius)?;
         let camera = match args.orthographic {
             true => {
-                // Parallel rays see what is behind the camera's place no more than a pinhole does: it stands outside the cube.
+                // Parallel rays see what is behind the camera's place no more than a pinhole does: it stands outside
+                // the cube.
                 let mut far = at(azimuth, radius.max(4.0))?;
                 far.fx = camera.fx / radius;
                 far.fy = far.fx;

@@ -16,9 +16,9 @@ use b2p::{Cancel, Isa};
 
 use crate::Source;
 
-/// Any bytes as voxels: encode → decode is equal, and parents and neighbours are those that a search finds. Any bytes as occupancies:
-/// an error, or the octree that its finest voxels have. Any bytes as the code of the next level: an error, or occupancies that have
-/// the very same code.
+/// Any bytes as voxels: encode → decode is equal, and parents and neighbours are those that a search finds. Any bytes
+/// as occupancies: an error, or the octree that its finest voxels have. Any bytes as the code of the next level: an
+/// error, or occupancies that have the very same code.
 pub fn octree(bytes: &[u8]) {
     let mut source = Source(bytes);
     let depth = 1 + source.byte() % 5;
@@ -94,7 +94,8 @@ fn searched(voxels: &Voxels) -> KernelMap {
     KernelMap::new(27, rows)
 }
 
-/// Bytes as the occupancies of one level after the other: refused if they are too few, one is zero, or there is no such level.
+/// Bytes as the occupancies of one level after the other: refused if they are too few, one is zero, or there is no such
+/// level.
 fn occupancies(mut bytes: &[u8]) {
     let mut octree = Octree::root();
     while !bytes.is_empty() {
@@ -170,8 +171,9 @@ fn raw<'a>(name: &'a str, rows: &'a RawTable) -> RawRows<'a> {
     }
 }
 
-/// Any table and symbols: encode → decode is equal, in slices and in passes too. Any bytes as code: an error, or symbols that have the
-/// very same code. Any real latents: rounded down or up, whatever a bit costs. Any numbers as a table: an error, or a sound one.
+/// Any table and symbols: encode → decode is equal, in slices and in passes too. Any bytes as code: an error, or
+/// symbols that have the very same code. Any real latents: rounded down or up, whatever a bit costs. Any numbers as a
+/// table: an error, or a sound one.
 pub fn entropy(bytes: &[u8]) {
     let mut source = Source(bytes);
     let seed = source.byte();
@@ -231,8 +233,8 @@ pub fn entropy(bytes: &[u8]) {
     }
 }
 
-/// Numbers as coefficients of colours, in two parts of any channels: encode → decode is equal, but for the one number that is brought within. Any bytes:
-/// an error, or coefficients that have the very same code.
+/// Numbers as coefficients of colours, in two parts of any channels: encode → decode is equal, but for the one number
+/// that is brought within. Any bytes: an error, or coefficients that have the very same code.
 fn as_coefficients(values: &[i16], code: &[u8]) {
     let which = usize::from(code.first().copied().unwrap_or(0));
     let channels = [0..3, 0..1, 1..3, 0..0];
@@ -291,8 +293,8 @@ fn in_slices(tables: &Tables, condition: Condition, latents: &[i16], slice: usiz
     }
 }
 
-/// A level in passes, each voxel predicted from the one before it if that is of a lower octant: encode → decode is equal, and what
-/// any bytes decode to has the very same code.
+/// A level in passes, each voxel predicted from the one before it if that is of a lower octant: encode → decode is
+/// equal, and what any bytes decode to has the very same code.
 fn in_passes(tables: &Tables, keys: &[u64], latents: &[i16], slice: usize, code: &[u8]) {
     let k = tables.channels();
     let predict = |slice: Range<usize>, voxels: &[u32], known: &[i16]| {

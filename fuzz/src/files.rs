@@ -29,8 +29,8 @@ static FILE: LazyLock<Vec<u8>> = LazyLock::new(|| {
     untrained(&shape, 0)
 });
 
-/// Any bytes as a model, and as edits of one: an error, or a model whose identity depends on nothing but the bytes, and that computes
-/// finite numbers.
+/// Any bytes as a model, and as edits of one: an error, or a model whose identity depends on nothing but the bytes, and
+/// that computes finite numbers.
 pub fn model(bytes: &[u8]) {
     load(bytes);
     let mut file = FILE.clone();
@@ -98,8 +98,8 @@ fn passes(model: &Model, role: usize, octree: &Octree, map: &KernelMap) {
     }
 }
 
-/// Any bytes as a file of points that a parser of this project reads: an error, or finite points of which every format that holds
-/// the grid gives back the same voxels.
+/// Any bytes as a file of points that a parser of this project reads: an error, or finite points of which every format
+/// that holds the grid gives back the same voxels.
 pub fn clouds(bytes: &[u8]) {
     let limits = Limits::default().with_max_points(1 << 16);
     // Other crates' parsers may panic inside of the reader, which a fuzzer counts.
@@ -131,7 +131,8 @@ pub fn clouds(bytes: &[u8]) {
     }
 }
 
-/// Any bytes as a point cloud and as Gaussians: an error, or arrays of equal length that are the same after writing and reading again.
+/// Any bytes as a point cloud and as Gaussians: an error, or arrays of equal length that are the same after writing and
+/// reading again.
 pub fn ply(bytes: &[u8]) {
     let limits = Limits::default().with_max_points(1 << 16);
     if let Ok(cloud) = PointCloud::from_ply(bytes, &limits) {
@@ -160,12 +161,13 @@ pub fn ply(bytes: &[u8]) {
     }
 }
 
-/// Memory that a file of splats may ask for, and what its reader takes besides, of which the tables of compressed data are most.
+/// Memory that a file of splats may ask for, and what its reader takes besides, of which the tables of compressed data
+/// are most.
 const SPLAT_MEMORY: u64 = 1 << 20;
 const SPLAT_OVERHEAD: u64 = 16 << 20;
 
-/// Any bytes as splats, of the format that the first byte names: an error, or Gaussians that are as many after writing and reading
-/// again, for memory within the limits.
+/// Any bytes as splats, of the format that the first byte names: an error, or Gaussians that are as many after writing
+/// and reading again, for memory within the limits.
 pub fn splats(bytes: &[u8]) {
     let [first, file @ ..] = bytes else { return };
     let format = splats::Format::all().nth(usize::from(*first) % 9).expect("one of nine");

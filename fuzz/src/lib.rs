@@ -56,8 +56,9 @@ fn within<T>(bytes: usize, run: impl FnOnce() -> T) -> T {
     value
 }
 
-/// Runs it, and holds it to giving back all memory: what is prepared at the first use and kept from then on, it takes only once. For one
-/// thread at a time; what a test's own surroundings take meanwhile, when another test has ended, they do not take again and again.
+/// Runs it, and holds it to giving back all memory: what is prepared at the first use and kept from then on, it takes
+/// only once. For one thread at a time; what a test's own surroundings take meanwhile, when another test has ended,
+/// they do not take again and again.
 fn giving_back(run: impl Fn()) {
     let taken = || {
         let before = MEMORY.current_usage();
@@ -81,15 +82,16 @@ static MODEL: LazyLock<Model> = LazyLock::new(|| {
 /// The targets whose inputs are streams, to be changed by [`mutate`].
 pub const STREAMS: [&str; 4] = ["header", "stream", "chunking", "transform"];
 
-/// Has the calling thread do all work from now on: inputs are so small that handing them over takes longer than they do.
+/// Has the calling thread do all work from now on: inputs are so small that handing them over takes longer than they
+/// do.
 pub fn alone() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1);
     let pool = pool.use_current_thread().build_global();
     pool.expect("nothing has run before");
 }
 
-/// Whether an input is one of those, one in `n`, for which checks are made that take longer than all others: as good as at random, and
-/// always the same for the same bytes.
+/// Whether an input is one of those, one in `n`, for which checks are made that take longer than all others: as good as
+/// at random, and always the same for the same bytes.
 fn one_in(n: u8, bytes: &[u8]) -> bool {
     bytes.iter().copied().fold(0, u8::wrapping_add).is_multiple_of(n)
 }

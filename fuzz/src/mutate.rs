@@ -6,13 +6,15 @@ use crate::seal;
 /// Where the header of version 2 holds the model's identity.
 const MODEL_ID: usize = 64;
 
-/// How a fuzzer changes the first bytes of a buffer: how many they are, how many they may become; how many they are then.
+/// How a fuzzer changes the first bytes of a buffer: how many they are, how many they may become; how many they are
+/// then.
 pub type Change<'a> = &'a mut dyn FnMut(&mut [u8], usize, usize) -> usize;
 
 /// Changes the stream that the first `size` bytes of `data` are, and says how many they are then, `most` at the most.
 ///
-/// The seed tells how. One in four is changed anywhere; one in four too, and then has its checksums recomputed; in the other half the
-/// payload of one chunk is changed, and every length, every checksum and the model's identity fit what comes out.
+/// The seed tells how. One in four is changed anywhere; one in four too, and then has its checksums recomputed; in the
+/// other half the payload of one chunk is changed, and every length, every checksum and the model's identity fit what
+/// comes out.
 pub fn mutate(data: &mut [u8], size: usize, most: usize, seed: u32, change: Change) -> usize {
     if !seed.is_multiple_of(2)
         && let Some(stream) = with_other_payload(&data[..size], most, seed / 4, change)

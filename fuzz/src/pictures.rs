@@ -38,8 +38,9 @@ fn models(precision: Precision) -> Vec<Vec<Model>> {
 static MODELS: LazyLock<Vec<Vec<Model>>> = LazyLock::new(|| models(Precision::Int16));
 static FLOATS: LazyLock<Vec<Vec<Model>>> = LazyLock::new(|| models(Precision::F16));
 
-/// Any latents and contexts on any voxels: every instruction set computes what plain code does, to the bit in integers, within a
-/// 256th of the largest number in floats. Most inputs ask one module of one instruction set, the others all of all.
+/// Any latents and contexts on any voxels: every instruction set computes what plain code does, to the bit in integers,
+/// within a 256th of the largest number in floats. Most inputs ask one module of one instruction set, the others all of
+/// all.
 pub fn backends(bytes: &[u8]) {
     let mut source = Source(bytes);
     // The widest takes as long as a dozen of the others.
@@ -97,8 +98,8 @@ pub fn backends(bytes: &[u8]) {
     }
 }
 
-/// Any numbers as Gaussians, before a camera anywhere: an error, or a picture whose every pixel is finite, with work in proportion to
-/// Gaussians and pixels, and, for one input in four, the same again.
+/// Any numbers as Gaussians, before a camera anywhere: an error, or a picture whose every pixel is finite, with work in
+/// proportion to Gaussians and pixels, and, for one input in four, the same again.
 pub fn render(bytes: &[u8]) {
     let mut source = Source(bytes);
     let [width, height] = [(); 2].map(|()| 1 + source.count(15, 69) as u32);

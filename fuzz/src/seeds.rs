@@ -213,8 +213,8 @@ fn noises() -> impl Iterator<Item = Vec<u8>> {
     lengths.into_iter().map(|length| noise(length as u64, length))
 }
 
-/// What the target `entropy` reads as tables of one row of three entries, and as symbols under it: one that is sound, and one with each
-/// fault that is more than a wrong sum.
+/// What the target `entropy` reads as tables of one row of three entries, and as symbols under it: one that is sound,
+/// and one with each fault that is more than a wrong sum.
 fn faulty_tables() -> [Vec<u8>; 5] {
     let table = |how: u8, low: i16, rest: &[u8]| {
         let entries = [0, 1, 2, 3, 4, 5];

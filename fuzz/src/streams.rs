@@ -14,9 +14,9 @@ pub(crate) fn limits() -> Limits {
     Limits::default().with_max_points(1 << 8).with_max_bytes(2 << 20)
 }
 
-/// Any bytes: an error, or a header that is within the limits and is written back as it was read, whose levels, where they are whole,
-/// have as many voxels as it tells; a whole stream is written back as it was read, but for chunks that may be skipped. Reading takes
-/// memory in proportion to the bytes that are there, whatever they say.
+/// Any bytes: an error, or a header that is within the limits and is written back as it was read, whose levels, where
+/// they are whole, have as many voxels as it tells; a whole stream is written back as it was read, but for chunks that
+/// may be skipped. Reading takes memory in proportion to the bytes that are there, whatever they say.
 pub fn header(bytes: &[u8]) {
     let limits = limits();
     let most = 4096 + 16 * bytes.len();
@@ -70,8 +70,8 @@ pub fn header(bytes: &[u8]) {
     requests(bytes, &header, stream.deepest());
 }
 
-/// The same stream, put together from its parts; with `colours`, if there are any, as the payload of all colour filters and the slices of
-/// a residual of each level.
+/// The same stream, put together from its parts; with `colours`, if there are any, as the payload of all colour filters
+/// and the slices of a residual of each level.
 pub(crate) fn rewritten(stream: &Stream, colours: Option<&Colours<'_>>) -> Vec<u8> {
     let mut writer = Writer::new(stream.header().clone()).expect("a header that was read");
     for level in stream.levels() {
@@ -127,7 +127,8 @@ pub(crate) struct Colours<'a> {
     pub residual: &'a dyn Fn(&Level) -> Vec<Vec<u8>>,
 }
 
-/// A level can be asked for if it is whole; a prefix is intact if it ends with a level; a header has as many voxel counts as levels.
+/// A level can be asked for if it is whole; a prefix is intact if it ends with a level; a header has as many voxel
+/// counts as levels.
 fn requests(bytes: &[u8], header: &Header, deepest: Option<u8>) {
     let stream = || Stream::parse(bytes, &limits()).expect("the header is sound");
     for level in header.base.saturating_sub(1)..=header.top + 1 {
@@ -158,9 +159,9 @@ pub fn deepest(bytes: &[u8]) -> Result<Option<u8>, Error> {
     Ok(decoding.level())
 }
 
-/// Any bytes under small limits: an error, or as many finite Gaussians as the header tells, and again the same ones; a level that is
-/// refused leaves those before it as they were, no level takes more memory than it may, and all of it is given back. For one input in
-/// four the Gaussians of all levels, and everything twice.
+/// Any bytes under small limits: an error, or as many finite Gaussians as the header tells, and again the same ones; a
+/// level that is refused leaves those before it as they were, no level takes more memory than it may, and all of it is
+/// given back. For one input in four the Gaussians of all levels, and everything twice.
 pub fn stream(bytes: &[u8]) {
     giving_back(|| decoded(bytes));
 }
@@ -247,7 +248,8 @@ pub(crate) fn check(error: &Error) {
     ));
 }
 
-/// Any bytes in any pieces, which the last bytes tell the sizes of: result and error are those of the whole, and all memory is given back.
+/// Any bytes in any pieces, which the last bytes tell the sizes of: result and error are those of the whole, and all
+/// memory is given back.
 pub fn chunking(bytes: &[u8]) {
     giving_back(|| pieced(bytes));
 }

@@ -48,9 +48,9 @@ pub(crate) fn rewrite(writer: &mut Writer, level: &Level, colours: &Colours) {
     }
 }
 
-/// Any bytes under small limits, whole and in pieces whose sizes the last bytes tell: an error, or as many voxels with colours, and finite
-/// Gaussians of them, as the header tells; the same both times. A level that is refused leaves those before it as they were, no level takes more
-/// memory than it may, and all of it is given back.
+/// Any bytes under small limits, whole and in pieces whose sizes the last bytes tell: an error, or as many voxels with
+/// colours, and finite Gaussians of them, as the header tells; the same both times. A level that is refused leaves
+/// those before it as they were, no level takes more memory than it may, and all of it is given back.
 pub fn transform(bytes: &[u8]) {
     giving_back(|| decoded(bytes));
 }

@@ -5,7 +5,8 @@ use std::sync::{Mutex, PoisonError};
 
 use b2p_fuzz::{STREAMS, TARGETS, seeds::seeds};
 
-/// Targets count what memory they take: one test at a time, and on one thread, for each keeps what it has prepared for itself.
+/// Targets count what memory they take: one test at a time, and on one thread, for each keeps what it has prepared for
+/// itself.
 fn alone(test: impl FnOnce() + Send) {
     static ALONE: Mutex<()> = Mutex::new(());
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -75,7 +76,8 @@ fn mutate(bytes: &mut Vec<u8>, others: &[Vec<u8>], random: &mut impl FnMut(usize
     }
 }
 
-/// `B2P_FUZZ_ROUNDS` asks for more than the usual few seconds: so many times as many inputs, and others than the usual ones.
+/// `B2P_FUZZ_ROUNDS` asks for more than the usual few seconds: so many times as many inputs, and others than the usual
+/// ones.
 #[test]
 fn every_target_holds_on_changed_seeds() {
     alone(|| {

@@ -1,6 +1,6 @@
-//! How fast one thread convolves, in multiply-adds of taps that read something, and as a share of what the core can do at best.
-//! Least time of a few repeats. Arguments: the number of voxels, the names of instruction sets,
-//! layers such as `64x16`.
+//! How fast one thread convolves, in multiply-adds of taps that read something, and as a share of what the core can do
+//! at best. Least time of a few repeats. Arguments: the number of voxels, the names of instruction sets, layers such as
+//! `64x16`.
 
 use std::collections::HashMap;
 use std::time::Instant;

@@ -1,12 +1,13 @@
 //! The arithmetic kernels of `b2p`, and the one place that maps files into memory.
 //!
-//! Every `unsafe` block of the project lives here, each with its reason. Nothing here knows of streams, levels or Gaussians.
+//! Every `unsafe` block of the project lives here, each with its reason. Nothing here knows of streams, levels or
+//! Gaussians.
 //!
-//! A sparse convolution is one loop ([`ExactConv`] in integers, [`FloatConv`] in floats): for every output row, the rows its
-//! [`Taps`] name are multiplied by that tap's weights and added up, in groups of rows with like neighbours ([`Plan`]) whose sums stay in the
-//! registers, or matrix tiles, of the [`Isa`] while the taps go by. All of them give the same bits: integers wrap,
-//! products of two f16 are exact in f32, fused or not, and each sum is added up in the same order. Only [`Precision::Bf16`],
-//! [`Precision::Fastest`] and [`Precision::Half`] depend on the machine.
+//! A sparse convolution is one loop ([`ExactConv`] in integers, [`FloatConv`] in floats): for every output row, the
+//! rows its [`Taps`] name are multiplied by that tap's weights and added up, in groups of rows with like neighbours
+//! ([`Plan`]) whose sums stay in the registers, or matrix tiles, of the [`Isa`] while the taps go by. All of them give
+//! the same bits: integers wrap, products of two f16 are exact in f32, fused or not, and each sum is added up in the
+//! same order. Only [`Precision::Bf16`], [`Precision::Fastest`] and [`Precision::Half`] depend on the machine.
 
 #[cfg(all(target_arch = "x86", not(target_feature = "sse2")))]
 compile_error!("x87 arithmetic does not round to f32 after every step: build for a target with SSE2");
@@ -45,8 +46,8 @@ pub use startup::stdout_was_closed;
 
 /// Peak throughput of one core, to judge the kernels by.
 ///
-/// Each function measures for about 10 ms and gives the best rate seen, in 10⁹ multiply-adds per second. For `scalar` it tells what the
-/// compiler makes of such a loop, which is no bound.
+/// Each function measures for about 10 ms and gives the best rate seen, in 10⁹ multiply-adds per second. For `scalar`
+/// it tells what the compiler makes of such a loop, which is no bound.
 pub mod peak {
     #[cfg(feature = "close")]
     pub use crate::close::peak::{bf16, f32, half};

@@ -19,15 +19,15 @@ impl Deref for MappedFile {
 /// Maps a whole file for reading. It pays for large ones, of which only a part is read.
 ///
 /// # Safety
-/// While it is mapped, no program may shorten or overwrite the file: its bytes would change under the reader, and reading beyond a new end
-/// kills the process (SIGBUS). Files that others may touch are to be read into memory instead.
+/// While it is mapped, no program may shorten or overwrite the file: its bytes would change under the reader, and
+/// reading beyond a new end kills the process (SIGBUS). Files that others may touch are to be read into memory instead.
 ///
 /// # Errors
 /// What the system says, as an [`io::Error`]: no such file, no permission, not a regular file.
 pub unsafe fn map_file(path: &Path) -> io::Result<MappedFile> {
     let file = File::open(path)?;
-    // SAFETY: the mapping is private and read-only, so nothing that this process does through it changes it; of other programs, the caller
-    // promises it.
+    // SAFETY: the mapping is private and read-only, so nothing that this process does through it changes it; of other
+    // programs, the caller promises it.
     let map = unsafe { memmap2::MmapOptions::new().map_copy_read_only(&file)? };
     Ok(MappedFile(map))
 }

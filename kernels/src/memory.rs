@@ -8,7 +8,8 @@ use bytemuck::Zeroable;
 #[cfg(target_os = "linux")]
 const HUGE: usize = 2 << 20;
 
-/// So many zeros, from the system as they are touched: in huge pages where it has them, for every small one costs a fault.
+/// So many zeros, from the system as they are touched: in huge pages where it has them, for every small one costs a
+/// fault.
 pub fn zeros<T: Zeroable>(len: usize) -> Vec<T> {
     let zeros = bytemuck::zeroed_vec(len);
     #[cfg(target_os = "linux")]
@@ -40,8 +41,8 @@ impl Zeros for f16 {
     }
 }
 
-/// Gives what is free back to the system, where the allocator keeps some for later: what is reserved next is as fresh as in a process that has
-/// just begun.
+/// Gives what is free back to the system, where the allocator keeps some for later: what is reserved next is as fresh
+/// as in a process that has just begun.
 pub fn give_back() {
     // SAFETY: nothing that is in use is touched.
     #[cfg(all(target_os = "linux", target_env = "gnu"))]

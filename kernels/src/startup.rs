@@ -1,7 +1,7 @@
 //! Whether standard output was open when the process started.
 //!
-//! Before `main`, the standard library opens a null device in the place of a closed descriptor, and what is written is lost without an
-//! error. A function that runs before that remembers.
+//! Before `main`, the standard library opens a null device in the place of a closed descriptor, and what is written is
+//! lost without an error. A function that runs before that remembers.
 
 #[cfg(target_os = "linux")]
 mod linux {
@@ -9,8 +9,8 @@ mod linux {
 
     static CLOSED: AtomicBool = AtomicBool::new(false);
 
-    // SAFETY: the section holds pointers to functions that the loader calls before `main`, with arguments that this one does not take.
-    // It makes one system call and stores into an atomic, for which nothing has to be set up.
+    // SAFETY: the section holds pointers to functions that the loader calls before `main`, with arguments that this one
+    // does not take. It makes one system call and stores into an atomic, for which nothing has to be set up.
     #[used]
     #[unsafe(link_section = ".init_array")]
     static LOOK: extern "C" fn() = {

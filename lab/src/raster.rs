@@ -1,9 +1,10 @@
 //! Ground-truth pictures of a mesh: a supersampled z-buffer with perspective-correct texture.
 //!
-//! Triangles are drawn in homogeneous form (Olano and Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates"): with the
-//! corners P as columns and a pixel's ray d = ((x − cx)/fx, (y − cy)/fy, 1), λ = P⁻¹ d are the barycentric coordinates over the depth, so
-//! λ ≥ 0 says inside, 1/Σλ is the depth, and no triangle has to be cut at the near plane. Both sides of a triangle are seen.
-//! Visibility is settled first, for every sample; then each sample is coloured once.
+//! Triangles are drawn in homogeneous form (Olano and Greer, "Triangle Scan Conversion using 2D Homogeneous
+//! Coordinates"): with the corners P as columns and a pixel's ray d = ((x − cx)/fx, (y − cy)/fy, 1), λ = P⁻¹ d are the
+//! barycentric coordinates over the depth, so λ ≥ 0 says inside, 1/Σλ is the depth, and no triangle has to be cut at
+//! the near plane. Both sides of a triangle are seen. Visibility is settled first, for every sample; then each sample
+//! is coloured once.
 
 use rayon::prelude::*;
 
@@ -25,7 +26,8 @@ pub struct View {
 }
 
 impl View {
-    /// A camera at `eye` that looks at `target`, with the surface's y up on the picture (z where y is the line of sight).
+    /// A camera at `eye` that looks at `target`, with the surface's y up on the picture (z where y is the line of
+    /// sight).
     pub fn look_at(eye: [f64; 3], target: [f64; 3], focal: f64, size: [u32; 2]) -> Self {
         let eye = glam::DVec3::from(eye);
         let forward = (glam::DVec3::from(target) - eye).normalize_or(glam::DVec3::NEG_Z);

@@ -31,7 +31,8 @@ const BLUE: [f32; 3] = [0., 0., 1.];
 
 #[test]
 fn a_slanted_textured_quads_pixels_are_the_analytic_ones() {
-    // A ramp of 256 texels: bilinear lookup is linear in u. The quad recedes from depth 2 at the left to 6 at the right.
+    // A ramp of 256 texels: bilinear lookup is linear in u. The quad recedes from depth 2 at the left to 6 at the
+    // right.
     let ramp = texture(256, 1, |x, _| [x as u8, 255 - x as u8, 7, 255]);
     let part = quad([-2., -3., 2.], [4., 0., 4.], [0., 6., 0.], Some(ramp));
     let picture = render(&Surface::new(&mesh(part)), &view(), [16, 16], 4, None);

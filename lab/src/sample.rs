@@ -1,8 +1,8 @@
 //! Mesh to cloud: points drawn uniformly by area, averaged per voxel.
 //!
-//! Point number `j` of a seed is always the same point, whatever thread draws it and whatever others are wanted: a box of the cloud
-//! can be sampled alone. Triangles get their share of the points by rounding the running sum of their areas. Colour sums are
-//! integers, so their order does not matter.
+//! Point number `j` of a seed is always the same point, whatever thread draws it and whatever others are wanted: a box
+//! of the cloud can be sampled alone. Triangles get their share of the points by rounding the running sum of their
+//! areas. Colour sums are integers, so their order does not matter.
 
 use std::path::Path;
 
@@ -277,7 +277,8 @@ fn corners(surface: &Surface, face: Face) -> [glam::DVec3; 3] {
     surface.corners(face).map(|p| glam::Vec3::from(p).as_dvec3())
 }
 
-/// Writes a cloud as binary little-endian PLY: float x y z, uchar red green blue, and comments that map it back to the mesh.
+/// Writes a cloud as binary little-endian PLY: float x y z, uchar red green blue, and comments that map it back to the
+/// mesh.
 ///
 /// # Errors
 /// If the file cannot be written; nothing is left behind then.

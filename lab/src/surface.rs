@@ -44,8 +44,8 @@ pub struct Face {
     pub triangle: u32,
 }
 
-/// A place on a triangle, and how far its neighbours on the picture are: barycentric coordinates here, one sample to the right
-/// and one sample down. For a lookup without filtering all three are the same.
+/// A place on a triangle, and how far its neighbours on the picture are: barycentric coordinates here, one sample to
+/// the right and one sample down. For a lookup without filtering all three are the same.
 pub type Footprint = [[f32; 3]; 3];
 
 impl Surface {
@@ -79,7 +79,8 @@ impl Surface {
         }
     }
 
-    /// The surface with every position mapped by `f`; a photograph stays where it was in space (but see [`Surface::translated`]).
+    /// The surface with every position mapped by `f`; a photograph stays where it was in space (but see
+    /// [`Surface::translated`]).
     pub fn map(&self, f: impl Fn([f32; 3]) -> [f32; 3] + Sync) -> Self {
         let mut surface = self.clone();
         for part in &mut surface.parts {
@@ -294,8 +295,8 @@ impl Pyramid {
 
     /// Trilinear lookup for a sample whose neighbours to the right and below are at these coordinates.
     ///
-    /// The resolution follows the geometric mean of the two distances: at grazing angles the supersampling, not the texture, filters
-    /// along the longer one.
+    /// The resolution follows the geometric mean of the two distances: at grazing angles the supersampling, not the
+    /// texture, filters along the longer one.
     pub fn filtered(&self, here: [f32; 2], right: [f32; 2], down: [f32; 2]) -> [f32; 4] {
         let size = [self.levels[0].width as f32, self.levels[0].height as f32];
         let distance = |to: [f32; 2]| {

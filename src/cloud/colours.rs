@@ -84,7 +84,8 @@ impl Stored {
         }
     }
 
-    /// The value that is white if `maximum` is the greatest, and whether that was guessed. `None` if none is sure enough.
+    /// The value that is white if `maximum` is the greatest, and whether that was guessed. `None` if none is sure
+    /// enough.
     pub(super) fn white(self, maximum: f64) -> Option<(f64, bool)> {
         match self {
             Stored::Byte => Some((255.0, false)),

@@ -1,7 +1,7 @@
 //! Point clouds: PLY files, colours of any range, and voxelisation.
 //!
-//! A reader of a file format makes [`RawPoints`]. [`RawPoints::finish`] makes a [`PointCloud`] of them: it leaves out bad
-//! points, converts colours, and reports what it did. [`voxelise`] makes the octree's finest level: it keeps
+//! A reader of a file format makes [`RawPoints`]. [`RawPoints::finish`] makes a [`PointCloud`] of them: it leaves out
+//! bad points, converts colours, and reports what it did. [`voxelise`] makes the octree's finest level: it keeps
 //! coordinates that are voxels already, and fits a grid to all others. [`voxelise_closed`] chooses the level by the
 //! spacing of the points.
 

@@ -64,9 +64,9 @@ impl Encoder {
         self
     }
 
-    /// The same encoder with head maps: streams of version 3 say where surfels draw better than the best of these heads.
-    /// Decoders with learned heads follow it. The two finest levels of a cloud have none. Maps are chosen by pictures, which
-    /// differ slightly between instruction sets, so that maps may, too. Default: without.
+    /// The same encoder with head maps: streams of version 3 say where surfels draw better than the best of these
+    /// heads. Decoders with learned heads follow it. The two finest levels of a cloud have none. Maps are chosen by
+    /// pictures, which differ slightly between instruction sets, so that maps may, too. Default: without.
     pub fn with_heads_model(mut self, heads: HeadsModel) -> Self {
         self.options.heads = Some(heads);
         self

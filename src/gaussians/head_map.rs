@@ -1,4 +1,5 @@
-//! Where surfels take the place of learned Gaussians: the encoder's choice, block by block (`docs/format.md`, clause 7.5).
+//! Where surfels take the place of learned Gaussians: the encoder's choice, block by block (`docs/format.md`, clause
+//! 7.5).
 //!
 //! The encoder draws a level in both ways and compares the pictures with the cloud. A block is a voxel three levels
 //! above. Nothing that is decoded depends on the map, so a decoder may ignore it.

@@ -3,9 +3,9 @@
 //! Per Gaussian, as `float`: `x y z` in world units; `f_dc_0..2`, with colour = ½ + 0.2820948·f_dc; `opacity`, the
 //! logit; `scale_0..2`, the natural logarithms of the standard deviations in world units; `rot_0..3`, the quaternion w,
 //! x, y, z. Logits and logarithms must be finite: the writer clamps opacities to [10⁻⁶, 1 − 10⁻⁶] and deviations to at
-//! least 10⁻³⁸. Comments hold the cube, so that the reader restores the frame. Positions are single precision, which does
-//! not resolve the voxels of a cube far from the origin: [`Frame::offset`] is subtracted from them, and written as a
-//! comment, too.
+//! least 10⁻³⁸. Comments hold the cube, so that the reader restores the frame. Positions are single precision, which
+//! does not resolve the voxels of a cube far from the origin: [`Frame::offset`] is subtracted from them, and written as
+//! a comment, too.
 //!
 //! View-dependent colour is `f_rest_*`. The comment `SplatRenderMode: mip` marks Gaussians that were trained for
 //! rendering with opacity compensation.

@@ -39,8 +39,8 @@ pub enum Effect {
     /// pixel is dimmed and not grown. Called for by files made that way; a stream's Gaussians are trained without.
     Antialias,
     /// Each pixel is the mean of several samples a side, as many as it takes to bring the typical splat to [`RESOLVED`]
-    /// of them, and at most [`MOST_SAMPLES`]. Many overlapping dimmed splats transmit light that the undimmed would not,
-    /// and only what is resolved is free of that. Called for by anti-aliasing where splats fall under a pixel.
+    /// of them, and at most [`MOST_SAMPLES`]. Many overlapping dimmed splats transmit light that the undimmed would
+    /// not, and only what is resolved is free of that. Called for by anti-aliasing where splats fall under a pixel.
     Supersample,
     /// What reaches over the near plane is drawn as what of it is beyond the plane, evaluated in space along each
     /// pixel's ray: it has no sensible image in the plane, and its centre may be behind. Called for where there are

@@ -1,9 +1,10 @@
 //! The conformance suite: small streams, and what each must decode to, bit for bit, on every machine.
 //!
-//! `tests/data/conformance/suite.txt` has a line for each stream: its name, its model, then for every level `level=` and the SHA-256 of
-//! its geometry (Morton keys, u64), latents and features (i16) and, where the model has a head, Gaussians (positions, scales,
-//! rotations, opacities, colours, f32), all little-endian. Here each line is tried with every instruction set of the machine, one,
-//! two and seven threads, whole and in pieces. The bare decoder (`--no-default-features`) is enough for that.
+//! `tests/data/conformance/suite.txt` has a line for each stream: its name, its model, then for every level `level=`
+//! and the SHA-256 of its geometry (Morton keys, u64), latents and features (i16) and, where the model has a head,
+//! Gaussians (positions, scales, rotations, opacities, colours, f32), all little-endian. Here each line is tried with
+//! every instruction set of the machine, one, two and seven threads, whole and in pieces. The bare decoder
+//! (`--no-default-features`) is enough for that.
 //!
 //! The suite of version 3 is beside it: see `transform`.
 //!

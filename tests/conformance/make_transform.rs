@@ -6,8 +6,8 @@ use b2p::log::Log;
 
 use crate::common::{Ball, cloud_of};
 
-/// A stream of the suite, what is unusual about it in its name, and whether no float had a part in it, so that every machine makes the
-/// same bytes.
+/// A stream of the suite, what is unusual about it in its name, and whether no float had a part in it, so that every
+/// machine makes the same bytes.
 pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
     let code = |cloud: &ColouredVoxels, levels, fineness, slice: u32, filter| {
         let options = Options {

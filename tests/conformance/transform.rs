@@ -1,7 +1,8 @@
 //! The suite of version 3, in `tests/data/conformance/version-3`.
 //!
-//! `suite.txt` has a line for each stream: its name, then for every level `level=` and the SHA-256 of its geometry (Morton keys, u64), of its
-//! colours (red, green, blue, u8) and of its surfels (positions, scales, rotations, opacities, colours, f32), all little-endian.
+//! `suite.txt` has a line for each stream: its name, then for every level `level=` and the SHA-256 of its geometry
+//! (Morton keys, u64), of its colours (red, green, blue, u8) and of its surfels (positions, scales, rotations,
+//! opacities, colours, f32), all little-endian.
 
 use std::path::PathBuf;
 

@@ -44,7 +44,8 @@ fn every_cut_is_noticed_and_leaves_the_whole_levels_before_it() {
     });
 }
 
-/// Decodes changed streams: each must be refused, after no more than the levels before the change, these as they should be.
+/// Decodes changed streams: each must be refused, after no more than the levels before the change, these as they should
+/// be.
 fn all_are_noticed(changes: impl Fn(u8) -> Vec<u8> + Sync) {
     let model = model();
     let bytes = small_stream(&model);

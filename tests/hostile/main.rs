@@ -26,7 +26,8 @@ fn decoded(model: &Model, bytes: &[u8], level: Option<u8>) -> Result<Gaussians, 
         .map_err(|error| format!("{error:?}"))
 }
 
-/// Pushes a stream in pieces of these sizes: the levels as they became whole, with the bytes that had come by then, and what came of it.
+/// Pushes a stream in pieces of these sizes: the levels as they became whole, with the bytes that had come by then, and
+/// what came of it.
 fn pushed(
     model: &Model,
     bytes: &[u8],

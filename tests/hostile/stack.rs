@@ -10,10 +10,12 @@ use b2p::renderer::{Background, render};
 use crate::common::{Ball, cloud_of};
 use crate::{decoded, model};
 
-/// A thirty-second of what Linux gives the main thread, an eighth of what Rust gives others; unoptimised code must do with it too.
+/// A thirty-second of what Linux gives the main thread, an eighth of what Rust gives others; unoptimised code must do
+/// with it too.
 const STACK: usize = 256 << 10;
 
-/// Runs it on a thread of so little stack, whose parallel work is done by threads of no more; overflowing it ends the process.
+/// Runs it on a thread of so little stack, whose parallel work is done by threads of no more; overflowing it ends the
+/// process.
 fn on_small_stacks<T: Send>(run: impl FnOnce() -> T + Send) -> T {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).stack_size(STACK);
     let pool = pool.build().expect("threads start");

@@ -34,7 +34,8 @@ fn found(decoding: &Decoding) -> Option<Found> {
     Some((points.voxels.keys().to_vec(), points.colours.to_vec()))
 }
 
-/// Pushes a stream in pieces: every level as it became whole with the bytes that had come by then, and the error that ended it.
+/// Pushes a stream in pieces: every level as it became whole with the bytes that had come by then, and the error that
+/// ended it.
 fn pushed(
     bytes: &[u8],
     level: Option<u8>,

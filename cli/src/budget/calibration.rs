@@ -18,8 +18,8 @@ const MOST_BYTES: u64 = 1 << 16;
 const MOST_ENTRIES: usize = 256;
 const MOST: f64 = 1e12;
 
-/// What decoding and drawing cost, in nanoseconds, as in a process that does it once: threads have just started, memory is fresh from the
-/// system, and nothing is ready.
+/// What decoding and drawing cost, in nanoseconds, as in a process that does it once: threads have just started, memory
+/// is fresh from the system, and nothing is ready.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// Where it was measured.
@@ -99,8 +99,8 @@ pub struct DrawCost {
 }
 
 impl LevelCost {
-    /// From few voxels and the nanoseconds that they took, and many: what lies between is interpolated. Where the second are not more, or
-    /// did not take longer, all is the voxels' cost.
+    /// From few voxels and the nanoseconds that they took, and many: what lies between is interpolated. Where the
+    /// second are not more, or did not take longer, all is the voxels' cost.
     pub fn through(few: [f64; 2], many: [f64; 2]) -> LevelCost {
         let per_voxel = (many[1] - few[1]) / (many[0] - few[0]);
         if many[0] > few[0] && per_voxel >= 0.0 {
@@ -158,18 +158,19 @@ impl PictureCost {
 }
 
 impl Calibration {
-    /// Measures with a stream and its model, with as many threads as the rayon pool that the caller is in has; `say` receives what is being
-    /// done.
+    /// Measures with a stream and its model, with as many threads as the rayon pool that the caller is in has; `say`
+    /// receives what is being done.
     ///
     /// # Errors
     /// Those of [`LatentDecoder::decode`](b2p::latents::LatentDecoder::decode) and
-    /// [`Renderer::render`](b2p::renderer::Renderer::render); [`Error::Usage`] if no level has Gaussians, or threads cannot be started.
+    /// [`Renderer::render`](b2p::renderer::Renderer::render); [`Error::Usage`] if no level has Gaussians, or threads
+    /// cannot be started.
     pub fn measure(subject: &CalibrationInput<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
         measure(subject, say)
     }
 
-    /// Where the user's calibration for a model and a number of threads is kept: under `XDG_CACHE_HOME`, or `.cache` at home. None where
-    /// neither is known.
+    /// Where the user's calibration for a model and a number of threads is kept: under `XDG_CACHE_HOME`, or `.cache` at
+    /// home. None where neither is known.
     pub fn path(model: &Model) -> Option<PathBuf> {
         let absolute = |name: &str| {
             let path = PathBuf::from(std::env::var_os(name)?);
@@ -182,8 +183,8 @@ impl Calibration {
         Some(cache.join("b2p").join(name))
     }
 
-    /// What was kept at `path`, if it is of this machine, this version of the program, this model, and as many threads as there are now.
-    /// Anything else is none, whatever it is.
+    /// What was kept at `path`, if it is of this machine, this version of the program, this model, and as many threads
+    /// as there are now. Anything else is none, whatever it is.
     pub fn load(path: &Path, model: &Model) -> Option<Calibration> {
         let about = std::fs::metadata(path).ok()?;
         if !about.is_file() || about.len() > MOST_BYTES {

@@ -11,8 +11,8 @@ use b2p::layers::Precision;
 use b2p::renderer::Quality;
 use b2p::{Error, Result};
 
-/// A time is promised only if the estimate, so many times and with so many nanoseconds more, keeps it: in short tasks it shows when a thread
-/// wakes late, or a page is long in coming.
+/// A time is promised only if the estimate, so many times and with so many nanoseconds more, keeps it: in short tasks
+/// it shows when a thread wakes late, or a page is long in coming.
 const MARGIN: f64 = 1.1;
 const SPARE: f64 = 1e6;
 
@@ -26,12 +26,14 @@ pub struct CalibrationInput<'a> {
     pub limits: &'a Limits,
 }
 
-/// What is asked for. With a time, the most accurate setting that fits it; with an accuracy alone, the fastest that has it.
+/// What is asked for. With a time, the most accurate setting that fits it; with an accuracy alone, the fastest that has
+/// it.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Budget {
     /// The time that the task may take.
     pub time: Option<Duration>,
-    /// The least PSNR in dB against pictures in double precision. It is an estimate: that of the stream that was calibrated with.
+    /// The least PSNR in dB against pictures in double precision. It is an estimate: that of the stream that was
+    /// calibrated with.
     pub min_psnr: Option<f64>,
 }
 
@@ -40,7 +42,8 @@ pub struct Budget {
 pub enum Task {
     /// From a stream in memory to its Gaussians.
     Decode,
-    /// From Gaussians to one picture of so many pixels, from where the program's camera stands: from nearer, it shows more.
+    /// From Gaussians to one picture of so many pixels, from where the program's camera stands: from nearer, it shows
+    /// more.
     Picture {
         /// Width times height.
         pixels: u64,
@@ -71,7 +74,8 @@ pub struct Choice {
 impl Budget {
     /// The setting for a stream with this header, of which `levels` can be decoded to Gaussians.
     ///
-    /// If no setting both fits the budget and has the accuracy, the budget comes first; if none fits it either, it is the fastest.
+    /// If no setting both fits the budget and has the accuracy, the budget comes first; if none fits it either, it is
+    /// the fastest.
     ///
     /// # Errors
     /// [`Error::Usage`] if the calibration knows none of the levels.

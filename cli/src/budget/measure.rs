@@ -1,7 +1,7 @@
 //! What decoding and drawing cost, measured as a process that does it once has it.
 //!
-//! Threads have just started, memory is fresh from the system, models are freshly loaded and renderers are new. What is paid
-//! however few the voxels are comes from a second stream: the same geometry, some levels coarser.
+//! Threads have just started, memory is fresh from the system, models are freshly loaded and renderers are new. What is
+//! paid however few the voxels are comes from a second stream: the same geometry, some levels coarser.
 
 use std::time::{Duration, Instant};
 
@@ -27,12 +27,14 @@ use b2p::renderer::reference::{self, Cutoffs};
 use b2p::renderer::{Background, Image, Quality, Renderer};
 use b2p::{Error, Result};
 
-/// Times that everything is measured, unless that takes longer than [`PATIENCE`]. The third quartile counts: what is promised on it is to be kept.
+/// Times that everything is measured, unless that takes longer than [`PATIENCE`]. The third quartile counts: what is
+/// promised on it is to be kept.
 const REPEATS: usize = 5;
 const PATIENCE: Duration = Duration::from_millis(250);
 /// Levels by which the second stream is coarser, if the first has them above its own.
 const COARSER: u8 = 3;
-/// Sides of the pictures whose times tell what a Gaussian and what a pixel costs; the smaller one's accuracy is measured.
+/// Sides of the pictures whose times tell what a Gaussian and what a pixel costs; the smaller one's accuracy is
+/// measured.
 const SIDES: [u32; 2] = [320, 1024];
 /// The renderer's qualities by name, the finest last.
 const QUALITIES: [(&str, Quality); 3] = [
@@ -275,8 +277,8 @@ impl Level {
     }
 }
 
-/// What pictures of few and many Gaussians cost, of each of [`QUALITIES`], which take turns. An empty one costs the same in all, and none less
-/// than a coarser one.
+/// What pictures of few and many Gaussians cost, of each of [`QUALITIES`], which take turns. An empty one costs the
+/// same in all, and none less than a coarser one.
 fn picture_costs(limits: &Limits, model: &Model, [few, many]: [(&Gaussians, &Level); 2]) -> Result<[PictureCost; 3]> {
     let empty = Gaussians::default();
     let pictures = [few.0, many.0].map(|gaussians| SIDES.map(|side| (gaussians, side)));

@@ -27,9 +27,9 @@ use super::{Failure, Result, load};
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Budget")]
 pub struct BudgetArgs {
-    /// Time that it may take, such as 33ms or 0.5s: level, precision and quality are chosen by what they cost on this machine, which is
-    /// measured at the first use and kept in the user's cache folder. Decoding: from the stream in memory to Gaussians. Drawing: from
-    /// Gaussians to each picture
+    /// Time that it may take, such as 33ms or 0.5s: level, precision and quality are chosen by what they cost on this
+    /// machine, which is measured at the first use and kept in the user's cache folder. Decoding: from the stream in
+    /// memory to Gaussians. Drawing: from Gaussians to each picture
     #[arg(long, value_name = "TIME", value_parser = time, conflicts_with_all = ["level", "precision", "heads"])]
     pub budget: Option<Duration>,
     /// Least PSNR in dB against double precision, as it was for the sample

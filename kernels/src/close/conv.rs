@@ -36,15 +36,15 @@ pub enum Precision {
     /// f32: a sum's error is that of adding in f32.
     #[default]
     F32,
-    /// Activations and weights are rounded to bf16 (8 significant bits) first; products are added in f32. A sum's error is at most
-    /// 2⁻⁷ of its terms' magnitudes. Needs [`Isa::has_bf16`]; elsewhere it is [`Precision::F32`].
+    /// Activations and weights are rounded to bf16 (8 significant bits) first; products are added in f32. A sum's error
+    /// is at most 2⁻⁷ of its terms' magnitudes. Needs [`Isa::has_bf16`]; elsewhere it is [`Precision::F32`].
     Bf16,
     /// As [`Precision::Bf16`] where it is many times as fast, with [`Isa::has_tiles`]; elsewhere [`Precision::F32`].
     Fastest,
-    /// Products are summed in f16 with fused multiply-adds, 16 at a time, and then in f32. Besides what f32 loses, a sum is off by at most
-    /// 1.004 · 2⁻⁷ of its terms' magnitudes, and by 1.01 · 2⁻¹⁹ · w · (|x| + 1) for each activation x that it reads, w being the output
-    /// channel's largest weight. Of finite activations and weights no sum overflows. Needs [`Isa::has_half`]; elsewhere it is
-    /// [`Precision::F32`].
+    /// Products are summed in f16 with fused multiply-adds, 16 at a time, and then in f32. Besides what f32 loses, a
+    /// sum is off by at most 1.004 · 2⁻⁷ of its terms' magnitudes, and by 1.01 · 2⁻¹⁹ · w · (|x| + 1) for each
+    /// activation x that it reads, w being the output channel's largest weight. Of finite activations and weights no
+    /// sum overflows. Needs [`Isa::has_half`]; elsewhere it is [`Precision::F32`].
     Half,
 }
 
@@ -197,7 +197,8 @@ impl FloatConv {
         (kernel::multiply, &self.weights, widen)
     }
 
-    /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations each.
+    /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations
+    /// each.
     ///
     /// # Panics
     /// If `taps` are not this layer's, or name rows that `input` lacks, or `output` does not fit.

@@ -15,8 +15,8 @@ pub fn to_f32(isa: Isa, from: &[f16], to: &mut [f32]) {
     dispatch!(isa, fn widen(from: &[f16], to: &mut [f32]));
 }
 
-/// Rounds to the nearest f16, ties to even; beyond ±65504, and for NaN, to the nearest end (NaN to −65504): the result is
-/// always finite.
+/// Rounds to the nearest f16, ties to even; beyond ±65504, and for NaN, to the nearest end (NaN to −65504): the result
+/// is always finite.
 ///
 /// # Panics
 /// If the lengths differ.

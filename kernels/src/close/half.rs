@@ -2,14 +2,16 @@
 //!
 //! Products are summed in f16 in blocks of [`BLOCK`], blocks in f32, tap by tap.
 //!
-//! **No sum overflows.** An f16 ends at 65504. Each output channel's weights are divided by a power of two, its unit, that brings the largest, w, to
-//! at least 1/64 and below 1/32. Finite activations are below 2¹⁶, so the first k products of a block come to less than k · 2¹¹ together, which f16
-//! holds exactly for every k up to 16; and as rounding keeps the order of numbers, no rounded sum is beyond it.
+//! **No sum overflows.** An f16 ends at 65504. Each output channel's weights are divided by a power of two, its unit,
+//! that brings the largest, w, to at least 1/64 and below 1/32. Finite activations are below 2¹⁶, so the first k
+//! products of a block come to less than k · 2¹¹ together, which f16 holds exactly for every k up to 16; and as
+//! rounding keeps the order of numbers, no rounded sum is beyond it.
 //!
-//! **What is lost.** An addition gives (s + p)(1 + ε) + η, |ε| ≤ 2⁻¹¹ and |η| ≤ 2⁻²⁵, so that a block of products p is off by at most
-//! (1 + 2⁻¹¹)¹⁶ − 1 < 1.004 · 2⁻⁷ of Σ|p|, and by 1.008 · 2⁻²⁵ a product. A weight that division takes below f16's normal numbers loses up to 2⁻²⁵,
-//! which takes up to 1.008 · 2⁻²⁵ · |x| from its product. Since the unit is at most 64 w, sums that are multiplied by it again have lost no more
-//! than 1.004 · 2⁻⁷ of their terms' magnitudes, and 1.01 · 2⁻¹⁹ · w · (|x| + 1) a product. Adding blocks in f32 comes on top.
+//! **What is lost.** An addition gives (s + p)(1 + ε) + η, |ε| ≤ 2⁻¹¹ and |η| ≤ 2⁻²⁵, so that a block of products p is
+//! off by at most (1 + 2⁻¹¹)¹⁶ − 1 < 1.004 · 2⁻⁷ of Σ|p|, and by 1.008 · 2⁻²⁵ a product. A weight that division takes
+//! below f16's normal numbers loses up to 2⁻²⁵, which takes up to 1.008 · 2⁻²⁵ · |x| from its product. Since the unit
+//! is at most 64 w, sums that are multiplied by it again have lost no more than 1.004 · 2⁻⁷ of their terms' magnitudes,
+//! and 1.01 · 2⁻¹⁹ · w · (|x| + 1) a product. Adding blocks in f32 comes on top.
 
 use std::arch::aarch64::*;
 use std::arch::asm;
@@ -35,7 +37,8 @@ const ROWS: usize = 4;
 /// A layer's weights, divided by their units.
 #[derive(Debug, Clone)]
 pub(crate) struct Weights {
-    /// Per tap, panel and two input channels, in whole blocks: the weights of the one for all outputs, then those of the other.
+    /// Per tap, panel and two input channels, in whole blocks: the weights of the one for all outputs, then those of
+    /// the other.
     pub words: Vec<Words>,
     /// What a sum of each output channel is to be multiplied by: powers of two.
     pub units: Vec<[f32; PANEL]>,
@@ -125,7 +128,8 @@ with_neon_half! {
             }
             let mut weights = block.weights[usize::from(tap) * block.tap..][..block.steps].as_ptr().cast::<u16>();
             for _ in 0..block.steps * 2 / BLOCK {
-                // SAFETY: of each row and of the weights, as many inputs are read as they were just cut to: whole blocks.
+                // SAFETY: of each row and of the weights, as many inputs are read as they were just cut to: whole
+                // blocks.
                 unsafe {
                     begin(&mut products, &mut inputs, &mut weights);
                     for _ in 1..BLOCK / EIGHT {
@@ -199,8 +203,8 @@ macro_rules! channel {
     };
 }
 
-/// The next eight input channels. All in one piece, with as many registers as are left beside the sums: of single instructions compilers
-/// make an order that takes more.
+/// The next eight input channels. All in one piece, with as many registers as are left beside the sums: of single
+/// instructions compilers make an order that takes more.
 macro_rules! eight {
     ($(#[$doc:meta])* $name:ident, $first:literal) => { with_neon_half! {
         $(#[$doc])*

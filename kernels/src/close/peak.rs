@@ -22,7 +22,8 @@ pub fn bf16(isa: Isa) -> f64 {
     f32(isa)
 }
 
-/// f16 by f16, summed in f16: the bound of [`crate::Precision::Half`], whose sums in f32 come on top. Where that falls back to f32, so does this.
+/// f16 by f16, summed in f16: the bound of [`crate::Precision::Half`], whose sums in f32 come on top. Where that falls
+/// back to f32, so does this.
 pub fn half(isa: Isa) -> f64 {
     #[cfg(target_arch = "aarch64")]
     if let Some(half) = isa.half() {

@@ -42,8 +42,8 @@ impl ExactConv {
     /// Packs `weights[tap][input][output]`.
     ///
     /// # Panics
-    /// If lengths don't match the extents, there are more than 54 taps, or a shift is above 31: the caller has checked what it
-    /// read.
+    /// If lengths don't match the extents, there are more than 54 taps, or a shift is above 31: the caller has checked
+    /// what it read.
     pub fn new(volume: usize, cin: usize, cout: usize, weights: &[i16], requantise: Requantise) -> Self {
         let extents = Extents { volume, cin, cout };
         extents.check(weights.len());
@@ -113,8 +113,8 @@ impl ExactConv {
         self.extents.cin
     }
 
-    /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations each, within
-    /// ±[`LIMIT`](super::requantise::LIMIT).
+    /// Computes the rows `first ..` of the layer that `output` holds, from `input`, whose rows are `cin` activations
+    /// each, within ±[`LIMIT`](super::requantise::LIMIT).
     ///
     /// The residual is added after requantising, and the sum clamped to ±[`LIMIT`](super::requantise::LIMIT) again.
     ///

@@ -1,5 +1,5 @@
-//! Integers by sums of four products of bytes (NEON with `dotprod`), of which a processor does two a cycle where it does one of the long
-//! products that NEON has otherwise.
+//! Integers by sums of four products of bytes (NEON with `dotprod`), of which a processor does two a cycle where it
+//! does one of the long products that NEON has otherwise.
 //!
 //! Numbers of up to 13 bits are cut into two digits, of which three products make one of numbers ([`digits`]).
 
@@ -40,13 +40,14 @@ pub(crate) struct Weights {
 /// Memory that a thread reuses.
 #[derive(Debug, Default)]
 pub(crate) struct Buffers {
-    /// The input rows that a tile reads, and one of zeros: `[row][step][digit]`, of an even number of steps; and a word more.
+    /// The input rows that a tile reads, and one of zeros: `[row][step][digit]`, of an even number of steps; and a word
+    /// more.
     rows: Vec<u32>,
 }
 
 impl Weights {
-    /// Cuts the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, into digits; nothing, if one is too large
-    /// for that.
+    /// Cuts the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, into digits; nothing,
+    /// if one is too large for that.
     pub fn new(extents: Extents, weights: impl Fn(usize, usize, usize) -> [i16; PANEL]) -> Option<Weights> {
         let Extents { volume, cin, cout } = extents;
         let (steps, halves) = (cin.div_ceil(STEP), cout.div_ceil(HALF));
@@ -74,8 +75,8 @@ impl Weights {
     }
 }
 
-/// The sums over all taps of a tile: `sums[row · panels + panel]`, rows in the plan's order. False, and no sums, if activations are too
-/// large for digits.
+/// The sums over all taps of a tile: `sums[row · panels + panel]`, rows in the plan's order. False, and no sums, if
+/// activations are too large for digits.
 ///
 /// # Panics
 /// If the plan is another kernel's, or it reads beyond the input.
@@ -123,8 +124,9 @@ pub(crate) fn accumulate(
                     stride: panels * PANEL,
                     more: first > 0,
                 };
-                // SAFETY: the processor has the instruction; all places are those of a row, or of the zeros that follow, after which there is
-                // a word more; the weights are those of all taps, the sums those of the group's rows.
+                // SAFETY: the processor has the instruction; all places are those of a row, or of the zeros that
+                // follow, after which there is a word more; the weights are those of all taps, the sums those of the
+                // group's rows.
                 unsafe { multiply(&block) };
             }
         }
@@ -192,7 +194,8 @@ with_neon_dot! {
     /// # Safety
     /// The processor must have the instruction, and the block's pointers what they promise.
     unsafe fn multiply(block: &Block) {
-        // SAFETY: the caller's promise: a row has so many steps of words and one word behind it, and so many halves each tap.
+        // SAFETY: the caller's promise: a row has so many steps of words and one word behind it, and so many halves
+        // each tap.
         unsafe {
             let mut sums = [[[vdupq_n_s32(0); DIGITS]; VECTORS]; ROWS];
             for (t, &tap) in block.taps.iter().enumerate() {

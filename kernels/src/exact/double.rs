@@ -2,7 +2,8 @@
 
 use crate::simd::{Isa, Simd, dispatch};
 
-/// Adds to each sum `o` the products `input[c] · weights[c][o]`, one input after the other: the same bits on any instruction set.
+/// Adds to each sum `o` the products `input[c] · weights[c][o]`, one input after the other: the same bits on any
+/// instruction set.
 ///
 /// # Panics
 /// If there are no sums, or not a weight for each of them and each input.

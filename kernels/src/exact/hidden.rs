@@ -1,4 +1,5 @@
-//! One hidden layer of [`WIDTH`] rectified units and an output that learns as it goes, in integers of 16 bits: what predicts an octree's occupancies.
+//! One hidden layer of [`WIDTH`] rectified units and an output that learns as it goes, in integers of 16 bits: what
+//! predicts an octree's occupancies.
 
 use crate::simd::{I16Vector, I32Vector, Simd};
 

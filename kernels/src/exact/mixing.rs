@@ -1,7 +1,8 @@
-//! What several contexts have shown, mixed in the logistic domain by weights that learn, in integers: each context with what it says in a lane of its own.
+//! What several contexts have shown, mixed in the logistic domain by weights that learn, in integers: each context with
+//! what it says in a lane of its own.
 //!
-//! An entry of a context is a word: the probability of a 1 in units of 2⁻¹⁶, from bit 16 on how often it was *seen*, from bit 24 on a check. Logits are in
-//! units of 1/64.
+//! An entry of a context is a word: the probability of a 1 in units of 2⁻¹⁶, from bit 16 on how often it was *seen*,
+//! from bit 24 on a check. Logits are in units of 1/64.
 
 use crate::simd::{F32Vector, I32Vector, Simd};
 
@@ -29,8 +30,8 @@ pub struct Mixed {
     pub sum: i32,
 }
 
-/// Mixes what `entries` say, of each if the low byte of `checks` is the entry's check: `((stretch[one >> 4] − logit)·⌊1024·seen / (4·seen + 1)⌋) >> 8`;
-/// the inputs of [`OTHERS`] are `logit` and `bias`.
+/// Mixes what `entries` say, of each if the low byte of `checks` is the entry's check: `((stretch[one >> 4] −
+/// logit)·⌊1024·seen / (4·seen + 1)⌋) >> 8`; the inputs of [`OTHERS`] are `logit` and `bias`.
 #[inline(always)]
 pub fn mix<S: Simd>(
     simd: S,
@@ -49,9 +50,10 @@ pub fn mix<S: Simd>(
     mix_narrow(simd.narrow(), &said, asked, &stretched, [logit, bias], weights)
 }
 
-/// Learns from a prediction that was `error` off, in units of 2⁻¹⁶: each weight grows by `(3·error·input + 32768) >> 16`, and stays within ±[`HEAVIEST`].
-/// The result are the entries to come, for a bit of probability `truth`, 0 or 2¹⁶: each *seen* once more, up to [`MOST`], its probability, at first `first`,
-/// grown by `((truth − one)·⌊65536 / (4·seen + 1)⌋) >> 14`, within 16 to 65520.
+/// Learns from a prediction that was `error` off, in units of 2⁻¹⁶: each weight grows by `(3·error·input + 32768) >>
+/// 16`, and stays within ±[`HEAVIEST`]. The result are the entries to come, for a bit of probability `truth`, 0 or 2¹⁶:
+/// each *seen* once more, up to [`MOST`], its probability, at first `first`, grown by `((truth − one)·⌊65536 /
+/// (4·seen + 1)⌋) >> 14`, within 16 to 65520.
 #[inline(always)]
 pub fn learn<S: Simd>(
     simd: S,
@@ -68,8 +70,8 @@ pub fn learn<S: Simd>(
     first
 }
 
-/// `⌊factor / (4·seen + 1)⌋` for *seen* up to [`MOST`] and quotients up to 2¹⁶: a quotient that is no whole number is at least 1/121 from
-/// the next, and an f32's error below 1/256, so that it is rounded down to the same.
+/// `⌊factor / (4·seen + 1)⌋` for *seen* up to [`MOST`] and quotients up to 2¹⁶: a quotient that is no whole number is
+/// at least 1/121 from the next, and an f32's error below 1/256, so that it is rounded down to the same.
 #[inline(always)]
 fn by_four_seen<S: Simd>(simd: S, factor: S::I32, seen: S::I32) -> S::I32 {
     let divisor = seen.shl(2) + S::I32::splat(simd, 1);

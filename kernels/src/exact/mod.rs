@@ -1,5 +1,5 @@
-//! All that decides a bit of a stream, in integers and in floats whose order of operations is written down: convolution, minimal
-//! filtering, requantisation, prediction of occupancies, the colour filter and the residual.
+//! All that decides a bit of a stream, in integers and in floats whose order of operations is written down:
+//! convolution, minimal filtering, requantisation, prediction of occupancies, the colour filter and the residual.
 //!
 //! Nothing here may name `close`: without the feature of that name it does not exist.
 

@@ -1,4 +1,5 @@
-//! The integer micro-kernel of NEON, by hand: first and second values of pairs apart, for its long multiplication multiplies like by like.
+//! The integer micro-kernel of NEON, by hand: first and second values of pairs apart, for its long multiplication
+//! multiplies like by like.
 
 use std::arch::aarch64::*;
 

@@ -1,4 +1,5 @@
-//! The factors of geometry-invariant layers: they depend on which taps read something, and on nothing else of the input.
+//! The factors of geometry-invariant layers: they depend on which taps read something, and on nothing else of the
+//! input.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -17,7 +18,8 @@ const NONE: u64 = u64::MAX;
 pub(crate) struct Gains<E> {
     /// Tells it from all others but its clones.
     id: u64,
-    /// `Σ weight²` over the input channels of some of [`PART`] taps, by which of them: `[panel][taps / PART][1 << PART]`.
+    /// `Σ weight²` over the input channels of some of [`PART`] taps, by which of them: `[panel][taps / PART][1 <<
+    /// PART]`.
     energy: Vec<[E; PANEL]>,
     gain: Vec<[f32; PANEL]>,
 }

@@ -1,4 +1,5 @@
-//! Responses of an edge-preserving filter to the differences between a voxel and its neighbours, eight lanes at a time, in integers.
+//! Responses of an edge-preserving filter to the differences between a voxel and its neighbours, eight lanes at a time,
+//! in integers.
 
 use crate::simd::{I32Vector, Simd};
 
@@ -10,9 +11,11 @@ pub type Lanes = [i32; 8];
 /// Marks a neighbour that is not there.
 const ABSENT: u32 = u32::MAX;
 
-/// The sums of the responses to the neighbours whose indices stand at `places` of `row`, and how many of them are there.
+/// The sums of the responses to the neighbours whose indices stand at `places` of `row`, and how many of them are
+/// there.
 ///
-/// The response to a difference `d` is `(d·(4096 − ((x·x) >> 12))) >> 12` with `x = min(4096, (|d|·inverse) >> 12)`. Inverses are at most 2¹⁶.
+/// The response to a difference `d` is `(d·(4096 − ((x·x) >> 12))) >> 12` with `x = min(4096, (|d|·inverse) >> 12)`.
+/// Inverses are at most 2¹⁶.
 ///
 /// # Panics
 /// If an index or a place lies beyond its slice.

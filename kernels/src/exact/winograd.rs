@@ -1,9 +1,10 @@
 //! All eight children of voxels by minimal filtering: 64 products a voxel and pair of channels instead of up to 216.
 //!
-//! F(2³, 3³) after Winograd, as Lavin and Gray use it (arXiv 1509.09308): the window of 4³ positions around a voxel's children is
-//! transformed, multiplied position by position with transformed weights, and transformed back to the eight children. Weights are taken
-//! eightfold, so that no transform divides, and all is computed modulo 2³²: what comes back is eight times the sum, whatever wrapped on the
-//! way. So results are those of the definition to the bit where no sum takes more than 29 bits.
+//! F(2³, 3³) after Winograd, as Lavin and Gray use it (arXiv 1509.09308): the window of 4³ positions around a voxel's
+//! children is transformed, multiplied position by position with transformed weights, and transformed back to the eight
+//! children. Weights are taken eightfold, so that no transform divides, and all is computed modulo 2³²: what comes back
+//! is eight times the sum, whatever wrapped on the way. So results are those of the definition to the bit where no sum
+//! takes more than 29 bits.
 
 use bytemuck::{must_cast_slice, must_cast_slice_mut};
 
@@ -17,7 +18,8 @@ use crate::sparse::taps::ABSENT;
 
 /// Positions of the window.
 const WINDOW: usize = 64;
-/// Voxels whose children are computed together: their windows and products fit the second cache. A multiple of every [`crate::sparse::accumulate::group`].
+/// Voxels whose children are computed together: their windows and products fit the second cache. A multiple of every
+/// [`crate::sparse::accumulate::group`].
 const PART: usize = 16;
 /// Sums must stay below this, either side of zero.
 const SUM_LIMIT: i64 = 1 << 28;
@@ -39,8 +41,8 @@ pub(crate) struct Buffers {
 }
 
 impl Weights {
-    /// Transforms the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs; nothing if sums could be too large, a
-    /// weight does not fit 16 bits afterwards, or input channels are not whole panels.
+    /// Transforms the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs; nothing if sums
+    /// could be too large, a weight does not fit 16 bits afterwards, or input channels are not whole panels.
     pub fn new(extents: Extents, weights: impl Fn(usize, usize, usize) -> [i16; PANEL]) -> Option<Self> {
         assert_eq!(extents.volume, 27, "a window is that of a 3³ kernel");
         let cin = extents.cin;
@@ -83,7 +85,8 @@ fn transformed(taps: &[i32; 27]) -> [i32; WINDOW] {
     })
 }
 
-/// Words between positions of windows and products beyond what they hold: without, all positions of a voxel fall into few sets of the cache.
+/// Words between positions of windows and products beyond what they hold: without, all positions of a voxel fall into
+/// few sets of the cache.
 const GAP: usize = PANEL;
 
 /// The sums of all children of voxels: `sums[child · panels + panel]`, and which taps of each child read something.
@@ -130,7 +133,8 @@ pub(crate) fn accumulate<'a>(
     masks
 }
 
-/// Gathers and transforms the windows of up to [`PART`] voxels: `[position][voxel][channel]`, positions [`GAP`] words apart.
+/// Gathers and transforms the windows of up to [`PART`] voxels: `[position][voxel][channel]`, positions [`GAP`] words
+/// apart.
 #[inline(always)]
 fn forward<S: Simd>(simd: S, neighbours: &[u32], input: &[i16], cin: usize, windows: &mut [i16], masks: &mut Vec<u64>) {
     // Rows of whole panels consist of whole vectors of one of both.
@@ -201,7 +205,8 @@ fn differences<S: Simd>([a, b, c, d]: [S::I16; 4]) -> [S::I16; 4] {
     [a - c, b + c, c - b, b - d]
 }
 
-/// Transforms products `[position][voxel][panel]`, positions [`GAP`] words apart, back to the sums of eight children a voxel.
+/// Transforms products `[position][voxel][panel]`, positions [`GAP`] words apart, back to the sums of eight children a
+/// voxel.
 #[inline(always)]
 fn back<S: Simd>(simd: S, products: &[Words], panels: usize, sums: &mut [Words]) {
     let stride = PART * panels + GAP / PANEL;

@@ -35,7 +35,8 @@ fn tiles_permitted() -> bool {
     const ARCH_REQ_XCOMP_PERM: i64 = 0x1023;
     const XTILEDATA: i64 = 18;
     let answer: i64;
-    // SAFETY: a system call that reads and writes no memory of this process, with the registers that it may change named.
+    // SAFETY: a system call that reads and writes no memory of this process, with the registers that it may change
+    // named.
     unsafe {
         std::arch::asm!(
             "syscall",

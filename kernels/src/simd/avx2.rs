@@ -96,7 +96,8 @@ methods! { with_avx2 F32x8: F32Vector<Avx2> {
 
     fn load_deinterleaved3(_simd: Avx2, from: &[[f32; 3]]) -> [Self; 3] {
         let [a, b, c]: [__m256; 3] = must_cast(*first::<_, 8>(from));
-        // Lane `i` of vector `k` is float `3i + k`: in each of the three loads, what belongs to the vector is put in its place.
+        // Lane `i` of vector `k` is float `3i + k`: in each of the three loads, what belongs to the vector is put in
+        // its place.
         macro_rules! vector {
             ($index:expr, $from_b:literal, $from_c:literal) => {{
                 let index = must_cast($index);

@@ -92,7 +92,8 @@ methods! { with_avx512 F32x16: F32Vector<Avx512> {
 
     fn load_deinterleaved3(_simd: Avx512, from: &[[f32; 3]]) -> [Self; 3] {
         let [a, b, c]: [__m512; 3] = must_cast(*first::<_, 16>(from));
-        // Lane `i` of vector `k` is float `3i + k`. Of the first two loads an index picks any; the third's are put in after.
+        // Lane `i` of vector `k` is float `3i + k`. Of the first two loads an index picks any; the third's are put in
+        // after.
         static INDEX: [[[i32; 16]; 2]; 3] = {
             let mut index = [[[0; 16]; 2]; 3];
             let mut at = 0;
@@ -119,8 +120,8 @@ methods! { with_avx512 F32x16: F32Vector<Avx512> {
 
     fn load_records(_simd: Avx512, records: &[&[f32; 16]]) -> [Self; 16] {
         let records: &[&[f32; 16]; 16] = first(records);
-        // Quarter `j` of `rows[q][i]` is quarter `q` of record `4j + i`; transposed, vector `k` of them is field `4q + k`, in order
-        // but for the lanes: lane `4j + i`.
+        // Quarter `j` of `rows[q][i]` is quarter `q` of record `4j + i`; transposed, vector `k` of them is field `4q +
+        // k`, in order but for the lanes: lane `4j + i`.
         let mut rows = [[_mm512_setzero_ps(); 4]; 4];
         for i in 0..4 {
             let [a, b, c, d]: [__m512; 4] = four!(j => must_cast(*records[4 * j + i]));
@@ -471,8 +472,8 @@ vectorize! { with_bf16 Bf16, base: Avx512 }
 
 #[cfg(feature = "close")]
 impl Bf16 {
-    /// Rows of f16 as pairs of bf16, rounded to even: row `i` of `to` is row `rows[i]` of `input`, of `cin` values each. An odd row's last
-    /// pair has a zero.
+    /// Rows of f16 as pairs of bf16, rounded to even: row `i` of `to` is row `rows[i]` of `input`, of `cin` values
+    /// each. An odd row's last pair has a zero.
     ///
     /// # Panics
     /// If the input lacks a row.

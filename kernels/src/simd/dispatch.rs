@@ -15,7 +15,8 @@ fn call<S: Simd, W: Work>(simd: S, work: W) -> W::Output {
     work.run(simd)
 }
 
-/// Calls `$body::<S, …>(token, args…)` in a function that is compiled with the features of `$isa`, whose token is of type `S`.
+/// Calls `$body::<S, …>(token, args…)` in a function that is compiled with the features of `$isa`, whose token is of
+/// type `S`.
 ///
 /// Each compilation stays a function of its own, small enough for the compiler to find the vectors in it.
 macro_rules! dispatch {

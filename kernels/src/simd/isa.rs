@@ -60,7 +60,8 @@ instruction_sets! { define_level }
 /// What some processors have besides, which some kernels are written for by hand.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 enum Extension {
-    /// Of AVX2: products of pairs of i16 that are added in the same instruction. Small processors without AVX-512 have it.
+    /// Of AVX2: products of pairs of i16 that are added in the same instruction. Small processors without AVX-512 have
+    /// it.
     #[cfg(target_arch = "x86_64")]
     AvxVnni(AvxVnni),
     /// Of AVX-512: matrix tiles of bytes and bf16.

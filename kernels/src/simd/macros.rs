@@ -1,7 +1,7 @@
 //! What the files of the instruction sets, and bodies over any vectors, are written with.
 
-/// `[$e; 3]` with `$i` counting. Arrays' own `map` and `from_fn` are calls that the compiler does not always inline into code for
-/// an instruction set above the baseline; so are closures.
+/// `[$e; 3]` with `$i` counting. Arrays' own `map` and `from_fn` are calls that the compiler does not always inline
+/// into code for an instruction set above the baseline; so are closures.
 macro_rules! three {
     ($i:ident => $e:expr) => {
         [
@@ -59,8 +59,8 @@ macro_rules! five {
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 pub(crate) use five;
 
-/// Names the features of an instruction set, once: defines a token that can only be had where the processor has them, and a macro
-/// that compiles functions with them. A set may extend another one.
+/// Names the features of an instruction set, once: defines a token that can only be had where the processor has them,
+/// and a macro that compiles functions with them. A set may extend another one.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! define_set {
     ($dollar:tt $with:ident, $detect:ident, $(#[$doc:meta])* $visible:vis struct $token:ident = $($feature:tt),+;) => {
@@ -108,7 +108,8 @@ macro_rules! define_set {
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 pub(crate) use define_set;
 
-/// Lets a token run work in a function that is compiled with the features of its set, with the token that `$proof` names.
+/// Lets a token run work in a function that is compiled with the features of its set, with the token that `$proof`
+/// names.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! vectorize {
     ($with:ident $token:ident, $proof:ident: $type:ty) => {
@@ -163,7 +164,8 @@ macro_rules! feature_macro {
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 pub(crate) use feature_macro;
 
-/// Implements a trait of vectors by functions that are compiled with the features of an instruction set. Their bodies are safe code.
+/// Implements a trait of vectors by functions that are compiled with the features of an instruction set. Their bodies
+/// are safe code.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! methods {
     ($with:ident $vector:ident: $trait:path {
@@ -183,7 +185,8 @@ macro_rules! methods {
             $(const $constant: $constant_type = $value;)?
             $(#[inline(always)]
             fn $name($first $(: $first_ty)? $(, $arg: $ty)*) $(-> $out)? {
-                // SAFETY: among the arguments is the set's token, or a vector, which is only made from the token or other vectors.
+                // SAFETY: among the arguments is the set's token, or a vector, which is only made from the token or
+                // other vectors.
                 unsafe { <$vector>::$name($first $(, $arg)*) }
             })*
         }

@@ -30,8 +30,9 @@ pub trait Simd: Copy + Debug + Send + Sync + 'static + sealed::Sealed {
 
 /// Work that is compiled once for every instruction set.
 ///
-/// What it calls must be inlined into it (`#[inline(always)]`, closures): a function that is not is compiled for the baseline of the
-/// target. Results are the same in all sets, as integers are everywhere, and floats whose order of operations is written down.
+/// What it calls must be inlined into it (`#[inline(always)]`, closures): a function that is not is compiled for the
+/// baseline of the target. Results are the same in all sets, as integers are everywhere, and floats whose order of
+/// operations is written down.
 pub trait Work {
     /// The result.
     type Output;
@@ -65,7 +66,8 @@ pub trait F32Vector<S: Simd>:
     fn store(self, to: &mut [f32]);
     /// As [`F32Vector::load`], from f16: exact.
     fn load_f16(simd: S, from: &[f16]) -> Self;
-    /// As [`F32Vector::store`], rounded to the nearest f16, ties to even. Values beyond ±65504 become ±65504, and NaN −65504.
+    /// As [`F32Vector::store`], rounded to the nearest f16, ties to even. Values beyond ±65504 become ±65504, and NaN
+    /// −65504.
     fn store_f16(self, to: &mut [f16]);
     /// Vector `k` of the result holds component `k` of the first elements of `from`.
     ///
@@ -79,8 +81,8 @@ pub trait F32Vector<S: Simd>:
     /// # Panics
     /// If there are fewer than [`Simd::LANES`].
     fn load_records(simd: S, records: &[&[f32; 16]]) -> [Self; 16];
-    /// For every lane whose bit is set in `which`, in order, writes what the 16 vectors hold in it to the next record of `to`. The
-    /// result is the number of records written.
+    /// For every lane whose bit is set in `which`, in order, writes what the 16 vectors hold in it to the next record
+    /// of `to`. The result is the number of records written.
     ///
     /// # Panics
     /// If `to` is shorter.
@@ -111,8 +113,8 @@ pub trait F32Vector<S: Simd>:
     fn select(mask: S::Mask, yes: Self, no: Self) -> Self;
     /// `self` where the mask holds, else 0.
     fn keep(self, mask: S::Mask) -> Self;
-    /// An approximation of `2^x` for `−126 ≤ x ≤ 1`, with a relative error below 3.1·10⁻⁶, exact for integers; at most 2⁻¹²⁶ for any
-    /// lesser x. Its last bits depend on the instruction set.
+    /// An approximation of `2^x` for `−126 ≤ x ≤ 1`, with a relative error below 3.1·10⁻⁶, exact for integers; at most
+    /// 2⁻¹²⁶ for any lesser x. Its last bits depend on the instruction set.
     fn exp2(self) -> Self;
     /// The mantissa in `[1, 2)` and the exponent of a positive normal number.
     fn split_exponent(self) -> (Self, Self);
@@ -255,7 +257,8 @@ pub(super) fn first_mut<T, const N: usize>(to: &mut [T]) -> &mut [T; N] {
 /// The largest finite f16.
 pub(crate) const F16_MAX: f32 = 65504.0;
 
-/// The polynomial of degree 4 through (0, 1) that is nearest to `2^f` on `[−½, ½]`, in relative error; highest power first.
+/// The polynomial of degree 4 through (0, 1) that is nearest to `2^f` on `[−½, ½]`, in relative error; highest power
+/// first.
 pub(super) const EXP2: [f32; 5] = [9.582_853e-3, 5.590_642_6e-2, 2.402_41e-1, 6.931_242e-1, 1.0];
 /// As [`EXP2`], on `[0, 1]`.
 #[cfg(target_arch = "x86_64")]

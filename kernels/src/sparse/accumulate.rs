@@ -8,8 +8,8 @@ use crate::simd::Isa;
 /// [`Words`] of weights that the first cache holds besides rows and sums.
 const CACHED: usize = 256;
 
-/// Output rows of a layer of `cout` channels that are multiplied by the same taps: those of a matrix tile, or as many as keep the
-/// registers busy. A multiple of [`MIN_GROUP`].
+/// Output rows of a layer of `cout` channels that are multiplied by the same taps: those of a matrix tile, or as many
+/// as keep the registers busy. A multiple of [`MIN_GROUP`].
 pub(crate) fn group(isa: Isa, cout: usize) -> usize {
     if isa.has_tiles() {
         16
@@ -20,7 +20,8 @@ pub(crate) fn group(isa: Isa, cout: usize) -> usize {
     }
 }
 
-/// Multiplies the panels of a block, of which so many whole ones are left, or none and a half one: as many as [`width`] says.
+/// Multiplies the panels of a block, of which so many whole ones are left, or none and a half one: as many as [`width`]
+/// says.
 pub(crate) type Multiply = fn(Isa, &mut Block<'_>, usize);
 
 /// Writes rows of the input, of so many values each, as words.
@@ -28,7 +29,8 @@ pub(crate) type Expand<T> = fn(Isa, &[T], &[u32], usize, &mut [u32]);
 
 /// The sums over all taps of a tile, `sums[row · panels + panel]`, rows in the plan's order; others may follow.
 ///
-/// `weights` are ordered `[tap][panel][step]`; an input row has `cin` values, which `expand` writes into a word for each step.
+/// `weights` are ordered `[tap][panel][step]`; an input row has `cin` values, which `expand` writes into a word for
+/// each step.
 ///
 /// # Panics
 /// If the plan reads beyond the input.

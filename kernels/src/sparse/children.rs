@@ -1,5 +1,5 @@
-//! The 3³ neighbours of voxels' children, from those of the voxels: a child's neighbour lies in its parent or in one of its parent's 26
-//! neighbours, and the neighbours of all eight siblings fill a window of 4³ positions around them.
+//! The 3³ neighbours of voxels' children, from those of the voxels: a child's neighbour lies in its parent or in one of
+//! its parent's 26 neighbours, and the neighbours of all eight siblings fill a window of 4³ positions around them.
 
 use super::taps::ABSENT;
 
@@ -8,7 +8,8 @@ const WINDOW: [(u8, u8); 64] = {
     let mut window = [(0, 0); 64];
     let mut i = 0;
     while i < 64 {
-        // Window position 0..4 along an axis is child coordinate −1..2: parent offset −1, 0, 0, 1 and octant bit 1, 0, 1, 0.
+        // Window position 0..4 along an axis is child coordinate −1..2: parent offset −1, 0, 0, 1 and octant bit 1, 0,
+        // 1, 0.
         let (x, y, z) = (i & 3, i >> 2 & 3, i >> 4);
         window[i] = (
             (((x + 1) >> 1) + 3 * ((y + 1) >> 1) + 9 * ((z + 1) >> 1)) as u8,
@@ -19,8 +20,8 @@ const WINDOW: [(u8, u8); 64] = {
     window
 };
 
-/// The indices of the voxels in the window around the children of a voxel with these 27 neighbours; `child` tells those of a voxel's child in
-/// an octant.
+/// The indices of the voxels in the window around the children of a voxel with these 27 neighbours; `child` tells those
+/// of a voxel's child in an octant.
 ///
 /// # Panics
 /// If there are fewer than 27.
@@ -54,8 +55,8 @@ pub(crate) fn copy_mask(window: &[u32; 64], octant: usize) -> u64 {
     bits.fold(0, |mask, (k, &q)| mask | u64::from(q != ABSENT) << k)
 }
 
-/// Writes the rows of some children, `rows.len() / 27` from `first` on, of all eight children of voxels with these neighbours, 27 each: the
-/// child in octant `o` of voxel `i` has index `8i + o`.
+/// Writes the rows of some children, `rows.len() / 27` from `first` on, of all eight children of voxels with these
+/// neighbours, 27 each: the child in octant `o` of voxel `i` has index `8i + o`.
 pub(crate) fn rows_of_all(neighbours: &[u32], first: usize, rows: &mut [u32]) {
     let mut at = first;
     let mut rest = rows;

@@ -6,7 +6,8 @@ use super::rows::{PANEL, Words};
 pub(crate) const MIN_GROUP: usize = 4;
 /// Panels that AVX-512 multiplies at once, by the rows of the smallest group, where a layer has so many.
 pub(crate) const WIDE: usize = 4;
-/// A micro-kernel: vectors of 32-bit sums, and what multiplies and adds one step, which is an f32 or a pair of i16 or bf16.
+/// A micro-kernel: vectors of 32-bit sums, and what multiplies and adds one step, which is an f32 or a pair of i16 or
+/// bf16.
 pub(crate) trait Microkernel: Copy {
     /// Sums.
     type Sum: Copy;
@@ -53,7 +54,8 @@ pub(crate) struct Block<'a> {
     pub volume: usize,
     /// [`Words`] from one tap's weights to the next's.
     pub tap: usize,
-    /// The first panel's sums of the group's rows, each `stride` [`Words`] after the last's; those of the next panel follow.
+    /// The first panel's sums of the group's rows, each `stride` [`Words`] after the last's; those of the next panel
+    /// follow.
     pub sums: &'a mut [Words],
     /// [`Words`] from one row's sums to the next's.
     pub stride: usize,
@@ -69,8 +71,9 @@ impl Block<'_> {
     }
 }
 
-/// Sums a block's products, for `V` vectors of channels from the first panel on, `R` rows at once, which divide the group. Each sum is
-/// computed in `P` parts, of every `P`th step, where there would be too few to hide the latency of an addition.
+/// Sums a block's products, for `V` vectors of channels from the first panel on, `R` rows at once, which divide the
+/// group. Each sum is computed in `P` parts, of every `P`th step, where there would be too few to hide the latency of
+/// an addition.
 ///
 /// # Panics
 /// If the block reads or writes beyond its slices.
@@ -91,8 +94,8 @@ pub(crate) fn columns<K: Microkernel, const R: usize, const V: usize, const P: u
         "weights of all taps"
     );
     for first in (0..group).step_by(R) {
-        // SAFETY: there are places for all taps and rows of the group, `first + R` among them at most, and rows for all places; all
-        // taps have weights of all panels.
+        // SAFETY: there are places for all taps and rows of the group, `first + R` among them at most, and rows for all
+        // places; all taps have weights of all panels.
         unsafe { multiply::<K, R, V, P>(kernel, block, first) };
     }
 }
@@ -100,8 +103,8 @@ pub(crate) fn columns<K: Microkernel, const R: usize, const V: usize, const P: u
 /// Sums the products of `R` rows from `first` on.
 ///
 /// # Safety
-/// The block must have a place for each tap and each row of the group, and these rows; the places must name whole rows of `inputs`, and
-/// each of the `volume` taps have `steps` weights of the panels of `V` vectors.
+/// The block must have a place for each tap and each row of the group, and these rows; the places must name whole rows
+/// of `inputs`, and each of the `volume` taps have `steps` weights of the panels of `V` vectors.
 ///
 /// # Panics
 /// If a tap is none of the `volume`.

@@ -1,5 +1,5 @@
-//! Sparse convolution, as far as integers and floats have it in common: which input rows a tile of output rows reads, and the
-//! register-blocked loop that multiplies them by weights.
+//! Sparse convolution, as far as integers and floats have it in common: which input rows a tile of output rows reads,
+//! and the register-blocked loop that multiplies them by weights.
 
 pub(crate) mod accumulate;
 pub(crate) mod children;

@@ -1,8 +1,8 @@
 //! Peak throughput of one core, to judge the kernels by: loops of multiply-adds that wait for nothing.
 //!
-//! Each measurement takes about 10 ms and gives the best rate seen, in 10⁹ multiply-adds per second. For [`Scalar`](crate::Scalar) it
-//! tells what the compiler makes of such a loop, which is no bound. The numbers have many different bits, as those of layers do: with
-//! zeros alone AMX came out 1 % faster.
+//! Each measurement takes about 10 ms and gives the best rate seen, in 10⁹ multiply-adds per second. For
+//! [`Scalar`](crate::Scalar) it tells what the compiler makes of such a loop, which is no bound. The numbers have many
+//! different bits, as those of layers do: with zeros alone AMX came out 1 % faster.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -25,7 +25,8 @@ pub(crate) fn best(batch: impl Fn() -> usize) -> f64 {
     best
 }
 
-/// Words that are numbers of either sign around 1 as f32, as two bf16 and as two f16, and large ones as two i16: many of their bits differ.
+/// Words that are numbers of either sign around 1 as f32, as two bf16 and as two f16, and large ones as two i16: many
+/// of their bits differ.
 pub(crate) fn some_words<const N: usize>() -> [Words; N] {
     let mut state = 1u32;
     [(); N].map(|()| {
@@ -37,8 +38,8 @@ pub(crate) fn some_words<const N: usize>() -> [Words; N] {
     })
 }
 
-/// Multiplies `rounds` times five factors by two vectors of weights, in registers but for the factors, and gives the number of words
-/// multiplied.
+/// Multiplies `rounds` times five factors by two vectors of weights, in registers but for the factors, and gives the
+/// number of words multiplied.
 #[inline(always)]
 pub(crate) fn rounds<K: Microkernel>(kernel: K, rounds: usize) -> usize {
     const ROWS: usize = 5;

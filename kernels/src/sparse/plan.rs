@@ -1,12 +1,13 @@
-//! Kernel maps as layers read them: few input rows, each known by a short number, and output rows of like neighbours together.
+//! Kernel maps as layers read them: few input rows, each known by a short number, and output rows of like neighbours
+//! together.
 
 use std::ops::Range;
 use std::sync::OnceLock;
 
 use super::rows::{IN_ORDER, TILE};
 
-/// A kernel map arranged for the layers that read it, part by part as they first do, in the smallest groups and in larger ones. It pays where a
-/// map serves several layers; results are the same without.
+/// A kernel map arranged for the layers that read it, part by part as they first do, in the smallest groups and in
+/// larger ones. It pays where a map serves several layers; results are the same without.
 #[derive(Debug, Clone)]
 pub struct Plan(pub(super) Vec<[OnceLock<PlanTile>; 2]>);
 
@@ -19,8 +20,8 @@ impl Plan {
 
 /// Up to [`TILE`] rows of a kernel map, arranged.
 ///
-/// Rows are sorted by which taps they use, and cut into groups of [`super::accumulate::group`]: what a group multiplies is the taps that any of its rows
-/// uses.
+/// Rows are sorted by which taps they use, and cut into groups of [`super::accumulate::group`]: what a group multiplies
+/// is the taps that any of its rows uses.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct PlanTile {
     /// Rows of a group.
@@ -43,7 +44,8 @@ pub(crate) struct PlanTile {
     pub(super) starts: Vec<u32>,
     /// Each step's tap; they ascend within a group.
     pub(super) taps: Vec<u8>,
-    /// For each step and row of its group, which of `inputs` it reads; their number for nothing. One more step, of nothing, comes last.
+    /// For each step and row of its group, which of `inputs` it reads; their number for nothing. One more step, of
+    /// nothing, comes last.
     pub(super) places: Clamped,
 }
 
@@ -139,8 +141,8 @@ impl PlanTile {
         &self.positions
     }
 
-    /// What a group multiplies of some taps, ascending: the taps it uses, and for each of them the places of the input rows, followed by
-    /// one more.
+    /// What a group multiplies of some taps, ascending: the taps it uses, and for each of them the places of the input
+    /// rows, followed by one more.
     pub(crate) fn steps(&self, group: usize, taps: Range<usize>) -> (&[u8], Places<'_>) {
         let (start, end) = (self.step(group, taps.start), self.step(group, taps.end));
         let places = start * self.group..(end + 1) * self.group;

@@ -56,7 +56,8 @@ impl PlanTile {
         self.places = Clamped::new(places, self.inputs.len() as u16);
     }
 
-    /// Arranges `count` rows from `first` on, of which each reads the input row of its own number, through the only tap.
+    /// Arranges `count` rows from `first` on, of which each reads the input row of its own number, through the only
+    /// tap.
     fn arrange_same(&mut self, group: usize, first: usize, count: usize) {
         if (self.group, self.masks.len()) != (group, count) {
             let groups = count.div_ceil(group);
@@ -80,7 +81,8 @@ impl PlanTile {
         self.inputs.extend(first as u32..self.end as u32);
     }
 
-    /// Orders rows by their masks in reflected binary, the taps that half of the rows use first: neighbours then differ in few taps.
+    /// Orders rows by their masks in reflected binary, the taps that half of the rows use first: neighbours then differ
+    /// in few taps.
     fn sort(&mut self) {
         let rows = self.masks.len() as i32;
         let mut uses = [0i32; 64];

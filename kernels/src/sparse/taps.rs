@@ -28,8 +28,8 @@ pub enum Taps<'a> {
     },
     /// Eight taps: row `8p + o` reads row `p` through tap `o`. All children of every voxel.
     Children,
-    /// 27 taps: row `8p + o` is the child in octant `o` of voxel `p`, and reads the children of `p` and its neighbours around it. All
-    /// children of every voxel.
+    /// 27 taps: row `8p + o` is the child in octant `o` of voxel `p`, and reads the children of `p` and its neighbours
+    /// around it. All children of every voxel.
     AllChildren {
         /// Entry `p·27 + k` is the neighbour of voxel `p` at offset `k`, x fastest, or [`ABSENT`].
         neighbours: &'a [u32],

@@ -69,8 +69,8 @@ fn exact_layers_equal_their_definition_to_the_bit() {
     }
 }
 
-/// Where sums are small enough, all children of a voxel are computed at once, else each by itself: on both sides of that border, and with the
-/// largest sums on either side of zero.
+/// Where sums are small enough, all children of a voxel are computed at once, else each by itself: on both sides of
+/// that border, and with the largest sums on either side of zero.
 #[test]
 fn all_children_equal_their_definition_up_to_the_largest_sums() {
     // 27 voxels around one, and one far from all.
@@ -91,7 +91,8 @@ fn all_children_equal_their_definition_up_to_the_largest_sums() {
         plan: &plan,
     };
     for [cin, cout] in [[16, 16], [32, 14], [64, 40]] {
-        // The largest even weight, if all are alike, with which sums stay below 2²⁸; the next; what transforms make too large.
+        // The largest even weight, if all are alike, with which sums stay below 2²⁸; the next; what transforms make too
+        // large.
         let most = ((1 << 28) / 2047 - 1) / (27 * cin as i32);
         for weight in [most, most + 1, 2047, i16::MAX.into()] {
             for sign in [1, -1] {

@@ -125,8 +125,8 @@ fn measured(depth: f64, step: f64, noise: f64) -> f64 {
     1.0 / (disparity * step)
 }
 
-/// The depth of a surface behind a pixel's, if one of its neighbours sees such; of a background without one, a little more than
-/// the pixel's own.
+/// The depth of a surface behind a pixel's, if one of its neighbours sees such; of a background without one, a little
+/// more than the pixel's own.
 fn edge(station: &Station, x: i64, y: i64, depth: f64) -> Option<f64> {
     let beside = [(-1, 0), (1, 0), (0, -1), (0, 1)].map(|(dx, dy)| station.hit(x + dx, y + dy));
     let behind = beside.map(|hit| hit.map_or(1.1 * depth, |hit| hit.depth));

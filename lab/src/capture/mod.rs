@@ -1,9 +1,9 @@
 //! Clouds as instruments capture them: with holes, noise and uneven density. The truth stays the mesh.
 //!
-//! An object's longest side is taken to be one metre long where an instrument's noise is given in metres. Every instrument
-//! takes photographs for the points' colours, each with its own exposure and white balance and through a JPEG, so that colours
-//! have seams between views, blocks, and some of the backdrop at the object's edges. Equal seeds give equal captures, for any
-//! number of threads.
+//! An object's longest side is taken to be one metre long where an instrument's noise is given in metres. Every
+//! instrument takes photographs for the points' colours, each with its own exposure and white balance and through a
+//! JPEG, so that colours have seams between views, blocks, and some of the backdrop at the object's edges. Equal seeds
+//! give equal captures, for any number of threads.
 
 mod cameras;
 mod lidar;

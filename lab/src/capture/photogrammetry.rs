@@ -10,15 +10,16 @@ const ELEVATIONS: [f64; 3] = [-10.0, 15.0, 40.0];
 const PER_RING: usize = 8;
 /// Side of a photograph: at most, at least, and per square root of a point.
 const SIDES: [f64; 3] = [640.0, 160.0, 1.2];
-/// Chance of a pixel without texture over that of one with much, and the change of brightness from a pixel to the next that is
-/// much.
+/// Chance of a pixel without texture over that of one with much, and the change of brightness from a pixel to the next
+/// that is much.
 const PLAIN: f64 = 0.12;
 const TEXTURED: f64 = 0.04;
 /// Waves of the error of low frequency: how many, their standard deviation and their lengths in metres.
 const WAVES: usize = 24;
 const BUMPS: f64 = 0.0012;
 const LENGTHS: [f64; 2] = [0.04, 0.3];
-/// Standard deviation of a point's own error where there is much texture, in metres. Without texture it is four times that.
+/// Standard deviation of a point's own error where there is much texture, in metres. Without texture it is four times
+/// that.
 const NOISE: f64 = 0.0006;
 /// Share of outliers and their standard deviation along the ray in metres.
 const OUTLIERS: f64 = 0.006;

@@ -21,9 +21,10 @@ use crate::surface::Surface;
 
 /// Judge streams and point clouds by pictures of the mesh they came from
 ///
-/// Every item is drawn from twelve cameras and compared with the mesh: PSNR over whole pictures and over the foreground, MS-SSIM,
-/// SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes), as one round Gaussian a point (of four) and as surfels (of
-/// five). With a cloud and a model but no stream among the items, the cloud is coded first.
+/// Every item is drawn from twelve cameras and compared with the mesh: PSNR over whole pictures and over the
+/// foreground, MS-SSIM, SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes), as one round Gaussian
+/// a point (of four) and as surfels (of five). With a cloud and a model but no stream among the items, the cloud is
+/// coded first.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Streams (.b2p), or point clouds on the voxel grid or Gaussians (.ply, .ply.zst): [NAME=]PATH[@BPP]

@@ -15,8 +15,8 @@ use crate::tradeoff::{self, MeasuredInput, Options, Report, Row};
 /// Measure what accuracy costs in time on this machine: a table, JSON, a plot, and a page with all of them
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Stream to measure with, or cloud to be coded first, whose own pictures are then compared with as well [default: the sample that comes
-    /// with the program]
+    /// Stream to measure with, or cloud to be coded first, whose own pictures are then compared with as well [default:
+    /// the sample that comes with the program]
     input: Option<PathBuf>,
     /// Folder for tradeoff.html, tradeoff.json and tradeoff.svg
     #[arg(short, long, value_name = "DIR", default_value = "b2p-tradeoff")]

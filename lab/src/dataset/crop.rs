@@ -37,7 +37,8 @@ pub(super) fn place(sampler: &Sampler, grid: &Grid, points: u64, crop: u32, rand
     }
 }
 
-/// Whether a crop has neither too little to learn from nor more than a training step can hold: 6,000 to 70,000 voxels of 128³.
+/// Whether a crop has neither too little to learn from nor more than a training step can hold: 6,000 to 70,000 voxels
+/// of 128³.
 pub(super) fn is_sensible(voxels: usize, crop: u32) -> bool {
     let area = (crop as usize).pow(2);
     (voxels * 128 * 128 >= 6_000 * area) && (voxels * 128 * 128 <= 70_000 * area)
@@ -154,7 +155,8 @@ impl Tensor {
     }
 }
 
-/// Puts a safetensors file together; by hand, because the library writes metadata in an order that changes from run to run.
+/// Puts a safetensors file together; by hand, because the library writes metadata in an order that changes from run to
+/// run.
 fn assemble(name: &str, bits: u8, size: u32, mut tensors: Vec<Tensor>) -> Vec<u8> {
     // Wider items first keeps every tensor aligned to its items.
     tensors.sort_by_key(|t| t.kind == "U8");

@@ -2,8 +2,8 @@
 //!
 //! Sample `i` of a seed is always the same, whatever the thread count and however many samples are made.
 //!
-//! Each sample is a safetensors file, `NAME.safetensors`, with `n_R` voxels at role R (3 is the finest level, 0 the coarsest) and V
-//! pictures of S × S pixels:
+//! Each sample is a safetensors file, `NAME.safetensors`, with `n_R` voxels at role R (3 is the finest level, 0 the
+//! coarsest) and V pictures of S × S pixels:
 //!
 //! | tensor | type and shape | contents |
 //! |---|---|---|
@@ -191,7 +191,8 @@ fn sample(objects: &[Object], photos: &[Photo], options: &Options, index: usize)
     Ok(None)
 }
 
-/// Which object sample `index` takes after `skipped` others: rounds through all objects in random order, people twice a round.
+/// Which object sample `index` takes after `skipped` others: rounds through all objects in random order, people twice a
+/// round.
 fn turn(objects: &[Object], seed: u64, index: usize, skipped: usize) -> usize {
     let mut order: Vec<usize> = (0..objects.len())
         .flat_map(|i| std::iter::repeat_n(i, objects[i].kind.weight()))

@@ -6,8 +6,8 @@ use crate::raster::View;
 
 /// Cameras in crop coordinates.
 ///
-/// Pixels per finest voxel are log-uniform in 0.55 to 1.6 at the point looked at (the protocol has 0.8), the distance in 1.6 to 16
-/// crop sides (the protocol has 12 for the whole body's cube at 10 bits, 1.5 at 7).
+/// Pixels per finest voxel are log-uniform in 0.55 to 1.6 at the point looked at (the protocol has 0.8), the distance
+/// in 1.6 to 16 crop sides (the protocol has 12 for the whole body's cube at 10 bits, 1.5 at 7).
 pub(super) fn random(crop: &Crop, options: &Options, random: &mut Random) -> Vec<View> {
     let side = f64::from(options.crop);
     let middle = crop.centroid();

@@ -22,7 +22,8 @@ use crate::surface::Surface;
 
 /// Sides of squares that are tried, as multiples of the points' spacing.
 const SIDES: [f64; 3] = [1.0, 1.3, 1.7];
-/// Standard deviations of round Gaussians that are tried, as multiples of the mean distance to the nearest point; the paper's is the first.
+/// Standard deviations of round Gaussians that are tried, as multiples of the mean distance to the nearest point; the
+/// paper's is the first.
 const SIGMAS: [f64; 4] = [1.0, 0.5, 0.35, 0.25];
 /// Standard deviations of surfels in their plane that are tried, as multiples of the points' spacing.
 const WIDTHS: [f64; 8] = [0.36, 0.42, 0.5, 0.6, 0.72, 1.0, 1.4, 2.0];
@@ -207,7 +208,8 @@ impl Bench {
     }
 }
 
-/// The best of some sizes, by PSNR over whole pictures. It has one peak over the sizes, which are in order: none after a fall is tried.
+/// The best of some sizes, by PSNR over whole pictures. It has one peak over the sizes, which are in order: none after
+/// a fall is tried.
 fn best<const N: usize>(sizes: [f64; N], judge: impl Fn(f64) -> Result<Judged>) -> Result<(f64, Judged)> {
     let mut best: Option<(f64, Judged)> = None;
     for size in sizes {

@@ -1,7 +1,8 @@
 //! Rate and distortion: what a method costs, and how far its pictures are from the truth.
 //!
-//! [`protocol`] says what is drawn and compared, [`metrics`] how. Clouds without Gaussians of their own are drawn as squares, as
-//! one round Gaussian a point ([`points`]) and as surfels ([`surfels`]). A [`Bench`] holds one object's truth and judges files of every kind against it.
+//! [`protocol`] says what is drawn and compared, [`metrics`] how. Clouds without Gaussians of their own are drawn as
+//! squares, as one round Gaussian a point ([`points`]) and as surfels ([`surfels`]). A [`Bench`] holds one object's
+//! truth and judges files of every kind against it.
 
 pub mod bench;
 pub mod item;

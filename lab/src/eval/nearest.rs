@@ -6,10 +6,12 @@ use rayon::prelude::*;
 
 /// Points in a leaf of the tree, at most.
 const LEAF: usize = 12;
-/// Points that are searched for one after the other by a thread, and whose results are added up before others are added.
+/// Points that are searched for one after the other by a thread, and whose results are added up before others are
+/// added.
 pub const CHUNK: usize = 1 << 12;
 
-/// The mean distance from a point to the nearest other; none for fewer than two points. Points at one place are 0 apart.
+/// The mean distance from a point to the nearest other; none for fewer than two points. Points at one place are 0
+/// apart.
 pub fn mean_nearest_distance(points: &[[f32; 3]]) -> Option<f64> {
     if points.len() < 2 {
         return None;
@@ -32,8 +34,8 @@ pub fn mean_nearest_distance(points: &[[f32; 3]]) -> Option<f64> {
     Some(sums.iter().sum::<f64>() / points.len() as f64)
 }
 
-/// A balanced k-d tree: the median along x in the middle, in the halves beside it their medians along y, in theirs those along z, and
-/// so on.
+/// A balanced k-d tree: the median along x in the middle, in the halves beside it their medians along y, in theirs
+/// those along z, and so on.
 pub struct Tree {
     points: Vec<Point>,
 }
@@ -92,7 +94,8 @@ impl Tree {
         insert(&self.points[middle], at, count, found);
         let (low, high) = (range.start..middle, middle + 1..range.end);
         let beyond = at[axis] - self.points[middle].at[axis];
-        // Which half a point is in does not follow from its coordinate where that equals the median's: both are searched then.
+        // Which half a point is in does not follow from its coordinate where that equals the median's: both are
+        // searched then.
         let (near, far) = if beyond < 0.0 { (low, high) } else { (high, low) };
         self.search(near, depth + 1, at, count, found);
         if found.len() < count || beyond * beyond < found[found.len() - 1].square {

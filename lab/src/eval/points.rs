@@ -26,10 +26,11 @@ pub struct Points {
 impl Points {
     /// Takes a cloud whose coordinates are voxels of a grid of `2^bits`, voxel `v` being centred on `v + ½`.
     ///
-    /// A decoder that dropped low bits leaves a coarser lattice in these coordinates: its spacing is the greatest common divisor of
-    /// all differences, and a point stands for a cell of voxels. Whether the codec rounded to the lattice (the point is in the
-    /// cell's middle) or cut off bits (in its lowest corner) is asked of the `finest` cloud, if there is one: whichever finds more of
-    /// its voxels. Coordinates that are no integers have their mean distance to the nearest point as spacing.
+    /// A decoder that dropped low bits leaves a coarser lattice in these coordinates: its spacing is the greatest
+    /// common divisor of all differences, and a point stands for a cell of voxels. Whether the codec rounded to the
+    /// lattice (the point is in the cell's middle) or cut off bits (in its lowest corner) is asked of the `finest`
+    /// cloud, if there is one: whichever finds more of its voxels. Coordinates that are no integers have their mean
+    /// distance to the nearest point as spacing.
     pub fn on_grid(cloud: &PointCloud, bits: u8, finest: Option<&PointCloud>) -> Points {
         let step = lattice(&cloud.positions);
         let middle = match (step, finest) {
@@ -53,8 +54,8 @@ impl Points {
         }
     }
 
-    /// Squares that face the camera, with a depth buffer, on white: each is drawn on the pixels whose centres it covers, and at least
-    /// on the one it lies in. A square's side is the `factor`-fold projected spacing.
+    /// Squares that face the camera, with a depth buffer, on white: each is drawn on the pixels whose centres it
+    /// covers, and at least on the one it lies in. A square's side is the `factor`-fold projected spacing.
     pub fn draw_squares(&self, camera: &Camera, factor: f64) -> Image {
         let (width, height) = (camera.width as usize, camera.height as usize);
         let mut image = Image {
@@ -85,8 +86,8 @@ impl Points {
         image
     }
 
-    /// One round Gaussian a point: σ is the `factor`-fold mean distance from a point to the nearest other, opacity 1. Some of σ² counts as
-    /// a blur of their own, so that pictures widen them by no more than a stream's.
+    /// One round Gaussian a point: σ is the `factor`-fold mean distance from a point to the nearest other, opacity 1.
+    /// Some of σ² counts as a blur of their own, so that pictures widen them by no more than a stream's.
     pub fn to_gaussians(&self, frame: Frame, factor: f64) -> Gaussians {
         let nearest = mean_nearest_distance(&self.positions).unwrap_or(self.spacing);
         let variance = (factor * nearest).powi(2);

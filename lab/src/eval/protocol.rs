@@ -1,8 +1,9 @@
 //! The views that everything is judged by.
 //!
-//! Twelve cameras on a circle around the cube's centre, 30° apart, at its height, three cube-frame units away, with a field of view of
-//! 45°. Methods are drawn at 1024² on white and averaged 2×2 to 512², then rounded to 8 bits. The truth is the mesh itself, unlit, at
-//! 512² with 4×4 samples a pixel. The foreground is where the mesh covers more than half of a pixel.
+//! Twelve cameras on a circle around the cube's centre, 30° apart, at its height, three cube-frame units away, with a
+//! field of view of 45°. Methods are drawn at 1024² on white and averaged 2×2 to 512², then rounded to 8 bits. The
+//! truth is the mesh itself, unlit, at 512² with 4×4 samples a pixel. The foreground is where the mesh covers more than
+//! half of a pixel.
 
 use b2p::Gaussians;
 use b2p::renderer::camera::Camera;
@@ -92,7 +93,8 @@ impl Truth {
         self.views.iter().map(|v| &v.picture)
     }
 
-    /// The smallest rectangle that holds the foreground of every view and a little around it: first column, first row, width, height.
+    /// The smallest rectangle that holds the foreground of every view and a little around it: first column, first row,
+    /// width, height.
     pub fn extent(&self) -> [usize; 4] {
         let side = SIDE as usize;
         let (mut low, mut high) = ([side; 2], [0; 2]);

@@ -5,8 +5,8 @@ use b2p::placement::Placement;
 
 /// The same Gaussians with coordinates in the cube of `frame`.
 ///
-/// They stay where they are in the world. Gaussians whose world is a bare voxel grid have no other place: their grid is taken to be
-/// `frame`'s, of whatever depth.
+/// They stay where they are in the world. Gaussians whose world is a bare voxel grid have no other place: their grid is
+/// taken to be `frame`'s, of whatever depth.
 pub fn into_frame(mut gaussians: Gaussians, frame: Frame) -> Gaussians {
     let from = gaussians.frame;
     gaussians.frame = frame;

@@ -11,7 +11,8 @@ use super::protocol::Scores;
 pub struct Rate {
     /// All bits of the stream up to the level: header, geometry, features.
     pub total: f64,
-    /// What each level takes, the base level first (its geometry being that of all levels up to it); empty if not known.
+    /// What each level takes, the base level first (its geometry being that of all levels up to it); empty if not
+    /// known.
     pub levels: Vec<LevelRate>,
 }
 

@@ -16,7 +16,8 @@ pub struct SheetRow<'a> {
     pub pictures: Vec<&'a Picture>,
 }
 
-/// Puts rows below each other; of every picture only `crop` (first column, first row, width, height) is shown, pixel for pixel.
+/// Puts rows below each other; of every picture only `crop` (first column, first row, width, height) is shown, pixel
+/// for pixel.
 ///
 /// # Panics
 /// If `crop` reaches beyond a picture.

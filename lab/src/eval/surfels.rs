@@ -1,7 +1,8 @@
 //! Point clouds drawn as surfels: what a careful viewer makes of a decoded cloud without learning.
 //!
-//! A point becomes an opaque disc. Its normal is the least axis of the covariance of its [`NEIGHBOURS`] nearest points, itself among
-//! them, and its centre moves along the normal onto the plane through their mean, which takes the staircase of voxels away.
+//! A point becomes an opaque disc. Its normal is the least axis of the covariance of its [`NEIGHBOURS`] nearest points,
+//! itself among them, and its centre moves along the normal onto the plane through their mean, which takes the
+//! staircase of voxels away.
 
 use b2p::gaussians::{Frame, Gaussians};
 use glam::{DMat3, DQuat, DVec3};
@@ -102,7 +103,8 @@ fn least_axis(matrix: DMat3) -> DVec3 {
             if a[p][q] == 0.0 {
                 continue;
             }
-            // The rotation in the plane of p and q that makes a[p][q] vanish (Golub and Van Loan, Matrix Computations, 8.5).
+            // The rotation in the plane of p and q that makes a[p][q] vanish (Golub and Van Loan, Matrix Computations,
+            // 8.5).
             let half = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
             let tangent = half.signum() / (half.abs() + (half * half + 1.0).sqrt());
             let cosine = 1.0 / (tangent * tangent + 1.0).sqrt();

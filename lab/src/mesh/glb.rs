@@ -11,7 +11,8 @@ use crate::error::{LabError, Result};
 /// Reads a mesh, all nodes of its scene, with their transforms applied.
 ///
 /// # Errors
-/// Names the file and what is wrong with it: not glTF, data outside the file, no triangles, a texture that cannot be read.
+/// Names the file and what is wrong with it: not glTF, data outside the file, no triangles, a texture that cannot be
+/// read.
 pub fn load(path: &Path) -> Result<Mesh> {
     let bytes = std::fs::read(path).map_err(LabError::io(path))?;
     parse(&bytes).map_err(|detail| LabError::Mesh {

@@ -16,7 +16,8 @@ const SIDE: f64 = (1 << BITS) as f64;
 const POINTS: f64 = 15e6 / 4.0;
 const FILL: f64 = 0.95;
 
-/// An object, as clouds: as it stands, turned about the vertical, turned any way and smaller, and either rough or one side alone.
+/// An object, as clouds: as it stands, turned about the vertical, turned any way and smaller, and either rough or one
+/// side alone.
 ///
 /// # Errors
 /// If the object has no area.

@@ -8,7 +8,8 @@ use crate::error::Result;
 /// Parents per slice, as in a stream.
 const SLICE: usize = 16_384;
 
-/// For every voxel of an octree's levels but the deepest: the features known when its children are coded, and which children it has.
+/// For every voxel of an octree's levels but the deepest: the features known when its children are coded, and which
+/// children it has.
 #[derive(Debug, Default)]
 pub struct Samples {
     features: Vec<u8>,

@@ -7,7 +7,8 @@ pub const HEIGHT: u32 = 7;
 /// Dots from one letter to the next.
 pub const ADVANCE: u32 = WIDTH + 1;
 
-/// The dots of a letter, row by row from the top, the leftmost dot in bit 4. Characters outside printable ASCII get a box.
+/// The dots of a letter, row by row from the top, the leftmost dot in bit 4. Characters outside printable ASCII get a
+/// box.
 pub fn glyph(letter: char) -> [u8; 7] {
     (letter as u32)
         .checked_sub(0x20)

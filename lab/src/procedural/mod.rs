@@ -1,7 +1,8 @@
 //! Meshes of the project's own making, textures included: nothing here comes from a file.
 //!
-//! [`objects()`] are shapes and paints by chance, for variety in training and for tests. [`scene()`] is the still life that the demo shows.
-//! [`named`] finds either by name. Equal seeds give equal meshes wherever the platform's sine is the same.
+//! [`objects()`] are shapes and paints by chance, for variety in training and for tests. [`scene()`] is the still life
+//! that the demo shows. [`named`] finds either by name. Equal seeds give equal meshes wherever the platform's sine is
+//! the same.
 
 pub mod font;
 pub mod light;

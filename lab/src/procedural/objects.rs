@@ -40,8 +40,8 @@ const SHAPES: [(&str, Shape); 16] = [
 /// How many heaps of small objects [`objects`] makes.
 const HEAPS: usize = 4;
 
-/// One object of every shape, and heaps of many small ones, in sizes about that of the unit sphere. Shapes vary and paint is drawn
-/// by chance; equal seeds give equal objects.
+/// One object of every shape, and heaps of many small ones, in sizes about that of the unit sphere. Shapes vary and
+/// paint is drawn by chance; equal seeds give equal objects.
 pub fn objects(seed: u64) -> Vec<(String, Mesh)> {
     let single = SHAPES.iter().map(|(name, _)| (*name).to_owned());
     let heaps = (1..=HEAPS).map(|i| format!("heap{i}"));

@@ -95,8 +95,8 @@ impl Patch {
         )
     }
 
-    /// Triangles with a texture of its own, painted with `pattern` at `density` texels per unit of length and lit by `light`.
-    /// The outermost texels' centres lie on the patch's border, so that no texture lookup reaches across it.
+    /// Triangles with a texture of its own, painted with `pattern` at `density` texels per unit of length and lit by
+    /// `light`. The outermost texels' centres lie on the patch's border, so that no texture lookup reaches across it.
     pub fn part(&self, density: f32, pattern: &Pattern, light: Option<&Light>) -> Part {
         let lengths = self.lengths();
         let texels = |length: f32| (length * density).ceil().clamp(2.0, LARGEST_TEXTURE) as u32;

@@ -1,8 +1,8 @@
 //! The still life of the demo: a vase of flowers among small things on a round stone, not quite two units high.
 //!
-//! Voxelised at 10 bits a voxel is about 1/500 of a unit. There is fine print, thin stems and bars, single sheets (leaves, petals),
-//! white on white, saturated and dark colours, and soft noise, so that a picture of it shows what a codec does to each. Surfaces
-//! that nothing outside could see are left out where that is simple.
+//! Voxelised at 10 bits a voxel is about 1/500 of a unit. There is fine print, thin stems and bars, single sheets
+//! (leaves, petals), white on white, saturated and dark colours, and soft noise, so that a picture of it shows what a
+//! codec does to each. Surfaces that nothing outside could see are left out where that is simple.
 
 use std::f32::consts::{PI, TAU};
 use std::sync::Arc;

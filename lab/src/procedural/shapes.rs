@@ -33,8 +33,8 @@ pub fn sphere() -> Patch {
     Patch::new([96, 48], polar)
 }
 
-/// A superquadric: `ns` and `ew` are the exponents along meridians and parallels, 1 for a sphere, near 0 for a box, 2 for an
-/// octahedron.
+/// A superquadric: `ns` and `ew` are the exponents along meridians and parallels, 1 for a sphere, near 0 for a box, 2
+/// for an octahedron.
 pub fn superquadric(ns: f32, ew: f32) -> Patch {
     let power = |x: f32, e: f32| x.signum() * x.abs().powf(e);
     Patch::new([128, 96], move |u, v| {
@@ -54,7 +54,8 @@ pub fn torus(large: f32, small: f32) -> Patch {
     tube(circle, [24, 128], move |_| small)
 }
 
-/// The centre line of a torus knot that winds `p` times around the axis and `q` times through the hole, within the unit sphere.
+/// The centre line of a torus knot that winds `p` times around the axis and `q` times through the hole, within the unit
+/// sphere.
 pub fn torus_knot(p: u32, q: u32) -> Curve {
     Arc::new(move |t| {
         let (sin_p, cos_p) = (TAU * p as f32 * t).sin_cos();
@@ -235,8 +236,8 @@ pub fn disc(inner: f32, outer: f32) -> Patch {
     lathe([96, 12], move |v| Vec2::new(inner + (outer - inner) * v, 0.0))
 }
 
-/// A thin leaf, one sheet: it grows from the origin along +z, `length` long and `width` wide, and its tip bends down by `droop`
-/// radians. v runs from tip to root.
+/// A thin leaf, one sheet: it grows from the origin along +z, `length` long and `width` wide, and its tip bends down by
+/// `droop` radians. v runs from tip to root.
 pub fn leaf(length: f32, width: f32, droop: f32) -> Patch {
     Patch::new([12, 32], move |u, v| {
         let t = 1.0 - v;

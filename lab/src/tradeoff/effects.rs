@@ -36,7 +36,8 @@ pub struct EffectCost {
     pub on: Spread,
     /// Whether on is faster or slower than off.
     pub verdict: Verdict,
-    /// The worst pixel, in steps of eight bits, of the picture with it on, against double precision with the same effect.
+    /// The worst pixel, in steps of eight bits, of the picture with it on, against double precision with the same
+    /// effect.
     pub worst: f64,
 }
 

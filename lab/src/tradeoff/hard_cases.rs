@@ -94,7 +94,8 @@ const LEVEL: u8 = 5;
 /// The model's generators on features that are hard to compute with, in every precision.
 ///
 /// # Errors
-/// Those of [`Model::from_bytes`](b2p::latents::network::Model::from_bytes), of [`Model::generate`](b2p::latents::network::Model::generate), and of
+/// Those of [`Model::from_bytes`](b2p::latents::network::Model::from_bytes), of
+/// [`Model::generate`](b2p::latents::network::Model::generate), and of
 /// [`Renderer::render`](b2p::renderer::Renderer::render).
 pub fn network_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
     let model = (subject.model)()?;

@@ -1,17 +1,18 @@
 //! Accuracy against time: every setting that trades one for the other, measured on the same stream in one run.
 //!
-//! The truth is the finest level of the stream, its Gaussians generated in double precision and drawn by [`b2p::renderer::reference`], in
-//! double precision and without any cut-off. Against it stand, one knob at a time and in combination, the coarser levels, the
-//! precisions of the network, the qualities of the renderer, and smaller pictures, enlarged as a viewer does. Instructions and threads
-//! change time alone; that they hardly change the picture is shown by their rows.
+//! The truth is the finest level of the stream, its Gaussians generated in double precision and drawn by
+//! [`b2p::renderer::reference`], in double precision and without any cut-off. Against it stand, one knob at a time and
+//! in combination, the coarser levels, the precisions of the network, the qualities of the renderer, and smaller
+//! pictures, enlarged as a viewer does. Instructions and threads change time alone; that they hardly change the picture
+//! is shown by their rows.
 //!
-//! Where the cloud that was coded is at hand, the same pictures are also held against pictures of the cloud ([`of_cloud`]): what a setting loses,
-//! beside what coding has lost.
+//! Where the cloud that was coded is at hand, the same pictures are also held against pictures of the cloud
+//! ([`of_cloud`]): what a setting loses, beside what coding has lost.
 //!
 //! What decides the next bit of a stream is exact with every setting: none of the knobs bears on it.
 //!
-//! Settings take turns: each is run once in every repeat, so that whatever disturbs the machine disturbs all alike. Medians are given with
-//! their quartiles, and where those of two settings overlap, the two cannot be told apart.
+//! Settings take turns: each is run once in every repeat, so that whatever disturbs the machine disturbs all alike.
+//! Medians are given with their quartiles, and where those of two settings overlap, the two cannot be told apart.
 
 mod effects;
 mod hard_cases;
@@ -77,7 +78,8 @@ impl Options {
 /// Measures all settings; `say` receives what is being done.
 ///
 /// # Errors
-/// Those of decoding and drawing; [`Error::Usage`] if the stream has no level with Gaussians, or nothing is to be measured.
+/// Those of decoding and drawing; [`Error::Usage`] if the stream has no level with Gaussians, or nothing is to be
+/// measured.
 pub fn run(subject: &MeasuredInput<'_>, options: &Options, say: &dyn Fn(&str)) -> Result<Report> {
     if options.views == 0 || options.repeats == 0 {
         return Err(Error::Usage("no view or no repeat leaves nothing to measure".into()));

@@ -94,7 +94,8 @@ impl<'a> Run<'a> {
     /// What decodes and draws with each of the settings, ready to be measured.
     ///
     /// # Errors
-    /// Those of [`Header::parse`], of reading the model, and [`crate::Error::Usage`] for a setting that the model does not have.
+    /// Those of [`Header::parse`], of reading the model, and [`crate::Error::Usage`] for a setting that the model does
+    /// not have.
     pub fn new(subject: &'a MeasuredInput<'a>, options: &'a Options, settings: &[Setting]) -> Result<Self> {
         let header = Header::parse(subject.stream, subject.limits)?;
         let mut run = Run {

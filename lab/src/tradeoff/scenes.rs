@@ -16,7 +16,8 @@ pub struct Scene {
     pub camera: Camera,
 }
 
-/// Numbers in `[0, 1)` that need no quality, only variety: the upper bits of a linear congruential generator (Knuth, MMIX).
+/// Numbers in `[0, 1)` that need no quality, only variety: the upper bits of a linear congruential generator (Knuth,
+/// MMIX).
 pub struct Random(pub u64);
 
 impl Random {
@@ -194,7 +195,8 @@ pub fn hard_scenes() -> Result<Vec<Scene>> {
     ])
 }
 
-/// A surface of many small splats, and its camera at a distance where each is about `pixels` wide in a picture of `side` pixels.
+/// A surface of many small splats, and its camera at a distance where each is about `pixels` wide in a picture of
+/// `side` pixels.
 ///
 /// # Errors
 /// As [`Camera::check`].

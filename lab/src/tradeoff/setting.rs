@@ -153,8 +153,8 @@ impl Choices {
         ladder
     }
 
-    /// All combinations of level, heads, precision, quality, and the two larger sizes; those of quick heads in the default precision, as they
-    /// are for who lacks time.
+    /// All combinations of level, heads, precision, quality, and the two larger sizes; those of quick heads in the
+    /// default precision, as they are for who lacks time.
     pub fn combinations(&self) -> Vec<Setting> {
         let Some(default) = self.default_setting() else {
             return Vec::new();
@@ -184,7 +184,8 @@ impl Choices {
     }
 }
 
-/// The settings that no other beats: none has as much accuracy in as little time, and more of one. Each is a time and an accuracy.
+/// The settings that no other beats: none has as much accuracy in as little time, and more of one. Each is a time and
+/// an accuracy.
 pub fn pareto_front(points: &[(f64, f64)]) -> Vec<bool> {
     let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 >= b.1 && a != b;
     points

@@ -13,7 +13,8 @@ use b2p::latents::network::Model;
 use b2p::latents::{ColourContexts, ColourFilter, ColourResidual, activate};
 use b2p::log::Log;
 
-/// The Gaussians that the best heads have for a level, generated in double precision; and how many milliseconds that took.
+/// The Gaussians that the best heads have for a level, generated in double precision; and how many milliseconds that
+/// took.
 ///
 /// # Errors
 /// Those of [`LatentDecoder::exact`] and [`Model::generate_in_double`].

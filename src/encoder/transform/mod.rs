@@ -28,7 +28,8 @@ pub use rate_control::encode_to_rate;
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum QualityTarget {
-    /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice that.
+    /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice
+    /// that.
     Step(f32),
     /// The same with a size for each.
     Steps {
@@ -41,7 +42,8 @@ pub enum QualityTarget {
     Lossless,
 }
 
-/// What may be chosen about a stream of version 3; [`encode_to_rate`] chooses how exactly colours are coded, and may leave out the finest levels.
+/// What may be chosen about a stream of version 3; [`encode_to_rate`] chooses how exactly colours are coded, and may
+/// leave out the finest levels.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The levels that a stream may be cut after, the last one at most the bit depth N. Default: N−3 to N−1.
@@ -54,12 +56,14 @@ pub struct Options {
     pub optimised: bool,
     /// Streams that [`encode_to_rate`] tries for a level at most, once one fits.
     pub tries: usize,
-    /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level, and costs bits.
+    /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level,
+    /// and costs bits.
     pub slice_voxels: u32,
     /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`]: fewer let more threads decode a level, and cost
     /// bits.
     pub colour_slice: u32,
-    /// Heads whose pictures are compared with those of surfels, so that the stream says where surfels are better; `None` for no head maps.
+    /// Heads whose pictures are compared with those of surfels, so that the stream says where surfels are better;
+    /// `None` for no head maps.
     pub heads: Option<HeadsModel>,
     /// The instructions to use; any give the same stream, but for head maps. Default: the best of this machine.
     pub isa: Option<Isa>,
@@ -84,7 +88,8 @@ impl Default for Options {
 /// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.
 const COLOUR_SLICE: u32 = 8192;
 
-/// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green and blue comes of both.
+/// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green
+/// and blue comes of both.
 const CHROMA: u8 = 8;
 /// The coarsest index of chroma: Co's step is two indices greater.
 const MAX_CHROMA: u8 = Steps::MAX - 2;
@@ -94,8 +99,9 @@ const FILTER_SHARE: usize = 100;
 /// Codes a cloud, then decodes the stream and compares before giving it out.
 ///
 /// # Errors
-/// [`Error::Usage`] for levels that the cloud does not have and steps that the format does not have, [`Error::Malformed`] for slices that the
-/// format does not have; and, if encoder and decoder disagreed on this machine, whatever the decoder found.
+/// [`Error::Usage`] for levels that the cloud does not have and steps that the format does not have,
+/// [`Error::Malformed`] for slices that the format does not have; and, if encoder and decoder disagreed on this
+/// machine, whatever the decoder found.
 pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<Encoded> {
     let steps = options.fineness.steps()?;
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
@@ -279,8 +285,8 @@ impl<'a> EncoderInput<'a> {
         Truth::new(voxels, colours, &self.octree, top, lossless)
     }
 
-    /// How levels are coded, if the last one, `top`, has these steps: the coarser a level, the smaller are its steps, for what it brings is seen
-    /// at all levels that follow.
+    /// How levels are coded, if the last one, `top`, has these steps: the coarser a level, the smaller are its steps,
+    /// for what it brings is seen at all levels that follow.
     fn coding(&self, steps: Steps, top: u8, level: u8) -> colour::Options {
         let mut steps = (level..top).fold(steps, |steps, _| steps.above());
         if self.grey && !steps.is_lossless() {
@@ -424,8 +430,8 @@ impl<'a> EncoderInput<'a> {
         Ok(())
     }
 
-    /// The stream, once it has been decoded to what was encoded; with head maps, if there are heads and the stream has at most
-    /// `most` bytes with them.
+    /// The stream, once it has been decoded to what was encoded; with head maps, if there are heads and the stream has
+    /// at most `most` bytes with them.
     fn checked(&self, mut coded: Coded, heads: Option<&HeadsModel>, most: usize, log: &Log) -> Result<Encoded> {
         let top = coded.top;
         let voxels = self.octree.level(top);
@@ -482,8 +488,8 @@ impl<'a> EncoderInput<'a> {
         })
     }
 
-    /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its own
-    /// does the cloud tell more than the best heads.
+    /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its
+    /// own does the cloud tell more than the best heads.
     fn has_head_map(&self, level: u8) -> bool {
         (1..self.cloud.voxels.depth().saturating_sub(1)).contains(&level)
     }

@@ -1,8 +1,8 @@
 //! What a slice teaches about its own predictions while it is coded: means that were too low or too high, here or
 //! nearby; scales that were too narrow or too wide; and means where nothing is predicted.
 //!
-//! All of it starts from its first values in every slice, and is learned latent by latent in the order of coding, by the encoder and the
-//! decoder alike. Shifts to the right round down.
+//! All of it starts from its first values in every slice, and is learned latent by latent in the order of coding, by
+//! the encoder and the decoder alike. Shifts to the right round down.
 //!
 //! # Where nothing is predicted
 //! `μ` is the mean of the latents two away along each of the axes along which they differ, in the same slice, of those
@@ -22,9 +22,9 @@
 //! # Means
 //! Every channel has an offset, in units of 2⁻¹⁰ of a sixteenth, at first 0, and a weight for every input, in units of
 //! 2⁻¹⁸, at first ⅛ for what is one away, ¼ for what is two away, and 0; where nothing is predicted all are 0.
-//! `μ′ = μ + (Σ (weight >> 6)·input + 2⁶·offset + 2¹⁵) >> 16`, kept within ±2047, is used. Then with the error `16·y − μ′`,
-//! kept within ±16, the offset grows by 32 times the error, and is kept within ±2²¹; every weight by the error times
-//! its input, that kept within ±256, and is kept within ±2¹⁹.
+//! `μ′ = μ + (Σ (weight >> 6)·input + 2⁶·offset + 2¹⁵) >> 16`, kept within ±2047, is used. Then with the error `16·y −
+//! μ′`, kept within ±16, the offset grows by 32 times the error, and is kept within ±2²¹; every weight by the error
+//! times its input, that kept within ±256, and is kept within ±2¹⁹.
 //!
 //! # Scales
 //! A latent's *gradient*, of its log-likelihood with respect to scale, is positive where a wider scale would have made
@@ -33,8 +33,8 @@
 //! rounded towards zero. A voxel's gradient sum is that of its latents that have residuals.
 //!
 //! Places are of six kinds: by whether the mean gradient sum of the voxels nearby that have residuals is at least −256,
-//! 0, 256 and 768, and those where there are none. Every channel has an offset for each kind, and one for all, in units of
-//! 2⁻¹⁶ of a scale index, at first 0. `σ′ = σ + (both offsets + 2¹⁵) >> 16`, kept in 0 to 63, is used, and then they
+//! 0, 256 and 768, and those where there are none. Every channel has an offset for each kind, and one for all, in units
+//! of 2⁻¹⁶ of a scale index, at first 0. `σ′ = σ + (both offsets + 2¹⁵) >> 16`, kept in 0 to 63, is used, and then they
 //! grow by 24 and 36 times the gradient, and are kept within ±2²².
 
 use b2p_kernels::LIMIT;

@@ -72,9 +72,9 @@ pub fn quantise(tables: &Tables, condition: Condition, latents: &[f32], rounding
 }
 
 /// Rounds the latents [voxels, K] of a level that is coded by [`super::encode_passes`], in the order of coding: each
-/// pass is predicted from those before it as they were rounded. What costs more bits than it gains stays away from a whole
-/// smooth place, which shows; so where there is a price, a twentieth of what the latents of siblings (voxels of one
-/// parent) before it are off, all of them together, counts as a latent's own.
+/// pass is predicted from those before it as they were rounded. What costs more bits than it gains stays away from a
+/// whole smooth place, which shows; so where there is a price, a twentieth of what the latents of siblings (voxels of
+/// one parent) before it are off, all of them together, counts as a latent's own.
 ///
 /// # Panics
 /// As [`super::encode_passes`] does, and if there is not one price for each channel.

@@ -1,45 +1,50 @@
-//! The learned part: features and latents (the exact zone, in integers), Gaussians, and the encoder's own layers (in floats).
+//! The learned part: features and latents (the exact zone, in integers), Gaussians, and the encoder's own layers (in
+//! floats).
 //!
-//! A level of the stream has a *role*: 0 for its base level L, then 1 and 2. Role 3 is the level above the finest coded one; the
-//! encoder starts from its colours. All modules are those of the paper's appendix (arXiv 2406.05915); where it is silent, here
-//! is what holds:
+//! A level of the stream has a *role*: 0 for its base level L, then 1 and 2. Role 3 is the level above the finest coded
+//! one; the encoder starts from its colours. All modules are those of the paper's appendix (arXiv 2406.05915); where it
+//! is silent, here is what holds:
 //!
-//! - **Geometry-invariant convolution**: output channel `o` is `gain_o · (Σ W x)_o / √D_o + bias_o`, with `D_o = Σ W²_o` and both sums
-//!   over the taps that read an occupied voxel. The integer code divides by `√max(D_o, 1)`, the float code by
-//!   `√(D_o + 1e-8)`.
+//! - **Geometry-invariant convolution**: output channel `o` is `gain_o · (Σ W x)_o / √D_o + bias_o`, with `D_o = Σ
+//!   W²_o` and both sums over the taps that read an occupied voxel. The integer code divides by `√max(D_o, 1)`, the
+//!   float code by `√(D_o + 1e-8)`.
 //! - **Context**: `c` of a voxel is a linear layer, one per octant, of its parent's feature `g` (or a copy of it).
-//! - **Base level**: no context. Beyond the paper, a small network predicts its latents from those of neighbours that were coded
-//!   before ([`Model::pass_parameters`]); without one, they have one distribution per channel.
-//! - **Latents**: a model may have none in its finest roles ([`Shape::latent_roles`]), beyond the paper: such a level brings geometry alone. Its
-//!   features are made of the context, or are the context ([`Shape::fr_roles`]).
-//! - **Neighbours**: beyond the paper, another such network may correct, at the levels above, what PEM predicts from the context.
+//! - **Base level**: no context. Beyond the paper, a small network predicts its latents from those of neighbours that
+//!   were coded before ([`Model::pass_parameters`]); without one, they have one distribution per channel.
+//! - **Latents**: a model may have none in its finest roles ([`Shape::latent_roles`]), beyond the paper: such a level
+//!   brings geometry alone. Its features are made of the context, or are the context ([`Shape::fr_roles`]).
+//! - **Neighbours**: beyond the paper, another such network may correct, at the levels above, what PEM predicts from
+//!   the context.
 //!
 //! # The exact zone
 //! Whatever reaches a probability is computed in integers, and the same on every machine: [`Model::upsample`],
 //! [`Model::entropy_parameters`] (PEM), [`Model::pass_parameters`] and [`Model::reconstruct`] (FR).
 //!
-//! Activations are `i16` in ±2047, weights `i16` in ±511, sums `i32`; loading proves per output channel that no sum can overflow.
-//! A sum becomes an activation by `clamp((sum + bias) >> shift)`, the rounding constant being part of the bias; in
-//! geometry-invariant layers by `clamp(round_ties_even(f32(sum) · (gain / √f32(max(D, 1))) + bias))`, `D` being the sum of the squared
-//! weights of the taps that read something: one square root, one division, one product, one sum of IEEE f32, in that order, never
-//! fused. A residual is added after that and clamped again, then the ReLU follows. No transcendental function, no float sum.
+//! Activations are `i16` in ±2047, weights `i16` in ±511, sums `i32`; loading proves per output channel that no sum can
+//! overflow. A sum becomes an activation by `clamp((sum + bias) >> shift)`, the rounding constant being part of the
+//! bias; in geometry-invariant layers by `clamp(round_ties_even(f32(sum) · (gain / √f32(max(D, 1))) + bias))`, `D`
+//! being the sum of the squared weights of the taps that read something: one square root, one division, one product,
+//! one sum of IEEE f32, in that order, never fused. A residual is added after that and clamped again, then the ReLU
+//! follows. No transcendental function, no float sum.
 //!
 //! Means are in sixteenths; standard deviations are an index i, σ = 0.11·(64 / 0.11)^(i / 63).
 //!
 //! # The close zone
-//! Gaussian generation (GG) and the encoder's feature conversion (FC) and squeezing (FS) are f16 in the file. In f16 they store f16,
-//! saturating, and sum in f32; where there are matrix tiles, FC of the finest level multiplies in bf16. A decoder may run GG in integers instead ([`Precision`]), with the arithmetic of the exact zone, which is
-//! faster, and gives the same Gaussians to the bit everywhere; or, where processors have it, with sums in f16, which do not.
+//! Gaussian generation (GG) and the encoder's feature conversion (FC) and squeezing (FS) are f16 in the file. In f16
+//! they store f16, saturating, and sum in f32; where there are matrix tiles, FC of the finest level multiplies in bf16.
+//! A decoder may run GG in integers instead ([`Precision`]), with the arithmetic of the exact zone, which is faster,
+//! and gives the same Gaussians to the bit everywhere; or, where processors have it, with sums in f16, which do not.
 //!
 //! # The model file
-//! Safetensors. The metadata's `b2p` is JSON: [`Shape`]. Layer `NAME` has `NAME.weight` [taps, in, out] and, in the exact zone,
-//! `.bias` i32 and `.shift` u8, or, if geometry-invariant, `.gain` and `.bias` f32; in the close zone, where weights are f16,
-//! `.bias` f32 and, if geometry-invariant, `.gain` f32. The names are those in `structure.rs`. `g_scale[r]` is the real value of
-//! one step of role r's features `g`, `c_scale[r]` that of its context. `gg.r.scale`, which may be left out, has the same for a generator:
-//! of the chain of residual blocks before layer 4 (what enters it, every branch, every sum), of the inside of each of its blocks, and
-//! of the same after layer 4. Where `gg` of the metadata has further generators that say `"heads": "quick"`, their layers are `gg.quick.r.*`
-//! (quick heads). Tables: see [`crate::latents::entropy::Tables`]. A file without `fc.*` and `fs.*` can decode only.
-//! The JSON may also say at which `bit_price` latents are best rounded: one for all, or K for each of the three roles.
+//! Safetensors. The metadata's `b2p` is JSON: [`Shape`]. Layer `NAME` has `NAME.weight` [taps, in, out] and, in the
+//! exact zone, `.bias` i32 and `.shift` u8, or, if geometry-invariant, `.gain` and `.bias` f32; in the close zone,
+//! where weights are f16, `.bias` f32 and, if geometry-invariant, `.gain` f32. The names are those in `structure.rs`.
+//! `g_scale[r]` is the real value of one step of role r's features `g`, `c_scale[r]` that of its context. `gg.r.scale`,
+//! which may be left out, has the same for a generator: of the chain of residual blocks before layer 4 (what enters it,
+//! every branch, every sum), of the inside of each of its blocks, and of the same after layer 4. Where `gg` of the
+//! metadata has further generators that say `"heads": "quick"`, their layers are `gg.quick.r.*` (quick heads). Tables:
+//! see [`crate::latents::entropy::Tables`]. A file without `fc.*` and `fs.*` can decode only. The JSON may also say at
+//! which `bit_price` latents are best rounded: one for all, or K for each of the three roles.
 
 mod children;
 mod convert;
@@ -106,7 +111,8 @@ impl Model {
     /// Loads a model file.
     ///
     /// # Errors
-    /// [`Error::Io`](crate::Error::Io), [`Error::LimitExceeded`](crate::Error::LimitExceeded) for a file of more than 2 GiB, or as [`Model::from_bytes`].
+    /// [`Error::Io`](crate::Error::Io), [`Error::LimitExceeded`](crate::Error::LimitExceeded) for a file of more than 2
+    /// GiB, or as [`Model::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
         // Read, not mapped: another program may shorten the file meanwhile.
         let bytes = input::read_file(path, &Limits::default())?;
@@ -116,8 +122,9 @@ impl Model {
     /// Loads a model file's content. Memory is bounded by its length.
     ///
     /// # Errors
-    /// [`Error::Malformed`](crate::Error::Malformed), naming field or tensor, if anything is missing, of another type or extent, not finite, out of range,
-    /// or could overflow a sum; [`Error::Unsupported`](crate::Error::Unsupported) for another format.
+    /// [`Error::Malformed`](crate::Error::Malformed), naming field or tensor, if anything is missing, of another type
+    /// or extent, not finite, out of range, or could overflow a sum; [`Error::Unsupported`](crate::Error::Unsupported)
+    /// for another format.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let tensors = Tensors::new(bytes)?;
         let shape = tensors.shape()?;
@@ -151,7 +158,8 @@ impl Model {
     /// Generates Gaussians in that precision.
     ///
     /// # Errors
-    /// [`Error::Unsupported`](crate::Error::Unsupported) if the model file lacks what integers need, or the instructions lack what [`Precision::Half`] needs.
+    /// [`Error::Unsupported`](crate::Error::Unsupported) if the model file lacks what integers need, or the
+    /// instructions lack what [`Precision::Half`] needs.
     pub fn with_precision(self, precision: Precision) -> Result<Self> {
         if precision == Precision::Half && !self.isa.has_half() {
             let detail = format!("{} has no arithmetic in f16, take f16 or int16", self.isa);
@@ -173,8 +181,8 @@ impl Model {
         self.precision
     }
 
-    /// Uses no more than these instructions. Whatever is computed in integers stays as it is; [`Precision::Half`] becomes [`Precision::F16`] where
-    /// they have no arithmetic in f16.
+    /// Uses no more than these instructions. Whatever is computed in integers stays as it is; [`Precision::Half`]
+    /// becomes [`Precision::F16`] where they have no arithmetic in f16.
     pub fn with_isa(self, isa: Isa) -> Self {
         Model { isa, ..self }
     }
@@ -201,7 +209,8 @@ impl Model {
         &self.tables
     }
 
-    /// What a bit is best worth when a role's latents are rounded, in squared latent steps, of each channel: see [`crate::latents::entropy::Rounding`].
+    /// What a bit is best worth when a role's latents are rounded, in squared latent steps, of each channel: see
+    /// [`crate::latents::entropy::Rounding`].
     ///
     /// # Panics
     /// If `role` is above 2.

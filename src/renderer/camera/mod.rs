@@ -64,8 +64,9 @@ impl Camera {
 
     /// A camera on a sphere around the cube's centre, looking at it, with +y up.
     ///
-    /// `azimuth` and `elevation` in degrees: the eye is at `radius·(cos el·sin az, sin el, cos el·cos az)`. `fov` is the horizontal
-    /// field of view in degrees; pixels are square and the principal point is the middle. At the poles, up is the limit of up.
+    /// `azimuth` and `elevation` in degrees: the eye is at `radius·(cos el·sin az, sin el, cos el·cos az)`. `fov` is
+    /// the horizontal field of view in degrees; pixels are square and the principal point is the middle. At the poles,
+    /// up is the limit of up.
     ///
     /// # Errors
     /// [`Error::Usage`] if that is no camera: see [`Camera::check`].
@@ -73,8 +74,8 @@ impl Camera {
         Self::orbit_around([0.0; 3], azimuth, elevation, radius, fov, width, height)
     }
 
-    /// A pinhole camera of square pixels with its principal point in the middle, and `focal` in pixels. `rotation` (three
-    /// rows) and `translation` take points of the cube frame to camera axes: x right, y down, z forward.
+    /// A pinhole camera of square pixels with its principal point in the middle, and `focal` in pixels. `rotation`
+    /// (three rows) and `translation` take points of the cube frame to camera axes: x right, y down, z forward.
     ///
     /// # Errors
     /// [`Error::Usage`] if that is no camera: see [`Camera::check`].
@@ -115,8 +116,8 @@ impl Camera {
         Ok(self)
     }
 
-    /// The camera of [`Camera::orbit_around`] `target` with another axis up: the world is turned about the target so that
-    /// `up` becomes +y.
+    /// The camera of [`Camera::orbit_around`] `target` with another axis up: the world is turned about the target so
+    /// that `up` becomes +y.
     pub fn with_up(mut self, up: Up, target: [f64; 3]) -> Camera {
         let target = DVec3::from(target);
         let before = self.pose.matrix3 * target;
@@ -138,7 +139,8 @@ impl Camera {
         })
     }
 
-    /// The camera that draws only the pixels `x0 ≤ x < x1`, `y0 ≤ y < y1` of this one's picture: to the bit what the whole shows there.
+    /// The camera that draws only the pixels `x0 ≤ x < x1`, `y0 ≤ y < y1` of this one's picture: to the bit what the
+    /// whole shows there.
     ///
     /// # Errors
     /// [`Error::Usage`] if that is empty or reaches out of the picture.
@@ -193,8 +195,8 @@ impl Camera {
         [x1 - x0, y1 - y0]
     }
 
-    /// The window, widened to the edges of tiles as far as there is a picture: what is drawn in a pixel may depend on which splats
-    /// reach its neighbours, but never on where the picture is cut.
+    /// The window, widened to the edges of tiles as far as there is a picture: what is drawn in a pixel may depend on
+    /// which splats reach its neighbours, but never on where the picture is cut.
     pub(crate) fn tiled_window(&self) -> Bounds {
         let Bounds { x0, y0, x1, y1 } = self.window();
         Bounds {
@@ -208,8 +210,8 @@ impl Camera {
     /// Whether pictures can be taken with it.
     ///
     /// # Errors
-    /// [`Error::Usage`] if a number is not finite, the pose scales, shears or mirrors, a focal length or the near plane is not
-    /// positive, a side of the picture is 0 or over [`Camera::MAX_SIDE`], or the crop is not a part of it.
+    /// [`Error::Usage`] if a number is not finite, the pose scales, shears or mirrors, a focal length or the near plane
+    /// is not positive, a side of the picture is 0 or over [`Camera::MAX_SIDE`], or the crop is not a part of it.
     pub fn check(&self) -> Result<()> {
         let complaint = |what: String| Err(Error::Usage(format!("camera: {what}")));
         let rotation = self.pose.matrix3;
@@ -250,8 +252,9 @@ impl Camera {
         Ok(())
     }
 
-    /// The range of `x/z` and of `y/z` outside which the projection is linearised at the range's end: the field of view, and 15 %
-    /// of its width more at either side. Far outside the picture the linearisation would otherwise stretch splats into streaks.
+    /// The range of `x/z` and of `y/z` outside which the projection is linearised at the range's end: the field of
+    /// view, and 15 % of its width more at either side. Far outside the picture the linearisation would otherwise
+    /// stretch splats into streaks.
     ///
     /// The ends follow the principal point, so an off-centre one is handled.
     pub(crate) fn slope_ranges(&self) -> [[f64; 2]; 2] {

@@ -21,11 +21,13 @@ pub enum Loop {
     Plain,
     /// Blends [`Crossing`] Gaussians too.
     RaySpace,
-    /// That, and puts the splats of each pixel in the order of their depths there, as far as [`super::WAITING`] of them reach.
+    /// That, and puts the splats of each pixel in the order of their depths there, as far as [`super::WAITING`] of them
+    /// reach.
     Order,
     /// As `RaySpace`, and keeps which Gaussian each pixel shows most of.
     Ids,
-    /// As `RaySpace`, and keeps how much of each Gaussian each pixel shows, for whoever mixes something else than colours.
+    /// As `RaySpace`, and keeps how much of each Gaussian each pixel shows, for whoever mixes something else than
+    /// colours.
     Shares,
 }
 

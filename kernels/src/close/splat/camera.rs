@@ -16,7 +16,8 @@ pub struct View {
     pub translation: [f64; 3],
     /// What is not farther than this along z is not drawn.
     pub near: f64,
-    /// Gaussians that reach over the near plane are drawn whatever side of it their centres are on: see [`super::Crossing`].
+    /// Gaussians that reach over the near plane are drawn whatever side of it their centres are on: see
+    /// [`super::Crossing`].
     pub ray_space: bool,
     /// Pixels per unit of slope, or, of an orthographic camera, per unit of length.
     pub focal: [f64; 2],

@@ -4,7 +4,8 @@ use bytemuck::{Pod, Zeroable};
 
 /// The greatest α of one ellipse.
 pub const ALPHA_CEILING: f32 = 0.99;
-/// A pixel that lets less light through than this is finished: what is not drawn is less than a quarter of a step of eight bits.
+/// A pixel that lets less light through than this is finished: what is not drawn is less than a quarter of a step of
+/// eight bits.
 pub const FINISHED: f32 = 1.0 / 1024.0;
 /// With [`super::Loop::Order`], so many splats of a pixel wait for one that may be nearer.
 pub const WAITING: usize = 8;
@@ -13,7 +14,8 @@ pub const MAX_SCALE: f32 = 1e4;
 /// What is left of a splat's opacity, at least, by the compensation for its widening.
 pub const MIN_COMPENSATION: f32 = 0.005;
 
-/// A splat on the picture: `α(x, y) = 2^(log_opacity − u² − v²)` with `(u, v)` linear in the pixel's distance to the centre.
+/// A splat on the picture: `α(x, y) = 2^(log_opacity − u² − v²)` with `(u, v)` linear in the pixel's distance to the
+/// centre.
 ///
 /// One cache line.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
@@ -37,9 +39,9 @@ pub struct Ellipse {
     pub index: u32,
 }
 
-/// A Gaussian that reaches over the near plane, where no ellipse approximates it: α is opacity·2^(−|x|²) at the point nearest to its
-/// centre, in its own measure, of the part of a pixel's ray that is beyond the plane. At depth `t` on the ray of pixel `(px, py)`,
-/// `x = from·(px, py, 1) + t·along·(px, py, 1)`.
+/// A Gaussian that reaches over the near plane, where no ellipse approximates it: α is opacity·2^(−|x|²) at the point
+/// nearest to its centre, in its own measure, of the part of a pixel's ray that is beyond the plane. At depth `t` on
+/// the ray of pixel `(px, py)`, `x = from·(px, py, 1) + t·along·(px, py, 1)`.
 ///
 /// Its [`Ellipse`] has forms of zeroes, and the bounds of a box around what of it lies beyond the plane.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]

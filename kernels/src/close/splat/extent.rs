@@ -1,7 +1,7 @@
 //! Where in the picture a Gaussian may be seen that reaches over the near plane.
 //!
-//! What may reach the minimum α is an ellipsoid; the picture of the box around its part beyond the plane bounds it from outside. Without,
-//! all that lies beside the camera, of which a room has thousands, would be looked at in every pixel.
+//! What may reach the minimum α is an ellipsoid; the picture of the box around its part beyond the plane bounds it from
+//! outside. Without, all that lies beside the camera, of which a room has thousands, would be looked at in every pixel.
 
 use super::camera::{Camera, ORTHOGRAPHIC};
 use crate::simd::{F32Vector, F64Vector, Simd};
@@ -38,8 +38,8 @@ impl<S: Simd> Extent<S> {
         }
     }
 
-    /// The first and the end of the pixels along x (`k` 0) or y (1) that see the box around what reaches from `centre` by `half`: seen
-    /// where it is widest, from nearest to farthest.
+    /// The first and the end of the pixels along x (`k` 0) or y (1) that see the box around what reaches from `centre`
+    /// by `half`: seen where it is widest, from nearest to farthest.
     #[inline(always)]
     pub fn covered<const VARIANT: u8>(
         &self,

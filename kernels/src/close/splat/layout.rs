@@ -33,9 +33,9 @@ const WINDOW: [u64; 5] = [0, 0x0101_0101, 0x0303_0303, 0x0707_0707, 0x0f0f_0f0f]
 /// Numbers in a [`Batch`].
 const FORMS: usize = 9;
 
-/// Of several ellipses, one to a lane: the form in the middle of the tile's first block; by how much it changes, at most, from there
-/// to the block's outer pixels; how large its square may be, before nothing is drawn; and, as integers, the first column and row of
-/// blocks that it may touch, and their ends.
+/// Of several ellipses, one to a lane: the form in the middle of the tile's first block; by how much it changes, at
+/// most, from there to the block's outer pixels; how large its square may be, before nothing is drawn; and, as
+/// integers, the first column and row of blocks that it may touch, and their ends.
 #[repr(C, align(64))]
 struct Batch([[f32; AREA]; FORMS]);
 
@@ -71,8 +71,8 @@ impl Batch {
     }
 }
 
-/// What is to be blended: a list of ellipses and blocks. It is laid out and worked off in turns, because in either loop nearly every
-/// branch goes the usual way, and in one for both none would.
+/// What is to be blended: a list of ellipses and blocks. It is laid out and worked off in turns, because in either loop
+/// nearly every branch goes the usual way, and in one for both none would.
 #[derive(Debug, Clone)]
 #[repr(C, align(64))]
 pub(super) struct Work {
@@ -298,7 +298,8 @@ fn numbered(key: u64) -> usize {
     key as u32 as usize
 }
 
-/// Field `k` of the ellipse that key `i` numbers in lane `i` of vector `k`. Where there are fewer keys than lanes, those of the last.
+/// Field `k` of the ellipse that key `i` numbers in lane `i` of vector `k`. Where there are fewer keys than lanes,
+/// those of the last.
 #[inline(always)]
 fn gather<S: Simd>(simd: S, all: &[Ellipse], keys: &[u64]) -> [S::F32; 16] {
     let mut records = [&[0.0; 16]; 16];

@@ -1,7 +1,7 @@
 //! Splats: Gaussians onto the picture ([`project`]), and into the pixels of one tile ([`Tile`]).
 //!
-//! Each kernel is one body over the vectors of any instruction set. Between sets the last bits differ, because only some multiply and
-//! add in one rounding; in each of them the result is a function of the input alone.
+//! Each kernel is one body over the vectors of any instruction set. Between sets the last bits differ, because only
+//! some multiply and add in one rounding; in each of them the result is a function of the input alone.
 
 mod block;
 mod camera;

@@ -6,7 +6,8 @@ use super::block::{AREA, Block, COLUMNS, EffectData, ROWS, SIDE, Splat};
 use super::ellipse::{ALPHA_CEILING, Crossing, FINISHED, WAITING};
 use crate::simd::{F32Vector, I32Vector, LEAST_EXPONENT, MaskVector, Simd};
 
-/// Puts an ellipse on the block. `u`, `v`: its form in the block's middle. False, and nothing done, if every pixel is finished.
+/// Puts an ellipse on the block. `u`, `v`: its form in the block's middle. False, and nothing done, if every pixel is
+/// finished.
 #[inline(always)]
 pub(super) fn blend<S: Simd>(simd: S, block: &mut Block, splat: &Splat, form: [f32; 2]) -> bool {
     let mut open = 0;
@@ -21,7 +22,8 @@ pub(super) fn blend<S: Simd>(simd: S, block: &mut Block, splat: &Splat, form: [f
     open != 0
 }
 
-/// As [`blend`], of a Gaussian that reaches over the near plane. `at`: the block's first pixel in the tile, whose own is `corner`.
+/// As [`blend`], of a Gaussian that reaches over the near plane. `at`: the block's first pixel in the tile, whose own
+/// is `corner`.
 #[inline(always)]
 pub(super) fn cross<S: Simd>(
     simd: S,
@@ -115,7 +117,8 @@ fn add<S: Simd>(simd: S, block: &mut Block, lanes: usize, weight: S::F32, colour
     }
 }
 
-/// As [`blend`] and [`cross`], without colours: what stays in each pixel. `None`, and nothing done, if every pixel is finished.
+/// As [`blend`] and [`cross`], without colours: what stays in each pixel. `None`, and nothing done, if every pixel is
+/// finished.
 #[inline(always)]
 pub(super) fn weigh<S: Simd>(
     simd: S,
@@ -178,7 +181,8 @@ impl Best {
     }
 }
 
-/// Depth, α, and colour of the splats that wait, in each pixel, for something that may be nearer there: the nearest first.
+/// Depth, α, and colour of the splats that wait, in each pixel, for something that may be nearer there: the nearest
+/// first.
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
 pub(super) struct Pending([[[f32; AREA]; 5]; WAITING]);
@@ -196,7 +200,8 @@ impl Pending {
         Pending([nothing; WAITING])
     };
 
-    /// Lets the nearest of those that wait, and of the splat, be blended in each pixel; the others wait. α below `least` does not.
+    /// Lets the nearest of those that wait, and of the splat, be blended in each pixel; the others wait. α below
+    /// `least` does not.
     #[inline(always)]
     pub(super) fn add<S: Simd>(
         &mut self,

@@ -1,10 +1,11 @@
 //! Gaussians seen by a camera.
 //!
-//! With the rows `m₁`, `m₂` of `M = J·W·R·S` the covariance is `[[a, b], [b, c]]`, `a = m₁² + ε`, `b = m₁·m₂`, `c = m₂² + ε`. Its
-//! determinant is taken as `(m₁ × m₂)² + ε(m₁² + m₂²) + ε²` (Cauchy–Binet): a sum of squares, at least `ε²`, nothing cancels. The
-//! quadratic form is evaluated as `u² + v²` with the factors of a Cholesky decomposition that starts from the larger variance `p`:
-//! for `p = a`, `v = dx/√p` and `u = (dy − (b/p)·dx)/√(det/p)`. So the exponent cannot be positive, and a needle of 3000 × 0.1 px
-//! keeps its α to 2·10⁻⁴ where the textbook form is wrong by 1.
+//! With the rows `m₁`, `m₂` of `M = J·W·R·S` the covariance is `[[a, b], [b, c]]`, `a = m₁² + ε`, `b = m₁·m₂`, `c =
+//! m₂² + ε`. Its determinant is taken as `(m₁ × m₂)² + ε(m₁² + m₂²) + ε²` (Cauchy–Binet): a sum of squares, at least
+//! `ε²`, nothing cancels. The quadratic form is evaluated as `u² + v²` with the factors of a Cholesky decomposition
+//! that starts from the larger variance `p`: for `p = a`, `v = dx/√p` and `u = (dy − (b/p)·dx)/√(det/p)`. So the
+//! exponent cannot be positive, and a needle of 3000 × 0.1 px keeps its α to 2·10⁻⁴ where the textbook form is wrong
+//! by 1.
 
 use super::extent::Extent;
 use bytemuck::must_cast_slice_mut;
@@ -42,8 +43,8 @@ pub struct Tally {
     pub too_faint: u32,
     pub behind: u32,
     pub outside: u32,
-    /// Of all that could be drawn otherwise, how many reach over the near plane, on whatever side their centres are; of those that are
-    /// drawn like that, how many are visible.
+    /// Of all that could be drawn otherwise, how many reach over the near plane, on whatever side their centres are; of
+    /// those that are drawn like that, how many are visible.
     pub crossing: u32,
 }
 
@@ -132,8 +133,8 @@ fn body<S: Simd, const VARIANT: u8>(simd: S, view: &View, cloud: Cloud, first: u
 impl<S: Simd> Camera<S> {
     /// Sees the first `count` of `group`, at most as many as there are lanes.
     ///
-    /// The centre is transformed in double precision: the sum of a rotated position and a distant camera's translation is the one
-    /// place where digits are lost.
+    /// The centre is transformed in double precision: the sum of a rotated position and a distant camera's translation
+    /// is the one place where digits are lost.
     #[inline(always)]
     fn see<const VARIANT: u8>(&self, group: Cloud, count: usize, index: u32, tally: &mut Tally, out: &mut [Ellipse]) {
         let simd = self.simd;
@@ -301,7 +302,8 @@ impl<S: Simd> Camera<S> {
         powers * S::F32::splat(simd, 2.0 * std::f32::consts::LN_2)
     }
 
-    /// The centre along x (`k` 0) or y (1), and that row of `M`. `seen`: the centre's offset along that axis of the camera.
+    /// The centre along x (`k` 0) or y (1), and that row of `M`. `seen`: the centre's offset along that axis of the
+    /// camera.
     #[inline(always)]
     fn along<const VARIANT: u8>(
         &self,
@@ -327,7 +329,8 @@ impl<S: Simd> Camera<S> {
     }
 }
 
-/// The first and the end of the pixels from `low` to `high` whose centres lie within `half` of `centre`: none if they don't rise.
+/// The first and the end of the pixels from `low` to `high` whose centres lie within `half` of `centre`: none if they
+/// don't rise.
 #[inline(always)]
 fn covered<S: Simd>(simd: S, centre: S::F32, half: S::F32, [low, high]: [S::F32; 2]) -> (S::F32, S::F32) {
     let middle = S::F32::splat(simd, 0.5);

@@ -1,12 +1,13 @@
 //! The pixels of one tile, front to back.
 //!
-//! For each ellipse in order: `α = min(0.99, opacity·exp(−½d²))`; a pixel of a transmittance below [`super::FINISHED`] is finished. Otherwise
-//! `T` becomes `T' = T − α·T`, and the colour gains `(T − T')·colour`: a weight that is the difference of what is stored keeps the
-//! weights' sum at 1 to a few units in the last place, however many layers there are.
+//! For each ellipse in order: `α = min(0.99, opacity·exp(−½d²))`; a pixel of a transmittance below [`super::FINISHED`]
+//! is finished. Otherwise `T` becomes `T' = T − α·T`, and the colour gains `(T − T')·colour`: a weight that is the
+//! difference of what is stored keeps the weights' sum at 1 to a few units in the last place, however many layers there
+//! are.
 //!
-//! Splats are a few pixels wide, so a tile is cut into blocks of 4×4 pixels. For each splat, the blocks in which its α may reach the
-//! floor are found all at once, a block to a lane (`layout.rs`), and of these the ones that are not finished are blended, a
-//! pixel to a lane (`pixels.rs`). Within such a block every pixel is blended, however faint.
+//! Splats are a few pixels wide, so a tile is cut into blocks of 4×4 pixels. For each splat, the blocks in which its α
+//! may reach the floor are found all at once, a block to a lane (`layout.rs`), and of these the ones that are not
+//! finished are blended, a pixel to a lane (`pixels.rs`). Within such a block every pixel is blended, however faint.
 
 use super::block::{
     ALL_BLOCKS, AREA, BLOCKS, CLEAR, IDS, Loop, ORDER, PLAIN, RAY_SPACE, SHARES, SIDE, Scene, Share, TILE, rectangle,
@@ -36,8 +37,8 @@ impl Default for Tile {
 }
 
 impl Tile {
-    /// Clears it and puts its first pixel at `corner`; of its pixels, those of `part`, counted from there, are wanted. An α below
-    /// `floor` may be left out.
+    /// Clears it and puts its first pixel at `corner`; of its pixels, those of `part`, counted from there, are wanted.
+    /// An α below `floor` may be left out.
     ///
     /// # Panics
     /// If the part is empty or reaches out of the tile.
@@ -63,8 +64,8 @@ impl Tile {
         }
     }
 
-    /// Blends ellipses, nearest first: those of the scene that the lower halves of `keys` number. False once every pixel is finished.
-    /// `next`: what will probably be blended after these, to be fetched already.
+    /// Blends ellipses, nearest first: those of the scene that the lower halves of `keys` number. False once every
+    /// pixel is finished. `next`: what will probably be blended after these, to be fetched already.
     ///
     /// # Panics
     /// If there is no such ellipse, or the scene lacks what the loop needs of it.
@@ -82,8 +83,8 @@ impl Tile {
         self.canvas.open != 0
     }
 
-    /// With [`Loop::Shares`], how much the pixels show of what the last call of [`Tile::blend`] put on them: in each pixel, all shares of a
-    /// picture and the transmittance that is left are together 1.
+    /// With [`Loop::Shares`], how much the pixels show of what the last call of [`Tile::blend`] put on them: in each
+    /// pixel, all shares of a picture and the transmittance that is left are together 1.
     pub fn shares(&self) -> &[Share] {
         &self.canvas.shares
     }
@@ -101,9 +102,9 @@ impl Tile {
         }
     }
 
-    /// Writes the wanted part of the tile's pixels into `rows`, whose first is the part's first and of which each is `stride` pixels
-    /// long: premultiplied colour and transmittance, of which each channel takes `behind` times the transmittance and alpha one more.
-    /// How many of them something was drawn on.
+    /// Writes the wanted part of the tile's pixels into `rows`, whose first is the part's first and of which each is
+    /// `stride` pixels long: premultiplied colour and transmittance, of which each channel takes `behind` times the
+    /// transmittance and alpha one more. How many of them something was drawn on.
     ///
     /// # Panics
     /// If `rows` do not hold the part.
@@ -114,8 +115,8 @@ impl Tile {
         drawn
     }
 
-    /// Writes which Gaussian each pixel of the wanted part shows most of, [`u32::MAX`] for none, as [`Tile::write`] does colours, and
-    /// counts as that does.
+    /// Writes which Gaussian each pixel of the wanted part shows most of, [`u32::MAX`] for none, as [`Tile::write`]
+    /// does colours, and counts as that does.
     ///
     /// # Panics
     /// If `rows` do not hold the part, or the loop was not [`Loop::Ids`].

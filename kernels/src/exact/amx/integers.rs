@@ -1,7 +1,8 @@
 //! Integers in tiles of bytes.
 //!
-//! Numbers of up to 13 bits are cut into two digits, of which three products make one of numbers ([`digits`]). Of up to 32 channels both digits
-//! fit a tile row, and the mixed products come of one multiplication by the weights' digits the other way round.
+//! Numbers of up to 13 bits are cut into two digits, of which three products make one of numbers ([`digits`]). Of up to
+//! 32 channels both digits fit a tile row, and the mixed products come of one multiplication by the weights' digits the
+//! other way round.
 
 use std::arch::x86_64::*;
 
@@ -24,8 +25,8 @@ const HALF: usize = LINE / 2;
 const WIDE: [usize; 2] = [17, 3];
 
 impl Weights {
-    /// Cuts the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, into digits; nothing, if one is too large
-    /// for that, or the layer too narrow to gain.
+    /// Cuts the weights, of which `weights(tap, input, panel)` tells those of a panel of outputs, into digits; nothing,
+    /// if one is too large for that, or the layer too narrow to gain.
     pub fn of_integers(extents: Extents, weights: impl Fn(usize, usize, usize) -> [i16; PANEL]) -> Option<Weights> {
         let (cin, panels) = (extents.cin, extents.panels());
         if cin < WIDE[0] || cin > HALF && panels < WIDE[1] {
@@ -81,8 +82,8 @@ fn add(words: &mut [u32; PANEL], byte: usize, digits: [i8; PANEL]) {
     }
 }
 
-/// The sums over all taps of a tile: `sums[row · panels + panel]`, rows in the plan's order. False, and no sums, if activations are too large for
-/// digits.
+/// The sums over all taps of a tile: `sums[row · panels + panel]`, rows in the plan's order. False, and no sums, if
+/// activations are too large for digits.
 ///
 /// # Panics
 /// If the plan reads beyond the input.
@@ -117,8 +118,8 @@ pub(crate) fn accumulate(
 }
 
 with_avx512! {
-    /// Writes rows as tile rows of 64 channels, first the high digits of all rows, then the low ones, then their sums. Zeros follow each
-    /// time. Tells whether all were small enough.
+    /// Writes rows as tile rows of 64 channels, first the high digits of all rows, then the low ones, then their sums.
+    /// Zeros follow each time. Tells whether all were small enough.
     fn split_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Words]) -> bool {
         let chunks = cin.div_ceil(LINE);
         let (highs, rest) = to.split_at_mut((rows.len() + 1) * chunks);
@@ -154,7 +155,8 @@ with_avx512! {
 }
 
 with_avx512! {
-    /// Writes rows as a tile row each, first the high digits, then the low ones. A row of zeros follows. Tells whether all were small enough.
+    /// Writes rows as a tile row each, first the high digits, then the low ones. A row of zeros follows. Tells whether
+    /// all were small enough.
     fn split_short_rows(input: &[i16], cin: usize, rows: &[u32], to: &mut [Words]) -> bool {
         let (to, zeros) = to.split_at_mut(rows.len());
         let mut largest = _mm512_setzero_si512();

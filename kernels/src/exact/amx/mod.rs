@@ -1,6 +1,7 @@
 //! AMX: tiles of 16 rows by 64 bytes, multiplied and summed in 32 bits.
 //!
-//! [`multiply()`] multiplies a plan's groups by tiles of weights; [`integers`], and `close` for bf16, cut numbers into what tiles hold.
+//! [`multiply()`] multiplies a plan's groups by tiles of weights; [`integers`], and `close` for bf16, cut numbers into
+//! what tiles hold.
 
 pub(crate) mod integers;
 mod multiply;

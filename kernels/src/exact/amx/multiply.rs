@@ -19,10 +19,11 @@ pub(crate) fn prepare(weights: &Weights, plan: &PlanTile, inputs: usize, buffers
     buffers.rows.resize(weights.passes() * lines, Words::default());
 }
 
-/// The sums of all groups, of `buffers.rows`: the plan's input rows in tile rows as the weights' scheme has them, and then one of zeros.
+/// The sums of all groups, of `buffers.rows`: the plan's input rows in tile rows as the weights' scheme has them, and
+/// then one of zeros.
 ///
-/// Weights of all taps are more than the first cache holds: for as many taps as do fit, all groups are multiplied by them, and their sums
-/// stored and loaded again with the next taps.
+/// Weights of all taps are more than the first cache holds: for as many taps as do fit, all groups are multiplied by
+/// them, and their sums stored and loaded again with the next taps.
 ///
 /// # Panics
 /// If there are fewer rows.
@@ -73,8 +74,9 @@ with_avx512! {
                             to: to.as_mut_ptr(),
                             more: usize::from(tap + chunk > 0),
                         };
-                        // SAFETY: all rows that the places name are there, and one of zeros; so are the weights of all taps from this
-                        // chunk and column on, room for two tiles and for the products. Tiles are configured.
+                        // SAFETY: all rows that the places name are there, and one of zeros; so are the weights of all
+                        // taps from this chunk and column on, room for two tiles and for the products. Tiles are
+                        // configured.
                         unsafe { block.run(width, weights.scheme) };
                     }
                 }
@@ -135,7 +137,8 @@ impl Block {
     }
 }
 
-/// Copies the rows of one step into a tile: one instruction after the other, for they are to fill what time multiplications leave.
+/// Copies the rows of one step into a tile: one instruction after the other, for they are to fill what time
+/// multiplications leave.
 macro_rules! gather {
     () => {
         concat!(
@@ -207,8 +210,9 @@ macro_rules! gather {
     };
 }
 
-/// A function that multiplies a block by some columns of tiles, summing in tile registers: that of the rows, for each column that of its
-/// sums, one for its weights, and where these lie. Each step's rows are gathered while the one before is multiplied.
+/// A function that multiplies a block by some columns of tiles, summing in tile registers: that of the rows, for each
+/// column that of its sums, one for its weights, and where these lie. Each step's rows are gathered while the one
+/// before is multiplied.
 macro_rules! columns {
     ($(#[$doc:meta])* $name:ident, $multiply:literal, $rows:literal, $(($sum:literal, $weight:literal, $at:literal)),*) => {
         $(#[$doc])*

@@ -6,7 +6,8 @@ use crate::sparse::rows::{Extents, Words};
 pub(super) const WIDTH: usize = 2;
 /// Products of digits: high, low, and of their sums.
 pub(super) const PRODUCTS: usize = 3;
-/// The taps of a 3³ kernel in pairs that few groups need: on surfaces a voxel has both neighbours or none more often than not.
+/// The taps of a 3³ kernel in pairs that few groups need: on surfaces a voxel has both neighbours or none more often
+/// than not.
 const OF_27: [&[u8]; 14] = [
     &[0, 1],
     &[2],

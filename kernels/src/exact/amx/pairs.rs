@@ -1,4 +1,5 @@
-//! Up to 32 channels of two taps in a tile row: the multiplication fills its tiles, and a step of two taps takes the time of one.
+//! Up to 32 channels of two taps in a tile row: the multiplication fills its tiles, and a step of two taps takes the
+//! time of one.
 
 use std::arch::asm;
 
@@ -26,11 +27,11 @@ struct Block {
     to: *mut Words,
 }
 
-/// The sums of all groups: `sums[row · panels + panel]`, of `buffers.rows`: the plan's input rows, high digits and low ones, and then one
-/// of zeros.
+/// The sums of all groups: `sums[row · panels + panel]`, of `buffers.rows`: the plan's input rows, high digits and low
+/// ones, and then one of zeros.
 ///
-/// What a step multiplies is gathered two steps before, in whatever group they are: what has just been written to memory takes long to come
-/// back as a tile.
+/// What a step multiplies is gathered two steps before, in whatever group they are: what has just been written to
+/// memory takes long to come back as a tile.
 ///
 /// # Panics
 /// If there are fewer rows.
@@ -99,8 +100,8 @@ with_avx512! {
                     gathered,
                     to: products[turn * STORED..].as_mut_ptr(),
                 };
-                // SAFETY: the places name rows that are there, the weights are those of whole pairs, there is room for the tiles, and they
-                // are configured; the first two steps' rows are gathered.
+                // SAFETY: the places name rows that are there, the weights are those of whole pairs, there is room for
+                // the tiles, and they are configured; the first two steps' rows are gathered.
                 unsafe {
                     match panels - panel {
                         1 => one(&mut block),

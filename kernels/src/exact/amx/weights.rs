@@ -12,7 +12,8 @@ const CACHED: usize = 28;
 pub(crate) enum Scheme {
     /// High digits, low ones and their sums in three passes of a tile row each 64 channels.
     Digits,
-    /// 32 high digits and 32 low ones in a tile row, which meet three tiles of weights: columns of high, mixed and low products.
+    /// 32 high digits and 32 low ones in a tile row, which meet three tiles of weights: columns of high, mixed and low
+    /// products.
     Both,
     /// 32 channels of two taps in a tile row, of one digit: see [`super::pairs`].
     Pairs,
