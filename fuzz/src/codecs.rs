@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 use b2p::container::Slice;
 use b2p::geometry::{KernelMap, Octree, Voxels, codec, morton};
 use b2p::latents::entropy::{
-    Condition, SlicePart, RawRows, Rounding, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
+    Condition, RawRows, Rounding, SlicePart, Tables, UNPREDICTED, decode_coefficients, decode_level, decode_passes,
     decode_slice, encode_coefficients, encode_level, encode_passes, encode_slice, quantise, quantise_passes,
 };
 use b2p::{Cancel, Isa};
