@@ -12,7 +12,7 @@ const STAGES: [(&str, &[&str]); 12] = [
     ("colour", &["coding", "container", "geometry"]),
     ("layers", &[]),
     ("cloud", &["geometry"]),
-    ("gaussians", &["geometry", "layers", "cloud"]),
+    ("gaussians", &["coding", "geometry", "layers", "cloud"]),
     ("renderer", &["gaussians"]),
     ("latents", &["coding", "container", "geometry", "layers", "gaussians"]),
     (
