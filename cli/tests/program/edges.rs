@@ -54,8 +54,12 @@ fn a_file_over_the_limit_is_refused_before_it_is_read() {
     let file = std::fs::File::create(at.join("large.ply")).unwrap();
     // A hole takes no room.
     file.set_len(1 << 40).unwrap();
-    for command in ["decode", "render", "encode", "info"] {
-        let to: &[&str] = if command == "info" { &[] } else { &["-o", "x.png"] };
+    for (command, to) in [
+        ("decode", &["-o", "x.ply"] as &[&str]),
+        ("render", &["-o", "x.png"]),
+        ("encode", &["-o", "x.b2p"]),
+        ("info", &[]),
+    ] {
         let words = ["large.ply", "size of the file is 1099511627776", "--max-memory"];
         fails(at, &[&[command, "large.ply"], to].concat(), &words);
     }
