@@ -16,7 +16,7 @@ pub enum Taps<'a> {
         volume: usize,
         /// One entry per output row and tap.
         rows: &'a [u32],
-        /// The same, arranged for [`Isa`]s.
+        /// The same, arranged for vector kernels.
         plan: Option<&'a Plan>,
     },
     /// Eight taps, of which row `i` uses only `octants[i]`, to read row `parents[i]`.
@@ -33,7 +33,7 @@ pub enum Taps<'a> {
     AllChildren {
         /// Entry `p·27 + k` is the neighbour of voxel `p` at offset `k`, x fastest, or [`ABSENT`].
         neighbours: &'a [u32],
-        /// The rows, arranged for [`Isa`]s.
+        /// The rows, arranged for vector kernels.
         plan: &'a Plan,
     },
 }
