@@ -54,7 +54,8 @@ fn without_noise_points_lie_on_the_surface_and_with_it_near() {
         let noisy = added(1.0);
         assert!((0.0005..0.05).contains(&noisy), "{kind:?}: {noisy}");
         let more = added(3.0);
-        assert!(more > 1.5 * noisy, "{kind:?}: {more} after {noisy}");
+        // Pixels at edges err as far with little noise.
+        assert!(more > 1.2 * noisy, "{kind:?}: {more} after {noisy}");
     }
 }
 
@@ -113,20 +114,16 @@ fn a_laser_returns_less_at_grazing_angles() {
 }
 
 #[test]
-fn depth_cameras_leave_flying_pixels_at_edges_in_front_of_a_wall() {
-    let paint = pattern::checker(0.1, Vec3::new(0.9, 0.2, 0.1), Vec3::new(0.1, 0.3, 0.8));
+fn depth_cameras_leave_flying_pixels_behind_edges_only() {
     let grey = texture(8, 8, |_, _| [128, 128, 128, 255]);
-    let floating = |parts| {
-        let capture = of(&Surface::new(&Mesh { parts }), Kind::Frame, 1.0);
-        // Neither on the ball nor on the wall, farther off than noise explains.
-        let free = |p: &&[f64; 3]| radius(p) > 1.1 && p[2] > -1.8;
-        capture.positions.iter().filter(free).count()
-    };
-    let ball = || shapes::sphere().part(100.0, &paint, None);
-    let wall = quad([-2.0, -2.0, -2.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0], Some(grey));
-    assert_eq!(floating(vec![ball()]), 0);
-    let count = floating(vec![ball(), wall]);
-    assert!((5..400).contains(&count), "{count}");
+    let card = quad([-0.5, -0.5, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], Some(grey));
+    let capture = of(&Surface::new(&Mesh { parts: vec![card] }), Kind::Frame, 1.0);
+    // Farther behind the card than noise explains.
+    let flying: Vec<_> = capture.positions.iter().filter(|p| p[2] < -0.03).collect();
+    assert!((5..400).contains(&flying.len()), "{}", flying.len());
+    for p in flying {
+        assert!(p[0].abs().max(p[1].abs()) > 0.4, "{p:?}");
+    }
 }
 
 #[test]
