@@ -31,7 +31,7 @@ fn coded(depth: u8, keys: Vec<u64>, slice_voxels: u32) -> (Vec<u8>, Option<Vec<u
     };
     let log = Log::default();
     let stream = encode(&cloud, &MODEL, &options, &log).expect("a small cloud is coded");
-    let gaussians = LatentDecoder::new(&*MODEL).decode(&stream.bytes, None, &log);
+    let gaussians = LatentDecoder::new(&MODEL).decode(&stream.bytes, None, &log);
     let file = gaussians.ok().map(|gaussians| {
         let mut file = Vec::new();
         let name = Path::new("memory");
@@ -105,8 +105,7 @@ fn coloured(bytes: &[u8]) -> Vec<u8> {
 }
 
 /// The Gaussians of a PLY file in each format, and with view-dependent colour.
-fn splats(file: &Option<Vec<u8>>) -> Vec<Vec<u8>> {
-    let file = file.as_ref().expect("Gaussians of a small cloud");
+fn splats(file: &[u8]) -> Vec<Vec<u8>> {
     let mut gaussians = Gaussians::from_ply(file, &Limits::default()).expect("a file of ours");
     let mut seeds = Vec::new();
     for count in [0, 3] {
@@ -167,7 +166,10 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
             files.chain([cloud.to_ply(), ascii.into()]).collect()
         }
         "clouds" => point_files(),
-        "splats" => splats(&clouds[0].1),
+        "splats" => {
+            let drawn = clouds.iter().find_map(|(_, file)| file.as_deref());
+            splats(drawn.expect("one of the clouds has Gaussians"))
+        }
         "model" => vec![vec![], noise(1, 5), noise(2, 40)],
         // No voxels; one at every level, and one level too many.
         "octree" => {

@@ -153,7 +153,7 @@ pub fn deepest(bytes: &[u8]) -> Result<Option<u8>, Error> {
         let decoder = Decoder::new().with_limits(transform::limits());
         return Ok(decoder.whole(bytes)?.level());
     }
-    let mut decoding = LatentDecoder::new(&*MODEL).with_limits(limits()).start(None);
+    let mut decoding = LatentDecoder::new(&MODEL).with_limits(limits()).start(None);
     decoding.push(bytes);
     decoding.finish(log)?;
     Ok(decoding.level())
@@ -167,7 +167,7 @@ pub fn stream(bytes: &[u8]) {
 }
 
 fn decoded(bytes: &[u8]) {
-    let decoder = LatentDecoder::new(&*MODEL).with_limits(limits());
+    let decoder = LatentDecoder::new(&MODEL).with_limits(limits());
     let (mut decoding, log) = (decoder.start(None), Log::default());
     decoding.push(bytes);
     let most = (limits().max_bytes + Limits::OVERHEAD) as usize;
@@ -259,7 +259,7 @@ fn pieced(bytes: &[u8]) {
         [.., a, b, c, level] => ([*a, *b, *c], [None, Some(2), Some(3)][usize::from(level % 3)]),
         _ => ([1; 3], None),
     };
-    let decoder = LatentDecoder::new(&*MODEL).with_limits(limits());
+    let decoder = LatentDecoder::new(&MODEL).with_limits(limits());
     let log = Log::default();
     let mut whole = decoder.start(level);
     whole.push(bytes);

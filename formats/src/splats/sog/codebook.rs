@@ -13,7 +13,9 @@ pub(super) struct Codebook(Vec<f32>);
 impl Codebook {
     /// Exact for at most 256 different numbers; else entries start evenly spaced and move to where the numbers are.
     pub fn of(values: impl Iterator<Item = f64>) -> Self {
-        let mut values: Vec<f32> = values.map(|x| x as f32).collect();
+        // Numbers beyond single precision become the outermost that it has.
+        let single = |x: f64| x.clamp(f32::MIN.into(), f32::MAX.into()) as f32;
+        let mut values: Vec<f32> = values.map(single).collect();
         values.par_sort_unstable_by(f32::total_cmp);
         let mut distinct: Vec<f32> = Vec::new();
         for &value in &values {
@@ -94,6 +96,13 @@ mod tests {
             assert_eq!(f64::from(book.numbers()[usize::from(book.index(value))]), value);
         }
         assert_eq!(Codebook::of(std::iter::empty()).numbers().len(), 256);
+    }
+
+    #[test]
+    fn numbers_beyond_single_precision_give_finite_entries() {
+        let book = Codebook::of([-1e39, 0.0, 1e300].into_iter());
+        assert!(book.numbers().iter().all(|x| x.is_finite()));
+        assert_eq!(book.index(0.0), 1);
     }
 
     #[test]
