@@ -225,7 +225,7 @@ impl Model {
         + DECISIONS * (1 + LOGIT_CLASSES + 12) * size_of::<Lanes>()
         + size_of::<Model>();
 
-    /// A placeholder without memory, which cannot code.
+    /// A model without slots, which cannot code.
     pub fn empty() -> Model {
         Model {
             slots: Vec::new(),
