@@ -226,7 +226,7 @@ impl<S: Simd> Form<S> {
 }
 
 /// What a group looks like, one to a lane: most of what an [`Ellipse`] stores.
-struct Seen<S: Simd> {
+struct Projected<S: Simd> {
     centre: [S::F32; 2],
     depth: S::F32,
     form: Form<S>,
@@ -236,7 +236,7 @@ struct Seen<S: Simd> {
     rows: [S::F32; 2],
 }
 
-impl<S: Simd> Seen<S> {
+impl<S: Simd> Projected<S> {
     /// Makes the lanes of `crossing` what ray space calls for: no form in the plane, for they may be anywhere, a depth
     /// from the near plane on, and these columns and rows.
     #[inline(always)]
@@ -345,7 +345,7 @@ impl<S: Simd> Camera<S> {
         visible.keep(group.finite.bits(), |tally| &mut tally.not_finite);
         visible.keep(group.turned.bits(), |tally| &mut tally.no_rotation);
         visible.keep(self.floor.le(opacity).bits(), |tally| &mut tally.too_faint);
-        let mut seen = Seen {
+        let mut seen = Projected {
             centre,
             depth,
             form,
@@ -396,7 +396,7 @@ impl<S: Simd> Camera<S> {
         &self,
         group: &Group<S>,
         place: [S::F64; 3],
-        seen: &mut Seen<S>,
+        seen: &mut Projected<S>,
         visible: &mut Visible,
     ) -> u32 {
         let simd = self.simd;
