@@ -1,5 +1,6 @@
 //! What can be asked of the program.
 
+use std::net::IpAddr;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
@@ -147,6 +148,8 @@ pub enum Command {
     Info(Info),
     /// Cut a stream after a level: a shorter stream
     Cut(Cut),
+    /// Show streams in a web page, drawn by the browser without a GPU
+    Serve(Serve),
     /// Decode and draw the sample that comes with the program
     Demo(Demo),
     /// Time the stages of decoding
@@ -507,4 +510,17 @@ mod tests {
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
     }
+}
+
+#[derive(Debug, Args)]
+pub struct Serve {
+    /// Stream, or folder of streams
+    #[arg(value_name = "FILE|FOLDER")]
+    pub source: PathBuf,
+    /// Port; 0: any that is free
+    #[arg(short, long, value_name = "N", default_value_t = 8000)]
+    pub port: u16,
+    /// Address to listen at. Others than this machine's own let everybody in who can reach it
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1")]
+    pub host: IpAddr,
 }

@@ -21,6 +21,7 @@ mod picture;
 mod pipe;
 mod progress;
 mod render;
+mod serve;
 mod sheet;
 mod table;
 mod turntable;
@@ -148,6 +149,7 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Render(args) => render::run(args, &limits, &progress)?,
         Command::Info(args) => info::run(args, &limits)?,
         Command::Cut(args) => cut::run(args, &limits)?,
+        Command::Serve(args) => serve::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,
     };

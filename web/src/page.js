@@ -6,13 +6,19 @@ const parameters = new URLSearchParams(location.search);
 const canvas = document.querySelector("canvas");
 const [state, time, files, heads] = ["state", "time", "files", "heads"].map((id) => document.getElementById(id));
 
-const model = parameters.get("heads");
+// `b2p serve` tells which streams there are, and where learned heads are.
+const listed = await list();
+const model = parameters.get("heads") ?? listed.heads;
 const viewer = new Viewer(canvas, { heads: model });
 let source = null;
 let milliseconds = 0;
 
 heads.parentElement.hidden = !model;
-heads.value = model ? "quick" : "surfels";
+
+async function list() {
+  const response = await fetch("./streams.json").catch(() => null);
+  return response?.ok ? response.json() : { streams: [], heads: null };
+}
 
 function say(text, error = false) {
   state.textContent = text;
@@ -59,16 +65,8 @@ addEventListener("drop", (event) => {
 });
 addEventListener("keydown", ({ key }) => key === "r" && viewer.reset());
 
-// `b2p serve` tells which streams there are.
-async function list() {
-  const response = await fetch("./streams.json").catch(() => null);
-  if (!response?.ok) return [];
-  return response.json();
-}
-
-const listed = await list();
-for (const name of listed) files.add(new Option(name, name));
-files.hidden = listed.length < 2;
-files.addEventListener("change", () => open(files.value));
-const first = parameters.get("src") ?? listed[0];
-if (first) open(first);
+for (const name of listed.streams) files.add(new Option(name, name));
+files.hidden = listed.streams.length < 2;
+files.addEventListener("change", () => open(encodeURIComponent(files.value)));
+const first = parameters.get("src") ?? listed.streams[0];
+if (first) open(parameters.has("src") ? first : encodeURIComponent(first));

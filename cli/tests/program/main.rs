@@ -11,6 +11,7 @@ mod knobs;
 mod outputs;
 mod pictures;
 mod rate_control;
+mod serving;
 mod transform;
 
 use std::io::Write;
