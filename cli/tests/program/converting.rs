@@ -11,7 +11,7 @@ fn splats(at: &Path, name: &str) -> Gaussians {
     let bytes = std::fs::read(at.join(name)).unwrap();
     let format = Format::of_path(Path::new(name)).unwrap();
     let splats = read(&bytes, format, &Options::default(), &Limits::default()).unwrap();
-    splats.into_ply_axes().unwrap()
+    splats.into_cloud()
 }
 
 /// Corners of the box around the centres, in the world.
@@ -97,7 +97,7 @@ fn coordinates_far_from_the_origin_are_local_with_the_offset_beside() {
         let name = format!("there{}", format.extension());
         let output = b2p(at, &["convert", "far.ply", &name]);
         assert!(output.status.success());
-        let beside = at.join(format!("{name}.offset.json"));
+        let beside = at.join(format!("{name}.json"));
         let whole = matches!(format, Format::Csv | Format::Glb | Format::Gltf);
         assert_eq!(beside.exists(), !whole, "{format}");
         let errors = String::from_utf8_lossy(&output.stderr);
