@@ -102,7 +102,10 @@ fn stray_points_leave_the_detail_and_can_be_dropped() {
     };
     let alone = voxels("ball.ply", &[]);
     let merged = succeeds(at, &["info", "x.b2p"]);
-    assert!(merged.contains("made of 60 000 points in ") && merged.contains(" % merged"), "{merged}");
+    assert!(
+        merged.contains("made of 60 000 points in ") && merged.contains(" % merged"),
+        "{merged}"
+    );
     assert!(voxels("strays.ply", &[]) > 0.6 * alone);
     assert_eq!(voxels("strays.ply", &["--drop-outliers"]), alone);
 }

@@ -164,7 +164,13 @@ fn points_are_converted_between_all_formats_with_axes_unit_and_coordinate_system
         assert!((0..3).all(|k| (a[k] - b[k]).abs() < 1e-9), "{a:?} {b:?}");
     }
     // Only formats that cannot say all have a file beside.
-    for (name, beside) in [("1.las", true), ("2.pcd", true), ("4.e57", true), ("0.ply", false), ("6.ply", false)] {
+    for (name, beside) in [
+        ("1.las", true),
+        ("2.pcd", true),
+        ("4.e57", true),
+        ("0.ply", false),
+        ("6.ply", false),
+    ] {
         assert_eq!(at.join(format!("{name}.json")).exists(), beside, "{name}");
     }
 }
@@ -183,9 +189,18 @@ fn what_stands_beside_a_file_is_read_with_it_and_goes_with_it() {
     succeeds(at, &["encode", "near.pcd", "x.b2p", "--bits", "10"]);
     let info: Value = serde_json::from_str(&succeeds(at, &["info", "x.b2p", "--json"])).unwrap();
     assert!(info["origin"][0].as_f64().unwrap() > 499_000.0, "{info}");
-    assert_eq!((&info["up"], &info["metres_per_unit"]), (&Value::from("z"), &Value::from(1.0)));
+    assert_eq!(
+        (&info["up"], &info["metres_per_unit"]),
+        (&Value::from("z"), &Value::from(1.0))
+    );
     // A box is in the coordinates of the world.
-    let cropped = ["convert", "near.pcd", "box.ply", "--crop", "500000,500000,0,500000.5,500001,60"];
+    let cropped = [
+        "convert",
+        "near.pcd",
+        "box.ply",
+        "--crop",
+        "500000,500000,0,500000.5,500001,60",
+    ];
     succeeds(at, &cropped);
     assert!(cloud(at, "box.ply").positions.len() < 600);
     // A file without an offset takes its place.
@@ -211,7 +226,11 @@ fn gaussians_become_points_only_where_nothing_else_can_be_meant() {
     assert_eq!(cloud(at, "centres.laz").positions.len(), count);
     succeeds(at, &["convert", "ball.spz", "same.ply"]);
     assert_eq!(splats(at, "same.ply").len(), count);
-    fails(at, &["convert", "ball.spz", "x.ply", "--crop", "0,0,0,1,1,1"], &["--crop is for points"]);
+    fails(
+        at,
+        &["convert", "ball.spz", "x.ply", "--crop", "0,0,0,1,1,1"],
+        &["--crop is for points"],
+    );
     let formats = ["convert", "ball.spz", "x", "--points", "--format", "sog"];
     fails(at, &formats, &["sog is for Gaussians"]);
 }
@@ -221,7 +240,11 @@ fn points_become_gaussians_only_as_surfels() {
     let folder = folder_with_cloud();
     let at = folder.path();
     for name in ["x.spz", "x.compressed.ply", "x.glb"] {
-        fails(at, &["convert", "ball.ply", name], &["not Gaussians", "b2p encode", "--surfels"]);
+        fails(
+            at,
+            &["convert", "ball.ply", name],
+            &["not Gaussians", "b2p encode", "--surfels"],
+        );
     }
     succeeds(at, &["convert", "ball.ply", "flat.sog", "--surfels"]);
     assert!(splats(at, "flat.sog").len() > 1000);
@@ -230,7 +253,11 @@ fn points_become_gaussians_only_as_surfels() {
 
 /// The place of the only red Gaussian, less that of the middle of all.
 fn red(g: &Gaussians) -> [f64; 3] {
-    let places: Vec<_> = g.position.iter().map(|&p| g.frame.placement.from_cube(g.frame.bits, p)).collect();
+    let places: Vec<_> = g
+        .position
+        .iter()
+        .map(|&p| g.frame.placement.from_cube(g.frame.bits, p))
+        .collect();
     let red = (0..g.len()).filter(|&i| g.colour[i][0] > 0.6 && g.colour[i][2] < 0.4);
     let red: Vec<_> = red.map(|i| places[i]).collect();
     assert!(!red.is_empty());
@@ -249,21 +276,47 @@ fn scenes_stand_upright_in_viewers_and_come_back_as_they_were() {
         (0..16).for_each(|j| rows += &format!("{} {} {i} 255 0 0\n", 36 + j % 4, 36 + j / 4));
     }
     std::fs::write(at.join("tower.xyz"), rows).unwrap();
-    let encode = ["encode", "tower.xyz", "t.b2p", "--bits", "6", "--lossless", "--levels", "3..6", "--up"];
+    let encode = [
+        "encode",
+        "tower.xyz",
+        "t.b2p",
+        "--bits",
+        "6",
+        "--lossless",
+        "--levels",
+        "3..6",
+        "--up",
+    ];
     succeeds(at, &[&encode[..], &["z"]].concat());
     for format in Format::all() {
         let name = format!("t{}", format.extension());
         let said = b2p(at, &["decode", "t.b2p", &name, "--heads", "surfels"]);
         let said = String::from_utf8_lossy(&said.stderr).into_owned();
-        assert!(said.contains("turned from z up") && said.contains("--keep-axes"), "{format}: {said}");
+        assert!(
+            said.contains("turned from z up") && said.contains("--keep-axes"),
+            "{format}: {said}"
+        );
         // To this one: the coordinates of the cloud again.
         succeeds(at, &["convert", &name, "back.xyz"]);
         let back = cloud(at, "back.xyz");
-        let (low, high) = back.positions.iter().fold(([1e9f64; 3], [-1e9f64; 3]), |(low, high), p| {
-            ([0, 1, 2].map(|k| low[k].min(p[k])), [0, 1, 2].map(|k| high[k].max(p[k])))
-        });
-        assert!((0..3).all(|k| low[k] > -1.5 && high[k] < 41.5 && high[k] > 38.0), "{format}: {low:?} {high:?}");
-        assert!(std::fs::read_to_string(at.join("back.xyz.json")).unwrap().contains("\"up\": \"z\""));
+        let (low, high) = back
+            .positions
+            .iter()
+            .fold(([1e9f64; 3], [-1e9f64; 3]), |(low, high), p| {
+                (
+                    [0, 1, 2].map(|k| low[k].min(p[k])),
+                    [0, 1, 2].map(|k| high[k].max(p[k])),
+                )
+            });
+        assert!(
+            (0..3).all(|k| low[k] > -1.5 && high[k] < 41.5 && high[k] > 38.0),
+            "{format}: {low:?} {high:?}"
+        );
+        assert!(
+            std::fs::read_to_string(at.join("back.xyz.json"))
+                .unwrap()
+                .contains("\"up\": \"z\"")
+        );
         // A picture has the tower above the floor.
         succeeds(at, &["render", &name, "x.png", "--size", "48x48", "--orbit", "200,20"]);
         let picture = png(&at.join("x.png"));
@@ -281,7 +334,10 @@ fn scenes_stand_upright_in_viewers_and_come_back_as_they_were() {
     succeeds(at, &csv);
     std::fs::remove_file(alone.join("t.csv.json")).unwrap();
     assert!(red(&splats(&alone, "t.csv"))[1] < -5.0);
-    succeeds(at, &["decode", "t.b2p", "kept.csv", "--heads", "surfels", "--keep-axes"]);
+    succeeds(
+        at,
+        &["decode", "t.b2p", "kept.csv", "--heads", "surfels", "--keep-axes"],
+    );
     assert!(red(&splats(at, "kept.csv"))[2] > 5.0);
     // The axis can be said, too.
     succeeds(at, &["decode", "t.b2p", "x.csv", "--heads", "surfels", "--up", "-z"]);
@@ -291,5 +347,8 @@ fn scenes_stand_upright_in_viewers_and_come_back_as_they_were() {
     let stream = std::fs::read(at.join("t.b2p")).unwrap();
     let from_pipe = piped(at, &["decode", "-", "piped.ply", "--heads", "surfels"], &stream);
     assert!(from_pipe.status.success());
-    assert_eq!(std::fs::read(at.join("piped.ply")).unwrap(), std::fs::read(at.join("t.ply")).unwrap());
+    assert_eq!(
+        std::fs::read(at.join("piped.ply")).unwrap(),
+        std::fs::read(at.join("t.ply")).unwrap()
+    );
 }
