@@ -21,7 +21,7 @@ pub fn axes(bytes: &[u8]) -> Result<Axes> {
         .unwrap_or_default())
 }
 
-/// The number of points that the stream's voxels were made of, if it says so.
+/// The number of points that the stream's voxels were made of, if it states it.
 ///
 /// # Errors
 /// Those of [`axes`].

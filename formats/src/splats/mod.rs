@@ -188,7 +188,7 @@ impl Axes {
 pub struct Splats {
     /// The Gaussians.
     pub gaussians: Gaussians,
-    /// Their axes: those of the cloud that was turned when the file was written, if it says so; else those of the file.
+    /// Their axes: those of the cloud that was turned when the file was written, if it states them; else those of the file.
     pub axes: Axes,
     /// What was ignored or guessed, a sentence each.
     pub warnings: Vec<String>,
