@@ -140,7 +140,7 @@ pub enum Command {
     Encode(Encode),
     /// Decode a stream to 3D Gaussians
     Decode(Decode),
-    /// Convert Gaussians from one file format to another
+    /// Convert Gaussians or points from one file format to another
     Convert(Convert),
     /// Draw a stream, or Gaussians, into a picture
     Render(Render),
@@ -245,6 +245,13 @@ pub struct Decode {
     /// Format of the Gaussians: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
     #[arg(long, value_name = "NAME", conflicts_with = "points")]
     pub format: Option<SplatFormat>,
+    /// Axis of the cloud that points up: x, y, z, -x, -y, -z, or auto. Gaussians are turned so that they stand upright in viewers
+    /// [default: what the stream says; if it says nothing, they are not turned]
+    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true, conflicts_with = "points")]
+    pub up: Option<UpArg>,
+    /// Keep the axes of the cloud: do not turn Gaussians
+    #[arg(long, conflicts_with_all = ["points", "up"])]
+    pub keep_axes: bool,
     #[command(flatten)]
     pub write: WriteArgs,
     #[command(flatten)]
@@ -257,20 +264,59 @@ pub struct Decode {
 
 #[derive(Debug, Args)]
 pub struct Convert {
-    /// Gaussians: PLY, compressed PLY, SPZ, SOG, .splat, glTF, CSV or NumPy archive. `-`: standard input
+    /// Gaussians: PLY, compressed PLY, SPZ, SOG, .splat, glTF, CSV or NumPy archive; or points: PLY, LAS, LAZ, PCD, E57, XYZ, OBJ or
+    /// glTF. `-`: standard input
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
     pub output: Output,
-    /// Format of the output: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
-    #[arg(long, value_name = "NAME", conflicts_with = "points")]
-    pub format: Option<SplatFormat>,
-    /// Format of the input [default: by its contents, of .splat and .csv by the ending]
+    /// Format of the output: of Gaussians ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz; of points ply, las, laz, pcd, e57,
+    /// xyz [default: by the ending]
+    #[arg(long, value_name = "NAME")]
+    pub format: Option<OutFormat>,
+    /// Format of the input, if it is Gaussians [default: by its contents, of .splat and .csv by the ending]
     #[arg(long, value_name = "NAME")]
     pub from: Option<SplatFormat>,
-    /// Write a PLY of points instead: the centres with their colours
+    /// Write the centres of Gaussians with their colours as points, also to .ply
     #[arg(long)]
     pub points: bool,
+    /// Make flat Gaussians of points, without a stream between
+    #[arg(long, conflicts_with_all = ["points", "double", "local"])]
+    pub surfels: bool,
+    /// Keep the axes of the coordinates: do not turn Gaussians so that they stand upright in viewers
+    #[arg(long)]
+    pub keep_axes: bool,
+    /// Write points with coordinates as doubles [default: floats where they are exact]
+    #[arg(long, help_heading = "Points")]
+    pub double: bool,
+    /// Write points with coordinates from a near origin, which goes into a comment and into OUT.json
+    #[arg(long, help_heading = "Points")]
+    pub local: bool,
+    #[command(flatten)]
+    pub read: ReadArgs,
+}
+
+/// A format of Gaussians or of points. PLY is one of both.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OutFormat {
+    Splats(SplatFormat),
+    Points(PointFormat),
+}
+
+impl std::str::FromStr for OutFormat {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let points = || name.parse().map(OutFormat::Points);
+        let found = name.parse().map(OutFormat::Splats).or_else(|_: b2p::Error| points());
+        found.map_err(|_: b2p::Error| {
+            let names: Vec<_> = SplatFormat::all().map(SplatFormat::name).collect();
+            format!(
+                "{name:?} is no format, expected {}, las, laz, pcd, e57 or xyz",
+                names.join(", ")
+            )
+        })
+    }
 }
 
 #[derive(Debug, Args)]
@@ -493,6 +539,7 @@ use super::values::{
     background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,
 };
 pub use b2p::renderer::{Background, Effect, EffectMode, Quality};
+use b2p_formats::clouds::PointFormat;
 pub use b2p_formats::splats::Format as SplatFormat;
 
 /// The help of `--effect`.

@@ -15,7 +15,7 @@ use super::args::Decode;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, cloud, convert, keep, kinds, load, pipe};
+use super::{Failure, Result, budget, cloud, convert, keep, kinds, load, pipe, points};
 
 /// Decodes a stream into a file of Gaussians.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
@@ -25,16 +25,23 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
     cloud::refuse(&args.input)?;
     let log = progress.log();
     if args.points {
-        return points(args, limits, &log);
+        return decoded_points(args, limits, &log);
     }
     let (input, to) = (&args.input, &args.output);
     let format = convert::output_format(to, args.format)?;
     let mut written = 0;
     let mut write = |gaussians: &Gaussians, log: &Log| {
         written = gaussians.len();
-        convert::write(gaussians, Axes::Ply, format, to, log)
+        let known = cloud::known_axes(input);
+        let axes = match args.up.map_or(known.up, |up| up.up().or(known.up)) {
+            _ if args.keep_axes => Axes::of(format),
+            Some(up) => Axes::Cloud(up),
+            None => Axes::Ply,
+        };
+        convert::write(gaussians, axes, &known, format, to, log)
     };
     let chosen = if let Some(bytes) = keep::stream(&args.budget, input, limits)? {
+        cloud::remember(&bytes);
         let (budget, start) = (&args.budget, Instant::now());
         let kept = keep::decode(budget, input, &bytes, &args.model, limits, &log)?;
         let told = kept.describe(start.elapsed());
@@ -81,7 +88,7 @@ fn said(args: &Decode, chosen: &str, written: usize, thing: &str, log: &Log) -> 
 }
 
 /// Decodes a stream into a file of points.
-fn points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
+fn decoded_points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
     let bytes = load::bytes(&args.input, limits)?;
     kinds::check_stream(&args.input, &bytes)?;
     let bytes = load::whole_levels(&args.input, bytes, &args.detail, limits)?;
@@ -98,19 +105,6 @@ fn points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
     let voxels = voxels.ok_or_else(|| Failure(format!("{}: no level is complete", args.input.display())))?;
     let (written, to): (usize, &Path) = (voxels.voxels.len(), &args.output);
     let encoded = cloud::encoded(&voxels, &cloud::axes(&bytes), to, args.write)?;
-    let write = |path: &Path, bytes: &[u8]| {
-        manners::write(path, |w| {
-            w.write_all(bytes).map_err(|source| b2p::Error::Io {
-                path: path.to_path_buf(),
-                source,
-            })
-        })
-    };
-    log.step("write points", written, "points", || Ok(write(to, &encoded.bytes)))??;
-    if let Some(text) = encoded.sidecar.as_ref().filter(|_| !manners::is_pipe(to)) {
-        let path = cloud::sidecar(to);
-        manners::permit(&[&path], &[&args.input])?;
-        write(&path, text.as_bytes())?;
-    }
+    points::write(&encoded, written, to, log)?;
     Ok(said(args, "", written, "point", log))
 }

@@ -19,10 +19,12 @@ mod load;
 mod manners;
 mod picture;
 mod pipe;
+mod points;
 mod progress;
 mod render;
 mod serve;
 mod sheet;
+mod sidecar;
 mod table;
 mod turntable;
 mod values;
@@ -104,6 +106,13 @@ const BROKEN_PIPE: u8 = 128 + 13;
 fn main() -> ExitCode {
     let cli = parse();
     manners::set(&cli);
+    let usual = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        // Readers of other crates may panic on damaged files, which becomes an error.
+        if !b2p_formats::clouds::is_guarded() {
+            usual(panic);
+        }
+    }));
     let interrupted = ctrlc::set_handler(|| {
         output::remove_unfinished();
         std::process::exit(130);

@@ -20,7 +20,7 @@ mod stream;
 mod transform;
 mod writer;
 
-pub use axes::{axes, axes_bytes, with_axes};
+pub use axes::{axes, axes_bytes, source_bytes, source_points, with_axes, with_source};
 pub use header::{Format, Header, MAGIC, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Section, version};
 pub use reader::{Reader, put_varint};
 pub use stream::{Geometry, Level, Slice, Stream};
