@@ -8,7 +8,7 @@ use b2p::gaussians::HeadSet;
 use b2p::{Error, Result};
 
 use super::calibration::Calibration;
-use super::costs::{PictureSize, decibels};
+use super::costs::{PictureSize, score};
 
 /// A time is promised only if the estimate, so many times and with so many nanoseconds more, keeps it: in short tasks
 /// it shows when a thread wakes late, or a page is long in coming.
@@ -41,7 +41,7 @@ pub struct Choice {
     /// Time of the task.
     pub expected: Duration,
     /// How good pictures are.
-    decibels: f64,
+    score: f64,
 }
 
 impl Choice {
@@ -93,7 +93,7 @@ pub fn choices(
                 level,
                 heads: cost.heads,
                 expected,
-                decibels: decibels(above, cost.heads),
+                score: score(above, cost.heads),
             }));
         }
     }
@@ -107,7 +107,7 @@ pub fn choices(
 pub fn choose(all: &[Choice], time: Duration) -> Option<Choice> {
     let better = |a: &&Choice, b: &&Choice| -> Ordering {
         let faster = || b.expected.cmp(&a.expected);
-        a.decibels.total_cmp(&b.decibels).then_with(faster)
+        a.score.total_cmp(&b.score).then_with(faster)
     };
     let fitting = all.iter().filter(|choice| choice.fits(time));
     let fastest = || all.iter().min_by_key(|choice| choice.expected);
@@ -206,16 +206,16 @@ mod tests {
     fn more_time_is_never_used_for_a_worse_picture() {
         for task in [Task::Decode, PICTURE] {
             let all = choices(&calibration(), &header(), &[7, 8, 9], None, task).unwrap();
-            let mut before = 0.0;
+            let mut before = f64::MIN;
             for time in 1..1000 {
                 let time = Duration::from_millis(time);
                 let choice = choose(&all, time).unwrap();
                 if choice.fits(time) {
-                    assert!(choice.decibels >= before, "{time:?}: {choice:?}");
-                    before = choice.decibels;
+                    assert!(choice.score >= before, "{time:?}: {choice:?}");
+                    before = choice.score;
                 }
             }
-            assert!(before > 0.0);
+            assert!(before > f64::MIN);
         }
     }
 

@@ -1,7 +1,8 @@
 //! What decoding and drawing cost, measured as a process that does it once has it: threads have just started, memory is
 //! fresh from the system, networks and renderers are new.
 //!
-//! Everything is measured in rounds, and the least time counts: whatever else the machine does only adds to it.
+//! Everything is measured in rounds, and the least time counts: whatever else the machine does only adds to it. Time in
+//! which threads waited for a processor does not count at all, where the system tells it.
 
 use std::time::{Duration, Instant};
 
@@ -154,18 +155,53 @@ fn calibration(
     Ok(calibration)
 }
 
-/// Nanoseconds of `run`, with new threads and fresh memory, and its result.
+/// Nanoseconds of `run`, with new threads and fresh memory, and its result. Time in which its threads could have run, but
+/// other programs did, is taken out.
 fn cold<T: Send>(run: impl FnOnce() -> Result<T> + Send) -> Result<(f64, T)> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(rayon::current_num_threads());
     let pool = pool
         .build()
         .map_err(|e| Error::Usage(format!("no threads to calibrate with: {e}")))?;
     give_back();
-    pool.install(|| {
+    let before = pool.broadcast(|_| Scheduled::now());
+    let (time, made) = pool.install(|| {
         let start = Instant::now();
         let made = run()?;
-        Ok((start.elapsed().as_nanos() as f64, made))
-    })
+        Result::Ok((start.elapsed().as_nanos() as f64, made))
+    })?;
+    let after = pool.broadcast(|_| Scheduled::now());
+    Ok((time * undisturbed(&before, &after), made))
+}
+
+/// How long a thread has run and waited for a processor, in nanoseconds.
+#[derive(Clone, Copy, Default)]
+struct Scheduled {
+    ran: u64,
+    waited: u64,
+}
+
+impl Scheduled {
+    /// Of the thread that asks; zeros where the system does not tell.
+    fn now() -> Scheduled {
+        let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
+        let mut numbers = text.split_ascii_whitespace().map(|n| n.parse().unwrap_or_default());
+        let mut next = || numbers.next().unwrap_or_default();
+        Scheduled {
+            ran: next(),
+            waited: next(),
+        }
+    }
+}
+
+/// The share of the time that these threads had a processor when they asked for one: with fewer other programs they would
+/// have taken so much of it.
+fn undisturbed(before: &[Scheduled], after: &[Scheduled]) -> f64 {
+    let sum = |of: fn(&Scheduled) -> u64| {
+        let [before, after] = [before, after].map(|all| all.iter().map(of).sum::<u64>());
+        after.saturating_sub(before) as f64
+    };
+    let (ran, waited) = (sum(|s| s.ran), sum(|s| s.waited));
+    if ran > 0.0 { ran / (ran + waited) } else { 1.0 }
 }
 
 fn camera(side: u32) -> Result<Camera> {
@@ -183,3 +219,16 @@ fn draw(sample: &Sample<'_>, gaussians: &Gaussians, side: u32) -> Result<f64> {
     Ok(time)
 }
 
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_that_other_programs_took_is_taken_out() {
+        let of = |ran, waited| Scheduled { ran, waited };
+        let before = [of(100, 50), of(200, 0)];
+        assert_eq!(undisturbed(&before, &[of(200, 50), of(300, 0)]), 1.0);
+        assert_eq!(undisturbed(&before, &[of(200, 150), of(300, 100)]), 0.5);
+        assert_eq!(undisturbed(&[of(0, 0)], &[of(0, 0)]), 1.0, "where nothing is known");
+    }
+}
