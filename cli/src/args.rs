@@ -299,7 +299,13 @@ pub struct Render {
     #[arg(long, help_heading = "Advanced", value_name = "NAME=on|off|auto", value_parser = effect, help = effect_help())]
     pub effect: Vec<(Effect, EffectMode)>,
     /// How much of what is faint may be left out: fast, fine, exact
-    #[arg(long, help_heading = "Advanced", value_name = "NAME", default_value = "fine", conflicts_with = "budget")]
+    #[arg(
+        long,
+        help_heading = "Advanced",
+        value_name = "NAME",
+        default_value = "fine",
+        conflicts_with = "budget"
+    )]
     pub quality: Quality,
     /// The same as --json
     #[arg(long, hide = true, value_enum, value_name = "FORMAT")]

@@ -44,10 +44,18 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
     let mut took = Duration::ZERO;
     // What has gone to standard output cannot be replaced by something finer.
     let early = !manners::is_pipe(to);
-    pipe::each(input, detail, &args.model, limits, early, &log, &mut |gaussians, log| {
-        took = log.steps().iter().map(|step| step.time).sum();
-        write(gaussians, log)
-    })?;
+    pipe::each(
+        input,
+        detail,
+        &args.model,
+        limits,
+        early,
+        &log,
+        &mut |gaussians, log| {
+            took = log.steps().iter().map(|step| step.time).sum();
+            write(gaussians, log)
+        },
+    )?;
     let chosen = match chosen {
         Some(chosen) => chosen.describe(took, limits, progress)?,
         None => String::new(),

@@ -79,10 +79,7 @@ fn a_budget_chooses_says_so_and_measures_once() {
     assert!(kept() != first, "measured again");
 
     let render = ["render", "ball.b2p", "-o", "a.png", "--size", "64x48"];
-    let drawn = succeeds(
-        at,
-        &[&render[..], &model, &["--budget", "1000s"]].concat(),
-    );
+    let drawn = succeeds(at, &[&render[..], &model, &["--budget", "1000s"]].concat());
     let line = drawn.lines().find(|line| line.starts_with("budget: level 5, "));
     assert!(line.is_some_and(|l| l.contains("; kept: ")), "{drawn}");
 }
@@ -176,11 +173,19 @@ fn streams_of_version_3_have_budgets_and_a_calibration_that_is_plainly_off_is_me
     let surfels = decode(&["1000s", "--heads", "surfels"]);
     assert!(surfels.starts_with("budget: level 6, surfels, expected "), "{surfels}");
     let hopeless = decode(&["0.001ms"]);
-    assert!(hopeless.starts_with("budget: level 4, surfels, expected "), "{hopeless}");
+    assert!(
+        hopeless.starts_with("budget: level 4, surfels, expected "),
+        "{hopeless}"
+    );
     assert!(hopeless.contains("; no setting fits 0.0 ms; took "), "{hopeless}");
-    let render = ["render", "ball.b2p", "-o", "x.png", "--size", "48x32", "--budget", "1000s"];
+    let render = [
+        "render", "ball.b2p", "-o", "x.png", "--size", "48x32", "--budget", "1000s",
+    ];
     let drawn = succeeds(at, &render);
-    assert!(drawn.contains("budget: level 4, best, "), "what is finer is not seen: {drawn}");
+    assert!(
+        drawn.contains("budget: level 4, best, "),
+        "what is finer is not seen: {drawn}"
+    );
 
     // As if everything took a tenth of a second a voxel.
     let path = kept_calibration(at);

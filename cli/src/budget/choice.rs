@@ -98,7 +98,9 @@ pub fn choices(
         }
     }
     match all.is_empty() {
-        true => Err(Error::Usage("no heads of a budget draw the levels of this stream".into())),
+        true => Err(Error::Usage(
+            "no heads of a budget draw the levels of this stream".into(),
+        )),
         false => Ok(all),
     }
 }
@@ -161,7 +163,11 @@ mod tests {
             isa: "scalar".into(),
             threads: 2,
             model: String::new(),
-            exact: Curve([[1e4, 10.0], [5e4, 30.0], [2e5, 80.0]].map(|[n, ms]| [n, ms * MS]).into()),
+            exact: Curve(
+                [[1e4, 10.0], [5e4, 30.0], [2e5, 80.0]]
+                    .map(|[n, ms]| [n, ms * MS])
+                    .into(),
+            ),
             heads: vec![
                 heads(HeadSet::Best, true, &[[1e4, 10.0], [5e4, 50.0]]),
                 heads(HeadSet::Surfels, true, &[[1e4, 1.0], [5e4, 5.0]]),
@@ -199,7 +205,10 @@ mod tests {
     #[test]
     fn a_time_that_nothing_keeps_gives_the_fastest() {
         assert_eq!(chosen(5, None, Task::Decode), (7, HeadSet::Surfels, 11, false));
-        assert_eq!(chosen(5, Some(HeadSet::Best), Task::Decode), (7, HeadSet::Best, 20, false));
+        assert_eq!(
+            chosen(5, Some(HeadSet::Best), Task::Decode),
+            (7, HeadSet::Best, 20, false)
+        );
     }
 
     #[test]

@@ -12,8 +12,8 @@ const SCORES: [[f64; 3]; 4] = [
     [53.6, 50.3, 36.7],
     [27.5, 22.2, 0.4],
 ];
-/// What each further level costs.
-const STEP: f64 = 25.0;
+/// What each further level is taken to cost: about as much as those before it.
+const STEP: f64 = 30.0;
 
 /// How good pictures are: of a level so many above that of the cloud, with these heads.
 pub fn score(above: u8, heads: HeadSet) -> f64 {
@@ -93,7 +93,11 @@ impl PictureCost {
         let more = sizes[1].covered - sizes[0].covered;
         // No more than the smaller picture took, or its Gaussians would cost less than nothing.
         let most = few / sizes[0].covered.max(1.0);
-        let per_covered = if more > 0.0 { ((many - few) / more).clamp(0.0, most) } else { 0.0 };
+        let per_covered = if more > 0.0 {
+            ((many - few) / more).clamp(0.0, most)
+        } else {
+            0.0
+        };
         PictureCost {
             per_gaussian: (few - per_covered * sizes[0].covered) / gaussians.max(1.0),
             per_pixel,
@@ -137,7 +141,10 @@ mod tests {
         curve.push(20.0, 400.0);
         curve.push(20.0, 9000.0);
         let at = |voxels| curve.of(voxels).unwrap();
-        assert_eq!([5.0, 10.0, 15.0, 20.0, 40.0].map(at), [50.0, 100.0, 250.0, 400.0, 800.0]);
+        assert_eq!(
+            [5.0, 10.0, 15.0, 20.0, 40.0].map(at),
+            [50.0, 100.0, 250.0, 400.0, 800.0]
+        );
     }
 
     #[test]

@@ -219,10 +219,7 @@ impl Chosen {
 
     fn words(&self, took: Duration) -> String {
         let Choice {
-            level,
-            heads,
-            expected,
-            ..
+            level, heads, expected, ..
         } = self.choice;
         let [expected, took_ms, time] = [expected, took, self.time].map(milliseconds);
         let told = match (self.choice.fits(self.time), took <= self.time) {

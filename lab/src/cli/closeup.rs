@@ -76,8 +76,15 @@ impl Args {
         }
         let rates = rates.join(" | ");
         let label = |(heads, pictures): &(HeadSet, Vec<Picture>)| {
-            let first = if *heads == HeadSet::Best { "mesh" } else { "exact voxels" };
-            (format!("{first} | {rates} bits per point, {heads}"), pictures.iter().collect())
+            let first = if *heads == HeadSet::Best {
+                "mesh"
+            } else {
+                "exact voxels"
+            };
+            (
+                format!("{first} | {rates} bits per point, {heads}"),
+                pictures.iter().collect(),
+            )
         };
         let rows = rows.iter().map(|row| {
             let (label, pictures) = label(row);

@@ -174,7 +174,11 @@ fn multiply(x: &[f64], weights: &[f64], out: &mut [f64]) {
 
 fn luma_chroma([r, g, b]: [u8; 3]) -> [f64; 3] {
     let [r, g, b] = [r, g, b].map(f64::from);
-    [(r + 2.0 * g + b) / 512.0 - 1.0, (r - b) / 128.0, (g - (r + b) / 2.0) / 128.0]
+    [
+        (r + 2.0 * g + b) / 512.0 - 1.0,
+        (r - b) / 128.0,
+        (g - (r + b) / 2.0) / 128.0,
+    ]
 }
 
 fn activated(raw: &Rows, count: usize, blur: f64, input: &LevelInput<'_>, frame: Frame) -> Gaussians {
@@ -194,7 +198,11 @@ fn activated(raw: &Rows, count: usize, blur: f64, input: &LevelInput<'_>, frame:
         let corner = voxels.coordinate(i).map(|v| f64::from(v) * voxel - 1.0);
         let decoded = input.colours[i].map(|v| f64::from(v) / 255.0);
         for (octant, raw) in raw.chunks_exact(RAW).enumerate() {
-            let opacity = if count == 8 { 1.0 / (1.0 + (-raw[10] - 2.0).exp()) } else { 1.0 };
+            let opacity = if count == 8 {
+                1.0 / (1.0 + (-raw[10] - 2.0).exp())
+            } else {
+                1.0
+            };
             if opacity < 1.0 / 255.0 {
                 continue;
             }
@@ -264,7 +272,9 @@ mod tests {
         let model = HeadsModel::from_bytes(embedded::HEADS).unwrap();
         for set in [(Heads::Best, 1), (Heads::Best, 8), (Heads::Quick, 1), (Heads::Quick, 8)] {
             let frame = Frame::default();
-            let f16 = model.generate(Isa::detect(), Precision::F16, set, input, frame).unwrap();
+            let f16 = model
+                .generate(Isa::detect(), Precision::F16, set, input, frame)
+                .unwrap();
             let double = generate(embedded::HEADS, set, &input, frame).unwrap();
             assert_eq!((f16.len(), f16.blur), (double.len(), double.blur), "{set:?}");
             let apart = |a: &[[f32; 3]], b: &[[f32; 3]]| {

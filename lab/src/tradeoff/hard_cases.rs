@@ -3,8 +3,8 @@
 use b2p::Isa;
 use serde::Serialize;
 
-use super::double;
 use super::MeasuredInput;
+use super::double;
 use super::scenes::{Random, Scene, hard_scenes};
 use super::setting::QUALITIES;
 use b2p::Result;
@@ -127,7 +127,9 @@ fn heads_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
     let cases: [(&str, &Voxels, Colours); 5] = [
         ("one grey", &ball, &|n, m| (grey(n), grey(m), 1.0)),
         ("random extremes", &ball, &|n, m| (extremes(n), extremes(m), 16.0)),
-        ("white below black", &ball, &|n, m| (vec![[255; 3]; n], vec![[0; 3]; m], 16.0)),
+        ("white below black", &ball, &|n, m| {
+            (vec![[255; 3]; n], vec![[0; 3]; m], 16.0)
+        }),
         ("random extremes, the coarsest step", &ball, &|n, m| {
             (extremes(n), extremes(m), 65_536.0)
         }),

@@ -1,11 +1,11 @@
 //! The report as one HTML page that needs nothing else.
 
+use super::TruthKind;
 use super::effects::EffectCost;
 use super::hard_cases::{BOUND, HardCase};
 use super::plot::{decibel, escaped, plot};
 use super::report::{Report, Row, STAGES};
 use super::setting::Knob;
-use super::TruthKind;
 use b2p::Result;
 use b2p::metrics::{Spread, Verdict};
 use b2p::renderer::Image;
@@ -116,7 +116,11 @@ fn table(rows: &[Row]) -> String {
     let mut html = format!(
         "<div class=\"wide\"><table><tr><th>setting</th><th>decode, ms</th><th>picture, ms</th><th>both, ms</th><th>computation, dB</th>\
          <th>MS-SSIM</th><th>worst</th>{}<th>MB at most</th></tr>\n",
-        if has_truth { "<th>truth, dB</th><th>SSIMULACRA2</th>" } else { "" }
+        if has_truth {
+            "<th>truth, dB</th><th>SSIMULACRA2</th>"
+        } else {
+            ""
+        }
     );
     for row in rows {
         // The default is the same as itself.

@@ -112,7 +112,13 @@ fn draw(panel: &Panel, report: &Report, left: f64) -> String {
             TOP + HEIGHT + 16.0
         );
     }
-    let step = if high - low > 40.0 { 10 } else if high - low > 15.0 { 5 } else { 2 };
+    let step = if high - low > 40.0 {
+        10
+    } else if high - low > 15.0 {
+        5
+    } else {
+        2
+    };
     let from = (low / f64::from(step)).ceil() as i32 * step;
     for db in (from..=high as i32).step_by(step as usize) {
         svg += &format!(

@@ -192,10 +192,18 @@ impl<'a> Run<'a> {
     pub fn choices(subject: &MeasuredInput<'_>) -> Result<Choices> {
         let levels = subject.decoder()?.levels(subject.stream)?;
         let heads: Vec<HeadSet> = match subject.is_learned() {
-            true => Model::from_bytes(subject.model)?.shape().heads().into_iter().map(HeadSet::from).collect(),
+            true => Model::from_bytes(subject.model)?
+                .shape()
+                .heads()
+                .into_iter()
+                .map(HeadSet::from)
+                .collect(),
             false => {
                 let model = HeadsModel::from_bytes(subject.model)?;
-                let has = |set: &HeadSet| set.learned().is_none_or(|own| model.sets().any(|(heads, _)| heads == own));
+                let has = |set: &HeadSet| {
+                    set.learned()
+                        .is_none_or(|own| model.sets().any(|(heads, _)| heads == own))
+                };
                 HeadSet::ALL.into_iter().filter(has).collect()
             }
         };

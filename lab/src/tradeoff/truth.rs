@@ -44,7 +44,9 @@ fn heads_in_double(subject: &MeasuredInput<'_>, header: &Header, level: u8) -> R
     let start = Instant::now();
     let made = decoding.with_heads_input(|input| {
         let made = double::generate(subject.model, (Heads::Best, count), &input, drawn.frame);
-        let others = input.without.map_or(0, |without| without.iter().filter(|w| **w).count());
+        let others = input
+            .without
+            .map_or(0, |without| without.iter().filter(|w| **w).count());
         made.map(|made| (made, others * if count == 8 { 4 } else { 1 }))
     });
     let took = start.elapsed().as_secs_f64() * 1e3;
@@ -147,7 +149,15 @@ pub fn of_cloud(cloud: &ColouredVoxels) -> Result<Gaussians> {
     };
     let (voxels, colours) = (&cloud.voxels, &cloud.colours);
     let choice = SurfelSelection::ALL;
-    Ok(surfels(Isa::detect(), voxels, &map, colours, PerVoxel::One, choice, frame))
+    Ok(surfels(
+        Isa::detect(),
+        voxels,
+        &map,
+        colours,
+        PerVoxel::One,
+        choice,
+        frame,
+    ))
 }
 
 #[cfg(test)]
@@ -197,6 +207,10 @@ mod tests {
         assert_eq!((mesh.width, mesh.height), (96, 80));
         let red = mesh.pixels.iter().filter(|p| p[1] < 0.5).count();
         assert!(red > 300 && red < 96 * 80 / 2, "{red}");
-        assert!(pixels_apart(&mesh, &drawn).0 < 0.01, "{}", pixels_apart(&mesh, &drawn).0);
+        assert!(
+            pixels_apart(&mesh, &drawn).0 < 0.01,
+            "{}",
+            pixels_apart(&mesh, &drawn).0
+        );
     }
 }
