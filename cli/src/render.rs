@@ -126,7 +126,7 @@ struct Drawing<'a> {
     args: &'a Render,
     limits: &'a Limits,
     detail: Option<Explanation>,
-    /// What was chosen for a budget, how long it took to decode, and who is told of a calibration.
+    /// What was chosen for a budget, how long it took to decode, and what shows a calibration.
     chosen: Option<(&'a Chosen, Duration, &'a Progress)>,
 }
 

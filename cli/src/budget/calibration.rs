@@ -21,7 +21,7 @@ const LEAST_AGE: Duration = Duration::from_secs(600);
 
 /// What it was measured with.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Subject {
+pub struct CalibrationKey {
     /// Instructions.
     pub isa: String,
     /// A name for model and stream.
@@ -85,14 +85,14 @@ impl Calibration {
 
     /// Where the user's calibration for a model and a number of threads is kept: under `XDG_CACHE_HOME`, or `.cache` at
     /// home. None where neither is known.
-    pub fn path(subject: &Subject) -> Option<PathBuf> {
+    pub fn path(key: &CalibrationKey) -> Option<PathBuf> {
         let absolute = |name: &str| {
             let path = PathBuf::from(std::env::var_os(name)?);
             path.is_absolute().then_some(path)
         };
         let cache = absolute("XDG_CACHE_HOME").or_else(|| Some(absolute("HOME")?.join(".cache")))?;
-        let (isa, threads) = (&subject.isa, rayon::current_num_threads());
-        let name = format!("calibration-{}-{isa}-{threads}.json", subject.model);
+        let (isa, threads) = (&key.isa, rayon::current_num_threads());
+        let name = format!("calibration-{}-{isa}-{threads}.json", key.model);
         Some(cache.join("b2p").join(name))
     }
 
@@ -103,9 +103,9 @@ impl Calibration {
         age.is_none_or(|age| age >= LEAST_AGE)
     }
 
-    /// What was kept at `path`, if it is of this machine, this version of the program, this subject, and as many threads
+    /// What was kept at `path`, if it is of this machine, this version of the program, this key, and as many threads
     /// as there are now. Anything else is none, whatever it is.
-    pub fn load(path: &Path, subject: &Subject) -> Option<Calibration> {
+    pub fn load(path: &Path, key: &CalibrationKey) -> Option<Calibration> {
         let about = std::fs::metadata(path).ok()?;
         if !about.is_file() || about.len() > MOST_BYTES {
             return None;
@@ -115,9 +115,9 @@ impl Calibration {
         file.take(MOST_BYTES).read_to_end(&mut bytes).ok()?;
         let found: Calibration = serde_json::from_slice(&bytes).ok()?;
         let fits = found.machine == Machine::this()
-            && found.isa == subject.isa
+            && found.isa == key.isa
             && found.threads == rayon::current_num_threads()
-            && found.model == subject.model;
+            && found.model == key.model;
         (fits && found.is_sound()).then_some(found)
     }
 
@@ -151,8 +151,8 @@ impl Calibration {
 mod tests {
     use super::*;
 
-    fn subject() -> Subject {
-        Subject {
+    fn key() -> CalibrationKey {
+        CalibrationKey {
             isa: "scalar".into(),
             model: "ab12".into(),
         }
@@ -181,7 +181,7 @@ mod tests {
         let path = folder.path().join("b2p").join("c.json");
         let kept = calibration();
         kept.save(&path).unwrap();
-        assert_eq!(Calibration::load(&path, &subject()), Some(kept));
+        assert_eq!(Calibration::load(&path, &key()), Some(kept));
     }
 
     #[test]
@@ -213,7 +213,7 @@ mod tests {
             let mut kept = calibration();
             spoil(&mut kept);
             kept.save(&path).unwrap();
-            assert_eq!(Calibration::load(&path, &subject()), None, "{i}");
+            assert_eq!(Calibration::load(&path, &key()), None, "{i}");
         }
     }
 
@@ -221,7 +221,7 @@ mod tests {
     fn whatever_lies_in_the_cache_is_no_calibration_and_no_harm() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("c.json");
-        let load = |path: &Path| Calibration::load(path, &subject());
+        let load = |path: &Path| Calibration::load(path, &key());
         assert_eq!(load(&path), None, "nothing");
         assert_eq!(load(folder.path()), None, "a folder");
         let kept = serde_json::to_string(&calibration()).unwrap();

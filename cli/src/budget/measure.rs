@@ -13,7 +13,7 @@ use b2p::renderer::Renderer;
 use b2p::renderer::camera::Camera;
 use b2p::{Decoder, Error, Isa, Limits, Result};
 
-use super::calibration::{Calibration, HeadsCost, Subject};
+use super::calibration::{Calibration, CalibrationKey, HeadsCost};
 use super::costs::{Curve, PictureCost, PictureSize};
 
 /// Rounds, unless they take longer than [`PATIENCE`]: then at least two.
@@ -55,7 +55,7 @@ struct LevelTimes {
 ///
 /// # Errors
 /// Those of decoding and drawing; [`Error::Usage`] if threads cannot be started.
-pub fn measure(sample: &Sample<'_>, subject: Subject, say: &dyn Fn(&str)) -> Result<Calibration> {
+pub fn measure(sample: &Sample<'_>, key: CalibrationKey, say: &dyn Fn(&str)) -> Result<Calibration> {
     let header = Header::parse(sample.stream, sample.limits)?;
     let least = Least {
         generate: f64::MAX,
@@ -82,7 +82,7 @@ pub fn measure(sample: &Sample<'_>, subject: Subject, say: &dyn Fn(&str)) -> Res
         }
         empty = empty.min(draw(sample, &Gaussians::default(), SIDES[1])?);
     }
-    calibration(sample, subject, &header, &all, empty)
+    calibration(sample, key, &header, &all, empty)
 }
 
 /// One round of a level.
@@ -110,16 +110,16 @@ fn measure_level(sample: &Sample<'_>, times: &mut LevelTimes) -> Result<()> {
 /// What was measured, in terms of voxels, Gaussians and pixels.
 fn calibration(
     sample: &Sample<'_>,
-    subject: Subject,
+    key: CalibrationKey,
     header: &Header,
     all: &[LevelTimes],
     empty: f64,
 ) -> Result<Calibration> {
     let mut calibration = Calibration {
         machine: Machine::this(),
-        isa: subject.isa,
+        isa: key.isa,
         threads: rayon::current_num_threads(),
-        model: subject.model,
+        model: key.model,
         exact: Curve::default(),
         heads: Vec::new(),
     };

@@ -16,7 +16,7 @@ use b2p::latents::network::Model;
 use b2p::{Decoder, Isa, Limits, embedded};
 use clap::Args;
 
-use self::calibration::{Calibration, Subject};
+use self::calibration::{Calibration, CalibrationKey};
 use self::choice::Choice;
 pub use self::choice::Task;
 use self::measure::{Sample, measure};
@@ -134,12 +134,12 @@ impl Machine {
         })
     }
 
-    fn subject(&self) -> Subject {
+    fn key(&self) -> CalibrationKey {
         let mut hasher = DefaultHasher::new();
         self.model.hash(&mut hasher);
         // A stream of the user's is one of many, and as good as any other.
         self.version.hash(&mut hasher);
-        Subject {
+        CalibrationKey {
             isa: self.isa.to_string(),
             model: format!("{:016x}", hasher.finish()),
         }
@@ -147,13 +147,13 @@ impl Machine {
 
     /// What was kept, or what is measured now and kept where that is possible.
     fn calibration(&self, again: bool, limits: &Limits, progress: &Progress) -> Result<Calibration> {
-        let subject = self.subject();
-        let path = Calibration::path(&subject);
+        let key = self.key();
+        let path = Calibration::path(&key);
         let kept = path.as_deref().filter(|_| !again);
-        if let Some(kept) = kept.and_then(|path| Calibration::load(path, &subject)) {
+        if let Some(kept) = kept.and_then(|path| Calibration::load(path, &key)) {
             return Ok(kept);
         }
-        let calibration = self.measure(subject, limits, progress)?;
+        let calibration = self.measure(key, limits, progress)?;
         match path.map(|path| calibration.save(&path)) {
             None => manners::warn("no folder for the calibration is known, it is not kept"),
             Some(Err(error)) => manners::warn(&format!("the calibration is not kept: {error}")),
@@ -162,7 +162,7 @@ impl Machine {
         Ok(calibration)
     }
 
-    fn measure(&self, subject: Subject, limits: &Limits, progress: &Progress) -> Result<Calibration> {
+    fn measure(&self, key: CalibrationKey, limits: &Limits, progress: &Progress) -> Result<Calibration> {
         let decoder = || {
             let decoder = Decoder::new().with_isa(self.isa).with_limits(limits.clone());
             Ok(match self.version {
@@ -191,7 +191,7 @@ impl Machine {
             isa: self.isa,
             limits,
         };
-        Ok(measure(&sample, subject, &|step| progress.say(step))?)
+        Ok(measure(&sample, key, &|step| progress.say(step))?)
     }
 }
 
@@ -209,7 +209,7 @@ impl Chosen {
     /// expected, the machine is measured again, unless that was done a moment ago.
     pub fn describe(&self, took: Duration, limits: &Limits, progress: &Progress) -> Result<String> {
         let mut text = self.words(took);
-        let path = Calibration::path(&self.machine.subject());
+        let path = Calibration::path(&self.machine.key());
         if self.choice.is_off(took) && path.is_some_and(|path| Calibration::may_be_retaken(&path)) {
             self.machine.calibration(true, limits, progress)?;
             text += "budget: far from what was expected, the machine was measured again\n";

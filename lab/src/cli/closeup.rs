@@ -75,20 +75,16 @@ impl Args {
             }
         }
         let rates = rates.join(" | ");
-        let label = |(heads, pictures): &(HeadSet, Vec<Picture>)| {
+        let rows = rows.iter().map(|(heads, pictures)| {
             let first = if *heads == HeadSet::Best {
                 "mesh"
             } else {
                 "exact voxels"
             };
-            (
-                format!("{first} | {rates} bits per point, {heads}"),
-                pictures.iter().collect(),
-            )
-        };
-        let rows = rows.iter().map(|row| {
-            let (label, pictures) = label(row);
-            SheetRow { label, pictures }
+            SheetRow {
+                label: format!("{first} | {rates} bits per point, {heads}"),
+                pictures: pictures.iter().collect(),
+            }
         });
         let sheet = contact_sheet(&rows.collect::<Vec<_>>(), [0, 0, width as usize, height as usize]);
         write_bytes(&self.output, &sheet.to_png()?)
