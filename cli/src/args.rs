@@ -240,7 +240,7 @@ pub struct Decode {
     pub output: Output,
     /// Write the level's voxels with their colours instead, as points: PLY, or LAS, LAZ, PCD, E57 or XYZ by the ending (of learned
     /// streams there are none)
-    #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
+    #[arg(long, conflicts_with_all = ["heads", "budget", "calibrate"])]
     pub points: bool,
     /// Format of the Gaussians: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
     #[arg(long, value_name = "NAME", conflicts_with = "points")]
@@ -348,7 +348,13 @@ pub struct Render {
     #[arg(long, help_heading = "Advanced", value_name = "NAME=on|off|auto", value_parser = effect, help = effect_help())]
     pub effect: Vec<(Effect, EffectMode)>,
     /// How much of what is faint may be left out: fast, fine, exact
-    #[arg(long, help_heading = "Advanced", value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
+    #[arg(
+        long,
+        help_heading = "Advanced",
+        value_name = "NAME",
+        default_value = "fine",
+        conflicts_with = "budget"
+    )]
     pub quality: Quality,
     /// The same as --json
     #[arg(long, hide = true, value_enum, value_name = "FORMAT")]
@@ -532,8 +538,9 @@ pub struct ModelArg {
     pub precision: Option<String>,
 }
 
-use super::budget::BudgetArgs;
+use super::budget::{BudgetArgs, Request};
 use super::cloud::{ReadArgs, UpArg, WriteArgs, up};
+use super::progress::Progress;
 pub use super::values::Orbit;
 use super::values::{
     background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,
@@ -548,16 +555,24 @@ fn effect_help() -> String {
     format!("Force an effect ({names}) on or off")
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use clap::CommandFactory;
-
-    #[test]
-    fn the_command_line_is_consistent() {
-        Cli::command().debug_assert();
-    }
+macro_rules! budget_request {
+    ($($command:ident)*) => {$(
+        impl $command {
+            /// What a choice of level and heads is made for.
+            pub fn budget<'a>(&'a self, limits: &'a Limits, progress: &'a Progress) -> Request<'a> {
+                Request {
+                    args: &self.budget,
+                    detail: &self.detail,
+                    model: &self.model,
+                    limits,
+                    progress,
+                }
+            }
+        }
+    )*};
 }
+
+budget_request!(Decode Render);
 
 #[derive(Debug, Args)]
 pub struct Serve {
@@ -570,4 +585,15 @@ pub struct Serve {
     /// Address to listen at. Others than this machine's own let everybody in who can reach it
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1")]
     pub host: IpAddr,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
 }

@@ -1,9 +1,9 @@
 //! `b2p decode`: stream to Gaussians in a file.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use super::budget::Task;
+use super::budget::{Chosen, Task};
 use b2p::Limits;
 use b2p::container::version;
 use b2p::gaussians::Gaussians;
@@ -15,7 +15,7 @@ use super::args::Decode;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, cloud, convert, keep, kinds, load, pipe, points};
+use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points};
 
 /// Decodes a stream into a file of Gaussians.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
@@ -40,28 +40,31 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
         };
         convert::write(gaussians, axes, &known, format, to, log)
     };
-    let chosen = if let Some(bytes) = keep::stream(&args.budget, input, limits)? {
-        cloud::remember(&bytes);
-        let (budget, start) = (&args.budget, Instant::now());
-        let kept = keep::decode(budget, input, &bytes, &args.model, limits, &log)?;
-        let told = kept.describe(start.elapsed());
-        write(&kept.gaussians, &log)?;
-        told
-    } else {
-        let chosen = budget::choose(&args.budget, &args.model, input, Task::Decode, limits, progress)?;
-        let chosen_args = chosen.as_ref().map(|c| (c.detail(), c.model(&args.model)));
-        let (detail, model) = match &chosen_args {
-            Some((detail, model)) => (detail, model),
-            None => (&args.detail, &args.model),
-        };
-        let mut took = Duration::ZERO;
-        // What has gone to standard output cannot be replaced by something finer.
-        let early = !manners::is_pipe(to);
-        pipe::each(input, detail, model, limits, early, &log, &mut |gaussians, log| {
+    let stream = budget::stream(&args.budget, input, &args.detail, limits)?;
+    let chosen = match &stream {
+        Some(stream) => budget::choose(&args.budget(limits, progress), input, stream, None, Task::Decode)?,
+        None => None,
+    };
+    let detail = chosen.as_ref().map(Chosen::detail);
+    let detail = detail.as_ref().unwrap_or(&args.detail);
+    let mut took = Duration::ZERO;
+    // What has gone to standard output cannot be replaced by something finer.
+    let early = !manners::is_pipe(to);
+    pipe::each(
+        input,
+        detail,
+        &args.model,
+        limits,
+        early,
+        &log,
+        &mut |gaussians, log| {
             took = log.steps().iter().map(|step| step.time).sum();
             write(gaussians, log)
-        })?;
-        chosen.map_or(String::new(), |c| c.describe(Task::Decode, took))
+        },
+    )?;
+    let chosen = match chosen {
+        Some(chosen) => chosen.describe(took, limits, progress)?,
+        None => String::new(),
     };
     Ok(said(args, &chosen, written, "Gaussian", &log))
 }

@@ -12,7 +12,6 @@ mod decode;
 mod demo;
 mod encode;
 mod info;
-mod keep;
 mod kinds;
 mod knobs;
 mod load;

@@ -12,7 +12,7 @@ use crate::cloud::{ColouredVoxels, PointCloud};
 use crate::container::feed::Goal;
 use crate::container::{Format, Header, Stream};
 use crate::error::{Error, Result};
-use crate::gaussians::learned::{HeadsModel, LevelInput, Set};
+use crate::gaussians::learned::{HeadsModel, Set};
 use crate::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
 use crate::gaussians::{Frame, Gaussians};
 use crate::gaussians::{HeadMap, HeadSet, Heads};
@@ -404,16 +404,8 @@ impl Decoder {
             return discs(None);
         }
         let chosen = map_of_heads.and_then(|heads| heads.surfels(octree, level));
-        let input = LevelInput {
-            octree,
-            level,
-            map,
-            above: &above.map,
-            colours,
-            colours_above: &reached.colours_above(above),
-            luma_step: reached.coloured.steps().luma_step(),
-            without: chosen.as_deref(),
-        };
+        let colours_above = reached.colours_above(above);
+        let input = reached.heads_input(self.isa(), above, &colours_above, chosen.as_deref());
         let mut gaussians = model.generate(self.isa(), self.precision, set, input, frame)?;
         if let Some(chosen) = &chosen {
             gaussians.append(discs(Some(chosen))?);
