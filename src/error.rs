@@ -2,6 +2,10 @@
 
 use std::path::PathBuf;
 
+mod clause;
+
+pub(crate) use clause::feature;
+
 /// The result of everything in this crate that can fail.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
@@ -76,6 +80,8 @@ pub enum Error {
         expected: u32,
         /// The checksum of the bytes.
         found: u32,
+        /// The clause of `docs/format.md`.
+        clause: &'static str,
     },
     /// The stream was made with another model.
     #[error("the stream was coded with model {expected}, but model {found} is loaded")]
@@ -146,6 +152,8 @@ pub enum Error {
         value: String,
         /// What it may hold.
         expected: String,
+        /// The clause of `docs/format.md`; `None` unless it is a stream.
+        clause: Option<&'static str>,
     },
     /// Of the streams that the encoder may choose from, none is as small as was asked for. Coarser levels take less,
     /// and so does, of learned streams, a model that was trained for fewer bits.
@@ -183,6 +191,15 @@ impl Error {
             field: field.to_string(),
             value: value.to_string(),
             expected: expected.to_string(),
+            clause: None,
         }
+    }
+
+    /// The same [`Error::Malformed`] as a breach of this clause of `docs/format.md`.
+    pub(crate) fn breaks(mut self, rule: &'static str) -> Self {
+        if let Error::Malformed { clause, .. } = &mut self {
+            *clause = Some(rule);
+        }
+        self
     }
 }

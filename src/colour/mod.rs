@@ -125,7 +125,8 @@ pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Sli
             "chroma of the root",
             format!("{:?}", &root[1..]),
             "−255 to 255",
-        ));
+        )
+        .breaks("5.3.2"));
     }
     let mut coder = EntropyDecoder(Decoder::new(rest));
     let colours = trunk(isa, octree, maps, coding, root, &mut coder, |_| None);
@@ -202,7 +203,8 @@ pub fn decode_level(
             "number of colour slices",
             payloads.len(),
             ranges.len(),
-        ));
+        )
+        .breaks("3.3.2"));
     }
     let decode = |(range, payload): (Range<usize>, &Slice)| {
         cancel.check()?;
@@ -221,7 +223,8 @@ pub fn decode_level(
                 "steps",
                 format!("{:?}", coding.steps),
                 expected,
-            ));
+            )
+            .breaks("5.1.3"));
         }
         let (mut coder, mut model) = (EntropyDecoder(Decoder::new(rest)), above.model.clone());
         let coded = isa.run(CodeSlice {
@@ -337,7 +340,8 @@ fn read_coding<'a>(payload: &Slice<'a>, header: usize) -> Result<(Coding, &'a [u
             "steps",
             format!("{steps:?}"),
             expected,
-        ));
+        )
+        .breaks("5.2.1"));
     }
     Ok((Coding { steps, gain: head[2] }, rest))
 }

@@ -29,14 +29,15 @@ pub use writer::Writer;
 
 use crate::error::{Error, Stage};
 
-/// The error for data at byte `offset` that violates the format.
+/// The error for data at byte `offset` that violates a clause of the format.
 fn malformed(
+    clause: &'static str,
     offset: impl std::fmt::Display,
     field: impl ToString,
     value: impl ToString,
     expected: impl ToString,
 ) -> Error {
-    Error::malformed(Stage::Bitstream, format!("byte {offset}"), field, value, expected)
+    Error::malformed(Stage::Bitstream, format!("byte {offset}"), field, value, expected).breaks(clause)
 }
 
 #[cfg(test)]
