@@ -145,6 +145,8 @@ pub enum Command {
     Render(Render),
     /// Say what a stream holds
     Info(Info),
+    /// Say whether streams are valid, and where not, which clause of the format they break
+    Check(Check),
     /// Cut a stream after a level: a shorter stream
     Cut(Cut),
     /// Decode and draw the sample that comes with the program
@@ -250,6 +252,16 @@ pub struct Decode {
     pub model: ModelArg,
     #[command(flatten)]
     pub budget: BudgetArgs,
+}
+
+#[derive(Debug, Args)]
+pub struct Check {
+    /// Streams to check to the last bit. `-`: standard input
+    #[arg(value_name = "STREAM", required = true)]
+    pub inputs: Vec<PathBuf>,
+    /// Model of learned streams [default: the one inside the program]
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]

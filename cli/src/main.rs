@@ -5,6 +5,7 @@ mod args;
 mod bench;
 mod bench_render;
 mod budget;
+mod check;
 mod cloud;
 mod convert;
 mod cut;
@@ -147,6 +148,7 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Convert(args) => convert::run(args, &limits, &progress)?,
         Command::Render(args) => render::run(args, &limits, &progress)?,
         Command::Info(args) => info::run(args, &limits)?,
+        Command::Check(args) => check::run(args, &limits)?,
         Command::Cut(args) => cut::run(args, &limits)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,

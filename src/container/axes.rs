@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::limits::Limits;
 
 /// The type of the chunk.
-const AXES: u8 = 128;
+pub(super) const AXES: u8 = 128;
 
 /// What a stream says of its coordinates, which is nothing unless it has the chunk. The stream may be cut after the
 /// chunk.
@@ -77,7 +77,7 @@ pub fn axes_bytes(axes: &Axes) -> usize {
     }
 }
 
-fn form(header: &Header) -> Form {
+pub(super) fn form(header: &Header) -> Form {
     match header.format {
         Format::Learned { .. } => Form::Fixed,
         Format::Transform { .. } => Form::Short,

@@ -93,6 +93,8 @@ pub struct Chunks<'a> {
     form: Form,
     reader: Reader<'a>,
     end: usize,
+    /// Byte offset of the payload of the chunk read last.
+    payload_at: usize,
 }
 
 /// Form, type number and name of each kind.
@@ -181,7 +183,32 @@ impl<'a> Chunks<'a> {
             form,
             reader: Reader::new(&stream[..range.end], range.start),
             end: range.end,
+            payload_at: range.start,
         }
+    }
+
+    /// The next chunk, damaged or not, with its byte offset. Unlike the iterator it goes on behind a chunk that is
+    /// refused, as long as its length can be read.
+    pub(super) fn next_of_damaged(&mut self) -> Option<(usize, Result<Chunk<'a>>)> {
+        if self.reader.at() >= self.end {
+            return None;
+        }
+        let start = self.reader.at();
+        let chunk = self.read();
+        if matches!(chunk, Err(Error::Truncated { .. } | Error::Malformed { clause: Some("1.4.2"), .. })) {
+            self.end = start;
+        }
+        Some((start, chunk))
+    }
+
+    /// Byte offset of the checksum of the chunk read last.
+    pub(super) fn checksum_at(&self) -> usize {
+        self.payload_at - 4
+    }
+
+    /// Whether a chunk starts here, or the section ends.
+    pub(super) fn is_at_chunk(&self) -> bool {
+        self.clone().next().is_none_or(|chunk| chunk.is_ok())
     }
 
     fn read(&mut self) -> Result<Chunk<'a>> {
@@ -193,6 +220,7 @@ impl<'a> Chunks<'a> {
         let head = self.reader.since(start);
         let expected = self.reader.u32("chunk checksum")?;
         let payload_at = self.reader.at();
+        self.payload_at = payload_at;
         let payload = self.reader.take(length as usize, "chunk payload")?;
         let found = crc32c::crc32c_append(crc32c::crc32c(head), payload);
         if found != expected {

@@ -247,6 +247,13 @@ impl Header {
         }
     }
 
+    /// Byte offset of the checksum of the header that starts here, if its length can be known.
+    pub(crate) fn checksum_at(bytes: &[u8]) -> Option<usize> {
+        let format = read_version(&mut Reader::new(bytes, 0), bytes).ok()?;
+        let levels = bytes.get(22)?.checked_sub(*bytes.get(21)?)?;
+        Some(format.fixed_bytes() + 12 * (usize::from(levels) + 1))
+    }
+
     /// Parents per slice of colours; in version 2, that of the geometry.
     #[doc(hidden)]
     pub fn colour_slice(&self) -> u32 {
