@@ -147,6 +147,8 @@ pub enum Command {
     Info(Info),
     /// Say whether streams are valid, and where not, which clause of the format they break
     Check(Check),
+    /// Turn a stream of version 2 into one of version 3, which needs no model
+    Upgrade(Upgrade),
     /// Cut a stream after a level: a shorter stream
     Cut(Cut),
     /// Decode and draw the sample that comes with the program
@@ -262,6 +264,23 @@ pub struct Check {
     /// Model of learned streams [default: the one inside the program]
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct Upgrade {
+    /// Stream of version 2. `-`: standard input
+    #[arg(value_name = "IN")]
+    pub input: PathBuf,
+    #[command(flatten)]
+    pub output: Output,
+    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000 [default: 20]
+    #[arg(long, value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
+    pub step: Option<QualityTarget>,
+    /// Code the colours that the voxels are drawn in exactly, in 8 bits
+    #[arg(long)]
+    pub lossless: bool,
+    #[command(flatten)]
+    pub model: ModelArg,
 }
 
 #[derive(Debug, Args)]

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use b2p::container::{Header, Surveyed, version};
+use b2p::container::{Header, ScannedChunk, version};
 use b2p::decoder::{Checked, Fault};
 use b2p::latents::network::Model;
 use b2p::{Decoder, Error, Limits};
@@ -137,7 +137,10 @@ fn verdict(bytes: usize, checked: &Checked) -> String {
         Some(level) => format!("complete to level {level}"),
         None => "no level is complete".into(),
     };
-    let only_cut = checked.faults.iter().all(|fault| matches!(fault.error, Error::Truncated { .. }));
+    let only_cut = checked
+        .faults
+        .iter()
+        .all(|fault| matches!(fault.error, Error::Truncated { .. }));
     match checked.faults.len() {
         0 if checked.unchecked.is_some() => format!("not checked to the end: {to}"),
         0 if checked.valid_to == Some(header.top) => "valid".into(),
@@ -167,7 +170,10 @@ fn contents(header: &Header, checked: &Checked) -> String {
         }
         let kinds = kinds.iter().map(|(kind, number)| format!("{number} {kind}"));
         let kinds = kinds.collect::<Vec<_>>().join(", ");
-        text += &format!("  level {level}: {}; chunks: {kinds}\n", counted((*voxels).into(), "voxel"));
+        text += &format!(
+            "  level {level}: {}; chunks: {kinds}\n",
+            counted((*voxels).into(), "voxel")
+        );
     }
     text
 }
@@ -187,7 +193,7 @@ fn fault_text(checked: &Checked, fault: &Fault) -> String {
     format!("{place}: {}", fault.error)
 }
 
-fn chunk_text(chunk: &Surveyed) -> String {
+fn chunk_text(chunk: &ScannedChunk) -> String {
     format!("{} chunk of level {}, slice {}", chunk.kind, chunk.level, chunk.slice)
 }
 

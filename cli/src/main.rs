@@ -25,6 +25,7 @@ mod render;
 mod sheet;
 mod table;
 mod turntable;
+mod upgrade;
 mod values;
 mod views;
 
@@ -149,6 +150,7 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Render(args) => render::run(args, &limits, &progress)?,
         Command::Info(args) => info::run(args, &limits)?,
         Command::Check(args) => check::run(args, &limits)?,
+        Command::Upgrade(args) => upgrade::run(args, &limits, &progress)?,
         Command::Cut(args) => cut::run(args, &limits)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,

@@ -217,14 +217,9 @@ pub fn decode_level(
             } else {
                 "lossy, as in the level above"
             };
-            return Err(Error::malformed(
-                Stage::Colour,
-                at,
-                "steps",
-                format!("{:?}", coding.steps),
-                expected,
-            )
-            .breaks("5.1.3"));
+            return Err(
+                Error::malformed(Stage::Colour, at, "steps", format!("{:?}", coding.steps), expected).breaks("5.1.3"),
+            );
         }
         let (mut coder, mut model) = (EntropyDecoder(Decoder::new(rest)), above.model.clone());
         let coded = isa.run(CodeSlice {
@@ -334,14 +329,7 @@ fn read_coding<'a>(payload: &Slice<'a>, header: usize) -> Result<(Coding, &'a [u
     if !steps.is_valid() {
         let at = format!("byte {}", payload.offset);
         let expected = "luma 0 to 87 and chroma 0 to 87 or 254, or both 255";
-        return Err(Error::malformed(
-            Stage::Colour,
-            at,
-            "steps",
-            format!("{steps:?}"),
-            expected,
-        )
-        .breaks("5.2.1"));
+        return Err(Error::malformed(Stage::Colour, at, "steps", format!("{steps:?}"), expected).breaks("5.2.1"));
     }
     Ok((Coding { steps, gain: head[2] }, rest))
 }

@@ -195,7 +195,14 @@ impl<'a> Chunks<'a> {
         }
         let start = self.reader.at();
         let chunk = self.read();
-        if matches!(chunk, Err(Error::Truncated { .. } | Error::Malformed { clause: Some("1.4.2"), .. })) {
+        if matches!(
+            chunk,
+            Err(Error::Truncated { .. }
+                | Error::Malformed {
+                    clause: Some("1.4.2"),
+                    ..
+                })
+        ) {
             self.end = start;
         }
         Some((start, chunk))
@@ -296,7 +303,13 @@ impl<'a> Chunks<'a> {
         if !counts.contains(&chunk.count.into()) {
             let field = format!("voxel count of the {}", expected_chunk());
             let expected = format!("{} to {}", counts.start(), counts.end());
-            return Err(malformed(self.form.clause_of(kind), chunk.offset, field, chunk.count, expected));
+            return Err(malformed(
+                self.form.clause_of(kind),
+                chunk.offset,
+                field,
+                chunk.count,
+                expected,
+            ));
         }
         Ok(chunk)
     }
@@ -317,13 +330,25 @@ impl<'a> Chunks<'a> {
     ) -> Result<Chunk<'a>> {
         let Some(chunk) = self.next_critical()? else {
             let clause = self.form.clause_of(kind);
-            return Err(malformed(clause, self.end, "end of the section", "here", expected_chunk()));
+            return Err(malformed(
+                clause,
+                self.end,
+                "end of the section",
+                "here",
+                expected_chunk(),
+            ));
         };
         if chunk.kind == kind && fits(&chunk) {
             return Ok(chunk);
         }
         let found = format!("{} of level {}, slice {}", chunk.kind, chunk.level, chunk.slice);
-        Err(malformed(self.form.clause_of(kind), chunk.offset, "chunk", found, expected_chunk()))
+        Err(malformed(
+            self.form.clause_of(kind),
+            chunk.offset,
+            "chunk",
+            found,
+            expected_chunk(),
+        ))
     }
 
     /// The next critical chunk, without consuming it.
@@ -346,7 +371,13 @@ impl<'a> Chunks<'a> {
             None => Ok(()),
             Some(chunk) => {
                 let found = format!("a {} chunk", chunk.kind);
-                Err(malformed(clause, chunk.offset, "chunk after the section's last", found, "none"))
+                Err(malformed(
+                    clause,
+                    chunk.offset,
+                    "chunk after the section's last",
+                    found,
+                    "none",
+                ))
             }
         }
     }

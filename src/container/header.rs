@@ -243,7 +243,13 @@ impl Header {
         let end = self.stream_bytes();
         match length.saturating_sub(end) {
             0 => Ok(()),
-            rest => Err(malformed("2.1.1", end, "number of bytes after the last section", rest, 0)),
+            rest => Err(malformed(
+                "2.1.1",
+                end,
+                "number of bytes after the last section",
+                rest,
+                0,
+            )),
         }
     }
 
@@ -351,7 +357,13 @@ impl Header {
         let lengths = (self.voxels.len(), self.sections.len());
         if lengths != (levels, levels) {
             let value = format!("{lengths:?}");
-            return Err(malformed("2.2.2", fixed_bytes, "voxel counts and sections", value, levels));
+            return Err(malformed(
+                "2.2.2",
+                fixed_bytes,
+                "voxel counts and sections",
+                value,
+                levels,
+            ));
         }
         let mut allowed = 1..=1u64 << (3 * base);
         for (i, &count) in self.voxels.iter().enumerate() {

@@ -16,17 +16,17 @@ mod chunk;
 pub(crate) mod feed;
 mod header;
 mod reader;
+mod scan;
 mod stream;
-mod survey;
 mod transform;
 mod writer;
 
 pub use axes::{axes, axes_bytes, with_axes};
+pub use chunk::ChunkKind;
 pub use header::{Format, Header, MAGIC, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Section, version};
 pub use reader::{Reader, put_varint};
-pub use chunk::ChunkKind;
+pub use scan::{Note, Scan, ScannedChunk};
 pub use stream::{Geometry, Level, Slice, Stream};
-pub use survey::{Note, Survey, Surveyed};
 pub use transform::{ColourLevel, Colours, MAX_TRUNK_VOXELS, Trunk};
 pub use writer::Writer;
 

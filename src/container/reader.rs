@@ -1,4 +1,4 @@
-//! Reads little-endian numbers from bytes, with an error where they end early.
+//! Reads little-endian numbers from bytes, with an error where they end early (`docs/format.md`, clause 1.4).
 
 use super::malformed;
 use crate::error::{Error, Result, Stage};

@@ -1,4 +1,4 @@
-//! Splits a stream into its header and its complete levels.
+//! Splits a stream into its header and its complete levels (`docs/format.md`, clauses 2.1, 3.2 and 8.2).
 
 use super::chunk::{Chunk, ChunkKind, Chunks, Form};
 use super::header::{Format, Header};
@@ -333,7 +333,13 @@ fn take_features<'a>(
             let mut reader = Reader::new(chunk.payload, 0);
             let Ok(hash) = reader.u64("latent hash") else {
                 let field = "length of a level's first feature chunk";
-                return Err(malformed("8.2.2", chunk.offset, field, chunk.payload.len(), "8 or more"));
+                return Err(malformed(
+                    "8.2.2",
+                    chunk.offset,
+                    field,
+                    chunk.payload.len(),
+                    "8 or more",
+                ));
             };
             latent_hash = hash;
             hash_bytes = reader.at();

@@ -111,7 +111,10 @@ fn take_trunk<'a>(
 /// Offsets become those of the stream.
 fn in_trunk<T>(chunk: &Chunk, read: Result<T>, offset: usize) -> Result<T> {
     read.map_err(|error| {
-        if let Error::Malformed { field, value, expected, .. } = error {
+        if let Error::Malformed {
+            field, value, expected, ..
+        } = error
+        {
             return malformed("1.4.2", offset, field, value, expected);
         }
         let length = chunk.payload.len();

@@ -6,7 +6,7 @@ use super::stream::Decoder;
 use super::streaming::{Decoding, State};
 use crate::colour::Filter;
 use crate::container::feed::Goal;
-use crate::container::{Header, Level, Note, Survey, Surveyed};
+use crate::container::{Header, Level, Note, Scan, ScannedChunk};
 use crate::error::{Error, Result};
 use crate::geometry::{KernelMap, Octree, codec};
 
@@ -17,7 +17,7 @@ pub struct Checked {
     /// The header, if it can be read.
     pub header: Option<Header>,
     /// The chunks whose checksums are valid.
-    pub chunks: Vec<Surveyed>,
+    pub chunks: Vec<ScannedChunk>,
     /// Everything that breaks the format.
     pub faults: Vec<Fault>,
     /// What is unusual, and valid.
@@ -49,7 +49,7 @@ impl Checked {
     }
 
     /// The chunk in which a fault lies.
-    pub fn chunk_of(&self, fault: &Fault) -> Option<&Surveyed> {
+    pub fn chunk_of(&self, fault: &Fault) -> Option<&ScannedChunk> {
         let at = usize::try_from(fault.offset?).ok()?;
         self.chunks.iter().find(|chunk| (chunk.start..chunk.end).contains(&at))
     }
@@ -80,21 +80,27 @@ impl Decoder {
             return checked;
         };
         note_header(&header, &bytes, &mut checked.notes);
-        let survey = Survey::new(&bytes, &header);
-        checked.chunks = survey.chunks;
-        checked.notes.extend(survey.notes);
-        for (level, error) in survey.faults {
+        let scan = Scan::new(&bytes, &header);
+        checked.chunks = scan.chunks;
+        checked.notes.extend(scan.notes);
+        for (level, error) in scan.faults {
             checked.fault(Some(level), error);
         }
-        let bytes = survey.bytes;
+        let bytes = scan.bytes;
         let levels = read_levels(&bytes, &header, &mut checked);
         let whole = levels.iter().take_while(|level| level.is_some()).count();
         self.check_levels(&bytes, &header, &levels[..whole], &mut checked);
         if checked.valid_to.map_or(0, |level| usize::from(level - header.base) + 1) < whole {
             self.check_rest(&header, &levels[..whole], &mut checked);
         }
+        let start = header.bytes() as u64;
         checked.header = Some(header);
-        checked.faults.sort_by_key(|fault| (fault.level, fault.offset));
+        // In the order of the stream.
+        checked.faults.sort_by_key(|fault| match fault.level {
+            None if fault.offset >= Some(start) => (u8::MAX, None),
+            None => (0, fault.offset),
+            Some(level) => (1 + level, fault.offset.or(Some(u64::MAX))),
+        });
         checked
     }
 
@@ -218,10 +224,19 @@ fn note_header(header: &Header, bytes: &[u8], notes: &mut Vec<Note>) {
         });
     };
     if minor != 0 {
-        note(10, format!("minor version {minor}, of which this decoder knows nothing"));
+        note(
+            10,
+            format!("minor version {minor}, of which this decoder knows nothing"),
+        );
     }
     if header.optional_flags != 0 {
-        note(16, format!("optional flags {:#010x}, which this decoder ignores", header.optional_flags));
+        note(
+            16,
+            format!(
+                "optional flags {:#010x}, which this decoder ignores",
+                header.optional_flags
+            ),
+        );
     }
 }
 

@@ -13,6 +13,7 @@
 #[cfg(feature = "encoder")]
 #[path = "../common/mod.rs"]
 mod common;
+mod damage;
 mod digest;
 mod digest_transform;
 #[cfg(feature = "encoder")]

@@ -1,4 +1,4 @@
-//! All chunks of a stream, damaged ones too: what a check of the stream reports, and goes on with.
+//! All chunks of a stream, damaged ones too: what a check reports, and goes on with (`docs/format.md`, clause 15.3).
 
 use std::borrow::Cow;
 
@@ -13,7 +13,7 @@ const MAX_FAULTS: usize = 1000;
 
 /// A chunk with a valid checksum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Surveyed {
+pub struct ScannedChunk {
     /// The kind.
     pub kind: ChunkKind,
     /// The level whose section holds it.
@@ -41,21 +41,21 @@ pub struct Note {
 
 /// The chunks of a stream.
 #[derive(Debug)]
-pub struct Survey<'a> {
+pub struct Scan<'a> {
     /// The stream, in which damaged chunks that decoders skip have valid checksums: they hide nothing then.
     pub bytes: Cow<'a, [u8]>,
     /// The chunks whose checksums were valid.
-    pub chunks: Vec<Surveyed>,
+    pub chunks: Vec<ScannedChunk>,
     /// Damaged chunks, with the level of their section.
     pub faults: Vec<(u8, Error)>,
     /// What is unusual.
     pub notes: Vec<Note>,
 }
 
-impl<'a> Survey<'a> {
+impl<'a> Scan<'a> {
     /// Looks at all chunks of a stream with this header, each section by itself.
     pub fn new(bytes: &'a [u8], header: &Header) -> Self {
-        let mut survey = Survey {
+        let mut scan = Scan {
             bytes: Cow::Borrowed(bytes),
             chunks: Vec::new(),
             faults: Vec::new(),
@@ -65,11 +65,11 @@ impl<'a> Survey<'a> {
         for (level, section) in (header.base..).zip(&header.sections) {
             for (length, of_geometry) in [(section.geometry, true), (section.colours, false)] {
                 let end = at + u64::from(length);
-                survey.section(bytes, header, level, of_geometry, at..end);
+                scan.section(bytes, header, level, of_geometry, at..end);
                 at = end;
             }
         }
-        survey
+        scan
     }
 
     fn section(&mut self, bytes: &[u8], header: &Header, level: u8, of_geometry: bool, range: std::ops::Range<u64>) {
@@ -84,7 +84,7 @@ impl<'a> Survey<'a> {
             match chunk {
                 Ok(chunk) => {
                     let end = chunk.payload_at + chunk.payload.len();
-                    self.chunks.push(surveyed(&chunk, level, end));
+                    self.chunks.push(scanned(&chunk, level, end));
                     self.ancillary(&chunk, axes, map && chunk.level == level);
                     axes &= chunk.kind != ChunkKind::Ancillary(AXES) || Axes::from_bytes(chunk.payload).is_none();
                     map &= chunk.kind != ChunkKind::HeadMap || chunk.level != level;
@@ -137,8 +137,8 @@ impl<'a> Survey<'a> {
     }
 }
 
-fn surveyed(chunk: &Chunk, section: u8, end: usize) -> Surveyed {
-    Surveyed {
+fn scanned(chunk: &Chunk, section: u8, end: usize) -> ScannedChunk {
+    ScannedChunk {
         kind: chunk.kind,
         section,
         level: chunk.level,
