@@ -113,7 +113,11 @@ fn every_stream_of_the_suites_is_valid_as_is_a_prefix_that_ends_after_a_level() 
         let (bytes, decoder) = (crate::stream(&name), decoder(&name));
         let checked = decoder.check(&bytes);
         assert!(checked.is_valid(), "{name}: {checked:?}");
-        assert_eq!(checked.notes.is_empty(), !name.contains("notes-between-chunks"), "{name}: {checked:?}");
+        assert_eq!(
+            checked.notes.is_empty(),
+            !name.contains("notes-between-chunks"),
+            "{name}: {checked:?}"
+        );
         let header = checked.header.expect("a valid stream has a header");
         assert_eq!(checked.valid_to, Some(header.top), "{name}");
         for level in header.base..header.top {
