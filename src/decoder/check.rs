@@ -206,10 +206,8 @@ fn read_levels<'b>(bytes: &'b [u8], header: &Header, checked: &mut Checked) -> V
             }
         });
     }
-    if length > header.stream_bytes() {
-        if let Err(error) = header.check_end(length) {
-            checked.fault(None, error);
-        }
+    if let Err(error) = header.check_end(length) {
+        checked.fault(None, error);
     }
     levels
 }
