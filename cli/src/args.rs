@@ -146,6 +146,10 @@ pub enum Command {
     Render(Render),
     /// Say what a stream holds
     Info(Info),
+    /// Say whether streams are valid, and where not, which clause of the format they break
+    Check(Check),
+    /// Turn a stream of version 2 into one of version 3, which needs no model
+    Upgrade(Upgrade),
     /// Cut a stream after a level: a shorter stream
     Cut(Cut),
     /// Show streams in a web page, drawn by the browser without a GPU
@@ -260,6 +264,33 @@ pub struct Decode {
     pub model: ModelArg,
     #[command(flatten)]
     pub budget: BudgetArgs,
+}
+
+#[derive(Debug, Args)]
+pub struct Check {
+    /// Streams to check to the last bit. `-`: standard input
+    #[arg(value_name = "STREAM", required = true)]
+    pub inputs: Vec<PathBuf>,
+    /// Model of learned streams [default: the one inside the program]
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct Upgrade {
+    /// Stream of version 2. `-`: standard input
+    #[arg(value_name = "IN")]
+    pub input: PathBuf,
+    #[command(flatten)]
+    pub output: Output,
+    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000 [default: 20]
+    #[arg(long, value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
+    pub step: Option<QualityTarget>,
+    /// Code the colours that the voxels are drawn in exactly, in 8 bits
+    #[arg(long)]
+    pub lossless: bool,
+    #[command(flatten)]
+    pub model: ModelArg,
 }
 
 #[derive(Debug, Args)]

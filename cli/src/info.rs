@@ -1,6 +1,6 @@
 //! `b2p info`: what a stream holds.
 
-use b2p::container::{self, Level, Section, Stream};
+use b2p::container::{self, Level, Scan, Section, Stream};
 use b2p::latents::{ResidualSteps, Steps};
 use b2p::{Axes, Limits, colour};
 use serde_json::json;
@@ -35,18 +35,12 @@ pub fn run(args: &Info, limits: &Limits) -> Result<Said> {
     let axes = cloud::axes(&bytes);
     let from = container::source_points(&bytes).ok().flatten();
     Ok(Said::result(match manners::json() {
-        true => json(
-            &stream,
-            bytes.len(),
-            &Cloud { axes, points: from },
-            &levels,
-            known,
-            &state,
-        ),
+        true => json(&stream, &bytes, &Cloud { axes, points: from }, &levels, known, &state),
         false => {
             text(args, &stream, bytes.len(), &levels, known, &state)
                 + &cloud::described(&axes)
                 + &merged(header.points, from)
+                + &notes(&bytes, &stream)
         }
     }))
 }
@@ -72,6 +66,12 @@ fn merged(voxels: u64, points: Option<u32>) -> String {
         counted(points, "point"),
         counted(voxels, "voxel")
     )
+}
+
+/// What is unusual about the stream's chunks, such as one of a later version.
+fn notes(bytes: &[u8], stream: &Stream) -> String {
+    let notes = Scan::new(bytes, stream.header()).notes;
+    notes.iter().map(|note| format!("note: {}\n", note.text)).collect()
 }
 
 /// How much of a stream is there.
@@ -146,8 +146,10 @@ fn steps(level: &Level) -> Option<colour::Steps> {
     steps.is_valid().then_some(steps)
 }
 
-fn json(stream: &Stream, bytes: usize, cloud: &Cloud, levels: &[Described], known: Known, state: &State) -> String {
+fn json(stream: &Stream, bytes: &[u8], cloud: &Cloud, levels: &[Described], known: Known, state: &State) -> String {
     let header = stream.header();
+    let notes = Scan::new(bytes, header).notes;
+    let notes: Vec<_> = notes.into_iter().map(|note| note.text).collect();
     let level = |of: &Described| {
         json!({
             "level": of.level,
@@ -174,7 +176,7 @@ fn json(stream: &Stream, bytes: usize, cloud: &Cloud, levels: &[Described], know
         "bits": header.bits,
         "points": header.points,
         "levels": levels,
-        "total_bytes": bytes,
+        "total_bytes": bytes.len(),
         "model": header.model(),
         "model_name": known.as_ref().map(|(name, _)| name),
         "heads": known.as_ref().map(|(_, heads)| heads),
@@ -184,6 +186,7 @@ fn json(stream: &Stream, bytes: usize, cloud: &Cloud, levels: &[Described], know
         "crs": axes.crs,
         "origin": header.placement.origin,
         "voxel_size": header.placement.voxel_size,
+        "notes": notes,
         "complete_to_level": stream.deepest(),
         "top_level": header.top,
         "damage": match state {

@@ -5,6 +5,7 @@ mod args;
 mod bench;
 mod bench_render;
 mod budget;
+mod check;
 mod cloud;
 mod convert;
 mod cut;
@@ -26,6 +27,7 @@ mod sheet;
 mod sidecar;
 mod table;
 mod turntable;
+mod upgrade;
 mod values;
 mod views;
 
@@ -156,6 +158,8 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Convert(args) => convert::run(args, &limits, &progress)?,
         Command::Render(args) => render::run(args, &limits, &progress)?,
         Command::Info(args) => info::run(args, &limits)?,
+        Command::Check(args) => check::run(args, &limits)?,
+        Command::Upgrade(args) => upgrade::run(args, &limits, &progress)?,
         Command::Cut(args) => cut::run(args, &limits)?,
         Command::Serve(args) => serve::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,

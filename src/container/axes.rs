@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::limits::Limits;
 
 /// The type of the chunk.
-const AXES: u8 = 128;
+pub(super) const AXES: u8 = 128;
 
 /// What a stream says of its coordinates, which is nothing unless it has the chunk. The stream may be cut after the
 /// chunk.
@@ -106,7 +106,7 @@ pub fn source_bytes(axes: &Axes, points: Option<u64>) -> usize {
     }
 }
 
-fn form(header: &Header) -> Form {
+pub(super) fn form(header: &Header) -> Form {
     match header.format {
         Format::Learned { .. } => Form::Fixed,
         Format::Transform { .. } => Form::Short,

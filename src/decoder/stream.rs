@@ -36,7 +36,7 @@ pub struct Decoder {
     per_voxel: Option<usize>,
     precision: Precision,
     isa: Option<Isa>,
-    limits: Limits,
+    pub(super) limits: Limits,
     cancel: Cancel,
     /// The last level, if not the finest that can be drawn.
     level: Option<u8>,

@@ -22,12 +22,12 @@ use crate::latents::{LatentDecoding, nothing_reached};
 pub struct Decoding<'b> {
     decoder: Decoder,
     goal: Goal,
-    state: State<'b>,
+    pub(super) state: State<'b>,
 }
 
 /// What is known of a stream.
 #[derive(Debug)]
-enum State<'b> {
+pub(super) enum State<'b> {
     /// Not its version.
     Start(Cow<'b, [u8]>),
     Learned(Box<LatentDecoding<'b>>),

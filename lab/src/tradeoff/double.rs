@@ -46,6 +46,7 @@ fn wrong(detail: impl ToString) -> Error {
         field: "heads".into(),
         value: detail.to_string(),
         expected: "a file of heads".into(),
+        clause: None,
     }
 }
 
