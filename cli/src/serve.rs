@@ -224,7 +224,8 @@ fn plain(status: u16, text: &str) -> Response<Cursor<Vec<u8>>> {
     common(Response::from_string(text).with_status_code(status))
 }
 
-/// What every answer says: other sites get nothing, the page may use threads, and files may change.
+/// What every answer says: how long it is, that other sites get nothing, that the page may use threads, and that files may
+/// change.
 fn common<R: Read>(response: Response<R>) -> Response<R> {
     [
         ("Cross-Origin-Opener-Policy", "same-origin"),
@@ -234,9 +235,10 @@ fn common<R: Read>(response: Response<R>) -> Response<R> {
         ("Cache-Control", "no-cache"),
     ]
     .into_iter()
-    .fold(response, |response, (name, value)| {
-        response.with_header(header(name, value))
-    })
+    .fold(
+        response.with_chunked_threshold(usize::MAX),
+        |response, (name, value)| response.with_header(header(name, value)),
+    )
 }
 
 fn header(name: &str, value: &str) -> Header {
