@@ -1,12 +1,12 @@
 """Rate against distortion of b2p, MPEG's G-PCC (TMC13) and V-PCC (TMC2) on whole objects, by `b2p-lab eval`'s protocol.
 
     python3 docs/rd.py --data FOLDER --cache FOLDER [--series NAME …] [--objects NAME …]
-                          measures these series of SERIES, and TMC13 where the cache lacks it, writes docs/rd.json, and goes on as below
+                          measures these series of SERIES, and TMC13 where docs/rd.json lacks it, writes docs/rd.json, and goes on as below
     python3 docs/rd.py    from docs/rd.json and docs/times.json: tables, plot, and the list of lower scores
 
 The data folder holds meshes (`val/*.glb`, `train/*.glb`), TMC13's decoded clouds (`gpcc/*.ply.zst`) with their rates (`SOURCES.md`), and
-V-PCC's scores (`vpcc.md`). The cache holds clouds, streams and TMC13's scores, so that only b2p is measured again: remove its `streams` when
-the encoder has changed. B2P and B2P_LAB name programs that are built already, B2P_HEADS a file of heads for `best` and `quick`.
+V-PCC's scores (`vpcc.md`). The cache holds clouds, streams and TMC13's scores; remove its `streams` when the
+encoder has changed. B2P and B2P_LAB name programs that are built already, B2P_HEADS a file of heads for `best` and `quick`.
 """
 
 import argparse
@@ -132,19 +132,20 @@ def measure(data, cache, name, series, rates):
         return [row_of(name, series, row, level=levels[row["name"]]) for row in rows]
 
 
-def measure_all(data, cache, wanted, objects):
-    kept = json.loads(MEASURED.read_text()) if MEASURED.exists() else []
-    again = lambda row: row["series"] in wanted and row["object"] in objects
-    rows = [row for row in kept if row["series"] not in (PEER, VPCC) and not again(row)] + read_vpcc(data)
-    peers = {name: measure_peer(data, cache, name) for name in OBJECTS}
-    rows += sum(peers.values(), [])
+def measure_all(data, cache, wanted, objects, anew):
+    """Measures object by object; what was measured is kept if a later object fails."""
+    rows = json.loads(MEASURED.read_text()) if MEASURED.exists() else []
+    rows = [row for row in rows if row["series"] != VPCC] + read_vpcc(data)
     for name in objects:
-        peer = peers[name]
+        peer = [row for row in rows if (row["object"], row["series"]) == (name, PEER)]
+        if anew or not peer:
+            peer = measure_peer(data, cache, name)
         rates = sorted({row["rate"] for row in peer} | {rate for rate, *_ in rd_tables.HYBRID.get(name, ())})
+        rows = [row for row in rows if row["object"] != name or row["series"] not in (PEER, *wanted)] + peer
         for series in wanted:
             print(name, series, flush=True)
             rows += measure(data, cache, name, series, rates)
-    MEASURED.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+        MEASURED.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
 
 
 def main():
@@ -153,11 +154,12 @@ def main():
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--series", nargs="*", default=[], choices=SERIES)
     parser.add_argument("--objects", nargs="*", default=list(OBJECTS), choices=OBJECTS)
+    parser.add_argument("--peer", action="store_true", help="measure TMC13 again, too")
     args = parser.parse_args()
     if bool(args.data) != bool(args.cache):
         parser.error("--data and --cache go together")
     if args.data:
-        measure_all(args.data.resolve(), args.cache.resolve(), args.series, args.objects)
+        measure_all(args.data.resolve(), args.cache.resolve(), args.series, args.objects, args.peer)
     rows = json.loads(MEASURED.read_text())
     for path, marks in rd_tables.tables(rows, json.loads(TIMES.read_text())).items():
         text = (ROOT / path).read_text()
