@@ -132,13 +132,13 @@ def measure(data, cache, name, series, rates):
         return [row_of(name, series, row, level=levels[row["name"]]) for row in rows]
 
 
-def measure_all(data, cache, wanted, objects, anew):
+def measure_all(data, cache, wanted, objects, peer_too):
     """Measures object by object; what was measured is kept if a later object fails."""
     rows = json.loads(MEASURED.read_text()) if MEASURED.exists() else []
     rows = [row for row in rows if row["series"] != VPCC] + read_vpcc(data)
     for name in objects:
         peer = [row for row in rows if (row["object"], row["series"]) == (name, PEER)]
-        if anew or not peer:
+        if peer_too or not peer:
             peer = measure_peer(data, cache, name)
         rates = sorted({row["rate"] for row in peer} | {rate for rate, *_ in rd_tables.HYBRID.get(name, ())})
         rows = [row for row in rows if row["object"] != name or row["series"] not in (PEER, *wanted)] + peer

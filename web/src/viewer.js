@@ -51,7 +51,7 @@ export class Viewer extends EventTarget {
 
   /**
    * Shows a stream: its address, a `Response`, a `Blob`, bytes, or a `ReadableStream` of bytes. Ends when its last level
-   * is there, with that level; levels that arrive are told by the event `level`. Another call ends the one before.
+   * is there, with that level; the event `level` reports levels that arrive. Another call ends the one before.
    */
   async open(source, { heads = null, level = -1 } = {}) {
     this.#cancel?.();
@@ -237,7 +237,7 @@ export class Viewer extends EventTarget {
   }
 }
 
-/** Bytes as they come. */
+/** The bytes of a source. */
 async function readable(source) {
   if (source instanceof ReadableStream) return source;
   if (source instanceof Blob) return source.stream();

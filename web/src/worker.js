@@ -54,7 +54,7 @@ const on = {
     close();
     stream = number;
     if (library) attempt(() => (decoding = library.decoding({ model, heads, level })));
-    else postMessage({ type: "error", stream, kind: "internal", message: "the library has failed: load it anew" });
+    else postMessage({ type: "error", stream, kind: "internal", message: "the library has failed: load it again" });
   },
   bytes({ number, bytes }) {
     if (number !== stream || !decoding) return;

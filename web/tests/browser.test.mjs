@@ -79,7 +79,7 @@ test("dragging turns the scene, and a double click turns it back", { skip }, asy
   assert.deepEqual(await page.evaluate(PIXELS), before);
 });
 
-test("a cut download and a damaged file are told, and the levels that came stay", { skip }, async () => {
+test("a cut download and a damaged file are reported, and the levels that came stay", { skip }, async () => {
   for (const name of ["cut.b2p", "damaged.b2p"]) {
     const page = await show(name);
     await page.until("document.body.dataset.state === 'error'");

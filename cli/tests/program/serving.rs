@@ -141,7 +141,7 @@ fn nothing_else_of_the_folder_and_nothing_outside_is_served() {
 }
 
 #[test]
-fn a_folder_without_streams_and_a_port_that_is_taken_are_told() {
+fn a_folder_without_streams_and_a_port_that_is_taken_are_reported() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("scene.b2p"), SCENE).unwrap();
     std::fs::create_dir(folder.path().join("empty")).unwrap();
