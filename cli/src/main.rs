@@ -14,7 +14,6 @@ mod encode;
 mod info;
 mod keep;
 mod kinds;
-mod knobs;
 mod load;
 mod manners;
 mod picture;
