@@ -67,7 +67,14 @@ enum Lens {
 /// A file of cameras. They depend on the cube, and are kept for the last one.
 struct File {
     text: Text,
-    last: Mutex<Option<(Frame, (u32, u32), Vec<Named>)>>,
+    last: Mutex<Option<Resolved>>,
+}
+
+/// The cameras of a file for a cube and a size.
+struct Resolved {
+    frame: Frame,
+    size: (u32, u32),
+    named: Vec<Named>,
 }
 
 enum Text {
@@ -97,15 +104,18 @@ impl File {
     /// The camera number `index`, or the names of all.
     fn with<T>(&self, frame: &Frame, size: (u32, u32), take: impl FnOnce(&[Named]) -> T) -> Result<T> {
         let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
-        let known = last.as_ref().is_some_and(|(of, at, _)| of == frame && *at == size);
+        let known = last
+            .as_ref()
+            .is_some_and(|last| last.frame == *frame && last.size == size);
         if !known {
             let named = match &self.text {
                 Text::Any(bytes) => files::read(bytes, frame, size)?,
                 Text::Colmap { cameras, images } => files::colmap(cameras, images, frame)?,
             };
-            *last = Some((*frame, size, named));
+            let frame = *frame;
+            *last = Some(Resolved { frame, size, named });
         }
-        Ok(take(last.as_ref().map_or(&[], |(_, _, named)| named)))
+        Ok(take(last.as_ref().map_or(&[], |last| &last.named)))
     }
 }
 

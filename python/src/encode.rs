@@ -85,19 +85,7 @@ pub fn encode<'py>(
     threads: Option<usize>,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyBytes>> {
-    let asked = [bits_per_point.is_some(), quality.is_some(), step.is_some(), lossless];
-    if asked.iter().filter(|asked| **asked).count() > 1 {
-        return Err(errors::usage(
-            py,
-            "at most one of bits_per_point, quality, step and lossless can be asked for",
-        ));
-    }
-    if let Some(quality @ 101..) = quality {
-        return Err(errors::usage(
-            py,
-            format!("the quality is {quality}, expected 0 to 100"),
-        ));
-    }
+    check(py, bits_per_point, quality, step.is_some(), lossless)?;
     let mut options = Options {
         levels: levels.map(|(first, last)| first..=last),
         ..Options::default()
@@ -126,6 +114,28 @@ pub fn encode<'py>(
         errors::warn(py, &what)?;
     }
     Ok(PyBytes::new(py, &stream))
+}
+
+/// Fails if what is asked for contradicts itself.
+fn check(
+    py: Python<'_>,
+    bits_per_point: Option<f64>,
+    quality: Option<u8>,
+    has_step: bool,
+    lossless: bool,
+) -> PyResult<()> {
+    let asked = [bits_per_point.is_some(), quality.is_some(), has_step, lossless];
+    if asked.iter().filter(|asked| **asked).count() > 1 {
+        let what = "at most one of bits_per_point, quality, step and lossless can be asked for";
+        return Err(errors::usage(py, what));
+    }
+    match quality {
+        Some(quality @ 101..) => Err(errors::usage(
+            py,
+            format!("the quality is {quality}, expected 0 to 100"),
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// The cloud of arrays, or the one that was given; what was named beside holds for both.

@@ -25,7 +25,7 @@ pub fn usage(py: Python<'_>, text: impl Into<String>) -> PyErr {
 pub fn warn(py: Python<'_>, text: &str) -> PyResult<()> {
     let category = py.import(MODULE)?.getattr("InputWarning")?;
     py.import("warnings")?
-        .call_method1("warn", (text, category, 2))
+        .call_method1("warn", (text, category, 1))
         .map(drop)
 }
 

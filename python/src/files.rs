@@ -129,8 +129,8 @@ fn format_of(path: &Path, bytes: &[u8]) -> Option<Format> {
 ///     Points: .ply, .las, .laz, .pcd, .e57, .xyz. Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, .gltf,
 ///     .csv, .npz.
 /// thing : PointCloud, (xyz, rgb) or Gaussians
-///     PLY keeps the coordinates of points as they are; the other formats put points that are on no voxel grid on one of
-///     2**21 voxels along the longest side. What a format of Gaussians does not keep is an `InputWarning`.
+///     PLY keeps the coordinates of points as they are; the other formats put points that are on no voxel grid on one
+///     of 2**21 voxels along the longest side. What a format of Gaussians does not keep is an `InputWarning`.
 /// format : str, optional
 ///     The format, whatever the ending is, such as "laz" or "compressed-ply".
 /// double : bool

@@ -113,23 +113,17 @@ impl PyGaussians {
             compensated,
             ..b2p::Gaussians::default()
         };
+        gaussians.frame = given.unwrap_or_default();
         match coordinates {
             "cube" => {
-                gaussians.frame = given.unwrap_or_default();
                 gaussians.position = rows("positions", positions, &limits)?;
                 gaussians.scale = rows("scales", scales, &limits)?;
                 gaussians.blur = blur as f32;
             }
             "world" => {
-                let world: Vec<[f64; 3]> = rows("positions", positions, &limits)?;
-                let scales: Vec<[f64; 3]> = rows("scales", scales, &limits)?;
-                let frame = given.unwrap_or_else(|| Frame::fitted(world.iter().copied()));
-                let unit = frame.unit();
-                let place = |world: &[f64; 3]| frame.placement.to_cube(frame.bits, *world);
-                gaussians.position = world.iter().map(place).collect();
-                gaussians.scale = scales.iter().map(|scale| scale.map(|s| (s / unit) as f32)).collect();
-                gaussians.blur = (blur / (unit * unit)) as f32;
-                gaussians.frame = frame;
+                let positions = rows("positions", positions, &limits)?;
+                let scales = rows("scales", scales, &limits)?;
+                place(&mut gaussians, given, &positions, &scales, blur);
             }
             other => {
                 let what = format!("coordinates are {other:?}, expected \"world\" or \"cube\"");
@@ -273,6 +267,17 @@ impl PyGaussians {
         fields.set_item("limits", PyLimits(Limits::unlimited()))?;
         values::reduced(slf.as_any(), &STATE, fields)
     }
+}
+
+/// Places Gaussians of the world in the cube that is given, or that is fitted to them.
+fn place(gaussians: &mut b2p::Gaussians, given: Option<Frame>, positions: &[[f64; 3]], scales: &[[f64; 3]], blur: f64) {
+    let frame = given.unwrap_or_else(|| Frame::fitted(positions.iter().copied()));
+    let unit = frame.unit();
+    let in_cube = |world: &[f64; 3]| frame.placement.to_cube(frame.bits, *world);
+    gaussians.position = positions.iter().map(in_cube).collect();
+    gaussians.scale = scales.iter().map(|scale| scale.map(|s| (s / unit) as f32)).collect();
+    gaussians.blur = (blur / (unit * unit)) as f32;
+    gaussians.frame = frame;
 }
 
 /// The cube that is given, if any is.

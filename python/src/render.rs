@@ -6,8 +6,8 @@ use std::sync::Arc;
 use b2p::container::Header;
 use b2p::container::axes;
 use b2p::{
-    Background, Camera, Channel, Decoder, EffectMode, Effects, Error, Extent, Gaussians, Image, Limits, Quality,
-    Renderer, Result, Up,
+    Background, Camera, Cancel, Channel, Decoder, EffectMode, Effects, Error, Extent, Gaussians, Image, Limits, Log,
+    Quality, Renderer, Result, Up,
 };
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
@@ -17,7 +17,7 @@ use crate::camera::PyCamera;
 use crate::decode;
 use crate::errors;
 use crate::gaussians::PyGaussians;
-use crate::source::{Drawing, Loaded, Source};
+use crate::source::{Drawing, Source};
 use crate::values::{self, PyLimits};
 use crate::work::Work;
 
@@ -128,33 +128,11 @@ pub fn render<'py>(
         limits: values::limits(limits),
     };
     let drawing = Drawing::new(py, heads, model, per_voxel, level)?;
-    let scene = match scene.cast::<PyGaussians>() {
-        Ok(gaussians) => {
-            if !drawing.is_default() {
-                return Err(errors::usage(
-                    py,
-                    "level, heads, model and per_voxel are for streams, these are Gaussians",
-                ));
-            }
-            Scene::Gaussians(gaussians.get().inner.clone(), gaussians.get().up)
-        }
-        Err(_) => Scene::Stream(Source::of(scene)?),
-    };
+    let scene = scene_of(scene, &drawing)?;
     let (picture, [width, height]) = Work::on(threads).run(py, move |cancel, log| {
         let (gaussians, up) = match scene {
             Scene::Gaussians(gaussians, up) => (gaussians, up),
-            Scene::Stream(source) => {
-                let bytes: Loaded = source.load(&sketch.limits)?;
-                let decoder = drawing.decoder(&bytes, &sketch.limits)?;
-                let decoder = decoder.with_cancel(cancel.clone()).with_log(log);
-                let up = axes(&bytes).ok().and_then(|axes| axes.up);
-                let level = match drawing.level() {
-                    None => sketch.level(&decoder, &bytes, up)?,
-                    level => level,
-                };
-                let (gaussians, _) = decode::gaussians(&decoder.with_level(level), &bytes, false)?;
-                (Arc::new(gaussians), up)
-            }
+            Scene::Stream(source) => sketch.decoded(source, drawing, cancel, log)?,
         };
         cancel.check()?;
         sketch.draw(&gaussians, up)
@@ -162,7 +140,40 @@ pub fn render<'py>(
     array(py, picture, width as usize, height as usize)
 }
 
+/// Gaussians, or a stream, for which `drawing` is.
+fn scene_of(scene: &Bound<'_, PyAny>, drawing: &Drawing) -> PyResult<Scene> {
+    let Ok(gaussians) = scene.cast::<PyGaussians>() else {
+        return Source::of(scene).map(Scene::Stream);
+    };
+    if !drawing.is_default() {
+        let what = "level, heads, model and per_voxel are for streams, these are Gaussians";
+        return Err(errors::usage(scene.py(), what));
+    }
+    let PyGaussians { inner, up, .. } = gaussians.get();
+    Ok(Scene::Gaussians(inner.clone(), *up))
+}
+
 impl Sketch {
+    /// The Gaussians of a stream, at the level that the camera calls for unless one is named, and what is up.
+    fn decoded(
+        &self,
+        source: Source,
+        drawing: Drawing,
+        cancel: &Cancel,
+        log: &Log,
+    ) -> Result<(Arc<Gaussians>, Option<Up>)> {
+        let bytes = source.load(&self.limits)?;
+        let decoder = drawing.decoder(&bytes, &self.limits)?;
+        let decoder = decoder.with_cancel(cancel.clone()).with_log(log);
+        let up = axes(&bytes).ok().and_then(|axes| axes.up);
+        let level = match drawing.level() {
+            None => self.level(&decoder, &bytes, up)?,
+            level => level,
+        };
+        let (gaussians, _) = decode::gaussians(&decoder.with_level(level), &bytes, false)?;
+        Ok((Arc::new(gaussians), up))
+    }
+
     /// The coarsest level whose voxels fall under a pixel, if there are finer ones.
     fn level(&self, decoder: &Decoder, bytes: &[u8], up: Option<Up>) -> Result<Option<u8>> {
         let frame = decoder.frame(bytes)?;

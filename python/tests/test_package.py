@@ -40,8 +40,8 @@ def test_everything_public_is_documented():
         if not (thing.__doc__ or "").strip():
             missing.append(name)
         for member, value in vars(thing).items() if inspect.isclass(thing) else []:
-            documented = callable(value) or isinstance(value, (property, staticmethod)) or inspect.isgetsetdescriptor(value)
-            if not member.startswith("_") and documented and not (value.__doc__ or "").strip():
+            is_member = callable(value) or isinstance(value, (property, staticmethod)) or inspect.isdatadescriptor(value)
+            if not member.startswith("_") and is_member and not (value.__doc__ or "").strip():
                 missing.append(f"{name}.{member}")
     assert not missing
 

@@ -101,7 +101,7 @@ def test_channels_agree_with_each_other(scene_gaussians):
     assert nothing.any() and (ids >= 0).any() and ids.max() < len(g)
     assert np.isinf(depth[nothing]).all() and (normal[nothing] == 0).all()
     solid = (alpha > 0.99) & (ids >= 0)
-    # Four units from the middle of the cube along z: the depth of a pixel is near that of the Gaussian it shows most of.
+    # Four units from the middle of the cube along z: a pixel is about as far as the Gaussian that it shows most of.
     expected = (4 - g.positions[ids[solid], 2]) * g.unit
     assert np.median(np.abs(depth[solid] - expected)) < 0.05 * g.unit
     assert (normal[solid, 2] < 0).mean() > 0.9

@@ -102,8 +102,10 @@ mod tests {
 
     #[test]
     fn levels_that_are_asked_for_stay() {
-        let mut options = Options::default();
-        options.levels = Some(5..=7);
+        let mut options = Options {
+            levels: Some(5..=7),
+            ..Options::default()
+        };
         options.set_quality(90, 10);
         assert_eq!(options.levels, Some(5..=7));
         options.levels = None;
