@@ -4,6 +4,7 @@ use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use crate::cancel::Cancel;
 use crate::error::Result;
 
 /// One finished step.
@@ -46,6 +47,8 @@ pub struct Log {
     listener: Option<Arc<Listener>>,
     /// None for a log that collects nothing.
     steps: Option<Arc<Mutex<Vec<Step>>>>,
+    /// Stops a run before its next step.
+    cancel: Option<Cancel>,
 }
 
 impl Default for Log {
@@ -68,6 +71,7 @@ impl Log {
         Log {
             listener: None,
             steps: Some(Arc::default()),
+            cancel: None,
         }
     }
 
@@ -84,7 +88,15 @@ impl Log {
         Log {
             listener: None,
             steps: None,
+            cancel: None,
         }
+    }
+
+    /// The same log, whose steps do not begin once `cancel` is thrown.
+    #[doc(hidden)]
+    pub fn with_cancel(mut self, cancel: Cancel) -> Self {
+        self.cancel = Some(cancel);
+        self
     }
 
     /// The finished steps, in order.
@@ -98,7 +110,7 @@ impl Log {
     /// Runs a step that works on `count` items.
     ///
     /// # Errors
-    /// The [`crate::Error`] of `run`; the step is then not recorded.
+    /// The [`crate::Error`] of `run`; the step is then not recorded. [`crate::Error::Cancelled`] if it is not to begin.
     #[doc(hidden)]
     pub fn step<T>(
         &self,
@@ -107,6 +119,9 @@ impl Log {
         unit: &'static str,
         run: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
+        if let Some(cancel) = &self.cancel {
+            cancel.check()?;
+        }
         let name = name.into();
         if let Some(listener) = &self.listener {
             listener(&name);

@@ -15,7 +15,7 @@ use super::args::{Colours, Encode};
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{count, counted, steps, steps_json, table};
-use super::{Failure, Result, cloud, knobs, load};
+use super::{Failure, Result, cloud, load};
 
 /// Codes a cloud and says what it cost.
 pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> {
@@ -154,10 +154,10 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) ->
         ..transform::Options::default()
     };
     if let Some(quality) = args.quality {
-        knobs::set_quality(&mut options, quality, cloud.voxels.depth(), args.levels.clone());
+        options.set_quality(quality, cloud.voxels.depth());
     }
     if let Some(effort) = args.effort {
-        knobs::set_effort(&mut options, effort);
+        options.set_effort(effort);
     }
     match args.step {
         Some(step) => options.fineness = step,

@@ -14,7 +14,6 @@ mod demo;
 mod encode;
 mod info;
 mod kinds;
-mod knobs;
 mod load;
 mod manners;
 mod picture;

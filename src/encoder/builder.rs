@@ -6,6 +6,7 @@ use b2p_kernels::Isa;
 
 use super::transform::{self, QualityTarget};
 use super::{Encoded, Options, encode, encode_to_rate};
+use crate::cancel::Cancel;
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
 use crate::gaussians::learned::HeadsModel;
@@ -34,6 +35,7 @@ pub struct Encoder {
     options: transform::Options,
     model: Option<Model>,
     lambda_scale: Option<f32>,
+    cancel: Cancel,
     log: Option<Log>,
 }
 
@@ -100,6 +102,12 @@ impl Encoder {
         self
     }
 
+    /// The same encoder, stopped before its next step when `cancel` is thrown.
+    pub fn with_cancel(mut self, cancel: Cancel) -> Self {
+        self.cancel = cancel;
+        self
+    }
+
     /// The same encoder, whose steps `log` collects.
     pub fn with_log(mut self, log: &Log) -> Self {
         self.log = Some(log.clone());
@@ -111,8 +119,8 @@ impl Encoder {
     /// # Errors
     /// [`Error::Usage`](crate::Error::Usage) for levels that the cloud does not have and steps out of range,
     /// [`Error::Malformed`](crate::Error::Malformed) for slices that the format does not have,
-    /// [`Error::Unsupported`](crate::Error::Unsupported) if the model can only decode; the decoder's errors, if this
-    /// machine computes incorrectly.
+    /// [`Error::Unsupported`](crate::Error::Unsupported) if the model can only decode;
+    /// [`Error::Cancelled`](crate::Error::Cancelled); the decoder's errors, if this machine computes incorrectly.
     pub fn encode(&self, cloud: &ColouredVoxels) -> Result<Encoded> {
         match &self.model {
             None => transform::encode(cloud, &self.options, &self.log()),
@@ -134,7 +142,8 @@ impl Encoder {
     }
 
     fn log(&self) -> Log {
-        self.log.clone().unwrap_or(Log::off())
+        let log = self.log.clone().unwrap_or(Log::off());
+        log.with_cancel(self.cancel.clone())
     }
 
     /// The options of version 2.
@@ -147,5 +156,32 @@ impl Encoder {
             bit_price: self.lambda_scale.unwrap_or(default.bit_price),
             ..default
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Error, PointCloud, voxelise};
+
+    #[test]
+    fn a_thrown_switch_stops_encoding_before_its_next_step() {
+        let cloud = PointCloud {
+            positions: (0..64).map(|i| [i % 8, i / 8, 0].map(f64::from)).collect(),
+            colours: vec![[9, 99, 199]; 64],
+            ..PointCloud::default()
+        };
+        let grid = voxelise(&cloud, Some(3)).unwrap();
+        let switch = Cancel::default();
+        let thrower = switch.clone();
+        let log = Log::with_listener(move |step| {
+            if step == "geometry" {
+                thrower.cancel();
+            }
+        });
+        let encoder = Encoder::new().with_cancel(switch).with_log(&log);
+        assert!(matches!(encoder.encode(&grid), Err(Error::Cancelled)));
+        assert!(matches!(encoder.encode_to_rate(&grid, 9.0), Err(Error::Cancelled)));
+        assert_eq!(log.steps().last().map(|step| step.name.as_str()), Some("geometry"));
     }
 }

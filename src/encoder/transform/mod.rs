@@ -1,6 +1,7 @@
 //! Streams of version 3: colours as transform coefficients.
 
 mod head_maps;
+mod knobs;
 mod rate_control;
 
 use std::fmt;

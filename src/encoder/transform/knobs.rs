@@ -1,8 +1,6 @@
-//! `--quality` and `--effort`: what they stand for.
+//! Quality and effort as one number each: what they stand for.
 
-use std::ops::RangeInclusive;
-
-use b2p::encoder::transform::{Options, QualityTarget};
+use super::{Options, QualityTarget};
 
 /// A stretch of the scale, from one quality to the next stretch's: how many levels above the cloud's own the finest
 /// coded level is, and the quantisation steps of luma at both ends. Streams of the sample are about as long where a
@@ -43,28 +41,31 @@ fn place(quality: u8) -> (u8, f32) {
     (above, steps[0] * (steps[1] / steps[0]).powf(share))
 }
 
-/// Sets what a quality stands for, for a cloud of bit depth `bits` whose levels `levels` were asked for.
-pub fn set_quality(options: &mut Options, quality: u8, bits: u8, levels: Option<RangeInclusive<u8>>) {
-    let (above, fineness) = match quality {
-        100.. => (0, QualityTarget::Lossless),
-        _ => {
-            let (above, step) = place(quality);
-            (above, QualityTarget::Step(step))
-        }
-    };
-    options.fineness = fineness;
-    let top = bits.saturating_sub(above);
-    options.levels = Some(levels.unwrap_or(bits.saturating_sub(3).min(top)..=top));
-}
+impl Options {
+    /// Sets what a quality from 0 to 100 stands for, for a cloud of bit depth `bits`. Levels that were asked for stay.
+    pub fn set_quality(&mut self, quality: u8, bits: u8) {
+        let (above, fineness) = match quality {
+            100.. => (0, QualityTarget::Lossless),
+            _ => {
+                let (above, step) = place(quality);
+                (above, QualityTarget::Step(step))
+            }
+        };
+        self.fineness = fineness;
+        let top = bits.saturating_sub(above);
+        let levels = self.levels.take();
+        self.levels = Some(levels.unwrap_or(bits.saturating_sub(3).min(top)..=top));
+    }
 
-/// Sets what an effort stands for.
-pub fn set_effort(options: &mut Options, effort: u8) {
-    options.optimised = effort > 0;
-    options.filter &= effort > 1;
-    options.tries = match effort {
-        9.. => usize::MAX,
-        _ => 2 + usize::from(effort),
-    };
+    /// Sets what an effort from 0 to 9 stands for.
+    pub fn set_effort(&mut self, effort: u8) {
+        self.optimised = effort > 0;
+        self.filter &= effort > 1;
+        self.tries = match effort {
+            9.. => usize::MAX,
+            _ => 2 + usize::from(effort),
+        };
+    }
 }
 
 #[cfg(test)]
@@ -84,7 +85,7 @@ mod tests {
         }
         assert_eq!(last, (0, 1.0));
         let mut options = Options::default();
-        set_quality(&mut options, 100, 10, None);
+        options.set_quality(100, 10);
         assert_eq!(options.fineness, QualityTarget::Lossless);
         assert_eq!(options.levels, Some(7..=10));
     }
@@ -101,10 +102,14 @@ mod tests {
 
     #[test]
     fn levels_that_are_asked_for_stay() {
-        let mut options = Options::default();
-        set_quality(&mut options, 90, 10, Some(5..=7));
+        let mut options = Options {
+            levels: Some(5..=7),
+            ..Options::default()
+        };
+        options.set_quality(90, 10);
         assert_eq!(options.levels, Some(5..=7));
-        set_quality(&mut options, 90, 1, None);
+        options.levels = None;
+        options.set_quality(90, 1);
         assert_eq!(options.levels, Some(0..=1));
     }
 }
