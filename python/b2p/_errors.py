@@ -59,6 +59,8 @@ class TruncatedError(FormatError):
 class ChecksumError(FormatError):
     """The bytes are not what was written."""
 
+    clause: str
+    """The clause of docs/format.md that says so."""
     what: str
     """The header, or which chunk."""
     offset: int
@@ -72,6 +74,8 @@ class ChecksumError(FormatError):
 class MalformedError(FormatError):
     """A field of the input holds what its format forbids."""
 
+    clause: str | None
+    """The clause of docs/format.md that a stream breaks; None for other files."""
     stage: str
     """The stage that noticed."""
     at: str

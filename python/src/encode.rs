@@ -191,12 +191,14 @@ fn code(cloud: &PointCloud, asked: Asked, log: &Log) -> Result<(Vec<u8>, usize)>
     if let Some(effort) = asked.effort {
         options.set_effort(effort);
     }
-    let voxels = grid.voxels.len() as f64;
+    let (points, voxels) = (cloud.positions.len(), grid.voxels.len());
+    let merged = (points > voxels).then_some(points as u64);
+    let voxels = voxels as f64;
     let mut axes = cloud.axes.clone();
     let mut left_out = 0;
     let Some(most) = asked.bits_per_point else {
         let stream = transform::encode(&grid, &options, log)?.bytes;
-        return Ok((container::with_axes(&stream, &axes)?, 0));
+        return Ok((container::with_source(&stream, &axes, merged)?, 0));
     };
     if !(most.is_finite() && most > 0.0) {
         return Err(Error::Usage(format!(
@@ -208,7 +210,7 @@ fn code(cloud: &PointCloud, asked: Asked, log: &Log) -> Result<(Vec<u8>, usize)>
         axes.crs.clear();
     }
     // The rate counts the whole stream.
-    let reserved = container::axes_bytes(&axes) as f64 * 8.0 / voxels;
+    let reserved = container::source_bytes(&axes, merged) as f64 * 8.0 / voxels;
     let (encoded, _) = transform::encode_to_rate(&grid, &options, most - reserved, log)?;
-    Ok((container::with_axes(&encoded.bytes, &axes)?, left_out))
+    Ok((container::with_source(&encoded.bytes, &axes, merged)?, left_out))
 }

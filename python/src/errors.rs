@@ -114,7 +114,9 @@ fn fill_format(error: &Error, fields: &Bound<'_, PyDict>) -> PyResult<&'static s
             offset,
             expected,
             found,
+            clause,
         } => {
+            fields.set_item("clause", clause)?;
             fields.set_item("what", what)?;
             fields.set_item("offset", offset)?;
             fields.set_item("expected", expected)?;
@@ -139,7 +141,9 @@ fn fill_format(error: &Error, fields: &Bound<'_, PyDict>) -> PyResult<&'static s
             field,
             value,
             expected,
+            clause,
         } => {
+            fields.set_item("clause", clause)?;
             fields.set_item("stage", stage.to_string())?;
             fields.set_item("at", at)?;
             fields.set_item("field", field)?;

@@ -7,9 +7,9 @@ use b2p::cloud::{Note, ReadOptions, voxelise};
 use b2p::{ColouredVoxels, Error, Gaussians, Limits, PointCloud, Result, Up, input, output};
 use b2p_formats::clouds::{self, PointFormat, WriteOptions};
 use b2p_formats::detect::{Group, Kind};
+use b2p_formats::sidecar::Sidecar;
 use b2p_formats::splats::{self, Axes, Format};
 use pyo3::prelude::*;
-use serde_json::{Value, json};
 
 use crate::cloud::PyPointCloud;
 use crate::errors;
@@ -50,7 +50,7 @@ enum Content {
 /// Returns
 /// -------
 /// PointCloud or Gaussians
-///     Gaussians in the axes of PLY files.
+///     Gaussians in the axes of their cloud, if the file states them, else in those of PLY files.
 #[pyfunction]
 #[pyo3(signature = (path, *, format=None, up=None, unit=None, crop=None, drop_outliers=false, vertices=false,
     limits=None, threads=None))]
@@ -97,16 +97,27 @@ pub fn read<'py>(
 fn content(path: &Path, asked: Option<Format>, options: &ReadOptions, limits: &Limits) -> Result<Content> {
     let bytes = input::read_file(path, limits)?;
     let Some(format) = asked.or_else(|| format_of(path, &bytes)) else {
-        let read = clouds::read(bytes, path.parent(), limits, options)?;
+        let beside = Sidecar::beside(path).unwrap_or_default();
+        let mut read = clouds::read(bytes, path.parent(), limits, &beside.options(options))?;
+        beside.complete(&mut read.cloud);
         return Ok(Content::Cloud(read.cloud, read.notes));
     };
-    let offset = match format {
-        Format::Spz | Format::Splat => offset_beside(path).unwrap_or_default(),
-        _ => [0.0; 3],
+    // Other formats say themselves what is beside them, too.
+    let beside = match format {
+        Format::Spz | Format::Splat | Format::Csv => Sidecar::beside(path).unwrap_or_default(),
+        _ => Sidecar::default(),
     };
-    let splats = splats::read(&bytes, format, &splats::Options { offset }, limits)?;
+    let unsaid = splats::Options {
+        offset: beside.offset,
+        turned_from: beside.turned_from,
+    };
+    let splats = splats::read(&bytes, format, &unsaid, limits)?;
     let warnings = splats.warnings.clone();
-    Ok(Content::Gaussians(splats.into_ply_axes()?, options.up, warnings))
+    let up = match splats.axes {
+        Axes::Cloud(up) => Some(up),
+        Axes::Ply | Axes::Gltf => options.up,
+    };
+    Ok(Content::Gaussians(splats.into_cloud(), up, warnings))
 }
 
 /// The format of a file of splats, by its contents; `.splat` and CSV files are known by their names.
@@ -130,7 +141,8 @@ fn format_of(path: &Path, bytes: &[u8]) -> Option<Format> {
 ///     .csv, .npz.
 /// thing : PointCloud, (xyz, rgb) or Gaussians
 ///     PLY keeps the coordinates of points as they are; the other formats put points that are on no voxel grid on one
-///     of 2**21 voxels along the longest side. What a format of Gaussians does not keep is an `InputWarning`.
+///     of 2**21 voxels along the longest side. Gaussians whose `up` is known are turned to the axes of the format. What
+///     a format of Gaussians does not keep is an `InputWarning`.
 /// format : str, optional
 ///     The format, whatever the ending is, such as "laz" or "compressed-ply".
 /// double : bool
@@ -152,8 +164,9 @@ pub fn write(
     let work = Work::on(threads);
     let warnings = if let Ok(gaussians) = thing.cast::<PyGaussians>() {
         let format = splat_format(&path, format).map_err(|error| errors::exception(py, &error))?;
+        let axes = gaussians.get().up.map_or(Axes::Ply, Axes::Cloud);
         let gaussians = gaussians.get().inner.clone();
-        work.run(py, move |_, _| write_splats(&path, &gaussians, format))?
+        work.run(py, move |_, _| write_splats(&path, &gaussians, axes, format))?
     } else {
         let format = point_format(&path, format).map_err(|error| errors::exception(py, &error))?;
         let (cloud, grid) = match thing.cast::<PyPointCloud>() {
@@ -216,45 +229,38 @@ fn splat_format(path: &Path, asked: Option<&str>) -> Result<Format> {
     }
 }
 
-/// Writes Gaussians, and what was subtracted from coordinates far from the origin into a file beside. Returns what the
-/// format does not keep.
-fn write_splats(path: &Path, gaussians: &Gaussians, format: Format) -> Result<Vec<String>> {
+/// Writes Gaussians, turned to the axes of the format if theirs are known, and a file beside with what the format has no
+/// place for. Returns what is lost or unexpected.
+fn write_splats(path: &Path, gaussians: &Gaussians, axes: Axes, format: Format) -> Result<Vec<String>> {
+    let offset = splats::offset(gaussians, axes, format);
+    let turned_from = match axes {
+        Axes::Cloud(up) if matches!(format, Format::Spz | Format::Splat | Format::Csv) => Some(up),
+        _ => None,
+    };
+    let beside = Sidecar::path_of(path);
+    let ours = Sidecar::beside(path).is_some();
+    let needed = offset != [0.0; 3] || turned_from.is_some();
+    if needed && !ours && beside.exists() {
+        let what = "exists already and is of another program: coordinates that the format has no place for go there";
+        return Err(Error::Usage(format!("{}: {what}", beside.display())));
+    }
     let mut warnings = Vec::new();
     output::write_file(path, |to| {
-        warnings = splats::write(gaussians, Axes::Ply, format, to, path)?;
+        warnings = splats::write(gaussians, axes, format, to, path)?;
         Ok(())
     })?;
-    let offset = splats::offset(gaussians, Axes::Ply, format);
-    if offset == [0.0; 3] {
-        return Ok(warnings);
+    if needed {
+        let sidecar = Sidecar {
+            offset,
+            turned_from,
+            ..Sidecar::default()
+        };
+        write_file(&beside, sidecar.to_json(path).as_bytes())?;
+        warnings.push(format!("{} states {}", beside.display(), sidecar.contents()));
+    } else if ours {
+        std::fs::remove_file(&beside).map_err(|source| Error::Io { path: beside, source })?;
     }
-    let beside = sidecar(path);
-    let text = json!({ "file": path.file_name().map(|name| name.to_string_lossy()), "offset": offset });
-    write_file(&beside, format!("{text:#}\n").as_bytes())?;
-    let [x, y, z] = offset;
-    let beside = beside.display();
-    warnings.push(format!(
-        "coordinates are less an offset of {x} {y} {z}, which {beside} states"
-    ));
     Ok(warnings)
-}
-
-/// The file that states the offset of another, as the program has it.
-fn sidecar(path: &Path) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".offset.json");
-    name.into()
-}
-
-fn offset_beside(path: &Path) -> Option<[f64; 3]> {
-    let small = Limits::default().with_max_bytes(4096);
-    let text = input::read_file(&sidecar(path), &small).ok()?;
-    let value: Value = serde_json::from_slice(&text).ok()?;
-    let [x, y, z] = value["offset"].as_array()?.as_slice() else {
-        return None;
-    };
-    let offset = [x.as_f64()?, y.as_f64()?, z.as_f64()?];
-    offset.iter().all(|x| x.is_finite()).then_some(offset)
 }
 
 fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
