@@ -14,7 +14,7 @@ use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::{Axes, Cancel, Error, Isa, Limits, Up};
 use b2p::{Decoder, Decoding};
-use common::{Ball, cloud_of, tiny_model};
+use common::{Ball, cloud_of, sparse_wall, tiny_model};
 
 fn stream(cloud: &ColouredVoxels, options: &Options) -> Vec<u8> {
     let encoded = encode(cloud, options, &Log::default());
@@ -265,6 +265,33 @@ fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_
         most = f64::max(most, if learned < 1.0 { surfels } else { 0.0 });
     }
     assert!(most > 0.3, "{most}");
+}
+
+#[test]
+fn learned_heads_leave_sparse_surfaces_to_surfels() {
+    let bytes = stream(&sparse_wall(), &with(QualityTarget::Lossless));
+    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
+    let surfels = Decoder::new().decode(&bytes).unwrap();
+    let learned = Decoder::new().with_heads_model(heads).decode(&bytes).unwrap();
+    let bits = |gaussians: &b2p::gaussians::Gaussians| {
+        let places = gaussians.position.iter().zip(&gaussians.scale);
+        let places = places.map(|(p, s)| [p, s].map(|v| v.map(f32::to_bits)));
+        places.collect::<std::collections::HashSet<_>>()
+    };
+    let (of_surfels, of_learned) = (bits(&surfels), bits(&learned));
+    assert_eq!(of_surfels.len(), of_learned.len());
+    let whole = |at: &&[[u32; 3]; 2]| f32::from_bits(at[0][2]) > 0.8;
+    let (near, far): (Vec<_>, Vec<_>) = of_surfels.iter().partition(|at| !whole(at));
+    assert!(
+        near.iter().all(|at| of_learned.contains(*at)),
+        "the sparse wall is drawn as surfels"
+    );
+    let kept = far.iter().filter(|at| of_learned.contains(**at)).count();
+    assert!(
+        kept * 2 < far.len(),
+        "{kept} of {} voxels of the whole wall are surfels",
+        far.len()
+    );
 }
 
 #[test]

@@ -1,6 +1,7 @@
 use super::discs::Disc;
 use super::*;
 use crate::geometry::{Octree, morton};
+use crate::testing::Random;
 use proptest::prelude::*;
 
 /// A cloud's voxels and kernel map.
@@ -306,6 +307,121 @@ fn a_choice_of_voxels_gives_their_discs_in_another_size() {
             assert_eq!(some.colour[to], all.colour[from]);
             let [u, v, thickness] = all.scale[from];
             assert_eq!(some.scale[to], [0.5 * u, 0.5 * v, thickness]);
+        }
+    }
+}
+
+/// A wall of 64 × 64 voxels at z = 9 of which a random share is there.
+fn wall(share: f64) -> Vec<[u32; 3]> {
+    let mut random = Random(5);
+    let mut is_there = move || (random.next() % 10_000) as f64 / 10_000.0 < share;
+    let all = (0..64 * 64).map(|i| [i % 64, i / 64, 9]);
+    all.filter(|_| is_there()).collect()
+}
+
+/// How opaque discs are at a place of the plane z = 9.5, in voxels.
+fn opacity(gaussians: &Gaussians, edge: f64, at: [f64; 2]) -> f64 {
+    let splats = gaussians.position.iter().zip(&gaussians.scale);
+    let transmitted = splats.map(|(p, s)| {
+        let off = |axis: usize| (f64::from(p[axis]) + 1.0) / edge - at[axis];
+        let sigma = f64::from(s[0]) / edge;
+        1.0 - (-(off(0).powi(2) + off(1).powi(2)) / (2.0 * sigma * sigma)).exp()
+    });
+    1.0 - transmitted.product::<f64>()
+}
+
+#[test]
+fn walls_close_whatever_share_of_their_voxels_is_there() {
+    for share in [1.0, 0.6, 0.4, 0.25, 0.12] {
+        let (voxels, map) = cloud(6, wall(share));
+        let wall = one_each(&voxels, &map);
+        let inner = |i: u32| [f64::from(12 + i % 40) + 0.3, f64::from(12 + i / 40) + 0.7];
+        let open = (0..1600)
+            .filter(|&i| opacity(&wall, 2.0 / 64.0, inner(i)) < 0.5)
+            .count();
+        assert!(open < 16, "{open} of 1600 places are open at {share}");
+    }
+}
+
+#[test]
+fn discs_at_the_border_of_a_wall_reach_no_farther_than_its_points_are_apart() {
+    for share in [1.0, 0.6, 0.4, 0.25, 0.12, 0.06] {
+        let (voxels, map) = cloud(7, wall(share));
+        let wall = one_each(&voxels, &map);
+        // The mean distance of the points, and half a voxel.
+        let reach = 0.5 + 1.0 / share.sqrt();
+        let beside = |i: u32| [64.0 + reach, 4.0 + f64::from(i)];
+        let mean = (0..56).map(|i| opacity(&wall, 2.0 / 128.0, beside(i))).sum::<f64>() / 56.0;
+        assert!(mean < 0.4, "{mean} at {share}");
+    }
+}
+
+#[test]
+fn lone_voxels_are_faint_beside_a_dense_surface_only() {
+    let specks = || (0..15).map(|i| [4 * i, 40, 50]);
+    let (voxels, map) = cloud(6, wall(1.0).into_iter().chain(specks()));
+    let drawn = one_each(&voxels, &map);
+    for (i, opacity) in drawn.opacity.iter().enumerate() {
+        let is_speck = voxels.coordinate(i)[2] == 50;
+        assert_eq!(*opacity, if is_speck { 1.0 / 64.0 } else { 1.0 });
+    }
+    let (voxels, map) = cloud(6, specks());
+    assert!(one_each(&voxels, &map).opacity.iter().all(|&opacity| opacity == 1.0));
+}
+
+#[test]
+fn full_surfaces_do_not_grow() {
+    let sheet = (0..400).map(|i| [i % 20, i / 20, 8]);
+    let slope = (0..48 * 48).map(|i| [i % 48, i / 48, 8 + i % 48 / 3]);
+    for (voxels, map) in [cloud(5, sheet), cloud(6, slope)] {
+        for disc in all_discs(Isa::detect(), &voxels, &map) {
+            assert!(disc.spacing < 1.02, "{}", disc.spacing);
+        }
+    }
+}
+
+#[test]
+fn bars_beside_a_dense_surface_do_not_merge() {
+    // Bars one voxel thick, every fourth column, above a sheet that has most of the voxels.
+    let sheet = (0..30 * 30).map(|i| [i % 30, i / 30, 2]);
+    let bars = (0..4 * 20).map(|i| [4 * (i % 4), i / 4, 12]);
+    let (voxels, map) = cloud(5, sheet.chain(bars));
+    let gaussians = one_each(&voxels, &map);
+    for i in (0..voxels.len()).filter(|&i| voxels.coordinate(i)[2] == 12) {
+        assert!(gaussians.scale[i].iter().all(|s| (s * 16.0 - 0.4).abs() < 0.01));
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(32))]
+
+    #[test]
+    fn windows_hold_what_is_within_their_reach(
+        keys in prop::collection::vec(0u64..1 << 15, 1..200), depth in 5u8..21
+    ) {
+        let (voxels, _) = cloud(depth, keys.into_iter().map(morton::decode));
+        let mut search = Windows::new(&voxels);
+        let all: Vec<_> = (0..voxels.len()).map(|i| voxels.coordinate(i)).collect();
+        for &middle in &all {
+            let within = |reach: u32| {
+                let near = |at: &&[u32; 3]| (0..3).all(|a| at[a].abs_diff(middle[a]) <= reach);
+                all.iter().filter(near).collect::<Vec<_>>()
+            };
+            let reach = [2, 4, 8].into_iter().find(|&reach| within(reach).len() >= 16);
+            let window = search.around(middle);
+            prop_assert_eq!(window.map(|w| u32::from(w.reach)), reach);
+            if let Some(window) = window {
+                let inside = within(window.reach.into());
+                let offset = |at: &[u32; 3], a: usize| at[a] as i32 - middle[a] as i32;
+                prop_assert_eq!(usize::from(window.count), inside.len());
+                for (k, (a, b)) in moments::PAIRS.into_iter().enumerate() {
+                    let square: i32 = inside.iter().map(|at| offset(at, a) * offset(at, b)).sum();
+                    prop_assert_eq!(window.square[k], square);
+                }
+                for a in 0..3 {
+                    prop_assert_eq!(window.sum[a], inside.iter().map(|at| offset(at, a)).sum::<i32>());
+                }
+            }
         }
     }
 }
