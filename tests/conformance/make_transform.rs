@@ -4,7 +4,7 @@ use b2p::cloud::ColouredVoxels;
 use b2p::encoder::transform::{Options, QualityTarget, encode};
 use b2p::log::Log;
 
-use crate::common::{Ball, cloud_of, sparse_wall};
+use crate::common::{Ball, cloud_of};
 
 /// A stream of the suite, what is unusual about it in its name, and whether no float had a part in it, so that every
 /// machine makes the same bytes.
