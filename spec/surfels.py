@@ -57,12 +57,13 @@ def relative(m, coordinates):
 
 
 def sparsity(n):
-    """6.3.2: masks of the voxels in open blocks, and of those that are noise unless they take a window."""
+    """6.3.2: masks of the voxels in open blocks, and of those that are noise unless they take a window. Blocks are thin
+    by the same rule with few = 512."""
     is_open, noise = np.zeros(len(n), dtype=bool), np.zeros(len(n), dtype=bool)
     for first in range(0, len(n), 1024):
         block = slice(first, first + 1024)
         specks = n[block] < 27
-        few = (n[block] < 512) & ~specks
+        few = (n[block] < 300) & ~specks
         noisy = 4 * specks.sum() < len(specks)
         is_open[block] = 8 * few.sum() >= len(specks) or not noisy
         noise[block] = specks & noisy

@@ -13,20 +13,22 @@ use crate::geometry::KernelMap;
 
 /// Weight below which a voxel lacks neighbours.
 const FEW: u16 = 512;
-/// Weight below which a voxel takes a window in an open block.
+/// Weight below which a voxel lacks most neighbours, and takes a window in an open block: less than at a border.
 const SPARSE: u16 = 300;
 /// Weight below which a voxel is a speck: a line of three voxels has 17, an endless one 27.
 const SPECK: u16 = 27;
-/// A block is open if one in so many voxels lacks neighbours and is no speck.
+/// A block is thin, or open, if one in so many voxels lacks neighbours, or most of them, and is no speck.
 const FEW_SHARE: usize = 8;
-/// A block is open if one in so many voxels is a speck. In others, specks are noise.
+/// A block is thin and open if one in so many voxels is a speck. In others, specks are noise.
 const SPECK_SHARE: usize = 4;
 
 /// What holds for a block of voxels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sparsity {
-    /// Whether many voxels lack neighbours, so that surfaces are known from wider windows only.
-    pub open: bool,
+    /// Whether many voxels lack most neighbours, so that surfaces are known from wider windows only.
+    open: bool,
+    /// Whether many voxels lack neighbours.
+    thin: bool,
     /// Whether specks are noise.
     noisy: bool,
 }
@@ -34,14 +36,16 @@ pub struct Sparsity {
 impl Sparsity {
     /// Of a block, from the weight of each voxel.
     pub fn of_block(weights: impl ExactSizeIterator<Item = u16>) -> Self {
-        let (all, mut few, mut specks) = (weights.len(), 0, 0);
+        let (all, mut few, mut sparse, mut specks) = (weights.len(), 0, 0, 0);
         for weight in weights {
             few += usize::from((SPECK..FEW).contains(&weight));
+            sparse += usize::from((SPECK..SPARSE).contains(&weight));
             specks += usize::from(weight < SPECK);
         }
         let noisy = SPECK_SHARE * specks < all;
         Sparsity {
-            open: FEW_SHARE * few >= all || !noisy,
+            open: FEW_SHARE * sparse >= all || !noisy,
+            thin: FEW_SHARE * few >= all || !noisy,
             noisy,
         }
     }
@@ -69,7 +73,7 @@ pub fn sparse_voxels(map: &KernelMap) -> Option<Vec<bool>> {
     let any = blocks.map(|(sparse, weights)| {
         let block = Sparsity::of_block(weights.iter().copied());
         let each = sparse.iter_mut().zip(weights);
-        each.for_each(|(sparse, &weight)| *sparse = block.open || block.is_noise(weight));
+        each.for_each(|(sparse, &weight)| *sparse = block.thin || block.is_noise(weight));
         sparse.contains(&true)
     });
     let any = any.reduce(|| false, |a, b| a | b);
