@@ -23,7 +23,7 @@ KEPT = HERE / "budget.json"
 BITS = (10, 9, 7)
 BUDGETS = (10, 20, 50, 100, 200, 500, 1000, 2000)  # ms
 SIZES = ("512x512", "1024x1024", "1920x1080")
-LINE = re.compile(r"budget: (?P<choice>.*); expected (?P<expected>[\d.]+) ms and [\d.]+ dB(?P<not_promised>, nothing promises)?.*kept: (?P<took>[\d.]+) ms of (?P<time>[\d.]+) ms")
+LINE = re.compile(r"budget: (?P<choice>.*), expected (?P<expected>[\d.]+) ms; (?P<not_promised>no setting fits)?.*?(took|kept:) (?P<took>[\d.]+) ms")
 
 
 def b2p(*args):

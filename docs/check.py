@@ -18,6 +18,12 @@ GLOSSARY = "docs/glossary.md"
 # What may stand between the words of a phrase: the next line of a comment, or the underscores of a test's name.
 BREAK = r"(?:_|\s+(?:(?:///|//!|//|#|\*|>)\s*)?)"
 README_LINES, README_WIDTH = 150, 120
+# Modules that implement no clause of the format.
+NO_CLAUSE = {
+    "src/colour/encode.rs",
+    "src/gaussians/surfels/lanes.rs",
+    "src/gaussians/surfels/passes.rs",
+}
 
 
 def tracked(*patterns):
@@ -100,8 +106,34 @@ def size():
             yield f"README.md:{number}: {len(line)} characters, at most {README_WIDTH}"
 
 
+def clauses():
+    """Clauses of the format that sources and documents cite, but that do not exist."""
+    text = (BOOK / "format.md").read_text()
+    known = set(re.findall(r"^#* ?(\d+(?:\.\d+)*) ", text, re.M))
+    number = r"\d+(?:\.\d+)*"
+    more = rf"(?:(?:,| and| to|–) ?{number})*"
+    cited = re.compile(rf"\b(?:clauses? |format\.md`?,? (?:clauses? )?)({number}{more})", re.I)
+    code = re.compile(r"(?:\.breaks\(|malformed\(|require\([^\n]*?, |Refused\(|clause: )\"(\d[\d.]*)\"")
+    for name in tracked("*.rs", "*.py", "*.md"):
+        if name.startswith("lab/"):
+            continue
+        text = (ROOT / name).read_text()
+        # A citation may go on in the next line of a comment.
+        plain = re.sub(r"\s*\n\s*(?:///|//!|//|#)?\s*", " ", text)
+        found = [n for numbers in cited.findall(plain) for n in re.findall(number, numbers)]
+        for clause in sorted({*found, *code.findall(text)} - known):
+            yield f"{name}: docs/format.md has no clause {clause}"
+    for folder in ("container", "geometry", "colour", "gaussians/surfels"):
+        for path in sorted((ROOT / "src" / folder).rglob("*.rs")):
+            name = path.relative_to(ROOT).as_posix()
+            head = re.match(r"(?://!.*\n)*", path.read_text()).group().replace("\n//! ", " ")
+            cites = re.search(r"format\.md`?,? (?:clauses? )?\d|clause \d", head)
+            if "/tests" not in name and name not in NO_CLAUSE and not cites:
+                yield f"{name}: its first comment names no clause of docs/format.md"
+
+
 def main():
-    checks = {"links": links, "words": words, "size": size}
+    checks = {"links": links, "words": words, "size": size, "clauses": clauses}
     asked = sys.argv[1:] or list(checks)
     if unknown := [name for name in asked if name not in checks]:
         sys.exit(f"no check {unknown[0]}; there are {', '.join(checks)}")

@@ -4,13 +4,17 @@ import struct
 
 
 class Refused(Exception):
-    """What clause 15.3 tells a decoder to refuse."""
+    """What clause 15.3 tells a decoder to refuse, and the clause that it breaks."""
+
+    def __init__(self, clause, what):
+        super().__init__(f"{what} (clause {clause})")
+        self.clause = clause
 
 
 def require(condition, clause, what):
     """Refuses the stream unless `condition` holds."""
     if not condition:
-        raise Refused(f"{what} (clause {clause})")
+        raise Refused(clause, what)
 
 
 def limit(x, most):
@@ -44,14 +48,14 @@ def sgn3(x):
 
 
 class Reader:
-    """Little-endian numbers from bytes (1.4)."""
+    """Little-endian numbers from bytes (1.4). `clause` says how many bytes there must be."""
 
-    def __init__(self, data, at=0, end=None):
-        self.data, self.at = data, at
+    def __init__(self, data, clause, at=0, end=None):
+        self.data, self.clause, self.at = data, clause, at
         self.end = len(data) if end is None else end
 
     def take(self, count):
-        require(self.at + count <= self.end, "2.1.1", f"the bytes end at {self.end}")
+        require(self.at + count <= self.end, self.clause, f"the bytes end at {self.end}")
         self.at += count
         return self.data[self.at - count : self.at]
 
@@ -67,7 +71,7 @@ class Reader:
             if byte < 128:
                 require(value < 1 << 32 and (byte > 0 or shift == 0), "1.4.2", "varint")
                 return value
-        raise Refused("varint of more than five bytes (clause 1.4.2)")
+        raise Refused("1.4.2", "varint of more than five bytes")
 
 
 def crc32c(data):

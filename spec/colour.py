@@ -320,7 +320,7 @@ def spread(nodes, energies):
 
 def decode_trunk(levels, payload):
     """5.3.2; `levels` are the voxels of the levels 0 to K."""
-    reader = Reader(payload)
+    reader = Reader(payload, "5.3")
     steps = Steps(reader.number("B"), reader.number("B"))
     steps.check()
     gain = reader.number("B")
@@ -345,7 +345,7 @@ def decode_level(nodes, children, above, payloads, slice_nodes):
     """5.3.1; `nodes` is the level above."""
     values, energies, steps, model = [], [], None, None
     for number, payload in enumerate(payloads):
-        reader = Reader(payload)
+        reader = Reader(payload, "5.3")
         own = Steps(reader.number("B"), reader.number("B"))
         own.check()
         require(own.lossless() == above.steps.lossless(), "5.1.3", "lossless and lossy colours")

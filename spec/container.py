@@ -46,7 +46,7 @@ class Level:
 
 def parse_header(data):
     """2.2"""
-    reader = Reader(data)
+    reader = Reader(data, "2.2.1")
     require(reader.take(8) == MAGIC, "2.2.1", "magic")
     major, _ = reader.number("H"), reader.number("H")  # the minor version does not matter
     require(major == 3, "2.2.1", f"major version {major}: this decoder reads 3")
@@ -81,7 +81,7 @@ class Chunks:
     def __init__(self, data, start, end):
         require(end <= len(data), "2.1.1", "section beyond the end of the stream")
         self.chunks, self.head_maps = [], []
-        reader = Reader(data, start, end)
+        reader = Reader(data, "2.1.2", start, end)
         while reader.at < end:
             chunk = self.read(reader)
             if chunk.kind < 128:
@@ -104,16 +104,16 @@ class Chunks:
         require(number <= 65535, "3.1.1", "slice number")
         return Chunk(kind, level, number, count, payload)
 
-    def take(self, kind, levels, number):
+    def take(self, clause, kind, levels, number):
         """The next chunk, which must be this one."""
-        require(self.chunks, "3.2", f"missing chunk of type {kind}")
+        require(self.chunks, clause, f"missing chunk of type {kind}")
         chunk = self.chunks.pop()
         fits = (chunk.kind, chunk.slice) == (kind, number) and chunk.level in levels
-        require(fits, "3.2", f"chunk of type {chunk.kind}, level {chunk.level}, slice {chunk.slice}")
+        require(fits, clause, f"chunk of type {chunk.kind}, level {chunk.level}, slice {chunk.slice}")
         return chunk
 
-    def finish(self):
-        require(not self.chunks, "3.2", "chunk after the last of a section")
+    def finish(self, clause):
+        require(not self.chunks, clause, "chunk after the last of a section")
 
 
 def sliced(count, size):
@@ -139,11 +139,11 @@ def read_level(data, header, level):
     for n in range(first, level + 1):
         result.geometry[n] = []
         for number, parents in enumerate(sliced(counts[n - 1], header.slice_voxels)):
-            chunk = chunks.take(GEOMETRY, [n], number)
+            chunk = chunks.take("3.2.3", GEOMETRY, [n], number)
             require(parents <= chunk.count <= 8 * parents, "3.2.3", "children of a slice")
             result.geometry[n].append((chunk.count, chunk.payload))
         counts[n] = sum(count for count, _ in result.geometry[n])
-    chunks.finish()
+    chunks.finish("3.2.1")
     require(counts[level] == header.voxels[index], "3.2.4", f"voxels of level {level}")
     require(max(counts.values()) == counts[level], "3.2.4", "voxels of a level before")
     read_colours(Chunks(data, middle, end), header, counts, result)
@@ -152,8 +152,8 @@ def read_level(data, header, level):
 
 def read_geometry_trunk(chunks, header, counts, result):
     """3.2.2; the first level after the trunk."""
-    chunk = chunks.take(GEOMETRY_TRUNK, range(1, header.base + 1), 0)
-    reader = Reader(chunk.payload)
+    chunk = chunks.take("3.2.1", GEOMETRY_TRUNK, range(1, header.base + 1), 0)
+    reader = Reader(chunk.payload, "3.2.2")
     for n in range(1, chunk.level + 1):
         require(counts[n - 1] <= header.slice_voxels, "3.2.2", "parents of a level in the trunk")
         counts[n] = reader.varint()
@@ -179,7 +179,7 @@ def read_colours(chunks, header, counts, result):
 
     first = level
     if level == header.base:
-        chunk = chunks.take(COLOUR_TRUNK, range(level + 1), 0)
+        chunk = chunks.take("3.3.1", COLOUR_TRUNK, range(level + 1), 0)
         require(chunk.count == counts[chunk.level], "3.3.1", "voxels of the colour trunk")
         require(chunk.level == 0 or chunk.count <= 65536, "3.3.1", "voxels of the colour trunk")
         result.trunk = (chunk.level, payload(chunk))
@@ -187,11 +187,11 @@ def read_colours(chunks, header, counts, result):
     for n in range(first, level + 1):
         result.colours[n] = []
         for number, parents in enumerate(sliced(counts[n - 1], header.colour_slice)):
-            chunk = chunks.take(COLOURS, [n], number)
+            chunk = chunks.take("3.3.2", COLOURS, [n], number)
             require(chunk.count == parents, "3.3.2", "parents of a colour slice")
             result.colours[n].append(payload(chunk))
     if chunks.chunks:
-        chunk = chunks.take(FILTER, [level], 0)
+        chunk = chunks.take("3.3.4", FILTER, [level], 0)
         require(chunk.count == counts[level], "3.3.4", "voxels of the colour filter")
         result.filter = chunk.payload
-    chunks.finish()
+    chunks.finish("3.3.4")

@@ -2,6 +2,7 @@
 
     python3 spec/decode.py STREAM.b2p           prints voxels and digests of every level
     python3 spec/decode.py --suite FOLDER       checks all streams of FOLDER/suite.txt
+    python3 spec/decode.py --damage LIST        checks that the streams of LIST are refused for the stated clauses
 """
 
 import hashlib
@@ -85,10 +86,41 @@ def check(folder):
     return failed
 
 
+def damaged(data, changes):
+    """The stream after changes `offset:removed:inserted` (16.3)."""
+    for change in reversed(changes):
+        offset, removed, inserted = change.split(":")
+        end = int(offset) + int(removed)
+        data = data[: int(offset)] + bytes.fromhex(inserted) + data[end:]
+    return data
+
+
+def check_damage(path):
+    """How many damaged streams are not refused for the stated clause."""
+    failed = count = 0
+    for line in path.read_text().splitlines():
+        name, stream, expected, *changes = line.split(" ")
+        if not stream.startswith("version-3/"):
+            continue
+        try:
+            list(digests(damaged((path.parent / f"{stream}.b2p").read_bytes(), changes)))
+            found = "nothing"
+        except Refused as fault:
+            found = fault.clause
+        if found != expected:
+            print(f"{name}: REFUSED FOR {found}, not {expected}", flush=True)
+        failed += found != expected
+        count += 1
+    print(f"{count} damaged streams, {failed} refused for another clause or not at all")
+    return failed
+
+
 def main(arguments):
     match arguments:
         case ["--suite", folder]:
             return min(check(Path(folder)), 1)
+        case ["--damage", path]:
+            return min(check_damage(Path(path)), 1)
         case [path]:
             print(*digests(Path(path).read_bytes()), sep="\n")
             return 0

@@ -13,22 +13,48 @@ fn python(arguments: &[&str]) -> std::io::Result<(bool, String)> {
     Ok((output.status.success(), String::from_utf8_lossy(&printed).into_owned()))
 }
 
-#[test]
-fn a_decoder_written_from_the_document_decodes_the_conformance_streams() {
+/// Whether Python and numpy are there; says so if not.
+fn can_run() -> bool {
     let needed = "import sys, numpy; assert sys.version_info >= (3, 10), sys.version";
     match python(&["-c", needed]) {
-        Ok((true, _)) => (),
-        Ok((false, why)) => return println!("not run: {}", why.lines().last().unwrap_or_default()),
-        Err(why) => return println!("not run: python3: {why}"),
+        Ok((true, _)) => return true,
+        Ok((false, why)) => println!("not run: {}", why.lines().last().unwrap_or_default()),
+        Err(why) => println!("not run: python3: {why}"),
+    }
+    false
+}
+
+fn lines(file: &str) -> Vec<String> {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(file);
+    let text = std::fs::read_to_string(file).expect("the suite is there");
+    text.lines().map(str::to_owned).collect()
+}
+
+/// `tests/conformance` holds this library to the same list.
+#[test]
+fn the_second_decoder_refuses_every_damaged_stream_for_the_clause_that_it_breaks() {
+    if !can_run() {
+        return;
+    }
+    let list = "tests/data/conformance/damage.txt";
+    let (success, printed) = python(&["spec/decode.py", "--damage", list]).expect("python3 was there a moment ago");
+    assert!(success, "{printed}");
+    let lines = lines(list);
+    let streams = lines.iter().filter(|line| line.contains(" version-3/")).count();
+    assert!(streams >= 100, "{streams} damaged streams");
+    let expected = format!("{streams} damaged streams, 0 refused for another clause");
+    assert!(printed.contains(&expected), "{printed}");
+}
+
+#[test]
+fn a_decoder_written_from_the_document_decodes_the_conformance_streams() {
+    if !can_run() {
+        return;
     }
     let suite = ["spec/decode.py", "--suite", "tests/data/conformance/version-3"];
     let (success, printed) = python(&suite).expect("python3 was there a moment ago");
     println!("{printed}");
     assert!(success, "{printed}");
-    let list = Path::new(env!("CARGO_MANIFEST_DIR")).join(suite[2]).join("suite.txt");
-    let streams = std::fs::read_to_string(list)
-        .expect("the suite is there")
-        .lines()
-        .count();
+    let streams = lines("tests/data/conformance/version-3/suite.txt").len();
     assert!(printed.contains(&format!("{streams} streams, 0 differ")), "{printed}");
 }

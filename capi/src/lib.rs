@@ -8,6 +8,8 @@ mod decoding;
 mod model;
 mod picture;
 mod points;
+#[cfg(target_family = "wasm")]
+pub mod wasm;
 
 pub use boundary::Status;
 pub use decoding::{Arrays, Cancel, Decoding, Gaussians};

@@ -1,5 +1,6 @@
 //! What can be asked of the program.
 
+use std::net::IpAddr;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
@@ -139,14 +140,20 @@ pub enum Command {
     Encode(Encode),
     /// Decode a stream to 3D Gaussians
     Decode(Decode),
-    /// Convert Gaussians from one file format to another
+    /// Convert Gaussians or points from one file format to another
     Convert(Convert),
     /// Draw a stream, or Gaussians, into a picture
     Render(Render),
     /// Say what a stream holds
     Info(Info),
+    /// Say whether streams are valid, and where not, which clause of the format they break
+    Check(Check),
+    /// Turn a stream of version 2 into one of version 3, which needs no model
+    Upgrade(Upgrade),
     /// Cut a stream after a level: a shorter stream
     Cut(Cut),
+    /// Show streams in a web page, drawn by the browser without a GPU
+    Serve(Serve),
     /// Decode and draw the sample that comes with the program
     Demo(Demo),
     /// Time the stages of decoding
@@ -237,11 +244,18 @@ pub struct Decode {
     pub output: Output,
     /// Write the level's voxels with their colours instead, as points: PLY, or LAS, LAZ, PCD, E57 or XYZ by the ending (of learned
     /// streams there are none)
-    #[arg(long, conflicts_with_all = ["heads", "budget", "min_psnr", "calibrate"])]
+    #[arg(long, conflicts_with_all = ["heads", "budget", "calibrate"])]
     pub points: bool,
     /// Format of the Gaussians: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
     #[arg(long, value_name = "NAME", conflicts_with = "points")]
     pub format: Option<SplatFormat>,
+    /// Axis of the cloud that points up: x, y, z, -x, -y, -z, or auto. Gaussians are turned so that they stand upright in viewers
+    /// [default: what the stream says; if it says nothing, they are not turned]
+    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true, conflicts_with = "points")]
+    pub up: Option<UpArg>,
+    /// Keep the axes of the cloud: do not turn Gaussians
+    #[arg(long, conflicts_with_all = ["points", "up"])]
+    pub keep_axes: bool,
     #[command(flatten)]
     pub write: WriteArgs,
     #[command(flatten)]
@@ -253,21 +267,87 @@ pub struct Decode {
 }
 
 #[derive(Debug, Args)]
-pub struct Convert {
-    /// Gaussians: PLY, compressed PLY, SPZ, SOG, .splat, glTF, CSV or NumPy archive. `-`: standard input
+pub struct Check {
+    /// Streams to check to the last bit. `-`: standard input
+    #[arg(value_name = "STREAM", required = true)]
+    pub inputs: Vec<PathBuf>,
+    /// Model of learned streams [default: the one inside the program]
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct Upgrade {
+    /// Stream of version 2. `-`: standard input
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
     pub output: Output,
-    /// Format of the output: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
-    #[arg(long, value_name = "NAME", conflicts_with = "points")]
-    pub format: Option<SplatFormat>,
-    /// Format of the input [default: by its contents, of .splat and .csv by the ending]
+    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000 [default: 20]
+    #[arg(long, value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
+    pub step: Option<QualityTarget>,
+    /// Code the colours that the voxels are drawn in exactly, in 8 bits
+    #[arg(long)]
+    pub lossless: bool,
+    #[command(flatten)]
+    pub model: ModelArg,
+}
+
+#[derive(Debug, Args)]
+pub struct Convert {
+    /// Gaussians: PLY, compressed PLY, SPZ, SOG, .splat, glTF, CSV or NumPy archive; or points: PLY, LAS, LAZ, PCD, E57, XYZ, OBJ or
+    /// glTF. `-`: standard input
+    #[arg(value_name = "IN")]
+    pub input: PathBuf,
+    #[command(flatten)]
+    pub output: Output,
+    /// Format of the output: of Gaussians ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz; of points ply, las, laz, pcd, e57,
+    /// xyz [default: by the ending]
+    #[arg(long, value_name = "NAME")]
+    pub format: Option<OutFormat>,
+    /// Format of the input, if it is Gaussians [default: by its contents, of .splat and .csv by the ending]
     #[arg(long, value_name = "NAME")]
     pub from: Option<SplatFormat>,
-    /// Write a PLY of points instead: the centres with their colours
+    /// Write the centres of Gaussians with their colours as points, also to .ply
     #[arg(long)]
     pub points: bool,
+    /// Make flat Gaussians of points, without a stream between
+    #[arg(long, conflicts_with_all = ["points", "double", "local"])]
+    pub surfels: bool,
+    /// Keep the axes of the coordinates: do not turn Gaussians so that they stand upright in viewers
+    #[arg(long)]
+    pub keep_axes: bool,
+    /// Write points with coordinates as doubles [default: floats where they are exact]
+    #[arg(long, help_heading = "Points")]
+    pub double: bool,
+    /// Write points with coordinates from a near origin, which goes into a comment and into OUT.json
+    #[arg(long, help_heading = "Points")]
+    pub local: bool,
+    #[command(flatten)]
+    pub read: ReadArgs,
+}
+
+/// A format of Gaussians or of points. PLY is one of both.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OutFormat {
+    Splats(SplatFormat),
+    Points(PointFormat),
+}
+
+impl std::str::FromStr for OutFormat {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let points = || name.parse().map(OutFormat::Points);
+        let found = name.parse().map(OutFormat::Splats).or_else(|_: b2p::Error| points());
+        found.map_err(|_: b2p::Error| {
+            let names: Vec<_> = SplatFormat::all().map(SplatFormat::name).collect();
+            format!(
+                "{name:?} is no format, expected {}, las, laz, pcd, e57 or xyz",
+                names.join(", ")
+            )
+        })
+    }
 }
 
 #[derive(Debug, Args)]
@@ -299,7 +379,13 @@ pub struct Render {
     #[arg(long, help_heading = "Advanced", value_name = "NAME=on|off|auto", value_parser = effect, help = effect_help())]
     pub effect: Vec<(Effect, EffectMode)>,
     /// How much of what is faint may be left out: fast, fine, exact
-    #[arg(long, help_heading = "Advanced", value_name = "NAME", default_value = "fine", conflicts_with_all = ["budget", "min_psnr"])]
+    #[arg(
+        long,
+        help_heading = "Advanced",
+        value_name = "NAME",
+        default_value = "fine",
+        conflicts_with = "budget"
+    )]
     pub quality: Quality,
     /// The same as --json
     #[arg(long, hide = true, value_enum, value_name = "FORMAT")]
@@ -483,19 +569,53 @@ pub struct ModelArg {
     pub precision: Option<String>,
 }
 
-use super::budget::BudgetArgs;
+use super::budget::{BudgetArgs, Request};
 use super::cloud::{ReadArgs, UpArg, WriteArgs, up};
+use super::progress::Progress;
 pub use super::values::Orbit;
 use super::values::{
     background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,
 };
 pub use b2p::renderer::{Background, Effect, EffectMode, Quality};
+use b2p_formats::clouds::PointFormat;
 pub use b2p_formats::splats::Format as SplatFormat;
 
 /// The help of `--effect`.
 fn effect_help() -> String {
     let names = Effect::ALL.map(Effect::name).join(", ");
     format!("Force an effect ({names}) on or off")
+}
+
+macro_rules! budget_request {
+    ($($command:ident)*) => {$(
+        impl $command {
+            /// What a choice of level and heads is made for.
+            pub fn budget<'a>(&'a self, limits: &'a Limits, progress: &'a Progress) -> Request<'a> {
+                Request {
+                    args: &self.budget,
+                    detail: &self.detail,
+                    model: &self.model,
+                    limits,
+                    progress,
+                }
+            }
+        }
+    )*};
+}
+
+budget_request!(Decode Render);
+
+#[derive(Debug, Args)]
+pub struct Serve {
+    /// Stream, or folder of streams
+    #[arg(value_name = "FILE|FOLDER")]
+    pub source: PathBuf,
+    /// Port; 0: any that is free
+    #[arg(short, long, value_name = "N", default_value_t = 8000)]
+    pub port: u16,
+    /// Address to listen at. Others than this machine's own let everybody in who can reach it
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1")]
+    pub host: IpAddr,
 }
 
 #[cfg(test)]

@@ -1,23 +1,27 @@
 //! Point clouds in: of any format, with what was mended; and as surfels to draw.
 
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 
 use b2p::axes::{Axes, Up};
-use b2p::cloud::{ColourRange, ColouredVoxels, GridReport, PointCloud, ReadOptions, voxelise, voxelise_closed};
+use b2p::cloud::{
+    ColourRange, ColouredVoxels, GridReport, Note, PointCloud, ReadOptions, voxelise, voxelise_closed, voxelise_memory,
+};
 use b2p::container;
 use b2p::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::geometry::Octree;
 use b2p::log::Log;
 use b2p::{Isa, Limits};
-use b2p_formats::clouds::{self, Encoded, PointFormat, WriteOptions};
+use b2p_formats::clouds::{self, Encoded, PointFormat, Reading, WriteOptions};
 use b2p_formats::detect::{Group, Kind};
+use b2p_formats::sidecar::Sidecar;
 use clap::Args;
 use serde_json::json;
 
 use super::table::count;
-use super::{Failure, Result, manners};
+use super::{Failure, Result, load, manners};
 
 /// Voxels of the finest level for one of the level above from which on surfaces are closed at the finest level.
 const CLOSED: usize = 3;
@@ -25,7 +29,10 @@ const CLOSED: usize = 3;
 const CRS_SHARE: f64 = 20.0;
 
 /// Bytes of a stream that hold its header and its axes.
-const START: u64 = 1 << 18;
+pub const START: u64 = 1 << 18;
+
+/// What the input said of its coordinates when it was read.
+static REMEMBERED: Mutex<Option<Axes>> = Mutex::new(None);
 
 /// How points are read.
 #[derive(Debug, Clone, Default, Args)]
@@ -58,6 +65,13 @@ pub struct ReadArgs {
 /// An axis, or what the file says.
 #[derive(Debug, Clone, Copy)]
 pub struct UpArg(Option<Up>);
+
+impl UpArg {
+    /// The axis. `None` for what the file says.
+    pub fn up(self) -> Option<Up> {
+        self.0
+    }
+}
 
 /// How points are written.
 #[derive(Debug, Clone, Copy, Default, Args)]
@@ -96,6 +110,19 @@ fn corners(text: &str) -> std::result::Result<[[f64; 3]; 2], String> {
 }
 
 impl ReadArgs {
+    /// The first option that was given and concerns points alone.
+    pub fn given(&self) -> Option<&'static str> {
+        let all = [
+            ("--crop", self.crop.is_some()),
+            ("--drop-outliers", self.drop_outliers),
+            ("--strict", self.strict),
+            ("--colour-range", self.colour_range.is_some()),
+            ("--unit", self.unit.is_some()),
+            ("--vertices", self.vertices),
+        ];
+        all.iter().find(|(_, given)| *given).map(|(name, _)| *name)
+    }
+
     fn options(&self) -> ReadOptions {
         ReadOptions {
             strict: self.strict,
@@ -105,25 +132,58 @@ impl ReadArgs {
             up: self.up.and_then(|up| up.0),
             metres_per_unit: self.unit,
             vertices: self.vertices,
+            offset: [0.0; 3],
         }
     }
 }
 
 /// Reads the points of a file, and says on standard error what was mended.
 pub fn read(path: &Path, args: &ReadArgs, limits: &Limits) -> Result<PointCloud> {
-    let read = clouds::open(path, limits, &args.options()).map_err(Failure::in_file(path))?;
+    of_bytes(path, load::bytes(path, limits)?, args, limits)
+}
+
+/// Reads the points of a file with these bytes, and says on standard error what was mended.
+pub fn of_bytes(path: &Path, bytes: Vec<u8>, args: &ReadArgs, limits: &Limits) -> Result<PointCloud> {
+    let read = reading(path, bytes, &args.options(), limits)?;
     say(path, &read.notes);
     Ok(read.cloud)
 }
 
-fn say(path: &Path, notes: &[b2p::cloud::Note]) {
+/// Reads points, with what stands in a file beside.
+fn reading(path: &Path, bytes: Vec<u8>, options: &ReadOptions, limits: &Limits) -> Result<Reading> {
+    let folder = path
+        .parent()
+        .filter(|folder| *folder != Path::new(""))
+        .unwrap_or(Path::new("."));
+    let beside = Sidecar::beside(path);
+    let options = beside
+        .as_ref()
+        .map_or_else(|| options.clone(), |beside| beside.options(options));
+    let read = clouds::read(bytes, Some(folder), limits, &options);
+    let mut read = read.map_err(Failure::in_file(path))?;
+    if let Some(beside) = beside {
+        beside.complete(&mut read.cloud);
+        let (contents, name) = (beside.contents(), Sidecar::path_of(path));
+        read.notes
+            .push(Note::Other(format!("{contents}: as {} states", name.display())));
+    }
+    Ok(read)
+}
+
+fn say(path: &Path, notes: &[Note]) {
     for note in notes {
         manners::warn(&format!("{}: {note}", path.display()));
     }
 }
 
+/// Fails unless so many points may be voxelised.
+fn check_memory(points: usize, limits: &Limits) -> b2p::Result<()> {
+    limits.check_bytes("bytes of a cloud and its voxels", voxelise_memory(points as u64))
+}
+
 /// The voxels of a cloud, of this depth or by the spacing of its points.
-pub fn grid(cloud: &PointCloud, bits: Option<u8>) -> b2p::Result<(ColouredVoxels, GridReport)> {
+pub fn grid(cloud: &PointCloud, bits: Option<u8>, limits: &Limits) -> b2p::Result<(ColouredVoxels, GridReport)> {
+    check_memory(cloud.positions.len(), limits)?;
     match bits {
         None => voxelise_closed(cloud),
         Some(bits) => {
@@ -169,9 +229,45 @@ pub fn axes(bytes: &[u8]) -> Axes {
     container::axes(bytes).unwrap_or_default()
 }
 
+/// Remembers what a stream that starts with these bytes says of its coordinates. There may be no other way to know once it
+/// has been read.
+pub fn remember(bytes: &[u8]) {
+    if let Ok(axes) = container::axes(bytes) {
+        set_remembered(axes);
+    }
+}
+
+/// Remembers the axis that points up in the Gaussians that were read.
+pub fn remember_up(up: Up) {
+    set_remembered(Axes {
+        up: Some(up),
+        ..Axes::default()
+    });
+}
+
+fn set_remembered(axes: Axes) {
+    *REMEMBERED.lock().unwrap_or_else(PoisonError::into_inner) = Some(axes);
+}
+
+fn remembered() -> Option<Axes> {
+    REMEMBERED.lock().unwrap_or_else(PoisonError::into_inner).clone()
+}
+
+/// What the stream in a file says of its coordinates, or what came from a pipe said.
+pub fn known_axes(path: &Path) -> Axes {
+    let of_file = || start_of(path).map(|start| axes(&start));
+    remembered().or_else(of_file).unwrap_or_default()
+}
+
 /// The axis that points up in pictures of a file: as asked for, as the file says, or as its format has it.
 pub fn up_of(path: &Path, asked: Option<UpArg>) -> Option<Up> {
     if let Some(up) = asked.and_then(|asked| asked.0) {
+        return Some(up);
+    }
+    if let Some(up) = remembered().and_then(|axes| axes.up) {
+        return Some(up);
+    }
+    if let Some(up) = Sidecar::beside(path).and_then(|beside| beside.axes.up) {
         return Some(up);
     }
     let start = start_of(path)?;
@@ -221,15 +317,24 @@ pub fn drawable(path: &Path, bytes: &[u8], isa: Isa, limits: &Limits, log: &Log)
     if !is_cloud(bytes) {
         return Ok(None);
     }
+    surfels_of(path, bytes.to_vec(), &ReadArgs::default(), isa, limits, log).map(|(gaussians, _)| Some(gaussians))
+}
+
+/// Points as surfels, and what is known of their coordinates.
+pub fn surfels_of(
+    path: &Path,
+    bytes: Vec<u8>,
+    args: &ReadArgs,
+    isa: Isa,
+    limits: &Limits,
+    log: &Log,
+) -> Result<(Gaussians, Axes)> {
     let fail = Failure::in_file(path);
-    let read = log.step("read cloud", 1, "file", || {
-        clouds::read(bytes.to_vec(), path.parent(), limits, &ReadOptions::default())
-    });
-    let read = read.map_err(&fail)?;
-    say(path, &read.notes);
-    let points = read.cloud.positions.len();
+    let cloud = log.step("read cloud", 1, "file", || Ok(of_bytes(path, bytes, args, limits)))??;
+    let points = cloud.positions.len();
+    check_memory(points, limits).map_err(&fail)?;
     let grid = log
-        .step("voxelise", points, "points", || closed(&read.cloud))
+        .step("voxelise", points, "points", || closed(&cloud))
         .map_err(&fail)?;
     let frame = Frame {
         bits: grid.voxels.depth(),
@@ -249,7 +354,7 @@ pub fn drawable(path: &Path, bytes: &[u8], isa: Isa, limits: &Limits, log: &Log)
             frame,
         ))
     });
-    gaussians.map(Some).map_err(&fail)
+    Ok((gaussians.map_err(&fail)?, cloud.axes))
 }
 
 /// Voxels of the finest level at which surfaces are closed: the grid's own, or the level above.
@@ -268,8 +373,9 @@ pub fn info(path: &Path, bytes: &[u8], as_json: bool, limits: &Limits) -> Result
         return Ok(None);
     }
     let fail = Failure::in_file(path);
-    let read = clouds::read(bytes.to_vec(), path.parent(), limits, &ReadOptions::default()).map_err(&fail)?;
+    let read = reading(path, bytes.to_vec(), &ReadOptions::default(), limits)?;
     let cloud = &read.cloud;
+    check_memory(cloud.positions.len(), limits).map_err(&fail)?;
     let (grid, report) = voxelise_closed(cloud).map_err(&fail)?;
     let mut corners = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
     for position in &cloud.positions {
@@ -320,13 +426,6 @@ pub fn described(axes: &Axes) -> String {
         text += &format!("coordinate system: {}\n", axes.crs);
     }
     text
-}
-
-/// The file beside a file of points that holds the offset of local coordinates.
-pub fn sidecar(path: &Path) -> PathBuf {
-    let mut path = path.to_owned().into_os_string();
-    path.push(".json");
-    path.into()
 }
 
 /// Points as a file of the format that its ending names, PLY for any other.

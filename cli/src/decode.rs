@@ -1,9 +1,9 @@
 //! `b2p decode`: stream to Gaussians in a file.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use super::budget::Task;
+use super::budget::{Chosen, Task};
 use b2p::Limits;
 use b2p::container::version;
 use b2p::gaussians::Gaussians;
@@ -15,7 +15,7 @@ use super::args::Decode;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, cloud, convert, keep, kinds, load, pipe};
+use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points};
 
 /// Decodes a stream into a file of Gaussians.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
@@ -25,36 +25,46 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
     cloud::refuse(&args.input)?;
     let log = progress.log();
     if args.points {
-        return points(args, limits, &log);
+        return decoded_points(args, limits, &log);
     }
     let (input, to) = (&args.input, &args.output);
     let format = convert::output_format(to, args.format)?;
     let mut written = 0;
     let mut write = |gaussians: &Gaussians, log: &Log| {
         written = gaussians.len();
-        convert::write(gaussians, Axes::Ply, format, to, log)
-    };
-    let chosen = if let Some(bytes) = keep::stream(&args.budget, input, limits)? {
-        let (budget, start) = (&args.budget, Instant::now());
-        let kept = keep::decode(budget, input, &bytes, &args.model, limits, &log)?;
-        let told = kept.describe(start.elapsed());
-        write(&kept.gaussians, &log)?;
-        told
-    } else {
-        let chosen = budget::choose(&args.budget, &args.model, input, Task::Decode, limits, progress)?;
-        let chosen_args = chosen.as_ref().map(|c| (c.detail(), c.model(&args.model)));
-        let (detail, model) = match &chosen_args {
-            Some((detail, model)) => (detail, model),
-            None => (&args.detail, &args.model),
+        let known = cloud::known_axes(input);
+        let axes = match args.up.map_or(known.up, |up| up.up().or(known.up)) {
+            _ if args.keep_axes => Axes::of(format),
+            Some(up) => Axes::Cloud(up),
+            None => Axes::Ply,
         };
-        let mut took = Duration::ZERO;
-        // What has gone to standard output cannot be replaced by something finer.
-        let early = !manners::is_pipe(to);
-        pipe::each(input, detail, model, limits, early, &log, &mut |gaussians, log| {
+        convert::write(gaussians, axes, &known, format, to, log)
+    };
+    let stream = budget::stream(&args.budget, input, &args.detail, limits)?;
+    let chosen = match &stream {
+        Some(stream) => budget::choose(&args.budget(limits, progress), input, stream, None, Task::Decode)?,
+        None => None,
+    };
+    let detail = chosen.as_ref().map(Chosen::detail);
+    let detail = detail.as_ref().unwrap_or(&args.detail);
+    let mut took = Duration::ZERO;
+    // What has gone to standard output cannot be replaced by something finer.
+    let early = !manners::is_pipe(to);
+    pipe::each(
+        input,
+        detail,
+        &args.model,
+        limits,
+        early,
+        &log,
+        &mut |gaussians, log| {
             took = log.steps().iter().map(|step| step.time).sum();
             write(gaussians, log)
-        })?;
-        chosen.map_or(String::new(), |c| c.describe(Task::Decode, took))
+        },
+    )?;
+    let chosen = match chosen {
+        Some(chosen) => chosen.describe(took, limits, progress)?,
+        None => String::new(),
     };
     Ok(said(args, &chosen, written, "Gaussian", &log))
 }
@@ -81,7 +91,7 @@ fn said(args: &Decode, chosen: &str, written: usize, thing: &str, log: &Log) -> 
 }
 
 /// Decodes a stream into a file of points.
-fn points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
+fn decoded_points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
     let bytes = load::bytes(&args.input, limits)?;
     kinds::check_stream(&args.input, &bytes)?;
     let bytes = load::whole_levels(&args.input, bytes, &args.detail, limits)?;
@@ -98,19 +108,6 @@ fn points(args: &Decode, limits: &Limits, log: &Log) -> Result<Said> {
     let voxels = voxels.ok_or_else(|| Failure(format!("{}: no level is complete", args.input.display())))?;
     let (written, to): (usize, &Path) = (voxels.voxels.len(), &args.output);
     let encoded = cloud::encoded(&voxels, &cloud::axes(&bytes), to, args.write)?;
-    let write = |path: &Path, bytes: &[u8]| {
-        manners::write(path, |w| {
-            w.write_all(bytes).map_err(|source| b2p::Error::Io {
-                path: path.to_path_buf(),
-                source,
-            })
-        })
-    };
-    log.step("write points", written, "points", || Ok(write(to, &encoded.bytes)))??;
-    if let Some(text) = encoded.sidecar.as_ref().filter(|_| !manners::is_pipe(to)) {
-        let path = cloud::sidecar(to);
-        manners::permit(&[&path], &[&args.input])?;
-        write(&path, text.as_bytes())?;
-    }
+    points::write(&encoded, written, to, log)?;
     Ok(said(args, "", written, "point", log))
 }

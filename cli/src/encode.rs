@@ -31,7 +31,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         .map_err(&in_cloud)??;
     let points = cloud.positions.len();
     let (grid, found) = log
-        .step("voxelise", points, "points", || cloud::grid(&cloud, args.bits))
+        .step("voxelise", points, "points", || cloud::grid(&cloud, args.bits, limits))
         .map_err(&in_cloud)?;
     let axes = cloud.axes;
     drop((cloud.positions, cloud.colours));
@@ -41,14 +41,15 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         Some(most) => cloud::affordable(axes, most * voxels as f64 / 8.0),
         None => axes,
     };
+    let merged = (points > voxels).then_some(points as u64);
     // The rate counts the whole file.
-    let reserved = container::axes_bytes(&axes) as f64 * 8.0 / voxels as f64;
+    let reserved = container::source_bytes(&axes, merged) as f64 * 8.0 / voxels as f64;
     let coded = match args.colours {
         Colours::Transform => transform(args, &cloud, reserved, &log)?,
         Colours::Learned => learned(args, &cloud, reserved, &log)?,
     };
     let Coded { mut encoded, chosen } = coded;
-    encoded.bytes = container::with_axes(&encoded.bytes, &axes)?;
+    encoded.bytes = container::with_source(&encoded.bytes, &axes, merged)?;
     let to = &args.output;
     manners::write(to, |w| {
         w.write_all(&encoded.bytes).map_err(|source| Error::Io {

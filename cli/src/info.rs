@@ -1,6 +1,6 @@
 //! `b2p info`: what a stream holds.
 
-use b2p::container::{Level, Section, Stream};
+use b2p::container::{self, Level, Scan, Section, Stream};
 use b2p::latents::{ResidualSteps, Steps};
 use b2p::{Axes, Limits, colour};
 use serde_json::json;
@@ -33,10 +33,45 @@ pub fn run(args: &Info, limits: &Limits) -> Result<Said> {
     let levels = levels(&stream)?;
     let state = State::of(&stream, bytes.len());
     let axes = cloud::axes(&bytes);
+    let from = container::source_points(&bytes).ok().flatten();
     Ok(Said::result(match manners::json() {
-        true => json(&stream, bytes.len(), &axes, &levels, known, &state),
-        false => text(args, &stream, bytes.len(), &levels, known, &state) + &cloud::described(&axes),
+        true => json(&stream, &bytes, &Cloud { axes, points: from }, &levels, known, &state),
+        false => {
+            text(args, &stream, bytes.len(), &levels, known, &state)
+                + &cloud::described(&axes)
+                + &merged(header.points, from)
+                + &notes(&bytes, &stream)
+        }
     }))
+}
+
+/// What a stream says of the cloud that it was made of.
+struct Cloud {
+    axes: Axes,
+    /// Points before those of a voxel were merged.
+    points: Option<u32>,
+}
+
+/// How many points were merged into voxels, if the stream says so. It may say anything.
+fn merged(voxels: u64, points: Option<u32>) -> String {
+    let Some(points) = points.map(u64::from) else {
+        return String::new();
+    };
+    let share = match points.checked_sub(voxels) {
+        Some(merged) if points > 0 => format!(", {:.1} % merged", 100.0 * merged as f64 / points as f64),
+        _ => ", which cannot be".into(),
+    };
+    format!(
+        "made of {} in {}{share}\n",
+        counted(points, "point"),
+        counted(voxels, "voxel")
+    )
+}
+
+/// What is unusual about the stream's chunks, such as one of a later version.
+fn notes(bytes: &[u8], stream: &Stream) -> String {
+    let notes = Scan::new(bytes, stream.header()).notes;
+    notes.iter().map(|note| format!("note: {}\n", note.text)).collect()
 }
 
 /// How much of a stream is there.
@@ -111,8 +146,10 @@ fn steps(level: &Level) -> Option<colour::Steps> {
     steps.is_valid().then_some(steps)
 }
 
-fn json(stream: &Stream, bytes: usize, axes: &Axes, levels: &[Described], known: Known, state: &State) -> String {
+fn json(stream: &Stream, bytes: &[u8], cloud: &Cloud, levels: &[Described], known: Known, state: &State) -> String {
     let header = stream.header();
+    let notes = Scan::new(bytes, header).notes;
+    let notes: Vec<_> = notes.into_iter().map(|note| note.text).collect();
     let level = |of: &Described| {
         json!({
             "level": of.level,
@@ -133,20 +170,23 @@ fn json(stream: &Stream, bytes: usize, axes: &Axes, levels: &[Described], known:
         })
     };
     let levels: Vec<_> = levels.iter().map(level).collect();
+    let axes = &cloud.axes;
     let description = json!({
         "version": header.format.version(),
         "bits": header.bits,
         "points": header.points,
         "levels": levels,
-        "total_bytes": bytes,
+        "total_bytes": bytes.len(),
         "model": header.model(),
         "model_name": known.as_ref().map(|(name, _)| name),
         "heads": known.as_ref().map(|(_, heads)| heads),
+        "points_before_merging": cloud.points,
         "up": axes.up.map(|up| up.to_string()),
         "metres_per_unit": axes.metres_per_unit,
         "crs": axes.crs,
         "origin": header.placement.origin,
         "voxel_size": header.placement.voxel_size,
+        "notes": notes,
         "complete_to_level": stream.deepest(),
         "top_level": header.top,
         "damage": match state {

@@ -271,5 +271,5 @@ pub fn other(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log
         return cloud::drawable(path, bytes, isa(None)?, limits, log);
     };
     let splats = convert::read(path, bytes, format, limits, log)?;
-    splats.into_ply_axes().map(Some).map_err(Failure::in_file(path))
+    Ok(Some(splats.into_cloud()))
 }

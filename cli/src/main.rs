@@ -5,6 +5,7 @@ mod args;
 mod bench;
 mod bench_render;
 mod budget;
+mod check;
 mod cloud;
 mod convert;
 mod cut;
@@ -12,18 +13,21 @@ mod decode;
 mod demo;
 mod encode;
 mod info;
-mod keep;
 mod kinds;
 mod knobs;
 mod load;
 mod manners;
 mod picture;
 mod pipe;
+mod points;
 mod progress;
 mod render;
+mod serve;
 mod sheet;
+mod sidecar;
 mod table;
 mod turntable;
+mod upgrade;
 mod values;
 mod views;
 
@@ -103,6 +107,13 @@ const BROKEN_PIPE: u8 = 128 + 13;
 fn main() -> ExitCode {
     let cli = parse();
     manners::set(&cli);
+    let usual = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        // Readers of other crates may panic on damaged files, which becomes an error.
+        if !b2p_formats::clouds::is_guarded() {
+            usual(panic);
+        }
+    }));
     let interrupted = ctrlc::set_handler(|| {
         output::remove_unfinished();
         std::process::exit(130);
@@ -147,7 +158,10 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Convert(args) => convert::run(args, &limits, &progress)?,
         Command::Render(args) => render::run(args, &limits, &progress)?,
         Command::Info(args) => info::run(args, &limits)?,
+        Command::Check(args) => check::run(args, &limits)?,
+        Command::Upgrade(args) => upgrade::run(args, &limits, &progress)?,
         Command::Cut(args) => cut::run(args, &limits)?,
+        Command::Serve(args) => serve::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,
     };

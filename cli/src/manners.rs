@@ -119,6 +119,13 @@ pub fn warn(text: &str) {
     note("33", text);
 }
 
+/// Says on standard error what was done, unless `-q` is given.
+pub fn note_report(text: &str) {
+    if !manners().quiet {
+        warn(text);
+    }
+}
+
 /// Says on standard error why the program fails.
 pub fn complain(text: &str) {
     note("31", text);

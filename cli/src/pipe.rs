@@ -71,7 +71,12 @@ pub fn each(
     let in_pipe = Failure::in_file(path);
     let mut piece = Some(start);
     let mut length = 0;
+    let mut head = Vec::new();
     while let Some(bytes) = piece {
+        if head.len() < cloud::START as usize {
+            head.extend(&bytes);
+            cloud::remember(&head);
+        }
         length += bytes.len() as u64;
         decoding.push(&bytes);
         while decoding.advance().map_err(&in_pipe)?.is_some() {}

@@ -3,17 +3,15 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::budget::Task;
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
 use b2p::renderer::camera::{Camera, Extent};
-use b2p::renderer::{Background, EffectMode, Effects, Explanation, Quality, Renderer, Stats};
+use b2p::renderer::{Background, EffectMode, Effects, Explanation, Renderer, Stats};
 use b2p::{Error, Limits};
 use serde_json::json;
 
 use super::args::{Format, Render};
-use super::budget::{self, Chosen};
-use super::keep::{self, Kept};
+use super::budget::{self, Chosen, Task};
 use super::load::Source;
 use super::manners::{self, Said};
 use super::picture::{Artist, format_of};
@@ -39,19 +37,10 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     if manners::is_pipe(&args.input) && !args.budget.is_given() {
         return from_pipe(args, limits, &log);
     }
-    if let Some(bytes) = keep::stream(&args.budget, &args.input, limits)? {
-        return within_time(args, &bytes, limits, &log);
-    }
-    let pixels = u64::from(args.view.size.0) * u64::from(args.view.size.1);
-    let task = Task::Picture { pixels };
-    let (budget, input) = (&args.budget, &args.input);
-    let chosen = budget::choose(budget, &args.model, input, task, limits, progress)?;
-    let chosen_args = chosen.as_ref().map(|c| (c.detail(), c.model(&args.model)));
-    let (detail, model) = match &chosen_args {
-        Some((detail, model)) => (detail, model),
-        None => (&args.detail, &args.model),
-    };
-    let source = Source::open(input, detail, model, limits, &log)?;
+    let chosen = choose(args, limits, progress)?;
+    let detail = chosen.as_ref().map(Chosen::detail);
+    let detail = detail.as_ref().unwrap_or(&args.detail);
+    let source = Source::open(&args.input, detail, &args.model, limits, &log)?;
     let frame = source.frame()?;
     let mut cameras = shots(args, &frame, &Extent::cube(), limits)?;
     if args.camera.is_some() {
@@ -62,12 +51,12 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         cameras = shots(args, &frame, &source.extent(limits), limits)?;
     }
     let (gaussians, detail) = source.gaussians(detail, &cameras, &log)?;
+    let decoded = log.steps().iter().map(|step| step.time).sum();
     let drawing = Drawing {
         args,
-        quality: chosen.as_ref().map_or(args.quality, |c| c.choice.quality),
         limits,
         detail: Some(detail),
-        chosen: chosen.as_ref().map(|chosen| For::Chosen(chosen, task)),
+        chosen: chosen.as_ref().map(|chosen| (chosen, decoded, progress)),
     };
     pictures(&drawing, &gaussians, &log)
 }
@@ -86,7 +75,6 @@ fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
         }
         let drawing = Drawing {
             args,
-            quality: args.quality,
             limits,
             detail: None,
             chosen: None,
@@ -98,27 +86,22 @@ fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
     Ok(said)
 }
 
-/// Draws the finest level that is drawn within the budget.
-fn within_time(args: &Render, bytes: &[u8], limits: &Limits, log: &Log) -> Result<Said> {
-    let decoder = load::decoder(bytes, &args.detail, &args.model, limits)?;
-    let frame = decoder.frame(bytes).map_err(Failure::in_file(&args.input))?;
-    let cameras = shots(args, &frame, &load::extent(bytes, &decoder, limits), limits)?;
-    if args.camera.is_some() {
-        permit(args, &cameras)?;
-    }
-    let Some(Shot { camera, .. }) = cameras.first() else {
-        return Ok(Said::default());
+/// Level and heads for a budget, if one is given: for a picture as the cameras see the object, and no finer than they see.
+fn choose(args: &Render, limits: &Limits, progress: &Progress) -> Result<Option<Chosen>> {
+    let Some(stream) = budget::stream(&args.budget, &args.input, &args.detail, limits)? else {
+        return Ok(None);
     };
-    let (budget, model) = (&args.budget, &args.model);
-    let kept = keep::draw(budget, &args.input, bytes, model, camera, limits, log)?;
-    let drawing = Drawing {
-        args,
-        quality: args.quality,
-        limits,
-        detail: None,
-        chosen: Some(For::Kept(&kept)),
-    };
-    pictures(&drawing, &kept.gaussians, log)
+    let fail = Failure::in_file(&args.input);
+    let decoder = load::decoder(&stream, &args.detail, &args.model, limits)?;
+    let frame = decoder.frame(&stream).map_err(&fail)?;
+    let cameras = shots(args, &frame, &load::extent(&stream, &decoder, limits), limits)?;
+    let per_unit = cameras.iter().map(|shot| shot.camera.pixels_per_unit());
+    let per_unit = per_unit.fold(0.0, f64::max);
+    let pixels = cameras.iter().map(|shot| shot.camera.size().map(f64::from));
+    let pixels = pixels.map(|[width, height]| width * height).fold(0.0, f64::max);
+    let finest = decoder.level_for(&stream, per_unit).map_err(&fail)?;
+    let task = Task::Picture { pixels, per_unit };
+    budget::choose(&args.budget(limits, progress), &args.input, &stream, finest, task)
 }
 
 /// Whether the pictures may be written.
@@ -141,16 +124,10 @@ fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
 /// How pictures are drawn.
 struct Drawing<'a> {
     args: &'a Render,
-    quality: Quality,
     limits: &'a Limits,
     detail: Option<Explanation>,
-    chosen: Option<For<'a>>,
-}
-
-/// What pictures were chosen for.
-enum For<'a> {
-    Chosen(&'a Chosen, Task),
-    Kept(&'a Kept),
+    /// What was chosen for a budget, how long it took to decode, and what shows a calibration.
+    chosen: Option<(&'a Chosen, Duration, &'a Progress)>,
 }
 
 /// A picture's file, its size, and how it was drawn.
@@ -166,7 +143,7 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &Log) -> Result<Said>
     }
     let mut renderer = Renderer::new().with_isa(load::isa(args.model.isa.as_deref())?);
     renderer.set_effects(effects);
-    renderer.set_quality(drawing.quality);
+    renderer.set_quality(args.quality);
     let many = if args.contact_sheet { 1 } else { cameras.len() };
     let format = match &args.output.turntable {
         Some(_) => Format::Y4m,
@@ -180,7 +157,7 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &Log) -> Result<Said>
         _ => stills(args, cameras, &mut artist, log)?,
     };
 
-    let mut report = chosen(drawing, &all);
+    let mut report = chosen(drawing, &all)?;
     if let (true, Some(Shot { camera, .. }), Some((_, _, stats))) = (manners::verbose(), cameras.first(), all.first()) {
         if let Some(detail) = &drawing.detail {
             report += &format!("{detail}\n");
@@ -305,14 +282,15 @@ fn stills(args: &Render, cameras: &[Shot], artist: &mut Artist, log: &Log) -> Re
     Ok(all)
 }
 
-/// What was chosen for a budget, and how long the slowest picture took.
-fn chosen(drawing: &Drawing, all: &[Drawn]) -> String {
+/// What was chosen for a budget, and how long decoding and the slowest picture took.
+fn chosen(drawing: &Drawing, all: &[Drawn]) -> Result<String> {
     let slowest = all.iter().map(|(.., stats)| stats.times.total()).max();
-    let slowest = slowest.unwrap_or_default();
-    match &drawing.chosen {
-        None => String::new(),
-        Some(For::Chosen(chosen, task)) => chosen.describe(*task, slowest),
-        Some(For::Kept(kept)) => kept.describe(slowest),
+    match drawing.chosen {
+        None => Ok(String::new()),
+        Some((chosen, decoded, progress)) => {
+            let took = decoded + slowest.unwrap_or_default();
+            chosen.describe(took, drawing.limits, progress)
+        }
     }
 }
 

@@ -58,7 +58,7 @@ fn a_budget_chooses_says_so_and_measures_once() {
     let decode = ["decode", "ball.b2p", "-o", "ball-g.ply"];
     let with = |more: &[&str]| succeeds(at, &[&decode[..], &model, more].concat());
     let ample = with(&["--budget", "1000s"]);
-    assert!(ample.starts_with("budget: level 5, "), "{ample}");
+    assert!(ample.starts_with("budget: level 5, best, expected "), "{ample}");
     assert!(ample.contains("; kept: "), "{ample}");
     assert!(!ample.contains("no setting fits"), "{ample}");
     let kept = || {
@@ -73,16 +73,13 @@ fn a_budget_chooses_says_so_and_measures_once() {
     let told = "no setting fits 0.0 ms; took ";
     assert!(hopeless.contains(told), "{hopeless}");
     assert!(kept() == first, "measured once");
-    let accurate = with(&["--min-psnr", "199"]);
-    assert!(accurate.contains("not the 199 dB asked for"), "{accurate}");
+    let quick = with(&["--budget", "1000s", "--heads", "quick"]);
+    assert!(quick.starts_with("budget: level 5, quick, "), "{quick}");
     with(&["--budget", "1s", "--calibrate"]);
     assert!(kept() != first, "measured again");
 
     let render = ["render", "ball.b2p", "-o", "a.png", "--size", "64x48"];
-    let drawn = succeeds(
-        at,
-        &[&render[..], &model, &["--budget", "1000s", "--min-psnr", "1"]].concat(),
-    );
+    let drawn = succeeds(at, &[&render[..], &model, &["--budget", "1000s"]].concat());
     let line = drawn.lines().find(|line| line.starts_with("budget: level 5, "));
     assert!(line.is_some_and(|l| l.contains("; kept: ")), "{drawn}");
 }
@@ -100,7 +97,7 @@ fn a_hostile_cache_harms_nobody() {
         files.next().unwrap().unwrap().path()
     };
     let sound = std::fs::read_to_string(&path).unwrap();
-    let costly = sound.replace("\"start\":", "\"start\": 1e300, \"begin\":");
+    let costly = sound.replacen("\"per_pixel\": ", "\"per_pixel\": 1e300, \"x\": ", 1);
     for hostile in ["", "{\"exact\": 3}", "[[[[", &costly, &sound[..sound.len() / 2]] {
         std::fs::write(&path, hostile).unwrap();
         let text = succeeds(at, &arguments);
@@ -138,10 +135,10 @@ fn a_budget_and_a_knob_exclude_each_other_and_pipes_and_gaussians_have_none() {
     let decode = ["decode", "ball.b2p", "-o", "x.ply", "--budget"];
     misuse(&[&decode[..], &["1s", "--level", "5"]].concat());
     misuse(&[&decode[..], &["1s", "--precision", "f16"]].concat());
-    misuse(&[&decode[..], &["1s", "--heads", "quick"]].concat());
+    misuse(&[&decode[..], &["1s", "--per-voxel", "1"]].concat());
     misuse(&[&decode[..], &["33"]].concat());
     let render = ["render", "ball.b2p", "-o", "x.png", "--quality", "exact"];
-    misuse(&[&render[..], &["--min-psnr", "40"]].concat());
+    misuse(&[&render[..], &["--budget", "1s"]].concat());
 
     let model = ["--model", "tiny.safetensors"];
     succeeds(at, &[&["decode", "ball.b2p", "-o", "g.ply"], &model[..]].concat());
@@ -152,4 +149,54 @@ fn a_budget_and_a_knob_exclude_each_other_and_pipes_and_gaussians_have_none() {
         assert_eq!(output.status.code(), Some(1), "{told}");
         assert!(told.contains(word), "{told}");
     }
+}
+
+/// The calibration in the cache of a folder.
+fn kept_calibration(at: &Path) -> std::path::PathBuf {
+    let mut files = std::fs::read_dir(at.join("cache/b2p")).unwrap();
+    files.next().unwrap().unwrap().path()
+}
+
+#[test]
+fn streams_of_version_3_have_budgets_and_a_calibration_that_is_plainly_off_is_measured_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("ball.ply"), Ball::new(6, 20.0).to_ply()).unwrap();
+    succeeds(at, &["encode", "ball.ply", "-o", "ball.b2p", "--levels", "4..6"]);
+    let decode = |more: &[&str]| {
+        let arguments = ["decode", "ball.b2p", "-o", "x.ply", "--budget"];
+        succeeds(at, &[&arguments[..], more].concat())
+    };
+    let roomy = decode(&["1000s"]);
+    assert!(roomy.starts_with("budget: level 6, best, expected "), "{roomy}");
+    assert!(roomy.contains("; kept: "), "{roomy}");
+    let surfels = decode(&["1000s", "--heads", "surfels"]);
+    assert!(surfels.starts_with("budget: level 6, surfels, expected "), "{surfels}");
+    let hopeless = decode(&["0.001ms"]);
+    assert!(
+        hopeless.starts_with("budget: level 4, surfels, expected "),
+        "{hopeless}"
+    );
+    assert!(hopeless.contains("; no setting fits 0.0 ms; took "), "{hopeless}");
+    let render = [
+        "render", "ball.b2p", "-o", "x.png", "--size", "48x32", "--budget", "1000s",
+    ];
+    let drawn = succeeds(at, &render);
+    assert!(drawn.contains("budget: level 6, best, expected "), "{drawn}");
+
+    // As if everything took a tenth of a second a voxel.
+    let path = kept_calibration(at);
+    let mut kept: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    for point in kept["exact"].as_array_mut().unwrap() {
+        point[1] = (1e8 * point[0].as_f64().unwrap()).into();
+    }
+    let slow = kept.to_string();
+    std::fs::write(&path, &slow).unwrap();
+    assert!(!decode(&["1000s"]).contains("measured again"), "it is young");
+    let file = std::fs::File::options().append(true).open(&path).unwrap();
+    let hour = std::time::Duration::from_secs(3600);
+    file.set_modified(std::time::SystemTime::now() - hour).unwrap();
+    assert!(decode(&["1000s"]).contains("the machine was measured again"));
+    assert!(std::fs::read_to_string(&path).unwrap() != slow);
+    assert!(!decode(&["1000s"]).contains("measured again"));
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use b2p::gaussians::{Frame, Gaussians};
-use b2p::{Limits, Placement};
+use b2p::{Limits, Placement, Up};
 use b2p_formats::splats::{Axes, Format, Options, Splats, read, write};
 
 /// The program's main file, which Node runs.
@@ -230,7 +230,45 @@ fn files_mean_the_same_to_splat_transform() {
             there_and_back(&program, &before, format, harmonics);
         }
     }
+    clouds_stand_upright(&program);
     std::fs::remove_dir_all(folder).unwrap();
+}
+
+/// The other program makes glTF of our files of a cloud with z up: there y is up.
+fn clouds_stand_upright(program: &Program) {
+    let before = sample(300, 0);
+    for format in [
+        Format::Ply,
+        Format::CompressedPly,
+        Format::Spz,
+        Format::Sog,
+        Format::Splat,
+    ] {
+        let name = format!("up{}", format.extension());
+        program.write(&before, Axes::Cloud(Up::Z), format, &name);
+        program.run(&[&name, "up.glb"]);
+        let there = program.read(Format::Glb, "up.glb");
+        assert_eq!(there.axes, Axes::Gltf, "{format}");
+        let places: Vec<[f64; 3]> = world(&there.gaussians).iter().map(|splat| splat.position).collect();
+        let most = tolerance(format).position;
+        for Splat {
+            position: [x, y, z], ..
+        } in world(&before)
+        {
+            let expected = [x, z, -y];
+            let near = |p: &[f64; 3]| (0..3).all(|k| (p[k] - expected[k]).abs() <= most);
+            assert!(places.iter().any(near), "{format}: nothing at {expected:?}");
+        }
+        // What we make of it lies as the cloud does.
+        program.write(&there.gaussians, Axes::Gltf, Format::Ply, "down.ply");
+        let down = program.read(Format::Ply, "down.ply").gaussians;
+        let lowest = |g: &Gaussians, k: usize| world(g).iter().map(|s| s.position[k]).fold(f64::INFINITY, f64::min);
+        let highest = world(&before)
+            .iter()
+            .map(|s| s.position[2])
+            .fold(f64::NEG_INFINITY, f64::max);
+        assert!((lowest(&down, 1) + highest).abs() <= most, "{format}: −y is up");
+    }
 }
 
 fn there_and_back(program: &Program, before: &Gaussians, format: Format, harmonics: usize) {

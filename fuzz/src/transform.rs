@@ -50,7 +50,8 @@ pub(crate) fn rewrite(writer: &mut Writer, level: &Level, colours: &Colours) {
 
 /// Any bytes under small limits, whole and in pieces whose sizes the last bytes tell: an error, or as many voxels with
 /// colours, and finite Gaussians of them, as the header tells; the same both times. A level that is refused leaves
-/// those before it as they were, no level takes more memory than it may, and all of it is given back.
+/// those before it as they were, no level takes more memory than it may, and all of it is given back. A check of the
+/// stream finds the same, and names the clause of each fault.
 pub fn transform(bytes: &[u8]) {
     giving_back(|| decoded(bytes));
 }
@@ -80,6 +81,12 @@ fn decoded(bytes: &[u8]) {
             Error::ModelMissing { .. } => (),
             error => check(error),
         }
+    }
+    if one_in(2, bytes) {
+        let checked = decoder.check(bytes);
+        let limited = matches!(error, Some(Error::LimitExceeded { .. }));
+        assert!(limited || checked.is_valid() == error.is_none(), "{checked:?}");
+        assert!(checked.faults.iter().all(|fault| fault.error.clause().is_some()), "{checked:?}");
     }
     if reached.is_some() && one_in(2, bytes) {
         let gaussians = within(most, || decoding.gaussians());

@@ -82,6 +82,7 @@ pub(super) fn read(bytes: &[u8], limits: &Limits, options: &ReadOptions) -> Resu
         normals,
         hints: Hints::from_comments(comments),
         axes: axes_in(comments),
+        has_offset: false,
     };
     add_offset(&mut raw, comments);
     Ok(raw)
@@ -209,6 +210,7 @@ fn add_offset(raw: &mut RawPoints, comments: &[String]) {
         *position = std::array::from_fn(|axis| position[axis] + offset[axis]);
     }
     raw.hints.coordinates = Coordinates::World;
+    raw.has_offset = true;
 }
 
 #[cfg(test)]

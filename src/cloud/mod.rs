@@ -18,7 +18,7 @@ pub use colours::{ColourRange, RawColours, Stored};
 pub use points::{Coordinates, Hints, PointCloud, is_a_mesh};
 pub use raw::{Note, RawPoints, ReadOptions};
 
-pub use voxelise::{ColouredVoxels, GridReport, voxelise, voxelise_closed};
+pub use voxelise::{ColouredVoxels, GridReport, voxelise, voxelise_closed, voxelise_memory};
 pub use write::axes_comments;
 
 use crate::error::{Error, Stage};

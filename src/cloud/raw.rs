@@ -18,6 +18,8 @@ pub struct RawPoints {
     pub hints: Hints,
     /// What is known of the coordinates.
     pub axes: Axes,
+    /// Whether the file stated an offset, which has been added.
+    pub has_offset: bool,
 }
 
 /// How points are read.
@@ -38,6 +40,8 @@ pub struct ReadOptions {
     pub metres_per_unit: Option<f64>,
     /// Take the vertices of a mesh as points. Otherwise meshes are refused.
     pub vertices: bool,
+    /// Added to the coordinates of files that state no offset of their own.
+    pub offset: [f64; 3],
 }
 
 /// What was done to points when they were read, for the user.
@@ -131,6 +135,11 @@ impl RawPoints {
         }
         if count == 0 {
             return Err(malformed("the file", "number of points", 0, "at least one"));
+        }
+        if !self.has_offset && options.offset != [0.0; 3] {
+            for position in &mut self.positions {
+                *position = std::array::from_fn(|axis| position[axis] + options.offset[axis]);
+            }
         }
         let mut notes = Vec::new();
         self.drop_not_finite(options, &mut notes)?;

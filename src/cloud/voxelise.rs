@@ -112,6 +112,16 @@ pub fn voxelise_closed(cloud: &PointCloud) -> Result<(ColouredVoxels, GridReport
     Ok((grid, report))
 }
 
+/// Bytes that so many points and their voxelisation take at most: the cloud, a key and a colour to sort for each, and
+/// either a hash for each, to count places, or voxels.
+pub fn voxelise_memory(points: u64) -> u64 {
+    const CLOUD: usize = size_of::<[f64; 3]>() + size_of::<[u8; 3]>();
+    const SORTED: usize = size_of::<(u64, [u8; 3])>();
+    // Vectors that grow take twice what is in them.
+    const VOXELS: usize = 2 * (size_of::<u64>() + size_of::<[u8; 3]>());
+    points.saturating_mul((CLOUD + SORTED + VOXELS) as u64)
+}
+
 fn check_bits(bits: Option<u8>) -> Result<()> {
     match bits {
         Some(bits) if !(1..=morton::MAX_DEPTH).contains(&bits) => {

@@ -111,7 +111,7 @@ impl<'a> Decoder<'a> {
             read: 0,
             offset: 0,
             range: u64::MAX,
-            damaged: !bytes.len().is_multiple_of(4),
+            damaged: false,
         };
         decoder.offset = decoder.word() << 32;
         decoder.offset |= decoder.word();
@@ -132,11 +132,16 @@ impl<'a> Decoder<'a> {
     /// [`Error::Malformed`] if not, with `at` as the place.
     pub fn finish(self, at: &str) -> Result<()> {
         let (words, read) = (self.bytes.len().div_ceil(4), self.read);
-        if !self.damaged && (words..=words + LOOKAHEAD).contains(&read) {
+        let whole = self.bytes.len().is_multiple_of(4);
+        if whole && self.damaged {
+            let (field, value) = ("quantile of the range coder", "65536 or more");
+            return Err(Error::malformed(Stage::Colour, at, field, value, "less").breaks("5.4.2"));
+        }
+        if whole && (words..=words + LOOKAHEAD).contains(&read) {
             return Ok(());
         }
         let expected = format!("{} to {read} of 4 bytes", read.saturating_sub(LOOKAHEAD));
-        Err(Error::malformed(Stage::Colour, at, "number of words", words, expected))
+        Err(Error::malformed(Stage::Colour, at, "number of words", words, expected).breaks("5.4.3"))
     }
 }
 

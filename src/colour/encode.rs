@@ -24,27 +24,32 @@ pub struct Options {
     /// The Lagrangian multiplier of RDOQ: squared error, in squared steps, that one bit must save. 0 rounds to the
     /// nearest integer.
     pub lambda: f32,
-    /// Factor of the predicted differences, in units of 1/256.
-    pub gain: u8,
+    /// Factor of the predicted differences, in units of 1/256; `None` for the best of three in the middle slice of the level.
+    pub gain: Option<u8>,
 }
 
 impl Options {
-    /// Default λ and gain for these steps.
+    /// Default λ for these steps, and the best gain.
     pub fn new(steps: Steps) -> Options {
         Options {
             steps,
             lambda: 0.055,
-            gain: 220,
+            gain: None,
         }
     }
 
-    fn coding(&self) -> Coding {
-        Coding {
-            steps: self.steps,
-            gain: self.gain,
-        }
+    /// Coding parameters with each gain to try.
+    fn codings(&self) -> Vec<Coding> {
+        let steps = self.steps;
+        let coding = |gain| Coding { steps, gain };
+        self.gain.map_or(GAINS.map(coding).to_vec(), |gain| vec![coding(gain)])
     }
 }
+
+/// Gains that are tried: differences of rough surfaces are predicted too large, those of smooth ones are not.
+const GAINS: [u8; 3] = [190, 225, 255];
+/// Squared error, in squared steps, that a bit must save, where gains are compared.
+const GAIN_LAMBDA: f64 = 0.08;
 
 /// Original colours by level: those of the finest coded level, and the transform's means for the levels above.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -119,19 +124,23 @@ pub fn encode_trunk(
     let fraction = options.steps.fraction();
     let half = (1 << fraction) >> 1;
     let root = truth.level(0)[0].map(|x| (x + half) >> fraction);
-    let mut bytes = vec![options.steps.luma, options.steps.chroma, options.gain];
-    bytes.push(root[0].clamp(0, 255) as u8);
-    bytes.extend(root[1..].iter().flat_map(|x| x.clamp(&-255, &255).to_le_bytes()));
     let root = [
         root[0].clamp(0, 255),
         root[1].clamp(-255, 255),
         root[2].clamp(-255, 255),
     ];
-    let mut coder = RdoEncoder::new(options.lambda);
-    let colours = trunk(isa, octree, maps, options.coding(), root, &mut coder, |level| {
-        Some(truth.level(level))
-    });
-    bytes.extend(coder.encoder.finish());
+    let encode = |coding: Coding| {
+        let mut bytes = vec![coding.steps.luma, coding.steps.chroma, coding.gain, root[0] as u8];
+        bytes.extend(root[1..].iter().flat_map(|x| x.to_le_bytes()));
+        let mut coder = RdoEncoder::new(options.lambda);
+        let colours = trunk(isa, octree, maps, coding, root, &mut coder, |level| {
+            Some(truth.level(level))
+        });
+        let error = coder.error;
+        bytes.extend(coder.encoder.finish());
+        (cost(error, bytes.len()), bytes, colours)
+    };
+    let (_, bytes, colours) = encode(best(options.codings(), |coding| encode(coding).0));
     (bytes, colours)
 }
 
@@ -153,8 +162,7 @@ pub fn encode_level(
     options: Options,
 ) -> (Vec<Vec<u8>>, LevelColours) {
     let nodes = nodes(octree, level, above_map, map, above);
-    let coding = options.coding();
-    let encode = |range: Range<usize>| {
+    let encode = |range: Range<usize>, coding: Coding| {
         let (mut coder, mut model) = (RdoEncoder::new(options.lambda), above.model.clone());
         let first = nodes.first_child[range.start] as usize;
         let truth = Some(&truth.level(level)[first..]);
@@ -167,12 +175,31 @@ pub fn encode_level(
             truth,
         });
         let mut bytes = vec![coding.steps.luma, coding.steps.chroma, coding.gain];
+        let error = coder.error;
         bytes.extend(coder.encoder.finish());
-        (bytes, (coding.steps, coded, model))
+        (cost(error, bytes.len()), bytes, (coding.steps, coded, model))
     };
     let ranges: Vec<_> = slices(nodes.masks.len(), slice).collect();
-    let (payloads, coded): (Vec<_>, Vec<_>) = ranges.into_par_iter().map(encode).unzip();
+    let middle = &ranges[ranges.len() / 2];
+    let coding = best(options.codings(), |coding| encode(middle.clone(), coding).0);
+    let coded: Vec<_> = ranges.into_par_iter().map(|range| encode(range, coding)).collect();
+    let (payloads, coded) = coded.into_iter().map(|(_, bytes, coded)| (bytes, coded)).unzip();
     (payloads, join(isa, nodes, coded))
+}
+
+/// The coding of least cost. A single one is not tried.
+fn best(codings: Vec<Coding>, cost: impl Fn(Coding) -> f64 + Sync) -> Coding {
+    if let [coding] = codings[..] {
+        return coding;
+    }
+    let costs: Vec<f64> = codings.par_iter().map(|coding| cost(*coding)).collect();
+    let least = (1..codings.len()).fold(0, |least, i| if costs[i] < costs[least] { i } else { least });
+    codings[least]
+}
+
+/// Lagrangian cost of a squared error, in squared steps, and a number of bytes.
+fn cost(error: f64, bytes: usize) -> f64 {
+    error + GAIN_LAMBDA * 8.0 * bytes as f64
 }
 
 /// Above this magnitude coefficients are rounded to the nearest integer, without RDOQ.
@@ -182,6 +209,8 @@ const LARGE: f32 = 12.0;
 struct RdoEncoder {
     encoder: Encoder,
     lambda: f32,
+    /// Sum of squared errors so far, in squared steps.
+    error: f64,
 }
 
 impl RdoEncoder {
@@ -189,6 +218,7 @@ impl RdoEncoder {
         RdoEncoder {
             encoder: Encoder::default(),
             lambda,
+            error: 0.0,
         }
     }
 
@@ -245,7 +275,10 @@ impl CoefficientCoder for RdoEncoder {
         let chosen = if exact {
             target.abs()
         } else {
-            self.quantise(simd, model, c, steps)
+            let chosen = self.quantise(simd, model, c, steps);
+            let error = f64::from(steps) - f64::from(chosen);
+            self.error += error * error;
+            chosen
         };
         model.code(simd, &mut self.encoder, c, if target < 0 { -chosen } else { chosen })
     }

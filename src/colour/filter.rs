@@ -57,7 +57,8 @@ impl Filter {
             let at = format!("byte {offset}");
             let value = format!("{passes} passes in {} bytes", bytes.len());
             let expected = format!("1 to {MAX_PASSES} passes of {PASS_BYTES} bytes after their number");
-            return Err(Error::malformed(Stage::Colour, at, "colour filter", value, expected));
+            let error = Error::malformed(Stage::Colour, at, "colour filter", value, expected);
+            return Err(error.breaks("5.11.1"));
         }
         let pass =
             |bytes: &[u8]| -> Pass { std::array::from_fn(|t| std::array::from_fn(|j| bytes[t * TERMS + j] as i8)) };

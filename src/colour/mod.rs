@@ -125,7 +125,8 @@ pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Sli
             "chroma of the root",
             format!("{:?}", &root[1..]),
             "−255 to 255",
-        ));
+        )
+        .breaks("5.3.2"));
     }
     let mut coder = EntropyDecoder(Decoder::new(rest));
     let colours = trunk(isa, octree, maps, coding, root, &mut coder, |_| None);
@@ -202,7 +203,8 @@ pub fn decode_level(
             "number of colour slices",
             payloads.len(),
             ranges.len(),
-        ));
+        )
+        .breaks("3.3.2"));
     }
     let decode = |(range, payload): (Range<usize>, &Slice)| {
         cancel.check()?;
@@ -215,13 +217,9 @@ pub fn decode_level(
             } else {
                 "lossy, as in the level above"
             };
-            return Err(Error::malformed(
-                Stage::Colour,
-                at,
-                "steps",
-                format!("{:?}", coding.steps),
-                expected,
-            ));
+            return Err(
+                Error::malformed(Stage::Colour, at, "steps", format!("{:?}", coding.steps), expected).breaks("5.1.3"),
+            );
         }
         let (mut coder, mut model) = (EntropyDecoder(Decoder::new(rest)), above.model.clone());
         let coded = isa.run(CodeSlice {
@@ -331,13 +329,7 @@ fn read_coding<'a>(payload: &Slice<'a>, header: usize) -> Result<(Coding, &'a [u
     if !steps.is_valid() {
         let at = format!("byte {}", payload.offset);
         let expected = "luma 0 to 87 and chroma 0 to 87 or 254, or both 255";
-        return Err(Error::malformed(
-            Stage::Colour,
-            at,
-            "steps",
-            format!("{steps:?}"),
-            expected,
-        ));
+        return Err(Error::malformed(Stage::Colour, at, "steps", format!("{steps:?}"), expected).breaks("5.2.1"));
     }
     Ok((Coding { steps, gain: head[2] }, rest))
 }

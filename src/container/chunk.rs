@@ -2,7 +2,7 @@
 
 use super::malformed;
 use super::reader::{Reader, put_varint};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, feature};
 
 /// Encoding of a chunk's header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -11,6 +11,29 @@ pub(super) enum Form {
     Fixed,
     /// Version 3: numbers as varints.
     Short,
+}
+
+impl Form {
+    /// The clause that says what a chunk is.
+    fn clause_of_chunks(self) -> &'static str {
+        match self {
+            Form::Fixed => "8.1.1",
+            Form::Short => "3.1.1",
+        }
+    }
+
+    /// The clause that says where chunks of this kind stand, and what they count.
+    fn clause_of(self, kind: ChunkKind) -> &'static str {
+        match (self, kind) {
+            (Form::Fixed, ChunkKind::Geometry) => "8.2.1",
+            (Form::Fixed, _) => "8.2.2",
+            (Form::Short, ChunkKind::GeometryTrunk) => "3.2.1",
+            (Form::Short, ChunkKind::Geometry) => "3.2.3",
+            (Form::Short, ChunkKind::ColourTrunk) => "3.3.1",
+            (Form::Short, ChunkKind::Colours) => "3.3.2",
+            (Form::Short, _) => "3.3.4",
+        }
+    }
 }
 
 /// Bytes of a chunk header of version 2, without the checksum.
@@ -70,6 +93,8 @@ pub struct Chunks<'a> {
     form: Form,
     reader: Reader<'a>,
     end: usize,
+    /// Byte offset of the payload of the chunk read last.
+    payload_at: usize,
 }
 
 /// Form, type number and name of each kind.
@@ -158,7 +183,39 @@ impl<'a> Chunks<'a> {
             form,
             reader: Reader::new(&stream[..range.end], range.start),
             end: range.end,
+            payload_at: range.start,
         }
+    }
+
+    /// The next chunk, damaged or not, with its byte offset. Unlike the iterator it goes on behind a chunk that is
+    /// refused, as long as its length can be read.
+    pub(super) fn next_of_damaged(&mut self) -> Option<(usize, Result<Chunk<'a>>)> {
+        if self.reader.at() >= self.end {
+            return None;
+        }
+        let start = self.reader.at();
+        let chunk = self.read();
+        if matches!(
+            chunk,
+            Err(Error::Truncated { .. }
+                | Error::Malformed {
+                    clause: Some("1.4.2"),
+                    ..
+                })
+        ) {
+            self.end = start;
+        }
+        Some((start, chunk))
+    }
+
+    /// Byte offset of the checksum of the chunk read last.
+    pub(super) fn checksum_at(&self) -> usize {
+        self.payload_at - 4
+    }
+
+    /// Whether a chunk starts here, or the section ends.
+    pub(super) fn is_at_chunk(&self) -> bool {
+        self.clone().next().is_none_or(|chunk| chunk.is_ok())
     }
 
     fn read(&mut self) -> Result<Chunk<'a>> {
@@ -170,6 +227,7 @@ impl<'a> Chunks<'a> {
         let head = self.reader.since(start);
         let expected = self.reader.u32("chunk checksum")?;
         let payload_at = self.reader.at();
+        self.payload_at = payload_at;
         let payload = self.reader.take(length as usize, "chunk payload")?;
         let found = crc32c::crc32c_append(crc32c::crc32c(head), payload);
         if found != expected {
@@ -178,16 +236,20 @@ impl<'a> Chunks<'a> {
                 offset: start as u64,
                 expected,
                 found,
+                clause: self.form.clause_of_chunks(),
             });
         }
         let Some(kind) = ChunkKind::of(self.form, code as u8) else {
             return Err(Error::Unsupported {
-                what: "this chunk type",
-                detail: format!("byte {start} has type {code}, which this version does not define"),
+                what: match self.form {
+                    Form::Fixed => feature::CHUNK_OF_VERSION_2,
+                    Form::Short => feature::CHUNK,
+                },
+                detail: format!("byte {start} has the critical type {code}, which this decoder does not know"),
             });
         };
         let Ok(slice) = slice.try_into() else {
-            return Err(malformed(start, "slice of a chunk", slice, "at most 65535"));
+            return Err(malformed("3.1.1", start, "slice of a chunk", slice, "at most 65535"));
         };
         Ok(Chunk {
             kind,
@@ -241,7 +303,13 @@ impl<'a> Chunks<'a> {
         if !counts.contains(&chunk.count.into()) {
             let field = format!("voxel count of the {}", expected_chunk());
             let expected = format!("{} to {}", counts.start(), counts.end());
-            return Err(malformed(chunk.offset, field, chunk.count, expected));
+            return Err(malformed(
+                self.form.clause_of(kind),
+                chunk.offset,
+                field,
+                chunk.count,
+                expected,
+            ));
         }
         Ok(chunk)
     }
@@ -261,13 +329,26 @@ impl<'a> Chunks<'a> {
         expected_chunk: impl Fn() -> String,
     ) -> Result<Chunk<'a>> {
         let Some(chunk) = self.next_critical()? else {
-            return Err(malformed(self.end, "end of the section", "here", expected_chunk()));
+            let clause = self.form.clause_of(kind);
+            return Err(malformed(
+                clause,
+                self.end,
+                "end of the section",
+                "here",
+                expected_chunk(),
+            ));
         };
         if chunk.kind == kind && fits(&chunk) {
             return Ok(chunk);
         }
         let found = format!("{} of level {}, slice {}", chunk.kind, chunk.level, chunk.slice);
-        Err(malformed(chunk.offset, "chunk", found, expected_chunk()))
+        Err(malformed(
+            self.form.clause_of(kind),
+            chunk.offset,
+            "chunk",
+            found,
+            expected_chunk(),
+        ))
     }
 
     /// The next critical chunk, without consuming it.
@@ -284,13 +365,19 @@ impl<'a> Chunks<'a> {
         chunks.find(|chunk| chunk.kind == ChunkKind::HeadMap && chunk.level == level)
     }
 
-    /// Checks that only ancillary chunks remain.
-    pub(super) fn finish(&mut self) -> Result<()> {
+    /// Checks that only ancillary chunks remain, as `clause` says.
+    pub(super) fn finish(&mut self, clause: &'static str) -> Result<()> {
         match self.next_critical()? {
             None => Ok(()),
             Some(chunk) => {
                 let found = format!("a {} chunk", chunk.kind);
-                Err(malformed(chunk.offset, "chunk after the section's last", found, "none"))
+                Err(malformed(
+                    clause,
+                    chunk.offset,
+                    "chunk after the section's last",
+                    found,
+                    "none",
+                ))
             }
         }
     }

@@ -1,4 +1,4 @@
-//! A stream that arrives in parts, and the next level that can be decoded from them.
+//! A stream that arrives in parts, and the next level that can be decoded from them (`docs/format.md`, clause 1.6.3).
 
 use std::borrow::Cow;
 

@@ -2,7 +2,7 @@
 
 use super::malformed;
 use super::reader::Reader;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, feature};
 use crate::limits::{Limits, MAX_DEPTH};
 use crate::placement::Placement;
 
@@ -153,12 +153,12 @@ impl Header {
         check_sum(&mut reader, bytes)?;
         if critical_flags != 0 {
             return Err(Error::Unsupported {
-                what: "this stream",
-                detail: format!("it has the unknown critical flags {critical_flags:#010x}"),
+                what: feature::FLAGS,
+                detail: format!("the critical flags are {critical_flags:#010x}, none of which this version knows"),
             });
         }
         if reserved != 0 {
-            return Err(malformed(23, "reserved byte", reserved, 0));
+            return Err(malformed("2.2.1", 23, "reserved byte", reserved, 0));
         }
         let header = Header {
             optional_flags,
@@ -243,8 +243,21 @@ impl Header {
         let end = self.stream_bytes();
         match length.saturating_sub(end) {
             0 => Ok(()),
-            rest => Err(malformed(end, "number of bytes after the last section", rest, 0)),
+            rest => Err(malformed(
+                "2.1.1",
+                end,
+                "number of bytes after the last section",
+                rest,
+                0,
+            )),
         }
+    }
+
+    /// Byte offset of the checksum of the header that starts here, if its length can be known.
+    pub(crate) fn checksum_at(bytes: &[u8]) -> Option<usize> {
+        let format = read_version(&mut Reader::new(bytes, 0), bytes).ok()?;
+        let levels = bytes.get(22)?.checked_sub(*bytes.get(21)?)?;
+        Some(format.fixed_bytes() + 12 * (usize::from(levels) + 1))
     }
 
     /// Parents per slice of colours; in version 2, that of the geometry.
@@ -325,12 +338,13 @@ impl Header {
         let min_bits = top + u8::from(!self.format.codes_finest_level());
         if !(1..=MAX_DEPTH).contains(&bits) || bits < min_bits {
             let expected = format!("{} to {MAX_DEPTH}", min_bits.max(1));
-            return Err(malformed(20, "bit depth", bits, expected));
+            return Err(malformed("2.2.2", 20, "bit depth", bits, expected));
         }
         limits.check_depth("bit depth of the stream", bits)?;
         if !self.placement.is_valid() {
             let value = format!("{:?}", self.placement);
             return Err(malformed(
+                "2.2.3",
                 32,
                 "placement",
                 value,
@@ -343,7 +357,13 @@ impl Header {
         let lengths = (self.voxels.len(), self.sections.len());
         if lengths != (levels, levels) {
             let value = format!("{lengths:?}");
-            return Err(malformed(fixed_bytes, "voxel counts and sections", value, levels));
+            return Err(malformed(
+                "2.2.2",
+                fixed_bytes,
+                "voxel counts and sections",
+                value,
+                levels,
+            ));
         }
         let mut allowed = 1..=1u64 << (3 * base);
         for (i, &count) in self.voxels.iter().enumerate() {
@@ -351,7 +371,7 @@ impl Header {
             if !allowed.contains(&count) {
                 let field = format!("voxel count of level {}", usize::from(base) + i);
                 let expected = format!("{} to {}", allowed.start(), allowed.end());
-                return Err(malformed(fixed_bytes + 4 * i, field, count, expected));
+                return Err(malformed("2.2.2", fixed_bytes + 4 * i, field, count, expected));
             }
             limits.check_points("voxel count of a level", count)?;
             allowed = count..=8 * count;
@@ -360,7 +380,7 @@ impl Header {
         let max = u128::from(finest) << (3 * (bits - top));
         if self.points < finest || u128::from(self.points) > max {
             let expected = format!("{finest} to {max}");
-            return Err(malformed(24, "points", self.points, expected));
+            return Err(malformed("2.2.2", 24, "points", self.points, expected));
         }
         limits.check_points("points of the stream", self.points)
     }
@@ -369,7 +389,7 @@ impl Header {
         let at = self.format.fixed_bytes() - 4;
         let check = |at, field, value, max| match (1..=max).contains(&value) {
             true => Ok(()),
-            false => Err(malformed(at, field, value, format!("1 to {max}"))),
+            false => Err(malformed("2.2.1", at, field, value, format!("1 to {max}"))),
         };
         match self.format {
             Format::Learned { .. } => check(at, "slice size", self.slice_voxels, MAX_SLICE_VOXELS),
@@ -391,7 +411,7 @@ fn read_version(reader: &mut Reader, bytes: &[u8]) -> Result<Format> {
     let known = bytes.len().min(MAGIC.len());
     if bytes[..known] != MAGIC[..known] {
         let found = format!("{:02x?}", &bytes[..known]);
-        return Err(malformed(0, "magic", found, format!("{MAGIC:02x?}")));
+        return Err(malformed("2.2.1", 0, "magic", found, format!("{MAGIC:02x?}")));
     }
     reader.take(MAGIC.len(), "magic")?;
     let major = reader.u16("version")?;
@@ -400,7 +420,7 @@ fn read_version(reader: &mut Reader, bytes: &[u8]) -> Result<Format> {
         2 => Ok(Format::Learned { model: [0; 16] }),
         3 => Ok(Format::Transform { colour_slice: 0 }),
         _ => Err(Error::Unsupported {
-            what: "this stream version",
+            what: feature::VERSION,
             detail: format!("found version {major}, supported are 2 and 3"),
         }),
     }
@@ -418,6 +438,7 @@ fn check_sum(reader: &mut Reader, bytes: &[u8]) -> Result<()> {
         offset: 0,
         expected,
         found,
+        clause: "2.2.1",
     })
 }
 
@@ -426,7 +447,7 @@ fn check_levels(format: &Format, base: u8, top: u8) -> Result<()> {
     let deepest = MAX_DEPTH - u8::from(!format.codes_finest_level());
     if base > top || top - base >= max || top > deepest {
         let expected = format!("1 to {max} levels, none deeper than {deepest}");
-        return Err(malformed(21, "levels", format!("{base} to {top}"), expected));
+        return Err(malformed("2.2.2", 21, "levels", format!("{base} to {top}"), expected));
     }
     Ok(())
 }

@@ -16,27 +16,31 @@ mod chunk;
 pub(crate) mod feed;
 mod header;
 mod reader;
+mod scan;
 mod stream;
 mod transform;
 mod writer;
 
-pub use axes::{axes, axes_bytes, with_axes};
+pub use axes::{axes, axes_bytes, source_bytes, source_points, with_axes, with_source};
+pub use chunk::ChunkKind;
 pub use header::{Format, Header, MAGIC, MAX_COLOUR_SLICE, MAX_SLICE_VOXELS, Section, version};
 pub use reader::{Reader, put_varint};
+pub use scan::{Note, Scan, ScannedChunk};
 pub use stream::{Geometry, Level, Slice, Stream};
 pub use transform::{ColourLevel, Colours, MAX_TRUNK_VOXELS, Trunk};
 pub use writer::Writer;
 
 use crate::error::{Error, Stage};
 
-/// The error for data at byte `offset` that violates the format.
+/// The error for data at byte `offset` that violates a clause of the format.
 fn malformed(
+    clause: &'static str,
     offset: impl std::fmt::Display,
     field: impl ToString,
     value: impl ToString,
     expected: impl ToString,
 ) -> Error {
-    Error::malformed(Stage::Bitstream, format!("byte {offset}"), field, value, expected)
+    Error::malformed(Stage::Bitstream, format!("byte {offset}"), field, value, expected).breaks(clause)
 }
 
 #[cfg(test)]

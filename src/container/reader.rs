@@ -1,4 +1,4 @@
-//! Reads little-endian numbers from bytes, with an error where they end early.
+//! Reads little-endian numbers from bytes, with an error where they end early (`docs/format.md`, clause 1.4).
 
 use super::malformed;
 use crate::error::{Error, Result, Stage};
@@ -85,7 +85,7 @@ impl<'a> Reader<'a> {
         }
         let expected = "a number below 2^32 in its shortest form";
         let value = format!("{:02x?}", &self.bytes[start..self.at]);
-        Err(malformed(start, field, value, expected))
+        Err(malformed("1.4.2", start, field, value, expected))
     }
 
     numbers!(u8, u16, u32, u64, f64);

@@ -1,4 +1,4 @@
-//! Splits a stream into its header and its complete levels.
+//! Splits a stream into its header and its complete levels (`docs/format.md`, clauses 2.1, 3.2 and 8.2).
 
 use super::chunk::{Chunk, ChunkKind, Chunks, Form};
 use super::header::{Format, Header};
@@ -143,12 +143,12 @@ impl<'a> Level<'a> {
         let (length, field) = (section.geometry, "geometry section");
         let mut chunks = take_section(Form::Short, bytes, &mut at, length, field)?;
         let geometry = transform::take_geometry(&mut chunks, header, level)?;
-        chunks.finish()?;
+        chunks.finish("3.2.1")?;
         let (length, field) = (section.colours, "colour section");
         let mut chunks = take_section(Form::Short, bytes, &mut at, length, field)?;
         let above = header.parents(level)?;
         let colours = transform::take_colours(&mut chunks, &geometry, above, header, level)?;
-        chunks.finish()?;
+        chunks.finish("3.3.4")?;
         Ok(Level {
             level,
             voxels,
@@ -169,7 +169,7 @@ impl<'a> Level<'a> {
         let (length, field) = (section.geometry, "geometry section");
         let mut chunks = take_section(Form::Fixed, bytes, &mut at, length, field)?;
         let geometry = take_geometry(&mut chunks, header, level)?;
-        chunks.finish()?;
+        chunks.finish("8.2.1")?;
 
         let (length, field) = (section.colours, "feature section");
         let mut chunks = take_section(Form::Fixed, bytes, &mut at, length, field)?;
@@ -179,7 +179,7 @@ impl<'a> Level<'a> {
         };
         let filters = take_filters(&mut chunks, level, voxels)?;
         let residual = take_residual(&mut chunks, header.slice_voxels, level, voxels)?;
-        chunks.finish()?;
+        chunks.finish("8.2.2")?;
         Ok(Level {
             level,
             voxels,
@@ -262,6 +262,8 @@ pub(super) struct Counts {
     max: u32,
     /// Byte offset of the section.
     start: u64,
+    /// The clause that these counts obey.
+    clause: &'static str,
 }
 
 impl Counts {
@@ -272,6 +274,10 @@ impl Counts {
             level,
             max: header.voxels(level)?,
             start: header.start(level)?,
+            clause: match header.format {
+                Format::Learned { .. } => "8.2.1",
+                Format::Transform { .. } => "3.2.4",
+            },
         })
     }
 
@@ -298,7 +304,7 @@ impl Counts {
         }
         let field = format!("voxel count of level {level}");
         let expected = format!("at most {}, as in the header", self.max);
-        Err(malformed(offset, field, total, expected))
+        Err(malformed(self.clause, offset, field, total, expected))
     }
 
     /// Checks that the section's last level has as many voxels as the header states.
@@ -308,7 +314,7 @@ impl Counts {
         }
         let field = format!("voxel count of level {}", self.level);
         let expected = format!("{}, as in the header", self.max);
-        Err(malformed(self.start, field, self.parents, expected))
+        Err(malformed(self.clause, self.start, field, self.parents, expected))
     }
 }
 
@@ -327,7 +333,13 @@ fn take_features<'a>(
             let mut reader = Reader::new(chunk.payload, 0);
             let Ok(hash) = reader.u64("latent hash") else {
                 let field = "length of a level's first feature chunk";
-                return Err(malformed(chunk.offset, field, chunk.payload.len(), "8 or more"));
+                return Err(malformed(
+                    "8.2.2",
+                    chunk.offset,
+                    field,
+                    chunk.payload.len(),
+                    "8 or more",
+                ));
             };
             latent_hash = hash;
             hash_bytes = reader.at();

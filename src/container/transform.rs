@@ -5,7 +5,7 @@ use super::header::Header;
 use super::malformed;
 use super::reader::Reader;
 use super::stream::{Counts, Geometry, Slice, sliced};
-use crate::error::Result;
+use crate::error::{Error, Result};
 
 /// Maximum number of voxels of the last level of a colour trunk.
 pub const MAX_TRUNK_VOXELS: u32 = 65_536;
@@ -77,14 +77,14 @@ fn take_trunk<'a>(
         if counts.parents > slice_voxels.into() {
             let field = format!("parents of level {level} in the geometry trunk");
             let expected = format!("at most {slice_voxels}, one slice");
-            return Err(malformed(offset, field, counts.parents, expected));
+            return Err(malformed("3.2.2", offset, field, counts.parents, expected));
         }
         let voxels = in_trunk(&chunk, reader.varint("voxel count"), offset)?;
         let allowed = counts.parents..=8 * counts.parents;
         if !allowed.contains(&voxels.into()) {
             let field = format!("voxel count of level {level}");
             let expected = format!("{} to {}", allowed.start(), allowed.end());
-            return Err(malformed(offset, field, voxels, expected));
+            return Err(malformed("3.2.2", offset, field, voxels, expected));
         }
         counts.check_total(level, offset, voxels.into())?;
         let offset = at(&reader);
@@ -102,18 +102,25 @@ fn take_trunk<'a>(
         let field = "voxel count, and bytes after the last level, of the geometry trunk";
         let value = format!("{}, {rest}", chunk.count);
         let expected = format!("{}, 0", counts.parents);
-        return Err(malformed(chunk.offset, field, value, expected));
+        return Err(malformed("3.2.2", chunk.offset, field, value, expected));
     }
     Ok(geometry)
 }
 
 /// Converts the error of a payload that ends early: its checksum is valid, so the stream is malformed, not truncated.
+/// Offsets become those of the stream.
 fn in_trunk<T>(chunk: &Chunk, read: Result<T>, offset: usize) -> Result<T> {
-    read.map_err(|_| {
+    read.map_err(|error| {
+        if let Error::Malformed {
+            field, value, expected, ..
+        } = error
+        {
+            return malformed("1.4.2", offset, field, value, expected);
+        }
         let length = chunk.payload.len();
         let field = "payload of the geometry trunk";
         let value = format!("{length} bytes");
-        malformed(offset, field, value, "counts and codes of all its levels")
+        malformed("3.2.2", offset, field, value, "counts and codes of all its levels")
     })
 }
 
@@ -172,12 +179,12 @@ fn take_colour_trunk<'a>(
     let expected = voxels(chunk.level);
     if u64::from(chunk.count) != expected {
         let field = "voxel count of the colour trunk";
-        return Err(malformed(chunk.offset, field, chunk.count, expected));
+        return Err(malformed("3.3.1", chunk.offset, field, chunk.count, expected));
     }
     if chunk.level > 0 && chunk.count > MAX_TRUNK_VOXELS {
         let field = "voxel count of the colour trunk";
         let expected = format!("at most {MAX_TRUNK_VOXELS}");
-        return Err(malformed(chunk.offset, field, chunk.count, expected));
+        return Err(malformed("3.3.1", chunk.offset, field, chunk.count, expected));
     }
     let skip = take_hash(&chunk, hash)?;
     Ok(Trunk {
@@ -195,7 +202,7 @@ fn take_hash(chunk: &Chunk, hash: &mut Option<u64>) -> Result<usize> {
     let Ok(found) = reader.u64("colour hash") else {
         let field = "length of a level's first colour chunk";
         let length = chunk.payload.len();
-        return Err(malformed(chunk.offset, field, length, "8 or more"));
+        return Err(malformed("3.3.3", chunk.offset, field, length, "8 or more"));
     };
     *hash = Some(found);
     Ok(reader.at())

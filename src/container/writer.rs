@@ -1,4 +1,4 @@
-//! Writes streams.
+//! Writes streams (`docs/format.md`, clauses 2, 3 and 8).
 
 use super::chunk::{Chunk, ChunkKind, Form};
 use super::header::{Format, Header, Section};

@@ -5,11 +5,13 @@
 //! and error are the same however the bytes are cut, and the error is that of the first fault in the order of the
 //! stream. What only version 2 needs, down to latents and features, is in `latents`.
 
+mod check;
 mod memory;
 mod stream;
 mod streaming;
 mod transform;
 
+pub use check::{Checked, Fault};
 pub use stream::{Decoder, Points};
 pub use streaming::Decoding;
 #[cfg(feature = "encoder")]

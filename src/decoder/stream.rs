@@ -12,7 +12,7 @@ use crate::cloud::{ColouredVoxels, PointCloud};
 use crate::container::feed::Goal;
 use crate::container::{Format, Header, Stream};
 use crate::error::{Error, Result};
-use crate::gaussians::learned::{HeadsModel, LevelInput, Set};
+use crate::gaussians::learned::{HeadsModel, Set};
 use crate::gaussians::surfels::{PerVoxel, SurfelSelection, sparse_voxels, surfels};
 use crate::gaussians::{Frame, Gaussians};
 use crate::gaussians::{HeadMap, HeadSet, Heads};
@@ -36,7 +36,7 @@ pub struct Decoder {
     per_voxel: Option<usize>,
     precision: Precision,
     isa: Option<Isa>,
-    limits: Limits,
+    pub(super) limits: Limits,
     cancel: Cancel,
     /// The last level, if not the finest that can be drawn.
     level: Option<u8>,
@@ -410,16 +410,8 @@ impl Decoder {
         if let Some(all) = chosen.as_deref().filter(|chosen| !chosen.contains(&false)) {
             return discs(Some(all));
         }
-        let input = LevelInput {
-            octree,
-            level,
-            map,
-            above: &above.map,
-            colours,
-            colours_above: &reached.colours_above(above),
-            luma_step: reached.coloured.steps().luma_step(),
-            without: chosen.as_deref(),
-        };
+        let colours_above = reached.colours_above(above);
+        let input = reached.heads_input(self.isa(), above, &colours_above, chosen.as_deref());
         let mut gaussians = model.generate(self.isa(), self.precision, set, input, frame)?;
         if let Some(chosen) = &chosen {
             gaussians.append(discs(Some(chosen))?);

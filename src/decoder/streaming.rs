@@ -8,7 +8,7 @@ use crate::container::feed::{Goal, failed_before};
 use crate::container::{Header, MAGIC, version};
 use crate::error::{Error, Result};
 use crate::gaussians::HeadSet;
-use crate::gaussians::learned::HeadsModel;
+use crate::gaussians::learned::{HeadsModel, LevelInput};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::Voxels;
 use crate::latents::{LatentDecoding, nothing_reached};
@@ -22,12 +22,12 @@ use crate::latents::{LatentDecoding, nothing_reached};
 pub struct Decoding<'b> {
     decoder: Decoder,
     goal: Goal,
-    state: State<'b>,
+    pub(super) state: State<'b>,
 }
 
 /// What is known of a stream.
 #[derive(Debug)]
-enum State<'b> {
+pub(super) enum State<'b> {
     /// Not its version.
     Start(Cow<'b, [u8]>),
     Learned(Box<LatentDecoding<'b>>),
@@ -163,6 +163,16 @@ impl<'b> Decoding<'b> {
                 placement: header.placement,
             },
         })
+    }
+
+    /// Calls `with` with what learned heads read of the level reached, and gives its result; `None` if they draw nothing
+    /// of it, or the stream has version 2.
+    #[doc(hidden)]
+    pub fn with_heads_input<T>(&self, with: impl FnOnce(LevelInput<'_>) -> T) -> Option<T> {
+        let State::Transform(decoding) = &self.state else {
+            return None;
+        };
+        decoding.reached()?.with_heads_input(self.decoder.isa(), with)
     }
 
     /// The Gaussians of the level reached.

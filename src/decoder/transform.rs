@@ -11,6 +11,7 @@ use crate::colour::{self, Filter, LevelColours};
 use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
+use crate::gaussians::learned::LevelInput;
 use crate::gaussians::{Gaussians, HeadMap};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::latents::nothing_reached;
@@ -70,6 +71,40 @@ impl Reached {
             Some(coloured) => coloured.rgb(),
             None => means(&self.octree, self.level, &self.coloured.rgb()),
         }
+    }
+}
+
+impl Reached {
+    /// What learned heads read, for all voxels but those `without` Gaussians.
+    pub fn heads_input<'a>(
+        &'a self,
+        isa: Isa,
+        above: &'a Above,
+        colours_above: &'a [[u8; 3]],
+        without: Option<&'a [bool]>,
+    ) -> LevelInput<'a> {
+        LevelInput {
+            octree: &self.octree,
+            level: self.level,
+            map: &self.map,
+            above: &above.map,
+            colours: self.colours(isa),
+            colours_above,
+            luma_step: self.coloured.steps().luma_step(),
+            without,
+        }
+    }
+
+    /// Calls `with` with what learned heads read, of the voxels that they draw; none at level 0, or if surfels draw all.
+    pub fn with_heads_input<T>(&self, isa: Isa, with: impl FnOnce(LevelInput<'_>) -> T) -> Option<T> {
+        let above = self.above.as_ref()?;
+        let heads = self.head_map.as_ref();
+        if heads.is_some_and(HeadMap::is_all_surfels) {
+            return None;
+        }
+        let without = heads.and_then(|heads| heads.surfels(&self.octree, self.level));
+        let colours_above = self.colours_above(above);
+        Some(with(self.heads_input(isa, above, &colours_above, without.as_deref())))
     }
 }
 

@@ -263,26 +263,6 @@ fn pooled(cloud: &ColouredVoxels, level: u8) -> (Voxels, Vec<[f32; 3]>) {
     (Voxels::from_sorted(level, keys), colours)
 }
 
-/// A stream of version 2 of this octree whose latents are all zero: what geometry and entropy coding cost, for
-/// calibrations.
-///
-/// # Errors
-/// Those of [`encode`].
-#[doc(hidden)]
-pub fn with_zero_latents(header: Header, octree: Octree, model: &Model) -> Result<Vec<u8>> {
-    let base = header.base;
-    let maps = kernel_maps(&octree, base);
-    let log = &Log::off();
-    let skeleton = Skeleton::new(header, octree, maps, model, log)?;
-    let latents = model.shape().latents;
-    let mut zero = |role: usize, _: Coding<'_>, _: Option<&[i16]>| {
-        let voxels = skeleton.octree.level(base + role as u8).len();
-        Ok(vec![0; voxels * latents])
-    };
-    let coded = skeleton.code(&mut zero, None, log)?;
-    skeleton.stream(&coded, &[])
-}
-
 /// The kernel maps of `base` and all deeper levels, in this order.
 fn kernel_maps(octree: &Octree, base: u8) -> Vec<KernelMap> {
     let mut maps = vec![octree.kernel_map(base)];

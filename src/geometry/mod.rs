@@ -1,4 +1,5 @@
-//! Geometry: the occupied voxels of every octree level, their neighbours, and the lossless codec.
+//! Geometry: the occupied voxels of every octree level, their neighbours, and the lossless codec (`docs/format.md`,
+//! clauses 2.3, 2.4 and 4).
 
 pub mod codec;
 pub mod morton;

@@ -1,4 +1,4 @@
-//! Kernel maps: the indices of every voxel's occupied neighbours.
+//! Kernel maps: the indices of every voxel's occupied neighbours (`docs/format.md`, clause 2.4).
 //!
 //! A kernel map is built from that of the level above, without searching or hashing. The neighbour of a child lies in
 //! its parent or in one of its parent's 26 neighbours, whose children are found by counting bits of the occupancy. The

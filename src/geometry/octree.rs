@@ -1,4 +1,4 @@
-//! The octree of a cloud: its voxels at every level, and the links between levels.
+//! The octree of a cloud: its voxels at every level, and the links between levels (`docs/format.md`, clause 2.3).
 
 use super::{KernelMap, Voxels, morton, neighbours};
 use crate::error::{Error, Result, Stage};

@@ -1,4 +1,4 @@
-//! The occupied voxels of one octree level.
+//! The occupied voxels of one octree level (`docs/format.md`, clause 2.3).
 
 use super::morton;
 

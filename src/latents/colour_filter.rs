@@ -71,7 +71,7 @@ impl ColourFilter {
     pub fn parse(payload: &Slice, level: u8) -> Result<Self> {
         let malformed = |field, value, expected: String| {
             let place = format!("byte {}, level {level}", payload.offset);
-            Error::malformed(Stage::Gaussians, place, field, value, expected)
+            Error::malformed(Stage::Gaussians, place, field, value, expected).breaks("14.1.1")
         };
         let Ok(bytes) = <&[u8; BYTES]>::try_from(payload.bytes) else {
             let (found, expected) = (payload.bytes.len(), BYTES.to_string());

@@ -190,7 +190,7 @@ impl ColourResidual {
                 let field = "steps of the colour residual";
                 let expected = "four steps, not all 0, and a bit up to 63";
                 let found = format!("{:?}", &payload.bytes[..payload.bytes.len().min(FIXED)]);
-                return Err(Error::malformed(Stage::Gaussians, at, field, found, expected));
+                return Err(Error::malformed(Stage::Gaussians, at, field, found, expected).breaks("14.2.1"));
             };
             let mut parts = precision.parts(triples.split_at_mut(precision.coarse_of(keys)));
             decode_coefficients(&payload.bytes[FIXED..], &mut parts, &at)?;

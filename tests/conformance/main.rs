@@ -13,6 +13,7 @@
 #[cfg(feature = "encoder")]
 #[path = "../common/mod.rs"]
 mod common;
+mod damage;
 mod digest;
 mod digest_transform;
 #[cfg(feature = "encoder")]
@@ -119,6 +120,26 @@ fn every_stream_decodes_to_its_digests_with_every_instruction_set_and_number_of_
         let dotprod = std::arch::is_aarch64_feature_detected!("dotprod");
         let sets = ["scalar", "neon", "dotprod"];
         assert_eq!(ran, sets[..2 + usize::from(dotprod)]);
+    }
+}
+
+/// What a release has written, every later one decodes (`docs/format.md`, clause 1.6.4): no version leaves the suites.
+#[test]
+fn the_suites_have_streams_of_every_version_of_the_format() {
+    let format = std::fs::read_to_string(root().join("docs/format.md")).expect("the format is there");
+    let named = format.lines().find_map(|line| line.split("major version: ").nth(1));
+    let numbers = named.expect("clause 2.2.1 names the versions").split(' ');
+    let versions: Vec<u16> = numbers.filter_map(|number| number.parse().ok()).collect();
+    assert_eq!(versions, [2, 3]);
+    for (version, suite) in versions.into_iter().zip(["suite.txt", "version-3/suite.txt"]) {
+        let path = folder().join(suite);
+        let text = std::fs::read_to_string(&path).expect("the suite is there");
+        assert!(text.lines().count() >= 10, "{suite}");
+        for line in text.lines() {
+            let name = line.split(' ').next().expect("a name");
+            let bytes = std::fs::read(path.with_file_name(format!("{name}.b2p"))).expect("every line has a stream");
+            assert_eq!(b2p::container::version(&bytes), Some(version), "{name}");
+        }
     }
 }
 

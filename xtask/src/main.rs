@@ -1,9 +1,11 @@
-//! Regenerates generated files that are kept in the repository: `cargo xtask conformance`, `seeds` or `sample`.
+//! Regenerates generated files that are kept in the repository: `cargo xtask conformance`, `damage`, `seeds` or
+//! `sample`.
 //!
 //! Tests compare with these files and never write them. What streams a suite has is defined beside its test.
 
 #[path = "../../tests/common/mod.rs"]
 mod common;
+mod damage;
 #[path = "../../tests/conformance/digest.rs"]
 #[allow(dead_code, reason = "the test decodes in pieces, too")]
 mod digest;
@@ -31,14 +33,18 @@ type Result<T = ()> = std::result::Result<T, Box<dyn Error>>;
 
 const USAGE: &str = "usage: cargo xtask TASK
 
-conformance  writes the streams and digests of both conformance suites into tests/data/conformance
+conformance  writes the streams and digests of both conformance suites into tests/data/conformance, and the damage
+damage       writes the list of damaged streams, tests/data/conformance/damage.txt
 seeds        writes the seeds of the fuzz targets into fuzz/corpus
 sample       renders the sample scene and codes it as models/scene.b2p and models/sample.b2p";
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let done = match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        ["conformance"] => conformance().and_then(|()| conformance_transform()),
+        ["conformance"] => conformance()
+            .and_then(|()| conformance_transform())
+            .and_then(|()| damage()),
+        ["damage"] => damage(),
         ["seeds"] => cargo(&[
             "run",
             "--locked",
@@ -103,6 +109,14 @@ fn conformance_transform() -> Result {
     }
     std::fs::write(folder.join("suite.txt"), text)?;
     println!("version 3: {} streams", streams.len());
+    Ok(())
+}
+
+/// Writes the list of damaged streams.
+fn damage() -> Result {
+    let text = damage::list(&suite())?;
+    std::fs::write(suite().join("damage.txt"), &text)?;
+    println!("damage: {} streams, {} bytes", text.lines().count(), text.len());
     Ok(())
 }
 

@@ -1,52 +1,33 @@
-//! A time budget or a least accuracy, in place of single settings.
+//! The setting that looks best among those that fit a time.
 
+use std::cmp::Ordering;
 use std::time::Duration;
 
-use super::calibration::{Calibration, DrawCost};
-use b2p::Limits;
 use b2p::container::Header;
-use b2p::gaussians::Heads;
-use b2p::latents::network::Model;
-use b2p::layers::Precision;
-use b2p::renderer::Quality;
+use b2p::gaussians::HeadSet;
 use b2p::{Error, Result};
+
+use super::calibration::Calibration;
+use super::costs::{PictureSize, score};
 
 /// A time is promised only if the estimate, so many times and with so many nanoseconds more, keeps it: in short tasks
 /// it shows when a thread wakes late, or a page is long in coming.
 const MARGIN: f64 = 1.1;
 const SPARE: f64 = 1e6;
-
-/// A stream to measure with.
-pub struct CalibrationInput<'a> {
-    /// The stream.
-    pub stream: &'a [u8],
-    /// Loads the model that it was coded with.
-    pub model: &'a dyn Fn() -> Result<Model>,
-    /// Limits of decoding and drawing.
-    pub limits: &'a Limits,
-}
-
-/// What is asked for. With a time, the most accurate setting that fits it; with an accuracy alone, the fastest that has
-/// it.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Budget {
-    /// The time that the task may take.
-    pub time: Option<Duration>,
-    /// The least PSNR in dB against pictures in double precision. It is an estimate: that of the stream that was
-    /// calibrated with.
-    pub min_psnr: Option<f64>,
-}
+/// How many times longer or shorter than expected something takes if the calibration is plainly off.
+const OFF: f64 = 1.5;
 
 /// What is to be done in the time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Task {
     /// From a stream in memory to its Gaussians.
     Decode,
-    /// From Gaussians to one picture of so many pixels, from where the program's camera stands: from nearer, it shows
-    /// more.
+    /// From a stream in memory to a picture.
     Picture {
         /// Width times height.
-        pixels: u64,
+        pixels: f64,
+        /// Pixels that a cube-frame unit takes at most.
+        per_unit: f64,
     },
 }
 
@@ -55,113 +36,100 @@ pub enum Task {
 pub struct Choice {
     /// Octree level.
     pub level: u8,
-    /// What generates Gaussians.
-    pub heads: Heads,
-    /// Precision of the network.
-    pub precision: Precision,
-    /// Quality of the renderer; it takes no part in decoding.
-    pub quality: Quality,
+    /// What makes Gaussians.
+    pub heads: HeadSet,
     /// Time of the task.
     pub expected: Duration,
-    /// PSNR in dB of the setting in the calibration.
-    pub psnr: f64,
-    /// Whether that fits the time budget, with a tenth and a millisecond to spare.
-    pub in_time: bool,
-    /// Whether it has the accuracy asked for.
-    pub accurate: bool,
+    /// How good pictures are.
+    score: f64,
 }
 
-impl Budget {
-    /// The setting for a stream with this header, of which `levels` can be decoded to Gaussians.
-    ///
-    /// If no setting both fits the budget and has the accuracy, the budget comes first; if none fits it either, it is
-    /// the fastest.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if the calibration knows none of the levels.
-    pub fn choose(&self, calibration: &Calibration, header: &Header, levels: &[u8], task: Task) -> Result<Choice> {
-        let of_level = |&level: &u8| {
-            let role = usize::from(level.checked_sub(header.base)?);
-            let draws = calibration.draws.iter().filter(move |d| d.role == role);
-            Some(draws.filter_map(move |draw| self.rate(calibration, header, level, draw, task)))
-        };
-        let all: Vec<Choice> = levels.iter().filter_map(of_level).flatten().collect();
-        let most_accurate = |a: &&Choice, b: &&Choice| {
-            let faster = || b.expected.cmp(&a.expected);
-            a.psnr.total_cmp(&b.psnr).then_with(faster)
-        };
-        let fits = |c: &&Choice| c.in_time && c.accurate;
-        let best = match self.time {
-            None => all.iter().filter(fits).min_by_key(|c| c.expected),
-            Some(_) => all.iter().filter(fits).max_by(most_accurate),
-        };
-        let in_time = || match self.time {
-            // No setting is accurate enough: the nearest to it.
-            None => all.iter().max_by(most_accurate),
-            Some(_) => all.iter().filter(|c| c.in_time).max_by(most_accurate),
-        };
-        let fastest = || all.iter().min_by_key(|c| c.expected);
-        let chosen = best.or_else(in_time).or_else(fastest);
-        chosen.copied().ok_or_else(|| {
-            Error::Usage(format!(
-                "nothing is known of what the levels {levels:?} of this stream take: calibrate again"
-            ))
-        })
+impl Choice {
+    /// Whether it fits a time, with something to spare.
+    pub fn fits(&self, time: Duration) -> bool {
+        self.expected.as_secs_f64() * MARGIN + SPARE / 1e9 <= time.as_secs_f64()
     }
 
-    fn rate(
-        &self,
-        calibration: &Calibration,
-        header: &Header,
-        level: u8,
-        draw: &DrawCost,
-        task: Task,
-    ) -> Option<Choice> {
-        let heads: Heads = draw.heads.parse().ok()?;
-        let precision: Precision = draw.precision.parse().ok()?;
-        let quality: Quality = draw.quality.parse().ok()?;
-        let voxels = |role: usize| header.voxels.get(role).copied().map(f64::from);
-        let here = voxels(draw.role)?;
-        let nanoseconds = match task {
-            Task::Decode => {
-                let exact = calibration.exact.iter().zip(&header.voxels).take(draw.role + 1);
-                let exact: f64 = exact.map(|(cost, &n)| cost.of(f64::from(n))).sum();
-                calibration.start + exact + draw.generate.of(here)
-            }
-            Task::Picture { pixels } => {
-                let gaussians = here * f64::from(draw.children);
-                draw.draw.of(gaussians, faces(here, level), pixels as f64)
-            }
-        };
-        let expected = Duration::try_from_secs_f64(nanoseconds / 1e9).ok()?;
-        Some(Choice {
-            level,
-            heads,
-            precision,
-            quality,
-            expected,
-            psnr: draw.psnr,
-            in_time: self
-                .time
-                .is_none_or(|time| nanoseconds * MARGIN + SPARE <= time.as_secs_f64() * 1e9),
-            accurate: self.min_psnr.is_none_or(|least| draw.psnr >= least),
-        })
+    /// Whether what it took tells that the machine is another than it was when it was calibrated.
+    pub fn is_off(&self, took: Duration) -> bool {
+        let (took, expected) = (took.as_secs_f64(), self.expected.as_secs_f64());
+        let spare = SPARE / 1e9;
+        took > expected * OFF + spare || expected > took * OFF + spare
     }
 }
 
-/// The area of a surface of so many voxels of a level, in faces of the cube.
-pub(super) fn faces(voxels: f64, level: u8) -> f64 {
-    voxels / 4f64.powi(level.into())
+/// The choices for the `levels` of a stream with this header, with `heads` alone if they are named.
+///
+/// # Errors
+/// [`Error::Usage`] if there are none: the calibration does not know these heads.
+pub fn choices(
+    calibration: &Calibration,
+    header: &Header,
+    levels: &[u8],
+    heads: Option<HeadSet>,
+    task: Task,
+) -> Result<Vec<Choice>> {
+    let mut all = Vec::new();
+    for &level in levels {
+        let voxels = f64::from(header.voxels(level)?);
+        let above = header.bits - level;
+        for cost in calibration.of_levels_above(above) {
+            if heads.is_some_and(|heads| heads != cost.heads) {
+                continue;
+            }
+            let decode = [calibration.exact.of(voxels), cost.generate.of(voxels)];
+            let [Some(exact), Some(generate)] = decode else {
+                continue;
+            };
+            let picture = match task {
+                Task::Decode => 0.0,
+                Task::Picture { pixels, per_unit } => {
+                    let size = PictureSize::of_surface(pixels, per_unit, voxels, level);
+                    cost.picture.of(voxels * cost.per_voxel, size)
+                }
+            };
+            let expected = Duration::try_from_secs_f64((exact + generate + picture) / 1e9);
+            all.extend(expected.ok().map(|expected| Choice {
+                level,
+                heads: cost.heads,
+                expected,
+                score: score(above, cost.heads),
+            }));
+        }
+    }
+    match all.is_empty() {
+        true => Err(Error::Usage(
+            "no heads of a budget draw the levels of this stream".into(),
+        )),
+        false => Ok(all),
+    }
+}
+
+/// The one that looks best among those that fit the time, the fastest of equals; if none fits, the fastest.
+pub fn choose(all: &[Choice], time: Duration) -> Option<Choice> {
+    let better = |a: &&Choice, b: &&Choice| -> Ordering {
+        let faster = || b.expected.cmp(&a.expected);
+        a.score.total_cmp(&b.score).then_with(faster)
+    };
+    let fitting = all.iter().filter(|choice| choice.fits(time));
+    let fastest = || all.iter().min_by_key(|choice| choice.expected);
+    fitting.max_by(better).or_else(fastest).copied()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::calibration::{LevelCost, PictureCost};
+    use crate::budget::calibration::HeadsCost;
+    use crate::budget::costs::{Curve, PictureCost};
     use b2p::container::{Format, Section};
-    use b2p::latents::network::Shape;
     use b2p::metrics::Machine;
     use b2p::placement::Placement;
+
+    const MS: f64 = 1e6;
+    const PICTURE: Task = Task::Picture {
+        pixels: 1e6,
+        per_unit: 100.0,
+    };
 
     fn header() -> Header {
         Header {
@@ -178,107 +146,103 @@ mod tests {
         }
     }
 
+    /// Eight Gaussians a voxel above level 9: level 8 has twice as many as level 9.
     fn calibration() -> Calibration {
-        let draw = |role, children, generator: [&str; 2], quality: &str, costs: [f64; 3], psnr| DrawCost {
-            role,
-            children,
-            heads: generator[0].into(),
-            precision: generator[1].into(),
-            quality: quality.into(),
-            generate: LevelCost {
-                once: 2e6,
-                per_voxel: costs[0],
-            },
-            draw: PictureCost {
-                per_gaussian: costs[1],
-                per_pixel: costs[2],
+        let heads = |heads, wide, generate: &[[f64; 2]]| HeadsCost {
+            heads,
+            wide,
+            per_voxel: if wide { 8.0 } else { 1.0 },
+            generate: Curve(generate.iter().map(|[n, ms]| [*n, ms * MS]).collect()),
+            picture: PictureCost {
+                per_gaussian: 100.0,
                 ..PictureCost::default()
             },
-            psnr,
         };
-        let (best, quick, float) = (["best", "int16"], ["quick", "int16"], ["best", "f16"]);
         Calibration {
             machine: Machine::this(),
             isa: "scalar".into(),
             threads: 2,
             model: String::new(),
-            gg: Shape::tiny().gg,
-            start: 0.0,
-            exact: vec![
-                LevelCost {
-                    once: 0.0,
-                    per_voxel: 1000.0
-                };
-                3
-            ],
-            draws: vec![
-                draw(1, 8, quick, "fast", [1000.0, 20.0, 5.0], 28.0),
-                draw(1, 8, best, "fast", [4000.0, 20.0, 5.0], 30.0),
-                draw(2, 1, best, "fast", [1000.0, 20.0, 5.0], 45.0),
-                draw(2, 1, best, "exact", [1000.0, 40.0, 9.0], 60.0),
-                draw(2, 1, float, "exact", [3000.0, 40.0, 9.0], 70.0),
+            exact: Curve(
+                [[1e4, 10.0], [5e4, 30.0], [2e5, 80.0]]
+                    .map(|[n, ms]| [n, ms * MS])
+                    .into(),
+            ),
+            heads: vec![
+                heads(HeadSet::Best, true, &[[1e4, 10.0], [5e4, 50.0]]),
+                heads(HeadSet::Surfels, true, &[[1e4, 1.0], [5e4, 5.0]]),
+                heads(HeadSet::Best, false, &[[2e5, 120.0]]),
+                heads(HeadSet::Surfels, false, &[[2e5, 10.0]]),
             ],
         }
     }
 
-    fn choose(time: Option<u64>, min_psnr: Option<f64>, task: Task) -> Choice {
-        let time = time.map(Duration::from_millis);
-        Budget { time, min_psnr }
-            .choose(&calibration(), &header(), &[8, 9], task)
-            .unwrap()
+    fn chosen(time: u64, heads: Option<HeadSet>, task: Task) -> (u8, HeadSet, u128, bool) {
+        let all = choices(&calibration(), &header(), &[7, 8, 9], heads, task).unwrap();
+        let time = Duration::from_millis(time);
+        let choice = choose(&all, time).unwrap();
+        let expected = choice.expected.as_millis();
+        (choice.level, choice.heads, expected, choice.fits(time))
     }
 
     #[test]
-    fn the_most_accurate_setting_that_fits_the_budget_is_taken() {
-        // Level 8: 62 + 200 ms, with quick heads 62 + 50; level 9: 262 + 200 ms, and 262 + 600 ms in f16.
-        let with = |time| choose(Some(time), None, Task::Decode);
-        let named = |c: Choice| (c.level, c.heads, c.precision, c.in_time);
-        let (best, quick) = (Heads::Best, Heads::Quick);
-        assert_eq!(named(with(10_000)), (9, best, Precision::F16, true));
-        assert_eq!(named(with(600)), (9, best, Precision::Int16, true));
-        assert_eq!(named(with(300)), (8, best, Precision::Int16, true));
-        assert_eq!(named(with(200)), (8, quick, Precision::Int16, true));
-        assert_eq!(with(600).expected, Duration::from_millis(462));
+    fn the_best_looking_setting_that_fits_the_time_is_taken() {
+        let (best, surfels) = (HeadSet::Best, HeadSet::Surfels);
+        assert_eq!(chosen(1000, None, Task::Decode), (9, best, 200, true));
+        assert_eq!(chosen(150, None, Task::Decode), (9, surfels, 90, true));
+        assert_eq!(chosen(95, None, Task::Decode), (8, best, 80, true));
+        assert_eq!(chosen(50, None, Task::Decode), (8, surfels, 35, true));
+        assert_eq!(chosen(25, None, Task::Decode), (7, best, 20, true));
     }
 
     #[test]
-    fn a_time_that_nothing_keeps_gives_the_fastest_and_says_so() {
-        let choice = choose(Some(5), Some(50.0), Task::Decode);
-        assert_eq!((choice.level, choice.in_time, choice.accurate), (8, false, false));
+    fn a_coarser_level_that_draws_slower_is_not_taken_for_being_coarser() {
+        // Level 8 with the best heads: 80 ms and 400,000 Gaussians; level 9 with surfels: 90 ms and half as many.
+        assert_eq!(chosen(125, None, PICTURE), (9, HeadSet::Surfels, 110, true));
+        assert_eq!(chosen(120, Some(HeadSet::Best), PICTURE), (7, HeadSet::Best, 28, true));
     }
 
     #[test]
-    fn an_accuracy_alone_gives_the_fastest_that_has_it() {
-        let picture = Task::Picture { pixels: 1_000_000 };
-        assert_eq!(choose(None, Some(40.0), picture).quality, Quality::Fast);
-        let fine = choose(None, Some(50.0), picture);
-        assert_eq!((fine.quality, fine.precision), (Quality::Exact, Precision::Int16));
-        let beyond = choose(None, Some(90.0), picture);
-        assert_eq!((beyond.precision, beyond.accurate), (Precision::F16, false));
+    fn a_time_that_nothing_keeps_gives_the_fastest() {
+        assert_eq!(chosen(5, None, Task::Decode), (7, HeadSet::Surfels, 11, false));
+        assert_eq!(
+            chosen(5, Some(HeadSet::Best), Task::Decode),
+            (7, HeadSet::Best, 20, false)
+        );
     }
 
     #[test]
-    fn more_time_is_never_used_for_less_accuracy() {
-        let picture = Task::Picture { pixels: 500_000 };
-        for task in [Task::Decode, picture] {
-            let mut before = 0.0;
+    fn more_time_is_never_used_for_a_worse_picture() {
+        for task in [Task::Decode, PICTURE] {
+            let all = choices(&calibration(), &header(), &[7, 8, 9], None, task).unwrap();
+            let mut before = f64::MIN;
             for time in 1..1000 {
-                let choice = choose(Some(time), None, task);
-                if choice.in_time {
-                    assert!(choice.psnr >= before, "{time} ms: {choice:?}");
-                    before = choice.psnr;
+                let time = Duration::from_millis(time);
+                let choice = choose(&all, time).unwrap();
+                if choice.fits(time) {
+                    assert!(choice.score >= before, "{time:?}: {choice:?}");
+                    before = choice.score;
                 }
             }
-            assert!(before > 0.0);
+            assert!(before > f64::MIN);
         }
     }
 
     #[test]
-    fn levels_that_nothing_is_known_of_are_an_error() {
-        let budget = Budget::default();
-        for levels in [&[][..], &[7], &[3]] {
-            let chosen = budget.choose(&calibration(), &header(), levels, Task::Decode);
-            assert!(matches!(chosen, Err(Error::Usage(_))), "{levels:?}");
+    fn heads_that_nothing_is_known_of_are_an_error() {
+        for (levels, heads) in [(&[][..], None), (&[9][..], Some(HeadSet::Quick))] {
+            let all = choices(&calibration(), &header(), levels, heads, Task::Decode);
+            assert!(matches!(all, Err(Error::Usage(_))), "{levels:?}");
+        }
+    }
+
+    #[test]
+    fn a_calibration_is_off_if_something_takes_half_as_long_again_or_two_thirds() {
+        let all = choices(&calibration(), &header(), &[9], None, Task::Decode).unwrap();
+        let choice = choose(&all, Duration::from_secs(1)).unwrap();
+        assert_eq!(choice.expected, Duration::from_millis(200));
+        for (took, off) in [(120, true), (140, false), (200, false), (295, false), (310, true)] {
+            assert_eq!(choice.is_off(Duration::from_millis(took)), off, "{took} ms");
         }
     }
 }

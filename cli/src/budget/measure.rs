@@ -1,327 +1,234 @@
-//! What decoding and drawing cost, measured as a process that does it once has it.
+//! What decoding and drawing cost, measured as a process that does it once has it: threads have just started, memory is
+//! fresh from the system, networks and renderers are new.
 //!
-//! Threads have just started, memory is fresh from the system, models are freshly loaded and renderers are new. What is
-//! paid however few the voxels are comes from a second stream: the same geometry, some levels coarser.
+//! Everything is measured in rounds, and the least time counts: whatever else the machine does only adds to it. Time in
+//! which threads waited for a processor does not count at all, where the system tells it.
 
 use std::time::{Duration, Instant};
 
-use b2p::metrics::give_back;
-
-use super::calibration::{Calibration, DrawCost, LevelCost, PictureCost, PictureTimes, model_name};
-use super::choice::CalibrationInput;
-use super::choice::faces;
-use b2p::Limits;
 use b2p::container::Header;
-use b2p::encoder::with_zero_latents;
-use b2p::gaussians::Heads;
-use b2p::gaussians::{Frame, Gaussians};
-use b2p::geometry::{KernelMap, Octree, Voxels};
-use b2p::latents::LatentDecoder;
-use b2p::latents::activate;
-use b2p::latents::network::Model;
-use b2p::layers::Precision;
-use b2p::log::{Log, Step};
-use b2p::metrics::{Machine, Spread, pixels_apart, psnr};
+use b2p::gaussians::{Gaussians, HeadSet};
+use b2p::metrics::{Machine, give_back};
+use b2p::renderer::Renderer;
 use b2p::renderer::camera::Camera;
-use b2p::renderer::reference::{self, Cutoffs};
-use b2p::renderer::{Background, Image, Quality, Renderer};
-use b2p::{Error, Result};
+use b2p::{Decoder, Error, Isa, Limits, Result};
 
-/// Times that everything is measured, unless that takes longer than [`PATIENCE`]. The third quartile counts: what is
-/// promised on it is to be kept.
-const REPEATS: usize = 5;
-const PATIENCE: Duration = Duration::from_millis(250);
-/// Levels by which the second stream is coarser, if the first has them above its own.
-const COARSER: u8 = 3;
-/// Sides of the pictures whose times tell what a Gaussian and what a pixel costs; the smaller one's accuracy is
-/// measured.
+use super::calibration::{Calibration, CalibrationKey, HeadsCost};
+use super::costs::{Curve, PictureCost, PictureSize};
+
+/// Rounds, unless they take longer than [`PATIENCE`]: then at least two.
+const ROUNDS: usize = 5;
+const PATIENCE: Duration = Duration::from_secs(5);
+/// Sides of the pictures whose times tell what a Gaussian and what a pixel costs.
 const SIDES: [u32; 2] = [320, 1024];
-/// The renderer's qualities by name, the finest last.
-const QUALITIES: [(&str, Quality); 3] = [
-    ("fast", Quality::Fast),
-    ("fine", Quality::Fine),
-    ("exact", Quality::Exact),
-];
-/// The accuracy, in dB, of pictures that are equal.
-const EQUAL: f64 = 200.0;
 
-/// [`Calibration::measure`].
-pub(super) fn measure(subject: &CalibrationInput<'_>, say: &dyn Fn(&str)) -> Result<Calibration> {
-    let header = Header::parse(subject.stream, subject.limits)?;
-    let model = (subject.model)()?;
-    let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
-    let levels = decoder.levels(subject.stream)?;
-    let Some(&finest) = levels.last() else {
-        return Err(Error::Usage("the stream has no level with Gaussians".into()));
+/// A stream to measure with.
+pub struct Sample<'a> {
+    /// The stream.
+    pub stream: &'a [u8],
+    /// Makes a decoder of it with a freshly loaded model.
+    pub decoder: &'a dyn Fn() -> Result<Decoder>,
+    /// What heads there are.
+    pub heads: &'a [HeadSet],
+    /// Instructions.
+    pub isa: Isa,
+    /// Limits of decoding and drawing.
+    pub limits: &'a Limits,
+}
+
+/// The least times, in nanoseconds.
+#[derive(Clone, Copy)]
+struct Least {
+    generate: f64,
+    draw: [f64; 2],
+    gaussians: usize,
+}
+
+/// Those of a level.
+struct LevelTimes {
+    level: u8,
+    exact: f64,
+    heads: Vec<Least>,
+}
+
+/// Measures with as many threads as the rayon pool that the caller is in has; `say` receives what is being done.
+///
+/// # Errors
+/// Those of decoding and drawing; [`Error::Usage`] if threads cannot be started.
+pub fn measure(sample: &Sample<'_>, key: CalibrationKey, say: &dyn Fn(&str)) -> Result<Calibration> {
+    let header = Header::parse(sample.stream, sample.limits)?;
+    let least = Least {
+        generate: f64::MAX,
+        draw: [f64::MAX; 2],
+        gaussians: 0,
     };
-    say("calibrate: levels");
-    let (all, octree) = decode_levels(&decoder, subject.stream, header.base, &levels)?;
-    let coarser = COARSER.min(header.base);
-    let small = without_features(&header, finest, &octree, coarser, &model)?;
-    let small_levels: Vec<u8> = levels.iter().map(|level| level - coarser).collect();
-    let all_small = decode_levels(&decoder, &small, header.base - coarser, &small_levels)?.0;
-    let few = exact_times(subject, &small, finest - coarser)?;
-    let many = exact_times(subject, subject.stream, finest)?;
-    say("calibrate: the truth");
-    let truth = match all.last() {
-        Some(level) => level.in_double(&model)?,
-        None => Gaussians::default(),
-    };
-    let truth = reference::render(&truth, &camera(SIDES[0])?, Background::WHITE, Cutoffs::NONE);
-    let mut calibration = Calibration {
-        machine: Machine::this(),
-        isa: model.isa().to_string(),
-        threads: rayon::current_num_threads(),
-        model: model_name(&model),
-        gg: model.shape().gg.clone(),
-        start: start_time()?,
-        exact: few
-            .into_iter()
-            .zip(many)
-            .map(|(few, many)| LevelCost::through(few, many))
-            .collect(),
-        draws: Vec::new(),
-    };
-    let mut precisions = Vec::new();
-    for precision in Precision::ALL {
-        if (subject.model)()?.with_precision(precision).is_ok() {
-            precisions.push(precision);
+    let levels = (sample.decoder)()?.levels(sample.stream)?;
+    let mut all: Vec<LevelTimes> = levels
+        .into_iter()
+        .map(|level| LevelTimes {
+            level,
+            exact: f64::MAX,
+            heads: vec![least; sample.heads.len()],
+        })
+        .collect();
+    let (mut empty, start) = (f64::MAX, Instant::now());
+    for round in 0..ROUNDS {
+        if round > 1 && start.elapsed() > PATIENCE {
+            break;
+        }
+        say(&format!("calibrate: round {} of {ROUNDS}", round + 1));
+        for times in &mut all {
+            measure_level(sample, times)?;
+        }
+        empty = empty.min(draw(sample, &Gaussians::default(), SIDES[1])?);
+    }
+    calibration(sample, key, &header, &all, empty)
+}
+
+/// One round of a level.
+fn measure_level(sample: &Sample<'_>, times: &mut LevelTimes) -> Result<()> {
+    let decoder = (sample.decoder)()?.with_level(times.level);
+    let (exact, mut decoding) = cold(|| {
+        let decoding = decoder.whole(sample.stream)?;
+        // The filter of its colours is part of them.
+        decoding.points();
+        Ok(decoding)
+    })?;
+    times.exact = times.exact.min(exact);
+    for (&heads, least) in sample.heads.iter().zip(&mut times.heads) {
+        decoding.set_heads(heads)?;
+        let (generate, gaussians) = cold(|| decoding.gaussians())?;
+        least.generate = least.generate.min(generate);
+        least.gaussians = gaussians.len();
+        for (side, least) in SIDES.into_iter().zip(&mut least.draw) {
+            *least = least.min(draw(sample, &gaussians, side)?);
         }
     }
-    for (level, small) in all.iter().zip(&all_small) {
-        // What a picture costs hardly depends on what generated the Gaussians: the first tells for all.
-        let mut draws: Option<[PictureCost; 3]> = None;
-        for heads in model.shape().heads() {
-            // Other heads than the best are for who lacks time: one precision is enough.
-            let some = if heads == Heads::Best { precisions.len() } else { 1 };
-            for &precision in precisions.iter().take(some) {
-                let (depth, role) = (level.voxels.depth(), level.role);
-                say(&format!("calibrate: level {depth}, {heads} heads, {precision}"));
-                let precise = || (subject.model)()?.with_precision(precision);
-                let few = small.generate(&precise, heads)?;
-                let many = level.generate(&precise, heads)?;
-                let gaussians = &many.gaussians;
-                let draws = match draws {
-                    Some(draws) => draws,
-                    None => {
-                        let both = [(&few.gaussians, small), (gaussians, level)];
-                        *draws.insert(picture_costs(subject.limits, &model, both)?)
-                    }
-                };
-                for ((name, quality), draw) in QUALITIES.into_iter().zip(draws) {
-                    let picture = picture(subject.limits, &model, gaussians, quality, SIDES[0])?;
-                    calibration.draws.push(DrawCost {
-                        role,
-                        children: many.children as u8,
-                        heads: heads.to_string(),
-                        precision: precision.to_string(),
-                        quality: name.into(),
-                        generate: LevelCost::through(few.time, many.time),
-                        draw,
-                        psnr: psnr(pixels_apart(&truth, &picture).0).min(EQUAL),
-                    });
-                }
+    Ok(())
+}
+
+/// What was measured, in terms of voxels, Gaussians and pixels.
+fn calibration(
+    sample: &Sample<'_>,
+    key: CalibrationKey,
+    header: &Header,
+    all: &[LevelTimes],
+    empty: f64,
+) -> Result<Calibration> {
+    let mut calibration = Calibration {
+        machine: Machine::this(),
+        isa: key.isa,
+        threads: rayon::current_num_threads(),
+        model: key.model,
+        exact: Curve::default(),
+        heads: Vec::new(),
+    };
+    let per_unit = camera(SIDES[1])?.pixels_per_unit() / f64::from(SIDES[1]);
+    for times in all {
+        let voxels = f64::from(header.voxels(times.level)?);
+        calibration.exact.push(voxels, times.exact);
+        let wide = header.bits - times.level > 1;
+        let sizes = SIDES.map(|side| {
+            let side = f64::from(side);
+            PictureSize::of_surface(side * side, per_unit * side, voxels, times.level)
+        });
+        for (&heads, least) in sample.heads.iter().zip(&times.heads) {
+            let gaussians = least.gaussians as f64;
+            let mut same = calibration.heads.iter_mut();
+            let known = same.find(|cost| cost.heads == heads && cost.wide == wide);
+            let mut generate = known.as_ref().map_or(Curve::default(), |cost| cost.generate.clone());
+            generate.push(voxels, least.generate);
+            // Pictures of the finest level of the kind have the most Gaussians.
+            let cost = HeadsCost {
+                heads,
+                wide,
+                per_voxel: gaussians / voxels.max(1.0),
+                generate,
+                picture: PictureCost::from_times(gaussians, sizes, least.draw, empty),
+            };
+            match known {
+                Some(known) => *known = cost,
+                None => calibration.heads.push(cost),
             }
         }
     }
     Ok(calibration)
 }
 
-/// What `run` gives, [`REPEATS`] times or until it has taken [`PATIENCE`].
-fn repeated<T>(mut run: impl FnMut() -> Result<T>) -> Result<Vec<T>> {
-    let start = Instant::now();
-    let mut all = vec![run()?];
-    while all.len() < REPEATS && start.elapsed() < PATIENCE {
-        all.push(run()?);
-    }
-    Ok(all)
-}
-
-/// As many threads as the caller has, just started.
-fn threads() -> Result<rayon::ThreadPool> {
+/// Nanoseconds of `run`, with new threads and fresh memory, and its result. Time in which its threads could have run, but
+/// other programs did, is taken out.
+fn cold<T: Send>(run: impl FnOnce() -> Result<T> + Send) -> Result<(f64, T)> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(rayon::current_num_threads());
-    pool.build()
-        .map_err(|e| Error::Usage(format!("no threads to calibrate with: {e}")))
-}
-
-/// Runs with new threads and fresh memory.
-fn cold<T: Send>(run: impl FnOnce() -> Result<T> + Send) -> Result<T> {
-    let pool = threads()?;
+    let pool = pool
+        .build()
+        .map_err(|e| Error::Usage(format!("no threads to calibrate with: {e}")))?;
     give_back();
-    pool.install(run)
-}
-
-/// Nanoseconds that threads take to start.
-fn start_time() -> Result<f64> {
-    let times = repeated(|| {
+    let before = pool.broadcast(|_| Scheduled::now());
+    let (time, made) = pool.install(|| {
         let start = Instant::now();
-        threads()?.broadcast(|_| ());
-        Ok(start.elapsed().as_nanos() as f64)
-    });
-    Ok(Spread::of(times?).high)
-}
-
-/// A stream of as many levels as lead to `finest`, `coarser` levels above them; its latents are zero.
-fn without_features(header: &Header, finest: u8, octree: &Octree, coarser: u8, model: &Model) -> Result<Vec<u8>> {
-    let [base, top] = [header.base, finest].map(|level| level - coarser);
-    let octree = octree.truncated(top);
-    let header = Header {
-        bits: header.bits - coarser,
-        base,
-        top,
-        points: octree.level(top).len() as u64,
-        sections: Vec::new(),
-        ..header.clone()
-    };
-    with_zero_latents(header, octree, model)
-}
-
-/// Of each level of a stream down to `finest`, its voxels, and the nanoseconds that it takes in the exact zone.
-fn exact_times(subject: &CalibrationInput<'_>, stream: &[u8], finest: u8) -> Result<Vec<[f64; 2]>> {
-    let header = Header::parse(stream, subject.limits)?;
-    let runs = repeated(|| {
-        let model = (subject.model)()?;
-        let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
-        cold(|| {
-            let log = Log::default();
-            decoder.exact(stream, finest, &log)?;
-            Ok(log.steps())
-        })
+        let made = run()?;
+        Result::Ok((start.elapsed().as_nanos() as f64, made))
     })?;
-    let levels = (header.base..=finest).zip(&header.voxels);
-    let times = levels.map(|(level, &voxels)| {
-        let ending = format!(" of level {level}");
-        let sum = |steps: &Vec<Step>| -> f64 {
-            let steps = steps.iter().filter(|step| step.name.ends_with(&ending));
-            steps.map(|step| step.time.as_nanos() as f64).sum()
-        };
-        [f64::from(voxels), Spread::of(runs.iter().map(sum)).high]
-    });
-    Ok(times.collect())
+    let after = pool.broadcast(|_| Scheduled::now());
+    Ok((time * undisturbed(&before, &after), made))
 }
 
-/// A level, decoded in the exact zone.
-struct Level {
-    role: usize,
-    map: KernelMap,
-    voxels: Voxels,
-    features: Vec<i16>,
-    frame: Frame,
+/// How long a thread has run and waited for a processor, in nanoseconds.
+#[derive(Clone, Copy, Default)]
+struct Scheduled {
+    ran: u64,
+    waited: u64,
 }
 
-/// Gaussians of a level, the voxels that they were generated from, and the nanoseconds that it took.
-struct Made {
-    gaussians: Gaussians,
-    children: usize,
-    time: [f64; 2],
-}
-
-/// These levels of a stream whose first is `base`, and the octree down to the last.
-fn decode_levels(decoder: &LatentDecoder, stream: &[u8], base: u8, levels: &[u8]) -> Result<(Vec<Level>, Octree)> {
-    let frame = decoder.frame(stream)?;
-    let mut decoding = decoder.start(levels.last().copied());
-    decoding.push(stream);
-    let (mut all, mut octree) = (Vec::new(), Octree::root());
-    while let Some(level) = decoding.advance(&Log::default())? {
-        let Some(exact) = decoding.exact().filter(|_| levels.contains(&level)) else {
-            continue;
-        };
-        octree = exact.octree.clone();
-        all.push(Level {
-            role: usize::from(level - base),
-            map: octree.kernel_map(level),
-            voxels: octree.level(level).clone(),
-            features: exact.features.clone(),
-            frame,
-        });
-    }
-    Ok((all, octree))
-}
-
-impl Level {
-    fn gaussians(&self, model: &Model, heads: Heads, raw: &[f32]) -> Gaussians {
-        let children = self.children(model, heads);
-        activate(raw, &self.voxels, children, model.shape(), self.frame)
-    }
-
-    fn children(&self, model: &Model, heads: Heads) -> usize {
-        let head = model.shape().head(self.role, heads);
-        head.map_or(1, |head| head.children)
-    }
-
-    /// Gaussians as they should be.
-    fn in_double(&self, model: &Model) -> Result<Gaussians> {
-        let raw = model.generate_in_double(Heads::Best, self.role, &self.features, &self.map)?;
-        Ok(self.gaussians(model, Heads::Best, &raw))
-    }
-
-    /// Generates Gaussians, each time with a freshly loaded model.
-    fn generate(&self, model: &dyn Fn() -> Result<Model>, heads: Heads) -> Result<Made> {
-        let runs = repeated(|| {
-            let fresh = model()?;
-            cold(|| {
-                let start = Instant::now();
-                let raw = fresh.generate_with(heads, self.role, &self.features, &self.map)?;
-                let gaussians = self.gaussians(&fresh, heads, &raw);
-                let time = start.elapsed().as_nanos() as f64;
-                Ok((time, gaussians, self.children(&fresh, heads)))
-            })
-        })?;
-        let time = Spread::of(runs.iter().map(|(time, ..)| *time)).high;
-        let (_, gaussians, children) = runs.into_iter().next_back().unwrap_or_default();
-        Ok(Made {
-            gaussians,
-            children,
-            time: [self.voxels.len() as f64, time],
-        })
-    }
-}
-
-/// What pictures of few and many Gaussians cost, of each of [`QUALITIES`], which take turns. An empty one costs the
-/// same in all, and none less than a coarser one.
-fn picture_costs(limits: &Limits, model: &Model, [few, many]: [(&Gaussians, &Level); 2]) -> Result<[PictureCost; 3]> {
-    let empty = Gaussians::default();
-    let pictures = [few.0, many.0].map(|gaussians| SIDES.map(|side| (gaussians, side)));
-    let mut rounds = [const { [const { Vec::new() }; 5] }; QUALITIES.len()];
-    let start = Instant::now();
-    for round in 0..REPEATS {
-        if round > 0 && start.elapsed() > 4 * PATIENCE {
-            break;
-        }
-        for ((_, quality), runs) in QUALITIES.into_iter().zip(&mut rounds) {
-            let pictures = pictures.as_flattened().iter().copied();
-            for ((gaussians, side), runs) in pictures.chain([(&empty, SIDES[1])]).zip(runs) {
-                runs.push(cold(|| {
-                    let start = Instant::now();
-                    picture(limits, model, gaussians, quality, side)?;
-                    Ok(start.elapsed().as_nanos() as f64)
-                })?);
-            }
+impl Scheduled {
+    /// Of the thread that asks; zeros where the system does not tell.
+    fn now() -> Scheduled {
+        let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
+        let mut numbers = text.split_ascii_whitespace().map(|n| n.parse().unwrap_or_default());
+        let mut next = || numbers.next().unwrap_or_default();
+        Scheduled {
+            ran: next(),
+            waited: next(),
         }
     }
-    let area = |level: &Level| faces(level.voxels.len() as f64, level.voxels.depth());
-    let empties = rounds.iter().flat_map(|runs| runs[4].iter().copied());
-    let mut times = PictureTimes {
-        gaussians: [few.0.len() as f64, many.0.len() as f64],
-        faces: [area(few.1), area(many.1)],
-        pixels: SIDES.map(|side| f64::from(side).powi(2)),
-        drawn: [[0.0; 2]; 2],
-        empty: Spread::of(empties).high,
+}
+
+/// The share of the time that these threads had a processor when they asked for one: with fewer other programs they would
+/// have taken so much of it.
+fn undisturbed(before: &[Scheduled], after: &[Scheduled]) -> f64 {
+    let sum = |of: fn(&Scheduled) -> u64| {
+        let [before, after] = [before, after].map(|all| all.iter().map(of).sum::<u64>());
+        after.saturating_sub(before) as f64
     };
-    Ok(rounds.map(|runs| {
-        for (drawn, runs) in times.drawn.as_flattened_mut().iter_mut().zip(runs) {
-            *drawn = drawn.max(Spread::of(runs).high);
-        }
-        PictureCost::from_times(&times)
-    }))
+    let (ran, waited) = (sum(|s| s.ran), sum(|s| s.waited));
+    if ran > 0.0 { ran / (ran + waited) } else { 1.0 }
 }
 
 fn camera(side: u32) -> Result<Camera> {
     Camera::orbit(20.0, 20.0, 2.6, 45.0, side, side)
 }
 
-/// A picture by a new renderer.
-fn picture(limits: &Limits, model: &Model, gaussians: &Gaussians, quality: Quality, side: u32) -> Result<Image> {
-    let renderer = Renderer::new().with_isa(model.isa()).with_limits(limits.clone());
-    renderer.with_quality(quality).render(gaussians, &camera(side)?)
+/// Nanoseconds of a picture by a new renderer.
+fn draw(sample: &Sample<'_>, gaussians: &Gaussians, side: u32) -> Result<f64> {
+    let camera = camera(side)?;
+    let (isa, limits) = (sample.isa, sample.limits);
+    let (time, _) = cold(|| {
+        let renderer = Renderer::new().with_isa(isa);
+        renderer.with_limits(limits.clone()).render(gaussians, &camera)
+    })?;
+    Ok(time)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_that_other_programs_took_is_taken_out() {
+        let of = |ran, waited| Scheduled { ran, waited };
+        let before = [of(100, 50), of(200, 0)];
+        assert_eq!(undisturbed(&before, &[of(200, 50), of(300, 0)]), 1.0);
+        assert_eq!(undisturbed(&before, &[of(200, 150), of(300, 100)]), 0.5);
+        assert_eq!(undisturbed(&[of(0, 0)], &[of(0, 0)]), 1.0, "where nothing is known");
+    }
 }

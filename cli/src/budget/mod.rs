@@ -1,40 +1,40 @@
-//! `--budget` and `--min-psnr`: level, precision and quality chosen by what they cost on this machine.
+//! `--budget`: level and heads chosen by what they cost on this machine.
 
 mod calibration;
 mod choice;
+mod costs;
 mod measure;
 
-use std::path::Path;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use b2p::container::Header;
-use b2p::gaussians::Heads;
-use b2p::latents::LatentDecoder;
+use b2p::container::{Header, version};
+use b2p::gaussians::HeadSet;
+use b2p::gaussians::learned::HeadsModel;
 use b2p::latents::network::Model;
-use b2p::{Limits, embedded};
+use b2p::{Decoder, Isa, Limits, embedded};
 use clap::Args;
 
-use self::calibration::Calibration;
+use self::calibration::{Calibration, CalibrationKey};
+use self::choice::Choice;
 pub use self::choice::Task;
-use self::choice::{Budget, CalibrationInput, Choice};
+use self::measure::{Sample, measure};
 use super::args::{DetailArg, ModelArg};
 use super::pipe::PIPE;
 use super::progress::Progress;
 use super::table::milliseconds;
-use super::{Failure, Result, load};
+use super::{Failure, Result, load, manners};
 
-/// A time or an accuracy instead of level, precision and quality.
+/// A time instead of level and heads.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Budget")]
 pub struct BudgetArgs {
-    /// Time that it may take, such as 33ms or 0.5s: level, precision and quality are chosen by what they cost on this
-    /// machine, which is measured at the first use and kept in the user's cache folder. Decoding: from the stream in
-    /// memory to Gaussians. Drawing: from Gaussians to each picture
-    #[arg(long, value_name = "TIME", value_parser = time, conflicts_with_all = ["level", "precision", "heads"])]
+    /// Time that it may take, such as 33ms or 0.5s: level and heads are those that look best among all that fit, by what
+    /// they cost on this machine, which is measured at the first use and kept in the user's cache folder. Decoding: from
+    /// the stream in memory to Gaussians. Drawing: from the stream in memory to a picture
+    #[arg(long, value_name = "TIME", value_parser = time, conflicts_with_all = ["level", "precision", "per_voxel"])]
     pub budget: Option<Duration>,
-    /// Least PSNR in dB against double precision, as it was for the sample
-    #[arg(long, value_name = "DB", value_parser = decibel, conflicts_with_all = ["level", "precision", "heads"])]
-    pub min_psnr: Option<f64>,
     /// Measure this machine again
     #[arg(long)]
     pub calibrate: bool,
@@ -43,29 +43,36 @@ pub struct BudgetArgs {
 impl BudgetArgs {
     /// Whether anything is asked for.
     pub fn is_given(&self) -> bool {
-        self.calibrate || self.budget.is_some() || self.min_psnr.is_some()
+        self.calibrate || self.budget.is_some()
     }
+}
+
+/// What a choice is made for.
+pub struct Request<'a> {
+    pub args: &'a BudgetArgs,
+    pub detail: &'a DetailArg,
+    pub model: &'a ModelArg,
+    pub limits: &'a Limits,
+    pub progress: &'a Progress,
 }
 
 /// A choice that was made, and what it was made for.
 pub struct Chosen {
-    pub choice: Choice,
-    budget: Budget,
+    choice: Choice,
+    time: Duration,
+    machine: Machine,
 }
 
-/// The choice for a file; none if nothing was asked for.
-pub fn choose(
-    args: &BudgetArgs,
-    model_arg: &ModelArg,
-    input: &Path,
-    task: Task,
-    limits: &Limits,
-    progress: &Progress,
-) -> Result<Option<Chosen>> {
-    let budget = Budget {
-        time: args.budget,
-        min_psnr: args.min_psnr,
-    };
+/// What is calibrated: this machine, with a model.
+struct Machine {
+    stream: Vec<u8>,
+    model: Vec<u8>,
+    version: u16,
+    isa: Isa,
+}
+
+/// The stream of a file that a budget is for; none if no budget is asked for.
+pub fn stream(args: &BudgetArgs, input: &Path, detail: &DetailArg, limits: &Limits) -> Result<Option<Vec<u8>>> {
     if !args.is_given() {
         return Ok(None);
     }
@@ -77,55 +84,115 @@ pub fn choose(
         let what = "a budget is for streams, this is a PLY";
         return Err(Failure(format!("{}: {what}", input.display())));
     }
-    let model = load::model(model_arg)?;
-    let fail = Failure::in_file(input);
-    let header = Header::parse(&stream, limits).map_err(&fail)?;
-    header.check_model(&model.id()).map_err(&fail)?;
-    // The sample is the program's own model's; another model is measured with the stream at hand.
-    let known = match model_arg.model {
-        None => embedded::SAMPLE,
-        Some(_) => &stream[..],
-    };
-    let calibration = calibration(args, &model, known, model_arg, limits, progress)?;
-    if budget == Budget::default() {
-        return Ok(None);
-    }
-    let decoder = LatentDecoder::new(&model).with_limits(limits.clone());
-    let levels = decoder.levels(&stream).map_err(&fail)?;
-    let choice = budget.choose(&calibration, &header, &levels, task).map_err(&fail)?;
-    Ok(Some(Chosen { choice, budget }))
+    load::whole_levels(input, stream, detail, limits).map(Some)
 }
 
-/// What was kept, or what is measured now and kept where that is possible.
-fn calibration(
-    args: &BudgetArgs,
-    model: &Model,
+/// The choice for a stream; none if only a calibration was asked for. No level finer than `finest` is taken.
+pub fn choose(
+    request: &Request,
+    input: &Path,
     stream: &[u8],
-    model_arg: &ModelArg,
-    limits: &Limits,
-    progress: &Progress,
-) -> Result<Calibration> {
-    let path = Calibration::path(model);
-    let kept = path.as_deref().filter(|_| !args.calibrate);
-    if let Some(kept) = kept.and_then(|path| Calibration::load(path, model)) {
-        return Ok(kept);
-    }
-    let file = match &model_arg.model {
-        Some(path) => load::bytes(path, limits)?,
-        None => embedded::MODEL.to_vec(),
-    };
-    let subject = CalibrationInput {
-        stream,
-        model: &|| Ok(Model::from_bytes(&file)?.with_isa(model.isa())),
+    finest: Option<u8>,
+    task: Task,
+) -> Result<Option<Chosen>> {
+    let Request {
+        args,
+        detail,
+        model,
         limits,
-    };
-    let calibration = Calibration::measure(&subject, &|step| progress.say(step))?;
-    match path.map(|path| calibration.save(&path)) {
-        None => super::manners::warn("no folder for the calibration is known, it is not kept"),
-        Some(Err(error)) => super::manners::warn(&format!("the calibration is not kept: {error}")),
-        Some(Ok(())) => {}
+        progress,
+    } = *request;
+    let fail = Failure::in_file(input);
+    let header = Header::parse(stream, limits).map_err(&fail)?;
+    let decoder = load::decoder(stream, detail, model, limits)?;
+    let mut levels = decoder.levels(stream).map_err(&fail)?;
+    levels.retain(|level| finest.is_none_or(|finest| *level <= finest));
+    let machine = Machine::new(stream, model, limits)?;
+    let calibration = machine.calibration(args.calibrate, limits, progress)?;
+    let Some(time) = args.budget else { return Ok(None) };
+    let all = choice::choices(&calibration, &header, &levels, detail.heads, task).map_err(&fail)?;
+    Ok(choice::choose(&all, time).map(|choice| Chosen { choice, time, machine }))
+}
+
+impl Machine {
+    fn new(stream: &[u8], model: &ModelArg, limits: &Limits) -> Result<Machine> {
+        let version = version(stream).unwrap_or_default();
+        let path = model.model.as_ref();
+        let file = |path: &PathBuf| load::bytes(path, limits);
+        let own = if version == 2 { embedded::MODEL } else { embedded::HEADS };
+        let sample = match (version, path) {
+            // The sample is the program's own model's; another model is measured with the stream at hand.
+            (2, Some(_)) => stream,
+            (2, None) => embedded::SAMPLE,
+            _ => embedded::SCENE,
+        };
+        Ok(Machine {
+            stream: sample.to_vec(),
+            model: path.map_or(Ok(own.to_vec()), file)?,
+            version,
+            isa: load::isa(model.isa.as_deref())?,
+        })
     }
-    Ok(calibration)
+
+    fn key(&self) -> CalibrationKey {
+        let mut hasher = DefaultHasher::new();
+        self.model.hash(&mut hasher);
+        // A stream of the user's is one of many, and as good as any other.
+        self.version.hash(&mut hasher);
+        CalibrationKey {
+            isa: self.isa.to_string(),
+            model: format!("{:016x}", hasher.finish()),
+        }
+    }
+
+    /// What was kept, or what is measured now and kept where that is possible.
+    fn calibration(&self, again: bool, limits: &Limits, progress: &Progress) -> Result<Calibration> {
+        let key = self.key();
+        let path = Calibration::path(&key);
+        let kept = path.as_deref().filter(|_| !again);
+        if let Some(kept) = kept.and_then(|path| Calibration::load(path, &key)) {
+            return Ok(kept);
+        }
+        let calibration = self.measure(key, limits, progress)?;
+        match path.map(|path| calibration.save(&path)) {
+            None => manners::warn("no folder for the calibration is known, it is not kept"),
+            Some(Err(error)) => manners::warn(&format!("the calibration is not kept: {error}")),
+            Some(Ok(())) => {}
+        }
+        Ok(calibration)
+    }
+
+    fn measure(&self, key: CalibrationKey, limits: &Limits, progress: &Progress) -> Result<Calibration> {
+        let decoder = || {
+            let decoder = Decoder::new().with_isa(self.isa).with_limits(limits.clone());
+            Ok(match self.version {
+                2 => decoder.with_model(Model::from_bytes(&self.model)?.with_isa(self.isa)),
+                _ => decoder.with_heads_model(HeadsModel::from_bytes(&self.model)?),
+            })
+        };
+        let has = |heads: HeadSet| -> Result<bool> {
+            Ok(match (self.version, heads.learned()) {
+                (2, None) => false,
+                (2, Some(heads)) => Model::from_bytes(&self.model)?.shape().heads().contains(&heads),
+                (_, None) => true,
+                (_, Some(heads)) => HeadsModel::from_bytes(&self.model)?.sets().any(|set| set.0 == heads),
+            })
+        };
+        let mut heads = Vec::new();
+        for set in HeadSet::ALL {
+            if has(set)? {
+                heads.push(set);
+            }
+        }
+        let sample = Sample {
+            stream: &self.stream,
+            decoder: &decoder,
+            heads: &heads,
+            isa: self.isa,
+            limits,
+        };
+        Ok(measure(&sample, key, &|step| progress.say(step))?)
+    }
 }
 
 impl Chosen {
@@ -133,63 +200,34 @@ impl Chosen {
     pub fn detail(&self) -> DetailArg {
         DetailArg {
             level: Some(self.choice.level),
-            heads: Some(self.choice.heads.into()),
+            heads: Some(self.choice.heads),
             per_voxel: None,
         }
     }
 
-    /// The model as chosen.
-    pub fn model(&self, model: &ModelArg) -> ModelArg {
-        ModelArg {
-            precision: Some(self.choice.precision.to_string()),
-            ..model.clone()
+    /// The choice in words, and whether the time was kept by something that took `took`. If that is far from what was
+    /// expected, the machine is measured again, unless that was done a moment ago.
+    pub fn describe(&self, took: Duration, limits: &Limits, progress: &Progress) -> Result<String> {
+        let mut text = self.words(took);
+        let path = Calibration::path(&self.machine.key());
+        if self.choice.is_off(took) && path.is_some_and(|path| Calibration::may_be_retaken(&path)) {
+            self.machine.calibration(true, limits, progress)?;
+            text += "budget: far from what was expected, the machine was measured again\n";
         }
+        Ok(text)
     }
 
-    /// The choice in words, and whether what it was made for was kept by something that took `took`.
-    pub fn describe(&self, task: Task, took: Duration) -> String {
+    fn words(&self, took: Duration) -> String {
         let Choice {
-            level,
-            heads,
-            precision,
-            quality,
-            expected,
-            psnr,
-            ..
+            level, heads, expected, ..
         } = self.choice;
-        let quality = match task {
-            Task::Decode => String::new(),
-            Task::Picture { .. } => format!(", {}", quality),
+        let [expected, took_ms, time] = [expected, took, self.time].map(milliseconds);
+        let told = match (self.choice.fits(self.time), took <= self.time) {
+            (false, _) => format!("no setting fits {time}; took {took_ms}"),
+            (true, true) => format!("kept: {took_ms} of {time}"),
+            (true, false) => format!("not kept: {took_ms} of {time}"),
         };
-        let heads = match heads {
-            Heads::Best => String::new(),
-            heads => format!("{heads} heads, "),
-        };
-        let mut text = format!(
-            "budget: level {level}, {heads}{precision}{quality}; expected {} and {psnr:.1} dB",
-            milliseconds(expected)
-        );
-        if let Some(least) = self.budget.min_psnr
-            && !self.choice.accurate
-        {
-            text += &format!(", not the {least} dB asked for");
-        }
-        if let Some(time) = self.budget.time
-            && !self.choice.in_time
-        {
-            text += &format!(", no setting fits {}", milliseconds(time));
-        }
-        text += &match self.budget.time {
-            None => format!("; took {}", milliseconds(took)),
-            Some(time) if took <= time => {
-                format!("; kept: {} of {}", milliseconds(took), milliseconds(time))
-            }
-            Some(_) if !self.choice.in_time => format!("; took {}", milliseconds(took)),
-            Some(time) => {
-                format!("; not kept: {} of {}", milliseconds(took), milliseconds(time))
-            }
-        };
-        text + "\n"
+        format!("budget: level {level}, {heads}, expected {expected}; {told}\n")
     }
 }
 
@@ -208,25 +246,16 @@ fn time(text: &str) -> std::result::Result<Duration, String> {
     }
 }
 
-fn decibel(text: &str) -> std::result::Result<f64, String> {
-    match text.parse() {
-        Ok(db) if (0.0..=200.0).contains(&db) => Ok(db),
-        _ => Err("expected a number from 0 to 200".into()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn times_and_accuracies_are_read_as_written_and_nonsense_is_refused_with_an_example() {
+    fn times_are_read_as_written_and_nonsense_is_refused_with_an_example() {
         assert_eq!(time("33ms"), Ok(Duration::from_millis(33)));
         assert_eq!(time("0.5s"), Ok(Duration::from_millis(500)));
-        assert_eq!(decibel("40"), Ok(40.0));
         for nonsense in ["", "33", "ms", "-1s", "0ms", "NaNs", "infs", "1e99s"] {
             assert!(time(nonsense).unwrap_err().contains("33ms"), "{nonsense}");
         }
-        assert!(decibel("NaN").is_err() && decibel("-1").is_err());
     }
 }

@@ -101,6 +101,11 @@ fn stray_points_leave_the_detail_and_can_be_dropped() {
         info["points"].as_f64().unwrap()
     };
     let alone = voxels("ball.ply", &[]);
+    let merged = succeeds(at, &["info", "x.b2p"]);
+    assert!(
+        merged.contains("made of 60 000 points in ") && merged.contains(" % merged"),
+        "{merged}"
+    );
     assert!(voxels("strays.ply", &[]) > 0.6 * alone);
     assert_eq!(voxels("strays.ply", &["--drop-outliers"]), alone);
 }
@@ -218,4 +223,31 @@ fn no_more_is_read_than_the_limits_allow() {
     );
     assert_eq!(big.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&big.stderr).contains("--max-memory"));
+}
+
+#[test]
+fn memory_for_voxels_counts_and_damage_in_readers_of_others_is_said_once() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    succeeds(at, &["convert", "ball.ply", "ball.e57"]);
+    succeeds(at, &["convert", "ball.ply", "ball.las"]);
+    let bytes = std::fs::metadata(at.join("ball.ply")).unwrap().len();
+    let points = read(&at.join("ball.ply")).positions.len() as u64;
+    // Enough to read the file, not to voxelise it.
+    let between = (bytes.max(49 * points) + b2p::cloud::voxelise_memory(points)) / 2;
+    let limited = ["encode", "ball.ply", "x.b2p", "--max-memory", &between.to_string()];
+    fails(at, &limited, &["a cloud and its voxels", "--max-memory"]);
+    let render = ["render", "ball.ply", "x.png", "--max-memory", &between.to_string()];
+    fails(at, &render, &["--max-memory"]);
+    for name in ["ball.e57", "ball.las"] {
+        let whole = std::fs::read(at.join(name)).unwrap();
+        for at_byte in (30..whole.len().min(3000)).step_by(97) {
+            let mut damaged = whole.clone();
+            damaged[at_byte] ^= 0x5a;
+            std::fs::write(at.join("damaged"), damaged).unwrap();
+            let output = b2p(at, &["info", "damaged"]);
+            let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert!(!errors.contains("panicked"), "{name} at {at_byte}: {errors}");
+        }
+    }
 }

@@ -1,5 +1,6 @@
 //! The program from outside: files in, files out, errors that say what is wrong, and nothing half-written.
 
+mod checking;
 mod clouds;
 #[path = "../../../tests/common/mod.rs"]
 mod common;
@@ -11,6 +12,9 @@ mod knobs;
 mod outputs;
 mod pictures;
 mod rate_control;
+#[path = "../../../tests/common/seal.rs"]
+mod seal;
+mod serving;
 mod transform;
 
 use std::io::Write;

@@ -81,22 +81,6 @@ fn a_learned_stream_has_no_points_and_no_surfels() {
 }
 
 #[test]
-fn a_budget_chooses_the_finest_level_in_time() {
-    let folder = folder_with_stream();
-    let at = folder.path();
-    let decode = ["decode", "ball.b2p", "-o", "x.ply", "--budget"];
-    let roomy = succeeds(at, &[&decode[..], &["100s"]].concat());
-    assert!(roomy.contains("budget: level 6; kept"), "{roomy}");
-    let tight = succeeds(at, &[&decode[..], &["0.001ms"]].concat());
-    assert!(tight.contains("budget: level 4, which was not expected"), "{tight}");
-    let render = ["render", "ball.b2p", "-o", "x.png", "--size", "48x32", "--budget"];
-    let drawn = succeeds(at, &[&render[..], &["100s"]].concat());
-    assert!(drawn.contains("budget: level 6; kept"), "{drawn}");
-    let psnr = ["decode", "ball.b2p", "-o", "y.ply", "--min-psnr", "40"];
-    fails(at, &psnr, &["--min-psnr", "version 2"]);
-}
-
-#[test]
 fn stages_are_timed() {
     let folder = folder_with_stream();
     let bench = ["bench", "ball.b2p", "--repeat", "1", "--json"];

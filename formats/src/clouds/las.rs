@@ -18,6 +18,11 @@ const PROJECTION: &str = "LASF_Projection";
 /// Version of the files that are written: the first with coordinate systems in WKT.
 const WRITTEN: Version = Version { major: 1, minor: 4 };
 
+/// Powers of ten that steps of coordinates have at most, and how far from a multiple of a step a coordinate may be, in
+/// steps: doubles of decimals are not exact.
+const COARSEST: i32 = 0;
+const NEAR: f64 = 1e-3;
+
 /// What of a header must be right before the file is read.
 struct Start {
     compressed: bool,
@@ -300,19 +305,92 @@ fn u64_at(bytes: &[u8], at: usize) -> u64 {
     u64::from(u32_at(bytes, at)) | u64::from(u32_at(bytes, at + 4)) << 32
 }
 
-/// Encodes a cloud as LAS 1.4, or LAZ if `compressed`. Coordinates are integers of `grid`: exact for the centres of its
-/// voxels.
+/// The integers that coordinates of a LAS file are.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Steps {
+    pub scale: f64,
+    offset: [f64; 3],
+    /// Whether the coordinates are such integers.
+    pub exact: bool,
+}
+
+impl Steps {
+    /// Those of the centres of a grid's voxels.
+    pub fn of_grid(grid: &Placement) -> Self {
+        Steps {
+            scale: grid.voxel_size,
+            offset: grid.origin.map(|x| x + grid.voxel_size / 2.0),
+            exact: true,
+        }
+    }
+
+    /// The coarsest power of ten of which all coordinates are multiples, else the finest for which there is room.
+    pub fn of(positions: &[[f64; 3]]) -> Self {
+        let ends = (0..3).map(|axis| {
+            let all = positions.iter().map(|p| p[axis]);
+            (
+                all.clone().fold(f64::INFINITY, f64::min),
+                all.fold(f64::NEG_INFINITY, f64::max),
+            )
+        });
+        let ends: Vec<(f64, f64)> = ends.collect();
+        let middle = |axis: usize| (ends[axis].0 / 2.0 + ends[axis].1 / 2.0).round();
+        let offset = [0, 1, 2].map(middle);
+        let reach = (0..3).map(|axis| (ends[axis].1 - offset[axis]).max(offset[axis] - ends[axis].0));
+        let reach = reach.fold(f64::MIN_POSITIVE, f64::max);
+        // 32 bits with their sign, and some to spare.
+        let finest = (reach / 2e9).log10().ceil().max(-300.0) as i32;
+        let is_exact = |power: i32| {
+            let per_unit = 10f64.powi(-power);
+            let near = |p: &[f64; 3]| {
+                (0..3).all(|axis| {
+                    let at = (p[axis] - offset[axis]) * per_unit;
+                    (at - at.round()).abs() <= NEAR
+                })
+            };
+            positions.iter().all(near)
+        };
+        let coarsest = finest.max(COARSEST);
+        let found = (finest..=coarsest).rev().find(|power| is_exact(*power));
+        Steps {
+            scale: 10f64.powi(found.unwrap_or(finest)),
+            offset,
+            exact: found.is_some(),
+        }
+    }
+}
+
+/// What a reader learns of a file that is written with these axes.
+pub(super) fn told(axes: &Axes) -> Axes {
+    let crs = if holds(&axes.crs) {
+        axes.crs.clone()
+    } else {
+        String::new()
+    };
+    Axes {
+        up: Some(Up::Z),
+        metres_per_unit: unit_of(&crs),
+        crs,
+    }
+}
+
+/// Whether a file can hold a coordinate system: WKT alone belongs into LAS 1.4; a record holds 65,535 bytes.
+fn holds(crs: &str) -> bool {
+    crs.contains('[') && crs.len() < usize::from(u16::MAX)
+}
+
+/// Encodes a cloud as LAS 1.4, or LAZ if `compressed`.
 ///
 /// # Errors
-/// [`Error::Usage`] if the points lie too far from the grid's origin.
-pub(super) fn write(cloud: &PointCloud, grid: &Placement, compressed: bool) -> Result<Vec<u8>> {
+/// [`Error::Usage`] if the points lie too far from each other for these steps.
+pub(super) fn write(cloud: &PointCloud, steps: &Steps, compressed: bool) -> Result<Vec<u8>> {
     let failed = |e: las::Error| Error::Usage(format!("these points cannot be written as LAS: {e}"));
     let mut builder = las::Builder::from((WRITTEN.major, WRITTEN.minor));
     builder.point_format = Format::new(7).map_err(failed)?;
     builder.point_format.is_compressed = compressed;
     let transform = |axis: usize| Transform {
-        scale: grid.voxel_size,
-        offset: grid.origin[axis] + grid.voxel_size / 2.0,
+        scale: steps.scale,
+        offset: steps.offset[axis],
     };
     builder.transforms = Vector {
         x: transform(0),
@@ -320,9 +398,8 @@ pub(super) fn write(cloud: &PointCloud, grid: &Placement, compressed: bool) -> R
         z: transform(2),
     };
     builder.generating_software = "b2p".into();
-    // WKT alone belongs into LAS 1.4; a record holds 65,535 bytes.
     let crs = &cloud.axes.crs;
-    if crs.contains('[') && crs.len() < usize::from(u16::MAX) {
+    if holds(crs) {
         builder.has_wkt_crs = true;
         builder.vlrs.push(Vlr {
             user_id: PROJECTION.into(),
@@ -388,7 +465,7 @@ mod tests {
     fn points_far_from_the_origin_come_back_exactly_from_las_and_laz() {
         let (cloud, grid) = cloud();
         for compressed in [false, true] {
-            let bytes = write(&cloud, &grid, compressed).unwrap();
+            let bytes = write(&cloud, &Steps::of_grid(&grid), compressed).unwrap();
             assert_eq!(describe(&bytes), if compressed { "LAZ 1.4" } else { "LAS 1.4" });
             let (read, notes) = parse(bytes).unwrap();
             assert_eq!(notes, []);
@@ -404,7 +481,7 @@ mod tests {
     fn a_file_cut_anywhere_is_an_error_and_nothing_panics() {
         let (cloud, grid) = cloud();
         for compressed in [false, true] {
-            let bytes = write(&cloud, &grid, compressed).unwrap();
+            let bytes = write(&cloud, &Steps::of_grid(&grid), compressed).unwrap();
             for length in (0..bytes.len()).step_by(7) {
                 assert!(
                     parse(bytes[..length].to_vec()).is_err(),
@@ -418,7 +495,7 @@ mod tests {
     fn counts_beyond_the_file_are_refused_before_memory_is_taken() {
         let (cloud, grid) = cloud();
         for compressed in [false, true] {
-            let bytes = write(&cloud, &grid, compressed).unwrap();
+            let bytes = write(&cloud, &Steps::of_grid(&grid), compressed).unwrap();
             for (at, value) in [
                 (247, 1u64 << 25),
                 (247, u64::MAX),
@@ -441,7 +518,7 @@ mod tests {
     #[test]
     fn eight_bit_colours_in_sixteen_bits_are_recognised() {
         let (cloud, grid) = cloud();
-        let mut bytes = write(&cloud, &grid, false).unwrap();
+        let mut bytes = write(&cloud, &Steps::of_grid(&grid), false).unwrap();
         let start = Start::parse(&bytes).unwrap();
         for record in bytes[start.offset..].chunks_exact_mut(start.record) {
             for channel in record[30..36].chunks_exact_mut(2) {
@@ -460,7 +537,7 @@ mod tests {
     fn intensities_serve_where_colours_were_never_set() {
         let (mut cloud, grid) = cloud();
         cloud.colours.fill([0; 3]);
-        let mut bytes = write(&cloud, &grid, false).unwrap();
+        let mut bytes = write(&cloud, &Steps::of_grid(&grid), false).unwrap();
         let start = Start::parse(&bytes).unwrap();
         for record in bytes[start.offset..].chunks_exact_mut(start.record) {
             record[12] = 200;

@@ -20,8 +20,9 @@ mod splats;
 pub(crate) mod text;
 mod write;
 
-pub use write::{Encoded, PointFormat, WriteOptions, encode};
+pub use write::{Encoded, PointFormat, WriteOptions, encode, encode_cloud};
 
+use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
@@ -126,9 +127,22 @@ pub fn describe(bytes: &[u8]) -> String {
     }
 }
 
+thread_local! {
+    static GUARDED: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Whether this thread runs a reader of another crate, a panic of which is caught and becomes an error in the file.
+/// Programs may ask in their panic hook, and say nothing.
+pub fn is_guarded() -> bool {
+    GUARDED.get()
+}
+
 /// Runs a reader of another crate. Should it panic on a damaged file, that is an error in the file.
-fn guarded<T>(name: &'static str, read: impl FnOnce() -> Result<T>) -> Result<T> {
-    catch_unwind(AssertUnwindSafe(read)).unwrap_or_else(|_| {
+pub(crate) fn guarded<T>(name: &'static str, read: impl FnOnce() -> Result<T>) -> Result<T> {
+    let outer = GUARDED.replace(true);
+    let done = catch_unwind(AssertUnwindSafe(read));
+    GUARDED.set(outer);
+    done.unwrap_or_else(|_| {
         let field = format!("{name} data");
         Err(malformed("the file", field, "damaged", "what its reader can read"))
     })
@@ -181,6 +195,16 @@ mod tests {
             let text = refusal(bytes);
             assert!(text.contains(what) && text.contains(advice), "{text}");
         }
+    }
+
+    #[test]
+    fn a_panic_of_another_crate_is_an_error_and_known_to_the_panic_hook() {
+        let panicked = guarded::<()>("X", || {
+            assert!(is_guarded());
+            std::panic::resume_unwind(Box::new("a panic without a message"))
+        });
+        assert!(panicked.unwrap_err().to_string().contains("X data is damaged"));
+        assert!(!is_guarded());
     }
 
     #[test]

@@ -2,10 +2,11 @@
 
 use std::path::Path;
 
-use b2p::cloud::{ColouredVoxels, PointCloud, axes_comments};
-use b2p::{Axes, Error, Placement, Result};
+use b2p::cloud::{ColouredVoxels, Coordinates, PointCloud, axes_comments};
+use b2p::{Axes, Error, Result, Up};
 
 use super::{e57, las, pcd};
+use crate::sidecar::Sidecar;
 
 /// How far rounding may move a point, in voxels, so that it still tells which voxel it is.
 const TOLERANCE: f64 = 0.005;
@@ -38,8 +39,10 @@ pub struct WriteOptions {
 pub struct Encoded {
     /// The file.
     pub bytes: Vec<u8>,
-    /// What belongs into a file beside it, as JSON: the offset of local coordinates, grid, axes and unit.
-    pub sidecar: Option<String>,
+    /// What belongs into a file beside it: the offset of local coordinates, and what the format has no place for.
+    pub sidecar: Option<Sidecar>,
+    /// What was changed, for the user.
+    pub notes: Vec<String>,
 }
 
 impl PointFormat {
@@ -75,26 +78,110 @@ impl std::str::FromStr for PointFormat {
 /// # Errors
 /// [`Error::Usage`] if the format cannot hold them.
 pub fn encode(voxels: &ColouredVoxels, axes: &Axes, format: PointFormat, options: WriteOptions) -> Result<Encoded> {
-    let grid = voxels.placement;
     let mut cloud = voxels.to_world();
     cloud.axes = axes.clone();
-    let local = options.local && matches!(format, PointFormat::Ply | PointFormat::Pcd | PointFormat::Xyz);
+    encode_cloud(cloud, format, options)
+}
+
+/// Encodes a cloud. Coordinates are exact, but for LAS and LAZ files, whose steps are a power of ten, or the voxels of the
+/// cloud's grid. Voxels with a grid are written at their places in the world, except to PLY files, which state the grid.
+///
+/// # Errors
+/// [`Error::Usage`] if the format cannot hold them.
+pub fn encode_cloud(mut cloud: PointCloud, format: PointFormat, options: WriteOptions) -> Result<Encoded> {
+    let mut notes = Vec::new();
+    if format != PointFormat::Ply && place_voxels(&mut cloud) {
+        notes.push("voxels are written as points at their centres in the world".into());
+    }
+    let grid = cloud
+        .hints
+        .placement
+        .filter(|_| cloud.hints.coordinates == Coordinates::World);
+    let in_world = grid.is_some() || cloud.hints.placement.is_none();
+    let local = options.local && in_world && matches!(format, PointFormat::Ply | PointFormat::Pcd | PointFormat::Xyz);
+    let mut offset = [0.0; 3];
     if local {
+        offset = grid.map_or_else(|| lowest(&cloud.positions).map(f64::floor), |grid| grid.origin);
         for position in &mut cloud.positions {
-            *position = std::array::from_fn(|axis| position[axis] - grid.origin[axis]);
+            *position = std::array::from_fn(|axis| position[axis] - offset[axis]);
         }
     }
-    let double = options.double || !fits_floats(&cloud, grid.voxel_size);
+    let double = options.double || !fits_floats(&cloud, grid.map_or(0.0, |grid| grid.voxel_size));
     let bytes = match format {
-        PointFormat::Ply => ply(&cloud, &grid, double, local),
-        PointFormat::Las => las::write(&cloud, &grid, false)?,
-        PointFormat::Laz => las::write(&cloud, &grid, true)?,
+        PointFormat::Ply => ply(&cloud, double, local.then_some(offset)),
+        PointFormat::Las | PointFormat::Laz => {
+            let steps = grid.map_or_else(|| las::Steps::of(&cloud.positions), |grid| las::Steps::of_grid(&grid));
+            if !steps.exact {
+                let size = steps.scale;
+                notes.push(format!(
+                    "coordinates are rounded to {size:e}, the finest step that LAS has room for"
+                ));
+            }
+            las::write(&cloud, &steps, format == PointFormat::Laz)?
+        }
         PointFormat::Pcd => pcd::write(&cloud, double),
         PointFormat::E57 => e57::write(&cloud)?,
         PointFormat::Xyz => xyz(&cloud),
     };
-    let sidecar = local.then(|| sidecar(&cloud, &grid));
-    Ok(Encoded { bytes, sidecar })
+    let lost = lost(&cloud.axes, format);
+    let sidecar = (local || !lost.is_empty()).then(|| Sidecar {
+        offset,
+        axes: if local { cloud.axes.clone() } else { lost },
+        bits: cloud.hints.bits.filter(|_| grid.is_some()),
+        grid,
+        turned_from: None,
+    });
+    Ok(Encoded { bytes, sidecar, notes })
+}
+
+/// Moves voxels to their places in the world. Whether there were any.
+fn place_voxels(cloud: &mut PointCloud) -> bool {
+    let (Some(grid), Coordinates::Voxels) = (cloud.hints.placement, cloud.hints.coordinates) else {
+        return false;
+    };
+    cloud.hints.coordinates = Coordinates::World;
+    if !cloud.positions.as_flattened().iter().all(|x| x.fract() == 0.0) {
+        // The comments are those of another cloud.
+        cloud.hints = Default::default();
+        return false;
+    }
+    for position in &mut cloud.positions {
+        *position = std::array::from_fn(|axis| grid.origin[axis] + grid.voxel_size * (position[axis] + 0.5));
+    }
+    true
+}
+
+fn lowest(positions: &[[f64; 3]]) -> [f64; 3] {
+    let least = |low: [f64; 3], p: &[f64; 3]| std::array::from_fn(|axis| low[axis].min(p[axis]));
+    positions
+        .iter()
+        .fold(positions.first().copied().unwrap_or_default(), least)
+}
+
+/// What readers of a file of this format would not learn from it.
+fn lost(axes: &Axes, format: PointFormat) -> Axes {
+    let crs = axes.crs.clone();
+    let told = match format {
+        PointFormat::Ply => return Axes::default(),
+        PointFormat::Pcd | PointFormat::Xyz => Axes::default(),
+        PointFormat::Las | PointFormat::Laz => las::told(axes),
+        PointFormat::E57 => Axes {
+            up: Some(Up::Z),
+            metres_per_unit: Some(1.0),
+            crs,
+        },
+    };
+    Axes {
+        up: axes.up.filter(|_| axes.up != told.up),
+        metres_per_unit: axes
+            .metres_per_unit
+            .filter(|_| axes.metres_per_unit != told.metres_per_unit),
+        crs: if told.crs == axes.crs {
+            String::new()
+        } else {
+            axes.crs.clone()
+        },
+    }
 }
 
 /// Whether floats are exact enough for these coordinates.
@@ -104,20 +191,21 @@ fn fits_floats(cloud: &PointCloud, voxel_size: f64) -> bool {
     cloud.positions.as_flattened().iter().all(fits)
 }
 
-fn ply(cloud: &PointCloud, grid: &Placement, double: bool, local: bool) -> Vec<u8> {
+fn ply(cloud: &PointCloud, double: bool, offset: Option<[f64; 3]>) -> Vec<u8> {
     let scalar = if double { "double" } else { "float" };
-    let [x, y, z] = grid.origin;
+    let hints = &cloud.hints;
     let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
-    if let Some(bits) = cloud.hints.bits {
+    if let Some(bits) = hints.bits {
         header += &format!("comment bits {bits}\n");
     }
-    header += &format!("comment unit {}\ncomment origin {x} {y} {z}\n", grid.voxel_size);
-    header += match local {
-        true => "comment coordinates local\n",
-        false => "comment coordinates world\n",
-    };
-    if local {
-        header += &format!("comment offset {x} {y} {z}\n");
+    if let Some(grid) = hints.placement {
+        let [x, y, z] = grid.origin;
+        header += &format!("comment unit {}\ncomment origin {x} {y} {z}\n", grid.voxel_size);
+    }
+    match offset {
+        Some([x, y, z]) => header += &format!("comment coordinates local\ncomment offset {x} {y} {z}\n"),
+        None if hints.coordinates == Coordinates::World => header += "comment coordinates world\n",
+        None => {}
     }
     header += &axes_comments(&cloud.axes);
     header += &format!("element vertex {}\n", cloud.positions.len());
@@ -140,37 +228,20 @@ fn ply(cloud: &PointCloud, grid: &Placement, double: bool, local: bool) -> Vec<u
 }
 
 fn xyz(cloud: &PointCloud) -> Vec<u8> {
+    use std::fmt::Write;
     let mut text = String::with_capacity(48 * cloud.positions.len());
     for ([x, y, z], [r, g, b]) in cloud.positions.iter().zip(&cloud.colours) {
-        text += &format!("{x} {y} {z} {r} {g} {b}\n");
+        // Strings take all that is written.
+        let _ = writeln!(text, "{x} {y} {z} {r} {g} {b}");
     }
     text.into_bytes()
-}
-
-fn sidecar(cloud: &PointCloud, grid: &Placement) -> String {
-    let axes = &cloud.axes;
-    let mut object = serde_json::json!({
-        "offset": grid.origin,
-        "voxel_size": grid.voxel_size,
-        "bits": cloud.hints.bits,
-    });
-    if let Some(up) = axes.up {
-        object["up"] = up.to_string().into();
-    }
-    if let Some(metres) = axes.metres_per_unit {
-        object["metres_per_unit"] = metres.into();
-    }
-    if !axes.crs.is_empty() {
-        object["crs"] = axes.crs.clone().into();
-    }
-    format!("{object:#}\n")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use b2p::Up;
-    use b2p::cloud::{ReadOptions, voxelise};
+    use b2p::Placement;
+    use b2p::cloud::{Hints, ReadOptions, voxelise};
     use b2p::geometry::{Voxels, morton};
 
     const ALL: [PointFormat; 6] = [
@@ -219,7 +290,13 @@ mod tests {
             for double in [false, true] {
                 let options = WriteOptions { double, local: false };
                 let encoded = encode(&voxels, &axes(), format, options).unwrap();
-                assert_eq!(encoded.sidecar, None);
+                // These two have no place for axes.
+                let lossy = matches!(format, PointFormat::Pcd | PointFormat::Xyz);
+                assert_eq!(
+                    encoded.sidecar.map(|beside| beside.axes),
+                    lossy.then(axes),
+                    "{format:?}"
+                );
                 let read = back(encoded.bytes);
                 assert_eq!(read.colours, voxels.colours, "{format:?}");
                 for (a, b) in read.positions.iter().zip(&world.positions) {
@@ -247,9 +324,9 @@ mod tests {
             "{header}"
         );
         assert_eq!(voxelise(&back(encoded.bytes), None).unwrap(), voxels);
-        let sidecar: serde_json::Value = serde_json::from_str(&encoded.sidecar.unwrap()).unwrap();
-        assert_eq!(sidecar["offset"][1], 4_000_000.0);
-        assert_eq!(sidecar["up"], "z");
+        let sidecar = encoded.sidecar.unwrap();
+        assert_eq!(sidecar.offset[1], 4_000_000.0);
+        assert_eq!(sidecar.axes.up, Some(Up::Z));
         let encoded = encode(&voxels, &axes(), PointFormat::Pcd, options).unwrap();
         assert!(back(encoded.bytes).positions[0][1] < 1.1);
     }
@@ -264,6 +341,56 @@ mod tests {
         assert!(!is_float(&voxels));
         voxels.placement.origin = [-0.5; 3];
         assert!(is_float(&voxels));
+    }
+
+    #[test]
+    fn points_without_a_grid_come_back_exactly_and_las_says_what_it_rounds() {
+        let mut cloud = PointCloud {
+            positions: (0..500)
+                .map(|i| [500_000.001 + f64::from(i) * 0.01, -0.125, f64::from(i % 7) * 1e-3])
+                .collect(),
+            colours: (0..500).map(|i| [i as u8, 9, 200]).collect(),
+            ..PointCloud::default()
+        };
+        for format in ALL {
+            let encoded = encode_cloud(cloud.clone(), format, WriteOptions::default()).unwrap();
+            assert_eq!((encoded.sidecar, encoded.notes), (None, Vec::new()), "{format:?}");
+            let read = back(encoded.bytes);
+            assert_eq!(read.colours, cloud.colours, "{format:?}");
+            for (a, b) in read.positions.iter().zip(&cloud.positions) {
+                let near = if format == PointFormat::Las || format == PointFormat::Laz {
+                    1e-9
+                } else {
+                    0.0
+                };
+                assert!((0..3).all(|i| (a[i] - b[i]).abs() <= near), "{format:?}: {a:?} {b:?}");
+            }
+        }
+        cloud.positions[7][1] = std::f64::consts::PI;
+        let encoded = encode_cloud(cloud, PointFormat::Las, WriteOptions::default()).unwrap();
+        assert!(encoded.notes[0].contains("rounded to 1e-8"), "{:?}", encoded.notes);
+    }
+
+    #[test]
+    fn voxels_with_a_grid_are_written_at_their_places_but_stay_voxels_in_ply() {
+        let cloud = PointCloud {
+            positions: vec![[0.0; 3], [3.0, 1.0, 2.0]],
+            colours: vec![[1, 2, 3], [4, 5, 6]],
+            hints: Hints {
+                bits: Some(5),
+                placement: Some(Placement {
+                    origin: [10.0, 20.0, 30.0],
+                    voxel_size: 2.0,
+                }),
+                coordinates: Coordinates::Voxels,
+            },
+            axes: Axes::default(),
+        };
+        let write = |format| encode_cloud(cloud.clone(), format, WriteOptions::default()).unwrap();
+        assert_eq!(back(write(PointFormat::Ply).bytes), cloud);
+        let las = write(PointFormat::Las);
+        assert!(las.notes[0].contains("centres in the world"));
+        assert_eq!(back(las.bytes).positions, [[11.0, 21.0, 31.0], [17.0, 23.0, 35.0]]);
     }
 
     #[test]

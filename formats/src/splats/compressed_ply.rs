@@ -15,6 +15,7 @@ use b2p::{Limits, Result};
 use super::builder::{self, Builder};
 use super::bytes::malformed;
 use super::rows::{Row, Rows};
+use super::up_comment;
 
 /// Gaussians of a block.
 const BLOCK: usize = 256;
@@ -150,7 +151,7 @@ pub(super) fn write(rows: &mut Rows, to: &mut dyn Write) -> io::Result<()> {
         .map(|first| Block::of(rows, first))
         .collect();
     let coefficients = 3 * rows.harmonics();
-    let told = comments(&rows.frame(), rows.gaussians.compensated, 0.0);
+    let told = comments(&rows.frame(), rows.gaussians.compensated, 0.0) + &up_comment(rows.up);
     let mut header = format!(
         "ply\nformat binary_little_endian 1.0\n{told}element chunk {}\n",
         blocks.len()

@@ -3,7 +3,7 @@
 use std::io::{Cursor, Read, Write};
 
 use b2p::gaussians::Frame;
-use b2p::{Limits, Placement, Result};
+use b2p::{Limits, Placement, Result, Up};
 use serde_json::{Value, json};
 use zip::ZipArchive;
 use zip::result::ZipError;
@@ -13,6 +13,9 @@ use super::bytes::malformed;
 
 /// Sizes of files that the headers of an archive need 64 bits for, and their own headers.
 const LARGE: u64 = (1 << 32) - (1 << 16);
+
+/// The name of the axis that pointed up.
+const TURNED: &str = "turned_from";
 
 /// A ZIP archive in memory.
 pub(super) struct Archive<'a> {
@@ -107,15 +110,24 @@ impl<'a> ArchiveWriter<'a> {
     }
 }
 
-/// The cube for formats that hold JSON, and its offset.
-pub(super) fn frame_to_json(frame: Frame) -> Value {
+/// The cube for formats that hold JSON, its offset, and the axis that pointed up before the scene was turned.
+pub(super) fn frame_to_json(frame: Frame, up: Option<Up>) -> Value {
     let Frame { bits, placement } = frame;
-    json!({
+    let mut value = json!({
         "bits": bits,
         "origin": placement.origin,
         "voxel_size": placement.voxel_size,
         "offset": frame.offset(),
-    })
+    });
+    if let Some(up) = up {
+        value[TURNED] = up.to_string().into();
+    }
+    value
+}
+
+/// The axis of [`frame_to_json`].
+pub(super) fn up_from_json(value: &Value) -> Option<Up> {
+    value[TURNED].as_str()?.parse().ok()
 }
 
 /// Reads what [`frame_to_json`] wrote: the cube and the offset. What does not parse is ignored.

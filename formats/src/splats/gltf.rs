@@ -179,7 +179,7 @@ fn document(rows: &Rows, attributes: &[Attribute], size: u64, uri: Option<String
         buffer["uri"] = uri.into();
     }
     let mut asset = json!({ "version": "2.0", "generator": concat!("b2p ", env!("CARGO_PKG_VERSION")) });
-    let details = json!({ "antialiased": rows.gaussians.compensated, "cube": frame_to_json(rows.frame()) });
+    let details = json!({ "antialiased": rows.gaussians.compensated, "cube": frame_to_json(rows.frame(), rows.up) });
     asset["extras"] = json!({ "b2p": details });
     json!({
         "asset": asset,

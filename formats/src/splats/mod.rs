@@ -13,8 +13,10 @@
 //!
 //! Coordinates are those of the world. A cube far from the origin is written less an offset ([`offset`]), which SPZ and
 //! `.splat` cannot state: [`Options::offset`] restores it.
-//! All formats but glTF share the axes of PLY files. glTF defines +y as up, where programs take −y of a PLY file as up,
-//! so [`write()`] turns by 180° about z, as other programs do.
+//! All formats but glTF share the axes of PLY files, of which viewers take −y as up; glTF defines +y as up. [`write()`]
+//! turns scenes to the axes of the format: those of which the axis that points up is known ([`Axes::Cloud`]), so that
+//! they stand upright, and between PLY and glTF by 180° about z, as other programs do. Files say which axis pointed up
+//! where they have a place for it, and [`read`] turns back.
 //!
 //! Only PLY states the [`blur`](Gaussians::blur); all other writers add it to the squared scales, which draws the same.
 //! Gaussians with a number that is not finite, or without a rotation, are left out and counted.
@@ -35,10 +37,15 @@ mod turn;
 use std::io::Write;
 use std::path::Path;
 
+use b2p::cloud::ply::Ply;
 use b2p::gaussians::{Gaussians, ply};
-use b2p::{Error, Limits, Result};
+use b2p::{Error, Limits, Result, Up};
 
 use rows::Rows;
+use turn::Turn;
+
+/// How a comment starts that says which axis pointed up before the scene was turned.
+const TURNED: &str = "b2p turned_from ";
 
 /// A file format of splats.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -162,6 +169,8 @@ pub enum Axes {
     Ply,
     /// Those of glTF, in which +y is up: turned by 180° about z.
     Gltf,
+    /// Those of a cloud of which this axis points up. Files are turned to the axes of their format, and say so.
+    Cloud(Up),
 }
 
 impl Axes {
@@ -177,24 +186,27 @@ impl Axes {
 /// What a file holds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Splats {
-    /// The Gaussians, in the axes of the file.
+    /// The Gaussians.
     pub gaussians: Gaussians,
-    /// The axes of the file.
+    /// Their axes: those of the cloud that was turned when the file was written, if it states them; else those of the file.
     pub axes: Axes,
     /// What was ignored or guessed, a sentence each.
     pub warnings: Vec<String>,
 }
 
 impl Splats {
-    /// The Gaussians in the axes of PLY files. Those that are turned lose the ones with numbers that are not finite.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if the cube that was fitted to them is not valid.
-    pub fn into_ply_axes(self) -> Result<Gaussians> {
-        match self.axes {
-            Axes::Ply => Ok(self.gaussians),
-            Axes::Gltf => Rows::new(&self.gaussians, true)?.to_gaussians(),
+    /// The Gaussians in the axes of their cloud if they are known, else in those of PLY files.
+    pub fn into_cloud(mut self) -> Gaussians {
+        if self.axes == Axes::Gltf {
+            turn(&mut self.gaussians, Axes::Gltf, Axes::Ply);
         }
+        self.gaussians
+    }
+}
+
+fn turn(gaussians: &mut Gaussians, from: Axes, to: Axes) {
+    if let Some(turn) = Turn::between(from, to) {
+        turn.apply(gaussians);
     }
 }
 
@@ -203,7 +215,13 @@ impl Splats {
 pub struct Options {
     /// What was subtracted from the coordinates of a file that does not state it (SPZ, `.splat`).
     pub offset: [f64; 3],
+    /// The axis that pointed up before the scene was turned to the axes of the format, for a file that does not state it
+    /// (SPZ, `.splat`, CSV).
+    pub turned_from: Option<Up>,
 }
+
+/// Gaussians, warnings, and the axis that pointed up before the scene was turned.
+type Parts = (Gaussians, Vec<String>, Option<Up>);
 
 /// Reads splats from a whole file in memory.
 ///
@@ -214,24 +232,67 @@ pub struct Options {
 /// [`Error::Malformed`], [`Error::Truncated`], [`Error::Unsupported`]; [`Error::LimitExceeded`] before more memory is
 /// reserved than `limits` allow.
 pub fn read(bytes: &[u8], format: Format, options: &Options, limits: &Limits) -> Result<Splats> {
-    let (gaussians, warnings) = match format {
+    let unsaid = |(gaussians, warnings)| (gaussians, warnings, options.turned_from);
+    let (mut gaussians, warnings, up) = match format {
         Format::Ply => {
             let (gaussians, notes) = ply::read(bytes, limits)?;
-            (gaussians, notes.warnings())
+            (gaussians, notes.warnings(), up_in_comments(bytes))
         }
-        Format::CompressedPly => compressed_ply::read(bytes, limits)?,
-        Format::Spz => spz::read(bytes, options.offset, limits)?,
+        Format::CompressedPly => {
+            let (gaussians, warnings) = compressed_ply::read(bytes, limits)?;
+            (gaussians, warnings, up_in_comments(bytes))
+        }
+        Format::Spz => unsaid(spz::read(bytes, options.offset, limits)?),
         Format::Sog => sog::read(bytes, limits)?,
-        Format::Splat => splat::read(bytes, options.offset, limits)?,
+        Format::Splat => unsaid(splat::read(bytes, options.offset, limits)?),
         Format::Glb | Format::Gltf => gltf::read(bytes, limits)?,
-        Format::Csv => csv::read(bytes, limits)?,
+        Format::Csv => unsaid(csv::read(bytes, limits)?),
         Format::Npz => npz::read(bytes, limits)?,
     };
+    let axes = up.map_or(Axes::of(format), Axes::Cloud);
+    turn(&mut gaussians, Axes::of(format), axes);
     Ok(Splats {
         gaussians,
-        axes: Axes::of(format),
+        axes,
         warnings,
     })
+}
+
+/// The comment of a PLY header that says which axis pointed up before the scene was turned.
+fn up_comment(up: Option<Up>) -> String {
+    up.map_or(String::new(), |up| format!("comment {TURNED} {up}\n"))
+}
+
+fn up_in_comments(bytes: &[u8]) -> Option<Up> {
+    let ply = Ply::open(bytes).ok()?;
+    let named = |comment: &String| comment.strip_prefix(TURNED)?.trim().parse().ok();
+    ply.header.comments.iter().find_map(named)
+}
+
+/// Writes a line after the second one, where a PLY header may have comments.
+struct WithLine<'a> {
+    to: &'a mut dyn Write,
+    line: String,
+    passed: usize,
+}
+
+impl Write for WithLine<'_> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        if self.passed == 2 {
+            return self.to.write(bytes);
+        }
+        let end = bytes.iter().position(|b| *b == b'\n').map_or(bytes.len(), |at| at + 1);
+        self.to.write_all(&bytes[..end])?;
+        self.passed += usize::from(bytes[..end].ends_with(b"\n"));
+        if self.passed == 2 {
+            self.to.write_all(self.line.as_bytes())?;
+        }
+        Ok(end)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.to.flush()
+    }
 }
 
 /// What [`write()`] subtracts from the coordinates in a file of this format, in the axes of the file. Zeros for formats
@@ -239,12 +300,14 @@ pub fn read(bytes: &[u8], format: Format, options: &Options, limits: &Limits) ->
 pub fn offset(gaussians: &Gaussians, axes: Axes, format: Format) -> [f64; 3] {
     match format {
         Format::Csv | Format::Glb | Format::Gltf => [0.0; 3],
-        _ if axes == Axes::of(format) => gaussians.frame.offset(),
-        _ => rows::turned_frame(gaussians.frame).offset(),
+        _ => match Turn::between(axes, Axes::of(format)) {
+            Some(turn) => turn.frame(gaussians.frame).offset(),
+            None => gaussians.frame.offset(),
+        },
     }
 }
 
-/// Writes Gaussians whose coordinates have the axes `axes`. Returns what the format could not keep, a sentence each.
+/// Writes Gaussians whose coordinates have the axes `axes`, turned to those of the format. Returns what the format could not keep, a sentence each.
 /// `path` appears in error messages only.
 ///
 /// # Errors
@@ -257,24 +320,34 @@ pub fn write(
     to: &mut dyn Write,
     path: &Path,
 ) -> Result<Vec<String>> {
-    let turned = axes != Axes::of(format);
-    if format == Format::Ply && !turned {
-        return gaussians.write_ply(to, path).map(|()| Vec::new());
+    let turned = Turn::between(axes, Axes::of(format)).map(|turn| {
+        let mut turned = gaussians.clone();
+        turn.apply(&mut turned);
+        turned
+    });
+    let gaussians = turned.as_ref().unwrap_or(gaussians);
+    let up = match axes {
+        Axes::Cloud(up) => Some(up),
+        Axes::Ply | Axes::Gltf => None,
+    };
+    if format == Format::Ply {
+        let (line, passed) = (up_comment(up), 0);
+        let mut to = WithLine { to, line, passed };
+        return gaussians.write_ply(&mut to, path).map(|()| Vec::new());
     }
-    let mut rows = Rows::new(gaussians, turned)?;
+    let mut rows = Rows::new(gaussians, up)?;
     let io = |source| Error::Io {
         path: path.to_owned(),
         source,
     };
     match format {
-        Format::Ply => rows.to_gaussians()?.write_ply(to, path)?,
         Format::CompressedPly => compressed_ply::write(&mut rows, to).map_err(io)?,
         Format::Spz => spz::write(&mut rows, to, &io)?,
         Format::Sog => sog::write(&mut rows, to, &io)?,
         Format::Splat => splat::write(&mut rows, to).map_err(io)?,
         Format::Glb | Format::Gltf => gltf::write(&rows, format, to, &io)?,
         Format::Csv => csv::write(&rows, to).map_err(io)?,
-        Format::Npz => npz::write(&rows, to, &io)?,
+        Format::Ply | Format::Npz => npz::write(&rows, to, &io)?,
     }
     Ok(rows.warnings())
 }

@@ -2,14 +2,15 @@
 //!
 //! Of n Gaussians `positions` (n × 3), `scales` (n × 3, linear), `rotations` (n × 4: w, x, y, z), `opacities` (n, in
 //! [0, 1]), `colours` (n × 3, sRGB), and `harmonics` (n × k × 3) if there are any, all single precision; `offset` (3
-//! doubles), which is to be added to the positions; `antialiased` (one byte); and `cube`: bits, origin and voxel size
-//! (5 doubles).
+//! doubles), which is to be added to the positions; `antialiased` (one byte); `cube`: bits, origin and voxel size (5
+//! doubles); and `turned_from` (3 doubles), the direction that pointed up before the scene was turned, if that is known.
 
 use std::io::{self, Write};
 
-use b2p::gaussians::{Frame, Gaussians};
-use b2p::{Error, Limits, Placement, Result};
+use b2p::gaussians::Frame;
+use b2p::{Error, Limits, Placement, Result, Up};
 
+use super::Parts;
 use super::builder::{self, Builder};
 use super::bytes::{Bytes, malformed};
 use super::details::{Archive, ArchiveWriter};
@@ -18,6 +19,7 @@ use super::rows::{Row, Rows};
 const MAGIC: &[u8] = b"\x93NUMPY";
 /// Headers are padded to multiples of this.
 const ALIGN: usize = 64;
+const UPS: [Up; 6] = [Up::X, Up::MinusX, Up::Y, Up::MinusY, Up::Z, Up::MinusZ];
 
 /// An array of numbers.
 struct Array {
@@ -97,7 +99,7 @@ fn value_of<'t>(header: &'t str, key: &str) -> Option<&'t str> {
     Some(rest[..end].trim())
 }
 
-pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Vec<String>)> {
+pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<Parts> {
     let mut archive = Archive::open(bytes, limits)?;
     let mut get = |name: &'static str, count: Option<u64>, widths: &[u64]| -> Result<Array> {
         let array = Array::read(name, archive.need(&format!("{name}.npy"))?)?;
@@ -124,6 +126,7 @@ pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Vec<Stri
     let harmonics = array("harmonics", optional("harmonics")?)?;
     let offset = array("offset", optional("offset")?)?;
     let cube = array("cube", optional("cube")?)?;
+    let up = array("turned_from", optional("turned_from")?)?;
     let antialiased = optional("antialiased")?;
 
     let each = match &harmonics {
@@ -166,7 +169,12 @@ pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Vec<Stri
             voxel_size: cube.get(4),
         },
     });
-    Ok((builder.finish(frame.filter(Frame::is_valid)), Vec::new()))
+    let up = up.filter(|up| up.shape == [3]);
+    let up = up.and_then(|up| {
+        UPS.into_iter()
+            .find(|known| (0..3).all(|k| up.get(k) == direction(*known)[k]))
+    });
+    Ok((builder.finish(frame.filter(Frame::is_valid)), Vec::new(), up))
 }
 
 pub(super) fn write(rows: &Rows, to: &mut dyn Write, io: &dyn Fn(io::Error) -> Error) -> Result<()> {
@@ -205,10 +213,21 @@ fn write_archive(rows: &Rows, to: &mut dyn Write) -> io::Result<()> {
     let Frame { bits, placement } = rows.frame();
     let [x, y, z] = placement.origin;
     doubles("cube", &[f64::from(bits), x, y, z, placement.voxel_size])?;
+    if let Some(up) = rows.up {
+        doubles("turned_from", &direction(up))?;
+    }
     let to = archive.start("antialiased.npy", 0)?;
     to.write_all(&header("|b1", &[]))?;
     to.write_all(&[u8::from(rows.gaussians.compensated)])?;
     archive.finish()
+}
+
+/// The unit vector of an axis.
+fn direction(up: Up) -> [f64; 3] {
+    let (axis, negative) = up.axis();
+    let mut direction = [0.0; 3];
+    direction[axis] = if negative { -1.0 } else { 1.0 };
+    direction
 }
 
 /// The header of a `.npy` file.

@@ -1,11 +1,10 @@
 //! Gaussians as rows of numbers in world units, as all writers but that of PLY take them.
 
 use b2p::gaussians::{Frame, Gaussians, Harmonics};
-use b2p::{Error, Placement, Result};
+use b2p::{Error, Result, Up};
 use rayon::prelude::*;
 
-use super::builder::Builder;
-use super::turn::{Turn, unit};
+use super::turn::unit;
 
 /// The spherical harmonic of degree 0: `1/(2√π)`.
 pub(super) const HARMONIC: f64 = 0.282_094_791_773_878_14;
@@ -50,7 +49,8 @@ impl Row {
 /// The Gaussians that have finite numbers and a rotation.
 pub(super) struct Rows<'a> {
     pub gaussians: &'a Gaussians,
-    turn: Option<Turn>,
+    /// The axis that pointed up before the scene was turned, for formats that can say so.
+    pub up: Option<Up>,
     frame: Frame,
     offset: [f64; 3],
     unit: f64,
@@ -59,7 +59,7 @@ pub(super) struct Rows<'a> {
 }
 
 impl<'a> Rows<'a> {
-    pub fn new(gaussians: &'a Gaussians, turned: bool) -> Result<Self> {
+    pub fn new(gaussians: &'a Gaussians, up: Option<Up>) -> Result<Self> {
         gaussians.check_lengths()?;
         if !gaussians.frame.is_valid() {
             return Err(Error::Usage(format!("{:?} is no cube", gaussians.frame)));
@@ -76,17 +76,13 @@ impl<'a> Rows<'a> {
             let what = "with numbers that are not finite, or without a rotation, are left out";
             warnings.push(format!("{lost} of {} Gaussians {what}", gaussians.len()));
         }
-        let frame = if turned {
-            turned_frame(gaussians.frame)
-        } else {
-            gaussians.frame
-        };
+        let frame = gaussians.frame;
         Ok(Rows {
             gaussians,
-            turn: turned.then(Turn::half_about_z),
+            up,
             offset: frame.offset(),
             frame,
-            unit: gaussians.frame.unit(),
+            unit: frame.unit(),
             order,
             warnings,
         })
@@ -126,10 +122,6 @@ impl<'a> Rows<'a> {
         let blur = f64::from(g.blur.max(0.0)) * self.unit * self.unit;
         let world = g.frame.placement.from_cube(g.frame.bits, g.position[i]);
         let rotation = unit(g.rotation[i].map(f64::from));
-        let (world, rotation) = match &self.turn {
-            Some(turn) => (turn.point(world), turn.rotation(rotation)),
-            None => (world, rotation),
-        };
         Row {
             position: std::array::from_fn(|k| world[k] - self.offset[k]),
             scale: g.scale[i].map(|s| {
@@ -151,11 +143,7 @@ impl<'a> Rows<'a> {
     pub fn coefficients(&self, i: usize) -> Vec<[f64; 3]> {
         let Harmonics { count, coefficients } = &self.gaussians.harmonics;
         let own = &coefficients[self.order[i] as usize * count..][..*count];
-        let mut own: Vec<[f64; 3]> = own.iter().map(|c| c.map(f64::from)).collect();
-        if let Some(turn) = &self.turn {
-            turn.coefficients(&mut own);
-        }
-        own
+        own.iter().map(|c| c.map(f64::from)).collect()
     }
 
     /// The lowest and highest coordinates; zeros if there are no rows.
@@ -183,30 +171,6 @@ impl<'a> Rows<'a> {
         let mut order: Vec<(u64, u32)> = self.order.par_iter().map(|&i| (key(i), i)).collect();
         order.par_sort_unstable();
         self.order = order.into_iter().map(|(_, i)| i).collect();
-    }
-
-    /// The rows as Gaussians.
-    pub fn to_gaussians(&self) -> Result<Gaussians> {
-        let mut builder = Builder::new(self.len() as u64, self.harmonics(), &b2p::Limits::unlimited())?;
-        builder.offset = self.offset();
-        builder.compensated = self.gaussians.compensated;
-        for i in 0..self.len() {
-            builder.push(self.row(i));
-            builder.push_coefficients(self.coefficients(i));
-        }
-        Ok(builder.finish(Some(self.frame)))
-    }
-}
-
-/// The cube after half a turn about z.
-pub(super) fn turned_frame(frame: Frame) -> Frame {
-    let side = 2.0 * frame.unit();
-    let Placement { origin, voxel_size } = frame.placement;
-    let [x, y, z] = origin;
-    let origin = [-x - side, -y - side, z];
-    Frame {
-        placement: Placement { origin, voxel_size },
-        ..frame
     }
 }
 

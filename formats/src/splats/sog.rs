@@ -11,13 +11,13 @@ mod pictures;
 
 use std::io::{self, Write};
 
-use b2p::gaussians::Gaussians;
 use b2p::{Error, Limits, Result};
 use serde_json::{Value, json};
 
+use super::Parts;
 use super::builder::{self, Builder};
 use super::bytes::{malformed, to_byte};
-use super::details::{Archive, ArchiveWriter, frame_from_json, frame_to_json, three};
+use super::details::{Archive, ArchiveWriter, frame_from_json, frame_to_json, three, up_from_json};
 use super::rows::{HARMONIC, Row, Rows};
 use codebook::Codebook;
 use pictures::{Picture, size_of_pictures};
@@ -33,7 +33,7 @@ const PER_ROW: usize = 64;
 /// The model of Gaussians that were trained with opacity compensation.
 const ANTIALIASED: &str = "antialiased";
 
-pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Vec<String>)> {
+pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<Parts> {
     let mut archive = Archive::open(bytes, limits)?;
     let text = archive.need("meta.json")?;
     limits.check_bytes(
@@ -121,7 +121,7 @@ pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Vec<Stri
             builder.push_coefficients(palette.coefficients(i));
         }
     }
-    Ok((builder.finish(frame), warnings))
+    Ok((builder.finish(frame), warnings, up_from_json(&meta["b2p"])))
 }
 
 /// A codebook of 256 numbers. The first may be null, as some early files have it.
@@ -223,7 +223,7 @@ pub(super) fn write(rows: &mut Rows, to: &mut dyn Write, io: &dyn Fn(io::Error) 
     if rows.gaussians.compensated {
         meta["model"] = ANTIALIASED.into();
     }
-    meta["b2p"] = frame_to_json(rows.frame());
+    meta["b2p"] = frame_to_json(rows.frame(), rows.up);
     let mut archive = ArchiveWriter::new(to);
     let mut add = |name: &str, bytes: &[u8]| archive.start(name, bytes.len() as u64)?.write_all(bytes);
     let mut picture = |name: &str, pixels: &[[u8; 4]]| {

@@ -49,12 +49,16 @@ fn written_in(gaussians: &Gaussians, axes: Axes, format: Format) -> (Vec<u8>, Ve
 }
 
 pub(super) fn read_back(bytes: &[u8], format: Format, offset: [f64; 3]) -> Splats {
-    read(bytes, format, &Options { offset }, &Limits::default()).unwrap()
+    let options = Options {
+        offset,
+        ..Options::default()
+    };
+    read(bytes, format, &options, &Limits::default()).unwrap()
 }
 
 /// The rows in the order of the format's files, in the world, with their harmonics.
 fn world(gaussians: &Gaussians, format: Format, sort: bool) -> Vec<(Row, Vec<[f64; 3]>)> {
-    let mut rows = Rows::new(gaussians, false).unwrap();
+    let mut rows = Rows::new(gaussians, None).unwrap();
     if sort && matches!(format, Format::CompressedPly | Format::Sog) {
         rows.sort_in_space();
     }
@@ -160,7 +164,7 @@ fn assert_alike(
 }
 
 fn bounds_of(gaussians: &Gaussians) -> (f64, f64) {
-    let (low, high) = Rows::new(gaussians, false).unwrap().bounds();
+    let (low, high) = Rows::new(gaussians, None).unwrap().bounds();
     let extent = (0..3).fold(0.0, |m: f64, k| m.max(high[k] - low[k]));
     (extent, low.iter().chain(&high).fold(0.0, |m: f64, x| m.max(x.abs())))
 }
@@ -359,7 +363,7 @@ fn gltf_is_turned_by_180_degrees_about_z_and_back() {
         }
     }
     // So does its cube, and all of it back.
-    let back = turned.clone().into_ply_axes().unwrap();
+    let back = turned.clone().into_cloud();
     let near = |a: [f64; 3], b: [f64; 3]| (0..3).all(|k| (a[k] - b[k]).abs() < 1e-9);
     assert!(near(back.frame.placement.origin, before.frame.placement.origin));
     assert!(
@@ -382,6 +386,49 @@ fn gltf_is_turned_by_180_degrees_about_z_and_back() {
             ..limits
         };
         assert_alike(&before, &after, format, &looser).unwrap();
+    }
+}
+
+#[test]
+fn a_cloud_stands_upright_in_every_format_and_comes_back_as_it_was() {
+    let before = sample(40, 15);
+    let (extent, farthest) = bounds_of(&before);
+    for up in [Up::X, Up::MinusX, Up::Y, Up::MinusY, Up::Z, Up::MinusZ] {
+        let (axis, negative) = up.axis();
+        for format in Format::all() {
+            let (bytes, _) = written_in(&before, Axes::Cloud(up), format);
+            let options = Options {
+                turned_from: Some(up),
+                ..Options::default()
+            };
+            let back = read(&bytes, format, &options, &Limits::default()).unwrap();
+            assert_eq!(back.axes, Axes::Cloud(up), "{format} {up}");
+            let limits = tolerance(format, extent, farthest);
+            let looser = Tolerance {
+                position: 4.0 * limits.position,
+                harmonics: 4.0 * limits.harmonics,
+                colour: 2.0 * limits.colour,
+                rotation: limits.rotation + 1e-6,
+                ..limits
+            };
+            // Some files are in the order of a curve, which depends on the axes.
+            let turned = |g: &Gaussians| {
+                let mut turned = g.clone();
+                turn(&mut turned, Axes::Cloud(up), Axes::of(format));
+                turned
+            };
+            assert_alike(&turned(&before), &turned(&back.gaussians), format, &looser).unwrap();
+            if format != Format::Csv {
+                continue;
+            }
+            // Other readers see the file's own axes: what was up is −y.
+            let file = read_back(&bytes, format, [0.0; 3]).gaussians;
+            let places = |g: &Gaussians, i: usize| g.frame.placement.from_cube(g.frame.bits, g.position[i]);
+            for i in 0..before.len() {
+                let height = places(&before, i)[axis] * if negative { -1.0 } else { 1.0 };
+                assert!((places(&file, i)[1] + height).abs() < 1e-5, "{up}");
+            }
+        }
     }
 }
 

@@ -1,5 +1,11 @@
 //! Rotation of whole scenes, with their view-dependent colours.
 
+use b2p::gaussians::{Frame, Gaussians};
+use b2p::{Placement, Up};
+use rayon::prelude::*;
+
+use super::Axes;
+
 /// Coefficients of degree 1, 2 and 3.
 const BANDS: [(usize, usize); 3] = [(0, 3), (3, 5), (8, 7)];
 /// Directions by which rotated harmonics are determined: more than coefficients of a degree.
@@ -26,9 +32,51 @@ impl Turn {
         }
     }
 
-    /// 180° about z.
-    pub fn half_about_z() -> Self {
-        Turn::new([0.0, 0.0, 0.0, 1.0])
+    /// From the axes `from` to the axes `to`. `None` if they are alike.
+    pub fn between(from: Axes, to: Axes) -> Option<Self> {
+        let (from, to) = (to_gltf(from), to_gltf(to));
+        // The inverse of a rotation is its transpose.
+        let product = |i: usize, j: usize| (0..3).map(|k| to[k][i] * from[k][j]).sum();
+        let matrix: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| product(i, j)));
+        let identity = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
+        (matrix != identity).then(|| Turn {
+            quaternion: quaternion(&matrix),
+            bands: BANDS.map(|band| rotated_band(band, &matrix)),
+            matrix,
+        })
+    }
+
+    /// The cube of a scene after a rotation that maps axes to axes.
+    pub fn frame(&self, frame: Frame) -> Frame {
+        let side = 2.0 * frame.unit();
+        let Placement { origin, voxel_size } = frame.placement;
+        let corners = [origin, origin.map(|x| x + side)].map(|corner| self.point(corner));
+        let origin = std::array::from_fn(|k| corners[0][k].min(corners[1][k]));
+        Frame {
+            placement: Placement { origin, voxel_size },
+            ..frame
+        }
+    }
+
+    /// Rotates a scene by a rotation that maps axes to axes: positions change their signs and places, exactly.
+    pub fn apply(&self, gaussians: &mut Gaussians) {
+        gaussians.frame = self.frame(gaussians.frame);
+        let positions = gaussians.position.par_iter_mut();
+        positions.for_each(|p| *p = self.point(p.map(f64::from)).map(|x| x as f32));
+        let rotations = gaussians.rotation.par_iter_mut();
+        rotations.for_each(|q| *q = self.rotation(q.map(f64::from)).map(|x| x as f32));
+        let count = gaussians.harmonics.count;
+        if count == 0 {
+            return;
+        }
+        let own = gaussians.harmonics.coefficients.par_chunks_exact_mut(count);
+        own.for_each(|own| {
+            let mut turned: Vec<[f64; 3]> = own.iter().map(|c| c.map(f64::from)).collect();
+            self.coefficients(&mut turned);
+            for (to, c) in own.iter_mut().zip(turned) {
+                *to = c.map(|x| x as f32);
+            }
+        });
     }
 
     /// A rotated point.
@@ -57,6 +105,36 @@ impl Turn {
             band.copy_from_slice(&rotated[..count]);
         }
     }
+}
+
+/// The rotation to the axes of glTF, row by row.
+fn to_gltf(axes: Axes) -> [[f64; 3]; 3] {
+    match axes {
+        Axes::Gltf => Up::Y.to_y(),
+        // 180° about z: what programs do to PLY files.
+        Axes::Ply | Axes::Cloud(Up::MinusY) => [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]],
+        Axes::Cloud(up) => up.to_y(),
+    }
+}
+
+/// The quaternion w, x, y, z of a rotation.
+fn quaternion(m: &[[f64; 3]; 3]) -> [f64; 4] {
+    // Four times the square of each component; the largest one divides.
+    let squares = [
+        1.0 + m[0][0] + m[1][1] + m[2][2],
+        1.0 + m[0][0] - m[1][1] - m[2][2],
+        1.0 - m[0][0] + m[1][1] - m[2][2],
+        1.0 - m[0][0] - m[1][1] + m[2][2],
+    ];
+    let largest = (1..4).fold(0, |best, k| if squares[k] > squares[best] { k } else { best });
+    let [a, b, c] = [m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]];
+    let [d, e, f] = [m[1][0] + m[0][1], m[0][2] + m[2][0], m[2][1] + m[1][2]];
+    unit(match largest {
+        0 => [squares[0], a, b, c],
+        1 => [a, squares[1], d, e],
+        2 => [b, d, squares[2], f],
+        _ => [c, e, f, squares[3]],
+    })
 }
 
 /// The quaternion of unit length.
@@ -192,9 +270,65 @@ mod tests {
         }
     }
 
+    const UPS: [Up; 6] = [Up::X, Up::MinusX, Up::Y, Up::MinusY, Up::Z, Up::MinusZ];
+
+    #[test]
+    fn the_axis_that_pointed_up_points_where_the_format_has_up() {
+        for up in UPS {
+            let (axis, negative) = up.axis();
+            let mut way = [0.0; 3];
+            way[axis] = if negative { -1.0 } else { 1.0 };
+            for (to, expected) in [(Axes::Ply, [0.0, -1.0, 0.0]), (Axes::Gltf, [0.0, 1.0, 0.0])] {
+                let turn = Turn::between(Axes::Cloud(up), to);
+                assert_eq!(
+                    turn.is_none(),
+                    way == expected && (up == Up::Y || up == Up::MinusY),
+                    "{up}"
+                );
+                let Some(turn) = turn else { continue };
+                assert_eq!(turn.point(way), expected, "{up}");
+                let back = Turn::between(to, Axes::Cloud(up)).unwrap();
+                assert_eq!(back.point(turn.point([1.0, 2.0, 3.0])), [1.0, 2.0, 3.0]);
+                // The quaternion is the same rotation as the matrix.
+                let from = matrix(turn.quaternion);
+                let same = from.as_flattened().iter().zip(turn.matrix.as_flattened());
+                assert!(same.into_iter().all(|(a, b)| (a - b).abs() < 1e-12), "{up}");
+            }
+        }
+        assert!(Turn::between(Axes::Cloud(Up::MinusY), Axes::Ply).is_none());
+    }
+
+    #[test]
+    fn a_cube_is_turned_with_its_scene() {
+        let mut g = Gaussians {
+            position: vec![[0.5, -0.25, 1.0]],
+            rotation: vec![[1.0, 0.0, 0.0, 0.0]],
+            frame: Frame {
+                bits: 3,
+                placement: Placement {
+                    origin: [10.0, 20.0, 30.0],
+                    voxel_size: 0.5,
+                },
+            },
+            ..Gaussians::default()
+        };
+        let place = |g: &Gaussians| g.frame.placement.from_cube(g.frame.bits, g.position[0]);
+        for up in UPS {
+            let Some(turn) = Turn::between(Axes::Cloud(up), Axes::Ply) else {
+                continue;
+            };
+            let expected = turn.point(place(&g));
+            let before = g.clone();
+            turn.apply(&mut g);
+            assert_eq!(place(&g), expected, "{up}");
+            Turn::between(Axes::Ply, Axes::Cloud(up)).unwrap().apply(&mut g);
+            assert_eq!((g.frame, &g.position), (before.frame, &before.position));
+        }
+    }
+
     #[test]
     fn half_a_turn_about_z_negates_x_and_y() {
-        let turn = Turn::half_about_z();
+        let turn = Turn::between(Axes::Ply, Axes::Gltf).unwrap();
         assert_eq!(turn.point([1.0, 2.0, 3.0]), [-1.0, -2.0, 3.0]);
         let mut coefficients = [[1.0; 3]; 15];
         turn.coefficients(&mut coefficients);

@@ -1,6 +1,7 @@
 //! The program's subcommands.
 
 pub mod capture;
+pub mod closeup;
 pub mod dataset;
 pub mod eval;
 pub mod occupancy;
@@ -28,6 +29,7 @@ pub struct Cli {
 enum Command {
     Voxelize(voxelize::Args),
     Capture(capture::Args),
+    Closeup(closeup::Args),
     Dataset(dataset::Args),
     Scene(scene::Args),
     Eval(eval::Args),
@@ -44,6 +46,7 @@ impl Cli {
         match self.command {
             Command::Voxelize(args) => args.run(),
             Command::Capture(args) => args.run(),
+            Command::Closeup(args) => args.run(),
             Command::Dataset(args) => args.run(),
             Command::Scene(args) => args.run(),
             Command::Eval(args) => args.run(),

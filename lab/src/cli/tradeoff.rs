@@ -3,21 +3,34 @@
 use std::path::{Path, PathBuf};
 
 use b2p::cloud::{ColouredVoxels, PointCloud, voxelise_closed};
-use b2p::latents::network::Model;
+use b2p::container::{MAGIC, version};
+use b2p::encoder::transform;
+use b2p::geometry::Voxels;
 use b2p::log::Log;
 use b2p::metrics::{Spread, Verdict};
-use b2p::{Limits, embedded, encoder};
+use b2p::{Limits, embedded};
 
 use crate::error::{LabError, Result};
-use crate::sample::write_bytes;
-use crate::tradeoff::{self, MeasuredInput, Options, Report, Row};
+use crate::procedural;
+use crate::sample::{Grid, Sampler, write_bytes};
+use crate::surface::Surface;
+use crate::tradeoff::{self, MeasuredInput, Options, Origin, Report, Row, TruthKind};
+
+/// Points that are drawn of a mesh, and the share of the cube that its longest side spans.
+const POINTS: u64 = 15_000_000;
+const FILL: f64 = 0.95;
+/// The scene that the built-in sample was coded from.
+const SCENE: &str = "procedural:scene";
 
 /// Measure what accuracy costs in time on this machine: a table, JSON, a plot, and a page with all of them
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Stream to measure with, or cloud to be coded first, whose own pictures are then compared with as well [default:
-    /// the sample that comes with the program]
+    /// Stream to measure with, or cloud (PLY) or mesh (.glb, procedural:NAME) to be coded first, whose own pictures are
+    /// then the truth [default: the sample that comes with the program, and the mesh that it was coded from]
     input: Option<PathBuf>,
+    /// Mesh behind the input, .glb or procedural:NAME: its pictures are the truth
+    #[arg(long, value_name = "MESH", requires = "input")]
+    mesh: Option<PathBuf>,
     /// Folder for tradeoff.html, tradeoff.json and tradeoff.svg
     #[arg(short, long, value_name = "DIR", default_value = "b2p-tradeoff")]
     output: PathBuf,
@@ -30,9 +43,16 @@ pub struct Args {
     /// Times that everything is measured; medians are reported
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeat: u32,
-    /// Model file [default: the one inside the program]
+    /// Model file: of a learned stream (version 2) the model, of others heads [default: the one inside the program]
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
+}
+
+/// A stream, and what it was made of.
+struct Input {
+    stream: Vec<u8>,
+    surface: Option<Surface>,
+    cloud: Option<ColouredVoxels>,
 }
 
 impl Args {
@@ -42,25 +62,20 @@ impl Args {
     /// [`LabError::Io`], and those of [`tradeoff::run`].
     pub fn run(self) -> Result<()> {
         let limits = Limits::default();
-        let stream = match &self.input {
-            Some(path) => read(path)?,
-            None => embedded::SAMPLE.to_vec(),
-        };
+        let mut input = self.input(&limits)?;
+        if let Some(mesh) = &self.mesh {
+            input.surface = Some(Surface::new(&super::load_mesh(mesh)?));
+        }
         let file = match &self.model {
             Some(path) => read(path)?,
-            None => embedded::MODEL.to_vec(),
+            None if version(&input.stream) == Some(2) => embedded::MODEL.to_vec(),
+            None => embedded::HEADS.to_vec(),
         };
-        let (stream, cloud) = match stream.starts_with(b"ply") {
-            true => {
-                let (stream, cloud) = coded(&stream, &file, &limits)?;
-                (stream, Some(cloud))
-            }
-            false => (stream, None),
-        };
+        let mesh = input.surface.as_ref().map(Origin::Mesh);
         let subject = MeasuredInput {
-            stream: &stream,
-            model: &|| Model::from_bytes(&file),
-            cloud: cloud.as_ref(),
+            stream: &input.stream,
+            model: &file,
+            origin: mesh.or(input.cloud.as_ref().map(Origin::Cloud)),
             limits: &limits,
         };
         let options = Options {
@@ -99,34 +114,86 @@ fn size(text: &str) -> Result<[u32; 2], String> {
     }
 }
 
-/// A point cloud's stream, and its voxels.
-fn coded(ply: &[u8], model: &[u8], limits: &Limits) -> b2p::Result<(Vec<u8>, ColouredVoxels)> {
-    let (cloud, _) = voxelise_closed(&PointCloud::from_ply(ply, limits)?)?;
-    let (model, log) = (Model::from_bytes(model)?, &Log::default());
-    let coded = encoder::encode(&cloud, &model, &encoder::Options::default(), log)?;
-    Ok((coded.bytes, cloud))
+impl Args {
+    fn input(&self, limits: &Limits) -> Result<Input> {
+        let Some(path) = &self.input else {
+            return Ok(Input {
+                stream: embedded::SCENE.to_vec(),
+                surface: Some(Surface::new(&super::load_mesh(Path::new(SCENE))?)),
+                cloud: None,
+            });
+        };
+        let is_mesh = path.extension().is_some_and(|ending| ending == "glb")
+            || path.to_str().is_some_and(|name| name.starts_with(procedural::PREFIX));
+        if is_mesh {
+            let surface = Surface::new(&super::load_mesh(path)?);
+            let cloud = sampled(&surface)?;
+            return Ok(Input {
+                stream: coded(&cloud)?,
+                surface: Some(surface),
+                cloud: None,
+            });
+        }
+        let bytes = read(path)?;
+        if bytes.starts_with(&MAGIC) {
+            return Ok(Input {
+                stream: bytes,
+                surface: None,
+                cloud: None,
+            });
+        }
+        let (cloud, _) = voxelise_closed(&PointCloud::from_ply(&bytes, limits)?)?;
+        Ok(Input {
+            stream: coded(&cloud)?,
+            surface: None,
+            cloud: Some(cloud),
+        })
+    }
+}
+
+/// A mesh as a cloud of 10 bits.
+fn sampled(surface: &Surface) -> Result<ColouredVoxels> {
+    let grid = Grid::fit(surface.bounds(), 10, FILL)?;
+    let sampled = Sampler::new(surface, grid, POINTS, 0)?.cloud(None);
+    Ok(ColouredVoxels {
+        voxels: Voxels::from_sorted(grid.bits, sampled.keys),
+        colours: sampled.rgb,
+        placement: grid.placement(),
+    })
+}
+
+/// The stream of a cloud, as the program codes it.
+fn coded(cloud: &ColouredVoxels) -> Result<Vec<u8>> {
+    let options = transform::Options::default();
+    Ok(transform::encode(cloud, &options, &Log::default())?.bytes)
 }
 
 fn summary(report: &Report) -> String {
     let [width, height] = report.size;
+    let truth = match report.truth {
+        Some(TruthKind::Mesh) => "pictures of the mesh",
+        Some(TruthKind::Cloud) => "pictures of the cloud, as surfels",
+        None => "not at hand",
+    };
     let mut text = format!(
         "{}, {} cores, {}; {} views of {width}×{height}, medians of {} repeats\n\
-         Accuracy against pictures in double precision: PSNR in dB, MS-SSIM, the worst pixel of 255.\n\
-         ~ cannot be told from the default's time.\n\n",
+         Computation: PSNR in dB, MS-SSIM and the worst pixel of 255, against the finest level in double precision.\n\
+         Truth: {truth}. ~ cannot be told from the default's time.\n\n",
         report.machine.processor, report.machine.cores, report.machine.isa, report.views, report.repeats,
     );
     let head = [
         "one knob at a time",
         "decode ms",
         "picture ms",
-        "PSNR",
+        "both ms",
+        "computation",
         "MS-SSIM",
         "worst",
         "MB at most",
     ];
     let mut rows = vec![head.map(String::from).to_vec()];
-    if report.ladder.iter().any(|row| row.cloud_psnr.is_some()) {
-        rows[0].push("PSNR, cloud".into());
+    if report.truth.is_some() {
+        rows[0].extend(["truth dB", "SSIMULACRA2"].map(String::from));
     }
     rows.extend(report.ladder.iter().map(line));
     text += &table(&rows);
@@ -179,12 +246,16 @@ fn line(row: &Row) -> Vec<String> {
         row.name(),
         time(row.decode, row.decode_verdict),
         time(row.picture, row.picture_verdict),
+        format!("{:.1}", row.total.median),
         row.psnr.map_or("equal".into(), |db| format!("{db:.1}")),
         row.ms_ssim.map_or("-".into(), |s| format!("{s:.5}")),
         format!("{:.2}", row.worst),
         (row.most_memory / 1_000_000).to_string(),
     ];
-    cells.extend(row.cloud_psnr.map(|db| format!("{db:.2}")));
+    if let Some(truth) = row.truth {
+        cells.push(format!("{:.2}", truth.psnr));
+        cells.push(truth.ssimulacra2.map_or("-".into(), |score| format!("{score:.1}")));
+    }
     cells
 }
 

@@ -8,8 +8,6 @@ use super::scenes::{dense_surface, interleaved, iridescent};
 use super::{MeasuredInput, Options};
 use b2p::Result;
 use b2p::gaussians::Gaussians;
-use b2p::latents::LatentDecoder;
-use b2p::log::Log;
 use b2p::metrics::pixels_apart;
 use b2p::metrics::{Spread, Verdict};
 use b2p::renderer::camera::Camera;
@@ -51,9 +49,7 @@ struct Case {
 }
 
 fn cases(subject: &MeasuredInput<'_>, options: &Options) -> Result<Vec<Case>> {
-    let model = (subject.model)()?;
-    let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
-    let stream = decoder.decode(subject.stream, None, &Log::default())?;
+    let stream = subject.decoder()?.decode(subject.stream)?;
     let side = options.size[0].min(options.size[1]);
     let stream_camera = || Camera::orbit(20.0, 20.0, 2.6, 45.0, side, side);
     let (plain, camera) = dense_surface(COUNT, 2.0, side)?;
@@ -135,7 +131,7 @@ fn cases(subject: &MeasuredInput<'_>, options: &Options) -> Result<Vec<Case>> {
 /// Every effect on a scene that calls for it and on one that doesn't, on and off in turns.
 ///
 /// # Errors
-/// Those of [`LatentDecoder::decode`](b2p::latents::LatentDecoder::decode) and
+/// Those of [`Decoder::decode`](b2p::Decoder::decode) and
 /// [`Renderer::render`](b2p::renderer::Renderer::render).
 pub fn effect_costs(subject: &MeasuredInput<'_>, options: &Options) -> Result<Vec<EffectCost>> {
     let cases = cases(subject, options)?;

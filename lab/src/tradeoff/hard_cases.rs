@@ -4,11 +4,12 @@ use b2p::Isa;
 use serde::Serialize;
 
 use super::MeasuredInput;
+use super::double;
 use super::scenes::{Random, Scene, hard_scenes};
 use super::setting::QUALITIES;
 use b2p::Result;
-use b2p::gaussians::Frame;
-use b2p::gaussians::Heads;
+use b2p::gaussians::learned::{HeadsModel, LevelInput};
+use b2p::gaussians::{Frame, Gaussians, Heads};
 use b2p::geometry::{Octree, Voxels, morton};
 use b2p::latents::activate;
 use b2p::latents::network::Model;
@@ -91,17 +92,87 @@ pub fn renderer_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
 /// Octree level of the voxels that generators are tried on.
 const LEVEL: u8 = 5;
 
-/// The model's generators on features that are hard to compute with, in every precision.
+/// The model's networks on inputs that are hard to compute with, in every precision.
 ///
 /// # Errors
-/// Those of [`Model::from_bytes`](b2p::latents::network::Model::from_bytes), of
-/// [`Model::generate`](b2p::latents::network::Model::generate), and of
-/// [`Renderer::render`](b2p::renderer::Renderer::render).
+/// Those of reading the model, and of generating Gaussians.
 pub fn network_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
-    let model = (subject.model)()?;
+    match subject.is_learned() {
+        true => latent_cases(subject),
+        false => heads_cases(subject),
+    }
+}
+
+/// A picture that adds no error of its own.
+fn picture(gaussians: &Gaussians) -> Result<Image> {
+    let camera = Camera::orbit(20.0, 20.0, 2.6, 45.0, 96, 96)?;
+    Ok(reference::render(gaussians, &camera, Background::WHITE, Cutoffs::NONE))
+}
+
+/// Colours of the voxels of a level and of the level above, and the quantisation step.
+type Coloured = (Vec<[u8; 3]>, Vec<[u8; 3]>, f32);
+
+/// Heads of streams of version 3 on colours that no object has.
+fn heads_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
+    let model = HeadsModel::from_bytes(subject.model)?;
+    let extremes = |count: usize| -> Vec<[u8; 3]> {
+        let mut random = Random(7);
+        let mut end = || if random.unit() < 0.5 { 0 } else { 255 };
+        (0..count).map(|_| [end(), end(), end()]).collect()
+    };
+    let grey = |count: usize| vec![[128; 3]; count];
+    let ball = ball(LEVEL, 9.0);
+    let lone = Voxels::new(LEVEL, vec![morton::encode([16, 16, 16])]);
+    type Colours<'a> = &'a dyn Fn(usize, usize) -> Coloured;
+    let cases: [(&str, &Voxels, Colours); 5] = [
+        ("one grey", &ball, &|n, m| (grey(n), grey(m), 1.0)),
+        ("random extremes", &ball, &|n, m| (extremes(n), extremes(m), 16.0)),
+        ("white below black", &ball, &|n, m| {
+            (vec![[255; 3]; n], vec![[0; 3]; m], 16.0)
+        }),
+        ("random extremes, the coarsest step", &ball, &|n, m| {
+            (extremes(n), extremes(m), 65_536.0)
+        }),
+        ("a single voxel", &lone, &|n, m| (extremes(n), grey(m), 16.0)),
+    ];
+    let mut all = Vec::new();
+    for set in model.sets() {
+        for (name, voxels, colours) in cases {
+            let octree = Octree::new(voxels.clone())?;
+            let (map, above) = (octree.kernel_map(LEVEL), octree.kernel_map(LEVEL - 1));
+            let (colours, colours_above, luma_step) = colours(map.len(), above.len());
+            let input = LevelInput {
+                octree: &octree,
+                level: LEVEL,
+                map: &map,
+                above: &above,
+                colours: &colours,
+                colours_above: &colours_above,
+                luma_step,
+                without: None,
+            };
+            let truth = picture(&double::generate(subject.model, set, &input, Frame::default())?)?;
+            let mut errors = Vec::new();
+            for precision in Precision::ALL {
+                if precision == Precision::Half && !Isa::detect().has_half() {
+                    continue;
+                }
+                let made = model.generate(Isa::detect(), precision, set, input, Frame::default())?;
+                errors.push(CaseError::between(precision.to_string(), &truth, &picture(&made)?));
+            }
+            let name = format!("{name}, {} heads, {} Gaussians a voxel", set.0, set.1);
+            all.push(HardCase { name, errors });
+        }
+    }
+    Ok(all)
+}
+
+/// Generators of a model of version 2 on features that no encoder makes.
+fn latent_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
+    let model = Model::from_bytes(subject.model)?;
     let mut others = Vec::new();
     for precision in Precision::ALL {
-        if let Ok(other) = (subject.model)()?.with_precision(precision) {
+        if let Ok(other) = Model::from_bytes(subject.model)?.with_precision(precision) {
             others.push((precision, other));
         }
     }
@@ -113,12 +184,9 @@ pub fn network_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
             let octree = Octree::new(voxels.clone())?;
             let map = octree.kernel_map(LEVEL);
             let g = features(voxels.len());
-            let picture = |raw: &[f32]| -> Result<Image> {
-                let frame = Frame::default();
-                let gaussians = activate(raw, voxels, head.children, model.shape(), frame);
-                let camera = Camera::orbit(20.0, 20.0, 2.6, 45.0, 96, 96)?;
-                // Drawing adds no error of its own.
-                Ok(reference::render(&gaussians, &camera, Background::WHITE, Cutoffs::NONE))
+            let picture = |raw: &[f32]| {
+                let gaussians = activate(raw, voxels, head.children, model.shape(), Frame::default());
+                picture(&gaussians)
             };
             let truth = picture(&model.generate_in_double(head.heads, head.role, &g, &map)?)?;
             let error = |(precision, model): &(Precision, Model)| {

@@ -1,19 +1,20 @@
 //! Accuracy against time: every setting that trades one for the other, measured on the same stream in one run.
 //!
-//! The truth is the finest level of the stream, its Gaussians generated in double precision and drawn by
-//! [`b2p::renderer::reference`], in double precision and without any cut-off. Against it stand, one knob at a time and
-//! in combination, the coarser levels, the precisions of the network, the qualities of the renderer, and smaller
-//! pictures, enlarged as a viewer does. Instructions and threads change time alone; that they hardly change the picture
-//! is shown by their rows.
+//! Accuracy has two senses here. The *computation* is accurate if it comes near to what the stream says: the Gaussians
+//! of its finest level, made by the best heads in double precision and drawn by [`b2p::renderer::reference`], in double
+//! precision and without any cut-off. The *truth* is the object itself: pictures of its mesh, or, if the mesh is not at
+//! hand, of the cloud that was coded, as surfels. What coding has lost is missing in the truth alone.
 //!
-//! Where the cloud that was coded is at hand, the same pictures are also held against pictures of the cloud
-//! ([`of_cloud`]): what a setting loses, beside what coding has lost.
+//! Against both stand, one knob at a time and in combination, the coarser levels, other heads, the precisions of the
+//! network, the qualities of the renderer, and smaller pictures, enlarged as a viewer does. Instructions and threads
+//! change time alone; that they hardly change the picture is shown by their rows.
 //!
 //! What decides the next bit of a stream is exact with every setting: none of the knobs bears on it.
 //!
 //! Settings take turns: each is run once in every repeat, so that whatever disturbs the machine disturbs all alike.
 //! Medians are given with their quartiles, and where those of two settings overlap, the two cannot be told apart.
 
+mod double;
 mod effects;
 mod hard_cases;
 mod page;
@@ -25,10 +26,15 @@ mod setting;
 mod truth;
 
 use b2p::cloud::ColouredVoxels;
+use b2p::container::version;
+use b2p::gaussians::learned::HeadsModel;
 use b2p::latents::network::Model;
 use b2p::limits::Limits;
 use b2p::renderer::camera::Camera;
-use b2p::{Error, Result};
+use b2p::{Decoder, Error, Result};
+use serde::Serialize;
+
+use crate::surface::Surface;
 
 pub use effects::EffectCost;
 pub use hard_cases::{BOUND, CaseError, HardCase};
@@ -36,7 +42,7 @@ pub use page::page;
 pub use plot::plot;
 pub use report::{Crop, Measured, Report, Row, STAGES};
 pub use setting::{Choices, Decode, Knob, QUALITIES, Setting, pareto_front};
-pub use truth::of_cloud;
+pub use truth::{of_cloud, of_mesh};
 
 use run::Run;
 
@@ -44,12 +50,58 @@ use run::Run;
 pub struct MeasuredInput<'a> {
     /// A stream.
     pub stream: &'a [u8],
-    /// Loads the model that it was coded with.
-    pub model: &'a dyn Fn() -> Result<Model>,
-    /// The cloud that was coded, if it is there: pictures are held against its own as well ([`of_cloud`]).
-    pub cloud: Option<&'a ColouredVoxels>,
+    /// The model file: of a stream of version 2 that it was coded with, of others heads.
+    pub model: &'a [u8],
+    /// What was coded, if it is there: pictures are held against its own as well.
+    pub origin: Option<Origin<'a>>,
     /// Limits of decoding and drawing.
     pub limits: &'a Limits,
+}
+
+/// What a stream was made of.
+#[derive(Clone, Copy)]
+pub enum Origin<'a> {
+    /// A mesh, in the world's space.
+    Mesh(&'a Surface),
+    /// A cloud.
+    Cloud(&'a ColouredVoxels),
+}
+
+/// What pictures are held against in the second sense.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TruthKind {
+    /// Pictures of the mesh.
+    Mesh,
+    /// Those of the cloud, as surfels.
+    Cloud,
+}
+
+impl MeasuredInput<'_> {
+    /// A decoder of the stream, with a freshly loaded model.
+    ///
+    /// # Errors
+    /// Those of reading the model.
+    pub fn decoder(&self) -> Result<Decoder> {
+        let decoder = Decoder::new().with_limits(self.limits.clone());
+        Ok(match self.is_learned() {
+            true => decoder.with_model(Model::from_bytes(self.model)?),
+            false => decoder.with_heads_model(HeadsModel::from_bytes(self.model)?),
+        })
+    }
+
+    /// Whether the stream has version 2.
+    pub fn is_learned(&self) -> bool {
+        version(self.stream) == Some(2)
+    }
+
+    /// What the truth is.
+    pub fn truth_kind(&self) -> Option<TruthKind> {
+        self.origin.map(|origin| match origin {
+            Origin::Mesh(_) => TruthKind::Mesh,
+            Origin::Cloud(_) => TruthKind::Cloud,
+        })
+    }
 }
 
 /// How much is measured.

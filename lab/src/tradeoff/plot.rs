@@ -13,9 +13,10 @@ const FOOT: f64 = 84.0;
 const LETTER: f64 = 6.4;
 
 /// A colour for each knob of the ladder, and what it stands for.
-const COLOURS: [(Knob, &str); 7] = [
+const COLOURS: [(Knob, &str); 8] = [
     (Knob::Default, "#111827"),
     (Knob::Level, "#1d4ed8"),
+    (Knob::Heads, "#a16207"),
     (Knob::Precision, "#7c3aed"),
     (Knob::Quality, "#c2410c"),
     (Knob::Size, "#15803d"),
@@ -23,27 +24,28 @@ const COLOURS: [(Knob, &str); 7] = [
     (Knob::Threads, "#be185d"),
 ];
 
-/// One of the two plots: a title, the time of a row, and whether the row is on its front.
+/// One of the two plots: a title, the accuracy of a row, infinite for equal pictures, and whether the row is on a front.
 struct Panel {
     title: &'static str,
-    time: fn(&Row) -> f64,
-    front: fn(&Row) -> bool,
+    accuracy: fn(&Row) -> Option<f64>,
+    has_front: bool,
 }
 
 const PANELS: [Panel; 2] = [
     Panel {
-        title: "From stream to picture",
-        time: |row| row.total.median,
-        front: |row| row.on_front,
+        title: "Against the truth",
+        accuracy: |row| row.truth.map(|truth| truth.psnr),
+        has_front: true,
     },
     Panel {
-        title: "Each further picture",
-        time: |row| row.picture.median,
-        front: |row| row.on_picture_front,
+        title: "Against the most accurate computation",
+        accuracy: |row| Some(row.decibel()),
+        has_front: false,
     },
 ];
 
-/// Both plots side by side: milliseconds on a logarithmic scale, and PSNR against the truth.
+/// Both plots side by side: milliseconds from stream to picture on a logarithmic scale, and PSNR in either sense. Without a
+/// truth the first is empty.
 pub fn plot(report: &Report) -> String {
     let (width, height) = (LEFT + 2.0 * WIDTH + GAP + 16.0, TOP + HEIGHT + FOOT);
     let mut svg = format!(
@@ -76,12 +78,19 @@ pub fn plot(report: &Report) -> String {
 }
 
 fn draw(panel: &Panel, report: &Report, left: f64) -> String {
-    let all = || report.ladder.iter().chain(&report.combinations);
-    let times = || all().map(|row| (panel.time)(row).max(1e-3));
-    let finite = || all().filter_map(|row| row.psnr);
+    let time = |row: &Row| row.total.median;
+    let all = || {
+        let all = report.ladder.iter().chain(&report.combinations);
+        all.filter(|row| (panel.accuracy)(row).is_some())
+    };
+    let times = || all().map(|row| time(row).max(1e-3));
+    let finite = || all().filter_map(|row| (panel.accuracy)(row).filter(|db| db.is_finite()));
     let bounds = |values: &mut dyn Iterator<Item = f64>| {
         values.fold((f64::INFINITY, 0.0f64), |(low, high), v| (low.min(v), high.max(v)))
     };
+    if all().next().is_none() {
+        return String::new();
+    }
     let (fastest, slowest) = bounds(&mut times());
     let (worst, best) = bounds(&mut finite());
     let (low, high) = (worst.min(best) - 3.0, best.max(1.0) + 4.0);
@@ -91,7 +100,7 @@ fn draw(panel: &Panel, report: &Report, left: f64) -> String {
     let y = |db: f64| TOP + HEIGHT - (db.min(high) - low) / (high - low) * HEIGHT;
 
     let mut svg = format!(
-        "<text x=\"{left}\" y=\"{:.1}\" font-weight=\"bold\">{}: ms, dB against double precision</text>\n\
+        "<text x=\"{left}\" y=\"{:.1}\" font-weight=\"bold\">{}: ms, PSNR in dB</text>\n\
          <rect x=\"{left}\" y=\"{TOP}\" width=\"{WIDTH}\" height=\"{HEIGHT}\" fill=\"none\" stroke=\"#d1d5db\"/>\n",
         TOP - 14.0,
         panel.title
@@ -103,7 +112,13 @@ fn draw(panel: &Panel, report: &Report, left: f64) -> String {
             TOP + HEIGHT + 16.0
         );
     }
-    let step = if high - low > 40.0 { 10 } else { 5 };
+    let step = if high - low > 40.0 {
+        10
+    } else if high - low > 15.0 {
+        5
+    } else {
+        2
+    };
     let from = (low / f64::from(step)).ceil() as i32 * step;
     for db in (from..=high as i32).step_by(step as usize) {
         svg += &format!(
@@ -113,18 +128,20 @@ fn draw(panel: &Panel, report: &Report, left: f64) -> String {
             y(db.into()) + 4.0
         );
     }
-    let at = |row: &Row| (x((panel.time)(row)), y(row.decibel()));
+    let accuracy = |row: &Row| (panel.accuracy)(row).unwrap_or_default();
+    let at = |row: &Row| (x(time(row)), y(accuracy(row)));
     let point = |row: &Row, radius: f64, colour: &str| {
         let (x, y) = at(row);
         format!(
             "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{radius}\" fill=\"{colour}\"><title>{}: {:.2} ms, {} dB</title></circle>\n",
             escaped(&row.name()),
-            (panel.time)(row),
-            decibel(row.psnr)
+            time(row),
+            decibel(Some(accuracy(row)).filter(|db| db.is_finite()))
         )
     };
-    let mut front: Vec<&Row> = report.combinations.iter().filter(|r| (panel.front)(r)).collect();
-    front.sort_by(|a, b| (panel.time)(a).total_cmp(&(panel.time)(b)));
+    let on_front = |row: &&Row| panel.has_front && row.on_front;
+    let mut front: Vec<&Row> = report.combinations.iter().filter(on_front).collect();
+    front.sort_by(|a, b| time(a).total_cmp(&time(b)));
     let path: Vec<String> = front
         .iter()
         .map(|row| format!("{:.1} {:.1}", at(row).0, at(row).1))
@@ -136,7 +153,7 @@ fn draw(panel: &Panel, report: &Report, left: f64) -> String {
         );
     }
     for row in &report.combinations {
-        svg += &point(row, if (panel.front)(row) { 3.5 } else { 2.5 }, "#9ca3af");
+        svg += &point(row, if on_front(&row) { 3.5 } else { 2.5 }, "#9ca3af");
     }
     // The default last, on top of what it coincides with; names keep out of each other's way.
     let mut taken: Vec<[f64; 3]> = Vec::new();

@@ -6,21 +6,22 @@ use super::effects::EffectCost;
 use super::hard_cases::HardCase;
 use super::run::Truth;
 use super::setting::{Knob, Setting, pareto_front};
-use super::{MeasuredInput, Options};
+use super::{MeasuredInput, Options, TruthKind};
 use b2p::Result;
 use b2p::container::Header;
-use b2p::gaussians::Heads;
+use b2p::gaussians::HeadSet;
 use b2p::metrics::Distance;
 use b2p::metrics::Machine;
 use b2p::metrics::{Spread, Verdict};
 use b2p::renderer::Image;
 
-/// The stages, four of decoding and four of drawing.
+/// The stages, four of decoding and four of drawing. Geometry includes kernel maps, but of a stream of version 3 not what
+/// is decoded beside the colours of the level above. Reconstruction is the colour filter, or the features of version 2.
 pub const STAGES: [&str; 8] = [
     "geometry",
-    "entropy",
-    "network",
-    "gaussians",
+    "colours",
+    "reconstruction",
+    "heads",
     "project",
     "bin",
     "sort",
@@ -38,16 +39,25 @@ pub struct Measured {
     pub picture: Spread,
     /// Both.
     pub total: Spread,
-    /// From what the pictures should be: the means of all views, and the worst pixel of all.
+    /// From the most accurate computation: the means of all views, and the worst pixel of all.
     pub distance: Distance,
-    /// PSNR in dB against the cloud's pictures, where there is a cloud.
-    pub from_cloud: Option<f64>,
+    /// From the truth, where it is at hand.
+    pub from_truth: Option<FromTruth>,
     /// The view that has the worst pixel.
     pub view: usize,
-    /// Bytes of memory that decoding takes at most: [`b2p::latents::LatentDecoder::memory`].
+    /// Bytes of memory that decoding takes at most: [`b2p::Decoder::memory`].
     pub memory: u64,
     /// The surroundings of the worst pixel.
     pub crop: Option<Crop>,
+}
+
+/// How near pictures come to the truth.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct FromTruth {
+    /// PSNR in dB.
+    pub psnr: f64,
+    /// SSIMULACRA2; `None` of pictures too small for it.
+    pub ssimulacra2: Option<f64>,
 }
 
 /// The surroundings of a pixel.
@@ -126,19 +136,19 @@ pub struct Row {
     pub decode_verdict: Verdict,
     /// [`Row::picture`] against the default's.
     pub picture_verdict: Verdict,
-    /// In dB against the truth; `None` (in JSON, null) for equal pictures.
+    /// In dB against the most accurate computation; `None` (in JSON, null) for equal pictures.
     pub psnr: Option<f64>,
-    /// In dB against pictures of the cloud that was coded, where that was at hand.
-    pub cloud_psnr: Option<f64>,
-    /// Multi-scale structural similarity; `None` of pictures too small for it.
+    /// Multi-scale structural similarity to it; `None` of pictures too small for it.
     pub ms_ssim: Option<f64>,
-    /// The largest difference of a channel in steps of eight bits.
+    /// Against the truth, where that was at hand.
+    pub truth: Option<FromTruth>,
+    /// The largest difference of a channel from the most accurate computation in steps of eight bits.
     pub worst: f64,
     /// View, column and row where it is.
     pub worst_at: [u32; 3],
     /// Bytes of memory that decoding takes at most, an upper bound from the stream's header.
     pub most_memory: u64,
-    /// Whether no combination decodes and draws a picture as well in less time.
+    /// Whether no combination decodes and draws a picture as well ([`Row::accuracy`]) in less time.
     pub on_front: bool,
     /// The same of the picture alone, once there are Gaussians.
     pub on_picture_front: bool,
@@ -159,7 +169,7 @@ impl Row {
             picture,
             total,
             distance,
-            from_cloud,
+            from_truth,
             view,
             memory,
             crop,
@@ -181,8 +191,8 @@ impl Row {
             decode_verdict: Verdict::Same,
             picture_verdict: Verdict::Same,
             psnr: Some(distance.psnr()).filter(|psnr| psnr.is_finite()),
-            cloud_psnr: from_cloud,
             ms_ssim: distance.ms_ssim,
+            truth: from_truth,
             worst: distance.worst,
             worst_at: [view as u32, x, y],
             most_memory: memory,
@@ -211,7 +221,7 @@ impl Row {
                     quality,
                     ..
                 } = self;
-                let heads = match self.heads == Heads::Best.to_string() {
+                let heads = match self.heads == HeadSet::Best.to_string() {
                     true => String::new(),
                     false => format!("{} heads, ", self.heads),
                 };
@@ -223,6 +233,14 @@ impl Row {
     /// [`Row::psnr`] as a number: infinite for equal pictures.
     pub fn decibel(&self) -> f64 {
         self.psnr.unwrap_or(f64::INFINITY)
+    }
+}
+
+impl Row {
+    /// What fronts are drawn by, in tenths of a dB: PSNR against the truth, or, without one, against the computation.
+    pub fn accuracy(&self) -> f64 {
+        let psnr = self.truth.map_or(self.decibel(), |truth| truth.psnr);
+        (psnr * 10.0).round() / 10.0
     }
 }
 
@@ -250,8 +268,10 @@ pub struct Report {
     pub views: u32,
     /// Times.
     pub repeats: u32,
-    /// Milliseconds that generating the truth's Gaussians took, and drawing one of its pictures; once each.
-    pub truth_ms: [f64; 2],
+    /// What the truth is, where it was at hand.
+    pub truth: Option<TruthKind>,
+    /// Milliseconds that generating Gaussians in double precision took, and drawing one picture of them; once each.
+    pub double_ms: [f64; 2],
     /// The default, then one knob at a time.
     pub ladder: Vec<Row>,
     /// Levels, heads, precisions, qualities and sizes: see [`super::Choices::combinations`].
@@ -280,7 +300,7 @@ impl Report {
             }
         }
         let points = |time: fn(&Row) -> f64| -> Vec<(f64, f64)> {
-            let point = |row: &Row| (time(row), row.decibel());
+            let point = |row: &Row| (time(row), row.accuracy());
             combinations.iter().map(point).collect()
         };
         let front = pareto_front(&points(|row| row.total.median));
@@ -303,7 +323,8 @@ impl Report {
             size: options.size,
             views: options.views,
             repeats: options.repeats,
-            truth_ms: [truth.generate, truth.draw],
+            truth: subject.truth_kind(),
+            double_ms: [truth.generate, truth.draw],
             ladder,
             combinations,
             renderer_cases: Vec::new(),

@@ -4,22 +4,23 @@ use std::time::Instant;
 
 use rayon::ThreadPool;
 
-use super::report::{Crop, Measured, STAGES};
+use super::report::{Crop, FromTruth, Measured, STAGES};
 use super::setting::{Choices, Decode, Setting};
-use super::truth::{in_double, of_cloud};
+use super::truth::{in_double, of_origin};
 use super::{MeasuredInput, Options};
+use crate::eval::metrics::Ssimulacra2;
+use crate::eval::picture::Picture;
 use b2p::container::Header;
-use b2p::gaussians::Gaussians;
-use b2p::gaussians::Heads;
-use b2p::latents::LatentDecoder;
+use b2p::gaussians::learned::HeadsModel;
+use b2p::gaussians::{Gaussians, HeadSet};
 use b2p::latents::network::Model;
 use b2p::layers::Precision;
 use b2p::log::{Log, Step};
 use b2p::metrics::Spread;
 use b2p::metrics::{Distance, pixels_apart, psnr, resized};
 use b2p::renderer::reference::{self, Cutoffs};
-use b2p::renderer::{Background, Image, Quality, Renderer};
-use b2p::{Error, Result};
+use b2p::renderer::{Background, Image, Renderer};
+use b2p::{Decoder, Error, Isa, Result};
 
 /// Half the side of the cut-out around a worst pixel.
 const CROP: u32 = 28;
@@ -43,7 +44,7 @@ struct Drawing {
     how: Setting,
     laps: Vec<Lap>,
     distance: Option<Distance>,
-    from_cloud: Option<f64>,
+    from_truth: Option<FromTruth>,
     view: usize,
     crop: Option<Crop>,
 }
@@ -52,7 +53,7 @@ struct Drawing {
 pub(super) struct Run<'a> {
     subject: &'a MeasuredInput<'a>,
     options: &'a Options,
-    models: Vec<(Decode, Model)>,
+    decoders: Vec<(Decode, Decoder)>,
     pools: Vec<(usize, ThreadPool)>,
     decodings: Vec<Decoding>,
     drawings: Vec<Drawing>,
@@ -60,7 +61,7 @@ pub(super) struct Run<'a> {
 }
 
 /// What Gaussians depend on.
-type Kind = (u8, Heads, Precision);
+type Kind = (u8, HeadSet, Precision);
 
 fn kind(how: &Decode) -> Kind {
     (how.level, how.heads, how.precision)
@@ -69,10 +70,16 @@ fn kind(how: &Decode) -> Kind {
 /// The pictures as they should be, and what they took, in milliseconds.
 pub(super) struct Truth {
     pub images: Vec<Image>,
-    /// Those of the cloud, where there is one.
-    pub cloud: Option<Vec<Image>>,
+    /// Those of the object, where it is at hand, with what compares others with them if they are large enough.
+    pub origin: Option<Vec<TrueView>>,
     pub generate: f64,
     pub draw: f64,
+}
+
+/// What a camera sees of the object.
+pub(super) struct TrueView {
+    image: Image,
+    ssimulacra2: Option<Ssimulacra2>,
 }
 
 fn milliseconds(since: Instant) -> f64 {
@@ -84,9 +91,46 @@ fn stage_of(step: &Step) -> usize {
     let first = step.name.split(' ').next().unwrap_or_default();
     match first {
         "geometry" | "kernel" => 0,
-        "latents" => 1,
-        "generate" | "activate" => 3,
+        "latents" | "colours" => 1,
+        "generate" | "activate" | "Gaussians" => 3,
         _ => 2,
+    }
+}
+
+/// Whether the model can be had in this precision here. `half` needs arithmetic in f16.
+fn has_precision(subject: &MeasuredInput<'_>, precision: Precision) -> Result<bool> {
+    Ok(match subject.is_learned() {
+        true => Model::from_bytes(subject.model)?.with_precision(precision).is_ok(),
+        false => precision != Precision::Half || Isa::detect().has_half(),
+    })
+}
+
+/// What decodes with this setting.
+fn decoder(subject: &MeasuredInput<'_>, how: Decode) -> Result<Decoder> {
+    let decoder = match subject.is_learned() {
+        true => {
+            let model = Model::from_bytes(subject.model)?.with_isa(how.isa);
+            subject.decoder()?.with_model(model.with_precision(how.precision)?)
+        }
+        false => subject.decoder()?.with_precision(how.precision),
+    };
+    let decoder = decoder.with_isa(how.isa).with_level(how.level);
+    Ok(decoder.with_heads(how.heads))
+}
+
+/// Means over all views; no SSIMULACRA2 of pictures too small for it.
+fn from_truth(views: &[TrueView], images: &[Image]) -> FromTruth {
+    let count = images.len() as f64;
+    let pairs = || views.iter().zip(images);
+    let squares: f64 = pairs().map(|(view, image)| pixels_apart(&view.image, image).0).sum();
+    let score = |(view, image): (&TrueView, &Image)| {
+        let own = view.ssimulacra2.as_ref()?;
+        own.score(&Picture::from(image)).ok()
+    };
+    let scores: Option<f64> = pairs().map(score).sum();
+    FromTruth {
+        psnr: psnr(squares / count),
+        ssimulacra2: scores.map(|sum| sum / count),
     }
 }
 
@@ -101,7 +145,7 @@ impl<'a> Run<'a> {
         let mut run = Run {
             subject,
             options,
-            models: Vec::new(),
+            decoders: Vec::new(),
             pools: Vec::new(),
             decodings: Vec::new(),
             drawings: Vec::new(),
@@ -113,7 +157,7 @@ impl<'a> Run<'a> {
                     how,
                     laps: Vec::new(),
                     distance: None,
-                    from_cloud: None,
+                    from_truth: None,
                     view: 0,
                     crop: None,
                 });
@@ -122,11 +166,9 @@ impl<'a> Run<'a> {
             if run.decodings.iter().any(|d| d.how == how) {
                 continue;
             }
-            let model = (subject.model)()?;
-            let model = model.with_isa(how.isa).with_precision(how.precision)?;
-            let decoder = LatentDecoder::new(&model).with_heads(how.heads)?;
+            let decoder = decoder(subject, how)?;
             let memory = decoder.memory(&header, how.level)?;
-            run.models.push((how, model));
+            run.decoders.push((how, decoder));
             run.decodings.push(Decoding {
                 how,
                 laps: Vec::new(),
@@ -146,21 +188,34 @@ impl<'a> Run<'a> {
     /// What there is to choose from for a stream.
     ///
     /// # Errors
-    /// Those of reading the model, and of [`LatentDecoder::levels`].
+    /// Those of reading the model, and of [`Decoder::levels`].
     pub fn choices(subject: &MeasuredInput<'_>) -> Result<Choices> {
-        let model = (subject.model)()?;
-        let decoder = LatentDecoder::new(&model).with_limits(subject.limits.clone());
-        let levels = decoder.levels(subject.stream)?;
-        let mut precisions = vec![model.precision()];
+        let levels = subject.decoder()?.levels(subject.stream)?;
+        let heads: Vec<HeadSet> = match subject.is_learned() {
+            true => Model::from_bytes(subject.model)?
+                .shape()
+                .heads()
+                .into_iter()
+                .map(HeadSet::from)
+                .collect(),
+            false => {
+                let model = HeadsModel::from_bytes(subject.model)?;
+                let has = |set: &HeadSet| {
+                    set.learned()
+                        .is_none_or(|own| model.sets().any(|(heads, _)| heads == own))
+                };
+                HeadSet::ALL.into_iter().filter(has).collect()
+            }
+        };
+        let mut precisions = Vec::new();
         for precision in Precision::ALL {
-            let other = precision != model.precision();
-            if other && (subject.model)()?.with_precision(precision).is_ok() {
+            if has_precision(subject, precision)? {
                 precisions.push(precision);
             }
         }
         Ok(Choices {
             levels,
-            heads: model.shape().heads(),
+            heads,
             precisions,
             threads: rayon::current_num_threads(),
         })
@@ -169,7 +224,7 @@ impl<'a> Run<'a> {
     /// Runs everything once in each repeat.
     ///
     /// # Errors
-    /// Those of [`LatentDecoder::decode`] and of [`Renderer::render_into`].
+    /// Those of [`Decoder::decode`] and of [`Renderer::render_into`].
     pub fn measure(&mut self, truth: &Truth, say: &dyn Fn(&str)) -> Result<()> {
         for repeat in 0..self.options.repeats {
             say(&format!("repeat {} of {}", repeat + 1, self.options.repeats));
@@ -205,17 +260,16 @@ impl<'a> Run<'a> {
     }
 
     fn decode(&self, how: Decode) -> Result<(Lap, Gaussians)> {
-        let mut models = self.models.iter();
-        let Some((_, model)) = models.find(|(other, _)| *other == how) else {
+        let mut decoders = self.decoders.iter();
+        let Some((_, decoder)) = decoders.find(|(other, _)| *other == how) else {
             return Err(Error::Usage("no model was loaded for this setting".into()));
         };
-        let MeasuredInput { stream, limits, .. } = self.subject;
+        let stream = self.subject.stream;
         self.pool(how.threads)?.install(|| {
             let log = Log::default();
-            let decoder = LatentDecoder::new(model).with_limits((*limits).clone());
-            let decoder = decoder.with_heads(how.heads)?;
+            let decoder = decoder.clone().with_log(&log);
             let start = Instant::now();
-            let gaussians = decoder.decode(stream, Some(how.level), &log)?;
+            let gaussians = decoder.decode(stream)?;
             let mut lap = Lap {
                 total: milliseconds(start),
                 ..Lap::default()
@@ -269,11 +323,7 @@ impl<'a> Run<'a> {
             false => resized(image, truth.width, truth.height),
         };
         let images: Vec<Image> = truth.images.iter().zip(&images).map(enlarged).collect();
-        let from_cloud = truth.cloud.as_ref().map(|cloud| {
-            let pairs = cloud.iter().zip(&images);
-            let sum: f64 = pairs.map(|(a, b)| pixels_apart(a, b).0).sum();
-            psnr(sum / images.len() as f64)
-        });
+        let from_truth = truth.origin.as_ref().map(|views| from_truth(views, &images));
         let each: Vec<Distance> = truth
             .images
             .iter()
@@ -287,7 +337,7 @@ impl<'a> Run<'a> {
         let ms_ssim = each.iter().all(|d| d.ms_ssim.is_some());
         let drawing = &mut self.drawings[i];
         drawing.view = view;
-        drawing.from_cloud = from_cloud;
+        drawing.from_truth = from_truth;
         drawing.distance = Some(Distance {
             mean_square: mean(&|d| d.mean_square),
             ms_ssim: ms_ssim.then(|| mean(&|d| d.ms_ssim.unwrap_or_default())),
@@ -300,12 +350,11 @@ impl<'a> Run<'a> {
     /// The pictures of the finest level, generated and drawn in double precision without any cut-off.
     ///
     /// # Errors
-    /// Those of [`LatentDecoder::exact`] and [`Model::generate_in_double`], and of drawing the cloud.
+    /// Those of [`in_double`] and [`of_origin`].
     pub fn truth(&self, choices: &Choices, say: &dyn Fn(&str)) -> Result<Truth> {
-        let model = (self.subject.model)()?;
         let level = choices.levels.last().copied().unwrap_or_default();
         say("generate Gaussians in double precision");
-        let (gaussians, generate) = in_double(self.subject, &model, level)?;
+        let (gaussians, generate) = in_double(self.subject, level)?;
         say("draw in double precision");
         let cameras = self.options.cameras(1)?;
         let start = Instant::now();
@@ -314,17 +363,15 @@ impl<'a> Run<'a> {
             .map(|camera| reference::render(&gaussians, camera, Background::WHITE, Cutoffs::NONE))
             .collect();
         let draw = milliseconds(start) / cameras.len() as f64;
-        let cloud = self.subject.cloud.map(|cloud| {
-            say("draw the cloud");
-            let gaussians = of_cloud(cloud);
-            let renderer = Renderer::new().with_isa(model.isa()).with_quality(Quality::Exact);
-            let mut renderer = renderer.with_limits(self.subject.limits.clone());
-            let mut draw = |camera| renderer.render(&gaussians, camera);
-            cameras.iter().map(&mut draw).collect::<Result<_, _>>()
-        });
+        say("draw the truth");
+        let true_view = |image: Image| TrueView {
+            ssimulacra2: Ssimulacra2::new(&Picture::from(&image)).ok(),
+            image,
+        };
+        let origin = of_origin(self.subject, &cameras)?;
         Ok(Truth {
             images,
-            cloud: cloud.transpose()?,
+            origin: origin.map(|all| all.into_iter().map(true_view).collect()),
             generate,
             draw,
         })
@@ -345,7 +392,7 @@ impl<'a> Run<'a> {
             picture: Spread::of(drawing.laps.iter().map(|lap| lap.total)),
             total: Spread::of(totals.map(|(a, b)| a.total + b.total)),
             distance: drawing.distance?,
-            from_cloud: drawing.from_cloud,
+            from_truth: drawing.from_truth,
             view: drawing.view,
             memory: decoding.memory,
             crop: drawing.crop.clone(),

@@ -3,7 +3,7 @@
 use b2p::Isa;
 use serde::Serialize;
 
-use b2p::gaussians::Heads;
+use b2p::gaussians::HeadSet;
 use b2p::layers::Precision;
 use b2p::renderer::Quality;
 
@@ -24,7 +24,7 @@ pub struct Decode {
     /// The octree level.
     pub level: u8,
     /// What generates Gaussians.
-    pub heads: Heads,
+    pub heads: HeadSet,
     /// What they are generated in.
     pub precision: Precision,
     /// Instructions.
@@ -83,6 +83,9 @@ pub const QUALITIES: [Quality; 5] = [
     Quality::Exact,
 ];
 
+/// Qualities to combine with other knobs.
+const COMBINED: [Quality; 2] = [Quality::Fast, Quality::Fine];
+
 /// Sizes to try, the reference's first.
 const SHRINKS: [u32; 3] = [1, 2, 4];
 
@@ -90,8 +93,8 @@ const SHRINKS: [u32; 3] = [1, 2, 4];
 pub struct Choices {
     /// Levels with Gaussians, the finest last.
     pub levels: Vec<u8>,
-    /// Heads that the model has, the default first.
-    pub heads: Vec<Heads>,
+    /// Heads that there are, the default first.
+    pub heads: Vec<HeadSet>,
     /// Precisions that the model has, the default first.
     pub precisions: Vec<Precision>,
     /// Threads that the caller has.
@@ -153,8 +156,8 @@ impl Choices {
         ladder
     }
 
-    /// All combinations of level, heads, precision, quality, and the two larger sizes; those of quick heads in the
-    /// default precision, as they are for who lacks time.
+    /// All combinations of level, heads, precision, [`COMBINED`] qualities, and the two larger sizes; those of other heads
+    /// than the best in the default precision, as they are for who lacks time.
     pub fn combinations(&self) -> Vec<Setting> {
         let Some(default) = self.default_setting() else {
             return Vec::new();
@@ -166,7 +169,7 @@ impl Choices {
         let generators: Vec<_> = generators.collect();
         for &level in &self.levels {
             for &(heads, precision) in &generators {
-                for quality in QUALITIES {
+                for quality in COMBINED {
                     all.extend(SHRINKS[..2].iter().map(|&shrink| Setting {
                         decode: Decode {
                             level,
@@ -201,7 +204,7 @@ mod tests {
     fn choices() -> Choices {
         Choices {
             levels: vec![8, 9],
-            heads: Heads::ALL.to_vec(),
+            heads: HeadSet::ALL.to_vec(),
             precisions: vec![Precision::Int16, Precision::F16],
             threads: 4,
         }
@@ -235,7 +238,7 @@ mod tests {
     fn combinations_are_all_different_and_hold_the_default() {
         let choices = choices();
         let all = choices.combinations();
-        assert_eq!(all.len(), 2 * 3 * QUALITIES.len() * 2);
+        assert_eq!(all.len(), 2 * 4 * COMBINED.len() * 2);
         assert!(all.contains(&choices.default_setting().unwrap()));
         for (i, a) in all.iter().enumerate() {
             assert!(!all[..i].contains(a));

@@ -80,3 +80,20 @@ fn the_newest_chunk_counts_and_damage_behind_the_header_is_no_error() {
     damaged[at] ^= 1;
     assert_eq!(axes(&damaged).unwrap(), Axes::default());
 }
+
+#[test]
+fn the_number_of_points_is_kept_with_and_without_axes_and_is_no_matter_to_older_readers() {
+    for stream in [sample(), super::transform::sample(), root()] {
+        assert_eq!(source_points(&stream).unwrap(), None);
+        for (said, points) in [(Axes::default(), 1u64), (known(), u64::from(u32::MAX))] {
+            let bytes = with_source(&stream, &said, Some(points)).unwrap();
+            assert!(bytes.len() - stream.len() <= source_bytes(&said, Some(points)));
+            assert_eq!(source_points(&bytes).unwrap().map(u64::from), Some(points));
+            // Readers of axes alone find them as before.
+            assert_eq!(axes(&bytes).unwrap(), said);
+            assert!(parse(&bytes).unwrap().damage().is_none());
+        }
+        assert_eq!(with_source(&stream, &Axes::default(), Some(1 << 32)).unwrap(), stream);
+        assert_eq!(source_points(&with_axes(&stream, &known()).unwrap()).unwrap(), None);
+    }
+}

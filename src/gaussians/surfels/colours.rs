@@ -1,4 +1,4 @@
-//! Colour gradients along the surface.
+//! Colour gradients along the surface (`docs/format.md`, clause 6.6.3).
 
 use super::discs::Disc;
 use crate::geometry::KernelMap;

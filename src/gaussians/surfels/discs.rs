@@ -1,4 +1,4 @@
-//! The disc of a voxel: centre, radius, thickness and orientation.
+//! The disc of a voxel: centre, radius, thickness and orientation (`docs/format.md`, clause 6.5).
 
 use super::lanes::{GROUP, Lane, axes, dot, lane};
 use super::moments::{CentredMoments, PAIRS};

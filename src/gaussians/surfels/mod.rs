@@ -1,4 +1,5 @@
-//! Surfels: opaque discs in closed form, from the voxels of a level and their colours. No network, no model file.
+//! Surfels: opaque discs in closed form, from the voxels of a level and their colours (`docs/format.md`, clause 6). No
+//! network, no model file.
 //!
 //! A voxel's normal is the eigenvector with the smallest eigenvalue of the covariance of its neighbourhood
 //! (`moments.rs`). The disc lies in the plane through the mean of the neighbourhood, which smooths the staircase of

@@ -1,4 +1,4 @@
-//! Moments of the voxel distribution around every voxel, in integers.
+//! Moments of the voxel distribution around every voxel, in integers (`docs/format.md`, clause 6.2).
 //!
 //! A neighbourhood consists of the ends of all walks of [`ROUNDS`] steps over occupied voxels, where a step leads to
 //! one of the 27 positions around a voxel. The weight of a voxel is the number of walks that end there. On a plane the

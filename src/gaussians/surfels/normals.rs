@@ -1,5 +1,5 @@
 //! Eigenvectors of symmetric 3×3 matrices by Jacobi rotations in IEEE f32: without trigonometry or branches, and with a
-//! fixed number of sweeps.
+//! fixed number of sweeps (`docs/format.md`, clause 6.4).
 
 use super::lanes::{GROUP, Lane, lane};
 

@@ -154,7 +154,8 @@ impl<'a> Decoder<'a> {
                 "length of the occupancy",
                 self.bytes.len(),
                 self.next,
-            ));
+            )
+            .breaks("4.2.3"));
         }
         if self.value != self.interval.low {
             return Err(Error::malformed(
@@ -163,7 +164,8 @@ impl<'a> Decoder<'a> {
                 "end of the occupancy",
                 format!("{:#010x}", self.value),
                 format!("{:#010x}", self.interval.low),
-            ));
+            )
+            .breaks("4.2.3"));
         }
         Ok(())
     }

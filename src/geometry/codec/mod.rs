@@ -130,7 +130,8 @@ pub fn decode_masks(
             "number of slices",
             encoded.len(),
             ranges.len(),
-        ));
+        )
+        .breaks("3.2.3"));
     }
     let tasks: Vec<_> = ranges.zip(encoded).collect();
     let decode = |(parents, slice): (Range<usize>, &Slice)| {
@@ -214,7 +215,7 @@ fn count(masks: &[u8]) -> usize {
 
 fn wrong_count(level: u8, parents: &Range<usize>, slice: &Slice, found: impl ToString, expected: String) -> Error {
     let at = format!("byte {}, level {level}, parents {parents:?}", slice.offset);
-    Error::malformed(Stage::Geometry, at, "number of voxels", found, expected)
+    Error::malformed(Stage::Geometry, at, "number of voxels", found, expected).breaks("4.1.3")
 }
 
 #[cfg(test)]

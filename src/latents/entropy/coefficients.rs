@@ -272,7 +272,7 @@ pub fn decode_coefficients(bytes: &[u8], parts: &mut [SlicePart<&mut [[i16; 3]]>
             let read = model.triple(&mut stack, present.clone(), [0; 3]);
             *triple = read.ok_or_else(|| {
                 let (field, found) = ("colour coefficient", "one of 16 bits or more");
-                Error::malformed(Stage::Entropy, at, field, found, "magnitudes of 15 bits")
+                Error::malformed(Stage::Entropy, at, field, found, "magnitudes of 15 bits").breaks("14.3.4")
             })?;
         }
     }

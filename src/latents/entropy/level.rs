@@ -93,7 +93,8 @@ fn expect_number(slices: usize, needed: usize, level: u8) -> Result<()> {
             "number of feature slices",
             slices,
             needed,
-        )),
+        )
+        .breaks("8.2.2")),
     }
 }
 

@@ -198,7 +198,7 @@ impl<'a> Reader<'a> {
             }
         };
         let expected = "a number of 16 bits";
-        i16::try_from(value).map_err(|_| malformed(self.at, "latent", value, expected))
+        i16::try_from(value).map_err(|_| malformed("10.3.4", self.at, "latent", value, expected))
     }
 
     /// Nothing may be left.
@@ -215,12 +215,12 @@ pub(super) fn expect_end(stack: Stack, at: &dyn Display) -> Result<()> {
     let (state, words) = stack.into_parts();
     if !words.is_empty() {
         let left = format!("{} bytes", words.len() * WORD_BYTES);
-        return Err(malformed(at, "rest after the last symbol", left, "none"));
+        return Err(malformed("10.3.5", at, "rest after the last symbol", left, "none"));
     }
     if state != END_STATE {
         let (state, end) = (format!("{state:#x}"), format!("{END_STATE:#x}"));
         let field = "coder state after the last symbol";
-        return Err(malformed(at, field, state, end));
+        return Err(malformed("10.3.5", at, field, state, end));
     }
     Ok(())
 }
@@ -229,12 +229,12 @@ pub(super) fn expect_end(stack: Stack, at: &dyn Display) -> Result<()> {
 pub(super) fn open(bytes: &[u8], at: &dyn Display) -> Result<Stack> {
     let Some(more) = bytes.len().checked_sub(LEAST_STATE_BYTES) else {
         let expected = format!("at least {LEAST_STATE_BYTES} bytes");
-        return Err(malformed(at, "length of the slice", bytes.len(), expected));
+        return Err(malformed("10.3.1", at, "length of the slice", bytes.len(), expected));
     };
     let (first, words) = bytes.split_at(LEAST_STATE_BYTES + more % WORD_BYTES);
     if first.last() == Some(&0) {
         let expected = "a first state in as few bytes as hold it";
-        return Err(malformed(at, "highest byte of the coder state", 0, expected));
+        return Err(malformed("10.3.1", at, "highest byte of the coder state", 0, expected));
     }
     let mut state = [0; 8];
     state[..first.len()].copy_from_slice(first);
@@ -264,15 +264,21 @@ fn pop_distance(stack: &mut Stack, at: &dyn Display) -> Result<(bool, i32)> {
         bits += 1;
         if bits > MAX_PREFIX {
             let expected = format!("at most {MAX_PREFIX}");
-            return Err(malformed(at, "ones before an escape's zero", bits, expected));
+            return Err(malformed("10.3.4", at, "ones before an escape's zero", bits, expected));
         }
     }
     let distance = (0..bits).fold(1, |distance, _| distance << 1 | i32::from(bit()));
     Ok((above, distance))
 }
 
-fn malformed(at: &dyn Display, field: &str, value: impl ToString, expected: impl ToString) -> Error {
-    Error::malformed(Stage::Entropy, at, field, value, expected)
+fn malformed(
+    clause: &'static str,
+    at: &dyn Display,
+    field: &str,
+    value: impl ToString,
+    expected: impl ToString,
+) -> Error {
+    Error::malformed(Stage::Entropy, at, field, value, expected).breaks(clause)
 }
 
 #[cfg(test)]

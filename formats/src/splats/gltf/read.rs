@@ -2,16 +2,16 @@
 
 use std::borrow::Cow;
 
-use b2p::gaussians::Gaussians;
 use b2p::{Error, Limits, Result};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
 use super::{BINARY_CHUNK, DEGREES, EXTENSION, JSON_CHUNK, MAGIC};
+use crate::splats::Parts;
 use crate::splats::builder::{self, Builder};
 use crate::splats::bytes::{Bytes, malformed};
-use crate::splats::details::{frame_from_json, three};
+use crate::splats::details::{frame_from_json, three, up_from_json};
 use crate::splats::rows::{HARMONIC, Row};
 use crate::splats::turn::{Turn, matrix, product, unit};
 
@@ -164,7 +164,7 @@ struct Part<'d> {
     harmonics: usize,
 }
 
-pub(in crate::splats) fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Vec<String>)> {
+pub(in crate::splats) fn read(bytes: &[u8], limits: &Limits) -> Result<Parts> {
     let document = Document::open(bytes, limits)?;
     let mut warnings = Vec::new();
     let parts = document.parts(&mut warnings)?;
@@ -186,7 +186,7 @@ pub(in crate::splats) fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussian
     for part in &parts {
         document.add(part, harmonics, &mut builder)?;
     }
-    Ok((builder.finish(frame), warnings))
+    Ok((builder.finish(frame), warnings, up_from_json(&details["cube"])))
 }
 
 impl<'a> Document<'a> {

@@ -1,3 +1,5 @@
+use b2p::gaussians::Gaussians;
+
 use super::*;
 use crate::splats::tests::{read_back, sample, written};
 use crate::splats::{Format, Options};

@@ -130,64 +130,75 @@ fn body<S: Simd, const VARIANT: u8>(simd: S, view: &View, cloud: Cloud, first: u
     tally
 }
 
-impl<S: Simd> Camera<S> {
-    /// Sees the first `count` of `group`, at most as many as there are lanes.
-    ///
-    /// The centre is transformed in double precision: the sum of a rotated position and a distant camera's translation
-    /// is the one place where digits are lost.
+/// Parameters of a group of Gaussians, one to a lane.
+struct Group<S: Simd> {
+    position: [S::F32; 3],
+    /// At most [`MAX_SCALE`].
+    scale: [S::F32; 3],
+    /// The columns of the rotation's matrix.
+    axes: [[S::F32; 3]; 3],
+    colour: [S::F32; 3],
+    /// At most 1.
+    opacity: S::F32,
+    /// Whether all parameters are finite.
+    finite: S::Mask,
+    /// Whether the quaternion is a rotation: not zero.
+    turned: S::Mask,
+}
+
+impl<S: Simd> Group<S> {
     #[inline(always)]
-    fn see<const VARIANT: u8>(&self, group: Cloud, count: usize, index: u32, tally: &mut Tally, out: &mut [Ellipse]) {
-        let simd = self.simd;
-        let (zero, one) = (S::F32::splat(simd, 0.0), S::F32::splat(simd, 1.0));
+    fn load(simd: S, group: Cloud) -> Self {
+        let one = S::F32::splat(simd, 1.0);
         let position = S::F32::load_deinterleaved3(simd, group.position);
         let scale = S::F32::load_deinterleaved3(simd, group.scale);
         let rotation = S::F32::load_deinterleaved4(simd, group.rotation);
         let colour = S::F32::load_deinterleaved3(simd, group.colour);
         let opacity = S::F32::load(simd, group.opacity);
-
-        // Zero times a number is zero exactly if the number is finite.
-        let mut products = opacity * zero;
-        for [x, y, z] in [position, scale, colour] {
-            products = x.mul_add(zero, y.mul_add(zero, z.mul_add(zero, products)));
-        }
-        for x in rotation {
-            products = x.mul_add(zero, products);
-        }
-        let finite = products.le(zero);
-
-        let (axes, turned) = rotation_matrix(simd, rotation);
-
-        let [px, py, pz] = three!(i => S::F64::from_f32(position[i]));
-        let seen: [S::F64; 3] = three!(k => {
-            let [rx, ry, rz] = self.rotation[k];
-            px.mul_add(rx, py.mul_add(ry, pz.mul_add(rz, self.translation[k])))
-        });
-        let ahead = self.near.lt(seen[2]);
-        let mut depth = seen[2].to_f32();
-        let inverse = S::F64::splat(simd, 1.0) / seen[2];
-
+        let ([px, py, pz], [sx, sy, sz], [r, g, b], [qw, qx, qy, qz]) = (position, scale, colour, rotation);
+        let numbers = [px, py, pz, sx, sy, sz, r, g, b, qw, qx, qy, qz, opacity];
         let limit = S::F32::splat(simd, MAX_SCALE);
-        let scale = three!(i => scale[i].abs().min(limit));
-        let (mut x, m1) = self.along::<VARIANT>(0, seen[0], inverse, &axes, scale);
-        let (mut y, m2) = self.along::<VARIANT>(1, seen[1], inverse, &axes, scale);
-        let own = if VARIANT & ORTHOGRAPHIC != 0 {
-            self.blur
-        } else {
-            self.blur * inverse * inverse
-        };
-        let blur = own.to_f32().max(self.pixel_blur);
+        let (axes, turned) = rotation_matrix(simd, rotation);
+        Group {
+            position,
+            scale: three!(i => scale[i].abs().min(limit)),
+            axes,
+            colour,
+            opacity: opacity.min(one),
+            finite: all_finite(simd, numbers),
+            turned,
+        }
+    }
+}
+
+/// The quadratic form of an ellipse in the image plane, with the factors that the module's text derives.
+struct Form<S: Simd> {
+    /// `a` and `c`: the variances along x and y, blur included.
+    variances: [S::F32; 2],
+    /// Whether `a` is the larger one.
+    wide: S::Mask,
+    /// The factors of `u` and `v`, scaled for powers of two.
+    across: S::F32,
+    lengthwise: S::F32,
+    /// The factor of `u` along the other axis.
+    tilted: S::F32,
+    /// Without blur, and what blur adds: the determinant divided by the larger variance.
+    minors: S::F32,
+    blurred: S::F32,
+}
+
+impl<S: Simd> Form<S> {
+    /// Of the ellipse with the rows `m1` and `m2` of `M`, each variance enlarged by `blur`.
+    #[inline(always)]
+    fn new(simd: S, m1: [S::F32; 3], m2: [S::F32; 3], blur: S::F32) -> Self {
+        let (zero, one) = (S::F32::splat(simd, 0.0), S::F32::splat(simd, 1.0));
         let (a0, c0) = (dot(simd, m1, m1), dot(simd, m2, m2));
         let (a, c) = (a0 + blur, c0 + blur);
-        let products = depth.mul_add(zero, x * zero);
-        let products = y.mul_add(zero, a.mul_add(zero, c.mul_add(zero, products)));
-        let representable = products.le(zero);
-
         let wide = c.le(a);
         let long: [S::F32; 3] = three!(i => S::F32::select(wide, m1[i], m2[i]));
         let short: [S::F32; 3] = three!(i => S::F32::select(wide, m2[i], m1[i]));
         // `1/√p` and `1/√(det/p)`, and `b/p`; `p` is the larger variance, blur included.
-        let p = S::F32::select(wide, a, c);
-        let inverse = one / p;
+        let inverse = one / S::F32::select(wide, a, c);
         let root = inverse.sqrt();
         // Divided by √p before it is squared, the cross product stays far from overflow.
         let minors = cross(simd, three!(i => long[i] * root), short);
@@ -195,103 +206,223 @@ impl<S: Simd> Camera<S> {
         let blurred = (a0 + c0 + blur) * inverse * blur;
         let across = S::F32::splat(simd, FORM_SCALE) / (minors + blurred).sqrt();
         let slope = dot(simd, long, short) * inverse;
-        let lengthwise = root * S::F32::splat(simd, FORM_SCALE);
-
-        let uncompensated = opacity.min(one);
-        let mut opacity = uncompensated;
-        if VARIANT & COMPENSATED != 0 {
-            let kept = (minors / (minors + blurred)).sqrt();
-            opacity = opacity * kept.max(S::F32::splat(simd, MIN_COMPENSATION));
+        Form {
+            variances: [a, c],
+            wide,
+            across,
+            lengthwise: root * S::F32::splat(simd, FORM_SCALE),
+            tilted: zero - slope * across,
+            minors,
+            blurred,
         }
-        let bright = self.floor.le(opacity);
-        let mut log_opacity = if one.le(opacity).bits() + 1 == 1 << S::LANES {
-            zero
+    }
+
+    /// The opacity that keeps a Gaussian's light as it was before the blur widened it.
+    #[inline(always)]
+    fn compensate(&self, simd: S, opacity: S::F32) -> S::F32 {
+        let kept = (self.minors / (self.minors + self.blurred)).sqrt();
+        opacity * kept.max(S::F32::splat(simd, MIN_COMPENSATION))
+    }
+}
+
+/// What a group looks like, one to a lane: most of what an [`Ellipse`] stores.
+struct Projected<S: Simd> {
+    centre: [S::F32; 2],
+    depth: S::F32,
+    form: Form<S>,
+    log_opacity: S::F32,
+    /// The first and the end of the columns that are covered, and of the rows.
+    columns: [S::F32; 2],
+    rows: [S::F32; 2],
+}
+
+impl<S: Simd> Projected<S> {
+    /// Makes the lanes of `crossing` what ray space calls for: no form in the plane, for they may be anywhere, a depth
+    /// from the near plane on, and these columns and rows.
+    #[inline(always)]
+    fn replace(&mut self, simd: S, crossing: S::Mask, near: S::F32, [columns, rows]: [[S::F32; 2]; 2]) {
+        let zero = S::F32::splat(simd, 0.0);
+        let [x, y] = &mut self.centre;
+        let form = &mut self.form;
+        for number in [x, y, &mut form.across, &mut form.lengthwise, &mut form.tilted] {
+            *number = S::F32::select(crossing, zero, *number);
+        }
+        self.depth = S::F32::select(crossing, self.depth.max(near), self.depth);
+        for k in 0..2 {
+            self.columns[k] = S::F32::select(crossing, columns[k], self.columns[k]);
+            self.rows[k] = S::F32::select(crossing, rows[k], self.rows[k]);
+        }
+    }
+
+    /// Stores the lanes of `left` as ellipses, one after the other; returns how many. `index`: the first lane's.
+    #[inline(always)]
+    fn store(&self, simd: S, colour: [S::F32; 3], index: u32, left: u32, out: &mut [Ellipse]) -> u32 {
+        let zero = S::F32::splat(simd, 0.0);
+        let mut indices = [0.0; 16];
+        for (i, place) in indices.iter_mut().enumerate() {
+            *place = f32::from_bits(index.wrapping_add(i as u32));
+        }
+        let Form {
+            wide,
+            across,
+            lengthwise,
+            tilted,
+            ..
+        } = self.form;
+        let fields = [
+            self.centre[0],
+            self.centre[1],
+            S::F32::select(wide, tilted, across),
+            S::F32::select(wide, across, tilted),
+            S::F32::select(wide, lengthwise, zero),
+            S::F32::select(wide, zero, lengthwise),
+            self.log_opacity,
+            colour[0],
+            colour[1],
+            colour[2],
+            self.columns[0].truncate_to_i32().as_f32(),
+            self.rows[0].truncate_to_i32().as_f32(),
+            self.columns[1].truncate_to_i32().as_f32(),
+            self.rows[1].truncate_to_i32().as_f32(),
+            self.depth,
+            S::F32::load(simd, &indices),
+        ];
+        S::F32::store_records(&fields, left, must_cast_slice_mut(out)) as u32
+    }
+}
+
+/// Which lanes are left, and how many were dropped for what reason.
+struct Visible<'a> {
+    left: u32,
+    tally: &'a mut Tally,
+}
+
+impl Visible<'_> {
+    /// Keeps the lanes of `bits`; the others count as `reason`.
+    #[inline(always)]
+    fn keep(&mut self, bits: u32, reason: fn(&mut Tally) -> &mut u32) {
+        *reason(self.tally) += (self.left & !bits).count_ones();
+        self.left &= bits;
+    }
+}
+
+impl<S: Simd> Camera<S> {
+    /// Sees the first `count` of `group`, at most as many as there are lanes.
+    #[inline(always)]
+    fn see<const VARIANT: u8>(&self, group: Cloud, count: usize, index: u32, tally: &mut Tally, out: &mut [Ellipse]) {
+        let simd = self.simd;
+        let one = S::F32::splat(simd, 1.0);
+        let group = Group::load(simd, group);
+        let place = self.transform(group.position);
+        let (centre, form) = self.flatten::<VARIANT>(&group, place);
+        let depth = place[2].to_f32();
+        let representable = all_finite(
+            simd,
+            [depth, centre[0], centre[1], form.variances[0], form.variances[1]],
+        );
+
+        let mut opacity = group.opacity;
+        if VARIANT & COMPENSATED != 0 {
+            opacity = form.compensate(simd, opacity);
+        }
+        let opaque = one.le(opacity).bits() + 1 == 1 << S::LANES;
+        let log_opacity = if opaque {
+            S::F32::splat(simd, 0.0)
         } else {
             log2(simd, opacity)
         };
         // α is at the floor at d² = 2·ln(opacity/floor) standard deviations squared.
         let reach = self.reach(log_opacity);
-        let (mut x0, mut x1) = covered(simd, x, (a * reach).sqrt(), self.window[0]);
-        let (mut y0, mut y1) = covered(simd, y, (c * reach).sqrt(), self.window[1]);
-        let inside = x0.lt(x1).and(y0.lt(y1));
+        let [a, c] = form.variances;
+        let columns = covered(simd, centre[0], (a * reach).sqrt(), self.window[0]);
+        let rows = covered(simd, centre[1], (c * reach).sqrt(), self.window[1]);
+        let inside = columns[0].lt(columns[1]).and(rows[0].lt(rows[1]));
 
-        let mut left = (1 << count) - 1;
-        for (mask, missing) in [
-            (finite, &mut tally.not_finite),
-            (turned, &mut tally.no_rotation),
-            (bright, &mut tally.too_faint),
-        ] {
-            let bits = mask.bits();
-            *missing += (left & !bits).count_ones();
-            left &= bits;
-        }
-        let ahead_of = three!(i => dot(simd, self.rows[2], axes[i]) * scale[i]);
-        let variance = dot(simd, ahead_of, ahead_of);
-        let beyond = depth - self.near_plane;
-        let crossing = (beyond * beyond).lt(variance * S::F32::splat(simd, REACH * REACH));
-        let mut crossed = left & crossing.bits();
-        if self.ray_space && crossed != 0 {
-            log_opacity = S::F32::select(crossing, log2(simd, uncompensated), log_opacity);
-            let sigmas = self.reach(log_opacity);
-            let extent = Extent::new::<VARIANT>(self, depth, variance, sigmas);
-            let rows = three!(k => three!(i => dot(simd, self.rows[k], axes[i]) * scale[i]));
-            let halves = three!(k => ((dot(simd, rows[k], rows[k]) + extent.blur) * sigmas).sqrt());
-            let across = extent.covered::<VARIANT>(self, 0, seen[0].to_f32(), halves[0]);
-            let along = extent.covered::<VARIANT>(self, 1, seen[1].to_f32(), halves[1]);
-            let visible = across[0].lt(across[1]).and(along[0].lt(along[1])).bits();
-            tally.outside += (crossed & !visible).count_ones();
-            left &= visible | !crossed;
-            crossed &= visible;
-            x0 = S::F32::select(crossing, across[0], x0);
-            x1 = S::F32::select(crossing, across[1], x1);
-            y0 = S::F32::select(crossing, along[0], y0);
-            y1 = S::F32::select(crossing, along[1], y1);
-        }
-        tally.crossing += crossed.count_ones();
-        let along_rays = if self.ray_space { crossed } else { 0 };
-        for (mask, missing) in [
-            (ahead, &mut tally.behind),
-            (representable, &mut tally.not_finite),
-            (inside, &mut tally.outside),
-        ] {
-            let bits = mask.bits() | along_rays;
-            *missing += (left & !bits).count_ones();
-            left &= bits;
-        }
-
-        let (mut across, mut lengthwise) = (across, lengthwise);
-        let mut tilted = zero - slope * across;
-        if along_rays != 0 {
-            // They may be anywhere, and have no form in the plane.
-            let either = |yes, no| S::F32::select(crossing, yes, no);
-            for form in [&mut x, &mut y, &mut across, &mut lengthwise, &mut tilted] {
-                *form = either(zero, *form);
-            }
-            depth = either(depth.max(self.near_plane), depth);
-        }
-        let mut indices = [0.0; 16];
-        for (i, place) in indices.iter_mut().enumerate() {
-            *place = f32::from_bits(index.wrapping_add(i as u32));
-        }
-        let fields = [
-            x,
-            y,
-            S::F32::select(wide, tilted, across),
-            S::F32::select(wide, across, tilted),
-            S::F32::select(wide, lengthwise, zero),
-            S::F32::select(wide, zero, lengthwise),
-            log_opacity,
-            colour[0],
-            colour[1],
-            colour[2],
-            x0.truncate_to_i32().as_f32(),
-            y0.truncate_to_i32().as_f32(),
-            x1.truncate_to_i32().as_f32(),
-            y1.truncate_to_i32().as_f32(),
+        let mut visible = Visible {
+            left: (1 << count) - 1,
+            tally,
+        };
+        visible.keep(group.finite.bits(), |tally| &mut tally.not_finite);
+        visible.keep(group.turned.bits(), |tally| &mut tally.no_rotation);
+        visible.keep(self.floor.le(opacity).bits(), |tally| &mut tally.too_faint);
+        let mut seen = Projected {
+            centre,
             depth,
-            S::F32::load(simd, &indices),
-        ];
-        tally.visible += S::F32::store_records(&fields, left, must_cast_slice_mut(out)) as u32;
+            form,
+            log_opacity,
+            columns,
+            rows,
+        };
+        let along_rays = self.cross_near_plane::<VARIANT>(&group, place, &mut seen, &mut visible);
+        visible.keep(self.near.lt(place[2]).bits() | along_rays, |tally| &mut tally.behind);
+        visible.keep(representable.bits() | along_rays, |tally| &mut tally.not_finite);
+        visible.keep(inside.bits() | along_rays, |tally| &mut tally.outside);
+        let stored = seen.store(simd, group.colour, index, visible.left, out);
+        visible.tally.visible += stored;
+    }
+
+    /// The position in the camera's axes.
+    ///
+    /// In double precision: the sum of a rotated position and a distant camera's translation is the one place where
+    /// digits are lost.
+    #[inline(always)]
+    fn transform(&self, position: [S::F32; 3]) -> [S::F64; 3] {
+        let [px, py, pz] = three!(i => S::F64::from_f32(position[i]));
+        three!(k => {
+            let [rx, ry, rz] = self.rotation[k];
+            px.mul_add(rx, py.mul_add(ry, pz.mul_add(rz, self.translation[k])))
+        })
+    }
+
+    /// The centre and the form in the image plane of a group whose centres are at `place` of the camera's axes.
+    #[inline(always)]
+    fn flatten<const VARIANT: u8>(&self, group: &Group<S>, place: [S::F64; 3]) -> ([S::F32; 2], Form<S>) {
+        let inverse = S::F64::splat(self.simd, 1.0) / place[2];
+        let (x, m1) = self.along::<VARIANT>(0, place[0], inverse, &group.axes, group.scale);
+        let (y, m2) = self.along::<VARIANT>(1, place[1], inverse, &group.axes, group.scale);
+        let own = if VARIANT & ORTHOGRAPHIC != 0 {
+            self.blur
+        } else {
+            self.blur * inverse * inverse
+        };
+        let blur = own.to_f32().max(self.pixel_blur);
+        ([x, y], Form::new(self.simd, m1, m2, blur))
+    }
+
+    /// Finds which Gaussians reach over the near plane. If those are evaluated in ray space, drops what is outside the
+    /// picture and replaces what of `seen` has no meaning for them. Returns the lanes that are drawn like that.
+    #[inline(always)]
+    fn cross_near_plane<const VARIANT: u8>(
+        &self,
+        group: &Group<S>,
+        place: [S::F64; 3],
+        seen: &mut Projected<S>,
+        visible: &mut Visible,
+    ) -> u32 {
+        let simd = self.simd;
+        let ahead = three!(i => dot(simd, self.rows[2], group.axes[i]) * group.scale[i]);
+        let variance = dot(simd, ahead, ahead);
+        let beyond = seen.depth - self.near_plane;
+        let crossing = (beyond * beyond).lt(variance * S::F32::splat(simd, REACH * REACH));
+        let mut crossed = visible.left & crossing.bits();
+        if !self.ray_space || crossed == 0 {
+            visible.tally.crossing += crossed.count_ones();
+            return 0;
+        }
+        let log_opacity = log2(simd, group.opacity);
+        seen.log_opacity = S::F32::select(crossing, log_opacity, seen.log_opacity);
+        let sigmas = self.reach(seen.log_opacity);
+        let extent = Extent::new::<VARIANT>(self, seen.depth, variance, sigmas);
+        let rows = three!(k => three!(i => dot(simd, self.rows[k], group.axes[i]) * group.scale[i]));
+        let halves = three!(k => ((dot(simd, rows[k], rows[k]) + extent.blur) * sigmas).sqrt());
+        let columns = extent.covered::<VARIANT>(self, 0, place[0].to_f32(), halves[0]);
+        let rows = extent.covered::<VARIANT>(self, 1, place[1].to_f32(), halves[1]);
+        let inside = columns[0].lt(columns[1]).and(rows[0].lt(rows[1])).bits();
+        visible.keep(inside | !crossed, |tally| &mut tally.outside);
+        crossed &= inside;
+        visible.tally.crossing += crossed.count_ones();
+        seen.replace(simd, crossing, self.near_plane, [columns, rows]);
+        crossed
     }
 
     /// So many standard deviations, squared, α is from its peak to the floor.
@@ -332,12 +463,23 @@ impl<S: Simd> Camera<S> {
 /// The first and the end of the pixels from `low` to `high` whose centres lie within `half` of `centre`: none if they
 /// don't rise.
 #[inline(always)]
-fn covered<S: Simd>(simd: S, centre: S::F32, half: S::F32, [low, high]: [S::F32; 2]) -> (S::F32, S::F32) {
+fn covered<S: Simd>(simd: S, centre: S::F32, half: S::F32, [low, high]: [S::F32; 2]) -> [S::F32; 2] {
     let middle = S::F32::splat(simd, 0.5);
     // Clamped before it is rounded, the number is small enough for that. NaN comes to an end of the range.
     let first = (centre - half - middle).max(low).min(high);
     let end = (centre + half + middle).max(low).min(high);
-    (first.ceil(), end.floor())
+    [first.ceil(), end.floor()]
+}
+
+/// Whether all numbers of a lane are finite: zero times a number is zero exactly if it is.
+#[inline(always)]
+fn all_finite<S: Simd, const N: usize>(simd: S, numbers: [S::F32; N]) -> S::Mask {
+    let zero = S::F32::splat(simd, 0.0);
+    let mut products = zero;
+    for number in numbers {
+        products = number.mul_add(zero, products);
+    }
+    products.le(zero)
 }
 
 /// The columns of the rotation matrix of a quaternion `w, x, y, z` of any length, and whether that is one: not zero.

@@ -1,0 +1,313 @@
+// b2p in WebAssembly: streams to Gaussians and pictures, in whatever thread imports this module.
+//
+// The module is the C interface (capi/include/b2p.h) compiled for WASI. Sizes and offsets of its structs below are those
+// of 32-bit addresses.
+
+const STATUS = [
+  "ok", "io", "truncated", "checksum", "model", "determinism", "limit", "unsupported", "malformed", "cancelled",
+  "usage", "internal",
+];
+const HEADS = { best: 0, quick: 1, surfels: 2 };
+const MESSAGE = 1024;
+
+/** What a stream or an argument is refused for. `kind` is one of the statuses of the C interface, in lower case. */
+export class B2pError extends Error {
+  constructor(kind, message) {
+    super(message);
+    this.name = "B2pError";
+    this.kind = kind;
+  }
+}
+
+/** The few calls of WASI that the library makes: a clock, and messages of defects. There are no files. */
+function system(memory, report) {
+  const BADF = 8;
+  const view = () => new DataView(memory().buffer);
+  const none = () => BADF;
+  let line = "";
+  return {
+    environ_sizes_get: (count, size) => (view().setUint32(count, 0, true), view().setUint32(size, 0, true), 0),
+    environ_get: () => 0,
+    clock_time_get: (_clock, _precision, to) => {
+      view().setBigUint64(to, BigInt(Math.round(performance.now() * 1e6)), true);
+      return 0;
+    },
+    fd_write: (_file, vectors, count, written) => {
+      let total = 0;
+      for (let i = 0; i < count; i++) {
+        const at = view().getUint32(vectors + 8 * i, true);
+        const length = view().getUint32(vectors + 8 * i + 4, true);
+        line += new TextDecoder().decode(new Uint8Array(memory().buffer, at, length));
+        total += length;
+      }
+      const lines = line.split("\n");
+      line = lines.pop();
+      lines.forEach(report);
+      view().setUint32(written, total, true);
+      return 0;
+    },
+    sched_yield: () => 0,
+    proc_exit: (code) => {
+      throw new B2pError("internal", `the library ended with ${code}`);
+    },
+    fd_close: none, fd_fdstat_get: none, fd_filestat_get: none, fd_prestat_get: none, fd_prestat_dir_name: none,
+    fd_read: none, path_open: none,
+  };
+}
+
+/** The library. One instance has one memory; after an `internal` error it must not be used any more. */
+export class B2p {
+  #exports;
+  #message;
+
+  /** From a `Response`, its promise, bytes, or a compiled module. */
+  static async load(source, { report = console.error } = {}) {
+    let memory;
+    const imports = { wasi_snapshot_preview1: system(() => memory, report) };
+    source = await source;
+    let instance;
+    if (source instanceof WebAssembly.Module) {
+      instance = await WebAssembly.instantiate(source, imports);
+    } else {
+      const bytes = typeof Response !== "undefined" && source instanceof Response ? await source.arrayBuffer() : source;
+      ({ instance } = await WebAssembly.instantiate(bytes, imports));
+    }
+    memory = instance.exports.memory;
+    instance.exports._initialize?.();
+    return new B2p(instance.exports);
+  }
+
+  constructor(exports) {
+    this.#exports = exports;
+    this.#message = this._alloc(MESSAGE);
+  }
+
+  get version() {
+    return this.#text(this.#exports.b2p_version());
+  }
+
+  /** Learned heads from the bytes of a model file. */
+  headsModel(bytes) {
+    const copy = this._copy(bytes);
+    try {
+      const at = this._out((out) => this._call("b2p_heads_model_from_bytes", copy.at, copy.length, out));
+      return new HeadsModel(this, at);
+    } finally {
+      copy.free();
+    }
+  }
+
+  /** Begins to decode a stream, down to `level` or to the finest. */
+  decoding({ level = -1, model = null, heads = null } = {}) {
+    const at = this._out((out) => this._call("b2p_decoding_start", 0, 0, 0, level, out));
+    const decoding = new Decoding(this, at);
+    if (model) this._call("b2p_decoding_use_heads_model", at, model.at);
+    if (heads) {
+      if (!(heads in HEADS)) throw new B2pError("usage", `no heads \`${heads}\`, but ${Object.keys(HEADS).join(", ")}`);
+      this._call("b2p_decoding_use_heads", at, HEADS[heads]);
+    }
+    return decoding;
+  }
+
+  /** All of a stream: the Gaussians of its finest level, or of `level`. */
+  decode(bytes, options) {
+    const decoding = this.decoding(options);
+    try {
+      decoding.push(bytes);
+      decoding.finish();
+      return decoding.gaussians();
+    } finally {
+      decoding.free();
+    }
+  }
+
+  /** Calls a function of the C interface that returns a status, and throws what is not ok. */
+  _call(name, ...args) {
+    const status = this.#exports[name](...args, this.#message, MESSAGE);
+    if (status !== 0) throw new B2pError(STATUS[status] ?? "internal", this.#text(this.#message));
+  }
+
+  /** A function of the C interface that returns something else. */
+  _plain(name, ...args) {
+    return this.#exports[name](...args);
+  }
+
+  /** The number that `run` has written where it was told to. */
+  _out(run) {
+    const at = this._alloc(4);
+    try {
+      this._view().setUint32(at, 0, true);
+      run(at);
+      return this._view().getInt32(at, true);
+    } finally {
+      this._free(at, 4);
+    }
+  }
+
+  _alloc(size) {
+    const at = this.#exports.b2p_alloc(size);
+    if (at === 0) throw new B2pError("limit", `no memory for ${size} bytes`);
+    return at;
+  }
+
+  _free(at, size) {
+    this.#exports.b2p_dealloc(at, size);
+  }
+
+  _copy(bytes) {
+    const from = bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes);
+    const at = this._alloc(from.length);
+    new Uint8Array(this.#exports.memory.buffer, at, from.length).set(from);
+    return { at, length: from.length, free: () => this._free(at, from.length) };
+  }
+
+  _view() {
+    return new DataView(this.#exports.memory.buffer);
+  }
+
+  _array(Type, at, length) {
+    return new Type(this.#exports.memory.buffer, at, length);
+  }
+
+  #text(at) {
+    const bytes = new Uint8Array(this.#exports.memory.buffer, at);
+    return new TextDecoder().decode(bytes.subarray(0, bytes.indexOf(0)));
+  }
+}
+
+/** What the library made, until it is freed. */
+class Handle {
+  constructor(library, at, free) {
+    this.library = library;
+    this.at = at;
+    this.release = free;
+  }
+
+  free() {
+    if (this.at) this.library._plain(this.release, this.at);
+    this.at = 0;
+  }
+}
+
+export class HeadsModel extends Handle {
+  constructor(library, at) {
+    super(library, at, "b2p_heads_model_free");
+  }
+}
+
+/** A stream that is decoded as its bytes arrive. */
+export class Decoding extends Handle {
+  constructor(library, at) {
+    super(library, at, "b2p_decoding_free");
+  }
+
+  push(bytes) {
+    const copy = this.library._copy(bytes);
+    try {
+      this.library._call("b2p_decoding_push", this.at, copy.at, copy.length);
+    } finally {
+      copy.free();
+    }
+  }
+
+  /** Decodes the next level if all of it has come: its number, or `null`. To be called until it is `null`. */
+  advance() {
+    const level = this.library._out((out) => this.library._call("b2p_decoding_advance", this.at, out));
+    return level < 0 ? null : level;
+  }
+
+  /** Decodes what is left, knowing that no more bytes will come. */
+  finish() {
+    this.library._call("b2p_decoding_finish", this.at);
+  }
+
+  /** The finest level decoded so far, or `null`. */
+  get level() {
+    const level = this.library._plain("b2p_decoding_level", this.at);
+    return level < 0 ? null : level;
+  }
+
+  /** The Gaussians of the finest level decoded so far. */
+  gaussians() {
+    const at = this.library._out((out) => this.library._call("b2p_decoding_gaussians", this.at, out));
+    return new Gaussians(this.library, at);
+  }
+
+  /** Coordinates (3 numbers a voxel) and colours (3 bytes a voxel) of the finest level decoded so far, copied. */
+  points() {
+    const { library } = this;
+    const points = library._out((out) => library._call("b2p_decoding_points", this.at, out));
+    const arrays = library._alloc(56);
+    try {
+      library._call("b2p_points_arrays", points, arrays);
+      const view = library._view();
+      const [count, coordinate, colour] = [0, 4, 8].map((offset) => view.getUint32(arrays + offset, true));
+      return {
+        count,
+        level: view.getUint8(arrays + 12),
+        origin: [16, 24, 32].map((offset) => view.getFloat64(arrays + offset, true)),
+        voxelSize: view.getFloat64(arrays + 40, true),
+        coordinates: library._array(Uint32Array, coordinate, 3 * count).slice(),
+        colours: library._array(Uint8Array, colour, 3 * count).slice(),
+      };
+    } finally {
+      library._free(arrays, 56);
+      library._plain("b2p_points_free", points);
+    }
+  }
+}
+
+/** Gaussians of a level, in the cube frame, where the voxel cube reaches from −1 to 1. */
+export class Gaussians extends Handle {
+  constructor(library, at) {
+    super(library, at, "b2p_gaussians_free");
+  }
+
+  /**
+   * Views of their numbers, valid until the library is next called: `position`, `scale` and `colour` (3 each),
+   * `rotation` (w, x, y, z), `opacity`; world = origin + (position + 1) · unit.
+   */
+  arrays() {
+    const { library } = this;
+    const at = library._alloc(56);
+    try {
+      library._call("b2p_gaussians_arrays", this.at, at);
+      const view = library._view();
+      const [count, ...places] = [0, 4, 8, 12, 16, 20].map((offset) => view.getUint32(at + offset, true));
+      const widths = { position: 3, scale: 3, rotation: 4, opacity: 1, colour: 3 };
+      const arrays = Object.entries(widths).map(([name, width], i) => {
+        return [name, library._array(Float32Array, places[i], width * count)];
+      });
+      return {
+        count,
+        ...Object.fromEntries(arrays),
+        origin: [24, 32, 40].map((offset) => view.getFloat64(at + offset, true)),
+        unit: view.getFloat64(at + 48, true),
+      };
+    } finally {
+      library._free(at, 56);
+    }
+  }
+
+  /**
+   * A picture: `width × height` pixels of red, green, blue, alpha (8 bits each, premultiplied), as `ImageData` takes.
+   * `background` is a colour in [0, 1] or `null` for none.
+   */
+  render({ azimuth = 20, elevation = 20, distance = 2.6, fov = 45, width, height, background = [1, 1, 1] }) {
+    const { library } = this;
+    const [camera, length] = [library._alloc(56), 4 * width * height];
+    const pixels = library._alloc(length);
+    try {
+      const view = library._view();
+      [azimuth, elevation, distance, fov].forEach((x, i) => view.setFloat64(camera + 8 * i, x, true));
+      [width, height].forEach((x, i) => view.setUint32(camera + 32 + 4 * i, x, true));
+      (background ?? [0, 0, 0]).forEach((x, i) => view.setFloat32(camera + 40 + 4 * i, x, true));
+      view.setUint8(camera + 52, background ? 0 : 1);
+      library._call("b2p_render", this.at, camera, 0, pixels, length);
+      return library._array(Uint8ClampedArray, pixels, length).slice();
+    } finally {
+      library._free(pixels, length);
+      library._free(camera, 56);
+    }
+  }
+}

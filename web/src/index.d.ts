@@ -1,0 +1,122 @@
+/** A colour, red, green and blue in [0, 1]. */
+export type Colour = [number, number, number];
+export type Heads = "best" | "quick" | "surfels";
+
+/** What a stream or an argument is refused for. */
+export class B2pError extends Error {
+  readonly kind:
+    | "io" | "truncated" | "checksum" | "model" | "determinism" | "limit" | "unsupported" | "malformed" | "cancelled"
+    | "usage" | "internal";
+}
+
+export interface DecodeOptions {
+  /** The level to end with; the finest if it is left out. */
+  level?: number;
+  /** Learned heads. */
+  model?: HeadsModel | null;
+  heads?: Heads | null;
+}
+
+/** The library, in the thread that loads it. After an `internal` error it must not be used any more. */
+export class B2p {
+  static load(
+    source: Response | Promise<Response> | BufferSource | WebAssembly.Module,
+    options?: { report?: (line: string) => void },
+  ): Promise<B2p>;
+  readonly version: string;
+  headsModel(bytes: Uint8Array | ArrayBuffer): HeadsModel;
+  decoding(options?: DecodeOptions): Decoding;
+  decode(bytes: Uint8Array | ArrayBuffer, options?: DecodeOptions): Gaussians;
+}
+
+/** Memory of the library: it is given back by `free`, once. */
+interface Handle {
+  free(): void;
+}
+
+export interface HeadsModel extends Handle {}
+
+/** A stream that is decoded as its bytes arrive. */
+export interface Decoding extends Handle {
+  push(bytes: Uint8Array | ArrayBuffer): void;
+  /** Decodes the next level if all of it has come. To be called until it is `null`. */
+  advance(): number | null;
+  finish(): void;
+  readonly level: number | null;
+  gaussians(): Gaussians;
+  points(): Points;
+}
+
+/** Voxels of a level. One with coordinates `c` covers `origin + c · voxelSize` to `origin + (c + 1) · voxelSize`. */
+export interface Points {
+  count: number;
+  level: number;
+  origin: [number, number, number];
+  voxelSize: number;
+  /** x, y, z of each. */
+  coordinates: Uint32Array;
+  /** Red, green, blue of each. */
+  colours: Uint8Array;
+}
+
+/** Gaussians in the cube frame, where the voxel cube reaches from −1 to 1. */
+export interface Gaussians extends Handle {
+  /** Views, valid until the library is next called. world = origin + (position + 1) · unit. */
+  arrays(): {
+    count: number;
+    /** x, y, z of centres. */
+    position: Float32Array;
+    /** Standard deviations along the Gaussian's axes. */
+    scale: Float32Array;
+    /** Unit quaternions w, x, y, z. */
+    rotation: Float32Array;
+    /** In [0, 1]. */
+    opacity: Float32Array;
+    /** Red, green, blue in [0, 1]. */
+    colour: Float32Array;
+    origin: [number, number, number];
+    unit: number;
+  };
+  /** Red, green, blue, alpha of each pixel, premultiplied, row by row from the top left. */
+  render(view: View): Uint8ClampedArray;
+}
+
+/** An eye that looks at the centre of the cube. */
+export interface Camera {
+  /** Degrees around the vertical axis. */
+  azimuth?: number;
+  /** Degrees above the horizon. */
+  elevation?: number;
+  distance?: number;
+  /** Horizontal field of view in degrees. */
+  fov?: number;
+}
+
+export interface View extends Camera {
+  width: number;
+  height: number;
+  /** `null` is transparent; white if it is left out. */
+  background?: Colour | null;
+}
+
+/**
+ * A canvas that shows a stream, with the library in a worker. Events: `level` (`detail`: level, count, milliseconds),
+ * `picture` (milliseconds, scale), `failure` (kind, message).
+ */
+export class Viewer extends EventTarget {
+  constructor(
+    canvas: HTMLCanvasElement,
+    options?: { wasm?: string | URL; worker?: string | URL; heads?: string | URL | null; background?: Colour | null },
+  );
+  get camera(): Required<Camera>;
+  set camera(camera: Camera);
+  /** Ends with the last level, when it is there. */
+  open(
+    source: string | URL | Response | Blob | BufferSource | ReadableStream<Uint8Array>,
+    options?: { heads?: Heads | null; level?: number },
+  ): Promise<number>;
+  /** How long the picture took, or `null` if there was nothing to draw, or another one was asked for. */
+  draw(): Promise<number | null>;
+  reset(): void;
+  close(): void;
+}

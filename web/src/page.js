@@ -1,0 +1,72 @@
+// The page: `?src=ADDRESS` opens a stream, `?heads=ADDRESS` is a model file of learned heads.
+
+import { Viewer } from "./viewer.js";
+
+const parameters = new URLSearchParams(location.search);
+const canvas = document.querySelector("canvas");
+const [state, time, files, heads] = ["state", "time", "files", "heads"].map((id) => document.getElementById(id));
+
+// `b2p serve` tells which streams there are, and where learned heads are.
+const listed = await list();
+const model = parameters.get("heads") ?? listed.heads;
+const viewer = new Viewer(canvas, { heads: model });
+let source = null;
+let milliseconds = 0;
+
+heads.parentElement.hidden = !model;
+
+async function list() {
+  const response = await fetch("./streams.json").catch(() => null);
+  return response?.ok ? response.json() : { streams: [], heads: null };
+}
+
+function say(text, error = false) {
+  state.textContent = text;
+  state.classList.toggle("error", error);
+  document.body.dataset.state = error ? "error" : text.startsWith("Level") ? "level" : "busy";
+}
+
+async function open(next) {
+  source = next;
+  milliseconds = 0;
+  say("Loading …");
+  try {
+    const level = await viewer.open(source, { heads: model ? heads.value : "surfels" });
+    document.body.dataset.done = level;
+  } catch (error) {
+    if (error.name !== "AbortError") say(error.message, true);
+  }
+}
+
+viewer.addEventListener("level", ({ detail }) => {
+  milliseconds += detail.milliseconds;
+  const count = detail.count.toLocaleString("en").replaceAll(",", " ");
+  say(`Level ${detail.level}: ${count} Gaussians, decoded in ${milliseconds.toFixed(0)} ms`);
+});
+viewer.addEventListener("picture", ({ detail }) => {
+  time.textContent = `drawn in ${detail.milliseconds.toFixed(0)} ms`;
+  document.body.dataset.pictures = Number(document.body.dataset.pictures ?? 0) + 1;
+});
+
+function resize() {
+  canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
+  canvas.height = Math.round(canvas.clientHeight * devicePixelRatio);
+  viewer.draw();
+}
+addEventListener("resize", resize);
+resize();
+
+document.querySelector("input").addEventListener("change", ({ target }) => target.files[0] && open(target.files[0]));
+heads.addEventListener("change", () => source && open(source));
+addEventListener("dragover", (event) => event.preventDefault());
+addEventListener("drop", (event) => {
+  event.preventDefault();
+  if (event.dataTransfer.files[0]) open(event.dataTransfer.files[0]);
+});
+addEventListener("keydown", ({ key }) => key === "r" && viewer.reset());
+
+for (const name of listed.streams) files.add(new Option(name, name));
+files.hidden = listed.streams.length < 2;
+files.addEventListener("change", () => open(encodeURIComponent(files.value)));
+const first = parameters.get("src") ?? listed.streams[0];
+if (first) open(parameters.has("src") ? first : encodeURIComponent(first));

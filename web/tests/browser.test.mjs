@@ -1,0 +1,96 @@
+// The page in a headless Chromium. Skipped where there is none.
+
+import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import test from "node:test";
+
+import { B2p } from "../src/index.js";
+import { Browser, chromium } from "./chromium.mjs";
+import { broken, paused, serve, whole } from "./server.mjs";
+
+const read = (path) => readFileSync(new URL(`../../${path}`, import.meta.url));
+const scene = read("models/scene.b2p");
+const SIZE = [640, 480];
+const skip = chromium ? false : "no Chromium is installed";
+
+const damaged = Buffer.from(scene);
+damaged[scene.length - 100] ^= 1;
+const waiting = paused(scene, 30_000);
+const streams = {
+  "whole.b2p": whole(scene),
+  "cut.b2p": broken(scene, 20_000),
+  "damaged.b2p": whole(damaged),
+  "late.b2p": waiting.answer,
+};
+const server = skip ? null : await serve(streams);
+const browser = skip ? null : new Browser();
+test.after(async () => {
+  await browser?.close();
+  server?.close();
+});
+
+const show = (name) => browser.page(`${server.address}/?src=streams/${name}`, ...SIZE);
+/** The pixels of the canvas. */
+const PIXELS = `(() => {
+  const canvas = document.querySelector("canvas");
+  return [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data];
+})()`;
+const STATE = "document.getElementById('state').textContent";
+
+test("a stream is shown as the library draws it", { skip }, async () => {
+  const page = await show("whole.b2p");
+  await page.until("document.body.dataset.done === '9'");
+  const library = await B2p.load(read("web/b2p.wasm"));
+  const gaussians = library.decode(scene);
+  const expected = [...gaussians.render({ width: SIZE[0], height: SIZE[1] })];
+  await page.until("!document.getElementById('time').textContent.startsWith('drawn in 0')");
+  let shown;
+  for (let i = 0; i < 100; i++) {
+    shown = await page.evaluate(PIXELS);
+    if (Buffer.from(shown).equals(Buffer.from(expected))) break;
+    await new Promise((resolve) => setTimeout(resolve, 100));
+  }
+  assert.ok(Buffer.from(shown).equals(Buffer.from(expected)), "the canvas has the library's pixels");
+  assert.match(await page.evaluate(STATE), /^Level 9: 224 525 Gaussians/);
+});
+
+test("a picture is there before the download ends", { skip }, async () => {
+  const page = await show("late.b2p");
+  await page.until(`${STATE}.startsWith("Level 8")`);
+  await page.until("Number(document.body.dataset.pictures) > 0");
+  assert.equal(await page.evaluate("document.body.dataset.done ?? null"), null);
+  waiting.go();
+  await page.until("document.body.dataset.done === '9'");
+});
+
+test("dragging turns the scene, and a double click turns it back", { skip }, async () => {
+  const page = await show("whole.b2p");
+  await page.until("document.body.dataset.done === '9'");
+  await page.until("Number(document.body.dataset.pictures) > 0");
+  const settle = () => new Promise((resolve) => setTimeout(resolve, 1500));
+  await settle();
+  const before = await page.evaluate(PIXELS);
+  await page.drag([320, 240], [420, 260]);
+  await settle();
+  const turned = await page.evaluate(PIXELS);
+  assert.notDeepEqual(turned, before);
+  await page.evaluate("document.querySelector('canvas').dispatchEvent(new MouseEvent('dblclick')), 0");
+  await settle();
+  assert.deepEqual(await page.evaluate(PIXELS), before);
+});
+
+test("a cut download and a damaged file are told, and the levels that came stay", { skip }, async () => {
+  for (const name of ["cut.b2p", "damaged.b2p"]) {
+    const page = await show(name);
+    await page.until("document.body.dataset.state === 'error'");
+    await page.until("Number(document.body.dataset.pictures) > 0");
+    const pixels = await page.evaluate(PIXELS);
+    assert.ok(pixels.some((x, i) => i % 4 !== 3 && x !== 255), `${name}: the picture stays`);
+  }
+});
+
+test("the page needs no cross-origin isolation", { skip }, async () => {
+  const page = await show("whole.b2p");
+  await page.until("document.body.dataset.done === '9'");
+  assert.equal(await page.evaluate("crossOriginIsolated"), false);
+});

@@ -1,0 +1,48 @@
+// Serves `web/`, and streams under `/streams/` as tests give them.
+
+import { createServer } from "node:http";
+import { readFile } from "node:fs/promises";
+import { extname, join, normalize } from "node:path";
+
+const TYPES = { ".html": "text/html", ".js": "text/javascript", ".wasm": "application/wasm", ".json": "application/json" };
+const web = new URL("..", import.meta.url).pathname;
+
+/** A server and its address. `streams` maps a name to a function that answers with it. */
+export async function serve(streams) {
+  const server = createServer(async (request, response) => {
+    const path = normalize(new URL(request.url, "http://localhost").pathname);
+    const stream = streams[path.replace("/streams/", "")];
+    if (path.startsWith("/streams/") && stream) return stream(response);
+    try {
+      const file = path === "/" ? "/index.html" : path;
+      const bytes = await readFile(join(web, file));
+      response.writeHead(200, { "content-type": TYPES[extname(file)] ?? "application/octet-stream" }).end(bytes);
+    } catch {
+      response.writeHead(404).end();
+    }
+  });
+  await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
+  return { address: `http://127.0.0.1:${server.address().port}`, close: () => server.close() };
+}
+
+/** Answers with all bytes. */
+export const whole = (bytes) => (response) => response.end(bytes);
+
+/** Answers with some bytes, and then breaks the connection. */
+export const broken = (bytes, length) => (response) => {
+  response.writeHead(200, { "content-length": bytes.length });
+  response.write(bytes.subarray(0, length), () => setTimeout(() => response.destroy(), 200));
+};
+
+/** Answers with some bytes, and with the others when `go` is called. */
+export function paused(bytes, length) {
+  let go;
+  const waiting = new Promise((resolve) => (go = resolve));
+  const answer = async (response) => {
+    response.writeHead(200, { "content-length": bytes.length });
+    response.write(bytes.subarray(0, length));
+    await waiting;
+    response.end(bytes.subarray(length));
+  };
+  return { answer, go };
+}
