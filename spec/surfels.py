@@ -56,10 +56,11 @@ def relative(m, coordinates):
     return F(m[:, 0]), [F(signed(x)) for x in s], q
 
 
-def sparsity(n):
-    """6.3.2: masks of the voxels in open blocks, and of those that are noise unless they take a window. Blocks are thin
-    by the same rule with few = 512."""
+def sparsity(degree, n):
+    """6.3.2: masks of the voxels in open blocks, and of those that are noise unless they take a window."""
     is_open, noise = np.zeros(len(n), dtype=bool), np.zeros(len(n), dtype=bool)
+    if len(n) < 1024 or 512 * (degree == 1).sum() < len(n):
+        return is_open, noise
     for first in range(0, len(n), 1024):
         block = slice(first, first + 1024)
         specks = n[block] < 27
@@ -122,16 +123,6 @@ def normals(cov):
     return [n * up for n in normal], np.minimum(low, d[2]), np.maximum(low, np.minimum(high, d[2]))
 
 
-def walk_spacing(n, shift, density, middle):
-    """6.5.2"""
-    border = F(1) + F(0.235) * shift
-    weight = n * (border * border * border)
-    full = F(729) * (density * density * density)
-    growth = np.clip(np.sqrt(np.sqrt(F(0.75) * full / weight)), F(1), F(2.5))
-    inside = np.clip((middle - F(0.8)) / (F(1.2) - F(0.8)), F(0), F(1))
-    return F(1) + inside * (growth - F(1))
-
-
 def window_spacing(n, shift, density, reach):
     """6.5.3"""
     side = F(2) * reach + F(1)
@@ -149,11 +140,11 @@ def disc(near, n, s, q, reach=None):
     thick = np.clip((least - density * density / F(12)) / F(0.4), F(0), F(1))
     height = high + thick * (low - high)
     place = [normal[a] * height + F(0.2) * (centre[a] - high * normal[a]) for a in range(3)]
-    shift = np.maximum(dot(centre, centre) - high * high, F(0))
     if reach is None:
         flat = np.minimum(middle / F(0.6), F(1))
-        spacing = walk_spacing(n, shift, density, middle)
+        spacing = np.ones_like(flat)
     else:
+        shift = np.maximum(dot(centre, centre) - high * high, F(0))
         extent = np.minimum(middle / (F(0.15) * (reach * reach)), F(1))
         flat = extent * np.clip(F(2) - F(4) * least / (middle + F(1e-6)), F(0), F(1))
         spacing = window_spacing(n, shift, density, reach)
@@ -168,10 +159,10 @@ def disc(near, n, s, q, reach=None):
 def discs(voxels):
     """6.5: place, radius, thickness, rotation, spacing and opacity of every voxel's disc."""
     near, far = moments(voxels)
+    is_open, noise = sparsity(near[:, 0], far[:, 0])
     n, s, _ = relative(near, voxels.coordinates)
     near = np.stack([x / n for x in s])
     made = disc(near, *relative(far, voxels.coordinates))
-    is_open, noise = sparsity(far[:, 0])
     rows, *window = windows(voxels, is_open & (far[:, 0] < 300))
     opacity = np.where(noise, F(1 / 64), F(1))
     opacity[rows] = 1

@@ -268,30 +268,18 @@ fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_
 }
 
 #[test]
-fn learned_heads_leave_sparse_surfaces_to_surfels() {
+fn learned_heads_leave_sparse_levels_to_surfels() {
     let bytes = stream(&sparse_wall(), &with(QualityTarget::Lossless));
-    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
-    let surfels = Decoder::new().decode(&bytes).unwrap();
-    let learned = Decoder::new().with_heads_model(heads).decode(&bytes).unwrap();
-    let bits = |gaussians: &b2p::gaussians::Gaussians| {
-        let places = gaussians.position.iter().zip(&gaussians.scale);
-        let places = places.map(|(p, s)| [p, s].map(|v| v.map(f32::to_bits)));
-        places.collect::<std::collections::HashSet<_>>()
+    let model = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
+    let draw = |heads: HeadSet, level| {
+        let decoder = Decoder::new().with_heads_model(HeadsModel::clone(&model)).with_heads(heads);
+        decoder.with_level(level).decode(&bytes).unwrap()
     };
-    let (of_surfels, of_learned) = (bits(&surfels), bits(&learned));
-    assert_eq!(of_surfels.len(), of_learned.len());
-    let whole = |at: &&[[u32; 3]; 2]| f32::from_bits(at[0][2]) > 0.8;
-    let (near, far): (Vec<_>, Vec<_>) = of_surfels.iter().partition(|at| !whole(at));
-    assert!(
-        near.iter().all(|at| of_learned.contains(*at)),
-        "the sparse wall is drawn as surfels"
-    );
-    let kept = far.iter().filter(|at| of_learned.contains(**at)).count();
-    assert!(
-        kept * 2 < far.len(),
-        "{kept} of {} voxels of the whole wall are surfels",
-        far.len()
-    );
+    for heads in [HeadSet::Best, HeadSet::Quick] {
+        assert!(draw(heads, 7) == draw(HeadSet::Surfels, 7), "{heads}");
+        // Half of the grid's resolution leaves hardly a voxel without neighbours.
+        assert!(draw(heads, 5) != draw(HeadSet::Surfels, 5), "{heads}");
+    }
 }
 
 #[test]

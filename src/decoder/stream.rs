@@ -13,7 +13,7 @@ use crate::container::feed::Goal;
 use crate::container::{Format, Header, Stream};
 use crate::error::{Error, Result};
 use crate::gaussians::learned::{HeadsModel, Set};
-use crate::gaussians::surfels::{PerVoxel, SurfelSelection, sparse_voxels, surfels};
+use crate::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
 use crate::gaussians::{Frame, Gaussians};
 use crate::gaussians::{HeadMap, HeadSet, Heads};
 use crate::geometry::Voxels;
@@ -400,16 +400,10 @@ impl Decoder {
         let (Some((model, set)), Some(above)) = (network, &reached.above) else {
             return discs(None);
         };
-        if map_of_heads.is_some_and(HeadMap::is_all_surfels) {
+        if reached.is_all_surfels() {
             return discs(None);
         }
-        let chosen = union(
-            map_of_heads.and_then(|heads| heads.surfels(octree, level)),
-            sparse_voxels(map),
-        );
-        if let Some(all) = chosen.as_deref().filter(|chosen| !chosen.contains(&false)) {
-            return discs(Some(all));
-        }
+        let chosen = map_of_heads.and_then(|heads| heads.surfels(octree, level));
         let colours_above = reached.colours_above(above);
         let input = reached.heads_input(self.isa(), above, &colours_above, chosen.as_deref());
         let mut gaussians = model.generate(self.isa(), self.precision, set, input, frame)?;
@@ -417,14 +411,6 @@ impl Decoder {
             gaussians.append(discs(Some(chosen))?);
         }
         Ok(gaussians)
-    }
-}
-
-/// Voxels that either choice has.
-fn union(a: Option<Vec<bool>>, b: Option<Vec<bool>>) -> Option<Vec<bool>> {
-    match (a, b) {
-        (Some(a), Some(b)) => Some(a.into_iter().zip(b).map(|(a, b)| a | b).collect()),
-        (a, b) => a.or(b),
     }
 }
 

@@ -19,19 +19,9 @@ const THICK: f32 = 0.4;
 /// over the borders of a surface.
 const INWARDS: f32 = 0.2;
 
-/// Weight of a plane's voxels after all steps over the cube of its density, measured on planes of every direction.
-const FULL: f32 = 729.0;
-/// Fraction of [`FULL`] below which voxels are missing. Nearly all voxels of dense surfaces have more.
-const DENSE: f32 = 0.75;
-/// Greatest factor by which a disc grows where voxels are missing.
-const GROWTH: f32 = 2.5;
-/// Middle eigenvalues between which discs start to grow: at the border of a surface it is 0.83, on strips less, inside
-/// of surfaces 2 whether voxels are missing or not. Discs at borders do not grow.
-const INSIDE: [f32; 2] = [0.8, 1.2];
-/// How much the weight falls at the border of a surface, per squared distance of the mean from the voxel. Of windows:
-/// per squared share of the window's reach.
-const BORDER: f32 = 0.235;
-const WINDOW_BORDER: f32 = 4.0;
+/// How much fewer voxels a window holds at the border of a surface, per squared distance of the mean from the voxel over
+/// the squared reach.
+const BORDER: f32 = 4.0;
 /// How much farther than the mean distance discs must reach to close a surface of which most voxels are missing, since
 /// those that are there are not evenly distributed.
 const UNEVEN: f32 = 0.5;
@@ -79,17 +69,14 @@ pub fn discs(near: &CentredMoments, far: &CentredMoments, reach: Option<&Lane>) 
         let (n, mean) = (&normal[axis], &centre[axis]);
         lane(|j| n[j] * height[j] + INWARDS * (mean[j] - high[j] * n[j]))
     });
-    let distance = dot(&centre, &centre);
-    let shift = lane(|j| (distance[j] - high[j] * high[j]).max(0.0));
     let (flat, spacing) = match reach {
-        None => (
-            lane(|j| (system.middle[j] / SURFACE).min(1.0)),
-            spacing(&far.count, &shift, &density, &system.middle),
-        ),
-        Some(reach) => (
-            lane(|j| window_flatness(system.least[j], system.middle[j], reach[j])),
-            window_spacing(&far.count, &shift, &density, reach),
-        ),
+        None => (lane(|j| (system.middle[j] / SURFACE).min(1.0)), [1.0; GROUP]),
+        Some(reach) => {
+            let distance = dot(&centre, &centre);
+            let shift = lane(|j| (distance[j] - high[j] * high[j]).max(0.0));
+            let flat = lane(|j| window_flatness(system.least[j], system.middle[j], reach[j]));
+            (flat, window_spacing(&far.count, &shift, &density, reach))
+        }
     };
     let radius = lane(|j| SPHERE + flat[j] * (RADIUS / density[j].sqrt() * spacing[j] - SPHERE));
     let thickness = lane(|j| SPHERE + flat[j] * (THICKNESS - SPHERE));
@@ -109,26 +96,12 @@ pub fn discs(near: &CentredMoments, far: &CentredMoments, reach: Option<&Lane>) 
     discs
 }
 
-/// How far a surface's voxels lie apart, from the weight of the walks. It falls with the cube of the share of voxels
-/// that are occupied; as few neighbours include the voxel itself, its fourth root is a good measure of the distance.
-#[inline(always)]
-fn spacing(count: &Lane, shift: &Lane, density: &Lane, middle: &Lane) -> Lane {
-    lane(|j| {
-        let border = 1.0 + BORDER * shift[j];
-        let weight = count[j] * (border * border * border);
-        let full = FULL * (density[j] * density[j] * density[j]);
-        let growth = (DENSE * full / weight).sqrt().sqrt().clamp(1.0, GROWTH);
-        let inside = ((middle[j] - INSIDE[0]) / (INSIDE[1] - INSIDE[0])).clamp(0.0, 1.0);
-        1.0 + inside * (growth - 1.0)
-    })
-}
-
 /// How far a surface's voxels lie apart, from how many there are in a window.
 #[inline(always)]
 fn window_spacing(count: &Lane, shift: &Lane, density: &Lane, reach: &Lane) -> Lane {
     lane(|j| {
         let side = 2.0 * reach[j] + 1.0;
-        let border = 1.0 + WINDOW_BORDER * shift[j] / (reach[j] * reach[j]);
+        let border = 1.0 + BORDER * shift[j] / (reach[j] * reach[j]);
         let filled = (count[j] * border / (side * side * density[j])).min(1.0);
         ((1.0 + UNEVEN * (1.0 - filled)) / filled.sqrt()).min(reach[j])
     })

@@ -4,11 +4,13 @@
 //! A voxel's normal is the eigenvector with the smallest eigenvalue of the covariance of its neighbourhood
 //! (`moments.rs`). The disc lies in the plane through the mean of the neighbourhood, which smooths the staircase of
 //! voxels away. If the neighbourhood is not planar, the disc lies nearer to the voxel. Its radius follows from the
-//! distance of the surface's voxels, which is measured in each neighbourhood: where voxels are missing, discs grow, but
-//! not at the borders of surfaces. In blocks where many voxels lack neighbours (`sparsity.rs`), these fit wider windows
-//! (`windows.rs`); in others, lone voxels are noise and become faint. The
-//! thickness is negligible, so that silhouettes do not grow. With fewer neighbours in the plane the disc becomes
-//! rounder. [`PerVoxel::Four`] makes four smaller discs with colours along the local gradient.
+//! distance of a plane's voxels; its thickness is negligible, so that silhouettes do not grow. With fewer neighbours in
+//! the plane the disc becomes rounder. [`PerVoxel::Four`] makes four smaller discs with colours along the local
+//! gradient.
+//!
+//! Captures are sparse at their finest level (`sparsity.rs`). There, in blocks where many voxels lack neighbours, these
+//! fit wider windows (`windows.rs`), whose discs are as large as the voxels are far apart; in other blocks, lone voxels
+//! are noise and become faint. Nothing changes at levels that are not sparse.
 //!
 //! All sums are integer sums. The rest is IEEE f32 additions, multiplications, divisions and square roots in a fixed
 //! order, so that the Gaussians are bit-exact on every machine and for any number of threads.
@@ -32,7 +34,7 @@ use crate::geometry::{KernelMap, Voxels};
 use discs::Disc;
 use moments::Moments;
 use sparsity::Sparsity;
-pub use sparsity::sparse_voxels;
+pub use sparsity::is_sparse_level;
 use windows::{Window, Windows};
 
 /// Voxels per task, and per block whose sparsity is measured: part of the definition of surfels.
@@ -131,6 +133,7 @@ pub fn surfels(
         frame,
         ..Gaussians::default()
     };
+    let sparse = sparsity::is_sparse(near[..voxels.len()].par_iter().map(|moments| moments[0]));
     let tasks = Rows::of(&mut gaussians).tasks(voxels.len(), n, choice);
     tasks.into_par_iter().for_each(|(first, rows)| {
         let last = (first + BLOCK).min(voxels.len());
@@ -141,7 +144,9 @@ pub fn surfels(
             near,
             far,
         });
-        fit_windows(isa, voxels, &coordinates, near, far, &mut discs);
+        if sparse {
+            fit_windows(isa, voxels, &coordinates, near, far, &mut discs);
+        }
         let mut to = 0;
         for (j, (disc, &coordinate)) in discs.iter().zip(&coordinates).enumerate() {
             if !choice.has(first + j) {
@@ -224,7 +229,7 @@ impl<'a> Rows<'a> {
 }
 
 /// Fits the discs of voxels that lack neighbours to the windows around them, if the block is open, and makes noise
-/// faint. Dense clouds have some such voxels, in thin bars, and windows would close the gaps between bars.
+/// faint. Dense parts have some such voxels, in thin bars, and windows would close the gaps between bars.
 fn fit_windows(
     isa: Isa,
     voxels: &Voxels,

@@ -1,34 +1,34 @@
-//! Which neighbourhoods lack voxels: measured block by block, from occupancy alone.
+//! Which levels and neighbourhoods lack voxels: measured from occupancy alone.
 //!
-//! The measure is the weight of a voxel's walks (`moments.rs`): a plane has 729 at least, half of one 351 at its border,
-//! and a lone voxel 1. Dense clouds have blocks of which a fifteenth of the voxels has few; captures at their finest
-//! level have a seventh to a half.
+//! A level is sparse if one in 512 of its voxels has no neighbour. Clouds sampled densely from surfaces have next to
+//! none, wires and twigs included. Captures at the finest level of their grid have more: points are missing, or stray.
+//!
+//! In sparse levels, the measure of a neighbourhood is the weight of a voxel's walks (`moments.rs`): a plane has 729 at
+//! least, half of one 351 at its border, and a lone voxel 1.
 
-use b2p_kernels::zeros;
 use rayon::prelude::*;
 
 use super::BLOCK;
-use super::moments::ROUNDS;
 use crate::geometry::KernelMap;
 
-/// Weight below which a voxel lacks neighbours.
-const FEW: u16 = 512;
+/// A level is sparse if one in so many voxels is lone.
+const LONE_SHARE: usize = 512;
+/// Levels with fewer voxels are never sparse: at coarse levels, small parts of scenes are lone voxels.
+const LEAST: usize = 1024;
 /// Weight below which a voxel lacks most neighbours, and takes a window in an open block: less than at a border.
-const SPARSE: u16 = 300;
+const FEW: u16 = 300;
+/// A block is open if one in so many voxels lacks most neighbours and is no speck.
+const FEW_SHARE: usize = 8;
 /// Weight below which a voxel is a speck: a line of three voxels has 17, an endless one 27.
 const SPECK: u16 = 27;
-/// A block is thin, or open, if one in so many voxels lacks neighbours, or most of them, and is no speck.
-const FEW_SHARE: usize = 8;
-/// A block is thin and open if one in so many voxels is a speck. In others, specks are noise.
+/// A block is open if one in so many voxels is a speck. In others, specks are noise.
 const SPECK_SHARE: usize = 4;
 
-/// What holds for a block of voxels.
+/// What holds for a block of voxels of a sparse level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sparsity {
     /// Whether many voxels lack most neighbours, so that surfaces are known from wider windows only.
     open: bool,
-    /// Whether many voxels lack neighbours.
-    thin: bool,
     /// Whether specks are noise.
     noisy: bool,
 }
@@ -36,23 +36,21 @@ pub struct Sparsity {
 impl Sparsity {
     /// Of a block, from the weight of each voxel.
     pub fn of_block(weights: impl ExactSizeIterator<Item = u16>) -> Self {
-        let (all, mut few, mut sparse, mut specks) = (weights.len(), 0, 0, 0);
+        let (all, mut few, mut specks) = (weights.len(), 0, 0);
         for weight in weights {
             few += usize::from((SPECK..FEW).contains(&weight));
-            sparse += usize::from((SPECK..SPARSE).contains(&weight));
             specks += usize::from(weight < SPECK);
         }
         let noisy = SPECK_SHARE * specks < all;
         Sparsity {
-            open: FEW_SHARE * sparse >= all || !noisy,
-            thin: FEW_SHARE * few >= all || !noisy,
+            open: FEW_SHARE * few >= all || !noisy,
             noisy,
         }
     }
 
     /// Whether a voxel of this weight looks for a window.
     pub fn wants_window(self, weight: u16) -> bool {
-        self.open && weight < SPARSE
+        self.open && weight < FEW
     }
 
     /// Whether a voxel of this weight that has no window is noise.
@@ -61,40 +59,23 @@ impl Sparsity {
     }
 }
 
-/// For every voxel of a level whether surfels draw it in place of learned heads, which never saw such neighbourhoods;
-/// `None` if none.
+/// Whether a level is sparse, from the number of voxels within one step of each, itself included.
+pub fn is_sparse(degrees: impl IndexedParallelIterator<Item = u16>) -> bool {
+    let all = degrees.len();
+    let lone = degrees.with_min_len(BLOCK).filter(|&degree| degree == 1).count();
+    all >= LEAST && LONE_SHARE * lone >= all
+}
+
+/// Whether the level of a map is sparse, so that surfels draw it in place of learned heads, which never saw such
+/// neighbourhoods.
 ///
 /// # Panics
 /// If `map` is not a 3³ map.
-pub fn sparse_voxels(map: &KernelMap) -> Option<Vec<bool>> {
-    let weights = weights(map);
-    let mut sparse = vec![false; weights.len()];
-    let blocks = sparse.par_chunks_mut(BLOCK).zip(weights.par_chunks(BLOCK));
-    let any = blocks.map(|(sparse, weights)| {
-        let block = Sparsity::of_block(weights.iter().copied());
-        let each = sparse.iter_mut().zip(weights);
-        each.for_each(|(sparse, &weight)| *sparse = block.thin || block.is_noise(weight));
-        sparse.contains(&true)
-    });
-    let any = any.reduce(|| false, |a, b| a | b);
-    any.then_some(sparse)
-}
-
-/// Number of walks from every voxel: the first of its moments after all steps.
-fn weights(map: &KernelMap) -> Vec<u16> {
-    assert_eq!(map.volume(), 27, "walks need a 3³ map");
-    let mut from = vec![1u16; map.len()];
-    let mut to: Vec<u16> = zeros(map.len());
-    for _ in 0..ROUNDS {
-        let blocks = to.par_chunks_mut(BLOCK).zip(map.rows().par_chunks(27 * BLOCK));
-        blocks.for_each(|(to, rows)| {
-            for (to, row) in to.iter_mut().zip(rows.chunks_exact(27)) {
-                *to = row.iter().filter_map(|&at| from.get(at as usize)).sum();
-            }
-        });
-        std::mem::swap(&mut from, &mut to);
-    }
-    from
+pub fn is_sparse_level(map: &KernelMap) -> bool {
+    assert_eq!(map.volume(), 27, "sparsity is measured in a 3³ map");
+    let absent = KernelMap::ABSENT;
+    let degree = |row: &[u32]| row.iter().map(|&at| u16::from(at != absent)).sum::<u16>();
+    is_sparse(map.rows().par_chunks_exact(27).map(degree))
 }
 
 #[cfg(test)]
@@ -112,21 +93,34 @@ mod tests {
     }
 
     #[test]
-    fn full_surfaces_are_not_sparse() {
-        assert_eq!(sparse_voxels(&map(6, plane())), None);
+    fn full_surfaces_and_wires_are_not_sparse() {
+        // Five voxels long, beside the surface.
+        let wires = (0..16 * 16 * 5).map(|i| [4 * (i % 16), 4 * (i / 16 % 16), 11 + i / 256]);
+        assert!(!is_sparse_level(&map(6, plane())));
+        assert!(!is_sparse_level(&map(6, plane().chain(wires))));
     }
 
     #[test]
-    fn lone_voxels_beside_a_surface_are_noise() {
-        let specks = (0..20).map(|i| [3 * i, 40, 50]);
-        let sparse = sparse_voxels(&map(6, plane().chain(specks))).unwrap();
-        assert_eq!(sparse.iter().filter(|&&on| on).count(), 20);
+    fn one_lone_voxel_in_512_makes_a_level_sparse() {
+        let specks = |count: u32| (0..count).map(|i| [3 * i, 40, 50]);
+        assert!(!is_sparse_level(&map(6, plane().chain(specks(8)))));
+        assert!(is_sparse_level(&map(6, plane().chain(specks(9)))));
     }
 
     #[test]
-    fn clouds_of_lone_voxels_are_sparse_and_not_noise() {
-        let lone = (0..4096).map(|i| [4 * (i % 16), 4 * (i / 16 % 16), 4 * (i / 256)]);
-        assert_eq!(sparse_voxels(&map(6, lone)), Some(vec![true; 4096]));
-        assert!(!Sparsity::of_block([1; 1024].into_iter()).is_noise(1));
+    fn small_levels_are_not_sparse() {
+        let lone = |count: u32| (0..count).map(|i| [4 * (i % 16), 4 * (i / 16 % 16), 4 * (i / 256)]);
+        assert!(!is_sparse_level(&map(6, lone(1023))));
+        assert!(is_sparse_level(&map(6, lone(1024))));
+    }
+
+    #[test]
+    fn lone_voxels_among_others_are_noise_and_alone_are_not() {
+        let block = |weights: &[u16]| Sparsity::of_block(weights.iter().copied());
+        assert!(!block(&[1; 1024]).is_noise(1));
+        let mixed: Vec<u16> = (0..1000).map(|i| if i % 5 == 0 { 1 } else { 729 }).collect();
+        assert!(block(&mixed).is_noise(1) && !block(&mixed).wants_window(1));
+        // So it is in a short block.
+        assert!(block(&mixed[..10]).is_noise(1));
     }
 }
