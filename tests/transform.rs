@@ -272,7 +272,9 @@ fn learned_heads_leave_sparse_levels_to_surfels() {
     let bytes = stream(&sparse_wall(), &with(QualityTarget::Lossless));
     let model = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
     let draw = |heads: HeadSet, level| {
-        let decoder = Decoder::new().with_heads_model(HeadsModel::clone(&model)).with_heads(heads);
+        let decoder = Decoder::new()
+            .with_heads_model(HeadsModel::clone(&model))
+            .with_heads(heads);
         decoder.with_level(level).decode(&bytes).unwrap()
     };
     for heads in [HeadSet::Best, HeadSet::Quick] {

@@ -45,7 +45,11 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         ("exact-slices", code(&ball, 2..=5, lossless, 20, true), true),
         ("exact-solid", code(&solid, 0..=4, lossless, 300, true), true),
         ("exact-one-voxel", code(&one, 7..=10, lossless, 9, true), true),
-        ("exact-sparse", code(&sparse_wall(), 6..=7, lossless, 32_768, true), true),
+        (
+            "exact-sparse",
+            code(&sparse_wall(), 6..=7, lossless, 32_768, true),
+            true,
+        ),
         ("exact-deepest", code(&lone, 21..=21, lossless, 16, true), true),
     ]
 }

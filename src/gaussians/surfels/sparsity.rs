@@ -1,4 +1,4 @@
-//! Which levels and neighbourhoods lack voxels: measured from occupancy alone.
+//! Which levels and neighbourhoods lack voxels: measured from occupancy alone (`docs/format.md`, clause 6.3.2).
 //!
 //! A level is sparse if one in 512 of its voxels has no neighbour. Clouds sampled densely from surfaces have next to
 //! none, wires and twigs included. Captures at the finest level of their grid have more: points are missing, or stray.

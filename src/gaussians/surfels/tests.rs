@@ -366,7 +366,10 @@ fn lone_voxels_are_faint_beside_a_dense_surface_only() {
         assert_eq!(*opacity, if is_speck { 1.0 / 64.0 } else { 1.0 });
     }
     // A few stand for nothing, and without a surface they are all there is.
-    for few in [wall(1.0).into_iter().chain(specks(20)).collect(), specks(1024).collect::<Vec<_>>()] {
+    for few in [
+        wall(1.0).into_iter().chain(specks(20)).collect(),
+        specks(1024).collect::<Vec<_>>(),
+    ] {
         let (voxels, map) = cloud(7, few);
         assert!(one_each(&voxels, &map).opacity.iter().all(|&opacity| opacity == 1.0));
     }

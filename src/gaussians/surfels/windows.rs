@@ -1,4 +1,5 @@
-//! Windows: cubes around voxels that have few connected neighbours, because the grid is finer than the points are close.
+//! Windows: cubes around voxels that have few connected neighbours, because the grid is finer than the points are close
+//! (`docs/format.md`, clause 6.3.3).
 //!
 //! Windows reach 2, 4 and 8 voxels far. A voxel takes the first that holds at least [`LEAST`] voxels, itself included.
 //! Their moments replace those of the walks (`moments.rs`), which need neighbours that touch. A surface of which an
