@@ -12,7 +12,7 @@ use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
 use crate::gaussians::learned::LevelInput;
-use crate::gaussians::surfels::is_sparse_level;
+use crate::gaussians::surfels::is_for_surfels;
 use crate::gaussians::{Gaussians, HeadMap};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::latents::nothing_reached;
@@ -99,7 +99,7 @@ impl Reached {
     /// Whether surfels draw all of the level, whatever heads are asked for.
     pub fn is_all_surfels(&self) -> bool {
         let head_map = self.head_map.as_ref();
-        head_map.is_some_and(HeadMap::is_all_surfels) || is_sparse_level(&self.map)
+        head_map.is_some_and(HeadMap::is_all_surfels) || is_for_surfels(&self.map)
     }
 
     /// Calls `with` with what learned heads read, of the voxels that they draw; none at level 0, or if surfels draw all.

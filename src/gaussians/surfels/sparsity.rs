@@ -15,6 +15,9 @@ use crate::geometry::KernelMap;
 const LONE_SHARE: usize = 512;
 /// Levels with fewer voxels are never sparse: at coarse levels, small parts of scenes are lone voxels.
 const LEAST: usize = 1024;
+/// A sparse level is drawn with surfels if one in so many voxels has at most [`THIN`] within one step, itself included.
+const THIN_SHARE: usize = 64;
+const THIN: u16 = 3;
 /// Weight below which a voxel lacks most neighbours, and takes a window in an open block: less than at a border.
 const FEW: u16 = 300;
 /// A block is open if one in so many voxels lacks most neighbours and is no speck.
@@ -66,16 +69,18 @@ pub fn is_sparse(degrees: impl IndexedParallelIterator<Item = u16>) -> bool {
     all >= LEAST && LONE_SHARE * lone >= all
 }
 
-/// Whether the level of a map is sparse, so that surfels draw it in place of learned heads, which never saw such
-/// neighbourhoods.
+/// Whether surfels draw the level of a map in place of learned heads, which never saw such neighbourhoods: it is sparse,
+/// and more than stray voxels lack neighbours.
 ///
 /// # Panics
 /// If `map` is not a 3³ map.
-pub fn is_sparse_level(map: &KernelMap) -> bool {
+pub fn is_for_surfels(map: &KernelMap) -> bool {
     assert_eq!(map.volume(), 27, "sparsity is measured in a 3³ map");
     let absent = KernelMap::ABSENT;
     let degree = |row: &[u32]| row.iter().map(|&at| u16::from(at != absent)).sum::<u16>();
-    is_sparse(map.rows().par_chunks_exact(27).map(degree))
+    let degrees = || map.rows().par_chunks_exact(27).map(degree);
+    let thin = || degrees().with_min_len(BLOCK).filter(|&degree| degree <= THIN).count();
+    is_sparse(degrees()) && THIN_SHARE * thin() >= map.len()
 }
 
 #[cfg(test)]
@@ -92,6 +97,13 @@ mod tests {
         (0..64 * 64).map(|i| [i % 64, i / 64, 9])
     }
 
+    fn is_sparse_level(map: &KernelMap) -> bool {
+        is_sparse((0..map.len()).into_par_iter().map(|i| {
+            let row = &map.rows()[27 * i..27 * (i + 1)];
+            row.iter().filter(|&&at| at != KernelMap::ABSENT).count() as u16
+        }))
+    }
+
     #[test]
     fn full_surfaces_and_wires_are_not_sparse() {
         // Five voxels long, beside the surface.
@@ -105,6 +117,14 @@ mod tests {
         let specks = |count: u32| (0..count).map(|i| [3 * i, 40, 50]);
         assert!(!is_sparse_level(&map(6, plane().chain(specks(8)))));
         assert!(is_sparse_level(&map(6, plane().chain(specks(9)))));
+    }
+
+    #[test]
+    fn learned_heads_draw_surfaces_with_stray_voxels_and_leave_more_of_them_to_surfels() {
+        let specks = |count: u32| (0..count).map(|i| [3 * (i % 20), 20 + 3 * (i / 20), 50]);
+        assert!(!is_for_surfels(&map(6, plane())));
+        assert!(!is_for_surfels(&map(6, plane().chain(specks(64)))));
+        assert!(is_for_surfels(&map(6, plane().chain(specks(66)))));
     }
 
     #[test]
