@@ -56,6 +56,43 @@ def relative(m, coordinates):
     return F(m[:, 0]), [F(signed(x)) for x in s], q
 
 
+def sparsity(degree, n):
+    """6.3.2: masks of the voxels in open blocks, and of those that are noise unless they take a window."""
+    is_open, noise = np.zeros(len(n), dtype=bool), np.zeros(len(n), dtype=bool)
+    if len(n) < 1024 or 512 * (degree == 1).sum() < len(n):
+        return is_open, noise
+    for first in range(0, len(n), 1024):
+        block = slice(first, first + 1024)
+        specks = n[block] < 27
+        few = (n[block] < 300) & ~specks
+        noisy = 4 * specks.sum() < len(specks)
+        is_open[block] = 8 * few.sum() >= len(specks) or not noisy
+        noise[block] = specks & noisy
+    return is_open, noise
+
+
+def windows(voxels, wanted):
+    """6.3.3: rows, n, s, q (as in 6.2.2) and reach of the voxels that take a window."""
+    all_voxels = np.array(voxels.coordinates, dtype=np.int64)
+    scales = range(1, min(3, voxels.level) + 1)
+    cells = {k: {} for k in scales}
+    for k in scales if wanted.any() else ():
+        for i, c in enumerate(all_voxels):
+            cells[k].setdefault(tuple(c >> k), []).append(i)
+    found = []
+    for i in np.flatnonzero(wanted):
+        for k in scales:
+            around = [tuple((all_voxels[i] >> k) + delta) for delta in OFFSETS]
+            near = [j for cell in around for j in cells[k].get(cell, ())]
+            d = all_voxels[near] - all_voxels[i]
+            d = d[(abs(d) <= 1 << k).all(axis=1)]
+            if len(d) >= 16:
+                found.append((i, len(d), *d.sum(axis=0), *((d[:, a] * d[:, b]).sum() for a, b in PAIRS), 1 << k))
+                break
+    table = np.array(found, dtype=np.int64).reshape(-1, 12).T
+    return table[0], F(table[1]), [F(x) for x in table[2:5]], [F(x) for x in table[5:11]], F(table[11])
+
+
 def dot(a, b):
     """6.5"""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -86,12 +123,16 @@ def normals(cov):
     return [n * up for n in normal], np.minimum(low, d[2]), np.maximum(low, np.minimum(high, d[2]))
 
 
-def discs(voxels):
-    """6.5: place, radius, thickness and rotation of every voxel's disc."""
-    near, far = moments(voxels)
-    n, s, _ = relative(near, voxels.coordinates)
-    near = [x / n for x in s]
-    n, s, q = relative(far, voxels.coordinates)
+def window_spacing(n, shift, density, reach):
+    """6.5.3"""
+    side = F(2) * reach + F(1)
+    border = F(1) + F(4) * shift / (reach * reach)
+    filled = np.minimum(n * border / (side * side * density), F(1))
+    return np.minimum((F(1) + F(0.5) * (F(1) - filled)) / np.sqrt(filled), reach)
+
+
+def disc(near, n, s, q, reach=None):
+    """6.3 to 6.5: place, radius, thickness, rotation and spacing, as one array of 10 rows."""
     centre = [x / n for x in s]
     normal, least, middle = normals([x / n - centre[a] * centre[b] for x, (a, b) in zip(q, PAIRS)])
     low, high = dot(near, normal), dot(centre, normal)
@@ -99,16 +140,38 @@ def discs(voxels):
     thick = np.clip((least - density * density / F(12)) / F(0.4), F(0), F(1))
     height = high + thick * (low - high)
     place = [normal[a] * height + F(0.2) * (centre[a] - high * normal[a]) for a in range(3)]
-    flat = np.minimum(middle / F(0.6), F(1))
-    radius = F(0.4) + flat * (F(0.62) / np.sqrt(density) - F(0.4))
+    if reach is None:
+        flat = np.minimum(middle / F(0.6), F(1))
+        spacing = np.ones_like(flat)
+    else:
+        shift = np.maximum(dot(centre, centre) - high * high, F(0))
+        extent = np.minimum(middle / (F(0.15) * (reach * reach)), F(1))
+        flat = extent * np.clip(F(2) - F(4) * least / (middle + F(1e-6)), F(0), F(1))
+        spacing = window_spacing(n, shift, density, reach)
+    radius = F(0.4) + flat * (F(0.62) / np.sqrt(density) * spacing - F(0.4))
     thickness = F(0.4) + flat * (F(0.01) - F(0.4))
     w = F(1) + normal[2]
     norm = np.sqrt(w * w + normal[0] * normal[0] + normal[1] * normal[1])
     rotation = [w / norm, -normal[1] / norm, normal[0] / norm, np.zeros_like(w)]
-    return place, radius, thickness, rotation
+    return np.stack([*place, radius, thickness, *rotation, spacing])
 
 
-def quarters(voxels, colours, place, rotation):
+def discs(voxels):
+    """6.5: place, radius, thickness, rotation, spacing and opacity of every voxel's disc."""
+    near, far = moments(voxels)
+    is_open, noise = sparsity(near[:, 0], far[:, 0])
+    n, s, _ = relative(near, voxels.coordinates)
+    near = np.stack([x / n for x in s])
+    made = disc(near, *relative(far, voxels.coordinates))
+    rows, *window = windows(voxels, is_open & (far[:, 0] < 300))
+    opacity = np.where(noise, F(1 / 64), F(1))
+    opacity[rows] = 1
+    if len(rows):
+        made[:, rows] = disc(near[:, rows], *window)
+    return list(made[:3]), made[3], made[4], list(made[5:9]), made[9], opacity
+
+
+def quarters(voxels, colours, place, rotation, spacing):
     """6.6.3: offsets and colours of four Gaussians for each voxel."""
     w, x, y, _ = rotation
     one, two = F(1), F(2)
@@ -125,20 +188,20 @@ def quarters(voxels, colours, place, rotation):
         ru, rv = ru + a * change, rv + b * change
     det = uu * vv - uv * uv
     gu, gv = (vv * ru - uv * rv) / det, (uu * rv - uv * ru) / det
-    for a, b in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
-        a, b = F(a), F(b)
+    far = F(0.25) * spacing
+    for a, b in ((-far, -far), (far, -far), (-far, far), (far, far)):
         offset = [place[i] + a * u[i] + b * v[i] for i in range(3)]
         yield offset, np.clip(colours + a * gu + b * gv, F(0), F(255))
 
 
 def surfels(voxels, colours, count, size):
     """6.6: one or four Gaussians for each voxel; `size` in 64ths."""
-    place, radius, thickness, rotation = discs(voxels)
+    place, radius, thickness, rotation, spacing, opacity = discs(voxels)
     colours = np.array(colours, dtype=F).T
     edge = F(2) / F(1 << voxels.level)
     parts, narrow = [(place, colours)], F(1)
     if count == 4:
-        parts, narrow = list(quarters(voxels, colours, place, rotation)), F(0.6)
+        parts, narrow = list(quarters(voxels, colours, place, rotation, spacing)), F(0.6)
     centre = (np.array(voxels.coordinates, dtype=np.float64) + 0.5) * np.float64(edge) - 1
     r = radius * narrow * (F(size) / F(64)) * edge
 
@@ -149,6 +212,6 @@ def surfels(voxels, colours, count, size):
         rows([[F(centre[:, a]) + offset[a] * edge for a in range(3)] for offset, _ in parts]),
         rows([[r, r, thickness * edge]] * len(parts)),
         rows([rotation] * len(parts)),
-        np.ones(len(parts) * len(voxels), dtype=F),
+        np.repeat(opacity, len(parts)),
         rows([rgb / F(255) for _, rgb in parts]),
     )

@@ -13,6 +13,7 @@ use b2p::encoder::{Options, Residual, encode};
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::gaussians::{Gaussians, Harmonics};
+use b2p::geometry::morton;
 use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Model, Shape, untrained};
 use b2p::layers::Precision;
@@ -117,7 +118,11 @@ fn transformed(cloud: &ColouredVoxels) -> [Vec<u8>; 3] {
 fn decoding_version_3_holds_no_more_than_the_bound_that_its_header_gives() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let decoder = Decoder::new().with_limits(Limits::unlimited());
-    for (kind, cloud) in clouds() {
+    let mut clouds = clouds();
+    // Surfels fit windows to all of these.
+    let lattice = (0..40 * 40 * 40).map(|i| [i % 40, i / 40 % 40, i / 1600].map(|v| 3 * v));
+    clouds.push(("lattice", cloud_of(7, lattice.map(morton::encode).collect())));
+    for (kind, cloud) in clouds {
         for bytes in transformed(&cloud) {
             let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
             for level in header.base..=header.top {

@@ -14,7 +14,7 @@ use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::{Axes, Cancel, Error, Isa, Limits, Up};
 use b2p::{Decoder, Decoding};
-use common::{Ball, cloud_of, tiny_model};
+use common::{Ball, cloud_of, sparse_wall, tiny_model};
 
 fn stream(cloud: &ColouredVoxels, options: &Options) -> Vec<u8> {
     let encoded = encode(cloud, options, &Log::default());
@@ -265,6 +265,23 @@ fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_
         most = f64::max(most, if learned < 1.0 { surfels } else { 0.0 });
     }
     assert!(most > 0.3, "{most}");
+}
+
+#[test]
+fn learned_heads_leave_sparse_levels_to_surfels() {
+    let bytes = stream(&sparse_wall(), &with(QualityTarget::Lossless));
+    let model = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
+    let draw = |heads: HeadSet, level| {
+        let decoder = Decoder::new()
+            .with_heads_model(HeadsModel::clone(&model))
+            .with_heads(heads);
+        decoder.with_level(level).decode(&bytes).unwrap()
+    };
+    for heads in [HeadSet::Best, HeadSet::Quick] {
+        assert!(draw(heads, 7) == draw(HeadSet::Surfels, 7), "{heads}");
+        // Half of the grid's resolution leaves hardly a voxel without neighbours.
+        assert!(draw(heads, 5) != draw(HeadSet::Surfels, 5), "{heads}");
+    }
 }
 
 #[test]

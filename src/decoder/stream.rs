@@ -400,7 +400,7 @@ impl Decoder {
         let (Some((model, set)), Some(above)) = (network, &reached.above) else {
             return discs(None);
         };
-        if map_of_heads.is_some_and(HeadMap::is_all_surfels) {
+        if reached.is_all_surfels() {
             return discs(None);
         }
         let chosen = map_of_heads.and_then(|heads| heads.surfels(octree, level));

@@ -12,6 +12,7 @@ use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
 use crate::gaussians::learned::LevelInput;
+use crate::gaussians::surfels::is_for_surfels;
 use crate::gaussians::{Gaussians, HeadMap};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::latents::nothing_reached;
@@ -95,13 +96,19 @@ impl Reached {
         }
     }
 
+    /// Whether surfels draw all of the level, whatever heads are asked for.
+    pub fn is_all_surfels(&self) -> bool {
+        let head_map = self.head_map.as_ref();
+        head_map.is_some_and(HeadMap::is_all_surfels) || is_for_surfels(&self.map)
+    }
+
     /// Calls `with` with what learned heads read, of the voxels that they draw; none at level 0, or if surfels draw all.
     pub fn with_heads_input<T>(&self, isa: Isa, with: impl FnOnce(LevelInput<'_>) -> T) -> Option<T> {
         let above = self.above.as_ref()?;
-        let heads = self.head_map.as_ref();
-        if heads.is_some_and(HeadMap::is_all_surfels) {
+        if self.is_all_surfels() {
             return None;
         }
+        let heads = self.head_map.as_ref();
         let without = heads.and_then(|heads| heads.surfels(&self.octree, self.level));
         let colours_above = self.colours_above(above);
         Some(with(self.heads_input(isa, above, &colours_above, without.as_deref())))

@@ -13,6 +13,16 @@ use b2p::latents::{ResidualSteps, Steps};
 use b2p::log::Log;
 use b2p::{Limits, Placement};
 
+/// A slanted wall on a grid of 7 bits of which one voxel in five is there, beside the whole of a wall.
+pub fn sparse_wall() -> ColouredVoxels {
+    let is_there = |i: u32| u64::from(i).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32 & 0xff < 51;
+    let sparse = (0..96 * 96u32)
+        .filter(|&i| is_there(i))
+        .map(|i| [i % 96, i / 96, 20 + i % 96 / 5]);
+    let whole = (0..48 * 48u32).map(|i| [60 + i % 48, 60 + i / 48, 120]);
+    cloud_of(7, sparse.chain(whole).map(morton::encode).collect())
+}
+
 /// A coloured ball's surface on a voxel grid.
 pub struct Ball {
     bits: u8,

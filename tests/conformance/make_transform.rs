@@ -4,7 +4,7 @@ use b2p::cloud::ColouredVoxels;
 use b2p::encoder::transform::{Options, QualityTarget, encode};
 use b2p::log::Log;
 
-use crate::common::{Ball, cloud_of};
+use crate::common::{Ball, cloud_of, sparse_wall};
 
 /// A stream of the suite, what is unusual about it in its name, and whether no float had a part in it, so that every
 /// machine makes the same bytes.
@@ -45,6 +45,11 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         ("exact-slices", code(&ball, 2..=5, lossless, 20, true), true),
         ("exact-solid", code(&solid, 0..=4, lossless, 300, true), true),
         ("exact-one-voxel", code(&one, 7..=10, lossless, 9, true), true),
+        (
+            "exact-sparse",
+            code(&sparse_wall(), 6..=7, lossless, 32_768, true),
+            true,
+        ),
         ("exact-deepest", code(&lone, 21..=21, lossless, 16, true), true),
     ]
 }

@@ -19,6 +19,15 @@ const THICK: f32 = 0.4;
 /// over the borders of a surface.
 const INWARDS: f32 = 0.2;
 
+/// How much fewer voxels a window holds at the border of a surface, per squared distance of the mean from the voxel over
+/// the squared reach.
+const BORDER: f32 = 4.0;
+/// How much farther than the mean distance discs must reach to close a surface of which most voxels are missing, since
+/// those that are there are not evenly distributed.
+const UNEVEN: f32 = 0.5;
+/// Middle eigenvalue of a window from which on it counts as a surface, over the squared reach. A full one has 1/3.
+const WINDOW_SURFACE: f32 = 0.15;
+
 /// A voxel's disc. Lengths are in voxels.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Disc {
@@ -30,11 +39,15 @@ pub struct Disc {
     pub radius: f32,
     /// σ along the normal.
     pub thickness: f32,
+    /// Distance of the surface's voxels over that of a plane's, 1 or more.
+    pub spacing: f32,
+    pub opacity: f32,
 }
 
-/// The discs of [`GROUP`] voxels, from their moments after one step (`near`) and after all steps (`far`).
+/// The discs of [`GROUP`] voxels, from their moments after one step (`near`) and after all steps (`far`). With a
+/// `reach`, `far` has the moments of windows in place of those of walks.
 #[inline(always)]
-pub fn discs(near: &CentredMoments, far: &CentredMoments) -> [Disc; GROUP] {
+pub fn discs(near: &CentredMoments, far: &CentredMoments, reach: Option<&Lane>) -> [Disc; GROUP] {
     let mean = |m: &CentredMoments| axes(|axis| lane(|j| m.sum[axis][j] / m.count[j]));
     let (near, centre) = (mean(near), mean(far));
     let mut covariance = [[0.0; GROUP]; 6];
@@ -56,8 +69,16 @@ pub fn discs(near: &CentredMoments, far: &CentredMoments) -> [Disc; GROUP] {
         let (n, mean) = (&normal[axis], &centre[axis]);
         lane(|j| n[j] * height[j] + INWARDS * (mean[j] - high[j] * n[j]))
     });
-    let flat = lane(|j| (system.middle[j] / SURFACE).min(1.0));
-    let radius = lane(|j| SPHERE + flat[j] * (RADIUS / density[j].sqrt() - SPHERE));
+    let (flat, spacing) = match reach {
+        None => (lane(|j| (system.middle[j] / SURFACE).min(1.0)), [1.0; GROUP]),
+        Some(reach) => {
+            let distance = dot(&centre, &centre);
+            let shift = lane(|j| (distance[j] - high[j] * high[j]).max(0.0));
+            let flat = lane(|j| window_flatness(system.least[j], system.middle[j], reach[j]));
+            (flat, window_spacing(&far.count, &shift, &density, reach))
+        }
+    };
+    let radius = lane(|j| SPHERE + flat[j] * (RADIUS / density[j].sqrt() * spacing[j] - SPHERE));
     let thickness = lane(|j| SPHERE + flat[j] * (THICKNESS - SPHERE));
     let rotation = rotation_to(&normal);
     let mut discs = [Disc::default(); GROUP];
@@ -68,10 +89,35 @@ pub fn discs(near: &CentredMoments, far: &CentredMoments) -> [Disc; GROUP] {
             rotation: [w[j], i[j], k[j], l[j]],
             radius: radius[j],
             thickness: thickness[j],
+            spacing: spacing[j],
+            opacity: 1.0,
         };
     }
     discs
 }
+
+/// How far a surface's voxels lie apart, from how many there are in a window.
+#[inline(always)]
+fn window_spacing(count: &Lane, shift: &Lane, density: &Lane, reach: &Lane) -> Lane {
+    lane(|j| {
+        let side = 2.0 * reach[j] + 1.0;
+        let border = 1.0 + BORDER * shift[j] / (reach[j] * reach[j]);
+        let filled = (count[j] * border / (side * side * density[j])).min(1.0);
+        ((1.0 + UNEVEN * (1.0 - filled)) / filled.sqrt()).min(reach[j])
+    })
+}
+
+/// 1 if the voxels of a window form a surface, 0 if they form a line or fill the space.
+#[inline(always)]
+fn window_flatness(least: f32, middle: f32, reach: f32) -> f32 {
+    let extent = (middle / (WINDOW_SURFACE * (reach * reach))).min(1.0);
+    // TINY prevents 0 / 0.
+    let planar = (2.0 - 4.0 * least / (middle + TINY)).clamp(0.0, 1.0);
+    extent * planar
+}
+
+/// Far below the variance of voxels that are not on one line.
+const TINY: f32 = 1e-6;
 
 /// Number of voxels per unit area that a plane with this normal cuts.
 #[inline(always)]

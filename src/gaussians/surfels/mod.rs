@@ -8,6 +8,10 @@
 //! the plane the disc becomes rounder. [`PerVoxel::Four`] makes four smaller discs with colours along the local
 //! gradient.
 //!
+//! Captures are sparse at their finest level (`sparsity.rs`). There, in blocks where many voxels lack neighbours, these
+//! fit wider windows (`windows.rs`), whose discs are as large as the voxels are far apart; in other blocks, lone voxels
+//! are noise and become faint. Nothing changes at levels that are not sparse.
+//!
 //! All sums are integer sums. The rest is IEEE f32 additions, multiplications, divisions and square roots in a fixed
 //! order, so that the Gaussians are bit-exact on every machine and for any number of threads.
 
@@ -17,8 +21,10 @@ mod lanes;
 mod moments;
 mod normals;
 mod passes;
+mod sparsity;
 #[cfg(test)]
 mod tests;
+mod windows;
 
 use b2p_kernels::{Isa, zeros};
 use rayon::prelude::*;
@@ -26,9 +32,15 @@ use rayon::prelude::*;
 use super::{Frame, Gaussians};
 use crate::geometry::{KernelMap, Voxels};
 use discs::Disc;
+use moments::Moments;
+use sparsity::Sparsity;
+pub use sparsity::is_for_surfels;
+use windows::{Window, Windows};
 
-/// Voxels per task.
+/// Voxels per task, and per block whose sparsity is measured: part of the definition of surfels.
 const BLOCK: usize = 1024;
+/// Opacity of noise: little is seen of it, and all formats of Gaussians can say it.
+const FAINT: f32 = 1.0 / 64.0;
 /// [`Gaussians::blur`], in voxels squared.
 const BLUR: f32 = 0.003;
 /// Offset of the four discs along both axes of their plane from the centre of the single disc, in voxels.
@@ -121,16 +133,20 @@ pub fn surfels(
         frame,
         ..Gaussians::default()
     };
+    let sparse = sparsity::is_sparse(near[..voxels.len()].par_iter().map(|moments| moments[0]));
     let tasks = Rows::of(&mut gaussians).tasks(voxels.len(), n, choice);
     tasks.into_par_iter().for_each(|(first, rows)| {
         let last = (first + BLOCK).min(voxels.len());
         let coordinates: Vec<[u32; 3]> = (first..last).map(|i| voxels.coordinate(i)).collect();
         let (near, far) = (&near[first..last], &far[first..last]);
-        let discs = isa.run(passes::Fit {
+        let mut discs = isa.run(passes::Fit {
             coordinates: &coordinates,
             near,
             far,
         });
+        if sparse {
+            fit_windows(isa, voxels, &coordinates, near, far, &mut discs);
+        }
         let mut to = 0;
         for (j, (disc, &coordinate)) in discs.iter().zip(&coordinates).enumerate() {
             if !choice.has(first + j) {
@@ -146,6 +162,7 @@ pub fn surfels(
                 rows.position[to] = cube_point(coordinate, offset, edge);
                 rows.scale[to] = [radius, radius, disc.thickness * edge];
                 rows.rotation[to] = disc.rotation;
+                rows.opacity[to] = disc.opacity;
                 rows.colour[to] = rgb.map(|v| v / 255.0);
                 to += 1;
             }
@@ -159,6 +176,7 @@ struct Rows<'a> {
     position: &'a mut [[f32; 3]],
     scale: &'a mut [[f32; 3]],
     rotation: &'a mut [[f32; 4]],
+    opacity: &'a mut [f32],
     colour: &'a mut [[f32; 3]],
 }
 
@@ -168,6 +186,7 @@ impl<'a> Rows<'a> {
             position: &mut gaussians.position,
             scale: &mut gaussians.scale,
             rotation: &mut gaussians.rotation,
+            opacity: &mut gaussians.opacity,
             colour: &mut gaussians.colour,
         }
     }
@@ -189,20 +208,60 @@ impl<'a> Rows<'a> {
         let (position, positions) = self.position.split_at_mut(count);
         let (scale, scales) = self.scale.split_at_mut(count);
         let (rotation, rotations) = self.rotation.split_at_mut(count);
+        let (opacity, opacities) = self.opacity.split_at_mut(count);
         let (colour, colours) = self.colour.split_at_mut(count);
         let rows = Rows {
             position,
             scale,
             rotation,
+            opacity,
             colour,
         };
         let rest = Rows {
             position: positions,
             scale: scales,
             rotation: rotations,
+            opacity: opacities,
             colour: colours,
         };
         (rows, rest)
+    }
+}
+
+/// Fits the discs of voxels that lack neighbours to the windows around them, if the block is open, and makes noise
+/// faint. Dense parts have some such voxels, in thin bars, and windows would close the gaps between bars.
+fn fit_windows(
+    isa: Isa,
+    voxels: &Voxels,
+    coordinates: &[[u32; 3]],
+    near: &[Moments],
+    far: &[Moments],
+    discs: &mut [Disc],
+) {
+    let block = Sparsity::of_block(far.iter().map(|moments| moments[0]));
+    for (disc, moments) in discs.iter_mut().zip(far) {
+        if block.is_noise(moments[0]) {
+            disc.opacity = FAINT;
+        }
+    }
+    let mut search = Windows::new(voxels);
+    let wanted = (0..discs.len()).filter(|&j| block.wants_window(far[j][0]));
+    let found: Vec<(usize, Window)> = wanted
+        .filter_map(|j| Some((j, search.around(coordinates[j])?)))
+        .collect();
+    if found.is_empty() {
+        return;
+    }
+    let coordinates: Vec<_> = found.iter().map(|&(j, _)| coordinates[j]).collect();
+    let near: Vec<_> = found.iter().map(|&(j, _)| near[j]).collect();
+    let windows: Vec<_> = found.iter().map(|&(_, window)| window).collect();
+    let fitted = isa.run(passes::FitWindows {
+        coordinates: &coordinates,
+        near: &near,
+        windows: &windows,
+    });
+    for ((j, _), disc) in found.into_iter().zip(fitted) {
+        discs[j] = disc;
     }
 }
 
@@ -221,13 +280,8 @@ fn quarters(disc: &Disc, map: &KernelMap, colours: &[[u8; 3]], voxel: usize) -> 
     let [u, v] = colours::plane(disc);
     let [along_u, along_v] = colours::gradient(map, colours, voxel, [u, v]);
     let own = colours[voxel].map(f32::from);
-    [
-        (-OFFSET, -OFFSET),
-        (OFFSET, -OFFSET),
-        (-OFFSET, OFFSET),
-        (OFFSET, OFFSET),
-    ]
-    .map(|(a, b)| {
+    let far = OFFSET * disc.spacing;
+    [(-far, -far), (far, -far), (-far, far), (far, far)].map(|(a, b)| {
         let offset = [0, 1, 2].map(|axis| disc.centre[axis] + a * u[axis] + b * v[axis]);
         let rgb = [0, 1, 2].map(|c| own[c] + a * along_u[c] + b * along_v[c]);
         (offset, rgb.map(|v| v.clamp(0.0, 255.0)))

@@ -71,15 +71,23 @@ pub struct CentredMoments {
     pub square: [Lane; 6],
 }
 
+impl CentredMoments {
+    /// Those of single voxels.
+    #[inline(always)]
+    pub fn single() -> Self {
+        CentredMoments {
+            count: [1.0; GROUP],
+            sum: [[0.0; GROUP]; 3],
+            square: [[0.0; GROUP]; 6],
+        }
+    }
+}
+
 /// Moves the moments of up to [`GROUP`] voxels to their `coordinates`. Missing voxels get the moments of a single
 /// voxel.
 #[inline(always)]
 pub fn centred(moments: &[Moments], coordinates: &[[u32; 3]]) -> CentredMoments {
-    let mut lanes = CentredMoments {
-        count: [1.0; GROUP],
-        sum: [[0.0; GROUP]; 3],
-        square: [[0.0; GROUP]; 6],
-    };
+    let mut lanes = CentredMoments::single();
     for (j, (m, coordinate)) in moments.iter().zip(coordinates).enumerate() {
         let c = [coordinate[0] as u16, coordinate[1] as u16, coordinate[2] as u16];
         let (n, times) = (m[0], u16::wrapping_mul);

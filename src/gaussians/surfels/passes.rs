@@ -5,6 +5,7 @@ use b2p_kernels::{Instructions, Work};
 use super::discs::{Disc, discs};
 use super::lanes::GROUP;
 use super::moments::{Moments, centred};
+use super::windows::{Window, gathered};
 
 /// Sums the moments of all neighbours.
 pub struct Sum<'a> {
@@ -52,7 +53,31 @@ impl Work for Fit<'_> {
         let mut out = Vec::with_capacity(self.coordinates.len().next_multiple_of(GROUP));
         let groups = self.near.chunks(GROUP).zip(self.far.chunks(GROUP));
         for (coordinates, (near, far)) in self.coordinates.chunks(GROUP).zip(groups) {
-            out.extend(discs(&centred(near, coordinates), &centred(far, coordinates)));
+            out.extend(discs(&centred(near, coordinates), &centred(far, coordinates), None));
+        }
+        out.truncate(self.coordinates.len());
+        out
+    }
+}
+
+/// Fits the discs of voxels to windows.
+pub struct FitWindows<'a> {
+    pub coordinates: &'a [[u32; 3]],
+    /// Moments after one step.
+    pub near: &'a [Moments],
+    pub windows: &'a [Window],
+}
+
+impl Work for FitWindows<'_> {
+    type Output = Vec<Disc>;
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) -> Vec<Disc> {
+        let mut out = Vec::with_capacity(self.coordinates.len().next_multiple_of(GROUP));
+        let groups = self.near.chunks(GROUP).zip(self.windows.chunks(GROUP));
+        for (coordinates, (near, windows)) in self.coordinates.chunks(GROUP).zip(groups) {
+            let (far, reach) = gathered(windows);
+            out.extend(discs(&centred(near, coordinates), &far, Some(&reach)));
         }
         out.truncate(self.coordinates.len());
         out

@@ -1,6 +1,7 @@
 use super::discs::Disc;
 use super::*;
 use crate::geometry::{Octree, morton};
+use crate::testing::Random;
 use proptest::prelude::*;
 
 /// A cloud's voxels and kernel map.
@@ -306,6 +307,175 @@ fn a_choice_of_voxels_gives_their_discs_in_another_size() {
             assert_eq!(some.colour[to], all.colour[from]);
             let [u, v, thickness] = all.scale[from];
             assert_eq!(some.scale[to], [0.5 * u, 0.5 * v, thickness]);
+        }
+    }
+}
+
+/// A wall of 128 × 128 voxels at z = 9 of which a random share is there.
+fn wall(share: f64) -> Vec<[u32; 3]> {
+    let mut random = Random(5);
+    let mut is_there = move || (random.next() % 10_000) as f64 / 10_000.0 < share;
+    let all = (0..128 * 128).map(|i| [i % 128, i / 128, 9]);
+    all.filter(|_| is_there()).collect()
+}
+
+/// How opaque discs are at a place of the plane z = 9.5, in voxels.
+fn opacity(gaussians: &Gaussians, edge: f64, at: [f64; 2]) -> f64 {
+    let splats = gaussians.position.iter().zip(&gaussians.scale);
+    let transmitted = splats.map(|(p, s)| {
+        let off = |axis: usize| (f64::from(p[axis]) + 1.0) / edge - at[axis];
+        let sigma = f64::from(s[0]) / edge;
+        1.0 - (-(off(0).powi(2) + off(1).powi(2)) / (2.0 * sigma * sigma)).exp()
+    });
+    1.0 - transmitted.product::<f64>()
+}
+
+#[test]
+fn walls_close_whatever_share_of_their_voxels_is_there() {
+    for share in [1.0, 0.4, 0.25, 0.12] {
+        let (voxels, map) = cloud(7, wall(share));
+        let wall = one_each(&voxels, &map);
+        let inner = |i: u32| [f64::from(12 + i % 30 * 3) + 0.3, f64::from(12 + i / 30 * 3) + 0.7];
+        let open = (0..900)
+            .filter(|&i| opacity(&wall, 2.0 / 128.0, inner(i)) < 0.5)
+            .count();
+        assert!(open < 9, "{open} of 900 places are open at {share}");
+    }
+}
+
+#[test]
+fn discs_at_the_border_of_a_wall_reach_no_farther_than_its_points_are_apart() {
+    for share in [1.0, 0.6, 0.4, 0.25, 0.12, 0.08] {
+        let (voxels, map) = cloud(8, wall(share));
+        let wall = one_each(&voxels, &map);
+        // The mean distance of the points, and half a voxel.
+        let reach = 0.5 + 1.0 / share.sqrt();
+        let beside = |i: u32| [128.0 + reach, 4.0 + f64::from(2 * i)];
+        let mean = (0..60).map(|i| opacity(&wall, 2.0 / 256.0, beside(i))).sum::<f64>() / 60.0;
+        assert!(mean < 0.4, "{mean} at {share}");
+    }
+}
+
+#[test]
+fn lone_voxels_are_faint_beside_a_dense_surface_only() {
+    let specks = |count: u32| (0..count).map(|i| [4 * (i % 32), 4 * (i / 32), 20]);
+    let (voxels, map) = cloud(7, wall(1.0).into_iter().chain(specks(40)));
+    let drawn = one_each(&voxels, &map);
+    for (i, opacity) in drawn.opacity.iter().enumerate() {
+        let is_speck = voxels.coordinate(i)[2] == 20;
+        assert_eq!(*opacity, if is_speck { 1.0 / 64.0 } else { 1.0 });
+    }
+    // A few stand for nothing, and without a surface they are all there is.
+    for few in [
+        wall(1.0).into_iter().chain(specks(20)).collect(),
+        specks(1024).collect::<Vec<_>>(),
+    ] {
+        let (voxels, map) = cloud(7, few);
+        assert!(one_each(&voxels, &map).opacity.iter().all(|&opacity| opacity == 1.0));
+    }
+}
+
+#[test]
+fn levels_that_are_not_sparse_have_the_discs_of_walks_to_the_bit() {
+    let range = |side: u32| (0..side.pow(3)).map(move |i| [i % side, i / side % side, i / side.pow(2)]);
+    let off = |v: u32, middle: f64| f64::from(v) + 0.5 - middle;
+    let ball = range(48).filter(|at| (at.map(|v| off(v, 24.0).powi(2)).iter().sum::<f64>().sqrt() - 20.0).abs() < 0.6);
+    let torus = range(64).filter(|&[x, y, z]| {
+        let along = off(x, 32.0).hypot(off(y, 32.0)) - 20.0;
+        (along.hypot(off(z, 32.0)) - 7.0).abs() < 0.6
+    });
+    // A surface with single voxels missing, and one with a few lone voxels beside it.
+    let specks = (0..20).map(|i| [3 * i, 40, 50]);
+    let clouds = [
+        ball.collect::<Vec<_>>(),
+        torus.collect(),
+        wall(0.8),
+        wall(1.0).into_iter().chain(specks).collect(),
+    ];
+    for of in clouds {
+        let octree = Octree::new(Voxels::new(7, of.into_iter().map(morton::encode).collect())).unwrap();
+        for level in 4..=7 {
+            let (voxels, map) = (octree.level(level), octree.kernel_map(level));
+            let drawn = one_each(voxels, &map);
+            let edge = 2.0 / (1u32 << level) as f32;
+            for (i, disc) in all_discs(Isa::detect(), voxels, &map).into_iter().enumerate() {
+                let [radius, thickness] = [disc.radius, disc.thickness].map(|v| v * edge);
+                assert_eq!(drawn.scale[i], [radius, radius, thickness]);
+                assert_eq!(drawn.position[i], cube_point(voxels.coordinate(i), disc.centre, edge));
+                assert_eq!((drawn.rotation[i], drawn.opacity[i]), (disc.rotation, 1.0));
+            }
+        }
+    }
+}
+
+#[test]
+fn bars_beside_a_dense_surface_do_not_merge() {
+    // Bars one voxel thick, every fourth column, above a sheet that has most of the voxels; lone voxels above them.
+    let sheet = (0..60 * 60).map(|i| [i % 60, i / 60, 2]);
+    let bars = (0..4 * 20).map(|i| [4 * (i % 4), i / 4, 12]);
+    let specks = (0..20).map(|i| [3 * i, 50, 50]);
+    let (voxels, map) = cloud(6, sheet.chain(bars).chain(specks));
+    let near = moments::step(Isa::detect(), &map, &moments::of_voxels(&voxels));
+    assert!(sparsity::is_sparse(
+        near[..voxels.len()].par_iter().map(|moments| moments[0])
+    ));
+    let gaussians = one_each(&voxels, &map);
+    for i in (0..voxels.len()).filter(|&i| voxels.coordinate(i)[2] == 12) {
+        assert!(gaussians.scale[i].iter().all(|s| (s * 32.0 - 0.4).abs() < 0.01));
+    }
+}
+
+#[test]
+fn windows_give_the_same_discs_with_every_instruction_set_and_number_of_threads() {
+    let (voxels, map) = cloud(7, wall(0.2));
+    let colours: Vec<[u8; 3]> = (0..voxels.len()).map(|i| [i as u8, (i / 7) as u8, 90]).collect();
+    let draw = |isa, per_voxel| {
+        let (all, frame) = (SurfelSelection::ALL, Frame::default());
+        surfels(isa, &voxels, &map, &colours, per_voxel, all, frame)
+    };
+    for per_voxel in [PerVoxel::One, PerVoxel::Four] {
+        let expected = draw(Isa::SCALAR, per_voxel);
+        assert!(expected.scale.iter().any(|s| s[0] > 1.5 * 0.62 / 64.0));
+        for isa in Isa::available() {
+            for threads in [1, 2, 5] {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                let found = pool.install(|| draw(isa, per_voxel));
+                assert!(found == expected, "{isa}, {threads} threads");
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(32))]
+
+    #[test]
+    fn windows_hold_what_is_within_their_reach(
+        keys in prop::collection::vec(0u64..1 << 15, 1..200), depth in 5u8..21
+    ) {
+        let (voxels, _) = cloud(depth, keys.into_iter().map(morton::decode));
+        let mut search = Windows::new(&voxels);
+        let all: Vec<_> = (0..voxels.len()).map(|i| voxels.coordinate(i)).collect();
+        for &middle in &all {
+            let within = |reach: u32| {
+                let near = |at: &&[u32; 3]| (0..3).all(|a| at[a].abs_diff(middle[a]) <= reach);
+                all.iter().filter(near).collect::<Vec<_>>()
+            };
+            let reach = [2, 4, 8].into_iter().find(|&reach| within(reach).len() >= 16);
+            let window = search.around(middle);
+            prop_assert_eq!(window.map(|w| u32::from(w.reach)), reach);
+            if let Some(window) = window {
+                let inside = within(window.reach.into());
+                let offset = |at: &[u32; 3], a: usize| at[a] as i32 - middle[a] as i32;
+                prop_assert_eq!(usize::from(window.count), inside.len());
+                for (k, (a, b)) in moments::PAIRS.into_iter().enumerate() {
+                    let square: i32 = inside.iter().map(|at| offset(at, a) * offset(at, b)).sum();
+                    prop_assert_eq!(window.square[k], square);
+                }
+                for a in 0..3 {
+                    prop_assert_eq!(window.sum[a], inside.iter().map(|at| offset(at, a)).sum::<i32>());
+                }
+            }
         }
     }
 }

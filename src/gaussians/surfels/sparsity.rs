@@ -1,0 +1,146 @@
+//! Which levels and neighbourhoods lack voxels: measured from occupancy alone (`docs/format.md`, clause 6.3.2).
+//!
+//! A level is sparse if one in 512 of its voxels has no neighbour. Clouds sampled densely from surfaces have next to
+//! none, wires and twigs included. Captures at the finest level of their grid have more: points are missing, or stray.
+//!
+//! In sparse levels, the measure of a neighbourhood is the weight of a voxel's walks (`moments.rs`): a plane has 729 at
+//! least, half of one 351 at its border, and a lone voxel 1.
+
+use rayon::prelude::*;
+
+use super::BLOCK;
+use crate::geometry::KernelMap;
+
+/// A level is sparse if one in so many voxels is lone.
+const LONE_SHARE: usize = 512;
+/// Levels with fewer voxels are never sparse: at coarse levels, small parts of scenes are lone voxels.
+const LEAST: usize = 1024;
+/// A sparse level is drawn with surfels if one in so many voxels has at most [`THIN`] within one step, itself included.
+const THIN_SHARE: usize = 64;
+const THIN: u16 = 3;
+/// Weight below which a voxel lacks most neighbours, and takes a window in an open block: less than at a border.
+const FEW: u16 = 300;
+/// A block is open if one in so many voxels lacks most neighbours and is no speck.
+const FEW_SHARE: usize = 8;
+/// Weight below which a voxel is a speck: a line of three voxels has 17, an endless one 27.
+const SPECK: u16 = 27;
+/// A block is open if one in so many voxels is a speck. In others, specks are noise.
+const SPECK_SHARE: usize = 4;
+
+/// What holds for a block of voxels of a sparse level.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sparsity {
+    /// Whether many voxels lack most neighbours, so that surfaces are known from wider windows only.
+    open: bool,
+    /// Whether specks are noise.
+    noisy: bool,
+}
+
+impl Sparsity {
+    /// Of a block, from the weight of each voxel.
+    pub fn of_block(weights: impl ExactSizeIterator<Item = u16>) -> Self {
+        let (all, mut few, mut specks) = (weights.len(), 0, 0);
+        for weight in weights {
+            few += usize::from((SPECK..FEW).contains(&weight));
+            specks += usize::from(weight < SPECK);
+        }
+        let noisy = SPECK_SHARE * specks < all;
+        Sparsity {
+            open: FEW_SHARE * few >= all || !noisy,
+            noisy,
+        }
+    }
+
+    /// Whether a voxel of this weight looks for a window.
+    pub fn wants_window(self, weight: u16) -> bool {
+        self.open && weight < FEW
+    }
+
+    /// Whether a voxel of this weight that has no window is noise.
+    pub fn is_noise(self, weight: u16) -> bool {
+        self.noisy && weight < SPECK
+    }
+}
+
+/// Whether a level is sparse, from the number of voxels within one step of each, itself included.
+pub fn is_sparse(degrees: impl IndexedParallelIterator<Item = u16>) -> bool {
+    let all = degrees.len();
+    let lone = degrees.with_min_len(BLOCK).filter(|&degree| degree == 1).count();
+    all >= LEAST && LONE_SHARE * lone >= all
+}
+
+/// Whether surfels draw the level of a map in place of learned heads, which never saw such neighbourhoods: it is sparse,
+/// and more than stray voxels lack neighbours.
+///
+/// # Panics
+/// If `map` is not a 3³ map.
+pub fn is_for_surfels(map: &KernelMap) -> bool {
+    assert_eq!(map.volume(), 27, "sparsity is measured in a 3³ map");
+    let absent = KernelMap::ABSENT;
+    let degree = |row: &[u32]| row.iter().map(|&at| u16::from(at != absent)).sum::<u16>();
+    let degrees = || map.rows().par_chunks_exact(27).map(degree);
+    let thin = || degrees().with_min_len(BLOCK).filter(|&degree| degree <= THIN).count();
+    is_sparse(degrees()) && THIN_SHARE * thin() >= map.len()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Octree, Voxels, morton};
+
+    fn map(depth: u8, cloud: impl Iterator<Item = [u32; 3]>) -> KernelMap {
+        let octree = Octree::new(Voxels::new(depth, cloud.map(morton::encode).collect())).unwrap();
+        (0..depth).fold(octree.kernel_map(0), |map, level| octree.child_map(level, &map))
+    }
+
+    fn plane() -> impl Iterator<Item = [u32; 3]> {
+        (0..64 * 64).map(|i| [i % 64, i / 64, 9])
+    }
+
+    fn is_sparse_level(map: &KernelMap) -> bool {
+        is_sparse((0..map.len()).into_par_iter().map(|i| {
+            let row = &map.rows()[27 * i..27 * (i + 1)];
+            row.iter().filter(|&&at| at != KernelMap::ABSENT).count() as u16
+        }))
+    }
+
+    #[test]
+    fn full_surfaces_and_wires_are_not_sparse() {
+        // Five voxels long, beside the surface.
+        let wires = (0..16 * 16 * 5).map(|i| [4 * (i % 16), 4 * (i / 16 % 16), 11 + i / 256]);
+        assert!(!is_sparse_level(&map(6, plane())));
+        assert!(!is_sparse_level(&map(6, plane().chain(wires))));
+    }
+
+    #[test]
+    fn one_lone_voxel_in_512_makes_a_level_sparse() {
+        let specks = |count: u32| (0..count).map(|i| [3 * i, 40, 50]);
+        assert!(!is_sparse_level(&map(6, plane().chain(specks(8)))));
+        assert!(is_sparse_level(&map(6, plane().chain(specks(9)))));
+    }
+
+    #[test]
+    fn learned_heads_draw_surfaces_with_stray_voxels_and_leave_more_of_them_to_surfels() {
+        let specks = |count: u32| (0..count).map(|i| [3 * (i % 20), 20 + 3 * (i / 20), 50]);
+        assert!(!is_for_surfels(&map(6, plane())));
+        assert!(!is_for_surfels(&map(6, plane().chain(specks(64)))));
+        assert!(is_for_surfels(&map(6, plane().chain(specks(66)))));
+    }
+
+    #[test]
+    fn small_levels_are_not_sparse() {
+        let lone = |count: u32| (0..count).map(|i| [4 * (i % 16), 4 * (i / 16 % 16), 4 * (i / 256)]);
+        assert!(!is_sparse_level(&map(6, lone(1023))));
+        assert!(is_sparse_level(&map(6, lone(1024))));
+    }
+
+    #[test]
+    fn lone_voxels_among_others_are_noise_and_alone_are_not() {
+        let block = |weights: &[u16]| Sparsity::of_block(weights.iter().copied());
+        assert!(!block(&[1; 1024]).is_noise(1));
+        let mixed: Vec<u16> = (0..1000).map(|i| if i % 5 == 0 { 1 } else { 729 }).collect();
+        assert!(block(&mixed).is_noise(1) && !block(&mixed).wants_window(1));
+        // So it is in a short block.
+        assert!(block(&mixed[..10]).is_noise(1));
+    }
+}
