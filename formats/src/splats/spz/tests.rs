@@ -196,12 +196,17 @@ fn coordinates_have_the_bits_that_the_sizes_of_gaussians_need() {
         let mut rows = Rows::new(&g, None).unwrap();
         rows.sort_in_space();
         let after = Rows::new(&after, None).unwrap();
-        let after_offset = after.offset();
+        let world = |rows: &Rows, row: &Row| -> [f64; 3] {
+            let offset = rows.offset();
+            std::array::from_fn(|k| row.position[k] + offset[k])
+        };
         for (a, b) in rows.iter().zip(after.iter()) {
-            for k in 0..3 {
-                let off = (a.position[k] + rows.offset()[k]) - (b.position[k] + after_offset[k]);
-                assert!(off.abs() <= f64::from(size) * MOST_ERROR + 1e-6, "{size} {a:?} {b:?}");
-            }
+            let (from, to) = (world(&rows, &a), world(&after, &b));
+            let near = from
+                .iter()
+                .zip(to)
+                .all(|(a, b)| (a - b).abs() <= f64::from(size) * MOST_ERROR + 1e-6);
+            assert!(near, "{size} {a:?} {b:?}");
         }
         bytes[13]
     };
