@@ -8,6 +8,7 @@
 mod codebook;
 mod palette;
 mod pictures;
+mod webp;
 
 use std::io::{self, Write};
 
@@ -229,10 +230,7 @@ pub(super) fn write(rows: &mut Rows, to: &mut dyn Write, io: &dyn Fn(io::Error) 
     let mut picture = |name: &str, pixels: &[[u8; 4]]| {
         let mut pixels = pixels.to_vec();
         pixels.resize((width * height) as usize, [0; 4]);
-        add(
-            name,
-            &pictures::write(&pixels, width, height).map_err(io::Error::other)?,
-        )
+        add(name, &webp::encode(&pixels, width, height))
     };
 
     let means = Means::of(rows);
@@ -267,7 +265,7 @@ pub(super) fn write(rows: &mut Rows, to: &mut dyn Write, io: &dyn Fn(io::Error) 
             .collect();
         picture("shN_labels.webp", &labels).map_err(io)?;
         let (centroids, meta_of) = pictures_of(&palette, rows.harmonics());
-        add("shN_centroids.webp", &centroids.map_err(|e| io(io::Error::other(e)))?).map_err(io)?;
+        add("shN_centroids.webp", &centroids).map_err(io)?;
         meta["shN"] = meta_of;
     }
     add("meta.json", meta.to_string().as_bytes()).map_err(io)?;
@@ -275,7 +273,7 @@ pub(super) fn write(rows: &mut Rows, to: &mut dyn Write, io: &dyn Fn(io::Error) 
 }
 
 /// The picture of a palette, and its part of `meta.json`.
-fn pictures_of(palette: &palette::Palette, harmonics: usize) -> (Result<Vec<u8>, String>, Value) {
+fn pictures_of(palette: &palette::Palette, harmonics: usize) -> (Vec<u8>, Value) {
     let book = Codebook::of(palette.entries.iter().flatten().map(|&x| x.into()));
     let count = palette.entries.len() / harmonics;
     let (width, height) = (PER_ROW * harmonics, count.div_ceil(PER_ROW));
@@ -288,7 +286,7 @@ fn pictures_of(palette: &palette::Palette, harmonics: usize) -> (Result<Vec<u8>,
     let bands = COEFFICIENTS.iter().position(|&c| c == harmonics);
     let files = ["shN_centroids.webp", "shN_labels.webp"];
     let meta = json!({ "count": count, "bands": bands, "codebook": book.numbers(), "files": files });
-    (pictures::write(&pixels, width as u32, height as u32), meta)
+    (webp::encode(&pixels, width as u32, height as u32), meta)
 }
 
 /// Bounds of the logarithms of the coordinates.

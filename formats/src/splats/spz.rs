@@ -39,8 +39,12 @@ const KEPT: usize = 15;
 /// Bits of the harmonics of degree 1, and of the others, as Niantic's writer has them.
 const DEGREE_1_BITS: u32 = 5;
 const REST_BITS: u32 = 4;
-/// Most bits after the point of a coordinate.
+/// Bits after the point of a coordinate, where its size allows so many: what other writers have, and the most.
+const LEAST_FRACTION: u32 = 12;
 const MAX_FRACTION: u32 = 24;
+/// The largest error of a coordinate, as a part of the size of a small Gaussian: one that few are smaller than.
+const MOST_ERROR: f64 = 1.0 / 8.0;
+const SMALL_SHARE: usize = 20;
 /// 2^23: the first integer that a coordinate cannot hold.
 const RANGE: f64 = 8_388_608.0;
 const COLUMNS: [&str; 6] = ["positions", "opacities", "colours", "scales", "rotations", "harmonics"];
@@ -356,6 +360,7 @@ fn rotation(bytes: &[u8]) -> [f64; 4] {
 
 /// Writes version 4.
 pub(super) fn write(rows: &mut Rows, to: &mut dyn Write, io: &dyn Fn(io::Error) -> Error) -> Result<()> {
+    rows.sort_in_space();
     let fraction = fraction(rows)?;
     let mut columns: [Vec<u8>; 6] = Default::default();
     let mut clamped = 0;
@@ -418,16 +423,35 @@ fn write_columns(
     filled.iter().try_for_each(|(_, stream)| to.write_all(stream))
 }
 
-/// As many bits after the point as the coordinates leave.
+/// Bits after the point: as many as the Gaussians' sizes need, and as the coordinates leave. Bits below that are noise,
+/// which does not compress.
 fn fraction(rows: &Rows) -> Result<u32> {
     let (low, high) = rows.bounds();
     let farthest = low.iter().chain(&high).fold(0.0, |m: f64, x| m.max(x.abs()));
     let fits = |bits: u32| (farthest * f64::from(1u32 << bits)).round() < RANGE;
-    (0..=MAX_FRACTION).rev().find(|&bits| fits(bits)).ok_or_else(|| {
+    let size = small_size(rows);
+    let is_fine = |bits: &u32| 0.5 / f64::from(1u32 << bits) <= size * MOST_ERROR;
+    let needed = (LEAST_FRACTION..MAX_FRACTION).find(is_fine).unwrap_or(MAX_FRACTION);
+    (0..=needed).rev().find(|&bits| fits(bits)).ok_or_else(|| {
         Error::Usage(format!(
             "SPZ holds coordinates below 2²³, but there is one of {farthest}"
         ))
     })
+}
+
+/// The size that all but one Gaussian in twenty exceed. A Gaussian's size is its middle scale: discs have one of
+/// almost zero, and needles two that are thin.
+fn small_size(rows: &Rows) -> f64 {
+    let middle = |row: Row| {
+        let [a, b, c] = row.scale;
+        a.max(b).min(a.min(b).max(c))
+    };
+    let mut sizes: Vec<f64> = rows.iter().map(middle).collect();
+    if sizes.is_empty() {
+        return 0.0;
+    }
+    let rank = sizes.len() / SMALL_SHARE;
+    *sizes.select_nth_unstable_by(rank, f64::total_cmp).1
 }
 
 /// The index of the largest component, and of the others sign and 9 bits each; the order is x, y, z, w.

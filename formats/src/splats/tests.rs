@@ -59,7 +59,7 @@ pub(super) fn read_back(bytes: &[u8], format: Format, offset: [f64; 3]) -> Splat
 /// The rows in the order of the format's files, in the world, with their harmonics.
 fn world(gaussians: &Gaussians, format: Format, sort: bool) -> Vec<(Row, Vec<[f64; 3]>)> {
     let mut rows = Rows::new(gaussians, None).unwrap();
-    if sort && matches!(format, Format::CompressedPly | Format::Sog) {
+    if sort && matches!(format, Format::CompressedPly | Format::Sog | Format::Spz) {
         rows.sort_in_space();
     }
     let offset = rows.offset();
@@ -105,8 +105,8 @@ fn tolerance(format: Format, extent: f64, farthest: f64) -> Tolerance {
             harmonics: 8.0 / 256.0,
         },
         Format::Spz => Tolerance {
-            // 23 bits for the farthest, of which one is lost to the power of two.
-            position: farthest / 8_388_608.0 + 2f64.powi(-25) + float.position,
+            // 23 bits for the farthest, of which one is lost to the power of two, or 12 after the point.
+            position: farthest / 8_388_608.0 + 2f64.powi(-13) + float.position,
             log_scale: 1.0 / 32.0 + 1e-6,
             rotation: 3e-3,
             opacity: byte,

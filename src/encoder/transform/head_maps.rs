@@ -33,29 +33,45 @@ const MARGIN: f64 = 0.9;
 /// Squared errors over whole pictures and over the foreground.
 type Errors = [f64; 2];
 
-/// The pictures that levels are compared with.
+/// Pictures of the cloud, which levels are compared with. Nothing else of it is kept: Gaussians take much more memory.
 pub struct Reference {
     isa: Isa,
-    gaussians: Gaussians,
+    /// Of each side in use the views.
+    pictures: Vec<(u32, Vec<Image>)>,
 }
 
-/// What draws a level.
-pub struct Candidates<'a> {
-    pub octree: &'a Octree,
-    pub level: u8,
-    pub learned: Gaussians,
-    /// All voxels as surfels of the usual size.
-    pub surfels: Gaussians,
+/// What a level has, besides its Gaussians.
+pub struct Comparison<'a> {
+    reference: &'a Reference,
+    level: u8,
+    views: Views,
+    /// Of each view the block that its pixels show.
+    shown: Vec<Vec<Option<u32>>>,
+    sums: Sums,
 }
 
 impl Reference {
-    /// Draws the cloud's voxels, whose depth is at least 1.
-    pub fn new(isa: Isa, cloud: &ColouredVoxels) -> Result<Self> {
+    /// Draws the cloud's voxels, whose depth is at least 1, as these levels need it.
+    pub fn new(isa: Isa, cloud: &ColouredVoxels, levels: impl Iterator<Item = u8>) -> Result<Self> {
+        let gaussians = Self::gaussians(isa, cloud)?;
+        let mut pictures: Vec<(u32, Vec<Image>)> = Vec::new();
+        for side in levels.map(side) {
+            if pictures.iter().all(|(known, _)| *known != side) {
+                let mut views = Views::new(isa, side);
+                let drawn = VIEWS.map(|view| views.half(&gaussians, view));
+                pictures.push((side, drawn.into_iter().collect::<Result<_>>()?));
+            }
+        }
+        Ok(Reference { isa, pictures })
+    }
+
+    fn gaussians(isa: Isa, cloud: &ColouredVoxels) -> Result<Gaussians> {
         let octree = Octree::new(cloud.voxels.clone())?;
         let mut map = octree.kernel_map(0);
         for level in 0..octree.depth() {
             map = octree.child_map(level, &map);
         }
+        drop(octree);
         let choice = SurfelSelection {
             size: REFERENCE,
             ..SurfelSelection::ALL
@@ -65,47 +81,72 @@ impl Reference {
             placement: cloud.placement,
         };
         let (voxels, colours) = (&cloud.voxels, &cloud.colours);
-        let gaussians = surfels(isa, voxels, &map, colours, PerVoxel::One, choice, frame);
-        Ok(Reference { isa, gaussians })
+        Ok(surfels(isa, voxels, &map, colours, PerVoxel::One, choice, frame))
     }
 
-    /// The map of a level.
-    pub fn head_map(&self, level: &Candidates<'_>) -> Result<HeadMap> {
-        let blocks = HeadMap::block_of(level.octree, level.level);
-        let per_voxel = level.surfels.len() / blocks.len();
-        let mut sums = Sums {
-            blocks: vec![Default::default(); HeadMap::block_count(level.octree, level.level)],
-            all: Default::default(),
-        };
-        let sized = SIZES.map(|size| scaled(&level.surfels, f32::from(size) / 64.0));
-        let candidates = [&level.learned, &sized[0], &sized[1], &sized[2]];
-        let wide = scaled(&level.surfels, WIDER);
-        let mut views = Views {
-            renderer: Renderer::new()
-                .with_isa(self.isa)
-                .with_background(Background::Transparent)
-                .with_limits(Limits::unlimited()),
-            side: (SIDE >> 8u8.saturating_sub(level.level)).max(64),
-            ids: Ids::default(),
-        };
-        for (azimuth, elevation) in VIEWS {
-            let half = views.camera(azimuth, elevation, 1)?;
+    fn pictures(&self, side: u32) -> &[Image] {
+        let known = self.pictures.iter().find(|(known, _)| *known == side);
+        known.map_or(&[], |(_, pictures)| pictures)
+    }
+
+    /// Compares all voxels of a level as surfels, of the usual size.
+    pub fn compare_surfels(&self, octree: &Octree, level: u8, mut surfels: Gaussians) -> Result<Comparison<'_>> {
+        let blocks = HeadMap::block_of(octree, level);
+        let per_voxel = surfels.len() / blocks.len();
+        let usual = surfels.scale.clone();
+        let mut views = Views::new(self.isa, side(level));
+        scale(&mut surfels, &usual, WIDER);
+        let mut ids = Ids::default();
+        let mut shown = Vec::new();
+        for view in VIEWS {
+            let camera = views.camera(view, 1)?;
             views
                 .renderer
-                .ids_into(&wide, &half, &Limits::unlimited(), &mut views.ids)?;
-            let camera = views.camera(azimuth, elevation, 2)?;
-            let truth = views.half(&self.gaussians, &camera)?;
-            for (which, candidate) in candidates.into_iter().enumerate() {
-                let seen = views.half(candidate, &camera)?;
-                let pixels = truth.pixels.iter().zip(&seen.pixels).zip(&views.ids.indices);
-                for ((truth, seen), id) in pixels {
-                    let block = blocks.get(*id as usize / per_voxel).map(|&block| block as usize);
-                    sums.add(which, block, error(truth, seen), truth[3] > 0.5);
-                }
+                .ids_into(&surfels, &camera, &Limits::unlimited(), &mut ids)?;
+            let block = |id: &u32| blocks.get(*id as usize / per_voxel).copied();
+            shown.push(ids.indices.iter().map(block).collect());
+        }
+        let mut comparison = Comparison {
+            reference: self,
+            level,
+            views,
+            shown,
+            sums: Sums {
+                blocks: vec![Default::default(); HeadMap::block_count(octree, level)],
+                all: Default::default(),
+            },
+        };
+        for (which, size) in SIZES.into_iter().enumerate() {
+            scale(&mut surfels, &usual, f32::from(size) / 64.0);
+            comparison.add(1 + which, &surfels)?;
+        }
+        Ok(comparison)
+    }
+}
+
+impl Comparison<'_> {
+    /// The map of the level, once it has been compared with these Gaussians of the learned heads, too.
+    pub fn with_learned(mut self, learned: &Gaussians) -> Result<HeadMap> {
+        self.add(0, learned)?;
+        Ok(self.sums.choose())
+    }
+
+    fn add(&mut self, which: usize, candidate: &Gaussians) -> Result<()> {
+        let pictures = self.reference.pictures(side(self.level));
+        for ((view, truth), shown) in VIEWS.into_iter().zip(pictures).zip(&self.shown) {
+            let seen = self.views.half(candidate, view)?;
+            for ((truth, seen), block) in truth.pixels.iter().zip(&seen.pixels).zip(shown) {
+                let block = block.map(|block| block as usize);
+                self.sums.add(which, block, error(truth, seen), truth[3] > 0.5);
             }
         }
-        Ok(sums.choose())
+        Ok(())
     }
+}
+
+/// Pixels along a side of the pictures of a level.
+fn side(level: u8) -> u32 {
+    (SIDE >> 8u8.saturating_sub(level)).max(64)
 }
 
 /// Errors of each candidate: the learned Gaussians, then surfels by [`SIZES`].
@@ -148,19 +189,27 @@ impl Sums {
 struct Views {
     renderer: Renderer,
     side: u32,
-    ids: Ids,
 }
 
 impl Views {
-    /// A camera of `times` half the side.
-    fn camera(&self, azimuth: f64, elevation: f64, times: u32) -> Result<Camera> {
+    fn new(isa: Isa, side: u32) -> Self {
+        let renderer = Renderer::new()
+            .with_isa(isa)
+            .with_background(Background::Transparent)
+            .with_limits(Limits::unlimited());
+        Views { renderer, side }
+    }
+
+    /// A camera of `times` half the side, at this azimuth and elevation.
+    fn camera(&self, (azimuth, elevation): (f64, f64), times: u32) -> Result<Camera> {
         let side = self.side / 2 * times;
         Camera::orbit(azimuth, elevation, DISTANCE, FIELD, side, side)
     }
 
     /// A picture averaged to half its size.
-    fn half(&mut self, gaussians: &Gaussians, camera: &Camera) -> Result<Image> {
-        let image = self.renderer.render(gaussians, camera)?;
+    fn half(&mut self, gaussians: &Gaussians, view: (f64, f64)) -> Result<Image> {
+        let camera = self.camera(view, 2)?;
+        let image = self.renderer.render(gaussians, &camera)?;
         Ok(image.box_half())
     }
 }
@@ -172,12 +221,9 @@ fn error(a: &[f32; 4], b: &[f32; 4]) -> f64 {
     channels.map(|d| d * d).sum()
 }
 
-/// Surfels with other radii.
-fn scaled(surfels: &Gaussians, factor: f32) -> Gaussians {
-    let mut scaled = surfels.clone();
-    for scale in &mut scaled.scale {
-        scale[0] *= factor;
-        scale[1] *= factor;
+/// Sets the radii of surfels to a multiple of the usual ones.
+fn scale(surfels: &mut Gaussians, usual: &[[f32; 3]], factor: f32) {
+    for (scale, [a, b, c]) in surfels.scale.iter_mut().zip(usual) {
+        *scale = [a * factor, b * factor, *c];
     }
-    scaled
 }

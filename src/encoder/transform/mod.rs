@@ -106,9 +106,11 @@ const FILTER_SHARE: usize = 100;
 pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<Encoded> {
     let steps = options.fineness.steps()?;
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
-    let subject = EncoderInput::new(cloud, levels, options, log)?;
+    let mut subject = EncoderInput::new(cloud, levels, options, log)?;
     let top = *subject.levels.end();
     let coded = subject.code(top, steps, log)?;
+    // They are needed no more, and are the largest part.
+    subject.maps = Vec::new();
     subject.checked(coded, options.heads.as_ref(), usize::MAX, log)
 }
 
@@ -442,7 +444,11 @@ impl<'a> EncoderInput<'a> {
         let reference = match heads.filter(|_| self.has_head_maps(top)) {
             Some(heads) => {
                 decoding.set_heads_model(heads.clone());
-                Some(head_maps::Reference::new(self.isa, self.cloud)?)
+                let levels = (*self.levels.start().min(&top)..=top).filter(|level| self.has_head_map(*level));
+                let reference = log.step("draw the cloud", self.cloud.voxels.len(), "voxels", || {
+                    head_maps::Reference::new(self.isa, self.cloud, levels)
+                })?;
+                Some(reference)
             }
             None => None,
         };
@@ -478,15 +484,11 @@ impl<'a> EncoderInput<'a> {
 
     /// Compares the ways to draw the level that was decoded.
     fn head_map(&self, reference: &head_maps::Reference, decoding: &mut Decoding<'_>, level: u8) -> Result<HeadMap> {
-        decoding.set_heads(HeadSet::Best)?;
-        let learned = decoding.gaussians()?;
         decoding.set_heads(HeadSet::Surfels)?;
-        reference.head_map(&head_maps::Candidates {
-            octree: &self.octree,
-            level,
-            learned,
-            surfels: decoding.gaussians()?,
-        })
+        let surfels = decoding.gaussians()?;
+        let comparison = reference.compare_surfels(&self.octree, level, surfels)?;
+        decoding.set_heads(HeadSet::Best)?;
+        comparison.with_learned(&decoding.gaussians()?)
     }
 
     /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its

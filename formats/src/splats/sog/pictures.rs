@@ -3,7 +3,7 @@
 use std::io::Cursor;
 
 use b2p::{Error, Limits, Result};
-use image_webp::{ColorType, WebPDecoder, WebPEncoder};
+use image_webp::WebPDecoder;
 
 use crate::splats::bytes::malformed;
 
@@ -72,12 +72,4 @@ pub(super) fn size_of_pictures(count: usize) -> Result<(u32, u32)> {
             "{count} Gaussians are more than SOG's pictures have pixels"
         ))),
     }
-}
-
-/// A lossless picture.
-pub(super) fn write(pixels: &[[u8; 4]], width: u32, height: u32) -> Result<Vec<u8>, String> {
-    let mut bytes = Vec::new();
-    let encoder = WebPEncoder::new(&mut bytes);
-    let done = encoder.encode(pixels.as_flattened(), width, height, ColorType::Rgba8);
-    done.map(|()| bytes).map_err(|e| e.to_string())
 }

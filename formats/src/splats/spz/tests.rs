@@ -177,3 +177,41 @@ fn coordinates_take_all_bits_and_no_more() {
     assert_eq!(fraction(4097.0), 10);
     assert_eq!(fraction(1e-6), 24);
 }
+
+#[test]
+fn coordinates_have_the_bits_that_the_sizes_of_gaussians_need() {
+    let fraction = |size: f32| {
+        let mut g = sample(1000, 0);
+        g.blur = 0.0;
+        g.frame.placement = b2p::Placement {
+            origin: [-1.0; 3],
+            voxel_size: 2.0 / 1024.0,
+        };
+        // Discs of almost no thickness, and a few that are tiny.
+        g.scale = (0..1000)
+            .map(|i| [size * if i % 50 == 0 { 1e-4 } else { 1.0 }, size * 2.0, 1e-6])
+            .collect();
+        let bytes = written(&g, Format::Spz);
+        let after = read_back(&bytes, Format::Spz, g.frame.offset()).gaussians;
+        let mut rows = Rows::new(&g, None).unwrap();
+        rows.sort_in_space();
+        let after = Rows::new(&after, None).unwrap();
+        let world = |rows: &Rows, row: &Row| -> [f64; 3] {
+            let offset = rows.offset();
+            std::array::from_fn(|k| row.position[k] + offset[k])
+        };
+        for (a, b) in rows.iter().zip(after.iter()) {
+            let (from, to) = (world(&rows, &a), world(&after, &b));
+            let near = from
+                .iter()
+                .zip(to)
+                .all(|(a, b)| (a - b).abs() <= f64::from(size) * MOST_ERROR + 1e-6);
+            assert!(near, "{size} {a:?} {b:?}");
+        }
+        bytes[13]
+    };
+    assert_eq!(fraction(0.1), 12);
+    assert_eq!(fraction(0.001), 12);
+    assert_eq!(fraction(0.000_3), 14);
+    assert_eq!(fraction(0.000_02), 18);
+}
