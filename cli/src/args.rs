@@ -170,23 +170,24 @@ pub struct Encode {
     /// Quality, from 0 to 100: chooses quantisation step and finest level. 100 is lossless, 38 the default
     #[arg(short = 'Q', long, value_name = "0..100", value_parser = clap::value_parser!(u8).range(0..=100), conflicts_with_all = ["step", "lossless", "bits_per_point"])]
     pub quality: Option<u8>,
-    /// Make the best stream of at most X bits for each point of the cloud, the whole file counted: chooses the quantisation step, and
-    /// leaves out the finest levels if they do not fit
+    /// Make the best stream of at most X bits for each point of the cloud, the whole file counted: chooses the
+    /// quantisation step, and leaves out the finest levels if they do not fit
     #[arg(short, long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["step", "lossless", "bit_price", "residual"])]
     pub bits_per_point: Option<f64>,
-    /// Effort, from 0 (quick) to 9: rate–distortion optimised quantisation from 1 on, colour filters from 2 on; with --bits-per-point
-    /// 2 + EFFORT tries for a level, of 9 as many as it takes [default: 9]
+    /// Effort, from 0 (quick) to 9: rate–distortion optimised quantisation from 1 on, colour filters from 2 on; with
+    /// --bits-per-point 2 + EFFORT tries for a level, of 9 as many as it takes [default: 9]
     #[arg(short, long, value_name = "0..9", value_parser = clap::value_parser!(u8).range(0..=9))]
     pub effort: Option<u8>,
-    /// Bit depth N of the voxel grid, 1 to 21 [default: by the spacing of the points; at most what a cloud of integers needs]
+    /// Bit depth N of the voxel grid, 1 to 21 [default: by the spacing of the points; at most what a cloud of integers
+    /// needs]
     #[arg(long, help_heading = "Advanced", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]
     pub bits: Option<u8>,
-    /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last below N
-    /// [default: N−3..N−1; with --bits-per-point up to N]
+    /// Octree levels that the stream may be cut after, the last at most N; of learned streams up to three, the last
+    /// below N [default: N−3..N−1; with --bits-per-point up to N]
     #[arg(long, help_heading = "Advanced", value_name = "L..M", value_parser = levels)]
     pub levels: Option<RangeInclusive<u8>>,
-    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma by default twice that of luma; coarser
-    /// levels have finer steps [default: 20]
+    /// Quantisation steps of the finest level's luma and chroma in 255ths, 0.5 to 1000, of chroma by default twice that
+    /// of luma; coarser levels have finer steps [default: 20]
     #[arg(long, help_heading = "Advanced", value_name = "LUMA[,CHROMA]", value_parser = step, conflicts_with = "lossless")]
     pub step: Option<QualityTarget>,
     /// Code the mean colours of the finest level's voxels exactly
@@ -222,15 +223,17 @@ pub enum Colours {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "With --colours learned")]
 pub struct LearnedArgs {
-    /// Rate-distortion trade-off, a factor on the model's Lagrangian λ: 0 rounds latents to the nearest, higher gives smaller files and
-    /// costs quality
+    /// Rate-distortion trade-off, a factor on the model's Lagrangian λ: 0 rounds latents to the nearest, higher gives
+    /// smaller files and costs quality
     #[arg(long = "lambda-scale", alias = "bit-price", value_name = "X", value_parser = price, default_value_t = 1.0)]
     pub bit_price: f32,
-    /// Residual of the finest level's colours. `coarse`: low frequencies, where they are worth it and filters are made; `none`: nothing;
-    /// else all of it, in steps of STEP/255, 1 to 255, of chroma by default 3/8 of it: 24 doubles some streams
+    /// Residual of the finest level's colours. `coarse`: low frequencies, where they are worth it and filters are made;
+    /// `none`: nothing; else all of it, in steps of STEP/255, 1 to 255, of chroma by default 3/8 of it: 24 doubles some
+    /// streams
     #[arg(long, value_name = "coarse|none|STEP[,CHROMA]", value_parser = residual, default_value = "coarse")]
     pub residual: Residual,
-    /// Give each level that is drawn a residual of its own, not the finest alone: better pictures of coarser levels, for bytes that the finest does not need
+    /// Give each level that is drawn a residual of its own, not the finest alone: better pictures of coarser levels,
+    /// for bytes that the finest does not need
     #[arg(long)]
     pub every_level: bool,
 }
@@ -242,15 +245,15 @@ pub struct Decode {
     pub input: PathBuf,
     #[command(flatten)]
     pub output: Output,
-    /// Write the level's voxels with their colours instead, as points: PLY, or LAS, LAZ, PCD, E57 or XYZ by the ending (of learned
-    /// streams there are none)
+    /// Write the level's voxels with their colours instead, as points: PLY, or LAS, LAZ, PCD, E57 or XYZ by the ending
+    /// (of learned streams there are none)
     #[arg(long, conflicts_with_all = ["heads", "budget", "calibrate"])]
     pub points: bool,
     /// Format of the Gaussians: ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz [default: by the ending]
     #[arg(long, value_name = "NAME", conflicts_with = "points")]
     pub format: Option<SplatFormat>,
-    /// Axis of the cloud that points up: x, y, z, -x, -y, -z, or auto. Gaussians are turned so that they stand upright in viewers
-    /// [default: what the stream says; if it says nothing, they are not turned]
+    /// Axis of the cloud that points up: x, y, z, -x, -y, -z, or auto. Gaussians are turned so that they stand upright
+    /// in viewers [default: what the stream says; if it says nothing, they are not turned]
     #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true, conflicts_with = "points")]
     pub up: Option<UpArg>,
     /// Keep the axes of the cloud: do not turn Gaussians
@@ -295,14 +298,14 @@ pub struct Upgrade {
 
 #[derive(Debug, Args)]
 pub struct Convert {
-    /// Gaussians: PLY, compressed PLY, SPZ, SOG, .splat, glTF, CSV or NumPy archive; or points: PLY, LAS, LAZ, PCD, E57, XYZ, OBJ or
-    /// glTF. `-`: standard input
+    /// Gaussians: PLY, compressed PLY, SPZ, SOG, .splat, glTF, CSV or NumPy archive; or points: PLY, LAS, LAZ, PCD,
+    /// E57, XYZ, OBJ or glTF. `-`: standard input
     #[arg(value_name = "IN")]
     pub input: PathBuf,
     #[command(flatten)]
     pub output: Output,
-    /// Format of the output: of Gaussians ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz; of points ply, las, laz, pcd, e57,
-    /// xyz [default: by the ending]
+    /// Format of the output: of Gaussians ply, compressed-ply, spz, sog, splat, glb, gltf, csv, npz; of points ply,
+    /// las, laz, pcd, e57, xyz [default: by the ending]
     #[arg(long, value_name = "NAME")]
     pub format: Option<OutFormat>,
     /// Format of the input, if it is Gaussians [default: by its contents, of .splat and .csv by the ending]
@@ -363,11 +366,12 @@ pub struct Render {
     /// What is written [default: by the ending; to standard output png, and y4m of several pictures]
     #[arg(long, help_heading = "Advanced", value_enum, value_name = "FORMAT")]
     pub format: Option<Format>,
-    /// Cameras of a file in place of --orbit: NeRF's transforms.json, COLMAP's images.txt beside its cameras.txt, Open3D's pinhole JSON,
-    /// glTF's camera nodes
+    /// Cameras of a file in place of --orbit: NeRF's transforms.json, COLMAP's images.txt beside its cameras.txt,
+    /// Open3D's pinhole JSON, glTF's camera nodes
     #[arg(long, value_name = "FILE", conflicts_with_all = ["orbit", "views", "fov", "look_at"])]
     pub camera: Option<PathBuf>,
-    /// Axis that points up in the pictures of --orbit: x, y, z, -x, -y, -z, or auto [default: what the input says, else y]
+    /// Axis that points up in the pictures of --orbit: x, y, z, -x, -y, -z, or auto [default: what the input says, else
+    /// y]
     #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true, conflicts_with = "camera")]
     pub up: Option<UpArg>,
     /// Parallel rays; the cube's centre stays as large as it is
@@ -404,7 +408,8 @@ pub struct Render {
 #[derive(Debug, Args)]
 #[group(required = true, multiple = false)]
 pub struct Picture {
-    /// Picture to write: .png, .ppm, .exr, or .y4m for a video; of several pictures a number is put before the ending. `-`: standard output
+    /// Picture to write: .png, .ppm, .exr, or .y4m for a video; of several pictures a number is put before the ending.
+    /// `-`: standard output
     #[arg(value_name = "OUT")]
     to: Option<PathBuf>,
     /// The same as an option
@@ -475,11 +480,12 @@ pub struct View {
     /// Horizontal field of view in degrees
     #[arg(long, value_name = "DEG", default_value_t = 45.0, allow_negative_numbers = true)]
     pub fov: f32,
-    /// Azimuth and elevation of the camera in degrees. It keeps the whole object in view, unless a distance is given: R from the cube's
-    /// centre, the cube reaching from −1 to 1
+    /// Azimuth and elevation of the camera in degrees. It keeps the whole object in view, unless a distance is given: R
+    /// from the cube's centre, the cube reaching from −1 to 1
     #[arg(long, value_name = "AZ,EL[,R]", default_value = "0,0", value_parser = orbit, allow_hyphen_values = true)]
     pub orbit: Orbit,
-    /// Point to look at, in the units of the cloud [default: the middle of the object; with a distance the cube's centre]
+    /// Point to look at, in the units of the cloud [default: the middle of the object; with a distance the cube's
+    /// centre]
     #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
     pub look_at: Option<[f64; 3]>,
     /// Draw N pictures, turning once around the object [default: 1; of a contact sheet 8, of a turntable 120]
@@ -547,24 +553,28 @@ pub struct DetailArg {
     /// Octree level to decode to [default: the finest with Gaussians; to draw, the finest that can be seen]
     #[arg(long, value_name = "M")]
     pub level: Option<u8>,
-    /// Heads that make Gaussians: best; quick, less accurate in a fraction of the time; or surfels, which need no model file (learned
-    /// streams have none) [default: the best there are]
+    /// Heads that make Gaussians: best; quick, less accurate in a fraction of the time; or surfels, which need no model
+    /// file (learned streams have none) [default: the best there are]
     #[arg(long, value_name = "NAME")]
     pub heads: Option<HeadSet>,
-    /// Gaussians that heads make of a voxel of streams of version 3: 1 or 8, of surfels 1 or 4 [default: 1 from level N−1 on, else more]
+    /// Gaussians that heads make of a voxel of streams of version 3: 1 or 8, of surfels 1 or 4 [default: 1 from level
+    /// N−1 on, else more]
     #[arg(long, help_heading = "Advanced", value_name = "N", value_parser = per_voxel)]
     pub per_voxel: Option<usize>,
 }
 
 #[derive(Debug, Clone, Args)]
 pub struct ModelArg {
-    /// Model file: of learned streams the model that they were coded with [default: the one inside the program], of others heads
+    /// Model file: of learned streams the model that they were coded with [default: the one inside the program], of
+    /// others heads
     #[arg(long, help_heading = "Advanced", value_name = "FILE")]
     pub model: Option<PathBuf>,
-    /// Use at most this instruction set: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the best of this machine]
+    /// Use at most this instruction set: scalar, avx2, avxvnni, avx512, amx, neon, dotprod [default: B2P_ISA, or the
+    /// best of this machine]
     #[arg(long, help_heading = "Advanced", value_name = "NAME")]
     pub isa: Option<String>,
-    /// Generate Gaussians in int16 (the same bits everywhere), f16, or half (f16 with sums in f16 too, on processors that have them) [default: int16 if the model has it]
+    /// Generate Gaussians in int16 (the same bits everywhere), f16, or half (f16 with sums in f16 too, on processors
+    /// that have them) [default: int16 if the model has it]
     #[arg(long, help_heading = "Advanced", value_name = "NAME")]
     pub precision: Option<String>,
 }

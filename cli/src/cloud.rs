@@ -229,8 +229,8 @@ pub fn axes(bytes: &[u8]) -> Axes {
     container::axes(bytes).unwrap_or_default()
 }
 
-/// Remembers what a stream that starts with these bytes says of its coordinates. There may be no other way to know once it
-/// has been read.
+/// Remembers what a stream that starts with these bytes says of its coordinates. There may be no other way to know once
+/// it has been read.
 pub fn remember(bytes: &[u8]) {
     if let Ok(axes) = container::axes(bytes) {
         set_remembered(axes);

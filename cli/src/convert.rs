@@ -256,7 +256,8 @@ pub fn output_format(to: &Path, asked: Option<Format>) -> Result<Format> {
 }
 
 /// Writes Gaussians with these axes, with warnings about what the format does not keep. What a file cannot say of a
-/// scene that is far from the origin, or was turned, stands in a file beside, with what else is known of its coordinates.
+/// scene that is far from the origin, or was turned, stands in a file beside, with what else is known of its
+/// coordinates.
 pub fn write(g: &Gaussians, axes: Axes, known: &CloudAxes, format: Format, to: &Path, log: &Log) -> Result<()> {
     let offset = splats::offset(g, axes, format);
     let turned_from = match axes {

@@ -48,7 +48,8 @@ pub fn model(arg: &ModelArg) -> Result<Model> {
     }
 }
 
-/// What decodes the stream that starts with these bytes, with the heads asked for. A model is loaded only if it takes one.
+/// What decodes the stream that starts with these bytes, with the heads asked for. A model is loaded only if it takes
+/// one.
 pub fn decoder(bytes: &[u8], detail: &DetailArg, model_arg: &ModelArg, limits: &Limits) -> Result<Decoder> {
     let mut decoder = Decoder::new()
         .with_isa(isa(model_arg.isa.as_deref())?)
@@ -114,7 +115,8 @@ pub fn reserve_for(path: &Path, bytes: &[u8], decoder: &Decoder, level: Option<u
     }
 }
 
-/// The bytes of a stream's file. If it is cut within a level and none was named, those up to the finest complete level, with a warning.
+/// The bytes of a stream's file. If it is cut within a level and none was named, those up to the finest complete level,
+/// with a warning.
 pub fn whole_levels(path: &Path, mut bytes: Vec<u8>, detail: &DetailArg, limits: &Limits) -> Result<Vec<u8>> {
     if detail.level.is_some() {
         return Ok(bytes);
@@ -254,7 +256,8 @@ impl<'p> Source<'p> {
     }
 }
 
-/// Gaussians as they stand in the file `bytes`, which came from `path`, or surfels of its points. `None` if it has neither.
+/// Gaussians as they stand in the file `bytes`, which came from `path`, or surfels of its points. `None` if it has
+/// neither.
 pub fn other(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Option<Gaussians>> {
     let format = convert::format_of(path, bytes, None);
     if format.is_none() && !cloud::is_cloud(bytes) {

@@ -145,8 +145,8 @@ pub fn is_pipe(path: &Path) -> bool {
     path == Path::new(PIPE)
 }
 
-/// Whether these outputs may be written: none is one of the inputs, and those that exist may be replaced. On a terminal the user is
-/// asked; elsewhere `--force` is needed.
+/// Whether these outputs may be written: none is one of the inputs, and those that exist may be replaced. On a terminal
+/// the user is asked; elsewhere `--force` is needed.
 pub fn permit(outputs: &[&Path], inputs: &[&Path]) -> Result<()> {
     for output in outputs.iter().filter(|output| !is_pipe(output)) {
         if let Some(input) = inputs.iter().find(|input| is_same(input, output)) {

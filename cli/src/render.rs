@@ -86,7 +86,8 @@ fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
     Ok(said)
 }
 
-/// Level and heads for a budget, if one is given: for a picture as the cameras see the object, and no finer than they see.
+/// Level and heads for a budget, if one is given: for a picture as the cameras see the object, and no finer than they
+/// see.
 fn choose(args: &Render, limits: &Limits, progress: &Progress) -> Result<Option<Chosen>> {
     let Some(stream) = budget::stream(&args.budget, &args.input, &args.detail, limits)? else {
         return Ok(None);
@@ -332,8 +333,8 @@ pub fn describe(path: &Path, stats: &Stats) -> String {
     )
 }
 
-/// What a picture took, for programs. `overlap`: tiles that a Gaussian touches, in the mean. `coverage`: the share of the pixels
-/// that something was drawn on.
+/// What a picture took, for programs. `overlap`: tiles that a Gaussian touches, in the mean. `coverage`: the share of
+/// the pixels that something was drawn on.
 fn numbers(path: &Path, [width, height]: [u32; 2], stats: &Stats) -> serde_json::Value {
     let ms = |time: std::time::Duration| time.as_secs_f64() * 1e3;
     let (times, dropped, effects) = (stats.times, stats.dropped, stats.effects);

@@ -224,8 +224,8 @@ fn plain(status: u16, text: &str) -> Response<Cursor<Vec<u8>>> {
     common(Response::from_string(text).with_status_code(status))
 }
 
-/// What every answer says: how long it is, that other sites get nothing, that the page may use threads, and that files may
-/// change.
+/// What every answer says: how long it is, that other sites get nothing, that the page may use threads, and that files
+/// may change.
 fn common<R: Read>(response: Response<R>) -> Response<R> {
     [
         ("Cross-Origin-Opener-Policy", "same-origin"),

@@ -22,8 +22,8 @@ pub fn check(to: &Path, sidecar: Option<&Sidecar>) -> Result<()> {
     manners::permit(&[&Sidecar::path_of(to)], &[])
 }
 
-/// Writes what belongs beside `to`, which has been written, and says so. What lies there for an earlier file is replaced
-/// or removed.
+/// Writes what belongs beside `to`, which has been written, and says so. What lies there for an earlier file is
+/// replaced or removed.
 pub fn settle(to: &Path, sidecar: Option<&Sidecar>) -> Result<()> {
     let beside = Sidecar::path_of(to);
     let name = to.display();

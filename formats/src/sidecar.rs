@@ -44,7 +44,8 @@ impl Sidecar {
         Sidecar::parse(&text)
     }
 
-    /// Reads what [`Sidecar::to_json`] wrote. `None` if it is anything else, or a field has a value that it cannot have.
+    /// Reads what [`Sidecar::to_json`] wrote. `None` if it is anything else, or a field has a value that it cannot
+    /// have.
     pub fn parse(text: &[u8]) -> Option<Self> {
         let value: Value = serde_json::from_slice(text).ok()?;
         if value[MARK].as_u64() != Some(VERSION) {

@@ -229,8 +229,8 @@ fn splat_format(path: &Path, asked: Option<&str>) -> Result<Format> {
     }
 }
 
-/// Writes Gaussians, turned to the axes of the format if theirs are known, and a file beside with what the format has no
-/// place for. Returns what is lost or unexpected.
+/// Writes Gaussians, turned to the axes of the format if theirs are known, and a file beside with what the format has
+/// no place for. Returns what is lost or unexpected.
 fn write_splats(path: &Path, gaussians: &Gaussians, axes: Axes, format: Format) -> Result<Vec<String>> {
     let offset = splats::offset(gaussians, axes, format);
     let turned_from = match axes {

@@ -24,7 +24,8 @@ pub struct Options {
     /// The Lagrangian multiplier of RDOQ: squared error, in squared steps, that one bit must save. 0 rounds to the
     /// nearest integer.
     pub lambda: f32,
-    /// Factor of the predicted differences, in units of 1/256; `None` for the best of three in the middle slice of the level.
+    /// Factor of the predicted differences, in units of 1/256; `None` for the best of three in the middle slice of the
+    /// level.
     pub gain: Option<u8>,
 }
 

@@ -90,8 +90,8 @@ impl Decoder {
         self
     }
 
-    /// The same decoder with these heads. Only Gaussians differ by them. A stream that cannot be drawn with them is refused with
-    /// [`Error::Unsupported`].
+    /// The same decoder with these heads. Only Gaussians differ by them. A stream that cannot be drawn with them is
+    /// refused with [`Error::Unsupported`].
     pub fn with_heads(mut self, heads: HeadSet) -> Self {
         self.heads = Some(heads);
         self
@@ -103,14 +103,15 @@ impl Decoder {
         self
     }
 
-    /// The same decoder, whose heads of streams of version 3 make so many Gaussians of a voxel: learned heads 1 or 8, surfels 1 or 4. By
-    /// default it is one where voxels are at most twice as wide as those of the cloud, else more.
+    /// The same decoder, whose heads of streams of version 3 make so many Gaussians of a voxel: learned heads 1 or 8,
+    /// surfels 1 or 4. By default it is one where voxels are at most twice as wide as those of the cloud, else more.
     pub fn with_per_voxel(mut self, count: usize) -> Self {
         self.per_voxel = Some(count);
         self
     }
 
-    /// The same decoder, whose learned heads of streams of version 3 calculate in this precision. Models of version 2 have their own.
+    /// The same decoder, whose learned heads of streams of version 3 calculate in this precision. Models of version 2
+    /// have their own.
     pub fn with_precision(mut self, precision: Precision) -> Self {
         self.precision = precision;
         self
@@ -154,8 +155,8 @@ impl Decoder {
 
     /// Decodes a stream to Gaussians.
     ///
-    /// A stream cut exactly after a level is a coarser stream. From one that is cut or damaged elsewhere, a level before
-    /// the damage is decoded only when [asked for](Decoder::with_level).
+    /// A stream cut exactly after a level is a coarser stream. From one that is cut or damaged elsewhere, a level
+    /// before the damage is decoded only when [asked for](Decoder::with_level).
     ///
     /// # Errors
     /// Those of [`Decoding::finish`] and [`Decoding::gaussians`].
@@ -198,12 +199,13 @@ impl Decoder {
         })
     }
 
-    /// The coarsest level with Gaussians whose voxels are nowhere wider than a pixel, in pictures where a cube-frame unit takes `pixels_per_unit`
-    /// pixels at most: what is finer is hardly seen. `None` if no level before the finest whole one does, so that the stream as it is serves best.
+    /// The coarsest level with Gaussians whose voxels are nowhere wider than a pixel, in pictures where a cube-frame
+    /// unit takes `pixels_per_unit` pixels at most: what is finer is hardly seen. `None` if no level before the finest
+    /// whole one does, so that the stream as it is serves best.
     ///
     /// # Errors
-    /// Those of [`Stream::parse`], [`Error::ModelMissing`], and the damage of a stream that is cut or damaged elsewhere than right after a
-    /// level.
+    /// Those of [`Stream::parse`], [`Error::ModelMissing`], and the damage of a stream that is cut or damaged elsewhere
+    /// than right after a level.
     pub fn level_for(&self, bytes: &[u8], pixels_per_unit: f64) -> Result<Option<u8>> {
         let stream = Stream::parse(bytes, &self.limits)?.intact()?;
         let seen = |level: &u8| 2.0 / f64::from(1u32 << level) * pixels_per_unit <= 1.0;
@@ -211,8 +213,8 @@ impl Decoder {
         Ok(coarsest.filter(|level| Some(*level) < stream.deepest()))
     }
 
-    /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included, beyond
-    /// [`Limits::OVERHEAD`] and models.
+    /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included,
+    /// beyond [`Limits::OVERHEAD`] and models.
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level, [`Error::ModelMissing`].

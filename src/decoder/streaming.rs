@@ -165,8 +165,8 @@ impl<'b> Decoding<'b> {
         })
     }
 
-    /// Calls `with` with what learned heads read of the level reached, and gives its result; `None` if they draw nothing
-    /// of it, or the stream has version 2.
+    /// Calls `with` with what learned heads read of the level reached, and gives its result; `None` if they draw
+    /// nothing of it, or the stream has version 2.
     #[doc(hidden)]
     pub fn with_heads_input<T>(&self, with: impl FnOnce(LevelInput<'_>) -> T) -> Option<T> {
         let State::Transform(decoding) = &self.state else {

@@ -27,7 +27,8 @@ pub(super) struct Transform<'b> {
     ahead: Ahead,
 }
 
-/// The occupancies of a level that were decoded beside the colours of the level above, which are coded apart from them and take as long.
+/// The occupancies of a level that were decoded beside the colours of the level above, which are coded apart from them
+/// and take as long.
 type Ahead = Option<(u8, Result<Vec<u8>>)>;
 
 /// The deepest level so far.
@@ -65,8 +66,8 @@ impl Reached {
         })
     }
 
-    /// The colours of the level above before its filter: where they are not known, the means of this level's, which come to the same but for
-    /// rounding.
+    /// The colours of the level above before its filter: where they are not known, the means of this level's, which
+    /// come to the same but for rounding.
     pub fn colours_above(&self, above: &Above) -> Vec<[u8; 3]> {
         match &above.coloured {
             Some(coloured) => coloured.rgb(),
@@ -102,7 +103,8 @@ impl Reached {
         head_map.is_some_and(HeadMap::is_all_surfels) || is_for_surfels(&self.map)
     }
 
-    /// Calls `with` with what learned heads read, of the voxels that they draw; none at level 0, or if surfels draw all.
+    /// Calls `with` with what learned heads read, of the voxels that they draw; none at level 0, or if surfels draw
+    /// all.
     pub fn with_heads_input<T>(&self, isa: Isa, with: impl FnOnce(LevelInput<'_>) -> T) -> Option<T> {
         let above = self.above.as_ref()?;
         if self.is_all_surfels() {
@@ -246,7 +248,8 @@ struct Growing<'a> {
     next: Option<&'a Level<'a>>,
 }
 
-/// The kernel map and the colours of a level on the way to the one that a section is of, and of the level above if the section has it.
+/// The kernel map and the colours of a level on the way to the one that a section is of, and of the level above if the
+/// section has it.
 struct Step {
     map: KernelMap,
     coloured: LevelColours,
@@ -367,8 +370,8 @@ impl Growing<'_> {
         }
     }
 
-    /// Decodes the colours of level `n`, and beside them the occupancies of the level after it, if it is there. `map` is the kernel map of level
-    /// `n`.
+    /// Decodes the colours of level `n`, and beside them the occupancies of the level after it, if it is there. `map`
+    /// is the kernel map of level `n`.
     fn with_next_occupancies(
         &self,
         n: u8,
@@ -388,8 +391,8 @@ impl Growing<'_> {
     }
 }
 
-/// What a stream says of the colours of a level, to tell whether they were decoded as they were coded: XXH3-64 of Y, Co and Cg of every voxel
-/// as 16-bit numbers, little-endian.
+/// What a stream says of the colours of a level, to tell whether they were decoded as they were coded: XXH3-64 of Y, Co
+/// and Cg of every voxel as 16-bit numbers, little-endian.
 pub fn colour_hash(coloured: &LevelColours) -> u64 {
     let mut hasher = Xxh3Default::new();
     let mut bytes = Vec::with_capacity(6 * 1024);

@@ -1,6 +1,6 @@
-//! Damaged streams: `tests/data/conformance/damage.txt` has a line for each, with its name, the stream of the suite that
-//! it is made from, the clause of `docs/format.md` that it breaks, and the changes `offset:bytes removed:bytes inserted`.
-//! `cargo xtask damage` makes the list.
+//! Damaged streams: `tests/data/conformance/damage.txt` has a line for each, with its name, the stream of the suite
+//! that it is made from, the clause of `docs/format.md` that it breaks, and the changes `offset:bytes removed:bytes
+//! inserted`. `cargo xtask damage` makes the list.
 
 use std::collections::BTreeSet;
 

@@ -3,9 +3,10 @@
 use b2p::gaussians::HeadSet;
 use serde::{Deserialize, Serialize};
 
-/// SSIMULACRA2 against the textured mesh by the evaluation protocol, of levels 0 to 3 above that of the cloud, with each of
-/// [`HeadSet::ALL`]: means over a procedural still life at 0.46 bits per point and a person at 1 (`docs/accuracy.md`). It
-/// does not depend on the machine, and orders settings; pictures of another cloud may be better or worse.
+/// SSIMULACRA2 against the textured mesh by the evaluation protocol, of levels 0 to 3 above that of the cloud, with
+/// each of [`HeadSet::ALL`]: means over a procedural still life at 0.46 bits per point and a person at 1
+/// (`docs/accuracy.md`). It does not depend on the machine, and orders settings; pictures of another cloud may be
+/// better or worse.
 const SCORES: [[f64; 3]; 4] = [
     [71.1, 68.7, 66.1],
     [69.2, 66.7, 62.0],
@@ -74,8 +75,8 @@ pub struct PictureSize {
 }
 
 impl PictureSize {
-    /// Of a surface of so many voxels of a level, where a cube-frame unit takes `per_unit` pixels: as if half of it were
-    /// turned to the camera, never more than there is.
+    /// Of a surface of so many voxels of a level, where a cube-frame unit takes `per_unit` pixels: as if half of it
+    /// were turned to the camera, never more than there is.
     pub fn of_surface(pixels: f64, per_unit: f64, voxels: f64, level: u8) -> Self {
         let voxel = 2.0 / f64::from(1u32 << level) * per_unit;
         PictureSize {

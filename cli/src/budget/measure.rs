@@ -155,8 +155,8 @@ fn calibration(
     Ok(calibration)
 }
 
-/// Nanoseconds of `run`, with new threads and fresh memory, and its result. Time in which its threads could have run, but
-/// other programs did, is taken out.
+/// Nanoseconds of `run`, with new threads and fresh memory, and its result. Time in which its threads could have run,
+/// but other programs did, is taken out.
 fn cold<T: Send>(run: impl FnOnce() -> Result<T> + Send) -> Result<(f64, T)> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(rayon::current_num_threads());
     let pool = pool
@@ -193,8 +193,8 @@ impl Scheduled {
     }
 }
 
-/// The share of the time that these threads had a processor when they asked for one: with fewer other programs they would
-/// have taken so much of it.
+/// The share of the time that these threads had a processor when they asked for one: with fewer other programs they
+/// would have taken so much of it.
 fn undisturbed(before: &[Scheduled], after: &[Scheduled]) -> f64 {
     let sum = |of: fn(&Scheduled) -> u64| {
         let [before, after] = [before, after].map(|all| all.iter().map(of).sum::<u64>());

@@ -30,9 +30,9 @@ use super::{Failure, Result, load, manners};
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Budget")]
 pub struct BudgetArgs {
-    /// Time that it may take, such as 33ms or 0.5s: level and heads are those that look best among all that fit, by what
-    /// they cost on this machine, which is measured at the first use and kept in the user's cache folder. Decoding: from
-    /// the stream in memory to Gaussians. Drawing: from the stream in memory to a picture
+    /// Time that it may take, such as 33ms or 0.5s: level and heads are those that look best among all that fit, by
+    /// what they cost on this machine, which is measured at the first use and kept in the user's cache folder.
+    /// Decoding: from the stream in memory to Gaussians. Drawing: from the stream in memory to a picture
     #[arg(long, value_name = "TIME", value_parser = time, conflicts_with_all = ["level", "precision", "per_voxel"])]
     pub budget: Option<Duration>,
     /// Measure this machine again

@@ -29,8 +29,8 @@ pub enum PointFormat {
 pub struct WriteOptions {
     /// Coordinates as doubles, also where floats would do (PLY and PCD; the other formats are as exact in any case).
     pub double: bool,
-    /// Coordinates from the grid's origin, for programs that compute with floats (PLY, PCD and XYZ). The offset goes into
-    /// a comment, where the format has some, and into a file beside.
+    /// Coordinates from the grid's origin, for programs that compute with floats (PLY, PCD and XYZ). The offset goes
+    /// into a comment, where the format has some, and into a file beside.
     pub local: bool,
 }
 
@@ -83,8 +83,9 @@ pub fn encode(voxels: &ColouredVoxels, axes: &Axes, format: PointFormat, options
     encode_cloud(cloud, format, options)
 }
 
-/// Encodes a cloud. Coordinates are exact, but for LAS and LAZ files, whose steps are a power of ten, or the voxels of the
-/// cloud's grid. Voxels with a grid are written at their places in the world, except to PLY files, which state the grid.
+/// Encodes a cloud. Coordinates are exact, but for LAS and LAZ files, whose steps are a power of ten, or the voxels of
+/// the cloud's grid. Voxels with a grid are written at their places in the world, except to PLY files, which state the
+/// grid.
 ///
 /// # Errors
 /// [`Error::Usage`] if the format cannot hold them.

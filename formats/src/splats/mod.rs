@@ -188,7 +188,8 @@ impl Axes {
 pub struct Splats {
     /// The Gaussians.
     pub gaussians: Gaussians,
-    /// Their axes: those of the cloud that was turned when the file was written, if it states them; else those of the file.
+    /// Their axes: those of the cloud that was turned when the file was written, if it states them; else those of the
+    /// file.
     pub axes: Axes,
     /// What was ignored or guessed, a sentence each.
     pub warnings: Vec<String>,
@@ -215,8 +216,8 @@ fn turn(gaussians: &mut Gaussians, from: Axes, to: Axes) {
 pub struct Options {
     /// What was subtracted from the coordinates of a file that does not state it (SPZ, `.splat`).
     pub offset: [f64; 3],
-    /// The axis that pointed up before the scene was turned to the axes of the format, for a file that does not state it
-    /// (SPZ, `.splat`, CSV).
+    /// The axis that pointed up before the scene was turned to the axes of the format, for a file that does not state
+    /// it (SPZ, `.splat`, CSV).
     pub turned_from: Option<Up>,
 }
 
@@ -307,8 +308,8 @@ pub fn offset(gaussians: &Gaussians, axes: Axes, format: Format) -> [f64; 3] {
     }
 }
 
-/// Writes Gaussians whose coordinates have the axes `axes`, turned to those of the format. Returns what the format could not keep, a sentence each.
-/// `path` appears in error messages only.
+/// Writes Gaussians whose coordinates have the axes `axes`, turned to those of the format. Returns what the format
+/// could not keep, a sentence each. `path` appears in error messages only.
 ///
 /// # Errors
 /// [`Error::Io`] if `to` fails; [`Error::Usage`] if the arrays differ in length, the frame is invalid, or the format

@@ -3,7 +3,8 @@
 //! Of n Gaussians `positions` (n × 3), `scales` (n × 3, linear), `rotations` (n × 4: w, x, y, z), `opacities` (n, in
 //! [0, 1]), `colours` (n × 3, sRGB), and `harmonics` (n × k × 3) if there are any, all single precision; `offset` (3
 //! doubles), which is to be added to the positions; `antialiased` (one byte); `cube`: bits, origin and voxel size (5
-//! doubles); and `turned_from` (3 doubles), the direction that pointed up before the scene was turned, if that is known.
+//! doubles); and `turned_from` (3 doubles), the direction that pointed up before the scene was turned, if that is
+//! known.
 
 use std::io::{self, Write};
 

@@ -17,8 +17,8 @@ use crate::sample::write_bytes;
 use crate::surface::Surface;
 use crate::tradeoff::{of_cloud, of_mesh};
 
-/// Draw a mesh from close up beside streams of it, with the best heads in a first row and with surfels, beside the exact
-/// voxels, in a second (PNG)
+/// Draw a mesh from close up beside streams of it, with the best heads in a first row and with surfels, beside the
+/// exact voxels, in a second (PNG)
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Streams of version 3

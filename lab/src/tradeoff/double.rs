@@ -1,4 +1,5 @@
-//! Heads of version 3 in double precision, from their definition ([`b2p::gaussians::learned`]) and the model file alone.
+//! Heads of version 3 in double precision, from their definition ([`b2p::gaussians::learned`]) and the model file
+//! alone.
 
 use std::collections::BTreeMap;
 

@@ -24,7 +24,8 @@ const COLOURS: [(Knob, &str); 8] = [
     (Knob::Threads, "#be185d"),
 ];
 
-/// One of the two plots: a title, the accuracy of a row, infinite for equal pictures, and whether the row is on a front.
+/// One of the two plots: a title, the accuracy of a row, infinite for equal pictures, and whether the row is on a
+/// front.
 struct Panel {
     title: &'static str,
     accuracy: fn(&Row) -> Option<f64>,
@@ -44,8 +45,8 @@ const PANELS: [Panel; 2] = [
     },
 ];
 
-/// Both plots side by side: milliseconds from stream to picture on a logarithmic scale, and PSNR in either sense. Without a
-/// truth the first is empty.
+/// Both plots side by side: milliseconds from stream to picture on a logarithmic scale, and PSNR in either sense.
+/// Without a truth the first is empty.
 pub fn plot(report: &Report) -> String {
     let (width, height) = (LEFT + 2.0 * WIDTH + GAP + 16.0, TOP + HEIGHT + FOOT);
     let mut svg = format!(

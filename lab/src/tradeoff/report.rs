@@ -15,8 +15,9 @@ use b2p::metrics::Machine;
 use b2p::metrics::{Spread, Verdict};
 use b2p::renderer::Image;
 
-/// The stages, four of decoding and four of drawing. Geometry includes kernel maps, but of a stream of version 3 not what
-/// is decoded beside the colours of the level above. Reconstruction is the colour filter, or the features of version 2.
+/// The stages, four of decoding and four of drawing. Geometry includes kernel maps, but of a stream of version 3 not
+/// what is decoded beside the colours of the level above. Reconstruction is the colour filter, or the features of
+/// version 2.
 pub const STAGES: [&str; 8] = [
     "geometry",
     "colours",

@@ -102,7 +102,8 @@ impl HeadsModel {
     /// Loads a model file.
     ///
     /// # Errors
-    /// [`Error::Io`](crate::Error::Io), [`Error::LimitExceeded`](crate::Error::LimitExceeded) for a file of more than 2 GiB, and those of [`HeadsModel::from_bytes`].
+    /// [`Error::Io`](crate::Error::Io), [`Error::LimitExceeded`](crate::Error::LimitExceeded) for a file of more than 2
+    /// GiB, and those of [`HeadsModel::from_bytes`].
     pub fn open(path: &Path) -> Result<Self> {
         // Read, not mapped: another program may shorten the file meanwhile.
         let bytes = input::read_file(path, &Limits::default())?;
@@ -112,8 +113,8 @@ impl HeadsModel {
     /// Loads a model from the content of its file. Memory is bounded by its length.
     ///
     /// # Errors
-    /// [`Error::Malformed`](crate::Error::Malformed), with the field or tensor that is missing, of another type or shape, not finite, or out of
-    /// range; [`Error::Unsupported`](crate::Error::Unsupported) for another version.
+    /// [`Error::Malformed`](crate::Error::Malformed), with the field or tensor that is missing, of another type or
+    /// shape, not finite, or out of range; [`Error::Unsupported`](crate::Error::Unsupported) for another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         load::model(bytes)
     }
@@ -138,8 +139,8 @@ impl HeadsModel {
     /// are omitted.
     ///
     /// # Errors
-    /// [`Error::Unsupported`](crate::Error::Unsupported) for level 0, which has no level above, for a set that the model does not have, and for
-    /// [`Precision::Half`] if `isa` has no f16 arithmetic.
+    /// [`Error::Unsupported`](crate::Error::Unsupported) for level 0, which has no level above, for a set that the
+    /// model does not have, and for [`Precision::Half`] if `isa` has no f16 arithmetic.
     ///
     /// # Panics
     /// If the octree is less deep, or if the kernel maps or colours do not match its levels in length.

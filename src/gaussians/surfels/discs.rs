@@ -19,8 +19,8 @@ const THICK: f32 = 0.4;
 /// over the borders of a surface.
 const INWARDS: f32 = 0.2;
 
-/// How much fewer voxels a window holds at the border of a surface, per squared distance of the mean from the voxel over
-/// the squared reach.
+/// How much fewer voxels a window holds at the border of a surface, per squared distance of the mean from the voxel
+/// over the squared reach.
 const BORDER: f32 = 4.0;
 /// How much farther than the mean distance discs must reach to close a surface of which most voxels are missing, since
 /// those that are there are not evenly distributed.

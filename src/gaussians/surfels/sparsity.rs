@@ -69,8 +69,8 @@ pub fn is_sparse(degrees: impl IndexedParallelIterator<Item = u16>) -> bool {
     all >= LEAST && LONE_SHARE * lone >= all
 }
 
-/// Whether surfels draw the level of a map in place of learned heads, which never saw such neighbourhoods: it is sparse,
-/// and more than stray voxels lack neighbours.
+/// Whether surfels draw the level of a map in place of learned heads, which never saw such neighbourhoods: it is
+/// sparse, and more than stray voxels lack neighbours.
 ///
 /// # Panics
 /// If `map` is not a 3³ map.

@@ -15,6 +15,8 @@ use crate::geometry::{Voxels, morton};
 const LEAST: u16 = 16;
 /// The widest window reaches 2³ voxels far.
 const WIDEST: usize = 3;
+/// Voxels are searched for in cells of up to 2⁷ voxels: those of the next voxel are mostly the same.
+const COARSEST: usize = 7;
 
 /// Moments of the voxels in a window relative to the voxel in its middle.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,8 +34,8 @@ pub struct Window {
 /// Finds windows of voxels that are visited in Morton order.
 pub struct Windows<'a> {
     voxels: &'a Voxels,
-    /// For reaches of 2, 4 and 8: the cell of the last voxel and the voxels of the 27 cells around it.
-    cells: [Option<Cells>; WIDEST],
+    /// For cells of 2, 4 … 2⁷ voxels: that of the last voxel, and the voxels of the 27 cells around it.
+    cells: [Option<Cells>; COARSEST],
 }
 
 /// The 27 cells around one, x fastest.
@@ -48,14 +50,22 @@ impl<'a> Windows<'a> {
     pub fn new(voxels: &'a Voxels) -> Self {
         Windows {
             voxels,
-            cells: [None, None, None],
+            cells: [const { None }; COARSEST],
         }
     }
 
     /// The smallest window around a voxel with enough voxels.
     pub fn around(&mut self, coordinate: [u32; 3]) -> Option<Window> {
-        let widest = WIDEST.min(usize::from(self.voxels.depth()));
-        for scale in (1..=widest).rev() {
+        let depth = usize::from(self.voxels.depth());
+        let widest = WIDEST.min(depth);
+        for scale in (widest.max(1)..=COARSEST.min(depth)).rev() {
+            self.find_cells(coordinate, scale);
+        }
+        // No window holds more voxels than the cells of the widest one.
+        if self.cells[widest.checked_sub(1)?].as_ref()?.voxels() < usize::from(LEAST) {
+            return None;
+        }
+        for scale in (1..widest).rev() {
             self.find_cells(coordinate, scale);
         }
         (1..=widest)
@@ -121,6 +131,11 @@ impl<'a> Windows<'a> {
 }
 
 impl Cells {
+    /// How many voxels they hold.
+    fn voxels(&self) -> usize {
+        self.ranges.iter().map(Range::len).sum()
+    }
+
     /// The voxels of a cell that is one of the 27.
     fn of(&self, cell: [u32; 3]) -> Range<usize> {
         let step = [0, 1, 2].map(|axis| (cell[axis] + 1 - self.middle[axis]) as usize);
