@@ -203,9 +203,13 @@ fn a_decode_gives_back_all_that_it_reserved_whether_it_succeeds_or_fails() {
         // What is prepared at the first use stays, and so does an odd block of the threads' queues.
         decode();
         let ((), most) = peak(decode);
-        let before = MEMORY.current_usage();
-        (0..20).for_each(|_| decode());
-        let kept = MEMORY.current_usage().saturating_sub(before) as u64;
+        let kept = || {
+            let before = MEMORY.current_usage();
+            (0..20).for_each(|_| decode());
+            MEMORY.current_usage().saturating_sub(before) as u64
+        };
+        // What is lost is lost each time.
+        let kept = kept().min(kept());
         assert!(kept < most / 100, "{kind}: {kept} of {most} bytes are kept");
     }
 }
@@ -394,7 +398,7 @@ fn from_the_third_picture_on_drawing_takes_no_memory() {
 
 #[test]
 fn a_picture_becomes_a_file_row_by_row() {
-    let _quiet = QUIET.lock().unwrap();
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let (width, height) = (1500, 1500);
     let pixels = (0..width * height).map(|i: u32| [(i % 251) as f32 / 251.0, (i % 83) as f32 / 83.0, 0.5, 1.0]);
     let image = Image {

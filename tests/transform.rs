@@ -269,7 +269,11 @@ fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_
 
 #[test]
 fn learned_heads_leave_sparse_levels_to_surfels() {
-    let bytes = stream(&sparse_wall(), &with(QualityTarget::Lossless));
+    let options = Options {
+        levels: Some(5..=7),
+        ..with(QualityTarget::Lossless)
+    };
+    let bytes = stream(&sparse_wall(), &options);
     let model = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
     let draw = |heads: HeadSet, level| {
         let decoder = Decoder::new()

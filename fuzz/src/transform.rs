@@ -86,7 +86,10 @@ fn decoded(bytes: &[u8]) {
         let checked = decoder.check(bytes);
         let limited = matches!(error, Some(Error::LimitExceeded { .. }));
         assert!(limited || checked.is_valid() == error.is_none(), "{checked:?}");
-        assert!(checked.faults.iter().all(|fault| fault.error.clause().is_some()), "{checked:?}");
+        assert!(
+            checked.faults.iter().all(|fault| fault.error.clause().is_some()),
+            "{checked:?}"
+        );
     }
     if reached.is_some() && one_in(2, bytes) {
         let gaussians = within(most, || decoding.gaussians());

@@ -156,7 +156,7 @@ impl Choices {
         ladder
     }
 
-    /// All combinations of level, heads, precision, [`COMBINED`] qualities, and the two larger sizes; those of other
+    /// All combinations of level, heads, precision, `COMBINED` qualities, and the two larger sizes; those of other
     /// heads than the best in the default precision, as they are for who lacks time.
     pub fn combinations(&self) -> Vec<Setting> {
         let Some(default) = self.default_setting() else {

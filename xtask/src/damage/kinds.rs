@@ -452,7 +452,9 @@ fn colour_code(kinds: &mut Kinds) {
         let at = payload.len() - 1 - i / 8 % (payload.len() - 11);
         payload[at] ^= 1 << (i % 8);
     });
-    kinds.add("root-y-changed", of_hash, |s| s.colours(0)[0].payload[8 + 3] ^= 64);
+    kinds.find("root-y-changed", of_hash, |s, i| {
+        s.colours(0)[0].payload[8 + 3] ^= 1 << (i % 7)
+    });
 }
 
 fn filters(kinds: &mut Kinds) {
