@@ -87,15 +87,17 @@ pub(crate) fn columns<K: Microkernel, const R: usize, const V: usize, const P: u
     let rows = places.is_empty() || (block.most + 1).saturating_mul(steps) <= block.inputs.len();
     assert!(rows, "a place names a row that is not there");
     assert!(group.is_multiple_of(R), "whole groups");
+    let panels = (V * K::LANES).div_ceil(PANEL);
     let last = block.volume.saturating_sub(1).saturating_mul(block.tap);
-    let panels = (V * K::LANES).div_ceil(PANEL).saturating_mul(steps);
     assert!(
-        last.saturating_add(panels) <= block.weights.len(),
+        last.saturating_add(panels.saturating_mul(steps)) <= block.weights.len(),
         "weights of all taps"
     );
+    let last = group.saturating_sub(1).saturating_mul(block.stride);
+    assert!(last.saturating_add(panels) <= block.sums.len(), "sums of all rows");
     for first in (0..group).step_by(R) {
         // SAFETY: there are places for all taps and rows of the group, `first + R` among them at most, and rows for all
-        // places; all taps have weights of all panels.
+        // places; all taps have weights of all panels, and all rows sums of them.
         unsafe { multiply::<K, R, V, P>(kernel, block, first) };
     }
 }
@@ -104,7 +106,7 @@ pub(crate) fn columns<K: Microkernel, const R: usize, const V: usize, const P: u
 ///
 /// # Safety
 /// The block must have a place for each tap and each row of the group, and these rows; the places must name whole rows
-/// of `inputs`, and each of the `volume` taps have `steps` weights of the panels of `V` vectors.
+/// of `inputs`, each of the `volume` taps have `steps` weights of the panels of `V` vectors, and each row sums of them.
 ///
 /// # Panics
 /// If a tap is none of the `volume`.
@@ -121,21 +123,24 @@ unsafe fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usiz
         for r in 0..R {
             for v in 0..V {
                 let at = v * K::LANES;
-                let panel = &block.sums[(first + r) * block.stride + at / PANEL];
+                // SAFETY: the caller's promise of sums.
+                let panel = unsafe { block.sums.get_unchecked((first + r) * block.stride + at / PANEL) };
                 sums[0][r][v] = k.load(&panel.0[at % PANEL..]);
             }
         }
     }
-    for (&tap, places) in block.taps.iter().zip(block.places.chunks_exact(block.group)) {
+    let mut row = first;
+    for &tap in block.taps {
         let mut inputs = [(&[][..], &[][..]); R];
         for r in 0..R {
             // SAFETY: the caller's promise of places and rows.
-            let row = unsafe {
-                let place = usize::from(*places.get_unchecked(first + r));
+            let values = unsafe {
+                let place = usize::from(*block.places.get_unchecked(row + r));
                 std::slice::from_raw_parts(block.inputs.as_ptr().add(place * steps), steps)
             };
-            inputs[r] = row.as_chunks::<P>();
+            inputs[r] = values.as_chunks::<P>();
         }
+        row += block.group;
         let tap = usize::from(tap);
         assert!(tap < block.volume, "a tap that has no weights");
         let mut weights = [(&[][..], &[][..]); V];
@@ -179,7 +184,8 @@ unsafe fn multiply<K: Microkernel, const R: usize, const V: usize, const P: usiz
                 sum = k.add(sum, sums[part][r][v]);
             }
             let at = v * K::LANES;
-            let panel = &mut block.sums[(first + r) * block.stride + at / PANEL];
+            // SAFETY: the caller's promise of sums.
+            let panel = unsafe { block.sums.get_unchecked_mut((first + r) * block.stride + at / PANEL) };
             k.store(sum, &mut panel.0[at % PANEL..]);
         }
     }
