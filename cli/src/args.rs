@@ -136,13 +136,15 @@ impl LimitArgs {
 
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Code a coloured point cloud into a stream
+    /// Code coloured point clouds into streams: PLY, LAS, LAZ, PCD, E57, XYZ, CSV, OBJ, glTF or GLB, recognised by
+    /// content
     Encode(Encode),
-    /// Decode a stream to 3D Gaussians
+    /// Decode streams to 3D Gaussians
     Decode(Decode),
     /// Convert Gaussians or points from one file format to another
     Convert(Convert),
-    /// Draw a stream, or Gaussians, into a picture
+    /// Draw streams, Gaussians in any format that `convert` reads, or point clouds into pictures: .png, .ppm, .exr, or
+    /// .y4m for a video. Of several pictures a number is put before the ending
     Render(Render),
     /// Say what a stream holds
     Info(Info),
@@ -160,13 +162,29 @@ pub enum Command {
     Bench(Bench),
 }
 
+impl Command {
+    /// The files of commands that take many.
+    pub fn files(&self) -> Option<&Files> {
+        match self {
+            Command::Encode(args) => Some(&args.files),
+            Command::Decode(args) => Some(&args.files),
+            Command::Render(args) => Some(&args.files),
+            _ => None,
+        }
+    }
+}
+
 #[derive(Debug, Args)]
+#[command(override_usage = "b2p encode [OPTIONS] <IN>... <OUT>")]
 pub struct Encode {
-    /// Point cloud: PLY, LAS, LAZ, PCD, E57, XYZ, CSV, OBJ, glTF or GLB, recognised by content. `-`: standard input
-    #[arg(value_name = "IN")]
-    pub cloud: PathBuf,
     #[command(flatten)]
-    pub output: Output,
+    pub files: Files,
+    /// Of the files: the cloud at hand.
+    #[arg(skip)]
+    pub cloud: PathBuf,
+    /// Its stream.
+    #[arg(skip)]
+    pub output: PathBuf,
     /// Quality, from 0 to 100: chooses quantisation step and finest level. 100 is lossless, 38 the default
     #[arg(short = 'Q', long, value_name = "0..100", value_parser = clap::value_parser!(u8).range(0..=100), conflicts_with_all = ["step", "lossless", "bits_per_point"])]
     pub quality: Option<u8>,
@@ -239,12 +257,16 @@ pub struct LearnedArgs {
 }
 
 #[derive(Debug, Args)]
+#[command(override_usage = "b2p decode [OPTIONS] <IN>... <OUT>")]
 pub struct Decode {
-    /// Stream to decode to Gaussians. `-`: standard input, decoded as it arrives
-    #[arg(value_name = "IN")]
-    pub input: PathBuf,
     #[command(flatten)]
-    pub output: Output,
+    pub files: Files,
+    /// Of the files: the stream at hand.
+    #[arg(skip)]
+    pub input: PathBuf,
+    /// Its Gaussians.
+    #[arg(skip)]
+    pub output: PathBuf,
     /// Write the level's voxels with their colours instead, as points: PLY, or LAS, LAZ, PCD, E57 or XYZ by the ending
     /// (of learned streams there are none)
     #[arg(long, conflicts_with_all = ["heads", "budget", "calibrate"])]
@@ -354,12 +376,20 @@ impl std::str::FromStr for OutFormat {
 }
 
 #[derive(Debug, Args)]
+#[command(override_usage = "b2p render [OPTIONS] <IN>... <OUT>")]
 pub struct Render {
-    /// Stream, Gaussians in any format that `convert` reads, or point cloud. `-`: standard input, drawn as it arrives
-    #[arg(value_name = "IN")]
-    pub input: PathBuf,
     #[command(flatten)]
-    pub output: Picture,
+    pub files: Files,
+    /// Of the files: what is drawn at hand.
+    #[arg(skip)]
+    pub input: PathBuf,
+    /// Its picture.
+    #[arg(skip)]
+    pub output: PathBuf,
+    /// Draw a video of one turn around the object: .gif, .webp, animated .png, or with FFmpeg .mp4, .webm and .mkv; of
+    /// several inputs into a folder
+    #[arg(long, value_name = "FILE", conflicts_with = "output")]
+    pub turntable: Option<PathBuf>,
     /// Draw all views into one picture, a grid with their angles below them [default: 8 views]
     #[arg(long, conflicts_with_all = ["camera", "turntable"])]
     pub contact_sheet: bool,
@@ -402,36 +432,6 @@ pub struct Render {
     pub model: ModelArg,
     #[command(flatten)]
     pub budget: BudgetArgs,
-}
-
-/// Where pictures go.
-#[derive(Debug, Args)]
-#[group(required = true, multiple = false)]
-pub struct Picture {
-    /// Picture to write: .png, .ppm, .exr, or .y4m for a video; of several pictures a number is put before the ending.
-    /// `-`: standard output
-    #[arg(value_name = "OUT")]
-    to: Option<PathBuf>,
-    /// The same as an option
-    #[arg(short, long = "output", value_name = "OUT")]
-    output: Option<PathBuf>,
-    /// Draw a video of one turn around the object: .gif, .webp, animated .png, or with FFmpeg .mp4, .webm and .mkv
-    #[arg(long, value_name = "FILE")]
-    pub turntable: Option<PathBuf>,
-}
-
-impl std::ops::Deref for Picture {
-    type Target = Path;
-
-    fn deref(&self) -> &Path {
-        let given = [&self.to, &self.output, &self.turntable];
-        // The parser requires one.
-        given
-            .into_iter()
-            .flatten()
-            .next()
-            .map_or(Path::new(""), PathBuf::as_path)
-    }
 }
 
 /// Kinds of pictures.
@@ -581,6 +581,7 @@ pub struct ModelArg {
 
 use super::budget::{BudgetArgs, Request};
 use super::cloud::{ReadArgs, UpArg, WriteArgs, up};
+use super::many::Files;
 use super::progress::Progress;
 pub use super::values::Orbit;
 use super::values::{

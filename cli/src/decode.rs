@@ -13,9 +13,22 @@ use serde_json::json;
 
 use super::args::Decode;
 use super::manners::{self, Said};
+use super::many::Kind;
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
 use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points};
+
+/// What is taken from folders, and what becomes of it.
+pub fn kind(args: &Decode) -> Kind<'_> {
+    Kind {
+        command: "decode",
+        takes: &["b2p"],
+        ending: args
+            .format
+            .map_or("ply", |format| format.extension().trim_start_matches('.')),
+        instead: None,
+    }
+}
 
 /// Decodes a stream into a file of Gaussians.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {

@@ -13,9 +13,20 @@ use serde_json::json;
 
 use super::args::{Colours, Encode};
 use super::manners::{self, Said};
+use super::many::Kind;
 use super::progress::Progress;
 use super::table::{count, counted, steps, steps_json, table};
 use super::{Failure, Result, cloud, load};
+
+/// What is taken from folders, and what becomes of it.
+pub const KIND: Kind<'_> = Kind {
+    command: "encode",
+    takes: &[
+        "ply", "las", "laz", "pcd", "e57", "xyz", "csv", "txt", "obj", "gltf", "glb",
+    ],
+    ending: "b2p",
+    instead: None,
+};
 
 /// Codes a cloud and says what it cost.
 pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> {

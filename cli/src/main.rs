@@ -16,6 +16,7 @@ mod info;
 mod kinds;
 mod load;
 mod manners;
+mod many;
 mod picture;
 mod pipe;
 mod points;
@@ -38,6 +39,7 @@ use std::sync::mpsc::sync_channel;
 use args::{Cli, Command};
 use clap::{ColorChoice, CommandFactory, FromArgMatches};
 use manners::Said;
+use many::{Files, Work};
 
 use b2p::{Error, output};
 
@@ -104,7 +106,7 @@ const BROKEN_PIPE: u8 = 128 + 13;
 /// Runs the program; the exit code is 0 for success, 1 for failure, 2 (from the argument parser) for misuse, 130 after
 /// Ctrl-C, 141 if the reader of standard output has gone.
 fn main() -> ExitCode {
-    let cli = parse();
+    let mut cli = parse();
     manners::set(&cli);
     let usual = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
@@ -114,15 +116,20 @@ fn main() -> ExitCode {
         }
     }));
     let interrupted = ctrlc::set_handler(|| {
+        many::stop();
         output::remove_unfinished();
         std::process::exit(130);
     });
     if let Err(error) = interrupted {
         manners::warn(&format!("Ctrl-C may leave a temporary file behind: {error}"));
     }
-    match run(&cli) {
+    match run(&mut cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure(message)) if message == Failure::READER_GONE => ExitCode::from(BROKEN_PIPE),
+        Err(Failure(message)) if message.ends_with(many::UP_TO_DATE) => {
+            manners::note_report(&message);
+            ExitCode::SUCCESS
+        }
         Err(Failure(message)) => {
             manners::complain(&message);
             ExitCode::FAILURE
@@ -147,15 +154,38 @@ fn parse() -> Cli {
     Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
 }
 
-fn run(cli: &Cli) -> Result<()> {
+fn run(cli: &mut Cli) -> Result<()> {
     start_threads(cli.threads)?;
     let progress = progress::Progress::new(cli.quiet);
     let limits = cli.limits.limits();
-    let said: Said = match &cli.command {
-        Command::Encode(args) => encode::run(args, &limits, &progress)?,
-        Command::Decode(args) => decode::run(args, &limits, &progress)?,
+    let threads = cli.threads;
+    let many = |files: &Files, units, output| many::run(files, units, output, threads, &progress);
+    let said: Said = match &mut cli.command {
+        Command::Encode(args) => match args.files.work(encode::KIND)? {
+            Work::One { input, output } => {
+                (args.cloud, args.output) = (input, output);
+                encode::run(args, &limits, &progress)?
+            }
+            Work::Many(units) => many(&args.files, units, "--output")?,
+        },
+        Command::Decode(args) => match args.files.work(decode::kind(args))? {
+            Work::One { input, output } => {
+                (args.input, args.output) = (input, output);
+                decode::run(args, &limits, &progress)?
+            }
+            Work::Many(units) => many(&args.files, units, "--output")?,
+        },
         Command::Convert(args) => convert::run(args, &limits, &progress)?,
-        Command::Render(args) => render::run(args, &limits, &progress)?,
+        Command::Render(args) => match args.files.work(render::kind(args))? {
+            Work::One { input, output } => {
+                (args.input, args.output) = (input, output);
+                render::run(args, &limits, &progress)?
+            }
+            Work::Many(units) => {
+                let output = args.turntable.as_ref().map_or("--output", |_| "--turntable");
+                many(&args.files, units, output)?
+            }
+        },
         Command::Info(args) => info::run(args, &limits)?,
         Command::Check(args) => check::run(args, &limits)?,
         Command::Upgrade(args) => upgrade::run(args, &limits, &progress)?,
@@ -165,7 +195,8 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Bench(args) => bench::run(args, &limits, &progress)?,
     };
     drop(progress);
-    said.say()
+    said.say()?;
+    manners::remember()
 }
 
 /// Starts the threads at once, so that none that the system refuses is missed later. Unless a number was asked for,

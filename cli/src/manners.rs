@@ -2,12 +2,14 @@
 
 use std::io::{ErrorKind, IsTerminal, Write};
 use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use b2p::output;
 use serde_json::Value;
 
 use super::args::{Cli, Colour};
+use super::many::UP_TO_DATE;
+use super::many::record::{self, Record};
 use super::pipe::PIPE;
 use super::{Failure, Result};
 
@@ -21,7 +23,11 @@ struct Manners {
     force: bool,
     json: bool,
     coloured: bool,
+    resume: bool,
 }
+
+/// What `--resume` will know of this run: its inputs and its outputs.
+static FILES: Mutex<[Vec<PathBuf>; 2]> = Mutex::new([Vec::new(), Vec::new()]);
 
 /// Takes the global options, once.
 pub fn set(cli: &Cli) {
@@ -37,6 +43,7 @@ pub fn set(cli: &Cli) {
         force: cli.force,
         json: cli.json,
         coloured,
+        resume: cli.command.files().is_some_and(|files| files.resume),
     });
 }
 
@@ -131,6 +138,11 @@ pub fn complain(text: &str) {
     note("31", text);
 }
 
+/// Passes on what a command said on standard error.
+pub fn note_text(text: &str) {
+    let _ = std::io::stderr().lock().write_all(text.as_bytes());
+}
+
 fn note(colour: &str, text: &str) {
     let name = match manners().coloured {
         true => format!("\x1b[1;{colour}mb2p:\x1b[0m"),
@@ -147,12 +159,17 @@ pub fn is_pipe(path: &Path) -> bool {
 
 /// Whether these outputs may be written: none is one of the inputs, and those that exist may be replaced. On a terminal
 /// the user is asked; elsewhere `--force` is needed.
+///
+/// With `--resume`, what is up to date ends the command, and what is not may be replaced.
 pub fn permit(outputs: &[&Path], inputs: &[&Path]) -> Result<()> {
     for output in outputs.iter().filter(|output| !is_pipe(output)) {
         if let Some(input) = inputs.iter().find(|input| is_same(input, output)) {
             let (output, input) = (output.display(), input.display());
             return Err(Failure(format!("{output} is the input {input}: write to another file")));
         }
+    }
+    if manners().resume {
+        return resume(outputs, inputs);
     }
     let existing = outputs.iter().filter(|output| !is_pipe(output));
     let existing: Vec<PathBuf> = existing.filter_map(|output| output::replaced(output)).collect();
@@ -167,6 +184,29 @@ pub fn permit(outputs: &[&Path], inputs: &[&Path]) -> Result<()> {
         return Ok(());
     }
     Err(Failure(format!("{what}; --force overwrites")))
+}
+
+/// Ends the command if it did before what it is to do; remembers its files otherwise.
+fn resume(outputs: &[&Path], inputs: &[&Path]) -> Result<()> {
+    let owned = |paths: &[&Path]| paths.iter().map(|&path| path.to_path_buf()).collect::<Vec<_>>();
+    let (inputs, outputs) = (owned(inputs), owned(outputs));
+    if let Some(first) = outputs.first()
+        && let Some(before) = Record::read(first)
+        && Record::of(&record::options(), &inputs, &outputs).is_some_and(|now| now == before)
+    {
+        return Err(Failure(format!("{} {UP_TO_DATE}", first.display())));
+    }
+    *FILES.lock().unwrap_or_else(PoisonError::into_inner) = [inputs, outputs];
+    Ok(())
+}
+
+/// With `--resume`, keeps a record of what this run has done.
+pub fn remember() -> Result<()> {
+    let [inputs, outputs] = &*FILES.lock().unwrap_or_else(PoisonError::into_inner);
+    match Record::of(&record::options(), inputs, outputs) {
+        Some(record) if manners().resume => record.write(),
+        _ => Ok(()),
+    }
 }
 
 /// Asks on a terminal, if there is one at both ends.

@@ -139,6 +139,16 @@ impl<'a> Artist<'a> {
     }
 }
 
+/// The ending of a format's files.
+pub fn ending(format: Format) -> &'static str {
+    match format {
+        Format::Png | Format::Png16 => "png",
+        Format::Ppm => "ppm",
+        Format::Y4m => "y4m",
+        Format::Exr => "exr",
+    }
+}
+
 /// The format asked for, or that the ending tells.
 pub fn format_of(args: &Render, pictures: usize) -> Result<Format> {
     if let Some(format) = args.format {

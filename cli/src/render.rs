@@ -14,7 +14,8 @@ use super::args::{Format, Render};
 use super::budget::{self, Chosen, Task};
 use super::load::Source;
 use super::manners::{self, Said};
-use super::picture::{Artist, format_of};
+use super::many::Kind;
+use super::picture::{Artist, ending, format_of};
 use super::progress::Progress;
 use super::sheet::Sheet;
 use super::table::{count, counted, milliseconds, steps};
@@ -24,10 +25,26 @@ use super::{Failure, Result, load, pipe, turntable};
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
 
+/// What is taken from folders, and what becomes of it.
+pub fn kind(args: &Render) -> Kind<'_> {
+    Kind {
+        command: "render",
+        takes: &[
+            "b2p", "ply", "spz", "sog", "splat", "glb", "gltf", "npz", "las", "laz", "pcd", "e57", "xyz", "obj",
+        ],
+        ending: match (args.format, &args.turntable) {
+            (None, Some(_)) => "mp4",
+            (Some(format), _) => ending(format),
+            (None, None) => "png",
+        },
+        instead: args.turntable.as_deref(),
+    }
+}
+
 /// Draws one picture, or several: on a circle, or with the cameras of a file.
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> {
     let log = progress.log();
-    if let Some(path) = &args.output.turntable {
+    if let Some(path) = &args.turntable {
         turntable::kind_of(path)?;
     }
     if args.camera.is_none() {
@@ -109,7 +126,7 @@ fn choose(args: &Render, limits: &Limits, progress: &Progress) -> Result<Option<
 fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
     let mut outputs: Vec<&Path> = cameras.iter().map(|shot| shot.path.as_path()).collect();
     outputs.dedup();
-    let is_video = args.output.turntable.is_some() || args.contact_sheet;
+    let is_video = args.turntable.is_some() || args.contact_sheet;
     if !is_video
         && !manners::is_pipe(&args.output)
         && cameras.len() > 1
@@ -146,14 +163,14 @@ fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &Log) -> Result<Said>
     renderer.set_effects(effects);
     renderer.set_quality(args.quality);
     let many = if args.contact_sheet { 1 } else { cameras.len() };
-    let format = match &args.output.turntable {
+    let format = match &args.turntable {
         Some(_) => Format::Y4m,
         None => format_of(args, many)?,
     };
     let mut artist = Artist::new(renderer, gaussians, limits, args, format);
     let all = match format {
         _ if args.contact_sheet => sheet(cameras, &mut artist, limits, log)?,
-        _ if args.output.turntable.is_some() => turn(cameras, &mut artist, log)?,
+        _ if args.turntable.is_some() => turn(cameras, &mut artist, log)?,
         Format::Y4m => video(args, cameras, &mut artist, log)?,
         _ => stills(args, cameras, &mut artist, log)?,
     };

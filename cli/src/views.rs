@@ -24,7 +24,7 @@ pub struct Shot {
 
 /// How many pictures are drawn, where they are on a circle.
 fn count(args: &Render) -> u32 {
-    let usual = match (args.contact_sheet, &args.output.turntable) {
+    let usual = match (args.contact_sheet, &args.turntable) {
         (true, _) => ON_SHEET,
         (_, Some(_)) => OF_TURNTABLE,
         _ => 1,
@@ -38,7 +38,7 @@ pub fn shots(args: &Render, frame: &Frame, extent: &Extent, limits: &Limits) -> 
         Some(path) => from_file(path, args.view.size, frame, limits)?,
         None => circle(args, frame, extent)?,
     };
-    let one_file = args.contact_sheet || args.output.turntable.is_some() || named.len() == 1;
+    let one_file = args.contact_sheet || args.turntable.is_some() || named.len() == 1;
     let path = |i: usize| match one_file {
         true => args.output.to_path_buf(),
         false => numbered(&args.output, i),

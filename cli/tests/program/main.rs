@@ -9,6 +9,7 @@ mod cutting;
 mod edges;
 mod framing;
 mod knobs;
+mod many;
 mod outputs;
 mod pictures;
 mod rate_control;
