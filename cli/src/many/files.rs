@@ -36,7 +36,7 @@ pub struct Files {
     pub progress: Option<ProgressFormat>,
 }
 
-/// How progress is told.
+/// How progress is reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum ProgressFormat {
     /// JSON, an object a line
