@@ -154,6 +154,8 @@ pub enum Command {
     Upgrade(Upgrade),
     /// Cut a stream after a level: a shorter stream
     Cut(Cut),
+    /// Plan a job of many files for a render farm or a cluster: Open Job Description, Slurm or Ray
+    Plan(Plan),
     /// Show streams in a web page, drawn by the browser without a GPU
     Serve(Serve),
     /// Decode and draw the sample that comes with the program
@@ -582,6 +584,7 @@ pub struct ModelArg {
 use super::budget::{BudgetArgs, Request};
 use super::cloud::{ReadArgs, UpArg, WriteArgs, up};
 use super::many::Files;
+use super::plan::Plan;
 use super::progress::Progress;
 pub use super::values::Orbit;
 use super::values::{

@@ -19,6 +19,7 @@ mod manners;
 mod many;
 mod picture;
 mod pipe;
+mod plan;
 mod points;
 mod progress;
 mod render;
@@ -190,6 +191,7 @@ fn run(cli: &mut Cli) -> Result<()> {
         Command::Check(args) => check::run(args, &limits)?,
         Command::Upgrade(args) => upgrade::run(args, &limits, &progress)?,
         Command::Cut(args) => cut::run(args, &limits)?,
+        Command::Plan(args) => plan::run(args)?,
         Command::Serve(args) => serve::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,

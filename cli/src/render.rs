@@ -25,13 +25,16 @@ use super::{Failure, Result, load, pipe, turntable};
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
 
+/// Endings of what is taken from folders.
+pub const TAKES: &[&str] = &[
+    "b2p", "ply", "spz", "sog", "splat", "glb", "gltf", "npz", "las", "laz", "pcd", "e57", "xyz", "obj",
+];
+
 /// What is taken from folders, and what becomes of it.
 pub fn kind(args: &Render) -> Kind<'_> {
     Kind {
         command: "render",
-        takes: &[
-            "b2p", "ply", "spz", "sog", "splat", "glb", "gltf", "npz", "las", "laz", "pcd", "e57", "xyz", "obj",
-        ],
+        takes: TAKES,
         ending: match (args.format, &args.turntable) {
             (None, Some(_)) => "mp4",
             (Some(format), _) => ending(format),

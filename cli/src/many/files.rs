@@ -166,7 +166,7 @@ fn is_pattern(path: &Path) -> bool {
 }
 
 /// The files that inputs stand for. Those of a folder and of a pattern are in the order of their names.
-fn expanded(inputs: &[PathBuf], takes: &[&str]) -> Result<Vec<PathBuf>> {
+pub fn expanded(inputs: &[PathBuf], takes: &[&str]) -> Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for input in inputs {
         if input.is_dir() {

@@ -20,7 +20,7 @@ use super::progress::Progress;
 use super::table::counted;
 use super::{Failure, Result};
 use command_line::CommandLine;
-pub use files::{Files, Kind, Unit, Work};
+pub use files::{Files, Kind, Unit, Work, expanded};
 
 /// What a command says of an output that `--resume` finds as it was left.
 pub const UP_TO_DATE: &str = "is up to date";

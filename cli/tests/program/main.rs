@@ -12,6 +12,7 @@ mod knobs;
 mod many;
 mod outputs;
 mod pictures;
+mod planning;
 mod rate_control;
 #[path = "../../../tests/common/seal.rs"]
 mod seal;
