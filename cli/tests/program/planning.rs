@@ -106,7 +106,7 @@ fn batch_scripts_are_scripts() {
     let at = folder.path();
     succeeds(at, &["plan", "job.toml", "--engine", "slurm", "-o", "plan"]);
     for script in ["encode.sbatch", "render.sbatch", "submit.sh"] {
-        let checked = Command::new("sh")
+        let checked = Command::new("bash")
             .arg("-n")
             .arg(at.join("plan").join(script))
             .status()
