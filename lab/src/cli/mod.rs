@@ -1,5 +1,6 @@
 //! The program's subcommands.
 
+pub mod animate;
 pub mod capture;
 pub mod closeup;
 pub mod dataset;
@@ -27,6 +28,7 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Animate(animate::Args),
     Voxelize(voxelize::Args),
     Capture(capture::Args),
     Closeup(closeup::Args),
@@ -44,6 +46,7 @@ impl Cli {
     /// Whatever the subcommand fails with.
     pub fn run(self) -> Result<()> {
         match self.command {
+            Command::Animate(args) => args.run(),
             Command::Voxelize(args) => args.run(),
             Command::Capture(args) => args.run(),
             Command::Closeup(args) => args.run(),
