@@ -6,7 +6,7 @@ use crate::error::{LabError, Result};
 use crate::motion::{FrameInfo, Motion, Procedural, RECIPE, Sequence, Source};
 use crate::sample::{Grid, write_ply};
 
-/// Sample an animated mesh into a sequence of voxelised coloured clouds (PLY), each frame anew, on one grid
+/// Sample an animated mesh as coloured clouds on one voxel grid (PLY), each frame with points of its own
 ///
 /// Writes frame_0000.ply, frame_0001.ply, … and sequence.json, from which `eval-sequence` makes the truth again.
 #[derive(Debug, clap::Args)]

@@ -5,6 +5,7 @@ pub mod capture;
 pub mod closeup;
 pub mod dataset;
 pub mod eval;
+pub mod eval_sequence;
 pub mod occupancy;
 pub mod scene;
 pub mod tradeoff;
@@ -35,6 +36,7 @@ enum Command {
     Dataset(dataset::Args),
     Scene(scene::Args),
     Eval(eval::Args),
+    EvalSequence(eval_sequence::Args),
     Occupancy(occupancy::Args),
     Tradeoff(tradeoff::Args),
 }
@@ -53,6 +55,7 @@ impl Cli {
             Command::Dataset(args) => args.run(),
             Command::Scene(args) => args.run(),
             Command::Eval(args) => args.run(),
+            Command::EvalSequence(args) => args.run(),
             Command::Occupancy(args) => args.run(),
             Command::Tradeoff(args) => args.run(),
         }
