@@ -130,20 +130,9 @@ pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<Parts> {
     let up = array("turned_from", optional("turned_from")?)?;
     let antialiased = optional("antialiased")?;
 
-    let each = match &harmonics {
-        None => 0,
-        Some(array) => match array.shape[..] {
-            [n, each @ (0 | 3 | 8 | 15), 3] if Some(n) == count => each as usize,
-            _ => {
-                return Err(malformed(
-                    "harmonics",
-                    "shape",
-                    format!("{:?}", array.shape),
-                    "n × 3, 8 or 15 × 3",
-                ));
-            }
-        },
-    };
+    let each = harmonics
+        .as_ref()
+        .map_or(Ok(0), |array| coefficients(array, positions.shape[0]))?;
     builder::check(positions.shape[0], each, limits)?;
     let mut builder = Builder::new(positions.shape[0], each, limits)?;
     builder.compensated = antialiased.is_some_and(|file| file.last() == Some(&1));
@@ -163,19 +152,36 @@ pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<Parts> {
             builder.push_coefficients((0..each).map(|k| std::array::from_fn(|channel| at(k, channel))));
         }
     }
-    let frame = cube.filter(|cube| cube.shape == [5]).map(|cube| Frame {
+    let frame = cube.as_ref().and_then(frame).filter(Frame::is_valid);
+    Ok((builder.finish(frame), Vec::new(), up.as_ref().and_then(known_up)))
+}
+
+/// Coefficients of each of `count` Gaussians.
+fn coefficients(harmonics: &Array, count: u64) -> Result<usize> {
+    match harmonics.shape[..] {
+        [n, each @ (0 | 3 | 8 | 15), 3] if n == count => Ok(each as usize),
+        _ => Err(malformed(
+            "harmonics",
+            "shape",
+            format!("{:?}", harmonics.shape),
+            "n × 3, 8 or 15 × 3",
+        )),
+    }
+}
+
+fn frame(cube: &Array) -> Option<Frame> {
+    (cube.shape == [5]).then(|| Frame {
         bits: cube.get(0) as u8,
         placement: Placement {
             origin: [cube.get(1), cube.get(2), cube.get(3)],
             voxel_size: cube.get(4),
         },
-    });
-    let up = up.filter(|up| up.shape == [3]);
-    let up = up.and_then(|up| {
-        UPS.into_iter()
-            .find(|known| (0..3).all(|k| up.get(k) == direction(*known)[k]))
-    });
-    Ok((builder.finish(frame.filter(Frame::is_valid)), Vec::new(), up))
+    })
+}
+
+fn known_up(up: &Array) -> Option<Up> {
+    let is = |known: &Up| (0..3).all(|k| up.get(k) == direction(*known)[k]);
+    UPS.into_iter().find(|known| up.shape == [3] && is(known))
 }
 
 pub(super) fn write(rows: &Rows, to: &mut dyn Write, io: &dyn Fn(io::Error) -> Error) -> Result<()> {

@@ -36,22 +36,7 @@ const ANTIALIASED: &str = "antialiased";
 
 pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<Parts> {
     let mut archive = Archive::open(bytes, limits)?;
-    let text = archive.need("meta.json")?;
-    limits.check_bytes(
-        "bytes of meta.json in memory",
-        JSON_FACTOR.saturating_mul(text.len() as u64),
-    )?;
-    let meta: Value = serde_json::from_slice(&text).map_err(|e| malformed("meta.json", "JSON", e, "an object"))?;
-    match meta["version"].as_u64() {
-        Some(2) => {}
-        found => {
-            let version = found.map_or("no version: it is version 1".into(), |v| format!("version {v}"));
-            return Err(Error::Unsupported {
-                what: "this version of SOG",
-                detail: format!("meta.json has {version}, expected version 2"),
-            });
-        }
-    }
+    let meta = meta(&mut archive, limits)?;
     let count = meta["count"].as_u64();
     let count = count.ok_or_else(|| malformed("meta.json", "count", &meta["count"], "a number of Gaussians"))?;
     let bands = meta["shN"]["bands"].as_u64().unwrap_or(0) as usize;
@@ -71,58 +56,117 @@ pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<Parts> {
         }
         _ => {}
     }
-    let mut pictures = |name: &str, files: usize| -> Result<Vec<Picture>> {
-        let names = meta[name]["files"].as_array().map_or(&[][..], Vec::as_slice);
-        let names: Vec<&str> = names.iter().filter_map(Value::as_str).collect();
-        if names.len() != files {
-            return Err(malformed("meta.json", format!("files of {name}"), names.len(), files));
-        }
-        names
-            .iter()
-            .map(|name| Picture::read(name, &archive.need(name)?, limits))
-            .collect()
-    };
-    let means = pictures("means", 2)?;
-    let quats = pictures("quats", 1)?;
-    let scales = pictures("scales", 1)?;
-    let sh0 = pictures("sh0", 1)?;
-    let rest = if harmonics > 0 { pictures("shN", 2)? } else { Vec::new() };
-    for picture in means.iter().chain(&quats).chain(&scales).chain(&sh0).chain(rest.get(1)) {
-        picture.check_pixels(count)?;
-    }
-    let bounds = |name: &str| {
-        let bounds = three(&meta["means"][name]);
-        bounds.ok_or_else(|| {
-            malformed(
-                "meta.json",
-                format!("means.{name}"),
-                &meta["means"][name],
-                "three numbers",
-            )
-        })
-    };
-    let (low, high) = (bounds("mins")?, bounds("maxs")?);
-    let scale_book = numbers(&meta, "scales")?;
-    let colour_book = numbers(&meta, "sh0")?;
-    let palette = Palette::read(&meta, harmonics, &rest)?;
+    let pictures = Pictures::read(&mut archive, &meta, count, harmonics, limits)?;
+    let codes = Codes::read(&meta)?;
+    let palette = Palette::read(&meta, harmonics, &pictures.rest)?;
     for i in 0..count as usize {
-        let (l, u) = (means[0].pixel(i), means[1].pixel(i));
-        let (scale, colour) = (scales[0].pixel(i), sh0[0].pixel(i));
-        builder.push(Row {
-            position: std::array::from_fn(|k| {
-                let t = f64::from(u16::from_le_bytes([l[k], u[k]])) / 65535.0;
-                inverse_log(low[k] + (high[k] - low[k]) * t)
-            }),
-            scale: std::array::from_fn(|k| scale_book[usize::from(scale[k])].exp()),
-            rotation: rotation(quats[0].pixel(i), i)?,
-            opacity: f64::from(colour[3]) / 255.0,
-            colour: std::array::from_fn(|k| 0.5 + HARMONIC * colour_book[usize::from(colour[k])]),
-        });
+        builder.push(pictures.row(i, &codes)?);
         if let Some(palette) = &palette {
             builder.push_coefficients(palette.coefficients(i));
         }
     }
     Ok((builder.finish(frame), warnings, up_from_json(&meta["b2p"])))
+}
+
+/// The description of an archive of version 2.
+fn meta(archive: &mut Archive, limits: &Limits) -> Result<Value> {
+    let text = archive.need("meta.json")?;
+    limits.check_bytes(
+        "bytes of meta.json in memory",
+        JSON_FACTOR.saturating_mul(text.len() as u64),
+    )?;
+    let meta: Value = serde_json::from_slice(&text).map_err(|e| malformed("meta.json", "JSON", e, "an object"))?;
+    match meta["version"].as_u64() {
+        Some(2) => Ok(meta),
+        found => {
+            let version = found.map_or("no version: it is version 1".into(), |v| format!("version {v}"));
+            Err(Error::Unsupported {
+                what: "this version of SOG",
+                detail: format!("meta.json has {version}, expected version 2"),
+            })
+        }
+    }
+}
+
+/// The pictures of an archive. A pixel of each belongs to a Gaussian.
+struct Pictures {
+    /// The low and the high bytes of positions.
+    means: Vec<Picture>,
+    quats: Vec<Picture>,
+    scales: Vec<Picture>,
+    sh0: Vec<Picture>,
+    /// The palette of harmonics and its labels; empty without harmonics.
+    rest: Vec<Picture>,
+}
+
+impl Pictures {
+    fn read(archive: &mut Archive, meta: &Value, count: u64, harmonics: usize, limits: &Limits) -> Result<Self> {
+        let mut pictures = |name: &str, files: usize| -> Result<Vec<Picture>> {
+            let names = meta[name]["files"].as_array().map_or(&[][..], Vec::as_slice);
+            let names: Vec<&str> = names.iter().filter_map(Value::as_str).collect();
+            if names.len() != files {
+                return Err(malformed("meta.json", format!("files of {name}"), names.len(), files));
+            }
+            let read = |name: &&str| Picture::read(name, &archive.need(name)?, limits);
+            names.iter().map(read).collect()
+        };
+        let read = Pictures {
+            means: pictures("means", 2)?,
+            quats: pictures("quats", 1)?,
+            scales: pictures("scales", 1)?,
+            sh0: pictures("sh0", 1)?,
+            rest: if harmonics > 0 { pictures("shN", 2)? } else { Vec::new() },
+        };
+        let each = read
+            .means
+            .iter()
+            .chain(&read.quats)
+            .chain(&read.scales)
+            .chain(&read.sh0);
+        for picture in each.chain(read.rest.get(1)) {
+            picture.check_pixels(count)?;
+        }
+        Ok(read)
+    }
+
+    fn row(&self, i: usize, codes: &Codes) -> Result<Row> {
+        let (lower, upper) = (self.means[0].pixel(i), self.means[1].pixel(i));
+        let (scale, colour) = (self.scales[0].pixel(i), self.sh0[0].pixel(i));
+        Ok(Row {
+            position: std::array::from_fn(|k| {
+                let t = f64::from(u16::from_le_bytes([lower[k], upper[k]])) / 65535.0;
+                inverse_log(codes.low[k] + (codes.high[k] - codes.low[k]) * t)
+            }),
+            scale: std::array::from_fn(|k| codes.scales[usize::from(scale[k])].exp()),
+            rotation: rotation(self.quats[0].pixel(i), i)?,
+            opacity: f64::from(colour[3]) / 255.0,
+            colour: std::array::from_fn(|k| 0.5 + HARMONIC * codes.colours[usize::from(colour[k])]),
+        })
+    }
+}
+
+/// What the bytes of pictures stand for.
+struct Codes {
+    /// Bounds of positions, in symmetric logarithms.
+    low: [f64; 3],
+    high: [f64; 3],
+    scales: Vec<f64>,
+    colours: Vec<f64>,
+}
+
+impl Codes {
+    fn read(meta: &Value) -> Result<Self> {
+        let bounds = |name: &str| {
+            let found = &meta["means"][name];
+            three(found).ok_or_else(|| malformed("meta.json", format!("means.{name}"), found, "three numbers"))
+        };
+        Ok(Codes {
+            low: bounds("mins")?,
+            high: bounds("maxs")?,
+            scales: numbers(meta, "scales")?,
+            colours: numbers(meta, "sh0")?,
+        })
+    }
 }
 
 /// A codebook of 256 numbers. The first may be null, as some early files have it.
