@@ -115,7 +115,7 @@ pub struct Sampler<'a> {
 const CHUNK: u64 = 1 << 15;
 
 /// Parts the random numbers of noise from those of places.
-const NOISE: u64 = 0x6e6f_6973_65;
+const NOISE: u64 = 0x006e_6f69_7365;
 
 /// Voxel sums of a chunk. Colours have 8 fractional bits.
 #[derive(Debug, Clone, Copy)]

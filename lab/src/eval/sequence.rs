@@ -223,7 +223,7 @@ pub fn judge(
         let in_cube = |p: [f32; 3]| frame.placement.to_cube(frame.bits, p.map(f64::from));
         let now = Truth::new(TrueView::from_camera(
             &truth.surface(motion, index).map(in_cube),
-            camera.clone(),
+            *camera,
         )?)?;
         for (item, tally) in items.iter().zip(&mut tallies) {
             let coded = item.frame(index, frame)?;

@@ -329,7 +329,7 @@ impl Binding {
                 return Err(format!("a vertex names joint {joint} of {}", joints.len()));
             }
             let sum: f64 = influence.iter().map(|(_, w)| w).sum();
-            if !(sum > 0.0) {
+            if sum <= 0.0 {
                 return Err("a vertex of a skinned mesh has no weights".into());
             }
             influence.iter_mut().for_each(|(_, w)| *w /= sum);
