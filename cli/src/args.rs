@@ -144,6 +144,9 @@ pub enum Command {
     Convert(Convert),
     /// Draw a stream, or Gaussians, into a picture
     Render(Render),
+    /// Show streams, Gaussians and point clouds in a window, or in the terminal
+    #[cfg(feature = "view")]
+    View(super::view::View),
     /// Say what a stream holds
     Info(Info),
     /// Say whether streams are valid, and where not, which clause of the format they break
@@ -158,6 +161,10 @@ pub enum Command {
     Demo(Demo),
     /// Time the stages of decoding
     Bench(Bench),
+    /// Print completions of command lines for a shell
+    Completions(super::paperwork::Completions),
+    /// Write the manual, a page for each command
+    Man(super::paperwork::Manual),
 }
 
 #[derive(Debug, Args)]

@@ -12,10 +12,12 @@ mod cut;
 mod decode;
 mod demo;
 mod encode;
+mod font;
 mod info;
 mod kinds;
 mod load;
 mod manners;
+mod paperwork;
 mod picture;
 mod pipe;
 mod points;
@@ -28,6 +30,8 @@ mod table;
 mod turntable;
 mod upgrade;
 mod values;
+#[cfg(feature = "view")]
+mod view;
 mod views;
 
 use std::io::ErrorKind;
@@ -160,9 +164,17 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Check(args) => check::run(args, &limits)?,
         Command::Upgrade(args) => upgrade::run(args, &limits, &progress)?,
         Command::Cut(args) => cut::run(args, &limits)?,
+        #[cfg(feature = "view")]
+        Command::View(args) => {
+            // A window or a terminal of its own says how it goes.
+            drop(progress);
+            return view::run(args, &limits)?.say();
+        }
         Command::Serve(args) => serve::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,
+        Command::Completions(args) => paperwork::completions(args)?,
+        Command::Man(args) => paperwork::manual(args)?,
     };
     drop(progress);
     said.say()
