@@ -23,7 +23,7 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 PROGRAM = os.environ.get("B2P_PROGRAM", str(ROOT / "target/debug/b2p"))
 SAMPLE, SCENE = ROOT / "models/sample.b2p", ROOT / "models/scene.b2p"
 # Seconds after which something that was to happen is held not to.
-PATIENCE = 60
+PATIENCE = 120
 
 
 def wait_for(what, condition):
@@ -130,14 +130,14 @@ class Viewer:
         found = dict(line.split("=") for line in self.ask("getwindowgeometry", "--shell", self.window).split())
         return [int(found[name]) for name in ("X", "Y", "WIDTH", "HEIGHT")]
 
-    def pixels(self):
+    def pixels(self, whole=True):
         """What is shown, without the pointer, once it does not change any more."""
         self.ask("mousemove", "1279", "1023")
         last, since = None, 0.0
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             now = self.screen.pixels(*self.geometry())
-            if now != last:
+            if now != last or (whole and "decoding" in self.title()):
                 last, since = now, time.monotonic()
             elif time.monotonic() - since > 0.7 and len(set(now)) > 1:
                 return now
@@ -147,10 +147,10 @@ class Viewer:
     def said(self):
         return pathlib.Path(self.errors.name).read_text()
 
-    def screenshot(self):
+    def screenshot(self, whole=True):
         """The file of a screenshot, and the options of `render` that draw it."""
         before = set(self.folder.glob("*.png"))
-        line = wait_for("a picture to save", lambda: self.pixels()) and len(self.said().splitlines())
+        line = wait_for("a picture to save", lambda: self.pixels(whole)) and len(self.said().splitlines())
         self.press("s")
         wait_for("a line about the screenshot", lambda: len(self.said().splitlines()) > line)
         (path,) = set(self.folder.glob("*.png")) - before
@@ -294,7 +294,7 @@ class WindowTest(unittest.TestCase):
         half = len(stream) // 2
         viewer.process.stdin.write(stream[:half])
         viewer.process.stdin.flush()
-        early, coarse = viewer.screenshot()
+        early, coarse = viewer.screenshot(whole=False)
         viewer.process.stdin.write(stream[half:])
         viewer.process.stdin.close()
         viewer.process.stdin = None

@@ -103,14 +103,16 @@ impl State {
         self.files.get(self.file).map_or(Path::new(""), PathBuf::as_path)
     }
 
-    /// The file that is shown and which of how many it is, for a title.
+    /// The file that is shown, which of how many it is, and whether more of it is to come, for a title.
     pub fn title(&self) -> String {
         let name = self.path().file_name().unwrap_or(self.path().as_os_str());
         let name = name.to_string_lossy();
-        match self.files.len() {
-            1 => format!("{name} – b2p"),
-            count => format!("{name} ({} of {count}) – b2p", self.file + 1),
-        }
+        let place = match self.files.len() {
+            1 => String::new(),
+            count => format!(" ({} of {count})", self.file + 1),
+        };
+        let decoding = if self.busy { ", decoding" } else { "" };
+        format!("{name}{place}{decoding} – b2p")
     }
 
     /// Whether there is another file to go to.
@@ -404,7 +406,7 @@ mod tests {
     #[test]
     fn another_file_is_shown_from_the_start_with_a_camera_of_its_own() {
         let mut state = state(&["a.b2p", "b.ply", "c.spz"]);
-        assert_eq!(state.title(), "a.b2p (1 of 3) – b2p");
+        assert_eq!(state.title(), "a.b2p (1 of 3), decoding – b2p");
         state.take(0, choices());
         state.take(0, scene(0.5, 9));
         let first = state.camera.camera([200, 100]).unwrap();

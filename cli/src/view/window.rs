@@ -88,6 +88,7 @@ fn no_display(error: impl std::fmt::Display) -> Failure {
 struct Shell {
     window: Arc<Window>,
     surface: Surface<Arc<Window>, Arc<Window>>,
+    title: String,
 }
 
 #[derive(Default)]
@@ -133,13 +134,14 @@ impl App {
             let most = (f64::from(width.min(height)) * SHARE) as u32;
             size = size.map(|side| side.min(most.max(1)));
         }
+        let title = self.state.title();
         let attributes = Window::default_attributes()
-            .with_title(self.state.title())
+            .with_title(&title)
             .with_inner_size(PhysicalSize::new(size[0], size[1]));
         let window = Arc::new(events.create_window(attributes).map_err(no_display)?);
         let context = Context::new(window.clone()).map_err(no_display)?;
         let surface = Surface::new(&context, window.clone()).map_err(no_display)?;
-        Ok(Shell { window, surface })
+        Ok(Shell { window, surface, title })
     }
 
     fn apply(&mut self, effect: Effect, events: &ActiveEventLoop) {
@@ -156,13 +158,15 @@ impl App {
             }
             Effect::Load => {
                 self.source.want(self.state.wanted());
-                if let Some(shell) = &self.shell {
-                    shell.window.set_title(&self.state.title());
-                }
                 self.order(false);
             }
             Effect::Screenshot => self.screenshot(),
             Effect::Close => events.exit(),
+        }
+        let title = self.state.title();
+        if let Some(shell) = self.shell.as_mut().filter(|shell| shell.title != title) {
+            shell.window.set_title(&title);
+            shell.title = title;
         }
         events.set_control_flow(self.rest.map_or(ControlFlow::Wait, ControlFlow::WaitUntil));
     }
@@ -247,7 +251,7 @@ impl App {
     /// Shows the last picture and what is written over it.
     fn show(&mut self) -> std::result::Result<(), softbuffer::SoftBufferError> {
         let (state, picture) = (&self.state, self.picture.as_ref());
-        let Some(Shell { window, surface }) = &mut self.shell else {
+        let Some(Shell { window, surface, .. }) = &mut self.shell else {
             return Ok(());
         };
         let [width, height] = state.size;
