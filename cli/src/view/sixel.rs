@@ -95,7 +95,7 @@ mod tests {
                     let numbers: Vec<u32> = rest[..length].split(';').map(|n| n.parse().unwrap()).collect();
                     colour = numbers[0] as usize;
                     if let [_, 2, r, g, b] = numbers[..] {
-                        palette[colour] = [r, g, b].iter().fold(0, |all, c| all << 8 | (c * 255 + 50) / 100);
+                        palette[colour] = [r, g, b].iter().fold(0, |all, c| (all << 8) | ((c * 255 + 50) / 100));
                     }
                     rest = &rest[length..];
                 }
