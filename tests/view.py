@@ -74,7 +74,8 @@ class Screen:
     def __init__(self):
         self.folder = tempfile.mkdtemp(prefix="b2p-view-")
         read, write = os.pipe()
-        options = ["-screen", "0", "1280x1024x24", "-fbdir", self.folder, "-noreset", "-nolisten", "tcp", "-displayfd", str(write)]
+        options = ["-screen", "0", "1280x1024x24", "-fbdir", self.folder, "-noreset", "-nolisten", "tcp"]
+        options += ["-displayfd", str(write)]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         self.process = subprocess.Popen(["Xvfb", *options], pass_fds=[write], **quiet)
         os.close(write)
@@ -392,7 +393,7 @@ class TerminalTest(unittest.TestCase):
         os.write(main, b"q")
         wait_for("the end", lambda: hear(lambda: process.poll() is not None))
         self.assertEqual(process.returncode, 0)
-        self.assertTrue(heard.rstrip().endswith(b"\x1b[?25h\x1b[0m"), heard[-50:])
+        self.assertTrue(heard.rstrip().endswith(b"\x1b[0m"), heard[-50:])
         self.assertEqual(termios.tcgetattr(other), before)
         os.close(main)
         os.close(other)

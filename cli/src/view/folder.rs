@@ -66,7 +66,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let write = |name: &str, bytes: &[u8]| std::fs::write(folder.path().join(name), bytes).unwrap();
         write("b.b2p", &[&MAGIC[..], &[3, 0]].concat());
-        write("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n");
+        let axes = ["x", "y", "z"].map(|axis| format!("property float {axis}\n")).concat();
+        let ply = format!("ply\nformat ascii 1.0\nelement vertex 1\n{axes}end_header\n0 0 0\n");
+        write("a.ply", ply.as_bytes());
         write("c.txt", b"# notes: nothing to see");
         write("d.png", b"\x89PNG\r\n\x1a\n");
         std::fs::create_dir(folder.path().join("e.b2p")).unwrap();

@@ -77,11 +77,11 @@ pub fn run(viewer: Viewer, kind: Kind) -> Result<Said> {
     screen.state.resize(size);
     if is_followed {
         screen.keys = Some(follow(terminal, teller)?);
-        print("\x1b[2J\x1b[?25l")?;
+        print("\x1b[2J")?;
     }
     let ended = screen.run(&told);
     if is_followed {
-        print("\x1b[?25h\x1b[0m\n")?;
+        print("\x1b[0m\n")?;
     }
     ended.map(|()| Said::default())
 }
