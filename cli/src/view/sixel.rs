@@ -4,9 +4,8 @@ use color_quant::NeuQuant;
 
 /// Colours of a picture; terminals have at least so many.
 const COLOURS: usize = 256;
-/// Of how many pixels one is looked at to choose the colours, and the least number that can be chosen from.
-const SAMPLES: i32 = 10;
-const LEAST_PIXELS: usize = 1024;
+/// Pixels that are looked at to choose the colours: fewer choose badly, of more only one in so many is taken.
+const SAMPLES: usize = 1 << 15;
 /// Rows of pixels that one character has.
 const ROWS: usize = 6;
 
@@ -19,13 +18,15 @@ pub fn encode(pixels: &[u32], width: usize) -> String {
         .collect();
     // The chooser needs some pixels to choose from.
     let mut sample = rgba.clone();
-    while !sample.is_empty() && sample.len() < 4 * LEAST_PIXELS {
+    while !sample.is_empty() && sample.len() < 4 * SAMPLES {
         sample.extend_from_within(..);
     }
     if sample.is_empty() {
         return String::new();
     }
-    let palette = NeuQuant::new(SAMPLES, COLOURS, &sample);
+    // The chooser takes 1 to 30.
+    let one_in = (sample.len() / 4 / SAMPLES).clamp(1, 30) as i32;
+    let palette = NeuQuant::new(one_in, COLOURS, &sample);
     let indices: Vec<u8> = rgba
         .chunks_exact(4)
         .map(|colour| palette.index_of(colour) as u8)
