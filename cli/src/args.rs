@@ -146,6 +146,9 @@ pub enum Command {
     /// Draw streams, Gaussians in any format that `convert` reads, or point clouds into pictures: .png, .ppm, .exr, or
     /// .y4m for a video. Of several pictures a number is put before the ending
     Render(Render),
+    /// Show streams, Gaussians and point clouds in a window, or in the terminal
+    #[cfg(feature = "view")]
+    View(super::view::View),
     /// Say what a stream holds
     Info(Info),
     /// Say whether streams are valid, and where not, which clause of the format they break
@@ -162,6 +165,10 @@ pub enum Command {
     Demo(Demo),
     /// Time the stages of decoding
     Bench(Bench),
+    /// Print completions of command lines for a shell
+    Completions(super::paperwork::Completions),
+    /// Write the manual, a page for each command
+    Man(super::paperwork::Manual),
 }
 
 impl Command {

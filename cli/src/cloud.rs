@@ -245,6 +245,12 @@ pub fn remember_up(up: Up) {
     });
 }
 
+/// Forgets what the last input said, before another is read.
+#[cfg(feature = "view")]
+pub fn forget() {
+    *REMEMBERED.lock().unwrap_or_else(PoisonError::into_inner) = None;
+}
+
 fn set_remembered(axes: Axes) {
     *REMEMBERED.lock().unwrap_or_else(PoisonError::into_inner) = Some(axes);
 }

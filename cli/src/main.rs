@@ -12,11 +12,13 @@ mod cut;
 mod decode;
 mod demo;
 mod encode;
+mod font;
 mod info;
 mod kinds;
 mod load;
 mod manners;
 mod many;
+mod paperwork;
 mod picture;
 mod pipe;
 mod plan;
@@ -30,6 +32,8 @@ mod table;
 mod turntable;
 mod upgrade;
 mod values;
+#[cfg(feature = "view")]
+mod view;
 mod views;
 
 use std::io::ErrorKind;
@@ -192,9 +196,17 @@ fn run(cli: &mut Cli) -> Result<()> {
         Command::Upgrade(args) => upgrade::run(args, &limits, &progress)?,
         Command::Cut(args) => cut::run(args, &limits)?,
         Command::Plan(args) => plan::run(args)?,
+        #[cfg(feature = "view")]
+        Command::View(args) => {
+            // A window or a terminal of its own says how it goes.
+            drop(progress);
+            return view::run(args, &limits)?.say();
+        }
         Command::Serve(args) => serve::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,
+        Command::Completions(args) => paperwork::completions(args)?,
+        Command::Man(args) => paperwork::manual(args)?,
     };
     drop(progress);
     said.say()?;

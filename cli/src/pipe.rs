@@ -22,7 +22,8 @@ const WAITING: usize = 16;
 /// Bytes that tell what comes, and of which version.
 const STREAM_START: usize = 10;
 
-type Piece = std::io::Result<Vec<u8>>;
+/// What was read at once, and what stops reading.
+pub type Piece = std::io::Result<Vec<u8>>;
 
 /// What is done with Gaussians.
 pub type Show<'a> = dyn FnMut(&Gaussians, &Log) -> Result<()> + 'a;
@@ -124,7 +125,7 @@ fn show_level(decoding: &Decoding, log: &Log, show: &mut Show) -> Result<()> {
 }
 
 /// Standard input, read by a thread of its own so that it can be known whether something waits.
-fn pieces() -> Result<Receiver<Piece>> {
+pub fn pieces() -> Result<Receiver<Piece>> {
     let (sender, receiver) = sync_channel(WAITING);
     let read = move || {
         let mut input = std::io::stdin().lock();
@@ -146,7 +147,8 @@ fn pieces() -> Result<Receiver<Piece>> {
     Ok(receiver)
 }
 
-fn broken(source: std::io::Error) -> Failure {
+/// What the system said when standard input was read.
+pub fn broken(source: std::io::Error) -> Failure {
     Failure::from(Error::Io {
         path: PIPE.into(),
         source,

@@ -2,13 +2,11 @@
 
 use b2p::renderer::Image;
 use b2p::{Error, Limits};
-use font8x8::legacy::BASIC_LEGACY;
-use font8x8::legacy::LATIN_LEGACY;
+
+use super::font::{CHARACTER, glyph};
 
 /// Pixels between pictures, and around them.
 const GAP: u32 = 8;
-/// A character is so many pixels wide and high before it is enlarged.
-const CHARACTER: u32 = 8;
 
 /// A picture that is filled view by view.
 pub struct Sheet {
@@ -99,16 +97,6 @@ impl Sheet {
 fn columns(count: u32, width: u32, height: u32) -> u32 {
     let square = (f64::from(count) * f64::from(height) / f64::from(width)).sqrt();
     (square.round() as u32).clamp(1, count)
-}
-
-/// Eight rows of eight pixels, the lowest bit leftmost; an empty one for what the font has not.
-fn glyph(character: char) -> [u8; 8] {
-    let code = character as usize;
-    match code {
-        0..0x80 => BASIC_LEGACY[code],
-        0xa0..0x100 => LATIN_LEGACY[code - 0xa0],
-        _ => [0; 8],
-    }
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use b2p::Limits;
 use b2p::gaussians::Frame;
 use b2p::renderer::camera::{Camera, Extent, Projection, files};
 
-use super::args::{Render, View};
+use super::args::Render;
 use super::{Failure, Result, cloud, load};
 
 /// Pictures of a contact sheet and of a turntable, unless a number is given.
@@ -76,7 +76,7 @@ fn circle(args: &Render, frame: &Frame, extent: &Extent) -> Result<Vec<files::Na
     let view = &args.view;
     let count = count(args);
     let azimuths = (0..count).map(|i| view.orbit.azimuth + 360.0 * f64::from(i) / f64::from(count));
-    let target = target(view, frame, extent);
+    let target = target(view.look_at, view.orbit.distance, frame, extent);
     let up = cloud::up_of(&args.input, args.up);
     let at = |azimuth: f64, radius: f64| {
         let (width, height) = view.size;
@@ -119,9 +119,10 @@ fn circle(args: &Render, frame: &Frame, extent: &Extent) -> Result<Vec<files::Na
     azimuths.map(camera).collect()
 }
 
-/// The point that is looked at, in the cube frame.
-fn target(view: &View, frame: &Frame, extent: &Extent) -> [f64; 3] {
-    match (view.look_at, view.orbit.distance) {
+/// The point that is looked at, in the cube frame: `look_at`, which is in the units of the cloud, or the middle of the
+/// object, or with a distance that of the cube.
+pub fn target(look_at: Option<[f64; 3]>, distance: Option<f64>, frame: &Frame, extent: &Extent) -> [f64; 3] {
+    match (look_at, distance) {
         (Some(world), _) => {
             let unit = frame.unit();
             std::array::from_fn(|axis| (world[axis] - frame.placement.origin[axis]) / unit - 1.0)

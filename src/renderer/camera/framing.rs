@@ -67,10 +67,16 @@ impl Extent {
 
     /// The middle of the box around it.
     pub fn middle(&self) -> [f64; 3] {
+        let [low, high] = self.corners().map(DVec3::from);
+        (0.5 * (low + high)).to_array()
+    }
+
+    /// The lowest and the highest corner of the box around it.
+    pub fn corners(&self) -> [[f64; 3]; 2] {
         let points = || self.points.iter().copied();
         let low = points().reduce(DVec3::min).unwrap_or_default();
         let high = points().reduce(DVec3::max).unwrap_or_default();
-        (0.5 * (low + high)).to_array()
+        [low.to_array(), high.to_array()]
     }
 }
 
@@ -228,5 +234,6 @@ mod tests {
         );
         assert_eq!(Extent::of(odd.into_iter()), Extent::cube());
         assert_eq!(Extent::cube().middle(), [0.0; 3]);
+        assert_eq!(Extent::cube().corners(), [[-1.0; 3], [1.0; 3]]);
     }
 }
