@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 /// The folders of `src/`, each with those that it may import beside the commons: an arrow only leads to a folder
 /// further up.
-const STAGES: [(&str, &[&str]); 12] = [
+const STAGES: [(&str, &[&str]); 13] = [
     ("coding", &[]),
     ("container", &[]),
     ("geometry", &["coding", "container"]),
@@ -40,6 +40,7 @@ const STAGES: [(&str, &[&str]); 12] = [
             "decoder",
         ],
     ),
+    ("sequence", &["container", "cloud", "gaussians", "decoder", "encoder"]),
     ("metrics", &["renderer"]),
 ];
 
