@@ -7,6 +7,7 @@ pub mod dataset;
 pub mod error;
 pub mod eval;
 pub mod mesh;
+pub mod motion;
 pub mod occupancy;
 pub mod procedural;
 pub mod random;

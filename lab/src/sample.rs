@@ -104,6 +104,8 @@ pub struct Sampler<'a> {
     surface: &'a Surface,
     grid: Grid,
     seed: u64,
+    /// Standard deviation of the points' places in voxels, per axis.
+    noise: f64,
     faces: Vec<Face>,
     /// `ends[i]` points belong to the triangles up to and with `faces[i]`.
     ends: Vec<u64>,
@@ -111,6 +113,9 @@ pub struct Sampler<'a> {
 
 /// Points drawn and sorted at a time: few enough for a fast cache.
 const CHUNK: u64 = 1 << 15;
+
+/// Parts the random numbers of noise from those of places.
+const NOISE: u64 = 0x6e6f_6973_65;
 
 /// Voxel sums of a chunk. Colours have 8 fractional bits.
 #[derive(Debug, Clone, Copy)]
@@ -153,16 +158,24 @@ impl<'a> Sampler<'a> {
             surface,
             grid,
             seed,
+            noise: 0.0,
             faces,
             ends,
         })
+    }
+
+    /// With normal noise on the places of points: its standard deviation in voxels along each axis. Points that it
+    /// takes out of the grid are left out.
+    pub fn with_noise(mut self, deviation: f64) -> Self {
+        self.noise = deviation;
+        self
     }
 
     /// Where point `index` is, in continuous voxel coordinates.
     pub fn point(&self, index: u64) -> [f64; 3] {
         let face = self.faces[self.ends.partition_point(|&end| end <= index)];
         let corners = corners(self.surface, face);
-        self.place(&corners, self.weights(index)).to_array()
+        self.place(&corners, self.weights(index), index).to_array()
     }
 
     /// All voxels that hold a visible point, or those in a box.
@@ -193,7 +206,7 @@ impl<'a> Sampler<'a> {
         let mut room = CHUNK;
         let mut first = 0;
         for (i, &end) in self.ends.iter().enumerate() {
-            if only.is_none_or(|b| self.may_touch(self.faces[i], b)) {
+            if self.noise > 0.0 || only.is_none_or(|b| self.may_touch(self.faces[i], b)) {
                 while first < end {
                     let take = room.min(end - first);
                     chunk.push((i, first, first + take));
@@ -230,7 +243,10 @@ impl<'a> Sampler<'a> {
             let corners = corners(self.surface, face);
             for index in first..end {
                 let weights = self.weights(index);
-                let place = self.place(&corners, weights).to_array();
+                let place = self.place(&corners, weights, index).to_array();
+                if self.noise > 0.0 && place.iter().any(|x| !(0.0..f64::from(side)).contains(x)) {
+                    continue;
+                }
                 // Saturates below 0, which rounding may reach.
                 let voxel = place.map(|x| (x as u32).min(side - 1));
                 let inside = |b: VoxelBox| (0..3).all(|a| (b.low[a]..b.high[a]).contains(&voxel[a]));
@@ -267,9 +283,14 @@ impl<'a> Sampler<'a> {
         [1.0 - r, r * (1.0 - s), r * s]
     }
 
-    fn place(&self, corners: &[glam::DVec3; 3], weights: [f64; 3]) -> glam::DVec3 {
+    fn place(&self, corners: &[glam::DVec3; 3], weights: [f64; 3], index: u64) -> glam::DVec3 {
         let p = corners[0] * weights[0] + corners[1] * weights[1] + corners[2] * weights[2];
-        self.grid.coordinate(p.to_array()).into()
+        let place = glam::DVec3::from(self.grid.coordinate(p.to_array()));
+        if self.noise == 0.0 {
+            return place;
+        }
+        let mut random = Random::at(self.seed ^ NOISE, 6 * index);
+        place + self.noise * glam::DVec3::from_array(std::array::from_fn(|_| random.normal()))
     }
 }
 
@@ -415,6 +436,22 @@ mod tests {
         assert_eq!(grid.unit, 4.0 / 128.0);
         assert_eq!(grid.shift, [64.0, 96.0, 120.0]);
         assert_eq!(grid.coordinate([5.0, 2.0, 3.0]), [192.0, 96.0, 120.0]);
+    }
+
+    #[test]
+    fn noise_has_its_deviation_and_leaves_colours_where_they_were_drawn() {
+        let surface = square();
+        let exact = Sampler::new(&surface, Grid::unit(4), 20_000, 3).unwrap();
+        let noisy = Sampler::new(&surface, Grid::unit(4), 20_000, 3)
+            .unwrap()
+            .with_noise(0.5);
+        let off = |i| noisy.point(i)[2] - exact.point(i)[2];
+        let mean = (0..20_000).map(off).sum::<f64>() / 20_000.0;
+        let variance = (0..20_000).map(|i| off(i).powi(2)).sum::<f64>() / 20_000.0;
+        assert!(mean.abs() < 0.02 && (variance - 0.25).abs() < 0.02, "{mean} {variance}");
+        let cloud = noisy.cloud(None);
+        assert!(cloud.keys.len() > 256);
+        assert!(cloud.rgb.iter().all(|rgb| rgb[1..] == [20, 30]));
     }
 
     #[test]

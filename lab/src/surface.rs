@@ -92,6 +92,23 @@ impl Surface {
         surface
     }
 
+    /// The surface with other positions, part by part and vertex by vertex; a photograph stays where it was in space.
+    ///
+    /// # Panics
+    /// If the number of parts or of a part's vertices is another.
+    pub fn with_positions(&self, positions: Vec<Vec<[f32; 3]>>) -> Self {
+        assert_eq!(positions.len(), self.parts.len(), "every part has positions");
+        let mut surface = self.clone();
+        for (part, positions) in surface.parts.iter_mut().zip(positions) {
+            assert_eq!(positions.len(), part.positions.len(), "every vertex has a position");
+            part.positions = positions.into();
+        }
+        if surface.photograph.is_some() {
+            surface.find_normals();
+        }
+        surface
+    }
+
     /// The surface elsewhere, with all that is on it.
     pub fn translated(&self, by: [f32; 3]) -> Self {
         let mut surface = self.map(|p| std::array::from_fn(|a| p[a] + by[a]));

@@ -1,9 +1,11 @@
 //! The program's subcommands.
 
+pub mod animate;
 pub mod capture;
 pub mod closeup;
 pub mod dataset;
 pub mod eval;
+pub mod eval_sequence;
 pub mod occupancy;
 pub mod scene;
 pub mod tradeoff;
@@ -27,12 +29,14 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Animate(animate::Args),
     Voxelize(voxelize::Args),
     Capture(capture::Args),
     Closeup(closeup::Args),
     Dataset(dataset::Args),
     Scene(scene::Args),
     Eval(eval::Args),
+    EvalSequence(eval_sequence::Args),
     Occupancy(occupancy::Args),
     Tradeoff(tradeoff::Args),
 }
@@ -44,12 +48,14 @@ impl Cli {
     /// Whatever the subcommand fails with.
     pub fn run(self) -> Result<()> {
         match self.command {
+            Command::Animate(args) => args.run(),
             Command::Voxelize(args) => args.run(),
             Command::Capture(args) => args.run(),
             Command::Closeup(args) => args.run(),
             Command::Dataset(args) => args.run(),
             Command::Scene(args) => args.run(),
             Command::Eval(args) => args.run(),
+            Command::EvalSequence(args) => args.run(),
             Command::Occupancy(args) => args.run(),
             Command::Tradeoff(args) => args.run(),
         }

@@ -13,6 +13,7 @@ pub mod points;
 pub mod protocol;
 pub mod reframe;
 pub mod report;
+pub mod sequence;
 pub mod sheet;
 pub mod surfels;
 

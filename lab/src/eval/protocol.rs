@@ -56,11 +56,13 @@ pub struct Truth {
     views: Vec<TrueView>,
 }
 
-struct TrueView {
-    camera: Camera,
-    picture: Picture,
-    foreground: Vec<bool>,
-    ssimulacra2: Ssimulacra2,
+/// The truth from one camera.
+pub(super) struct TrueView {
+    pub camera: Camera,
+    pub picture: Picture,
+    /// The pixels of which the surface covers more than half.
+    pub foreground: Vec<bool>,
+    pub ssimulacra2: Ssimulacra2,
 }
 
 impl Truth {
@@ -142,7 +144,11 @@ impl Truth {
 impl TrueView {
     fn new(surface: &Surface, index: usize) -> Result<Self> {
         let azimuth = 360.0 * index as f64 / VIEWS as f64;
-        let camera = Camera::orbit(azimuth, 0.0, 3.0, 45.0, 2 * SIDE, 2 * SIDE)?;
+        TrueView::from_camera(surface, Camera::orbit(azimuth, 0.0, 3.0, 45.0, 2 * SIDE, 2 * SIDE)?)
+    }
+
+    /// The truth from a camera of 1024² pixels.
+    pub fn from_camera(surface: &Surface, camera: Camera) -> Result<Self> {
         let rotation = camera.pose.matrix3.transpose();
         let half = View {
             rotation: [rotation.x_axis, rotation.y_axis, rotation.z_axis].map(|r| r.to_array()),

@@ -1,7 +1,7 @@
 use super::*;
 
 /// A glTF binary of these JSON fields (after `asset`) and data.
-fn glb(json: &str, data: &[u8]) -> Vec<u8> {
+pub(crate) fn glb(json: &str, data: &[u8]) -> Vec<u8> {
     let pad = |bytes: &[u8], with: u8| {
         let mut bytes = bytes.to_vec();
         bytes.resize(bytes.len().next_multiple_of(4), with);

@@ -1,8 +1,12 @@
 //! Textured triangle meshes: where clouds and ground-truth pictures come from.
 
+mod accessor;
+pub mod animated;
 #[cfg(test)]
 pub(crate) mod fixtures;
 pub mod glb;
+mod keyframes;
+
 /// A mesh in its own units, y up.
 #[derive(Debug, Clone, Default)]
 pub struct Mesh {
