@@ -94,6 +94,8 @@ mod memory;
 #[doc(hidden)]
 pub mod metrics;
 #[doc(hidden)]
+pub mod motion;
+#[doc(hidden)]
 pub mod output;
 #[doc(hidden)]
 pub mod placement;

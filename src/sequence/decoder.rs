@@ -1,16 +1,31 @@
 //! Decodes the frames of a sequence (`docs/format.md`, clause 17.4).
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use super::{Group, SequenceReader};
+use crate::container::Header;
 use crate::decoder::{Decoder, Decoding, Points};
 use crate::error::{Error, Result};
 use crate::gaussians::Gaussians;
+use crate::motion::{Inter, Previous};
 
-/// Decodes frames of a sequence. It keeps the frame that it decoded last: the next one of the group continues from it.
+/// Decodes frames of a sequence. It keeps what the frame that it decoded last leaves for the next one of its group: a
+/// frame that follows is decoded alone, any other one with the frames of its group before it.
 #[derive(Debug, Clone)]
 pub struct SequenceDecoder {
     decoder: Decoder,
+    last: Option<Last>,
+}
+
+/// The frame that was decoded last.
+#[derive(Debug, Clone)]
+struct Last {
+    /// Hash of its group.
+    group: u64,
+    /// Its place in the group.
+    at: usize,
+    previous: Arc<Previous>,
 }
 
 /// A decoded frame.
@@ -25,7 +40,7 @@ impl SequenceDecoder {
     /// A decoder of sequences, which decodes and draws as `decoder` does: its level, heads, limits and instructions
     /// count.
     pub fn new(decoder: Decoder) -> Self {
-        SequenceDecoder { decoder }
+        SequenceDecoder { decoder, last: None }
     }
 
     /// Decodes a frame.
@@ -49,23 +64,74 @@ impl SequenceDecoder {
 
     fn in_group(&mut self, group: &Group, frame: u64) -> Result<DecodedFrame> {
         let at = (frame - group.first()) as usize;
-        if !group.is_whole(at) {
-            let detail = format!("frame {frame} is predicted from the frame before");
-            let what = "this kind of frame";
-            return Err(Error::Unsupported { what, detail });
+        let whole = (0..=at).rev().find(|at| group.is_whole(*at)).unwrap_or(0);
+        let last = self.last.take().filter(|last| last.group == group.hash());
+        let mut last = last.filter(|last| (whole..at).contains(&last.at));
+        let start = last.as_ref().map_or(whole, |last| last.at + 1);
+        for before in start..at {
+            let mut decoding = self.decoded(group, before, last.as_ref())?;
+            last = kept(&mut decoding, group, before);
         }
-        let (stream, _) = group.stream(at);
-        let mut decoding = self.decoder.start();
-        decoding.push(&stream);
-        decoding.finish().map_err(|source| Error::Frame {
-            frame,
-            source: Box::new(source),
-        })?;
+        let mut decoding = self.decoded(group, at, last.as_ref())?;
+        if at + 1 < group.len() && !group.is_whole(at + 1) {
+            self.last = kept(&mut decoding, group, at);
+        }
         Ok(DecodedFrame {
             number: frame,
             decoding,
         })
     }
+
+    /// Decodes the frame at a place of the group, given the frame before it.
+    fn decoded(&self, group: &Group, at: usize, last: Option<&Last>) -> Result<Decoding<'static>> {
+        let decoded = || {
+            let (stream, motion) = group.stream(at);
+            let header = group.frame_header(at);
+            let inter = match (group.is_whole(at), last) {
+                (true, _) => None,
+                (false, None) => return Err(Error::Usage("the frame before was not decoded".into())),
+                (false, Some(last)) => {
+                    self.check_memory(&header, group)?;
+                    Some(Inter::new(
+                        Arc::clone(&last.previous),
+                        &motion,
+                        header.base,
+                        header.top,
+                    )?)
+                }
+            };
+            let mut decoding = self.decoder.start_frame(stream, inter);
+            decoding.finish()?;
+            Ok(decoding)
+        };
+        decoded().map_err(|source| Error::Frame {
+            frame: group.first() + at as u64,
+            source: Box::new(source),
+        })
+    }
+
+    /// Checks that a frame and the one before it fit the limits. Both have at most the voxels that the sequence states.
+    fn check_memory(&self, header: &Header, group: &Group) -> Result<()> {
+        let top = self.decoder.last_level(header);
+        let most = group.common.voxels(top)?;
+        // Levels above the last one have a third of its voxels, more or less; never more than each as many.
+        let levels = u64::from(top) + 1;
+        let voxels = u64::from(most).saturating_mul(levels.min(4));
+        let kept = voxels.saturating_mul(Previous::bytes_per_voxel() as u64);
+        let bytes = self.decoder.memory(header, top)?.saturating_add(kept);
+        self.decoder
+            .limits()
+            .check_bytes("memory to decode this sequence", bytes)
+    }
+}
+
+/// What a decoded frame leaves for the next one.
+fn kept(decoding: &mut Decoding, group: &Group, at: usize) -> Option<Last> {
+    Some(Last {
+        group: group.hash(),
+        at,
+        previous: Arc::new(decoding.take_previous()?),
+    })
 }
 
 impl DecodedFrame {

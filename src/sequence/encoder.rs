@@ -1,6 +1,7 @@
 //! Clouds on one grid to a sequence.
 
 use std::ops::RangeInclusive;
+use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -10,10 +11,12 @@ use crate::cancel::Cancel;
 use crate::cloud::ColouredVoxels;
 use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
 use crate::container::{Header, with_axes};
+use crate::decoder::Decoder;
 use crate::encoder::transform::{self, Options, QualityTarget};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::log::Log;
+use crate::motion::{Inter, Previous};
 
 /// Codes clouds on one grid as a sequence.
 #[derive(Debug, Clone)]
@@ -22,6 +25,7 @@ pub struct SequenceEncoder {
     timescale: u32,
     duration: u32,
     group: u32,
+    predicted: bool,
     axes: Axes,
     cancel: Cancel,
 }
@@ -33,14 +37,23 @@ impl Default for SequenceEncoder {
             timescale: 30,
             duration: 1,
             group: 32,
+            predicted: true,
             axes: Axes::default(),
             cancel: Cancel::default(),
         }
     }
 }
 
-/// A coded frame.
+/// The entry and the bytes of a frame.
 type Coded = (FrameEntry, Vec<u8>);
+
+/// A coded frame.
+struct Frame {
+    header: Header,
+    coded: Coded,
+    /// What the next frame is predicted from.
+    next: Option<Arc<Previous>>,
+}
 
 impl SequenceEncoder {
     /// An encoder for 30 frames per second in groups of 32, with the levels and the quality of
@@ -78,6 +91,12 @@ impl SequenceEncoder {
     /// The same encoder with so many frames per group, 1 to 65,536. The first frame of a group is coded by itself.
     pub fn with_group(mut self, frames: u32) -> Self {
         self.group = frames;
+        self
+    }
+
+    /// The same encoder, which predicts frames from the frame before or codes each by itself. Default: it predicts.
+    pub fn with_prediction(mut self, predicted: bool) -> Self {
+        self.predicted = predicted;
         self
     }
 
@@ -129,15 +148,19 @@ impl SequenceEncoder {
         let code = |group: u64| -> Result<(Header, Vec<Coded>)> {
             let first = group * u64::from(self.group);
             let mut common: Option<Header> = None;
-            let mut frames = Vec::new();
-            for frame in first..count.min(first + u64::from(self.group)) {
+            let (mut frames, mut previous) = (Vec::new(), None);
+            let end = count.min(first + u64::from(self.group));
+            for frame in first..end {
                 self.cancel.check()?;
                 let cloud = cloud(frame).map_err(|error| in_frame(frame, error))?;
                 let ticks = (frame - first) as u32 * self.duration;
-                let (header, coded) = self.whole(&cloud, ticks).map_err(|error| in_frame(frame, error))?;
-                check_common(common.as_ref(), &header, frame)?;
-                common.get_or_insert(header);
-                frames.push(coded);
+                let follows = self.predicted && frame + 1 < end;
+                let coded = self.frame(&cloud, &previous, ticks, follows);
+                let coded = coded.map_err(|error| in_frame(frame, error))?;
+                check_common(common.as_ref(), &coded.header, frame)?;
+                common.get_or_insert(coded.header);
+                frames.push(coded.coded);
+                previous = coded.next.filter(|_| follows);
                 done(frame);
             }
             let common = common.ok_or_else(|| Error::Usage("a group needs at least one frame".into()))?;
@@ -154,31 +177,74 @@ impl SequenceEncoder {
         assembly.finish()
     }
 
-    /// Codes a frame by itself.
-    fn whole(&self, cloud: &ColouredVoxels, ticks: u32) -> Result<(Header, Coded)> {
+    /// Codes a frame, from the frame before if there is one in the group.
+    fn frame(
+        &self,
+        cloud: &ColouredVoxels,
+        previous: &Option<Arc<Previous>>,
+        ticks: u32,
+        follows: bool,
+    ) -> Result<Frame> {
         let log = Log::off().with_cancel(self.cancel.clone());
-        let stream = transform::encode(cloud, &self.options, &log)?.bytes;
-        let stream = with_axes(&stream, &self.axes)?;
-        let header = Header::parse(&stream, &Limits::unlimited())?;
-        let points = u32::try_from(header.points);
-        let points = points.map_err(|_| Error::Usage("a frame has less than 2^32 points".into()))?;
-        let levels = header.voxels.iter().zip(&header.sections);
-        let entry = FrameEntry {
-            kind: FrameKind::Whole,
-            ticks,
-            points,
-            levels: levels
-                .map(|(&voxels, &section)| FrameLevel {
-                    voxels,
-                    motion: 0,
-                    section,
-                })
-                .collect(),
-            offset: 0,
+        let (stream, motion) = match previous {
+            None => {
+                let stream = transform::encode(cloud, &self.options, &log)?.bytes;
+                (with_axes(&stream, &self.axes)?, Vec::new())
+            }
+            Some(previous) => {
+                let frame = transform::encode_predicted(cloud, previous, &self.options, &log)?;
+                (frame.stream, frame.motion)
+            }
         };
-        let bytes = stream[header.bytes()..].to_vec();
-        Ok((header, (entry, bytes)))
+        let header = Header::parse(&stream, &Limits::unlimited())?;
+        let coded = frame_of(&header, &stream, &motion, ticks)?;
+        let mut next = None;
+        if follows || !motion.is_empty() {
+            // What the next frame is predicted from is what the decoder will have.
+            let inter = previous.as_ref().map(|previous| {
+                let motion: Vec<&[u8]> = motion.iter().map(Vec::as_slice).collect();
+                Inter::new(Arc::clone(previous), &motion, header.base, header.top)
+            });
+            let decoder = Decoder::new().with_limits(Limits::unlimited()).with_level(header.top);
+            let mut decoding = decoder.start_frame(stream, inter.transpose()?);
+            decoding.finish()?;
+            next = decoding.take_previous().map(Arc::new);
+        }
+        Ok(Frame { header, coded, next })
     }
+}
+
+/// The entry and the bytes of a frame from its stream.
+fn frame_of(header: &Header, stream: &[u8], motion: &[Vec<u8>], ticks: u32) -> Result<Coded> {
+    let points = u32::try_from(header.points);
+    let points = points.map_err(|_| Error::Usage("a frame has less than 2^32 points".into()))?;
+    let kind = if motion.is_empty() {
+        FrameKind::Whole
+    } else {
+        FrameKind::Predicted
+    };
+    let (mut levels, mut bytes) = (Vec::new(), Vec::new());
+    let mut rest = &stream[header.bytes()..];
+    for (i, (&voxels, &section)) in header.voxels.iter().zip(&header.sections).enumerate() {
+        let moved = motion.get(i).map_or(&[][..], |moved| moved);
+        let (sections, after) = rest.split_at(section.bytes() as usize);
+        bytes.extend(moved);
+        bytes.extend(sections);
+        rest = after;
+        levels.push(FrameLevel {
+            voxels,
+            motion: moved.len() as u32,
+            section,
+        });
+    }
+    let entry = FrameEntry {
+        kind,
+        ticks,
+        points,
+        levels,
+        offset: 0,
+    };
+    Ok((entry, bytes))
 }
 
 /// Checks that a frame is on the grid of the first one.

@@ -229,6 +229,11 @@ impl Group<'_> {
         self.frames[at].bytes()
     }
 
+    /// What tells the group from others.
+    pub(super) fn hash(&self) -> u64 {
+        self.entry.hash
+    }
+
     /// The sections of a frame behind a header of its own: a stream of one frame, if the frame is whole. With the
     /// motion of each level.
     pub(super) fn stream(&self, at: usize) -> (Vec<u8>, Vec<&[u8]>) {
