@@ -15,10 +15,13 @@ use super::args::Decode;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points};
+use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points, sequence};
 
 /// Decodes a stream into a file of Gaussians.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
+    if sequence::is_sequence(&args.input) {
+        return sequence::decode(args, limits, progress);
+    }
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.input.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;

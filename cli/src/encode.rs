@@ -15,10 +15,17 @@ use super::args::{Colours, Encode};
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{count, counted, steps, steps_json, table};
-use super::{Failure, Result, cloud, load};
+use super::{Failure, Result, cloud, load, sequence};
 
 /// Codes a cloud and says what it cost.
 pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> {
+    if sequence::names_many(&args.cloud) {
+        return sequence::encode(args, limits, progress);
+    }
+    if let Some(name) = args.sequence.given() {
+        let what = "is for sequences: a folder of clouds, or a name such as frame_%04d.ply";
+        return Err(Failure(format!("{name} {what}")));
+    }
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.cloud.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;

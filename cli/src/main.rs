@@ -21,6 +21,7 @@ mod pipe;
 mod points;
 mod progress;
 mod render;
+mod sequence;
 mod serve;
 mod sheet;
 mod sidecar;
@@ -61,6 +62,7 @@ impl From<Error> for Failure {
                 "max_bytes" => text.replace(option, "--max-memory"),
                 "max_points" => text.replace(option, "--max-points"),
                 "max_pixels" => text.replace(option, "--max-pixels"),
+                "max_frames" => text.replace(option, "--limits unlimited"),
                 "max_pairs" => text.replace(option, "--max-pairs"),
                 _ => text,
             },
@@ -160,6 +162,7 @@ fn run(cli: &Cli) -> Result<()> {
         Command::Check(args) => check::run(args, &limits)?,
         Command::Upgrade(args) => upgrade::run(args, &limits, &progress)?,
         Command::Cut(args) => cut::run(args, &limits)?,
+        Command::Join(args) => sequence::join(args, &limits)?,
         Command::Serve(args) => serve::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,

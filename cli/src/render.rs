@@ -19,13 +19,16 @@ use super::progress::Progress;
 use super::sheet::Sheet;
 use super::table::{count, counted, milliseconds, steps};
 use super::views::{Shot, shots};
-use super::{Failure, Result, load, pipe, turntable};
+use super::{Failure, Result, load, pipe, sequence, turntable};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
 
 /// Draws one picture, or several: on a circle, or with the cameras of a file.
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> {
+    if sequence::is_sequence(&args.input) {
+        return sequence::render(args, limits, progress);
+    }
     let log = progress.log();
     if let Some(path) = &args.output.turntable {
         turntable::kind_of(path)?;

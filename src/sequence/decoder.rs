@@ -62,6 +62,14 @@ impl SequenceDecoder {
         }
     }
 
+    /// The Gaussians of the frames `frames`, one after the other: while those of a frame are made, the next frame is
+    /// decoded.
+    pub fn gaussians<'a>(&'a mut self, sequence: &'a SequenceReader<'a>, frames: Range<u64>) -> GaussianFrames<'a> {
+        let mut frames = self.frames(sequence, frames);
+        let next = frames.next();
+        GaussianFrames { frames, next }
+    }
+
     fn in_group(&mut self, group: &Group, frame: u64) -> Result<DecodedFrame> {
         let at = (frame - group.first()) as usize;
         let whole = (0..=at).rev().find(|at| group.is_whole(*at)).unwrap_or(0);
@@ -172,5 +180,25 @@ impl Iterator for Frames<'_> {
 
     fn size_hint(&self) -> (usize, Option<usize>) {
         self.frames.size_hint()
+    }
+}
+
+/// Gaussians of the frames of a sequence. An error does not end it.
+#[derive(Debug)]
+pub struct GaussianFrames<'a> {
+    frames: Frames<'a>,
+    /// The frame whose Gaussians come next.
+    next: Option<Result<DecodedFrame>>,
+}
+
+impl Iterator for GaussianFrames<'_> {
+    type Item = Result<Gaussians>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let frame = self.next.take()?;
+        let frames = &mut self.frames;
+        let (gaussians, next) = rayon::join(|| frame?.gaussians(), || frames.next());
+        self.next = next;
+        Some(gaussians)
     }
 }

@@ -21,10 +21,10 @@ use crate::motion::{Inter, Previous};
 /// Codes clouds on one grid as a sequence.
 #[derive(Debug, Clone)]
 pub struct SequenceEncoder {
-    options: Options,
+    pub(super) options: Options,
     timescale: u32,
     duration: u32,
-    group: u32,
+    pub(super) group: u32,
     predicted: bool,
     axes: Axes,
     cancel: Cancel,

@@ -14,10 +14,14 @@ mod assembly;
 mod decoder;
 #[cfg(feature = "encoder")]
 mod encoder;
+#[cfg(feature = "encoder")]
+mod rate_control;
 mod reader;
 
 pub use assembly::join;
-pub use decoder::{DecodedFrame, Frames, SequenceDecoder};
+pub use decoder::{DecodedFrame, Frames, GaussianFrames, SequenceDecoder};
 #[cfg(feature = "encoder")]
 pub use encoder::SequenceEncoder;
+#[cfg(feature = "encoder")]
+pub use rate_control::Rate;
 pub use reader::{Group, SequenceReader};

@@ -2,8 +2,9 @@
 
 use std::borrow::Cow;
 
-use crate::container::Header;
+use crate::axes::Axes;
 use crate::container::sequence::{FrameEntry, FrameKind, GroupEntry, Index, parse_table};
+use crate::container::{Header, axes};
 use crate::error::{Error, Result, Stage};
 use crate::limits::Limits;
 
@@ -58,6 +59,14 @@ impl<'a> SequenceReader<'a> {
     #[doc(hidden)]
     pub fn index(&self) -> &Index {
         &self.index
+    }
+
+    /// What the sequence says of its coordinates: what its first frame does.
+    ///
+    /// # Errors
+    /// Those of [`SequenceReader::group`].
+    pub fn axes(&self) -> Result<Axes> {
+        axes(&self.group(0)?.stream(0).0)
     }
 
     /// Number of frames, at least 1.
