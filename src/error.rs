@@ -163,6 +163,14 @@ pub enum Error {
         /// Bits per point of the smallest stream that was tried.
         least: f64,
     },
+    /// A frame of a sequence cannot be decoded.
+    #[error("frame {frame}: {source}")]
+    Frame {
+        /// Its number, from 0.
+        frame: u64,
+        /// Why.
+        source: Box<Error>,
+    },
     /// The caller threw the [`Cancel`](crate::Cancel) switch.
     #[error("cancelled")]
     Cancelled,
@@ -218,6 +226,7 @@ impl Error {
             Error::DeterminismMismatch { what: "colours", .. } => Some("5.10.1"),
             Error::DeterminismMismatch { .. } => Some("8.2.2"),
             Error::ModelMismatch { .. } => Some("9.5.2"),
+            Error::Frame { source, .. } => source.clause(),
             Error::Unsupported { what, .. } => match *what {
                 feature::VERSION | feature::FLAGS => Some("2.2.1"),
                 feature::CHUNK => Some("3.1.2"),

@@ -21,6 +21,7 @@
 //! | to | use |
 //! |---|---|
 //! | decode a stream, whole or as it arrives | [`Decoder`], [`Decoding`] |
+//! | read and decode sequences of frames | [`SequenceReader`], [`SequenceDecoder`], `SequenceEncoder` |
 //! | draw with learned heads | [`HeadsModel`], [`HeadSet`] |
 //! | read and write Gaussians | [`Gaussians`] |
 //! | draw | `Renderer`, `Camera`, `Image` |
@@ -93,12 +94,16 @@ mod memory;
 #[doc(hidden)]
 pub mod metrics;
 #[doc(hidden)]
+pub mod motion;
+#[doc(hidden)]
 pub mod output;
 #[doc(hidden)]
 pub mod placement;
 #[cfg(feature = "render")]
 #[doc(hidden)]
 pub mod renderer;
+#[doc(hidden)]
+pub mod sequence;
 #[cfg(test)]
 mod testing;
 
@@ -134,3 +139,6 @@ pub use renderer::{
     Background, Channel, Effect, EffectMode, EffectSet, Effects, Explanation, Ids, Image, Quality, Renderer, Stats,
     Times,
 };
+#[cfg(feature = "encoder")]
+pub use sequence::SequenceEncoder;
+pub use sequence::{DecodedFrame, SequenceDecoder, SequenceReader};

@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 pub const MAX_DEPTH: u8 = 21;
 
 /// Bounds that are checked before memory is reserved. Finite by default: 2²⁶ points, 21 levels, 2²⁶ pixels, 2²⁸ pairs,
-/// 2 GiB.
+/// 2²⁰ frames, 2 GiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Limits {
@@ -18,6 +18,8 @@ pub struct Limits {
     pub max_pixels: u64,
     /// Pairs of a Gaussian and a tile of 32×32 pixels that it touches, in one picture: the work of drawing it.
     pub max_pairs: u64,
+    /// Frames of one sequence.
+    pub max_frames: u64,
     /// Bytes that one input may make the library reserve, estimated from its counts.
     pub max_bytes: u64,
 }
@@ -29,6 +31,7 @@ impl Default for Limits {
             max_depth: 21,
             max_pixels: 1 << 26,
             max_pairs: 1 << 28,
+            max_frames: 1 << 20,
             max_bytes: 2 << 30,
         }
     }
@@ -38,13 +41,15 @@ impl Limits {
     /// What the library takes beyond `max_bytes`, however small the input: threads and their scratch.
     pub const OVERHEAD: u64 = 4 << 20;
 
-    /// For boards with 512 MB of memory: 2²⁰ points, pictures of 2²² pixels and 2²⁴ pairs, 192 MiB.
+    /// For boards with 512 MB of memory: 2²⁰ points, pictures of 2²² pixels and 2²⁴ pairs, 2¹⁶ frames,
+    /// 192 MiB.
     pub fn embedded() -> Self {
         Limits {
             max_points: 1 << 20,
             max_depth: 21,
             max_pixels: 1 << 22,
             max_pairs: 1 << 24,
+            max_frames: 1 << 16,
             max_bytes: 192 << 20,
         }
     }
@@ -56,6 +61,7 @@ impl Limits {
             max_depth: u8::MAX,
             max_pixels: u64::MAX,
             max_pairs: u64::MAX,
+            max_frames: u64::MAX,
             max_bytes: u64::MAX,
         }
     }
@@ -81,6 +87,12 @@ impl Limits {
     /// The same limits with other [`Limits::max_pairs`].
     pub fn with_max_pairs(mut self, pairs: u64) -> Self {
         self.max_pairs = pairs;
+        self
+    }
+
+    /// The same limits with other [`Limits::max_frames`].
+    pub fn with_max_frames(mut self, frames: u64) -> Self {
+        self.max_frames = frames;
         self
     }
 
@@ -124,6 +136,15 @@ impl Limits {
     #[doc(hidden)]
     pub fn check_pairs(&self, what: &'static str, count: u64) -> Result<()> {
         check(what, count, self.max_pairs, "max_pairs")
+    }
+
+    /// Holds `count` frames against the limit.
+    ///
+    /// # Errors
+    /// [`Error::LimitExceeded`], naming `what`, if they are more.
+    #[doc(hidden)]
+    pub fn check_frames(&self, what: &'static str, count: u64) -> Result<()> {
+        check(what, count, self.max_frames, "max_frames")
     }
 
     /// Holds `bytes` against the limit, which is never more than the machine can address.

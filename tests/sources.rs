@@ -5,11 +5,12 @@ use std::path::{Path, PathBuf};
 
 /// The folders of `src/`, each with those that it may import beside the commons: an arrow only leads to a folder
 /// further up.
-const STAGES: [(&str, &[&str]); 12] = [
+const STAGES: [(&str, &[&str]); 14] = [
     ("coding", &[]),
     ("container", &[]),
     ("geometry", &["coding", "container"]),
     ("colour", &["coding", "container", "geometry"]),
+    ("motion", &["coding", "geometry", "colour"]),
     ("layers", &[]),
     ("cloud", &["geometry"]),
     ("gaussians", &["coding", "geometry", "layers", "cloud"]),
@@ -21,6 +22,7 @@ const STAGES: [(&str, &[&str]); 12] = [
             "container",
             "geometry",
             "colour",
+            "motion",
             "layers",
             "cloud",
             "gaussians",
@@ -37,9 +39,11 @@ const STAGES: [(&str, &[&str]); 12] = [
             "gaussians",
             "renderer",
             "latents",
+            "motion",
             "decoder",
         ],
     ),
+    ("sequence", &["container", "cloud", "gaussians", "decoder", "encoder"]),
     ("metrics", &["renderer"]),
 ];
 

@@ -155,10 +155,12 @@ pub enum Command {
     Check(Check),
     /// Turn a stream of version 2 into one of version 3, which needs no model
     Upgrade(Upgrade),
-    /// Cut a stream after a level: a shorter stream
+    /// Cut a stream after a level, or a sequence between groups of frames
     Cut(Cut),
     /// Plan a job of many files for a render farm or a cluster: Open Job Description, Slurm or Ray
     Plan(Plan),
+    /// Join sequences, one after the other, without coding anything again
+    Join(Join),
     /// Show streams in a web page, drawn by the browser without a GPU
     Serve(Serve),
     /// Decode and draw the sample that comes with the program
@@ -191,9 +193,14 @@ pub struct Encode {
     /// Of the files: the cloud at hand.
     #[arg(skip)]
     pub cloud: PathBuf,
+    /// The frames of a sequence, if the files are such.
+    #[arg(skip)]
+    pub clouds: Vec<PathBuf>,
     /// Its stream.
     #[arg(skip)]
     pub output: PathBuf,
+    #[command(flatten)]
+    pub sequence: SequenceArgs,
     /// Quality, from 0 to 100: chooses quantisation step and finest level. 100 is lossless, 38 the default
     #[arg(short = 'Q', long, value_name = "0..100", value_parser = clap::value_parser!(u8).range(0..=100), conflicts_with_all = ["step", "lossless", "bits_per_point"])]
     pub quality: Option<u8>,
@@ -235,6 +242,61 @@ pub struct Encode {
     pub learned: LearnedArgs,
     #[command(flatten)]
     pub model: ModelArg,
+}
+
+/// What may be chosen about a sequence.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Sequences")]
+pub struct SequenceArgs {
+    /// Frames per second, such as 30 or 30000/1001 [default: 30]
+    #[arg(long, value_name = "F", value_parser = frame_rate)]
+    fps: Option<(u32, u32)>,
+    /// Frames of a group, which decodes alone: the first of a group is coded by itself
+    #[arg(long, value_name = "N", default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    pub gop: u32,
+    /// Make the best sequence of at most so many bits per second, such as 5M
+    #[arg(long, value_name = "BITS", value_parser = bits, conflicts_with_all = ["bits_per_point", "step", "lossless", "quality"])]
+    pub bitrate: Option<f64>,
+    /// Code every frame by itself
+    #[arg(long)]
+    pub intra: bool,
+}
+
+impl SequenceArgs {
+    /// Ticks per second and per frame.
+    pub fn rate(&self) -> (u32, u32) {
+        self.fps.unwrap_or((30, 1))
+    }
+
+    /// The first option that was given and concerns sequences alone.
+    pub fn given(&self) -> Option<&'static str> {
+        let all = [
+            ("--fps", self.fps.is_some()),
+            ("--bitrate", self.bitrate.is_some()),
+            ("--intra", self.intra),
+        ];
+        all.iter().find(|(_, given)| *given).map(|(name, _)| *name)
+    }
+}
+
+/// A frame of a sequence.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Sequences")]
+pub struct FrameArgs {
+    /// Frame of a sequence, from 0
+    #[arg(long, value_name = "N", conflicts_with = "time")]
+    frame: Option<u64>,
+    /// The frame that is shown at this time, in seconds
+    #[arg(long, value_name = "SECONDS")]
+    time: Option<f64>,
+}
+
+impl FrameArgs {
+    /// The frame that was asked for.
+    pub fn frame(&self, sequence: &b2p::SequenceReader) -> Option<b2p::Result<u64>> {
+        let by_time = || self.time.map(|time| sequence.frame_at(time));
+        self.frame.map(Ok).or_else(by_time)
+    }
 }
 
 /// How colours are coded.
@@ -290,6 +352,8 @@ pub struct Decode {
     /// Keep the axes of the cloud: do not turn Gaussians
     #[arg(long, conflicts_with_all = ["points", "up"])]
     pub keep_axes: bool,
+    #[command(flatten)]
+    pub sequence: FrameArgs,
     #[command(flatten)]
     pub write: WriteArgs,
     #[command(flatten)]
@@ -399,6 +463,8 @@ pub struct Render {
     /// several inputs into a folder
     #[arg(long, value_name = "FILE", conflicts_with = "output")]
     pub turntable: Option<PathBuf>,
+    #[command(flatten)]
+    pub sequence: FrameArgs,
     /// Draw all views into one picture, a grid with their angles below them [default: 8 views]
     #[arg(long, conflicts_with_all = ["camera", "turntable"])]
     pub contact_sheet: bool,
@@ -522,9 +588,27 @@ pub struct Cut {
     pub input: PathBuf,
     #[command(flatten)]
     pub output: Output,
-    /// Last level to keep
-    #[arg(long, value_name = "M")]
-    pub level: u8,
+    /// Last level to keep of a stream
+    #[arg(
+        long,
+        value_name = "M",
+        required_unless_present = "frames",
+        conflicts_with = "frames"
+    )]
+    pub level: Option<u8>,
+    /// Frames to keep of a sequence, from A to before B: whole groups
+    #[arg(long, value_name = "A..B", value_parser = frames)]
+    pub frames: Option<std::ops::Range<u64>>,
+}
+
+#[derive(Debug, Args)]
+pub struct Join {
+    /// Sequences on one grid, in order
+    #[arg(value_name = "IN", required = true, num_args = 1..)]
+    pub inputs: Vec<PathBuf>,
+    /// File to write; `-`: standard output
+    #[arg(short, long, value_name = "OUT")]
+    pub output: PathBuf,
 }
 
 #[derive(Debug, Args)]
@@ -595,7 +679,8 @@ use super::plan::Plan;
 use super::progress::Progress;
 pub use super::values::Orbit;
 use super::values::{
-    background, bits_per_point, bytes, effect, levels, orbit, per_voxel, point, price, residual, size, step,
+    background, bits, bits_per_point, bytes, effect, frame_rate, frames, levels, orbit, per_voxel, point, price,
+    residual, size, step,
 };
 pub use b2p::renderer::{Background, Effect, EffectMode, Quality};
 use b2p_formats::clouds::PointFormat;

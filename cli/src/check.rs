@@ -11,19 +11,25 @@ use serde_json::{Value, json};
 use super::args::Check;
 use super::manners::{self, Said};
 use super::table::{count, counted};
-use super::{Failure, Result, load};
+use super::{Failure, Result, load, sequence};
 
 /// Checks every stream, then fails if one of them is not valid.
 pub fn run(args: &Check, limits: &Limits) -> Result<Said> {
     let mut model = None;
     let mut reports = Vec::new();
-    for path in &args.inputs {
+    let (sequences, streams): (Vec<_>, Vec<_>) = args.inputs.iter().partition(|path| sequence::is_sequence(path));
+    let sequences: Vec<_> = sequences.iter().map(|path| sequence::check(path, limits)).collect();
+    let texts = sequences.into_iter().collect::<Result<Vec<String>>>()?;
+    if streams.is_empty() {
+        return Ok(Said::result(texts.concat()));
+    }
+    for path in streams {
         reports.push(Report::of(path, args, &mut model, limits)?);
     }
     let bad = reports.iter().filter(|report| !report.is_valid()).count();
     let result = match manners::json() {
         true => format!("{:#}\n", Value::from_iter(reports.iter().map(Report::json))),
-        false => reports.iter().map(Report::text).collect(),
+        false => texts.concat() + &reports.iter().map(Report::text).collect::<String>(),
     };
     let said = Said::result(result);
     if bad == 0 {

@@ -7,20 +7,27 @@ use serde_json::json;
 use super::args::Cut;
 use super::manners::{self, Said};
 use super::table::{count, counted};
-use super::{Failure, Result, kinds, load};
+use super::{Failure, Result, kinds, load, sequence};
 
 /// Writes the stream up to the end of a level, once it is known to be complete.
 pub fn run(args: &Cut, limits: &Limits) -> Result<Said> {
+    if sequence::is_sequence(&args.input) {
+        return sequence::cut(args, limits);
+    }
+    let Some(level) = args.level else {
+        let what = "it is no sequence: --level M cuts it";
+        return Err(Failure(format!("{}: {what}", args.input.display())));
+    };
     manners::permit(&[&args.output], &[&args.input])?;
     let bytes = load::bytes(&args.input, limits)?;
     kinds::check_stream(&args.input, &bytes)?;
     let fail = Failure::in_file(&args.input);
     let stream = Stream::parse(&bytes, limits).map_err(&fail)?;
-    let stream = stream.require(args.level).map_err(&fail)?;
+    let stream = stream.require(level).map_err(&fail)?;
     let header = stream.header();
-    let end = header.prefix_bytes(args.level).map_err(&fail)?;
+    let end = header.prefix_bytes(level).map_err(&fail)?;
     let kept = usize::try_from(end).ok().and_then(|end| bytes.get(..end));
-    let kept = kept.ok_or_else(|| Failure(format!("{}: it ends before level {}", args.input.display(), args.level)))?;
+    let kept = kept.ok_or_else(|| Failure(format!("{}: it ends before level {level}", args.input.display())))?;
     let to = &args.output;
     manners::write(to, |w| {
         w.write_all(kept).map_err(|source| Error::Io {
@@ -28,7 +35,7 @@ pub fn run(args: &Cut, limits: &Limits) -> Result<Said> {
             source,
         })
     })?;
-    let (level, top) = (args.level, header.top);
+    let top = header.top;
     let bits = kept.len() as f64 * 8.0 / header.points.max(1) as f64;
     let report = format!(
         "{}: {} of {}, level {level} of {top}, {bits:.4} bits per point\n",

@@ -16,7 +16,7 @@ use super::manners::{self, Said};
 use super::many::Kind;
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points};
+use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points, sequence};
 
 /// What is taken from folders, and what becomes of it.
 pub fn kind(args: &Decode) -> Kind<'_> {
@@ -27,11 +27,15 @@ pub fn kind(args: &Decode) -> Kind<'_> {
             .format
             .map_or("ply", |format| format.extension().trim_start_matches('.')),
         instead: None,
+        gathers: false,
     }
 }
 
 /// Decodes a stream into a file of Gaussians.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
+    if sequence::is_sequence(&args.input) {
+        return sequence::decode(args, limits, progress);
+    }
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.input.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;

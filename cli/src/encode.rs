@@ -16,7 +16,7 @@ use super::manners::{self, Said};
 use super::many::Kind;
 use super::progress::Progress;
 use super::table::{count, counted, steps, steps_json, table};
-use super::{Failure, Result, cloud, load};
+use super::{Failure, Result, cloud, load, sequence};
 
 /// What is taken from folders, and what becomes of it.
 pub const KIND: Kind<'_> = Kind {
@@ -26,10 +26,18 @@ pub const KIND: Kind<'_> = Kind {
     ],
     ending: "b2p",
     instead: None,
+    gathers: true,
 };
 
 /// Codes a cloud and says what it cost.
 pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> {
+    if !args.clouds.is_empty() || sequence::names_many(&args.cloud) {
+        return sequence::encode(args, limits, progress);
+    }
+    if let Some(name) = args.sequence.given() {
+        let what = "is for sequences: a folder of clouds, or a name such as frame_%04d.ply";
+        return Err(Failure(format!("{name} {what}")));
+    }
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.cloud.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;

@@ -25,6 +25,7 @@ mod plan;
 mod points;
 mod progress;
 mod render;
+mod sequence;
 mod serve;
 mod sheet;
 mod sidecar;
@@ -68,6 +69,7 @@ impl From<Error> for Failure {
                 "max_bytes" => text.replace(option, "--max-memory"),
                 "max_points" => text.replace(option, "--max-points"),
                 "max_pixels" => text.replace(option, "--max-pixels"),
+                "max_frames" => text.replace(option, "--limits unlimited"),
                 "max_pairs" => text.replace(option, "--max-pairs"),
                 _ => text,
             },
@@ -171,6 +173,10 @@ fn run(cli: &mut Cli) -> Result<()> {
                 (args.cloud, args.output) = (input, output);
                 encode::run(args, &limits, &progress)?
             }
+            Work::Sequence { inputs, output } => {
+                (args.clouds, args.output) = (inputs, output);
+                encode::run(args, &limits, &progress)?
+            }
             Work::Many(units) => many(&args.files, units, "--output")?,
         },
         Command::Decode(args) => match args.files.work(decode::kind(args))? {
@@ -178,6 +184,7 @@ fn run(cli: &mut Cli) -> Result<()> {
                 (args.input, args.output) = (input, output);
                 decode::run(args, &limits, &progress)?
             }
+            Work::Sequence { .. } => unreachable!("only `encode` gathers files"),
             Work::Many(units) => many(&args.files, units, "--output")?,
         },
         Command::Convert(args) => convert::run(args, &limits, &progress)?,
@@ -186,6 +193,7 @@ fn run(cli: &mut Cli) -> Result<()> {
                 (args.input, args.output) = (input, output);
                 render::run(args, &limits, &progress)?
             }
+            Work::Sequence { .. } => unreachable!("only `encode` gathers files"),
             Work::Many(units) => {
                 let output = args.turntable.as_ref().map_or("--output", |_| "--turntable");
                 many(&args.files, units, output)?
@@ -202,6 +210,7 @@ fn run(cli: &mut Cli) -> Result<()> {
             drop(progress);
             return view::run(args, &limits)?.say();
         }
+        Command::Join(args) => sequence::join(args, &limits)?,
         Command::Serve(args) => serve::run(args)?,
         Command::Demo(args) => demo::run(args, &progress)?,
         Command::Bench(args) => bench::run(args, &limits, &progress)?,

@@ -20,7 +20,7 @@ use super::progress::Progress;
 use super::sheet::Sheet;
 use super::table::{count, counted, milliseconds, steps};
 use super::views::{Shot, shots};
-use super::{Failure, Result, load, pipe, turntable};
+use super::{Failure, Result, load, pipe, sequence, turntable};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
@@ -41,11 +41,15 @@ pub fn kind(args: &Render) -> Kind<'_> {
             (None, None) => "png",
         },
         instead: args.turntable.as_deref(),
+        gathers: false,
     }
 }
 
 /// Draws one picture, or several: on a circle, or with the cameras of a file.
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> {
+    if sequence::is_sequence(&args.input) {
+        return sequence::render(args, limits, progress);
+    }
     let log = progress.log();
     if let Some(path) = &args.turntable {
         turntable::kind_of(path)?;

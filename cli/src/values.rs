@@ -24,6 +24,49 @@ pub fn bytes(text: &str) -> Result<u64, String> {
     number.checked_mul(1 << (10 * power)).ok_or_else(|| expected.into())
 }
 
+/// A number of bits, with or without k, M or G for powers of 1000.
+pub fn bits(text: &str) -> Result<f64, String> {
+    let expected = "expected bits such as 5M or 800k";
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let scale = match text[digits.len()..].to_ascii_uppercase().as_str() {
+        "" => 1.0,
+        "K" => 1e3,
+        "M" => 1e6,
+        "G" => 1e9,
+        _ => return Err(expected.into()),
+    };
+    match digits.parse::<f64>() {
+        Ok(number) if number > 0.0 && number.is_finite() => Ok(number * scale),
+        _ => Err(expected.into()),
+    }
+}
+
+/// Frames per second as ticks per second and per frame: a whole number, a fraction, or up to three decimals.
+pub fn frame_rate(text: &str) -> Result<(u32, u32), String> {
+    let expected = "expected frames per second such as 30, 29.97 or 30000/1001";
+    let above_0 = |text: &str| text.parse::<u32>().ok().filter(|n| *n > 0);
+    if let Some((ticks, duration)) = text.split_once('/') {
+        return above_0(ticks).zip(above_0(duration)).ok_or_else(|| expected.into());
+    }
+    if let Some(whole) = above_0(text) {
+        return Ok((whole, 1));
+    }
+    match text.parse::<f64>() {
+        Ok(rate) if (0.001..=1e6).contains(&rate) => Ok(((rate * 1000.0).round() as u32, 1000)),
+        _ => Err(expected.into()),
+    }
+}
+
+/// Frames from A to before B.
+pub fn frames(text: &str) -> Result<std::ops::Range<u64>, String> {
+    let expected = "expected frames such as 0..64, the last one not included";
+    let (first, end) = text.split_once("..").ok_or(expected)?;
+    match (first.parse(), end.parse()) {
+        (Ok(first), Ok(end)) if first < end => Ok(first..end),
+        _ => Err(expected.into()),
+    }
+}
+
 pub fn levels(text: &str) -> Result<RangeInclusive<u8>, String> {
     let expected = "expected two levels such as 7..9";
     let (first, last) = text.split_once("..").ok_or(expected)?;

@@ -6,6 +6,7 @@
 //! spacing of the points.
 
 mod colours;
+mod common_grid;
 mod dialects;
 pub mod ply;
 mod points;
@@ -15,6 +16,7 @@ mod voxelise;
 mod write;
 
 pub use colours::{ColourRange, RawColours, Stored};
+pub use common_grid::{CommonGrid, GridNeed};
 pub use points::{Coordinates, Hints, PointCloud, is_a_mesh};
 pub use raw::{Note, RawPoints, ReadOptions};
 

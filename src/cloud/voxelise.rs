@@ -385,7 +385,7 @@ impl ColouredVoxels {
     }
 }
 
-fn finite_bounds(positions: &[[f64; 3]]) -> Result<([f64; 3], [f64; 3])> {
+pub(super) fn finite_bounds(positions: &[[f64; 3]]) -> Result<([f64; 3], [f64; 3])> {
     if positions.is_empty() {
         return Err(malformed(POINTS, "number of points", 0, "at least one"));
     }
@@ -437,7 +437,7 @@ pub(super) fn fit(low: [f64; 3], high: [f64; 3], depth: u8) -> Placement {
     }
 }
 
-fn mean(points: &[(u64, [u8; 3])]) -> [u8; 3] {
+pub(super) fn mean(points: &[(u64, [u8; 3])]) -> [u8; 3] {
     let count = points.len() as u64;
     std::array::from_fn(|channel| {
         let sum: u64 = points.iter().map(|(_, c)| u64::from(c[channel])).sum();

@@ -10,6 +10,7 @@ use super::prediction::{Coded, EARLIER_FACES, FaceNeighbours};
 use super::space::{Steps, Ycc, clamp};
 use super::transform::{AXIS, FRACTIONS, JOINS, JOINS_OF, SCALE, Scale, UNSCALED, forward};
 use crate::geometry::KernelMap;
+use crate::geometry::codec::guide::Mode;
 
 /// Reads coefficients from an entropy stream, or chooses and writes them.
 pub(super) trait CoefficientCoder {
@@ -57,6 +58,18 @@ pub(super) struct Nodes<'a> {
     pub values: &'a [Ycc],
     /// The local coefficient energy of each node and channel: 16 times the mean magnitude, at most 255.
     pub energies: &'a [[u8; 3]],
+    /// What a previous frame tells of the children.
+    pub guide: Option<Guide<'a>>,
+}
+
+/// What a previous frame tells of the colours of a level (`docs/format.md`, clause 17.7).
+#[derive(Debug, Clone, Copy)]
+pub struct Guide<'a> {
+    /// The mode of every node.
+    pub modes: &'a [Mode],
+    /// Y, Co and Cg of every child in the moved previous frame, and whether it is there. Of no meaning for children of
+    /// nodes in [`Mode::Intra`].
+    pub moved: &'a [Option<Ycc>],
 }
 
 /// Coding parameters of a slice.
@@ -102,6 +115,11 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
     let scales = Scales::new(coding.steps);
     for node in range.clone() {
         let mask = nodes.masks[node];
+        let mode = nodes.guide.map_or(Mode::Intra, |guide| guide.modes[node]);
+        if mode == Mode::Skip {
+            push_moved(&mut coded, nodes, node);
+            continue;
+        }
         if mask.is_power_of_two() {
             coded.push(nodes.values[node]);
             continue;
@@ -110,7 +128,10 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
         let around = FaceNeighbours::new(nodes.map, nodes.masks, nodes.values, node);
         let joins = &JOINS_OF[usize::from(mask)];
         let fractions = &FRACTIONS[usize::from(mask)];
-        let predicted = predict(nodes, node, &around, &coded);
+        let mut predicted = predict(nodes, node, &around, &coded);
+        if mode == Mode::Inter {
+            predict_moved(&mut predicted, nodes, node);
+        }
         let target = truth.map(|truth| {
             let at = nodes.first_child[node] as usize - base;
             forward(mask, spread(mask, &truth[at..])).1
@@ -121,9 +142,9 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
         }));
         let mut block = NodeCoder {
             model,
-            coding,
             scales: &scales,
             joins,
+            gain: if mode == Mode::Inter { 256 } else { coding.gain.into() },
             predicted: butterflies::forward(simd, &JOINS, fractions, predicted),
             gradient: around.gradient(),
             energy: nodes.energies[node].map(|energy| log_class(energy.into())),
@@ -191,6 +212,45 @@ fn predict(nodes: Nodes<'_>, node: usize, around: &FaceNeighbours, coded: &Coded
         predicted[octant] = [a, b, c, 0, d, e, f, 0];
     }
     predicted
+}
+
+/// Gives the children of a skipped node the colours of the moved previous frame; those that are not there, the node's.
+#[inline(always)]
+fn push_moved(coded: &mut Coded, nodes: Nodes<'_>, node: usize) {
+    let first = nodes.first_child[node] as usize;
+    for child in first..first + nodes.masks[node].count_ones() as usize {
+        let moved = nodes.guide.and_then(|guide| guide.moved[child]);
+        coded.push(moved.unwrap_or(nodes.values[node]));
+    }
+}
+
+/// The largest magnitude of a value.
+const LARGEST: i32 = 256 << 6;
+
+/// Replaces the near predictions of children that are in the moved previous frame by their colours there. The others
+/// move by the mean of these changes.
+#[inline(always)]
+fn predict_moved(predicted: &mut [Lanes; 8], nodes: Nodes<'_>, node: usize) {
+    let Some(guide) = nodes.guide else {
+        return;
+    };
+    let first = nodes.first_child[node] as usize;
+    let (mut shifts, mut count) = ([0i32; 3], 0);
+    for (child, octant) in (first..).zip(crate::geometry::ones(nodes.masks[node].into())) {
+        if let Some(moved) = guide.moved[child] {
+            for t in 0..3 {
+                shifts[t] += i32::from(moved[t]) - predicted[octant][t];
+                predicted[octant][t] = moved[t].into();
+            }
+            count += 1;
+        }
+    }
+    let shifts = shifts.map(|shift| shift / count.max(1));
+    for (child, octant) in (first..).zip(crate::geometry::ones(nodes.masks[node].into())) {
+        if guide.moved[child].is_none() {
+            (0..3).for_each(|t| predicted[octant][t] = (predicted[octant][t] + shifts[t]).clamp(-LARGEST, LARGEST));
+        }
+    }
 }
 
 /// The mean from sums of weighted colours and of weights, which must be at least 2.
@@ -277,7 +337,8 @@ fn sign_class(x: i32) -> usize {
 /// Coder of the coefficients of one node.
 struct NodeCoder<'a> {
     model: &'a mut Model,
-    coding: Coding,
+    /// Factor of the predicted differences, in units of 1/256.
+    gain: i32,
     scales: &'a Scales,
     joins: &'a super::transform::Joins,
     /// Transforms of both predictions, by slot: four lanes of the one that includes children coded before, and four of
@@ -343,7 +404,7 @@ impl NodeCoder<'_> {
         let mut differences = [0; 3];
         let mut luma = 0;
         for t in 0..3 {
-            let mut expected = (self.predicted[slot][t] * i32::from(self.coding.gain) + 128) >> 8;
+            let mut expected = (self.predicted[slot][t] * self.gain + 128) >> 8;
             let unit = self.scales.units[t];
             if unit == 0 {
                 differences[t] = expected;

@@ -11,7 +11,7 @@ use super::filter::{Responses, TERMS, solve, widen};
 use super::model::{BINS, CoefficientContext, Model};
 use super::space::{FRACTION, from_rgb};
 use super::transform::forward;
-use super::{CodeSlice, LevelColours, Steps, Ycc, join, nodes, slices, trunk};
+use super::{CodeSlice, Guide, LevelColours, Steps, Ycc, join, nodes, slices, trunk};
 use crate::coding::ONE;
 use crate::coding::binary::Encoder;
 use crate::geometry::{KernelMap, Octree, Voxels};
@@ -82,19 +82,22 @@ impl Truth {
             let mean = sum.map(|sum| (((sum << (fraction + 1)) + count) / (2 * count).max(1)) as i32);
             from_rgb(mean).map(|x| x as i16)
         });
-        let mut levels: Vec<Vec<Ycc>> = vec![means.collect()];
-        for level in (0..top).rev() {
-            let (masks, first) = (octree.occupancy(level), octree.first_child(level));
-            let below = &levels[levels.len() - 1];
-            let mean = |(mask, first): (&u8, &u32)| {
-                let children = super::block::spread(*mask, &below[*first as usize..]);
-                forward(*mask, children).0.map(|x| x as i16)
-            };
-            let means = masks.par_iter().zip(first).map(mean).collect();
-            levels.push(means);
+        Truth {
+            levels: means_above(octree, top, means.collect()),
+            lossless,
         }
-        levels.reverse();
-        Truth { levels, lossless }
+    }
+
+    /// Colours of the voxels of level `top`, in the units of [`LevelColours::values`], transformed up to the root.
+    ///
+    /// # Panics
+    /// If `values` does not have one entry per voxel of level `top`.
+    pub fn of_values(octree: &Octree, top: u8, values: Vec<Ycc>, lossless: bool) -> Truth {
+        assert_eq!(values.len(), octree.level(top).len(), "one colour per voxel");
+        Truth {
+            levels: means_above(octree, top, values),
+            lossless,
+        }
     }
 
     /// The colours of a level, in the units of [`LevelColours::values`].
@@ -110,8 +113,25 @@ impl Truth {
     }
 }
 
-/// Encodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K. Returns the
-/// payload and the colours that it decodes to.
+/// Colours of level `top` and the transform's means of all levels above, from the root on.
+fn means_above(octree: &Octree, top: u8, values: Vec<Ycc>) -> Vec<Vec<Ycc>> {
+    let mut levels = vec![values];
+    for level in (0..top).rev() {
+        let (masks, first) = (octree.occupancy(level), octree.first_child(level));
+        let below = &levels[levels.len() - 1];
+        let mean = |(mask, first): (&u8, &u32)| {
+            let children = super::block::spread(*mask, &below[*first as usize..]);
+            forward(*mask, children).0.map(|x| x as i16)
+        };
+        let means = masks.par_iter().zip(first).map(mean).collect();
+        levels.push(means);
+    }
+    levels.reverse();
+    levels
+}
+
+/// Encodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K, `guides` what
+/// a previous frame tells of the levels from 1 on, if anything. Returns the payload and the colours that it decodes to.
 ///
 /// # Panics
 /// If the octree has fewer than K levels.
@@ -121,6 +141,7 @@ pub fn encode_trunk(
     maps: &[KernelMap],
     truth: &Truth,
     options: Options,
+    guides: &[Guide<'_>],
 ) -> (Vec<u8>, LevelColours) {
     let fraction = options.steps.fraction();
     let half = (1 << fraction) >> 1;
@@ -134,9 +155,9 @@ pub fn encode_trunk(
         let mut bytes = vec![coding.steps.luma, coding.steps.chroma, coding.gain, root[0] as u8];
         bytes.extend(root[1..].iter().flat_map(|x| x.to_le_bytes()));
         let mut coder = RdoEncoder::new(options.lambda);
-        let colours = trunk(isa, octree, maps, coding, root, &mut coder, |level| {
-            Some(truth.level(level))
-        });
+        let truth = |level| Some(truth.level(level));
+        let each = &mut |_: u8, _: &LevelColours| {};
+        let colours = trunk(isa, octree, maps, coding, root, &mut coder, truth, guides, each);
         let error = coder.error;
         bytes.extend(coder.encoder.finish());
         (cost(error, bytes.len()), bytes, colours)
@@ -161,8 +182,10 @@ pub fn encode_level(
     truth: &Truth,
     slice: usize,
     options: Options,
+    guide: Option<Guide<'_>>,
 ) -> (Vec<Vec<u8>>, LevelColours) {
-    let nodes = nodes(octree, level, above_map, map, above);
+    let mut nodes = nodes(octree, level, above_map, map, above);
+    nodes.guide = guide;
     let encode = |range: Range<usize>, coding: Coding| {
         let (mut coder, mut model) = (RdoEncoder::new(options.lambda), above.model.clone());
         let first = nodes.first_child[range.start] as usize;

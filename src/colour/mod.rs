@@ -26,6 +26,7 @@ mod prediction;
 mod space;
 mod transform;
 
+pub use block::Guide;
 #[cfg(feature = "encoder")]
 pub use encode::{Options, Truth, encode_level, encode_trunk};
 pub use filter::Filter;
@@ -113,6 +114,25 @@ fn slices(nodes: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<usi
 /// # Panics
 /// If the octree has fewer than K levels.
 pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Slice) -> Result<LevelColours> {
+    decode_guided_trunk(isa, octree, maps, payload, &[], &mut |_, _| {})
+}
+
+/// [`decode_trunk`] with what a previous frame tells of the levels from 1 on, if there are guides. `each` gets the
+/// levels before K, and their colours.
+///
+/// # Errors
+/// Those of [`decode_trunk`].
+///
+/// # Panics
+/// As [`decode_trunk`]; if there are guides, but not of every level.
+pub fn decode_guided_trunk(
+    isa: Isa,
+    octree: &Octree,
+    maps: &[KernelMap],
+    payload: &Slice,
+    guides: &[Guide<'_>],
+    each: &mut dyn FnMut(u8, &LevelColours),
+) -> Result<LevelColours> {
     let depth = maps.len() - 1;
     let (coding, rest) = read_coding(payload, TRUNK_HEADER)?;
     let number = |at: usize| i16::from_le_bytes([payload.bytes[at], payload.bytes[at + 1]]);
@@ -129,7 +149,7 @@ pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Sli
         .breaks("5.3.2"));
     }
     let mut coder = EntropyDecoder(Decoder::new(rest));
-    let colours = trunk(isa, octree, maps, coding, root, &mut coder, |_| None);
+    let colours = trunk(isa, octree, maps, coding, root, &mut coder, |_| None, guides, each);
     coder
         .0
         .finish(&format!("byte {}, colours of levels 1 to {depth}", payload.offset))?;
@@ -137,7 +157,8 @@ pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Sli
 }
 
 /// Codes the levels 1 to K in turn, from a root of this colour. `coding` is that of level K. `truth` returns the
-/// original colours of a level to an encoder, and `None` to a decoder.
+/// original colours of a level to an encoder, and `None` to a decoder. `guides` are those of the levels from 1 on, if
+/// there are any; `each` gets the levels before K.
 fn trunk<'t, S: CoefficientCoder>(
     isa: Isa,
     octree: &Octree,
@@ -146,14 +167,18 @@ fn trunk<'t, S: CoefficientCoder>(
     root: [i16; 3],
     coder: &mut S,
     truth: impl Fn(u8) -> Option<&'t [Ycc]>,
+    guides: &[Guide<'_>],
+    each: &mut dyn FnMut(u8, &LevelColours),
 ) -> LevelColours {
     let depth = maps.len() - 1;
     let mut colours = root_colours(coding.steps, root);
     for level in 1..=depth {
+        each(level as u8 - 1, &colours);
         let coding = coding_above(coding, depth - level);
         let mut model = std::mem::replace(&mut colours.model, Model::empty());
         let [above, map] = [&maps[level - 1], &maps[level]];
-        let nodes = nodes(octree, level as u8, above, map, &colours);
+        let mut nodes = nodes(octree, level as u8, above, map, &colours);
+        nodes.guide = guides.get(level - 1).copied();
         let coded = isa.run(CodeSlice {
             coder,
             model: &mut model,
@@ -174,7 +199,7 @@ fn trunk<'t, S: CoefficientCoder>(
 }
 
 /// Decodes the colours of `level` from those of the level above and one payload for every `slice` nodes. `above_map`
-/// and `map` are the 3³ kernel maps of the level above and of `level`.
+/// and `map` are the 3³ kernel maps of the level above and of `level`, `guide` what a previous frame tells of the level.
 ///
 /// # Errors
 /// [`Error::Truncated`] or [`Error::Malformed`] if a payload is invalid, and [`Error::Cancelled`].
@@ -191,9 +216,11 @@ pub fn decode_level(
     above: &LevelColours,
     payloads: &[Slice],
     slice: usize,
+    guide: Option<Guide<'_>>,
     cancel: &Cancel,
 ) -> Result<LevelColours> {
-    let nodes = nodes(octree, level, above_map, map, above);
+    let mut nodes = nodes(octree, level, above_map, map, above);
+    nodes.guide = guide;
     let ranges = slices(nodes.masks.len(), slice);
     if payloads.len() != ranges.len() {
         let at = format!("level {level}");
@@ -308,6 +335,7 @@ fn nodes<'a>(
         first_child: octree.first_child(level - 1),
         values: &above.values,
         energies: &above.energies,
+        guide: None,
     }
 }
 

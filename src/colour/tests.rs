@@ -51,11 +51,29 @@ impl Case {
     /// The payloads of the trunk and of every level below, and the colours of the last level.
     fn encode(&self, isa: Isa, trunk: u8, slice: usize, steps: Steps) -> (Vec<Vec<Vec<u8>>>, LevelColours) {
         let (truth, options) = (self.truth(steps), Options::new(steps));
-        let (bytes, mut colours) = encode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &truth, options);
+        let (bytes, mut colours) = encode_trunk(
+            isa,
+            &self.octree,
+            &self.maps[..=usize::from(trunk)],
+            &truth,
+            options,
+            &[],
+        );
         let mut payloads = vec![vec![bytes]];
         for level in trunk + 1..=self.octree.depth() {
             let [above, map] = [level - 1, level].map(|l| &self.maps[usize::from(l)]);
-            let (slices, next) = encode_level(isa, &self.octree, level, above, map, &colours, &truth, slice, options);
+            let (slices, next) = encode_level(
+                isa,
+                &self.octree,
+                level,
+                above,
+                map,
+                &colours,
+                &truth,
+                slice,
+                options,
+                None,
+            );
             payloads.push(slices);
             colours = next;
         }
@@ -88,6 +106,7 @@ impl Case {
                 &colours,
                 &slices,
                 slice,
+                None,
                 &Cancel::default(),
             )?;
         }

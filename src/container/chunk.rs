@@ -11,6 +11,8 @@ pub(super) enum Form {
     Fixed,
     /// Version 3: numbers as varints.
     Short,
+    /// The same around the frames of a sequence, whose kinds occur there alone.
+    Sequence,
 }
 
 impl Form {
@@ -18,7 +20,7 @@ impl Form {
     fn clause_of_chunks(self) -> &'static str {
         match self {
             Form::Fixed => "8.1.1",
-            Form::Short => "3.1.1",
+            Form::Short | Form::Sequence => "3.1.1",
         }
     }
 
@@ -32,6 +34,9 @@ impl Form {
             (Form::Short, ChunkKind::ColourTrunk) => "3.3.1",
             (Form::Short, ChunkKind::Colours) => "3.3.2",
             (Form::Short, _) => "3.3.4",
+            (Form::Sequence, ChunkKind::Index) => "17.2.1",
+            (Form::Sequence, ChunkKind::FrameTable) => "17.3.1",
+            (Form::Sequence, _) => "17.4.1",
         }
     }
 }
@@ -64,6 +69,12 @@ pub enum ChunkKind {
     PostFilter,
     /// Where surfels take the place of learned Gaussians (version 3). Ancillary.
     HeadMap,
+    /// How a level of a frame moved (sequences).
+    Motion,
+    /// Where the groups of a sequence lie.
+    Index,
+    /// Where the frames of a group lie (sequences).
+    FrameTable,
     /// A chunk that a reader skips, of type 128 to 255.
     Ancillary(u8),
 }
@@ -98,7 +109,7 @@ pub struct Chunks<'a> {
 }
 
 /// Form, type number and name of each kind.
-const KINDS: [(Form, u8, ChunkKind, &str); 10] = [
+const KINDS: [(Form, u8, ChunkKind, &str); 13] = [
     (Form::Fixed, 1, ChunkKind::Geometry, "geometry"),
     (Form::Fixed, 2, ChunkKind::Features, "feature"),
     (Form::Fixed, 3, ChunkKind::Filter, "filter"),
@@ -109,6 +120,9 @@ const KINDS: [(Form, u8, ChunkKind, &str); 10] = [
     (Form::Short, 7, ChunkKind::Colours, "colour"),
     (Form::Short, 8, ChunkKind::PostFilter, "colour filter"),
     (Form::Short, HEAD_MAP, ChunkKind::HeadMap, "head map"),
+    (Form::Sequence, 9, ChunkKind::Motion, "motion"),
+    (Form::Sequence, 10, ChunkKind::Index, "index"),
+    (Form::Sequence, 11, ChunkKind::FrameTable, "frame table"),
 ];
 
 impl ChunkKind {
@@ -158,7 +172,7 @@ impl Chunk<'_> {
                 out.extend(self.count.to_le_bytes());
                 out.extend(length.to_le_bytes());
             }
-            Form::Short => {
+            Form::Short | Form::Sequence => {
                 for number in [self.slice.into(), self.count, length] {
                     put_varint(out, number);
                 }
@@ -222,7 +236,7 @@ impl<'a> Chunks<'a> {
         let start = self.reader.at();
         let [code, level, slice, count, length] = match self.form {
             Form::Fixed => self.fixed_header()?,
-            Form::Short => self.short_header()?,
+            Form::Short | Form::Sequence => self.short_header()?,
         };
         let head = self.reader.since(start);
         let expected = self.reader.u32("chunk checksum")?;
@@ -243,7 +257,7 @@ impl<'a> Chunks<'a> {
             return Err(Error::Unsupported {
                 what: match self.form {
                     Form::Fixed => feature::CHUNK_OF_VERSION_2,
-                    Form::Short => feature::CHUNK,
+                    Form::Short | Form::Sequence => feature::CHUNK,
                 },
                 detail: format!("byte {start} has the critical type {code}, which this decoder does not know"),
             });

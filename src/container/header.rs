@@ -15,6 +15,8 @@ pub const MAX_COLOUR_SLICE: u32 = 65_536;
 
 /// The minor version written.
 const MINOR: u16 = 0;
+/// The critical flag of a sequence of frames, whose header counts the most of any frame (clause 17.1).
+const SEQUENCE: u32 = 1;
 
 /// Version of the format, with the fields that only it has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -120,6 +122,27 @@ impl Header {
     /// [`Error::Truncated`], [`Error::ChecksumMismatch`], [`Error::Unsupported`] for another version or unknown
     /// critical flags, [`Error::Malformed`] for values that the format forbids, [`Error::LimitExceeded`].
     pub fn parse(bytes: &[u8], limits: &Limits) -> Result<Self> {
+        Self::parse_flagged(bytes, limits, 0)
+    }
+
+    /// Parses the header of a sequence of frames.
+    ///
+    /// # Errors
+    /// Those of [`Header::parse`], and [`Error::Unsupported`] for a stream of one frame.
+    #[doc(hidden)]
+    pub fn parse_sequence(bytes: &[u8], limits: &Limits) -> Result<Self> {
+        Self::parse_flagged(bytes, limits, SEQUENCE)
+    }
+
+    /// Whether bytes start like a sequence of frames. What follows may be damaged.
+    #[doc(hidden)]
+    pub fn is_of_sequence(bytes: &[u8]) -> bool {
+        let flags = bytes.get(12..16).and_then(|flags| flags.try_into().ok());
+        version(bytes) == Some(3) && flags.map(u32::from_le_bytes) == Some(SEQUENCE)
+    }
+
+    /// Parses a header whose critical flags must be `expected`.
+    fn parse_flagged(bytes: &[u8], limits: &Limits, expected: u32) -> Result<Self> {
         let mut reader = Reader::new(bytes, 0);
         let mut format = read_version(&mut reader, bytes)?;
         let critical_flags = reader.u32("critical flags")?;
@@ -151,12 +174,7 @@ impl Header {
         };
         let sections = (0..levels).map(&mut section).collect::<Result<Vec<_>>>()?;
         check_sum(&mut reader, bytes)?;
-        if critical_flags != 0 {
-            return Err(Error::Unsupported {
-                what: feature::FLAGS,
-                detail: format!("the critical flags are {critical_flags:#010x}, none of which this version knows"),
-            });
-        }
+        check_flags(critical_flags, expected)?;
         if reserved != 0 {
             return Err(malformed("2.2.1", 23, "reserved byte", reserved, 0));
         }
@@ -182,11 +200,21 @@ impl Header {
     /// Serialises the header.
     #[doc(hidden)]
     pub fn write(&self) -> Vec<u8> {
+        self.write_flagged(0)
+    }
+
+    /// Serialises the header of a sequence of frames.
+    #[doc(hidden)]
+    pub fn write_sequence(&self) -> Vec<u8> {
+        self.write_flagged(SEQUENCE)
+    }
+
+    fn write_flagged(&self, critical_flags: u32) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(self.bytes());
         bytes.extend(MAGIC);
         bytes.extend(self.format.version().to_le_bytes());
         bytes.extend(MINOR.to_le_bytes());
-        bytes.extend(0u32.to_le_bytes());
+        bytes.extend(critical_flags.to_le_bytes());
         bytes.extend(self.optional_flags.to_le_bytes());
         bytes.extend([self.bits, self.base, self.top, 0]);
         bytes.extend(self.points.to_le_bytes());
@@ -400,6 +428,26 @@ impl Header {
             }
         }
     }
+}
+
+/// Checks the critical flags of a stream of which `expected` are.
+fn check_flags(found: u32, expected: u32) -> Result<()> {
+    let (what, detail) = match (found, expected) {
+        _ if found == expected => return Ok(()),
+        (SEQUENCE, _) => (
+            feature::FLAGS,
+            "it is a sequence of frames, where one frame is expected".into(),
+        ),
+        (0, _) => (
+            "this stream",
+            "it has one frame, where a sequence of frames is expected".into(),
+        ),
+        _ => (
+            feature::FLAGS,
+            format!("the critical flags are {found:#010x}, of which this version knows {SEQUENCE:#010x} alone"),
+        ),
+    };
+    Err(Error::Unsupported { what, detail })
 }
 
 fn hex(id: &[u8; 16]) -> String {

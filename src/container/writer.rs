@@ -20,6 +20,7 @@ const UNLIMITED: Limits = Limits {
     max_depth: u8::MAX,
     max_pixels: u64::MAX,
     max_pairs: u64::MAX,
+    max_frames: u64::MAX,
     max_bytes: u64::MAX,
 };
 

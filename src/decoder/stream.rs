@@ -22,6 +22,7 @@ use crate::latents::network::Model;
 use crate::layers::Precision;
 use crate::limits::Limits;
 use crate::log::Log;
+use crate::motion::Inter;
 #[cfg(feature = "ply")]
 use crate::placement::Placement;
 
@@ -151,6 +152,11 @@ impl Decoder {
     pub fn start(&self) -> Decoding<'static> {
         let goal = Goal::Gaussians(self.level);
         Decoding::new(self.clone(), goal, Cow::Owned(Vec::new()))
+    }
+
+    /// Begins to decode a frame of a sequence, as [`Decoder::start`] does with all its bytes.
+    pub(crate) fn start_frame(&self, stream: Vec<u8>, inter: Option<Inter>) -> Decoding<'static> {
+        Decoding::of_frame(self.clone(), Goal::Gaussians(self.level), stream, inter)
     }
 
     /// Decodes a stream to Gaussians.
@@ -323,6 +329,11 @@ impl Decoder {
         })
     }
 
+    /// The level that decoding a stream with this header ends with.
+    pub(crate) fn last_level(&self, header: &Header) -> u8 {
+        self.level.unwrap_or(header.top).clamp(header.base, header.top)
+    }
+
     pub(super) fn log(&self) -> Log {
         self.log.clone().unwrap_or(Log::off())
     }
@@ -331,7 +342,7 @@ impl Decoder {
         self.isa.unwrap_or_else(Isa::detect)
     }
 
-    pub(super) fn limits(&self) -> &Limits {
+    pub(crate) fn limits(&self) -> &Limits {
         &self.limits
     }
 

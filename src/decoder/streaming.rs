@@ -12,6 +12,7 @@ use crate::gaussians::learned::{HeadsModel, LevelInput};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::Voxels;
 use crate::latents::{LatentDecoding, nothing_reached};
+use crate::motion::{Inter, Previous};
 
 /// A stream of either version that is decoded level by level as its bytes arrive.
 ///
@@ -42,6 +43,24 @@ impl<'b> Decoding<'b> {
             decoder,
             goal,
             state: State::Start(bytes),
+        }
+    }
+
+    /// A frame of a sequence: a stream of version 3 that `inter` predicts, if it is not whole.
+    pub(crate) fn of_frame(decoder: Decoder, goal: Goal, bytes: Vec<u8>, inter: Option<Inter>) -> Self {
+        let frame = Transform::new(decoder.clone(), goal, Cow::Owned(bytes)).as_frame(inter);
+        Decoding {
+            decoder,
+            goal,
+            state: State::Transform(Box::new(frame)),
+        }
+    }
+
+    /// What the next frame of a sequence is predicted from. `None` if this is no frame, or it was taken before.
+    pub(crate) fn take_previous(&mut self) -> Option<Previous> {
+        match &mut self.state {
+            State::Transform(decoding) => decoding.previous(),
+            _ => None,
         }
     }
 

@@ -7,7 +7,7 @@ use b2p_kernels::Isa;
 use xxhash_rust::xxh3::Xxh3Default;
 
 use super::stream::Decoder;
-use crate::colour::{self, Filter, LevelColours};
+use crate::colour::{self, Filter, LevelColours, Ycc};
 use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
@@ -17,6 +17,7 @@ use crate::gaussians::{Gaussians, HeadMap};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::latents::nothing_reached;
 use crate::log::Log;
+use crate::motion::{ColourGuide, GeometryGuide, Inter, Previous};
 
 /// A stream of version 3 that is decoded level by level.
 #[derive(Debug)]
@@ -25,7 +26,14 @@ pub(super) struct Transform<'b> {
     feed: Feed<'b>,
     reached: Option<Reached>,
     ahead: Ahead,
+    /// What a frame of a sequence is predicted from.
+    inter: Option<Inter>,
+    /// The colours of all levels so far and their filters, if another frame will be predicted from them.
+    history: Option<History>,
 }
+
+/// Decoded colours of the levels from 0 on before their filters, and the filters.
+type History = Vec<(Vec<Ycc>, Option<Filter>)>;
 
 /// The occupancies of a level that were decoded beside the colours of the level above, which are coded apart from them
 /// and take as long.
@@ -124,7 +132,23 @@ impl<'b> Transform<'b> {
             feed: Feed::new(goal, bytes),
             reached: None,
             ahead: None,
+            inter: None,
+            history: None,
         }
+    }
+
+    /// The same stream as a frame of a sequence that `inter` predicts, if it is not whole. It keeps what the next frame
+    /// needs.
+    pub(super) fn as_frame(mut self, inter: Option<Inter>) -> Self {
+        self.inter = inter;
+        self.history = Some(Vec::new());
+        self
+    }
+
+    /// What the next frame is predicted from.
+    pub(super) fn previous(&mut self) -> Option<Previous> {
+        let history = self.history.take()?;
+        Some(Previous::new(&self.reached.as_ref()?.octree, history))
     }
 
     pub(super) fn push(&mut self, bytes: &[u8]) {
@@ -169,7 +193,10 @@ impl<'b> Transform<'b> {
             return Err(nothing_reached());
         };
         let parse = |payload: &Slice| Filter::parse(payload.bytes, payload.offset);
-        let filter = colours.filter.as_ref().map(parse).transpose()?;
+        let mut filter = colours.filter.as_ref().map(parse).transpose()?;
+        if let (None, Some(inter)) = (&filter, &self.inter) {
+            filter = inter.previous().level(level).and_then(|level| level.filter.clone());
+        }
         let mut octree = match &mut self.reached {
             Some(above) => std::mem::replace(&mut above.octree, Octree::root()),
             None => Octree::root(),
@@ -183,8 +210,11 @@ impl<'b> Transform<'b> {
             part: &part,
             colours,
             next: next.as_ref(),
+            inter: self.inter.as_ref(),
         };
-        match growing.level(&mut octree, self.reached.as_ref(), &mut self.ahead, log) {
+        let mut values = Vec::new();
+        let kept = self.history.is_some().then_some(&mut values);
+        match growing.level(&mut octree, self.reached.as_ref(), &mut self.ahead, kept, log) {
             Ok(Step { map, coloured, above }) => {
                 let old = self.reached.take().map(|old| Above {
                     map: old.map,
@@ -193,6 +223,12 @@ impl<'b> Transform<'b> {
                 let blocks = HeadMap::block_count(&octree, level);
                 let head_map = colours.head_map.as_ref();
                 let head_map = head_map.and_then(|map| HeadMap::parse(map.bytes, blocks));
+                if let Some(history) = &mut self.history {
+                    history.extend(values.into_iter().map(|values| (values, None)));
+                    if let Some(last) = history.last_mut() {
+                        last.1 = filter.clone();
+                    }
+                }
                 self.reached = Some(Reached {
                     level,
                     octree,
@@ -246,7 +282,12 @@ struct Growing<'a> {
     colours: &'a Colours<'a>,
     /// The level after it, if its geometry may be decoded already.
     next: Option<&'a Level<'a>>,
+    /// What the frame is predicted from.
+    inter: Option<&'a Inter>,
 }
+
+/// Decoded colours of levels, one after the other, if they are to be kept.
+type Kept<'a> = Option<&'a mut Vec<Vec<Ycc>>>;
 
 /// The kernel map and the colours of a level on the way to the one that a section is of, and of the level above if the
 /// section has it.
@@ -258,10 +299,17 @@ struct Step {
 
 impl Growing<'_> {
     /// Grows `octree` to the level of the part.
-    fn level(&self, octree: &mut Octree, above: Option<&Reached>, ahead: &mut Ahead, log: &Log) -> Result<Step> {
+    fn level(
+        &self,
+        octree: &mut Octree,
+        above: Option<&Reached>,
+        ahead: &mut Ahead,
+        mut kept: Kept<'_>,
+        log: &Log,
+    ) -> Result<Step> {
         let level = self.part.level;
         let mut step = match &self.colours.trunk {
-            Some(trunk) => Some(self.trunk(octree, trunk, ahead, log)?),
+            Some(trunk) => Some(self.trunk(octree, trunk, ahead, kept.as_deref_mut(), log)?),
             None => None,
         };
         for n in octree.depth() + 1..=level {
@@ -271,6 +319,9 @@ impl Growing<'_> {
                 (None, None) => return Err(nothing_reached()),
             };
             let (map, coloured) = self.next(octree, n, map, coloured, ahead, log)?;
+            if let Some(kept) = kept.as_deref_mut() {
+                kept.push(coloured.values().to_vec());
+            }
             step = Some(Step {
                 map,
                 coloured,
@@ -286,26 +337,42 @@ impl Growing<'_> {
     }
 
     /// The levels that the colour trunk holds.
-    fn trunk(&self, octree: &mut Octree, trunk: &Trunk, ahead: &mut Ahead, log: &Log) -> Result<Step> {
-        let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
+    fn trunk(&self, octree: &mut Octree, trunk: &Trunk, ahead: &mut Ahead, kept: Kept<'_>, log: &Log) -> Result<Step> {
+        let isa = self.decoder.isa();
         let (depth, count) = (trunk.level, trunk.slice.voxels as usize);
-        let slice = self.header.slice_voxels as usize;
         let mut maps = vec![KernelMap::root()];
         let name = format!("geometry of levels 0 to {depth}");
         log.step(name, count, "voxels", || {
             for part in self.part.geometry.iter().take(depth.into()) {
                 let map = &maps[maps.len() - 1];
-                codec::decode_level(isa, octree, map, &part.slices, slice, cancel)?;
+                let masks = self.masks(octree, part, map)?;
+                octree.grow(masks)?;
                 maps.push(octree.child_map(part.level - 1, map));
             }
             Ok(())
         })?;
-        cancel.check()?;
+        self.decoder.cancel().check()?;
+        let guides = match self.inter {
+            Some(inter) => (1..=depth)
+                .map(|n| inter.colours(octree, n))
+                .collect::<Result<Vec<_>>>()?,
+            None => Vec::new(),
+        };
+        let guides: Vec<colour::Guide> = guides.iter().map(ColourGuide::guide).collect();
+        let mut values = Vec::new();
         let name = self.named(format!("colours of levels 0 to {depth}"), depth);
         let coloured = log.step(name, count, "voxels", || {
-            let colours = || colour::decode_trunk(isa, octree, &maps, &trunk.slice);
-            self.with_next_occupancies(depth, &maps[maps.len() - 1], ahead, colours)
+            let colours = || {
+                let mut each = |_: u8, level: &LevelColours| values.push(level.values().to_vec());
+                let colours = colour::decode_guided_trunk(isa, octree, &maps, &trunk.slice, &guides, &mut each)?;
+                values.push(colours.values().to_vec());
+                Ok(colours)
+            };
+            self.with_next_occupancies(octree, depth, &maps[maps.len() - 1], ahead, colours)
         })?;
+        if let Some(kept) = kept {
+            kept.append(&mut values);
+        }
         let map = maps.pop().unwrap_or_else(KernelMap::root);
         Ok(Step {
             map,
@@ -337,20 +404,25 @@ impl Growing<'_> {
             match ahead.take() {
                 Some((level, masks)) if level == n => octree.grow(masks?),
                 _ => {
-                    let slice = header.slice_voxels as usize;
-                    codec::decode_level(isa, octree, above_map, slices, slice, cancel)
+                    let masks = self.masks(octree, geometry, above_map)?;
+                    octree.grow(masks)
                 }
             }
         })?;
         let map = log.step(format!("kernel map of level {n}"), count, "voxels", || {
             Ok(octree.child_map(n - 1, above_map))
         })?;
+        let guide = self.inter.map(|inter| inter.colours(octree, n)).transpose()?;
         let name = self.named(format!("colours of level {n}"), n);
         let coloured = log.step(name, count, "voxels", || {
             let slice = header.colour_slice() as usize;
             let slices = &colours.slices;
-            let colours = || colour::decode_level(isa, octree, n, above_map, &map, above, slices, slice, cancel);
-            self.with_next_occupancies(n, &map, ahead, colours)
+            let guide = guide.as_ref().map(ColourGuide::guide);
+            let colours = || {
+                let octree = &*octree;
+                colour::decode_level(isa, octree, n, above_map, &map, above, slices, slice, guide, cancel)
+            };
+            self.with_next_occupancies(octree, n, &map, ahead, colours)
         })?;
         Ok((map, coloured))
     }
@@ -374,6 +446,7 @@ impl Growing<'_> {
     /// is the kernel map of level `n`.
     fn with_next_occupancies(
         &self,
+        octree: &Octree,
         n: u8,
         map: &KernelMap,
         ahead: &mut Ahead,
@@ -382,12 +455,20 @@ impl Growing<'_> {
         let Some(next) = self.after(n) else {
             return colours();
         };
-        let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
-        let slice = self.header.slice_voxels as usize;
-        let masks = || codec::decode_masks(isa, n + 1, map, &next.slices, slice, cancel);
-        let (coloured, masks) = rayon::join(colours, masks);
+        let (coloured, masks) = rayon::join(colours, || self.masks(octree, next, map));
         *ahead = Some((n + 1, masks));
         coloured
+    }
+}
+
+impl Growing<'_> {
+    /// The occupancies that make the level of `part`. `map` is the kernel map of the level above.
+    fn masks(&self, octree: &Octree, part: &Geometry<'_>, map: &KernelMap) -> Result<Vec<u8>> {
+        let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
+        let guide = self.inter.map(|inter| inter.geometry(octree, part.level)).transpose()?;
+        let guide = guide.as_ref().map(GeometryGuide::guide);
+        let slice = self.header.slice_voxels as usize;
+        codec::decode_masks(isa, part.level, map, &part.slices, slice, guide, cancel)
     }
 }
 

@@ -58,7 +58,15 @@ pub const OPTIONS: [&str; 8] = [
 /// What a command works on.
 #[derive(Debug)]
 pub enum Work {
-    One { input: PathBuf, output: PathBuf },
+    One {
+        input: PathBuf,
+        output: PathBuf,
+    },
+    /// Inputs that become one output: frames of a sequence.
+    Sequence {
+        inputs: Vec<PathBuf>,
+        output: PathBuf,
+    },
     Many(Vec<Unit>),
 }
 
@@ -80,6 +88,8 @@ pub struct Kind<'a> {
     pub ending: &'a str,
     /// An output that an option names in place of [`Files`].
     pub instead: Option<&'a Path>,
+    /// Whether many inputs may become one output.
+    pub gathers: bool,
 }
 
 impl Files {
@@ -107,16 +117,20 @@ impl Files {
                 Some(_) => Work::Many(vec![Unit { input, output }]),
             });
         }
-        if output.extension().is_some() && !is_folder(output) {
-            let what = format!("{} is no folder: outputs of several inputs need one", output.display());
-            let folder = output.with_extension("");
-            return Err(Failure(format!("{what}, such as -o {}/", folder.display())));
-        }
         let mut all = expanded(inputs, kind.takes)?;
         if let Some(list) = &self.files_from {
             let text = std::fs::read_to_string(list);
             let text = text.map_err(|error| Failure(format!("{}: {error}", list.display())))?;
             all.extend(text.lines().filter(|line| !line.trim().is_empty()).map(PathBuf::from));
+        }
+        if output.extension().is_some() && !is_folder(output) {
+            if kind.gathers {
+                let output = output.to_path_buf();
+                return Ok(Work::Sequence { inputs: all, output });
+            }
+            let what = format!("{} is no folder: outputs of several inputs need one", output.display());
+            let folder = output.with_extension("");
+            return Err(Failure(format!("{what}, such as -o {}/", folder.display())));
         }
         self.units(&all, output, kind.ending).map(Work::Many)
     }

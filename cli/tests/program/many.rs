@@ -198,7 +198,7 @@ fn inputs_that_are_not_there_and_outputs_that_collide_are_said_before_any_work()
     );
     fails(
         at,
-        &["encode", "clouds", "-o", "out.b2p"],
-        &["out.b2p is no folder", "-o out/"],
+        &["decode", "clouds/a.ply", "clouds/b.ply", "-o", "out.ply"],
+        &["out.ply is no folder", "-o out/"],
     );
 }

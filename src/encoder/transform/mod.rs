@@ -2,6 +2,8 @@
 
 mod head_maps;
 mod knobs;
+mod motion;
+mod predicted;
 mod rate_control;
 
 use std::fmt;
@@ -23,6 +25,8 @@ use crate::gaussians::{HeadMap, HeadSet};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
+use crate::motion::{ColourGuide, GeometryGuide};
+pub use predicted::{PredictedFrame, encode_predicted};
 pub use rate_control::encode_to_rate;
 
 /// How exactly colours are coded.
@@ -199,6 +203,17 @@ struct EncoderInput<'a> {
     /// The code of the levels from 1 on: of each slice the children, and its bytes.
     geometry: Vec<Vec<(u32, Vec<u8>)>>,
     grey: bool,
+    /// Points that the header states.
+    points: u64,
+    /// What the previous frame tells of the levels from 1 on, for a predicted frame of a sequence.
+    guides: Option<Guides>,
+}
+
+/// What a previous frame tells of the levels from 1 on.
+#[derive(Debug, Default)]
+struct Guides {
+    geometry: Vec<GeometryGuide>,
+    colours: Vec<ColourGuide>,
 }
 
 /// A stream that has not been checked yet.
@@ -233,25 +248,31 @@ impl<'a> EncoderInput<'a> {
             maps: Vec::new(),
             geometry: Vec::new(),
             grey: cloud.colours.par_iter().all(|[r, g, b]| r == g && g == b),
+            points: cloud.voxels.len() as u64,
+            guides: None,
         };
         // What the format forbids is refused before anything is computed, as if of one voxel.
         Writer::new(Header {
             points: 1,
             ..subject.header(top, |_| 1)
         })?;
-        let shift = 3 * (cloud.voxels.depth() - top);
-        let mut keys: Vec<u64> = cloud.voxels.keys().iter().map(|key| key >> shift).collect();
-        keys.dedup();
-        let count = keys.len();
-        let octree = log.step("octree", count, "voxels", || {
-            Octree::new(Voxels::from_sorted(top, keys))
-        })?;
+        let octree = octree_of(cloud, top, log)?;
+        subject.with_octree(octree, top, log)
+    }
+
+    /// Codes the octree down to level `top`.
+    fn with_octree(self, octree: Octree, top: u8, log: &Log) -> Result<Self> {
+        let (isa, count) = (self.isa, octree.level(top).len());
         let maps = log.step("kernel maps", count, "voxels", || Ok(super::kernel_maps(&octree, 0)))?;
-        let slice = options.slice_voxels as usize;
+        let slice = self.options.slice_voxels as usize;
         let geometry = log.step("geometry", count, "voxels", || {
             let code = |level: u8| {
                 let map = &maps[usize::from(level) - 1];
-                codec::encode_level(isa, &octree, map, level, slice)
+                let guide = self
+                    .guides
+                    .as_ref()
+                    .map(|guides| guides.geometry[usize::from(level) - 1].guide());
+                codec::encode_guided(isa, &octree, map, level, slice, guide)
             };
             Ok((1..=top).into_par_iter().map(code).collect())
         })?;
@@ -259,7 +280,7 @@ impl<'a> EncoderInput<'a> {
             octree,
             maps,
             geometry,
-            ..subject
+            ..self
         })
     }
 
@@ -271,7 +292,7 @@ impl<'a> EncoderInput<'a> {
             bits: self.cloud.voxels.depth(),
             base: *levels.start(),
             top,
-            points: self.cloud.voxels.len() as u64,
+            points: self.points,
             placement: self.cloud.placement,
             format: Format::Transform {
                 colour_slice: self.options.colour_slice,
@@ -321,7 +342,9 @@ impl<'a> EncoderInput<'a> {
         let (payload, mut coloured) = log.step(name, count, "voxels", || {
             let maps = &maps[..=usize::from(trunk)];
             let coding = self.coding(steps, top, trunk);
-            Ok(colour::encode_trunk(isa, octree, maps, truth, coding))
+            let guides = self.guides.iter().flat_map(|guides| &guides.colours);
+            let guides: Vec<_> = guides.map(ColourGuide::guide).collect();
+            Ok(colour::encode_trunk(isa, octree, maps, truth, coding, &guides))
         })?;
         let mut layers = Vec::new();
         let mut bytes = payload.len();
@@ -332,10 +355,14 @@ impl<'a> EncoderInput<'a> {
             if level > trunk {
                 let [above, map] = [level - 1, level].map(|n| &maps[usize::from(n)]);
                 let coding = self.coding(steps, top, level);
+                let guide = self
+                    .guides
+                    .as_ref()
+                    .map(|guides| guides.colours[usize::from(level) - 1].guide());
                 let name = format!("colours of level {level}");
                 let (payloads, next) = log.step(name, count, "voxels", || {
                     Ok(colour::encode_level(
-                        isa, octree, level, above, map, &coloured, truth, slice, coding,
+                        isa, octree, level, above, map, &coloured, truth, slice, coding, guide,
                     ))
                 })?;
                 coloured = next;
@@ -343,7 +370,8 @@ impl<'a> EncoderInput<'a> {
                 bytes += slices.iter().map(|slice| slice.1.len()).sum::<usize>();
             }
             let mut filter = None;
-            if level >= base && self.options.filter {
+            // Predicted frames inherit the filters of the frame before.
+            if level >= base && self.options.filter && self.guides.is_none() {
                 let name = format!("filter of level {level}");
                 let most = match level == top {
                     true => usize::MAX,
@@ -510,6 +538,17 @@ impl<'a> EncoderInput<'a> {
         let bytes = |level| CHUNK + HeadMap::usual_bytes(HeadMap::block_count(&self.octree, level));
         mapped.map(bytes).sum()
     }
+}
+
+/// The octree of a cloud down to level `top`.
+fn octree_of(cloud: &ColouredVoxels, top: u8, log: &Log) -> Result<Octree> {
+    let shift = 3 * (cloud.voxels.depth() - top);
+    let mut keys: Vec<u64> = cloud.voxels.keys().iter().map(|key| key >> shift).collect();
+    keys.dedup();
+    let count = keys.len();
+    log.step("octree", count, "voxels", || {
+        Octree::new(Voxels::from_sorted(top, keys))
+    })
 }
 
 /// Payloads with the numbers of their parents.

@@ -19,7 +19,7 @@
 //! negative numbers round down.
 
 use crate::coding::ONE;
-use crate::coding::probability::{STRETCH, squash};
+use crate::coding::probability::{LIMIT, STRETCH, squash};
 use b2p_kernels::Instructions;
 use b2p_kernels::mixing::{self, CONTEXTS, Lanes, OTHERS};
 
@@ -44,6 +44,13 @@ pub(super) struct Mixed {
     mixed: mixing::Mixed,
     /// Probability of a 1 in units of 2⁻¹⁶.
     pub one: u32,
+}
+
+impl Mixed {
+    /// The logit of the prediction.
+    pub fn logit(&self) -> i32 {
+        (self.mixed.sum >> 16).clamp(-LIMIT, LIMIT)
+    }
 }
 
 impl<I: Instructions> Mixer<I> {

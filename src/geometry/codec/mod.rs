@@ -23,6 +23,7 @@
 
 mod coder;
 mod contexts;
+pub mod guide;
 mod mixer;
 mod neighbourhood;
 pub mod network;
@@ -34,6 +35,7 @@ use crate::container::Slice;
 use crate::error::{Error, Result, Stage};
 use b2p_kernels::{Instructions, Isa, Work};
 use coder::{Decoder, Encoder};
+use guide::Guide;
 use neighbourhood::Neighbourhood;
 use predictor::Predictor;
 use rayon::prelude::*;
@@ -50,12 +52,33 @@ fn slices(parents: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<u
 /// # Panics
 /// If `level` is 0 or deeper than the octree, `map` belongs to another level, or `slice` is 0.
 pub fn encode_level(isa: Isa, octree: &Octree, map: &KernelMap, level: u8, slice: usize) -> Vec<(u32, Vec<u8>)> {
+    encode_guided(isa, octree, map, level, slice, None)
+}
+
+/// [`encode_level`] with what a previous frame tells of the level.
+///
+/// # Panics
+/// As [`encode_level`]; if the guide does not have one mode and window per parent, or has the mode `Skip` where the
+/// window's children are not those of the parent.
+pub fn encode_guided(
+    isa: Isa,
+    octree: &Octree,
+    map: &KernelMap,
+    level: u8,
+    slice: usize,
+    guide: Option<Guide<'_>>,
+) -> Vec<(u32, Vec<u8>)> {
     let occupancy = octree.occupancy(level - 1);
     assert_eq!(map.len(), occupancy.len(), "one kernel map row per parent");
     let ranges: Vec<_> = slices(occupancy.len(), slice).collect();
     let encode = |parents: Range<usize>| {
         let masks = &occupancy[parents.clone()];
-        let work = Encode { map, parents, masks };
+        let work = Encode {
+            map,
+            parents,
+            masks,
+            guide,
+        };
         (count(masks) as u32, isa.run(work))
     };
     ranges.into_par_iter().map(encode).collect()
@@ -71,11 +94,24 @@ pub fn encode_level(isa: Isa, octree: &Octree, map: &KernelMap, level: u8, slice
 /// # Panics
 /// If `parents` exceeds the rows of `map`.
 pub fn decode_slice(isa: Isa, level: u8, map: &KernelMap, parents: Range<usize>, slice: &Slice) -> Result<Vec<u8>> {
+    decode_guided_slice(isa, level, map, parents, slice, None)
+}
+
+/// [`decode_slice`] with what a previous frame tells of the level.
+fn decode_guided_slice(
+    isa: Isa,
+    level: u8,
+    map: &KernelMap,
+    parents: Range<usize>,
+    slice: &Slice,
+    guide: Option<Guide<'_>>,
+) -> Result<Vec<u8>> {
     let masks = isa.run(Decode {
         level,
         map,
         parents: parents.clone(),
         slice,
+        guide,
     })?;
     match count(&masks) {
         found if found == slice.voxels as usize => Ok(masks),
@@ -103,11 +139,11 @@ pub fn decode_level(
     cancel: &Cancel,
 ) -> Result<()> {
     let level = octree.depth() + 1;
-    octree.grow(decode_masks(isa, level, map, encoded, slice, cancel)?)
+    octree.grow(decode_masks(isa, level, map, encoded, slice, None, cancel)?)
 }
 
 /// Decodes the slices of `level`, of `slice` parents each. Returns the occupancies of all parents, as [`Octree::grow`]
-/// takes them. `map` is the 3³ kernel map of the parents.
+/// takes them. `map` is the 3³ kernel map of the parents, `guide` what a previous frame tells of the level.
 ///
 /// # Errors
 /// Those of [`decode_slice`], [`Error::Malformed`] if the number of slices is wrong, and [`Error::Cancelled`].
@@ -120,6 +156,7 @@ pub fn decode_masks(
     map: &KernelMap,
     encoded: &[Slice],
     slice: usize,
+    guide: Option<Guide<'_>>,
     cancel: &Cancel,
 ) -> Result<Vec<u8>> {
     let ranges = slices(map.len(), slice);
@@ -136,7 +173,7 @@ pub fn decode_masks(
     let tasks: Vec<_> = ranges.zip(encoded).collect();
     let decode = |(parents, slice): (Range<usize>, &Slice)| {
         cancel.check()?;
-        decode_slice(isa, level, map, parents, slice)
+        decode_guided_slice(isa, level, map, parents, slice, guide)
     };
     // Collect all results first: the error returned is that of the first faulty slice, with any number of threads.
     let masks: Vec<Result<_>> = tasks.into_par_iter().map(decode).collect();
@@ -149,6 +186,7 @@ struct Encode<'a> {
     map: &'a KernelMap,
     parents: Range<usize>,
     masks: &'a [u8],
+    guide: Option<Guide<'a>>,
 }
 
 impl Work for Encode<'_> {
@@ -156,11 +194,24 @@ impl Work for Encode<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, instructions: I) -> Vec<u8> {
-        let Encode { map, parents, masks } = self;
-        let (mut predictor, mut encoder) = (Predictor::new(instructions, parents.len()), Encoder::new());
+        let Encode {
+            map,
+            parents,
+            masks,
+            guide,
+        } = self;
+        let mut predictor = Predictor::new(instructions, parents.len(), guide.is_some());
+        let mut encoder = Encoder::new();
         let neighbourhoods = Neighbourhood::of_all(map, &parents);
         for ((parent, &mask), neighbourhood) in parents.clone().zip(masks).zip(neighbourhoods) {
-            predictor.code(&mut encoder, neighbourhood, map.row(parent), parents.start, masks, mask);
+            let skipped = guide.map_or(0, |guide| guide.skipped(parent));
+            if skipped != 0 {
+                assert_eq!(skipped, mask, "a skipped parent has the children of its window");
+                continue;
+            }
+            let window = guide.and_then(|guide| guide.window(parent));
+            let (row, first) = (map.row(parent), parents.start);
+            predictor.code(&mut encoder, neighbourhood, row, first, masks, mask, window);
         }
         encoder.finish()
     }
@@ -172,6 +223,7 @@ struct Decode<'a> {
     map: &'a KernelMap,
     parents: Range<usize>,
     slice: &'a Slice<'a>,
+    guide: Option<Guide<'a>>,
 }
 
 impl Work for Decode<'_> {
@@ -184,15 +236,22 @@ impl Work for Decode<'_> {
             map,
             parents,
             slice,
+            guide,
         } = self;
-        let mut predictor = Predictor::new(instructions, parents.len());
+        let mut predictor = Predictor::new(instructions, parents.len(), guide.is_some());
         let mut decoder = Decoder::new(slice.bytes, slice.offset);
         let mut masks = Vec::with_capacity(parents.len());
         let mut found = 0;
         let neighbourhoods = Neighbourhood::of_all(map, &parents);
         for (parent, neighbourhood) in parents.clone().zip(neighbourhoods) {
             let (row, first) = (map.row(parent), parents.start);
-            let mask = predictor.code(&mut decoder, neighbourhood, row, first, &masks, 0);
+            let mask = match guide.map_or(0, |guide| guide.skipped(parent)) {
+                0 => {
+                    let window = guide.and_then(|guide| guide.window(parent));
+                    predictor.code(&mut decoder, neighbourhood, row, first, &masks, 0, window)
+                }
+                skipped => skipped,
+            };
             decoder.check_not_past_end()?;
             masks.push(mask);
             found += mask.count_ones() as usize;

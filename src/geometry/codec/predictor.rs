@@ -11,6 +11,7 @@
 
 use super::coder::Coder;
 use super::contexts::Contexts;
+use super::guide::Refiner;
 use super::mixer::Mixer;
 use super::neighbourhood::Neighbourhood;
 use super::network::Network;
@@ -35,11 +36,13 @@ pub(super) struct Predictor<I> {
     mixer: Mixer<I>,
     output: [Row; 8],
     bias: [i32; 8],
+    /// What a previous frame is used with.
+    refiner: Option<Refiner>,
 }
 
 impl<I: Instructions> Predictor<I> {
     /// The initial state of a slice of `parents` parents.
-    pub fn new(instructions: I, parents: usize) -> Self {
+    pub fn new(instructions: I, parents: usize, guided: bool) -> Self {
         let network = Network::get();
         Predictor {
             instructions,
@@ -47,11 +50,13 @@ impl<I: Instructions> Predictor<I> {
             mixer: Mixer::new(instructions, parents),
             output: network.output,
             bias: network.bias,
+            refiner: guided.then(Refiner::new),
         }
     }
 
     /// Codes the occupancy of a voxel. `neighbours` is its neighbourhood and `row` its row of the kernel map.
-    /// `occupancies` are those of the slice, from its first voxel, of index `first`, at least up to this one.
+    /// `occupancies` are those of the slice, from its first voxel, of index `first`, at least up to this one. `window` is
+    /// what a previous frame has there.
     ///
     /// An encoder codes `occupancy`, never 0, and returns it. A decoder ignores it and returns what it decoded, also
     /// never 0: if seven children are absent, the eighth is implied and not coded.
@@ -64,6 +69,7 @@ impl<I: Instructions> Predictor<I> {
         first: usize,
         occupancies: &[u8],
         occupancy: u8,
+        window: Option<u64>,
     ) -> u8 {
         let (network, mut contexts) = (self.network, Contexts::new());
         let (mut rows, mut count) = ([network.presence(0); 2 * 26 + 2 * 19], 0);
@@ -98,13 +104,20 @@ impl<I: Instructions> Predictor<I> {
             let logit = (sum >> SHIFT).clamp(-LIMIT, LIMIT);
             let network = squash(logit);
             let target = occupancy >> octant & 1 == 1;
+            let refiner = window.and_then(|window| Some((window, self.refiner.as_mut()?)));
             let bit = if logit.abs() < CERTAIN {
                 let mixed = self.mixer.predict(logit, contexts.hashes(octant, node));
-                let bit = coder.code(target, mixed.one);
+                let bit = match refiner {
+                    None => coder.code(target, mixed.one),
+                    Some((window, refiner)) => refiner.code(coder, window, octant, coded, mixed.logit(), target),
+                };
                 self.mixer.adapt(&mixed, network, bit);
                 bit
             } else {
-                coder.code(target, network)
+                match refiner {
+                    None => coder.code(target, network),
+                    Some((window, refiner)) => refiner.code(coder, window, octant, coded, logit, target),
+                }
             };
             // Speculate on the bit, so that the next child's features do not wait for the coder. It is seldom wrong.
             let guess = logit >= 0;

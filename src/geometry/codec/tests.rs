@@ -37,7 +37,7 @@ fn a_thrown_switch_stops_before_the_first_slice_and_between_slices() {
     assert!(encoded.len() > 2, "several slices");
     let map = octree.kernel_map(5);
     let cancel = Cancel::default();
-    let decode = || decode_masks(Isa::detect(), 6, &map, &borrowed(encoded), 100, &cancel);
+    let decode = || decode_masks(Isa::detect(), 6, &map, &borrowed(encoded), 100, None, &cancel);
     assert_eq!(decode().unwrap(), octree.occupancy(5));
     cancel.cancel();
     assert!(matches!(decode(), Err(Error::Cancelled)));

@@ -1,0 +1,111 @@
+//! `b2p info` and `b2p check` of a sequence.
+
+use std::path::Path;
+
+use b2p::{Decoder, Limits, SequenceDecoder, SequenceReader};
+use serde_json::json;
+
+use super::super::manners::{self, Said};
+use super::super::table::{count, counted, table};
+use super::super::{Failure, Result};
+
+/// Says what a sequence holds.
+pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
+    let sequence = super::read(path, limits)?;
+    let (mut rows, mut groups) = (Vec::new(), Vec::new());
+    rows.push(
+        ["group", "frames", "start", "bytes", "whole", "bits per point"]
+            .map(String::from)
+            .to_vec(),
+    );
+    for group in 0..sequence.groups() {
+        let frames = sequence.frames_of(group).unwrap_or(0..0);
+        let Ok(found) = sequence.group(group) else {
+            rows.push(vec![
+                group.to_string(),
+                format!("{}..{}", frames.start, frames.end),
+                "damaged".into(),
+            ]);
+            groups.push(json!({ "frames": [frames.start, frames.end], "damaged": true }));
+            continue;
+        };
+        let bytes: u64 = (0..found.len()).map(|at| found.frame_bytes(at)).sum();
+        let points: u64 = (0..found.len()).map(|at| found.frame_header(at).points).sum();
+        let whole = (0..found.len()).filter(|at| found.is_whole(*at)).count();
+        let start = sequence.time_of(frames.start)?;
+        rows.push(vec![
+            group.to_string(),
+            format!("{}..{}", frames.start, frames.end),
+            format!("{start:.3} s"),
+            count(bytes),
+            whole.to_string(),
+            format!("{:.4}", bytes as f64 * 8.0 / points.max(1) as f64),
+        ]);
+        groups.push(json!({
+            "frames": [frames.start, frames.end],
+            "start": start,
+            "bytes": bytes,
+            "points": points,
+            "whole": whole,
+        }));
+    }
+    let header = sequence.header();
+    let (frames, rate, seconds) = (sequence.frames(), sequence.frame_rate(), sequence.seconds());
+    if manners::json() {
+        let value = json!({
+            "frames": frames,
+            "frame_rate": rate,
+            "seconds": seconds,
+            "bits": header.bits,
+            "levels": [header.base, header.top],
+            "most_points": header.points,
+            "groups": groups,
+        });
+        return Ok(Said::result(format!("{value:#}\n")));
+    }
+    let text = format!(
+        "sequence of {} at {rate:.3} Hz, {seconds:.3} s\n{} deep, levels {} to {}, at most {} a frame\n{}",
+        counted(frames, "frame"),
+        counted(header.bits.into(), "bit"),
+        header.base,
+        header.top,
+        counted(header.points, "point"),
+        table(&rows)
+    );
+    Ok(Said::result(text))
+}
+
+/// Decodes every frame, and says which cannot be.
+pub fn check(path: &Path, limits: &Limits) -> Result<String> {
+    let sequence = super::read(path, limits)?;
+    let mut decoder = SequenceDecoder::new(Decoder::new().with_limits(limits.clone()));
+    let mut faults = Vec::new();
+    for frame in decoder.frames(&sequence, 0..sequence.frames()) {
+        if let Err(error) = frame {
+            faults.push(error);
+        }
+    }
+    faults.extend(sequence.check_end().err());
+    let name = path.display();
+    match faults.first() {
+        None => Ok(format!("{name}: valid, {}\n", counted(sequence.frames(), "frame"))),
+        Some(first) => {
+            let clause = first
+                .clause()
+                .map(|clause| format!(" (clause {clause})"))
+                .unwrap_or_default();
+            let count = counted(faults.len() as u64, "fault");
+            Err(Failure(format!("{name}: {count}, the first: {first}{clause}")))
+        }
+    }
+}
+
+/// Points of all frames of groups that can be read.
+pub fn points(sequence: &SequenceReader) -> Result<u64> {
+    let mut points = 0;
+    for group in 0..sequence.groups() {
+        let group = sequence.group(group)?;
+        points += (0..group.len()).map(|at| group.frame_header(at).points).sum::<u64>();
+    }
+    Ok(points)
+}

@@ -1,0 +1,123 @@
+//! Sequences of frames: coding folders of clouds, decoding, cutting and joining.
+
+mod decode;
+mod edit;
+mod encode;
+mod info;
+mod render;
+
+use std::path::{Path, PathBuf};
+
+use b2p::{Limits, SequenceReader};
+
+pub use decode::run as decode;
+pub use edit::{cut, join};
+pub use encode::run as encode;
+pub use info::{check, run as info};
+pub use render::run as render;
+
+use super::{Failure, Result};
+
+/// Whether the file starts like a sequence.
+pub fn is_sequence(path: &Path) -> bool {
+    let start = || -> std::io::Result<[u8; 16]> {
+        let mut start = [0; 16];
+        std::io::Read::read_exact(&mut std::fs::File::open(path)?, &mut start)?;
+        Ok(start)
+    };
+    !super::manners::is_pipe(path) && start().is_ok_and(|start| SequenceReader::is_sequence(&start))
+}
+
+/// Whether a path names many clouds: a folder, or a name with a number such as `frame_%04d.ply`.
+pub fn names_many(path: &Path) -> bool {
+    path.is_dir() || Pattern::of(path).is_some()
+}
+
+/// A file name with a place for a number, as `printf` has it.
+pub struct Pattern {
+    before: String,
+    width: usize,
+    after: String,
+}
+
+impl Pattern {
+    /// The pattern that a path is, if it has `%d` or `%04d`.
+    pub fn of(path: &Path) -> Option<Self> {
+        let text = path.to_str()?;
+        let (before, rest) = text.split_once('%')?;
+        let (width, after) = rest.split_once('d')?;
+        let width = match width {
+            "" => 0,
+            _ => width
+                .strip_prefix('0')
+                .unwrap_or(width)
+                .parse()
+                .ok()
+                .filter(|w| *w < 20)?,
+        };
+        Some(Pattern {
+            before: before.into(),
+            width,
+            after: after.into(),
+        })
+    }
+
+    /// The path with a number.
+    pub fn path(&self, number: u64) -> PathBuf {
+        let width = self.width;
+        PathBuf::from(format!("{}{number:0width$}{}", self.before, self.after))
+    }
+}
+
+/// The files that a path names, in order: those of a folder by name, those of a pattern from number 0 or 1 on.
+fn clouds(path: &Path) -> Result<Vec<PathBuf>> {
+    let wrong = |what: &str| Failure(format!("{}: {what}", path.display()));
+    if let Some(pattern) = Pattern::of(path) {
+        let first = (0..2).find(|number| pattern.path(*number).is_file());
+        let first = first.ok_or_else(|| wrong("there is no such file with the number 0 or 1"))?;
+        return Ok((first..)
+            .map(|number| pattern.path(number))
+            .take_while(|path| path.is_file())
+            .collect());
+    }
+    /// Endings of point clouds.
+    const ENDINGS: [&str; 11] = [
+        "ply", "las", "laz", "pcd", "e57", "xyz", "csv", "obj", "gltf", "glb", "txt",
+    ];
+    let failed = |error: std::io::Error| wrong(&error.to_string());
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(path).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        if path.is_file() && ENDINGS.contains(&ending.as_str()) {
+            found.push(path);
+        }
+    }
+    found.sort();
+    match found.is_empty() {
+        true => Err(wrong("the folder has no point clouds")),
+        false => Ok(found),
+    }
+}
+
+/// Reads a sequence.
+fn read(path: &Path, limits: &Limits) -> Result<SequenceReader<'static>> {
+    let bytes = super::load::bytes(path, limits)?;
+    SequenceReader::new(bytes, limits).map_err(Failure::in_file(path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pattern_has_a_place_for_a_number() {
+        let pattern = Pattern::of(Path::new("a/frame_%04d.ply")).expect("a pattern");
+        assert_eq!(pattern.path(7), Path::new("a/frame_0007.ply"));
+        let pattern = Pattern::of(Path::new("%d.ply")).expect("a pattern");
+        assert_eq!(pattern.path(123), Path::new("123.ply"));
+        for none in ["frame.ply", "100%.ply", "%s.ply", "%99d.ply"] {
+            assert!(Pattern::of(Path::new(none)).is_none(), "{none}");
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! `b2p render` of a sequence: a video, or a picture of each frame.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use b2p::gaussians::Gaussians;
+use b2p::renderer::camera::{Camera, Extent};
+use b2p::renderer::{Effects, Renderer};
+use b2p::{Error, Limits, SequenceDecoder, SequenceReader};
+use serde_json::json;
+
+use super::super::args::{Format, Render};
+use super::super::manners::{self, Said};
+use super::super::picture::{Artist, format_of};
+use super::super::progress::Progress;
+use super::super::table::counted;
+use super::super::views::shots;
+use super::super::{Failure, Result, load};
+use super::Pattern;
+
+/// Draws every frame with one camera: into a `.y4m` file, or into pictures of a pattern. While a frame is drawn, the next
+/// one is decoded.
+pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> {
+    let sequence = super::read(&args.input, limits)?;
+    let one = args
+        .sequence
+        .frame(&sequence)
+        .transpose()
+        .map_err(Failure::in_file(&args.input))?;
+    let frames = one.map_or(0..sequence.frames(), |frame| frame..frame + 1);
+    let pattern = Pattern::of(&args.output);
+    let format = match (&pattern, one) {
+        (None, None) => Format::Y4m,
+        _ => format_of(args, 1)?,
+    };
+    if args.contact_sheet || args.turntable.is_some() || args.view.views.is_some_and(|views| views > 1) {
+        let what = "a sequence is drawn with one camera; --frame draws other views of a frame";
+        return Err(Failure(what.into()));
+    }
+    if pattern.is_none() && one.is_none() && args.output.extension().is_none_or(|ending| ending != "y4m") {
+        let what = "a sequence is drawn into a .y4m file or, with %04d in the name, into a picture of each frame";
+        return Err(Failure(format!("{}: {what}", args.output.display())));
+    }
+    let paths: Vec<PathBuf> = match &pattern {
+        Some(pattern) => frames.clone().map(|frame| pattern.path(frame)).collect(),
+        None => vec![args.output.to_path_buf()],
+    };
+    let outputs: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
+    manners::permit(&outputs, &[&args.input])?;
+    let mut film = Film {
+        args,
+        limits,
+        format,
+        camera: None,
+        renderer: None,
+        decoder: SequenceDecoder::new(load::decoder(&[], &args.detail, &args.model, limits)?),
+    };
+    let started = Instant::now();
+    let count = frames.end - frames.start;
+    match pattern.is_some() || one.is_some() {
+        true => film.stills(&sequence, frames, &paths, progress)?,
+        false => film.video(&sequence, frames, &paths[0], progress)?,
+    }
+    let took = started.elapsed().as_secs_f64();
+    let rate = count as f64 / took;
+    let to = args.output.display();
+    let report = format!("{to}: {}, {rate:.1} a second\n", counted(count, "frame"));
+    let json = || json!({ "output": to.to_string(), "frames": count, "seconds": took, "frames_per_second": rate });
+    Ok(Said::report(report, json).beside(&args.output))
+}
+
+/// Draws frames one after the other.
+struct Film<'a> {
+    args: &'a Render,
+    limits: &'a Limits,
+    format: Format,
+    /// That of the first frame, and of all that follow.
+    camera: Option<Camera>,
+    renderer: Option<Renderer>,
+    decoder: SequenceDecoder,
+}
+
+impl Film<'_> {
+    /// Writes each frame to a file of its own.
+    fn stills(
+        &mut self,
+        sequence: &SequenceReader,
+        frames: std::ops::Range<u64>,
+        paths: &[PathBuf],
+        progress: &Progress,
+    ) -> Result<()> {
+        let mut decoder = self.decoder.clone();
+        for (gaussians, path) in decoder.gaussians(sequence, frames).zip(paths) {
+            progress.say(&format!("draw {}", path.display()));
+            let gaussians = gaussians.map_err(Failure::in_file(&self.args.input))?;
+            self.draw(&gaussians, |artist| manners::write(path, |w| artist.write(w, path)))?;
+        }
+        Ok(())
+    }
+
+    /// Writes all frames into one video.
+    fn video(
+        &mut self,
+        sequence: &SequenceReader,
+        frames: std::ops::Range<u64>,
+        path: &Path,
+        progress: &Progress,
+    ) -> Result<()> {
+        let mut decoder = self.decoder.clone();
+        let index = sequence.index();
+        let rate = format!(" F{}:{} ", index.timescale, index.duration);
+        manners::write(path, |w| {
+            for (i, gaussians) in decoder.gaussians(sequence, frames).enumerate() {
+                progress.say(&format!("draw frame {i}"));
+                let drawn = self.draw(&gaussians?, |artist| {
+                    if i == 0 {
+                        let header = String::from_utf8_lossy(&artist.image.y4m_header()).replace(" F30:1 ", &rate);
+                        w.write_all(header.as_bytes())
+                            .map_err(|source| Failure::writing(path, source))?;
+                    }
+                    Ok(artist.write(w, path)?)
+                });
+                drawn.map_err(|failure| Error::Usage(failure.0))?;
+            }
+            Ok(())
+        })
+    }
+
+    /// Draws a frame, and writes it with `write`.
+    fn draw(&mut self, gaussians: &Gaussians, write: impl FnOnce(&Artist) -> Result<()>) -> Result<()> {
+        let camera = match &self.camera {
+            Some(camera) => camera.clone(),
+            None => {
+                let extent = Extent::of_gaussians(gaussians);
+                let shots = shots(self.args, &gaussians.frame, &extent, self.limits)?;
+                let first = shots
+                    .into_iter()
+                    .next()
+                    .ok_or_else(|| Failure("there is no camera".into()))?;
+                self.camera.insert(first.camera).clone()
+            }
+        };
+        let renderer = match self.renderer.take() {
+            Some(renderer) => renderer,
+            None => self.new_renderer()?,
+        };
+        let mut artist = Artist::new(renderer, gaussians, self.limits, self.args, self.format);
+        artist.draw(&camera)?;
+        write(&artist)?;
+        self.renderer = Some(artist.renderer);
+        Ok(())
+    }
+
+    fn new_renderer(&self) -> Result<Renderer> {
+        let mut effects = Effects::default();
+        for (effect, choice) in &self.args.effect {
+            effects.set(*effect, *choice);
+        }
+        let mut renderer = Renderer::new().with_isa(load::isa(self.args.model.isa.as_deref())?);
+        renderer.set_effects(effects);
+        renderer.set_quality(self.args.quality);
+        Ok(renderer)
+    }
+}

@@ -1,0 +1,312 @@
+//! Frames of a sequence that are predicted from the frame before (`docs/format.md`, clauses 17.5 to 17.7).
+
+use std::sync::Arc;
+
+use b2p_kernels::Isa;
+use rayon::prelude::*;
+
+use super::motion::{Block, Search, Tolerance};
+use super::{EncoderInput, Guides, Options, choose_levels, octree_of};
+use crate::cloud::ColouredVoxels;
+use crate::colour::{Steps, Truth, Ycc};
+use crate::error::Result;
+use crate::geometry::{Octree, Voxels, morton};
+use crate::log::Log;
+use crate::motion::{Blocks, Head, Inter, Mode, Modes, Previous, own};
+
+/// A coded frame that is predicted from the frame before.
+#[derive(Debug)]
+pub struct PredictedFrame {
+    /// Its sections behind a header of its own.
+    pub stream: Vec<u8>,
+    /// The motion of each level, from the base level on.
+    pub motion: Vec<Vec<u8>>,
+}
+
+/// The level whose nodes are the blocks, if the base level is not above it.
+const BLOCK_LEVEL: u8 = 5;
+/// Colours of a block are predicted from the previous frame if what is left is at most this share of the differences.
+const INTER_COLOURS: f32 = 0.9;
+
+/// Codes a cloud as a frame that is predicted from `previous`, the frame before as it was decoded, down to the last
+/// level of `options`.
+///
+/// # Errors
+/// Those of [`encode`](super::encode).
+pub fn encode_predicted(
+    cloud: &ColouredVoxels,
+    previous: &Arc<Previous>,
+    options: &Options,
+    log: &Log,
+) -> Result<PredictedFrame> {
+    let steps = options.fineness.steps()?;
+    let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
+    let (base, top) = (*levels.start(), *levels.end());
+    let octree = octree_of(cloud, top, log)?;
+    let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, steps.is_lossless());
+    // Bricks of 4³ voxels lie within blocks.
+    let block_level = base.min(BLOCK_LEVEL).min(top.saturating_sub(2));
+    let target = Target::new(&octree, &truth, previous, [block_level, top], steps)?;
+    let head = Head {
+        block_level,
+        unit_level: top,
+        root: target.root,
+        vector: [0; 3],
+    };
+    let plan = target.modes(previous, head, base)?;
+    let inter = Inter::of(Arc::clone(previous), plan.head, plan.blocks.clone(), base);
+    let guides = Guides {
+        geometry: (1..=top)
+            .map(|n| inter.geometry(&target.octree, n))
+            .collect::<Result<_>>()?,
+        colours: (1..=top)
+            .map(|n| inter.colours(&target.octree, n))
+            .collect::<Result<_>>()?,
+    };
+    let points = (cloud.voxels.len() as u64).max(target.octree.level(top).len() as u64);
+    let subject = EncoderInput {
+        cloud,
+        options,
+        isa: options.isa.unwrap_or_else(Isa::detect),
+        levels,
+        octree: Octree::root(),
+        maps: Vec::new(),
+        geometry: Vec::new(),
+        grey: cloud.colours.par_iter().all(|[r, g, b]| r == g && g == b),
+        points,
+        guides: Some(guides),
+    };
+    let subject = subject.with_octree(target.octree, top, log)?;
+    let stream = subject.code_towards(&target.truth, top, steps, log)?.bytes;
+    let motion = plan.head.write(base, &plan.blocks)?;
+    Ok(PredictedFrame { stream, motion })
+}
+
+/// What a frame is to decode to: its own voxels, and the moved previous ones where these differ by noise alone.
+struct Target {
+    octree: Octree,
+    truth: Truth,
+    /// The blocks with voxels, in order.
+    blocks: Vec<Block>,
+    root: Modes,
+    top: u8,
+    block_level: u8,
+    lossless: bool,
+}
+
+/// The motion of a frame.
+struct Plan {
+    head: Head,
+    blocks: Blocks,
+}
+
+impl Target {
+    fn new(
+        octree: &Octree,
+        truth: &Truth,
+        previous: &Arc<Previous>,
+        [block_level, top]: [u8; 2],
+        steps: Steps,
+    ) -> Result<Self> {
+        let levels = (0..=top).map(|level| (truth.level(level).to_vec(), None));
+        let current = Previous::new(octree, levels.collect());
+        let search = Search {
+            octree,
+            truth,
+            previous,
+            current: &current,
+            top,
+            block_level,
+        };
+        let step = steps.luma_step() * 64.0;
+        let tolerance = Tolerance {
+            near: 0.4,
+            far: 0.01,
+            luma: 0.6 * step,
+            mean: 0.25 * step,
+        };
+        let mut blocks = search.blocks((!steps.is_lossless()).then_some(tolerance));
+        let parts = |blocks: &[Block]| -> Vec<Vec<(u64, Ycc)>> {
+            blocks.par_iter().map(|block| voxels_of(&search, block)).collect()
+        };
+        let mut all = parts(&blocks);
+        if all.iter().all(Vec::is_empty) {
+            // A frame has at least one voxel.
+            blocks.iter_mut().for_each(|block| block.keep = false);
+            all = parts(&blocks);
+        }
+        let parts = all;
+        let kept = blocks.into_iter().zip(&parts).filter(|(_, part)| !part.is_empty());
+        let blocks: Vec<Block> = kept.map(|(block, _)| block).collect();
+        let mut all: Vec<(u64, Ycc)> = parts.concat();
+        all.sort_unstable_by_key(|voxel| voxel.0);
+        let keys = all.iter().map(|voxel| voxel.0).collect();
+        let octree = Octree::new(Voxels::from_sorted(top, keys))?;
+        let values = all.into_iter().map(|voxel| voxel.1).collect();
+        let truth = Truth::of_values(&octree, top, values, steps.is_lossless());
+        Ok(Target {
+            octree,
+            truth,
+            blocks,
+            root: Modes {
+                geometry: Mode::Inter,
+                colours: Mode::Inter,
+            },
+            top,
+            block_level,
+            lossless: steps.is_lossless(),
+        })
+    }
+
+    /// Chooses the modes of all levels.
+    fn modes(&self, previous: &Arc<Previous>, head: Head, base: u8) -> Result<Plan> {
+        let inter = Modes {
+            geometry: Mode::Inter,
+            colours: Mode::Inter,
+        };
+        let levels = usize::from(self.top - self.block_level);
+        let mut plan = Plan {
+            head,
+            blocks: Blocks {
+                vectors: self.blocks.iter().map(|block| block.vector).collect(),
+                modes: vec![vec![inter; self.blocks.len()]; levels],
+            },
+        };
+        let tried = Inter::of(Arc::clone(previous), head, plan.blocks.clone(), base);
+        let mut root = [Votes::default(), Votes::default()];
+        for level in 1..=self.top {
+            let votes = self.votes(&tried, level)?;
+            match level.checked_sub(self.block_level + 1) {
+                None => root[1].add(votes[0]),
+                Some(i) => {
+                    for ((modes, votes), block) in plan.blocks.modes[usize::from(i)]
+                        .iter_mut()
+                        .zip(votes)
+                        .zip(&self.blocks)
+                    {
+                        *modes = votes.modes(block.keep, self.lossless);
+                    }
+                }
+            }
+        }
+        let all = self.blocks.iter().all(|block| block.keep);
+        plan.head.root = root[1].modes(all, self.lossless);
+        Ok(plan)
+    }
+
+    /// How well each block of `level` is predicted; for levels of no blocks, the whole level.
+    fn votes(&self, inter: &Inter, level: u8) -> Result<Vec<Votes>> {
+        let (geometry, colours) = (
+            inter.geometry(&self.octree, level)?,
+            inter.colours(&self.octree, level)?,
+        );
+        let nodes = self.octree.level(level - 1).keys();
+        let (masks, first) = (self.octree.occupancy(level - 1), self.octree.first_child(level - 1));
+        let blocks = level > self.block_level;
+        let down = 3 * (level - 1).saturating_sub(self.block_level);
+        let mut votes = vec![Votes::default(); if blocks { self.blocks.len() } else { 1 }];
+        let mut block = 0;
+        for (node, key) in nodes.iter().enumerate() {
+            while blocks && self.blocks[block].key < key >> down {
+                block += 1;
+            }
+            let vote = &mut votes[block];
+            let (mask, moved) = (masks[node], own(geometry.windows()[node]));
+            vote.geometry(mask, moved);
+            let first = first[node] as usize;
+            let children = first..first + mask.count_ones() as usize;
+            let above = self.truth.level(level - 1)[node];
+            vote.colours(
+                &self.truth.level(level)[children.clone()],
+                &colours.moved()[children],
+                above,
+            );
+        }
+        Ok(votes)
+    }
+}
+
+/// How well the previous frame predicts a block at a level.
+#[derive(Debug, Clone, Copy, Default)]
+struct Votes {
+    /// Parents whose children are there, but not those of the window.
+    other: u64,
+    /// Children that are there in both frames, and in one of them.
+    hits: u64,
+    misses: u64,
+    /// Children without, or with other colours.
+    coloured: u64,
+    /// Differences of luma to the parent, and those left by the prediction.
+    intra: f32,
+    inter: f32,
+}
+
+impl Votes {
+    fn geometry(&mut self, mask: u8, moved: u8) {
+        self.other += u64::from(moved != 0 && moved != mask);
+        self.hits += u64::from((mask & moved).count_ones());
+        self.misses += u64::from((mask ^ moved).count_ones());
+    }
+
+    fn colours(&mut self, truth: &[Ycc], moved: &[Option<Ycc>], above: Ycc) {
+        let there = || {
+            truth
+                .iter()
+                .zip(moved)
+                .filter_map(|(truth, moved)| Some((truth, (*moved)?)))
+        };
+        let mut shift = 0;
+        let mut count = 0;
+        for (truth, moved) in there() {
+            shift += i32::from(truth[0]) - i32::from(moved[0]);
+            count += 1;
+            self.coloured += u64::from(*truth != moved);
+        }
+        self.coloured += (truth.len() - count) as u64;
+        let shift = shift as f32 / count.max(1) as f32;
+        for (truth, moved) in there() {
+            self.intra += (f32::from(truth[0]) - f32::from(above[0])).abs();
+            self.inter += (f32::from(truth[0]) - f32::from(moved[0]) - shift).abs();
+        }
+    }
+
+    fn add(&mut self, other: Votes) {
+        self.other += other.other;
+        self.hits += other.hits;
+        self.misses += other.misses;
+        self.coloured += other.coloured;
+        self.intra += other.intra;
+        self.inter += other.inter;
+    }
+
+    /// The modes for a block, which is to stay what it was if `keep`.
+    fn modes(&self, keep: bool, lossless: bool) -> Modes {
+        let geometry = match (self.other, self.hits > 0) {
+            (0, true) => Mode::Skip,
+            _ if 2 * self.hits >= self.misses => Mode::Inter,
+            _ => Mode::Intra,
+        };
+        let colours = match self.hits {
+            0 => Mode::Intra,
+            _ if self.coloured == 0 || (keep && !lossless) => Mode::Skip,
+            _ if self.inter <= INTER_COLOURS * self.intra => Mode::Inter,
+            _ => Mode::Intra,
+        };
+        Modes { geometry, colours }
+    }
+}
+
+/// Keys and colours of the voxels that a block is to have.
+fn voxels_of(search: &Search, block: &Block) -> Vec<(u64, Ycc)> {
+    if !block.keep {
+        let (keys, values) = (search.octree.level(search.top).keys(), search.truth.level(search.top));
+        let own = search.voxels(search.top, block.key);
+        return own.map(|i| (keys[i], values[i])).collect();
+    }
+    let Some(previous) = search.previous.level(search.top) else {
+        return Vec::new();
+    };
+    let key = |at: [i32; 3]| morton::encode(at.map(|x| x as u32));
+    let moved = search.moved(block).into_iter();
+    moved.map(|(at, index)| (key(at), previous.values[index])).collect()
+}

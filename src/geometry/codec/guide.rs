@@ -1,0 +1,156 @@
+//! What a previous frame tells of a level's occupancies (`docs/format.md`, clause 17.6).
+//!
+//! Every parent has a *mode* and a *window*: the 4³ cells around its children that are occupied in the moved previous
+//! frame, numbered as in `contexts`. In the mode [`Mode::Skip`] a parent has the children that the window has, unless
+//! it has none. Else the window refines the probability of each child: a table by what the window has around the child
+//! and by the logit that was predicted without it. So a wrong window costs bits and nothing else.
+
+use super::coder::Coder;
+use crate::coding::probability::{LIMIT, squash};
+
+/// How a block of a level is predicted from the previous frame.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Mode {
+    /// It is not.
+    #[default]
+    Intra,
+    /// Probabilities, or predicted values, depend on it.
+    Inter,
+    /// It is the same as there.
+    Skip,
+}
+
+/// What a previous frame tells of the occupancies of a level.
+#[derive(Debug, Clone, Copy)]
+pub struct Guide<'a> {
+    /// The mode of every parent.
+    pub modes: &'a [Mode],
+    /// The window of every parent; of no meaning in [`Mode::Intra`].
+    pub windows: &'a [u64],
+}
+
+/// The cells of the children in octants 0 to 7.
+const OWN: [u32; 8] = [21, 22, 25, 26, 37, 38, 41, 42];
+/// The face neighbours of the child in octant 0.
+const FACES: u64 = 1 << 5 | 1 << 17 | 1 << 20 | 1 << 22 | 1 << 25 | 1 << 37;
+
+impl Guide<'_> {
+    /// The occupancy that the window of this parent has; 0 if the parent is not to be skipped.
+    #[inline(always)]
+    pub(super) fn skipped(&self, parent: usize) -> u8 {
+        match self.modes[parent] {
+            Mode::Skip => own(self.windows[parent]),
+            _ => 0,
+        }
+    }
+
+    /// The window of this parent, if it refines probabilities.
+    #[inline(always)]
+    pub(super) fn window(&self, parent: usize) -> Option<u64> {
+        (self.modes[parent] != Mode::Intra).then(|| self.windows[parent])
+    }
+}
+
+/// The occupancy of a parent in its window.
+#[inline(always)]
+pub fn own(window: u64) -> u8 {
+    let bit = |mask: u8, (octant, cell): (usize, &u32)| mask | ((window >> cell & 1) as u8) << octant;
+    OWN.iter().enumerate().fold(0, bit)
+}
+
+/// Logits between two entries of the table.
+const STEP: i32 = 45;
+/// Entries of a context: logits from −720 to 720.
+const ENTRIES: usize = (2 * LIMIT / STEP) as usize + 1;
+/// Contexts: the child in the window, its faces there, wrong siblings, and errors before.
+const CONTEXTS: usize = 2 * 7 * 3 * 3;
+/// Bits of a probability in the table.
+const BITS: u32 = 22;
+/// How often an entry is seen at first, and at most.
+const SEEN: [u32; 2] = [4, 250];
+/// Logits by which a child in the window, or none there, moves the initial probability.
+const INITIAL: i32 = 96;
+
+/// Refines probabilities by the windows of a slice.
+#[derive(Debug)]
+pub(super) struct Refiner {
+    /// Probabilities of a 1 in the upper bits, from bit 8 on; how often they were seen below.
+    table: Vec<u32>,
+    /// A running mean of wrong children, in units of 2⁻¹⁶.
+    wrong: u32,
+}
+
+/// A refined probability, and what [`Refiner::adapt`] needs.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Refined {
+    at: usize,
+    there: bool,
+    pub one: u32,
+}
+
+impl Refiner {
+    pub fn new() -> Self {
+        let mut table = Vec::with_capacity(CONTEXTS * ENTRIES);
+        for context in 0..CONTEXTS {
+            let shift = if context % 2 == 1 { INITIAL } else { -INITIAL };
+            for entry in 0..ENTRIES as i32 {
+                let one = squash(entry * STEP - LIMIT + shift) << (BITS - 16);
+                table.push(one << 8 | SEEN[0]);
+            }
+        }
+        Refiner { table, wrong: 1 << 13 }
+    }
+
+    /// The probability of the child in `octant`, whose lower siblings are `coded`, where `logit` was predicted without
+    /// the window.
+    #[inline(always)]
+    fn predict(&self, window: u64, octant: usize, coded: u8, logit: i32) -> Refined {
+        let shift = OWN[octant] - OWN[0];
+        let around = window >> shift;
+        let there = around >> OWN[0] & 1;
+        let faces = (around & FACES).count_ones() as usize;
+        let lower = (1u8 << octant).wrapping_sub(1);
+        let siblings = (((coded ^ own(window)) & lower).count_ones() as usize).min(2);
+        let errors = usize::from(self.wrong > 1 << 11) + usize::from(self.wrong > 1 << 13);
+        let context = there as usize + 2 * (faces + 7 * (siblings + 3 * errors));
+        let place = (logit + LIMIT).clamp(0, 2 * LIMIT - 1);
+        let (low, part) = (place / STEP, (place % STEP) as u32);
+        let at = context * ENTRIES + low as usize;
+        let [a, b] = [self.table[at] >> 8, self.table[at + 1] >> 8];
+        let mean = (a * (STEP as u32 - part) + b * part) / STEP as u32;
+        Refined {
+            at,
+            there: there == 1,
+            one: (mean >> (BITS - 16)).clamp(16, 65_520),
+        }
+    }
+
+    /// Codes a child with the refined probability, and adapts.
+    #[inline(always)]
+    pub fn code(
+        &mut self,
+        coder: &mut impl Coder,
+        window: u64,
+        octant: usize,
+        coded: u8,
+        logit: i32,
+        target: bool,
+    ) -> bool {
+        let refined = self.predict(window, octant, coded, logit);
+        let bit = coder.code(target, refined.one);
+        self.adapt(&refined, bit);
+        bit
+    }
+
+    #[inline(always)]
+    fn adapt(&mut self, refined: &Refined, bit: bool) {
+        let target = if bit { (1i64 << BITS) - 1 } else { 0 };
+        for entry in &mut self.table[refined.at..refined.at + 2] {
+            let (one, seen) = (i64::from(*entry >> 8), *entry & 255);
+            let one = one + (target - one) * 2 / (2 * i64::from(seen) + 3);
+            *entry = (one as u32) << 8 | (seen + 1).min(SEEN[1]);
+        }
+        let wrong = if bit == refined.there { 0 } else { 1 << 16 };
+        self.wrong = self.wrong - (self.wrong >> 5) + (wrong >> 5);
+    }
+}

@@ -1,0 +1,178 @@
+//! Voxels of a level in bricks of 4³, found by position.
+
+use crate::geometry::{Voxels, morton};
+
+/// Bits of all cells whose x, and y, is below n.
+const X_BELOW: [u64; 5] = [
+    0,
+    0x1111_1111_1111_1111,
+    0x3333_3333_3333_3333,
+    0x7777_7777_7777_7777,
+    u64::MAX,
+];
+const Y_BELOW: [u64; 5] = [
+    0,
+    0x000f_000f_000f_000f,
+    0x00ff_00ff_00ff_00ff,
+    0x0fff_0fff_0fff_0fff,
+    u64::MAX,
+];
+
+/// A brick: its voxels as a mask by Morton key, as a mask by `x + 4y + 16z`, and the number of its first voxel.
+#[derive(Debug, Clone, Copy)]
+struct Brick {
+    key: u64,
+    mask: u64,
+    cells: u64,
+    first: u32,
+}
+
+/// The voxels of a level by position.
+#[derive(Debug, Clone)]
+pub(super) struct Bricks {
+    bricks: Vec<Brick>,
+    /// Open addressing: a brick's number and 1, or 0. A power of two, at least twice as many as bricks.
+    table: Vec<u32>,
+    /// Bricks along an axis.
+    side: i32,
+}
+
+impl Bricks {
+    pub fn new(voxels: &Voxels) -> Self {
+        let mut bricks: Vec<Brick> = Vec::new();
+        for (i, key) in voxels.keys().iter().enumerate() {
+            if bricks.last().is_none_or(|brick| brick.key != key >> 6) {
+                bricks.push(Brick {
+                    key: key >> 6,
+                    mask: 0,
+                    cells: 0,
+                    first: i as u32,
+                });
+            }
+            if let Some(brick) = bricks.last_mut() {
+                let [x, y, z] = morton::decode(key & 63);
+                brick.mask |= 1 << (key & 63);
+                brick.cells |= 1 << (x + 4 * y + 16 * z);
+            }
+        }
+        let mut table = vec![0; (2 * bricks.len()).next_power_of_two().max(2)];
+        for (i, brick) in bricks.iter().enumerate() {
+            let mut at = place(brick.key, table.len());
+            while table[at] != 0 {
+                at = (at + 1) % table.len();
+            }
+            table[at] = i as u32 + 1;
+        }
+        Bricks {
+            bricks,
+            table,
+            side: 1 << voxels.depth().saturating_sub(2),
+        }
+    }
+
+    /// Bytes of memory per voxel at most: a brick for each.
+    pub const fn bytes_per_voxel() -> usize {
+        size_of::<Brick>() + 4 * size_of::<u32>()
+    }
+
+    /// Keys of the bricks without their `down` lowest bits, each once.
+    pub fn nodes(&self, down: u32) -> Vec<u64> {
+        let mut keys: Vec<u64> = self.bricks.iter().map(|brick| brick.key >> down).collect();
+        keys.dedup();
+        keys
+    }
+
+    /// The brick at this place among bricks.
+    #[inline]
+    fn brick(&self, at: [i32; 3]) -> Option<&Brick> {
+        if at.iter().any(|x| !(0..self.side).contains(x)) {
+            return None;
+        }
+        let key = morton::encode(at.map(|x| x as u32));
+        let mut slot = place(key, self.table.len());
+        loop {
+            let brick = self.bricks.get((self.table[slot] as usize).checked_sub(1)?)?;
+            if brick.key == key {
+                return Some(brick);
+            }
+            slot = (slot + 1) % self.table.len();
+        }
+    }
+
+    /// The number of the voxel at this place, if there is one.
+    #[inline]
+    pub fn index(&self, at: [i32; 3]) -> Option<usize> {
+        let brick = self.brick(at.map(|x| x >> 2))?;
+        let cell = morton::encode(at.map(|x| (x & 3) as u32));
+        let before = brick.mask & ((1 << cell) - 1);
+        (brick.mask >> cell & 1 == 1).then(|| brick.first as usize + before.count_ones() as usize)
+    }
+
+    /// The 4³ cells from this place on, as a mask by `x + 4y + 16z`.
+    #[inline]
+    pub fn window(&self, at: [i32; 3]) -> u64 {
+        let (first, [ox, oy, oz]) = (at.map(|x| x >> 2), at.map(|x| (x & 3) as usize));
+        let mut window = 0;
+        for i in 0..8 {
+            let [dx, dy, dz] = [i & 1, i >> 1 & 1, i >> 2];
+            if (dx == 1 && ox == 0) || (dy == 1 && oy == 0) || (dz == 1 && oz == 0) {
+                continue;
+            }
+            let place = [first[0] + dx, first[1] + dy, first[2] + dz];
+            let Some(brick) = self.brick(place) else {
+                continue;
+            };
+            let cells = brick.cells;
+            let cells = match dx {
+                0 => (cells & !X_BELOW[ox]) >> ox,
+                _ => (cells & X_BELOW[ox]) << (4 - ox),
+            };
+            let cells = match dy {
+                0 => (cells & !Y_BELOW[oy]) >> (4 * oy),
+                _ => (cells & Y_BELOW[oy]) << (4 * (4 - oy)),
+            };
+            window |= match dz {
+                0 => cells >> (16 * oz),
+                _ => cells << (16 * (4 - oz)),
+            };
+        }
+        window
+    }
+}
+
+/// Where a key is looked for first in a table of this size.
+#[inline]
+fn place(key: u64, size: usize) -> usize {
+    (key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32) as usize & (size - 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn windows_and_indices_are_those_of_a_search(
+            depth in 0u8..6,
+            keys in prop::collection::vec(0u64..1 << 15, 1..400),
+            at in prop::array::uniform3(-40i32..40),
+        ) {
+            let keys = keys.into_iter().map(|key| key & ((1 << (3 * depth)) - 1)).collect();
+            let voxels = Voxels::new(depth, keys);
+            let bricks = Bricks::new(&voxels);
+            let find = |at: [i32; 3]| {
+                let inside = at.iter().all(|x| (0..1 << depth).contains(x));
+                let key = morton::encode(at.map(|x| if inside { x as u32 } else { 0 }));
+                voxels.keys().binary_search(&key).ok().filter(|_| inside)
+            };
+            let mut window = 0u64;
+            for cell in 0..64i32 {
+                let here = [at[0] + cell % 4, at[1] + cell / 4 % 4, at[2] + cell / 16];
+                prop_assert_eq!(bricks.index(here), find(here));
+                window |= u64::from(find(here).is_some()) << cell;
+            }
+            prop_assert_eq!(bricks.window(at), window);
+        }
+    }
+}

@@ -1,0 +1,239 @@
+//! What a previous frame tells of each level (`docs/format.md`, clauses 17.6 and 17.7).
+
+use std::sync::{Arc, OnceLock};
+
+use rayon::prelude::*;
+
+use super::payload::{Blocks, Head, Modes};
+use super::previous::{Previous, PreviousLevel};
+use crate::colour::{self, Ycc};
+use crate::error::{Error, Result};
+use crate::geometry::codec::guide::{Guide, Mode};
+use crate::geometry::{Octree, ones};
+
+/// A frame that is predicted: the previous frame and the motion.
+#[derive(Debug, Clone)]
+pub struct Inter {
+    previous: Arc<Previous>,
+    head: Head,
+    /// L, the first level with sections of its own.
+    base: u8,
+    /// The motion's bytes behind the head, then of each level after L, until the blocks are read.
+    parts: Vec<Vec<u8>>,
+    blocks: OnceLock<Blocks>,
+}
+
+/// What a previous frame tells of the occupancies of a level.
+#[derive(Debug, Clone, Default)]
+pub struct GeometryGuide {
+    modes: Vec<Mode>,
+    windows: Vec<u64>,
+}
+
+/// What a previous frame tells of the colours of a level.
+#[derive(Debug, Clone, Default)]
+pub struct ColourGuide {
+    modes: Vec<Mode>,
+    moved: Vec<Option<Ycc>>,
+}
+
+impl GeometryGuide {
+    /// As the coder of occupancies takes it.
+    pub fn guide(&self) -> Guide<'_> {
+        Guide {
+            modes: &self.modes,
+            windows: &self.windows,
+        }
+    }
+
+    /// The window of every parent; 0 in [`Mode::Intra`].
+    pub fn windows(&self) -> &[u64] {
+        &self.windows
+    }
+}
+
+impl ColourGuide {
+    /// As the coder of colours takes it.
+    pub fn guide(&self) -> colour::Guide<'_> {
+        colour::Guide {
+            modes: &self.modes,
+            moved: &self.moved,
+        }
+    }
+
+    /// Colours of every child in the moved previous frame; `None` also for children in [`Mode::Intra`].
+    pub fn moved(&self) -> &[Option<Ycc>] {
+        &self.moved
+    }
+}
+
+/// Nodes per task.
+const CHUNK: usize = 4096;
+
+impl Inter {
+    /// A frame of the levels `base` to `top`. `motion` is the motion of `base` and of the levels after it, as far as
+    /// they are to be decoded.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if the motion is damaged.
+    pub fn new(previous: Arc<Previous>, motion: &[&[u8]], base: u8, top: u8) -> Result<Self> {
+        let (head, first) = Head::parse(motion.first().copied().unwrap_or_default(), base, top)?;
+        let mut parts = vec![first.to_vec()];
+        parts.extend(motion.iter().skip(1).map(|part| part.to_vec()));
+        Ok(Inter {
+            previous,
+            head,
+            base,
+            parts,
+            blocks: OnceLock::new(),
+        })
+    }
+
+    /// The same of motion that has been chosen.
+    pub fn of(previous: Arc<Previous>, head: Head, blocks: Blocks, base: u8) -> Self {
+        Inter {
+            previous,
+            head,
+            base,
+            parts: Vec::new(),
+            blocks: OnceLock::from(blocks),
+        }
+    }
+
+    /// The previous frame.
+    pub fn previous(&self) -> &Previous {
+        &self.previous
+    }
+
+    /// What the previous frame tells of the occupancies of `level`. The octree has the level above.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if the motion is damaged; [`Error::Usage`] if the previous frame lacks the level.
+    pub fn geometry(&self, octree: &Octree, level: u8) -> Result<GeometryGuide> {
+        let (field, previous) = (self.field(octree, level)?, self.level(level)?);
+        let voxels = octree.level(level - 1);
+        let parents = (0..voxels.len()).into_par_iter().with_min_len(CHUNK);
+        let (modes, windows) = parents
+            .map(|parent| {
+                let (modes, shift) = field.at(voxels.keys()[parent]);
+                let window = match modes.geometry {
+                    Mode::Intra => 0,
+                    _ => {
+                        let at = voxels.coordinate(parent).map(|x| 2 * x as i32 - 1);
+                        previous.window(moved(at, shift))
+                    }
+                };
+                (modes.geometry, window)
+            })
+            .unzip();
+        Ok(GeometryGuide { modes, windows })
+    }
+
+    /// What the previous frame tells of the colours of `level`, which the octree has.
+    ///
+    /// # Errors
+    /// Those of [`Inter::geometry`].
+    pub fn colours(&self, octree: &Octree, level: u8) -> Result<ColourGuide> {
+        let (field, previous) = (self.field(octree, level)?, self.level(level)?);
+        let nodes = octree.level(level - 1);
+        let masks = octree.occupancy(level - 1);
+        let modes: Vec<Mode> = nodes.keys().iter().map(|key| field.at(*key).0.colours).collect();
+        let chunks: Vec<usize> = (0..nodes.len()).step_by(CHUNK).collect();
+        let moved_of = |first: usize| {
+            let mut found = Vec::new();
+            for node in first..nodes.len().min(first + CHUNK) {
+                let shift = field.at(nodes.keys()[node]).1;
+                let at = moved(nodes.coordinate(node).map(|x| 2 * x as i32), shift);
+                for octant in ones(masks[node].into()) {
+                    let octant = [octant & 1, octant >> 1 & 1, octant >> 2].map(|x| x as i32);
+                    let place = [at[0] + octant[0], at[1] + octant[1], at[2] + octant[2]];
+                    let index = match modes[node] {
+                        Mode::Intra => None,
+                        _ => previous.index(place),
+                    };
+                    found.push(index.map(|index| previous.values[index]));
+                }
+            }
+            found
+        };
+        let moved: Vec<Vec<_>> = chunks.into_par_iter().map(moved_of).collect();
+        Ok(ColourGuide {
+            modes,
+            moved: moved.concat(),
+        })
+    }
+
+    fn level(&self, level: u8) -> Result<&PreviousLevel> {
+        self.previous
+            .level(level)
+            .ok_or_else(|| Error::Usage(format!("level {level} of the previous frame was not decoded")))
+    }
+
+    /// The motion at `level`. The octree has the level above.
+    fn field<'a>(&'a self, octree: &'a Octree, level: u8) -> Result<Field<'a>> {
+        let head = &self.head;
+        let shift = |vector| shift(vector, head.unit_level, level);
+        if level <= head.block_level {
+            return Ok(Field {
+                keys: &[0],
+                down: u32::from(3 * (level - 1)),
+                blocks: vec![(head.root, shift(head.vector))],
+            });
+        }
+        let voxels = octree.level(head.block_level);
+        let blocks = match self.blocks.get() {
+            Some(blocks) => blocks,
+            None => {
+                let parts: Vec<&[u8]> = self.parts.iter().map(Vec::as_slice).collect();
+                let blocks = head.blocks(self.base, voxels.len(), &parts)?;
+                self.blocks.get_or_init(|| blocks)
+            }
+        };
+        let modes = blocks.modes.get(usize::from(level - head.block_level - 1));
+        let Some(modes) = modes else {
+            return Err(Error::Usage(format!("the motion of level {level} is not there")));
+        };
+        let vectors = blocks.vectors.iter();
+        Ok(Field {
+            keys: voxels.keys(),
+            down: u32::from(3 * (level - 1 - head.block_level)),
+            blocks: modes
+                .iter()
+                .zip(vectors)
+                .map(|(modes, vector)| (*modes, shift(*vector)))
+                .collect(),
+        })
+    }
+}
+
+/// The motion of a level's nodes.
+struct Field<'a> {
+    /// Keys of the blocks.
+    keys: &'a [u64],
+    /// Bits from the key of a node to that of its block.
+    down: u32,
+    /// Modes of each block, and its vector in voxels of the level.
+    blocks: Vec<(Modes, [i32; 3])>,
+}
+
+impl Field<'_> {
+    /// Modes and vector of the node with this key.
+    #[inline]
+    fn at(&self, key: u64) -> (Modes, [i32; 3]) {
+        let block = self.keys.partition_point(|block| *block < key >> self.down);
+        self.blocks[block]
+    }
+}
+
+/// A vector in voxels of `unit` as one in voxels of `level`, rounded to the nearest, halves up.
+pub(super) fn shift(vector: [i16; 3], unit: u8, level: u8) -> [i32; 3] {
+    let down = u32::from(unit - level);
+    let half = if down == 0 { 0 } else { 1i32 << (down - 1) };
+    vector.map(|x| (i32::from(x) + half) >> down)
+}
+
+/// Where the voxel at this place was in the previous frame.
+#[inline]
+fn moved(at: [i32; 3], shift: [i32; 3]) -> [i32; 3] {
+    [at[0] - shift[0], at[1] - shift[1], at[2] - shift[2]]
+}

@@ -1,0 +1,20 @@
+//! Prediction of a frame from the frame before it (`docs/format.md`, clauses 17.5 to 17.7).
+//!
+//! A frame is cut into *blocks*, the nodes of one coarse level. Each has a motion vector, and for every level one mode
+//! for its occupancies and one for its colours. All that a level is predicted from is the same level of the previous
+//! frame, as it was decoded, so that frames stay scalable and encoder and decoder never differ.
+//!
+//! - [`Previous`] is the previous frame, searched by position.
+//! - [`Motion`] is what a frame says of its blocks.
+//! - [`Inter`] makes of both what the coders of occupancies and colours take.
+
+mod bricks;
+mod guides;
+mod payload;
+mod previous;
+
+pub use guides::{ColourGuide, GeometryGuide, Inter};
+pub use payload::{Blocks, Head, Modes};
+pub use previous::{Previous, PreviousLevel};
+
+pub use crate::geometry::codec::guide::{Mode, own};

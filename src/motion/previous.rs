@@ -1,0 +1,75 @@
+//! The previous frame as it was decoded.
+
+use super::bricks::Bricks;
+use crate::colour::{Filter, Ycc};
+use crate::geometry::{Octree, Voxels};
+use rayon::prelude::*;
+
+/// The levels of a decoded frame, from level 0 on, that the next frame is predicted from.
+#[derive(Debug)]
+pub struct Previous {
+    levels: Vec<PreviousLevel>,
+}
+
+/// A level of a decoded frame.
+#[derive(Debug)]
+pub struct PreviousLevel {
+    pub(super) bricks: Bricks,
+    /// Y, Co and Cg of every voxel before the filter.
+    pub values: Vec<Ycc>,
+    /// The filter of the level, which the next frame inherits.
+    pub filter: Option<Filter>,
+}
+
+impl Previous {
+    /// The levels of `octree` with their colours and filters, from level 0 on.
+    ///
+    /// # Panics
+    /// If there are more colours than levels, or other than one per voxel.
+    pub fn new(octree: &Octree, colours: Vec<(Vec<Ycc>, Option<Filter>)>) -> Self {
+        let level = |(level, (values, filter)): (usize, (Vec<Ycc>, Option<Filter>))| {
+            let voxels = octree.level(level as u8);
+            PreviousLevel::new(voxels, values, filter)
+        };
+        Previous {
+            levels: colours.into_par_iter().enumerate().map(level).collect(),
+        }
+    }
+
+    /// A level. `None` if it was not decoded.
+    pub fn level(&self, level: u8) -> Option<&PreviousLevel> {
+        self.levels.get(usize::from(level))
+    }
+
+    /// Bytes of memory per voxel at most.
+    pub const fn bytes_per_voxel() -> usize {
+        Bricks::bytes_per_voxel() + size_of::<Ycc>()
+    }
+}
+
+impl PreviousLevel {
+    fn new(voxels: &Voxels, values: Vec<Ycc>, filter: Option<Filter>) -> Self {
+        assert_eq!(voxels.len(), values.len(), "one colour per voxel");
+        PreviousLevel {
+            bricks: Bricks::new(voxels),
+            values,
+            filter,
+        }
+    }
+
+    /// Keys of the nodes of level `block` with voxels; the level itself is `level`, at least two
+    /// deeper.
+    pub fn blocks(&self, level: u8, block: u8) -> Vec<u64> {
+        self.bricks.nodes(3 * u32::from(level.saturating_sub(2 + block)))
+    }
+
+    /// The number of the voxel at this place, if there is one.
+    pub fn index(&self, at: [i32; 3]) -> Option<usize> {
+        self.bricks.index(at)
+    }
+
+    /// The 4³ cells from this place on, as a mask by `x + 4y + 16z`.
+    pub fn window(&self, at: [i32; 3]) -> u64 {
+        self.bricks.window(at)
+    }
+}

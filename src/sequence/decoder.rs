@@ -1,0 +1,204 @@
+//! Decodes the frames of a sequence (`docs/format.md`, clause 17.4).
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use super::{Group, SequenceReader};
+use crate::container::Header;
+use crate::decoder::{Decoder, Decoding, Points};
+use crate::error::{Error, Result};
+use crate::gaussians::Gaussians;
+use crate::motion::{Inter, Previous};
+
+/// Decodes frames of a sequence. It keeps what the frame that it decoded last leaves for the next one of its group: a
+/// frame that follows is decoded alone, any other one with the frames of its group before it.
+#[derive(Debug, Clone)]
+pub struct SequenceDecoder {
+    decoder: Decoder,
+    last: Option<Last>,
+}
+
+/// The frame that was decoded last.
+#[derive(Debug, Clone)]
+struct Last {
+    /// Hash of its group.
+    group: u64,
+    /// Its place in the group.
+    at: usize,
+    previous: Arc<Previous>,
+}
+
+/// A decoded frame.
+#[derive(Debug)]
+pub struct DecodedFrame {
+    /// Its number, from 0.
+    pub number: u64,
+    decoding: Decoding<'static>,
+}
+
+impl SequenceDecoder {
+    /// A decoder of sequences, which decodes and draws as `decoder` does: its level, heads, limits and instructions
+    /// count.
+    pub fn new(decoder: Decoder) -> Self {
+        SequenceDecoder { decoder, last: None }
+    }
+
+    /// Decodes a frame.
+    ///
+    /// # Errors
+    /// [`Error::Frame`] if the frame, or one that it is predicted from, is damaged; those of
+    /// [`SequenceReader::group`]. Frames of other groups can be decoded after that.
+    pub fn frame(&mut self, sequence: &SequenceReader, frame: u64) -> Result<DecodedFrame> {
+        let group = sequence.group(sequence.group_of(frame)?)?;
+        self.in_group(&group, frame)
+    }
+
+    /// Decodes the frames `frames` one after the other.
+    pub fn frames<'a>(&'a mut self, sequence: &'a SequenceReader<'a>, frames: Range<u64>) -> Frames<'a> {
+        Frames {
+            decoder: self,
+            sequence,
+            frames,
+        }
+    }
+
+    /// The Gaussians of the frames `frames`, one after the other: while those of a frame are made, the next frame is
+    /// decoded.
+    pub fn gaussians<'a>(&'a mut self, sequence: &'a SequenceReader<'a>, frames: Range<u64>) -> GaussianFrames<'a> {
+        let mut frames = self.frames(sequence, frames);
+        let next = frames.next();
+        GaussianFrames { frames, next }
+    }
+
+    fn in_group(&mut self, group: &Group, frame: u64) -> Result<DecodedFrame> {
+        let at = (frame - group.first()) as usize;
+        let whole = (0..=at).rev().find(|at| group.is_whole(*at)).unwrap_or(0);
+        let last = self.last.take().filter(|last| last.group == group.hash());
+        let mut last = last.filter(|last| (whole..at).contains(&last.at));
+        let start = last.as_ref().map_or(whole, |last| last.at + 1);
+        for before in start..at {
+            let mut decoding = self.decoded(group, before, last.as_ref())?;
+            last = kept(&mut decoding, group, before);
+        }
+        let mut decoding = self.decoded(group, at, last.as_ref())?;
+        if at + 1 < group.len() && !group.is_whole(at + 1) {
+            self.last = kept(&mut decoding, group, at);
+        }
+        Ok(DecodedFrame {
+            number: frame,
+            decoding,
+        })
+    }
+
+    /// Decodes the frame at a place of the group, given the frame before it.
+    fn decoded(&self, group: &Group, at: usize, last: Option<&Last>) -> Result<Decoding<'static>> {
+        let decoded = || {
+            let (stream, motion) = group.stream(at);
+            let header = group.frame_header(at);
+            let inter = match (group.is_whole(at), last) {
+                (true, _) => None,
+                (false, None) => return Err(Error::Usage("the frame before was not decoded".into())),
+                (false, Some(last)) => {
+                    self.check_memory(&header, group)?;
+                    Some(Inter::new(
+                        Arc::clone(&last.previous),
+                        &motion,
+                        header.base,
+                        header.top,
+                    )?)
+                }
+            };
+            let mut decoding = self.decoder.start_frame(stream, inter);
+            decoding.finish()?;
+            Ok(decoding)
+        };
+        decoded().map_err(|source| Error::Frame {
+            frame: group.first() + at as u64,
+            source: Box::new(source),
+        })
+    }
+
+    /// Checks that a frame and the one before it fit the limits. Both have at most the voxels that the sequence states.
+    fn check_memory(&self, header: &Header, group: &Group) -> Result<()> {
+        let top = self.decoder.last_level(header);
+        let most = group.common.voxels(top)?;
+        // Levels above the last one have a third of its voxels, more or less; never more than each as many.
+        let levels = u64::from(top) + 1;
+        let voxels = u64::from(most).saturating_mul(levels.min(4));
+        let kept = voxels.saturating_mul(Previous::bytes_per_voxel() as u64);
+        let bytes = self.decoder.memory(header, top)?.saturating_add(kept);
+        self.decoder
+            .limits()
+            .check_bytes("memory to decode this sequence", bytes)
+    }
+}
+
+/// What a decoded frame leaves for the next one.
+fn kept(decoding: &mut Decoding, group: &Group, at: usize) -> Option<Last> {
+    Some(Last {
+        group: group.hash(),
+        at,
+        previous: Arc::new(decoding.take_previous()?),
+    })
+}
+
+impl DecodedFrame {
+    /// The voxels with their colours.
+    pub fn points(&self) -> Option<Points<'_>> {
+        self.decoding.points()
+    }
+
+    /// The frame's Gaussians.
+    ///
+    /// # Errors
+    /// Those of [`Decoding::gaussians`].
+    pub fn gaussians(&self) -> Result<Gaussians> {
+        self.decoding.gaussians()
+    }
+
+    /// The level that was decoded.
+    pub fn level(&self) -> Option<u8> {
+        self.decoding.level()
+    }
+}
+
+/// Frames of a sequence, one after the other. An error does not end it: frames of later groups follow.
+#[derive(Debug)]
+pub struct Frames<'a> {
+    decoder: &'a mut SequenceDecoder,
+    sequence: &'a SequenceReader<'a>,
+    frames: Range<u64>,
+}
+
+impl Iterator for Frames<'_> {
+    type Item = Result<DecodedFrame>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let frame = self.frames.next()?;
+        Some(self.decoder.frame(self.sequence, frame))
+    }
+
+    fn size_hint(&self) -> (usize, Option<usize>) {
+        self.frames.size_hint()
+    }
+}
+
+/// Gaussians of the frames of a sequence. An error does not end it.
+#[derive(Debug)]
+pub struct GaussianFrames<'a> {
+    frames: Frames<'a>,
+    /// The frame whose Gaussians come next.
+    next: Option<Result<DecodedFrame>>,
+}
+
+impl Iterator for GaussianFrames<'_> {
+    type Item = Result<Gaussians>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let frame = self.next.take()?;
+        let frames = &mut self.frames;
+        let (gaussians, next) = rayon::join(|| frame?.gaussians(), || frames.next());
+        self.next = next;
+        Some(gaussians)
+    }
+}

@@ -1,0 +1,262 @@
+//! Clouds on one grid to a sequence.
+
+use std::ops::RangeInclusive;
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::assembly::{Assembly, group_of};
+use crate::axes::Axes;
+use crate::cancel::Cancel;
+use crate::cloud::ColouredVoxels;
+use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
+use crate::container::{Header, with_axes};
+use crate::decoder::Decoder;
+use crate::encoder::transform::{self, Options, QualityTarget};
+use crate::error::{Error, Result};
+use crate::limits::Limits;
+use crate::log::Log;
+use crate::motion::{Inter, Previous};
+
+/// Codes clouds on one grid as a sequence.
+#[derive(Debug, Clone)]
+pub struct SequenceEncoder {
+    pub(super) options: Options,
+    timescale: u32,
+    duration: u32,
+    pub(super) group: u32,
+    predicted: bool,
+    axes: Axes,
+    cancel: Cancel,
+}
+
+impl Default for SequenceEncoder {
+    fn default() -> Self {
+        SequenceEncoder {
+            options: Options::default(),
+            timescale: 30,
+            duration: 1,
+            group: 32,
+            predicted: true,
+            axes: Axes::default(),
+            cancel: Cancel::default(),
+        }
+    }
+}
+
+/// The entry and the bytes of a frame.
+type Coded = (FrameEntry, Vec<u8>);
+
+/// A coded frame.
+struct Frame {
+    header: Header,
+    coded: Coded,
+    /// What the next frame is predicted from.
+    next: Option<Arc<Previous>>,
+}
+
+impl SequenceEncoder {
+    /// An encoder for 30 frames per second in groups of 32, with the levels and the quality of
+    /// [`Encoder::new`](crate::Encoder::new).
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// The same encoder with these options of each frame.
+    #[doc(hidden)]
+    pub fn with_options(mut self, options: Options) -> Self {
+        self.options = options;
+        self
+    }
+
+    /// The same encoder for these levels: each frame may be cut after each of them.
+    pub fn with_levels(mut self, levels: RangeInclusive<u8>) -> Self {
+        self.options.levels = Some(levels);
+        self
+    }
+
+    /// The same encoder with another quality of colours.
+    pub fn with_quality(mut self, quality: QualityTarget) -> Self {
+        self.options.fineness = quality;
+        self
+    }
+
+    /// The same encoder for `timescale / duration` frames per second: frames last `duration` ticks, a second has
+    /// `timescale`.
+    pub fn with_frame_rate(mut self, timescale: u32, duration: u32) -> Self {
+        (self.timescale, self.duration) = (timescale, duration);
+        self
+    }
+
+    /// The same encoder with so many frames per group, 1 to 65,536. The first frame of a group is coded by itself.
+    pub fn with_group(mut self, frames: u32) -> Self {
+        self.group = frames;
+        self
+    }
+
+    /// The same encoder, which predicts frames from the frame before or codes each by itself. Default: it predicts.
+    pub fn with_prediction(mut self, predicted: bool) -> Self {
+        self.predicted = predicted;
+        self
+    }
+
+    /// The same encoder, whose sequences state these axes.
+    pub fn with_axes(mut self, axes: Axes) -> Self {
+        self.axes = axes;
+        self
+    }
+
+    /// The same encoder, stopped before its next frame when `cancel` is thrown.
+    pub fn with_cancel(mut self, cancel: Cancel) -> Self {
+        self.cancel = cancel;
+        self
+    }
+
+    /// Codes `count` frames. `cloud` gives each of them by its number, from several threads at a time; `done` gets
+    /// each frame that was coded. The sequence does not depend on the number of threads.
+    ///
+    /// # Errors
+    /// Those of `cloud` and of [`Encoder::encode`](crate::Encoder::encode), as [`Error::Frame`]; [`Error::Usage`] for
+    /// no frames, a frame rate or a group out of range, and for frames on different grids; [`Error::Cancelled`].
+    pub fn encode(
+        &self,
+        count: u64,
+        cloud: impl Fn(u64) -> Result<ColouredVoxels> + Sync,
+        done: impl Fn(u64) + Sync,
+    ) -> Result<Vec<u8>> {
+        if count == 0 || self.timescale == 0 || self.duration == 0 {
+            let what = "a sequence needs at least one frame and a frame rate above 0";
+            return Err(Error::Usage(what.into()));
+        }
+        if !(1..=MAX_GROUP_FRAMES).contains(&self.group) {
+            let what = format!("a group has 1 to {MAX_GROUP_FRAMES} frames, not {}", self.group);
+            return Err(Error::Usage(what));
+        }
+        let longest = u64::from(self.group).min(count) * u64::from(self.duration);
+        if longest > u32::MAX.into() {
+            let what = format!("a group lasts less than 2^32 ticks, not {longest}");
+            return Err(Error::Usage(what));
+        }
+        let in_frame = |frame, error| match error {
+            Error::Cancelled => Error::Cancelled,
+            source => Error::Frame {
+                frame,
+                source: Box::new(source),
+            },
+        };
+        let groups = count.div_ceil(self.group.into());
+        let code = |group: u64| -> Result<(Header, Vec<Coded>)> {
+            let first = group * u64::from(self.group);
+            let mut common: Option<Header> = None;
+            let (mut frames, mut previous) = (Vec::new(), None);
+            let end = count.min(first + u64::from(self.group));
+            for frame in first..end {
+                self.cancel.check()?;
+                let cloud = cloud(frame).map_err(|error| in_frame(frame, error))?;
+                let ticks = (frame - first) as u32 * self.duration;
+                let follows = self.predicted && frame + 1 < end;
+                let coded = self.frame(&cloud, &previous, ticks, follows);
+                let coded = coded.map_err(|error| in_frame(frame, error))?;
+                check_common(common.as_ref(), &coded.header, frame)?;
+                common.get_or_insert(coded.header);
+                frames.push(coded.coded);
+                previous = coded.next.filter(|_| follows);
+                done(frame);
+            }
+            let common = common.ok_or_else(|| Error::Usage("a group needs at least one frame".into()))?;
+            Ok((common, frames))
+        };
+        let groups: Vec<Result<_>> = (0..groups).into_par_iter().map(code).collect();
+        let groups = groups.into_iter().collect::<Result<Vec<_>>>()?;
+        let mut assembly = Assembly::new(&groups[0].0, self.timescale, self.duration);
+        for (i, (header, frames)) in groups.iter().enumerate() {
+            check_common(Some(&groups[0].0), header, i as u64 * u64::from(self.group))?;
+            let (entries, bytes) = group_of(frames)?;
+            assembly.push(&entries, bytes, 0, frames.len() as u32 * self.duration)?;
+        }
+        assembly.finish()
+    }
+
+    /// Codes a frame, from the frame before if there is one in the group.
+    fn frame(
+        &self,
+        cloud: &ColouredVoxels,
+        previous: &Option<Arc<Previous>>,
+        ticks: u32,
+        follows: bool,
+    ) -> Result<Frame> {
+        let log = Log::off().with_cancel(self.cancel.clone());
+        let (stream, motion) = match previous {
+            None => {
+                let stream = transform::encode(cloud, &self.options, &log)?.bytes;
+                (with_axes(&stream, &self.axes)?, Vec::new())
+            }
+            Some(previous) => {
+                let frame = transform::encode_predicted(cloud, previous, &self.options, &log)?;
+                (frame.stream, frame.motion)
+            }
+        };
+        let header = Header::parse(&stream, &Limits::unlimited())?;
+        let coded = frame_of(&header, &stream, &motion, ticks)?;
+        let mut next = None;
+        if follows || !motion.is_empty() {
+            // What the next frame is predicted from is what the decoder will have.
+            let inter = previous.as_ref().map(|previous| {
+                let motion: Vec<&[u8]> = motion.iter().map(Vec::as_slice).collect();
+                Inter::new(Arc::clone(previous), &motion, header.base, header.top)
+            });
+            let decoder = Decoder::new().with_limits(Limits::unlimited()).with_level(header.top);
+            let mut decoding = decoder.start_frame(stream, inter.transpose()?);
+            decoding.finish()?;
+            next = decoding.take_previous().map(Arc::new);
+        }
+        Ok(Frame { header, coded, next })
+    }
+}
+
+/// The entry and the bytes of a frame from its stream.
+fn frame_of(header: &Header, stream: &[u8], motion: &[Vec<u8>], ticks: u32) -> Result<Coded> {
+    let points = u32::try_from(header.points);
+    let points = points.map_err(|_| Error::Usage("a frame has less than 2^32 points".into()))?;
+    let kind = if motion.is_empty() {
+        FrameKind::Whole
+    } else {
+        FrameKind::Predicted
+    };
+    let (mut levels, mut bytes) = (Vec::new(), Vec::new());
+    let mut rest = &stream[header.bytes()..];
+    for (i, (&voxels, &section)) in header.voxels.iter().zip(&header.sections).enumerate() {
+        let moved = motion.get(i).map_or(&[][..], |moved| moved);
+        let (sections, after) = rest.split_at(section.bytes() as usize);
+        bytes.extend(moved);
+        bytes.extend(sections);
+        rest = after;
+        levels.push(FrameLevel {
+            voxels,
+            motion: moved.len() as u32,
+            section,
+        });
+    }
+    let entry = FrameEntry {
+        kind,
+        ticks,
+        points,
+        levels,
+        offset: 0,
+    };
+    Ok((entry, bytes))
+}
+
+/// Checks that a frame is on the grid of the first one.
+fn check_common(first: Option<&Header>, header: &Header, frame: u64) -> Result<()> {
+    let same = |first: &Header| {
+        (first.bits, first.base, first.top) == (header.bits, header.base, header.top)
+            && first.placement == header.placement
+    };
+    match first {
+        Some(first) if !same(first) => Err(Error::Usage(format!(
+            "frame {frame} is on another grid than the first: frames share bit depth, levels and placement"
+        ))),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,191 @@
+//! Sequences of frames: index, groups, seeking, cutting and joining.
+
+mod common;
+
+use b2p::cloud::ColouredVoxels;
+use b2p::geometry::{Voxels, morton};
+use b2p::sequence::join;
+use b2p::{Decoder, Error, Limits, Placement, SequenceDecoder, SequenceEncoder, SequenceReader};
+use common::Ball;
+
+/// A ball that moves by a voxel a frame, and starts again after eight frames.
+fn moving(frame: u64) -> ColouredVoxels {
+    let moved = |([x, y, z], colour): ([u32; 3], [u8; 3])| (morton::encode([x + (frame % 8) as u32, y, z]), colour);
+    let mut voxels: Vec<_> = Ball::new(6, 20.0).voxels().into_iter().map(moved).collect();
+    voxels.sort_unstable();
+    ColouredVoxels {
+        voxels: Voxels::new(6, voxels.iter().map(|voxel| voxel.0).collect()),
+        colours: voxels.iter().map(|voxel| voxel.1).collect(),
+        placement: Placement::VOXEL_GRID,
+    }
+}
+
+fn encoder() -> SequenceEncoder {
+    SequenceEncoder::new().with_levels(3..=5).with_group(3)
+}
+
+fn encoded(frames: u64) -> Vec<u8> {
+    let sequence = encoder().encode(frames, |frame| Ok(moving(frame)), |_| {});
+    sequence.expect("a ball can be coded")
+}
+
+fn reader(bytes: &[u8]) -> SequenceReader<'_> {
+    SequenceReader::new(bytes, &Limits::default()).expect("a sequence")
+}
+
+type Frame = (Vec<u64>, Vec<[u8; 3]>);
+
+fn frame(sequence: &SequenceReader, frame: u64, level: Option<u8>) -> Result<Frame, Error> {
+    let mut decoder = SequenceDecoder::new(Decoder::new().with_level(level));
+    let decoded = decoder.frame(sequence, frame)?;
+    let points = decoded.points().expect("a level");
+    Ok((points.voxels.keys().to_vec(), points.colours.to_vec()))
+}
+
+#[test]
+fn every_frame_decodes_alone_and_in_order_at_every_level() {
+    let bytes = encoded(7);
+    let sequence = reader(&bytes);
+    assert_eq!((sequence.frames(), sequence.groups()), (7, 3));
+    for level in 3..=5 {
+        let mut decoder = SequenceDecoder::new(Decoder::new().with_level(level));
+        for (number, decoded) in decoder.frames(&sequence, 0..7).enumerate() {
+            let decoded = decoded.expect("a frame");
+            assert_eq!(decoded.number, number as u64);
+            let points = decoded.points().expect("a level");
+            let alone = frame(&sequence, number as u64, Some(level)).expect("a frame");
+            assert_eq!((points.voxels.keys(), points.colours), (&alone.0[..], &alone.1[..]));
+        }
+    }
+}
+
+#[test]
+fn a_sequence_does_not_depend_on_the_number_of_threads() {
+    let bytes = encoded(7);
+    for threads in [1, 3] {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .expect("threads");
+        assert!(pool.install(|| encoded(7)) == bytes);
+    }
+}
+
+#[test]
+fn frames_are_found_by_their_time() {
+    let encoder = encoder().with_frame_rate(30_000, 1001);
+    let bytes = encoder
+        .encode(7, |frame| Ok(moving(frame)), |_| {})
+        .expect("a sequence");
+    let sequence = reader(&bytes);
+    for number in 0..7 {
+        let time = sequence.time_of(number).expect("a time");
+        assert!((time - number as f64 * 1001.0 / 30_000.0).abs() < 1e-9);
+        assert_eq!(sequence.frame_at(time).expect("a frame"), number);
+        assert_eq!(sequence.frame_at(time + 0.03).expect("a frame"), number);
+    }
+    assert!((sequence.seconds() - 7.0 * 1001.0 / 30_000.0).abs() < 1e-9);
+    assert_eq!(sequence.frame_at(-1.0).expect("a frame"), 0);
+    assert_eq!(sequence.frame_at(1e300).expect("a frame"), 6);
+    assert!(matches!(sequence.frame_at(f64::NAN), Err(Error::Usage(_))));
+    assert!(matches!(sequence.time_of(7), Err(Error::Usage(_))));
+}
+
+#[test]
+fn cutting_and_joining_keep_groups_bit_for_bit() {
+    let bytes = encoded(8);
+    let sequence = reader(&bytes);
+    assert!(sequence.cut(0..8).expect("all") == bytes);
+    let parts = [0..3, 3..6, 6..8].map(|frames| sequence.cut(frames).expect("groups"));
+    for (part, first) in parts.iter().zip([0, 3, 6]) {
+        let part = reader(part);
+        assert_eq!(part.time_of(0).expect("a time"), 0.0);
+        for number in 0..part.frames() {
+            let same = frame(&sequence, first + number, None).expect("a frame");
+            assert!(frame(&part, number, None).expect("a frame") == same);
+        }
+    }
+    let joined = join(&parts.iter().map(|part| reader(part)).collect::<Vec<_>>());
+    assert!(joined.expect("a sequence") == bytes);
+}
+
+#[test]
+fn a_cut_within_a_group_is_refused_and_says_where_groups_are() {
+    let bytes = encoded(8);
+    let refused = reader(&bytes).cut(1..5).expect_err("a cut within groups");
+    assert!(refused.to_string().contains("0..6"), "{refused}");
+    assert!(reader(&bytes).cut(3..3).is_err());
+    assert!(reader(&bytes).cut(6..9).is_err());
+}
+
+#[test]
+fn sequences_on_different_grids_are_not_joined() {
+    let here = encoded(3);
+    let coarser = encoder().with_levels(3..=4);
+    let there = coarser
+        .encode(3, |frame| Ok(moving(frame)), |_| {})
+        .expect("a sequence");
+    let refused = join(&[reader(&here), reader(&there)]).expect_err("other levels");
+    assert!(refused.to_string().contains("levels"), "{refused}");
+}
+
+#[test]
+fn frames_on_different_grids_are_refused_naming_the_frame() {
+    let cloud = |frame| {
+        let mut cloud = moving(frame);
+        cloud.placement.voxel_size += if frame == 4 { 0.5 } else { 0.0 };
+        Ok(cloud)
+    };
+    let refused = encoder().encode(6, cloud, |_| {}).expect_err("another grid");
+    assert!(refused.to_string().contains("frame 4"), "{refused}");
+}
+
+#[test]
+fn a_decoder_of_one_frame_refuses_a_sequence_and_names_the_feature() {
+    let bytes = encoded(3);
+    let refused = Decoder::new().decode(&bytes).expect_err("a sequence");
+    assert!(matches!(refused, Error::Unsupported { .. }));
+    assert!(refused.to_string().contains("sequence of frames"), "{refused}");
+    let alone = b2p::Encoder::new()
+        .with_levels(3..=5)
+        .encode(&moving(0))
+        .expect("a frame")
+        .bytes;
+    let refused = SequenceReader::new(&alone, &Limits::default()).expect_err("one frame");
+    assert!(matches!(refused, Error::Unsupported { .. }));
+    assert!(SequenceReader::is_sequence(&bytes) && !SequenceReader::is_sequence(&alone));
+}
+
+#[test]
+fn a_damaged_group_leaves_the_others_and_a_cut_file_its_first_groups() {
+    let bytes = encoded(7);
+    let sequence = reader(&bytes);
+    let start = bytes.len() - 40;
+    let mut damaged = bytes.clone();
+    damaged[start] ^= 4;
+    let damaged = reader(&damaged);
+    let cut = reader(&bytes[..start]);
+    for number in 0..6 {
+        let whole = frame(&sequence, number, None).expect("a frame");
+        assert!(frame(&damaged, number, None).expect("a frame") == whole);
+        assert!(frame(&cut, number, None).expect("a frame") == whole);
+    }
+    assert!(matches!(frame(&damaged, 6, None), Err(Error::Malformed { .. })));
+    assert!(matches!(frame(&cut, 6, None), Err(Error::Truncated { .. })));
+    assert!(matches!(cut.check_end(), Err(Error::Truncated { .. })));
+    assert!(sequence.check_end().is_ok());
+}
+
+#[test]
+fn more_frames_than_the_limit_are_refused() {
+    let bytes = encoded(7);
+    let limits = Limits::default().with_max_frames(6);
+    let refused = SequenceReader::new(&bytes[..], &limits).expect_err("too many");
+    assert!(matches!(
+        refused,
+        Error::LimitExceeded {
+            option: "max_frames",
+            ..
+        }
+    ));
+}
