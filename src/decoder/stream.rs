@@ -317,8 +317,11 @@ impl Decoder {
         };
         let surfels = super::memory::surfels(voxels, self.surfels_per_voxel(header, level)?.count() as u64);
         Ok(match self.network(header, level)? {
-            // Some voxels may become surfels after all.
-            Some((model, set)) => model.bytes(set, voxels, above) + surfels,
+            // Some voxels may become surfels after all, once the network is done.
+            Some((model, set)) => {
+                let [gaussians, network] = model.bytes(set, voxels, above);
+                gaussians.saturating_add(network.max(surfels))
+            }
             None => surfels,
         })
     }
@@ -408,7 +411,9 @@ impl Decoder {
         let chosen = map_of_heads.and_then(|heads| heads.surfels(octree, level));
         let colours_above = reached.colours_above(above);
         let input = reached.heads_input(self.isa(), above, &colours_above, chosen.as_deref());
-        let mut gaussians = model.generate(self.isa(), self.precision, set, input, frame)?;
+        let (isa, precision) = (self.isa(), self.precision);
+        let mut check = |_: &mut Gaussians| self.cancel.check();
+        let mut gaussians = model.generate_in_parts(isa, precision, set, input, frame, true, &mut check)?;
         if let Some(chosen) = &chosen {
             gaussians.append(discs(Some(chosen))?);
         }
