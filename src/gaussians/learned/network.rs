@@ -177,7 +177,7 @@ impl Run<'_> {
                 true,
             );
             drop(parent);
-            for (block, outer) in net.parent.iter().zip((0..rings - 2).rev().step_by(2)) {
+            for (block, outer) in net.parent.iter().zip((0..rings.saturating_sub(2)).rev().step_by(2)) {
                 let some = [span.rows(outer + 1), span.rows(outer)];
                 h = block.apply_to_some(&mut pool, isa, taps, h, some);
             }

@@ -92,14 +92,17 @@ pub fn for_each_span<E>(
 
 /// Cuts a level into ranges of about the same size, at most `most` voxels each.
 fn ranges(keys: &[u64], most: usize) -> Vec<Range<usize>> {
-    let mut ranges = Vec::new();
-    let mut rest = 0..keys.len();
-    for left in (1..=keys.len().div_ceil(most * 7 / 8)).rev() {
+    let (mut ranges, mut rest) = (Vec::new(), 0..keys.len());
+    // A cut may be an eighth later than where it should be.
+    let usual = (most * 7 / 8).max(1);
+    for left in (1..=keys.len().div_ceil(usual)).rev() {
         let end = match left {
             1 => rest.end,
             _ => cut(keys, &rest, rest.len() / left),
         };
-        ranges.push(rest.start..end);
+        if rest.start < end {
+            ranges.push(rest.start..end);
+        }
         rest.start = end;
     }
     ranges
