@@ -8,7 +8,7 @@ use b2p::encoder::transform::{self, QualityTarget};
 use b2p::encoder::{self, Encoded, Options, Rate, Residual};
 use b2p::latents::Steps;
 use b2p::log::Log;
-use b2p::{Decoder, Error, Limits};
+use b2p::{Error, Limits};
 use serde_json::json;
 
 use super::args::{Colours, Encode};
@@ -16,7 +16,7 @@ use super::manners::{self, Said};
 use super::many::Kind;
 use super::progress::Progress;
 use super::table::{count, counted, steps, steps_json, table};
-use super::{Failure, Result, cloud, load, sequence};
+use super::{Failure, Result, cloud, decodable, load, sequence};
 
 /// What is taken from folders, and what becomes of it.
 pub const KIND: Kind<'_> = Kind {
@@ -76,7 +76,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
             source,
         })
     })?;
-    warn_if_undrawable(args, &encoded.bytes, limits)?;
+    decodable::warn(to, &encoded.bytes, args.colours, &args.model, limits)?;
     let depth = cloud.voxels.depth();
     let json = || {
         let level = |rate: &Rate| {
@@ -126,23 +126,6 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         chosen,
     );
     Ok(Said::report(report, json).beside(to))
-}
-
-/// Warns of a stream that the program's own heads do not draw.
-fn warn_if_undrawable(args: &Encode, bytes: &[u8], limits: &Limits) -> Result<()> {
-    let decoder = match args.colours {
-        // The model at hand has coded it.
-        Colours::Learned => Decoder::new().with_model(load::model(&args.model)?),
-        Colours::Transform => Decoder::new().with_heads_model(load::heads(None)?),
-    };
-    if decoder.with_limits(limits.clone()).levels(bytes)?.is_empty() {
-        let what = match args.colours {
-            Colours::Learned => "no level of the stream has Gaussians; code finer levels (--levels)",
-            Colours::Transform => "no level of the stream is drawn with learned heads; --heads surfels draws it",
-        };
-        manners::warn(&format!("{}: {what}", args.output.display()));
-    }
-    Ok(())
 }
 
 /// A stream, and what was chosen about it in words.

@@ -118,17 +118,21 @@ const ONE: Term = Term {
 
 // Version 3.
 
+const KEPT: Term = Term {
+    each: "voxel of the level and of the level above",
+    takes: "kernel map, colours decoded and as bytes",
+    fixed: MAP + LevelColours::bytes_per_voxel() as u64 + 3,
+    by: NOTHING,
+};
 const TRUNK: Term = Term {
-    each: "voxel of the levels above the base, at most 65,536 in each",
+    each: "voxel of the levels above the base, at most 65,536 in each, while colours are decoded",
     takes: "kernel map",
     fixed: MAP,
     by: NOTHING,
 };
-const KEPT: Term = Term {
-    each: "voxel of the level and of the two levels above",
-    takes: "kernel map, colours decoded and as bytes",
-    fixed: MAP + LevelColours::bytes_per_voxel() as u64 + 3,
-    by: NOTHING,
+const KEPT_ABOVE: Term = Term {
+    each: "voxel two levels above the level, at the same time",
+    ..KEPT
 };
 const CODING: Term = Term {
     each: "voxel of the level, while its colours are decoded",
@@ -149,7 +153,7 @@ const FILTERING: Term = Term {
     by: NOTHING,
 };
 const CONTEXTS: Term = Term {
-    each: "slice of colours decoded at a time, at most one on each thread, and 3 more",
+    each: "slice of colours while it is decoded, at most one on each thread, and 3 more",
     takes: "adaptive contexts",
     fixed: LevelColours::model_bytes() as u64,
     by: NOTHING,
@@ -241,12 +245,18 @@ pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64>
     let terms = [
         (SLICES, header.prefix_bytes(level)?),
         (OCTREE, counts().sum::<u64>() + above(base)),
-        (TRUNK, above(base.min(MAX_TRUNK_VOXELS.into()))),
-        (KEPT, grandparents + parents + voxels),
-        (CONTEXTS, 3 + slices.min(rayon::current_num_threads() as u64)),
+        (KEPT, parents + voxels),
+        (CONTEXTS, 3),
     ];
     // These do not coexist.
-    let coding = total(&[(CODING, voxels), (CODING_ABOVE, parents)], NOTHING);
+    let coding = [
+        (TRUNK, above(base.min(MAX_TRUNK_VOXELS.into()))),
+        (KEPT_ABOVE, grandparents),
+        (CONTEXTS, slices.min(rayon::current_num_threads() as u64)),
+        (CODING, voxels),
+        (CODING_ABOVE, parents),
+    ];
+    let coding = total(&coding, NOTHING);
     let filtering = total(&[(FILTERING, voxels)], NOTHING);
     Ok(total(&terms, NOTHING).saturating_add(coding.max(filtering).max(drawing)))
 }
@@ -275,7 +285,10 @@ mod tests {
         };
         let by = [(channels, 'C'), (latents, 'K'), (generator, 'H'), (base, 'B')];
         let by = by.iter().filter(|(times, _)| *times > 0);
-        by.fold(fixed, |text, (times, of)| format!("{text} + {times}·{of}"))
+        let by = by.map(|(times, of)| format!("{times}·{of}"));
+        let fixed = (term.fixed > 0).then_some(fixed);
+        let parts: Vec<String> = fixed.into_iter().chain(by).collect();
+        parts.join(" + ")
     }
 
     fn table(terms: &[Term]) -> String {
@@ -292,7 +305,7 @@ mod tests {
         let base = [BASE, BASE_LEARNING, NEAR, NEAR_LEARNING];
         let drawing = [GENERATOR, GAUSSIANS, EIGHT, ONE];
         let version_2 = [&[SLICES, OCTREE, ABOVE, EXACT][..], &base, &drawing].concat();
-        let version_3 = [SLICES, OCTREE, TRUNK, KEPT, CONTEXTS];
+        let version_3 = [SLICES, OCTREE, KEPT, CONTEXTS, TRUNK, KEPT_ABOVE];
         let coding = [CODING, CODING_ABOVE, FILTERING, SURFEL_SUMS, SURFELS];
         let version_3 = [&version_3[..], &coding, &learned::TERMS].concat();
         let tables = [table(&version_2), table(&version_3)];

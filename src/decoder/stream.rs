@@ -12,7 +12,7 @@ use crate::cloud::{ColouredVoxels, PointCloud};
 use crate::container::feed::Goal;
 use crate::container::{Format, Header, Stream};
 use crate::error::{Error, Result};
-use crate::gaussians::learned::{HeadsModel, Set};
+use crate::gaussians::learned::{HeadsModel, Set, span_rows};
 use crate::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
 use crate::gaussians::{Frame, Gaussians};
 use crate::gaussians::{HeadMap, HeadSet, Heads};
@@ -323,10 +323,18 @@ impl Decoder {
         };
         let surfels = super::memory::surfels(voxels, self.surfels_per_voxel(header, level)?.count() as u64);
         Ok(match self.network(header, level)? {
-            // Some voxels may become surfels after all.
-            Some((model, set)) => model.bytes(set, voxels, above) + surfels,
+            // Some voxels may become surfels after all, once the network is done.
+            Some((model, set)) => {
+                let [gaussians, network] = model.bytes(set, voxels, above, self.span_rows());
+                gaussians.saturating_add(network.max(surfels))
+            }
             None => surfels,
         })
+    }
+
+    /// Rows of a level that learned heads are evaluated on at a time, at most: less memory takes more time.
+    fn span_rows(&self) -> usize {
+        span_rows(self.limits.max_bytes)
     }
 
     /// The level that decoding a stream with this header ends with.
@@ -419,7 +427,10 @@ impl Decoder {
         let chosen = map_of_heads.and_then(|heads| heads.surfels(octree, level));
         let colours_above = reached.colours_above(above);
         let input = reached.heads_input(self.isa(), above, &colours_above, chosen.as_deref());
-        let mut gaussians = model.generate(self.isa(), self.precision, set, input, frame)?;
+        let (isa, precision) = (self.isa(), self.precision);
+        let mut check = |_: &mut Gaussians| self.cancel.check();
+        let mut gaussians =
+            model.generate_in_parts(isa, precision, set, input, frame, (self.span_rows(), true), &mut check)?;
         if let Some(chosen) = &chosen {
             gaussians.append(discs(Some(chosen))?);
         }

@@ -44,11 +44,11 @@ struct Rows<'a> {
 }
 
 impl<'a> Drawing<'a> {
-    /// No Gaussians yet, with capacity for all. `blur` is in squares of half the unit.
-    pub fn new(input: &LevelInput<'a>, count: usize, blur: f32, frame: Frame) -> Self {
+    /// No Gaussians yet, with capacity for all if they are `kept`. `blur` is in squares of half the unit.
+    pub fn new(input: &LevelInput<'a>, count: usize, blur: f32, frame: Frame, kept: bool) -> Self {
         let voxels = input.octree.level(input.level);
         let half = 1.0 / (1u32 << (voxels.depth() + u8::from(count == 8))) as f32;
-        let all = voxels.len() * count;
+        let all = if kept { voxels.len() * count } else { 0 };
         Drawing {
             voxels,
             colours: input.colours,

@@ -35,6 +35,7 @@ mod activate;
 mod inputs;
 mod load;
 mod network;
+mod spans;
 #[cfg(test)]
 mod tests;
 
@@ -50,9 +51,11 @@ use crate::geometry::{KernelMap, Octree};
 use crate::input;
 use crate::layers::{Precision, missing};
 use crate::limits::Limits;
+use activate::Drawing;
 use network::Generator;
 #[cfg(test)]
 pub(crate) use network::TERMS;
+pub use spans::span_rows;
 
 /// Network outputs per Gaussian.
 const RAW: usize = 14;
@@ -125,14 +128,18 @@ impl HeadsModel {
         self.generators.iter().map(|(set, _)| *set)
     }
 
-    /// Maximum memory in bytes of [`HeadsModel::generate`] for a level of `voxels` voxels and `above` voxels in the
-    /// level above, Gaussians included; 0 if the model does not have the set.
+    /// Maximum memory in bytes of [`HeadsModel::generate_in_parts`] for a level of `voxels` voxels and `above` voxels in
+    /// the level above, on spans of at most `rows` rows: that of the Gaussians, and that of the network, which is given
+    /// back; 0 if the model does not have the set.
     #[doc(hidden)]
-    pub fn bytes(&self, set: Set, voxels: u64, above: u64) -> u64 {
-        match self.find(set) {
-            Some(generator) => network::bytes(generator.shape(), voxels, above),
-            None => 0,
-        }
+    pub fn bytes(&self, set: Set, voxels: u64, above: u64, rows: usize) -> [u64; 2] {
+        let shape = self.find(set).map(Generator::shape);
+        shape.map_or([0; 2], |shape| {
+            [
+                network::gaussian_bytes(shape, voxels),
+                network::work_bytes(shape, voxels, above, rows),
+            ]
+        })
     }
 
     /// Makes the Gaussians of a level voxel by voxel, one or eight each. Of eight, those with an opacity below 1/255
@@ -153,6 +160,43 @@ impl HeadsModel {
         input: LevelInput<'_>,
         frame: Frame,
     ) -> Result<Gaussians> {
+        self.generate_in_parts(isa, precision, set, input, frame, (usize::MAX, true), &mut |_| Ok(()))
+    }
+
+    /// As [`HeadsModel::generate`] on spans of at most `rows` rows, and calls `taken` with the Gaussians whenever some
+    /// have been added, which may take them away. There is memory for all from the start if they are `kept`.
+    ///
+    /// # Errors
+    /// Those of [`HeadsModel::generate`] and of `taken`.
+    ///
+    /// # Panics
+    /// As [`HeadsModel::generate`].
+    #[doc(hidden)]
+    #[allow(clippy::too_many_arguments)]
+    pub fn generate_in_parts(
+        &self,
+        isa: Isa,
+        precision: Precision,
+        set: Set,
+        input: LevelInput<'_>,
+        frame: Frame,
+        (rows, kept): (usize, bool),
+        taken: &mut dyn FnMut(&mut Gaussians) -> Result<()>,
+    ) -> Result<Gaussians> {
+        let generator = self.generator(isa, precision, set, &input)?;
+        let drawing = Drawing::new(&input, generator.shape().gaussians, self.blur, frame, kept);
+        generator.generate(
+            isa,
+            precision,
+            network::enough_rows(generator.shape(), rows),
+            &input,
+            drawing,
+            taken,
+        )
+    }
+
+    /// The network of a set, which can draw this level in this precision.
+    fn generator(&self, isa: Isa, precision: Precision, set: Set, input: &LevelInput<'_>) -> Result<&Generator> {
         let Some(generator) = self.find(set) else {
             let sets = self.sets().map(|(heads, k)| format!("{heads}.{k}"));
             let sets = sets.collect::<Vec<_>>().join(", ");
@@ -168,7 +212,7 @@ impl HeadsModel {
             return Err(missing("generating Gaussians in half", detail));
         }
         input.check();
-        Ok(generator.generate(isa, precision, &input, self.blur, frame))
+        Ok(generator)
     }
 
     fn find(&self, set: Set) -> Option<&Generator> {

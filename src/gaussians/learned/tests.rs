@@ -343,6 +343,57 @@ fn the_division_into_parts_does_not_change_the_result() {
 }
 
 #[test]
+fn the_size_of_spans_does_not_change_a_bit() {
+    let cloud = Cloud::surface(6);
+    for made in all_sets() {
+        let model = model(std::slice::from_ref(&made));
+        for precision in [Precision::Int16, Precision::F16] {
+            let expected = cloud.draw(&model, Isa::detect(), precision, made.set);
+            for (most, threads) in [(100, 3), (700, 1), (1500, 2), (3000, 2)] {
+                let input = cloud.input();
+                let generator = model.generator(Isa::detect(), precision, made.set, &input).unwrap();
+                let drawing = Drawing::new(&input, made.set.1, model.blur, Frame::default(), true);
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                let draw = || generator.generate(Isa::detect(), precision, most, &input, drawing, &mut |_| Ok(()));
+                let drawn: crate::error::Result<Gaussians> = pool.install(draw);
+                assert_eq!(drawn.unwrap(), expected, "{most} rows, {threads} threads, {precision}");
+            }
+        }
+    }
+}
+
+#[test]
+fn parts_that_are_taken_away_make_up_the_whole() {
+    let cloud = Cloud::surface(8);
+    let made = Made::new((Heads::Quick, 8), 4, [0, 0], 11);
+    let model = model(std::slice::from_ref(&made));
+    let expected = cloud.draw(&model, Isa::detect(), Precision::Int16, made.set);
+    let (frame, mut whole, mut parts) = (Frame::default(), Gaussians::default(), 0);
+    let mut taken = |part: &mut Gaussians| {
+        parts += 1;
+        whole.blur = part.blur;
+        let empty = Gaussians {
+            blur: part.blur,
+            ..Gaussians::default()
+        };
+        whole.append(std::mem::replace(part, empty));
+        Ok(())
+    };
+    let rest = model.generate_in_parts(
+        Isa::detect(),
+        Precision::Int16,
+        made.set,
+        cloud.input(),
+        frame,
+        (usize::MAX, false),
+        &mut taken,
+    );
+    assert!(rest.unwrap().is_empty());
+    assert!(parts > 3, "{parts} parts");
+    assert_eq!(whole, expected);
+}
+
+#[test]
 fn invalid_requests_are_refused_with_the_reason() {
     let model = model(&[Made::new((Heads::Best, 1), 4, [0, 0], 1)]);
     assert_eq!(model.sets().collect::<Vec<_>>(), [(Heads::Best, 1)]);
