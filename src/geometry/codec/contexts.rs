@@ -50,7 +50,14 @@ const NEAR: u64 = {
     mask
 };
 /// Face cells, in the shifted masks.
-const FACES: u64 = 1 << 5 | 1 << 17 | 1 << 20 | 1 << 22 | 1 << 25 | 1 << 37;
+pub(super) const FACES: u64 = 1 << 5 | 1 << 17 | 1 << 20 | 1 << 22 | 1 << 25 | 1 << 37;
+/// Near cells that share an edge with the child, in the shifted masks.
+#[cfg(feature = "encoder")]
+pub(super) const EDGES: u64 =
+    1 << 1 | 1 << 4 | 1 << 6 | 1 << 9 | 1 << 16 | 1 << 18 | 1 << 24 | 1 << 26 | 1 << 33 | 1 << 36 | 1 << 38 | 1 << 41;
+/// Near cells that share only a corner with it.
+#[cfg(feature = "encoder")]
+pub(super) const CORNERS: u64 = NEAR & !FACES & !EDGES;
 /// Cells of this voxel's own children, in the masks before the shift.
 const OWN: u64 = 0b0110_0110 << 20 | 0b0110_0110 << 36;
 
@@ -61,7 +68,7 @@ const fn cell_of(at: usize) -> usize {
 
 /// Cells of a neighbour's children, by its offset, by half of its occupancy (low or high four octants), and by these
 /// four bits.
-static CELLS: [[[u64; 16]; 2]; 27] = {
+pub(super) static CELLS: [[[u64; 16]; 2]; 27] = {
     let mut cells = [[[0; 16]; 2]; 27];
     let mut k = 0;
     while k < 27 {

@@ -26,6 +26,8 @@ mod contexts;
 mod mixer;
 mod neighbourhood;
 pub mod network;
+#[cfg(feature = "encoder")]
+mod optimise;
 mod predictor;
 
 use super::{KernelMap, Octree};
@@ -35,6 +37,8 @@ use crate::error::{Error, Result, Stage};
 use b2p_kernels::{Instructions, Isa, Work};
 use coder::{Decoder, Encoder};
 use neighbourhood::Neighbourhood;
+#[cfg(feature = "encoder")]
+pub use optimise::{Distortion, FULL, optimise_level};
 use predictor::Predictor;
 use rayon::prelude::*;
 use std::ops::Range;
