@@ -276,12 +276,17 @@ impl<'a> EncoderInput<'a> {
     /// The header of a stream whose last level is `top`.
     fn header(&self, top: u8, voxels: impl Fn(u8) -> usize) -> Header {
         let levels = *self.levels.start().min(&top)..=top;
+        let bits = self.cloud.voxels.depth();
         Header {
             optional_flags: 0,
-            bits: self.cloud.voxels.depth(),
+            bits,
             base: *levels.start(),
             top,
-            points: self.cloud.voxels.len() as u64,
+            // Of a stream of all levels they are its voxels.
+            points: match top == bits {
+                true => voxels(top) as u64,
+                false => self.cloud.voxels.len() as u64,
+            },
             placement: self.cloud.placement,
             format: Format::Transform {
                 colour_slice: self.options.colour_slice,
