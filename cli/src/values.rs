@@ -59,11 +59,11 @@ pub fn step(text: &str) -> Result<QualityTarget, String> {
 pub fn geometry(text: &str) -> Result<GeometryTarget, String> {
     match text {
         "exact" => return Ok(GeometryTarget::Exact),
-        "visual" => return Ok(GeometryTarget::Visual(0.5)),
+        "visual" => return Ok(GeometryTarget::Visual),
         _ => {}
     }
     match text.parse() {
-        Ok(lambda) if (0.0..=100.0).contains(&lambda) => Ok(GeometryTarget::Visual(lambda)),
+        Ok(lambda) if (0.0..=100.0).contains(&lambda) => Ok(GeometryTarget::Lambda(lambda)),
         _ => Err("expected exact, visual, or a number from 0 to 100".into()),
     }
 }

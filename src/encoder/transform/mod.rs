@@ -115,7 +115,7 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
     let mut subject = EncoderInput::new(cloud, levels, options, log)?;
     let top = *subject.levels.end();
-    let shape = subject.shape(top, options.geometry.lambda(steps, top), log)?;
+    let shape = subject.shape(top, options.geometry.lambda(steps), log)?;
     let coded = subject.code(top, steps, shape, log)?;
     // They are needed no more, and are the largest part.
     subject.maps = Vec::new();
@@ -276,17 +276,12 @@ impl<'a> EncoderInput<'a> {
     /// The header of a stream whose last level is `top`.
     fn header(&self, top: u8, voxels: impl Fn(u8) -> usize) -> Header {
         let levels = *self.levels.start().min(&top)..=top;
-        let bits = self.cloud.voxels.depth();
         Header {
             optional_flags: 0,
-            bits,
+            bits: self.cloud.voxels.depth(),
             base: *levels.start(),
             top,
-            // Of a stream of all levels they are its voxels.
-            points: match top == bits {
-                true => voxels(top) as u64,
-                false => self.cloud.voxels.len() as u64,
-            },
+            points: self.cloud.voxels.len() as u64,
             placement: self.cloud.placement,
             format: Format::Transform {
                 colour_slice: self.options.colour_slice,

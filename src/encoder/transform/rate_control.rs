@@ -157,7 +157,7 @@ impl Search<'_> {
 
     /// The shape of a stream with the last level `top` and these steps.
     fn shape(&mut self, top: u8, steps: Steps, log: &Log) -> Result<Option<Arc<Shape>>> {
-        let lambda = self.subject.options.geometry.lambda(steps, top);
+        let lambda = self.subject.options.geometry.lambda(steps);
         let known = self.shapes.iter().find(|known| (known.0, known.1) == (top, lambda));
         if let Some((_, _, shape)) = known {
             return Ok(shape.clone());

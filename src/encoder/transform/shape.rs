@@ -10,24 +10,39 @@ use crate::error::Result;
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
 
-/// How exactly the finest level's voxels are coded.
+/// How exactly the finest level's voxels are coded. Only a level above the cloud's own is optimised, and only of streams
+/// with lossy colours.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum GeometryTarget {
     /// As they are.
     Exact,
-    /// Rate–distortion optimised: voxels may move by one. The number is the Lagrangian multiplier λ, 0 to 100: the
-    /// squared distance, in squared voxels, that a bit must save.
-    Visual(f32),
+    /// Rate–distortion optimised: voxels may move by one. λ follows from luma's quantisation step.
+    Visual,
+    /// The same with this λ, 0 to 100: the squared distance, in squared voxels, that a bit must save.
+    Lambda(f32),
 }
 
+/// λ where luma's quantisation step is one 255th. The error of a colour that is moved, and the squared error that a bit
+/// must save elsewhere, are both squares: λ grows with the squared step.
+const LAMBDA: f32 = 2e-4;
+/// The greatest λ that follows from a step.
+const MOST_LAMBDA: f32 = 0.4;
+
 impl GeometryTarget {
-    /// λ in units of 1/256; 0 for exact geometry, which lossless colours always have.
-    pub(super) fn lambda(self, steps: Steps, _top: u8) -> u32 {
-        match self {
-            GeometryTarget::Visual(lambda) if !steps.is_lossless() => (256.0 * lambda.clamp(0.0, 100.0)) as u32,
-            _ => 0,
-        }
+    /// λ in units of 1/256.
+    pub(super) fn lambda(self, steps: Steps) -> u32 {
+        let lambda = match self {
+            _ if steps.is_lossless() => 0.0,
+            GeometryTarget::Exact => 0.0,
+            // Of powers of two, so that streams of similar steps share an octree.
+            GeometryTarget::Visual => {
+                let lambda = (LAMBDA * steps.luma_step().powi(2)).min(MOST_LAMBDA);
+                lambda.log2().round().exp2()
+            }
+            GeometryTarget::Lambda(lambda) => lambda.clamp(0.0, 100.0),
+        };
+        (256.0 * lambda).round() as u32
     }
 }
 
@@ -43,18 +58,18 @@ pub(super) struct Shape {
 }
 
 impl EncoderInput<'_> {
-    /// The octree whose level `top` is optimised with this λ, in units of 1/256; `None` for λ = 0, and where the level
-    /// belongs to the colour trunk.
+    /// The octree whose level `top` is optimised with this λ, in units of 1/256; `None` for λ = 0, for the
+    /// cloud's own level, and where the level belongs to the colour trunk.
     pub(super) fn shape(&self, top: u8, lambda: u32, log: &Log) -> Result<Option<Arc<Shape>>> {
-        if lambda == 0 || top <= self.trunk_depth(top) {
+        if lambda == 0 || top == self.cloud.voxels.depth() || top <= self.trunk_depth(top) {
             return Ok(None);
         }
         let count = self.octree.level(top).len();
         log.step("shape", count, "voxels", || {
-            let weights = self.weights(top);
+            let points = self.points(top);
             let (level, slice) = (usize::from(top), self.options.slice_voxels as usize);
             let distortion = codec::Distortion {
-                weights: &weights,
+                points: &points,
                 lambda,
             };
             let above = &self.maps[level - 1];
@@ -71,21 +86,16 @@ impl EncoderInput<'_> {
         })
     }
 
-    /// How much of the surface each voxel of a level holds: a patch of it has four of the voxels below.
-    fn weights(&self, level: u8) -> Vec<u8> {
+    /// For each voxel of a level above the cloud's own, which of its children hold points.
+    fn points(&self, level: u8) -> Vec<u8> {
         let keys = self.cloud.voxels.keys();
-        let depth = self.cloud.voxels.depth();
-        if level == depth {
-            return vec![codec::FULL; keys.len()];
-        }
-        let shift = 3 * (depth - level);
-        let patch = 4usize.pow(u32::from(depth - level).min(4));
-        let weight = |key: &u64| {
+        let shift = 3 * (self.cloud.voxels.depth() - level);
+        let mask = |key: &u64| {
             let first = keys.partition_point(|k| k >> shift < *key);
-            let inside = keys[first..].iter().take(patch).take_while(|k| *k >> shift == *key);
-            (usize::from(codec::FULL) * inside.count() / patch).max(1) as u8
+            let inside = keys[first..].iter().take_while(|k| *k >> shift == *key);
+            inside.fold(0, |mask, k| mask | 1 << (k >> (shift - 3) & 7))
         };
-        self.octree.level(level).keys().par_iter().map(weight).collect()
+        self.octree.level(level).keys().par_iter().map(mask).collect()
     }
 }
 

@@ -50,14 +50,7 @@ const NEAR: u64 = {
     mask
 };
 /// Face cells, in the shifted masks.
-pub(super) const FACES: u64 = 1 << 5 | 1 << 17 | 1 << 20 | 1 << 22 | 1 << 25 | 1 << 37;
-/// Near cells that share an edge with the child, in the shifted masks.
-#[cfg(feature = "encoder")]
-pub(super) const EDGES: u64 =
-    1 << 1 | 1 << 4 | 1 << 6 | 1 << 9 | 1 << 16 | 1 << 18 | 1 << 24 | 1 << 26 | 1 << 33 | 1 << 36 | 1 << 38 | 1 << 41;
-/// Near cells that share only a corner with it.
-#[cfg(feature = "encoder")]
-pub(super) const CORNERS: u64 = NEAR & !FACES & !EDGES;
+const FACES: u64 = 1 << 5 | 1 << 17 | 1 << 20 | 1 << 22 | 1 << 25 | 1 << 37;
 /// Cells of this voxel's own children, in the masks before the shift.
 const OWN: u64 = 0b0110_0110 << 20 | 0b0110_0110 << 36;
 

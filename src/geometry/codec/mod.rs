@@ -38,7 +38,7 @@ use b2p_kernels::{Instructions, Isa, Work};
 use coder::{Decoder, Encoder};
 use neighbourhood::Neighbourhood;
 #[cfg(feature = "encoder")]
-pub use optimise::{Distortion, FULL, optimise_level};
+pub use optimise::{Distortion, optimise_level};
 use predictor::Predictor;
 use rayon::prelude::*;
 use std::ops::Range;

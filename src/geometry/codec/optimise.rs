@@ -4,8 +4,13 @@
 //! each parent, in coding order, the encoder chooses the occupancy that minimises D + λ·R. R is the code length under
 //! the predictor as it is at that parent. D counts
 //!
-//! - for each voxel that is left out, its weight times the squared distance to the nearest coded voxel;
-//! - for each voxel that is added, the squared distance to the nearest true voxel.
+//! - for each voxel that is left out and each point in it, how much the squared distance to the nearest coded centre
+//!   grows, a quarter of it: a patch of the surface has about four points in a voxel;
+//! - for each voxel that is added, the squared distance of its centre to the nearest point, less what it would be to a
+//!   point inside.
+//!
+//! Points are the voxels of the next level, whose places in a voxel are known: ±¼ along each axis. Distances are in
+//! voxels.
 //!
 //! Children of parents that are not coded yet count as true ones. Parents keep at least one child, and true voxels lie
 //! in them. So each true voxel has a coded voxel within one in each coordinate; each coded voxel has a true one there,
@@ -18,14 +23,11 @@ use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
 use super::coder::Encoder;
-use super::contexts::{CELLS, CORNERS, EDGES, FACES};
+use super::contexts::CELLS;
 use super::neighbourhood::Neighbourhood;
 use super::predictor::Predictor;
 use super::{count, slices};
 use crate::geometry::{KernelMap, Octree, ones};
-
-/// Weight of a voxel that holds a whole patch of the surface.
-pub const FULL: u8 = 16;
 
 /// Candidates that are kept at each octant.
 const BEAM: usize = 8;
@@ -36,8 +38,8 @@ const UNLIKELIEST: u32 = 4 << 8;
 /// What the encoder may change about a level.
 #[derive(Debug, Clone, Copy)]
 pub struct Distortion<'a> {
-    /// For each voxel of the level how much of the surface it holds, from 1 to [`FULL`].
-    pub weights: &'a [u8],
+    /// For each voxel of the level, which of its eight children hold points.
+    pub points: &'a [u8],
     /// The Lagrangian multiplier λ: squared distance, in squared voxels, that a bit must save, in units of 1/256.
     pub lambda: u32,
 }
@@ -47,8 +49,8 @@ pub struct Distortion<'a> {
 /// the number of threads.
 ///
 /// # Panics
-/// If `level` is 0 or deeper than the octree, `map` belongs to another level, `slice` is 0, or there is not one weight
-/// for each voxel of the level.
+/// If `level` is 0 or deeper than the octree, `map` belongs to another level, `slice` is 0, or there is not one
+/// mask of points for each voxel of the level.
 pub fn optimise_level(
     isa: Isa,
     octree: &Octree,
@@ -61,8 +63,8 @@ pub fn optimise_level(
     assert_eq!(map.len(), truth.len(), "one kernel map row per parent");
     assert_eq!(
         octree.level(level).len(),
-        distortion.weights.len(),
-        "one weight per voxel"
+        distortion.points.len(),
+        "one mask of points per voxel"
     );
     let ranges: Vec<_> = slices(truth.len(), slice).collect();
     let optimise = |parents: Range<usize>| {
@@ -110,16 +112,17 @@ impl Work for Optimise<'_> {
         let mut masks: Vec<u8> = Vec::with_capacity(parents.len());
         for (parent, neighbourhood) in parents.clone().zip(neighbourhoods) {
             let (row, first) = (map.row(parent), parents.start);
-            let children = &distortion.weights[first_child[parent] as usize..];
-            let mut surface = Surface::new(truth[parent], children);
+            let points = |parent: usize| &distortion.points[first_child[parent] as usize..];
+            let mut surface = Surface::new(truth[parent], points(parent));
             for k in ones(neighbourhood.there) {
                 let neighbour = row[k] as usize;
                 let coded = match neighbourhood.known >> k & 1 {
                     1 => masks[neighbour - first],
                     _ => truth[neighbour],
                 };
-                surface.add(k, truth[neighbour], coded);
+                surface.add(k, truth[neighbour], coded, points(neighbour));
             }
+            surface.finish();
             let chosen = predictor.choose(neighbourhood, row, first, &masks, &surface, distortion.lambda);
             predictor.code(&mut encoder, neighbourhood, row, first, &masks, chosen);
             masks.push(chosen);
@@ -133,34 +136,53 @@ impl Work for Optimise<'_> {
 pub(super) struct Surface {
     /// The parent's true children.
     pub mask: u8,
-    /// Weights of the true children, by octant.
-    weights: [u8; 8],
-    /// True cells, the parent's own included.
-    truth: u64,
+    /// Of each of them which of its children hold points.
+    own: [u8; 8],
+    /// For each octant the cells that hold a point in it.
+    points: [u64; 8],
     /// Coded cells, and true ones where none are coded yet; without the parent's own.
     coded: u64,
+    /// Distortion of each child that is not a true one, if it is added.
+    added: [u32; 8],
 }
 
 impl Surface {
-    fn new(mask: u8, children: &[u8]) -> Self {
-        let mut weights = [0; 8];
-        for (octant, weight) in ones(mask.into()).zip(children) {
-            weights[octant] = *weight;
-        }
-        let truth = cells(KernelMap::CENTRE, mask);
-        Surface {
+    fn new(mask: u8, points: &[u8]) -> Self {
+        let mut surface = Surface {
             mask,
-            weights,
-            truth,
+            own: [0; 8],
+            points: [0; 8],
             coded: 0,
+            added: [0; 8],
+        };
+        for (octant, points) in ones(mask.into()).zip(points) {
+            surface.own[octant] = *points;
+        }
+        surface.add(KernelMap::CENTRE, mask, 0, points);
+        surface
+    }
+
+    /// Adds the neighbour at offset `k`. `points` start with those of its children.
+    #[inline(always)]
+    fn add(&mut self, k: usize, truth: u8, coded: u8, points: &[u8]) {
+        self.coded |= cells(k, coded);
+        for (octant, points) in ones(truth.into()).zip(points) {
+            let cell = cells(k, 1 << octant);
+            for (at, cells) in self.points.iter_mut().enumerate() {
+                *cells |= cell * u64::from(points >> at & 1);
+            }
         }
     }
 
-    /// Adds the neighbour at offset `k`.
+    /// Computes what children cost that are added, once all neighbours are there.
     #[inline(always)]
-    fn add(&mut self, k: usize, truth: u8, coded: u8) {
-        self.truth |= cells(k, truth);
-        self.coded |= cells(k, coded);
+    fn finish(&mut self) {
+        for octant in ones((!self.mask).into()) {
+            let shift = shift_of(octant);
+            let near = |half: usize| (0..8).any(|at| self.points[at] >> shift & AROUND[7 - at][half] != 0);
+            let half = (1..FARTHEST).find(|half| near(*half)).unwrap_or(FARTHEST);
+            self.added[octant] = ADDED * half as u32;
+        }
     }
 
     /// A lower bound of the distortion of octant `octant`, if its child is there or not as `bit` says, in sixteenths of
@@ -168,8 +190,8 @@ impl Surface {
     #[inline(always)]
     pub fn least(&self, octant: usize, bit: bool) -> u32 {
         match (self.mask >> octant & 1 == 1, bit) {
-            (true, false) => self.weights[octant].into(),
-            (false, true) => u32::from(FULL) * squared_distance(self.truth, octant),
+            (true, false) => POINT * self.own[octant].count_ones(),
+            (false, true) => self.added[octant],
             _ => 0,
         }
     }
@@ -178,30 +200,62 @@ impl Surface {
     #[inline(always)]
     pub fn of(&self, mask: u8) -> u32 {
         let coded = self.coded | cells(KernelMap::CENTRE, mask);
-        let lost = ones((self.mask & !mask).into())
-            .map(|octant| u32::from(self.weights[octant]) * squared_distance(coded, octant));
-        let added =
-            ones((mask & !self.mask).into()).map(|octant| u32::from(FULL) * squared_distance(self.truth, octant));
-        lost.sum::<u32>() + added.sum::<u32>()
+        let mut sum = 0;
+        for octant in ones((self.mask & !mask).into()) {
+            let around = coded >> shift_of(octant);
+            for at in ones(self.own[octant].into()) {
+                let half = (1..FARTHEST).find(|half| around & AROUND[at][*half] != 0);
+                sum += POINT * half.unwrap_or(FARTHEST) as u32;
+            }
+        }
+        for octant in ones((mask & !self.mask).into()) {
+            sum += self.added[octant];
+        }
+        sum
     }
+}
+
+/// Distortion of a point, and of a voxel that is added, for each half squared voxel, in sixteenths of a squared voxel.
+const POINT: u32 = 2;
+const ADDED: u32 = 8;
+
+/// Half squared voxels to the farthest of the cells around a cell.
+const FARTHEST: usize = 9;
+
+/// For a point in each octant of a cell, and by half squared voxels, the near cells whose centres are so much farther
+/// from it than the cell's own. Along an axis it is ½ to the side where the point is, 1½ to the other.
+static AROUND: [[u64; FARTHEST + 1]; 8] = {
+    let mut around = [[0; FARTHEST + 1]; 8];
+    let mut at = 0;
+    while at < 8 * 27 {
+        let (octant, k) = (at / 27, at % 27);
+        let place = [k % 3, k / 3 % 3, k / 9];
+        let (mut half, mut axis) = (0, 0);
+        while axis < 3 {
+            let side = 2 * (octant >> axis & 1);
+            half += match place[axis] {
+                1 => 0,
+                place if place == side => 1,
+                _ => 3,
+            };
+            axis += 1;
+        }
+        around[octant][half] |= 1 << (place[0] + 4 * place[1] + 16 * place[2]);
+        at += 1;
+    }
+    around
+};
+
+/// How far masks of cells are shifted for the child in `octant`.
+#[inline(always)]
+fn shift_of(octant: usize) -> usize {
+    (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2)
 }
 
 /// Cells of the children `mask` of the neighbour at offset `k`.
 #[inline(always)]
 fn cells(k: usize, mask: u8) -> u64 {
     CELLS[k][0][usize::from(mask & 15)] | CELLS[k][1][usize::from(mask >> 4)]
-}
-
-/// Squared distance from a child to the nearest of `cells` but itself; 4 if none is around it.
-#[inline(always)]
-fn squared_distance(cells: u64, octant: usize) -> u32 {
-    let around = cells >> ((octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2));
-    match (around & FACES, around & EDGES, around & CORNERS) {
-        (0, 0, 0) => 4,
-        (0, 0, _) => 3,
-        (0, _, _) => 2,
-        _ => 1,
-    }
 }
 
 /// Code length of a decision of probability `one / 65536`, in units of 1/256 bit.
@@ -309,12 +363,21 @@ mod tests {
         Octree::new(Voxels::new(7, (0..128 * 128).map(column).collect())).unwrap()
     }
 
+    /// Points in the voxels of a level: some, by their places, where the octree ends with it.
+    fn points(octree: &Octree, level: u8) -> Vec<u8> {
+        let some = |key: &u64| (key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 56) as u8 | 1;
+        match level == octree.depth() {
+            true => octree.level(level).keys().iter().map(some).collect(),
+            false => octree.occupancy(level).to_vec(),
+        }
+    }
+
     /// The level optimised with this λ, in slices of 1000, and the octree that it decodes to.
     fn optimised(octree: &Octree, level: u8, lambda: u32) -> (Vec<(u32, Vec<u8>)>, Octree) {
         let map = octree.kernel_map(level - 1);
-        let weights = vec![FULL; octree.level(level).len()];
+        let points = points(octree, level);
         let distortion = Distortion {
-            weights: &weights,
+            points: &points,
             lambda,
         };
         let (masks, encoded) = optimise_level(Isa::detect(), octree, &map, level, 1000, distortion);
@@ -376,9 +439,9 @@ mod tests {
         let one = with_threads(1);
         assert_eq!(one, with_threads(3));
         let map = octree.kernel_map(6);
-        let weights = vec![FULL; octree.level(7).len()];
+        let points = points(&octree, 7);
         let distortion = Distortion {
-            weights: &weights,
+            points: &points,
             lambda: 200,
         };
         for isa in Isa::available() {
@@ -403,44 +466,68 @@ mod tests {
         }
 
         #[test]
-        fn distortions_match_their_definition(
-            truth in prop::array::uniform27(any::<u8>()), coded in prop::array::uniform27(any::<u8>()),
-            weights in prop::array::uniform8(1u8..=FULL), mask in 1u8..
-        ) {
-            let own = truth[KernelMap::CENTRE].max(1);
-            let children: Vec<u8> = ones(own.into()).map(|octant| weights[octant]).collect();
-            let mut surface = Surface::new(own, &children);
-            for k in (0..27).filter(|k| *k != KernelMap::CENTRE) {
-                surface.add(k, truth[k], coded[k]);
-            }
-            // Places of the children around and in the parent, if its own are these.
-            let places = |around: &[u8; 27], own: u8| -> Vec<[i32; 3]> {
-                let of = |k: usize, o: usize| {
-                    let parent = [k % 3, k / 3 % 3, k / 9].map(|x| 2 * (x as i32 - 1));
-                    let child = [o & 1, o >> 1 & 1, o >> 2].map(|x| x as i32);
-                    std::array::from_fn(|c| parent[c] + child[c])
-                };
-                let mask = |k: usize| if k == KernelMap::CENTRE { own } else { around[k] };
-                (0..27).flat_map(|k| ones(mask(k).into()).map(move |o| of(k, o))).collect()
-            };
-            let nearest = |octant: usize, places: &[[i32; 3]]| {
-                let at = [octant & 1, octant >> 1 & 1, octant >> 2].map(|x| x as i32);
-                let squared = |p: &[i32; 3]| (0..3).map(|c| (p[c] - at[c]).pow(2) as u32).sum::<u32>();
-                let near = |p: &&[i32; 3]| (0..3).all(|c| (p[c] - at[c]).abs() <= 1);
-                places.iter().filter(near).map(squared).min().unwrap_or(4)
-            };
-            let (all, kept) = (places(&truth, own), places(&coded, mask));
-            let mut want = 0;
-            for octant in 0..8 {
-                match (own >> octant & 1, mask >> octant & 1) {
-                    (1, 0) => want += u32::from(weights[octant]) * nearest(octant, &kept),
-                    (0, 1) => want += u32::from(FULL) * nearest(octant, &all),
-                    _ => {}
+        fn distortions_match_their_definition(keys in prop::collection::vec(0u64..1 << 12, 1..200), mask in 1u8..) {
+            let octree = Octree::new(Voxels::new(4, keys)).unwrap();
+            let (parents, truth) = (octree.level(2), octree.occupancy(2));
+            let points = octree.occupancy(3);
+            let (map, first) = (octree.kernel_map(2), octree.first_child(2));
+            for parent in 0..parents.len() {
+                let of = |parent: usize| &points[first[parent] as usize..];
+                let mut surface = Surface::new(truth[parent], of(parent));
+                for k in (0..27).filter(|k| *k != KernelMap::CENTRE) {
+                    let neighbour = map.row(parent)[k];
+                    if neighbour != KernelMap::ABSENT {
+                        let neighbour = neighbour as usize;
+                        surface.add(k, truth[neighbour], truth[neighbour], of(neighbour));
+                    }
                 }
+                surface.finish();
+                let want = by_definition(&octree, parent, mask);
+                prop_assert_eq!(surface.of(mask), want);
+                let least = (0..8).map(|octant| surface.least(octant, mask >> octant & 1 == 1));
+                prop_assert!(least.sum::<u32>() <= want);
             }
-            prop_assert_eq!(surface.of(mask), want);
-            let least = (0..8).map(|octant| surface.least(octant, mask >> octant & 1 == 1));
-            prop_assert!(least.sum::<u32>() <= want);
         }
+    }
+
+    /// The distortion if a voxel of level 2 has these children and all others are exact, by coordinates in quarters of
+    /// a voxel of level 3.
+    fn by_definition(octree: &Octree, parent: usize, mask: u8) -> u32 {
+        let centre = |key: u64| morton::decode(key).map(|x| 4 * i64::from(x) + 2);
+        let point = |key: u64| morton::decode(key).map(|x| 2 * i64::from(x) + 1);
+        let squared = |a: [i64; 3], b: [i64; 3]| (0..3).map(|c| (a[c] - b[c]).pow(2)).sum::<i64>();
+        let near = |a: u64, b: u64| {
+            let (a, b) = (morton::decode(a), morton::decode(b));
+            (0..3).all(|c| a[c].abs_diff(b[c]) <= 1)
+        };
+        let key = octree.level(2).keys()[parent];
+        let coded: Vec<u64> = (0..512)
+            .filter(|child| match child >> 3 == key {
+                true => mask >> (child & 7) & 1 == 1,
+                false => octree.level(3).keys().binary_search(child).is_ok(),
+            })
+            .collect();
+        let mut sum = 0;
+        for child in key << 3..=key << 3 | 7 {
+            let here = octree.level(3).keys().binary_search(&child).is_ok();
+            let points = octree.level(4).keys();
+            let nearest = |distances: &mut dyn Iterator<Item = i64>| (distances.min().unwrap() - 3) / 8;
+            match (here, mask >> (child & 7) & 1 == 1) {
+                (true, false) => {
+                    for own in points.iter().filter(|point| *point >> 3 == child) {
+                        let around = coded.iter().filter(|other| near(**other, child));
+                        let mut distances = around.map(|other| squared(centre(*other), point(*own)));
+                        sum += POINT * nearest(&mut distances) as u32;
+                    }
+                }
+                (false, true) => {
+                    let around = points.iter().filter(|point| near(*point >> 3, child));
+                    let mut distances = around.map(|other| squared(centre(child), point(*other)));
+                    sum += ADDED * nearest(&mut distances) as u32;
+                }
+                _ => {}
+            }
+        }
+        sum
     }
 }
