@@ -25,9 +25,9 @@ pub enum GeometryTarget {
 
 /// λ where luma's quantisation step is one 255th. The error of a colour that is moved, and the squared error that a bit
 /// must save elsewhere, are both squares: λ grows with the squared step.
-const LAMBDA: f32 = 2e-4;
+const LAMBDA: f32 = 6e-5;
 /// The greatest λ that follows from a step.
-const MOST_LAMBDA: f32 = 0.4;
+const MOST_LAMBDA: f32 = 0.25;
 
 impl GeometryTarget {
     /// λ in units of 1/256.

@@ -1,4 +1,5 @@
-//! Rate–distortion optimised occupancy: an encoder that may move voxels by one where that saves bits.
+//! Rate–distortion optimised occupancy: an encoder that may move voxels by one where that saves bits
+//! (`docs/format.md`, clause 4, says what is coded).
 //!
 //! Which of two adjacent layers holds a voxel is often decided by sampling and rounding, and costs several bits. For
 //! each parent, in coding order, the encoder chooses the occupancy that minimises D + λ·R. R is the code length under
@@ -430,7 +431,7 @@ mod tests {
     }
 
     #[test]
-    fn any_number_of_threads_and_any_instructions_give_the_same_bytes() {
+    fn every_number_of_threads_and_every_instruction_set_give_the_same_bytes() {
         let octree = noisy_plane();
         let with_threads = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
