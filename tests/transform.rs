@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use b2p::cloud::{ColouredVoxels, voxelise};
 use b2p::container::{self, Header, Stream};
-use b2p::encoder::transform::{Options, QualityTarget, encode, encode_to_rate};
+use b2p::encoder::transform::{GeometryTarget, Options, QualityTarget, encode, encode_to_rate};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
@@ -34,6 +34,14 @@ fn sliced() -> Options {
         slice_voxels: 24,
         colour_slice: 30,
         ..Options::default()
+    }
+}
+
+/// Small slices, and optimised geometry of the finest level.
+fn visual(lambda: f32) -> Options {
+    Options {
+        geometry: GeometryTarget::Lambda(lambda),
+        ..sliced()
     }
 }
 
@@ -364,5 +372,74 @@ fn sections_are_whole_and_hold_what_the_header_tells() {
             assert_eq!(colours.levels.len(), 1);
             assert_eq!(colours.levels[0].level, level.level);
         }
+    }
+}
+
+#[test]
+fn optimised_geometry_takes_fewer_bytes_and_moves_voxels_of_the_finest_level_by_at_most_one() {
+    let cloud = Ball::new(7, 50.0).cloud();
+    let exact = stream(&cloud, &sliced());
+    let coordinates = |keys: &[u64]| -> Vec<[u32; 3]> {
+        let voxels = b2p::Voxels::new(6, keys.to_vec());
+        (0..voxels.len()).map(|i| voxels.coordinate(i)).collect()
+    };
+    let near = |a: &[[u32; 3]], b: &[[u32; 3]]| {
+        let is_near = |x: &[u32; 3], y: &[u32; 3]| (0..3).all(|c| x[c].abs_diff(y[c]) <= 1);
+        a.iter().all(|x| b.iter().any(|y| is_near(x, y)))
+    };
+    let truth = points(&exact, None).unwrap().0;
+    for lambda in [0.1, 1.0, 100.0] {
+        let bytes = stream(&cloud, &visual(lambda));
+        assert!(bytes.len() < exact.len(), "{lambda}");
+        let coded = points(&bytes, None).unwrap().0;
+        assert_ne!(coded, truth);
+        let [coded, truth] = [&coded, &truth].map(|keys| coordinates(keys));
+        assert!(near(&coded, &truth) && near(&truth, &coded), "{lambda}");
+        assert_eq!(points(&bytes, Some(5)).unwrap().0, points(&exact, Some(5)).unwrap().0);
+    }
+}
+
+#[test]
+fn geometry_stays_exact_where_nothing_else_is_asked_for_and_with_lossless_colours_and_the_cloud_s_own_level() {
+    let cloud = Ball::new(6, 25.0).cloud();
+    let default = stream(&cloud, &sliced());
+    let exact = Options {
+        geometry: GeometryTarget::Exact,
+        ..sliced()
+    };
+    assert_eq!(stream(&cloud, &exact), default);
+    assert_eq!(stream(&cloud, &visual(0.0)), default);
+    for (levels, fineness) in [(3..=5, QualityTarget::Lossless), (4..=6, QualityTarget::Step(20.0))] {
+        let with = |options: Options| Options {
+            levels: Some(levels.clone()),
+            fineness,
+            ..options
+        };
+        assert_eq!(stream(&cloud, &with(visual(1.0))), stream(&cloud, &with(sliced())));
+    }
+}
+
+#[test]
+fn optimised_geometry_is_the_same_for_any_number_of_threads() {
+    let cloud = Ball::new(6, 25.0).cloud();
+    let with_threads = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        pool.unwrap().install(|| stream(&cloud, &visual(0.5)))
+    };
+    assert_eq!(with_threads(1), with_threads(5));
+}
+
+#[test]
+fn optimised_geometry_keeps_to_a_rate() {
+    let cloud = Ball::new(7, 50.0).cloud();
+    let options = Options {
+        geometry: GeometryTarget::Visual,
+        ..sliced()
+    };
+    for bits in [0.7, 1.0, 2.0] {
+        let (encoded, chosen) = encode_to_rate(&cloud, &options, bits, &Log::default()).unwrap();
+        let most = bits * cloud.voxels.len() as f64 / 8.0;
+        assert!(encoded.bytes.len() as f64 <= most, "{bits}");
+        assert_eq!(stream(&cloud, &chosen), encoded.bytes, "{bits}");
     }
 }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use b2p::Limits;
 use b2p::encoder::Residual;
-use b2p::encoder::transform::QualityTarget;
+use b2p::encoder::transform::{GeometryTarget, QualityTarget};
 use b2p::gaussians::HeadSet;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -227,6 +227,10 @@ pub struct Encode {
     /// Code the mean colours of the finest level's voxels exactly
     #[arg(long, help_heading = "Advanced")]
     pub lossless: bool,
+    /// Geometry of the finest level. `exact`: its voxels as they are; `visual`: voxels may move by one where that saves
+    /// bits and looks alike; a number from 0 to 100 is the Lagrangian λ of that, in squared voxels per bit
+    #[arg(long, help_heading = "Advanced", value_name = "exact|visual|X", value_parser = geometry, conflicts_with = "lossless")]
+    pub geometry: Option<GeometryTarget>,
     /// How colours are coded
     #[arg(long, help_heading = "Advanced", value_enum, value_name = "HOW", default_value_t = Colours::Transform)]
     pub colours: Colours,
@@ -679,8 +683,8 @@ use super::plan::Plan;
 use super::progress::Progress;
 pub use super::values::Orbit;
 use super::values::{
-    background, bits, bits_per_point, bytes, effect, frame_rate, frames, levels, orbit, per_voxel, point, price,
-    residual, size, step,
+    background, bits, bits_per_point, bytes, effect, frame_rate, frames, geometry, levels, orbit, per_voxel, point,
+    price, residual, size, step,
 };
 pub use b2p::renderer::{Background, Effect, EffectMode, Quality};
 use b2p_formats::clouds::PointFormat;

@@ -161,6 +161,9 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) ->
     if let Some(effort) = args.effort {
         options.set_effort(effort);
     }
+    if let Some(geometry) = args.geometry {
+        options.geometry = geometry;
+    }
     match args.step {
         Some(step) => options.fineness = step,
         None if args.lossless => options.fineness = QualityTarget::Lossless,

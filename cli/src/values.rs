@@ -4,7 +4,7 @@ use std::num::NonZeroU8;
 use std::ops::RangeInclusive;
 
 use b2p::encoder::Residual;
-use b2p::encoder::transform::QualityTarget;
+use b2p::encoder::transform::{GeometryTarget, QualityTarget};
 use b2p::latents::Steps;
 use b2p::renderer::{Background, Effect, EffectMode};
 
@@ -97,6 +97,18 @@ pub fn step(text: &str) -> Result<QualityTarget, String> {
             chroma: size(chroma)?,
         },
     })
+}
+
+pub fn geometry(text: &str) -> Result<GeometryTarget, String> {
+    match text {
+        "exact" => return Ok(GeometryTarget::Exact),
+        "visual" => return Ok(GeometryTarget::Visual),
+        _ => {}
+    }
+    match text.parse() {
+        Ok(lambda) if (0.0..=100.0).contains(&lambda) => Ok(GeometryTarget::Lambda(lambda)),
+        _ => Err("expected exact, visual, or a number from 0 to 100".into()),
+    }
 }
 
 pub fn per_voxel(text: &str) -> Result<usize, String> {

@@ -14,7 +14,7 @@ use super::transform::forward;
 use super::{CodeSlice, Guide, LevelColours, Steps, Ycc, join, nodes, slices, trunk};
 use crate::coding::ONE;
 use crate::coding::binary::Encoder;
-use crate::geometry::{KernelMap, Octree, Voxels};
+use crate::geometry::{KernelMap, Octree, Voxels, morton};
 
 /// Encoding parameters of a level.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -61,7 +61,8 @@ pub struct Truth {
 
 impl Truth {
     /// Averages the colours of a cloud's voxels in each voxel of level `top`, and transforms them up to the root. If
-    /// `lossless`, colours are rounded to whole 255ths.
+    /// `lossless`, colours are rounded to whole 255ths. A voxel of the octree that holds none of the cloud's has the
+    /// mean of those of the cloud's that are nearest, at most one away.
     ///
     /// # Panics
     /// If `colours` does not have one entry per voxel, or the octree is less deep than `top`.
@@ -70,17 +71,12 @@ impl Truth {
         let shift = 3 * (voxels.depth() - top);
         let fraction = if lossless { 0 } else { FRACTION };
         let means = octree.level(top).keys().par_iter().map(|key| {
-            let first = voxels.keys().partition_point(|k| k >> shift < *key);
-            let (mut sum, mut count) = ([0u64; 3], 0u64);
-            let inside = voxels.keys()[first..].iter().take_while(|k| *k >> shift == *key);
-            for (_, colour) in inside.zip(&colours[first..]) {
-                for (sum, c) in sum.iter_mut().zip(colour) {
-                    *sum += u64::from(*c);
-                }
-                count += 1;
+            let mut sum = ColourSum::default();
+            sum.add(voxels, colours, shift, *key);
+            if sum.count == 0 {
+                sum.add_nearest(voxels, colours, shift, *key, top);
             }
-            let mean = sum.map(|sum| (((sum << (fraction + 1)) + count) / (2 * count).max(1)) as i32);
-            from_rgb(mean).map(|x| x as i16)
+            from_rgb(sum.mean(fraction)).map(|x| x as i16)
         });
         Truth {
             levels: means_above(octree, top, means.collect()),
@@ -128,6 +124,51 @@ fn means_above(octree: &Octree, top: u8, values: Vec<Ycc>) -> Vec<Vec<Ycc>> {
     }
     levels.reverse();
     levels
+}
+
+/// Colours of a cloud's voxels.
+#[derive(Debug, Default)]
+struct ColourSum {
+    sum: [u64; 3],
+    count: u64,
+}
+
+impl ColourSum {
+    /// Adds the voxels in the voxel `key`, `shift / 3` levels above.
+    fn add(&mut self, voxels: &Voxels, colours: &[[u8; 3]], shift: u8, key: u64) {
+        let first = voxels.keys().partition_point(|k| k >> shift < key);
+        let inside = voxels.keys()[first..].iter().take_while(|k| *k >> shift == key);
+        for (_, colour) in inside.zip(&colours[first..]) {
+            for (sum, c) in self.sum.iter_mut().zip(colour) {
+                *sum += u64::from(*c);
+            }
+            self.count += 1;
+        }
+    }
+
+    /// Adds the voxels in those neighbours of the voxel `key` of level `level` that are nearest to it.
+    fn add_nearest(&mut self, voxels: &Voxels, colours: &[[u8; 3]], shift: u8, key: u64, level: u8) {
+        let at = morton::decode(key).map(i64::from);
+        for distance in 1..=3 {
+            for k in 0..27i64 {
+                let offset = [k % 3 - 1, k / 3 % 3 - 1, k / 9 - 1];
+                let place: [i64; 3] = std::array::from_fn(|i| at[i] + offset[i]);
+                let inside = place.iter().all(|x| (0..1i64 << level).contains(x));
+                if inside && offset.iter().map(|x| x * x).sum::<i64>() == distance {
+                    self.add(voxels, colours, shift, morton::encode(place.map(|x| x as u32)));
+                }
+            }
+            if self.count > 0 {
+                return;
+            }
+        }
+    }
+
+    /// The mean, with so many fractional bits.
+    fn mean(&self, fraction: u32) -> [i32; 3] {
+        self.sum
+            .map(|sum| (((sum << (fraction + 1)) + self.count) / (2 * self.count).max(1)) as i32)
+    }
 }
 
 /// Encodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K, `guides` what

@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use b2p_kernels::Isa;
 
-use super::transform::{self, QualityTarget};
+use super::transform::{self, GeometryTarget, QualityTarget};
 use super::{Encoded, Options, encode, encode_to_rate};
 use crate::cancel::Cancel;
 use crate::cloud::ColouredVoxels;
@@ -57,6 +57,13 @@ impl Encoder {
     /// The same encoder with another quality of colours. Without effect on streams of version 2.
     pub fn with_quality(mut self, quality: QualityTarget) -> Self {
         self.options.fineness = quality;
+        self
+    }
+
+    /// The same encoder with exact or optimised geometry of the finest level. Without effect on streams of version 2.
+    /// Default: exact.
+    pub fn with_geometry(mut self, geometry: GeometryTarget) -> Self {
+        self.options.geometry = geometry;
         self
     }
 

@@ -5,9 +5,11 @@ mod knobs;
 mod motion;
 mod predicted;
 mod rate_control;
+mod shape;
 
 use std::fmt;
 use std::ops::RangeInclusive;
+use std::sync::Arc;
 
 use b2p_kernels::Isa;
 use rayon::prelude::*;
@@ -28,6 +30,8 @@ use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
 pub use predicted::{PredictedFrame, encode_predicted};
 pub use rate_control::encode_to_rate;
+pub use shape::GeometryTarget;
+use shape::Shape;
 
 /// How exactly colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,6 +59,8 @@ pub struct Options {
     pub levels: Option<RangeInclusive<u8>>,
     /// How exactly colours are coded.
     pub fineness: QualityTarget,
+    /// How exactly the finest level's voxels are coded. Default: exactly.
+    pub geometry: GeometryTarget,
     /// Whether levels have a filter that the decoder runs on their colours.
     pub filter: bool,
     /// Whether quantisation is rate–distortion optimised; otherwise coefficients are rounded to the nearest.
@@ -79,6 +85,7 @@ impl Default for Options {
         Options {
             levels: None,
             fineness: QualityTarget::Step(20.0),
+            geometry: GeometryTarget::Exact,
             filter: true,
             optimised: true,
             tries: usize::MAX,
@@ -112,7 +119,8 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
     let mut subject = EncoderInput::new(cloud, levels, options, log)?;
     let top = *subject.levels.end();
-    let coded = subject.code(top, steps, log)?;
+    let shape = subject.shape(top, options.geometry.lambda(steps), log)?;
+    let coded = subject.code(top, steps, shape, log)?;
     // They are needed no more, and are the largest part.
     subject.maps = Vec::new();
     subject.checked(coded, options.heads.as_ref(), usize::MAX, log)
@@ -220,6 +228,8 @@ struct Guides {
 struct Coded {
     bytes: Vec<u8>,
     top: u8,
+    /// Its geometry, unless that is exact.
+    shape: Option<Arc<Shape>>,
     /// The colours of the finest level, filtered.
     colours: Vec<[u8; 3]>,
     /// Last level and payload of the colour trunk.
@@ -304,9 +314,20 @@ impl<'a> EncoderInput<'a> {
     }
 
     /// The colours that a stream whose last level is `top` approaches.
-    fn truth(&self, top: u8, lossless: bool) -> Truth {
+    fn truth(&self, top: u8, shape: Option<&Shape>, lossless: bool) -> Truth {
         let ColouredVoxels { voxels, colours, .. } = self.cloud;
-        Truth::new(voxels, colours, &self.octree, top, lossless)
+        Truth::new(voxels, colours, self.octree(shape), top, lossless)
+    }
+
+    /// The octree of streams of this shape.
+    fn octree<'b>(&'b self, shape: Option<&'b Shape>) -> &'b Octree {
+        shape.map_or(&self.octree, |shape| &shape.octree)
+    }
+
+    /// The last level of the colour trunk of a stream whose last level is `top`.
+    fn trunk_depth(&self, top: u8) -> u8 {
+        let base = *self.levels.start().min(&top);
+        colour::trunk_depth(base, |level| self.octree.level(level).len())
     }
 
     /// How levels are coded, if the last one, `top`, has these steps: the coarser a level, the smaller are its steps,
@@ -324,23 +345,34 @@ impl<'a> EncoderInput<'a> {
     }
 
     /// Codes the colours of the levels down to `top`.
-    fn code(&self, top: u8, steps: Steps, log: &Log) -> Result<Coded> {
+    fn code(&self, top: u8, steps: Steps, shape: Option<Arc<Shape>>, log: &Log) -> Result<Coded> {
         let truth = log.step("mean colours", self.cloud.voxels.len(), "voxels", || {
-            Ok(self.truth(top, steps.is_lossless()))
+            Ok(self.truth(top, shape.as_deref(), steps.is_lossless()))
         })?;
-        self.code_towards(&truth, top, steps, log)
+        self.code_towards(&truth, top, steps, shape, log)
     }
 
     /// The same, of colours that have been computed.
-    fn code_towards(&self, truth: &Truth, top: u8, steps: Steps, log: &Log) -> Result<Coded> {
-        let (octree, maps, isa) = (&self.octree, &self.maps, self.isa);
+    fn code_towards(
+        &self,
+        truth: &Truth,
+        top: u8,
+        steps: Steps,
+        shape: Option<Arc<Shape>>,
+        log: &Log,
+    ) -> Result<Coded> {
+        let (octree, isa) = (self.octree(shape.as_deref()), self.isa);
+        let map_of = |level: u8| match &shape {
+            Some(shape) if level == top => &shape.map,
+            _ => &self.maps[usize::from(level)],
+        };
         let slice = self.options.colour_slice as usize;
         let base = *self.levels.start().min(&top);
-        let trunk = colour::trunk_depth(base, |level| octree.level(level).len());
+        let trunk = self.trunk_depth(top);
         let count = octree.level(trunk).len();
         let name = format!("colours of levels 0 to {trunk}");
         let (payload, mut coloured) = log.step(name, count, "voxels", || {
-            let maps = &maps[..=usize::from(trunk)];
+            let maps = &self.maps[..=usize::from(trunk)];
             let coding = self.coding(steps, top, trunk);
             let guides = self.guides.iter().flat_map(|guides| &guides.colours);
             let guides: Vec<_> = guides.map(ColourGuide::guide).collect();
@@ -353,7 +385,7 @@ impl<'a> EncoderInput<'a> {
             let count = octree.level(level).len();
             let mut slices = Vec::new();
             if level > trunk {
-                let [above, map] = [level - 1, level].map(|n| &maps[usize::from(n)]);
+                let [above, map] = [level - 1, level].map(map_of);
                 let coding = self.coding(steps, top, level);
                 let guide = self
                     .guides
@@ -375,17 +407,17 @@ impl<'a> EncoderInput<'a> {
                 let name = format!("filter of level {level}");
                 let most = match level == top {
                     true => usize::MAX,
-                    false => (bytes + self.geometry_bytes(level)) / FILTER_SHARE,
+                    false => (bytes + self.geometry_bytes(level, None)) / FILTER_SHARE,
                 };
                 filter = log.step(name, count, "voxels", || {
-                    let map = &maps[usize::from(level)];
+                    let map = map_of(level);
                     let filter = Filter::fit(isa, &coloured, map, truth.level(level));
                     Ok(filter.filter(|filter| filter.to_bytes().len() <= most))
                 })?;
             }
             if level == top {
                 colours = match &filter {
-                    Some(filter) => filter.rgb(isa, &coloured, &maps[usize::from(level)]),
+                    Some(filter) => filter.rgb(isa, &coloured, map_of(level)),
                     None => coloured.rgb(),
                 };
             }
@@ -400,6 +432,7 @@ impl<'a> EncoderInput<'a> {
         let mut coded = Coded {
             bytes: Vec::new(),
             top,
+            shape,
             colours,
             trunk: (trunk, payload),
             layers,
@@ -408,15 +441,19 @@ impl<'a> EncoderInput<'a> {
         Ok(coded)
     }
 
-    /// Bytes of the geometry of the levels 1 to `level`.
-    fn geometry_bytes(&self, level: u8) -> usize {
-        let levels = self.geometry[..usize::from(level)].iter().flatten();
-        levels.map(|(_, bytes)| bytes.len()).sum()
+    /// Bytes of the geometry of the levels 1 to `level`, which may have a shape.
+    fn geometry_bytes(&self, level: u8, shape: Option<&Shape>) -> usize {
+        let exact = usize::from(level) - usize::from(shape.is_some());
+        let last = shape.into_iter().flat_map(|shape| &shape.geometry);
+        let levels = self.geometry[..exact].iter().flatten();
+        levels.chain(last).map(|(_, bytes)| bytes.len()).sum()
     }
 
     /// The stream of what was coded.
     fn written(&self, coded: &Coded) -> Result<Vec<u8>> {
-        let header = self.header(coded.top, |level| self.octree.level(level).len());
+        let header = self.header(coded.top, |level| {
+            self.octree(coded.shape.as_deref()).level(level).len()
+        });
         let base = header.base;
         let mut writer = Writer::new(header)?;
         self.write(&mut writer, base, coded)?;
@@ -425,24 +462,30 @@ impl<'a> EncoderInput<'a> {
 
     /// Writes the sections of all levels.
     fn write(&self, writer: &mut Writer, base: u8, coded: &Coded) -> Result<()> {
-        let Coded { trunk, layers, .. } = coded;
+        let Coded {
+            trunk, layers, shape, ..
+        } = coded;
         let (trunk, payload) = (trunk.0, &trunk.1);
         let slice = self.options.slice_voxels as usize;
         let voxels = |level: usize| self.octree.level(level as u8).len();
         // Levels of one slice each.
         let small = (1..=usize::from(base)).take_while(|level| voxels(level - 1) <= slice);
         let small = small.count();
-        let levels = self.geometry[..small].iter().flatten();
+        let geometry = |level: u8| match shape {
+            Some(shape) if level == coded.top => &shape.geometry,
+            _ => &self.geometry[usize::from(level) - 1],
+        };
+        let levels = (1..=small).flat_map(|level| geometry(level as u8));
         let levels: Vec<_> = levels.map(|(count, bytes)| (*count, bytes)).collect();
         writer.geometry_trunk(&levels)?;
         let rest = small + 1..=usize::from(base);
         for level in rest {
-            writer.geometry(level as u8, &self.geometry[level - 1])?;
+            writer.geometry(level as u8, geometry(level as u8))?;
         }
         for layer in layers {
             let level = layer.level;
             if level > base {
-                writer.geometry(level, &self.geometry[usize::from(level) - 1])?;
+                writer.geometry(level, geometry(level))?;
             }
             if level == trunk {
                 let hash = layers[usize::from(base - trunk)].hash;
@@ -465,7 +508,9 @@ impl<'a> EncoderInput<'a> {
     /// at most `most` bytes with them.
     fn checked(&self, mut coded: Coded, heads: Option<&HeadsModel>, most: usize, log: &Log) -> Result<Encoded> {
         let top = coded.top;
-        let voxels = self.octree.level(top);
+        let shape = coded.shape.clone();
+        let octree = self.octree(shape.as_deref());
+        let voxels = octree.level(top);
         let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
         let mut decoding = decoder.with_level(top).start();
         decoding.push(&coded.bytes);
@@ -484,7 +529,7 @@ impl<'a> EncoderInput<'a> {
         let same = log.step("decode again", voxels.len(), "voxels", || {
             while let Some(level) = decoding.advance()? {
                 if let Some(reference) = reference.as_ref().filter(|_| self.has_head_map(level)) {
-                    maps.push((level, self.head_map(reference, &mut decoding, level)?));
+                    maps.push((level, head_map(octree, reference, &mut decoding, level)?));
                 }
             }
             let points = decoding.points();
@@ -508,15 +553,6 @@ impl<'a> EncoderInput<'a> {
         let bytes = coded.bytes;
         let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);
         Ok(Encoded { bytes, rates })
-    }
-
-    /// Compares the ways to draw the level that was decoded.
-    fn head_map(&self, reference: &head_maps::Reference, decoding: &mut Decoding<'_>, level: u8) -> Result<HeadMap> {
-        decoding.set_heads(HeadSet::Surfels)?;
-        let surfels = decoding.gaussians()?;
-        let comparison = reference.compare_surfels(&self.octree, level, surfels)?;
-        decoding.set_heads(HeadSet::Best)?;
-        comparison.with_learned(&decoding.gaussians()?)
     }
 
     /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its
@@ -556,4 +592,18 @@ fn counted(parents: usize, slice: usize, payloads: Vec<Vec<u8>>) -> Vec<(u32, Ve
     let count = |i: usize| (parents - i * slice).min(slice) as u32;
     let payloads = payloads.into_iter().enumerate();
     payloads.map(|(i, bytes)| (count(i), bytes)).collect()
+}
+
+/// Compares the ways to draw the level that was decoded.
+fn head_map(
+    octree: &Octree,
+    reference: &head_maps::Reference,
+    decoding: &mut Decoding<'_>,
+    level: u8,
+) -> Result<HeadMap> {
+    decoding.set_heads(HeadSet::Surfels)?;
+    let surfels = decoding.gaussians()?;
+    let comparison = reference.compare_surfels(octree, level, surfels)?;
+    decoding.set_heads(HeadSet::Best)?;
+    comparison.with_learned(&decoding.gaussians()?)
 }

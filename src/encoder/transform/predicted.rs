@@ -77,7 +77,7 @@ pub fn encode_predicted(
         guides: Some(guides),
     };
     let subject = subject.with_octree(target.octree, top, log)?;
-    let stream = subject.code_towards(&target.truth, top, steps, log)?.bytes;
+    let stream = subject.code_towards(&target.truth, top, steps, None, log)?.bytes;
     let motion = plan.head.write(base, &plan.blocks)?;
     Ok(PredictedFrame { stream, motion })
 }

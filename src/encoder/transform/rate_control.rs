@@ -4,6 +4,9 @@
 //! in smaller and smaller steps, then the next level, and so on; at the end of the path are the exact colours of the
 //! finest level. A level is on the path from the greatest step that its geometry is worth.
 
+use std::sync::Arc;
+
+use super::shape::Shape;
 use super::{Coded, EncoderInput, MAX_CHROMA, Options, QualityTarget, choose_levels, steps_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth};
@@ -55,13 +58,14 @@ pub fn encode_to_rate(
         subject: &subject,
         room,
         least: f64::INFINITY,
+        shapes: Vec::new(),
         truth: None,
         tries: 0,
     };
     let mut found = None;
     for top in levels.clone().rev() {
         // What does not fit without colours does not fit with them.
-        if subject.geometry_bytes(top) as f64 > room && top > *levels.start() {
+        if top > *levels.start() && search.geometry_bytes(top, log)? > room {
             continue;
         }
         found = search.level(top, top == *levels.start(), log)?;
@@ -93,8 +97,10 @@ struct Search<'a> {
     room: f64,
     /// Of the smallest stream so far.
     least: f64,
-    /// The lossy colours of the level at hand.
-    truth: Option<(u8, Truth)>,
+    /// Shapes by level and λ.
+    shapes: Vec<(u8, u32, Option<Arc<Shape>>)>,
+    /// The lossy colours of the level at hand, by its λ, too.
+    truth: Option<(u8, u32, Truth)>,
     tries: usize,
 }
 
@@ -112,7 +118,7 @@ impl Search<'_> {
             top,
             steps: steps_of(at / 2, at.div_ceil(2)),
         };
-        let fixed = self.subject.geometry_bytes(top) as f64;
+        let fixed = self.geometry_bytes(top, log)?;
         // Bytes of the finest place that fits and of the coarsest that does not, beyond the geometry's.
         let (mut fits, mut exceeds): (Option<Candidate>, Option<Candidate>) = (None, None);
         let mut best = None;
@@ -149,6 +155,24 @@ impl Search<'_> {
         Ok(Some(best))
     }
 
+    /// The shape of a stream with the last level `top` and these steps.
+    fn shape(&mut self, top: u8, steps: Steps, log: &Log) -> Result<Option<Arc<Shape>>> {
+        let lambda = self.subject.options.geometry.lambda(steps);
+        let known = self.shapes.iter().find(|known| (known.0, known.1) == (top, lambda));
+        if let Some((_, _, shape)) = known {
+            return Ok(shape.clone());
+        }
+        let shape = self.subject.shape(top, lambda, log)?;
+        self.shapes.push((top, lambda, shape.clone()));
+        Ok(shape)
+    }
+
+    /// Bytes of the geometry of a stream with the last level `top`, at the place that is tried first.
+    fn geometry_bytes(&mut self, top: u8, log: &Log) -> Result<f64> {
+        let shape = self.shape(top, steps_of(FIRST / 2, FIRST.div_ceil(2)), log)?;
+        Ok(self.subject.geometry_bytes(top, shape.as_deref()) as f64)
+    }
+
     /// Bytes to set aside for head maps: none where they might take more than 6 % of the stream.
     fn head_map_bytes(&self, top: u8) -> usize {
         let bytes = match self.subject.options.heads {
@@ -169,18 +193,20 @@ impl Search<'_> {
         let how = QualityTarget::of(steps);
         let name = format!("try {}: level {top}, {how}", self.tries);
         let points = self.subject.cloud.voxels.len();
+        let shape = self.shape(top, steps, log)?;
+        let lambda = shape.as_ref().map_or(0, |shape| shape.lambda());
         let coded = log.step(name, points, "points", || {
             let log = &Log::off();
             if steps.is_lossless() {
-                return self.subject.code(top, steps, log);
+                return self.subject.code(top, steps, shape, log);
             }
-            if self.truth.as_ref().is_none_or(|(of, _)| *of != top) {
-                self.truth = Some((top, self.subject.truth(top, false)));
-            }
-            match &self.truth {
-                Some((_, truth)) => self.subject.code_towards(truth, top, steps, log),
-                None => self.subject.code(top, steps, log),
-            }
+            let truth = match self.truth.take() {
+                Some((level, of, truth)) if (level, of) == (top, lambda) => truth,
+                _ => self.subject.truth(top, shape.as_deref(), false),
+            };
+            let coded = self.subject.code_towards(&truth, top, steps, shape, log);
+            self.truth = Some((top, lambda, truth));
+            coded
         })?;
         let size = (coded.bytes.len() + self.head_map_bytes(top)) as f64;
         self.least = self.least.min(size);

@@ -61,7 +61,7 @@ const fn cell_of(at: usize) -> usize {
 
 /// Cells of a neighbour's children, by its offset, by half of its occupancy (low or high four octants), and by these
 /// four bits.
-static CELLS: [[[u64; 16]; 2]; 27] = {
+pub(super) static CELLS: [[[u64; 16]; 2]; 27] = {
     let mut cells = [[[0; 16]; 2]; 27];
     let mut k = 0;
     while k < 27 {

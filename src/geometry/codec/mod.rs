@@ -27,6 +27,8 @@ pub mod guide;
 mod mixer;
 mod neighbourhood;
 pub mod network;
+#[cfg(feature = "encoder")]
+mod optimise;
 mod predictor;
 
 use super::{KernelMap, Octree};
@@ -37,6 +39,8 @@ use b2p_kernels::{Instructions, Isa, Work};
 use coder::{Decoder, Encoder};
 use guide::Guide;
 use neighbourhood::Neighbourhood;
+#[cfg(feature = "encoder")]
+pub use optimise::{Distortion, optimise_level};
 use predictor::Predictor;
 use rayon::prelude::*;
 use std::ops::Range;

@@ -15,6 +15,8 @@ use super::guide::Refiner;
 use super::mixer::Mixer;
 use super::neighbourhood::Neighbourhood;
 use super::network::Network;
+#[cfg(feature = "encoder")]
+use super::optimise::{self, Surface};
 use crate::coding::ONE;
 use crate::coding::probability::{LIMIT, squash};
 use crate::geometry::ones;
@@ -54,23 +56,10 @@ impl<I: Instructions> Predictor<I> {
         }
     }
 
-    /// Codes the occupancy of a voxel. `neighbours` is its neighbourhood and `row` its row of the kernel map.
-    /// `occupancies` are those of the slice, from its first voxel, of index `first`, at least up to this one. `window` is
-    /// what a previous frame has there.
-    ///
-    /// An encoder codes `occupancy`, never 0, and returns it. A decoder ignores it and returns what it decoded, also
-    /// never 0: if seven children are absent, the eighth is implied and not coded.
+    /// The input of the hidden layer and the contexts of a voxel, before any of its children is known. The arguments are
+    /// those of [`Predictor::code`].
     #[inline(always)]
-    pub fn code(
-        &mut self,
-        coder: &mut impl Coder,
-        neighbours: Neighbourhood,
-        row: &[u32],
-        first: usize,
-        occupancies: &[u8],
-        occupancy: u8,
-        window: Option<u64>,
-    ) -> u8 {
+    fn gather(&self, neighbours: Neighbourhood, row: &[u32], first: usize, occupancies: &[u8]) -> (Row, Contexts) {
         let (network, mut contexts) = (self.network, Contexts::new());
         let (mut rows, mut count) = ([network.presence(0); 2 * 26 + 2 * 19], 0);
         for k in ones(neighbours.there & !neighbours.known) {
@@ -91,14 +80,35 @@ impl<I: Instructions> Predictor<I> {
             }
         }
         contexts.set_faces(neighbours);
-        let features = hidden::add_up(self.instructions, &rows[..count]);
+        (hidden::add_up(self.instructions, &rows[..count]), contexts)
+    }
+
+    /// Codes the occupancy of a voxel. `neighbours` is its neighbourhood and `row` its row of the kernel map.
+    /// `occupancies` are those of the slice, from its first voxel, of index `first`, at least up to this one. `window` is
+    /// what a previous frame has there.
+    ///
+    /// An encoder codes `occupancy`, never 0, and returns it. A decoder ignores it and returns what it decoded, also
+    /// never 0: if seven children are absent, the eighth is implied and not coded.
+    #[inline(always)]
+    pub fn code(
+        &mut self,
+        coder: &mut impl Coder,
+        neighbours: Neighbourhood,
+        row: &[u32],
+        first: usize,
+        occupancies: &[u8],
+        occupancy: u8,
+        window: Option<u64>,
+    ) -> u8 {
+        let network = self.network;
+        let (features, mut contexts) = self.gather(neighbours, row, first, occupancies);
         let mut coded = 0u8;
         for octant in 0..8 {
             if octant == 7 && coded == 0 {
                 return 0x80;
             }
             let node = 1 << octant | usize::from(coded);
-            let row = self.network.node(node);
+            let row = network.node(node);
             let sum = hidden::sum(self.instructions, &features, row, &self.output[octant]);
             let sum = self.bias[octant].wrapping_add(sum);
             let logit = (sum >> SHIFT).clamp(-LIMIT, LIMIT);
@@ -137,5 +147,65 @@ impl<I: Instructions> Predictor<I> {
             }
         }
         coded
+    }
+
+    /// The occupancy of a voxel that minimises distortion + λ · rate, never 0. The arguments are those of
+    /// [`Predictor::code`]; `lambda` is that of [`Distortion`](super::optimise::Distortion).
+    #[cfg(feature = "encoder")]
+    #[inline(always)]
+    pub fn choose(
+        &self,
+        neighbours: Neighbourhood,
+        row: &[u32],
+        first: usize,
+        occupancies: &[u8],
+        surface: &Surface,
+        lambda: u32,
+    ) -> u8 {
+        let lengths = optimise::code_lengths();
+        let (features, contexts) = self.gather(neighbours, row, first, occupancies);
+        let mut beam = optimise::Beam::new(contexts);
+        let mut next = Vec::with_capacity(beam.candidates.capacity());
+        for octant in 0..8 {
+            let truth = surface.mask >> octant & 1 == 1;
+            for candidate in &beam.candidates {
+                let mut step = |bit: bool, bits: u32| {
+                    let mut child = *candidate;
+                    child.mask |= u8::from(bit) << octant;
+                    child.bits += bits;
+                    child.least += surface.least(octant, bit);
+                    child.contexts.set_child(octant, bit);
+                    next.push(child);
+                };
+                if octant == 7 && candidate.mask == 0 {
+                    step(true, 0);
+                    continue;
+                }
+                let one = self.probability(&features, &candidate.contexts, octant, candidate.mask);
+                step(truth, optimise::bits(lengths, one, truth));
+                let other = optimise::bits(lengths, one, !truth);
+                if optimise::may_differ(other) {
+                    step(!truth, other);
+                }
+            }
+            std::mem::swap(&mut beam.candidates, &mut next);
+            next.clear();
+            beam.prune(lambda);
+        }
+        beam.best(surface, lambda)
+    }
+
+    /// The probability, in units of 2⁻¹⁶, of the child in `octant`. `coded` are the children in lower octants.
+    #[cfg(feature = "encoder")]
+    #[inline(always)]
+    fn probability(&self, features: &Row, contexts: &Contexts, octant: usize, coded: u8) -> u32 {
+        let node = 1 << octant | usize::from(coded);
+        let row = self.network.node(node);
+        let sum = hidden::sum(self.instructions, features, row, &self.output[octant]);
+        let logit = (self.bias[octant].wrapping_add(sum) >> SHIFT).clamp(-LIMIT, LIMIT);
+        match logit.abs() < CERTAIN {
+            true => self.mixer.predict(logit, contexts.hashes(octant, node)).one,
+            false => squash(logit),
+        }
     }
 }

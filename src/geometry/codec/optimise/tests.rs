@@ -1,0 +1,187 @@
+use proptest::prelude::*;
+
+use super::*;
+use crate::cancel::Cancel;
+use crate::container::Slice;
+use crate::geometry::codec::{decode_level, encode_level};
+use crate::geometry::{Voxels, morton};
+use crate::testing::Random;
+
+/// A tilted plane of depth 7, whose voxels lie in one of two layers where noise decides.
+fn noisy_plane() -> Octree {
+    let mut random = Random(3);
+    let column = |i: u32| {
+        let (x, y) = (i % 128, i / 128);
+        let noise = (random.next() % 100) as f32 / 100.0;
+        morton::encode([x, y, (20.0 + 0.21 * x as f32 + 0.13 * y as f32 + noise) as u32])
+    };
+    Octree::new(Voxels::new(7, (0..128 * 128).map(column).collect())).unwrap()
+}
+
+/// Points in the voxels of a level: some, by their places, where the octree ends with it.
+fn points(octree: &Octree, level: u8) -> Vec<u8> {
+    let some = |key: &u64| (key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 56) as u8 | 1;
+    match level == octree.depth() {
+        true => octree.level(level).keys().iter().map(some).collect(),
+        false => octree.occupancy(level).to_vec(),
+    }
+}
+
+/// The level optimised with this λ, in slices of 1000, and the octree that it decodes to.
+fn optimised(octree: &Octree, level: u8, lambda: u32) -> (Vec<(u32, Vec<u8>)>, Octree) {
+    let map = octree.kernel_map(level - 1);
+    let points = points(octree, level);
+    let distortion = Distortion {
+        points: &points,
+        lambda,
+    };
+    let (masks, encoded) = optimise_level(Isa::detect(), octree, &map, level, 1000, distortion);
+    let slices: Vec<_> = encoded
+        .iter()
+        .map(|(voxels, bytes)| Slice {
+            voxels: *voxels,
+            bytes,
+            offset: 0,
+        })
+        .collect();
+    let mut decoded = octree.truncated(level - 1);
+    decode_level(Isa::detect(), &mut decoded, &map, &slices, 1000, &Cancel::default()).unwrap();
+    assert_eq!(decoded.occupancy(level - 1), masks);
+    (encoded, decoded)
+}
+
+fn size(encoded: &[(u32, Vec<u8>)]) -> usize {
+    encoded.iter().map(|(_, bytes)| bytes.len()).sum()
+}
+
+/// Whether every voxel of `a` has one of `b` within one in each coordinate.
+fn is_near(a: &Voxels, b: &Voxels) -> bool {
+    let side = 1i64 << a.depth();
+    (0..a.len()).all(|i| {
+        let at = a.coordinate(i).map(i64::from);
+        (0..27i64).any(|k| {
+            let d = [k % 3 - 1, k / 3 % 3 - 1, k / 9 - 1];
+            let place: [i64; 3] = std::array::from_fn(|c| at[c] + d[c]);
+            let inside = place.iter().all(|x| (0..side).contains(x));
+            inside && b.keys().binary_search(&morton::encode(place.map(|x| x as u32))).is_ok()
+        })
+    })
+}
+
+#[test]
+fn a_bit_that_may_cost_nothing_leaves_the_level_exact() {
+    let octree = noisy_plane();
+    let (encoded, decoded) = optimised(&octree, 7, 0);
+    let exact = encode_level(Isa::detect(), &octree, &octree.kernel_map(6), 7, 1000);
+    assert_eq!((encoded, decoded), (exact, octree));
+}
+
+#[test]
+fn the_larger_lambda_the_fewer_bytes() {
+    let octree = noisy_plane();
+    let sizes = [0, 64, 256, 1024].map(|lambda| size(&optimised(&octree, 7, lambda).0));
+    assert!(sizes.is_sorted_by(|a, b| a > b), "{sizes:?}");
+    assert!(2 * sizes[3] < sizes[0], "{sizes:?}");
+}
+
+#[test]
+fn every_number_of_threads_and_every_instruction_set_give_the_same_bytes() {
+    let octree = noisy_plane();
+    let with_threads = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        pool.unwrap().install(|| optimised(&octree, 7, 200))
+    };
+    let one = with_threads(1);
+    assert_eq!(one, with_threads(3));
+    let map = octree.kernel_map(6);
+    let points = points(&octree, 7);
+    let distortion = Distortion {
+        points: &points,
+        lambda: 200,
+    };
+    for isa in Isa::available() {
+        assert_eq!(
+            optimise_level(isa, &octree, &map, 7, 1000, distortion).1,
+            one.0,
+            "{isa}"
+        );
+    }
+}
+
+proptest! {
+    #[test]
+    fn coded_voxels_lie_within_one_of_true_ones_and_these_of_coded_ones(
+        keys in prop::collection::vec(0u64..1 << 12, 1..400), lambda in 0u32..20_000
+    ) {
+        let octree = Octree::new(Voxels::new(4, keys)).unwrap();
+        let (_, decoded) = optimised(&octree, 4, lambda);
+        prop_assert!(is_near(decoded.level(4), octree.level(4)));
+        prop_assert!(is_near(octree.level(4), decoded.level(4)));
+        prop_assert_eq!(decoded.truncated(3), octree.truncated(3));
+    }
+
+    #[test]
+    fn distortions_match_their_definition(keys in prop::collection::vec(0u64..1 << 12, 1..200), mask in 1u8..) {
+        let octree = Octree::new(Voxels::new(4, keys)).unwrap();
+        let (parents, truth) = (octree.level(2), octree.occupancy(2));
+        let points = octree.occupancy(3);
+        let (map, first) = (octree.kernel_map(2), octree.first_child(2));
+        for parent in 0..parents.len() {
+            let of = |parent: usize| &points[first[parent] as usize..];
+            let mut surface = Surface::new(truth[parent], of(parent));
+            for k in (0..27).filter(|k| *k != KernelMap::CENTRE) {
+                let neighbour = map.row(parent)[k];
+                if neighbour != KernelMap::ABSENT {
+                    let neighbour = neighbour as usize;
+                    surface.add(k, truth[neighbour], truth[neighbour], of(neighbour));
+                }
+            }
+            surface.finish();
+            let want = by_definition(&octree, parent, mask);
+            prop_assert_eq!(surface.of(mask), want);
+            let least = (0..8).map(|octant| surface.least(octant, mask >> octant & 1 == 1));
+            prop_assert!(least.sum::<u32>() <= want);
+        }
+    }
+}
+
+/// The distortion if a voxel of level 2 has these children and all others are exact, by coordinates in quarters of
+/// a voxel of level 3.
+fn by_definition(octree: &Octree, parent: usize, mask: u8) -> u32 {
+    let centre = |key: u64| morton::decode(key).map(|x| 4 * i64::from(x) + 2);
+    let point = |key: u64| morton::decode(key).map(|x| 2 * i64::from(x) + 1);
+    let squared = |a: [i64; 3], b: [i64; 3]| (0..3).map(|c| (a[c] - b[c]).pow(2)).sum::<i64>();
+    let near = |a: u64, b: u64| {
+        let (a, b) = (morton::decode(a), morton::decode(b));
+        (0..3).all(|c| a[c].abs_diff(b[c]) <= 1)
+    };
+    let key = octree.level(2).keys()[parent];
+    let coded: Vec<u64> = (0..512)
+        .filter(|child| match child >> 3 == key {
+            true => mask >> (child & 7) & 1 == 1,
+            false => octree.level(3).keys().binary_search(child).is_ok(),
+        })
+        .collect();
+    let mut sum = 0;
+    for child in key << 3..=key << 3 | 7 {
+        let here = octree.level(3).keys().binary_search(&child).is_ok();
+        let points = octree.level(4).keys();
+        let nearest = |distances: &mut dyn Iterator<Item = i64>| (distances.min().unwrap() - 3) / 8;
+        match (here, mask >> (child & 7) & 1 == 1) {
+            (true, false) => {
+                for own in points.iter().filter(|point| *point >> 3 == child) {
+                    let around = coded.iter().filter(|other| near(**other, child));
+                    let mut distances = around.map(|other| squared(centre(*other), point(*own)));
+                    sum += POINT * nearest(&mut distances) as u32;
+                }
+            }
+            (false, true) => {
+                let around = points.iter().filter(|point| near(*point >> 3, child));
+                let mut distances = around.map(|other| squared(centre(child), point(*other)));
+                sum += ADDED * nearest(&mut distances) as u32;
+            }
+            _ => {}
+        }
+    }
+    sum
+}
