@@ -26,7 +26,8 @@ use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
-pub use predicted::{PredictedFrame, encode_predicted};
+pub use motion::Errors;
+pub use predicted::{Known, PredictedFrame, encode_predicted};
 pub use rate_control::encode_to_rate;
 
 /// How exactly colours are coded.
