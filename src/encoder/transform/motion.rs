@@ -249,7 +249,7 @@ impl Search<'_> {
 /// Voxels of a block that are noise, however few it has.
 const FEW: f32 = 4.0;
 /// Voxels of which a mean says something.
-const MANY: f32 = 8.0;
+const MANY: f32 = 16.0;
 
 /// Differences between a block and the moved previous frame.
 #[derive(Debug, Default)]
