@@ -4,7 +4,7 @@ mod common;
 
 use b2p::cloud::ColouredVoxels;
 use b2p::geometry::{Voxels, morton};
-use b2p::sequence::join;
+use b2p::sequence::{Rate, join};
 use b2p::{Decoder, Error, Limits, Placement, SequenceDecoder, SequenceEncoder, SequenceReader};
 use common::Ball;
 
@@ -188,4 +188,103 @@ fn more_frames_than_the_limit_are_refused() {
             ..
         }
     ));
+}
+
+/// A ball of level 8 of whose voxels other ones are missing in each frame.
+fn still(frame: u64) -> ColouredVoxels {
+    let is_there = |key: u64| (key ^ frame << 40).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 56 > 6;
+    let mut voxels: Vec<_> = Ball::new(8, 90.0)
+        .voxels()
+        .into_iter()
+        .map(|(at, colour)| (morton::encode(at), colour))
+        .filter(|(key, _)| is_there(*key))
+        .collect();
+    voxels.sort_unstable();
+    ColouredVoxels {
+        voxels: Voxels::new(8, voxels.iter().map(|voxel| voxel.0).collect()),
+        colours: voxels.iter().map(|voxel| voxel.1).collect(),
+        placement: Placement::VOXEL_GRID,
+    }
+}
+
+#[test]
+fn a_still_cloud_has_the_same_gaussians_in_every_frame_for_few_bits() {
+    let encoder = SequenceEncoder::new().with_levels(4..=7);
+    let bytes = encoder.encode(4, |frame| Ok(still(frame)), |_| {}).expect("a sequence");
+    let sequence = reader(&bytes);
+    let group = sequence.group(0).expect("a group");
+    let mut decoder = SequenceDecoder::new(Decoder::new());
+    let mut first = None;
+    for (at, gaussians) in decoder.gaussians(&sequence, 0..4).enumerate() {
+        let gaussians = gaussians.expect("a frame");
+        assert_eq!(group.is_whole(at), at == 0);
+        let bytes = [0, at].map(|at| group.frame_bytes(at));
+        assert!(at == 0 || 10 * bytes[1] < bytes[0], "{bytes:?}");
+        assert!(*first.get_or_insert_with(|| gaussians.clone()) == gaussians);
+    }
+}
+
+#[test]
+fn a_moved_cloud_takes_a_fraction_of_its_bits() {
+    // By whole voxels of the finest level that is coded.
+    let bytes = encoder()
+        .encode(3, |frame| Ok(moving(2 * frame)), |_| {})
+        .expect("a sequence");
+    let sequence = reader(&bytes);
+    let group = sequence.group(0).expect("a group");
+    for at in 1..3 {
+        assert!(!group.is_whole(at));
+        let bytes = [0, at].map(|at| group.frame_bytes(at));
+        assert!(2 * bytes[1] < bytes[0], "{bytes:?}");
+    }
+}
+
+#[test]
+fn lossless_frames_have_exactly_their_voxels_and_colours() {
+    let encoder = SequenceEncoder::new()
+        .with_levels(3..=6)
+        .with_quality(b2p::QualityTarget::Lossless);
+    let bytes = encoder
+        .encode(5, |frame| Ok(moving(frame)), |_| {})
+        .expect("a sequence");
+    let sequence = reader(&bytes);
+    for number in 0..5 {
+        let (keys, colours) = frame(&sequence, number, None).expect("a frame");
+        let cloud = moving(number);
+        assert_eq!((&keys[..], &colours), (cloud.voxels.keys(), &cloud.colours));
+    }
+}
+
+#[test]
+fn frames_are_coded_alone_without_prediction() {
+    let encoder = encoder().with_prediction(false);
+    let bytes = encoder
+        .encode(3, |frame| Ok(moving(frame)), |_| {})
+        .expect("a sequence");
+    let sequence = reader(&bytes);
+    let group = sequence.group(0).expect("a group");
+    assert!((0..3).all(|at| group.is_whole(at)));
+    // A whole frame is what a stream of one frame decodes to.
+    let alone = b2p::Encoder::new()
+        .with_levels(3..=5)
+        .encode(&moving(1))
+        .expect("a frame")
+        .bytes;
+    let alone = Decoder::new().whole(&alone).expect("a frame");
+    let points = alone.points().expect("a level");
+    let (keys, colours) = frame(&sequence, 1, None).expect("a frame");
+    assert_eq!((points.voxels.keys(), points.colours), (&keys[..], &colours[..]));
+}
+
+#[test]
+fn a_rate_is_kept_to_and_too_few_bits_are_refused() {
+    let cloud = |frame| Ok(moving(frame));
+    let most = Rate::BitsPerPoint(0.9);
+    let bytes = encoder().encode_to_rate(4, cloud, |_| {}, most).expect("a sequence");
+    let sequence = reader(&bytes);
+    let points = (0..4).map(|frame| moving(frame).voxels.len()).sum::<usize>();
+    assert_eq!(sequence.frames(), 4);
+    assert!(bytes.len() as f64 * 8.0 <= 0.9 * points as f64);
+    let refused = encoder().encode_to_rate(4, cloud, |_| {}, Rate::BitsPerFrame(10.0));
+    assert!(matches!(refused, Err(Error::TooFewBits { .. })));
 }

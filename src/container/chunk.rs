@@ -35,8 +35,7 @@ impl Form {
             (Form::Short, ChunkKind::Colours) => "3.3.2",
             (Form::Short, _) => "3.3.4",
             (Form::Sequence, ChunkKind::Index) => "17.2.1",
-            (Form::Sequence, ChunkKind::FrameTable) => "17.3.1",
-            (Form::Sequence, _) => "17.4.1",
+            (Form::Sequence, _) => "17.3.1",
         }
     }
 }
@@ -69,8 +68,6 @@ pub enum ChunkKind {
     PostFilter,
     /// Where surfels take the place of learned Gaussians (version 3). Ancillary.
     HeadMap,
-    /// How a level of a frame moved (sequences).
-    Motion,
     /// Where the groups of a sequence lie.
     Index,
     /// Where the frames of a group lie (sequences).
@@ -109,7 +106,7 @@ pub struct Chunks<'a> {
 }
 
 /// Form, type number and name of each kind.
-const KINDS: [(Form, u8, ChunkKind, &str); 13] = [
+const KINDS: [(Form, u8, ChunkKind, &str); 12] = [
     (Form::Fixed, 1, ChunkKind::Geometry, "geometry"),
     (Form::Fixed, 2, ChunkKind::Features, "feature"),
     (Form::Fixed, 3, ChunkKind::Filter, "filter"),
@@ -120,7 +117,6 @@ const KINDS: [(Form, u8, ChunkKind, &str); 13] = [
     (Form::Short, 7, ChunkKind::Colours, "colour"),
     (Form::Short, 8, ChunkKind::PostFilter, "colour filter"),
     (Form::Short, HEAD_MAP, ChunkKind::HeadMap, "head map"),
-    (Form::Sequence, 9, ChunkKind::Motion, "motion"),
     (Form::Sequence, 10, ChunkKind::Index, "index"),
     (Form::Sequence, 11, ChunkKind::FrameTable, "frame table"),
 ];

@@ -48,7 +48,7 @@ impl<'b> Decoding<'b> {
 
     /// A frame of a sequence: a stream of version 3 that `inter` predicts, if it is not whole.
     pub(crate) fn of_frame(decoder: Decoder, goal: Goal, bytes: Vec<u8>, inter: Option<Inter>) -> Self {
-        let frame = Transform::new(decoder.clone(), goal, Cow::Owned(bytes)).as_frame(inter);
+        let frame = Transform::new(decoder.clone(), goal, Cow::Owned(bytes)).into_frame(inter);
         Decoding {
             decoder,
             goal,

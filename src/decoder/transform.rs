@@ -139,7 +139,7 @@ impl<'b> Transform<'b> {
 
     /// The same stream as a frame of a sequence that `inter` predicts, if it is not whole. It keeps what the next frame
     /// needs.
-    pub(super) fn as_frame(mut self, inter: Option<Inter>) -> Self {
+    pub(super) fn into_frame(mut self, inter: Option<Inter>) -> Self {
         self.inter = inter;
         self.history = Some(Vec::new());
         self

@@ -115,7 +115,7 @@ impl Inter {
         let parents = (0..voxels.len()).into_par_iter().with_min_len(CHUNK);
         let (modes, windows) = parents
             .map(|parent| {
-                let (modes, shift) = field.at(voxels.keys()[parent]);
+                let Block { modes, shift, .. } = *field.at(voxels.keys()[parent]);
                 let window = match modes.geometry {
                     Mode::Intra => 0,
                     _ => {
@@ -137,21 +137,21 @@ impl Inter {
         let (field, previous) = (self.field(octree, level)?, self.level(level)?);
         let nodes = octree.level(level - 1);
         let masks = octree.occupancy(level - 1);
-        let modes: Vec<Mode> = nodes.keys().iter().map(|key| field.at(*key).0.colours).collect();
+        let modes: Vec<Mode> = nodes.keys().iter().map(|key| field.at(*key).modes.colours).collect();
         let chunks: Vec<usize> = (0..nodes.len()).step_by(CHUNK).collect();
         let moved_of = |first: usize| {
             let mut found = Vec::new();
             for node in first..nodes.len().min(first + CHUNK) {
-                let shift = field.at(nodes.keys()[node]).1;
-                let at = moved(nodes.coordinate(node).map(|x| 2 * x as i32), shift);
+                let Block { shift, low, part, .. } = *field.at(nodes.keys()[node]);
+                let own = nodes.coordinate(node).map(|x| 2 * x as i32);
                 for octant in ones(masks[node].into()) {
                     let octant = [octant & 1, octant >> 1 & 1, octant >> 2].map(|x| x as i32);
-                    let place = [at[0] + octant[0], at[1] + octant[1], at[2] + octant[2]];
-                    let index = match modes[node] {
+                    let place = [0, 1, 2].map(|axis| own[axis] + octant[axis]);
+                    found.push(match modes[node] {
                         Mode::Intra => None,
-                        _ => previous.index(place),
-                    };
-                    found.push(index.map(|index| previous.values[index]));
+                        Mode::Skip => previous.index(moved(place, shift)).map(|index| previous.values[index]),
+                        Mode::Inter => interpolated(previous, moved(place, low), part),
+                    });
                 }
             }
             found
@@ -172,12 +172,12 @@ impl Inter {
     /// The motion at `level`. The octree has the level above.
     fn field<'a>(&'a self, octree: &'a Octree, level: u8) -> Result<Field<'a>> {
         let head = &self.head;
-        let shift = |vector| shift(vector, head.unit_level, level);
+        let block = |modes, vector| Block::new(modes, vector, head.unit_level, level);
         if level <= head.block_level {
             return Ok(Field {
                 keys: &[0],
                 down: u32::from(3 * (level - 1)),
-                blocks: vec![(head.root, shift(head.vector))],
+                blocks: vec![block(head.root, head.vector)],
             });
         }
         let voxels = octree.level(head.block_level);
@@ -200,7 +200,7 @@ impl Inter {
             blocks: modes
                 .iter()
                 .zip(vectors)
-                .map(|(modes, vector)| (*modes, shift(*vector)))
+                .map(|(modes, vector)| block(*modes, *vector))
                 .collect(),
         })
     }
@@ -212,24 +212,63 @@ struct Field<'a> {
     keys: &'a [u64],
     /// Bits from the key of a node to that of its block.
     down: u32,
-    /// Modes of each block, and its vector in voxels of the level.
-    blocks: Vec<(Modes, [i32; 3])>,
+    blocks: Vec<Block>,
 }
 
-impl Field<'_> {
-    /// Modes and vector of the node with this key.
-    #[inline]
-    fn at(&self, key: u64) -> (Modes, [i32; 3]) {
-        let block = self.keys.partition_point(|block| *block < key >> self.down);
-        self.blocks[block]
+/// The motion of a block at a level.
+#[derive(Debug, Clone, Copy)]
+struct Block {
+    modes: Modes,
+    /// Its vector in voxels of the level, rounded to the nearest, halves up.
+    shift: [i32; 3],
+    /// The same rounded down, and what is left of it, in units of 1/16.
+    low: [i32; 3],
+    part: [i32; 3],
+}
+
+impl Block {
+    /// A block whose vector is in voxels of level `unit`.
+    fn new(modes: Modes, vector: [i16; 3], unit: u8, level: u8) -> Self {
+        let down = u32::from(unit - level);
+        let half = if down == 0 { 0 } else { 1i32 << (down - 1) };
+        let vector = vector.map(i32::from);
+        Block {
+            modes,
+            shift: vector.map(|x| (x + half) >> down),
+            low: vector.map(|x| x >> down),
+            part: vector.map(|x| ((x << 4) >> down) & 15),
+        }
     }
 }
 
-/// A vector in voxels of `unit` as one in voxels of `level`, rounded to the nearest, halves up.
-pub(super) fn shift(vector: [i16; 3], unit: u8, level: u8) -> [i32; 3] {
-    let down = u32::from(unit - level);
-    let half = if down == 0 { 0 } else { 1i32 << (down - 1) };
-    vector.map(|x| (i32::from(x) + half) >> down)
+/// The colour of the previous frame between voxels: at a place, less `part` sixteenths of a voxel along each axis. The
+/// mean of the voxels that are there, by their shares.
+fn interpolated(previous: &PreviousLevel, at: [i32; 3], part: [i32; 3]) -> Option<Ycc> {
+    let (mut sums, mut total) = ([0i64; 3], 0i64);
+    for corner in 0..8 {
+        let step = [corner & 1, corner >> 1 & 1, corner >> 2];
+        let share = |axis: usize| if step[axis] == 1 { part[axis] } else { 16 - part[axis] };
+        let weight = i64::from(share(0) * share(1) * share(2));
+        if weight == 0 {
+            continue;
+        }
+        if let Some(index) = previous.index([0, 1, 2].map(|axis| at[axis] - step[axis])) {
+            for (sum, value) in sums.iter_mut().zip(previous.values[index]) {
+                *sum += weight * i64::from(value);
+            }
+            total += weight;
+        }
+    }
+    (total > 0).then(|| sums.map(|sum| (2 * sum + total).div_euclid(2 * total) as i16))
+}
+
+impl Field<'_> {
+    /// The block of the node with this key.
+    #[inline]
+    fn at(&self, key: u64) -> &Block {
+        let block = self.keys.partition_point(|block| *block < key >> self.down);
+        &self.blocks[block]
+    }
 }
 
 /// Where the voxel at this place was in the previous frame.

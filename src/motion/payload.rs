@@ -303,3 +303,78 @@ fn code_escape(coder: &mut impl Coder, value: u32) -> Result<u32> {
     }
     Ok(number - 1)
 }
+
+#[cfg(all(test, feature = "encoder"))]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn head(block_level: u8) -> Head {
+        Head {
+            block_level,
+            unit_level: 12,
+            root: Modes {
+                geometry: Mode::Skip,
+                colours: Mode::Inter,
+            },
+            vector: [0, -3, 4096],
+        }
+    }
+
+    fn modes() -> impl Strategy<Value = Modes> {
+        (0u8..3, 0u8..3).prop_map(|(geometry, colours)| Modes {
+            geometry: mode_of(geometry).unwrap_or_default(),
+            colours: mode_of(colours).unwrap_or_default(),
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn motion_is_read_as_it_was_written(
+            vectors in prop::collection::vec(prop::array::uniform3(-4096i16..=4096), 1..40),
+            all in prop::collection::vec(prop::collection::vec(modes(), 40), 2..6),
+        ) {
+            let (base, top) = (6, 6 + all.len() as u8 - 2);
+            let head = head(4);
+            let modes = all.iter().map(|modes| modes[..vectors.len()].to_vec()).collect();
+            let blocks = Blocks { vectors, modes };
+            let parts = head.write(base, &blocks).unwrap();
+            prop_assert_eq!(parts.len(), usize::from(top - base) + 1);
+            let (read, first) = Head::parse(&parts[0], base, top).unwrap();
+            prop_assert_eq!(read, head);
+            let mut behind: Vec<&[u8]> = parts.iter().map(Vec::as_slice).collect();
+            behind[0] = first;
+            prop_assert_eq!(read.blocks(base, blocks.vectors.len(), &behind).unwrap(), blocks);
+        }
+
+        #[test]
+        fn any_bytes_are_read_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..80), count in 1usize..50) {
+            if let Ok((head, rest)) = Head::parse(&bytes, 6, 9) {
+                if let Ok(blocks) = head.blocks(6, count, &[rest]) {
+                    prop_assert_eq!(blocks.vectors.len(), count);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn vectors_longer_than_the_cube_and_levels_out_of_range_are_refused() {
+        let clause = |head: Head| {
+            let parsed = Head::parse(&head.to_bytes(), 6, 9).map(|(head, _)| head);
+            parsed.map_err(|error| error.clause())
+        };
+        assert!(clause(head(6)).is_ok());
+        assert_eq!(clause(head(7)).err(), Some(Some("17.5.1")));
+        let far = Head {
+            vector: [0, 0, 4097],
+            ..head(5)
+        };
+        assert_eq!(clause(far).err(), Some(Some("17.5.3")));
+        for unit_level in [8, 22] {
+            let other = Head { unit_level, ..head(5) };
+            assert_eq!(clause(other).err(), Some(Some("17.5.1")));
+        }
+        let short = Head::parse(&[0; 8], 6, 9).expect_err("too short");
+        assert_eq!(short.clause(), Some("17.5.1"));
+    }
+}

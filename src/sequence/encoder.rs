@@ -12,7 +12,7 @@ use crate::cloud::ColouredVoxels;
 use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
 use crate::container::{Header, with_axes};
 use crate::decoder::Decoder;
-use crate::encoder::transform::{self, Options, QualityTarget};
+use crate::encoder::transform::{self, Errors, Known, Options, QualityTarget};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -52,7 +52,13 @@ struct Frame {
     header: Header,
     coded: Coded,
     /// What the next frame is predicted from.
-    next: Option<Arc<Previous>>,
+    next: Option<Reference>,
+}
+
+/// A decoded frame, and what the encoder knows of it.
+struct Reference {
+    decoded: Arc<Previous>,
+    errors: Errors,
 }
 
 impl SequenceEncoder {
@@ -155,7 +161,7 @@ impl SequenceEncoder {
                 let cloud = cloud(frame).map_err(|error| in_frame(frame, error))?;
                 let ticks = (frame - first) as u32 * self.duration;
                 let follows = self.predicted && frame + 1 < end;
-                let coded = self.frame(&cloud, &previous, ticks, follows);
+                let coded = self.frame(&cloud, previous.as_ref(), ticks, follows);
                 let coded = coded.map_err(|error| in_frame(frame, error))?;
                 check_common(common.as_ref(), &coded.header, frame)?;
                 common.get_or_insert(coded.header);
@@ -178,22 +184,18 @@ impl SequenceEncoder {
     }
 
     /// Codes a frame, from the frame before if there is one in the group.
-    fn frame(
-        &self,
-        cloud: &ColouredVoxels,
-        previous: &Option<Arc<Previous>>,
-        ticks: u32,
-        follows: bool,
-    ) -> Result<Frame> {
+    fn frame(&self, cloud: &ColouredVoxels, previous: Option<&Reference>, ticks: u32, follows: bool) -> Result<Frame> {
         let log = Log::off().with_cancel(self.cancel.clone());
-        let (stream, motion) = match previous {
+        let options = &self.options;
+        let (stream, motion, known) = match previous {
             None => {
-                let stream = transform::encode(cloud, &self.options, &log)?.bytes;
-                (with_axes(&stream, &self.axes)?, Vec::new())
+                let stream = transform::encode(cloud, options, &log)?.bytes;
+                let known = follows.then(|| Known::of_whole(cloud, options, &log));
+                (with_axes(&stream, &self.axes)?, Vec::new(), known.transpose()?)
             }
-            Some(previous) => {
-                let frame = transform::encode_predicted(cloud, previous, &self.options, &log)?;
-                (frame.stream, frame.motion)
+            Some(Reference { decoded, errors }) => {
+                let frame = transform::encode_predicted(cloud, decoded, errors, options, &log)?;
+                (frame.stream, frame.motion, Some(frame.known))
             }
         };
         let header = Header::parse(&stream, &Limits::unlimited())?;
@@ -201,14 +203,17 @@ impl SequenceEncoder {
         let mut next = None;
         if follows || !motion.is_empty() {
             // What the next frame is predicted from is what the decoder will have.
-            let inter = previous.as_ref().map(|previous| {
+            let inter = previous.map(|previous| {
                 let motion: Vec<&[u8]> = motion.iter().map(Vec::as_slice).collect();
-                Inter::new(Arc::clone(previous), &motion, header.base, header.top)
+                Inter::new(Arc::clone(&previous.decoded), &motion, header.base, header.top)
             });
             let decoder = Decoder::new().with_limits(Limits::unlimited()).with_level(header.top);
             let mut decoding = decoder.start_frame(stream, inter.transpose()?);
             decoding.finish()?;
-            next = decoding.take_previous().map(Arc::new);
+            next = decoding.take_previous().zip(known).map(|(decoded, known)| Reference {
+                errors: known.errors(&decoded),
+                decoded: Arc::new(decoded),
+            });
         }
         Ok(Frame { header, coded, next })
     }

@@ -7,6 +7,7 @@ mod incremental;
 mod lies;
 #[path = "../common/seal.rs"]
 mod seal;
+mod sequences;
 mod stack;
 mod transform;
 

@@ -29,8 +29,12 @@ pub(super) struct Tolerance {
     pub near: f32,
     /// Share of voxels that may be farther off.
     pub far: f32,
-    /// Root of the mean squared difference of luma, in units of colours.
-    pub luma: f32,
+    /// Mean displacement over an eighth of a block, in voxels.
+    pub drift: f32,
+    /// Mean squared difference of colours where nothing is known of the previous frame's error, in squared units.
+    pub error: f32,
+    /// The same as a share of that error, and what may be added to it.
+    pub worse: [f32; 2],
     /// Mean difference of luma over an eighth of a block, in units of colours.
     pub mean: f32,
 }
@@ -40,6 +44,8 @@ pub(super) struct Tolerance {
 pub(super) struct Block {
     pub key: u64,
     pub vector: [i16; 3],
+    /// The mean squared error of colours with which it was last coded, if that is known.
+    pub error: Option<f32>,
     /// Its voxels become those of the moved previous frame.
     pub keep: bool,
 }
@@ -54,6 +60,8 @@ pub(super) struct Search<'a> {
     pub previous: &'a Previous,
     /// The frame itself, found by position.
     pub current: &'a Previous,
+    /// Errors of the blocks of the previous frame.
+    pub errors: &'a Errors,
     pub top: u8,
     pub block_level: u8,
 }
@@ -78,6 +86,7 @@ impl Search<'_> {
             blocks.push(Block {
                 key,
                 vector: before.map(|x| x as i16),
+                error: self.errors.get(&self.origin(key, before)).copied(),
                 keep: false,
             });
         }
@@ -89,6 +98,14 @@ impl Search<'_> {
         blocks
     }
 
+    /// The block that the centre of a block was in.
+    fn origin(&self, key: u64, vector: [i32; 3]) -> u64 {
+        let (side, blocks) = (1i32 << (self.top - self.block_level), 1i32 << self.block_level);
+        let at = morton::decode(key).map(|x| x as i32 * side + side / 2);
+        let place = [0, 1, 2].map(|axis| ((at[axis] - vector[axis]).div_euclid(side)).clamp(0, blocks - 1) as u32);
+        morton::encode(place)
+    }
+
     /// The vector found at the coarsest level, in its voxels.
     fn coarse(&self, key: u64) -> [i32; 3] {
         let down = 2.min(self.top - self.block_level);
@@ -98,7 +115,7 @@ impl Search<'_> {
             for y in -REACH..=REACH {
                 for x in -REACH..=REACH {
                     let length = (x.abs() + y.abs() + z.abs()) as f32;
-                    let cost = self.cost(level, key, [x, y, z], 1) + 0.05 * length;
+                    let cost = self.cost(level, key, [x, y, z]) + 0.05 * length;
                     if cost < best.0 {
                         best = (cost, [x, y, z]);
                     }
@@ -117,7 +134,7 @@ impl Search<'_> {
             } else {
                 3.0 + bits(0) + bits(1) + bits(2)
             };
-            self.cost(self.top, key, vector, 1) + VECTOR_BIT * bits
+            self.cost(self.top, key, vector) + VECTOR_BIT * bits
         };
         let mut best = (cost(before), before);
         let mut consider = |vector: [i32; 3]| {
@@ -139,13 +156,13 @@ impl Search<'_> {
         centre
     }
 
-    /// How badly a vector in voxels of `level` predicts the block's voxels of that level, every `every`th.
-    fn cost(&self, level: u8, key: u64, vector: [i32; 3], every: usize) -> f32 {
+    /// How badly a vector in voxels of `level` predicts the block's voxels of that level.
+    fn cost(&self, level: u8, key: u64, vector: [i32; 3]) -> f32 {
         let Some(previous) = self.previous.level(level) else {
             return 0.0;
         };
         let mut cost = 0.0;
-        for i in self.voxels(level, key).step_by(every) {
+        for i in self.voxels(level, key) {
             let at = self.octree.level(level).coordinate(i);
             let at = [0, 1, 2].map(|axis| at[axis] as i32 - vector[axis]);
             cost += match previous.index(at) {
@@ -156,7 +173,7 @@ impl Search<'_> {
                 }
             };
         }
-        cost * every as f32
+        cost
     }
 
     /// Numbers of the voxels of `level` in a block.
@@ -207,57 +224,116 @@ impl Search<'_> {
         let (own, moved) = (self.voxels(self.top, block.key), self.moved(block));
         let total = (own.len() + moved.len()) as f32;
         let vector = block.vector.map(i32::from);
-        let (mut near, mut far) = (0.0, 0.0);
-        let mut count = |level: &PreviousLevel, at: [i32; 3]| {
-            let around = level.window(at.map(|x| x - 1)) & AROUND;
-            match around & CENTRE {
-                0 if around == 0 => far += 1.0,
-                0 => near += 1.0,
-                _ => {}
-            }
-        };
-        let mut colours = Colours::default();
         let half = u32::from(self.top - self.block_level).saturating_sub(1);
+        let part = |at: [i32; 3]| at.iter().rev().fold(0, |part, x| part << 1 | (x >> half & 1) as usize);
+        let mut found = Differences::default();
         for i in own {
             let at = self.octree.level(self.top).coordinate(i).map(|x| x as i32);
             let from = [0, 1, 2].map(|axis| at[axis] - vector[axis]);
-            count(previous, from);
+            found.place(previous, from, part(at), 1.0);
             if let Some(index) = previous.index(from) {
-                let part = at.iter().rev().fold(0, |part, x| part << 1 | (x >> half & 1) as usize);
-                colours.add(part, luma_apart(self.truth.level(self.top)[i], previous.values[index]));
+                let apart = luma_apart(self.truth.level(self.top)[i], previous.values[index]);
+                found.colour(part(at), apart);
             }
         }
         for (at, _) in &moved {
-            count(current, *at);
+            found.place(current, *at, part(*at), -1.0);
         }
         // A few voxels at the border of a block are noise, too.
-        let few = 4.0;
-        near <= tolerance.near * total + few && far <= tolerance.far * total && colours.are_within(tolerance)
+        found.near <= tolerance.near * total + FEW
+            && found.far <= tolerance.far * total
+            && found.are_within(block.error, tolerance)
     }
 }
 
-/// Differences of luma in the eighths of a block.
+/// Voxels of a block that are noise, however few it has.
+const FEW: f32 = 4.0;
+/// Voxels of which a mean says something.
+const MANY: f32 = 16.0;
+
+/// Differences between a block and the moved previous frame.
 #[derive(Debug, Default)]
-struct Colours {
-    sums: [f32; 8],
+struct Differences {
+    /// Voxels that have none at their place but one beside it, and those that have none there.
+    near: f32,
+    far: f32,
+    /// Of each eighth: displacements, and the voxels that were compared.
+    displaced: [[f32; 3]; 8],
+    placed: [f32; 8],
+    /// Of each eighth: differences of colours, and the voxels that were compared.
+    colours: [f32; 8],
+    coloured: [f32; 8],
     squares: f32,
-    counts: [f32; 8],
 }
 
-impl Colours {
-    fn add(&mut self, part: usize, apart: f32) {
-        self.sums[part] += apart;
-        self.squares += apart * apart;
-        self.counts[part] += 1.0;
+impl Differences {
+    /// Compares a voxel with those of the other frame. `sign` tells from which side.
+    fn place(&mut self, other: &PreviousLevel, at: [i32; 3], part: usize, sign: f32) {
+        let mut around = other.window(at.map(|x| x - 1)) & AROUND;
+        self.placed[part] += 1.0;
+        if around & CENTRE != 0 {
+            return;
+        }
+        if around == 0 {
+            self.far += 1.0;
+            return;
+        }
+        self.near += 1.0;
+        let weight = sign / around.count_ones() as f32;
+        while around != 0 {
+            let cell = around.trailing_zeros();
+            around &= around - 1;
+            for axis in 0..3 {
+                self.displaced[part][axis] += weight * ((cell >> (2 * axis) & 3) as f32 - 1.0);
+            }
+        }
     }
 
-    fn are_within(&self, tolerance: Tolerance) -> bool {
-        let total: f32 = self.counts.iter().sum();
-        // The mean of few voxels is noise.
-        let means = self.sums.iter().zip(self.counts).filter(|(_, count)| *count >= 8.0);
-        let mut means = means.map(|(sum, count)| sum.abs() / count);
-        self.squares <= tolerance.luma * tolerance.luma * total && means.all(|mean| mean <= tolerance.mean)
+    fn colour(&mut self, part: usize, apart: f32) {
+        self.colours[part] += apart;
+        self.squares += apart * apart;
+        self.coloured[part] += 1.0;
     }
+
+    /// Whether means and squares are within the tolerance, of a block that was coded with this error.
+    fn are_within(&self, error: Option<f32>, tolerance: Tolerance) -> bool {
+        let still = (0..8).filter(|part| self.placed[*part] >= MANY).all(|part| {
+            let mean = self.displaced[part].map(|sum| sum / self.placed[part]);
+            mean.iter().map(|x| x * x).sum::<f32>() <= tolerance.drift * tolerance.drift
+        });
+        let even = (0..8).filter(|part| self.coloured[*part] >= MANY);
+        let even = { even }.all(|part| self.colours[part].abs() <= tolerance.mean * self.coloured[part]);
+        let most = error.map_or(tolerance.error, |error| tolerance.worse[0] * error + tolerance.worse[1]);
+        still && even && self.squares <= most * self.coloured.iter().sum::<f32>()
+    }
+}
+
+/// Mean squared errors of colours, of blocks by their keys.
+pub type Errors = std::collections::BTreeMap<u64, f32>;
+
+/// The errors of a decoded frame against the frame. Blocks that were kept have the errors that they had.
+pub(super) fn errors(octree: &Octree, truth: &Truth, decoded: &Previous, top: u8, kept: &[Block], block: u8) -> Errors {
+    let mut errors = Errors::new();
+    let Some(level) = decoded.level(top) else {
+        return errors;
+    };
+    let (voxels, down) = (octree.level(top), 3 * (top - block));
+    let mut sums = std::collections::BTreeMap::<u64, [f32; 2]>::new();
+    for (i, key) in voxels.keys().iter().enumerate() {
+        if let Some(index) = level.index(voxels.coordinate(i).map(|x| x as i32)) {
+            let apart = luma_apart(truth.level(top)[i], level.values[index]);
+            let sum = sums.entry(key >> down).or_default();
+            *sum = [sum[0] + apart * apart, sum[1] + 1.0];
+        }
+    }
+    errors.extend(sums.into_iter().map(|(key, [sum, count])| (key, sum / count)));
+    for block in kept.iter().filter(|block| block.keep) {
+        match block.error {
+            Some(error) => errors.insert(block.key, error),
+            None => errors.remove(&block.key),
+        };
+    }
+    errors
 }
 
 /// Difference of luma, and half of those of chroma.

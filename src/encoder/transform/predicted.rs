@@ -5,7 +5,7 @@ use std::sync::Arc;
 use b2p_kernels::Isa;
 use rayon::prelude::*;
 
-use super::motion::{Block, Search, Tolerance};
+use super::motion::{Block, Errors, Search, Tolerance};
 use super::{EncoderInput, Guides, Options, choose_levels, octree_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth, Ycc};
@@ -21,6 +21,50 @@ pub struct PredictedFrame {
     pub stream: Vec<u8>,
     /// The motion of each level, from the base level on.
     pub motion: Vec<Vec<u8>>,
+    /// What is to be known of the frame, once it is decoded, to code the next one.
+    pub known: Known,
+}
+
+/// What an encoder knows of a frame beside what the decoder does.
+#[derive(Debug)]
+pub struct Known {
+    octree: Octree,
+    truth: Truth,
+    blocks: Vec<Block>,
+    top: u8,
+    block_level: u8,
+}
+
+impl Known {
+    /// What is known of a whole frame.
+    ///
+    /// # Errors
+    /// Those of [`encode`](super::encode).
+    pub fn of_whole(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<Self> {
+        let lossless = options.fineness.steps()?.is_lossless();
+        let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
+        let (base, top) = (*levels.start(), *levels.end());
+        let octree = octree_of(cloud, top, log)?;
+        let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, lossless);
+        Ok(Known {
+            octree,
+            truth,
+            blocks: Vec::new(),
+            top,
+            block_level: block_level(base, top),
+        })
+    }
+
+    /// The errors of the frame as it was decoded.
+    pub fn errors(&self, decoded: &Previous) -> Errors {
+        let Known { octree, truth, .. } = self;
+        super::motion::errors(octree, truth, decoded, self.top, &self.blocks, self.block_level)
+    }
+}
+
+/// The level whose nodes are the blocks. Bricks of 4³ voxels lie within blocks.
+fn block_level(base: u8, top: u8) -> u8 {
+    base.min(BLOCK_LEVEL).min(top.saturating_sub(2))
 }
 
 /// The level whose nodes are the blocks, if the base level is not above it.
@@ -29,13 +73,14 @@ const BLOCK_LEVEL: u8 = 5;
 const INTER_COLOURS: f32 = 0.9;
 
 /// Codes a cloud as a frame that is predicted from `previous`, the frame before as it was decoded, down to the last
-/// level of `options`.
+/// level of `options`. `errors` are those of its blocks.
 ///
 /// # Errors
 /// Those of [`encode`](super::encode).
 pub fn encode_predicted(
     cloud: &ColouredVoxels,
     previous: &Arc<Previous>,
+    errors: &Errors,
     options: &Options,
     log: &Log,
 ) -> Result<PredictedFrame> {
@@ -44,9 +89,8 @@ pub fn encode_predicted(
     let (base, top) = (*levels.start(), *levels.end());
     let octree = octree_of(cloud, top, log)?;
     let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, steps.is_lossless());
-    // Bricks of 4³ voxels lie within blocks.
-    let block_level = base.min(BLOCK_LEVEL).min(top.saturating_sub(2));
-    let target = Target::new(&octree, &truth, previous, [block_level, top], steps)?;
+    let block_level = block_level(base, top);
+    let target = Target::new(&octree, &truth, (previous, errors), [block_level, top], steps)?;
     let head = Head {
         block_level,
         unit_level: top,
@@ -79,7 +123,14 @@ pub fn encode_predicted(
     let subject = subject.with_octree(target.octree, top, log)?;
     let stream = subject.code_towards(&target.truth, top, steps, None, log)?.bytes;
     let motion = plan.head.write(base, &plan.blocks)?;
-    Ok(PredictedFrame { stream, motion })
+    let known = Known {
+        octree,
+        truth,
+        blocks: target.blocks,
+        top,
+        block_level,
+    };
+    Ok(PredictedFrame { stream, motion, known })
 }
 
 /// What a frame is to decode to: its own voxels, and the moved previous ones where these differ by noise alone.
@@ -104,7 +155,7 @@ impl Target {
     fn new(
         octree: &Octree,
         truth: &Truth,
-        previous: &Arc<Previous>,
+        (previous, errors): (&Arc<Previous>, &Errors),
         [block_level, top]: [u8; 2],
         steps: Steps,
     ) -> Result<Self> {
@@ -115,15 +166,18 @@ impl Target {
             truth,
             previous,
             current: &current,
+            errors,
             top,
             block_level,
         };
         let step = steps.luma_step() * 64.0;
         let tolerance = Tolerance {
-            near: 0.4,
+            near: 0.6,
             far: 0.01,
-            luma: 0.6 * step,
-            mean: 0.25 * step,
+            drift: 0.2,
+            error: (0.4 * step).powi(2),
+            worse: [2.0, (0.3 * step).powi(2)],
+            mean: 0.3 * step,
         };
         let mut blocks = search.blocks((!steps.is_lossless()).then_some(tolerance));
         let parts = |blocks: &[Block]| -> Vec<Vec<(u64, Ycc)>> {
@@ -172,7 +226,20 @@ impl Target {
                 modes: vec![vec![inter; self.blocks.len()]; levels],
             },
         };
-        let tried = Inter::of(Arc::clone(previous), head, plan.blocks.clone(), base);
+        // Colours of skipped blocks are not interpolated.
+        let still = Modes {
+            colours: Mode::Skip,
+            ..inter
+        };
+        let kept = Blocks {
+            vectors: plan.blocks.vectors.clone(),
+            modes: vec![vec![still; self.blocks.len()]; levels],
+        };
+        let root_kept = Head { root: still, ..head };
+        let tried = [
+            Inter::of(Arc::clone(previous), head, plan.blocks.clone(), base),
+            Inter::of(Arc::clone(previous), root_kept, kept, base),
+        ];
         let mut root = [Votes::default(), Votes::default()];
         for level in 1..=self.top {
             let votes = self.votes(&tried, level)?;
@@ -195,11 +262,12 @@ impl Target {
     }
 
     /// How well each block of `level` is predicted; for levels of no blocks, the whole level.
-    fn votes(&self, inter: &Inter, level: u8) -> Result<Vec<Votes>> {
+    fn votes(&self, [inter, still]: &[Inter; 2], level: u8) -> Result<Vec<Votes>> {
         let (geometry, colours) = (
             inter.geometry(&self.octree, level)?,
             inter.colours(&self.octree, level)?,
         );
+        let exact = still.colours(&self.octree, level)?;
         let nodes = self.octree.level(level - 1).keys();
         let (masks, first) = (self.octree.occupancy(level - 1), self.octree.first_child(level - 1));
         let blocks = level > self.block_level;
@@ -216,11 +284,10 @@ impl Target {
             let first = first[node] as usize;
             let children = first..first + mask.count_ones() as usize;
             let above = self.truth.level(level - 1)[node];
-            vote.colours(
-                &self.truth.level(level)[children.clone()],
-                &colours.moved()[children],
-                above,
-            );
+            let truth = &self.truth.level(level)[children.clone()];
+            let same = truth.iter().zip(&exact.moved()[children.clone()]);
+            vote.coloured += same.filter(|(truth, moved)| Some(**truth) != **moved).count() as u64;
+            vote.colours(truth, &colours.moved()[children], above);
         }
         Ok(votes)
     }
@@ -260,9 +327,7 @@ impl Votes {
         for (truth, moved) in there() {
             shift += i32::from(truth[0]) - i32::from(moved[0]);
             count += 1;
-            self.coloured += u64::from(*truth != moved);
         }
-        self.coloured += (truth.len() - count) as u64;
         let shift = shift as f32 / count.max(1) as f32;
         for (truth, moved) in there() {
             self.intra += (f32::from(truth[0]) - f32::from(above[0])).abs();

@@ -154,3 +154,88 @@ impl Refiner {
         self.wrong = self.wrong - (self.wrong >> 5) + (wrong >> 5);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::{decode_masks, encode_guided, encode_level};
+    use super::*;
+    use crate::cancel::Cancel;
+    use crate::container::Slice;
+    use crate::geometry::{Octree, Voxels};
+    use b2p_kernels::Isa;
+    use proptest::prelude::*;
+
+    /// Windows whose own children are those of the octree, each wrong where `wrong` has a bit.
+    fn windows(octree: &Octree, level: u8, wrong: impl Fn(usize) -> u8) -> Vec<u64> {
+        let masks = octree.occupancy(level - 1).iter().enumerate();
+        let cells = |mask: u8| {
+            OWN.iter()
+                .enumerate()
+                .map(move |(o, cell)| u64::from(mask >> o & 1) << cell)
+                .sum()
+        };
+        masks.map(|(i, mask)| cells(mask ^ wrong(i))).collect()
+    }
+
+    fn slices(coded: &[(u32, Vec<u8>)]) -> Vec<Slice<'_>> {
+        coded
+            .iter()
+            .map(|(voxels, bytes)| Slice {
+                voxels: *voxels,
+                bytes,
+                offset: 0,
+            })
+            .collect()
+    }
+
+    proptest! {
+        #[test]
+        fn occupancies_are_decoded_as_they_were_coded_however_wrong_the_windows_are(
+            keys in prop::collection::vec(0u64..1 << 15, 1..600),
+            wrong in prop::collection::vec(any::<u8>(), 600),
+            modes in prop::collection::vec(0usize..3, 600),
+        ) {
+            let octree = Octree::new(Voxels::new(5, keys)).unwrap();
+            let (map, parents) = (octree.kernel_map(4), octree.occupancy(4).len());
+            let mode = |i: usize| [Mode::Intra, Mode::Inter, Mode::Skip][modes[i % 600]];
+            let modes: Vec<Mode> = (0..parents).map(mode).collect();
+            let windows = windows(&octree, 5, |i| match modes[i] {
+                Mode::Skip => 0,
+                _ => wrong[i % 600],
+            });
+            let guide = Some(Guide { modes: &modes, windows: &windows });
+            let isa = Isa::detect();
+            let coded = encode_guided(isa, &octree, &map, 5, 90, guide);
+            let masks = decode_masks(isa, 5, &map, &slices(&coded), 90, guide, &Cancel::default()).unwrap();
+            prop_assert_eq!(&masks[..], octree.occupancy(4));
+            let scalar = encode_guided("scalar".parse().unwrap(), &octree, &map, 5, 90, guide);
+            prop_assert_eq!(scalar, coded);
+        }
+    }
+
+    #[test]
+    fn right_windows_save_most_bits_and_skipped_parents_take_none() {
+        let sphere = |key: &u64| {
+            let at = crate::geometry::morton::decode(*key).map(|x| f64::from(x) - 31.5);
+            (at.iter().map(|x| x * x).sum::<f64>().sqrt() - 25.0).abs() < 0.6
+        };
+        let octree = Octree::new(Voxels::new(6, (0..1 << 18).filter(sphere).collect())).unwrap();
+        let (map, parents) = (octree.kernel_map(5), octree.occupancy(5).len());
+        let bytes = |mode, wrong: fn(usize) -> u8| {
+            let (modes, windows) = (vec![mode; parents], windows(&octree, 6, wrong));
+            let guide = Guide {
+                modes: &modes,
+                windows: &windows,
+            };
+            encode_guided(Isa::detect(), &octree, &map, 6, 1 << 14, Some(guide))
+        };
+        let size = |coded: &[(u32, Vec<u8>)]| coded.iter().map(|slice| slice.1.len()).sum::<usize>();
+        let alone = encode_level(Isa::detect(), &octree, &map, 6, 1 << 14);
+        assert_eq!(bytes(Mode::Intra, |_| 0), alone);
+        assert!(4 * size(&bytes(Mode::Inter, |_| 0)) < size(&alone));
+        assert_eq!(size(&bytes(Mode::Skip, |_| 0)), 4);
+        // Windows that know nothing cost little.
+        let useless = size(&bytes(Mode::Inter, |i| (i * 0x9e37) as u8));
+        assert!(20 * useless < 23 * size(&alone), "{useless} of {}", size(&alone));
+    }
+}

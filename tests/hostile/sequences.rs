@@ -1,0 +1,177 @@
+//! Sequences: cut, damaged, and lying behind right checksums.
+
+use b2p::cloud::ColouredVoxels;
+use b2p::container::Header;
+use b2p::container::sequence::{GroupEntry, Index, parse_table};
+use b2p::geometry::{Voxels, morton};
+use b2p::{Decoder, Error, Limits, Placement, SequenceDecoder, SequenceEncoder, SequenceReader};
+use rayon::prelude::*;
+
+use crate::common::Ball;
+
+/// Voxels and colours of a frame, or why there are none.
+type Frame = Result<(Vec<u64>, Vec<[u8; 3]>), Error>;
+
+/// Four frames of a ball that moves, in two groups.
+fn sequence() -> Vec<u8> {
+    let cloud = |frame: u64| {
+        let moved = |([x, y, z], colour): ([u32; 3], [u8; 3])| (morton::encode([x, y + frame as u32, z]), colour);
+        let mut voxels: Vec<_> = Ball::new(5, 9.5).voxels().into_iter().map(moved).collect();
+        voxels.sort_unstable();
+        Ok(ColouredVoxels {
+            voxels: Voxels::new(5, voxels.iter().map(|voxel| voxel.0).collect()),
+            colours: voxels.iter().map(|voxel| voxel.1).collect(),
+            placement: Placement::VOXEL_GRID,
+        })
+    };
+    let encoder = SequenceEncoder::new().with_levels(3..=4).with_group(2);
+    encoder.encode(4, cloud, |_| {}).expect("a ball can be coded")
+}
+
+/// Every frame that can be had.
+fn frames(bytes: &[u8]) -> Result<Vec<Frame>, Error> {
+    let sequence = SequenceReader::new(bytes, &Limits::default())?;
+    let mut decoder = SequenceDecoder::new(Decoder::new());
+    let decoded = decoder.frames(&sequence, 0..sequence.frames().min(8));
+    let found = decoded.map(|frame| {
+        let frame = frame?;
+        let points = frame.points().expect("a level");
+        Ok((points.voxels.keys().to_vec(), points.colours.to_vec()))
+    });
+    Ok(found.collect())
+}
+
+/// The index, and the first group.
+fn parts(bytes: &[u8]) -> (Header, Index, Vec<u8>) {
+    let header = Header::parse_sequence(bytes, &Limits::default()).expect("a header");
+    let index = Index::parse(bytes, &header, &Limits::default()).expect("an index");
+    let group = index.groups[0].take(bytes).expect("a group").to_vec();
+    (header, index, group)
+}
+
+/// The sequence with another first group, of the right hash.
+fn with_group(bytes: &[u8], group: &[u8]) -> Vec<u8> {
+    let (header, mut index, _) = parts(bytes);
+    let old = index.groups[0];
+    let entry = GroupEntry::of(group, old.frames, old.start, old.ticks).expect("a short group");
+    let rest = bytes[old.offset as usize + old.bytes as usize..].to_vec();
+    index.groups[0] = entry;
+    let mut changed = header.write_sequence();
+    index.write(&mut changed).expect("an index");
+    changed.extend(group);
+    changed.extend(rest);
+    changed
+}
+
+#[test]
+fn every_cut_gives_the_frames_of_whole_groups_and_typed_errors() {
+    let bytes = sequence();
+    let whole = frames(&bytes).expect("a sequence");
+    (0..bytes.len()).into_par_iter().for_each(|length| {
+        let Ok(found) = frames(&bytes[..length]) else {
+            return;
+        };
+        for (found, whole) in found.iter().zip(&whole) {
+            if let Ok(found) = found {
+                assert!(whole.as_ref().is_ok_and(|whole| whole == found), "{length} bytes");
+            }
+        }
+        assert!(found.last().is_some_and(|last| last.is_err()), "{length} bytes");
+    });
+}
+
+#[test]
+fn every_flipped_bit_is_noticed_and_leaves_the_other_groups() {
+    let bytes = sequence();
+    let whole = frames(&bytes).expect("a sequence");
+    let (_, index, _) = parts(&bytes);
+    (0..8 * bytes.len()).into_par_iter().for_each(|bit| {
+        let mut damaged = bytes.clone();
+        damaged[bit / 8] ^= 1 << (bit % 8);
+        let Ok(found) = frames(&damaged) else {
+            assert!(bit / 8 < index.groups[0].offset as usize, "bit {bit}");
+            return;
+        };
+        // The minor version and optional flags mean nothing, but the header's checksum holds them.
+        let lost = found.iter().filter(|frame| frame.is_err()).count();
+        assert_eq!(lost, 2, "bit {bit}");
+        for (found, whole) in found.iter().zip(&whole).filter(|(found, _)| found.is_ok()) {
+            assert!(found.as_ref().ok() == whole.as_ref().ok(), "bit {bit}");
+        }
+    });
+}
+
+#[test]
+fn motion_that_is_changed_behind_the_hash_is_refused_or_decoded_within_the_limits() {
+    let bytes = sequence();
+    let (header, index, group) = parts(&bytes);
+    let table = parse_table(&group, &index.groups[0], &header, &Limits::default()).expect("a table");
+    let motion: u32 = table[1].levels.iter().map(|level| level.motion).sum();
+    assert!(motion > 9);
+    let start = table[1].offset as usize;
+    (8 * start..8 * (start + table[1].levels[0].motion as usize))
+        .into_par_iter()
+        .for_each(|bit| {
+            let mut changed = group.clone();
+            changed[bit / 8] ^= 1 << (bit % 8);
+            let found = frames(&with_group(&bytes, &changed)).expect("a sequence");
+            assert!(found[0].is_ok(), "bit {bit}");
+            assert!(found[2].is_ok() && found[3].is_ok(), "bit {bit}");
+            // The hash of colours tells that another motion is not the one that was coded with.
+            if let Err(error) = &found[1] {
+                assert!(matches!(error, Error::Frame { frame: 1, .. }), "bit {bit}: {error}");
+            }
+        });
+}
+
+#[test]
+fn vectors_out_of_range_are_refused_and_name_the_clause() {
+    let bytes = sequence();
+    let (header, index, mut group) = parts(&bytes);
+    let table = parse_table(&group, &index.groups[0], &header, &Limits::default()).expect("a table");
+    let vector = table[1].offset as usize + 3;
+    group[vector..vector + 2].copy_from_slice(&i16::MIN.to_le_bytes());
+    let found = frames(&with_group(&bytes, &group)).expect("a sequence");
+    let error = found[1].as_ref().expect_err("a vector out of range");
+    assert_eq!(error.clause(), Some("17.5.3"), "{error}");
+    assert!(found[2].is_ok());
+}
+
+#[test]
+fn numbers_of_frames_that_are_not_there_are_refused_before_anything_is_reserved() {
+    let bytes = sequence();
+    let (header, index, _) = parts(&bytes);
+    let parse = |index: &Index| {
+        let mut changed = header.write_sequence();
+        index.write(&mut changed).expect("an index");
+        SequenceReader::new(changed, &Limits::default()).map(|sequence| sequence.frames())
+    };
+    let with_frames = |frames: u32| {
+        let mut index = index.clone();
+        index.groups[0].frames = frames;
+        index
+    };
+    for frames in [0, 65_537, u32::MAX] {
+        let error = parse(&with_frames(frames)).expect_err("frames out of range");
+        assert_eq!(error.clause(), Some("17.2.2"), "{error}");
+    }
+    let mut many = index.clone();
+    many.groups = vec![with_frames(65_536).groups[0]; 17];
+    many.groups.iter_mut().for_each(|group| group.start = 0);
+    many.groups.iter_mut().for_each(|group| group.ticks = 0);
+    assert!(matches!(
+        parse(&many),
+        Err(Error::LimitExceeded {
+            option: "max_frames",
+            ..
+        })
+    ));
+    // A table of other frames than the index states.
+    let (_, _, group) = parts(&bytes);
+    let entry = GroupEntry {
+        frames: 3,
+        ..index.groups[0]
+    };
+    let error = parse_table(&group, &entry, &header, &Limits::default()).expect_err("another number");
+    assert_eq!(error.clause(), Some("17.3.1"), "{error}");
+}
