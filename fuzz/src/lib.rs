@@ -9,6 +9,7 @@ mod pictures;
 #[path = "../../tests/common/seal.rs"]
 mod seal;
 pub mod seeds;
+mod sequences;
 mod streams;
 mod transform;
 
@@ -21,6 +22,7 @@ pub use codecs::{entropy, octree};
 pub use files::{clouds, model, ply, splats};
 pub use mutate::{Change, mutate};
 pub use pictures::{backends, render};
+pub use sequences::sequence;
 pub use streams::{chunking, deepest, header, stream};
 pub use transform::transform;
 
@@ -28,10 +30,11 @@ pub use transform::transform;
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All targets.
-pub const TARGETS: [Target; 12] = [
+pub const TARGETS: [Target; 13] = [
     ("header", header),
     ("stream", stream),
     ("transform", transform),
+    ("sequence", sequence),
     ("chunking", chunking),
     ("octree", octree),
     ("entropy", entropy),

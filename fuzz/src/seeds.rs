@@ -10,7 +10,7 @@ use b2p::geometry::Voxels;
 use b2p::latents::LatentDecoder;
 use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, ResidualSteps, Steps};
 use b2p::log::Log;
-use b2p::{Limits, Placement};
+use b2p::{Limits, Placement, SequenceEncoder};
 use b2p_formats::splats::{Axes, Format, write};
 
 use crate::MODEL;
@@ -70,6 +70,38 @@ fn transformed() -> Vec<Vec<u8>> {
         coded(4, (0..4096).step_by(37).collect(), 2..=4, 16, step(4.0)),
         coded(4, (0..4096).step_by(41).collect(), 0..=4, 16, lossless),
         coded(21, vec![0, 77, (1 << 63) - 1], 18..=21, 16_384, step(30.0)),
+    ]
+}
+
+/// Sequences of a few voxels that move: in one group and in two, lossless, and of frames that are all alike.
+fn sequences() -> Vec<Vec<u8>> {
+    let coded = |depth: u8, moves: u64, group: u32, lossless: bool| {
+        let side = 1u64 << depth;
+        let cloud = |frame: u64| {
+            let key = |i: u64| {
+                let at = [i % side, (i / side + moves * frame) % side, (i * i / 7) % side];
+                b2p::geometry::morton::encode(at.map(|v| v as u32))
+            };
+            let voxels = Voxels::new(depth, (0..60).map(key).collect());
+            let colour = |key: &u64| [*key as u8, (key >> 3) as u8, (key >> 6) as u8];
+            Ok(ColouredVoxels {
+                colours: voxels.keys().iter().map(colour).collect(),
+                voxels,
+                placement: Placement::VOXEL_GRID,
+            })
+        };
+        let encoder = SequenceEncoder::new().with_group(group).with_levels(1..=depth);
+        let encoder = match lossless {
+            true => encoder.with_quality(transform::QualityTarget::Lossless),
+            false => encoder,
+        };
+        encoder.encode(4, cloud, |_| {}).expect("a few voxels are coded")
+    };
+    vec![
+        coded(3, 1, 4, false),
+        coded(4, 1, 2, false),
+        coded(4, 0, 4, false),
+        coded(3, 1, 4, true),
     ]
 }
 
@@ -154,6 +186,7 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
             streams.chain([coloured]).chain(new.into_iter().flatten()).collect()
         }
         "transform" => transformed(),
+        "sequence" => sequences(),
         "ply" => {
             let cloud = PointCloud {
                 positions: vec![[0.0, 1.0, 2.0], [3.0, 4.5, -1.0]],
