@@ -41,7 +41,13 @@ impl Sources {
 impl Source for Sources {
     fn want(&mut self, wanted: Wish) {
         if let Some(player) = self.player.as_ref().filter(|player| player.path == wanted.path) {
-            return player.shared.change(|state| state.wish_again(wanted));
+            let number = wanted.number;
+            player.shared.change(|state| state.wish_again(wanted));
+            let choices = player.shared.lock().choices.clone();
+            if let Some(choices) = choices {
+                (self.tell)(number, Arrived::Choices(choices));
+            }
+            return;
         }
         self.player = None;
         if !sequence::is_sequence(&wanted.path) {
@@ -114,6 +120,8 @@ struct Shared {
 struct State {
     wish: Wish,
     /// None until the sequence is open.
+    choices: Option<Choices>,
+    /// None until the sequence is open.
     clock: Option<Clock>,
     /// What was decoded, in the order of slots.
     ready: VecDeque<Ready>,
@@ -121,6 +129,8 @@ struct State {
     next: u64,
     /// Grows when `next` is no longer what follows.
     turn: u64,
+    /// Whether the next clock may be another one than that at hand.
+    renewed: bool,
     /// Frames that were due and not shown.
     dropped: u64,
     /// When the last frame was shown.
@@ -163,10 +173,12 @@ impl State {
     fn new(wish: Wish) -> Self {
         State {
             wish,
+            choices: None,
             clock: None,
             ready: VecDeque::new(),
             next: 0,
             turn: 0,
+            renewed: false,
             dropped: 0,
             shown: None,
             served: None,
@@ -177,6 +189,7 @@ impl State {
     /// The same sequence with another level or other heads, from the frame at hand on.
     fn wish_again(&mut self, wish: Wish) {
         self.wish = wish;
+        self.renewed = true;
         self.go_on_from(self.clock.as_ref().map_or(0, |clock| clock.slot(Instant::now())));
     }
 
@@ -191,7 +204,7 @@ impl State {
         let jumped = self.clock.as_ref().is_none_or(|before| before.jumps() != clock.jumps());
         let slot = clock.slot(Instant::now());
         self.clock = Some(clock);
-        if !jumped {
+        if !std::mem::take(&mut self.renewed) && !jumped {
             return;
         }
         self.ready.retain(|ready| ready.slot >= slot);
@@ -304,10 +317,7 @@ struct Job {
 impl Worker {
     /// Reads the sequence, and says what there is to choose from.
     fn open(shared: Arc<Shared>, loading: &Loading, cancel: &Cancel, tell: &Tell) -> Result<Worker> {
-        let (path, number) = {
-            let state = shared.lock();
-            (state.wish.path.clone(), state.wish.number)
-        };
+        let path = shared.lock().wish.path.clone();
         cloud::forget();
         let sequence = sequence::read(&path, &loading.limits)?;
         let decoder = load::decoder(&[], &loading.detail(), &loading.model, &loading.limits)?;
@@ -321,6 +331,11 @@ impl Worker {
             levels: levels.clone().collect(),
             heads: HeadSet::ALL.to_vec(),
             timeline: Some(timeline.clone()),
+        };
+        let number = {
+            let mut state = shared.lock();
+            state.choices = Some(choices.clone());
+            state.wish.number
         };
         tell(number, Arrived::Choices(choices));
         let decoder = decoder.with_cancel(cancel.clone());

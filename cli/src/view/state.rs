@@ -232,7 +232,10 @@ impl State {
                 let (speed, looped) = self.playing;
                 let timeline = choices.timeline.clone();
                 self.choices = choices;
-                self.clock = timeline.map(|timeline| Clock::new(timeline, speed, looped));
+                // With another level the clock goes on.
+                if self.clock.is_none() {
+                    self.clock = timeline.map(|timeline| Clock::new(timeline, speed, looped));
+                }
                 self.with_clock(|_, _| ())
             }
             Arrived::Scene(scene) => {

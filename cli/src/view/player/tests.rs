@@ -60,12 +60,16 @@ fn wish(number: u64, path: &Path, level: Option<u8>) -> Wish {
 
 /// The clock of the sequence that is opened.
 fn clock(heard: &Receiver<(u64, Arrived)>) -> Clock {
-    match heard.recv() {
-        Ok((_, Arrived::Choices(choices))) => {
+    let choices = |arrived| match arrived {
+        Arrived::Choices(choices) => Some(choices),
+        _ => None,
+    };
+    match heard.iter().find_map(|(_, arrived)| choices(arrived)) {
+        Some(choices) => {
             assert_eq!(choices.levels, [4, 5]);
             Clock::new(choices.timeline.expect("a time line"), 1.0, false)
         }
-        other => panic!("{other:?}"),
+        None => panic!("the player has ended"),
     }
 }
 
@@ -143,6 +147,11 @@ fn a_running_clock_shows_frames_in_order_and_another_level_goes_on_from_there() 
     assert!(seen.windows(2).all(|pair| pair[0] < pair[1]), "{seen:?}");
     sources.want(wish(1, file.path(), Some(4)));
     assert_eq!(next(&heard), Ok((11, 4)));
-    sources.want(wish(2, Path::new("missing"), None));
+    sources.want(wish(2, file.path(), None));
+    let again = self::clock(&heard);
+    sources.play(&again);
+    let last = std::iter::repeat_with(|| next(&heard).unwrap().0).find(|frame| *frame == 0);
+    assert_eq!(last, Some(0));
+    sources.want(wish(3, Path::new("missing"), None));
     assert!(next(&heard).is_err());
 }
