@@ -60,6 +60,20 @@ fn every_frame_decodes_alone_and_in_order_at_every_level() {
 }
 
 #[test]
+fn another_level_from_any_frame_on_does_not_change_what_is_decoded() {
+    let bytes = encoded(7);
+    let sequence = reader(&bytes);
+    let mut decoder = SequenceDecoder::new(Decoder::new());
+    for (number, level) in [5, 4, 5, 3, 4, 5, 3].into_iter().enumerate() {
+        decoder.set_decoder(Decoder::new().with_level(level));
+        let decoded = decoder.frame(&sequence, number as u64).expect("a frame");
+        let points = decoded.points().expect("a level");
+        let alone = frame(&sequence, number as u64, Some(level)).expect("a frame");
+        assert_eq!((points.voxels.keys(), points.colours), (&alone.0[..], &alone.1[..]));
+    }
+}
+
+#[test]
 fn a_sequence_does_not_depend_on_the_number_of_threads() {
     let bytes = encoded(7);
     for threads in [1, 3] {

@@ -1,4 +1,4 @@
-"""Tests of `b2p view` from outside, with keys and a mouse. `tests/view.sh` has what they need."""
+"""Tests of `b2p view` and `b2p play` from outside, with keys and a mouse. `tests/view.sh` has what they need."""
 
 import importlib.util
 import json
@@ -68,6 +68,23 @@ def difference(one, other):
     return max(max(abs(x - y) for x, y in zip(a, b)) for a, b in zip(one, other))
 
 
+def sequence(folder):
+    """A sequence of 24 frames, 8 a second: a ball of points that moves by a voxel each frame."""
+    (folder / "frames").mkdir()
+    axis = range(-6, 7)
+    ball = [(x, y, z) for x in axis for y in axis for z in axis if 25 < x * x + y * y + z * z <= 36]
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(ball)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "".join(f"property uchar {colour}\n" for colour in ("red", "green", "blue")) + "end_header\n"
+    for frame in range(24):
+        rows = [f"{x + frame} {y} {z} {100 + 16 * x} {100 + 16 * y} 90\n" for x, y, z in ball]
+        (folder / "frames" / f"{frame:02}.ply").write_text(header + "".join(rows))
+    encoded = folder / "ball.b2p"
+    options = ["--fps", "8", "--gop", "6", "--bits", "6", "--levels", "3..5"]
+    subprocess.run([PROGRAM, "-q", "encode", folder / "frames", "-o", encoded, *options], check=True)
+    return encoded
+
+
 class Screen:
     """An X server without a screen, whose pixels are in a file."""
 
@@ -102,12 +119,12 @@ class Screen:
 class Viewer:
     """The program in a window."""
 
-    def __init__(self, screen, folder, *arguments, stdin=subprocess.DEVNULL, size="320x240"):
+    def __init__(self, screen, folder, *arguments, stdin=subprocess.DEVNULL, size="320x240", command="view"):
         self.screen, self.folder = screen, folder
         environment = {name: value for name, value in os.environ.items() if name != "WAYLAND_DISPLAY"}
         self.environment = environment | {"DISPLAY": screen.name, "WINIT_X11_SCALE_FACTOR": "1"}
         self.errors = open(folder / "errors.txt", "w+")
-        command = [PROGRAM, "view", "--json", "--size", size, "-o", str(folder), *map(str, arguments)]
+        command = [PROGRAM, command, "--json", "--size", size, "-o", str(folder), *map(str, arguments)]
         self.process = subprocess.Popen(
             command, env=self.environment, stdin=stdin, stdout=subprocess.PIPE, stderr=self.errors
         )
@@ -303,6 +320,45 @@ class WindowTest(unittest.TestCase):
         late, fine = wait_for("a finer picture", lambda: viewer.pixels() != before and viewer.screenshot())
         self.assertEqual(coarse, fine)
         self.assertNotEqual(png(late)[2], before)
+
+    def test_a_sequence_plays_and_is_paused_stepped_through_and_sought(self):
+        folder = pathlib.Path(tempfile.mkdtemp(prefix="b2p-view-"))
+        self.addCleanup(shutil.rmtree, folder)
+        detail = ["--level", "5", "--heads", "surfels"]
+        viewer = self.viewer(sequence(folder), *detail, command="play")
+        wait_for("the sequence to play", lambda: viewer.title() == "ball.b2p – b2p")
+        for _ in range(2):
+            before = self.screen.pixels(*viewer.geometry())
+            wait_for("another frame", lambda: self.screen.pixels(*viewer.geometry()) != before)
+
+        def paused():
+            found = re.search(r"paused at frame (\d+) of 24", viewer.title())
+            return found and int(found[1])
+
+        viewer.press("space")
+        wait_for("a pause", lambda: paused() is not None)
+        above = slice(0, 320 * 216)  # the time line
+        frame, shown = paused(), viewer.pixels()
+        time.sleep(1)
+        self.assertEqual((paused(), viewer.pixels()), (frame, shown))
+        viewer.press("period")
+        wait_for("the next frame", lambda: paused() == (frame + 1) % 24)
+        self.assertNotEqual(viewer.pixels()[above], shown[above])
+        viewer.press("comma")
+        wait_for("the frame before", lambda: paused() == frame)
+        self.assertEqual(viewer.pixels()[above], shown[above])
+        for x, sought in [(244, 18), (4, 0), (124, 9)]:
+            viewer.ask("mousemove", "--window", viewer.window, str(x), "236", "click", "1")
+            wait_for(f"frame {sought}", lambda: paused() == sought)
+            path, command = viewer.screenshot()
+            self.assertEqual(command[-2:], ["--frame", str(sought)])
+            self.assertLessEqual(difference(png(path)[2], viewer.rendered(command, *detail)[2]), 1)
+        viewer.press("space")
+        wait_for("the sequence to play", lambda: paused() is None)
+        status, result = viewer.close()
+        played = json.loads(result)["sequence"]
+        self.assertEqual((status, played["skips"]), (0, 0))
+        self.assertGreater(played["frames"], 5)
 
     def test_at_rest_it_sleeps(self):
         viewer = self.viewer(SCENE)

@@ -146,9 +146,12 @@ pub enum Command {
     /// Draw streams, Gaussians in any format that `convert` reads, or point clouds into pictures: .png, .ppm, .exr, or
     /// .y4m for a video. Of several pictures a number is put before the ending
     Render(Render),
-    /// Show streams, Gaussians and point clouds in a window, or in the terminal
+    /// Show streams, sequences, Gaussians and point clouds in a window, or in the terminal
     #[cfg(feature = "view")]
     View(super::view::View),
+    /// Play sequences in a window, or in the terminal: `view` under another name
+    #[cfg(feature = "view")]
+    Play(super::view::View),
     /// Say what a stream holds
     Info(Info),
     /// Say whether streams are valid, and where not, which clause of the format they break

@@ -206,7 +206,7 @@ fn run(cli: &mut Cli) -> Result<()> {
         Command::Cut(args) => cut::run(args, &limits)?,
         Command::Plan(args) => plan::run(args)?,
         #[cfg(feature = "view")]
-        Command::View(args) => {
+        Command::View(args) | Command::Play(args) => {
             // A window or a terminal of its own says how it goes.
             drop(progress);
             return view::run(args, &limits)?.say();

@@ -25,6 +25,8 @@ struct Last {
     group: u64,
     /// Its place in the group.
     at: usize,
+    /// The finest level that was decoded.
+    level: u8,
     previous: Arc<Previous>,
 }
 
@@ -41,6 +43,13 @@ impl SequenceDecoder {
     /// count.
     pub fn new(decoder: Decoder) -> Self {
         SequenceDecoder { decoder, last: None }
+    }
+
+    /// Decodes and draws as `decoder` does from now on. What the last frame leaves for the next one is kept: with other
+    /// heads or a coarser level the next frame is decoded alone. With a finer level it is decoded with the frames of its
+    /// group before it, unless it is whole.
+    pub fn set_decoder(&mut self, decoder: Decoder) {
+        self.decoder = decoder;
     }
 
     /// Decodes a frame.
@@ -74,15 +83,16 @@ impl SequenceDecoder {
         let at = (frame - group.first()) as usize;
         let whole = (0..=at).rev().find(|at| group.is_whole(*at)).unwrap_or(0);
         let last = self.last.take().filter(|last| last.group == group.hash());
-        let mut last = last.filter(|last| (whole..at).contains(&last.at));
+        let level = self.decoder.last_level(&group.frame_header(at));
+        let mut last = last.filter(|last| (whole..at).contains(&last.at) && last.level >= level);
         let start = last.as_ref().map_or(whole, |last| last.at + 1);
         for before in start..at {
             let mut decoding = self.decoded(group, before, last.as_ref())?;
-            last = kept(&mut decoding, group, before);
+            last = kept(&mut decoding, group, before, level);
         }
         let mut decoding = self.decoded(group, at, last.as_ref())?;
         if at + 1 < group.len() && !group.is_whole(at + 1) {
-            self.last = kept(&mut decoding, group, at);
+            self.last = kept(&mut decoding, group, at, level);
         }
         Ok(DecodedFrame {
             number: frame,
@@ -133,11 +143,12 @@ impl SequenceDecoder {
     }
 }
 
-/// What a decoded frame leaves for the next one.
-fn kept(decoding: &mut Decoding, group: &Group, at: usize) -> Option<Last> {
+/// What a frame that was decoded down to `level` leaves for the next one.
+fn kept(decoding: &mut Decoding, group: &Group, at: usize, level: u8) -> Option<Last> {
     Some(Last {
         group: group.hash(),
         at,
+        level,
         previous: Arc::new(decoding.take_previous()?),
     })
 }

@@ -230,6 +230,15 @@ impl Group<'_> {
         self.frames[at].header(self.common)
     }
 
+    /// Ticks from the start of the group to the frame at this place in it.
+    ///
+    /// # Panics
+    /// If the group has no such frame.
+    #[doc(hidden)]
+    pub fn ticks(&self, at: usize) -> u32 {
+        self.frames[at].ticks
+    }
+
     /// Bytes of the frame at this place in the group, without its entry in the table.
     ///
     /// # Panics

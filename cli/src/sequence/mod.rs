@@ -101,7 +101,7 @@ fn clouds(path: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// Reads a sequence.
-fn read(path: &Path, limits: &Limits) -> Result<SequenceReader<'static>> {
+pub fn read(path: &Path, limits: &Limits) -> Result<SequenceReader<'static>> {
     let bytes = super::load::bytes(path, limits)?;
     SequenceReader::new(bytes, limits).map_err(Failure::in_file(path))
 }

@@ -129,7 +129,7 @@ impl Film<'_> {
     /// Draws a frame, and writes it with `write`.
     fn draw(&mut self, gaussians: &Gaussians, write: impl FnOnce(&Artist) -> Result<()>) -> Result<()> {
         let camera = match &self.camera {
-            Some(camera) => camera.clone(),
+            Some(camera) => *camera,
             None => {
                 let extent = Extent::of_gaussians(gaussians);
                 let shots = shots(self.args, &gaussians.frame, &extent, self.limits)?;
@@ -137,7 +137,7 @@ impl Film<'_> {
                     .into_iter()
                     .next()
                     .ok_or_else(|| Failure("there is no camera".into()))?;
-                self.camera.insert(first.camera).clone()
+                *self.camera.insert(first.camera)
             }
         };
         let renderer = match self.renderer.take() {

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use b2p::{Cancel, Decoder, Decoding, Error, Extent, Gaussians, HeadSet, Header, Limits, Log, Stage, container};
 
+use super::clock::Clock;
 use super::source::{Arrived, Choices, Scene, Source, Tell, Wish};
 use crate::args::{DetailArg, ModelArg};
 use crate::cloud::UpArg;
@@ -28,7 +29,8 @@ pub struct Loading {
 }
 
 impl Loading {
-    fn detail(&self) -> DetailArg {
+    /// Level and heads are those of a wish.
+    pub fn detail(&self) -> DetailArg {
         DetailArg {
             level: None,
             heads: None,
@@ -64,6 +66,15 @@ impl Files {
     }
 }
 
+impl Files {
+    /// Stops what is being decoded: nothing of it is wanted any more.
+    pub fn stop(&mut self) {
+        if let Some((_, cancel)) = self.current.take() {
+            cancel.cancel();
+        }
+    }
+}
+
 impl Source for Files {
     fn want(&mut self, wanted: Wish) {
         let cancel = match &self.current {
@@ -79,6 +90,8 @@ impl Source for Files {
         // If the thread has ended, so will the program.
         let _ = self.orders.send(Order { wanted, cancel });
     }
+
+    fn play(&mut self, _: &Clock) {}
 }
 
 struct Worker {
@@ -198,6 +211,7 @@ fn open_file(path: &Path, loading: &Loading, cancel: &Cancel) -> Result<Opened> 
             up: cloud::up_of(path, loading.up),
             made: None,
             steps: log.steps(),
+            frame: None,
         })));
     }
     kinds::check_stream(path, &bytes)?;
@@ -356,6 +370,7 @@ impl OpenStream {
         Some(Choices {
             levels: levels.into_iter().filter(|level| *level <= deepest).collect(),
             heads: HeadSet::ALL.into_iter().filter(can).collect(),
+            timeline: None,
         })
     }
 
@@ -375,6 +390,7 @@ impl OpenStream {
             up: cloud::up_of(&self.path, self.up),
             made: level.zip(heads),
             steps: self.log.steps().split_off(self.old_steps),
+            frame: None,
         })
     }
 }
@@ -422,7 +438,7 @@ mod tests {
         for (of, arrived) in heard {
             assert_eq!(of, number);
             match arrived {
-                Arrived::Choices(_) => {}
+                Arrived::Choices(_) | Arrived::Skipped(_) => {}
                 Arrived::Scene(scene) => made.extend(scene.made),
                 Arrived::Done => return (made, Ok(())),
                 Arrived::Failed(message) => return (made, Err(message)),

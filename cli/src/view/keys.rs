@@ -23,6 +23,9 @@ pub enum Action {
     Pan(f64, f64),
     /// A factor on the distance.
     Zoom(f64),
+    /// Of sequences a higher or lower speed, else nearer or further away.
+    Faster,
+    Slower,
     Reset,
     Finer,
     Coarser,
@@ -37,6 +40,10 @@ pub enum Action {
         high: bool,
         by: f32,
     },
+    /// Pauses a sequence or plays it.
+    Pause,
+    /// In a loop or not.
+    Loop,
     Times,
     Help,
     Screenshot,
@@ -49,7 +56,7 @@ pub enum Action {
 /// far a face of the clipping box moves.
 const TURN: f64 = 5.0;
 const PAN: f64 = 0.05;
-const ZOOM: f64 = 1.1;
+pub const ZOOM: f64 = 1.1;
 const FACE: f32 = 0.02;
 
 /// The keys and what they do, for people.
@@ -71,6 +78,16 @@ pub const HELP: [(&str, &str); 17] = [
     ("n p, PgDn PgUp", "next, previous file"),
     ("?", "keys"),
     ("q, Esc", "close"),
+];
+
+/// The keys of sequences.
+pub const SEQUENCE_HELP: [(&str, &str); 6] = [
+    ("space", "pause, play"),
+    (", .", "frame back, on (while there is no box)"),
+    ("+ -", "faster, slower"),
+    ("= _", "zoom"),
+    ("l", "once, in a loop"),
+    ("click on the time line", "go there"),
 ];
 
 /// What a key does, if it does anything.
@@ -96,8 +113,12 @@ pub fn action(key: Key, shift: bool) -> Option<Action> {
 fn letter(character: char) -> Option<Action> {
     let face = |high, by| Some(Action::ClipFace { high, by });
     Some(match character.to_ascii_lowercase() {
-        '+' | '=' => Action::Zoom(1.0 / ZOOM),
-        '-' | '_' => Action::Zoom(ZOOM),
+        '+' => Action::Faster,
+        '-' => Action::Slower,
+        '=' => Action::Zoom(1.0 / ZOOM),
+        '_' => Action::Zoom(ZOOM),
+        ' ' => Action::Pause,
+        'l' => Action::Loop,
         'r' => Action::Reset,
         ']' => Action::Finer,
         '[' => Action::Coarser,
@@ -127,7 +148,7 @@ mod tests {
 
     #[test]
     fn every_key_of_the_help_does_something() {
-        for (keys, what) in HELP {
+        for (keys, what) in HELP.into_iter().chain(SEQUENCE_HELP) {
             for key in keys.split([' ', ',']).filter(|key| key.chars().count() == 1) {
                 let key = key.chars().next().unwrap();
                 assert!(action(Key::Char(key), false).is_some(), "{key}: {what}");
@@ -147,7 +168,7 @@ mod tests {
         let Ok(guide) = std::fs::read_to_string(guide) else {
             return;
         };
-        for (keys, what) in HELP {
+        for (keys, what) in HELP.into_iter().chain(SEQUENCE_HELP) {
             let row = guide
                 .lines()
                 .any(|line| line.starts_with('|') && line.contains(&format!("{keys} | {what}")));

@@ -1,6 +1,7 @@
 //! `b2p view`: streams, Gaussians and point clouds in a window, or in the terminal.
 
 mod clip;
+mod clock;
 mod files;
 mod folder;
 mod keys;
@@ -8,6 +9,8 @@ mod orbit;
 mod overlay;
 mod pace;
 mod painter;
+mod player;
+mod schedule;
 mod sixel;
 mod source;
 mod state;
@@ -25,6 +28,7 @@ use super::cloud::{UpArg, up};
 use super::manners::Said;
 use super::values::{background, orbit as orbit_value, point, size};
 use super::{Failure, Result, load};
+use clock::SPEEDS;
 use files::Loading;
 use orbit::{OrbitCamera, Start};
 use state::State;
@@ -62,6 +66,12 @@ pub struct View {
     /// Folder for screenshots
     #[arg(short, long, value_name = "DIR", default_value = ".")]
     output: PathBuf,
+    /// How many times as fast as it was recorded a sequence is played: 0.125, 0.25, 0.5, 1, 2, 4 or 8
+    #[arg(long, help_heading = "Sequences", value_name = "X", default_value_t = 1.0, value_parser = speed)]
+    speed: f64,
+    /// Play a sequence once, not in a loop
+    #[arg(long, help_heading = "Sequences")]
+    once: bool,
     #[command(flatten)]
     detail: DetailArg,
     #[command(flatten)]
@@ -85,6 +95,11 @@ enum Kind {
 fn terminal_arg(text: &str) -> std::result::Result<TerminalArg, String> {
     let kind = Kind::from_str(text, false).map(TerminalArg::Kind);
     Ok(kind.unwrap_or_else(|_| TerminalArg::File(text.into())))
+}
+
+fn speed(text: &str) -> std::result::Result<f64, String> {
+    let speed = text.parse().ok().filter(|speed| SPEEDS.contains(speed));
+    speed.ok_or_else(|| format!("expected one of {SPEEDS:?}"))
 }
 
 /// Shows files until the user closes the window.
@@ -111,7 +126,11 @@ pub fn run(args: &View, limits: &b2p::Limits) -> Result<Said> {
     let state = State::new(shown, camera, args.background, [width, height]);
     let viewer = Viewer {
         // What is wrong with the camera is said before anything is opened.
-        state: checked(state.with_detail(args.detail.level, args.detail.heads))?,
+        state: checked(
+            state
+                .with_detail(args.detail.level, args.detail.heads)
+                .with_playing(args.speed, !args.once),
+        )?,
         loading: Loading {
             model: args.model.clone(),
             per_voxel: args.detail.per_voxel,
@@ -173,5 +192,11 @@ mod tests {
     fn what_follows_the_option_may_be_the_file_already() {
         assert!(matches!(terminal_arg("sixel"), Ok(TerminalArg::Kind(Kind::Sixel))));
         assert!(matches!(terminal_arg("a.b2p"), Ok(TerminalArg::File(path)) if path == Path::new("a.b2p")));
+    }
+
+    #[test]
+    fn a_speed_is_one_of_those_that_keys_choose() {
+        assert_eq!(speed("0.5"), Ok(0.5));
+        assert!(speed("3").unwrap_err().contains("4.0"));
     }
 }

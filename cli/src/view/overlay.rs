@@ -1,10 +1,10 @@
 //! What is written and drawn over a picture.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use b2p::renderer::camera::Camera;
 
-use super::keys::HELP;
+use super::keys::{HELP, SEQUENCE_HELP};
 use super::painter::Picture;
 use super::state::State;
 use crate::font::{CHARACTER, glyph};
@@ -35,16 +35,32 @@ pub fn draw(state: &State, picture: Option<&Picture>, sheet: &mut Sheet, zoom: u
             }
         }
     }
+    if let Some(clock) = &state.clock {
+        sheet.time_line(clock.share(Instant::now()), zoom);
+        let height = sheet.size[1].saturating_sub(time_line_height(zoom));
+        return words(state, picture, &mut sheet.upper(height), zoom);
+    }
+    words(state, picture, sheet, zoom);
+}
+
+/// Pixels at the lower edge that the time line of a sequence takes.
+pub fn time_line_height(zoom: u32) -> u32 {
+    3 * MARGIN * zoom
+}
+
+fn words(state: &State, picture: Option<&Picture>, sheet: &mut Sheet, zoom: u32) {
     let mut upper = Vec::new();
     if state.times {
         upper.extend(times(state, picture));
-    } else if state.busy {
+    } else if state.busy || state.clock.is_some() && !state.is_running() {
         upper.push(state.line());
     }
     upper.extend(state.clip.describe());
     if state.help {
-        let width = HELP.iter().map(|(keys, _)| keys.len()).max().unwrap_or(0);
-        upper.extend(HELP.iter().map(|(keys, what)| format!("{keys:width$}  {what}")));
+        let of_sequence = state.clock.iter().flat_map(|_| SEQUENCE_HELP);
+        let rows: Vec<_> = of_sequence.chain(HELP).collect();
+        let width = rows.iter().map(|(keys, _)| keys.len()).max().unwrap_or(0);
+        upper.extend(rows.iter().map(|(keys, what)| format!("{keys:width$}  {what}")));
     }
     sheet.panel(&upper, false, zoom);
     if let Some(message) = &state.message {
@@ -110,6 +126,27 @@ fn wrapped(text: &str, columns: usize) -> Vec<String> {
 }
 
 impl Sheet<'_> {
+    /// The part above this row.
+    fn upper(&mut self, height: u32) -> Sheet<'_> {
+        Sheet {
+            pixels: &mut self.pixels[..(height * self.size[0]) as usize],
+            size: [self.size[0], height],
+        }
+    }
+
+    /// The time line, of which a share has passed.
+    fn time_line(&mut self, share: f64, zoom: u32) {
+        let [width, height] = self.size;
+        let top = height.saturating_sub(time_line_height(zoom));
+        self.darken([0, top], [width, height]);
+        let passed = (share * f64::from(width)) as u32;
+        for y in (top + MARGIN * zoom..height.saturating_sub(MARGIN * zoom)).filter(|y| *y < height) {
+            for x in 0..passed.min(width) {
+                self.set([x, y], INK);
+            }
+        }
+    }
+
     /// Lines of text on a darker ground, at the upper or the lower edge.
     fn panel(&mut self, lines: &[String], at_the_bottom: bool, zoom: u32) {
         let columns = lines.iter().map(|line| line.chars().count()).max().unwrap_or(0) as u32;
@@ -222,6 +259,28 @@ mod tests {
         sheet.panel(&["a long line of words".into(), "more".into(), "more".into()], true, 1);
         sheet.panel(&[], false, 1);
         assert!(pixels.contains(&INK) && pixels.contains(&0x202020));
+    }
+
+    #[test]
+    fn the_time_line_is_as_long_as_the_share_that_has_passed() {
+        for (share, passed) in [(0.0, 0), (0.5, 20), (1.0, 40)] {
+            let mut pixels = vec![0x808080; 40 * 30];
+            let mut sheet = Sheet {
+                pixels: &mut pixels,
+                size: [40, 30],
+            };
+            sheet.time_line(share, 1);
+            let row = &pixels[40 * (30 - 6)..][..40];
+            assert_eq!(row.iter().filter(|pixel| **pixel == INK).count(), passed);
+            assert!(pixels[..40 * 18].iter().all(|pixel| *pixel == 0x808080));
+        }
+        let mut low = [0; 8];
+        let mut sheet = Sheet {
+            pixels: &mut low,
+            size: [4, 2],
+        };
+        sheet.time_line(1.0, 2);
+        assert!(sheet.upper(0).pixels.is_empty());
     }
 
     #[test]

@@ -201,6 +201,17 @@ fn fill(image: &Image, [width, height]: [u32; 2], pixels: &mut [u32]) {
     });
 }
 
+/// Shows a picture of another size until the right one is there.
+pub fn stretch(picture: &Picture, [width, height]: [u32; 2], pixels: &mut [u32]) {
+    let [columns, rows] = picture.size.map(u64::from);
+    for (y, row) in pixels.chunks_exact_mut(width as usize).enumerate() {
+        let from = (y as u64 * rows / u64::from(height)) * columns;
+        for (x, pixel) in row.iter_mut().enumerate() {
+            *pixel = picture.pixels[(from + x as u64 * columns / u64::from(width)) as usize];
+        }
+    }
+}
+
 /// For each of `to` pixels the two of `from` that it is between, and the weight of the second.
 fn axis(from: u32, to: u32) -> Vec<(usize, usize, f32)> {
     let last = from.saturating_sub(1) as usize;

@@ -5,25 +5,29 @@ use std::sync::Arc;
 
 use b2p::{Extent, Gaussians, HeadSet, Step, Up};
 
+use super::clock::{Clock, Timeline};
+
 /// What is to be shown.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wish {
     /// Tells what arrives for this from what arrives for an earlier wish.
     pub number: u64,
     pub path: PathBuf,
-    /// Level of a stream to decode to; `None` for the finest.
+    /// Level of a stream to decode to; `None` for the finest, of a sequence the finest that there is time for.
     pub level: Option<u8>,
-    /// Heads that draw a stream; `None` for the best.
+    /// Heads that draw a stream; `None` for the best, of a sequence those that there is time for.
     pub heads: Option<HeadSet>,
 }
 
 /// What there is to choose from in a file.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Choices {
     /// The levels that can be drawn, the coarsest first. Empty for files of Gaussians and points.
     pub levels: Vec<u8>,
     /// The heads that can draw them.
     pub heads: Vec<HeadSet>,
+    /// When frames are shown, of a sequence.
+    pub timeline: Option<Arc<Timeline>>,
 }
 
 /// Gaussians that are there to be drawn.
@@ -38,6 +42,17 @@ pub struct Scene {
     pub made: Option<(u8, HeadSet)>,
     /// What it took so far.
     pub steps: Vec<Step>,
+    /// The frame that this is, of a sequence.
+    pub frame: Option<Shown>,
+}
+
+/// A frame that is shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shown {
+    /// Its number, from 0.
+    pub number: u64,
+    /// Frames that were due before it and not shown, since the sequence was opened.
+    pub dropped: u64,
 }
 
 /// What a source tells, with the number of the wish that it is for.
@@ -47,7 +62,9 @@ pub enum Arrived {
     Choices(Choices),
     /// Gaussians, the coarser before the finer.
     Scene(Box<Scene>),
-    /// All that was wished for has arrived.
+    /// Frames of a sequence that cannot be shown. Others follow.
+    Skipped(String),
+    /// All that was wished for has arrived; of a sequence, the first frame.
     Done,
     /// Nothing more will arrive.
     Failed(String),
@@ -60,6 +77,9 @@ pub enum Arrived {
 pub trait Source {
     /// Begins to make this. What was wished for before may never arrive.
     fn want(&mut self, wanted: Wish);
+
+    /// Shows frames of a sequence by this clock from now on.
+    fn play(&mut self, clock: &Clock);
 }
 
 /// Takes what a source tells, on any thread.

@@ -1,12 +1,14 @@
 //! What a viewer shows, and how keys and the mouse change it. There is no window in here.
 
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use b2p::HeadSet;
 use b2p::renderer::Background;
 
 use super::clip::Clip;
-use super::keys::Action;
+use super::clock::Clock;
+use super::keys::{Action, ZOOM};
 use super::orbit::OrbitCamera;
 use super::pace::Pace;
 use super::source::{Arrived, Choices, Scene, Wish};
@@ -31,6 +33,8 @@ pub enum Effect {
     Draw,
     /// Ask the source for [`State::wanted`].
     Load,
+    /// Tell the source the clock.
+    Play,
     Screenshot,
     Close,
 }
@@ -40,6 +44,8 @@ pub struct State {
     pub camera: OrbitCamera,
     pub pace: Pace,
     pub clip: Clip,
+    /// Of a sequence.
+    pub clock: Option<Clock>,
     /// Width and height of the picture.
     pub size: [u32; 2],
     pub scene: Option<Scene>,
@@ -56,6 +62,10 @@ pub struct State {
     heads: Option<HeadSet>,
     choices: Choices,
     backgrounds: Vec<Background>,
+    /// The speed of sequences, and whether they are played in a loop.
+    playing: (f64, bool),
+    /// Whether a frame of the sequence has arrived, so that its clock runs.
+    began: bool,
 }
 
 impl State {
@@ -66,6 +76,7 @@ impl State {
             camera,
             pace: Pace::default(),
             clip: Clip::default(),
+            clock: None,
             size,
             scene: None,
             times: false,
@@ -79,12 +90,20 @@ impl State {
             heads: None,
             choices: Choices::default(),
             backgrounds: [background].into_iter().chain(others).collect(),
+            playing: (1.0, true),
+            began: false,
         }
     }
 
     /// The same with this level and these heads of streams.
     pub fn with_detail(mut self, level: Option<u8>, heads: Option<HeadSet>) -> Self {
         (self.level, self.heads) = (level, heads);
+        self
+    }
+
+    /// The same, which plays sequences this many times as fast as they were recorded, in a loop or once.
+    pub fn with_playing(mut self, speed: f64, looped: bool) -> Self {
+        self.playing = (speed, looped);
         self
     }
 
@@ -112,7 +131,10 @@ impl State {
             count => format!(" ({} of {count})", self.file + 1),
         };
         let decoding = if self.busy { ", decoding" } else { "" };
-        format!("{name}{place}{decoding} – b2p")
+        let paused = self
+            .paused()
+            .map(|(frame, count)| format!(", paused at frame {frame} of {count}"));
+        format!("{name}{place}{decoding}{} – b2p", paused.unwrap_or_default())
     }
 
     /// Whether there is another file to go to.
@@ -128,6 +150,9 @@ impl State {
     /// Does what a key asks for.
     pub fn act(&mut self, action: Action) -> Effect {
         self.message = None;
+        if let Some(effect) = self.act_on_clock(action) {
+            return effect;
+        }
         let size = self.size;
         match action {
             Action::Turn(azimuth, elevation) => self.camera.turn(azimuth, elevation),
@@ -136,6 +161,9 @@ impl State {
                 self.camera.pan([x * height, y * height], size);
             }
             Action::Zoom(factor) => self.camera.zoom(factor),
+            Action::Faster => self.camera.zoom(1.0 / ZOOM),
+            Action::Slower => self.camera.zoom(ZOOM),
+            Action::Pause | Action::Loop => return self.say("this is no sequence of frames"),
             Action::Reset => {
                 self.camera.reset(size);
                 return Effect::Draw;
@@ -170,6 +198,21 @@ impl State {
         Effect::Move
     }
 
+    /// Does what a key asks for of a sequence, if it does. Keys of the clipping box step while there is none.
+    fn act_on_clock(&mut self, action: Action) -> Option<Effect> {
+        self.clock.as_ref()?;
+        Some(match action {
+            Action::Faster => self.with_clock(|clock, now| clock.change_speed(true, now)),
+            Action::Slower => self.with_clock(|clock, now| clock.change_speed(false, now)),
+            Action::Pause => self.with_clock(Clock::toggle),
+            Action::Loop => self.with_clock(Clock::toggle_loop),
+            Action::ClipFace { high: false, by } if self.clip.corners().is_none() => {
+                self.with_clock(|clock, now| clock.step(by.signum() as i64, now))
+            }
+            _ => return None,
+        })
+    }
+
     /// Shows other files, from the one at `first` on.
     pub fn open(&mut self, files: Vec<PathBuf>, first: usize) -> Effect {
         if first >= files.len() {
@@ -186,14 +229,31 @@ impl State {
         }
         match arrived {
             Arrived::Choices(choices) => {
+                let (speed, looped) = self.playing;
+                let timeline = choices.timeline.clone();
                 self.choices = choices;
-                Effect::Overlay
+                // With another level the clock goes on.
+                if self.clock.is_none() {
+                    self.clock = timeline.map(|timeline| Clock::new(timeline, speed, looped));
+                }
+                self.with_clock(|_, _| ())
             }
             Arrived::Scene(scene) => {
                 let frame = scene.gaussians.frame;
                 self.camera.look_at(scene.extent.clone(), frame, scene.up, self.size);
+                let frame = scene.frame;
                 self.scene = Some(*scene);
-                Effect::Draw
+                match frame {
+                    None => Effect::Draw,
+                    Some(_) => self.begin().unwrap_or(match self.is_running() {
+                        true => Effect::Move,
+                        false => Effect::Draw,
+                    }),
+                }
+            }
+            Arrived::Skipped(message) => {
+                self.message = Some(message);
+                self.begin().unwrap_or(Effect::Overlay)
             }
             Arrived::Done => {
                 self.busy = false;
@@ -225,10 +285,70 @@ impl State {
             }
             line += &format!(", {count}");
         }
+        line += &self.playing_line().unwrap_or_default();
         match self.busy {
             true => line + ", decoding",
             false => line,
         }
+    }
+
+    /// Goes to the frame at a share of the sequence's time.
+    pub fn seek(&mut self, share: f64) -> Effect {
+        self.message = None;
+        self.with_clock(|clock, now| clock.seek(share, now))
+    }
+
+    /// Whether a sequence is played, and not paused.
+    pub fn is_running(&self) -> bool {
+        self.clock
+            .as_ref()
+            .is_some_and(|clock| clock.is_running(Instant::now()))
+    }
+
+    /// The frame at which a sequence is paused, and the number of its frames.
+    fn paused(&self) -> Option<(u64, u64)> {
+        let (clock, now) = (self.clock.as_ref()?, Instant::now());
+        let is_paused = self.began && !clock.is_running(now);
+        is_paused.then(|| (clock.frame(now), clock.timeline().len()))
+    }
+
+    /// The frame that is shown, of how many, and how a sequence is played.
+    fn playing_line(&self) -> Option<String> {
+        let clock = self.clock.as_ref()?;
+        let frame = self.scene.as_ref()?.frame?;
+        let speed = match clock.speed() {
+            1.0 => String::new(),
+            speed => format!(", speed {speed}"),
+        };
+        let how = match (self.paused(), clock.is_looped()) {
+            (Some(_), _) => ", paused",
+            (None, true) => "",
+            (None, false) => ", once",
+        };
+        Some(format!(
+            ", frame {} of {}{speed}{how}",
+            frame.number,
+            clock.timeline().len()
+        ))
+    }
+
+    /// Changes the clock of a sequence.
+    fn with_clock(&mut self, change: impl FnOnce(&mut Clock, Instant)) -> Effect {
+        match &mut self.clock {
+            Some(clock) => {
+                change(clock, Instant::now());
+                Effect::Play
+            }
+            None => Effect::Overlay,
+        }
+    }
+
+    /// Lets the clock run when the first frame has arrived.
+    fn begin(&mut self) -> Option<Effect> {
+        if std::mem::replace(&mut self.began, true) {
+            return None;
+        }
+        Some(self.with_clock(Clock::play))
     }
 
     /// A level further on, of those that there are.
@@ -279,6 +399,8 @@ impl State {
         self.camera.forget();
         self.clip = Clip::default();
         self.scene = None;
+        self.clock = None;
+        self.began = false;
         self.choices = Choices::default();
         // A level of one stream may not be there in another.
         self.level = None;
@@ -293,194 +415,4 @@ impl State {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::sync::Arc;
-
-    use b2p::{Extent, Frame, Gaussians};
-
-    use super::*;
-    use crate::args::Orbit;
-    use crate::view::keys::{Key, action};
-    use crate::view::orbit::Start;
-
-    fn state(files: &[&str]) -> State {
-        let orbit = Orbit {
-            azimuth: 20.0,
-            elevation: 10.0,
-            distance: None,
-        };
-        let camera = OrbitCamera::new(Start {
-            orbit,
-            fov: 45.0,
-            look_at: None,
-        });
-        State::new(
-            files.iter().map(PathBuf::from).collect(),
-            camera,
-            Background::WHITE,
-            [200, 100],
-        )
-    }
-
-    fn scene(radius: f64, level: u8) -> Arrived {
-        Arrived::Scene(Box::new(Scene {
-            gaussians: Arc::new(Gaussians {
-                frame: Frame::default(),
-                ..Gaussians::default()
-            }),
-            extent: Extent::of([([0.0; 3], radius)].into_iter()),
-            up: None,
-            made: Some((level, HeadSet::Best)),
-            steps: Vec::new(),
-        }))
-    }
-
-    fn choices() -> Arrived {
-        Arrived::Choices(Choices {
-            levels: vec![7, 8, 9],
-            heads: HeadSet::ALL.to_vec(),
-        })
-    }
-
-    fn press(state: &mut State, key: char) -> Effect {
-        state.act(action(Key::Char(key), false).unwrap())
-    }
-
-    #[test]
-    fn levels_appear_one_after_the_other_and_the_camera_stays() {
-        let mut state = state(&["a.b2p"]);
-        assert_eq!(state.take(0, choices()), Effect::Overlay);
-        assert_eq!(state.take(0, scene(0.5, 7)), Effect::Draw);
-        let before = state.camera.camera([200, 100]).unwrap();
-        assert_eq!(state.take(0, scene(0.3, 8)), Effect::Draw);
-        assert_eq!(state.take(0, Arrived::Done), Effect::Overlay);
-        assert_eq!(state.camera.camera([200, 100]).unwrap(), before);
-        assert!(
-            !state.busy && state.line().contains("level 8, best"),
-            "{}",
-            state.line()
-        );
-    }
-
-    #[test]
-    fn keys_go_from_level_to_level_within_those_that_there_are() {
-        let mut state = state(&["a.b2p"]);
-        assert_eq!(press(&mut state, '['), Effect::Overlay);
-        state.take(0, choices());
-        assert_eq!(press(&mut state, ']'), Effect::Overlay);
-        assert_eq!(state.message.as_deref(), Some("levels go from 7 to 9"));
-        assert_eq!(press(&mut state, '['), Effect::Load);
-        assert_eq!(state.wanted().level, Some(8));
-        press(&mut state, '[');
-        assert_eq!(press(&mut state, '['), Effect::Overlay);
-        assert_eq!(state.wanted().level, Some(7));
-        press(&mut state, ']');
-        press(&mut state, ']');
-        assert_eq!(state.wanted().level, None);
-    }
-
-    #[test]
-    fn heads_go_around() {
-        let mut state = state(&["a.b2p"]);
-        assert_eq!(press(&mut state, 'h'), Effect::Overlay);
-        state.take(0, choices());
-        state.take(0, scene(0.5, 9));
-        let mut seen = Vec::new();
-        for _ in 0..3 {
-            assert_eq!(press(&mut state, 'h'), Effect::Load);
-            seen.push(state.wanted().heads.unwrap());
-        }
-        assert_eq!(seen, [HeadSet::Quick, HeadSet::Surfels, HeadSet::Best]);
-    }
-
-    #[test]
-    fn what_arrives_late_for_an_earlier_wish_is_not_shown() {
-        let mut state = state(&["a.b2p"]);
-        state.take(0, choices());
-        press(&mut state, '[');
-        assert_eq!(state.take(0, scene(0.5, 9)), Effect::Nothing);
-        assert!(state.scene.is_none());
-        assert_eq!(state.take(1, scene(0.5, 8)), Effect::Draw);
-    }
-
-    #[test]
-    fn another_file_is_shown_from_the_start_with_a_camera_of_its_own() {
-        let mut state = state(&["a.b2p", "b.ply", "c.spz"]);
-        assert_eq!(state.title(), "a.b2p (1 of 3), decoding – b2p");
-        state.take(0, choices());
-        state.take(0, scene(0.5, 9));
-        let first = state.camera.camera([200, 100]).unwrap();
-        press(&mut state, '[');
-        press(&mut state, '+');
-        assert_eq!(press(&mut state, 'p'), Effect::Load);
-        assert_eq!(
-            state.wanted(),
-            Wish {
-                number: 2,
-                path: "c.spz".into(),
-                level: None,
-                heads: None
-            }
-        );
-        assert!(state.scene.is_none());
-        state.take(2, scene(0.1, 9));
-        assert_ne!(state.camera.camera([200, 100]).unwrap(), first);
-        press(&mut state, 'n');
-        state.take(3, scene(0.5, 9));
-        assert_eq!(state.camera.camera([200, 100]).unwrap(), first);
-    }
-
-    #[test]
-    fn a_file_that_is_dropped_takes_the_place_of_the_others() {
-        let mut state = state(&["a.b2p", "b.ply"]);
-        assert_eq!(state.open(vec!["d.b2p".into()], 0), Effect::Load);
-        assert_eq!(state.wanted().path, Path::new("d.b2p"));
-        assert!(!state.has_others());
-        assert_eq!(state.open(Vec::new(), 0), Effect::Nothing);
-    }
-
-    #[test]
-    fn backgrounds_go_around_and_begin_with_the_one_that_was_asked_for() {
-        let mut state = state(&["a.b2p"]);
-        let mut seen = Vec::new();
-        for _ in 0..5 {
-            seen.push(state.background());
-            assert_eq!(press(&mut state, 'b'), Effect::Draw);
-        }
-        assert_eq!(seen[0], Background::WHITE);
-        assert_eq!(seen[4], seen[0]);
-        assert!((1..4).all(|i| seen[i] != seen[i - 1]));
-    }
-
-    #[test]
-    fn a_failure_is_said_and_what_was_there_stays() {
-        let mut state = state(&["a.b2p"]);
-        state.take(0, scene(0.5, 8));
-        assert_eq!(state.take(0, Arrived::Failed("damaged".into())), Effect::Overlay);
-        assert_eq!(state.message.as_deref(), Some("damaged"));
-        assert!(state.scene.is_some() && !state.busy);
-        assert_eq!(press(&mut state, 't'), Effect::Overlay);
-        assert_eq!(state.message, None);
-    }
-
-    #[test]
-    fn keys_ask_for_what_they_say() {
-        let mut state = state(&["a.b2p"]);
-        for (key, effect) in [
-            ('s', Effect::Screenshot),
-            ('q', Effect::Close),
-            ('?', Effect::Overlay),
-            ('+', Effect::Move),
-            ('r', Effect::Draw),
-            ('c', Effect::Draw),
-            ('x', Effect::Overlay),
-            ('>', Effect::Draw),
-            ('c', Effect::Draw),
-            ('>', Effect::Nothing),
-        ] {
-            assert_eq!(press(&mut state, key), effect, "{key}");
-        }
-        assert_eq!(state.resize([50, 60]), Effect::Draw);
-        assert_eq!(state.size, [50, 60]);
-    }
-}
+mod tests;

@@ -8,9 +8,9 @@ use std::sync::mpsc::{Receiver, Sender, channel, sync_channel};
 
 use console::{Key as TerminalKey, Term};
 
-use super::files::Files;
-use super::keys::{self, HELP, Key};
+use super::keys::{self, HELP, Key, SEQUENCE_HELP};
 use super::painter::{Destination, Order, Painted, Painter};
+use super::player::Sources;
 use super::source::{Arrived, Source};
 use super::state::{Effect, State};
 use super::{Kind, Viewer, screenshot_path};
@@ -61,7 +61,7 @@ pub fn run(viewer: Viewer, kind: Kind) -> Result<Said> {
                 send(&teller, Told::Source(number, arrived));
             }
         };
-        Files::start(viewer.loading, Arc::new(tell))?
+        Sources::start(viewer.loading, Arc::new(tell))?
     };
     let mut screen = Screen {
         state: viewer.state,
@@ -181,6 +181,14 @@ impl Screen {
                 self.source.want(self.state.wanted());
                 return self.write_line();
             }
+            Effect::Play => {
+                if let Some(clock) = &self.state.clock {
+                    self.source.play(clock);
+                }
+                if self.is_followed {
+                    self.order();
+                }
+            }
             Effect::Screenshot => match screenshot_path(&self.screenshots, self.state.path()) {
                 Ok(path) => self.paint(Destination::File(path)),
                 Err(Failure(message)) => self.state.message = Some(message),
@@ -250,7 +258,10 @@ impl Screen {
         let line = match &self.state.message {
             Some(message) => message.clone(),
             None if self.state.help => {
-                let short = HELP.iter().filter(|(keys, _)| !keys.contains("drag"));
+                let sequence = self.state.clock.iter().flat_map(|_| &SEQUENCE_HELP);
+                let short = sequence
+                    .chain(&HELP)
+                    .filter(|(keys, _)| !keys.contains("drag") && !keys.contains("click on"));
                 let words: Vec<_> = short.map(|(keys, what)| format!("{keys}: {what}")).collect();
                 words.join("  ")
             }

@@ -12,10 +12,10 @@ use winit::event_loop::{ActiveEventLoop, ControlFlow, EventLoop};
 use winit::keyboard::{Key as WindowKey, ModifiersState, NamedKey};
 use winit::window::{Window, WindowId};
 
-use super::files::Files;
 use super::keys::{self, Action, Key};
 use super::overlay::{self, Sheet};
-use super::painter::{Destination, Order, Painted, Painter, Picture};
+use super::painter::{Destination, Order, Painted, Painter, Picture, stretch};
+use super::player::Sources;
 use super::source::{Arrived, Source};
 use super::state::{Effect, State};
 use super::tally::Tally;
@@ -51,7 +51,7 @@ pub fn run(viewer: Viewer) -> Result<Said> {
     let tell = move |number, arrived| {
         let _ = proxy.send_event(Told::Source(number, arrived));
     };
-    let source = Files::start(viewer.loading, Arc::new(tell))?;
+    let source = Sources::start(viewer.loading, Arc::new(tell))?;
     let mut app = App {
         state: viewer.state,
         source: Box::new(source),
@@ -103,6 +103,8 @@ struct Pointer {
 enum Drag {
     Turn,
     Pan,
+    /// Along the time line.
+    Seek,
 }
 
 struct App {
@@ -158,6 +160,12 @@ impl App {
             }
             Effect::Load => {
                 self.source.want(self.state.wanted());
+                self.order(false);
+            }
+            Effect::Play => {
+                if let Some(clock) = &self.state.clock {
+                    self.source.play(clock);
+                }
                 self.order(false);
             }
             Effect::Screenshot => self.screenshot(),
@@ -231,7 +239,10 @@ impl App {
                 }
             }
             Painted::Saved(path) => {
-                let options = self.state.camera.options(self.state.size);
+                let mut options = self.state.camera.options(self.state.size);
+                if let Some(frame) = self.state.scene.as_ref().and_then(|scene| scene.frame) {
+                    options += &format!(" --frame {}", frame.number);
+                }
                 let from = quoted(self.state.path());
                 manners::note_report(&format!(
                     "{}: as `b2p render {from} {options}` draws it",
@@ -269,8 +280,7 @@ impl App {
             pixels: &mut buffer,
             size: state.size,
         };
-        let zoom = ((1.5 * window.scale_factor()).round() as u32).max(1);
-        overlay::draw(state, picture, &mut sheet, zoom);
+        overlay::draw(state, picture, &mut sheet, zoom(window));
         window.pre_present_notify();
         buffer.present()?;
         if let Some(picture) = picture {
@@ -290,6 +300,7 @@ impl App {
             WindowKey::Named(NamedKey::Home) => Key::Home,
             WindowKey::Named(NamedKey::Escape) => Key::Escape,
             WindowKey::Named(NamedKey::F1) => Key::Char('?'),
+            WindowKey::Named(NamedKey::Space) => Key::Char(' '),
             WindowKey::Character(text) => match text.chars().next() {
                 Some(character) => Key::Char(character),
                 None => return,
@@ -305,12 +316,16 @@ impl App {
     fn button(&mut self, button: MouseButton, state: ElementState, events: &ActiveEventLoop) {
         self.pointer.drag = match (state, button) {
             (ElementState::Released, _) => None,
+            (_, MouseButton::Left) if self.is_on_the_time_line() => Some(Drag::Seek),
             (_, MouseButton::Left) if !self.modifiers.shift_key() => Some(Drag::Turn),
             (_, MouseButton::Left | MouseButton::Right | MouseButton::Middle) => Some(Drag::Pan),
             _ => return,
         };
         if (state, button) != (ElementState::Pressed, MouseButton::Left) {
             return;
+        }
+        if matches!(self.pointer.drag, Some(Drag::Seek)) {
+            return self.seek(events);
         }
         let (now, at) = (Instant::now(), self.pointer.at);
         let before = self.pointer.pressed.replace((now, at));
@@ -330,8 +345,25 @@ impl App {
             None => return,
             Some(Drag::Turn) => self.state.camera.drag(by, size),
             Some(Drag::Pan) => self.state.camera.pan(by, size),
+            Some(Drag::Seek) => return self.seek(events),
         }
         self.apply(Effect::Move, events);
+    }
+
+    fn is_on_the_time_line(&self) -> bool {
+        let Some(shell) = self.shell.as_ref().filter(|_| self.state.clock.is_some()) else {
+            return false;
+        };
+        let height = overlay::time_line_height(zoom(&shell.window));
+        self.pointer.at[1] >= f64::from(self.state.size[1].saturating_sub(height))
+    }
+
+    /// Goes where the pointer is on the time line.
+    fn seek(&mut self, events: &ActiveEventLoop) {
+        let effect = self
+            .state
+            .seek(self.pointer.at[0] / f64::from(self.state.size[0].max(1)));
+        self.apply(effect, events);
     }
 
     fn dropped(&mut self, path: PathBuf, events: &ActiveEventLoop) {
@@ -381,6 +413,7 @@ impl ApplicationHandler<Told> for App {
                     self.failure = Some(Failure(message.clone()));
                     return events.exit();
                 }
+                self.tally.arrived(&arrived, Instant::now());
                 let effect = self.state.take(number, arrived);
                 self.apply(effect, events);
             }
@@ -423,6 +456,11 @@ impl ApplicationHandler<Told> for App {
     }
 }
 
+/// How much letters and the time line are enlarged.
+fn zoom(window: &Window) -> u32 {
+    ((1.5 * window.scale_factor()).round() as u32).max(1)
+}
+
 /// A path as a shell takes it.
 fn quoted(path: &Path) -> String {
     let path = path.display().to_string();
@@ -430,17 +468,6 @@ fn quoted(path: &Path) -> String {
     match !path.is_empty() && path.chars().all(is_plain) {
         true => path,
         false => format!("'{}'", path.replace('\'', "'\\''")),
-    }
-}
-
-/// Shows a picture of another size until the right one is there.
-fn stretch(picture: &Picture, [width, height]: [u32; 2], pixels: &mut [u32]) {
-    let [columns, rows] = picture.size.map(u64::from);
-    for (y, row) in pixels.chunks_exact_mut(width as usize).enumerate() {
-        let from = (y as u64 * rows / u64::from(height)) * columns;
-        for (x, pixel) in row.iter_mut().enumerate() {
-            *pixel = picture.pixels[(from + x as u64 * columns / u64::from(width)) as usize];
-        }
     }
 }
 
