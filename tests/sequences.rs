@@ -254,6 +254,35 @@ fn a_moved_cloud_takes_fewer_bits_than_a_whole_frame() {
 }
 
 #[test]
+fn frames_of_other_sample_points_are_coded_to_the_level_of_the_cloud() {
+    let sampled = |frame: u64| {
+        let cloud = moving(0);
+        let is_there = |key: &u64| !(key.wrapping_mul(0x9e37_79b9_7f4a_7c15 + 2 * frame) >> 59).is_multiple_of(8);
+        let pairs = cloud.voxels.keys().iter().zip(&cloud.colours);
+        let there: Vec<_> = pairs.filter(|(key, _)| is_there(key)).collect();
+        ColouredVoxels {
+            voxels: Voxels::new(6, there.iter().map(|(key, _)| **key).collect()),
+            colours: there.iter().map(|(_, colour)| **colour).collect(),
+            placement: Placement::VOXEL_GRID,
+        }
+    };
+    let bytes = SequenceEncoder::new().with_levels(4..=6);
+    let bytes = bytes
+        .encode(4, |number| Ok(sampled(number)), |_| {})
+        .expect("a sequence");
+    let sequence = reader(&bytes);
+    for number in 0..4 {
+        let (keys, _) = frame(&sequence, number, None).expect("a frame");
+        let cloud = sampled(number);
+        // Kept blocks have the voxels of another sample.
+        assert!(
+            keys.len().abs_diff(cloud.voxels.len()) < cloud.voxels.len() / 4,
+            "frame {number}"
+        );
+    }
+}
+
+#[test]
 fn lossless_frames_have_exactly_their_voxels_and_colours() {
     let encoder = SequenceEncoder::new()
         .with_levels(3..=6)

@@ -107,7 +107,12 @@ pub fn encode_predicted(
             .map(|n| inter.colours(&target.octree, n))
             .collect::<Result<_>>()?,
     };
-    let points = (cloud.voxels.len() as u64).max(target.octree.level(top).len() as u64);
+    let count = target.octree.level(top).len() as u64;
+    // At level N the points are its voxels, and kept blocks may have others than the cloud.
+    let points = match top == cloud.voxels.depth() {
+        true => count,
+        false => count.max(cloud.voxels.len() as u64),
+    };
     let subject = EncoderInput {
         cloud,
         options,
