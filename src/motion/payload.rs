@@ -349,10 +349,10 @@ mod tests {
 
         #[test]
         fn any_bytes_are_read_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..80), count in 1usize..50) {
-            if let Ok((head, rest)) = Head::parse(&bytes, 6, 9) {
-                if let Ok(blocks) = head.blocks(6, count, &[rest]) {
-                    prop_assert_eq!(blocks.vectors.len(), count);
-                }
+            if let Ok((head, rest)) = Head::parse(&bytes, 6, 9)
+                && let Ok(blocks) = head.blocks(6, count, &[rest])
+            {
+                prop_assert_eq!(blocks.vectors.len(), count);
             }
         }
     }
