@@ -36,12 +36,18 @@ fn decoded(bytes: &[u8]) {
     let most = HELD * (limits().max_bytes + Limits::OVERHEAD) as usize;
     let found = within(most, || {
         let mut decoder = SequenceDecoder::new(Decoder::new().with_limits(limits()));
-        (0..frames).map(|n| frame(&mut decoder, &sequence, n)).collect::<Vec<_>>()
+        (0..frames)
+            .map(|n| frame(&mut decoder, &sequence, n))
+            .collect::<Vec<_>>()
     });
     if let Some(last) = found.last() {
         let mut decoder = SequenceDecoder::new(Decoder::new().with_limits(limits()));
         let again = frame(&mut decoder, &sequence, frames - 1);
-        assert_eq!(again.as_ref().ok(), last.as_ref().ok(), "a frame depends on where decoding began");
+        assert_eq!(
+            again.as_ref().ok(),
+            last.as_ref().ok(),
+            "a frame depends on where decoding began"
+        );
     }
 }
 
@@ -72,7 +78,9 @@ fn sealed(bytes: &[u8]) -> Option<Vec<u8>> {
     for group in &mut index.groups {
         let start = usize::try_from(group.offset).ok()?;
         let content = bytes.get(start..start.checked_add(group.bytes as usize)?)?;
-        let hash = GroupEntry::of(content, group.frames, group.start, group.ticks).ok()?.hash;
+        let hash = GroupEntry::of(content, group.frames, group.start, group.ticks)
+            .ok()?
+            .hash;
         group.hash = hash;
     }
     let mut sealed = header.write_sequence();

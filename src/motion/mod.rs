@@ -5,7 +5,7 @@
 //! frame, as it was decoded, so that frames stay scalable and encoder and decoder never differ.
 //!
 //! - [`Previous`] is the previous frame, searched by position.
-//! - [`Motion`] is what a frame says of its blocks.
+//! - [`Head`] and [`Blocks`] are what a frame says of its blocks.
 //! - [`Inter`] makes of both what the coders of occupancies and colours take.
 
 mod bricks;
