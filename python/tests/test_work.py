@@ -14,6 +14,9 @@ from conftest import torus
 
 import b2p
 
+# A background process may have inherited that Ctrl-C is ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 @pytest.fixture(scope="module")
 def large():
