@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use super::SequenceReader;
 use crate::container::Header;
-use crate::container::sequence::{FrameEntry, GroupEntry, Index, table_bytes};
+use crate::container::sequence::{FrameEntry, GroupEntry, Index};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 
@@ -64,9 +64,10 @@ impl Assembly {
 }
 
 /// A group of frames, each an entry of the table and its bytes.
+#[cfg(feature = "encoder")]
 pub(super) fn group_of(frames: &[(FrameEntry, Vec<u8>)]) -> Result<(Vec<FrameEntry>, Vec<u8>)> {
     let entries: Vec<FrameEntry> = frames.iter().map(|frame| frame.0.clone()).collect();
-    let mut bytes = table_bytes(&entries)?;
+    let mut bytes = crate::container::sequence::table_bytes(&entries)?;
     for (_, coded) in frames {
         bytes.extend(coded);
     }
