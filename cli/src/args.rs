@@ -137,7 +137,7 @@ impl LimitArgs {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Code coloured point clouds into streams: PLY, LAS, LAZ, PCD, E57, XYZ, CSV, OBJ, glTF or GLB, recognised by
-    /// content
+    /// content. Several clouds into one file, or a name such as `frame_%04d.ply`: the frames of a sequence
     Encode(Encode),
     /// Decode streams to 3D Gaussians
     Decode(Decode),

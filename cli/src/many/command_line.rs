@@ -46,12 +46,13 @@ impl CommandLine {
                 }
                 continue;
             }
-            let (name, joined) = named(&text);
-            let takes_next = !joined && with_value.iter().any(|known| known == name);
-            let value = if takes_next { arguments.next() } else { None };
-            if !OPTIONS.contains(&name) && !left_out.contains(&name) {
-                common.push(argument.clone());
-                common.extend(value);
+            for (name, written, joined) in options_in(&argument, &text, &with_value) {
+                let takes_next = !joined && with_value.contains(&name);
+                let value = if takes_next { arguments.next() } else { None };
+                if !OPTIONS.contains(&name.as_str()) && !left_out.contains(&name.as_str()) {
+                    common.push(written);
+                    common.extend(value);
+                }
             }
         }
         common
@@ -82,13 +83,24 @@ fn options_with_value(command: &clap::Command) -> Vec<String> {
     names.collect()
 }
 
-/// The name of an option, and whether its value is in the same argument.
-fn named(text: &str) -> (&str, bool) {
-    match text.split_once('=') {
-        Some((name, _)) if text.starts_with("--") => (name, true),
-        _ if !text.starts_with("--") && text.is_char_boundary(2) && text.len() > 2 => (&text[..2], true),
-        _ => (text, false),
+/// The options of an argument: one, or several short ones such as `-fo`. Of each its name, how it is written by itself,
+/// and whether its value is there, too.
+fn options_in(argument: &OsStr, text: &str, with_value: &[String]) -> Vec<(String, OsString, bool)> {
+    if let Some(long) = text.strip_prefix("--") {
+        let name = long.split('=').next().unwrap_or(long);
+        return vec![(format!("--{name}"), argument.to_owned(), long.contains('='))];
     }
+    let mut options = Vec::new();
+    for (at, short) in text.char_indices().skip(1) {
+        let name = format!("-{short}");
+        let rest = &text[at + short.len_utf8()..];
+        if with_value.contains(&name) {
+            options.push((name, format!("-{short}{rest}").into(), !rest.is_empty()));
+            break;
+        }
+        options.push((name.clone(), name.into(), false));
+    }
+    options
 }
 
 #[cfg(test)]
@@ -121,6 +133,14 @@ mod tests {
         assert_eq!(
             of("encode --resume -b0.2 -Q 3 --name {n}.b2p -od -- -a -b", "--output"),
             "encode --resume -b0.2 -Q 3 --color never --threads 2 --output y.png -- x.b2p"
+        );
+    }
+
+    #[test]
+    fn short_options_may_be_written_together() {
+        assert_eq!(
+            of("encode -vfo d/ a b -fb0.2 -qv", "--output"),
+            "encode -v -f -f -b0.2 -v --color never --threads 2 --output y.png -- x.b2p"
         );
     }
 

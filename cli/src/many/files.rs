@@ -6,6 +6,7 @@ use clap::error::ErrorKind;
 use clap::{Args, CommandFactory, ValueEnum};
 
 use super::super::args::Cli;
+use super::super::manners::is_pipe;
 use super::super::{Failure, Result};
 
 /// Inputs, and an output or a folder of outputs.
@@ -44,7 +45,7 @@ pub enum ProgressFormat {
 }
 
 /// Options that are not those of each input.
-pub const OPTIONS: [&str; 8] = [
+pub const OPTIONS: [&str; 10] = [
     "--output",
     "-o",
     "--files-from",
@@ -53,6 +54,9 @@ pub const OPTIONS: [&str; 8] = [
     "--progress",
     "--threads",
     "--color",
+    // What each says is caught, and tells whether it was done before.
+    "--quiet",
+    "-q",
 ];
 
 /// What a command works on.
@@ -123,7 +127,7 @@ impl Files {
             let text = text.map_err(|error| Failure(format!("{}: {error}", list.display())))?;
             all.extend(text.lines().filter(|line| !line.trim().is_empty()).map(PathBuf::from));
         }
-        if output.extension().is_some() && !is_folder(output) {
+        if is_pipe(output) || (output.extension().is_some() && !is_folder(output)) {
             if kind.gathers {
                 let output = output.to_path_buf();
                 return Ok(Work::Sequence { inputs: all, output });

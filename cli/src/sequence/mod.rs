@@ -28,9 +28,9 @@ pub fn is_sequence(path: &Path) -> bool {
     !super::manners::is_pipe(path) && start().is_ok_and(|start| SequenceReader::is_sequence(&start))
 }
 
-/// Whether a path names many clouds: a folder, or a name with a number such as `frame_%04d.ply`.
+/// Whether a path names many clouds by a number, such as `frame_%04d.ply`.
 pub fn names_many(path: &Path) -> bool {
-    path.is_dir() || Pattern::of(path).is_some()
+    Pattern::of(path).is_some()
 }
 
 /// A file name with a place for a number, as `printf` has it.
@@ -69,35 +69,19 @@ impl Pattern {
     }
 }
 
-/// The files that a path names, in order: those of a folder by name, those of a pattern from number 0 or 1 on.
+/// The files that a pattern names, from number 0 or 1 on.
 fn clouds(path: &Path) -> Result<Vec<PathBuf>> {
-    let wrong = |what: &str| Failure(format!("{}: {what}", path.display()));
-    if let Some(pattern) = Pattern::of(path) {
-        let first = (0..2).find(|number| pattern.path(*number).is_file());
-        let first = first.ok_or_else(|| wrong("there is no such file with the number 0 or 1"))?;
-        return Ok((first..)
-            .map(|number| pattern.path(number))
-            .take_while(|path| path.is_file())
-            .collect());
-    }
-    /// Endings of point clouds.
-    const ENDINGS: [&str; 11] = [
-        "ply", "las", "laz", "pcd", "e57", "xyz", "csv", "obj", "gltf", "glb", "txt",
-    ];
-    let failed = |error: std::io::Error| wrong(&error.to_string());
-    let mut found = Vec::new();
-    for entry in std::fs::read_dir(path).map_err(failed)? {
-        let path = entry.map_err(failed)?.path();
-        let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        if path.is_file() && ENDINGS.contains(&ending.as_str()) {
-            found.push(path);
-        }
-    }
-    found.sort();
-    match found.is_empty() {
-        true => Err(wrong("the folder has no point clouds")),
-        false => Ok(found),
-    }
+    let wrong = || {
+        Failure(format!(
+            "{}: there is no such file with the number 0 or 1",
+            path.display()
+        ))
+    };
+    let pattern = Pattern::of(path).ok_or_else(wrong)?;
+    let first = (0..2).find(|number| pattern.path(*number).is_file());
+    let numbers = first.ok_or_else(wrong)?..;
+    let paths = numbers.map(|number| pattern.path(number));
+    Ok(paths.take_while(|path| path.is_file()).collect())
 }
 
 /// Reads a sequence.

@@ -16,6 +16,7 @@ mod planning;
 mod rate_control;
 #[path = "../../../tests/common/seal.rs"]
 mod seal;
+mod sequences;
 mod serving;
 mod transform;
 

@@ -1,0 +1,126 @@
+//! Sequences through the program: coded from many clouds, described, checked, cut, joined, decoded and drawn.
+
+use std::path::Path;
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+use super::common::{Ball, names_in};
+use super::{fails, plain, succeeds};
+
+/// Six frames of a ball that moves by a voxel, named as `frame_%02d.ply` from 0 on.
+fn frames() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::create_dir(folder.path().join("frames")).unwrap();
+    for frame in 0..6u32 {
+        let mut text = String::from("ply\nformat ascii 1.0\ncomment bits 6\n");
+        let voxels = Ball::new(6, 14.0).voxels();
+        text += &format!("element vertex {}\n", voxels.len());
+        text += "property float x\nproperty float y\nproperty float z\n";
+        text += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n";
+        for ([x, y, z], [r, g, b]) in voxels {
+            text += &format!("{} {y} {z} {r} {g} {b}\n", x + frame);
+        }
+        std::fs::write(folder.path().join(format!("frames/frame_{frame:02}.ply")), text).unwrap();
+    }
+    folder
+}
+
+const CODING: [&str; 6] = ["--gop", "3", "--fps", "25", "--levels", "3..5"];
+
+fn encode(at: &Path, inputs: &[&str], output: &str, more: &[&str]) {
+    succeeds(at, &[&["encode"], inputs, &["-o", output], &CODING, more].concat());
+}
+
+fn bytes(at: &Path, name: &str) -> Vec<u8> {
+    std::fs::read(at.join(name)).unwrap()
+}
+
+#[test]
+fn a_folder_a_pattern_and_a_list_of_files_make_the_same_sequence() {
+    let folder = frames();
+    let at = folder.path();
+    encode(at, &["frames"], "a.b2p", &[]);
+    encode(at, &["frames/frame_%02d.ply"], "b.b2p", &[]);
+    let names: Vec<String> = (0..6).map(|i| format!("frames/frame_{i:02}.ply")).collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    encode(at, &names, "c.b2p", &["--threads", "1"]);
+    let output = plain(at, &[&["encode", "frames", "-o", "-"][..], &CODING].concat());
+    assert!(output.status.success());
+    for other in [bytes(at, "b.b2p"), bytes(at, "c.b2p"), output.stdout] {
+        assert!(bytes(at, "a.b2p") == other);
+    }
+    let info: Value = serde_json::from_str(&succeeds(at, &["info", "a.b2p", "--json"])).unwrap();
+    assert_eq!(info["frames"], 6, "{info}");
+    succeeds(at, &["check", "a.b2p"]);
+}
+
+#[test]
+fn parts_of_a_sequence_are_cut_joined_decoded_and_drawn() {
+    let folder = frames();
+    let at = folder.path();
+    encode(at, &["frames"], "all.b2p", &[]);
+    succeeds(at, &["cut", "all.b2p", "-o", "first.b2p", "--frames", "0..3"]);
+    succeeds(at, &["cut", "all.b2p", "-o", "rest.b2p", "--frames", "3..6"]);
+    succeeds(at, &["join", "first.b2p", "rest.b2p", "-o", "joined.b2p"]);
+    assert!(bytes(at, "all.b2p") == bytes(at, "joined.b2p"));
+
+    let surfels = ["--heads", "surfels"];
+    succeeds(
+        at,
+        &[&["decode", "all.b2p", "-o", "four.ply", "--frame", "4"][..], &surfels].concat(),
+    );
+    succeeds(
+        at,
+        &[&["decode", "rest.b2p", "-o", "one.ply", "--time", "0.05"][..], &surfels].concat(),
+    );
+    assert!(
+        bytes(at, "four.ply") == bytes(at, "one.ply"),
+        "the second frame of the rest"
+    );
+    let draw = ["--size", "40x30"];
+    succeeds(
+        at,
+        &[&["render", "all.b2p", "-o", "%d.png"][..], &surfels, &draw].concat(),
+    );
+    assert_eq!(
+        names_in(at)
+            .iter()
+            .filter(|name| name.to_string_lossy().ends_with(".png"))
+            .count(),
+        6
+    );
+    succeeds(
+        at,
+        &[&["render", "all.b2p", "-o", "all.y4m"][..], &surfels, &draw].concat(),
+    );
+    assert_eq!(
+        bytes(at, "all.y4m").windows(5).filter(|part| part == b"FRAME").count(),
+        6
+    );
+    fails(at, &["cut", "all.b2p", "-o", "x.b2p", "--frames", "1..3"], &["all.b2p"]);
+}
+
+#[test]
+fn options_of_sequences_are_kept_to() {
+    let folder = frames();
+    let at = folder.path();
+    let size = |more: &[&str]| {
+        encode(at, &["frames"], "x.b2p", more);
+        bytes(at, "x.b2p").len()
+    };
+    let usual = size(&[]);
+    assert!(usual < size(&["--intra"]), "frames are predicted");
+    assert!(usual < size(&["--lossless"]));
+    // Six frames last 0.24 s.
+    let most = usual * 8 * 9 / 10;
+    let rate = (most as f64 / 0.24) as u64;
+    assert!(size(&["--bitrate", &rate.to_string()]) * 8 <= most);
+    let points = 6 * Ball::new(6, 14.0).voxels().len();
+    assert!(size(&["--bits-per-point", "1.5"]) as f64 * 8.0 <= 1.5 * points as f64);
+    fails(
+        at,
+        &["encode", "frames/frame_00.ply", "-o", "y.b2p", "--fps", "30"],
+        &["--fps", "for sequences"],
+    );
+}
