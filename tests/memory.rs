@@ -159,17 +159,22 @@ fn drawing_version_3_with_learned_heads_holds_no_more_than_the_bound_that_its_he
     let mut clouds = clouds();
     // The network's output is computed in parts of 16,384 voxels: this cloud has several.
     clouds.push(("large surface", Ball::new(8, 60.0).cloud()));
-    // With this limit the network is evaluated on spans of at most 98,304 rows: this cloud has several.
-    clouds.push(("spans", Ball::new(8, 100.0).cloud()));
+    // The network is evaluated on spans of at most 98,304 rows with the lower limit, and all at once with the other.
+    clouds.push(("several spans", Ball::new(8, 100.0).cloud()));
+    clouds.push(("one span", Ball::new(8, 100.0).cloud()));
     for (kind, cloud) in clouds {
+        let (max_bytes, finest_alone) = match kind {
+            "one span" => (2 << 30, true),
+            kind => (192 << 20, kind == "several spans"),
+        };
         let [bytes, ..] = transformed(&cloud);
         let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
         for (set, gaussians) in sets.iter().copied() {
             for precision in [Precision::Int16, Precision::F16] {
-                let decoder = Decoder::new().with_limits(Limits::default().with_max_bytes(192 << 20));
+                let decoder = Decoder::new().with_limits(Limits::default().with_max_bytes(max_bytes));
                 let decoder = decoder.with_heads_model(heads.clone()).with_heads(set.into());
                 let decoder = decoder.with_precision(precision).with_per_voxel(gaussians);
-                let first = if kind == "spans" { header.top } else { header.base };
+                let first = if finest_alone { header.top } else { header.base };
                 for level in first.max(1)..=header.top {
                     let of = format!("{kind}, {set}.{gaussians} in {precision}, level {level}");
                     let most = decoder.memory(&header, level).unwrap();

@@ -19,7 +19,7 @@ use super::picture::{Artist, ending, format_of};
 use super::progress::Progress;
 use super::sheet::Sheet;
 use super::table::{count, counted, milliseconds, steps};
-use super::views::{Shot, shots};
+use super::views::{Shot, lenses_beside, shots};
 use super::{Failure, Result, load, pipe, sequence, turntable};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
@@ -141,7 +141,13 @@ fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
     {
         outputs = vec![&args.output];
     }
-    let inputs = [Some(&args.input), args.camera.as_ref(), args.model.model.as_ref()];
+    let lenses = args.camera.as_deref().and_then(lenses_beside);
+    let inputs = [
+        Some(&args.input),
+        args.camera.as_ref(),
+        lenses.as_ref(),
+        args.model.model.as_ref(),
+    ];
     let inputs: Vec<&Path> = inputs.into_iter().flatten().map(PathBuf::as_path).collect();
     manners::permit(&outputs, &inputs)
 }

@@ -32,6 +32,12 @@ fn count(args: &Render) -> u32 {
     args.view.views.unwrap_or(usual)
 }
 
+/// The second file of cameras of COLMAP.
+pub fn lenses_beside(cameras: &Path) -> Option<PathBuf> {
+    let is_colmap = cameras.extension().is_some_and(|ending| ending == "txt");
+    is_colmap.then(|| cameras.with_file_name("cameras.txt"))
+}
+
 /// The cameras of the file, or of the circle around an object that takes `extent` of the cube.
 pub fn shots(args: &Render, frame: &Frame, extent: &Extent, limits: &Limits) -> Result<Vec<Shot>> {
     let named = match &args.camera {
@@ -58,9 +64,8 @@ fn from_file(path: &Path, size: (u32, u32), frame: &Frame, limits: &Limits) -> R
         let text = String::from_utf8(load::bytes(path, &limits)?);
         text.map_err(|_| Failure(format!("{}: not a text", path.display())))
     };
-    let named = if path.extension().is_some_and(|ending| ending == "txt") {
-        let lenses = text(&path.with_file_name("cameras.txt"))?;
-        files::colmap(&lenses, &text(path)?, frame)
+    let named = if let Some(lenses) = lenses_beside(path) {
+        files::colmap(&text(&lenses)?, &text(path)?, frame)
     } else {
         files::read(&load::bytes(path, &limits)?, frame, size)
     };

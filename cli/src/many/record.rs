@@ -6,7 +6,7 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use b2p::{Error, output};
+use b2p::{Error, embedded, output};
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::Xxh3;
 
@@ -34,7 +34,7 @@ const IRRELEVANT: [&str; 13] = [
 /// What a command did.
 #[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Record {
-    /// Version of the program.
+    /// Version of the program, and the hash of the models in it.
     program: String,
     /// Its options.
     options: Vec<String>,
@@ -56,7 +56,7 @@ impl Record {
     pub fn of(options: &[String], inputs: &[PathBuf], outputs: &[PathBuf]) -> Option<Record> {
         let files = |paths: &[PathBuf]| paths.iter().map(|path| File::of(path)).collect::<Option<Vec<_>>>();
         Some(Record {
-            program: env!("CARGO_PKG_VERSION").into(),
+            program: program(),
             options: options.to_vec(),
             inputs: files(inputs)?,
             outputs: files(outputs)?,
@@ -112,6 +112,14 @@ impl Write for Hash {
     fn flush(&mut self) -> std::io::Result<()> {
         Ok(())
     }
+}
+
+/// What this program is: other models draw other pictures.
+fn program() -> String {
+    let mut hash = Xxh3::new();
+    hash.update(embedded::MODEL);
+    hash.update(embedded::HEADS);
+    format!("{} {:032x}", env!("CARGO_PKG_VERSION"), hash.digest128())
 }
 
 /// Where the record of an output is.

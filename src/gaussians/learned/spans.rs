@@ -11,11 +11,11 @@ use rayon::prelude::*;
 
 use crate::geometry::{KernelMap, Voxels};
 
-/// Rows of a span with its halo where memory is short. Spans of as many evaluate about a tenth of their voxels twice.
+/// Rows of a span with its halo where memory is short: smaller spans evaluate more of their voxels twice.
 const LEAST_ROWS: u64 = 3 << 15;
 /// Rows of a span with its halo where memory is not limited.
 const MOST_ROWS: u64 = 1 << 20;
-/// A span has a row for so many bytes of the memory limit: its activations take a tenth of them, or less.
+/// A span has a row for so many bytes of the memory limit.
 const BYTES_PER_ROW: u64 = 4096;
 
 /// Rows of a span with its halo, at most, where decoding may take so many bytes of memory.
