@@ -16,13 +16,14 @@ OCTANTS = np.array([[o & 1, o >> 1 & 1, o >> 2] for o in range(8)])
 
 class Tree:
     """All levels of a sample from the root (`roles[0]`) to `top`. coords[r] int32 [n_r, 3]; parent[r], octant[r]; children[r] [n_r, 8], rows of role r + 1
-    or -1; colours[r] f32 [n_r, 3] in 0..255, of which a parent's is the mean of its children's; map[r] the 3x3x3 kernel map."""
+    or -1; colours[r] f32 [n_r, 3] in 0..255, of which a parent's is the mean of its children's; map[r] the 3x3x3 kernel map. `xyz` and `rgb` are voxels
+    of role `finest` in Morton order; `depth` is the level of role FINEST."""
 
-    def __init__(self, xyz, rgb, depth, top):
+    def __init__(self, xyz, rgb, depth, top, finest=FINEST):
         self.depth = depth
         self.roles = range(FINEST - depth, top + 1)
-        self.coords, self.colours, self.parent, self.octant, self.children = {FINEST: xyz}, {FINEST: rgb.astype(np.float32)}, {}, {}, {}
-        for r in range(FINEST - 1, self.roles[0] - 1, -1):
+        self.coords, self.colours, self.parent, self.octant, self.children = {finest: xyz}, {finest: rgb.astype(np.float32)}, {}, {}, {}
+        for r in range(finest - 1, self.roles[0] - 1, -1):
             self._above(r)
         self.map = {self.roles[0]: ops.neighbours(torch.from_numpy(self.coords[self.roles[0]]))}
         for r in self.roles[1:]:
@@ -176,9 +177,10 @@ def decoded_colours(tree, role, step, rng):
 
 
 class Sample:
-    """A file of `b2p-lab dataset` as a tree, with its pictures, and what a teacher said of it, if that is known."""
+    """A file of `b2p-lab dataset` as a tree, with its pictures, and what a teacher said of it, if that is known. `moved[r]` are trees whose role r is
+    optimised occupancy, if `moved.py` wrote some to the folder `moved`."""
 
-    def __init__(self, path, top=2, teacher=None):
+    def __init__(self, path, top=2, teacher=None, moved=None):
         self.name = os.path.basename(path).removesuffix(".safetensors")
         d = load_file(path)
         depth = max(int(d["xyz.3"].max()).bit_length(), 5)  # a crop is the root of a tree of its own
@@ -187,6 +189,13 @@ class Sample:
         self.taught = None
         if teacher and os.path.exists(taught := os.path.join(teacher, os.path.basename(path))):
             self.taught = {k: torch.from_numpy(v) for k, v in load_file(taught).items()}
+        self.moved = {}
+        if moved and os.path.exists(moved := os.path.join(moved, os.path.basename(path))):
+            d = load_file(moved)
+            for key in sorted(k for k in d if k.startswith("xyz.")):
+                role = int(key.split(".")[1])
+                if role <= top:
+                    self.moved.setdefault(role, []).append(Tree(d[key], d[key.replace("xyz", "rgb")], depth, role, role))
 
     def pictures(self, views):
         """Cameras, premultiplied colours [V, 3, H, W] and coverage [V, 1, H, W]."""

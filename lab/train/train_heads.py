@@ -33,7 +33,7 @@ def random_step(rng, lossless=0.2, most=64.0):
 
 
 class Stream:
-    """(sample, role, decoded colours, step, views) in an order that is a function of the seed; prepared ahead by one thread."""
+    """(sample, tree, role, decoded colours, step, views) in an order that is a function of the seed; prepared ahead by one thread."""
 
     def __init__(self, files, args, start=0):
         self.files, self.args, self.known = files, args, collections.OrderedDict()
@@ -43,7 +43,7 @@ class Stream:
 
     def sample(self, path):
         if path not in self.known:
-            self.known[path] = Sample(path, max(self.roles), self.args.teacher)
+            self.known[path] = Sample(path, max(self.roles), self.args.teacher, self.args.moved)
             if len(self.known) > self.args.keep:
                 self.known.popitem(last=False)
         return self.known[path]
@@ -58,7 +58,10 @@ class Stream:
             role = min(self.roles)
         step = random_step(rng)
         views = rng.permutation(len(sample.cameras))[: self.args.views]
-        return sample, role, decoded_colours(sample.tree, role, step, rng), step, sample.pictures(views)
+        tree = sample.tree
+        if step >= self.args.moved_from and role in sample.moved and rng.random() < self.args.moved_share:
+            tree = sample.moved[role][rng.integers(len(sample.moved[role]))]
+        return sample, tree, role, decoded_colours(tree, role, step, rng), step, sample.pictures(views)
 
     def _run(self, position):
         torch.set_num_threads(1)
@@ -110,22 +113,22 @@ class Trainer:
     def fraction(self):
         return self.used / (self.args.minutes * 60) if self.args.minutes else self.step / self.args.steps
 
-    def taught(self, sample, role, rgb, level, above, here):
+    def taught(self, sample, tree, role, rgb, level, above, here):
         """What to imitate: an elder head that reads the same, or what the teacher said of this role, with true colours."""
         k = self.gaussians
         with torch.no_grad():
             if self.elder:
                 return parameters(self.elder(above, here, level), rgb, k)
-            if sample.taught is None or role != {1: 2, 8: 1}[k]:
+            if sample.taught is None or tree is not sample.tree or role != {1: 2, 8: 1}[k]:
                 return None
             own = parameters(sample.taught[f"raw.{role}"].float(), rgb, k)
             colour = torch.from_numpy(sample.tree.colours[role]) / 255 if k == 1 else sample.tree.child_colours(role)[0]
             return (*own[:4], colour)
 
     def loss(self, item, imitate, drawing):
-        sample, role, decoded, step, (cameras, image, coverage) = item
-        level = sample.tree.level(role)
-        above, here, rgb = sample.tree.head_inputs(role, decoded, step)
+        sample, tree, role, decoded, step, (cameras, image, coverage) = item
+        level = tree.level(role)
+        above, here, rgb = tree.head_inputs(role, decoded, step)
         own = parameters(self.head(above, here, level), rgb, self.gaussians)
         loss, info = own[0].new_zeros(()), {"role": role, "voxels": len(rgb)}
         if drawing:
@@ -134,7 +137,7 @@ class Trainer:
             truth = image + (1 - coverage) * background[:, :, None, None]
             loss = loss + distortion(seen, truth, self.args.pyramid, self.args.square)
             info |= {"d": loss.item(), "mse": (seen - truth).pow(2).mean().item()}
-        if imitate > 0 and (taught := self.taught(sample, role, rgb, level, above, here)):
+        if imitate > 0 and (taught := self.taught(sample, tree, role, rgb, level, above, here)):
             apart = imitation(own, taught)
             loss, info["apart"] = loss + imitate * apart, apart.item()
         if self.args.small:  # what the pictures say nothing of keeps the decoded colour
@@ -175,6 +178,9 @@ def options():
     p.add_argument("--data", required=True, help="folder of samples of whole objects")
     p.add_argument("--out", required=True, help="folder of checkpoints and the log")
     p.add_argument("--teacher", help="folder that `teach.py` wrote")
+    p.add_argument("--moved", help="folder that `moved.py` wrote: samples with optimised occupancy")
+    p.add_argument("--moved-share", type=float, default=0.5, help="how often the occupancy is an optimised one, if there is one")
+    p.add_argument("--moved-from", type=float, default=8.0, help="luma's step from which on it may be")
     p.add_argument("--elder", help="checkpoint, or MODEL.safetensors:SET, of a head of as many Gaussians to imitate instead")
     p.add_argument("--init", help="checkpoint, or MODEL.safetensors:SET, to start from")
     p.add_argument("--resume", action="store_true", help="go on from OUT/last.pt")

@@ -6,9 +6,10 @@ use b2p_kernels::smooth::Values;
 use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
-use super::block::{Coding, CoefficientCoder, Quantiser};
+use super::block::Coding;
 use super::filter::{Responses, TERMS, solve, widen};
 use super::model::{BINS, CoefficientContext, Model};
+use super::node::{CoefficientCoder, Quantiser};
 use super::space::{FRACTION, from_rgb};
 use super::transform::forward;
 use super::{CodeSlice, Guide, LevelColours, Steps, Ycc, join, nodes, slices, trunk};

@@ -6,7 +6,7 @@
 //! 1. transformed by two-point butterflies (`transform`),
 //! 2. predicted from neighbouring colours (`prediction`),
 //! 3. quantised with a step per channel (`space`), and
-//! 4. coded with a binary range coder, whose probabilities mix several adaptive contexts (`model`, `block`).
+//! 4. coded with a binary range coder, whose probabilities mix several adaptive contexts (`model`, `node`, `block`).
 //!
 //! No model file is needed. All arithmetic is on integers, so decoded colours are bit-exact on every machine.
 //!
@@ -20,8 +20,10 @@
 mod block;
 #[cfg(feature = "encoder")]
 mod encode;
+mod energy;
 mod filter;
 mod model;
+mod node;
 mod prediction;
 mod space;
 mod transform;
@@ -42,8 +44,10 @@ use crate::coding::binary::Decoder;
 use crate::container::Slice;
 use crate::error::{Error, Result, Stage};
 use crate::geometry::{KernelMap, Octree};
-use block::{Coding, CoefficientCoder, Nodes, Quantiser};
+use block::{Coding, Nodes};
+use energy::spread_energies;
 use model::{CoefficientContext, Model};
+use node::{CoefficientCoder, Quantiser};
 
 /// Maximum number of voxels of the trunk's deepest level.
 pub const TRUNK_VOXELS: usize = 16_384;
@@ -362,76 +366,6 @@ fn read_coding<'a>(payload: &Slice<'a>, header: usize) -> Result<(Coding, &'a [u
     Ok((Coding { steps, gain: head[2] }, rest))
 }
 
-/// Coefficient energies of a level's nodes, smoothed over their neighbours and copied to each child.
-fn spread_energies(isa: Isa, nodes: Nodes<'_>, energies: &[[u8; 3]]) -> Vec<[u8; 3]> {
-    /// Nodes per task.
-    const BLOCK: usize = 2048;
-    // The last one stands for absent neighbours.
-    let mut padded = vec![[0; 4]; energies.len() + 1];
-    for (to, &[y, co, cg]) in padded.iter_mut().zip(energies) {
-        *to = [y.into(), co.into(), cg.into(), 1];
-    }
-    let count = |masks: &[u8]| masks.iter().map(|mask| mask.count_ones() as usize).sum::<usize>();
-    let mut spread = vec![[0; 3]; count(nodes.masks)];
-    let mut tasks = Vec::with_capacity(nodes.masks.len().div_ceil(BLOCK));
-    let mut rest = &mut spread[..];
-    for (masks, rows) in nodes.masks.chunks(BLOCK).zip(nodes.map.rows().chunks(27 * BLOCK)) {
-        let (out, after) = rest.split_at_mut(count(masks));
-        tasks.push((masks, rows, out));
-        rest = after;
-    }
-    let energies = &padded[..];
-    tasks.into_par_iter().for_each(|(masks, rows, out)| {
-        isa.run(Smooth {
-            energies,
-            rows,
-            masks,
-            out,
-        })
-    });
-    spread
-}
-
-/// Smooths the energies of consecutive nodes and copies them to their children.
-struct Smooth<'a> {
-    /// Energies of Y, Co and Cg, and 1, of every node, then zeros.
-    energies: &'a [[u16; 4]],
-    /// Kernel map rows of the nodes.
-    rows: &'a [u32],
-    masks: &'a [u8],
-    out: &'a mut [[u8; 3]],
-}
-
-impl Work for Smooth<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<I: Instructions>(self, _: I) {
-        let Smooth {
-            energies,
-            rows,
-            masks,
-            out,
-        } = self;
-        let mut out = out.iter_mut();
-        for (row, mask) in rows.chunks_exact(27).zip(masks) {
-            let mut sums = [0u32; 4];
-            // By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
-            add_energies(energies, row, &[KernelMap::CENTRE], 40, &mut sums);
-            add_energies(energies, row, &filter::FACES, 15, &mut sums);
-            add_energies(energies, row, &filter::EDGES, 7, &mut sums);
-            add_energies(energies, row, &filter::CORNERS, 3, &mut sums);
-            let [y, co, cg, weight] = sums;
-            let smoothed = [y, co, cg].map(|sum| (sum / weight.max(1)) as u8);
-            for _ in 0..mask.count_ones() {
-                if let Some(to) = out.next() {
-                    *to = smoothed;
-                }
-            }
-        }
-    }
-}
-
 /// Decodes coefficients from an entropy stream.
 struct EntropyDecoder<'a>(Decoder<'a>);
 
@@ -446,30 +380,6 @@ impl CoefficientCoder for EntropyDecoder<'_> {
         _: Quantiser,
     ) -> i32 {
         model.code(simd, &mut self.0, c, 0)
-    }
-}
-
-/// Adds the weighted energies, and the weight, of the neighbours at these offsets. The last of `energies` stands for
-/// absent neighbours.
-#[inline(always)]
-fn add_energies<const N: usize>(
-    energies: &[[u16; 4]],
-    row: &[u32],
-    offsets: &[usize; N],
-    weight: u32,
-    sums: &mut [u32; 4],
-) {
-    let absent = energies.len() - 1;
-    let mut unweighted = [0u16; 4];
-    for &k in offsets {
-        // No branch: the presence of neighbours is unpredictable.
-        let energies = &energies[absent.min(row[k] as usize)];
-        for i in 0..4 {
-            unweighted[i] += energies[i];
-        }
-    }
-    for i in 0..4 {
-        sums[i] += weight * u32::from(unweighted[i]);
     }
 }
 

@@ -89,7 +89,7 @@ pub(super) struct CoefficientContext {
     pub co: usize,
     /// Sum of `min(|q|, 2)` of the same slot and channel in the blocks at z − 1, y − 1 and x − 1: 0 to 6.
     pub neighbour_magnitudes: usize,
-    /// Local coefficient energy. This and the next five are logarithms in eighths of an octave (`block::log_class`).
+    /// Local coefficient energy. This and the next five are logarithms in eighths of an octave (`node::log_class`).
     pub energy: i32,
     /// Mean absolute difference to the face neighbours.
     pub gradient: i32,
