@@ -2,7 +2,6 @@
 
 use std::io::Read;
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
 
 use b2p::axes::{Axes, Up};
 use b2p::cloud::{
@@ -27,12 +26,8 @@ use super::{Failure, Result, load, manners};
 const CLOSED: usize = 3;
 /// Share of a stream, one in so many bytes, that a coordinate system may take.
 const CRS_SHARE: f64 = 20.0;
-
-/// Bytes of a stream that hold its header and its axes.
-pub const START: u64 = 1 << 18;
-
-/// What the input said of its coordinates when it was read.
-static REMEMBERED: Mutex<Option<Axes>> = Mutex::new(None);
+/// Bytes that tell the kind of a file.
+const START: u64 = 1 << 18;
 
 /// How points are read.
 #[derive(Debug, Clone, Default, Args)]
@@ -229,69 +224,12 @@ pub fn axes(bytes: &[u8]) -> Axes {
     container::axes(bytes).unwrap_or_default()
 }
 
-/// Remembers what a stream that starts with these bytes says of its coordinates. There may be no other way to know once
-/// it has been read.
-pub fn remember(bytes: &[u8]) {
-    if let Ok(axes) = container::axes(bytes) {
-        set_remembered(axes);
-    }
+/// The axis that points up: as asked for, or as the input says.
+pub fn up_of(asked: Option<UpArg>, known: &Axes) -> Option<Up> {
+    asked.and_then(UpArg::up).or(known.up)
 }
 
-/// Remembers the axis that points up in the Gaussians that were read.
-pub fn remember_up(up: Up) {
-    set_remembered(Axes {
-        up: Some(up),
-        ..Axes::default()
-    });
-}
-
-/// Forgets what the last input said, before another is read.
-#[cfg(feature = "view")]
-pub fn forget() {
-    *REMEMBERED.lock().unwrap_or_else(PoisonError::into_inner) = None;
-}
-
-fn set_remembered(axes: Axes) {
-    *REMEMBERED.lock().unwrap_or_else(PoisonError::into_inner) = Some(axes);
-}
-
-fn remembered() -> Option<Axes> {
-    REMEMBERED.lock().unwrap_or_else(PoisonError::into_inner).clone()
-}
-
-/// What the stream in a file says of its coordinates, or what came from a pipe said.
-pub fn known_axes(path: &Path) -> Axes {
-    let of_file = || start_of(path).map(|start| axes(&start));
-    remembered().or_else(of_file).unwrap_or_default()
-}
-
-/// The axis that points up in pictures of a file: as asked for, as the file says, or as its format has it.
-pub fn up_of(path: &Path, asked: Option<UpArg>) -> Option<Up> {
-    if let Some(up) = asked.and_then(|asked| asked.0) {
-        return Some(up);
-    }
-    if let Some(up) = remembered().and_then(|axes| axes.up) {
-        return Some(up);
-    }
-    if let Some(up) = Sidecar::beside(path).and_then(|beside| beside.axes.up) {
-        return Some(up);
-    }
-    let start = start_of(path)?;
-    match Kind::of(&start) {
-        Kind::Stream => axes(&start).up,
-        Kind::Las | Kind::E57 => Some(Up::Z),
-        Kind::Ply => {
-            let lines = start.split(|b| matches!(b, b'\n' | b'\r'));
-            let named = lines.filter_map(|line| line.strip_prefix(b"comment up "));
-            named
-                .filter_map(|name| std::str::from_utf8(name).ok()?.trim().parse().ok())
-                .next()
-        }
-        _ => None,
-    }
-}
-
-/// The first bytes of a regular file. What is read from a pipe would be missing afterwards.
+/// The first bytes of a regular file, enough to know its kind. What is read from a pipe would be missing afterwards.
 fn start_of(path: &Path) -> Option<Vec<u8>> {
     let is_file = std::fs::metadata(path).is_ok_and(|data| data.is_file());
     let file = std::fs::File::open(path).ok().filter(|_| is_file)?;
@@ -316,14 +254,6 @@ pub fn refuse(path: &Path) -> Result<()> {
 pub fn is_cloud(bytes: &[u8]) -> bool {
     let kind = Kind::of(bytes);
     kind.group() == Group::Cloud || matches!(kind, Kind::Obj | Kind::Glb | Kind::Gltf)
-}
-
-/// Points as surfels, if the file holds points.
-pub fn drawable(path: &Path, bytes: &[u8], isa: Isa, limits: &Limits, log: &Log) -> Result<Option<Gaussians>> {
-    if !is_cloud(bytes) {
-        return Ok(None);
-    }
-    surfels_of(path, bytes.to_vec(), &ReadArgs::default(), isa, limits, log).map(|(gaussians, _)| Some(gaussians))
 }
 
 /// Points as surfels, and what is known of their coordinates.

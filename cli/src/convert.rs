@@ -234,10 +234,16 @@ pub fn read(path: &Path, bytes: &[u8], format: Format, limits: &Limits, log: &Lo
     for warning in &splats.warnings {
         manners::warn(&format!("{}: {warning}", path.display()));
     }
-    if let Axes::Cloud(up) = splats.axes {
-        cloud::remember_up(up);
-    }
     Ok(splats)
+}
+
+/// What a file of splats, and the file beside it, say of the coordinates of the cloud that they show.
+pub fn cloud_axes(path: &Path, splats: &Splats) -> CloudAxes {
+    let beside = Sidecar::beside(path).unwrap_or_default().axes;
+    match splats.axes {
+        Axes::Cloud(up) => CloudAxes { up: Some(up), ..beside },
+        Axes::Ply | Axes::Gltf => beside,
+    }
 }
 
 /// The format to write: the one asked for, or that of the name; PLY to standard output and under other names.

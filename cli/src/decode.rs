@@ -47,15 +47,14 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
     let (input, to) = (&args.input, &args.output);
     let format = convert::output_format(to, args.format)?;
     let mut written = 0;
-    let mut write = |gaussians: &Gaussians, log: &Log| {
+    let mut write = |gaussians: &Gaussians, known: &b2p::Axes, log: &Log| {
         written = gaussians.len();
-        let known = cloud::known_axes(input);
-        let axes = match args.up.map_or(known.up, |up| up.up().or(known.up)) {
+        let axes = match cloud::up_of(args.up, known) {
             _ if args.keep_axes => Axes::of(format),
             Some(up) => Axes::Cloud(up),
             None => Axes::Ply,
         };
-        convert::write(gaussians, axes, &known, format, to, log)
+        convert::write(gaussians, axes, known, format, to, log)
     };
     let stream = budget::stream(&args.budget, input, &args.detail, limits)?;
     let chosen = match &stream {
@@ -74,9 +73,9 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
         limits,
         early,
         &log,
-        &mut |gaussians, log| {
+        &mut |gaussians, known, log| {
             took = log.steps().iter().map(|step| step.time).sum();
-            write(gaussians, log)
+            write(gaussians, known, log)
         },
     )?;
     let chosen = match chosen {

@@ -10,9 +10,10 @@ use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::renderer::Explanation;
 use b2p::renderer::camera::Extent;
-use b2p::{Decoder, Error, Isa, Limits, UnknownIsa, input};
+use b2p::{Axes, Decoder, Error, Isa, Limits, UnknownIsa, input};
 
 use super::args::{DetailArg, ModelArg};
+use super::cloud::ReadArgs;
 use super::views::Shot;
 use super::{Failure, Result, cloud, convert, kinds, manners};
 
@@ -155,30 +156,33 @@ pub fn extent(bytes: &[u8], decoder: &Decoder, limits: &Limits) -> Extent {
     base().unwrap_or(Extent::cube())
 }
 
+/// Gaussians, and what is known of the coordinates of the cloud that they show.
+pub struct Loaded {
+    pub gaussians: Gaussians,
+    pub axes: Axes,
+}
+
 /// Gaussians from a stream, or as they stand in a file.
-pub fn gaussians(
-    path: &Path,
-    detail: &DetailArg,
-    model_arg: &ModelArg,
-    limits: &Limits,
-    log: &Log,
-) -> Result<Gaussians> {
+pub fn gaussians(path: &Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Loaded> {
     let bytes = bytes(path, limits)?;
-    if let Some(gaussians) = other(path, &bytes, detail, limits, log)? {
-        return Ok(gaussians);
+    if let Some(loaded) = other(path, &bytes, detail, limits, log)? {
+        return Ok(loaded);
     }
     kinds::check_stream(path, &bytes)?;
     let bytes = whole_levels(path, bytes, detail, limits)?;
     let decoder = decoder(&bytes, detail, model_arg, limits)?;
     reserve_for(path, &bytes, &decoder, detail.level, limits)?;
     let gaussians = decoder.with_log(log).decode(&bytes);
-    gaussians.map_err(Failure::in_file(path))
+    Ok(Loaded {
+        gaussians: gaussians.map_err(Failure::in_file(path))?,
+        axes: cloud::axes(&bytes),
+    })
 }
 
 /// Where Gaussians come from.
 pub enum Source<'p> {
-    /// A file of them that has been read.
-    Gaussians(Gaussians),
+    /// A file of them, or of points, that has been read.
+    Loaded(Loaded),
     /// A stream, and what decodes it.
     Stream {
         path: &'p Path,
@@ -191,8 +195,8 @@ impl<'p> Source<'p> {
     /// Reads a file.
     pub fn open(path: &'p Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Self> {
         let bytes = bytes(path, limits)?;
-        if let Some(gaussians) = other(path, &bytes, detail, limits, log)? {
-            return Ok(Source::Gaussians(gaussians));
+        if let Some(loaded) = other(path, &bytes, detail, limits, log)? {
+            return Ok(Source::Loaded(loaded));
         }
         kinds::check_stream(path, &bytes)?;
         let bytes = whole_levels(path, bytes, detail, limits)?;
@@ -204,15 +208,23 @@ impl<'p> Source<'p> {
     /// The cube that they refer to.
     pub fn frame(&self) -> Result<Frame> {
         match self {
-            Source::Gaussians(gaussians) => Ok(gaussians.frame),
+            Source::Loaded(loaded) => Ok(loaded.gaussians.frame),
             Source::Stream { path, bytes, decoder } => decoder.frame(bytes).map_err(Failure::in_file(path)),
+        }
+    }
+
+    /// What is known of the coordinates of the cloud.
+    pub fn axes(&self) -> Axes {
+        match self {
+            Source::Loaded(loaded) => loaded.axes.clone(),
+            Source::Stream { bytes, .. } => cloud::axes(bytes),
         }
     }
 
     /// The part of the cube that the object takes, if that can be known before it is decoded.
     pub fn extent(&self, limits: &Limits) -> Extent {
         match self {
-            Source::Gaussians(gaussians) => Extent::of_gaussians(gaussians),
+            Source::Loaded(loaded) => Extent::of_gaussians(&loaded.gaussians),
             Source::Stream { bytes, decoder, .. } => extent(bytes, decoder, limits),
         }
     }
@@ -239,7 +251,7 @@ impl<'p> Source<'p> {
             why,
         };
         let (path, bytes, decoder) = match self {
-            Source::Gaussians(gaussians) => {
+            Source::Loaded(Loaded { gaussians, .. }) => {
                 return Ok((gaussians, explain(false, "files of Gaussians have no levels".into())));
             }
             Source::Stream { path, bytes, decoder } => (path, bytes, decoder),
@@ -258,7 +270,7 @@ impl<'p> Source<'p> {
 
 /// Gaussians as they stand in the file `bytes`, which came from `path`, or surfels of its points. `None` if it has
 /// neither.
-pub fn other(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Option<Gaussians>> {
+pub fn other(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log: &Log) -> Result<Option<Loaded>> {
     let format = convert::format_of(path, bytes, None);
     if format.is_none() && !cloud::is_cloud(bytes) {
         return Ok(None);
@@ -271,8 +283,12 @@ pub fn other(path: &Path, bytes: &[u8], detail: &DetailArg, limits: &Limits, log
         )));
     }
     let Some(format) = format else {
-        return cloud::drawable(path, bytes, isa(None)?, limits, log);
+        let read = ReadArgs::default();
+        let (gaussians, axes) = cloud::surfels_of(path, bytes.to_vec(), &read, isa(None)?, limits, log)?;
+        return Ok(Some(Loaded { gaussians, axes }));
     };
     let splats = convert::read(path, bytes, format, limits, log)?;
-    Ok(Some(splats.into_cloud()))
+    let axes = convert::cloud_axes(path, &splats);
+    let gaussians = splats.into_cloud();
+    Ok(Some(Loaded { gaussians, axes }))
 }

@@ -7,7 +7,7 @@ use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 use b2p::error::Stage;
 use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p::{Decoding, Error, Limits};
+use b2p::{Axes, Decoding, Error, Limits};
 
 use super::args::{DetailArg, ModelArg};
 use super::{Failure, Result, cloud, convert, kinds, load, manners};
@@ -19,14 +19,16 @@ pub const PIPE: &str = "-";
 const PIECE: usize = 1 << 16;
 const WAITING: usize = 16;
 
+/// Bytes of a stream that hold its header and its axes.
+const HEAD: usize = 1 << 18;
 /// Bytes that tell what comes, and of which version.
 const STREAM_START: usize = 10;
 
 /// What was read at once, and what stops reading.
 pub type Piece = std::io::Result<Vec<u8>>;
 
-/// What is done with Gaussians.
-pub type Show<'a> = dyn FnMut(&Gaussians, &Log) -> Result<()> + 'a;
+/// What is done with Gaussians, of a cloud of whose coordinates so much is known.
+pub type Show<'a> = dyn FnMut(&Gaussians, &Axes, &Log) -> Result<()> + 'a;
 
 /// Shows the Gaussians of a file, or of standard input: then also those of coarser levels, if `early` and nothing finer
 /// has come meanwhile; and if the stream is cut and no level was named, what its finest whole level has.
@@ -40,8 +42,8 @@ pub fn each(
     show: &mut Show,
 ) -> Result<()> {
     if path != Path::new(PIPE) {
-        let gaussians = load::gaussians(path, detail, model_arg, limits, log)?;
-        return show(&gaussians, log);
+        let loaded = load::gaussians(path, detail, model_arg, limits, log)?;
+        return show(&loaded.gaussians, &loaded.axes, log);
     }
     let pieces = pieces()?;
     let mut start = Vec::new();
@@ -58,8 +60,8 @@ pub fn each(
             let checked = limits.check_bytes("size of the input, as far as it was read,", length);
             checked.map_err(Failure::in_file(path))?;
         }
-        if let Some(gaussians) = load::other(path, &start, detail, limits, log)? {
-            return show(&gaussians, log);
+        if let Some(loaded) = load::other(path, &start, detail, limits, log)? {
+            return show(&loaded.gaussians, &loaded.axes, log);
         }
         kinds::check_stream(path, &start)?;
         let what = "neither a stream, nor Gaussians or points that are known by their contents";
@@ -74,9 +76,8 @@ pub fn each(
     let mut length = 0;
     let mut head = Vec::new();
     while let Some(bytes) = piece {
-        if head.len() < cloud::START as usize {
+        if head.len() < HEAD {
             head.extend(&bytes);
-            cloud::remember(&head);
         }
         length += bytes.len() as u64;
         decoding.push(&bytes);
@@ -91,7 +92,7 @@ pub fn each(
             Err(TryRecvError::Empty) => {
                 if early && decoding.is_drawable() && shown != decoding.level() {
                     shown = decoding.level();
-                    show_level(&decoding, log, show)?;
+                    show_level(&decoding, &cloud::axes(&head), log, show)?;
                 }
                 pieces.recv().ok()
             }
@@ -115,13 +116,13 @@ pub fn each(
     }
     match shown == decoding.level() {
         true => Ok(()),
-        false => show_level(&decoding, log, show),
+        false => show_level(&decoding, &cloud::axes(&head), log, show),
     }
 }
 
-fn show_level(decoding: &Decoding, log: &Log, show: &mut Show) -> Result<()> {
+fn show_level(decoding: &Decoding, axes: &Axes, log: &Log, show: &mut Show) -> Result<()> {
     let gaussians = decoding.gaussians().map_err(Failure::in_file(Path::new(PIPE)))?;
-    show(&gaussians, log)
+    show(&gaussians, axes, log)
 }
 
 /// Standard input, read by a thread of its own so that it can be known whether something waits.

@@ -7,7 +7,7 @@ use b2p::gaussians::{Frame, Gaussians};
 use b2p::log::Log;
 use b2p::renderer::camera::{Camera, Extent};
 use b2p::renderer::{Background, EffectMode, Effects, Explanation, Renderer, Stats};
-use b2p::{Error, Limits};
+use b2p::{Axes, Error, Limits};
 use serde_json::json;
 
 use super::args::{Format, Render};
@@ -20,7 +20,7 @@ use super::progress::Progress;
 use super::sheet::Sheet;
 use super::table::{count, counted, milliseconds, steps};
 use super::views::{Shot, lenses_beside, shots};
-use super::{Failure, Result, load, pipe, sequence, turntable};
+use super::{Failure, Result, cloud, load, pipe, sequence, turntable};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
@@ -56,7 +56,8 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     }
     if args.camera.is_none() {
         // Where pictures go is known at once; a file of cameras needs to know the cube.
-        permit(args, &shots(args, &Frame::default(), &Extent::cube(), limits)?)?;
+        let unseen = Axes::default();
+        permit(args, &shots(args, &Frame::default(), &Extent::cube(), &unseen, limits)?)?;
     }
     if manners::is_pipe(&args.input) && !args.budget.is_given() {
         return from_pipe(args, limits, &log);
@@ -65,14 +66,14 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     let detail = chosen.as_ref().map(Chosen::detail);
     let detail = detail.as_ref().unwrap_or(&args.detail);
     let source = Source::open(&args.input, detail, &args.model, limits, &log)?;
-    let frame = source.frame()?;
-    let mut cameras = shots(args, &frame, &Extent::cube(), limits)?;
+    let (frame, axes) = (source.frame()?, source.axes());
+    let mut cameras = shots(args, &frame, &Extent::cube(), &axes, limits)?;
     if args.camera.is_some() {
         permit(args, &cameras)?;
     }
     // What keeps the object in view is nearer than what keeps the cube in view.
     if detail.level.is_none() && source.level_for(&cameras)?.is_some() {
-        cameras = shots(args, &frame, &source.extent(limits), limits)?;
+        cameras = shots(args, &frame, &source.extent(limits), &axes, limits)?;
     }
     let (gaussians, detail) = source.gaussians(detail, &cameras, &log)?;
     let decoded = log.steps().iter().map(|step| step.time).sum();
@@ -82,7 +83,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         detail: Some(detail),
         chosen: chosen.as_ref().map(|chosen| (chosen, decoded, progress)),
     };
-    pictures(&drawing, &gaussians, &log)
+    pictures(&drawing, &gaussians, &axes, &log)
 }
 
 /// Draws what comes on standard input, each level as it is complete.
@@ -91,10 +92,10 @@ fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
     // What has gone to standard output cannot be replaced by something finer.
     let early = !manners::is_pipe(&args.output);
     let mut permitted = args.camera.is_none();
-    let mut show = |gaussians: &Gaussians, log: &Log| {
+    let mut show = |gaussians: &Gaussians, axes: &Axes, log: &Log| {
         // Pictures of coarser levels are this program's own.
         if !permitted {
-            permit(args, &shots(args, &gaussians.frame, &Extent::cube(), limits)?)?;
+            permit(args, &shots(args, &gaussians.frame, &Extent::cube(), axes, limits)?)?;
             permitted = true;
         }
         let drawing = Drawing {
@@ -103,7 +104,7 @@ fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
             detail: None,
             chosen: None,
         };
-        said = pictures(&drawing, gaussians, log)?;
+        said = pictures(&drawing, gaussians, axes, log)?;
         Ok(())
     };
     pipe::each(&args.input, &args.detail, &args.model, limits, early, log, &mut show)?;
@@ -119,7 +120,8 @@ fn choose(args: &Render, limits: &Limits, progress: &Progress) -> Result<Option<
     let fail = Failure::in_file(&args.input);
     let decoder = load::decoder(&stream, &args.detail, &args.model, limits)?;
     let frame = decoder.frame(&stream).map_err(&fail)?;
-    let cameras = shots(args, &frame, &load::extent(&stream, &decoder, limits), limits)?;
+    let extent = load::extent(&stream, &decoder, limits);
+    let cameras = shots(args, &frame, &extent, &cloud::axes(&stream), limits)?;
     let per_unit = cameras.iter().map(|shot| shot.camera.pixels_per_unit());
     let per_unit = per_unit.fold(0.0, f64::max);
     let pixels = cameras.iter().map(|shot| shot.camera.size().map(f64::from));
@@ -165,9 +167,10 @@ struct Drawing<'a> {
 type Drawn = (PathBuf, [u32; 2], Stats);
 
 /// Draws these Gaussians into the pictures asked for.
-fn pictures(drawing: &Drawing, gaussians: &Gaussians, log: &Log) -> Result<Said> {
+fn pictures(drawing: &Drawing, gaussians: &Gaussians, axes: &Axes, log: &Log) -> Result<Said> {
     let &Drawing { args, limits, .. } = drawing;
-    let cameras = &shots(args, &gaussians.frame, &Extent::of_gaussians(gaussians), limits)?[..];
+    let extent = Extent::of_gaussians(gaussians);
+    let cameras = &shots(args, &gaussians.frame, &extent, axes, limits)?[..];
     let mut effects = Effects::default();
     for (effect, choice) in &args.effect {
         effects.set(*effect, *choice);

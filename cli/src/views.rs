@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use b2p::Limits;
+use b2p::axes::Up;
 use b2p::gaussians::Frame;
 use b2p::renderer::camera::{Camera, Extent, Projection, files};
+use b2p::{Axes, Limits};
 
 use super::args::Render;
 use super::{Failure, Result, cloud, load};
@@ -38,11 +39,12 @@ pub fn lenses_beside(cameras: &Path) -> Option<PathBuf> {
     is_colmap.then(|| cameras.with_file_name("cameras.txt"))
 }
 
-/// The cameras of the file, or of the circle around an object that takes `extent` of the cube.
-pub fn shots(args: &Render, frame: &Frame, extent: &Extent, limits: &Limits) -> Result<Vec<Shot>> {
+/// The cameras of the file, or of the circle around an object that takes `extent` of the cube, upright as far as `axes`
+/// say what that is.
+pub fn shots(args: &Render, frame: &Frame, extent: &Extent, axes: &Axes, limits: &Limits) -> Result<Vec<Shot>> {
     let named = match &args.camera {
         Some(path) => from_file(path, args.view.size, frame, limits)?,
-        None => circle(args, frame, extent)?,
+        None => circle(args, frame, extent, cloud::up_of(args.up, axes))?,
     };
     let one_file = args.contact_sheet || args.turntable.is_some() || named.len() == 1;
     let path = |i: usize| match one_file {
@@ -77,12 +79,11 @@ fn from_file(path: &Path, size: (u32, u32), frame: &Frame, limits: &Limits) -> R
 }
 
 /// The cameras of a circle, each called by its azimuth.
-fn circle(args: &Render, frame: &Frame, extent: &Extent) -> Result<Vec<files::Named>> {
+fn circle(args: &Render, frame: &Frame, extent: &Extent, up: Option<Up>) -> Result<Vec<files::Named>> {
     let view = &args.view;
     let count = count(args);
     let azimuths = (0..count).map(|i| view.orbit.azimuth + 360.0 * f64::from(i) / f64::from(count));
     let target = target(view.look_at, view.orbit.distance, frame, extent);
-    let up = cloud::up_of(&args.input, args.up);
     let at = |azimuth: f64, radius: f64| {
         let (width, height) = view.size;
         let (elevation, fov) = (view.orbit.elevation, view.fov.into());

@@ -79,7 +79,7 @@ fn write(
     let gaussians: Gaussians = decoded.gaussians()?;
     let format = convert::output_format(to, args.format)?;
     let known = sequence.axes()?;
-    let axes = match args.up.map_or(known.up, |up| up.up().or(known.up)) {
+    let axes = match cloud::up_of(args.up, &known) {
         _ if args.keep_axes => Axes::of(format),
         Some(up) => Axes::Cloud(up),
         None => Axes::Ply,

@@ -6,7 +6,7 @@ use std::time::Instant;
 use b2p::gaussians::Gaussians;
 use b2p::renderer::camera::{Camera, Extent};
 use b2p::renderer::{Effects, Renderer};
-use b2p::{Error, Limits, SequenceDecoder, SequenceReader};
+use b2p::{Axes, Error, Limits, SequenceDecoder, SequenceReader};
 use serde_json::json;
 
 use super::super::args::{Format, Render};
@@ -54,6 +54,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         camera: None,
         renderer: None,
         decoder: SequenceDecoder::new(load::decoder(&[], &args.detail, &args.model, limits)?),
+        axes: sequence.axes().map_err(Failure::in_file(&args.input))?,
     };
     let started = Instant::now();
     let count = frames.end - frames.start;
@@ -78,6 +79,7 @@ struct Film<'a> {
     camera: Option<Camera>,
     renderer: Option<Renderer>,
     decoder: SequenceDecoder,
+    axes: Axes,
 }
 
 impl Film<'_> {
@@ -132,7 +134,7 @@ impl Film<'_> {
             Some(camera) => *camera,
             None => {
                 let extent = Extent::of_gaussians(gaussians);
-                let shots = shots(self.args, &gaussians.frame, &extent, self.limits)?;
+                let shots = shots(self.args, &gaussians.frame, &extent, &self.axes, self.limits)?;
                 let first = shots
                     .into_iter()
                     .next()

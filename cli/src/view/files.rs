@@ -11,6 +11,7 @@ use super::clock::Clock;
 use super::source::{Arrived, Choices, Scene, Source, Tell, Wish};
 use crate::args::{DetailArg, ModelArg};
 use crate::cloud::UpArg;
+use crate::load::Loaded;
 use crate::pipe::{self, Piece};
 use crate::{Failure, Result, cloud, kinds, load, manners};
 
@@ -198,17 +199,16 @@ fn check_level(wanted: &Wish, choices: &Choices) -> Result<()> {
 
 /// Reads a file, and decodes nothing of a stream yet.
 fn open_file(path: &Path, loading: &Loading, cancel: &Cancel) -> Result<Opened> {
-    cloud::forget();
     let (log, limits) = (Log::new(), &loading.limits);
     if manners::is_pipe(path) {
         return open_pipe(loading, cancel).map(|stream| Opened::Stream(Box::new(stream)));
     }
     let bytes = load::bytes(path, limits)?;
-    if let Some(gaussians) = load::other(path, &bytes, &loading.detail(), limits, &log)? {
+    if let Some(Loaded { gaussians, axes }) = load::other(path, &bytes, &loading.detail(), limits, &log)? {
         return Ok(Opened::Fixed(Box::new(Scene {
             extent: Extent::of_gaussians(&gaussians),
             gaussians: Arc::new(gaussians),
-            up: cloud::up_of(path, loading.up),
+            up: cloud::up_of(loading.up, &axes),
             made: None,
             steps: log.steps(),
             frame: None,
@@ -379,15 +379,12 @@ impl OpenStream {
         let fail = Failure::in_file(&self.path);
         let gaussians: Gaussians = self.decoding.gaussians().map_err(fail)?;
         let extent = self.extent.get_or_insert_with(|| Extent::of_gaussians(&gaussians));
-        if manners::is_pipe(&self.path) {
-            cloud::remember(&self.bytes[..self.bytes.len().min(cloud::START as usize)]);
-        }
         let (level, header) = (self.decoding.level(), self.decoding.header());
         let heads = header.map(|header| self.heads.unwrap_or_else(|| self.decoder.heads_for(header)));
         Ok(Scene {
             extent: extent.clone(),
             gaussians: Arc::new(gaussians),
-            up: cloud::up_of(&self.path, self.up),
+            up: cloud::up_of(self.up, &cloud::axes(&self.bytes)),
             made: level.zip(heads),
             steps: self.log.steps().split_off(self.old_steps),
             frame: None,

@@ -318,14 +318,12 @@ impl Worker {
     /// Reads the sequence, and says what there is to choose from.
     fn open(shared: Arc<Shared>, loading: &Loading, cancel: &Cancel, tell: &Tell) -> Result<Worker> {
         let path = shared.lock().wish.path.clone();
-        cloud::forget();
         let sequence = sequence::read(&path, &loading.limits)?;
         let decoder = load::decoder(&[], &loading.detail(), &loading.model, &loading.limits)?;
         let header = sequence.header();
         // Heads need a level above their own.
         let levels = header.base.max(1).min(header.top)..=header.top;
-        let known = sequence.axes().ok().and_then(|axes| axes.up);
-        let up = loading.up.map_or(known, |up| up.up().or(known));
+        let up = cloud::up_of(loading.up, &sequence.axes().unwrap_or_default());
         let timeline = Arc::new(Timeline::of(&sequence));
         let choices = Choices {
             levels: levels.clone().collect(),

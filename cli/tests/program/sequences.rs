@@ -102,6 +102,23 @@ fn parts_of_a_sequence_are_cut_joined_decoded_and_drawn() {
 }
 
 #[test]
+fn a_sequence_is_drawn_upright() {
+    let folder = frames();
+    let at = folder.path();
+    encode(at, &["frames"], "z.b2p", &["--up", "z"]);
+    let draw = |name: &str, more: &[&str]| {
+        let picture = [
+            "--frame", "2", "--size", "40x30", "--orbit", "10,30", "--heads", "surfels",
+        ];
+        succeeds(at, &[&["render", "z.b2p", "-o", name][..], &picture, more].concat());
+        bytes(at, name)
+    };
+    let known = draw("known.png", &[]);
+    assert!(known == draw("z.png", &["--up", "z"]));
+    assert!(known != draw("y.png", &["--up", "y"]));
+}
+
+#[test]
 fn options_of_sequences_are_kept_to() {
     let folder = frames();
     let at = folder.path();
