@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use b2p::cloud::ColouredVoxels;
 use b2p::container;
-use b2p::encoder::transform::{self, QualityTarget};
+use b2p::encoder::transform::{self, GeometryTarget, QualityTarget};
 use b2p::encoder::{self, Encoded, Options, Rate, Residual};
 use b2p::latents::Steps;
 use b2p::log::Log;
@@ -161,9 +161,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) ->
     if let Some(effort) = args.effort {
         options.set_effort(effort);
     }
-    if let Some(geometry) = args.geometry {
-        options.geometry = geometry;
-    }
+    options.geometry = args.geometry.unwrap_or(GeometryTarget::Visual);
     match args.step {
         Some(step) => options.fineness = step,
         None if args.lossless => options.fineness = QualityTarget::Lossless,

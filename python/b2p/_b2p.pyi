@@ -195,6 +195,7 @@ def encode(
     quality: int | None = None,
     step: float | tuple[float, float] | None = None,
     lossless: bool = False,
+    geometry: str | float | None = None,
     levels: tuple[int, int] | None = None,
     effort: int | None = None,
     head_maps: bool = True,

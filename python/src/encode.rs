@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use b2p::cloud::{voxelise, voxelise_closed};
-use b2p::encoder::transform::{self, Options, QualityTarget};
+use b2p::encoder::transform::{self, GeometryTarget, Options, QualityTarget};
 use b2p::{Error, Log, PointCloud, Result, container};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
@@ -45,6 +45,10 @@ struct Asked {
 ///     Quantisation step of luma, or steps of luma and chroma, in 255ths, 0.5 to 1000. Default: 20.
 /// lossless : bool
 ///     Code the mean colours of the finest level's voxels exactly.
+/// geometry : "exact", "visual" or float
+///     Geometry of the finest level: its voxels as they are, or moved by at most one where that saves bits and looks
+///     alike; a number from 0 to 100 is the Lagrangian of that, in squared voxels per bit. Lossless streams, and the
+///     cloud's own level, keep all voxels.
 /// levels : (int, int), optional
 ///     First and last level that the stream may be cut after, the last at most `bits`. Default: bits - 3 to bits - 1.
 /// effort : int, optional
@@ -65,7 +69,7 @@ struct Asked {
 ///     The stream, which `decode`, `decode_points`, `open`, `info` and `render` take.
 #[pyfunction]
 #[pyo3(signature = (xyz, rgb=None, *, bits=None, bits_per_point=None, quality=None, step=None, lossless=false,
-    levels=None, effort=None, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
+    geometry=None, levels=None, effort=None, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
 pub fn encode<'py>(
     py: Python<'py>,
     xyz: &Bound<'py, PyAny>,
@@ -75,6 +79,7 @@ pub fn encode<'py>(
     quality: Option<u8>,
     step: Option<&Bound<'py, PyAny>>,
     lossless: bool,
+    geometry: Option<&Bound<'py, PyAny>>,
     levels: Option<(u8, u8)>,
     effort: Option<u8>,
     head_maps: bool,
@@ -88,6 +93,7 @@ pub fn encode<'py>(
     check(py, bits_per_point, quality, step.is_some(), lossless)?;
     let mut options = Options {
         levels: levels.map(|(first, last)| first..=last),
+        geometry: geometry.map_or(Ok(GeometryTarget::Visual), shape)?,
         ..Options::default()
     };
     match step {
@@ -164,6 +170,24 @@ fn cloud(
         axes.crs = crs.unwrap_or(std::mem::take(&mut axes.crs));
     }
     Ok(cloud)
+}
+
+/// How exactly geometry is coded.
+fn shape(geometry: &Bound<'_, PyAny>) -> PyResult<GeometryTarget> {
+    if let Ok(lambda) = geometry.extract::<f32>()
+        && (0.0..=100.0).contains(&lambda)
+    {
+        return Ok(GeometryTarget::Lambda(lambda));
+    }
+    match geometry.extract::<String>().as_deref() {
+        Ok("exact") => Ok(GeometryTarget::Exact),
+        Ok("visual") => Ok(GeometryTarget::Visual),
+        _ => {
+            let what = "\"exact\", \"visual\" or a number from 0 to 100";
+            let what = format!("geometry is {}, expected {what}", geometry.repr()?);
+            Err(errors::usage(geometry.py(), &what))
+        }
+    }
 }
 
 /// One step, or luma's and chroma's.

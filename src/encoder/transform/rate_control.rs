@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use super::shape::Shape;
-use super::{Coded, EncoderInput, MAX_CHROMA, Options, QualityTarget, choose_levels, steps_of};
+use super::{Coded, EncoderInput, GeometryTarget, MAX_CHROMA, Options, QualityTarget, choose_levels, steps_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth};
 use crate::encoder::Encoded;
@@ -17,12 +17,20 @@ use crate::log::Log;
 /// The coarsest place of a level that the stream could do without: a step of luma of 64 255ths.
 const COARSEST: u8 = 112;
 
+/// The same where geometry is lossy, and leaves more bits to colours: a step of luma of 45.
+const COARSEST_OF_LOSSY: u8 = 104;
+
 /// The same of the level of the cloud's own voxels, whose geometry takes most: a step of luma of 23. In coarser steps
 /// the level above makes better pictures of the same bits.
 const COARSEST_OF_ALL: u8 = 88;
 
 /// The place that is tried first: a step of luma of 11.
 const FIRST: u8 = 72;
+
+/// The steps of a place: luma and chroma become finer in turn.
+fn steps_at(at: u8) -> Steps {
+    steps_of(at / 2, at.div_ceil(2))
+}
 
 /// One place on the path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,11 +72,13 @@ pub fn encode_to_rate(
     };
     let mut found = None;
     for top in levels.clone().rev() {
+        let only = top == *levels.start();
         // What does not fit without colours does not fit with them.
-        if top > *levels.start() && search.geometry_bytes(top, log)? > room {
+        let least = search.least_geometry(top, only, log)?;
+        if !only && least > room {
             continue;
         }
-        found = search.level(top, top == *levels.start(), log)?;
+        found = search.level(top, only, least, log)?;
         if found.is_some() {
             break;
         }
@@ -105,20 +115,23 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// The largest stream with the last level `top` that fits, if there is one; `only` tells that no coarser level
-    /// could take its place.
-    fn level(&mut self, top: u8, only: bool, log: &Log) -> Result<Option<(Place, Coded)>> {
-        let last = match top == self.subject.cloud.voxels.depth() {
+    /// The coarsest place of the level `top`; `only` tells that no coarser level could take its place.
+    fn last(&self, top: u8, only: bool) -> u8 {
+        match self.subject.options.geometry {
             _ if only => 2 * MAX_CHROMA,
-            true => COARSEST_OF_ALL,
-            false => COARSEST,
-        };
-        // Luma and chroma become finer in turn.
+            _ if top == self.subject.cloud.voxels.depth() => COARSEST_OF_ALL,
+            GeometryTarget::Exact => COARSEST,
+            _ => COARSEST_OF_LOSSY,
+        }
+    }
+
+    /// The largest stream with the last level `top` that fits, if there is one. `fixed` are bytes that all of them have.
+    fn level(&mut self, top: u8, only: bool, fixed: f64, log: &Log) -> Result<Option<(Place, Coded)>> {
+        let last = self.last(top, only);
         let place = |at: u8| Place {
             top,
-            steps: steps_of(at / 2, at.div_ceil(2)),
+            steps: steps_at(at),
         };
-        let fixed = self.geometry_bytes(top, log)?;
         // Bytes of the finest place that fits and of the coarsest that does not, beyond the geometry's.
         let (mut fits, mut exceeds): (Option<Candidate>, Option<Candidate>) = (None, None);
         let mut best = None;
@@ -167,9 +180,9 @@ impl Search<'_> {
         Ok(shape)
     }
 
-    /// Bytes of the geometry of a stream with the last level `top`, at the place that is tried first.
-    fn geometry_bytes(&mut self, top: u8, log: &Log) -> Result<f64> {
-        let shape = self.shape(top, steps_of(FIRST / 2, FIRST.div_ceil(2)), log)?;
+    /// Bytes of the geometry of a stream with the last level `top`, at the coarsest place.
+    fn least_geometry(&mut self, top: u8, only: bool, log: &Log) -> Result<f64> {
+        let shape = self.shape(top, steps_at(self.last(top, only)), log)?;
         Ok(self.subject.geometry_bytes(top, shape.as_deref()) as f64)
     }
 
