@@ -35,10 +35,10 @@ impl GeometryTarget {
         let lambda = match self {
             _ if steps.is_lossless() => 0.0,
             GeometryTarget::Exact => 0.0,
-            // Of powers of two, so that streams of similar steps share an octree.
+            // Of half octaves, so that streams of similar steps share an octree, and sizes do not jump by much.
             GeometryTarget::Visual => {
                 let lambda = (LAMBDA * steps.luma_step().powi(2)).min(MOST_LAMBDA);
-                lambda.log2().round().exp2()
+                ((2.0 * lambda.log2()).round() / 2.0).exp2()
             }
             GeometryTarget::Lambda(lambda) => lambda.clamp(0.0, 100.0),
         };
