@@ -22,6 +22,7 @@
 //! |---|---|
 //! | decode a stream, whole or as it arrives | [`Decoder`], [`Decoding`] |
 //! | read and decode sequences of frames | [`SequenceReader`], [`SequenceDecoder`], `SequenceEncoder` |
+//! | read and decode scenes of blocks, in part | [`SceneReader`], [`SceneDecoder`], `SceneEncoder` |
 //! | draw with learned heads | [`HeadsModel`], [`HeadSet`] |
 //! | read and write Gaussians | [`Gaussians`] |
 //! | draw | `Renderer`, `Camera`, `Image` |
@@ -103,6 +104,8 @@ pub mod placement;
 #[doc(hidden)]
 pub mod renderer;
 #[doc(hidden)]
+pub mod scene;
+#[doc(hidden)]
 pub mod sequence;
 #[cfg(test)]
 mod testing;
@@ -140,5 +143,8 @@ pub use renderer::{
     Times,
 };
 #[cfg(feature = "encoder")]
+pub use scene::SceneEncoder;
+#[cfg(feature = "encoder")]
 pub use sequence::SequenceEncoder;
+pub use scene::{DecodedScene, FileSource, SceneDecoder, SceneReader, Source, Wanted};
 pub use sequence::{DecodedFrame, SequenceDecoder, SequenceReader};

@@ -44,6 +44,10 @@ const STAGES: [(&str, &[&str]); 14] = [
         ],
     ),
     (
+        "scene",
+        &["container", "geometry", "cloud", "gaussians", "decoder", "encoder"],
+    ),
+    (
         "sequence",
         &["container", "cloud", "gaussians", "motion", "decoder", "encoder"],
     ),
