@@ -45,7 +45,15 @@ const STAGES: [(&str, &[&str]); 14] = [
     ),
     (
         "scene",
-        &["container", "geometry", "cloud", "gaussians", "decoder", "encoder"],
+        &[
+            "container",
+            "geometry",
+            "cloud",
+            "gaussians",
+            "renderer",
+            "decoder",
+            "encoder",
+        ],
     ),
     (
         "sequence",

@@ -95,7 +95,7 @@ fn unit(text: &str) -> std::result::Result<f64, String> {
     Axes::parse_unit(text).map_err(|e| e.to_string())
 }
 
-fn corners(text: &str) -> std::result::Result<[[f64; 3]; 2], String> {
+pub fn corners(text: &str) -> std::result::Result<[[f64; 3]; 2], String> {
     let expected = "expected six numbers, the lowest corner and the highest, such as -1,-1,0,1,1,2";
     let numbers: Option<Vec<f64>> = text.split(',').map(|t| t.trim().parse().ok()).collect();
     match numbers.as_deref() {

@@ -62,8 +62,8 @@ struct Selection {
     bounds: Option<Bounds>,
 }
 
-/// Decoded blocks by their numbers. Of a block that could not be decoded nothing is there.
-pub(super) type Decoded = BTreeMap<usize, LevelVoxels>;
+/// Blocks that were decoded to a level, by their numbers; `None` for those that could not be.
+pub(super) type Decoded = BTreeMap<usize, Option<LevelVoxels>>;
 
 impl SceneDecoder {
     /// A decoder of scenes, which decodes and draws as `decoder` does: its level, heads, limits and instructions count.
@@ -79,31 +79,56 @@ impl SceneDecoder {
     /// [`Error::Unsupported`] for heads that there are not, [`Error::Cancelled`]; what is wrong with all blocks, if none
     /// can be decoded. Of damage in some of them [`DecodedScene::lost`] tells.
     pub fn gaussians<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<DecodedScene<Gaussians>> {
-        let header = scene.header();
         let selection = self.select(scene, wanted)?;
-        let level = selection.level;
-        self.decoder.check_drawable(header, level)?;
-        let reach = self.decoder.reach(header, level)?;
-        let needed = around(scene.blocks(), &selection, reach);
-        let kept = self.gaussian_bytes(scene, &selection)?;
-        let kept = kept.saturating_add(self.check_memory(scene, &needed, level, kept)?);
-        let (decoded, lost) = self.decode(scene, &needed, level)?;
-        let frame = frame_of(header);
+        let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
         let mut all = Gaussians {
-            frame,
+            frame: frame_of(scene.header()),
             ..Gaussians::default()
         };
-        for &block in &selection.blocks {
-            self.decoder.cancel().check()?;
-            let Some(own) = decoded.get(&block) else { continue };
-            let surroundings = Surroundings::find(scene.blocks(), &decoded, block, level, reach);
-            self.check_drawing(header, level, surroundings.voxels(), kept)?;
-            let surroundings = surroundings.collect()?;
-            let drawn = self.draw(header, own, &surroundings, selection.bounds.as_ref())?;
+        let mut blocks = 0;
+        let mut take = |_, drawn: Gaussians| {
+            blocks += 1;
             all.blur = drawn.blur;
             all.append(drawn);
+        };
+        let Selection { level, bounds, .. } = &selection;
+        let (bounds, wanted) = (bounds.as_ref(), &selection.blocks);
+        self.draw_blocks(scene, *level, wanted, bounds, &mut decoded, &mut lost, &mut take)?;
+        finish(all, lost, blocks)
+    }
+
+    /// Draws blocks at a level, or what of them lies in a box, and gives each to `take`. What is decoded for it is kept
+    /// in `decoded`.
+    pub(super) fn draw_blocks<S: Source>(
+        &self,
+        scene: &SceneReader<S>,
+        level: u8,
+        blocks: &[usize],
+        bounds: Option<&Bounds>,
+        decoded: &mut Decoded,
+        lost: &mut Vec<Error>,
+        take: &mut dyn FnMut(usize, Gaussians),
+    ) -> Result<()> {
+        let header = scene.header();
+        self.decoder.check_drawable(header, level)?;
+        let reach = self.decoder.reach(header, level)?;
+        let needed = around(scene.blocks(), blocks, level, reach);
+        let kept = self.gaussian_bytes(scene, blocks, level)?;
+        let kept = kept.saturating_add(self.check_memory(scene, &needed, level, kept)?);
+        self.decode(scene, &needed, level, decoded, lost)?;
+        for &block in blocks {
+            self.decoder.cancel().check()?;
+            let Some(Some(own)) = decoded.get(&block) else { continue };
+            let near = Near::of(scene.blocks(), decoded, block, level, reach);
+            self.check_drawing(header, level, near.voxels(), kept)?;
+            take(block, self.draw(header, own, &near.collect()?, bounds)?);
         }
-        selection.finish(all, lost, decoded.len())
+        Ok(())
+    }
+
+    /// What decodes blocks.
+    pub(super) fn decoder(&self) -> &Decoder {
+        &self.decoder
     }
 
     /// The voxels of a part with their colours, in the order of space.
@@ -117,16 +142,20 @@ impl SceneDecoder {
     ) -> Result<DecodedScene<(Voxels, Vec<[u8; 3]>)>> {
         let selection = self.select(scene, wanted)?;
         self.check_memory(scene, &selection.blocks, selection.level, 0)?;
-        let (decoded, lost) = self.decode(scene, &selection.blocks, selection.level)?;
+        let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
+        self.decode(scene, &selection.blocks, selection.level, &mut decoded, &mut lost)?;
         let (mut keys, mut colours) = (Vec::new(), Vec::new());
+        let mut blocks = 0;
         for (&block, voxels) in &decoded {
+            let Some(voxels) = voxels else { continue };
+            blocks += 1;
             for range in selection.ranges(&voxels.keys, scene.blocks()[block].cube) {
                 keys.extend(&voxels.keys[range.clone()]);
                 colours.extend(&voxels.colours[range]);
             }
         }
         let voxels = Voxels::from_sorted(selection.level, keys);
-        selection.finish((voxels, colours), lost, decoded.len())
+        finish((voxels, colours), lost, blocks)
     }
 
     /// The blocks in which a part lies.
@@ -138,7 +167,7 @@ impl SceneDecoder {
     }
 
     /// The level that is decoded.
-    fn level(&self, header: &Header) -> Result<u8> {
+    pub(super) fn level(&self, header: &Header) -> Result<u8> {
         let level = self.decoder.level().unwrap_or(header.top);
         header.voxels(level)?;
         Ok(level)
@@ -168,8 +197,15 @@ impl SceneDecoder {
         Ok(Selection { level, blocks, bounds })
     }
 
-    /// Decodes blocks, as many at a time as there are threads.
-    pub(super) fn decode<S: Source>(&self, scene: &SceneReader<S>, blocks: &[usize], level: u8) -> Result<(Decoded, Vec<Error>)> {
+    /// Decodes those of some blocks that have not been decoded yet, as many at a time as there are threads.
+    pub(super) fn decode<S: Source>(
+        &self,
+        scene: &SceneReader<S>,
+        blocks: &[usize],
+        level: u8,
+        decoded: &mut Decoded,
+        lost: &mut Vec<Error>,
+    ) -> Result<()> {
         let decode = |&block: &usize| -> Result<LevelVoxels> {
             let cube = scene.blocks()[block].cube;
             let bytes = scene.block(block)?;
@@ -189,19 +225,23 @@ impl SceneDecoder {
             voxels.keys.iter_mut().for_each(|key| *key |= first);
             Ok(voxels)
         };
-        let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
-        for group in blocks.chunks(rayon::current_num_threads().max(1)) {
+        let missing: Vec<usize> = blocks.iter().copied().filter(|block| !decoded.contains_key(block)).collect();
+        for group in missing.chunks(rayon::current_num_threads().max(1)) {
             self.decoder.cancel().check()?;
             let found: Vec<Result<LevelVoxels>> = group.par_iter().map(decode).collect();
             for (&block, found) in group.iter().zip(found) {
-                match found {
-                    Ok(voxels) => drop(decoded.insert(block, voxels)),
-                    Err(error @ (Error::Cancelled | Error::Io { .. })) => return Err(error),
-                    Err(error) => lost.push(error),
-                }
+                let voxels = match found {
+                    Ok(voxels) => Some(voxels),
+                    Err(error @ Error::Cancelled) => return Err(error),
+                    Err(error) => {
+                        lost.push(error);
+                        None
+                    }
+                };
+                decoded.insert(block, voxels);
             }
         }
-        Ok((decoded, lost))
+        Ok(())
     }
 
     /// Draws a block among the voxels around it.
@@ -243,15 +283,14 @@ impl SceneDecoder {
         self.decoder.draw(header, &part, || Decoder::colours_above(octree, level, &around.unfiltered))
     }
 
-    /// Bytes that the Gaussians of the selected blocks take at most.
-    fn gaussian_bytes<S: Source>(&self, scene: &SceneReader<S>, selection: &Selection) -> Result<u64> {
-        let (header, level) = (scene.header(), selection.level);
+    /// Bytes that the Gaussians of some blocks take at most.
+    fn gaussian_bytes<S: Source>(&self, scene: &SceneReader<S>, blocks: &[usize], level: u8) -> Result<u64> {
         let mut voxels = 0;
-        for &block in &selection.blocks {
+        for &block in blocks {
             let entry = &scene.blocks()[block];
-            voxels += u64::from(entry.header(header).voxels(level - entry.cube.level)?);
+            voxels += u64::from(entry.header(scene.header()).voxels(level - entry.cube.level)?);
         }
-        self.decoder.gaussian_bytes(header, level, voxels)
+        self.decoder.gaussian_bytes(scene.header(), level, voxels)
     }
 
     /// Checks that decoding these blocks keeps to the limits, beside `kept` bytes, and returns what they take when they
@@ -289,13 +328,13 @@ impl Selection {
             None => std::iter::once(0..keys.len()).collect(),
         }
     }
+}
 
-    /// What was decoded, unless all is lost.
-    fn finish<T>(self, content: T, mut lost: Vec<Error>, blocks: usize) -> Result<DecodedScene<T>> {
-        match blocks == 0 && !lost.is_empty() {
-            true => Err(lost.swap_remove(0)),
-            false => Ok(DecodedScene { content, blocks, lost }),
-        }
+/// What was decoded, unless all is lost.
+fn finish<T>(content: T, mut lost: Vec<Error>, blocks: usize) -> Result<DecodedScene<T>> {
+    match blocks == 0 && !lost.is_empty() {
+        true => Err(lost.swap_remove(0)),
+        false => Ok(DecodedScene { content, blocks, lost }),
     }
 }
 
@@ -317,8 +356,8 @@ struct Surroundings {
     own: Range<usize>,
 }
 
-impl Surroundings {
-    fn find<'a>(blocks: &[BlockEntry], decoded: &'a Decoded, block: usize, level: u8, reach: u32) -> Near<'a> {
+impl<'a> Near<'a> {
+    fn of(blocks: &[BlockEntry], decoded: &'a Decoded, block: usize, level: u8, reach: u32) -> Self {
         let bounds = Bounds::around(blocks[block].cube, level, reach);
         let (mut parts, mut own) = (Vec::new(), 0);
         for (&other, voxels) in decoded {
@@ -327,13 +366,13 @@ impl Surroundings {
             } else if !bounds.meets(&Bounds::of(blocks[other].cube, level)) {
                 continue;
             }
-            parts.push((voxels, bounds.ranges(&voxels.keys, blocks[other].cube, level)));
+            if let Some(voxels) = voxels {
+                parts.push((voxels, bounds.ranges(&voxels.keys, blocks[other].cube, level)));
+            }
         }
         Near { level, parts, own }
     }
-}
 
-impl Near<'_> {
     /// How many there are.
     fn voxels(&self) -> u64 {
         let ranges = self.parts.iter().flat_map(|(_, ranges)| ranges);
@@ -365,26 +404,22 @@ impl Near<'_> {
     }
 }
 
-/// The selected blocks and those that drawing them depends on, ascending.
-fn around(blocks: &[BlockEntry], selection: &Selection, reach: u32) -> Vec<usize> {
-    let level = selection.level;
-    if selection.blocks.len() == blocks.len() {
-        return selection.blocks.clone();
+/// Some blocks and those that drawing them depends on, ascending.
+fn around(all: &[BlockEntry], blocks: &[usize], level: u8, reach: u32) -> Vec<usize> {
+    if blocks.len() == all.len() {
+        return blocks.to_vec();
     }
-    let own: Vec<Bounds> = selection
-        .blocks
-        .iter()
-        .map(|&block| Bounds::around(blocks[block].cube, level, reach))
-        .collect();
+    let own = blocks.iter().map(|&block| Bounds::around(all[block].cube, level, reach));
+    let own: Vec<Bounds> = own.collect();
     let is_near = |block: &usize| {
-        let bounds = Bounds::of(blocks[*block].cube, level);
+        let bounds = Bounds::of(all[*block].cube, level);
         own.iter().any(|own| own.meets(&bounds))
     };
-    (0..blocks.len()).into_par_iter().filter(is_near).collect()
+    (0..all.len()).into_par_iter().filter(is_near).collect()
 }
 
 /// The cube that a scene's Gaussians refer to.
-fn frame_of(header: &Header) -> Frame {
+pub(super) fn frame_of(header: &Header) -> Frame {
     Frame {
         bits: header.bits,
         placement: header.placement,

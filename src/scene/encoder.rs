@@ -17,8 +17,8 @@ use crate::geometry::Voxels;
 use crate::log::Log;
 use crate::placement::Placement;
 
-/// Levels that are coded by default, from some below the bit depth N to N − 1: what is far away needs coarse ones.
-const LEVELS: u8 = 5;
+/// How far the first level lies above the bit depth N by default: what is far away needs coarse levels.
+pub const LEVELS: u8 = 5;
 
 /// Codes clouds as scenes.
 #[derive(Debug, Clone)]

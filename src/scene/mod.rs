@@ -17,10 +17,14 @@ mod reader;
 mod source;
 #[cfg(all(test, feature = "encoder"))]
 mod tests;
+#[cfg(feature = "render")]
+mod view;
 
 pub use decoder::{DecodedScene, SceneDecoder, Wanted};
 #[cfg(feature = "encoder")]
-pub use encoder::{Grid, SceneEncoder, Sink, Voxel};
+pub use encoder::{Grid, LEVELS, SceneEncoder, Sink, Voxel};
 pub use partition::{BLOCK_VOXELS, Cutter};
 pub use reader::{Checks, SceneReader};
 pub use source::{FileSource, Source};
+#[cfg(feature = "render")]
+pub use view::Sight;

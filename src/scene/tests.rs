@@ -45,7 +45,7 @@ fn heads() -> HeadsModel {
 fn in_one_piece(decoder: &Decoder, scene: &SceneReader<&[u8]>, decoded: &Decoded, level: u8) -> Gaussians {
     let mut keys = Vec::new();
     let [mut colours, mut unfiltered] = [const { Vec::new() }; 2];
-    for block in decoded.values() {
+    for block in decoded.values().flatten() {
         keys.extend(&block.keys);
         colours.extend(&block.colours);
         unfiltered.extend(&block.unfiltered);
@@ -62,7 +62,7 @@ fn in_one_piece(decoder: &Decoder, scene: &SceneReader<&[u8]>, decoded: &Decoded
         range: 0..map.len(),
         chosen: None,
         surfels: None,
-        advice: decoded.values().next().expect("a block").advice,
+        advice: decoded.values().flatten().next().expect("a block").advice,
     };
     let colours_above = || Decoder::colours_above(&octree, level, &unfiltered);
     decoder.draw(scene.header(), &part, colours_above).expect("Gaussians")
@@ -94,7 +94,8 @@ proptest! {
         prop_assert!(found.lost.is_empty());
         let blocks: Vec<usize> = (0..scene.blocks().len()).collect();
         prop_assert!(blocks.len() > 1);
-        let (decoded, _) = scenes.decode(&scene, &blocks, level).expect("blocks");
+        let mut decoded = Decoded::new();
+        scenes.decode(&scene, &blocks, level, &mut decoded, &mut Vec::new()).expect("blocks");
         let expected = in_one_piece(&decoder, &scene, &decoded, level);
         prop_assert_eq!(found.content.blur, expected.blur);
         prop_assert!(bits(&found.content) == bits(&expected), "{} blocks, {set} heads", blocks.len());
