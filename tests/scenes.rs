@@ -9,7 +9,7 @@ use b2p::cloud::ColouredVoxels;
 use b2p::container::Header;
 use b2p::container::scene::{BlockEntry, parse_index, write_index};
 use b2p::geometry::morton;
-use b2p::scene::Sight;
+use b2p::scene::ViewOptions;
 use b2p::{
     Background, Camera, Decoder, Error, Gaussians, Image, Limits, Renderer, SceneDecoder, SceneEncoder, SceneReader,
     SequenceReader, Source, Wanted,
@@ -86,7 +86,10 @@ fn a_scene_does_not_depend_on_the_number_of_threads() {
     let whole = SceneDecoder::default().gaussians(&reader(&bytes), &Wanted::All);
     let whole = whole.expect("Gaussians").content;
     for threads in [1, 3] {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .expect("threads");
         pool.install(|| {
             assert!(scene_bytes() == bytes);
             let again = SceneDecoder::default().gaussians(&reader(&bytes), &Wanted::All);
@@ -118,12 +121,19 @@ fn a_box_has_the_voxels_whose_centres_lie_in_it_and_their_gaussians() {
         (0..gaussians.len())
             .map(|i| {
                 let numbers = [gaussians.position[i], gaussians.scale[i], gaussians.colour[i]];
-                (numbers.map(|row| row.map(f32::to_bits)), gaussians.rotation[i].map(f32::to_bits))
+                (
+                    numbers.map(|row| row.map(f32::to_bits)),
+                    gaussians.rotation[i].map(f32::to_bits),
+                )
             })
             .collect()
     };
     // One surfel of each voxel of the last level but one.
-    let chosen = all.iter().zip(rows(&whole)).filter(|(key, _)| is_in(key)).map(|(_, row)| row);
+    let chosen = all
+        .iter()
+        .zip(rows(&whole))
+        .filter(|(key, _)| is_in(key))
+        .map(|(_, row)| row);
     assert!(rows(&part) == chosen.collect::<Vec<_>>());
 }
 
@@ -178,7 +188,10 @@ fn every_cut_gives_whole_blocks_and_typed_errors() {
             return;
         };
         assert!(scene.check_end().is_err());
-        let missing = scene.blocks().iter().filter(|block| block.offset + u64::from(block.bytes) > length as u64);
+        let missing = scene
+            .blocks()
+            .iter()
+            .filter(|block| block.offset + u64::from(block.bytes) > length as u64);
         let missing = missing.count();
         match points(&scene, None, &Wanted::All) {
             Ok((_, lost)) => assert_eq!(lost, missing, "{length} bytes"),
@@ -200,7 +213,13 @@ fn a_scene_that_is_cut_after_a_level_decodes_to_that_level() {
         let expected = points(&scene, Some(level), &Wanted::All).expect("a scene").0;
         assert!(points(&cut, None, &Wanted::All).expect("a scene").0 == expected);
         let checks = cut.check(&Decoder::new());
-        assert!(checks.end.is_none() && checks.blocks.iter().all(|block| block.as_ref().is_ok_and(|b| b.is_valid())));
+        assert!(
+            checks.end.is_none()
+                && checks
+                    .blocks
+                    .iter()
+                    .all(|block| block.as_ref().is_ok_and(|b| b.is_valid()))
+        );
     }
     assert!(matches!(scene.cut(6), Err(Error::Usage(_))));
 }
@@ -254,7 +273,10 @@ fn lies_of_the_index_are_refused() {
     let error = SceneReader::new(&changed[..], &Limits::default()).expect_err("another sum");
     assert_eq!(error.clause(), Some("18.1.2"));
     let longer = [&bytes[..], &[0]].concat();
-    assert_eq!(reader(&longer).check_end().err().and_then(|e| e.clause()), Some("18.1.1"));
+    assert_eq!(
+        reader(&longer).check_end().err().and_then(|e| e.clause()),
+        Some("18.1.1")
+    );
 }
 
 #[test]
@@ -265,7 +287,13 @@ fn limits_on_points_hold_for_blocks_and_limits_on_memory_for_what_is_decoded() {
     assert!(scene.header().points > limits.max_points);
     let limits = Limits::default().with_max_points(100);
     let refused = SceneReader::new(&bytes[..], &limits);
-    assert!(matches!(refused, Err(Error::LimitExceeded { option: "max_points", .. })));
+    assert!(matches!(
+        refused,
+        Err(Error::LimitExceeded {
+            option: "max_points",
+            ..
+        })
+    ));
     let decoder = |bytes| SceneDecoder::new(Decoder::new().with_limits(Limits::default().with_max_bytes(bytes)));
     let least = (0..40).find(|i| decoder(1 << i).gaussians(&scene, &Wanted::Blocks(vec![0])).is_ok());
     let bound = 1 << least.expect("some memory is enough");
@@ -292,7 +320,9 @@ fn voxels_that_are_not_in_order_are_refused() {
     let cloud = cloud_of(4, (0..500).collect());
     let voxels = cloud.voxels.keys().iter().rev().map(|key| Ok((*key, [0; 3])));
     let grid = b2p::scene::Grid::of(&cloud);
-    let refused = encoder().with_levels(2..=3).encode_voxels(grid, voxels, &mut |_, _| Ok(()));
+    let refused = encoder()
+        .with_levels(2..=3)
+        .encode_voxels(grid, voxels, &mut |_, _| Ok(()));
     assert!(matches!(refused, Err(Error::Usage(_))));
 }
 
@@ -311,9 +341,16 @@ fn what_a_camera_sees_makes_the_picture_of_the_whole_scene() {
     // Two walls, one behind the other, and floors, on a grid of 8 bits.
     let wall = |x: u32| (0..200 * 200u32).map(move |i| [x, 20 + i % 200, 20 + i / 200]);
     let floor = (0..120 * 200u32).map(|i| [90 + i % 120, 15, 20 + i / 120]);
-    let keys = wall(220).chain(wall(60)).chain(wall(30)).chain(floor).map(morton::encode);
+    let keys = wall(220)
+        .chain(wall(60))
+        .chain(wall(30))
+        .chain(floor)
+        .map(morton::encode);
     let cloud = cloud_of(8, keys.collect());
-    let bytes = SceneEncoder::new().with_levels(4..=7).with_block_voxels(3000).encode(&cloud);
+    let bytes = SceneEncoder::new()
+        .with_levels(4..=7)
+        .with_block_voxels(3000)
+        .encode(&cloud);
     let bytes = bytes.expect("walls can be coded");
     let scene = reader(&bytes);
     let decoder = SceneDecoder::default();
@@ -322,10 +359,14 @@ fn what_a_camera_sees_makes_the_picture_of_the_whole_scene() {
     for (azimuth, elevation, distance) in [(90.0, 0.0, 3.0), (80.0, 20.0, 2.6), (0.0, 10.0, 2.0), (85.0, 0.0, 0.7)] {
         let camera = Camera::orbit(azimuth, elevation, distance, 40.0, 160, 120).expect("a camera");
         let all = picture(&whole, &camera);
-        let seen = decoder.seen(&scene, &camera, Sight::default()).expect("Gaussians");
+        let seen = decoder
+            .visible(&scene, &camera, ViewOptions::default())
+            .expect("Gaussians");
         let off = difference(&picture(&seen.content, &camera), &all);
         assert!(off <= 1.0 / 255.0, "azimuth {azimuth}: {} of 255", off * 255.0);
-        let open = decoder.seen(&scene, &camera, Sight::default().with_hiding(false)).expect("Gaussians");
+        let open = decoder
+            .visible(&scene, &camera, ViewOptions::default().with_occlusion_culling(false))
+            .expect("Gaussians");
         assert!(seen.blocks <= open.blocks);
         assert!(difference(&picture(&open.content, &camera), &all) <= 1.0 / 255.0);
         fewest = fewest.min(seen.blocks * 100 / scene.blocks().len());
@@ -336,13 +377,19 @@ fn what_a_camera_sees_makes_the_picture_of_the_whole_scene() {
 #[test]
 fn what_is_far_away_is_drawn_from_coarser_levels() {
     let cloud = ball();
-    let bytes = SceneEncoder::new().with_levels(2..=6).with_block_voxels(800).encode(&cloud);
+    let bytes = SceneEncoder::new()
+        .with_levels(2..=6)
+        .with_block_voxels(800)
+        .encode(&cloud);
     let bytes = bytes.expect("a ball can be coded");
     let (scene, decoder) = (reader(&bytes), SceneDecoder::default());
     let camera = Camera::orbit(20.0, 10.0, 20.0, 40.0, 96, 96).expect("a camera");
-    let full = decoder.seen(&scene, &camera, Sight::default()).expect("Gaussians").content;
-    let sight = Sight::default().with_voxel_pixels(0.5);
-    let coarse = decoder.seen(&scene, &camera, sight).expect("Gaussians").content;
+    let full = decoder
+        .visible(&scene, &camera, ViewOptions::default())
+        .expect("Gaussians")
+        .content;
+    let options = ViewOptions::default().with_voxel_pixels(0.5);
+    let coarse = decoder.visible(&scene, &camera, options).expect("Gaussians").content;
     assert!(coarse.len() * 3 < full.len(), "{} of {}", coarse.len(), full.len());
     let (a, b) = (picture(&full, &camera), picture(&coarse, &camera));
     let squares = a.pixels.iter().flatten().zip(b.pixels.iter().flatten());

@@ -165,6 +165,22 @@ fn reading(path: &Path, bytes: Vec<u8>, options: &ReadOptions, limits: &Limits) 
     Ok(read)
 }
 
+/// Reads a piece of a file's points, whose bytes are a file of their own, with colours of a known range.
+pub fn piece(
+    path: &Path,
+    bytes: Vec<u8>,
+    args: &ReadArgs,
+    range: Option<ColourRange>,
+    limits: &Limits,
+) -> Result<Reading> {
+    let options = ReadOptions {
+        colour_range: range,
+        ..args.options()
+    };
+    let read = clouds::read(bytes, None, limits, &options);
+    read.map_err(Failure::in_file(path))
+}
+
 fn say(path: &Path, notes: &[Note]) {
     for note in notes {
         manners::warn(&format!("{}: {note}", path.display()));

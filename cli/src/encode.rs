@@ -38,6 +38,10 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         let what = "is for sequences: a folder of clouds, or a name such as frame_%04d.ply";
         return Err(Failure(format!("{name} {what}")));
     }
+    if let Some(pieces) = scene::pieces(args, limits)? {
+        let options = |bits| transform_options(args, bits);
+        return scene::encode_pieces(args, pieces, options, limits, progress);
+    }
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.cloud.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;

@@ -73,16 +73,15 @@ pub fn write(path: &Path, surfaces: &[Surface], options: &Options) -> Result<(u6
         points += voxels.keys.len() as u64;
     }
     file.seek(SeekFrom::Start(before.len() as u64)).map_err(failed)?;
-    file.write_all(format!("{points:<DIGITS$}").as_bytes()).map_err(failed)?;
+    file.write_all(format!("{points:<DIGITS$}").as_bytes())
+        .map_err(failed)?;
     file.flush().map_err(failed)?;
     Ok((points, bits))
 }
 
 /// The header before and after the number of points.
 fn header(bits: u8) -> (String, String) {
-    let before = format!(
-        "ply\nformat binary_little_endian 1.0\ncomment bits {bits}\nelement vertex "
-    );
+    let before = format!("ply\nformat binary_little_endian 1.0\ncomment bits {bits}\nelement vertex ");
     let after = "\nproperty float x\nproperty float y\nproperty float z\n\
                  property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n";
     (before, after.into())
@@ -109,10 +108,18 @@ mod tests {
         let surface = Surface::new(&procedural::scene());
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.ply");
-        let options = Options { count: 5, bits: 5, density: 1.0, seed: 3 };
+        let options = Options {
+            count: 5,
+            bits: 5,
+            density: 1.0,
+            seed: 3,
+        };
         let (points, bits) = write(&path, &[surface], &options).unwrap();
         let cloud = PointCloud::open(&path, &Limits::default()).unwrap();
-        assert_eq!((cloud.positions.len() as u64, bits, cloud.hints.bits), (points, 7, Some(7)));
+        assert_eq!(
+            (cloud.positions.len() as u64, bits, cloud.hints.bits),
+            (points, 7, Some(7))
+        );
         let mut cells: Vec<[u32; 3]> = cloud.positions.iter().map(|p| p.map(|x| x as u32 >> 5)).collect();
         cells.sort_unstable();
         cells.dedup();

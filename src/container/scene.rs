@@ -188,7 +188,13 @@ fn read_block(
     let level = reader.read(|r| r.u8("level of a block"))?;
     let most = most_level(header.base, header.bits);
     if level > most {
-        return Err(malformed("18.2.2", at, "level of a block", level, format!("at most {most}")));
+        return Err(malformed(
+            "18.2.2",
+            at,
+            "level of a block",
+            level,
+            format!("at most {most}"),
+        ));
     }
     let at = reader.at();
     let gap = reader.varint("cubes before a block")?;
@@ -268,6 +274,10 @@ pub fn write_index(common: &Header, blocks: &[BlockEntry]) -> Result<Vec<u8>> {
     }
     let mut bytes = header.write_scene();
     put_chunk(ChunkKind::Index, blocks.len(), &payload, &mut bytes)?;
-    parse_index(&bytes, &Header::parse_scene(&bytes, &Limits::unlimited())?, &Limits::unlimited())?;
+    parse_index(
+        &bytes,
+        &Header::parse_scene(&bytes, &Limits::unlimited())?,
+        &Limits::unlimited(),
+    )?;
     Ok(bytes)
 }

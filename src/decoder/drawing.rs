@@ -107,7 +107,12 @@ impl Decoder {
             surfels: surfels.as_deref(),
             advice: Advice::of(reached),
         };
-        let colours_above = || reached.above.as_ref().map_or_else(Vec::new, |above| reached.colours_above(above));
+        let colours_above = || {
+            reached
+                .above
+                .as_ref()
+                .map_or_else(Vec::new, |above| reached.colours_above(above))
+        };
         self.draw(header, &part, colours_above)
     }
 
@@ -135,7 +140,15 @@ impl Decoder {
             let choice = SurfelSelection { only, size, range };
             let per_voxel = self.surfels_per_voxel(header, level)?;
             let voxels = part.octree.level(level);
-            Ok(surfels(self.isa(), voxels, part.map, part.colours, per_voxel, choice, frame))
+            Ok(surfels(
+                self.isa(),
+                voxels,
+                part.map,
+                part.colours,
+                per_voxel,
+                choice,
+                frame,
+            ))
         };
         let (Some((model, set)), Some(above)) = (self.network(header, level)?, part.above) else {
             return discs(part.chosen, alone);

@@ -186,7 +186,9 @@ impl SceneDecoder {
             Wanted::Blocks(blocks) => {
                 if let Some(block) = blocks.iter().find(|block| !all.contains(block)) {
                     let last = all.end - 1;
-                    return Err(Error::Usage(format!("the scene has the blocks 0 to {last}, not {block}")));
+                    return Err(Error::Usage(format!(
+                        "the scene has the blocks 0 to {last}, not {block}"
+                    )));
                 }
                 let mut blocks = blocks.clone();
                 blocks.sort_unstable();
@@ -225,7 +227,11 @@ impl SceneDecoder {
             voxels.keys.iter_mut().for_each(|key| *key |= first);
             Ok(voxels)
         };
-        let missing: Vec<usize> = blocks.iter().copied().filter(|block| !decoded.contains_key(block)).collect();
+        let missing: Vec<usize> = blocks
+            .iter()
+            .copied()
+            .filter(|block| !decoded.contains_key(block))
+            .collect();
         for group in missing.chunks(rayon::current_num_threads().max(1)) {
             self.decoder.cancel().check()?;
             let found: Vec<Result<LevelVoxels>> = group.par_iter().map(decode).collect();
@@ -249,7 +255,7 @@ impl SceneDecoder {
         &self,
         header: &Header,
         own: &LevelVoxels,
-        around: &Surroundings,
+        around: &Neighbourhood,
         bounds: Option<&Bounds>,
     ) -> Result<Gaussians> {
         let (octree, level) = (&around.octree, around.octree.depth());
@@ -280,7 +286,9 @@ impl SceneDecoder {
             surfels: surfels.as_deref(),
             advice: own.advice,
         };
-        self.decoder.draw(header, &part, || Decoder::colours_above(octree, level, &around.unfiltered))
+        self.decoder.draw(header, &part, || {
+            Decoder::colours_above(octree, level, &around.unfiltered)
+        })
     }
 
     /// Bytes that the Gaussians of some blocks take at most.
@@ -315,7 +323,9 @@ impl SceneDecoder {
     /// Checks that drawing a block among so many voxels keeps to the limits, beside `kept` bytes.
     fn check_drawing(&self, header: &Header, level: u8, voxels: u64, kept: u64) -> Result<()> {
         let drawing = self.decoder.drawing_bytes_of(header, level, [voxels; 2])?;
-        let all = kept.saturating_add(drawing).saturating_add(voxels.saturating_mul(PART_BYTES));
+        let all = kept
+            .saturating_add(drawing)
+            .saturating_add(voxels.saturating_mul(PART_BYTES));
         self.decoder.limits().check_bytes("memory to draw this scene", all)
     }
 }
@@ -348,7 +358,7 @@ struct Near<'a> {
 }
 
 /// A block's voxels among those that drawing it depends on.
-struct Surroundings {
+struct Neighbourhood {
     octree: Octree,
     colours: Vec<[u8; 3]>,
     unfiltered: Vec<[u8; 3]>,
@@ -379,7 +389,7 @@ impl<'a> Near<'a> {
         ranges.map(|range| range.len() as u64).sum()
     }
 
-    fn collect(self) -> Result<Surroundings> {
+    fn collect(self) -> Result<Neighbourhood> {
         let count = self.voxels() as usize;
         let mut keys = Vec::with_capacity(count);
         let (mut colours, mut unfiltered) = (Vec::with_capacity(count), Vec::with_capacity(count));
@@ -395,7 +405,7 @@ impl<'a> Near<'a> {
                 own = start..keys.len();
             }
         }
-        Ok(Surroundings {
+        Ok(Neighbourhood {
             octree: Octree::new(Voxels::from_sorted(self.level, keys))?,
             colours,
             unfiltered,
@@ -409,7 +419,9 @@ fn around(all: &[BlockEntry], blocks: &[usize], level: u8, reach: u32) -> Vec<us
     if blocks.len() == all.len() {
         return blocks.to_vec();
     }
-    let own = blocks.iter().map(|&block| Bounds::around(all[block].cube, level, reach));
+    let own = blocks
+        .iter()
+        .map(|&block| Bounds::around(all[block].cube, level, reach));
     let own: Vec<Bounds> = own.collect();
     let is_near = |block: &usize| {
         let bounds = Bounds::of(all[*block].cube, level);
@@ -428,7 +440,11 @@ pub(super) fn frame_of(header: &Header) -> Frame {
 
 /// The voxels of a level whose centres lie in a box of the world.
 fn bounds_of(header: &Header, level: u8, low: [f64; 3], high: [f64; 3]) -> Result<Bounds> {
-    if low.iter().zip(&high).any(|(low, high)| low.is_nan() || high.is_nan() || low > high) {
+    if low
+        .iter()
+        .zip(&high)
+        .any(|(low, high)| low.is_nan() || high.is_nan() || low > high)
+    {
         let what = "a box has a lowest and a highest corner";
         return Err(Error::Usage(format!("{what}, not {low:?} and {high:?}")));
     }

@@ -16,7 +16,10 @@ impl<S: Source> SceneReader<S> {
         self.header().voxels(level)?;
         let mut entries = Vec::new();
         for block in 0..self.blocks().len() {
-            entries.push(BlockEntry::of(self.blocks()[block].cube, &self.cut_block(block, level)?)?);
+            entries.push(BlockEntry::of(
+                self.blocks()[block].cube,
+                &self.cut_block(block, level)?,
+            )?);
         }
         let mut common = self.header().clone();
         common.top = level;

@@ -10,15 +10,12 @@ use crate::axes::Axes;
 use crate::cancel::Cancel;
 use crate::cloud::ColouredVoxels;
 use crate::container::scene::{BlockEntry, Cube, most_level, write_index};
-use crate::container::{Format, Header, with_axes};
+use crate::container::{Format, Header, MAX_COLOUR_SLICE, with_axes};
 use crate::encoder::transform::{self, Options, QualityTarget};
 use crate::error::{Error, Result};
 use crate::geometry::Voxels;
 use crate::log::Log;
 use crate::placement::Placement;
-
-/// How far the first level lies above the bit depth N by default: what is far away needs coarse levels.
-pub const LEVELS: u8 = 5;
 
 /// Codes clouds as scenes.
 #[derive(Debug, Clone)]
@@ -50,7 +47,7 @@ pub(super) type Cut = (Cube, Vec<Voxel>);
 impl Default for SceneEncoder {
     fn default() -> Self {
         SceneEncoder {
-            options: Options::default(),
+            options: scene_options(Options::default()),
             block_voxels: BLOCK_VOXELS,
             axes: Axes::default(),
             cancel: Cancel::default(),
@@ -59,16 +56,16 @@ impl Default for SceneEncoder {
 }
 
 impl SceneEncoder {
-    /// An encoder of blocks of at most 2²⁰ voxels, with the quality of [`Encoder::new`](crate::Encoder::new), whose
-    /// levels are N − 5 to N − 1 of a cloud of N bits.
+    /// An encoder of blocks of at most [`BLOCK_VOXELS`] voxels, with the quality and the levels of
+    /// [`Encoder::new`](crate::Encoder::new).
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// The same encoder with these options of each block. Levels are those of the scene.
+    /// The same encoder with these options of each block, but for slices of colours. Levels are those of the scene.
     #[doc(hidden)]
     pub fn with_options(mut self, options: Options) -> Self {
-        self.options = options;
+        self.options = scene_options(options);
         self
     }
 
@@ -172,7 +169,7 @@ impl SceneEncoder {
 
     /// The levels of a scene of so many bits.
     pub(super) fn levels(&self, bits: u8) -> Result<RangeInclusive<u8>> {
-        let usual = bits.saturating_sub(LEVELS)..=bits.saturating_sub(1);
+        let usual = bits.saturating_sub(3)..=bits.saturating_sub(1);
         let levels = self.options.levels.clone().unwrap_or(usual);
         match levels.is_empty() || *levels.end() > bits {
             true => Err(Error::Usage(format!(
@@ -219,6 +216,14 @@ impl SceneEncoder {
             true => with_axes(&bytes, &self.axes),
             false => Ok(bytes),
         }
+    }
+}
+
+/// Blocks are decoded beside each other, so that their slices may be as long as they can be: that takes fewer bits.
+fn scene_options(options: Options) -> Options {
+    Options {
+        colour_slice: MAX_COLOUR_SLICE,
+        ..options
     }
 }
 

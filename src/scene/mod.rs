@@ -14,6 +14,8 @@ mod partition;
 #[cfg(feature = "encoder")]
 mod rate_control;
 mod reader;
+#[cfg(feature = "encoder")]
+mod runs;
 mod source;
 #[cfg(all(test, feature = "encoder"))]
 mod tests;
@@ -22,9 +24,11 @@ mod view;
 
 pub use decoder::{DecodedScene, SceneDecoder, Wanted};
 #[cfg(feature = "encoder")]
-pub use encoder::{Grid, LEVELS, SceneEncoder, Sink, Voxel};
+pub use encoder::{Grid, SceneEncoder, Sink, Voxel};
 pub use partition::{BLOCK_VOXELS, Cutter};
 pub use reader::{Checks, SceneReader};
+#[cfg(feature = "encoder")]
+pub use runs::Runs;
 pub use source::{FileSource, Source};
 #[cfg(feature = "render")]
-pub use view::Sight;
+pub use view::ViewOptions;

@@ -121,12 +121,30 @@ mod tests {
     }
 
     #[test]
-    fn what_a_cube_depends_on_has_whole_families() {
-        let cube = Cube { level: 2, key: morton::encode([1, 2, 3]) };
+    fn what_a_cube_depends_on_has_all_children_of_its_parents() {
+        let cube = Cube {
+            level: 2,
+            key: morton::encode([1, 2, 3]),
+        };
         let around = Bounds::around(cube, 5, 3);
         // At level 4 the cube has the voxels 4..8, 8..12 and 12..16, the last of that level.
-        assert_eq!(around, Bounds { low: [2, 10, 18], high: [21, 29, 31] });
-        let voxel = Cube { level: 5, key: morton::encode([9, 9, 31]) };
-        assert_eq!(Bounds::around(voxel, 5, 1), Bounds { low: [6, 6, 28], high: [11, 11, 31] });
+        assert_eq!(
+            around,
+            Bounds {
+                low: [2, 10, 18],
+                high: [21, 29, 31]
+            }
+        );
+        let voxel = Cube {
+            level: 5,
+            key: morton::encode([9, 9, 31]),
+        };
+        assert_eq!(
+            Bounds::around(voxel, 5, 1),
+            Bounds {
+                low: [6, 6, 28],
+                high: [11, 11, 31]
+            }
+        );
     }
 }

@@ -55,7 +55,9 @@ impl<S: Source> SceneReader<S> {
             let parsed = parsed.and_then(|header| Ok((parse_index(&bytes, &header, limits)?, header)));
             match parsed {
                 Ok((blocks, header)) => break (header, blocks),
-                Err(Error::Truncated { needed, .. }) if first.saturating_add(needed) <= length => first += needed.max(1),
+                Err(Error::Truncated { needed, .. }) if first.saturating_add(needed) <= length => {
+                    first += needed.max(1)
+                }
                 Err(error) => return Err(error),
             }
         };
@@ -79,7 +81,9 @@ impl<S: Source> SceneReader<S> {
     pub fn block(&self, block: usize) -> Result<Cow<'_, [u8]>> {
         let Some(entry) = self.blocks.get(block) else {
             let last = self.blocks.len() - 1;
-            return Err(Error::Usage(format!("the scene has the blocks 0 to {last}, not {block}")));
+            return Err(Error::Usage(format!(
+                "the scene has the blocks 0 to {last}, not {block}"
+            )));
         };
         let read = || {
             let bytes = self.source.read(entry.offset, entry.bytes as usize)?;

@@ -76,7 +76,10 @@ impl FileSource {
     #[cfg(not(unix))]
     fn read_exact(&self, offset: u64, bytes: &mut [u8]) -> io::Result<()> {
         use std::io::{Read, Seek};
-        let mut file = self.file.lock().map_err(|_| io::Error::other("another thread failed"))?;
+        let mut file = self
+            .file
+            .lock()
+            .map_err(|_| io::Error::other("another thread failed"))?;
         file.seek(io::SeekFrom::Start(offset))?;
         file.read_exact(bytes)
     }

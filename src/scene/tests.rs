@@ -69,8 +69,15 @@ fn in_one_piece(decoder: &Decoder, scene: &SceneReader<&[u8]>, decoded: &Decoded
 }
 
 fn bits(gaussians: &Gaussians) -> Vec<u32> {
-    let triples = gaussians.position.iter().chain(&gaussians.scale).chain(&gaussians.colour);
-    let numbers = triples.flatten().chain(gaussians.rotation.iter().flatten()).chain(&gaussians.opacity);
+    let triples = gaussians
+        .position
+        .iter()
+        .chain(&gaussians.scale)
+        .chain(&gaussians.colour);
+    let numbers = triples
+        .flatten()
+        .chain(gaussians.rotation.iter().flatten())
+        .chain(&gaussians.opacity);
     numbers.map(|number| number.to_bits()).collect()
 }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 
-use super::decoder::{DecodedScene, Decoded, SceneDecoder};
+use super::decoder::{Decoded, DecodedScene, SceneDecoder};
 use super::reader::SceneReader;
 use super::source::Source;
 use crate::container::Header;
@@ -18,8 +18,9 @@ use crate::renderer::{Background, Channel, Image, Renderer};
 
 /// How far Gaussians may reach out of their block, in voxels of its level.
 const MARGIN: f64 = 8.0;
-/// What is behind may shine through so much where it is left out: less than half a step of eight bits.
-const SHINE: f32 = 1.0 / 512.0;
+/// Transmittance up to which what is behind may be left out: it changes the picture by less than half a step of eight
+/// bits.
+const THRESHOLD: f32 = 1.0 / 512.0;
 /// The blocks in view are decoded in so many groups, at least: what a group hides of the next ones is known then.
 const GROUPS: usize = 16;
 /// A group has so many blocks at least.
@@ -28,40 +29,40 @@ const GROUP: usize = 4;
 /// How much of a scene a picture needs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
-pub struct Sight {
+pub struct ViewOptions {
     /// Width in pixels that voxels of a coarser level may have where that takes the place of the finest one. 0 for the
     /// finest everywhere.
     pub voxel_pixels: f64,
     /// Whether blocks that are hidden behind others are left out.
-    pub hides: bool,
+    pub occlusion_culling: bool,
 }
 
-impl Sight {
-    /// The same with another [`Sight::voxel_pixels`].
+impl ViewOptions {
+    /// The same with another [`ViewOptions::voxel_pixels`].
     pub fn with_voxel_pixels(mut self, pixels: f64) -> Self {
         self.voxel_pixels = pixels;
         self
     }
 
-    /// The same with another [`Sight::hides`].
-    pub fn with_hiding(mut self, hides: bool) -> Self {
-        self.hides = hides;
+    /// The same with another [`ViewOptions::occlusion_culling`].
+    pub fn with_occlusion_culling(mut self, on: bool) -> Self {
+        self.occlusion_culling = on;
         self
     }
 }
 
-impl Default for Sight {
+impl Default for ViewOptions {
     fn default() -> Self {
-        Sight {
+        ViewOptions {
             voxel_pixels: 0.0,
-            hides: true,
+            occlusion_culling: true,
         }
     }
 }
 
 /// A block in view.
 #[derive(Debug, Clone, Copy)]
-struct Seen {
+struct VisibleBlock {
     block: usize,
     level: u8,
     /// Columns and rows of the picture that it may reach: first and last. `None` if it comes too near to tell.
@@ -74,11 +75,11 @@ impl SceneDecoder {
     ///
     /// # Errors
     /// Those of [`SceneDecoder::gaussians`] and of drawing.
-    pub fn seen<S: Source>(
+    pub fn visible<S: Source>(
         &self,
         scene: &SceneReader<S>,
         camera: &Camera,
-        sight: Sight,
+        options: ViewOptions,
     ) -> Result<DecodedScene<Gaussians>> {
         camera.check()?;
         let header = scene.header();
@@ -87,11 +88,11 @@ impl SceneDecoder {
         let levels = self.drawable_levels(header, finest)?;
         let in_view = order.into_iter().filter_map(|block| {
             let cube = scene.blocks()[block].cube;
-            let level = level_for(cube, header, camera, sight, &levels);
+            let level = level_for(cube, header, camera, options, &levels);
             let window = window(cube, level, camera)?;
-            Some(Seen { block, level, window })
+            Some(VisibleBlock { block, level, window })
         });
-        let in_view: Vec<Seen> = in_view.collect();
+        let in_view: Vec<VisibleBlock> = in_view.collect();
         let mut work = Work {
             decoder: self,
             scene,
@@ -99,7 +100,7 @@ impl SceneDecoder {
             decoded: BTreeMap::new(),
             lost: Vec::new(),
             drawn: BTreeMap::new(),
-            veil: sight.hides.then(|| Veil::new(camera)),
+            transmittance: options.occlusion_culling.then(|| Transmittance::new(camera)),
         };
         for group in in_view.chunks(GROUP.max(in_view.len().div_ceil(GROUPS))) {
             work.add(group)?;
@@ -111,7 +112,9 @@ impl SceneDecoder {
     fn drawable_levels(&self, header: &Header, finest: u8) -> Result<Vec<u8>> {
         self.decoder().check_drawable(header, finest)?;
         let levels = header.base..=finest;
-        Ok(levels.filter(|level| self.decoder().check_drawable(header, *level).is_ok()).collect())
+        Ok(levels
+            .filter(|level| self.decoder().check_drawable(header, *level).is_ok())
+            .collect())
     }
 }
 
@@ -126,27 +129,33 @@ struct Work<'a, S> {
     /// By block.
     drawn: BTreeMap<usize, Gaussians>,
     /// Nothing, if hidden blocks are drawn, too.
-    veil: Option<Veil>,
+    transmittance: Option<Transmittance>,
 }
 
 impl<S: Source> Work<'_, S> {
     /// Decodes the blocks of a group that are not hidden, and draws them over what is behind.
-    fn add(&mut self, group: &[Seen]) -> Result<()> {
-        let hidden = |seen: &&Seen| self.veil.as_ref().is_none_or(|veil| !veil.hides(seen));
-        let visible: Vec<Seen> = group.iter().filter(hidden).copied().collect();
+    fn add(&mut self, group: &[VisibleBlock]) -> Result<()> {
+        let in_front = self.transmittance.as_ref();
+        let is_visible = |seen: &&VisibleBlock| in_front.is_none_or(|in_front| !in_front.hides(seen));
+        let visible: Vec<VisibleBlock> = group.iter().filter(is_visible).copied().collect();
         let mut own: Vec<(usize, Gaussians)> = Vec::new();
         let mut levels: Vec<u8> = visible.iter().map(|seen| seen.level).collect();
         levels.sort_unstable();
         levels.dedup();
         for level in levels {
-            let blocks: Vec<usize> = visible.iter().filter(|seen| seen.level == level).map(|seen| seen.block).collect();
+            let blocks: Vec<usize> = visible
+                .iter()
+                .filter(|seen| seen.level == level)
+                .map(|seen| seen.block)
+                .collect();
             let decoded = self.decoded.entry(level).or_default();
             let mut take = |block, gaussians| own.push((block, gaussians));
-            self.decoder.draw_blocks(self.scene, level, &blocks, None, decoded, &mut self.lost, &mut take)?;
+            self.decoder
+                .draw_blocks(self.scene, level, &blocks, None, decoded, &mut self.lost, &mut take)?;
         }
-        if let Some(veil) = &mut self.veil {
+        if let Some(transmittance) = &mut self.transmittance {
             let together = joined(own.iter().map(|(_, gaussians)| gaussians), self.scene.header());
-            veil.draw(&together, self.camera, self.decoder.decoder().limits())?;
+            transmittance.draw(&together, self.camera, self.decoder.decoder().limits())?;
         }
         self.drawn.extend(own);
         Ok(())
@@ -167,7 +176,10 @@ impl<S: Source> Work<'_, S> {
 /// Gaussians of blocks, which may have different levels, as one.
 fn joined<'a>(blocks: impl Iterator<Item = &'a Gaussians> + Clone, header: &Header) -> Gaussians {
     let with_blur = blocks.clone().filter(|gaussians| !gaussians.is_empty());
-    let blur = with_blur.map(|gaussians| gaussians.blur).reduce(f32::min).unwrap_or(0.0);
+    let blur = with_blur
+        .map(|gaussians| gaussians.blur)
+        .reduce(f32::min)
+        .unwrap_or(0.0);
     let mut all = Gaussians {
         blur,
         frame: super::decoder::frame_of(header),
@@ -187,22 +199,22 @@ fn joined<'a>(blocks: impl Iterator<Item = &'a Gaussians> + Clone, header: &Head
 }
 
 /// How much of what is behind is seen in each pixel.
-struct Veil {
+struct Transmittance {
     renderer: Renderer,
     image: Image,
     width: usize,
     /// Row by row, 1 where nothing is in front.
-    shine: Vec<f32>,
+    through: Vec<f32>,
 }
 
-impl Veil {
+impl Transmittance {
     fn new(camera: &Camera) -> Self {
         let [width, height] = camera.size().map(|side| side as usize);
-        Veil {
+        Transmittance {
             renderer: Renderer::new(),
             image: Image::default(),
             width,
-            shine: vec![1.0; width * height],
+            through: vec![1.0; width * height],
         }
     }
 
@@ -213,20 +225,20 @@ impl Veil {
         let (nothing, image) = (Background::Transparent, &mut self.image);
         self.renderer
             .draw_into(gaussians, camera, Channel::Colour, nothing, limits, image)?;
-        for (shine, pixel) in self.shine.iter_mut().zip(&self.image.pixels) {
-            *shine *= (1.0 - pixel[3]).clamp(0.0, 1.0);
+        for (through, pixel) in self.through.iter_mut().zip(&self.image.pixels) {
+            *through *= (1.0 - pixel[3]).clamp(0.0, 1.0);
         }
         Ok(())
     }
 
     /// Whether nothing of a block is seen through what is in front.
-    fn hides(&self, seen: &Seen) -> bool {
+    fn hides(&self, seen: &VisibleBlock) -> bool {
         let Some([columns, rows]) = seen.window else {
             return false;
         };
         (rows[0]..=rows[1]).all(|row| {
-            let row = &self.shine[row * self.width..][..self.width];
-            row[columns[0]..=columns[1]].iter().all(|shine| *shine <= SHINE)
+            let row = &self.through[row * self.width..][..self.width];
+            row[columns[0]..=columns[1]].iter().all(|through| *through <= THRESHOLD)
         })
     }
 }
@@ -245,10 +257,15 @@ fn front_to_back<S: Source>(scene: &SceneReader<S>, camera: &Camera) -> Vec<usiz
     let (eye, forward) = (inverse.translation, inverse.matrix3 * DVec3::Z);
     let mut order = Vec::new();
     let blocks: Vec<(usize, Cube)> = scene.blocks().iter().map(|block| block.cube).enumerate().collect();
-    sort(&blocks, Cube { level: 0, key: 0 }, &|middle| match camera.projection {
-        Projection::Pinhole => eye - middle,
-        Projection::Orthographic => -forward,
-    }, &mut order);
+    sort(
+        &blocks,
+        Cube { level: 0, key: 0 },
+        &|middle| match camera.projection {
+            Projection::Pinhole => eye - middle,
+            Projection::Orthographic => -forward,
+        },
+        &mut order,
+    );
     order
 }
 
@@ -270,7 +287,8 @@ fn sort(blocks: &[(usize, Cube)], cube: Cube, towards: &impl Fn(DVec3) -> DVec3,
             level: cube.level + 1,
             key: cube.key << 3 | octant,
         };
-        let is_in = |other: &Cube| other.level >= child.level && other.key >> (3 * (other.level - child.level)) == child.key;
+        let is_in =
+            |other: &Cube| other.level >= child.level && other.key >> (3 * (other.level - child.level)) == child.key;
         let first = blocks.iter().position(|(_, other)| is_in(other)).unwrap_or(0);
         let count = blocks[first..].iter().take_while(|(_, other)| is_in(other)).count();
         sort(&blocks[first..first + count], child, towards, order);
@@ -278,7 +296,7 @@ fn sort(blocks: &[(usize, Cube)], cube: Cube, towards: &impl Fn(DVec3) -> DVec3,
 }
 
 /// The level of a block: the coarsest whose voxels are nowhere too wide.
-fn level_for(cube: Cube, header: &Header, camera: &Camera, sight: Sight, levels: &[u8]) -> u8 {
+fn level_for(cube: Cube, header: &Header, camera: &Camera, options: ViewOptions, levels: &[u8]) -> u8 {
     let finest = levels.last().copied().unwrap_or(header.top);
     let [low, high] = corners(cube);
     let points = (0..8).map(|corner| camera.pose.transform_point3(pick(low, high, corner)).z);
@@ -288,7 +306,7 @@ fn level_for(cube: Cube, header: &Header, camera: &Camera, sight: Sight, levels:
         Projection::Pinhole => focal / nearest,
         Projection::Orthographic => focal,
     };
-    let is_fine = |level: &&u8| 2.0 / f64::from(1u32 << **level) * per_unit <= sight.voxel_pixels;
+    let is_fine = |level: &&u8| 2.0 / f64::from(1u32 << **level) * per_unit <= options.voxel_pixels;
     levels.iter().find(is_fine).copied().unwrap_or(finest)
 }
 
@@ -334,11 +352,18 @@ fn window(cube: Cube, level: u8, camera: &Camera) -> Option<Option<[[usize; 2]; 
     }
     let range = |axis: usize| {
         let (focal, centre, first, end) = sides[axis];
-        let places = points.iter().map(|point| focal * point[axis] / depth(point) + centre - f64::from(first));
-        let (low, high) = places.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), at| (low.min(at), high.max(at)));
+        let places = points
+            .iter()
+            .map(|point| focal * point[axis] / depth(point) + centre - f64::from(first));
+        let (low, high) = places.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), at| {
+            (low.min(at), high.max(at))
+        });
         let last = f64::from(end - first) - 1.0;
         // A pixel more on each side, for filters.
-        [(low - 1.0).clamp(0.0, last) as usize, (high + 1.0).clamp(0.0, last) as usize]
+        [
+            (low - 1.0).clamp(0.0, last) as usize,
+            (high + 1.0).clamp(0.0, last) as usize,
+        ]
     };
     Some(Some([range(0), range(1)]))
 }

@@ -2,7 +2,6 @@
 
 use b2p::cloud::{ColouredVoxels, GridReport};
 use b2p::encoder::transform::Options;
-use b2p::scene::LEVELS;
 use b2p::{Axes, Error, Limits, SceneEncoder, SceneReader};
 use serde_json::json;
 
@@ -22,15 +21,10 @@ pub fn run(
     args: &Encode,
     (cloud, found): (&ColouredVoxels, &GridReport),
     axes: Axes,
-    mut options: Options,
+    options: Options,
     limits: &Limits,
     progress: &Progress,
 ) -> Result<Said> {
-    if let (None, Some(levels)) = (&args.levels, &options.levels) {
-        // Those of a quality; what is far away needs coarser ones, too.
-        let first = cloud.voxels.depth().saturating_sub(LEVELS);
-        options.levels = Some(first.min(*levels.start())..=*levels.end());
-    }
     let fail = Failure::in_file(&args.cloud);
     let encoder = SceneEncoder::new()
         .with_options(options)

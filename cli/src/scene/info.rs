@@ -98,7 +98,10 @@ pub fn check(path: &Path, limits: &Limits) -> Result<String> {
     faults.extend(end.map(|error| format!("{error}{}", clause(error).unwrap_or_default())));
     let name = path.display();
     if faults.is_empty() {
-        return Ok(format!("{name}: valid, {}\n", counted(scene.blocks().len() as u64, "block")));
+        return Ok(format!(
+            "{name}: valid, {}\n",
+            counted(scene.blocks().len() as u64, "block")
+        ));
     }
     let number = counted(faults.len() as u64, "fault");
     Err(Failure(format!("{name}: {number}\n  {}", faults.join("\n  "))))

@@ -5,6 +5,7 @@ mod edit;
 mod encode;
 mod info;
 mod render;
+mod stream;
 
 use std::path::Path;
 
@@ -15,6 +16,7 @@ pub use edit::cut;
 pub use encode::{is_wanted, run as encode};
 pub use info::{check, run as info};
 pub use render::run as render;
+pub use stream::{pieces, run as encode_pieces};
 
 use super::table::counted;
 use super::{Failure, Result, manners};
@@ -54,7 +56,10 @@ fn complain(path: &Path, lost: &[Error], blocks: usize) -> Result<()> {
         n => {
             let lost = counted(n as u64, "block");
             let all = counted((n + blocks) as u64, "block");
-            Err(Failure(format!("{}: {lost} of {all} cannot be decoded", path.display())))
+            Err(Failure(format!(
+                "{}: {lost} of {all} cannot be decoded",
+                path.display()
+            )))
         }
     }
 }

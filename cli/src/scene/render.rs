@@ -3,7 +3,7 @@
 use b2p::gaussians::{Frame, Gaussians};
 use b2p::renderer::camera::Extent;
 use b2p::renderer::{Effects, Renderer};
-use b2p::scene::Sight;
+use b2p::scene::ViewOptions;
 use b2p::{Limits, SceneDecoder, Wanted};
 
 use super::super::args::{Format, Render};
@@ -36,7 +36,9 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     let one_file = args.contact_sheet || args.turntable.is_some() || format_of(args, cameras.len())? == Format::Y4m;
     if one_file {
         let blocks = scene.blocks().len();
-        let decoded = log.step("decode scene", blocks, "blocks", || decoder.gaussians(&scene, &Wanted::All));
+        let decoded = log.step("decode scene", blocks, "blocks", || {
+            decoder.gaussians(&scene, &Wanted::All)
+        });
         let decoded = decoded.map_err(&fail)?;
         let drawing = Drawing {
             args,
@@ -48,14 +50,14 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         complain(&args.input, &decoded.lost, decoded.blocks)?;
         return Ok(said);
     }
-    let sight = Sight::default().with_voxel_pixels(args.lod);
+    let options = ViewOptions::default().with_voxel_pixels(args.lod);
     let (mut all, mut report) = (Vec::new(), String::new());
     let (mut lost, mut most) = (Vec::new(), 0);
     let mut renderer = None;
     for shot in &cameras {
         let name = format!("decode what is seen in {}", shot.path.display());
         let seen = log.step(name, scene.blocks().len(), "blocks", || {
-            decoder.seen(&scene, &shot.camera, sight)
+            decoder.visible(&scene, &shot.camera, options)
         });
         let seen = seen.map_err(&fail)?;
         let gaussians: &Gaussians = &seen.content;

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use crate::error::Result;
 use crate::procedural;
-use crate::scatter;
 use crate::sample::{Grid, Sampler, write_ply};
+use crate::scatter;
 use crate::surface::Surface;
 
 /// Make the demo's still life, as a voxelised coloured cloud (PLY); or with --objects a large one: meshes placed many times
@@ -55,7 +55,7 @@ impl Args {
 
     /// Places meshes many times.
     fn scatter(self, count: u32) -> Result<()> {
-        let surface = |path| Ok(Surface::new(&super::load_mesh(path)?));
+        let surface = |path: &PathBuf| Ok(Surface::new(&super::load_mesh(path)?));
         let surfaces = self.meshes.iter().map(surface).collect::<Result<Vec<_>>>()?;
         let options = scatter::Options {
             count,

@@ -206,12 +206,7 @@ impl<'a> Rows<'a> {
     }
 
     /// First voxel and rows of every block.
-    fn tasks(
-        mut self,
-        voxels: Range<usize>,
-        per_voxel: usize,
-        choice: SurfelSelection<'_>,
-    ) -> Vec<(usize, Rows<'a>)> {
+    fn tasks(mut self, voxels: Range<usize>, per_voxel: usize, choice: SurfelSelection<'_>) -> Vec<(usize, Rows<'a>)> {
         let mut tasks = Vec::with_capacity(voxels.len().div_ceil(BLOCK));
         for first in voxels.clone().step_by(BLOCK) {
             let block = first..(first + BLOCK).min(voxels.end);
