@@ -154,7 +154,9 @@ impl<S: Source> Work<'_, S> {
                 .draw_blocks(self.scene, level, &blocks, None, decoded, &mut self.lost, &mut take)?;
         }
         if let Some(transmittance) = &mut self.transmittance {
-            let together = joined(own.iter().map(|(_, gaussians)| gaussians), self.scene.header());
+            let gaussians = || own.iter().map(|(_, gaussians)| gaussians);
+            let blur = least_blur(gaussians());
+            let together = joined(gaussians().cloned(), blur, self.scene.header());
             transmittance.draw(&together, self.camera, self.decoder.decoder().limits())?;
         }
         self.drawn.extend(own);
@@ -165,28 +167,23 @@ impl<S: Source> Work<'_, S> {
         if self.drawn.is_empty() && !self.lost.is_empty() {
             return Err(self.lost.swap_remove(0));
         }
+        let (blur, blocks) = (least_blur(self.drawn.values()), self.drawn.len());
         Ok(DecodedScene {
-            content: joined(self.drawn.values(), self.scene.header()),
-            blocks: self.drawn.len(),
+            content: joined(self.drawn.into_values(), blur, self.scene.header()),
+            blocks,
             lost: self.lost,
         })
     }
 }
 
-/// Gaussians of blocks, which may have different levels, as one.
-fn joined<'a>(blocks: impl Iterator<Item = &'a Gaussians> + Clone, header: &Header) -> Gaussians {
-    let with_blur = blocks.clone().filter(|gaussians| !gaussians.is_empty());
-    let blur = with_blur
-        .map(|gaussians| gaussians.blur)
-        .reduce(f32::min)
-        .unwrap_or(0.0);
+/// Gaussians of blocks, which may have different levels, as one, to which the variance `blur` is added.
+fn joined(blocks: impl Iterator<Item = Gaussians>, blur: f32, header: &Header) -> Gaussians {
     let mut all = Gaussians {
         blur,
         frame: super::decoder::frame_of(header),
         ..Gaussians::default()
     };
-    for gaussians in blocks {
-        let mut gaussians = gaussians.clone();
+    for mut gaussians in blocks {
         // A variance that is added to all is the same as larger scales.
         let more = gaussians.blur - blur;
         if more > 0.0 {
@@ -196,6 +193,15 @@ fn joined<'a>(blocks: impl Iterator<Item = &'a Gaussians> + Clone, header: &Head
         all.append(gaussians);
     }
     all
+}
+
+/// The least variance that is added to the Gaussians of some blocks.
+fn least_blur<'a>(blocks: impl Iterator<Item = &'a Gaussians>) -> f32 {
+    let with_blur = blocks.filter(|gaussians| !gaussians.is_empty());
+    with_blur
+        .map(|gaussians| gaussians.blur)
+        .reduce(f32::min)
+        .unwrap_or(0.0)
 }
 
 /// How much of what is behind is seen in each pixel.
