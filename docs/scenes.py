@@ -27,7 +27,7 @@ def run(*args):
     timed = ["/usr/bin/time", "-f", "%U %M", *map(str, args)]
     done = subprocess.run(timed, check=True, capture_output=True, text=True)
     user, kilobytes = done.stderr.strip().splitlines()[-1].split()
-    return done.stdout + done.stderr, float(user), int(kilobytes) / 1e3
+    return done.stdout or done.stderr, float(user), int(kilobytes) / 1e3
 
 
 def measure(meshes, objects, bits, folder):

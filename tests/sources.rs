@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 /// The folders of `src/`, each with those that it may import beside the commons: an arrow only leads to a folder
 /// further up.
-const STAGES: [(&str, &[&str]); 14] = [
+const STAGES: [(&str, &[&str]); 15] = [
     ("coding", &[]),
     ("container", &[]),
     ("geometry", &["coding", "container"]),

@@ -19,7 +19,7 @@ use crate::placement::Placement;
 /// Bytes of memory for each byte of a stream that is decoded: the stream, and its slices.
 const CODED_BYTES: u64 = 5;
 /// Bytes of a decoded voxel that is kept: its key, two colours, and how it is drawn.
-const VOXEL_BYTES: u64 = 8 + 3 + 3 + 1;
+pub(super) const VOXEL_BYTES: u64 = 8 + 3 + 3 + 1;
 /// Bytes of a voxel of a block, or around it, while it is drawn: its key, links and colours at two levels, two kernel
 /// maps, and choices.
 const PART_BYTES: u64 = 2 * (8 + 5 + 27 * 4) + 3 + 3 + 3;
@@ -81,30 +81,23 @@ impl SceneDecoder {
     pub fn gaussians<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<DecodedScene<Gaussians>> {
         let selection = self.select(scene, wanted)?;
         let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
-        let mut all = Gaussians {
-            frame: frame_of(scene.header()),
-            ..Gaussians::default()
-        };
-        let mut blocks = 0;
-        let mut take = |_, drawn: Gaussians| {
-            blocks += 1;
-            all.blur = drawn.blur;
-            all.append(drawn);
-        };
+        let mut parts: Vec<Gaussians> = Vec::new();
+        let mut take = |_, drawn| parts.push(drawn);
         let Selection { level, bounds, .. } = &selection;
-        let (bounds, wanted) = (bounds.as_ref(), &selection.blocks);
-        self.draw_blocks(scene, *level, wanted, bounds, &mut decoded, &mut lost, &mut take)?;
-        finish(all, lost, blocks)
+        let wanted = (*level, &selection.blocks[..], bounds.as_ref());
+        self.draw_blocks(scene, wanted, 0, &mut decoded, &mut lost, &mut take)?;
+        drop(decoded);
+        let blocks = parts.len();
+        finish(joined(parts, frame_of(scene.header())), lost, blocks)
     }
 
-    /// Draws blocks at a level, or what of them lies in a box, and gives each to `take`. What is decoded for it is kept
-    /// in `decoded`.
+    /// Draws blocks at a level, or what of them lies in a box, and gives each to `take` with its number. What is decoded for it is kept
+    /// in `decoded`; `held` bytes of memory are taken already, what is in `decoded` included.
     pub(super) fn draw_blocks<S: Source>(
         &self,
         scene: &SceneReader<S>,
-        level: u8,
-        blocks: &[usize],
-        bounds: Option<&Bounds>,
+        (level, blocks, bounds): (u8, &[usize], Option<&Bounds>),
+        held: u64,
         decoded: &mut Decoded,
         lost: &mut Vec<Error>,
         take: &mut dyn FnMut(usize, Gaussians),
@@ -113,8 +106,10 @@ impl SceneDecoder {
         self.decoder.check_drawable(header, level)?;
         let reach = self.decoder.reach(header, level)?;
         let needed = around(scene.blocks(), blocks, level, reach);
-        let kept = self.gaussian_bytes(scene, blocks, level)?;
-        let kept = kept.saturating_add(self.check_memory(scene, &needed, level, kept)?);
+        let missing = needed.iter().copied().filter(|block| !decoded.contains_key(block));
+        let missing: Vec<usize> = missing.collect();
+        let kept = self.gaussian_bytes(scene, blocks, level)?.saturating_add(held);
+        let kept = kept.saturating_add(self.check_memory(scene, &missing, level, kept)?);
         self.decode(scene, &needed, level, decoded, lost)?;
         for &block in blocks {
             self.decoder.cancel().check()?;
@@ -428,6 +423,29 @@ fn around(all: &[BlockEntry], blocks: &[usize], level: u8, reach: u32) -> Vec<us
         own.iter().any(|own| own.meets(&bounds))
     };
     (0..all.len()).into_par_iter().filter(is_near).collect()
+}
+
+/// Gaussians of blocks at one level, as one. Array by array, so that no more than one of them is in memory twice.
+fn joined(mut parts: Vec<Gaussians>, frame: Frame) -> Gaussians {
+    fn taken<T: Copy>(parts: &mut [Gaussians], array: impl Fn(&mut Gaussians) -> &mut Vec<T>) -> Vec<T> {
+        let count = parts.iter_mut().map(|part| array(part).len()).sum();
+        let mut all = Vec::with_capacity(count);
+        for part in parts {
+            all.append(&mut std::mem::take(array(part)));
+        }
+        all
+    }
+    let blur = parts.first().map_or(0.0, |part| part.blur);
+    Gaussians {
+        position: taken(&mut parts, |part| &mut part.position),
+        scale: taken(&mut parts, |part| &mut part.scale),
+        rotation: taken(&mut parts, |part| &mut part.rotation),
+        opacity: taken(&mut parts, |part| &mut part.opacity),
+        colour: taken(&mut parts, |part| &mut part.colour),
+        blur,
+        frame,
+        ..Gaussians::default()
+    }
 }
 
 /// The cube that a scene's Gaussians refer to.

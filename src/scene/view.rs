@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 
-use super::decoder::{Decoded, DecodedScene, SceneDecoder};
+use super::decoder::{Decoded, DecodedScene, SceneDecoder, VOXEL_BYTES, frame_of};
 use super::reader::SceneReader;
 use super::source::Source;
 use crate::container::Header;
@@ -99,7 +99,12 @@ impl SceneDecoder {
             camera,
             decoded: BTreeMap::new(),
             lost: Vec::new(),
-            drawn: BTreeMap::new(),
+            content: Gaussians {
+                frame: frame_of(header),
+                ..Gaussians::default()
+            },
+            groups: Vec::new(),
+            blocks: 0,
             transmittance: options.occlusion_culling.then(|| Transmittance::new(camera)),
         };
         for group in in_view.chunks(GROUP.max(in_view.len().div_ceil(GROUPS))) {
@@ -126,8 +131,11 @@ struct Work<'a, S> {
     /// By level.
     decoded: BTreeMap<u8, Decoded>,
     lost: Vec<Error>,
-    /// By block.
-    drawn: BTreeMap<usize, Gaussians>,
+    /// The Gaussians of all groups so far.
+    content: Gaussians,
+    /// Where those of each group begin, and the variance that is to be added to them.
+    groups: Vec<(usize, f32)>,
+    blocks: usize,
     /// Nothing, if hidden blocks are drawn, too.
     transmittance: Option<Transmittance>,
 }
@@ -138,70 +146,74 @@ impl<S: Source> Work<'_, S> {
         let in_front = self.transmittance.as_ref();
         let is_visible = |seen: &&VisibleBlock| in_front.is_none_or(|in_front| !in_front.hides(seen));
         let visible: Vec<VisibleBlock> = group.iter().filter(is_visible).copied().collect();
-        let mut own: Vec<(usize, Gaussians)> = Vec::new();
         let mut levels: Vec<u8> = visible.iter().map(|seen| seen.level).collect();
         levels.sort_unstable();
         levels.dedup();
+        let mut drawn: Vec<Gaussians> = Vec::new();
         for level in levels {
-            let blocks: Vec<usize> = visible
-                .iter()
-                .filter(|seen| seen.level == level)
-                .map(|seen| seen.block)
-                .collect();
+            let of_level = visible.iter().filter(|seen| seen.level == level);
+            let blocks: Vec<usize> = of_level.map(|seen| seen.block).collect();
+            let held = self.held_bytes(&drawn);
             let decoded = self.decoded.entry(level).or_default();
-            let mut take = |block, gaussians| own.push((block, gaussians));
+            let mut take = |_, gaussians| drawn.push(gaussians);
+            let wanted = (level, &blocks[..], None);
             self.decoder
-                .draw_blocks(self.scene, level, &blocks, None, decoded, &mut self.lost, &mut take)?;
+                .draw_blocks(self.scene, wanted, held, decoded, &mut self.lost, &mut take)?;
+        }
+        self.blocks += drawn.len();
+        let blur = drawn.iter().map(|gaussians| gaussians.blur).reduce(f32::min);
+        let Some(blur) = blur else { return Ok(()) };
+        let mut together = Gaussians {
+            blur,
+            frame: self.content.frame,
+            ..Gaussians::default()
+        };
+        for mut gaussians in drawn {
+            widen(&mut gaussians.scale, gaussians.blur - blur);
+            together.append(gaussians);
         }
         if let Some(transmittance) = &mut self.transmittance {
-            let gaussians = || own.iter().map(|(_, gaussians)| gaussians);
-            let blur = least_blur(gaussians());
-            let together = joined(gaussians().cloned(), blur, self.scene.header());
             transmittance.draw(&together, self.camera, self.decoder.decoder().limits())?;
         }
-        self.drawn.extend(own);
+        self.groups.push((self.content.len(), blur));
+        self.content.append(together);
         Ok(())
     }
 
+    /// Bytes that are held of what was decoded and drawn.
+    fn held_bytes(&self, drawn: &[Gaussians]) -> u64 {
+        let decoded = self.decoded.values().flat_map(|decoded| decoded.values().flatten());
+        let voxels: u64 = decoded.map(|voxels| voxels.keys.len() as u64).sum();
+        let drawn = drawn.iter().chain([&self.content]);
+        let gaussians: u64 = drawn.map(|gaussians| gaussians.len() as u64).sum();
+        voxels * VOXEL_BYTES + gaussians * size_of::<[f32; 14]>() as u64
+    }
+
     fn finish(mut self) -> Result<DecodedScene<Gaussians>> {
-        if self.drawn.is_empty() && !self.lost.is_empty() {
+        if self.blocks == 0 && !self.lost.is_empty() {
             return Err(self.lost.swap_remove(0));
         }
-        let (blur, blocks) = (least_blur(self.drawn.values()), self.drawn.len());
+        let least = self.groups.iter().map(|(_, blur)| *blur).reduce(f32::min);
+        let least = least.unwrap_or(0.0);
+        let ends = self.groups.iter().skip(1).map(|(start, _)| *start);
+        for ((start, blur), end) in self.groups.iter().zip(ends.chain([self.content.len()])) {
+            widen(&mut self.content.scale[*start..end], blur - least);
+        }
+        self.content.blur = least;
         Ok(DecodedScene {
-            content: joined(self.drawn.into_values(), blur, self.scene.header()),
-            blocks,
+            content: self.content,
+            blocks: self.blocks,
             lost: self.lost,
         })
     }
 }
 
-/// Gaussians of blocks, which may have different levels, as one, to which the variance `blur` is added.
-fn joined(blocks: impl Iterator<Item = Gaussians>, blur: f32, header: &Header) -> Gaussians {
-    let mut all = Gaussians {
-        blur,
-        frame: super::decoder::frame_of(header),
-        ..Gaussians::default()
-    };
-    for mut gaussians in blocks {
-        // A variance that is added to all is the same as larger scales.
-        let more = gaussians.blur - blur;
-        if more > 0.0 {
-            let widen = |scale: &mut f32| *scale = (*scale * *scale + more).sqrt();
-            gaussians.scale.iter_mut().flatten().for_each(widen);
-        }
-        all.append(gaussians);
+/// Adds a variance to Gaussians with these scales.
+fn widen(scales: &mut [[f32; 3]], more: f32) {
+    if more > 0.0 {
+        let widen = |scale: &mut f32| *scale = (*scale * *scale + more).sqrt();
+        scales.iter_mut().flatten().for_each(widen);
     }
-    all
-}
-
-/// The least variance that is added to the Gaussians of some blocks.
-fn least_blur<'a>(blocks: impl Iterator<Item = &'a Gaussians>) -> f32 {
-    let with_blur = blocks.filter(|gaussians| !gaussians.is_empty());
-    with_blur
-        .map(|gaussians| gaussians.blur)
-        .reduce(f32::min)
-        .unwrap_or(0.0)
 }
 
 /// How much of what is behind is seen in each pixel.
