@@ -426,7 +426,7 @@ fn around(all: &[BlockEntry], blocks: &[usize], level: u8, reach: u32) -> Vec<us
 }
 
 /// Gaussians of blocks at one level, as one. Array by array, so that no more than one of them is in memory twice.
-fn joined(mut parts: Vec<Gaussians>, frame: Frame) -> Gaussians {
+pub(super) fn joined(mut parts: Vec<Gaussians>, frame: Frame) -> Gaussians {
     fn taken<T: Copy>(parts: &mut [Gaussians], array: impl Fn(&mut Gaussians) -> &mut Vec<T>) -> Vec<T> {
         let count = parts.iter_mut().map(|part| array(part).len()).sum();
         let mut all = Vec::with_capacity(count);

@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 
-use super::decoder::{Decoded, DecodedScene, SceneDecoder, VOXEL_BYTES, frame_of};
+use super::decoder::{Decoded, DecodedScene, SceneDecoder, VOXEL_BYTES, frame_of, joined};
 use super::reader::SceneReader;
 use super::source::Source;
 use crate::container::Header;
 use crate::container::scene::Cube;
 use crate::error::{Error, Result};
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::morton;
 use crate::limits::Limits;
 use crate::renderer::camera::{Camera, Projection};
@@ -99,12 +99,7 @@ impl SceneDecoder {
             camera,
             decoded: BTreeMap::new(),
             lost: Vec::new(),
-            content: Gaussians {
-                frame: frame_of(header),
-                ..Gaussians::default()
-            },
-            groups: Vec::new(),
-            blocks: 0,
+            drawn: BTreeMap::new(),
             transmittance: options.occlusion_culling.then(|| Transmittance::new(camera)),
         };
         for group in in_view.chunks(GROUP.max(in_view.len().div_ceil(GROUPS))) {
@@ -131,11 +126,8 @@ struct Work<'a, S> {
     /// By level.
     decoded: BTreeMap<u8, Decoded>,
     lost: Vec<Error>,
-    /// The Gaussians of all groups so far.
-    content: Gaussians,
-    /// Where those of each group begin, and the variance that is to be added to them.
-    groups: Vec<(usize, f32)>,
-    blocks: usize,
+    /// By block: where Gaussians are equally far away, their order decides.
+    drawn: BTreeMap<usize, Gaussians>,
     /// Nothing, if hidden blocks are drawn, too.
     transmittance: Option<Transmittance>,
 }
@@ -149,63 +141,59 @@ impl<S: Source> Work<'_, S> {
         let mut levels: Vec<u8> = visible.iter().map(|seen| seen.level).collect();
         levels.sort_unstable();
         levels.dedup();
-        let mut drawn: Vec<Gaussians> = Vec::new();
+        let mut own: Vec<(usize, Gaussians)> = Vec::new();
         for level in levels {
             let of_level = visible.iter().filter(|seen| seen.level == level);
             let blocks: Vec<usize> = of_level.map(|seen| seen.block).collect();
-            let held = self.held_bytes(&drawn);
+            let held = self.held_bytes(&own);
             let decoded = self.decoded.entry(level).or_default();
-            let mut take = |_, gaussians| drawn.push(gaussians);
+            let mut take = |block, gaussians| own.push((block, gaussians));
             let wanted = (level, &blocks[..], None);
             self.decoder
                 .draw_blocks(self.scene, wanted, held, decoded, &mut self.lost, &mut take)?;
         }
-        self.blocks += drawn.len();
-        let blur = drawn.iter().map(|gaussians| gaussians.blur).reduce(f32::min);
-        let Some(blur) = blur else { return Ok(()) };
-        let mut together = Gaussians {
-            blur,
-            frame: self.content.frame,
-            ..Gaussians::default()
-        };
-        for mut gaussians in drawn {
-            widen(&mut gaussians.scale, gaussians.blur - blur);
-            together.append(gaussians);
-        }
         if let Some(transmittance) = &mut self.transmittance {
+            let copies = own.iter().map(|(_, gaussians)| gaussians.clone()).collect();
+            let together = with_one_blur(copies, frame_of(self.scene.header()));
             transmittance.draw(&together, self.camera, self.decoder.decoder().limits())?;
         }
-        self.groups.push((self.content.len(), blur));
-        self.content.append(together);
+        self.drawn.extend(own);
         Ok(())
     }
 
-    /// Bytes that are held of what was decoded and drawn.
-    fn held_bytes(&self, drawn: &[Gaussians]) -> u64 {
+    /// Bytes that are held of what was decoded and drawn, of the group at hand twice.
+    fn held_bytes(&self, own: &[(usize, Gaussians)]) -> u64 {
         let decoded = self.decoded.values().flat_map(|decoded| decoded.values().flatten());
         let voxels: u64 = decoded.map(|voxels| voxels.keys.len() as u64).sum();
-        let drawn = drawn.iter().chain([&self.content]);
-        let gaussians: u64 = drawn.map(|gaussians| gaussians.len() as u64).sum();
-        voxels * VOXEL_BYTES + gaussians * size_of::<[f32; 14]>() as u64
+        let drawn: u64 = self.drawn.values().map(|gaussians| gaussians.len() as u64).sum();
+        let own: u64 = own.iter().map(|(_, gaussians)| gaussians.len() as u64).sum();
+        voxels * VOXEL_BYTES + (drawn + 2 * own) * size_of::<[f32; 14]>() as u64
     }
 
     fn finish(mut self) -> Result<DecodedScene<Gaussians>> {
-        if self.blocks == 0 && !self.lost.is_empty() {
+        if self.drawn.is_empty() && !self.lost.is_empty() {
             return Err(self.lost.swap_remove(0));
         }
-        let least = self.groups.iter().map(|(_, blur)| *blur).reduce(f32::min);
-        let least = least.unwrap_or(0.0);
-        let ends = self.groups.iter().skip(1).map(|(start, _)| *start);
-        for ((start, blur), end) in self.groups.iter().zip(ends.chain([self.content.len()])) {
-            widen(&mut self.content.scale[*start..end], blur - least);
-        }
-        self.content.blur = least;
+        drop(self.decoded);
+        let blocks = self.drawn.len();
+        let parts = self.drawn.into_values().collect();
         Ok(DecodedScene {
-            content: self.content,
-            blocks: self.blocks,
+            content: with_one_blur(parts, frame_of(self.scene.header())),
+            blocks,
             lost: self.lost,
         })
     }
+}
+
+/// Gaussians of blocks, which may have different levels, as one. A variance that is added to all is the same as larger
+/// scales.
+fn with_one_blur(mut parts: Vec<Gaussians>, frame: Frame) -> Gaussians {
+    let least = parts.iter().map(|part| part.blur).reduce(f32::min).unwrap_or(0.0);
+    for part in &mut parts {
+        widen(&mut part.scale, part.blur - least);
+        part.blur = least;
+    }
+    joined(parts, frame)
 }
 
 /// Adds a variance to Gaussians with these scales.
