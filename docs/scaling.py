@@ -29,7 +29,7 @@ def measure(bits):
     cloud, stream = folder / f"{bits}.ply", folder / f"{bits}.b2p"
     if not stream.exists():
         run(lab, "voxelize", "procedural:scene", "--bits", bits, "--points", max(200_000, min(200_000_000, 14 * 4**bits)) if bits < 13 else SPARSE, "-o", cloud)
-        run(program, "-q", "--force", "encode", cloud, "-o", stream, "--limits", "unlimited")
+        run(program, "-q", "--force", "encode", cloud, "-o", stream, "--limits", "unlimited", "--no-blocks")
         cloud.unlink()
     out = {"bits": bits, "bytes": stream.stat().st_size}
     for key, more in (("ms", []), ("ms_one", ["--threads", 1])):

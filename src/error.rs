@@ -171,6 +171,14 @@ pub enum Error {
         /// Why.
         source: Box<Error>,
     },
+    /// A block of a scene cannot be decoded.
+    #[error("block {block}: {source}")]
+    Block {
+        /// Its number, from 0.
+        block: usize,
+        /// Why.
+        source: Box<Error>,
+    },
     /// The caller threw the [`Cancel`](crate::Cancel) switch.
     #[error("cancelled")]
     Cancelled,
@@ -226,7 +234,7 @@ impl Error {
             Error::DeterminismMismatch { what: "colours", .. } => Some("5.10.1"),
             Error::DeterminismMismatch { .. } => Some("8.2.2"),
             Error::ModelMismatch { .. } => Some("9.5.2"),
-            Error::Frame { source, .. } => source.clause(),
+            Error::Frame { source, .. } | Error::Block { source, .. } => source.clause(),
             Error::Unsupported { what, .. } => match *what {
                 feature::VERSION | feature::FLAGS => Some("2.2.1"),
                 feature::CHUNK => Some("3.1.2"),

@@ -22,6 +22,7 @@
 //! |---|---|
 //! | decode a stream, whole or as it arrives | [`Decoder`], [`Decoding`] |
 //! | read and decode sequences of frames | [`SequenceReader`], [`SequenceDecoder`], `SequenceEncoder` |
+//! | read and decode scenes of blocks, in part | [`SceneReader`], [`SceneDecoder`], `SceneEncoder` |
 //! | draw with learned heads | [`HeadsModel`], [`HeadSet`] |
 //! | read and write Gaussians | [`Gaussians`] |
 //! | draw | `Renderer`, `Camera`, `Image` |
@@ -103,6 +104,8 @@ pub mod placement;
 #[doc(hidden)]
 pub mod renderer;
 #[doc(hidden)]
+pub mod scene;
+#[doc(hidden)]
 pub mod sequence;
 #[cfg(test)]
 mod testing;
@@ -139,6 +142,9 @@ pub use renderer::{
     Background, Channel, Effect, EffectMode, EffectSet, Effects, Explanation, Ids, Image, Quality, Renderer, Stats,
     Times,
 };
+#[cfg(feature = "encoder")]
+pub use scene::SceneEncoder;
+pub use scene::{DecodedScene, FileSource, SceneDecoder, SceneReader, Source, Wanted};
 #[cfg(feature = "encoder")]
 pub use sequence::SequenceEncoder;
 pub use sequence::{DecodedFrame, SequenceDecoder, SequenceReader};

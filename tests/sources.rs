@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 /// The folders of `src/`, each with those that it may import beside the commons: an arrow only leads to a folder
 /// further up.
-const STAGES: [(&str, &[&str]); 14] = [
+const STAGES: [(&str, &[&str]); 15] = [
     ("coding", &[]),
     ("container", &[]),
     ("geometry", &["coding", "container"]),
@@ -41,6 +41,18 @@ const STAGES: [(&str, &[&str]); 14] = [
             "latents",
             "motion",
             "decoder",
+        ],
+    ),
+    (
+        "scene",
+        &[
+            "container",
+            "geometry",
+            "cloud",
+            "gaussians",
+            "renderer",
+            "decoder",
+            "encoder",
         ],
     ),
     (

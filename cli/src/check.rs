@@ -1,6 +1,6 @@
 //! `b2p check`: whether streams are valid, and where not, which clause of the format they break.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use b2p::container::{Header, ScannedChunk, version};
 use b2p::decoder::{Checked, Fault};
@@ -11,15 +11,20 @@ use serde_json::{Value, json};
 use super::args::Check;
 use super::manners::{self, Said};
 use super::table::{count, counted};
-use super::{Failure, Result, load, sequence};
+use super::{Failure, Result, load, scene, sequence};
 
 /// Checks every stream, then fails if one of them is not valid.
 pub fn run(args: &Check, limits: &Limits) -> Result<Said> {
     let mut model = None;
     let mut reports = Vec::new();
-    let (sequences, streams): (Vec<_>, Vec<_>) = args.inputs.iter().partition(|path| sequence::is_sequence(path));
-    let sequences: Vec<_> = sequences.iter().map(|path| sequence::check(path, limits)).collect();
-    let texts = sequences.into_iter().collect::<Result<Vec<String>>>()?;
+    let (containers, streams): (Vec<_>, Vec<_>) =
+        (args.inputs.iter()).partition(|path| sequence::is_sequence(path) || scene::is_scene(path));
+    let check = |path: &&PathBuf| match scene::is_scene(path) {
+        true => scene::check(path, limits),
+        false => sequence::check(path, limits),
+    };
+    let containers: Vec<_> = containers.iter().map(check).collect();
+    let texts = containers.into_iter().collect::<Result<Vec<String>>>()?;
     if streams.is_empty() {
         return Ok(Said::result(texts.concat()));
     }

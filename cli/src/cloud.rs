@@ -95,7 +95,7 @@ fn unit(text: &str) -> std::result::Result<f64, String> {
     Axes::parse_unit(text).map_err(|e| e.to_string())
 }
 
-fn corners(text: &str) -> std::result::Result<[[f64; 3]; 2], String> {
+pub fn corners(text: &str) -> std::result::Result<[[f64; 3]; 2], String> {
     let expected = "expected six numbers, the lowest corner and the highest, such as -1,-1,0,1,1,2";
     let numbers: Option<Vec<f64>> = text.split(',').map(|t| t.trim().parse().ok()).collect();
     match numbers.as_deref() {
@@ -163,6 +163,22 @@ fn reading(path: &Path, bytes: Vec<u8>, options: &ReadOptions, limits: &Limits) 
             .push(Note::Other(format!("{contents}: as {} states", name.display())));
     }
     Ok(read)
+}
+
+/// Reads a piece of a file's points, whose bytes are a file of their own, with colours of a known range.
+pub fn piece(
+    path: &Path,
+    bytes: Vec<u8>,
+    args: &ReadArgs,
+    range: Option<ColourRange>,
+    limits: &Limits,
+) -> Result<Reading> {
+    let options = ReadOptions {
+        colour_range: range,
+        ..args.options()
+    };
+    let read = clouds::read(bytes, None, limits, &options);
+    read.map_err(Failure::in_file(path))
 }
 
 fn say(path: &Path, notes: &[Note]) {

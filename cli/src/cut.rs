@@ -7,12 +7,15 @@ use serde_json::json;
 use super::args::Cut;
 use super::manners::{self, Said};
 use super::table::{count, counted};
-use super::{Failure, Result, kinds, load, sequence};
+use super::{Failure, Result, kinds, load, scene, sequence};
 
 /// Writes the stream up to the end of a level, once it is known to be complete.
 pub fn run(args: &Cut, limits: &Limits) -> Result<Said> {
     if sequence::is_sequence(&args.input) {
         return sequence::cut(args, limits);
+    }
+    if scene::is_scene(&args.input) {
+        return scene::cut(args, limits);
     }
     let Some(level) = args.level else {
         let what = "it is no sequence: --level M cuts it";

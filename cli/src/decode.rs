@@ -16,7 +16,7 @@ use super::manners::{self, Said};
 use super::many::Kind;
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points, sequence};
+use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points, scene, sequence};
 
 /// What is taken from folders, and what becomes of it.
 pub fn kind(args: &Decode) -> Kind<'_> {
@@ -35,6 +35,13 @@ pub fn kind(args: &Decode) -> Kind<'_> {
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
     if sequence::is_sequence(&args.input) {
         return sequence::decode(args, limits, progress);
+    }
+    if scene::is_scene(&args.input) {
+        return scene::decode(args, limits, progress);
+    }
+    if args.wanted.is_some() {
+        let what = "it is no scene of blocks, of which --box takes a part";
+        return Err(Failure(format!("{}: {what}", args.input.display())));
     }
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.input.as_path()]).collect();

@@ -16,7 +16,7 @@ use super::manners::{self, Said};
 use super::many::Kind;
 use super::progress::Progress;
 use super::table::{count, counted, steps, steps_json, table};
-use super::{Failure, Result, cloud, decodable, load, sequence};
+use super::{Failure, Result, cloud, decodable, load, scene, sequence};
 
 /// What is taken from folders, and what becomes of it.
 pub const KIND: Kind<'_> = Kind {
@@ -38,6 +38,10 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         let what = "is for sequences: a folder of clouds, or a name such as frame_%04d.ply";
         return Err(Failure(format!("{name} {what}")));
     }
+    if let Some(pieces) = scene::pieces(args, limits)? {
+        let options = |bits| transform_options(args, bits);
+        return scene::encode_pieces(args, pieces, options, limits, progress);
+    }
     let model = args.model.model.iter().map(PathBuf::as_path);
     let inputs: Vec<&Path> = model.chain([args.cloud.as_path()]).collect();
     manners::permit(&[&args.output], &inputs)?;
@@ -56,6 +60,10 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
     drop((cloud.positions, cloud.colours));
     let cloud = grid;
     let voxels = cloud.voxels.len();
+    if scene::is_wanted(args, cloud.voxels.len()) {
+        let options = transform_options(args, cloud.voxels.depth())?;
+        return scene::encode(args, (&cloud, &found), axes, options, limits, progress);
+    }
     let axes = match args.bits_per_point {
         Some(most) => cloud::affordable(axes, most * voxels as f64 / 8.0),
         None => axes,
@@ -134,8 +142,8 @@ struct Coded {
     chosen: String,
 }
 
-/// Codes a stream of version 3, which keeps `reserved` bits per point free.
-fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) -> Result<Coded> {
+/// How streams of version 3 are coded, of clouds of so many bits.
+fn transform_options(args: &Encode, bits: u8) -> Result<transform::Options> {
     let model = &args.model;
     let learned = &args.learned;
     let asked = [
@@ -156,7 +164,7 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) ->
         ..transform::Options::default()
     };
     if let Some(quality) = args.quality {
-        options.set_quality(quality, cloud.voxels.depth());
+        options.set_quality(quality, bits);
     }
     if let Some(effort) = args.effort {
         options.set_effort(effort);
@@ -167,6 +175,12 @@ fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) ->
         None if args.lossless => options.fineness = QualityTarget::Lossless,
         None => {}
     }
+    Ok(options)
+}
+
+/// Codes a stream of version 3, which keeps `reserved` bits per point free.
+fn transform(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) -> Result<Coded> {
+    let options = transform_options(args, cloud.voxels.depth())?;
     let in_cloud = Failure::in_file(&args.cloud);
     let (encoded, chosen) = match args.bits_per_point {
         Some(most) => {

@@ -8,13 +8,16 @@ use serde_json::json;
 use super::args::Info;
 use super::manners::{self, Said};
 use super::table::{count, counted, table};
-use super::{Failure, Result, cloud, kinds, load, sequence};
+use super::{Failure, Result, cloud, kinds, load, scene, sequence};
 
 /// Describes a stream as text or JSON. A cut or damaged stream is described with what is wrong; its model is described
 /// if it is the one at hand.
 pub fn run(args: &Info, limits: &Limits) -> Result<Said> {
     if sequence::is_sequence(&args.input) {
         return sequence::info(&args.input, limits);
+    }
+    if scene::is_scene(&args.input) {
+        return scene::info(&args.input, limits);
     }
     let bytes = load::bytes(&args.input, limits)?;
     if let Some(text) = cloud::info(&args.input, &bytes, manners::json(), limits)? {

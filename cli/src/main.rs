@@ -26,6 +26,7 @@ mod plan;
 mod points;
 mod progress;
 mod render;
+mod scene;
 mod sequence;
 mod serve;
 mod sheet;

@@ -20,7 +20,7 @@ use super::progress::Progress;
 use super::sheet::Sheet;
 use super::table::{count, counted, milliseconds, steps};
 use super::views::{Shot, lenses_beside, shots};
-use super::{Failure, Result, cloud, load, pipe, sequence, turntable};
+use super::{Failure, Result, cloud, load, pipe, scene, sequence, turntable};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
@@ -49,6 +49,9 @@ pub fn kind(args: &Render) -> Kind<'_> {
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> {
     if sequence::is_sequence(&args.input) {
         return sequence::render(args, limits, progress);
+    }
+    if scene::is_scene(&args.input) {
+        return scene::render(args, limits, progress);
     }
     let log = progress.log();
     if let Some(path) = &args.turntable {
@@ -132,7 +135,7 @@ fn choose(args: &Render, limits: &Limits, progress: &Progress) -> Result<Option<
 }
 
 /// Whether the pictures may be written.
-fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
+pub fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
     let mut outputs: Vec<&Path> = cameras.iter().map(|shot| shot.path.as_path()).collect();
     outputs.dedup();
     let is_video = args.turntable.is_some() || args.contact_sheet;
@@ -155,19 +158,19 @@ fn permit(args: &Render, cameras: &[Shot]) -> Result<()> {
 }
 
 /// How pictures are drawn.
-struct Drawing<'a> {
-    args: &'a Render,
-    limits: &'a Limits,
-    detail: Option<Explanation>,
+pub struct Drawing<'a> {
+    pub args: &'a Render,
+    pub limits: &'a Limits,
+    pub detail: Option<Explanation>,
     /// What was chosen for a budget, how long it took to decode, and what shows a calibration.
-    chosen: Option<(&'a Chosen, Duration, &'a Progress)>,
+    pub chosen: Option<(&'a Chosen, Duration, &'a Progress)>,
 }
 
 /// A picture's file, its size, and how it was drawn.
 type Drawn = (PathBuf, [u32; 2], Stats);
 
 /// Draws these Gaussians into the pictures asked for.
-fn pictures(drawing: &Drawing, gaussians: &Gaussians, axes: &Axes, log: &Log) -> Result<Said> {
+pub fn pictures(drawing: &Drawing, gaussians: &Gaussians, axes: &Axes, log: &Log) -> Result<Said> {
     let &Drawing { args, limits, .. } = drawing;
     let extent = Extent::of_gaussians(gaussians);
     let cameras = &shots(args, &gaussians.frame, &extent, axes, limits)?[..];
@@ -368,7 +371,7 @@ pub fn describe(path: &Path, stats: &Stats) -> String {
 
 /// What a picture took, for programs. `overlap`: tiles that a Gaussian touches, in the mean. `coverage`: the share of
 /// the pixels that something was drawn on.
-fn numbers(path: &Path, [width, height]: [u32; 2], stats: &Stats) -> serde_json::Value {
+pub fn numbers(path: &Path, [width, height]: [u32; 2], stats: &Stats) -> serde_json::Value {
     let ms = |time: std::time::Duration| time.as_secs_f64() * 1e3;
     let (times, dropped, effects) = (stats.times, stats.dropped, stats.effects);
     json!({

@@ -6,6 +6,7 @@ mod codecs;
 mod files;
 mod mutate;
 mod pictures;
+mod scenes;
 #[path = "../../tests/common/seal.rs"]
 mod seal;
 pub mod seeds;
@@ -22,6 +23,7 @@ pub use codecs::{entropy, octree};
 pub use files::{clouds, model, ply, splats};
 pub use mutate::{Change, mutate};
 pub use pictures::{backends, render};
+pub use scenes::scene;
 pub use sequences::sequence;
 pub use streams::{chunking, deepest, header, stream};
 pub use transform::transform;
@@ -30,11 +32,12 @@ pub use transform::transform;
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All targets.
-pub const TARGETS: [Target; 13] = [
+pub const TARGETS: [Target; 14] = [
     ("header", header),
     ("stream", stream),
     ("transform", transform),
     ("sequence", sequence),
+    ("scene", scene),
     ("chunking", chunking),
     ("octree", octree),
     ("entropy", entropy),

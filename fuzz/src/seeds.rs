@@ -10,7 +10,7 @@ use b2p::geometry::Voxels;
 use b2p::latents::LatentDecoder;
 use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, ResidualSteps, Steps};
 use b2p::log::Log;
-use b2p::{Limits, Placement, SequenceEncoder};
+use b2p::{Limits, Placement, SceneEncoder, SequenceEncoder};
 use b2p_formats::splats::{Axes, Format, write};
 
 use crate::MODEL;
@@ -74,6 +74,31 @@ fn transformed() -> Vec<Vec<u8>> {
 }
 
 /// Sequences of a few voxels that move: in one group and in two, lossless, and of frames that are all alike.
+/// Scenes of a few voxels in several blocks.
+fn scenes() -> Vec<Vec<u8>> {
+    let coded = |depth: u8, levels: std::ops::RangeInclusive<u8>, most: usize, lossless: bool| {
+        let voxels = Voxels::new(depth, (0..1u64 << (3 * depth)).step_by(7).take(160).collect());
+        let colour = |key: &u64| [*key as u8, (key >> 3) as u8, (key >> 6) as u8];
+        let cloud = ColouredVoxels {
+            colours: voxels.keys().iter().map(colour).collect(),
+            voxels,
+            placement: Placement::VOXEL_GRID,
+        };
+        let encoder = SceneEncoder::new().with_levels(levels).with_block_voxels(most);
+        let encoder = match lossless {
+            true => encoder.with_quality(transform::QualityTarget::Lossless),
+            false => encoder,
+        };
+        encoder.encode(&cloud).expect("a few voxels are coded")
+    };
+    vec![
+        coded(3, 1..=3, 20, false),
+        coded(4, 2..=3, 50, false),
+        coded(4, 0..=4, 50, false),
+        coded(3, 2..=3, 9, true),
+    ]
+}
+
 fn sequences() -> Vec<Vec<u8>> {
     let coded = |depth: u8, moves: u64, group: u32, lossless: bool| {
         let side = 1u64 << depth;
@@ -187,6 +212,7 @@ pub fn seeds(target: &str) -> Vec<Vec<u8>> {
         }
         "transform" => transformed(),
         "sequence" => sequences(),
+        "scene" => scenes(),
         "ply" => {
             let cloud = PointCloud {
                 positions: vec![[0.0, 1.0, 2.0], [3.0, 4.5, -1.0]],

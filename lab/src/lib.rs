@@ -13,6 +13,7 @@ pub mod procedural;
 pub mod random;
 pub mod raster;
 pub mod sample;
+pub mod scatter;
 pub mod surface;
 pub mod tradeoff;
 pub mod triplanar;

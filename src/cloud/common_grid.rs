@@ -110,6 +110,25 @@ impl CommonGrid {
     /// # Errors
     /// [`Error::Usage`] if colours and points differ in number; those of [`GridNeed::of`].
     pub fn voxelise(&self, cloud: &PointCloud) -> Result<ColouredVoxels> {
+        let points = self.points(cloud)?;
+        let (mut keys, mut colours) = (Vec::new(), Vec::new());
+        for same in points.chunk_by(|a, b| a.0 == b.0) {
+            keys.push(same[0].0);
+            colours.push(mean(same));
+        }
+        Ok(ColouredVoxels {
+            voxels: Voxels::from_sorted(self.bits, keys),
+            colours,
+            placement: self.placement,
+        })
+    }
+
+    /// The key of the voxel that each point of a cloud lies in, and its colour, ascending. Points outside of the grid go
+    /// to its border.
+    ///
+    /// # Errors
+    /// Those of [`CommonGrid::voxelise`].
+    pub fn points(&self, cloud: &PointCloud) -> Result<Vec<(u64, [u8; 3])>> {
         finite_bounds(&cloud.positions)?;
         if cloud.positions.len() != cloud.colours.len() {
             let (points, colours) = (cloud.positions.len(), cloud.colours.len());
@@ -121,16 +140,12 @@ impl CommonGrid {
             .map(|(p, colour)| (fitted_key(p, &self.from) >> down, *colour))
             .collect();
         points.par_sort_unstable_by_key(|point| point.0);
-        let (mut keys, mut colours) = (Vec::new(), Vec::new());
-        for same in points.chunk_by(|a, b| a.0 == b.0) {
-            keys.push(same[0].0);
-            colours.push(mean(same));
-        }
-        Ok(ColouredVoxels {
-            voxels: Voxels::from_sorted(self.bits, keys),
-            colours,
-            placement: self.placement,
-        })
+        Ok(points)
+    }
+
+    /// Where the grid lies.
+    pub fn placement(&self) -> Placement {
+        self.placement
     }
 }
 

@@ -17,6 +17,8 @@ pub const MAX_COLOUR_SLICE: u32 = 65_536;
 const MINOR: u16 = 0;
 /// The critical flag of a sequence of frames, whose header counts the most of any frame (clause 17.1).
 const SEQUENCE: u32 = 1;
+/// The critical flag of a scene of blocks, whose header counts all of them (clause 18.1).
+const SCENE: u32 = 2;
 
 /// Version of the format, with the fields that only it has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -134,11 +136,30 @@ impl Header {
         Self::parse_flagged(bytes, limits, SEQUENCE)
     }
 
+    /// Parses the header of a scene of blocks. `limits` on points hold for each block, not for their sum.
+    ///
+    /// # Errors
+    /// Those of [`Header::parse`], and [`Error::Unsupported`] for a stream of one frame.
+    #[doc(hidden)]
+    pub fn parse_scene(bytes: &[u8], limits: &Limits) -> Result<Self> {
+        Self::parse_flagged(bytes, &limits.clone().with_max_points(u64::MAX), SCENE)
+    }
+
     /// Whether bytes start like a sequence of frames. What follows may be damaged.
     #[doc(hidden)]
     pub fn is_of_sequence(bytes: &[u8]) -> bool {
+        Self::has_flags(bytes, SEQUENCE)
+    }
+
+    /// Whether bytes start like a scene of blocks. What follows may be damaged.
+    #[doc(hidden)]
+    pub fn is_of_scene(bytes: &[u8]) -> bool {
+        Self::has_flags(bytes, SCENE)
+    }
+
+    fn has_flags(bytes: &[u8], expected: u32) -> bool {
         let flags = bytes.get(12..16).and_then(|flags| flags.try_into().ok());
-        version(bytes) == Some(3) && flags.map(u32::from_le_bytes) == Some(SEQUENCE)
+        version(bytes) == Some(3) && flags.map(u32::from_le_bytes) == Some(expected)
     }
 
     /// Parses a header whose critical flags must be `expected`.
@@ -207,6 +228,12 @@ impl Header {
     #[doc(hidden)]
     pub fn write_sequence(&self) -> Vec<u8> {
         self.write_flagged(SEQUENCE)
+    }
+
+    /// Serialises the header of a scene of blocks.
+    #[doc(hidden)]
+    pub fn write_scene(&self) -> Vec<u8> {
+        self.write_flagged(SCENE)
     }
 
     fn write_flagged(&self, critical_flags: u32) -> Vec<u8> {
@@ -432,21 +459,22 @@ impl Header {
 
 /// Checks the critical flags of a stream of which `expected` are.
 fn check_flags(found: u32, expected: u32) -> Result<()> {
-    let (what, detail) = match (found, expected) {
-        _ if found == expected => return Ok(()),
-        (SEQUENCE, _) => (
-            feature::FLAGS,
-            "it is a sequence of frames, where one frame is expected".into(),
-        ),
-        (0, _) => (
-            "this stream",
-            "it has one frame, where a sequence of frames is expected".into(),
-        ),
-        _ => (
-            feature::FLAGS,
-            format!("the critical flags are {found:#010x}, of which this version knows {SEQUENCE:#010x} alone"),
-        ),
+    let kind = |flags| match flags {
+        SEQUENCE => "a sequence of frames",
+        SCENE => "a scene of blocks",
+        _ => "a single frame",
     };
+    if found == expected {
+        return Ok(());
+    }
+    let detail = match found {
+        0 | SEQUENCE | SCENE => format!("it is {}, where {} is expected", kind(found), kind(expected)),
+        _ => {
+            let known = SEQUENCE | SCENE;
+            format!("the critical flags are {found:#010x}, of which this version knows one of {known:#010x} alone")
+        }
+    };
+    let what = if found == 0 { "this stream" } else { feature::FLAGS };
     Err(Error::Unsupported { what, detail })
 }
 

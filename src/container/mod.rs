@@ -17,6 +17,7 @@ pub(crate) mod feed;
 mod header;
 mod reader;
 mod scan;
+pub mod scene;
 pub mod sequence;
 mod stream;
 mod transform;

@@ -334,7 +334,7 @@ fn check_frame(frame: &FrameEntry, at: usize, common: &Header, limits: &Limits) 
 }
 
 /// The chunk of this kind that starts at byte `at`.
-fn only_chunk(bytes: &[u8], at: usize, kind: ChunkKind) -> Result<Chunk<'_>> {
+pub(super) fn only_chunk(bytes: &[u8], at: usize, kind: ChunkKind) -> Result<Chunk<'_>> {
     if at >= bytes.len() {
         return Err(Error::Truncated {
             stage: Stage::Bitstream,
@@ -346,8 +346,8 @@ fn only_chunk(bytes: &[u8], at: usize, kind: ChunkKind) -> Result<Chunk<'_>> {
     Chunks::new(Form::Sequence, bytes, at..bytes.len()).expect(kind, 0, 0, 0..=u32::MAX.into())
 }
 
-fn put_chunk(kind: ChunkKind, count: usize, payload: &[u8], out: &mut Vec<u8>) -> Result<()> {
-    let count = u32::try_from(count).map_err(|_| Error::Usage(format!("{count} are too many frames or groups")))?;
+pub(super) fn put_chunk(kind: ChunkKind, count: usize, payload: &[u8], out: &mut Vec<u8>) -> Result<()> {
+    let count = u32::try_from(count).map_err(|_| Error::Usage(format!("{count} are too many units")))?;
     let chunk = Chunk {
         kind,
         level: 0,
@@ -361,7 +361,7 @@ fn put_chunk(kind: ChunkKind, count: usize, payload: &[u8], out: &mut Vec<u8>) -
 }
 
 /// Reads the payload of a chunk, whose checksum holds: what is missing in it is malformed, not cut.
-struct InPayload<'a> {
+pub(super) struct InPayload<'a> {
     reader: Reader<'a>,
     payload_at: usize,
     length: usize,
@@ -369,7 +369,7 @@ struct InPayload<'a> {
 }
 
 impl<'a> InPayload<'a> {
-    fn new(chunk: &Chunk<'a>, clause: &'static str) -> Self {
+    pub(super) fn new(chunk: &Chunk<'a>, clause: &'static str) -> Self {
         InPayload {
             reader: Reader::new(chunk.payload, 0),
             payload_at: chunk.payload_at,
@@ -378,11 +378,11 @@ impl<'a> InPayload<'a> {
         }
     }
 
-    fn at(&self) -> usize {
+    pub(super) fn at(&self) -> usize {
         self.payload_at + self.reader.at()
     }
 
-    fn read<T>(&mut self, read: impl FnOnce(&mut Reader<'a>) -> Result<T>) -> Result<T> {
+    pub(super) fn read<T>(&mut self, read: impl FnOnce(&mut Reader<'a>) -> Result<T>) -> Result<T> {
         let (at, clause, length) = (self.at(), self.clause, self.length);
         read(&mut self.reader).map_err(|error| match error {
             Error::Truncated { field, .. } => malformed(clause, at, field, format!("end after {length} bytes"), "more"),
@@ -393,7 +393,7 @@ impl<'a> InPayload<'a> {
         })
     }
 
-    fn varint(&mut self, field: &'static str) -> Result<u32> {
+    pub(super) fn varint(&mut self, field: &'static str) -> Result<u32> {
         self.read(|reader| reader.varint(field))
     }
 
@@ -456,7 +456,7 @@ impl<'a> InPayload<'a> {
         })
     }
 
-    fn finish(&self) -> Result<()> {
+    pub(super) fn finish(&self) -> Result<()> {
         match self.length - self.reader.at() {
             0 => Ok(()),
             rest => Err(malformed(self.clause, self.at(), "bytes after the last entry", rest, 0)),

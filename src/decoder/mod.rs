@@ -6,12 +6,14 @@
 //! stream. What only version 2 needs, down to latents and features, is in `latents`.
 
 mod check;
+mod drawing;
 mod memory;
 mod stream;
 mod streaming;
 mod transform;
 
 pub use check::{Checked, Fault};
+pub(crate) use drawing::{LevelVoxels, Part};
 pub use stream::{Decoder, Points};
 pub use streaming::Decoding;
 #[cfg(feature = "encoder")]

@@ -5,7 +5,6 @@ use std::borrow::Cow;
 use b2p_kernels::Isa;
 
 use super::Decoding;
-use super::transform::Reached;
 use crate::cancel::Cancel;
 #[cfg(feature = "ply")]
 use crate::cloud::{ColouredVoxels, PointCloud};
@@ -13,9 +12,9 @@ use crate::container::feed::Goal;
 use crate::container::{Format, Header, Stream};
 use crate::error::{Error, Result};
 use crate::gaussians::learned::{HeadsModel, Set, span_rows};
-use crate::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
+use crate::gaussians::surfels::PerVoxel;
 use crate::gaussians::{Frame, Gaussians};
-use crate::gaussians::{HeadMap, HeadSet, Heads};
+use crate::gaussians::{HeadSet, Heads};
 use crate::geometry::Voxels;
 use crate::latents::LatentDecoder;
 use crate::latents::network::Model;
@@ -35,7 +34,7 @@ pub struct Decoder {
     pub(super) heads_model: Option<HeadsModel>,
     /// Gaussians a voxel, if asked for.
     per_voxel: Option<usize>,
-    precision: Precision,
+    pub(super) precision: Precision,
     isa: Option<Isa>,
     pub(super) limits: Limits,
     cancel: Cancel,
@@ -170,6 +169,16 @@ impl Decoder {
         self.whole(bytes)?.gaussians()
     }
 
+    /// Decodes a stream down to a level, which need not have Gaussians.
+    ///
+    /// # Errors
+    /// Those of [`Decoding::finish`].
+    pub(crate) fn exact<'b>(&self, bytes: impl Into<Cow<'b, [u8]>>, level: u8) -> Result<Decoding<'b>> {
+        let mut decoding = Decoding::new(self.clone(), Goal::Exact(level), bytes.into());
+        decoding.finish()?;
+        Ok(decoding)
+    }
+
     /// Decodes a whole stream, but makes no Gaussians yet. [`Decoding::points`] are the voxels with their colours.
     ///
     /// # Errors
@@ -274,7 +283,7 @@ impl Decoder {
     }
 
     /// The network that draws a level of a stream of version 3; none if it is drawn as surfels.
-    fn network(&self, header: &Header, level: u8) -> Result<Option<(&HeadsModel, Set)>> {
+    pub(super) fn network(&self, header: &Header, level: u8) -> Result<Option<(&HeadsModel, Set)>> {
         let Some(heads) = self.heads().learned() else {
             return Ok(None);
         };
@@ -296,7 +305,7 @@ impl Decoder {
         Ok(Some((model, (heads, count))))
     }
 
-    fn surfels_per_voxel(&self, header: &Header, level: u8) -> Result<PerVoxel> {
+    pub(super) fn surfels_per_voxel(&self, header: &Header, level: u8) -> Result<PerVoxel> {
         let wide = level + 1 < header.bits;
         let usual = if wide { 4 } else { 1 };
         let asked = match (self.per_voxel, self.heads().learned()) {
@@ -321,6 +330,11 @@ impl Decoder {
             true => header.voxels(level - 1)?.into(),
             false => voxels,
         };
+        self.drawing_bytes_of(header, level, [voxels, above])
+    }
+
+    /// The same of so many voxels of a level, and of the level above.
+    pub(crate) fn drawing_bytes_of(&self, header: &Header, level: u8, [voxels, above]: [u64; 2]) -> Result<u64> {
         let surfels = super::memory::surfels(voxels, self.surfels_per_voxel(header, level)?.count() as u64);
         Ok(match self.network(header, level)? {
             // Some voxels may become surfels after all, once the network is done.
@@ -332,9 +346,22 @@ impl Decoder {
         })
     }
 
+    /// Bytes of memory that the Gaussians of so many voxels of a level take at most.
+    pub(crate) fn gaussian_bytes(&self, header: &Header, level: u8, voxels: u64) -> Result<u64> {
+        let surfels = self.surfels_per_voxel(header, level)?.count();
+        let learned = self.network(header, level)?.map_or(0, |(_, (_, count))| count);
+        let each = size_of::<[f32; 14]>() as u64;
+        Ok(voxels.saturating_mul(surfels.max(learned) as u64 * each))
+    }
+
     /// Rows of a level that learned heads are evaluated on at a time, at most: less memory takes more time.
-    fn span_rows(&self) -> usize {
+    pub(super) fn span_rows(&self) -> usize {
         span_rows(self.limits.max_bytes)
+    }
+
+    /// The level that was asked for.
+    pub(crate) fn level(&self) -> Option<u8> {
+        self.level
     }
 
     /// The level that decoding a stream with this header ends with.
@@ -346,7 +373,7 @@ impl Decoder {
         self.log.clone().unwrap_or(Log::off())
     }
 
-    pub(super) fn isa(&self) -> Isa {
+    pub(crate) fn isa(&self) -> Isa {
         self.isa.unwrap_or_else(Isa::detect)
     }
 
@@ -354,7 +381,7 @@ impl Decoder {
         &self.limits
     }
 
-    pub(super) fn cancel(&self) -> &Cancel {
+    pub(crate) fn cancel(&self) -> &Cancel {
         &self.cancel
     }
 
@@ -365,7 +392,7 @@ impl Decoder {
     }
 
     /// Fails with [`Error::Unsupported`] unless `level` of a stream of version 3 can be drawn.
-    pub(super) fn check_drawable(&self, header: &Header, level: u8) -> Result<()> {
+    pub(crate) fn check_drawable(&self, header: &Header, level: u8) -> Result<()> {
         header.voxels(level)?;
         if self.network(header, level)?.is_none() {
             self.surfels_per_voxel(header, level)?;
@@ -398,43 +425,6 @@ impl Decoder {
         let bytes = self.memory(header, level)?;
         let what = "memory to decode this stream";
         self.limits.check_bytes(what, bytes)
-    }
-
-    /// The Gaussians of a level of a stream of version 3.
-    pub(super) fn generate(&self, header: &Header, reached: &Reached) -> Result<Gaussians> {
-        let frame = Frame {
-            bits: header.bits,
-            placement: header.placement,
-        };
-        let (octree, level) = (&reached.octree, reached.level);
-        let (map, colours) = (&reached.map, reached.colours(self.isa()));
-        let map_of_heads = reached.head_map.as_ref();
-        let [mixed, alone] = map_of_heads.map_or([1.0; 2], HeadMap::sizes);
-        let discs = |only: Option<&[bool]>| {
-            let size = if only.is_some() { mixed } else { alone };
-            let choice = SurfelSelection { only, size };
-            let per_voxel = self.surfels_per_voxel(header, level)?;
-            let voxels = octree.level(level);
-            Ok(surfels(self.isa(), voxels, map, colours, per_voxel, choice, frame))
-        };
-        let network = self.network(header, level)?;
-        let (Some((model, set)), Some(above)) = (network, &reached.above) else {
-            return discs(None);
-        };
-        if reached.is_all_surfels() {
-            return discs(None);
-        }
-        let chosen = map_of_heads.and_then(|heads| heads.surfels(octree, level));
-        let colours_above = reached.colours_above(above);
-        let input = reached.heads_input(self.isa(), above, &colours_above, chosen.as_deref());
-        let (isa, precision) = (self.isa(), self.precision);
-        let mut check = |_: &mut Gaussians| self.cancel.check();
-        let mut gaussians =
-            model.generate_in_parts(isa, precision, set, input, frame, (self.span_rows(), true), &mut check)?;
-        if let Some(chosen) = &chosen {
-            gaussians.append(discs(Some(chosen))?);
-        }
-        Ok(gaussians)
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 
+use super::drawing::LevelVoxels;
 use super::stream::{Decoder, Points, learned_heads};
 use super::transform::Transform;
 use crate::container::feed::{Goal, failed_before};
@@ -182,6 +183,14 @@ impl<'b> Decoding<'b> {
                 placement: header.placement,
             },
         })
+    }
+
+    /// The voxels of the level reached and how they are to be drawn, if the stream has version 3.
+    pub(crate) fn level_voxels(&self) -> Option<LevelVoxels> {
+        match &self.state {
+            State::Transform(decoding) => Some(LevelVoxels::of(&self.decoder, decoding.reached()?)),
+            _ => None,
+        }
     }
 
     /// Calls `with` with what learned heads read of the level reached, and gives its result; `None` if they draw

@@ -102,13 +102,18 @@ impl Reached {
             colours_above,
             luma_step: self.coloured.steps().luma_step(),
             without,
+            range: None,
         }
     }
 
     /// Whether surfels draw all of the level, whatever heads are asked for.
     pub fn is_all_surfels(&self) -> bool {
-        let head_map = self.head_map.as_ref();
-        head_map.is_some_and(HeadMap::is_all_surfels) || is_for_surfels(&self.map)
+        self.advises_surfels() || is_for_surfels(&self.map, 0..self.map.len())
+    }
+
+    /// Whether the encoder advises surfels for all of the level.
+    pub fn advises_surfels(&self) -> bool {
+        self.head_map.as_ref().is_some_and(HeadMap::is_all_surfels)
     }
 
     /// Calls `with` with what learned heads read, of the voxels that they draw; none at level 0, or if surfels draw
@@ -486,7 +491,7 @@ pub fn colour_hash(coloured: &LevelColours) -> u64 {
 }
 
 /// The mean colours of the children of every voxel above `level`, rounded to the nearest, halves up.
-fn means(octree: &Octree, level: u8, colours: &[[u8; 3]]) -> Vec<[u8; 3]> {
+pub(super) fn means(octree: &Octree, level: u8, colours: &[[u8; 3]]) -> Vec<[u8; 3]> {
     let parents = octree.occupancy(level - 1).iter();
     let parents = parents.zip(octree.first_child(level - 1));
     let mean = |(mask, &first): (&u8, &u32)| {

@@ -8,7 +8,7 @@ use clap::Args;
 
 use super::{DetailArg, FrameArgs, ModelArg};
 use crate::budget::{BudgetArgs, Request};
-use crate::cloud::{UpArg, WriteArgs, up};
+use crate::cloud::{UpArg, WriteArgs, corners, up};
 use crate::many::Files;
 use crate::progress::Progress;
 
@@ -37,6 +37,10 @@ pub struct Decode {
     /// Keep the axes of the cloud: do not turn Gaussians
     #[arg(long, conflicts_with_all = ["points", "up"])]
     pub keep_axes: bool,
+    /// Decode a box of a scene: its lowest and its highest corner, in the units of the cloud. Only blocks that it meets
+    /// are read
+    #[arg(long = "box", help_heading = "Scenes", value_name = "X0,Y0,Z0,X1,Y1,Z1", value_parser = corners, allow_hyphen_values = true)]
+    pub wanted: Option<[[f64; 3]; 2]>,
     #[command(flatten)]
     pub sequence: FrameArgs,
     #[command(flatten)]

@@ -28,6 +28,12 @@ pub struct Encode {
     pub output: PathBuf,
     #[command(flatten)]
     pub sequence: SequenceArgs,
+    /// Voxels of a block at most. A cloud with more becomes a scene of blocks, which are coded, read and drawn one by one
+    #[arg(long, help_heading = "Scenes", value_name = "N", default_value_t = b2p::scene::BLOCK_VOXELS as u32, value_parser = clap::value_parser!(u32).range(1..))]
+    pub block_size: u32,
+    /// Code any cloud in one piece
+    #[arg(long, help_heading = "Scenes", conflicts_with = "block_size")]
+    pub no_blocks: bool,
     /// Quality, from 0 to 100: chooses quantisation step and finest level. 100 is lossless, 38 the default
     #[arg(short = 'Q', long, value_name = "0..100", value_parser = clap::value_parser!(u8).range(0..=100), conflicts_with_all = ["step", "lossless", "bits_per_point"])]
     pub quality: Option<u8>,

@@ -30,6 +30,10 @@ pub struct Render {
     pub turntable: Option<PathBuf>,
     #[command(flatten)]
     pub sequence: FrameArgs,
+    /// Draw blocks of a scene that are far away from coarser levels, whose voxels are at most so many pixels wide there.
+    /// 0: everything from the finest level
+    #[arg(long, help_heading = "Scenes", value_name = "PIXELS", default_value_t = 0.0)]
+    pub lod: f64,
     /// Draw all views into one picture, a grid with their angles below them [default: 8 views]
     #[arg(long, conflicts_with_all = ["camera", "turntable"])]
     pub contact_sheet: bool,

@@ -14,6 +14,7 @@ mod outputs;
 mod pictures;
 mod planning;
 mod rate_control;
+mod scenes;
 #[path = "../../../tests/common/seal.rs"]
 mod seal;
 mod sequences;

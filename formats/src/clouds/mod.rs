@@ -16,10 +16,12 @@ mod gltf;
 mod las;
 mod obj;
 mod pcd;
+mod pieces;
 mod splats;
 pub(crate) mod text;
 mod write;
 
+pub use pieces::Pieces;
 pub use write::{Encoded, PointFormat, WriteOptions, encode, encode_cloud};
 
 use std::cell::Cell;

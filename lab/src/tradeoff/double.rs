@@ -270,6 +270,7 @@ mod tests {
             colours_above: &colours_above,
             luma_step: 8.0,
             without: Some(&without),
+            range: None,
         };
         let model = HeadsModel::from_bytes(embedded::HEADS).unwrap();
         for set in [(Heads::Best, 1), (Heads::Best, 8), (Heads::Quick, 1), (Heads::Quick, 8)] {

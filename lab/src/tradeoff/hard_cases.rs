@@ -150,6 +150,7 @@ fn heads_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
                 colours_above: &colours_above,
                 luma_step,
                 without: None,
+                range: None,
             };
             let truth = picture(&double::generate(subject.model, set, &input, Frame::default())?)?;
             let mut errors = Vec::new();

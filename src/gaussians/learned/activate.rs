@@ -48,7 +48,7 @@ impl<'a> Drawing<'a> {
     pub fn new(input: &LevelInput<'a>, count: usize, blur: f32, frame: Frame, kept: bool) -> Self {
         let voxels = input.octree.level(input.level);
         let half = 1.0 / (1u32 << (voxels.depth() + u8::from(count == 8))) as f32;
-        let all = if kept { voxels.len() * count } else { 0 };
+        let all = if kept { input.range().len() * count } else { 0 };
         Drawing {
             voxels,
             colours: input.colours,

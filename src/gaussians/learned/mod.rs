@@ -39,6 +39,7 @@ mod spans;
 #[cfg(test)]
 mod tests;
 
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -90,6 +91,8 @@ pub struct LevelInput<'a> {
     pub luma_step: f32,
     /// For every voxel whether it gets no Gaussians; `None` for none.
     pub without: Option<&'a [bool]>,
+    /// The voxels that are drawn; the others are what these depend on. `None` for all.
+    pub range: Option<&'a Range<usize>>,
 }
 
 impl std::fmt::Debug for HeadsModel {
@@ -215,6 +218,12 @@ impl HeadsModel {
         Ok(generator)
     }
 
+    /// How many voxels of the level above lie between a voxel's parent and the farthest parent that its Gaussians depend
+    /// on. 0 for a set that the model has not.
+    pub(crate) fn reach(&self, set: Set) -> u32 {
+        self.find(set).map_or(0, |generator| network::reach(generator.shape()))
+    }
+
     fn find(&self, set: Set) -> Option<&Generator> {
         let mut generators = self.generators.iter();
         generators.find(|(of, _)| *of == set).map(|(_, generator)| generator)
@@ -222,6 +231,12 @@ impl HeadsModel {
 }
 
 impl LevelInput<'_> {
+    /// The voxels that are drawn.
+    fn range(&self) -> Range<usize> {
+        let all = 0..self.octree.level(self.level).len();
+        self.range.cloned().unwrap_or(all)
+    }
+
     fn check(&self) {
         let (voxels, above) = (
             self.octree.level(self.level).len(),

@@ -1,5 +1,6 @@
 //! Evaluation of the network in integers or in floats.
 
+use std::convert::Infallible;
 use std::sync::OnceLock;
 
 use b2p_kernels::{ExactConv, FloatConv, Isa, Precision as Sums, Taps, zeros};
@@ -138,7 +139,7 @@ impl Run<'_> {
         let rings = 2 * net.child.len() + 2;
         let voxels = input.octree.level(input.level);
         let mut pool = Pool::new();
-        for_each_span(voxels, input.map, rings, self.most, |span| {
+        for_each_span(voxels, input.map, input.range(), rings, self.most, |span| {
             let links = Links::new(input, &span.voxels);
             let child = rows(inputs::children(input, &span.voxels, &links.parents, of_child));
             let x = self.children(&mut pool, net, &span, &links, &child, &h);
@@ -164,7 +165,8 @@ impl Run<'_> {
         let voxels = input.octree.level(input.level - 1);
         let mut all = Vec::new();
         let mut pool = Pool::new();
-        let done: Result<(), std::convert::Infallible> = for_each_span(voxels, input.above, rings, self.most, |span| {
+        let all_voxels = 0..voxels.len();
+        let done: Result<(), Infallible> = for_each_span(voxels, input.above, all_voxels, rings, self.most, |span| {
             let parent = rows(inputs::parents(input, &span.voxels));
             let taps = span.taps();
             let mut h = apply(
@@ -286,6 +288,13 @@ pub const TERMS: [Term; 7] = [ABOVE, VOXEL, SPLIT, PLACES, FEATURES, OUTPUTS, GA
 pub fn enough_rows(shape: &Shape, rows: usize) -> usize {
     let rings = 2 * shape.parent_blocks.max(shape.child_blocks) + 2;
     rows.max((2 * rings + 1).pow(3))
+}
+
+/// How many voxels of the level above lie between a voxel's parent and the farthest parent that its Gaussians depend
+/// on.
+pub fn reach(shape: &Shape) -> u32 {
+    let child_rings = 2 * shape.child_blocks as u32 + 2;
+    child_rings.div_ceil(2) + 2 * shape.parent_blocks as u32 + 1
 }
 
 /// Maximum memory in bytes of the Gaussians of so many voxels.

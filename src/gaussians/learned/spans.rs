@@ -55,24 +55,25 @@ impl Span<'_> {
     }
 }
 
-/// Calls `each` with the spans of a level in order, each with a halo of `rings` rings. No span has more than `most`
-/// rows, unless it is a single voxel; a level with so few voxels is one span without a halo.
+/// Calls `each` with the spans of consecutive voxels of a level in order, each with a halo of `rings` rings. No span has
+/// more than `most` rows, unless it is a single voxel; a level with so few voxels is one span without a halo.
 ///
 /// # Errors
 /// The first of `each`.
 ///
 /// # Panics
-/// If `map` is not the level's 3³ kernel map.
+/// If `map` is not the level's 3³ kernel map, or the level has no such voxels.
 pub fn for_each_span<E>(
     voxels: &Voxels,
     map: &KernelMap,
+    wanted: Range<usize>,
     rings: usize,
     most: usize,
     mut each: impl FnMut(Span<'_>) -> Result<(), E>,
 ) -> Result<(), E> {
     let count = voxels.len();
     assert_eq!(map.len(), count, "the map must be that of the level");
-    if count <= most {
+    if count <= most && wanted == (0..count) {
         return each(Span {
             range: 0..count,
             voxels: (0..count as u32).collect(),
@@ -86,7 +87,7 @@ pub fn for_each_span<E>(
         places: vec![KernelMap::ABSENT; count],
     };
     // The next span is on top.
-    let mut left = ranges(voxels.keys(), most * 2 / 3);
+    let mut left = ranges(voxels.keys(), wanted, most * 2 / 3);
     left.reverse();
     while let Some(range) = left.pop() {
         match rows.span(range.clone(), rings, most) {
@@ -100,12 +101,12 @@ pub fn for_each_span<E>(
     Ok(())
 }
 
-/// Cuts a level into ranges of about the same size, at most `most` voxels each.
-fn ranges(keys: &[u64], most: usize) -> Vec<Range<usize>> {
-    let (mut ranges, mut rest) = (Vec::new(), 0..keys.len());
+/// Cuts a range of voxels into ranges of about the same size, at most `most` voxels each.
+fn ranges(keys: &[u64], mut rest: Range<usize>, most: usize) -> Vec<Range<usize>> {
+    let mut ranges = Vec::new();
     // A cut may be an eighth later than where it should be.
     let usual = (most * 7 / 8).max(1);
-    for left in (1..=keys.len().div_ceil(usual)).rev() {
+    for left in (1..=rest.len().div_ceil(usual)).rev() {
         let end = match left {
             1 => rest.end,
             _ => cut(keys, &rest, rest.len() / left),
@@ -275,10 +276,16 @@ mod tests {
     }
 
     fn check(voxels: Voxels, rings: usize, most: usize) {
-        let octree = Octree::new(voxels).unwrap();
+        let count = voxels.len();
+        check_some(&voxels, 0..count, rings, most);
+        check_some(&voxels, count / 3..count / 2, rings, most);
+    }
+
+    fn check_some(voxels: &Voxels, wanted: Range<usize>, rings: usize, most: usize) {
+        let octree = Octree::new(voxels.clone()).unwrap();
         let (map, voxels) = (octree.kernel_map(octree.depth()), octree.level(octree.depth()));
-        let mut next = 0;
-        let done: Result<(), Infallible> = for_each_span(voxels, &map, rings, most, |span| {
+        let mut next = wanted.start;
+        let done: Result<(), Infallible> = for_each_span(voxels, &map, wanted.clone(), rings, most, |span| {
             let Span { range, voxels, .. } = &span;
             assert_eq!(range.start, next, "spans follow one another");
             next = range.end;
@@ -304,7 +311,7 @@ mod tests {
             Ok(())
         });
         let Ok(()) = done;
-        assert_eq!(next, map.len(), "spans cover the level");
+        assert_eq!(next, wanted.end, "spans cover what is wanted");
     }
 
     proptest! {
@@ -333,7 +340,8 @@ mod tests {
         });
         let octree = Octree::new(Voxels::new(8, bowl.collect())).unwrap();
         let mut spans = 0;
-        let done: Result<(), Infallible> = for_each_span(octree.level(8), &octree.kernel_map(8), 6, 12_000, |_| {
+        let (voxels, map) = (octree.level(8), octree.kernel_map(8));
+        let done: Result<(), Infallible> = for_each_span(voxels, &map, 0..voxels.len(), 6, 12_000, |_| {
             spans += 1;
             Ok(())
         });

@@ -150,6 +150,7 @@ impl Cloud {
             colours_above: &self.colours[1],
             luma_step: self.step,
             without: None,
+            range: None,
         }
     }
 

@@ -26,6 +26,8 @@ mod sparsity;
 mod tests;
 mod windows;
 
+use std::ops::Range;
+
 use b2p_kernels::{Isa, zeros};
 use rayon::prelude::*;
 
@@ -77,14 +79,26 @@ pub struct SurfelSelection<'a> {
     pub only: Option<&'a [bool]>,
     /// Factor of the radii.
     pub size: f32,
+    /// The voxels that are drawn at all, and what the sparsity of the level is known from; the others are neighbours of
+    /// theirs. `None` for all.
+    pub range: Option<&'a Range<usize>>,
 }
 
 impl SurfelSelection<'_> {
     /// All voxels, in the usual size.
-    pub const ALL: SurfelSelection<'static> = SurfelSelection { only: None, size: 1.0 };
+    pub const ALL: SurfelSelection<'static> = SurfelSelection {
+        only: None,
+        size: 1.0,
+        range: None,
+    };
 
     fn has(&self, voxel: usize) -> bool {
         self.only.is_none_or(|only| only[voxel])
+    }
+
+    /// The voxels of the range, of so many.
+    fn range(&self, voxels: usize) -> Range<usize> {
+        self.range.cloned().unwrap_or(0..voxels)
     }
 }
 
@@ -94,7 +108,7 @@ impl SurfelSelection<'_> {
 /// the Gaussians are in cube-frame units.
 ///
 /// # Panics
-/// If `map` is not a 3³ map, or if `map`, `voxels`, `colours` and the choice differ in length.
+/// If `map` is not a 3³ map, if `map`, `voxels`, `colours` and the choice differ in length, or the range has other voxels.
 pub fn surfels(
     isa: Isa,
     voxels: &Voxels,
@@ -107,10 +121,10 @@ pub fn surfels(
     assert_eq!(map.volume(), 27, "surfels need a 3³ map");
     assert_eq!(map.len(), voxels.len(), "one row of the map per voxel");
     assert_eq!(colours.len(), voxels.len(), "one colour per voxel");
-    let chosen = choice.only.map_or(voxels.len(), |only| {
-        assert_eq!(only.len(), voxels.len(), "one choice per voxel");
-        only.iter().filter(|&&on| on).count()
-    });
+    let only = choice.only.map_or(voxels.len(), <[bool]>::len);
+    assert_eq!(only, voxels.len(), "one choice per voxel");
+    let range = choice.range(voxels.len());
+    let chosen = range.clone().filter(|&voxel| choice.has(voxel)).count();
     // Memory that was touched before is faster than fresh memory.
     let mut spare = moments::of_voxels(voxels);
     let near = moments::step(isa, map, &spare);
@@ -133,10 +147,10 @@ pub fn surfels(
         frame,
         ..Gaussians::default()
     };
-    let sparse = sparsity::is_sparse(near[..voxels.len()].par_iter().map(|moments| moments[0]));
-    let tasks = Rows::of(&mut gaussians).tasks(voxels.len(), n, choice);
+    let sparse = sparsity::is_sparse(near[range.clone()].par_iter().map(|moments| moments[0]));
+    let tasks = Rows::of(&mut gaussians).tasks(range.clone(), n, choice);
     tasks.into_par_iter().for_each(|(first, rows)| {
-        let last = (first + BLOCK).min(voxels.len());
+        let last = (first + BLOCK).min(range.end);
         let coordinates: Vec<[u32; 3]> = (first..last).map(|i| voxels.coordinate(i)).collect();
         let (near, far) = (&near[first..last], &far[first..last]);
         let mut discs = isa.run(passes::Fit {
@@ -192,10 +206,10 @@ impl<'a> Rows<'a> {
     }
 
     /// First voxel and rows of every block.
-    fn tasks(mut self, voxels: usize, per_voxel: usize, choice: SurfelSelection<'_>) -> Vec<(usize, Rows<'a>)> {
-        let mut tasks = Vec::with_capacity(voxels.div_ceil(BLOCK));
-        for first in (0..voxels).step_by(BLOCK) {
-            let block = first..(first + BLOCK).min(voxels);
+    fn tasks(mut self, voxels: Range<usize>, per_voxel: usize, choice: SurfelSelection<'_>) -> Vec<(usize, Rows<'a>)> {
+        let mut tasks = Vec::with_capacity(voxels.len().div_ceil(BLOCK));
+        for first in voxels.clone().step_by(BLOCK) {
+            let block = first..(first + BLOCK).min(voxels.end);
             let count = per_voxel * block.filter(|&voxel| choice.has(voxel)).count();
             let (rows, rest) = self.split_at(count);
             tasks.push((first, rows));

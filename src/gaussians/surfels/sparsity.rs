@@ -6,6 +6,8 @@
 //! In sparse levels, the measure of a neighbourhood is the weight of a voxel's walks (`moments.rs`): a plane has 729 at
 //! least, half of one 351 at its border, and a lone voxel 1.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use super::BLOCK;
@@ -69,18 +71,19 @@ pub fn is_sparse(degrees: impl IndexedParallelIterator<Item = u16>) -> bool {
     all >= LEAST && LONE_SHARE * lone >= all
 }
 
-/// Whether surfels draw the level of a map in place of learned heads, which never saw such neighbourhoods: it is
-/// sparse, and more than stray voxels lack neighbours.
+/// Whether surfels draw these voxels of the level of a map in place of learned heads, which never saw such
+/// neighbourhoods: they are sparse, and more than stray voxels lack neighbours.
 ///
 /// # Panics
-/// If `map` is not a 3³ map.
-pub fn is_for_surfels(map: &KernelMap) -> bool {
+/// If `map` is not a 3³ map, or has no such voxels.
+pub fn is_for_surfels(map: &KernelMap, range: Range<usize>) -> bool {
     assert_eq!(map.volume(), 27, "sparsity is measured in a 3³ map");
     let absent = KernelMap::ABSENT;
     let degree = |row: &[u32]| row.iter().map(|&at| u16::from(at != absent)).sum::<u16>();
-    let degrees = || map.rows().par_chunks_exact(27).map(degree);
+    let rows = &map.rows()[27 * range.start..27 * range.end];
+    let degrees = || rows.par_chunks_exact(27).map(degree);
     let thin = || degrees().with_min_len(BLOCK).filter(|&degree| degree <= THIN).count();
-    is_sparse(degrees()) && THIN_SHARE * thin() >= map.len()
+    is_sparse(degrees()) && THIN_SHARE * thin() >= range.len()
 }
 
 #[cfg(test)]
@@ -119,12 +122,16 @@ mod tests {
         assert!(is_sparse_level(&map(6, plane().chain(specks(9)))));
     }
 
+    fn is_all_for_surfels(map: &KernelMap) -> bool {
+        is_for_surfels(map, 0..map.len())
+    }
+
     #[test]
     fn learned_heads_draw_surfaces_with_stray_voxels_and_leave_more_of_them_to_surfels() {
         let specks = |count: u32| (0..count).map(|i| [3 * (i % 20), 20 + 3 * (i / 20), 50]);
-        assert!(!is_for_surfels(&map(6, plane())));
-        assert!(!is_for_surfels(&map(6, plane().chain(specks(64)))));
-        assert!(is_for_surfels(&map(6, plane().chain(specks(66)))));
+        assert!(!is_all_for_surfels(&map(6, plane())));
+        assert!(!is_all_for_surfels(&map(6, plane().chain(specks(64)))));
+        assert!(is_all_for_surfels(&map(6, plane().chain(specks(66)))));
     }
 
     #[test]

@@ -298,6 +298,7 @@ fn a_choice_of_voxels_gives_their_discs_in_another_size() {
         let some = make(SurfelSelection {
             only: Some(&only),
             size: 0.5,
+            ..SurfelSelection::ALL
         });
         let n = per_voxel.count();
         let chosen: Vec<usize> = (0..all.len()).filter(|i| only[i / n]).collect();

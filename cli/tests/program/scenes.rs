@@ -1,0 +1,171 @@
+//! Scenes through the program: coded in blocks, from memory and from disk; described, checked, cut, decoded and drawn.
+
+use std::path::Path;
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+use super::common::Ball;
+use super::{b2p, fails, folder_with_cloud, png, succeeds};
+
+const CODING: [&str; 6] = ["--bits", "7", "--levels", "4..6", "--block-size", "2000"];
+
+/// A folder with `ball.ply` and `ball.b2p`, a scene of its blocks.
+fn folder() -> TempDir {
+    let folder = folder_with_cloud();
+    succeeds(
+        folder.path(),
+        &[&["encode", "ball.ply", "-o", "ball.b2p"][..], &CODING].concat(),
+    );
+    folder
+}
+
+fn bytes(at: &Path, name: &str) -> Vec<u8> {
+    std::fs::read(at.join(name)).unwrap()
+}
+
+fn json(at: &Path, arguments: &[&str]) -> Value {
+    serde_json::from_str(&succeeds(at, &[arguments, &["--json"]].concat())).unwrap()
+}
+
+#[test]
+fn a_cloud_above_the_block_size_becomes_a_scene_unless_that_is_declined() {
+    let folder = folder();
+    let at = folder.path();
+    let info = json(at, &["info", "ball.b2p"]);
+    let blocks = info["blocks"].as_array().unwrap();
+    assert!(blocks.len() >= 8, "{info}");
+    assert!(succeeds(at, &["check", "ball.b2p"]).contains("valid"));
+    assert!(succeeds(at, &["info", "ball.b2p"]).contains("scene of"));
+    let again = ["encode", "ball.ply", "-o", "again.b2p", "--threads", "1"];
+    succeeds(at, &[&again[..], &CODING].concat());
+    assert!(bytes(at, "ball.b2p") == bytes(at, "again.b2p"));
+    succeeds(
+        at,
+        &["encode", "ball.ply", "-o", "one.b2p", "--bits", "7", "--no-blocks"],
+    );
+    let info = json(at, &["info", "one.b2p"]);
+    assert!(info["blocks"].is_null());
+    fails(
+        at,
+        &["decode", "one.b2p", "-o", "box.ply", "--box", "0,0,0,9,9,9"],
+        &["no scene"],
+    );
+}
+
+#[test]
+fn a_cloud_that_does_not_fit_into_memory_is_sorted_on_disk_to_the_same_scene() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("text.ply"), Ball::new(7, 50.0).to_ply()).unwrap();
+    for name in ["ball.ply", "ball.las"] {
+        succeeds(at, &["convert", "text.ply", "-o", name, "--points"]);
+        let coding = ["--bits", "7", "--levels", "4..6", "--block-size", "2000"];
+        succeeds(at, &[&["encode", name, "-o", "memory.b2p"][..], &coding].concat());
+        let little = ["encode", name, "-o", "disk.b2p", "--max-memory", "1M"];
+        let output = b2p(at, &[&little[..], &coding].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let [memory, disk] = ["memory.b2p", "disk.b2p"].map(|scene| {
+            succeeds(at, &["decode", scene, "-o", "points.ply", "--points"]);
+            bytes(at, "points.ply")
+        });
+        assert!(memory == disk, "{name}");
+    }
+    let asked = [
+        "encode",
+        "ball.ply",
+        "-o",
+        "x.b2p",
+        "--max-memory",
+        "1M",
+        "--bits",
+        "7",
+        "--drop-outliers",
+    ];
+    fails(at, &asked, &["--drop-outliers", "memory"]);
+}
+
+#[test]
+fn parts_of_a_scene_are_decoded_cut_and_drawn() {
+    let folder = folder();
+    let at = folder.path();
+    let surfels = ["--heads", "surfels"];
+    let count = |arguments: &[&str]| json(at, &[arguments, &surfels].concat())["count"].as_u64().unwrap();
+    let all = count(&["decode", "ball.b2p", "-o", "all.ply"]);
+    let half = ["decode", "ball.b2p", "-o", "half.ply", "--box", "0,0,0,63,128,128"];
+    let part = count(&half);
+    assert!(part > all / 3 && part < 2 * all / 3, "{part} of {all}");
+    succeeds(
+        at,
+        &[
+            "decode",
+            "ball.b2p",
+            "-o",
+            "points.ply",
+            "--points",
+            "--box",
+            "0,0,0,63,128,128",
+        ],
+    );
+    succeeds(at, &["cut", "ball.b2p", "-o", "cut.b2p", "--level", "5"]);
+    let levels = json(at, &["info", "cut.b2p"])["levels"].clone();
+    assert_eq!(levels, serde_json::json!([4, 5]));
+    succeeds(at, &["decode", "cut.b2p", "-o", "cut.ply", "--points"]);
+    succeeds(
+        at,
+        &["decode", "ball.b2p", "-o", "level.ply", "--points", "--level", "5"],
+    );
+    assert!(bytes(at, "cut.ply") == bytes(at, "level.ply"));
+    // Drawn from what is seen, and from everything.
+    let view = ["--orbit", "30,20,3", "--size", "96x96"];
+    succeeds(
+        at,
+        &[&["render", "ball.b2p", "-o", "seen.png"][..], &view, &surfels].concat(),
+    );
+    succeeds(at, &[&["render", "all.ply", "-o", "all.png"][..], &view].concat());
+    let [seen, all] = ["seen.png", "all.png"].map(|name| png(&at.join(name)));
+    let off = seen.data().iter().zip(all.data()).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(off <= Some(1), "{off:?}");
+    succeeds(
+        at,
+        &[
+            "render", "ball.b2p", "-o", "many.png", "--views", "3", "--size", "64x64", "--lod", "1",
+        ],
+    );
+    fails(
+        at,
+        &["decode", "ball.b2p", "-o", "x.ply", "--box", "900,0,0,901,1,1"],
+        &["no voxel"],
+    );
+    fails(
+        at,
+        &["cut", "ball.b2p", "-o", "x.b2p", "--level", "9"],
+        &["levels 4 to 6"],
+    );
+}
+
+#[test]
+fn damage_stays_in_its_block_and_is_reported() {
+    let folder = folder();
+    let at = folder.path();
+    let blocks = json(at, &["info", "ball.b2p"])["blocks"].clone();
+    let third = &blocks[2];
+    let mut damaged = bytes(at, "ball.b2p");
+    damaged[third["offset"].as_u64().unwrap() as usize + 150] ^= 4;
+    std::fs::write(at.join("damaged.b2p"), damaged).unwrap();
+    for how in [&["--points"][..], &["--heads", "surfels"]] {
+        let output = b2p(at, &[&["decode", "damaged.b2p", "-o", "rest.ply"][..], how].concat());
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(errors.contains("block 2") && errors.contains("1 block of"), "{errors}");
+        let rest = bytes(at, "rest.ply");
+        assert!(rest.len() > 1000, "the other blocks are written");
+        std::fs::remove_file(at.join("rest.ply")).unwrap();
+    }
+    fails(at, &["check", "damaged.b2p"], &["1 fault", "block 2", "18.2.4"]);
+    let cut = &bytes(at, "ball.b2p")[..blocks[5]["offset"].as_u64().unwrap() as usize];
+    std::fs::write(at.join("short.b2p"), cut).unwrap();
+    let output = b2p(at, &["decode", "short.b2p", "-o", "rest.ply", "--points"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(at.join("rest.ply").exists());
+}
