@@ -426,7 +426,7 @@ impl<'a> EncoderInput<'a> {
                 level,
                 hash: colour_hash(&coloured),
                 filter: filter.map(|filter| filter.to_bytes()),
-                head_map: None,
+                head_map: self.closing_map(octree, level, map_of(level)),
                 slices,
             });
         }
