@@ -4,12 +4,13 @@
 #     packaging/deb.sh          builds it
 #     packaging/deb.sh test     then installs it into a root of its own that debootstrap makes, runs it there, and removes it
 #
-# Needs cargo-deb; the test needs root and debootstrap. Says what it skips where the latter cannot be had.
+# Needs cargo-deb; the test needs root and debootstrap. Says what it skips where they cannot be had. Pages and completions
+# are written in any case.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-cargo build --locked --release -p b2p-cli
-program=${CARGO_TARGET_DIR:-target}/release/b2p
+cargo build --locked --profile dist -p b2p-cli
+program=${CARGO_TARGET_DIR:-target}/dist/b2p
 out=target/packaging
 rm -rf $out
 mkdir -p $out
@@ -17,7 +18,8 @@ $program -q man $out/man
 $program completions bash > $out/b2p.bash
 $program completions zsh > $out/_b2p
 $program completions fish > $out/b2p.fish
-cargo deb --quiet --locked -p b2p-cli --no-build --output $out/
+cargo deb --version > /dev/null 2>&1 || { echo "skipped: the Debian package; cargo-deb is not there" && exit 0; }
+cargo deb --quiet --locked -p b2p-cli --profile dist --no-build --output $out/
 package=$(echo $out/b2p_*.deb)
 printf '%s: %s bytes\n' "$package" "$(stat -c %s "$package")"
 [ "${1:-}" = test ] || exit 0

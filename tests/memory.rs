@@ -226,6 +226,40 @@ fn the_limits_of_boards_allow_a_person_with_any_heads() {
 }
 
 #[test]
+fn encoding_holds_no_more_than_is_said_of_so_many_voxels() {
+    let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
+    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
+    let far = |i: u64| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 1;
+    let lone = cloud_of(21, (0..10_000).map(far).collect());
+    // With bits per point that they can be coded to.
+    let clouds = [
+        (Ball::new(7, 50.0).cloud(), Some(0.2)),
+        (Ball::new(9, 200.0).cloud(), Some(0.2)),
+        (lone, None),
+    ];
+    for (cloud, rate) in clouds {
+        let voxels = cloud.voxels.len();
+        for heads in [None, Some(heads.clone())] {
+            let options = transform::Options {
+                heads,
+                tries: 2,
+                ..transform::Options::default()
+            };
+            let (encoded, most) = peak(|| transform::encode(&cloud, &options, &Log::default()));
+            let bound = transform::encode_memory(&cloud.voxels, false);
+            assert!(encoded.is_ok() && most <= bound, "{voxels} voxels: {most} of {bound}");
+            let Some(rate) = rate else { continue };
+            let (encoded, most) = peak(|| transform::encode_to_rate(&cloud, &options, rate, &Log::default()));
+            let bound = transform::encode_memory(&cloud.voxels, true);
+            assert!(
+                encoded.is_ok() && most <= bound,
+                "{voxels} voxels to a rate: {most} of {bound}"
+            );
+        }
+    }
+}
+
+#[test]
 fn a_decode_gives_back_all_that_it_reserved_whether_it_succeeds_or_fails() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
     let (_, model) = models().remove(0);

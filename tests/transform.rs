@@ -297,6 +297,32 @@ fn learned_heads_leave_sparse_levels_to_surfels() {
 }
 
 #[test]
+fn streams_state_how_wide_surfels_close_a_sparse_level_and_nothing_of_a_dense_one() {
+    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
+    let usual = Options {
+        levels: Some(5..=7),
+        ..with(QualityTarget::Step(20.0))
+    };
+    let mapped = Options {
+        heads: Some(heads),
+        ..usual.clone()
+    };
+    let radii = |cloud, options: &Options| {
+        let decoder = Decoder::new().with_heads(HeadSet::Surfels).with_level(7);
+        let gaussians = decoder.decode(&stream(cloud, options)).unwrap();
+        gaussians.scale.iter().map(|[radius, ..]| *radius).collect::<Vec<_>>()
+    };
+    let sparse = sparse_wall();
+    let factors = radii(&sparse, &mapped).into_iter().zip(radii(&sparse, &usual));
+    let mut factors = factors.map(|(wide, usual)| wide / usual);
+    let first = factors.next().unwrap();
+    assert!(first > 1.1 && first < 1.41, "{first}");
+    assert!(factors.all(|factor| (factor - first).abs() < 1e-5));
+    let dense = Ball::new(7, 50.0).cloud();
+    assert!(radii(&dense, &mapped) == radii(&dense, &usual));
+}
+
+#[test]
 fn levels_and_steps_that_do_not_exist_are_refused() {
     let cloud = Ball::new(4, 5.0).cloud();
     let refused = |options: Options| encode(&cloud, &options, &Log::default()).is_err();

@@ -68,6 +68,11 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         Some(most) => cloud::affordable(axes, most * voxels as f64 / 8.0),
         None => axes,
     };
+    if args.colours == Colours::Transform {
+        let memory = transform::encode_memory(&cloud.voxels, args.bits_per_point.is_some());
+        let checked = limits.check_bytes("bytes that encoding the voxels takes", memory);
+        checked.map_err(&in_cloud)?;
+    }
     let merged = (points > voxels).then_some(points as u64);
     // The rate counts the whole file.
     let reserved = container::source_bytes(&axes, merged) as f64 * 8.0 / voxels as f64;

@@ -121,6 +121,8 @@ impl<'a> Scan<'a> {
     fn ancillary(&mut self, chunk: &Chunk, axes: bool, map: bool) {
         let (clause, text) = match chunk.kind {
             ChunkKind::Ancillary(AXES) if !axes => ("3.4.2", "axes that do not count here".into()),
+            // A chunk that has the number of points alone has no payload (3.4.3).
+            ChunkKind::Ancillary(AXES) if chunk.payload.is_empty() && chunk.count > 0 => return,
             ChunkKind::Ancillary(AXES) if Axes::from_bytes(chunk.payload).is_none() => {
                 ("3.4.2", "axes of another form: they say nothing".into())
             }

@@ -1,4 +1,4 @@
-//! What `convert` is told.
+//! Arguments of `convert`.
 
 use std::path::PathBuf;
 

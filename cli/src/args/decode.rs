@@ -1,4 +1,4 @@
-//! What `decode` is told.
+//! Arguments of `decode`.
 
 use std::path::PathBuf;
 

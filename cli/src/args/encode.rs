@@ -1,4 +1,4 @@
-//! What `encode` is told.
+//! Arguments of `encode`.
 
 use std::ops::RangeInclusive;
 use std::path::PathBuf;

@@ -1,4 +1,4 @@
-//! What `render` is told.
+//! Arguments of `render`.
 
 use std::path::PathBuf;
 

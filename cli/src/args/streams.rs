@@ -1,4 +1,4 @@
-//! What the commands are told that look into streams, cut, join and upgrade them.
+//! Arguments of the commands that look into streams, cut, join and upgrade them.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! What `serve`, `demo` and `bench` are told.
+//! Arguments of `serve`, `demo` and `bench`.
 
 use std::net::IpAddr;
 use std::path::PathBuf;

@@ -89,6 +89,18 @@ fn a_chunk_that_this_version_does_not_know_is_mentioned_by_check_and_info() {
 }
 
 #[test]
+fn a_stream_that_says_how_many_points_it_has_and_nothing_of_its_axes_is_usual() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    succeeds(at, &["encode", "ball.ply", "ball.b2p", "--bits", "6"]);
+    assert!(succeeds(at, &["info", "ball.b2p"]).contains("made of"));
+    for command in ["check", "info"] {
+        let said = succeeds(at, &[command, "ball.b2p"]);
+        assert!(!said.contains("note"), "{command}: {said}");
+    }
+}
+
+#[test]
 fn a_stream_of_version_2_becomes_one_of_version_3_with_the_same_geometry() {
     let folder = folder_with_learned_stream();
     let at = folder.path();

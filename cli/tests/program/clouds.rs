@@ -226,6 +226,17 @@ fn no_more_is_read_than_the_limits_allow() {
 }
 
 #[test]
+fn the_memory_limit_holds_for_encoding_too() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    let voxelised = b2p::cloud::voxelise_memory(read(&at.join("ball.ply")).positions.len() as u64);
+    let limit = (voxelised + (8 << 20)).to_string();
+    let limited = ["encode", "ball.ply", "x.b2p", "--bits", "7", "--max-memory", &limit];
+    fails(at, &limited, &["encoding the voxels", "--max-memory"]);
+    assert!(!at.join("x.b2p").exists());
+}
+
+#[test]
 fn memory_for_voxels_counts_and_damage_in_readers_of_others_is_said_once() {
     let folder = folder_with_cloud();
     let at = folder.path();

@@ -29,6 +29,36 @@ fn an_output_that_is_a_fifo_or_a_link_stays_what_it_is() {
     }
 }
 
+#[cfg(target_os = "linux")]
+#[test]
+fn a_file_is_made_under_a_name_of_its_own_and_synchronised_before_it_gets_the_one_asked_for() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let calls = "trace=openat,fsync,rename,renameat,renameat2";
+    let traced = Command::new("strace")
+        .current_dir(at)
+        .args(["-f", "-o", "calls.txt", "-e", calls, env!("CARGO_BIN_EXE_b2p")])
+        .args(["decode", "ball.b2p", "out.ply", "--heads", "surfels"])
+        .output();
+    if !traced.is_ok_and(|done| done.status.success()) {
+        eprintln!("skipped: strace cannot be had");
+        return;
+    }
+    let text = std::fs::read_to_string(at.join("calls.txt")).unwrap();
+    let calls: Vec<&str> = text.lines().collect();
+    let place = |words: &[&str]| {
+        calls
+            .iter()
+            .position(|call| words.iter().all(|word| call.contains(word)))
+    };
+    let made = place(&["openat", ".b2p-", "O_EXCL"]);
+    let places = [made, place(&["fsync("]), place(&["rename", ".b2p-", "out.ply"])];
+    assert!(
+        places.iter().all(Option::is_some) && places.is_sorted(),
+        "{places:?}: {text}"
+    );
+}
+
 #[test]
 fn an_existing_file_is_overwritten_only_if_that_is_asked_for() {
     let folder = folder_with_stream();

@@ -7,12 +7,14 @@ use b2p_kernels::Isa;
 
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
-use crate::gaussians::surfels::{PerVoxel, SurfelSelection, surfels};
+use crate::gaussians::surfels::{PerVoxel, SurfelSelection, closing_size, is_for_surfels, surfels};
 use crate::gaussians::{Frame, Gaussians, HeadMap};
-use crate::geometry::Octree;
+use crate::geometry::{KernelMap, Octree};
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
 use crate::renderer::{Background, Ids, Image, Renderer};
+
+use super::EncoderInput;
 
 /// Azimuth and elevation of the views, in degrees.
 const VIEWS: [(f64, f64); 4] = [(25.0, 20.0), (115.0, -10.0), (205.0, 20.0), (295.0, -10.0)];
@@ -141,6 +143,17 @@ impl Comparison<'_> {
             }
         }
         Ok(())
+    }
+}
+
+impl EncoderInput<'_> {
+    /// The head map of a sparse level, which surfels draw: it says how wide they must be to close. `None` of other
+    /// levels, and where the usual size does.
+    pub(super) fn closing_map(&self, octree: &Octree, level: u8, map: &KernelMap) -> Option<Vec<u8>> {
+        let applies = self.options.heads.is_some() && level > 0 && is_for_surfels(map);
+        let size = applies.then(|| closing_size(map)).filter(|size| *size > 64)?;
+        let surfels = vec![true; HeadMap::block_count(octree, level)];
+        Some(HeadMap::new(size, size, surfels).to_bytes())
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod head_maps;
 mod knobs;
+mod memory;
 mod motion;
 mod predicted;
 mod rate_control;
@@ -28,6 +29,7 @@ use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
+pub use memory::encode_memory;
 pub use motion::Errors;
 pub use predicted::{Known, PredictedFrame, encode_predicted};
 pub use rate_control::encode_to_rate;
@@ -426,7 +428,7 @@ impl<'a> EncoderInput<'a> {
                 level,
                 hash: colour_hash(&coloured),
                 filter: filter.map(|filter| filter.to_bytes()),
-                head_map: None,
+                head_map: self.closing_map(octree, level, map_of(level)),
                 slices,
             });
         }

@@ -36,7 +36,7 @@ use crate::geometry::{KernelMap, Voxels};
 use discs::Disc;
 use moments::Moments;
 use sparsity::Sparsity;
-pub use sparsity::is_for_surfels;
+pub use sparsity::{closing_size, is_for_surfels};
 use windows::{Window, Windows};
 
 /// Voxels per task, and per block whose sparsity is measured: part of the definition of surfels.

@@ -20,6 +20,12 @@ const LEAST: usize = 1024;
 /// A sparse level is drawn with surfels if one in so many voxels has at most [`THIN`] within one step, itself included.
 const THIN_SHARE: usize = 64;
 const THIN: u16 = 3;
+/// Twice the number of voxels within one step, itself included, that voxels of a closed surface have on average. Exact
+/// voxels of surfaces have 13 to 14, those of thin parts fewer.
+const CLOSED_TWICE: i64 = 23;
+/// What surfels are widened by, in 64ths, for each half voxel that is lacking, and the most.
+const WIDEN: i64 = 10;
+const WIDEST: i64 = 26;
 /// Weight below which a voxel lacks most neighbours, and takes a window in an open block: less than at a border.
 const FEW: u16 = 300;
 /// A block is open if one in so many voxels lacks most neighbours and is no speck.
@@ -86,6 +92,20 @@ pub fn is_for_surfels(map: &KernelMap, range: Range<usize>) -> bool {
     is_sparse(degrees()) && THIN_SHARE * thin() >= range.len()
 }
 
+/// Size of the surfels that close a level which [`is_for_surfels`], in 64ths of the usual radius, for
+/// [`HeadMap`](crate::gaussians::HeadMap) to state: from 64 where voxels have the neighbours of a closed surface up to
+/// 90 the fewer they have.
+///
+/// # Panics
+/// If `map` is not a 3³ map.
+pub fn closing_size(map: &KernelMap) -> u8 {
+    assert_eq!(map.volume(), 27, "sparsity is measured in a 3³ map");
+    let present = map.rows().par_iter().filter(|&&at| at != KernelMap::ABSENT);
+    let (voxels, neighbours) = (map.len() as i64, present.count() as i64);
+    let wider = WIDEN * (CLOSED_TWICE * voxels - 2 * neighbours) / voxels.max(1);
+    wider.clamp(0, WIDEST) as u8 + 64
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -132,6 +152,18 @@ mod tests {
         assert!(!is_all_for_surfels(&map(6, plane())));
         assert!(!is_all_for_surfels(&map(6, plane().chain(specks(64)))));
         assert!(is_all_for_surfels(&map(6, plane().chain(specks(66)))));
+    }
+
+    #[test]
+    fn surfels_are_the_wider_the_fewer_neighbours_there_are() {
+        // Three layers of voxels: all that a diagonal plane touches.
+        let plane = || (0..1u32 << 18).map(|i| [i & 63, i >> 6 & 63, i >> 12]);
+        let touched = |[x, y, z]: &[u32; 3]| (95..98).contains(&(x + y + z));
+        let hash = |[x, y, z]: &[u32; 3]| u64::from(x + 64 * y + 4096 * z).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 60;
+        let part = |of_16: u64| map(6, plane().filter(move |at| touched(at) && hash(at) < of_16));
+        let sizes = [16, 10, 6].map(|of_16| closing_size(&part(of_16)));
+        assert_eq!(sizes[0], 64);
+        assert!((68..88).contains(&sizes[1]) && sizes[2] == 90, "{sizes:?}");
     }
 
     #[test]

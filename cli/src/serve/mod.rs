@@ -1,20 +1,27 @@
 //! `b2p serve`: the web page and streams by HTTP.
 
 use std::fs::File;
-use std::io::{Cursor, Read, Seek, SeekFrom};
-use std::net::SocketAddr;
+use std::io::{Seek, SeekFrom};
+use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use serde_json::json;
-use tiny_http::{Header, Method, Request, Response, Server, StatusCode};
 
 use super::args::Serve;
 use super::manners::{self, Said};
 use super::table::counted;
 use super::{Failure, Result};
+use http::{Bounds, Request, Response};
 
-/// Requests that are answered at the same time; others wait.
-const THREADS: usize = 8;
+mod http;
+
+/// A page and its files take a few connections each.
+const BOUNDS: Bounds = Bounds {
+    connections: 64,
+    request: Duration::from_secs(30),
+    stalled: Duration::from_secs(30),
+};
 /// Bytes of an address.
 const LONGEST: usize = 2048;
 /// Where the page finds the learned heads.
@@ -29,8 +36,9 @@ pub fn run(args: &Serve) -> Result<Said> {
     let streams = Streams::find(&args.source)?;
     let count = streams.names()?.len();
     let address = SocketAddr::new(args.host, args.port);
-    let server = Server::http(address).map_err(|error| Failure(format!("cannot listen at {address}: {error}")))?;
-    let address = server.server_addr().to_ip().unwrap_or(address);
+    let fail = |error| Failure(format!("cannot listen at {address}: {error}"));
+    let listener = TcpListener::bind(address).map_err(fail)?;
+    let address = listener.local_addr().map_err(fail)?;
     let shown = format!("http://{address}/");
     let said = match manners::json() {
         true => Said::result(format!("{}\n", json!({ "address": shown, "streams": count }))),
@@ -40,16 +48,7 @@ pub fn run(args: &Serve) -> Result<Said> {
         )),
     };
     said.say()?;
-    std::thread::scope(|scope| {
-        for _ in 0..THREADS {
-            scope.spawn(|| {
-                while let Ok(request) = server.recv() {
-                    answer(request, &streams, module);
-                }
-            });
-        }
-    });
-    Ok(Said::default())
+    http::serve(&listener, BOUNDS, &|request| common(answer(request, &streams, module)))
 }
 
 /// The streams that are served.
@@ -108,82 +107,60 @@ impl Streams {
     }
 }
 
-/// Answers a request. What fails is the connection, which has then nobody at its other end.
-fn answer(request: Request, streams: &Streams, module: &'static [u8]) {
-    if !matches!(request.method(), Method::Get | Method::Head) {
-        let _ = request.respond(plain(405, "only GET and HEAD\n").with_header(header("Allow", "GET, HEAD")));
-        return;
-    }
-    let url = request.url();
-    let path = url.split(['?', '#']).next().unwrap_or_default().trim_start_matches('/');
-    let Some(path) = decoded(path).filter(|_| url.len() <= LONGEST) else {
-        let _ = request.respond(plain(400, "this is no address of a file\n"));
-        return;
+/// The answer to a request.
+fn answer(request: &Request, streams: &Streams, module: &'static [u8]) -> Response {
+    let target = &request.target;
+    let path = target.split(['?', '#']).next().unwrap_or_default();
+    let path = path.trim_start_matches('/');
+    let Some(path) = decoded(path).filter(|_| target.len() <= LONGEST) else {
+        return plain(400, "this is no address of a file\n");
     };
     let file = match path.as_str() {
         "" => "index.html",
         path => path,
     };
     if let Some(page) = b2p_web::FILES.iter().find(|page| page.path == file) {
-        let _ = request.respond(bytes(page.bytes, page.media_type));
-        return;
+        return Response::bytes(page.bytes, page.media_type);
     }
     match file {
-        "b2p.wasm" => {
-            let response = bytes(module, "application/wasm").with_header(header("Content-Encoding", "gzip"));
-            let _ = request.respond(response);
-        }
-        HEADS => {
-            let _ = request.respond(bytes(b2p::embedded::HEADS, "application/octet-stream"));
-        }
+        "b2p.wasm" => Response::bytes(module, "application/wasm").with("Content-Encoding", "gzip"),
+        HEADS => Response::bytes(b2p::embedded::HEADS, "application/octet-stream"),
         "streams.json" => {
             let names = streams.names().unwrap_or_default();
             let list = json!({ "streams": names, "heads": HEADS }).to_string();
-            let response = Response::from_data(list).with_header(header("Content-Type", "application/json"));
-            let _ = request.respond(common(response));
+            Response::text(200, list, "application/json")
         }
         name => match streams.open(name) {
             Some(file) => stream(request, file),
-            None => {
-                let _ = request.respond(plain(404, "no such file\n"));
-            }
+            None => plain(404, "no such file\n"),
         },
     }
 }
 
-/// Answers with a stream, or with the range of it that was asked for.
-fn stream(request: Request, mut file: File) {
+/// A stream, or the range of it that was asked for.
+fn stream(request: &Request, mut file: File) -> Response {
     let Ok(length) = file.metadata().map(|metadata| metadata.len()) else {
-        let _ = request.respond(plain(500, "the file cannot be read\n"));
-        return;
+        return plain(500, "the file cannot be read\n");
     };
-    let asked = request.headers().iter().find(|header| header.field.equiv("Range"));
-    let range = asked.map(|header| range(header.value.as_str(), length));
-    let (status, range) = match range {
+    let (status, range) = match request.range.as_deref().map(|asked| range(asked, length)) {
         None => (200, 0..length),
         Some(Some(range)) => (206, range),
         Some(None) => {
-            let all = header("Content-Range", &format!("bytes */{length}"));
-            let _ = request.respond(plain(416, "there is no such range\n").with_header(all));
-            return;
+            let all = format!("bytes */{length}");
+            return plain(416, "there is no such range\n").with("Content-Range", all);
         }
     };
     if file.seek(SeekFrom::Start(range.start)).is_err() {
-        let _ = request.respond(plain(500, "the file cannot be read\n"));
-        return;
+        return plain(500, "the file cannot be read\n");
     }
-    let count = range.end - range.start;
-    let body = file.take(count);
-    let mut headers = vec![
-        header("Content-Type", "application/octet-stream"),
-        header("Accept-Ranges", "bytes"),
-    ];
-    if status == 206 {
-        let part = format!("bytes {}-{}/{length}", range.start, range.end - 1);
-        headers.push(header("Content-Range", &part));
+    let response = Response::file(status, file, range.end - range.start).with("Accept-Ranges", "bytes");
+    match status {
+        206 => {
+            let part = format!("bytes {}-{}/{length}", range.start, range.end - 1);
+            response.with("Content-Range", part)
+        }
+        _ => response,
     }
-    let response = Response::new(StatusCode(status), headers, body, usize::try_from(count).ok(), None);
-    let _ = request.respond(common(response));
 }
 
 /// The bytes that a `Range` header asks for, if it asks for one range that is there.
@@ -214,19 +191,12 @@ fn decoded(path: &str) -> Option<String> {
     String::from_utf8(bytes).ok().filter(|path| !path.contains('\0'))
 }
 
-fn bytes(bytes: &'static [u8], media_type: &str) -> Response<Cursor<&'static [u8]>> {
-    let headers = vec![header("Content-Type", media_type)];
-    let body = Cursor::new(bytes);
-    common(Response::new(StatusCode(200), headers, body, Some(bytes.len()), None))
+fn plain(status: u16, text: &str) -> Response {
+    Response::text(status, text.to_owned(), "text/plain; charset=utf-8")
 }
 
-fn plain(status: u16, text: &str) -> Response<Cursor<Vec<u8>>> {
-    common(Response::from_string(text).with_status_code(status))
-}
-
-/// What every answer says: how long it is, that other sites get nothing, that the page may use threads, and that files
-/// may change.
-fn common<R: Read>(response: Response<R>) -> Response<R> {
+/// What every answer says: that other sites get nothing, that the page may use threads, and that files may change.
+fn common(response: Response) -> Response {
     [
         ("Cross-Origin-Opener-Policy", "same-origin"),
         ("Cross-Origin-Embedder-Policy", "require-corp"),
@@ -235,14 +205,7 @@ fn common<R: Read>(response: Response<R>) -> Response<R> {
         ("Cache-Control", "no-cache"),
     ]
     .into_iter()
-    .fold(
-        response.with_chunked_threshold(usize::MAX),
-        |response, (name, value)| response.with_header(header(name, value)),
-    )
-}
-
-fn header(name: &str, value: &str) -> Header {
-    Header::from_bytes(name, value).expect("names and values here are ASCII")
+    .fold(response, |response, (name, value)| response.with(name, value))
 }
 
 #[cfg(test)]

@@ -1,0 +1,53 @@
+//! What encoding holds in memory.
+
+use crate::geometry::Voxels;
+
+/// Pictures of the cloud and of its levels, for head maps, and adaptive contexts.
+const FIXED: u64 = 64 << 20;
+/// Bytes for each node of the octree: kernel maps, colours, the code, and the stream as it is decoded again and drawn.
+const NODE: u64 = 240;
+/// The same where the encoder looks for a rate: what it found so far beside what it tries, and colours to try.
+const NODE_TO_RATE: u64 = 390;
+
+/// Bytes that [`encode`](super::encode) of these voxels holds at most, beside the cloud itself; with `to_rate`
+/// [`encode_to_rate`](super::encode_to_rate). The bytes of a node were measured; `cargo test --test memory` compares the
+/// bound with what the allocator gives out.
+pub fn encode_memory(voxels: &Voxels, to_rate: bool) -> u64 {
+    let each = if to_rate { NODE_TO_RATE } else { NODE };
+    nodes(voxels).saturating_mul(each).saturating_add(FIXED)
+}
+
+/// Voxels of all levels below the root.
+fn nodes(voxels: &Voxels) -> u64 {
+    let keys = voxels.keys();
+    let first = if keys.is_empty() { 0 } else { u64::from(voxels.depth()) };
+    // A key has a node of its own on each level from the first on that tells it from the key before.
+    let own = keys
+        .windows(2)
+        .map(|pair| u64::from((u64::BITS - (pair[0] ^ pair[1]).leading_zeros()).div_ceil(3)));
+    first + own.sum::<u64>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Octree;
+
+    #[test]
+    fn nodes_are_the_voxels_of_all_levels() {
+        let scattered = (0..3000u64).map(|i| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 46);
+        for (depth, keys) in [
+            (6, scattered.collect::<Vec<_>>()),
+            (2, vec![9]),
+            (3, (0..512).collect()),
+        ] {
+            let mut keys = keys;
+            keys.sort_unstable();
+            keys.dedup();
+            let voxels = Voxels::new(depth, keys);
+            let octree = Octree::new(voxels.clone()).unwrap();
+            let all: usize = (1..=depth).map(|level| octree.level(level).len()).sum();
+            assert_eq!(nodes(&voxels), all as u64);
+        }
+    }
+}
