@@ -46,7 +46,7 @@ fn gaussians(
     });
     let decoded = decoded.map_err(Failure::in_file(&args.input))?;
     let known = scene.axes().unwrap_or_default();
-    let axes = match args.up.map_or(known.up, |up| up.up().or(known.up)) {
+    let axes = match cloud::up_of(args.up, &known) {
         _ if args.keep_axes => Axes::of(format),
         Some(up) => Axes::Cloud(up),
         None => Axes::Ply,
