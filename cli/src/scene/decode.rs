@@ -12,7 +12,8 @@ use super::super::table::{counted, steps, steps_json};
 use super::super::{Failure, Result, cloud, convert, load, points};
 use super::{Reader, complain};
 
-/// Decodes a scene into a file of Gaussians or points. What could be decoded is written even if some blocks are damaged.
+/// Decodes a scene into a file of Gaussians or points. What could be decoded is written even if some blocks are
+/// damaged.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
     if args.budget.is_given() {
         let what = "it is a scene, which is decoded without a budget: --level and --heads choose how";
