@@ -31,8 +31,8 @@ pub struct Options {
     pub seed: u64,
 }
 
-/// Writes the cloud of `count` objects, by turns those of `surfaces`, as PLY with whole coordinates in Morton order of each
-/// object. Returns the number of points and the bit depth.
+/// Writes the cloud of `count` objects, by turns those of `surfaces`, as PLY with whole coordinates in Morton order of
+/// each object. Returns the number of points and the bit depth.
 ///
 /// # Errors
 /// If there are no objects, one has no extent, the floor is too large for a grid, or the file cannot be written.

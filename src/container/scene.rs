@@ -140,7 +140,8 @@ impl BlockEntry {
     }
 }
 
-/// Reads the index behind the header of a scene. Returns the blocks in the order of space. The blocks need not be there.
+/// Reads the index behind the header of a scene. Returns the blocks in the order of space. The blocks need not be
+/// there.
 ///
 /// # Errors
 /// [`Error::Truncated`], [`Error::ChecksumMismatch`], [`Error::Malformed`], and [`Error::LimitExceeded`] for a block

@@ -116,7 +116,8 @@ impl Decoder {
         self.draw(header, &part, colours_above)
     }
 
-    /// How many voxels of the level above lie between a voxel's parent and the farthest one that its Gaussians depend on.
+    /// How many voxels of the level above lie between a voxel's parent and the farthest one that its Gaussians depend
+    /// on.
     pub(crate) fn reach(&self, header: &Header, level: u8) -> Result<u32> {
         let network = self.network(header, level)?;
         Ok(SURFEL_REACH.max(network.map_or(0, |(model, set)| model.reach(set))))

@@ -75,9 +75,9 @@ impl SceneDecoder {
     /// The Gaussians of a part, block by block.
     ///
     /// # Errors
-    /// [`Error::LimitExceeded`], [`Error::Usage`] for a level or a part that the scene has not,
-    /// [`Error::Unsupported`] for heads that there are not, [`Error::Cancelled`]; what is wrong with all blocks, if none
-    /// can be decoded. Of damage in some of them [`DecodedScene::lost`] tells.
+    /// [`Error::LimitExceeded`], [`Error::Usage`] for a level or a part that the scene has not, [`Error::Unsupported`]
+    /// for heads that there are not, [`Error::Cancelled`]; what is wrong with all blocks, if none can be decoded. Of
+    /// damage in some of them [`DecodedScene::lost`] tells.
     pub fn gaussians<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<DecodedScene<Gaussians>> {
         let selection = self.select(scene, wanted)?;
         let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
@@ -91,8 +91,8 @@ impl SceneDecoder {
         finish(joined(parts, frame_of(scene.header())), lost, blocks)
     }
 
-    /// Draws blocks at a level, or what of them lies in a box, and gives each to `take` with its number. What is decoded for it is kept
-    /// in `decoded`; `held` bytes of memory are taken already, what is in `decoded` included.
+    /// Draws blocks at a level, or what of them lies in a box, and gives each to `take` with its number. What is
+    /// decoded for it is kept in `decoded`; `held` bytes of memory are taken already, what is in `decoded` included.
     pub(super) fn draw_blocks<S: Source>(
         &self,
         scene: &SceneReader<S>,

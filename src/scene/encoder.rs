@@ -69,7 +69,8 @@ impl SceneEncoder {
         self
     }
 
-    /// The same encoder for these levels, which a scene may be cut after. Blocks are not smaller than voxels of the first.
+    /// The same encoder for these levels, which a scene may be cut after. Blocks are not smaller than voxels of the
+    /// first.
     pub fn with_levels(mut self, levels: RangeInclusive<u8>) -> Self {
         self.options.levels = Some(levels);
         self

@@ -2,8 +2,8 @@
 //!
 //! A block is a cube of the octree. Header and index come first, so that a part of a scene is decoded from those bytes
 //! that hold it. [`SceneReader`] finds them, in memory or in a file. [`SceneDecoder`] decodes them: Gaussians at the
-//! border of a block depend on the voxels of the blocks around it, as if the scene was one piece. So those of a part that
-//! is decoded by itself equal those of the whole, bit for bit.
+//! border of a block depend on the voxels of the blocks around it, as if the scene was one piece. So those of a part
+//! that is decoded by itself equal those of the whole, bit for bit.
 
 mod decoder;
 mod edit;

@@ -28,8 +28,8 @@ impl Bounds {
         }
     }
 
-    /// The voxels of `level`, 1 or more, that drawing a cube may depend on: all children of the voxels of the level above
-    /// that are at most `reach` away.
+    /// The voxels of `level`, 1 or more, that drawing a cube may depend on: all children of the voxels of the level
+    /// above that are at most `reach` away.
     pub fn around(cube: Cube, level: u8, reach: u32) -> Self {
         let Some(above) = level.checked_sub(1) else {
             return Bounds::of(cube, level);

@@ -5,7 +5,8 @@ use crate::container::scene::Cube;
 /// Voxels of a block at most, by default: of blocks of a surface the mean is about 2²⁰.
 pub const BLOCK_VOXELS: usize = 1 << 21;
 
-/// Cuts voxels in Morton order into the largest cubes with at most so many voxels. Only the deepest cubes may have more.
+/// Cuts voxels in Morton order into the largest cubes with at most so many voxels. Only the deepest cubes may have
+/// more.
 #[derive(Debug, Clone)]
 pub struct Cutter {
     /// N.

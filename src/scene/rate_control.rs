@@ -16,8 +16,8 @@ const CORRECTIONS: usize = 8;
 
 impl SceneEncoder {
     /// Codes a cloud as well as possible with at most so many bits for each point, the whole scene counted, and says in
-    /// which steps and down to which level. All blocks have one quality. It is found on some blocks, and corrected if all
-    /// together take more.
+    /// which steps and down to which level. All blocks have one quality. It is found on some blocks, and corrected if
+    /// all together take more.
     ///
     /// # Errors
     /// [`Error::Usage`] if the bits are not a finite number above 0, [`Error::TooFewBits`] if the smallest scene has

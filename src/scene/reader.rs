@@ -43,7 +43,8 @@ impl<S: Source> SceneReader<S> {
     ///
     /// # Errors
     /// [`Error::Truncated`], [`Error::ChecksumMismatch`], [`Error::Malformed`]; [`Error::Unsupported`] for a stream of
-    /// one frame or a later version; [`Error::LimitExceeded`] for a block with too many points or levels; [`Error::Io`].
+    /// one frame or a later version; [`Error::LimitExceeded`] for a block with too many points or levels;
+    /// [`Error::Io`].
     pub fn new(source: S, limits: &Limits) -> Result<Self> {
         let length = source.length();
         let mut first = length.min(FIRST_READ);

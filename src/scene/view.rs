@@ -70,8 +70,8 @@ struct VisibleBlock {
 }
 
 impl SceneDecoder {
-    /// The Gaussians that a camera sees. The picture of them is that of the whole scene, but for what is less than a step
-    /// of eight bits; where levels are coarser, but for what they lack. `decoder`'s level is the finest one.
+    /// The Gaussians that a camera sees. The picture of them is that of the whole scene, but for what is less than a
+    /// step of eight bits; where levels are coarser, but for what they lack. `decoder`'s level is the finest one.
     ///
     /// # Errors
     /// Those of [`SceneDecoder::gaussians`] and of drawing.
@@ -256,8 +256,8 @@ fn corners(cube: Cube) -> [DVec3; 2] {
     [DVec3::from(low), DVec3::from(low) + edge]
 }
 
-/// The blocks in an order in which none hides one before it. Of eight neighbouring cubes, those are in front that lie on
-/// the camera's side of more of the planes between them.
+/// The blocks in an order in which none hides one before it. Of eight neighbouring cubes, those are in front that lie
+/// on the camera's side of more of the planes between them.
 fn front_to_back<S: Source>(scene: &SceneReader<S>, camera: &Camera) -> Vec<usize> {
     let inverse = camera.pose.inverse();
     let (eye, forward) = (inverse.translation, inverse.matrix3 * DVec3::Z);

@@ -12,7 +12,8 @@ use super::super::table::{counted, steps, steps_json};
 use super::super::{Failure, Result, cloud, convert, load, points};
 use super::{Reader, complain};
 
-/// Decodes a scene into a file of Gaussians or points. What could be decoded is written even if some blocks are damaged.
+/// Decodes a scene into a file of Gaussians or points. What could be decoded is written even if some blocks are
+/// damaged.
 pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> {
     if args.budget.is_given() {
         let what = "it is a scene, which is decoded without a budget: --level and --heads choose how";
@@ -46,7 +47,7 @@ fn gaussians(
     });
     let decoded = decoded.map_err(Failure::in_file(&args.input))?;
     let known = scene.axes().unwrap_or_default();
-    let axes = match args.up.map_or(known.up, |up| up.up().or(known.up)) {
+    let axes = match cloud::up_of(args.up, &known) {
         _ if args.keep_axes => Axes::of(format),
         Some(up) => Axes::Cloud(up),
         None => Axes::Ply,
