@@ -1,4 +1,4 @@
-//! Motion of blocks between frames, and which blocks stay what they were.
+//! Motion of blocks between frames.
 
 use rayon::prelude::*;
 
