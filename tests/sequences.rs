@@ -60,6 +60,28 @@ fn every_frame_decodes_alone_and_in_order_at_every_level() {
 }
 
 #[test]
+fn every_level_of_a_scalable_sequence_decodes_for_more_bits() {
+    let encode = |scalable| {
+        let encoder = encoder().with_scalability(scalable);
+        encoder
+            .encode(3, |frame| Ok(moving(frame)), |_| {})
+            .expect("a sequence")
+    };
+    let (usual, scalable) = (encode(false), encode(true));
+    assert!(usual.len() < scalable.len(), "{} and {}", usual.len(), scalable.len());
+    for level in 3..=5 {
+        for number in 0..3 {
+            let (keys, _) = frame(&reader(&scalable), number, Some(level)).expect("a frame");
+            let (same, _) = frame(&reader(&usual), number, Some(level)).expect("a frame");
+            assert!(
+                keys.len().abs_diff(same.len()) < same.len() / 8,
+                "level {level}, frame {number}"
+            );
+        }
+    }
+}
+
+#[test]
 fn another_level_from_any_frame_on_does_not_change_what_is_decoded() {
     let bytes = encoded(7);
     let sequence = reader(&bytes);
@@ -250,6 +272,45 @@ fn a_moved_cloud_takes_fewer_bits_than_a_whole_frame() {
         assert!(!group.is_whole(at));
         let bytes = [0, at].map(|at| group.frame_bytes(at));
         assert!(4 * bytes[1] < 3 * bytes[0], "{bytes:?}");
+    }
+}
+
+#[test]
+fn a_moved_surface_of_other_sample_points_takes_a_fraction_of_the_bits() {
+    let cloud = |frame: u64| {
+        let cloud = still(frame);
+        let moved = |key: &u64| {
+            let [x, y, z] = morton::decode(*key);
+            morton::encode([x + 4 * frame as u32, y + 2 * frame as u32, z])
+        };
+        let pairs = cloud.voxels.keys().iter().map(moved).zip(cloud.colours.iter().copied());
+        let mut voxels: Vec<_> = pairs.collect();
+        voxels.sort_unstable();
+        ColouredVoxels {
+            voxels: Voxels::new(8, voxels.iter().map(|voxel| voxel.0).collect()),
+            colours: voxels.iter().map(|voxel| voxel.1).collect(),
+            placement: Placement::VOXEL_GRID,
+        }
+    };
+    let encoder = SequenceEncoder::new().with_levels(4..=7);
+    let bytes = encoder.encode(3, |frame| Ok(cloud(frame)), |_| {}).expect("a sequence");
+    let sequence = reader(&bytes);
+    let group = sequence.group(0).expect("a group");
+    let sizes: Vec<u64> = (0..3).map(|at| group.frame_bytes(at)).collect();
+    assert!(2 * sizes[1] < sizes[0] && 2 * sizes[2] < sizes[0], "{sizes:?}");
+    // Each true voxel has one of the frame within one.
+    for number in 0..3 {
+        let (keys, _) = frame(&sequence, number, None).expect("a frame");
+        let near = |key: &u64| {
+            let at = morton::decode(key >> 3).map(|x| x as i32);
+            (0..27).any(|k| {
+                let place = [at[0] + k % 3 - 1, at[1] + k / 3 % 3 - 1, at[2] + k / 9 - 1];
+                place.iter().all(|x| *x >= 0) && keys.binary_search(&morton::encode(place.map(|x| x as u32))).is_ok()
+            })
+        };
+        let cloud = cloud(number);
+        let far = cloud.voxels.keys().iter().filter(|key| !near(key)).count();
+        assert!(1000 * far <= cloud.voxels.len(), "frame {number}: {far} voxels");
     }
 }
 

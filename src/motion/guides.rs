@@ -4,6 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 
+use super::moved::Moved;
 use super::payload::{Blocks, Head, Modes};
 use super::previous::{Previous, PreviousLevel};
 use crate::colour::{self, Ycc};
@@ -21,6 +22,7 @@ pub struct Inter {
     /// The motion's bytes behind the head, then of each level after L, until the blocks are read.
     parts: Vec<Vec<u8>>,
     blocks: OnceLock<Blocks>,
+    moved: OnceLock<Moved>,
 }
 
 /// What a previous frame tells of the occupancies of a level.
@@ -86,6 +88,7 @@ impl Inter {
             base,
             parts,
             blocks: OnceLock::new(),
+            moved: OnceLock::new(),
         })
     }
 
@@ -97,6 +100,7 @@ impl Inter {
             base,
             parts: Vec::new(),
             blocks: OnceLock::from(blocks),
+            moved: OnceLock::new(),
         }
     }
 
@@ -110,7 +114,7 @@ impl Inter {
     /// # Errors
     /// [`Error::Malformed`] if the motion is damaged; [`Error::Usage`] if the previous frame lacks the level.
     pub fn geometry(&self, octree: &Octree, level: u8) -> Result<GeometryGuide> {
-        let (field, previous) = (self.field(octree, level)?, self.level(level)?);
+        let (field, previous) = self.source(octree, level)?;
         let voxels = octree.level(level - 1);
         let parents = (0..voxels.len()).into_par_iter().with_min_len(CHUNK);
         let (modes, windows) = parents
@@ -134,7 +138,7 @@ impl Inter {
     /// # Errors
     /// Those of [`Inter::geometry`].
     pub fn colours(&self, octree: &Octree, level: u8) -> Result<ColourGuide> {
-        let (field, previous) = (self.field(octree, level)?, self.level(level)?);
+        let (field, previous) = self.source(octree, level)?;
         let nodes = octree.level(level - 1);
         let masks = octree.occupancy(level - 1);
         let modes: Vec<Mode> = nodes.keys().iter().map(|key| field.at(*key).modes.colours).collect();
@@ -169,6 +173,41 @@ impl Inter {
             .ok_or_else(|| Error::Usage(format!("level {level} of the previous frame was not decoded")))
     }
 
+    /// The motion at `level`, and what it moves. The octree has the level above.
+    fn source<'a>(&'a self, octree: &'a Octree, level: u8) -> Result<(Field<'a>, &'a PreviousLevel)> {
+        let mut field = self.field(octree, level)?;
+        let Head {
+            block_level,
+            unit_level,
+            reference_level,
+            ..
+        } = self.head;
+        if !(block_level + 1..reference_level).contains(&level) {
+            return Ok((field, self.level(level)?));
+        }
+        let moved = match self.moved.get() {
+            Some(moved) => moved,
+            None => {
+                let shifts: Vec<_> = { self.vectors().iter() }
+                    .map(|vector| Block::new(Modes::default(), *vector, unit_level, reference_level).shift)
+                    .collect();
+                let levels = [block_level, reference_level];
+                let moved = Moved::new(self.level(reference_level)?, levels, field.keys, |i| shifts[i])?;
+                self.moved.get_or_init(|| moved)
+            }
+        };
+        field.blocks.iter_mut().for_each(Block::stop);
+        match moved.level(level) {
+            Some(level) => Ok((field, level)),
+            None => Err(Error::Usage(format!("level {level} was not moved"))),
+        }
+    }
+
+    /// Vectors of the blocks, once they are read.
+    fn vectors(&self) -> &[[i16; 3]] {
+        self.blocks.get().map_or(&[], |blocks| &blocks.vectors)
+    }
+
     /// The motion at `level`. The octree has the level above.
     fn field<'a>(&'a self, octree: &'a Octree, level: u8) -> Result<Field<'a>> {
         let head = &self.head;
@@ -185,7 +224,7 @@ impl Inter {
             Some(blocks) => blocks,
             None => {
                 let parts: Vec<&[u8]> = self.parts.iter().map(Vec::as_slice).collect();
-                let blocks = head.blocks(self.base, voxels.len(), &parts)?;
+                let blocks = head.blocks(self.base, voxels.keys(), &parts)?;
                 self.blocks.get_or_init(|| blocks)
             }
         };
@@ -238,6 +277,11 @@ impl Block {
             low: vector.map(|x| x >> down),
             part: vector.map(|x| ((x << 4) >> down) & 15),
         }
+    }
+
+    /// The same modes without motion.
+    fn stop(&mut self) {
+        (self.shift, self.low, self.part) = ([0; 3], [0; 3], [0; 3]);
     }
 }
 

@@ -1,8 +1,9 @@
 //! Prediction of a frame from the frame before it (`docs/format.md`, clauses 17.5 to 17.7).
 //!
 //! A frame is cut into *blocks*, the nodes of one coarse level. Each has a motion vector, and for every level one mode
-//! for its occupancies and one for its colours. All that a level is predicted from is the same level of the previous
-//! frame, as it was decoded, so that frames stay scalable and encoder and decoder never differ.
+//! for its occupancies and one for its colours. All that a level is predicted from is the previous frame as it was
+//! decoded, so that encoder and decoder never differ: the same level of it, or the moved frame that one finer level
+//! makes.
 //!
 //! - [`Previous`] is the previous frame, searched by position.
 //! - [`Head`] and [`Blocks`] are what a frame says of its blocks.
@@ -10,11 +11,12 @@
 
 mod bricks;
 mod guides;
+pub(crate) mod moved;
 mod payload;
 mod previous;
 
 pub use guides::{ColourGuide, GeometryGuide, Inter};
-pub use payload::{Blocks, Head, Modes};
+pub use payload::{Blocks, Head, Modes, predicted};
 pub use previous::{Previous, PreviousLevel};
 
 pub use crate::geometry::codec::guide::{Mode, own};

@@ -1,8 +1,10 @@
 //! What a predicted frame says of its blocks, as bytes (`docs/format.md`, clause 17.5).
 
+use super::moved::REACH;
 use crate::coding::binary::{Coder, Decoder};
 use crate::error::{Error, Result, Stage};
 use crate::geometry::codec::guide::Mode;
+use crate::geometry::morton;
 use crate::limits::MAX_DEPTH;
 
 /// Modes of a block at a level.
@@ -21,6 +23,9 @@ pub struct Head {
     pub block_level: u8,
     /// U: vectors are in voxels of this level.
     pub unit_level: u8,
+    /// R: the levels after B and before this one are predicted from the moved previous frame of level R, all others
+    /// from their own.
+    pub reference_level: u8,
     /// Modes of the levels 1 to B.
     pub root: Modes,
     /// Vector of the levels 1 to B.
@@ -37,7 +42,7 @@ pub struct Blocks {
 }
 
 /// Bytes of a head.
-const HEAD: usize = 9;
+const HEAD: usize = 10;
 /// Magnitudes from here on have an escape.
 const ESCAPE: usize = 14;
 
@@ -57,7 +62,7 @@ impl Head {
     pub fn parse(bytes: &[u8], base: u8, top: u8) -> Result<(Head, &[u8])> {
         let Some((head, rest)) = bytes.split_at_checked(HEAD) else {
             let value = format!("{} bytes", bytes.len());
-            return Err(malformed("17.5.1", "length of the motion", value, "9 or more"));
+            return Err(malformed("17.5.1", "length of the motion", value, "10 or more"));
         };
         let (block_level, unit_level) = (head[0], head[1]);
         if block_level > base {
@@ -72,19 +77,26 @@ impl Head {
             let expected = format!("{top} to {MAX_DEPTH}");
             return Err(malformed("17.5.1", "level of the vectors", unit_level, expected));
         }
-        let modes = (mode_of(head[2] & 15), mode_of(head[2] >> 4));
+        let reference_level = head[2];
+        let deepest = top.min(block_level + REACH);
+        if !(block_level..=deepest).contains(&reference_level) {
+            let expected = format!("{block_level} to {deepest}");
+            return Err(malformed("17.5.1", "reference level", reference_level, expected));
+        }
+        let modes = (mode_of(head[3] & 15), mode_of(head[3] >> 4));
         let (Some(geometry), Some(colours)) = modes else {
             return Err(malformed(
                 "17.5.1",
                 "modes of the frame",
-                head[2],
+                head[3],
                 "0 to 2 in each half",
             ));
         };
-        let component = |i: usize| i16::from_le_bytes([head[3 + 2 * i], head[4 + 2 * i]]);
+        let component = |i: usize| i16::from_le_bytes([head[4 + 2 * i], head[5 + 2 * i]]);
         let head = Head {
             block_level,
             unit_level,
+            reference_level,
             root: Modes { geometry, colours },
             vector: [0, 1, 2].map(component),
         };
@@ -97,6 +109,7 @@ impl Head {
         let mut bytes = vec![
             self.block_level,
             self.unit_level,
+            self.reference_level,
             self.root.geometry as u8 | (self.root.colours as u8) << 4,
         ];
         bytes.extend(self.vector.iter().flat_map(|x| x.to_le_bytes()));
@@ -115,24 +128,25 @@ impl Head {
         }
     }
 
-    /// Reads vectors and modes of `count` blocks: `parts` are the bytes behind the head, then those of each level after
-    /// `base`.
+    /// Reads vectors and modes of the blocks `keys`: `parts` are the bytes behind the head, then those of each level
+    /// after `base`.
     ///
     /// # Errors
     /// [`Error::Malformed`].
-    pub fn blocks(&self, base: u8, count: usize, parts: &[&[u8]]) -> Result<Blocks> {
+    pub fn blocks(&self, base: u8, keys: &[u64], parts: &[&[u8]]) -> Result<Blocks> {
+        let count = keys.len();
         let mut blocks = Blocks::default();
         let mut models = Models::new();
         for (i, part) in parts.iter().enumerate() {
             let mut coder = Decoder::new(part);
             let mut vectors = vec![[0; 3]; if i == 0 { count } else { 0 }];
             let levels = if i == 0 { base - self.block_level } else { 1 };
-            models.code_vectors(&mut coder, self.vector, &mut vectors)?;
-            for vector in &vectors {
-                self.check(*vector)?;
-            }
             if i == 0 {
-                blocks.vectors = vectors;
+                models.code_vectors(&mut coder, self.vector, keys, &mut vectors)?;
+                for vector in &vectors {
+                    self.check(*vector)?;
+                }
+                blocks.vectors = std::mem::take(&mut vectors);
             }
             for _ in 0..levels {
                 let mut modes = vec![Modes::default(); count];
@@ -149,7 +163,7 @@ impl Head {
     /// # Errors
     /// [`Error::Malformed`] if a number has no code.
     #[cfg(feature = "encoder")]
-    pub fn write(&self, base: u8, blocks: &Blocks) -> Result<Vec<Vec<u8>>> {
+    pub fn write(&self, base: u8, keys: &[u64], blocks: &Blocks) -> Result<Vec<Vec<u8>>> {
         let first = usize::from(base - self.block_level);
         let mut models = Models::new();
         let mut parts = Vec::new();
@@ -157,7 +171,7 @@ impl Head {
         for part in 0..=blocks.modes.len() - first {
             let mut coder = crate::coding::binary::Encoder::default();
             if part == 0 {
-                models.code_vectors(&mut coder, self.vector, &mut blocks.vectors.clone())?;
+                models.code_vectors(&mut coder, self.vector, keys, &mut blocks.vectors.clone())?;
             }
             let levels = if part == 0 {
                 0..first
@@ -193,8 +207,8 @@ impl Bit {
 
 /// Adaptive probabilities of a frame's motion.
 struct Models {
-    /// Whether a vector differs from the one before, by whether that one did.
-    differs: [Bit; 2],
+    /// Whether a vector differs from its prediction, by whether the one before did, and by how sure the prediction is.
+    differs: [[Bit; 3]; 2],
     /// Of a component: whether it differs, its sign, and whether its magnitude is greater.
     component: [[Bit; 2 + ESCAPE]; 3],
     /// Whether a mode is not 0, and then whether it is 2: by kind, mode at the level above, and mode of the block before.
@@ -205,29 +219,36 @@ impl Models {
     fn new() -> Self {
         let even = Bit(1 << 15);
         Models {
-            differs: [even; 2],
+            differs: [[even; 3]; 2],
             component: [[even; 2 + ESCAPE]; 3],
             modes: [[[[even; 2]; 3]; 4]; 2],
         }
     }
 
-    /// Codes vectors, each from the one before, the first from `vector`.
-    fn code_vectors(&mut self, coder: &mut impl Coder, vector: [i16; 3], vectors: &mut [[i16; 3]]) -> Result<()> {
-        let (mut before, mut differed) = (vector, false);
-        for vector in vectors {
-            differed = self.differs[usize::from(differed)].code(coder, *vector != before);
-            let mut found = before;
+    /// Codes the vectors of the blocks `keys`, each from those of its neighbours, the first from `vector`.
+    fn code_vectors(
+        &mut self,
+        coder: &mut impl Coder,
+        vector: [i16; 3],
+        keys: &[u64],
+        vectors: &mut [[i16; 3]],
+    ) -> Result<()> {
+        let mut differed = false;
+        for i in 0..keys.len() {
+            let (predicted, sure) = predicted(keys, &vectors[..i], vector);
+            let target = vectors[i];
+            differed = self.differs[usize::from(differed)][sure].code(coder, target != predicted);
+            let mut found = predicted;
             if differed {
                 for axis in 0..3 {
-                    let difference = i32::from(vector[axis]) - i32::from(before[axis]);
+                    let difference = i32::from(target[axis]) - i32::from(predicted[axis]);
                     let difference = self.code_component(coder, axis, difference)?;
-                    let sum = i16::try_from(i32::from(before[axis]) + difference);
+                    let sum = i16::try_from(i32::from(predicted[axis]) + difference);
                     found[axis] =
                         sum.map_err(|_| malformed("17.5.3", "motion vector", difference, "a sum of 16 bits"))?;
                 }
             }
-            *vector = found;
-            before = found;
+            vectors[i] = found;
         }
         Ok(())
     }
@@ -282,6 +303,38 @@ impl Models {
     }
 }
 
+/// The prediction of a block's vector from those before it, `vectors`, and how sure it is: 0 if no neighbour is there, 1
+/// if neighbours differ, 2 if all are alike. Blocks are those of the nodes `keys`. The prediction is the median of the
+/// neighbours before along each axis; of two of them it is the first, and of none the vector before, or `start`.
+pub fn predicted(keys: &[u64], vectors: &[[i16; 3]], start: [i16; 3]) -> ([i16; 3], usize) {
+    let at = morton::decode(keys[vectors.len()]);
+    let mut around = [[0; 3]; 3];
+    let mut count = 0;
+    for axis in 0..3 {
+        let mut place = at;
+        let Some(before) = place[axis].checked_sub(1) else {
+            continue;
+        };
+        place[axis] = before;
+        // All of them have lower keys.
+        if let Ok(i) = keys[..vectors.len()].binary_search(&morton::encode(place)) {
+            around[count] = vectors[i];
+            count += 1;
+        }
+    }
+    let alike = around[..count].iter().all(|vector| *vector == around[0]);
+    let median = |axis: usize| {
+        let [a, b, c] = around.map(|vector: [i16; 3]| vector[axis]);
+        a.max(b).min(a.min(b).max(c))
+    };
+    let vector = match count {
+        0 => vectors.last().copied().unwrap_or(start),
+        3 => [0, 1, 2].map(median),
+        _ => around[0],
+    };
+    (vector, if count == 0 { 0 } else { 1 + usize::from(alike) })
+}
+
 /// Codes a number of up to 16 bits: one less than the bits of the number and 1, then these bits, all even.
 fn code_escape(coder: &mut impl Coder, value: u32) -> Result<u32> {
     let target = value + 1;
@@ -313,6 +366,7 @@ mod tests {
         Head {
             block_level,
             unit_level: 12,
+            reference_level: block_level + 1,
             root: Modes {
                 geometry: Mode::Skip,
                 colours: Mode::Inter,
@@ -337,20 +391,22 @@ mod tests {
             let (base, top) = (6, 6 + all.len() as u8 - 2);
             let head = head(4);
             let modes = all.iter().map(|modes| modes[..vectors.len()].to_vec()).collect();
+            let vectors_len = vectors.len();
             let blocks = Blocks { vectors, modes };
-            let parts = head.write(base, &blocks).unwrap();
+            let keys: Vec<u64> = (0..vectors_len as u64).map(|i| i * i / 2 + i).collect();
+            let parts = head.write(base, &keys, &blocks).unwrap();
             prop_assert_eq!(parts.len(), usize::from(top - base) + 1);
             let (read, first) = Head::parse(&parts[0], base, top).unwrap();
             prop_assert_eq!(read, head);
             let mut behind: Vec<&[u8]> = parts.iter().map(Vec::as_slice).collect();
             behind[0] = first;
-            prop_assert_eq!(read.blocks(base, blocks.vectors.len(), &behind).unwrap(), blocks);
+            prop_assert_eq!(read.blocks(base, &keys, &behind).unwrap(), blocks);
         }
 
         #[test]
         fn any_bytes_are_read_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..80), count in 1usize..50) {
             if let Ok((head, rest)) = Head::parse(&bytes, 6, 9)
-                && let Ok(blocks) = head.blocks(6, count, &[rest])
+                && let Ok(blocks) = head.blocks(6, &(0..count as u64).collect::<Vec<_>>(), &[rest])
             {
                 prop_assert_eq!(blocks.vectors.len(), count);
             }
@@ -374,7 +430,14 @@ mod tests {
             let other = Head { unit_level, ..head(5) };
             assert_eq!(clause(other).err(), Some(Some("17.5.1")));
         }
-        let short = Head::parse(&[0; 8], 6, 9).expect_err("too short");
+        for reference_level in [4, 10] {
+            let other = Head {
+                reference_level,
+                ..head(5)
+            };
+            assert_eq!(clause(other).err(), Some(Some("17.5.1")));
+        }
+        let short = Head::parse(&[0; 9], 6, 9).expect_err("too short");
         assert_eq!(short.clause(), Some("17.5.1"));
     }
 }

@@ -12,7 +12,7 @@ pub struct Previous {
 }
 
 /// A level of a decoded frame.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct PreviousLevel {
     pub(super) bricks: Bricks,
     /// Y, Co and Cg of every voxel before the filter.
@@ -48,7 +48,7 @@ impl Previous {
 }
 
 impl PreviousLevel {
-    fn new(voxels: &Voxels, values: Vec<Ycc>, filter: Option<Filter>) -> Self {
+    pub(super) fn new(voxels: &Voxels, values: Vec<Ycc>, filter: Option<Filter>) -> Self {
         assert_eq!(voxels.len(), values.len(), "one colour per voxel");
         PreviousLevel {
             bricks: Bricks::new(voxels),
@@ -61,6 +61,26 @@ impl PreviousLevel {
     /// deeper.
     pub fn blocks(&self, level: u8, block: u8) -> Vec<u64> {
         self.bricks.nodes(3 * u32::from(level.saturating_sub(2 + block)))
+    }
+
+    /// Calls `each` with the place and number of all voxels in a box of `side`³ cells from the place `first` on.
+    pub fn in_box(&self, first: [i32; 3], side: i32, mut each: impl FnMut([i32; 3], usize)) {
+        for window in 0..(side as u32).div_ceil(4).pow(3) as i32 {
+            let count = (side + 3) / 4;
+            let place = [window % count, window / count % count, window / count / count];
+            let at = [0, 1, 2].map(|axis| first[axis] + 4 * place[axis]);
+            let mut cells = self.window(at);
+            while cells != 0 {
+                let cell = cells.trailing_zeros() as i32;
+                cells &= cells - 1;
+                let here = [0, 1, 2].map(|axis| at[axis] + (cell >> (2 * axis) & 3));
+                // Boxes of less than 4³ cells end before the window does.
+                let inside = (0..3).all(|axis| here[axis] - first[axis] < side);
+                if let Some(index) = self.index(here).filter(|_| inside) {
+                    each(here, index);
+                }
+            }
+        }
     }
 
     /// The number of the voxel at this place, if there is one.

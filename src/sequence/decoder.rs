@@ -82,17 +82,33 @@ impl SequenceDecoder {
     fn in_group(&mut self, group: &Group, frame: u64) -> Result<DecodedFrame> {
         let at = (frame - group.first()) as usize;
         let whole = (0..=at).rev().find(|at| group.is_whole(*at)).unwrap_or(0);
+        let shown = self.decoder.last_level(&group.frame_header(at));
+        let needed = needed(group, whole..at, shown)?;
         let last = self.last.take().filter(|last| last.group == group.hash());
-        let level = self.decoder.last_level(&group.frame_header(at));
-        let mut last = last.filter(|last| (whole..at).contains(&last.at) && last.level >= level);
+        let fits = |last: &Last| (whole..at).contains(&last.at) && last.level >= needed[last.at - whole];
+        let mut last = last.filter(fits);
         let start = last.as_ref().map_or(whole, |last| last.at + 1);
         for before in start..at {
-            let mut decoding = self.decoded(group, before, last.as_ref())?;
+            let level = needed[before - whole];
+            let mut decoding = self.decoded(group, before, last.as_ref(), level)?;
             last = kept(&mut decoding, group, before, level);
         }
-        let mut decoding = self.decoded(group, at, last.as_ref())?;
-        if at + 1 < group.len() && !group.is_whole(at + 1) {
-            self.last = kept(&mut decoding, group, at, level);
+        let follows = at + 1 < group.len() && !group.is_whole(at + 1);
+        let next = if follows {
+            group.reference_level(at + 1).ok()
+        } else {
+            None
+        };
+        // What the next frame is predicted from may be finer than what is shown.
+        if let Some(level) = next.filter(|next| *next > shown) {
+            let decoded = self.decoded(group, at, last.as_ref(), level);
+            self.last = decoded
+                .ok()
+                .and_then(|mut decoding| kept(&mut decoding, group, at, level));
+        }
+        let mut decoding = self.decoded(group, at, last.as_ref(), shown)?;
+        if next.is_some_and(|next| next <= shown) {
+            self.last = kept(&mut decoding, group, at, shown);
         }
         Ok(DecodedFrame {
             number: frame,
@@ -100,8 +116,8 @@ impl SequenceDecoder {
         })
     }
 
-    /// Decodes the frame at a place of the group, given the frame before it.
-    fn decoded(&self, group: &Group, at: usize, last: Option<&Last>) -> Result<Decoding<'static>> {
+    /// Decodes the frame at a place of the group down to `level`, given the frame before it.
+    fn decoded(&self, group: &Group, at: usize, last: Option<&Last>, level: u8) -> Result<Decoding<'static>> {
         let decoded = || {
             let (stream, motion) = group.stream(at);
             let header = group.frame_header(at);
@@ -109,7 +125,7 @@ impl SequenceDecoder {
                 (true, _) => None,
                 (false, None) => return Err(Error::Usage("the frame before was not decoded".into())),
                 (false, Some(last)) => {
-                    self.check_memory(&header, group)?;
+                    self.check_memory(&header, group, level)?;
                     Some(Inter::new(
                         Arc::clone(&last.previous),
                         &motion,
@@ -118,7 +134,8 @@ impl SequenceDecoder {
                     )?)
                 }
             };
-            let mut decoding = self.decoder.start_frame(stream, inter);
+            let decoder = self.decoder.clone().with_level(level);
+            let mut decoding = decoder.start_frame(stream, inter);
             decoding.finish()?;
             Ok(decoding)
         };
@@ -129,18 +146,34 @@ impl SequenceDecoder {
     }
 
     /// Checks that a frame and the one before it fit the limits. Both have at most the voxels that the sequence states.
-    fn check_memory(&self, header: &Header, group: &Group) -> Result<()> {
-        let top = self.decoder.last_level(header);
+    /// The moved frame has at most twice as many.
+    fn check_memory(&self, header: &Header, group: &Group, top: u8) -> Result<()> {
         let most = group.common.voxels(top)?;
         // Levels above the last one have a third of its voxels, more or less; never more than each as many.
         let levels = u64::from(top) + 1;
         let voxels = u64::from(most).saturating_mul(levels.min(4));
-        let kept = voxels.saturating_mul(Previous::bytes_per_voxel() as u64);
+        let kept = voxels.saturating_mul(3 * Previous::bytes_per_voxel() as u64);
         let bytes = self.decoder.memory(header, top)?.saturating_add(kept);
         self.decoder
             .limits()
             .check_bytes("memory to decode this sequence", bytes)
     }
+}
+
+/// The levels that the frames at `places` must be decoded to so that the frame behind them can be shown at level `shown`.
+fn needed(group: &Group, places: Range<usize>, shown: u8) -> Result<Vec<u8>> {
+    let mut level = shown;
+    let mut levels = Vec::with_capacity(places.len());
+    for next in (places.start + 1..=places.end).rev() {
+        let reference = group.reference_level(next).map_err(|source| Error::Frame {
+            frame: group.first() + next as u64,
+            source: Box::new(source),
+        })?;
+        level = level.max(reference);
+        levels.push(level);
+    }
+    levels.reverse();
+    Ok(levels)
 }
 
 /// What a frame that was decoded down to `level` leaves for the next one.
@@ -211,5 +244,41 @@ impl Iterator for GaussianFrames<'_> {
         let (gaussians, next) = rayon::join(|| frame?.gaussians(), || frames.next());
         self.next = next;
         Some(gaussians)
+    }
+}
+
+#[cfg(all(test, feature = "encoder"))]
+mod tests {
+    use super::*;
+    use crate::cloud::ColouredVoxels;
+    use crate::geometry::{Voxels, morton};
+    use crate::limits::Limits;
+    use crate::placement::Placement;
+    use crate::sequence::SequenceEncoder;
+
+    /// Three frames of a slanted plane that moves by a voxel a frame.
+    fn sequence(scalable: bool) -> Vec<u8> {
+        let cloud = |frame: u64| {
+            let key = |i: u32| morton::encode([i % 64, i / 64, i % 64 / 2 + frame as u32]);
+            let mut keys: Vec<u64> = (0..64 * 64).map(key).collect();
+            keys.sort_unstable();
+            let colour = |key: &u64| [(key % 251) as u8, 100, 50];
+            Ok(ColouredVoxels {
+                colours: keys.iter().map(colour).collect(),
+                voxels: Voxels::new(6, keys),
+                placement: Placement::VOXEL_GRID,
+            })
+        };
+        let encoder = SequenceEncoder::new().with_levels(3..=5).with_scalability(scalable);
+        encoder.encode(3, cloud, |_| {}).unwrap()
+    }
+
+    #[test]
+    fn a_coarse_level_needs_finer_ones_of_the_frames_before_unless_the_sequence_is_scalable() {
+        for (scalable, expected) in [(true, [4, 4]), (false, [5, 5])] {
+            let bytes = sequence(scalable);
+            let reader = SequenceReader::new(&bytes[..], &Limits::default()).unwrap();
+            assert_eq!(needed(&reader.group(0).unwrap(), 0..2, 4).unwrap(), expected);
+        }
     }
 }

@@ -12,7 +12,7 @@ use crate::cloud::ColouredVoxels;
 use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
 use crate::container::{Header, with_axes};
 use crate::decoder::Decoder;
-use crate::encoder::transform::{self, Errors, Known, Options, QualityTarget};
+use crate::encoder::transform::{self, Options, QualityTarget};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -52,13 +52,7 @@ struct Frame {
     header: Header,
     coded: Coded,
     /// What the next frame is predicted from.
-    next: Option<Reference>,
-}
-
-/// A decoded frame, and what the encoder knows of it.
-struct Reference {
-    decoded: Arc<Previous>,
-    errors: Errors,
+    next: Option<Arc<Previous>>,
 }
 
 impl SequenceEncoder {
@@ -103,6 +97,14 @@ impl SequenceEncoder {
     /// The same encoder, which predicts frames from the frame before or codes each by itself. Default: it predicts.
     pub fn with_prediction(mut self, predicted: bool) -> Self {
         self.predicted = predicted;
+        self
+    }
+
+    /// The same encoder, which predicts each level from the same level of the frame before if `scalable`, else the coarser
+    /// levels from the finest one. That takes far fewer bits, but a decoder that shows a coarser level then decodes the
+    /// finest one, too. Default: not scalable.
+    pub fn with_scalability(mut self, scalable: bool) -> Self {
+        self.options.scalable = scalable;
         self
     }
 
@@ -184,18 +186,23 @@ impl SequenceEncoder {
     }
 
     /// Codes a frame, from the frame before if there is one in the group.
-    fn frame(&self, cloud: &ColouredVoxels, previous: Option<&Reference>, ticks: u32, follows: bool) -> Result<Frame> {
+    fn frame(
+        &self,
+        cloud: &ColouredVoxels,
+        previous: Option<&Arc<Previous>>,
+        ticks: u32,
+        follows: bool,
+    ) -> Result<Frame> {
         let log = Log::off().with_cancel(self.cancel.clone());
         let options = &self.options;
-        let (stream, motion, known) = match previous {
+        let (stream, motion) = match previous {
             None => {
                 let stream = transform::encode(cloud, options, &log)?.bytes;
-                let known = follows.then(|| Known::of_whole(cloud, options, &log));
-                (with_axes(&stream, &self.axes)?, Vec::new(), known.transpose()?)
+                (with_axes(&stream, &self.axes)?, Vec::new())
             }
-            Some(Reference { decoded, errors }) => {
-                let frame = transform::encode_predicted(cloud, decoded, errors, options, &log)?;
-                (frame.stream, frame.motion, Some(frame.known))
+            Some(previous) => {
+                let frame = transform::encode_predicted(cloud, previous, options, &log)?;
+                (frame.stream, frame.motion)
             }
         };
         let header = Header::parse(&stream, &Limits::unlimited())?;
@@ -205,15 +212,12 @@ impl SequenceEncoder {
             // What the next frame is predicted from is what the decoder will have.
             let inter = previous.map(|previous| {
                 let motion: Vec<&[u8]> = motion.iter().map(Vec::as_slice).collect();
-                Inter::new(Arc::clone(&previous.decoded), &motion, header.base, header.top)
+                Inter::new(Arc::clone(previous), &motion, header.base, header.top)
             });
             let decoder = Decoder::new().with_limits(Limits::unlimited()).with_level(header.top);
             let mut decoding = decoder.start_frame(stream, inter.transpose()?);
             decoding.finish()?;
-            next = decoding.take_previous().zip(known).map(|(decoded, known)| Reference {
-                errors: known.errors(&decoded),
-                decoded: Arc::new(decoded),
-            });
+            next = decoding.take_previous().map(Arc::new);
         }
         Ok(Frame { header, coded, next })
     }

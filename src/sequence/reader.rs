@@ -7,6 +7,7 @@ use crate::container::sequence::{FrameEntry, FrameKind, GroupEntry, Index, parse
 use crate::container::{Header, axes};
 use crate::error::{Error, Result, Stage};
 use crate::limits::Limits;
+use crate::motion::Head;
 
 /// Header and index of a sequence. Its groups are read when they are asked for, so that one that is damaged or missing
 /// leaves the others usable.
@@ -250,6 +251,19 @@ impl Group<'_> {
     /// What tells the group from others.
     pub(super) fn hash(&self) -> u64 {
         self.entry.hash
+    }
+
+    /// The level that the frame before must be decoded to at least, so that the predicted frame at this place in the
+    /// group can be decoded.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if the frame's motion is damaged.
+    pub(super) fn reference_level(&self, at: usize) -> Result<u8> {
+        let frame = &self.frames[at];
+        let motion = frame.levels.first().map_or(0, |level| level.motion as usize);
+        let bytes = &self.bytes[frame.offset as usize..][..motion];
+        let (head, _) = Head::parse(bytes, self.common.base, self.common.top)?;
+        Ok(head.reference_level)
     }
 
     /// The sections of a frame behind a header of its own: a stream of one frame, if the frame is whole. With the

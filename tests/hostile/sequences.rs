@@ -129,7 +129,7 @@ fn vectors_out_of_range_are_refused_and_name_the_clause() {
     let bytes = sequence();
     let (header, index, mut group) = parts(&bytes);
     let table = parse_table(&group, &index.groups[0], &header, &Limits::default()).expect("a table");
-    let vector = table[1].offset as usize + 3;
+    let vector = table[1].offset as usize + 4;
     group[vector..vector + 2].copy_from_slice(&i16::MIN.to_le_bytes());
     let found = frames(&with_group(&bytes, &group)).expect("a sequence");
     let error = found[1].as_ref().expect_err("a vector out of range");

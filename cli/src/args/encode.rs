@@ -98,6 +98,10 @@ pub struct SequenceArgs {
     /// Code every frame by itself
     #[arg(long)]
     pub intra: bool,
+    /// Predict each level from the same level: a coarser level of all frames decodes without the finer ones, for more
+    /// bits
+    #[arg(long)]
+    pub scalable: bool,
 }
 
 impl SequenceArgs {
@@ -112,6 +116,7 @@ impl SequenceArgs {
             ("--fps", self.fps.is_some()),
             ("--bitrate", self.bitrate.is_some()),
             ("--intra", self.intra),
+            ("--scalable", self.scalable),
         ];
         all.iter().find(|(_, given)| *given).map(|(name, _)| *name)
     }

@@ -38,6 +38,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         .with_frame_rate(timescale, duration)
         .with_group(args.sequence.gop)
         .with_prediction(!args.sequence.intra)
+        .with_scalability(args.sequence.scalable)
         .with_axes(axes);
     let finished = AtomicU64::new(0);
     let done = |_: u64| {

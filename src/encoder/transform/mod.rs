@@ -1,5 +1,6 @@
 //! Streams of version 3: colours as transform coefficients.
 
+mod choice;
 mod head_maps;
 mod knobs;
 mod memory;
@@ -30,8 +31,7 @@ use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
 pub use memory::encode_memory;
-pub use motion::Errors;
-pub use predicted::{Known, PredictedFrame, encode_predicted};
+pub use predicted::{PredictedFrame, encode_predicted};
 pub use rate_control::encode_to_rate;
 pub use shape::GeometryTarget;
 use shape::Shape;
@@ -76,6 +76,8 @@ pub struct Options {
     /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`]: fewer let more threads decode a level, and cost
     /// bits.
     pub colour_slice: u32,
+    /// For frames of a sequence: whether a decoder of a level of all frames needs no finer level of any.
+    pub scalable: bool,
     /// Heads whose pictures are compared with those of surfels, so that the stream says where surfels are better;
     /// `None` for no head maps.
     pub heads: Option<HeadsModel>,
@@ -94,6 +96,7 @@ impl Default for Options {
             tries: usize::MAX,
             slice_voxels: MAX_SLICE_VOXELS,
             colour_slice: COLOUR_SLICE,
+            scalable: false,
             heads: None,
             isa: None,
         }

@@ -5,13 +5,15 @@ use std::sync::Arc;
 use b2p_kernels::Isa;
 use rayon::prelude::*;
 
-use super::motion::{Block, Errors, Search, Tolerance};
+use super::choice::{self, Shown, Weights};
+use super::motion::{Block, Search};
 use super::{EncoderInput, Guides, Options, choose_levels, octree_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth, Ycc};
 use crate::error::Result;
-use crate::geometry::{Octree, Voxels, morton};
+use crate::geometry::{Octree, Voxels};
 use crate::log::Log;
+use crate::motion::moved::{self, REACH};
 use crate::motion::{Blocks, Head, Inter, Mode, Modes, Previous, own};
 
 /// A coded frame that is predicted from the frame before.
@@ -21,66 +23,26 @@ pub struct PredictedFrame {
     pub stream: Vec<u8>,
     /// The motion of each level, from the base level on.
     pub motion: Vec<Vec<u8>>,
-    /// What is to be known of the frame, once it is decoded, to code the next one.
-    pub known: Known,
 }
 
-/// What an encoder knows of a frame beside what the decoder does.
-#[derive(Debug)]
-pub struct Known {
-    octree: Octree,
-    truth: Truth,
-    blocks: Vec<Block>,
-    top: u8,
-    block_level: u8,
-}
-
-impl Known {
-    /// What is known of a whole frame.
-    ///
-    /// # Errors
-    /// Those of [`encode`](super::encode).
-    pub fn of_whole(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<Self> {
-        let lossless = options.fineness.steps()?.is_lossless();
-        let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
-        let (base, top) = (*levels.start(), *levels.end());
-        let octree = octree_of(cloud, top, log)?;
-        let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, lossless);
-        Ok(Known {
-            octree,
-            truth,
-            blocks: Vec::new(),
-            top,
-            block_level: block_level(base, top),
-        })
-    }
-
-    /// The errors of the frame as it was decoded.
-    pub fn errors(&self, decoded: &Previous) -> Errors {
-        let Known { octree, truth, .. } = self;
-        super::motion::errors(octree, truth, decoded, self.top, &self.blocks, self.block_level)
-    }
-}
-
-/// The level whose nodes are the blocks. Bricks of 4³ voxels lie within blocks.
+/// The level whose nodes are the blocks.
 fn block_level(base: u8, top: u8) -> u8 {
-    base.min(BLOCK_LEVEL).min(top.saturating_sub(2))
+    base.min(top.saturating_sub(BLOCK_DEPTH))
 }
 
-/// The level whose nodes are the blocks, if the base level is not above it.
-const BLOCK_LEVEL: u8 = 5;
+/// Levels from the blocks to the finest one: blocks have 16³ voxels, if the base level is not above them.
+const BLOCK_DEPTH: u8 = 4;
 /// Colours of a block are predicted from the previous frame if what is left is at most this share of the differences.
 const INTER_COLOURS: f32 = 0.9;
 
 /// Codes a cloud as a frame that is predicted from `previous`, the frame before as it was decoded, down to the last
-/// level of `options`. `errors` are those of its blocks.
+/// level of `options`.
 ///
 /// # Errors
 /// Those of [`encode`](super::encode).
 pub fn encode_predicted(
     cloud: &ColouredVoxels,
     previous: &Arc<Previous>,
-    errors: &Errors,
     options: &Options,
     log: &Log,
 ) -> Result<PredictedFrame> {
@@ -90,14 +52,29 @@ pub fn encode_predicted(
     let octree = octree_of(cloud, top, log)?;
     let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, steps.is_lossless());
     let block_level = block_level(base, top);
-    let target = Target::new(&octree, &truth, (previous, errors), [block_level, top], steps)?;
+    let target = Target::new(cloud, &octree, &truth, previous, [block_level, top], steps)?;
     let head = Head {
         block_level,
         unit_level: top,
+        reference_level: if options.scalable { base } else { top }.min(block_level + REACH),
         root: target.root,
         vector: [0; 3],
     };
-    let plan = target.modes(previous, head, base)?;
+    let plan = match target.modes(previous, head, base) {
+        // Blocks that come from the same place may together have too many voxels.
+        Err(error) if error.clause() == Some(moved::TOO_MANY) => {
+            let reference_level = block_level;
+            target.modes(
+                previous,
+                Head {
+                    reference_level,
+                    ..head
+                },
+                base,
+            )?
+        }
+        plan => plan?,
+    };
     let inter = Inter::of(Arc::clone(previous), plan.head, plan.blocks.clone(), base);
     let guides = Guides {
         geometry: (1..=top)
@@ -127,18 +104,12 @@ pub fn encode_predicted(
     };
     let subject = subject.with_octree(target.octree, top, log)?;
     let stream = subject.code_towards(&target.truth, top, steps, None, log)?.bytes;
-    let motion = plan.head.write(base, &plan.blocks)?;
-    let known = Known {
-        octree,
-        truth,
-        blocks: target.blocks,
-        top,
-        block_level,
-    };
-    Ok(PredictedFrame { stream, motion, known })
+    let keys: Vec<u64> = target.blocks.iter().map(|block| block.key).collect();
+    let motion = plan.head.write(base, &keys, &plan.blocks)?;
+    Ok(PredictedFrame { stream, motion })
 }
 
-/// What a frame is to decode to: its own voxels, and the moved previous ones where these differ by noise alone.
+/// What a frame is to decode to: its own voxels and those of the moved previous frame, as `choice` says.
 struct Target {
     octree: Octree,
     truth: Truth,
@@ -158,12 +129,14 @@ struct Plan {
 
 impl Target {
     fn new(
+        cloud: &ColouredVoxels,
         octree: &Octree,
         truth: &Truth,
-        (previous, errors): (&Arc<Previous>, &Errors),
+        previous: &Arc<Previous>,
         [block_level, top]: [u8; 2],
         steps: Steps,
     ) -> Result<Self> {
+        let lossless = steps.is_lossless();
         let levels = (0..=top).map(|level| (truth.level(level).to_vec(), None));
         let current = Previous::new(octree, levels.collect());
         let search = Search {
@@ -171,38 +144,36 @@ impl Target {
             truth,
             previous,
             current: &current,
-            errors,
             top,
             block_level,
         };
-        let step = steps.luma_step() * 64.0;
-        let tolerance = Tolerance {
-            near: 0.6,
-            far: 0.01,
-            drift: 0.2,
-            error: (0.4 * step).powi(2),
-            worse: [2.0, (0.3 * step).powi(2)],
-            mean: 0.3 * step,
+        let weights = Weights::of_step(steps.luma_step());
+        let mut blocks = search.blocks(weights);
+        let choose = |block: &mut Block| match lossless {
+            true => choice::own(&search, block),
+            false => choice::choose(&search, block, weights),
         };
-        let mut blocks = search.blocks((!steps.is_lossless()).then_some(tolerance));
-        let parts = |blocks: &[Block]| -> Vec<Vec<(u64, Ycc)>> {
-            blocks.par_iter().map(|block| voxels_of(&search, block)).collect()
-        };
-        let mut all = parts(&blocks);
-        if all.iter().all(Vec::is_empty) {
+        let mut shown: Vec<Shown> = blocks.par_iter_mut().map(choose).collect();
+        if shown.iter().all(Vec::is_empty) {
             // A frame has at least one voxel.
-            blocks.iter_mut().for_each(|block| block.keep = false);
-            all = parts(&blocks);
+            for (shown, block) in shown.iter_mut().zip(&mut blocks) {
+                block.keep = false;
+                *shown = choice::own(&search, block);
+            }
         }
-        let parts = all;
-        let kept = blocks.into_iter().zip(&parts).filter(|(_, part)| !part.is_empty());
+        let kept = blocks.into_iter().zip(&shown).filter(|(_, shown)| !shown.is_empty());
         let blocks: Vec<Block> = kept.map(|(block, _)| block).collect();
-        let mut all: Vec<(u64, Ycc)> = parts.concat();
+        let mut all: Vec<(u64, Option<Ycc>)> = shown.concat();
         all.sort_unstable_by_key(|voxel| voxel.0);
         let keys = all.iter().map(|voxel| voxel.0).collect();
         let octree = Octree::new(Voxels::from_sorted(top, keys))?;
-        let values = all.into_iter().map(|voxel| voxel.1).collect();
-        let truth = Truth::of_values(&octree, top, values, steps.is_lossless());
+        let own = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, lossless);
+        let values = all
+            .iter()
+            .zip(own.level(top))
+            .map(|((_, copied), own)| copied.unwrap_or(*own))
+            .collect();
+        let truth = Truth::of_values(&octree, top, values, lossless);
         Ok(Target {
             octree,
             truth,
@@ -213,7 +184,7 @@ impl Target {
             },
             top,
             block_level,
-            lossless: steps.is_lossless(),
+            lossless,
         })
     }
 
@@ -364,19 +335,4 @@ impl Votes {
         };
         Modes { geometry, colours }
     }
-}
-
-/// Keys and colours of the voxels that a block is to have.
-fn voxels_of(search: &Search, block: &Block) -> Vec<(u64, Ycc)> {
-    if !block.keep {
-        let (keys, values) = (search.octree.level(search.top).keys(), search.truth.level(search.top));
-        let own = search.voxels(search.top, block.key);
-        return own.map(|i| (keys[i], values[i])).collect();
-    }
-    let Some(previous) = search.previous.level(search.top) else {
-        return Vec::new();
-    };
-    let key = |at: [i32; 3]| morton::encode(at.map(|x| x as u32));
-    let moved = search.moved(block).into_iter();
-    moved.map(|(at, index)| (key(at), previous.values[index])).collect()
 }

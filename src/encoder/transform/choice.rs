@@ -1,0 +1,291 @@
+//! Rate–distortion choice of what the blocks of a predicted frame show.
+//!
+//! Two samplings of one surface differ in many voxels, and coding them tells nothing of the surface. Each cell of 4³
+//! voxels of the finest level therefore shows what minimises D + λ·R of
+//!
+//! - *copy*: the voxels of the moved previous frame;
+//! - *mend*: the same without those that have no true voxel within one, with the true ones that have no copied one
+//!   within one;
+//! - *own*: the true voxels.
+//!
+//! A block whose cells are all copied, colours included, is *kept*, if coding what differs saves less distortion than
+//! it costs bits. D is compared with the true frame, never with the previous one, so that errors do not add up.
+
+use super::motion::{AROUND, Block, CENTRE, Search};
+use crate::colour::Ycc;
+use crate::geometry::morton;
+use crate::motion::PreviousLevel;
+
+/// Voxels along the side of a cell.
+const CELL: i32 = 4;
+/// λ, and the mean squared error up to which coefficients are not coded, in squared steps.
+const LAMBDA: f32 = 0.06;
+const FLOOR: f32 = 0.06;
+/// Squared error of luma, in 255ths, that stands for a squared voxel of displacement: about what pictures lose of both.
+const PLACE: f32 = 900.0;
+/// Bits of a voxel that is not where it is predicted.
+const CHANGED_BITS: f32 = 3.0;
+/// Bits of a voxel that is as it is predicted, in a block that is not kept: of its place and colour.
+const STEADY_BITS: f32 = 0.5;
+/// The square of a sum of displacements that chance alone brings, for each voxel that is displaced.
+const CHANCE: f32 = 0.7;
+
+/// What bits and errors are worth.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Weights {
+    /// Squared error of luma, in 255ths, that a bit must save.
+    pub lambda: f32,
+    /// Mean squared error up to which coefficients are not coded.
+    pub floor: f32,
+}
+
+impl Weights {
+    /// Those of a quantisation step of luma, in 255ths.
+    pub fn of_step(step: f32) -> Self {
+        Weights {
+            lambda: LAMBDA * step * step,
+            floor: FLOOR * step * step,
+        }
+    }
+}
+
+/// Voxels that a block shows: their keys, and their colours if they are copied.
+pub(super) type Shown = Vec<(u64, Option<Ycc>)>;
+
+/// A cell's differences between both frames.
+#[derive(Debug, Clone, Copy, Default)]
+struct Cell {
+    /// Voxels of either frame; those that have none at their place in the other; those that have none within one.
+    placed: f32,
+    near: f32,
+    far: f32,
+    displaced: [f32; 3],
+    /// Voxels whose colours were compared; sums of differences, and of their squares.
+    coloured: f32,
+    sums: [f32; 3],
+    squares: f32,
+    show: Show,
+}
+
+/// What a cell shows.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+enum Show {
+    #[default]
+    Copy,
+    Mend,
+    Own,
+}
+
+impl Cell {
+    /// Compares a voxel with the cells `around` it in the other frame. `sign` tells from which side.
+    fn place(&mut self, mut around: u64, sign: f32) {
+        self.placed += 1.0;
+        if around & CENTRE != 0 {
+            return;
+        }
+        if around == 0 {
+            self.far += 1.0;
+            return;
+        }
+        self.near += 1.0;
+        let weight = sign / around.count_ones() as f32;
+        while around != 0 {
+            let cell = around.trailing_zeros();
+            around &= around - 1;
+            for axis in 0..3 {
+                self.displaced[axis] += weight * ((cell >> (2 * axis) & 3) as f32 - 1.0);
+            }
+        }
+    }
+
+    /// Compares colours, in 255ths. As much error in red, green and blue comes of twice as much chroma.
+    fn colour(&mut self, apart: [f32; 3]) {
+        let apart = [apart[0], apart[1] / 2.0, apart[2] / 2.0];
+        self.coloured += 1.0;
+        for (sum, apart) in self.sums.iter_mut().zip(apart) {
+            *sum += apart;
+            self.squares += apart * apart;
+        }
+    }
+
+    /// Squared voxels of the cell's displacement as a whole, over its voxels, without what chance brings.
+    fn drift(&self) -> f32 {
+        if self.placed == 0.0 {
+            return 0.0;
+        }
+        let squares: f32 = self.displaced.iter().map(|sum| sum * sum).sum();
+        (squares - CHANCE * self.near).max(0.0) / self.placed
+    }
+
+    /// Chooses what is shown. Returns the Lagrangian costs of a copy, and of the choice.
+    fn choose(&mut self, weights: Weights) -> [f32; 2] {
+        // Both frames' voxels are counted.
+        let drift = PLACE * self.drift() / 2.0;
+        let changed = weights.lambda * CHANGED_BITS;
+        let copy = drift + PLACE * self.far;
+        let mend = drift + changed * self.far;
+        let own = changed * (self.far + self.near);
+        let (show, cost) = match () {
+            _ if copy <= mend && copy <= own => (Show::Copy, copy),
+            _ if mend <= own => (Show::Mend, mend),
+            _ => (Show::Own, own),
+        };
+        self.show = show;
+        [copy, cost]
+    }
+
+    /// Lagrangian costs of colours that are copied, and of coded ones.
+    fn colours(&self, weights: Weights) -> [f32; 2] {
+        if self.coloured == 0.0 {
+            return [0.0; 2];
+        }
+        let coded = |x: f32, count: f32| {
+            let mean = x / count;
+            match mean <= weights.floor {
+                true => x,
+                false => count * weights.floor * (1.0 + (mean / weights.floor).ln()),
+            }
+        };
+        let whole: f32 = self.sums.iter().map(|sum| sum * sum / self.coloured).sum();
+        let rest = (self.squares - whole).max(0.0);
+        let rate = weights.lambda * STEADY_BITS * self.coloured;
+        [whole + rest, coded(whole, 1.0) + coded(rest, self.coloured) + rate]
+    }
+}
+
+/// A block and the moved previous frame.
+struct Compared {
+    /// The places of its voxels, each with the 3³ cells around it in the moved previous frame.
+    own: Vec<([i32; 3], u64)>,
+    /// The voxels of the moved previous frame: places, numbers there, and the cells around them in this frame.
+    copied: Vec<([i32; 3], usize, u64)>,
+    cells: Vec<Cell>,
+    /// Voxels along its side.
+    side: i32,
+}
+
+impl Compared {
+    /// Compares a block with the previous frame moved by `vector`.
+    fn new(search: &Search, key: u64, vector: [i16; 3], [previous, current]: [&PreviousLevel; 2]) -> Self {
+        let side = 1i32 << (search.top - search.block_level);
+        let cells = (side / CELL).max(1);
+        let mut compared = Compared {
+            own: Vec::new(),
+            copied: Vec::new(),
+            cells: vec![Cell::default(); (cells * cells * cells) as usize],
+            side,
+        };
+        let around = |other: &PreviousLevel, at: [i32; 3]| other.window(at.map(|x| x - 1)) & AROUND;
+        let voxels = search.octree.level(search.top);
+        for i in search.voxels(search.top, key) {
+            let at = voxels.coordinate(i).map(|x| x as i32);
+            let from = [0, 1, 2].map(|axis| at[axis] - i32::from(vector[axis]));
+            let there = around(previous, from);
+            let number = compared.number(at);
+            let cell = &mut compared.cells[number];
+            cell.place(there, 1.0);
+            if let Some(colour) = colour_near(previous, from, there) {
+                let truth = search.truth.level(search.top)[i];
+                cell.colour([0, 1, 2].map(|t| (f32::from(truth[t]) - colour[t]) / 64.0));
+            }
+            compared.own.push((at, there));
+        }
+        for (at, index) in search.moved(key, vector) {
+            let (there, number) = (around(current, at), compared.number(at));
+            compared.cells[number].place(there, -1.0);
+            compared.copied.push((at, index, there));
+        }
+        compared
+    }
+
+    /// The cell that a place is in.
+    fn number(&self, at: [i32; 3]) -> usize {
+        let cells = (self.side / CELL).max(1);
+        let [x, y, z] = at.map(|x| (x & (self.side - 1)) / CELL);
+        (x + cells * (y + cells * z)) as usize
+    }
+
+    /// Lagrangian costs of a copy, and of what is best for each cell, which is chosen.
+    fn costs(&mut self, weights: Weights) -> [f32; 2] {
+        let mut costs = [0.0; 2];
+        for cell in &mut self.cells {
+            let (places, colours) = (cell.choose(weights), cell.colours(weights));
+            (0..2).for_each(|i| costs[i] += places[i] + colours[i]);
+        }
+        costs
+    }
+}
+
+/// The finest level of the previous frame, and of this one.
+fn levels<'a>(search: &'a Search) -> Option<[&'a PreviousLevel; 2]> {
+    Some([search.previous.level(search.top)?, search.current.level(search.top)?])
+}
+
+/// The least Lagrangian cost of a block whose vector is `vector`, without that of the vector.
+pub(super) fn cost(search: &Search, key: u64, vector: [i16; 3], weights: Weights) -> f32 {
+    let Some(levels) = levels(search) else {
+        return 0.0;
+    };
+    let [copy, coded] = Compared::new(search, key, vector, levels).costs(weights);
+    copy.min(coded)
+}
+
+/// Chooses what a block shows, and whether it is kept.
+pub(super) fn choose(search: &Search, block: &mut Block, weights: Weights) -> Shown {
+    let Some(levels) = levels(search) else {
+        return own(search, block);
+    };
+    let mut compared = Compared::new(search, block.key, block.vector, levels);
+    let costs = compared.costs(weights);
+    block.keep = costs[0] <= costs[1] && !compared.copied.is_empty();
+    let mut shown = Shown::new();
+    let key = |at: [i32; 3]| morton::encode(at.map(|x| x as u32));
+    for &(at, index, there) in &compared.copied {
+        let cell = &compared.cells[compared.number(at)];
+        let show = if block.keep { Show::Copy } else { cell.show };
+        match show {
+            Show::Own => {}
+            Show::Mend if there == 0 => {}
+            _ if block.keep || there & CENTRE == 0 => shown.push((key(at), Some(levels[0].values[index]))),
+            _ => shown.push((key(at), None)),
+        }
+    }
+    for &(at, there) in &compared.own {
+        let missing = match compared.cells[compared.number(at)].show {
+            Show::Own => true,
+            Show::Mend => there == 0,
+            Show::Copy => false,
+        };
+        if missing && !block.keep {
+            shown.push((key(at), None));
+        }
+    }
+    if shown.is_empty() && !block.keep {
+        return own(search, block);
+    }
+    shown
+}
+
+/// The block's true voxels.
+pub(super) fn own(search: &Search, block: &Block) -> Shown {
+    let keys = search.octree.level(search.top).keys();
+    search.voxels(search.top, block.key).map(|i| (keys[i], None)).collect()
+}
+
+/// The colour at a place, or the mean of those around it.
+fn colour_near(level: &PreviousLevel, at: [i32; 3], mut around: u64) -> Option<[f32; 3]> {
+    if around & CENTRE != 0 {
+        around = CENTRE;
+    }
+    let (mut sum, mut count) = ([0.0; 3], 0.0);
+    while around != 0 {
+        let cell = around.trailing_zeros() as i32;
+        around &= around - 1;
+        let place = [0, 1, 2].map(|axis| at[axis] + (cell >> (2 * axis) & 3) - 1);
+        if let Some(index) = level.index(place) {
+            (0..3).for_each(|t| sum[t] += f32::from(level.values[index][t]));
+            count += 1.0;
+        }
+    }
+    (count > 0.0).then(|| sum.map(|x| x / count))
+}

@@ -1,0 +1,163 @@
+//! The moved previous frame (`docs/format.md`, clause 17.8).
+
+use rayon::prelude::*;
+
+use super::previous::PreviousLevel;
+use crate::colour::Ycc;
+use crate::error::{Error, Result, Stage};
+use crate::geometry::{Voxels, morton};
+
+/// How many levels a reference level may be below the blocks.
+pub const REACH: u8 = 5;
+
+/// The clause of more voxels than a moved frame may have.
+pub const TOO_MANY: &str = "17.8.2";
+
+/// The levels between blocks and reference level of the moved previous frame.
+#[derive(Debug, Clone)]
+pub(super) struct Moved {
+    /// The first of them.
+    first: u8,
+    levels: Vec<PreviousLevel>,
+}
+
+impl Moved {
+    /// Moves the voxels of `previous`, of level `reference`, into the blocks `keys` of level `block`, each by its shift,
+    /// and averages them up to the level after `block`.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if the blocks take more than twice the previous frame's voxels.
+    pub fn new(
+        previous: &PreviousLevel,
+        [block, reference]: [u8; 2],
+        keys: &[u64],
+        shift: impl Fn(usize) -> [i32; 3] + Sync,
+    ) -> Result<Self> {
+        let side = 1i32 << (reference - block);
+        let most = 2 * previous.values.len() + 64;
+        let counts = keys.par_iter().enumerate().map(|(i, key)| {
+            let mut count = 0;
+            previous.in_box(corner(*key, side, shift(i)), side, |_, _| count += 1);
+            count
+        });
+        let count: usize = counts.sum();
+        if count > most {
+            return Err(Error::malformed(
+                Stage::Bitstream,
+                "motion of the frame",
+                "voxels of the moved previous frame",
+                count,
+                format!("at most {most}"),
+            )
+            .breaks(TOO_MANY));
+        }
+        let parts = keys.par_iter().enumerate().map(|(i, key)| {
+            let (shift, mut found) = (shift(i), Vec::new());
+            previous.in_box(corner(*key, side, shift), side, |from, index| {
+                let at = [0, 1, 2].map(|axis| (from[axis] + shift[axis]) as u32);
+                found.push((morton::encode(at), previous.values[index]));
+            });
+            found.sort_unstable_by_key(|voxel| voxel.0);
+            found
+        });
+        // Blocks are in the order of keys, and each has keys of its own.
+        let mut voxels: Vec<(u64, Ycc)> = parts.collect::<Vec<_>>().concat();
+        let mut levels = Vec::new();
+        for level in (block + 1..reference).rev() {
+            voxels = means(&voxels);
+            let keys = voxels.iter().map(|voxel| voxel.0).collect();
+            let values = voxels.iter().map(|voxel| voxel.1).collect();
+            levels.push(PreviousLevel::new(&Voxels::from_sorted(level, keys), values, None));
+        }
+        levels.reverse();
+        Ok(Moved {
+            first: block + 1,
+            levels,
+        })
+    }
+
+    /// A level. `None` if it is not between blocks and reference level.
+    pub fn level(&self, level: u8) -> Option<&PreviousLevel> {
+        self.levels.get(usize::from(level.checked_sub(self.first)?))
+    }
+}
+
+/// Where the first voxel of a block of `side` voxels was.
+fn corner(key: u64, side: i32, shift: [i32; 3]) -> [i32; 3] {
+    let at = morton::decode(key);
+    [0, 1, 2].map(|axis| at[axis] as i32 * side - shift[axis])
+}
+
+/// The parents of voxels, each with the mean colour of its children, rounded to the nearest, halves up.
+fn means(voxels: &[(u64, Ycc)]) -> Vec<(u64, Ycc)> {
+    let mean = |children: &[(u64, Ycc)]| {
+        let count = children.len() as i32;
+        let channel = |t: usize| {
+            let sum: i32 = children.iter().map(|(_, colour)| i32::from(colour[t])).sum();
+            (2 * sum + count).div_euclid(2 * count) as i16
+        };
+        (children[0].0 >> 3, [0, 1, 2].map(channel))
+    };
+    voxels.chunk_by(|a, b| a.0 >> 3 == b.0 >> 3).map(mean).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::collections::BTreeMap;
+
+    fn level(depth: u8, keys: Vec<u64>) -> (PreviousLevel, Vec<(u64, Ycc)>) {
+        let voxels = Voxels::new(depth, keys);
+        let values: Vec<Ycc> = (0..voxels.len() as i16).map(|i| [i * 7 % 100, -i, i]).collect();
+        let all = voxels.keys().iter().copied().zip(values.iter().copied()).collect();
+        (PreviousLevel::new(&voxels, values, None), all)
+    }
+
+    proptest! {
+        #[test]
+        fn voxels_move_with_the_blocks_that_they_come_to(
+            keys in prop::collection::vec(0u64..1 << 12, 1..200),
+            shift in prop::array::uniform3(-9i32..10),
+        ) {
+            let (previous, voxels) = level(4, keys);
+            // The blocks of the lower half along z stay, the others move.
+            let blocks: Vec<u64> = (0..64).collect();
+            let shift_of = |block: u64| if morton::decode(block)[2] < 2 { [0; 3] } else { shift };
+            let moved = Moved::new(&previous, [2, 4], &blocks, |i| shift_of(blocks[i])).unwrap();
+            let mut expected = BTreeMap::<u64, Vec<Ycc>>::new();
+            for block in &blocks {
+                for &(key, colour) in &voxels {
+                    let (at, shift) = (morton::decode(key), shift_of(*block));
+                    let at = [0, 1, 2].map(|axis| at[axis] as i32 + shift[axis]);
+                    if at.iter().all(|x| (0..16).contains(x)) {
+                        let key = morton::encode(at.map(|x| x as u32));
+                        if key >> 6 == *block {
+                            expected.entry(key >> 3).or_default().push(colour);
+                        }
+                    }
+                }
+            }
+            let found = moved.level(3).unwrap();
+            prop_assert!(moved.level(2).is_none() && moved.level(4).is_none());
+            prop_assert_eq!(found.values.len(), expected.len());
+            for (key, colours) in expected {
+                let at = morton::decode(key).map(|x| x as i32);
+                let mean = [0, 1, 2].map(|t| {
+                    let sum: f64 = colours.iter().map(|colour| f64::from(colour[t])).sum();
+                    (sum / colours.len() as f64 + 0.5).floor() as i16
+                });
+                prop_assert_eq!(found.index(at).map(|index| found.values[index]), Some(mean));
+            }
+        }
+    }
+
+    #[test]
+    fn blocks_that_all_come_from_one_crowded_place_are_refused() {
+        let (previous, _) = level(4, (0..64).collect());
+        let blocks: Vec<u64> = (0..64).collect();
+        let from_the_corner = |i: usize| morton::decode(blocks[i]).map(|x| 4 * x as i32);
+        let refused = Moved::new(&previous, [2, 4], &blocks, from_the_corner).expect_err("64 times as many voxels");
+        assert_eq!(refused.clause(), Some(TOO_MANY));
+    }
+}
