@@ -9,7 +9,7 @@ mod stream;
 
 use std::path::Path;
 
-use b2p::{Axes, Error, FileSource, Limits, SceneReader};
+use b2p::{Error, FileSource, Limits, SceneReader};
 
 pub use decode::run as decode;
 pub use edit::cut;
@@ -38,12 +38,6 @@ pub fn is_scene(path: &Path) -> bool {
 pub fn open(path: &Path, limits: &Limits) -> Result<Reader> {
     let opened = FileSource::open(path).and_then(|file| SceneReader::new(file, limits));
     opened.map_err(Failure::in_file(path))
-}
-
-/// What a scene says of its coordinates; nothing if it cannot be read.
-pub fn axes(path: &Path) -> Axes {
-    let opened = FileSource::open(path).and_then(|file| SceneReader::new(file, &Limits::default()));
-    opened.and_then(|scene| scene.axes()).unwrap_or_default()
 }
 
 /// Says which blocks could not be decoded, and fails if there are some.

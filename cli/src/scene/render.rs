@@ -30,7 +30,8 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         placement: scene.header().placement,
     };
     let extent = extent(args, &scene, limits)?;
-    let cameras = shots(args, &frame, &extent, limits)?;
+    let axes = scene.axes().unwrap_or_default();
+    let cameras = shots(args, &frame, &extent, &axes, limits)?;
     permit(args, &cameras)?;
     let log = progress.log();
     let one_file = args.contact_sheet || args.turntable.is_some() || format_of(args, cameras.len())? == Format::Y4m;
@@ -46,7 +47,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
             detail: None,
             chosen: None,
         };
-        let said = pictures(&drawing, &decoded.content, &log)?;
+        let said = pictures(&drawing, &decoded.content, &axes, &log)?;
         complain(&args.input, &decoded.lost, decoded.blocks)?;
         return Ok(said);
     }
