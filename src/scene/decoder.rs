@@ -13,7 +13,7 @@ use crate::container::scene::{BlockEntry, Cube};
 use crate::decoder::{Decoder, LevelVoxels, Part};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians};
-use crate::geometry::{Octree, Voxels, morton};
+use crate::geometry::{Octree, Voxels};
 use crate::placement::Placement;
 
 /// Bytes of memory for each byte of a stream that is decoded: the stream, and its slices.
@@ -122,6 +122,7 @@ impl SceneDecoder {
     }
 
     /// What decodes blocks.
+    #[cfg(feature = "render")]
     pub(super) fn decoder(&self) -> &Decoder {
         &self.decoder
     }
@@ -483,9 +484,4 @@ fn bounds_of(header: &Header, level: u8, low: [f64; 3], high: [f64; 3]) -> Resul
         low: axes.map(|(first, _)| first as u32),
         high: axes.map(|(_, end)| end as u32),
     })
-}
-
-/// The coordinates of a cube's lowest corner in voxels of level N.
-pub fn corner(cube: Cube, depth: u8) -> [u32; 3] {
-    morton::decode(cube.key).map(|x| x << (depth - cube.level))
 }

@@ -4,7 +4,6 @@ use std::ops::RangeInclusive;
 
 use rayon::prelude::*;
 
-use super::decoder::corner;
 use super::partition::{BLOCK_VOXELS, Cutter};
 use crate::axes::Axes;
 use crate::cancel::Cancel;
@@ -13,7 +12,7 @@ use crate::container::scene::{BlockEntry, Cube, most_level, write_index};
 use crate::container::{Format, Header, MAX_COLOUR_SLICE, with_axes};
 use crate::encoder::transform::{self, Options, QualityTarget};
 use crate::error::{Error, Result};
-use crate::geometry::Voxels;
+use crate::geometry::{Voxels, morton};
 use crate::log::Log;
 use crate::placement::Placement;
 
@@ -313,4 +312,9 @@ fn in_block(block: usize, error: Error) -> Error {
             source: Box::new(source),
         },
     }
+}
+
+/// The coordinates of a cube's lowest corner in voxels of level N.
+fn corner(cube: Cube, depth: u8) -> [u32; 3] {
+    morton::decode(cube.key).map(|x| x << (depth - cube.level))
 }
