@@ -100,7 +100,8 @@ impl PictureCost {
             0.0
         };
         PictureCost {
-            per_gaussian: (few - per_covered * sizes[0].covered) / gaussians.max(1.0),
+            // At most `few` is subtracted, but for rounding.
+            per_gaussian: (few - per_covered * sizes[0].covered).max(0.0) / gaussians.max(1.0),
             per_pixel,
             per_covered,
         }
@@ -120,6 +121,22 @@ impl PictureCost {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn nothing_costs_less_than_nothing_however_long_the_larger_picture_took() {
+        for i in 1..1000 {
+            let [covered, time] = [f64::from(i) * 7.3, 1e6 + f64::from(i) * 331.7];
+            let sizes = [covered, 16.0 * covered].map(|covered| PictureSize {
+                pixels: 2.0 * covered,
+                covered,
+            });
+            let cost = PictureCost::from_times(1000.0, sizes, [time, 1000.0 * time], 0.0);
+            assert!(
+                cost.numbers().iter().all(|n| *n >= 0.0),
+                "{cost:?} of {covered} pixels in {time} ns"
+            );
+        }
+    }
 
     #[test]
     fn better_heads_look_better_on_any_level_and_a_finer_level_with_any_heads_but_at_the_finest() {
