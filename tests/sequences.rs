@@ -276,6 +276,22 @@ fn a_moved_cloud_takes_fewer_bits_than_a_whole_frame() {
 }
 
 #[test]
+fn a_frame_that_the_one_before_tells_nothing_of_is_whole() {
+    // Textures have nothing in common.
+    let cloud = |frame: u64| {
+        let mut cloud = still(frame);
+        let shade = |key: &u64| ((key ^ frame << 40).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 56) as u8;
+        cloud.colours = cloud.voxels.keys().iter().map(|key| [shade(key); 3]).collect();
+        Ok(cloud)
+    };
+    let encoder = SequenceEncoder::new().with_levels(4..=7);
+    let bytes = encoder.encode(3, cloud, |_| {}).expect("a sequence");
+    let sequence = reader(&bytes);
+    let group = sequence.group(0).expect("a group");
+    assert!((0..3).all(|at| group.is_whole(at)));
+}
+
+#[test]
 fn a_moved_surface_of_other_sample_points_takes_a_fraction_of_the_bits() {
     let cloud = |frame: u64| {
         let cloud = still(frame);

@@ -32,9 +32,9 @@ mod serve;
 mod sheet;
 mod sidecar;
 mod table;
-mod turntable;
 mod upgrade;
 mod values;
+mod video;
 #[cfg(feature = "view")]
 mod view;
 mod views;

@@ -20,7 +20,7 @@ use super::progress::Progress;
 use super::sheet::Sheet;
 use super::table::{count, counted, milliseconds, steps};
 use super::views::{Shot, lenses_beside, shots};
-use super::{Failure, Result, cloud, load, pipe, scene, sequence, turntable};
+use super::{Failure, Result, cloud, load, pipe, scene, sequence, video};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
@@ -55,7 +55,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     }
     let log = progress.log();
     if let Some(path) = &args.turntable {
-        turntable::kind_of(path)?;
+        video::kind_of(path)?;
     }
     if args.camera.is_none() {
         // Where pictures go is known at once; a file of cameras needs to know the cube.
@@ -272,13 +272,18 @@ fn turn(cameras: &[Shot], artist: &mut Artist, log: &Log) -> Result<Vec<Drawn>> 
     let mut all = Vec::new();
     let Some(first) = cameras.first() else { return Ok(all) };
     let [width, height] = first.camera.size();
-    artist.other_bytes = u64::from(width) * u64::from(height) * turntable::BYTES_PER_PIXEL;
-    turntable::write(&first.path, cameras.len() as u32, |i, image| {
-        let drawn = draw_logged(&cameras[i as usize], artist, log)?;
-        all.push(drawn);
-        std::mem::swap(image, &mut artist.image);
-        Ok(())
-    })?;
+    artist.other_bytes = u64::from(width) * u64::from(height) * video::BYTES_PER_PIXEL;
+    video::write(
+        &first.path,
+        cameras.len() as u32,
+        video::FrameTime::THIRTIETH,
+        |i, image| {
+            let drawn = draw_logged(&cameras[i as usize], artist, log)?;
+            all.push(drawn);
+            std::mem::swap(image, &mut artist.image);
+            Ok(())
+        },
+    )?;
     Ok(all)
 }
 

@@ -73,22 +73,23 @@ impl Filter {
         [self.passes.len() as u8].into_iter().chain(weights).collect()
     }
 
-    /// Filtered red, green and blue of every voxel of a level. `map` is the level's 3³ kernel map.
+    /// Filtered red, green and blue of every voxel of a level. `map` is the level's 3³ kernel map, `steps` are those that
+    /// the filter was made for.
     ///
     /// # Panics
     /// If `map` belongs to another level.
-    pub fn rgb(&self, isa: Isa, colours: &LevelColours, map: &KernelMap) -> Vec<[u8; 3]> {
+    pub fn rgb(&self, isa: Isa, colours: &LevelColours, map: &KernelMap, steps: Steps) -> Vec<[u8; 3]> {
         let fraction = colours.steps().fraction();
-        let values = self.apply(isa, colours, map);
+        let values = self.apply(isa, colours, map, steps);
         values.par_iter().map(|ycc| display(*ycc, fraction)).collect()
     }
 
     /// Filtered [`LevelColours::values`] of a level.
-    fn apply(&self, isa: Isa, colours: &LevelColours, map: &KernelMap) -> Vec<Ycc> {
+    fn apply(&self, isa: Isa, colours: &LevelColours, map: &KernelMap, steps: Steps) -> Vec<Ycc> {
         assert_eq!(map.len(), colours.values.len(), "the map must be that of the level");
         let mut values = colours.values.clone();
         for pass in &self.passes {
-            values = filtered(isa, &values, map, colours.steps, pass);
+            values = filtered(isa, &values, map, steps, pass);
         }
         values
     }

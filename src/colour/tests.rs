@@ -261,7 +261,7 @@ fn a_fitted_filter_reduces_the_error_and_its_payload_round_trips() {
     let (colours, map, truth) = noisy();
     let filter = Filter::fit(Isa::detect(), &colours, &map, &truth).expect("noise to remove");
     let before = squared_error(&colours.rgb(), &truth);
-    let filtered = filter.rgb(Isa::detect(), &colours, &map);
+    let filtered = filter.rgb(Isa::detect(), &colours, &map, colours.steps());
     assert!(squared_error(&filtered, &truth) < 0.95 * before);
     let bytes = filter.to_bytes();
     assert_eq!(Filter::parse(&bytes, 0).unwrap(), filter);
@@ -269,7 +269,7 @@ fn a_fitted_filter_reduces_the_error_and_its_payload_round_trips() {
         assert!(Filter::parse(wrong, 7).unwrap_err().to_string().contains("byte 7"));
     }
     for isa in Isa::available() {
-        assert_eq!(filter.rgb(isa, &colours, &map), filtered, "{isa}");
+        assert_eq!(filter.rgb(isa, &colours, &map, colours.steps()), filtered, "{isa}");
     }
 }
 
@@ -281,7 +281,9 @@ fn one_pass_matches_its_definition() {
         .into_iter()
         .chain(weights.iter().flatten().map(|w| *w as u8))
         .collect();
-    let filtered = Filter::parse(&bytes, 0).unwrap().rgb(Isa::detect(), &colours, &map);
+    let filtered = Filter::parse(&bytes, 0)
+        .unwrap()
+        .rgb(Isa::detect(), &colours, &map, colours.steps());
     let units = colours.steps().units().map(i64::from);
     for (voxel, own) in colours.values().iter().enumerate() {
         let mut expected = *own;

@@ -83,7 +83,7 @@ impl LevelVoxels {
 impl Advice {
     fn of(reached: &Reached) -> Self {
         Advice {
-            luma_step: reached.coloured.steps().luma_step(),
+            luma_step: reached.luma_step(),
             all_surfels: reached.advises_surfels(),
             sizes: reached.head_map.as_ref().map_or([1.0; 2], HeadMap::sizes),
         }

@@ -7,7 +7,7 @@ use b2p_kernels::Isa;
 use xxhash_rust::xxh3::Xxh3Default;
 
 use super::stream::Decoder;
-use crate::colour::{self, Filter, LevelColours, Ycc};
+use crate::colour::{self, Filter, LevelColours, Steps, Ycc};
 use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
@@ -17,7 +17,7 @@ use crate::gaussians::{Gaussians, HeadMap};
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::latents::nothing_reached;
 use crate::log::Log;
-use crate::motion::{ColourGuide, GeometryGuide, Inter, Previous};
+use crate::motion::{self, ColourGuide, GeometryGuide, Inter, Previous};
 
 /// A stream of version 3 that is decoded level by level.
 #[derive(Debug)]
@@ -32,8 +32,8 @@ pub(super) struct Transform<'b> {
     history: Option<History>,
 }
 
-/// Decoded colours of the levels from 0 on before their filters, and the filters.
-type History = Vec<(Vec<Ycc>, Option<Filter>)>;
+/// What the next frame is predicted from: the levels from 0 on.
+type History = Vec<motion::Coloured>;
 
 /// The occupancies of a level that were decoded beside the colours of the level above, which are coded apart from them
 /// and take as long.
@@ -51,6 +51,8 @@ pub(super) struct Reached {
     /// Decoded, before the filter: what the next level is coded from.
     pub coloured: LevelColours,
     filter: Option<Filter>,
+    /// Quantisation steps that the filter and learned heads go by: those of the frame that the filter is from.
+    steps: Steps,
     /// Where the encoder advises surfels in place of learned Gaussians.
     pub head_map: Option<HeadMap>,
     /// Filtered, as they are drawn, once they are asked for.
@@ -70,8 +72,13 @@ impl Reached {
     pub fn colours(&self, isa: Isa) -> &[[u8; 3]] {
         self.filtered.get_or_init(|| match &self.filter {
             None => self.coloured.rgb(),
-            Some(filter) => filter.rgb(isa, &self.coloured, &self.map),
+            Some(filter) => filter.rgb(isa, &self.coloured, &self.map, self.steps),
         })
+    }
+
+    /// The size of luma's quantisation step that heads go by, in 255ths.
+    pub fn luma_step(&self) -> f32 {
+        self.steps.luma_step()
     }
 
     /// The colours of the level above before its filter: where they are not known, the means of this level's, which
@@ -100,7 +107,7 @@ impl Reached {
             above: &above.map,
             colours: self.colours(isa),
             colours_above,
-            luma_step: self.coloured.steps().luma_step(),
+            luma_step: self.luma_step(),
             without,
             range: None,
         }
@@ -199,8 +206,12 @@ impl<'b> Transform<'b> {
         };
         let parse = |payload: &Slice| Filter::parse(payload.bytes, payload.offset);
         let mut filter = colours.filter.as_ref().map(parse).transpose()?;
-        if let (None, Some(inter)) = (&filter, &self.inter) {
-            filter = inter.previous().level(level).and_then(|level| level.filter.clone());
+        let mut inherited = None;
+        if let (None, Some(inter)) = (&filter, &self.inter)
+            && let Some(previous) = inter.previous().level(level)
+        {
+            filter = previous.filter.clone();
+            inherited = previous.steps;
         }
         let mut octree = match &mut self.reached {
             Some(above) => std::mem::replace(&mut above.octree, Octree::root()),
@@ -228,10 +239,13 @@ impl<'b> Transform<'b> {
                 let blocks = HeadMap::block_count(&octree, level);
                 let head_map = colours.head_map.as_ref();
                 let head_map = head_map.and_then(|map| HeadMap::parse(map.bytes, blocks));
+                let own = coloured.steps();
+                let steps = inherited.filter(|steps| steps.is_lossless() == own.is_lossless());
+                let steps = steps.unwrap_or(own);
                 if let Some(history) = &mut self.history {
-                    history.extend(values.into_iter().map(|values| (values, None)));
+                    history.extend(values.into_iter().map(|values| (values, None, None)));
                     if let Some(last) = history.last_mut() {
-                        last.1 = filter.clone();
+                        (last.1, last.2) = (filter.clone(), Some(steps));
                     }
                 }
                 self.reached = Some(Reached {
@@ -241,6 +255,7 @@ impl<'b> Transform<'b> {
                     above: above.or(old),
                     coloured,
                     filter,
+                    steps,
                     head_map,
                     filtered: OnceLock::new(),
                 });

@@ -29,7 +29,7 @@ struct Brick {
 
 /// The voxels of a level by position.
 #[derive(Debug, Clone)]
-pub(super) struct Bricks {
+pub struct Bricks {
     bricks: Vec<Brick>,
     /// Open addressing: a brick's number and 1, or 0. A power of two, at least twice as many as bricks.
     table: Vec<u32>,

@@ -15,8 +15,9 @@ pub(crate) mod moved;
 mod payload;
 mod previous;
 
+pub use bricks::Bricks as Places;
 pub use guides::{ColourGuide, GeometryGuide, Inter};
 pub use payload::{Blocks, Head, Modes, predicted};
-pub use previous::{Previous, PreviousLevel};
+pub use previous::{Coloured, Previous, PreviousLevel};
 
 pub use crate::geometry::codec::guide::{Mode, own};

@@ -67,7 +67,7 @@ impl Moved {
             voxels = means(&voxels);
             let keys = voxels.iter().map(|voxel| voxel.0).collect();
             let values = voxels.iter().map(|voxel| voxel.1).collect();
-            levels.push(PreviousLevel::new(&Voxels::from_sorted(level, keys), values, None));
+            levels.push(PreviousLevel::new(&Voxels::from_sorted(level, keys), values));
         }
         levels.reverse();
         Ok(Moved {
@@ -111,7 +111,7 @@ mod tests {
         let voxels = Voxels::new(depth, keys);
         let values: Vec<Ycc> = (0..voxels.len() as i16).map(|i| [i * 7 % 100, -i, i]).collect();
         let all = voxels.keys().iter().copied().zip(values.iter().copied()).collect();
-        (PreviousLevel::new(&voxels, values, None), all)
+        (PreviousLevel::new(&voxels, values), all)
     }
 
     proptest! {

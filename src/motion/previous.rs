@@ -1,7 +1,7 @@
 //! The previous frame as it was decoded.
 
 use super::bricks::Bricks;
-use crate::colour::{Filter, Ycc};
+use crate::colour::{Filter, Steps, Ycc};
 use crate::geometry::{Octree, Voxels};
 use rayon::prelude::*;
 
@@ -19,17 +19,26 @@ pub struct PreviousLevel {
     pub values: Vec<Ycc>,
     /// The filter of the level, which the next frame inherits.
     pub filter: Option<Filter>,
+    /// The quantisation steps that filter and heads go by, which it inherits, too.
+    pub steps: Option<Steps>,
 }
+
+/// Y, Co and Cg of a level's voxels, its filter, and the steps that it is drawn with.
+pub type Coloured = (Vec<Ycc>, Option<Filter>, Option<Steps>);
 
 impl Previous {
     /// The levels of `octree` with their colours and filters, from level 0 on.
     ///
     /// # Panics
     /// If there are more colours than levels, or other than one per voxel.
-    pub fn new(octree: &Octree, colours: Vec<(Vec<Ycc>, Option<Filter>)>) -> Self {
-        let level = |(level, (values, filter)): (usize, (Vec<Ycc>, Option<Filter>))| {
+    pub fn new(octree: &Octree, colours: Vec<Coloured>) -> Self {
+        let level = |(level, (values, filter, steps)): (usize, Coloured)| {
             let voxels = octree.level(level as u8);
-            PreviousLevel::new(voxels, values, filter)
+            PreviousLevel {
+                filter,
+                steps,
+                ..PreviousLevel::new(voxels, values)
+            }
         };
         Previous {
             levels: colours.into_par_iter().enumerate().map(level).collect(),
@@ -48,12 +57,13 @@ impl Previous {
 }
 
 impl PreviousLevel {
-    pub(super) fn new(voxels: &Voxels, values: Vec<Ycc>, filter: Option<Filter>) -> Self {
+    pub(super) fn new(voxels: &Voxels, values: Vec<Ycc>) -> Self {
         assert_eq!(voxels.len(), values.len(), "one colour per voxel");
         PreviousLevel {
             bricks: Bricks::new(voxels),
             values,
-            filter,
+            filter: None,
+            steps: None,
         }
     }
 

@@ -12,7 +12,7 @@ use crate::cloud::ColouredVoxels;
 use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
 use crate::container::{Header, with_axes};
 use crate::decoder::Decoder;
-use crate::encoder::transform::{self, Options, QualityTarget};
+use crate::encoder::transform::{self, Options, PredictedFrame, QualityTarget};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -46,6 +46,13 @@ impl Default for SequenceEncoder {
 
 /// The entry and the bytes of a frame.
 type Coded = (FrameEntry, Vec<u8>);
+
+/// Factor of the steps of a group's first frame: the frames after it show what they keep of it.
+const FIRST_STEP: f32 = 0.7;
+/// Share of the bytes of the group's first frame above which a predicted frame is compared with a whole one.
+const LARGE: f64 = 0.65;
+/// Bytes of a whole frame, over those of a predicted one, that its exact voxels and colours are worth.
+const WORTH: f64 = 1.08;
 
 /// A coded frame.
 struct Frame {
@@ -156,14 +163,18 @@ impl SequenceEncoder {
         let code = |group: u64| -> Result<(Header, Vec<Coded>)> {
             let first = group * u64::from(self.group);
             let mut common: Option<Header> = None;
-            let (mut frames, mut previous) = (Vec::new(), None);
+            let (mut frames, mut previous): (Vec<Coded>, _) = (Vec::new(), None);
             let end = count.min(first + u64::from(self.group));
             for frame in first..end {
                 self.cancel.check()?;
                 let cloud = cloud(frame).map_err(|error| in_frame(frame, error))?;
                 let ticks = (frame - first) as u32 * self.duration;
                 let follows = self.predicted && frame + 1 < end;
-                let coded = self.frame(&cloud, previous.as_ref(), ticks, follows);
+                let first_bytes = frames.first().map_or(0, |(_, bytes)| bytes.len());
+                let coded = match &previous {
+                    None => self.whole(&cloud, ticks, follows),
+                    Some(previous) => self.predicted(&cloud, previous, ticks, follows, first_bytes),
+                };
                 let coded = coded.map_err(|error| in_frame(frame, error))?;
                 check_common(common.as_ref(), &coded.header, frame)?;
                 common.get_or_insert(coded.header);
@@ -185,42 +196,75 @@ impl SequenceEncoder {
         assembly.finish()
     }
 
-    /// Codes a frame, from the frame before if there is one in the group.
-    fn frame(
+    /// Codes the first frame of a group, or one that no other is predicted from.
+    fn whole(&self, cloud: &ColouredVoxels, ticks: u32, follows: bool) -> Result<Frame> {
+        let mut options = self.options.clone();
+        if follows {
+            options.fineness = options.fineness.scaled(FIRST_STEP);
+        }
+        self.whole_with(cloud, &options, ticks, follows)
+    }
+
+    /// Codes a frame by itself.
+    fn whole_with(&self, cloud: &ColouredVoxels, options: &Options, ticks: u32, follows: bool) -> Result<Frame> {
+        let stream = transform::encode(cloud, options, &self.log())?.bytes;
+        finished(with_axes(&stream, &self.axes)?, &[], None, ticks, follows)
+    }
+
+    /// Codes a frame from the frame before, or by itself if that is better. `first_bytes` are those of the group's
+    /// first frame.
+    fn predicted(
         &self,
         cloud: &ColouredVoxels,
-        previous: Option<&Arc<Previous>>,
+        previous: &Arc<Previous>,
         ticks: u32,
         follows: bool,
+        first_bytes: usize,
     ) -> Result<Frame> {
-        let log = Log::off().with_cancel(self.cancel.clone());
-        let options = &self.options;
-        let (stream, motion) = match previous {
-            None => {
-                let stream = transform::encode(cloud, options, &log)?.bytes;
-                (with_axes(&stream, &self.axes)?, Vec::new())
-            }
-            Some(previous) => {
-                let frame = transform::encode_predicted(cloud, previous, options, &log)?;
-                (frame.stream, frame.motion)
-            }
-        };
-        let header = Header::parse(&stream, &Limits::unlimited())?;
-        let coded = frame_of(&header, &stream, &motion, ticks)?;
-        let mut next = None;
-        if follows || !motion.is_empty() {
-            // What the next frame is predicted from is what the decoder will have.
-            let inter = previous.map(|previous| {
-                let motion: Vec<&[u8]> = motion.iter().map(Vec::as_slice).collect();
-                Inter::new(Arc::clone(previous), &motion, header.base, header.top)
-            });
-            let decoder = Decoder::new().with_limits(Limits::unlimited()).with_level(header.top);
-            let mut decoding = decoder.start_frame(stream, inter.transpose()?);
-            decoding.finish()?;
-            next = decoding.take_previous().map(Arc::new);
+        let PredictedFrame { stream, motion } =
+            transform::encode_predicted(cloud, previous, &self.options, &self.log())?;
+        let frame = finished(stream, &motion, Some(previous), ticks, follows)?;
+        let bytes = frame.coded.1.len() as f64;
+        if bytes <= LARGE * first_bytes as f64 {
+            return Ok(frame);
         }
-        Ok(Frame { header, coded, next })
+        let worth = match self.options.fineness {
+            QualityTarget::Lossless => 1.0,
+            _ => WORTH,
+        };
+        let whole = self.whole_with(cloud, &self.options, ticks, follows)?;
+        let better = whole.coded.1.len() as f64 <= worth * bytes;
+        Ok(if better { whole } else { frame })
     }
+
+    fn log(&self) -> Log {
+        Log::off().with_cancel(self.cancel.clone())
+    }
+}
+
+/// The frame of a stream and its motion, decoded if another frame follows, which is predicted from what the decoder will
+/// have, or to check its motion.
+fn finished(
+    stream: Vec<u8>,
+    motion: &[Vec<u8>],
+    previous: Option<&Arc<Previous>>,
+    ticks: u32,
+    follows: bool,
+) -> Result<Frame> {
+    let header = Header::parse(&stream, &Limits::unlimited())?;
+    let coded = frame_of(&header, &stream, motion, ticks)?;
+    let mut next = None;
+    if follows || !motion.is_empty() {
+        let inter = previous.map(|previous| {
+            let motion: Vec<&[u8]> = motion.iter().map(Vec::as_slice).collect();
+            Inter::new(Arc::clone(previous), &motion, header.base, header.top)
+        });
+        let decoder = Decoder::new().with_limits(Limits::unlimited()).with_level(header.top);
+        let mut decoding = decoder.start_frame(stream, inter.transpose()?);
+        decoding.finish()?;
+        next = decoding.take_previous().map(Arc::new);
+    }
+    Ok(Frame { header, coded, next })
 }
 
 /// The entry and the bytes of a frame from its stream.

@@ -14,12 +14,13 @@ use super::super::manners::{self, Said};
 use super::super::picture::{Artist, format_of};
 use super::super::progress::Progress;
 use super::super::table::counted;
+use super::super::video::{self, FrameTime};
 use super::super::views::shots;
 use super::super::{Failure, Result, load};
 use super::Pattern;
 
-/// Draws every frame with one camera: into a `.y4m` file, or into pictures of a pattern. While a frame is drawn, the next
-/// one is decoded.
+/// Draws every frame with one camera: into a video, or into pictures of a pattern. While a frame is drawn, the next one
+/// is decoded.
 pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> {
     let sequence = super::read(&args.input, limits)?;
     let one = args
@@ -37,8 +38,8 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         let what = "a sequence is drawn with one camera; --frame draws other views of a frame";
         return Err(Failure(what.into()));
     }
-    if pattern.is_none() && one.is_none() && args.output.extension().is_none_or(|ending| ending != "y4m") {
-        let what = "a sequence is drawn into a .y4m file or, with %04d in the name, into a picture of each frame";
+    if pattern.is_none() && one.is_none() && !is_video(&args.output) {
+        let what = "a sequence is drawn into a video (.gif, .webp, .apng, .y4m, or with FFmpeg .mp4, .webm, .mkv) or, with %04d in the name, into a picture of each frame";
         return Err(Failure(format!("{}: {what}", args.output.display())));
     }
     let paths: Vec<PathBuf> = match &pattern {
@@ -55,12 +56,17 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
         renderer: None,
         decoder: SequenceDecoder::new(load::decoder(&[], &args.detail, &args.model, limits)?),
         axes: sequence.axes().map_err(Failure::in_file(&args.input))?,
+        other_bytes: 0,
     };
     let started = Instant::now();
     let count = frames.end - frames.start;
     match pattern.is_some() || one.is_some() {
         true => film.stills(&sequence, frames, &paths, progress)?,
-        false => film.video(&sequence, frames, &paths[0], progress)?,
+        false => {
+            let (width, height) = args.view.size;
+            film.other_bytes = u64::from(width) * u64::from(height) * video::BYTES_PER_PIXEL;
+            film.video(&sequence, frames, &paths[0], progress)?;
+        }
     }
     let took = started.elapsed().as_secs_f64();
     let rate = count as f64 / took;
@@ -68,6 +74,11 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     let report = format!("{to}: {}, {rate:.1} a second\n", counted(count, "frame"));
     let json = || json!({ "output": to.to_string(), "frames": count, "seconds": took, "frames_per_second": rate });
     Ok(Said::report(report, json).beside(&args.output))
+}
+
+/// Whether all frames go into a file with this ending. Those of a `.png` file would be a surprise.
+fn is_video(path: &Path) -> bool {
+    path.extension().is_some_and(|ending| ending != "png") && video::kind_of(path).is_ok()
 }
 
 /// Draws frames one after the other.
@@ -80,6 +91,8 @@ struct Film<'a> {
     renderer: Option<Renderer>,
     decoder: SequenceDecoder,
     axes: Axes,
+    /// Bytes that a video holds beside a picture.
+    other_bytes: u64,
 }
 
 impl Film<'_> {
@@ -110,26 +123,28 @@ impl Film<'_> {
     ) -> Result<()> {
         let mut decoder = self.decoder.clone();
         let index = sequence.index();
-        let rate = format!(" F{}:{} ", index.timescale, index.duration);
-        manners::write(path, |w| {
-            for (i, gaussians) in decoder.gaussians(sequence, frames).enumerate() {
-                progress.say(&format!("draw frame {i}"));
-                let drawn = self.draw(&gaussians?, |artist| {
-                    if i == 0 {
-                        let header = String::from_utf8_lossy(&artist.image.y4m_header()).replace(" F30:1 ", &rate);
-                        w.write_all(header.as_bytes())
-                            .map_err(|source| Failure::writing(path, source))?;
-                    }
-                    Ok(artist.write(w, path)?)
-                });
-                drawn.map_err(|failure| Error::Usage(failure.0))?;
-            }
-            Ok(())
+        let time = FrameTime {
+            timescale: index.timescale,
+            duration: index.duration,
+        };
+        let count = u32::try_from(frames.end - frames.start)
+            .map_err(|_| Failure("a video has less than 2^32 frames".into()))?;
+        let mut decoded = decoder.gaussians(sequence, frames);
+        video::write(path, count, time, |i, image| {
+            progress.say(&format!("draw frame {i}"));
+            let gaussians = decoded
+                .next()
+                .ok_or_else(|| Error::Usage("a frame is missing".into()))??;
+            let drawn = self.draw(&gaussians, |artist| {
+                std::mem::swap(image, &mut artist.image);
+                Ok(())
+            });
+            drawn.map_err(|failure| Error::Usage(failure.0))
         })
     }
 
-    /// Draws a frame, and writes it with `write`.
-    fn draw(&mut self, gaussians: &Gaussians, write: impl FnOnce(&Artist) -> Result<()>) -> Result<()> {
+    /// Draws a frame, and hands it to `use_picture`.
+    fn draw(&mut self, gaussians: &Gaussians, use_picture: impl FnOnce(&mut Artist) -> Result<()>) -> Result<()> {
         let camera = match &self.camera {
             Some(camera) => *camera,
             None => {
@@ -147,8 +162,9 @@ impl Film<'_> {
             None => self.new_renderer()?,
         };
         let mut artist = Artist::new(renderer, gaussians, self.limits, self.args, self.format);
+        artist.other_bytes = self.other_bytes;
         artist.draw(&camera)?;
-        write(&artist)?;
+        use_picture(&mut artist)?;
         self.renderer = Some(artist.renderer);
         Ok(())
     }

@@ -98,6 +98,16 @@ fn parts_of_a_sequence_are_cut_joined_decoded_and_drawn() {
         bytes(at, "all.y4m").windows(5).filter(|part| part == b"FRAME").count(),
         6
     );
+    for (name, start) in [
+        ("all.gif", &b"GIF89a"[..]),
+        ("all.webp", b"RIFF"),
+        ("all.apng", b"\x89PNG"),
+    ] {
+        succeeds(at, &[&["render", "all.b2p", "-o", name][..], &surfels, &draw].concat());
+        assert!(bytes(at, name).starts_with(start), "{name}");
+    }
+    let refused = &[&["render", "all.b2p", "-o", "all.png"][..], &surfels, &draw].concat();
+    fails(at, refused, &["all.png", ".gif", "%04d"]);
     fails(at, &["cut", "all.b2p", "-o", "x.b2p", "--frames", "1..3"], &["all.b2p"]);
 }
 

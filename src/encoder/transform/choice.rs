@@ -11,10 +11,12 @@
 //! A block whose cells are all copied, colours included, is *kept*, if coding what differs saves less distortion than
 //! it costs bits. D is compared with the true frame, never with the previous one, so that errors do not add up.
 
+use rayon::prelude::*;
+
 use super::motion::{AROUND, Block, CENTRE, Search};
 use crate::colour::Ycc;
-use crate::geometry::morton;
-use crate::motion::PreviousLevel;
+use crate::geometry::{Voxels, morton};
+use crate::motion::{Places, PreviousLevel};
 
 /// Voxels along the side of a cell.
 const CELL: i32 = 4;
@@ -22,7 +24,7 @@ const CELL: i32 = 4;
 const LAMBDA: f32 = 0.06;
 const FLOOR: f32 = 0.06;
 /// Squared error of luma, in 255ths, that stands for a squared voxel of displacement: about what pictures lose of both.
-const PLACE: f32 = 900.0;
+const PLACE: f32 = 3000.0;
 /// Bits of a voxel that is not where it is predicted.
 const CHANGED_BITS: f32 = 3.0;
 /// Bits of a voxel that is as it is predicted, in a block that is not kept: of its place and colour.
@@ -266,6 +268,69 @@ pub(super) fn choose(search: &Search, block: &mut Block, weights: Weights) -> Sh
     shown
 }
 
+/// Adds the true voxels that are in holes of what all blocks show together: what moves apart leaves gaps. Blocks that are
+/// kept and move together have what they had.
+pub(super) fn close(search: &Search, blocks: &[Block], shown: &mut Shown) {
+    let Some(current) = search.current.level(search.top) else {
+        return;
+    };
+    shown.sort_unstable_by_key(|voxel| voxel.0);
+    let keys = shown.iter().map(|voxel| voxel.0).collect();
+    let places = Places::new(&Voxels::from_sorted(search.top, keys));
+    let voxels = search.octree.level(search.top);
+    let holes = (0..voxels.len()).into_par_iter().filter(|i| {
+        let at = voxels.coordinate(*i).map(|x| x as i32);
+        !is_steady(search, blocks, at) && in_a_hole(&places, at, normal(current.window(at.map(|x| x - 1))))
+    });
+    let holes: Vec<_> = holes.map(|i| (voxels.keys()[i], None)).collect();
+    shown.extend(holes);
+    shown.sort_unstable_by_key(|voxel| voxel.0);
+}
+
+/// Whether all blocks within two of a place are kept, and move together.
+fn is_steady(search: &Search, blocks: &[Block], at: [i32; 3]) -> bool {
+    let down = search.top - search.block_level;
+    let block_at = |corner: i32| {
+        let step = [corner & 1, corner >> 1 & 1, corner >> 2];
+        let place = [0, 1, 2].map(|axis| (at[axis] + 4 * step[axis] - 2).max(0) as u32 >> down);
+        let key = morton::encode(place);
+        blocks
+            .binary_search_by_key(&key, |block| block.key)
+            .ok()
+            .map(|i| &blocks[i])
+    };
+    let mut around = (0..8).filter_map(block_at);
+    let first = around.next();
+    first.is_none_or(|first| first.keep && around.all(|block| block.keep && block.vector == first.vector))
+}
+
+/// Whether nothing is shown within one of a place along the axis `normal`, but on two opposite sides of it.
+fn in_a_hole(places: &Places, at: [i32; 3], normal: usize) -> bool {
+    let beside = |axis: usize, offset: i32| {
+        (-1..=1).any(|height| {
+            let mut place = at;
+            place[axis] += offset;
+            place[normal] += height;
+            places.index(place).is_some()
+        })
+    };
+    let across = |axis: usize| {
+        [[1, 2], [-1, -2]]
+            .iter()
+            .all(|side| side.iter().any(|x| beside(axis, *x)))
+    };
+    !beside(normal, 0) && (0..3).any(|axis| axis != normal && across(axis))
+}
+
+/// The axis nearest to the normal of a surface of which 3³ cells are known: along it the fewest of them are before and
+/// behind the middle.
+fn normal(surface: u64) -> usize {
+    /// The cells that are not in the middle along each axis.
+    const BESIDE: [u64; 3] = [0x0555_0555_0555, 0x0707_0707_0707, 0x0777_0000_0777];
+    let beside = |axis: &usize| (surface & BESIDE[*axis]).count_ones();
+    (0..3).min_by_key(beside).unwrap_or(0)
+}
+
 /// The block's true voxels.
 pub(super) fn own(search: &Search, block: &Block) -> Shown {
     let keys = search.octree.level(search.top).keys();
@@ -288,4 +353,45 @@ fn colour_near(level: &PreviousLevel, at: [i32; 3], mut around: u64) -> Option<[
         }
     }
     (count > 0.0).then(|| sum.map(|x| x / count))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cells(inside: impl Fn([i32; 3]) -> bool) -> u64 {
+        let places = (0..27).map(|i| [i % 3, i / 3 % 3, i / 9]);
+        let occupied = places.filter(|at| inside(at.map(|x| x - 1)));
+        occupied.map(|[x, y, z]| 1 << (x + 4 * y + 16 * z)).sum()
+    }
+
+    #[test]
+    fn the_normal_is_the_axis_across_a_surface() {
+        for axis in 0..3 {
+            assert_eq!(normal(cells(|at| at[axis] == 0)), axis);
+            let other = (axis + 1) % 3;
+            let slanted = |at: [i32; 3]| at[axis] == i32::from(at[other] > 0);
+            assert_eq!(normal(cells(slanted)), axis);
+        }
+    }
+
+    #[test]
+    fn gaps_of_a_surface_are_holes_but_its_edges_and_what_moved_across_it_are_not() {
+        // The plane z = 8 for x below 12, with a gap of two voxels.
+        let shown = |[x, _, z]: [u32; 3]| z == 8 && x < 12 && x != 5 && x != 6;
+        let all = (0..1 << 12).filter(|key| shown(morton::decode(*key)));
+        let places = Places::new(&Voxels::new(4, all.collect()));
+        for (x, z, hole) in [
+            (5, 8, true),
+            (6, 8, true),
+            (4, 8, false),
+            (4, 9, false),
+            (12, 8, false),
+            (13, 8, false),
+        ] {
+            assert_eq!(in_a_hole(&places, [x, 7, z], 2), hole, "{x} {z}");
+        }
+        // The true surface is one higher.
+        assert!(in_a_hole(&places, [5, 7, 9], 2));
+    }
 }

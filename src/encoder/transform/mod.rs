@@ -158,6 +158,19 @@ impl QualityTarget {
         }
     }
 
+    /// The same with `factor` times the steps, within their limits.
+    pub fn scaled(self, factor: f32) -> Self {
+        let scale = |step: f32| (step * factor).clamp(0.5, 1000.0);
+        match self {
+            QualityTarget::Lossless => QualityTarget::Lossless,
+            QualityTarget::Step(step) => QualityTarget::Step(scale(step)),
+            QualityTarget::Steps { luma, chroma } => QualityTarget::Steps {
+                luma: scale(luma),
+                chroma: scale(chroma),
+            },
+        }
+    }
+
     /// What stands for these steps.
     fn of(steps: Steps) -> Self {
         let size = |luma| Steps { luma, ..steps }.luma_step();
@@ -423,7 +436,7 @@ impl<'a> EncoderInput<'a> {
             }
             if level == top {
                 colours = match &filter {
-                    Some(filter) => filter.rgb(isa, &coloured, map_of(level)),
+                    Some(filter) => filter.rgb(isa, &coloured, map_of(level), coloured.steps()),
                     None => coloured.rgb(),
                 };
             }

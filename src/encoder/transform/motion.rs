@@ -6,7 +6,7 @@ use super::Truth;
 use super::choice::{self, Weights};
 use crate::colour::Ycc;
 use crate::geometry::{Octree, morton};
-use crate::motion::{Previous, predicted};
+use crate::motion::{Previous, PreviousLevel, predicted};
 
 /// How far vectors are searched at the coarsest of three levels, in its voxels.
 const REACH: i32 = 4;
@@ -16,6 +16,10 @@ const MISSING: f32 = 1.0;
 const OTHER_COLOUR: f32 = 0.7;
 /// Difference of luma that costs the most, in units of colours.
 const FAR_LUMA: f32 = 40.0 * 64.0;
+/// Voxels of a block that vectors are compared by.
+const SAMPLE: usize = 160;
+/// Vectors of a block whose costs in rate and distortion are compared.
+const PROMISING: usize = 8;
 /// The 3³ cells at the start of a window of 4³.
 pub(super) const AROUND: u64 = 0x0777_0777_0777;
 /// The cell in their middle.
@@ -62,7 +66,7 @@ impl Search<'_> {
             .par_iter()
             .enumerate()
             .map(|(i, key)| {
-                let tried = candidates(own, &found, i).into_iter();
+                let tried = self.promising(*key, candidates(own, &found, i)).into_iter();
                 tried
                     .map(|vector| (vector, choice::cost(self, *key, vector, weights)))
                     .collect()
@@ -90,66 +94,58 @@ impl Search<'_> {
         blocks
     }
 
+    /// The [`PROMISING`] vectors of least cost at the finest level.
+    fn promising(&self, key: u64, vectors: Vec<[i16; 3]>) -> Vec<[i16; 3]> {
+        let sample = self.sample(self.top, key);
+        let cost = |vector: &[i16; 3]| sample.cost(vector.map(i32::from), f32::INFINITY);
+        let mut ranked: Vec<(f32, [i16; 3])> = vectors.iter().map(|vector| (cost(vector), *vector)).collect();
+        ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
+        ranked.iter().take(PROMISING).map(|ranked| ranked.1).collect()
+    }
+
     /// The vector found at the coarsest level, in its voxels.
     fn coarse(&self, key: u64) -> [i32; 3] {
         let down = 2.min(self.top - self.block_level);
-        let level = self.top - down;
-        let mut best = (f32::INFINITY, [0; 3]);
+        let sample = self.sample(self.top - down, key);
+        let mut best = Best::default();
         for z in -REACH..=REACH {
             for y in -REACH..=REACH {
                 for x in -REACH..=REACH {
-                    let length = (x.abs() + y.abs() + z.abs()) as f32;
-                    let cost = self.cost(level, key, [x, y, z]) + 0.05 * length;
-                    if cost < best.0 {
-                        best = (cost, [x, y, z]);
-                    }
+                    best.consider(&sample, [x, y, z]);
                 }
             }
         }
-        best.1.map(|x| x << down)
+        best.vector.map(|x| x << down)
     }
 
     /// The best vector near the one of the coarsest level, and near 0.
     fn refined(&self, key: u64, coarse: [i32; 3]) -> [i16; 3] {
-        let mut best = (f32::INFINITY, [0; 3]);
-        let mut consider = |vector: [i32; 3]| {
-            let length: i32 = vector.iter().map(|x| x.abs()).sum();
-            let cost = self.cost(self.top, key, vector) + 0.05 * length as f32;
-            if cost < best.0 {
-                best = (cost, vector);
-            }
-            best.1
-        };
-        consider([0; 3]);
-        let mut centre = consider(coarse);
+        let sample = self.sample(self.top, key);
+        let mut best = Best::default();
+        best.consider(&sample, [0; 3]);
+        best.consider(&sample, coarse);
         for step in [2, 1, 1] {
-            let around = centre;
+            let around = best.vector;
             for i in 0..27 {
                 let offset = [i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1];
-                centre = consider([0, 1, 2].map(|axis| around[axis] + step * offset[axis]));
+                best.consider(&sample, [0, 1, 2].map(|axis| around[axis] + step * offset[axis]));
             }
         }
-        centre.map(|x| x as i16)
+        best.vector.map(|x| x as i16)
     }
 
-    /// How badly a vector in voxels of `level` predicts the block's voxels of that level.
-    fn cost(&self, level: u8, key: u64, vector: [i32; 3]) -> f32 {
-        let Some(previous) = self.previous.level(level) else {
-            return 0.0;
+    /// At most [`SAMPLE`] voxels of a block at a level, spread over it.
+    fn sample(&self, level: u8, key: u64) -> Sample<'_> {
+        let voxels = self.voxels(level, key);
+        let every = voxels.len().div_ceil(SAMPLE).max(1);
+        let voxel = |i: usize| {
+            let place = self.octree.level(level).coordinate(i).map(|x| x as i32);
+            (place, self.truth.level(level)[i])
         };
-        let mut cost = 0.0;
-        for i in self.voxels(level, key) {
-            let at = self.octree.level(level).coordinate(i);
-            let at = [0, 1, 2].map(|axis| at[axis] as i32 - vector[axis]);
-            cost += match previous.index(at) {
-                None => MISSING,
-                Some(index) => {
-                    let apart = luma_apart(self.truth.level(level)[i], previous.values[index]);
-                    OTHER_COLOUR * (apart.abs() / FAR_LUMA).min(1.0)
-                }
-            };
+        Sample {
+            voxels: voxels.step_by(every).map(voxel).collect(),
+            previous: self.previous.level(level),
         }
-        cost
     }
 
     /// Numbers of the voxels of `level` in a block.
@@ -171,6 +167,62 @@ impl Search<'_> {
             });
         }
         found
+    }
+}
+
+/// Voxels of a block, and the level of the previous frame that they are looked for in.
+struct Sample<'a> {
+    voxels: Vec<([i32; 3], Ycc)>,
+    previous: Option<&'a PreviousLevel>,
+}
+
+impl Sample<'_> {
+    /// How badly a vector in voxels of the level predicts the voxels. What exceeds `most` may be less than the whole.
+    fn cost(&self, vector: [i32; 3], most: f32) -> f32 {
+        let Some(previous) = self.previous else {
+            return 0.0;
+        };
+        let mut cost = 0.0;
+        for (place, truth) in &self.voxels {
+            cost += match previous.index([0, 1, 2].map(|axis| place[axis] - vector[axis])) {
+                None => MISSING,
+                Some(index) => {
+                    let apart = luma_apart(*truth, previous.values[index]);
+                    OTHER_COLOUR * (apart.abs() / FAR_LUMA).min(1.0)
+                }
+            };
+            if cost > most {
+                break;
+            }
+        }
+        cost
+    }
+}
+
+/// The vector of least cost so far.
+struct Best {
+    cost: f32,
+    vector: [i32; 3],
+}
+
+impl Default for Best {
+    fn default() -> Self {
+        Best {
+            cost: f32::INFINITY,
+            vector: [0; 3],
+        }
+    }
+}
+
+impl Best {
+    /// Of equal costs the first vector stays.
+    fn consider(&mut self, sample: &Sample, vector: [i32; 3]) {
+        let length: i32 = vector.iter().map(|x| x.abs()).sum();
+        let length = 0.05 * length as f32;
+        let cost = sample.cost(vector, self.cost - length) + length;
+        if cost < self.cost {
+            (self.cost, self.vector) = (cost, vector);
+        }
     }
 }
 

@@ -137,7 +137,7 @@ impl Target {
         steps: Steps,
     ) -> Result<Self> {
         let lossless = steps.is_lossless();
-        let levels = (0..=top).map(|level| (truth.level(level).to_vec(), None));
+        let levels = (0..=top).map(|level| (truth.level(level).to_vec(), None, None));
         let current = Previous::new(octree, levels.collect());
         let search = Search {
             octree,
@@ -161,11 +161,16 @@ impl Target {
                 *shown = choice::own(&search, block);
             }
         }
-        let kept = blocks.into_iter().zip(&shown).filter(|(_, shown)| !shown.is_empty());
-        let blocks: Vec<Block> = kept.map(|(block, _)| block).collect();
-        let mut all: Vec<(u64, Option<Ycc>)> = shown.concat();
-        all.sort_unstable_by_key(|voxel| voxel.0);
-        let keys = all.iter().map(|voxel| voxel.0).collect();
+        let mut all: Shown = shown.concat();
+        if !lossless {
+            choice::close(&search, &blocks, &mut all);
+        }
+        let keys: Vec<u64> = all.iter().map(|voxel| voxel.0).collect();
+        let down = 3 * (top - block_level);
+        blocks.retain(|block| {
+            let first = keys.partition_point(|key| key >> down < block.key);
+            keys.get(first).is_some_and(|key| key >> down == block.key)
+        });
         let octree = Octree::new(Voxels::from_sorted(top, keys))?;
         let own = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, lossless);
         let values = all

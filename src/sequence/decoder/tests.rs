@@ -5,16 +5,18 @@ use crate::limits::Limits;
 use crate::placement::Placement;
 use crate::sequence::SequenceEncoder;
 
-/// Three frames of a slanted plane that moves by a voxel a frame.
+/// Three frames of a slanted plane that moves by two voxels a frame.
 fn sequence(scalable: bool) -> Vec<u8> {
     let cloud = |frame: u64| {
-        let key = |i: u32| morton::encode([i % 64, i / 64, i % 64 / 2 + frame as u32]);
-        let mut keys: Vec<u64> = (0..64 * 64).map(key).collect();
-        keys.sort_unstable();
-        let colour = |key: &u64| [(key % 251) as u8, 100, 50];
+        let voxel = |i: u32| {
+            let key = morton::encode([i % 64, i / 64, i % 64 / 2 + 2 * frame as u32]);
+            (key, [(i % 64 * 3) as u8, (i / 64 * 3) as u8, 50])
+        };
+        let mut voxels: Vec<(u64, [u8; 3])> = (0..64 * 64).map(voxel).collect();
+        voxels.sort_unstable();
         Ok(ColouredVoxels {
-            colours: keys.iter().map(colour).collect(),
-            voxels: Voxels::new(6, keys),
+            colours: voxels.iter().map(|voxel| voxel.1).collect(),
+            voxels: Voxels::new(6, voxels.iter().map(|voxel| voxel.0).collect()),
             placement: Placement::VOXEL_GRID,
         })
     };

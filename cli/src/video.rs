@@ -1,4 +1,4 @@
-//! `--turntable`: a video of one turn, by FFmpeg or as an animated GIF, PNG or WebP.
+//! Videos, of one turn (`--turntable`) or of a sequence: by FFmpeg, as an animated GIF, PNG or WebP, or as YUV4MPEG2.
 
 use std::io::Write;
 use std::path::Path;
@@ -9,13 +9,32 @@ use b2p::{Error, output};
 
 use super::{Failure, Result};
 
-/// Frames a second.
-const RATE: u16 = 30;
-/// Hundredths of a second of a GIF's frame; viewers slow down what is shorter.
-const GIF_DELAY: u16 = 3;
+/// Hundredths of a second of a GIF's frame at least: viewers slow down what is shorter.
+const LEAST_GIF_DELAY: u64 = 2;
 
 /// Bytes a pixel that a frame takes beside its picture: the frame before, and two copies in eight bits.
 pub const BYTES_PER_PIXEL: u64 = 16 + 2 * 4;
+
+/// How long a frame is shown: `duration / timescale` seconds.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameTime {
+    pub timescale: u32,
+    pub duration: u32,
+}
+
+impl FrameTime {
+    /// 30 frames a second.
+    pub const THIRTIETH: FrameTime = FrameTime {
+        timescale: 30,
+        duration: 1,
+    };
+
+    /// Units, of which a second has `units`, that frame `i` is shown. The sum over frames is right to half a unit.
+    fn shown(self, i: u32, units: u64) -> u64 {
+        let start = |i: u64| (2 * units * i * u64::from(self.duration) / u64::from(self.timescale)).div_ceil(2);
+        start(u64::from(i) + 1) - start(u64::from(i))
+    }
+}
 
 /// Kinds of videos.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,21 +57,26 @@ pub fn kind_of(path: &Path) -> Result<Kind> {
         "y4m" => Ok(Kind::Y4m),
         "mp4" | "webm" | "mkv" | "mov" => Ok(Kind::Other),
         _ => Err(Failure(format!(
-            "{}: no turntables are written as .{ending}, but as .gif, .webp, .png, .y4m, and with FFmpeg as .mp4, .webm, .mkv and .mov",
+            "{}: no videos are written as .{ending}, but as .gif, .webp, .png, .y4m, and with FFmpeg as .mp4, .webm, .mkv and .mov",
             path.display()
         ))),
     }
 }
 
 /// Writes the `count` frames that `draw` makes, one after the other, to a file.
-pub fn write(path: &Path, count: u32, mut draw: impl FnMut(u32, &mut Image) -> b2p::Result<()>) -> Result<()> {
+pub fn write(
+    path: &Path,
+    count: u32,
+    time: FrameTime,
+    mut draw: impl FnMut(u32, &mut Image) -> b2p::Result<()>,
+) -> Result<()> {
     let kind = kind_of(path)?;
     if kind == Kind::Other {
-        return by_ffmpeg(path, count, draw);
+        return by_ffmpeg(path, count, time, draw);
     }
     let mut image = Image::default();
     Ok(output::write_file(path, |w| {
-        let mut film = Film::new(kind, path, w);
+        let mut film = Film::new(kind, path, w, time);
         for i in 0..count {
             draw(i, &mut image)?;
             film.add(i, count, &image)?;
@@ -62,7 +86,12 @@ pub fn write(path: &Path, count: u32, mut draw: impl FnMut(u32, &mut Image) -> b
 }
 
 /// A file that frames are added to.
-enum Film<'w> {
+struct Film<'w> {
+    file: File<'w>,
+    time: FrameTime,
+}
+
+enum File<'w> {
     Gif(
         &'w Path,
         Option<gif::Encoder<&'w mut dyn Write>>,
@@ -78,18 +107,20 @@ enum Film<'w> {
 }
 
 impl<'w> Film<'w> {
-    fn new(kind: Kind, path: &'w Path, to: &'w mut dyn Write) -> Self {
-        match kind {
-            Kind::Gif => Film::Gif(path, None, Some(to)),
-            Kind::Png => Film::Png(path, None, Some(to)),
-            Kind::WebP => Film::WebP(path, WebP::default(), to),
-            Kind::Y4m | Kind::Other => Film::Y4m(path, to),
-        }
+    fn new(kind: Kind, path: &'w Path, to: &'w mut dyn Write, time: FrameTime) -> Self {
+        let file = match kind {
+            Kind::Gif => File::Gif(path, None, Some(to)),
+            Kind::Png => File::Png(path, None, Some(to)),
+            Kind::WebP => File::WebP(path, WebP::default(), to),
+            Kind::Y4m | Kind::Other => File::Y4m(path, to),
+        };
+        Film { file, time }
     }
 
     fn add(&mut self, i: u32, count: u32, image: &Image) -> b2p::Result<()> {
-        match self {
-            Film::Gif(path, encoder, to) => {
+        let time = self.time;
+        match &mut self.file {
+            File::Gif(path, encoder, to) => {
                 let failed = |e: gif::EncodingError| unwritten(path, e);
                 let [width, height] = sides(path, image)?;
                 if let Some(to) = to.take() {
@@ -99,21 +130,25 @@ impl<'w> Film<'w> {
                 }
                 let mut pixels = straight(image)?;
                 let mut frame = gif::Frame::from_rgba_speed(width, height, &mut pixels, 10);
-                frame.delay = GIF_DELAY;
+                frame.delay = time.shown(i, 100).clamp(LEAST_GIF_DELAY, u16::MAX.into()) as u16;
                 frame.dispose = gif::DisposalMethod::Background;
                 match encoder {
                     Some(encoder) => encoder.write_frame(&frame).map_err(failed),
                     None => Ok(()),
                 }
             }
-            Film::Png(path, encoder, to) => {
+            File::Png(path, encoder, to) => {
                 let failed = |e: png::EncodingError| unwritten(path, e);
                 if let Some(to) = to.take() {
                     let mut started = png::Encoder::new(to, image.width, image.height);
                     started.set_color(png::ColorType::Rgba);
                     started.set_depth(png::BitDepth::Eight);
                     started.set_animated(count, 0).map_err(failed)?;
-                    started.set_frame_delay(1, RATE).map_err(failed)?;
+                    let [part, whole] = match (u16::try_from(time.duration), u16::try_from(time.timescale)) {
+                        (Ok(part), Ok(whole)) => [part, whole],
+                        _ => [time.shown(0, 1000).min(u16::MAX.into()) as u16, 1000],
+                    };
+                    started.set_frame_delay(part, whole).map_err(failed)?;
                     *encoder = Some(started.write_header().map_err(failed)?);
                 }
                 let pixels = straight(image)?;
@@ -122,10 +157,10 @@ impl<'w> Film<'w> {
                     None => Ok(()),
                 }
             }
-            Film::WebP(path, webp, _) => webp.add(path, i, image),
-            Film::Y4m(path, to) => {
+            File::WebP(path, webp, _) => webp.add(path, time.shown(i, 1000) as u32, image),
+            File::Y4m(path, to) => {
                 if i == 0 {
-                    to.write_all(&image.y4m_header()).map_err(|e| unwritten(path, e))?;
+                    to.write_all(&y4m_header(image, time)).map_err(|e| unwritten(path, e))?;
                 }
                 image.write_y4m_frame(to, path)
             }
@@ -133,18 +168,18 @@ impl<'w> Film<'w> {
     }
 
     fn finish(self) -> b2p::Result<()> {
-        match self {
-            Film::Y4m(..) => Ok(()),
-            Film::Gif(path, encoder, _) => match encoder {
+        match self.file {
+            File::Y4m(..) => Ok(()),
+            File::Gif(path, encoder, _) => match encoder {
                 // Ends the file.
                 Some(encoder) => encoder.into_inner().map(drop).map_err(|e| unwritten(path, e)),
                 None => Ok(()),
             },
-            Film::Png(path, encoder, _) => match encoder {
+            File::Png(path, encoder, _) => match encoder {
                 Some(encoder) => encoder.finish().map_err(|e| unwritten(path, e)),
                 None => Ok(()),
             },
-            Film::WebP(path, webp, to) => webp.write(path, to),
+            File::WebP(path, webp, to) => webp.write(path, to),
         }
     }
 }
@@ -157,7 +192,7 @@ struct WebP {
 }
 
 impl WebP {
-    fn add(&mut self, path: &Path, i: u32, image: &Image) -> b2p::Result<()> {
+    fn add(&mut self, path: &Path, milliseconds: u32, image: &Image) -> b2p::Result<()> {
         sides(path, image)?;
         self.size = [image.width, image.height];
         let mut still = Vec::new();
@@ -174,8 +209,8 @@ impl WebP {
         let chunk = still.get(12..).unwrap_or_default();
         let mut frame = Vec::new();
         // No offset; sides less one; milliseconds.
-        let elapsed = |frames: u32| 1000 * frames / u32::from(RATE);
-        for number in [0, 0, image.width - 1, image.height - 1, elapsed(i + 1) - elapsed(i)] {
+        let milliseconds = milliseconds.min((1 << 24) - 1);
+        for number in [0, 0, image.width - 1, image.height - 1, milliseconds] {
             frame.extend(&number.to_le_bytes()[..3]);
         }
         // Does not blend with the frame before.
@@ -221,7 +256,12 @@ fn append(to: &mut Vec<u8>, name: &[u8; 4], bytes: &[u8]) {
 }
 
 /// Pipes frames through FFmpeg into a file that appears when it is complete.
-fn by_ffmpeg(path: &Path, count: u32, mut draw: impl FnMut(u32, &mut Image) -> b2p::Result<()>) -> Result<()> {
+fn by_ffmpeg(
+    path: &Path,
+    count: u32,
+    time: FrameTime,
+    mut draw: impl FnMut(u32, &mut Image) -> b2p::Result<()>,
+) -> Result<()> {
     let folder = match path.parent() {
         Some(folder) if folder != Path::new("") => folder,
         _ => Path::new("."),
@@ -259,7 +299,8 @@ fn by_ffmpeg(path: &Path, count: u32, mut draw: impl FnMut(u32, &mut Image) -> b
         for i in 0..count {
             drawn = draw(i, &mut image).and_then(|()| {
                 if i == 0 {
-                    pipe.write_all(&image.y4m_header()).map_err(|e| unwritten(path, e))?;
+                    pipe.write_all(&y4m_header(&image, time))
+                        .map_err(|e| unwritten(path, e))?;
                 }
                 image.write_y4m_frame(&mut pipe, path)
             });
@@ -274,6 +315,13 @@ fn by_ffmpeg(path: &Path, count: u32, mut draw: impl FnMut(u32, &mut Image) -> b
         return Err(Failure(format!("{}: ffmpeg failed with {ended}", path.display())));
     }
     temporary.keep_as(path).map_err(|source| Failure::writing(path, source))
+}
+
+/// The header of a YUV4MPEG2 file of such pictures.
+fn y4m_header(image: &Image, time: FrameTime) -> Vec<u8> {
+    let rate = format!(" F{}:{} ", time.timescale, time.duration);
+    let header = String::from_utf8_lossy(&image.y4m_header()).replace(" F30:1 ", &rate);
+    header.into_bytes()
 }
 
 /// Eight bits a channel, straight alpha.
@@ -313,7 +361,7 @@ mod tests {
             image.pixels = vec![[0.25 * i as f32, 0.5, 1.0, 1.0]; 15];
             Ok(())
         };
-        write(&path, 4, frame).unwrap();
+        write(&path, 4, FrameTime::THIRTIETH, frame).unwrap();
         std::fs::read(path).unwrap()
     }
 
@@ -355,12 +403,14 @@ mod tests {
         let mut options = gif::DecodeOptions::new();
         options.set_color_output(gif::ColorOutput::RGBA);
         let mut decoder = options.read_info(&file[..]).unwrap();
-        let mut reds = Vec::new();
+        let (mut reds, mut delays) = (Vec::new(), Vec::new());
         while let Some(frame) = decoder.read_next_frame().unwrap() {
-            assert_eq!(frame.delay, GIF_DELAY);
+            delays.push(frame.delay);
             reds.push(frame.buffer[0]);
         }
         assert_eq!(reds, [0, 64, 128, 191]);
+        // Whole hundredths, which do not drift from the time.
+        assert_eq!(delays, [3, 4, 3, 3]);
     }
 
     #[test]
