@@ -82,7 +82,7 @@ pub enum Command {
     /// Convert Gaussians or points from one file format to another
     Convert(Convert),
     /// Draw streams, Gaussians in any format that `convert` reads, or point clouds into pictures: .png, .ppm, .exr, or
-    /// .y4m for a video. Of several pictures a number is put before the ending
+    /// .y4m for a video; sequences also into .gif, .webp and .apng. Of several pictures a number is put before the ending
     Render(Render),
     /// Show streams, sequences, Gaussians and point clouds in a window, or in the terminal
     #[cfg(feature = "view")]

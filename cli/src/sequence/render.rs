@@ -76,7 +76,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     Ok(Said::report(report, json).beside(&args.output))
 }
 
-/// Whether all frames go into a file with this ending. Those of a `.png` file would be a surprise.
+/// Whether all frames go into a file with this ending. A `.png` file is one picture.
 fn is_video(path: &Path) -> bool {
     path.extension().is_some_and(|ending| ending != "png") && video::kind_of(path).is_ok()
 }
