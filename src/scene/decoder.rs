@@ -8,6 +8,8 @@ use rayon::prelude::*;
 use super::neighbours::Bounds;
 use super::reader::SceneReader;
 use super::source::Source;
+#[cfg(feature = "ply")]
+use crate::cloud::ColouredVoxels;
 use crate::container::Header;
 use crate::container::scene::{BlockEntry, Cube};
 use crate::decoder::{Decoder, LevelVoxels, Part};
@@ -52,6 +54,19 @@ pub struct DecodedScene<T> {
     pub blocks: usize,
     /// Why other blocks could not be decoded: [`Error::Block`]. Their neighbours are drawn as if they were empty.
     pub lost: Vec<Error>,
+}
+
+impl<T> DecodedScene<T> {
+    /// What was decoded, if no block is lost.
+    ///
+    /// # Errors
+    /// Why the first of them is.
+    pub fn whole(self) -> Result<T> {
+        match self.lost.into_iter().next() {
+            Some(error) => Err(error),
+            None => Ok(self.content),
+        }
+    }
 }
 
 /// The voxels of a level that are wanted, and the blocks that they are in.
@@ -152,6 +167,38 @@ impl SceneDecoder {
         }
         let voxels = Voxels::from_sorted(selection.level, keys);
         finish((voxels, colours), lost, blocks)
+    }
+
+    /// The same on a grid of their own: that of the scene, with as many bits as the level has.
+    ///
+    /// # Errors
+    /// Those of [`SceneDecoder::voxels`].
+    #[cfg(feature = "ply")]
+    pub fn points<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<DecodedScene<ColouredVoxels>> {
+        let DecodedScene { content, blocks, lost } = self.voxels(scene, wanted)?;
+        let (voxels, colours) = content;
+        let Placement { origin, voxel_size } = scene.header().placement;
+        let coarser = f64::from(1u32 << (scene.header().bits - voxels.depth()));
+        let content = ColouredVoxels {
+            voxels,
+            colours,
+            placement: Placement {
+                origin,
+                voxel_size: voxel_size * coarser,
+            },
+        };
+        Ok(DecodedScene { content, blocks, lost })
+    }
+
+    /// The levels of a scene that can be drawn, the coarsest first, down to the decoder's level if it has one.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a level that the scene has not.
+    pub fn levels<S: Source>(&self, scene: &SceneReader<S>) -> Result<Vec<u8>> {
+        let header = scene.header();
+        let levels = header.base..=self.level(header)?;
+        let drawable = |level: &u8| self.decoder.check_drawable(header, *level).is_ok();
+        Ok(levels.filter(drawable).collect())
     }
 
     /// The blocks in which a part lies.
