@@ -11,8 +11,8 @@ use b2p::container::scene::{BlockEntry, parse_index, write_index};
 use b2p::geometry::morton;
 use b2p::scene::ViewOptions;
 use b2p::{
-    Background, Camera, Decoder, Error, Gaussians, Image, Limits, Renderer, SceneDecoder, SceneDecoding, SceneEncoder,
-    SceneReader, SequenceReader, Source, Wanted,
+    Background, Camera, Decoder, Error, FileSource, Gaussians, Image, Limits, Renderer, SceneDecoder, SceneDecoding,
+    SceneEncoder, SceneReader, SequenceReader, Source, Wanted,
 };
 use common::{Ball, cloud_of};
 use rayon::prelude::*;
@@ -154,6 +154,29 @@ fn a_scene_takes_the_part_of_the_cube_that_its_voxels_take() {
     // A ball of 24 voxels in a cube of 64, in voxels of level 3.
     assert!(low.iter().all(|x| (-1.0..=-0.75).contains(x)), "{low:?}");
     assert!(high.iter().all(|x| (0.75..=1.0).contains(x)), "{high:?}");
+}
+
+#[test]
+fn a_file_that_becomes_shorter_after_its_index_was_read_loses_the_blocks_behind_its_end_alone() {
+    let bytes = scene_bytes();
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("scene.b2p");
+    std::fs::write(&path, &bytes).expect("written");
+    let source = FileSource::open(&path).expect("a file");
+    let scene = SceneReader::new(source, &Limits::default()).expect("a scene");
+    let kept = scene.blocks().len() / 2;
+    let file = std::fs::File::options().write(true).open(&path).expect("a file");
+    file.set_len(scene.blocks()[kept].offset + 1).expect("it is cut");
+    let decoded = SceneDecoder::default().voxels(&scene, &Wanted::All).expect("a part");
+    let whole = SceneDecoder::default().voxels(&reader(&bytes), &Wanted::Blocks((0..kept).collect()));
+    assert_eq!(decoded.content, whole.expect("a part").content);
+    assert_eq!(decoded.lost.len(), scene.blocks().len() - kept);
+    for error in &decoded.lost {
+        let Error::Block { block, source } = error else {
+            panic!("{error}")
+        };
+        assert!(*block >= kept && matches!(**source, Error::Truncated { .. }), "{error}");
+    }
 }
 
 #[test]

@@ -93,9 +93,10 @@ pub fn bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     bytes.map_err(Failure::in_file(path))
 }
 
-/// Fails, before anything is begun, unless the machine has this much memory to give.
+/// Fails, before anything is begun, unless the machine has this much memory to give, and what everything else takes.
 pub fn reserve(what: &'static str, bytes: u64) -> Result<()> {
     let mut trial = Vec::<u8>::new();
+    let bytes = bytes.saturating_add(Limits::OVERHEAD);
     let bytes_here = usize::try_from(bytes).unwrap_or(usize::MAX);
     let had = trial.try_reserve_exact(bytes_here);
     had.map_err(|_| Failure::from(Error::OutOfMemory { what, bytes }))

@@ -16,6 +16,8 @@ use crate::decoder::{Decoder, LevelVoxels, Part};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::{Octree, Voxels};
+#[cfg(doc)]
+use crate::limits::Limits;
 use crate::placement::Placement;
 
 /// Bytes of memory for each byte of a stream that is decoded: the stream, and its slices.
@@ -201,6 +203,32 @@ impl SceneDecoder {
         Ok(levels.filter(drawable).collect())
     }
 
+    /// Bytes of memory that decoding a part and its Gaussians takes, beyond [`Limits::OVERHEAD`] and models. Around a
+    /// block there are taken to be as many voxels as in it.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a level or a part that the scene has not, [`Error::Unsupported`] for heads that there are
+    /// not.
+    pub fn memory<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<u64> {
+        let Selection { level, blocks, .. } = self.select(scene, wanted)?;
+        let reach = self.decoder.reach(scene.header(), level)?;
+        let needed = around(scene.blocks(), &blocks, level, reach);
+        let (decoded, working) = self.decoding_bytes(scene, &needed, level)?;
+        let made = self.gaussian_bytes(scene, &blocks, level)?;
+        let own = |block: &usize| -> Result<u64> {
+            let entry = &scene.blocks()[*block];
+            let voxels = entry.header(scene.header()).voxels(level - entry.cube.level)?;
+            Ok(2 * u64::from(voxels))
+        };
+        let most = blocks
+            .iter()
+            .map(own)
+            .try_fold(0, |most, voxels| voxels.map(|voxels| most.max(voxels)))?;
+        let drawing = self.decoder.drawing_bytes_of(scene.header(), level, [most; 2])?;
+        let drawing = drawing.saturating_add(most.saturating_mul(PART_BYTES));
+        Ok(made.saturating_add(decoded).saturating_add(working.max(drawing)))
+    }
+
     /// The blocks in which a part lies.
     ///
     /// # Errors
@@ -347,6 +375,14 @@ impl SceneDecoder {
     /// Checks that decoding these blocks keeps to the limits, beside `kept` bytes, and returns what they take when they
     /// are decoded.
     fn check_memory<S: Source>(&self, scene: &SceneReader<S>, blocks: &[usize], level: u8, kept: u64) -> Result<u64> {
+        let (decoded, working) = self.decoding_bytes(scene, blocks, level)?;
+        let all = kept.saturating_add(decoded).saturating_add(working);
+        self.decoder.limits().check_bytes("memory to decode this scene", all)?;
+        Ok(decoded)
+    }
+
+    /// Bytes of these blocks when they are decoded, and while they are.
+    fn decoding_bytes<S: Source>(&self, scene: &SceneReader<S>, blocks: &[usize], level: u8) -> Result<(u64, u64)> {
         let mut working: Vec<u64> = Vec::new();
         let mut decoded: u64 = 0;
         for &block in blocks {
@@ -357,10 +393,9 @@ impl SceneDecoder {
             decoded = decoded.saturating_add(u64::from(own.voxels(local)?) * VOXEL_BYTES);
         }
         working.sort_unstable();
-        let working: u64 = working.iter().rev().take(rayon::current_num_threads()).sum();
-        let all = kept.saturating_add(decoded).saturating_add(working);
-        self.decoder.limits().check_bytes("memory to decode this scene", all)?;
-        Ok(decoded)
+        let largest = working.iter().rev().take(rayon::current_num_threads());
+        let working = largest.fold(0, |sum: u64, bytes| sum.saturating_add(*bytes));
+        Ok((decoded, working))
     }
 
     /// Checks that drawing a block among so many voxels keeps to the limits, beside `kept` bytes.

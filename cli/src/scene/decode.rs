@@ -26,6 +26,7 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
         Some([low, high]) => Wanted::Box(low, high),
         None => Wanted::All,
     };
+    super::reserve(&args.input, &scene, &decoder, &wanted, limits)?;
     match args.points {
         true => voxels(args, &scene, &decoder, &wanted, progress),
         false => gaussians(args, &scene, &decoder, &wanted, progress),

@@ -10,7 +10,7 @@ mod stream;
 use std::borrow::Cow;
 use std::path::Path;
 
-use b2p::{Error, FileSource, Limits, SceneReader, Source};
+use b2p::{Error, FileSource, Limits, SceneDecoder, SceneReader, Source, Wanted};
 
 pub use decode::run as decode;
 pub use edit::cut;
@@ -76,6 +76,17 @@ pub fn open(path: &Path, limits: &Limits) -> Result<Reader> {
         false => SceneSource::File(FileSource::open(path).map_err(Failure::in_file(path))?),
     };
     SceneReader::new(source, limits).map_err(Failure::in_file(path))
+}
+
+/// Fails, before anything is begun, unless the machine has the memory that decoding a part of a scene takes.
+fn reserve(path: &Path, scene: &Reader, decoder: &SceneDecoder, wanted: &Wanted, limits: &Limits) -> Result<()> {
+    match decoder.memory(scene, wanted) {
+        Ok(memory) if limits.check_bytes("", memory).is_ok() => {
+            load::reserve("decoding", memory).map_err(|Failure(text)| Failure(format!("{}: {text}", path.display())))
+        }
+        // What is wrong is said when it is decoded.
+        _ => Ok(()),
+    }
 }
 
 /// Says which blocks could not be decoded, and fails if there are some.

@@ -32,6 +32,7 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     let log = progress.log();
     let one_file = args.contact_sheet || args.turntable.is_some() || format_of(args, cameras.len())? == Format::Y4m;
     if one_file {
+        super::reserve(&args.input, &scene, &decoder, &Wanted::All, limits)?;
         let blocks = scene.blocks().len();
         let decoded = log.step("decode scene", blocks, "blocks", || {
             decoder.gaussians(&scene, &Wanted::All)
