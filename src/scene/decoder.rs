@@ -1,6 +1,6 @@
 //! Decodes scenes, whole or in part (`docs/format.md`, clause 18.3).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
 use rayon::prelude::*;
@@ -79,8 +79,17 @@ struct Selection {
     bounds: Option<Bounds>,
 }
 
-/// Blocks that were decoded to a level, by their numbers; `None` for those that could not be.
-pub(super) type Decoded = BTreeMap<usize, Option<LevelVoxels>>;
+/// What is known of the blocks of a scene at a level.
+#[derive(Debug, Default)]
+pub(super) struct Decoded {
+    /// Blocks that were decoded, by their numbers; `None` for those that could not be.
+    pub blocks: Blocks,
+    /// Keys of the coarsest level, of blocks that were decoded no further.
+    coarse: BTreeMap<usize, Vec<u64>>,
+}
+
+/// Decoded blocks by their numbers; `None` for those that could not be decoded.
+pub(super) type Blocks = BTreeMap<usize, Option<LevelVoxels>>;
 
 impl SceneDecoder {
     /// A decoder of scenes, which decodes and draws as `decoder` does: its level, heads, limits and instructions count.
@@ -97,7 +106,7 @@ impl SceneDecoder {
     /// damage in some of them [`DecodedScene::lost`] tells.
     pub fn gaussians<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<DecodedScene<Gaussians>> {
         let selection = self.select(scene, wanted)?;
-        let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
+        let (mut decoded, mut lost) = (Decoded::default(), Vec::new());
         let mut parts: Vec<Gaussians> = Vec::new();
         let mut take = |_, drawn| parts.push(drawn);
         let Selection { level, bounds, .. } = &selection;
@@ -122,10 +131,11 @@ impl SceneDecoder {
         let header = scene.header();
         self.decoder.check_drawable(header, level)?;
         let reach = self.decoder.reach(header, level)?;
-        let needed = around(scene.blocks(), blocks, level, reach);
+        let kept = self.gaussian_bytes(scene, blocks, level)?.saturating_add(held);
+        let needed = self.near(scene, (level, blocks), kept, decoded)?;
+        let decoded = &mut decoded.blocks;
         let missing = needed.iter().copied().filter(|block| !decoded.contains_key(block));
         let missing: Vec<usize> = missing.collect();
-        let kept = self.gaussian_bytes(scene, blocks, level)?.saturating_add(held);
         let kept = kept.saturating_add(self.check_memory(scene, &missing, level, kept)?);
         self.decode(scene, &needed, level, decoded, lost)?;
         for &block in blocks {
@@ -136,6 +146,49 @@ impl SceneDecoder {
             take(block, self.draw(header, own, &near.collect()?, bounds)?);
         }
         Ok(())
+    }
+
+    /// Some blocks and those around them that have voxels so near that drawing depends on them. The coarsest level of a
+    /// block tells that, for a fraction of what it takes to decode.
+    pub(super) fn near<S: Source>(
+        &self,
+        scene: &SceneReader<S>,
+        (level, blocks): (u8, &[usize]),
+        held: u64,
+        decoded: &mut Decoded,
+    ) -> Result<Vec<usize>> {
+        let (all, base) = (scene.blocks(), scene.header().base);
+        let reach = self.decoder.reach(scene.header(), level)?;
+        let around = around(all, blocks, level, reach);
+        if around.len() == blocks.len() || base >= level {
+            return Ok(around);
+        }
+        let own: BTreeSet<usize> = blocks.iter().copied().collect();
+        let is_needed = |block: &usize| own.contains(block) || decoded.blocks.contains_key(block);
+        let unknown = |block: &&usize| !is_needed(block) && !decoded.coarse.contains_key(block);
+        let unknown: Vec<usize> = around.iter().filter(unknown).copied().collect();
+        self.check_memory(scene, &unknown, base, held)?;
+        let mut found = Blocks::new();
+        // What is wrong with a block is said when it is decoded.
+        self.decode(scene, &unknown, base, &mut found, &mut Vec::new())?;
+        for (block, voxels) in found {
+            decoded.coarse.extend(voxels.map(|voxels| (block, voxels.keys)));
+        }
+        let reached = own.iter().map(|&block| Bounds::around(all[block].cube, level, reach));
+        let reached: Vec<Bounds> = reached.collect();
+        let has_near = |block: &usize, keys: &[u64]| {
+            let cube = Bounds::of(all[*block].cube, level);
+            let close: Vec<&Bounds> = reached.iter().filter(|bounds| bounds.meets(&cube)).collect();
+            keys.iter().any(|&key| {
+                let voxel = Bounds::of(Cube { level: base, key }, level);
+                close.iter().any(|bounds| bounds.meets(&voxel))
+            })
+        };
+        let near = around.into_iter().filter(|block| match decoded.coarse.get(block) {
+            Some(keys) if !own.contains(block) && !decoded.blocks.contains_key(block) => has_near(block, keys),
+            _ => true,
+        });
+        Ok(near.collect())
     }
 
     /// What decodes blocks.
@@ -155,7 +208,7 @@ impl SceneDecoder {
     ) -> Result<DecodedScene<(Voxels, Vec<[u8; 3]>)>> {
         let selection = self.select(scene, wanted)?;
         self.check_memory(scene, &selection.blocks, selection.level, 0)?;
-        let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
+        let (mut decoded, mut lost) = (Blocks::new(), Vec::new());
         self.decode(scene, &selection.blocks, selection.level, &mut decoded, &mut lost)?;
         let (mut keys, mut colours) = (Vec::new(), Vec::new());
         let mut blocks = 0;
@@ -276,7 +329,7 @@ impl SceneDecoder {
         scene: &SceneReader<S>,
         blocks: &[usize],
         level: u8,
-        decoded: &mut Decoded,
+        decoded: &mut Blocks,
         lost: &mut Vec<Error>,
     ) -> Result<()> {
         let decode = |&block: &usize| -> Result<LevelVoxels> {
@@ -445,7 +498,7 @@ struct Neighbourhood {
 }
 
 impl<'a> Near<'a> {
-    fn of(blocks: &[BlockEntry], decoded: &'a Decoded, block: usize, level: u8, reach: u32) -> Self {
+    fn of(blocks: &[BlockEntry], decoded: &'a Blocks, block: usize, level: u8, reach: u32) -> Self {
         let bounds = Bounds::around(blocks[block].cube, level, reach);
         let (mut parts, mut own) = (Vec::new(), 0);
         for (&other, voxels) in decoded {

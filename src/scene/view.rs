@@ -170,7 +170,10 @@ impl<S: Source> Work<'_, S> {
 
     /// Bytes that are held of what was decoded and drawn, of the group at hand twice.
     fn held_bytes(&self, own: &[(usize, Gaussians)]) -> u64 {
-        let decoded = self.decoded.values().flat_map(|decoded| decoded.values().flatten());
+        let decoded = self
+            .decoded
+            .values()
+            .flat_map(|decoded| decoded.blocks.values().flatten());
         let voxels: u64 = decoded.map(|voxels| voxels.keys.len() as u64).sum();
         let drawn: u64 = self.drawn.values().map(|gaussians| gaussians.len() as u64).sum();
         let own: u64 = own.iter().map(|(_, gaussians)| gaussians.len() as u64).sum();
