@@ -44,8 +44,17 @@ class Level:
     head_map: bytes = None
 
 
-def parse_header(data):
-    """2.2"""
+def check_counts(header, clause):
+    """2.2.2: voxels and points."""
+    low, high = 1, 8**header.base
+    for count in header.voxels:
+        require(low <= count <= high, clause, "voxel counts")
+        low, high = count, 8 * count
+    require(low <= header.points <= low * 8 ** (header.bits - header.top), clause, "points")
+
+
+def parse_header(data, flags=0):
+    """2.2; `flags` are the critical ones that are expected."""
     reader = Reader(data, "2.2.1")
     require(reader.take(8) == MAGIC, "2.2.1", "magic")
     major, _ = reader.number("H"), reader.number("H")  # the minor version does not matter
@@ -62,17 +71,14 @@ def parse_header(data):
     sections = [(reader.number("I"), reader.number("I")) for _ in range(levels)]
     found = crc32c(data[: reader.at])
     require(reader.number("I") == found, "2.2.1", "header checksum")
-    require(critical == 0 and reserved == 0, "2.2.1", "critical flags and reserved byte")
+    require(critical == flags and reserved == 0, "2.2.1", "critical flags and reserved byte")
     require(1 <= bits <= 21 and top <= bits, "2.2.2", "bit depth")
     require(all(map(math.isfinite, (*origin, voxel_size))) and voxel_size > 0, "2.2.3", "placement")
     require(1 <= slice_voxels <= 16384 and 1 <= colour_slice <= 65536, "2.2.1", "slice sizes")
-    low, high = 1, 8**base
-    for count in voxels:
-        require(low <= count <= high, "2.2.2", "voxel counts")
-        low, high = count, 8 * count
-    require(low <= points <= low * 8 ** (bits - top), "2.2.2", "points")
     sizes = (slice_voxels, colour_slice, voxels, sections, reader.at)
-    return Header(bits, base, top, points, origin, voxel_size, *sizes)
+    header = Header(bits, base, top, points, origin, voxel_size, *sizes)
+    check_counts(header, "2.2.2")
+    return header
 
 
 class Chunks:
@@ -91,7 +97,8 @@ class Chunks:
         self.chunks.reverse()
 
     @staticmethod
-    def read(reader):
+    def read(reader, kinds=(GEOMETRY, GEOMETRY_TRUNK, COLOUR_TRUNK, COLOURS, FILTER)):
+        """The next chunk; `kinds` are the critical ones that are defined here."""
         start = reader.at
         kind, level = reader.number("B"), reader.number("B")
         number, count, length = reader.varint(), reader.varint(), reader.varint()
@@ -99,8 +106,7 @@ class Chunks:
         checksum = reader.number("I")
         payload = reader.take(length)
         require(crc32c(head + payload) == checksum, "3.1.1", f"checksum of the chunk at byte {start}")
-        known = kind >= 128 or kind in (GEOMETRY, GEOMETRY_TRUNK, COLOUR_TRUNK, COLOURS, FILTER)
-        require(known, "3.1.2", f"unknown chunk type {kind}")
+        require(kind >= 128 or kind in kinds, "3.1.2", f"unknown chunk type {kind}")
         require(number <= 65535, "3.1.1", "slice number")
         return Chunk(kind, level, number, count, payload)
 

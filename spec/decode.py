@@ -1,6 +1,6 @@
 """Decodes streams of version 3, and holds a folder of conformance streams against their digests.
 
-    python3 spec/decode.py STREAM.b2p           prints voxels and digests of every level
+    python3 spec/decode.py STREAM.b2p           prints the digests of every level, of a scene also those of each block
     python3 spec/decode.py --suite FOLDER       checks all streams of FOLDER/suite.txt
     python3 spec/decode.py --damage LIST        checks that the streams of LIST are refused for the stated clauses
 """
@@ -16,6 +16,7 @@ import colour
 import container
 import geometry
 import head_map
+import scene
 import surfels
 from base import Refused, require
 from octree import Voxels
@@ -57,32 +58,47 @@ class Decoder:
         return voxels, [colour.display(value, fraction) for value in values]
 
 
+def digest(level, voxels, colours, gaussians, count, part):
+    """`level=geometry,colours,surfels` of a range of voxels, with `count` surfels each (16.2)."""
+    keys = b"".join(struct.pack("<Q", voxels.keys[i]) for i in part)
+    own_colours = bytes(x for i in part for x in colours[i])
+    drawn = gaussians.tobytes(slice(count * part.start, count * part.stop))
+    return f"{level}=" + ",".join(hashlib.sha256(part).hexdigest() for part in (keys, own_colours, drawn))
+
+
 def digests(data):
-    """For every level `level=geometry,colours,surfels` (16.2)."""
-    decoder = Decoder(data)
+    """For a stream, and for each block of a scene, what is behind its name, and the digest of every level (16.4)."""
+    if scene.is_scene(data):
+        decoder = scene.Scene(data, Decoder)
+        names = ["", *(f"/{i}" for i in range(len(decoder.blocks)))]
+    else:
+        decoder, names = Decoder(data), [""]
+    lines = [[] for _ in names]
     for level in range(decoder.header.base, decoder.header.top + 1):
-        voxels, colours = decoder.decode(level)
-        keys = b"".join(struct.pack("<Q", key) for key in voxels.keys)
+        voxels, colours, *of_scene = decoder.decode(level)
+        sizes, blocks = of_scene or (decoder.size, [])
         count = 4 if level + 1 < decoder.header.bits else 1
-        gaussians = surfels.surfels(voxels, colours, count, decoder.size)
-        parts = [keys, bytes(x for rgb in colours for x in rgb), gaussians.tobytes()]
-        yield f"{level}=" + ",".join(hashlib.sha256(part).hexdigest() for part in parts)
+        gaussians = surfels.surfels(voxels, colours, count, sizes, blocks)
+        for line, part in zip(lines, [range(len(voxels)), *blocks]):
+            line.append(digest(level, voxels, colours, gaussians, count, part))
+    return [" ".join([name, *line]) for name, line in zip(names, lines)]
 
 
 def check(folder):
     """How many streams of the suite decode to something else."""
     failed = 0
     lines = (folder / "suite.txt").read_text().splitlines()
-    for line in lines:
-        name, *expected = line.split(" ")
+    streams = [name for name in (line.split(" ")[0] for line in lines) if "/" not in name]
+    for name in streams:
+        expected = [line[len(name) :] for line in lines if line.startswith((f"{name} ", f"{name}/"))]
         try:
-            found = list(digests((folder / f"{name}.b2p").read_bytes()))
+            found = digests((folder / f"{name}.b2p").read_bytes())
             good, why = found == expected, f"DIFFERS: {found}"
         except Refused as fault:
             good, why = False, f"REFUSED: {fault}"
         print(f"{name}: {'as expected' if good else why}", flush=True)
         failed += not good
-    print(f"{len(lines)} streams, {failed} differ")
+    print(f"{len(streams)} streams, {failed} differ")
     return failed
 
 
@@ -100,10 +116,10 @@ def check_damage(path):
     failed = count = 0
     for line in path.read_text().splitlines():
         name, stream, expected, *changes = line.split(" ")
-        if not stream.startswith("version-3/"):
+        if not stream.startswith(("version-3/", "scenes/")):
             continue
         try:
-            list(digests(damaged((path.parent / f"{stream}.b2p").read_bytes(), changes)))
+            digests(damaged((path.parent / f"{stream}.b2p").read_bytes(), changes))
             found = "nothing"
         except Refused as fault:
             found = fault.clause

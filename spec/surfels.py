@@ -20,10 +20,10 @@ class Gaussians:
     opacity: np.ndarray
     colour: np.ndarray
 
-    def tobytes(self):
-        """16.1"""
+    def tobytes(self, rows=slice(None)):
+        """16.1, of some rows."""
         parts = (self.position, self.scale, self.rotation, self.opacity, self.colour)
-        return b"".join(np.ascontiguousarray(part, dtype="<f4").tobytes() for part in parts)
+        return b"".join(np.ascontiguousarray(part[rows], dtype="<f4").tobytes() for part in parts)
 
 
 def moments(voxels):
@@ -56,8 +56,15 @@ def relative(m, coordinates):
     return F(m[:, 0]), [F(signed(x)) for x in s], q
 
 
-def sparsity(degree, n):
-    """6.3.2: masks of the voxels in open blocks, and of those that are noise unless they take a window."""
+def sparsity(degree, n, levels):
+    """6.3.2: masks of the voxels in open blocks, and of those that are noise unless they take a window. `levels` are
+    the ranges of voxels of which each counts as a level: those of the blocks of a scene (18.4.2)."""
+    parts = [sparsity_of_level(degree[part.start : part.stop], n[part.start : part.stop]) for part in levels]
+    return [np.concatenate(masks) for masks in zip(*parts)]
+
+
+def sparsity_of_level(degree, n):
+    """6.3.2"""
     is_open, noise = np.zeros(len(n), dtype=bool), np.zeros(len(n), dtype=bool)
     if len(n) < 1024 or 512 * (degree == 1).sum() < len(n):
         return is_open, noise
@@ -156,10 +163,10 @@ def disc(near, n, s, q, reach=None):
     return np.stack([*place, radius, thickness, *rotation, spacing])
 
 
-def discs(voxels):
+def discs(voxels, levels):
     """6.5: place, radius, thickness, rotation, spacing and opacity of every voxel's disc."""
     near, far = moments(voxels)
-    is_open, noise = sparsity(near[:, 0], far[:, 0])
+    is_open, noise = sparsity(near[:, 0], far[:, 0], levels)
     n, s, _ = relative(near, voxels.coordinates)
     near = np.stack([x / n for x in s])
     made = disc(near, *relative(far, voxels.coordinates))
@@ -194,9 +201,9 @@ def quarters(voxels, colours, place, rotation, spacing):
         yield offset, np.clip(colours + a * gu + b * gv, F(0), F(255))
 
 
-def surfels(voxels, colours, count, size):
-    """6.6: one or four Gaussians for each voxel; `size` in 64ths."""
-    place, radius, thickness, rotation, spacing, opacity = discs(voxels)
+def surfels(voxels, colours, count, size, levels=None):
+    """6.6: one or four Gaussians for each voxel; `size`, one or one of each voxel, in 64ths. `levels`: see sparsity."""
+    place, radius, thickness, rotation, spacing, opacity = discs(voxels, levels or [range(len(voxels))])
     colours = np.array(colours, dtype=F).T
     edge = F(2) / F(1 << voxels.level)
     parts, narrow = [(place, colours)], F(1)

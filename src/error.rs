@@ -222,6 +222,7 @@ pub(crate) mod feature {
     pub const FLAGS: &str = "a critical feature of this stream";
     pub const CHUNK: &str = "this chunk type";
     pub const CHUNK_OF_VERSION_2: &str = "this chunk type of version 2";
+    pub const UNITS: &str = "the index of this scene";
 }
 
 impl Error {
@@ -239,6 +240,7 @@ impl Error {
                 feature::VERSION | feature::FLAGS => Some("2.2.1"),
                 feature::CHUNK => Some("3.1.2"),
                 feature::CHUNK_OF_VERSION_2 => Some("8.1.2"),
+                feature::UNITS => Some("18.2.2"),
                 _ => None,
             },
             _ => None,
@@ -250,6 +252,8 @@ impl Error {
 fn of_missing(stage: Stage, field: &str) -> Option<&'static str> {
     match stage {
         Stage::Bitstream if field.ends_with("section") => Some("2.1.1"),
+        Stage::Bitstream if field == "index of the scene" => Some("18.1.1"),
+        Stage::Bitstream if field == "block" => Some("18.2.4"),
         // A section is whole before its chunks are read.
         Stage::Bitstream if field.starts_with("chunk ") => Some("2.1.2"),
         Stage::Bitstream => Some("2.2.1"),
@@ -294,12 +298,15 @@ mod tests {
             (missing(Stage::Bitstream, "feature section"), "2.1.1"),
             (missing(Stage::Bitstream, "chunk payload"), "2.1.2"),
             (missing(Stage::Bitstream, "magic"), "2.2.1"),
+            (missing(Stage::Bitstream, "index of the scene"), "18.1.1"),
+            (missing(Stage::Bitstream, "block"), "18.2.4"),
             (missing(Stage::Geometry, "occupancy"), "4.2.3"),
             (missing(Stage::Colour, "steps of colours"), "5.3"),
             (lacking(feature::VERSION), "2.2.1"),
             (lacking(feature::FLAGS), "2.2.1"),
             (lacking(feature::CHUNK), "3.1.2"),
             (lacking(feature::CHUNK_OF_VERSION_2), "8.1.2"),
+            (lacking(feature::UNITS), "18.2.2"),
             (hashes("colours"), "5.10.1"),
             (hashes("latents"), "8.2.2"),
             (Error::ModelMismatch { expected, found }, "9.5.2"),

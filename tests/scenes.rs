@@ -11,8 +11,8 @@ use b2p::container::scene::{BlockEntry, parse_index, write_index};
 use b2p::geometry::morton;
 use b2p::scene::ViewOptions;
 use b2p::{
-    Background, Camera, Decoder, Error, Gaussians, Image, Limits, Renderer, SceneDecoder, SceneEncoder, SceneReader,
-    SequenceReader, Source, Wanted,
+    Background, Camera, Decoder, Error, FileSource, Gaussians, Image, Limits, Renderer, SceneDecoder, SceneDecoding,
+    SceneEncoder, SceneReader, SequenceReader, Source, Wanted,
 };
 use common::{Ball, cloud_of};
 use rayon::prelude::*;
@@ -95,6 +95,87 @@ fn a_scene_does_not_depend_on_the_number_of_threads() {
             let again = SceneDecoder::default().gaussians(&reader(&bytes), &Wanted::All);
             assert!(again.expect("Gaussians").content == whole);
         });
+    }
+}
+
+#[test]
+fn a_scene_that_arrives_in_pieces_has_all_levels_once_it_is_all_there() {
+    let bytes = scene_bytes();
+    let whole = SceneDecoder::default();
+    for (piece, level) in [(1, Some(4)), (1000, None), (usize::MAX, None)] {
+        let mut arriving = SceneDecoding::new(Decoder::new().with_level(level));
+        let mut reached = Vec::new();
+        for piece in bytes.chunks(piece.min(bytes.len())) {
+            assert!(reached.is_empty() && !arriving.is_drawable());
+            assert!(arriving.gaussians().is_err());
+            arriving.push(piece).expect("the limits allow it");
+            while let Some(level) = arriving.advance().expect("a scene") {
+                let decoder = SceneDecoder::new(Decoder::new().with_level(level));
+                let expected = decoder.gaussians(&reader(&bytes), &Wanted::All).expect("a scene");
+                assert!(arriving.gaussians().expect("Gaussians") == expected.content);
+                let expected = decoder.voxels(&reader(&bytes), &Wanted::All).expect("a scene");
+                assert_eq!(arriving.voxels().expect("voxels"), expected.content);
+                assert!(arriving.is_drawable());
+                reached.push(level);
+            }
+        }
+        assert_eq!(reached, (3..=level.unwrap_or(5)).collect::<Vec<_>>());
+        assert!(arriving.is_complete());
+        arriving.push(b"what follows is dropped").expect("no memory is needed");
+        arriving.finish().expect("all is there");
+    }
+    assert_eq!(whole.levels(&reader(&bytes)).expect("levels"), [3, 4, 5]);
+}
+
+#[test]
+fn a_scene_that_does_not_arrive_whole_is_an_error_and_so_is_one_above_the_limits() {
+    let bytes = scene_bytes();
+    for end in [0, 15, 100, bytes.len() - 1] {
+        let mut arriving = SceneDecoding::new(Decoder::new());
+        arriving.push(&bytes[..end]).expect("the limits allow it");
+        assert_eq!(arriving.advance().expect("so far nothing is wrong"), None);
+        assert!(matches!(arriving.finish(), Err(Error::Truncated { .. })), "{end} bytes");
+        arriving.push(&bytes[end..]).expect("the limits allow it");
+        assert_eq!(arriving.advance().expect("now it is whole"), Some(3));
+    }
+    let limits = Limits::default().with_max_bytes(bytes.len() as u64 - 1);
+    let mut limited = SceneDecoding::new(Decoder::new().with_limits(limits));
+    assert!(matches!(limited.push(&bytes), Err(Error::LimitExceeded { .. })));
+    let mut none = SceneDecoding::new(Decoder::new().with_level(9));
+    none.push(&bytes).expect("the limits allow it");
+    assert!(matches!(none.advance(), Err(Error::Usage(_))), "there is no level 9");
+}
+
+#[test]
+fn a_scene_takes_the_part_of_the_cube_that_its_voxels_take() {
+    let bytes = scene_bytes();
+    let extent = SceneDecoder::default().extent(&reader(&bytes)).expect("a scene");
+    let [low, high] = extent.corners();
+    // A ball of 24 voxels in a cube of 64, in voxels of level 3.
+    assert!(low.iter().all(|x| (-1.0..=-0.75).contains(x)), "{low:?}");
+    assert!(high.iter().all(|x| (0.75..=1.0).contains(x)), "{high:?}");
+}
+
+#[test]
+fn a_file_that_becomes_shorter_after_its_index_was_read_loses_the_blocks_behind_its_end_alone() {
+    let bytes = scene_bytes();
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("scene.b2p");
+    std::fs::write(&path, &bytes).expect("written");
+    let source = FileSource::open(&path).expect("a file");
+    let scene = SceneReader::new(source, &Limits::default()).expect("a scene");
+    let kept = scene.blocks().len() / 2;
+    let file = std::fs::File::options().write(true).open(&path).expect("a file");
+    file.set_len(scene.blocks()[kept].offset + 1).expect("it is cut");
+    let decoded = SceneDecoder::default().voxels(&scene, &Wanted::All).expect("a part");
+    let whole = SceneDecoder::default().voxels(&reader(&bytes), &Wanted::Blocks((0..kept).collect()));
+    assert_eq!(decoded.content, whole.expect("a part").content);
+    assert_eq!(decoded.lost.len(), scene.blocks().len() - kept);
+    for error in &decoded.lost {
+        let Error::Block { block, source } = error else {
+            panic!("{error}")
+        };
+        assert!(*block >= kept && matches!(**source, Error::Truncated { .. }), "{error}");
     }
 }
 

@@ -1,5 +1,5 @@
 //! Holds `docs/format.md` against the streams: the Python decoder in `spec/`, written from that document, must decode
-//! every conformance stream of version 3 to its digests. Needs Python 3.10 with numpy; without them the test says so
+//! every conformance stream of version 3 and every scene to its digests. Needs Python 3.10 with numpy; without them the test says so
 //! and passes.
 
 use std::path::Path;
@@ -40,21 +40,37 @@ fn the_second_decoder_refuses_every_damaged_stream_for_the_clause_that_it_breaks
     let (success, printed) = python(&["spec/decode.py", "--damage", list]).expect("python3 was there a moment ago");
     assert!(success, "{printed}");
     let lines = lines(list);
-    let streams = lines.iter().filter(|line| line.contains(" version-3/")).count();
-    assert!(streams >= 100, "{streams} damaged streams");
+    let of = |folder: &str| lines.iter().filter(|line| line.contains(folder)).count();
+    let (frames, scenes) = (of(" version-3/"), of(" scenes/"));
+    assert!(frames >= 100, "{frames} damaged streams");
+    assert!(scenes >= 50, "{scenes} damaged scenes");
+    let streams = frames + scenes;
     let expected = format!("{streams} damaged streams, 0 refused for another clause");
     assert!(printed.contains(&expected), "{printed}");
 }
 
 #[test]
 fn a_decoder_written_from_the_document_decodes_the_conformance_streams() {
+    decodes_all_of("version-3");
+}
+
+#[test]
+fn a_decoder_written_from_the_document_decodes_and_draws_scenes_block_by_block() {
+    decodes_all_of("scenes");
+}
+
+/// Decodes the streams of a suite and compares with its digests.
+fn decodes_all_of(suite: &str) {
     if !can_run() {
         return;
     }
-    let suite = ["spec/decode.py", "--suite", "tests/data/conformance/version-3"];
-    let (success, printed) = python(&suite).expect("python3 was there a moment ago");
+    let folder = format!("tests/data/conformance/{suite}");
+    let (success, printed) = python(&["spec/decode.py", "--suite", &folder]).expect("python3 was there a moment ago");
     println!("{printed}");
     assert!(success, "{printed}");
-    let streams = lines("tests/data/conformance/version-3/suite.txt").len();
+    let lines = lines(&format!("{folder}/suite.txt"));
+    let names = lines.iter().filter_map(|line| line.split(' ').next());
+    let streams = names.filter(|name| !name.contains('/')).count();
+    assert!(streams >= 7, "{streams} streams");
     assert!(printed.contains(&format!("{streams} streams, 0 differ")), "{printed}");
 }

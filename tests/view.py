@@ -21,6 +21,7 @@ import zlib
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 PROGRAM = os.environ.get("B2P_PROGRAM", str(ROOT / "target/debug/b2p"))
+BLOCKS = ROOT / "tests/data/conformance/scenes/ball.b2p"
 SAMPLE, SCENE = ROOT / "models/sample.b2p", ROOT / "models/scene.b2p"
 # Seconds after which something that was to happen is held not to.
 PATIENCE = 120
@@ -320,6 +321,18 @@ class WindowTest(unittest.TestCase):
         late, fine = wait_for("a finer picture", lambda: viewer.pixels() != before and viewer.screenshot())
         self.assertEqual(coarse, fine)
         self.assertNotEqual(png(late)[2], before)
+
+    def test_a_scene_of_blocks_is_shown_and_keys_change_its_level(self):
+        viewer = self.viewer(BLOCKS, "--heads", "surfels")
+        shown = viewer.pixels()
+        path, command = viewer.screenshot()
+        self.assertEqual(png(path)[2], shown)
+        self.assertLessEqual(difference(shown, viewer.rendered(command, "--heads", "surfels")[2]), 1)
+        viewer.press("bracketleft")
+        coarse = wait_for("another level", lambda: (now := viewer.pixels()) != shown and now)
+        viewer.press("bracketright")
+        wait_for("the finest level again", lambda: viewer.pixels() == shown)
+        self.assertNotEqual(coarse, shown)
 
     def test_a_sequence_plays_and_is_paused_stepped_through_and_sought(self):
         folder = pathlib.Path(tempfile.mkdtemp(prefix="b2p-view-"))

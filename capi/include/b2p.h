@@ -53,7 +53,7 @@ typedef enum b2p_heads {
 // A switch that stops decodings from another thread.
 typedef struct b2p_cancel b2p_cancel;
 
-// A stream that is decoded as its bytes arrive.
+// A stream or a scene that is decoded as its bytes arrive.
 typedef struct b2p_decoding b2p_decoding;
 
 // Gaussians of a level.
@@ -213,7 +213,7 @@ void b2p_cancel_throw(const struct b2p_cancel *cancel);
 // `cancel` is NULL or came from this library, and is not used any more.
 void b2p_cancel_free(struct b2p_cancel *cancel);
 
-// Begins to decode a stream of either version down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits`
+// Begins to decode a stream of either version, or a scene of blocks, down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits`
 // and `cancel` may be NULL, and so may `model`, which streams of version 3 do not need: one of version 2 then fails with MODEL. Fails with
 // USAGE.
 //
@@ -256,7 +256,8 @@ enum b2p_status b2p_decoding_use_heads_model(struct b2p_decoding *decoding,
                                              char *message,
                                              size_t size);
 
-// Takes the next bytes of the stream, which are not needed afterwards. Decodes nothing yet. Fails with USAGE.
+// Takes the next bytes of the stream, which are not needed afterwards. Decodes nothing yet. Bytes of a scene of blocks are kept until
+// all of it is there; its levels are decoded when Gaussians or points are asked for. Fails with USAGE, and with LIMIT for a scene.
 //
 // # Safety
 // `decoding` is a decoding; `bytes` leads to `length` bytes; `message` is NULL or leads to `size` bytes.
@@ -297,7 +298,8 @@ int32_t b2p_decoding_level(const struct b2p_decoding *decoding);
 // `decoding` is NULL or came from this library, and is not used any more.
 void b2p_decoding_free(struct b2p_decoding *decoding);
 
-// Makes the Gaussians of the deepest level decoded so far. Fails with UNSUPPORTED if it has none, LIMIT, CANCELLED, USAGE.
+// Makes the Gaussians of the deepest level decoded so far. Fails with UNSUPPORTED if it has none, LIMIT, CANCELLED, USAGE, and for a
+// scene as b2p_decoding_advance does.
 //
 // # Safety
 // `decoding` is a decoding; `gaussians` is writable; `message` is NULL or leads to `size` bytes.
@@ -322,7 +324,7 @@ enum b2p_status b2p_gaussians_arrays(const struct b2p_gaussians *gaussians,
 void b2p_gaussians_free(struct b2p_gaussians *gaussians);
 
 // The points of the deepest level decoded so far, in Morton order. Fails with UNSUPPORTED for streams of version 2, whose colours
-// are those of Gaussians, and with USAGE.
+// are those of Gaussians, with USAGE, and for a scene as b2p_decoding_advance does.
 //
 // # Safety
 // `decoding` is a decoding; `points` is writable; `message` is NULL or leads to `size` bytes.

@@ -47,7 +47,12 @@ impl Fault {
 
 impl From<Error> for Fault {
     fn from(error: Error) -> Fault {
-        let status = match &error {
+        // Of a block, its own fault counts.
+        let cause = match &error {
+            Error::Block { source, .. } => source,
+            error => error,
+        };
+        let status = match cause {
             Error::Io { .. } => Status::Io,
             Error::Truncated { .. } => Status::Truncated,
             Error::ChecksumMismatch { .. } => Status::Checksum,

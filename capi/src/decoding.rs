@@ -3,6 +3,7 @@
 use std::ffi::c_char;
 
 use b2p::gaussians::HeadSet;
+use b2p::{Frame, SceneReader, Voxels};
 
 use crate::boundary::{Fault, Status, borrowed, changed, give, guard, slice, take};
 use crate::model::{HeadsModel, Limits, Model};
@@ -11,8 +12,108 @@ use crate::model::{HeadsModel, Limits, Model};
 #[derive(Default)]
 pub struct Cancel(b2p::Cancel);
 
-/// A stream that is decoded as its bytes arrive.
-pub struct Decoding(pub(crate) b2p::Decoding<'static>);
+/// Bytes that tell a scene from a stream.
+const START: usize = 16;
+
+/// Voxels, their colours, and the cube that they lie in.
+pub(crate) type DecodedPoints = (Voxels, Vec<[u8; 3]>, Frame);
+
+/// A stream or a scene that is decoded as its bytes arrive.
+pub struct Decoding {
+    stream: b2p::Decoding<'static>,
+    /// Once the first bytes say that a scene comes.
+    scene: Option<b2p::SceneDecoding>,
+    /// The first bytes.
+    start: Vec<u8>,
+    decoder: b2p::Decoder,
+}
+
+impl Decoding {
+    fn new(decoder: b2p::Decoder) -> Self {
+        Decoding {
+            stream: decoder.start(),
+            scene: None,
+            start: Vec::new(),
+            decoder,
+        }
+    }
+
+    /// Takes the next bytes. The first ones tell what comes.
+    fn push(&mut self, bytes: &[u8]) -> b2p::Result<()> {
+        if let Some(scene) = &mut self.scene {
+            return scene.push(bytes);
+        }
+        let (own, rest) = bytes.split_at(bytes.len().min(START - self.start.len()));
+        self.start.extend(own);
+        if !own.is_empty() && SceneReader::is_scene(&self.start) {
+            let scene = self.scene.insert(b2p::SceneDecoding::new(self.decoder.clone()));
+            scene.push(&self.start)?;
+            return scene.push(rest);
+        }
+        self.stream.push(bytes);
+        Ok(())
+    }
+
+    fn set_heads(&mut self, heads: HeadSet) -> b2p::Result<()> {
+        self.stream.set_heads(heads)?;
+        self.decoder = self.decoder.clone().with_heads(heads);
+        if let Some(scene) = &mut self.scene {
+            scene.set_heads(heads);
+        }
+        Ok(())
+    }
+
+    fn set_heads_model(&mut self, heads: b2p::HeadsModel) {
+        self.stream.set_heads_model(heads.clone());
+        self.decoder = self.decoder.clone().with_heads_model(heads.clone());
+        if let Some(scene) = &mut self.scene {
+            scene.set_heads_model(heads);
+        }
+    }
+
+    fn advance(&mut self) -> b2p::Result<Option<u8>> {
+        match &mut self.scene {
+            Some(scene) => scene.advance(),
+            None => self.stream.advance(),
+        }
+    }
+
+    fn finish(&mut self) -> b2p::Result<()> {
+        match &mut self.scene {
+            Some(scene) => scene.finish(),
+            None => self.stream.finish(),
+        }
+    }
+
+    fn level(&self) -> Option<u8> {
+        match &self.scene {
+            Some(scene) => scene.level(),
+            None => self.stream.level(),
+        }
+    }
+
+    fn gaussians(&self) -> b2p::Result<b2p::Gaussians> {
+        match &self.scene {
+            Some(scene) => scene.gaussians(),
+            None => self.stream.gaussians(),
+        }
+    }
+
+    /// The voxels of the level reached with their colours; `None` of streams that have no colours of voxels.
+    pub(crate) fn points(&self) -> b2p::Result<Option<DecodedPoints>> {
+        if let Some(scene) = &self.scene {
+            let (voxels, colours) = scene.voxels()?;
+            return Ok(Some((voxels, colours, scene.frame()?)));
+        }
+        let points = self.stream.points();
+        Ok(points.map(|points| (points.voxels.clone(), points.colours.to_vec(), points.frame)))
+    }
+
+    /// Whether a level has been reached.
+    pub(crate) fn has_level(&self) -> bool {
+        self.level().is_some()
+    }
+}
 
 /// Gaussians of a level.
 pub struct Gaussians(pub(crate) b2p::gaussians::Gaussians);
@@ -86,7 +187,7 @@ pub enum Heads {
     Surfels = 2,
 }
 
-/// Begins to decode a stream of either version down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits`
+/// Begins to decode a stream of either version, or a scene of blocks, down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits`
 /// and `cancel` may be NULL, and so may `model`, which streams of version 3 do not need: one of version 2 then fails with MODEL. Fails with
 /// USAGE.
 ///
@@ -121,7 +222,7 @@ pub unsafe extern "C" fn b2p_decoding_start(
             _ => Some(u8::try_from(level).map_err(|_| Fault::usage("level is above 255"))?),
         };
         // SAFETY: the caller vouches for `decoding`.
-        unsafe { give(decoding, "decoding", Decoding(decoder.with_level(level).start())) }
+        unsafe { give(decoding, "decoding", Decoding::new(decoder.with_level(level))) }
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -142,7 +243,7 @@ pub unsafe extern "C" fn b2p_decoding_use_quick_heads(
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { changed(decoding, "decoding") }?;
         let heads = if quick { HeadSet::Quick } else { HeadSet::Best };
-        Ok(decoding.0.set_heads(heads)?)
+        Ok(decoding.set_heads(heads)?)
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -171,7 +272,7 @@ pub unsafe extern "C" fn b2p_decoding_use_heads(
         ];
         let known = all.iter().find(|(number, _)| *number as i32 == heads);
         let (_, heads) = known.ok_or_else(|| Fault::usage("heads are none of b2p_heads"))?;
-        Ok(decoding.0.set_heads(*heads)?)
+        Ok(decoding.set_heads(*heads)?)
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -191,14 +292,15 @@ pub unsafe extern "C" fn b2p_decoding_use_heads_model(
     let run = || {
         // SAFETY: the caller vouches for `decoding` and `heads`.
         let (decoding, heads) = unsafe { (changed(decoding, "decoding")?, borrowed(heads, "heads")?) };
-        decoding.0.set_heads_model(heads.0.clone());
+        decoding.set_heads_model(heads.0.clone());
         Ok(())
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
 }
 
-/// Takes the next bytes of the stream, which are not needed afterwards. Decodes nothing yet. Fails with USAGE.
+/// Takes the next bytes of the stream, which are not needed afterwards. Decodes nothing yet. Bytes of a scene of blocks are kept until
+/// all of it is there; its levels are decoded when Gaussians or points are asked for. Fails with USAGE, and with LIMIT for a scene.
 ///
 /// # Safety
 /// `decoding` is a decoding; `bytes` leads to `length` bytes; `message` is NULL or leads to `size` bytes.
@@ -213,8 +315,7 @@ pub unsafe extern "C" fn b2p_decoding_push(
     let run = || {
         // SAFETY: the caller vouches for `decoding` and `bytes`.
         let (decoding, bytes) = unsafe { (changed(decoding, "decoding")?, slice(bytes, length, "bytes")?) };
-        decoding.0.push(bytes);
-        Ok(())
+        Ok(decoding.push(bytes)?)
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -236,7 +337,7 @@ pub unsafe extern "C" fn b2p_decoding_advance(
         // SAFETY: the caller vouches for `decoding` and `level`.
         let (decoding, level) = unsafe { (changed(decoding, "decoding")?, changed(level, "level")?) };
         *level = -1;
-        *level = decoding.0.advance()?.map_or(-1, i32::from);
+        *level = decoding.advance()?.map_or(-1, i32::from);
         Ok(())
     };
     // SAFETY: the caller vouches for `message`.
@@ -253,7 +354,7 @@ pub unsafe extern "C" fn b2p_decoding_finish(decoding: *mut Decoding, message: *
     let run = || {
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { changed(decoding, "decoding") }?;
-        Ok(decoding.0.finish()?)
+        Ok(decoding.finish()?)
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }
@@ -267,7 +368,7 @@ pub unsafe extern "C" fn b2p_decoding_finish(decoding: *mut Decoding, message: *
 pub unsafe extern "C" fn b2p_decoding_level(decoding: *const Decoding) -> i32 {
     // SAFETY: the caller vouches for `decoding`.
     let decoding = unsafe { decoding.as_ref() };
-    decoding.and_then(|decoding| decoding.0.level()).map_or(-1, i32::from)
+    decoding.and_then(|decoding| decoding.level()).map_or(-1, i32::from)
 }
 
 /// Frees a decoding. Gaussians that were made of it stay.
@@ -280,7 +381,8 @@ pub unsafe extern "C" fn b2p_decoding_free(decoding: *mut Decoding) {
     unsafe { take(decoding) }
 }
 
-/// Makes the Gaussians of the deepest level decoded so far. Fails with UNSUPPORTED if it has none, LIMIT, CANCELLED, USAGE.
+/// Makes the Gaussians of the deepest level decoded so far. Fails with UNSUPPORTED if it has none, LIMIT, CANCELLED, USAGE, and for a
+/// scene as b2p_decoding_advance does.
 ///
 /// # Safety
 /// `decoding` is a decoding; `gaussians` is writable; `message` is NULL or leads to `size` bytes.
@@ -294,7 +396,7 @@ pub unsafe extern "C" fn b2p_decoding_gaussians(
     let run = || {
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { borrowed(decoding, "decoding") }?;
-        let made = decoding.0.gaussians()?;
+        let made = decoding.gaussians()?;
         // SAFETY: the caller vouches for `gaussians`.
         unsafe { give(gaussians, "gaussians", Gaussians(made)) }
     };

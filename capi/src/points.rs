@@ -34,7 +34,7 @@ pub struct PointArrays {
 }
 
 /// The points of the deepest level decoded so far, in Morton order. Fails with UNSUPPORTED for streams of version 2, whose colours
-/// are those of Gaussians, and with USAGE.
+/// are those of Gaussians, with USAGE, and for a scene as b2p_decoding_advance does.
 ///
 /// # Safety
 /// `decoding` is a decoding; `points` is writable; `message` is NULL or leads to `size` bytes.
@@ -48,21 +48,20 @@ pub unsafe extern "C" fn b2p_decoding_points(
     let run = || {
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { borrowed(decoding, "decoding") }?;
-        if decoding.0.level().is_none() {
+        if !decoding.has_level() {
             return Err(Fault::usage("no level has been decoded yet"));
         }
-        let Some(decoded) = decoding.0.points() else {
+        let Some((voxels, colours, frame)) = decoding.points()? else {
             return Err(b2p::Error::Unsupported {
                 what: "decoding points",
                 detail: "the stream has version 2, which has no colours of voxels".into(),
             }
             .into());
         };
-        let (voxels, frame) = (decoded.voxels, decoded.frame);
         let coarser = frame.bits - voxels.depth();
         let made = Points {
             coordinates: (0..voxels.len()).map(|i| voxels.coordinate(i)).collect(),
-            colours: decoded.colours.to_vec(),
+            colours,
             level: voxels.depth(),
             origin: frame.placement.origin,
             voxel_size: frame.placement.voxel_size * f64::from(1u32 << coarser),

@@ -7,7 +7,6 @@ mod common;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use b2p::Decoder;
 use b2p::encoder::transform;
 use b2p::gaussians::Heads;
 use b2p::latents::LatentDecoder;
@@ -15,6 +14,7 @@ use b2p::latents::network::{Model, Shape, untrained};
 use b2p::log::Log;
 use b2p::renderer::camera::Camera;
 use b2p::renderer::{Background, render};
+use b2p::{Decoder, SceneDecoder, SceneReader, Voxels, Wanted};
 
 /// Where cargo put the static library: beside this test, or a folder above.
 fn library() -> PathBuf {
@@ -50,6 +50,19 @@ fn printed(output: Output) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
+/// A small scene of blocks.
+fn conformance_scene() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/conformance/scenes/ball.b2p")
+}
+
+/// A sum over coordinates and colours, as the C program makes it.
+fn sum_of(voxels: &Voxels, colours: &[[u8; 3]]) -> u64 {
+    let coordinates = (0..voxels.len()).flat_map(|i| voxels.coordinate(i));
+    let colours = colours.as_flattened().iter().map(|c| u32::from(*c));
+    let sum = coordinates.zip(colours).flat_map(|(c, colour)| [c, colour]);
+    sum.fold(0u64, |sum, x| sum.wrapping_mul(31).wrapping_add(x.into()))
+}
+
 #[test]
 fn a_c_program_decodes_and_draws_as_rust_does() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -83,12 +96,14 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     let decoding = Decoder::new().whole(&new.bytes);
     let decoding = decoding.expect("a stream");
     let points = decoding.points().expect("points");
-    let coordinates = (0..points.voxels.len()).flat_map(|i| points.voxels.coordinate(i));
-    let colours = points.colours.as_flattened().iter().map(|c| u32::from(*c));
-    let sum = coordinates.zip(colours).flat_map(|(c, colour)| [c, colour]);
-    let sum = sum.fold(0u64, |sum, x| sum.wrapping_mul(31).wrapping_add(x.into()));
+    let sum = sum_of(points.voxels, points.colours);
     let points = format!("{} {sum:016x}\n", points.voxels.len());
-    let expected = format!("{points}{best:016x}\n{quick:016x}\n");
+    let blocks = std::fs::read(conformance_scene()).expect("a scene");
+    let scene = SceneReader::new(&blocks[..], &limits).expect("a scene");
+    let decoded = SceneDecoder::new(Decoder::new()).voxels(&scene, &Wanted::All);
+    let (voxels, colours) = decoded.expect("voxels").whole().expect("no damage");
+    let blocks = format!("{} {:016x}\n", voxels.len(), sum_of(&voxels, &colours));
+    let expected = format!("{blocks}{points}{best:016x}\n{quick:016x}\n");
 
     let sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"];
     printed(compile("tests/use.c", &at("plain"), &[]));
@@ -107,7 +122,7 @@ fn a_c_program_decodes_and_draws_as_rust_does() {
     }
     assert!(programs.len() > 1, "nothing here watches a program's memory");
     for (how, mut program) in programs {
-        program.args([at("model"), at("stream"), at("both"), at("new")]);
+        program.args([at("model"), at("stream"), at("both"), at("new"), conformance_scene()]);
         let output = program.output().expect("the program starts");
         assert_eq!(printed(output), expected, "{how}");
         println!("ran {how}");

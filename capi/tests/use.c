@@ -212,9 +212,61 @@ static void without_model(file stream) {
     b2p_decoding_free(decoding);
 }
 
+/* A scene of blocks, in pieces, is what a stream is; a damaged block is named. */
+static void scene(file scene) {
+    b2p_decoding *decoding = NULL;
+    b2p_gaussians *gaussians = NULL;
+    CHECK(b2p_decoding_start(NULL, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_use_heads(decoding, B2P_HEADS_SURFELS, message, sizeof message) == B2P_STATUS_OK);
+    int32_t level = -1, levels = 0;
+    for (size_t at = 0; at < scene.length; at += 7) {
+        size_t left = scene.length - at;
+        CHECK(b2p_decoding_advance(decoding, &level, message, sizeof message) == B2P_STATUS_OK && level == -1);
+        CHECK(b2p_decoding_push(decoding, scene.bytes + at, left < 7 ? left : 7, message, sizeof message) == B2P_STATUS_OK);
+    }
+    CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_USAGE);
+    for (;;) {
+        CHECK(b2p_decoding_advance(decoding, &level, message, sizeof message) == B2P_STATUS_OK);
+        if (level == -1) {
+            break;
+        }
+        CHECK(level == b2p_decoding_level(decoding));
+        levels++;
+    }
+    CHECK(levels == 3);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_OK);
+    b2p_arrays arrays;
+    CHECK(b2p_gaussians_arrays(gaussians, &arrays, NULL, 0) == B2P_STATUS_OK && arrays.count > 0);
+    b2p_gaussians_free(gaussians);
+    points(decoding, &arrays);
+    b2p_decoding_free(decoding);
+
+    CHECK(b2p_decoding_start(NULL, NULL, NULL, -1, &decoding, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_push(decoding, scene.bytes, scene.length - 1, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_TRUNCATED);
+    CHECK(b2p_decoding_level(decoding) == -1);
+    uint8_t last = scene.bytes[scene.length - 1] ^ 1;
+    CHECK(b2p_decoding_push(decoding, &last, 1, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_OK);
+    gaussians = NULL;
+    CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_MALFORMED);
+    CHECK(strstr(message, "block") && gaussians == NULL);
+    b2p_decoding_free(decoding);
+
+    b2p_limits limits = b2p_limits_default();
+    limits.max_bytes = scene.length - 1;
+    CHECK(b2p_decoding_start(NULL, &limits, NULL, -1, &decoding, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_push(decoding, scene.bytes, scene.length, message, sizeof message) == B2P_STATUS_LIMIT);
+    b2p_decoding_free(decoding);
+}
+
 int main(int count, char **arguments) {
-    // A model, a stream, the same model with quick heads as well, and a stream of version 3.
-    CHECK(count == 5);
+    // A model, a stream, the same model with quick heads as well, a stream of version 3, and a scene.
+    CHECK(count == 6);
+    file blocks = read_file(arguments[5]);
+    scene(blocks);
+    free(blocks.bytes);
     file new_stream = read_file(arguments[4]);
     without_model(new_stream);
     free(new_stream.bytes);

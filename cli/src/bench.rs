@@ -10,7 +10,7 @@ use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Module, Shape, Work};
 use b2p::layers::Precision;
 use b2p::log::{Log, Step};
-use b2p::{Isa, Limits, embedded, peak_throughput};
+use b2p::{Decoder, Gaussians, Isa, Limits, SceneDecoder, SceneReader, Wanted, embedded, peak_throughput};
 use serde_json::json;
 
 use super::args::Bench;
@@ -46,7 +46,15 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
         Some(path) => Failure::in_file(path)(error),
         None => Failure::from(error),
     };
-    let levels = decoder.levels(&bytes).map_err(fail)?;
+    let scene = match SceneReader::is_scene(&bytes) {
+        true => Some(SceneReader::new(&bytes[..], limits).map_err(fail)?),
+        false => None,
+    };
+    let levels = match &scene {
+        Some(scene) => SceneDecoder::new(decoder.clone()).levels(scene),
+        None => decoder.levels(&bytes),
+    };
+    let levels = levels.map_err(fail)?;
     let level = match args.detail.level {
         Some(level) => level,
         None => *levels
@@ -58,12 +66,19 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
         let log = Log::new();
         let decoder = decoder.clone().with_level(level).with_log(&log);
         let start = Instant::now();
-        let gaussians = decoder.decode(&bytes).map_err(fail)?;
+        let gaussians = match &scene {
+            Some(scene) => decode_scene(scene, decoder, &log),
+            None => decoder.decode(&bytes),
+        };
+        let gaussians = gaussians.map_err(fail)?;
         let total = start.elapsed();
         drop(gaussians);
         Ok((total, log.steps()))
     })?;
-    let header = Header::parse(&bytes, limits).map_err(fail)?;
+    let header = match &scene {
+        Some(scene) => scene.header().clone(),
+        None => Header::parse(&bytes, limits).map_err(fail)?,
+    };
     let heads = decoder.heads_for(&header);
     // Of version 3, no more is known than the times.
     let works = match (model, heads.learned()) {
@@ -96,6 +111,14 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
         true => report.json(),
         false => report.text(),
     }))
+}
+
+/// The Gaussians of a scene, whose blocks are decoded in one step: those of blocks come in any order.
+fn decode_scene(scene: &SceneReader<&[u8]>, decoder: Decoder, log: &Log) -> b2p::Result<Gaussians> {
+    log.step("decode scene", scene.blocks().len(), "blocks", || {
+        let decoder = SceneDecoder::new(decoder.with_log(&Log::default()));
+        decoder.gaussians(scene, &Wanted::All)?.whole()
+    })
 }
 
 /// What each run took, but for the first, which warms caches and memory up.

@@ -15,7 +15,7 @@ use b2p::{Axes, Decoder, Error, Isa, Limits, UnknownIsa, input};
 use super::args::{DetailArg, ModelArg};
 use super::cloud::ReadArgs;
 use super::views::Shot;
-use super::{Failure, Result, cloud, convert, kinds, manners};
+use super::{Failure, Result, cloud, convert, kinds, manners, pipe};
 
 /// A stream or Gaussians, told apart by their first bytes.
 pub const PLY_MAGIC: &[u8] = b"ply";
@@ -87,15 +87,16 @@ pub fn isa(name: Option<&str>) -> Result<Isa> {
 /// The bytes of a file, or of standard input, no more than the limits allow.
 pub fn bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     let bytes = match manners::is_pipe(path) {
-        true => input::read_all(std::io::stdin().lock(), 0, path, limits),
+        true => input::read_all(pipe::stdin(), 0, path, limits),
         false => input::read_file(path, limits),
     };
     bytes.map_err(Failure::in_file(path))
 }
 
-/// Fails, before anything is begun, unless the machine has this much memory to give.
+/// Fails, before anything is begun, unless the machine has this much memory to give, and what everything else takes.
 pub fn reserve(what: &'static str, bytes: u64) -> Result<()> {
     let mut trial = Vec::<u8>::new();
+    let bytes = bytes.saturating_add(Limits::OVERHEAD);
     let bytes_here = usize::try_from(bytes).unwrap_or(usize::MAX);
     let had = trial.try_reserve_exact(bytes_here);
     had.map_err(|_| Failure::from(Error::OutOfMemory { what, bytes }))

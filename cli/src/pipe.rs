@@ -3,6 +3,7 @@
 use std::io::Read;
 use std::path::Path;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+use std::sync::{Mutex, PoisonError};
 
 use b2p::error::Stage;
 use b2p::gaussians::Gaussians;
@@ -23,6 +24,26 @@ const WAITING: usize = 16;
 const HEAD: usize = 1 << 18;
 /// Bytes that tell what comes, and of which version.
 const STREAM_START: usize = 10;
+
+/// Bytes of standard input that were looked at before anything took them.
+static SEEN: Mutex<Vec<u8>> = Mutex::new(Vec::new());
+
+/// Standard input from its start, also after [`peek`].
+pub fn stdin() -> impl Read {
+    let seen = std::mem::take(&mut *SEEN.lock().unwrap_or_else(PoisonError::into_inner));
+    std::io::Cursor::new(seen).chain(std::io::stdin())
+}
+
+/// The first bytes of standard input, which stay there to be read; fewer if it ends before. Waits for them.
+///
+/// # Errors
+/// What the system says when they are read.
+pub fn peek(count: usize) -> std::io::Result<Vec<u8>> {
+    let mut seen = SEEN.lock().unwrap_or_else(PoisonError::into_inner);
+    let missing = count.saturating_sub(seen.len());
+    std::io::stdin().take(missing as u64).read_to_end(&mut seen)?;
+    Ok(seen.clone())
+}
 
 /// What was read at once, and what stops reading.
 pub type Piece = std::io::Result<Vec<u8>>;
@@ -129,7 +150,7 @@ fn show_level(decoding: &Decoding, axes: &Axes, log: &Log, show: &mut Show) -> R
 pub fn pieces() -> Result<Receiver<Piece>> {
     let (sender, receiver) = sync_channel(WAITING);
     let read = move || {
-        let mut input = std::io::stdin().lock();
+        let mut input = stdin();
         loop {
             let mut bytes = vec![0; PIECE];
             let piece = input.read(&mut bytes).map(|count| {

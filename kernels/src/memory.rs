@@ -1,5 +1,7 @@
 //! Large blocks of memory.
 
+use std::alloc::{Layout, handle_alloc_error};
+
 use ::half::f16;
 use ::half::vec::HalfBitsVecExt;
 use bytemuck::Zeroable;
@@ -9,9 +11,13 @@ use bytemuck::Zeroable;
 const HUGE: usize = 2 << 20;
 
 /// So many zeros, from the system as they are touched: in huge pages where it has them, for every small one costs a
-/// fault.
+/// fault. If there is no memory the process ends, as with every other vector: it must not unwind, for reporting that takes
+/// memory, too.
 pub fn zeros<T: Zeroable>(len: usize) -> Vec<T> {
-    let zeros = bytemuck::zeroed_vec(len);
+    let zeros = bytemuck::try_zeroed_vec(len).unwrap_or_else(|()| match Layout::array::<T>(len) {
+        Ok(layout) => handle_alloc_error(layout),
+        Err(_) => std::process::abort(),
+    });
     #[cfg(target_os = "linux")]
     ask_for_huge_pages(&zeros);
     zeros

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use b2p::cloud::{Note, RawColours, RawPoints, ReadOptions, Stored};
 use b2p::container::axes;
-use b2p::{ColourRange, ColouredVoxels, Limits};
+use b2p::{Axes, ColourRange, ColouredVoxels, Limits};
 use numpy::{PyArray2, PyArrayDescrMethods, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::{PyIterator, PyTuple};
@@ -74,8 +74,13 @@ impl PyPointCloud {
 
     /// The voxels of a stream that starts with these bytes.
     pub fn decoded(grid: ColouredVoxels, stream: &[u8]) -> Self {
+        Self::of_grid(grid, axes(stream).unwrap_or_default())
+    }
+
+    /// Decoded voxels, whose coordinates are to be understood by these axes.
+    pub fn of_grid(grid: ColouredVoxels, axes: Axes) -> Self {
         let mut cloud = grid.to_world();
-        cloud.axes = axes(stream).unwrap_or_default();
+        cloud.axes = axes;
         PyPointCloud {
             cloud: Arc::new(cloud),
             grid: Some(Arc::new(grid)),

@@ -5,11 +5,13 @@ use std::path::PathBuf;
 use b2p::container::axes;
 use b2p::container::version;
 use b2p::error::Stage;
-use b2p::{Decoder, Error, Gaussians, Result};
+use b2p::{Decoder, Error, Gaussians, Result, SceneDecoder};
 use pyo3::prelude::*;
 
+use crate::camera::PyCamera;
 use crate::cloud::PyPointCloud;
 use crate::gaussians::PyGaussians;
+use crate::scene::{self, Input, Part, PyBox};
 use crate::source::{Drawing, Loaded, Source, no_points};
 use crate::values::{self, PyLimits};
 use crate::work::Work;
@@ -30,8 +32,15 @@ use crate::work::Work;
 ///     inside the library.
 /// per_voxel : int, optional
 ///     Gaussians of a voxel: 1 or 8 of learned heads, 1 or 4 of surfels.
+/// box : ((x, y, z), (x, y, z)), optional
+///     Of a scene of blocks: the lowest and the highest corner of the part to decode, in the world.
+/// camera : Camera, optional
+///     Of a scene of blocks: decodes what this camera sees. Its picture is that of the whole scene.
+/// lod : float
+///     With a camera: width in pixels that voxels of a coarser level may have where it takes the place of the finest.
 /// partial : bool
-///     Whether a stream that ends within a level gives the level before; otherwise that is a `TruncatedError`.
+///     Whether a stream that ends within a level gives the level before; otherwise that is a `TruncatedError`. Of a
+///     scene: whether damaged blocks are left out, with an `InputWarning`.
 /// limits : Limits, optional
 /// threads : int, optional
 ///     Threads of this call; those of `set_threads` by default.
@@ -43,8 +52,8 @@ use crate::work::Work;
 /// Gaussians
 ///     float32 arrays in the cube frame, which are not copied.
 #[pyfunction]
-#[pyo3(signature = (stream, level=None, heads=None, *, model=None, per_voxel=None, partial=false, limits=None,
-    threads=None, progress=None))]
+#[pyo3(signature = (stream, level=None, heads=None, *, model=None, per_voxel=None, r#box=None, camera=None,
+    lod=0.0, partial=false, limits=None, threads=None, progress=None))]
 pub fn decode(
     py: Python<'_>,
     stream: &Bound<'_, PyAny>,
@@ -52,26 +61,45 @@ pub fn decode(
     heads: Option<&str>,
     model: Option<PathBuf>,
     per_voxel: Option<usize>,
+    r#box: Option<PyBox>,
+    camera: Option<PyCamera>,
+    lod: f64,
     partial: bool,
     limits: Option<PyLimits>,
     threads: Option<usize>,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<PyGaussians> {
     let source = Source::of(stream)?;
+    let part = Part::new(py, r#box, camera, lod)?;
     let limits = values::limits(limits);
     let drawing = Drawing::new(py, heads, model, per_voxel, level)?;
     let work = Work {
         progress,
         ..Work::on(threads)
     };
-    let (gaussians, level, up) = work.run(py, move |cancel, log| {
+    let (gaussians, level, up, lost) = work.run(py, move |cancel, log| {
+        let source = match Input::of(source, &limits)? {
+            Input::Scene(scene) => {
+                let decoder = drawing.decoder(&[], &limits)?.with_cancel(cancel.clone());
+                let blocks = scene.blocks().len();
+                let decoded = log.step("decode scene", blocks, "blocks", || {
+                    scene::gaussians(&scene, decoder, &part)
+                });
+                let (gaussians, lost) = scene::checked(decoded?, partial)?;
+                let level = level.or(Some(scene.header().top)).filter(|_| part.lod == 0.0);
+                return Ok((gaussians, level, scene::up(&scene), lost));
+            }
+            Input::Stream(source) => source,
+        };
+        part.refuse()?;
         let bytes = source.load(&limits)?;
         let decoder = drawing.decoder(&bytes, &limits)?;
         let decoder = decoder.with_cancel(cancel.clone()).with_log(log);
         let (gaussians, level) = gaussians(&decoder, &bytes, partial && level.is_none())?;
         let up = axes(&bytes).ok().and_then(|axes| axes.up);
-        Ok((gaussians, level, up))
+        Ok((gaussians, level, up, Vec::new()))
     })?;
+    scene::warn(py, &lost)?;
     Ok(PyGaussians {
         level,
         up,
@@ -110,8 +138,11 @@ fn is_cut(error: &Error) -> bool {
 ///     A stream of version 3; those of version 2 have no colours of voxels.
 /// level : int, optional
 ///     The octree level; the finest by default.
+/// box : ((x, y, z), (x, y, z)), optional
+///     Of a scene of blocks: the lowest and the highest corner of the part to decode, in the world.
 /// partial : bool
-///     Whether a stream that ends within a level gives the level before.
+///     Whether a stream that ends within a level gives the level before. Of a scene: whether damaged blocks are left
+///     out, with an `InputWarning`.
 /// limits : Limits, optional
 /// threads : int, optional
 /// progress : callable, optional
@@ -123,24 +154,39 @@ fn is_cut(error: &Error) -> bool {
 ///     ``xyz, rgb = decode_points(stream)``: the centres of the voxels in the world, float64 [n, 3], and their sRGB
 ///     colours, uint8 [n, 3]. Its attribute `voxels` has the voxels, uint32 [n, 3].
 #[pyfunction]
-#[pyo3(signature = (stream, level=None, *, partial=false, limits=None, threads=None, progress=None))]
+#[pyo3(signature = (stream, level=None, *, r#box=None, partial=false, limits=None, threads=None, progress=None))]
 pub fn decode_points(
     py: Python<'_>,
     stream: &Bound<'_, PyAny>,
     level: Option<u8>,
+    r#box: Option<PyBox>,
     partial: bool,
     limits: Option<PyLimits>,
     threads: Option<usize>,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<PyPointCloud> {
     let source = Source::of(stream)?;
+    let part = Part::new(py, r#box, None, 0.0)?;
     let limits = values::limits(limits);
     let drawing = Drawing::for_points(level);
     let work = Work {
         progress,
         ..Work::on(threads)
     };
-    work.run(py, move |cancel, log| {
+    let (cloud, lost) = work.run(py, move |cancel, log| {
+        let source = match Input::of(source, &limits)? {
+            Input::Scene(scene) => {
+                let decoder = SceneDecoder::new(drawing.decoder(&[], &limits)?.with_cancel(cancel.clone()));
+                let blocks = scene.blocks().len();
+                let decoded = log.step("decode scene", blocks, "blocks", || {
+                    decoder.points(&scene, &part.wanted())
+                });
+                let (grid, lost) = scene::checked(decoded?, partial)?;
+                return Ok((PyPointCloud::of_grid(grid, scene.axes().unwrap_or_default()), lost));
+            }
+            Input::Stream(source) => source,
+        };
+        part.refuse()?;
         let bytes: Loaded = source.load(&limits)?;
         if version(&bytes) == Some(2) {
             return Err(no_points());
@@ -154,6 +200,8 @@ pub fn decode_points(
             done => done?,
         }
         let points = decoding.points().map(|points| points.to_voxels());
-        Ok(PyPointCloud::decoded(points.ok_or_else(no_points)?, &bytes))
-    })
+        Ok((PyPointCloud::decoded(points.ok_or_else(no_points)?, &bytes), Vec::new()))
+    })?;
+    scene::warn(py, &lost)?;
+    Ok(cloud)
 }

@@ -88,6 +88,10 @@ fn fill(error: &Error, fields: &Bound<'_, PyDict>) -> PyResult<&'static str> {
             fields.set_item("least", least)?;
             "TooFewBits"
         }
+        Error::Block { block, source } => {
+            fields.set_item("block", block)?;
+            return fill(source, fields);
+        }
         Error::Cancelled => "Cancelled",
         Error::Usage(_) => "UsageError",
         other => return fill_format(other, fields),

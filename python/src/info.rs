@@ -5,6 +5,7 @@ use b2p::{Error, Result, colour};
 use pyo3::prelude::*;
 use serde_json::{Value, json};
 
+use crate::scene::{self, Input};
 use crate::source::Source;
 use crate::values::{self, PyLimits};
 use crate::work::Work;
@@ -22,13 +23,19 @@ use crate::work::Work;
 /// dict
 ///     version, bits, points; levels, each a dict of level, voxels, geometry_bytes, colour_bytes, luma_step, lossless,
 ///     prefix_bytes (where a stream that ends with it is cut) and whole; total_bytes, model, up, metres_per_unit, crs,
-///     origin, voxel_size, complete_to_level, top_level, and damage, which says what is wrong.
+///     origin, voxel_size, complete_to_level, top_level, and damage, which says what is wrong. Of a scene of blocks,
+///     levels are the first and the last, voxels those of each, and blocks a dict each of level, at (coordinates of
+///     its cube), points, voxels, offset and bytes.
 #[pyfunction]
 #[pyo3(signature = (stream, *, limits=None))]
 pub fn info<'py>(py: Python<'py>, stream: &Bound<'py, PyAny>, limits: Option<PyLimits>) -> PyResult<Bound<'py, PyAny>> {
     let source = Source::of(stream)?;
     let limits = values::limits(limits);
     let text = Work::default().run(py, move |_, _| {
+        let source = match Input::of(source, &limits)? {
+            Input::Scene(scene) => return Ok(scene::description(&scene).to_string()),
+            Input::Stream(source) => source,
+        };
         let bytes = source.load(&limits)?;
         let stream = Stream::parse(&bytes, &limits)?;
         Ok(description(&stream, &bytes)?.to_string())

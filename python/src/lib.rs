@@ -16,6 +16,7 @@ mod files;
 mod gaussians;
 mod info;
 mod render;
+mod scene;
 mod source;
 mod stream;
 mod values;

@@ -5,9 +5,10 @@ use std::sync::Arc;
 
 use b2p::container::Header;
 use b2p::container::axes;
+use b2p::scene::ViewOptions;
 use b2p::{
     Background, Camera, Cancel, Channel, Decoder, EffectMode, Effects, Error, Extent, Gaussians, Image, Limits, Log,
-    Quality, Renderer, Result, Up,
+    Quality, Renderer, Result, SceneDecoder, Up,
 };
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
@@ -17,14 +18,23 @@ use crate::camera::PyCamera;
 use crate::decode;
 use crate::errors;
 use crate::gaussians::PyGaussians;
+use crate::scene::{self, Input, Scene};
 use crate::source::{Drawing, Source};
 use crate::values::{self, PyLimits};
 use crate::work::Work;
 
 /// What is drawn.
-enum Scene {
-    Gaussians(Arc<Gaussians>, Option<Up>),
+enum Drawn {
+    Gaussians(Decoded),
     Stream(Source),
+}
+
+/// Gaussians that are drawn.
+struct Decoded {
+    gaussians: Arc<Gaussians>,
+    up: Option<Up>,
+    /// The camera that they were decoded for.
+    camera: Option<Camera>,
 }
 
 /// What a picture shows, and what it is made of.
@@ -55,6 +65,7 @@ struct Sketch {
     background: Background,
     effects: Effects,
     quality: Quality,
+    lod: f64,
     limits: Limits,
 }
 
@@ -64,6 +75,7 @@ struct Sketch {
 /// ----------
 /// scene : Gaussians, or a stream as path or bytes
 ///     A stream is decoded as `decode` does; levels whose voxels fall under a pixel are left out, as `b2p render` does.
+///     Of a scene of blocks, what the camera sees is decoded.
 /// camera : Camera, optional
 ///     By default from the front, with the whole object in view.
 /// width, height : int, optional
@@ -77,8 +89,8 @@ struct Sketch {
 /// quality : {"fast", "fine", "exact"}
 /// dtype : {"uint8", "float32"}
 ///     Of colours.
-/// level, heads, model, per_voxel : optional
-///     As of `decode`, for streams.
+/// level, heads, model, per_voxel, lod : optional
+///     As of `decode`, for streams; `lod` for scenes of blocks.
 /// limits : Limits, optional
 /// threads : int, optional
 ///
@@ -94,7 +106,8 @@ struct Sketch {
 ///     "ids": int32 [height, width], the index of the Gaussian that a pixel shows most of; -1 where nothing is.
 #[pyfunction]
 #[pyo3(signature = (scene, camera=None, width=None, height=None, *, background=None, effects=None, channel="colour",
-    quality="fine", dtype="uint8", level=None, heads=None, model=None, per_voxel=None, limits=None, threads=None))]
+    quality="fine", dtype="uint8", level=None, heads=None, model=None, per_voxel=None, lod=0.0,
+    limits=None, threads=None))]
 pub fn render<'py>(
     py: Python<'py>,
     scene: &Bound<'py, PyAny>,
@@ -110,6 +123,7 @@ pub fn render<'py>(
     heads: Option<&str>,
     model: Option<PathBuf>,
     per_voxel: Option<usize>,
+    lod: f64,
     limits: Option<PyLimits>,
     threads: Option<usize>,
 ) -> PyResult<Bound<'py, PyAny>> {
@@ -125,43 +139,46 @@ pub fn render<'py>(
         background: background.map_or(Ok(Background::WHITE), colour)?,
         effects: effects.map_or(Ok(Effects::default()), forced)?,
         quality: quality.parse().map_err(|e: String| errors::usage(py, e))?,
+        lod,
         limits: values::limits(limits),
     };
     let drawing = Drawing::new(py, heads, model, per_voxel, level)?;
     let scene = scene_of(scene, &drawing)?;
     let (picture, [width, height]) = Work::on(threads).run(py, move |cancel, log| {
-        let (gaussians, up) = match scene {
-            Scene::Gaussians(gaussians, up) => (gaussians, up),
-            Scene::Stream(source) => sketch.decoded(source, drawing, cancel, log)?,
+        let decoded = match scene {
+            Drawn::Gaussians(decoded) => decoded,
+            Drawn::Stream(source) => sketch.decoded(source, drawing, cancel, log)?,
         };
         cancel.check()?;
-        sketch.draw(&gaussians, up)
+        sketch.draw(&decoded)
     })?;
     array(py, picture, width as usize, height as usize)
 }
 
 /// Gaussians, or a stream, for which `drawing` is.
-fn scene_of(scene: &Bound<'_, PyAny>, drawing: &Drawing) -> PyResult<Scene> {
+fn scene_of(scene: &Bound<'_, PyAny>, drawing: &Drawing) -> PyResult<Drawn> {
     let Ok(gaussians) = scene.cast::<PyGaussians>() else {
-        return Source::of(scene).map(Scene::Stream);
+        return Source::of(scene).map(Drawn::Stream);
     };
     if !drawing.is_default() {
         let what = "level, heads, model and per_voxel are for streams, these are Gaussians";
         return Err(errors::usage(scene.py(), what));
     }
     let PyGaussians { inner, up, .. } = gaussians.get();
-    Ok(Scene::Gaussians(inner.clone(), *up))
+    Ok(Drawn::Gaussians(Decoded {
+        gaussians: inner.clone(),
+        up: *up,
+        camera: None,
+    }))
 }
 
 impl Sketch {
     /// The Gaussians of a stream, at the level that the camera calls for unless one is named, and what is up.
-    fn decoded(
-        &self,
-        source: Source,
-        drawing: Drawing,
-        cancel: &Cancel,
-        log: &Log,
-    ) -> Result<(Arc<Gaussians>, Option<Up>)> {
+    fn decoded(&self, source: Source, drawing: Drawing, cancel: &Cancel, log: &Log) -> Result<Decoded> {
+        let source = match Input::of(source, &self.limits)? {
+            Input::Scene(scene) => return self.seen(&scene, &drawing, cancel, log),
+            Input::Stream(source) => source,
+        };
         let bytes = source.load(&self.limits)?;
         let decoder = drawing.decoder(&bytes, &self.limits)?;
         let decoder = decoder.with_cancel(cancel.clone()).with_log(log);
@@ -171,7 +188,27 @@ impl Sketch {
             level => level,
         };
         let (gaussians, _) = decode::gaussians(&decoder.with_level(level), &bytes, false)?;
-        Ok((Arc::new(gaussians), up))
+        Ok(Decoded {
+            gaussians: Arc::new(gaussians),
+            up,
+            camera: None,
+        })
+    }
+
+    /// What the camera sees of a scene of blocks.
+    fn seen(&self, scene: &Scene, drawing: &Drawing, cancel: &Cancel, log: &Log) -> Result<Decoded> {
+        let decoder = drawing.decoder(&[], &self.limits)?.with_cancel(cancel.clone());
+        let decoder = SceneDecoder::new(decoder);
+        let camera = scene::resolved(scene, &decoder, &self.camera, self.size)?;
+        let options = ViewOptions::default().with_voxel_pixels(self.lod);
+        let seen = log.step("decode what is seen", scene.blocks().len(), "blocks", || {
+            decoder.visible(scene, &camera, options)?.whole()
+        })?;
+        Ok(Decoded {
+            gaussians: Arc::new(seen),
+            up: scene::up(scene),
+            camera: Some(camera),
+        })
     }
 
     /// The coarsest level whose voxels fall under a pixel, if there are finer ones.
@@ -188,9 +225,15 @@ impl Sketch {
         }
     }
 
-    fn draw(&self, gaussians: &Gaussians, up: Option<Up>) -> Result<(Picture, [u32; 2])> {
-        let extent = Extent::of_gaussians(gaussians);
-        let camera = self.camera.resolve(&gaussians.frame, &extent, up, self.size)?;
+    fn draw(&self, decoded: &Decoded) -> Result<(Picture, [u32; 2])> {
+        let gaussians = &*decoded.gaussians;
+        let camera = match decoded.camera {
+            Some(camera) => camera,
+            None => {
+                let extent = Extent::of_gaussians(gaussians);
+                self.camera.resolve(&gaussians.frame, &extent, decoded.up, self.size)?
+            }
+        };
         let (channel, background) = match self.show {
             Show::Bytes | Show::Floats => (Channel::Colour, self.background),
             Show::Alpha => (Channel::Colour, Background::Transparent),

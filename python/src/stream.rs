@@ -4,25 +4,25 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
 use b2p::container::axes;
-use b2p::{Cancel, Decoding, Error, Limits, Result, Up};
+use b2p::{Cancel, Decoding, Error, Gaussians, Limits, Result, SceneDecoding, SceneReader, Up};
 use pyo3::prelude::*;
 
 use crate::cloud::PyPointCloud;
 use crate::errors;
 use crate::gaussians::PyGaussians;
+use crate::scene::START;
 use crate::source::{self, Drawing, no_points};
 use crate::values::{self, PyLimits};
 use crate::work::Work;
 
-/// Bytes that tell of which version a stream is.
-const START: usize = 10;
 /// Bytes of a stream that hold its header and its axes.
 const AXES: usize = 1 << 18;
 
 /// A stream that is decoded level by level as its bytes arrive. `b2p.open` is the usual way to use it.
 ///
 /// Bytes are pushed in pieces of any size; `advance` decodes a level as soon as it is whole, and `gaussians` and
-/// `points` give what the level reached holds. After an error what was reached before stays usable, and nothing more is
+/// `points` give what the level reached holds. Of a scene of blocks all levels are whole when its last byte has come;
+/// they are decoded when they are asked for. After an error what was reached before stays usable, and nothing more is
 /// decoded. The parameters are those of `b2p.decode`.
 #[pyclass(frozen, module = "b2p", name = "Stream")]
 pub struct PyStream {
@@ -37,8 +37,10 @@ struct State {
     cancel: Cancel,
     /// The first bytes, which hold what is said of axes.
     start: Vec<u8>,
-    /// Once the version is known.
+    /// Once it is known that a stream of one frame comes.
     decoding: Option<Decoding<'static>>,
+    /// Once it is known that a scene of blocks comes.
+    scene: Option<SceneDecoding>,
 }
 
 impl State {
@@ -47,11 +49,15 @@ impl State {
         let before = self.start.len();
         self.start
             .extend(&bytes[..bytes.len().min(AXES.saturating_sub(before))]);
-        if self.decoding.is_none() && self.start.len() < START {
+        let is_known = self.decoding.is_some() || self.scene.is_some();
+        if !is_known && self.start.len() < START {
             return Ok(());
         }
-        if self.decoding.is_none() {
+        if !is_known {
             self.open(before)?;
+        }
+        if let Some(scene) = &mut self.scene {
+            scene.push(bytes)?;
         }
         if let Some(decoding) = &mut self.decoding {
             decoding.push(bytes);
@@ -62,7 +68,14 @@ impl State {
     /// Begins to decode, with so many of the first bytes.
     fn open(&mut self, count: usize) -> Result<()> {
         let decoder = self.drawing.decoder(&self.start, &self.limits)?;
-        let mut decoding = decoder.with_cancel(self.cancel.clone()).start();
+        let decoder = decoder.with_cancel(self.cancel.clone());
+        if SceneReader::is_scene(&self.start) {
+            let mut scene = SceneDecoding::new(decoder);
+            scene.push(&self.start[..count])?;
+            self.scene = Some(scene);
+            return Ok(());
+        }
+        let mut decoding = decoder.start();
         decoding.push(&self.start[..count]);
         self.decoding = Some(decoding);
         Ok(())
@@ -80,11 +93,56 @@ impl State {
         self.decoding.as_ref().ok_or_else(nothing)
     }
 
+    fn advance(&mut self) -> Result<Option<u8>> {
+        match (&mut self.scene, &mut self.decoding) {
+            (Some(scene), _) => scene.advance(),
+            (None, Some(decoding)) => decoding.advance(),
+            (None, None) => Ok(None),
+        }
+    }
+
+    fn finish(&mut self) -> Result<()> {
+        match &mut self.scene {
+            Some(scene) => scene.finish(),
+            None => self.decoding()?.finish(),
+        }
+    }
+
+    fn gaussians(&self) -> Result<(Gaussians, Option<u8>, Option<Up>)> {
+        if let Some(scene) = &self.scene {
+            return Ok((scene.gaussians()?, scene.level(), scene.axes()?.up));
+        }
+        let decoding = self.reached()?;
+        Ok((decoding.gaussians()?, decoding.level(), self.up()))
+    }
+
+    fn points(&self) -> Result<PyPointCloud> {
+        if let Some(scene) = &self.scene {
+            return Ok(PyPointCloud::of_grid(scene.points()?, scene.axes()?));
+        }
+        let decoding = self.reached()?;
+        if decoding.level().is_none() {
+            return Err(nothing());
+        }
+        let points = decoding.points().map(|points| points.to_voxels());
+        Ok(PyPointCloud::decoded(points.ok_or_else(no_points)?, &self.start))
+    }
+
+    fn level(&self) -> Option<u8> {
+        match &self.scene {
+            Some(scene) => scene.level(),
+            None => self.decoding.as_ref()?.level(),
+        }
+    }
+
     fn up(&self) -> Option<Up> {
         axes(&self.start).ok().and_then(|axes| axes.up)
     }
 
     fn is_complete(&self) -> bool {
+        if let Some(scene) = &self.scene {
+            return scene.is_complete();
+        }
         let Some(decoding) = &self.decoding else { return false };
         let top = || decoding.header().map(|header| header.top);
         let last = self.drawing.level().or_else(top);
@@ -124,6 +182,7 @@ impl PyStream {
             cancel: cancel.clone(),
             start: Vec::new(),
             decoding: None,
+            scene: None,
         };
         Ok(PyStream {
             state: Arc::new(Mutex::new(state)),
@@ -141,24 +200,18 @@ impl PyStream {
 
     /// Decodes the next level if all of it has come, and returns its number, else None.
     fn advance(&self, py: Python<'_>) -> PyResult<Option<u8>> {
-        self.run(py, |state| match &mut state.decoding {
-            Some(decoding) => decoding.advance(),
-            None => Ok(None),
-        })
+        self.run(py, State::advance)
     }
 
     /// Decodes what is left, knowing that no more bytes will come: a `TruncatedError` unless the stream is whole, or
     /// ends just where one of its levels ends.
     fn finish(&self, py: Python<'_>) -> PyResult<()> {
-        self.run(py, |state| state.decoding()?.finish())
+        self.run(py, State::finish)
     }
 
     /// The Gaussians of the level reached.
     fn gaussians(&self, py: Python<'_>) -> PyResult<PyGaussians> {
-        let (gaussians, level, up) = self.run(py, |state| {
-            let decoding = state.reached()?;
-            Ok((decoding.gaussians()?, decoding.level(), state.up()))
-        })?;
+        let (gaussians, level, up) = self.run(py, |state| state.gaussians())?;
         Ok(PyGaussians {
             level,
             up,
@@ -168,26 +221,22 @@ impl PyStream {
 
     /// The voxels of the level reached with their colours.
     fn points(&self, py: Python<'_>) -> PyResult<PyPointCloud> {
-        self.run(py, |state| {
-            let decoding = state.reached()?;
-            if decoding.level().is_none() {
-                return Err(nothing());
-            }
-            let points = decoding.points().map(|points| points.to_voxels());
-            Ok(PyPointCloud::decoded(points.ok_or_else(no_points)?, &state.start))
-        })
+        self.run(py, |state| state.points())
     }
 
     /// The deepest level decoded so far; None before the first.
     #[getter]
     fn level(&self, py: Python<'_>) -> PyResult<Option<u8>> {
-        self.ask(py, |state| state.decoding.as_ref()?.level())
+        self.ask(py, State::level)
     }
 
     /// Whether the level reached has Gaussians.
     #[getter]
     fn is_drawable(&self, py: Python<'_>) -> PyResult<bool> {
-        self.ask(py, |state| state.decoding.as_ref().is_some_and(Decoding::is_drawable))
+        self.ask(py, |state| match &state.scene {
+            Some(scene) => scene.is_drawable(),
+            None => state.decoding.as_ref().is_some_and(Decoding::is_drawable),
+        })
     }
 
     /// Whether the last level has been decoded: that which was asked for, or the stream's finest.
@@ -197,9 +246,7 @@ impl PyStream {
     }
 
     fn __repr__(&self) -> String {
-        let level = lock(&self.state)
-            .ok()
-            .and_then(|state| state.decoding.as_ref()?.level());
+        let level = lock(&self.state).ok().and_then(|state| state.level());
         match level {
             Some(level) => format!("<b2p.Stream: decoded to level {level}>"),
             None => "<b2p.Stream>".into(),

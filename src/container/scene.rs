@@ -10,7 +10,7 @@ use super::header::{Header, Section};
 use super::malformed;
 use super::reader::put_varint;
 use super::sequence::{InPayload, only_chunk, put_chunk};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, feature};
 use crate::limits::Limits;
 
 /// The deepest level whose voxels may be blocks.
@@ -114,7 +114,8 @@ impl BlockEntry {
         Err(malformed("18.2.4", self.offset, "hash of the block", found, expected))
     }
 
-    /// Checks that the header of the block's stream says what the index says.
+    /// Checks that the header of the block's stream says what the index says, and that all levels are there and nothing
+    /// follows them.
     ///
     /// # Errors
     /// [`Error::Malformed`] if not.
@@ -127,14 +128,19 @@ impl BlockEntry {
                 header.points, header.voxels
             )
         };
-        match stated(found) == stated(&expected) && found.format.version() == 3 {
+        if stated(found) != stated(&expected) || found.format.version() != 3 {
+            let (found, expected) = (stated(found), stated(&expected));
+            return Err(malformed("18.3.1", self.offset, "header of the block", found, expected));
+        }
+        let whole = found.prefix_bytes(found.top)?;
+        match u64::from(self.bytes) == whole {
             true => Ok(()),
             false => Err(malformed(
-                "18.3.1",
+                "2.1.1",
                 self.offset,
-                "header of the block",
-                stated(found),
-                stated(&expected),
+                "bytes of the block's stream",
+                self.bytes,
+                whole,
             )),
         }
     }
@@ -151,12 +157,15 @@ pub fn parse_index(bytes: &[u8], header: &Header, limits: &Limits) -> Result<Vec
         let value = format!("{section:?}");
         return Err(malformed("18.1.2", 72, "section lengths of a scene", value, 0));
     }
-    let chunk = only_chunk(bytes, header.bytes(), ChunkKind::Index)?;
+    let chunk = only_chunk(bytes, header.bytes(), ChunkKind::Index).map_err(of_index)?;
+    if chunk.count == 0 {
+        return Err(malformed("18.2.1", chunk.offset, "number of blocks", 0, "at least 1"));
+    }
     let mut reader = InPayload::new(&chunk, "18.2.2");
     let units = reader.read(|r| r.u8("units of the index"))?;
     if units != UNITS_IN_SPACE {
         return Err(Error::Unsupported {
-            what: "the index of this scene",
+            what: feature::UNITS,
             detail: format!("its units are of kind {units}; this version knows blocks, kind 1"),
         });
     }
@@ -177,6 +186,24 @@ pub fn parse_index(bytes: &[u8], header: &Header, limits: &Limits) -> Result<Vec
     reader.finish()?;
     check_sums(&blocks, header, chunk.offset)?;
     Ok(blocks)
+}
+
+/// What is wrong with the chunk, as the clauses of scenes say it.
+fn of_index(error: Error) -> Error {
+    match error {
+        Error::Truncated {
+            stage, offset, needed, ..
+        } => Error::Truncated {
+            stage,
+            offset,
+            field: "index of the scene",
+            needed,
+        },
+        Error::Malformed {
+            clause: Some("17.2.1"), ..
+        } => error.breaks("18.2.1"),
+        error => error,
+    }
 }
 
 fn read_block(

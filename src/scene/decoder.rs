@@ -1,6 +1,6 @@
 //! Decodes scenes, whole or in part (`docs/format.md`, clause 18.3).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
 use rayon::prelude::*;
@@ -8,12 +8,16 @@ use rayon::prelude::*;
 use super::neighbours::Bounds;
 use super::reader::SceneReader;
 use super::source::Source;
+#[cfg(feature = "ply")]
+use crate::cloud::ColouredVoxels;
 use crate::container::Header;
 use crate::container::scene::{BlockEntry, Cube};
 use crate::decoder::{Decoder, LevelVoxels, Part};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::{Octree, Voxels};
+#[cfg(doc)]
+use crate::limits::Limits;
 use crate::placement::Placement;
 
 /// Bytes of memory for each byte of a stream that is decoded: the stream, and its slices.
@@ -54,6 +58,19 @@ pub struct DecodedScene<T> {
     pub lost: Vec<Error>,
 }
 
+impl<T> DecodedScene<T> {
+    /// What was decoded, if no block is lost.
+    ///
+    /// # Errors
+    /// Why the first of them is.
+    pub fn whole(self) -> Result<T> {
+        match self.lost.into_iter().next() {
+            Some(error) => Err(error),
+            None => Ok(self.content),
+        }
+    }
+}
+
 /// The voxels of a level that are wanted, and the blocks that they are in.
 struct Selection {
     level: u8,
@@ -62,8 +79,17 @@ struct Selection {
     bounds: Option<Bounds>,
 }
 
-/// Blocks that were decoded to a level, by their numbers; `None` for those that could not be.
-pub(super) type Decoded = BTreeMap<usize, Option<LevelVoxels>>;
+/// What is known of the blocks of a scene at a level.
+#[derive(Debug, Default)]
+pub(super) struct Decoded {
+    /// Blocks that were decoded, by their numbers; `None` for those that could not be.
+    pub blocks: Blocks,
+    /// Keys of the coarsest level, of blocks that were decoded no further.
+    coarse: BTreeMap<usize, Vec<u64>>,
+}
+
+/// Decoded blocks by their numbers; `None` for those that could not be decoded.
+pub(super) type Blocks = BTreeMap<usize, Option<LevelVoxels>>;
 
 impl SceneDecoder {
     /// A decoder of scenes, which decodes and draws as `decoder` does: its level, heads, limits and instructions count.
@@ -80,7 +106,7 @@ impl SceneDecoder {
     /// damage in some of them [`DecodedScene::lost`] tells.
     pub fn gaussians<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<DecodedScene<Gaussians>> {
         let selection = self.select(scene, wanted)?;
-        let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
+        let (mut decoded, mut lost) = (Decoded::default(), Vec::new());
         let mut parts: Vec<Gaussians> = Vec::new();
         let mut take = |_, drawn| parts.push(drawn);
         let Selection { level, bounds, .. } = &selection;
@@ -105,10 +131,11 @@ impl SceneDecoder {
         let header = scene.header();
         self.decoder.check_drawable(header, level)?;
         let reach = self.decoder.reach(header, level)?;
-        let needed = around(scene.blocks(), blocks, level, reach);
+        let kept = self.gaussian_bytes(scene, blocks, level)?.saturating_add(held);
+        let needed = self.near(scene, (level, blocks), kept, decoded)?;
+        let decoded = &mut decoded.blocks;
         let missing = needed.iter().copied().filter(|block| !decoded.contains_key(block));
         let missing: Vec<usize> = missing.collect();
-        let kept = self.gaussian_bytes(scene, blocks, level)?.saturating_add(held);
         let kept = kept.saturating_add(self.check_memory(scene, &missing, level, kept)?);
         self.decode(scene, &needed, level, decoded, lost)?;
         for &block in blocks {
@@ -119,6 +146,49 @@ impl SceneDecoder {
             take(block, self.draw(header, own, &near.collect()?, bounds)?);
         }
         Ok(())
+    }
+
+    /// Some blocks and those around them that have voxels so near that drawing depends on them. The coarsest level of a
+    /// block tells that, for a fraction of what it takes to decode.
+    pub(super) fn near<S: Source>(
+        &self,
+        scene: &SceneReader<S>,
+        (level, blocks): (u8, &[usize]),
+        held: u64,
+        decoded: &mut Decoded,
+    ) -> Result<Vec<usize>> {
+        let (all, base) = (scene.blocks(), scene.header().base);
+        let reach = self.decoder.reach(scene.header(), level)?;
+        let around = around(all, blocks, level, reach);
+        if around.len() == blocks.len() || base >= level {
+            return Ok(around);
+        }
+        let own: BTreeSet<usize> = blocks.iter().copied().collect();
+        let is_needed = |block: &usize| own.contains(block) || decoded.blocks.contains_key(block);
+        let unknown = |block: &&usize| !is_needed(block) && !decoded.coarse.contains_key(block);
+        let unknown: Vec<usize> = around.iter().filter(unknown).copied().collect();
+        self.check_memory(scene, &unknown, base, held)?;
+        let mut found = Blocks::new();
+        // What is wrong with a block is said when it is decoded.
+        self.decode(scene, &unknown, base, &mut found, &mut Vec::new())?;
+        for (block, voxels) in found {
+            decoded.coarse.extend(voxels.map(|voxels| (block, voxels.keys)));
+        }
+        let reached = own.iter().map(|&block| Bounds::around(all[block].cube, level, reach));
+        let reached: Vec<Bounds> = reached.collect();
+        let has_near = |block: &usize, keys: &[u64]| {
+            let cube = Bounds::of(all[*block].cube, level);
+            let close: Vec<&Bounds> = reached.iter().filter(|bounds| bounds.meets(&cube)).collect();
+            keys.iter().any(|&key| {
+                let voxel = Bounds::of(Cube { level: base, key }, level);
+                close.iter().any(|bounds| bounds.meets(&voxel))
+            })
+        };
+        let near = around.into_iter().filter(|block| match decoded.coarse.get(block) {
+            Some(keys) if !own.contains(block) && !decoded.blocks.contains_key(block) => has_near(block, keys),
+            _ => true,
+        });
+        Ok(near.collect())
     }
 
     /// What decodes blocks.
@@ -138,7 +208,7 @@ impl SceneDecoder {
     ) -> Result<DecodedScene<(Voxels, Vec<[u8; 3]>)>> {
         let selection = self.select(scene, wanted)?;
         self.check_memory(scene, &selection.blocks, selection.level, 0)?;
-        let (mut decoded, mut lost) = (Decoded::new(), Vec::new());
+        let (mut decoded, mut lost) = (Blocks::new(), Vec::new());
         self.decode(scene, &selection.blocks, selection.level, &mut decoded, &mut lost)?;
         let (mut keys, mut colours) = (Vec::new(), Vec::new());
         let mut blocks = 0;
@@ -152,6 +222,64 @@ impl SceneDecoder {
         }
         let voxels = Voxels::from_sorted(selection.level, keys);
         finish((voxels, colours), lost, blocks)
+    }
+
+    /// The same on a grid of their own: that of the scene, with as many bits as the level has.
+    ///
+    /// # Errors
+    /// Those of [`SceneDecoder::voxels`].
+    #[cfg(feature = "ply")]
+    pub fn points<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<DecodedScene<ColouredVoxels>> {
+        let DecodedScene { content, blocks, lost } = self.voxels(scene, wanted)?;
+        let (voxels, colours) = content;
+        let Placement { origin, voxel_size } = scene.header().placement;
+        let coarser = f64::from(1u32 << (scene.header().bits - voxels.depth()));
+        let content = ColouredVoxels {
+            voxels,
+            colours,
+            placement: Placement {
+                origin,
+                voxel_size: voxel_size * coarser,
+            },
+        };
+        Ok(DecodedScene { content, blocks, lost })
+    }
+
+    /// The levels of a scene that can be drawn, the coarsest first, down to the decoder's level if it has one.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a level that the scene has not.
+    pub fn levels<S: Source>(&self, scene: &SceneReader<S>) -> Result<Vec<u8>> {
+        let header = scene.header();
+        let levels = header.base..=self.level(header)?;
+        let drawable = |level: &u8| self.decoder.check_drawable(header, *level).is_ok();
+        Ok(levels.filter(drawable).collect())
+    }
+
+    /// Bytes of memory that decoding a part and its Gaussians takes, beyond [`Limits::OVERHEAD`] and models. Around a
+    /// block there are taken to be as many voxels as in it.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a level or a part that the scene has not, [`Error::Unsupported`] for heads that there are
+    /// not.
+    pub fn memory<S: Source>(&self, scene: &SceneReader<S>, wanted: &Wanted) -> Result<u64> {
+        let Selection { level, blocks, .. } = self.select(scene, wanted)?;
+        let reach = self.decoder.reach(scene.header(), level)?;
+        let needed = around(scene.blocks(), &blocks, level, reach);
+        let (decoded, working) = self.decoding_bytes(scene, &needed, level)?;
+        let made = self.gaussian_bytes(scene, &blocks, level)?;
+        let own = |block: &usize| -> Result<u64> {
+            let entry = &scene.blocks()[*block];
+            let voxels = entry.header(scene.header()).voxels(level - entry.cube.level)?;
+            Ok(2 * u64::from(voxels))
+        };
+        let most = blocks
+            .iter()
+            .map(own)
+            .try_fold(0, |most, voxels| voxels.map(|voxels| most.max(voxels)))?;
+        let drawing = self.decoder.drawing_bytes_of(scene.header(), level, [most; 2])?;
+        let drawing = drawing.saturating_add(most.saturating_mul(PART_BYTES));
+        Ok(made.saturating_add(decoded).saturating_add(working.max(drawing)))
     }
 
     /// The blocks in which a part lies.
@@ -201,7 +329,7 @@ impl SceneDecoder {
         scene: &SceneReader<S>,
         blocks: &[usize],
         level: u8,
-        decoded: &mut Decoded,
+        decoded: &mut Blocks,
         lost: &mut Vec<Error>,
     ) -> Result<()> {
         let decode = |&block: &usize| -> Result<LevelVoxels> {
@@ -300,6 +428,14 @@ impl SceneDecoder {
     /// Checks that decoding these blocks keeps to the limits, beside `kept` bytes, and returns what they take when they
     /// are decoded.
     fn check_memory<S: Source>(&self, scene: &SceneReader<S>, blocks: &[usize], level: u8, kept: u64) -> Result<u64> {
+        let (decoded, working) = self.decoding_bytes(scene, blocks, level)?;
+        let all = kept.saturating_add(decoded).saturating_add(working);
+        self.decoder.limits().check_bytes("memory to decode this scene", all)?;
+        Ok(decoded)
+    }
+
+    /// Bytes of these blocks when they are decoded, and while they are.
+    fn decoding_bytes<S: Source>(&self, scene: &SceneReader<S>, blocks: &[usize], level: u8) -> Result<(u64, u64)> {
         let mut working: Vec<u64> = Vec::new();
         let mut decoded: u64 = 0;
         for &block in blocks {
@@ -310,10 +446,9 @@ impl SceneDecoder {
             decoded = decoded.saturating_add(u64::from(own.voxels(local)?) * VOXEL_BYTES);
         }
         working.sort_unstable();
-        let working: u64 = working.iter().rev().take(rayon::current_num_threads()).sum();
-        let all = kept.saturating_add(decoded).saturating_add(working);
-        self.decoder.limits().check_bytes("memory to decode this scene", all)?;
-        Ok(decoded)
+        let largest = working.iter().rev().take(rayon::current_num_threads());
+        let working = largest.fold(0, |sum: u64, bytes| sum.saturating_add(*bytes));
+        Ok((decoded, working))
     }
 
     /// Checks that drawing a block among so many voxels keeps to the limits, beside `kept` bytes.
@@ -363,7 +498,7 @@ struct Neighbourhood {
 }
 
 impl<'a> Near<'a> {
-    fn of(blocks: &[BlockEntry], decoded: &'a Decoded, block: usize, level: u8, reach: u32) -> Self {
+    fn of(blocks: &[BlockEntry], decoded: &'a Blocks, block: usize, level: u8, reach: u32) -> Self {
         let bounds = Bounds::around(blocks[block].cube, level, reach);
         let (mut parts, mut own) = (Vec::new(), 0);
         for (&other, voxels) in decoded {

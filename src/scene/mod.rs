@@ -5,6 +5,7 @@
 //! border of a block depend on the voxels of the blocks around it, as if the scene was one piece. So those of a part
 //! that is decoded by itself equal those of the whole, bit for bit.
 
+mod arriving;
 mod decoder;
 mod edit;
 #[cfg(feature = "encoder")]
@@ -22,6 +23,7 @@ mod tests;
 #[cfg(feature = "render")]
 mod view;
 
+pub use arriving::SceneDecoding;
 pub use decoder::{DecodedScene, SceneDecoder, Wanted};
 #[cfg(feature = "encoder")]
 pub use encoder::{Grid, SceneEncoder, Sink, Voxel};

@@ -2,12 +2,14 @@
 
 use std::borrow::Cow;
 
+use super::decoder::frame_of;
 use super::source::Source;
 use crate::axes::Axes;
 use crate::container::scene::{BlockEntry, parse_index};
 use crate::container::{Header, axes};
 use crate::decoder::{Checked, Decoder};
 use crate::error::{Error, Result, Stage};
+use crate::gaussians::Frame;
 use crate::limits::Limits;
 
 /// Bytes that are read first: header and index of most scenes.
@@ -68,6 +70,11 @@ impl<S: Source> SceneReader<S> {
     /// What all blocks have in common. Voxels and points are the sums over all blocks; section lengths are 0.
     pub fn header(&self) -> &Header {
         &self.header
+    }
+
+    /// The cube that the scene's Gaussians refer to.
+    pub fn frame(&self) -> Frame {
+        frame_of(&self.header)
     }
 
     /// The index.

@@ -2,7 +2,7 @@ use std::path::Path;
 
 use proptest::prelude::*;
 
-use super::decoder::Decoded;
+use super::decoder::{Blocks, Decoded};
 use super::*;
 use crate::cloud::ColouredVoxels;
 use crate::decoder::{Decoder, Part};
@@ -42,7 +42,7 @@ fn heads() -> HeadsModel {
 }
 
 /// The Gaussians of all decoded blocks, drawn as one level without borders.
-fn in_one_piece(decoder: &Decoder, scene: &SceneReader<&[u8]>, decoded: &Decoded, level: u8) -> Gaussians {
+fn in_one_piece(decoder: &Decoder, scene: &SceneReader<&[u8]>, decoded: &Blocks, level: u8) -> Gaussians {
     let mut keys = Vec::new();
     let [mut colours, mut unfiltered] = [const { Vec::new() }; 2];
     for block in decoded.values().flatten() {
@@ -101,19 +101,62 @@ proptest! {
         prop_assert!(found.lost.is_empty());
         let blocks: Vec<usize> = (0..scene.blocks().len()).collect();
         prop_assert!(blocks.len() > 1);
-        let mut decoded = Decoded::new();
+        let mut decoded = Blocks::new();
         scenes.decode(&scene, &blocks, level, &mut decoded, &mut Vec::new()).expect("blocks");
         let expected = in_one_piece(&decoder, &scene, &decoded, level);
         prop_assert_eq!(found.content.blur, expected.blur);
         prop_assert!(bits(&found.content) == bits(&expected), "{} blocks, {set} heads", blocks.len());
-        // And a part is that part.
+        // And a part is that part, also of one block, for which others are decoded only where they are near.
         let part: Vec<usize> = blocks.iter().copied().filter(|block| block % 3 == 1).collect();
         let alone = scenes.gaussians(&scene, &Wanted::Blocks(part.clone())).expect("a part");
-        let mut of_whole = Gaussians { frame: alone.content.frame, blur: alone.content.blur, ..Gaussians::default() };
-        for block in part {
-            let block = scenes.gaussians(&scene, &Wanted::Blocks(vec![block])).expect("a block");
-            of_whole.append(block.content);
+        let none = Gaussians { frame: alone.content.frame, blur: alone.content.blur, ..Gaussians::default() };
+        let (mut of_whole, mut together) = (none.clone(), none);
+        for block in blocks {
+            let drawn = scenes.gaussians(&scene, &Wanted::Blocks(vec![block])).expect("a block").content;
+            if part.contains(&block) {
+                of_whole.append(drawn.clone());
+            }
+            together.append(drawn);
         }
+        prop_assert!(bits(&together) == bits(&found.content));
         prop_assert!(bits(&alone.content) == bits(&of_whole));
+    }
+}
+
+#[test]
+fn of_the_blocks_around_one_only_those_with_voxels_near_its_border_are_decoded() {
+    // Two cubes of 8 voxels in neighbouring octants, far from the border between them or on both sides of it.
+    for (gap, expected) in [(0..8u32, vec![0]), (24..32, vec![0, 1])] {
+        let corner = |octant: u32, at: u32| match octant {
+            0 => at,
+            _ => 63 - at,
+        };
+        let cells = (0..2).flat_map(|octant| {
+            let gap = gap.clone();
+            gap.flat_map(move |x| (0..64).map(move |i| [corner(octant, x), i % 8, i / 8]))
+        });
+        let voxels = Voxels::new(6, cells.map(morton::encode).collect());
+        let cloud = ColouredVoxels {
+            colours: vec![[9, 99, 200]; voxels.len()],
+            voxels,
+            placement: Placement::VOXEL_GRID,
+        };
+        let encoder = SceneEncoder::new().with_levels(3..=6).with_block_voxels(600);
+        let bytes = encoder.encode(&cloud).expect("a cloud");
+        let scene = SceneReader::new(&bytes[..], &Limits::default()).expect("a scene");
+        assert_eq!(scene.blocks().len(), 2);
+        let decoder = SceneDecoder::new(Decoder::new().with_heads(HeadSet::Surfels));
+        let mut decoded = Decoded::default();
+        for _ in 0..2 {
+            let near = decoder.near(&scene, (6, &[0]), 0, &mut decoded).expect("a scene");
+            assert_eq!(near, expected, "{gap:?}");
+        }
+        let whole = decoder.gaussians(&scene, &Wanted::All).expect("a scene").content;
+        let one = decoder
+            .gaussians(&scene, &Wanted::Blocks(vec![0]))
+            .expect("a block")
+            .content;
+        assert_eq!(one.position, whole.position[..one.len()]);
+        assert_eq!(one.scale, whole.scale[..one.len()]);
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 
-use super::decoder::{Decoded, DecodedScene, SceneDecoder, VOXEL_BYTES, frame_of, joined};
+use super::decoder::{Decoded, DecodedScene, SceneDecoder, VOXEL_BYTES, Wanted, joined};
 use super::reader::SceneReader;
 use super::source::Source;
 use crate::container::Header;
@@ -13,7 +13,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::morton;
 use crate::limits::Limits;
-use crate::renderer::camera::{Camera, Projection};
+use crate::renderer::camera::{Camera, Extent, Projection};
 use crate::renderer::{Background, Channel, Image, Renderer};
 
 /// How far Gaussians may reach out of their block, in voxels of its level.
@@ -70,6 +70,21 @@ struct VisibleBlock {
 }
 
 impl SceneDecoder {
+    /// The part of the cube that a scene takes, by the voxels of its coarsest level.
+    ///
+    /// # Errors
+    /// Those of [`SceneDecoder::voxels`].
+    pub fn extent<S: Source>(&self, scene: &SceneReader<S>) -> Result<Extent> {
+        let coarsest = SceneDecoder::new(self.decoder().clone().with_level(scene.header().base));
+        let (voxels, _) = coarsest.voxels(scene, &Wanted::All)?.content;
+        let half = f64::from(1u32 << voxels.depth()) / 2.0;
+        let spheres = (0..voxels.len()).map(|voxel| {
+            let centre = voxels.coordinate(voxel).map(|x| (f64::from(x) + 0.5) / half - 1.0);
+            (centre, 0.5 / half)
+        });
+        Ok(Extent::of(spheres))
+    }
+
     /// The Gaussians that a camera sees. The picture of them is that of the whole scene, but for what is less than a
     /// step of eight bits; where levels are coarser, but for what they lack. `decoder`'s level is the finest one.
     ///
@@ -85,7 +100,8 @@ impl SceneDecoder {
         let header = scene.header();
         let finest = self.level(header)?;
         let order = front_to_back(scene, camera);
-        let levels = self.drawable_levels(header, finest)?;
+        self.decoder().check_drawable(header, finest)?;
+        let levels = self.levels(scene)?;
         let in_view = order.into_iter().filter_map(|block| {
             let cube = scene.blocks()[block].cube;
             let level = level_for(cube, header, camera, options, &levels);
@@ -106,15 +122,6 @@ impl SceneDecoder {
             work.add(group)?;
         }
         work.finish()
-    }
-
-    /// The levels that can be drawn, down to the finest that is wanted.
-    fn drawable_levels(&self, header: &Header, finest: u8) -> Result<Vec<u8>> {
-        self.decoder().check_drawable(header, finest)?;
-        let levels = header.base..=finest;
-        Ok(levels
-            .filter(|level| self.decoder().check_drawable(header, *level).is_ok())
-            .collect())
     }
 }
 
@@ -154,7 +161,7 @@ impl<S: Source> Work<'_, S> {
         }
         if let Some(transmittance) = &mut self.transmittance {
             let copies = own.iter().map(|(_, gaussians)| gaussians.clone()).collect();
-            let together = with_one_blur(copies, frame_of(self.scene.header()));
+            let together = with_one_blur(copies, self.scene.frame());
             transmittance.draw(&together, self.camera, self.decoder.decoder().limits())?;
         }
         self.drawn.extend(own);
@@ -163,7 +170,10 @@ impl<S: Source> Work<'_, S> {
 
     /// Bytes that are held of what was decoded and drawn, of the group at hand twice.
     fn held_bytes(&self, own: &[(usize, Gaussians)]) -> u64 {
-        let decoded = self.decoded.values().flat_map(|decoded| decoded.values().flatten());
+        let decoded = self
+            .decoded
+            .values()
+            .flat_map(|decoded| decoded.blocks.values().flatten());
         let voxels: u64 = decoded.map(|voxels| voxels.keys.len() as u64).sum();
         let drawn: u64 = self.drawn.values().map(|gaussians| gaussians.len() as u64).sum();
         let own: u64 = own.iter().map(|(_, gaussians)| gaussians.len() as u64).sum();
@@ -178,7 +188,7 @@ impl<S: Source> Work<'_, S> {
         let blocks = self.drawn.len();
         let parts = self.drawn.into_values().collect();
         Ok(DecodedScene {
-            content: with_one_blur(parts, frame_of(self.scene.header())),
+            content: with_one_blur(parts, self.scene.frame()),
             blocks,
             lost: self.lost,
         })

@@ -6,7 +6,7 @@
 //! every instruction set of the machine, one, two and seven threads, whole and in pieces. The bare decoder
 //! (`--no-default-features`) is enough for that.
 //!
-//! The suite of version 3 is beside it: see `transform`.
+//! The suites of version 3 and of scenes are beside it: see `transform` and `scene`.
 //!
 //! After a change of the format or of the shipped model, `cargo xtask conformance` makes streams and digests again.
 
@@ -15,12 +15,16 @@
 mod common;
 mod damage;
 mod digest;
+mod digest_scene;
 mod digest_transform;
 #[cfg(feature = "encoder")]
 mod make;
 #[cfg(feature = "encoder")]
+mod make_scene;
+#[cfg(feature = "encoder")]
 mod make_transform;
 mod models;
+mod scene;
 #[cfg(feature = "encoder")]
 #[path = "../common/seal.rs"]
 mod seal;

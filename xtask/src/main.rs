@@ -9,12 +9,16 @@ mod damage;
 #[path = "../../tests/conformance/digest.rs"]
 #[allow(dead_code, reason = "the test decodes in pieces, too")]
 mod digest;
+#[path = "../../tests/conformance/digest_scene.rs"]
+mod digest_scene;
 #[path = "../../tests/conformance/digest_transform.rs"]
 #[allow(dead_code, reason = "the test decodes in pieces, too")]
 mod digest_transform;
 #[path = "../../tests/conformance/make.rs"]
 #[allow(dead_code, reason = "the test knows which streams every machine makes alike")]
 mod make;
+#[path = "../../tests/conformance/make_scene.rs"]
+mod make_scene;
 #[path = "../../tests/conformance/make_transform.rs"]
 mod make_transform;
 #[path = "../../tests/conformance/models.rs"]
@@ -33,7 +37,8 @@ type Result<T = ()> = std::result::Result<T, Box<dyn Error>>;
 
 const USAGE: &str = "usage: cargo xtask TASK
 
-conformance  writes the streams and digests of both conformance suites into tests/data/conformance, and the damage
+conformance  writes the streams and digests of the conformance suites into tests/data/conformance, and the damage
+scenes       writes those of the suite of scenes alone
 damage       writes the list of damaged streams, tests/data/conformance/damage.txt
 seeds        writes the seeds of the fuzz targets into fuzz/corpus
 sample       renders the sample scene and codes it as models/scene.b2p and models/sample.b2p";
@@ -43,7 +48,9 @@ fn main() -> ExitCode {
     let done = match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         ["conformance"] => conformance()
             .and_then(|()| conformance_transform())
+            .and_then(|()| conformance_scenes())
             .and_then(|()| damage()),
+        ["scenes"] => conformance_scenes(),
         ["damage"] => damage(),
         ["seeds"] => cargo(&[
             "run",
@@ -90,9 +97,22 @@ fn conformance() -> Result {
     Ok(())
 }
 
+/// Writes the scenes and their digests, in place of all that are there.
+fn conformance_scenes() -> Result {
+    let decoder = Decoder::new().with_heads(HeadSet::Surfels);
+    let (mut text, mut streams) = (String::new(), Vec::new());
+    for (name, bytes, _) in make_scene::cases() {
+        let parts = digest_scene::parts(&decoder, &bytes).map_err(|error| format!("{name}: {error}"))?;
+        text += &digest_scene::lines(name, &parts);
+        streams.push((name, bytes));
+    }
+    replace(&suite().join("scenes"), &streams, &text)?;
+    println!("scenes: {}", streams.len());
+    Ok(())
+}
+
 /// Writes the streams and digests of version 3, in place of all that are there.
 fn conformance_transform() -> Result {
-    let folder = suite().join("version-3");
     let decoder = Decoder::new().with_heads(HeadSet::Surfels);
     let (mut text, mut streams) = (String::new(), Vec::new());
     for (name, bytes, _) in make_transform::cases() {
@@ -100,15 +120,21 @@ fn conformance_transform() -> Result {
         text += &format!("{name} {}\n", levels.join(" "));
         streams.push((name, bytes));
     }
+    replace(&suite().join("version-3"), &streams, &text)?;
+    println!("version 3: {} streams", streams.len());
+    Ok(())
+}
+
+/// Writes a suite in place of the one in a folder.
+fn replace(folder: &Path, streams: &[(&str, Vec<u8>)], text: &str) -> Result {
     if folder.exists() {
-        std::fs::remove_dir_all(&folder)?;
+        std::fs::remove_dir_all(folder)?;
     }
-    std::fs::create_dir_all(&folder)?;
-    for (name, bytes) in &streams {
+    std::fs::create_dir_all(folder)?;
+    for (name, bytes) in streams {
         std::fs::write(folder.join(format!("{name}.b2p")), bytes)?;
     }
     std::fs::write(folder.join("suite.txt"), text)?;
-    println!("version 3: {} streams", streams.len());
     Ok(())
 }
 

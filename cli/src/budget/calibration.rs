@@ -194,6 +194,9 @@ mod tests {
         let old = std::time::SystemTime::now() - 2 * LEAST_AGE;
         file.set_modified(old).unwrap();
         assert!(Calibration::may_be_retaken(&path));
+        // The clock has run backwards since.
+        file.set_modified(std::time::SystemTime::now() + 2 * LEAST_AGE).unwrap();
+        assert!(Calibration::may_be_retaken(&path));
     }
 
     #[test]

@@ -1,7 +1,6 @@
 //! `b2p decode` of a scene, whole or a box of it.
 
-use b2p::cloud::ColouredVoxels;
-use b2p::{Limits, Placement, SceneDecoder, Wanted};
+use b2p::{Limits, SceneDecoder, Wanted};
 use b2p_formats::splats::Axes;
 use serde_json::json;
 
@@ -27,6 +26,7 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
         Some([low, high]) => Wanted::Box(low, high),
         None => Wanted::All,
     };
+    super::reserve(&args.input, &scene, &decoder, &wanted, limits)?;
     match args.points {
         true => voxels(args, &scene, &decoder, &wanted, progress),
         false => gaussians(args, &scene, &decoder, &wanted, progress),
@@ -60,22 +60,11 @@ fn gaussians(
 fn voxels(args: &Decode, scene: &Reader, decoder: &SceneDecoder, wanted: &Wanted, progress: &Progress) -> Result<Said> {
     let (to, log) = (&args.output, progress.log());
     let decoded = log.step("decode scene", scene.blocks().len(), "blocks", || {
-        decoder.voxels(scene, wanted)
+        decoder.points(scene, wanted)
     });
     let decoded = decoded.map_err(Failure::in_file(&args.input))?;
-    let (voxels, colours) = decoded.content;
-    let header = scene.header();
-    let coarser = f64::from(1u32 << (header.bits - voxels.depth()));
-    let count = voxels.len();
-    let cloud = ColouredVoxels {
-        voxels,
-        colours,
-        placement: Placement {
-            voxel_size: header.placement.voxel_size * coarser,
-            ..header.placement
-        },
-    };
-    let encoded = cloud::encoded(&cloud, &scene.axes().unwrap_or_default(), to, args.write)?;
+    let count = decoded.content.voxels.len();
+    let encoded = cloud::encoded(&decoded.content, &scene.axes().unwrap_or_default(), to, args.write)?;
     points::write(&encoded, count, to, &log)?;
     complain(&args.input, &decoded.lost, decoded.blocks)?;
     Ok(said(args, decoded.blocks, count, "point", &log))

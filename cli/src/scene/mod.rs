@@ -7,9 +7,10 @@ mod info;
 mod render;
 mod stream;
 
+use std::borrow::Cow;
 use std::path::Path;
 
-use b2p::{Error, FileSource, Limits, SceneReader};
+use b2p::{Error, FileSource, Limits, SceneDecoder, SceneReader, Source, Wanted};
 
 pub use decode::run as decode;
 pub use edit::cut;
@@ -19,25 +20,73 @@ pub use render::run as render;
 pub use stream::{pieces, run as encode_pieces};
 
 use super::table::counted;
-use super::{Failure, Result, manners};
+use super::{Failure, Result, load, manners, pipe};
 
-/// A scene in a file.
-pub type Reader = SceneReader<FileSource>;
+/// Bytes that tell a scene from a stream.
+const START: usize = 16;
 
-/// Whether the file starts like a scene.
-pub fn is_scene(path: &Path) -> bool {
-    let start = || -> std::io::Result<[u8; 16]> {
-        let mut start = [0; 16];
-        std::io::Read::read_exact(&mut std::fs::File::open(path)?, &mut start)?;
-        Ok(start)
-    };
-    !manners::is_pipe(path) && start().is_ok_and(|start| SceneReader::is_scene(&start))
+/// A scene in a file, or one that came on standard input.
+pub type Reader = SceneReader<SceneSource>;
+
+/// What a scene is read from.
+#[derive(Debug)]
+pub enum SceneSource {
+    /// A file, of which parts are read when they are needed.
+    File(FileSource),
+    /// All of what standard input had.
+    Memory(Vec<u8>),
 }
 
-/// Opens a scene. Its blocks are read when they are needed.
+impl Source for SceneSource {
+    fn length(&self) -> u64 {
+        match self {
+            SceneSource::File(file) => file.length(),
+            SceneSource::Memory(bytes) => bytes.length(),
+        }
+    }
+
+    fn read(&self, offset: u64, count: usize) -> b2p::Result<Cow<'_, [u8]>> {
+        match self {
+            SceneSource::File(file) => file.read(offset, count),
+            SceneSource::Memory(bytes) => bytes.read(offset, count),
+        }
+    }
+}
+
+/// Whether the file, or standard input, starts like a scene. What was read of standard input stays to be read.
+pub fn is_scene(path: &Path) -> bool {
+    let start = || -> std::io::Result<Vec<u8>> {
+        if manners::is_pipe(path) {
+            return pipe::peek(START);
+        }
+        // What is no file is read once.
+        let mut start = vec![0; START];
+        if std::fs::metadata(path)?.is_file() {
+            std::io::Read::read_exact(&mut std::fs::File::open(path)?, &mut start)?;
+        }
+        Ok(start)
+    };
+    start().is_ok_and(|start| SceneReader::is_scene(&start))
+}
+
+/// Opens a scene. Blocks of a file are read when they are needed; standard input is read to its end first.
 pub fn open(path: &Path, limits: &Limits) -> Result<Reader> {
-    let opened = FileSource::open(path).and_then(|file| SceneReader::new(file, limits));
-    opened.map_err(Failure::in_file(path))
+    let source = match manners::is_pipe(path) {
+        true => SceneSource::Memory(load::bytes(path, limits)?),
+        false => SceneSource::File(FileSource::open(path).map_err(Failure::in_file(path))?),
+    };
+    SceneReader::new(source, limits).map_err(Failure::in_file(path))
+}
+
+/// Fails, before anything is begun, unless the machine has the memory that decoding a part of a scene takes.
+fn reserve(path: &Path, scene: &Reader, decoder: &SceneDecoder, wanted: &Wanted, limits: &Limits) -> Result<()> {
+    match decoder.memory(scene, wanted) {
+        Ok(memory) if limits.check_bytes("", memory).is_ok() => {
+            load::reserve("decoding", memory).map_err(|Failure(text)| Failure(format!("{}: {text}", path.display())))
+        }
+        // What is wrong is said when it is decoded.
+        _ => Ok(()),
+    }
 }
 
 /// Says which blocks could not be decoded, and fails if there are some.

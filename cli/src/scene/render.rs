@@ -1,6 +1,6 @@
 //! `b2p render` of a scene: pictures of the blocks that each camera sees.
 
-use b2p::gaussians::{Frame, Gaussians};
+use b2p::gaussians::Gaussians;
 use b2p::renderer::camera::Extent;
 use b2p::renderer::{Effects, Renderer};
 use b2p::scene::ViewOptions;
@@ -25,17 +25,14 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     let scene = super::open(&args.input, limits)?;
     let decoder = SceneDecoder::new(load::decoder(&[], &args.detail, &args.model, limits)?);
     let fail = Failure::in_file(&args.input);
-    let frame = Frame {
-        bits: scene.header().bits,
-        placement: scene.header().placement,
-    };
     let extent = extent(args, &scene, limits)?;
     let axes = scene.axes().unwrap_or_default();
-    let cameras = shots(args, &frame, &extent, &axes, limits)?;
+    let cameras = shots(args, &scene.frame(), &extent, &axes, limits)?;
     permit(args, &cameras)?;
     let log = progress.log();
     let one_file = args.contact_sheet || args.turntable.is_some() || format_of(args, cameras.len())? == Format::Y4m;
     if one_file {
+        super::reserve(&args.input, &scene, &decoder, &Wanted::All, limits)?;
         let blocks = scene.blocks().len();
         let decoded = log.step("decode scene", blocks, "blocks", || {
             decoder.gaussians(&scene, &Wanted::All)
@@ -94,15 +91,9 @@ fn extent(args: &Render, scene: &Reader, limits: &Limits) -> Result<Extent> {
     if args.camera.is_some() || args.view.orbit.distance.is_some() {
         return Ok(Extent::cube());
     }
-    let base = load::decoder(&[], &args.detail, &args.model, limits)?.with_level(scene.header().base);
-    let decoded = SceneDecoder::new(base).voxels(scene, &Wanted::All);
-    let (voxels, _) = decoded.map_err(Failure::in_file(&args.input))?.content;
-    let half = f64::from(1u32 << voxels.depth()) / 2.0;
-    let spheres = (0..voxels.len()).map(|i| {
-        let centre = voxels.coordinate(i).map(|x| (f64::from(x) + 0.5) / half - 1.0);
-        (centre, 0.5 / half)
-    });
-    Ok(Extent::of(spheres))
+    let decoder = load::decoder(&[], &args.detail, &args.model, limits)?;
+    let extent = SceneDecoder::new(decoder).extent(scene);
+    extent.map_err(Failure::in_file(&args.input))
 }
 
 fn new_renderer(args: &Render) -> Result<Renderer> {

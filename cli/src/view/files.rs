@@ -7,13 +7,14 @@ use std::time::Duration;
 
 use b2p::{Cancel, Decoder, Decoding, Error, Extent, Gaussians, HeadSet, Header, Limits, Log, Stage, container};
 
+use super::blocks::OpenScene;
 use super::clock::Clock;
 use super::source::{Arrived, Choices, Scene, Source, Tell, Wish};
 use crate::args::{DetailArg, ModelArg};
 use crate::cloud::UpArg;
 use crate::load::Loaded;
 use crate::pipe::{self, Piece};
-use crate::{Failure, Result, cloud, kinds, load, manners};
+use crate::{Failure, Result, cloud, kinds, load, manners, scene};
 
 /// How long is waited for bytes of a pipe before other wishes are looked at.
 const PATIENCE: Duration = Duration::from_millis(100);
@@ -105,6 +106,7 @@ struct Worker {
 enum Opened {
     Fixed(Box<Scene>),
     Stream(Box<OpenStream>),
+    Scene(Box<OpenScene>),
 }
 
 impl Worker {
@@ -149,7 +151,22 @@ impl Worker {
                 Ok(None)
             }
             Opened::Stream(stream) => self.decode(stream, wanted, fresh),
+            Opened::Scene(scene) => self.decode_scene(scene, wanted, fresh).map(|()| None),
         }
+    }
+
+    /// Decodes as much of a scene as is wanted, and its coarsest level before if the file is `fresh`.
+    fn decode_scene(&self, scene: &mut OpenScene, wanted: &Wish, fresh: bool) -> Result<()> {
+        let choices = scene.choices();
+        check_level(wanted, &choices)?;
+        (self.tell)(wanted.number, Arrived::Choices(choices));
+        let first = if fresh { scene.first(wanted) } else { None };
+        if let Some(first) = first {
+            (self.tell)(wanted.number, Arrived::Scene(Box::new(first)));
+        }
+        (self.tell)(wanted.number, Arrived::Scene(Box::new(scene.wanted(wanted)?)));
+        (self.tell)(wanted.number, Arrived::Done);
+        Ok(())
     }
 
     /// Decodes a stream to the level that is wanted. Coarser levels are shown if the file is `fresh`.
@@ -200,6 +217,9 @@ fn check_level(wanted: &Wish, choices: &Choices) -> Result<()> {
 /// Reads a file, and decodes nothing of a stream yet.
 fn open_file(path: &Path, loading: &Loading, cancel: &Cancel) -> Result<Opened> {
     let (log, limits) = (Log::new(), &loading.limits);
+    if scene::is_scene(path) {
+        return OpenScene::open(path, loading, cancel).map(|scene| Opened::Scene(Box::new(scene)));
+    }
     if manners::is_pipe(path) {
         return open_pipe(loading, cancel).map(|stream| Opened::Stream(Box::new(stream)));
     }
@@ -210,6 +230,7 @@ fn open_file(path: &Path, loading: &Loading, cancel: &Cancel) -> Result<Opened> 
             gaussians: Arc::new(gaussians),
             up: cloud::up_of(loading.up, &axes),
             made: None,
+            is_part: false,
             steps: log.steps(),
             frame: None,
         })));
@@ -386,6 +407,7 @@ impl OpenStream {
             gaussians: Arc::new(gaussians),
             up: cloud::up_of(self.up, &cloud::axes(&self.bytes)),
             made: level.zip(heads),
+            is_part: false,
             steps: self.log.steps().split_off(self.old_steps),
             frame: None,
         })
@@ -423,6 +445,7 @@ mod tests {
             path: path.to_owned(),
             level,
             heads: Some(heads),
+            camera: None,
         }
     }
 

@@ -1,5 +1,6 @@
 //! `b2p view`: streams, Gaussians and point clouds in a window, or in the terminal.
 
+mod blocks;
 mod clip;
 mod clock;
 mod files;

@@ -426,6 +426,7 @@ impl Worker {
             gaussians: Arc::new(gaussians),
             up: self.up,
             made: Some((rung.level, rung.heads)),
+            is_part: false,
             steps: log.steps(),
             frame: None,
         })))

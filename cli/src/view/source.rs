@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use b2p::{Extent, Gaussians, HeadSet, Step, Up};
+use b2p::{Camera, Extent, Gaussians, HeadSet, Step, Up};
 
 use super::clock::{Clock, Timeline};
 
@@ -17,6 +17,8 @@ pub struct Wish {
     pub level: Option<u8>,
     /// Heads that draw a stream; `None` for the best, of a sequence those that there is time for.
     pub heads: Option<HeadSet>,
+    /// What looks at a scene of blocks that does not fit into memory; `None` for the finest level of it that does.
+    pub camera: Option<Camera>,
 }
 
 /// What there is to choose from in a file.
@@ -40,6 +42,8 @@ pub struct Scene {
     pub up: Option<Up>,
     /// Their level and the heads that made them, of a stream.
     pub made: Option<(u8, HeadSet)>,
+    /// Whether a finer level of it fits into memory no more, so that [`Wish::camera`] says what is made of it.
+    pub is_part: bool,
     /// What it took so far.
     pub steps: Vec<Step>,
     /// The frame that this is, of a sequence.

@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use b2p::HeadSet;
 use b2p::renderer::Background;
+use b2p::{Camera, HeadSet};
 
 use super::clip::Clip;
 use super::clock::Clock;
@@ -66,6 +66,8 @@ pub struct State {
     playing: (f64, bool),
     /// Whether a frame of the sequence has arrived, so that its clock runs.
     began: bool,
+    /// The camera that the scene on show was made for, if it is too large to be shown as a whole.
+    looked: Option<Camera>,
 }
 
 impl State {
@@ -92,6 +94,7 @@ impl State {
             backgrounds: [background].into_iter().chain(others).collect(),
             playing: (1.0, true),
             began: false,
+            looked: None,
         }
     }
 
@@ -114,6 +117,7 @@ impl State {
             path: self.path().to_owned(),
             level: self.level,
             heads: self.heads,
+            camera: self.looked,
         }
     }
 
@@ -351,6 +355,19 @@ impl State {
         Some(self.with_clock(Clock::play))
     }
 
+    /// Whether the source is to be asked for what the camera sees now, of a scene that is too large to be shown as a
+    /// whole. To be called where the camera rests.
+    pub fn look_again(&mut self) -> bool {
+        let is_part = self.scene.as_ref().is_some_and(|scene| scene.is_part);
+        let camera = self.camera.camera(self.size).ok();
+        if !is_part || self.busy || camera.is_none() || camera == self.looked {
+            return false;
+        }
+        self.looked = camera;
+        self.again();
+        true
+    }
+
     /// A level further on, of those that there are.
     fn go_to_level(&mut self, by: i32) -> Effect {
         let levels = &self.choices.levels;
@@ -401,6 +418,7 @@ impl State {
         self.scene = None;
         self.clock = None;
         self.began = false;
+        self.looked = None;
         self.choices = Choices::default();
         // A level of one stream may not be there in another.
         self.level = None;

@@ -198,6 +198,13 @@ impl Screen {
     }
 
     fn order(&mut self) {
+        if self.state.look_again() {
+            self.source.want(self.state.wanted());
+            if !self.is_followed {
+                // The one picture is drawn of what it shows.
+                return;
+            }
+        }
         if self.painting {
             self.again = true;
             return;

@@ -187,6 +187,9 @@ impl App {
 
     /// Asks for a picture; if one is being drawn, after it, and only the last.
     fn order(&mut self, moving: bool) {
+        if !moving && self.state.look_again() {
+            self.source.want(self.state.wanted());
+        }
         if self.painting {
             self.again = Some(moving);
             return;

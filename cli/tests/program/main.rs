@@ -7,6 +7,7 @@ mod common;
 mod converting;
 mod cutting;
 mod edges;
+mod faults;
 mod framing;
 mod knobs;
 mod many;

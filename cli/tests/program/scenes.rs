@@ -6,7 +6,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use super::common::Ball;
-use super::{b2p, fails, folder_with_cloud, png, succeeds};
+use super::{b2p, fails, folder_with_cloud, piped, png, succeeds};
 
 const CODING: [&str; 6] = ["--bits", "7", "--levels", "4..6", "--block-size", "2000"];
 
@@ -168,4 +168,128 @@ fn damage_stays_in_its_block_and_is_reported() {
     let output = b2p(at, &["decode", "short.b2p", "-o", "rest.ply", "--points"]);
     assert_eq!(output.status.code(), Some(1));
     assert!(at.join("rest.ply").exists());
+}
+
+/// What a command makes of `ball.b2p` as a file and from standard input: both results.
+#[track_caller]
+fn both_ways(at: &Path, arguments: &[&str], output: &str) -> [Vec<u8>; 2] {
+    let scene = bytes(at, "ball.b2p");
+    let run = |input: &str| {
+        let arguments: Vec<&str> = arguments
+            .iter()
+            .map(|word| if *word == "IN" { input } else { word })
+            .collect();
+        let run = piped(at, &arguments, &scene);
+        let errors = String::from_utf8_lossy(&run.stderr);
+        assert!(run.status.success(), "{arguments:?}: {errors}");
+        match output {
+            "" => run.stdout,
+            name => bytes(at, name),
+        }
+    };
+    ["ball.b2p", "-"].map(run)
+}
+
+#[test]
+fn a_scene_on_standard_input_is_what_it_is_in_a_file() {
+    let folder = folder();
+    let at = folder.path();
+    for (arguments, output) in [
+        (&["decode", "IN", "-o", "out.ply", "--heads", "surfels"][..], "out.ply"),
+        (
+            &["decode", "IN", "-o", "out.ply", "--points", "--box", "0,0,0,63,128,128"],
+            "out.ply",
+        ),
+        (&["decode", "IN", "-o", "-", "--points", "--level", "5"], ""),
+        (
+            &["render", "IN", "-o", "out.png", "--size", "64x64", "--heads", "surfels"],
+            "out.png",
+        ),
+        (&["cut", "IN", "-o", "out.b2p", "--level", "5"], "out.b2p"),
+        (&["info", "IN", "--json"], ""),
+        (&["view", "IN", "--terminal", "--size", "20x20"], ""),
+    ] {
+        let [file, pipe] = both_ways(at, arguments, output);
+        assert!(!file.is_empty() && file == pipe, "{arguments:?}");
+    }
+    let checked = piped(at, &["check", "-"], &bytes(at, "ball.b2p"));
+    assert!(checked.status.success());
+    assert!(String::from_utf8_lossy(&checked.stdout).contains("valid, "));
+}
+
+#[test]
+fn a_scene_on_standard_input_is_held_to_the_limits_and_read_as_far_as_it_goes() {
+    let folder = folder();
+    let at = folder.path();
+    let scene = bytes(at, "ball.b2p");
+    let most = (scene.len() - 1).to_string();
+    let limited = piped(at, &["decode", "-", "-o", "out.ply", "--max-memory", &most], &scene);
+    let errors = String::from_utf8_lossy(&limited.stderr);
+    assert!(
+        limited.status.code() == Some(1) && errors.contains("--max-memory"),
+        "{errors}"
+    );
+    let cut = piped(
+        at,
+        &["decode", "-", "-o", "out.ply", "--points"],
+        &scene[..scene.len() - 9],
+    );
+    let errors = String::from_utf8_lossy(&cut.stderr);
+    assert!(
+        cut.status.code() == Some(1) && errors.contains("1 block of"),
+        "{errors}"
+    );
+    assert!(at.join("out.ply").exists(), "the other blocks are written");
+    for start in [0, 9, 15, 16, 40] {
+        let cut = piped(at, &["decode", "-", "-o", "none.ply"], &scene[..start]);
+        assert_eq!(cut.status.code(), Some(1), "{start} bytes");
+    }
+    assert!(!at.join("none.ply").exists());
+}
+
+#[test]
+fn the_time_that_a_scene_takes_is_measured_as_that_of_a_stream() {
+    let folder = folder();
+    let timed = json(
+        folder.path(),
+        &["bench", "ball.b2p", "--repeat", "1", "--heads", "surfels"],
+    );
+    let stages = timed["stages"].as_array().unwrap();
+    assert_eq!(stages.len(), 1, "{timed}");
+    assert_eq!((&timed["level"], &timed["heads"]), (&6.into(), &"surfels".into()));
+    assert!(stages[0]["stage"] == "decode scene" && stages[0]["count"].as_u64() >= Some(8));
+    assert!(timed["decode_ms"].as_f64() > Some(0.0));
+}
+
+#[test]
+fn a_scene_that_is_too_large_for_memory_is_viewed_as_far_as_the_camera_sees_it() {
+    let folder = folder();
+    let at = folder.path();
+    // Near enough that a part of the ball is in view.
+    let near = [
+        "view",
+        "ball.b2p",
+        "--terminal",
+        "--size",
+        "40x20",
+        "--orbit",
+        "0,0,1",
+        "--heads",
+        "surfels",
+    ];
+    let whole = b2p(at, &near);
+    assert!(whole.status.success());
+    let mut parts = 0;
+    for step in 0..40 {
+        let most = (100_000.0 * 1.1f64.powi(step)) as u64;
+        let limit = ["--max-memory", &most.to_string()[..]];
+        let decode = ["decode", "ball.b2p", "-o", "out.ply", "--heads", "surfels"];
+        let part = b2p(at, &[&near[..], &limit].concat());
+        if b2p(at, &[&decode[..], &limit].concat()).status.success() || !part.status.success() {
+            continue;
+        }
+        parts += 1;
+        assert_eq!(part.stdout.len(), whole.stdout.len(), "at most {most} bytes");
+    }
+    assert!(parts > 0, "no limit was between a part and the whole");
 }

@@ -9,7 +9,7 @@ pub struct Kind {
     pub stream: &'static str,
     pub clause: &'static str,
     /// Damaged streams, of which the first that breaks the clause is taken.
-    pub tries: Vec<Parts>,
+    pub tries: Vec<Vec<u8>>,
 }
 
 /// What collects kinds of damage of a stream.
@@ -44,7 +44,7 @@ impl Kinds<'_> {
             name,
             stream,
             clause,
-            tries,
+            tries: tries.iter().map(Parts::bytes).collect(),
         });
     }
 }

@@ -5,12 +5,14 @@
 
 mod kinds;
 mod parts;
+mod scenes;
 
 use std::fmt::Write;
 use std::path::Path;
 
 use b2p::Decoder;
 
+use crate::digest_scene::broken_clause;
 use crate::{Result, models};
 use parts::Parts;
 
@@ -19,7 +21,9 @@ pub fn list(suite: &Path) -> Result<String> {
     let read = |name: &str| std::fs::read(suite.join(format!("{name}.b2p")));
     let mut text = String::new();
     let names = std::fs::read_to_string(suite.join("suite.txt"))?;
-    for kind in kinds::all(|name| Parts::of(&read(name).unwrap_or_default())) {
+    let streams = kinds::all(|name| Parts::of(&read(name).unwrap_or_default()));
+    let scenes = scenes::all(&read(scenes::DAMAGED)?);
+    for kind in streams.into_iter().chain(scenes) {
         let whole = read(kind.stream)?;
         let mut decoder = Decoder::new();
         let line = names.lines().find(|line| line.split(' ').next() == Some(kind.stream));
@@ -27,7 +31,11 @@ pub fn list(suite: &Path) -> Result<String> {
             decoder = decoder.with_model(models::model(model));
         }
         let mut found = None;
-        let broken = kind.tries.iter().map(Parts::bytes).find(|bytes| {
+        let broken = kind.tries.into_iter().find(|bytes| {
+            if kind.stream == scenes::DAMAGED {
+                found = broken_clause(bytes).map(str::to_owned);
+                return broken_clause(bytes) == Some(kind.clause);
+            }
             let checked = decoder.check(bytes);
             found = checked.faults.first().map(|fault| fault.error.to_string());
             checked.faults.first().and_then(|fault| fault.error.clause()) == Some(kind.clause)

@@ -184,7 +184,8 @@ impl Chunk {
         chunks
     }
 
-    fn write(&self, short: bool, out: &mut Vec<u8>) {
+    /// Appends the chunk, in the form of version 3 if `short`.
+    pub fn write(&self, short: bool, out: &mut Vec<u8>) {
         if let Some(raw) = &self.raw {
             return out.extend(raw);
         }

@@ -55,6 +55,7 @@ fn wish(number: u64, path: &Path, level: Option<u8>) -> Wish {
         path: path.to_owned(),
         level,
         heads: Some(HeadSet::Surfels),
+        camera: None,
     }
 }
 

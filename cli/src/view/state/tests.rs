@@ -37,6 +37,7 @@ fn scene(radius: f64, level: u8) -> Arrived {
         extent: Extent::of([([0.0; 3], radius)].into_iter()),
         up: None,
         made: Some((level, HeadSet::Best)),
+        is_part: false,
         steps: Vec::new(),
         frame: None,
     }))
@@ -112,6 +113,36 @@ fn what_arrives_late_for_an_earlier_wish_is_not_shown() {
 }
 
 #[test]
+fn of_a_scene_that_is_too_large_what_each_camera_sees_is_asked_for_once() {
+    let mut state = state(&["a.b2p", "b.b2p"]);
+    let part = |state: &mut State| {
+        let Arrived::Scene(mut shown) = scene(0.5, 9) else {
+            return;
+        };
+        shown.is_part = true;
+        let number = state.wanted().number;
+        state.take(number, Arrived::Scene(shown));
+        state.take(number, Arrived::Done);
+    };
+    assert!(!state.look_again(), "nothing is there");
+    state.take(0, scene(0.5, 9));
+    state.take(0, Arrived::Done);
+    assert!(!state.look_again(), "all of it is there");
+    part(&mut state);
+    assert!(state.look_again());
+    let wanted = state.wanted();
+    assert_eq!(wanted.camera, state.camera.camera(state.size).ok());
+    assert!(!state.look_again(), "it is on its way");
+    part(&mut state);
+    assert!(!state.look_again(), "the camera has not moved");
+    press(&mut state, '+');
+    assert!(state.look_again());
+    assert_ne!(state.wanted().camera, wanted.camera);
+    press(&mut state, 'n');
+    assert_eq!(state.wanted().camera, None, "another file");
+}
+
+#[test]
 fn another_file_is_shown_from_the_start_with_a_camera_of_its_own() {
     let mut state = state(&["a.b2p", "b.ply", "c.spz"]);
     assert_eq!(state.title(), "a.b2p (1 of 3), decoding – b2p");
@@ -127,7 +158,8 @@ fn another_file_is_shown_from_the_start_with_a_camera_of_its_own() {
             number: 2,
             path: "c.spz".into(),
             level: None,
-            heads: None
+            heads: None,
+            camera: None
         }
     );
     assert!(state.scene.is_none());
