@@ -89,10 +89,10 @@ def own(program, level, known, truth, points, out):
     for step in STEPS:
         stream, decoded = out / "stream.b2p", out / "points.ply"
         run = lambda *args: subprocess.run([program, *map(str, args)], check=True, capture_output=True, text=True).stdout
-        run("encode", out / "target.ply", "-o", stream, "--bits", level, "--levels", f"{level}..{level}", "--step", step, "-q")
+        run("encode", out / "target.ply", "-o", stream, "--bits", level, "--levels", f"{level}..{level}", "--step", step, "-q", "--force")
         parts = json.loads(run("info", stream, "--json"))["levels"]
         bits = 8 * sum(part["colour_bytes"] for part in parts) / points
-        run("decode", stream, "-o", decoded, "--points", "-q")
+        run("decode", stream, "-o", decoded, "--points", "-q", "--force")
         xyz, rgb = read(decoded)
         order = np.argsort(keys(xyz))
         assert len(xyz) == len(known), "the stream has TMC13's voxels"

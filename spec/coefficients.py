@@ -38,8 +38,8 @@ class RangeDecoder:
         require(len(self.words) <= self.read <= len(self.words) + 2, "5.4.3", "words of a range coder")
 
 
-SIZES = (147, 81, 168, 784, 48, 896, 1152, 324)
-SIGN_SIZES = (27, 63, 81, 81)
+SIZES = (588, 81, 168, 784, 48, 896, 1152, 324)
+SIGN_SIZES = (108, 63, 81, 81)
 HALF = (1 << 21, 0)
 RATE = [327680 // (5 * c + 8) for c in range(121)]
 TRUST = [256 * (10 * c + 2) // (10 * c + 17) for c in range(121)]
@@ -60,7 +60,7 @@ def slot_adapted(slot, bit):
 
 def mixed(total):
     """5.8.5, 5.8.7: the probability of a sum of weighted inputs."""
-    return clamp(squash(wrap32(total) >> 16), 24, 65512)
+    return clamp(squash(wrap32(total) >> 16), 4, 65532)
 
 
 class Model:
@@ -109,7 +109,7 @@ class Model:
         both = 2 * (c.lum > 0) + (c.oth > 0)
         fine = (unit + 640) * 48 // 1281
         places = (
-            (c.axis * 7 + c.kids - 2) * 7 + c.nmag,
+            ((c.ht * 3 + c.axis) * 7 + c.kids - 2) * 7 + c.nmag,
             classed(c.gr, 8, 9) * 9 + classed(c.pr, 8, 9),
             (classed(c.pr, 5, 14) * 3 + c.axis) * 4 + c.heavy,
             ((classed(c.en, 8, 7) * 7 + classed(c.gr, 10, 7)) * 4 + c.lum) * 4 + c.oth,
@@ -142,7 +142,8 @@ class Model:
 
     def sign(self, decoder, c):
         """5.8.7"""
-        places = (c.psign * 3 + c.axis, c.others * 7 + c.slot, c.nsign * 3 + c.axis, c.shift * 9 + c.psign)
+        near = (c.ht * 9 + c.psign) * 3 + c.axis
+        places = (near, c.others * 7 + c.slot, c.nsign * 3 + c.axis, c.shift * 9 + c.psign)
         at = [c.t * size + place for size, place in zip(SIGN_SIZES, places)]
         inputs = [slot_input(slots[i]) for slots, i in zip(self.signs, at)]
         weights = self.sign_weights[c.t]

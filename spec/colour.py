@@ -1,6 +1,7 @@
 """Colours of voxels: clause 5 of docs/format.md."""
 
 from dataclasses import dataclass
+from functools import cache
 from math import isqrt
 from types import SimpleNamespace
 
@@ -56,6 +57,7 @@ class Coloured:
     """What is known of the colours of a level."""
 
     steps: Steps
+    target: int  # T of 5.3.2
     values: list  # [y, co, cg] of each voxel
     energies: list  # 5.9, of each voxel
     model: Model  # of the first slice
@@ -75,9 +77,36 @@ def display(value, fraction):
     return tuple(clamp(x + half >> fraction, 0, 255) for x in (b + co, cg + t, b))
 
 
-# 5.5: the joins of every occupancy.
-def _joins(mask):
-    n = [mask >> place & 1 for place in range(8)]
+# 5.5.3: by axes with face neighbours on both sides, and on one.
+ESTIMATES = ((360, 360, 370, 460), (1170, 920, 920), (1110, 1210), (1560,))
+
+
+def estimates(voxels):
+    """5.5.3: the weights of a level from K to M − 1."""
+    weights = []
+    for near in voxels.near:
+        sides = [(near[k] != ABSENT) + (near[26 - k] != ABSENT) for k in (4, 10, 12)]
+        weights.append(ESTIMATES[sides.count(2)][sides.count(1)])
+    return weights
+
+
+def trunk_weights(levels, target):
+    """5.5.3: the weights of the levels 0 to K."""
+    last = levels[-1]
+    weights = [[1024] * len(last) if len(levels) > target else estimates(last)]
+    for nodes in reversed(levels[:-1]):
+        below = iter(weights[0])
+        sums = [sum(next(below) for _ in range(mask.bit_count())) for mask in nodes.masks]
+        weights.insert(0, [clamp(s + 2 >> 2, 1, 16384) for s in sums])
+    return weights
+
+
+@cache
+def joins_of(mask, weights):
+    """5.5: the joins of a node whose children have these weights."""
+    n, weights = [0] * 8, iter(weights)
+    for place in range(8):
+        n[place] = next(weights) if mask >> place & 1 else 0
     joins = []
     for slot, a, b in JOINS:
         joins.append((slot, a, b, n[a], n[b]))
@@ -85,40 +114,43 @@ def _joins(mask):
     return joins
 
 
-JOINS_OF = [_joins(mask) for mask in range(256)]
+def share(d, v, w):
+    """5.5.4"""
+    return d * (((w << 14) + (v + w) // 2) // (v + w)) >> 14
 
 
-def forward(mask, values):
-    """5.5.4, of one channel: the differences by slot."""
+def forward(joins, values):
+    """5.5.5, of one channel: the differences by slot."""
     values, differences = list(values), [0] * 7
-    for slot, a, b, v, w in JOINS_OF[mask]:
+    for slot, a, b, v, w in joins:
         if v and w:
             differences[slot] = values[b] - values[a]
-            values[a] += differences[slot] * w // (v + w)
+            values[a] += share(differences[slot], v, w)
         elif w:
             values[a] = values[b]
     return differences
 
 
-def inverse(mask, mean, differences):
-    """5.5.5, of one channel: the values by place."""
+def inverse(joins, mean, differences):
+    """5.5.6, of one channel: the values by place."""
     values = [mean] + [0] * 7
-    for slot, a, b, v, w in reversed(JOINS_OF[mask]):
+    for slot, a, b, v, w in reversed(joins):
         if v and w:
-            values[a] -= differences[slot] * w // (v + w)
+            values[a] -= share(differences[slot], v, w)
             values[b] = values[a] + differences[slot]
         elif w:
             values[b] = values[a]
     return values
 
 
-def root(p, q):
-    """5.5.6"""
-    return (isqrt((p << 26) // q) + 1) // 2
+def fwd(v, w):
+    """5.5.7"""
+    return (isqrt((v * w << 16) // (v + w)) + 1) // 2
 
 
-FORWARD = [[root(v * w, v + w) if v * w else 0 for w in range(5)] for v in range(5)]
-INVERSE = [[root(v + w, v * w) if v * w else 0 for w in range(5)] for v in range(5)]
+def inv(v, w):
+    """5.5.7"""
+    return ((1 << 24) + fwd(v, w) // 2) // fwd(v, w)
 
 
 # 5.6.2
@@ -165,7 +197,8 @@ EMPTY = [[0] * 3 for _ in range(7)]
 class SliceDecoder:
     """The children of the nodes `first..end` (5.6, 5.7)."""
 
-    def __init__(self, nodes, children, above, first, end, steps, gain, model, decoder):
+    def __init__(self, nodes, children, weights, height, above, first, end, steps, gain, model, decoder):
+        self.weights, self.height = weights, height
         self.nodes, self.children, self.above = nodes, children, above
         self.first, self.end = first, end
         self.units, self.fraction, self.lossless = steps.units(), steps.fraction(), steps.lossless()
@@ -182,15 +215,17 @@ class SliceDecoder:
                 self.values.append(value)
             else:
                 block = [[0] * 3 for _ in range(7)]
-                differences, sums = self.coefficients(i, mask, block)
-                channels = [inverse(mask, value[t], [d[t] for d in differences]) for t in range(3)]
+                child = self.nodes.first[i]
+                joins = joins_of(mask, tuple(self.weights[child : child + done + 1]))
+                differences, sums = self.coefficients(i, mask, joins, block)
+                channels = [inverse(joins, value[t], [d[t] for d in differences]) for t in range(3)]
                 for octant in range(8):
                     if mask >> octant & 1:
                         self.values.append([keep(channel[octant], self.fraction) for channel in channels])
             self.blocks.append(block)
             self.energies.append([min(16 * s // max(done, 1), 255) for s in sums])
 
-    def predictions(self, i, mask):
+    def predictions(self, i, mask, joins):
         """5.6.5, 5.6.6: A and B by slot and channel."""
         near, far = [[0] * 3] * 8, [[0] * 3] * 8
         own_first = self.nodes.first[i]
@@ -213,7 +248,7 @@ class SliceDecoder:
                     weight += w
             near[octant] = mean(sums, weight)
             child += 1
-        split = [[forward(mask, [v[t] for v in values]) for t in range(3)] for values in (near, far)]
+        split = [[forward(joins, [v[t] for v in values]) for t in range(3)] for values in (near, far)]
         return [[[channels[t][slot] for t in range(3)] for slot in range(7)] for channels in split]
 
     def gradient(self, i):
@@ -221,24 +256,23 @@ class SliceDecoder:
         others = [self.above.values[j] for j in others if j != ABSENT]
         return [sum(abs(own[t] - other[t]) for other in others) // max(len(others), 1) for t in range(3)]
 
-    def coefficients(self, i, mask, own):
+    def coefficients(self, i, mask, joins, own):
         """5.7.3: differences by slot and channel, sums of magnitudes; fills `own`."""
-        a, b = self.predictions(i, mask)
+        a, b = self.predictions(i, mask, joins)
         c = SimpleNamespace()  # 5.7.4
-        c.kids = mask.bit_count()
+        c.kids, c.ht = mask.bit_count(), self.height
         gradient, energy = self.gradient(i), self.above.energies[i]
         around = []
         for k in (4, 10, 12):
             j = self.nodes.near[i][k]
             around.append(self.blocks[j - self.first] if j >= self.first else EMPTY)
         differences, sums, done = [[0] * 3 for _ in range(7)], [0, 0, 0], 0
-        for slot, _, _, v, w in reversed(JOINS_OF[mask]):
+        for slot, _, _, v, w in reversed(joins):
             if v == 0 or w == 0:
                 continue
             c.slot, c.axis, c.lum, c.oth, c.others = slot, AXIS[slot], 0, 0, 0
-            c.heavy = sum(FORWARD[v][w] > x for x in (3000, 3700, 4200))
-            fwd, inv = (4096, 4096) if self.lossless else (FORWARD[v][w], INVERSE[v][w])
-            self.fwd = fwd
+            c.heavy = sum(fwd(v, w) > x for x in (3000, 3700, 4200))
+            self.fwd, self.inv = (4096, 4096) if self.lossless else (fwd(v, w), inv(v, w))
             magnitudes = [self.sixteenths(t, abs(a[slot][t])) for t in range(3)]
             brought = 0
             for t in range(3):
@@ -251,7 +285,7 @@ class SliceDecoder:
                 follow = self.follow(t - 1, brought) if t > 0 else 0
                 expected += follow
                 q = self.model.coefficient(self.decoder, c)
-                value = limit(q * self.units[t] * inv + 2048 >> 12, 1 << 20)
+                value = limit(q * self.units[t] * self.inv + 2048 >> 12, 1 << 20)
                 differences[slot][t] = limit(expected + value, 1 << 16)
                 if t == 0:
                     brought = value
@@ -326,23 +360,28 @@ def decode_trunk(levels, payload):
     gain = reader.number("B")
     colour = [reader.number("B"), reader.number("h"), reader.number("h")]
     require(all(abs(x) <= 255 for x in colour[1:]), "5.3.2", "chroma of the root")
+    target = reader.number("B")
     steps_of = [steps]
     for _ in levels[1:]:
         steps_of.insert(0, steps_of[0].above())
     decoder = RangeDecoder(payload[reader.at :])
     fraction = steps.fraction()
     value = [keep(x << fraction, fraction) for x in colour]
-    coloured = Coloured(steps_of[0], [value], [[0, 0, 0]], Model())
-    for nodes, children, steps in zip(levels, levels[1:], steps_of[1:]):
-        part = SliceDecoder(nodes, children, coloured, 0, len(nodes), steps, gain, coloured.model, decoder)
+    coloured = Coloured(steps_of[0], target, [value], [[0, 0, 0]], Model())
+    weights = trunk_weights(levels, target)
+    for n, steps in enumerate(steps_of[1:], 1):
+        (nodes, children), height = levels[n - 1 : n + 1], min(max(target - n, 0), 3)
+        part = SliceDecoder(nodes, children, weights[n], height, coloured, 0, len(nodes), steps, gain, coloured.model, decoder)
         part.decode()
-        coloured = Coloured(steps, part.values, spread(nodes, part.energies), part.model)
+        coloured = Coloured(steps, target, part.values, spread(nodes, part.energies), part.model)
     decoder.finish()
     return coloured
 
 
-def decode_level(nodes, children, above, payloads, slice_nodes):
+def decode_level(nodes, children, level, above, payloads, slice_nodes):
     """5.3.1; `nodes` is the level above."""
+    up = max(above.target - level, 0)
+    weights = estimates(children) if up else [1024] * len(children)
     values, energies, steps, model = [], [], None, None
     for number, payload in enumerate(payloads):
         reader = Reader(payload, "5.3")
@@ -353,14 +392,14 @@ def decode_level(nodes, children, above, payloads, slice_nodes):
         first = number * slice_nodes
         end = min(first + slice_nodes, len(nodes))
         decoder = RangeDecoder(payload[reader.at :])
-        part = SliceDecoder(nodes, children, above, first, end, own, gain, above.model.copy(), decoder)
+        part = SliceDecoder(nodes, children, weights, min(up, 3), above, first, end, own, gain, above.model.copy(), decoder)
         part.decode()
         decoder.finish()
         values += part.values
         energies += part.energies
         if number == 0:
             steps, model = own, part.model
-    return Coloured(steps, values, spread(nodes, energies), model)
+    return Coloured(steps, above.target, values, spread(nodes, energies), model)
 
 
 def filtered(voxels, coloured, payload):

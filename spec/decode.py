@@ -45,7 +45,7 @@ class Decoder:
             self.coloured = colour.decode_trunk(self.levels[: last + 1], payload)
         for n, payloads in sorted(part.colours.items()):
             nodes, children = self.levels[n - 1 : n + 1]
-            self.coloured = colour.decode_level(nodes, children, self.coloured, payloads, self.header.colour_slice)
+            self.coloured = colour.decode_level(nodes, children, n, self.coloured, payloads, self.header.colour_slice)
         voxels, values = self.levels[level], self.coloured.values
         found = xxh3_64(b"".join((x & 65535).to_bytes(2, "little") for value in values for x in value))
         require(found == part.colour_hash, "5.10.1", f"colour hash of level {level}")

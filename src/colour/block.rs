@@ -9,7 +9,8 @@ use super::model::Model;
 use super::node::{Block, CoefficientCoder, Lanes, NodeCoder, Scales, log_class};
 use super::prediction::{Coded, EARLIER_FACES, FaceNeighbours};
 use super::space::{Steps, Ycc, clamp};
-use super::transform::{FRACTIONS, JOINS, JOINS_OF, forward};
+use super::transform::{EVEN, JOINS, JOINS_OF};
+use super::weights::Weights;
 use crate::geometry::KernelMap;
 use crate::geometry::codec::guide::Mode;
 
@@ -20,6 +21,10 @@ pub(super) struct Nodes<'a> {
     pub map: &'a KernelMap,
     /// The 3³ kernel map of the children's level.
     pub children: &'a KernelMap,
+    /// The weights of the children.
+    pub weights: Weights<'a>,
+    /// Levels from the children's to the stream's last, at most 3.
+    pub height: usize,
     /// The occupancy of each node.
     pub masks: &'a [u8],
     /// The index of each node's first child.
@@ -78,6 +83,7 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
     // The last one stays zero: it stands for blocks that are absent or in another slice.
     let mut blocks = vec![Block::default(); range.len() + 1];
     let scales = Scales::new(coding.steps);
+    let mut own_weighting = EVEN[0];
     for node in range.clone() {
         let mask = nodes.masks[node];
         let mode = nodes.guide.map_or(Mode::Intra, |guide| guide.modes[node]);
@@ -92,14 +98,19 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
         let row = nodes.map.row(node);
         let around = FaceNeighbours::new(nodes.map, nodes.masks, nodes.values, node);
         let joins = &JOINS_OF[usize::from(mask)];
-        let fractions = &FRACTIONS[usize::from(mask)];
+        let first_child = nodes.first_child[node] as usize;
+        let weighting = nodes
+            .weights
+            .weighting(mask, first_child, nodes.children, &mut own_weighting);
+        let fractions = &weighting.fractions;
         let mut predicted = predict(nodes, node, &around, &coded);
         if mode == Mode::Inter {
             predict_moved(&mut predicted, nodes, node);
         }
         let target = truth.map(|truth| {
             let at = nodes.first_child[node] as usize - base;
-            forward(mask, spread(mask, &truth[at..])).1
+            let wide = spread(mask, &truth[at..]).map(|[y, co, cg]| [y, co, cg, 0, 0, 0, 0, 0]);
+            butterflies::forward(simd, &JOINS, fractions, wide).map(|[y, co, cg, ..]| [y, co, cg])
         });
         let (magnitudes, signs) = sum_blocks(EARLIER_FACES.map(|k| {
             let block = (row[k] as usize).wrapping_sub(first).min(range.len());
@@ -109,6 +120,7 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
             model,
             scales: &scales,
             joins,
+            weighting,
             gain: if mode == Mode::Inter { 256 } else { coding.gain.into() },
             predicted: butterflies::forward(simd, &JOINS, fractions, predicted),
             gradient: around.gradient(),
@@ -119,6 +131,7 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
             sums: [0; 3],
             done: 0,
             children: mask.count_ones() as usize,
+            height: nodes.height,
         };
         let differences = block.code(simd, coder, target.as_ref());
         let (own, sums, done) = (block.own, block.sums, block.done);

@@ -11,7 +11,8 @@ use super::filter::{Responses, TERMS, solve, widen};
 use super::model::{BINS, CoefficientContext, Model};
 use super::node::{CoefficientCoder, Quantiser};
 use super::space::{FRACTION, from_rgb};
-use super::transform::forward;
+use super::transform::{EVEN, forward};
+use super::weights::{self, Weights};
 use super::{CodeSlice, Guide, LevelColours, Steps, Ycc, join, nodes, slices, trunk};
 use crate::coding::ONE;
 use crate::coding::binary::Encoder;
@@ -35,7 +36,7 @@ impl Options {
     pub fn new(steps: Steps) -> Options {
         Options {
             steps,
-            lambda: 0.055,
+            lambda: 0.05,
             gain: None,
         }
     }
@@ -61,13 +62,14 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Averages the colours of a cloud's voxels in each voxel of level `top`, and transforms them up to the root. If
-    /// `lossless`, colours are rounded to whole 255ths. A voxel of the octree that holds none of the cloud's has the
-    /// mean of those of the cloud's that are nearest, at most one away.
+    /// Averages the colours of a cloud's voxels in each voxel of level `top`, the last one of the stream, and transforms
+    /// them up to the root; the colour trunk ends with level `trunk`. If `lossless`, colours are rounded to whole
+    /// 255ths. A voxel of the octree that holds none of the cloud's has the mean of those of the cloud's that are
+    /// nearest, at most one away.
     ///
     /// # Panics
     /// If `colours` does not have one entry per voxel, or the octree is less deep than `top`.
-    pub fn new(voxels: &Voxels, colours: &[[u8; 3]], octree: &Octree, top: u8, lossless: bool) -> Truth {
+    pub fn new(voxels: &Voxels, colours: &[[u8; 3]], octree: &Octree, trunk: u8, top: u8, lossless: bool) -> Truth {
         assert_eq!(voxels.len(), colours.len(), "one colour per voxel");
         let shift = 3 * (voxels.depth() - top);
         let fraction = if lossless { 0 } else { FRACTION };
@@ -80,7 +82,7 @@ impl Truth {
             from_rgb(sum.mean(fraction)).map(|x| x as i16)
         });
         Truth {
-            levels: means_above(octree, top, means.collect()),
+            levels: means_above(octree, trunk, top, means.collect()),
             lossless,
         }
     }
@@ -89,10 +91,10 @@ impl Truth {
     ///
     /// # Panics
     /// If `values` does not have one entry per voxel of level `top`.
-    pub fn of_values(octree: &Octree, top: u8, values: Vec<Ycc>, lossless: bool) -> Truth {
+    pub fn of_values(octree: &Octree, trunk: u8, top: u8, values: Vec<Ycc>, lossless: bool) -> Truth {
         assert_eq!(values.len(), octree.level(top).len(), "one colour per voxel");
         Truth {
-            levels: means_above(octree, top, values),
+            levels: means_above(octree, trunk, top, values),
             lossless,
         }
     }
@@ -111,14 +113,27 @@ impl Truth {
 }
 
 /// Colours of level `top` and the transform's means of all levels above, from the root on.
-fn means_above(octree: &Octree, top: u8, values: Vec<Ycc>) -> Vec<Vec<Ycc>> {
+fn means_above(octree: &Octree, trunk: u8, top: u8, values: Vec<Ycc>) -> Vec<Vec<Ycc>> {
+    let maps: Vec<KernelMap> = (0..=trunk).map(|level| octree.kernel_map(level)).collect();
+    let of_trunk = weights::of_trunk(octree, &maps, top);
     let mut levels = vec![values];
     for level in (0..top).rev() {
         let (masks, first) = (octree.occupancy(level), octree.first_child(level));
         let below = &levels[levels.len() - 1];
+        let map = match level + 1 {
+            level if trunk < level && level < top => octree.kernel_map(level),
+            _ => KernelMap::root(),
+        };
+        let weights = match level < trunk {
+            true => Weights::Given(&of_trunk[usize::from(level) + 1]),
+            false => Weights::below_trunk(level + 1, top),
+        };
         let mean = |(mask, first): (&u8, &u32)| {
-            let children = super::block::spread(*mask, &below[*first as usize..]);
-            forward(*mask, children).0.map(|x| x as i16)
+            let first = *first as usize;
+            let children = super::block::spread(*mask, &below[first..]);
+            let mut own = EVEN[0];
+            let weighting = weights.weighting(*mask, first, &map, &mut own);
+            forward(*mask, weighting, children).0.map(|x| x as i16)
         };
         let means = masks.par_iter().zip(first).map(mean).collect();
         levels.push(means);
@@ -172,8 +187,9 @@ impl ColourSum {
     }
 }
 
-/// Encodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K, `guides` what
-/// a previous frame tells of the levels from 1 on, if anything. Returns the payload and the colours that it decodes to.
+/// Encodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K, `top` is the
+/// stream's last level, `guides` what a previous frame tells of the levels from 1 on, if anything. Returns the payload
+/// and the colours that it decodes to.
 ///
 /// # Panics
 /// If the octree has fewer than K levels.
@@ -181,6 +197,7 @@ pub fn encode_trunk(
     isa: Isa,
     octree: &Octree,
     maps: &[KernelMap],
+    top: u8,
     truth: &Truth,
     options: Options,
     guides: &[Guide<'_>],
@@ -196,10 +213,11 @@ pub fn encode_trunk(
     let encode = |coding: Coding| {
         let mut bytes = vec![coding.steps.luma, coding.steps.chroma, coding.gain, root[0] as u8];
         bytes.extend(root[1..].iter().flat_map(|x| x.to_le_bytes()));
+        bytes.push(top);
         let mut coder = RdoEncoder::new(options.lambda);
         let truth = |level| Some(truth.level(level));
         let each = &mut |_: u8, _: &LevelColours| {};
-        let colours = trunk(isa, octree, maps, coding, root, &mut coder, truth, guides, each);
+        let colours = trunk(isa, octree, maps, top, coding, root, &mut coder, truth, guides, each);
         let error = coder.error;
         bytes.extend(coder.encoder.finish());
         (cost(error, bytes.len()), bytes, colours)
@@ -226,7 +244,8 @@ pub fn encode_level(
     options: Options,
     guide: Option<Guide<'_>>,
 ) -> (Vec<Vec<u8>>, LevelColours) {
-    let mut nodes = nodes(octree, level, above_map, map, above);
+    let weights = Weights::below_trunk(level, above.last);
+    let mut nodes = nodes(octree, level, above_map, map, weights, above);
     nodes.guide = guide;
     let encode = |range: Range<usize>, coding: Coding| {
         let (mut coder, mut model) = (RdoEncoder::new(options.lambda), above.model.clone());
@@ -250,7 +269,7 @@ pub fn encode_level(
     let coding = best(options.codings(), |coding| encode(middle.clone(), coding).0);
     let coded: Vec<_> = ranges.into_par_iter().map(|range| encode(range, coding)).collect();
     let (payloads, coded) = coded.into_iter().map(|(_, bytes, coded)| (bytes, coded)).unzip();
-    (payloads, join(isa, nodes, coded))
+    (payloads, join(isa, nodes, above.last, coded))
 }
 
 /// The coding of least cost. A single one is not tried.

@@ -1,7 +1,7 @@
 //! Colours of voxels as integer transform coefficients over the octree (`docs/format.md`, clause 5).
 //!
 //! A level's colours are coded given the octree and the colours of the level above. The colour of a node is the mean of
-//! its children's colours. The differences between the children are
+//! its children's colours, by their `weights`. The differences between the children are
 //!
 //! 1. transformed by two-point butterflies (`transform`),
 //! 2. predicted from neighbouring colours (`prediction`),
@@ -27,6 +27,7 @@ mod node;
 mod prediction;
 mod space;
 mod transform;
+mod weights;
 
 pub use block::Guide;
 #[cfg(feature = "encoder")]
@@ -48,18 +49,21 @@ use block::{Coding, Nodes};
 use energy::spread_energies;
 use model::{CoefficientContext, Model};
 use node::{CoefficientCoder, Quantiser};
+use weights::Weights;
 
 /// Maximum number of voxels of the trunk's deepest level.
 pub const TRUNK_VOXELS: usize = 16_384;
 /// Bytes of a slice before its entropy stream: step indices of luma and chroma, gain.
 const SLICE_HEADER: usize = 3;
-/// Bytes of the trunk before its entropy stream: those of a slice, then the root's colour.
-const TRUNK_HEADER: usize = SLICE_HEADER + 5;
+/// Bytes of the trunk before its entropy stream: those of a slice, then the root's colour and the last level.
+const TRUNK_HEADER: usize = SLICE_HEADER + 6;
 
 /// Decoded colours of a level, with the coder state that the next level needs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LevelColours {
     steps: Steps,
+    /// The last level of the stream, as it was coded: that of a cut one may be coarser.
+    last: u8,
     values: Vec<Ycc>,
     /// Of each voxel and channel, the local coefficient energy around its parent: 16 times the mean magnitude.
     energies: Vec<[u8; 3]>,
@@ -152,21 +156,34 @@ pub fn decode_guided_trunk(
         )
         .breaks("5.3.2"));
     }
+    let last = payload.bytes[8];
     let mut coder = EntropyDecoder(Decoder::new(rest));
-    let colours = trunk(isa, octree, maps, coding, root, &mut coder, |_| None, guides, each);
+    let colours = trunk(
+        isa,
+        octree,
+        maps,
+        last,
+        coding,
+        root,
+        &mut coder,
+        |_| None,
+        guides,
+        each,
+    );
     coder
         .0
         .finish(&format!("byte {}, colours of levels 1 to {depth}", payload.offset))?;
     Ok(colours)
 }
 
-/// Codes the levels 1 to K in turn, from a root of this colour. `coding` is that of level K. `truth` returns the
-/// original colours of a level to an encoder, and `None` to a decoder. `guides` are those of the levels from 1 on, if
-/// there are any; `each` gets the levels before K.
+/// Codes the levels 1 to K in turn, from a root of this colour. `coding` is that of level K, `last` the stream's last
+/// level. `truth` returns the original colours of a level to an encoder, and `None` to a decoder. `guides` are those of
+/// the levels from 1 on, if there are any; `each` gets the levels before K.
 fn trunk<'t, S: CoefficientCoder>(
     isa: Isa,
     octree: &Octree,
     maps: &[KernelMap],
+    last: u8,
     coding: Coding,
     root: [i16; 3],
     coder: &mut S,
@@ -175,13 +192,15 @@ fn trunk<'t, S: CoefficientCoder>(
     each: &mut dyn FnMut(u8, &LevelColours),
 ) -> LevelColours {
     let depth = maps.len() - 1;
-    let mut colours = root_colours(coding.steps, root);
+    let mut colours = root_colours(coding.steps, last, root);
+    let weights = weights::of_trunk(octree, maps, last);
     for level in 1..=depth {
         each(level as u8 - 1, &colours);
         let coding = coding_above(coding, depth - level);
         let mut model = std::mem::replace(&mut colours.model, Model::empty());
         let [above, map] = [&maps[level - 1], &maps[level]];
-        let mut nodes = nodes(octree, level as u8, above, map, &colours);
+        let weights = Weights::Given(&weights[level]);
+        let mut nodes = nodes(octree, level as u8, above, map, weights, &colours);
         nodes.guide = guides.get(level - 1).copied();
         let coded = isa.run(CodeSlice {
             coder,
@@ -194,6 +213,7 @@ fn trunk<'t, S: CoefficientCoder>(
         let energies = spread_energies(isa, nodes, &coded.energies);
         colours = LevelColours {
             steps: coding.steps,
+            last,
             values: coded.values,
             energies,
             model,
@@ -223,7 +243,8 @@ pub fn decode_level(
     guide: Option<Guide<'_>>,
     cancel: &Cancel,
 ) -> Result<LevelColours> {
-    let mut nodes = nodes(octree, level, above_map, map, above);
+    let weights = Weights::below_trunk(level, above.last);
+    let mut nodes = nodes(octree, level, above_map, map, weights, above);
     nodes.guide = guide;
     let ranges = slices(nodes.masks.len(), slice);
     if payloads.len() != ranges.len() {
@@ -271,11 +292,11 @@ pub fn decode_level(
     let tasks: Vec<_> = ranges.zip(payloads).collect();
     // Collect all results first: the error returned is that of the first faulty slice, with any number of threads.
     let coded: Vec<Result<_>> = tasks.into_par_iter().map(decode).collect();
-    Ok(join(isa, nodes, coded.into_iter().collect::<Result<_>>()?))
+    Ok(join(isa, nodes, above.last, coded.into_iter().collect::<Result<_>>()?))
 }
 
-/// Concatenates the slices of a level.
-fn join(isa: Isa, nodes: Nodes<'_>, slices: Vec<(Steps, block::CodedSlice, Model)>) -> LevelColours {
+/// Concatenates the slices of a level, in a stream with this last level.
+fn join(isa: Isa, nodes: Nodes<'_>, last: u8, slices: Vec<(Steps, block::CodedSlice, Model)>) -> LevelColours {
     let children = slices.iter().map(|(_, coded, _)| coded.values.len()).sum();
     let mut values = Vec::with_capacity(children);
     let mut energies = Vec::with_capacity(nodes.masks.len());
@@ -290,6 +311,7 @@ fn join(isa: Isa, nodes: Nodes<'_>, slices: Vec<(Steps, block::CodedSlice, Model
     let energies = spread_energies(isa, nodes, &energies);
     LevelColours {
         steps,
+        last,
         values,
         energies,
         model,
@@ -297,10 +319,11 @@ fn join(isa: Isa, nodes: Nodes<'_>, slices: Vec<(Steps, block::CodedSlice, Model
 }
 
 /// The colours of level 0, with the initial model.
-fn root_colours(steps: Steps, root: [i16; 3]) -> LevelColours {
+fn root_colours(steps: Steps, last: u8, root: [i16; 3]) -> LevelColours {
     let fraction = steps.fraction();
     LevelColours {
         steps,
+        last,
         values: vec![root.map(|x| space::clamp(i32::from(x) << fraction, fraction))],
         energies: vec![[0; 3]],
         model: Model::new(),
@@ -313,12 +336,14 @@ fn coding_above(coding: Coding, up: usize) -> Coding {
     Coding { steps, ..coding }
 }
 
-/// The nodes of level `level − 1`, whose children are coded. `map` is their kernel map, `children` that of `level`.
+/// The nodes of level `level − 1`, whose children are coded. `map` is their kernel map, `children` that of `level`, of
+/// which the weights are.
 fn nodes<'a>(
     octree: &'a Octree,
     level: u8,
     map: &'a KernelMap,
     children: &'a KernelMap,
+    weights: Weights<'a>,
     above: &'a LevelColours,
 ) -> Nodes<'a> {
     let masks = octree.occupancy(level - 1);
@@ -335,6 +360,8 @@ fn nodes<'a>(
     Nodes {
         map,
         children,
+        weights,
+        height: usize::from(above.last.saturating_sub(level)).min(3),
         masks,
         first_child: octree.first_child(level - 1),
         values: &above.values,

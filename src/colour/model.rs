@@ -18,6 +18,8 @@ const SIGN_CONTEXTS: usize = 4;
 /// Number of decisions of a magnitude with probabilities of their own: > 0, > 1, …; the last one serves all that
 /// follow.
 pub(super) const BINS: usize = 7;
+/// Least probability of either outcome of a decision, in units of 2⁻¹⁶: where steps are coarse, nearly all are 0.
+const FLOOR: u32 = 4;
 /// From this magnitude on, the remainder is an Exp-Golomb code.
 const ESCAPE: i32 = 18;
 /// Maximum number of leading ones of such a code.
@@ -83,6 +85,8 @@ pub(super) struct CoefficientContext {
     pub axis: usize,
     /// Number of children of the node, 2 to 8.
     pub children: usize,
+    /// Levels from the children's to the stream's last, at most 3.
+    pub height: usize,
     /// `min(|q|, 3)` of Y in the same slot, 0 while Y is coded.
     pub luma: usize,
     /// `min(|q|, 3)` of Co in the same slot, 0 until it is coded.
@@ -124,7 +128,7 @@ pub(super) struct SignContext {
 
 /// Number of slots of each context, for one decision.
 const CONTEXT_SIZES: [usize; CONTEXTS] = [
-    3 * 7 * 7,
+    4 * 3 * 7 * 7,
     9 * 9,
     14 * 3 * 4,
     7 * 7 * 4 * 4,
@@ -147,7 +151,7 @@ const CONTEXT_STARTS: [usize; CONTEXTS + 1] = {
     starts
 };
 /// Number of slots of each sign context, for one channel.
-const SIGN_SIZES: [usize; SIGN_CONTEXTS] = [9 * 3, 9 * 7, 27 * 3, 9 * 9];
+const SIGN_SIZES: [usize; SIGN_CONTEXTS] = [4 * 9 * 3, 9 * 7, 27 * 3, 9 * 9];
 /// Index of each sign context's first slot, and the number of all.
 const SIGN_STARTS: [usize; SIGN_CONTEXTS + 1] = {
     let mut starts = [0; SIGN_CONTEXTS + 1];
@@ -267,7 +271,7 @@ impl Model {
         Magnitude {
             unit,
             offsets: [
-                (c.axis * 7 + c.children - 2) * 7 + c.neighbour_magnitudes,
+                ((c.height * 3 + c.axis) * 7 + c.children - 2) * 7 + c.neighbour_magnitudes,
                 class(c.gradient, 8, 9) * 9 + class(c.near, 8, 9),
                 (class(c.near, 5, 14) * 3 + c.axis) * 4 + c.weight_class,
                 ((class(c.energy, 8, 7) * 7 + class(c.gradient, 10, 7)) * 4 + c.luma) * 4 + c.co,
@@ -302,7 +306,7 @@ impl Model {
             &self.by_channels[sets[2]],
         ];
         let mixed = mix(simd, &slots, [magnitude.unit / 2, BIAS], &STRETCH, weights);
-        let one = squash(mixed.sum >> 16).clamp(24, ONE - 24);
+        let one = squash(mixed.sum >> 16).clamp(FLOOR, ONE - FLOOR);
         Prediction { at, mixed, sets, one }
     }
 
@@ -336,7 +340,7 @@ impl Model {
     fn sign_slots(c: &CoefficientContext) -> [usize; SIGN_CONTEXTS] {
         let s = &c.sign;
         let offsets = [
-            s.near * 3 + c.axis,
+            (c.height * 9 + s.near) * 3 + c.axis,
             s.channels * 7 + c.slot,
             s.neighbours * 3 + c.axis,
             s.shift * 9 + s.near,
@@ -358,7 +362,7 @@ impl Model {
         }
         let weights = &mut self.sign_weights[c.channel];
         let sum = (0..SIGN_CONTEXTS).fold(0i32, |sum, i| sum.wrapping_add(weights[i] * inputs[i]));
-        let one = squash(sum >> 16).clamp(24, ONE - 24);
+        let one = squash(sum >> 16).clamp(FLOOR, ONE - FLOOR);
         let bit = coder.code(negative, one);
         let error = if bit { ONE as i32 } else { 0 } - one as i32;
         for i in 0..SIGN_CONTEXTS {

@@ -5,7 +5,7 @@ use b2p_kernels::Instructions;
 
 use super::model::{ChromaFromLuma, CoefficientContext, FEATURES, Model, SignContext};
 use super::space::Steps;
-use super::transform::{AXIS, Joins, SCALE, Scale, UNSCALED};
+use super::transform::{AXIS, Joins, Scale, UNSCALED, Weighting};
 
 /// Reads coefficients from an entropy stream, or chooses and writes them.
 pub(super) trait CoefficientCoder {
@@ -73,11 +73,6 @@ impl Scales {
         }
     }
 
-    #[inline(always)]
-    fn scale(&self, [v, w]: [usize; 2]) -> Scale {
-        if self.lossless { UNSCALED } else { SCALE[v][w] }
-    }
-
     /// Differences in units of 1/16 of their channel's step, at most 4095, in lanes of Y, Co, Cg and 0, twice.
     #[inline(always)]
     fn sixteenths(&self, differences: Lanes, scale: Scale) -> [u32; 8] {
@@ -122,6 +117,7 @@ pub(super) struct NodeCoder<'a> {
     pub gain: i32,
     pub scales: &'a Scales,
     pub joins: &'a Joins,
+    pub weighting: &'a Weighting,
     /// Transforms of both predictions, by slot: four lanes of the one that includes children coded before, and four of
     /// the one from nodes of the level above alone.
     pub predicted: [Lanes; 7],
@@ -137,6 +133,8 @@ pub(super) struct NodeCoder<'a> {
     /// Number of slots coded so far.
     pub done: u32,
     pub children: usize,
+    /// Levels from the children's to the stream's last, at most 3.
+    pub height: usize,
 }
 
 /// What the contexts of a slot's channels are made of. Lanes are as in [`NodeCoder::predicted`].
@@ -178,9 +176,12 @@ impl NodeCoder<'_> {
         slot: usize,
         target: [i32; 3],
     ) -> [i32; 3] {
-        let weights = self.joins.weights(slot);
-        let scale = self.scales.scale(weights);
-        let mut context = self.context(slot, weights);
+        let scale = if self.scales.lossless {
+            UNSCALED
+        } else {
+            self.weighting.scales[slot]
+        };
+        let mut context = self.context(slot);
         let shared = self.slot_context(slot, scale);
         let mut differences = [0; 3];
         let mut luma = 0;
@@ -227,12 +228,13 @@ impl NodeCoder<'_> {
 
     /// The part of the context that all channels of a slot share.
     #[inline(always)]
-    fn context(&self, slot: usize, [v, w]: [usize; 2]) -> CoefficientContext {
-        let forward = SCALE[v][w].forward;
+    fn context(&self, slot: usize) -> CoefficientContext {
+        let forward = self.weighting.scales[slot].forward;
         CoefficientContext {
             slot,
             axis: AXIS[slot],
             children: self.children,
+            height: self.height,
             weight_class: usize::from(forward > 3000) + usize::from(forward > 3700) + usize::from(forward > 4200),
             ..CoefficientContext::default()
         }

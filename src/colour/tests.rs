@@ -43,18 +43,26 @@ impl Case {
         })
     }
 
-    fn truth(&self, steps: Steps) -> Truth {
+    fn truth(&self, trunk: u8, steps: Steps) -> Truth {
         let top = self.octree.depth();
-        Truth::new(&self.voxels, &self.colours, &self.octree, top, steps.is_lossless())
+        Truth::new(
+            &self.voxels,
+            &self.colours,
+            &self.octree,
+            trunk,
+            top,
+            steps.is_lossless(),
+        )
     }
 
     /// The payloads of the trunk and of every level below, and the colours of the last level.
     fn encode(&self, isa: Isa, trunk: u8, slice: usize, steps: Steps) -> (Vec<Vec<Vec<u8>>>, LevelColours) {
-        let (truth, options) = (self.truth(steps), Options::new(steps));
+        let (truth, options) = (self.truth(trunk, steps), Options::new(steps));
         let (bytes, mut colours) = encode_trunk(
             isa,
             &self.octree,
             &self.maps[..=usize::from(trunk)],
+            self.octree.depth(),
             &truth,
             options,
             &[],
@@ -167,7 +175,7 @@ proptest! {
 #[test]
 fn the_error_grows_with_the_step() {
     let case = Case::bowl(7, 6);
-    let truth = case.truth(Steps { luma: 0, chroma: 0 });
+    let truth = case.truth(3, Steps { luma: 0, chroma: 0 });
     let mut last = 0.0;
     for index in [0, 16, 32, 48] {
         let steps = Steps {
@@ -244,7 +252,7 @@ fn noisy() -> (LevelColours, KernelMap, Vec<Ycc>) {
     let case = Case::bowl(7, 6);
     let steps = Steps { luma: 44, chroma: 52 };
     let (_, colours) = case.encode(Isa::detect(), 3, 1 << 14, steps);
-    (colours, case.maps[6].clone(), case.truth(steps).level(6).to_vec())
+    (colours, case.maps[6].clone(), case.truth(3, steps).level(6).to_vec())
 }
 
 fn squared_error(values: &[[u8; 3]], truth: &[Ycc]) -> f64 {

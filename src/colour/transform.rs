@@ -1,12 +1,15 @@
 //! The transform of a node's children: up to seven two-point butterflies, as in RAHT (`docs/format.md`, clause 5.5).
 //!
-//! Children are joined pairwise along z, then y, then x. Let a and b be values that represent `v` and `w` children. A
-//! join replaces them by their difference `b − a` and their mean `a + ⌊(b − a)·w / (v + w)⌋`. A value without a partner
-//! passes through. The mean of all children ends in octant 0. Each join leaves a difference in its *slot*: 0 along x, 1
-//! and 2 along y, 3 to 6 along z. All means are integers of one scale, so the transform is exactly reversible. RAHT (de
-//! Queiroz and Chou, doi 10.1109/TIP.2016.2575005) normalises the differences; here [`SCALE`] does so in quantisation.
+//! Children are joined pairwise along z, then y, then x. Let a and b be values of the weights `v` and `w` (`weights`). A
+//! join replaces them by their difference `b − a` and their mean `a + ⌊(b − a)·f⌋`, with `f` about `w / (v + w)`. A value
+//! without a partner passes through. The mean of all children ends in octant 0. Each join leaves a difference in its
+//! *slot*: 0 along x, 1 and 2 along y, 3 to 6 along z. All means are integers of one scale, so the transform is exactly
+//! reversible. RAHT (de Queiroz and Chou, doi 10.1109/TIP.2016.2575005) normalises the differences; here [`Scale`] does
+//! so in quantisation.
 
 use b2p_kernels::butterflies::Join;
+
+use super::weights::UNIT;
 
 /// All joins in the order of the forward transform.
 pub(super) const JOINS: [Join; 7] = [
@@ -27,26 +30,17 @@ pub(super) const AXIS: [usize; 7] = [0, 1, 1, 2, 2, 2, 2];
 pub(super) struct Joins {
     pub count: usize,
     slots: [u8; 7],
-    /// Number of children that the two values of each slot represent; 0 for an inactive slot.
-    weights: [[u8; 2]; 7],
 }
 
 impl Joins {
     const NONE: Joins = Joins {
         count: 0,
         slots: [0; 7],
-        weights: [[0; 2]; 7],
     };
 
     #[inline(always)]
     pub fn slots(&self) -> impl Iterator<Item = usize> + '_ {
         self.slots[..self.count].iter().map(|&slot| usize::from(slot))
-    }
-
-    /// Number of children that the two values of a slot represent.
-    #[inline(always)]
-    pub fn weights(&self, slot: usize) -> [usize; 2] {
-        self.weights[slot].map(usize::from)
     }
 }
 
@@ -55,23 +49,17 @@ pub(super) static JOINS_OF: [Joins; 256] = {
     let mut all = [Joins::NONE; 256];
     let mut mask = 0;
     while mask < 256 {
-        let mut weights = [0u8; 8];
-        let mut octant = 0;
-        while octant < 8 {
-            weights[octant] = (mask >> octant & 1) as u8;
-            octant += 1;
-        }
+        let mut occupied = mask;
         let mut joins = Joins::NONE;
         let mut slots = [0u8; 7];
         let mut i = 0;
         while i < 7 {
             let (slot, a, b) = JOINS[i];
-            if weights[a] > 0 && weights[b] > 0 {
-                joins.weights[slot] = [weights[a], weights[b]];
+            if occupied >> a & 1 == 1 && occupied >> b & 1 == 1 {
                 slots[joins.count] = slot as u8;
                 joins.count += 1;
             }
-            weights[a] += weights[b];
+            occupied |= (occupied >> b & 1) << a;
             i += 1;
         }
         let mut i = 0;
@@ -85,27 +73,53 @@ pub(super) static JOINS_OF: [Joins; 256] = {
     all
 };
 
-/// Fraction of the difference that each join of [`JOINS`] adds to its first value, by occupancy: `w / (v + w)`, and 0
-/// where no child is joined. A second value without a first replaces it.
-pub(super) static FRACTIONS: [[f32; 7]; 256] = {
-    let mut all = [[0.0; 7]; 256];
-    let mut mask = 0;
-    while mask < 256 {
-        let mut weights = [0u8; 8];
-        let mut octant = 0;
-        while octant < 8 {
-            weights[octant] = (mask >> octant & 1) as u8;
-            octant += 1;
-        }
+/// How the children of a node are joined: what their weights make of it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Weighting {
+    /// Fraction of the difference that each join of [`JOINS`] adds to its first value, in units of 2⁻¹⁴: that of the
+    /// second value's weight, and 0 where no child is joined. A second value without a first replaces it.
+    pub fractions: [i32; 7],
+    /// Scale of the difference in each slot.
+    pub scales: [Scale; 7],
+}
+
+impl Weighting {
+    /// Of children of these weights, 1 to 2¹⁴; 0 in octants without a child.
+    #[inline(always)]
+    pub const fn new(mut weights: [u32; 8]) -> Weighting {
+        let mut weighting = Weighting {
+            fractions: [0; 7],
+            scales: [UNSCALED; 7],
+        };
         let mut i = 0;
         while i < 7 {
-            let (_, a, b) = JOINS[i];
-            if weights[b] > 0 {
-                all[mask][i] = weights[b] as f32 / (weights[a] + weights[b]) as f32;
+            let (slot, a, b) = JOINS[i];
+            let [v, w] = [weights[a], weights[b]];
+            if w > 0 {
+                weighting.fractions[i] = (((w << 14) + (v + w) / 2) / (v + w)) as i32;
+                if v > 0 {
+                    weighting.scales[slot] = Scale::new(v, w);
+                }
             }
-            weights[a] += weights[b];
+            weights[a] += w;
             i += 1;
         }
+        weighting
+    }
+}
+
+/// Of children of weight [`UNIT`], by occupancy.
+pub(super) static EVEN: [Weighting; 256] = {
+    let mut all = [Weighting::new([0; 8]); 256];
+    let mut mask = 0;
+    while mask < 256 {
+        let mut weights = [0; 8];
+        let mut octant = 0;
+        while octant < 8 {
+            weights[octant] = (mask as u32 >> octant & 1) * UNIT;
+            octant += 1;
+        }
+        all[mask] = Weighting::new(weights);
         mask += 1;
     }
     all
@@ -126,18 +140,17 @@ const OCTANTS: [[usize; 2]; 7] = {
 
 /// Transforms the values of the children in `mask`, indexed by octant. Returns the mean and the difference of each
 /// slot.
-#[inline(always)]
-pub(super) fn forward(mask: u8, mut values: [[i32; 3]; 8]) -> ([i32; 3], [[i32; 3]; 7]) {
+#[cfg(any(test, feature = "encoder"))]
+pub(super) fn forward(mask: u8, weighting: &Weighting, mut values: [[i32; 3]; 8]) -> ([i32; 3], [[i32; 3]; 7]) {
     let mut differences = [[0; 3]; 7];
     let mut occupied = mask;
-    for (slot, a, b) in JOINS {
+    for ((slot, a, b), fraction) in JOINS.into_iter().zip(weighting.fractions) {
         match (occupied >> a & 1, occupied >> b & 1) {
             (1, 1) => {
-                let [v, w] = JOINS_OF[usize::from(mask)].weights(slot).map(|w| w as i32);
                 for k in 0..3 {
                     let difference = values[b][k] - values[a][k];
                     differences[slot][k] = difference;
-                    values[a][k] += share(difference, v, w);
+                    values[a][k] += share(difference, fraction);
                 }
             }
             (0, 1) => values[a] = values[b],
@@ -150,15 +163,14 @@ pub(super) fn forward(mask: u8, mut values: [[i32; 3]; 8]) -> ([i32; 3], [[i32; 
 
 /// Inverse of [`forward`]: values of the children by octant.
 #[cfg(test)]
-pub(super) fn inverse(mask: u8, mean: [i32; 3], differences: &[[i32; 3]; 7]) -> [[i32; 3]; 8] {
+pub(super) fn inverse(mask: u8, weighting: &Weighting, mean: [i32; 3], differences: &[[i32; 3]; 7]) -> [[i32; 3]; 8] {
     let mut values = [[0; 3]; 8];
     values[0] = mean;
-    let joins = &JOINS_OF[usize::from(mask)];
-    for (slot, a, b) in JOINS.into_iter().rev() {
-        let [v, w] = joins.weights(slot).map(|w| w as i32);
-        if v > 0 {
+    let active: Vec<usize> = JOINS_OF[usize::from(mask)].slots().collect();
+    for ((slot, a, b), fraction) in JOINS.into_iter().zip(weighting.fractions).rev() {
+        if active.contains(&slot) {
             for k in 0..3 {
-                values[a][k] -= share(differences[slot][k], v, w);
+                values[a][k] -= share(differences[slot][k], fraction);
                 values[b][k] = values[a][k] + differences[slot][k];
             }
         } else if mask & REACH[b] != 0 {
@@ -182,56 +194,31 @@ const REACH: [u8; 8] = [
 ];
 
 /// Difference of the mean to the first of two values.
+#[cfg(any(test, feature = "encoder"))]
 #[inline(always)]
-fn share(difference: i32, v: i32, w: i32) -> i32 {
-    // The compiler turns a division by a constant into a multiplication. `v + w` is at most 8.
-    let product = difference * w;
-    match v + w {
-        2 => product >> 1,
-        3 => product.div_euclid(3),
-        4 => product >> 2,
-        5 => product.div_euclid(5),
-        6 => product.div_euclid(6),
-        7 => product.div_euclid(7),
-        _ => product >> 3,
-    }
+fn share(difference: i32, fraction: i32) -> i32 {
+    (difference * fraction) >> 14
 }
 
-/// Factor that makes a difference orthonormal, `√(vw / (v + w))`, and its inverse, in units of 2⁻¹².
+/// Factor that makes a difference orthonormal, `√(vw / (v + w))` in units of weight, and its inverse, in units of 2⁻¹².
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Scale {
     pub forward: i32,
     pub inverse: i32,
 }
 
-/// [`Scale`] by the numbers of children `v` and `w`, each 1 to 4.
-pub(super) static SCALE: [[Scale; 5]; 5] = {
-    let mut table = [[Scale {
-        forward: 1 << 12,
-        inverse: 1 << 12,
-    }; 5]; 5];
-    let mut v = 1;
-    while v < 5 {
-        let mut w = 1;
-        while w < 5 {
-            let (product, sum) = (v as u64 * w as u64, v as u64 + w as u64);
-            table[v][w] = Scale {
-                forward: nearest_root(product, sum) as i32,
-                inverse: nearest_root(sum, product) as i32,
-            };
-            w += 1;
+impl Scale {
+    /// Of a difference between values of the weights `v` and `w`, each 1 to 2¹⁶.
+    #[inline(always)]
+    const fn new(v: u32, w: u32) -> Scale {
+        // ⌊√(4·square)⌋ = ⌊2·√square⌋: halving it, rounded up, rounds the root to the nearest integer.
+        let square = ((v as u64 * w as u64) << 16) / (v as u64 + w as u64);
+        let forward = (square as u32).isqrt().div_ceil(2);
+        Scale {
+            forward: forward as i32,
+            inverse: (((1 << 24) + forward / 2) / forward) as i32,
         }
-        v += 1;
     }
-    table
-};
-
-/// `round(2¹²·√(numerator / denominator))`.
-const fn nearest_root(numerator: u64, denominator: u64) -> u64 {
-    // ⌊√(4·square)⌋ = ⌊2·√square⌋: halving it, rounded up, rounds the root to the nearest integer.
-    let square = (numerator << 26) / denominator;
-    let twice = square.isqrt();
-    twice.div_ceil(2)
 }
 
 /// Scale of lossless colours, whose differences are not scaled.
@@ -253,78 +240,91 @@ mod tests {
     use b2p_kernels::{Instructions, Isa, Work, butterflies};
     use proptest::prelude::*;
 
+    /// Children of any weights, in the octants of any occupancy.
+    fn some_children() -> impl Strategy<Value = (u8, Weighting, [[i32; 3]; 8])> {
+        let weight = prop_oneof![Just(UNIT), 1u32..=1 << 14, Just(1), Just(1 << 14)];
+        let values = prop::array::uniform8(prop::array::uniform3(-16384i32..=16384));
+        (1u8..=255, prop::array::uniform8(weight), values).prop_map(|(mask, mut weights, mut values)| {
+            for octant in (0..8).filter(|o| mask >> o & 1 == 0) {
+                weights[octant] = 0;
+                values[octant] = [0; 3];
+            }
+            (mask, Weighting::new(weights), values)
+        })
+    }
+
     proptest! {
         #[test]
-        fn the_inverse_undoes_the_transform(mask in 1u8..=255, values in prop::array::uniform8(prop::array::uniform3(-16384i32..16384))) {
-            let (mean, differences) = forward(mask, values);
-            let back = inverse(mask, mean, &differences);
-            for octant in 0..8 {
-                if mask >> octant & 1 == 1 {
-                    prop_assert_eq!(back[octant], values[octant]);
-                }
+        fn the_inverse_undoes_the_transform((mask, weighting, values) in some_children()) {
+            let (mean, differences) = forward(mask, &weighting, values);
+            let back = inverse(mask, &weighting, mean, &differences);
+            for octant in (0..8).filter(|o| mask >> o & 1 == 1) {
+                prop_assert_eq!(back[octant], values[octant]);
             }
         }
 
         #[test]
-        fn the_mean_is_that_of_the_children_within_a_unit_a_join(mask in 1u8..=255, values in prop::array::uniform8(prop::array::uniform3(-16384i32..16384))) {
-            let (mean, _) = forward(mask, values);
-            let children: Vec<_> = (0..8).filter(|o| mask >> o & 1 == 1).collect();
+        fn the_mean_is_that_of_the_children_by_their_weights(
+            mask in 1u8..=255,
+            weights in prop::array::uniform8(1u32..=1 << 14),
+            values in prop::array::uniform8(prop::array::uniform3(-16384i32..16384)),
+        ) {
+            let there = |o: usize| u32::from(mask >> o & 1);
+            let weights: [u32; 8] = std::array::from_fn(|o| weights[o] * there(o));
+            let (mean, _) = forward(mask, &Weighting::new(weights), values);
+            let total = f64::from(weights.iter().sum::<u32>());
             for k in 0..3 {
-                let sum: i32 = children.iter().map(|&o| values[o][k]).sum();
-                let exact = f64::from(sum) / children.len() as f64;
-                prop_assert!((f64::from(mean[k]) - exact).abs() < 3.0);
+                let sum: f64 = (0..8).map(|o| f64::from(weights[o]) * f64::from(values[o][k])).sum();
+                // A join is off by a unit at most, and by half a unit of its fraction.
+                prop_assert!((f64::from(mean[k]) - sum / total).abs() < 6.1);
             }
         }
     }
 
-    struct There(u8, [[i32; 8]; 8]);
+    struct There<'a>(&'a Weighting, [[i32; 8]; 8]);
 
-    impl Work for There {
+    impl Work for There<'_> {
         type Output = [[i32; 8]; 7];
 
         #[inline(always)]
         fn run<I: Instructions>(self, simd: I) -> [[i32; 8]; 7] {
-            butterflies::forward(simd, &JOINS, &FRACTIONS[usize::from(self.0)], self.1)
+            butterflies::forward(simd, &JOINS, &self.0.fractions, self.1)
         }
     }
 
-    struct Back<'a>(u8, [i32; 8], &'a [[i32; 8]; 7]);
+    struct Back<'a>(&'a Weighting, [i32; 8], &'a [[i32; 8]; 7]);
 
     impl Work for Back<'_> {
         type Output = [[i32; 8]; 8];
 
         #[inline(always)]
         fn run<I: Instructions>(self, simd: I) -> [[i32; 8]; 8] {
-            butterflies::inverse(simd, &JOINS, &FRACTIONS[usize::from(self.0)], self.1, self.2)
+            butterflies::inverse(simd, &JOINS, &self.0.fractions, self.1, self.2)
         }
     }
 
     proptest! {
         #[test]
         fn kernels_transform_every_occupancy_as_plain_code_does(
-            values in prop::array::uniform8(prop::array::uniform3(-16384i32..=16384)),
+            (mask, weighting, values) in some_children(),
             chosen in prop::array::uniform7(prop::array::uniform3(-65536i32..=65536)),
         ) {
             let wide = |[y, co, cg]: [i32; 3]| [y, co, cg, 0, y, co, cg, 0];
-            for (mask, isa) in (1..=255u8).flat_map(|mask| Isa::available().into_iter().map(move |isa| (mask, isa))) {
-                let joins = &JOINS_OF[usize::from(mask)];
-                let mut children = values;
-                let mut differences = [[0; 3]; 7];
-                for octant in (0..8).filter(|o| mask >> o & 1 == 0) {
-                    children[octant] = [0; 3];
-                }
-                for slot in joins.slots() {
-                    differences[slot] = chosen[slot];
-                }
-                let (_, expected) = forward(mask, children);
-                let there = isa.run(There(mask, children.map(wide)));
+            let joins = &JOINS_OF[usize::from(mask)];
+            let mut differences = [[0; 3]; 7];
+            for slot in joins.slots() {
+                differences[slot] = chosen[slot];
+            }
+            let (mean, expected) = forward(mask, &weighting, values);
+            let undone = inverse(mask, &weighting, mean, &differences);
+            for isa in Isa::available() {
+                let there = isa.run(There(&weighting, values.map(wide)));
                 for slot in joins.slots() {
                     prop_assert_eq!(there[slot], wide(expected[slot]), "{}", isa);
                 }
-                let expected = inverse(mask, values[0], &differences);
-                let back = isa.run(Back(mask, wide(values[0]), &differences.map(wide)));
+                let back = isa.run(Back(&weighting, wide(mean), &differences.map(wide)));
                 for octant in (0..8).filter(|o| mask >> o & 1 == 1) {
-                    prop_assert_eq!(back[octant], wide(expected[octant]), "{}", isa);
+                    prop_assert_eq!(back[octant], wide(undone[octant]), "{}", isa);
                 }
             }
         }
@@ -337,19 +337,23 @@ mod tests {
             assert_eq!(joins.count, mask.count_ones() as usize - 1);
             for slot in joins.slots() {
                 let [a, b] = octants(slot);
-                assert!(a < b && joins.weights(slot).iter().all(|w| (1..=4).contains(w)));
+                assert!(a < b);
             }
         }
     }
 
     #[test]
     fn the_scale_makes_a_rotation() {
-        for v in 1..5 {
-            for w in 1..5 {
-                let Scale { forward, inverse } = SCALE[v][w];
-                let exact = (v as f64 * w as f64 / (v + w) as f64).sqrt();
-                assert!((f64::from(forward) / 4096.0 - exact).abs() < 1.3e-4, "{v} {w}");
-                assert!((f64::from(inverse) / 4096.0 - 1.0 / exact).abs() < 1.3e-4, "{v} {w}");
+        for v in [1, 2, 7, 360, 1024, 4096, 16_384, 65_536] {
+            for w in [1, 3, 920, 1024, 2048, 3072, 50_000, 65_536] {
+                let Scale { forward, inverse } = Scale::new(v, w);
+                let [v, w] = [v, w].map(f64::from);
+                let exact = 4096.0 * (v * w / (v + w) / f64::from(UNIT)).sqrt();
+                assert!((f64::from(forward) - exact).abs() < 0.51, "{v} {w}");
+                assert!(
+                    (f64::from(inverse) * exact / f64::from(1 << 24) - 1.0).abs() < 0.006,
+                    "{v} {w}"
+                );
             }
         }
     }

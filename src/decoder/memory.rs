@@ -126,8 +126,8 @@ const KEPT: Term = Term {
 };
 const TRUNK: Term = Term {
     each: "voxel of the levels above the base, at most 65,536 in each, while colours are decoded",
-    takes: "kernel map",
-    fixed: MAP,
+    takes: "kernel map, weight of colours",
+    fixed: MAP + 2,
     by: NOTHING,
 };
 const KEPT_ABOVE: Term = Term {

@@ -2,9 +2,9 @@
 //! occupied.
 //!
 //! A join replaces the values `a` and `b` by their difference `b − a` and by `a + ⌊(b − a)·f⌋`, where `f` is a fraction
-//! with a denominator of at most 8. An `f` of 0 leaves `a`, one of 1 replaces it by `b`.
+//! in units of 2⁻¹⁴. An `f` of 0 leaves `a`, one of 1 replaces it by `b`.
 
-use crate::simd::{F32Vector, I32Vector, Simd};
+use crate::simd::{I32Vector, Simd};
 
 /// Number of joins of eight octants.
 pub const JOINS: usize = 7;
@@ -13,20 +13,19 @@ pub type Lanes = [i32; 8];
 /// A join: its slot, and the octants of its two values.
 pub type Join = (usize, usize, usize);
 
-/// `⌊d·f⌋` for `|d|` up to 2¹⁷: a product that is no integer is at least 1/8 from the next, an f32's error below 1/32.
+/// `⌊d·f⌋` for `|d|` up to 2¹⁶.
 #[inline(always)]
-fn share<S: Simd>(simd: S, d: S::I32, f: f32) -> S::I32 {
-    let product = d.to_f32() * S::F32::splat(simd, f) + S::F32::splat(simd, 1.0 / 16.0);
-    product.floor().truncate_to_i32()
+fn share<S: Simd>(simd: S, d: S::I32, f: i32) -> S::I32 {
+    (d * S::I32::splat(simd, f)).shr(14)
 }
 
 /// Joins `values` in the order of `joins`, each with its fraction. Returns the differences by slot. Differences must be
-/// within ±2¹⁷.
+/// within ±2¹⁶.
 #[inline(always)]
 pub fn forward<S: Simd>(
     simd: S,
     joins: &[Join; JOINS],
-    fractions: &[f32; JOINS],
+    fractions: &[i32; JOINS],
     values: [Lanes; 8],
 ) -> [Lanes; JOINS] {
     forward_narrow(simd.narrow(), joins, fractions, values)
@@ -36,7 +35,7 @@ pub fn forward<S: Simd>(
 fn forward_narrow<S: Simd>(
     simd: S,
     joins: &[Join; JOINS],
-    fractions: &[f32; JOINS],
+    fractions: &[i32; JOINS],
     mut values: [Lanes; 8],
 ) -> [Lanes; JOINS] {
     let mut differences = [[0; 8]; JOINS];
@@ -52,12 +51,12 @@ fn forward_narrow<S: Simd>(
 }
 
 /// Undoes the joins in reverse order, from the mean in octant 0: `a` becomes `a − ⌊d·f⌋`, `b` becomes the new `a` plus
-/// `d`. Differences must be within ±2¹⁷, and 0 in slots without a join.
+/// `d`. Differences must be within ±2¹⁶, and 0 in slots without a join.
 #[inline(always)]
 pub fn inverse<S: Simd>(
     simd: S,
     joins: &[Join; JOINS],
-    fractions: &[f32; JOINS],
+    fractions: &[i32; JOINS],
     mean: Lanes,
     differences: &[Lanes; JOINS],
 ) -> [Lanes; 8] {
@@ -68,7 +67,7 @@ pub fn inverse<S: Simd>(
 fn inverse_narrow<S: Simd>(
     simd: S,
     joins: &[Join; JOINS],
-    fractions: &[f32; JOINS],
+    fractions: &[i32; JOINS],
     mean: Lanes,
     differences: &[Lanes; JOINS],
 ) -> [Lanes; 8] {
@@ -100,7 +99,7 @@ mod tests {
         (0, 0, 1),
     ];
 
-    struct There<'a>(&'a [f32; JOINS], [Lanes; 8]);
+    struct There<'a>(&'a [i32; JOINS], [Lanes; 8]);
 
     impl Work for There<'_> {
         type Output = [Lanes; JOINS];
@@ -111,7 +110,7 @@ mod tests {
         }
     }
 
-    struct Back<'a>(&'a [f32; JOINS], Lanes, &'a [Lanes; JOINS]);
+    struct Back<'a>(&'a [i32; JOINS], Lanes, &'a [Lanes; JOINS]);
 
     impl Work for Back<'_> {
         type Output = [Lanes; 8];
@@ -129,15 +128,12 @@ mod tests {
     proptest! {
         #[test]
         fn every_instruction_set_joins_as_plain_code_does(
-            shares in prop::array::uniform7((0i32..=4, 0i32..=4)),
+            fractions in prop::array::uniform7(0i32..=1 << 14),
             start in prop::array::uniform8(lanes(1 << 14)),
             mean in lanes(1 << 14),
             differences in prop::array::uniform7(lanes(1 << 16)),
         ) {
-            // `w` of `v + w` values, and 0 of none.
-            let whole = |(v, w): (i32, i32)| (v + w).max(1);
-            let fractions = shares.map(|(v, w)| w as f32 / whole((v, w)) as f32);
-            let share = |join: usize, d: i32| (d * shares[join].1).div_euclid(whole(shares[join]));
+            let share = |join: usize, d: i32| (d * fractions[join]) >> 14;
             let (mut values, mut there, mut back) = (start, [[0; 8]; JOINS], [mean; 8]);
             for lane in 0..8 {
                 for (join, (slot, a, b)) in ALL.into_iter().enumerate() {
@@ -159,19 +155,13 @@ mod tests {
     #[test]
     fn every_share_is_rounded_down() {
         for isa in Isa::available() {
-            for whole in 1..=8i32 {
-                for part in 0..=whole.min(4) {
-                    let fractions = [part as f32 / whole as f32; JOINS];
-                    for d in (-131_072..=131_072).step_by(7).chain(-50..50) {
-                        let mut differences = [[0; 8]; JOINS];
-                        differences[0] = [d; 8];
-                        let back = isa.run(Back(&fractions, [0; 8], &differences));
-                        assert_eq!(
-                            back[0],
-                            [-(d * part).div_euclid(whole); 8],
-                            "{isa}: {part}/{whole} of {d}"
-                        );
-                    }
+            for f in (0..=1 << 14).step_by(127).chain([1 << 13, 1 << 14]) {
+                for d in (-65_536..=65_536).step_by(77).chain(-50..50).chain([65_536]) {
+                    let mut differences = [[0; 8]; JOINS];
+                    differences[0] = [d; 8];
+                    let back = isa.run(Back(&[f; JOINS], [0; 8], &differences));
+                    let expected = -(i64::from(d) * i64::from(f)).div_euclid(1 << 14);
+                    assert_eq!(back[0], [expected as i32; 8], "{isa}: {f} of {d}");
                 }
             }
         }

@@ -335,7 +335,8 @@ impl<'a> EncoderInput<'a> {
     /// The colours that a stream whose last level is `top` approaches.
     fn truth(&self, top: u8, shape: Option<&Shape>, lossless: bool) -> Truth {
         let ColouredVoxels { voxels, colours, .. } = self.cloud;
-        Truth::new(voxels, colours, self.octree(shape), top, lossless)
+        let octree = self.octree(shape);
+        Truth::new(voxels, colours, octree, self.trunk_depth(top), top, lossless)
     }
 
     /// The octree of streams of this shape.
@@ -395,7 +396,7 @@ impl<'a> EncoderInput<'a> {
             let coding = self.coding(steps, top, trunk);
             let guides = self.guides.iter().flat_map(|guides| &guides.colours);
             let guides: Vec<_> = guides.map(ColourGuide::guide).collect();
-            Ok(colour::encode_trunk(isa, octree, maps, truth, coding, &guides))
+            Ok(colour::encode_trunk(isa, octree, maps, top, truth, coding, &guides))
         })?;
         let mut layers = Vec::new();
         let mut bytes = payload.len();

@@ -9,7 +9,7 @@ use super::choice::{self, Shown, Weights};
 use super::motion::{Block, Search};
 use super::{EncoderInput, Guides, Options, choose_levels, octree_of};
 use crate::cloud::ColouredVoxels;
-use crate::colour::{Steps, Truth, Ycc};
+use crate::colour::{Steps, Truth, Ycc, trunk_depth};
 use crate::error::Result;
 use crate::geometry::{Octree, Voxels};
 use crate::log::Log;
@@ -50,9 +50,10 @@ pub fn encode_predicted(
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
     let (base, top) = (*levels.start(), *levels.end());
     let octree = octree_of(cloud, top, log)?;
-    let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, steps.is_lossless());
+    let trunk = trunk_depth(base, |level| octree.level(level).len());
+    let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, trunk, top, steps.is_lossless());
     let block_level = block_level(base, top);
-    let target = Target::new(cloud, &octree, &truth, previous, [block_level, top], steps)?;
+    let target = Target::new(cloud, &octree, &truth, previous, [base, block_level, top], steps)?;
     let head = Head {
         block_level,
         unit_level: top,
@@ -133,7 +134,7 @@ impl Target {
         octree: &Octree,
         truth: &Truth,
         previous: &Arc<Previous>,
-        [block_level, top]: [u8; 2],
+        [base, block_level, top]: [u8; 3],
         steps: Steps,
     ) -> Result<Self> {
         let lossless = steps.is_lossless();
@@ -172,13 +173,14 @@ impl Target {
             keys.get(first).is_some_and(|key| key >> down == block.key)
         });
         let octree = Octree::new(Voxels::from_sorted(top, keys))?;
-        let own = Truth::new(&cloud.voxels, &cloud.colours, &octree, top, lossless);
+        let trunk = trunk_depth(base, |level| octree.level(level).len());
+        let own = Truth::new(&cloud.voxels, &cloud.colours, &octree, trunk, top, lossless);
         let values = all
             .iter()
             .zip(own.level(top))
             .map(|((_, copied), own)| copied.unwrap_or(*own))
             .collect();
-        let truth = Truth::of_values(&octree, top, values, lossless);
+        let truth = Truth::of_values(&octree, trunk, top, values, lossless);
         Ok(Target {
             octree,
             truth,
