@@ -45,6 +45,22 @@ pub fn peek(count: usize) -> std::io::Result<Vec<u8>> {
     Ok(seen.clone())
 }
 
+/// The first bytes of a file, at most `count`, or of standard input, which stay to be read. None of what is no file, and
+/// is read once.
+///
+/// # Errors
+/// What the system says when they are read.
+pub fn start_of(path: &Path, count: usize) -> std::io::Result<Vec<u8>> {
+    if manners::is_pipe(path) {
+        return peek(count);
+    }
+    let mut start = Vec::new();
+    if std::fs::metadata(path)?.is_file() {
+        std::fs::File::open(path)?.take(count as u64).read_to_end(&mut start)?;
+    }
+    Ok(start)
+}
+
 /// What was read at once, and what stops reading.
 pub type Piece = std::io::Result<Vec<u8>>;
 

@@ -28,9 +28,10 @@ pub struct Encode {
     pub output: PathBuf,
     #[command(flatten)]
     pub sequence: SequenceArgs,
-    /// Voxels of a block at most. A cloud with more becomes a scene of blocks, which are coded, read and drawn one by one
-    #[arg(long, help_heading = "Scenes", value_name = "N", default_value_t = b2p::scene::BLOCK_VOXELS as u32, value_parser = clap::value_parser!(u32).range(1..))]
-    pub block_size: u32,
+    /// Make a scene of a cloud with more than N voxels: blocks of at most N, which are coded, read and drawn one by one
+    /// [default: blocks of 2²¹ voxels, of clouds with more than 2²²]
+    #[arg(long, help_heading = "Scenes", value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub block_size: Option<u32>,
     /// Code any cloud in one piece
     #[arg(long, help_heading = "Scenes", conflicts_with = "block_size")]
     pub no_blocks: bool,

@@ -55,18 +55,7 @@ impl Source for SceneSource {
 
 /// Whether the file, or standard input, starts like a scene. What was read of standard input stays to be read.
 pub fn is_scene(path: &Path) -> bool {
-    let start = || -> std::io::Result<Vec<u8>> {
-        if manners::is_pipe(path) {
-            return pipe::peek(START);
-        }
-        // What is no file is read once.
-        let mut start = vec![0; START];
-        if std::fs::metadata(path)?.is_file() {
-            std::io::Read::read_exact(&mut std::fs::File::open(path)?, &mut start)?;
-        }
-        Ok(start)
-    };
-    start().is_ok_and(|start| SceneReader::is_scene(&start))
+    pipe::start_of(path, START).is_ok_and(|start| SceneReader::is_scene(&start))
 }
 
 /// Opens a scene. Blocks of a file are read when they are needed; standard input is read to its end first.

@@ -70,7 +70,7 @@ pub fn run(
     let mut runs = cloud.sort(&grid, progress)?;
     let encoder = SceneEncoder::new()
         .with_options(options(grid.bits())?)
-        .with_block_voxels(args.block_size as usize)
+        .with_block_voxels(super::encode::block_voxels(args))
         .with_axes(axes);
     let mut blocks = Vec::new();
     let mut count = 0u64;

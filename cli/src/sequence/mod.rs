@@ -18,14 +18,12 @@ pub use render::run as render;
 
 use super::{Failure, Result};
 
-/// Whether the file starts like a sequence.
+/// Bytes of a stream that tell a sequence.
+const START: usize = 16;
+
+/// Whether the file, or standard input, starts like a sequence. What was read of standard input stays to be read.
 pub fn is_sequence(path: &Path) -> bool {
-    let start = || -> std::io::Result<[u8; 16]> {
-        let mut start = [0; 16];
-        std::io::Read::read_exact(&mut std::fs::File::open(path)?, &mut start)?;
-        Ok(start)
-    };
-    !super::manners::is_pipe(path) && start().is_ok_and(|start| SequenceReader::is_sequence(&start))
+    super::pipe::start_of(path, START).is_ok_and(|start| SequenceReader::is_sequence(&start))
 }
 
 /// Whether a path names many clouds by a number, such as `frame_%04d.ply`.

@@ -11,7 +11,7 @@ use super::clock::{Clock, Timeline};
 use super::files::{Files, Loading};
 use super::schedule::{Ladder, Task, next_task};
 use super::source::{Arrived, Choices, Scene, Shown, Source, Tell, Wish};
-use crate::{Failure, Result, cloud, load, sequence};
+use crate::{Failure, Result, cloud, load, manners, sequence};
 
 /// Frames that wait to be shown, at most.
 const AHEAD: usize = 3;
@@ -50,7 +50,8 @@ impl Source for Sources {
             return;
         }
         self.player = None;
-        if !sequence::is_sequence(&wanted.path) {
+        // A pipe is read once, by the decoder of streams that arrive.
+        if manners::is_pipe(&wanted.path) || !sequence::is_sequence(&wanted.path) {
             return self.files.want(wanted);
         }
         self.files.stop();

@@ -6,7 +6,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use super::common::{Ball, names_in};
-use super::{fails, plain, succeeds};
+use super::{fails, piped, plain, succeeds};
 
 /// Six frames of a ball that moves by a voxel, named as `frame_%02d.ply` from 0 on.
 fn frames() -> TempDir {
@@ -109,6 +109,46 @@ fn parts_of_a_sequence_are_cut_joined_decoded_and_drawn() {
     let refused = &[&["render", "all.b2p", "-o", "all.png"][..], &surfels, &draw].concat();
     fails(at, refused, &["all.png", ".gif", "%04d"]);
     fails(at, &["cut", "all.b2p", "-o", "x.b2p", "--frames", "1..3"], &["all.b2p"]);
+}
+
+#[test]
+fn a_sequence_on_standard_input_is_read_as_one_in_a_file() {
+    let folder = frames();
+    let at = folder.path();
+    encode(at, &["frames"], "all.b2p", &[]);
+    let sequence = bytes(at, "all.b2p");
+    let surfels = ["--heads", "surfels"];
+    succeeds(
+        at,
+        &[&["decode", "all.b2p", "-o", "file_%d.ply"][..], &surfels].concat(),
+    );
+    let run = piped(
+        at,
+        &[&["decode", "-", "-o", "pipe_%d.ply"][..], &surfels].concat(),
+        &sequence,
+    );
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    for i in 0..6 {
+        assert!(
+            bytes(at, &format!("file_{i}.ply")) == bytes(at, &format!("pipe_{i}.ply")),
+            "{i}"
+        );
+    }
+    let draw = [&["render", "-", "-o", "pipe.gif", "--size", "40x30"][..], &surfels].concat();
+    assert!(piped(at, &draw, &sequence).status.success());
+    assert!(bytes(at, "pipe.gif").starts_with(b"GIF89a"));
+    for command in [
+        &["info", "-"][..],
+        &["check", "-"],
+        &["cut", "-", "-o", "cut.b2p", "--frames", "0..3"],
+    ] {
+        let run = piped(at, command, &sequence);
+        assert!(
+            run.status.success(),
+            "{command:?}: {}",
+            String::from_utf8_lossy(&run.stderr)
+        );
+    }
 }
 
 #[test]
