@@ -153,7 +153,12 @@ fn sample() -> Result {
     let cloud = path(&folder.join("scene.ply"))?;
     let run = ["run", "--release", "--locked"];
     cargo(&[&run[..], &["--package", "b2p-lab", "--", "scene", "-o", &cloud]].concat())?;
-    for (stream, colours) in [("scene", "transform"), ("sample", "learned")] {
+    // The scene is embedded in the program: coarser steps than the default's.
+    let kinds = [
+        ("scene", "transform", &["--step", "35"][..]),
+        ("sample", "learned", &[]),
+    ];
+    for (stream, colours, more) in kinds {
         let stream = path(&root().join(format!("models/{stream}.b2p")))?;
         let encode = [
             "--bin",
@@ -167,7 +172,7 @@ fn sample() -> Result {
             "--colours",
             colours,
         ];
-        cargo(&[&run[..], &encode].concat())?;
+        cargo(&[&run[..], &encode, more].concat())?;
     }
     Ok(())
 }
