@@ -70,6 +70,15 @@ impl Truth {
     /// # Panics
     /// If `colours` does not have one entry per voxel, or the octree is less deep than `top`.
     pub fn new(voxels: &Voxels, colours: &[[u8; 3]], octree: &Octree, trunk: u8, top: u8, lossless: bool) -> Truth {
+        let means = Truth::finest(voxels, colours, octree, top, lossless);
+        Truth::of_values(octree, trunk, top, means, lossless)
+    }
+
+    /// The colours of level `top` alone, as [`Truth::new`] has them.
+    ///
+    /// # Panics
+    /// If `colours` does not have one entry per voxel, or the octree is less deep than `top`.
+    pub fn finest(voxels: &Voxels, colours: &[[u8; 3]], octree: &Octree, top: u8, lossless: bool) -> Vec<Ycc> {
         assert_eq!(voxels.len(), colours.len(), "one colour per voxel");
         let shift = 3 * (voxels.depth() - top);
         let fraction = if lossless { 0 } else { FRACTION };
@@ -81,10 +90,7 @@ impl Truth {
             }
             from_rgb(sum.mean(fraction)).map(|x| x as i16)
         });
-        Truth {
-            levels: means_above(octree, trunk, top, means.collect()),
-            lossless,
-        }
+        means.collect()
     }
 
     /// Colours of the voxels of level `top`, in the units of [`LevelColours::values`], transformed up to the root.

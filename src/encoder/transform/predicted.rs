@@ -174,10 +174,10 @@ impl Target {
         });
         let octree = Octree::new(Voxels::from_sorted(top, keys))?;
         let trunk = trunk_depth(base, |level| octree.level(level).len());
-        let own = Truth::new(&cloud.voxels, &cloud.colours, &octree, trunk, top, lossless);
+        let own = Truth::finest(&cloud.voxels, &cloud.colours, &octree, top, lossless);
         let values = all
             .iter()
-            .zip(own.level(top))
+            .zip(&own)
             .map(|((_, copied), own)| copied.unwrap_or(*own))
             .collect();
         let truth = Truth::of_values(&octree, trunk, top, values, lossless);
