@@ -6,6 +6,7 @@
 pub use crate::limits::MAX_DEPTH;
 
 /// Interleaves the low 21 bits of each coordinate.
+#[inline]
 pub fn encode([x, y, z]: [u32; 3]) -> u64 {
     spread(x) | spread(y) << 1 | spread(z) << 2
 }
@@ -17,6 +18,7 @@ pub fn decode(key: u64) -> [u32; 3] {
 }
 
 /// Moves bit `i` to bit `3i`.
+#[inline]
 fn spread(v: u32) -> u64 {
     let mut v = u64::from(v) & 0x1f_ffff;
     v = (v | v << 32) & 0x001f_0000_0000_ffff;

@@ -59,7 +59,7 @@ impl Bricks {
         for (i, brick) in bricks.iter().enumerate() {
             let mut at = place(brick.key, table.len());
             while table[at] != 0 {
-                at = (at + 1) % table.len();
+                at = (at + 1) & (table.len() - 1);
             }
             table[at] = i as u32 + 1;
         }
@@ -95,31 +95,127 @@ impl Bricks {
             if brick.key == key {
                 return Some(brick);
             }
-            slot = (slot + 1) % self.table.len();
+            slot = (slot + 1) & (self.table.len() - 1);
         }
     }
 
     /// The number of the voxel at this place, if there is one.
     #[inline]
     pub fn index(&self, at: [i32; 3]) -> Option<usize> {
-        let brick = self.brick(at.map(|x| x >> 2))?;
-        let cell = morton::encode(at.map(|x| (x & 3) as u32));
-        let before = brick.mask & ((1 << cell) - 1);
-        (brick.mask >> cell & 1 == 1).then(|| brick.first as usize + before.count_ones() as usize)
+        self.brick(at.map(|x| x >> 2))?.index(at)
+    }
+
+    /// The 4³ cells from this place on, as a mask by `x + 4y + 16z`.
+    pub fn window(&self, at: [i32; 3]) -> u64 {
+        self.near().window(at)
+    }
+
+    /// For queries of which each is near the one before.
+    pub fn near(&self) -> Near<'_> {
+        Near {
+            bricks: self,
+            base: [i32::MIN; 3],
+            known: 0,
+            found: [None; 8],
+        }
+    }
+
+    /// Calls `each` with the place and number of all voxels in a box of `side`³ cells from the place `first` on.
+    pub fn in_box(&self, first: [i32; 3], side: i32, mut each: impl FnMut([i32; 3], usize)) {
+        let low = first.map(|x| (x >> 2).max(0));
+        let high = first.map(|x| ((x + side - 1) >> 2).min(self.side - 1));
+        let inside = |here: &[i32; 3]| (0..3).all(|axis| (first[axis]..first[axis] + side).contains(&here[axis]));
+        for z in low[2]..=high[2] {
+            for y in low[1]..=high[1] {
+                for x in low[0]..=high[0] {
+                    let Some(brick) = self.brick([x, y, z]) else {
+                        continue;
+                    };
+                    let (mut cells, mut index) = (brick.mask, brick.first as usize);
+                    while cells != 0 {
+                        let cell = morton::decode(cells.trailing_zeros().into());
+                        let here = [4 * x + cell[0] as i32, 4 * y + cell[1] as i32, 4 * z + cell[2] as i32];
+                        if inside(&here) {
+                            each(here, index);
+                        }
+                        cells &= cells - 1;
+                        index += 1;
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl Brick {
+    /// The number of the voxel at this place, which is in the brick, if there is one.
+    #[inline]
+    fn index(&self, at: [i32; 3]) -> Option<usize> {
+        let [x, y, z] = at.map(|x| x & 3);
+        if self.cells >> (x + 4 * y + 16 * z) & 1 == 0 {
+            return None;
+        }
+        let cell = morton::encode([x as u32, y as u32, z as u32]);
+        let before = self.mask & ((1 << cell) - 1);
+        Some(self.first as usize + before.count_ones() as usize)
+    }
+}
+
+/// The 2³ bricks from a place on. They are kept from one query to the next.
+#[derive(Debug, Clone)]
+pub struct Near<'a> {
+    bricks: &'a Bricks,
+    /// The first brick's place among bricks.
+    base: [i32; 3],
+    /// A bit for each brick that has been looked up.
+    known: u8,
+    found: [Option<&'a Brick>; 8],
+}
+
+impl<'a> Near<'a> {
+    /// Goes to the bricks from the one of this place on.
+    #[inline]
+    pub fn go(&mut self, at: [i32; 3]) {
+        let base = at.map(|x| x >> 2);
+        if base != self.base {
+            (self.base, self.known) = (base, 0);
+        }
+    }
+
+    /// The brick this many steps from the first one, 0 or 1 along each axis.
+    #[inline]
+    fn brick(&mut self, step: [i32; 3]) -> Option<&'a Brick> {
+        let slot = (step[0] + 2 * step[1] + 4 * step[2]) as usize & 7;
+        if self.known >> slot & 1 == 0 {
+            self.known |= 1 << slot;
+            self.found[slot] = self.bricks.brick([0, 1, 2].map(|axis| self.base[axis] + step[axis]));
+        }
+        self.found[slot]
+    }
+
+    /// The number of the voxel at this place, if there is one.
+    #[inline]
+    pub fn index(&mut self, at: [i32; 3]) -> Option<usize> {
+        let mut step = [0, 1, 2].map(|axis| (at[axis] >> 2).wrapping_sub(self.base[axis]));
+        if step.iter().any(|x| !(0..2).contains(x)) {
+            self.go(at);
+            step = [0; 3];
+        }
+        self.brick(step)?.index(at)
     }
 
     /// The 4³ cells from this place on, as a mask by `x + 4y + 16z`.
     #[inline]
-    pub fn window(&self, at: [i32; 3]) -> u64 {
-        let (first, [ox, oy, oz]) = (at.map(|x| x >> 2), at.map(|x| (x & 3) as usize));
+    pub fn window(&mut self, at: [i32; 3]) -> u64 {
+        self.go(at);
+        let [ox, oy, oz] = at.map(|x| (x & 3) as usize);
         let mut window = 0;
         for i in 0..8 {
             let [dx, dy, dz] = [i & 1, i >> 1 & 1, i >> 2];
             if (dx == 1 && ox == 0) || (dy == 1 && oy == 0) || (dz == 1 && oz == 0) {
                 continue;
             }
-            let place = [first[0] + dx, first[1] + dy, first[2] + dz];
-            let Some(brick) = self.brick(place) else {
+            let Some(brick) = self.brick([dx, dy, dz]) else {
                 continue;
             };
             let cells = brick.cells;
@@ -166,13 +262,30 @@ mod tests {
                 let key = morton::encode(at.map(|x| if inside { x as u32 } else { 0 }));
                 voxels.keys().binary_search(&key).ok().filter(|_| inside)
             };
-            let mut window = 0u64;
+            let (mut window, mut near) = (0u64, bricks.near());
             for cell in 0..64i32 {
                 let here = [at[0] + cell % 4, at[1] + cell / 4 % 4, at[2] + cell / 16];
                 prop_assert_eq!(bricks.index(here), find(here));
+                prop_assert_eq!(near.index(here), find(here));
                 window |= u64::from(find(here).is_some()) << cell;
             }
             prop_assert_eq!(bricks.window(at), window);
+            prop_assert_eq!(near.window(at), window);
+        }
+
+        #[test]
+        fn all_voxels_of_a_box_are_found(
+            keys in prop::collection::vec(0u64..1 << 12, 1..400),
+            first in prop::array::uniform3(-9i32..20),
+            side in 1i32..12,
+        ) {
+            let voxels = Voxels::new(4, keys);
+            let mut found = Vec::new();
+            Bricks::new(&voxels).in_box(first, side, |at, index| found.push((index, at)));
+            found.sort_unstable();
+            let all = voxels.keys().iter().map(|key| morton::decode(*key).map(|x| x as i32)).enumerate();
+            let inside = all.filter(|(_, at)| (0..3).all(|axis| (first[axis]..first[axis] + side).contains(&at[axis])));
+            prop_assert_eq!(found, inside.collect::<Vec<_>>());
         }
     }
 }

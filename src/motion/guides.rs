@@ -4,6 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 
+use super::bricks::Near;
 use super::moved::Moved;
 use super::payload::{Blocks, Head, Modes};
 use super::previous::{Previous, PreviousLevel};
@@ -118,17 +119,20 @@ impl Inter {
         let voxels = octree.level(level - 1);
         let parents = (0..voxels.len()).into_par_iter().with_min_len(CHUNK);
         let (modes, windows) = parents
-            .map(|parent| {
-                let Block { modes, shift, .. } = *field.at(voxels.keys()[parent]);
-                let window = match modes.geometry {
-                    Mode::Intra => 0,
-                    _ => {
-                        let at = voxels.coordinate(parent).map(|x| 2 * x as i32 - 1);
-                        previous.window(moved(at, shift))
-                    }
-                };
-                (modes.geometry, window)
-            })
+            .map_init(
+                || (field.cursor(), previous.near()),
+                |(field, near), parent| {
+                    let Block { modes, shift, .. } = *field.at(voxels.keys()[parent]);
+                    let window = match modes.geometry {
+                        Mode::Intra => 0,
+                        _ => {
+                            let at = voxels.coordinate(parent).map(|x| 2 * x as i32 - 1);
+                            near.window(moved(at, shift))
+                        }
+                    };
+                    (modes.geometry, window)
+                },
+            )
             .unzip();
         Ok(GeometryGuide { modes, windows })
     }
@@ -141,10 +145,14 @@ impl Inter {
         let (field, previous) = self.source(octree, level)?;
         let nodes = octree.level(level - 1);
         let masks = octree.occupancy(level - 1);
-        let modes: Vec<Mode> = nodes.keys().iter().map(|key| field.at(*key).modes.colours).collect();
+        let mut cursor = field.cursor();
+        let modes: Vec<Mode> = { nodes.keys().iter() }
+            .map(|key| cursor.at(*key).modes.colours)
+            .collect();
         let chunks: Vec<usize> = (0..nodes.len()).step_by(CHUNK).collect();
         let moved_of = |first: usize| {
             let mut found = Vec::new();
+            let (mut field, mut near) = (field.cursor(), previous.near());
             for node in first..nodes.len().min(first + CHUNK) {
                 let Block { shift, low, part, .. } = *field.at(nodes.keys()[node]);
                 let own = nodes.coordinate(node).map(|x| 2 * x as i32);
@@ -153,8 +161,8 @@ impl Inter {
                     let place = [0, 1, 2].map(|axis| own[axis] + octant[axis]);
                     found.push(match modes[node] {
                         Mode::Intra => None,
-                        Mode::Skip => previous.index(moved(place, shift)).map(|index| previous.values[index]),
-                        Mode::Inter => interpolated(previous, moved(place, low), part),
+                        Mode::Skip => near.index(moved(place, shift)).map(|index| previous.values[index]),
+                        Mode::Inter => interpolated(previous, &mut near, moved(place, low), part),
                     });
                 }
             }
@@ -287,7 +295,8 @@ impl Block {
 
 /// The colour of the previous frame between voxels: at a place, less `part` sixteenths of a voxel along each axis. The
 /// mean of the voxels that are there, by their shares.
-fn interpolated(previous: &PreviousLevel, at: [i32; 3], part: [i32; 3]) -> Option<Ycc> {
+fn interpolated(previous: &PreviousLevel, near: &mut Near, at: [i32; 3], part: [i32; 3]) -> Option<Ycc> {
+    near.go(at.map(|x| x - 1));
     let (mut sums, mut total) = ([0i64; 3], 0i64);
     for corner in 0..8 {
         let step = [corner & 1, corner >> 1 & 1, corner >> 2];
@@ -296,7 +305,7 @@ fn interpolated(previous: &PreviousLevel, at: [i32; 3], part: [i32; 3]) -> Optio
         if weight == 0 {
             continue;
         }
-        if let Some(index) = previous.index([0, 1, 2].map(|axis| at[axis] - step[axis])) {
+        if let Some(index) = near.index([0, 1, 2].map(|axis| at[axis] - step[axis])) {
             for (sum, value) in sums.iter_mut().zip(previous.values[index]) {
                 *sum += weight * i64::from(value);
             }
@@ -307,11 +316,29 @@ fn interpolated(previous: &PreviousLevel, at: [i32; 3], part: [i32; 3]) -> Optio
 }
 
 impl Field<'_> {
+    /// Finds the blocks of nodes.
+    fn cursor(&self) -> Cursor<'_> {
+        Cursor { field: self, block: 0 }
+    }
+}
+
+/// Finds the blocks of nodes, fast where a node is in the block of the one before.
+struct Cursor<'a> {
+    field: &'a Field<'a>,
+    /// The block found last.
+    block: usize,
+}
+
+impl Cursor<'_> {
     /// The block of the node with this key.
     #[inline]
-    fn at(&self, key: u64) -> &Block {
-        let block = self.keys.partition_point(|block| *block < key >> self.down);
-        &self.blocks[block]
+    fn at(&mut self, key: u64) -> &Block {
+        let Field { keys, down, blocks } = self.field;
+        let key = key >> down;
+        if keys[self.block] != key {
+            self.block = keys.partition_point(|block| *block < key);
+        }
+        &blocks[self.block]
     }
 }
 

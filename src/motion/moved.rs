@@ -1,5 +1,7 @@
 //! The moved previous frame (`docs/format.md`, clause 17.8).
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use rayon::prelude::*;
 
 use super::previous::PreviousLevel;
@@ -35,33 +37,34 @@ impl Moved {
     ) -> Result<Self> {
         let side = 1i32 << (reference - block);
         let most = 2 * previous.values.len() + 64;
-        let counts = keys.par_iter().enumerate().map(|(i, key)| {
-            let mut count = 0;
-            previous.in_box(corner(*key, side, shift(i)), side, |_, _| count += 1);
-            count
-        });
-        let count: usize = counts.sum();
-        if count > most {
-            return Err(Error::malformed(
-                Stage::Bitstream,
-                "motion of the frame",
-                "voxels of the moved previous frame",
-                count,
-                format!("at most {most}"),
-            )
-            .breaks(TOO_MANY));
-        }
-        let parts = keys.par_iter().enumerate().map(|(i, key)| {
+        let count = AtomicUsize::new(0);
+        let voxels_of = |(i, key): (usize, &u64)| {
             let (shift, mut found) = (shift(i), Vec::new());
+            // No more is kept than may be.
+            if count.load(Ordering::Relaxed) > most {
+                return found;
+            }
             previous.in_box(corner(*key, side, shift), side, |from, index| {
                 let at = [0, 1, 2].map(|axis| (from[axis] + shift[axis]) as u32);
                 found.push((morton::encode(at), previous.values[index]));
             });
+            count.fetch_add(found.len(), Ordering::Relaxed);
             found.sort_unstable_by_key(|voxel| voxel.0);
             found
-        });
+        };
+        let parts: Vec<_> = keys.par_iter().enumerate().map(voxels_of).collect();
+        if count.into_inner() > most {
+            return Err(Error::malformed(
+                Stage::Bitstream,
+                "motion of the frame",
+                "voxels of the moved previous frame",
+                "more",
+                format!("at most {most}"),
+            )
+            .breaks(TOO_MANY));
+        }
         // Blocks are in the order of keys, and each has keys of its own.
-        let mut voxels: Vec<(u64, Ycc)> = parts.collect::<Vec<_>>().concat();
+        let mut voxels: Vec<(u64, Ycc)> = parts.concat();
         let mut levels = Vec::new();
         for level in (block + 1..reference).rev() {
             voxels = means(&voxels);

@@ -1,6 +1,6 @@
 //! The previous frame as it was decoded.
 
-use super::bricks::Bricks;
+use super::bricks::{Bricks, Near};
 use crate::colour::{Filter, Steps, Ycc};
 use crate::geometry::{Octree, Voxels};
 use rayon::prelude::*;
@@ -74,23 +74,13 @@ impl PreviousLevel {
     }
 
     /// Calls `each` with the place and number of all voxels in a box of `side`³ cells from the place `first` on.
-    pub fn in_box(&self, first: [i32; 3], side: i32, mut each: impl FnMut([i32; 3], usize)) {
-        for window in 0..(side as u32).div_ceil(4).pow(3) as i32 {
-            let count = (side + 3) / 4;
-            let place = [window % count, window / count % count, window / count / count];
-            let at = [0, 1, 2].map(|axis| first[axis] + 4 * place[axis]);
-            let mut cells = self.window(at);
-            while cells != 0 {
-                let cell = cells.trailing_zeros() as i32;
-                cells &= cells - 1;
-                let here = [0, 1, 2].map(|axis| at[axis] + (cell >> (2 * axis) & 3));
-                // Boxes of less than 4³ cells end before the window does.
-                let inside = (0..3).all(|axis| here[axis] - first[axis] < side);
-                if let Some(index) = self.index(here).filter(|_| inside) {
-                    each(here, index);
-                }
-            }
-        }
+    pub fn in_box(&self, first: [i32; 3], side: i32, each: impl FnMut([i32; 3], usize)) {
+        self.bricks.in_box(first, side, each);
+    }
+
+    /// For queries of which each is near the one before.
+    pub fn near(&self) -> Near<'_> {
+        self.bricks.near()
     }
 
     /// The number of the voxel at this place, if there is one.

@@ -8,6 +8,10 @@ use tiny_skia::{IntSize, Pixmap, PremultipliedColorU8};
 
 use crate::error::{Error, Result};
 
+/// Pixels of a plane of YUV4MPEG2 that are written at once, and that a task converts.
+const PLANE_PART: usize = 1 << 17;
+const PLANE_TASK: usize = 1 << 13;
+
 /// A picture in floats: premultiplied red, green, blue, and alpha, row by row from the top left.
 ///
 /// The colours are display-referred (sRGB) values, blended as they are; they may lie outside `[0, 1]` if Gaussians'
@@ -193,7 +197,7 @@ impl Image {
         file
     }
 
-    /// As [`Image::to_y4m_frame`], row by row into `to`. `path` appears in error messages only.
+    /// As [`Image::to_y4m_frame`], part by part into `to`. `path` appears in error messages only.
     ///
     /// # Errors
     /// [`Error::Io`] if `to` fails.
@@ -205,15 +209,18 @@ impl Image {
             [112.0, -93.786, -18.214, 128.0],
         ];
         to.write_all(b"FRAME\n").map_err(io_error(path))?;
-        let mut row = Vec::with_capacity(self.width as usize);
+        let mut plane = vec![0; self.pixels.len().min(PLANE_PART)];
         for [kr, kg, kb, offset] in rows {
-            for pixels in self.pixels.chunks(self.width.max(1) as usize) {
-                row.clear();
-                row.extend(pixels.iter().map(|p| -> u8 {
-                    let [r, g, b] = [p[0], p[1], p[2]].map(|c| c.clamp(0.0, 1.0));
-                    (kr * r + kg * g + kb * b + offset + 0.5) as u8
-                }));
-                to.write_all(&row).map_err(io_error(path))?;
+            for pixels in self.pixels.chunks(PLANE_PART) {
+                let plane = &mut plane[..pixels.len()];
+                let tasks = plane.par_chunks_mut(PLANE_TASK).zip(pixels.par_chunks(PLANE_TASK));
+                tasks.for_each(|(plane, pixels)| {
+                    for (value, [r, g, b, _]) in plane.iter_mut().zip(pixels) {
+                        let [r, g, b] = [r, g, b].map(|c| c.clamp(0.0, 1.0));
+                        *value = (kr * r + kg * g + kb * b + offset + 0.5) as u8;
+                    }
+                });
+                to.write_all(plane).map_err(io_error(path))?;
             }
         }
         Ok(())

@@ -1,6 +1,8 @@
 //! `b2p render` of a sequence: a video, or a picture of each frame.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::time::Instant;
 
 use b2p::gaussians::Gaussians;
@@ -18,6 +20,9 @@ use super::super::video::{self, FrameTime};
 use super::super::views::shots;
 use super::super::{Failure, Result, load};
 use super::Pattern;
+
+/// Frames that wait to be drawn while the next one is decoded.
+const WAITING: usize = 1;
 
 /// Draws every frame with one camera: into a video, or into pictures of a pattern. While a frame is drawn, the next one
 /// is decoded.
@@ -81,6 +86,36 @@ fn is_video(path: &Path) -> bool {
     path.extension().is_some_and(|ending| ending != "png") && video::kind_of(path).is_ok()
 }
 
+/// Calls `draw` with the Gaussians of the frames, one after the other, which a thread decodes ahead of it.
+fn ahead<T>(
+    decoder: &mut SequenceDecoder,
+    sequence: &SequenceReader,
+    frames: Range<u64>,
+    draw: impl FnOnce(Receiver<b2p::Result<Gaussians>>) -> Result<T>,
+) -> Result<T> {
+    std::thread::scope(|scope| {
+        let (sender, receiver) = sync_channel(WAITING);
+        let decode = move || {
+            for frame in decoder.gaussians(sequence, frames) {
+                // Nobody draws any more.
+                if sender.send(frame).is_err() {
+                    break;
+                }
+            }
+        };
+        let builder = std::thread::Builder::new().name("decode".into());
+        builder
+            .spawn_scoped(scope, decode)
+            .map_err(|e| Failure(format!("no thread can be had to decode with: {e}")))?;
+        draw(receiver)
+    })
+}
+
+/// The Gaussians of the next frame.
+fn next(decoded: &Receiver<b2p::Result<Gaussians>>) -> b2p::Result<Gaussians> {
+    decoded.recv().map_err(|_| Error::Usage("a frame is missing".into()))?
+}
+
 /// Draws frames one after the other.
 struct Film<'a> {
     args: &'a Render,
@@ -100,27 +135,23 @@ impl Film<'_> {
     fn stills(
         &mut self,
         sequence: &SequenceReader,
-        frames: std::ops::Range<u64>,
+        frames: Range<u64>,
         paths: &[PathBuf],
         progress: &Progress,
     ) -> Result<()> {
         let mut decoder = self.decoder.clone();
-        for (gaussians, path) in decoder.gaussians(sequence, frames).zip(paths) {
-            progress.say(&format!("draw {}", path.display()));
-            let gaussians = gaussians.map_err(Failure::in_file(&self.args.input))?;
-            self.draw(&gaussians, |artist| manners::write(path, |w| artist.write(w, path)))?;
-        }
-        Ok(())
+        ahead(&mut decoder, sequence, frames, |decoded| {
+            for path in paths {
+                progress.say(&format!("draw {}", path.display()));
+                let gaussians = next(&decoded).map_err(Failure::in_file(&self.args.input))?;
+                self.draw(&gaussians, |artist| manners::write(path, |w| artist.write(w, path)))?;
+            }
+            Ok(())
+        })
     }
 
     /// Writes all frames into one video.
-    fn video(
-        &mut self,
-        sequence: &SequenceReader,
-        frames: std::ops::Range<u64>,
-        path: &Path,
-        progress: &Progress,
-    ) -> Result<()> {
+    fn video(&mut self, sequence: &SequenceReader, frames: Range<u64>, path: &Path, progress: &Progress) -> Result<()> {
         let mut decoder = self.decoder.clone();
         let index = sequence.index();
         let time = FrameTime {
@@ -129,17 +160,16 @@ impl Film<'_> {
         };
         let count = u32::try_from(frames.end - frames.start)
             .map_err(|_| Failure("a video has less than 2^32 frames".into()))?;
-        let mut decoded = decoder.gaussians(sequence, frames);
-        video::write(path, count, time, |i, image| {
-            progress.say(&format!("draw frame {i}"));
-            let gaussians = decoded
-                .next()
-                .ok_or_else(|| Error::Usage("a frame is missing".into()))??;
-            let drawn = self.draw(&gaussians, |artist| {
-                std::mem::swap(image, &mut artist.image);
-                Ok(())
-            });
-            drawn.map_err(|failure| Error::Usage(failure.0))
+        ahead(&mut decoder, sequence, frames, |decoded| {
+            video::write(path, count, time, |i, image| {
+                progress.say(&format!("draw frame {i}"));
+                let gaussians = next(&decoded)?;
+                let drawn = self.draw(&gaussians, |artist| {
+                    std::mem::swap(image, &mut artist.image);
+                    Ok(())
+                });
+                drawn.map_err(|failure| Error::Usage(failure.0))
+            })
         })
     }
 

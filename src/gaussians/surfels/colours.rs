@@ -6,24 +6,44 @@ use crate::geometry::KernelMap;
 /// Ridge regularisation of the least squares, since the colours of few neighbours are mostly noise.
 const DAMPING: f32 = 0.3;
 
+/// Places of a 3³ row, as steps from the middle.
+const OFFSETS: [[f32; 3]; 27] = {
+    let mut offsets = [[0.0; 3]; 27];
+    let mut k = 0;
+    while k < 27 {
+        offsets[k] = [(k % 3) as f32 - 1.0, (k / 3 % 3) as f32 - 1.0, (k / 9) as f32 - 1.0];
+        k += 1;
+    }
+    offsets
+};
+
+/// A colour as floats, and a 0 that fills a vector.
+fn with_zero([r, g, b]: [u8; 3]) -> [f32; 4] {
+    [r, g, b, 0].map(f32::from)
+}
+
 /// The gradient of R, G and B per voxel along both axes `u`, `v` of a disc's plane, by least squares over the occupied
 /// ones of the 26 neighbours.
 pub fn gradient(map: &KernelMap, colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3]; 2]) -> [[f32; 3]; 2] {
-    let own = colours[voxel].map(f32::from);
-    let (mut uu, mut uv, mut vv) = (DAMPING, 0.0, DAMPING);
-    let (mut ru, mut rv) = ([0.0f32; 3], [0.0f32; 3]);
+    let own = with_zero(colours[voxel]);
+    // Those that are present come together first, without branches: their presence is unpredictable.
+    let (mut present, mut count) = ([(0, 0); 27], 0);
     for (k, &q) in map.row(voxel).iter().enumerate() {
-        if q == KernelMap::ABSENT {
-            continue;
-        }
-        let offset = [k % 3, k / 3 % 3, k / 9].map(|step| step as f32 - 1.0);
+        present[count.min(26)] = (k, q);
+        count += usize::from(q != KernelMap::ABSENT);
+    }
+    let (mut uu, mut uv, mut vv) = (DAMPING, 0.0, DAMPING);
+    let (mut ru, mut rv) = ([0.0f32; 4], [0.0f32; 4]);
+    for &(k, q) in &present[..count] {
+        let offset = OFFSETS[k];
         let along = |axis: [f32; 3]| offset[0] * axis[0] + offset[1] * axis[1] + offset[2] * axis[2];
         let (a, b) = (along(u), along(v));
         uu += a * a;
         uv += a * b;
         vv += b * b;
-        for channel in 0..3 {
-            let change = f32::from(colours[q as usize][channel]) - own[channel];
+        let colour = with_zero(colours[q as usize]);
+        for channel in 0..4 {
+            let change = colour[channel] - own[channel];
             ru[channel] += a * change;
             rv[channel] += b * change;
         }

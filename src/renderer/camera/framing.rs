@@ -1,6 +1,7 @@
 //! Cameras that keep an object in view.
 
 use glam::{DAffine3, DMat3, DVec3};
+use rayon::prelude::*;
 
 use super::{Camera, Projection};
 use crate::error::{Error, Result};
@@ -38,17 +39,25 @@ impl Extent {
         let spheres = spheres
             .map(|(centre, radius)| (DVec3::from(centre), radius))
             .filter(|(centre, radius)| centre.is_finite() && radius.is_finite() && centre.abs().max_element() <= 1.0);
-        let count = spheres.clone().count();
-        let outermost = |direction: DVec3, spheres: &mut dyn Iterator<Item = (DVec3, f64)>| {
-            let outer = |(centre, radius): (DVec3, f64)| centre + direction * radius;
-            let further = |a: DVec3, b: DVec3| if a.dot(direction) >= b.dot(direction) { a } else { b };
-            spheres.map(outer).reduce(further)
-        };
-        let axes = DVec3::AXES.into_iter().flat_map(|axis| [axis, -axis]);
-        let on_axes = axes.map(|axis| outermost(axis, &mut spheres.clone()));
-        let some: Vec<_> = spheres.clone().step_by(count.div_ceil(LOOKED_AT).max(1)).collect();
-        let around = (0..DIRECTIONS).map(|i| outermost(spread(i, DIRECTIONS), &mut some.iter().copied()));
-        let points = on_axes.chain(around).flatten();
+        let mut count = 0usize;
+        let mut on_axes = DVec3::AXES.map(|axis| [Outermost::along(axis), Outermost::along(-axis)]);
+        for sphere in spheres.clone() {
+            count += 1;
+            on_axes.as_flattened_mut().iter_mut().for_each(|most| most.add(sphere));
+        }
+        let some: Vec<_> = spheres.step_by(count.div_ceil(LOOKED_AT).max(1)).collect();
+        let around = (0..DIRECTIONS).into_par_iter().map(|i| {
+            let mut most = Outermost::along(spread(i, DIRECTIONS));
+            some.iter().for_each(|sphere| most.add(*sphere));
+            most.point
+        });
+        let around: Vec<_> = around.collect();
+        let points = on_axes
+            .as_flattened()
+            .iter()
+            .map(|most| most.point)
+            .chain(around)
+            .flatten();
         let points: Vec<DVec3> = points.map(|point| point.clamp(DVec3::NEG_ONE, DVec3::ONE)).collect();
         match points.is_empty() {
             true => Extent::cube(),
@@ -77,6 +86,26 @@ impl Extent {
         let low = points().reduce(DVec3::min).unwrap_or_default();
         let high = points().reduce(DVec3::max).unwrap_or_default();
         [low.to_array(), high.to_array()]
+    }
+}
+
+/// The outermost point of spheres in a direction.
+struct Outermost {
+    direction: DVec3,
+    point: Option<DVec3>,
+}
+
+impl Outermost {
+    fn along(direction: DVec3) -> Self {
+        Outermost { direction, point: None }
+    }
+
+    fn add(&mut self, (centre, radius): (DVec3, f64)) {
+        let point = centre + self.direction * radius;
+        let is_further = |other: DVec3| point.dot(self.direction) > other.dot(self.direction);
+        if self.point.is_none_or(is_further) {
+            self.point = Some(point);
+        }
     }
 }
 
