@@ -3,6 +3,7 @@
 mod common;
 
 use b2p::cloud::ColouredVoxels;
+use b2p::encoder::transform::QualityTarget;
 use b2p::geometry::{Voxels, morton};
 use b2p::sequence::{Rate, join};
 use b2p::{Decoder, Error, Limits, Placement, SequenceDecoder, SequenceEncoder, SequenceReader};
@@ -226,6 +227,14 @@ fn more_frames_than_the_limit_are_refused() {
     ));
 }
 
+/// A number that looks random (the last steps of SplitMix64).
+fn mixed(number: u64) -> u64 {
+    let x = number.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    let x = (x ^ x >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    let x = (x ^ x >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+    x ^ x >> 31
+}
+
 /// A ball of level 8 of whose voxels other ones are missing in each frame.
 fn still(frame: u64) -> ColouredVoxels {
     let is_there = |key: u64| (key ^ frame << 40).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 56 > 6;
@@ -261,6 +270,37 @@ fn a_still_cloud_has_the_same_gaussians_in_every_frame_for_few_bits() {
 }
 
 #[test]
+fn noise_of_colours_is_not_coded_again_but_a_change_is() {
+    let cloud = |frame: u64, change: u8| {
+        let mut cloud = still(frame);
+        let noise = |key: &u64| (mixed(key ^ frame << 40) >> 59) as u8;
+        let noisy = |(key, colour): (&u64, &[u8; 3])| colour.map(|c| (c / 2 + noise(key)).saturating_add(change));
+        cloud.colours = cloud.voxels.keys().iter().zip(&cloud.colours).map(noisy).collect();
+        cloud
+    };
+    let encoder = SequenceEncoder::new()
+        .with_levels(4..=7)
+        .with_quality(QualityTarget::Step(8.0));
+    let mean = |frame: Frame| {
+        let sum: f64 = frame.1.iter().map(|colour| f64::from(colour[1])).sum();
+        sum / frame.1.len() as f64
+    };
+    let encode = |change: u8| {
+        let clouds = |frame: u64| Ok(cloud(frame, if frame == 2 { change } else { 0 }));
+        encoder.encode(3, clouds, |_| {}).expect("a sequence")
+    };
+    let bytes = encode(0);
+    let sequence = reader(&bytes);
+    let group = sequence.group(0).expect("a group");
+    let sizes: Vec<u64> = (0..3).map(|at| group.frame_bytes(at)).collect();
+    assert!(15 * sizes[1] < sizes[0] && 15 * sizes[2] < sizes[0], "{sizes:?}");
+    // All of it becomes lighter by less than the noise.
+    let bytes = encode(6);
+    let [before, after] = [1, 2].map(|number| mean(frame(&reader(&bytes), number, None).expect("a frame")));
+    assert!((after - before - 6.0).abs() < 1.5, "{before} {after}");
+}
+
+#[test]
 fn a_moved_cloud_takes_fewer_bits_than_a_whole_frame() {
     // By whole voxels of the finest level that is coded.
     let bytes = encoder()
@@ -277,10 +317,19 @@ fn a_moved_cloud_takes_fewer_bits_than_a_whole_frame() {
 
 #[test]
 fn a_frame_that_the_one_before_tells_nothing_of_is_whole() {
-    // Textures have nothing in common.
+    // Neither shapes nor textures have anything in common.
     let cloud = |frame: u64| {
-        let mut cloud = still(frame);
-        let shade = |key: &u64| ((key ^ frame << 40).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 56) as u8;
+        let mut voxels: Vec<_> = { Ball::new(8, 50.0 + 20.0 * frame as f32).voxels().into_iter() }
+            .map(|(at, colour)| (morton::encode(at), colour))
+            .collect();
+        voxels.sort_unstable();
+        let mut cloud = ColouredVoxels {
+            voxels: Voxels::new(8, voxels.iter().map(|voxel| voxel.0).collect()),
+            colours: Vec::new(),
+            placement: Placement::VOXEL_GRID,
+        };
+        // In patches of 8³ voxels: what differs from voxel to voxel may be noise.
+        let shade = |key: &u64| (mixed(key >> 9 ^ frame << 40) >> 56) as u8;
         cloud.colours = cloud.voxels.keys().iter().map(|key| [shade(key); 3]).collect();
         Ok(cloud)
     };
@@ -288,7 +337,8 @@ fn a_frame_that_the_one_before_tells_nothing_of_is_whole() {
     let bytes = encoder.encode(3, cloud, |_| {}).expect("a sequence");
     let sequence = reader(&bytes);
     let group = sequence.group(0).expect("a group");
-    assert!((0..3).all(|at| group.is_whole(at)));
+    let sizes: Vec<u64> = (0..3).map(|at| group.frame_bytes(at)).collect();
+    assert!((0..3).all(|at| group.is_whole(at)), "{sizes:?}");
 }
 
 #[test]
@@ -383,7 +433,8 @@ fn frames_are_coded_alone_without_prediction() {
         .expect("a sequence");
     let sequence = reader(&bytes);
     let group = sequence.group(0).expect("a group");
-    assert!((0..3).all(|at| group.is_whole(at)));
+    let sizes: Vec<u64> = (0..3).map(|at| group.frame_bytes(at)).collect();
+    assert!((0..3).all(|at| group.is_whole(at)), "{sizes:?}");
     // A whole frame is what a stream of one frame decodes to.
     let alone = b2p::Encoder::new()
         .with_levels(3..=5)

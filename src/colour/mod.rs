@@ -33,6 +33,8 @@ pub use block::Guide;
 #[cfg(feature = "encoder")]
 pub use encode::{Options, Truth, encode_level, encode_trunk};
 pub use filter::Filter;
+#[cfg(feature = "encoder")]
+pub(crate) use space::from_rgb;
 pub use space::{Steps, Ycc};
 
 use std::ops::Range;

@@ -14,6 +14,7 @@
 use rayon::prelude::*;
 
 use super::motion::{AROUND, Block, CENTRE, Search};
+use super::noise::Chance;
 use crate::colour::Ycc;
 use crate::geometry::{Voxels, morton};
 use crate::motion::{Places, PreviousLevel};
@@ -31,6 +32,9 @@ const CHANGED_BITS: f32 = 3.0;
 const STEADY_BITS: f32 = 0.5;
 /// The square of a sum of displacements that chance alone brings, for each voxel that is displaced.
 const CHANCE: f32 = 0.7;
+/// How many times a frame's squared error of sampling both frames together may differ by: where nothing moves, by that of
+/// both. Elsewhere vectors of whole voxels bring errors of their own, which must not add up.
+const SAMPLINGS: [f32; 2] = [2.0, 1.5];
 
 /// What bits and errors are worth.
 #[derive(Debug, Clone, Copy)]
@@ -66,6 +70,8 @@ struct Cell {
     coloured: f32,
     sums: [f32; 3],
     squares: f32,
+    /// The squared error that chance alone brings to a colour of the block.
+    chance: f32,
     show: Show,
 }
 
@@ -100,9 +106,9 @@ impl Cell {
         }
     }
 
-    /// Compares colours, in 255ths. As much error in red, green and blue comes of twice as much chroma.
+    /// Compares colours, in 255ths.
     fn colour(&mut self, apart: [f32; 3]) {
-        let apart = [apart[0], apart[1] / 2.0, apart[2] / 2.0];
+        let apart = in_255ths(apart);
         self.coloured += 1.0;
         for (sum, apart) in self.sums.iter_mut().zip(apart) {
             *sum += apart;
@@ -136,7 +142,33 @@ impl Cell {
         [copy, cost]
     }
 
-    /// Lagrangian costs of colours that are copied, and of coded ones.
+    /// Squared errors of copied colours as a whole, and of the rest.
+    fn squares(&self) -> [f32; 2] {
+        let whole = self.sums.iter().map(|sum| sum * sum).sum::<f32>() / self.coloured.max(1.0);
+        [whole, (self.squares - whole).max(0.0)]
+    }
+
+    /// The errors less what chance brings; below 0 where it brought less.
+    fn apart(&self) -> [f32; 2] {
+        let [whole, rest] = self.squares();
+        [whole - self.chance, rest - self.chance * (self.coloured - 1.0).max(0.0)]
+    }
+
+    /// What a voxel's colour is to become that differs by `apart` from the copied one: the difference of the cell, and the
+    /// voxel's own, each as far as chance does not explain them.
+    fn change(&self, apart: [f32; 3]) -> [f32; 3] {
+        let squares = self.squares();
+        let left = self.apart().map(|x| x.max(0.0));
+        let [whole, rest] = [0, 1].map(|i| if squares[i] > 0.0 { left[i] / squares[i] } else { 0.0 });
+        [0, 1, 2].map(|t| {
+            let scale = if t == 0 { 1.0 } else { 2.0 };
+            let mean = scale * self.sums[t] / self.coloured.max(1.0);
+            whole * mean + rest * (apart[t] - mean)
+        })
+    }
+
+    /// Lagrangian costs of colours that are copied, and of coded ones. The former is below 0 where chance brought less
+    /// than it does on average, so that a block has its sum.
     fn colours(&self, weights: Weights) -> [f32; 2] {
         if self.coloured == 0.0 {
             return [0.0; 2];
@@ -148,11 +180,17 @@ impl Cell {
                 false => count * weights.floor * (1.0 + (mean / weights.floor).ln()),
             }
         };
-        let whole: f32 = self.sums.iter().map(|sum| sum * sum / self.coloured).sum();
-        let rest = (self.squares - whole).max(0.0);
+        let [whole, rest] = self.apart();
         let rate = weights.lambda * STEADY_BITS * self.coloured;
-        [whole + rest, coded(whole, 1.0) + coded(rest, self.coloured) + rate]
+        let coded = coded(whole.max(0.0), 1.0) + coded(rest.max(0.0), self.coloured);
+        [whole + rest, coded + rate]
     }
+}
+
+/// A difference of colours, in 255ths, whose squares can be added up: as much error in red, green and blue comes of twice
+/// as much chroma.
+pub(super) fn in_255ths(apart: [f32; 3]) -> [f32; 3] {
+    [apart[0], apart[1] / 2.0, apart[2] / 2.0]
 }
 
 /// A block and the moved previous frame.
@@ -177,6 +215,7 @@ impl Compared {
             cells: vec![Cell::default(); (cells * cells * cells) as usize],
             side,
         };
+        let mut chance = Chance::default();
         let around = |other: &PreviousLevel, at: [i32; 3]| other.window(at.map(|x| x - 1)) & AROUND;
         let voxels = search.octree.level(search.top);
         for i in search.voxels(search.top, key) {
@@ -188,10 +227,13 @@ impl Compared {
             cell.place(there, 1.0);
             if let Some(colour) = colour_near(previous, from, there) {
                 let truth = search.truth.level(search.top)[i];
-                cell.colour([0, 1, 2].map(|t| (f32::from(truth[t]) - colour[t]) / 64.0));
+                cell.colour(apart(truth, colour));
+                chance.add(search.samples[i]);
             }
             compared.own.push((at, there));
         }
+        let chance = SAMPLINGS[usize::from(vector != [0; 3])] * chance.squared_error();
+        compared.cells.iter_mut().for_each(|cell| cell.chance = chance);
         for (at, index) in search.moved(key, vector) {
             let (there, number) = (around(current, at), compared.number(at));
             compared.cells[number].place(there, -1.0);
@@ -209,13 +251,18 @@ impl Compared {
 
     /// Lagrangian costs of a copy, and of what is best for each cell, which is chosen.
     fn costs(&mut self, weights: Weights) -> [f32; 2] {
-        let mut costs = [0.0; 2];
+        let (mut places, mut colours) = ([0.0; 2], [0.0; 2]);
         for cell in &mut self.cells {
-            let (places, colours) = (cell.choose(weights), cell.colours(weights));
-            (0..2).for_each(|i| costs[i] += places[i] + colours[i]);
+            let costs = [cell.choose(weights), cell.colours(weights)];
+            (0..2).for_each(|i| (places[i], colours[i]) = (places[i] + costs[0][i], colours[i] + costs[1][i]));
         }
-        costs
+        [0, 1].map(|i| places[i] + colours[i].max(0.0))
     }
+}
+
+/// The difference of a colour to another one, in 255ths.
+fn apart(a: Ycc, b: [f32; 3]) -> [f32; 3] {
+    [0, 1, 2].map(|t| (f32::from(a[t]) - b[t]) / 64.0)
 }
 
 /// The finest level of the previous frame, and of this one.
@@ -249,7 +296,14 @@ pub(super) fn choose(search: &Search, block: &mut Block, weights: Weights) -> Sh
             Show::Own => {}
             Show::Mend if there == 0 => {}
             _ if block.keep || there & CENTRE == 0 => shown.push((key(at), Some(levels[0].values[index]))),
-            _ => shown.push((key(at), None)),
+            _ => {
+                let old = levels[0].values[index];
+                let colour = levels[1].index(at).map(|i| {
+                    let change = cell.change(apart(levels[1].values[i], old.map(f32::from)));
+                    [0, 1, 2].map(|t| (f32::from(old[t]) + 64.0 * change[t]).round() as i16)
+                });
+                shown.push((key(at), colour));
+            }
         }
     }
     for &(at, there) in &compared.own {
@@ -363,6 +417,32 @@ mod tests {
         let places = (0..27).map(|i| [i % 3, i / 3 % 3, i / 9]);
         let occupied = places.filter(|at| inside(at.map(|x| x - 1)));
         occupied.map(|[x, y, z]| 1 << (x + 4 * y + 16 * z)).sum()
+    }
+
+    #[test]
+    fn what_chance_explains_costs_nothing_and_changes_nothing() {
+        let weights = Weights::of_step(8.0);
+        let cell = |shift: f32| {
+            let mut cell = Cell {
+                chance: 50.0,
+                ..Cell::default()
+            };
+            (0..64).for_each(|i| cell.colour([shift + if i % 2 == 0 { 5.0 } else { -5.0 }, 0.0, 0.0]));
+            cell
+        };
+        let noise = cell(0.0);
+        assert!(noise.colours(weights)[0] <= 0.0);
+        assert_eq!(noise.change([5.0, 0.0, 0.0]), [0.0; 3]);
+        // The light changes: the noise is still left out.
+        let lighter = cell(30.0);
+        let [copied, coded] = lighter.colours(weights);
+        assert!(coded < copied);
+        let change = lighter.change([35.0, 0.0, 0.0]);
+        assert!((change[0] - 30.0).abs() < 1.0, "{change:?}");
+        // What is not known to be noise counts in full.
+        let mut unknown = Cell::default();
+        unknown.colour([5.0, 8.0, 0.0]);
+        assert_eq!(unknown.change([5.0, 8.0, 0.0]), [5.0, 8.0, 0.0]);
     }
 
     #[test]

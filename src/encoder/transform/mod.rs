@@ -5,6 +5,7 @@ mod head_maps;
 mod knobs;
 mod memory;
 mod motion;
+mod noise;
 mod predicted;
 mod rate_control;
 mod shape;

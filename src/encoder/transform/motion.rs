@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use super::Truth;
 use super::choice::{self, Weights};
+use super::noise::Sampled;
 use crate::colour::Ycc;
 use crate::geometry::{Octree, morton};
 use crate::motion::{Previous, PreviousLevel, predicted};
@@ -44,6 +45,8 @@ pub(super) struct Search<'a> {
     pub previous: &'a Previous,
     /// The frame itself, found by position.
     pub current: &'a Previous,
+    /// What the cloud has in the voxels of its finest level.
+    pub samples: &'a [Sampled],
     pub top: u8,
     pub block_level: u8,
 }
@@ -94,13 +97,15 @@ impl Search<'_> {
         blocks
     }
 
-    /// The [`PROMISING`] vectors of least cost at the finest level.
+    /// The [`PROMISING`] vectors of least cost at the finest level, among them 0, by which noise is told.
     fn promising(&self, key: u64, vectors: Vec<[i16; 3]>) -> Vec<[i16; 3]> {
         let sample = self.sample(self.top, key);
         let cost = |vector: &[i16; 3]| sample.cost(vector.map(i32::from), f32::INFINITY);
         let mut ranked: Vec<(f32, [i16; 3])> = vectors.iter().map(|vector| (cost(vector), *vector)).collect();
         ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
-        ranked.iter().take(PROMISING).map(|ranked| ranked.1).collect()
+        let (best, others) = ranked.split_at(PROMISING.min(ranked.len()));
+        let zero = others.iter().filter(|ranked| ranked.1 == [0; 3]);
+        best.iter().chain(zero).map(|ranked| ranked.1).collect()
     }
 
     /// The vector found at the coarsest level, in its voxels.

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 
 use super::choice::{self, Shown, Weights};
 use super::motion::{Block, Search};
+use super::noise;
 use super::{EncoderInput, Guides, Options, choose_levels, octree_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth, Ycc, trunk_depth};
@@ -140,11 +141,13 @@ impl Target {
         let lossless = steps.is_lossless();
         let levels = (0..=top).map(|level| (truth.level(level).to_vec(), None, None));
         let current = Previous::new(octree, levels.collect());
+        let samples = noise::samples(cloud, octree, top);
         let search = Search {
             octree,
             truth,
             previous,
             current: &current,
+            samples: &samples,
             top,
             block_level,
         };
@@ -155,6 +158,12 @@ impl Target {
             false => choice::choose(&search, block, weights),
         };
         let mut shown: Vec<Shown> = blocks.par_iter_mut().map(choose).collect();
+        eprintln!(
+            "blocks {} kept {} zero {}",
+            blocks.len(),
+            blocks.iter().filter(|b| b.keep).count(),
+            blocks.iter().filter(|b| b.vector == [0; 3]).count()
+        );
         if shown.iter().all(Vec::is_empty) {
             // A frame has at least one voxel.
             for (shown, block) in shown.iter_mut().zip(&mut blocks) {
