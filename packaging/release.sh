@@ -31,6 +31,8 @@ archive() {
     rm -rf "$folder"
 }
 
+packaging/licences.sh
+
 # The page is part of the program.
 if web/build.sh; then
     cp web/b2p.wasm "$out/"

@@ -2,8 +2,8 @@
 
 use std::ops::Range;
 
+use super::reached::{Reached, means};
 use super::stream::Decoder;
-use super::transform::{Reached, means};
 use crate::container::Header;
 use crate::error::Result;
 use crate::gaussians::learned::LevelInput;

@@ -8,6 +8,7 @@
 mod check;
 mod drawing;
 mod memory;
+mod reached;
 mod stream;
 mod streaming;
 mod transform;

@@ -5,17 +5,18 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::halo::{Near, Neighbourhood, around};
 use super::neighbours::Bounds;
 use super::reader::SceneReader;
 use super::source::Source;
 #[cfg(feature = "ply")]
 use crate::cloud::ColouredVoxels;
 use crate::container::Header;
-use crate::container::scene::{BlockEntry, Cube};
+use crate::container::scene::Cube;
 use crate::decoder::{Decoder, LevelVoxels, Part};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians};
-use crate::geometry::{Octree, Voxels};
+use crate::geometry::Voxels;
 #[cfg(doc)]
 use crate::limits::Limits;
 use crate::placement::Placement;
@@ -477,88 +478,6 @@ fn finish<T>(content: T, mut lost: Vec<Error>, blocks: usize) -> Result<DecodedS
         true => Err(lost.swap_remove(0)),
         false => Ok(DecodedScene { content, blocks, lost }),
     }
-}
-
-/// Where the voxels lie that drawing a block depends on: its own and those around.
-struct Near<'a> {
-    level: u8,
-    /// Voxels of the blocks that have some, in the order of space.
-    parts: Vec<(&'a LevelVoxels, Vec<Range<usize>>)>,
-    /// Which of them the block is.
-    own: usize,
-}
-
-/// A block's voxels among those that drawing it depends on.
-struct Neighbourhood {
-    octree: Octree,
-    colours: Vec<[u8; 3]>,
-    unfiltered: Vec<[u8; 3]>,
-    /// Voxels of the block.
-    own: Range<usize>,
-}
-
-impl<'a> Near<'a> {
-    fn of(blocks: &[BlockEntry], decoded: &'a Blocks, block: usize, level: u8, reach: u32) -> Self {
-        let bounds = Bounds::around(blocks[block].cube, level, reach);
-        let (mut parts, mut own) = (Vec::new(), 0);
-        for (&other, voxels) in decoded {
-            if other == block {
-                own = parts.len();
-            } else if !bounds.meets(&Bounds::of(blocks[other].cube, level)) {
-                continue;
-            }
-            if let Some(voxels) = voxels {
-                parts.push((voxels, bounds.ranges(&voxels.keys, blocks[other].cube, level)));
-            }
-        }
-        Near { level, parts, own }
-    }
-
-    /// How many there are.
-    fn voxels(&self) -> u64 {
-        let ranges = self.parts.iter().flat_map(|(_, ranges)| ranges);
-        ranges.map(|range| range.len() as u64).sum()
-    }
-
-    fn collect(self) -> Result<Neighbourhood> {
-        let count = self.voxels() as usize;
-        let mut keys = Vec::with_capacity(count);
-        let (mut colours, mut unfiltered) = (Vec::with_capacity(count), Vec::with_capacity(count));
-        let mut own = 0..0;
-        for (i, (voxels, ranges)) in self.parts.into_iter().enumerate() {
-            let start = keys.len();
-            for range in ranges {
-                keys.extend(&voxels.keys[range.clone()]);
-                colours.extend(&voxels.colours[range.clone()]);
-                unfiltered.extend(&voxels.unfiltered[range]);
-            }
-            if i == self.own {
-                own = start..keys.len();
-            }
-        }
-        Ok(Neighbourhood {
-            octree: Octree::new(Voxels::from_sorted(self.level, keys))?,
-            colours,
-            unfiltered,
-            own,
-        })
-    }
-}
-
-/// Some blocks and those that drawing them depends on, ascending.
-fn around(all: &[BlockEntry], blocks: &[usize], level: u8, reach: u32) -> Vec<usize> {
-    if blocks.len() == all.len() {
-        return blocks.to_vec();
-    }
-    let own = blocks
-        .iter()
-        .map(|&block| Bounds::around(all[block].cube, level, reach));
-    let own: Vec<Bounds> = own.collect();
-    let is_near = |block: &usize| {
-        let bounds = Bounds::of(all[*block].cube, level);
-        own.iter().any(|own| own.meets(&bounds))
-    };
-    (0..all.len()).into_par_iter().filter(is_near).collect()
 }
 
 /// Gaussians of blocks at one level, as one. Array by array, so that no more than one of them is in memory twice.

@@ -10,6 +10,7 @@ mod decoder;
 mod edit;
 #[cfg(feature = "encoder")]
 mod encoder;
+mod halo;
 mod neighbours;
 mod partition;
 #[cfg(feature = "encoder")]

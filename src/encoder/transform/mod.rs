@@ -7,10 +7,10 @@ mod memory;
 mod motion;
 mod noise;
 mod predicted;
+mod quality;
 mod rate_control;
 mod shape;
 
-use std::fmt;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
@@ -33,27 +33,11 @@ use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
 pub use memory::encode_memory;
 pub use predicted::{PredictedFrame, encode_predicted};
+pub use quality::QualityTarget;
+
 pub use rate_control::encode_to_rate;
 pub use shape::GeometryTarget;
 use shape::Shape;
-
-/// How exactly colours are coded.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[non_exhaustive]
-pub enum QualityTarget {
-    /// In quantisation steps; luma's of the finest level has this size in 255ths, ½ to 1000, chroma's (Cg's) twice
-    /// that.
-    Step(f32),
-    /// The same with a size for each.
-    Steps {
-        /// Luma's.
-        luma: f32,
-        /// Chroma's, ½ to 1000, too.
-        chroma: f32,
-    },
-    /// The mean colours of the finest level's voxels, each channel rounded to a whole 255th.
-    Lossless,
-}
 
 /// What may be chosen about a stream of version 3; [`encode_to_rate`] chooses how exactly colours are coded, and may
 /// leave out the finest levels.
@@ -107,11 +91,6 @@ impl Default for Options {
 /// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.
 const COLOUR_SLICE: u32 = 8192;
 
-/// How much coarser the step of a chroma is than that of luma, in indices of steps: about as much error in red, green
-/// and blue comes of both.
-const CHROMA: u8 = 8;
-/// The coarsest index of chroma: Co's step is two indices greater.
-const MAX_CHROMA: u8 = Steps::MAX - 2;
 /// Filters of levels that are not the finest may take one part in so many of a stream that ends there.
 const FILTER_SHARE: usize = 100;
 
@@ -131,80 +110,6 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     // They are needed no more, and are the largest part.
     subject.maps = Vec::new();
     subject.checked(coded, options.heads.as_ref(), usize::MAX, log)
-}
-
-impl fmt::Display for QualityTarget {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            QualityTarget::Step(luma) => write!(f, "step {luma:.2}"),
-            QualityTarget::Steps { luma, chroma } => write!(f, "step {luma:.2},{chroma:.2}"),
-            QualityTarget::Lossless => f.write_str("exact colours"),
-        }
-    }
-}
-
-impl QualityTarget {
-    /// The steps of the finest level.
-    fn steps(self) -> Result<Steps> {
-        match self {
-            QualityTarget::Lossless => Ok(Steps::LOSSLESS),
-            QualityTarget::Step(step) => {
-                let luma = nearest(step)?;
-                Ok(steps_of(luma, luma))
-            }
-            QualityTarget::Steps { luma, chroma } => Ok(Steps {
-                luma: nearest(luma)?,
-                chroma: nearest(chroma)?.min(MAX_CHROMA),
-            }),
-        }
-    }
-
-    /// The same with `factor` times the steps, within their limits.
-    pub fn scaled(self, factor: f32) -> Self {
-        let scale = |step: f32| (step * factor).clamp(0.5, 1000.0);
-        match self {
-            QualityTarget::Lossless => QualityTarget::Lossless,
-            QualityTarget::Step(step) => QualityTarget::Step(scale(step)),
-            QualityTarget::Steps { luma, chroma } => QualityTarget::Steps {
-                luma: scale(luma),
-                chroma: scale(chroma),
-            },
-        }
-    }
-
-    /// What stands for these steps.
-    fn of(steps: Steps) -> Self {
-        let size = |luma| Steps { luma, ..steps }.luma_step();
-        match steps.is_lossless() {
-            true => QualityTarget::Lossless,
-            false => QualityTarget::Steps {
-                luma: size(steps.luma),
-                chroma: size(steps.chroma),
-            },
-        }
-    }
-}
-
-/// The index of the step nearest to this size.
-fn nearest(size: f32) -> Result<u8> {
-    if !(0.5..=1000.0).contains(&size) {
-        let what = "a quantisation step is 0.5 to 1000 255ths";
-        return Err(Error::Usage(format!("{what}, not {size}")));
-    }
-    let off = |luma: &u8| {
-        let steps = Steps { luma: *luma, chroma: 0 };
-        (steps.luma_step() / size).ln().abs()
-    };
-    let nearest = (0..=Steps::MAX).min_by(|a, b| off(a).total_cmp(&off(b)));
-    Ok(nearest.unwrap_or(Steps::MAX))
-}
-
-/// The steps that go with an index of luma's, and with one for chroma.
-fn steps_of(luma: u8, chroma: u8) -> Steps {
-    Steps {
-        luma,
-        chroma: (chroma + CHROMA).min(MAX_CHROMA),
-    }
 }
 
 /// The levels to code, for a cloud of bit depth `bits`.

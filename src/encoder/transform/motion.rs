@@ -97,7 +97,7 @@ impl Search<'_> {
         blocks
     }
 
-    /// The [`PROMISING`] vectors of least cost at the finest level, among them 0, by which noise is told.
+    /// The [`PROMISING`] vectors of least cost at the finest level, and 0, which tells noise from motion.
     fn promising(&self, key: u64, vectors: Vec<[i16; 3]>) -> Vec<[i16; 3]> {
         let sample = self.sample(self.top, key);
         let cost = |vector: &[i16; 3]| sample.cost(vector.map(i32::from), f32::INFINITY);

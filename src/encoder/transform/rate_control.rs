@@ -6,8 +6,9 @@
 
 use std::sync::Arc;
 
+use super::quality::{MAX_CHROMA, QualityTarget, steps_of};
 use super::shape::Shape;
-use super::{Coded, EncoderInput, GeometryTarget, MAX_CHROMA, Options, QualityTarget, choose_levels, steps_of};
+use super::{Coded, EncoderInput, GeometryTarget, Options, choose_levels};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth};
 use crate::encoder::Encoded;
