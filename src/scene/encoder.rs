@@ -21,6 +21,7 @@ use crate::placement::Placement;
 pub struct SceneEncoder {
     pub(super) options: Options,
     pub(super) block_voxels: usize,
+    memory: u64,
     axes: Axes,
     cancel: Cancel,
 }
@@ -43,11 +44,15 @@ pub type Sink<'a> = dyn FnMut(&BlockEntry, &[u8]) -> Result<()> + 'a;
 /// Voxels of a block.
 pub(super) type Cut = (Cube, Vec<Voxel>);
 
+/// Copies of a block's voxels while it is coded: as they came, and as a cloud.
+const COPIES: usize = 2;
+
 impl Default for SceneEncoder {
     fn default() -> Self {
         SceneEncoder {
             options: scene_options(Options::default()),
             block_voxels: BLOCK_VOXELS,
+            memory: u64::MAX,
             axes: Axes::default(),
             cancel: Cancel::default(),
         }
@@ -84,6 +89,13 @@ impl SceneEncoder {
     /// The same encoder, whose blocks have at most so many voxels of level N.
     pub fn with_block_voxels(mut self, voxels: usize) -> Self {
         self.block_voxels = voxels;
+        self
+    }
+
+    /// The same encoder, which codes as many blocks at a time as take so many bytes of memory, and at least one: smaller
+    /// blocks take less. Default: one for each thread.
+    pub fn with_memory(mut self, bytes: u64) -> Self {
+        self.memory = bytes;
         self
     }
 
@@ -130,10 +142,10 @@ impl SceneEncoder {
         let log = Log::off().with_cancel(self.cancel.clone());
         let mut cuts = Cuts::new(self.cutter(&grid, &levels), voxels);
         let mut entries: Vec<BlockEntry> = Vec::new();
+        let mut waiting = None;
         loop {
             self.cancel.check()?;
-            let group = cuts.by_ref().take(rayon::current_num_threads().max(1));
-            let group = group.collect::<Result<Vec<Cut>>>()?;
+            let group = self.group(&grid, &mut cuts, &mut waiting)?;
             if group.is_empty() {
                 break;
             }
@@ -165,6 +177,31 @@ impl SceneEncoder {
             sections: Vec::new(),
         };
         write_index(&common, &entries)
+    }
+
+    /// The next blocks that are coded at a time. What does not fit waits.
+    fn group(
+        &self,
+        grid: &Grid,
+        cuts: &mut impl Iterator<Item = Result<Cut>>,
+        waiting: &mut Option<Cut>,
+    ) -> Result<Vec<Cut>> {
+        let (mut group, mut bytes) = (Vec::new(), 0u64);
+        while group.len() < rayon::current_num_threads().max(1) {
+            let Some((cube, voxels)) = waiting.take().map(Ok).or_else(|| cuts.next()).transpose()? else {
+                break;
+            };
+            let keys = voxels.iter().map(|voxel| voxel.0);
+            let coding = transform::memory_of(grid.bits - cube.level, keys, false);
+            let copies = (COPIES * size_of::<Voxel>() * voxels.len()) as u64;
+            bytes = bytes.saturating_add(coding).saturating_add(copies);
+            if bytes > self.memory && !group.is_empty() {
+                *waiting = Some((cube, voxels));
+                break;
+            }
+            group.push((cube, voxels));
+        }
+        Ok(group)
     }
 
     /// The levels of a scene of so many bits.
@@ -317,4 +354,43 @@ fn in_block(block: usize, error: Error) -> Error {
 /// The coordinates of a cube's lowest corner in voxels of level N.
 fn corner(cube: Cube, depth: u8) -> [u32; 3] {
     morton::decode(cube.key).map(|x| x << (depth - cube.level))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Blocks of one voxel each, in order.
+    fn blocks(count: u64) -> impl Iterator<Item = Result<Cut>> {
+        (0..count).map(|key| Ok((Cube { level: 4, key }, vec![(key << 6, [7; 3])])))
+    }
+
+    #[test]
+    fn as_many_blocks_as_fit_are_coded_at_a_time_and_at_least_one() {
+        let grid = Grid {
+            bits: 6,
+            placement: Placement::VOXEL_GRID,
+        };
+        let sizes = |memory: u64| {
+            let encoder = SceneEncoder::new().with_memory(memory);
+            let (mut cuts, mut waiting) = (blocks(7), None);
+            let mut groups = Vec::new();
+            loop {
+                let group = encoder.group(&grid, &mut cuts, &mut waiting).unwrap();
+                if group.is_empty() {
+                    break;
+                }
+                groups.push(group.iter().map(|(cube, _)| cube.key).collect::<Vec<_>>());
+            }
+            assert_eq!(groups.concat(), (0..7).collect::<Vec<_>>());
+            groups.into_iter().map(|group| group.len()).collect::<Vec<_>>()
+        };
+        let one = transform::memory_of(2, [0].into_iter(), false) + (COPIES * size_of::<Voxel>()) as u64;
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+        pool.install(|| {
+            assert_eq!(sizes(u64::MAX), [3, 3, 1]);
+            assert_eq!(sizes(2 * one), [2, 2, 2, 1]);
+            assert_eq!(sizes(0), [1; 7]);
+        });
+    }
 }

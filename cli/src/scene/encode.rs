@@ -39,6 +39,7 @@ pub fn run(
     let encoder = SceneEncoder::new()
         .with_options(options)
         .with_block_voxels(block_voxels(args))
+        .with_memory(limits.max_bytes)
         .with_axes(axes);
     let started = std::time::Instant::now();
     progress.say("code blocks");

@@ -2,7 +2,7 @@
 
 use b2p::cloud::{ColourRange, CommonGrid, GridNeed, Note, PointCloud, voxelise_memory};
 use b2p::encoder::transform::Options;
-use b2p::scene::{Grid, Runs};
+use b2p::scene::{BLOCK_VOXELS, Grid, Runs};
 use b2p::{Error, Limits, SceneEncoder};
 use b2p_formats::clouds::Pieces;
 
@@ -18,6 +18,16 @@ const POINT_BYTES: u64 = 128;
 const SHARE: u64 = 8;
 /// Points of a piece at least.
 const LEAST: u64 = 1 << 12;
+
+/// Bytes that coding takes for each voxel of a surface, whose octree has 1.4 times as many nodes, and at least.
+const CODED_BYTES: u64 = 400;
+const CODING: u64 = 64 << 20;
+
+/// Voxels of a block of which two are coded at a time within the limits.
+fn block_voxels(limits: &Limits) -> usize {
+    let voxels = (limits.max_bytes / 2).saturating_sub(CODING) / CODED_BYTES;
+    (voxels as usize).clamp(BLOCK_VOXELS >> 5, BLOCK_VOXELS)
+}
 
 /// The pieces of a cloud, if it is to be read in pieces: it is one file, and larger than memory allows.
 pub fn pieces(args: &Encode, limits: &Limits) -> Result<Option<Pieces>> {
@@ -70,7 +80,8 @@ pub fn run(
     let mut runs = cloud.sort(&grid, progress)?;
     let encoder = SceneEncoder::new()
         .with_options(options(grid.bits())?)
-        .with_block_voxels(super::encode::block_voxels(args))
+        .with_block_voxels(args.block_size.map_or(block_voxels(limits), |size| size as usize))
+        .with_memory(limits.max_bytes)
         .with_axes(axes);
     let mut blocks = Vec::new();
     let mut count = 0u64;

@@ -13,19 +13,26 @@ const NODE_TO_RATE: u64 = 390;
 /// [`encode_to_rate`](super::encode_to_rate). The bytes of a node were measured; `cargo test --test memory` compares the
 /// bound with what the allocator gives out.
 pub fn encode_memory(voxels: &Voxels, to_rate: bool) -> u64 {
+    memory_of(voxels.depth(), voxels.keys().iter().copied(), to_rate)
+}
+
+/// The same of keys of level `depth` in their order.
+pub(crate) fn memory_of(depth: u8, keys: impl Iterator<Item = u64>, to_rate: bool) -> u64 {
     let each = if to_rate { NODE_TO_RATE } else { NODE };
-    nodes(voxels).saturating_mul(each).saturating_add(FIXED)
+    nodes(depth, keys).saturating_mul(each).saturating_add(FIXED)
 }
 
 /// Voxels of all levels below the root.
-fn nodes(voxels: &Voxels) -> u64 {
-    let keys = voxels.keys();
-    let first = if keys.is_empty() { 0 } else { u64::from(voxels.depth()) };
+fn nodes(depth: u8, mut keys: impl Iterator<Item = u64>) -> u64 {
+    let Some(mut before) = keys.next() else {
+        return 0;
+    };
     // A key has a node of its own on each level from the first on that tells it from the key before.
-    let own = keys
-        .windows(2)
-        .map(|pair| u64::from((u64::BITS - (pair[0] ^ pair[1]).leading_zeros()).div_ceil(3)));
-    first + own.sum::<u64>()
+    keys.fold(u64::from(depth), |sum, key| {
+        let own = (u64::BITS - (key ^ before).leading_zeros()).div_ceil(3);
+        before = key;
+        sum + u64::from(own)
+    })
 }
 
 #[cfg(test)]
@@ -47,7 +54,7 @@ mod tests {
             let voxels = Voxels::new(depth, keys);
             let octree = Octree::new(voxels.clone()).unwrap();
             let all: usize = (1..=depth).map(|level| octree.level(level).len()).sum();
-            assert_eq!(nodes(&voxels), all as u64);
+            assert_eq!(nodes(depth, voxels.keys().iter().copied()), all as u64);
         }
     }
 }

@@ -32,6 +32,7 @@ use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
 pub use memory::encode_memory;
+pub(crate) use memory::memory_of;
 pub use predicted::{PredictedFrame, encode_predicted};
 pub use quality::QualityTarget;
 
