@@ -54,6 +54,7 @@
 //! Without any, the library is the bare decoder: streams and models in, Gaussians in memory out. `ply` adds PLY files,
 //! `render` pictures, `encoder` (default) all of it, and `embedded` the models and samples that the program contains.
 #![forbid(unsafe_code)]
+#![cfg_attr(not(test), warn(clippy::print_stderr, clippy::print_stdout))]
 
 #[doc(hidden)]
 pub mod axes;

@@ -19,4 +19,5 @@ if [ ! -e "$main" ]; then
         "@playcanvas/splat-transform@$version" || skip "npm could not have splat-transform $version"
 fi
 node "$main" --version > /dev/null || skip "splat-transform $version does not start"
-B2P_SPLAT_TRANSFORM=$PWD/$main cargo test --locked -p b2p-formats --test splat_transform -- --nocapture
+# Of the whole workspace, so that nothing is compiled again with other features.
+B2P_SPLAT_TRANSFORM=$PWD/$main cargo test --locked --workspace --test splat_transform -- --nocapture

@@ -10,6 +10,7 @@
 //!
 //! A block whose cells are all copied, colours included, is *kept*, if coding what differs saves less distortion than
 //! it costs bits. D is compared with the true frame, never with the previous one, so that errors do not add up.
+//! Differences of colours that sampling explains (`noise.rs`) are no distortion, and are left out of what is coded.
 
 use rayon::prelude::*;
 

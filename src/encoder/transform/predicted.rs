@@ -158,12 +158,6 @@ impl Target {
             false => choice::choose(&search, block, weights),
         };
         let mut shown: Vec<Shown> = blocks.par_iter_mut().map(choose).collect();
-        eprintln!(
-            "blocks {} kept {} zero {}",
-            blocks.len(),
-            blocks.iter().filter(|b| b.keep).count(),
-            blocks.iter().filter(|b| b.vector == [0; 3]).count()
-        );
         if shown.iter().all(Vec::is_empty) {
             // A frame has at least one voxel.
             for (shown, block) in shown.iter_mut().zip(&mut blocks) {
