@@ -158,9 +158,7 @@ struct ColourSum {
 impl ColourSum {
     /// Adds the voxels in the voxel `key`, `shift / 3` levels above.
     fn add(&mut self, voxels: &Voxels, colours: &[[u8; 3]], shift: u8, key: u64) {
-        let first = voxels.keys().partition_point(|k| k >> shift < key);
-        let inside = voxels.keys()[first..].iter().take_while(|k| *k >> shift == key);
-        for (_, colour) in inside.zip(&colours[first..]) {
+        for colour in &colours[voxels.within(key, shift)] {
             for (sum, c) in self.sum.iter_mut().zip(colour) {
                 *sum += u64::from(*c);
             }

@@ -1,5 +1,8 @@
 //! The occupied voxels of one octree level (`docs/format.md`, clause 2.3).
 
+#[cfg(feature = "encoder")]
+use std::ops::Range;
+
 use super::morton;
 
 /// The occupied voxels of one level, in Morton order.
@@ -33,6 +36,15 @@ impl Voxels {
         );
         debug_assert!(keys.windows(2).all(|w| w[0] < w[1]));
         Voxels { depth, keys }
+    }
+
+    /// Numbers of the voxels in the node `key`, whose level is `shift / 3` above.
+    #[cfg(feature = "encoder")]
+    pub(crate) fn within(&self, key: u64, shift: u8) -> Range<usize> {
+        let first = self.keys.partition_point(|k| k >> shift < key);
+        // A node has few of all voxels.
+        let inside = self.keys[first..].iter().take_while(|k| *k >> shift == key);
+        first..first + inside.count()
     }
 
     /// The octree level. Coordinates are below `2^depth`.

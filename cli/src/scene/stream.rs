@@ -1,7 +1,7 @@
 //! `b2p encode` of a cloud that does not fit into memory: it is read piece by piece, and sorted on disk.
 
 use b2p::cloud::{ColourRange, CommonGrid, GridNeed, Note, PointCloud, voxelise_memory};
-use b2p::encoder::transform::Options;
+use b2p::encoder::transform::{Options, surface_within};
 use b2p::scene::{BLOCK_VOXELS, Grid, Runs};
 use b2p::{Error, Limits, SceneEncoder};
 use b2p_formats::clouds::Pieces;
@@ -19,14 +19,12 @@ const SHARE: u64 = 8;
 /// Points of a piece at least.
 const LEAST: u64 = 1 << 12;
 
-/// Bytes that coding takes for each voxel of a surface, whose octree has 1.4 times as many nodes, and at least.
-const CODED_BYTES: u64 = 400;
-const CODING: u64 = 64 << 20;
+/// Voxels of a block at least: smaller blocks take many more bits.
+const LEAST_BLOCK: usize = 1 << 16;
 
 /// Voxels of a block of which two are coded at a time within the limits.
 fn block_voxels(limits: &Limits) -> usize {
-    let voxels = (limits.max_bytes / 2).saturating_sub(CODING) / CODED_BYTES;
-    (voxels as usize).clamp(BLOCK_VOXELS >> 5, BLOCK_VOXELS)
+    (surface_within(limits.max_bytes / 2) as usize).clamp(LEAST_BLOCK, BLOCK_VOXELS)
 }
 
 /// The pieces of a cloud, if it is to be read in pieces: it is one file, and larger than memory allows.

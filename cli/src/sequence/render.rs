@@ -23,6 +23,8 @@ use super::Pattern;
 
 /// Frames that wait to be drawn while the next one is decoded.
 const WAITING: usize = 1;
+/// Bytes of a Gaussian of one colour: 14 numbers.
+const GAUSSIAN_BYTES: usize = 14 * size_of::<f32>();
 
 /// Draws every frame with one camera: into a video, or into pictures of a pattern. While a frame is drawn, the next one
 /// is decoded.
@@ -192,7 +194,9 @@ impl Film<'_> {
             None => self.new_renderer()?,
         };
         let mut artist = Artist::new(renderer, gaussians, self.limits, self.args, self.format);
-        artist.other_bytes = self.other_bytes;
+        // Beside the frame that is drawn, one more was made that could not be handed over.
+        let others = (WAITING + 1) * gaussians.len() * GAUSSIAN_BYTES;
+        artist.other_bytes = self.other_bytes.saturating_add(others as u64);
         artist.draw(&camera)?;
         use_picture(&mut artist)?;
         self.renderer = Some(artist.renderer);

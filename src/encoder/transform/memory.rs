@@ -8,6 +8,8 @@ const FIXED: u64 = 64 << 20;
 const NODE: u64 = 240;
 /// The same where the encoder looks for a rate: what it found so far beside what it tries, and colours to try.
 const NODE_TO_RATE: u64 = 390;
+/// Bytes of a voxel as it came and as a part of a cloud.
+const COPIES: u64 = 32;
 
 /// Bytes that [`encode`](super::encode) of these voxels holds at most, beside the cloud itself; with `to_rate`
 /// [`encode_to_rate`](super::encode_to_rate). The bytes of a node were measured; `cargo test --test memory` compares the
@@ -20,6 +22,12 @@ pub fn encode_memory(voxels: &Voxels, to_rate: bool) -> u64 {
 pub(crate) fn memory_of(depth: u8, keys: impl Iterator<Item = u64>, to_rate: bool) -> u64 {
     let each = if to_rate { NODE_TO_RATE } else { NODE };
     nodes(depth, keys).saturating_mul(each).saturating_add(FIXED)
+}
+
+/// Voxels of a surface that `bytes` of memory suffice to encode: of such, an octree has 1.4 times as many nodes, and of
+/// the voxels themselves there are copies.
+pub fn surface_within(bytes: u64) -> u64 {
+    bytes.saturating_sub(FIXED) / (NODE * 7 / 5 + COPIES)
 }
 
 /// Voxels of all levels below the root.

@@ -31,8 +31,8 @@ use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
-pub use memory::encode_memory;
 pub(crate) use memory::memory_of;
+pub use memory::{encode_memory, surface_within};
 pub use predicted::{PredictedFrame, encode_predicted};
 pub use quality::QualityTarget;
 

@@ -155,9 +155,7 @@ impl Search<'_> {
 
     /// Numbers of the voxels of `level` in a block.
     pub fn voxels(&self, level: u8, key: u64) -> std::ops::Range<usize> {
-        let (keys, down) = (self.octree.level(level).keys(), 3 * (level - self.block_level));
-        let first = keys.partition_point(|k| k >> down < key);
-        first..first + keys[first..].partition_point(|k| k >> down == key)
+        self.octree.level(level).within(key, 3 * (level - self.block_level))
     }
 
     /// The voxels of level `top` that the previous frame has in a block, moved by `vector`.

@@ -52,10 +52,8 @@ pub(super) fn samples(cloud: &ColouredVoxels, octree: &Octree, top: u8) -> Vec<S
 }
 
 fn in_voxel(voxels: &Voxels, colours: &[[u8; 3]], shift: u8, key: u64) -> Sampled {
-    let first = voxels.keys().partition_point(|k| k >> shift < key);
     let (mut count, mut sums, mut squares) = (0.0f32, [0.0f32; 3], 0.0f32);
-    let inside = voxels.keys()[first..].iter().take_while(|k| *k >> shift == key);
-    for (_, colour) in inside.zip(&colours[first..]) {
+    for colour in &colours[voxels.within(key, shift)] {
         let colour: Ycc = from_rgb(colour.map(i32::from)).map(|x| x as i16);
         let colour = in_255ths(colour.map(f32::from));
         count += 1.0;

@@ -88,11 +88,10 @@ impl EncoderInput<'_> {
 
     /// For each voxel of a level above the cloud's own, which of its children hold points.
     fn points(&self, level: u8) -> Vec<u8> {
-        let keys = self.cloud.voxels.keys();
+        let voxels = &self.cloud.voxels;
         let shift = 3 * (self.cloud.voxels.depth() - level);
         let mask = |key: &u64| {
-            let first = keys.partition_point(|k| k >> shift < *key);
-            let inside = keys[first..].iter().take_while(|k| *k >> shift == *key);
+            let inside = voxels.keys()[voxels.within(*key, shift)].iter();
             inside.fold(0, |mask, k| mask | 1 << (k >> (shift - 3) & 7))
         };
         self.octree.level(level).keys().par_iter().map(mask).collect()
