@@ -110,9 +110,8 @@ fn floats<S: Simd>(s: S, x: &Arguments) -> Vec<(&'static str, Lanes)> {
         ),
         (
             "neg_mul_add",
-            collect!(Near, 0.0, n, x, |at| c(at)
-                .neg_mul_add(c(at).abs(), S::F32::splat(s, -1.0))
-                .abs()),
+            // Both terms have one sign: what cancels would magnify the rounding of the product.
+            collect!(Near, 0.0, n, x, |at| c(at).neg_mul_add(c(at), S::F32::splat(s, -1.0))),
         ),
         ("sqrt", collect!(F32, 0.0, n, x, |at| a(at).sqrt())),
         ("abs", collect!(F32, 0.0, n, x, |at| a(at).abs())),
