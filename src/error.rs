@@ -222,7 +222,8 @@ pub(crate) mod feature {
     pub const FLAGS: &str = "a critical feature of this stream";
     pub const CHUNK: &str = "this chunk type";
     pub const CHUNK_OF_VERSION_2: &str = "this chunk type of version 2";
-    pub const UNITS: &str = "the index of this scene";
+    pub const UNITS_OF_SCENE: &str = "the index of this scene";
+    pub const UNITS_OF_SEQUENCE: &str = "the index of this sequence";
 }
 
 impl Error {
@@ -240,7 +241,8 @@ impl Error {
                 feature::VERSION | feature::FLAGS => Some("2.2.1"),
                 feature::CHUNK => Some("3.1.2"),
                 feature::CHUNK_OF_VERSION_2 => Some("8.1.2"),
-                feature::UNITS => Some("18.2.2"),
+                feature::UNITS_OF_SCENE => Some("18.2.2"),
+                feature::UNITS_OF_SEQUENCE => Some("17.2.2"),
                 _ => None,
             },
             _ => None,
@@ -252,6 +254,9 @@ impl Error {
 fn of_missing(stage: Stage, field: &str) -> Option<&'static str> {
     match stage {
         Stage::Bitstream if field.ends_with("section") => Some("2.1.1"),
+        Stage::Bitstream if field == "index of the sequence" => Some("17.1.1"),
+        Stage::Bitstream if field == "group of frames" => Some("17.2.3"),
+        Stage::Bitstream if field == "frame table" => Some("17.3.1"),
         Stage::Bitstream if field == "index of the scene" => Some("18.1.1"),
         Stage::Bitstream if field == "block" => Some("18.2.4"),
         // A section is whole before its chunks are read.
@@ -298,6 +303,9 @@ mod tests {
             (missing(Stage::Bitstream, "feature section"), "2.1.1"),
             (missing(Stage::Bitstream, "chunk payload"), "2.1.2"),
             (missing(Stage::Bitstream, "magic"), "2.2.1"),
+            (missing(Stage::Bitstream, "index of the sequence"), "17.1.1"),
+            (missing(Stage::Bitstream, "group of frames"), "17.2.3"),
+            (missing(Stage::Bitstream, "frame table"), "17.3.1"),
             (missing(Stage::Bitstream, "index of the scene"), "18.1.1"),
             (missing(Stage::Bitstream, "block"), "18.2.4"),
             (missing(Stage::Geometry, "occupancy"), "4.2.3"),
@@ -306,7 +314,8 @@ mod tests {
             (lacking(feature::FLAGS), "2.2.1"),
             (lacking(feature::CHUNK), "3.1.2"),
             (lacking(feature::CHUNK_OF_VERSION_2), "8.1.2"),
-            (lacking(feature::UNITS), "18.2.2"),
+            (lacking(feature::UNITS_OF_SCENE), "18.2.2"),
+            (lacking(feature::UNITS_OF_SEQUENCE), "17.2.2"),
             (hashes("colours"), "5.10.1"),
             (hashes("latents"), "8.2.2"),
             (Error::ModelMismatch { expected, found }, "9.5.2"),

@@ -45,6 +45,21 @@ pub fn run(args: &Check, limits: &Limits) -> Result<Said> {
     Err(Failure(format!("{bad} of {streams} not known to be valid")))
 }
 
+/// The clause of the format that a stream breaks, as it is put behind its error.
+pub fn named_clause(error: &Error) -> String {
+    let named = error.clause().map(|clause| format!(" (clause {clause})"));
+    named.unwrap_or_default()
+}
+
+/// What is said of a file whose header or index is refused.
+pub fn refused(path: &Path) -> impl Fn(Error) -> Failure + '_ {
+    move |error| {
+        let clause = named_clause(&error);
+        let Failure(text) = Failure::in_file(path)(error);
+        Failure(text + &clause)
+    }
+}
+
 /// What is said of a file.
 struct Report<'a> {
     path: &'a Path,

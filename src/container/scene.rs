@@ -157,7 +157,7 @@ pub fn parse_index(bytes: &[u8], header: &Header, limits: &Limits) -> Result<Vec
         let value = format!("{section:?}");
         return Err(malformed("18.1.2", 72, "section lengths of a scene", value, 0));
     }
-    let chunk = only_chunk(bytes, header.bytes(), ChunkKind::Index).map_err(of_index)?;
+    let chunk = only_chunk(bytes, header.bytes(), ChunkKind::Index, "index of the scene").map_err(of_index)?;
     if chunk.count == 0 {
         return Err(malformed("18.2.1", chunk.offset, "number of blocks", 0, "at least 1"));
     }
@@ -165,7 +165,7 @@ pub fn parse_index(bytes: &[u8], header: &Header, limits: &Limits) -> Result<Vec
     let units = reader.read(|r| r.u8("units of the index"))?;
     if units != UNITS_IN_SPACE {
         return Err(Error::Unsupported {
-            what: feature::UNITS,
+            what: feature::UNITS_OF_SCENE,
             detail: format!("its units are of kind {units}; this version knows blocks, kind 1"),
         });
     }
@@ -191,14 +191,6 @@ pub fn parse_index(bytes: &[u8], header: &Header, limits: &Limits) -> Result<Vec
 /// What is wrong with the chunk, as the clauses of scenes say it.
 fn of_index(error: Error) -> Error {
     match error {
-        Error::Truncated {
-            stage, offset, needed, ..
-        } => Error::Truncated {
-            stage,
-            offset,
-            field: "index of the scene",
-            needed,
-        },
         Error::Malformed {
             clause: Some("17.2.1"), ..
         } => error.breaks("18.2.1"),

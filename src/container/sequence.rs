@@ -9,7 +9,7 @@ use super::chunk::{Chunk, ChunkKind, Chunks, Form};
 use super::header::{Header, Section};
 use super::malformed;
 use super::reader::{Reader, put_varint};
-use crate::error::{Error, Result, Stage};
+use crate::error::{Error, Result, Stage, feature};
 use crate::limits::Limits;
 
 /// Maximum number of frames of a group.
@@ -122,12 +122,15 @@ impl Index {
             let value = format!("{section:?}");
             return Err(malformed("17.1.2", 72, "section lengths of a sequence", value, 0));
         }
-        let chunk = only_chunk(bytes, header.bytes(), ChunkKind::Index)?;
+        let chunk = only_chunk(bytes, header.bytes(), ChunkKind::Index, "index of the sequence")?;
+        if chunk.count == 0 {
+            return Err(malformed("17.2.1", chunk.offset, "number of groups", 0, "at least 1"));
+        }
         let mut reader = InPayload::new(&chunk, "17.2.2");
         let units = reader.read(|r| r.u8("units of the index"))?;
         if units != UNITS_IN_TIME {
             return Err(Error::Unsupported {
-                what: "the index of this sequence",
+                what: feature::UNITS_OF_SEQUENCE,
                 detail: format!("its units are of kind {units}; this version knows groups of frames, kind 0"),
             });
         }
@@ -154,10 +157,7 @@ impl Index {
             index.groups.push(entry);
         }
         reader.finish()?;
-        match index.groups.is_empty() {
-            true => Err(malformed("17.2.1", chunk.offset, "number of groups", 0, "at least 1")),
-            false => Ok(index),
-        }
+        Ok(index)
     }
 
     /// Appends the index. The groups' offsets and first frames follow from the rest.
@@ -232,7 +232,7 @@ impl GroupEntry {
 /// # Errors
 /// [`Error::Truncated`], [`Error::ChecksumMismatch`], [`Error::Malformed`], [`Error::LimitExceeded`].
 pub fn parse_table(group: &[u8], entry: &GroupEntry, common: &Header, limits: &Limits) -> Result<Vec<FrameEntry>> {
-    let chunk = only_chunk(group, 0, ChunkKind::FrameTable)?;
+    let chunk = only_chunk(group, 0, ChunkKind::FrameTable, "frame table")?;
     if chunk.count != entry.frames {
         let field = "number of frames in the table";
         return Err(malformed("17.3.1", chunk.offset, field, chunk.count, entry.frames));
@@ -248,16 +248,13 @@ pub fn parse_table(group: &[u8], entry: &GroupEntry, common: &Header, limits: &L
         frames.push(frame);
     }
     reader.finish()?;
-    if frames
-        .first()
-        .is_none_or(|first| first.kind != FrameKind::Whole || first.ticks > 0)
-    {
-        let expected = "a whole frame at the start of the group";
+    if frames.first().is_none_or(|first| first.kind != FrameKind::Whole) {
+        let (field, expected) = ("first frame of the group", "a whole frame");
         return Err(malformed(
             "17.3.3",
             chunk.payload_at,
-            "first frame",
-            "another",
+            field,
+            "a predicted one",
             expected,
         ));
     }
@@ -333,17 +330,23 @@ fn check_frame(frame: &FrameEntry, at: usize, common: &Header, limits: &Limits) 
     }
 }
 
-/// The chunk of this kind that starts at byte `at`.
-pub(super) fn only_chunk(bytes: &[u8], at: usize, kind: ChunkKind) -> Result<Chunk<'_>> {
+/// The first critical chunk from byte `at` on, which must be of this kind. One that is not all there is the `field` that
+/// is cut.
+pub(super) fn only_chunk<'a>(bytes: &'a [u8], at: usize, kind: ChunkKind, field: &'static str) -> Result<Chunk<'a>> {
+    let cut = |offset, needed| Error::Truncated {
+        stage: Stage::Bitstream,
+        offset,
+        field,
+        needed,
+    };
     if at >= bytes.len() {
-        return Err(Error::Truncated {
-            stage: Stage::Bitstream,
-            offset: bytes.len() as u64,
-            field: "index or frame table",
-            needed: (at - bytes.len() + 1) as u64,
-        });
+        return Err(cut(bytes.len() as u64, (at - bytes.len() + 1) as u64));
     }
-    Chunks::new(Form::Sequence, bytes, at..bytes.len()).expect(kind, 0, 0, 0..=u32::MAX.into())
+    let chunk = Chunks::new(Form::Sequence, bytes, at..bytes.len()).expect(kind, 0, 0, 0..=u32::MAX.into());
+    chunk.map_err(|error| match error {
+        Error::Truncated { offset, needed, .. } => cut(offset, needed),
+        error => error,
+    })
 }
 
 pub(super) fn put_chunk(kind: ChunkKind, count: usize, payload: &[u8], out: &mut Vec<u8>) -> Result<()> {
@@ -427,9 +430,14 @@ impl<'a> InPayload<'a> {
             other => return Err(malformed("17.3.2", at, "kind of a frame", other, "0 or 1")),
         };
         let step = self.varint("ticks after the frame before")?;
-        let ticks = before.map_or(Some(step), |before| before.ticks.checked_add(step).filter(|_| step > 0));
+        let (ticks, expected) = match before {
+            None => (Some(0).filter(|_| step == 0), "0 for the first frame"),
+            Some(before) => (
+                before.ticks.checked_add(step).filter(|_| step > 0),
+                "more than 0, and less than 2^32 in all",
+            ),
+        };
         let Some(ticks) = ticks else {
-            let expected = "more than 0, and less than 2^32 in all";
             return Err(malformed("17.3.2", at, "ticks after the frame before", step, expected));
         };
         let points = self.varint("points of a frame")?;

@@ -71,6 +71,14 @@ impl SequenceDecoder {
         }
     }
 
+    /// Decodes all frames, and returns what is wrong with the sequence: with each frame, and behind the last group.
+    pub fn faults(&mut self, sequence: &SequenceReader) -> Vec<Error> {
+        let frames = self.frames(sequence, 0..sequence.frames());
+        let mut faults: Vec<Error> = frames.filter_map(Result::err).collect();
+        faults.extend(sequence.check_end().err());
+        faults
+    }
+
     /// The Gaussians of the frames `frames`, one after the other: while those of a frame are made, the next frame is
     /// decoded.
     pub fn gaussians<'a>(&'a mut self, sequence: &'a SequenceReader<'a>, frames: Range<u64>) -> GaussianFrames<'a> {

@@ -189,7 +189,7 @@ impl<'a> SequenceReader<'a> {
             }),
             Some(rest) => {
                 let field = "number of bytes after the last group";
-                Err(Error::malformed(Stage::Bitstream, format!("byte {end}"), field, rest, 0).breaks("17.2.3"))
+                Err(Error::malformed(Stage::Bitstream, format!("byte {end}"), field, rest, 0).breaks("17.1.1"))
             }
         }
     }
@@ -313,6 +313,19 @@ fn shifted(error: Error, start: u64) -> Error {
             offset: offset + start,
             field,
             needed,
+        },
+        Error::ChecksumMismatch {
+            what,
+            offset,
+            expected,
+            found,
+            clause,
+        } => Error::ChecksumMismatch {
+            what,
+            offset: offset + start,
+            expected,
+            found,
+            clause,
         },
         error => error,
     }

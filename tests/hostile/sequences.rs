@@ -120,8 +120,21 @@ fn motion_that_is_changed_behind_the_hash_is_refused_or_decoded_within_the_limit
             // The hash of colours tells that another motion is not the one that was coded with.
             if let Err(error) = &found[1] {
                 assert!(matches!(error, Error::Frame { frame: 1, .. }), "bit {bit}: {error}");
+                assert!(error.clause().is_some(), "bit {bit}: {error} has no clause");
             }
         });
+}
+
+#[test]
+fn a_fault_in_a_group_is_at_its_place_in_the_file() {
+    let bytes = sequence();
+    let (_, index, mut group) = parts(&bytes);
+    group[9] ^= 1;
+    let found = frames(&with_group(&bytes, &group)).expect("a sequence");
+    match &found[0] {
+        Err(Error::ChecksumMismatch { offset, .. }) => assert_eq!(*offset, index.groups[0].offset),
+        other => panic!("{other:?}"),
+    }
 }
 
 #[test]

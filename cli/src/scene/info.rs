@@ -3,9 +3,10 @@
 use std::path::Path;
 
 use b2p::geometry::morton;
-use b2p::{Decoder, Limits};
+use b2p::{Decoder, Limits, SceneReader};
 use serde_json::json;
 
+use super::super::check::{named_clause, refused};
 use super::super::manners::{self, Said};
 use super::super::table::{count, counted, table};
 use super::super::{Failure, Result};
@@ -79,23 +80,22 @@ pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
 
 /// Checks every block, and says which are not valid.
 pub fn check(path: &Path, limits: &Limits) -> Result<String> {
-    let scene = super::open(path, limits)?;
+    let scene = SceneReader::new(super::source(path, limits)?, limits).map_err(refused(path))?;
     let checks = scene.check(&Decoder::new().with_limits(limits.clone()));
-    let clause = |error: &b2p::Error| error.clause().map(|clause| format!(" (clause {clause})"));
     let mut faults = Vec::new();
     for (block, checked) in checks.blocks.iter().enumerate() {
         match checked {
-            Err(error) => faults.push(format!("{error}{}", clause(error).unwrap_or_default())),
+            Err(error) => faults.push(format!("{error}{}", named_clause(error))),
             Ok(checked) => {
                 let own = checked.faults.iter().map(|fault| &fault.error);
                 for error in own.chain(&checked.unchecked) {
-                    faults.push(format!("block {block}: {error}{}", clause(error).unwrap_or_default()));
+                    faults.push(format!("block {block}: {error}{}", named_clause(error)));
                 }
             }
         }
     }
     let end = checks.end.iter();
-    faults.extend(end.map(|error| format!("{error}{}", clause(error).unwrap_or_default())));
+    faults.extend(end.map(|error| format!("{error}{}", named_clause(error))));
     let name = path.display();
     if faults.is_empty() {
         return Ok(format!(

@@ -60,11 +60,15 @@ pub fn is_scene(path: &Path) -> bool {
 
 /// Opens a scene. Blocks of a file are read when they are needed; standard input is read to its end first.
 pub fn open(path: &Path, limits: &Limits) -> Result<Reader> {
-    let source = match manners::is_pipe(path) {
+    SceneReader::new(source(path, limits)?, limits).map_err(Failure::in_file(path))
+}
+
+/// The bytes of a scene.
+fn source(path: &Path, limits: &Limits) -> Result<SceneSource> {
+    Ok(match manners::is_pipe(path) {
         true => SceneSource::Memory(load::bytes(path, limits)?),
         false => SceneSource::File(FileSource::open(path).map_err(Failure::in_file(path))?),
-    };
-    SceneReader::new(source, limits).map_err(Failure::in_file(path))
+    })
 }
 
 /// Fails, before anything is begun, unless the machine has the memory that decoding a part of a scene takes.

@@ -5,6 +5,8 @@ use std::path::Path;
 use b2p::{Decoder, Limits, SequenceDecoder, SequenceReader};
 use serde_json::json;
 
+use super::super::check::{named_clause, refused};
+use super::super::load;
 use super::super::manners::{self, Said};
 use super::super::table::{count, counted, table};
 use super::super::{Failure, Result};
@@ -77,24 +79,14 @@ pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
 
 /// Decodes every frame, and says which cannot be.
 pub fn check(path: &Path, limits: &Limits) -> Result<String> {
-    let sequence = super::read(path, limits)?;
-    let mut decoder = SequenceDecoder::new(Decoder::new().with_limits(limits.clone()));
-    let mut faults = Vec::new();
-    for frame in decoder.frames(&sequence, 0..sequence.frames()) {
-        if let Err(error) = frame {
-            faults.push(error);
-        }
-    }
-    faults.extend(sequence.check_end().err());
+    let bytes = load::bytes(path, limits)?;
+    let sequence = SequenceReader::new(bytes, limits).map_err(refused(path))?;
+    let faults = SequenceDecoder::new(Decoder::new().with_limits(limits.clone())).faults(&sequence);
     let name = path.display();
     match faults.first() {
         None => Ok(format!("{name}: valid, {}\n", counted(sequence.frames(), "frame"))),
         Some(first) => {
-            let clause = first
-                .clause()
-                .map(|clause| format!(" (clause {clause})"))
-                .unwrap_or_default();
-            let count = counted(faults.len() as u64, "fault");
+            let (count, clause) = (counted(faults.len() as u64, "fault"), named_clause(first));
             Err(Failure(format!("{name}: {count}, the first: {first}{clause}")))
         }
     }

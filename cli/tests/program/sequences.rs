@@ -56,6 +56,18 @@ fn a_folder_a_pattern_and_a_list_of_files_make_the_same_sequence() {
 }
 
 #[test]
+fn a_check_of_a_damaged_sequence_names_the_clause_that_it_breaks() {
+    let folder = frames();
+    let at = folder.path();
+    encode(at, &["frames"], "a.b2p", &[]);
+    let whole = bytes(at, "a.b2p");
+    for (end, clause) in [(90, "2.2.1"), (130, "17.1.1"), (whole.len() - 1, "17.2.3")] {
+        std::fs::write(at.join("cut.b2p"), &whole[..end]).unwrap();
+        fails(at, &["check", "cut.b2p"], &["cut.b2p", &format!("(clause {clause})")]);
+    }
+}
+
+#[test]
 fn parts_of_a_sequence_are_cut_joined_decoded_and_drawn() {
     let folder = frames();
     let at = folder.path();
