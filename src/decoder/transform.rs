@@ -253,6 +253,9 @@ impl Growing<'_> {
         }
         let step = step.ok_or_else(nothing_reached)?;
         self.part.check_colours(colour_hash(&step.coloured))?;
+        if let Some(inter) = self.inter {
+            inter.check(octree)?;
+        }
         Ok(step)
     }
 

@@ -211,6 +211,26 @@ impl Inter {
         }
     }
 
+    /// Checks the motion of level L, of which the octree has all voxels. No level needs it if its blocks are the voxels
+    /// of the finest level.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if the motion is damaged.
+    pub fn check(&self, octree: &Octree) -> Result<()> {
+        self.blocks(octree).map(drop)
+    }
+
+    /// The blocks, read when they are first asked for. The octree has their level.
+    fn blocks(&self, octree: &Octree) -> Result<&Blocks> {
+        if let Some(blocks) = self.blocks.get() {
+            return Ok(blocks);
+        }
+        let parts: Vec<&[u8]> = self.parts.iter().map(Vec::as_slice).collect();
+        let keys = octree.level(self.head.block_level).keys();
+        let blocks = self.head.blocks(self.base, keys, &parts)?;
+        Ok(self.blocks.get_or_init(|| blocks))
+    }
+
     /// Vectors of the blocks, once they are read.
     fn vectors(&self) -> &[[i16; 3]] {
         self.blocks.get().map_or(&[], |blocks| &blocks.vectors)
@@ -228,14 +248,7 @@ impl Inter {
             });
         }
         let voxels = octree.level(head.block_level);
-        let blocks = match self.blocks.get() {
-            Some(blocks) => blocks,
-            None => {
-                let parts: Vec<&[u8]> = self.parts.iter().map(Vec::as_slice).collect();
-                let blocks = head.blocks(self.base, voxels.keys(), &parts)?;
-                self.blocks.get_or_init(|| blocks)
-            }
-        };
+        let blocks = self.blocks(octree)?;
         let modes = blocks.modes.get(usize::from(level - head.block_level - 1));
         let Some(modes) = modes else {
             return Err(Error::Usage(format!("the motion of level {level} is not there")));

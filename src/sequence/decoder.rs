@@ -134,12 +134,10 @@ impl SequenceDecoder {
                 (false, None) => return Err(Error::Usage("the frame before was not decoded".into())),
                 (false, Some(last)) => {
                     self.check_memory(&header, group, level)?;
-                    Some(Inter::new(
-                        Arc::clone(&last.previous),
-                        &motion,
-                        header.base,
-                        header.top,
-                    )?)
+                    // What is wrong with the motion of finer levels is theirs.
+                    let motion = &motion[..=usize::from(level - header.base)];
+                    let previous = Arc::clone(&last.previous);
+                    Some(Inter::new(previous, motion, header.base, header.top)?)
                 }
             };
             let decoder = self.decoder.clone().with_level(level);

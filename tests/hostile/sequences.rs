@@ -2,7 +2,7 @@
 
 use b2p::cloud::ColouredVoxels;
 use b2p::container::Header;
-use b2p::container::sequence::{GroupEntry, Index, parse_table};
+use b2p::container::sequence::{GroupEntry, Index, parse_table, table_bytes};
 use b2p::geometry::{Voxels, morton};
 use b2p::{Decoder, Error, Limits, Placement, SequenceDecoder, SequenceEncoder, SequenceReader};
 use rayon::prelude::*;
@@ -123,6 +123,29 @@ fn motion_that_is_changed_behind_the_hash_is_refused_or_decoded_within_the_limit
                 assert!(error.clause().is_some(), "bit {bit}: {error} has no clause");
             }
         });
+}
+
+#[test]
+fn motion_of_a_finer_level_that_is_damaged_leaves_the_coarser_levels() {
+    let bytes = sequence();
+    let (header, index, mut group) = parts(&bytes);
+    let table = parse_table(&group, &index.groups[0], &header, &Limits::default()).expect("a table");
+    // More words than are read.
+    let (mut frames, at) = (table.clone(), table[1].offset + table[1].prefix_bytes(0));
+    let motion = at as usize..at as usize + table[1].levels[1].motion as usize;
+    let longer = [&group[motion.clone()], &[0; 12]].concat();
+    frames[1].levels[1].motion += 12;
+    group.splice(motion, longer);
+    let content = &group[table[0].offset as usize..];
+    let group = [&table_bytes(&frames).expect("a table"), content].concat();
+    let bytes = with_group(&bytes, &group);
+    let sequence = SequenceReader::new(&bytes[..], &Limits::default()).expect("a sequence");
+    let at_level = |level| {
+        let frame = SequenceDecoder::new(Decoder::new().with_level(level)).frame(&sequence, 1);
+        frame.map(drop).map_err(|error| error.clause())
+    };
+    assert_eq!(at_level(3), Ok(()));
+    assert_eq!(at_level(4), Err(Some("5.4.3")));
 }
 
 #[test]
