@@ -6,7 +6,7 @@
 //! every instruction set of the machine, one, two and seven threads, whole and in pieces. The bare decoder
 //! (`--no-default-features`) is enough for that.
 //!
-//! The suites of version 3 and of scenes are beside it: see `transform` and `scene`.
+//! The suites of version 3, of scenes and of sequences are beside it: see `transform`, `scene` and `sequence`.
 //!
 //! After a change of the format or of the shipped model, `cargo xtask conformance` makes streams and digests again.
 
@@ -16,11 +16,14 @@ mod common;
 mod damage;
 mod digest;
 mod digest_scene;
+mod digest_sequence;
 mod digest_transform;
 #[cfg(feature = "encoder")]
 mod make;
 #[cfg(feature = "encoder")]
 mod make_scene;
+#[cfg(feature = "encoder")]
+mod make_sequence;
 #[cfg(feature = "encoder")]
 mod make_transform;
 mod models;
@@ -28,6 +31,7 @@ mod scene;
 #[cfg(feature = "encoder")]
 #[path = "../common/seal.rs"]
 mod seal;
+mod sequence;
 mod transform;
 
 use std::path::{Path, PathBuf};

@@ -11,6 +11,9 @@ mod damage;
 mod digest;
 #[path = "../../tests/conformance/digest_scene.rs"]
 mod digest_scene;
+#[path = "../../tests/conformance/digest_sequence.rs"]
+#[allow(dead_code, reason = "the test checks sequences, too")]
+mod digest_sequence;
 #[path = "../../tests/conformance/digest_transform.rs"]
 #[allow(dead_code, reason = "the test decodes in pieces, too")]
 mod digest_transform;
@@ -19,6 +22,8 @@ mod digest_transform;
 mod make;
 #[path = "../../tests/conformance/make_scene.rs"]
 mod make_scene;
+#[path = "../../tests/conformance/make_sequence.rs"]
+mod make_sequence;
 #[path = "../../tests/conformance/make_transform.rs"]
 mod make_transform;
 #[path = "../../tests/conformance/models.rs"]
@@ -39,6 +44,7 @@ const USAGE: &str = "usage: cargo xtask TASK
 
 conformance  writes the streams and digests of the conformance suites into tests/data/conformance, and the damage
 scenes       writes those of the suite of scenes alone
+sequences    writes those of the suite of sequences alone
 damage       writes the list of damaged streams, tests/data/conformance/damage.txt
 seeds        writes the seeds of the fuzz targets into fuzz/corpus
 sample       renders the sample scene and codes it as models/scene.b2p and models/sample.b2p";
@@ -49,8 +55,10 @@ fn main() -> ExitCode {
         ["conformance"] => conformance()
             .and_then(|()| conformance_transform())
             .and_then(|()| conformance_scenes())
+            .and_then(|()| conformance_sequences())
             .and_then(|()| damage()),
         ["scenes"] => conformance_scenes(),
+        ["sequences"] => conformance_sequences(),
         ["damage"] => damage(),
         ["seeds"] => cargo(&[
             "run",
@@ -108,6 +116,20 @@ fn conformance_scenes() -> Result {
     }
     replace(&suite().join("scenes"), &streams, &text)?;
     println!("scenes: {}", streams.len());
+    Ok(())
+}
+
+/// Writes the sequences and their digests, in place of all that are there.
+fn conformance_sequences() -> Result {
+    let decoder = Decoder::new().with_heads(HeadSet::Surfels);
+    let (mut text, mut streams) = (String::new(), Vec::new());
+    for (name, bytes, _) in make_sequence::cases() {
+        let lines = digest_sequence::lines(&decoder, name, &bytes, false);
+        text += &lines.map_err(|error| format!("{name}: {error}"))?;
+        streams.push((name, bytes));
+    }
+    replace(&suite().join("sequences"), &streams, &text)?;
+    println!("sequences: {}", streams.len());
     Ok(())
 }
 
