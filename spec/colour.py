@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 from base import POWERS, Reader, clamp, ilog2, limit, quot, require, sgn3
 from coefficients import Model, RangeDecoder
+from motion import INTER, SKIP
 from octree import ABSENT, AXES, CORNERS, EDGES, FACES, OFFSETS, octant_xyz
 
 JOINS = ((3, 0, 4), (4, 1, 5), (5, 2, 6), (6, 3, 7), (1, 0, 2), (2, 1, 3), (0, 0, 1))
@@ -195,14 +196,16 @@ EMPTY = [[0] * 3 for _ in range(7)]
 
 
 class SliceDecoder:
-    """The children of the nodes `first..end` (5.6, 5.7)."""
+    """The children of the nodes `first..end` (5.6, 5.7). `guides`, in predicted frames: mode and colours of each node's
+    children (17.7)."""
 
-    def __init__(self, nodes, children, weights, height, above, first, end, steps, gain, model, decoder):
+    def __init__(self, nodes, children, weights, height, above, first, end, steps, gain, model, decoder, guides):
         self.weights, self.height = weights, height
         self.nodes, self.children, self.above = nodes, children, above
         self.first, self.end = first, end
         self.units, self.fraction, self.lossless = steps.units(), steps.fraction(), steps.lossless()
         self.gain, self.model, self.decoder = gain, model, decoder
+        self.guides = guides or [(0, ())] * len(nodes)
         self.base = nodes.first[first]
         self.values, self.energies, self.blocks = [], [], []
 
@@ -211,7 +214,9 @@ class SliceDecoder:
             mask, value = self.nodes.masks[i], self.above.values[i]
             block, sums = EMPTY, [0, 0, 0]
             done = mask.bit_count() - 1
-            if done == 0:
+            if self.guides[i][0] == SKIP:
+                self.values += [value if found is None else found for found in self.guides[i][1]]
+            elif done == 0:
                 self.values.append(value)
             else:
                 block = [[0] * 3 for _ in range(7)]
@@ -248,8 +253,19 @@ class SliceDecoder:
                     weight += w
             near[octant] = mean(sums, weight)
             child += 1
+        if self.guides[i][0] == INTER:
+            octants = [octant for octant in range(8) if mask >> octant & 1]
+            self.bring(near, dict(zip(octants, self.guides[i][1])))
         split = [[forward(joins, [v[t] for v in values]) for t in range(3)] for values in (near, far)]
         return [[[channels[t][slot] for t in range(3)] for slot in range(7)] for channels in split]
+
+    @staticmethod
+    def bring(near, found):
+        """17.7.3; `found` are the colours between voxels of the previous frame by octant, None where there is none."""
+        changes = [[x - n for x, n in zip(value, near[o])] for o, value in found.items() if value is not None]
+        d = [quot(sum(change), len(changes)) for change in zip(*changes)] or [0, 0, 0]
+        for octant, value in found.items():
+            near[octant] = value or [limit(n + x, 16384) for n, x in zip(near[octant], d)]
 
     def gradient(self, i):
         own, others = self.above.values[i], [self.nodes.near[i][k] for k in FACES]
@@ -274,9 +290,9 @@ class SliceDecoder:
             c.heavy = sum(fwd(v, w) > x for x in (3000, 3700, 4200))
             self.fwd, self.inv = (4096, 4096) if self.lossless else (fwd(v, w), inv(v, w))
             magnitudes = [self.sixteenths(t, abs(a[slot][t])) for t in range(3)]
-            brought = 0
+            brought, gain = 0, 256 if self.guides[i][0] == INTER else self.gain
             for t in range(3):
-                expected = a[slot][t] * self.gain + 128 >> 8
+                expected = a[slot][t] * gain + 128 >> 8
                 if self.units[t] == 0:
                     differences[slot][t] = expected
                     continue
@@ -352,8 +368,8 @@ def spread(nodes, energies):
     return result
 
 
-def decode_trunk(levels, payload):
-    """5.3.2; `levels` are the voxels of the levels 0 to K."""
+def decode_trunk(levels, payload, motion=None):
+    """5.3.2: the colours of the levels 0 to K, whose voxels are `levels`."""
     reader = Reader(payload, "5.3")
     steps = Steps(reader.number("B"), reader.number("B"))
     steps.check()
@@ -367,22 +383,25 @@ def decode_trunk(levels, payload):
     decoder = RangeDecoder(payload[reader.at :])
     fraction = steps.fraction()
     value = [keep(x << fraction, fraction) for x in colour]
-    coloured = Coloured(steps_of[0], target, [value], [[0, 0, 0]], Model())
+    coloured = [Coloured(steps_of[0], target, [value], [[0, 0, 0]], Model())]
     weights = trunk_weights(levels, target)
     for n, steps in enumerate(steps_of[1:], 1):
         (nodes, children), height = levels[n - 1 : n + 1], min(max(target - n, 0), 3)
-        part = SliceDecoder(nodes, children, weights[n], height, coloured, 0, len(nodes), steps, gain, coloured.model, decoder)
+        above, guides = coloured[-1], motion and motion.colours(nodes, children)
+        own = (steps, gain, above.model, decoder, guides)
+        part = SliceDecoder(nodes, children, weights[n], height, above, 0, len(nodes), *own)
         part.decode()
-        coloured = Coloured(steps, target, part.values, spread(nodes, part.energies), part.model)
+        coloured.append(Coloured(steps, target, part.values, spread(nodes, part.energies), part.model))
     decoder.finish()
     return coloured
 
 
-def decode_level(nodes, children, level, above, payloads, slice_nodes):
+def decode_level(nodes, children, level, above, payloads, slice_nodes, motion=None):
     """5.3.1; `nodes` is the level above."""
     up = max(above.target - level, 0)
     weights = estimates(children) if up else [1024] * len(children)
     values, energies, steps, model = [], [], None, None
+    guides = motion and motion.colours(nodes, children)
     for number, payload in enumerate(payloads):
         reader = Reader(payload, "5.3")
         own = Steps(reader.number("B"), reader.number("B"))
@@ -392,7 +411,8 @@ def decode_level(nodes, children, level, above, payloads, slice_nodes):
         first = number * slice_nodes
         end = min(first + slice_nodes, len(nodes))
         decoder = RangeDecoder(payload[reader.at :])
-        part = SliceDecoder(nodes, children, weights, min(up, 3), above, first, end, own, gain, above.model.copy(), decoder)
+        state = (own, gain, above.model.copy(), decoder, guides)
+        part = SliceDecoder(nodes, children, weights, min(up, 3), above, first, end, *state)
         part.decode()
         decoder.finish()
         values += part.values
@@ -402,14 +422,13 @@ def decode_level(nodes, children, level, above, payloads, slice_nodes):
     return Coloured(steps, above.target, values, spread(nodes, energies), model)
 
 
-def filtered(voxels, coloured, payload):
+def filtered(voxels, values, steps, payload):
     """5.11: the values after the filter."""
     require(payload and payload[0] in (1, 2) and len(payload) == 1 + 15 * payload[0], "5.11.1", "colour filter")
     weights = [w - 256 if w > 127 else w for w in payload[1:]]
-    values = coloured.values
     for at in range(0, len(weights), 15):
         passed = [weights[at + 5 * t : at + 5 * t + 5] for t in range(3)]
-        values = filter_pass(voxels, values, coloured.steps, passed)
+        values = filter_pass(voxels, values, steps, passed)
     return values
 
 

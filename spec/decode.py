@@ -1,6 +1,6 @@
 """Decodes streams of version 3, and holds a folder of conformance streams against their digests.
 
-    python3 spec/decode.py STREAM.b2p           prints the digests of every level, of a scene also those of each block
+    python3 spec/decode.py STREAM.b2p           prints the digests of every level, of each block and of each frame
     python3 spec/decode.py --suite FOLDER       checks all streams of FOLDER/suite.txt
     python3 spec/decode.py --damage LIST        checks that the streams of LIST are refused for the stated clauses
 """
@@ -17,6 +17,7 @@ import container
 import geometry
 import head_map
 import scene
+import sequence
 import surfels
 from base import Refused, require
 from octree import Voxels
@@ -24,38 +25,56 @@ from xxh3 import xxh3_64
 
 
 class Decoder:
-    """Decodes a stream level by level."""
+    """Decodes a stream level by level, or the sections of a frame of a sequence: then the header is given, and for a
+    predicted frame its motion and how the levels of the frame before were shown."""
 
-    def __init__(self, data):
-        self.data = data
-        self.header = container.parse_header(data)
-        end = self.header.length + sum(map(sum, self.header.sections))
-        require(len(data) <= end, "2.1.1", "bytes after the last section")
+    def __init__(self, data, header=None, motion=None, shown_before=None):
+        if header is None:
+            header = container.parse_header(data)
+            end = header.length + sum(map(sum, header.sections))
+            require(len(data) <= end, "2.1.1", "bytes after the last section")
+        self.data, self.header, self.motion = data, header, motion
         self.network = geometry.Network(geometry.WEIGHTS.read_bytes())
-        self.levels = [Voxels(0, [0], [(0, 0, 0)])]
-        self.coloured = None
+        self.levels, self.coloured = [], []
+        self.shown, self.shown_before = {}, shown_before or {}  # filter and steps of a level
+        self.reach(Voxels(0, [0], [(0, 0, 0)]))
+
+    def reach(self, voxels):
+        self.levels.append(voxels)
+        if self.motion:
+            self.motion.reach(voxels)
 
     def decode(self, level):
         """The next level: its voxels and its display colours."""
         part = container.read_level(self.data, self.header, level)
-        for n, slices in sorted(part.geometry.items()):
-            self.levels.append(geometry.decode_level(self.network, self.levels[-1], slices, self.header.slice_voxels))
+        for _, slices in sorted(part.geometry.items()):
+            nodes, size = self.levels[-1], self.header.slice_voxels
+            self.reach(geometry.decode_level(self.network, nodes, slices, size, self.motion))
         if part.trunk is not None:
             last, payload = part.trunk
-            self.coloured = colour.decode_trunk(self.levels[: last + 1], payload)
+            self.coloured = colour.decode_trunk(self.levels[: last + 1], payload, self.motion)
         for n, payloads in sorted(part.colours.items()):
             nodes, children = self.levels[n - 1 : n + 1]
-            self.coloured = colour.decode_level(nodes, children, n, self.coloured, payloads, self.header.colour_slice)
-        voxels, values = self.levels[level], self.coloured.values
+            above, size = self.coloured[-1], self.header.colour_slice
+            self.coloured.append(colour.decode_level(nodes, children, n, above, payloads, size, self.motion))
+        voxels, values, steps = self.levels[level], self.coloured[-1].values, self.coloured[-1].steps
         found = xxh3_64(b"".join((x & 65535).to_bytes(2, "little") for value in values for x in value))
         require(found == part.colour_hash, "5.10.1", f"colour hash of level {level}")
-        if part.filter is not None:
-            values = colour.filtered(voxels, self.coloured, part.filter)
+        self.shown[level] = self.show(level, part.filter, steps)
+        if self.shown[level][0] is not None:
+            values = colour.filtered(voxels, values, self.shown[level][1], self.shown[level][0])
         blocks = len(self.levels[max(level - 3, 0)])
         sizes = part.head_map and head_map.parse(part.head_map, blocks)
         self.size = sizes[1] if sizes else 64
-        fraction = self.coloured.steps.fraction()
-        return voxels, [colour.display(value, fraction) for value in values]
+        return voxels, [colour.display(value, steps.fraction()) for value in values]
+
+    def show(self, level, own_filter, steps):
+        """17.4.3: the filter of a level, and the steps that it has for 5.11."""
+        if own_filter is None and level in self.shown_before:
+            own_filter, before = self.shown_before[level]
+            if before.lossless() == steps.lossless():
+                steps = before
+        return own_filter, steps
 
 
 def digest(level, voxels, colours, gaussians, count, part):
@@ -66,13 +85,29 @@ def digest(level, voxels, colours, gaussians, count, part):
     return f"{level}=" + ",".join(hashlib.sha256(part).hexdigest() for part in (keys, own_colours, drawn))
 
 
-def digests(data):
-    """For a stream, and for each block of a scene, what is behind its name, and the digest of every level (16.4)."""
-    if scene.is_scene(data):
+def digests(data, like=None):
+    """For a stream, and for each block of a scene and each frame of a sequence, what is behind its name, and the digest of
+    every level (16.2, 16.4, 16.5). It must be what `like` is: a stream of one frame, a sequence or a scene."""
+    like = like or data
+    if sequence.is_sequence(like):
+        return sequence_digests(sequence.Sequence(data, Decoder))
+    if scene.is_scene(like):
         decoder = scene.Scene(data, Decoder)
-        names = ["", *(f"/{i}" for i in range(len(decoder.blocks)))]
-    else:
-        decoder, names = Decoder(data), [""]
+        return level_digests(decoder, ["", *(f"/{i}" for i in range(len(decoder.blocks)))])
+    return level_digests(Decoder(data), [""])
+
+
+def sequence_digests(decoder):
+    """16.5"""
+    lines, ticks = [], []
+    for number, (tick, frame) in enumerate(decoder.frames()):
+        lines += level_digests(frame, [f"/{number}"])
+        ticks.append(tick)
+    return [" ".join(map(str, ["", decoder.timescale, *ticks])), *lines]
+
+
+def level_digests(decoder, names):
+    """The digests of every level of a stream or a frame, or of a scene and each of its blocks."""
     lines = [[] for _ in names]
     for level in range(decoder.header.base, decoder.header.top + 1):
         voxels, colours, *of_scene = decoder.decode(level)
@@ -116,10 +151,11 @@ def check_damage(path):
     failed = count = 0
     for line in path.read_text().splitlines():
         name, stream, expected, *changes = line.split(" ")
-        if not stream.startswith(("version-3/", "scenes/")):
+        if not stream.startswith(("version-3/", "scenes/", "sequences/")):
             continue
+        whole = (path.parent / f"{stream}.b2p").read_bytes()
         try:
-            digests(damaged((path.parent / f"{stream}.b2p").read_bytes(), changes))
+            digests(damaged(whole, changes), whole)
             found = "nothing"
         except Refused as fault:
             found = fault.clause

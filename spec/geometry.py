@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from base import STRETCH, limit, quot, require, squash, wrap32
+from base import STRETCH, clamp, limit, quot, require, squash, wrap32
+from motion import SKIP
 from octree import ABSENT, BEFORE, FACES, OFFSETS, octant_xyz
 
 M32, M64 = (1 << 32) - 1, (1 << 64) - 1
@@ -96,8 +97,9 @@ class Mixer:
             self.inputs.append((STRETCH[one >> 4] - logit) * (1024 * seen // (4 * seen + 1)) >> 8)
         self.inputs += [logit, 20]
         total = sum(x * w for x, w in zip(self.inputs, self.weights))
-        self.mixed = squash(wrap32(total) >> 16)
-        return self.mixed
+        logit = limit(wrap32(total) >> 16, 720)
+        self.mixed = squash(logit)
+        return logit
 
     def learn(self, bit, network):
         error = 65536 * bit - self.mixed
@@ -110,11 +112,39 @@ class Mixer:
             self.tables[i][self.places[i]] = (self.checks[i], seen, min(max(one, 16), 65520))
 
 
-class Slice:
-    """The state of one slice (4.1)."""
+class Refined:
+    """17.6.4: how decisions follow the cells of the previous frame."""
 
-    def __init__(self, network, voxels, first, end, code):
+    def __init__(self):
+        starts = [[squash(45 * i - 720 + d) << 6 for i in range(33)] for d in (-96, 96)]
+        self.table = [list(starts[c % 2]) for c in range(126)]
+        self.seen = [[4] * 33 for _ in range(126)]
+        self.state = 8192
+
+    def decide(self, decoder, logit, window, own, octant, mask):
+        """17.6.3"""
+        shifted = window >> CELL[OWN][octant].bit_length() - 22
+        there = shifted >> 21 & 1
+        faces = (shifted & FACE_BITS).bit_count()
+        wrong = min(2, ((mask ^ own) & (1 << octant) - 1).bit_count())
+        errors = (self.state > 2048) + (self.state > 8192)
+        context = there + 2 * (faces + 7 * (wrong + 3 * errors))
+        i, r = divmod(min(logit + 720, 1439), 45)
+        table, seen = self.table[context], self.seen[context]
+        bit = decoder.decide(clamp((table[i] * (45 - r) + table[i + 1] * r) // 45 >> 6, 16, 65520))
+        for k in (i, i + 1):
+            table[k] += quot(2 * (((1 << 22) - 1) * bit - table[k]), 2 * seen[k] + 3)
+            seen[k] = min(seen[k] + 1, 250)
+        self.state += (2048 if bit != there else 0) - (self.state >> 5)
+        return bit
+
+
+class Slice:
+    """The state of one slice (4.1). `guides`, in predicted frames: mode and window of each parent (17.6.1)."""
+
+    def __init__(self, network, voxels, first, end, code, guides):
         self.network, self.voxels, self.first, self.end = network, voxels, first, end
+        self.guides, self.refined = guides, Refined()
         self.decoder = ArithmeticDecoder(code)
         self.mixer = Mixer(end - first)
         self.output, self.bias = network.output.copy(), list(network.bias)
@@ -133,6 +163,10 @@ class Slice:
 
     def parent(self, i):
         near, network = self.voxels.near[i], self.network
+        mode, window = self.guides[i] if self.guides else (0, 0)
+        own = sum(bool(window & cell) << octant for octant, cell in enumerate(CELL[OWN]))
+        if mode == SKIP and own:
+            return own
         known, unknown = {}, []
         for k, j in enumerate(near):
             if j != ABSENT and k != 13:
@@ -158,23 +192,27 @@ class Slice:
                 return 128
             node = 1 << octant | mask
             units = np.maximum(0, total + network.node[node])
-            bit = self.child(octant, units, words, occupied, hidden, node)
+            guide = (window, own, octant, mask) if mode else None
+            bit = self.child(octant, units, words, occupied, hidden, node, guide)
             mask |= bit << octant
             hidden &= ~CELL[OWN][octant]
             occupied |= CELL[OWN][octant] * bit
         return mask
 
-    def child(self, octant, units, words, occupied, hidden, node):
-        """4.8"""
+    def child(self, octant, units, words, occupied, hidden, node, guide):
+        """4.8; with a guide 17.6.3."""
         total = wrap32(self.bias[octant] + int(units @ self.output[octant]))
         logit = limit(total >> 12, 720)
         network = squash(logit)
-        if abs(logit) < 384:
-            one = self.mixer.predict(logit, words.contexts(octant, occupied, hidden, node))
-            bit = self.decoder.decide(one)
-            self.mixer.learn(bit, network)
+        mixes = abs(logit) < 384
+        if mixes:
+            logit = self.mixer.predict(logit, words.contexts(octant, occupied, hidden, node))
+        if guide:
+            bit = self.refined.decide(self.decoder, logit, *guide)
         else:
-            bit = self.decoder.decide(network)
+            bit = self.decoder.decide(squash(logit))
+        if mixes:
+            self.mixer.learn(bit, network)
         error = 65536 * bit - network
         if abs(error) >= 4096:
             e = quot(error, 64)
@@ -220,11 +258,12 @@ class Words:
         ]
 
 
-def decode_level(network, voxels, slices, slice_voxels):
+def decode_level(network, voxels, slices, slice_voxels, motion=None):
     """The level below `voxels`, from (children, code) of each slice."""
+    guides = motion and motion.occupancies(voxels)
     masks = []
     for number, (count, code) in enumerate(slices):
         first = number * slice_voxels
         end = min(first + slice_voxels, len(voxels))
-        masks += Slice(network, voxels, first, end, code).decode(count)
+        masks += Slice(network, voxels, first, end, code, guides).decode(count)
     return voxels.grow(masks)

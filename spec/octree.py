@@ -6,6 +6,7 @@ OFFSETS = [(k % 3 - 1, k // 3 % 3 - 1, k // 9 - 1) for k in range(27)]
 FACES = [4, 10, 12, 14, 16, 22]
 EDGES = [k for k in range(27) if AXES[k] == 2]
 CORNERS = [k for k in range(27) if AXES[k] == 3]
+CELLS = [(i % 4 - 1, i // 4 % 4 - 1, i // 16 - 1) for i in range(64)]  # 4.6.1
 BEFORE = [k for k in range(27) if min(OFFSETS[k]) < 0]
 
 
@@ -19,7 +20,7 @@ class Voxels:
 
     def __init__(self, level, keys, coordinates):
         self.level, self.keys, self.coordinates = level, keys, coordinates
-        places = {c: i for i, c in enumerate(coordinates)}
+        self.places = places = {c: i for i, c in enumerate(coordinates)}
         self.near = [
             [places.get((x + dx, y + dy, z + dz), ABSENT) for dx, dy, dz in OFFSETS] for x, y, z in coordinates
         ]

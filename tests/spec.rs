@@ -1,6 +1,6 @@
 //! Holds `docs/format.md` against the streams: the Python decoder in `spec/`, written from that document, must decode
-//! every conformance stream of version 3 and every scene to its digests. Needs Python 3.10 with numpy; without them the test says so
-//! and passes.
+//! every conformance stream of version 3, every scene and every frame of a sequence to its digests. Needs Python 3.10 with
+//! numpy; without them the test says so and passes.
 
 use std::path::Path;
 use std::process::Command;
@@ -57,6 +57,11 @@ fn a_decoder_written_from_the_document_decodes_the_conformance_streams() {
 #[test]
 fn a_decoder_written_from_the_document_decodes_and_draws_scenes_block_by_block() {
     decodes_all_of("scenes");
+}
+
+#[test]
+fn a_decoder_written_from_the_document_decodes_and_draws_every_frame_of_sequences() {
+    decodes_all_of("sequences");
 }
 
 /// Decodes the streams of a suite and compares with its digests.

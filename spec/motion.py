@@ -1,0 +1,217 @@
+"""What a frame is predicted from: motion and the moved frame, clauses 17.5 to 17.8 of docs/format.md."""
+
+from dataclasses import dataclass
+
+from base import Reader, clamp, require
+from coefficients import RangeDecoder
+from octree import CELLS, Voxels, octant_xyz
+
+INTRA, INTER, SKIP = 0, 1, 2
+CORNERS_BELOW = [octant_xyz(o) for o in range(8)]
+
+
+def half_up(a, b):
+    """1.3.5"""
+    return (2 * a + b) // (2 * b)
+
+
+@dataclass
+class Known:
+    """A level of a frame that was decoded: its voxels, and their colours before the filter."""
+
+    voxels: Voxels
+    values: list
+
+    def colour(self, place):
+        """The colour at a place, None if it was not occupied."""
+        i = self.voxels.places.get(place)
+        return None if i is None else self.values[i]
+
+
+class Bits:
+    """17.5.2: adaptive decisions. The names of the states are those of the document."""
+
+    def __init__(self):
+        self.states = {}
+
+    def decide(self, decoder, *name):
+        p = self.states.get(name, 32768)
+        bit = decoder.decide(clamp(p, 256, 65280))
+        self.states[name] = p + (65535 - p >> 4) if bit else p - (p >> 4)
+        return bit
+
+    def component(self, decoder, axis):
+        """17.5.3: a component of a difference of vectors."""
+        if not self.decide(decoder, "some", axis):
+            return 0
+        negative, m = self.decide(decoder, "sign", axis), 1
+        while m < 15 and self.decide(decoder, "more", axis, m - 1):
+            m += 1
+        if m == 15:
+            n, e = 0, 1
+            while decoder.decide(32768):
+                n += 1
+                require(n <= 16, "17.5.3", "difference of vectors")
+            for _ in range(n):
+                e = 2 * e + decoder.decide(32768)
+            m += e - 1
+        return -m if negative else m
+
+
+class Motion:
+    """The motion of a predicted frame. `payloads` are those of the levels L to M, `previous` the Known levels of the
+    frame before."""
+
+    def __init__(self, payloads, header, previous):
+        reader = Reader(payloads[0], "17.5.1")
+        self.block_level, self.unit, self.reference, modes = reader.take(4)
+        self.vector = tuple(reader.number("h") for _ in range(3))
+        require(self.block_level <= header.base and header.top <= self.unit <= 21, "17.5.1", "levels of the motion")
+        furthest = min(header.top, self.block_level + 5)
+        require(self.block_level <= self.reference <= furthest, "17.5.1", "reference level")
+        self.above = (modes & 15, modes >> 4)
+        require(max(self.above) <= SKIP, "17.5.1", "modes of the motion")
+        self.check(self.vector)
+        self.base, self.payloads, self.previous = header.base, payloads, previous
+        self.decoder = RangeDecoder(payloads[0][reader.at :])
+        self.bits, self.modes = Bits(), {}
+
+    def check(self, vector):
+        """17.5.3"""
+        least, most = max(-(1 << self.unit), -32768), min(1 << self.unit, 32767)
+        require(all(least <= x <= most for x in vector), "17.5.3", "vector out of range")
+
+    def reach(self, voxels):
+        """17.5.1: decodes the motion of level L once its blocks are known, the voxels of level B."""
+        if voxels.level == self.block_level:
+            self.blocks = voxels
+            self.read_vectors()
+            self.modes[self.block_level] = [(3, 3)] * len(voxels)
+            for level in range(self.block_level + 1, self.base + 1):
+                self.read_modes(level, self.decoder)
+            self.decoder.finish()
+            self.moved = self.move()
+
+    def read_finer(self, level):
+        """17.5.1: the motion of a level below L."""
+        decoder = RangeDecoder(self.payloads[level - self.base])
+        self.read_modes(level, decoder)
+        decoder.finish()
+
+    def read_vectors(self):
+        """17.5.3"""
+        self.vectors, changed = [], 0
+        for i, near in enumerate(self.blocks.near):
+            around = [self.vectors[near[k]] for k in (12, 10, 4) if near[k] >= 0]
+            sure = (2 if len(set(around)) == 1 else 1) if around else 0
+            if len(around) == 3:
+                vector = tuple(sorted(components)[1] for components in zip(*around))
+            elif around:
+                vector = around[0]
+            else:
+                vector = self.vectors[-1] if i > 0 else self.vector
+            if self.bits.decide(self.decoder, "differs", changed, sure):
+                change = [self.bits.component(self.decoder, axis) for axis in range(3)]
+                vector = tuple(a + b for a, b in zip(vector, change))
+                changed = int(any(change))
+            else:
+                changed = 0
+            self.check(vector)
+            self.vectors.append(vector)
+
+    def read_modes(self, level, decoder):
+        """17.5.4"""
+        modes, before = [], (0, 0)
+        for above in self.modes[level - 1]:
+            own = []
+            for kind in (0, 1):
+                name = kind, above[kind], before[kind]
+                if not self.bits.decide(decoder, "some", *name):
+                    own.append(INTRA)
+                else:
+                    own.append(SKIP if self.bits.decide(decoder, "skip", *name) else INTER)
+            before = tuple(own)
+            modes.append(before)
+        self.modes[level] = modes
+
+    def rounded(self, vector, level):
+        """17.5.5"""
+        shift = self.unit - level
+        return tuple(v + (1 << shift >> 1) >> shift for v in vector)
+
+    def move(self):
+        """17.8: the moved frame's levels, R and those above it."""
+        if self.reference <= self.block_level + 1:
+            return {}
+        source, down = self.previous[self.reference], self.reference - self.block_level
+        most, found = 2 * len(source.voxels) + 64, {}
+        for vector in set(self.vectors):
+            d = self.rounded(vector, self.reference)
+            for (x, y, z), value in zip(source.voxels.coordinates, source.values):
+                place = (x + d[0], y + d[1], z + d[2])
+                block = self.blocks.places.get(tuple(c >> down for c in place))
+                if block is not None and self.vectors[block] == vector:
+                    found[place] = value
+                    require(len(found) <= most, "17.8.2", "voxels of the moved frame")
+        moved = {}
+        for level in range(self.reference, self.block_level, -1):
+            moved[level] = Known(Voxels(level, None, list(found)), list(found.values()))
+            children = {}
+            for place, value in found.items():
+                children.setdefault(tuple(c >> 1 for c in place), []).append(value)
+            found = {place: [half_up(sum(v), len(v)) for v in zip(*values)] for place, values in children.items()}
+        return moved
+
+    def of(self, nodes):
+        """17.5.5, 17.5.6: for each node the modes and the vector that hold for its children; and what they are
+        predicted from."""
+        level = nodes.level + 1
+        if level > self.base and level not in self.modes:
+            self.read_finer(level)
+        if level <= self.block_level:
+            return [(self.above, self.vector)] * len(nodes), self.previous[level]
+        at = [tuple(c >> level - 1 - self.block_level for c in place) for place in nodes.coordinates]
+        blocks = [self.blocks.places[place] for place in at]
+        if level < self.reference:
+            return [(self.modes[level][b], (0, 0, 0)) for b in blocks], self.moved[level]
+        return [(self.modes[level][b], self.vectors[b]) for b in blocks], self.previous[level]
+
+    def occupancies(self, nodes):
+        """17.6.1: mode and window of each node."""
+        guides, (own, source) = [], self.of(nodes)
+        for (modes, vector), place in zip(own, nodes.coordinates):
+            d, window = self.rounded(vector, nodes.level + 1), 0
+            corner = [2 * c - v for c, v in zip(place, d)]
+            for bit, cell in enumerate(CELLS) if modes[0] else ():
+                window |= (tuple(a + b for a, b in zip(corner, cell)) in source.voxels.places) << bit
+            guides.append((modes[0], window))
+        return guides
+
+    def colours(self, nodes, children):
+        """17.7: mode of each node, and colours of its children."""
+        guides, (own, source) = [], self.of(nodes)
+        for (modes, vector), first, mask in zip(own, nodes.first, nodes.masks):
+            colour = {INTRA: lambda *_: None, INTER: self.between, SKIP: self.was}[modes[1]]
+            places = children.coordinates[first : first + mask.bit_count()]
+            guides.append((modes[1], [colour(place, vector, source) for place in places]))
+        return guides
+
+    def was(self, place, vector, source):
+        """17.7.1"""
+        d = self.rounded(vector, source.voxels.level)
+        return source.colour(tuple(a - b for a, b in zip(place, d)))
+
+    def between(self, place, vector, source):
+        """17.7.2"""
+        shift = self.unit - source.voxels.level
+        low, part = [v >> shift for v in vector], [(v << 4) >> shift & 15 for v in vector]
+        sums, total = [0, 0, 0], 0
+        for corner in CORNERS_BELOW:
+            weight = 1
+            for c, p in zip(corner, part):
+                weight *= p if c else 16 - p
+            value = source.colour(tuple(x - v - c for x, v, c in zip(place, low, corner))) if weight else None
+            if value is not None:
+                sums = [s + weight * x for s, x in zip(sums, value)]
+                total += weight
+        return [half_up(s, total) for s in sums] if total else None
