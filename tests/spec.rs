@@ -41,10 +41,11 @@ fn the_second_decoder_refuses_every_damaged_stream_for_the_clause_that_it_breaks
     assert!(success, "{printed}");
     let lines = lines(list);
     let of = |folder: &str| lines.iter().filter(|line| line.contains(folder)).count();
-    let (frames, scenes) = (of(" version-3/"), of(" scenes/"));
+    let (frames, scenes, sequences) = (of(" version-3/"), of(" scenes/"), of(" sequences/"));
     assert!(frames >= 100, "{frames} damaged streams");
     assert!(scenes >= 50, "{scenes} damaged scenes");
-    let streams = frames + scenes;
+    assert!(sequences >= 100, "{sequences} damaged sequences");
+    let streams = frames + scenes + sequences;
     let expected = format!("{streams} damaged streams, 0 refused for another clause");
     assert!(printed.contains(&expected), "{printed}");
 }

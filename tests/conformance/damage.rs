@@ -7,18 +7,33 @@ use std::collections::BTreeSet;
 use b2p::decoder::Checked;
 use b2p::{Decoder, Limits};
 
-use crate::digest_scene::broken_clause;
 use crate::models::model;
-use crate::scene::is_refused;
-use crate::{folder, root, suite};
+use crate::{digest_scene, digest_sequence, folder, root, scene, suite};
 
 struct Damage {
     name: String,
     clause: String,
     bytes: Vec<u8>,
     decoder: Decoder,
-    /// Whether it was a scene before it was damaged.
-    is_scene: bool,
+    kind: Kind,
+}
+
+/// What it was before it was damaged.
+#[derive(Clone, Copy)]
+enum Kind {
+    Frame,
+    Scene,
+    Sequence,
+}
+
+impl Kind {
+    fn of(stream: &str) -> Self {
+        match stream.split('/').next() {
+            Some("scenes") => Kind::Scene,
+            Some("sequences") => Kind::Sequence,
+            _ => Kind::Frame,
+        }
+    }
 }
 
 fn changed(mut bytes: Vec<u8>, changes: &[&str]) -> Vec<u8> {
@@ -49,7 +64,7 @@ fn damaged() -> Vec<Damage> {
             clause: words[2].into(),
             bytes: changed(crate::stream(words[1]), &words[3..]),
             decoder: decoder(words[1]),
-            is_scene: words[1].starts_with("scenes/"),
+            kind: Kind::of(words[1]),
         }
     };
     text.lines().map(damage).collect()
@@ -80,7 +95,7 @@ fn every_damaged_stream_is_refused_for_the_clause_that_it_breaks() {
     let (damaged, clauses) = (damaged(), clauses());
     let names: BTreeSet<_> = damaged.iter().map(|damage| &damage.name).collect();
     assert!(
-        names.len() >= 100 && names.len() == damaged.len(),
+        names.len() >= 300 && names.len() == damaged.len(),
         "{} kinds of damage",
         names.len()
     );
@@ -89,17 +104,24 @@ fn every_damaged_stream_is_refused_for_the_clause_that_it_breaks() {
         clause,
         bytes,
         decoder,
-        is_scene,
+        kind,
     } in &damaged
     {
         assert!(
             clauses.contains(clause),
             "{name}: docs/format.md has no clause {clause}"
         );
-        if *is_scene {
-            assert_eq!(broken_clause(bytes), Some(&**clause), "{name}");
-            assert!(is_refused(bytes), "{name}");
-            continue;
+        match kind {
+            Kind::Frame => {}
+            Kind::Scene => {
+                assert_eq!(digest_scene::broken_clause(bytes), Some(&**clause), "{name}");
+                assert!(scene::is_refused(bytes), "{name}");
+                continue;
+            }
+            Kind::Sequence => {
+                assert_eq!(digest_sequence::broken_clause(bytes), Some(&**clause), "{name}");
+                continue;
+            }
         }
         let checked = decoder.check(bytes);
         assert_eq!(first_clause(&checked), Some(&**clause), "{name}: {:?}", checked.faults);

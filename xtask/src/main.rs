@@ -12,7 +12,6 @@ mod digest;
 #[path = "../../tests/conformance/digest_scene.rs"]
 mod digest_scene;
 #[path = "../../tests/conformance/digest_sequence.rs"]
-#[allow(dead_code, reason = "the test checks sequences, too")]
 mod digest_sequence;
 #[path = "../../tests/conformance/digest_transform.rs"]
 #[allow(dead_code, reason = "the test decodes in pieces, too")]

@@ -6,14 +6,15 @@
 mod kinds;
 mod parts;
 mod scenes;
+mod sequence_parts;
+mod sequences;
 
 use std::fmt::Write;
 use std::path::Path;
 
 use b2p::Decoder;
 
-use crate::digest_scene::broken_clause;
-use crate::{Result, models};
+use crate::{Result, digest_scene, digest_sequence, models};
 use parts::Parts;
 
 /// Makes the list of all damaged streams. Each must be refused for the clause that its kind states.
@@ -23,7 +24,8 @@ pub fn list(suite: &Path) -> Result<String> {
     let names = std::fs::read_to_string(suite.join("suite.txt"))?;
     let streams = kinds::all(|name| Parts::of(&read(name).unwrap_or_default()));
     let scenes = scenes::all(&read(scenes::DAMAGED)?);
-    for kind in streams.into_iter().chain(scenes) {
+    let sequences = sequences::all(|name| read(name).unwrap_or_default());
+    for kind in streams.into_iter().chain(scenes).chain(sequences) {
         let whole = read(kind.stream)?;
         let mut decoder = Decoder::new();
         let line = names.lines().find(|line| line.split(' ').next() == Some(kind.stream));
@@ -32,9 +34,14 @@ pub fn list(suite: &Path) -> Result<String> {
         }
         let mut found = None;
         let broken = kind.tries.into_iter().find(|bytes| {
-            if kind.stream == scenes::DAMAGED {
-                found = broken_clause(bytes).map(str::to_owned);
-                return broken_clause(bytes) == Some(kind.clause);
+            let broken_clause = match kind.stream.split('/').next() {
+                Some("scenes") => Some(digest_scene::broken_clause(bytes)),
+                Some("sequences") => Some(digest_sequence::broken_clause(bytes)),
+                _ => None,
+            };
+            if let Some(clause) = broken_clause {
+                found = clause.map(str::to_owned);
+                return clause == Some(kind.clause);
             }
             let checked = decoder.check(bytes);
             found = checked.faults.first().map(|fault| fault.error.to_string());
