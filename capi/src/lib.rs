@@ -8,6 +8,8 @@ mod decoding;
 mod model;
 mod picture;
 mod points;
+#[cfg(feature = "page")]
+mod splats;
 #[cfg(target_family = "wasm")]
 pub mod wasm;
 
@@ -16,3 +18,5 @@ pub use decoding::{Arrays, Cancel, Decoding, Gaussians};
 pub use model::{Limits, Model};
 pub use picture::Camera;
 pub use points::{PointArrays, Points};
+#[cfg(feature = "page")]
+pub use splats::Content;

@@ -8,6 +8,7 @@ const STATUS = [
   "usage", "internal",
 ];
 const HEADS = { best: 0, quick: 1, surfels: 2 };
+const CONTENT = ["stream", "scene", "sequence", "splats"];
 const MESSAGE = 1024;
 
 /** What a stream or an argument is refused for. `kind` is one of the statuses of the C interface, in lower case. */
@@ -19,7 +20,7 @@ export class B2pError extends Error {
   }
 }
 
-/** The few calls of WASI that the library makes: a clock, and messages of defects. There are no files. */
+/** The few calls of WASI that the library makes: a clock, chance, and messages of defects. There are no files. */
 function system(memory, report) {
   const BADF = 8;
   const view = () => new DataView(memory().buffer);
@@ -30,6 +31,11 @@ function system(memory, report) {
     environ_get: () => 0,
     clock_time_get: (_clock, _precision, to) => {
       view().setBigUint64(to, BigInt(Math.round(performance.now() * 1e6)), true);
+      return 0;
+    },
+    // Chance for the keys of hash tables: 65,536 bytes at most are given at a time.
+    random_get: (to, length) => {
+      crypto.getRandomValues(new Uint8Array(memory().buffer, to, length));
       return 0;
     },
     fd_write: (_file, vectors, count, written) => {
@@ -121,6 +127,30 @@ export class B2p {
     }
   }
 
+  /**
+   * What a file holds by its first 4096 bytes, or all of them: `stream`, `scene`, `sequence`, or `splats`, which may be
+   * Gaussians as other programs write them. Whatever else it is, the error says.
+   */
+  content(bytes) {
+    const copy = this._copy(bytes);
+    try {
+      return CONTENT[this._out((out) => this._call("b2p_content", copy.at, copy.length, out))];
+    } finally {
+      copy.free();
+    }
+  }
+
+  /** The Gaussians of a PLY, SPZ, SOG, .splat, glTF, CSV or NumPy file: its bytes, whole or in an array of parts. */
+  splats(bytes) {
+    const copy = this._copy(bytes);
+    try {
+      const at = this._out((out) => this._call("b2p_gaussians_from_file", copy.at, copy.length, 0, out));
+      return new Gaussians(this, at);
+    } finally {
+      copy.free();
+    }
+  }
+
   /** Calls a function of the C interface that returns a status, and throws what is not ok. */
   _call(name, ...args) {
     const status = this.#exports[name](...args, this.#message, MESSAGE);
@@ -154,11 +184,20 @@ export class B2p {
     this.#exports.b2p_dealloc(at, size);
   }
 
+  /** Bytes, or an array of parts, in the library's memory. */
   _copy(bytes) {
-    const from = bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes);
-    const at = this._alloc(from.length);
-    new Uint8Array(this.#exports.memory.buffer, at, from.length).set(from);
-    return { at, length: from.length, free: () => this._free(at, from.length) };
+    const parts = (Array.isArray(bytes) ? bytes : [bytes]).map((part) => {
+      return part instanceof Uint8Array ? part : new Uint8Array(part);
+    });
+    const length = parts.reduce((sum, part) => sum + part.length, 0);
+    const at = this._alloc(length);
+    const to = new Uint8Array(this.#exports.memory.buffer, at, length);
+    let place = 0;
+    for (const part of parts) {
+      to.set(part, place);
+      place += part.length;
+    }
+    return { at, length, free: () => this._free(at, length) };
   }
 
   _view() {

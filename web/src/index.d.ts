@@ -27,7 +27,13 @@ export class B2p {
   headsModel(bytes: Uint8Array | ArrayBuffer): HeadsModel;
   decoding(options?: DecodeOptions): Decoding;
   decode(bytes: Uint8Array | ArrayBuffer, options?: DecodeOptions): Gaussians;
+  /** What a file holds by its first 4096 bytes, or all of them. What is none of these is refused, and named. */
+  content(bytes: Uint8Array | ArrayBuffer): Content;
+  /** Gaussians in a PLY, SPZ, SOG, .splat, glTF, CSV or NumPy file: its bytes, whole or in parts. */
+  splats(bytes: Uint8Array | ArrayBuffer | Uint8Array[]): Gaussians;
 }
+
+export type Content = "stream" | "scene" | "sequence" | "splats";
 
 /** Memory of the library: it is given back by `free`, once. */
 interface Handle {
@@ -100,8 +106,8 @@ export interface View extends Camera {
 }
 
 /**
- * A canvas that shows a stream, with the library in a worker. Events: `level` (`detail`: level, count, milliseconds),
- * `picture` (milliseconds, scale), `failure` (kind, message).
+ * A canvas that shows a stream or a file of Gaussians, with the library in a worker. Events: `level` (`detail`: level,
+ * `null` for a file of Gaussians, count, milliseconds), `picture` (milliseconds, scale), `failure` (kind, message).
  */
 export class Viewer extends EventTarget {
   constructor(
@@ -110,11 +116,11 @@ export class Viewer extends EventTarget {
   );
   get camera(): Required<Camera>;
   set camera(camera: Camera);
-  /** Ends with the last level, when it is there. */
+  /** Ends with the last level, when it is there; with `null` for a file of Gaussians. */
   open(
     source: string | URL | Response | Blob | BufferSource | ReadableStream<Uint8Array>,
     options?: { heads?: Heads | null; level?: number },
-  ): Promise<number>;
+  ): Promise<number | null>;
   /** How long the picture took, or `null` if there was nothing to draw, or another one was asked for. */
   draw(): Promise<number | null>;
   reset(): void;

@@ -1,4 +1,4 @@
-// The page: `?src=ADDRESS` opens a stream, `?heads=ADDRESS` is a model file of learned heads.
+// The page: `?src=ADDRESS` opens a stream or a file of Gaussians, `?heads=ADDRESS` is a model file of learned heads.
 
 import { Viewer } from "./viewer.js";
 
@@ -6,7 +6,7 @@ const parameters = new URLSearchParams(location.search);
 const canvas = document.querySelector("canvas");
 const [state, time, files, heads] = ["state", "time", "files", "heads"].map((id) => document.getElementById(id));
 
-// `b2p serve` tells which streams there are, and where learned heads are.
+// `b2p serve` tells which files there are, and where learned heads are.
 const listed = await list();
 const model = parameters.get("heads") ?? listed.heads;
 const viewer = new Viewer(canvas, { heads: model });
@@ -20,28 +20,31 @@ async function list() {
   return response?.ok ? response.json() : { streams: [], heads: null };
 }
 
-function say(text, error = false) {
+/** Tells what the page does: it is `busy`, shows a `level`, or has met an `error`. */
+function say(text, what) {
   state.textContent = text;
-  state.classList.toggle("error", error);
-  document.body.dataset.state = error ? "error" : text.startsWith("Level") ? "level" : "busy";
+  state.classList.toggle("error", what === "error");
+  document.body.dataset.state = what;
 }
 
 async function open(next) {
   source = next;
   milliseconds = 0;
-  say("Loading …");
+  delete document.body.dataset.done;
+  say("Loading …", "busy");
   try {
     const level = await viewer.open(source, { heads: model ? heads.value : "surfels" });
-    document.body.dataset.done = level;
+    document.body.dataset.done = level ?? "Gaussians";
   } catch (error) {
-    if (error.name !== "AbortError") say(error.message, true);
+    if (error.name !== "AbortError") say(error.message, "error");
   }
 }
 
 viewer.addEventListener("level", ({ detail }) => {
   milliseconds += detail.milliseconds;
-  const count = detail.count.toLocaleString("en").replaceAll(",", " ");
-  say(`Level ${detail.level}: ${count} Gaussians, decoded in ${milliseconds.toFixed(0)} ms`);
+  const count = `${detail.count.toLocaleString("en").replaceAll(",", " ")} Gaussians`;
+  const took = `${milliseconds.toFixed(0)} ms`;
+  say(detail.level === null ? `${count}, read in ${took}` : `Level ${detail.level}: ${count}, decoded in ${took}`, "level");
 });
 viewer.addEventListener("picture", ({ detail }) => {
   time.textContent = `drawn in ${detail.milliseconds.toFixed(0)} ms`;

@@ -1,4 +1,4 @@
-// A canvas that shows a stream: levels appear as they arrive, drag, wheel and touch move the camera.
+// A canvas that shows a stream or a file of Gaussians: levels appear as they arrive, drag, wheel and touch move the camera.
 
 const FASTEST = 50;
 const LEAST_SCALE = 0.25;
@@ -50,8 +50,9 @@ export class Viewer extends EventTarget {
   }
 
   /**
-   * Shows a stream: its address, a `Response`, a `Blob`, bytes, or a `ReadableStream` of bytes. Ends when its last level
-   * is there, with that level; the event `level` reports levels that arrive. Another call ends the one before.
+   * Shows a stream or a file of Gaussians: its address, a `Response`, a `Blob`, bytes, or a `ReadableStream` of bytes.
+   * Ends when its last level is there, with that level, or with `null` if it has none; the event `level` reports levels
+   * that arrive. Another call ends the one before.
    */
   async open(source, { heads = null, level = -1 } = {}) {
     this.#cancel?.();
@@ -94,7 +95,7 @@ export class Viewer extends EventTarget {
       get(wasm).then((response) => response.arrayBuffer()).then((bytes) => WebAssembly.compile(bytes)),
       heads && get(heads).then((response) => response.arrayBuffer()),
     ]);
-    const ready = new Promise((resolve) => this.#waiting.set("ready", { resolve }));
+    const ready = new Promise((resolve, reject) => this.#waiting.set("ready", { resolve, reject }));
     this.#worker.postMessage({ type: "load", module, heads: model && new Uint8Array(model) });
     return ready;
   }

@@ -1,13 +1,19 @@
-// The library in a thread of its own, for `Viewer`. Messages in: open, bytes, end, fail, draw; out: ready, level,
-// picture, done, error.
+// The library in a thread of its own, for `Viewer`. Messages in: load, open, bytes, end, draw; out: ready, level, picture,
+// done, error.
 
-import { B2p } from "./b2p.js";
+import { B2p, B2pError } from "./b2p.js";
+
+/** Bytes that tell what a file is. */
+const ENOUGH = 4096;
+/** Bytes of a file that is read as a whole, at most: as the limits of the library. */
+const MOST = 2 ** 31;
 
 let library;
 let model = null;
-let decoding = null;
 let gaussians = null;
-/** The number of the stream that is open: messages about others are late. */
+/** What takes the bytes of the file that is open, until it is read. */
+let source = null;
+/** The number of the file that is open: messages about others are late. */
 let stream = 0;
 
 /** Runs `step`; an error of it goes to the page. After a defect the instance cannot be used any more. */
@@ -24,8 +30,8 @@ function attempt(step) {
 }
 
 function close() {
-  if (library) decoding?.free();
-  decoding = null;
+  if (library) source?.free();
+  source = null;
 }
 
 function show(next, level, milliseconds) {
@@ -34,40 +40,110 @@ function show(next, level, milliseconds) {
   postMessage({ type: "level", stream, level, count: next.arrays().count, milliseconds });
 }
 
-/** Decodes and shows what has come. */
-function advance() {
-  for (;;) {
-    const start = performance.now();
-    const level = decoding.advance();
-    if (level === null) return;
-    show(decoding.gaussians(), level, performance.now() - start);
+/** A file of which too little is there to know what it is. */
+class Unknown {
+  start = [];
+  length = 0;
+
+  constructor(options) {
+    this.options = options;
   }
+
+  push(bytes) {
+    this.start.push(bytes);
+    this.length += bytes.length;
+    if (this.length >= ENOUGH) this.begin();
+  }
+
+  /** Gives way to what reads the file. */
+  begin() {
+    const content = library.content(this.start);
+    source = content === "splats" ? new Splats() : new Stream(this.options);
+    for (const bytes of this.start) source.push(bytes);
+  }
+
+  end() {
+    this.begin();
+    return source.end();
+  }
+
+  free() {}
+}
+
+/** A stream or a scene, whose levels are shown as they arrive. */
+class Stream {
+  constructor({ heads, level }) {
+    this.decoding = library.decoding({ model, heads, level });
+  }
+
+  push(bytes) {
+    this.decoding.push(bytes);
+    for (;;) {
+      const start = performance.now();
+      const level = this.decoding.advance();
+      if (level === null) return;
+      show(this.decoding.gaussians(), level, performance.now() - start);
+    }
+  }
+
+  end() {
+    const { decoding } = this;
+    const before = decoding.level;
+    const start = performance.now();
+    decoding.finish();
+    if (decoding.level !== before) show(decoding.gaussians(), decoding.level, performance.now() - start);
+    return decoding.level;
+  }
+
+  free() {
+    this.decoding.free();
+  }
+}
+
+/** A file of Gaussians, which is read when all of it is there. */
+class Splats {
+  parts = [];
+  length = 0;
+
+  push(bytes) {
+    this.length += bytes.length;
+    if (this.length > MOST) throw new B2pError("limit", `the file has more than ${MOST} bytes`);
+    this.parts.push(bytes);
+  }
+
+  end() {
+    const start = performance.now();
+    show(library.splats(this.parts), null, performance.now() - start);
+    return null;
+  }
+
+  free() {}
 }
 
 const on = {
   async load({ module, heads }) {
-    library = await B2p.load(module);
+    try {
+      library = await B2p.load(module);
+    } catch (error) {
+      return postMessage({ type: "error", stream: "ready", kind: "internal", message: error.message });
+    }
     if (heads) attempt(() => (model = library.headsModel(heads)));
     postMessage({ type: "ready", version: library.version });
   },
   open({ number, heads, level }) {
     close();
     stream = number;
-    if (library) attempt(() => (decoding = library.decoding({ model, heads, level })));
+    if (library) source = new Unknown({ heads, level });
     else postMessage({ type: "error", stream, kind: "internal", message: "the library has failed: load it again" });
   },
   bytes({ number, bytes }) {
-    if (number !== stream || !decoding) return;
-    attempt(() => (decoding.push(bytes), advance()));
+    if (number === stream && source) attempt(() => source.push(bytes));
   },
   end({ number }) {
-    if (number !== stream || !decoding) return;
+    if (number !== stream || !source) return;
     attempt(() => {
-      const before = decoding.level;
-      const start = performance.now();
-      decoding.finish();
-      if (decoding.level !== before) show(decoding.gaussians(), decoding.level, performance.now() - start);
-      postMessage({ type: "done", stream, level: decoding.level });
+      const level = source.end();
+      postMessage({ type: "done", stream, level });
       close();
     });
   },
