@@ -3,7 +3,7 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use b2p::{Camera, Gaussians, Limits, Renderer};
+use b2p::{Camera, Decoder, Gaussians, Limits, Renderer, SequenceDecoder, SequenceReader};
 use b2p_formats::splats::{self, Format};
 use sha2::{Digest, Sha256};
 
@@ -15,6 +15,9 @@ const FILES: [&str; 6] = [
     "ball.splat",
     "ball.glb",
 ];
+
+const SEQUENCE: &str = "wave.b2p";
+const FRAMES: [u64; 4] = [0, 6, 13, 23];
 
 fn data() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../web/tests/data")
@@ -42,6 +45,14 @@ fn the_page_is_compared_with_what_is_drawn_natively() {
         let bytes = std::fs::read(&path).unwrap();
         let splats = splats::read(&bytes, format, &splats::Options::default(), &Limits::default()).unwrap();
         writeln!(made, "{name} {}", digest(&splats.into_cloud())).unwrap();
+    }
+    let bytes = std::fs::read(data().join(SEQUENCE)).unwrap();
+    let sequence = SequenceReader::new(bytes, &Limits::default()).unwrap();
+    let mut decoder = SequenceDecoder::new(Decoder::new());
+    for number in FRAMES {
+        let frame = decoder.frame(&sequence, number).unwrap();
+        let sum = digest(&frame.gaussians().unwrap());
+        writeln!(made, "{SEQUENCE}#{number} {sum}").unwrap();
     }
     let path = data().join("pictures.txt");
     if std::env::var_os("B2P_WRITE_PICTURES").is_some() {

@@ -1,7 +1,8 @@
-// The library in a thread of its own, for `Viewer`. Messages in: load, open, bytes, end, draw; out: ready, level, picture,
-// done, error.
+// The library in a thread of its own, for `Viewer`. Messages in: load, open, bytes, end, view, draw, play, pause, seek,
+// step, speed; out: ready, level, sequence, picture, skipped, done, error.
 
 import { B2p, B2pError } from "./b2p.js";
+import { Playing } from "./playing.js";
 
 /** Bytes that tell what a file is. */
 const ENOUGH = 4096;
@@ -13,11 +14,16 @@ let model = null;
 let gaussians = null;
 /** What takes the bytes of the file that is open, until it is read. */
 let source = null;
+/** The sequence that is played. */
+let playing = null;
 /** The number of the file that is open: messages about others are late. */
 let stream = 0;
+/** The camera, and the size of the canvas. */
+let view = null;
 
 /** Runs `step`; an error of it goes to the page. After a defect the instance cannot be used any more. */
 function attempt(step) {
+  if (!library) return null;
   try {
     return step();
   } catch (error) {
@@ -30,14 +36,29 @@ function attempt(step) {
 }
 
 function close() {
-  if (library) source?.free();
-  source = null;
+  if (library) {
+    source?.free();
+    playing?.free();
+  }
+  source = playing = null;
+}
+
+function replace(next) {
+  gaussians?.free();
+  gaussians = next;
 }
 
 function show(next, level, milliseconds) {
-  gaussians?.free();
-  gaussians = next;
+  replace(next);
   postMessage({ type: "level", stream, level, count: next.arrays().count, milliseconds });
+}
+
+/** A picture with `scale` times the canvas' pixels along each side. */
+function draw(what, scale) {
+  const start = performance.now();
+  const [width, height] = [view.width, view.height].map((pixels) => Math.max(1, Math.round(pixels * scale)));
+  const pixels = what.render({ ...view, width, height });
+  return { pixels, width, height, milliseconds: performance.now() - start };
 }
 
 /** A file of which too little is there to know what it is. */
@@ -58,7 +79,7 @@ class Unknown {
   /** Gives way to what reads the file. */
   begin() {
     const content = library.content(this.start);
-    source = content === "splats" ? new Splats() : new Stream(this.options);
+    source = new (READERS[content])(this.options);
     for (const bytes of this.start) source.push(bytes);
   }
 
@@ -100,8 +121,8 @@ class Stream {
   }
 }
 
-/** A file of Gaussians, which is read when all of it is there. */
-class Splats {
+/** A file that is read when all of it is there. */
+class Whole {
   parts = [];
   length = 0;
 
@@ -111,13 +132,45 @@ class Splats {
     this.parts.push(bytes);
   }
 
+  free() {}
+}
+
+/** A file of Gaussians. */
+class Splats extends Whole {
   end() {
     const start = performance.now();
     show(library.splats(this.parts), null, performance.now() - start);
     return null;
   }
+}
 
-  free() {}
+/** A sequence, which stands at its first frame until it is played. */
+class Sequence extends Whole {
+  constructor({ heads, level }) {
+    super();
+    this.options = { model, heads, level };
+  }
+
+  end() {
+    const player = library.player(this.parts, this.options);
+    const info = player.info();
+    postMessage({ type: "sequence", stream, ...info });
+    playing = new Playing(player, { attempt, draw, hand });
+    playing.go();
+    return info.top;
+  }
+}
+
+const READERS = { stream: Stream, scene: Stream, splats: Splats, sequence: Sequence };
+
+/** Shows what was played: a frame with its picture, or why there is none. */
+function hand({ gaussians: next, picture, error, ...frame }) {
+  if (error) {
+    return postMessage({ type: "skipped", stream, number: frame.number, kind: error.kind, message: error.message });
+  }
+  if (next !== gaussians) replace(next);
+  frame.count = next.arrays().count;
+  postMessage({ type: "picture", stream, frame, ...picture }, [picture.pixels.buffer]);
 }
 
 const on = {
@@ -144,19 +197,26 @@ const on = {
     attempt(() => {
       const level = source.end();
       postMessage({ type: "done", stream, level });
-      close();
+      source.free();
+      source = null;
     });
   },
-  draw({ view, ticket }) {
+  view(message) {
+    ({ view } = message);
+  },
+  draw({ view: wanted, ticket }) {
+    view = wanted;
     if (!library || !gaussians) return postMessage({ type: "picture", ticket, pixels: null });
     attempt(() => {
-      const start = performance.now();
-      const pixels = gaussians.render(view);
-      const { width, height } = view;
-      const milliseconds = performance.now() - start;
-      postMessage({ type: "picture", ticket, pixels, width, height, milliseconds }, [pixels.buffer]);
+      const picture = draw(gaussians, ticket);
+      postMessage({ type: "picture", ticket, ...picture }, [picture.pixels.buffer]);
     });
   },
+  play: () => playing?.play(),
+  pause: () => playing?.pause(),
+  seek: ({ time }) => playing?.seek(time),
+  step: ({ by }) => playing?.step(by),
+  speed: ({ speed }) => playing?.setSpeed(speed),
 };
 
 // One message after the other: loading is asynchronous.
