@@ -6,6 +6,6 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 rustup target list --installed | grep -qx wasm32-wasip1 || rustup target add wasm32-wasip1
 export CARGO_TARGET_WASM32_WASIP1_RUSTFLAGS="-C target-feature=+simd128,+bulk-memory"
-cargo build --locked --release -p b2p-capi --target wasm32-wasip1
+cargo build --locked --release -p b2p-capi --features page --target wasm32-wasip1
 cp "${CARGO_TARGET_DIR:-target}/wasm32-wasip1/release/b2p_c.wasm" web/b2p.wasm
 printf 'web/b2p.wasm: %s bytes, %s compressed\n' "$(stat -c %s web/b2p.wasm)" "$(gzip -9 -c web/b2p.wasm | wc -c)"

@@ -25,7 +25,9 @@ macro_rules! files {
 pub const FILES: &[PageFile] = files![
     "index.html": HTML,
     "src/b2p.js": SCRIPT,
+    "src/controls.js": SCRIPT,
     "src/page.js": SCRIPT,
+    "src/playing.js": SCRIPT,
     "src/viewer.js": SCRIPT,
     "src/worker.js": SCRIPT,
 ];

@@ -43,6 +43,12 @@ impl Fault {
     pub fn usage(text: impl Into<String>) -> Fault {
         Fault(Status::Usage, text.into())
     }
+
+    /// A file that nothing here reads.
+    #[cfg(feature = "page")]
+    pub fn unsupported(text: impl Into<String>) -> Fault {
+        Fault(Status::Unsupported, text.into())
+    }
 }
 
 impl From<Error> for Fault {

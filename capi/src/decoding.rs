@@ -187,6 +187,20 @@ pub enum Heads {
     Surfels = 2,
 }
 
+/// What makes Gaussians, as C and the library name it.
+pub(crate) const HEADS: [(Heads, HeadSet); 3] = [
+    (Heads::Best, HeadSet::Best),
+    (Heads::Quick, HeadSet::Quick),
+    (Heads::Surfels, HeadSet::Surfels),
+];
+
+/// What makes Gaussians by its number, for C lets an enumeration hold any.
+pub(crate) fn heads_of(number: i32) -> Result<HeadSet, Fault> {
+    let known = HEADS.iter().find(|(heads, _)| *heads as i32 == number);
+    let unknown = || Fault::usage("heads are none of b2p_heads");
+    known.map(|(_, set)| *set).ok_or_else(unknown)
+}
+
 /// Begins to decode a stream of either version, or a scene of blocks, down to `level`, or, if that is negative, to the finest level that has Gaussians. `limits`
 /// and `cancel` may be NULL, and so may `model`, which streams of version 3 do not need: one of version 2 then fails with MODEL. Fails with
 /// USAGE.
@@ -264,15 +278,8 @@ pub unsafe extern "C" fn b2p_decoding_use_heads(
     let run = || {
         // SAFETY: the caller vouches for `decoding`.
         let decoding = unsafe { changed(decoding, "decoding") }?;
-        // A number, for C lets an enumeration hold any.
-        let all = [
-            (Heads::Best, HeadSet::Best),
-            (Heads::Quick, HeadSet::Quick),
-            (Heads::Surfels, HeadSet::Surfels),
-        ];
-        let known = all.iter().find(|(number, _)| *number as i32 == heads);
-        let (_, heads) = known.ok_or_else(|| Fault::usage("heads are none of b2p_heads"))?;
-        Ok(decoding.set_heads(*heads)?)
+        let heads = heads_of(heads)?;
+        Ok(decoding.set_heads(heads)?)
     };
     // SAFETY: the caller vouches for `message`.
     unsafe { guard(message, size, run) }

@@ -7,7 +7,11 @@ mod boundary;
 mod decoding;
 mod model;
 mod picture;
+#[cfg(feature = "page")]
+mod player;
 mod points;
+#[cfg(feature = "page")]
+mod splats;
 #[cfg(target_family = "wasm")]
 pub mod wasm;
 
@@ -15,4 +19,8 @@ pub use boundary::Status;
 pub use decoding::{Arrays, Cancel, Decoding, Gaussians};
 pub use model::{Limits, Model};
 pub use picture::Camera;
+#[cfg(feature = "page")]
+pub use player::{PlayedFrame, Player, SequenceInfo};
 pub use points::{PointArrays, Points};
+#[cfg(feature = "page")]
+pub use splats::Content;

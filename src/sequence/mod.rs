@@ -8,12 +8,15 @@
 //! - [`SequenceReader`] reads header and index, and finds frames by number or time.
 //! - [`SequenceDecoder`] decodes frames.
 //! - `SequenceEncoder` codes clouds on one grid.
+//! - [`play`] has the clock of a player, and chooses frames and levels by it.
 //! - [`cut`](SequenceReader::cut) and [`join`] edit sequences by groups.
 
 mod assembly;
 mod decoder;
 #[cfg(feature = "encoder")]
 mod encoder;
+#[doc(hidden)]
+pub mod play;
 #[cfg(feature = "encoder")]
 mod rate_control;
 mod reader;

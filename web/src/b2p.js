@@ -8,7 +8,13 @@ const STATUS = [
   "usage", "internal",
 ];
 const HEADS = { best: 0, quick: 1, surfels: 2 };
+const CONTENT = ["stream", "scene", "sequence", "splats"];
 const MESSAGE = 1024;
+
+function headsNumber(heads) {
+  if (heads in HEADS) return HEADS[heads];
+  throw new B2pError("usage", `no heads \`${heads}\`, but ${Object.keys(HEADS).join(", ")}`);
+}
 
 /** What a stream or an argument is refused for. `kind` is one of the statuses of the C interface, in lower case. */
 export class B2pError extends Error {
@@ -19,7 +25,7 @@ export class B2pError extends Error {
   }
 }
 
-/** The few calls of WASI that the library makes: a clock, and messages of defects. There are no files. */
+/** The few calls of WASI that the library makes: a clock, chance, and messages of defects. There are no files. */
 function system(memory, report) {
   const BADF = 8;
   const view = () => new DataView(memory().buffer);
@@ -30,6 +36,11 @@ function system(memory, report) {
     environ_get: () => 0,
     clock_time_get: (_clock, _precision, to) => {
       view().setBigUint64(to, BigInt(Math.round(performance.now() * 1e6)), true);
+      return 0;
+    },
+    // Chance for the keys of hash tables: 65,536 bytes at most are given at a time.
+    random_get: (to, length) => {
+      crypto.getRandomValues(new Uint8Array(memory().buffer, to, length));
       return 0;
     },
     fd_write: (_file, vectors, count, written) => {
@@ -102,11 +113,21 @@ export class B2p {
     const at = this._out((out) => this._call("b2p_decoding_start", 0, 0, 0, level, out));
     const decoding = new Decoding(this, at);
     if (model) this._call("b2p_decoding_use_heads_model", at, model.at);
-    if (heads) {
-      if (!(heads in HEADS)) throw new B2pError("usage", `no heads \`${heads}\`, but ${Object.keys(HEADS).join(", ")}`);
-      this._call("b2p_decoding_use_heads", at, HEADS[heads]);
-    }
+    if (heads) this._call("b2p_decoding_use_heads", at, headsNumber(heads));
     return decoding;
+  }
+
+  /** A sequence of frames, whole or in an array of parts, to be played at the levels and with the heads there is time for. */
+  player(bytes, { level = -1, model = null, heads = null } = {}) {
+    const copy = this._copy(bytes);
+    const chosen = heads ? headsNumber(heads) : -1;
+    try {
+      return new Player(this, this._out((out) => {
+        this._call("b2p_player_open", copy.at, copy.length, model?.at ?? 0, level, chosen, out);
+      }));
+    } finally {
+      copy.free();
+    }
   }
 
   /** All of a stream: the Gaussians of its finest level, or of `level`. */
@@ -118,6 +139,30 @@ export class B2p {
       return decoding.gaussians();
     } finally {
       decoding.free();
+    }
+  }
+
+  /**
+   * What a file holds by its first 4096 bytes, or all of them: `stream`, `scene`, `sequence`, or `splats`, which may be
+   * Gaussians as other programs write them. Whatever else it is, the error says.
+   */
+  content(bytes) {
+    const copy = this._copy(bytes);
+    try {
+      return CONTENT[this._out((out) => this._call("b2p_content", copy.at, copy.length, out))];
+    } finally {
+      copy.free();
+    }
+  }
+
+  /** The Gaussians of a PLY, SPZ, SOG, .splat, glTF, CSV or NumPy file: its bytes, whole or in an array of parts. */
+  splats(bytes) {
+    const copy = this._copy(bytes);
+    try {
+      const at = this._out((out) => this._call("b2p_gaussians_from_file", copy.at, copy.length, 0, out));
+      return new Gaussians(this, at);
+    } finally {
+      copy.free();
     }
   }
 
@@ -154,11 +199,20 @@ export class B2p {
     this.#exports.b2p_dealloc(at, size);
   }
 
+  /** Bytes, or an array of parts, in the library's memory. */
   _copy(bytes) {
-    const from = bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes);
-    const at = this._alloc(from.length);
-    new Uint8Array(this.#exports.memory.buffer, at, from.length).set(from);
-    return { at, length: from.length, free: () => this._free(at, from.length) };
+    const parts = (Array.isArray(bytes) ? bytes : [bytes]).map((part) => {
+      return part instanceof Uint8Array ? part : new Uint8Array(part);
+    });
+    const length = parts.reduce((sum, part) => sum + part.length, 0);
+    const at = this._alloc(length);
+    const to = new Uint8Array(this.#exports.memory.buffer, at, length);
+    let place = 0;
+    for (const part of parts) {
+      to.set(part, place);
+      place += part.length;
+    }
+    return { at, length, free: () => this._free(at, length) };
   }
 
   _view() {
@@ -254,6 +308,94 @@ export class Decoding extends Handle {
       library._free(arrays, 56);
       library._plain("b2p_points_free", points);
     }
+  }
+}
+
+/**
+ * A sequence that is played. `next` decodes a frame; its user draws it when it is due, and says by `took` how long that
+ * took. It stands at first.
+ */
+export class Player extends Handle {
+  constructor(library, at) {
+    super(library, at, "b2p_player_free");
+  }
+
+  /** Length in seconds, number of frames, and the levels that can be drawn. */
+  info() {
+    const { library } = this;
+    const at = library._alloc(24);
+    try {
+      library._call("b2p_player_info", this.at, at);
+      const view = library._view();
+      const [frames, base, top] = [8, 12, 16].map((offset) => view.getUint32(at + offset, true));
+      return { seconds: view.getFloat64(at, true), frames, base, top };
+    } finally {
+      library._free(at, 24);
+    }
+  }
+
+  play() {
+    this.library._plain("b2p_player_play", this.at);
+  }
+
+  /** Stays at the frame that was shown last, which is then decoded as accurately as it can be. */
+  pause() {
+    this.library._plain("b2p_player_pause", this.at);
+  }
+
+  /** Goes to the frame at a time in seconds. */
+  seek(time) {
+    this.library._plain("b2p_player_seek", this.at, time);
+  }
+
+  /** Pauses so many frames further on, or back. */
+  step(by) {
+    this.library._plain("b2p_player_step", this.at, by);
+  }
+
+  /** How many times as fast as it was recorded it is played, from ⅛ to 8. */
+  set speed(speed) {
+    this.library._plain("b2p_player_speed", this.at, speed);
+  }
+
+  /**
+   * Decodes the next frame: its number, time, level, heads and Gaussians, which are `null` if it is not to be shown; the
+   * seconds until it is `due` and those that there are for a frame (`budget`, 0 if it stands); how many were `dropped`.
+   * `error` says why it is skipped. `null`: there is nothing to do until something else is wanted.
+   */
+  next() {
+    const { library } = this;
+    const frame = library._alloc(48);
+    let error = null;
+    try {
+      const gaussians = library._out((out) => {
+        try {
+          library._call("b2p_player_next", this.at, frame, out);
+        } catch (thrown) {
+          if (thrown.kind === "internal" || !(thrown instanceof B2pError)) throw thrown;
+          error = thrown;
+        }
+      });
+      const view = library._view();
+      if (view.getUint8(frame + 40) === 0) {
+        if (error) throw error;
+        return null;
+      }
+      const [time, due, budget] = [0, 8, 16].map((offset) => view.getFloat64(frame + offset, true));
+      const [number, dropped, level, heads] = [24, 28, 32, 36].map((offset) => view.getUint32(frame + offset, true));
+      return {
+        number, time, due, budget, dropped, level, error,
+        heads: Object.keys(HEADS)[heads],
+        gaussians: gaussians ? new Gaussians(library, gaussians) : null,
+      };
+    } finally {
+      library._free(frame, 48);
+    }
+  }
+
+  /** How long the last frame took, decoded and drawn, in seconds. */
+  took(seconds) {
+    this.library._plain("b2p_player_took", this.at, seconds);
   }
 }
 

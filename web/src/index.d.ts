@@ -27,7 +27,58 @@ export class B2p {
   headsModel(bytes: Uint8Array | ArrayBuffer): HeadsModel;
   decoding(options?: DecodeOptions): Decoding;
   decode(bytes: Uint8Array | ArrayBuffer, options?: DecodeOptions): Gaussians;
+  /** What a file holds by its first 4096 bytes, or all of them. What is none of these is refused, and named. */
+  content(bytes: Uint8Array | ArrayBuffer): Content;
+  /** A sequence, whole or in parts. It stands at its first frame. */
+  player(bytes: Uint8Array | ArrayBuffer | Uint8Array[], options?: DecodeOptions): Player;
+  /** Gaussians in a PLY, SPZ, SOG, .splat, glTF, CSV or NumPy file: its bytes, whole or in parts. */
+  splats(bytes: Uint8Array | ArrayBuffer | Uint8Array[]): Gaussians;
 }
+
+/** A sequence that is played by the clock: a frame at each call of `next`, which is shown when it is due. */
+export interface Player extends Handle {
+  info(): SequenceInfo;
+  play(): void;
+  /** Stays at the frame that was made last, which is then decoded as accurately as it can be. */
+  pause(): void;
+  seek(seconds: number): void;
+  /** Pauses so many frames further on, or back. */
+  step(by: number): void;
+  /** From ⅛ to 8. */
+  set speed(speed: number);
+  /** `null`: there is nothing to do until something else is wanted. */
+  next(): PlayedFrame | null;
+  /** How long the last frame took, decoded and drawn: levels and heads are chosen by that. */
+  took(seconds: number): void;
+}
+
+export interface SequenceInfo {
+  seconds: number;
+  frames: number;
+  /** The coarsest and the finest level that can be drawn. */
+  base: number;
+  top: number;
+}
+
+export interface PlayedFrame {
+  number: number;
+  /** Its time in the sequence, in seconds. */
+  time: number;
+  /** Seconds from the call on until it is to be shown. */
+  due: number;
+  /** Seconds that there are for a frame; 0 if the clock stands. */
+  budget: number;
+  /** Frames that were due and not shown. */
+  dropped: number;
+  level: number;
+  heads: Heads;
+  /** `null` if it is not to be shown. */
+  gaussians: Gaussians | null;
+  /** Why it is skipped with those that are predicted from it. */
+  error: B2pError | null;
+}
+
+export type Content = "stream" | "scene" | "sequence" | "splats";
 
 /** Memory of the library: it is given back by `free`, once. */
 interface Handle {
@@ -100,8 +151,10 @@ export interface View extends Camera {
 }
 
 /**
- * A canvas that shows a stream, with the library in a worker. Events: `level` (`detail`: level, count, milliseconds),
- * `picture` (milliseconds, scale), `failure` (kind, message).
+ * A canvas that shows a stream, a sequence or a file of Gaussians, with the library in a worker. Events: `level`
+ * (`detail`: level, `null` for a file of Gaussians, count, milliseconds), `picture` (milliseconds, scale), `failure` (kind,
+ * message); of a sequence `sequence` (seconds, frames, base, top), `frame` (number, time, level, heads, count, dropped),
+ * `skipped` (number, kind, message).
  */
 export class Viewer extends EventTarget {
   constructor(
@@ -110,13 +163,22 @@ export class Viewer extends EventTarget {
   );
   get camera(): Required<Camera>;
   set camera(camera: Camera);
-  /** Ends with the last level, when it is there. */
+  /** Ends with the last level, when it is there; with `null` for a file of Gaussians. */
   open(
     source: string | URL | Response | Blob | BufferSource | ReadableStream<Uint8Array>,
     options?: { heads?: Heads | null; level?: number },
-  ): Promise<number>;
+  ): Promise<number | null>;
   /** How long the picture took, or `null` if there was nothing to draw, or another one was asked for. */
   draw(): Promise<number | null>;
+  readonly playing: boolean;
+  play(): void;
+  /** Stays at the frame that is shown, at its finest level. */
+  pause(): void;
+  seek(seconds: number): void;
+  /** Pauses so many frames further on, or back. */
+  step(by: number): void;
+  /** From ⅛ to 8. */
+  set speed(speed: number);
   reset(): void;
   close(): void;
 }

@@ -1,4 +1,5 @@
-// A canvas that shows a stream: levels appear as they arrive, drag, wheel and touch move the camera.
+// A canvas that shows a stream, a sequence or a file of Gaussians: levels appear as they arrive, drag, wheel and touch move
+// the camera.
 
 const FASTEST = 50;
 const LEAST_SCALE = 0.25;
@@ -20,6 +21,10 @@ export class Viewer extends EventTarget {
   #scale = 1;
   #drawing = false;
   #again = null;
+  /** Whether frames come by themselves, each with the camera that was sent last. */
+  #playing = false;
+  /** What is shown on the canvas, one picture after the other. */
+  #shown = Promise.resolve();
   #rest = 0;
   #touches = new Map();
 
@@ -50,14 +55,18 @@ export class Viewer extends EventTarget {
   }
 
   /**
-   * Shows a stream: its address, a `Response`, a `Blob`, bytes, or a `ReadableStream` of bytes. Ends when its last level
-   * is there, with that level; the event `level` reports levels that arrive. Another call ends the one before.
+   * Shows a stream, a sequence or a file of Gaussians: its address, a `Response`, a `Blob`, bytes, or a `ReadableStream`
+   * of bytes. Ends when its last level is there, with that level, or with `null` if it has none; the event `level` reports
+   * levels that arrive. A sequence stands at its first frame when the event `sequence` tells of it. Another call ends the
+   * one before.
    */
   async open(source, { heads = null, level = -1 } = {}) {
     this.#cancel?.();
     const number = ++this.#stream;
+    this.#playing = false;
     await this.#ready;
     const done = new Promise((resolve, reject) => this.#waiting.set(number, { resolve, reject }));
+    this.#worker.postMessage({ type: "view", view: this.#view() });
     this.#worker.postMessage({ type: "open", number, heads, level });
     try {
       await this.#feed(number, await readable(source));
@@ -71,6 +80,38 @@ export class Viewer extends EventTarget {
   /** Draws the picture in full: `milliseconds`, or `null` if there is nothing to draw yet. */
   draw() {
     return this.#draw(1);
+  }
+
+  get playing() {
+    return this.#playing;
+  }
+
+  /** Plays the sequence: frames are dropped and levels are coarser, so that it keeps its time. It begins again at the end. */
+  play() {
+    this.#playing = true;
+    this.#worker.postMessage({ type: "play" });
+  }
+
+  /** Stays at the frame that is shown, at its finest level. */
+  pause() {
+    this.#playing = false;
+    this.#worker.postMessage({ type: "pause" });
+  }
+
+  /** Goes to the frame at a time in seconds. */
+  seek(time) {
+    this.#worker.postMessage({ type: "seek", time });
+  }
+
+  /** Pauses so many frames further on, or back. */
+  step(by) {
+    this.#playing = false;
+    this.#worker.postMessage({ type: "step", by });
+  }
+
+  /** Plays so many times as fast as it was recorded, from ⅛ to 8. */
+  set speed(speed) {
+    this.#worker.postMessage({ type: "speed", speed });
   }
 
   /** The camera as at first. */
@@ -94,7 +135,7 @@ export class Viewer extends EventTarget {
       get(wasm).then((response) => response.arrayBuffer()).then((bytes) => WebAssembly.compile(bytes)),
       heads && get(heads).then((response) => response.arrayBuffer()),
     ]);
-    const ready = new Promise((resolve) => this.#waiting.set("ready", { resolve }));
+    const ready = new Promise((resolve, reject) => this.#waiting.set("ready", { resolve, reject }));
     this.#worker.postMessage({ type: "load", module, heads: model && new Uint8Array(model) });
     return ready;
   }
@@ -128,8 +169,13 @@ export class Viewer extends EventTarget {
       case "error":
         this.#fail(message.kind, message.message, message.stream);
         break;
+      case "sequence":
+      case "skipped":
+        if (message.stream === this.#stream) this.#tell(message.type, message);
+        break;
       case "picture":
-        this.#show(message);
+        if (message.frame && message.stream !== this.#stream) break;
+        this.#shown = this.#shown.then(() => this.#show(message));
         break;
     }
   }
@@ -138,6 +184,7 @@ export class Viewer extends EventTarget {
     const error = Object.assign(new Error(text), { kind });
     this.#waiting.get(stream)?.reject(error);
     this.#waiting.delete(stream);
+    this.#playing = false;
     this.#tell("failure", { kind, message: text });
   }
 
@@ -147,29 +194,37 @@ export class Viewer extends EventTarget {
 
   /** Asks for a picture of `scale` times the canvas' pixels; if one is being drawn, after it, and only the last. */
   #draw(scale) {
+    if (this.#playing) {
+      this.#worker.postMessage({ type: "view", view: this.#view() });
+      return Promise.resolve(null);
+    }
     if (this.#drawing) {
       this.#again?.resolve(null);
       return new Promise((resolve) => (this.#again = { scale, resolve }));
     }
     this.#drawing = true;
-    const side = (pixels) => Math.max(1, Math.round(pixels * scale));
-    const view = {
-      ...this.#camera,
-      width: side(this.#canvas.width),
-      height: side(this.#canvas.height),
-      background: this.#background,
-    };
     return new Promise((resolve) => {
       this.#waiting.set("picture", { resolve });
-      this.#worker.postMessage({ type: "draw", view, ticket: scale });
+      this.#worker.postMessage({ type: "draw", view: this.#view(), ticket: scale });
     });
   }
 
-  async #show({ pixels, width, height, milliseconds, ticket: scale }) {
+  #view() {
+    const { width, height } = this.#canvas;
+    return { ...this.#camera, width, height, background: this.#background };
+  }
+
+  async #show({ pixels, width, height, milliseconds, ticket: scale, frame }) {
     if (pixels) {
       const image = await createImageBitmap(new ImageData(pixels, width, height));
       this.#context.clearRect(0, 0, this.#canvas.width, this.#canvas.height);
       this.#context.drawImage(image, 0, 0, this.#canvas.width, this.#canvas.height);
+    }
+    if (frame) {
+      this.#tell("frame", frame);
+      return this.#tell("picture", { milliseconds, scale: frame.scale });
+    }
+    if (pixels) {
       // While the camera moves, as many pixels as a frame has time for.
       const wanted = scale * Math.sqrt(FASTEST / Math.max(1, milliseconds));
       this.#scale = Math.min(1, Math.max(LEAST_SCALE, wanted));

@@ -6,10 +6,12 @@ import test from "node:test";
 
 import { B2p } from "../src/index.js";
 import { Browser, chromium } from "./chromium.mjs";
+import { SHOWN, digest } from "./page.mjs";
 import { broken, paused, serve, whole } from "./server.mjs";
 
 const read = (path) => readFileSync(new URL(`../../${path}`, import.meta.url));
 const scene = read("models/scene.b2p");
+const blocks = read("tests/data/conformance/scenes/ball.b2p");
 const SIZE = [640, 480];
 const skip = chromium ? false : "no Chromium is installed";
 
@@ -21,6 +23,8 @@ const streams = {
   "cut.b2p": broken(scene, 20_000),
   "damaged.b2p": whole(damaged),
   "late.b2p": waiting.answer,
+  "blocks.b2p": whole(blocks),
+  "cut-blocks.b2p": whole(blocks.subarray(0, blocks.length - 1)),
 };
 const server = skip ? null : await serve(streams);
 const browser = skip ? null : new Browser();
@@ -53,6 +57,15 @@ test("a stream is shown as the library draws it", { skip }, async () => {
   assert.ok(Buffer.from(shown).equals(Buffer.from(expected)), "the canvas has the library's pixels");
   const count = gaussians.arrays().count.toLocaleString("en").replaceAll(",", " ");
   assert.ok((await page.evaluate(STATE)).startsWith(`Level 9: ${count} Gaussians`));
+});
+
+test("a scene of blocks is shown as the library draws it, and one that is cut is reported", { skip }, async () => {
+  const library = await B2p.load(read("web/b2p.wasm"));
+  const expected = library.decode(blocks).render({ width: SIZE[0], height: SIZE[1] });
+  const page = await show("blocks.b2p");
+  await page.until(`${SHOWN}.then((sum) => sum === "${digest(expected)}")`);
+  const cut = await show("cut-blocks.b2p");
+  await cut.until("document.body.dataset.state === 'error'");
 });
 
 test("a picture is there before the download ends", { skip }, async () => {

@@ -102,7 +102,7 @@ pub enum Command {
     Plan(Plan),
     /// Join sequences, one after the other, without coding anything again
     Join(Join),
-    /// Show streams in a web page, drawn by the browser without a GPU
+    /// Show streams and Gaussians in a web page, drawn by the browser without a GPU
     Serve(Serve),
     /// Decode and draw the sample that comes with the program
     Demo(Demo),

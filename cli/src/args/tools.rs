@@ -11,7 +11,7 @@ use crate::values::size;
 
 #[derive(Debug, Args)]
 pub struct Serve {
-    /// Stream, or folder of streams
+    /// Stream or file of Gaussians, or a folder of them
     #[arg(value_name = "FILE|FOLDER")]
     pub source: PathBuf,
     /// Port; 0: any that is free

@@ -1,11 +1,12 @@
-//! `b2p serve`: the web page and streams by HTTP.
+//! `b2p serve`: the web page, streams and files of Gaussians by HTTP.
 
 use std::fs::File;
-use std::io::{Seek, SeekFrom};
+use std::io::{Read, Seek, SeekFrom};
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use b2p_formats::detect::{ENOUGH, Group, Kind};
 use serde_json::json;
 
 use super::args::Serve;
@@ -24,6 +25,8 @@ const BOUNDS: Bounds = Bounds {
 };
 /// Bytes of an address.
 const LONGEST: usize = 2048;
+/// Endings of files of Gaussians, of which those are served that are known by their first bytes.
+const SPLATS: [&str; 4] = [".ply", ".spz", ".sog", ".splat"];
 /// Where the page finds the learned heads.
 const HEADS: &str = "heads.safetensors";
 
@@ -44,14 +47,14 @@ pub fn run(args: &Serve) -> Result<Said> {
         true => Said::result(format!("{}\n", json!({ "address": shown, "streams": count }))),
         false => Said::result(format!(
             "{} at {shown}; Ctrl-C ends it\n",
-            counted(count as u64, "stream")
+            counted(count as u64, "file")
         )),
     };
     said.say()?;
     http::serve(&listener, BOUNDS, &|request| common(answer(request, &streams, module)))
 }
 
-/// The streams that are served.
+/// The streams and files of Gaussians that are served.
 struct Streams {
     folder: PathBuf,
     /// The only one, if a file was named.
@@ -69,7 +72,7 @@ impl Streams {
             };
             return match streams.names()?.is_empty() {
                 true => Err(Failure(format!(
-                    "{}: there is no .b2p file in it",
+                    "{}: there is no .b2p file in it, and none of Gaussians",
                     streams.folder.display()
                 ))),
                 false => Ok(streams),
@@ -91,16 +94,33 @@ impl Streams {
         let fail = |error| Failure(format!("{}: {error}", self.folder.display()));
         let entries = std::fs::read_dir(&self.folder).map_err(fail)?;
         let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
-        let mut names: Vec<String> = names.filter(|name| name.ends_with(".b2p")).collect();
+        let mut names: Vec<String> = names.filter(|name| self.is_shown(name)).collect();
         names.sort();
         Ok(names)
     }
 
-    /// A stream by its name. No other file of the folder is served, and none that a link leads to outside of it.
+    /// Whether a file of the folder is one that the page shows.
+    fn is_shown(&self, name: &str) -> bool {
+        let is_splats = || -> Option<bool> {
+            let mut start = Vec::new();
+            let file = self.inside(name)?.take(ENOUGH as u64).read_to_end(&mut start);
+            file.ok()?;
+            Some(Kind::of(&start).group() == Group::Splats)
+        };
+        name.ends_with(".b2p") || (SPLATS.iter().any(|ending| name.ends_with(ending)) && is_splats().unwrap_or(false))
+    }
+
+    /// A file that is served, by its name. No other file of the folder is.
     fn open(&self, name: &str) -> Option<File> {
-        if !self.names().ok()?.iter().any(|known| known == name) {
-            return None;
-        }
+        let is_served = match &self.only {
+            Some(only) => only == name,
+            None => !name.contains(std::path::is_separator) && self.is_shown(name),
+        };
+        self.inside(name).filter(|_| is_served)
+    }
+
+    /// A file of the folder, and none that a link leads to outside of it.
+    fn inside(&self, name: &str) -> Option<File> {
         let path = self.folder.join(name).canonicalize().ok()?;
         let inside = path.parent() == Some(&self.folder) && path.is_file();
         inside.then(|| File::open(path).ok()).flatten()

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
+use b2p::sequence::play::clock::Clock;
 use b2p::{Cancel, Decoder, Decoding, Error, Extent, Gaussians, HeadSet, Header, Limits, Log, Stage, container};
 
 use super::blocks::OpenScene;
-use super::clock::Clock;
 use super::source::{Arrived, Choices, Scene, Source, Tell, Wish};
 use crate::args::{DetailArg, ModelArg};
 use crate::cloud::UpArg;

@@ -2,7 +2,6 @@
 
 mod blocks;
 mod clip;
-mod clock;
 mod files;
 mod folder;
 mod keys;
@@ -11,7 +10,6 @@ mod overlay;
 mod pace;
 mod painter;
 mod player;
-mod schedule;
 mod sixel;
 mod source;
 mod state;
@@ -22,6 +20,7 @@ mod window;
 use std::path::{Path, PathBuf};
 
 use b2p::renderer::Background;
+use b2p::sequence::play::clock::SPEEDS;
 use clap::{Args, ValueEnum};
 
 use super::args::{DetailArg, ModelArg, Orbit};
@@ -29,7 +28,6 @@ use super::cloud::{UpArg, up};
 use super::manners::Said;
 use super::values::{background, orbit as orbit_value, point, size};
 use super::{Failure, Result, load};
-use clock::SPEEDS;
 use files::Loading;
 use orbit::{OrbitCamera, Start};
 use state::State;

@@ -5,18 +5,17 @@ use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use b2p::sequence::play::clock::{Clock, Timeline};
+use b2p::sequence::play::player::LATEST;
+use b2p::sequence::play::schedule::{Ladder, Task, next_task};
 use b2p::{Cancel, Decoder, Extent, HeadSet, Log, SequenceDecoder, SequenceReader, Up};
 
-use super::clock::{Clock, Timeline};
 use super::files::{Files, Loading};
-use super::schedule::{Ladder, Task, next_task};
 use super::source::{Arrived, Choices, Scene, Shown, Source, Tell, Wish};
 use crate::{Failure, Result, cloud, load, manners, sequence};
 
 /// Frames that wait to be shown, at most.
 const AHEAD: usize = 3;
-/// If no frame was shown for so long, one is shown though it is late.
-const LATEST: Duration = Duration::from_millis(200);
 
 /// Files of one frame and sequences alike.
 pub struct Sources {

@@ -3,9 +3,8 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use b2p::sequence::play::clock::{Clock, Timeline};
 use b2p::{Camera, Extent, Gaussians, HeadSet, Step, Up};
-
-use super::clock::{Clock, Timeline};
 
 /// What is to be shown.
 #[derive(Debug, Clone, PartialEq)]

@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use b2p::renderer::Background;
+use b2p::sequence::play::clock::Clock;
 use b2p::{Camera, HeadSet};
 
 use super::clip::Clip;
-use super::clock::Clock;
 use super::keys::{Action, ZOOM};
 use super::orbit::OrbitCamera;
 use super::pace::Pace;
@@ -313,7 +313,7 @@ impl State {
     fn paused(&self) -> Option<(u64, u64)> {
         let (clock, now) = (self.clock.as_ref()?, Instant::now());
         let is_paused = self.began && !clock.is_running(now);
-        is_paused.then(|| (clock.frame(now), clock.timeline().len()))
+        is_paused.then(|| (clock.frame(now), clock.timeline().count()))
     }
 
     /// The frame that is shown, of how many, and how a sequence is played.
@@ -332,7 +332,7 @@ impl State {
         Some(format!(
             ", frame {} of {}{speed}{how}",
             frame.number,
-            clock.timeline().len()
+            clock.timeline().count()
         ))
     }
 

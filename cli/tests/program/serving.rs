@@ -102,12 +102,35 @@ fn a_folder_is_served_with_its_page_whole_and_in_ranges() {
 }
 
 #[test]
+fn files_of_gaussians_are_served_too() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("scene.b2p"), SCENE).unwrap();
+    for name in ["scene.ply", "scene.spz", "scene.splat"] {
+        super::succeeds(
+            folder.path(),
+            &["decode", "scene.b2p", name, "--level", "7", "--heads", "surfels"],
+        );
+    }
+    let Some(serving) = Serving::start(folder.path(), ".") else {
+        return;
+    };
+    let (_, list) = serving.ask("GET /streams.json HTTP/1.1");
+    let list: serde_json::Value = serde_json::from_slice(&list).unwrap();
+    let names = ["scene.b2p", "scene.ply", "scene.splat", "scene.spz"];
+    assert_eq!(list["streams"], serde_json::json!(names));
+    let (head, file) = serving.ask("GET /scene.spz HTTP/1.1");
+    assert!(head.contains("200") && file == std::fs::read(folder.path().join("scene.spz")).unwrap());
+}
+
+#[test]
 fn nothing_else_of_the_folder_and_nothing_outside_is_served() {
     let folder = tempfile::tempdir().unwrap();
     let inside = folder.path().join("inside");
     std::fs::create_dir_all(inside.join("deeper")).unwrap();
     std::fs::write(inside.join("scene.b2p"), SCENE).unwrap();
     std::fs::write(inside.join("secret.txt"), "secret").unwrap();
+    std::fs::write(inside.join("points.ply"), "ply\nformat ascii 1.0\nend_header\n").unwrap();
+    std::fs::write(inside.join("secret.spz"), "secret").unwrap();
     std::fs::write(inside.join("deeper/deep.b2p"), SCENE).unwrap();
     std::fs::write(folder.path().join("outside.b2p"), SCENE).unwrap();
     #[cfg(unix)]
@@ -118,6 +141,9 @@ fn nothing_else_of_the_folder_and_nothing_outside_is_served() {
     assert_eq!(serving.status("GET /scene.b2p HTTP/1.1"), 200);
     let refused = [
         "/secret.txt",
+        "/points.ply",
+        "/secret.spz",
+        "/deeper/../scene.b2p",
         "/deeper/deep.b2p",
         "/../outside.b2p",
         "/%2e%2e/outside.b2p",

@@ -1,10 +1,10 @@
 use std::sync::Arc;
 
+use b2p::sequence::play::clock::Timeline;
 use b2p::{Extent, Frame, Gaussians};
 
 use super::*;
 use crate::args::Orbit;
-use crate::view::clock::Timeline;
 use crate::view::keys::{Key, action};
 use crate::view::orbit::Start;
 use crate::view::source::Shown;

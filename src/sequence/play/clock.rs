@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use b2p::SequenceReader;
+use crate::sequence::SequenceReader;
 
 /// How many times faster or slower than it was recorded a sequence can be played.
 pub const SPEEDS: [f64; 7] = [0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0];
@@ -56,7 +56,7 @@ impl Timeline {
     }
 
     /// Number of frames.
-    pub fn len(&self) -> u64 {
+    pub fn count(&self) -> u64 {
         self.frames.len() as u64
     }
 
@@ -67,7 +67,7 @@ impl Timeline {
 
     /// The frame of a slot.
     pub fn frame(&self, slot: u64) -> u64 {
-        slot % self.len()
+        slot % self.count()
     }
 
     /// Whether the frame of a slot is coded by itself.
@@ -84,9 +84,18 @@ impl Timeline {
         next
     }
 
+    /// The last slot up to this one whose frame is coded by itself.
+    pub fn last_whole(&self, slot: u64) -> u64 {
+        let mut last = slot;
+        while !self.is_whole(last) {
+            last -= 1;
+        }
+        last
+    }
+
     /// The time of a slot, from the start of the first lap.
     pub fn start(&self, slot: u64) -> f64 {
-        (slot / self.len()) as f64 * self.seconds + self.frames[self.frame(slot) as usize].0
+        (slot / self.count()) as f64 * self.seconds + self.frames[self.frame(slot) as usize].0
     }
 
     /// The slot that is shown at a time from the start of the first lap.
@@ -94,7 +103,7 @@ impl Timeline {
         let lap = ((time + ROUNDING) / self.seconds).floor().max(0.0);
         let within = time - lap * self.seconds + ROUNDING;
         let after = self.frames.partition_point(|(start, _)| *start <= within);
-        (lap as u64) * self.len() + after.saturating_sub(1) as u64
+        (lap as u64) * self.count() + after.saturating_sub(1) as u64
     }
 }
 
@@ -115,7 +124,7 @@ pub struct Clock {
 impl Clock {
     /// A clock that stands at the start.
     pub fn new(timeline: Arc<Timeline>, speed: f64, looped: bool) -> Self {
-        let last = (!looped).then(|| timeline.len() - 1);
+        let last = (!looped).then(|| timeline.count() - 1);
         Clock {
             timeline,
             at: 0.0,
@@ -126,18 +135,22 @@ impl Clock {
         }
     }
 
+    /// When frames are shown.
     pub fn timeline(&self) -> &Timeline {
         &self.timeline
     }
 
+    /// How many times as fast as it was recorded the sequence is played.
     pub fn speed(&self) -> f64 {
         self.speed
     }
 
+    /// Whether it begins again at the end.
     pub fn is_looped(&self) -> bool {
         self.last.is_none()
     }
 
+    /// Whether time passes: it neither stands nor is at the end.
     pub fn is_running(&self, now: Instant) -> bool {
         self.since.is_some() && !self.is_at_end(now)
     }
@@ -200,6 +213,7 @@ impl Clock {
         self.since = Some(now);
     }
 
+    /// Stands from now on.
     pub fn pause(&mut self, now: Instant) {
         self.at = self.position(now);
         self.since = None;
@@ -220,10 +234,15 @@ impl Clock {
             false => SPEEDS.iter().rev().find(|speed| **speed < self.speed),
         };
         if let Some(speed) = next {
-            self.at = self.position(now);
-            self.since = self.since.map(|_| now);
-            self.speed = *speed;
+            self.set_speed(*speed, now);
         }
+    }
+
+    /// Runs so many times as fast from now on.
+    pub fn set_speed(&mut self, speed: f64, now: Instant) {
+        self.at = self.position(now);
+        self.since = self.since.map(|_| now);
+        self.speed = speed;
     }
 
     /// Begins again at the end, or stays at the end of this lap.
@@ -233,7 +252,7 @@ impl Clock {
         self.last = match self.last {
             Some(_) => None,
             None => {
-                let frames = self.timeline.len();
+                let frames = self.timeline.count();
                 Some((self.slot(now) / frames + 1) * frames - 1)
             }
         };
@@ -246,7 +265,7 @@ impl Clock {
 
     /// Pauses a frame further on or back, within the sequence unless it is looped.
     pub fn step(&mut self, by: i64, now: Instant) {
-        let frames = self.timeline.len() as i64;
+        let frames = self.timeline.count() as i64;
         let frame = self.frame(now) as i64 + by;
         let frame = match self.last {
             None => frame.rem_euclid(frames),
@@ -258,7 +277,7 @@ impl Clock {
 
     /// Goes to a time of the first lap.
     pub fn jump(&mut self, time: f64, now: Instant) {
-        let last = self.timeline.len() - 1;
+        let last = self.timeline.count() - 1;
         self.last = self.last.map(|_| last);
         // The end belongs to the next lap.
         self.at = self.timeline.start(self.timeline.slot(time).min(last));
@@ -290,8 +309,12 @@ mod tests {
         }
         assert_eq!(timeline.slot(-1.0), 0);
         assert_eq!((timeline.next_whole(0), timeline.next_whole(7)), (5, 10));
+        assert_eq!(
+            (timeline.last_whole(4), timeline.last_whole(5), timeline.last_whole(19)),
+            (0, 5, 15)
+        );
         let empty = Timeline::new(Vec::new(), 0.0);
-        assert_eq!((empty.len(), empty.next_whole(0), empty.slot(0.0)), (1, 1, 0));
+        assert_eq!((empty.count(), empty.next_whole(0), empty.slot(0.0)), (1, 1, 0));
     }
 
     #[test]

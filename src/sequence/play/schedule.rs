@@ -2,13 +2,13 @@
 
 use std::time::Instant;
 
-use b2p::HeadSet;
-
 use super::clock::Clock;
+use crate::gaussians::HeadSet;
 
 /// A frame to decode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Task {
+    /// The slot of the frame.
     pub slot: u64,
     /// Whether it is shown, or only decoded because the next ones are predicted from it.
     pub shown: bool,
@@ -30,7 +30,7 @@ pub fn next_task(clock: &Clock, next: u64, now: Instant, is_wanted: bool) -> Opt
         });
     }
     // The first frame of each lap is coded by itself.
-    let nearest = due.saturating_sub(timeline.len()).max(next + 1);
+    let nearest = due.saturating_sub(timeline.count()).max(next + 1);
     match (nearest..=due).rev().find(|slot| timeline.is_whole(*slot)) {
         Some(slot) => Some(Task { slot, shown: true }),
         None => Some(Task {
@@ -43,7 +43,9 @@ pub fn next_task(clock: &Clock, next: u64, now: Instant, is_wanted: bool) -> Opt
 /// A level, and heads to draw it with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rung {
+    /// The level.
     pub level: u8,
+    /// The heads.
     pub heads: HeadSet,
 }
 
@@ -88,6 +90,17 @@ impl Ladder {
     /// The rung at hand.
     pub fn rung(&self) -> Rung {
         self.rungs[self.at]
+    }
+
+    /// The most accurate rung.
+    pub fn finest(&self) -> Rung {
+        self.rungs[0]
+    }
+
+    /// Forgets all times, and begins with the most accurate rung again.
+    pub fn forget(&mut self) {
+        self.times.fill(None);
+        self.at = 0;
     }
 
     /// Learns how many seconds a frame took. If a machine is slower than before, it is so on every rung.
