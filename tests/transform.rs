@@ -386,6 +386,19 @@ fn a_cancelled_decode_ends_with_cancelled() {
 }
 
 #[test]
+fn steps_of_luma_are_2_38_times_finer_with_each_of_two_levels_above_the_last() {
+    let bytes = stream(&Ball::new(8, 100.0).cloud(), &with(QualityTarget::Step(32.0)));
+    let stream = Stream::parse(&bytes, &Limits::default()).unwrap();
+    let coded = stream.levels().iter().map(|level| {
+        let colours = level.colours.as_ref().unwrap();
+        let last = colours.levels.last().map(|level| level.slices[0].bytes[0]);
+        last.unwrap_or_else(|| colours.trunk.as_ref().unwrap().slice.bytes[0])
+    });
+    // Eight indices are a factor of two, and 48 is a step of 32.
+    assert_eq!(coded.collect::<Vec<u8>>(), [28, 38, 48]);
+}
+
+#[test]
 fn sections_are_whole_and_hold_what_the_header_tells() {
     for cloud in clouds() {
         let bytes = stream(&cloud, &sliced());

@@ -50,16 +50,21 @@ impl Steps {
 
     /// The steps of the level above: half as large, but not below index 0.
     pub(crate) fn above(self) -> Steps {
+        self.finer(8)
+    }
+
+    /// Steps that are finer by so many indices, but not below index 0.
+    pub(crate) fn finer(self, indices: u8) -> Steps {
         if self.is_lossless() {
             return self;
         }
         let chroma = if self.chroma == Steps::ABSENT {
             self.chroma
         } else {
-            self.chroma.saturating_sub(8)
+            self.chroma.saturating_sub(indices)
         };
         Steps {
-            luma: self.luma.saturating_sub(8),
+            luma: self.luma.saturating_sub(indices),
             chroma,
         }
     }
