@@ -323,6 +323,23 @@ fn streams_state_how_wide_surfels_close_a_sparse_level_and_nothing_of_a_dense_on
 }
 
 #[test]
+fn the_level_above_a_sparse_cloud_s_own_has_a_head_map_and_that_above_a_dense_one_has_none() {
+    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
+    let options = Options {
+        levels: Some(5..=6),
+        heads: Some(heads),
+        ..with(QualityTarget::Step(20.0))
+    };
+    for (cloud, expected) in [(sparse_wall(), true), (Ball::new(7, 50.0).cloud(), false)] {
+        let bytes = stream(&cloud, &options);
+        let stream = Stream::parse(&bytes, &Limits::default()).unwrap();
+        let finest = stream.levels().last().unwrap();
+        assert_eq!(finest.level, 6);
+        assert_eq!(finest.colours.as_ref().unwrap().head_map.is_some(), expected);
+    }
+}
+
+#[test]
 fn levels_and_steps_that_do_not_exist_are_refused() {
     let cloud = Ball::new(4, 5.0).cloud();
     let refused = |options: Options| encode(&cloud, &options, &Log::default()).is_err();

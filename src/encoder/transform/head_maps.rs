@@ -4,6 +4,7 @@
 //! Gaussians are farther from the mesh than those are. A pixel's error goes to the block whose surfel covers it.
 
 use b2p_kernels::Isa;
+use rayon::prelude::*;
 
 use crate::cloud::ColouredVoxels;
 use crate::error::Result;
@@ -29,6 +30,8 @@ const SIZES: [u8; 3] = [54, 64, 74];
 const REFERENCE: f32 = 0.92;
 /// Factor of the surfels that decide which block a pixel belongs to, so that some lie beside the silhouette.
 const WIDER: f32 = 1.3;
+/// With more children than this for each voxel above, a cloud is not sparse.
+const DENSE: usize = 3;
 /// A block becomes surfels if they have less than this part of the learned Gaussians' error.
 const MARGIN: f64 = 0.9;
 
@@ -68,14 +71,14 @@ impl Reference {
     }
 
     fn gaussians(isa: Isa, cloud: &ColouredVoxels) -> Result<Gaussians> {
-        let octree = Octree::new(cloud.voxels.clone())?;
-        let mut map = octree.kernel_map(0);
-        for level in 0..octree.depth() {
-            map = octree.child_map(level, &map);
-        }
-        drop(octree);
+        let map = kernel_map(cloud)?;
+        let sparse = is_for_surfels(&map, 0..map.len());
         let choice = SurfelSelection {
-            size: REFERENCE,
+            size: if sparse {
+                f32::from(closing_size(&map)) / 64.0
+            } else {
+                REFERENCE
+            },
             ..SurfelSelection::ALL
         };
         let frame = Frame {
@@ -155,6 +158,28 @@ impl EncoderInput<'_> {
         let surfels = vec![true; HeadMap::block_count(octree, level)];
         Some(HeadMap::new(size, size, surfels).to_bytes())
     }
+}
+
+/// Whether a cloud is sparse at its own level, as captures are.
+pub fn is_sparse(cloud: &ColouredVoxels) -> Result<bool> {
+    // Voxels of a closed surface have about four children each.
+    let mut parents: Vec<u64> = cloud.voxels.keys().par_iter().map(|key| key >> 3).collect();
+    parents.dedup();
+    if cloud.voxels.depth() == 0 || cloud.voxels.len() > DENSE * parents.len() {
+        return Ok(false);
+    }
+    let map = kernel_map(cloud)?;
+    Ok(is_for_surfels(&map, 0..map.len()))
+}
+
+/// The 3³ kernel map of the cloud's voxels.
+fn kernel_map(cloud: &ColouredVoxels) -> Result<KernelMap> {
+    let octree = Octree::new(cloud.voxels.clone())?;
+    let mut map = octree.kernel_map(0);
+    for level in 0..octree.depth() {
+        map = octree.child_map(level, &map);
+    }
+    Ok(map)
 }
 
 /// Pixels along a side of the pictures of a level.

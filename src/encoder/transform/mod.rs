@@ -141,6 +141,8 @@ struct EncoderInput<'a> {
     /// The code of the levels from 1 on: of each slice the children, and its bytes.
     geometry: Vec<Vec<(u32, Vec<u8>)>>,
     grey: bool,
+    /// Whether the cloud is a capture that is sparse at its own level.
+    sparse: bool,
     /// Points that the header states.
     points: u64,
     /// What the previous frame tells of the levels from 1 on, for a predicted frame of a sequence.
@@ -187,6 +189,7 @@ impl<'a> EncoderInput<'a> {
             octree: Octree::root(),
             maps: Vec::new(),
             geometry: Vec::new(),
+            sparse: options.heads.is_some() && head_maps::is_sparse(cloud)?,
             grey: cloud.colours.par_iter().all(|[r, g, b]| r == g && g == b),
             points: cloud.voxels.len() as u64,
             guides: None,
@@ -488,9 +491,10 @@ impl<'a> EncoderInput<'a> {
     }
 
     /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its
-    /// own does the cloud tell more than the best heads.
+    /// own does the cloud tell more than the best heads, or one above if the cloud is sparse, which heads never saw.
     fn has_head_map(&self, level: u8) -> bool {
-        (1..self.cloud.voxels.depth().saturating_sub(1)).contains(&level)
+        let above = if self.sparse { 0 } else { 1 };
+        (1..self.cloud.voxels.depth().saturating_sub(above)).contains(&level)
     }
 
     fn has_head_maps(&self, top: u8) -> bool {

@@ -101,6 +101,8 @@ pub fn encode_predicted(
         maps: Vec::new(),
         geometry: Vec::new(),
         grey: cloud.colours.par_iter().all(|[r, g, b]| r == g && g == b),
+        // Predicted frames have no head maps.
+        sparse: false,
         points,
         guides: Some(guides),
     };

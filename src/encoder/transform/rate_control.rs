@@ -15,15 +15,15 @@ use crate::encoder::Encoded;
 use crate::error::{Error, Result};
 use crate::log::Log;
 
-/// The coarsest place of a level that the stream could do without: a step of luma of 64 255ths.
-const COARSEST: u8 = 112;
+/// The coarsest place of a level that the stream could do without: a step of luma of 76 255ths.
+const COARSEST: u8 = 116;
 
-/// The same where geometry is lossy, and leaves more bits to colours: a step of luma of 45.
-const COARSEST_OF_LOSSY: u8 = 104;
+/// The same where geometry is lossy, and leaves more bits to colours: a step of luma of 54.
+const COARSEST_OF_LOSSY: u8 = 108;
 
-/// The same of the level of the cloud's own voxels, whose geometry takes most: a step of luma of 23. In coarser steps
+/// The same of the level of the cloud's own voxels, whose geometry takes most: a step of luma of 27. In coarser steps
 /// the level above makes better pictures of the same bits.
-const COARSEST_OF_ALL: u8 = 88;
+const COARSEST_OF_ALL: u8 = 92;
 
 /// The place that is tried first: a step of luma of 11.
 const FIRST: u8 = 72;
