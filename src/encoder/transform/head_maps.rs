@@ -7,9 +7,10 @@ use b2p_kernels::Isa;
 use rayon::prelude::*;
 
 use crate::cloud::ColouredVoxels;
+use crate::decoder::Decoding;
 use crate::error::Result;
 use crate::gaussians::surfels::{PerVoxel, SurfelSelection, closing_size, is_for_surfels, surfels};
-use crate::gaussians::{Frame, Gaussians, HeadMap};
+use crate::gaussians::{Frame, Gaussians, HeadMap, HeadSet};
 use crate::geometry::{KernelMap, Octree};
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
@@ -158,6 +159,36 @@ impl EncoderInput<'_> {
         let surfels = vec![true; HeadMap::block_count(octree, level)];
         Some(HeadMap::new(size, size, surfels).to_bytes())
     }
+
+    /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its
+    /// own does the cloud tell more than the best heads, or one above if the cloud is sparse, which heads never saw.
+    pub(super) fn has_head_map(&self, level: u8) -> bool {
+        let above = if self.sparse { 0 } else { 1 };
+        (1..self.cloud.voxels.depth().saturating_sub(above)).contains(&level)
+    }
+
+    pub(super) fn has_head_maps(&self, top: u8) -> bool {
+        (*self.levels.start().min(&top)..=top).any(|level| self.has_head_map(level))
+    }
+
+    /// Bytes to set aside for the head maps of a stream whose last level is `top`.
+    pub(super) fn head_map_bytes(&self, top: u8) -> usize {
+        /// Of a chunk without its payload.
+        const CHUNK: usize = 12;
+        let levels = *self.levels.start().min(&top)..=top;
+        let mapped = levels.filter(|level| self.has_head_map(*level));
+        let bytes = |level| CHUNK + HeadMap::usual_bytes(HeadMap::block_count(&self.octree, level));
+        mapped.map(bytes).sum()
+    }
+}
+
+/// Compares the ways to draw the level that was decoded.
+pub fn of_level(octree: &Octree, reference: &Reference, decoding: &mut Decoding<'_>, level: u8) -> Result<HeadMap> {
+    decoding.set_heads(HeadSet::Surfels)?;
+    let surfels = decoding.gaussians()?;
+    let comparison = reference.compare_surfels(octree, level, surfels)?;
+    decoding.set_heads(HeadSet::Best)?;
+    comparison.with_learned(&decoding.gaussians()?)
 }
 
 /// Whether a cloud is sparse at its own level, as captures are.

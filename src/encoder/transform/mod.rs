@@ -23,10 +23,9 @@ use crate::colour::{self, Filter, Steps, Truth};
 #[cfg(doc)]
 use crate::container::MAX_COLOUR_SLICE;
 use crate::container::{Format, Header, MAX_SLICE_VOXELS, Writer};
-use crate::decoder::{Decoder, Decoding, colour_hash};
+use crate::decoder::{Decoder, colour_hash};
 use crate::error::{Error, Result};
 use crate::gaussians::learned::HeadsModel;
-use crate::gaussians::{HeadMap, HeadSet};
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -464,7 +463,7 @@ impl<'a> EncoderInput<'a> {
         let same = log.step("decode again", voxels.len(), "voxels", || {
             while let Some(level) = decoding.advance()? {
                 if let Some(reference) = reference.as_ref().filter(|_| self.has_head_map(level)) {
-                    maps.push((level, head_map(octree, reference, &mut decoding, level)?));
+                    maps.push((level, head_maps::of_level(octree, reference, &mut decoding, level)?));
                 }
             }
             let points = decoding.points();
@@ -489,27 +488,6 @@ impl<'a> EncoderInput<'a> {
         let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);
         Ok(Encoded { bytes, rates })
     }
-
-    /// Whether a level has a head map: heads read the level above, and only of a level that is at least two above its
-    /// own does the cloud tell more than the best heads, or one above if the cloud is sparse, which heads never saw.
-    fn has_head_map(&self, level: u8) -> bool {
-        let above = if self.sparse { 0 } else { 1 };
-        (1..self.cloud.voxels.depth().saturating_sub(above)).contains(&level)
-    }
-
-    fn has_head_maps(&self, top: u8) -> bool {
-        (*self.levels.start().min(&top)..=top).any(|level| self.has_head_map(level))
-    }
-
-    /// Bytes to set aside for the head maps of a stream whose last level is `top`.
-    fn head_map_bytes(&self, top: u8) -> usize {
-        /// Of a chunk without its payload.
-        const CHUNK: usize = 12;
-        let levels = *self.levels.start().min(&top)..=top;
-        let mapped = levels.filter(|level| self.has_head_map(*level));
-        let bytes = |level| CHUNK + HeadMap::usual_bytes(HeadMap::block_count(&self.octree, level));
-        mapped.map(bytes).sum()
-    }
 }
 
 /// The octree of a cloud down to level `top`.
@@ -528,18 +506,4 @@ fn counted(parents: usize, slice: usize, payloads: Vec<Vec<u8>>) -> Vec<(u32, Ve
     let count = |i: usize| (parents - i * slice).min(slice) as u32;
     let payloads = payloads.into_iter().enumerate();
     payloads.map(|(i, bytes)| (count(i), bytes)).collect()
-}
-
-/// Compares the ways to draw the level that was decoded.
-fn head_map(
-    octree: &Octree,
-    reference: &head_maps::Reference,
-    decoding: &mut Decoding<'_>,
-    level: u8,
-) -> Result<HeadMap> {
-    decoding.set_heads(HeadSet::Surfels)?;
-    let surfels = decoding.gaussians()?;
-    let comparison = reference.compare_surfels(octree, level, surfels)?;
-    decoding.set_heads(HeadSet::Best)?;
-    comparison.with_learned(&decoding.gaussians()?)
 }
