@@ -4,7 +4,6 @@
 //! Gaussians are farther from the mesh than those are. A pixel's error goes to the block whose surfel covers it.
 
 use b2p_kernels::Isa;
-use rayon::prelude::*;
 
 use crate::cloud::ColouredVoxels;
 use crate::decoder::Decoding;
@@ -57,9 +56,10 @@ pub struct Comparison<'a> {
 }
 
 impl Reference {
-    /// Draws the cloud's voxels, whose depth is at least 1, as these levels need it.
-    pub fn new(isa: Isa, cloud: &ColouredVoxels, levels: impl Iterator<Item = u8>) -> Result<Self> {
-        let gaussians = Self::gaussians(isa, cloud)?;
+    /// Draws the cloud's voxels, whose depth is at least 1, as these levels need it. Those of a `sparse` cloud are wide
+    /// enough to close.
+    pub fn new(isa: Isa, cloud: &ColouredVoxels, sparse: bool, levels: impl Iterator<Item = u8>) -> Result<Self> {
+        let gaussians = Self::gaussians(isa, cloud, sparse)?;
         let mut pictures: Vec<(u32, Vec<Image>)> = Vec::new();
         for side in levels.map(side) {
             if pictures.iter().all(|(known, _)| *known != side) {
@@ -71,9 +71,8 @@ impl Reference {
         Ok(Reference { isa, pictures })
     }
 
-    fn gaussians(isa: Isa, cloud: &ColouredVoxels) -> Result<Gaussians> {
+    fn gaussians(isa: Isa, cloud: &ColouredVoxels, sparse: bool) -> Result<Gaussians> {
         let map = kernel_map(cloud)?;
-        let sparse = is_for_surfels(&map, 0..map.len());
         let choice = SurfelSelection {
             size: if sparse {
                 f32::from(closing_size(&map)) / 64.0
@@ -193,10 +192,13 @@ pub fn of_level(octree: &Octree, reference: &Reference, decoding: &mut Decoding<
 
 /// Whether a cloud is sparse at its own level, as captures are.
 pub fn is_sparse(cloud: &ColouredVoxels) -> Result<bool> {
-    // Voxels of a closed surface have about four children each.
-    let mut parents: Vec<u64> = cloud.voxels.keys().par_iter().map(|key| key >> 3).collect();
-    parents.dedup();
-    if cloud.voxels.depth() == 0 || cloud.voxels.len() > DENSE * parents.len() {
+    let voxels = cloud.voxels.keys();
+    if cloud.voxels.depth() == 0 {
+        return Ok(false);
+    }
+    // Voxels of a closed surface have about four children each: few clouds need a kernel map to be told from captures.
+    let parents = 1 + voxels.windows(2).filter(|pair| pair[0] >> 3 != pair[1] >> 3).count();
+    if voxels.len() > DENSE * parents {
         return Ok(false);
     }
     let map = kernel_map(cloud)?;

@@ -91,10 +91,6 @@ impl Default for Options {
 /// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.
 const COLOUR_SLICE: u32 = 8192;
 
-/// By how many indices the steps of the two levels above the last are finer than squared error in voxels asks for: at
-/// equal bits SSIMULACRA2 gains 0.4 points, and PSNR nothing or 0.02 dB (`docs/measurements.md`).
-const FINER: u8 = 2;
-
 /// Filters of levels that are not the finest may take one part in so many of a stream that ends there.
 const FILTER_SHARE: usize = 100;
 
@@ -261,21 +257,6 @@ impl<'a> EncoderInput<'a> {
     fn trunk_depth(&self, top: u8) -> u8 {
         let base = *self.levels.start().min(&top);
         colour::trunk_depth(base, |level| self.octree.level(level).len())
-    }
-
-    /// How levels are coded, if the last one, `top`, has these steps: the coarser a level, the smaller are its steps,
-    /// for what it brings is seen at all levels that follow.
-    fn coding(&self, steps: Steps, top: u8, level: u8) -> colour::Options {
-        let above = (level..top).fold(steps, |steps, _| steps.above());
-        let mut steps = above.finer(FINER * (top - level).min(2));
-        if self.grey && !steps.is_lossless() {
-            steps.chroma = Steps::ABSENT;
-        }
-        let mut coding = colour::Options::new(steps);
-        if !self.options.optimised {
-            coding.lambda = 0.0;
-        }
-        coding
     }
 
     /// Codes the colours of the levels down to `top`.
@@ -453,7 +434,7 @@ impl<'a> EncoderInput<'a> {
                 decoding.set_heads_model(heads.clone());
                 let levels = (*self.levels.start().min(&top)..=top).filter(|level| self.has_head_map(*level));
                 let reference = log.step("draw the cloud", self.cloud.voxels.len(), "voxels", || {
-                    head_maps::Reference::new(self.isa, self.cloud, levels)
+                    head_maps::Reference::new(self.isa, self.cloud, self.sparse, levels)
                 })?;
                 Some(reference)
             }

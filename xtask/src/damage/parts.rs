@@ -50,6 +50,22 @@ fn u32_at(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
 
+/// A header whose checksum is wrong by `sum`, and its chunks. The one of no payload gets that of the index, and says that
+/// it has so many units.
+pub fn framed(header: &[u8], sum: u32, chunks: &[Chunk], index: &[u8], units: i64) -> Vec<u8> {
+    let sum = crc32c::crc32c(header) ^ sum;
+    let mut bytes = [header, &sum.to_le_bytes()].concat();
+    for chunk in chunks {
+        let mut chunk = chunk.clone();
+        if chunk.payload.is_empty() {
+            chunk.payload = index.to_vec();
+            chunk.count = varint(units as u64);
+        }
+        chunk.write(true, &mut bytes);
+    }
+    bytes
+}
+
 impl Parts {
     /// Takes a valid stream apart.
     pub fn of(bytes: &[u8]) -> Self {

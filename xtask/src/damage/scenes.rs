@@ -5,7 +5,7 @@ use b2p::{Limits, SceneReader};
 use xxhash_rust::xxh3::xxh3_64;
 
 use super::kinds::Kind;
-use super::parts::{Chunk, varint};
+use super::parts::{Chunk, framed, varint};
 
 /// The scene that is damaged: levels 3 to 5 of 6 bits, blocks of several sizes.
 pub const DAMAGED: &str = "scenes/blocks-of-many-sizes";
@@ -260,16 +260,8 @@ impl Scene {
         }
         payload.extend(&self.tails[0]);
         payload.truncate(payload.len().saturating_sub(self.short[0]));
-        let sum = crc32c::crc32c(&self.header) ^ self.sum;
-        let mut bytes = [&self.header[..], &sum.to_le_bytes()].concat();
-        for chunk in &self.chunks {
-            let mut chunk = chunk.clone();
-            if chunk.payload.is_empty() {
-                chunk.payload = payload.clone();
-                chunk.count = varint((self.blocks.len() as i64 + self.more) as u64);
-            }
-            chunk.write(true, &mut bytes);
-        }
+        let units = self.blocks.len() as i64 + self.more;
+        let mut bytes = framed(&self.header, self.sum, &self.chunks, &payload, units);
         self.blocks.iter().for_each(|block| bytes.extend(&block.stream));
         bytes.extend(&self.tails[1]);
         bytes.truncate(bytes.len() - self.short[1]);

@@ -5,7 +5,7 @@ use b2p::container::Header;
 use b2p::container::sequence::{FrameKind, Index, parse_table};
 use xxhash_rust::xxh3::xxh3_64;
 
-use super::parts::{Chunk, varint};
+use super::parts::{Chunk, framed, varint};
 
 /// A sequence as its parts.
 #[derive(Clone)]
@@ -166,16 +166,8 @@ impl Sequence {
         }
         payload.extend(&self.tails[0]);
         payload.truncate(payload.len().saturating_sub(self.short[0]));
-        let sum = crc32c::crc32c(&self.header) ^ self.sum;
-        let mut bytes = [&self.header[..], &sum.to_le_bytes()].concat();
-        for chunk in &self.chunks {
-            let mut chunk = chunk.clone();
-            if chunk.payload.is_empty() {
-                chunk.payload = payload.clone();
-                chunk.count = varint((self.groups.len() as i64 + self.more) as u64);
-            }
-            chunk.write(true, &mut bytes);
-        }
+        let units = self.groups.len() as i64 + self.more;
+        let mut bytes = framed(&self.header, self.sum, &self.chunks, &payload, units);
         groups.iter().for_each(|group| bytes.extend(group));
         bytes.extend(&self.tails[1]);
         bytes.truncate(bytes.len() - self.short[1]);
