@@ -22,7 +22,7 @@ async function list() {
   return response?.ok ? response.json() : { streams: [], heads: null };
 }
 
-/** Tells what the page does: it is `busy`, shows a `level`, or has met an `error`. */
+/** Tells what the page does: it is `ready` for a file, `busy`, shows a `level` or a `frame`, or has met an `error`. */
 function say(text, what) {
   state.textContent = text;
   state.classList.toggle("error", what === "error");
@@ -89,3 +89,4 @@ files.hidden = listed.streams.length < 2;
 files.addEventListener("change", () => open(encodeURIComponent(files.value)));
 const first = parameters.get("src") ?? listed.streams[0];
 if (first) open(parameters.has("src") ? first : encodeURIComponent(first));
+else say("Drop a stream, a sequence or a file of Gaussians here.", "ready");

@@ -68,7 +68,7 @@ test("the page draws files of Gaussians", { skip }, async () => {
 
 test("a file that is dropped is drawn, and one that is none of Gaussians is named", { skip }, async () => {
   const shown = await page.empty();
-  await shown.until(`${STATE}.startsWith("Drop")`);
+  await shown.until("document.body.dataset.state === 'ready'");
   const drop = (name) => shown.evaluate(`(async () => {
     const response = await fetch("streams/${name}");
     const transfer = new DataTransfer();
