@@ -29,13 +29,13 @@ pub fn score(above: u8, heads: HeadSet) -> f64 {
 pub struct Curve(pub Vec<[f64; 2]>);
 
 impl Curve {
-    /// Nanoseconds of so many voxels: interpolated between those that were measured, proportional outside.
+    /// Nanoseconds of so many voxels: interpolated between those that were measured, proportional above them, and below
+    /// them as many as of the fewest.
     pub fn of(&self, voxels: f64) -> Option<f64> {
         let above = self.0.iter().position(|[n, _]| *n >= voxels);
-        let share = |[n, time]: [f64; 2]| time * voxels / n.max(1.0);
         match above {
-            None => self.0.last().copied().map(share),
-            Some(0) => Some(share(self.0[0])),
+            None => self.0.last().map(|[n, time]| time * voxels / n.max(1.0)),
+            Some(0) => Some(self.0[0][1]),
             Some(i) => {
                 let [[n, t], [m, u]] = [self.0[i - 1], self.0[i]];
                 Some(t + (u - t) * (voxels - n) / (m - n).max(1.0))
@@ -59,6 +59,8 @@ impl Curve {
 /// What a picture costs in nanoseconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct PictureCost {
+    /// For any.
+    pub fixed: f64,
     /// For each Gaussian.
     pub per_gaussian: f64,
     /// For each pixel …
@@ -87,10 +89,14 @@ impl PictureSize {
 }
 
 impl PictureCost {
-    /// From pictures of two sizes of as many Gaussians, and an empty one of the second size.
-    pub fn from_times(gaussians: f64, sizes: [PictureSize; 2], times: [f64; 2], empty: f64) -> PictureCost {
-        let per_pixel = (empty.min(times[1]) / sizes[1].pixels.max(1.0)).max(0.0);
-        let [few, many] = [0, 1].map(|i| (times[i] - per_pixel * sizes[i].pixels).max(0.0));
+    /// From pictures of two sizes of as many Gaussians, and empty ones of the same sizes.
+    pub fn from_times(gaussians: f64, sizes: [PictureSize; 2], times: [f64; 2], empty: [f64; 2]) -> PictureCost {
+        let empty = [0, 1].map(|i| empty[i].min(times[i]));
+        let more = (sizes[1].pixels - sizes[0].pixels).max(1.0);
+        let per_pixel = ((empty[1] - empty[0]) / more).clamp(0.0, empty[0] / sizes[0].pixels.max(1.0));
+        // At most `empty` is subtracted, but for rounding.
+        let fixed = (empty[0] - per_pixel * sizes[0].pixels).max(0.0);
+        let [few, many] = [0, 1].map(|i| (times[i] - fixed - per_pixel * sizes[i].pixels).max(0.0));
         let more = sizes[1].covered - sizes[0].covered;
         // No more than the smaller picture took, or its Gaussians would cost less than nothing.
         let most = few / sizes[0].covered.max(1.0);
@@ -100,6 +106,7 @@ impl PictureCost {
             0.0
         };
         PictureCost {
+            fixed,
             // At most `few` is subtracted, but for rounding.
             per_gaussian: (few - per_covered * sizes[0].covered).max(0.0) / gaussians.max(1.0),
             per_pixel,
@@ -109,12 +116,12 @@ impl PictureCost {
 
     /// Nanoseconds of a picture of so many Gaussians.
     pub fn of(&self, gaussians: f64, size: PictureSize) -> f64 {
-        self.per_gaussian * gaussians + self.per_pixel * size.pixels + self.per_covered * size.covered
+        self.fixed + self.per_gaussian * gaussians + self.per_pixel * size.pixels + self.per_covered * size.covered
     }
 
     /// All its numbers.
-    pub fn numbers(&self) -> [f64; 3] {
-        [self.per_gaussian, self.per_pixel, self.per_covered]
+    pub fn numbers(&self) -> [f64; 4] {
+        [self.fixed, self.per_gaussian, self.per_pixel, self.per_covered]
     }
 }
 
@@ -130,7 +137,7 @@ mod tests {
                 pixels: 2.0 * covered,
                 covered,
             });
-            let cost = PictureCost::from_times(1000.0, sizes, [time, 1000.0 * time], 0.0);
+            let cost = PictureCost::from_times(1000.0, sizes, [time, 1000.0 * time], [0.0; 2]);
             assert!(
                 cost.numbers().iter().all(|n| *n >= 0.0),
                 "{cost:?} of {covered} pixels in {time} ns"
@@ -152,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_between_measured_sizes_is_interpolated_and_the_rest_proportional() {
+    fn what_lies_between_measured_sizes_is_interpolated_and_what_lies_above_proportional() {
         let mut curve = Curve::default();
         assert_eq!(curve.of(5.0), None);
         curve.push(10.0, 100.0);
@@ -161,13 +168,14 @@ mod tests {
         let at = |voxels| curve.of(voxels).unwrap();
         assert_eq!(
             [5.0, 10.0, 15.0, 20.0, 40.0].map(at),
-            [50.0, 100.0, 250.0, 400.0, 800.0]
+            [100.0, 100.0, 250.0, 400.0, 800.0]
         );
     }
 
     #[test]
     fn pictures_cost_what_those_took_that_they_were_calibrated_with() {
         let cost = PictureCost {
+            fixed: 700.0,
             per_gaussian: 2.0,
             per_pixel: 3.0,
             per_covered: 4.0,
@@ -177,9 +185,10 @@ mod tests {
             covered: pixels / 2.0,
         });
         let times = sizes.map(|size| cost.of(500.0, size));
-        assert_eq!(PictureCost::from_times(500.0, sizes, times, 3000.0), cost);
+        let empty = [1000.0, 3700.0];
+        assert_eq!(PictureCost::from_times(500.0, sizes, times, empty), cost);
         // Whatever a busy machine measured, nothing costs less than nothing.
-        for (times, empty) in [([9.0, 1.0], 5.0), ([1.0, 9e9], 0.0), ([0.0, 0.0], 1e9)] {
+        for (times, empty) in [([9.0, 1.0], [5.0; 2]), ([1.0, 9e9], [9.0, 0.0]), ([0.0, 0.0], [1e9, 1.0])] {
             let odd = PictureCost::from_times(500.0, sizes, times, empty);
             assert!(odd.numbers().iter().all(|n| *n >= 0.0), "{odd:?}");
         }

@@ -1,8 +1,8 @@
 //! What decoding and drawing cost, measured as a process that does it once has it: threads have just started, memory is
 //! fresh from the system, networks and renderers are new.
 //!
-//! Everything is measured in rounds, and the least time counts: whatever else the machine does only adds to it. Time in
-//! which threads waited for a processor does not count at all, where the system tells it.
+//! Everything is measured in rounds, and medians count: a task that runs once is as likely to take longer. Time in which
+//! threads waited for a processor does not count, where the system tells it.
 
 use std::time::{Duration, Instant};
 
@@ -22,10 +22,10 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// Sides of the pictures whose times tell what a Gaussian and what a pixel costs.
 const SIDES: [u32; 2] = [320, 1024];
 
-/// A stream to measure with.
+/// What to measure with.
 pub struct Sample<'a> {
-    /// The stream.
-    pub stream: &'a [u8],
+    /// Streams, the one of the fewest voxels first: small levels cost more a voxel than large ones.
+    pub streams: &'a [Vec<u8>],
     /// Makes a decoder of it with a freshly loaded model.
     pub decoder: &'a dyn Fn() -> Result<Decoder>,
     /// What heads there are.
@@ -36,19 +36,53 @@ pub struct Sample<'a> {
     pub limits: &'a Limits,
 }
 
-/// The least times, in nanoseconds.
-#[derive(Clone, Copy)]
-struct Least {
-    generate: f64,
-    draw: [f64; 2],
+/// The times that something took, in nanoseconds, one a round.
+#[derive(Clone, Default)]
+struct Times(Vec<f64>);
+
+impl Times {
+    fn median(&self) -> f64 {
+        let mut sorted = self.0.clone();
+        sorted.sort_by(f64::total_cmp);
+        sorted.get(sorted.len() / 2).copied().unwrap_or_default()
+    }
+}
+
+/// Those of a set of heads.
+#[derive(Clone, Default)]
+struct HeadsTimes {
+    generate: Times,
+    draw: [Times; 2],
     gaussians: usize,
 }
 
-/// Those of a level.
-struct LevelTimes {
+/// Those of a level of a stream.
+struct LevelTimes<'a> {
+    stream: &'a [u8],
     level: u8,
-    exact: f64,
-    heads: Vec<Least>,
+    voxels: f64,
+    wide: bool,
+    exact: Times,
+    heads: Vec<HeadsTimes>,
+}
+
+impl<'a> LevelTimes<'a> {
+    /// None yet, of all levels of a stream.
+    fn of_stream(sample: &Sample<'_>, stream: &'a [u8]) -> Result<Vec<Self>> {
+        let header = Header::parse(stream, sample.limits)?;
+        let of_level = |level| {
+            Ok(LevelTimes {
+                stream,
+                level,
+                voxels: f64::from(header.voxels(level)?),
+                wide: header.bits - level > 1,
+                exact: Times::default(),
+                heads: vec![HeadsTimes::default(); sample.heads.len()],
+            })
+        };
+        let levels = (sample.decoder)()?.levels(stream)?;
+        levels.into_iter().map(of_level).collect()
+    }
 }
 
 /// Measures with as many threads as the rayon pool that the caller is in has; `say` receives what is being done.
@@ -56,22 +90,9 @@ struct LevelTimes {
 /// # Errors
 /// Those of decoding and drawing; [`Error::Usage`] if threads cannot be started.
 pub fn measure(sample: &Sample<'_>, key: CalibrationKey, say: &dyn Fn(&str)) -> Result<Calibration> {
-    let header = Header::parse(sample.stream, sample.limits)?;
-    let least = Least {
-        generate: f64::MAX,
-        draw: [f64::MAX; 2],
-        gaussians: 0,
-    };
-    let levels = (sample.decoder)()?.levels(sample.stream)?;
-    let mut all: Vec<LevelTimes> = levels
-        .into_iter()
-        .map(|level| LevelTimes {
-            level,
-            exact: f64::MAX,
-            heads: vec![least; sample.heads.len()],
-        })
-        .collect();
-    let (mut empty, start) = (f64::MAX, Instant::now());
+    let levels = sample.streams.iter().map(|stream| LevelTimes::of_stream(sample, stream));
+    let mut all = levels.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect::<Vec<_>>();
+    let (mut empty, start) = ([Times::default(), Times::default()], Instant::now());
     for round in 0..ROUNDS {
         if round > 1 && start.elapsed() > PATIENCE {
             break;
@@ -80,28 +101,30 @@ pub fn measure(sample: &Sample<'_>, key: CalibrationKey, say: &dyn Fn(&str)) -> 
         for times in &mut all {
             measure_level(sample, times)?;
         }
-        empty = empty.min(draw(sample, &Gaussians::default(), SIDES[1])?);
+        for (side, times) in SIDES.into_iter().zip(&mut empty) {
+            times.0.push(draw(sample, &Gaussians::default(), side)?);
+        }
     }
-    calibration(sample, key, &header, &all, empty)
+    calibration(sample, key, &all, empty.map(|times| times.median()))
 }
 
 /// One round of a level.
-fn measure_level(sample: &Sample<'_>, times: &mut LevelTimes) -> Result<()> {
+fn measure_level(sample: &Sample<'_>, times: &mut LevelTimes<'_>) -> Result<()> {
     let decoder = (sample.decoder)()?.with_level(times.level);
     let (exact, mut decoding) = cold(|| {
-        let decoding = decoder.whole(sample.stream)?;
+        let decoding = decoder.whole(times.stream)?;
         // The filter of its colours is part of them.
         decoding.points();
         Ok(decoding)
     })?;
-    times.exact = times.exact.min(exact);
-    for (&heads, least) in sample.heads.iter().zip(&mut times.heads) {
+    times.exact.0.push(exact);
+    for (&heads, times) in sample.heads.iter().zip(&mut times.heads) {
         decoding.set_heads(heads)?;
         let (generate, gaussians) = cold(|| decoding.gaussians())?;
-        least.generate = least.generate.min(generate);
-        least.gaussians = gaussians.len();
-        for (side, least) in SIDES.into_iter().zip(&mut least.draw) {
-            *least = least.min(draw(sample, &gaussians, side)?);
+        times.generate.0.push(generate);
+        times.gaussians = gaussians.len();
+        for (side, times) in SIDES.into_iter().zip(&mut times.draw) {
+            times.0.push(draw(sample, &gaussians, side)?);
         }
     }
     Ok(())
@@ -111,9 +134,8 @@ fn measure_level(sample: &Sample<'_>, times: &mut LevelTimes) -> Result<()> {
 fn calibration(
     sample: &Sample<'_>,
     key: CalibrationKey,
-    header: &Header,
-    all: &[LevelTimes],
-    empty: f64,
+    all: &[LevelTimes<'_>],
+    empty: [f64; 2],
 ) -> Result<Calibration> {
     let mut calibration = Calibration {
         machine: Machine::this(),
@@ -125,26 +147,26 @@ fn calibration(
     };
     let per_unit = camera(SIDES[1])?.pixels_per_unit() / f64::from(SIDES[1]);
     for times in all {
-        let voxels = f64::from(header.voxels(times.level)?);
-        calibration.exact.push(voxels, times.exact);
-        let wide = header.bits - times.level > 1;
+        let voxels = times.voxels;
+        calibration.exact.push(voxels, times.exact.median());
         let sizes = SIDES.map(|side| {
             let side = f64::from(side);
             PictureSize::of_surface(side * side, per_unit * side, voxels, times.level)
         });
-        for (&heads, least) in sample.heads.iter().zip(&times.heads) {
-            let gaussians = least.gaussians as f64;
+        for (&heads, of_heads) in sample.heads.iter().zip(&times.heads) {
+            let gaussians = of_heads.gaussians as f64;
             let mut same = calibration.heads.iter_mut();
-            let known = same.find(|cost| cost.heads == heads && cost.wide == wide);
+            let known = same.find(|cost| cost.heads == heads && cost.wide == times.wide);
             let mut generate = known.as_ref().map_or(Curve::default(), |cost| cost.generate.clone());
-            generate.push(voxels, least.generate);
+            generate.push(voxels, of_heads.generate.median());
+            let drawn = of_heads.draw.each_ref().map(Times::median);
             // Pictures of the finest level of the kind have the most Gaussians.
             let cost = HeadsCost {
                 heads,
-                wide,
+                wide: times.wide,
                 per_voxel: gaussians / voxels.max(1.0),
                 generate,
-                picture: PictureCost::from_times(gaussians, sizes, least.draw, empty),
+                picture: PictureCost::from_times(gaussians, sizes, drawn, empty),
             };
             match known {
                 Some(known) => *known = cost,
@@ -222,6 +244,11 @@ fn draw(sample: &Sample<'_>, gaussians: &Gaussians, side: u32) -> Result<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_round_of_three_that_took_long_does_not_count() {
+        assert_eq!(Times(vec![2.0, 90.0, 1.0]).median(), 2.0);
+    }
 
     #[test]
     fn time_that_other_programs_took_is_taken_out() {

@@ -13,7 +13,7 @@ use b2p::container::{Header, version};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::learned::HeadsModel;
 use b2p::latents::network::Model;
-use b2p::{Decoder, Isa, Limits, embedded};
+use b2p::{Decoder, Encoder, Isa, Limits, embedded};
 use clap::Args;
 
 use self::calibration::{Calibration, CalibrationKey};
@@ -162,6 +162,20 @@ impl Machine {
         Ok(calibration)
     }
 
+    /// What is measured with: the stream, and before it, if it has version 3, one of its coarsest level.
+    fn streams(&self, decoder: &dyn Fn() -> b2p::Result<Decoder>) -> Result<Vec<Vec<u8>>> {
+        let own = self.stream.clone();
+        let Some(&coarsest) = decoder()?.levels(&own)?.first().filter(|_| self.version > 2) else {
+            return Ok(vec![own]);
+        };
+        let decoding = decoder()?.with_level(coarsest).whole(&own)?;
+        let Some(points) = decoding.points() else {
+            return Ok(vec![own]);
+        };
+        let coarse = Encoder::new().with_isa(self.isa).encode(&points.to_voxels())?;
+        Ok(vec![coarse.bytes, own])
+    }
+
     fn measure(&self, key: CalibrationKey, limits: &Limits, progress: &Progress) -> Result<Calibration> {
         let decoder = || {
             let decoder = Decoder::new().with_isa(self.isa).with_limits(limits.clone());
@@ -184,8 +198,9 @@ impl Machine {
                 heads.push(set);
             }
         }
+        let streams = self.streams(&decoder)?;
         let sample = Sample {
-            stream: &self.stream,
+            streams: &streams,
             decoder: &decoder,
             heads: &heads,
             isa: self.isa,

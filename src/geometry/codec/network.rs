@@ -180,33 +180,33 @@ impl Network {
 /// Returns for each half the sums clamped to `i8`, and their remainders. At most 26 + 19·8 + 1 rows are added for a
 /// child, so all totals stay within ±22,733.
 fn split(known: &Narrow, children: &[Narrow; 8]) -> [([Narrow; 16], [Narrow; 16]); 2] {
-    let sum = |half: usize, mask: usize, unit: usize| -> i32 {
-        ones(mask as u32)
-            .map(|octant| i32::from(children[4 * half + octant][unit]))
-            .sum()
-    };
-    // Range of the part of `known` with which all sums of a half fit in `i8`.
-    let range = |half: usize, unit: usize| {
-        let sums = (0..16).map(|mask| sum(half, mask, unit));
-        let (least, most) = sums.fold((0, 0), |(a, b), sum| (sum.min(a), sum.max(b)));
-        (i32::from(i8::MIN) - least, i32::from(i8::MAX) - most)
-    };
-    let base = |half: usize, unit: usize| {
+    let mut halves = [([[0; WIDTH]; 16], [[0; WIDTH]; 16]); 2];
+    for unit in 0..WIDTH {
+        let sums = [0, 1].map(|half| {
+            let mut sums = [0i32; 16];
+            for mask in 1..16usize {
+                let octant = 4 * half + mask.trailing_zeros() as usize;
+                sums[mask] = sums[mask & (mask - 1)] + i32::from(children[octant][unit]);
+            }
+            sums
+        });
+        // Range of the part of `known` with which all sums of a half fit in `i8`.
+        let [(a, b), (c, d)] = sums.map(|sums| {
+            let (least, most) = sums.iter().fold((0, 0), |(a, b), &sum| (sum.min(a), sum.max(b)));
+            (i32::from(i8::MIN) - least, i32::from(i8::MAX) - most)
+        });
         let known = i32::from(known[unit]);
-        let ((a, b), (c, d)) = (range(0, unit), range(1, unit));
         let low = known.max(a.max(known - d)).min(b.min(known - c));
-        if half == 0 { low } else { known - low }
-    };
-    [0, 1].map(|half| {
-        let (mut sums, mut remainder) = ([[0; WIDTH]; 16], [[0; WIDTH]; 16]);
-        for (unit, mask) in (0..WIDTH).flat_map(|unit| (0..16).map(move |mask| (unit, mask))) {
-            let exact = base(half, unit) + sum(half, mask, unit);
-            let fits = exact.clamp(i8::MIN.into(), i8::MAX.into());
-            sums[mask][unit] = fits as i8;
-            remainder[mask][unit] = i8::try_from(exact - fits).expect("the remainder fits in i8");
+        for ((clamped, remainder), (base, sums)) in halves.iter_mut().zip([low, known - low].into_iter().zip(sums)) {
+            for mask in 0..16 {
+                let exact = base + sums[mask];
+                let fits = exact.clamp(i8::MIN.into(), i8::MAX.into());
+                clamped[mask][unit] = fits as i8;
+                remainder[mask][unit] = i8::try_from(exact - fits).expect("the remainder fits in i8");
+            }
         }
-        (sums, remainder)
-    })
+    }
+    halves
 }
 
 #[cfg(test)]
