@@ -40,6 +40,8 @@ pub struct Calibration {
     pub threads: usize,
     /// With which model and stream.
     pub model: String,
+    /// How many times its usual time something may take here, as far as the rounds of the measurement tell.
+    pub spread: f64,
     /// Decoding to a level, without Gaussians, by the voxels of that level.
     pub exact: Curve,
     /// Each set of heads.
@@ -142,7 +144,11 @@ impl Calibration {
             let own = cost.picture.numbers().into_iter().chain([cost.per_voxel]);
             own.chain(cost.generate.numbers()).collect::<Vec<_>>()
         };
-        let numbers = self.exact.numbers().chain(self.heads.iter().flat_map(of_heads));
+        let numbers = self
+            .exact
+            .numbers()
+            .chain([self.spread])
+            .chain(self.heads.iter().flat_map(of_heads));
         numbers.into_iter().all(|n| (0.0..=MOST).contains(&n))
     }
 }
@@ -164,6 +170,7 @@ mod tests {
             isa: "scalar".into(),
             threads: rayon::current_num_threads(),
             model: "ab12".into(),
+            spread: 1.1,
             exact: Curve(vec![[10.0, 1.5]]),
             heads: vec![HeadsCost {
                 heads: HeadSet::Surfels,
@@ -203,12 +210,13 @@ mod tests {
     fn what_is_of_another_machine_model_or_number_of_threads_is_not_taken() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("c.json");
-        let spoil: [fn(&mut Calibration); 7] = [
+        let spoil: [fn(&mut Calibration); 8] = [
             |c| c.machine.processor.push('x'),
             |c| c.machine.version.push('x'),
             |c| c.isa.push('x'),
             |c| c.model.push('x'),
             |c| c.threads += 1,
+            |c| c.spread = -1.0,
             |c| c.exact.0[0][1] = -1.0,
             |c| c.heads[0].picture.per_pixel = -1.0,
         ];

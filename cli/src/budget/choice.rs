@@ -10,10 +10,10 @@ use b2p::{Error, Result};
 use super::calibration::Calibration;
 use super::costs::{PictureSize, score};
 
-/// A time is promised only if the estimate, so many times and with so many nanoseconds more, keeps it: in short tasks
-/// it shows when a thread wakes late, or a page is long in coming.
+/// A time is promised only if the longest that is likely, so many times and with so many nanoseconds more, keeps it: in
+/// short tasks it shows when a thread wakes late, or a page is long in coming.
 const MARGIN: f64 = 1.1;
-const SPARE: f64 = 1e6;
+const SPARE: f64 = 3e6;
 /// How many times longer or shorter than expected something takes if the calibration is plainly off.
 const OFF: f64 = 1.5;
 
@@ -40,6 +40,8 @@ pub struct Choice {
     pub heads: HeadSet,
     /// Time of the task.
     pub expected: Duration,
+    /// How many times as long it may take on this machine.
+    spread: f64,
     /// How good pictures are.
     score: f64,
 }
@@ -47,14 +49,14 @@ pub struct Choice {
 impl Choice {
     /// Whether it fits a time, with something to spare.
     pub fn fits(&self, time: Duration) -> bool {
-        self.expected.as_secs_f64() * MARGIN + SPARE / 1e9 <= time.as_secs_f64()
+        self.expected.as_secs_f64() * self.spread * MARGIN + SPARE / 1e9 <= time.as_secs_f64()
     }
 
     /// Whether what it took tells that the machine is another than it was when it was calibrated.
     pub fn is_off(&self, took: Duration) -> bool {
         let (took, expected) = (took.as_secs_f64(), self.expected.as_secs_f64());
-        let spare = SPARE / 1e9;
-        took > expected * OFF + spare || expected > took * OFF + spare
+        let (spare, off) = (SPARE / 1e9, OFF * self.spread);
+        took > expected * off + spare || expected > took * off + spare
     }
 }
 
@@ -93,6 +95,7 @@ pub fn choices(
                 level,
                 heads: cost.heads,
                 expected,
+                spread: calibration.spread.max(1.0),
                 score: score(above, cost.heads),
             }));
         }
@@ -163,6 +166,7 @@ mod tests {
             isa: "scalar".into(),
             threads: 2,
             model: String::new(),
+            spread: 1.0,
             exact: Curve(
                 [[1e4, 10.0], [5e4, 30.0], [2e5, 80.0]]
                     .map(|[n, ms]| [n, ms * MS])
@@ -190,16 +194,30 @@ mod tests {
         let (best, surfels) = (HeadSet::Best, HeadSet::Surfels);
         assert_eq!(chosen(1000, None, Task::Decode), (9, best, 200, true));
         assert_eq!(chosen(150, None, Task::Decode), (9, surfels, 90, true));
-        assert_eq!(chosen(95, None, Task::Decode), (8, best, 80, true));
+        assert_eq!(chosen(100, None, Task::Decode), (8, best, 80, true));
         assert_eq!(chosen(50, None, Task::Decode), (8, surfels, 35, true));
-        assert_eq!(chosen(25, None, Task::Decode), (7, best, 20, true));
+        assert_eq!(chosen(27, None, Task::Decode), (7, best, 20, true));
+    }
+
+    #[test]
+    fn a_machine_whose_times_differ_is_promised_less() {
+        let steady = calibration();
+        let shaky = Calibration {
+            spread: 1.5,
+            ..calibration()
+        };
+        let level = |calibration: &Calibration| {
+            let all = choices(calibration, &header(), &[7, 8, 9], None, Task::Decode).unwrap();
+            choose(&all, Duration::from_millis(120)).map(|choice| (choice.level, choice.expected.as_millis()))
+        };
+        assert_eq!((level(&steady), level(&shaky)), (Some((9, 90)), Some((8, 35))));
     }
 
     #[test]
     fn a_coarser_level_that_draws_slower_is_not_taken_for_being_coarser() {
         // Level 8 with the best heads: 80 ms and 400,000 Gaussians; level 9 with surfels: 90 ms and half as many.
-        assert_eq!(chosen(125, None, PICTURE), (9, HeadSet::Surfels, 110, true));
-        assert_eq!(chosen(120, Some(HeadSet::Best), PICTURE), (7, HeadSet::Best, 28, true));
+        assert_eq!(chosen(130, None, PICTURE), (9, HeadSet::Surfels, 110, true));
+        assert_eq!(chosen(125, Some(HeadSet::Best), PICTURE), (7, HeadSet::Best, 28, true));
     }
 
     #[test]

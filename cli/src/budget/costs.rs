@@ -188,7 +188,11 @@ mod tests {
         let empty = [1000.0, 3700.0];
         assert_eq!(PictureCost::from_times(500.0, sizes, times, empty), cost);
         // Whatever a busy machine measured, nothing costs less than nothing.
-        for (times, empty) in [([9.0, 1.0], [5.0; 2]), ([1.0, 9e9], [9.0, 0.0]), ([0.0, 0.0], [1e9, 1.0])] {
+        for (times, empty) in [
+            ([9.0, 1.0], [5.0; 2]),
+            ([1.0, 9e9], [9.0, 0.0]),
+            ([0.0, 0.0], [1e9, 1.0]),
+        ] {
             let odd = PictureCost::from_times(500.0, sizes, times, empty);
             assert!(odd.numbers().iter().all(|n| *n >= 0.0), "{odd:?}");
         }

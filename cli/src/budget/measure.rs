@@ -46,6 +46,12 @@ impl Times {
         sorted.sort_by(f64::total_cmp);
         sorted.get(sorted.len() / 2).copied().unwrap_or_default()
     }
+
+    /// How many times the median the longest is.
+    fn spread(&self) -> f64 {
+        let longest = self.0.iter().copied().fold(0.0, f64::max);
+        longest / self.median().max(1.0)
+    }
 }
 
 /// Those of a set of heads.
@@ -90,8 +96,15 @@ impl<'a> LevelTimes<'a> {
 /// # Errors
 /// Those of decoding and drawing; [`Error::Usage`] if threads cannot be started.
 pub fn measure(sample: &Sample<'_>, key: CalibrationKey, say: &dyn Fn(&str)) -> Result<Calibration> {
-    let levels = sample.streams.iter().map(|stream| LevelTimes::of_stream(sample, stream));
-    let mut all = levels.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect::<Vec<_>>();
+    let levels = sample
+        .streams
+        .iter()
+        .map(|stream| LevelTimes::of_stream(sample, stream));
+    let mut all = levels
+        .collect::<Result<Vec<_>>>()?
+        .into_iter()
+        .flatten()
+        .collect::<Vec<_>>();
     let (mut empty, start) = ([Times::default(), Times::default()], Instant::now());
     for round in 0..ROUNDS {
         if round > 1 && start.elapsed() > PATIENCE {
@@ -130,6 +143,16 @@ fn measure_level(sample: &Sample<'_>, times: &mut LevelTimes<'_>) -> Result<()> 
     Ok(())
 }
 
+/// How many times the median the longest of the rounds is: the median of all that was measured.
+fn spread(all: &[LevelTimes<'_>]) -> f64 {
+    let of_heads = |times: &HeadsTimes| [&times.generate, &times.draw[0], &times.draw[1]].map(Times::spread);
+    let of_level = |times: &LevelTimes<'_>| {
+        let heads = times.heads.iter().flat_map(of_heads);
+        heads.chain([times.exact.spread()]).collect::<Vec<_>>()
+    };
+    Times(all.iter().flat_map(of_level).collect()).median()
+}
+
 /// What was measured, in terms of voxels, Gaussians and pixels.
 fn calibration(
     sample: &Sample<'_>,
@@ -142,6 +165,7 @@ fn calibration(
         isa: key.isa,
         threads: rayon::current_num_threads(),
         model: key.model,
+        spread: spread(all),
         exact: Curve::default(),
         heads: Vec::new(),
     };
@@ -246,8 +270,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_round_of_three_that_took_long_does_not_count() {
-        assert_eq!(Times(vec![2.0, 90.0, 1.0]).median(), 2.0);
+    fn one_round_of_three_that_took_long_tells_of_the_spread_alone() {
+        let times = Times(vec![2.0, 90.0, 1.0]);
+        assert_eq!((times.median(), times.spread()), (2.0, 45.0));
     }
 
     #[test]
