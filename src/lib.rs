@@ -146,6 +146,6 @@ pub use renderer::{
 #[cfg(feature = "encoder")]
 pub use scene::SceneEncoder;
 pub use scene::{DecodedScene, FileSource, SceneDecoder, SceneDecoding, SceneReader, Source, Wanted};
-#[cfg(feature = "encoder")]
-pub use sequence::SequenceEncoder;
 pub use sequence::{DecodedFrame, SequenceDecoder, SequenceReader};
+#[cfg(feature = "encoder")]
+pub use sequence::{KeptGroups, SequenceEncoder};

@@ -152,6 +152,11 @@ fn note(colour: &str, text: &str) {
     let _ = writeln!(std::io::stderr(), "{name} {text}");
 }
 
+/// Whether `--resume` was given.
+pub fn resumes() -> bool {
+    manners().resume
+}
+
 /// Whether a path stands for standard input or output.
 pub fn is_pipe(path: &Path) -> bool {
     path == Path::new(PIPE)

@@ -1,10 +1,12 @@
 //! Clouds on one grid to a sequence.
 
-use std::ops::RangeInclusive;
+use std::fmt::Debug;
+use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::SequenceReader;
 use super::assembly::{Assembly, group_of};
 use crate::axes::Axes;
 use crate::cancel::Cancel;
@@ -18,6 +20,14 @@ use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{Inter, Previous};
 
+/// Groups that were coded, kept for a later run that is to go on where this one was stopped.
+pub trait KeptGroups: Debug + Send + Sync {
+    /// The sequence of these frames alone, if it was kept with these settings. Frames are the same if their clouds are.
+    fn find(&self, frames: Range<u64>, settings: &str) -> Option<Vec<u8>>;
+    /// Keeps the sequence of these frames, coded with these settings.
+    fn keep(&self, frames: Range<u64>, settings: &str, sequence: &[u8]);
+}
+
 /// Codes clouds on one grid as a sequence.
 #[derive(Debug, Clone)]
 pub struct SequenceEncoder {
@@ -28,6 +38,7 @@ pub struct SequenceEncoder {
     predicted: bool,
     axes: Axes,
     cancel: Cancel,
+    kept: Option<Arc<dyn KeptGroups>>,
 }
 
 impl Default for SequenceEncoder {
@@ -40,6 +51,7 @@ impl Default for SequenceEncoder {
             predicted: true,
             axes: Axes::default(),
             cancel: Cancel::default(),
+            kept: None,
         }
     }
 }
@@ -53,6 +65,14 @@ const FIRST_STEP: f32 = 0.7;
 const LARGE: f64 = 0.65;
 /// Bytes of a whole frame, over those of a predicted one, that its exact voxels and colours are worth.
 const WORTH: f64 = 1.08;
+
+/// A coded group.
+#[derive(Clone)]
+struct Group {
+    common: Header,
+    frames: Vec<FrameEntry>,
+    bytes: Vec<u8>,
+}
 
 /// A coded frame.
 struct Frame {
@@ -127,6 +147,12 @@ impl SequenceEncoder {
         self
     }
 
+    /// The same encoder, which keeps each group that it has coded, and codes none that was kept.
+    pub fn with_kept_groups(mut self, kept: Arc<dyn KeptGroups>) -> Self {
+        self.kept = Some(kept);
+        self
+    }
+
     /// Codes `count` frames. `cloud` gives each of them by its number, from several threads at a time; `done` gets
     /// each frame that was coded. The sequence does not depend on the number of threads.
     ///
@@ -152,6 +178,35 @@ impl SequenceEncoder {
             let what = format!("a group lasts less than 2^32 ticks, not {longest}");
             return Err(Error::Usage(what));
         }
+        let size = u64::from(self.group);
+        let groups = (0..count.div_ceil(size)).into_par_iter().map(|group| {
+            let frames = group * size..count.min((group + 1) * size);
+            if let Some(kept) = self.kept_group(&frames) {
+                frames.for_each(&done);
+                return Ok(kept);
+            }
+            let coded = self.code_group(frames.clone(), &cloud, &done)?;
+            self.keep(frames, &coded)?;
+            Ok(coded)
+        });
+        let groups = groups.collect::<Vec<Result<Group>>>();
+        let groups = groups.into_iter().collect::<Result<Vec<_>>>()?;
+        let common = groups[0].common.clone();
+        let mut assembly = self.assembly(&common);
+        for (i, group) in groups.into_iter().enumerate() {
+            check_common(Some(&common), &group.common, i as u64 * size)?;
+            self.add(&mut assembly, group)?;
+        }
+        assembly.finish()
+    }
+
+    /// Codes the frames of a group.
+    fn code_group(
+        &self,
+        frames: Range<u64>,
+        cloud: &(impl Fn(u64) -> Result<ColouredVoxels> + Sync),
+        done: &(impl Fn(u64) + Sync),
+    ) -> Result<Group> {
         let in_frame = |frame, error| match error {
             Error::Cancelled => Error::Cancelled,
             source => Error::Frame {
@@ -159,41 +214,68 @@ impl SequenceEncoder {
                 source: Box::new(source),
             },
         };
-        let groups = count.div_ceil(self.group.into());
-        let code = |group: u64| -> Result<(Header, Vec<Coded>)> {
-            let first = group * u64::from(self.group);
-            let mut common: Option<Header> = None;
-            let (mut frames, mut previous): (Vec<Coded>, _) = (Vec::new(), None);
-            let end = count.min(first + u64::from(self.group));
-            for frame in first..end {
-                self.cancel.check()?;
-                let cloud = cloud(frame).map_err(|error| in_frame(frame, error))?;
-                let ticks = (frame - first) as u32 * self.duration;
-                let follows = self.predicted && frame + 1 < end;
-                let first_bytes = frames.first().map_or(0, |(_, bytes)| bytes.len());
-                let coded = match &previous {
-                    None => self.whole(&cloud, ticks, follows),
-                    Some(previous) => self.predicted(&cloud, previous, ticks, follows, first_bytes),
-                };
-                let coded = coded.map_err(|error| in_frame(frame, error))?;
-                check_common(common.as_ref(), &coded.header, frame)?;
-                common.get_or_insert(coded.header);
-                frames.push(coded.coded);
-                previous = coded.next.filter(|_| follows);
-                done(frame);
-            }
-            let common = common.ok_or_else(|| Error::Usage("a group needs at least one frame".into()))?;
-            Ok((common, frames))
-        };
-        let groups: Vec<Result<_>> = (0..groups).into_par_iter().map(code).collect();
-        let groups = groups.into_iter().collect::<Result<Vec<_>>>()?;
-        let mut assembly = Assembly::new(&groups[0].0, self.timescale, self.duration);
-        for (i, (header, frames)) in groups.iter().enumerate() {
-            check_common(Some(&groups[0].0), header, i as u64 * u64::from(self.group))?;
-            let (entries, bytes) = group_of(frames)?;
-            assembly.push(&entries, bytes, 0, frames.len() as u32 * self.duration)?;
+        let mut common: Option<Header> = None;
+        let (mut all, mut previous): (Vec<Coded>, _) = (Vec::new(), None);
+        for frame in frames.clone() {
+            self.cancel.check()?;
+            let cloud = cloud(frame).map_err(|error| in_frame(frame, error))?;
+            let ticks = (frame - frames.start) as u32 * self.duration;
+            let follows = self.predicted && frame + 1 < frames.end;
+            let first_bytes = all.first().map_or(0, |(_, bytes)| bytes.len());
+            let coded = match &previous {
+                None => self.whole(&cloud, ticks, follows),
+                Some(previous) => self.predicted(&cloud, previous, ticks, follows, first_bytes),
+            };
+            let coded = coded.map_err(|error| in_frame(frame, error))?;
+            check_common(common.as_ref(), &coded.header, frame)?;
+            common.get_or_insert(coded.header);
+            all.push(coded.coded);
+            previous = coded.next.filter(|_| follows);
+            done(frame);
         }
-        assembly.finish()
+        let common = common.ok_or_else(|| Error::Usage("a group needs at least one frame".into()))?;
+        let (frames, bytes) = group_of(&all)?;
+        Ok(Group { common, frames, bytes })
+    }
+
+    /// A group that was kept, if it is sound.
+    fn kept_group(&self, frames: &Range<u64>) -> Option<Group> {
+        let bytes = self.kept.as_ref()?.find(frames.clone(), &self.settings())?;
+        let sequence = SequenceReader::new(&bytes[..], &Limits::unlimited()).ok()?;
+        let group = sequence.group(0).ok()?;
+        let right = sequence.groups() == 1 && sequence.frames() == frames.end - frames.start;
+        right.then_some(Group {
+            common: sequence.header().clone(),
+            frames: group.frames.clone(),
+            bytes: group.bytes.to_vec(),
+        })
+    }
+
+    fn keep(&self, frames: Range<u64>, group: &Group) -> Result<()> {
+        let Some(kept) = &self.kept else { return Ok(()) };
+        let mut alone = self.assembly(&group.common);
+        self.add(&mut alone, group.clone())?;
+        kept.keep(frames, &self.settings(), &alone.finish()?);
+        Ok(())
+    }
+
+    fn assembly(&self, common: &Header) -> Assembly {
+        Assembly::new(common, self.timescale, self.duration)
+    }
+
+    fn add(&self, assembly: &mut Assembly, group: Group) -> Result<()> {
+        let ticks = group.frames.len() as u32 * self.duration;
+        assembly.push(&group.frames, group.bytes, 0, ticks)
+    }
+
+    /// What decides the bytes of a group beside its clouds.
+    fn settings(&self) -> String {
+        let options = Options {
+            isa: None,
+            ..self.options.clone()
+        };
+        let rate = (self.timescale, self.duration);
+        format!("{:?}", (options, rate, self.predicted, &self.axes))
     }
 
     /// Codes the first frame of a group, or one that no other is predicted from.

@@ -24,7 +24,7 @@ mod reader;
 pub use assembly::join;
 pub use decoder::{DecodedFrame, Frames, GaussianFrames, SequenceDecoder};
 #[cfg(feature = "encoder")]
-pub use encoder::SequenceEncoder;
+pub use encoder::{KeptGroups, SequenceEncoder};
 #[cfg(feature = "encoder")]
 pub use rate_control::Rate;
 pub use reader::{Group, SequenceReader};

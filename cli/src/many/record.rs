@@ -91,14 +91,20 @@ impl File {
         if path == Path::new(PIPE) || !path.is_file() {
             return None;
         }
-        let mut hash = Hash(Xxh3::new());
-        let bytes = std::io::copy(&mut std::fs::File::open(path).ok()?, &mut hash).ok()?;
+        let (bytes, hash) = content_hash(path)?;
         Some(File {
             path: path.to_path_buf(),
             bytes,
-            hash: format!("{:032x}", hash.0.digest128()),
+            hash,
         })
     }
+}
+
+/// Length and hash of what a file contains; none if it cannot be read.
+pub fn content_hash(path: &Path) -> Option<(u64, String)> {
+    let mut hash = Hash(Xxh3::new());
+    let bytes = std::io::copy(&mut std::fs::File::open(path).ok()?, &mut hash).ok()?;
+    Some((bytes, format!("{:032x}", hash.0.digest128())))
 }
 
 struct Hash(Xxh3);
@@ -115,7 +121,7 @@ impl Write for Hash {
 }
 
 /// What this program is: other models draw other pictures.
-fn program() -> String {
+pub fn program() -> String {
     let mut hash = Xxh3::new();
     hash.update(embedded::MODEL);
     hash.update(embedded::HEADS);

@@ -1,6 +1,7 @@
 //! `b2p encode` of many clouds: a sequence.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use b2p::cloud::{ColouredVoxels, CommonGrid, GridNeed};
@@ -13,6 +14,7 @@ use super::super::manners::{self, Said};
 use super::super::progress::Progress;
 use super::super::table::counted;
 use super::super::{Failure, Result, cloud, load};
+use super::kept::Kept;
 
 /// Codes the clouds that the argument names as a sequence.
 pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> {
@@ -33,13 +35,18 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
     };
     let count = files.len() as u64;
     let (timescale, duration) = args.sequence.rate();
-    let encoder = SequenceEncoder::new()
+    let mut encoder = SequenceEncoder::new()
         .with_options(options(args, grid.bits())?)
         .with_frame_rate(timescale, duration)
         .with_group(args.sequence.gop)
         .with_prediction(!args.sequence.intra)
         .with_scalability(args.sequence.scalable)
         .with_axes(axes);
+    let place = format!("{:?} {}", grid.placement(), grid.bits());
+    let kept = Kept::of(&args.output, &files, &place).map(Arc::new);
+    if let Some(kept) = &kept {
+        encoder = encoder.with_kept_groups(Arc::<Kept>::clone(kept));
+    }
     let finished = AtomicU64::new(0);
     let done = |_: u64| {
         let finished = finished.fetch_add(1, Ordering::Relaxed) + 1;
@@ -58,11 +65,15 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
             source,
         })
     })?;
-    Ok(said(args, &bytes, took, limits)?.beside(to))
+    let before = kept.as_ref().map_or(0, |kept| kept.frames_found());
+    if let Some(kept) = kept {
+        kept.remove();
+    }
+    Ok(said(args, &bytes, took, before, limits)?.beside(to))
 }
 
-/// What was written.
-fn said(args: &Encode, bytes: &[u8], took: f64, limits: &Limits) -> Result<Said> {
+/// What was written. `before` frames were coded by a run before.
+fn said(args: &Encode, bytes: &[u8], took: f64, before: u64, limits: &Limits) -> Result<Said> {
     let sequence = SequenceReader::new(bytes, limits)?;
     let points = super::info::points(&sequence)?;
     let bits = bytes.len() as f64 * 8.0;
@@ -70,15 +81,19 @@ fn said(args: &Encode, bytes: &[u8], took: f64, limits: &Limits) -> Result<Said>
     let per_point = bits / points.max(1) as f64;
     let megabits = bits / sequence.seconds().max(f64::MIN_POSITIVE) / 1e6;
     let to = args.output.display();
-    let report = format!(
+    let mut report = format!(
         "{to}: {} in {}, {}, {per_point:.4} bits per point, {megabits:.3} Mbit/s at {rate:.2} Hz, {took:.1} s\n",
         counted(frames, "frame"),
         counted(groups as u64, "group"),
         counted(bytes.len() as u64, "byte"),
     );
+    if before > 0 {
+        report += &format!("{} coded by a run before\n", counted(before, "frame"));
+    }
     let json = || {
         json!({
             "output": to.to_string(),
+            "frames_kept": before,
             "frames": frames,
             "groups": groups,
             "bytes": bytes.len(),
@@ -116,6 +131,9 @@ fn options(args: &Encode, bits: u8) -> Result<Options> {
         isa: Some(load::isa(args.model.isa.as_deref())?),
         ..Options::default()
     };
+    if let Some(geometry) = args.geometry {
+        options.geometry = geometry;
+    }
     if let Some(quality) = args.quality {
         options.set_quality(quality, bits);
     }

@@ -4,6 +4,7 @@ mod decode;
 mod edit;
 mod encode;
 mod info;
+mod kept;
 mod render;
 
 use std::path::{Path, PathBuf};

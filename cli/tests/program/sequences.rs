@@ -180,6 +180,35 @@ fn a_sequence_is_drawn_upright() {
     assert!(known != draw("y.png", &["--up", "y"]));
 }
 
+#[cfg(unix)]
+#[test]
+fn a_run_that_was_killed_goes_on_with_the_groups_that_it_has_coded() {
+    let folder = frames();
+    let at = folder.path();
+    encode(at, &["frames"], "whole.b2p", &[]);
+    // No file may be larger than a block less than the sequence: the groups are written, the sequence is not.
+    let blocks = bytes(at, "whole.b2p").len().div_ceil(512) - 1;
+    let coding = CODING.join(" ");
+    let program = env!("CARGO_BIN_EXE_b2p");
+    let command = format!("ulimit -f {blocks}; exec {program} encode frames -o a.b2p --resume {coding}");
+    let killed = std::process::Command::new("sh")
+        .current_dir(at)
+        .args(["-c", &command])
+        .output();
+    assert!(!killed.unwrap().status.success());
+    assert_eq!(names_in(&at.join(".b2p/a.b2p.groups")).len(), 2);
+    assert!(!at.join("a.b2p").exists());
+    // The second group is damaged.
+    let kept = names_in(&at.join(".b2p/a.b2p.groups"));
+    std::fs::write(at.join(".b2p/a.b2p.groups").join(&kept[1]), b"damaged").unwrap();
+    let more = ["--resume", "--json"];
+    let said = succeeds(at, &[&["encode", "frames", "-o", "a.b2p"], &CODING[..], &more].concat());
+    let said: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(said["frames_kept"], 3, "{said}");
+    assert!(bytes(at, "a.b2p") == bytes(at, "whole.b2p"));
+    assert!(!at.join(".b2p/a.b2p.groups").exists());
+}
+
 #[test]
 fn options_of_sequences_are_kept_to() {
     let folder = frames();
