@@ -11,14 +11,14 @@
 set -euo pipefail
 cd "$(dirname "$0")"
 
-all="header entropy octree stream transform chunking backends model ply render"
+all="header entropy octree stream transform sequence scene chunking backends model ply clouds splats render"
 work=target/campaign
 log=$work/log
 mkdir -p $work artifacts
 
-build() { RUSTC_WRAPPER=$PWD/rustc.sh cargo build --locked --release --bins --target-dir target/fuzzers; }
+build() { RUSTC_WRAPPER=$PWD/rustc.sh cargo build --locked --profile fuzz -p b2p-fuzz --features fuzzing --bins --target-dir target/fuzzers; }
 
-program() { echo "target/fuzzers/release/$1"; }
+program() { echo "target/fuzzers/fuzz/$1"; }
 
 # Longer inputs repeat the same code and run slower.
 longest() {

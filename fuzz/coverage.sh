@@ -14,7 +14,7 @@ mkdir -p $out
 if [ $# -eq 0 ]; then
     rm -f $out/*.profraw
     export RUSTFLAGS="-C instrument-coverage" LLVM_PROFILE_FILE="$PWD/$out/%p-%m.profraw"
-    cargo test --locked --manifest-path fuzz/Cargo.toml --target-dir $out --test replay -- every_input_that_is_kept_passes
+    cargo test --locked -p b2p-fuzz --target-dir $out --test replay -- every_input_that_is_kept_passes
     "$tools/llvm-profdata" merge -sparse $out/*.profraw -o $out/all.profdata
 fi
 program=$(find $out/debug/deps -name 'replay-*' -type f -executable -printf '%T@ %p\n' | sort -n | tail -n 1 | cut -d' ' -f2)

@@ -3,7 +3,7 @@
 //! `suite.txt` has for each scene a line as in the suite of version 3, and one for each of its blocks: `name/block`.
 
 use b2p::gaussians::HeadSet;
-use b2p::{Decoder, Isa, Limits, SceneDecoder, SceneReader, Wanted};
+use b2p::{Decoder, Limits, SceneDecoder, SceneReader, Wanted};
 
 use crate::digest_scene::{broken_clause, lines, parts};
 use crate::{folder, pools, stream};
@@ -35,7 +35,7 @@ fn every_scene_decodes_to_its_digests_whole_and_block_by_block() {
     let (text, names) = (text(), names());
     assert!(names.len() >= 6);
     let pools = pools();
-    for isa in Isa::available() {
+    for isa in super::instruction_sets() {
         let decoder = Decoder::new().with_isa(isa).with_heads(HeadSet::Surfels);
         for (threads, pool) in &pools {
             let decoded = |name: &String| {

@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 use b2p::container::sequence::{FrameKind, FrameLevel, parse_table};
 use b2p::gaussians::HeadSet;
 use b2p::motion::{Head, Modes};
-use b2p::{Decoder, Isa, Limits, SequenceDecoder, SequenceReader};
+use b2p::{Decoder, Limits, SequenceDecoder, SequenceReader};
 
 use crate::digest_sequence::{broken_clause, lines};
 use crate::{folder, pools, stream};
@@ -29,7 +29,7 @@ fn names() -> Vec<String> {
 fn every_frame_of_every_sequence_decodes_to_its_digests_forwards_and_backwards() {
     let (text, names) = (text(), names());
     let pools = pools();
-    for isa in Isa::available() {
+    for isa in super::instruction_sets() {
         let decoder = Decoder::new().with_isa(isa).with_heads(HeadSet::Surfels);
         for (threads, pool) in &pools {
             for backwards in [false, true] {

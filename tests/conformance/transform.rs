@@ -7,7 +7,6 @@
 use std::path::PathBuf;
 
 use b2p::Decoder;
-use b2p::Isa;
 use b2p::gaussians::HeadSet;
 
 use crate::digest_transform::{in_pieces, whole};
@@ -26,7 +25,7 @@ fn every_stream_of_version_3_decodes_to_its_digests_with_every_instruction_set_a
     let text = std::fs::read_to_string(own_folder().join("suite.txt")).expect("the suite is there");
     assert!(text.lines().count() >= 8);
     let pools = pools();
-    for isa in Isa::available() {
+    for isa in super::instruction_sets() {
         let decoder = Decoder::new().with_isa(isa).with_heads(HeadSet::Surfels);
         for line in text.lines() {
             let mut words = line.split(' ').map(str::to_owned);

@@ -59,14 +59,7 @@ fn main() -> ExitCode {
         ["scenes"] => conformance_scenes(),
         ["sequences"] => conformance_sequences(),
         ["damage"] => damage(),
-        ["seeds"] => cargo(&[
-            "run",
-            "--locked",
-            "--manifest-path",
-            "fuzz/Cargo.toml",
-            "--example",
-            "seeds",
-        ]),
+        ["seeds"] => cargo(&["run", "--locked", "-p", "b2p-fuzz", "--example", "seeds"]),
         ["sample"] => sample(),
         _ => Err(USAGE.into()),
     };
