@@ -65,7 +65,7 @@ else
 fi
 
 # Those that are published; they need not compile here once more.
-cargo package --locked --workspace --exclude b2p-lab --exclude b2p-python --exclude xtask \
+cargo package --locked --workspace --exclude b2p-lab --exclude b2p-python --exclude b2p-fuzz --exclude xtask \
     --no-verify --allow-dirty --quiet --target-dir target/package-crates
 cp target/package-crates/package/*.crate "$out/"
 

@@ -7,7 +7,7 @@ use std::ops::Range;
 use std::sync::{Arc, Mutex};
 
 use b2p::cloud::ColouredVoxels;
-use b2p::encoder::transform::QualityTarget;
+use b2p::encoder::transform::{GeometryTarget, QualityTarget};
 use b2p::geometry::{Voxels, morton};
 use b2p::sequence::{Rate, join};
 use b2p::{Decoder, Error, KeptGroups, Limits, Placement, SequenceDecoder, SequenceEncoder, SequenceReader};
@@ -110,6 +110,45 @@ fn a_sequence_does_not_depend_on_the_number_of_threads() {
             .expect("threads");
         assert!(pool.install(|| encoded(7)) == bytes);
     }
+}
+
+#[test]
+fn only_frames_that_nothing_is_predicted_from_have_lossy_geometry() {
+    let encode = |predicted: bool, geometry| {
+        let encoder = encoder()
+            .with_group(2)
+            .with_prediction(predicted)
+            .with_geometry(geometry);
+        let bytes = encoder
+            .encode(2, |frame| Ok(moving(frame)), |_| {})
+            .expect("a sequence");
+        let sequence = reader(&bytes);
+        let first = frame(&sequence, 0, None).expect("a frame").0;
+        (bytes.len(), first)
+    };
+    let (exact, lossy) = (
+        encode(false, GeometryTarget::Exact),
+        encode(false, GeometryTarget::Lambda(0.5)),
+    );
+    assert!(
+        lossy.0 < exact.0 && lossy.1 != exact.1,
+        "{} and {} bytes",
+        lossy.0,
+        exact.0
+    );
+    assert!(encode(true, GeometryTarget::Exact).1 == encode(true, GeometryTarget::Lambda(0.5)).1);
+    let alone = b2p::Encoder::new()
+        .with_levels(3..=5)
+        .with_geometry(GeometryTarget::Lambda(0.5));
+    let alone = Decoder::new()
+        .whole(&alone.encode(&moving(0)).expect("a frame").bytes)
+        .expect("a frame")
+        .points()
+        .expect("a level")
+        .voxels
+        .keys()
+        .to_vec();
+    assert!(alone == lossy.1, "as a single frame has");
 }
 
 /// Groups that are kept in memory.

@@ -14,7 +14,7 @@ use crate::cloud::ColouredVoxels;
 use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
 use crate::container::{Header, with_axes};
 use crate::decoder::Decoder;
-use crate::encoder::transform::{self, Options, PredictedFrame, QualityTarget};
+use crate::encoder::transform::{self, GeometryTarget, Options, PredictedFrame, QualityTarget};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -36,6 +36,8 @@ pub struct SequenceEncoder {
     duration: u32,
     pub(super) group: u32,
     predicted: bool,
+    /// Geometry of whole frames, but for those that a group is predicted from.
+    geometry: GeometryTarget,
     axes: Axes,
     cancel: Cancel,
     kept: Option<Arc<dyn KeptGroups>>,
@@ -49,6 +51,7 @@ impl Default for SequenceEncoder {
             duration: 1,
             group: 32,
             predicted: true,
+            geometry: GeometryTarget::Exact,
             axes: Axes::default(),
             cancel: Cancel::default(),
             kept: None,
@@ -124,6 +127,13 @@ impl SequenceEncoder {
     /// The same encoder, which predicts frames from the frame before or codes each by itself. Default: it predicts.
     pub fn with_prediction(mut self, predicted: bool) -> Self {
         self.predicted = predicted;
+        self
+    }
+
+    /// The same encoder with another geometry of frames that are coded by themselves, but for the first of a group that is
+    /// predicted. Default: exact.
+    pub fn with_geometry(mut self, geometry: GeometryTarget) -> Self {
+        self.geometry = geometry;
         self
     }
 
@@ -275,7 +285,7 @@ impl SequenceEncoder {
             ..self.options.clone()
         };
         let rate = (self.timescale, self.duration);
-        format!("{:?}", (options, rate, self.predicted, &self.axes))
+        format!("{:?}", (options, rate, self.predicted, self.geometry, &self.axes))
     }
 
     /// Codes the first frame of a group, or one that no other is predicted from.
@@ -283,6 +293,8 @@ impl SequenceEncoder {
         let mut options = self.options.clone();
         if follows {
             options.fineness = options.fineness.scaled(FIRST_STEP);
+        } else {
+            options.geometry = self.geometry();
         }
         self.whole_with(cloud, &options, ticks, follows)
     }
@@ -314,9 +326,20 @@ impl SequenceEncoder {
             QualityTarget::Lossless => 1.0,
             _ => WORTH,
         };
-        let whole = self.whole_with(cloud, &self.options, ticks, follows)?;
+        let options = Options {
+            geometry: self.geometry(),
+            ..self.options.clone()
+        };
+        let whole = self.whole_with(cloud, &options, ticks, follows)?;
         let better = whole.coded.1.len() as f64 <= worth * bytes;
         Ok(if better { whole } else { frame })
+    }
+
+    fn geometry(&self) -> GeometryTarget {
+        match self.options.fineness {
+            QualityTarget::Lossless => GeometryTarget::Exact,
+            _ => self.geometry,
+        }
     }
 
     fn log(&self) -> Log {

@@ -63,7 +63,7 @@ pub struct Encode {
     pub lossless: bool,
     /// Geometry of the finest level. `exact`: its voxels as they are; `visual`: voxels may move by one where that saves
     /// bits and looks alike; a number from 0 to 100 is the Lagrangian λ of that, in squared voxels per bit. The cloud's
-    /// own level N is always exact [default: visual; of sequences exact]
+    /// own level N is always exact [default: visual; exact for the first frames of groups that are predicted]
     #[arg(long, help_heading = "Advanced", value_name = "exact|visual|X", value_parser = geometry, conflicts_with = "lossless")]
     pub geometry: Option<GeometryTarget>,
     /// How colours are coded

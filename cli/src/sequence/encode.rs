@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use b2p::cloud::{ColouredVoxels, CommonGrid, GridNeed};
-use b2p::encoder::transform::{Options, QualityTarget};
+use b2p::encoder::transform::{GeometryTarget, Options, QualityTarget};
 use b2p::{Error, Limits, SequenceEncoder, SequenceReader};
 use serde_json::json;
 
@@ -41,6 +41,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         .with_group(args.sequence.gop)
         .with_prediction(!args.sequence.intra)
         .with_scalability(args.sequence.scalable)
+        .with_geometry(args.geometry.unwrap_or(GeometryTarget::Visual))
         .with_axes(axes);
     let place = format!("{:?} {}", grid.placement(), grid.bits());
     let kept = Kept::of(&args.output, &files, &place).map(Arc::new);
