@@ -1,6 +1,11 @@
 //! `b2p-lab animate`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+use b2p::cloud::ColouredVoxels;
+use b2p::encoder::transform::GeometryTarget;
+use b2p::geometry::Voxels;
+use b2p::{SequenceEncoder, output};
 
 use crate::error::{LabError, Result};
 use crate::motion::{FrameInfo, Motion, Procedural, RECIPE, Sequence, Source};
@@ -8,7 +13,8 @@ use crate::sample::{Grid, write_ply};
 
 /// Sample an animated mesh as coloured clouds on one voxel grid (PLY), each frame with points of its own
 ///
-/// Writes frame_0000.ply, frame_0001.ply, … and sequence.json, from which `eval-sequence` makes the truth again.
+/// Writes frame_0000.ply, frame_0001.ply, … and sequence.json, from which `eval-sequence` makes the truth again; or codes
+/// the clouds as one sequence.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// The mesh: self-contained binary glTF with an animation
@@ -17,8 +23,8 @@ pub struct Args {
     /// A motion made by code in place of a file
     #[arg(long, value_enum, value_name = "NAME")]
     procedural: Option<Procedural>,
-    /// The folder to write to
-    #[arg(short, long, value_name = "DIR")]
+    /// The folder to write to, or the sequence to code, if the name ends in .b2p
+    #[arg(short, long, value_name = "DIR|OUT.b2p")]
     output: PathBuf,
     /// How many frames [default: all of the file's, or 32]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
@@ -86,6 +92,9 @@ impl Args {
             frames: Vec::new(),
         };
         sequence.grid = self.grid(&sequence, &motion, count)?.into();
+        if self.output.extension().is_some_and(|end| end == "b2p") {
+            return code(&sequence, &motion, count, &self.output);
+        }
         std::fs::create_dir_all(&self.output).map_err(LabError::io(&self.output))?;
         for index in 0..count as usize {
             let cloud = sequence.cloud(&motion, index)?;
@@ -137,5 +146,76 @@ impl Args {
             }
         }
         Grid::fit(bounds, self.bits, self.fill)
+    }
+}
+
+/// Codes the clouds of a sequence, with the defaults of `b2p encode`.
+fn code(sequence: &Sequence, motion: &Motion, count: u32, to: &Path) -> Result<()> {
+    let placement = sequence.grid().placement();
+    let cloud = |frame: u64| {
+        let sampled = sequence.cloud(motion, frame as usize);
+        let sampled = sampled.map_err(|error| b2p::Error::Usage(error.to_string()))?;
+        Ok(ColouredVoxels {
+            voxels: Voxels::new(sequence.grid().bits, sampled.keys),
+            colours: sampled.rgb,
+            placement,
+        })
+    };
+    let (timescale, duration) = ticks(sequence.fps);
+    let encoder = SequenceEncoder::new()
+        .with_frame_rate(timescale, duration)
+        .with_geometry(GeometryTarget::Visual);
+    let bytes = encoder.encode(count.into(), cloud, |frame| eprintln!("frame {frame} is coded"))?;
+    let written = output::write_file(to, |w| {
+        w.write_all(&bytes).map_err(|source| b2p::Error::Io {
+            path: to.to_path_buf(),
+            source,
+        })
+    });
+    eprintln!("{}: {count} frames, {} bytes", to.display(), bytes.len());
+    Ok(written?)
+}
+
+/// Ticks a second and a frame, to a thousandth of a frame per second.
+fn ticks(fps: f64) -> (u32, u32) {
+    match fps.fract() == 0.0 {
+        true => (fps as u32, 1),
+        false => (((fps * 1000.0).round() as u32).max(1), 1000),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use b2p::{Decoder, Limits, SequenceDecoder, SequenceReader};
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(clap::Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    #[test]
+    fn a_name_of_a_stream_gives_a_sequence_of_the_clouds_that_a_folder_gets() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = |output: &str| {
+            let output = folder.path().join(output);
+            let line = "x --procedural turning --frames 2 --bits 6 --points 30000 --fps 12.5 -o".split(' ');
+            let line = line.map(Into::into).chain([output.into_os_string()]);
+            Line::try_parse_from(line).unwrap().args.run().unwrap();
+        };
+        run("turning.b2p");
+        run("frames");
+        let bytes = std::fs::read(folder.path().join("turning.b2p")).unwrap();
+        let sequence = SequenceReader::new(&bytes[..], &Limits::default()).unwrap();
+        assert_eq!((sequence.frames(), sequence.frame_rate()), (2, 12.5));
+        let decoded = SequenceDecoder::new(Decoder::new()).frame(&sequence, 0).unwrap();
+        let first = std::fs::read(folder.path().join("frames/frame_0000.ply")).unwrap();
+        let first = b2p::PointCloud::from_ply(&first, &Limits::default()).unwrap();
+        let parents: std::collections::BTreeSet<_> = first.positions.iter().map(|p| p.map(|x| x as u32 / 2)).collect();
+        let points = decoded.points().unwrap();
+        assert_eq!((points.voxels.depth(), points.voxels.len()), (5, parents.len()));
     }
 }
