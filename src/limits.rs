@@ -175,6 +175,26 @@ mod tests {
     use super::*;
 
     #[test]
+    fn limits_of_small_devices_are_below_the_usual_ones() {
+        let all = |limits: Limits| {
+            let Limits {
+                max_points,
+                max_pixels,
+                max_pairs,
+                max_frames,
+                max_bytes,
+                ..
+            } = limits;
+            [max_points, max_pixels, max_pairs, max_frames, max_bytes]
+        };
+        let (small, usual) = (all(Limits::embedded()), all(Limits::default()));
+        assert!(
+            small.iter().zip(&usual).all(|(small, usual)| small < usual),
+            "{small:?} {usual:?}"
+        );
+    }
+
+    #[test]
     fn the_largest_picture_of_each_preset_fits_its_memory_twice_over() {
         for limits in [Limits::default(), Limits::embedded()] {
             let pixel = size_of::<[f32; 4]>() as u64;
