@@ -66,7 +66,7 @@ type Coded = (FrameEntry, Vec<u8>);
 const FIRST_STEP: f32 = 0.7;
 /// Share of the bytes of the group's first frame above which a predicted frame is compared with a whole one.
 const LARGE: f64 = 0.65;
-/// Bytes of a whole frame, over those of a predicted one, that its exact voxels and colours are worth.
+/// Bytes of a whole frame, over those of a predicted one, that its own voxels and colours are worth.
 const WORTH: f64 = 1.08;
 
 /// A coded group.
@@ -294,7 +294,7 @@ impl SequenceEncoder {
         if follows {
             options.fineness = options.fineness.scaled(FIRST_STEP);
         } else {
-            options.geometry = self.geometry();
+            options.geometry = self.geometry;
         }
         self.whole_with(cloud, &options, ticks, follows)
     }
@@ -327,19 +327,12 @@ impl SequenceEncoder {
             _ => WORTH,
         };
         let options = Options {
-            geometry: self.geometry(),
+            geometry: self.geometry,
             ..self.options.clone()
         };
         let whole = self.whole_with(cloud, &options, ticks, follows)?;
         let better = whole.coded.1.len() as f64 <= worth * bytes;
         Ok(if better { whole } else { frame })
-    }
-
-    fn geometry(&self) -> GeometryTarget {
-        match self.options.fineness {
-            QualityTarget::Lossless => GeometryTarget::Exact,
-            _ => self.geometry,
-        }
     }
 
     fn log(&self) -> Log {

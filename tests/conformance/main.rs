@@ -93,6 +93,7 @@ fn pools() -> Vec<(usize, Option<rayon::ThreadPool>)> {
 fn instruction_sets() -> Vec<Isa> {
     let mut all = Isa::available();
     all.retain(|isa| !is_skipped(&isa.to_string()));
+    assert!(!all.is_empty(), "B2P_SKIP_ISAS leaves nothing to try");
     all
 }
 

@@ -66,7 +66,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
             source,
         })
     })?;
-    let before = kept.as_ref().map_or(0, |kept| kept.frames_found());
+    let before = kept.as_ref().map_or(0, |kept| kept.frames_before(count));
     if let Some(kept) = kept {
         kept.remove();
     }

@@ -3,11 +3,13 @@
 //! They are sequences of one group in `.b2p/NAME.groups` beside the output. A name is a hash of all that a group depends
 //! on: this program, the options, the grid, and the contents of its clouds.
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
 
-use b2p::{Error, KeptGroups, Limits, SequenceReader, output};
+use b2p::{Error, KeptGroups, output};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::super::manners;
@@ -20,7 +22,8 @@ pub struct Kept {
     files: Vec<PathBuf>,
     /// What all groups depend on.
     common: String,
-    found: AtomicU64,
+    /// Frames that this run has coded.
+    coded: Mutex<BTreeSet<u64>>,
     warned: AtomicBool,
 }
 
@@ -36,14 +39,14 @@ impl Kept {
             folder: output.with_file_name(".b2p").join(name),
             files: files.to_vec(),
             common: format!("{:?} {:?} {grid}", record::program(), record::options()),
-            found: AtomicU64::new(0),
+            coded: Mutex::default(),
             warned: AtomicBool::new(false),
         })
     }
 
-    /// Frames of groups that were found.
-    pub fn frames_found(&self) -> u64 {
-        self.found.load(Ordering::Relaxed)
+    /// How many of `count` frames this run has not coded.
+    pub fn frames_before(&self, count: u64) -> u64 {
+        count - self.coded.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
     }
 
     /// Removes them: the sequence is complete.
@@ -74,14 +77,13 @@ impl Kept {
 
 impl KeptGroups for Kept {
     fn find(&self, frames: Range<u64>, settings: &str) -> Option<Vec<u8>> {
-        let sequence = std::fs::read(self.path(frames.clone(), settings)?).ok()?;
-        let reader = SequenceReader::new(&sequence[..], &Limits::unlimited()).ok()?;
-        reader.group(0).ok()?;
-        self.found.fetch_add(frames.end - frames.start, Ordering::Relaxed);
-        Some(sequence)
+        std::fs::read(self.path(frames, settings)?).ok()
     }
 
     fn keep(&self, frames: Range<u64>, settings: &str, sequence: &[u8]) {
+        let mut coded = self.coded.lock().unwrap_or_else(PoisonError::into_inner);
+        coded.extend(frames.clone());
+        drop(coded);
         let Some(path) = self.path(frames, settings) else {
             return;
         };

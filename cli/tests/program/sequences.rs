@@ -207,6 +207,11 @@ fn a_run_that_was_killed_goes_on_with_the_groups_that_it_has_coded() {
     assert_eq!(said["frames_kept"], 3, "{said}");
     assert!(bytes(at, "a.b2p") == bytes(at, "whole.b2p"));
     assert!(!at.join(".b2p/a.b2p.groups").exists());
+    // The groups of trials are those of this run.
+    let rate = ["--resume", "--json", "--bitrate", "1M"];
+    let said = succeeds(at, &[&["encode", "frames", "-o", "b.b2p"], &CODING[..], &rate].concat());
+    let said: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(said["frames_kept"], 0, "{said}");
 }
 
 #[test]
