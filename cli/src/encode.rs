@@ -165,7 +165,8 @@ fn transform_options(args: &Encode, bits: u8) -> Result<transform::Options> {
         levels: args.levels.clone(),
         filter: !args.no_filter,
         isa: Some(load::isa(model.isa.as_deref())?),
-        heads: (!args.no_head_maps).then(|| load::heads(None)).transpose()?,
+        heads: Some(load::heads(None)?),
+        head_maps: !args.no_head_maps,
         ..transform::Options::default()
     };
     if let Some(quality) = args.quality {
@@ -173,6 +174,9 @@ fn transform_options(args: &Encode, bits: u8) -> Result<transform::Options> {
     }
     if let Some(effort) = args.effort {
         options.set_effort(effort);
+    }
+    if let Some(tune) = args.tune {
+        options.tune = tune;
     }
     options.geometry = args.geometry.unwrap_or(GeometryTarget::Visual);
     match args.step {

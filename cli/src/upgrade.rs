@@ -2,7 +2,7 @@
 
 use b2p::cloud::ColouredVoxels;
 use b2p::container::{Format, Header, with_axes};
-use b2p::encoder::transform::{self, Options, QualityTarget};
+use b2p::encoder::transform::{self, Options, QualityTarget, Tune};
 use b2p::gaussians::HeadSet;
 use b2p::metrics::psnr;
 use b2p::{Decoder, Decoding, Error, Gaussians, Limits, Placement};
@@ -39,6 +39,7 @@ pub fn run(args: &Upgrade, limits: &Limits, progress: &Progress) -> Result<Said>
             true => QualityTarget::Lossless,
             false => args.step.unwrap_or(QualityTarget::Step(20.0)),
         },
+        tune: Tune::Psnr,
         ..Options::default()
     };
     let coded = transform::encode(&old, &options, &log)?.bytes;

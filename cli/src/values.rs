@@ -4,7 +4,7 @@ use std::num::NonZeroU8;
 use std::ops::RangeInclusive;
 
 use b2p::encoder::Residual;
-use b2p::encoder::transform::{GeometryTarget, QualityTarget};
+use b2p::encoder::transform::{GeometryTarget, QualityTarget, Tune};
 use b2p::latents::Steps;
 use b2p::renderer::{Background, Effect, EffectMode};
 
@@ -108,6 +108,14 @@ pub fn geometry(text: &str) -> Result<GeometryTarget, String> {
     match text.parse() {
         Ok(lambda) if (0.0..=100.0).contains(&lambda) => Ok(GeometryTarget::Lambda(lambda)),
         _ => Err("expected exact, visual, or a number from 0 to 100".into()),
+    }
+}
+
+pub fn tune(text: &str) -> Result<Tune, String> {
+    match text {
+        "visual" => Ok(Tune::Visual),
+        "psnr" => Ok(Tune::Psnr),
+        _ => Err("expected visual or psnr".into()),
     }
 }
 

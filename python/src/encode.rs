@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use b2p::cloud::{voxelise, voxelise_closed};
-use b2p::encoder::transform::{self, GeometryTarget, Options, QualityTarget};
+use b2p::encoder::transform::{self, GeometryTarget, Options, QualityTarget, Tune};
 use b2p::{Error, Log, PointCloud, Result, container};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
@@ -22,6 +22,7 @@ struct Asked {
     bits_per_point: Option<f64>,
     quality: Option<u8>,
     effort: Option<u8>,
+    tune: Option<Tune>,
     head_maps: bool,
     options: Options,
 }
@@ -53,6 +54,8 @@ struct Asked {
 ///     First and last level that the stream may be cut after, the last at most `bits`. Default: bits - 3 to bits - 1.
 /// effort : int, optional
 ///     0 (quick) to 9, the default.
+/// tune : "visual" or "psnr"
+///     What coded colours approach: those with which the cloud is drawn as it is, or the mean colours of voxels.
 /// head_maps : bool
 ///     Whether the stream says where surfels draw better than the learned heads.
 /// up, unit, crs : optional
@@ -69,7 +72,7 @@ struct Asked {
 ///     The stream, which `decode`, `decode_points`, `open`, `info` and `render` take.
 #[pyfunction]
 #[pyo3(signature = (xyz, rgb=None, *, bits=None, bits_per_point=None, quality=None, step=None, lossless=false,
-    geometry=None, levels=None, effort=None, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
+    geometry=None, levels=None, effort=None, tune=None, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
 pub fn encode<'py>(
     py: Python<'py>,
     xyz: &Bound<'py, PyAny>,
@@ -82,6 +85,7 @@ pub fn encode<'py>(
     geometry: Option<&Bound<'py, PyAny>>,
     levels: Option<(u8, u8)>,
     effort: Option<u8>,
+    tune: Option<&str>,
     head_maps: bool,
     up: Option<&str>,
     unit: Option<&Bound<'py, PyAny>>,
@@ -107,6 +111,7 @@ pub fn encode<'py>(
         bits_per_point,
         quality,
         effort,
+        tune: tune.map(|tune| tuned(py, tune)).transpose()?,
         head_maps,
         options,
     };
@@ -190,6 +195,18 @@ fn shape(geometry: &Bound<'_, PyAny>) -> PyResult<GeometryTarget> {
     }
 }
 
+/// What coded colours approach.
+fn tuned(py: Python<'_>, tune: &str) -> PyResult<Tune> {
+    match tune {
+        "visual" => Ok(Tune::Visual),
+        "psnr" => Ok(Tune::Psnr),
+        _ => Err(errors::usage(
+            py,
+            &format!("tune is '{tune}', expected 'visual' or 'psnr'"),
+        )),
+    }
+}
+
 /// One step, or luma's and chroma's.
 fn steps(step: &Bound<'_, PyAny>) -> PyResult<QualityTarget> {
     if let Ok(luma) = step.extract() {
@@ -206,14 +223,16 @@ fn code(cloud: &PointCloud, asked: Asked, log: &Log) -> Result<(Vec<u8>, usize)>
         Some(bits) => voxelise(cloud, Some(bits)),
     })?;
     let mut options = asked.options;
-    if asked.head_maps {
-        options.heads = Some(source::embedded_heads()?);
-    }
+    options.heads = Some(source::embedded_heads()?);
+    options.head_maps = asked.head_maps;
     if let Some(quality) = asked.quality {
         options.set_quality(quality, grid.voxels.depth());
     }
     if let Some(effort) = asked.effort {
         options.set_effort(effort);
+    }
+    if let Some(tune) = asked.tune {
+        options.tune = tune;
     }
     let (points, voxels) = (cloud.positions.len(), grid.voxels.len());
     let merged = (points > voxels).then_some(points as u64);

@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use b2p_kernels::Isa;
 
-use super::transform::{self, GeometryTarget, QualityTarget};
+use super::transform::{self, GeometryTarget, QualityTarget, Tune};
 use super::{Encoded, Options, encode, encode_to_rate};
 use crate::cancel::Cancel;
 use crate::cloud::ColouredVoxels;
@@ -67,15 +67,23 @@ impl Encoder {
         self
     }
 
+    /// The same encoder, whose colours approach something else. Without effect on streams of version 2. Default:
+    /// [`Tune::Visual`].
+    pub fn with_tune(mut self, tune: Tune) -> Self {
+        self.options.tune = tune;
+        self
+    }
+
     /// The same encoder with or without filters, which the decoder runs on the colours of each level. Default: with.
     pub fn with_filter(mut self, filter: bool) -> Self {
         self.options.filter = filter;
         self
     }
 
-    /// The same encoder with head maps: streams of version 3 say where surfels draw better than the best of these
-    /// heads. Decoders with learned heads follow it. The two finest levels of a cloud have none. Maps are chosen by
-    /// pictures, which differ slightly between instruction sets, so that maps may, too. Default: without.
+    /// The same encoder for a decoder with these heads: streams of version 3 have colours that are [tuned](Tune) to the
+    /// best of them, and head maps, which say where surfels draw better. Decoders with learned heads follow it. The two finest levels of a cloud have none. Maps are chosen by
+    /// pictures, which differ slightly between instruction sets, so that maps may, too. Default: surfels, and
+    /// no head maps.
     pub fn with_heads_model(mut self, heads: HeadsModel) -> Self {
         self.options.heads = Some(heads);
         self

@@ -14,7 +14,7 @@ use crate::cloud::ColouredVoxels;
 use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
 use crate::container::{Header, with_axes};
 use crate::decoder::Decoder;
-use crate::encoder::transform::{self, GeometryTarget, Options, PredictedFrame, QualityTarget};
+use crate::encoder::transform::{self, GeometryTarget, Options, PredictedFrame, QualityTarget, Tune};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -46,7 +46,10 @@ pub struct SequenceEncoder {
 impl Default for SequenceEncoder {
     fn default() -> Self {
         SequenceEncoder {
-            options: Options::default(),
+            options: Options {
+                tune: Tune::Psnr,
+                ..Options::default()
+            },
             timescale: 30,
             duration: 1,
             group: 32,

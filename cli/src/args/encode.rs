@@ -4,13 +4,13 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use b2p::encoder::Residual;
-use b2p::encoder::transform::{GeometryTarget, QualityTarget};
+use b2p::encoder::transform::{GeometryTarget, QualityTarget, Tune};
 use clap::{Args, ValueEnum};
 
 use super::ModelArg;
 use crate::cloud::ReadArgs;
 use crate::many::Files;
-use crate::values::{bits, bits_per_point, frame_rate, geometry, levels, price, residual, step};
+use crate::values::{bits, bits_per_point, frame_rate, geometry, levels, price, residual, step, tune};
 
 #[derive(Debug, Args)]
 #[command(override_usage = "b2p encode [OPTIONS] <IN>... <OUT>")]
@@ -42,10 +42,14 @@ pub struct Encode {
     /// quantisation step, and leaves out the finest levels if they do not fit
     #[arg(short, long, value_name = "X", value_parser = bits_per_point, conflicts_with_all = ["step", "lossless", "bit_price", "residual"])]
     pub bits_per_point: Option<f64>,
-    /// Effort, from 0 (quick) to 9: rate–distortion optimised quantisation from 1 on, colour filters from 2 on; with
-    /// --bits-per-point 2 + EFFORT tries for a level, of 9 as many as it takes [default: 9]
+    /// Effort, from 0 (quick) to 9: rate–distortion optimised quantisation from 1 on, colour filters from 2 on, --tune
+    /// visual from 3 on; with --bits-per-point 2 + EFFORT tries for a level, of 9 as many as it takes [default: 9]
     #[arg(short, long, value_name = "0..9", value_parser = clap::value_parser!(u8).range(0..=9))]
     pub effort: Option<u8>,
+    /// What coded colours approach. `visual`: those with which the cloud is drawn as it is; the stream is coded, decoded,
+    /// compared with the cloud, and coded again. `psnr`: the mean colours of voxels [default: visual; psnr for sequences]
+    #[arg(long, value_name = "visual|psnr", value_parser = tune, conflicts_with = "lossless")]
+    pub tune: Option<Tune>,
     /// Bit depth N of the voxel grid, 1 to 21 [default: by the spacing of the points; at most what a cloud of integers
     /// needs]
     #[arg(long, help_heading = "Advanced", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use b2p::cloud::{ColouredVoxels, CommonGrid, GridNeed};
-use b2p::encoder::transform::{GeometryTarget, Options, QualityTarget};
+use b2p::encoder::transform::{GeometryTarget, Options, QualityTarget, Tune};
 use b2p::{Error, Limits, SequenceEncoder, SequenceReader};
 use serde_json::json;
 
@@ -141,6 +141,7 @@ fn options(args: &Encode, bits: u8) -> Result<Options> {
     if let Some(effort) = args.effort {
         options.set_effort(effort);
     }
+    options.tune = args.tune.unwrap_or(Tune::Psnr);
     match args.step {
         Some(step) => options.fineness = step,
         None if args.lossless => {

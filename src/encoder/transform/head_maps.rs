@@ -153,7 +153,7 @@ impl EncoderInput<'_> {
     /// The head map of a sparse level, which surfels draw: it says how wide they must be to close. `None` of other
     /// levels, and where the usual size does.
     pub(super) fn closing_map(&self, octree: &Octree, level: u8, map: &KernelMap) -> Option<Vec<u8>> {
-        let applies = self.options.heads.is_some() && level > 0 && is_for_surfels(map, 0..map.len());
+        let applies = self.options.has_head_maps() && level > 0 && is_for_surfels(map, 0..map.len());
         let size = applies.then(|| closing_size(map)).filter(|size| *size > 64)?;
         let surfels = vec![true; HeadMap::block_count(octree, level)];
         Some(HeadMap::new(size, size, surfels).to_bytes())

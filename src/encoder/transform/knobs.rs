@@ -1,6 +1,6 @@
 //! Quality and effort as one number each: what they stand for.
 
-use super::{Options, QualityTarget};
+use super::{Options, QualityTarget, Tune};
 
 /// A stretch of the scale, from one quality to the next stretch's: how many levels above the cloud's own the finest
 /// coded level is, and the quantisation steps of luma at both ends. Streams of the sample are about as long where a
@@ -61,6 +61,9 @@ impl Options {
     pub fn set_effort(&mut self, effort: u8) {
         self.optimised = effort > 0;
         self.filter &= effort > 1;
+        if effort < 3 {
+            self.tune = Tune::Psnr;
+        }
         self.tries = match effort {
             9.. => usize::MAX,
             _ => 2 + usize::from(effort),

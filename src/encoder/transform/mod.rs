@@ -9,6 +9,7 @@ mod noise;
 mod predicted;
 mod quality;
 mod rate_control;
+mod refine;
 mod shape;
 
 use std::ops::RangeInclusive;
@@ -63,9 +64,13 @@ pub struct Options {
     pub colour_slice: u32,
     /// For frames of a sequence: whether a decoder of a level of all frames needs no finer level of any.
     pub scalable: bool,
-    /// Heads whose pictures are compared with those of surfels, so that the stream says where surfels are better;
-    /// `None` for no head maps.
+    /// What coded colours approach.
+    pub tune: Tune,
+    /// Heads that will draw the stream; `None` for surfels.
     pub heads: Option<HeadsModel>,
+    /// Whether pictures of the heads are compared with those of surfels, so that the stream says where surfels are
+    /// better.
+    pub head_maps: bool,
     /// The instructions to use; any give the same stream, but for head maps. Default: the best of this machine.
     pub isa: Option<Isa>,
 }
@@ -82,10 +87,31 @@ impl Default for Options {
             slice_voxels: MAX_SLICE_VOXELS,
             colour_slice: COLOUR_SLICE,
             scalable: false,
+            tune: Tune::Visual,
             heads: None,
+            head_maps: true,
             isa: None,
         }
     }
+}
+
+impl Options {
+    /// Whether the stream has head maps, if its levels may have.
+    fn has_head_maps(&self) -> bool {
+        self.head_maps && self.heads.is_some()
+    }
+}
+
+/// What coded colours approach.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Tune {
+    /// Colours with which the cloud is drawn as it is: Gaussians overlap, so that a picture of them is smoother than their
+    /// colours. A stream is coded, decoded and compared with the cloud, then coded again. Without effect on exact colours
+    /// and on predicted frames of a sequence.
+    Visual,
+    /// The mean colours of voxels.
+    Psnr,
 }
 
 /// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.
@@ -109,7 +135,7 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     let coded = subject.code(top, steps, shape, log)?;
     // They are needed no more, and are the largest part.
     subject.maps = Vec::new();
-    subject.checked(coded, options.heads.as_ref(), usize::MAX, log)
+    subject.checked(coded, options.has_head_maps(), usize::MAX, log)
 }
 
 /// The levels to code, for a cloud of bit depth `bits`.
@@ -184,7 +210,7 @@ impl<'a> EncoderInput<'a> {
             octree: Octree::root(),
             maps: Vec::new(),
             geometry: Vec::new(),
-            sparse: options.heads.is_some() && head_maps::is_sparse(cloud)?,
+            sparse: options.has_head_maps() && head_maps::is_sparse(cloud)?,
             grey: cloud.colours.par_iter().all(|[r, g, b]| r == g && g == b),
             points: cloud.voxels.len() as u64,
             guides: None,
@@ -264,10 +290,26 @@ impl<'a> EncoderInput<'a> {
         let truth = log.step("mean colours", self.cloud.voxels.len(), "voxels", || {
             Ok(self.truth(top, shape.as_deref(), steps.is_lossless()))
         })?;
+        let coded = self.code_towards(&truth, top, steps, shape, log)?;
+        drop(truth);
+        match self.is_refined(steps) {
+            true => self.refined(coded, steps, log),
+            false => Ok(coded),
+        }
+    }
+
+    /// The same again, nearer to the cloud as it is drawn.
+    fn refined(&self, coded: Coded, steps: Steps, log: &Log) -> Result<Coded> {
+        let (top, voxels) = (coded.top, coded.colours.len());
+        let moves = log.step("compare what is drawn", voxels, "voxels", || self.moves(&coded))?;
+        let shape = coded.shape;
+        let truth = log.step("colours to draw", voxels, "voxels", || {
+            Ok(self.moved_truth(top, shape.as_deref(), &moves))
+        })?;
         self.code_towards(&truth, top, steps, shape, log)
     }
 
-    /// The same, of colours that have been computed.
+    /// The same, of colours that have been computed, without looking at what is drawn.
     fn code_towards(
         &self,
         truth: &Truth,
@@ -419,9 +461,9 @@ impl<'a> EncoderInput<'a> {
         Ok(())
     }
 
-    /// The stream, once it has been decoded to what was encoded; with head maps, if there are heads and the stream has
+    /// The stream, once it has been decoded to what was encoded; if asked for with head maps, if the stream has
     /// at most `most` bytes with them.
-    fn checked(&self, mut coded: Coded, heads: Option<&HeadsModel>, most: usize, log: &Log) -> Result<Encoded> {
+    fn checked(&self, mut coded: Coded, head_maps: bool, most: usize, log: &Log) -> Result<Encoded> {
         let top = coded.top;
         let shape = coded.shape.clone();
         let octree = self.octree(shape.as_deref());
@@ -429,7 +471,12 @@ impl<'a> EncoderInput<'a> {
         let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
         let mut decoding = decoder.with_level(top).start();
         decoding.push(&coded.bytes);
-        let reference = match heads.filter(|_| self.has_head_maps(top)) {
+        let reference = match self
+            .options
+            .heads
+            .as_ref()
+            .filter(|_| head_maps && self.has_head_maps(top))
+        {
             Some(heads) => {
                 decoding.set_heads_model(heads.clone());
                 let levels = (*self.levels.start().min(&top)..=top).filter(|level| self.has_head_map(*level));

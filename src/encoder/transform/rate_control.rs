@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use super::quality::{MAX_CHROMA, QualityTarget, steps_of};
 use super::shape::Shape;
-use super::{Coded, EncoderInput, GeometryTarget, Options, choose_levels};
+use super::{Coded, EncoderInput, GeometryTarget, Options, Tune, choose_levels};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth};
 use crate::encoder::Encoded;
@@ -38,6 +38,8 @@ fn steps_at(at: u8) -> Steps {
 struct Place {
     top: u8,
     steps: Steps,
+    /// Whether what is drawn is compared with the cloud.
+    refined: bool,
 }
 
 /// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and
@@ -90,12 +92,12 @@ pub fn encode_to_rate(
         least: bits(search.least),
     })?;
     let maps = search.head_map_bytes(place.top) > 0;
-    let heads = options.heads.as_ref().filter(|_| maps);
-    let encoded = subject.checked(coded, heads, room as usize, log)?;
+    let encoded = subject.checked(coded, maps, room as usize, log)?;
     let chosen = Options {
-        heads: heads.cloned(),
+        head_maps: maps,
         levels: Some(*levels.start().min(&place.top)..=place.top),
         fineness: QualityTarget::of(place.steps),
+        tune: if place.refined { options.tune } else { Tune::Psnr },
         ..options.clone()
     };
     Ok((encoded, chosen))
@@ -128,45 +130,70 @@ impl Search<'_> {
 
     /// The largest stream with the last level `top` that fits, if there is one. `fixed` are bytes that all of them have.
     fn level(&mut self, top: u8, only: bool, fixed: f64, log: &Log) -> Result<Option<(Place, Coded)>> {
-        let last = self.last(top, only);
-        let place = |at: u8| Place {
+        let range = LevelRange {
             top,
-            steps: steps_at(at),
+            last: self.last(top, only),
+            fixed,
         };
+        let Some((at, mut best)) = self.finest(range, FIRST, false, log)? else {
+            return Ok(None);
+        };
+        if at == 0 {
+            let exact = Place {
+                top,
+                steps: Steps::LOSSLESS,
+                refined: false,
+            };
+            if let (_, Some(found)) = self.attempt(exact, log)? {
+                return Ok(Some(found));
+            }
+        }
+        // Refined streams are larger: of the places that are coarser, the finest that fits then.
+        if self.subject.is_refined(best.0.steps) {
+            let first = (at + 2).min(range.last);
+            if let Some((_, refined)) = self.finest(range, first, true, log)? {
+                best = refined;
+            }
+        }
+        Ok(Some(best))
+    }
+
+    /// The finest place of a level whose stream fits, and that stream; `first` is tried first.
+    fn finest(
+        &mut self,
+        range: LevelRange,
+        first: u8,
+        refined: bool,
+        log: &Log,
+    ) -> Result<Option<(u8, (Place, Coded))>> {
+        let LevelRange { top, last, fixed } = range;
         // Bytes of the finest place that fits and of the coarsest that does not, beyond the geometry's.
         let (mut fits, mut exceeds): (Option<Candidate>, Option<Candidate>) = (None, None);
         let mut best = None;
-        let mut next = Some(FIRST);
+        let mut next = Some(first);
         let mut tries = 0;
         while let Some(at) = next {
             if best.is_some() && tries >= self.subject.options.tries {
                 break;
             }
             tries += 1;
-            let (size, found) = self.attempt_sized(place(at), log)?;
+            let place = Place {
+                top,
+                steps: steps_at(at),
+                refined,
+            };
+            let (size, found) = self.attempt(place, log)?;
             let tried = Some(Candidate {
                 at,
                 bytes: (size - fixed).max(1.0),
             });
             match found {
-                Some(found) => (fits, best) = (tried, Some(found)),
+                Some(found) => (fits, best) = (tried, Some((at, found))),
                 None => exceeds = tried,
             }
             next = between(fits, exceeds, self.room - fixed, last);
         }
-        let Some(mut best) = best else {
-            return Ok(None);
-        };
-        if best.0.steps == place(0).steps {
-            let exact = Place {
-                top,
-                steps: Steps::LOSSLESS,
-            };
-            if let Some(found) = self.attempt(exact, log)? {
-                best = found;
-            }
-        }
-        Ok(Some(best))
+        Ok(best)
     }
 
     /// The shape of a stream with the last level `top` and these steps.
@@ -189,43 +216,59 @@ impl Search<'_> {
 
     /// Bytes to set aside for head maps: none where they might take more than 6 % of the stream.
     fn head_map_bytes(&self, top: u8) -> usize {
-        let bytes = match self.subject.options.heads {
-            Some(_) => self.subject.head_map_bytes(top),
-            None => 0,
+        let bytes = match self.subject.options.has_head_maps() {
+            true => self.subject.head_map_bytes(top),
+            false => 0,
         };
         if 16.0 * bytes as f64 <= self.room { bytes } else { 0 }
     }
 
-    fn attempt(&mut self, place: Place, log: &Log) -> Result<Option<(Place, Coded)>> {
-        Ok(self.attempt_sized(place, log)?.1)
-    }
-
     /// Codes at a place: the bytes, and the stream if it fits.
-    fn attempt_sized(&mut self, place: Place, log: &Log) -> Result<(f64, Option<(Place, Coded)>)> {
+    fn attempt(&mut self, place: Place, log: &Log) -> Result<(f64, Option<(Place, Coded)>)> {
         self.tries += 1;
-        let Place { top, steps } = place;
+        let Place { top, steps, refined } = place;
         let how = QualityTarget::of(steps);
         let name = format!("try {}: level {top}, {how}", self.tries);
         let points = self.subject.cloud.voxels.len();
         let shape = self.shape(top, steps, log)?;
-        let lambda = shape.as_ref().map_or(0, |shape| shape.lambda());
         let coded = log.step(name, points, "points", || {
             let log = &Log::off();
-            if steps.is_lossless() {
-                return self.subject.code(top, steps, shape, log);
+            let coded = self.plain(place, shape, log)?;
+            match refined {
+                true => self.subject.refined(coded, steps, log),
+                false => Ok(coded),
             }
-            let truth = match self.truth.take() {
-                Some((level, of, truth)) if (level, of) == (top, lambda) => truth,
-                _ => self.subject.truth(top, shape.as_deref(), false),
-            };
-            let coded = self.subject.code_towards(&truth, top, steps, shape, log);
-            self.truth = Some((top, lambda, truth));
-            coded
         })?;
         let size = (coded.bytes.len() + self.head_map_bytes(top)) as f64;
         self.least = self.least.min(size);
         Ok((size, (size <= self.room).then_some((place, coded))))
     }
+
+    /// Codes the mean colours of voxels at a place.
+    fn plain(&mut self, place: Place, shape: Option<Arc<Shape>>, log: &Log) -> Result<Coded> {
+        let Place { top, steps, .. } = place;
+        let lossless = steps.is_lossless();
+        let lambda = shape.as_ref().map_or(0, |shape| shape.lambda());
+        let truth = match self.truth.take() {
+            Some((level, of, truth)) if !lossless && (level, of) == (top, lambda) => truth,
+            _ => self.subject.truth(top, shape.as_deref(), lossless),
+        };
+        let coded = self.subject.code_towards(&truth, top, steps, shape, log);
+        if !lossless {
+            self.truth = Some((top, lambda, truth));
+        }
+        coded
+    }
+}
+
+/// The places of a level.
+#[derive(Debug, Clone, Copy)]
+struct LevelRange {
+    top: u8,
+    /// The coarsest one.
+    last: u8,
+    /// Bytes that streams of all of them have.
+    fixed: f64,
 }
 
 /// A candidate that was tried.
