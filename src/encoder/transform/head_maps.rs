@@ -36,7 +36,7 @@ const DENSE: usize = 3;
 const MARGIN: f64 = 0.9;
 
 /// Squared errors over whole pictures and over the foreground.
-type Errors = [f64; 2];
+pub type Errors = [f64; 2];
 
 /// Pictures of the cloud, which levels are compared with. Nothing else of it is kept: Gaussians take much more memory.
 pub struct Reference {
@@ -92,6 +92,21 @@ impl Reference {
     fn pictures(&self, side: u32) -> &[Image] {
         let known = self.pictures.iter().find(|(known, _)| *known == side);
         known.map_or(&[], |(_, pictures)| pictures)
+    }
+
+    /// Squared errors of pictures of these Gaussians of a level, over whole pictures and over the foreground.
+    pub fn errors(&self, level: u8, gaussians: &Gaussians) -> Result<Errors> {
+        let mut views = Views::new(self.isa, side(level));
+        let mut errors = [0.0; 2];
+        for (view, truth) in VIEWS.into_iter().zip(self.pictures(side(level))) {
+            let seen = views.half(gaussians, view)?;
+            for (truth, seen) in truth.pixels.iter().zip(&seen.pixels) {
+                let error = error(truth, seen);
+                errors[0] += error;
+                errors[1] += if truth[3] > 0.5 { error } else { 0.0 };
+            }
+        }
+        Ok(errors)
     }
 
     /// Compares all voxels of a level as surfels, of the usual size.

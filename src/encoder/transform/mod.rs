@@ -6,6 +6,7 @@ mod knobs;
 mod memory;
 mod motion;
 mod noise;
+mod options;
 mod predicted;
 mod quality;
 mod rate_control;
@@ -21,101 +22,22 @@ use rayon::prelude::*;
 use super::{Encoded, rates};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{self, Filter, Steps, Truth};
-#[cfg(doc)]
-use crate::container::MAX_COLOUR_SLICE;
-use crate::container::{Format, Header, MAX_SLICE_VOXELS, Writer};
+use crate::container::{Format, Header, Writer};
 use crate::decoder::{Decoder, colour_hash};
 use crate::error::{Error, Result};
-use crate::gaussians::learned::HeadsModel;
 use crate::geometry::{KernelMap, Octree, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
 pub(crate) use memory::memory_of;
 pub use memory::{encode_memory, surface_within};
+pub use options::{Options, Tune};
 pub use predicted::{PredictedFrame, encode_predicted};
 pub use quality::QualityTarget;
 
 pub use rate_control::encode_to_rate;
 pub use shape::GeometryTarget;
 use shape::Shape;
-
-/// What may be chosen about a stream of version 3; [`encode_to_rate`] chooses how exactly colours are coded, and may
-/// leave out the finest levels.
-#[derive(Debug, Clone)]
-pub struct Options {
-    /// The levels that a stream may be cut after, the last one at most the bit depth N. Default: N−3 to N−1.
-    pub levels: Option<RangeInclusive<u8>>,
-    /// How exactly colours are coded.
-    pub fineness: QualityTarget,
-    /// How exactly the finest level's voxels are coded. Default: exactly.
-    pub geometry: GeometryTarget,
-    /// Whether levels have a filter that the decoder runs on their colours.
-    pub filter: bool,
-    /// Whether quantisation is rate–distortion optimised; otherwise coefficients are rounded to the nearest.
-    pub optimised: bool,
-    /// Streams that [`encode_to_rate`] tries for a level at most, once one fits.
-    pub tries: usize,
-    /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level,
-    /// and costs bits.
-    pub slice_voxels: u32,
-    /// Parents per slice of the colours, 1 to [`MAX_COLOUR_SLICE`]: fewer let more threads decode a level, and cost
-    /// bits.
-    pub colour_slice: u32,
-    /// For frames of a sequence: whether a decoder of a level of all frames needs no finer level of any.
-    pub scalable: bool,
-    /// What coded colours approach.
-    pub tune: Tune,
-    /// Heads that will draw the stream; `None` for surfels.
-    pub heads: Option<HeadsModel>,
-    /// Whether pictures of the heads are compared with those of surfels, so that the stream says where surfels are
-    /// better.
-    pub head_maps: bool,
-    /// The instructions to use; any give the same stream, but for head maps. Default: the best of this machine.
-    pub isa: Option<Isa>,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Options {
-            levels: None,
-            fineness: QualityTarget::Step(20.0),
-            geometry: GeometryTarget::Exact,
-            filter: true,
-            optimised: true,
-            tries: usize::MAX,
-            slice_voxels: MAX_SLICE_VOXELS,
-            colour_slice: COLOUR_SLICE,
-            scalable: false,
-            tune: Tune::Visual,
-            heads: None,
-            head_maps: true,
-            isa: None,
-        }
-    }
-}
-
-impl Options {
-    /// Whether the stream has head maps, if its levels may have.
-    fn has_head_maps(&self) -> bool {
-        self.head_maps && self.heads.is_some()
-    }
-}
-
-/// What coded colours approach.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Tune {
-    /// Colours with which the cloud is drawn as it is: Gaussians overlap, so that a picture of them is smoother than their
-    /// colours. A stream is coded, decoded and compared with the cloud, then coded again. Without effect on exact colours
-    /// and on predicted frames of a sequence.
-    Visual,
-    /// The mean colours of voxels.
-    Psnr,
-}
-
-/// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.
-const COLOUR_SLICE: u32 = 8192;
 
 /// Filters of levels that are not the finest may take one part in so many of a stream that ends there.
 const FILTER_SHARE: usize = 100;

@@ -6,6 +6,7 @@
 
 use std::sync::Arc;
 
+use super::head_maps::Reference;
 use super::quality::{MAX_CHROMA, QualityTarget, steps_of};
 use super::shape::Shape;
 use super::{Coded, EncoderInput, GeometryTarget, Options, Tune, choose_levels};
@@ -24,6 +25,9 @@ const COARSEST_OF_LOSSY: u8 = 108;
 /// The same of the level of the cloud's own voxels, whose geometry takes most: a step of luma of 27. In coarser steps
 /// the level above makes better pictures of the same bits.
 const COARSEST_OF_ALL: u8 = 92;
+
+/// Up to this step of luma, refined streams look better at equal sizes.
+const SURE: f32 = 32.0;
 
 /// The place that is tried first: a step of luma of 11.
 const FIRST: u8 = 72;
@@ -152,10 +156,26 @@ impl Search<'_> {
         if self.subject.is_refined(best.0.steps) {
             let first = (at + 2).min(range.last);
             if let Some((_, refined)) = self.finest(range, first, true, log)? {
-                best = refined;
+                if self.looks_better(&refined, &best, log)? {
+                    best = refined;
+                }
             }
         }
         Ok(Some(best))
+    }
+
+    /// Whether a refined stream looks more like the cloud than one of mean colours, in finer steps.
+    fn looks_better(&self, refined: &(Place, Coded), plain: &(Place, Coded), log: &Log) -> Result<bool> {
+        let (place, subject) = (refined.0, self.subject);
+        if place.steps.luma_step() <= SURE {
+            return Ok(true);
+        }
+        log.step("compare pictures", plain.1.colours.len(), "voxels", || {
+            let reference = Reference::new(subject.isa, subject.cloud, subject.sparse, std::iter::once(place.top))?;
+            let errors = |coded: &Coded| reference.errors(place.top, &subject.drawn(coded)?);
+            let ([whole, foreground], [old_whole, old_foreground]) = (errors(&refined.1)?, errors(&plain.1)?);
+            Ok(whole / old_whole.max(1e-12) + foreground / old_foreground.max(1e-12) <= 2.0)
+        })
     }
 
     /// The finest place of a level whose stream fits, and that stream; `first` is tried first.

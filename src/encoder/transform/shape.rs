@@ -35,10 +35,10 @@ impl GeometryTarget {
         let lambda = match self {
             _ if steps.is_lossless() => 0.0,
             GeometryTarget::Exact => 0.0,
-            // Of half octaves, so that streams of similar steps share an octree, and sizes do not jump by much.
+            // Of quarter octaves, so that streams with the same step of luma share an octree.
             GeometryTarget::Visual => {
                 let lambda = (LAMBDA * steps.luma_step().powi(2)).min(MOST_LAMBDA);
-                ((2.0 * lambda.log2()).round() / 2.0).exp2()
+                ((4.0 * lambda.log2()).round() / 4.0).exp2()
             }
             GeometryTarget::Lambda(lambda) => lambda.clamp(0.0, 100.0),
         };
