@@ -46,7 +46,11 @@ fn a_coarse_level_taken_on_the_way_to_a_finer_one_is_that_decoded_by_itself() {
         assert_eq!(shown.level(), Some(4));
         let [alone, shown] = [alone, shown].map(|decoding| {
             let points = decoding.points().unwrap();
-            (points.voxels.clone(), points.colours.to_vec(), decoding.gaussians().unwrap())
+            (
+                points.voxels.clone(),
+                points.colours.to_vec(),
+                decoding.gaussians().unwrap(),
+            )
         });
         assert_eq!(alone, shown);
         assert_eq!(next.as_ref().map(|next| next.level), Some(5));
