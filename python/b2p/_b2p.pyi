@@ -198,6 +198,7 @@ def encode(
     geometry: str | float | None = None,
     levels: tuple[int, int] | None = None,
     effort: int | None = None,
+    filter: bool = True,
     head_maps: bool = True,
     up: _Axis | None = None,
     unit: str | float | None = None,

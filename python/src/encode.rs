@@ -53,6 +53,8 @@ struct Asked {
 ///     First and last level that the stream may be cut after, the last at most `bits`. Default: bits - 3 to bits - 1.
 /// effort : int, optional
 ///     0 (quick) to 9, the default.
+/// filter : bool
+///     Whether the stream has the colour filter, which decoders apply before they draw.
 /// head_maps : bool
 ///     Whether the stream says where surfels draw better than the learned heads.
 /// up, unit, crs : optional
@@ -69,7 +71,7 @@ struct Asked {
 ///     The stream, which `decode`, `decode_points`, `open`, `info` and `render` take.
 #[pyfunction]
 #[pyo3(signature = (xyz, rgb=None, *, bits=None, bits_per_point=None, quality=None, step=None, lossless=false,
-    geometry=None, levels=None, effort=None, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
+    geometry=None, levels=None, effort=None, filter=true, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
 pub fn encode<'py>(
     py: Python<'py>,
     xyz: &Bound<'py, PyAny>,
@@ -82,6 +84,7 @@ pub fn encode<'py>(
     geometry: Option<&Bound<'py, PyAny>>,
     levels: Option<(u8, u8)>,
     effort: Option<u8>,
+    filter: bool,
     head_maps: bool,
     up: Option<&str>,
     unit: Option<&Bound<'py, PyAny>>,
@@ -94,6 +97,7 @@ pub fn encode<'py>(
     let mut options = Options {
         levels: levels.map(|(first, last)| first..=last),
         geometry: geometry.map_or(Ok(GeometryTarget::Visual), shape)?,
+        filter,
         ..Options::default()
     };
     match step {
