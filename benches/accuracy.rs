@@ -31,7 +31,7 @@ fn gaussians(path: Option<&String>) -> Result<Gaussians> {
             Ok(ply::read(&bytes, &limits)?.0)
         }
         None => {
-            let model = Model::from_bytes(b2p::embedded::MODEL)?;
+            let model = Model::from_bytes(b2p::embedded::model())?;
             LatentDecoder::new(&model).decode(b2p::embedded::SAMPLE, None, &Log::default())
         }
     }

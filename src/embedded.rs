@@ -1,8 +1,23 @@
 //! The models and sample streams that the program carries.
 
+use std::io::Read;
+use std::sync::OnceLock;
+
+/// [`model`], compressed by zlib. What streams of version 3 need is not: it would take longer to load.
+pub static MODEL_ZLIB: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/lite.zlib"));
+
 /// The model that learned streams (version 2) are coded with unless another is named, as a safetensors file. See
-/// `models/README.md`.
-pub static MODEL: &[u8] = include_bytes!("../models/lite.safetensors");
+/// `models/README.md`. The first call inflates it.
+pub fn model() -> &'static [u8] {
+    static MODEL: OnceLock<Vec<u8>> = OnceLock::new();
+    MODEL.get_or_init(|| {
+        let mut bytes = Vec::new();
+        // What the build script has compressed can be read: a test does.
+        let read = flate2::read::ZlibDecoder::new(MODEL_ZLIB).read_to_end(&mut bytes);
+        debug_assert!(read.is_ok());
+        bytes
+    })
+}
 
 /// The heads that draw streams of version 3 unless others are named, as a safetensors file: see
 /// [`crate::gaussians::learned`].
@@ -11,6 +26,14 @@ pub static HEADS: &[u8] = include_bytes!("../models/heads.safetensors");
 /// A procedural still life, 10 bits, as a stream of version 3: made by `b2p-lab scene` and `b2p encode`.
 pub static SCENE: &[u8] = include_bytes!("../models/scene.b2p");
 
-/// The same still life as a learned stream (version 2), coded with [`MODEL`]: made by `b2p-lab scene` and `b2p encode
+/// The same still life as a learned stream (version 2), coded with [`model`]: made by `b2p-lab scene` and `b2p encode
 /// --colours learned`.
 pub static SAMPLE: &[u8] = include_bytes!("../models/sample.b2p");
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn the_model_is_the_file_that_was_compressed() {
+        assert!(super::model() == include_bytes!("../models/lite.safetensors"));
+    }
+}

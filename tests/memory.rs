@@ -50,7 +50,7 @@ fn models() -> Vec<(&'static str, Model)> {
         ("tiny", load(&untrained(&Shape::tiny().with_quick_heads(), 0))),
         ("wide", load(&untrained(&wide, 0))),
         #[cfg(feature = "embedded")]
-        ("lite", load(b2p::embedded::MODEL)),
+        ("lite", load(b2p::embedded::model())),
     ]
 }
 

@@ -53,9 +53,9 @@ impl Fault {
 
 impl From<Error> for Fault {
     fn from(error: Error) -> Fault {
-        // Of a block, its own fault counts.
+        // Of a block or a frame, its own fault counts.
         let cause = match &error {
-            Error::Block { source, .. } => source,
+            Error::Block { source, .. } | Error::Frame { source, .. } => source,
             error => error,
         };
         let status = match cause {

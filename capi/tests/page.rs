@@ -3,7 +3,7 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use b2p::{Camera, Decoder, Gaussians, Limits, Renderer, SequenceDecoder, SequenceReader};
+use b2p::{Camera, Decoder, Gaussians, HeadSet, HeadsModel, Limits, Renderer, SequenceDecoder, SequenceReader};
 use b2p_formats::splats::{self, Format};
 use sha2::{Digest, Sha256};
 
@@ -18,6 +18,8 @@ const FILES: [&str; 6] = [
 
 const SEQUENCE: &str = "wave.b2p";
 const FRAMES: [u64; 4] = [0, 6, 13, 23];
+/// Of these, the pictures of learned heads are compared, too: the first frame of the file, and one that is predicted.
+const LEARNED: [u64; 2] = [0, 13];
 
 fn data() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../web/tests/data")
@@ -48,11 +50,20 @@ fn the_page_is_compared_with_what_is_drawn_natively() {
     }
     let bytes = std::fs::read(data().join(SEQUENCE)).unwrap();
     let sequence = SequenceReader::new(bytes, &Limits::default()).unwrap();
-    let mut decoder = SequenceDecoder::new(Decoder::new());
-    for number in FRAMES {
-        let frame = decoder.frame(&sequence, number).unwrap();
-        let sum = digest(&frame.gaussians().unwrap());
-        writeln!(made, "{SEQUENCE}#{number} {sum}").unwrap();
+    let mut drawn = |decoder: Decoder, frames: &[u64], heads: &str| {
+        let mut decoder = SequenceDecoder::new(decoder);
+        for number in frames {
+            let frame = decoder.frame(&sequence, *number).unwrap();
+            let sum = digest(&frame.gaussians().unwrap());
+            writeln!(made, "{SEQUENCE}#{number}{heads} {sum}").unwrap();
+        }
+    };
+    drawn(Decoder::new(), &FRAMES, "");
+    let model = HeadsModel::open(&data().join("../../../models/heads.safetensors")).unwrap();
+    let scalar = "scalar".parse().unwrap();
+    for (heads, name) in [(HeadSet::Quick, ":quick"), (HeadSet::Best, ":best")] {
+        let decoder = Decoder::new().with_heads_model(model.clone());
+        drawn(decoder.with_heads(heads).with_isa(scalar), &LEARNED, name);
     }
     let path = data().join("pictures.txt");
     if std::env::var_os("B2P_WRITE_PICTURES").is_some() {

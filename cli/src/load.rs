@@ -27,7 +27,7 @@ const ISA: &str = "B2P_ISA";
 pub fn from_file(path: Option<&Path>) -> Result<Model> {
     match path {
         Some(path) => Model::open(path).map_err(Failure::in_file(path)),
-        None => Ok(Model::from_bytes(b2p::embedded::MODEL)?),
+        None => Ok(Model::from_bytes(b2p::embedded::model())?),
     }
 }
 

@@ -13,7 +13,7 @@ use common::{Ball, cloud_of, tiny_model};
 
 /// The model inside the program: others that tests have do not give λ.
 fn model() -> Model {
-    Model::from_bytes(b2p::embedded::MODEL).expect("the model inside the program loads")
+    Model::from_bytes(b2p::embedded::model()).expect("the model inside the program loads")
 }
 
 fn encode_to(bits: f64, cloud: &ColouredVoxels, model: &Model, options: &Options) -> Result<(Encoded, Options), Error> {

@@ -3,7 +3,7 @@
 #[path = "../../tests/common/mod.rs"]
 mod common;
 
-use b2p::embedded::{MODEL, SAMPLE};
+use b2p::embedded::{self, SAMPLE};
 use b2p::encoder::{Options, encode};
 use b2p::gaussians::Gaussians;
 use b2p::latents::LatentDecoder;
@@ -16,7 +16,7 @@ use b2p::{Isa, Limits};
 use common::Ball;
 
 fn model() -> Model {
-    Model::from_bytes(MODEL).expect("the model inside the program loads")
+    Model::from_bytes(embedded::model()).expect("the model inside the program loads")
 }
 
 fn decoded(model: &Model, level: u8) -> Gaussians {

@@ -56,6 +56,8 @@ struct Asked {
 ///     0 (quick) to 9, the default.
 /// tune : "visual" or "psnr"
 ///     What coded colours approach: those with which the cloud is drawn as it is, or the mean colours of voxels.
+/// filter : bool
+///     Whether the stream has the colour filter, which decoders apply before they draw.
 /// head_maps : bool
 ///     Whether the stream says where surfels draw better than the learned heads.
 /// up, unit, crs : optional
@@ -72,7 +74,7 @@ struct Asked {
 ///     The stream, which `decode`, `decode_points`, `open`, `info` and `render` take.
 #[pyfunction]
 #[pyo3(signature = (xyz, rgb=None, *, bits=None, bits_per_point=None, quality=None, step=None, lossless=false,
-    geometry=None, levels=None, effort=None, tune=None, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
+    geometry=None, levels=None, effort=None, tune=None, filter=true, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
 pub fn encode<'py>(
     py: Python<'py>,
     xyz: &Bound<'py, PyAny>,
@@ -86,6 +88,7 @@ pub fn encode<'py>(
     levels: Option<(u8, u8)>,
     effort: Option<u8>,
     tune: Option<&str>,
+    filter: bool,
     head_maps: bool,
     up: Option<&str>,
     unit: Option<&Bound<'py, PyAny>>,
@@ -98,6 +101,7 @@ pub fn encode<'py>(
     let mut options = Options {
         levels: levels.map(|(first, last)| first..=last),
         geometry: geometry.map_or(Ok(GeometryTarget::Visual), shape)?,
+        filter,
         ..Options::default()
     };
     match step {

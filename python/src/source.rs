@@ -137,7 +137,7 @@ impl Drawing {
         if version(start) == Some(2) {
             let model = match &self.model {
                 Some(path) => Model::open(path)?,
-                None => once(&MODEL, || Model::from_bytes(b2p::embedded::MODEL))?,
+                None => once(&MODEL, || Model::from_bytes(b2p::embedded::model()))?,
             };
             return Ok(decoder.with_model(model));
         }

@@ -112,6 +112,7 @@ def test_streams_are_equal_to_those_of_the_program(program, cloud, tmp_path):
         (["--quality", 80, "--bits", 6], {"quality": 80, "bits": 6}),
         (["--lossless", "--levels", "3..6", "--bits", 6], {"lossless": True, "levels": (3, 6), "bits": 6}),
         (["--step", "8,24", "--no-head-maps", "--bits", 6], {"step": (8, 24), "head_maps": False, "bits": 6}),
+        (["--no-filter", "--effort", 0, "--bits", 6], {"filter": False, "effort": 0, "bits": 6}),
         (["--effort", 0, "--bits", 6, "--up", "z", "--unit", "mm"],
          {"effort": 0, "bits": 6, "up": "z", "unit": "mm"}),
     ]:

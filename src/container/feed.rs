@@ -17,7 +17,7 @@ pub(crate) enum Goal {
 }
 
 /// The received part of a stream.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Feed<'b> {
     goal: Goal,
     /// The received bytes, without those that decoding does not need.
@@ -29,7 +29,7 @@ pub(crate) struct Feed<'b> {
 }
 
 /// State after the header was parsed.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Opened {
     header: Header,
     /// The last level to decode.

@@ -11,7 +11,7 @@ use crate::gaussians::surfels::is_for_surfels;
 use crate::geometry::{KernelMap, Octree};
 
 /// The deepest level so far.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Reached {
     pub level: u8,
     pub octree: Octree,
@@ -31,7 +31,7 @@ pub(super) struct Reached {
 }
 
 /// The level above.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Above {
     pub map: KernelMap,
     /// Before the filter; not known of the last level but one of a trunk.

@@ -57,6 +57,18 @@ impl<'b> Decoding<'b> {
         }
     }
 
+    /// A copy of the level reached, which is not decoded any further. `None` if this is no frame of a sequence.
+    pub(crate) fn so_far(&self) -> Option<Self> {
+        let State::Transform(decoding) = &self.state else {
+            return None;
+        };
+        Some(Decoding {
+            decoder: self.decoder.clone(),
+            goal: self.goal,
+            state: State::Transform(Box::new(decoding.so_far())),
+        })
+    }
+
     /// What the next frame of a sequence is predicted from. `None` if this is no frame, or it was taken before.
     pub(crate) fn take_previous(&mut self) -> Option<Previous> {
         match &mut self.state {

@@ -57,6 +57,18 @@ impl<'b> Transform<'b> {
         self
     }
 
+    /// The level reached, by itself: to be drawn while this one goes on to finer levels.
+    pub(super) fn so_far(&self) -> Self {
+        Transform {
+            decoder: self.decoder.clone(),
+            feed: self.feed.clone(),
+            reached: self.reached.clone(),
+            ahead: None,
+            inter: None,
+            history: None,
+        }
+    }
+
     /// What the next frame is predicted from.
     pub(super) fn previous(&mut self) -> Option<Previous> {
         let history = self.history.take()?;

@@ -27,7 +27,7 @@ use crate::log::Log;
 /// # fn main() -> b2p::Result<()> {
 /// use b2p::{Log, Model, latents::LatentDecoder};
 ///
-/// let model = Model::from_bytes(b2p::embedded::MODEL)?;
+/// let model = Model::from_bytes(b2p::embedded::model())?;
 /// let (mut decoding, log) = (LatentDecoder::new(&model).start(Some(8)), Log::new());
 /// for packet in b2p::embedded::SAMPLE.chunks(1400) {
 ///     decoding.push(packet);

@@ -108,11 +108,14 @@ impl SequenceDecoder {
             None
         };
         // What the next frame is predicted from may be finer than what is shown.
-        if let Some(level) = next.filter(|next| *next > shown) {
-            let decoded = self.decoded(group, at, last.as_ref(), level);
-            self.last = decoded
-                .ok()
-                .and_then(|mut decoding| kept(&mut decoding, group, at, level));
+        if let Some(level) = next.filter(|next| *next > shown)
+            && let Some((decoding, last)) = self.on_the_way(group, at, last.as_ref(), shown..level)
+        {
+            self.last = last;
+            return Ok(DecodedFrame {
+                number: frame,
+                decoding,
+            });
         }
         let mut decoding = self.decoded(group, at, last.as_ref(), shown)?;
         if next.is_some_and(|next| next <= shown) {
@@ -124,9 +127,36 @@ impl SequenceDecoder {
         })
     }
 
+    /// Decodes the frame at a place of the group, given the frame before it, down to level `levels.end`, which the next one
+    /// is predicted from: what it leaves for that, and the level `levels.start`, which is shown. Faults of finer levels
+    /// are none of it. `None` if it must be decoded by itself.
+    fn on_the_way(
+        &self,
+        group: &Group,
+        at: usize,
+        last: Option<&Last>,
+        levels: Range<u8>,
+    ) -> Option<(Decoding<'static>, Option<Last>)> {
+        let mut decoding = self.started(group, at, last, levels.end).ok()?;
+        while decoding.level() != Some(levels.start) {
+            decoding.advance().ok()??;
+        }
+        let shown = decoding.so_far()?;
+        let finished = decoding.finish().ok();
+        let last = finished.and_then(|()| kept(&mut decoding, group, at, levels.end));
+        Some((shown, last))
+    }
+
     /// Decodes the frame at a place of the group down to `level`, given the frame before it.
     fn decoded(&self, group: &Group, at: usize, last: Option<&Last>, level: u8) -> Result<Decoding<'static>> {
-        let decoded = || {
+        let mut decoding = self.started(group, at, last, level)?;
+        decoding.finish().map_err(|source| of_frame(group, at, source))?;
+        Ok(decoding)
+    }
+
+    /// Begins to decode the frame at a place of the group down to `level`, given the frame before it.
+    fn started(&self, group: &Group, at: usize, last: Option<&Last>, level: u8) -> Result<Decoding<'static>> {
+        let started = || {
             let (stream, motion) = group.stream(at);
             let header = group.frame_header(at);
             let inter = match (group.is_whole(at), last) {
@@ -141,14 +171,9 @@ impl SequenceDecoder {
                 }
             };
             let decoder = self.decoder.clone().with_level(level);
-            let mut decoding = decoder.start_frame(stream, inter);
-            decoding.finish()?;
-            Ok(decoding)
+            Ok(decoder.start_frame(stream, inter))
         };
-        decoded().map_err(|source| Error::Frame {
-            frame: group.first() + at as u64,
-            source: Box::new(source),
-        })
+        started().map_err(|source| of_frame(group, at, source))
     }
 
     /// Checks that a frame and the one before it fit the limits. Both have at most the voxels that the sequence states.
@@ -166,15 +191,21 @@ impl SequenceDecoder {
     }
 }
 
+/// An error in the frame at a place of the group.
+fn of_frame(group: &Group, at: usize, source: Error) -> Error {
+    Error::Frame {
+        frame: group.first() + at as u64,
+        source: Box::new(source),
+    }
+}
+
 /// The levels that the frames at `places` must be decoded to so that the frame behind them can be shown at level `shown`.
 fn needed(group: &Group, places: Range<usize>, shown: u8) -> Result<Vec<u8>> {
     let mut level = shown;
     let mut levels = Vec::with_capacity(places.len());
     for next in (places.start + 1..=places.end).rev() {
-        let reference = group.reference_level(next).map_err(|source| Error::Frame {
-            frame: group.first() + next as u64,
-            source: Box::new(source),
-        })?;
+        let reference = group.reference_level(next);
+        let reference = reference.map_err(|source| of_frame(group, next, source))?;
         level = level.max(reference);
         levels.push(level);
     }

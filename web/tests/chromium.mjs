@@ -58,7 +58,8 @@ export class Browser {
     const ended = new Promise((resolve) => this.#process.once("exit", resolve));
     this.#process.kill();
     await ended;
-    rmSync(this.#folder, { recursive: true, force: true, maxRetries: 5 });
+    // Its other processes may write a little longer.
+    rmSync(this.#folder, { recursive: true, force: true, maxRetries: 30 });
   }
 }
 

@@ -5,7 +5,7 @@ import { readFileSync } from "node:fs";
 import test from "node:test";
 
 import { B2p } from "../src/index.js";
-import { SHOWN, SIZE, STATE, data, digest, open, pictures, skip } from "./page.mjs";
+import { DRAWN, SHOWN, SIZE, STATE, data, digest, open, pictures, skip } from "./page.mjs";
 
 const library = await B2p.load(readFileSync(new URL("../b2p.wasm", import.meta.url)));
 // 24 frames in groups of 8, twelve a second.
@@ -16,7 +16,11 @@ const damaged = Buffer.from(wave);
 damaged[wave.length >> 1] ^= 1;
 const cut = wave.subarray(0, 40);
 
-const page = skip ? null : await open({ "wave.b2p": wave, "damaged.b2p": damaged, "cut.b2p": cut });
+const heads = readFileSync(new URL("../../models/heads.safetensors", import.meta.url));
+const LEARNED = ["quick", "best"];
+
+const files = { "wave.b2p": wave, "damaged.b2p": damaged, "cut.b2p": cut, "heads.safetensors": heads };
+const page = skip ? null : await open(files);
 test.after(() => page?.close());
 
 /** All that a player makes until it stands, with a digest in place of Gaussians. */
@@ -35,17 +39,35 @@ function digestOf(gaussians) {
 }
 
 /** The digest of a frame at its finest level. */
-function picture(number) {
-  const player = library.player(wave, { heads: "surfels" });
+function picture(number, heads = "surfels", model = null) {
+  const player = library.player(wave, { heads, model });
   player.seek((number + 0.5) / RATE);
   const last = made(player).at(-1);
   player.free();
-  assert.equal(last.number, number);
+  assert.deepEqual([last.number, last.heads], [number, heads]);
   return last.digest;
 }
 
 test("a frame that a player stands at is that of the program", () => {
   for (const number of [0, 6, 13, 23]) assert.equal(picture(number), pictures.get(`wave.b2p#${number}`), `frame ${number}`);
+});
+
+test("learned heads draw a sequence as the program does", () => {
+  const model = library.headsModel(heads);
+  for (const name of LEARNED) {
+    for (const number of [0, 13]) {
+      assert.equal(picture(number, name, model), pictures.get(`wave.b2p#${number}:${name}`), `${name}, frame ${number}`);
+    }
+  }
+  // Without a choice, the quick ones where it stands: the best take too long to be played.
+  const player = library.player(wave, { model });
+  assert.equal(made(player).at(-1).heads, "quick");
+  player.free();
+  model.free();
+  // A frame that cannot be drawn is no defect of the library, which goes on.
+  const without = library.player(wave, { heads: "best" });
+  assert.equal(without.next().error.kind, "unsupported");
+  without.free();
 });
 
 test("a player drops frames and goes to coarser levels as its user is slow", () => {
@@ -108,6 +130,23 @@ test("a sequence plays, a pause holds, and seeking is exact", { skip }, async ()
   await shows(shown, picture(1));
   await shown.evaluate("document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ' ', bubbles: true }))");
   await shown.until("Number(document.body.dataset.frame) > 1");
+});
+
+test("learned heads are chosen while a sequence plays, and keep its clock", { skip }, async () => {
+  const shown = await page.show("wave.b2p&heads=streams/heads.safetensors");
+  await shown.until("document.body.dataset.frame !== undefined");
+  for (const name of LEARNED) {
+    await input(shown, "heads", `"${name}"`, "change");
+    // It is opened again, and plays: frames are drawn with these heads.
+    await shown.until(`${STATE}.includes(", ${name}, ")`);
+    const first = await frame(shown);
+    await shown.until(`Number(document.body.dataset.frame) !== ${first}`);
+    assert.ok(await shown.evaluate(DRAWN), name);
+    assert.ok((await shown.evaluate(STATE)).includes(`, ${name}, `));
+    await click(shown);
+    await input(shown, "when", 13.5 / RATE, "input");
+    await shows(shown, pictures.get(`wave.b2p#13:${name}`));
+  }
 });
 
 test("the clock is kept at any speed", { skip }, async () => {

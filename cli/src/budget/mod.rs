@@ -119,7 +119,11 @@ impl Machine {
         let version = version(stream).unwrap_or_default();
         let path = model.model.as_ref();
         let file = |path: &PathBuf| load::bytes(path, limits);
-        let own = if version == 2 { embedded::MODEL } else { embedded::HEADS };
+        let own = if version == 2 {
+            embedded::model()
+        } else {
+            embedded::HEADS
+        };
         let sample = match (version, path) {
             // The sample is the program's own model's; another model is measured with the stream at hand.
             (2, Some(_)) => stream,

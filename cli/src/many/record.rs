@@ -123,7 +123,7 @@ impl Write for Hash {
 /// What this program is: other models draw other pictures.
 pub fn program() -> String {
     let mut hash = Xxh3::new();
-    hash.update(embedded::MODEL);
+    hash.update(embedded::MODEL_ZLIB);
     hash.update(embedded::HEADS);
     format!("{} {:032x}", env!("CARGO_PKG_VERSION"), hash.digest128())
 }

@@ -95,7 +95,7 @@ impl Args {
         }
         let model = match &self.model {
             Some(path) => Model::open(path)?,
-            None => Model::from_bytes(b2p::embedded::MODEL)?,
+            None => Model::from_bytes(b2p::embedded::model())?,
         };
         bench = bench.with_model(model, self.levels.clone()).with_heads(self.heads);
         if code {

@@ -68,7 +68,7 @@ impl Args {
         }
         let file = match &self.model {
             Some(path) => read(path)?,
-            None if version(&input.stream) == Some(2) => embedded::MODEL.to_vec(),
+            None if version(&input.stream) == Some(2) => embedded::model().to_vec(),
             None => embedded::HEADS.to_vec(),
         };
         let mesh = input.surface.as_ref().map(Origin::Mesh);

@@ -32,3 +32,28 @@ fn a_coarse_level_needs_finer_ones_of_the_frames_before_unless_the_sequence_is_s
         assert_eq!(needed(&reader.group(0).unwrap(), 0..2, 4).unwrap(), expected);
     }
 }
+
+#[test]
+fn a_coarse_level_taken_on_the_way_to_a_finer_one_is_that_decoded_by_itself() {
+    let bytes = sequence(false);
+    let reader = SequenceReader::new(&bytes[..], &Limits::default()).unwrap();
+    let group = reader.group(0).unwrap();
+    let decoder = SequenceDecoder::new(Decoder::new());
+    let mut last = None;
+    for at in 0..2 {
+        let alone = decoder.decoded(&group, at, last.as_ref(), 4).unwrap();
+        let (shown, next) = decoder.on_the_way(&group, at, last.as_ref(), 4..5).unwrap();
+        assert_eq!(shown.level(), Some(4));
+        let [alone, shown] = [alone, shown].map(|decoding| {
+            let points = decoding.points().unwrap();
+            (
+                points.voxels.clone(),
+                points.colours.to_vec(),
+                decoding.gaussians().unwrap(),
+            )
+        });
+        assert_eq!(alone, shown);
+        assert_eq!(next.as_ref().map(|next| next.level), Some(5));
+        last = next;
+    }
+}
