@@ -180,6 +180,41 @@ fn a_file_that_becomes_shorter_after_its_index_was_read_loses_the_blocks_behind_
 }
 
 #[test]
+fn a_check_of_a_damaged_block_finds_the_chunk_and_counts_from_the_start_of_the_scene() {
+    let bytes = scene_bytes();
+    let scene = reader(&bytes);
+    let (number, entry) = (1, &scene.blocks()[1]);
+    let stream = &bytes[entry.offset as usize..][..entry.bytes as usize];
+    let whole = Decoder::new().check(stream);
+    assert!(whole.chunks.len() >= 4, "{whole:?}");
+    for chunk in whole.chunks {
+        let mut damaged = bytes.clone();
+        damaged[entry.offset as usize + chunk.end - 1] ^= 1;
+        let checks = reader(&damaged).check(&Decoder::new());
+        for (block, found) in checks.blocks.iter().enumerate() {
+            let found = found.as_ref().expect("it can be read");
+            assert_eq!(found.is_valid(), block != number);
+        }
+        let found = checks.blocks[number].as_ref().expect("it can be read");
+        let first: Vec<_> = found
+            .faults
+            .iter()
+            .take(2)
+            .map(|fault| (fault.error.clause(), fault.offset))
+            .collect();
+        let place = entry.offset + chunk.start as u64;
+        assert_eq!(
+            first,
+            [(Some("18.2.4"), Some(entry.offset)), (Some("3.1.1"), Some(place))]
+        );
+        assert_eq!(found.faults[1].level, Some(chunk.section));
+        assert_eq!(found.faults[1].error.offset(), Some(place));
+        let start = found.chunks.first().map(|chunk| chunk.start as u64);
+        assert!(start >= Some(entry.offset), "{found:?}");
+    }
+}
+
+#[test]
 fn a_box_has_the_voxels_whose_centres_lie_in_it_and_their_gaussians() {
     let bytes = scene_bytes();
     let scene = reader(&bytes);
