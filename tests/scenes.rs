@@ -507,6 +507,16 @@ fn what_is_far_away_is_drawn_from_coarser_levels() {
     let options = ViewOptions::default().with_voxel_pixels(0.5);
     let coarse = decoder.visible(&scene, &camera, options).expect("Gaussians").content;
     assert!(coarse.len() * 3 < full.len(), "{} of {}", coarse.len(), full.len());
+    // What they take is known before anything is decoded.
+    let memory = |options| decoder.visible_memory(&scene, &camera, options).expect("a camera");
+    let (all, some) = (memory(ViewOptions::default()), memory(options));
+    let bytes = |gaussians: &Gaussians| (gaussians.len() * size_of::<[f32; 14]>()) as u64;
+    assert!(
+        all >= bytes(&full) && all <= 3 * bytes(&full),
+        "{all} of {}",
+        bytes(&full)
+    );
+    assert!(some >= bytes(&coarse) && some * 2 < all, "{some} of {all}");
     let (a, b) = (picture(&full, &camera), picture(&coarse, &camera));
     let squares = a.pixels.iter().flatten().zip(b.pixels.iter().flatten());
     let mean = squares.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / (4 * a.pixels.len()) as f64;

@@ -145,6 +145,25 @@ fn parts_of_a_scene_are_decoded_cut_and_drawn() {
 }
 
 #[test]
+fn memory_that_a_camera_may_need_is_foretold_with_what_takes_less() {
+    let folder = folder();
+    let at = folder.path();
+    let drawn = |more: &[&str]| {
+        let picture = [
+            "render", "ball.b2p", "-o", "a.png", "--size", "64x64", "--heads", "surfels",
+        ];
+        let output = b2p(at, &[&picture[..], more].concat());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let warned = drawn(&["--max-memory", "1M"]);
+    assert!(
+        warned.contains("may take ") && warned.contains("a greater --lod, 0 now"),
+        "{warned}"
+    );
+    assert!(!drawn(&[]).contains("may take "));
+}
+
+#[test]
 fn damage_stays_in_its_block_and_is_reported() {
     let folder = folder();
     let at = folder.path();
