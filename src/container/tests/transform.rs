@@ -1,6 +1,8 @@
 //! Version 3.
 
 use super::*;
+use crate::axes::{Axes, Up};
+use crate::container::axes::AXES;
 use crate::container::chunk::{Chunks, HEAD_MAP};
 use crate::container::reader::put_varint;
 
@@ -370,4 +372,44 @@ fn a_scan_lists_all_chunks_and_mends_damaged_ones_that_are_skipped() {
     longer[chunk_at + 4] = 100;
     let scan = Scan::new(&longer, &header);
     assert!(scan.faults.len() == 1 && scan.chunks.len() == 4, "{scan:?}");
+}
+
+#[test]
+fn a_scan_notes_axes_and_head_maps_that_have_no_effect() {
+    let [geometry, colours] = base();
+    let axes = Axes {
+        up: Some(Up::Z),
+        ..Axes::default()
+    };
+    let of = |payload: &[u8], points| chunk(AXES, 2, [0, points], payload);
+    let map = |level| chunk(HEAD_MAP, level, [0, 0], b"map");
+    let notes = |geometry: &[Vec<u8>], behind: &[Vec<u8>], above: &[Vec<u8>]| {
+        let sections = [
+            [&geometry[..], &behind[..]].concat(),
+            [&colours[..], &above[..]].concat(),
+        ];
+        let bytes = stream(only_base(), &sections);
+        let header = Header::parse(&bytes, &Limits::default()).unwrap();
+        assert!(parse(&bytes).unwrap().damage().is_none());
+        let scan = Scan::new(&bytes, &header);
+        assert!(scan.faults.is_empty());
+        let chunk_of = |at: usize| scan.chunks.iter().position(|chunk| chunk.start == at);
+        let notes = scan.notes.iter();
+        notes
+            .map(|note| (note.clause, chunk_of(note.offset).unwrap()))
+            .collect::<Vec<_>>()
+    };
+    let good = of(&axes.to_bytes(), 0);
+    // The first axes of a form that is known count, and those of the base level's geometry alone.
+    assert_eq!(notes(&geometry, &[good.clone()], &[]), []);
+    assert_eq!(notes(&geometry, &[good.clone(), good.clone()], &[]), [("3.4.2", 2)]);
+    assert_eq!(notes(&geometry, &[of(b"?", 0), good.clone()], &[]), [("3.4.2", 1)]);
+    assert_eq!(notes(&geometry, &[], &[good.clone()]), [("3.4.2", 4)]);
+    assert_eq!(notes(&geometry, &[of(b"", 7), good], &[]), []);
+    assert_eq!(notes(&geometry, &[of(b"", 0)], &[]), [("3.4.2", 1)]);
+    // So does the first head map of the level, among its colours.
+    assert_eq!(notes(&geometry, &[], &[map(2)]), []);
+    assert_eq!(notes(&geometry, &[], &[map(2), map(2)]), [("7.5.1", 5)]);
+    assert_eq!(notes(&geometry, &[], &[map(3), map(2)]), [("7.5.1", 4)]);
+    assert_eq!(notes(&geometry, &[map(2)], &[map(2)]), [("7.5.1", 1)]);
 }

@@ -99,6 +99,46 @@ fn sums_that_are_not_those_of_the_blocks_are_refused() {
 }
 
 #[test]
+fn the_header_of_a_block_must_say_what_the_index_says() {
+    let (common, blocks) = scene(&blocks()).unwrap();
+    for mut entry in blocks {
+        let header = entry.header(&common);
+        let wrong = |entry: &BlockEntry, found: &Header| {
+            let error = entry.check_header(found, &common).err()?;
+            assert_eq!(error.offset(), Some(entry.offset));
+            error.clause()
+        };
+        entry.bytes = header.prefix_bytes(header.top).unwrap() as u32;
+        assert_eq!(wrong(&entry, &header), None);
+        let more = |points| Header {
+            points: header.points + points,
+            ..header.clone()
+        };
+        assert_eq!(wrong(&entry, &more(1)), Some("18.3.1"));
+        for bytes in [entry.bytes - 1, entry.bytes + 1] {
+            let other = BlockEntry { bytes, ..entry.clone() };
+            assert_eq!(wrong(&other, &header), Some("2.1.1"));
+        }
+    }
+}
+
+#[test]
+fn the_bytes_of_a_block_must_have_the_hash_of_the_index() {
+    let stream = super::transform::sample();
+    let cube = Cube { level: 1, key: 3 };
+    let entry = BlockEntry::of(cube, &stream).unwrap();
+    assert_eq!((entry.cube, entry.points, entry.offset), (cube, 20, 0));
+    assert_eq!(
+        (entry.bytes as usize, &entry.voxels[..]),
+        (stream.len(), &[3, 10, 20][..])
+    );
+    entry.check_hash(&stream).unwrap();
+    let mut damaged = stream;
+    damaged[200] ^= 1;
+    assert_eq!(entry.check_hash(&damaged).unwrap_err().clause(), Some("18.2.4"));
+}
+
+#[test]
 fn a_cube_has_the_keys_below_it() {
     let cube = Cube { level: 2, key: 5 };
     assert_eq!(
