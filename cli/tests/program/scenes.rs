@@ -145,7 +145,7 @@ fn parts_of_a_scene_are_decoded_cut_and_drawn() {
 }
 
 #[test]
-fn memory_that_a_camera_may_need_is_foretold_with_what_takes_less() {
+fn memory_that_a_view_may_take_is_said_first_with_what_takes_less() {
     let folder = folder();
     let at = folder.path();
     let drawn = |more: &[&str]| {

@@ -215,6 +215,22 @@ fn the_index_of_a_sequence_is_read_as_it_was_written() {
     );
 }
 
+#[test]
+fn a_fault_in_an_index_or_a_table_is_at_the_entry_that_has_it() {
+    let mut index = index();
+    index.groups[1].frames = 0;
+    let mut bytes = common().write_sequence();
+    index.write(&mut bytes).unwrap();
+    let error = Index::parse(&bytes, &common(), &Limits::default()).unwrap_err();
+    // Before the end are the entries of two groups, of 12 and 13 bytes.
+    assert_eq!(error.offset(), Some(bytes.len() as u64 - 25));
+    let mut frames = frames();
+    frames[1].points = 61;
+    let end = table_bytes(&frames).unwrap().len() as u64;
+    // Those of two frames, of 15 and 12 bytes.
+    assert_eq!(table(&frames, 0).unwrap_err().offset(), Some(end - 27));
+}
+
 fn frames() -> Vec<FrameEntry> {
     let level = |voxels, motion, geometry, colours| FrameLevel {
         voxels,
