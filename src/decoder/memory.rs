@@ -272,7 +272,9 @@ mod tests {
     use super::*;
     use crate::Placement;
     use crate::container::{Format, Section};
+    use crate::gaussians::Heads;
     use crate::gaussians::learned;
+    use crate::latents::network::{Model, Shape, untrained};
 
     /// `214 + 2·C + 2·K`, with a comma at thousands.
     fn bytes(term: &Term) -> String {
@@ -334,6 +336,53 @@ mod tests {
             voxels: voxels.into(),
             sections: vec![section; voxels.len()],
         }
+    }
+
+    #[test]
+    fn the_bound_of_version_2_is_what_its_terms_say_of_the_counts() {
+        let learning = Shape {
+            learning: true,
+            ..Shape::tiny()
+        };
+        let (mut one, mut many) = (0, 0);
+        for shape in [Shape::tiny(), Shape::tiny().with_quick_heads(), learning] {
+            let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
+            let header = header(3, &[400, 1500, 6001], Format::Learned { model: model.id() });
+            let decoder = LatentDecoder::new(&model);
+            let [c, k, b] = [shape.channels, shape.latents, shape.base_channels].map(|size| size as u64);
+            for (level, bytes, parents, voxels, sum) in [
+                (3, 200, 0, 400, 400),
+                (4, 400, 400, 1500, 1900),
+                (5, 600, 1500, 6001, 7901),
+            ] {
+                let role = usize::from(level - 3);
+                let learned = if shape.learning { 144 + 2 * k } else { 0 };
+                let mut expected = 4 * (header.bytes() as u64 + bytes) + 13 * (sum + 3 * 400);
+                expected += (214 + 2 * c + 2 * k) * parents + (230 + 10 * c + 7 * k) * voxels;
+                if b > 0 {
+                    expected += (20 + 17 * k + 4 * b + learned) * 400;
+                }
+                if shape.corrects_up_to(role) {
+                    expected += (9 + 3 * k + learned) * voxels;
+                }
+                if let Some(head) = shape.head(role, Heads::Best) {
+                    let (h, gaussians) = (head.channels as u64, head.children as u64 * voxels);
+                    let kernel = if head.children == 1 { 208 + 6 * h } else { 100 + 6 * h };
+                    expected += (40 + 2 * c + 6 * h) * voxels + (112 + kernel) * gaussians;
+                    *(if head.children == 1 { &mut one } else { &mut many }) += 1;
+                }
+                assert_eq!(
+                    decoder.memory(&header, level).unwrap(),
+                    expected,
+                    "level {level} of {shape:?}"
+                );
+            }
+            assert!(decoder.memory(&header, 6).is_err());
+        }
+        assert!(
+            one > 0 && many > 0,
+            "{one} levels with a Gaussian for a voxel, {many} with more"
+        );
     }
 
     #[test]
