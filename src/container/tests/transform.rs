@@ -413,3 +413,15 @@ fn a_scan_notes_axes_and_head_maps_that_have_no_effect() {
     assert_eq!(notes(&geometry, &[], &[map(3), map(2)]), [("7.5.1", 4)]);
     assert_eq!(notes(&geometry, &[map(2)], &[map(2)]), [("7.5.1", 1)]);
 }
+
+#[test]
+fn no_more_than_a_thousand_damaged_chunks_are_listed() {
+    let [mut geometry, colours] = base();
+    let good = chunk(200, 2, [0, 0], b"x");
+    let mut damaged = good.clone();
+    *damaged.last_mut().unwrap() ^= 1;
+    geometry.extend(vec![[damaged, good].concat(); 1005]);
+    let bytes = stream(only_base(), &[geometry, colours]);
+    let header = Header::parse(&bytes, &Limits::default()).unwrap();
+    assert_eq!(Scan::new(&bytes, &header).faults.len(), 1000);
+}
