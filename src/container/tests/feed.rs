@@ -126,3 +126,12 @@ fn no_more_bytes_are_kept_than_decoding_needs() {
         assert_eq!(feed.bytes(), &bytes[..kept]);
     }
 }
+
+#[test]
+fn nothing_is_decoded_after_a_failure() {
+    let bytes = sample();
+    let mut feed = Feed::new(Goal::Exact(3), Cow::Borrowed(&bytes));
+    assert!(feed.check_usable().is_ok());
+    feed.fail();
+    assert!(matches!(feed.check_usable(), Err(Error::Usage(_))));
+}
