@@ -384,10 +384,7 @@ fn a_scan_notes_axes_and_head_maps_that_have_no_effect() {
     let of = |payload: &[u8], points| chunk(AXES, 2, [0, points], payload);
     let map = |level| chunk(HEAD_MAP, level, [0, 0], b"map");
     let notes = |geometry: &[Vec<u8>], behind: &[Vec<u8>], above: &[Vec<u8>]| {
-        let sections = [
-            [&geometry[..], &behind[..]].concat(),
-            [&colours[..], &above[..]].concat(),
-        ];
+        let sections = [[geometry, behind].concat(), [&colours[..], above].concat()];
         let bytes = stream(only_base(), &sections);
         let header = Header::parse(&bytes, &Limits::default()).unwrap();
         assert!(parse(&bytes).unwrap().damage().is_none());
@@ -401,10 +398,10 @@ fn a_scan_notes_axes_and_head_maps_that_have_no_effect() {
     };
     let good = of(&axes.to_bytes(), 0);
     // The first axes of a form that is known count, and those of the base level's geometry alone.
-    assert_eq!(notes(&geometry, &[good.clone()], &[]), []);
+    assert_eq!(notes(&geometry, std::slice::from_ref(&good), &[]), []);
     assert_eq!(notes(&geometry, &[good.clone(), good.clone()], &[]), [("3.4.2", 2)]);
     assert_eq!(notes(&geometry, &[of(b"?", 0), good.clone()], &[]), [("3.4.2", 1)]);
-    assert_eq!(notes(&geometry, &[], &[good.clone()]), [("3.4.2", 4)]);
+    assert_eq!(notes(&geometry, &[], std::slice::from_ref(&good)), [("3.4.2", 4)]);
     assert_eq!(notes(&geometry, &[of(b"", 7), good], &[]), []);
     assert_eq!(notes(&geometry, &[of(b"", 0)], &[]), [("3.4.2", 1)]);
     // So does the first head map of the level, among its colours.
