@@ -150,12 +150,12 @@ fn memory_that_a_view_may_take_is_said_first_with_what_takes_less() {
     let at = folder.path();
     let drawn = |more: &[&str]| {
         let picture = [
-            "render", "ball.b2p", "-o", "a.png", "--size", "64x64", "--heads", "surfels",
+            "render", "ball.b2p", "-o", "a.png", "--size", "64x64", "--heads", "surfels", "--orbit", "20,20,3",
         ];
         let output = b2p(at, &[&picture[..], more].concat());
         String::from_utf8(output.stderr).unwrap()
     };
-    let warned = drawn(&["--max-memory", "1M"]);
+    let warned = drawn(&["--max-memory", "100K"]);
     assert!(
         warned.contains("may take ") && warned.contains("a greater --lod, 0 now"),
         "{warned}"
