@@ -26,4 +26,4 @@ fi
     awk '$1 ~ /^src\// || $1 ~ /^kernels\/src\// { split($1, part, "/"); module = part[1] == "src" ? part[2] : "kernels"
             lines[module] += $8; missed[module] += $9 }
         END { for (module in lines) printf "%-12s %5d lines  %5.1f %%\n", module, lines[module], 100 - 100 * missed[module] / lines[module] }' | sort
-grep -E '^(src|kernels/src)/(bitstream|geometry|entropy)' $out/files.txt | awk '{ printf "  %-36s %5d lines, %4d missed\n", $1, $8, $9 }'
+grep -E '^src/(container|coding|geometry|colour)/' $out/files.txt | awk '{ printf "  %-36s %5d lines, %4d missed\n", $1, $8, $9 }'

@@ -207,6 +207,32 @@ impl Error {
         }
     }
 
+    /// The byte of the input that the error names, if it names one.
+    pub fn offset(&self) -> Option<u64> {
+        match self {
+            Error::Truncated { offset, .. } | Error::ChecksumMismatch { offset, .. } => Some(*offset),
+            Error::Malformed { at: text, .. } | Error::Unsupported { detail: text, .. } => Some(named_byte(text)?.0),
+            Error::Frame { source, .. } | Error::Block { source, .. } => source.offset(),
+            _ => None,
+        }
+    }
+
+    /// The same error of a part of a file, as one of the file: `place` is where a byte of the part lies.
+    pub(crate) fn moved(mut self, place: impl Fn(u64) -> u64) -> Self {
+        match &mut self {
+            // The end of what is there.
+            Error::Truncated { offset, .. } if *offset > 0 => *offset = place(*offset - 1) + 1,
+            Error::Truncated { offset, .. } | Error::ChecksumMismatch { offset, .. } => *offset = place(*offset),
+            Error::Malformed { at: text, .. } | Error::Unsupported { detail: text, .. } => {
+                if let Some((byte, rest)) = named_byte(text) {
+                    *text = format!("byte {}{rest}", place(byte));
+                }
+            }
+            _ => {}
+        }
+        self
+    }
+
     /// The same [`Error::Malformed`] as a breach of this clause of `docs/format.md`.
     pub(crate) fn breaks(mut self, rule: &'static str) -> Self {
         if let Error::Malformed { clause, .. } = &mut self {
@@ -214,6 +240,14 @@ impl Error {
         }
         self
     }
+}
+
+/// The byte that a place such as `byte 12, level 3` names, and what follows.
+fn named_byte(text: &str) -> Option<(u64, &str)> {
+    let text = text.strip_prefix("byte ")?;
+    let end = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
+    let (digits, rest) = text.split_at(end);
+    Some((digits.parse().ok()?, rest))
 }
 
 /// Features of streams that a decoder may lack, as [`Error::Unsupported`] names them.
@@ -293,6 +327,54 @@ mod tests {
             expected: 1,
             found: 2,
         }
+    }
+
+    #[test]
+    fn an_error_of_a_part_of_a_file_becomes_one_of_the_file() {
+        // Ten bytes of something else lie after the first hundred of the part, which starts at byte 1000.
+        let place = |byte: u64| 1000 + byte + if byte < 100 { 0 } else { 10 };
+        let at = |at: &str| Error::malformed(Stage::Colour, at, "steps", 1, 2);
+        let text = |error: Error| (error.offset(), error.moved(place).to_string());
+        assert_eq!(
+            text(at("byte 12, level 3")),
+            (Some(12), "colour: at byte 1012, level 3: steps is 1, expected 2".into())
+        );
+        assert_eq!(text(at("byte 100")).1, "colour: at byte 1110: steps is 1, expected 2");
+        assert_eq!(
+            text(at("level 3")),
+            (None, "colour: at level 3: steps is 1, expected 2".into())
+        );
+        assert_eq!(text(at("byte x")).0, None);
+        // What is cut ends where its last byte is.
+        let cut = |offset| Error::Truncated {
+            stage: Stage::Bitstream,
+            offset,
+            field: "chunk",
+            needed: 1,
+        };
+        assert_eq!(
+            [0, 1, 100, 101].map(|offset| cut(offset).moved(place).offset()),
+            [1000, 1001, 1100, 1111].map(Some)
+        );
+        let sum = Error::ChecksumMismatch {
+            what: String::new(),
+            offset: 100,
+            expected: 1,
+            found: 2,
+            clause: "3.1.1",
+        };
+        assert_eq!(sum.moved(place).offset(), Some(1110));
+        let detail = "byte 5 has the critical type 9".to_owned();
+        let what = feature::CHUNK;
+        let unknown = Error::Unsupported { what, detail }.moved(place);
+        assert_eq!(unknown.offset(), Some(1005));
+        assert!(
+            unknown.to_string().ends_with("byte 1005 has the critical type 9"),
+            "{unknown}"
+        );
+        let source = Box::new(unknown);
+        assert_eq!(Error::Frame { frame: 3, source }.offset(), Some(1005));
+        assert_eq!(lacking("a level").moved(place).offset(), None);
     }
 
     #[test]

@@ -59,3 +59,47 @@ pub(crate) fn total(terms: &[(Term, u64)], sizes: Sizes) -> u64 {
     let bytes = terms.iter().map(|(term, count)| term.times(*count, sizes));
     bytes.fold(0, u64::saturating_add)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZES: Sizes = Sizes {
+        channels: 2,
+        latents: 3,
+        generator: 5,
+        base: 7,
+    };
+
+    fn term(fixed: u64, by: Sizes) -> Term {
+        Term {
+            each: "",
+            takes: "",
+            fixed,
+            by,
+        }
+    }
+
+    #[test]
+    fn a_bound_is_the_sum_of_its_terms() {
+        let by = Sizes {
+            channels: 11,
+            latents: 13,
+            generator: 17,
+            base: 19,
+        };
+        let one = term(23, by);
+        assert_eq!(one.bytes(NOTHING), 23);
+        assert_eq!(one.bytes(SIZES), 23 + 2 * 11 + 3 * 13 + 5 * 17 + 7 * 19);
+        assert_eq!(one.times(10, SIZES), 3020);
+        assert_eq!(total(&[(one, 10), (term(4, NOTHING), 3)], SIZES), 3032);
+        assert_eq!(total(&[], SIZES), 0);
+    }
+
+    #[test]
+    fn a_bound_that_is_too_large_to_count_is_the_greatest_number() {
+        let four = term(4, NOTHING);
+        assert_eq!(four.times(u64::MAX / 2, SIZES), u64::MAX);
+        assert_eq!(total(&[(four, u64::MAX / 4), (four, 1)], SIZES), u64::MAX);
+    }
+}

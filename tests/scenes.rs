@@ -180,6 +180,41 @@ fn a_file_that_becomes_shorter_after_its_index_was_read_loses_the_blocks_behind_
 }
 
 #[test]
+fn a_check_of_a_damaged_block_finds_the_chunk_and_counts_from_the_start_of_the_scene() {
+    let bytes = scene_bytes();
+    let scene = reader(&bytes);
+    let (number, entry) = (1, &scene.blocks()[1]);
+    let stream = &bytes[entry.offset as usize..][..entry.bytes as usize];
+    let whole = Decoder::new().check(stream);
+    assert!(whole.chunks.len() >= 4, "{whole:?}");
+    for chunk in whole.chunks {
+        let mut damaged = bytes.clone();
+        damaged[entry.offset as usize + chunk.end - 1] ^= 1;
+        let checks = reader(&damaged).check(&Decoder::new());
+        for (block, found) in checks.blocks.iter().enumerate() {
+            let found = found.as_ref().expect("it can be read");
+            assert_eq!(found.is_valid(), block != number);
+        }
+        let found = checks.blocks[number].as_ref().expect("it can be read");
+        let first: Vec<_> = found
+            .faults
+            .iter()
+            .take(2)
+            .map(|fault| (fault.error.clause(), fault.offset))
+            .collect();
+        let place = entry.offset + chunk.start as u64;
+        assert_eq!(
+            first,
+            [(Some("18.2.4"), Some(entry.offset)), (Some("3.1.1"), Some(place))]
+        );
+        assert_eq!(found.faults[1].level, Some(chunk.section));
+        assert_eq!(found.faults[1].error.offset(), Some(place));
+        let start = found.chunks.first().map(|chunk| chunk.start as u64);
+        assert!(start >= Some(entry.offset), "{found:?}");
+    }
+}
+
+#[test]
 fn a_box_has_the_voxels_whose_centres_lie_in_it_and_their_gaussians() {
     let bytes = scene_bytes();
     let scene = reader(&bytes);
@@ -472,6 +507,16 @@ fn what_is_far_away_is_drawn_from_coarser_levels() {
     let options = ViewOptions::default().with_voxel_pixels(0.5);
     let coarse = decoder.visible(&scene, &camera, options).expect("Gaussians").content;
     assert!(coarse.len() * 3 < full.len(), "{} of {}", coarse.len(), full.len());
+    // What they take is known before anything is decoded.
+    let memory = |options| decoder.visible_memory(&scene, &camera, options).expect("a camera");
+    let (all, some) = (memory(ViewOptions::default()), memory(options));
+    let bytes = |gaussians: &Gaussians| (gaussians.len() * size_of::<[f32; 14]>()) as u64;
+    assert!(
+        all >= bytes(&full) && all <= 3 * bytes(&full),
+        "{all} of {}",
+        bytes(&full)
+    );
+    assert!(some >= bytes(&coarse) && some * 2 < all, "{some} of {all}");
     let (a, b) = (picture(&full, &camera), picture(&coarse, &camera));
     let squares = a.pixels.iter().flatten().zip(b.pixels.iter().flatten());
     let mean = squares.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / (4 * a.pixels.len()) as f64;

@@ -1,6 +1,6 @@
 //! `b2p check`: whether streams are valid, and where not, which clause of the format they break.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use b2p::container::{Header, ScannedChunk, version};
 use b2p::decoder::{Checked, Fault};
@@ -17,24 +17,13 @@ use super::{Failure, Result, load, scene, sequence};
 pub fn run(args: &Check, limits: &Limits) -> Result<Said> {
     let mut model = None;
     let mut reports = Vec::new();
-    let (containers, streams): (Vec<_>, Vec<_>) =
-        (args.inputs.iter()).partition(|path| sequence::is_sequence(path) || scene::is_scene(path));
-    let check = |path: &&PathBuf| match scene::is_scene(path) {
-        true => scene::check(path, limits),
-        false => sequence::check(path, limits),
-    };
-    let containers: Vec<_> = containers.iter().map(check).collect();
-    let texts = containers.into_iter().collect::<Result<Vec<String>>>()?;
-    if streams.is_empty() {
-        return Ok(Said::result(texts.concat()));
-    }
-    for path in streams {
+    for path in &args.inputs {
         reports.push(Report::of(path, args, &mut model, limits)?);
     }
     let bad = reports.iter().filter(|report| !report.is_valid()).count();
     let result = match manners::json() {
         true => format!("{:#}\n", Value::from_iter(reports.iter().map(Report::json))),
-        false => texts.concat() + &reports.iter().map(Report::text).collect::<String>(),
+        false => reports.iter().map(Report::text).collect::<String>(),
     };
     let said = Said::result(result);
     if bad == 0 {
@@ -63,12 +52,114 @@ pub fn refused(path: &Path) -> impl Fn(Error) -> Failure + '_ {
 /// What is said of a file.
 struct Report<'a> {
     path: &'a Path,
-    /// Its length, and what was found.
-    found: Result<(usize, Checked)>,
+    found: Result<Found>,
+}
+
+/// What was found in a file.
+enum Found {
+    /// Of a stream its length, and what was found in it.
+    Stream(usize, Box<Checked>),
+    Units(Units),
+}
+
+/// What was found in a sequence or a scene.
+pub struct Units {
+    /// How many frames or blocks it has.
+    pub count: String,
+    pub faults: Vec<UnitFault>,
+}
+
+/// What is wrong with a sequence or a scene.
+pub struct UnitFault {
+    /// The group, frame or block; `None` if it is the file's.
+    pub unit: Option<(&'static str, u64)>,
+    pub level: Option<u8>,
+    /// The byte of the file.
+    pub offset: Option<u64>,
+    /// What is there.
+    pub part: Option<String>,
+    pub clause: Option<&'static str>,
+    /// What is wrong, and what was expected.
+    pub what: String,
+}
+
+impl UnitFault {
+    /// A fault of the file.
+    pub fn of_file(error: &Error) -> Self {
+        UnitFault {
+            unit: None,
+            level: None,
+            offset: error.offset(),
+            part: None,
+            clause: error.clause(),
+            what: error.to_string(),
+        }
+    }
+
+    fn text(&self) -> String {
+        let place = [
+            self.clause.map(|clause| format!("clause {clause}")),
+            self.unit.map(|(name, number)| format!("{name} {number}")),
+            self.level.map(|level| format!("level {level}")),
+            self.offset.map(|offset| format!("byte {offset}")),
+            self.part.clone(),
+        ];
+        let place: Vec<String> = place.into_iter().flatten().collect();
+        match place.is_empty() {
+            true => self.what.clone(),
+            false => format!("{}: {}", place.join(", "), self.what),
+        }
+    }
+
+    fn json(&self) -> Value {
+        let mut value = json!({
+            "clause": self.clause,
+            "level": self.level,
+            "offset": self.offset,
+            "chunk": self.part,
+            "what": self.what,
+        });
+        if let Some((name, number)) = self.unit {
+            value[name] = number.into();
+        }
+        value
+    }
+}
+
+impl Units {
+    fn verdict(&self) -> String {
+        match self.faults.len() {
+            0 => format!("valid, {}", self.count),
+            n => format!("not valid: {}, {}", counted(n as u64, "fault"), self.count),
+        }
+    }
+
+    fn text(&self) -> String {
+        let faults = self.faults.iter().map(|fault| format!("  {}\n", fault.text()));
+        format!("{}\n{}", self.verdict(), faults.collect::<String>())
+    }
+
+    fn json(&self, name: &str) -> Value {
+        json!({
+            "input": name,
+            "valid": self.faults.is_empty(),
+            "verdict": self.verdict(),
+            "faults": self.faults.iter().map(UnitFault::json).collect::<Vec<_>>(),
+        })
+    }
 }
 
 impl<'a> Report<'a> {
     fn of(path: &'a Path, args: &Check, model: &mut Option<Model>, limits: &Limits) -> Result<Self> {
+        let units = match (scene::is_scene(path), sequence::is_sequence(path)) {
+            (true, _) => Some(scene::check(path, limits)),
+            (_, true) => Some(sequence::check(path, limits)),
+            _ => None,
+        };
+        if let Some(units) = units {
+            let found = units.map(Found::Units);
+            return Ok(Report { path, found });
+        }
         let bytes = match load::bytes(path, limits) {
             Ok(bytes) => bytes,
             Err(failure) => {
@@ -84,18 +175,23 @@ impl<'a> Report<'a> {
             };
             decoder = decoder.with_model(model.clone());
         }
-        let found = Ok((bytes.len(), decoder.check(&bytes)));
+        let found = Ok(Found::Stream(bytes.len(), Box::new(decoder.check(&bytes))));
         Ok(Report { path, found })
     }
 
     fn is_valid(&self) -> bool {
-        self.found.as_ref().is_ok_and(|(_, checked)| checked.is_valid())
+        match &self.found {
+            Ok(Found::Stream(_, checked)) => checked.is_valid(),
+            Ok(Found::Units(units)) => units.faults.is_empty(),
+            Err(_) => false,
+        }
     }
 
     fn text(&self) -> String {
         let name = self.path.display();
         let (bytes, checked) = match &self.found {
-            Ok(found) => found,
+            Ok(Found::Stream(bytes, checked)) => (bytes, checked),
+            Ok(Found::Units(units)) => return format!("{name}: {}", units.text()),
             Err(Failure(why)) => return format!("{why}\n"),
         };
         let mut text = format!("{name}: {}\n", verdict(*bytes, checked));
@@ -118,7 +214,8 @@ impl<'a> Report<'a> {
     fn json(&self) -> Value {
         let name = self.path.display().to_string();
         let (bytes, checked) = match &self.found {
-            Ok(found) => found,
+            Ok(Found::Stream(bytes, checked)) => (bytes, checked),
+            Ok(Found::Units(units)) => return units.json(&name),
             Err(Failure(why)) => return json!({ "input": name, "valid": false, "verdict": why }),
         };
         let header = checked.header.as_ref();
@@ -219,7 +316,7 @@ fn fault_text(checked: &Checked, fault: &Fault) -> String {
     format!("{place}: {}", fault.error)
 }
 
-fn chunk_text(chunk: &ScannedChunk) -> String {
+pub fn chunk_text(chunk: &ScannedChunk) -> String {
     format!("{} chunk of level {}, slice {}", chunk.kind, chunk.level, chunk.slice)
 }
 

@@ -197,6 +197,30 @@ mod tests {
         encoder.finish()
     }
 
+    #[test]
+    fn a_range_of_32_bits_is_widened_and_one_more_is_not() {
+        // With a range of 2^48 a decision of the least probability, 2^-16, leaves 2^32.
+        let after = |range: u64, offset: u64| {
+            let mut decoder = Decoder {
+                bytes: &[1, 2, 3, 4],
+                read: 0,
+                offset,
+                range,
+                damaged: false,
+            };
+            let bit = decoder.code(false, 1);
+            (bit, decoder.range, decoder.offset, decoder.read, decoder.damaged)
+        };
+        let first = 0xffff << 32;
+        assert_eq!(after(1 << 48, first + 5), (true, 1 << 32, 5, 0, false));
+        let scale = (1 << 32) - 1;
+        let widened = (true, scale << 32, 5 << 32 | 0x0403_0201, 1, false);
+        assert_eq!(after((1 << 48) - 1, scale * 0xffff + 5), widened);
+        // The last place that is no decision's.
+        assert_eq!(after(1 << 48, (1 << 48) - 1), (true, 1 << 32, (1 << 32) - 1, 0, false));
+        assert!(after((1 << 48) + 1, 1 << 48).4);
+    }
+
     fn decode(bytes: &[u8], decisions: &[(bool, u32)]) -> Result<Vec<bool>> {
         let mut decoder = Decoder::new(bytes);
         let bits = decisions.iter().map(|&(_, one)| decoder.code(false, one));

@@ -45,7 +45,7 @@ const FIXED_HEADER: usize = 12;
 /// Chunk types from here on are ancillary: a reader skips them.
 const ANCILLARY: u8 = 128;
 /// The type of head maps; axes have 128.
-const HEAD_MAP: u8 = 129;
+pub(super) const HEAD_MAP: u8 = 129;
 
 /// The kind of a chunk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

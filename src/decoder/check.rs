@@ -54,10 +54,28 @@ impl Checked {
         self.chunks.iter().find(|chunk| (chunk.start..chunk.end).contains(&at))
     }
 
+    /// The same of a stream that starts at this byte of a file.
+    pub(crate) fn moved(mut self, start: u64) -> Self {
+        let place = |byte: u64| start + byte;
+        let here = |byte: &mut usize| *byte = byte.saturating_add(usize::try_from(start).unwrap_or(usize::MAX));
+        for Fault { offset, error, .. } in &mut self.faults {
+            *offset = offset.map(place);
+            let own = std::mem::replace(error, Error::Cancelled);
+            *error = own.moved(place);
+        }
+        self.unchecked = self.unchecked.map(|error| error.moved(place));
+        for chunk in &mut self.chunks {
+            here(&mut chunk.start);
+            here(&mut chunk.end);
+        }
+        self.notes.iter_mut().for_each(|note| here(&mut note.offset));
+        self
+    }
+
     fn fault(&mut self, level: Option<u8>, error: Error) {
         let said = error.to_string();
         if self.faults.iter().all(|fault| fault.error.to_string() != said) {
-            let offset = offset_of(&error);
+            let offset = error.offset();
             self.faults.push(Fault { level, offset, error });
         }
     }
@@ -252,17 +270,4 @@ fn note_head_map(decoding: &Decoding, level: Option<&Level>, notes: &mut Vec<Not
             text: "a head map of another form: it has no effect".into(),
         });
     }
-}
-
-/// The byte that an error names.
-fn offset_of(error: &Error) -> Option<u64> {
-    let text = match error {
-        Error::Truncated { offset, .. } | Error::ChecksumMismatch { offset, .. } => return Some(*offset),
-        Error::Malformed { at, .. } => at,
-        Error::Unsupported { detail, .. } => detail,
-        _ => return None,
-    };
-    let digits = text.strip_prefix("byte ")?;
-    let digits = digits.split(|c: char| !c.is_ascii_digit()).next()?;
-    digits.parse().ok()
 }

@@ -231,6 +231,7 @@ impl LatentDecoder {
 /// # Errors
 /// [`crate::Error::Usage`] if the stream has no such level.
 pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64> {
+    header.voxels(level)?;
     let levels = usize::from(level - header.base) + 1;
     let counts = || header.voxels[..levels].iter().copied().map(u64::from);
     let base = counts().next().unwrap_or(0);
@@ -269,7 +270,11 @@ pub(super) fn surfels(voxels: u64, per_voxel: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Placement;
+    use crate::container::{Format, Section};
+    use crate::gaussians::Heads;
     use crate::gaussians::learned;
+    use crate::latents::network::{Model, Shape, untrained};
 
     /// `214 + 2·C + 2·K`, with a comma at thousands.
     fn bytes(term: &Term) -> String {
@@ -312,5 +317,119 @@ mod tests {
         let missing = tables.iter().filter(|table| !text.contains(*table));
         let missing: Vec<_> = missing.map(String::as_str).collect();
         assert!(missing.is_empty(), "SECURITY.md should have\n\n{}", missing.join("\n"));
+    }
+
+    fn header(base: u8, voxels: &[u32], format: Format) -> Header {
+        let section = Section {
+            geometry: 50,
+            colours: 150,
+        };
+        Header {
+            optional_flags: 0,
+            bits: 12,
+            base,
+            top: base + voxels.len() as u8 - 1,
+            points: 1 << 20,
+            placement: Placement::VOXEL_GRID,
+            format,
+            slice_voxels: 8192,
+            voxels: voxels.into(),
+            sections: vec![section; voxels.len()],
+        }
+    }
+
+    #[test]
+    fn the_bound_of_version_2_is_what_its_terms_say_of_the_counts() {
+        let learning = Shape {
+            learning: true,
+            ..Shape::tiny()
+        };
+        let (mut one, mut many) = (0, 0);
+        for shape in [Shape::tiny(), Shape::tiny().with_quick_heads(), learning] {
+            let model = Model::from_bytes(&untrained(&shape, 0)).unwrap();
+            let header = header(3, &[400, 1500, 6001], Format::Learned { model: model.id() });
+            let decoder = LatentDecoder::new(&model);
+            let [c, k, b] = [shape.channels, shape.latents, shape.base_channels].map(|size| size as u64);
+            for (level, bytes, parents, voxels, sum) in [
+                (3, 200, 0, 400, 400),
+                (4, 400, 400, 1500, 1900),
+                (5, 600, 1500, 6001, 7901),
+            ] {
+                let role = usize::from(level - 3);
+                let learned = if shape.learning { 144 + 2 * k } else { 0 };
+                let mut expected = 4 * (header.bytes() as u64 + bytes) + 13 * (sum + 3 * 400);
+                expected += (214 + 2 * c + 2 * k) * parents + (230 + 10 * c + 7 * k) * voxels;
+                if b > 0 {
+                    expected += (20 + 17 * k + 4 * b + learned) * 400;
+                }
+                if shape.corrects_up_to(role) {
+                    expected += (9 + 3 * k + learned) * voxels;
+                }
+                if let Some(head) = shape.head(role, Heads::Best) {
+                    let (h, gaussians) = (head.channels as u64, head.children as u64 * voxels);
+                    let kernel = if head.children == 1 { 208 + 6 * h } else { 100 + 6 * h };
+                    expected += (40 + 2 * c + 6 * h) * voxels + (112 + kernel) * gaussians;
+                    *(if head.children == 1 { &mut one } else { &mut many }) += 1;
+                }
+                assert_eq!(
+                    decoder.memory(&header, level).unwrap(),
+                    expected,
+                    "level {level} of {shape:?}"
+                );
+            }
+            assert!(decoder.memory(&header, 6).is_err());
+        }
+        assert!(
+            one > 0 && many > 0,
+            "{one} levels with a Gaussian for a voxel, {many} with more"
+        );
+    }
+
+    #[test]
+    fn the_bound_of_version_3_is_what_its_terms_say_of_the_counts() {
+        let colour_slice = 1000;
+        let header = header(3, &[400, 1500, 6001], Format::Transform { colour_slice });
+        let contexts = LevelColours::model_bytes() as u64;
+        let kept = LevelColours::bytes_per_voxel() as u64 + 27 * 4 + 3;
+        let threads = rayon::current_num_threads() as u64;
+        let start = header.bytes() as u64;
+        // Levels 0, 1 and 2 have at most 1, 8 and 64 voxels.
+        let (all, trunk): (u64, u64) = (73, 73 * (27 * 4 + 2));
+        let always = |bytes, voxels, pair| 4 * (start + bytes) + 13 * (voxels + all) + kept * pair + 3 * contexts;
+        // The base level stands for those above it that are not there.
+        let coding =
+            |up: [u64; 3], slices: u64| trunk + kept * up[0] + contexts * slices.min(threads) + 14 * up[2] + 46 * up[1];
+        let filtering = |voxels| 28 * voxels;
+        for (level, bytes, voxels, up, slices) in [
+            (3, 200, 400, [400, 400, 400], 1),
+            (4, 400, 1900, [400, 400, 1500], 1),
+            (5, 600, 7901, [400, 1500, 6001], 2),
+        ] {
+            let most = coding(up, slices).max(filtering(up[2]));
+            let expected = always(bytes, voxels, up[1] + up[2]);
+            assert_eq!(transform(&header, level, 0).unwrap(), expected + most, "level {level}");
+            assert_eq!(transform(&header, level, most + 1).unwrap(), expected + most + 1);
+        }
+        assert!(transform(&header, 6, 0).is_err());
+        assert_eq!(surfels(1000, 3), 1000 * 64 + 3000 * 56);
+    }
+
+    #[test]
+    fn levels_above_the_base_have_no_more_voxels_than_it_nor_than_there_are_places() {
+        let of = |base: u8, count: u32| {
+            let header = header(base, &[count], Format::Transform { colour_slice: 65_536 });
+            let with = transform(&header, base, 0).unwrap();
+            let least = transform(&self::header(0, &[1], header.format), 0, 0).unwrap();
+            (with, least)
+        };
+        // 0 to 6 have 1, 8, 64, 512, 4096, 32,768 and 70,000 at most; of these the trunk of colours has 65,536.
+        let (with, least) = of(7, 70_000);
+        let kept = LevelColours::bytes_per_voxel() as u64 + 27 * 4 + 3;
+        let slices = u64::from(rayon::current_num_threads() > 1) * LevelColours::model_bytes() as u64;
+        let places = 1 + 8 + 64 + 512 + 4096 + 32_768;
+        let own =
+            13 * (70_000 + places + 70_000) + kept * 140_000 + 110 * (places + 65_536) + (kept + 14 + 46) * 70_000;
+        let one = 13 + kept * 2 + (kept + 14 + 46);
+        assert_eq!(with + one, own + least + slices);
     }
 }

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::bricks::Near;
 use super::moved::Moved;
-use super::payload::{Blocks, Head, Modes};
+use super::payload::{Blocks, Head, Modes, of_level};
 use super::previous::{Previous, PreviousLevel};
 use crate::colour::{self, Ycc};
 use crate::error::{Error, Result};
@@ -200,7 +200,8 @@ impl Inter {
                     .map(|vector| Block::new(Modes::default(), *vector, unit_level, reference_level).shift)
                     .collect();
                 let levels = [block_level, reference_level];
-                let moved = Moved::new(self.level(reference_level)?, levels, field.keys, |i| shifts[i])?;
+                let moved = Moved::new(self.level(reference_level)?, levels, field.keys, |i| shifts[i]);
+                let moved = moved.map_err(|error| of_level(error, self.base))?;
                 self.moved.get_or_init(|| moved)
             }
         };

@@ -17,6 +17,7 @@ mod previous;
 
 pub use bricks::Bricks as Places;
 pub use guides::{ColourGuide, GeometryGuide, Inter};
+pub(crate) use payload::level_of;
 pub use payload::{Blocks, Head, Modes, predicted};
 pub use previous::{Coloured, Previous, PreviousLevel};
 

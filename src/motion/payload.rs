@@ -46,8 +46,40 @@ const HEAD: usize = 10;
 /// Magnitudes from here on have an escape.
 const ESCAPE: usize = 14;
 
+/// How errors name the motion of a level, whose place in the file is not known here.
+const PLACE: &str = "motion of level ";
+
 fn malformed(clause: &'static str, field: &'static str, value: impl ToString, expected: impl ToString) -> Error {
     Error::malformed(Stage::Bitstream, "motion of the frame", field, value, expected).breaks(clause)
+}
+
+/// The same error as one of the motion of this level.
+pub(crate) fn of_level(error: Error, level: u8) -> Error {
+    match error {
+        Error::Malformed {
+            field,
+            value,
+            expected,
+            clause,
+            ..
+        } => Error::Malformed {
+            stage: Stage::Bitstream,
+            at: format!("{PLACE}{level}"),
+            field,
+            value,
+            expected,
+            clause,
+        },
+        error => error,
+    }
+}
+
+/// The level whose motion an error blames.
+pub(crate) fn level_of(error: &Error) -> Option<u8> {
+    match error {
+        Error::Malformed { at, .. } => at.strip_prefix(PLACE)?.parse().ok(),
+        _ => None,
+    }
 }
 
 fn mode_of(code: u8) -> Option<Mode> {
@@ -60,6 +92,10 @@ impl Head {
     /// # Errors
     /// [`Error::Malformed`].
     pub fn parse(bytes: &[u8], base: u8, top: u8) -> Result<(Head, &[u8])> {
+        Self::parsed(bytes, base, top).map_err(|error| of_level(error, base))
+    }
+
+    fn parsed(bytes: &[u8], base: u8, top: u8) -> Result<(Head, &[u8])> {
         let Some((head, rest)) = bytes.split_at_checked(HEAD) else {
             let value = format!("{} bytes", bytes.len());
             return Err(malformed("17.5.1", "length of the motion", value, "10 or more"));
@@ -137,23 +173,26 @@ impl Head {
         let count = keys.len();
         let mut blocks = Blocks::default();
         let mut models = Models::new();
-        for (i, part) in parts.iter().enumerate() {
-            let mut coder = Decoder::new(part);
-            let mut vectors = vec![[0; 3]; if i == 0 { count } else { 0 }];
-            let levels = if i == 0 { base - self.block_level } else { 1 };
-            if i == 0 {
-                models.code_vectors(&mut coder, self.vector, keys, &mut vectors)?;
-                for vector in &vectors {
-                    self.check(*vector)?;
+        for (level, part) in (base..).zip(parts) {
+            let mut read = || {
+                let mut coder = Decoder::new(part);
+                let levels = if level == base { base - self.block_level } else { 1 };
+                if level == base {
+                    let mut vectors = vec![[0; 3]; count];
+                    models.code_vectors(&mut coder, self.vector, keys, &mut vectors)?;
+                    for vector in &vectors {
+                        self.check(*vector)?;
+                    }
+                    blocks.vectors = vectors;
                 }
-                blocks.vectors = std::mem::take(&mut vectors);
-            }
-            for _ in 0..levels {
-                let mut modes = vec![Modes::default(); count];
-                models.code_modes(&mut coder, blocks.modes.last().map(Vec::as_slice), &mut modes)?;
-                blocks.modes.push(modes);
-            }
-            coder.finish("motion of the frame")?;
+                for _ in 0..levels {
+                    let mut modes = vec![Modes::default(); count];
+                    models.code_modes(&mut coder, blocks.modes.last().map(Vec::as_slice), &mut modes)?;
+                    blocks.modes.push(modes);
+                }
+                coder.finish(PLACE)
+            };
+            read().map_err(|error| of_level(error, level))?;
         }
         Ok(blocks)
     }

@@ -345,7 +345,7 @@ impl SceneDecoder {
                 Error::Cancelled => Error::Cancelled,
                 source => Error::Block {
                     block,
-                    source: Box::new(source),
+                    source: Box::new(source.moved(|byte| scene.blocks()[block].offset + byte)),
                 },
             })?;
             let first = cube.keys(level).start;
@@ -417,7 +417,7 @@ impl SceneDecoder {
     }
 
     /// Bytes that the Gaussians of some blocks take at most.
-    fn gaussian_bytes<S: Source>(&self, scene: &SceneReader<S>, blocks: &[usize], level: u8) -> Result<u64> {
+    pub(super) fn gaussian_bytes<S: Source>(&self, scene: &SceneReader<S>, blocks: &[usize], level: u8) -> Result<u64> {
         let mut voxels = 0;
         for &block in blocks {
             let entry = &scene.blocks()[block];

@@ -7,7 +7,7 @@ use super::source::Source;
 use crate::axes::Axes;
 use crate::container::scene::{BlockEntry, parse_index};
 use crate::container::{Header, axes};
-use crate::decoder::{Checked, Decoder};
+use crate::decoder::{Checked, Decoder, Fault};
 use crate::error::{Error, Result, Stage};
 use crate::gaussians::Frame;
 use crate::limits::Limits;
@@ -27,7 +27,8 @@ pub struct SceneReader<S> {
 /// What [`SceneReader::check`] found.
 #[derive(Debug)]
 pub struct Checks {
-    /// For every block what was found, or why it could not be read.
+    /// For every block what was found, or why it could not be read. Offsets count from the start of the scene, levels are
+    /// those of the block's own stream.
     pub blocks: Vec<Result<Checked>>,
     /// What is wrong with the scene as a whole.
     pub end: Option<Error>,
@@ -96,7 +97,9 @@ impl<S: Source> SceneReader<S> {
         let read = || {
             let bytes = self.source.read(entry.offset, entry.bytes as usize)?;
             entry.check_hash(&bytes)?;
-            entry.check_header(&Header::parse(&bytes, &Limits::unlimited())?, &self.header)?;
+            let header = Header::parse(&bytes, &Limits::unlimited());
+            let header = header.map_err(|error| error.moved(|byte| entry.offset + byte))?;
+            entry.check_header(&header, &self.header)?;
             Ok(bytes)
         };
         read().map_err(|source| Error::Block {
@@ -140,12 +143,39 @@ impl<S: Source> SceneReader<S> {
         }
     }
 
-    /// Validates every block to the last bit with `decoder`.
+    /// Validates every block to the last bit with `decoder`. Of a block whose hash is wrong, or whose header is not what
+    /// the index says, it finds out the place.
     pub fn check(&self, decoder: &Decoder) -> Checks {
-        let checked = |block| Ok(decoder.check(&self.block(block)?));
         Checks {
-            blocks: (0..self.blocks.len()).map(checked).collect(),
+            blocks: (0..self.blocks.len())
+                .map(|block| self.check_block(block, decoder))
+                .collect(),
             end: self.check_end().err(),
         }
+    }
+
+    fn check_block(&self, block: usize, decoder: &Decoder) -> Result<Checked> {
+        let entry = &self.blocks[block];
+        let check = |bytes: &[u8]| decoder.check(bytes).moved(entry.offset);
+        let error = match self.block(block) {
+            Ok(bytes) => return Ok(check(&bytes)),
+            Err(error) => error,
+        };
+        let Ok(bytes) = self.source.read(entry.offset, entry.bytes as usize) else {
+            return Err(error);
+        };
+        let mut checked = check(&bytes);
+        let error = match error {
+            Error::Block { source, .. } => *source,
+            error => error,
+        };
+        let fault = Fault {
+            level: None,
+            offset: error.offset(),
+            error,
+        };
+        checked.faults.insert(0, fault);
+        checked.valid_to = None;
+        Ok(checked)
     }
 }

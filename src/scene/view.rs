@@ -96,19 +96,7 @@ impl SceneDecoder {
         camera: &Camera,
         options: ViewOptions,
     ) -> Result<DecodedScene<Gaussians>> {
-        camera.check()?;
-        let header = scene.header();
-        let finest = self.level(header)?;
-        let order = front_to_back(scene, camera);
-        self.decoder().check_drawable(header, finest)?;
-        let levels = self.levels(scene)?;
-        let in_view = order.into_iter().filter_map(|block| {
-            let cube = scene.blocks()[block].cube;
-            let level = level_for(cube, header, camera, options, &levels);
-            let window = window(cube, level, camera)?;
-            Some(VisibleBlock { block, level, window })
-        });
-        let in_view: Vec<VisibleBlock> = in_view.collect();
+        let in_view = self.in_view(scene, camera, options)?;
         let mut work = Work {
             decoder: self,
             scene,
@@ -122,6 +110,50 @@ impl SceneDecoder {
             work.add(group)?;
         }
         work.finish()
+    }
+
+    /// Bytes of memory that what a camera sees takes at most when it is decoded: blocks that are hidden behind others,
+    /// which [`SceneDecoder::visible`] leaves out, count as if they were seen.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a level that the scene has not or a camera that makes no sense, [`Error::Unsupported`] for
+    /// heads that there are not.
+    pub fn visible_memory<S: Source>(
+        &self,
+        scene: &SceneReader<S>,
+        camera: &Camera,
+        options: ViewOptions,
+    ) -> Result<u64> {
+        let mut bytes: u64 = 0;
+        for VisibleBlock { block, level, .. } in self.in_view(scene, camera, options)? {
+            let entry = &scene.blocks()[block];
+            let voxels = u64::from(entry.header(scene.header()).voxels(level - entry.cube.level)?);
+            let drawn = self.gaussian_bytes(scene, &[block], level)?;
+            bytes = bytes.saturating_add(drawn).saturating_add(voxels * VOXEL_BYTES);
+        }
+        Ok(bytes)
+    }
+
+    /// The blocks in a camera's view, front to back.
+    fn in_view<S: Source>(
+        &self,
+        scene: &SceneReader<S>,
+        camera: &Camera,
+        options: ViewOptions,
+    ) -> Result<Vec<VisibleBlock>> {
+        camera.check()?;
+        let header = scene.header();
+        let finest = self.level(header)?;
+        let order = front_to_back(scene, camera);
+        self.decoder().check_drawable(header, finest)?;
+        let levels = self.levels(scene)?;
+        let in_view = order.into_iter().filter_map(|block| {
+            let cube = scene.blocks()[block].cube;
+            let level = level_for(cube, header, camera, options, &levels);
+            let window = window(cube, level, camera)?;
+            Some(VisibleBlock { block, level, window })
+        });
+        Ok(in_view.collect())
     }
 }
 

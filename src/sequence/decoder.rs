@@ -1,5 +1,6 @@
 //! Decodes the frames of a sequence (`docs/format.md`, clause 17.4).
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -71,11 +72,31 @@ impl SequenceDecoder {
         }
     }
 
-    /// Decodes all frames, and returns what is wrong with the sequence: with each frame, and behind the last group.
+    /// Decodes all frames, and returns what is wrong with the sequence, each fault once: with groups, with frames, and
+    /// behind the last group. Of a group whose hash is wrong it finds the chunks that are damaged.
+    /// [`SequenceReader::part_at`] tells what lies at [`Error::offset`].
     pub fn faults(&mut self, sequence: &SequenceReader) -> Vec<Error> {
-        let frames = self.frames(sequence, 0..sequence.frames());
-        let mut faults: Vec<Error> = frames.filter_map(Result::err).collect();
+        let mut faults = Vec::new();
+        for number in 0..sequence.groups() {
+            let group = match sequence.group(number) {
+                Ok(group) => group,
+                Err(error) => {
+                    let is_cut = matches!(error, Error::Truncated { .. });
+                    faults.push(error);
+                    match sequence.damaged_group(number) {
+                        Ok(group) => faults.extend(group.damaged_chunks()),
+                        Err(error) if !is_cut => faults.push(error),
+                        Err(_) => {}
+                    }
+                    continue;
+                }
+            };
+            let frames = (group.first()..).take(group.len());
+            faults.extend(frames.filter_map(|frame| self.in_group(&group, frame).err()));
+        }
         faults.extend(sequence.check_end().err());
+        let mut said = BTreeSet::new();
+        faults.retain(|fault| said.insert(fault.to_string()));
         faults
     }
 
@@ -150,7 +171,7 @@ impl SequenceDecoder {
     /// Decodes the frame at a place of the group down to `level`, given the frame before it.
     fn decoded(&self, group: &Group, at: usize, last: Option<&Last>, level: u8) -> Result<Decoding<'static>> {
         let mut decoding = self.started(group, at, last, level)?;
-        decoding.finish().map_err(|source| of_frame(group, at, source))?;
+        decoding.finish().map_err(|error| group.in_frame(at, error))?;
         Ok(decoding)
     }
 
@@ -173,7 +194,7 @@ impl SequenceDecoder {
             let decoder = self.decoder.clone().with_level(level);
             Ok(decoder.start_frame(stream, inter))
         };
-        started().map_err(|source| of_frame(group, at, source))
+        started().map_err(|error| group.in_frame(at, error))
     }
 
     /// Checks that a frame and the one before it fit the limits. Both have at most the voxels that the sequence states.
@@ -191,22 +212,12 @@ impl SequenceDecoder {
     }
 }
 
-/// An error in the frame at a place of the group.
-fn of_frame(group: &Group, at: usize, source: Error) -> Error {
-    Error::Frame {
-        frame: group.first() + at as u64,
-        source: Box::new(source),
-    }
-}
-
 /// The levels that the frames at `places` must be decoded to so that the frame behind them can be shown at level `shown`.
 fn needed(group: &Group, places: Range<usize>, shown: u8) -> Result<Vec<u8>> {
     let mut level = shown;
     let mut levels = Vec::with_capacity(places.len());
     for next in (places.start + 1..=places.end).rev() {
-        let reference = group.reference_level(next);
-        let reference = reference.map_err(|source| of_frame(group, next, source))?;
-        level = level.max(reference);
+        level = level.max(group.reference_level(next)?);
         levels.push(level);
     }
     levels.reverse();

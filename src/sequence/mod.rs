@@ -27,4 +27,4 @@ pub use decoder::{DecodedFrame, Frames, GaussianFrames, SequenceDecoder};
 pub use encoder::{KeptGroups, SequenceEncoder};
 #[cfg(feature = "encoder")]
 pub use rate_control::Rate;
-pub use reader::{Group, SequenceReader};
+pub use reader::{FramePart, Group, SequenceReader};

@@ -4,10 +4,10 @@ use std::borrow::Cow;
 
 use crate::axes::Axes;
 use crate::container::sequence::{FrameEntry, FrameKind, GroupEntry, Index, parse_table};
-use crate::container::{Header, axes};
+use crate::container::{Header, Scan, ScannedChunk, axes};
 use crate::error::{Error, Result, Stage};
 use crate::limits::Limits;
-use crate::motion::Head;
+use crate::motion::{Head, level_of};
 
 /// Header and index of a sequence. Its groups are read when they are asked for, so that one that is damaged or missing
 /// leaves the others usable.
@@ -17,6 +17,30 @@ pub struct SequenceReader<'a> {
     header: Header,
     index: Index,
     limits: Limits,
+}
+
+/// What lies at a byte of a sequence.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct FramePart {
+    /// The number of the frame.
+    pub frame: u64,
+    /// The level whose sections or motion it is.
+    pub level: u8,
+    /// Whether it is of the motion that the level is predicted with.
+    pub is_motion: bool,
+    /// The chunk, if it is of one whose checksum holds. Places in it count from the start of a stream of the frame.
+    pub chunk: Option<ScannedChunk>,
+}
+
+/// Where a level of a frame lies in the sequence.
+struct Part {
+    level: u8,
+    /// Where its motion starts.
+    start: u64,
+    /// Where its sections start.
+    sections: u64,
+    end: u64,
 }
 
 /// A group whose hash and frame table hold.
@@ -147,13 +171,31 @@ impl<'a> SequenceReader<'a> {
     pub fn group(&self, group: usize) -> Result<Group<'_>> {
         let entry = self.entry(group)?;
         let bytes = entry.take(&self.bytes)?;
-        let shifted = |error| shifted(error, entry.offset);
+        self.with_table(entry, bytes)
+    }
+
+    /// The group, whatever its hash is: what is known of it if it is damaged.
+    pub(super) fn damaged_group(&self, group: usize) -> Result<Group<'_>> {
+        let entry = self.entry(group)?;
+        self.with_table(entry, entry.unchecked(&self.bytes)?)
+    }
+
+    fn with_table<'b>(&'b self, entry: &GroupEntry, bytes: &'b [u8]) -> Result<Group<'b>> {
+        let frames = parse_table(bytes, entry, &self.header, &self.limits);
         Ok(Group {
             bytes,
-            frames: parse_table(bytes, entry, &self.header, &self.limits).map_err(shifted)?,
+            frames: frames.map_err(|error| error.moved(|byte| entry.offset + byte))?,
             common: &self.header,
             entry: *entry,
         })
+    }
+
+    /// What lies at a byte of the sequence, as far as the tables tell. `None` outside of frames.
+    pub fn part_at(&self, byte: u64) -> Option<FramePart> {
+        let is_in = |entry: &GroupEntry| (entry.offset..entry.offset + u64::from(entry.bytes)).contains(&byte);
+        let group = self.index.groups.iter().position(is_in)?;
+        let group = self.damaged_group(group).ok()?;
+        (0..group.len()).find_map(|at| group.part_at(at, byte))
     }
 
     /// The bytes of a group.
@@ -262,8 +304,84 @@ impl Group<'_> {
         let frame = &self.frames[at];
         let motion = frame.levels.first().map_or(0, |level| level.motion as usize);
         let bytes = &self.bytes[frame.offset as usize..][..motion];
-        let (head, _) = Head::parse(bytes, self.common.base, self.common.top)?;
-        Ok(head.reference_level)
+        match Head::parse(bytes, self.common.base, self.common.top) {
+            Ok((head, _)) => Ok(head.reference_level),
+            Err(error) => Err(self.in_frame(at, error)),
+        }
+    }
+
+    /// An error in the stream or in the motion of a frame, as one of the sequence.
+    pub(super) fn in_frame(&self, at: usize, error: Error) -> Error {
+        let source = match level_of(&error).and_then(|level| self.parts(at).find(|part| part.level == level)) {
+            Some(part) => in_motion(error, &part),
+            None => error.moved(|byte| self.place(at, byte)),
+        };
+        Error::Frame {
+            frame: self.entry.first + at as u64,
+            source: Box::new(source),
+        }
+    }
+
+    /// Where the bytes of each level of a frame lie in the sequence.
+    fn parts(&self, at: usize) -> impl Iterator<Item = Part> {
+        let frame = &self.frames[at];
+        let mut start = self.entry.offset + frame.offset;
+        (self.common.base..).zip(&frame.levels).map(move |(level, own)| {
+            let sections = start + u64::from(own.motion);
+            let part = Part {
+                level,
+                start,
+                sections,
+                end: sections + own.section.bytes(),
+            };
+            start = part.end;
+            part
+        })
+    }
+
+    /// Where a byte of the stream of a frame lies in the sequence. Its header stands for the frame's entry in the table,
+    /// and lies where the frame starts.
+    fn place(&self, at: usize, byte: u64) -> u64 {
+        let Some(mut left) = byte.checked_sub(self.frame_header(at).bytes() as u64) else {
+            return self.entry.offset + self.frames[at].offset;
+        };
+        let mut last = self.entry.offset;
+        for part in self.parts(at) {
+            let own = part.end - part.sections;
+            if left < own {
+                return part.sections + left;
+            }
+            left -= own;
+            last = part.end;
+        }
+        last + left
+    }
+
+    /// What lies at a byte of the sequence, if it is of this frame.
+    fn part_at(&self, at: usize, byte: u64) -> Option<FramePart> {
+        let part = self.parts(at).find(|part| (part.start..part.end).contains(&byte))?;
+        let (stream, _) = self.stream(at);
+        let scan = Scan::new(&stream, &self.frame_header(at));
+        let is_here = |chunk: &&ScannedChunk| {
+            let ends = [chunk.start, chunk.end - 1].map(|end| self.place(at, end as u64));
+            (ends[0]..=ends[1]).contains(&byte) && byte >= part.sections
+        };
+        Some(FramePart {
+            frame: self.entry.first + at as u64,
+            level: part.level,
+            is_motion: byte < part.sections,
+            chunk: scan.chunks.iter().find(is_here).copied(),
+        })
+    }
+
+    /// The chunks of all frames that are damaged.
+    pub(super) fn damaged_chunks(&self) -> Vec<Error> {
+        let damaged = |at: usize| {
+            let (stream, _) = self.stream(at);
+            let faults = Scan::new(&stream, &self.frame_header(at)).faults;
+            faults.into_iter().map(move |(_, error)| self.in_frame(at, error))
+        };
+        (0..self.len()).flat_map(damaged).collect()
     }
 
     /// The sections of a frame behind a header of its own: a stream of one frame, if the frame is whole. With the
@@ -285,48 +403,10 @@ impl Group<'_> {
     }
 }
 
-/// An error in a part of a file that starts at this byte, as one of the file.
-fn shifted(error: Error, start: u64) -> Error {
-    match error {
-        Error::Malformed {
-            stage,
-            at,
-            field,
-            value,
-            expected,
-            clause,
-        } => Error::Malformed {
-            stage,
-            at: format!("group at byte {start}, {at} of it"),
-            field,
-            value,
-            expected,
-            clause,
-        },
-        Error::Truncated {
-            stage,
-            offset,
-            field,
-            needed,
-        } => Error::Truncated {
-            stage,
-            offset: offset + start,
-            field,
-            needed,
-        },
-        Error::ChecksumMismatch {
-            what,
-            offset,
-            expected,
-            found,
-            clause,
-        } => Error::ChecksumMismatch {
-            what,
-            offset: offset + start,
-            expected,
-            found,
-            clause,
-        },
-        error => error,
+/// An error in the motion of a level, with its place.
+fn in_motion(mut error: Error, part: &Part) -> Error {
+    if let Error::Malformed { at, .. } = &mut error {
+        *at = format!("byte {}, {at}", part.start);
     }
+    error
 }

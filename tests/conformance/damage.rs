@@ -5,7 +5,7 @@
 use std::collections::BTreeSet;
 
 use b2p::decoder::Checked;
-use b2p::{Decoder, Limits};
+use b2p::{Decoder, Error, Limits, SceneReader, SequenceDecoder, SequenceReader};
 
 use crate::models::model;
 use crate::{digest_scene, digest_sequence, folder, root, scene, suite};
@@ -90,6 +90,41 @@ fn first_clause(checked: &Checked) -> Option<&'static str> {
     checked.faults.first()?.error.clause()
 }
 
+/// What is wrong with a frame has a place in the file, in that frame, unless what was decoded has another hash.
+fn faults_of_frames_are_in_them(name: &str, bytes: &[u8]) {
+    let Ok(sequence) = SequenceReader::new(bytes, &Limits::unlimited()) else {
+        return;
+    };
+    for fault in SequenceDecoder::new(Decoder::new()).faults(&sequence) {
+        let Error::Frame { frame, source } = &fault else {
+            continue;
+        };
+        if !matches!(**source, Error::DeterminismMismatch { .. }) {
+            // What is cut ends there.
+            let at = fault.offset().unwrap_or_else(|| panic!("{name}: {fault} has no place"));
+            let part = [at, at - 1].into_iter().find_map(|byte| sequence.part_at(byte));
+            assert!(
+                part.is_some_and(|part| part.frame == *frame),
+                "{name}: {fault}: {part:?}"
+            );
+        }
+    }
+}
+
+fn faults_of_blocks_are_in_them(name: &str, bytes: &[u8]) {
+    let Ok(scene) = SceneReader::new(bytes, &Limits::unlimited()) else {
+        return;
+    };
+    let checks = scene.check(&Decoder::new());
+    for (entry, checked) in scene.blocks().iter().zip(&checks.blocks) {
+        let faults = checked.iter().flat_map(|checked| &checked.faults);
+        for at in faults.filter_map(|fault| fault.offset) {
+            let own = entry.offset..=entry.offset + u64::from(entry.bytes);
+            assert!(own.contains(&at), "{name}: byte {at} in {own:?}");
+        }
+    }
+}
+
 #[test]
 fn every_damaged_stream_is_refused_for_the_clause_that_it_breaks() {
     let (damaged, clauses) = (damaged(), clauses());
@@ -116,10 +151,12 @@ fn every_damaged_stream_is_refused_for_the_clause_that_it_breaks() {
             Kind::Scene => {
                 assert_eq!(digest_scene::broken_clause(bytes), Some(&**clause), "{name}");
                 assert!(scene::is_refused(bytes), "{name}");
+                faults_of_blocks_are_in_them(name, bytes);
                 continue;
             }
             Kind::Sequence => {
                 assert_eq!(digest_sequence::broken_clause(bytes), Some(&**clause), "{name}");
+                faults_of_frames_are_in_them(name, bytes);
                 continue;
             }
         }
@@ -186,7 +223,7 @@ mod sealed {
     use super::*;
     use crate::seal::{places, seal};
     use b2p::container::with_axes;
-    use b2p::{Axes, Error, Up};
+    use b2p::{Axes, Up};
 
     /// A stream of levels 2 to 4 with a chunk of axes in front.
     fn with_ancillary() -> Vec<u8> {

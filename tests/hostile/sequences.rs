@@ -142,10 +142,11 @@ fn motion_of_a_finer_level_that_is_damaged_leaves_the_coarser_levels() {
     let sequence = SequenceReader::new(&bytes[..], &Limits::default()).expect("a sequence");
     let at_level = |level| {
         let frame = SequenceDecoder::new(Decoder::new().with_level(level)).frame(&sequence, 1);
-        frame.map(drop).map_err(|error| error.clause())
+        frame.map(drop).map_err(|error| (error.clause(), error.offset()))
     };
     assert_eq!(at_level(3), Ok(()));
-    assert_eq!(at_level(4), Err(Some("5.4.3")));
+    let (.., motion, _) = &places(&bytes)[3];
+    assert_eq!(at_level(4), Err((Some("5.4.3"), Some(motion.start))));
 }
 
 #[test]
@@ -160,6 +161,104 @@ fn a_fault_in_a_group_is_at_its_place_in_the_file() {
     }
 }
 
+/// Where the motion and the sections of each level of each frame of the first group lie in the file, and which they are.
+fn places(bytes: &[u8]) -> Vec<(u64, u8, std::ops::Range<u64>, std::ops::Range<u64>)> {
+    let (header, index, group) = parts(bytes);
+    let table = parse_table(&group, &index.groups[0], &header, &Limits::default()).expect("a table");
+    let mut places = Vec::new();
+    for (number, frame) in (0..).zip(&table) {
+        let mut at = index.groups[0].offset + frame.offset;
+        for (level, own) in (header.base..).zip(&frame.levels) {
+            let sections = at + u64::from(own.motion);
+            let end = sections + own.section.bytes();
+            places.push((number, level, at..sections, sections..end));
+            at = end;
+        }
+    }
+    places
+}
+
+fn faults(bytes: &[u8]) -> Vec<Error> {
+    let sequence = SequenceReader::new(bytes, &Limits::default()).expect("a sequence");
+    SequenceDecoder::new(Decoder::new()).faults(&sequence)
+}
+
+#[test]
+fn a_damaged_chunk_is_found_in_its_frame_and_level_though_the_hash_of_the_group_is_wrong() {
+    let bytes = sequence();
+    let sequence = SequenceReader::new(&bytes[..], &Limits::default()).expect("a sequence");
+    let group = sequence.index().groups[0];
+    assert!(faults(&bytes).is_empty());
+    for (frame, level, motion, sections) in places(&bytes) {
+        // The length and the checksum of each chunk are among its first bytes.
+        for at in sections.clone().take(12).chain(sections.clone().skip(12).step_by(7)) {
+            let mut damaged = bytes.clone();
+            damaged[at as usize] ^= 16;
+            let found = faults(&damaged);
+            assert_eq!(
+                (found[0].clause(), found[0].offset()),
+                (Some("17.2.3"), Some(group.offset))
+            );
+            let Some(Error::Frame { frame: blamed, source }) = found.get(1) else {
+                panic!("byte {at}: {found:?}");
+            };
+            // A length that is too great is noticed where the section ends.
+            let place = match (**source).offset().expect("a place") {
+                end if matches!(**source, Error::Truncated { .. }) => end - 1,
+                start => start.min(at + 1),
+            };
+            assert_eq!(*blamed, frame, "byte {at}: {found:?}");
+            assert!(sections.contains(&place), "byte {at}: {found:?}");
+            let part = sequence.part_at(place).expect("a part of a frame");
+            assert_eq!((part.frame, part.level, part.is_motion), (frame, level, false));
+            let part = sequence.part_at(at).expect("a part of a frame");
+            assert!(
+                part.chunk.is_some_and(|chunk| chunk.section == level),
+                "byte {at}: {part:?}"
+            );
+        }
+        // It has no checksum of its own.
+        for at in motion {
+            let mut damaged = bytes.clone();
+            damaged[at as usize] ^= 16;
+            assert_eq!(faults(&damaged).len(), 1, "byte {at}");
+            let part = sequence.part_at(at).expect("a part of a frame");
+            assert_eq!((part.frame, part.level, part.is_motion), (frame, level, true));
+            assert!(part.chunk.is_none());
+        }
+    }
+    let first = places(&bytes)[0].3.start;
+    assert!(
+        [0, group.offset, first - 1, bytes.len() as u64]
+            .iter()
+            .all(|at| sequence.part_at(*at).is_none())
+    );
+}
+
+#[test]
+fn a_fault_behind_right_checksums_is_at_its_place_in_the_file() {
+    let bytes = sequence();
+    let (header, index, group) = parts(&bytes);
+    let table = parse_table(&group, &index.groups[0], &header, &Limits::default()).expect("a table");
+    for (frame, level) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+        let mut frames = table.clone();
+        frames[frame].levels[level].voxels -= 1;
+        let content = &group[table[0].offset as usize..];
+        let changed = with_group(&bytes, &[&table_bytes(&frames).expect("a table"), content].concat());
+        let found = faults(&changed);
+        let Some(Error::Frame { frame: blamed, .. }) = found.first() else {
+            panic!("{found:?}");
+        };
+        assert_eq!(*blamed, frame as u64);
+        let place = found[0].offset().expect("a place");
+        let all = places(&changed);
+        let (.., sections) = &all[2 * frame + level];
+        assert!(sections.contains(&place), "{found:?} in {all:?}");
+        // The frame after it cannot be decoded, either: that is said once.
+        assert_eq!(found.len(), 1, "{found:?}");
+    }
+}
+
 #[test]
 fn vectors_out_of_range_are_refused_and_name_the_clause() {
     let bytes = sequence();
@@ -170,6 +269,10 @@ fn vectors_out_of_range_are_refused_and_name_the_clause() {
     let found = frames(&with_group(&bytes, &group)).expect("a sequence");
     let error = found[1].as_ref().expect_err("a vector out of range");
     assert_eq!(error.clause(), Some("17.5.3"), "{error}");
+    let motion = index.groups[0].offset + table[1].offset;
+    assert_eq!(error.offset(), Some(motion), "{error}");
+    assert!(error.to_string().contains("frame 1: bitstream: at byte"), "{error}");
+    assert!(error.to_string().contains("motion of level 3"), "{error}");
     assert!(found[2].is_ok());
 }
 

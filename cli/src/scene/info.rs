@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use b2p::geometry::morton;
-use b2p::{Decoder, Limits, SceneReader};
+use b2p::{Decoder, Error, Limits, SceneReader};
 use serde_json::json;
 
-use super::super::check::{named_clause, refused};
+use super::super::Result;
+use super::super::check::{UnitFault, Units, chunk_text, refused};
 use super::super::manners::{self, Said};
 use super::super::table::{count, counted, table};
-use super::super::{Failure, Result};
 
 /// Blocks that are listed, unless all are asked for.
 const LISTED: usize = 20;
@@ -78,31 +78,39 @@ pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
     Ok(Said::result(text))
 }
 
-/// Checks every block, and says which are not valid.
-pub fn check(path: &Path, limits: &Limits) -> Result<String> {
+/// Checks every block, and says what is wrong, and where.
+pub fn check(path: &Path, limits: &Limits) -> Result<Units> {
     let scene = SceneReader::new(super::source(path, limits)?, limits).map_err(refused(path))?;
     let checks = scene.check(&Decoder::new().with_limits(limits.clone()));
     let mut faults = Vec::new();
-    for (block, checked) in checks.blocks.iter().enumerate() {
+    for (block, checked) in (0u64..).zip(&checks.blocks) {
+        let unit = Some(("block", block));
         match checked {
-            Err(error) => faults.push(format!("{error}{}", named_clause(error))),
+            Err(error) => faults.push(UnitFault {
+                unit,
+                what: match error {
+                    Error::Block { source, .. } => source.to_string(),
+                    error => error.to_string(),
+                },
+                ..UnitFault::of_file(error)
+            }),
             Ok(checked) => {
-                let own = checked.faults.iter().map(|fault| &fault.error);
-                for error in own.chain(&checked.unchecked) {
-                    faults.push(format!("block {block}: {error}{}", named_clause(error)));
-                }
+                faults.extend(checked.faults.iter().map(|fault| UnitFault {
+                    unit,
+                    level: fault.level,
+                    part: checked.chunk_of(fault).map(chunk_text),
+                    ..UnitFault::of_file(&fault.error)
+                }));
+                faults.extend(checked.unchecked.iter().map(|error| UnitFault {
+                    unit,
+                    ..UnitFault::of_file(error)
+                }));
             }
         }
     }
-    let end = checks.end.iter();
-    faults.extend(end.map(|error| format!("{error}{}", named_clause(error))));
-    let name = path.display();
-    if faults.is_empty() {
-        return Ok(format!(
-            "{name}: valid, {}\n",
-            counted(scene.blocks().len() as u64, "block")
-        ));
-    }
-    let number = counted(faults.len() as u64, "fault");
-    Err(Failure(format!("{name}: {number}\n  {}", faults.join("\n  "))))
+    faults.extend(checks.end.iter().map(UnitFault::of_file));
+    Ok(Units {
+        count: counted(scene.blocks().len() as u64, "block"),
+        faults,
+    })
 }

@@ -53,6 +53,10 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     let (mut lost, mut most) = (Vec::new(), 0);
     let mut renderer = None;
     for shot in &cameras {
+        let needed = decoder.visible_memory(&scene, &shot.camera, options).map_err(&fail)?;
+        if limits.check_bytes("", needed).is_err() {
+            warn_of_memory(args, needed);
+        }
         let name = format!("decode what is seen in {}", shot.path.display());
         let seen = log.step(name, scene.blocks().len(), "blocks", || {
             decoder.visible(&scene, &shot.camera, options)
@@ -84,6 +88,17 @@ pub fn run(args: &Render, limits: &Limits, progress: &Progress) -> Result<Said> 
     let report = format!("{}\n{report}", steps(&log.steps()));
     let result = String::new();
     Ok(Said { report, result })
+}
+
+/// Says, before anything is decoded, that the limits may not suffice, and what does.
+fn warn_of_memory(args: &Render, needed: u64) {
+    let megabytes = needed.div_ceil(1 << 20);
+    manners::warn(&format!(
+        "{}: what the camera sees may take {megabytes} MiB, more than --max-memory, unless much of it is hidden; a greater \
+         --lod, {} now, takes less",
+        args.input.display(),
+        args.lod
+    ));
 }
 
 /// The part of the cube that the scene takes, by its coarsest level; the cube where cameras do not depend on it.

@@ -2,14 +2,15 @@
 
 use std::path::Path;
 
-use b2p::{Decoder, Limits, SequenceDecoder, SequenceReader};
+use b2p::sequence::FramePart;
+use b2p::{Decoder, Error, Limits, SequenceDecoder, SequenceReader};
 use serde_json::json;
 
-use super::super::check::{named_clause, refused};
+use super::super::Result;
+use super::super::check::{UnitFault, Units, chunk_text, refused};
 use super::super::load;
 use super::super::manners::{self, Said};
 use super::super::table::{count, counted, table};
-use super::super::{Failure, Result};
 
 /// Says what a sequence holds.
 pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
@@ -77,18 +78,42 @@ pub fn run(path: &Path, limits: &Limits) -> Result<Said> {
     Ok(Said::result(text))
 }
 
-/// Decodes every frame, and says which cannot be.
-pub fn check(path: &Path, limits: &Limits) -> Result<String> {
+/// Decodes every frame, and says what is wrong, and where.
+pub fn check(path: &Path, limits: &Limits) -> Result<Units> {
     let bytes = load::bytes(path, limits)?;
     let sequence = SequenceReader::new(bytes, limits).map_err(refused(path))?;
     let faults = SequenceDecoder::new(Decoder::new().with_limits(limits.clone())).faults(&sequence);
-    let name = path.display();
-    match faults.first() {
-        None => Ok(format!("{name}: valid, {}\n", counted(sequence.frames(), "frame"))),
-        Some(first) => {
-            let (count, clause) = (counted(faults.len() as u64, "fault"), named_clause(first));
-            Err(Failure(format!("{name}: {count}, the first: {first}{clause}")))
-        }
+    Ok(Units {
+        count: counted(sequence.frames(), "frame"),
+        faults: faults.iter().map(|error| placed(&sequence, error)).collect(),
+    })
+}
+
+/// A fault with what lies at its place.
+fn placed(sequence: &SequenceReader, error: &Error) -> UnitFault {
+    let of_file = UnitFault::of_file(error);
+    let Error::Frame { frame, source } = error else {
+        return of_file;
+    };
+    // What is cut is of the part before its end.
+    let before = u64::from(matches!(**source, Error::Truncated { .. }));
+    let part = of_file
+        .offset
+        .and_then(|byte| sequence.part_at(byte - before.min(byte)));
+    let text = |part: &FramePart| match &part.chunk {
+        Some(chunk) => Some(chunk_text(chunk)),
+        None => part.is_motion.then(|| format!("motion of level {}", part.level)),
+    };
+    let level = match **source {
+        Error::DeterminismMismatch { level, .. } => Some(level),
+        _ => part.map(|part| part.level),
+    };
+    UnitFault {
+        unit: Some(("frame", *frame)),
+        level,
+        part: part.as_ref().and_then(text),
+        what: source.to_string(),
+        ..of_file
     }
 }
 

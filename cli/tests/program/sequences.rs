@@ -6,7 +6,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use super::common::{Ball, names_in};
-use super::{fails, piped, plain, succeeds};
+use super::{b2p, fails, piped, plain, succeeds};
 
 /// Six frames of a ball that moves by a voxel, named as `frame_%02d.ply` from 0 on.
 fn frames() -> TempDir {
@@ -63,8 +63,37 @@ fn a_check_of_a_damaged_sequence_names_the_clause_that_it_breaks() {
     let whole = bytes(at, "a.b2p");
     for (end, clause) in [(90, "2.2.1"), (130, "17.1.1"), (whole.len() - 1, "17.2.3")] {
         std::fs::write(at.join("cut.b2p"), &whole[..end]).unwrap();
-        fails(at, &["check", "cut.b2p"], &["cut.b2p", &format!("(clause {clause})")]);
+        let output = b2p(at, &["check", "cut.b2p"]);
+        let said = String::from_utf8(output.stdout).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(
+            said.contains("cut.b2p: ") && said.contains(&format!("clause {clause}")),
+            "{said}"
+        );
     }
+    // The last byte is of the colours of the last frame's finest level.
+    let mut damaged = whole.clone();
+    let last = damaged.len() - 1;
+    damaged[last] ^= 1;
+    std::fs::write(at.join("damaged.b2p"), damaged).unwrap();
+    let output = b2p(at, &["check", "a.b2p", "damaged.b2p"]);
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("a.b2p: valid, 6 frames"), "{said}");
+    assert!(
+        said.contains("damaged.b2p: not valid: 2 faults, 6 frames\n  clause 17.2.3, byte "),
+        "{said}"
+    );
+    assert!(said.contains("  clause 3.1.1, frame 5, level "), "{said}");
+    let output = b2p(at, &["check", "damaged.b2p", "--json"]);
+    let said: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let fault = &said[0]["faults"][1];
+    assert_eq!(
+        (&said[0]["valid"], &fault["frame"], &fault["clause"]),
+        (&false.into(), &5.into(), &"3.1.1".into())
+    );
+    let place = fault["offset"].as_u64().unwrap() as usize;
+    assert!(place < last && place > last / 2 && fault["level"].is_u64(), "{said}");
 }
 
 #[test]

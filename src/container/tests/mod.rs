@@ -1,6 +1,9 @@
 mod axes;
 mod colours;
+mod feed;
+mod headers;
 mod transform;
+mod units;
 
 use super::chunk::{Chunk, ChunkKind, Form};
 use super::*;

@@ -1,6 +1,9 @@
 //! Version 3.
 
 use super::*;
+use crate::axes::{Axes, Up};
+use crate::container::axes::AXES;
+use crate::container::chunk::{Chunks, HEAD_MAP};
 use crate::container::reader::put_varint;
 
 const HASHES: [u64; 3] = [7, u64::MAX, 0x0123_4567_89ab_cdef];
@@ -295,4 +298,127 @@ proptest! {
             prop_assert!(stream.levels().len() <= 1);
         }
     }
+}
+
+#[test]
+fn the_first_head_map_of_a_level_counts() {
+    let map = |level, payload: &[u8]| chunk(HEAD_MAP, level, [0, 0], payload);
+    let bytes = [
+        chunk(200, 4, [0, 0], b"?"),
+        map(3, b"three"),
+        map(4, b"four"),
+        map(4, b"more"),
+    ]
+    .concat();
+    let found = |bytes: &[u8], level| {
+        let chunks = Chunks::new(Form::Short, bytes, 0..bytes.len());
+        chunks.head_map(level).map(|chunk| chunk.payload.to_vec())
+    };
+    assert_eq!(found(&bytes, 3), Some(b"three".to_vec()));
+    assert_eq!(found(&bytes, 4), Some(b"four".to_vec()));
+    assert_eq!(found(&bytes, 5), None);
+    // Nothing is known of what follows a damaged chunk.
+    let mut damaged = bytes;
+    damaged[0] ^= 1;
+    assert_eq!(found(&damaged, 4), None);
+}
+
+#[test]
+fn a_scan_lists_all_chunks_and_mends_damaged_ones_that_are_skipped() {
+    let [mut geometry, colours] = base();
+    let skipped = geometry.concat().len();
+    geometry.push(chunk(200, 2, [0, 0], b"skipped"));
+    let bytes = stream(only_base(), &[geometry, colours]);
+    let header = Header::parse(&bytes, &Limits::default()).unwrap();
+    let scan = Scan::new(&bytes, &header);
+    assert!(scan.faults.is_empty() && scan.bytes == bytes);
+    let first = header.bytes();
+    let chunk_at = first + skipped;
+    let kinds: Vec<u8> = scan.chunks.iter().map(|chunk| bytes[chunk.start]).collect();
+    assert_eq!(kinds, [5, 200, 6, 7, 8]);
+    assert_eq!((scan.chunks[0].start, scan.chunks[1].start), (first, chunk_at));
+    assert!(scan.chunks.windows(2).all(|pair| pair[0].end == pair[1].start));
+    assert_eq!(scan.chunks.last().map(|chunk| chunk.end), Some(bytes.len()));
+    assert!(scan.chunks.iter().all(|chunk| chunk.section == 2 && chunk.slice == 0));
+    assert_eq!(
+        scan.chunks.iter().map(|chunk| chunk.level).collect::<Vec<_>>(),
+        [2, 2, 1, 2, 2]
+    );
+    let notes: Vec<_> = scan.notes.iter().map(|note| (note.clause, note.offset)).collect();
+    assert_eq!(notes, [("1.6.2", chunk_at)]);
+    // A decoder skips it, damaged or not.
+    let mut damaged = bytes.clone();
+    let end = scan.chunks[1].end;
+    damaged[end - 1] ^= 1;
+    let scan = Scan::new(&damaged, &header);
+    assert_eq!(scan.chunks.len(), 4);
+    let [(2, error)] = &scan.faults[..] else {
+        panic!("{:?}", scan.faults)
+    };
+    assert_eq!((error.clause(), error.offset()), (Some("3.1.1"), Some(chunk_at as u64)));
+    assert!(parse(&damaged).unwrap().damage().is_some());
+    let mended = parse(&scan.bytes).unwrap();
+    assert!(mended.damage().is_none() && scan.bytes[end - 1] == damaged[end - 1]);
+    // What decoders need is not mended.
+    let mut damaged = bytes.clone();
+    damaged[bytes.len() - 1] ^= 1;
+    let scan = Scan::new(&damaged, &header);
+    assert!(scan.faults.len() == 1 && scan.bytes == damaged);
+    // Of a section that is cut the chunks that are whole are listed, and the cut is not reported here.
+    let scan = Scan::new(&bytes[..bytes.len() - 1], &header);
+    assert!(scan.faults.is_empty() && scan.chunks.len() == 4);
+    // A length that leads out of its section is a fault of the section.
+    let mut longer = bytes.clone();
+    longer[chunk_at + 4] = 100;
+    let scan = Scan::new(&longer, &header);
+    assert!(scan.faults.len() == 1 && scan.chunks.len() == 4, "{scan:?}");
+}
+
+#[test]
+fn a_scan_notes_axes_and_head_maps_that_have_no_effect() {
+    let [geometry, colours] = base();
+    let axes = Axes {
+        up: Some(Up::Z),
+        ..Axes::default()
+    };
+    let of = |payload: &[u8], points| chunk(AXES, 2, [0, points], payload);
+    let map = |level| chunk(HEAD_MAP, level, [0, 0], b"map");
+    let notes = |geometry: &[Vec<u8>], behind: &[Vec<u8>], above: &[Vec<u8>]| {
+        let sections = [[geometry, behind].concat(), [&colours[..], above].concat()];
+        let bytes = stream(only_base(), &sections);
+        let header = Header::parse(&bytes, &Limits::default()).unwrap();
+        assert!(parse(&bytes).unwrap().damage().is_none());
+        let scan = Scan::new(&bytes, &header);
+        assert!(scan.faults.is_empty());
+        let chunk_of = |at: usize| scan.chunks.iter().position(|chunk| chunk.start == at);
+        let notes = scan.notes.iter();
+        notes
+            .map(|note| (note.clause, chunk_of(note.offset).unwrap()))
+            .collect::<Vec<_>>()
+    };
+    let good = of(&axes.to_bytes(), 0);
+    // The first axes of a form that is known count, and those of the base level's geometry alone.
+    assert_eq!(notes(&geometry, std::slice::from_ref(&good), &[]), []);
+    assert_eq!(notes(&geometry, &[good.clone(), good.clone()], &[]), [("3.4.2", 2)]);
+    assert_eq!(notes(&geometry, &[of(b"?", 0), good.clone()], &[]), [("3.4.2", 1)]);
+    assert_eq!(notes(&geometry, &[], std::slice::from_ref(&good)), [("3.4.2", 4)]);
+    assert_eq!(notes(&geometry, &[of(b"", 7), good], &[]), []);
+    assert_eq!(notes(&geometry, &[of(b"", 0)], &[]), [("3.4.2", 1)]);
+    // So does the first head map of the level, among its colours.
+    assert_eq!(notes(&geometry, &[], &[map(2)]), []);
+    assert_eq!(notes(&geometry, &[], &[map(2), map(2)]), [("7.5.1", 5)]);
+    assert_eq!(notes(&geometry, &[], &[map(3), map(2)]), [("7.5.1", 4)]);
+    assert_eq!(notes(&geometry, &[map(2)], &[map(2)]), [("7.5.1", 1)]);
+}
+
+#[test]
+fn no_more_than_a_thousand_damaged_chunks_are_listed() {
+    let [mut geometry, colours] = base();
+    let good = chunk(200, 2, [0, 0], b"x");
+    let mut damaged = good.clone();
+    *damaged.last_mut().unwrap() ^= 1;
+    geometry.extend(vec![[damaged, good].concat(); 1005]);
+    let bytes = stream(only_base(), &[geometry, colours]);
+    let header = Header::parse(&bytes, &Limits::default()).unwrap();
+    assert_eq!(Scan::new(&bytes, &header).faults.len(), 1000);
 }

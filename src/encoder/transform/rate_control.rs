@@ -155,10 +155,10 @@ impl Search<'_> {
         // Refined streams are larger: of the places that are coarser, the finest that fits then.
         if self.subject.is_refined(best.0.steps) {
             let first = (at + 2).min(range.last);
-            if let Some((_, refined)) = self.finest(range, first, true, log)? {
-                if self.looks_better(&refined, &best, log)? {
-                    best = refined;
-                }
+            if let Some((_, refined)) = self.finest(range, first, true, log)?
+                && self.looks_better(&refined, &best, log)?
+            {
+                best = refined;
             }
         }
         Ok(Some(best))
