@@ -206,7 +206,7 @@ fn tuned(py: Python<'_>, tune: &str) -> PyResult<Tune> {
         "psnr" => Ok(Tune::Psnr),
         _ => Err(errors::usage(
             py,
-            &format!("tune is '{tune}', expected 'visual' or 'psnr'"),
+            format!("tune is '{tune}', expected 'visual' or 'psnr'"),
         )),
     }
 }
