@@ -4,6 +4,7 @@ import { spawn, spawnSync } from "node:child_process";
 import { mkdtempSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
+import { setTimeout } from "node:timers/promises";
 
 const NAMES = [process.env.CHROMIUM, "chromium", "chromium-browser", "google-chrome"].filter(Boolean);
 
@@ -58,8 +59,15 @@ export class Browser {
     const ended = new Promise((resolve) => this.#process.once("exit", resolve));
     this.#process.kill();
     await ended;
-    // Its other processes may write a little longer.
-    rmSync(this.#folder, { recursive: true, force: true, maxRetries: 30 });
+    // Its other processes write a little longer, and `rmSync` does not look again for files that are new. What stays is
+    // in the folder for temporary files, and no fault of the page.
+    for (let tries = 0; tries < 50; tries++) {
+      try {
+        return rmSync(this.#folder, { recursive: true, force: true });
+      } catch {
+        await setTimeout(100);
+      }
+    }
   }
 }
 
@@ -88,7 +96,7 @@ class Page {
       if (Date.now() > end) {
         throw new Error(`not ${expression}; the page says: ${await this.evaluate("document.body?.innerText")}`);
       }
-      await new Promise((resolve) => setTimeout(resolve, 50));
+      await setTimeout(50);
     }
   }
 
