@@ -243,7 +243,10 @@ fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_
     let (encoded, chosen) = found.unwrap();
     assert!(encoded.bytes.len() * 8 <= cloud.voxels.len());
     assert_eq!(encoded.bytes, stream(&cloud, &chosen));
-    let without = Options { heads: None, ..chosen };
+    let without = Options {
+        head_maps: false,
+        ..chosen
+    };
     let plain = stream(&cloud, &without);
     let parsed = Stream::parse(&encoded.bytes, &Limits::default()).unwrap();
     assert!(parsed.damage().is_none());
