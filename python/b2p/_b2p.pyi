@@ -198,11 +198,8 @@ def encode(
     geometry: str | float | None = None,
     levels: tuple[int, int] | None = None,
     effort: int | None = None,
-<<<<<<< HEAD
     tune: str | None = None,
-=======
     filter: bool = True,
->>>>>>> w37
     head_maps: bool = True,
     up: _Axis | None = None,
     unit: str | float | None = None,
