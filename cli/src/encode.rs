@@ -213,8 +213,8 @@ fn learned(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) -> R
         let what = "--step and --lossless are for --colours transform";
         return Err(Failure(what.into()));
     }
-    if args.quality.is_some() || args.effort.is_some() {
-        let what = "--quality and --effort are for --colours transform";
+    if args.quality.is_some() || args.effort.is_some() || args.tune.is_some() {
+        let what = "--quality, --effort and --tune are for --colours transform";
         return Err(Failure(what.into()));
     }
     let model = load::model(&args.model)?;

@@ -96,8 +96,9 @@ impl Encoder {
         self
     }
 
-    /// The same encoder with kernels of this instruction set. The stream does not depend on it. Default: the best of
-    /// the machine.
+    /// The same encoder with kernels of this instruction set. The stream does not depend on it, but for what is chosen
+    /// by pictures (see [`Encoder::with_heads_model`], and coarse steps of [`Encoder::encode_to_rate`]). Default: the
+    /// best of the machine.
     pub fn with_isa(mut self, isa: Isa) -> Self {
         self.options.isa = Some(isa);
         self

@@ -30,6 +30,8 @@ fn more_quality_takes_more_bytes_and_its_ends_are_coarse_and_lossless() {
     );
     let learned = ["encode", "ball.ply", "q.b2p", "--colours", "learned", "--quality", "50"];
     fails(at, &learned, &["--quality", "--colours transform"]);
+    let learned = ["encode", "ball.ply", "q.b2p", "--colours", "learned", "--tune", "psnr"];
+    fails(at, &learned, &["--tune", "--colours transform"]);
 }
 
 #[test]

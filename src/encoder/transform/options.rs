@@ -26,7 +26,7 @@ pub struct Options {
     pub filter: bool,
     /// Whether quantisation is rate–distortion optimised; otherwise coefficients are rounded to the nearest.
     pub optimised: bool,
-    /// Streams that [`encode_to_rate`] tries for a level at most, once one fits.
+    /// Streams that [`encode_to_rate`] tries for a level at most, once one fits; of [`Tune::Visual`] as many again.
     pub tries: usize,
     /// Voxels per slice of the geometry, 1 to [`MAX_SLICE_VOXELS`], the default: less lets more threads decode a level,
     /// and costs bits.
@@ -43,7 +43,8 @@ pub struct Options {
     /// Whether pictures of the heads are compared with those of surfels, so that the stream says where surfels are
     /// better.
     pub head_maps: bool,
-    /// The instructions to use; any give the same stream, but for head maps. Default: the best of this machine.
+    /// The instructions to use; any give the same stream, but for what is chosen by pictures: head maps, and which colours
+    /// [`encode_to_rate`] keeps where steps are coarse. Default: the best of this machine.
     pub isa: Option<Isa>,
 }
 

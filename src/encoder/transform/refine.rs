@@ -5,8 +5,8 @@
 //! that difference, too, where it would be seen.
 //!
 //! The blend at a point is a weighted mean of the Gaussians around it, whatever the view: on a surface, no order of
-//! compositing is more likely than another. All arithmetic is f32 without `exp`, in a fixed order, so that a stream is
-//! the same on every machine.
+//! compositing is more likely than another. All arithmetic is f32 without `exp`, in a fixed order, so that these
+//! colours are the same on every machine.
 
 use std::ops::Range;
 
