@@ -8,7 +8,7 @@ use std::sync::Mutex;
 use b2p::Decoder;
 use b2p::cloud::ColouredVoxels;
 use b2p::container::{Format, Header};
-use b2p::encoder::transform::{self, QualityTarget};
+use b2p::encoder::transform::{self, GeometryTarget, QualityTarget};
 use b2p::encoder::{Options, Residual, encode};
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
@@ -231,27 +231,32 @@ fn encoding_holds_no_more_than_is_said_of_so_many_voxels() {
     let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
     let far = |i: u64| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 1;
     let lone = cloud_of(21, (0..10_000).map(far).collect());
-    // With bits per point that they can be coded to.
+    // With levels, and bits per point that they can be coded to.
     let clouds = [
-        (Ball::new(7, 50.0).cloud(), Some(0.2)),
-        (Ball::new(9, 200.0).cloud(), Some(0.2)),
-        (lone, None),
+        (Ball::new(7, 50.0).cloud(), None, Some(0.2)),
+        (Ball::new(9, 120.0).cloud(), None, Some(0.2)),
+        (Ball::new(8, 100.0).cloud(), Some(5..=8), Some(0.4)),
+        (lone, None, None),
     ];
-    for (cloud, rate) in clouds {
+    for (cloud, levels, rate) in clouds {
         let voxels = cloud.voxels.len();
         for heads in [None, Some(heads.clone())] {
             let options = transform::Options {
                 heads,
                 tries: 2,
+                geometry: GeometryTarget::Visual,
+                levels: levels.clone(),
                 ..transform::Options::default()
             };
             let (encoded, most) = peak(|| transform::encode(&cloud, &options, &Log::default()));
             let bound = transform::encode_memory(&cloud.voxels, false);
+            println!("{voxels} voxels: {most} of {bound}");
             assert!(encoded.is_ok() && most <= bound, "{voxels} voxels: {most} of {bound}");
             // Nobody draws lone voxels with learned heads.
             let Some(rate) = rate else { break };
             let (encoded, most) = peak(|| transform::encode_to_rate(&cloud, &options, rate, &Log::default()));
             let bound = transform::encode_memory(&cloud.voxels, true);
+            println!("{voxels} voxels to a rate: {most} of {bound}");
             assert!(
                 encoded.is_ok() && most <= bound,
                 "{voxels} voxels to a rate: {most} of {bound}"

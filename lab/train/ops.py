@@ -245,7 +245,7 @@ def pool(x, first):
 
 ALPHA_MAX, ALPHA_MIN, T_MIN, NEAR = 0.99, 1.0 / 16384, 1e-4, 1e-2
 # What every splat is widened by: so much of a finest voxel squared, or of a pixel squared if that is more.
-VOXEL_BLUR, PIXEL_BLUR = 0.15, 1.0 / 16
+VOXEL_BLUR, PIXEL_BLUR = 0.15, 1.0 / 64
 
 
 def covariance(scale, rotation):

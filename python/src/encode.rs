@@ -48,8 +48,8 @@ struct Asked {
 ///     Code the mean colours of the finest level's voxels exactly.
 /// geometry : "exact", "visual" or float
 ///     Geometry of the finest level: its voxels as they are, or moved by at most one where that saves bits and looks
-///     alike; a number from 0 to 100 is the Lagrangian of that, in squared voxels per bit. Lossless streams, and the
-///     cloud's own level, keep all voxels.
+///     alike; a number from 0 to 100 is the Lagrangian of that, in squared voxels per bit. Lossless streams
+///     keep all voxels.
 /// levels : (int, int), optional
 ///     First and last level that the stream may be cut after, the last at most `bits`. Default: bits - 3 to bits - 1.
 /// effort : int, optional

@@ -134,11 +134,12 @@ impl Gaussians {
     }
 
     /// Minimum variance that the renderer adds to every projected Gaussian, in px²: 0.3, with which 3D Gaussian
-    /// Splatting is trained, or 1/16 for Gaussians with a [`blur`](Gaussians::blur). The blur closes surfaces at any
-    /// distance; another 0.3 px² would enlarge silhouettes, and more so for objects that are small in the picture.
+    /// Splatting is trained, or 1/64 for Gaussians with a [`blur`](Gaussians::blur), which closes surfaces at any
+    /// distance. More would enlarge silhouettes, and more so for objects that are small in the picture
+    /// (`docs/rendering.md`, "Blur").
     #[doc(hidden)]
     pub fn pixel_blur(&self) -> f32 {
-        if self.own_blur() > 0.0 { 1.0 / 16.0 } else { 0.3 }
+        if self.own_blur() > 0.0 { 1.0 / 64.0 } else { 0.3 }
     }
 
     /// [`Gaussians::blur`], or 0 if that is negative or not finite.

@@ -66,8 +66,8 @@ pub struct Encode {
     #[arg(long, help_heading = "Advanced")]
     pub lossless: bool,
     /// Geometry of the finest level. `exact`: its voxels as they are; `visual`: voxels may move by one where that saves
-    /// bits and looks alike; a number from 0 to 100 is the Lagrangian λ of that, in squared voxels per bit. The cloud's
-    /// own level N is always exact [default: visual; exact for the first frames of groups that are predicted]
+    /// bits and looks alike; a number from 0 to 100 is the Lagrangian λ of that, in squared voxels per bit [default:
+    /// visual; exact for the first frames of groups that are predicted]
     #[arg(long, help_heading = "Advanced", value_name = "exact|visual|X", value_parser = geometry, conflicts_with = "lossless")]
     pub geometry: Option<GeometryTarget>,
     /// How colours are coded

@@ -20,12 +20,12 @@ const STRETCHES: [Stretch; 3] = [
     Stretch {
         from: 20,
         above: 1,
-        steps: [64.0, 2.5],
+        steps: [64.0, 10.0],
     },
     Stretch {
-        from: 70,
+        from: 50,
         above: 0,
-        steps: [23.0, 1.0],
+        steps: [64.0, 1.0],
     },
 ];
 

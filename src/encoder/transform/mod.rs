@@ -53,7 +53,12 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
     let mut subject = EncoderInput::new(cloud, levels, options, log)?;
     let top = *subject.levels.end();
-    let shape = subject.shape(top, options.geometry.lambda(steps), log)?;
+    let lambda = options.geometry.lambda(steps, top == cloud.voxels.depth());
+    let shape = subject.shape(top, lambda, log)?;
+    if shape.is_some() {
+        // A shape has a map of its own.
+        subject.maps.truncate(top.into());
+    }
     let coded = subject.code(top, steps, shape, log)?;
     // They are needed no more, and are the largest part.
     subject.maps = Vec::new();
@@ -178,7 +183,11 @@ impl<'a> EncoderInput<'a> {
             bits: self.cloud.voxels.depth(),
             base: *levels.start(),
             top,
-            points: self.points,
+            // At level N the points are its voxels, of which a shape may have others than the cloud.
+            points: match top == self.cloud.voxels.depth() {
+                true => voxels(top) as u64,
+                false => self.points,
+            },
             placement: self.cloud.placement,
             format: Format::Transform {
                 colour_slice: self.options.colour_slice,
@@ -241,9 +250,10 @@ impl<'a> EncoderInput<'a> {
         log: &Log,
     ) -> Result<Coded> {
         let (octree, isa) = (self.octree(shape.as_deref()), self.isa);
-        let map_of = |level: u8| match &shape {
-            Some(shape) if level == top => &shape.map,
-            _ => &self.maps[usize::from(level)],
+        let finest_map = self.finest_map(top, shape.as_deref());
+        let map_of = |level: u8| match level == top {
+            true => finest_map.as_ref(),
+            false => &self.maps[usize::from(level)],
         };
         let slice = self.options.colour_slice as usize;
         let base = *self.levels.start().min(&top);

@@ -22,12 +22,11 @@ const COARSEST: u8 = 116;
 /// The same where geometry is lossy, and leaves more bits to colours: a step of luma of 54.
 const COARSEST_OF_LOSSY: u8 = 108;
 
-/// The same of the level of the cloud's own voxels, whose geometry takes most: a step of luma of 27. In coarser steps
-/// the level above makes better pictures of the same bits.
-const COARSEST_OF_ALL: u8 = 92;
-
 /// Up to this step of luma, refined streams look better at equal sizes.
 const SURE: f32 = 32.0;
+
+/// Shapes that are kept: places next to each other mostly have the same.
+const SHAPES: usize = 2;
 
 /// The place that is tried first: a step of luma of 11.
 const FIRST: u8 = 72;
@@ -114,7 +113,7 @@ struct Search<'a> {
     room: f64,
     /// Of the smallest stream so far.
     least: f64,
-    /// Shapes by level and λ.
+    /// The last [`SHAPES`] shapes, by level and λ.
     shapes: Vec<(u8, u32, Option<Arc<Shape>>)>,
     /// The lossy colours of the level at hand, by its λ, too.
     truth: Option<(u8, u32, Truth)>,
@@ -122,11 +121,10 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// The coarsest place of the level `top`; `only` tells that no coarser level could take its place.
-    fn last(&self, top: u8, only: bool) -> u8 {
+    /// The coarsest place of a level; `only` tells that no coarser level could take its place.
+    fn last(&self, only: bool) -> u8 {
         match self.subject.options.geometry {
             _ if only => 2 * MAX_CHROMA,
-            _ if top == self.subject.cloud.voxels.depth() => COARSEST_OF_ALL,
             GeometryTarget::Exact => COARSEST,
             _ => COARSEST_OF_LOSSY,
         }
@@ -136,7 +134,7 @@ impl Search<'_> {
     fn level(&mut self, top: u8, only: bool, fixed: f64, log: &Log) -> Result<Option<(Place, Coded)>> {
         let range = LevelRange {
             top,
-            last: self.last(top, only),
+            last: self.last(only),
             fixed,
         };
         let Some((at, mut best)) = self.finest(range, FIRST, false, log)? else {
@@ -218,19 +216,23 @@ impl Search<'_> {
 
     /// The shape of a stream with the last level `top` and these steps.
     fn shape(&mut self, top: u8, steps: Steps, log: &Log) -> Result<Option<Arc<Shape>>> {
-        let lambda = self.subject.options.geometry.lambda(steps);
+        let own = top == self.subject.cloud.voxels.depth();
+        let lambda = self.subject.options.geometry.lambda(steps, own);
         let known = self.shapes.iter().find(|known| (known.0, known.1) == (top, lambda));
         if let Some((_, _, shape)) = known {
             return Ok(shape.clone());
         }
         let shape = self.subject.shape(top, lambda, log)?;
+        if self.shapes.len() == SHAPES {
+            self.shapes.remove(0);
+        }
         self.shapes.push((top, lambda, shape.clone()));
         Ok(shape)
     }
 
     /// Bytes of the geometry of a stream with the last level `top`, at the coarsest place.
     fn least_geometry(&mut self, top: u8, only: bool, log: &Log) -> Result<f64> {
-        let shape = self.shape(top, steps_at(self.last(top, only)), log)?;
+        let shape = self.shape(top, steps_at(self.last(only)), log)?;
         Ok(self.subject.geometry_bytes(top, shape.as_deref()) as f64)
     }
 

@@ -108,12 +108,9 @@ impl EncoderInput<'_> {
     pub(super) fn moves(&self, coded: &Coded) -> Result<Moves> {
         let top = coded.top;
         let voxels = self.octree(coded.shape.as_deref()).level(top);
-        let map = match &coded.shape {
-            Some(shape) => &shape.map,
-            None => &self.maps[usize::from(top)],
-        };
         let gaussians = self.drawn(coded)?;
-        let surface = Surface::new(self.cloud, voxels, map, &gaussians);
+        let map = self.finest_map(top, coded.shape.as_deref());
+        let surface = Surface::new(self.cloud, voxels, &map, &gaussians);
         drop(gaussians);
         let mut by = surface.moves();
         if self.grey {

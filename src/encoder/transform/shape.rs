@@ -1,5 +1,6 @@
 //! The geometry of a stream: exact, or at its finest level as it looks alike for fewer bits.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -10,8 +11,7 @@ use crate::error::Result;
 use crate::geometry::{KernelMap, Octree, codec};
 use crate::log::Log;
 
-/// How exactly the finest level's voxels are coded. Only a level above the cloud's own is optimised, and only of streams
-/// with lossy colours.
+/// How exactly the finest level's voxels are coded, in streams with lossy colours.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum GeometryTarget {
@@ -29,15 +29,24 @@ const LAMBDA: f32 = 4.2e-5;
 /// The greatest λ that follows from a step. Greater ones roughen smooth surfaces: at 0.25 a statue lost 13 SSIMULACRA2.
 const MOST_LAMBDA: f32 = 0.125;
 
+/// λ of the cloud's own level in steps of one 255th, and the greatest. Much of what is coded there is noise of rounding,
+/// without which pictures are better (`docs/measurements.md`, "Lossy geometry").
+const OWN_LAMBDA: f32 = 1.0 / 80.0;
+const MOST_OWN_LAMBDA: f32 = 0.5;
+
 impl GeometryTarget {
-    /// λ in units of 1/256.
-    pub(super) fn lambda(self, steps: Steps) -> u32 {
+    /// λ in units of 1/256, of the cloud's `own` level or one above it.
+    pub(super) fn lambda(self, steps: Steps, own: bool) -> u32 {
+        let step = steps.luma_step();
         let lambda = match self {
             _ if steps.is_lossless() => 0.0,
             GeometryTarget::Exact => 0.0,
             // Of quarter octaves, so that streams with the same step of luma share an octree.
             GeometryTarget::Visual => {
-                let lambda = (LAMBDA * steps.luma_step().powi(2)).min(MOST_LAMBDA);
+                let lambda = match own {
+                    true => (OWN_LAMBDA * step).min(MOST_OWN_LAMBDA),
+                    false => (LAMBDA * step.powi(2)).min(MOST_LAMBDA),
+                };
                 ((4.0 * lambda.log2()).round() / 4.0).exp2()
             }
             GeometryTarget::Lambda(lambda) => lambda.clamp(0.0, 100.0),
@@ -51,17 +60,15 @@ pub(super) struct Shape {
     /// λ, in units of 1/256.
     lambda: u32,
     pub octree: Octree,
-    /// The 3³ kernel map of the finest level.
-    pub map: KernelMap,
     /// The code of the finest level.
     pub geometry: Vec<(u32, Vec<u8>)>,
 }
 
 impl EncoderInput<'_> {
-    /// The octree whose level `top` is optimised with this λ, in units of 1/256; `None` for λ = 0, for the
-    /// cloud's own level, and where the level belongs to the colour trunk.
+    /// The octree whose level `top` is optimised with this λ, in units of 1/256; `None` for λ = 0, and where the level
+    /// belongs to the colour trunk.
     pub(super) fn shape(&self, top: u8, lambda: u32, log: &Log) -> Result<Option<Arc<Shape>>> {
-        if lambda == 0 || top == self.cloud.voxels.depth() || top <= self.trunk_depth(top) {
+        if lambda == 0 || top <= self.trunk_depth(top) {
             return Ok(None);
         }
         let count = self.octree.level(top).len();
@@ -76,20 +83,32 @@ impl EncoderInput<'_> {
             let (masks, geometry) = codec::optimise_level(self.isa, &self.octree, above, top, slice, distortion);
             let mut octree = self.octree.truncated(top - 1);
             octree.grow(masks)?;
-            let map = octree.child_map(top - 1, above);
             Ok(Some(Arc::new(Shape {
                 lambda,
                 octree,
-                map,
                 geometry,
             })))
         })
     }
 
-    /// For each voxel of a level above the cloud's own, which of its children hold points.
+    /// The 3³ kernel map of the level `top` of streams of this shape.
+    pub(super) fn finest_map(&self, top: u8, shape: Option<&Shape>) -> Cow<'_, KernelMap> {
+        match shape {
+            // Several shapes are kept while a rate is looked for, and maps are by far the largest part of them.
+            Some(shape) => Cow::Owned(shape.octree.child_map(top - 1, &self.maps[usize::from(top) - 1])),
+            None => Cow::Borrowed(&self.maps[usize::from(top)]),
+        }
+    }
+
+    /// For each voxel of a level, which of its children hold points; nothing is known about those of the cloud's own level,
+    /// where any may.
     fn points(&self, level: u8) -> Vec<u8> {
         let voxels = &self.cloud.voxels;
-        let shift = 3 * (self.cloud.voxels.depth() - level);
+        let deeper = self.cloud.voxels.depth() - level;
+        if deeper == 0 {
+            return vec![u8::MAX; self.octree.level(level).len()];
+        }
+        let shift = 3 * deeper;
         let mask = |key: &u64| {
             let inside = voxels.keys()[voxels.within(*key, shift)].iter();
             inside.fold(0, |mask, k| mask | 1 << (k >> (shift - 3) & 7))

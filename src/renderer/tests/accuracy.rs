@@ -48,6 +48,23 @@ fn an_object_with_a_blur_of_its_own_is_as_large_from_a_distance_as_from_close_up
 }
 
 #[test]
+fn an_object_of_splats_below_a_pixel_is_nearly_as_large_from_a_distance_as_from_close_up() {
+    let black = surface_splats(40_000, 0.8, 0.006).into_iter().map(|splat| Splat {
+        colour: [0.0; 3],
+        ..splat
+    });
+    let mut scene = scene(black.collect::<Vec<_>>());
+    scene.blur = 1e-6;
+    let ink = |side: u32| {
+        let image = draw(&scene, &orbit(side, side));
+        let all = image.pixels.iter().map(|p| f64::from(1.0 - p[0])).sum::<f64>();
+        all / f64::from(side * side)
+    };
+    let (near, far) = (ink(512), ink(64));
+    assert!((far / near - 1.0).abs() < 0.03, "{near} {far}");
+}
+
+#[test]
 fn with_hardly_any_cut_off_only_rounding_is_left() {
     let mut worst = 0.0f32;
     for seed in 0..6 {
