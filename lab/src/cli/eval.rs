@@ -23,7 +23,7 @@ use crate::surface::Surface;
 ///
 /// Every item is drawn from twelve cameras and compared with the mesh: PSNR over whole pictures and over the
 /// foreground, MS-SSIM, SSIMULACRA2. Point clouds are drawn as squares (the best of three sizes), as one round Gaussian
-/// a point (of four) and as surfels (of five). With a cloud and a model but no stream among the items, the cloud is
+/// a point (of four), and as wide and slim surfels (of eight). With a cloud and a model but no stream among the items, the cloud is
 /// coded first.
 #[derive(Debug, clap::Args)]
 pub struct Args {

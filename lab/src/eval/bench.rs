@@ -16,7 +16,7 @@ use super::points::Points;
 use super::protocol::{Judged, Truth, VIEWS};
 use super::reframe::into_frame;
 use super::report::{LevelRate, Rate, Row};
-use super::surfels::Surfels;
+use super::surfels::{SLIM_BLUR, Surfels, WIDE_BLUR};
 use crate::error::{LabError, Result};
 use crate::surface::Surface;
 
@@ -147,17 +147,24 @@ impl Bench {
                 let draw = |sigma| self.gaussians(points.to_gaussians(self.frame, sigma));
                 let (sigma, round) = best(SIGMAS, draw)?;
                 let flat = Surfels::new(&points);
-                let draw = |width| self.gaussians(flat.to_gaussians(self.frame, width));
-                let (width, surfels) = best(WIDTHS, draw)?;
-                let [squares_are, round_are, surfels_are] = [
+                let with = |blur| {
+                    best(WIDTHS, |width| {
+                        self.gaussians(flat.to_gaussians(self.frame, width, blur))
+                    })
+                };
+                let (width, surfels) = with(WIDE_BLUR)?;
+                let (slim_width, slim) = with(SLIM_BLUR)?;
+                let [squares_are, round_are, surfels_are, slim_are] = [
                     format!("squares x{side}"),
                     format!("global Gaussian x{sigma}"),
                     format!("surfels x{width}"),
+                    format!("slim surfels x{slim_width}"),
                 ];
                 Ok(vec![
                     entry(&squares_are, count, None, rate.clone(), squares),
                     entry(&round_are, count, None, rate.clone(), round),
-                    entry(&surfels_are, count, None, rate, surfels),
+                    entry(&surfels_are, count, None, rate.clone(), surfels),
+                    entry(&slim_are, count, None, rate, slim),
                 ])
             }
             Content::Gaussians(gaussians) => {
@@ -298,13 +305,14 @@ mod tests {
     }
 
     #[test]
-    fn a_cloud_is_drawn_in_three_ways_and_keeps_the_rate_it_was_given() {
+    fn a_cloud_is_drawn_in_four_ways_and_keeps_the_rate_it_was_given() {
         let bench = bench();
         let cloud = bench.finest.clone().unwrap();
         let entries = bench.judge("cloud", Content::Cloud(cloud), Some(0.5)).unwrap();
         assert!(entries[0].row.drawn.starts_with("squares x"));
         assert!(entries[1].row.drawn.starts_with("global Gaussian x"));
         assert!(entries[2].row.drawn.starts_with("surfels x"));
+        assert!(entries[3].row.drawn.starts_with("slim surfels x"));
         for entry in &entries {
             assert_eq!(entry.row.rate.as_ref().unwrap().total, 0.5);
         }

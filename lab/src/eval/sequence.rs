@@ -21,7 +21,7 @@ use super::picture::Picture;
 use super::points::Points;
 use super::protocol::TrueView;
 use super::reframe::into_frame;
-use super::surfels::Surfels;
+use super::surfels::{Surfels, WIDE_BLUR};
 use crate::error::{LabError, Result};
 use crate::motion::{Motion, Sequence};
 
@@ -83,7 +83,7 @@ impl Coded {
             Content::Gaussians(gaussians) => (gaussians, None),
             Content::Cloud(cloud) => {
                 let points = Points::on_grid(&cloud, frame.bits, None);
-                (Surfels::new(&points).to_gaussians(frame, WIDTH), None)
+                (Surfels::new(&points).to_gaussians(frame, WIDTH, WIDE_BLUR), None)
             }
         };
         let gaussians = into_frame(gaussians, frame);

@@ -15,8 +15,10 @@ use super::points::Points;
 pub const NEIGHBOURS: usize = 40;
 /// The standard deviation along the normal, as a multiple of the points' spacing.
 const THICKNESS: f64 = 0.05;
-/// The variance that pictures widen surfels by, in finest voxels squared: that of Gaussians which streams decode to.
-const BLUR: f64 = 0.15;
+/// Variances that pictures widen surfels by, in finest voxels squared: one that closes rough surfaces, and that of the
+/// surfels which streams decode to.
+pub const WIDE_BLUR: f64 = 0.15;
+pub const SLIM_BLUR: f64 = 0.003;
 /// Sweeps of Jacobi's method. It converges quadratically: a few reach the precision of doubles.
 const SWEEPS: usize = 8;
 
@@ -57,7 +59,8 @@ impl<'a> Surfels<'a> {
     }
 
     /// One opaque Gaussian a point, whose standard deviation in its plane is the `factor`-fold spacing of the points.
-    pub fn to_gaussians(&self, frame: Frame, factor: f64) -> Gaussians {
+    /// Pictures widen it by `blur`, in finest voxels squared.
+    pub fn to_gaussians(&self, frame: Frame, factor: f64, blur: f64) -> Gaussians {
         let Points { colours, spacing, .. } = self.points;
         let wide = (factor * spacing) as f32;
         let voxel = 2.0 / f64::from(1u32 << frame.bits);
@@ -67,7 +70,7 @@ impl<'a> Surfels<'a> {
             scale: vec![[wide, wide, (THICKNESS * spacing) as f32]; count],
             rotation: self.planes.iter().map(|p| p.rotation).collect(),
             opacity: vec![1.0; count],
-            blur: (BLUR * voxel * voxel) as f32,
+            blur: (blur * voxel * voxel) as f32,
             colour: colours.iter().map(|c| c.map(|v| f32::from(v) / 255.0)).collect(),
             frame,
             ..Gaussians::default()
@@ -190,7 +193,7 @@ mod tests {
     fn surfels_are_as_wide_as_asked_for_opaque_and_coloured_as_their_points() {
         let points = voxels_of_a_plane(DVec3::Z);
         let frame = Frame::default();
-        let gaussians = Surfels::new(&points).to_gaussians(frame, 0.5);
+        let gaussians = Surfels::new(&points).to_gaussians(frame, 0.5, WIDE_BLUR);
         assert_eq!(gaussians.len(), points.positions.len());
         assert_eq!(gaussians.scale[9], [1.0 / 64.0, 1.0 / 64.0, 0.05 / 32.0]);
         assert_eq!(gaussians.opacity[9], 1.0);
@@ -204,7 +207,7 @@ mod tests {
             colours: vec![[0; 3]],
             spacing: 0.1,
         };
-        let gaussians = Surfels::new(&points).to_gaussians(Frame::default(), 0.42);
+        let gaussians = Surfels::new(&points).to_gaussians(Frame::default(), 0.42, WIDE_BLUR);
         assert_eq!(gaussians.position, [[0.25, 0.5, -1.0]]);
     }
 }

@@ -26,8 +26,8 @@ const FIELD: f64 = 45.0;
 const SIDE: u32 = 1024;
 /// Sizes of surfels to choose from, in 64ths of the usual radius.
 const SIZES: [u8; 3] = [54, 64, 74];
-/// Size of the cloud's own surfels: between 0.85 and 1, which chose about alike.
-const REFERENCE: f32 = 0.92;
+/// Size of the cloud's own surfels, which closes them where a voxel is less than a pixel.
+const REFERENCE: f32 = 1.12;
 /// Factor of the surfels that decide which block a pixel belongs to, so that some lie beside the silhouette.
 const WIDER: f32 = 1.3;
 /// With more children than this for each voxel above, a cloud is not sparse.
