@@ -78,7 +78,7 @@ def main():
             cloud, stream = folder / "cloud.ply", folder / "cloud.b2p"
             capture = ["procedural:scene", "-o", cloud, "--kind", kind, "--points", str(POINTS), "--seed", "1"]
             subprocess.run([lab, "capture", *capture], check=True)
-            said = subprocess.run([b2p, "-f", "encode", cloud, stream, "--quality", "70"], check=True, capture_output=True)
+            said = subprocess.run([b2p, "-f", "encode", cloud, stream, "--quality", "62"], check=True, capture_output=True)
             print(kind, said.stderr.decode().strip().splitlines()[-1])
             info = subprocess.run([b2p, "info", stream, "--json"], check=True, capture_output=True)
             as_points(points(cloud), json.loads(info.stdout), folder / "points.ply")

@@ -489,6 +489,26 @@ fn optimised_geometry_is_the_same_for_any_number_of_threads() {
 }
 
 #[test]
+fn the_own_level_of_a_dense_cloud_may_move_and_that_of_a_sparse_one_stays() {
+    for (cloud, stays) in [(Ball::new(6, 25.0).cloud(), false), (sparse_wall(), true)] {
+        let depth = cloud.voxels.depth();
+        let with = |geometry| {
+            let options = Options {
+                levels: Some(depth - 2..=depth),
+                fineness: QualityTarget::Step(40.0),
+                geometry,
+                ..Options::default()
+            };
+            stream(&cloud, &options)
+        };
+        let [exact, visual] = [GeometryTarget::Exact, GeometryTarget::Visual].map(with);
+        assert_eq!(visual.len() == exact.len(), stays, "{depth}");
+        let (voxels, _) = points(&visual, Some(depth)).unwrap();
+        assert_eq!(voxels == cloud.voxels.keys(), stays, "{depth}");
+    }
+}
+
+#[test]
 fn optimised_geometry_keeps_to_a_rate() {
     let cloud = Ball::new(7, 50.0).cloud();
     let options = Options {

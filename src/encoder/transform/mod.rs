@@ -53,8 +53,7 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     let levels = choose_levels(cloud.voxels.depth(), options.levels.clone())?;
     let mut subject = EncoderInput::new(cloud, levels, options, log)?;
     let top = *subject.levels.end();
-    let lambda = options.geometry.lambda(steps, top == cloud.voxels.depth());
-    let shape = subject.shape(top, lambda, log)?;
+    let shape = subject.shape(top, subject.lambda(top, steps), log)?;
     if shape.is_some() {
         // A shape has a map of its own.
         subject.maps.truncate(top.into());
@@ -129,6 +128,7 @@ struct Layer {
 impl<'a> EncoderInput<'a> {
     fn new(cloud: &'a ColouredVoxels, levels: RangeInclusive<u8>, options: &'a Options, log: &Log) -> Result<Self> {
         let (isa, top) = (options.isa.unwrap_or_else(Isa::detect), *levels.end());
+        let may_move = options.geometry == GeometryTarget::Visual && top == cloud.voxels.depth();
         let subject = EncoderInput {
             cloud,
             options,
@@ -137,7 +137,7 @@ impl<'a> EncoderInput<'a> {
             octree: Octree::root(),
             maps: Vec::new(),
             geometry: Vec::new(),
-            sparse: options.has_head_maps() && head_maps::is_sparse(cloud)?,
+            sparse: (may_move || options.has_head_maps()) && head_maps::is_sparse(cloud)?,
             grey: cloud.colours.par_iter().all(|[r, g, b]| r == g && g == b),
             points: cloud.voxels.len() as u64,
             guides: None,

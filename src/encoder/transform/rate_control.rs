@@ -216,8 +216,7 @@ impl Search<'_> {
 
     /// The shape of a stream with the last level `top` and these steps.
     fn shape(&mut self, top: u8, steps: Steps, log: &Log) -> Result<Option<Arc<Shape>>> {
-        let own = top == self.subject.cloud.voxels.depth();
-        let lambda = self.subject.options.geometry.lambda(steps, own);
+        let lambda = self.subject.lambda(top, steps);
         let known = self.shapes.iter().find(|known| (known.0, known.1) == (top, lambda));
         if let Some((_, _, shape)) = known {
             return Ok(shape.clone());

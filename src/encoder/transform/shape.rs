@@ -36,7 +36,7 @@ const MOST_OWN_LAMBDA: f32 = 0.5;
 
 impl GeometryTarget {
     /// λ in units of 1/256, of the cloud's `own` level or one above it.
-    pub(super) fn lambda(self, steps: Steps, own: bool) -> u32 {
+    fn lambda(self, steps: Steps, own: bool) -> u32 {
         let step = steps.luma_step();
         let lambda = match self {
             _ if steps.is_lossless() => 0.0,
@@ -65,6 +65,16 @@ pub(super) struct Shape {
 }
 
 impl EncoderInput<'_> {
+    /// λ of streams with the last level `top` and these steps, in units of 1/256. A sparse cloud keeps its own voxels: few
+    /// of them have the neighbours that tell noise from shape, and heads take what is left for a closed surface.
+    pub(super) fn lambda(&self, top: u8, steps: Steps) -> u32 {
+        let own = top == self.cloud.voxels.depth();
+        match self.options.geometry {
+            GeometryTarget::Visual if own && self.sparse => 0,
+            geometry => geometry.lambda(steps, own),
+        }
+    }
+
     /// The octree whose level `top` is optimised with this λ, in units of 1/256; `None` for λ = 0, and where the level
     /// belongs to the colour trunk.
     pub(super) fn shape(&self, top: u8, lambda: u32, log: &Log) -> Result<Option<Arc<Shape>>> {
