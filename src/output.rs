@@ -57,12 +57,15 @@ pub fn replaced(path: &Path) -> Option<PathBuf> {
     }
 }
 
-/// Removes the temporary files of all writes in progress; for a handler that ends the process.
+/// Removes the temporary files of all writes in progress; for a handler that ends the process. No other is begun after it:
+/// threads that try wait for the end.
 pub fn remove_unfinished() {
-    for path in lock().iter() {
+    let unfinished = lock();
+    for path in unfinished.iter() {
         // The process is ending: there is nobody left to tell.
         let _ = std::fs::remove_file(path);
     }
+    std::mem::forget(unfinished);
 }
 
 fn write_all(
