@@ -15,9 +15,9 @@ use super::points::Points;
 pub const NEIGHBOURS: usize = 40;
 /// The standard deviation along the normal, as a multiple of the points' spacing.
 const THICKNESS: f64 = 0.05;
-/// Variances that pictures widen surfels by, in finest voxels squared: one that closes rough surfaces, and that of the
-/// surfels which streams decode to.
+/// Variance that pictures widen surfels by, in finest voxels squared, so that rough surfaces close.
 pub const WIDE_BLUR: f64 = 0.15;
+/// The same of slim surfels: that of the surfels which streams decode to.
 pub const SLIM_BLUR: f64 = 0.003;
 /// Sweeps of Jacobi's method. It converges quadratically: a few reach the precision of doubles.
 const SWEEPS: usize = 8;
