@@ -33,17 +33,19 @@ fn gaussians_with_a_blur_of_their_own_close_gaps_from_close_up_and_stay_slim_fro
     assert!(ink(&draw(&scene, &far)) < 0.95 * ink(&before_far));
 }
 
+/// What a pixel of a picture so many wide and high lacks of white, on average.
+fn ink(scene: &Gaussians, side: u32) -> f64 {
+    let image = draw(scene, &orbit(side, side));
+    let all = image.pixels.iter().map(|p| f64::from(1.0 - p[0])).sum::<f64>();
+    all / f64::from(side * side)
+}
+
 #[test]
 fn an_object_with_a_blur_of_its_own_is_as_large_from_a_distance_as_from_close_up() {
     let mut scene = scene(surface_splats(40_000, 0.8, 1e-3));
     // From a distance a fifteenth of a pixel squared.
     scene.blur = 1e-4;
-    let ink = |side: u32| {
-        let image = draw(&scene, &orbit(side, side));
-        let all = image.pixels.iter().map(|p| f64::from(1.0 - p[0])).sum::<f64>();
-        all / f64::from(side * side)
-    };
-    let (near, far) = (ink(512), ink(64));
+    let [near, far] = [512, 64].map(|side| ink(&scene, side));
     assert!((far / near - 1.0).abs() < 0.02, "{near} {far}");
 }
 
@@ -55,12 +57,7 @@ fn an_object_of_splats_below_a_pixel_is_nearly_as_large_from_a_distance_as_from_
     });
     let mut scene = scene(black.collect::<Vec<_>>());
     scene.blur = 1e-6;
-    let ink = |side: u32| {
-        let image = draw(&scene, &orbit(side, side));
-        let all = image.pixels.iter().map(|p| f64::from(1.0 - p[0])).sum::<f64>();
-        all / f64::from(side * side)
-    };
-    let (near, far) = (ink(512), ink(64));
+    let [near, far] = [512, 64].map(|side| ink(&scene, side));
     assert!((far / near - 1.0).abs() < 0.03, "{near} {far}");
 }
 
