@@ -803,7 +803,7 @@ Tensor pool_grad(const Tensor& dy, const Tensor& first, int64_t rows) {
 
 constexpr float ALPHA_MAX = 0.99f, ALPHA_MIN = 1.f / 16384, T_MIN = 1e-4f, NEAR = 1e-2f;
 // What every splat is widened by: so much of a finest voxel squared, or of a pixel squared if that is more.
-constexpr float VOXEL_BLUR = 0.15f, PIXEL_BLUR = 1.f / 16;
+constexpr float VOXEL_BLUR = 0.15f, PIXEL_BLUR = 1.f / 64;
 constexpr int TILE = 16;
 
 struct View {

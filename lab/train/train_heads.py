@@ -54,8 +54,8 @@ class Stream:
         rng = np.random.default_rng((self.args.seed, epoch, at))
         sample = self.sample(self.files[order[at]])
         role = int(rng.choice(self.roles, p=np.array(self.shares) / sum(self.shares)))
-        if len(sample.tree.coords[role]) > self.args.most_voxels:
-            role = min(self.roles)
+        while len(sample.tree.coords[role]) > self.args.most_voxels and role > min(self.roles):
+            role -= 1
         step = random_step(rng)
         views = rng.permutation(len(sample.cameras))[: self.args.views]
         tree = sample.tree
@@ -185,7 +185,7 @@ def options():
     p.add_argument("--init", help="checkpoint, or MODEL.safetensors:SET, to start from")
     p.add_argument("--resume", action="store_true", help="go on from OUT/last.pt")
     p.add_argument("--roles", default="2:1", help="roles and how often they are drawn; 3 is a sample's finest level")
-    p.add_argument("--most-voxels", type=int, default=80000, help="of a larger level the coarsest role is taken instead")
+    p.add_argument("--most-voxels", type=int, default=80000, help="of a larger level a coarser role is taken instead")
     p.add_argument("--only", default="", help="only samples whose names contain one of these, comma-separated")
     p.add_argument("--minutes", type=float, default=0, help="budget; the schedule follows the clock")
     p.add_argument("--steps", type=int, default=2000, help="budget without --minutes")
