@@ -9,7 +9,6 @@ use b2p::container::{self, Header, Stream};
 use b2p::encoder::transform::{GeometryTarget, Options, QualityTarget, encode, encode_to_rate};
 use b2p::gaussians::HeadSet;
 use b2p::gaussians::Heads;
-use b2p::gaussians::learned::HeadsModel;
 use b2p::latents::network::Model;
 use b2p::log::Log;
 use b2p::{Axes, Cancel, Error, Isa, Limits, Up};
@@ -233,117 +232,6 @@ fn as_many_bits_as_asked_for_are_used_and_more_bits_are_never_worse_but_for_a_fi
     assert!(lossless, "20 bits are enough for exact colours");
     let found = encode_to_rate(&cloud, &Options::default(), 0.001, &Log::default());
     assert!(matches!(found, Err(Error::TooFewBits { .. })));
-}
-
-#[test]
-fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_learned_gaussians() {
-    let cloud = Ball::new(8, 100.0).cloud();
-    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
-    let options = Options {
-        heads: Some(heads.clone()),
-        ..Options::default()
-    };
-    let found = encode_to_rate(&cloud, &options, 1.0, &Log::default());
-    let (encoded, chosen) = found.unwrap();
-    assert!(encoded.bytes.len() * 8 <= cloud.voxels.len());
-    assert_eq!(encoded.bytes, stream(&cloud, &chosen));
-    let without = Options {
-        head_maps: false,
-        ..chosen
-    };
-    let plain = stream(&cloud, &without);
-    let parsed = Stream::parse(&encoded.bytes, &Limits::default()).unwrap();
-    assert!(parsed.damage().is_none());
-    let map = |level: &b2p::container::Level| level.colours.as_ref().is_some_and(|colours| colours.head_map.is_some());
-    let mut most = 0.0;
-    for level in parsed.levels() {
-        assert_eq!(map(level), level.level < 7, "level {}", level.level);
-        let level = Some(level.level);
-        assert_eq!(points(&encoded.bytes, level), points(&plain, level));
-        let decoder = Decoder::new().with_level(level).with_heads_model(heads.clone());
-        let learned = decoder.decode(&plain).unwrap();
-        let surfels = Decoder::new().with_level(level).decode(&plain).unwrap();
-        // A ball is smooth: most of it, if not all, is better as surfels.
-        let mixed = decoder.decode(&encoded.bytes).unwrap();
-        let from = |of: &b2p::gaussians::Gaussians| {
-            let positions: Vec<_> = of.position.iter().map(|p| p.map(f32::to_bits)).collect();
-            let all: std::collections::HashSet<_> = positions.into_iter().collect();
-            let count = mixed
-                .position
-                .iter()
-                .filter(|p| all.contains(&p.map(f32::to_bits)))
-                .count();
-            count as f64 / mixed.len() as f64
-        };
-        let (learned, surfels) = (from(&learned), from(&surfels));
-        assert!(learned + surfels > 0.999, "{level:?}: {learned} + {surfels}");
-        most = f64::max(most, if learned < 1.0 { surfels } else { 0.0 });
-    }
-    assert!(most > 0.3, "{most}");
-}
-
-#[test]
-fn learned_heads_leave_sparse_levels_to_surfels() {
-    let options = Options {
-        levels: Some(5..=7),
-        ..with(QualityTarget::Lossless)
-    };
-    let bytes = stream(&sparse_wall(), &options);
-    let model = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
-    let draw = |heads: HeadSet, level| {
-        let decoder = Decoder::new()
-            .with_heads_model(HeadsModel::clone(&model))
-            .with_heads(heads);
-        decoder.with_level(level).decode(&bytes).unwrap()
-    };
-    for heads in [HeadSet::Best, HeadSet::Quick] {
-        assert!(draw(heads, 7) == draw(HeadSet::Surfels, 7), "{heads}");
-        // Half of the grid's resolution leaves hardly a voxel without neighbours.
-        assert!(draw(heads, 5) != draw(HeadSet::Surfels, 5), "{heads}");
-    }
-}
-
-#[test]
-fn streams_state_how_wide_surfels_close_a_sparse_level_and_nothing_of_a_dense_one() {
-    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
-    let usual = Options {
-        levels: Some(5..=7),
-        ..with(QualityTarget::Step(20.0))
-    };
-    let mapped = Options {
-        heads: Some(heads),
-        ..usual.clone()
-    };
-    let radii = |cloud, options: &Options| {
-        let decoder = Decoder::new().with_heads(HeadSet::Surfels).with_level(7);
-        let gaussians = decoder.decode(&stream(cloud, options)).unwrap();
-        gaussians.scale.iter().map(|[radius, ..]| *radius).collect::<Vec<_>>()
-    };
-    let sparse = sparse_wall();
-    let factors = radii(&sparse, &mapped).into_iter().zip(radii(&sparse, &usual));
-    let mut factors = factors.map(|(wide, usual)| wide / usual);
-    let first = factors.next().unwrap();
-    assert!(first > 1.1 && first < 1.41, "{first}");
-    assert!(factors.all(|factor| (factor - first).abs() < 1e-5));
-    let dense = Ball::new(7, 50.0).cloud();
-    assert!(radii(&dense, &mapped) == radii(&dense, &usual));
-}
-
-#[test]
-fn the_level_above_a_sparse_cloud_s_own_has_a_head_map_and_that_above_a_dense_one_has_none() {
-    let heads = HeadsModel::from_bytes(include_bytes!("../models/heads.safetensors")).unwrap();
-    let options = Options {
-        levels: Some(5..=6),
-        heads: Some(heads),
-        ..with(QualityTarget::Step(20.0))
-    };
-    for (cloud, expected) in [(sparse_wall(), true), (Ball::new(7, 50.0).cloud(), false)] {
-        let bytes = stream(&cloud, &options);
-        let stream = Stream::parse(&bytes, &Limits::default()).unwrap();
-        let finest = stream.levels().last().unwrap();
-        assert_eq!(finest.level, 6);
-        assert_eq!(finest.colours.as_ref().unwrap().head_map.is_some(), expected);
-    }
 }
 
 #[test]

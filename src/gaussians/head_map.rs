@@ -140,6 +140,10 @@ impl HeadMap {
         self.sizes.map(|size| f32::from(size) / USUAL)
     }
 
+    /// Bytes of a map that is the same for all blocks.
+    #[cfg(feature = "encoder")]
+    pub const UNIFORM_BYTES: usize = 3;
+
     /// Upper bound of [`HeadMap::to_bytes`] that is seldom exceeded.
     #[cfg(feature = "encoder")]
     pub fn usual_bytes(blocks: usize) -> usize {
@@ -196,6 +200,7 @@ mod tests {
         for on in [false, true] {
             let map = HeadMap::new(54, 64, vec![on; 1000]);
             assert_eq!(map.to_bytes(), [54, 64, u8::from(on)]);
+            assert_eq!(map.to_bytes().len(), HeadMap::UNIFORM_BYTES);
             assert_eq!(HeadMap::parse(&map.to_bytes(), 1000), Some(map));
         }
     }

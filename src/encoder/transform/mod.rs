@@ -10,6 +10,7 @@ mod options;
 mod predicted;
 mod quality;
 mod rate_control;
+mod reference;
 mod refine;
 mod shape;
 
@@ -36,6 +37,7 @@ pub use predicted::{PredictedFrame, encode_predicted};
 pub use quality::QualityTarget;
 
 pub use rate_control::encode_to_rate;
+use reference::Reference;
 pub use shape::GeometryTarget;
 use shape::Shape;
 
@@ -413,7 +415,7 @@ impl<'a> EncoderInput<'a> {
                 decoding.set_heads_model(heads.clone());
                 let levels = (*self.levels.start().min(&top)..=top).filter(|level| self.has_head_map(*level));
                 let reference = log.step("draw the cloud", self.cloud.voxels.len(), "voxels", || {
-                    head_maps::Reference::new(self.isa, self.cloud, self.sparse, levels)
+                    Reference::new(self.isa, self.cloud, self.sparse, Some(heads), levels)
                 })?;
                 Some(reference)
             }
@@ -423,7 +425,9 @@ impl<'a> EncoderInput<'a> {
         let same = log.step("decode again", voxels.len(), "voxels", || {
             while let Some(level) = decoding.advance()? {
                 if let Some(reference) = reference.as_ref().filter(|_| self.has_head_map(level)) {
-                    maps.push((level, head_maps::of_level(octree, reference, &mut decoding, level)?));
+                    let blocks = self.maps_blocks(level, top);
+                    let map = head_maps::of_level(octree, reference, &mut decoding, level, blocks)?;
+                    maps.push((level, map));
                 }
             }
             let points = decoding.points();

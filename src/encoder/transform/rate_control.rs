@@ -6,8 +6,8 @@
 
 use std::sync::Arc;
 
-use super::head_maps::Reference;
 use super::quality::{MAX_CHROMA, QualityTarget, steps_of};
+use super::reference::Reference;
 use super::shape::Shape;
 use super::{Coded, EncoderInput, GeometryTarget, Options, Tune, choose_levels};
 use crate::cloud::ColouredVoxels;
@@ -169,7 +169,8 @@ impl Search<'_> {
             return Ok(true);
         }
         log.step("compare pictures", plain.1.colours.len(), "voxels", || {
-            let reference = Reference::new(subject.isa, subject.cloud, subject.sparse, std::iter::once(place.top))?;
+            let (heads, levels) = (subject.options.heads.as_ref(), std::iter::once(place.top));
+            let reference = Reference::new(subject.isa, subject.cloud, subject.sparse, heads, levels)?;
             let errors = |coded: &Coded| reference.errors(place.top, &subject.drawn(coded)?);
             let ([whole, foreground], [old_whole, old_foreground]) = (errors(&refined.1)?, errors(&plain.1)?);
             Ok(whole / old_whole.max(1e-12) + foreground / old_foreground.max(1e-12) <= 2.0)
