@@ -4,7 +4,7 @@
 links  every relative link of a Markdown file leads to a file, and its anchor to a heading of it; links of the book stay
        within it, and its summary lists every chapter
 words  what the left column of docs/glossary.md replaces occurs in no tracked text file
-size   the README has at most 150 lines of at most 120 characters, tables and links aside
+size   the README has at most 150 lines; lines of all documents have at most 120 characters, tables, code and pictures aside
 """
 
 import re
@@ -17,7 +17,7 @@ BOOK = ROOT / "docs"
 GLOSSARY = "docs/glossary.md"
 # What may stand between the words of a phrase: the next line of a comment, or the underscores of a test's name.
 BREAK = r"(?:_|\s+(?:(?:///|//!|//|#|\*|>)\s*)?)"
-README_LINES, README_WIDTH = 150, 120
+README_LINES, WIDTH = 150, 120
 # Modules that implement no clause of the format.
 NO_CLAUSE = {
     "src/colour/encode.rs",
@@ -98,12 +98,15 @@ def words():
 
 
 def size():
-    lines = (ROOT / "README.md").read_text().splitlines()
-    if len(lines) > README_LINES:
-        yield f"README.md: {len(lines)} lines, at most {README_LINES}"
-    for number, line in enumerate(lines, 1):
-        if len(line) > README_WIDTH and not line.startswith("|"):
-            yield f"README.md:{number}: {len(line)} characters, at most {README_WIDTH}"
+    lines = len((ROOT / "README.md").read_text().splitlines())
+    if lines > README_LINES:
+        yield f"README.md: {lines} lines, at most {README_LINES}"
+    for name in tracked("*.md"):
+        code = False
+        for number, line in enumerate((ROOT / name).read_text().splitlines(), 1):
+            code ^= line.startswith("```")
+            if len(line) > WIDTH and not code and not (line.lstrip().startswith("|") or line.startswith(("    ", "!["))):
+                yield f"{name}:{number}: {len(line)} characters, at most {WIDTH}"
 
 
 def clauses():
