@@ -201,6 +201,8 @@ def encode(
     tune: str | None = None,
     filter: bool = True,
     head_maps: bool = True,
+    block_size: int | None = None,
+    blocks: bool = True,
     up: _Axis | None = None,
     unit: str | float | None = None,
     crs: str | None = None,

@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use b2p::cloud::{voxelise, voxelise_closed};
 use b2p::encoder::transform::{self, GeometryTarget, Options, QualityTarget, Tune};
-use b2p::{Error, Log, PointCloud, Result, container};
+use b2p::scene::{BLOCK_VOXELS, ONE_PIECE};
+use b2p::{Cancel, Error, Limits, Log, PointCloud, Result, SceneEncoder, container};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
@@ -24,6 +25,11 @@ struct Asked {
     effort: Option<u8>,
     tune: Option<Tune>,
     head_maps: bool,
+    /// Voxels of a block at most, for clouds with more than that; by default those of the program.
+    block_size: Option<usize>,
+    /// Whether large clouds become scenes.
+    blocks: bool,
+    limits: Limits,
     options: Options,
 }
 
@@ -60,6 +66,11 @@ struct Asked {
 ///     Whether the stream has the colour filter, which decoders apply before they draw.
 /// head_maps : bool
 ///     Whether the stream says where surfels draw better than the learned heads.
+/// block_size : int, optional
+///     Make a scene of a cloud with more voxels: blocks of at most so many, which are coded and read one by one. By
+///     default clouds with more than 2**22 voxels become blocks of 2**21.
+/// blocks : bool
+///     If False, code a cloud of any size in one piece.
 /// up, unit, crs : optional
 ///     As of `PointCloud`, for clouds that do not say.
 /// limits : Limits, optional
@@ -71,10 +82,11 @@ struct Asked {
 /// Returns
 /// -------
 /// bytes
-///     The stream, which `decode`, `decode_points`, `open`, `info` and `render` take.
+///     The stream or scene, which `decode`, `decode_points`, `open`, `info` and `render` take.
 #[pyfunction]
 #[pyo3(signature = (xyz, rgb=None, *, bits=None, bits_per_point=None, quality=None, step=None, lossless=false,
-    geometry=None, levels=None, effort=None, tune=None, filter=true, head_maps=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
+    geometry=None, levels=None, effort=None, tune=None, filter=true, head_maps=true, block_size=None, blocks=true, up=None, unit=None, crs=None, limits=None,
+    threads=None, progress=None))]
 pub fn encode<'py>(
     py: Python<'py>,
     xyz: &Bound<'py, PyAny>,
@@ -90,6 +102,8 @@ pub fn encode<'py>(
     tune: Option<&str>,
     filter: bool,
     head_maps: bool,
+    block_size: Option<usize>,
+    blocks: bool,
     up: Option<&str>,
     unit: Option<&Bound<'py, PyAny>>,
     crs: Option<String>,
@@ -98,6 +112,11 @@ pub fn encode<'py>(
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyBytes>> {
     check(py, bits_per_point, quality, step.is_some(), lossless)?;
+    if block_size.is_some_and(|size| size == 0 || !blocks) {
+        let what = "block_size is at least 1, and goes without blocks=False";
+        return Err(errors::usage(py, what));
+    }
+    let limits_of_blocks = limits.as_ref().map_or_else(Limits::default, |limits| limits.0.clone());
     let mut options = Options {
         levels: levels.map(|(first, last)| first..=last),
         geometry: geometry.map_or(Ok(GeometryTarget::Visual), shape)?,
@@ -117,13 +136,16 @@ pub fn encode<'py>(
         effort,
         tune: tune.map(|tune| tuned(py, tune)).transpose()?,
         head_maps,
+        block_size,
+        blocks,
+        limits: limits_of_blocks,
         options,
     };
     let work = Work {
         progress,
         ..Work::on(threads)
     };
-    let (stream, left_out) = work.run(py, move |_, log| code(&cloud, asked, log))?;
+    let (stream, left_out) = work.run(py, move |cancel, log| code(&cloud, asked, cancel, log))?;
     if left_out > 0 {
         let what = format!("left out the coordinate system: its {left_out} bytes are too many at this rate");
         errors::warn(py, &what)?;
@@ -221,7 +243,7 @@ fn steps(step: &Bound<'_, PyAny>) -> PyResult<QualityTarget> {
 }
 
 /// The stream, and how many bytes of a coordinate system are not in it.
-fn code(cloud: &PointCloud, asked: Asked, log: &Log) -> Result<(Vec<u8>, usize)> {
+fn code(cloud: &PointCloud, asked: Asked, cancel: &Cancel, log: &Log) -> Result<(Vec<u8>, usize)> {
     let grid = log.step("voxelise", cloud.positions.len(), "points", || match asked.bits {
         None => voxelise_closed(cloud).map(|(grid, _)| grid),
         Some(bits) => voxelise(cloud, Some(bits)),
@@ -239,6 +261,19 @@ fn code(cloud: &PointCloud, asked: Asked, log: &Log) -> Result<(Vec<u8>, usize)>
         options.tune = tune;
     }
     let (points, voxels) = (cloud.positions.len(), grid.voxels.len());
+    if asked.blocks && voxels > asked.block_size.unwrap_or(ONE_PIECE) {
+        let encoder = SceneEncoder::new()
+            .with_options(options)
+            .with_block_voxels(asked.block_size.unwrap_or(BLOCK_VOXELS))
+            .with_memory(asked.limits.max_bytes)
+            .with_axes(cloud.axes.clone())
+            .with_cancel(cancel.clone());
+        let scene = log.step("code blocks", voxels, "voxels", || match asked.bits_per_point {
+            Some(most) => encoder.encode_to_rate(&grid, most).map(|(scene, ..)| scene),
+            None => encoder.encode(&grid),
+        })?;
+        return Ok((scene, 0));
+    }
     let merged = (points > voxels).then_some(points as u64);
     let voxels = voxels as f64;
     let mut axes = cloud.axes.clone();

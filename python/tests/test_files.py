@@ -113,6 +113,9 @@ def test_streams_are_equal_to_those_of_the_program(program, cloud, tmp_path):
         (["--lossless", "--levels", "3..6", "--bits", 6], {"lossless": True, "levels": (3, 6), "bits": 6}),
         (["--step", "8,24", "--no-head-maps", "--bits", 6], {"step": (8, 24), "head_maps": False, "bits": 6}),
         (["--no-filter", "--effort", 0, "--bits", 6], {"filter": False, "effort": 0, "bits": 6}),
+        (["--effort", 0, "--bits", 7, "--block-size", 2000], {"effort": 0, "bits": 7, "block_size": 2000}),
+        (["--effort", 0, "--bits", 7, "--block-size", 2000, "--bits-per-point", 3],
+         {"effort": 0, "bits": 7, "block_size": 2000, "bits_per_point": 3}),
         (["--effort", 0, "--bits", 6, "--up", "z", "--unit", "mm"],
          {"effort": 0, "bits": 6, "up": "z", "unit": "mm"}),
     ]:

@@ -37,6 +37,17 @@ def test_scenes_of_the_conformance_suite_decode_to_their_digests(line):
             assert gaussians.level == int(level)
 
 
+def test_a_cloud_that_is_coded_in_blocks_decodes_to_the_points_of_one_piece(cloud):
+    options = {"bits": 7, "lossless": True, "levels": (4, 7), "effort": 0}
+    scene, stream = b2p.encode(*cloud, **options, block_size=2000), b2p.encode(*cloud, **options, blocks=False)
+    assert len(b2p.info(scene)["blocks"]) > 1 and "blocks" not in b2p.info(stream)
+    of_scene, of_stream = b2p.decode_points(scene), b2p.decode_points(stream)
+    assert np.array_equal(of_scene.voxels, of_stream.voxels) and np.array_equal(of_scene.rgb, of_stream.rgb)
+    for wrong in [{"block_size": 0}, {"block_size": 9, "blocks": False}]:
+        with pytest.raises(b2p.UsageError, match="block_size"):
+            b2p.encode(*cloud, **wrong)
+
+
 def test_a_box_of_a_scene_has_the_points_and_gaussians_in_it():
     low, high = (3.0, -1.0, 2.5), (17.5, 40.0, 20.0)
     xyz, rgb = b2p.decode_points(BALL)

@@ -28,7 +28,7 @@ pub use arriving::SceneDecoding;
 pub use decoder::{DecodedScene, SceneDecoder, Wanted};
 #[cfg(feature = "encoder")]
 pub use encoder::{Grid, SceneEncoder, Sink, Voxel};
-pub use partition::{BLOCK_VOXELS, Cutter};
+pub use partition::{BLOCK_VOXELS, Cutter, ONE_PIECE};
 pub use reader::{Checks, SceneReader};
 #[cfg(feature = "encoder")]
 pub use runs::Runs;

@@ -2,7 +2,7 @@
 
 use b2p::cloud::{ColouredVoxels, GridReport};
 use b2p::encoder::transform::Options;
-use b2p::scene::BLOCK_VOXELS;
+use b2p::scene::{BLOCK_VOXELS, ONE_PIECE};
 use b2p::{Axes, Error, Limits, SceneEncoder, SceneReader};
 use serde_json::json;
 
@@ -11,9 +11,6 @@ use super::super::manners::{self, Said};
 use super::super::progress::Progress;
 use super::super::table::{count, counted, table};
 use super::super::{Failure, Result, cloud};
-
-/// Voxels up to which a cloud is one piece: two blocks. Cut in small blocks it takes about 5 % more bits.
-const ONE_PIECE: usize = 2 * BLOCK_VOXELS;
 
 /// Whether a cloud of so many voxels becomes a scene.
 pub fn is_wanted(args: &Encode, voxels: usize) -> bool {
