@@ -1,4 +1,4 @@
-//! Where surfels draw a level better than learned heads, and how wide surfels should be.
+//! Where surfels draw a level better than learned heads, and how wide surfels should be there.
 //!
 //! Both are drawn from a few views and compared with pictures of the cloud itself ([`Reference`]). A pixel's error goes to
 //! the block whose surfel covers it.
@@ -14,26 +14,15 @@ use crate::renderer::Ids;
 
 use super::EncoderInput;
 use super::reference::{Errors, Reference, VIEWS, Views, error, maps};
+use super::surfel_size::{SIZES, scale};
 
-/// Sizes of surfels to choose from, in 64ths of the usual radius.
-const SIZES: [u8; 3] = [54, 64, 74];
 /// Factor of the surfels that decide which block a pixel belongs to, so that some lie beside the silhouette.
 const WIDER: f32 = 1.3;
 /// With more children than this for each voxel above, a cloud is not sparse.
 const DENSE: usize = 3;
 
-/// A block becomes surfels if they have less than a part of the learned Gaussians' error.
-#[derive(Clone, Copy)]
-struct Margins {
-    /// That part where the block before is learned.
-    enter: f64,
-    /// Where the block before is surfels: long runs take fewer bits.
-    stay: f64,
-}
-
-const FAR: Margins = Margins { enter: 0.9, stay: 0.9 };
-/// Of levels that are nearly as close to the mesh as what they are compared with.
-const NEAR: Margins = Margins { enter: 0.6, stay: 0.92 };
+/// A block becomes surfels if they have less than this part of the learned Gaussians' error.
+const MARGIN: f64 = 0.9;
 
 /// What a level has, besides its Gaussians.
 pub struct Comparison<'a> {
@@ -85,14 +74,7 @@ impl Comparison<'_> {
     /// The map of the level, once it has been compared with these Gaussians of the learned heads, too.
     pub fn with_learned(mut self, learned: &Gaussians) -> Result<HeadMap> {
         self.add(0, learned)?;
-        let margins = if self.reference.is_near(self.level) { NEAR } else { FAR };
-        Ok(self.sums.choose(margins))
-    }
-
-    /// A map that leaves all of the level to the heads that are asked for.
-    pub fn with_sizes_only(self) -> HeadMap {
-        let size = SIZES[self.sums.best_alone() - 1];
-        HeadMap::new(size, size, vec![false; self.sums.blocks.len()])
+        Ok(self.sums.choose())
     }
 
     fn add(&mut self, which: usize, candidate: &Gaussians) -> Result<()> {
@@ -128,11 +110,11 @@ impl EncoderInput<'_> {
         (*self.levels.start().min(&top)..=top).any(|level| self.has_head_map(level))
     }
 
-    /// Whether the head map of a level tells of each block what draws it, in a stream whose last level is `top`; else it
-    /// tells the size of surfels only. Blocks of a large level pay where that level is drawn.
-    pub(super) fn maps_blocks(&self, level: u8, top: u8) -> bool {
+    /// Whether the head map of a level tells of each block what draws it; else it tells the size of surfels only, as that of
+    /// a level so close to the cloud's own that no picture of the cloud tells which is nearer to the surface.
+    pub(super) fn maps_blocks(&self, level: u8) -> bool {
         let depth = self.cloud.voxels.depth();
-        level < depth && (self.sparse || level + 1 < depth || level == top)
+        level < depth && (self.sparse || level + 1 < depth)
     }
 
     /// Bytes to set aside for the head maps of a stream whose last level is `top`.
@@ -141,7 +123,7 @@ impl EncoderInput<'_> {
         const CHUNK: usize = 12;
         let levels = *self.levels.start().min(&top)..=top;
         let mapped = levels.filter(|level| self.has_head_map(*level));
-        let bytes = |level| match self.maps_blocks(level, top) {
+        let bytes = |level| match self.maps_blocks(level) {
             true => CHUNK + HeadMap::usual_bytes(HeadMap::block_count(&self.octree, level)),
             false => CHUNK + HeadMap::UNIFORM_BYTES,
         };
@@ -149,20 +131,11 @@ impl EncoderInput<'_> {
     }
 }
 
-/// Compares the ways to draw the level that was decoded: block by block, or surfels of several sizes.
-pub fn of_level(
-    octree: &Octree,
-    reference: &Reference,
-    decoding: &mut Decoding<'_>,
-    level: u8,
-    blocks: bool,
-) -> Result<HeadMap> {
+/// Compares the ways to draw the level that was decoded.
+pub fn of_level(octree: &Octree, reference: &Reference, decoding: &mut Decoding<'_>, level: u8) -> Result<HeadMap> {
     decoding.set_heads(HeadSet::Surfels)?;
     let surfels = decoding.gaussians()?;
     let comparison = reference.compare_surfels(octree, level, surfels)?;
-    if !blocks {
-        return Ok(comparison.with_sizes_only());
-    }
     decoding.set_heads(HeadSet::Best)?;
     comparison.with_learned(&decoding.gaussians()?)
 }
@@ -215,25 +188,16 @@ impl Sums {
         Self::best(|which| relative(&self.all[which]))
     }
 
-    fn choose(&self, margins: Margins) -> HeadMap {
+    fn choose(&self) -> HeadMap {
         let relative = self.relative_to(0);
         let mixed = Self::best(|which| {
             let of_block = |block: &[Errors; 1 + SIZES.len()]| relative(&block[which]).min(relative(&block[0]));
             self.blocks.iter().map(of_block).sum()
         });
-        let mut before = false;
-        let surfels = self.blocks.iter().map(|block| {
-            let margin = if before { margins.stay } else { margins.enter };
-            before = relative(&block[mixed]) < margin * relative(&block[0]);
-            before
-        });
+        let surfels = self
+            .blocks
+            .iter()
+            .map(|block| relative(&block[mixed]) < MARGIN * relative(&block[0]));
         HeadMap::new(SIZES[mixed - 1], SIZES[self.best_alone() - 1], surfels.collect())
-    }
-}
-
-/// Sets the radii of surfels to a multiple of the usual ones.
-fn scale(surfels: &mut Gaussians, usual: &[[f32; 3]], factor: f32) {
-    for (scale, [a, b, c]) in surfels.scale.iter_mut().zip(usual) {
-        *scale = [a * factor, b * factor, *c];
     }
 }

@@ -13,6 +13,7 @@ mod rate_control;
 mod reference;
 mod refine;
 mod shape;
+mod surfel_size;
 
 use std::ops::RangeInclusive;
 use std::sync::Arc;
@@ -405,30 +406,40 @@ impl<'a> EncoderInput<'a> {
         let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
         let mut decoding = decoder.with_level(top).start();
         decoding.push(&coded.bytes);
-        let reference = match self
-            .options
-            .heads
-            .as_ref()
-            .filter(|_| head_maps && self.has_head_maps(top))
-        {
-            Some(heads) => {
-                decoding.set_heads_model(heads.clone());
-                let levels = (*self.levels.start().min(&top)..=top).filter(|level| self.has_head_map(*level));
-                let reference = log.step("draw the cloud", self.cloud.voxels.len(), "voxels", || {
-                    Reference::new(self.isa, self.cloud, self.sparse, Some(heads), levels)
+        let wanted = head_maps && self.has_head_maps(top);
+        let (mut reference, mut finest) = (None, None);
+        if let Some(heads) = self.options.heads.as_ref().filter(|_| wanted) {
+            decoding.set_heads_model(heads.clone());
+            let levels = *self.levels.start().min(&top)..=top;
+            let (count, depth) = (self.cloud.voxels.len(), self.cloud.voxels.depth());
+            reference = Some(log.step("draw the cloud", count, "voxels", || {
+                let levels = levels.filter(|level| self.has_head_map(*level) && *level < depth);
+                Reference::new(self.isa, self.cloud, self.sparse, levels)
+            })?);
+            if top == depth && !self.sparse {
+                finest = log.step("draw the cloud with heads", count, "voxels", || {
+                    surfel_size::pictures(self.isa, self.cloud, heads)
                 })?;
-                Some(reference)
             }
-            None => None,
-        };
+        }
         let mut maps = Vec::new();
         let same = log.step("decode again", voxels.len(), "voxels", || {
             while let Some(level) = decoding.advance()? {
-                if let Some(reference) = reference.as_ref().filter(|_| self.has_head_map(level)) {
-                    let blocks = self.maps_blocks(level, top);
-                    let map = head_maps::of_level(octree, reference, &mut decoding, level, blocks)?;
-                    maps.push((level, map));
+                let Some(reference) = reference.as_ref().filter(|_| self.has_head_map(level)) else {
+                    continue;
+                };
+                let pictures = match level == self.cloud.voxels.depth() {
+                    true => finest.as_deref().unwrap_or_default(),
+                    false => reference.pictures(level),
+                };
+                if pictures.is_empty() {
+                    continue;
                 }
+                let map = match self.maps_blocks(level) {
+                    true => head_maps::of_level(octree, reference, &mut decoding, level)?,
+                    false => surfel_size::of_level(self.isa, octree, pictures, &mut decoding, level)?,
+                };
+                maps.push((level, map));
             }
             let points = decoding.points();
             Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == coded.colours))

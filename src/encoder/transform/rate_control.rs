@@ -169,8 +169,7 @@ impl Search<'_> {
             return Ok(true);
         }
         log.step("compare pictures", plain.1.colours.len(), "voxels", || {
-            let (heads, levels) = (subject.options.heads.as_ref(), std::iter::once(place.top));
-            let reference = Reference::new(subject.isa, subject.cloud, subject.sparse, heads, levels)?;
+            let reference = Reference::new(subject.isa, subject.cloud, subject.sparse, std::iter::once(place.top))?;
             let errors = |coded: &Coded| reference.errors(place.top, &subject.drawn(coded)?);
             let ([whole, foreground], [old_whole, old_foreground]) = (errors(&refined.1)?, errors(&plain.1)?);
             Ok(whole / old_whole.max(1e-12) + foreground / old_foreground.max(1e-12) <= 2.0)

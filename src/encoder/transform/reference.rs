@@ -1,19 +1,13 @@
-//! Pictures of the cloud itself, which those of streams are compared with.
-//!
-//! Levels far above the cloud's own are compared with its voxels as surfels, which are closer to the mesh than any
-//! Gaussians of theirs. The two finest levels are nearly as close, so that they are compared with what the best heads make of
-//! the cloud; without a model of heads, with surfels, too.
+//! Pictures of the cloud itself, as surfels at its full depth, which those of levels are compared with: a level's Gaussians
+//! are farther from the mesh than those are.
 
 use b2p_kernels::Isa;
 
 use crate::cloud::ColouredVoxels;
-use crate::decoder::Decoder;
 use crate::error::Result;
-use crate::gaussians::learned::{HeadsModel, LevelInput};
 use crate::gaussians::surfels::{PerVoxel, SurfelSelection, closing_size, surfels};
-use crate::gaussians::{Frame, Gaussians, Heads};
+use crate::gaussians::{Frame, Gaussians};
 use crate::geometry::{KernelMap, Octree};
-use crate::layers::Precision;
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
 use crate::renderer::{Background, Image, Renderer};
@@ -27,8 +21,6 @@ const FIELD: f64 = 45.0;
 const SIDE: u32 = 1024;
 /// Size of the cloud's own surfels, which closes them where a voxel is less than a pixel.
 const SIZE: f32 = 1.12;
-/// Rows that heads work on at a time.
-const ROWS: usize = 1 << 16;
 
 /// Squared errors over whole pictures and over the foreground.
 pub type Errors = [f64; 2];
@@ -36,94 +28,42 @@ pub type Errors = [f64; 2];
 /// Pictures of the cloud. Nothing else of it is kept: Gaussians take much more memory.
 pub struct Reference {
     isa: Isa,
-    depth: u8,
-    sparse: bool,
-    pictures: Vec<Pictures>,
-}
-
-/// The views that some levels are compared with.
-struct Pictures {
-    near: bool,
-    side: u32,
-    views: Vec<Image>,
+    /// Of each side in use the views.
+    pictures: Vec<(u32, Vec<Image>)>,
 }
 
 impl Reference {
-    /// Draws the cloud's voxels, whose depth is at least 1, as these levels need it. Those of a `sparse` cloud are surfels,
-    /// wide enough to close.
-    pub fn new(
-        isa: Isa,
-        cloud: &ColouredVoxels,
-        sparse: bool,
-        heads: Option<&HeadsModel>,
-        levels: impl Iterator<Item = u8>,
-    ) -> Result<Self> {
-        let depth = cloud.voxels.depth();
-        let mut reference = Reference {
-            isa,
-            depth,
-            sparse,
-            pictures: Vec::new(),
-        };
-        let mut wanted: Vec<(bool, u32)> = levels.map(|level| (reference.is_near(level), side(level))).collect();
-        wanted.sort_unstable();
-        wanted.dedup();
-        for near in [false, true] {
-            let mut sides = wanted
-                .iter()
-                .filter(|wanted| wanted.0 == near)
-                .map(|wanted| wanted.1)
-                .peekable();
-            if sides.peek().is_none() {
-                continue;
-            }
-            let gaussians = match heads.filter(|_| near) {
-                Some(heads) => learned(isa, cloud, heads)?,
-                None => closed(isa, cloud, sparse)?,
-            };
-            for side in sides {
-                let mut views = Views::new(isa, side);
-                let drawn = VIEWS.map(|view| views.half(&gaussians, view));
-                reference.pictures.push(Pictures {
-                    near,
-                    side,
-                    views: drawn.into_iter().collect::<Result<_>>()?,
-                });
+    /// Draws the cloud's voxels, whose depth is at least 1, as these levels need it. Those of a `sparse` cloud are wide
+    /// enough to close.
+    pub fn new(isa: Isa, cloud: &ColouredVoxels, sparse: bool, levels: impl Iterator<Item = u8>) -> Result<Self> {
+        let mut pictures: Vec<(u32, Vec<Image>)> = Vec::new();
+        let mut sides = levels.map(side).peekable();
+        if sides.peek().is_none() {
+            return Ok(Reference { isa, pictures });
+        }
+        let gaussians = closed(isa, cloud, sparse)?;
+        for side in sides {
+            if pictures.iter().all(|(known, _)| *known != side) {
+                pictures.push((side, Views::new(isa, side).all(&gaussians)?));
             }
         }
-        Ok(reference)
-    }
-
-    /// Whether a level is nearly as close to the mesh as the cloud's surfels.
-    pub fn is_near(&self, level: u8) -> bool {
-        !self.sparse && level + 1 >= self.depth
+        Ok(Reference { isa, pictures })
     }
 
     /// The pictures that a level is compared with, by [`VIEWS`].
     pub fn pictures(&self, level: u8) -> &[Image] {
-        let wanted = (self.is_near(level), side(level));
-        let known = self.pictures.iter().find(|known| (known.near, known.side) == wanted);
-        known.map_or(&[], |known| &known.views)
+        let known = self.pictures.iter().find(|(known, _)| *known == side(level));
+        known.map_or(&[], |(_, pictures)| pictures)
     }
 
     /// What draws a level as the pictures are drawn.
     pub fn views(&self, level: u8) -> Views {
-        Views::new(self.isa, side(level))
+        Views::of_level(self.isa, level)
     }
 
     /// Squared errors of pictures of these Gaussians of a level, over whole pictures and over the foreground.
     pub fn errors(&self, level: u8, gaussians: &Gaussians) -> Result<Errors> {
-        let mut views = self.views(level);
-        let mut errors = [0.0; 2];
-        for (view, truth) in VIEWS.into_iter().zip(self.pictures(level)) {
-            let seen = views.half(gaussians, view)?;
-            for (truth, seen) in truth.pixels.iter().zip(&seen.pixels) {
-                let error = error(truth, seen);
-                errors[0] += error;
-                errors[1] += if truth[3] > 0.5 { error } else { 0.0 };
-            }
-        }
-        Ok(errors)
+        self.views(level).errors(self.pictures(level), gaussians)
     }
 }
 
@@ -142,32 +82,8 @@ fn closed(isa: Isa, cloud: &ColouredVoxels, sparse: bool) -> Result<Gaussians> {
     Ok(surfels(isa, voxels, &map, colours, PerVoxel::One, choice, frame(cloud)))
 }
 
-/// The cloud's voxels as the best heads draw them.
-fn learned(isa: Isa, cloud: &ColouredVoxels, heads: &HeadsModel) -> Result<Gaussians> {
-    let (octree, [above, map]) = maps(cloud)?;
-    let level = octree.depth();
-    let input = LevelInput {
-        octree: &octree,
-        level,
-        map: &map,
-        above: &above,
-        colours: &cloud.colours,
-        colours_above: &Decoder::colours_above(&octree, level, &cloud.colours),
-        luma_step: 1.0,
-        without: None,
-        range: None,
-    };
-    let best = heads.sets().filter(|set| set.0 == Heads::Best).min_by_key(|set| set.1);
-    let Some(best) = best else {
-        return closed(isa, cloud, false);
-    };
-    let rows = (ROWS, true);
-    heads.generate_in_parts(isa, Precision::default(), best, input, frame(cloud), rows, &mut |_| {
-        Ok(())
-    })
-}
-
-fn frame(cloud: &ColouredVoxels) -> Frame {
+/// The frame of the cloud's Gaussians.
+pub fn frame(cloud: &ColouredVoxels) -> Frame {
     Frame {
         bits: cloud.voxels.depth(),
         placement: cloud.placement,
@@ -198,6 +114,11 @@ pub struct Views {
 }
 
 impl Views {
+    /// For pictures that a level is compared with.
+    pub fn of_level(isa: Isa, level: u8) -> Self {
+        Self::new(isa, side(level))
+    }
+
     fn new(isa: Isa, side: u32) -> Self {
         let renderer = Renderer::new()
             .with_isa(isa)
@@ -217,6 +138,25 @@ impl Views {
         let camera = self.camera(view, 2)?;
         let image = self.renderer.render(gaussians, &camera)?;
         Ok(image.box_half())
+    }
+
+    /// Pictures of all views.
+    pub fn all(&mut self, gaussians: &Gaussians) -> Result<Vec<Image>> {
+        VIEWS.iter().map(|view| self.half(gaussians, *view)).collect()
+    }
+
+    /// Squared errors of pictures of these Gaussians over whole pictures, and where the `truth` has something.
+    pub fn errors(&mut self, truth: &[Image], gaussians: &Gaussians) -> Result<Errors> {
+        let mut errors = [0.0; 2];
+        for (view, truth) in VIEWS.into_iter().zip(truth) {
+            let seen = self.half(gaussians, view)?;
+            for (truth, seen) in truth.pixels.iter().zip(&seen.pixels) {
+                let error = error(truth, seen);
+                errors[0] += error;
+                errors[1] += if truth[3] > 0.5 { error } else { 0.0 };
+            }
+        }
+        Ok(errors)
     }
 }
 
