@@ -12,7 +12,6 @@ use crate::error::Result;
 use crate::gaussians::learned::{HeadsModel, LevelInput};
 use crate::gaussians::{Gaussians, HeadMap, HeadSet, Heads};
 use crate::geometry::Octree;
-use crate::layers::Precision;
 use crate::renderer::Image;
 
 use super::reference::{Views, frame, maps};
@@ -41,7 +40,7 @@ pub fn pictures(isa: Isa, cloud: &ColouredVoxels, heads: &HeadsModel) -> Result<
         without: None,
         range: None,
     };
-    let (precision, rows) = (Precision::default(), (ROWS, true));
+    let (precision, rows) = (Default::default(), (ROWS, true));
     let gaussians = heads.generate_in_parts(isa, precision, best, input, frame(cloud), rows, &mut |_| Ok(()))?;
     Ok(Some(Views::of_level(isa, level).all(&gaussians)?))
 }
