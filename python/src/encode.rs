@@ -85,8 +85,8 @@ struct Asked {
 ///     The stream or scene, which `decode`, `decode_points`, `open`, `info` and `render` take.
 #[pyfunction]
 #[pyo3(signature = (xyz, rgb=None, *, bits=None, bits_per_point=None, quality=None, step=None, lossless=false,
-    geometry=None, levels=None, effort=None, tune=None, filter=true, head_maps=true, block_size=None, blocks=true, up=None, unit=None, crs=None, limits=None,
-    threads=None, progress=None))]
+    geometry=None, levels=None, effort=None, tune=None, filter=true, head_maps=true, block_size=None, blocks=true,
+    up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
 pub fn encode<'py>(
     py: Python<'py>,
     xyz: &Bound<'py, PyAny>,
