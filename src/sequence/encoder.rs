@@ -36,7 +36,7 @@ pub struct SequenceEncoder {
     duration: u32,
     pub(super) group: u32,
     predicted: bool,
-    /// Geometry of whole frames, but for those that a group is predicted from.
+    /// Geometry of frames, but for those that a group is predicted from.
     geometry: GeometryTarget,
     axes: Axes,
     cancel: Cancel,
@@ -133,8 +133,8 @@ impl SequenceEncoder {
         self
     }
 
-    /// The same encoder with another geometry of frames that are coded by themselves, but for the first of a group that is
-    /// predicted. Default: exact.
+    /// The same encoder with another geometry of all frames, but for the first of a group that is predicted, if its last
+    /// level is not the cloud's own. Default: exact.
     pub fn with_geometry(mut self, geometry: GeometryTarget) -> Self {
         self.geometry = geometry;
         self
@@ -294,9 +294,11 @@ impl SequenceEncoder {
     /// Codes the first frame of a group, or one that no other is predicted from.
     fn whole(&self, cloud: &ColouredVoxels, ticks: u32, follows: bool) -> Result<Frame> {
         let mut options = self.options.clone();
+        let last = options.levels.as_ref().map(|levels| *levels.end());
         if follows {
             options.fineness = options.fineness.scaled(FIRST_STEP);
-        } else {
+        }
+        if !follows || last == Some(cloud.voxels.depth()) {
             options.geometry = self.geometry;
         }
         self.whole_with(cloud, &options, ticks, follows)
@@ -318,8 +320,11 @@ impl SequenceEncoder {
         follows: bool,
         first_bytes: usize,
     ) -> Result<Frame> {
-        let PredictedFrame { stream, motion } =
-            transform::encode_predicted(cloud, previous, &self.options, &self.log())?;
+        let options = Options {
+            geometry: self.geometry,
+            ..self.options.clone()
+        };
+        let PredictedFrame { stream, motion } = transform::encode_predicted(cloud, previous, &options, &self.log())?;
         let frame = finished(stream, &motion, Some(previous), ticks, follows)?;
         let bytes = frame.coded.1.len() as f64;
         if bytes <= LARGE * first_bytes as f64 {
@@ -328,10 +333,6 @@ impl SequenceEncoder {
         let worth = match self.options.fineness {
             QualityTarget::Lossless => 1.0,
             _ => WORTH,
-        };
-        let options = Options {
-            geometry: self.geometry,
-            ..self.options.clone()
         };
         let whole = self.whole_with(cloud, &options, ticks, follows)?;
         let better = whole.coded.1.len() as f64 <= worth * bytes;

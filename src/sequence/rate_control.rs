@@ -1,5 +1,7 @@
 //! The best sequence of at most so many bits: one quality for all frames, found by trials on a few.
 
+use std::sync::atomic::{AtomicU32, Ordering};
+
 use super::{SequenceEncoder, SequenceReader};
 use crate::cloud::ColouredVoxels;
 use crate::encoder::transform::QualityTarget;
@@ -17,9 +19,9 @@ pub enum Rate {
 
 /// Frames that are tried: the first ones.
 const TRIAL: u64 = 4;
-/// The coarsest step that a level is tried with, in eighths of an octave above half of a 255th: 64 255ths; 23 for the
-/// level of the cloud's own voxels, whose geometry takes most.
-const COARSEST: [i32; 2] = [56, 44];
+/// The coarsest step that a level is tried with, in eighths of an octave above half of a 255th: 64 255ths; 38 for the
+/// cloud's own level, whose geometry takes most (`docs/sequences.md`, "What was tried").
+const COARSEST: [i32; 2] = [56, 50];
 /// Steps that are tried until all frames fit.
 const CORRECTIONS: usize = 8;
 
@@ -44,6 +46,12 @@ impl SequenceEncoder {
                 "a sequence cannot have {bits} bits for each point or frame"
             )));
         }
+        let points = Points((0..count).map(|_| AtomicU32::new(0)).collect());
+        let cloud = |frame: u64| -> Result<ColouredVoxels> {
+            let cloud = cloud(frame)?;
+            points.0[frame as usize].store(cloud.voxels.len() as u32, Ordering::Relaxed);
+            Ok(cloud)
+        };
         let depth = cloud(0)?.voxels.depth();
         let levels = self.options.levels.clone().unwrap_or(depth.saturating_sub(3)..=depth);
         let mut least = f64::INFINITY;
@@ -54,7 +62,7 @@ impl SequenceEncoder {
             };
             let coarsest = COARSEST[usize::from(top == depth && top > *levels.start())];
             let mut fits = |at: i32| -> Result<bool> {
-                let used = encoder(at).trial(count, &cloud, rate)?;
+                let used = encoder(at).trial(count, &cloud, &points, rate)?;
                 least = least.min(used);
                 Ok(used <= bits)
             };
@@ -70,12 +78,8 @@ impl SequenceEncoder {
                 }
             }
             for at in (finest..=coarsest).take(CORRECTIONS) {
-                let bytes = encoder(at).encode(count, &cloud, &done)?;
-                let used = used(
-                    &SequenceReader::new(&bytes[..], &Limits::unlimited())?,
-                    bytes.len(),
-                    rate,
-                )?;
+                let bytes = encoder(at).encode(count, cloud, &done)?;
+                let used = used(count, bytes.len(), &cloud, &points, rate)?;
                 least = least.min(used);
                 if used <= bits {
                     return Ok(bytes);
@@ -86,11 +90,17 @@ impl SequenceEncoder {
     }
 
     /// The bits that a sequence of `count` frames takes, by its first frames.
-    fn trial(&self, count: u64, cloud: &(impl Fn(u64) -> Result<ColouredVoxels> + Sync), rate: Rate) -> Result<f64> {
+    fn trial(
+        &self,
+        count: u64,
+        cloud: &(impl Fn(u64) -> Result<ColouredVoxels> + Sync),
+        points: &Points,
+        rate: Rate,
+    ) -> Result<f64> {
         let frames = count.min(TRIAL).min(self.group.into());
         let bytes = self.encode(frames, cloud, |_| {})?;
         let sequence = SequenceReader::new(&bytes[..], &Limits::unlimited())?;
-        let tried = used(&sequence, bytes.len(), rate)?;
+        let tried = used(frames, bytes.len(), cloud, points, rate)?;
         let group = sequence.group(0)?;
         let whole = group.frame_bytes(0) as f64;
         let rest: u64 = (1..group.len()).map(|at| group.frame_bytes(at)).sum();
@@ -106,18 +116,31 @@ impl SequenceEncoder {
     }
 }
 
-/// The bits that a sequence of `bytes` bytes takes for each point or frame.
-fn used(sequence: &SequenceReader, bytes: usize, rate: Rate) -> Result<f64> {
+/// How many points each frame's cloud has, 0 where it was not read: a frame of the cloud's own level states its voxels.
+struct Points(Vec<AtomicU32>);
+
+impl Points {
+    /// The points of the first `frames` frames.
+    fn of(&self, frames: u64, cloud: &impl Fn(u64) -> Result<ColouredVoxels>) -> Result<u64> {
+        let points = |frame: u64| match self.0[frame as usize].load(Ordering::Relaxed) {
+            0 => cloud(frame).map(|cloud| cloud.voxels.len() as u64),
+            points => Ok(points.into()),
+        };
+        (0..frames).map(points).sum()
+    }
+}
+
+/// The bits that a sequence of `frames` frames in `bytes` bytes takes for each point or frame.
+fn used(
+    frames: u64,
+    bytes: usize,
+    cloud: &impl Fn(u64) -> Result<ColouredVoxels>,
+    points: &Points,
+    rate: Rate,
+) -> Result<f64> {
     let bits = bytes as f64 * 8.0;
     match rate {
-        Rate::BitsPerFrame(_) => Ok(bits / sequence.frames() as f64),
-        Rate::BitsPerPoint(_) => {
-            let mut points = 0;
-            for group in 0..sequence.groups() {
-                let group = sequence.group(group)?;
-                points += (0..group.len()).map(|at| group.frame_header(at).points).sum::<u64>();
-            }
-            Ok(bits / points.max(1) as f64)
-        }
+        Rate::BitsPerFrame(_) => Ok(bits / frames as f64),
+        Rate::BitsPerPoint(_) => Ok(bits / points.of(frames, cloud)?.max(1) as f64),
     }
 }

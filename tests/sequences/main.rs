@@ -111,7 +111,7 @@ fn a_sequence_does_not_depend_on_the_number_of_threads() {
 }
 
 #[test]
-fn only_frames_that_nothing_is_predicted_from_have_lossy_geometry() {
+fn frames_that_a_group_is_predicted_from_have_exact_geometry_above_the_clouds_own_level() {
     let encode = |predicted: bool, geometry| {
         let encoder = encoder()
             .with_group(2)
@@ -134,7 +134,12 @@ fn only_frames_that_nothing_is_predicted_from_have_lossy_geometry() {
         lossy.0,
         exact.0
     );
-    assert!(encode(true, GeometryTarget::Exact).1 == encode(true, GeometryTarget::Lambda(0.5)).1);
+    let (exact, moved) = (
+        encode(true, GeometryTarget::Exact),
+        encode(true, GeometryTarget::Lambda(0.5)),
+    );
+    assert!(exact.1 == moved.1);
+    assert!(moved.0 < exact.0, "{} and {} bytes", moved.0, exact.0);
     let alone = b2p::Encoder::new()
         .with_levels(3..=5)
         .with_geometry(GeometryTarget::Lambda(0.5));
@@ -147,6 +152,28 @@ fn only_frames_that_nothing_is_predicted_from_have_lossy_geometry() {
         .keys()
         .to_vec();
     assert!(alone == lossy.1, "as a single frame has");
+}
+
+#[test]
+fn at_the_clouds_own_level_voxels_of_all_frames_may_move_by_one() {
+    let encode = |geometry| {
+        let encoder = SequenceEncoder::new().with_levels(5..=8).with_geometry(geometry);
+        encoder.encode(3, |frame| Ok(still(frame)), |_| {}).expect("a sequence")
+    };
+    let (exact, moved) = (encode(GeometryTarget::Exact), encode(GeometryTarget::Lambda(0.5)));
+    let sizes = [moved.len(), exact.len()];
+    assert!(3 * sizes[0] < 2 * sizes[1], "{sizes:?} bytes");
+    let near = |keys: &[u64], key: u64| {
+        let at = morton::decode(key).map(|x| x as i32);
+        (0..27).any(|k| {
+            let place = [at[0] + k % 3 - 1, at[1] + k / 3 % 3 - 1, at[2] + k / 9 - 1];
+            place.iter().all(|x| *x >= 0) && keys.binary_search(&morton::encode(place.map(|x| x as u32))).is_ok()
+        })
+    };
+    let (first, _) = frame(&reader(&moved), 0, None).expect("a frame");
+    let cloud = still(0);
+    assert!(cloud.voxels.keys().iter().all(|key| near(&first, *key)));
+    assert!(first.iter().all(|key| near(cloud.voxels.keys(), *key)));
 }
 
 #[test]

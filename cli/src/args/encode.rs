@@ -67,7 +67,7 @@ pub struct Encode {
     pub lossless: bool,
     /// Geometry of the finest level. `exact`: its voxels as they are; `visual`: voxels may move by one where that saves
     /// bits and looks alike; a number from 0 to 100 is the Lagrangian λ of that, in squared voxels per bit [default:
-    /// visual; exact for the first frames of groups that are predicted]
+    /// visual; exact for first frames that others are predicted from, above level N]
     #[arg(long, help_heading = "Advanced", value_name = "exact|visual|X", value_parser = geometry, conflicts_with = "lossless")]
     pub geometry: Option<GeometryTarget>,
     /// How colours are coded

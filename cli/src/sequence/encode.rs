@@ -28,10 +28,14 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
     let inputs: Vec<_> = files.iter().map(PathBuf::as_path).collect();
     manners::permit(&[&args.output], &inputs)?;
     let (grid, axes) = grid(args, &files, limits, progress)?;
+    // Frames of the cloud's own level state their voxels, of which they may have more than the cloud.
+    let points: Vec<AtomicU64> = files.iter().map(|_| AtomicU64::new(0)).collect();
     let read = |frame: u64| -> b2p::Result<ColouredVoxels> {
         let path = &files[frame as usize];
         let found = cloud::read(path, &args.read, limits).map_err(|failure| Error::Usage(failure.0))?;
-        grid.voxelise(&found)
+        let cloud = grid.voxelise(&found)?;
+        points[frame as usize].store(cloud.voxels.len() as u64, Ordering::Relaxed);
+        Ok(cloud)
     };
     let count = files.len() as u64;
     let (timescale, duration) = args.sequence.rate();
@@ -70,13 +74,18 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
     if let Some(kept) = kept {
         kept.remove();
     }
-    Ok(said(args, &bytes, took, before, limits)?.beside(to))
+    let points: Vec<u64> = points.iter().map(|count| count.load(Ordering::Relaxed)).collect();
+    Ok(said(args, &bytes, &points, took, before, limits)?.beside(to))
 }
 
-/// What was written. `before` frames were coded by a run before.
-fn said(args: &Encode, bytes: &[u8], took: f64, before: u64, limits: &Limits) -> Result<Said> {
+/// What was written. `points` are those of each frame's cloud, 0 where it was not read; `before` frames were coded by a
+/// run before.
+fn said(args: &Encode, bytes: &[u8], points: &[u64], took: f64, before: u64, limits: &Limits) -> Result<Said> {
     let sequence = SequenceReader::new(bytes, limits)?;
-    let points = super::info::points(&sequence)?;
+    let points = match points.contains(&0) {
+        true => super::info::points(&sequence)?,
+        false => points.iter().sum(),
+    };
     let bits = bytes.len() as f64 * 8.0;
     let (frames, groups, rate) = (sequence.frames(), sequence.groups(), sequence.frame_rate());
     let per_point = bits / points.max(1) as f64;

@@ -29,6 +29,9 @@ const FLOOR: f32 = 0.06;
 const PLACE: f32 = 3000.0;
 /// Bits of a voxel that is not where it is predicted.
 const CHANGED_BITS: f32 = 3.0;
+/// What a voxel that is displaced by one costs, if it stays, as a share of what it costs to code it: at levels above the
+/// cloud's own one, and at that one. It may be chance, but roughens the surface, more from frame to frame.
+const ROUGH: [f32; 2] = [0.5, 0.75];
 /// Bits of a voxel that is as it is predicted, in a block that is not kept: of its place and colour.
 const STEADY_BITS: f32 = 0.5;
 /// The square of a sum of displacements that chance alone brings, for each voxel that is displaced.
@@ -44,12 +47,15 @@ pub(super) struct Weights {
     pub lambda: f32,
     /// Mean squared error up to which coefficients are not coded.
     pub floor: f32,
+    /// What a voxel costs that is displaced by one, as a share of what it costs to code it.
+    pub rough: f32,
 }
 
 impl Weights {
-    /// Those of a quantisation step of luma, in 255ths.
-    pub fn of_step(step: f32) -> Self {
+    /// Those of a quantisation step of luma, in 255ths, at the cloud's `own` level or one above it.
+    pub fn of_step(step: f32, own: bool) -> Self {
         Weights {
+            rough: ROUGH[usize::from(own)],
             lambda: LAMBDA * step * step,
             floor: FLOOR * step * step,
         }
@@ -129,8 +135,8 @@ impl Cell {
     /// Chooses what is shown. Returns the Lagrangian costs of a copy, and of the choice.
     fn choose(&mut self, weights: Weights) -> [f32; 2] {
         // Both frames' voxels are counted.
-        let drift = PLACE * self.drift() / 2.0;
         let changed = weights.lambda * CHANGED_BITS;
+        let drift = PLACE * self.drift() / 2.0 + weights.rough * changed * self.near;
         let copy = drift + PLACE * self.far;
         let mend = drift + changed * self.far;
         let own = changed * (self.far + self.near);
@@ -422,7 +428,7 @@ mod tests {
 
     #[test]
     fn what_chance_explains_costs_nothing_and_changes_nothing() {
-        let weights = Weights::of_step(8.0);
+        let weights = Weights::of_step(8.0, false);
         let cell = |shift: f32| {
             let mut cell = Cell {
                 chance: 50.0,

@@ -8,14 +8,15 @@ use rayon::prelude::*;
 use super::choice::{self, Shown, Weights};
 use super::motion::{Block, Search};
 use super::noise;
+use super::shape::points_in_children;
 use super::{EncoderInput, Guides, Options, choose_levels, octree_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth, Ycc, trunk_depth};
 use crate::error::Result;
-use crate::geometry::{Octree, Voxels};
+use crate::geometry::{Octree, Voxels, codec};
 use crate::log::Log;
 use crate::motion::moved::{self, REACH};
-use crate::motion::{Blocks, Head, Inter, Mode, Modes, Previous, own};
+use crate::motion::{Blocks, GeometryGuide, Head, Inter, Mode, Modes, Previous, own};
 
 /// A coded frame that is predicted from the frame before.
 #[derive(Debug)]
@@ -54,7 +55,8 @@ pub fn encode_predicted(
     let trunk = trunk_depth(base, |level| octree.level(level).len());
     let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, trunk, top, steps.is_lossless());
     let block_level = block_level(base, top);
-    let target = Target::new(cloud, &octree, &truth, previous, [base, block_level, top], steps)?;
+    let isa = options.isa.unwrap_or_else(Isa::detect);
+    let mut target = Target::new(cloud, &octree, &truth, previous, [base, block_level, top], steps)?;
     let head = Head {
         block_level,
         unit_level: top,
@@ -78,6 +80,12 @@ pub fn encode_predicted(
         plan => plan?,
     };
     let inter = Inter::of(Arc::clone(previous), plan.head, plan.blocks.clone(), base);
+    let own = top == cloud.voxels.depth();
+    let lambda = options.geometry.lambda(steps, own, true);
+    if lambda > 0 && top > trunk {
+        let guide = inter.geometry(&target.octree, top)?;
+        target.move_voxels(cloud, &guide, lambda, options.slice_voxels as usize, isa, trunk)?;
+    }
     let guides = Guides {
         geometry: (1..=top)
             .map(|n| inter.geometry(&target.octree, n))
@@ -88,14 +96,14 @@ pub fn encode_predicted(
     };
     let count = target.octree.level(top).len() as u64;
     // At level N the points are its voxels, and kept blocks may have others than the cloud.
-    let points = match top == cloud.voxels.depth() {
+    let points = match own {
         true => count,
         false => count.max(cloud.voxels.len() as u64),
     };
     let subject = EncoderInput {
         cloud,
         options,
-        isa: options.isa.unwrap_or_else(Isa::detect),
+        isa,
         levels,
         octree: Octree::root(),
         maps: Vec::new(),
@@ -153,7 +161,7 @@ impl Target {
             top,
             block_level,
         };
-        let weights = Weights::of_step(steps.luma_step());
+        let weights = Weights::of_step(steps.luma_step(), top == cloud.voxels.depth());
         let mut blocks = search.blocks(weights);
         let choose = |block: &mut Block| match lossless {
             true => choice::own(&search, block),
@@ -198,6 +206,39 @@ impl Target {
             block_level,
             lossless,
         })
+    }
+
+    /// Moves voxels of the finest level by one where that saves bits (`codec::optimise_level`). What is skipped stays.
+    fn move_voxels(
+        &mut self,
+        cloud: &ColouredVoxels,
+        guide: &GeometryGuide,
+        lambda: u32,
+        slice: usize,
+        isa: Isa,
+        trunk: u8,
+    ) -> Result<()> {
+        let top = self.top;
+        let points = points_in_children(cloud, &self.octree, top);
+        let distortion = codec::Distortion {
+            points: &points,
+            lambda,
+        };
+        let map = self.octree.kernel_map(top - 1);
+        let guide = Some(guide.guide());
+        let (masks, _) = codec::optimise_level(isa, &self.octree, &map, top, slice, distortion, guide);
+        let mut octree = self.octree.truncated(top - 1);
+        octree.grow(masks)?;
+        let (before, colours) = (self.octree.level(top).keys(), self.truth.level(top));
+        let own = Truth::finest(&cloud.voxels, &cloud.colours, &octree, top, false);
+        let keys = octree.level(top).keys().iter();
+        let values = keys.zip(own).map(|(key, own)| match before.binary_search(key) {
+            Ok(i) => colours[i],
+            Err(_) => own,
+        });
+        self.truth = Truth::of_values(&octree, trunk, top, values.collect(), false);
+        self.octree = octree;
+        Ok(())
     }
 
     /// Chooses the modes of all levels.

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::EncoderInput;
+use crate::cloud::ColouredVoxels;
 use crate::colour::Steps;
 use crate::error::Result;
 use crate::geometry::{KernelMap, Octree, codec};
@@ -29,15 +30,19 @@ const LAMBDA: f32 = 4.2e-5;
 /// The greatest λ that follows from a step. Greater ones roughen smooth surfaces: at 0.25 a statue lost 13 SSIMULACRA2.
 const MOST_LAMBDA: f32 = 0.125;
 
+/// How many times as great λ is in predicted frames: steps of 34 gain as much from the greatest λ as steps of 68.
+const PREDICTED: f32 = 2.5;
+
 /// λ of the cloud's own level in steps of one 255th, and the greatest. Much of what is coded there is noise of rounding,
 /// without which pictures are better (`docs/measurements.md`, "Lossy geometry").
 const OWN_LAMBDA: f32 = 1.0 / 80.0;
 const MOST_OWN_LAMBDA: f32 = 0.5;
 
 impl GeometryTarget {
-    /// λ in units of 1/256, of the cloud's `own` level or one above it.
-    fn lambda(self, steps: Steps, own: bool) -> u32 {
+    /// λ in units of 1/256, of the cloud's `own` level or one above it, in a frame that is coded by itself or `predicted`.
+    pub(super) fn lambda(self, steps: Steps, own: bool, predicted: bool) -> u32 {
         let step = steps.luma_step();
+        let scale = if predicted { PREDICTED } else { 1.0 };
         let lambda = match self {
             _ if steps.is_lossless() => 0.0,
             GeometryTarget::Exact => 0.0,
@@ -45,7 +50,7 @@ impl GeometryTarget {
             GeometryTarget::Visual => {
                 let lambda = match own {
                     true => (OWN_LAMBDA * step).min(MOST_OWN_LAMBDA),
-                    false => (LAMBDA * step.powi(2)).min(MOST_LAMBDA),
+                    false => (scale * LAMBDA * step.powi(2)).min(MOST_LAMBDA),
                 };
                 ((4.0 * lambda.log2()).round() / 4.0).exp2()
             }
@@ -71,7 +76,7 @@ impl EncoderInput<'_> {
         let own = top == self.cloud.voxels.depth();
         match self.options.geometry {
             GeometryTarget::Visual if own && self.sparse => 0,
-            geometry => geometry.lambda(steps, own),
+            geometry => geometry.lambda(steps, own, false),
         }
     }
 
@@ -83,14 +88,14 @@ impl EncoderInput<'_> {
         }
         let count = self.octree.level(top).len();
         log.step("shape", count, "voxels", || {
-            let points = self.points(top);
+            let points = points_in_children(self.cloud, &self.octree, top);
             let (level, slice) = (usize::from(top), self.options.slice_voxels as usize);
             let distortion = codec::Distortion {
                 points: &points,
                 lambda,
             };
             let above = &self.maps[level - 1];
-            let (masks, geometry) = codec::optimise_level(self.isa, &self.octree, above, top, slice, distortion);
+            let (masks, geometry) = codec::optimise_level(self.isa, &self.octree, above, top, slice, distortion, None);
             let mut octree = self.octree.truncated(top - 1);
             octree.grow(masks)?;
             Ok(Some(Arc::new(Shape {
@@ -109,22 +114,25 @@ impl EncoderInput<'_> {
             None => Cow::Borrowed(&self.maps[usize::from(top)]),
         }
     }
+}
 
-    /// For each voxel of a level, which of its children hold points; nothing is known about those of the cloud's own level,
-    /// where any may.
-    fn points(&self, level: u8) -> Vec<u8> {
-        let voxels = &self.cloud.voxels;
-        let deeper = self.cloud.voxels.depth() - level;
-        if deeper == 0 {
-            return vec![u8::MAX; self.octree.level(level).len()];
-        }
-        let shift = 3 * deeper;
-        let mask = |key: &u64| {
-            let inside = voxels.keys()[voxels.within(*key, shift)].iter();
-            inside.fold(0, |mask, k| mask | 1 << (k >> (shift - 3) & 7))
-        };
-        self.octree.level(level).keys().par_iter().map(mask).collect()
+/// For each voxel of a level of `octree`, which of its children hold points of the cloud. Nothing is known of voxels of
+/// the cloud's own level and of those that hold none of its points: any child may.
+pub(super) fn points_in_children(cloud: &ColouredVoxels, octree: &Octree, level: u8) -> Vec<u8> {
+    let (voxels, keys) = (&cloud.voxels, octree.level(level).keys());
+    let deeper = voxels.depth() - level;
+    if deeper == 0 {
+        return vec![u8::MAX; keys.len()];
     }
+    let shift = 3 * deeper;
+    let mask = |key: &u64| {
+        let inside = voxels.keys()[voxels.within(*key, shift)].iter();
+        match inside.fold(0, |mask, k| mask | 1 << (k >> (shift - 3) & 7)) {
+            0 => u8::MAX,
+            mask => mask,
+        }
+    };
+    keys.par_iter().map(mask).collect()
 }
 
 impl Shape {

@@ -125,6 +125,13 @@ impl Refiner {
         }
     }
 
+    /// The refined probability alone, in units of 2⁻¹⁶.
+    #[cfg(feature = "encoder")]
+    #[inline(always)]
+    pub fn probability(&self, window: u64, octant: usize, coded: u8, logit: i32) -> u32 {
+        self.predict(window, octant, coded, logit).one
+    }
+
     /// Codes a child with the refined probability, and adapts.
     #[inline(always)]
     pub fn code(

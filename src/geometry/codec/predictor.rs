@@ -161,6 +161,7 @@ impl<I: Instructions> Predictor<I> {
         occupancies: &[u8],
         surface: &Surface,
         lambda: u32,
+        window: Option<u64>,
     ) -> u8 {
         let lengths = optimise::code_lengths();
         let (features, contexts) = self.gather(neighbours, row, first, occupancies);
@@ -181,7 +182,7 @@ impl<I: Instructions> Predictor<I> {
                     step(true, 0);
                     continue;
                 }
-                let one = self.probability(&features, &candidate.contexts, octant, candidate.mask);
+                let one = self.probability(&features, &candidate.contexts, octant, candidate.mask, window);
                 step(truth, optimise::bits(lengths, one, truth));
                 let other = optimise::bits(lengths, one, !truth);
                 if optimise::may_differ(other) {
@@ -198,14 +199,22 @@ impl<I: Instructions> Predictor<I> {
     /// The probability, in units of 2⁻¹⁶, of the child in `octant`. `coded` are the children in lower octants.
     #[cfg(feature = "encoder")]
     #[inline(always)]
-    fn probability(&self, features: &Row, contexts: &Contexts, octant: usize, coded: u8) -> u32 {
+    fn probability(&self, features: &Row, contexts: &Contexts, octant: usize, coded: u8, window: Option<u64>) -> u32 {
         let node = 1 << octant | usize::from(coded);
         let row = self.network.node(node);
         let sum = hidden::sum(self.instructions, features, row, &self.output[octant]);
         let logit = (self.bias[octant].wrapping_add(sum) >> SHIFT).clamp(-LIMIT, LIMIT);
-        match logit.abs() < CERTAIN {
-            true => self.mixer.predict(logit, contexts.hashes(octant, node)).one,
-            false => squash(logit),
+        let refiner = window.and_then(|window| Some((window, self.refiner.as_ref()?)));
+        if logit.abs() >= CERTAIN {
+            return match refiner {
+                None => squash(logit),
+                Some((window, refiner)) => refiner.probability(window, octant, coded, logit),
+            };
+        }
+        let mixed = self.mixer.predict(logit, contexts.hashes(octant, node));
+        match refiner {
+            None => mixed.one,
+            Some((window, refiner)) => refiner.probability(window, octant, coded, mixed.logit()),
         }
     }
 }

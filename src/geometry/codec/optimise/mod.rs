@@ -25,6 +25,7 @@ use rayon::prelude::*;
 
 use super::coder::Encoder;
 use super::contexts::CELLS;
+use super::guide::Guide;
 use super::neighbourhood::Neighbourhood;
 use super::predictor::Predictor;
 use super::{count, slices};
@@ -45,8 +46,9 @@ pub struct Distortion<'a> {
     pub lambda: u32,
 }
 
-/// Chooses and encodes the occupancies of the parents of level `level`, which `octree` has as they truly are. Returns
-/// them, and for each slice what [`encode_level`](super::encode_level) does. The result depends neither on `isa` nor on
+/// Chooses and encodes the occupancies of the parents of level `level`, which `octree` has as they truly are. `guide` is
+/// what a previous frame tells of the level; parents that it skips have the children of their windows. Returns the
+/// occupancies, and for each slice what [`encode_guided`](super::encode_guided) does. The result depends neither on `isa` nor on
 /// the number of threads.
 ///
 /// # Panics
@@ -59,6 +61,7 @@ pub fn optimise_level(
     level: u8,
     slice: usize,
     distortion: Distortion<'_>,
+    guide: Option<Guide<'_>>,
 ) -> (Vec<u8>, Vec<(u32, Vec<u8>)>) {
     let truth = octree.occupancy(level - 1);
     assert_eq!(map.len(), truth.len(), "one kernel map row per parent");
@@ -75,6 +78,7 @@ pub fn optimise_level(
             truth,
             first_child: octree.first_child(level - 1),
             distortion,
+            guide,
         })
     };
     let coded: Vec<(Vec<u8>, Vec<u8>)> = ranges.into_par_iter().map(optimise).collect();
@@ -94,6 +98,7 @@ struct Optimise<'a> {
     truth: &'a [u8],
     first_child: &'a [u32],
     distortion: Distortion<'a>,
+    guide: Option<Guide<'a>>,
 }
 
 impl Work for Optimise<'_> {
@@ -107,11 +112,19 @@ impl Work for Optimise<'_> {
             truth,
             first_child,
             distortion,
+            guide,
         } = self;
-        let (mut predictor, mut encoder) = (Predictor::new(instructions, parents.len(), false), Encoder::new());
+        let mut predictor = Predictor::new(instructions, parents.len(), guide.is_some());
+        let mut encoder = Encoder::new();
         let neighbourhoods = Neighbourhood::of_all(map, &parents);
         let mut masks: Vec<u8> = Vec::with_capacity(parents.len());
         for (parent, neighbourhood) in parents.clone().zip(neighbourhoods) {
+            let skipped = guide.map_or(0, |guide| guide.skipped(parent));
+            if skipped != 0 {
+                masks.push(skipped);
+                continue;
+            }
+            let window = guide.and_then(|guide| guide.window(parent));
             let (row, first) = (map.row(parent), parents.start);
             let points = |parent: usize| &distortion.points[first_child[parent] as usize..];
             let mut surface = Surface::new(truth[parent], points(parent));
@@ -124,8 +137,8 @@ impl Work for Optimise<'_> {
                 surface.add(k, truth[neighbour], coded, points(neighbour));
             }
             surface.finish();
-            let chosen = predictor.choose(neighbourhood, row, first, &masks, &surface, distortion.lambda);
-            predictor.code(&mut encoder, neighbourhood, row, first, &masks, chosen, None);
+            let chosen = predictor.choose(neighbourhood, row, first, &masks, &surface, distortion.lambda, window);
+            predictor.code(&mut encoder, neighbourhood, row, first, &masks, chosen, window);
             masks.push(chosen);
         }
         (masks, encoder.finish())

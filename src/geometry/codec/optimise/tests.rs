@@ -3,7 +3,8 @@ use proptest::prelude::*;
 use super::*;
 use crate::cancel::Cancel;
 use crate::container::Slice;
-use crate::geometry::codec::{decode_level, encode_level};
+use crate::geometry::codec::guide::{Mode, own};
+use crate::geometry::codec::{decode_masks, encode_guided, encode_level};
 use crate::geometry::{Voxels, morton};
 use crate::testing::Random;
 
@@ -29,13 +30,18 @@ fn points(octree: &Octree, level: u8) -> Vec<u8> {
 
 /// The level optimised with this λ, in slices of 1000, and the octree that it decodes to.
 fn optimised(octree: &Octree, level: u8, lambda: u32) -> (Vec<(u32, Vec<u8>)>, Octree) {
+    guided(octree, level, lambda, None)
+}
+
+/// The same with what a previous frame tells.
+fn guided(octree: &Octree, level: u8, lambda: u32, guide: Option<Guide>) -> (Vec<(u32, Vec<u8>)>, Octree) {
     let map = octree.kernel_map(level - 1);
     let points = points(octree, level);
     let distortion = Distortion {
         points: &points,
         lambda,
     };
-    let (masks, encoded) = optimise_level(Isa::detect(), octree, &map, level, 1000, distortion);
+    let (masks, encoded) = optimise_level(Isa::detect(), octree, &map, level, 1000, distortion, guide);
     let slices: Vec<_> = encoded
         .iter()
         .map(|(voxels, bytes)| Slice {
@@ -45,8 +51,9 @@ fn optimised(octree: &Octree, level: u8, lambda: u32) -> (Vec<(u32, Vec<u8>)>, O
         })
         .collect();
     let mut decoded = octree.truncated(level - 1);
-    decode_level(Isa::detect(), &mut decoded, &map, &slices, 1000, &Cancel::default()).unwrap();
-    assert_eq!(decoded.occupancy(level - 1), masks);
+    let found = decode_masks(Isa::detect(), level, &map, &slices, 1000, guide, &Cancel::default()).unwrap();
+    assert_eq!(found, masks);
+    decoded.grow(found).unwrap();
     (encoded, decoded)
 }
 
@@ -101,10 +108,63 @@ fn every_number_of_threads_and_every_instruction_set_give_the_same_bytes() {
     };
     for isa in Isa::available() {
         assert_eq!(
-            optimise_level(isa, &octree, &map, 7, 1000, distortion).1,
+            optimise_level(isa, &octree, &map, 7, 1000, distortion, None).1,
             one.0,
             "{isa}"
         );
+    }
+}
+
+/// The plane with other noise, and its windows as a previous frame would have them; every eleventh parent is skipped if
+/// its window has the children that it has.
+fn windows_of_other_noise(octree: &Octree) -> (Vec<Mode>, Vec<u64>) {
+    let before = Octree::new(Voxels::new(7, {
+        let moved = |key: &u64| {
+            let [x, y, z] = morton::decode(*key);
+            morton::encode([x, y, z + u32::from(key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 62 == 0)])
+        };
+        octree.level(7).keys().iter().map(moved).collect()
+    }))
+    .unwrap();
+    let there = |at: [i32; 3]| {
+        let key = morton::encode(at.map(|x| x as u32));
+        at.iter().all(|x| (0..128).contains(x)) && before.level(7).keys().binary_search(&key).is_ok()
+    };
+    let window = |parent: usize| {
+        let first = octree.level(6).coordinate(parent).map(|x| 2 * x as i32 - 1);
+        (0..64).fold(0u64, |window, cell| {
+            let at = [0, 1, 2].map(|axis| first[axis] + (cell >> (2 * axis) & 3));
+            window | u64::from(there(at)) << cell
+        })
+    };
+    let windows: Vec<u64> = (0..octree.level(6).len()).map(window).collect();
+    let masks = octree.occupancy(6).iter().zip(&windows).enumerate();
+    let modes = masks.map(|(i, (mask, window))| match i % 11 == 0 && own(*window) == *mask {
+        true => Mode::Skip,
+        false => Mode::Inter,
+    });
+    (modes.collect(), windows)
+}
+
+#[test]
+fn what_a_previous_frame_tells_saves_bits_and_skipped_parents_keep_their_children() {
+    let octree = noisy_plane();
+    let (modes, windows) = windows_of_other_noise(&octree);
+    let guide = Guide {
+        modes: &modes,
+        windows: &windows,
+    };
+    let exact = encode_guided(Isa::detect(), &octree, &octree.kernel_map(6), 7, 1000, Some(guide));
+    assert_eq!(guided(&octree, 7, 0, Some(guide)), (exact, octree.clone()));
+    for lambda in [8, 32] {
+        let (alone, with) = (optimised(&octree, 7, lambda), guided(&octree, 7, lambda, Some(guide)));
+        let sizes = [&alone.0, &with.0].map(|coded| size(coded));
+        assert!(4 * sizes[1] < 3 * sizes[0], "{sizes:?}");
+        assert!(is_near(with.1.level(7), octree.level(7)) && is_near(octree.level(7), with.1.level(7)));
+        for (i, mode) in modes.iter().enumerate() {
+            let masks = [&octree, &with.1].map(|octree| octree.occupancy(6)[i]);
+            assert!(*mode != Mode::Skip || masks[0] == masks[1], "parent {i}");
+        }
     }
 }
 
