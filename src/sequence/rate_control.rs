@@ -19,9 +19,9 @@ pub enum Rate {
 
 /// Frames that are tried: the first ones.
 const TRIAL: u64 = 4;
-/// The coarsest step that a level is tried with, in eighths of an octave above half of a 255th: 64 255ths; 38 for the
-/// cloud's own level, whose geometry takes most (`docs/sequences.md`, "What was tried").
-const COARSEST: [i32; 2] = [56, 50];
+/// The coarsest step that a level is tried with, in eighths of an octave above half of a 255th: 64 255ths; 45 for the
+/// cloud's own level, whose geometry takes most (`docs/sequences.md`, "Measured").
+const COARSEST: [i32; 2] = [56, 52];
 /// Steps that are tried until all frames fit.
 const CORRECTIONS: usize = 8;
 
