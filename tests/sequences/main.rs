@@ -177,6 +177,26 @@ fn at_the_clouds_own_level_voxels_of_all_frames_may_move_by_one() {
 }
 
 #[test]
+fn sparse_clouds_keep_their_own_level_in_predicted_frames_too() {
+    let encode = |one_in: u64, geometry| {
+        let cloud = |frame: u64| {
+            let whole = still(frame);
+            let pairs = whole.voxels.keys().iter().zip(&whole.colours);
+            let kept: Vec<_> = pairs.filter(|(key, _)| mixed(**key).is_multiple_of(one_in)).collect();
+            Ok(ColouredVoxels {
+                voxels: Voxels::new(8, kept.iter().map(|pair| *pair.0).collect()),
+                colours: kept.iter().map(|pair| *pair.1).collect(),
+                placement: whole.placement,
+            })
+        };
+        let encoder = SequenceEncoder::new().with_levels(5..=8).with_geometry(geometry);
+        encoder.encode(2, cloud, |_| {}).expect("a sequence")
+    };
+    assert!(encode(8, GeometryTarget::Visual) == encode(8, GeometryTarget::Exact));
+    assert!(encode(1, GeometryTarget::Visual) != encode(1, GeometryTarget::Exact));
+}
+
+#[test]
 fn frames_are_found_by_their_time() {
     let encoder = encoder().with_frame_rate(30_000, 1001);
     let bytes = encoder

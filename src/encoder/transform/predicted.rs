@@ -6,10 +6,11 @@ use b2p_kernels::Isa;
 use rayon::prelude::*;
 
 use super::choice::{self, Shown, Weights};
+use super::head_maps;
 use super::motion::{Block, Search};
 use super::noise;
 use super::shape::points_in_children;
-use super::{EncoderInput, Guides, Options, choose_levels, octree_of};
+use super::{EncoderInput, GeometryTarget, Guides, Options, choose_levels, octree_of};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth, Ycc, trunk_depth};
 use crate::error::Result;
@@ -81,7 +82,11 @@ pub fn encode_predicted(
     };
     let inter = Inter::of(Arc::clone(previous), plan.head, plan.blocks.clone(), base);
     let own = top == cloud.voxels.depth();
-    let lambda = options.geometry.lambda(steps, own, true);
+    let lambda = match options.geometry {
+        // As in frames that are coded by themselves.
+        GeometryTarget::Visual if own && head_maps::is_sparse(cloud)? => 0,
+        geometry => geometry.lambda(steps, own, true),
+    };
     if lambda > 0 && top > trunk {
         let guide = inter.geometry(&target.octree, top)?;
         target.move_voxels(cloud, &guide, lambda, options.slice_voxels as usize, isa, trunk)?;
