@@ -48,7 +48,7 @@ macro_rules! four {
 pub(crate) use four;
 
 /// As [`three`].
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64", target_feature = "simd128"))]
 macro_rules! five {
     ($i:ident => $e:expr) => {{
         let [a, b, c, d] = $crate::simd::macros::four!($i => $e);
@@ -56,7 +56,7 @@ macro_rules! five {
         [a, b, c, d, $e]
     }};
 }
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64", target_feature = "simd128"))]
 pub(crate) use five;
 
 /// Names the features of an instruction set, once: defines a token that can only be had where the processor has them,
@@ -166,7 +166,7 @@ pub(crate) use feature_macro;
 
 /// Implements a trait of vectors by functions that are compiled with the features of an instruction set. Their bodies
 /// are safe code.
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64", target_feature = "simd128"))]
 macro_rules! methods {
     ($with:ident $vector:ident: $trait:path {
         $(type $output:ident = $output_type:ty;)*
@@ -187,16 +187,17 @@ macro_rules! methods {
             fn $name($first $(: $first_ty)? $(, $arg: $ty)*) $(-> $out)? {
                 // SAFETY: among the arguments is the set's token, or a vector, which is only made from the token or
                 // other vectors.
+                #[allow(unused_unsafe, reason = "WebAssembly's features are those of the module")]
                 unsafe { <$vector>::$name($first $(, $arg)*) }
             })*
         }
     };
 }
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64", target_feature = "simd128"))]
 pub(crate) use methods;
 
 /// Implements operators that are one instruction each.
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64", target_feature = "simd128"))]
 macro_rules! operators {
     ($vector:ident: $($operator:ident::$name:ident = $instruction:ident),* $(,)?) => {
         $(impl std::ops::$operator for $vector {
@@ -205,10 +206,11 @@ macro_rules! operators {
             #[inline(always)]
             fn $name(self, other: Self) -> Self {
                 // SAFETY: a vector is only made from the set's token or other vectors.
+                #[allow(unused_unsafe, reason = "WebAssembly's features are those of the module")]
                 Self(unsafe { $instruction(self.0, other.0) })
             }
         })*
     };
 }
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64", target_feature = "simd128"))]
 pub(crate) use operators;

@@ -1,8 +1,8 @@
 //! The SIMD vocabulary: instruction sets, tokens that prove them, and vectors.
 //!
 //! - [`Isa`] names an instruction set of this machine. It is chosen once, at run time.
-//! - A **token** ([`Scalar`], `Avx2`, `Avx512`, `Neon`) is a value without size that exists only where the processor
-//!   has that instruction set. It implements [`Simd`], which names the vector types of the set.
+//! - A **token** ([`Scalar`], `Avx2`, `Avx512`, `Neon`, `Simd128`) is a value without size that exists only where the
+//!   processor has that instruction set. It implements [`Simd`], which names the vector types of the set.
 //! - A vector is made from a token or from other vectors, so owning one proves the instruction set too. All operations
 //!   are safe.
 //! - [`Isa::run`], or the macro `dispatch!` in this crate, turns an [`Isa`] into a token: it calls a body that is
@@ -27,6 +27,7 @@ macro_rules! instruction_sets {
             [target_arch = "x86_64"] avx2::Avx2, with_avx2;
             [target_arch = "x86_64"] avx512::Avx512, with_avx512;
             [target_arch = "aarch64"] neon::Neon, with_neon;
+            [target_feature = "simd128"] simd128::Simd128, with_simd128;
         }
     };
 }
@@ -45,6 +46,8 @@ pub(crate) mod macros;
 pub(crate) mod neon;
 mod prefetch;
 pub(crate) mod scalar;
+#[cfg(target_feature = "simd128")]
+pub(crate) mod simd128;
 #[cfg(test)]
 mod tests;
 pub(crate) mod vector;

@@ -269,7 +269,7 @@ pub(crate) const LEAST_EXPONENT: f32 = -126.0;
 pub(super) const ROUND: f32 = 12_582_912.0;
 
 /// The polynomial by Horner's rule, the highest coefficient first.
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64", target_feature = "simd128"))]
 #[inline(always)]
 pub(super) fn polynomial<S: Simd>(x: S::F32, coefficients: [S::F32; 5]) -> S::F32 {
     let mut p = coefficients[0];
