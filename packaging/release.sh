@@ -38,7 +38,7 @@ packaging/licences.sh
 
 # The page is part of the program.
 if web/build.sh; then
-    cp web/b2p.wasm "$out/"
+    cp web/b2p*.wasm "$out/"
     if command -v npm > /dev/null; then
         (cd web && npm pack --silent --pack-destination "../$out")
     else

@@ -3,7 +3,7 @@
 #
 #     tests/targets.sh [wasm32|armv7|s390x|riscv64|riscv64v …]    all of them by default
 #
-# wasm32  WebAssembly with SIMD, in Node: 32-bit addresses, no threads (and no kernels' tests, which are about panics too)
+# wasm32  WebAssembly with SIMD, in Node: 32-bit addresses, no threads (the kernels' tests are in web/test.sh)
 # armv7   32-bit ARM with NEON, whose vectors flush subnormal floats to zero, under QEMU: 32-bit addresses
 # s390x   IBM Z, under QEMU: big-endian
 # riscv64 RISC-V (rv64gc), under QEMU: NaNs of arithmetic have one canonical form

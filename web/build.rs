@@ -1,4 +1,4 @@
-//! Compresses the WebAssembly module for the page, if `web/build.sh` has built it.
+//! Compresses the WebAssembly modules for the page, if `web/build.sh` has built them.
 
 use std::error::Error;
 use std::io::Write;
@@ -8,18 +8,20 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let module = Path::new("b2p.wasm");
-    println!("cargo::rerun-if-changed={}", module.display());
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
-    let expression = match module.exists() {
-        false => "None".to_owned(),
-        true => {
-            let mut gzip = GzEncoder::new(Vec::new(), Compression::best());
-            gzip.write_all(&std::fs::read(module)?)?;
-            std::fs::write(out.join("b2p.wasm.gz"), gzip.finish()?)?;
-            "Some(include_bytes!(\"b2p.wasm.gz\"))".to_owned()
-        }
-    };
-    std::fs::write(out.join("module.rs"), expression)?;
+    for name in ["b2p", "b2p-threads"] {
+        let module = format!("{name}.wasm");
+        println!("cargo::rerun-if-changed={module}");
+        let expression = match Path::new(&module).exists() {
+            false => "None".to_owned(),
+            true => {
+                let mut gzip = GzEncoder::new(Vec::new(), Compression::best());
+                gzip.write_all(&std::fs::read(&module)?)?;
+                std::fs::write(out.join(format!("{module}.gz")), gzip.finish()?)?;
+                format!("Some(include_bytes!(\"{module}.gz\"))")
+            }
+        };
+        std::fs::write(out.join(format!("{name}.rs")), expression)?;
+    }
     Ok(())
 }

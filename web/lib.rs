@@ -21,16 +21,23 @@ macro_rules! files {
     };
 }
 
-/// All files but the WebAssembly module.
+/// All files but the WebAssembly modules.
 pub const FILES: &[PageFile] = files![
     "index.html": HTML,
     "src/b2p.js": SCRIPT,
     "src/controls.js": SCRIPT,
+    "src/error.js": SCRIPT,
     "src/page.js": SCRIPT,
     "src/playing.js": SCRIPT,
+    "src/system.js": SCRIPT,
+    "src/thread.js": SCRIPT,
+    "src/threads.js": SCRIPT,
     "src/viewer.js": SCRIPT,
     "src/worker.js": SCRIPT,
 ];
 
 /// The WebAssembly module `b2p.wasm`, compressed by gzip, if it was built (`web/build.sh`) before this crate.
-pub const MODULE_GZIP: Option<&[u8]> = include!(concat!(env!("OUT_DIR"), "/module.rs"));
+pub const MODULE_GZIP: Option<&[u8]> = include!(concat!(env!("OUT_DIR"), "/b2p.rs"));
+
+/// As [`MODULE_GZIP`], `b2p-threads.wasm`: the module with threads, for pages that are isolated from other origins.
+pub const THREADS_GZIP: Option<&[u8]> = include!(concat!(env!("OUT_DIR"), "/b2p-threads.rs"));

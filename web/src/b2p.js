@@ -3,6 +3,12 @@
 // The module is the C interface (capi/include/b2p.h) compiled for WASI. Sizes and offsets of its structs below are those
 // of 32-bit addresses.
 
+import { B2pError } from "./error.js";
+import { system } from "./system.js";
+import { Threads, cores, sharedMemory, usesThreads } from "./threads.js";
+
+export { B2pError };
+
 const STATUS = [
   "ok", "io", "truncated", "checksum", "model", "determinism", "limit", "unsupported", "malformed", "cancelled",
   "usage", "internal",
@@ -16,81 +22,53 @@ function headsNumber(heads) {
   throw new B2pError("usage", `no heads \`${heads}\`, but ${Object.keys(HEADS).join(", ")}`);
 }
 
-/** What a stream or an argument is refused for. `kind` is one of the statuses of the C interface, in lower case. */
-export class B2pError extends Error {
-  constructor(kind, message) {
-    super(message);
-    this.name = "B2pError";
-    this.kind = kind;
-  }
-}
-
-/** The few calls of WASI that the library makes: a clock, chance, and messages of defects. There are no files. */
-function system(memory, report) {
-  const BADF = 8;
-  const view = () => new DataView(memory().buffer);
-  const none = () => BADF;
-  let line = "";
-  return {
-    environ_sizes_get: (count, size) => (view().setUint32(count, 0, true), view().setUint32(size, 0, true), 0),
-    environ_get: () => 0,
-    clock_time_get: (_clock, _precision, to) => {
-      view().setBigUint64(to, BigInt(Math.round(performance.now() * 1e6)), true);
-      return 0;
-    },
-    // Chance for the keys of hash tables: 65,536 bytes at most are given at a time.
-    random_get: (to, length) => {
-      crypto.getRandomValues(new Uint8Array(memory().buffer, to, length));
-      return 0;
-    },
-    fd_write: (_file, vectors, count, written) => {
-      let total = 0;
-      for (let i = 0; i < count; i++) {
-        const at = view().getUint32(vectors + 8 * i, true);
-        const length = view().getUint32(vectors + 8 * i + 4, true);
-        line += new TextDecoder().decode(new Uint8Array(memory().buffer, at, length));
-        total += length;
-      }
-      const lines = line.split("\n");
-      line = lines.pop();
-      lines.forEach(report);
-      view().setUint32(written, total, true);
-      return 0;
-    },
-    sched_yield: () => 0,
-    proc_exit: (code) => {
-      throw new B2pError("internal", `the library ended with ${code}`);
-    },
-    fd_close: none, fd_fdstat_get: none, fd_filestat_get: none, fd_prestat_get: none, fd_prestat_dir_name: none,
-    fd_read: none, path_open: none,
-  };
-}
-
 /** The library. One instance has one memory; after an `internal` error it must not be used any more. */
 export class B2p {
   #exports;
+  #threads;
   #message;
 
-  /** From a `Response`, its promise, bytes, or a compiled module. */
-  static async load(source, { report = console.error } = {}) {
-    let memory;
-    const imports = { wasi_snapshot_preview1: system(() => memory, report) };
+  /**
+   * From a `Response`, its promise, bytes, or a compiled module. A module with threads takes as many as there are cores,
+   * or `threads`; in a browser it has to be loaded in a worker of a page that is isolated from other origins. If one of
+   * them fails, the library waits for ever: the `BroadcastChannel` of the name `channel` tells.
+   */
+  static async load(source, { report = console.error, threads = null, channel = "b2p" } = {}) {
     source = await source;
-    let instance;
-    if (source instanceof WebAssembly.Module) {
-      instance = await WebAssembly.instantiate(source, imports);
-    } else {
-      const bytes = typeof Response !== "undefined" && source instanceof Response ? await source.arrayBuffer() : source;
-      ({ instance } = await WebAssembly.instantiate(bytes, imports));
+    const isResponse = typeof Response !== "undefined" && source instanceof Response;
+    if (isResponse) source = await source.arrayBuffer();
+    const module = source instanceof WebAssembly.Module ? source : await WebAssembly.compile(source);
+    let memory;
+    let pool = null;
+    let count = 0;
+    const imports = {};
+    const environment = [];
+    if (usesThreads(module)) {
+      if (globalThis.document) throw new B2pError("usage", "a module with threads needs a worker");
+      count = threads ?? (await cores());
+      memory = sharedMemory();
+      imports.env = { memory };
+      imports.wasi = { "thread-spawn": (argument) => pool.spawn(argument) };
+      environment.push(`RAYON_NUM_THREADS=${count}`);
     }
-    memory = instance.exports.memory;
-    instance.exports._initialize?.();
-    return new B2p(instance.exports);
+    imports.wasi_snapshot_preview1 = system({ memory: () => memory, report, environment });
+    const { exports } = await WebAssembly.instantiate(module, imports);
+    memory = exports.memory;
+    // After the instance of this thread: the first one takes the memory that is the first thread's own.
+    if (count > 0) pool = await Threads.start(count, { module, memory, report, channel });
+    exports._initialize?.();
+    return new B2p(exports, pool);
   }
 
-  constructor(exports) {
+  constructor(exports, threads) {
     this.#exports = exports;
+    this.#threads = threads;
     this.#message = this._alloc(MESSAGE);
+  }
+
+  /** Ends its threads, if it has any. It must not be used any more. */
+  close() {
+    this.#threads?.end();
   }
 
   get version() {
@@ -225,7 +203,8 @@ export class B2p {
 
   #text(at) {
     const bytes = new Uint8Array(this.#exports.memory.buffer, at);
-    return new TextDecoder().decode(bytes.subarray(0, bytes.indexOf(0)));
+    // Copied: memory that threads share is not decoded.
+    return new TextDecoder().decode(bytes.slice(0, bytes.indexOf(0)));
   }
 }
 

@@ -21,8 +21,16 @@ export interface DecodeOptions {
 export class B2p {
   static load(
     source: Response | Promise<Response> | BufferSource | WebAssembly.Module,
-    options?: { report?: (line: string) => void },
+    options?: {
+      report?: (line: string) => void;
+      /** How many threads a module with threads gets; one per core, 16 at most, if it is left out. */
+      threads?: number | null;
+      /** Name of the `BroadcastChannel` that tells of a thread that failed, for which the library would wait for ever. */
+      channel?: string;
+    },
   ): Promise<B2p>;
+  /** Ends its threads, if it has any. It must not be used any more. */
+  close(): void;
   readonly version: string;
   headsModel(bytes: Uint8Array | ArrayBuffer): HeadsModel;
   decoding(options?: DecodeOptions): Decoding;
@@ -159,7 +167,14 @@ export interface View extends Camera {
 export class Viewer extends EventTarget {
   constructor(
     canvas: HTMLCanvasElement,
-    options?: { wasm?: string | URL; worker?: string | URL; heads?: string | URL | null; background?: Colour | null },
+    options?: {
+      wasm?: string | URL;
+      /** The library with threads, for pages that are isolated from other origins. */
+      threads?: string | URL | null;
+      worker?: string | URL;
+      heads?: string | URL | null;
+      background?: Colour | null;
+    },
   );
   get camera(): Required<Camera>;
   set camera(camera: Camera);

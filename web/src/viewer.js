@@ -23,16 +23,19 @@ export class Viewer extends EventTarget {
   #again = null;
   /** Whether frames come by themselves, each with the camera that was sent last. */
   #playing = false;
+  /** Tells of threads that fail, for which the worker would wait. */
+  #defects = new BroadcastChannel(`b2p-${crypto.randomUUID?.() ?? Math.random()}`);
   /** What is shown on the canvas, one picture after the other. */
   #shown = Promise.resolve();
   #rest = 0;
   #touches = new Map();
 
   /**
-   * `wasm` and `worker` are addresses of the library and of `worker.js`; `heads` that of a model file of learned
+   * `wasm` and `worker` are addresses of the library and of `worker.js`; `threads` that of the library with threads,
+   * which is taken where the page is isolated from other origins, or `null`; `heads` that of a model file of learned
    * heads, without which streams are drawn as surfels. `background` is a colour in [0, 1] or `null` for none.
    */
-  constructor(canvas, { wasm, worker, heads = null, background = [1, 1, 1] } = {}) {
+  constructor(canvas, { wasm, threads, worker, heads = null, background = [1, 1, 1] } = {}) {
     super();
     this.#canvas = canvas;
     this.#context = canvas.getContext("2d");
@@ -40,8 +43,11 @@ export class Viewer extends EventTarget {
     this.#worker = new Worker(worker ?? new URL("./worker.js", import.meta.url), { type: "module" });
     this.#worker.onmessage = ({ data }) => this.#hear(data);
     this.#worker.onerror = (event) => this.#fail("internal", event.message ?? "the worker cannot be started");
-    this.#ready = this.#load(wasm ?? new URL("../b2p.wasm", import.meta.url), heads);
+    const beside = (given, name) => (given === undefined ? new URL(name, import.meta.url) : given);
+    const modules = [beside(wasm, "../b2p.wasm"), globalThis.crossOriginIsolated ? beside(threads, "../b2p-threads.wasm") : null];
+    this.#ready = this.#load(...modules, heads);
     this.#ready.catch(() => {});
+    this.#defects.onmessage = ({ data }) => this.#end(data.message);
     this.#listen();
   }
 
@@ -122,21 +128,34 @@ export class Viewer extends EventTarget {
   /** Ends the worker. */
   close() {
     this.#cancel?.();
+    this.#defects.close();
     this.#worker.terminate();
   }
 
-  async #load(wasm, heads) {
+  /** Ends the worker after a defect. */
+  #end(message) {
+    this.#worker.terminate();
+    this.#ready = Promise.reject(Object.assign(new Error("the library has failed: load it again"), { kind: "internal" }));
+    this.#ready.catch(() => {});
+    this.#fail("internal", message);
+  }
+
+  async #load(wasm, threads, heads) {
     const get = async (address) => {
       const response = await fetch(address);
       if (!response.ok) throw new Error(`${address}: ${response.status} ${response.statusText}`);
       return response;
     };
+    const compile = (address) => {
+      return get(address).then((response) => response.arrayBuffer()).then((bytes) => WebAssembly.compile(bytes));
+    };
     const [module, model] = await Promise.all([
-      get(wasm).then((response) => response.arrayBuffer()).then((bytes) => WebAssembly.compile(bytes)),
+      threads ? compile(threads).catch(() => compile(wasm)) : compile(wasm),
       heads && get(heads).then((response) => response.arrayBuffer()),
     ]);
     const ready = new Promise((resolve, reject) => this.#waiting.set("ready", { resolve, reject }));
-    this.#worker.postMessage({ type: "load", module, heads: model && new Uint8Array(model) });
+    const channel = this.#defects.name;
+    this.#worker.postMessage({ type: "load", module, channel, heads: model && new Uint8Array(model) });
     return ready;
   }
 

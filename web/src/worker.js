@@ -174,9 +174,9 @@ function hand({ gaussians: next, picture, error, ...frame }) {
 }
 
 const on = {
-  async load({ module, heads }) {
+  async load({ module, channel, heads }) {
     try {
-      library = await B2p.load(module);
+      library = await B2p.load(module, { channel });
     } catch (error) {
       return postMessage({ type: "error", stream: "ready", kind: "internal", message: error.message });
     }

@@ -1,7 +1,7 @@
 // The page in a headless Chromium. Skipped where there is none.
 
 import assert from "node:assert/strict";
-import { readFileSync } from "node:fs";
+import { existsSync, readFileSync } from "node:fs";
 import test from "node:test";
 
 import { B2p } from "../src/index.js";
@@ -100,6 +100,25 @@ test("a cut download and a damaged file are reported, and the levels that came s
     await page.until("Number(document.body.dataset.pictures) > 0");
     const pixels = await page.evaluate(PIXELS);
     assert.ok(pixels.some((x, i) => i % 4 !== 3 && x !== 255), `${name}: the picture stays`);
+  }
+});
+
+const unthreaded = skip || (existsSync(new URL("../b2p-threads.wasm", import.meta.url)) ? false : "b2p-threads.wasm is not there");
+
+test("a page that is isolated from other origins has threads, and the same pixels", { skip: unthreaded }, async () => {
+  const isolated = await serve(streams, { isolated: true });
+  try {
+    const page = await browser.page(`${isolated.address}/?src=streams/whole.b2p`, ...SIZE);
+    await page.until("document.body.dataset.done === '9'");
+    assert.equal(await page.evaluate("crossOriginIsolated"), true);
+    const loaded = "performance.getEntriesByType('resource').map(({ name }) => name.split('/').at(-1))";
+    const names = await page.evaluate(loaded);
+    assert.ok(names.includes("b2p-threads.wasm") && !names.includes("b2p.wasm"), names.join(" "));
+    const library = await B2p.load(read("web/b2p.wasm"));
+    const expected = library.decode(scene).render({ width: SIZE[0], height: SIZE[1] });
+    await page.until(`${SHOWN}.then((sum) => sum === "${digest(expected)}")`);
+  } finally {
+    isolated.close();
   }
 });
 

@@ -2,15 +2,21 @@
 
 import assert from "node:assert/strict";
 import { createHash } from "node:crypto";
-import { readFileSync } from "node:fs";
+import { existsSync, readFileSync } from "node:fs";
 import test from "node:test";
 
 import { B2p, B2pError } from "../src/index.js";
+import { Threads, sharedMemory } from "../src/threads.js";
 
 const root = new URL("../..", import.meta.url);
 const read = (path) => readFileSync(new URL(path, root));
 const library = await B2p.load(read("web/b2p.wasm"));
+// With more threads than there may be cores.
+const threads = new URL("web/b2p-threads.wasm", root);
+const threaded = existsSync(threads) ? await B2p.load(readFileSync(threads), { threads: 3, channel: "tests" }) : null;
 const scene = read("models/scene.b2p");
+test.after(() => threaded?.close());
+
 
 /** The digests of colours and of Gaussians, as the conformance suite takes them; its first is of Morton keys. */
 function digests(decoding) {
@@ -27,7 +33,8 @@ function digests(decoding) {
   return found;
 }
 
-for (const [suite, least] of [["version-3", 20], ["scenes", 7]]) test(`every stream of the suite ${suite} decodes to its digests`, () => {
+const suites = [library, threaded].filter(Boolean).flatMap((library) => [[library, "version-3", 20], [library, "scenes", 7]]);
+for (const [library, suite, least] of suites) test(`every stream of the suite ${suite} decodes to its digests`, () => {
   const folder = `tests/data/conformance/${suite}`;
   const lines = read(`${folder}/suite.txt`).toString().trim().split("\n");
   let levels = 0;
@@ -109,4 +116,32 @@ test("memory is given back", () => {
   const before = library._view().byteLength;
   for (let i = 0; i < 10; i++) once();
   assert.equal(library._view().byteLength, before);
+});
+
+const unthreaded = threaded ? false : "b2p-threads.wasm is not there";
+
+test("threads draw what one thread draws, with every kind of heads", { skip: unthreaded }, () => {
+  const draw = (library, heads) => {
+    const model = library.headsModel(read("models/heads.safetensors"));
+    const gaussians = library.decode(scene, { model, heads });
+    const pixels = gaussians.render({ width: 320, height: 240 });
+    gaussians.free();
+    model.free();
+    return Buffer.from(pixels);
+  };
+  for (const heads of ["surfels", "quick", "best"]) assert.ok(draw(threaded, heads).equals(draw(library, heads)), heads);
+});
+
+test("a thread that fails is told of, and no more threads than there are can be had", { skip: unthreaded }, async () => {
+  const module = await WebAssembly.compile(readFileSync(threads));
+  const memory = sharedMemory();
+  const lost = await Threads.start(1, { module, memory, report: () => {}, channel: "lost" });
+  const channel = new BroadcastChannel("lost");
+  const heard = new Promise((resolve) => (channel.onmessage = ({ data }) => resolve(data.message)));
+  // There is no such thread to start.
+  assert.ok(lost.spawn(-1) > 0);
+  assert.ok(lost.spawn(-1) < 0);
+  assert.match(await heard, /memory access out of bounds|unreachable/);
+  channel.close();
+  lost.end();
 });

@@ -7,8 +7,13 @@ import { extname, join, normalize } from "node:path";
 const TYPES = { ".html": "text/html", ".js": "text/javascript", ".wasm": "application/wasm", ".json": "application/json" };
 const web = new URL("..", import.meta.url).pathname;
 
-/** A server and its address. `streams` maps a name to a function that answers with it. */
-export async function serve(streams) {
+const ISOLATION = { "cross-origin-opener-policy": "same-origin", "cross-origin-embedder-policy": "require-corp" };
+
+/**
+ * A server and its address. `streams` maps a name to a function that answers with it; its pages may be isolated from
+ * other origins.
+ */
+export async function serve(streams, { isolated = false } = {}) {
   const server = createServer(async (request, response) => {
     const path = normalize(new URL(request.url, "http://localhost").pathname);
     const stream = streams[path.replace("/streams/", "")];
@@ -16,7 +21,8 @@ export async function serve(streams) {
     try {
       const file = path === "/" ? "/index.html" : path;
       const bytes = await readFile(join(web, file));
-      response.writeHead(200, { "content-type": TYPES[extname(file)] ?? "application/octet-stream" }).end(bytes);
+      const type = TYPES[extname(file)] ?? "application/octet-stream";
+      response.writeHead(200, { "content-type": type, ...(isolated ? ISOLATION : {}) }).end(bytes);
     } catch {
       response.writeHead(404).end();
     }

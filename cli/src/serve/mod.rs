@@ -143,7 +143,8 @@ fn answer(request: &Request, streams: &Streams, module: &'static [u8]) -> Respon
         return Response::bytes(page.bytes, page.media_type);
     }
     match file {
-        "b2p.wasm" => Response::bytes(module, "application/wasm").with("Content-Encoding", "gzip"),
+        "b2p.wasm" => wasm(module),
+        "b2p-threads.wasm" => b2p_web::THREADS_GZIP.map_or_else(|| plain(404, "no such file\n"), wasm),
         HEADS => Response::bytes(b2p::embedded::HEADS, "application/octet-stream"),
         "streams.json" => {
             let names = streams.names().unwrap_or_default();
@@ -155,6 +156,11 @@ fn answer(request: &Request, streams: &Streams, module: &'static [u8]) -> Respon
             None => plain(404, "no such file\n"),
         },
     }
+}
+
+/// A module that is compressed.
+fn wasm(module: &'static [u8]) -> Response {
+    Response::bytes(module, "application/wasm").with("Content-Encoding", "gzip")
 }
 
 /// A stream, or the range of it that was asked for.
