@@ -40,8 +40,8 @@ export class Threads {
   #last = 0;
 
   /**
-   * Workers for `count` threads of a module. `report` takes each line that they print. A thread that fails is told of on
-   * the `BroadcastChannel` of the name `channel`: whoever waits for it never hears of anything again.
+   * Workers for `count` threads of a module. `report` takes each line that they print. A thread that fails reports
+   * its error on the `BroadcastChannel` of the name `channel`: whoever waits for the thread waits for ever.
    */
   static async start(count, { module, memory, report, channel }) {
     const threads = new Threads();

@@ -132,7 +132,7 @@ test("threads draw what one thread draws, with every kind of heads", { skip: unt
   for (const heads of ["surfels", "quick", "best"]) assert.ok(draw(threaded, heads).equals(draw(library, heads)), heads);
 });
 
-test("a thread that fails is told of, and no more threads than there are can be had", { skip: unthreaded }, async () => {
+test("a thread that fails reports its error, and no more threads start than there are workers", { skip: unthreaded }, async () => {
   const module = await WebAssembly.compile(readFileSync(threads));
   const memory = sharedMemory();
   const lost = await Threads.start(1, { module, memory, report: () => {}, channel: "lost" });
