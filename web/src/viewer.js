@@ -46,7 +46,7 @@ export class Viewer extends EventTarget {
     const beside = (given, name) => (given === undefined ? new URL(name, import.meta.url) : given);
     const modules = [beside(wasm, "../b2p.wasm"), globalThis.crossOriginIsolated ? beside(threads, "../b2p-threads.wasm") : null];
     this.#ready = this.#load(...modules, heads);
-    this.#ready.catch(() => {});
+    this.#ready.catch(({ kind = "internal", message }) => this.#tell("failure", { kind, message }));
     this.#defects.onmessage = ({ data }) => this.#end(data.message);
     this.#listen();
   }
@@ -149,14 +149,16 @@ export class Viewer extends EventTarget {
     const compile = (address) => {
       return get(address).then((response) => response.arrayBuffer()).then((bytes) => WebAssembly.compile(bytes));
     };
-    const [module, model] = await Promise.all([
-      threads ? compile(threads).catch(() => compile(wasm)) : compile(wasm),
-      heads && get(heads).then((response) => response.arrayBuffer()),
-    ]);
-    const ready = new Promise((resolve, reject) => this.#waiting.set("ready", { resolve, reject }));
-    const channel = this.#defects.name;
-    this.#worker.postMessage({ type: "load", module, channel, heads: model && new Uint8Array(model) });
-    return ready;
+    const model = heads && get(heads).then((response) => response.arrayBuffer());
+    const start = async (address) => {
+      const module = await compile(address);
+      const bytes = model && new Uint8Array(await model);
+      const ready = new Promise((resolve, reject) => this.#waiting.set("ready", { resolve, reject }));
+      this.#worker.postMessage({ type: "load", module, channel: this.#defects.name, heads: bytes });
+      return ready;
+    };
+    // Without threads if they, or their memory, cannot be had.
+    return threads ? start(threads).catch(() => start(wasm)) : start(wasm);
   }
 
   async #feed(number, stream) {
@@ -186,6 +188,10 @@ export class Viewer extends EventTarget {
         this.#waiting.delete(message.stream);
         break;
       case "error":
+        if (message.stream === "ready") {
+          this.#waiting.get("ready")?.reject(Object.assign(new Error(message.message), { kind: message.kind }));
+          break;
+        }
         this.#fail(message.kind, message.message, message.stream);
         break;
       case "sequence":

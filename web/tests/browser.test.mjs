@@ -122,6 +122,19 @@ test("a page that is isolated from other origins has threads, and the same pixel
   }
 });
 
+test("a page whose threads cannot be had does without them", { skip }, async () => {
+  for (const missing of ["/src/thread.js", "/b2p-threads.wasm"]) {
+    const isolated = await serve(streams, { isolated: true, missing: [missing] });
+    try {
+      const page = await browser.page(`${isolated.address}/?src=streams/whole.b2p`, ...SIZE);
+      await page.until("document.body.dataset.done === '9'");
+      assert.equal(await page.evaluate("crossOriginIsolated"), true);
+    } finally {
+      isolated.close();
+    }
+  }
+});
+
 test("the page needs no cross-origin isolation", { skip }, async () => {
   const page = await show("whole.b2p");
   await page.until("document.body.dataset.done === '9'");

@@ -10,16 +10,17 @@ const web = new URL("..", import.meta.url).pathname;
 const ISOLATION = { "cross-origin-opener-policy": "same-origin", "cross-origin-embedder-policy": "require-corp" };
 
 /**
- * A server and its address. `streams` maps a name to a function that answers with it; its pages may be isolated from
- * other origins.
+ * A server and its address. `streams` maps a name to a function that answers with it. Its pages may be isolated from
+ * other origins, and files of the page may be missing.
  */
-export async function serve(streams, { isolated = false } = {}) {
+export async function serve(streams, { isolated = false, missing = [] } = {}) {
   const server = createServer(async (request, response) => {
     const path = normalize(new URL(request.url, "http://localhost").pathname);
     const stream = streams[path.replace("/streams/", "")];
     if (path.startsWith("/streams/") && stream) return stream(response);
     try {
       const file = path === "/" ? "/index.html" : path;
+      if (missing.includes(file)) throw new Error("missing");
       const bytes = await readFile(join(web, file));
       const type = TYPES[extname(file)] ?? "application/octet-stream";
       response.writeHead(200, { "content-type": type, ...(isolated ? ISOLATION : {}) }).end(bytes);
