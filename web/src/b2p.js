@@ -184,7 +184,7 @@ export class B2p {
     });
     const length = parts.reduce((sum, part) => sum + part.length, 0);
     const at = this._alloc(length);
-    const to = new Uint8Array(this.#exports.memory.buffer, at, length);
+    const to = new Uint8Array(this.#buffer(), at, length);
     let place = 0;
     for (const part of parts) {
       to.set(part, place);
@@ -194,15 +194,22 @@ export class B2p {
   }
 
   _view() {
-    return new DataView(this.#exports.memory.buffer);
+    return new DataView(this.#buffer());
   }
 
   _array(Type, at, length) {
-    return new Type(this.#exports.memory.buffer, at, length);
+    return new Type(this.#buffer(), at, length);
+  }
+
+  /** The memory as it is now: V8 tells a thread late of what another has let grow, unless it grows itself. */
+  #buffer() {
+    const { memory } = this.#exports;
+    if (this.#threads) memory.grow(0);
+    return memory.buffer;
   }
 
   #text(at) {
-    const bytes = new Uint8Array(this.#exports.memory.buffer, at);
+    const bytes = new Uint8Array(this.#buffer(), at);
     // Copied: memory that threads share is not decoded.
     return new TextDecoder().decode(bytes.slice(0, bytes.indexOf(0)));
   }

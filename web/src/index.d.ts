@@ -120,7 +120,10 @@ export interface Points {
 
 /** Gaussians in the cube frame, where the voxel cube reaches from −1 to 1. */
 export interface Gaussians extends Handle {
-  /** Views, valid until the library is next called. world = origin + (position + 1) · unit. */
+  /**
+   * Views, valid until the library is next called; of shared memory if it has threads.
+   * world = origin + (position + 1) · unit.
+   */
   arrays(): {
     count: number;
     /** x, y, z of centres. */
