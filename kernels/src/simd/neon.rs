@@ -8,7 +8,7 @@ use half::f16;
 
 use super::macros::{define_set, five, four, methods, operators, vectorize};
 use super::vector::{
-    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, first,
+    EXP2, F16_MAX, F32Vector, F64Vector, FIRST, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, first,
     first_mut, polynomial, sealed,
 };
 
@@ -146,10 +146,7 @@ methods! { with_neon F32x4: F32Vector<Neon> {
     fn store_records(fields: &[Self; 16], which: u32, to: &mut [[f32; 16]]) -> usize {
         let quarters: [[F32x4; 4]; 4] = four!(q => transpose4(four!(k => fields[4 * q + k])));
         let mut kept = 0;
-        for lane in 0..4 {
-            if which >> lane & 1 == 0 {
-                continue;
-            }
+        for lane in (0..4).filter(|lane| which >> lane & 1 == 1) {
             let record = &mut to[kept];
             for q in 0..4 {
                 *first_mut::<f32, 4>(&mut record[4 * q..]) = must_cast(quarters[q][lane].0);
@@ -462,21 +459,3 @@ with_neon! {
         ]
     }
 }
-
-/// For each mask of four lanes, the bytes of the lanes that it holds, in order.
-static FIRST: [[u8; 16]; 16] = {
-    let mut first = [[0; 16]; 16];
-    let mut mask = 0;
-    while mask < 16 {
-        let (mut byte, mut kept) = (0, 0);
-        while byte < 16 {
-            if mask >> (byte / 4) & 1 == 1 {
-                first[mask][kept] = byte as u8;
-                kept += 1;
-            }
-            byte += 1;
-        }
-        mask += 1;
-    }
-    first
-};

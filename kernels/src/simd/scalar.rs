@@ -558,9 +558,9 @@ impl MaskVector for Mask4 {
 }
 
 /// The difference of the exponent biases of f32 and f16, where an f32 has its exponent.
-const REBIAS: u32 = (127 - 15) << 23;
+pub(super) const REBIAS: u32 = (127 - 15) << 23;
 /// The f32 whose last mantissa bit weighs as much as the smallest f16.
-const DENORMAL: u32 = (127 - 15 + 23 - 10 + 1) << 23;
+pub(super) const DENORMAL: u32 = (127 - 15 + 23 - 10 + 1) << 23;
 
 /// An f16 as f32, exactly.
 #[inline(always)]

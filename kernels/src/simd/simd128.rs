@@ -9,8 +9,9 @@ use bytemuck::must_cast;
 use half::f16;
 
 use super::macros::{five, four, methods, operators};
+use super::scalar::{DENORMAL, REBIAS};
 use super::vector::{
-    EXP2, F16_MAX, F32Vector, F64Vector, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, first,
+    EXP2, F16_MAX, F32Vector, F64Vector, FIRST, I16Vector, I32Vector, LEAST_EXPONENT, MaskVector, ROUND, Simd, first,
     first_mut, polynomial, sealed,
 };
 
@@ -481,26 +482,3 @@ with_simd128! {
         v128_or(v128_bitselect(subnormal, normal, small), sign)
     }
 }
-
-/// The difference of the exponent biases of f32 and f16, where an f32 has its exponent.
-const REBIAS: u32 = (127 - 15) << 23;
-/// The f32 whose last mantissa bit weighs as much as the smallest f16.
-const DENORMAL: u32 = (127 - 15 + 23 - 10 + 1) << 23;
-
-/// For each mask of four lanes, the bytes of the lanes that it holds, in order.
-static FIRST: [[u8; 16]; 16] = {
-    let mut first = [[0; 16]; 16];
-    let mut mask = 0;
-    while mask < 16 {
-        let (mut byte, mut kept) = (0, 0);
-        while byte < 16 {
-            if mask >> (byte / 4) & 1 == 1 {
-                first[mask][kept] = byte as u8;
-                kept += 1;
-            }
-            byte += 1;
-        }
-        mask += 1;
-    }
-    first
-};

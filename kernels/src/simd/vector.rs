@@ -278,3 +278,22 @@ pub(super) fn polynomial<S: Simd>(x: S::F32, coefficients: [S::F32; 5]) -> S::F3
     }
     p
 }
+
+/// For each mask of four lanes, the bytes of the lanes that it holds, in order.
+#[cfg(any(target_arch = "aarch64", target_feature = "simd128"))]
+pub(super) static FIRST: [[u8; 16]; 16] = {
+    let mut first = [[0; 16]; 16];
+    let mut mask = 0;
+    while mask < 16 {
+        let (mut byte, mut kept) = (0, 0);
+        while byte < 16 {
+            if mask >> (byte / 4) & 1 == 1 {
+                first[mask][kept] = byte as u8;
+                kept += 1;
+            }
+            byte += 1;
+        }
+        mask += 1;
+    }
+    first
+};
