@@ -44,8 +44,8 @@ export class Viewer extends EventTarget {
     this.#worker.onmessage = ({ data }) => this.#hear(data);
     this.#worker.onerror = (event) => this.#fail("internal", event.message ?? "the worker cannot be started");
     const beside = (given, name) => (given === undefined ? new URL(name, import.meta.url) : given);
-    const modules = [beside(wasm, "../b2p.wasm"), globalThis.crossOriginIsolated ? beside(threads, "../b2p-threads.wasm") : null];
-    this.#ready = this.#load(...modules, heads);
+    const shared = globalThis.crossOriginIsolated ? beside(threads, "../b2p-threads.wasm") : null;
+    this.#ready = this.#load(beside(wasm, "../b2p.wasm"), shared, heads);
     this.#ready.catch(({ kind = "internal", message }) => this.#tell("failure", { kind, message }));
     this.#defects.onmessage = ({ data }) => this.#end(data.message);
     this.#listen();
@@ -137,6 +137,9 @@ export class Viewer extends EventTarget {
     this.#worker.terminate();
     this.#ready = Promise.reject(Object.assign(new Error("the library has failed: load it again"), { kind: "internal" }));
     this.#ready.catch(() => {});
+    // Pictures that were asked for do not come any more.
+    this.#waiting.get("picture")?.resolve(null);
+    this.#again?.resolve(null);
     this.#fail("internal", message);
   }
 
@@ -149,12 +152,12 @@ export class Viewer extends EventTarget {
     const compile = (address) => {
       return get(address).then((response) => response.arrayBuffer()).then((bytes) => WebAssembly.compile(bytes));
     };
-    const model = heads && get(heads).then((response) => response.arrayBuffer());
+    const learned = heads && get(heads).then((response) => response.arrayBuffer());
     const start = async (address) => {
-      const module = await compile(address);
-      const bytes = model && new Uint8Array(await model);
+      const [module, bytes] = await Promise.all([compile(address), learned]);
       const ready = new Promise((resolve, reject) => this.#waiting.set("ready", { resolve, reject }));
-      this.#worker.postMessage({ type: "load", module, channel: this.#defects.name, heads: bytes });
+      const model = bytes && new Uint8Array(bytes);
+      this.#worker.postMessage({ type: "load", module, channel: this.#defects.name, heads: model });
       return ready;
     };
     // Without threads if they, or their memory, cannot be had.

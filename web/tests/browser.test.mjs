@@ -135,6 +135,31 @@ test("a page whose threads cannot be had does without them", { skip }, async () 
   }
 });
 
+test("a thread that fails ends the library, and who waits for a file hears of it", { skip }, async () => {
+  const page = await browser.page(server.address, ...SIZE);
+  await page.until("document.body?.dataset.state === 'ready'");
+  const heard = await page.evaluate(`(async () => {
+    const { Viewer } = await import("/src/viewer.js");
+    const names = [];
+    const Channel = BroadcastChannel;
+    globalThis.BroadcastChannel = class extends Channel {
+      constructor(name) {
+        super(name);
+        names.push(name);
+      }
+    };
+    const viewer = new Viewer(document.createElement("canvas"));
+    // A file that does not end.
+    viewer.open(new ReadableStream({})).catch(() => {});
+    await new Promise((resolve) => setTimeout(resolve, 1000));
+    new Channel(names[0]).postMessage({ message: "lost" });
+    const failure = await new Promise((resolve) => viewer.addEventListener("failure", ({ detail }) => resolve(detail)));
+    const again = await viewer.open(new Uint8Array(9)).catch(({ kind }) => kind);
+    return [failure.kind, failure.message, again].join();
+  })()`);
+  assert.equal(heard, "internal,lost,internal");
+});
+
 test("the page needs no cross-origin isolation", { skip }, async () => {
   const page = await show("whole.b2p");
   await page.until("document.body.dataset.done === '9'");

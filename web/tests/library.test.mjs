@@ -17,7 +17,6 @@ const threaded = existsSync(threads) ? await B2p.load(readFileSync(threads), { t
 const scene = read("models/scene.b2p");
 test.after(() => threaded?.close());
 
-
 /** The digests of colours and of Gaussians, as the conformance suite takes them; its first is of Morton keys. */
 function digests(decoding) {
   const hash = (...arrays) => {
