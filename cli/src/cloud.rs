@@ -39,6 +39,9 @@ pub struct ReadArgs {
     /// Leave out points far from all others
     #[arg(long)]
     pub drop_outliers: bool,
+    /// Leave out points that cannot be seen from outside, such as what closed surfaces surround
+    #[arg(long)]
+    pub drop_hidden: bool,
     /// Refuse points that are not finite, colours whose range must be guessed, and points without colours
     #[arg(long)]
     pub strict: bool,
@@ -110,6 +113,7 @@ impl ReadArgs {
         let all = [
             ("--crop", self.crop.is_some()),
             ("--drop-outliers", self.drop_outliers),
+            ("--drop-hidden", self.drop_hidden),
             ("--strict", self.strict),
             ("--colour-range", self.colour_range.is_some()),
             ("--unit", self.unit.is_some()),
@@ -124,6 +128,7 @@ impl ReadArgs {
             colour_range: self.colour_range,
             crop: self.crop,
             drop_outliers: self.drop_outliers,
+            drop_hidden: self.drop_hidden,
             up: self.up.and_then(|up| up.0),
             metres_per_unit: self.unit,
             vertices: self.vertices,

@@ -108,6 +108,7 @@ pub fn clouds(bytes: &[u8]) {
     }
     let options = ReadOptions {
         drop_outliers: one_in(2, bytes),
+        drop_hidden: one_in(5, bytes),
         vertices: one_in(3, bytes),
         ..ReadOptions::default()
     };

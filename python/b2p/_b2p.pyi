@@ -263,6 +263,7 @@ def read(
     unit: str | float | None = None,
     crop: tuple[_Point, _Point] | None = None,
     drop_outliers: bool = False,
+    drop_hidden: bool = False,
     vertices: bool = False,
     limits: Limits | None = None,
     threads: int | None = None,

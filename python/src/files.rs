@@ -42,6 +42,8 @@ enum Content {
 ///     Keep only the points in this box: its lowest and its highest corner.
 /// drop_outliers : bool
 ///     Leave out points far from all others.
+/// drop_hidden : bool
+///     Leave out points that cannot be seen from outside, such as what closed surfaces surround.
 /// vertices : bool
 ///     Take the vertices of a mesh as points. Otherwise meshes are refused.
 /// limits : Limits, optional
@@ -52,8 +54,8 @@ enum Content {
 /// PointCloud or Gaussians
 ///     Gaussians in the axes of their cloud, if the file states them, else in those of PLY files.
 #[pyfunction]
-#[pyo3(signature = (path, *, format=None, up=None, unit=None, crop=None, drop_outliers=false, vertices=false,
-    limits=None, threads=None))]
+#[pyo3(signature = (path, *, format=None, up=None, unit=None, crop=None, drop_outliers=false, drop_hidden=false,
+    vertices=false, limits=None, threads=None))]
 pub fn read<'py>(
     py: Python<'py>,
     path: PathBuf,
@@ -62,6 +64,7 @@ pub fn read<'py>(
     unit: Option<&Bound<'py, PyAny>>,
     crop: Option<[[f64; 3]; 2]>,
     drop_outliers: bool,
+    drop_hidden: bool,
     vertices: bool,
     limits: Option<PyLimits>,
     threads: Option<usize>,
@@ -76,6 +79,7 @@ pub fn read<'py>(
         metres_per_unit: values::unit(unit)?,
         crop,
         drop_outliers,
+        drop_hidden,
         vertices,
         ..ReadOptions::default()
     };

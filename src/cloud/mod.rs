@@ -8,6 +8,7 @@
 mod colours;
 mod common_grid;
 mod dialects;
+mod hidden;
 pub mod ply;
 mod points;
 mod raw;

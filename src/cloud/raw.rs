@@ -1,7 +1,7 @@
 //! Points as a reader of a file format found them, and what makes a [`PointCloud`] of them.
 
 use super::colours::{ColourRange, RawColours};
-use super::{Hints, PointCloud, colours, malformed, select};
+use super::{Hints, PointCloud, colours, hidden, malformed, select};
 use crate::axes::{Axes, Up};
 use crate::error::{Error, Result};
 
@@ -34,6 +34,9 @@ pub struct ReadOptions {
     pub crop: Option<[[f64; 3]; 2]>,
     /// Leave out points far from all others.
     pub drop_outliers: bool,
+    /// Leave out points that cannot be seen from outside: inside of closed surfaces, or far behind openings that are
+    /// narrower than three of 512 cells along the longest side.
+    pub drop_hidden: bool,
     /// The axis that points up, whatever the file says.
     pub up: Option<Up>,
     /// Metres per unit, whatever the file says.
@@ -86,6 +89,11 @@ pub enum Note {
         /// Their number.
         left_out: u64,
     },
+    /// Points that cannot be seen from outside were left out.
+    Hidden {
+        /// Their number.
+        left_out: u64,
+    },
     /// Something else that a reader has to say.
     Other(String),
 }
@@ -109,6 +117,7 @@ impl std::fmt::Display for Note {
             Note::Shaded { by } => write!(f, "no colours: points are shaded by their {by}"),
             Note::Cropped { left_out } => write!(f, "left out {}: outside of the box", points(*left_out)),
             Note::Outliers { left_out } => write!(f, "left out {}: far from all others", points(*left_out)),
+            Note::Hidden { left_out } => write!(f, "left out {}: not seen from outside", points(*left_out)),
             Note::Other(text) => f.write_str(text),
         }
     }
@@ -120,7 +129,7 @@ fn points(count: u64) -> String {
 
 impl RawPoints {
     /// Makes a cloud: leaves out points that are not finite or outside of the box, converts colours, and leaves out
-    /// outliers. Also returns what was done.
+    /// outliers and hidden points. Also returns what was done.
     ///
     /// # Errors
     /// [`Error::Malformed`] if there are no points, none is left, a colour is out of range, or, if strict, something
@@ -159,10 +168,15 @@ impl RawPoints {
         cloud.colours = colours::convert(self.colours, &self.normals, &cloud, options, &mut notes)?;
         if options.drop_outliers {
             let keep = select::not_outliers(&cloud.positions);
-            let left_out = count_of(&keep, false);
-            retain(&mut cloud.positions, &keep);
-            retain(&mut cloud.colours, &keep);
-            notes.push(Note::Outliers { left_out });
+            notes.push(Note::Outliers {
+                left_out: keep_only(&mut cloud, &keep),
+            });
+        }
+        if options.drop_hidden {
+            let keep = hidden::not_hidden(&cloud.positions);
+            notes.push(Note::Hidden {
+                left_out: keep_only(&mut cloud, &keep),
+            });
         }
         Ok((cloud, notes))
     }
@@ -212,6 +226,13 @@ impl RawPoints {
         retain(&mut self.normals, keep);
         self.colours.retain(keep);
     }
+}
+
+/// Keeps some points of a cloud, and returns how many others there were.
+fn keep_only(cloud: &mut PointCloud, keep: &[bool]) -> u64 {
+    retain(&mut cloud.positions, keep);
+    retain(&mut cloud.colours, keep);
+    count_of(keep, false)
 }
 
 fn count_of(keep: &[bool], value: bool) -> u64 {

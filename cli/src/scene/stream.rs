@@ -56,6 +56,7 @@ pub fn run(
     let asked = [
         ("--crop", args.read.crop.is_some()),
         ("--drop-outliers", args.read.drop_outliers),
+        ("--drop-hidden", args.read.drop_hidden),
         ("--bits-per-point", args.bits_per_point.is_some()),
     ];
     if let Some((name, _)) = asked.iter().find(|(_, asked)| *asked) {

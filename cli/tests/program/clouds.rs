@@ -111,6 +111,23 @@ fn stray_points_leave_the_detail_and_can_be_dropped() {
 }
 
 #[test]
+fn points_inside_of_a_closed_surface_are_left_out_on_request() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let ball = sparse_ball(60_000);
+    std::fs::write(at.join("ball.ply"), &ball).unwrap();
+    let inside: String = (10..60).map(|i| format!("0.{i} 0.1 0.2 9 9 9\n")).collect();
+    let with = ball.replace("vertex 60000", "vertex 60050") + &inside;
+    std::fs::write(at.join("filled.ply"), with).unwrap();
+    succeeds(at, &["encode", "ball.ply", "-o", "ball.b2p"]);
+    let encode = ["encode", "filled.ply", "-o", "filled.b2p", "--drop-hidden"];
+    let said = String::from_utf8(b2p(at, &encode).stderr).unwrap();
+    assert!(said.contains("left out 50 points: not seen from outside"), "{said}");
+    let [ball, filled] = ["ball.b2p", "filled.b2p"].map(|name| std::fs::read(at.join(name)).unwrap());
+    assert!(ball == filled);
+}
+
+#[test]
 fn point_clouds_are_drawn_and_described() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
