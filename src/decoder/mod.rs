@@ -14,7 +14,7 @@ mod streaming;
 mod transform;
 
 pub use check::{Checked, Fault};
-pub(crate) use drawing::{LevelVoxels, Part};
+pub(crate) use drawing::{Advice, LevelVoxels, Part};
 pub use stream::{Decoder, Points};
 pub use streaming::Decoding;
 #[cfg(feature = "encoder")]

@@ -114,6 +114,10 @@ struct Coded {
     shape: Option<Arc<Shape>>,
     /// The colours of the finest level, filtered.
     colours: Vec<[u8; 3]>,
+    /// Those of the level above before its filter, as heads read them.
+    colours_above: Vec<[u8; 3]>,
+    /// The step of luma that heads go by, in 255ths.
+    luma_step: f32,
     /// Last level and payload of the colour trunk.
     trunk: (u8, Vec<u8>),
     layers: Vec<Layer>,
@@ -273,9 +277,15 @@ impl<'a> EncoderInput<'a> {
         let mut layers = Vec::new();
         let mut bytes = payload.len();
         let mut colours = Vec::new();
+        let mut colours_above = Vec::new();
         for level in trunk..=top {
             let count = octree.level(level).len();
             let mut slices = Vec::new();
+            if level == top && level > trunk {
+                colours_above = coloured.rgb();
+            } else if level == top && level > 0 {
+                colours_above = Decoder::colours_above(octree, level, &coloured.rgb());
+            }
             if level > trunk {
                 let [above, map] = [level - 1, level].map(map_of);
                 let coding = self.coding(steps, top, level);
@@ -326,6 +336,8 @@ impl<'a> EncoderInput<'a> {
             top,
             shape,
             colours,
+            colours_above,
+            luma_step: coloured.steps().luma_step(),
             trunk: (trunk, payload),
             layers,
         };

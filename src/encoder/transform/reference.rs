@@ -1,6 +1,8 @@
 //! Pictures of the cloud itself, as surfels at its full depth, which those of levels are compared with: a level's Gaussians
 //! are farther from the mesh than those are.
 
+use std::collections::BTreeSet;
+
 use b2p_kernels::Isa;
 
 use crate::cloud::ColouredVoxels;
@@ -37,15 +39,19 @@ impl Reference {
     /// enough to close.
     pub fn new(isa: Isa, cloud: &ColouredVoxels, sparse: bool, levels: impl Iterator<Item = u8>) -> Result<Self> {
         let mut pictures: Vec<(u32, Vec<Image>)> = Vec::new();
-        let mut sides = levels.map(side).peekable();
-        if sides.peek().is_none() {
+        let sides: BTreeSet<u32> = levels.map(side).collect();
+        let Some(&largest) = sides.last() else {
             return Ok(Reference { isa, pictures });
-        }
-        let gaussians = closed(isa, cloud, sparse)?;
-        for side in sides {
-            if pictures.iter().all(|(known, _)| *known != side) {
-                pictures.push((side, Views::new(isa, side).all(&gaussians)?));
+        };
+        let mut views = Views::new(isa, largest).all(&closed(isa, cloud, sparse)?)?;
+        // Each side is half of the next one.
+        let mut at = largest;
+        for &side in sides.iter().rev() {
+            while at > side {
+                views.iter_mut().for_each(|view| *view = view.box_half());
+                at /= 2;
             }
+            pictures.push((side, views.clone()));
         }
         Ok(Reference { isa, pictures })
     }

@@ -16,9 +16,9 @@ use super::shape::Shape;
 use super::{Coded, EncoderInput, Tune};
 use crate::cloud::ColouredVoxels;
 use crate::colour::{Steps, Truth, Ycc};
-use crate::decoder::Decoder;
+use crate::decoder::{Advice, Decoder, Part};
 use crate::error::Result;
-use crate::gaussians::{Gaussians, HeadSet};
+use crate::gaussians::{Gaussians, HeadMap, HeadSet};
 use crate::geometry::{KernelMap, Voxels, morton};
 use crate::limits::Limits;
 
@@ -122,15 +122,33 @@ impl EncoderInput<'_> {
 
     /// The Gaussians that a decoder makes of the stream: of the best heads, if there are any.
     pub(super) fn drawn(&self, coded: &Coded) -> Result<Gaussians> {
-        let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
-        let mut decoding = decoder.with_level(coded.top).start();
-        decoding.push(&coded.bytes);
-        while decoding.advance()?.is_some() {}
+        let mut decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
         if let Some(heads) = self.options.heads.as_ref().filter(|_| coded.top > 0) {
-            decoding.set_heads_model(heads.clone());
-            decoding.set_heads(HeadSet::Best)?;
+            decoder = decoder.with_heads_model(heads.clone()).with_heads(HeadSet::Best);
         }
-        decoding.gaussians()
+        let (level, shape) = (coded.top, coded.shape.as_deref());
+        let octree = self.octree(shape);
+        let map = self.finest_map(level, shape);
+        let head_map = coded.layers.last().and_then(|layer| layer.head_map.as_ref());
+        let head_map = head_map.and_then(|bytes| HeadMap::parse(bytes, HeadMap::block_count(octree, level)));
+        let surfels = head_map.as_ref().and_then(|heads| heads.surfels(octree, level));
+        let part = Part {
+            octree,
+            level,
+            map: &map,
+            above: level.checked_sub(1).map(|above| &self.maps[usize::from(above)]),
+            colours: &coded.colours,
+            range: 0..map.len(),
+            chosen: None,
+            surfels: surfels.as_deref(),
+            advice: Advice {
+                luma_step: coded.luma_step,
+                all_surfels: head_map.as_ref().is_some_and(HeadMap::is_all_surfels),
+                sizes: head_map.as_ref().map_or([1.0; 2], HeadMap::sizes),
+            },
+        };
+        let header = self.header(level, |level| octree.level(level).len());
+        decoder.draw(&header, &part, || coded.colours_above.clone())
     }
 }
 
@@ -375,6 +393,7 @@ fn points_of(cloud: &ColouredVoxels, voxels: &Voxels) -> (Vec<Point>, Vec<u32>) 
 mod tests {
     use super::*;
     use crate::encoder::transform::{Options, QualityTarget};
+    use crate::gaussians::learned::HeadsModel;
     use crate::log::Log;
     use crate::placement::Placement;
 
@@ -420,6 +439,32 @@ mod tests {
         });
         let squares = points.map(|(voxel, i)| surface.missing(voxel, &surface.points[i]).0.map(|x| x * x));
         squares.flatten().sum::<f32>() / surface.points.len() as f32
+    }
+
+    #[test]
+    fn what_is_drawn_is_what_a_decoder_makes_of_the_stream() {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("models/heads.safetensors");
+        let model = HeadsModel::open(&path).unwrap();
+        let cloud = stripes();
+        for (top, lambda) in [(0, 0), (1, 0), (4, 0), (5, 25), (6, 25)] {
+            for heads in [None, Some(&model)] {
+                let options = Options {
+                    heads: heads.cloned(),
+                    ..options(Tune::Visual)
+                };
+                let input = EncoderInput::new(&cloud, top.min(4)..=top, &options, &Log::off()).unwrap();
+                let steps = options.fineness.steps().unwrap();
+                let shape = input.shape(top, lambda, &Log::off()).unwrap();
+                assert_eq!(shape.is_some(), lambda > 0);
+                let coded = input.code(top, steps, shape, &Log::off()).unwrap();
+                let mut decoder = Decoder::new().with_level(top);
+                if let Some(heads) = heads.filter(|_| top > 0) {
+                    decoder = decoder.with_heads_model(heads.clone()).with_heads(HeadSet::Best);
+                }
+                let decoded = decoder.decode(&coded.bytes).unwrap();
+                assert!(input.drawn(&coded).unwrap() == decoded, "level {top}");
+            }
+        }
     }
 
     #[test]
