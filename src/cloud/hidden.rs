@@ -128,9 +128,13 @@ impl Cells {
         });
         // Words `apart` from each other are neighbours along an axis, in parts of so many words.
         for (apart, part) in [(words, words * height), (words * height, words * height * depth)] {
+            let so_far;
             let from = match neighbours {
-                Neighbours::Faces => self.clone(),
-                Neighbours::All => grown.clone(),
+                Neighbours::Faces => self,
+                Neighbours::All => {
+                    so_far = grown.clone();
+                    &so_far
+                }
             };
             let parts = grown.bits.par_chunks_exact_mut(part);
             parts.zip(from.bits.par_chunks_exact(part)).for_each(|(to, from)| {

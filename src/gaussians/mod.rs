@@ -85,14 +85,20 @@ impl Frame {
         let ranges = [range(0), range(1), range(2)];
         let side = ranges.iter().fold(0.0, |side: f64, (low, high)| side.max(high - low));
         let cubes = f64::from(1u32 << FITTED_BITS);
-        // All centres coincide, or their extent overflows.
-        let side = if side > 0.0 && side.is_finite() { side } else { cubes };
-        Frame {
+        let cube = |side: f64| Frame {
             bits: FITTED_BITS,
             placement: Placement {
                 origin: ranges.map(|(low, high)| 0.5 * low + 0.5 * high - 0.5 * side),
                 voxel_size: side / cubes,
             },
+        };
+        // Voxels of a tiny cube are as small as single precision tells them.
+        let fitted = cube(side.max(cubes * f64::from(f32::MIN_POSITIVE)));
+        // All centres coincide, or their extent overflows.
+        if side > 0.0 && fitted.is_valid() {
+            fitted
+        } else {
+            cube(cubes)
         }
     }
 
@@ -124,6 +130,16 @@ impl Frame {
             && self.placement.is_valid()
             && (voxel_size as f32).is_normal()
             && origin.iter().all(|x| single(*x) && single(x + 2.0 * self.unit()))
+    }
+
+    /// The error that it is not [valid](Frame::is_valid).
+    #[doc(hidden)]
+    pub fn not_valid(&self) -> Error {
+        let Placement { origin, voxel_size } = self.placement;
+        Error::Usage(format!(
+            "a cube of {} bits with voxels of {voxel_size:e} from {origin:?} on cannot be told in single precision",
+            self.bits
+        ))
     }
 }
 

@@ -83,7 +83,7 @@ impl Gaussians {
     pub fn write_ply<W: Write + ?Sized>(&self, to: &mut W, path: &Path) -> Result<()> {
         self.check_lengths()?;
         if !self.frame.is_valid() {
-            return Err(Error::Usage(format!("{:?} is no cube", self.frame)));
+            return Err(self.frame.not_valid());
         }
         let io = |source| Error::Io {
             path: path.to_owned(),

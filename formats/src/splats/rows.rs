@@ -62,7 +62,7 @@ impl<'a> Rows<'a> {
     pub fn new(gaussians: &'a Gaussians, up: Option<Up>) -> Result<Self> {
         gaussians.check_lengths()?;
         if !gaussians.frame.is_valid() {
-            return Err(Error::Usage(format!("{:?} is no cube", gaussians.frame)));
+            return Err(gaussians.frame.not_valid());
         }
         if u32::try_from(gaussians.len()).is_err() {
             return Err(Error::Usage(format!("{} Gaussians are more than 2³²", gaussians.len())));

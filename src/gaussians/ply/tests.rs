@@ -191,6 +191,18 @@ fn centres_in_one_place_or_none_still_get_a_cube() {
 }
 
 #[test]
+fn centres_as_near_or_as_far_as_single_precision_allows_get_a_cube_that_can_be_written() {
+    for far in [1e-45, 1e-40, 1e-36, 1.0, 1e35, 1e38, 3.4e38] {
+        let rows = [-far, far].map(|x| format!("{x} 0 {x} 0 0 0 0 0 0 0 1 0 0 0"));
+        let (g, notes) = read_back(&ascii("", &FLOATS, &rows.each_ref().map(String::as_str)));
+        assert!(notes.fitted && g.frame.is_valid(), "{far}: {:?}", g.frame);
+        let (again, _) = read_back(&written(&g));
+        assert!(again.position.iter().flatten().all(|x| x.is_finite()), "{far}");
+        assert_eq!(again.frame, g.frame, "{far}");
+    }
+}
+
+#[test]
 fn extreme_values_are_kept() {
     let rows = [
         "0 0 0 0 0 0 inf 20 1000 -1000 1 0 0 0",
