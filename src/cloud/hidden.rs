@@ -304,8 +304,8 @@ mod tests {
     fn growing_adds_the_neighbours_of_every_cell() {
         for size in [[1, 1, 1], [63, 3, 4], [64, 4, 3], [130, 5, 2]] {
             let full = random(size).complement();
-            let wanted: [(Neighbours, fn([usize; 3]) -> bool); 2] =
-                [(Neighbours::Faces, is_face), (Neighbours::All, |_| true)];
+            type Wanted = fn([usize; 3]) -> bool;
+            let wanted: [(Neighbours, Wanted); 2] = [(Neighbours::Faces, is_face), (Neighbours::All, |_| true)];
             for (neighbours, wanted) in wanted {
                 let grown = full.grown(neighbours);
                 for_each(size, |cell| {
