@@ -124,6 +124,20 @@ def test_streams_are_equal_to_those_of_the_program(program, cloud, tmp_path):
         assert b2p.encode(b2p.read(path), **options) == out.read_bytes(), words
 
 
+def test_points_inside_of_a_closed_surface_are_left_out_on_request(tmp_path):
+    count = 60_000
+    z = 1 - (2 * np.arange(count) + 1) / count
+    across, turn = np.sqrt(1 - z * z), 2.399963 * np.arange(count)
+    shell = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+    inside = np.stack([np.linspace(-0.3, 0.3, 50), np.zeros(50), np.zeros(50)], axis=1)
+    xyz = np.concatenate([shell, inside])
+    path = tmp_path / "filled.ply"
+    b2p.write(path, (xyz, np.full(xyz.shape, 90, np.uint8)))
+    assert len(b2p.read(path).xyz) == count + 50
+    with pytest.warns(b2p.InputWarning, match="left out 50 points: not seen from outside"):
+        assert len(b2p.read(path, drop_hidden=True).xyz) == count
+
+
 def test_lossless_streams_give_back_every_voxel():
     rng = np.random.default_rng(5)
     voxels = np.unique(rng.integers(0, 32, (3000, 3)), axis=0)

@@ -35,7 +35,7 @@ pub struct ReadOptions {
     /// Leave out points far from all others.
     pub drop_outliers: bool,
     /// Leave out points that cannot be seen from outside: inside of closed surfaces, or far behind openings that are
-    /// narrower than three of 512 cells along the longest side.
+    /// narrower than three of 512 cells along the longest side. Takes up to 90 MB while it looks.
     pub drop_hidden: bool,
     /// The axis that points up, whatever the file says.
     pub up: Option<Up>,
