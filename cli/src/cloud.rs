@@ -300,7 +300,7 @@ pub fn surfels_of(
     let gaussians = log.step("surfels", grid.voxels.len(), "voxels", || -> b2p::Result<Gaussians> {
         let octree = Octree::new(grid.voxels)?;
         let depth = octree.depth();
-        let map = octree.kernel_map(depth);
+        let map = octree.sibling_map(depth);
         Ok(surfels(
             isa,
             octree.level(depth),

@@ -40,7 +40,7 @@ pub use simd::{Isa, Scalar, Simd, Simd as Instructions, UnknownIsa, Work};
 pub use sparse::children::{copy_row, window};
 pub use sparse::plan::Plan;
 pub use sparse::rows::Output;
-pub use sparse::taps::{ABSENT, Taps};
+pub use sparse::taps::{ABSENT, MadeRows, Taps};
 #[cfg(feature = "startup")]
 pub use startup::stdout_was_closed;
 

@@ -11,16 +11,16 @@ use super::prediction::{Coded, EARLIER_FACES, FaceNeighbours};
 use super::space::{Steps, Ycc, clamp};
 use super::transform::{EVEN, JOINS, JOINS_OF};
 use super::weights::Weights;
-use crate::geometry::KernelMap;
 use crate::geometry::codec::guide::Mode;
+use crate::geometry::{KernelMap, SiblingMap, Window};
 
 /// The nodes of a level, whose children's colours are coded.
 #[derive(Clone, Copy)]
 pub(super) struct Nodes<'a> {
     /// The 3³ kernel map of the nodes' level.
     pub map: &'a KernelMap,
-    /// The 3³ kernel map of the children's level.
-    pub children: &'a KernelMap,
+    /// That of the children's level.
+    pub children: &'a SiblingMap,
     /// The weights of the children.
     pub weights: Weights<'a>,
     /// Levels from the children's to the stream's last, at most 3.
@@ -98,12 +98,11 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
         let row = nodes.map.row(node);
         let around = FaceNeighbours::new(nodes.map, nodes.masks, nodes.values, node);
         let joins = &JOINS_OF[usize::from(mask)];
+        let window = nodes.children.window(node);
         let first_child = nodes.first_child[node] as usize;
-        let weighting = nodes
-            .weights
-            .weighting(mask, first_child, nodes.children, &mut own_weighting);
+        let weighting = nodes.weights.weighting(mask, first_child, &window, &mut own_weighting);
         let fractions = &weighting.fractions;
-        let mut predicted = predict(nodes, node, &around, &coded);
+        let mut predicted = predict(nodes, node, &around, &coded, &window);
         if mode == Mode::Inter {
             predict_moved(&mut predicted, nodes, node);
         }
@@ -179,13 +178,12 @@ pub(super) fn spread(mask: u8, values: &[Ycc]) -> [[i32; 3]; 8] {
 /// Both predictions of a node's children, by octant, in four lanes each: `near`, which includes the children coded
 /// before, then `far`, from the nodes of the level above alone (`docs/format.md`, 5.6.5).
 #[inline(always)]
-fn predict(nodes: Nodes<'_>, node: usize, around: &FaceNeighbours, coded: &Coded) -> [Lanes; 8] {
+fn predict(nodes: Nodes<'_>, node: usize, around: &FaceNeighbours, coded: &Coded, window: &Window) -> [Lanes; 8] {
     let mut predicted = [[0; 8]; 8];
     let sums = around.sums();
-    let first = nodes.first_child[node] as usize;
-    for (child, octant) in (first..).zip(crate::geometry::ones(nodes.masks[node].into())) {
+    for octant in crate::geometry::ones(nodes.masks[node].into()) {
         let far = [0, 1, 2, 3].map(|lane| sums[lane][octant]);
-        let near = coded.sums(nodes.children.row(child), far);
+        let near = coded.sums(&window.row(octant), far);
         let ([a, b, c], [d, e, f]) = (mean(near), mean(far));
         predicted[octant] = [a, b, c, 0, d, e, f, 0];
     }

@@ -16,7 +16,7 @@ use super::weights::{self, Weights};
 use super::{CodeSlice, Guide, LevelColours, Steps, Ycc, join, nodes, slices, trunk};
 use crate::coding::ONE;
 use crate::coding::binary::Encoder;
-use crate::geometry::{KernelMap, Octree, Voxels, morton};
+use crate::geometry::{KernelMap, Octree, RowBuffer, SiblingMap, Voxels, Window, morton};
 
 /// Encoding parameters of a level.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -120,28 +120,27 @@ impl Truth {
 
 /// Colours of level `top` and the transform's means of all levels above, from the root on.
 fn means_above(octree: &Octree, trunk: u8, top: u8, values: Vec<Ycc>) -> Vec<Vec<Ycc>> {
-    let maps: Vec<KernelMap> = (0..=trunk).map(|level| octree.kernel_map(level)).collect();
+    let maps: Vec<SiblingMap> = (0..=trunk).map(|level| octree.sibling_map(level)).collect();
     let of_trunk = weights::of_trunk(octree, &maps, top);
     let mut levels = vec![values];
     for level in (0..top).rev() {
         let (masks, first) = (octree.occupancy(level), octree.first_child(level));
         let below = &levels[levels.len() - 1];
-        let map = match level + 1 {
-            level if trunk < level && level < top => octree.kernel_map(level),
-            _ => KernelMap::root(),
-        };
+        let estimated = trunk < level + 1 && level + 1 < top;
+        let map = estimated.then(|| octree.sibling_map(level + 1));
         let weights = match level < trunk {
             true => Weights::Given(&of_trunk[usize::from(level) + 1]),
             false => Weights::below_trunk(level + 1, top),
         };
-        let mean = |(mask, first): (&u8, &u32)| {
+        let mean = |(node, (mask, first)): (usize, (&u8, &u32))| {
             let first = *first as usize;
+            let window = map.as_ref().map_or(Window::EMPTY, |map| map.window(node));
             let children = super::block::spread(*mask, &below[first..]);
             let mut own = EVEN[0];
-            let weighting = weights.weighting(*mask, first, &map, &mut own);
+            let weighting = weights.weighting(*mask, first, &window, &mut own);
             forward(*mask, weighting, children).0.map(|x| x as i16)
         };
-        let means = masks.par_iter().zip(first).map(mean).collect();
+        let means = masks.par_iter().zip(first).enumerate().map(mean).collect();
         levels.push(means);
     }
     levels.reverse();
@@ -191,7 +190,7 @@ impl ColourSum {
     }
 }
 
-/// Encodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K, `top` is the
+/// Encodes the trunk: the root and the levels 1 to K. `maps` are the maps of the levels 0 to K, `top` is the
 /// stream's last level, `guides` what a previous frame tells of the levels from 1 on, if anything. Returns the payload
 /// and the colours that it decodes to.
 ///
@@ -200,7 +199,7 @@ impl ColourSum {
 pub fn encode_trunk(
     isa: Isa,
     octree: &Octree,
-    maps: &[KernelMap],
+    maps: &[SiblingMap],
     top: u8,
     truth: &Truth,
     options: Options,
@@ -241,7 +240,7 @@ pub fn encode_level(
     octree: &Octree,
     level: u8,
     above_map: &KernelMap,
-    map: &KernelMap,
+    map: &SiblingMap,
     above: &LevelColours,
     truth: &Truth,
     slice: usize,
@@ -374,7 +373,7 @@ impl CoefficientCoder for RdoEncoder {
 }
 
 /// Fits the weights of a filter pass to the original colours `truth` by least squares.
-pub(super) fn fit_pass(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, truth: &[Ycc]) -> [[i8; TERMS]; 3] {
+pub(super) fn fit_pass(isa: Isa, values: &[Ycc], map: &SiblingMap, steps: Steps, truth: &[Ycc]) -> [[i8; TERMS]; 3] {
     let values = &widen(values);
     let blocks: Vec<usize> = (0..values.len()).step_by(FIT_BLOCK).collect();
     let sums: Vec<_> = blocks
@@ -411,7 +410,7 @@ type NormalEquations = [([[f64; TERMS]; TERMS], [f64; TERMS]); 3];
 struct Fit<'a> {
     first: usize,
     values: &'a [Values],
-    map: &'a KernelMap,
+    map: &'a SiblingMap,
     steps: Steps,
     truth: &'a [Ycc],
 }
@@ -430,8 +429,13 @@ impl Work for Fit<'_> {
         } = self;
         let responses = Responses::new(steps);
         let mut sums = NormalEquations::default();
+        let (mut buffer, mut rows) = (RowBuffer::new(), [].as_slice());
         for voxel in first..values.len().min(first + FIT_BLOCK) {
-            let terms = responses.terms(instructions, values, map, voxel);
+            let place = (voxel - first) % RowBuffer::ROWS;
+            if place == 0 {
+                rows = buffer.fill(map, voxel..values.len().min(voxel + RowBuffer::ROWS));
+            }
+            let terms = responses.terms(instructions, values, &rows[27 * place..][..27], voxel);
             for t in 0..3 {
                 let residual = f64::from(truth[voxel][t]) - f64::from(values[voxel][t]);
                 let x = terms[t].map(|x| f64::from(x) / 4.0);

@@ -20,7 +20,7 @@ use rayon::prelude::*;
 use super::LevelColours;
 use super::space::{Steps, Ycc, clamp, display};
 use crate::error::{Error, Result, Stage};
-use crate::geometry::KernelMap;
+use crate::geometry::{KernelMap, RowBuffer, SiblingMap};
 
 /// Number of terms of a pass and channel.
 pub(super) const TERMS: usize = 5;
@@ -73,19 +73,19 @@ impl Filter {
         [self.passes.len() as u8].into_iter().chain(weights).collect()
     }
 
-    /// Filtered red, green and blue of every voxel of a level. `map` is the level's 3³ kernel map, `steps` are those that
-    /// the filter was made for.
+    /// Filtered red, green and blue of every voxel of a level. `map` is the level's, `steps` are those that the filter was
+    /// made for.
     ///
     /// # Panics
     /// If `map` belongs to another level.
-    pub fn rgb(&self, isa: Isa, colours: &LevelColours, map: &KernelMap, steps: Steps) -> Vec<[u8; 3]> {
+    pub fn rgb(&self, isa: Isa, colours: &LevelColours, map: &SiblingMap, steps: Steps) -> Vec<[u8; 3]> {
         let fraction = colours.steps().fraction();
         let values = self.apply(isa, colours, map, steps);
         values.par_iter().map(|ycc| display(*ycc, fraction)).collect()
     }
 
     /// Filtered [`LevelColours::values`] of a level.
-    fn apply(&self, isa: Isa, colours: &LevelColours, map: &KernelMap, steps: Steps) -> Vec<Ycc> {
+    fn apply(&self, isa: Isa, colours: &LevelColours, map: &SiblingMap, steps: Steps) -> Vec<Ycc> {
         assert_eq!(map.len(), colours.values.len(), "the map must be that of the level");
         let mut values = colours.values.clone();
         for pass in &self.passes {
@@ -100,7 +100,7 @@ impl Filter {
     /// # Panics
     /// If `truth` does not have one colour per voxel.
     #[cfg(feature = "encoder")]
-    pub fn fit(isa: Isa, colours: &LevelColours, map: &KernelMap, truth: &[Ycc]) -> Option<Filter> {
+    pub fn fit(isa: Isa, colours: &LevelColours, map: &SiblingMap, truth: &[Ycc]) -> Option<Filter> {
         assert_eq!(truth.len(), colours.values.len(), "one original colour per voxel");
         if colours.steps.is_lossless() {
             return None;
@@ -120,7 +120,7 @@ impl Filter {
 }
 
 /// Applies one pass to a level.
-fn filtered(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, pass: &Pass) -> Vec<Ycc> {
+fn filtered(isa: Isa, values: &[Ycc], map: &SiblingMap, steps: Steps, pass: &Pass) -> Vec<Ycc> {
     let (values, mut out) = (&widen(values), vec![[0; 3]; values.len()]);
     let tasks = out.par_chunks_mut(BLOCK).enumerate();
     tasks.for_each(|(i, out)| {
@@ -140,7 +140,7 @@ fn filtered(isa: Isa, values: &[Ycc], map: &KernelMap, steps: Steps, pass: &Pass
 struct FilterBlock<'a> {
     first: usize,
     values: &'a [Values],
-    map: &'a KernelMap,
+    map: &'a SiblingMap,
     steps: Steps,
     pass: &'a Pass,
     out: &'a mut [Ycc],
@@ -160,12 +160,17 @@ impl Work for FilterBlock<'_> {
             out,
         } = self;
         let kernel = Responses::new(steps);
-        for (voxel, out) in (first..).zip(out) {
-            let terms = kernel.terms(instructions, values, map, voxel);
-            for t in 0..3 {
-                let weighted = pass[t].iter().zip(terms[t]);
-                let sum = weighted.fold(0i32, |sum, (w, x)| sum.wrapping_add(i32::from(*w) * x));
-                out[t] = clamp(i32::from(values[voxel][t]) + ((sum + 32) >> 6), steps.fraction());
+        let mut buffer = RowBuffer::new();
+        for (i, out) in out.chunks_mut(RowBuffer::ROWS).enumerate() {
+            let first = first + i * RowBuffer::ROWS;
+            let rows = buffer.fill(map, first..first + out.len()).chunks_exact(27);
+            for ((voxel, out), row) in (first..).zip(out).zip(rows) {
+                let terms = kernel.terms(instructions, values, row, voxel);
+                for t in 0..3 {
+                    let weighted = pass[t].iter().zip(terms[t]);
+                    let sum = weighted.fold(0i32, |sum, (w, x)| sum.wrapping_add(i32::from(*w) * x));
+                    out[t] = clamp(i32::from(values[voxel][t]) + ((sum + 32) >> 6), steps.fraction());
+                }
             }
         }
     }
@@ -236,10 +241,10 @@ impl Responses {
         responses(instructions, values, own, &present, &PLACES[..count], &self.inverses)
     }
 
-    /// Computes the terms of one voxel.
+    /// Computes the terms of one voxel, which has this row of its level's map.
     #[inline(always)]
-    pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], map: &KernelMap, voxel: usize) -> Terms {
-        let (own, row) = (&values[voxel], map.row(voxel));
+    pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], row: &[u32], voxel: usize) -> Terms {
+        let own = &values[voxel];
         let (faces, face_count) = self.sum(instructions, values, own, row, &FACES);
         let (edges, edge_count) = self.sum(instructions, values, own, row, &EDGES);
         let (corners, corner_count) = self.sum(instructions, values, own, row, &CORNERS);

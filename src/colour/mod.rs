@@ -46,7 +46,7 @@ use crate::cancel::Cancel;
 use crate::coding::binary::Decoder;
 use crate::container::Slice;
 use crate::error::{Error, Result, Stage};
-use crate::geometry::{KernelMap, Octree};
+use crate::geometry::{KernelMap, Octree, SiblingMap};
 use block::{Coding, Nodes};
 use energy::spread_energies;
 use model::{CoefficientContext, Model};
@@ -116,14 +116,14 @@ fn slices(nodes: usize, slice: usize) -> impl ExactSizeIterator<Item = Range<usi
     (0..nodes.div_ceil(slice)).map(move |i| i * slice..nodes.min((i + 1) * slice))
 }
 
-/// Decodes the trunk: the root and the levels 1 to K. `maps` are the 3³ kernel maps of the levels 0 to K.
+/// Decodes the trunk: the root and the levels 1 to K. `maps` are the maps of the levels 0 to K.
 ///
 /// # Errors
 /// [`Error::Truncated`] or [`Error::Malformed`] if the payload is invalid.
 ///
 /// # Panics
 /// If the octree has fewer than K levels.
-pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Slice) -> Result<LevelColours> {
+pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[SiblingMap], payload: &Slice) -> Result<LevelColours> {
     decode_guided_trunk(isa, octree, maps, payload, &[], &mut |_, _| {})
 }
 
@@ -138,7 +138,7 @@ pub fn decode_trunk(isa: Isa, octree: &Octree, maps: &[KernelMap], payload: &Sli
 pub fn decode_guided_trunk(
     isa: Isa,
     octree: &Octree,
-    maps: &[KernelMap],
+    maps: &[SiblingMap],
     payload: &Slice,
     guides: &[Guide<'_>],
     each: &mut dyn FnMut(u8, &LevelColours),
@@ -184,7 +184,7 @@ pub fn decode_guided_trunk(
 fn trunk<'t, S: CoefficientCoder>(
     isa: Isa,
     octree: &Octree,
-    maps: &[KernelMap],
+    maps: &[SiblingMap],
     last: u8,
     coding: Coding,
     root: [i16; 3],
@@ -200,9 +200,9 @@ fn trunk<'t, S: CoefficientCoder>(
         each(level as u8 - 1, &colours);
         let coding = coding_above(coding, depth - level);
         let mut model = std::mem::replace(&mut colours.model, Model::empty());
-        let [above, map] = [&maps[level - 1], &maps[level]];
+        let above = maps[level - 1].table();
         let weights = Weights::Given(&weights[level]);
-        let mut nodes = nodes(octree, level as u8, above, map, weights, &colours);
+        let mut nodes = nodes(octree, level as u8, &above, &maps[level], weights, &colours);
         nodes.guide = guides.get(level - 1).copied();
         let coded = isa.run(CodeSlice {
             coder,
@@ -224,8 +224,8 @@ fn trunk<'t, S: CoefficientCoder>(
     colours
 }
 
-/// Decodes the colours of `level` from those of the level above and one payload for every `slice` nodes. `above_map`
-/// and `map` are the 3³ kernel maps of the level above and of `level`, `guide` what a previous frame tells of the level.
+/// Decodes the colours of `level` from those of the level above and one payload for every `slice` nodes. `above_map` is
+/// the 3³ kernel map of the level above, `map` that of `level`, `guide` what a previous frame tells of the level.
 ///
 /// # Errors
 /// [`Error::Truncated`] or [`Error::Malformed`] if a payload is invalid, and [`Error::Cancelled`].
@@ -238,7 +238,7 @@ pub fn decode_level(
     octree: &Octree,
     level: u8,
     above_map: &KernelMap,
-    map: &KernelMap,
+    map: &SiblingMap,
     above: &LevelColours,
     payloads: &[Slice],
     slice: usize,
@@ -344,7 +344,7 @@ fn nodes<'a>(
     octree: &'a Octree,
     level: u8,
     map: &'a KernelMap,
-    children: &'a KernelMap,
+    children: &'a SiblingMap,
     weights: Weights<'a>,
     above: &'a LevelColours,
 ) -> Nodes<'a> {

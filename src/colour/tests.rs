@@ -2,12 +2,12 @@ use super::*;
 use crate::geometry::Voxels;
 use proptest::prelude::*;
 
-/// A cloud, its octree down to level `top`, and the kernel maps of all levels.
+/// A cloud, its octree down to level `top`, and the maps of all levels.
 struct Case {
     voxels: Voxels,
     colours: Vec<[u8; 3]>,
     octree: Octree,
-    maps: Vec<KernelMap>,
+    maps: Vec<SiblingMap>,
 }
 
 impl Case {
@@ -15,10 +15,7 @@ impl Case {
         let voxels = Voxels::new(depth, keys);
         let colours = (0..voxels.len()).map(|i| colour(voxels.coordinate(i))).collect();
         let octree = Octree::new(voxels.clone()).unwrap().truncated(top);
-        let mut maps = vec![KernelMap::root()];
-        for level in 0..top {
-            maps.push(octree.child_map(level, &maps[usize::from(level)]));
-        }
+        let maps = (0..=top).map(|level| octree.sibling_map(level)).collect();
         Case {
             voxels,
             colours,
@@ -69,12 +66,12 @@ impl Case {
         );
         let mut payloads = vec![vec![bytes]];
         for level in trunk + 1..=self.octree.depth() {
-            let [above, map] = [level - 1, level].map(|l| &self.maps[usize::from(l)]);
+            let (above, map) = (self.octree.kernel_map(level - 1), &self.maps[usize::from(level)]);
             let (slices, next) = encode_level(
                 isa,
                 &self.octree,
                 level,
-                above,
+                &above,
                 map,
                 &colours,
                 &truth,
@@ -96,7 +93,7 @@ impl Case {
         };
         let mut colours = decode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &first)?;
         for (level, payloads) in (trunk + 1..=self.octree.depth()).zip(&payloads[1..]) {
-            let [above, map] = [level - 1, level].map(|l| &self.maps[usize::from(l)]);
+            let (above, map) = (self.octree.kernel_map(level - 1), &self.maps[usize::from(level)]);
             let slices: Vec<_> = payloads
                 .iter()
                 .map(|bytes| Slice {
@@ -109,7 +106,7 @@ impl Case {
                 isa,
                 &self.octree,
                 level,
-                above,
+                &above,
                 map,
                 &colours,
                 &slices,
@@ -247,8 +244,8 @@ fn invalid_steps_are_an_error() {
     }
 }
 
-/// A coarsely coded level of a paraboloid, its kernel map, and its original colours.
-fn noisy() -> (LevelColours, KernelMap, Vec<Ycc>) {
+/// A coarsely coded level of a paraboloid, its map, and its original colours.
+fn noisy() -> (LevelColours, SiblingMap, Vec<Ycc>) {
     let case = Case::bowl(7, 6);
     let steps = Steps { luma: 44, chroma: 52 };
     let (_, colours) = case.encode(Isa::detect(), 3, 1 << 14, steps);

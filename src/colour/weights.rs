@@ -8,7 +8,7 @@
 use rayon::prelude::*;
 
 use super::transform::{EVEN, Weighting};
-use crate::geometry::{KernelMap, Octree};
+use crate::geometry::{Octree, SiblingMap, Window, ones};
 
 /// Weight of a voxel of the last level.
 pub(super) const UNIT: u32 = 1024;
@@ -45,15 +45,15 @@ impl Weights<'_> {
         }
     }
 
-    /// How the children of a node are joined. `first` is the first of them, `children` the kernel map of their level.
-    /// `own` has room for what no table holds.
+    /// How the children of a node are joined. `first` is the first of them, `window` what lies around them. `own` has room
+    /// for what no table holds.
     #[inline(always)]
-    pub fn weighting<'w>(self, mask: u8, first: usize, children: &KernelMap, own: &'w mut Weighting) -> &'w Weighting {
+    pub fn weighting<'w>(self, mask: u8, first: usize, window: &Window, own: &'w mut Weighting) -> &'w Weighting {
         let mut weights = [0; 8];
-        for (child, octant) in (first..).zip(crate::geometry::ones(mask.into())) {
+        for (child, octant) in (first..).zip(ones(mask.into())) {
             weights[octant] = match self {
                 Weights::Even => return &EVEN[usize::from(mask)],
-                Weights::Estimated => estimate(children.row(child)).into(),
+                Weights::Estimated => estimate(window, octant).into(),
                 Weights::Given(weights) => weights[child].into(),
             };
         }
@@ -62,12 +62,12 @@ impl Weights<'_> {
     }
 }
 
-/// The weight of a voxel with this row of its level's kernel map.
+/// The weight of a voxel in this octant of a window.
 #[inline(always)]
-fn estimate(row: &[u32]) -> u16 {
+fn estimate(window: &Window, octant: usize) -> u16 {
     let (mut both, mut one) = (0, 0);
     for [before, after] in [[12, 14], [10, 16], [4, 22]] {
-        let [before, after] = [before, after].map(|k: usize| row[k] != KernelMap::ABSENT);
+        let [before, after] = [before, after].map(|k| window.has(octant, k));
         both += usize::from(before & after);
         one += usize::from(before ^ after);
     }
@@ -75,11 +75,11 @@ fn estimate(row: &[u32]) -> u16 {
 }
 
 /// Weights of the levels 0 to K of a trunk whose maps these are, in a stream with the last level `top`.
-pub(super) fn of_trunk(octree: &Octree, maps: &[KernelMap], top: u8) -> Vec<Vec<u16>> {
+pub(super) fn of_trunk(octree: &Octree, maps: &[SiblingMap], top: u8) -> Vec<Vec<u16>> {
     let depth = maps.len() - 1;
     let last = match depth >= usize::from(top) {
         true => vec![UNIT as u16; maps[depth].len()],
-        false => estimates(&maps[depth]),
+        false => estimates(octree, depth as u8, &maps[depth]),
     };
     let mut levels = vec![last];
     for level in (0..depth as u8).rev() {
@@ -99,9 +99,17 @@ pub(super) fn of_trunk(octree: &Octree, maps: &[KernelMap], top: u8) -> Vec<Vec<
     levels
 }
 
-/// Estimated weights of the voxels of a level.
-pub(super) fn estimates(map: &KernelMap) -> Vec<u16> {
-    map.rows().par_chunks(27).map(estimate).collect()
+/// Estimated weights of the voxels of a level, whose map this is.
+pub(super) fn estimates(octree: &Octree, level: u8, map: &SiblingMap) -> Vec<u16> {
+    let Some(above) = level.checked_sub(1) else {
+        return vec![estimate(&map.window(0), 0)];
+    };
+    let parents = octree.occupancy(above).par_iter().enumerate();
+    let weights = parents.flat_map_iter(|(parent, &mask)| {
+        let window = map.window(parent);
+        ones(mask.into()).map(move |octant| estimate(&window, octant))
+    });
+    weights.collect()
 }
 
 #[cfg(test)]
@@ -112,7 +120,8 @@ mod tests {
     /// The weights of the voxels of the last level of these, of depth 3.
     fn estimated(at: &[[u32; 3]]) -> Vec<u16> {
         let keys = at.iter().map(|xyz| crate::geometry::morton::encode(*xyz)).collect();
-        estimates(&Octree::new(Voxels::new(3, keys)).unwrap().kernel_map(3))
+        let octree = Octree::new(Voxels::new(3, keys)).unwrap();
+        estimates(&octree, 3, &octree.sibling_map(3))
     }
 
     #[test]
@@ -133,13 +142,13 @@ mod tests {
     #[test]
     fn a_node_weighs_a_quarter_of_its_children() {
         let octree = Octree::new(Voxels::new(2, (0..24).chain([40]).collect())).unwrap();
-        let maps: Vec<_> = (0..=2).map(|level| octree.kernel_map(level)).collect();
+        let maps: Vec<_> = (0..=2).map(|level| octree.sibling_map(level)).collect();
         assert_eq!(
             of_trunk(&octree, &maps, 2)[..2],
             [vec![1600], vec![2048, 2048, 2048, 256]]
         );
         let estimated = of_trunk(&octree, &maps, 3);
-        assert_eq!(estimated[2], estimates(&maps[2]));
+        assert_eq!(estimated[2], estimates(&octree, 2, &maps[2]));
         let first: u16 = estimated[2][..8].iter().sum();
         assert_eq!(estimated[1][0], (first + 2) >> 2);
     }
@@ -147,10 +156,10 @@ mod tests {
     #[test]
     fn weights_stay_in_their_range() {
         let lone = Octree::new(Voxels::new(12, vec![5])).unwrap();
-        let maps: Vec<_> = (0..=12).map(|level| lone.kernel_map(level)).collect();
+        let maps: Vec<_> = (0..=12).map(|level| lone.sibling_map(level)).collect();
         assert_eq!(of_trunk(&lone, &maps, 12)[..6], vec![vec![1]; 6]);
         let solid = Octree::new(Voxels::new(6, (0..1 << 18).collect())).unwrap();
-        let maps: Vec<_> = (0..=6).map(|level| solid.kernel_map(level)).collect();
+        let maps: Vec<_> = (0..=6).map(|level| solid.sibling_map(level)).collect();
         assert_eq!(of_trunk(&solid, &maps, 6)[0], [1 << 14]);
     }
 }

@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::gaussians::learned::LevelInput;
 use crate::gaussians::surfels::{SurfelSelection, is_for_surfels, surfels};
 use crate::gaussians::{Frame, Gaussians, HeadMap};
-use crate::geometry::{KernelMap, Octree};
+use crate::geometry::{Octree, SiblingMap};
 
 /// How far surfels depend on other voxels: the widest window, in voxels of the level above.
 const SURFEL_REACH: u32 = 4;
@@ -43,10 +43,10 @@ pub(crate) struct Advice {
 pub(crate) struct Part<'a> {
     pub octree: &'a Octree,
     pub level: u8,
-    /// Their 3³ kernel map.
-    pub map: &'a KernelMap,
-    /// That of the level above; level 0 has none.
-    pub above: Option<&'a KernelMap>,
+    /// Their neighbours.
+    pub map: &'a SiblingMap,
+    /// Those in the level above; level 0 has none.
+    pub above: Option<&'a SiblingMap>,
     pub colours: &'a [[u8; 3]],
     /// The voxels that are drawn, if they are chosen.
     pub range: Range<usize>,

@@ -3,6 +3,7 @@
 use crate::colour::LevelColours;
 use crate::container::{Header, MAX_TRUNK_VOXELS};
 use crate::error::Result;
+use crate::geometry::SiblingMap;
 use crate::latents::LatentDecoder;
 use crate::latents::network::{AT_ONCE, RAW};
 use crate::memory::{NOTHING, Sizes, Term, total};
@@ -120,19 +121,33 @@ const ONE: Term = Term {
 
 const KEPT: Term = Term {
     each: "voxel of the level and of the level above",
-    takes: "kernel map, colours decoded and as bytes",
-    fixed: MAP + LevelColours::bytes_per_voxel() as u64 + 3,
+    takes: "neighbours, colours decoded and as bytes",
+    fixed: SiblingMap::BYTES_PER_VOXEL + LevelColours::bytes_per_voxel() as u64 + 3,
+    by: NOTHING,
+};
+const WINDOWS: Term = Term {
+    each: "voxel of the level above and two levels above",
+    takes: "which neighbours its children have",
+    fixed: SiblingMap::BYTES_PER_PARENT,
     by: NOTHING,
 };
 const TRUNK: Term = Term {
     each: "voxel of the levels above the base, at most 65,536 in each, while colours are decoded",
-    takes: "kernel map, weight of colours",
-    fixed: MAP + 2,
+    takes: "neighbours, weight of colours",
+    fixed: SiblingMap::BYTES_PER_VOXEL + SiblingMap::BYTES_PER_PARENT + 2,
     by: NOTHING,
 };
 const KEPT_ABOVE: Term = Term {
     each: "voxel two levels above the level, at the same time",
-    ..KEPT
+    takes: "neighbours, colours decoded and as bytes",
+    fixed: KEPT.fixed + WINDOWS.fixed,
+    by: NOTHING,
+};
+const TABLES: Term = Term {
+    each: "voxel of the level above and two levels above, at the same time",
+    takes: "kernel map",
+    fixed: MAP,
+    by: NOTHING,
 };
 const CODING: Term = Term {
     each: "voxel of the level, while its colours are decoded",
@@ -158,10 +173,16 @@ const CONTEXTS: Term = Term {
     fixed: LevelColours::model_bytes() as u64,
     by: NOTHING,
 };
-const SURFEL_SUMS: Term = Term {
-    each: "voxel of the level, with surfels",
-    takes: "sums that surfels are made of",
+const STEPS: Term = Term {
+    each: "voxel of the level, before surfels are made",
+    takes: "sums of moments, before and after a step",
     fixed: 2 * 32,
+    by: NOTHING,
+};
+const SUMS: Term = Term {
+    each: "voxel of the level, while surfels are made",
+    takes: "sums of moments",
+    fixed: 32,
     by: NOTHING,
 };
 const SURFELS: Term = Term {
@@ -235,24 +256,27 @@ pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64>
     let levels = usize::from(level - header.base) + 1;
     let counts = || header.voxels[..levels].iter().copied().map(u64::from);
     let base = counts().next().unwrap_or(0);
-    // Of the levels above the base level no more is known than that they have no more voxels.
-    let above = |most: u64| -> u64 {
-        let level = |n: u64| most.min(1 << (3 * n).min(60));
-        (0..u64::from(header.base)).map(level).sum()
-    };
-    let [grandparents, parents] = [2, 1].map(|up| counts().nth_back(up).unwrap_or(base));
+    // Of the levels above the base level no more is known than that they have no more voxels, nor than there are places.
+    let places = |level: u8| 1 << (3 * u64::from(level)).min(60);
+    let above = |most: u64| -> u64 { (0..header.base).map(|level| most.min(places(level))).sum() };
+    let [grandparents, parents] = [2, 1].map(|up: u8| {
+        let unknown = base.min(places(level.saturating_sub(up)));
+        counts().nth_back(up.into()).unwrap_or(unknown)
+    });
     let voxels = counts().next_back().unwrap_or(0);
     let slices = parents.div_ceil(header.colour_slice().into());
     let terms = [
         (SLICES, header.prefix_bytes(level)?),
         (OCTREE, counts().sum::<u64>() + above(base)),
         (KEPT, parents + voxels),
+        (WINDOWS, grandparents + parents),
         (CONTEXTS, 3),
     ];
     // These do not coexist.
     let coding = [
         (TRUNK, above(base.min(MAX_TRUNK_VOXELS.into()))),
         (KEPT_ABOVE, grandparents),
+        (TABLES, grandparents + parents),
         (CONTEXTS, slices.min(rayon::current_num_threads() as u64)),
         (CODING, voxels),
         (CODING_ABOVE, parents),
@@ -264,7 +288,8 @@ pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64>
 
 /// Bytes that making so many surfels of each of so many voxels takes at most, themselves included.
 pub(super) fn surfels(voxels: u64, per_voxel: u64) -> u64 {
-    total(&[(SURFEL_SUMS, voxels), (SURFELS, voxels * per_voxel)], NOTHING)
+    let made = total(&[(SUMS, voxels), (SURFELS, voxels * per_voxel)], NOTHING);
+    total(&[(STEPS, voxels)], NOTHING).max(made)
 }
 
 #[cfg(test)]
@@ -310,8 +335,8 @@ mod tests {
         let base = [BASE, BASE_LEARNING, NEAR, NEAR_LEARNING];
         let drawing = [GENERATOR, GAUSSIANS, EIGHT, ONE];
         let version_2 = [&[SLICES, OCTREE, ABOVE, EXACT][..], &base, &drawing].concat();
-        let version_3 = [SLICES, OCTREE, KEPT, CONTEXTS, TRUNK, KEPT_ABOVE];
-        let coding = [CODING, CODING_ABOVE, FILTERING, SURFEL_SUMS, SURFELS];
+        let version_3 = [SLICES, OCTREE, KEPT, WINDOWS, CONTEXTS, TRUNK, KEPT_ABOVE, TABLES];
+        let coding = [CODING, CODING_ABOVE, FILTERING, STEPS, SUMS, SURFELS];
         let version_3 = [&version_3[..], &coding, &learned::TERMS].concat();
         let tables = [table(&version_2), table(&version_3)];
         let missing = tables.iter().filter(|table| !text.contains(*table));
@@ -390,28 +415,34 @@ mod tests {
         let colour_slice = 1000;
         let header = header(3, &[400, 1500, 6001], Format::Transform { colour_slice });
         let contexts = LevelColours::model_bytes() as u64;
-        let kept = LevelColours::bytes_per_voxel() as u64 + 27 * 4 + 3;
+        let kept = LevelColours::bytes_per_voxel() as u64 + 32 + 3;
         let threads = rayon::current_num_threads() as u64;
         let start = header.bytes() as u64;
         // Levels 0, 1 and 2 have at most 1, 8 and 64 voxels.
-        let (all, trunk): (u64, u64) = (73, 73 * (27 * 4 + 2));
-        let always = |bytes, voxels, pair| 4 * (start + bytes) + 13 * (voxels + all) + kept * pair + 3 * contexts;
-        // The base level stands for those above it that are not there.
-        let coding =
-            |up: [u64; 3], slices: u64| trunk + kept * up[0] + contexts * slices.min(threads) + 14 * up[2] + 46 * up[1];
+        let (all, trunk): (u64, u64) = (73, 73 * (32 + 14 + 2));
+        let always = |bytes, voxels, up: [u64; 3]| {
+            let windows = 14 * (up[0] + up[1]);
+            4 * (start + bytes) + 13 * (voxels + all) + kept * (up[1] + up[2]) + windows + 3 * contexts
+        };
+        // Levels 1 and 2 have at most 8 and 64 voxels.
+        let coding = |up: [u64; 3], slices: u64| {
+            let maps = trunk + (kept + 14) * up[0] + 108 * (up[0] + up[1]);
+            maps + contexts * slices.min(threads) + 14 * up[2] + 46 * up[1]
+        };
         let filtering = |voxels| 28 * voxels;
         for (level, bytes, voxels, up, slices) in [
-            (3, 200, 400, [400, 400, 400], 1),
-            (4, 400, 1900, [400, 400, 1500], 1),
+            (3, 200, 400, [8, 64, 400], 1),
+            (4, 400, 1900, [64, 400, 1500], 1),
             (5, 600, 7901, [400, 1500, 6001], 2),
         ] {
             let most = coding(up, slices).max(filtering(up[2]));
-            let expected = always(bytes, voxels, up[1] + up[2]);
+            let expected = always(bytes, voxels, up);
             assert_eq!(transform(&header, level, 0).unwrap(), expected + most, "level {level}");
             assert_eq!(transform(&header, level, most + 1).unwrap(), expected + most + 1);
         }
         assert!(transform(&header, 6, 0).is_err());
-        assert_eq!(surfels(1000, 3), 1000 * 64 + 3000 * 56);
+        assert_eq!(surfels(1000, 3), 1000 * 32 + 3000 * 56);
+        assert_eq!(surfels(1000, 0), 1000 * 64);
     }
 
     #[test]
@@ -424,12 +455,13 @@ mod tests {
         };
         // 0 to 6 have 1, 8, 64, 512, 4096, 32,768 and 70,000 at most; of these the trunk of colours has 65,536.
         let (with, least) = of(7, 70_000);
-        let kept = LevelColours::bytes_per_voxel() as u64 + 27 * 4 + 3;
+        let kept = LevelColours::bytes_per_voxel() as u64 + 32 + 3;
         let slices = u64::from(rayon::current_num_threads() > 1) * LevelColours::model_bytes() as u64;
         let places = 1 + 8 + 64 + 512 + 4096 + 32_768;
-        let own =
-            13 * (70_000 + places + 70_000) + kept * 140_000 + 110 * (places + 65_536) + (kept + 14 + 46) * 70_000;
-        let one = 13 + kept * 2 + (kept + 14 + 46);
+        let always = 13 * (70_000 + places + 70_000) + kept * 140_000 + 14 * (70_000 + 32_768);
+        let maps = 48 * (places + 65_536) + (kept + 14) * 32_768 + 108 * (70_000 + 32_768);
+        let own = always + maps + (14 + 46) * 70_000;
+        let one = 13 + 2 * kept + 2 * 14 + (kept + 14) + 2 * 108 + (14 + 46);
         assert_eq!(with + one, own + least + slices);
     }
 }

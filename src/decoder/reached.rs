@@ -8,15 +8,15 @@ use crate::colour::{Filter, LevelColours, Steps};
 use crate::gaussians::HeadMap;
 use crate::gaussians::learned::LevelInput;
 use crate::gaussians::surfels::is_for_surfels;
-use crate::geometry::{KernelMap, Octree};
+use crate::geometry::{Octree, SiblingMap};
 
 /// The deepest level so far.
 #[derive(Debug, Clone)]
 pub(super) struct Reached {
     pub level: u8,
     pub octree: Octree,
-    /// Its 3³ kernel map.
-    pub map: KernelMap,
+    /// Its voxels' neighbours.
+    pub map: SiblingMap,
     /// Level 0 has none.
     pub above: Option<Above>,
     /// Decoded, before the filter: what the next level is coded from.
@@ -33,7 +33,7 @@ pub(super) struct Reached {
 /// The level above.
 #[derive(Debug, Clone)]
 pub(super) struct Above {
-    pub map: KernelMap,
+    pub map: SiblingMap,
     /// Before the filter; not known of the last level but one of a trunk.
     pub coloured: Option<LevelColours>,
 }

@@ -12,7 +12,7 @@ use crate::container::feed::{Feed, Goal};
 use crate::container::{Colours, Geometry, Header, Level, Slice, Trunk};
 use crate::error::Result;
 use crate::gaussians::{Gaussians, HeadMap};
-use crate::geometry::{KernelMap, Octree, codec};
+use crate::geometry::{KernelMap, Octree, SiblingMap, codec};
 use crate::latents::nothing_reached;
 use crate::log::Log;
 use crate::motion::{self, ColourGuide, GeometryGuide, Inter, Previous};
@@ -35,7 +35,7 @@ type History = Vec<motion::Coloured>;
 
 /// The occupancies of a level that were decoded beside the colours of the level above, which are coded apart from them
 /// and take as long.
-type Ahead = Option<(u8, Result<Vec<u8>>)>;
+type Ahead = Option<(u8, KernelMap, Result<Vec<u8>>)>;
 
 impl<'b> Transform<'b> {
     pub(super) fn new(decoder: Decoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
@@ -221,10 +221,10 @@ struct Growing<'a> {
 /// Decoded colours of levels, one after the other, if they are to be kept.
 type Kept<'a> = Option<&'a mut Vec<Vec<Ycc>>>;
 
-/// The kernel map and the colours of a level on the way to the one that a section is of, and of the level above if the
+/// The map and the colours of a level on the way to the one that a section is of, and of the level above if the
 /// section has it.
 struct Step {
-    map: KernelMap,
+    map: SiblingMap,
     coloured: LevelColours,
     above: Option<Above>,
 }
@@ -275,14 +275,14 @@ impl Growing<'_> {
     fn trunk(&self, octree: &mut Octree, trunk: &Trunk, ahead: &mut Ahead, kept: Kept<'_>, log: &Log) -> Result<Step> {
         let isa = self.decoder.isa();
         let (depth, count) = (trunk.level, trunk.slice.voxels as usize);
-        let mut maps = vec![KernelMap::root()];
+        let mut maps = vec![SiblingMap::root()];
         let name = format!("geometry of levels 0 to {depth}");
         log.step(name, count, "voxels", || {
             for part in self.part.geometry.iter().take(depth.into()) {
-                let map = &maps[maps.len() - 1];
-                let masks = self.masks(octree, part, map)?;
+                let map = maps[maps.len() - 1].table();
+                let masks = self.masks(octree, part, &map)?;
                 octree.grow(masks)?;
-                maps.push(octree.child_map(part.level - 1, map));
+                maps.push(octree.child_siblings(part.level - 1, &map));
             }
             Ok(())
         })?;
@@ -308,7 +308,7 @@ impl Growing<'_> {
         if let Some(kept) = kept {
             kept.append(&mut values);
         }
-        let map = maps.pop().unwrap_or_else(KernelMap::root);
+        let map = maps.pop().unwrap_or_else(SiblingMap::root);
         Ok(Step {
             map,
             coloured,
@@ -321,11 +321,11 @@ impl Growing<'_> {
         &self,
         octree: &mut Octree,
         n: u8,
-        above_map: &KernelMap,
+        above_map: &SiblingMap,
         above: &LevelColours,
         ahead: &mut Ahead,
         log: &Log,
-    ) -> Result<(KernelMap, LevelColours)> {
+    ) -> Result<(SiblingMap, LevelColours)> {
         let (isa, cancel) = (self.decoder.isa(), self.decoder.cancel());
         let header = self.header;
         let geometry = self.part.geometry.iter().find(|part| part.level == n);
@@ -335,17 +335,20 @@ impl Growing<'_> {
         };
         let slices = &geometry.slices;
         let count = slices.iter().map(|s| s.voxels as usize).sum();
-        log.step(format!("geometry of level {n}"), count, "voxels", || {
-            match ahead.take() {
-                Some((level, masks)) if level == n => octree.grow(masks?),
+        let above_map = log.step(format!("geometry of level {n}"), count, "voxels", || {
+            let (map, masks) = match ahead.take() {
+                Some((level, map, masks)) if level == n => (map, masks?),
                 _ => {
-                    let masks = self.masks(octree, geometry, above_map)?;
-                    octree.grow(masks)
+                    let map = above_map.table();
+                    let masks = self.masks(octree, geometry, &map)?;
+                    (map, masks)
                 }
-            }
+            };
+            octree.grow(masks)?;
+            Ok(map)
         })?;
-        let map = log.step(format!("kernel map of level {n}"), count, "voxels", || {
-            Ok(octree.child_map(n - 1, above_map))
+        let map = log.step(format!("neighbours of level {n}"), count, "voxels", || {
+            Ok(octree.child_siblings(n - 1, &above_map))
         })?;
         let guide = self.inter.map(|inter| inter.colours(octree, n)).transpose()?;
         let name = self.named(format!("colours of level {n}"), n);
@@ -355,7 +358,7 @@ impl Growing<'_> {
             let guide = guide.as_ref().map(ColourGuide::guide);
             let colours = || {
                 let octree = &*octree;
-                colour::decode_level(isa, octree, n, above_map, &map, above, slices, slice, guide, cancel)
+                colour::decode_level(isa, octree, n, &above_map, &map, above, slices, slice, guide, cancel)
             };
             self.with_next_occupancies(octree, n, &map, ahead, colours)
         })?;
@@ -377,21 +380,25 @@ impl Growing<'_> {
         }
     }
 
-    /// Decodes the colours of level `n`, and beside them the occupancies of the level after it, if it is there. `map`
-    /// is the kernel map of level `n`.
+    /// Decodes the colours of level `n`, and beside them the occupancies of the level after it, if it is there. `map` is
+    /// that of level `n`.
     fn with_next_occupancies(
         &self,
         octree: &Octree,
         n: u8,
-        map: &KernelMap,
+        map: &SiblingMap,
         ahead: &mut Ahead,
         colours: impl FnOnce() -> Result<LevelColours> + Send,
     ) -> Result<LevelColours> {
         let Some(next) = self.after(n) else {
             return colours();
         };
-        let (coloured, masks) = rayon::join(colours, || self.masks(octree, next, map));
-        *ahead = Some((n + 1, masks));
+        let (coloured, (map, masks)) = rayon::join(colours, || {
+            let map = map.table();
+            let masks = self.masks(octree, next, &map);
+            (map, masks)
+        });
+        *ahead = Some((n + 1, map, masks));
         coloured
     }
 }

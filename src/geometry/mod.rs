@@ -5,10 +5,13 @@ pub mod codec;
 pub mod morton;
 mod neighbours;
 mod octree;
+mod siblings;
 mod voxels;
 
 pub use neighbours::KernelMap;
 pub use octree::{MAX_VOXELS, Octree};
+pub(crate) use siblings::Window;
+pub use siblings::{RowBuffer, SiblingMap};
 pub use voxels::Voxels;
 
 /// Positions of the set bits of a mask, ascending.

@@ -1,6 +1,6 @@
 //! The octree of a cloud: its voxels at every level, and the links between levels (`docs/format.md`, clause 2.3).
 
-use super::{KernelMap, Voxels, morton, neighbours};
+use super::{KernelMap, SiblingMap, Voxels, morton, neighbours};
 use crate::error::{Error, Result, Stage};
 
 /// Maximum number of voxels of a level: indices are `u32`, without [`KernelMap::ABSENT`].
@@ -170,6 +170,39 @@ impl Octree {
     /// If the octree is not that deep, or `map` is not the 3³ kernel map of `level`.
     pub fn child_map(&self, level: u8, map: &KernelMap) -> KernelMap {
         neighbours::of_children(map, self.occupancy(level), self.first_child(level))
+    }
+
+    /// The same map as [`Octree::child_map`], in less memory.
+    ///
+    /// # Panics
+    /// As [`Octree::child_map`].
+    pub fn child_siblings(&self, level: u8, map: &KernelMap) -> SiblingMap {
+        SiblingMap::of_children(map, self.occupancy(level), self.first_child(level))
+    }
+
+    /// The same map as [`Octree::kernel_map`], in less memory.
+    ///
+    /// # Panics
+    /// As [`Octree::kernel_map`].
+    pub fn sibling_map(&self, level: u8) -> SiblingMap {
+        (0..level).fold(SiblingMap::root(), |map, above| {
+            self.child_siblings(above, &map.table())
+        })
+    }
+
+    /// The maps of the level above `level`, unless it is the root, and of `level`.
+    ///
+    /// # Panics
+    /// As [`Octree::kernel_map`].
+    pub fn last_sibling_maps(&self, level: u8) -> (Option<SiblingMap>, SiblingMap) {
+        let above = level.checked_sub(1).map(|above| self.sibling_map(above));
+        match above {
+            Some(map) => {
+                let children = self.child_siblings(level - 1, &map.table());
+                (Some(map), children)
+            }
+            None => (None, SiblingMap::root()),
+        }
     }
 }
 

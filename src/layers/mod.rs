@@ -9,7 +9,7 @@ mod stored;
 mod tensors;
 
 pub use precision::Precision;
-pub(crate) use run::{Conv, Inception, Pool, ResBlock, apply, apply_added, apply_f32, apply_part, concat, reals};
+pub(crate) use run::{Conv, Inception, Pool, ResBlock, apply, apply_f32, apply_onto, apply_part, concat, reals};
 pub(crate) use safetensors::{Dtype, File};
 pub(crate) use stored::{Spec, Stored};
 #[cfg(test)]

@@ -138,25 +138,27 @@ pub(crate) fn apply<C: Conv>(
     out
 }
 
-/// `relu(layer + added)`, as many rows as `added` has.
-pub(crate) fn apply_added<C: Conv>(
-    pool: &mut Pool<C::Value>,
+/// Makes `rows` `relu?(layer + rows)`.
+pub(crate) fn apply_onto<C: Conv>(
     isa: Isa,
     conv: &C,
     taps: Taps<'_>,
     input: &[C::Value],
-    added: &[C::Value],
-) -> Vec<C::Value> {
-    let mut out = pool.take(added.len());
-    let output = Output {
-        rows: &mut out,
-        stride: conv.cout(),
-        column: 0,
-        residual: Some(added),
-        relu: true,
-    };
-    spread(output, |first, output| conv.run(isa, taps, input, first, output));
-    out
+    rows: &mut [C::Value],
+    relu: bool,
+) {
+    let stride = conv.cout();
+    rows.par_chunks_mut(BLOCK * stride).enumerate().for_each(|(i, rows)| {
+        let before = rows.to_vec();
+        let output = Output {
+            rows,
+            stride,
+            column: 0,
+            residual: Some(&before[..]),
+            relu,
+        };
+        conv.run(isa, taps, input, i * BLOCK, output);
+    });
 }
 
 /// Output rows of a layer that ends in f32, from row `first` on, as many as there is room for. `first` is a multiple of
@@ -255,7 +257,7 @@ impl<C: Conv> ResBlock<C> {
         pool: &mut Pool<C::Value>,
         isa: Isa,
         map: Taps<'_>,
-        x: Vec<C::Value>,
+        mut x: Vec<C::Value>,
         rows: [usize; 2],
     ) -> Vec<C::Value> {
         let stride = self.c2.cout();
@@ -270,18 +272,10 @@ impl<C: Conv> ResBlock<C> {
             relu: true,
         };
         spread(output, |first, output| self.c1.run(isa, map, &x, first, output));
-        let mut out = pool.take(rows[1] * stride);
-        let output = Output {
-            rows: &mut out[..],
-            stride,
-            column: 0,
-            residual: Some(&x[..rows[1] * stride]),
-            relu: self.relu,
-        };
-        spread(output, |first, output| self.c2.run(isa, map, &inner, first, output));
+        x.truncate(rows[1] * stride);
+        apply_onto(isa, &self.c2, map, &inner, &mut x, self.relu);
         pool.give(inner);
-        pool.give(x);
-        out
+        x
     }
 }
 

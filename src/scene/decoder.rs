@@ -16,7 +16,7 @@ use crate::container::scene::Cube;
 use crate::decoder::{Decoder, LevelVoxels, Part};
 use crate::error::{Error, Result};
 use crate::gaussians::{Frame, Gaussians};
-use crate::geometry::Voxels;
+use crate::geometry::{SiblingMap, Voxels};
 #[cfg(doc)]
 use crate::limits::Limits;
 use crate::placement::Placement;
@@ -25,9 +25,9 @@ use crate::placement::Placement;
 const CODED_BYTES: u64 = 5;
 /// Bytes of a decoded voxel that is kept: its key, two colours, and how it is drawn.
 pub(super) const VOXEL_BYTES: u64 = 8 + 3 + 3 + 1;
-/// Bytes of a voxel of a block, or around it, while it is drawn: its key, links and colours at two levels, two kernel
-/// maps, and choices.
-const PART_BYTES: u64 = 2 * (8 + 5 + 27 * 4) + 3 + 3 + 3;
+/// Bytes of a voxel of a block, or around it, while it is drawn: its key, links and neighbours at two levels, a kernel
+/// map that these are made from, colours, and choices.
+const PART_BYTES: u64 = 2 * (8 + 5 + SiblingMap::BYTES_PER_VOXEL + SiblingMap::BYTES_PER_PARENT) + 27 * 4 + 3 + 3 + 3;
 
 /// Decodes scenes of blocks. Blocks are decoded in parallel; the result does not depend on the number of threads.
 #[derive(Debug, Clone, Default)]
@@ -384,11 +384,7 @@ impl SceneDecoder {
         bounds: Option<&Bounds>,
     ) -> Result<Gaussians> {
         let (octree, level) = (&around.octree, around.octree.depth());
-        let above = level.checked_sub(1).map(|above| octree.kernel_map(above));
-        let map = match &above {
-            Some(above) => octree.child_map(level - 1, above),
-            None => octree.kernel_map(level),
-        };
+        let (above, map) = octree.last_sibling_maps(level);
         let range = around.own.clone();
         let voxels = octree.level(level);
         let chosen = bounds.map(|bounds| {

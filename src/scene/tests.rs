@@ -51,13 +51,12 @@ fn in_one_piece(decoder: &Decoder, scene: &SceneReader<&[u8]>, decoded: &Blocks,
         unfiltered.extend(&block.unfiltered);
     }
     let octree = Octree::new(Voxels::from_sorted(level, keys)).expect("voxels");
-    let above = octree.kernel_map(level - 1);
-    let map = octree.child_map(level - 1, &above);
+    let (above, map) = octree.last_sibling_maps(level);
     let part = Part {
         octree: &octree,
         level,
         map: &map,
-        above: Some(&above),
+        above: above.as_ref(),
         colours: &colours,
         range: 0..map.len(),
         chosen: None,

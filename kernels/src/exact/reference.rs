@@ -11,6 +11,11 @@ pub fn tap(taps: &Taps<'_>, i: usize, k: usize) -> Option<usize> {
             let row = rows[i * volume + k];
             (row != ABSENT).then_some(row as usize)
         }
+        Taps::Made { volume, rows, .. } => {
+            let mut row = vec![ABSENT; *volume];
+            rows.fill(i, &mut row);
+            (row[k] != ABSENT).then_some(row[k] as usize)
+        }
         Taps::Octants { parents, octants } => (usize::from(octants[i]) == k).then(|| parents[i] as usize),
         Taps::Children => (i % 8 == k).then_some(i / 8),
         Taps::AllChildren { neighbours, .. } => {

@@ -166,7 +166,7 @@ impl Planner {
             scratch.fill(isa, taps, first, count, usize::MAX);
             tile.arrange(group, scratch, numbers);
         };
-        if let Taps::Map { plan: Some(plan), .. } | Taps::AllChildren { plan, .. } = taps
+        if let Taps::Map { plan: Some(plan), .. } | Taps::Made { plan, .. } | Taps::AllChildren { plan, .. } = taps
             && first.is_multiple_of(TILE)
             && let Some(places) = plan.0.get(first / TILE)
         {

@@ -5,6 +5,15 @@ use super::plan::Plan;
 /// Marks a tap that reads nothing.
 pub const ABSENT: u32 = u32::MAX;
 
+/// Rows of a kernel map that are made when they are read.
+pub trait MadeRows: std::fmt::Debug + std::panic::RefUnwindSafe + Sync {
+    /// Writes the rows from row `first` on, one after the other, as [`Taps::Map`] has them.
+    ///
+    /// # Panics
+    /// If there are not so many.
+    fn fill(&self, first: usize, rows: &mut [u32]);
+}
+
 /// The rule that gives every output row its input rows.
 #[derive(Debug, Clone, Copy)]
 pub enum Taps<'a> {
@@ -18,6 +27,15 @@ pub enum Taps<'a> {
         rows: &'a [u32],
         /// The same, arranged for vector kernels.
         plan: Option<&'a Plan>,
+    },
+    /// The same with rows that are made when a plan is.
+    Made {
+        /// Taps of the kernel.
+        volume: usize,
+        /// Makes the rows.
+        rows: &'a dyn MadeRows,
+        /// The rows, arranged for vector kernels.
+        plan: &'a Plan,
     },
     /// Eight taps, of which row `i` uses only `octants[i]`, to read row `parents[i]`.
     Octants {
@@ -43,7 +61,7 @@ impl Taps<'_> {
     pub fn volume(&self) -> usize {
         match self {
             Taps::Same => 1,
-            Taps::Map { volume, .. } => *volume,
+            Taps::Map { volume, .. } | Taps::Made { volume, .. } => *volume,
             Taps::Octants { .. } | Taps::Children => 8,
             Taps::AllChildren { .. } => 27,
         }

@@ -63,11 +63,10 @@ impl TileTaps {
                 end = self.fill_from(isa, &rows[first * volume..(first + count) * volume]);
             }
             Taps::AllChildren { neighbours, .. } => {
-                let mut map = std::mem::take(&mut self.map);
-                map.resize(count * volume, ABSENT);
-                children::rows_of_all(neighbours, first, &mut map);
-                end = self.fill_from(isa, &map);
-                self.map = map;
+                end = self.fill_made(isa, count * volume, |map| children::rows_of_all(neighbours, first, map));
+            }
+            Taps::Made { rows, .. } => {
+                end = self.fill_made(isa, count * volume, |map| rows.fill(first, map));
             }
             Taps::Octants { parents, octants } => {
                 let (parents, octants) = (&parents[first..][..count], &octants[first..][..count]);
@@ -87,6 +86,16 @@ impl TileTaps {
         }
         assert!(end <= inputs, "a tap reads row {}, but the input has {inputs}", end - 1);
         self.end = end;
+    }
+
+    /// The same of a part with so many entries, which `make` writes.
+    fn fill_made(&mut self, isa: Isa, entries: usize, make: impl FnOnce(&mut [u32])) -> usize {
+        let mut map = std::mem::take(&mut self.map);
+        map.resize(entries, ABSENT);
+        make(&mut map);
+        let end = self.fill_from(isa, &map);
+        self.map = map;
+        end
     }
 
     /// Gathers the pairs of a tile's part of a map, and gives the end of the input rows.

@@ -1,6 +1,6 @@
 //! Integers: equal to the bit.
 
-use b2p_kernels::{ABSENT, ExactConv, Isa, LIMIT, Output, Plan, Requantise, Taps, reference};
+use b2p_kernels::{ABSENT, ExactConv, Isa, LIMIT, MadeRows, Output, Plan, Requantise, Taps, reference};
 
 use crate::cases::{Random, cases, kernels, whole};
 
@@ -227,8 +227,18 @@ fn a_layer_writes_only_its_own_columns_and_rows_from_the_first_on() {
     }
 }
 
+/// Rows that are there, and made nevertheless.
+#[derive(Debug)]
+struct Copied<'a>(usize, &'a [u32]);
+
+impl MadeRows for Copied<'_> {
+    fn fill(&self, first: usize, rows: &mut [u32]) {
+        rows.copy_from_slice(&self.1[first * self.0..][..rows.len()]);
+    }
+}
+
 #[test]
-fn a_plan_changes_nothing() {
+fn neither_a_plan_nor_rows_that_are_made_when_they_are_read_change_anything() {
     let mut random = Random(5);
     let [rows, cin, cout] = [1300, 40, 40];
     let (taps, _) = kernels(&mut random, rows).swap_remove(5);
@@ -251,17 +261,28 @@ fn a_plan_changes_nothing() {
         let plan = Plan::new(rows);
         // From a tile's first row on, and from amid one.
         for first in [512, 0, 700, 512] {
-            let run = |plan| {
+            let run = |taps| {
                 let mut out = vec![i16::MIN; (rows - first) * cout];
-                let taps = Taps::Map {
-                    volume,
-                    rows: map,
-                    plan,
-                };
                 conv.run(isa, taps, &input, first, whole(&mut out, cout, None, true));
                 out
             };
-            assert!(run(Some(&plan)) == run(None), "{isa}, from row {first}");
+            let stored = |plan| Taps::Map {
+                volume,
+                rows: map,
+                plan,
+            };
+            let made = Taps::Made {
+                volume,
+                rows: &Copied(volume, map),
+                plan: &Plan::new(rows),
+            };
+            let expected = run(stored(None));
+            assert!(run(stored(Some(&plan))) == expected, "{isa}, from row {first}");
+            assert!(run(made) == expected, "{isa}, made, from row {first}");
+            assert_eq!(
+                reference::tap(&made, first, 13),
+                reference::tap(&stored(None), first, 13)
+            );
         }
     }
 }

@@ -137,8 +137,9 @@ impl Net<'_> {
             channels: 12,
             values: parents.collect(),
         };
-        let h = self.conv("parent.in", input.above, &parents, None)?;
-        let h = self.blocks("parent", shape.parent_blocks, input.above, h)?;
+        let (map, above) = (input.map.table(), input.above.table());
+        let h = self.conv("parent.in", &above, &parents, None)?;
+        let h = self.blocks("parent", shape.parent_blocks, &above, h)?;
 
         let voxels = input.octree.level(input.level);
         let (of, octants) = (voxels.parent_indices(), voxels.octants());
@@ -159,9 +160,9 @@ impl Net<'_> {
             multiply(from, &weights[octant * channels * channels..], out);
         });
         let up = Rows { channels, values: up };
-        let x = self.conv("child.in", input.map, &children, Some(&up))?;
-        let x = self.blocks("child", shape.child_blocks, input.map, x)?;
-        self.linear("out", input.map, &x, None)
+        let x = self.conv("child.in", &map, &children, Some(&up))?;
+        let x = self.blocks("child", shape.child_blocks, &map, x)?;
+        self.linear("out", &map, &x, None)
     }
 }
 
@@ -256,7 +257,7 @@ mod tests {
         let places = (0..8u32.pow(3)).map(|i| [i % 8, i / 8 % 8, i / 64]);
         let shell = places.filter(|at| at.iter().map(|v| (2 * v).abs_diff(7).pow(2)).sum::<u32>().abs_diff(36) < 20);
         let octree = Octree::new(Voxels::new(3, shell.map(morton::encode).collect())).unwrap();
-        let (map, above) = (octree.kernel_map(3), octree.kernel_map(2));
+        let (map, above) = (octree.sibling_map(3), octree.sibling_map(2));
         let colour = |i: usize| [37 * i, 91 * i, 11 * i].map(|v| (v % 256) as u8);
         let colours: Vec<_> = (0..octree.level(3).len()).map(colour).collect();
         let colours_above: Vec<_> = (0..octree.level(2).len()).map(colour).collect();

@@ -139,7 +139,7 @@ fn heads_cases(subject: &MeasuredInput<'_>) -> Result<Vec<HardCase>> {
     for set in model.sets() {
         for (name, voxels, colours) in cases {
             let octree = Octree::new(voxels.clone())?;
-            let (map, above) = (octree.kernel_map(LEVEL), octree.kernel_map(LEVEL - 1));
+            let (map, above) = (octree.sibling_map(LEVEL), octree.sibling_map(LEVEL - 1));
             let (colours, colours_above, luma_step) = colours(map.len(), above.len());
             let input = LevelInput {
                 octree: &octree,

@@ -142,7 +142,7 @@ pub fn of_mesh(surface: &Surface, camera: &Camera) -> Image {
 /// Those of [`Octree::new`].
 pub fn of_cloud(cloud: &ColouredVoxels) -> Result<Gaussians> {
     let octree = Octree::new(cloud.voxels.clone())?;
-    let map = octree.kernel_map(cloud.voxels.depth());
+    let map = octree.sibling_map(cloud.voxels.depth());
     let frame = Frame {
         bits: cloud.voxels.depth(),
         placement: cloud.placement,

@@ -8,7 +8,7 @@ use crate::decoder::Decoding;
 use crate::error::Result;
 use crate::gaussians::surfels::{closing_size, is_for_surfels};
 use crate::gaussians::{Gaussians, HeadMap, HeadSet};
-use crate::geometry::{KernelMap, Octree};
+use crate::geometry::{Octree, SiblingMap};
 use crate::limits::Limits;
 use crate::renderer::Ids;
 
@@ -93,7 +93,7 @@ impl Comparison<'_> {
 impl EncoderInput<'_> {
     /// The head map of a sparse level, which surfels draw: it says how wide they must be to close. `None` of other
     /// levels, and where the usual size does.
-    pub(super) fn closing_map(&self, octree: &Octree, level: u8, map: &KernelMap) -> Option<Vec<u8>> {
+    pub(super) fn closing_map(&self, octree: &Octree, level: u8, map: &SiblingMap) -> Option<Vec<u8>> {
         let applies = self.options.has_head_maps() && level > 0 && is_for_surfels(map, 0..map.len());
         let size = applies.then(|| closing_size(map)).filter(|size| *size > 64)?;
         let surfels = vec![true; HeadMap::block_count(octree, level)];
@@ -151,7 +151,7 @@ pub fn is_sparse(cloud: &ColouredVoxels) -> Result<bool> {
     if voxels.len() > DENSE * parents {
         return Ok(false);
     }
-    let (_, [_, map]) = maps(cloud)?;
+    let (_, _, map) = maps(cloud)?;
     Ok(is_for_surfels(&map, 0..map.len()))
 }
 

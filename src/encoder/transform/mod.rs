@@ -27,7 +27,7 @@ use crate::colour::{self, Filter, Steps, Truth};
 use crate::container::{Format, Header, Writer};
 use crate::decoder::{Decoder, colour_hash};
 use crate::error::{Error, Result};
-use crate::geometry::{KernelMap, Octree, Voxels, codec};
+use crate::geometry::{Octree, SiblingMap, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
@@ -86,8 +86,8 @@ struct EncoderInput<'a> {
     isa: Isa,
     levels: RangeInclusive<u8>,
     octree: Octree,
-    /// The 3³ kernel maps of the levels from 0 on.
-    maps: Vec<KernelMap>,
+    /// The maps of the levels from 0 on.
+    maps: Vec<SiblingMap>,
     /// The code of the levels from 1 on: of each slice the children, and its bytes.
     geometry: Vec<Vec<(u32, Vec<u8>)>>,
     grey: bool,
@@ -161,7 +161,7 @@ impl<'a> EncoderInput<'a> {
     /// Codes the octree down to level `top`.
     fn with_octree(self, octree: Octree, top: u8, log: &Log) -> Result<Self> {
         let (isa, count) = (self.isa, octree.level(top).len());
-        let maps = log.step("kernel maps", count, "voxels", || Ok(super::kernel_maps(&octree, 0)))?;
+        let maps = log.step("neighbours", count, "voxels", || Ok(sibling_maps(&octree)))?;
         let slice = self.options.slice_voxels as usize;
         let geometry = log.step("geometry", count, "voxels", || {
             let code = |level: u8| {
@@ -170,7 +170,7 @@ impl<'a> EncoderInput<'a> {
                     .guides
                     .as_ref()
                     .map(|guides| guides.geometry[usize::from(level) - 1].guide());
-                codec::encode_guided(isa, &octree, map, level, slice, guide)
+                codec::encode_guided(isa, &octree, &map.table(), level, slice, guide)
             };
             Ok((1..=top).into_par_iter().map(code).collect())
         })?;
@@ -287,7 +287,7 @@ impl<'a> EncoderInput<'a> {
                 colours_above = Decoder::colours_above(octree, level, &coloured.rgb());
             }
             if level > trunk {
-                let [above, map] = [level - 1, level].map(map_of);
+                let (above, map) = (map_of(level - 1).table(), map_of(level));
                 let coding = self.coding(steps, top, level);
                 let guide = self
                     .guides
@@ -296,7 +296,7 @@ impl<'a> EncoderInput<'a> {
                 let name = format!("colours of level {level}");
                 let (payloads, next) = log.step(name, count, "voxels", || {
                     Ok(colour::encode_level(
-                        isa, octree, level, above, map, &coloured, truth, slice, coding, guide,
+                        isa, octree, level, &above, map, &coloured, truth, slice, coding, guide,
                     ))
                 })?;
                 coloured = next;
@@ -475,6 +475,16 @@ impl<'a> EncoderInput<'a> {
         let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);
         Ok(Encoded { bytes, rates })
     }
+}
+
+/// The maps of all levels.
+fn sibling_maps(octree: &Octree) -> Vec<SiblingMap> {
+    let mut maps = vec![SiblingMap::root()];
+    for level in 0..octree.depth() {
+        let next = octree.child_siblings(level, &maps[maps.len() - 1].table());
+        maps.push(next);
+    }
+    maps
 }
 
 /// The octree of a cloud down to level `top`.

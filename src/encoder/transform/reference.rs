@@ -9,7 +9,7 @@ use crate::cloud::ColouredVoxels;
 use crate::error::Result;
 use crate::gaussians::surfels::{PerVoxel, SurfelSelection, closing_size, surfels};
 use crate::gaussians::{Frame, Gaussians};
-use crate::geometry::{KernelMap, Octree};
+use crate::geometry::{Octree, SiblingMap};
 use crate::limits::Limits;
 use crate::renderer::camera::Camera;
 use crate::renderer::{Background, Image, Renderer};
@@ -75,7 +75,7 @@ impl Reference {
 
 /// The cloud's voxels as surfels.
 fn closed(isa: Isa, cloud: &ColouredVoxels, sparse: bool) -> Result<Gaussians> {
-    let (_, [_, map]) = maps(cloud)?;
+    let (_, _, map) = maps(cloud)?;
     let choice = SurfelSelection {
         size: if sparse {
             f32::from(closing_size(&map)) / 64.0
@@ -96,16 +96,11 @@ pub fn frame(cloud: &ColouredVoxels) -> Frame {
     }
 }
 
-/// The octree of the cloud, whose depth is at least 1, and the 3³ kernel maps of its last two levels.
-pub fn maps(cloud: &ColouredVoxels) -> Result<(Octree, [KernelMap; 2])> {
+/// The octree of the cloud, and the maps of its last level but one, if it has several, and of its last.
+pub fn maps(cloud: &ColouredVoxels) -> Result<(Octree, Option<SiblingMap>, SiblingMap)> {
     let octree = Octree::new(cloud.voxels.clone())?;
-    let mut above = octree.kernel_map(0);
-    let last = octree.depth() - 1;
-    for level in 0..last {
-        above = octree.child_map(level, &above);
-    }
-    let map = octree.child_map(last, &above);
-    Ok((octree, [above, map]))
+    let (above, map) = octree.last_sibling_maps(octree.depth());
+    Ok((octree, above, map))
 }
 
 /// Pixels along a side of the pictures of a level.

@@ -19,7 +19,7 @@ use crate::colour::{Steps, Truth, Ycc};
 use crate::decoder::{Advice, Decoder, Part};
 use crate::error::Result;
 use crate::gaussians::{Gaussians, HeadMap, HeadSet};
-use crate::geometry::{KernelMap, Voxels, morton};
+use crate::geometry::{KernelMap, SiblingMap, Voxels, morton};
 use crate::limits::Limits;
 
 /// Share of the difference that colours move by.
@@ -59,7 +59,7 @@ struct Splat {
 
 /// What is drawn of a level, and the points that it should look like.
 struct Surface<'a> {
-    map: &'a KernelMap,
+    map: &'a SiblingMap,
     /// The Gaussians, voxel by voxel, and where those of each voxel begin.
     splats: Vec<Splat>,
     first_splat: Vec<u32>,
@@ -153,7 +153,7 @@ impl EncoderInput<'_> {
 }
 
 impl<'a> Surface<'a> {
-    fn new(cloud: &ColouredVoxels, voxels: &Voxels, map: &'a KernelMap, gaussians: &Gaussians) -> Self {
+    fn new(cloud: &ColouredVoxels, voxels: &Voxels, map: &'a SiblingMap, gaussians: &Gaussians) -> Self {
         let (splats, first_splat) = splats_of(voxels, gaussians);
         let (points, first_point) = points_of(cloud, voxels);
         Surface {
@@ -165,21 +165,11 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// Calls `f` with the Gaussians of the voxels around a voxel, or their points: those whose starts are `first`.
-    #[inline(always)]
-    fn for_each_around(&self, voxel: usize, first: &[u32], mut f: impl FnMut(usize)) {
-        for &v in self.map.row(voxel) {
-            if v != KernelMap::ABSENT {
-                range(first, v as usize).for_each(&mut f);
-            }
-        }
-    }
-
-    /// What is missing at a point in `voxel`: the difference of its colour to what is drawn there, and the factor that
+    /// What is missing at a point in the voxel with this row of the map: the difference of its colour to what is drawn there, and the factor that
     /// makes of a Gaussian's opacity there its share of the point.
-    fn missing(&self, voxel: usize, point: &Point) -> ([f32; 3], f32) {
+    fn missing(&self, row: &[u32; 27], point: &Point) -> ([f32; 3], f32) {
         let (mut sum, mut total) = ([0.0; 3], 0.0);
-        self.for_each_around(voxel, &self.first_splat, |i| {
+        for_each_around(row, &self.first_splat, |i| {
             let splat = &self.splats[i];
             let weight = splat.weight(&point.place);
             total += weight;
@@ -199,13 +189,15 @@ impl<'a> Surface<'a> {
             .into_par_iter()
             .flat_map_iter(|voxel| {
                 let points = &self.points[range(&self.first_point, voxel)];
-                points.iter().map(move |point| self.missing(voxel, point))
+                let row = self.map.row(voxel);
+                points.iter().map(move |point| self.missing(&row, point))
             })
             .collect();
         let of_voxel = |voxel: usize| {
             let (mut sum, mut total) = ([0.0; 3], INERTIA);
+            let row = self.map.row(voxel);
             for splat in &self.splats[range(&self.first_splat, voxel)] {
-                self.for_each_around(voxel, &self.first_point, |at| {
+                for_each_around(&row, &self.first_point, |at| {
                     let weight = splat.weight(&self.points[at].place);
                     if weight > 0.0 {
                         let (missing, inverse) = &missing[at];
@@ -217,6 +209,16 @@ impl<'a> Surface<'a> {
             difference(sum.map(|x| SHARE * UNITS * x / total))
         };
         voxels.into_par_iter().map(of_voxel).collect()
+    }
+}
+
+/// Calls `f` with the Gaussians of the voxels in a row of the map, or their points: those whose starts are `first`.
+#[inline(always)]
+fn for_each_around(row: &[u32; 27], first: &[u32], mut f: impl FnMut(usize)) {
+    for &v in row {
+        if v != KernelMap::ABSENT {
+            range(first, v as usize).for_each(&mut f);
+        }
     }
 }
 

@@ -9,7 +9,7 @@ use super::EncoderInput;
 use crate::cloud::ColouredVoxels;
 use crate::colour::Steps;
 use crate::error::Result;
-use crate::geometry::{KernelMap, Octree, codec};
+use crate::geometry::{Octree, SiblingMap, codec};
 use crate::log::Log;
 
 /// How exactly the finest level's voxels are coded, in streams with lossy colours.
@@ -94,8 +94,8 @@ impl EncoderInput<'_> {
                 points: &points,
                 lambda,
             };
-            let above = &self.maps[level - 1];
-            let (masks, geometry) = codec::optimise_level(self.isa, &self.octree, above, top, slice, distortion, None);
+            let above = self.maps[level - 1].table();
+            let (masks, geometry) = codec::optimise_level(self.isa, &self.octree, &above, top, slice, distortion, None);
             let mut octree = self.octree.truncated(top - 1);
             octree.grow(masks)?;
             Ok(Some(Arc::new(Shape {
@@ -106,11 +106,15 @@ impl EncoderInput<'_> {
         })
     }
 
-    /// The 3³ kernel map of the level `top` of streams of this shape.
-    pub(super) fn finest_map(&self, top: u8, shape: Option<&Shape>) -> Cow<'_, KernelMap> {
+    /// The map of the level `top` of streams of this shape.
+    pub(super) fn finest_map(&self, top: u8, shape: Option<&Shape>) -> Cow<'_, SiblingMap> {
         match shape {
             // Several shapes are kept while a rate is looked for, and maps are by far the largest part of them.
-            Some(shape) => Cow::Owned(shape.octree.child_map(top - 1, &self.maps[usize::from(top) - 1])),
+            Some(shape) => Cow::Owned(
+                shape
+                    .octree
+                    .child_siblings(top - 1, &self.maps[usize::from(top) - 1].table()),
+            ),
             None => Cow::Borrowed(&self.maps[usize::from(top)]),
         }
     }

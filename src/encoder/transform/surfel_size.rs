@@ -21,13 +21,15 @@ pub const SIZES: [u8; 3] = [54, 64, 74];
 /// Rows that heads work on at a time.
 const ROWS: usize = 1 << 16;
 
-/// Pictures of a cloud of depth 1 or more as the best heads draw it. `None` if the model has no best heads.
+/// Pictures of a cloud as the best heads draw it. `None` if it has no level but the root, or the model no best heads.
 pub fn pictures(isa: Isa, cloud: &ColouredVoxels, heads: &HeadsModel) -> Result<Option<Vec<Image>>> {
     let best = heads.sets().filter(|set| set.0 == Heads::Best);
     let Some(best) = best.min_by_key(|set| set.1) else {
         return Ok(None);
     };
-    let (octree, [above, map]) = maps(cloud)?;
+    let (octree, Some(above), map) = maps(cloud)? else {
+        return Ok(None);
+    };
     let level = octree.depth();
     let input = LevelInput {
         octree: &octree,

@@ -48,7 +48,7 @@ use b2p_kernels::Isa;
 use super::{Frame, Gaussians};
 use crate::error::Result;
 use crate::gaussians::Heads;
-use crate::geometry::{KernelMap, Octree};
+use crate::geometry::{Octree, SiblingMap};
 use crate::input;
 use crate::layers::{Precision, missing};
 use crate::limits::Limits;
@@ -79,10 +79,10 @@ pub struct LevelInput<'a> {
     pub octree: &'a Octree,
     /// The level to draw.
     pub level: u8,
-    /// 3³ kernel map of `level`.
-    pub map: &'a KernelMap,
-    /// The 3³ kernel map of the level above.
-    pub above: &'a KernelMap,
+    /// The neighbours in `level`.
+    pub map: &'a SiblingMap,
+    /// Those in the level above.
+    pub above: &'a SiblingMap,
     /// Decoded sRGB colours of the voxels of `level`.
     pub colours: &'a [[u8; 3]],
     /// Decoded sRGB colours of the level above.
@@ -153,7 +153,7 @@ impl HeadsModel {
     /// model does not have, and for [`Precision::Half`] if `isa` has no f16 arithmetic.
     ///
     /// # Panics
-    /// If the octree is less deep, or if the kernel maps or colours do not match its levels in length.
+    /// If the octree is less deep, or if the maps or colours do not match its levels in length.
     #[doc(hidden)]
     pub fn generate(
         &self,
@@ -242,21 +242,17 @@ impl LevelInput<'_> {
             self.octree.level(self.level).len(),
             self.octree.level(self.level - 1).len(),
         );
-        assert!(
-            self.map.volume() == 27 && self.above.volume() == 27,
-            "heads need 3³ maps"
-        );
         let without = self.without.map_or(voxels, <[bool]>::len);
         assert_eq!(without, voxels, "one choice per voxel");
         assert_eq!(
             [self.map.len(), self.colours.len()],
             [voxels; 2],
-            "kernel map and colours of the level"
+            "map and colours of the level"
         );
         assert_eq!(
             [self.above.len(), self.colours_above.len()],
             [above; 2],
-            "kernel map and colours of the level above"
+            "map and colours of the level above"
         );
     }
 }

@@ -11,7 +11,7 @@ use super::load::{INPUTS, Shape};
 use super::spans::{Span, for_each_span};
 use super::{LevelInput, RAW};
 use crate::gaussians::Gaussians;
-use crate::layers::{Conv, Pool, Precision, ResBlock, Stored, apply, apply_added, apply_part, reals};
+use crate::layers::{Conv, Pool, Precision, ResBlock, Stored, apply, apply_onto, apply_part, reals};
 use crate::memory::{NOTHING, Sizes, Term, total};
 
 /// The layers of a network.
@@ -215,9 +215,8 @@ impl Run<'_> {
             parents: &links.parents,
             octants: &links.octants,
         };
-        let up = apply(pool, isa, &net.up, descent, h, span.rows(rings - 1), false);
-        let mut x = apply_added(pool, isa, &net.child_in, taps, child, &up);
-        pool.give(up);
+        let mut x = apply(pool, isa, &net.up, descent, h, span.rows(rings - 1), false);
+        apply_onto(isa, &net.child_in, taps, child, &mut x, true);
         for (block, outer) in net.child.iter().zip((1..rings - 2).rev().step_by(2)) {
             let some = [span.rows(outer + 1), span.rows(outer)];
             x = block.apply_to_some(pool, isa, taps, x, some);
@@ -232,7 +231,7 @@ const PLAN: u64 = 100;
 const NUMBER: u64 = 4;
 const ABOVE: Term = Term {
     each: "voxel of a span of the level above, with learned heads of H channels",
-    takes: "kernel map arranged for layers, inputs as integers and as f16; input, inner rows and output of a block",
+    takes: "kernel map arranged for layers, inputs as integers and as f16; rows of a block, and inner ones",
     fixed: PLAN + NUMBER + 4 * INPUTS[0] as u64,
     by: ROWS,
 };
@@ -243,7 +242,7 @@ const VOXEL: Term = Term {
     by: ROWS,
 };
 const ROWS: Sizes = Sizes {
-    generator: 3 * 2,
+    generator: 2 * 2,
     ..NOTHING
 };
 const SPLIT: Term = Term {

@@ -3,13 +3,12 @@
 //! A network is evaluated span by span, so that its activations take memory for a span and not for the level. Results
 //! do not depend on where spans end: an output row reads the same rows in the same order.
 
-use std::borrow::Cow;
 use std::ops::Range;
 
-use b2p_kernels::{Plan, Taps, zeros};
+use b2p_kernels::{MadeRows, Plan, Taps, zeros};
 use rayon::prelude::*;
 
-use crate::geometry::{KernelMap, Voxels};
+use crate::geometry::{KernelMap, SiblingMap, Voxels};
 
 /// Rows of a span with its halo where memory is short: smaller spans evaluate more of their voxels twice.
 const LEAST_ROWS: u64 = 3 << 15;
@@ -34,9 +33,15 @@ pub struct Span<'a> {
     pub voxels: Vec<u32>,
     /// Number of rows that are at most so many steps away from the span.
     ends: Vec<usize>,
-    /// The 3³ kernel map of the rows, without the last ring.
-    map: Cow<'a, KernelMap>,
+    map: SpanMap<'a>,
     plan: Plan,
+}
+
+/// The 3³ kernel map of a span's rows, without the last ring.
+enum SpanMap<'a> {
+    /// A whole level.
+    Level(&'a SiblingMap),
+    Part(KernelMap),
 }
 
 impl Span<'_> {
@@ -47,10 +52,17 @@ impl Span<'_> {
 
     /// The kernel map in the form of convolution layers.
     pub fn taps(&self) -> Taps<'_> {
-        Taps::Map {
-            volume: self.map.volume(),
-            rows: self.map.rows(),
-            plan: Some(&self.plan),
+        match &self.map {
+            SpanMap::Level(map) => Taps::Made {
+                volume: 27,
+                rows: *map,
+                plan: &self.plan,
+            },
+            SpanMap::Part(map) => Taps::Map {
+                volume: 27,
+                rows: map.rows(),
+                plan: Some(&self.plan),
+            },
         }
     }
 }
@@ -62,10 +74,10 @@ impl Span<'_> {
 /// The first of `each`.
 ///
 /// # Panics
-/// If `map` is not the level's 3³ kernel map, or the level has no such voxels.
+/// If `map` is not the level's, or the level has no such voxels.
 pub fn for_each_span<E>(
     voxels: &Voxels,
-    map: &KernelMap,
+    map: &SiblingMap,
     wanted: Range<usize>,
     rings: usize,
     most: usize,
@@ -78,7 +90,7 @@ pub fn for_each_span<E>(
             range: 0..count,
             voxels: (0..count as u32).collect(),
             ends: vec![count; rings + 1],
-            map: Cow::Borrowed(map),
+            map: SpanMap::Level(map),
             plan: Plan::new(count),
         });
     }
@@ -136,7 +148,7 @@ fn cut(keys: &[u64], range: &Range<usize>, length: usize) -> usize {
 
 /// What spans are made from.
 struct Rows<'a> {
-    map: &'a KernelMap,
+    map: &'a SiblingMap,
     /// For every voxel of the level its row in the halo of the span, [`KernelMap::ABSENT`] between spans.
     places: Vec<u32>,
 }
@@ -180,7 +192,7 @@ impl Rows<'_> {
         fits.then(|| Span {
             range,
             plan: Plan::new(rows.len() / 27),
-            map: Cow::Owned(KernelMap::new(27, rows)),
+            map: SpanMap::Part(KernelMap::new(27, rows)),
             voxels,
             ends,
         })
@@ -190,18 +202,14 @@ impl Rows<'_> {
     fn own(&self, range: &Range<usize>) -> (Vec<u32>, Vec<u32>) {
         let (first, count) = (range.start as u32, range.len() as u32);
         let mut rows = zeros(27 * range.len());
-        let from = &self.map.rows()[27 * range.start..27 * range.end];
-        let tasks = rows
-            .par_chunks_mut(27 * BLOCK)
-            .zip(from.par_chunks(27 * BLOCK))
-            .enumerate();
-        let edges = tasks.map(|(block, (rows, from))| {
+        let tasks = rows.par_chunks_mut(27 * BLOCK).enumerate();
+        let edges = tasks.map(|(block, rows)| {
             let mut edge: Vec<u32> = Vec::new();
-            let pairs = rows.chunks_exact_mut(27).zip(from.chunks_exact(27));
-            for (voxel, (row, from)) in (first + (block * BLOCK) as u32..).zip(pairs) {
+            self.map.fill(range.start + block * BLOCK, rows);
+            for (voxel, row) in (first + (block * BLOCK) as u32..).zip(rows.chunks_exact_mut(27)) {
                 let mut outside = false;
-                for (to, &q) in row.iter_mut().zip(from) {
-                    let place = q.wrapping_sub(first);
+                for to in row {
+                    let (q, place) = (*to, to.wrapping_sub(first));
                     let inside = place < count;
                     *to = if inside { place } else { KernelMap::ABSENT };
                     outside |= !inside & (q != KernelMap::ABSENT);
@@ -226,7 +234,7 @@ impl Rows<'_> {
 
     /// Writes a voxel's row of the span's kernel map.
     fn place_row(&self, voxel: u32, range: &Range<usize>, row: &mut [u32]) {
-        for (to, &q) in row.iter_mut().zip(self.map.row(voxel as usize)) {
+        for (to, q) in row.iter_mut().zip(self.map.row(voxel as usize)) {
             *to = self.place(q, range);
         }
     }
@@ -235,8 +243,8 @@ impl Rows<'_> {
     fn around(&self, voxels: &[u32], range: &Range<usize>, most: usize) -> Vec<u32> {
         let new = |voxels: &[u32]| {
             let rows = voxels.iter().flat_map(|&voxel| self.map.row(voxel as usize));
-            let new = rows.filter(|&&q| q != KernelMap::ABSENT && self.place(q, range) == KernelMap::ABSENT);
-            let mut new: Vec<u32> = new.copied().collect();
+            let new = rows.filter(|&q| q != KernelMap::ABSENT && self.place(q, range) == KernelMap::ABSENT);
+            let mut new: Vec<u32> = new.collect();
             new.sort_unstable();
             new.dedup();
             new
@@ -260,15 +268,16 @@ impl Rows<'_> {
 mod tests {
     use super::*;
     use crate::geometry::{Octree, morton};
+    use b2p_kernels::reference;
     use proptest::prelude::*;
     use std::convert::Infallible;
 
     /// The voxels of a level that are at most so many steps from those of a range, by definition.
-    fn near(map: &KernelMap, range: Range<usize>, steps: usize) -> Vec<u32> {
+    fn near(map: &SiblingMap, range: Range<usize>, steps: usize) -> Vec<u32> {
         let mut near: Vec<u32> = (range.start as u32..range.end as u32).collect();
         for _ in 0..steps {
             let rows = near.iter().flat_map(|&voxel| map.row(voxel as usize));
-            near = rows.copied().filter(|&q| q != KernelMap::ABSENT).collect();
+            near = rows.filter(|&q| q != KernelMap::ABSENT).collect();
             near.sort_unstable();
             near.dedup();
         }
@@ -283,7 +292,7 @@ mod tests {
 
     fn check_some(voxels: &Voxels, wanted: Range<usize>, rings: usize, most: usize) {
         let octree = Octree::new(voxels.clone()).unwrap();
-        let (map, voxels) = (octree.kernel_map(octree.depth()), octree.level(octree.depth()));
+        let (map, voxels) = (octree.sibling_map(octree.depth()), octree.level(octree.depth()));
         let mut next = wanted.start;
         let done: Result<(), Infallible> = for_each_span(voxels, &map, wanted.clone(), rings, most, |span| {
             let Span { range, voxels, .. } = &span;
@@ -303,10 +312,13 @@ mod tests {
                 assert!(rows == expected || rows.len() == map.len(), "{steps} steps");
             }
             for (row, &voxel) in voxels[..span.rows(rings - 1)].iter().enumerate() {
-                let expected = map.row(voxel as usize);
-                let found = span.map.row(row).iter();
-                let found = found.map(|&row| voxels.get(row as usize).copied().unwrap_or(KernelMap::ABSENT));
-                assert!(found.eq(expected.iter().copied()), "row {row}");
+                let taps = span.taps();
+                let found = (0..27).map(|k| reference::tap(&taps, row, k));
+                let found = found.map(|row| {
+                    row.and_then(|row| voxels.get(row).copied())
+                        .unwrap_or(KernelMap::ABSENT)
+                });
+                assert!(found.eq(map.row(voxel as usize)), "row {row}");
             }
             Ok(())
         });
@@ -340,7 +352,7 @@ mod tests {
         });
         let octree = Octree::new(Voxels::new(8, bowl.collect())).unwrap();
         let mut spans = 0;
-        let (voxels, map) = (octree.level(8), octree.kernel_map(8));
+        let (voxels, map) = (octree.level(8), octree.sibling_map(8));
         let done: Result<(), Infallible> = for_each_span(voxels, &map, 0..voxels.len(), 6, 12_000, |_| {
             spans += 1;
             Ok(())

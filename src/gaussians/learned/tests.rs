@@ -108,7 +108,7 @@ fn model(networks: &[Made]) -> HeadsModel {
 /// A cloud with colours at a level and the one above it.
 struct Cloud {
     octree: Octree,
-    maps: [KernelMap; 2],
+    maps: [SiblingMap; 2],
     colours: [Vec<[u8; 3]>; 2],
     step: f32,
 }
@@ -123,7 +123,7 @@ impl Cloud {
             (0..count).map(|_| [0; 3].map(&mut channel)).collect()
         });
         Cloud {
-            maps: [octree.kernel_map(depth), octree.kernel_map(depth - 1)],
+            maps: [octree.sibling_map(depth), octree.sibling_map(depth - 1)],
             octree,
             colours,
             step: 1.0 + 20.0 * random.next().abs(),

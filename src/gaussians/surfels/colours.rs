@@ -23,12 +23,12 @@ fn with_zero([r, g, b]: [u8; 3]) -> [f32; 4] {
 }
 
 /// The gradient of R, G and B per voxel along both axes `u`, `v` of a disc's plane, by least squares over the occupied
-/// ones of the 26 neighbours.
-pub fn gradient(map: &KernelMap, colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3]; 2]) -> [[f32; 3]; 2] {
+/// ones of the 26 neighbours. `row` is the voxel's of its level's map.
+pub fn gradient(row: &[u32], colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3]; 2]) -> [[f32; 3]; 2] {
     let own = with_zero(colours[voxel]);
     // Those that are present come together first, without branches: their presence is unpredictable.
     let (mut present, mut count) = ([(0, 0); 27], 0);
-    for (k, &q) in map.row(voxel).iter().enumerate() {
+    for (k, &q) in row.iter().enumerate() {
         present[count.min(26)] = (k, q);
         count += usize::from(q != KernelMap::ABSENT);
     }

@@ -32,7 +32,7 @@ use b2p_kernels::{Isa, zeros};
 use rayon::prelude::*;
 
 use super::{Frame, Gaussians};
-use crate::geometry::{KernelMap, Voxels};
+use crate::geometry::{RowBuffer, SiblingMap, Voxels};
 use discs::Disc;
 use moments::Moments;
 use sparsity::Sparsity;
@@ -104,36 +104,30 @@ impl SurfelSelection<'_> {
 
 /// Makes the discs of `voxels`, voxel by voxel.
 ///
-/// `map` is the 3³ kernel map of the voxels, `colours` holds one sRGB colour per voxel. `frame` is the cube's frame;
+/// `map` is that of the voxels, `colours` holds one sRGB colour per voxel. `frame` is the cube's frame;
 /// the Gaussians are in cube-frame units.
 ///
 /// # Panics
-/// If `map` is not a 3³ map, if `map`, `voxels`, `colours` and the choice differ in length, or the range has other voxels.
+/// If `map`, `voxels`, `colours` and the choice differ in length, or the range has other voxels.
 pub fn surfels(
     isa: Isa,
     voxels: &Voxels,
-    map: &KernelMap,
+    map: &SiblingMap,
     colours: &[[u8; 3]],
     per_voxel: PerVoxel,
     choice: SurfelSelection<'_>,
     frame: Frame,
 ) -> Gaussians {
-    assert_eq!(map.volume(), 27, "surfels need a 3³ map");
     assert_eq!(map.len(), voxels.len(), "one row of the map per voxel");
     assert_eq!(colours.len(), voxels.len(), "one colour per voxel");
     let only = choice.only.map_or(voxels.len(), <[bool]>::len);
     assert_eq!(only, voxels.len(), "one choice per voxel");
     let range = choice.range(voxels.len());
     let chosen = range.clone().filter(|&voxel| choice.has(voxel)).count();
-    // Memory that was touched before is faster than fresh memory.
-    let mut spare = moments::of_voxels(voxels);
-    let near = moments::step(isa, map, &spare);
-    let mut far = moments::step(isa, map, &near);
-    for _ in 2..moments::ROUNDS {
-        moments::step_into(isa, map, &far, &mut spare);
-        std::mem::swap(&mut far, &mut spare);
-    }
-    drop(spare);
+    let degrees = map.degrees(range.clone());
+    let sparse = sparsity::is_sparse(degrees.par_iter().map(|&degree| degree.into()));
+    drop(degrees);
+    let far = moments::after_all_steps(isa, voxels, map);
     let n = per_voxel.count();
     let count = chosen * n;
     let edge = 2.0 / (1u32 << voxels.depth()) as f32;
@@ -147,28 +141,35 @@ pub fn surfels(
         frame,
         ..Gaussians::default()
     };
-    let sparse = sparsity::is_sparse(near[range.clone()].par_iter().map(|moments| moments[0]));
     let tasks = Rows::of(&mut gaussians).tasks(range.clone(), n, choice);
     tasks.into_par_iter().for_each(|(first, rows)| {
         let last = (first + BLOCK).min(range.end);
         let coordinates: Vec<[u32; 3]> = (first..last).map(|i| voxels.coordinate(i)).collect();
-        let (near, far) = (&near[first..last], &far[first..last]);
+        let far = &far[first..last];
+        let mut masks = [0; BLOCK];
+        let masks = &mut masks[..far.len()];
+        map.masks(first, masks);
         let mut discs = isa.run(passes::Fit {
             coordinates: &coordinates,
-            near,
+            masks,
             far,
         });
         if sparse {
-            fit_windows(isa, voxels, &coordinates, near, far, &mut discs);
+            fit_windows(isa, voxels, &coordinates, masks, far, &mut discs);
         }
+        let (mut buffer, mut around) = (RowBuffer::new(), [].as_slice());
         let mut to = 0;
         for (j, (disc, &coordinate)) in discs.iter().zip(&coordinates).enumerate() {
+            let place = j % RowBuffer::ROWS;
+            if n > 1 && place == 0 {
+                around = buffer.fill(map, first + j..last.min(first + j + RowBuffer::ROWS));
+            }
             if !choice.has(first + j) {
                 continue;
             }
             let parts = match per_voxel {
                 PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
-                PerVoxel::Four => quarters(disc, map, colours, first + j),
+                PerVoxel::Four => quarters(disc, &around[27 * place..][..27], colours, first + j),
             };
             let shrink = if n == 1 { 1.0 } else { SHRINK };
             let radius = disc.radius * shrink * choice.size * edge;
@@ -248,7 +249,7 @@ fn fit_windows(
     isa: Isa,
     voxels: &Voxels,
     coordinates: &[[u32; 3]],
-    near: &[Moments],
+    masks: &[u32],
     far: &[Moments],
     discs: &mut [Disc],
 ) {
@@ -266,12 +267,10 @@ fn fit_windows(
     if found.is_empty() {
         return;
     }
-    let coordinates: Vec<_> = found.iter().map(|&(j, _)| coordinates[j]).collect();
-    let near: Vec<_> = found.iter().map(|&(j, _)| near[j]).collect();
+    let masks: Vec<_> = found.iter().map(|&(j, _)| masks[j]).collect();
     let windows: Vec<_> = found.iter().map(|&(_, window)| window).collect();
     let fitted = isa.run(passes::FitWindows {
-        coordinates: &coordinates,
-        near: &near,
+        masks: &masks,
         windows: &windows,
     });
     for ((j, _), disc) in found.into_iter().zip(fitted) {
@@ -290,9 +289,9 @@ fn cube_point(coordinate: [u32; 3], offset: [f32; 3], edge: f32) -> [f32; 3] {
 
 /// Centres relative to the voxel's centre, in voxels, and colours in 0..=255 of the four discs that replace a voxel's
 /// disc.
-fn quarters(disc: &Disc, map: &KernelMap, colours: &[[u8; 3]], voxel: usize) -> [([f32; 3], [f32; 3]); 4] {
+fn quarters(disc: &Disc, row: &[u32], colours: &[[u8; 3]], voxel: usize) -> [([f32; 3], [f32; 3]); 4] {
     let [u, v] = colours::plane(disc);
-    let [along_u, along_v] = colours::gradient(map, colours, voxel, [u, v]);
+    let [along_u, along_v] = colours::gradient(row, colours, voxel, [u, v]);
     let own = colours[voxel].map(f32::from);
     let far = OFFSET * disc.spacing;
     [(-far, -far), (far, -far), (-far, far), (far, far)].map(|(a, b)| {

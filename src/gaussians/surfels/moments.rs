@@ -7,14 +7,14 @@
 //!
 //! The sums are of absolute coordinates modulo 2¹⁶, so that a step consists of additions only. [`centred`] moves them
 //! to the voxel's own coordinate, where they are exact: below 2¹⁶ (n ≤ 27³, Σx² ≤ 2 · 27³) or within ±2¹⁵ (|Σx| ≤ 5/9 ·
-//! 27³, |Σxy| ≤ 5/4 · 27³).
+//! 27³, |Σxy| ≤ 5/4 · 27³). The first step counts the occupied places of the voxel's row instead.
 
 use b2p_kernels::{Isa, zeros};
 use rayon::prelude::*;
 
 use super::lanes::{GROUP, Lane};
 use super::passes;
-use crate::geometry::{KernelMap, Voxels};
+use crate::geometry::{SiblingMap, Voxels};
 
 /// Steps of a walk.
 pub const ROUNDS: usize = 3;
@@ -23,42 +23,103 @@ pub type Moments = [u16; 16];
 /// Voxels per task.
 const BLOCK: usize = 1024;
 
-/// The moments of each single voxel, then one element of zeros.
-pub fn of_voxels(voxels: &Voxels) -> Vec<Moments> {
-    let of_voxel = |i: usize| {
-        let [x, y, z] = voxels.coordinate(i).map(|v| v as u16);
-        let times = u16::wrapping_mul;
-        let squares = [times(x, x), times(y, y), times(z, z)];
-        let products = [times(x, y), times(x, z), times(y, z)];
-        let mut moments = [0; 16];
-        moments[..4].copy_from_slice(&[1, x, y, z]);
-        moments[4..7].copy_from_slice(&squares);
-        moments[7..10].copy_from_slice(&products);
-        moments
-    };
-    let mut moments: Vec<Moments> = zeros(voxels.len() + 1);
-    let own = moments[..voxels.len()].par_iter_mut().with_min_len(BLOCK);
-    own.enumerate().for_each(|(i, to)| *to = of_voxel(i));
+/// Of each axis the places of a 3³ row one step behind the voxel, and one step ahead of it.
+const STEPS: [[u32; 2]; 3] = {
+    let mut steps = [[0; 2]; 3];
+    let mut k = 0;
+    while k < 27 {
+        let place = [k % 3, k / 3 % 3, k / 9];
+        let mut axis = 0;
+        while axis < 3 {
+            steps[axis][0] |= ((place[axis] == 0) as u32) << k;
+            steps[axis][1] |= ((place[axis] == 2) as u32) << k;
+            axis += 1;
+        }
+        k += 1;
+    }
+    steps
+};
+
+/// The moments of a voxel's occupied neighbours, itself included, relative to its coordinate, as [`Moments`] has them:
+/// those after one step.
+#[inline(always)]
+fn of_neighbours(mask: u32) -> [i16; 10] {
+    let count = |places: u32| (mask & places).count_ones() as i16;
+    let mut moments = [0; 10];
+    moments[0] = count(!0);
+    for (axis, [behind, ahead]) in STEPS.into_iter().enumerate() {
+        moments[1 + axis] = count(ahead) - count(behind);
+    }
+    for (k, (a, b)) in PAIRS.into_iter().enumerate() {
+        let ([behind_a, ahead_a], [behind_b, ahead_b]) = (STEPS[a], STEPS[b]);
+        let alike = behind_a & behind_b | ahead_a & ahead_b;
+        let opposite = behind_a & ahead_b | ahead_a & behind_b;
+        moments[4 + k] = count(alike) - count(opposite);
+    }
     moments
 }
 
-/// One step: for every voxel the sum over the occupied ones of its 27 neighbours, then one element of zeros.
-pub fn step(isa: Isa, map: &KernelMap, from: &[Moments]) -> Vec<Moments> {
-    let mut to: Vec<Moments> = zeros(from.len());
-    step_into(isa, map, from, &mut to);
-    to
+/// The moments of every voxel after one step, then one element of zeros.
+fn after_one_step(isa: Isa, voxels: &Voxels, map: &SiblingMap) -> Vec<Moments> {
+    let mut moments: Vec<Moments> = zeros(voxels.len() + 1);
+    let blocks = moments[..voxels.len()].par_chunks_mut(BLOCK).enumerate();
+    blocks.for_each(|(i, to)| {
+        isa.run(passes::FirstStep {
+            voxels,
+            map,
+            first: i * BLOCK,
+            to,
+        });
+    });
+    moments
 }
 
-/// [`step`] into `to`, whose last element must be zeros.
+/// Moments after one step with absolute coordinates, of a voxel at `coordinate` with these neighbours.
+#[inline(always)]
+pub fn absolute(mask: u32, coordinate: [u32; 3]) -> Moments {
+    let times = u16::wrapping_mul;
+    let c = coordinate.map(|v| v as u16);
+    let relative = of_neighbours(mask).map(|v| v as u16);
+    let (n, sum) = (relative[0], &relative[1..4]);
+    let mut moments = [0; 16];
+    moments[0] = n;
+    for axis in 0..3 {
+        moments[1 + axis] = times(n, c[axis]).wrapping_add(sum[axis]);
+    }
+    // Σ(c + x)(d + y) = n·c·d + c·Σy + d·Σx + Σxy.
+    for (k, (a, b)) in PAIRS.into_iter().enumerate() {
+        let moved = times(times(n, c[a]).wrapping_add(sum[a]), c[b]).wrapping_add(times(c[a], sum[b]));
+        moments[4 + k] = relative[4 + k].wrapping_add(moved);
+    }
+    moments
+}
+
+/// The moments of every voxel after all steps, then one element of zeros.
+pub fn after_all_steps(isa: Isa, voxels: &Voxels, map: &SiblingMap) -> Vec<Moments> {
+    let mut moments = after_one_step(isa, voxels, map);
+    let mut spare: Vec<Moments> = zeros(moments.len());
+    for _ in 1..ROUNDS {
+        step_into(isa, map, &moments, &mut spare);
+        std::mem::swap(&mut moments, &mut spare);
+    }
+    moments
+}
+
+/// One step: for every voxel the sum over the occupied ones of its 27 neighbours. The last elements are zeros.
 ///
 /// # Panics
 /// If `to` does not have one element for each of `from`.
-pub fn step_into(isa: Isa, map: &KernelMap, from: &[Moments], to: &mut [Moments]) {
+fn step_into(isa: Isa, map: &SiblingMap, from: &[Moments], to: &mut [Moments]) {
     assert_eq!(to.len(), from.len(), "one element per voxel, and zeros");
-    let blocks = to[..map.len()].par_chunks_mut(BLOCK);
-    blocks
-        .zip(map.rows().par_chunks(27 * BLOCK))
-        .for_each(|(to, rows)| isa.run(passes::Sum { from, rows, to }));
+    let blocks = to[..map.len()].par_chunks_mut(BLOCK).enumerate();
+    blocks.for_each(|(i, to)| {
+        isa.run(passes::Sum {
+            from,
+            map,
+            first: i * BLOCK,
+            to,
+        });
+    });
 }
 
 /// Moments of a group of voxels, each relative to its voxel's coordinate.
@@ -81,6 +142,24 @@ impl CentredMoments {
             square: [[0.0; GROUP]; 6],
         }
     }
+}
+
+/// Moments after one step of up to [`GROUP`] voxels with these neighbours. Missing voxels get the moments of a single
+/// voxel.
+#[inline(always)]
+pub fn near(masks: &[u32]) -> CentredMoments {
+    let mut lanes = CentredMoments::single();
+    for (j, &mask) in masks.iter().enumerate() {
+        let moments = of_neighbours(mask).map(f32::from);
+        lanes.count[j] = moments[0];
+        for (axis, lane) in lanes.sum.iter_mut().enumerate() {
+            lane[j] = moments[1 + axis];
+        }
+        for (k, lane) in lanes.square.iter_mut().enumerate() {
+            lane[j] = moments[4 + k];
+        }
+    }
+    lanes
 }
 
 /// Moves the moments of up to [`GROUP`] voxels to their `coordinates`. Missing voxels get the moments of a single

@@ -4,15 +4,18 @@ use b2p_kernels::{Instructions, Work};
 
 use super::discs::{Disc, discs};
 use super::lanes::GROUP;
-use super::moments::{Moments, centred};
+use super::moments::{Moments, absolute, centred, near};
 use super::windows::{Window, gathered};
+use crate::geometry::{RowBuffer, SiblingMap, Voxels};
 
 /// Sums the moments of all neighbours.
 pub struct Sum<'a> {
     /// Moments of each voxel, then zeros for absent neighbours.
     pub from: &'a [Moments],
-    /// 27 indices into `from` per element of `to`.
-    pub rows: &'a [u32],
+    /// Indices into `from`.
+    pub map: &'a SiblingMap,
+    /// The first voxel of `to`.
+    pub first: usize,
     pub to: &'a mut [Moments],
 }
 
@@ -22,16 +25,47 @@ impl Work for Sum<'_> {
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
         let absent = self.from.len() - 1;
-        for (to, row) in self.to.iter_mut().zip(self.rows.chunks_exact(27)) {
-            let mut sum = [0u16; 16];
-            for &q in row {
-                // No branch: the presence of neighbours is unpredictable.
-                let from = &self.from[absent.min(q as usize)];
-                for (sum, value) in sum.iter_mut().zip(from) {
-                    *sum = sum.wrapping_add(*value);
+        let mut buffer = RowBuffer::new();
+        for (i, to) in self.to.chunks_mut(RowBuffer::ROWS).enumerate() {
+            let first = self.first + i * RowBuffer::ROWS;
+            let rows = buffer.fill(self.map, first..first + to.len());
+            for (to, row) in to.iter_mut().zip(rows.chunks_exact(27)) {
+                let mut sum = [0u16; 16];
+                for &q in row {
+                    // No branch: the presence of neighbours is unpredictable.
+                    let from = &self.from[absent.min(q as usize)];
+                    for (sum, value) in sum.iter_mut().zip(from) {
+                        *sum = sum.wrapping_add(*value);
+                    }
                 }
+                *to = sum;
             }
-            *to = sum;
+        }
+    }
+}
+
+/// The moments of consecutive voxels after one step.
+pub struct FirstStep<'a> {
+    pub voxels: &'a Voxels,
+    pub map: &'a SiblingMap,
+    /// The first voxel of `to`.
+    pub first: usize,
+    pub to: &'a mut [Moments],
+}
+
+impl Work for FirstStep<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        let mut masks = [0; RowBuffer::ROWS];
+        for (i, to) in self.to.chunks_mut(RowBuffer::ROWS).enumerate() {
+            let first = self.first + i * RowBuffer::ROWS;
+            let masks = &mut masks[..to.len()];
+            self.map.masks(first, masks);
+            for ((voxel, to), &mut mask) in (first..).zip(to).zip(masks) {
+                *to = absolute(mask, self.voxels.coordinate(voxel));
+            }
         }
     }
 }
@@ -39,8 +73,8 @@ impl Work for Sum<'_> {
 /// Fits the discs of consecutive voxels.
 pub struct Fit<'a> {
     pub coordinates: &'a [[u32; 3]],
-    /// Moments after one step.
-    pub near: &'a [Moments],
+    /// The occupied places of each voxel's row.
+    pub masks: &'a [u32],
     /// Moments after all steps.
     pub far: &'a [Moments],
 }
@@ -51,9 +85,9 @@ impl Work for Fit<'_> {
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) -> Vec<Disc> {
         let mut out = Vec::with_capacity(self.coordinates.len().next_multiple_of(GROUP));
-        let groups = self.near.chunks(GROUP).zip(self.far.chunks(GROUP));
-        for (coordinates, (near, far)) in self.coordinates.chunks(GROUP).zip(groups) {
-            out.extend(discs(&centred(near, coordinates), &centred(far, coordinates), None));
+        let groups = self.masks.chunks(GROUP).zip(self.far.chunks(GROUP));
+        for (coordinates, (masks, far)) in self.coordinates.chunks(GROUP).zip(groups) {
+            out.extend(discs(&near(masks), &centred(far, coordinates), None));
         }
         out.truncate(self.coordinates.len());
         out
@@ -62,9 +96,8 @@ impl Work for Fit<'_> {
 
 /// Fits the discs of voxels to windows.
 pub struct FitWindows<'a> {
-    pub coordinates: &'a [[u32; 3]],
-    /// Moments after one step.
-    pub near: &'a [Moments],
+    /// The occupied places of each voxel's row.
+    pub masks: &'a [u32],
     pub windows: &'a [Window],
 }
 
@@ -73,13 +106,12 @@ impl Work for FitWindows<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) -> Vec<Disc> {
-        let mut out = Vec::with_capacity(self.coordinates.len().next_multiple_of(GROUP));
-        let groups = self.near.chunks(GROUP).zip(self.windows.chunks(GROUP));
-        for (coordinates, (near, windows)) in self.coordinates.chunks(GROUP).zip(groups) {
+        let mut out = Vec::with_capacity(self.masks.len().next_multiple_of(GROUP));
+        for (masks, windows) in self.masks.chunks(GROUP).zip(self.windows.chunks(GROUP)) {
             let (far, reach) = gathered(windows);
-            out.extend(discs(&centred(near, coordinates), &far, Some(&reach)));
+            out.extend(discs(&near(masks), &far, Some(&reach)));
         }
-        out.truncate(self.coordinates.len());
+        out.truncate(self.masks.len());
         out
     }
 }

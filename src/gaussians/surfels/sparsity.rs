@@ -11,7 +11,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::BLOCK;
-use crate::geometry::KernelMap;
+use crate::geometry::SiblingMap;
 
 /// A level is sparse if one in so many voxels is lone.
 const LONE_SHARE: usize = 512;
@@ -81,27 +81,20 @@ pub fn is_sparse(degrees: impl IndexedParallelIterator<Item = u16>) -> bool {
 /// neighbourhoods: they are sparse, and more than stray voxels lack neighbours.
 ///
 /// # Panics
-/// If `map` is not a 3³ map, or has no such voxels.
-pub fn is_for_surfels(map: &KernelMap, range: Range<usize>) -> bool {
-    assert_eq!(map.volume(), 27, "sparsity is measured in a 3³ map");
-    let absent = KernelMap::ABSENT;
-    let degree = |row: &[u32]| row.iter().map(|&at| u16::from(at != absent)).sum::<u16>();
-    let rows = &map.rows()[27 * range.start..27 * range.end];
-    let degrees = || rows.par_chunks_exact(27).map(degree);
-    let thin = || degrees().with_min_len(BLOCK).filter(|&degree| degree <= THIN).count();
-    is_sparse(degrees()) && THIN_SHARE * thin() >= range.len()
+/// If `map` has no such voxels.
+pub fn is_for_surfels(map: &SiblingMap, range: Range<usize>) -> bool {
+    let degrees = map.degrees(range.clone());
+    let thin = || degrees.iter().filter(|&&degree| u16::from(degree) <= THIN).count();
+    is_sparse(degrees.par_iter().map(|&degree| degree.into())) && THIN_SHARE * thin() >= range.len()
 }
 
 /// Size of the surfels that close a level which [`is_for_surfels`], in 64ths of the usual radius, for
 /// [`HeadMap`](crate::gaussians::HeadMap) to state: from 64 where voxels have the neighbours of a closed surface up to
 /// 90 the fewer they have.
-///
-/// # Panics
-/// If `map` is not a 3³ map.
-pub fn closing_size(map: &KernelMap) -> u8 {
-    assert_eq!(map.volume(), 27, "sparsity is measured in a 3³ map");
-    let present = map.rows().par_iter().filter(|&&at| at != KernelMap::ABSENT);
-    let (voxels, neighbours) = (map.len() as i64, present.count() as i64);
+pub fn closing_size(map: &SiblingMap) -> u8 {
+    let degrees = map.degrees(0..map.len());
+    let neighbours: i64 = degrees.iter().map(|&degree| i64::from(degree)).sum();
+    let voxels = map.len() as i64;
     let wider = WIDEN * (CLOSED_TWICE * voxels - 2 * neighbours) / voxels.max(1);
     wider.clamp(0, WIDEST) as u8 + 64
 }
@@ -111,20 +104,17 @@ mod tests {
     use super::*;
     use crate::geometry::{Octree, Voxels, morton};
 
-    fn map(depth: u8, cloud: impl Iterator<Item = [u32; 3]>) -> KernelMap {
+    fn map(depth: u8, cloud: impl Iterator<Item = [u32; 3]>) -> SiblingMap {
         let octree = Octree::new(Voxels::new(depth, cloud.map(morton::encode).collect())).unwrap();
-        (0..depth).fold(octree.kernel_map(0), |map, level| octree.child_map(level, &map))
+        octree.sibling_map(depth)
     }
 
     fn plane() -> impl Iterator<Item = [u32; 3]> {
         (0..64 * 64).map(|i| [i % 64, i / 64, 9])
     }
 
-    fn is_sparse_level(map: &KernelMap) -> bool {
-        is_sparse((0..map.len()).into_par_iter().map(|i| {
-            let row = &map.rows()[27 * i..27 * (i + 1)];
-            row.iter().filter(|&&at| at != KernelMap::ABSENT).count() as u16
-        }))
+    fn is_sparse_level(map: &SiblingMap) -> bool {
+        is_sparse(map.degrees(0..map.len()).par_iter().map(|&degree| degree.into()))
     }
 
     #[test]
@@ -142,7 +132,7 @@ mod tests {
         assert!(is_sparse_level(&map(6, plane().chain(specks(9)))));
     }
 
-    fn is_all_for_surfels(map: &KernelMap) -> bool {
+    fn is_all_for_surfels(map: &SiblingMap) -> bool {
         is_for_surfels(map, 0..map.len())
     }
 

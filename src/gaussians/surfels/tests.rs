@@ -4,14 +4,14 @@ use crate::geometry::{Octree, morton};
 use crate::testing::Random;
 use proptest::prelude::*;
 
-/// A cloud's voxels and kernel map.
-fn cloud(depth: u8, voxels: impl IntoIterator<Item = [u32; 3]>) -> (Voxels, KernelMap) {
+/// A cloud's voxels and their map.
+fn cloud(depth: u8, voxels: impl IntoIterator<Item = [u32; 3]>) -> (Voxels, SiblingMap) {
     let keys = voxels.into_iter().map(morton::encode).collect();
     let octree = Octree::new(Voxels::new(depth, keys)).unwrap();
-    (octree.level(depth).clone(), octree.kernel_map(depth))
+    (octree.level(depth).clone(), octree.sibling_map(depth))
 }
 
-fn one_each(voxels: &Voxels, map: &KernelMap) -> Gaussians {
+fn one_each(voxels: &Voxels, map: &SiblingMap) -> Gaussians {
     let grey = vec![[128; 3]; voxels.len()];
     surfels(
         Isa::detect(),
@@ -56,13 +56,14 @@ fn distribution(coordinates: &[[u32; 3]], voxel: usize, steps: usize) -> ([f64; 
     (mean, covariance)
 }
 
-fn all_discs(isa: Isa, voxels: &Voxels, map: &KernelMap) -> Vec<Disc> {
-    let near = moments::step(isa, map, &moments::of_voxels(voxels));
-    let far = (1..moments::ROUNDS).fold(near.clone(), |m, _| moments::step(isa, map, &m));
+fn all_discs(isa: Isa, voxels: &Voxels, map: &SiblingMap) -> Vec<Disc> {
+    let far = moments::after_all_steps(isa, voxels, map);
     let coordinates: Vec<_> = (0..voxels.len()).map(|i| voxels.coordinate(i)).collect();
+    let mut masks = vec![0; voxels.len()];
+    map.masks(0, &mut masks);
     isa.run(passes::Fit {
         coordinates: &coordinates,
-        near: &near,
+        masks: &masks,
         far: &far,
     })
 }
@@ -396,7 +397,7 @@ fn levels_that_are_not_sparse_have_the_discs_of_walks_to_the_bit() {
     for of in clouds {
         let octree = Octree::new(Voxels::new(7, of.into_iter().map(morton::encode).collect())).unwrap();
         for level in 4..=7 {
-            let (voxels, map) = (octree.level(level), octree.kernel_map(level));
+            let (voxels, map) = (octree.level(level), octree.sibling_map(level));
             let drawn = one_each(voxels, &map);
             let edge = 2.0 / (1u32 << level) as f32;
             for (i, disc) in all_discs(Isa::detect(), voxels, &map).into_iter().enumerate() {
@@ -416,10 +417,8 @@ fn bars_beside_a_dense_surface_do_not_merge() {
     let bars = (0..4 * 20).map(|i| [4 * (i % 4), i / 4, 12]);
     let specks = (0..20).map(|i| [3 * i, 50, 50]);
     let (voxels, map) = cloud(6, sheet.chain(bars).chain(specks));
-    let near = moments::step(Isa::detect(), &map, &moments::of_voxels(&voxels));
-    assert!(sparsity::is_sparse(
-        near[..voxels.len()].par_iter().map(|moments| moments[0])
-    ));
+    let degrees = map.degrees(0..map.len());
+    assert!(sparsity::is_sparse(degrees.par_iter().map(|&degree| degree.into())));
     let gaussians = one_each(&voxels, &map);
     for i in (0..voxels.len()).filter(|&i| voxels.coordinate(i)[2] == 12) {
         assert!(gaussians.scale[i].iter().all(|s| (s * 32.0 - 0.4).abs() < 0.01));

@@ -44,7 +44,8 @@ fn difference_of(cloud: &ColouredVoxels, tune: Tune) -> f32 {
         let points = range(&surface.first_point, voxel);
         points.map(move |i| (voxel, i))
     });
-    let squares = points.map(|(voxel, i)| surface.missing(voxel, &surface.points[i]).0.map(|x| x * x));
+    let missing = |voxel, i: usize| surface.missing(&surface.map.row(voxel), &surface.points[i]).0;
+    let squares = points.map(|(voxel, i)| missing(voxel, i).map(|x| x * x));
     squares.flatten().sum::<f32>() / surface.points.len() as f32
 }
 

@@ -1,0 +1,483 @@
+//! Kernel maps of whole levels, in a quarter of the memory: siblings share a window (`docs/format.md`, clause 2.4).
+//!
+//! The neighbours of up to eight siblings lie in a window of 4³ positions around them. A [`SiblingMap`] stores which of
+//! these are occupied, and the voxels there. Each voxel lies in at most eight windows, so that it takes 32 bytes and a
+//! parent 14; a row of a [`KernelMap`] takes 108. Rows are made when they are read.
+
+use std::ops::Range;
+
+use b2p_kernels::MadeRows;
+use rayon::prelude::*;
+
+use super::KernelMap;
+
+/// Parents of a block. The places of their windows fit 16 bits.
+const BLOCK: usize = 1024;
+
+/// The neighbours of every voxel of a level under a 3³ kernel.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SiblingMap {
+    /// Number of voxels.
+    len: usize,
+    /// Each has [`BLOCK`] parents, but for the last.
+    blocks: Vec<Block>,
+}
+
+/// The windows of consecutive parents.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Block {
+    /// The first child of each parent.
+    first_child: Box<[u32]>,
+    /// The occupied positions of each parent's window.
+    there: Box<[u64]>,
+    /// Where each parent's voxels begin in `voxels`.
+    start: Box<[u16]>,
+    /// The voxels of all windows, one window after the other, by position.
+    voxels: Box<[u32]>,
+}
+
+/// What lies around siblings: 4³ positions, x fastest. Octant 0 is at (1, 1, 1).
+pub struct Window {
+    /// The positions that are occupied.
+    there: u64,
+    /// The voxel at each position, [`KernelMap::ABSENT`] where none is.
+    voxels: [u32; 64],
+}
+
+/// Positions of the eight siblings.
+const OWN: u64 = 0b11_0011 << 21 | 0b11_0011 << 37;
+/// Position of the child in octant 0.
+const FIRST: u32 = 21;
+
+/// Of a neighbour of the parent: the octants that the window shows, and by how much their positions exceed those of the
+/// siblings in the same octants less [`FIRST`], modulo 64.
+const SEEN: [(u8, u32); 27] = {
+    let mut seen = [(0, 0); 27];
+    let mut k = 0;
+    while k < 27 {
+        let (mut octants, mut o) = (0, 0);
+        while o < 8 {
+            let axes = [(k % 3, o & 1), (k / 3 % 3, o >> 1 & 1), (k / 9, o >> 2)];
+            // Along an axis, the lower neighbour shows its upper octant, the upper neighbour its lower one.
+            let mut shown = true;
+            let mut axis = 0;
+            while axis < 3 {
+                let (step, octant) = axes[axis];
+                shown &= step == 1 || (step == 0 && octant == 1) || (step == 2 && octant == 0);
+                axis += 1;
+            }
+            octants |= (shown as u8) << o;
+            o += 1;
+        }
+        // Neighbour coordinate −1, 0, 1 begins at window position −1, 1, 3.
+        let [x, y, z] = [k % 3, k / 3 % 3, k / 9];
+        let turn = 2 * (x + 4 * y + 16 * z) + 64 - FIRST as usize;
+        seen[k] = (octants, (turn % 64) as u32);
+        k += 1;
+    }
+    seen
+};
+
+/// The positions of siblings of this occupancy, less [`FIRST`].
+const SPREAD: [u64; 256] = {
+    let mut spread = [0; 256];
+    let mut mask = 0;
+    while mask < 256 {
+        let mut o = 0;
+        while o < 8 {
+            let place = (o & 1) + 4 * (o >> 1 & 1) + 16 * (o >> 2);
+            spread[mask] |= ((mask as u64) >> o & 1) << place;
+            o += 1;
+        }
+        mask += 1;
+    }
+    spread
+};
+
+/// Of each position the neighbour of the parent that it lies in, and the octants before it there.
+const PLACE: [(u8, u8); 64] = {
+    let mut places = [(0, 0); 64];
+    let mut i = 0;
+    while i < 64 {
+        let (x, y, z) = (i & 3, i >> 2 & 3, i >> 4);
+        let neighbour = ((x + 1) >> 1) + 3 * ((y + 1) >> 1) + 9 * ((z + 1) >> 1);
+        let octant = ((x + 1) & 1) + 2 * ((y + 1) & 1) + 4 * ((z + 1) & 1);
+        places[i] = (neighbour as u8, ((1u32 << octant) - 1) as u8);
+        i += 1;
+    }
+    places
+};
+
+/// Positions of the set bits of a mask, ascending.
+#[inline(always)]
+fn ones(mut mask: u64) -> impl Iterator<Item = u32> {
+    std::iter::from_fn(move || {
+        let position = mask.trailing_zeros();
+        (mask != 0).then(|| {
+            mask &= mask - 1;
+            position
+        })
+    })
+}
+
+impl SiblingMap {
+    /// Bytes of memory of a voxel, at most: in each of the windows that it lies in.
+    pub(crate) const BYTES_PER_VOXEL: u64 = 8 * size_of::<u32>() as u64;
+    /// Bytes of memory of a voxel of the level above.
+    pub(crate) const BYTES_PER_PARENT: u64 = (size_of::<u32>() + size_of::<u64>() + size_of::<u16>()) as u64;
+
+    /// The map of level 0, which has one voxel.
+    pub fn root() -> Self {
+        let block = Block {
+            first_child: [0].into(),
+            there: [1 << FIRST].into(),
+            start: [0].into(),
+            voxels: [0].into(),
+        };
+        SiblingMap {
+            len: 1,
+            blocks: vec![block],
+        }
+    }
+
+    /// The map of the children of the voxels of `map`, given the occupancy and the first child of each.
+    ///
+    /// # Panics
+    /// If `map` is not a 3³ map, or the numbers of voxels differ.
+    pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]) -> Self {
+        assert_eq!(map.volume(), 27, "children come from a 3³ map");
+        assert_eq!(map.len(), occupancy.len(), "one occupancy per voxel");
+        assert_eq!(map.len(), first_child.len(), "one first child per voxel");
+        let rows = map.rows().par_chunks(27 * BLOCK);
+        let blocks = rows.zip(first_child.par_chunks(BLOCK));
+        let blocks = blocks.map(|(rows, firsts)| Block::new(rows, firsts, occupancy, first_child));
+        SiblingMap {
+            len: occupancy.iter().map(|mask| mask.count_ones() as usize).sum(),
+            blocks: blocks.collect(),
+        }
+    }
+
+    /// Number of voxels.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there are no voxels.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The window around the children of voxel `parent` of the level above.
+    #[inline(always)]
+    pub fn window(&self, parent: usize) -> Window {
+        self.blocks[parent / BLOCK].window(parent % BLOCK)
+    }
+
+    /// The row of voxel `i`, as a [`KernelMap`] has it. Those of consecutive voxels are better made in a
+    /// [`RowBuffer`].
+    ///
+    /// # Panics
+    /// If there is no such voxel.
+    pub fn row(&self, i: usize) -> [u32; 27] {
+        let mut row = [0; 27];
+        self.fill(i, &mut row);
+        row
+    }
+
+    /// The map with a row for every voxel.
+    pub fn table(&self) -> KernelMap {
+        let mut rows = b2p_kernels::zeros(27 * self.len);
+        rows.par_chunks_mut(27 * BLOCK)
+            .enumerate()
+            .for_each(|(i, rows)| self.fill(i * BLOCK, rows));
+        KernelMap::new(27, rows)
+    }
+
+    /// Writes of the voxels from `first` on which places of their rows are occupied: bit `k` for offset `k`.
+    ///
+    /// # Panics
+    /// If there are not so many voxels.
+    pub fn masks(&self, first: usize, masks: &mut [u32]) {
+        assert!(first + masks.len() <= self.len, "voxels beyond the last");
+        let mut masks = masks.iter_mut();
+        self.for_each_parent(first, |block, parent, children| {
+            if masks.len() == 0 {
+                return false;
+            }
+            for (position, mask) in ones(children).zip(&mut masks) {
+                let there = block.there[parent] >> corner(octant(position));
+                let lines = (0..9).map(|line| (there >> (4 * (line % 3) + 16 * (line / 3)) & 7) << (3 * line));
+                *mask = lines.sum::<u64>() as u32;
+            }
+            true
+        });
+    }
+
+    /// The number of neighbours of each of the voxels `range`, itself included.
+    ///
+    /// # Panics
+    /// If there are no such voxels.
+    pub fn degrees(&self, range: Range<usize>) -> Vec<u8> {
+        let mut degrees = vec![0; range.len()];
+        degrees.par_chunks_mut(BLOCK).enumerate().for_each(|(i, degrees)| {
+            let mut masks = [0; BLOCK];
+            let masks = &mut masks[..degrees.len()];
+            self.masks(range.start + i * BLOCK, masks);
+            for (degree, mask) in degrees.iter_mut().zip(masks) {
+                *degree = mask.count_ones() as u8;
+            }
+        });
+        degrees
+    }
+
+    /// Calls `each` with the block and place of parents, and the positions of their children, for the voxels from `first`
+    /// on, until it returns `false`.
+    #[inline(always)]
+    fn for_each_parent(&self, first: usize, mut each: impl FnMut(&Block, usize, u64) -> bool) {
+        if first >= self.len {
+            return;
+        }
+        // The last block and parent that do not begin after the voxel are its own.
+        let own = self
+            .blocks
+            .partition_point(|block| block.first_child[0] as usize <= first)
+            - 1;
+        let firsts = &self.blocks[own].first_child;
+        let mut parents = firsts.partition_point(|&child| child as usize <= first) - 1;
+        let mut skipped = first - firsts[parents] as usize;
+        for block in &self.blocks[own..] {
+            for parent in parents..block.there.len() {
+                let mut children = block.there[parent] & OWN;
+                for _ in 0..std::mem::take(&mut skipped) {
+                    children &= children - 1;
+                }
+                if !each(block, parent, children) {
+                    return;
+                }
+            }
+            parents = 0;
+        }
+    }
+}
+
+impl MadeRows for SiblingMap {
+    fn fill(&self, first: usize, rows: &mut [u32]) {
+        assert!(first + rows.len() / 27 <= self.len, "rows beyond the last voxel");
+        let mut rows = rows.chunks_exact_mut(27);
+        self.for_each_parent(first, |block, parent, children| {
+            if rows.len() == 0 {
+                return false;
+            }
+            let window = block.window(parent);
+            for (position, row) in ones(children).zip(&mut rows) {
+                window.copy_row(octant(position), row);
+            }
+            true
+        });
+    }
+}
+
+/// The octant at a position of a sibling.
+#[inline(always)]
+fn octant(position: u32) -> usize {
+    let place = position - FIRST;
+    (place & 1 | place >> 1 & 2 | place >> 2 & 4) as usize
+}
+
+/// Where the row of a child begins in the window.
+#[inline(always)]
+fn corner(octant: usize) -> usize {
+    (octant & 1) + 4 * (octant >> 1 & 1) + 16 * (octant >> 2)
+}
+
+impl Block {
+    /// The windows of the parents with these rows and first children, among all parents.
+    fn new(rows: &[u32], firsts: &[u32], occupancy: &[u8], first_child: &[u32]) -> Block {
+        let mut there = Vec::with_capacity(firsts.len());
+        let mut start = Vec::with_capacity(firsts.len());
+        let mut voxels = Vec::with_capacity(32 * firsts.len());
+        for row in rows.chunks_exact(27) {
+            let (mut masks, mut children) = ([0u8; 27], [0u32; 27]);
+            let mut seen = 0;
+            for (k, &q) in row.iter().enumerate() {
+                // No branch: the presence of neighbours is unpredictable.
+                let present = q != KernelMap::ABSENT;
+                let q = if present { q as usize } else { 0 };
+                masks[k] = if present { occupancy[q] } else { 0 };
+                children[k] = first_child[q];
+                let (octants, turn) = SEEN[k];
+                seen |= SPREAD[usize::from(masks[k] & octants)].rotate_left(turn);
+            }
+            start.push(voxels.len() as u16);
+            there.push(seen);
+            for position in ones(seen) {
+                let (k, before) = PLACE[position as usize & 63];
+                let rank = (masks[usize::from(k)] & before).count_ones();
+                voxels.push(children[usize::from(k)] + rank);
+            }
+        }
+        Block {
+            first_child: firsts.into(),
+            there: there.into(),
+            start: start.into(),
+            voxels: voxels.as_slice().into(),
+        }
+    }
+
+    #[inline(always)]
+    fn window(&self, parent: usize) -> Window {
+        let there = self.there[parent];
+        let mut window = Window { there, ..Window::EMPTY };
+        let voxels = &self.voxels[usize::from(self.start[parent])..];
+        for (position, &voxel) in ones(there).zip(voxels) {
+            window.voxels[position as usize & 63] = voxel;
+        }
+        window
+    }
+}
+
+impl Window {
+    /// Nothing.
+    pub const EMPTY: Window = Window {
+        there: 0,
+        voxels: [KernelMap::ABSENT; 64],
+    };
+
+    /// Whether the neighbour at offset `k` of the row of the child in `octant` is there.
+    #[inline(always)]
+    pub fn has(&self, octant: usize, k: usize) -> bool {
+        self.there >> (corner(octant) + k % 3 + 4 * (k / 3 % 3) + 16 * (k / 9)) & 1 != 0
+    }
+
+    /// The row of the child in `octant`.
+    #[inline(always)]
+    pub fn row(&self, octant: usize) -> [u32; 27] {
+        let mut row = [0; 27];
+        self.copy_row(octant, &mut row);
+        row
+    }
+
+    #[inline(always)]
+    fn copy_row(&self, octant: usize, row: &mut [u32]) {
+        // Four at a time: what is one too many, the next three replace.
+        let (row, start) = (&mut row[..27], corner(octant));
+        for line in 0..8 {
+            let from = start + 4 * (line % 3) + 16 * (line / 3);
+            row[3 * line..][..4].copy_from_slice(&self.voxels[from..][..4]);
+        }
+        row[24..].copy_from_slice(&self.voxels[start + 40..][..3]);
+    }
+}
+
+/// Room for rows of consecutive voxels.
+pub struct RowBuffer([u32; 27 * Self::ROWS]);
+
+impl RowBuffer {
+    /// Rows that there is room for: few enough that they stay in the fastest cache.
+    pub const ROWS: usize = 128;
+
+    /// Room for rows.
+    #[allow(clippy::new_without_default)]
+    pub fn new() -> Self {
+        RowBuffer([0; 27 * Self::ROWS])
+    }
+
+    /// The rows of the voxels `range` of a map, one after the other, as a [`KernelMap`] has them.
+    ///
+    /// # Panics
+    /// If these are more than [`RowBuffer::ROWS`], or the map has no such voxels.
+    #[inline(always)]
+    pub fn fill(&mut self, map: &SiblingMap, range: Range<usize>) -> &[u32] {
+        let rows = &mut self.0[..27 * range.len()];
+        map.fill(range.start, rows);
+        rows
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Octree, Voxels, morton};
+    use proptest::prelude::*;
+
+    /// Compares the maps of all levels with those that have a row for every voxel.
+    fn check(voxels: Voxels) {
+        let octree = Octree::new(voxels).unwrap();
+        for level in 0..=octree.depth() {
+            let (map, table) = (octree.sibling_map(level), octree.kernel_map(level));
+            assert_eq!(map.len(), table.len());
+            assert!(map.table() == table, "level {level}");
+            for i in (0..map.len()).step_by(1 + map.len() / 50) {
+                assert_eq!(map.row(i), table.row(i));
+                let range = i..(i + 1 + i % 7 * 21).min(map.len());
+                let mut buffer = RowBuffer::new();
+                let rows = buffer.fill(&map, range.clone());
+                assert_eq!(rows, &table.rows()[27 * range.start..27 * range.end]);
+                let present = |i: usize| table.row(i).iter().filter(|q| **q != KernelMap::ABSENT).count();
+                assert!(
+                    map.degrees(range.clone())
+                        .into_iter()
+                        .map(usize::from)
+                        .eq(range.clone().map(present))
+                );
+                let mut masks = vec![0; range.len()];
+                map.masks(i, &mut masks);
+                for (mask, i) in masks.into_iter().zip(range) {
+                    assert!((0..27).all(|k| (mask >> k & 1 == 1) == (table.row(i)[k] != KernelMap::ABSENT)));
+                    assert_eq!(mask >> 27, 0);
+                }
+            }
+            let Some(above) = level.checked_sub(1) else {
+                continue;
+            };
+            let parents = octree.occupancy(above).iter().zip(octree.first_child(above));
+            for (parent, (&mask, &first)) in parents.enumerate() {
+                let window = map.window(parent);
+                for (child, octant) in (first as usize..).zip(crate::geometry::ones(mask.into())) {
+                    assert_eq!(window.row(octant), table.row(child));
+                    assert!((0..27).all(|k| window.has(octant, k) == (table.row(child)[k] != KernelMap::ABSENT)));
+                }
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn rows_are_those_of_the_kernel_map(keys in prop::collection::vec(0u64..1 << 12, 1..300)) {
+            check(Voxels::new(4, keys));
+        }
+    }
+
+    #[test]
+    fn rows_of_extreme_clouds_are_those_of_the_kernel_map() {
+        check(Voxels::new(0, vec![0]));
+        check(Voxels::new(3, (0..512).collect()));
+        check(Voxels::new(21, vec![0, (1 << 63) - 1]));
+        check(Voxels::new(21, vec![1 << 62, (1 << 62) - 1]));
+    }
+
+    #[test]
+    fn rows_of_several_blocks_are_those_of_the_kernel_map() {
+        let bowl = (0..1u32 << 14).map(|i| {
+            let [x, y] = [i % 128, i / 128];
+            morton::encode([x, y, (x * x + y * y) / 256])
+        });
+        let voxels = Voxels::new(7, bowl.collect());
+        assert!(voxels.len() > 8 * BLOCK);
+        check(voxels);
+    }
+
+    #[test]
+    fn a_voxel_lies_in_at_most_eight_windows() {
+        for voxels in [
+            Voxels::new(3, (0..512).collect()),
+            Voxels::new(4, (0..1 << 12).step_by(9).collect()),
+            Voxels::new(9, (0..1 << 27).step_by(20_011).collect()),
+        ] {
+            let map = Octree::new(voxels).unwrap();
+            let map = map.sibling_map(map.depth());
+            let shown: usize = map.blocks.iter().map(|block| block.voxels.len()).sum();
+            assert!(shown <= 8 * map.len(), "{shown} of {}", map.len());
+        }
+    }
+}
