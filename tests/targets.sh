@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
 # The conformance suite, decoded by the bare decoder, on processors that differ from the usual ones in what could matter; the kernels' own tests too:
 #
-#     tests/targets.sh [wasm32|armv7|s390x|riscv64|riscv64v …]    all of them by default
+#     tests/targets.sh [wasm32|armv7|s390x|riscv64|riscv64v|windows|macos …]    all of them by default
 #
 # wasm32  WebAssembly with SIMD, in Node: 32-bit addresses, no threads (the kernels' tests are in web/test.sh)
 # armv7   32-bit ARM with NEON, whose vectors flush subnormal floats to zero, under QEMU: 32-bit addresses
 # s390x   IBM Z, under QEMU: big-endian
 # riscv64 RISC-V (rv64gc), under QEMU: NaNs of arithmetic have one canonical form
 # riscv64v the same with vectors (RVV 1.0), which the compiler makes of the plain kernels
+# windows, macos  the library, the program and the C library are type-checked only: nothing here runs them
 #
 # On Debian, as root, it installs what it needs; rustup adds the standard libraries. What it found is in SECURITY.md.
 set -euo pipefail
@@ -16,7 +17,7 @@ cd "$(dirname "$0")/.."
 # install COMMAND PACKAGE…
 install() { command -v "$1" > /dev/null || { apt-get update -qq && apt-get install -y -qq --no-install-recommends "${@:2}"; }; }
 
-[ $# -gt 0 ] || set -- wasm32 armv7 s390x riscv64 riscv64v
+[ $# -gt 0 ] || set -- wasm32 armv7 s390x riscv64 riscv64v windows macos
 for name in "$@"; do
     kernels= skip=
     case $name in
@@ -54,6 +55,14 @@ for name in "$@"; do
             [ $name = riscv64 ] || { features+=,+v && processor+=,v=true,vext_spec=v1.0 && skip="-- --skip hostile"; }
             export CARGO_TARGET_RISCV64GC_UNKNOWN_LINUX_GNU_RUSTFLAGS="-C target-feature=$features"
             export CARGO_TARGET_RISCV64GC_UNKNOWN_LINUX_GNU_RUNNER="timeout 1800 qemu-riscv64 -cpu $processor"
+            ;;
+        windows | macos)
+            target=x86_64-pc-windows-msvc
+            [ $name = windows ] || target=aarch64-apple-darwin
+            echo "== $target"
+            rustup target add $target
+            cargo check --locked --target $target -p b2p -p b2p-formats -p b2p-cli -p b2p-capi
+            continue
             ;;
         *)
             echo "no target $name" >&2

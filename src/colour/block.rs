@@ -183,7 +183,7 @@ fn predict(nodes: Nodes<'_>, node: usize, around: &FaceNeighbours, coded: &Coded
     let sums = around.sums();
     for octant in crate::geometry::ones(nodes.masks[node].into()) {
         let far = [0, 1, 2, 3].map(|lane| sums[lane][octant]);
-        let near = coded.sums(&window.row(octant), far);
+        let near = coded.sums(window.around(octant), far);
         let ([a, b, c], [d, e, f]) = (mean(near), mean(far));
         predicted[octant] = [a, b, c, 0, d, e, f, 0];
     }

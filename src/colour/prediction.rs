@@ -11,7 +11,7 @@
 //!
 //! A mean is `(sum·⌊2³² / weight⌋ + 2³¹) >> 32`, with the sums of weighted colours and of weights.
 
-use crate::geometry::KernelMap;
+use crate::geometry::{AROUND, KernelMap, place};
 
 /// Offsets of the node itself and of its face neighbours, as indices into a 3³ kernel map row.
 pub(super) const SELF_AND_FACES: [usize; 7] = [13, 4, 10, 12, 14, 16, 22];
@@ -189,27 +189,26 @@ impl Coded {
         self.len += 1;
     }
 
-    /// `sums` of weighted Y, Co and Cg and of weights, plus those of the coded children at the offsets of a child's
-    /// row.
+    /// `sums` of weighted Y, Co and Cg and of weights, plus those of the coded children around a child.
     #[inline(always)]
-    pub fn sums(&self, row: &[u32], sums: [i32; 4]) -> [i32; 4] {
+    pub fn sums(&self, around: &[u32; AROUND], sums: [i32; 4]) -> [i32; 4] {
         let (faces, edges, corners) = BEFORE;
         let [faces, edges, corners] = [
-            self.unweighted(row, faces),
-            self.unweighted(row, edges),
-            self.unweighted(row, corners),
+            self.unweighted(around, faces),
+            self.unweighted(around, edges),
+            self.unweighted(around, corners),
         ];
         let [_, face, edge, corner] = CHILD_WEIGHTS_BY_AXES;
         std::array::from_fn(|i| sums[i] + face * faces[i] + edge * edges[i] + corner * corners[i])
     }
 
     #[inline(always)]
-    fn unweighted<const N: usize>(&self, row: &[u32], offsets: &[usize; N]) -> [i32; 4] {
+    fn unweighted<const N: usize>(&self, around: &[u32; AROUND], offsets: &[usize; N]) -> [i32; 4] {
         let values = &self.values[..=self.len];
         let mut sums = [0; 4];
         for &k in offsets {
             // The children of other slices wrap or lie beyond, as absent ones do: they read the zeros after the last.
-            let value = &values[(row[k] as usize).wrapping_sub(self.base).min(self.len)];
+            let value = &values[(around[place(k)] as usize).wrapping_sub(self.base).min(self.len)];
             for i in 0..4 {
                 sums[i] += i32::from(value[i]);
             }

@@ -68,7 +68,8 @@ impl Frame {
         f64::from(1u32 << (self.bits - 1)) * self.placement.voxel_size
     }
 
-    /// A cube of 2¹⁰ voxels a side around the central 99 % of the finite `centres`, in world units.
+    /// A cube of 2¹⁰ voxels a side around the central 99 % of the finite `centres`, in world units; the default one if
+    /// they are so far that single precision cannot tell such a cube.
     pub fn fitted(centres: impl Iterator<Item = [f64; 3]>) -> Self {
         let mut centres: Vec<[f64; 3]> = centres.filter(|c| c.iter().all(|x| x.is_finite())).collect();
         if centres.is_empty() {
@@ -94,12 +95,12 @@ impl Frame {
         };
         // Voxels of a tiny cube are as small as single precision tells them.
         let fitted = cube(side.max(cubes * f64::from(f32::MIN_POSITIVE)));
-        // All centres coincide, or their extent overflows.
         if side > 0.0 && fitted.is_valid() {
-            fitted
-        } else {
-            cube(cubes)
+            return fitted;
         }
+        // All centres coincide, or their extent overflows.
+        let usual = cube(cubes);
+        if usual.is_valid() { usual } else { Frame::default() }
     }
 
     /// What files in single precision subtract from world coordinates: zeros, or a round number per axis for a cube so

@@ -183,14 +183,14 @@ pub struct Comments {
 }
 
 impl Comments {
-    /// Reads a header. Comments are free text: those that do not parse are ignored.
+    /// Reads a header. Comments are free text: those that do not parse are ignored, as are offsets beyond single precision.
     pub fn of(header: &Header) -> Self {
         let mode = render_mode(header);
         let compensated = mode.as_deref().is_some_and(|mode| MIP.contains(&mode));
         let frame = named_frame(header);
         let offset = words(header, "offset")
             .and_then(three)
-            .filter(|o| o.iter().all(|x| x.is_finite()));
+            .filter(|o| o.iter().all(|x| (*x as f32).is_finite()));
         Comments {
             blur: if frame.is_some() { blur(header) } else { 0.0 },
             frame,

@@ -10,7 +10,7 @@ mod voxels;
 
 pub use neighbours::KernelMap;
 pub use octree::{MAX_VOXELS, Octree};
-pub(crate) use siblings::Window;
+pub(crate) use siblings::{AROUND, Window, place};
 pub use siblings::{RowBuffer, SiblingMap};
 pub use voxels::Voxels;
 

@@ -206,7 +206,7 @@ impl SiblingMap {
             }
             for (position, mask) in ones(children).zip(&mut masks) {
                 let there = block.there[parent] >> corner(octant(position));
-                let lines = (0..9).map(|line| (there >> (4 * (line % 3) + 16 * (line / 3)) & 7) << (3 * line));
+                let lines = (0..9).map(|line| (there >> place(3 * line) & 7) << (3 * line));
                 *mask = lines.sum::<u64>() as u32;
             }
             true
@@ -284,6 +284,14 @@ fn octant(position: u32) -> usize {
     (place & 1 | place >> 1 & 2 | place >> 2 & 4) as usize
 }
 
+/// Positions from the first of a child's row to its last.
+pub const AROUND: usize = place(26) + 1;
+
+/// Where the voxel at offset `k` of a child's row is in the window, from the first of that row on.
+pub const fn place(k: usize) -> usize {
+    k % 3 + 4 * (k / 3 % 3) + 16 * (k / 9)
+}
+
 /// Where the row of a child begins in the window.
 #[inline(always)]
 fn corner(octant: usize) -> usize {
@@ -346,15 +354,17 @@ impl Window {
     /// Whether the neighbour at offset `k` of the row of the child in `octant` is there.
     #[inline(always)]
     pub fn has(&self, octant: usize, k: usize) -> bool {
-        self.there >> (corner(octant) + k % 3 + 4 * (k / 3 % 3) + 16 * (k / 9)) & 1 != 0
+        self.there >> (corner(octant) + place(k)) & 1 != 0
     }
 
-    /// The row of the child in `octant`.
+    /// The voxels around the child in `octant`: the one at offset `k` of its row is at [`place`]`(k)`.
     #[inline(always)]
-    pub fn row(&self, octant: usize) -> [u32; 27] {
-        let mut row = [0; 27];
-        self.copy_row(octant, &mut row);
-        row
+    pub fn around(&self, octant: usize) -> &[u32; AROUND] {
+        let start = corner(octant);
+        match self.voxels[start..start + AROUND].try_into() {
+            Ok(around) => around,
+            Err(_) => unreachable!("the length is that of the type"),
+        }
     }
 
     #[inline(always)]
@@ -362,10 +372,9 @@ impl Window {
         // Four at a time: what is one too many, the next three replace.
         let (row, start) = (&mut row[..27], corner(octant));
         for line in 0..8 {
-            let from = start + 4 * (line % 3) + 16 * (line / 3);
-            row[3 * line..][..4].copy_from_slice(&self.voxels[from..][..4]);
+            row[3 * line..][..4].copy_from_slice(&self.voxels[start + place(3 * line)..][..4]);
         }
-        row[24..].copy_from_slice(&self.voxels[start + 40..][..3]);
+        row[24..].copy_from_slice(&self.voxels[start + place(24)..][..3]);
     }
 }
 
@@ -434,7 +443,8 @@ mod tests {
             for (parent, (&mask, &first)) in parents.enumerate() {
                 let window = map.window(parent);
                 for (child, octant) in (first as usize..).zip(crate::geometry::ones(mask.into())) {
-                    assert_eq!(window.row(octant), table.row(child));
+                    let around = window.around(octant);
+                    assert!((0..27).all(|k| around[place(k)] == table.row(child)[k]));
                     assert!((0..27).all(|k| window.has(octant, k) == (table.row(child)[k] != KernelMap::ABSENT)));
                 }
             }

@@ -130,9 +130,10 @@ pub(super) fn up_from_json(value: &Value) -> Option<Up> {
     value[TURNED].as_str()?.parse().ok()
 }
 
-/// Reads what [`frame_to_json`] wrote: the cube and the offset. What does not parse is ignored.
+/// Reads what [`frame_to_json`] wrote: the cube and the offset. What does not parse is ignored, as are offsets beyond
+/// single precision.
 pub(super) fn frame_from_json(value: &Value) -> (Option<Frame>, [f64; 3]) {
-    let offset = three(&value["offset"]).unwrap_or_default();
+    let offset = three(&value["offset"]).filter(|o| o.iter().all(|x| (*x as f32).is_finite()));
     let frame = || {
         let frame = Frame {
             bits: value["bits"].as_u64()?.try_into().ok()?,
@@ -143,7 +144,7 @@ pub(super) fn frame_from_json(value: &Value) -> (Option<Frame>, [f64; 3]) {
         };
         frame.is_valid().then_some(frame)
     };
-    (frame(), offset)
+    (frame(), offset.unwrap_or_default())
 }
 
 /// Three finite numbers.

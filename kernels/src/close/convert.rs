@@ -60,9 +60,12 @@ mod tests {
     use super::*;
     use crate::simd::F16_MAX;
 
+    /// An interpreter has no time for all numbers.
+    const STEP: usize = if cfg!(miri) { 509 } else { 1 };
+
     #[test]
     fn widening_agrees_with_the_format_for_every_value() {
-        let all: Vec<f16> = (0..=u16::MAX).map(f16::from_bits).collect();
+        let all: Vec<f16> = (0..=u16::MAX).step_by(STEP).map(f16::from_bits).collect();
         for isa in Isa::available() {
             println!("ran on {isa}");
             let mut wide = vec![0.0; all.len()];
@@ -81,7 +84,7 @@ mod tests {
     fn narrowing_rounds_to_even_and_saturates() {
         // Every f16, every midpoint between two, and their neighbours in f32.
         let mut samples = vec![f32::INFINITY, 1e30, 65519.9, 65520.0, f32::MIN_POSITIVE, 1e-45, 0.0];
-        for bits in 0..0x7bffu16 {
+        for bits in (0..0x7bffu16).step_by(STEP) {
             let low = f16::from_bits(bits).to_f32();
             let middle = (low + f16::from_bits(bits + 1).to_f32()) / 2.0;
             for at in [low, middle] {

@@ -37,6 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
+    #[cfg_attr(miri, ignore = "an interpreter is too slow")]
     fn every_instruction_set_has_a_peak() {
         for isa in Isa::available() {
             for rate in [f32(isa), crate::exact::peak::i16(isa), bf16(isa), half(isa)] {

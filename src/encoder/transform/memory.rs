@@ -4,10 +4,10 @@ use crate::geometry::Voxels;
 
 /// Pictures of the cloud and of its levels, for head maps, and adaptive contexts.
 const FIXED: u64 = 64 << 20;
-/// Bytes for each node of the octree: kernel maps, colours, the code, and the stream as it is decoded again and drawn.
-const NODE: u64 = 400;
+/// Bytes for each node of the octree: neighbours, colours, the code, and the stream as it is decoded again and drawn.
+const NODE: u64 = 320;
 /// The same where the encoder looks for a rate: what it found so far beside what it tries, and colours to try.
-const NODE_TO_RATE: u64 = 540;
+const NODE_TO_RATE: u64 = 380;
 /// Bytes of a voxel as it came and as a part of a cloud.
 const COPIES: u64 = 32;
 

@@ -203,6 +203,20 @@ fn centres_as_near_or_as_far_as_single_precision_allows_get_a_cube_that_can_be_w
 }
 
 #[test]
+fn offsets_that_take_centres_beyond_single_precision_leave_a_cube_that_can_be_written() {
+    let rows = [
+        "1e38 -3e38 0 0 0 0 0 0 0 0 1 0 0 0",
+        "3e38 -3e38 0 0 0 0 0 0 0 0 1 0 0 0",
+    ];
+    for offset in ["4e53 0 0", "0 -3e38 1e107", "3e38 -3.4e38 0", "1e308 1e308 1e308"] {
+        let comment = format!("comment b2p offset {offset}\n");
+        let (g, notes) = read_back(&ascii(&comment, &FLOATS, &rows));
+        assert!(notes.fitted && g.frame.is_valid(), "{offset}: {:?}", g.frame);
+        assert_eq!(read_back(&written(&g)).0.len(), g.len(), "{offset}");
+    }
+}
+
+#[test]
 fn extreme_values_are_kept() {
     let rows = [
         "0 0 0 0 0 0 inf 20 1000 -1000 1 0 0 0",
