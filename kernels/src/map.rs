@@ -37,6 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
+    #[cfg_attr(miri, ignore = "Miri maps no files")]
     fn a_mapped_file_holds_the_file_s_bytes() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("Cargo.toml");
         // SAFETY: nothing writes to the manifest while tests run.

@@ -60,6 +60,10 @@ pub fn give_back() {
 /// Asks for huge pages where whole ones fit. It is up to the system to give them.
 #[cfg(target_os = "linux")]
 fn ask_for_huge_pages<T>(block: &[T]) {
+    // Miri knows no such advice.
+    if cfg!(miri) {
+        return;
+    }
     let start = block.as_ptr().addr().next_multiple_of(HUGE);
     let end = block.as_ptr_range().end.addr() / HUGE * HUGE;
     if start < end {
