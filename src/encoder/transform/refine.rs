@@ -165,8 +165,8 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// What is missing at a point in the voxel with this row of the map: the difference of its colour to what is drawn there, and the factor that
-    /// makes of a Gaussian's opacity there its share of the point.
+    /// What is missing at a point in the voxel with this row of the map: the difference of its colour to what is drawn
+    /// there, and the factor that makes of a Gaussian's opacity there its share of the point.
     fn missing(&self, row: &[u32; 27], point: &Point) -> ([f32; 3], f32) {
         let (mut sum, mut total) = ([0.0; 3], 0.0);
         for_each_around(row, &self.first_splat, |i| {
