@@ -109,10 +109,15 @@ def luma_chroma(rgb):
 def inputs(occupancy, rgb_above, rgb, parent, step):
     """Input channels of level l - 1 and level l. `occupancy` [n_above, 8] of 0 and 1; colours in 0..255; `parent` is each voxel's row above;
     `step` is luma's quantisation step, 1 for lossless."""
-    s = torch.log2(torch.tensor(float(step))) / 4
+    step = torch.tensor(float(step))
+    return inputs_of(occupancy, rgb_above, rgb, parent, step.expand(len(rgb_above)), step.expand(len(rgb)))
+
+
+def inputs_of(occupancy, rgb_above, rgb, parent, step_above, step):
+    """`inputs` with a step for every voxel of both levels."""
     up, own = luma_chroma(rgb_above), luma_chroma(rgb)
-    above = torch.cat([occupancy, up, s.expand(len(up), 1)], 1)
-    return above.contiguous(), torch.cat([4 * (own - up[parent]), own, s.expand(len(own), 1)], 1).contiguous()
+    above = torch.cat([occupancy, up, step_above.log2()[:, None] / 4], 1)
+    return above.contiguous(), torch.cat([4 * (own - up[parent]), own, step.log2()[:, None] / 4], 1).contiguous()
 
 
 def parameters(raw, rgb, gaussians):
@@ -128,7 +133,7 @@ def anchors(coords, gaussians):
     """Centres that offsets count from, and the unit, in voxels of the level."""
     if gaussians == 1:
         return coords + 0.5, 1.0
-    octant = torch.tensor([[o & 1, o >> 1 & 1, o >> 2] for o in range(8)], dtype=torch.float32)
+    octant = torch.tensor([[o & 1, o >> 1 & 1, o >> 2] for o in range(8)], dtype=torch.float32, device=coords.device)
     return (coords[:, None] + (octant + 0.5) / 2).reshape(-1, 3), 0.5
 
 

@@ -174,6 +174,8 @@ def _gather_conv(x, w, kmap):
 
 def conv(x, w, bias, kmap, relu=False):
     """Sparse convolution. x [n_in, c_in], w [taps, c_in, c_out] -> [n_out, c_out]."""
+    if not isinstance(kmap, Map):  # of `batch.py`
+        return kmap.conv(x, w, bias, relu)
     if native(x):
         return _Conv.apply(x.contiguous(), w, bias, kmap, relu)
     y = _gather_conv(x, w, kmap) + bias

@@ -24,7 +24,7 @@ HELD_OUT = ("person_Black_M_2_Medi", "gz_cordless_drill", "bob", "ph_wooden_book
 
 
 def object_of(path):
-    return os.path.basename(path).removesuffix(".safetensors").split("_", 1)[1]
+    return os.path.basename(path).removesuffix(".safetensors").partition("_")[2]
 
 
 def random_step(rng, lossless=0.2, most=64.0):

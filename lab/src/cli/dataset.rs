@@ -44,6 +44,16 @@ pub struct Args {
     /// Samples per pixel and axis
     #[arg(long, default_value_t = 4)]
     supersampling: u32,
+    /// The share of clouds with noise on their points and fewer of them, as captures have, 0 to 1
+    #[arg(long, default_value_t = 0.0, value_parser = share)]
+    noisy: f64,
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(share) if (0.0..=1.0).contains(&share) => Ok(share),
+        _ => Err("expected a number from 0 to 1".into()),
+    }
 }
 
 impl Args {
@@ -68,6 +78,7 @@ impl Args {
             views: self.views,
             size: self.size,
             supersampling: self.supersampling,
+            noisy: self.noisy,
         };
         // Hidden where the output is not a terminal.
         let bar = ProgressBar::new(self.count as u64).with_style(

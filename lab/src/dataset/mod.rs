@@ -53,6 +53,9 @@ pub struct Options {
     pub size: u32,
     /// Samples per pixel and axis.
     pub supersampling: u32,
+    /// The share of clouds with noise on their points and fewer of them, as captures have; pictures show the exact
+    /// surface.
+    pub noisy: f64,
 }
 
 /// A mesh to cut samples from.
@@ -162,7 +165,7 @@ fn sample(objects: &[Object], photos: &[Photo], options: &Options, index: usize)
         let object = &objects[turn(objects, options.seed, index, attempt / TRIES_PER_OBJECT)];
         let variant = variant::Variant::random(object.kind, options, !photos.is_empty(), &mut random);
         let (surface, grid) = variant.apply(&object.surface, photos, &mut random)?;
-        let sampler = Sampler::new(&surface, grid, variant.points, random.bits())?;
+        let sampler = Sampler::new(&surface, grid, variant.points, random.bits())?.with_noise(variant.noise);
         let only = crop::place(&sampler, &grid, variant.points, options.crop, &mut random);
         let cloud = sampler.cloud(Some(only));
         if !crop::is_sensible(cloud.keys.len(), options.crop) {

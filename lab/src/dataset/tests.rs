@@ -30,6 +30,7 @@ fn options() -> Options {
         views: 2,
         size: 40,
         supersampling: 3,
+        noisy: 0.0,
     }
 }
 

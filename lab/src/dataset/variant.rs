@@ -45,6 +45,8 @@ pub(super) struct Variant {
     fill: f64,
     /// Points drawn over the whole object.
     pub points: u64,
+    /// Standard deviation of their places in voxels, per axis.
+    pub noise: f64,
     photograph: bool,
     shaded: bool,
     tint: Option<Tint>,
@@ -71,11 +73,20 @@ impl Variant {
         };
         // As dense in voxels as the protocol's own clouds.
         let side = fill / PROTOCOL_FILL * f64::from(1u32 << bits) / f64::from(1 << PROTOCOL_BITS);
+        let dense = PROTOCOL_POINTS * side * side;
+        // No random numbers are drawn where no sample is noisy, so that a seed's samples stay what they were.
+        let noisy = options.noisy > 0.0 && random.chance(options.noisy);
+        let (points, noise) = if noisy {
+            (dense * random.log_range(0.06, 0.6), random.range(0.15, 0.8))
+        } else {
+            (dense, 0.0)
+        };
         Variant {
             rotation: rotation(random),
             bits,
             fill,
-            points: (PROTOCOL_POINTS * side * side) as u64,
+            points: points as u64,
+            noise,
             photograph: photos && (random.chance(0.35) || kind == Kind::Statue),
             shaded: kind == Kind::Statue,
             tint: random.chance(0.5).then(|| tint(random)),
