@@ -119,6 +119,20 @@ impl Log {
         unit: &'static str,
         run: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
+        self.paused_step(name, count, unit, |_| run())
+    }
+
+    /// Runs a step whose pauses do not count as its time.
+    ///
+    /// # Errors
+    /// As [`Log::step`].
+    pub(crate) fn paused_step<T>(
+        &self,
+        name: impl Into<String>,
+        count: usize,
+        unit: &'static str,
+        run: impl FnOnce(&mut Pauses) -> Result<T>,
+    ) -> Result<T> {
         if let Some(cancel) = &self.cancel {
             cancel.check()?;
         }
@@ -126,18 +140,41 @@ impl Log {
         if let Some(listener) = &self.listener {
             listener(&name);
         }
-        let start = now();
-        let value = run()?;
-        if let Some(steps) = &self.steps {
-            steps.lock().unwrap_or_else(PoisonError::into_inner).push(Step {
-                name,
-                count: count as u64,
-                unit,
-                time: start.map_or(Duration::ZERO, |start| start.elapsed()),
-            });
-        }
+        let (start, mut pauses) = (now(), Pauses(Duration::ZERO));
+        let value = run(&mut pauses)?;
+        self.add(name, count, unit, since(start).saturating_sub(pauses.0));
         Ok(value)
     }
+
+    /// Adds a finished step.
+    #[doc(hidden)]
+    pub fn add(&self, name: impl Into<String>, count: usize, unit: &'static str, time: Duration) {
+        if let Some(steps) = &self.steps {
+            steps.lock().unwrap_or_else(PoisonError::into_inner).push(Step {
+                name: name.into(),
+                count: count as u64,
+                unit,
+                time,
+            });
+        }
+    }
+}
+
+/// Time within a step that is not its own.
+pub(crate) struct Pauses(Duration);
+
+impl Pauses {
+    /// Runs what does not belong to the step.
+    pub fn pause<T>(&mut self, run: impl FnOnce() -> T) -> T {
+        let start = now();
+        let value = run();
+        self.0 += since(start);
+        value
+    }
+}
+
+fn since(start: Option<Instant>) -> Duration {
+    start.map_or(Duration::ZERO, |start| start.elapsed())
 }
 
 /// The time, which WebAssembly without a system cannot be asked for.

@@ -5,7 +5,7 @@ use std::path::Path;
 use b2p::axes::{Axes as CloudAxes, Up};
 use b2p::cloud::PointCloud;
 use b2p::container::MAGIC;
-use b2p::gaussians::Gaussians;
+use b2p::gaussians::{Frame, Gaussians};
 use b2p::{Limits, Log};
 use b2p_formats::clouds::{PointFormat, WriteOptions, encode_cloud};
 use b2p_formats::detect::Kind;
@@ -265,7 +265,29 @@ pub fn output_format(to: &Path, asked: Option<Format>) -> Result<Format> {
 /// scene that is far from the origin, or was turned, stands in a file beside, with what else is known of its
 /// coordinates.
 pub fn write(g: &Gaussians, axes: Axes, known: &CloudAxes, format: Format, to: &Path, log: &Log) -> Result<()> {
-    let offset = splats::offset(g, axes, format);
+    let name = format!("write {format}");
+    write_with(g.frame, axes, known, format, to, || {
+        let mut warnings = Vec::new();
+        log.step(name, g.len(), "Gaussians", || {
+            Ok(manners::write(to, |w| {
+                warnings = splats::write(g, axes, format, w, to)?;
+                Ok(())
+            }))
+        })??;
+        Ok(warnings)
+    })
+}
+
+/// What [`write`] does around the writing itself, which gives its warnings.
+pub fn write_with(
+    frame: Frame,
+    axes: Axes,
+    known: &CloudAxes,
+    format: Format,
+    to: &Path,
+    write: impl FnOnce() -> Result<Vec<String>>,
+) -> Result<()> {
+    let offset = splats::offset(frame, axes, format);
     let turned_from = match axes {
         Axes::Cloud(up) => Some(up),
         Axes::Ply | Axes::Gltf => None,
@@ -281,15 +303,7 @@ pub fn write(g: &Gaussians, axes: Axes, known: &CloudAxes, format: Format, to: &
         ..Sidecar::default()
     });
     sidecar::check(to, beside.as_ref())?;
-    let name = format!("write {format}");
-    let mut warnings = Vec::new();
-    log.step(name, g.len(), "Gaussians", || {
-        Ok(manners::write(to, |w| {
-            warnings = splats::write(g, axes, format, w, to)?;
-            Ok(())
-        }))
-    })??;
-    for warning in warnings {
+    for warning in write()? {
         manners::warn(&format!("{}: {warning}", to.display()));
     }
     if let (Some(up), true) = (turned_from, axes != Axes::of(format)) {

@@ -1,22 +1,21 @@
 //! `b2p decode`: stream to Gaussians in a file.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use super::budget::{Chosen, Task};
 use b2p::Limits;
 use b2p::container::version;
-use b2p::gaussians::Gaussians;
 use b2p::log::Log;
-use b2p_formats::splats::Axes;
+use b2p_formats::splats::{Axes, Format, PartWriter};
 use serde_json::json;
 
 use super::args::Decode;
 use super::manners::{self, Said};
 use super::many::Kind;
+use super::pipe::Shown;
 use super::progress::Progress;
 use super::table::{counted, steps, steps_json};
-use super::{Failure, Result, budget, cloud, convert, kinds, load, pipe, points, scene, sequence};
+use super::{Failure, Result, budget, cloud, convert, kinds, load, parts, pipe, points, scene, sequence};
 
 /// What is taken from folders, and what becomes of it.
 pub fn kind(args: &Decode) -> Kind<'_> {
@@ -54,14 +53,14 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
     let (input, to) = (&args.input, &args.output);
     let format = convert::output_format(to, args.format)?;
     let mut written = 0;
-    let mut write = |gaussians: &Gaussians, known: &b2p::Axes, log: &Log| {
-        written = gaussians.len();
+    let mut write = |shown: Shown<'_>, known: &b2p::Axes, log: &Log| {
         let axes = match cloud::up_of(args.up, known) {
             _ if args.keep_axes => Axes::of(format),
             Some(up) => Axes::Cloud(up),
             None => Axes::Ply,
         };
-        convert::write(gaussians, axes, known, format, to, log)
+        written = write_shown(shown, (axes, known), (input, to), format, log)?;
+        Ok(())
     };
     let stream = budget::stream(&args.budget, input, &args.detail, limits)?;
     let chosen = match &stream {
@@ -70,26 +69,45 @@ pub fn run(args: &Decode, limits: &Limits, progress: &Progress) -> Result<Said> 
     };
     let detail = chosen.as_ref().map(Chosen::detail);
     let detail = detail.as_ref().unwrap_or(&args.detail);
-    let mut took = Duration::ZERO;
     // What has gone to standard output cannot be replaced by something finer.
     let early = !manners::is_pipe(to);
-    pipe::each(
-        input,
-        detail,
-        &args.model,
-        limits,
-        early,
-        &log,
-        &mut |gaussians, known, log| {
-            took = log.steps().iter().map(|step| step.time).sum();
-            write(gaussians, known, log)
-        },
-    )?;
+    let in_parts = PartWriter::new(Axes::of(format), format).is_some();
+    pipe::each(input, detail, &args.model, limits, (early, in_parts), &log, &mut write)?;
+    // Writing is the last step.
+    let took = log.steps().iter().rev().skip(1).map(|step| step.time).sum();
     let chosen = match chosen {
         Some(chosen) => chosen.describe(took, limits, progress)?,
         None => String::new(),
     };
     Ok(said(args, &chosen, written, "Gaussian", &log))
+}
+
+/// Writes Gaussians of `input`, part by part if there is a level to make them of and the format allows it; says how many
+/// they are.
+fn write_shown(
+    shown: Shown<'_>,
+    (axes, known): (Axes, &b2p::Axes),
+    (input, to): (&Path, &Path),
+    format: Format,
+    log: &Log,
+) -> Result<usize> {
+    let mut written = 0;
+    if let Shown::Level(level) = shown
+        && let (true, Some(frame)) = (level.has_parts(), level.frame())
+        && let Some(writer) = PartWriter::new(axes, format)
+    {
+        convert::write_with(frame, axes, known, format, to, || {
+            let (count, warnings) = parts::write(level, input, writer, to, (format!("write {format}"), log))?;
+            written = count;
+            Ok(warnings)
+        })?;
+        return Ok(written);
+    }
+    shown.all_at_once(input, |gaussians| {
+        written = gaussians.len();
+        convert::write(gaussians, axes, known, format, to, log)
+    })?;
+    Ok(written)
 }
 
 /// What was written.

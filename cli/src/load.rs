@@ -163,23 +163,6 @@ pub struct Loaded {
     pub axes: Axes,
 }
 
-/// Gaussians from a stream, or as they stand in a file.
-pub fn gaussians(path: &Path, detail: &DetailArg, model_arg: &ModelArg, limits: &Limits, log: &Log) -> Result<Loaded> {
-    let bytes = bytes(path, limits)?;
-    if let Some(loaded) = other(path, &bytes, detail, limits, log)? {
-        return Ok(loaded);
-    }
-    kinds::check_stream(path, &bytes)?;
-    let bytes = whole_levels(path, bytes, detail, limits)?;
-    let decoder = decoder(&bytes, detail, model_arg, limits)?;
-    reserve_for(path, &bytes, &decoder, detail.level, limits)?;
-    let gaussians = decoder.with_log(log).decode(&bytes);
-    Ok(Loaded {
-        gaussians: gaussians.map_err(Failure::in_file(path))?,
-        axes: cloud::axes(&bytes),
-    })
-}
-
 /// Where Gaussians come from.
 pub enum Source<'p> {
     /// A file of them, or of points, that has been read.

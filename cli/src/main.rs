@@ -20,6 +20,7 @@ mod load;
 mod manners;
 mod many;
 mod paperwork;
+mod parts;
 mod picture;
 mod pipe;
 mod plan;

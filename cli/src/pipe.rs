@@ -64,23 +64,55 @@ pub fn start_of(path: &Path, count: usize) -> std::io::Result<Vec<u8>> {
 /// What was read at once, and what stops reading.
 pub type Piece = std::io::Result<Vec<u8>>;
 
+/// Gaussians, or a level that they are to be made of.
+pub enum Shown<'a> {
+    Gaussians(&'a Gaussians),
+    Level(&'a Decoding<'a>),
+}
+
+impl Shown<'_> {
+    /// Calls `show` with all Gaussians, which come from `path`.
+    pub fn all_at_once(self, path: &Path, show: impl FnOnce(&Gaussians) -> Result<()>) -> Result<()> {
+        match self {
+            Shown::Gaussians(gaussians) => show(gaussians),
+            Shown::Level(level) => show(&level.gaussians().map_err(Failure::in_file(path))?),
+        }
+    }
+}
+
 /// What is done with Gaussians, of a cloud of whose coordinates so much is known.
-pub type Show<'a> = dyn FnMut(&Gaussians, &Axes, &Log) -> Result<()> + 'a;
+pub type Show<'a> = dyn FnMut(Shown<'_>, &Axes, &Log) -> Result<()> + 'a;
 
 /// Shows the Gaussians of a file, or of standard input: then also those of coarser levels, if `early` and nothing finer
-/// has come meanwhile; and if the stream is cut and no level was named, what its finest whole level has.
+/// has come meanwhile; and if the stream is cut and no level was named, what its finest whole level has. Memory is
+/// counted for Gaussians `in_parts` or all at once.
 pub fn each(
     path: &Path,
     detail: &DetailArg,
     model_arg: &ModelArg,
     limits: &Limits,
-    early: bool,
+    (early, in_parts): (bool, bool),
     log: &Log,
     show: &mut Show,
 ) -> Result<()> {
+    let decoder = |start: &[u8]| {
+        let decoder = load::decoder(start, detail, model_arg, limits)?.with_log(log);
+        Ok::<_, Failure>(match in_parts {
+            true => decoder.with_gaussians_in_parts(),
+            false => decoder,
+        })
+    };
     if path != Path::new(PIPE) {
-        let loaded = load::gaussians(path, detail, model_arg, limits, log)?;
-        return show(&loaded.gaussians, &loaded.axes, log);
+        let bytes = load::bytes(path, limits)?;
+        if let Some(loaded) = load::other(path, &bytes, detail, limits, log)? {
+            return show(Shown::Gaussians(&loaded.gaussians), &loaded.axes, log);
+        }
+        kinds::check_stream(path, &bytes)?;
+        let bytes = load::whole_levels(path, bytes, detail, limits)?;
+        let decoder = decoder(&bytes)?;
+        load::reserve_for(path, &bytes, &decoder, detail.level, limits)?;
+        let level = decoder.whole(&bytes).map_err(Failure::in_file(path))?;
+        return show(Shown::Level(&level), &cloud::axes(&bytes), log);
     }
     let pieces = pieces()?;
     let mut start = Vec::new();
@@ -98,15 +130,14 @@ pub fn each(
             checked.map_err(Failure::in_file(path))?;
         }
         if let Some(loaded) = load::other(path, &start, detail, limits, log)? {
-            return show(&loaded.gaussians, &loaded.axes, log);
+            return show(Shown::Gaussians(&loaded.gaussians), &loaded.axes, log);
         }
         kinds::check_stream(path, &start)?;
         let what = "neither a stream, nor Gaussians or points that are known by their contents";
         return Err(Failure(format!("standard input: {what}")));
     }
     kinds::check_stream(path, &start)?;
-    let decoder = load::decoder(&start, detail, model_arg, limits)?.with_log(log);
-    let mut decoding = decoder.start();
+    let mut decoding = decoder(&start)?.start();
     let mut shown = None;
     let in_pipe = Failure::in_file(path);
     let mut piece = Some(start);
@@ -129,7 +160,7 @@ pub fn each(
             Err(TryRecvError::Empty) => {
                 if early && decoding.is_drawable() && shown != decoding.level() {
                     shown = decoding.level();
-                    show_level(&decoding, &cloud::axes(&head), log, show)?;
+                    show(Shown::Level(&decoding), &cloud::axes(&head), log)?;
                 }
                 pieces.recv().ok()
             }
@@ -153,13 +184,8 @@ pub fn each(
     }
     match shown == decoding.level() {
         true => Ok(()),
-        false => show_level(&decoding, &cloud::axes(&head), log, show),
+        false => show(Shown::Level(&decoding), &cloud::axes(&head), log),
     }
-}
-
-fn show_level(decoding: &Decoding, axes: &Axes, log: &Log, show: &mut Show) -> Result<()> {
-    let gaussians = decoding.gaussians().map_err(Failure::in_file(Path::new(PIPE)))?;
-    show(&gaussians, axes, log)
 }
 
 /// Standard input, read by a thread of its own so that it can be known whether something waits.

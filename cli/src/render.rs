@@ -16,11 +16,12 @@ use super::load::Source;
 use super::manners::{self, Said};
 use super::many::Kind;
 use super::picture::{Artist, ending, format_of};
+use super::pipe::{self, Shown};
 use super::progress::Progress;
 use super::sheet::Sheet;
 use super::table::{count, counted, milliseconds, steps};
 use super::views::{Shot, lenses_beside, shots};
-use super::{Failure, Result, cloud, load, pipe, scene, sequence, video};
+use super::{Failure, Result, cloud, load, scene, sequence, video};
 
 /// Frames that the cost of an effect is measured with; the fastest counts.
 const TRIALS: usize = 3;
@@ -95,7 +96,7 @@ fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
     // What has gone to standard output cannot be replaced by something finer.
     let early = !manners::is_pipe(&args.output);
     let mut permitted = args.camera.is_none();
-    let mut show = |gaussians: &Gaussians, axes: &Axes, log: &Log| {
+    let mut draw = |gaussians: &Gaussians, axes: &Axes, log: &Log| {
         // Pictures of coarser levels are this program's own.
         if !permitted {
             permit(args, &shots(args, &gaussians.frame, &Extent::cube(), axes, limits)?)?;
@@ -110,7 +111,9 @@ fn from_pipe(args: &Render, limits: &Limits, log: &Log) -> Result<Said> {
         said = pictures(&drawing, gaussians, axes, log)?;
         Ok(())
     };
-    pipe::each(&args.input, &args.detail, &args.model, limits, early, log, &mut show)?;
+    let input = &args.input;
+    let mut show = |shown: Shown<'_>, axes: &Axes, log: &Log| shown.all_at_once(input, |all| draw(all, axes, log));
+    pipe::each(input, &args.detail, &args.model, limits, (early, false), log, &mut show)?;
     Ok(said)
 }
 

@@ -236,7 +236,7 @@ fn splat_format(path: &Path, asked: Option<&str>) -> Result<Format> {
 /// Writes Gaussians, turned to the axes of the format if theirs are known, and a file beside with what the format has
 /// no place for. Returns what is lost or unexpected.
 fn write_splats(path: &Path, gaussians: &Gaussians, axes: Axes, format: Format) -> Result<Vec<String>> {
-    let offset = splats::offset(gaussians, axes, format);
+    let offset = splats::offset(gaussians.frame, axes, format);
     let turned_from = match axes {
         Axes::Cloud(up) if matches!(format, Format::Spz | Format::Splat | Format::Csv) => Some(up),
         _ => None,

@@ -7,7 +7,7 @@ use super::stream::Decoder;
 use crate::container::Header;
 use crate::error::Result;
 use crate::gaussians::learned::LevelInput;
-use crate::gaussians::surfels::{SurfelSelection, is_for_surfels, surfels};
+use crate::gaussians::surfels::{SurfelSelection, Surfels, is_for_surfels};
 use crate::gaussians::{Frame, Gaussians, HeadMap};
 use crate::geometry::{Octree, SiblingMap};
 
@@ -38,6 +38,9 @@ pub(crate) struct Advice {
     /// Factors of the surfels' radii: among learned Gaussians, and where all voxels are surfels.
     pub sizes: [f32; 2],
 }
+
+/// Called with the Gaussians of one part after the other.
+pub(crate) type Each<'a> = dyn FnMut(&Gaussians) -> Result<()> + 'a;
 
 /// Voxels among their neighbours.
 pub(crate) struct Part<'a> {
@@ -91,8 +94,13 @@ impl Advice {
 }
 
 impl Decoder {
-    /// The Gaussians of a level of a stream of version 3.
-    pub(super) fn generate(&self, header: &Header, reached: &Reached) -> Result<Gaussians> {
+    /// The Gaussians of a level of a stream of version 3. With `each`, it gets them part by part, and none are left.
+    pub(super) fn generate(
+        &self,
+        header: &Header,
+        reached: &Reached,
+        each: Option<&mut Each<'_>>,
+    ) -> Result<Gaussians> {
         let (octree, level) = (&reached.octree, reached.level);
         let heads = reached.head_map.as_ref();
         let surfels = heads.and_then(|heads| heads.surfels(octree, level));
@@ -113,7 +121,22 @@ impl Decoder {
                 .as_ref()
                 .map_or_else(Vec::new, |above| reached.colours_above(above))
         };
-        self.draw(header, &part, colours_above)
+        self.draw_to(header, &part, colours_above, each)
+    }
+
+    /// How many Gaussians a level of a stream of version 3 has, if that is known before they are made: of eight learned
+    /// ones of a voxel, faint ones are left out.
+    pub(super) fn gaussian_count(&self, header: &Header, reached: &Reached) -> Result<Option<usize>> {
+        let (octree, level) = (&reached.octree, reached.level);
+        let all = octree.level(level).len();
+        let discs = self.surfels_per_voxel(header, level)?.count();
+        let each = match self.network(header, level)? {
+            Some((_, (_, count))) if !reached.is_all_surfels() => count,
+            _ => return Ok(Some(discs * all)),
+        };
+        let surfels = reached.head_map.as_ref().and_then(|heads| heads.surfels(octree, level));
+        let surfels = surfels.map_or(0, |surfels| surfels.iter().filter(|&&is| is).count());
+        Ok((each == 1).then(|| all - surfels + discs * surfels))
     }
 
     /// How many voxels of the level above lie between a voxel's parent and the farthest one that its Gaussians depend
@@ -130,32 +153,49 @@ impl Decoder {
         part: &Part<'_>,
         colours_above: impl FnOnce() -> Vec<[u8; 3]>,
     ) -> Result<Gaussians> {
+        self.draw_to(header, part, colours_above, None)
+    }
+
+    /// As [`Decoder::draw`]. With `each`, it gets the Gaussians part by part, one part at least, and none are left.
+    fn draw_to(
+        &self,
+        header: &Header,
+        part: &Part<'_>,
+        colours_above: impl FnOnce() -> Vec<[u8; 3]>,
+        mut each: Option<&mut Each<'_>>,
+    ) -> Result<Gaussians> {
         let frame = Frame {
             bits: header.bits,
             placement: header.placement,
         };
         let level = part.level;
         let [mixed, alone] = part.advice.sizes;
-        let discs = |only: Option<&[bool]>, size: f32| {
+        let discs = |only: Option<&[bool]>, size: f32, blur: Option<f32>, each: Option<&mut Each<'_>>| {
             let range = Some(&part.range);
-            let choice = SurfelSelection { only, size, range };
-            let per_voxel = self.surfels_per_voxel(header, level)?;
-            let voxels = part.octree.level(level);
-            Ok(surfels(
-                self.isa(),
-                voxels,
-                part.map,
-                part.colours,
-                per_voxel,
-                choice,
+            let surfels = Surfels {
+                isa: self.isa(),
+                voxels: part.octree.level(level),
+                map: part.map,
+                colours: part.colours,
+                per_voxel: self.surfels_per_voxel(header, level)?,
+                choice: SurfelSelection { only, size, range },
                 frame,
-            ))
+            };
+            let Some(each) = each else {
+                return Ok(surfels.all());
+            };
+            surfels.in_parts(|mut drawn| {
+                self.cancel().check()?;
+                drawn.blur = blur.unwrap_or(drawn.blur);
+                each(&drawn)
+            })?;
+            Ok(Gaussians::default())
         };
         let (Some((model, set)), Some(above)) = (self.network(header, level)?, part.above) else {
-            return discs(part.chosen, alone);
+            return discs(part.chosen, alone, None, each);
         };
         if part.advice.all_surfels || is_for_surfels(part.map, part.range.clone()) {
-            return discs(part.chosen, alone);
+            return discs(part.chosen, alone, None, each);
         }
         let is_surfels = |voxel: usize| part.surfels.is_some_and(|surfels| surfels[voxel]);
         let without = (part.surfels.is_some() || part.chosen.is_some()).then(|| {
@@ -175,11 +215,19 @@ impl Decoder {
             range: Some(&part.range),
         };
         let (isa, precision) = (self.isa(), self.precision);
-        let mut check = |_: &mut Gaussians| self.cancel().check();
-        let mut gaussians =
-            model.generate_in_parts(isa, precision, set, input, frame, (self.span_rows(), true), &mut check)?;
+        let rows = (self.span_rows(), each.is_none());
+        let mut taken = |drawn: &mut Gaussians| {
+            self.cancel().check()?;
+            if let Some(each) = &mut each {
+                each(drawn)?;
+                drawn.clear();
+            }
+            Ok(())
+        };
+        let mut gaussians = model.generate_in_parts(isa, precision, set, input, frame, rows, &mut taken)?;
         if part.surfels.is_some() {
-            gaussians.append(discs(Some(&part.chosen_that(is_surfels)), mixed)?);
+            let chosen = part.chosen_that(is_surfels);
+            gaussians.append(discs(Some(&chosen), mixed, Some(gaussians.blur), each)?);
         }
         Ok(gaussians)
     }

@@ -3,6 +3,7 @@
 use crate::colour::LevelColours;
 use crate::container::{Header, MAX_TRUNK_VOXELS};
 use crate::error::Result;
+use crate::gaussians::surfels::{PART, TASK, WALK_BYTES};
 use crate::geometry::SiblingMap;
 use crate::latents::LatentDecoder;
 use crate::latents::network::{AT_ONCE, RAW};
@@ -173,16 +174,10 @@ const CONTEXTS: Term = Term {
     fixed: LevelColours::model_bytes() as u64,
     by: NOTHING,
 };
-const STEPS: Term = Term {
-    each: "voxel of the level, before surfels are made",
-    takes: "sums of moments, before and after a step",
-    fixed: 2 * 32,
-    by: NOTHING,
-};
-const SUMS: Term = Term {
-    each: "voxel of the level, while surfels are made",
-    takes: "sums of moments",
-    fixed: 32,
+const WALKS: Term = Term {
+    each: "2048 voxels of the level while surfels are made, at most once on each thread",
+    takes: "neighbours and sums of moments around them",
+    fixed: WALK_BYTES,
     by: NOTHING,
 };
 const SURFELS: Term = Term {
@@ -286,10 +281,11 @@ pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64>
     Ok(total(&terms, NOTHING).saturating_add(coding.max(filtering).max(drawing)))
 }
 
-/// Bytes that making so many surfels of each of so many voxels takes at most, themselves included.
-pub(super) fn surfels(voxels: u64, per_voxel: u64) -> u64 {
-    let made = total(&[(SUMS, voxels), (SURFELS, voxels * per_voxel)], NOTHING);
-    total(&[(STEPS, voxels)], NOTHING).max(made)
+/// Bytes that making so many surfels of each of so many voxels takes at most, themselves or a part of them included.
+pub(super) fn surfels(voxels: u64, per_voxel: u64, in_parts: bool) -> u64 {
+    let at_once = if in_parts { voxels.min(PART as u64) } else { voxels };
+    let tasks = voxels.div_ceil(TASK as u64).min(rayon::current_num_threads() as u64);
+    total(&[(WALKS, tasks), (SURFELS, at_once.saturating_mul(per_voxel))], NOTHING)
 }
 
 #[cfg(test)]
@@ -301,7 +297,7 @@ mod tests {
     use crate::gaussians::learned;
     use crate::latents::network::{Model, Shape, untrained};
 
-    /// `214 + 2·C + 2·K`, with a comma at thousands.
+    /// `214 + 2·C + 2·K`, with commas at thousands.
     fn bytes(term: &Term) -> String {
         let Sizes {
             channels,
@@ -309,10 +305,14 @@ mod tests {
             generator,
             base,
         } = term.by;
-        let fixed = match term.fixed {
-            1000.. => format!("{},{:03}", term.fixed / 1000, term.fixed % 1000),
-            _ => term.fixed.to_string(),
-        };
+        let digits = term.fixed.to_string();
+        let groups: Vec<&str> = digits
+            .as_bytes()
+            .rchunks(3)
+            .rev()
+            .map(|g| std::str::from_utf8(g).unwrap())
+            .collect();
+        let fixed = groups.join(",");
         let by = [(channels, 'C'), (latents, 'K'), (generator, 'H'), (base, 'B')];
         let by = by.iter().filter(|(times, _)| *times > 0);
         let by = by.map(|(times, of)| format!("{times}·{of}"));
@@ -336,7 +336,7 @@ mod tests {
         let drawing = [GENERATOR, GAUSSIANS, EIGHT, ONE];
         let version_2 = [&[SLICES, OCTREE, ABOVE, EXACT][..], &base, &drawing].concat();
         let version_3 = [SLICES, OCTREE, KEPT, WINDOWS, CONTEXTS, TRUNK, KEPT_ABOVE, TABLES];
-        let coding = [CODING, CODING_ABOVE, FILTERING, STEPS, SUMS, SURFELS];
+        let coding = [CODING, CODING_ABOVE, FILTERING, WALKS, SURFELS];
         let version_3 = [&version_3[..], &coding, &learned::TERMS].concat();
         let tables = [table(&version_2), table(&version_3)];
         let missing = tables.iter().filter(|table| !text.contains(*table));
@@ -441,8 +441,9 @@ mod tests {
             assert_eq!(transform(&header, level, most + 1).unwrap(), expected + most + 1);
         }
         assert!(transform(&header, 6, 0).is_err());
-        assert_eq!(surfels(1000, 3), 1000 * 32 + 3000 * 56);
-        assert_eq!(surfels(1000, 0), 1000 * 64);
+        assert_eq!(surfels(1000, 3, false), (1 << 20) + 3000 * 56);
+        assert_eq!(surfels(1 << 20, 3, false), (threads << 20) + (3 << 20) * 56);
+        assert_eq!(surfels(1 << 20, 3, true), (threads << 20) + (3 << 15) * 56);
     }
 
     #[test]

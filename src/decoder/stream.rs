@@ -32,6 +32,8 @@ pub struct Decoder {
     /// Asked for; otherwise the best there are.
     pub(super) heads: Option<HeadSet>,
     pub(super) heads_model: Option<HeadsModel>,
+    /// Whether memory is for Gaussians in parts.
+    in_parts: bool,
     /// Gaussians a voxel, if asked for.
     per_voxel: Option<usize>,
     pub(super) precision: Precision,
@@ -117,6 +119,13 @@ impl Decoder {
         self
     }
 
+    /// The same decoder, which holds against the limits what [`Decoding::gaussians_in_parts`] takes, not
+    /// [`Decoding::gaussians`]: it accepts larger streams of version 3.
+    pub fn with_gaussians_in_parts(mut self) -> Self {
+        self.in_parts = true;
+        self
+    }
+
     /// The same decoder, which uses at most this instruction set; results are the same.
     pub fn with_isa(mut self, isa: Isa) -> Self {
         self.isa = Some(isa);
@@ -167,6 +176,15 @@ impl Decoder {
     /// Those of [`Decoding::finish`] and [`Decoding::gaussians`].
     pub fn decode(&self, bytes: &[u8]) -> Result<Gaussians> {
         self.whole(bytes)?.gaussians()
+    }
+
+    /// Decodes a stream, and calls `each` with its Gaussians, part by part: see [`Decoding::gaussians_in_parts`].
+    ///
+    /// # Errors
+    /// Those of [`Decoding::finish`] and [`Decoding::gaussians_in_parts`].
+    pub fn decode_in_parts(&self, bytes: &[u8], each: impl FnMut(&Gaussians) -> Result<()>) -> Result<()> {
+        let decoder = self.clone().with_gaussians_in_parts();
+        decoder.whole(bytes)?.gaussians_in_parts(each)
     }
 
     /// Decodes a stream down to a level, which need not have Gaussians.
@@ -228,17 +246,21 @@ impl Decoder {
         Ok(coarsest.filter(|level| Some(*level) < stream.deepest()))
     }
 
-    /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included,
-    /// beyond [`Limits::OVERHEAD`] and models.
+    /// Bytes of memory that decoding a stream with this header down to `level` takes at most, its Gaussians included, or
+    /// a part of them if they come [in parts](Decoder::with_gaussians_in_parts), beyond [`Limits::OVERHEAD`] and models.
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level, [`Error::ModelMissing`].
     #[doc(hidden)]
     pub fn memory(&self, header: &Header, level: u8) -> Result<u64> {
+        self.memory_for(header, level, self.in_parts)
+    }
+
+    fn memory_for(&self, header: &Header, level: u8, in_parts: bool) -> Result<u64> {
         match header.format {
             Format::Learned { .. } => self.learned(header)?.memory(header, level),
             Format::Transform { .. } => {
-                let drawing = self.drawing_bytes(header, level)?;
+                let drawing = self.drawing_bytes(header, level, in_parts)?;
                 super::memory::transform(header, level, drawing)
             }
         }
@@ -324,22 +346,29 @@ impl Decoder {
     }
 
     /// Bytes of memory that making Gaussians of a level takes at most.
-    fn drawing_bytes(&self, header: &Header, level: u8) -> Result<u64> {
+    fn drawing_bytes(&self, header: &Header, level: u8, in_parts: bool) -> Result<u64> {
         let voxels = header.voxels(level)?.into();
         let above = match level > header.base {
             true => header.voxels(level - 1)?.into(),
             false => voxels,
         };
-        self.drawing_bytes_of(header, level, [voxels, above])
+        self.drawing_bytes_of(header, level, [voxels, above], in_parts)
     }
 
     /// The same of so many voxels of a level, and of the level above.
-    pub(crate) fn drawing_bytes_of(&self, header: &Header, level: u8, [voxels, above]: [u64; 2]) -> Result<u64> {
-        let surfels = super::memory::surfels(voxels, self.surfels_per_voxel(header, level)?.count() as u64);
+    pub(crate) fn drawing_bytes_of(
+        &self,
+        header: &Header,
+        level: u8,
+        [voxels, above]: [u64; 2],
+        in_parts: bool,
+    ) -> Result<u64> {
+        let per_voxel = self.surfels_per_voxel(header, level)?.count() as u64;
+        let surfels = super::memory::surfels(voxels, per_voxel, in_parts);
         Ok(match self.network(header, level)? {
             // Some voxels may become surfels after all, once the network is done.
             Some((model, set)) => {
-                let [gaussians, network] = model.bytes(set, voxels, above, self.span_rows());
+                let [gaussians, network] = model.bytes(set, [voxels, above], self.span_rows(), in_parts);
                 gaussians.saturating_add(network.max(surfels))
             }
             None => surfels,
@@ -416,13 +445,14 @@ impl Decoder {
             }
             Goal::Gaussians(None) => header.top,
         };
-        self.check_memory(header, last)?;
+        self.check_memory(header, last, self.in_parts)?;
         Ok(last)
     }
 
-    /// Fails with [`Error::LimitExceeded`] if decoding down to `level` takes more than is allowed.
-    pub(super) fn check_memory(&self, header: &Header, level: u8) -> Result<()> {
-        let bytes = self.memory(header, level)?;
+    /// Fails with [`Error::LimitExceeded`] if decoding down to `level`, with Gaussians all at once or in parts, takes more
+    /// than is allowed.
+    pub(super) fn check_memory(&self, header: &Header, level: u8, in_parts: bool) -> Result<()> {
+        let bytes = self.memory_for(header, level, in_parts)?;
         let what = "memory to decode this stream";
         self.limits.check_bytes(what, bytes)
     }

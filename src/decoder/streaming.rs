@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use super::drawing::LevelVoxels;
+use super::drawing::{Each, LevelVoxels};
 use super::stream::{Decoder, Points, learned_heads};
 use super::transform::Transform;
 use crate::container::feed::{Goal, failed_before};
@@ -122,6 +122,14 @@ impl<'b> Decoding<'b> {
         }
     }
 
+    /// The cube that Gaussians refer to, once [`Decoding::header`] is there.
+    pub fn frame(&self) -> Option<Frame> {
+        self.header().map(|header| Frame {
+            bits: header.bits,
+            placement: header.placement,
+        })
+    }
+
     /// The deepest level decoded so far.
     pub fn level(&self) -> Option<u8> {
         match &self.state {
@@ -186,14 +194,11 @@ impl<'b> Decoding<'b> {
         let State::Transform(decoding) = &self.state else {
             return None;
         };
-        let (reached, header) = (decoding.reached()?, decoding.header()?);
+        let reached = decoding.reached()?;
         Some(Points {
             voxels: reached.octree.level(reached.level),
             colours: reached.colours(self.decoder.isa()),
-            frame: Frame {
-                bits: header.bits,
-                placement: header.placement,
-            },
+            frame: self.frame()?,
         })
     }
 
@@ -226,6 +231,39 @@ impl<'b> Decoding<'b> {
             State::Start(_) | State::Refused => Err(nothing_reached()),
             State::Learned(decoding) => decoding.gaussians(log),
             State::Transform(decoding) => decoding.gaussians(log),
+        }
+    }
+
+    /// Calls `each` with the Gaussians of the level reached, part by part, and keeps none: the parts one after the other
+    /// are what [`Decoding::gaussians`] gives. A part has 131,072 at most, and may have none; there is one at least. The
+    /// Gaussians of a stream of version 2 come in one part.
+    ///
+    /// # Errors
+    /// Those of [`Decoding::gaussians`], and the first of `each`, after which it is not called again.
+    pub fn gaussians_in_parts(&self, mut each: impl FnMut(&Gaussians) -> Result<()>) -> Result<()> {
+        let (log, each): (_, &mut Each<'_>) = (&self.decoder.log(), &mut each);
+        match &self.state {
+            State::Start(_) | State::Refused => Err(nothing_reached()),
+            State::Learned(decoding) => each(&decoding.gaussians(log)?),
+            State::Transform(decoding) => decoding.gaussians_in_parts(log, each),
+        }
+    }
+
+    /// Whether [`Decoding::gaussians_in_parts`] takes less memory than [`Decoding::gaussians`]: the stream has version 3.
+    pub fn has_parts(&self) -> bool {
+        matches!(self.state, State::Transform(_))
+    }
+
+    /// How many Gaussians the level reached has, if that is known before they are made: heads with eight of a voxel
+    /// leave faint ones out.
+    ///
+    /// # Errors
+    /// Those of [`Decoding::gaussians`] but for limits.
+    pub fn gaussian_count(&self) -> Result<Option<usize>> {
+        match &self.state {
+            State::Start(_) | State::Refused => Err(nothing_reached()),
+            State::Learned(_) => Ok(None),
+            State::Transform(decoding) => decoding.gaussian_count(),
         }
     }
 

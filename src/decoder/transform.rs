@@ -5,6 +5,7 @@ use std::sync::OnceLock;
 
 use xxhash_rust::xxh3::Xxh3Default;
 
+use super::drawing::Each;
 use super::reached::{Above, Reached};
 use super::stream::Decoder;
 use crate::colour::{self, Filter, LevelColours, Ycc};
@@ -185,12 +186,29 @@ impl<'b> Transform<'b> {
 
     /// The Gaussians of the level reached.
     pub(super) fn gaussians(&self, log: &Log) -> Result<Gaussians> {
+        self.draw(log, None)
+    }
+
+    /// Calls `each` with the same Gaussians, part by part.
+    pub(super) fn gaussians_in_parts(&self, log: &Log, each: &mut Each<'_>) -> Result<()> {
+        self.draw(log, Some(each)).map(drop)
+    }
+
+    /// How many there are, if that is known before.
+    pub(super) fn gaussian_count(&self) -> Result<Option<usize>> {
+        match (self.header(), &self.reached) {
+            (Some(header), Some(reached)) => self.decoder.gaussian_count(header, reached),
+            _ => Err(nothing_reached()),
+        }
+    }
+
+    fn draw(&self, log: &Log, each: Option<&mut Each<'_>>) -> Result<Gaussians> {
         let (Some(header), Some(reached)) = (self.header(), &self.reached) else {
             return Err(nothing_reached());
         };
         let decoder = &self.decoder;
         decoder.check_drawable(header, reached.level)?;
-        decoder.check_memory(header, reached.level)?;
+        decoder.check_memory(header, reached.level, each.is_some())?;
         decoder.cancel().check()?;
         let set = decoder.heads();
         let name = format!("Gaussians of level {}, {set}", reached.level);
@@ -202,7 +220,10 @@ impl<'b> Transform<'b> {
                 Ok(())
             })?;
         }
-        log.step(name, voxels, "voxels", || decoder.generate(header, reached))
+        log.paused_step(name, voxels, "voxels", |pauses| match each {
+            None => decoder.generate(header, reached, None),
+            Some(each) => decoder.generate(header, reached, Some(&mut |part| pauses.pause(|| each(part)))),
+        })
     }
 }
 

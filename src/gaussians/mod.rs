@@ -169,6 +169,15 @@ impl Gaussians {
         self.position.is_empty()
     }
 
+    /// Takes all Gaussians out; there is still room for as many.
+    pub(crate) fn clear(&mut self) {
+        self.position.clear();
+        self.scale.clear();
+        self.rotation.clear();
+        self.opacity.clear();
+        self.colour.clear();
+    }
+
     /// Appends other Gaussians of the same frame, without harmonics.
     pub(crate) fn append(&mut self, mut other: Gaussians) {
         self.position.append(&mut other.position);

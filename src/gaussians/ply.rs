@@ -81,29 +81,50 @@ impl Gaussians {
     /// # Errors
     /// [`Error::Io`] if `to` fails; [`Error::Usage`] if the arrays differ in length or the frame is invalid.
     pub fn write_ply<W: Write + ?Sized>(&self, to: &mut W, path: &Path) -> Result<()> {
-        self.check_lengths()?;
-        if !self.frame.is_valid() {
-            return Err(self.frame.not_valid());
-        }
+        let header = self.ply_header(self.len())?;
         let io = |source| Error::Io {
             path: path.to_owned(),
             source,
         };
+        to.write_all(header.as_bytes()).map_err(io)?;
+        self.write_ply_rows(to, path)
+    }
+
+    /// The header of a PLY file of `count` Gaussians like these, of which these are some.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if the frame is invalid.
+    #[doc(hidden)]
+    pub fn ply_header(&self, count: usize) -> Result<String> {
+        if !self.frame.is_valid() {
+            return Err(self.frame.not_valid());
+        }
         let mut header = format!(
-            "ply\nformat binary_little_endian 1.0\n{}element vertex {}\n",
+            "ply\nformat binary_little_endian 1.0\n{}element vertex {count}\n",
             comments(&self.frame, self.compensated, self.blur),
-            self.len()
         );
         for name in PROPERTIES {
             header += &format!("property float {name}\n");
         }
-        let rest = self.harmonics.count;
-        for i in 0..3 * rest {
+        for i in 0..3 * self.harmonics.count {
             header += &format!("property float f_rest_{i}\n");
         }
         header += "end_header\n";
-        to.write_all(header.as_bytes()).map_err(io)?;
+        Ok(header)
+    }
 
+    /// What follows the header: a row for each Gaussian.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if `to` fails; [`Error::Usage`] if the arrays differ in length.
+    #[doc(hidden)]
+    pub fn write_ply_rows<W: Write + ?Sized>(&self, to: &mut W, path: &Path) -> Result<()> {
+        self.check_lengths()?;
+        let io = |source| Error::Io {
+            path: path.to_owned(),
+            source,
+        };
+        let rest = self.harmonics.count;
         let offset = self.frame.offset();
         let mut bytes = Vec::with_capacity(BLOCK * (PROPERTIES.len() + 3 * rest) * size_of::<f32>());
         for first in (0..self.len()).step_by(BLOCK) {

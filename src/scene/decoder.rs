@@ -278,7 +278,7 @@ impl SceneDecoder {
             .iter()
             .map(own)
             .try_fold(0, |most, voxels| voxels.map(|voxels| most.max(voxels)))?;
-        let drawing = self.decoder.drawing_bytes_of(scene.header(), level, [most; 2])?;
+        let drawing = self.decoder.drawing_bytes_of(scene.header(), level, [most; 2], false)?;
         let drawing = drawing.saturating_add(most.saturating_mul(PART_BYTES));
         Ok(made.saturating_add(decoded).saturating_add(working.max(drawing)))
     }
@@ -450,7 +450,7 @@ impl SceneDecoder {
 
     /// Checks that drawing a block among so many voxels keeps to the limits, beside `kept` bytes.
     fn check_drawing(&self, header: &Header, level: u8, voxels: u64, kept: u64) -> Result<()> {
-        let drawing = self.decoder.drawing_bytes_of(header, level, [voxels; 2])?;
+        let drawing = self.decoder.drawing_bytes_of(header, level, [voxels; 2], false)?;
         let all = kept
             .saturating_add(drawing)
             .saturating_add(voxels.saturating_mul(PART_BYTES));

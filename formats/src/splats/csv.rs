@@ -93,15 +93,18 @@ pub(super) fn read(bytes: &[u8], limits: &Limits) -> Result<(Gaussians, Vec<Stri
     Ok((builder.finish(None), Vec::new()))
 }
 
-pub(super) fn write(rows: &Rows, to: &mut dyn Write) -> io::Result<()> {
-    let harmonics = rows.harmonics();
+/// The line of names, where each Gaussian has so many harmonics.
+pub(super) fn header(harmonics: usize) -> String {
     let mut line = NAMES.join(",");
     (0..3 * harmonics).for_each(|k| line += &format!(",f_rest_{k}"));
-    writeln!(to, "{line}")?;
+    line + "\n"
+}
+
+pub(super) fn write_rows(rows: &Rows, to: &mut dyn Write) -> io::Result<()> {
     let offset = rows.offset();
     for (i, row) in rows.iter().enumerate() {
         let [x, y, z]: [f64; 3] = std::array::from_fn(|k| row.position[k] + offset[k]);
-        line = match offset == [0.0; 3] {
+        let mut line = match offset == [0.0; 3] {
             true => format!("{},{},{}", x as f32, y as f32, z as f32),
             // Single precision does not resolve these.
             false => format!("{x},{y},{z}"),

@@ -28,19 +28,22 @@ mod csv;
 mod details;
 mod gltf;
 mod npz;
+mod parts;
 mod rows;
 mod sog;
 mod splat;
 mod spz;
 mod turn;
 
+use std::borrow::Cow;
 use std::io::Write;
 use std::path::Path;
 
 use b2p::cloud::ply::Ply;
-use b2p::gaussians::{Gaussians, ply};
+use b2p::gaussians::{Frame, Gaussians, ply};
 use b2p::{Error, Limits, Result, Up};
 
+pub use parts::PartWriter;
 use rows::Rows;
 use turn::Turn;
 
@@ -181,6 +184,14 @@ impl Axes {
             _ => Axes::Ply,
         }
     }
+
+    /// The axis that pointed up before the scene is turned to the axes of a format.
+    fn turned_from(self) -> Option<Up> {
+        match self {
+            Axes::Cloud(up) => Some(up),
+            Axes::Ply | Axes::Gltf => None,
+        }
+    }
 }
 
 /// What a file holds.
@@ -270,40 +281,14 @@ fn up_in_comments(bytes: &[u8]) -> Option<Up> {
     ply.header.comments.iter().find_map(named)
 }
 
-/// Writes a line after the second one, where a PLY header may have comments.
-struct WithLine<'a> {
-    to: &'a mut dyn Write,
-    line: String,
-    passed: usize,
-}
-
-impl Write for WithLine<'_> {
-    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        if self.passed == 2 {
-            return self.to.write(bytes);
-        }
-        let end = bytes.iter().position(|b| *b == b'\n').map_or(bytes.len(), |at| at + 1);
-        self.to.write_all(&bytes[..end])?;
-        self.passed += usize::from(bytes[..end].ends_with(b"\n"));
-        if self.passed == 2 {
-            self.to.write_all(self.line.as_bytes())?;
-        }
-        Ok(end)
-    }
-
-    fn flush(&mut self) -> std::io::Result<()> {
-        self.to.flush()
-    }
-}
-
-/// What [`write()`] subtracts from the coordinates in a file of this format, in the axes of the file. Zeros for formats
+/// What [`write()`] subtracts from the coordinates of a cube in a file of this format, in the axes of the file. Zeros for formats
 /// that hold the coordinates of the world: CSV, whose numbers are decimal, and glTF, whose node has the offset.
-pub fn offset(gaussians: &Gaussians, axes: Axes, format: Format) -> [f64; 3] {
+pub fn offset(frame: Frame, axes: Axes, format: Format) -> [f64; 3] {
     match format {
         Format::Csv | Format::Glb | Format::Gltf => [0.0; 3],
         _ => match Turn::between(axes, Axes::of(format)) {
-            Some(turn) => turn.frame(gaussians.frame).offset(),
-            None => gaussians.frame.offset(),
+            Some(turn) => turn.frame(frame).offset(),
+            None => frame.offset(),
         },
     }
 }
@@ -321,36 +306,37 @@ pub fn write(
     to: &mut dyn Write,
     path: &Path,
 ) -> Result<Vec<String>> {
-    let turned = Turn::between(axes, Axes::of(format)).map(|turn| {
-        let mut turned = gaussians.clone();
-        turn.apply(&mut turned);
-        turned
-    });
-    let gaussians = turned.as_ref().unwrap_or(gaussians);
-    let up = match axes {
-        Axes::Cloud(up) => Some(up),
-        Axes::Ply | Axes::Gltf => None,
-    };
-    if format == Format::Ply {
-        let (line, passed) = (up_comment(up), 0);
-        let mut to = WithLine { to, line, passed };
-        return gaussians.write_ply(&mut to, path).map(|()| Vec::new());
-    }
-    let mut rows = Rows::new(gaussians, up)?;
     let io = |source| Error::Io {
         path: path.to_owned(),
         source,
     };
+    if let Some(mut parts) = PartWriter::new(axes, format) {
+        gaussians.check_lengths()?;
+        let head = parts.head(gaussians, gaussians.len())?;
+        to.write_all(&head).map_err(io)?;
+        parts.write_rows(gaussians, to, path)?;
+        return Ok(parts.warnings());
+    }
+    let turned = turned(gaussians, Turn::between(axes, Axes::of(format)).as_ref());
+    let mut rows = Rows::new(&turned, axes.turned_from())?;
     match format {
         Format::CompressedPly => compressed_ply::write(&mut rows, to).map_err(io)?,
         Format::Spz => spz::write(&mut rows, to, &io)?,
         Format::Sog => sog::write(&mut rows, to, &io)?,
-        Format::Splat => splat::write(&mut rows, to).map_err(io)?,
         Format::Glb | Format::Gltf => gltf::write(&rows, format, to, &io)?,
-        Format::Csv => csv::write(&rows, to).map_err(io)?,
-        Format::Ply | Format::Npz => npz::write(&rows, to, &io)?,
+        Format::Ply | Format::Splat | Format::Csv | Format::Npz => npz::write(&rows, to, &io)?,
     }
-    Ok(rows.warnings())
+    let lost = rows::loss(rows.lost());
+    Ok(lost.into_iter().chain(rows.unsaid()).collect())
+}
+
+/// Gaussians after a rotation.
+fn turned<'a>(gaussians: &'a Gaussians, turn: Option<&Turn>) -> Cow<'a, Gaussians> {
+    let mut turned = Cow::Borrowed(gaussians);
+    if let Some(turn) = turn {
+        turn.apply(turned.to_mut());
+    }
+    turned
 }
 
 #[cfg(test)]

@@ -55,6 +55,7 @@ pub(super) struct Rows<'a> {
     offset: [f64; 3],
     unit: f64,
     order: Vec<u32>,
+    /// Sentences about what the format does not keep.
     warnings: Vec<String>,
 }
 
@@ -70,12 +71,6 @@ impl<'a> Rows<'a> {
         let order: Vec<u32> = (0..gaussians.len() as u32)
             .filter(|&i| is_whole(gaussians, i as usize))
             .collect();
-        let lost = gaussians.len() - order.len();
-        let mut warnings = Vec::new();
-        if lost > 0 {
-            let what = "with numbers that are not finite, or without a rotation, are left out";
-            warnings.push(format!("{lost} of {} Gaussians {what}", gaussians.len()));
-        }
         let frame = gaussians.frame;
         Ok(Rows {
             gaussians,
@@ -84,7 +79,7 @@ impl<'a> Rows<'a> {
             frame,
             unit: frame.unit(),
             order,
-            warnings,
+            warnings: Vec::new(),
         })
     }
 
@@ -107,7 +102,14 @@ impl<'a> Rows<'a> {
         self.warnings.push(warning);
     }
 
-    pub fn warnings(self) -> Vec<String> {
+    /// How many Gaussians are left out, of how many.
+    pub fn lost(&self) -> [usize; 2] {
+        let all = self.gaussians.len();
+        [all - self.len(), all]
+    }
+
+    /// What the format does not keep, beside Gaussians that are left out.
+    pub fn unsaid(self) -> Vec<String> {
         self.warnings
     }
 
@@ -172,6 +174,12 @@ impl<'a> Rows<'a> {
         order.par_sort_unstable();
         self.order = order.into_iter().map(|(_, i)| i).collect();
     }
+}
+
+/// A sentence about Gaussians that are left out, if there are any.
+pub(super) fn loss([lost, all]: [usize; 2]) -> Option<String> {
+    let what = "with numbers that are not finite, or without a rotation, are left out";
+    (lost > 0).then(|| format!("{lost} of {all} Gaussians {what}"))
 }
 
 fn is_whole(g: &Gaussians, i: usize) -> bool {

@@ -39,7 +39,7 @@ pub(super) fn read(bytes: &[u8], offset: [f64; 3], limits: &Limits) -> Result<(G
     Ok((builder.finish(None), Vec::new()))
 }
 
-pub(super) fn write(rows: &mut Rows, to: &mut dyn Write) -> io::Result<()> {
+pub(super) fn write_rows(rows: &mut Rows, to: &mut dyn Write) -> io::Result<()> {
     for row in rows.iter() {
         let floats = row.position.into_iter().chain(row.scale).map(|x| x as f32);
         let mut bytes: Vec<u8> = floats.flat_map(f32::to_le_bytes).collect();

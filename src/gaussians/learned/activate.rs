@@ -44,11 +44,13 @@ struct Rows<'a> {
 }
 
 impl<'a> Drawing<'a> {
-    /// No Gaussians yet, with capacity for all if they are `kept`. `blur` is in squares of half the unit.
+    /// No Gaussians yet, with capacity for all if they are `kept`, else for a part. `blur` is in squares of half the
+    /// unit.
     pub fn new(input: &LevelInput<'a>, count: usize, blur: f32, frame: Frame, kept: bool) -> Self {
         let voxels = input.octree.level(input.level);
         let half = 1.0 / (1u32 << (voxels.depth() + u8::from(count == 8))) as f32;
-        let all = if kept { input.range().len() * count } else { 0 };
+        let voxels_at_once = if kept { usize::MAX } else { PART };
+        let all = input.range().len().min(voxels_at_once) * count;
         Drawing {
             voxels,
             colours: input.colours,

@@ -52,7 +52,7 @@ use crate::geometry::{Octree, SiblingMap};
 use crate::input;
 use crate::layers::{Precision, missing};
 use crate::limits::Limits;
-use activate::Drawing;
+use activate::{Drawing, PART};
 use network::Generator;
 #[cfg(test)]
 pub(crate) use network::TERMS;
@@ -132,14 +132,15 @@ impl HeadsModel {
     }
 
     /// Maximum memory in bytes of [`HeadsModel::generate_in_parts`] for a level of `voxels` voxels and `above` voxels in
-    /// the level above, on spans of at most `rows` rows: that of the Gaussians, and that of the network, which is given
-    /// back; 0 if the model does not have the set.
+    /// the level above, on spans of at most `rows` rows: that of the Gaussians, or of a part if they come in parts, and
+    /// that of the network, which is given back; 0 if the model does not have the set.
     #[doc(hidden)]
-    pub fn bytes(&self, set: Set, voxels: u64, above: u64, rows: usize) -> [u64; 2] {
+    pub fn bytes(&self, set: Set, [voxels, above]: [u64; 2], rows: usize, in_parts: bool) -> [u64; 2] {
         let shape = self.find(set).map(Generator::shape);
+        let at_once = if in_parts { voxels.min(PART as u64) } else { voxels };
         shape.map_or([0; 2], |shape| {
             [
-                network::gaussian_bytes(shape, voxels),
+                network::gaussian_bytes(shape, at_once),
                 network::work_bytes(shape, voxels, above, rows),
             ]
         })

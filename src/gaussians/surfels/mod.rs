@@ -24,6 +24,7 @@ mod passes;
 mod sparsity;
 #[cfg(test)]
 mod tests;
+mod walks;
 mod windows;
 
 use std::ops::Range;
@@ -37,10 +38,15 @@ use discs::Disc;
 use moments::Moments;
 use sparsity::Sparsity;
 pub use sparsity::{closing_size, is_for_surfels};
+pub use walks::BYTES as WALK_BYTES;
 use windows::{Window, Windows};
 
-/// Voxels per task, and per block whose sparsity is measured: part of the definition of surfels.
+/// Voxels of a block whose sparsity is measured: part of the definition of surfels.
 const BLOCK: usize = 1024;
+/// Voxels of a task: blocks. Larger ones have fewer voxels around them for each of their own.
+pub const TASK: usize = 2 * BLOCK;
+/// Voxels that are drawn at a time where surfels are not kept.
+pub const PART: usize = 16 * TASK;
 /// Opacity of noise: little is seen of it, and all formats of Gaussians can say it.
 const FAINT: f32 = 1.0 / 64.0;
 /// [`Gaussians::blur`], in voxels squared.
@@ -102,13 +108,25 @@ impl SurfelSelection<'_> {
     }
 }
 
-/// Makes the discs of `voxels`, voxel by voxel.
-///
-/// `map` is that of the voxels, `colours` holds one sRGB colour per voxel. `frame` is the cube's frame;
-/// the Gaussians are in cube-frame units.
+/// What surfels are made of.
+#[derive(Debug, Clone, Copy)]
+pub struct Surfels<'a> {
+    pub isa: Isa,
+    pub voxels: &'a Voxels,
+    /// Their neighbours.
+    pub map: &'a SiblingMap,
+    /// One sRGB colour per voxel.
+    pub colours: &'a [[u8; 3]],
+    pub per_voxel: PerVoxel,
+    pub choice: SurfelSelection<'a>,
+    /// The cube's frame. Gaussians are in units of the cube.
+    pub frame: Frame,
+}
+
+/// Makes the discs of `voxels`, voxel by voxel, as [`Surfels::all`] does.
 ///
 /// # Panics
-/// If `map`, `voxels`, `colours` and the choice differ in length, or the range has other voxels.
+/// As [`Surfels::all`].
 pub fn surfels(
     isa: Isa,
     voxels: &Voxels,
@@ -118,45 +136,112 @@ pub fn surfels(
     choice: SurfelSelection<'_>,
     frame: Frame,
 ) -> Gaussians {
-    assert_eq!(map.len(), voxels.len(), "one row of the map per voxel");
-    assert_eq!(colours.len(), voxels.len(), "one colour per voxel");
-    let only = choice.only.map_or(voxels.len(), <[bool]>::len);
-    assert_eq!(only, voxels.len(), "one choice per voxel");
-    let range = choice.range(voxels.len());
-    let chosen = range.clone().filter(|&voxel| choice.has(voxel)).count();
-    let degrees = map.degrees(range.clone());
-    let sparse = sparsity::is_sparse(degrees.par_iter().map(|&degree| degree.into()));
-    drop(degrees);
-    let far = moments::after_all_steps(isa, voxels, map);
-    let n = per_voxel.count();
-    let count = chosen * n;
-    let edge = 2.0 / (1u32 << voxels.depth()) as f32;
-    let mut gaussians = Gaussians {
-        blur: BLUR * edge * edge,
-        position: zeros(count),
-        scale: zeros(count),
-        rotation: zeros(count),
-        opacity: vec![1.0; count],
-        colour: zeros(count),
+    let surfels = Surfels {
+        isa,
+        voxels,
+        map,
+        colours,
+        per_voxel,
+        choice,
         frame,
-        ..Gaussians::default()
     };
-    let tasks = Rows::of(&mut gaussians).tasks(range.clone(), n, choice);
-    tasks.into_par_iter().for_each(|(first, rows)| {
-        let last = (first + BLOCK).min(range.end);
-        let coordinates: Vec<[u32; 3]> = (first..last).map(|i| voxels.coordinate(i)).collect();
-        let far = &far[first..last];
+    surfels.all()
+}
+
+impl Surfels<'_> {
+    /// Makes the discs of all chosen voxels, voxel by voxel.
+    ///
+    /// # Panics
+    /// If the map, the voxels, the colours and the choice differ in length, or the range has other voxels.
+    pub fn all(&self) -> Gaussians {
+        let range = self.checked_range();
+        self.of(range.clone(), self.is_sparse(range))
+    }
+
+    /// Makes the same discs in parts of at most [`PART`] voxels, and calls `each` with one after the other. There is one
+    /// at least.
+    ///
+    /// # Errors
+    /// The first of `each`.
+    ///
+    /// # Panics
+    /// As [`Surfels::all`].
+    pub fn in_parts<E>(&self, mut each: impl FnMut(Gaussians) -> Result<(), E>) -> Result<(), E> {
+        let range = self.checked_range();
+        let sparse = self.is_sparse(range.clone());
+        for first in range.clone().step_by(PART) {
+            each(self.of(first..range.end.min(first + PART), sparse))?;
+        }
+        Ok(())
+    }
+
+    fn checked_range(&self) -> Range<usize> {
+        let count = self.voxels.len();
+        assert_eq!(self.map.len(), count, "one row of the map per voxel");
+        assert_eq!(self.colours.len(), count, "one colour per voxel");
+        let only = self.choice.only.map_or(count, <[bool]>::len);
+        assert_eq!(only, count, "one choice per voxel");
+        self.choice.range(count)
+    }
+
+    fn is_sparse(&self, range: Range<usize>) -> bool {
+        sparsity::is_sparse(self.map, range)
+    }
+
+    /// The discs of chosen voxels of a range that starts with a block of the level's range.
+    fn of(&self, range: Range<usize>, sparse: bool) -> Gaussians {
+        let n = self.per_voxel.count();
+        let count = n * range.clone().filter(|&voxel| self.choice.has(voxel)).count();
+        let edge = self.edge();
+        let mut gaussians = Gaussians {
+            blur: BLUR * edge * edge,
+            position: zeros(count),
+            scale: zeros(count),
+            rotation: zeros(count),
+            opacity: vec![1.0; count],
+            colour: zeros(count),
+            frame: self.frame,
+            ..Gaussians::default()
+        };
+        let tasks = Rows::of(&mut gaussians).tasks(range.clone(), TASK, n, self.choice);
+        tasks.into_par_iter().for_each(|(first, rows)| {
+            let task = first..range.end.min(first + TASK);
+            // Blocks are drawn by what lies around them: what nobody wants is not fitted.
+            if rows.opacity.is_empty() {
+                return;
+            }
+            let far = walks::after_all_steps(self.isa, self.voxels, self.map, task.clone());
+            let blocks = rows.tasks(task.clone(), BLOCK, n, self.choice);
+            for ((first, rows), far) in blocks.into_iter().zip(far.chunks(BLOCK)) {
+                self.draw(first, far, sparse, rows);
+            }
+        });
+        gaussians
+    }
+
+    /// The edge of a voxel.
+    fn edge(&self) -> f32 {
+        2.0 / (1u32 << self.voxels.depth()) as f32
+    }
+
+    /// Draws a block of voxels, whose moments after all steps are `far`.
+    fn draw(&self, first: usize, far: &[Moments], sparse: bool, rows: Rows<'_>) {
+        let (map, colours, n) = (self.map, self.colours, self.per_voxel.count());
+        let last = first + far.len();
+        let coordinates: Vec<[u32; 3]> = (first..last).map(|i| self.voxels.coordinate(i)).collect();
         let mut masks = [0; BLOCK];
         let masks = &mut masks[..far.len()];
         map.masks(first, masks);
-        let mut discs = isa.run(passes::Fit {
+        let mut discs = self.isa.run(passes::Fit {
             coordinates: &coordinates,
             masks,
             far,
         });
         if sparse {
-            fit_windows(isa, voxels, &coordinates, masks, far, &mut discs);
+            fit_windows(self.isa, self.voxels, &coordinates, masks, far, &mut discs);
         }
+        let edge = self.edge();
+        let shrink = if n == 1 { 1.0 } else { SHRINK };
         let (mut buffer, mut around) = (RowBuffer::new(), [].as_slice());
         let mut to = 0;
         for (j, (disc, &coordinate)) in discs.iter().zip(&coordinates).enumerate() {
@@ -164,15 +249,14 @@ pub fn surfels(
             if n > 1 && place == 0 {
                 around = buffer.fill(map, first + j..last.min(first + j + RowBuffer::ROWS));
             }
-            if !choice.has(first + j) {
+            if !self.choice.has(first + j) {
                 continue;
             }
-            let parts = match per_voxel {
+            let parts = match self.per_voxel {
                 PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
                 PerVoxel::Four => quarters(disc, &around[27 * place..][..27], colours, first + j),
             };
-            let shrink = if n == 1 { 1.0 } else { SHRINK };
-            let radius = disc.radius * shrink * choice.size * edge;
+            let radius = disc.radius * shrink * self.choice.size * edge;
             for (offset, rgb) in parts.into_iter().take(n) {
                 rows.position[to] = cube_point(coordinate, offset, edge);
                 rows.scale[to] = [radius, radius, disc.thickness * edge];
@@ -182,8 +266,7 @@ pub fn surfels(
                 to += 1;
             }
         }
-    });
-    gaussians
+    }
 }
 
 /// The arrays that surfels are written to.
@@ -206,12 +289,18 @@ impl<'a> Rows<'a> {
         }
     }
 
-    /// First voxel and rows of every block.
-    fn tasks(mut self, voxels: Range<usize>, per_voxel: usize, choice: SurfelSelection<'_>) -> Vec<(usize, Rows<'a>)> {
-        let mut tasks = Vec::with_capacity(voxels.len().div_ceil(BLOCK));
-        for first in voxels.clone().step_by(BLOCK) {
-            let block = first..(first + BLOCK).min(voxels.end);
-            let count = per_voxel * block.filter(|&voxel| choice.has(voxel)).count();
+    /// First voxel and rows of every task of so many voxels.
+    fn tasks(
+        mut self,
+        voxels: Range<usize>,
+        size: usize,
+        per_voxel: usize,
+        choice: SurfelSelection<'_>,
+    ) -> Vec<(usize, Rows<'a>)> {
+        let mut tasks = Vec::with_capacity(voxels.len().div_ceil(size));
+        for first in voxels.clone().step_by(size) {
+            let task = first..(first + size).min(voxels.end);
+            let count = per_voxel * task.filter(|&voxel| choice.has(voxel)).count();
             let (rows, rest) = self.split_at(count);
             tasks.push((first, rows));
             self = rest;

@@ -9,20 +9,12 @@
 //! to the voxel's own coordinate, where they are exact: below 2¹⁶ (n ≤ 27³, Σx² ≤ 2 · 27³) or within ±2¹⁵ (|Σx| ≤ 5/9 ·
 //! 27³, |Σxy| ≤ 5/4 · 27³). The first step counts the occupied places of the voxel's row instead.
 
-use b2p_kernels::{Isa, zeros};
-use rayon::prelude::*;
-
 use super::lanes::{GROUP, Lane};
-use super::passes;
-use crate::geometry::{SiblingMap, Voxels};
 
 /// Steps of a walk.
 pub const ROUNDS: usize = 3;
 /// n, Σx, Σy, Σz, Σxx, Σyy, Σzz, Σxy, Σxz, Σyz, and six unused values that pad it to 32 bytes.
 pub type Moments = [u16; 16];
-/// Voxels per task.
-const BLOCK: usize = 1024;
-
 /// Of each axis the places of a 3³ row one step behind the voxel, and one step ahead of it.
 const STEPS: [[u32; 2]; 3] = {
     let mut steps = [[0; 2]; 3];
@@ -59,21 +51,6 @@ fn of_neighbours(mask: u32) -> [i16; 10] {
     moments
 }
 
-/// The moments of every voxel after one step, then one element of zeros.
-fn after_one_step(isa: Isa, voxels: &Voxels, map: &SiblingMap) -> Vec<Moments> {
-    let mut moments: Vec<Moments> = zeros(voxels.len() + 1);
-    let blocks = moments[..voxels.len()].par_chunks_mut(BLOCK).enumerate();
-    blocks.for_each(|(i, to)| {
-        isa.run(passes::FirstStep {
-            voxels,
-            map,
-            first: i * BLOCK,
-            to,
-        });
-    });
-    moments
-}
-
 /// Moments after one step with absolute coordinates, of a voxel at `coordinate` with these neighbours.
 #[inline(always)]
 pub fn absolute(mask: u32, coordinate: [u32; 3]) -> Moments {
@@ -92,34 +69,6 @@ pub fn absolute(mask: u32, coordinate: [u32; 3]) -> Moments {
         moments[4 + k] = relative[4 + k].wrapping_add(moved);
     }
     moments
-}
-
-/// The moments of every voxel after all steps, then one element of zeros.
-pub fn after_all_steps(isa: Isa, voxels: &Voxels, map: &SiblingMap) -> Vec<Moments> {
-    let mut moments = after_one_step(isa, voxels, map);
-    let mut spare: Vec<Moments> = zeros(moments.len());
-    for _ in 1..ROUNDS {
-        step_into(isa, map, &moments, &mut spare);
-        std::mem::swap(&mut moments, &mut spare);
-    }
-    moments
-}
-
-/// One step: for every voxel the sum over the occupied ones of its 27 neighbours. The last elements are zeros.
-///
-/// # Panics
-/// If `to` does not have one element for each of `from`.
-fn step_into(isa: Isa, map: &SiblingMap, from: &[Moments], to: &mut [Moments]) {
-    assert_eq!(to.len(), from.len(), "one element per voxel, and zeros");
-    let blocks = to[..map.len()].par_chunks_mut(BLOCK).enumerate();
-    blocks.for_each(|(i, to)| {
-        isa.run(passes::Sum {
-            from,
-            map,
-            first: i * BLOCK,
-            to,
-        });
-    });
 }
 
 /// Moments of a group of voxels, each relative to its voxel's coordinate.

@@ -6,16 +6,13 @@ use super::discs::{Disc, discs};
 use super::lanes::GROUP;
 use super::moments::{Moments, absolute, centred, near};
 use super::windows::{Window, gathered};
-use crate::geometry::{RowBuffer, SiblingMap, Voxels};
 
 /// Sums the moments of all neighbours.
 pub struct Sum<'a> {
     /// Moments of each voxel, then zeros for absent neighbours.
     pub from: &'a [Moments],
-    /// Indices into `from`.
-    pub map: &'a SiblingMap,
-    /// The first voxel of `to`.
-    pub first: usize,
+    /// 27 indices into `from` for each of `to`; those beyond it are of absent neighbours.
+    pub rows: &'a [u16],
     pub to: &'a mut [Moments],
 }
 
@@ -25,31 +22,25 @@ impl Work for Sum<'_> {
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
         let absent = self.from.len() - 1;
-        let mut buffer = RowBuffer::new();
-        for (i, to) in self.to.chunks_mut(RowBuffer::ROWS).enumerate() {
-            let first = self.first + i * RowBuffer::ROWS;
-            let rows = buffer.fill(self.map, first..first + to.len());
-            for (to, row) in to.iter_mut().zip(rows.chunks_exact(27)) {
-                let mut sum = [0u16; 16];
-                for &q in row {
-                    // No branch: the presence of neighbours is unpredictable.
-                    let from = &self.from[absent.min(q as usize)];
-                    for (sum, value) in sum.iter_mut().zip(from) {
-                        *sum = sum.wrapping_add(*value);
-                    }
+        for (to, row) in self.to.iter_mut().zip(self.rows.chunks_exact(27)) {
+            let mut sum = [0u16; 16];
+            for &q in row {
+                // No branch: the presence of neighbours is unpredictable.
+                let from = &self.from[absent.min(q.into())];
+                for (sum, value) in sum.iter_mut().zip(from) {
+                    *sum = sum.wrapping_add(*value);
                 }
-                *to = sum;
             }
+            *to = sum;
         }
     }
 }
 
-/// The moments of consecutive voxels after one step.
+/// The moments of voxels after one step.
 pub struct FirstStep<'a> {
-    pub voxels: &'a Voxels,
-    pub map: &'a SiblingMap,
-    /// The first voxel of `to`.
-    pub first: usize,
+    /// The occupied places of each voxel's row.
+    pub masks: &'a [u32],
+    pub coordinates: &'a [[u32; 3]],
     pub to: &'a mut [Moments],
 }
 
@@ -58,14 +49,8 @@ impl Work for FirstStep<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
-        let mut masks = [0; RowBuffer::ROWS];
-        for (i, to) in self.to.chunks_mut(RowBuffer::ROWS).enumerate() {
-            let first = self.first + i * RowBuffer::ROWS;
-            let masks = &mut masks[..to.len()];
-            self.map.masks(first, masks);
-            for ((voxel, to), &mut mask) in (first..).zip(to).zip(masks) {
-                *to = absolute(mask, self.voxels.coordinate(voxel));
-            }
+        for ((&mask, &coordinate), to) in self.masks.iter().zip(self.coordinates).zip(self.to) {
+            *to = absolute(mask, coordinate);
         }
     }
 }

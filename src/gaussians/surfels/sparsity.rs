@@ -19,7 +19,7 @@ const LONE_SHARE: usize = 512;
 const LEAST: usize = 1024;
 /// A sparse level is drawn with surfels if one in so many voxels has at most [`THIN`] within one step, itself included.
 const THIN_SHARE: usize = 64;
-const THIN: u16 = 3;
+const THIN: u32 = 3;
 /// Twice the number of voxels within one step, itself included, that voxels of a closed surface have on average. Exact
 /// voxels of surfaces have 13 to 14, those of thin parts fewer.
 const CLOSED_TWICE: i64 = 23;
@@ -70,11 +70,13 @@ impl Sparsity {
     }
 }
 
-/// Whether a level is sparse, from the number of voxels within one step of each, itself included.
-pub fn is_sparse(degrees: impl IndexedParallelIterator<Item = u16>) -> bool {
-    let all = degrees.len();
-    let lone = degrees.with_min_len(BLOCK).filter(|&degree| degree == 1).count();
-    all >= LEAST && LONE_SHARE * lone >= all
+/// Whether these voxels of the level of a map are sparse.
+///
+/// # Panics
+/// If `map` has no such voxels.
+pub fn is_sparse(map: &SiblingMap, range: Range<usize>) -> bool {
+    let all = range.len();
+    all >= LEAST && LONE_SHARE * with_few(map, range, 1) >= all
 }
 
 /// Whether surfels draw these voxels of the level of a map in place of learned heads, which never saw such
@@ -83,9 +85,19 @@ pub fn is_sparse(degrees: impl IndexedParallelIterator<Item = u16>) -> bool {
 /// # Panics
 /// If `map` has no such voxels.
 pub fn is_for_surfels(map: &SiblingMap, range: Range<usize>) -> bool {
-    let degrees = map.degrees(range.clone());
-    let thin = || degrees.iter().filter(|&&degree| u16::from(degree) <= THIN).count();
-    is_sparse(degrees.par_iter().map(|&degree| degree.into())) && THIN_SHARE * thin() >= range.len()
+    is_sparse(map, range.clone()) && THIN_SHARE * with_few(map, range.clone(), THIN) >= range.len()
+}
+
+/// How many of these voxels have so many within one step at most, themselves included.
+fn with_few(map: &SiblingMap, range: Range<usize>, most: u32) -> usize {
+    let blocks = range.clone().into_par_iter().step_by(BLOCK);
+    let counts = blocks.map(|first| {
+        let mut masks = [0; BLOCK];
+        let masks = &mut masks[..BLOCK.min(range.end - first)];
+        map.masks(first, masks);
+        masks.iter().filter(|mask| mask.count_ones() <= most).count()
+    });
+    counts.sum()
 }
 
 /// Size of the surfels that close a level which [`is_for_surfels`], in 64ths of the usual radius, for
@@ -114,7 +126,7 @@ mod tests {
     }
 
     fn is_sparse_level(map: &SiblingMap) -> bool {
-        is_sparse(map.degrees(0..map.len()).par_iter().map(|&degree| degree.into()))
+        is_sparse(map, 0..map.len())
     }
 
     #[test]

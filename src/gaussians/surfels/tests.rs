@@ -57,7 +57,7 @@ fn distribution(coordinates: &[[u32; 3]], voxel: usize, steps: usize) -> ([f64; 
 }
 
 fn all_discs(isa: Isa, voxels: &Voxels, map: &SiblingMap) -> Vec<Disc> {
-    let far = moments::after_all_steps(isa, voxels, map);
+    let far = walks::after_all_steps(isa, voxels, map, 0..voxels.len());
     let coordinates: Vec<_> = (0..voxels.len()).map(|i| voxels.coordinate(i)).collect();
     let mut masks = vec![0; voxels.len()];
     map.masks(0, &mut masks);
@@ -417,8 +417,7 @@ fn bars_beside_a_dense_surface_do_not_merge() {
     let bars = (0..4 * 20).map(|i| [4 * (i % 4), i / 4, 12]);
     let specks = (0..20).map(|i| [3 * i, 50, 50]);
     let (voxels, map) = cloud(6, sheet.chain(bars).chain(specks));
-    let degrees = map.degrees(0..map.len());
-    assert!(sparsity::is_sparse(degrees.par_iter().map(|&degree| degree.into())));
+    assert!(sparsity::is_sparse(&map, 0..map.len()));
     let gaussians = one_each(&voxels, &map);
     for i in (0..voxels.len()).filter(|&i| voxels.coordinate(i)[2] == 12) {
         assert!(gaussians.scale[i].iter().all(|s| (s * 32.0 - 0.4).abs() < 0.01));
