@@ -114,6 +114,12 @@ fn transformed(cloud: &ColouredVoxels) -> [Vec<u8>; 3] {
     })
 }
 
+/// The bounds of decoding to Gaussians, all at once and in parts.
+fn bounds(decoder: &Decoder, header: &Header, level: u8) -> [u64; 2] {
+    let in_parts = decoder.clone().with_gaussians_in_parts();
+    [decoder, &in_parts].map(|decoder| decoder.memory(header, level).unwrap())
+}
+
 #[test]
 fn decoding_version_3_holds_no_more_than_the_bound_that_its_header_gives() {
     let _quiet = QUIET.lock().unwrap_or_else(|e| e.into_inner());
@@ -126,18 +132,21 @@ fn decoding_version_3_holds_no_more_than_the_bound_that_its_header_gives() {
         for bytes in transformed(&cloud) {
             let header = Header::parse(&bytes, &Limits::unlimited()).unwrap();
             for level in header.base..=header.top {
-                let most = decoder.memory(&header, level).unwrap();
                 let decoder = decoder.clone().with_level(level);
-                let decode = || decoder.decode(&bytes);
-                decode().unwrap();
-                let (gaussians, held) = peak(decode);
+                decoder.decode(&bytes).unwrap();
+                let [whole, parts] = bounds(&decoder, &header, level);
+                let (gaussians, held) = peak(|| decoder.decode(&bytes));
                 let count = gaussians.unwrap().len();
-                println!("{kind}, level {level}, {count} Gaussians: {held} of {most} bytes");
-                assert!(held <= most + Limits::OVERHEAD, "{kind}, level {level}: {held}");
-                assert!(
-                    most <= 2 * held + Limits::OVERHEAD,
-                    "{kind}, level {level}: {held} of {most}"
-                );
+                let (done, held_in_parts) = peak(|| decoder.decode_in_parts(&bytes, |_| Ok(())));
+                done.unwrap();
+                for (held, most) in [(held, whole), (held_in_parts, parts)] {
+                    println!("{kind}, level {level}, {count} Gaussians: {held} of {most} bytes");
+                    assert!(held <= most + Limits::OVERHEAD, "{kind}, level {level}: {held}");
+                    assert!(
+                        most <= 2 * held + Limits::OVERHEAD,
+                        "{kind}, level {level}: {held} of {most}"
+                    );
+                }
             }
             let limits = Limits::default().with_max_bytes(decoder.memory(&header, header.top).unwrap() - 1);
             let strict = Decoder::new().with_limits(limits);
@@ -177,15 +186,19 @@ fn drawing_version_3_with_learned_heads_holds_no_more_than_the_bound_that_its_he
                 let first = if finest_alone { header.top } else { header.base };
                 for level in first.max(1)..=header.top {
                     let of = format!("{kind}, {set}.{gaussians} in {precision}, level {level}");
-                    let most = decoder.memory(&header, level).unwrap();
+                    let [whole, parts] = bounds(&decoder, &header, level);
                     let decoder = decoder.clone().with_level(level);
-                    let decode = || decoder.decode(&bytes);
                     // Weights are put in order the first time.
-                    decode().unwrap();
-                    let (drawn, held) = peak(decode);
-                    println!("{of}, {} Gaussians: {held} of {most} bytes", drawn.unwrap().len());
-                    assert!(held <= most + Limits::OVERHEAD, "{of}: {held} of {most}");
-                    assert!(10 * most <= 13 * held + 10 * Limits::OVERHEAD, "{of}: {held} of {most}");
+                    decoder.decode(&bytes).unwrap();
+                    let (drawn, held) = peak(|| decoder.decode(&bytes));
+                    let count = drawn.unwrap().len();
+                    let (done, held_in_parts) = peak(|| decoder.decode_in_parts(&bytes, |_| Ok(())));
+                    done.unwrap();
+                    for (held, most) in [(held, whole), (held_in_parts, parts)] {
+                        println!("{of}, {count} Gaussians: {held} of {most} bytes");
+                        assert!(held <= most + Limits::OVERHEAD, "{of}: {held} of {most}");
+                        assert!(10 * most <= 13 * held + 10 * Limits::OVERHEAD, "{of}: {held} of {most}");
+                    }
                 }
             }
         }

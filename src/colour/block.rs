@@ -12,13 +12,13 @@ use super::space::{Steps, Ycc, clamp};
 use super::transform::{EVEN, JOINS, JOINS_OF};
 use super::weights::Weights;
 use crate::geometry::codec::guide::Mode;
-use crate::geometry::{KernelMap, SiblingMap, Window};
+use crate::geometry::{RowBuffer, SiblingMap, Window};
 
 /// The nodes of a level, whose children's colours are coded.
 #[derive(Clone, Copy)]
 pub(super) struct Nodes<'a> {
-    /// The 3³ kernel map of the nodes' level.
-    pub map: &'a KernelMap,
+    /// The map of the nodes' level.
+    pub map: &'a SiblingMap,
     /// That of the children's level.
     pub children: &'a SiblingMap,
     /// The weights of the children.
@@ -84,7 +84,12 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
     let mut blocks = vec![Block::default(); range.len() + 1];
     let scales = Scales::new(coding.steps);
     let mut own_weighting = EVEN[0];
+    let (mut buffer, mut rows) = (RowBuffer::new(), [].as_slice());
     for node in range.clone() {
+        let place = (node - first) % RowBuffer::ROWS;
+        if place == 0 {
+            rows = buffer.fill(nodes.map, node..range.end.min(node + RowBuffer::ROWS));
+        }
         let mask = nodes.masks[node];
         let mode = nodes.guide.map_or(Mode::Intra, |guide| guide.modes[node]);
         if mode == Mode::Skip {
@@ -95,8 +100,8 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
             coded.push(nodes.values[node]);
             continue;
         }
-        let row = nodes.map.row(node);
-        let around = FaceNeighbours::new(nodes.map, nodes.masks, nodes.values, node);
+        let row = &rows[27 * place..][..27];
+        let around = FaceNeighbours::new(row, nodes.masks, nodes.values, node);
         let joins = &JOINS_OF[usize::from(mask)];
         let window = nodes.children.window(node);
         let first_child = nodes.first_child[node] as usize;

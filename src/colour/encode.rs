@@ -16,7 +16,7 @@ use super::weights::{self, Weights};
 use super::{CodeSlice, Guide, LevelColours, Steps, Ycc, join, nodes, slices, trunk};
 use crate::coding::ONE;
 use crate::coding::binary::Encoder;
-use crate::geometry::{KernelMap, Octree, RowBuffer, SiblingMap, Voxels, Window, morton};
+use crate::geometry::{Octree, RowBuffer, SiblingMap, Voxels, Window, morton};
 
 /// Encoding parameters of a level.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -239,7 +239,7 @@ pub fn encode_level(
     isa: Isa,
     octree: &Octree,
     level: u8,
-    above_map: &KernelMap,
+    above_map: &SiblingMap,
     map: &SiblingMap,
     above: &LevelColours,
     truth: &Truth,

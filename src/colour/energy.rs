@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::block::Nodes;
 use super::filter;
-use crate::geometry::KernelMap;
+use crate::geometry::{KernelMap, RowBuffer, SiblingMap};
 
 /// Coefficient energies of a level's nodes, smoothed over their neighbours and copied to each child.
 pub(super) fn spread_energies(isa: Isa, nodes: Nodes<'_>, energies: &[[u8; 3]]) -> Vec<[u8; 3]> {
@@ -20,16 +20,17 @@ pub(super) fn spread_energies(isa: Isa, nodes: Nodes<'_>, energies: &[[u8; 3]]) 
     let mut spread = vec![[0; 3]; count(nodes.masks)];
     let mut tasks = Vec::with_capacity(nodes.masks.len().div_ceil(BLOCK));
     let mut rest = &mut spread[..];
-    for (masks, rows) in nodes.masks.chunks(BLOCK).zip(nodes.map.rows().chunks(27 * BLOCK)) {
+    for (i, masks) in nodes.masks.chunks(BLOCK).enumerate() {
         let (out, after) = rest.split_at_mut(count(masks));
-        tasks.push((masks, rows, out));
+        tasks.push((i * BLOCK, masks, out));
         rest = after;
     }
     let energies = &padded[..];
-    tasks.into_par_iter().for_each(|(masks, rows, out)| {
+    tasks.into_par_iter().for_each(|(first, masks, out)| {
         isa.run(Smooth {
             energies,
-            rows,
+            map: nodes.map,
+            first,
             masks,
             out,
         })
@@ -41,8 +42,9 @@ pub(super) fn spread_energies(isa: Isa, nodes: Nodes<'_>, energies: &[[u8; 3]]) 
 struct Smooth<'a> {
     /// Energies of Y, Co and Cg, and 1, of every node, then zeros.
     energies: &'a [[u16; 4]],
-    /// Kernel map rows of the nodes.
-    rows: &'a [u32],
+    map: &'a SiblingMap,
+    /// The first of the nodes.
+    first: usize,
     masks: &'a [u8],
     out: &'a mut [[u8; 3]],
 }
@@ -54,23 +56,28 @@ impl Work for Smooth<'_> {
     fn run<I: Instructions>(self, _: I) {
         let Smooth {
             energies,
-            rows,
+            map,
+            first,
             masks,
             out,
         } = self;
         let mut out = out.iter_mut();
-        for (row, mask) in rows.chunks_exact(27).zip(masks) {
-            let mut sums = [0u32; 4];
-            // By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
-            add_energies(energies, row, &[KernelMap::CENTRE], 40, &mut sums);
-            add_energies(energies, row, &filter::FACES, 15, &mut sums);
-            add_energies(energies, row, &filter::EDGES, 7, &mut sums);
-            add_energies(energies, row, &filter::CORNERS, 3, &mut sums);
-            let [y, co, cg, weight] = sums;
-            let smoothed = [y, co, cg].map(|sum| (sum / weight.max(1)) as u8);
-            for _ in 0..mask.count_ones() {
-                if let Some(to) = out.next() {
-                    *to = smoothed;
+        let mut buffer = RowBuffer::new();
+        for (first, masks) in (first..).step_by(RowBuffer::ROWS).zip(masks.chunks(RowBuffer::ROWS)) {
+            let rows = buffer.fill(map, first..first + masks.len());
+            for (row, mask) in rows.chunks_exact(27).zip(masks) {
+                let mut sums = [0u32; 4];
+                // By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
+                add_energies(energies, row, &[KernelMap::CENTRE], 40, &mut sums);
+                add_energies(energies, row, &filter::FACES, 15, &mut sums);
+                add_energies(energies, row, &filter::EDGES, 7, &mut sums);
+                add_energies(energies, row, &filter::CORNERS, 3, &mut sums);
+                let [y, co, cg, weight] = sums;
+                let smoothed = [y, co, cg].map(|sum| (sum / weight.max(1)) as u8);
+                for _ in 0..mask.count_ones() {
+                    if let Some(to) = out.next() {
+                        *to = smoothed;
+                    }
                 }
             }
         }

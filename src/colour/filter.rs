@@ -87,11 +87,14 @@ impl Filter {
     /// Filtered [`LevelColours::values`] of a level.
     fn apply(&self, isa: Isa, colours: &LevelColours, map: &SiblingMap, steps: Steps) -> Vec<Ycc> {
         assert_eq!(map.len(), colours.values.len(), "the map must be that of the level");
-        let mut values = colours.values.clone();
+        let mut values: Option<Vec<Ycc>> = None;
         for pass in &self.passes {
-            values = filtered(isa, &values, map, steps, pass);
+            let wide = widen(values.as_deref().unwrap_or(&colours.values));
+            // What has been read makes room for what is made of it.
+            drop(values.take());
+            values = Some(filtered(isa, &wide, map, steps, pass));
         }
-        values
+        values.unwrap_or_else(|| colours.values.clone())
     }
 
     /// Fits a filter that minimises the squared error to the original colours `truth`. `None` if all weights round to
@@ -112,7 +115,7 @@ impl Filter {
             if pass == Pass::default() {
                 break;
             }
-            values = filtered(isa, &values, map, colours.steps, &pass);
+            values = filtered(isa, &widen(&values), map, colours.steps, &pass);
             passes.push(pass);
         }
         (!passes.is_empty()).then_some(Filter { passes })
@@ -120,8 +123,8 @@ impl Filter {
 }
 
 /// Applies one pass to a level.
-fn filtered(isa: Isa, values: &[Ycc], map: &SiblingMap, steps: Steps, pass: &Pass) -> Vec<Ycc> {
-    let (values, mut out) = (&widen(values), vec![[0; 3]; values.len()]);
+fn filtered(isa: Isa, values: &[Values], map: &SiblingMap, steps: Steps, pass: &Pass) -> Vec<Ycc> {
+    let mut out = vec![[0; 3]; values.len()];
     let tasks = out.par_chunks_mut(BLOCK).enumerate();
     tasks.for_each(|(i, out)| {
         isa.run(FilterBlock {

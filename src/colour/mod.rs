@@ -46,7 +46,7 @@ use crate::cancel::Cancel;
 use crate::coding::binary::Decoder;
 use crate::container::Slice;
 use crate::error::{Error, Result, Stage};
-use crate::geometry::{KernelMap, Octree, SiblingMap};
+use crate::geometry::{Octree, SiblingMap};
 use block::{Coding, Nodes};
 use energy::spread_energies;
 use model::{CoefficientContext, Model};
@@ -200,9 +200,8 @@ fn trunk<'t, S: CoefficientCoder>(
         each(level as u8 - 1, &colours);
         let coding = coding_above(coding, depth - level);
         let mut model = std::mem::replace(&mut colours.model, Model::empty());
-        let above = maps[level - 1].table();
         let weights = Weights::Given(&weights[level]);
-        let mut nodes = nodes(octree, level as u8, &above, &maps[level], weights, &colours);
+        let mut nodes = nodes(octree, level as u8, &maps[level - 1], &maps[level], weights, &colours);
         nodes.guide = guides.get(level - 1).copied();
         let coded = isa.run(CodeSlice {
             coder,
@@ -237,7 +236,7 @@ pub fn decode_level(
     isa: Isa,
     octree: &Octree,
     level: u8,
-    above_map: &KernelMap,
+    above_map: &SiblingMap,
     map: &SiblingMap,
     above: &LevelColours,
     payloads: &[Slice],
@@ -338,12 +337,12 @@ fn coding_above(coding: Coding, up: usize) -> Coding {
     Coding { steps, ..coding }
 }
 
-/// The nodes of level `level − 1`, whose children are coded. `map` is their kernel map, `children` that of `level`, of
+/// The nodes of level `level − 1`, whose children are coded. `map` is theirs, `children` that of `level`, of
 /// which the weights are.
 fn nodes<'a>(
     octree: &'a Octree,
     level: u8,
-    map: &'a KernelMap,
+    map: &'a SiblingMap,
     children: &'a SiblingMap,
     weights: Weights<'a>,
     above: &'a LevelColours,

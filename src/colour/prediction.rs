@@ -109,8 +109,7 @@ pub(super) struct FaceNeighbours {
 
 impl FaceNeighbours {
     #[inline(always)]
-    pub fn new(map: &KernelMap, masks: &[u8], values: &[[i16; 3]], node: usize) -> FaceNeighbours {
-        let row = map.row(node);
+    pub fn new(row: &[u32], masks: &[u8], values: &[[i16; 3]], node: usize) -> FaceNeighbours {
         let mut around = FaceNeighbours {
             masks: [0; 7],
             values: [[0; 3]; 7],

@@ -1,5 +1,5 @@
 use super::*;
-use crate::geometry::Voxels;
+use crate::geometry::{KernelMap, Voxels};
 use proptest::prelude::*;
 
 /// A cloud, its octree down to level `top`, and the maps of all levels.
@@ -66,7 +66,7 @@ impl Case {
         );
         let mut payloads = vec![vec![bytes]];
         for level in trunk + 1..=self.octree.depth() {
-            let (above, map) = (self.octree.kernel_map(level - 1), &self.maps[usize::from(level)]);
+            let (above, map) = (self.octree.sibling_map(level - 1), &self.maps[usize::from(level)]);
             let (slices, next) = encode_level(
                 isa,
                 &self.octree,
@@ -93,7 +93,7 @@ impl Case {
         };
         let mut colours = decode_trunk(isa, &self.octree, &self.maps[..=usize::from(trunk)], &first)?;
         for (level, payloads) in (trunk + 1..=self.octree.depth()).zip(&payloads[1..]) {
-            let (above, map) = (self.octree.kernel_map(level - 1), &self.maps[usize::from(level)]);
+            let (above, map) = (self.octree.sibling_map(level - 1), &self.maps[usize::from(level)]);
             let slices: Vec<_> = payloads
                 .iter()
                 .map(|bytes| Slice {

@@ -144,8 +144,8 @@ const KEPT_ABOVE: Term = Term {
     fixed: KEPT.fixed + WINDOWS.fixed,
     by: NOTHING,
 };
-const TABLES: Term = Term {
-    each: "voxel of the level above and two levels above, at the same time",
+const TABLE: Term = Term {
+    each: "voxel of the level above, while the geometry of the level is decoded",
     takes: "kernel map",
     fixed: MAP,
     by: NOTHING,
@@ -164,8 +164,8 @@ const CODING_ABOVE: Term = Term {
 };
 const FILTERING: Term = Term {
     each: "voxel of the level, while its colours are filtered",
-    takes: "colours before and after a pass, and as the pass reads them",
-    fixed: 6 + 6 + 16,
+    takes: "colours as a pass reads them, and after it",
+    fixed: 16 + 6,
     by: NOTHING,
 };
 const CONTEXTS: Term = Term {
@@ -175,7 +175,7 @@ const CONTEXTS: Term = Term {
     by: NOTHING,
 };
 const WALKS: Term = Term {
-    each: "2048 voxels of the level while surfels are made, at most once on each thread",
+    each: "4096 voxels of the level while surfels are made, at most once on each thread",
     takes: "neighbours and sums of moments around them",
     fixed: WALK_BYTES,
     by: NOTHING,
@@ -259,7 +259,8 @@ pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64>
         counts().nth_back(up.into()).unwrap_or(unknown)
     });
     let voxels = counts().next_back().unwrap_or(0);
-    let slices = parents.div_ceil(header.colour_slice().into());
+    let slices = |nodes: u64| nodes.div_ceil(header.colour_slice().into());
+    let threads = rayon::current_num_threads() as u64;
     let terms = [
         (SLICES, header.prefix_bytes(level)?),
         (OCTREE, counts().sum::<u64>() + above(base)),
@@ -267,18 +268,21 @@ pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64>
         (WINDOWS, grandparents + parents),
         (CONTEXTS, 3),
     ];
-    // These do not coexist.
-    let coding = [
-        (TRUNK, above(base.min(MAX_TRUNK_VOXELS.into()))),
-        (KEPT_ABOVE, grandparents),
-        (TABLES, grandparents + parents),
-        (CONTEXTS, slices.min(rayon::current_num_threads() as u64)),
-        (CODING, voxels),
-        (CODING_ABOVE, parents),
-    ];
-    let coding = total(&coding, NOTHING);
+    let colours = |voxels, parents| {
+        let terms = [
+            (TRUNK, above(base.min(MAX_TRUNK_VOXELS.into()))),
+            (KEPT_ABOVE, grandparents),
+            (CONTEXTS, slices(parents).min(threads)),
+            (CODING, voxels),
+            (CODING_ABOVE, parents),
+        ];
+        total(&terms, NOTHING)
+    };
+    // These do not coexist. The geometry of a level is decoded beside the colours of the level above.
+    let geometry = colours(parents, grandparents).saturating_add(TABLE.times(parents, NOTHING));
     let filtering = total(&[(FILTERING, voxels)], NOTHING);
-    Ok(total(&terms, NOTHING).saturating_add(coding.max(filtering).max(drawing)))
+    let most = geometry.max(colours(voxels, parents)).max(filtering).max(drawing);
+    Ok(total(&terms, NOTHING).saturating_add(most))
 }
 
 /// Bytes that making so many surfels of each of so many voxels takes at most, themselves or a part of them included.
@@ -335,7 +339,7 @@ mod tests {
         let base = [BASE, BASE_LEARNING, NEAR, NEAR_LEARNING];
         let drawing = [GENERATOR, GAUSSIANS, EIGHT, ONE];
         let version_2 = [&[SLICES, OCTREE, ABOVE, EXACT][..], &base, &drawing].concat();
-        let version_3 = [SLICES, OCTREE, KEPT, WINDOWS, CONTEXTS, TRUNK, KEPT_ABOVE, TABLES];
+        let version_3 = [SLICES, OCTREE, KEPT, WINDOWS, CONTEXTS, TRUNK, KEPT_ABOVE, TABLE];
         let coding = [CODING, CODING_ABOVE, FILTERING, WALKS, SURFELS];
         let version_3 = [&version_3[..], &coding, &learned::TERMS].concat();
         let tables = [table(&version_2), table(&version_3)];
@@ -426,10 +430,12 @@ mod tests {
         };
         // Levels 1 and 2 have at most 8 and 64 voxels.
         let coding = |up: [u64; 3], slices: u64| {
-            let maps = trunk + (kept + 14) * up[0] + 108 * (up[0] + up[1]);
-            maps + contexts * slices.min(threads) + 14 * up[2] + 46 * up[1]
+            let colours = |slices: u64| trunk + (kept + 14) * up[0] + contexts * slices.min(threads);
+            // No level above has so many voxels that its colours have two slices.
+            let geometry = colours(1) + 14 * up[1] + 46 * up[0] + 108 * up[1];
+            geometry.max(colours(slices) + 14 * up[2] + 46 * up[1])
         };
-        let filtering = |voxels| 28 * voxels;
+        let filtering = |voxels| 22 * voxels;
         for (level, bytes, voxels, up, slices) in [
             (3, 200, 400, [8, 64, 400], 1),
             (4, 400, 1900, [64, 400, 1500], 1),
@@ -441,9 +447,9 @@ mod tests {
             assert_eq!(transform(&header, level, most + 1).unwrap(), expected + most + 1);
         }
         assert!(transform(&header, 6, 0).is_err());
-        assert_eq!(surfels(1000, 3, false), (1 << 20) + 3000 * 56);
-        assert_eq!(surfels(1 << 20, 3, false), (threads << 20) + (3 << 20) * 56);
-        assert_eq!(surfels(1 << 20, 3, true), (threads << 20) + (3 << 15) * 56);
+        assert_eq!(surfels(1000, 3, false), (2 << 20) + 3000 * 56);
+        assert_eq!(surfels(1 << 20, 3, false), (threads << 21) + (3 << 20) * 56);
+        assert_eq!(surfels(1 << 20, 3, true), (threads << 21) + (3 << 15) * 56);
     }
 
     #[test]
@@ -457,12 +463,11 @@ mod tests {
         // 0 to 6 have 1, 8, 64, 512, 4096, 32,768 and 70,000 at most; of these the trunk of colours has 65,536.
         let (with, least) = of(7, 70_000);
         let kept = LevelColours::bytes_per_voxel() as u64 + 32 + 3;
-        let slices = u64::from(rayon::current_num_threads() > 1) * LevelColours::model_bytes() as u64;
         let places = 1 + 8 + 64 + 512 + 4096 + 32_768;
         let always = 13 * (70_000 + places + 70_000) + kept * 140_000 + 14 * (70_000 + 32_768);
-        let maps = 48 * (places + 65_536) + (kept + 14) * 32_768 + 108 * (70_000 + 32_768);
-        let own = always + maps + (14 + 46) * 70_000;
-        let one = 13 + 2 * kept + 2 * 14 + (kept + 14) + 2 * 108 + (14 + 46);
-        assert_eq!(with + one, own + least + slices);
+        let maps = 48 * (places + 65_536) + (kept + 14) * 32_768 + 108 * 70_000;
+        let own = always + maps + 14 * 70_000 + 46 * 32_768;
+        let one = 13 + 2 * kept + 2 * 14 + (kept + 14) + 108 + (14 + 46);
+        assert_eq!(with + one, own + least);
     }
 }

@@ -36,7 +36,7 @@ type History = Vec<motion::Coloured>;
 
 /// The occupancies of a level that were decoded beside the colours of the level above, which are coded apart from them
 /// and take as long.
-type Ahead = Option<(u8, KernelMap, Result<Vec<u8>>)>;
+type Ahead = Option<(u8, Result<Vec<u8>>)>;
 
 impl<'b> Transform<'b> {
     pub(super) fn new(decoder: Decoder, goal: Goal, bytes: Cow<'b, [u8]>) -> Self {
@@ -300,10 +300,11 @@ impl Growing<'_> {
         let name = format!("geometry of levels 0 to {depth}");
         log.step(name, count, "voxels", || {
             for part in self.part.geometry.iter().take(depth.into()) {
-                let map = maps[maps.len() - 1].table();
-                let masks = self.masks(octree, part, &map)?;
+                let map = &maps[maps.len() - 1];
+                let masks = self.masks(octree, part, &map.table())?;
                 octree.grow(masks)?;
-                maps.push(octree.child_siblings(part.level - 1, &map));
+                let children = octree.child_siblings(part.level - 1, map);
+                maps.push(children);
             }
             Ok(())
         })?;
@@ -356,20 +357,15 @@ impl Growing<'_> {
         };
         let slices = &geometry.slices;
         let count = slices.iter().map(|s| s.voxels as usize).sum();
-        let above_map = log.step(format!("geometry of level {n}"), count, "voxels", || {
-            let (map, masks) = match ahead.take() {
-                Some((level, map, masks)) if level == n => (map, masks?),
-                _ => {
-                    let map = above_map.table();
-                    let masks = self.masks(octree, geometry, &map)?;
-                    (map, masks)
-                }
+        log.step(format!("geometry of level {n}"), count, "voxels", || {
+            let masks = match ahead.take() {
+                Some((level, masks)) if level == n => masks?,
+                _ => self.masks(octree, geometry, &above_map.table())?,
             };
-            octree.grow(masks)?;
-            Ok(map)
+            octree.grow(masks)
         })?;
         let map = log.step(format!("neighbours of level {n}"), count, "voxels", || {
-            Ok(octree.child_siblings(n - 1, &above_map))
+            Ok(octree.child_siblings(n - 1, above_map))
         })?;
         let guide = self.inter.map(|inter| inter.colours(octree, n)).transpose()?;
         let name = self.named(format!("colours of level {n}"), n);
@@ -379,7 +375,7 @@ impl Growing<'_> {
             let guide = guide.as_ref().map(ColourGuide::guide);
             let colours = || {
                 let octree = &*octree;
-                colour::decode_level(isa, octree, n, &above_map, &map, above, slices, slice, guide, cancel)
+                colour::decode_level(isa, octree, n, above_map, &map, above, slices, slice, guide, cancel)
             };
             self.with_next_occupancies(octree, n, &map, ahead, colours)
         })?;
@@ -414,12 +410,8 @@ impl Growing<'_> {
         let Some(next) = self.after(n) else {
             return colours();
         };
-        let (coloured, (map, masks)) = rayon::join(colours, || {
-            let map = map.table();
-            let masks = self.masks(octree, next, &map);
-            (map, masks)
-        });
-        *ahead = Some((n + 1, map, masks));
+        let (coloured, masks) = rayon::join(colours, || self.masks(octree, next, &map.table()));
+        *ahead = Some((n + 1, masks));
         coloured
     }
 }

@@ -176,7 +176,7 @@ impl Octree {
     ///
     /// # Panics
     /// As [`Octree::child_map`].
-    pub fn child_siblings(&self, level: u8, map: &KernelMap) -> SiblingMap {
+    pub fn child_siblings(&self, level: u8, map: &SiblingMap) -> SiblingMap {
         SiblingMap::of_children(map, self.occupancy(level), self.first_child(level))
     }
 
@@ -185,9 +185,7 @@ impl Octree {
     /// # Panics
     /// As [`Octree::kernel_map`].
     pub fn sibling_map(&self, level: u8) -> SiblingMap {
-        (0..level).fold(SiblingMap::root(), |map, above| {
-            self.child_siblings(above, &map.table())
-        })
+        (0..level).fold(SiblingMap::root(), |map, above| self.child_siblings(above, &map))
     }
 
     /// The maps of the level above `level`, unless it is the root, and of `level`.
@@ -198,7 +196,7 @@ impl Octree {
         let above = level.checked_sub(1).map(|above| self.sibling_map(above));
         match above {
             Some(map) => {
-                let children = self.child_siblings(level - 1, &map.table());
+                let children = self.child_siblings(level - 1, &map);
                 (Some(map), children)
             }
             None => (None, SiblingMap::root()),

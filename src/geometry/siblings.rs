@@ -143,14 +143,16 @@ impl SiblingMap {
     /// The map of the children of the voxels of `map`, given the occupancy and the first child of each.
     ///
     /// # Panics
-    /// If `map` is not a 3³ map, or the numbers of voxels differ.
-    pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]) -> Self {
-        assert_eq!(map.volume(), 27, "children come from a 3³ map");
+    /// If the numbers of voxels differ.
+    pub(super) fn of_children(map: &SiblingMap, occupancy: &[u8], first_child: &[u32]) -> Self {
         assert_eq!(map.len(), occupancy.len(), "one occupancy per voxel");
         assert_eq!(map.len(), first_child.len(), "one first child per voxel");
-        let rows = map.rows().par_chunks(27 * BLOCK);
-        let blocks = rows.zip(first_child.par_chunks(BLOCK));
-        let blocks = blocks.map(|(rows, firsts)| Block::new(rows, firsts, occupancy, first_child));
+        let blocks = first_child.par_chunks(BLOCK).enumerate();
+        let blocks = blocks.map(|(i, firsts)| {
+            let mut rows = b2p_kernels::zeros(27 * firsts.len());
+            map.fill(i * BLOCK, &mut rows);
+            Block::new(&rows, firsts, occupancy, first_child)
+        });
         SiblingMap {
             len: occupancy.iter().map(|mask| mask.count_ones() as usize).sum(),
             blocks: blocks.collect(),

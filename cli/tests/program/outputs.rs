@@ -321,3 +321,34 @@ fn on_a_terminal_the_program_asks_before_it_overwrites() {
         assert_eq!(answer("\n"), Some(false));
     }
 }
+
+/// Of eight Gaussians of a voxel it is known in the end how many there are.
+#[test]
+fn gaussians_that_are_written_as_they_are_made_give_the_file_of_all_at_once() {
+    let folder = folder_with_stream();
+    let at = folder.path();
+    let heads = b2p::HeadsModel::from_bytes(b2p::embedded::HEADS).unwrap();
+    let stream = std::fs::read(at.join("ball.b2p")).unwrap();
+    for (name, count) in [("surfels", 1), ("surfels", 4), ("quick", 1), ("quick", 8)] {
+        let decoder = b2p::Decoder::new()
+            .with_heads_model(heads.clone())
+            .with_heads(name.parse().unwrap())
+            .with_per_voxel(count);
+        let mut expected = Vec::new();
+        let gaussians = decoder.decode(&stream).unwrap();
+        gaussians.write_ply(&mut expected, Path::new("x")).unwrap();
+        let count = count.to_string();
+        let how = ["--heads", name, "--per-voxel", &count];
+        let decode = |to| b2p(at, &[&["decode", "ball.b2p", "-o", to][..], &how].concat());
+        assert!(decode("out.ply").status.success());
+        assert!(
+            std::fs::read(at.join("out.ply")).unwrap() == expected,
+            "{name}, {count}"
+        );
+        assert!(decode("-").stdout == expected, "{name}, {count} to standard output");
+    }
+    let left = names_in(at)
+        .into_iter()
+        .filter(|name| name.to_string_lossy().starts_with(".b2p"));
+    assert_eq!(left.count(), 0, "temporary files are left");
+}

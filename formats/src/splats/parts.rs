@@ -99,3 +99,62 @@ impl PartWriter {
         rows::loss(self.lost).into_iter().chain(self.unsaid).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::sample;
+    use super::super::write;
+    use super::*;
+    use b2p::Up;
+
+    /// Gaussians from `first` on, at most so many.
+    fn some(of: &Gaussians, first: usize, count: usize) -> Gaussians {
+        let range = first..(first + count).min(of.len());
+        let mut part = of.clone();
+        part.position = of.position[range.clone()].to_vec();
+        part.scale = of.scale[range.clone()].to_vec();
+        part.rotation = of.rotation[range.clone()].to_vec();
+        part.opacity = of.opacity[range.clone()].to_vec();
+        part.colour = of.colour[range.clone()].to_vec();
+        let each = of.harmonics.count;
+        part.harmonics.coefficients = of.harmonics.coefficients[range.start * each..range.end * each].to_vec();
+        part
+    }
+
+    #[test]
+    fn parts_of_any_size_give_the_file_and_the_warnings_that_all_give_at_once() {
+        for harmonics in [0, 3] {
+            let mut all = sample(300, harmonics);
+            all.compensated = true;
+            all.opacity[7] = f32::NAN;
+            all.position[290][1] = f32::INFINITY;
+            for format in [Format::Ply, Format::Splat, Format::Csv] {
+                for (axes, size) in [(Axes::Ply, 1), (Axes::Cloud(Up::Z), 77), (Axes::Gltf, 1000)] {
+                    let (mut expected, mut bytes, path) = (Vec::new(), Vec::new(), Path::new("x"));
+                    let warnings = write(&all, axes, format, &mut expected, path).unwrap();
+                    let mut writer = PartWriter::new(axes, format).unwrap();
+                    for first in (0..all.len()).step_by(size) {
+                        let part = some(&all, first, size);
+                        if first == 0 {
+                            bytes = writer.head(&part, all.len()).unwrap();
+                        }
+                        writer.write_rows(&part, &mut bytes, path).unwrap();
+                    }
+                    assert!(bytes == expected, "{format}, {size} at a time");
+                    assert_eq!(writer.warnings(), warnings);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn formats_that_sort_gaussians_or_have_columns_take_no_parts() {
+        let takes = |format: &Format| PartWriter::new(Axes::Ply, *format).is_some();
+        let formats: Vec<_> = Format::all().filter(takes).collect();
+        assert_eq!(formats, [Format::Ply, Format::Splat, Format::Csv]);
+        let counts = formats
+            .iter()
+            .map(|format| PartWriter::new(Axes::Ply, *format).unwrap().has_count());
+        assert!(counts.eq([true, false, false]));
+    }
+}

@@ -287,7 +287,7 @@ impl<'a> EncoderInput<'a> {
                 colours_above = Decoder::colours_above(octree, level, &coloured.rgb());
             }
             if level > trunk {
-                let (above, map) = (map_of(level - 1).table(), map_of(level));
+                let (above, map) = (map_of(level - 1), map_of(level));
                 let coding = self.coding(steps, top, level);
                 let guide = self
                     .guides
@@ -296,7 +296,7 @@ impl<'a> EncoderInput<'a> {
                 let name = format!("colours of level {level}");
                 let (payloads, next) = log.step(name, count, "voxels", || {
                     Ok(colour::encode_level(
-                        isa, octree, level, &above, map, &coloured, truth, slice, coding, guide,
+                        isa, octree, level, above, map, &coloured, truth, slice, coding, guide,
                     ))
                 })?;
                 coloured = next;
@@ -481,7 +481,7 @@ impl<'a> EncoderInput<'a> {
 fn sibling_maps(octree: &Octree) -> Vec<SiblingMap> {
     let mut maps = vec![SiblingMap::root()];
     for level in 0..octree.depth() {
-        let next = octree.child_siblings(level, &maps[maps.len() - 1].table());
+        let next = octree.child_siblings(level, &maps[maps.len() - 1]);
         maps.push(next);
     }
     maps

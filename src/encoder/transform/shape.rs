@@ -110,11 +110,7 @@ impl EncoderInput<'_> {
     pub(super) fn finest_map(&self, top: u8, shape: Option<&Shape>) -> Cow<'_, SiblingMap> {
         match shape {
             // Several shapes are kept while a rate is looked for, and maps are by far the largest part of them.
-            Some(shape) => Cow::Owned(
-                shape
-                    .octree
-                    .child_siblings(top - 1, &self.maps[usize::from(top) - 1].table()),
-            ),
+            Some(shape) => Cow::Owned(shape.octree.child_siblings(top - 1, &self.maps[usize::from(top) - 1])),
             None => Cow::Borrowed(&self.maps[usize::from(top)]),
         }
     }

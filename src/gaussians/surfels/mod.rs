@@ -44,9 +44,9 @@ use windows::{Window, Windows};
 /// Voxels of a block whose sparsity is measured: part of the definition of surfels.
 const BLOCK: usize = 1024;
 /// Voxels of a task: blocks. Larger ones have fewer voxels around them for each of their own.
-pub const TASK: usize = 2 * BLOCK;
+pub const TASK: usize = 4 * BLOCK;
 /// Voxels that are drawn at a time where surfels are not kept.
-pub const PART: usize = 16 * TASK;
+pub const PART: usize = 8 * TASK;
 /// Opacity of noise: little is seen of it, and all formats of Gaussians can say it.
 const FAINT: f32 = 1.0 / 64.0;
 /// [`Gaussians::blur`], in voxels squared.

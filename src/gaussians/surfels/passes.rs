@@ -6,6 +6,7 @@ use super::discs::{Disc, discs};
 use super::lanes::GROUP;
 use super::moments::{Moments, absolute, centred, near};
 use super::windows::{Window, gathered};
+use crate::geometry::KernelMap;
 
 /// Sums the moments of all neighbours.
 pub struct Sum<'a> {
@@ -22,7 +23,7 @@ impl Work for Sum<'_> {
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
         let absent = self.from.len() - 1;
-        for (to, row) in self.to.iter_mut().zip(self.rows.chunks_exact(27)) {
+        for (to, row) in self.to.iter_mut().zip(self.rows.as_chunks::<27>().0) {
             let mut sum = [0u16; 16];
             for &q in row {
                 // No branch: the presence of neighbours is unpredictable.
@@ -32,6 +33,46 @@ impl Work for Sum<'_> {
                 }
             }
             *to = sum;
+        }
+    }
+}
+
+/// Makes places in a range of rows of neighbours.
+pub struct Locate<'a> {
+    /// The rows of voxels, as a map has them.
+    pub rows: &'a [u32],
+    /// The first voxel of the range, and how many it has.
+    pub range: (u32, u32),
+    /// Gets the places of neighbours in the range, [`Locate::ABSENT`] for others.
+    pub to: &'a mut [u16],
+    /// Gets the numbers of the rows that have neighbours beyond the range.
+    pub edge: &'a mut Vec<u32>,
+}
+
+impl Locate<'_> {
+    /// The place of a neighbour that is not in the range.
+    pub const ABSENT: u16 = u16::MAX;
+}
+
+impl Work for Locate<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        let (first, count) = self.range;
+        let (rows, to) = (self.rows.as_chunks::<27>().0, self.to.as_chunks_mut::<27>().0);
+        for (number, (row, to)) in (0..).zip(rows.iter().zip(to)) {
+            let mut beyond = 0u32;
+            // No branch: the presence of neighbours is unpredictable.
+            for (to, &q) in to.iter_mut().zip(row) {
+                let place = q.wrapping_sub(first);
+                let inside = place < count;
+                *to = if inside { place as u16 } else { Self::ABSENT };
+                beyond |= u32::from(!inside & (q != KernelMap::ABSENT));
+            }
+            if beyond != 0 {
+                self.edge.push(number);
+            }
         }
     }
 }

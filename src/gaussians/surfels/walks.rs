@@ -1,5 +1,5 @@
-//! Moments of consecutive voxels after all steps, from those within two steps of them: what is not drawn at the moment
-//! takes no memory.
+//! Moments of consecutive voxels after all steps (`docs/format.md`, clause 6.2), from those within two steps of them:
+//! what is not drawn at the moment takes no memory.
 
 use std::ops::Range;
 
@@ -10,21 +10,19 @@ use super::passes;
 use crate::geometry::{KernelMap, RowBuffer, SiblingMap, Voxels};
 
 /// Voxels and those around them, at most. There is always room for a single voxel.
-const MOST: usize = 4096;
+const MOST: usize = 8192;
 /// Neighbours beyond the range, of its voxels or of the first ring's, at most.
-const MOST_BEYOND: usize = 1 << 14;
-/// Bytes that [`after_all_steps`] takes at most, for up to 2048 voxels: rows, neighbours beyond, both twice while they
+const MOST_BEYOND: usize = 1 << 15;
+/// Bytes that [`after_all_steps`] takes at most, for up to 4096 voxels: rows, neighbours beyond, both twice while they
 /// grow; moments before and after a step, coordinates, occupied places, rings.
 pub const BYTES: u64 = (MOST * (2 * 27 * 2 + 2 * size_of::<Moments>() + 12 + 4 + 4) + 2 * 8 * MOST_BEYOND) as u64;
-/// In place of a neighbour that is absent.
-const ABSENT: u16 = u16::MAX;
 
 /// The moments of consecutive voxels after all steps.
 ///
 /// # Panics
 /// If the map is not that of the voxels, or these are not among them.
 pub fn after_all_steps(isa: Isa, voxels: &Voxels, map: &SiblingMap, range: Range<usize>) -> Vec<Moments> {
-    if let Some(near) = Near::of(map, range.clone()) {
+    if let Some(near) = Near::of(isa, map, range.clone()) {
         return near.moments(isa, voxels, map);
     }
     let middle = range.start + range.len() / 2;
@@ -45,71 +43,19 @@ struct Near {
 
 impl Near {
     /// `None` if they are too many.
-    fn of(map: &SiblingMap, range: Range<usize>) -> Option<Self> {
-        let mut near = Near {
-            rows: Vec::with_capacity(27 * range.len() * 9 / 8),
-            rings: [Vec::new(), Vec::new()],
-            range,
-        };
-        let mut beyond = Vec::new();
-        near.add_rows(map, near.range.clone(), &mut beyond)?;
-        let first = near.name(&mut beyond, &[])?;
+    fn of(isa: Isa, map: &SiblingMap, range: Range<usize>) -> Option<Self> {
+        let mut finder = Finder::new(isa, map, range.clone());
+        finder.add_rows(range.clone())?;
+        let first = finder.name(&[])?;
         for run in runs(&first) {
-            near.add_rows(map, run, &mut beyond)?;
+            finder.add_rows(run)?;
         }
-        let second = near.name(&mut beyond, &first)?;
-        near.rings = [first, second];
-        Some(near)
-    }
-
-    /// Appends the rows of voxels of the level. Neighbours beyond the range have no place yet: they go to `beyond`, each
-    /// before the index of its entry. `None` if these are too many.
-    fn add_rows(&mut self, map: &SiblingMap, voxels: Range<usize>, beyond: &mut Vec<u64>) -> Option<()> {
-        let (first, count) = (self.range.start as u32, self.range.len() as u32);
-        let mut buffer = RowBuffer::new();
-        for start in voxels.clone().step_by(RowBuffer::ROWS) {
-            let rows = buffer.fill(map, start..voxels.end.min(start + RowBuffer::ROWS));
-            let index = self.rows.len() as u64;
-            for (i, &q) in (index..).zip(rows) {
-                if q != KernelMap::ABSENT && q.wrapping_sub(first) >= count {
-                    beyond.push(u64::from(q) << 32 | i);
-                }
-            }
-            self.rows.extend(rows.iter().map(|&q| match q {
-                KernelMap::ABSENT => ABSENT,
-                q => q.wrapping_sub(first) as u16,
-            }));
-            if beyond.len() > MOST_BEYOND {
-                return None;
-            }
-        }
-        Some(())
-    }
-
-    /// Gives places to neighbours beyond the range, which are taken out, and returns those that are not `known`,
-    /// ascending. `None` if these are too many.
-    fn name(&mut self, beyond: &mut Vec<u64>, known: &[u32]) -> Option<Vec<u32>> {
-        beyond.sort_unstable();
-        let count = self.range.len();
-        let mut new: Vec<u32> = Vec::new();
-        let mut passed = 0;
-        for entry in beyond.drain(..) {
-            let (q, index) = ((entry >> 32) as u32, entry as u32 as usize);
-            while known.get(passed).is_some_and(|&known| known < q) {
-                passed += 1;
-            }
-            let place = match known.get(passed) == Some(&q) {
-                true => passed,
-                false => {
-                    if new.last() != Some(&q) {
-                        new.push(q);
-                    }
-                    known.len() + new.len() - 1
-                }
-            };
-            self.rows[index] = (count + place) as u16;
-        }
-        (count + known.len() + new.len() <= MOST).then_some(new)
+        let second = finder.name(&first)?;
+        Some(Near {
+            range,
+            rings: [first, second],
+            rows: finder.rows,
+        })
     }
 
     /// The moments of the voxels of the range.
@@ -151,6 +97,105 @@ impl Near {
             to: &mut moments[..coordinates.len()],
         });
         moments
+    }
+}
+
+/// Finds what is around consecutive voxels, ring by ring.
+struct Finder<'a> {
+    isa: Isa,
+    map: &'a SiblingMap,
+    range: Range<usize>,
+    rows: Vec<u16>,
+    /// Neighbours beyond the range that have no place yet, and where in `rows` it is missing.
+    missing: Vec<(u32, u32)>,
+    buffer: RowBuffer,
+    /// The last rows of the buffer that have neighbours beyond the range.
+    edge: Vec<u32>,
+    /// By the last bits of its number, a voxel beyond the range and its place: most are found without a search.
+    places: Box<[(u32, u16); SLOTS]>,
+}
+
+/// Voxels beyond the range whose places are found without a search, at most.
+const SLOTS: usize = 2048;
+/// A place that is not known.
+const UNKNOWN: u16 = u16::MAX;
+
+impl<'a> Finder<'a> {
+    fn new(isa: Isa, map: &'a SiblingMap, range: Range<usize>) -> Self {
+        Finder {
+            isa,
+            map,
+            rows: Vec::with_capacity(27 * range.len() * 9 / 8),
+            range,
+            missing: Vec::new(),
+            buffer: RowBuffer::new(),
+            edge: Vec::new(),
+            places: Box::new([(KernelMap::ABSENT, UNKNOWN); SLOTS]),
+        }
+    }
+
+    /// Appends the rows of voxels of the level. `None` if too many of their neighbours lie beyond the range.
+    fn add_rows(&mut self, voxels: Range<usize>) -> Option<()> {
+        let (first, count) = (self.range.start as u32, self.range.len() as u32);
+        for start in voxels.clone().step_by(RowBuffer::ROWS) {
+            let rows = self
+                .buffer
+                .fill(self.map, start..voxels.end.min(start + RowBuffer::ROWS));
+            let index = self.rows.len();
+            self.rows.resize(index + rows.len(), 0);
+            self.isa.run(passes::Locate {
+                rows,
+                range: (first, count),
+                to: &mut self.rows[index..],
+                edge: &mut self.edge,
+            });
+            for row in self.edge.drain(..) {
+                let start = 27 * row as usize;
+                for (i, &q) in (index + start..).zip(&rows[start..][..27]) {
+                    if q != KernelMap::ABSENT && q.wrapping_sub(first) >= count {
+                        self.missing.push((q, i as u32));
+                    }
+                }
+            }
+            if self.missing.len() > MOST_BEYOND {
+                return None;
+            }
+        }
+        Some(())
+    }
+
+    /// Gives places to the neighbours beyond the range, after those of the ones that are `known`, and returns those that
+    /// are not, ascending. `None` if these are too many.
+    fn name(&mut self, known: &[u32]) -> Option<Vec<u32>> {
+        let count = self.range.len();
+        let mut new: Vec<u32> = Vec::new();
+        for &(q, _) in &self.missing {
+            let slot = &mut self.places[q as usize % SLOTS];
+            if slot.0 != q {
+                *slot = (q, UNKNOWN);
+                new.push(q);
+            }
+        }
+        new.sort_unstable();
+        new.dedup();
+        new.retain(|q| known.binary_search(q).is_err());
+        if count + known.len() + new.len() > MOST {
+            return None;
+        }
+        for (place, &q) in (count + known.len()..).zip(&new) {
+            self.places[q as usize % SLOTS] = (q, place as u16);
+        }
+        for (q, index) in self.missing.drain(..) {
+            let place = match self.places[q as usize % SLOTS] {
+                (found, place) if found == q && place != UNKNOWN => place,
+                _ => match (known.binary_search(&q), new.binary_search(&q)) {
+                    (Ok(place), _) => (count + place) as u16,
+                    (_, Ok(place) | Err(place)) => (count + known.len() + place) as u16,
+                },
+            };
+            self.rows[index as usize] = place;
+        }
+        Some(new)
     }
 }
 
@@ -215,18 +260,21 @@ mod tests {
 
     #[test]
     fn parts_of_a_solid_are_halved_until_there_is_room_for_what_is_around_them() {
-        check(5, (0..1 << 15).collect(), &[700, 2048]);
-        let whole = Octree::new(Voxels::new(5, (0..1 << 15).collect())).unwrap();
-        let map = whole.sibling_map(5);
-        let mut firsts = (0..30_000).step_by(700);
-        assert!(firsts.any(|first| Near::of(&map, first..first + 2048).is_none()));
+        check(5, (0..1 << 15).collect(), &[700, 4096]);
+        let large = Octree::new(Voxels::new(6, (0..1 << 18).collect())).unwrap();
+        let map = large.sibling_map(6);
+        assert!(Near::of(Isa::detect(), &map, 14_700..14_700 + 4096).is_none());
+        let range = 14_700..14_700 + 4096;
+        let halves = [14_700..14_700 + 2048, 14_700 + 2048..14_700 + 4096];
+        let all = |range| after_all_steps(Isa::detect(), large.level(6), &map, range);
+        assert!(all(range) == halves.map(all).concat());
     }
 
     #[test]
     fn a_voxel_of_a_solid_has_room_for_all_that_are_around_it() {
         let whole = Octree::new(Voxels::new(5, (0..1 << 15).collect())).unwrap();
         let middle = whole.level(5).keys().binary_search(&morton::encode([9, 9, 9])).unwrap();
-        let near = Near::of(&whole.sibling_map(5), middle..middle + 1).unwrap();
+        let near = Near::of(Isa::detect(), &whole.sibling_map(5), middle..middle + 1).unwrap();
         assert_eq!(near.rings.map(|ring| ring.len()), [26, 98]);
     }
 
@@ -240,8 +288,8 @@ mod tests {
         for (depth, keys) in [(8, bowl.collect::<Vec<_>>()), (21, far.collect())] {
             let octree = Octree::new(Voxels::new(depth, keys)).unwrap();
             let map = octree.sibling_map(depth);
-            for first in (0..map.len()).step_by(2048) {
-                assert!(Near::of(&map, first..map.len().min(first + 2048)).is_some());
+            for first in (0..map.len()).step_by(4096) {
+                assert!(Near::of(Isa::detect(), &map, first..map.len().min(first + 4096)).is_some());
             }
         }
     }
