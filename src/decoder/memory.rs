@@ -174,8 +174,20 @@ const CONTEXTS: Term = Term {
     fixed: LevelColours::model_bytes() as u64,
     by: NOTHING,
 };
+const STEPS: Term = Term {
+    each: "voxel of the level, before surfels are made all at once",
+    takes: "sums of moments, before and after a step",
+    fixed: 2 * 32,
+    by: NOTHING,
+};
+const SUMS: Term = Term {
+    each: "voxel of the level, while surfels are made all at once",
+    takes: "sums of moments",
+    fixed: 32,
+    by: NOTHING,
+};
 const WALKS: Term = Term {
-    each: "4096 voxels of the level while surfels are made, at most once on each thread",
+    each: "4096 voxels of the level while surfels are made in parts or among learned ones, at most once on each thread",
     takes: "neighbours and sums of moments around them",
     fixed: WALK_BYTES,
     by: NOTHING,
@@ -287,9 +299,14 @@ pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64>
 
 /// Bytes that making so many surfels of each of so many voxels takes at most, themselves or a part of them included.
 pub(super) fn surfels(voxels: u64, per_voxel: u64, in_parts: bool) -> u64 {
-    let at_once = if in_parts { voxels.min(PART as u64) } else { voxels };
     let tasks = voxels.div_ceil(TASK as u64).min(rayon::current_num_threads() as u64);
-    total(&[(WALKS, tasks), (SURFELS, at_once.saturating_mul(per_voxel))], NOTHING)
+    let walked = |surfels| total(&[(WALKS, tasks), (SURFELS, surfels)], NOTHING);
+    if in_parts {
+        return walked(voxels.min(PART as u64).saturating_mul(per_voxel));
+    }
+    let surfels = voxels.saturating_mul(per_voxel);
+    let summed = total(&[(SUMS, voxels), (SURFELS, surfels)], NOTHING);
+    walked(surfels).max(summed).max(total(&[(STEPS, voxels)], NOTHING))
 }
 
 #[cfg(test)]
@@ -340,7 +357,7 @@ mod tests {
         let drawing = [GENERATOR, GAUSSIANS, EIGHT, ONE];
         let version_2 = [&[SLICES, OCTREE, ABOVE, EXACT][..], &base, &drawing].concat();
         let version_3 = [SLICES, OCTREE, KEPT, WINDOWS, CONTEXTS, TRUNK, KEPT_ABOVE, TABLE];
-        let coding = [CODING, CODING_ABOVE, FILTERING, WALKS, SURFELS];
+        let coding = [CODING, CODING_ABOVE, FILTERING, STEPS, SUMS, WALKS, SURFELS];
         let version_3 = [&version_3[..], &coding, &learned::TERMS].concat();
         let tables = [table(&version_2), table(&version_3)];
         let missing = tables.iter().filter(|table| !text.contains(*table));
@@ -448,7 +465,8 @@ mod tests {
         }
         assert!(transform(&header, 6, 0).is_err());
         assert_eq!(surfels(1000, 3, false), (2 << 20) + 3000 * 56);
-        assert_eq!(surfels(1 << 20, 3, false), (threads << 21) + (3 << 20) * 56);
+        assert_eq!(surfels(1 << 24, 3, false), (1 << 24) * 32 + (3 << 24) * 56);
+        assert_eq!(surfels(1 << 24, 0, false), (1 << 24) * 64);
         assert_eq!(surfels(1 << 20, 3, true), (threads << 21) + (3 << 15) * 56);
     }
 

@@ -27,6 +27,7 @@ mod tests;
 mod walks;
 mod windows;
 
+use std::borrow::Cow;
 use std::ops::Range;
 
 use b2p_kernels::{Isa, zeros};
@@ -155,7 +156,11 @@ impl Surfels<'_> {
     /// If the map, the voxels, the colours and the choice differ in length, or the range has other voxels.
     pub fn all(&self) -> Gaussians {
         let range = self.checked_range();
-        self.of(range.clone(), self.is_sparse(range))
+        let sparse = self.is_sparse(range.clone());
+        // Summing over the whole level is faster, unless little of it is wanted.
+        let moments = self.choice.only.is_none();
+        let moments = moments.then(|| moments::after_all_steps(self.isa, self.voxels, self.map));
+        self.of(range, sparse, moments.as_deref())
     }
 
     /// Makes the same discs in parts of at most [`PART`] voxels, and calls `each` with one after the other. There is one
@@ -170,7 +175,7 @@ impl Surfels<'_> {
         let range = self.checked_range();
         let sparse = self.is_sparse(range.clone());
         for first in range.clone().step_by(PART) {
-            each(self.of(first..range.end.min(first + PART), sparse))?;
+            each(self.of(first..range.end.min(first + PART), sparse, None))?;
         }
         Ok(())
     }
@@ -188,8 +193,9 @@ impl Surfels<'_> {
         sparsity::is_sparse(self.map, range)
     }
 
-    /// The discs of chosen voxels of a range that starts with a block of the level's range.
-    fn of(&self, range: Range<usize>, sparse: bool) -> Gaussians {
+    /// The discs of chosen voxels of a range that starts with a block of the level's range. `moments` are those of all
+    /// voxels after all steps, if they are known.
+    fn of(&self, range: Range<usize>, sparse: bool, moments: Option<&[Moments]>) -> Gaussians {
         let n = self.per_voxel.count();
         let count = n * range.clone().filter(|&voxel| self.choice.has(voxel)).count();
         let edge = self.edge();
@@ -210,7 +216,10 @@ impl Surfels<'_> {
             if rows.opacity.is_empty() {
                 return;
             }
-            let far = walks::after_all_steps(self.isa, self.voxels, self.map, task.clone());
+            let far = match moments {
+                Some(moments) => Cow::Borrowed(&moments[task.clone()]),
+                None => Cow::Owned(walks::after_all_steps(self.isa, self.voxels, self.map, task.clone())),
+            };
             let blocks = rows.tasks(task.clone(), BLOCK, n, self.choice);
             for ((first, rows), far) in blocks.into_iter().zip(far.chunks(BLOCK)) {
                 self.draw(first, far, sparse, rows);

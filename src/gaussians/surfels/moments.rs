@@ -9,12 +9,20 @@
 //! to the voxel's own coordinate, where they are exact: below 2¹⁶ (n ≤ 27³, Σx² ≤ 2 · 27³) or within ±2¹⁵ (|Σx| ≤ 5/9 ·
 //! 27³, |Σxy| ≤ 5/4 · 27³). The first step counts the occupied places of the voxel's row instead.
 
+use b2p_kernels::{Isa, zeros};
+use rayon::prelude::*;
+
 use super::lanes::{GROUP, Lane};
+use super::passes;
+use crate::geometry::{SiblingMap, Voxels};
 
 /// Steps of a walk.
 pub const ROUNDS: usize = 3;
 /// n, Σx, Σy, Σz, Σxx, Σyy, Σzz, Σxy, Σxz, Σyz, and six unused values that pad it to 32 bytes.
 pub type Moments = [u16; 16];
+/// Voxels per task.
+const BLOCK: usize = 1024;
+
 /// Of each axis the places of a 3³ row one step behind the voxel, and one step ahead of it.
 const STEPS: [[u32; 2]; 3] = {
     let mut steps = [[0; 2]; 3];
@@ -67,6 +75,41 @@ pub fn absolute(mask: u32, coordinate: [u32; 3]) -> Moments {
     for (k, (a, b)) in PAIRS.into_iter().enumerate() {
         let moved = times(times(n, c[a]).wrapping_add(sum[a]), c[b]).wrapping_add(times(c[a], sum[b]));
         moments[4 + k] = relative[4 + k].wrapping_add(moved);
+    }
+    moments
+}
+
+/// The moments of every voxel of a level after one step, then one element of zeros.
+fn after_one_step(isa: Isa, voxels: &Voxels, map: &SiblingMap) -> Vec<Moments> {
+    let mut moments: Vec<Moments> = zeros(voxels.len() + 1);
+    let blocks = moments[..voxels.len()].par_chunks_mut(BLOCK).enumerate();
+    blocks.for_each(|(i, to)| {
+        let (mut masks, mut coordinates) = ([0; BLOCK], [[0; 3]; BLOCK]);
+        let (masks, coordinates) = (&mut masks[..to.len()], &mut coordinates[..to.len()]);
+        map.masks(i * BLOCK, masks);
+        for (voxel, coordinate) in (i * BLOCK..).zip(coordinates.iter_mut()) {
+            *coordinate = voxels.coordinate(voxel);
+        }
+        isa.run(passes::FirstStep { masks, coordinates, to });
+    });
+    moments
+}
+
+/// The moments of every voxel of a level after all steps, then one element of zeros.
+pub fn after_all_steps(isa: Isa, voxels: &Voxels, map: &SiblingMap) -> Vec<Moments> {
+    let mut moments = after_one_step(isa, voxels, map);
+    let mut spare: Vec<Moments> = zeros(moments.len());
+    for _ in 1..ROUNDS {
+        let blocks = spare[..map.len()].par_chunks_mut(BLOCK).enumerate();
+        blocks.for_each(|(i, to)| {
+            isa.run(passes::SumOfLevel {
+                from: &moments,
+                map,
+                first: i * BLOCK,
+                to,
+            });
+        });
+        std::mem::swap(&mut moments, &mut spare);
     }
     moments
 }

@@ -6,7 +6,7 @@ use super::discs::{Disc, discs};
 use super::lanes::GROUP;
 use super::moments::{Moments, absolute, centred, near};
 use super::windows::{Window, gathered};
-use crate::geometry::KernelMap;
+use crate::geometry::{KernelMap, RowBuffer, SiblingMap};
 
 /// Sums the moments of all neighbours.
 pub struct Sum<'a> {
@@ -22,19 +22,50 @@ impl Work for Sum<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
-        let absent = self.from.len() - 1;
         for (to, row) in self.to.iter_mut().zip(self.rows.as_chunks::<27>().0) {
-            let mut sum = [0u16; 16];
-            for &q in row {
-                // No branch: the presence of neighbours is unpredictable.
-                let from = &self.from[absent.min(q.into())];
-                for (sum, value) in sum.iter_mut().zip(from) {
-                    *sum = sum.wrapping_add(*value);
-                }
-            }
-            *to = sum;
+            *to = sum(self.from, row.iter().map(|&q| q.into()));
         }
     }
+}
+
+/// Sums the moments of all neighbours of consecutive voxels of a level.
+pub struct SumOfLevel<'a> {
+    /// Moments of each voxel of the level, then zeros for absent neighbours.
+    pub from: &'a [Moments],
+    pub map: &'a SiblingMap,
+    /// The first voxel of `to`.
+    pub first: usize,
+    pub to: &'a mut [Moments],
+}
+
+impl Work for SumOfLevel<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        let mut buffer = RowBuffer::new();
+        for (i, to) in self.to.chunks_mut(RowBuffer::ROWS).enumerate() {
+            let first = self.first + i * RowBuffer::ROWS;
+            let rows = buffer.fill(self.map, first..first + to.len());
+            for (to, row) in to.iter_mut().zip(rows.as_chunks::<27>().0) {
+                *to = sum(self.from, row.iter().map(|&q| q as usize));
+            }
+        }
+    }
+}
+
+/// The sum of the moments of a row. Absent neighbours lie beyond the zeros that end the moments.
+#[inline(always)]
+fn sum(moments: &[Moments], row: impl Iterator<Item = usize>) -> Moments {
+    let absent = moments.len() - 1;
+    let mut sum = [0u16; 16];
+    for q in row {
+        // No branch: the presence of neighbours is unpredictable.
+        for (sum, value) in sum.iter_mut().zip(&moments[absent.min(q)]) {
+            *sum = sum.wrapping_add(*value);
+        }
+    }
+    sum
 }
 
 /// Makes places in a range of rows of neighbours.
