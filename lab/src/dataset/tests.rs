@@ -84,6 +84,23 @@ fn samples_depend_on_the_seed_alone_not_on_threads_or_how_many_are_made() {
 }
 
 #[test]
+fn no_sample_is_noisy_unless_asked_for_and_then_its_voxels_differ() {
+    let voxels = |noisy: f64| -> Vec<Vec<u8>> {
+        let samples = made(&Options { noisy, ..options() }, 1);
+        let finest = samples.iter().map(|(_, bytes)| {
+            let file = safetensors::SafeTensors::deserialize(bytes).unwrap();
+            file.tensor("xyz.3").unwrap().data().to_vec()
+        });
+        finest.collect()
+    };
+    let exact = voxels(0.0);
+    assert_eq!(exact, voxels(1e-300));
+    for (noisy, exact) in voxels(1.0).iter().zip(&exact) {
+        assert_ne!(noisy, exact);
+    }
+}
+
+#[test]
 fn a_samples_levels_fit_together_and_its_pictures_show_its_voxels() {
     for (name, bytes) in made(&options(), 2) {
         let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();

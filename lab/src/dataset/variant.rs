@@ -56,6 +56,8 @@ pub(super) struct Variant {
 const PROTOCOL_POINTS: f64 = 15e6;
 const PROTOCOL_FILL: f64 = 0.95;
 const PROTOCOL_BITS: u8 = 10;
+/// Parts the random numbers of noise from those of all else.
+const NOISE: u64 = 0x006e_6f69_7365;
 
 impl Variant {
     pub fn random(kind: Kind, options: &Options, photos: bool, random: &mut Random) -> Self {
@@ -74,10 +76,10 @@ impl Variant {
         // As dense in voxels as the protocol's own clouds.
         let side = fill / PROTOCOL_FILL * f64::from(1u32 << bits) / f64::from(1 << PROTOCOL_BITS);
         let dense = PROTOCOL_POINTS * side * side;
-        // No random numbers are drawn where no sample is noisy, so that a seed's samples stay what they were.
-        let noisy = options.noisy > 0.0 && random.chance(options.noisy);
-        let (points, noise) = if noisy {
-            (dense * random.log_range(0.06, 0.6), random.range(0.15, 0.8))
+        // Random numbers of its own: a sample is the same but for the noise.
+        let mut own = random.fork(NOISE);
+        let (points, noise) = if own.chance(options.noisy) {
+            (dense * own.log_range(0.06, 0.6), own.range(0.15, 0.8))
         } else {
             (dense, 0.0)
         };
