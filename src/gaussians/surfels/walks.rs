@@ -13,7 +13,7 @@ use crate::geometry::{KernelMap, RowBuffer, SiblingMap, Voxels};
 const MOST: usize = 8192;
 /// Neighbours beyond the range, of its voxels or of the first ring's, at most.
 const MOST_BEYOND: usize = 1 << 15;
-/// Bytes that [`after_all_steps`] takes at most, for up to 4096 voxels: rows, neighbours beyond, both twice while they
+/// Bytes that making the moments of up to 4096 voxels takes at most: rows, neighbours beyond, both twice while they
 /// grow; moments before and after a step, coordinates, occupied places, rings.
 pub const BYTES: u64 = (MOST * (2 * 27 * 2 + 2 * size_of::<Moments>() + 12 + 4 + 4) + 2 * 8 * MOST_BEYOND) as u64;
 
