@@ -187,7 +187,7 @@ const SUMS: Term = Term {
     by: NOTHING,
 };
 const WALKS: Term = Term {
-    each: "4096 voxels of the level while surfels are made in parts or among learned ones, at most once on each thread",
+    each: "4096 voxels of the level while surfels are made in parts, at most once on each thread",
     takes: "neighbours and sums of moments around them",
     fixed: WALK_BYTES,
     by: NOTHING,
@@ -299,14 +299,13 @@ pub(super) fn transform(header: &Header, level: u8, drawing: u64) -> Result<u64>
 
 /// Bytes that making so many surfels of each of so many voxels takes at most, themselves or a part of them included.
 pub(super) fn surfels(voxels: u64, per_voxel: u64, in_parts: bool) -> u64 {
-    let tasks = voxels.div_ceil(TASK as u64).min(rayon::current_num_threads() as u64);
-    let walked = |surfels| total(&[(WALKS, tasks), (SURFELS, surfels)], NOTHING);
     if in_parts {
-        return walked(voxels.min(PART as u64).saturating_mul(per_voxel));
+        let tasks = voxels.div_ceil(TASK as u64).min(rayon::current_num_threads() as u64);
+        let surfels = voxels.min(PART as u64).saturating_mul(per_voxel);
+        return total(&[(WALKS, tasks), (SURFELS, surfels)], NOTHING);
     }
-    let surfels = voxels.saturating_mul(per_voxel);
-    let summed = total(&[(SUMS, voxels), (SURFELS, surfels)], NOTHING);
-    walked(surfels).max(summed).max(total(&[(STEPS, voxels)], NOTHING))
+    let made = total(&[(SUMS, voxels), (SURFELS, voxels.saturating_mul(per_voxel))], NOTHING);
+    total(&[(STEPS, voxels)], NOTHING).max(made)
 }
 
 #[cfg(test)]
@@ -464,9 +463,9 @@ mod tests {
             assert_eq!(transform(&header, level, most + 1).unwrap(), expected + most + 1);
         }
         assert!(transform(&header, 6, 0).is_err());
-        assert_eq!(surfels(1000, 3, false), (2 << 20) + 3000 * 56);
-        assert_eq!(surfels(1 << 24, 3, false), (1 << 24) * 32 + (3 << 24) * 56);
-        assert_eq!(surfels(1 << 24, 0, false), (1 << 24) * 64);
+        assert_eq!(surfels(1000, 3, false), 1000 * 32 + 3000 * 56);
+        assert_eq!(surfels(1000, 0, false), 1000 * 64);
+        assert_eq!(surfels(1000, 3, true), (2 << 20) + 3000 * 56);
         assert_eq!(surfels(1 << 20, 3, true), (threads << 21) + (3 << 15) * 56);
     }
 

@@ -157,10 +157,9 @@ impl Surfels<'_> {
     pub fn all(&self) -> Gaussians {
         let range = self.checked_range();
         let sparse = self.is_sparse(range.clone());
-        // Summing over the whole level is faster, unless little of it is wanted.
-        let moments = self.choice.only.is_none();
-        let moments = moments.then(|| moments::after_all_steps(self.isa, self.voxels, self.map));
-        self.of(range, sparse, moments.as_deref())
+        // Summing over the whole level takes more memory and less time.
+        let moments = moments::after_all_steps(self.isa, self.voxels, self.map);
+        self.of(range, sparse, Some(&moments))
     }
 
     /// Makes the same discs in parts of at most [`PART`] voxels, and calls `each` with one after the other. There is one
