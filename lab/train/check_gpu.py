@@ -104,8 +104,9 @@ def check_splatter(gaussians, k, samples, role, batch):
 def check_training(folder):
     """A few steps from the project's heads run, and every head is written."""
     out = os.path.join(folder, "out")
-    train_gpu.main(["--device", "cpu", "--data", folder, "--out", out, "--minutes", "0.1", "--wait", "2", "--most", "2",
-                    "--init", os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../models/heads.safetensors")])
+    steps = train_gpu.main(["--device", "cpu", "--data", folder, "--out", out, "--minutes", "0.1", "--wait", "2", "--most", "2",
+                            "--init", os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../models/heads.safetensors")])
+    assert steps > 0
     assert sorted(os.listdir(out)) == ["best.1.pt", "best.8.pt", "quick.1.pt", "quick.8.pt"]
 
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Trains all heads on, on a GPU: remake_gpu.sh MESHES PHOTOS OUT MINUTES [ARGUMENTS OF train_gpu.py…]
-# Samples, and their optimised occupancy, are made beside it: 1,584 in five minutes of 16 cores. LAB names a built `b2p-lab`, PYTHON an interpreter that has
+# Samples, and their optimised occupancy, are made beside it: 1,584 in less than four minutes of 16 cores. LAB names a built `b2p-lab`, PYTHON an interpreter that has
 # torch, CuPy and the package `b2p`.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)

@@ -298,6 +298,7 @@ def main(argv=None):
     evaluate(learners, library, args, say)
     save(every, args.out)
     say("done", steps)
+    return steps
 
 
 if __name__ == "__main__":

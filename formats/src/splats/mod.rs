@@ -281,8 +281,9 @@ fn up_in_comments(bytes: &[u8]) -> Option<Up> {
     ply.header.comments.iter().find_map(named)
 }
 
-/// What [`write()`] subtracts from the coordinates of a cube in a file of this format, in the axes of the file. Zeros for formats
-/// that hold the coordinates of the world: CSV, whose numbers are decimal, and glTF, whose node has the offset.
+/// What [`write()`] subtracts from the coordinates of Gaussians with this frame in a file of this format, in the axes of
+/// the file. Zeros for formats that hold the coordinates of the world: CSV, whose numbers are decimal, and glTF, whose
+/// node has the offset.
 pub fn offset(frame: Frame, axes: Axes, format: Format) -> [f64; 3] {
     match format {
         Format::Csv | Format::Glb | Format::Gltf => [0.0; 3],
