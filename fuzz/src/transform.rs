@@ -51,7 +51,7 @@ pub(crate) fn rewrite(writer: &mut Writer, level: &Level, colours: &Colours) {
 /// Any bytes under small limits, whole and in pieces whose sizes the last bytes tell: an error, or as many voxels with
 /// colours, and finite Gaussians of them, as the header tells; the same both times. A level that is refused leaves
 /// those before it as they were, no level takes more memory than it may, and all of it is given back. A check of the
-/// stream finds the same, and names the clause of each fault.
+/// stream finds the same, and names the clause of each fault. Gaussians that come in parts are those that come at once.
 pub fn transform(bytes: &[u8]) {
     giving_back(|| decoded(bytes));
 }
@@ -92,8 +92,12 @@ fn decoded(bytes: &[u8]) {
         );
     }
     if reached.is_some() && one_in(2, bytes) {
-        let gaussians = within(most, || decoding.gaussians());
-        finite(&gaussians.expect("every level is drawn"));
+        let gaussians = within(most, || decoding.gaussians()).expect("every level is drawn");
+        finite(&gaussians);
+        if error.is_none() {
+            let parts = within(2 * most, || in_parts(&decoder, bytes));
+            assert!(parts == gaussians, "parts are other Gaussians");
+        }
     }
     if one_in(3, bytes) {
         let told = |error: Option<Error>| error.map(|error| error.to_string());
@@ -128,6 +132,23 @@ fn pieced(decoder: &Decoder, bytes: &[u8]) -> Found {
         decoding.finish()
     })();
     (points(&decoding), result.err())
+}
+
+/// The Gaussians of a whole stream, put together from parts.
+fn in_parts(decoder: &Decoder, bytes: &[u8]) -> Gaussians {
+    let mut whole = Gaussians::default();
+    let each = |part: &Gaussians| {
+        part.check_lengths()?;
+        whole.position.extend(&part.position);
+        whole.scale.extend(&part.scale);
+        whole.rotation.extend(&part.rotation);
+        whole.opacity.extend(&part.opacity);
+        whole.colour.extend(&part.colour);
+        (whole.frame, whole.blur, whole.compensated) = (part.frame, part.blur, part.compensated);
+        Ok(())
+    };
+    decoder.decode_in_parts(bytes, each).expect("a stream that decodes, decodes in parts");
+    whole
 }
 
 fn finite(gaussians: &Gaussians) {
