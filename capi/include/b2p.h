@@ -101,6 +101,10 @@ typedef struct b2p_arrays {
   double unit;
 } b2p_arrays;
 
+// Takes a part of the Gaussians, whose numbers are there until it returns. Gives false to have no more of them. It must not unwind,
+// and may not call functions with the decoding that the Gaussians come from.
+typedef bool (*b2p_part)(const struct b2p_arrays *arrays, void *context);
+
 // Where the numbers of points lie, until these are freed. A voxel with coordinates `c` covers `origin + c * voxel_size` to
 // `origin + (c + 1) * voxel_size` in the world, along each axis; its point is the middle.
 typedef struct b2p_point_arrays {
@@ -322,6 +326,27 @@ enum b2p_status b2p_gaussians_arrays(const struct b2p_gaussians *gaussians,
 // # Safety
 // `gaussians` is NULL or came from this library, and is not used any more.
 void b2p_gaussians_free(struct b2p_gaussians *gaussians);
+
+// Says, before the first bytes come, that Gaussians will be asked for in parts alone: limits then count no more of them than there are
+// in memory. Fails with USAGE.
+//
+// # Safety
+// `decoding` is a decoding; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_use_parts(struct b2p_decoding *decoding,
+                                       char *message,
+                                       size_t size);
+
+// Makes the Gaussians of the deepest level decoded so far, and calls `each` with `context` and one part of them after the other, in
+// order. No more than a part of a stream is in memory at a time, 131,072 Gaussians; those of a scene, or of a stream of version 2, come
+// in one part. A part may be empty. Fails as b2p_decoding_gaussians does, and with CANCELLED when `each` gives false.
+//
+// # Safety
+// `decoding` is a decoding; `each` may be called with `context`; `message` is NULL or leads to `size` bytes.
+enum b2p_status b2p_decoding_gaussians_in_parts(const struct b2p_decoding *decoding,
+                                                b2p_part each,
+                                                void *context,
+                                                char *message,
+                                                size_t size);
 
 // The points of the deepest level decoded so far, in Morton order. Fails with UNSUPPORTED for streams of version 2, whose colours
 // are those of Gaussians, with USAGE, and for a scene as b2p_decoding_advance does.

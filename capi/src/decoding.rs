@@ -99,6 +99,26 @@ impl Decoding {
         }
     }
 
+    pub(crate) fn gaussians_in_parts(
+        &self,
+        mut each: impl FnMut(&b2p::Gaussians) -> b2p::Result<()>,
+    ) -> b2p::Result<()> {
+        match &self.scene {
+            Some(scene) => each(&scene.gaussians()?),
+            None => self.stream.gaussians_in_parts(each),
+        }
+    }
+
+    /// Counts Gaussians in parts from now on, which is before the first bytes.
+    pub(crate) fn use_parts(&mut self) -> Result<(), Fault> {
+        if !self.start.is_empty() {
+            return Err(Fault::usage("bytes have come already"));
+        }
+        self.decoder = self.decoder.clone().with_gaussians_in_parts();
+        self.stream = self.decoder.start();
+        Ok(())
+    }
+
     /// The voxels of the level reached with their colours; `None` of streams that have no colours of voxels.
     pub(crate) fn points(&self) -> b2p::Result<Option<DecodedPoints>> {
         if let Some(scene) = &self.scene {
@@ -139,6 +159,22 @@ pub struct Arrays {
     pub origin: [f64; 3],
     /// One unit of the cube frame in the world's.
     pub unit: f64,
+}
+
+impl Arrays {
+    /// Where those of `gaussians` lie.
+    pub(crate) fn of(gaussians: &b2p::Gaussians) -> Arrays {
+        Arrays {
+            count: gaussians.len(),
+            position: gaussians.position.as_ptr().cast(),
+            scale: gaussians.scale.as_ptr().cast(),
+            rotation: gaussians.rotation.as_ptr().cast(),
+            opacity: gaussians.opacity.as_ptr(),
+            colour: gaussians.colour.as_ptr().cast(),
+            origin: gaussians.frame.placement.origin,
+            unit: gaussians.frame.unit(),
+        }
+    }
 }
 
 /// A new switch.
@@ -425,16 +461,7 @@ pub unsafe extern "C" fn b2p_gaussians_arrays(
     let run = || {
         // SAFETY: the caller vouches for `gaussians` and `arrays`.
         let (Gaussians(g), arrays) = unsafe { (borrowed(gaussians, "gaussians")?, changed(arrays, "arrays")?) };
-        *arrays = Arrays {
-            count: g.len(),
-            position: g.position.as_ptr().cast(),
-            scale: g.scale.as_ptr().cast(),
-            rotation: g.rotation.as_ptr().cast(),
-            opacity: g.opacity.as_ptr(),
-            colour: g.colour.as_ptr().cast(),
-            origin: g.frame.placement.origin,
-            unit: g.frame.unit(),
-        };
+        *arrays = Arrays::of(g);
         Ok(())
     };
     // SAFETY: the caller vouches for `message`.

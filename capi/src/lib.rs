@@ -6,6 +6,7 @@
 mod boundary;
 mod decoding;
 mod model;
+mod parts;
 mod picture;
 #[cfg(feature = "page")]
 mod player;
@@ -18,6 +19,7 @@ pub mod wasm;
 pub use boundary::Status;
 pub use decoding::{Arrays, Cancel, Decoding, Gaussians};
 pub use model::{Limits, Model};
+pub use parts::Part;
 pub use picture::Camera;
 #[cfg(feature = "page")]
 pub use player::{PlayedFrame, Player, SequenceInfo};

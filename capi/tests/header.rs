@@ -7,7 +7,7 @@ use std::path::Path;
 fn the_header_is_the_source_s() {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let config = cbindgen::Config::from_file(here.join("cbindgen.toml")).expect("a configuration");
-    let sources = ["boundary", "model", "decoding", "points", "picture"];
+    let sources = ["boundary", "model", "decoding", "parts", "points", "picture"];
     let mut builder = cbindgen::Builder::new().with_config(config);
     for source in sources {
         builder = builder.with_src(here.join(format!("src/{source}.rs")));

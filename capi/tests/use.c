@@ -188,6 +188,51 @@ static void points(b2p_decoding *decoding, const b2p_arrays *frame) {
     b2p_points_free(NULL);
 }
 
+typedef struct {
+    size_t count, parts, most;
+    double shapes, opacities;
+} parts_seen;
+
+/* Adds up a part, and stops after the most that are wanted. */
+static bool add_part(const b2p_arrays *arrays, void *context) {
+    parts_seen *seen = context;
+    for (size_t i = 0; i < 3 * arrays->count; i++) {
+        seen->shapes += arrays->position[i] + arrays->scale[i] + arrays->colour[i];
+    }
+    for (size_t i = 0; i < arrays->count; i++) {
+        seen->opacities += arrays->opacity[i] + arrays->rotation[4 * i];
+    }
+    seen->count += arrays->count;
+    return ++seen->parts < seen->most;
+}
+
+/* The Gaussians that come in parts are those that come at once. */
+static void in_parts(file stream) {
+    b2p_decoding *decoding = NULL;
+    b2p_gaussians *gaussians = NULL;
+    CHECK(b2p_decoding_use_parts(NULL, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_start(NULL, NULL, NULL, -1, &decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_use_parts(decoding, message, sizeof message) == B2P_STATUS_OK);
+    parts_seen seen = {0, 0, 1000, 0, 0};
+    CHECK(b2p_decoding_gaussians_in_parts(decoding, add_part, &seen, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_push(decoding, stream.bytes, stream.length, NULL, 0) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_use_parts(decoding, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(b2p_decoding_finish(decoding, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_gaussians_in_parts(decoding, NULL, &seen, message, sizeof message) == B2P_STATUS_USAGE);
+    CHECK(seen.parts == 0);
+    CHECK(b2p_decoding_gaussians_in_parts(decoding, add_part, &seen, message, sizeof message) == B2P_STATUS_OK);
+    CHECK(b2p_decoding_gaussians(decoding, &gaussians, message, sizeof message) == B2P_STATUS_OK);
+    b2p_arrays whole;
+    CHECK(b2p_gaussians_arrays(gaussians, &whole, NULL, 0) == B2P_STATUS_OK);
+    parts_seen once = {0, 0, 1000, 0, 0};
+    add_part(&whole, &once);
+    CHECK(seen.count == once.count && seen.shapes == once.shapes && seen.opacities == once.opacities);
+    b2p_gaussians_free(gaussians);
+    seen.most = 0;
+    CHECK(b2p_decoding_gaussians_in_parts(decoding, add_part, &seen, message, sizeof message) == B2P_STATUS_CANCELLED);
+    b2p_decoding_free(decoding);
+}
+
 /* A stream of version 3 without a model, in two pieces. */
 static void without_model(file stream) {
     b2p_decoding *decoding = NULL;
@@ -269,6 +314,7 @@ int main(int count, char **arguments) {
     free(blocks.bytes);
     file new_stream = read_file(arguments[4]);
     without_model(new_stream);
+    in_parts(new_stream);
     free(new_stream.bytes);
     file model_file = read_file(arguments[3]), stream = read_file(arguments[2]);
     b2p_model *model = NULL, *both = NULL;

@@ -147,7 +147,9 @@ fn in_parts(decoder: &Decoder, bytes: &[u8]) -> Gaussians {
         (whole.frame, whole.blur, whole.compensated) = (part.frame, part.blur, part.compensated);
         Ok(())
     };
-    decoder.decode_in_parts(bytes, each).expect("a stream that decodes, decodes in parts");
+    decoder
+        .decode_in_parts(bytes, each)
+        .expect("a stream that decodes, decodes in parts");
     whole
 }
 
