@@ -1,10 +1,12 @@
 """Decodes streams of version 3, and holds a folder of conformance streams against their digests.
 
-    python3 spec/decode.py STREAM.b2p           prints the digests of every level, of each block and of each frame
-    python3 spec/decode.py --suite FOLDER       checks all streams of FOLDER/suite.txt
-    python3 spec/decode.py --damage LIST        checks that the streams of LIST are refused for the stated clauses
+    python3 spec/decode.py STREAM.b2p [HEADS.safetensors best|quick]
+                                           prints the digests of every level, of each block and of each frame
+    python3 spec/decode.py --suite FOLDER  checks all streams of FOLDER, drawn as surfels and with learned heads
+    python3 spec/decode.py --damage LIST   checks that the streams of LIST are refused for the stated clauses
 """
 
+import functools
 import hashlib
 import struct
 import sys
@@ -16,6 +18,7 @@ import colour
 import container
 import geometry
 import head_map
+import heads
 import scene
 import sequence
 import surfels
@@ -45,7 +48,7 @@ class Decoder:
             self.motion.reach(voxels)
 
     def decode(self, level):
-        """The next level: its voxels and its display colours."""
+        """The next level."""
         part = container.read_level(self.data, self.header, level)
         for _, slices in sorted(part.geometry.items()):
             nodes, size = self.levels[-1], self.header.slice_voxels
@@ -60,13 +63,26 @@ class Decoder:
         voxels, values, steps = self.levels[level], self.coloured[-1].values, self.coloured[-1].steps
         found = xxh3_64(b"".join((x & 65535).to_bytes(2, "little") for value in values for x in value))
         require(found == part.colour_hash, "5.10.1", f"colour hash of level {level}")
-        self.shown[level] = self.show(level, part.filter, steps)
-        if self.shown[level][0] is not None:
-            values = colour.filtered(voxels, values, self.shown[level][1], self.shown[level][0])
-        blocks = len(self.levels[max(level - 3, 0)])
-        sizes = part.head_map and head_map.parse(part.head_map, blocks)
-        self.size = sizes[1] if sizes else 64
-        return voxels, [colour.display(value, steps.fraction()) for value in values]
+        self.shown[level] = own_filter, shown_steps = self.show(level, part.filter, steps)
+        before = displayed(values, steps)
+        if own_filter is not None:
+            values = colour.filtered(voxels, values, shown_steps, own_filter)
+        above = None
+        if level > self.header.base or part.trunk is not None and part.trunk[0] < level:
+            above = displayed(self.coloured[-2].values, self.coloured[-2].steps)
+        drawn = self.drawn(level, part.head_map, shown_steps)
+        return heads.Level(voxels, self.header.bits, displayed(values, steps), before, above, [drawn])
+
+    def drawn(self, level, payload, steps):
+        """7.2.3, 7.5: what the stream says of how a level is drawn."""
+        up = min(level, 3)
+        keys = self.levels[level].keys
+        blocks = self.levels[level - up].keys
+        found = payload and head_map.parse(payload, len(blocks))
+        *sizes, how, bits = found or (64, 64, 0, [0] * len(blocks))
+        is_disc = dict(zip(blocks, bits))
+        discs = None if how == 1 else [is_disc[key >> 3 * up] for key in keys]
+        return heads.Part(range(len(keys)), steps.units(), sizes, discs)
 
     def show(self, level, own_filter, steps):
         """17.4.3: the filter of a level, and the steps that it has for 5.11."""
@@ -77,62 +93,80 @@ class Decoder:
         return own_filter, steps
 
 
-def digest(level, voxels, colours, gaussians, count, part):
-    """`level=geometry,colours,surfels` of a range of voxels, with `count` surfels each (16.2)."""
-    keys = b"".join(struct.pack("<Q", voxels.keys[i]) for i in part)
-    own_colours = bytes(x for i in part for x in colours[i])
-    drawn = gaussians.tobytes(slice(count * part.start, count * part.stop))
-    return f"{level}=" + ",".join(hashlib.sha256(part).hexdigest() for part in (keys, own_colours, drawn))
+def displayed(values, steps):
+    """5.11.4"""
+    return [colour.display(value, steps.fraction()) for value in values]
 
 
-def digests(data, like=None):
+def digest(level, rows, gaussians):
+    """`level=geometry,colours,gaussians` of a range of voxels (16.2)."""
+    voxels = level.voxels
+    keys = b"".join(struct.pack("<Q", voxels.keys[i]) for i in rows)
+    own_colours = bytes(x for i in rows for x in level.colours[i])
+    parts = (keys, own_colours, gaussians.tobytes())
+    return f"{voxels.level}=" + ",".join(hashlib.sha256(part).hexdigest() for part in parts)
+
+
+def digests(data, like=None, ways=(heads.gaussians,)):
     """For a stream, and for each block of a scene and each frame of a sequence, what is behind its name, and the digest of
-    every level (16.2, 16.4, 16.5). It must be what `like` is: a stream of one frame, a sequence or a scene."""
+    every level (16.2, 16.4, 16.5), for each way to make Gaussians. It must be what `like` is: a stream of one frame, a
+    sequence or a scene."""
     like = like or data
     if sequence.is_sequence(like):
-        return sequence_digests(sequence.Sequence(data, Decoder))
+        return sequence_digests(sequence.Sequence(data, Decoder), ways)
     if scene.is_scene(like):
         decoder = scene.Scene(data, Decoder)
-        return level_digests(decoder, ["", *(f"/{i}" for i in range(len(decoder.blocks)))])
-    return level_digests(Decoder(data), [""])
+        return level_digests(decoder, ["", *(f"/{i}" for i in range(len(decoder.blocks)))], ways)
+    return level_digests(Decoder(data), [""], ways)
 
 
-def sequence_digests(decoder):
+def sequence_digests(decoder, ways):
     """16.5"""
-    lines, ticks = [], []
+    lines, ticks = [[] for _ in ways], []
     for number, (tick, frame) in enumerate(decoder.frames()):
-        lines += level_digests(frame, [f"/{number}"])
+        for of_way, found in zip(lines, level_digests(frame, [f"/{number}"], ways)):
+            of_way += found
         ticks.append(tick)
-    return [" ".join(map(str, ["", decoder.timescale, *ticks])), *lines]
+    return [[" ".join(map(str, ["", decoder.timescale, *ticks])), *of_way] for of_way in lines]
 
 
-def level_digests(decoder, names):
-    """The digests of every level of a stream or a frame, or of a scene and each of its blocks."""
-    lines = [[] for _ in names]
-    for level in range(decoder.header.base, decoder.header.top + 1):
-        voxels, colours, *of_scene = decoder.decode(level)
-        sizes, blocks = of_scene or (decoder.size, [])
-        count = 4 if level + 1 < decoder.header.bits else 1
-        gaussians = surfels.surfels(voxels, colours, count, sizes, blocks)
-        for line, part in zip(lines, [range(len(voxels)), *blocks]):
-            line.append(digest(level, voxels, colours, gaussians, count, part))
-    return [" ".join([name, *line]) for name, line in zip(names, lines)]
+def level_digests(decoder, names, ways):
+    """The digests of every level of a stream or a frame, or of a scene and each of its blocks, for each way."""
+    lines = [[[name] for name in names] for _ in ways]
+    for number in range(decoder.header.base, decoder.header.top + 1):
+        level = decoder.decode(number)
+        for of_way, draw in zip(lines, ways):
+            parts = [(part.rows, gaussians) for part, gaussians in zip(level.parts, draw(level))]
+            if len(names) > 1 and parts:
+                whole = functools.reduce(surfels.Gaussians.followed_by, (gaussians for _, gaussians in parts))
+                parts.insert(0, (range(len(level.voxels)), whole))
+            for line, (rows, gaussians) in zip(of_way, parts):
+                line.append(digest(level, rows, gaussians))
+    return [[" ".join(line) for line in of_way] for of_way in lines]
+
+
+def learned(model, quality):
+    """How a level is drawn with learned heads, which do not draw level 0 (7.2.1)."""
+    return lambda level: heads.gaussians(level, model, quality) if level.voxels.level else []
 
 
 def check(folder):
-    """How many streams of the suite decode to something else."""
+    """How many streams of the suite decode to something else, drawn as surfels and with learned heads (16.6)."""
+    model = heads.Model((folder.parent / "heads.safetensors").read_bytes())
+    ways = {"suite.txt": heads.gaussians, "best.txt": learned(model, "best"), "quick.txt": learned(model, "quick")}
+    lines = {file: (folder / file).read_text().splitlines() for file in ways}
+    streams = [name for name in (line.split(" ")[0] for line in lines["suite.txt"]) if "/" not in name]
     failed = 0
-    lines = (folder / "suite.txt").read_text().splitlines()
-    streams = [name for name in (line.split(" ")[0] for line in lines) if "/" not in name]
     for name in streams:
-        expected = [line[len(name) :] for line in lines if line.startswith((f"{name} ", f"{name}/"))]
+        own = (f"{name} ", f"{name}/")
+        expected = [[line[len(name) :] for line in lines[file] if line.startswith(own)] for file in ways]
         try:
-            found = digests((folder / f"{name}.b2p").read_bytes())
-            good, why = found == expected, f"DIFFERS: {found}"
+            found = digests((folder / f"{name}.b2p").read_bytes(), ways=ways.values())
+            wrong = [f"{file} DIFFERS: {f}" for file, e, f in zip(ways, expected, found) if e != f]
         except Refused as fault:
-            good, why = False, f"REFUSED: {fault}"
-        print(f"{name}: {'as expected' if good else why}", flush=True)
-        failed += not good
+            wrong = [f"REFUSED: {fault}"]
+        print(f"{name}: {'; '.join(wrong) or 'as expected'}", flush=True)
+        failed += bool(wrong)
     print(f"{len(streams)} streams, {failed} differ")
     return failed
 
@@ -174,7 +208,11 @@ def main(arguments):
         case ["--damage", path]:
             return min(check_damage(Path(path)), 1)
         case [path]:
-            print(*digests(Path(path).read_bytes()), sep="\n")
+            print(*digests(Path(path).read_bytes())[0], sep="\n")
+            return 0
+        case [path, model, "best" | "quick" as quality]:
+            way = learned(heads.Model(Path(model).read_bytes()), quality)
+            print(*digests(Path(path).read_bytes(), ways=[way])[0], sep="\n")
             return 0
     print(__doc__)
     return 2

@@ -5,12 +5,12 @@ from coefficients import RangeDecoder
 
 
 def parse(payload, blocks):
-    """Both sizes in 64ths and a bit for each block; None if the payload is no head map."""
+    """Both sizes in 64ths, `how`, and a bit for each block; None if the payload is no head map."""
     if len(payload) < 3 or 0 in payload[:2] or payload[2] > 2 or payload[2] < 2 and len(payload) > 3:
         return None
     mixed, alone, how = payload[:3]
     if how < 2:
-        return mixed, alone, [how] * blocks
+        return mixed, alone, how, [how] * blocks
     try:
         decoder = RangeDecoder(payload[3:])
         one, last, bits = [32768] * 4, 0, []
@@ -22,4 +22,4 @@ def parse(payload, blocks):
         decoder.finish()
     except Refused:
         return None
-    return mixed, alone, bits
+    return mixed, alone, how, bits

@@ -4,6 +4,7 @@ import struct
 from dataclasses import dataclass, replace
 
 import container
+import heads
 from base import Reader, require
 from octree import Voxels
 from xxh3 import xxh3_64
@@ -106,16 +107,16 @@ class Scene:
         require(stated[0] == stated[1], "18.3.1", "header of a block")
 
     def decode(self, level):
-        """18.3.2, 18.4.2: voxels and colours of the next level, the size of each voxel's surfels, and each block's
-        voxels."""
-        keys, coordinates, colours, sizes, ranges = [], [], [], [], []
+        """18.3.2, 18.4: the next level."""
+        keys, coordinates, colours, before, parts = [], [], [], [], []
         for block, stream in zip(self.blocks, self.streams):
             below = level - block.level
-            voxels, own_colours = stream.decode(below)
+            own = stream.decode(below)
             corner = [sum((block.key >> 3 * i + axis & 1) << i for i in range(block.level)) for axis in range(3)]
-            ranges.append(range(len(keys), len(keys) + len(voxels)))
-            keys += [(block.key << 3 * below) + key for key in voxels.keys]
-            coordinates += [tuple((c << below) + x for c, x in zip(corner, at)) for at in voxels.coordinates]
-            colours += own_colours
-            sizes += [stream.size] * len(voxels)
-        return Voxels(level, keys, coordinates), colours, sizes, ranges
+            (part,) = own.parts
+            parts.append(replace(part, rows=range(len(keys), len(keys) + len(own.voxels))))
+            keys += [(block.key << 3 * below) + key for key in own.voxels.keys]
+            coordinates += [tuple((c << below) + x for c, x in zip(corner, at)) for at in own.voxels.coordinates]
+            colours += own.colours
+            before += own.before
+        return heads.Level(Voxels(level, keys, coordinates), self.header.bits, colours, before, None, parts)

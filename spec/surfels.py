@@ -20,10 +20,17 @@ class Gaussians:
     opacity: np.ndarray
     colour: np.ndarray
 
-    def tobytes(self, rows=slice(None)):
-        """16.1, of some rows."""
-        parts = (self.position, self.scale, self.rotation, self.opacity, self.colour)
-        return b"".join(np.ascontiguousarray(part[rows], dtype="<f4").tobytes() for part in parts)
+    def tobytes(self):
+        """16.1"""
+        return b"".join(np.ascontiguousarray(array, dtype="<f4").tobytes() for array in vars(self).values())
+
+    def of(self, rows):
+        """Some of them."""
+        return Gaussians(*(array[rows] for array in vars(self).values()))
+
+    def followed_by(self, others):
+        both = zip(vars(self).values(), vars(others).values())
+        return Gaussians(*(np.concatenate(arrays) for arrays in both))
 
 
 def moments(voxels):

@@ -1,9 +1,19 @@
 //! Holds `docs/format.md` against the streams: the Python decoder in `spec/`, written from that document, must decode
-//! every conformance stream of version 3, every scene and every frame of a sequence to its digests. Needs Python 3.10 with
-//! numpy; without them the test says so and passes.
+//! every conformance stream of version 3, every scene and every frame of a sequence to its digests, drawn as surfels and
+//! with learned heads. Needs Python 3.10 with numpy; without them the test says so and passes.
+
+#[path = "conformance/digest.rs"]
+#[allow(dead_code, reason = "the suites have streams of version 2, too")]
+mod digest;
+#[path = "conformance/digest_transform.rs"]
+#[allow(dead_code, reason = "the suites decode in pieces, too")]
+mod digest_transform;
 
 use std::path::Path;
 use std::process::Command;
+
+use b2p::gaussians::Heads;
+use b2p::gaussians::learned::HeadsModel;
 
 /// Runs Python in the repository's root; the exit status and all that it printed.
 fn python(arguments: &[&str]) -> std::io::Result<(bool, String)> {
@@ -63,6 +73,29 @@ fn a_decoder_written_from_the_document_decodes_and_draws_scenes_block_by_block()
 #[test]
 fn a_decoder_written_from_the_document_decodes_and_draws_every_frame_of_sequences() {
     decodes_all_of("sequences");
+}
+
+#[test]
+fn the_heads_that_ship_draw_the_same_gaussians_in_both_decoders() {
+    if !can_run() {
+        return;
+    }
+    let [stream, model] = [
+        "tests/data/conformance/version-3/fine-steps.b2p",
+        "models/heads.safetensors",
+    ];
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let bytes = std::fs::read(root.join(stream)).expect("the suite is there");
+    let heads = HeadsModel::open(&root.join(model)).expect("the heads that ship load");
+    for quality in [Heads::Best, Heads::Quick] {
+        let decoder = b2p::Decoder::new()
+            .with_heads_model(heads.clone())
+            .with_heads(quality.into());
+        let expected = digest_transform::levels(&decoder, &bytes).expect("the stream decodes");
+        let (success, printed) = python(&["spec/decode.py", stream, model, &quality.to_string()]).expect("python3");
+        assert!(success, "{printed}");
+        assert_eq!(printed.trim(), expected.join(" "), "{quality}");
+    }
 }
 
 /// Decodes the streams of a suite and compares with its digests.

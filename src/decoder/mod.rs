@@ -14,7 +14,9 @@ mod streaming;
 mod transform;
 
 pub use check::{Checked, Fault};
-pub(crate) use drawing::{Advice, LevelVoxels, Part};
+#[cfg(feature = "encoder")]
+pub(crate) use drawing::Advice;
+pub(crate) use drawing::{LevelVoxels, Part};
 pub use stream::{Decoder, Points};
 pub use streaming::Decoding;
 #[cfg(feature = "encoder")]

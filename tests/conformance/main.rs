@@ -6,7 +6,8 @@
 //! every instruction set of the machine, one, two and seven threads, whole and in pieces. The bare decoder
 //! (`--no-default-features`) is enough for that.
 //!
-//! The suites of version 3, of scenes and of sequences are beside it: see `transform`, `scene` and `sequence`.
+//! The suites of version 3, of scenes and of sequences are beside it: see `transform`, `scene` and `sequence`. Each is
+//! drawn as surfels (`suite.txt`), and with the learned heads of `heads.safetensors` (`best.txt`, `quick.txt`).
 //!
 //! After a change of the format or of the shipped model, `cargo xtask conformance` makes streams and digests again.
 
@@ -18,6 +19,7 @@ mod digest;
 mod digest_scene;
 mod digest_sequence;
 mod digest_transform;
+mod heads;
 #[cfg(feature = "encoder")]
 mod make;
 #[cfg(feature = "encoder")]

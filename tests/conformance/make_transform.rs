@@ -1,7 +1,10 @@
 //! The streams of the suite of version 3: what is unusual about them is in their names.
 
+use b2p::Limits;
 use b2p::cloud::ColouredVoxels;
+use b2p::container::{Level, Slice, Stream, Writer};
 use b2p::encoder::transform::{Options, QualityTarget, encode};
+use b2p::gaussians::HeadMap;
 use b2p::log::Log;
 
 use crate::common::{Ball, cloud_of, sparse_wall};
@@ -51,5 +54,52 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
             true,
         ),
         ("exact-deepest", code(&lone, 21..=21, lossless, 16, true), true),
+        (
+            "exact-head-maps",
+            with_head_maps(&code(&large, 4..=6, lossless, 32_768, true), &large),
+            true,
+        ),
     ]
+}
+
+/// The stream of a cloud with head maps: some blocks of its levels are surfels, and all of level 5.
+fn with_head_maps(bytes: &[u8], cloud: &ColouredVoxels) -> Vec<u8> {
+    let stream = Stream::parse(bytes, &Limits::default()).expect("a stream of the encoder");
+    let mut writer = Writer::new(stream.header().clone()).expect("the header of a stream");
+    for level in stream.levels() {
+        copy(&mut writer, level).expect("a level of the stream");
+        let up = 3 * (cloud.voxels.depth() - (level.level - 3));
+        let mut blocks: Vec<u64> = cloud.voxels.keys().iter().map(|key| key >> up).collect();
+        blocks.dedup();
+        let surfels = blocks.iter().map(|block| level.level == 5 || block % 3 == 0);
+        let map = HeadMap::new(80, 70 - level.level, surfels.collect());
+        let added = writer.head_map(level.level, &map.to_bytes());
+        added.expect("a level of the stream");
+    }
+    writer.finish().expect("all levels of a stream")
+}
+
+/// Writes a level as it was read.
+fn copy(writer: &mut Writer, level: &Level<'_>) -> b2p::Result<()> {
+    let of = |slices: &[Slice<'_>]| {
+        slices
+            .iter()
+            .map(|slice| (slice.voxels, slice.bytes.to_vec()))
+            .collect()
+    };
+    let colours = level.colours.as_ref().expect("a stream of version 3");
+    let (finest, trunk) = level.geometry.split_last().expect("a level has geometry");
+    let trunk: Vec<(u32, Vec<u8>)> = trunk.iter().flat_map(|part| -> Vec<_> { of(&part.slices) }).collect();
+    writer.geometry_trunk(&trunk)?;
+    let finest: Vec<(u32, Vec<u8>)> = of(&finest.slices);
+    writer.geometry(level.level, &finest)?;
+    if let Some(trunk) = &colours.trunk {
+        writer.colour_trunk(trunk.level, trunk.slice.voxels, colours.hash, trunk.slice.bytes)?;
+    }
+    for part in &colours.levels {
+        let hash = colours.trunk.is_none().then_some(colours.hash);
+        let slices: Vec<(u32, Vec<u8>)> = of(&part.slices);
+        writer.colours(part.level, hash, &slices)?;
+    }
+    Ok(())
 }

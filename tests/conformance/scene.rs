@@ -1,20 +1,21 @@
 //! The suite of scenes, in `tests/data/conformance/scenes`.
 //!
-//! `suite.txt` has for each scene a line as in the suite of version 3, and one for each of its blocks: `name/block`.
+//! `suite.txt` has for each scene a line as in the suite of version 3, and one for each of its blocks: `name/block`;
+//! `best.txt` and `quick.txt` have those of learned heads.
 
-use b2p::gaussians::HeadSet;
 use b2p::{Decoder, Limits, SceneDecoder, SceneReader, Wanted};
 
 use crate::digest_scene::{broken_clause, lines, parts};
+use crate::heads::drawn;
 use crate::{folder, pools, stream};
 
-fn text() -> String {
-    std::fs::read_to_string(folder().join("scenes/suite.txt")).expect("the suite is there")
+fn text(file: &str) -> String {
+    std::fs::read_to_string(folder().join("scenes").join(file)).expect("the suite is there")
 }
 
 /// Names of the scenes.
 pub fn names() -> Vec<String> {
-    let text = text();
+    let text = text("suite.txt");
     let first = text.lines().filter_map(|line| line.split(' ').next());
     let scenes = first.filter(|name| !name.contains('/'));
     scenes.map(|name| format!("scenes/{name}")).collect()
@@ -32,11 +33,12 @@ pub fn is_refused(bytes: &[u8]) -> bool {
 
 #[test]
 fn every_scene_decodes_to_its_digests_whole_and_block_by_block() {
-    let (text, names) = (text(), names());
+    let names = names();
     assert!(names.len() >= 6);
     let pools = pools();
-    for isa in super::instruction_sets() {
-        let decoder = Decoder::new().with_isa(isa).with_heads(HeadSet::Surfels);
+    let ways = |isa| drawn(&folder(), isa).map(|(file, decoder)| (isa, file, decoder));
+    for (isa, file, decoder) in super::instruction_sets().into_iter().flat_map(ways) {
+        let text = text(file);
         for (threads, pool) in &pools {
             let decoded = |name: &String| {
                 let found = parts(&decoder, &stream(name)).unwrap_or_else(|error| panic!("{name}: {error}"));
@@ -47,7 +49,7 @@ fn every_scene_decodes_to_its_digests_whole_and_block_by_block() {
                 Some(pool) => pool.install(decode),
                 None => decode(),
             };
-            assert!(found == text, "with {isa} and {threads} threads:\n{found}");
+            assert!(found == text, "{file} with {isa} and {threads} threads:\n{found}");
         }
     }
 }

@@ -1,25 +1,25 @@
 //! The suite of sequences, in `tests/data/conformance/sequences`.
 //!
 //! `suite.txt` has for each sequence a line with its timescale and the tick of each frame, and for each frame a line as in
-//! the suite of version 3: `name/frame`.
+//! the suite of version 3: `name/frame`; `best.txt` and `quick.txt` have those of learned heads.
 
 use std::collections::BTreeSet;
 
 use b2p::container::sequence::{FrameKind, FrameLevel, parse_table};
-use b2p::gaussians::HeadSet;
 use b2p::motion::{Head, Modes};
 use b2p::{Decoder, Limits, SequenceDecoder, SequenceReader};
 
 use crate::digest_sequence::{broken_clause, lines};
+use crate::heads::drawn;
 use crate::{folder, pools, stream};
 
-fn text() -> String {
-    std::fs::read_to_string(folder().join("sequences/suite.txt")).expect("the suite is there")
+fn text(file: &str) -> String {
+    std::fs::read_to_string(folder().join("sequences").join(file)).expect("the suite is there")
 }
 
 /// Names of the sequences.
 fn names() -> Vec<String> {
-    let text = text();
+    let text = text("suite.txt");
     let first = text.lines().filter_map(|line| line.split(' ').next());
     let sequences = first.filter(|name| !name.contains('/'));
     sequences.map(|name| format!("sequences/{name}")).collect()
@@ -27,10 +27,11 @@ fn names() -> Vec<String> {
 
 #[test]
 fn every_frame_of_every_sequence_decodes_to_its_digests_forwards_and_backwards() {
-    let (text, names) = (text(), names());
+    let names = names();
     let pools = pools();
-    for isa in super::instruction_sets() {
-        let decoder = Decoder::new().with_isa(isa).with_heads(HeadSet::Surfels);
+    let ways = |isa| drawn(&folder(), isa).map(|(file, decoder)| (isa, file, decoder));
+    for (isa, file, decoder) in super::instruction_sets().into_iter().flat_map(ways) {
+        let text = text(file);
         for (threads, pool) in &pools {
             for backwards in [false, true] {
                 let decoded = |name: &String| {
@@ -44,7 +45,7 @@ fn every_frame_of_every_sequence_decodes_to_its_digests_forwards_and_backwards()
                 };
                 assert!(
                     found == text,
-                    "with {isa} and {threads} threads, backwards: {backwards}:\n{found}"
+                    "{file} with {isa} and {threads} threads, backwards: {backwards}:\n{found}"
                 );
             }
         }

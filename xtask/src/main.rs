@@ -16,6 +16,8 @@ mod digest_sequence;
 #[path = "../../tests/conformance/digest_transform.rs"]
 #[allow(dead_code, reason = "the test decodes in pieces, too")]
 mod digest_transform;
+#[path = "../../tests/conformance/heads.rs"]
+mod heads;
 #[path = "../../tests/conformance/make.rs"]
 #[allow(dead_code, reason = "the test knows which streams every machine makes alike")]
 mod make;
@@ -34,8 +36,8 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-use b2p::Decoder;
 use b2p::gaussians::HeadSet;
+use b2p::{Decoder, Isa};
 
 type Result<T = ()> = std::result::Result<T, Box<dyn Error>>;
 
@@ -44,6 +46,7 @@ const USAGE: &str = "usage: cargo xtask TASK
 conformance  writes the streams and digests of the conformance suites into tests/data/conformance, and the damage
 scenes       writes those of the suite of scenes alone
 sequences    writes those of the suite of sequences alone
+heads        writes the learned heads of the suites, and the digests of all their streams drawn with them
 damage       writes the list of damaged streams, tests/data/conformance/damage.txt
 seeds        writes the seeds of the fuzz targets into fuzz/corpus
 sample       renders the sample scene and codes it as models/scene.b2p and models/sample.b2p";
@@ -55,9 +58,11 @@ fn main() -> ExitCode {
             .and_then(|()| conformance_transform())
             .and_then(|()| conformance_scenes())
             .and_then(|()| conformance_sequences())
+            .and_then(|()| conformance_heads())
             .and_then(|()| damage()),
-        ["scenes"] => conformance_scenes(),
-        ["sequences"] => conformance_sequences(),
+        ["scenes"] => conformance_scenes().and_then(|()| conformance_heads()),
+        ["sequences"] => conformance_sequences().and_then(|()| conformance_heads()),
+        ["heads"] => conformance_heads(),
         ["damage"] => damage(),
         ["seeds"] => cargo(&["run", "--locked", "-p", "b2p-fuzz", "--example", "seeds"]),
         ["sample"] => sample(),
@@ -136,6 +141,41 @@ fn conformance_transform() -> Result {
     }
     replace(&suite().join("version-3"), &streams, &text)?;
     println!("version 3: {} streams", streams.len());
+    Ok(())
+}
+
+/// Writes the learned heads of the suites of version 3, and digests of the streams that these have, drawn with them.
+fn conformance_heads() -> Result {
+    std::fs::write(suite().join("heads.safetensors"), heads::file())?;
+    type Lines = fn(&Decoder, &str, &[u8]) -> b2p::Result<String>;
+    let suites: [(&str, Lines); 3] = [
+        ("version-3", |decoder, name, bytes| {
+            let levels = digest_transform::levels(decoder, bytes)?;
+            Ok(format!("{name} {}\n", levels.join(" ")))
+        }),
+        ("scenes", |decoder, name, bytes| {
+            Ok(digest_scene::lines(name, &digest_scene::parts(decoder, bytes)?))
+        }),
+        ("sequences", |decoder, name, bytes| {
+            digest_sequence::lines(decoder, name, bytes, false)
+        }),
+    ];
+    for (name, lines) in suites {
+        let folder = suite().join(name);
+        let text = std::fs::read_to_string(folder.join("suite.txt"))?;
+        let names = text.lines().filter_map(|line| line.split(' ').next());
+        let names: Vec<&str> = names.filter(|name| !name.contains('/')).collect();
+        let [_, learned @ ..] = heads::drawn(&suite(), Isa::detect());
+        for (file, decoder) in learned {
+            let mut text = String::new();
+            for name in &names {
+                let bytes = std::fs::read(folder.join(format!("{name}.b2p")))?;
+                text += &lines(&decoder, name, &bytes).map_err(|error| format!("{name}: {error}"))?;
+            }
+            std::fs::write(folder.join(file), text)?;
+        }
+        println!("{name} with learned heads: {} streams", names.len());
+    }
     Ok(())
 }
 
