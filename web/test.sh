@@ -1,8 +1,17 @@
 #!/usr/bin/env bash
-# Builds the WebAssembly module and tests it: in Node, and as a page in a headless Chromium, which it installs on Debian as
-# root. Says what it skips where Node, the target or Chromium cannot be had.
+# Builds the WebAssembly module and tests it: in Node, and as a page in a headless browser, which it installs on Debian as
+# root. Says what it skips where Node, the target or the browser cannot be had.
+#
+#     web/test.sh [chromium|firefox]    chromium by default; firefox needs Node 20 or later
 set -euo pipefail
 cd "$(dirname "$0")/.."
+
+browser=${1:-chromium}
+case $browser in
+    chromium) package=chromium ;;
+    firefox) package=firefox-esr ;;
+    *) echo "chromium or firefox, not $browser" >&2 && exit 2 ;;
+esac
 
 install() { # COMMAND PACKAGE
     command -v "$1" > /dev/null && return
@@ -16,5 +25,7 @@ CARGO_TARGET_WASM32_WASIP1_RUSTFLAGS="-C target-feature=+simd128,+bulk-memory" \
     CARGO_TARGET_WASM32_WASIP1_RUNNER="node --no-warnings $PWD/tests/wasi.mjs" \
     cargo test --locked --target wasm32-wasip1 -p b2p-kernels --lib -- \
     --skip map:: --skip a_vector_is_not_loaded_from_fewer_values
-install chromium chromium || echo "skipped: the page; Chromium cannot be had"
-node --test web/tests/
+command -v "$browser" > /dev/null || install "$package" "$package" || echo "skipped: the page; $browser cannot be had"
+# Node 20 has sockets behind an option, and later ones anyway.
+[ "$browser" = chromium ] || export NODE_OPTIONS=--experimental-websocket
+B2P_BROWSER=$browser node --test web/tests/

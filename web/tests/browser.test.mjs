@@ -1,11 +1,11 @@
-// The page in a headless Chromium. Skipped where there is none.
+// The page in a headless browser. Skipped where there is none.
 
 import assert from "node:assert/strict";
 import { existsSync, readFileSync } from "node:fs";
 import test from "node:test";
 
 import { B2p } from "../src/index.js";
-import { Browser, chromium } from "./chromium.mjs";
+import { Browser, skip } from "./browser.mjs";
 import { SHOWN, digest } from "./page.mjs";
 import { broken, paused, serve, whole } from "./server.mjs";
 
@@ -13,7 +13,6 @@ const read = (path) => readFileSync(new URL(`../../${path}`, import.meta.url));
 const scene = read("models/scene.b2p");
 const blocks = read("tests/data/conformance/scenes/ball.b2p");
 const SIZE = [640, 480];
-const skip = chromium ? false : "no Chromium is installed";
 
 const damaged = Buffer.from(scene);
 damaged[scene.length - 100] ^= 1;

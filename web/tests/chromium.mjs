@@ -6,10 +6,12 @@ import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { setTimeout } from "node:timers/promises";
 
+import { Waiting } from "./waiting.mjs";
+
 const NAMES = [process.env.CHROMIUM, "chromium", "chromium-browser", "google-chrome"].filter(Boolean);
 
-/** The name of a Chromium that is installed, or `undefined`. */
-export const chromium = NAMES.find((name) => spawnSync(name, ["--version"]).status === 0);
+/** The name of one that is installed, or `undefined`. */
+export const installed = NAMES.find((name) => spawnSync(name, ["--version"]).status === 0);
 
 export class Browser {
   #process;
@@ -20,7 +22,7 @@ export class Browser {
 
   constructor() {
     const options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--mute-audio"];
-    this.#process = spawn(chromium, [...options, `--user-data-dir=${this.#folder}`, "about:blank"], {
+    this.#process = spawn(installed, [...options, `--user-data-dir=${this.#folder}`, "about:blank"], {
       stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"],
     });
     this.#process.stdio[4].setEncoding("utf8").on("data", (text) => this.#read(text));
@@ -71,8 +73,9 @@ export class Browser {
   }
 }
 
-class Page {
+class Page extends Waiting {
   constructor(browser, session) {
+    super();
     this.browser = browser;
     this.session = session;
   }
@@ -87,17 +90,6 @@ class Page {
     const { result, exceptionDetails } = await this.call("Runtime.evaluate", options);
     if (exceptionDetails) throw new Error(exceptionDetails.exception?.description ?? exceptionDetails.text);
     return result.value;
-  }
-
-  /** Waits until an expression is true; after `seconds`, fails with what the page says. */
-  async until(expression, seconds = 60) {
-    const end = Date.now() + 1000 * seconds;
-    while (!(await this.evaluate(expression).catch(() => false))) {
-      if (Date.now() > end) {
-        throw new Error(`not ${expression}; the page says: ${await this.evaluate("document.body?.innerText")}`);
-      }
-      await setTimeout(50);
-    }
   }
 
   async drag([x0, y0], [x1, y1]) {

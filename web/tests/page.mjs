@@ -3,11 +3,11 @@
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 
-import { Browser, chromium } from "./chromium.mjs";
+import { Browser, skip } from "./browser.mjs";
 import { serve, whole } from "./server.mjs";
 
 export const SIZE = [320, 240];
-export const skip = chromium ? false : "no Chromium is installed";
+export { skip };
 
 /** A file of the tests. */
 export const data = (name) => readFileSync(new URL(`./data/${name}`, import.meta.url));
