@@ -77,6 +77,19 @@ fn seal_chunks(bytes: &mut [u8], mut at: usize) {
 }
 
 #[test]
+fn a_stream_is_intact_if_it_ends_where_one_of_its_levels_ends() {
+    for bytes in [sample(), transform::sample()] {
+        let header = parse(&bytes).unwrap().header().clone();
+        let ends: Vec<u64> = (2..=4).map(|level| header.prefix_bytes(level).unwrap()).collect();
+        for length in header.bytes()..=bytes.len() {
+            let intact = parse(&bytes[..length]).unwrap().intact();
+            assert_eq!(intact.is_ok(), ends.contains(&(length as u64)), "{length} bytes");
+        }
+        assert!(parse(&[&bytes[..], b"x"].concat()).unwrap().intact().is_err());
+    }
+}
+
+#[test]
 fn reading_inverts_writing() {
     let bytes = sample();
     let stream = parse(&bytes).unwrap().require(4).unwrap();
