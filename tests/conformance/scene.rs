@@ -7,7 +7,7 @@ use b2p::{Decoder, Limits, SceneDecoder, SceneReader, Wanted};
 
 use crate::digest_scene::{broken_clause, lines, parts};
 use crate::heads::drawn;
-use crate::{folder, pools, stream};
+use crate::{folder, pools, pools_for, stream};
 
 fn text(file: &str) -> String {
     std::fs::read_to_string(folder().join("scenes").join(file)).expect("the suite is there")
@@ -39,7 +39,7 @@ fn every_scene_decodes_to_its_digests_whole_and_block_by_block() {
     let ways = |isa| drawn(&folder(), isa).map(|(file, decoder)| (isa, file, decoder));
     for (isa, file, decoder) in super::instruction_sets().into_iter().flat_map(ways) {
         let text = text(file);
-        for (threads, pool) in &pools {
+        for (threads, pool) in pools_for(file, &pools) {
             let decoded = |name: &String| {
                 let found = parts(&decoder, &stream(name)).unwrap_or_else(|error| panic!("{name}: {error}"));
                 lines(name.trim_start_matches("scenes/"), &found)

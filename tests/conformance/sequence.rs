@@ -11,7 +11,7 @@ use b2p::{Decoder, Limits, SequenceDecoder, SequenceReader};
 
 use crate::digest_sequence::{broken_clause, lines};
 use crate::heads::drawn;
-use crate::{folder, pools, stream};
+use crate::{folder, pools, pools_for, stream};
 
 fn text(file: &str) -> String {
     std::fs::read_to_string(folder().join("sequences").join(file)).expect("the suite is there")
@@ -32,7 +32,7 @@ fn every_frame_of_every_sequence_decodes_to_its_digests_forwards_and_backwards()
     let ways = |isa| drawn(&folder(), isa).map(|(file, decoder)| (isa, file, decoder));
     for (isa, file, decoder) in super::instruction_sets().into_iter().flat_map(ways) {
         let text = text(file);
-        for (threads, pool) in &pools {
+        for (threads, pool) in pools_for(file, &pools) {
             for backwards in [false, true] {
                 let decoded = |name: &String| {
                     let own = name.trim_start_matches("sequences/");

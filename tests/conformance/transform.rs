@@ -8,7 +8,7 @@ use std::path::PathBuf;
 
 use crate::digest_transform::{in_pieces, whole};
 use crate::heads::drawn;
-use crate::{folder, pools};
+use crate::{folder, pools, pools_for};
 
 fn own_folder() -> PathBuf {
     folder().join("version-3")
@@ -30,7 +30,7 @@ fn every_stream_of_version_3_decodes_to_its_digests_with_every_instruction_set_a
             let name = words.next().expect("a name");
             let levels: Vec<String> = words.collect();
             let bytes = stream(&name);
-            for (threads, pool) in &pools {
+            for (threads, pool) in pools_for(file, &pools) {
                 let decode = || [whole(&decoder, &bytes), in_pieces(&decoder, &bytes)];
                 let found = match pool {
                     Some(pool) => pool.install(decode),
