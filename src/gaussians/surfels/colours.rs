@@ -1,7 +1,7 @@
 //! Colour gradients along the surface (`docs/format.md`, clause 6.6.3).
 
 use super::discs::Disc;
-use crate::geometry::KernelMap;
+use crate::geometry::ones;
 
 /// Ridge regularisation of the least squares, since the colours of few neighbours are mostly noise.
 const DAMPING: f32 = 0.3;
@@ -18,24 +18,21 @@ const OFFSETS: [[f32; 3]; 27] = {
 };
 
 /// A colour as floats, and a 0 that fills a vector.
+#[inline(always)]
 fn with_zero([r, g, b]: [u8; 3]) -> [f32; 4] {
     [r, g, b, 0].map(f32::from)
 }
 
 /// The gradient of R, G and B per voxel along both axes `u`, `v` of a disc's plane, by least squares over the occupied
-/// ones of the 26 neighbours. `row` is the voxel's of its level's map.
-pub fn gradient(row: &[u32], colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3]; 2]) -> [[f32; 3]; 2] {
+/// ones of the 26 neighbours. `row` is the voxel's of its level's map, and `mask` has a bit for each of its places that
+/// is occupied.
+#[inline(always)]
+pub fn gradient(mask: u32, row: &[u32], colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3]; 2]) -> [[f32; 3]; 2] {
     let own = with_zero(colours[voxel]);
-    // Those that are present come together first, without branches: their presence is unpredictable.
-    let (mut present, mut count) = ([(0, 0); 27], 0);
-    for (k, &q) in row.iter().enumerate() {
-        present[count.min(26)] = (k, q);
-        count += usize::from(q != KernelMap::ABSENT);
-    }
     let (mut uu, mut uv, mut vv) = (DAMPING, 0.0, DAMPING);
     let (mut ru, mut rv) = ([0.0f32; 4], [0.0f32; 4]);
-    for &(k, q) in &present[..count] {
-        let offset = OFFSETS[k];
+    for k in ones(mask) {
+        let (offset, q) = (OFFSETS[k], row[k]);
         let along = |axis: [f32; 3]| offset[0] * axis[0] + offset[1] * axis[1] + offset[2] * axis[2];
         let (a, b) = (along(u), along(v));
         uu += a * a;
@@ -57,6 +54,7 @@ pub fn gradient(row: &[u32], colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3
 }
 
 /// The axes of a disc's plane: the rotated x and y.
+#[inline(always)]
 pub fn plane(disc: &Disc) -> [[f32; 3]; 2] {
     let [w, x, y, _] = disc.rotation;
     [

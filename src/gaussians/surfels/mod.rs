@@ -30,7 +30,7 @@ mod windows;
 use std::borrow::Cow;
 use std::ops::Range;
 
-use b2p_kernels::{Isa, zeros};
+use b2p_kernels::{Instructions, Isa, Work, zeros};
 use rayon::prelude::*;
 
 use super::{Frame, Gaussians};
@@ -99,6 +99,7 @@ impl SurfelSelection<'_> {
         range: None,
     };
 
+    #[inline(always)]
     fn has(&self, voxel: usize) -> bool {
         self.only.is_none_or(|only| only[voxel])
     }
@@ -228,18 +229,17 @@ impl Surfels<'_> {
     }
 
     /// The edge of a voxel.
+    #[inline(always)]
     fn edge(&self) -> f32 {
         2.0 / (1u32 << self.voxels.depth()) as f32
     }
 
     /// Draws a block of voxels, whose moments after all steps are `far`.
     fn draw(&self, first: usize, far: &[Moments], sparse: bool, rows: Rows<'_>) {
-        let (map, colours, n) = (self.map, self.colours, self.per_voxel.count());
-        let last = first + far.len();
-        let coordinates: Vec<[u32; 3]> = (first..last).map(|i| self.voxels.coordinate(i)).collect();
+        let coordinates: Vec<[u32; 3]> = (first..first + far.len()).map(|i| self.voxels.coordinate(i)).collect();
         let mut masks = [0; BLOCK];
         let masks = &mut masks[..far.len()];
-        map.masks(first, masks);
+        self.map.masks(first, masks);
         let mut discs = self.isa.run(passes::Fit {
             coordinates: &coordinates,
             masks,
@@ -248,25 +248,58 @@ impl Surfels<'_> {
         if sparse {
             fit_windows(self.isa, self.voxels, &coordinates, masks, far, &mut discs);
         }
-        let edge = self.edge();
+        self.isa.run(Placed {
+            surfels: self,
+            first,
+            coordinates: &coordinates,
+            masks,
+            discs: &discs,
+            rows,
+        });
+    }
+}
+
+/// Writes the Gaussians of a block of voxels, whose discs are known.
+struct Placed<'a, 'b> {
+    surfels: &'a Surfels<'a>,
+    /// The first voxel.
+    first: usize,
+    coordinates: &'a [[u32; 3]],
+    /// Which places of the voxels' rows are occupied.
+    masks: &'a [u32],
+    discs: &'a [Disc],
+    rows: Rows<'b>,
+}
+
+impl Work for Placed<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        let (surfels, first, rows) = (self.surfels, self.first, self.rows);
+        let (map, colours, n) = (surfels.map, surfels.colours, surfels.per_voxel.count());
+        let last = first + self.discs.len();
+        let edge = surfels.edge();
         let shrink = if n == 1 { 1.0 } else { SHRINK };
         let (mut buffer, mut around) = (RowBuffer::new(), [].as_slice());
         let mut to = 0;
-        for (j, (disc, &coordinate)) in discs.iter().zip(&coordinates).enumerate() {
+        let voxels = self.discs.iter().zip(self.coordinates).zip(self.masks);
+        for (j, ((disc, &coordinate), &mask)) in voxels.enumerate() {
             let place = j % RowBuffer::ROWS;
             if n > 1 && place == 0 {
                 around = buffer.fill(map, first + j..last.min(first + j + RowBuffer::ROWS));
             }
-            if !self.choice.has(first + j) {
+            if !surfels.choice.has(first + j) {
                 continue;
             }
-            let parts = match self.per_voxel {
+            let parts = match surfels.per_voxel {
                 PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
-                PerVoxel::Four => quarters(disc, &around[27 * place..][..27], colours, first + j),
+                PerVoxel::Four => quarters(disc, mask, &around[27 * place..][..27], colours, first + j),
             };
-            let radius = disc.radius * shrink * self.choice.size * edge;
+            let centre = cube_centre(coordinate, edge);
+            let radius = disc.radius * shrink * surfels.choice.size * edge;
             for (offset, rgb) in parts.into_iter().take(n) {
-                rows.position[to] = cube_point(coordinate, offset, edge);
+                rows.position[to] = [0, 1, 2].map(|axis| centre[axis] + offset[axis] * edge);
                 rows.scale[to] = [radius, radius, disc.thickness * edge];
                 rows.rotation[to] = disc.rotation;
                 rows.opacity[to] = disc.opacity;
@@ -375,20 +408,18 @@ fn fit_windows(
     }
 }
 
-/// The point `offset` voxels from a voxel's centre, in the cube frame. `edge` is the voxel's edge. Centres are exact up
-/// to level 20.
-fn cube_point(coordinate: [u32; 3], offset: [f32; 3], edge: f32) -> [f32; 3] {
-    std::array::from_fn(|axis| {
-        let centre = (f64::from(coordinate[axis]) + 0.5) * f64::from(edge) - 1.0;
-        centre as f32 + offset[axis] * edge
-    })
+/// A voxel's centre in the cube frame. `edge` is the voxel's edge. Centres are exact up to level 20.
+#[inline(always)]
+fn cube_centre(coordinate: [u32; 3], edge: f32) -> [f32; 3] {
+    coordinate.map(|x| ((f64::from(x) + 0.5) * f64::from(edge) - 1.0) as f32)
 }
 
 /// Centres relative to the voxel's centre, in voxels, and colours in 0..=255 of the four discs that replace a voxel's
-/// disc.
-fn quarters(disc: &Disc, row: &[u32], colours: &[[u8; 3]], voxel: usize) -> [([f32; 3], [f32; 3]); 4] {
+/// disc. `mask` has a bit for each place of the voxel's `row` that is occupied.
+#[inline(always)]
+fn quarters(disc: &Disc, mask: u32, row: &[u32], colours: &[[u8; 3]], voxel: usize) -> [([f32; 3], [f32; 3]); 4] {
     let [u, v] = colours::plane(disc);
-    let [along_u, along_v] = colours::gradient(row, colours, voxel, [u, v]);
+    let [along_u, along_v] = colours::gradient(mask, row, colours, voxel, [u, v]);
     let own = colours[voxel].map(f32::from);
     let far = OFFSET * disc.spacing;
     [(-far, -far), (far, -far), (-far, far), (far, far)].map(|(a, b)| {

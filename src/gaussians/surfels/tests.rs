@@ -403,7 +403,9 @@ fn levels_that_are_not_sparse_have_the_discs_of_walks_to_the_bit() {
             for (i, disc) in all_discs(Isa::detect(), voxels, &map).into_iter().enumerate() {
                 let [radius, thickness] = [disc.radius, disc.thickness].map(|v| v * edge);
                 assert_eq!(drawn.scale[i], [radius, radius, thickness]);
-                assert_eq!(drawn.position[i], cube_point(voxels.coordinate(i), disc.centre, edge));
+                let centre = cube_centre(voxels.coordinate(i), edge);
+                let position = [0, 1, 2].map(|axis| centre[axis] + disc.centre[axis] * edge);
+                assert_eq!(drawn.position[i], position);
                 assert_eq!((drawn.rotation[i], drawn.opacity[i]), (disc.rotation, 1.0));
             }
         }
