@@ -32,10 +32,10 @@ const HEADS: &str = "heads.safetensors";
 
 /// Serves until the program is stopped.
 pub fn run(args: &Serve) -> Result<Said> {
-    let Some(module) = b2p_web::MODULE_GZIP else {
+    if !b2p_web::HAS_MODULE {
         let text = "this program was built without its web page: run web/build.sh, then build the program again";
         return Err(Failure(text.into()));
-    };
+    }
     let streams = Streams::find(&args.source)?;
     let count = streams.names()?.len();
     let address = SocketAddr::new(args.host, args.port);
@@ -51,7 +51,9 @@ pub fn run(args: &Serve) -> Result<Said> {
         )),
     };
     said.say()?;
-    http::serve(&listener, BOUNDS, &|request| common(answer(request, &streams, module)))
+    // Unpacked by the time that a browser asks for it; without this thread, it is when one does.
+    let _ = std::thread::Builder::new().spawn(|| b2p_web::module_gzip("b2p.wasm"));
+    http::serve(&listener, BOUNDS, &|request| common(answer(request, &streams)))
 }
 
 /// The streams and files of Gaussians that are served.
@@ -128,7 +130,7 @@ impl Streams {
 }
 
 /// The answer to a request.
-fn answer(request: &Request, streams: &Streams, module: &'static [u8]) -> Response {
+fn answer(request: &Request, streams: &Streams) -> Response {
     let target = &request.target;
     let path = target.split(['?', '#']).next().unwrap_or_default();
     let path = path.trim_start_matches('/');
@@ -143,8 +145,10 @@ fn answer(request: &Request, streams: &Streams, module: &'static [u8]) -> Respon
         return Response::bytes(page.bytes, page.media_type);
     }
     match file {
-        "b2p.wasm" => wasm(module),
-        "b2p-threads.wasm" => b2p_web::THREADS_GZIP.map_or_else(|| plain(404, "no such file\n"), wasm),
+        name @ ("b2p.wasm" | "b2p-threads.wasm") => match b2p_web::module_gzip(name) {
+            Some(module) => wasm(module),
+            None => plain(404, "no such file\n"),
+        },
         HEADS => Response::bytes(b2p::embedded::HEADS, "application/octet-stream"),
         "streams.json" => {
             let names = streams.names().unwrap_or_default();

@@ -86,7 +86,7 @@ fn a_folder_is_served_with_its_page_whole_and_in_ranges() {
     assert!(head.contains("application/wasm") && head.contains("content-encoding: gzip"));
     assert_eq!(module[..2], [0x1f, 0x8b]);
     let (head, threads) = serving.ask("GET /b2p-threads.wasm HTTP/1.1");
-    match b2p_web::THREADS_GZIP {
+    match b2p_web::module_gzip("b2p-threads.wasm") {
         Some(_) => assert!(head.contains("application/wasm") && threads[..2] == [0x1f, 0x8b]),
         None => assert!(head.contains("404")),
     }
