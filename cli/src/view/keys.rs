@@ -163,7 +163,7 @@ mod tests {
 
     #[test]
     fn the_guide_has_the_keys() {
-        let guide = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/guide.md");
+        let guide = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/guide.md");
         // A package of this crate is without it.
         let Ok(guide) = std::fs::read_to_string(guide) else {
             return;

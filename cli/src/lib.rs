@@ -1,4 +1,4 @@
-//! The `b2p` program: arguments in, one stage after the other, files out.
+//! What the `b2p` program does: arguments in, one stage after the other, files out.
 #![forbid(unsafe_code)]
 
 mod args;
@@ -115,7 +115,7 @@ const BROKEN_PIPE: u8 = 128 + 13;
 
 /// Runs the program; the exit code is 0 for success, 1 for failure, 2 (from the argument parser) for misuse, 130 after
 /// Ctrl-C, 141 if the reader of standard output has gone.
-fn main() -> ExitCode {
+pub fn main() -> ExitCode {
     let mut cli = parse();
     manners::set(&cli);
     let usual = std::panic::take_hook();
