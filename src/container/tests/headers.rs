@@ -107,6 +107,28 @@ fn a_count_that_cannot_be_is_at_its_place_in_the_header() {
 }
 
 #[test]
+fn a_slice_size_that_cannot_be_is_at_its_place_in_the_header() {
+    let fault = |bytes: &[u8], at: usize| {
+        let mut bytes = bytes.to_vec();
+        bytes[at..at + 4].copy_from_slice(&[0; 4]);
+        let end = bytes.len() - 4;
+        let sum = crc32c::crc32c(&bytes[..end]);
+        bytes[end..].copy_from_slice(&sum.to_le_bytes());
+        Header::parse(&bytes, &Limits::default()).unwrap_err()
+    };
+    let [version_2, version_3] = [of_version_2(), of_version_3()].map(|header| header.write());
+    for (bytes, at, field) in [
+        (&version_2, 80, "slice size"),
+        (&version_3, 64, "slice size"),
+        (&version_3, 68, "slice size of the colours"),
+    ] {
+        let error = fault(bytes, at);
+        assert_eq!(error.offset(), Some(at as u64), "{error}");
+        assert!(error.to_string().contains(field), "{error}");
+    }
+}
+
+#[test]
 fn levels_end_above_the_finest_in_version_2_and_at_it_in_version_3() {
     let deep = |header: Header, bits: u8, top: u8| {
         let header = Header {
