@@ -1,5 +1,6 @@
 """Learned heads in `int16` arithmetic: clauses 7, 11.1, 11.2, 12.3 and 13 of docs/format.md."""
 
+import functools
 import json
 from dataclasses import dataclass
 
@@ -280,18 +281,19 @@ def gaussians(level, model=None, heads=None):
     count = 4 if level.voxels.level + 1 < level.bits else 1
     nodes = level_above(level.voxels) if model and level.voxels.level else None
 
+    @functools.cache
     def discs(which):
         sizes = [part.sizes[which] for part in level.parts for _ in part.rows]
         return surfels.surfels(level.voxels, level.colours, count, sizes, rows)
 
-    mixed, alone = discs(0), discs(1)
+    mixed, alone = 0, 1
     for part in level.parts:
         if nodes is None or part.discs is None or sparse(level, part.rows):
-            yield alone.of([count * i + k for i in part.rows for k in range(count)])
+            yield discs(alone).of([count * i + k for i in part.rows for k in range(count)])
             continue
         network = model.network(heads, level.voxels.level, level.bits)
         parents, children = inputs(level, nodes, coarseness(part.units))
         raw = network.run(nodes, parents, level.voxels, children)
         learned = [i for i, disc in zip(part.rows, part.discs) if not disc]
         drawn = [count * i + k for i, disc in zip(part.rows, part.discs) if disc for k in range(count)]
-        yield activated(level, learned, raw[learned]).followed_by(mixed.of(drawn))
+        yield activated(level, learned, raw[learned]).followed_by(discs(mixed).of(drawn))

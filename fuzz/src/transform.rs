@@ -95,7 +95,7 @@ fn decoded(bytes: &[u8]) {
         let gaussians = within(most, || decoding.gaussians()).expect("every level is drawn");
         finite(&gaussians);
         if error.is_none() {
-            let parts = within(2 * most, || in_parts(&decoder, bytes));
+            let parts = within(most, || in_parts(&decoder, bytes));
             assert!(parts == gaussians, "parts are other Gaussians");
         }
     }
