@@ -7,7 +7,7 @@ use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
 use super::block::Coding;
-use super::filter::{Responses, TERMS, solve, widen};
+use super::filter::{Responses, TERMS, solve, terms, widen};
 use super::model::{BINS, CoefficientContext, Model};
 use super::node::{CoefficientCoder, Quantiser};
 use super::space::{FRACTION, from_rgb};
@@ -16,7 +16,7 @@ use super::weights::{self, Weights};
 use super::{CodeSlice, Guide, LevelColours, Steps, Ycc, join, nodes, slices, trunk};
 use crate::coding::ONE;
 use crate::coding::binary::Encoder;
-use crate::geometry::{Octree, RowBuffer, SiblingMap, Voxels, Window, morton};
+use crate::geometry::{Octree, SiblingMap, Voxels, Window, morton};
 
 /// Encoding parameters of a level.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -429,13 +429,12 @@ impl Work for Fit<'_> {
         } = self;
         let responses = Responses::new(steps);
         let mut sums = NormalEquations::default();
-        let (mut buffer, mut rows) = (RowBuffer::new(), [].as_slice());
+        let mut windows = map.windows(first);
         for voxel in first..values.len().min(first + FIT_BLOCK) {
-            let place = (voxel - first) % RowBuffer::ROWS;
-            if place == 0 {
-                rows = buffer.fill(map, voxel..values.len().min(voxel + RowBuffer::ROWS));
-            }
-            let terms = responses.terms(instructions, values, &rows[27 * place..][..27], voxel);
+            let Some((window, corner)) = windows.next() else {
+                break;
+            };
+            let terms = terms(&responses.means(instructions, values, voxel, window, corner));
             for t in 0..3 {
                 let residual = f64::from(truth[voxel][t]) - f64::from(values[voxel][t]);
                 let x = terms[t].map(|x| f64::from(x) / 4.0);

@@ -4,8 +4,14 @@ use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 
 use super::block::Nodes;
-use super::filter;
 use crate::geometry::{KernelMap, RowBuffer, SiblingMap};
+
+/// Offsets of the neighbours that share a face, as indices into a 3³ row.
+const FACES: [usize; 6] = [4, 10, 12, 14, 16, 22];
+/// Offsets of the neighbours that share only an edge.
+const EDGES: [usize; 12] = [1, 3, 5, 7, 9, 11, 15, 17, 19, 21, 23, 25];
+/// Offsets of the neighbours that share only a corner.
+const CORNERS: [usize; 8] = [0, 2, 6, 8, 18, 20, 24, 26];
 
 /// Coefficient energies of a level's nodes, smoothed over their neighbours and copied to each child.
 pub(super) fn spread_energies(isa: Isa, nodes: Nodes<'_>, energies: &[[u8; 3]]) -> Vec<[u8; 3]> {
@@ -69,9 +75,9 @@ impl Work for Smooth<'_> {
                 let mut sums = [0u32; 4];
                 // By the number of coordinates in which a neighbour differs: itself, by a face, an edge, a corner.
                 add_energies(energies, row, &[KernelMap::CENTRE], 40, &mut sums);
-                add_energies(energies, row, &filter::FACES, 15, &mut sums);
-                add_energies(energies, row, &filter::EDGES, 7, &mut sums);
-                add_energies(energies, row, &filter::CORNERS, 3, &mut sums);
+                add_energies(energies, row, &FACES, 15, &mut sums);
+                add_energies(energies, row, &EDGES, 7, &mut sums);
+                add_energies(energies, row, &CORNERS, 3, &mut sums);
                 let [y, co, cg, weight] = sums;
                 let smoothed = [y, co, cg].map(|sum| (sum / weight.max(1)) as u8);
                 for _ in 0..mask.count_ones() {

@@ -20,7 +20,7 @@ use rayon::prelude::*;
 use super::LevelColours;
 use super::space::{Steps, Ycc, clamp, display};
 use crate::error::{Error, Result, Stage};
-use crate::geometry::{KernelMap, RowBuffer, SiblingMap};
+use crate::geometry::{SiblingMap, Window, place};
 
 /// Number of terms of a pass and channel.
 pub(super) const TERMS: usize = 5;
@@ -36,6 +36,7 @@ const BLOCK: usize = 4096;
 /// Weights of a pass by channel and term, in units of 1/16.
 type Pass = [[i8; TERMS]; 3];
 /// Five terms of three channels: four times the mean.
+#[cfg(feature = "encoder")]
 type Terms = [[i32; TERMS]; 3];
 
 /// The colour filter of a level.
@@ -163,20 +164,35 @@ impl Work for FilterBlock<'_> {
             out,
         } = self;
         let kernel = Responses::new(steps);
-        let mut buffer = RowBuffer::new();
-        for (i, out) in out.chunks_mut(RowBuffer::ROWS).enumerate() {
-            let first = first + i * RowBuffer::ROWS;
-            let rows = buffer.fill(map, first..first + out.len()).chunks_exact(27);
-            for ((voxel, out), row) in (first..).zip(out).zip(rows) {
-                let terms = kernel.terms(instructions, values, row, voxel);
-                for t in 0..3 {
-                    let weighted = pass[t].iter().zip(terms[t]);
-                    let sum = weighted.fold(0i32, |sum, (w, x)| sum.wrapping_add(i32::from(*w) * x));
-                    out[t] = clamp(i32::from(values[voxel][t]) + ((sum + 32) >> 6), steps.fraction());
+        let weights = by_lane(pass);
+        let mut windows = map.windows(first);
+        for (voxel, out) in (first..).zip(out) {
+            let Some((window, corner)) = windows.next() else {
+                return;
+            };
+            let means = kernel.means(instructions, values, voxel, window, corner);
+            let mut sums = [0i32; 8];
+            for (weights, means) in weights.iter().zip(&means) {
+                for (sum, (weight, mean)) in sums.iter_mut().zip(weights.iter().zip(means)) {
+                    *sum = sum.wrapping_add(weight.wrapping_mul(*mean));
                 }
+            }
+            for t in 0..3 {
+                let sum = sums[t].wrapping_add(sums[4 + t]);
+                out[t] = clamp(i32::from(values[voxel][t]) + ((sum + 32) >> 6), steps.fraction());
             }
         }
     }
+}
+
+/// The weights of a pass for each lane of the [means](Responses::means).
+fn by_lane(pass: &Pass) -> [Lanes; 3] {
+    let mut weights = [[0; 8]; 3];
+    for (t, [a, b, c, d, e]) in pass.map(|weights| weights.map(i32::from)).into_iter().enumerate() {
+        (weights[0][t], weights[1][t], weights[2][t]) = (a, b, c);
+        (weights[0][4 + t], weights[1][4 + t]) = (d, e);
+    }
+    weights
 }
 
 /// Values in the layout of [`responses`]: Y, Co, Cg and 0, twice.
@@ -187,22 +203,19 @@ pub(super) fn widen(values: &[Ycc]) -> Vec<Values> {
         .collect()
 }
 
-/// Offsets of the neighbours that share a face, as indices into a 3³ row.
-pub(super) const FACES: [usize; 6] = [4, 10, 12, 14, 16, 22];
-/// Offsets of the neighbours that share only an edge.
-pub(super) const EDGES: [usize; 12] = [1, 3, 5, 7, 9, 11, 15, 17, 19, 21, 23, 25];
-/// Offsets of the neighbours that share only a corner.
-pub(super) const CORNERS: [usize; 8] = [0, 2, 6, 8, 18, 20, 24, 26];
-
-/// All places of a row.
-const PLACES: [usize; 27] = {
-    let mut places = [0; 27];
+/// Where the neighbours that share a face, only an edge, and only a corner are in a window, from the first of a row on.
+const CLASSES: [u64; 3] = {
+    let mut classes = [0; 3];
     let mut k = 0;
     while k < 27 {
-        places[k] = k;
+        // Steps away from the voxel.
+        let steps = (k % 3 != 1) as usize + (k / 3 % 3 != 1) as usize + (k / 9 != 1) as usize;
+        if steps > 0 {
+            classes[steps - 1] |= 1 << place(k);
+        }
         k += 1;
     }
-    places
+    classes
 };
 
 /// Response functions of a level: lanes 0 to 2 are the narrow responses of Y, Co and Cg, lanes 4 to 6 the wide ones.
@@ -223,48 +236,46 @@ impl Responses {
         }
     }
 
-    /// The sums of the responses to the neighbours at these offsets, and how many of them are present.
-    ///
-    /// A function, as closures are not always inlined, and would then be compiled for the baseline of the target.
+    /// Four times the weighted means over all neighbours of a voxel of the narrow responses in lanes 0 to 2, of the wide
+    /// ones in lanes 4 to 6: those of faces, of edges, and of corners. The wide ones of corners count as edges. `corner`
+    /// is where the voxel's row begins in the window.
     #[inline(always)]
-    fn sum<I: Instructions, const N: usize>(
+    pub fn means<I: Instructions>(
         &self,
         instructions: I,
         values: &[Values],
-        own: &Values,
-        row: &[u32],
-        offsets: &[usize; N],
-    ) -> (Lanes, i32) {
-        // Those that are present come together first, without branches: their presence is unpredictable.
-        let (mut present, mut count) = ([0; N], 0);
-        for &k in offsets {
-            present[count.min(N - 1)] = row[k];
-            count += usize::from(row[k] != KernelMap::ABSENT);
+        voxel: usize,
+        window: &Window,
+        corner: usize,
+    ) -> [Lanes; 3] {
+        let (around, there) = window.voxels();
+        let mut classes = [[0; 8]; 3];
+        let mut counts = 0;
+        for ((sums, class), weight) in classes.iter_mut().zip(CLASSES).zip(CLASS_WEIGHTS) {
+            let places = there & class << corner;
+            *sums = responses(instructions, values, &values[voxel], around, places, &self.inverses);
+            for sum in sums.iter_mut() {
+                *sum *= weight;
+            }
+            counts += weight * places.count_ones() as i32;
         }
-        responses(instructions, values, own, &present, &PLACES[..count], &self.inverses)
-    }
-
-    /// Computes the terms of one voxel, which has this row of its level's map.
-    #[inline(always)]
-    pub fn terms<I: Instructions>(&self, instructions: I, values: &[Values], row: &[u32], voxel: usize) -> Terms {
-        let own = &values[voxel];
-        let (faces, face_count) = self.sum(instructions, values, own, row, &FACES);
-        let (edges, edge_count) = self.sum(instructions, values, own, row, &EDGES);
-        let (corners, corner_count) = self.sum(instructions, values, own, row, &CORNERS);
-        let [face, edge, corner] = CLASS_WEIGHTS;
-        let counts = face_count * face + edge_count * edge + corner_count * corner;
+        for lane in 4..8 {
+            classes[1][lane] += std::mem::take(&mut classes[2][lane]);
+        }
         let inverse = i64::from((1u32 << 16) / counts.max(1) as u32);
-        let mean = |sum: i32| ((i64::from(sum) * inverse) >> 14) as i32;
-        std::array::from_fn(|t| {
-            [
-                mean(face * faces[t]),
-                mean(edge * edges[t]),
-                mean(corner * corners[t]),
-                mean(face * faces[4 + t]),
-                mean(edge * edges[4 + t] + corner * corners[4 + t]),
-            ]
-        })
+        for sums in &mut classes {
+            for sum in sums {
+                *sum = ((i64::from(*sum) * inverse) >> 14) as i32;
+            }
+        }
+        classes
     }
+}
+
+/// The terms of the three channels, of what [`Responses::means`] returns.
+#[cfg(feature = "encoder")]
+pub(super) fn terms([faces, edges, corners]: &[Lanes; 3]) -> Terms {
+    std::array::from_fn(|t| [faces[t], edges[t], corners[t], faces[4 + t], edges[4 + t]])
 }
 
 /// Solves the normal equations `a·x = b`, regularised, for weights in units of 1/16.

@@ -202,17 +202,16 @@ impl SiblingMap {
     pub fn masks(&self, first: usize, masks: &mut [u32]) {
         assert!(first + masks.len() <= self.len, "voxels beyond the last");
         let mut masks = masks.iter_mut();
-        self.for_each_parent(first, |block, parent, children| {
+        for (block, parent, children) in self.parents(first) {
             if masks.len() == 0 {
-                return false;
+                return;
             }
             for (position, mask) in ones(children).zip(&mut masks) {
                 let there = block.there[parent] >> corner(octant(position));
                 let lines = (0..9).map(|line| (there >> place(3 * line) & 7) << (3 * line));
                 *mask = lines.sum::<u64>() as u32;
             }
-            true
-        });
+        }
     }
 
     /// The number of neighbours of each of the voxels `range`, itself included.
@@ -232,12 +231,25 @@ impl SiblingMap {
         degrees
     }
 
-    /// Calls `each` with the block and place of parents, and the positions of their children, for the voxels from `first`
-    /// on, until it returns `false`.
+    /// The voxels from `first` on, each in the window that it shares with its siblings.
     #[inline(always)]
-    fn for_each_parent(&self, first: usize, mut each: impl FnMut(&Block, usize, u64) -> bool) {
+    pub fn windows(&self, first: usize) -> Windows<'_> {
+        Windows {
+            parents: self.parents(first),
+            window: Window::EMPTY,
+            left: 0,
+        }
+    }
+
+    /// The parents of the voxels from `first` on.
+    #[inline(always)]
+    fn parents(&self, first: usize) -> Parents<'_> {
         if first >= self.len {
-            return;
+            return Parents {
+                blocks: &[],
+                next: 0,
+                skipped: 0,
+            };
         }
         // The last block and parent that do not begin after the voxel are its own.
         let own = self
@@ -245,20 +257,66 @@ impl SiblingMap {
             .partition_point(|block| block.first_child[0] as usize <= first)
             - 1;
         let firsts = &self.blocks[own].first_child;
-        let mut parents = firsts.partition_point(|&child| child as usize <= first) - 1;
-        let mut skipped = first - firsts[parents] as usize;
-        for block in &self.blocks[own..] {
-            for parent in parents..block.there.len() {
-                let mut children = block.there[parent] & OWN;
-                for _ in 0..std::mem::take(&mut skipped) {
-                    children &= children - 1;
-                }
-                if !each(block, parent, children) {
-                    return;
-                }
-            }
-            parents = 0;
+        let next = firsts.partition_point(|&child| child as usize <= first) - 1;
+        Parents {
+            blocks: &self.blocks[own..],
+            next,
+            skipped: first - firsts[next] as usize,
         }
+    }
+}
+
+/// Parents one after the other: the block and the place of each, and the positions of its children.
+struct Parents<'a> {
+    blocks: &'a [Block],
+    /// The place of the next one in the first of the blocks.
+    next: usize,
+    /// How many of its children are left out.
+    skipped: usize,
+}
+
+impl<'a> Iterator for Parents<'a> {
+    type Item = (&'a Block, usize, u64);
+
+    #[inline(always)]
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            let (block, rest) = self.blocks.split_first()?;
+            let parent = self.next;
+            if parent == block.there.len() {
+                (self.blocks, self.next) = (rest, 0);
+                continue;
+            }
+            self.next += 1;
+            let mut children = block.there[parent] & OWN;
+            for _ in 0..std::mem::take(&mut self.skipped) {
+                children &= children - 1;
+            }
+            return Some((block, parent, children));
+        }
+    }
+}
+
+/// Voxels of a level one after the other, each in the window that it shares with its siblings.
+pub struct Windows<'a> {
+    parents: Parents<'a>,
+    window: Window,
+    /// Positions of the siblings that come next.
+    left: u64,
+}
+
+impl Windows<'_> {
+    /// Goes to the next voxel, and returns the window that shows its neighbours, and where its row begins there: the
+    /// voxel at offset `k` is [`place`]`(k)` further on. `None` after the last voxel.
+    #[inline(always)]
+    pub fn next(&mut self) -> Option<(&Window, usize)> {
+        while self.left == 0 {
+            let (block, parent, children) = self.parents.next()?;
+            (self.window, self.left) = (block.window(parent), children);
+        }
+        let position = self.left.trailing_zeros();
+        self.left &= self.left - 1;
+        Some((&self.window, corner(octant(position))))
     }
 }
 
@@ -266,16 +324,15 @@ impl MadeRows for SiblingMap {
     fn fill(&self, first: usize, rows: &mut [u32]) {
         assert!(first + rows.len() / 27 <= self.len, "rows beyond the last voxel");
         let mut rows = rows.chunks_exact_mut(27);
-        self.for_each_parent(first, |block, parent, children| {
+        for (block, parent, children) in self.parents(first) {
             if rows.len() == 0 {
-                return false;
+                return;
             }
             let window = block.window(parent);
             for (position, row) in ones(children).zip(&mut rows) {
                 window.copy_row(octant(position), row);
             }
-            true
-        });
+        }
     }
 }
 
@@ -352,6 +409,12 @@ impl Window {
         there: 0,
         voxels: [KernelMap::ABSENT; 64],
     };
+
+    /// The voxel at each position, and which positions are occupied. Of no meaning where none is.
+    #[inline(always)]
+    pub fn voxels(&self) -> (&[u32; 64], u64) {
+        (&self.voxels, self.there)
+    }
 
     /// Whether the neighbour at offset `k` of the row of the child in `octant` is there.
     #[inline(always)]

@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::path::Path;
 
+use b2p_kernels::{Instructions, Isa, Work};
 use rayon::prelude::*;
 use tiny_skia::{IntSize, Pixmap, PremultipliedColorU8};
 
@@ -208,23 +209,51 @@ impl Image {
             [-37.797, -74.203, 112.0, 128.0],
             [112.0, -93.786, -18.214, 128.0],
         ];
+        let isa = Isa::detect();
         to.write_all(b"FRAME\n").map_err(io_error(path))?;
         let mut plane = vec![0; self.pixels.len().min(PLANE_PART)];
-        for [kr, kg, kb, offset] in rows {
+        for row in rows {
             for pixels in self.pixels.chunks(PLANE_PART) {
                 let plane = &mut plane[..pixels.len()];
                 let tasks = plane.par_chunks_mut(PLANE_TASK).zip(pixels.par_chunks(PLANE_TASK));
-                tasks.for_each(|(plane, pixels)| {
-                    for (value, [r, g, b, _]) in plane.iter_mut().zip(pixels) {
-                        let [r, g, b] = [r, g, b].map(|c| c.clamp(0.0, 1.0));
-                        *value = (kr * r + kg * g + kb * b + offset + 0.5) as u8;
-                    }
-                });
+                tasks.for_each(|(plane, pixels)| isa.run(PlaneTask { row, pixels, plane }));
                 to.write_all(plane).map_err(io_error(path))?;
             }
         }
         Ok(())
     }
+}
+
+/// A part of a plane of YUV4MPEG2.
+struct PlaneTask<'a> {
+    /// Factors of red, green and blue, and what is added.
+    row: [f32; 4],
+    pixels: &'a [[f32; 4]],
+    plane: &'a mut [u8],
+}
+
+impl Work for PlaneTask<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        let [kr, kg, kb, offset] = self.row;
+        for (value, [r, g, b, _]) in self.plane.iter_mut().zip(self.pixels) {
+            let [r, g, b] = [r, g, b].map(|c| c.clamp(0.0, 1.0));
+            *value = floor(kr * r + kg * g + kb * b + offset + 0.5);
+        }
+    }
+}
+
+/// The whole part of a number from 0 to 255; 0 for what is not a number. Compilers find the vectors in it, which they
+/// do not in a conversion that saturates.
+#[inline(always)]
+fn floor(x: f32) -> u8 {
+    /// The last bits of the sum with it are those of the nearest whole number.
+    const WHOLE: f32 = (1u32 << 23) as f32;
+    let nearest = x + WHOLE;
+    let above = nearest - WHOLE > x;
+    nearest.to_bits().wrapping_sub(u32::from(above)) as u8
 }
 
 /// Eight bits a channel, premultiplied.
@@ -342,6 +371,15 @@ mod tests {
         assert!(picture.y4m_header().starts_with(b"YUV4MPEG2 W2 H1 "));
         let frame = picture.to_y4m_frame();
         assert_eq!(frame[6..], [235, 81, 128, 90, 128, 240]);
+    }
+
+    #[test]
+    fn whole_parts_are_those_of_a_conversion() {
+        let numbers = (0..=255u32 << 12).map(|i| i as f32 / 4096.0);
+        let halves = (0..=255).flat_map(|i| [(i as f32).next_down().max(0.0), (i as f32 + 0.5).next_down()]);
+        for x in numbers.chain(halves).chain([f32::NAN]) {
+            assert_eq!(floor(x), x as u8, "{x}");
+        }
     }
 
     #[test]

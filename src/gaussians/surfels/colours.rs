@@ -1,6 +1,7 @@
 //! Colour gradients along the surface (`docs/format.md`, clause 6.6.3).
 
 use super::discs::Disc;
+use super::lanes::{GROUP, Lane, axes, lane};
 use crate::geometry::ones;
 
 /// Ridge regularisation of the least squares, since the colours of few neighbours are mostly noise.
@@ -17,48 +18,97 @@ const OFFSETS: [[f32; 3]; 27] = {
     offsets
 };
 
-/// A colour as floats, and a 0 that fills a vector.
-#[inline(always)]
-fn with_zero([r, g, b]: [u8; 3]) -> [f32; 4] {
-    [r, g, b, 0].map(f32::from)
+/// The planes of up to [`GROUP`] discs, and how the colours change along them.
+pub struct Gradients {
+    /// The axes of the planes, by component.
+    pub axes: [[Lane; 3]; 2],
+    /// What red, green and blue change by per voxel along both axes.
+    pub along: [[Lane; 3]; 2],
 }
 
-/// The gradient of R, G and B per voxel along both axes `u`, `v` of a disc's plane, by least squares over the occupied
-/// ones of the 26 neighbours. `row` is the voxel's of its level's map, and `mask` has a bit for each of its places that
-/// is occupied.
+impl Gradients {
+    /// Those of consecutive voxels, from voxel `first` on, by least squares over the occupied ones of the 26
+    /// neighbours. `rows` are the voxels' of their level's map, and `masks` have a bit for each place that is occupied.
+    #[inline(always)]
+    pub fn new(discs: &[Disc], masks: &[u32], rows: &[u32], colours: &[[u8; 3]], first: usize) -> Self {
+        let axes = planes(discs);
+        let (mut there, mut own) = ([0; GROUP], [[0; GROUP]; 3]);
+        // Of absent neighbours any colour will do, since they weigh nothing.
+        let mut around = [[[0; GROUP]; 3]; 27];
+        for (j, (&mask, row)) in masks.iter().zip(rows.as_chunks::<27>().0).enumerate() {
+            there[j] = mask;
+            for (own, value) in own.iter_mut().zip(colours[first + j]) {
+                own[j] = value;
+            }
+            for k in ones(mask) {
+                for (around, value) in around[k].iter_mut().zip(colours[row[k] as usize]) {
+                    around[j] = value;
+                }
+            }
+        }
+        let along = least_squares(&there, &axes, &own, &around);
+        Gradients { axes, along }
+    }
+}
+
+/// The axes of the planes of discs: the rotated x and y.
 #[inline(always)]
-pub fn gradient(mask: u32, row: &[u32], colours: &[[u8; 3]], voxel: usize, [u, v]: [[f32; 3]; 2]) -> [[f32; 3]; 2] {
-    let own = with_zero(colours[voxel]);
-    let (mut uu, mut uv, mut vv) = (DAMPING, 0.0, DAMPING);
-    let (mut ru, mut rv) = ([0.0f32; 4], [0.0f32; 4]);
-    for k in ones(mask) {
-        let (offset, q) = (OFFSETS[k], row[k]);
-        let along = |axis: [f32; 3]| offset[0] * axis[0] + offset[1] * axis[1] + offset[2] * axis[2];
-        let (a, b) = (along(u), along(v));
-        uu += a * a;
-        uv += a * b;
-        vv += b * b;
-        let colour = with_zero(colours[q as usize]);
-        for channel in 0..4 {
-            let change = colour[channel] - own[channel];
-            ru[channel] += a * change;
-            rv[channel] += b * change;
+fn planes(discs: &[Disc]) -> [[Lane; 3]; 2] {
+    let mut rotations = [[0.0; GROUP]; 3];
+    for (j, disc) in discs.iter().enumerate() {
+        for (axis, value) in rotations.iter_mut().zip(disc.rotation) {
+            axis[j] = value;
         }
     }
-    let determinant = uu * vv - uv * uv;
-    let solve = |a: f32, b: f32, c: f32, d: f32| (a * b - c * d) / determinant;
+    let [w, x, y] = &rotations;
     [
-        [0, 1, 2].map(|c| solve(vv, ru[c], uv, rv[c])),
-        [0, 1, 2].map(|c| solve(uu, rv[c], uv, ru[c])),
+        [
+            lane(|j| 1.0 - 2.0 * y[j] * y[j]),
+            lane(|j| 2.0 * x[j] * y[j]),
+            lane(|j| -2.0 * w[j] * y[j]),
+        ],
+        [
+            lane(|j| 2.0 * x[j] * y[j]),
+            lane(|j| 1.0 - 2.0 * x[j] * x[j]),
+            lane(|j| 2.0 * w[j] * x[j]),
+        ],
     ]
 }
 
-/// The axes of a disc's plane: the rotated x and y.
+/// The slopes of colours along both axes of planes. `there` has a bit for each neighbour that counts.
 #[inline(always)]
-pub fn plane(disc: &Disc) -> [[f32; 3]; 2] {
-    let [w, x, y, _] = disc.rotation;
+fn least_squares(
+    there: &[u32; GROUP],
+    [u, v]: &[[Lane; 3]; 2],
+    own: &[[u8; GROUP]; 3],
+    around: &[[[u8; GROUP]; 3]; 27],
+) -> [[Lane; 3]; 2] {
+    let (mut uu, mut uv, mut vv) = ([DAMPING; GROUP], [0.0; GROUP], [DAMPING; GROUP]);
+    let (mut ru, mut rv) = ([[0.0; GROUP]; 3], [[0.0; GROUP]; 3]);
+    for (k, (&[x, y, z], around)) in OFFSETS.iter().zip(around).enumerate() {
+        // Adding zero changes no sum.
+        let along = |axis: &[Lane; 3], j: usize| {
+            let along = x * axis[0][j] + y * axis[1][j] + z * axis[2][j];
+            if there[j] >> k & 1 == 0 { 0.0 } else { along }
+        };
+        let (a, b) = (lane(|j| along(u, j)), lane(|j| along(v, j)));
+        for j in 0..GROUP {
+            uu[j] += a[j] * a[j];
+            uv[j] += a[j] * b[j];
+            vv[j] += b[j] * b[j];
+        }
+        for channel in 0..3 {
+            for j in 0..GROUP {
+                let change = f32::from(around[channel][j]) - f32::from(own[channel][j]);
+                ru[channel][j] += a[j] * change;
+                rv[channel][j] += b[j] * change;
+            }
+        }
+    }
+    let determinant = lane(|j| uu[j] * vv[j] - uv[j] * uv[j]);
+    let solve = |a: &Lane, b: &Lane, c: &Lane, d: &Lane| lane(|j| (a[j] * b[j] - c[j] * d[j]) / determinant[j]);
     [
-        [1.0 - 2.0 * y * y, 2.0 * x * y, -2.0 * w * y],
-        [2.0 * x * y, 1.0 - 2.0 * x * x, 2.0 * w * x],
+        axes(|channel| solve(&vv, &ru[channel], &uv, &rv[channel])),
+        axes(|channel| solve(&uu, &rv[channel], &uv, &ru[channel])),
     ]
 }

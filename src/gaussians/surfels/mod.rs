@@ -35,7 +35,9 @@ use rayon::prelude::*;
 
 use super::{Frame, Gaussians};
 use crate::geometry::{RowBuffer, SiblingMap, Voxels};
+use colours::Gradients;
 use discs::Disc;
+use lanes::GROUP;
 use moments::Moments;
 use sparsity::Sparsity;
 pub use sparsity::{closing_size, is_for_surfels};
@@ -282,30 +284,43 @@ impl Work for Placed<'_, '_> {
         let edge = surfels.edge();
         let shrink = if n == 1 { 1.0 } else { SHRINK };
         let (mut buffer, mut around) = (RowBuffer::new(), [].as_slice());
-        let mut to = 0;
-        let voxels = self.discs.iter().zip(self.coordinates).zip(self.masks);
-        for (j, ((disc, &coordinate), &mask)) in voxels.enumerate() {
+        let mut gradients = None;
+        let mut taken = 0;
+        for (j, (disc, &coordinate)) in self.discs.iter().zip(self.coordinates).enumerate() {
             let place = j % RowBuffer::ROWS;
             if n > 1 && place == 0 {
                 around = buffer.fill(map, first + j..last.min(first + j + RowBuffer::ROWS));
             }
+            if j % GROUP == 0 {
+                gradients = None;
+            }
             if !surfels.choice.has(first + j) {
                 continue;
             }
-            let parts = match surfels.per_voxel {
-                PerVoxel::One => [(disc.centre, colours[first + j].map(f32::from)); 4],
-                PerVoxel::Four => quarters(disc, mask, &around[27 * place..][..27], colours, first + j),
+            if n > 1 && gradients.is_none() {
+                let group = j / GROUP * GROUP..self.discs.len().min((j / GROUP + 1) * GROUP);
+                let rows = &around[27 * (group.start % RowBuffer::ROWS)..];
+                let (discs, masks) = (&self.discs[group.clone()], &self.masks[group.clone()]);
+                gradients = Some(Gradients::new(discs, masks, rows, colours, first + group.start));
+            }
+            let own = with_floats(colours[first + j]);
+            let (places, rgb) = match &gradients {
+                None => ([[disc.centre[0]; 4], [disc.centre[1]; 4], [disc.centre[2]; 4]], own),
+                Some(gradients) => quarters(disc, gradients, j % GROUP, own),
             };
             let centre = cube_centre(coordinate, edge);
             let radius = disc.radius * shrink * surfels.choice.size * edge;
-            for (offset, rgb) in parts.into_iter().take(n) {
-                rows.position[to] = [0, 1, 2].map(|axis| centre[axis] + offset[axis] * edge);
-                rows.scale[to] = [radius, radius, disc.thickness * edge];
-                rows.rotation[to] = disc.rotation;
-                rows.opacity[to] = disc.opacity;
-                rows.colour[to] = rgb.map(|v| v / 255.0);
-                to += 1;
+            let (places, rgb) = (moved(places, centre, edge), shares(rgb));
+            let to = taken..taken + n;
+            let positions = rows.position[to.clone()].iter_mut().zip(&mut rows.colour[to.clone()]);
+            for (part, (position, colour)) in positions.enumerate() {
+                *position = [places[0][part], places[1][part], places[2][part]];
+                *colour = [rgb[0][part], rgb[1][part], rgb[2][part]];
             }
+            rows.scale[to.clone()].fill([radius, radius, disc.thickness * edge]);
+            rows.rotation[to.clone()].fill(disc.rotation);
+            rows.opacity[to.clone()].fill(disc.opacity);
+            taken = to.end;
         }
     }
 }
@@ -414,17 +429,49 @@ fn cube_centre(coordinate: [u32; 3], edge: f32) -> [f32; 3] {
     coordinate.map(|x| ((f64::from(x) + 0.5) * f64::from(edge) - 1.0) as f32)
 }
 
-/// Centres relative to the voxel's centre, in voxels, and colours in 0..=255 of the four discs that replace a voxel's
-/// disc. `mask` has a bit for each place of the voxel's `row` that is occupied.
+/// Three components of the four discs of a voxel.
+type Quarters = [[f32; 4]; 3];
+
+/// The same colour four times.
 #[inline(always)]
-fn quarters(disc: &Disc, mask: u32, row: &[u32], colours: &[[u8; 3]], voxel: usize) -> [([f32; 3], [f32; 3]); 4] {
-    let [u, v] = colours::plane(disc);
-    let [along_u, along_v] = colours::gradient(mask, row, colours, voxel, [u, v]);
-    let own = colours[voxel].map(f32::from);
+fn with_floats([r, g, b]: [u8; 3]) -> Quarters {
+    [[f32::from(r); 4], [f32::from(g); 4], [f32::from(b); 4]]
+}
+
+/// Centres relative to the voxel's centre, in voxels, and colours in 0..=255 of the four discs that replace a voxel's
+/// disc. The voxel's colour is `own`, and it is at place `j` of its group.
+#[inline(always)]
+fn quarters(disc: &Disc, gradients: &Gradients, j: usize, own: Quarters) -> (Quarters, Quarters) {
+    let ([u, v], [along_u, along_v]) = (&gradients.axes, &gradients.along);
     let far = OFFSET * disc.spacing;
-    [(-far, -far), (far, -far), (-far, far), (far, far)].map(|(a, b)| {
-        let offset = [0, 1, 2].map(|axis| disc.centre[axis] + a * u[axis] + b * v[axis]);
-        let rgb = [0, 1, 2].map(|c| own[c] + a * along_u[c] + b * along_v[c]);
-        (offset, rgb.map(|v| v.clamp(0.0, 255.0)))
-    })
+    let (a, b) = ([-far, far, -far, far], [-far, -far, far, far]);
+    let (mut places, mut rgb) = ([[0.0; 4]; 3], [[0.0; 4]; 3]);
+    for k in 0..3 {
+        let (u, v, along_u, along_v) = (u[k][j], v[k][j], along_u[k][j], along_v[k][j]);
+        for part in 0..4 {
+            places[k][part] = disc.centre[k] + a[part] * u + b[part] * v;
+            rgb[k][part] = (own[k][part] + a[part] * along_u + b[part] * along_v).clamp(0.0, 255.0);
+        }
+    }
+    (places, rgb)
+}
+
+/// Places in the cube frame, of places in voxels from a voxel's centre.
+#[inline(always)]
+fn moved(mut places: Quarters, centre: [f32; 3], edge: f32) -> Quarters {
+    for (places, centre) in places.iter_mut().zip(centre) {
+        for place in places {
+            *place = centre + *place * edge;
+        }
+    }
+    places
+}
+
+/// Colours in 0..=1, of colours in 0..=255.
+#[inline(always)]
+fn shares(mut rgb: Quarters) -> Quarters {
+    for value in rgb.as_flattened_mut() {
+        *value /= 255.0;
+    }
+    rgb
 }
