@@ -259,8 +259,9 @@ impl Responses {
             }
             counts += weight * places.count_ones() as i32;
         }
-        for lane in 4..8 {
-            classes[1][lane] += std::mem::take(&mut classes[2][lane]);
+        let [_, edges, corners] = &mut classes;
+        for (edge, corner) in edges[4..].iter_mut().zip(&mut corners[4..]) {
+            *edge += std::mem::take(corner);
         }
         let inverse = i64::from((1u32 << 16) / counts.max(1) as u32);
         for sums in &mut classes {
