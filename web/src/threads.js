@@ -85,6 +85,9 @@ export class Threads {
 async function newWorker() {
   const address = new URL("./thread.js", import.meta.url);
   if (globalThis.Worker) {
+    // Of a script that is not there, Firefox does not always tell.
+    const script = await fetch(address);
+    if (!script.ok) throw new Error(`${address}: ${script.status} ${script.statusText}`);
     const worker = new Worker(address, { type: "module" });
     return {
       hear(listen, fail) {
