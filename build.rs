@@ -1,14 +1,14 @@
-//! Compresses the model of learned streams, which the library carries with the feature `embedded`.
+//! Compresses the model of learned streams, which the library carries with the feature `embedded-learned`.
 
 use std::error::Error;
 
-#[cfg(not(feature = "embedded"))]
+#[cfg(not(feature = "embedded-learned"))]
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed=build.rs");
     Ok(())
 }
 
-#[cfg(feature = "embedded")]
+#[cfg(feature = "embedded-learned")]
 fn main() -> Result<(), Box<dyn Error>> {
     use std::io::Write;
 

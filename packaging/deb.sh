@@ -8,11 +8,13 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-cargo build --locked --profile dist -p b2p-cli
+# Its data are files beside it.
+cargo build --locked --profile dist -p b2p-cli --no-default-features --features view
 program=${CARGO_TARGET_DIR:-target}/dist/b2p
 out=target/packaging
 rm -rf $out
 mkdir -p $out
+packaging/data.sh $out/share/b2p
 $program -q man $out/man
 $program completions bash > $out/b2p.bash
 $program completions zsh > $out/_b2p

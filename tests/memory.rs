@@ -49,7 +49,7 @@ fn models() -> Vec<(&'static str, Model)> {
     vec![
         ("tiny", load(&untrained(&Shape::tiny().with_quick_heads(), 0))),
         ("wide", load(&untrained(&wide, 0))),
-        #[cfg(feature = "embedded")]
+        #[cfg(feature = "embedded-learned")]
         ("lite", load(b2p::embedded::model())),
     ]
 }

@@ -23,7 +23,7 @@ use crate::log::Log;
 /// stays usable, and nothing more is decoded.
 ///
 /// ```
-/// # #[cfg(feature = "embedded")]
+/// # #[cfg(feature = "embedded-learned")]
 /// # fn main() -> b2p::Result<()> {
 /// use b2p::{Log, Model, latents::LatentDecoder};
 ///
@@ -40,7 +40,7 @@ use crate::log::Log;
 /// # assert!(gaussians.len() > 0);
 /// # Ok(())
 /// # }
-/// # #[cfg(not(feature = "embedded"))]
+/// # #[cfg(not(feature = "embedded-learned"))]
 /// # fn main() {}
 /// ```
 #[derive(Debug)]

@@ -36,7 +36,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
     }
     let bytes = match &args.input {
         Some(path) => load::bytes(path, limits)?,
-        None => embedded::SAMPLE.to_vec(),
+        None => embedded::SCENE.to_vec(),
     };
     let start = Instant::now();
     let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?;

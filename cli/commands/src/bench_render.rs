@@ -45,7 +45,7 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
             source.gaussians(&args.detail, &[shot], &log)?.0
         }
         None => {
-            let sample = embedded::SAMPLE;
+            let sample = embedded::SCENE;
             let decoder = load::decoder(sample, &args.detail, &args.model, limits)?;
             decoder.with_log(&log).decode(sample)?
         }

@@ -210,7 +210,7 @@ fn text(args: &Info, stream: &Stream, bytes: usize, levels: &[Described], known:
         (Some(id), Some((name, heads)), _) => {
             format!("colours: learned, model {id}: {name}, heads: {}", heads.join(", "))
         }
-        (Some(id), None, None) => format!("colours: learned, model {id}, which is not the one inside the program"),
+        (Some(id), None, None) => format!("colours: learned, model {id}, which is not the program's own"),
         (Some(id), None, Some(path)) => format!("colours: learned, model {id}, which is not {}", path.display()),
     };
     let placement = header.placement;

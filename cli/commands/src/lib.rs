@@ -9,6 +9,7 @@ mod check;
 mod cloud;
 mod convert;
 mod cut;
+mod data;
 mod decodable;
 mod decode;
 mod demo;

@@ -15,7 +15,7 @@ use b2p::{Axes, Decoder, Error, Isa, Limits, UnknownIsa, input};
 use super::args::{DetailArg, ModelArg};
 use super::cloud::ReadArgs;
 use super::views::Shot;
-use super::{Failure, Result, cloud, convert, kinds, manners, pipe};
+use super::{Failure, Result, cloud, convert, data, kinds, manners, pipe};
 
 /// A stream or Gaussians, told apart by their first bytes.
 pub const PLY_MAGIC: &[u8] = b"ply";
@@ -23,11 +23,11 @@ pub const PLY_MAGIC: &[u8] = b"ply";
 /// The environment variable that says which instructions to use when the arguments don't.
 const ISA: &str = "B2P_ISA";
 
-/// The model in a file, or the one inside the program.
+/// The model in a file, or the program's own.
 pub fn from_file(path: Option<&Path>) -> Result<Model> {
     match path {
         Some(path) => Model::open(path).map_err(Failure::in_file(path)),
-        None => Ok(Model::from_bytes(b2p::embedded::model())?),
+        None => Ok(Model::from_bytes(&data::model()?)?),
     }
 }
 
@@ -39,7 +39,7 @@ pub fn heads(path: Option<&Path>) -> Result<HeadsModel> {
     }
 }
 
-/// The model in a file, or the one inside the program, set to the instructions and the precision asked for.
+/// The model in a file, or the program's own, set to the instructions and the precision asked for.
 pub fn model(arg: &ModelArg) -> Result<Model> {
     let model = from_file(arg.model.as_deref())?;
     let model = model.with_isa(isa(arg.isa.as_deref())?);

@@ -6,6 +6,7 @@ mod clouds;
 mod common;
 mod converting;
 mod cutting;
+mod data;
 mod edges;
 mod faults;
 mod framing;
@@ -243,7 +244,7 @@ fn quick_heads_are_used_where_the_model_has_them() {
     let info = |model| with(&["info", "ball.b2p"], model);
     assert!(info(&one).contains("tiny, heads: best\n"));
     assert!(info(&both).contains("tiny, heads: best, quick\n"));
-    assert!(succeeds(at, &["info", "ball.b2p"]).contains("not the one inside"));
+    assert!(succeeds(at, &["info", "ball.b2p"]).contains("not the program's own"));
 
     let refused = |arguments: &[&str], words: &[&str]| fails(at, arguments, words);
     let to = [&decode[..], &["x.ply"]].concat();

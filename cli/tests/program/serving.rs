@@ -8,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 const SCENE: &[u8] = include_bytes!("../../../models/scene.b2p");
 
 /// A server, until it is dropped.
-struct Serving {
+pub struct Serving {
     child: Child,
     address: String,
 }
@@ -16,8 +16,14 @@ struct Serving {
 impl Serving {
     /// Of `source` in `folder`, if the program has its page.
     fn start(folder: &Path, source: &str) -> Option<Serving> {
+        Self::start_with(folder, source, &[])
+    }
+
+    /// The same with these variables.
+    pub fn start_with(folder: &Path, source: &str, environment: &[(&str, &str)]) -> Option<Serving> {
         let mut child = Command::new(env!("CARGO_BIN_EXE_b2p"))
             .current_dir(folder)
+            .envs(environment.iter().copied())
             .args(["serve", source, "--port", "0"])
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -44,7 +50,7 @@ impl Serving {
     }
 
     /// What comes back for a request: the head in lower case, and the body.
-    fn ask(&self, request: &str) -> (String, Vec<u8>) {
+    pub fn ask(&self, request: &str) -> (String, Vec<u8>) {
         let mut stream = TcpStream::connect(&self.address).expect("a connection");
         write!(stream, "{request}\r\nHost: localhost\r\nConnection: close\r\n\r\n").expect("a request");
         let mut bytes = Vec::new();

@@ -166,7 +166,7 @@ pub struct DetailArg {
 
 #[derive(Debug, Clone, Args)]
 pub struct ModelArg {
-    /// Model file: of learned streams the model that they were coded with [default: the one inside the program], of
+    /// Model file: of learned streams the model that they were coded with [default: the program's own], of
     /// others heads
     #[arg(long, help_heading = "Advanced", value_name = "FILE")]
     pub model: Option<PathBuf>,

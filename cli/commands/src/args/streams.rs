@@ -13,7 +13,7 @@ pub struct Info {
     /// Stream to describe. `-`: standard input
     #[arg(value_name = "IN")]
     pub input: PathBuf,
-    /// Model file to look for the stream's model in [default: the one inside the program]
+    /// Model file to look for the stream's model in [default: the program's own]
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
 }
@@ -23,7 +23,7 @@ pub struct Check {
     /// Streams to check to the last bit. `-`: standard input
     #[arg(value_name = "STREAM", required = true)]
     pub inputs: Vec<PathBuf>,
-    /// Model of learned streams [default: the one inside the program]
+    /// Model of learned streams [default: the program's own]
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
 }

@@ -24,7 +24,7 @@ use super::args::{DetailArg, ModelArg};
 use super::pipe::PIPE;
 use super::progress::Progress;
 use super::table::milliseconds;
-use super::{Failure, Result, load, manners};
+use super::{Failure, Result, data, load, manners};
 
 /// A time instead of level and heads.
 #[derive(Debug, Args)]
@@ -119,20 +119,19 @@ impl Machine {
         let version = version(stream).unwrap_or_default();
         let path = model.model.as_ref();
         let file = |path: &PathBuf| load::bytes(path, limits);
-        let own = if version == 2 {
-            embedded::model()
-        } else {
-            embedded::HEADS
+        let own = || match version {
+            2 => data::model(),
+            _ => Ok(embedded::HEADS.into()),
         };
         let sample = match (version, path) {
             // The sample is the program's own model's; another model is measured with the stream at hand.
+            (2, None) => data::SAMPLE.unwrap_or(stream),
             (2, Some(_)) => stream,
-            (2, None) => embedded::SAMPLE,
             _ => embedded::SCENE,
         };
         Ok(Machine {
             stream: sample.to_vec(),
-            model: path.map_or(Ok(own.to_vec()), file)?,
+            model: path.map_or_else(|| own().map(Into::into), file)?,
             version,
             isa: load::isa(model.isa.as_deref())?,
         })

@@ -5,13 +5,14 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 
 use b2p::{Error, embedded, output};
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::Xxh3;
 
-use super::super::Result;
 use super::super::pipe::PIPE;
+use super::super::{Result, data};
 use super::command_line::CommandLine;
 
 /// Options that change how a command works, but not what it writes.
@@ -122,10 +123,15 @@ impl Write for Hash {
 
 /// What this program is: other models draw other pictures.
 pub fn program() -> String {
-    let mut hash = Xxh3::new();
-    hash.update(embedded::MODEL_ZLIB);
-    hash.update(embedded::HEADS);
-    format!("{} {:032x}", env!("CARGO_PKG_VERSION"), hash.digest128())
+    static PROGRAM: OnceLock<String> = OnceLock::new();
+    let name = || {
+        let mut hash = Xxh3::new();
+        // Without it, learned streams give an error, which leaves no record.
+        hash.update(&data::model().unwrap_or_default());
+        hash.update(embedded::HEADS);
+        format!("{} {:032x}", env!("CARGO_PKG_VERSION"), hash.digest128())
+    };
+    PROGRAM.get_or_init(name).clone()
 }
 
 /// Where the record of an output is.

@@ -37,23 +37,23 @@ pub struct Request {
 
 /// What is sent back.
 #[derive(Debug)]
-pub struct Response {
+pub struct Response<'a> {
     status: u16,
     fields: Vec<(&'static str, String)>,
-    body: Body,
+    body: Body<'a>,
 }
 
 #[derive(Debug)]
-enum Body {
-    Bytes(&'static [u8]),
+enum Body<'a> {
+    Bytes(&'a [u8]),
     Owned(Vec<u8>),
     /// So many bytes from where the file stands.
     File(File, u64),
 }
 
-impl Response {
+impl<'a> Response<'a> {
     /// Bytes of this media type.
-    pub fn bytes(bytes: &'static [u8], media_type: &str) -> Self {
+    pub fn bytes(bytes: &'a [u8], media_type: &str) -> Self {
         Self::new(200, Body::Bytes(bytes)).with("Content-Type", media_type)
     }
 
@@ -67,7 +67,7 @@ impl Response {
         Self::new(status, Body::Owned(text.into_bytes())).with("Content-Type", media_type)
     }
 
-    fn new(status: u16, body: Body) -> Self {
+    fn new(status: u16, body: Body<'a>) -> Self {
         Response {
             status,
             fields: Vec::new(),
@@ -136,7 +136,7 @@ fn reason(status: u16) -> &'static str {
 }
 
 /// Answers all that connects, each connection in a thread of its own, without end.
-pub fn serve(listener: &TcpListener, bounds: Bounds, answer: &(impl Fn(&Request) -> Response + Sync)) -> ! {
+pub fn serve<'a>(listener: &TcpListener, bounds: Bounds, answer: &(impl Fn(&Request) -> Response<'a> + Sync)) -> ! {
     let open = AtomicUsize::new(0);
     std::thread::scope(|scope| {
         loop {
@@ -172,7 +172,11 @@ fn refuse(mut stream: TcpStream) {
 }
 
 /// Answers the requests of a connection, one after the other.
-fn converse(stream: &mut TcpStream, bounds: Bounds, answer: &impl Fn(&Request) -> Response) -> std::io::Result<()> {
+fn converse<'a>(
+    stream: &mut TcpStream,
+    bounds: Bounds,
+    answer: &impl Fn(&Request) -> Response<'a>,
+) -> std::io::Result<()> {
     stream.set_write_timeout(Some(bounds.stalled))?;
     stream.set_nodelay(true)?;
     // What was read after a request belongs to the next one.
@@ -196,7 +200,7 @@ fn converse(stream: &mut TcpStream, bounds: Bounds, answer: &impl Fn(&Request) -
 /// What was asked for.
 enum Asked {
     File { request: Request, head: bool, keep: bool },
-    Refused(Response),
+    Refused(Response<'static>),
 }
 
 /// Reads the next request, and leaves in `bytes` what follows it. `None` if the other end has closed, or sends nothing.

@@ -10,6 +10,7 @@ use b2p_formats::detect::{ENOUGH, Group, Kind};
 use serde_json::json;
 
 use super::args::Serve;
+use super::data::Page;
 use super::manners::{self, Said};
 use super::table::counted;
 use super::{Failure, Result};
@@ -32,10 +33,7 @@ const HEADS: &str = "heads.safetensors";
 
 /// Serves until the program is stopped.
 pub fn run(args: &Serve) -> Result<Said> {
-    if !b2p_web::HAS_MODULE {
-        let text = "this program was built without its web page: run web/build.sh, then build the program again";
-        return Err(Failure(text.into()));
-    }
+    let page = Page::open()?;
     let streams = Streams::find(&args.source)?;
     let count = streams.names()?.len();
     let address = SocketAddr::new(args.host, args.port);
@@ -51,9 +49,7 @@ pub fn run(args: &Serve) -> Result<Said> {
         )),
     };
     said.say()?;
-    // Unpacked by the time that a browser asks for it; without this thread, it is when one does.
-    let _ = std::thread::Builder::new().spawn(|| b2p_web::module_gzip("b2p.wasm"));
-    http::serve(&listener, BOUNDS, &|request| common(answer(request, &streams)))
+    http::serve(&listener, BOUNDS, &|request| common(answer(request, &page, &streams)))
 }
 
 /// The streams and files of Gaussians that are served.
@@ -130,7 +126,7 @@ impl Streams {
 }
 
 /// The answer to a request.
-fn answer(request: &Request, streams: &Streams) -> Response {
+fn answer<'a>(request: &Request, page: &'a Page, streams: &Streams) -> Response<'a> {
     let target = &request.target;
     let path = target.split(['?', '#']).next().unwrap_or_default();
     let path = path.trim_start_matches('/');
@@ -141,14 +137,14 @@ fn answer(request: &Request, streams: &Streams) -> Response {
         "" => "index.html",
         path => path,
     };
-    if let Some(page) = b2p_web::FILES.iter().find(|page| page.path == file) {
-        return Response::bytes(page.bytes, page.media_type);
+    if let Some(file) = page.file(file) {
+        let response = Response::bytes(file.bytes, file.media_type);
+        return match file.gzip {
+            true => response.with("Content-Encoding", "gzip"),
+            false => response,
+        };
     }
     match file {
-        name @ ("b2p.wasm" | "b2p-threads.wasm") => match b2p_web::module_gzip(name) {
-            Some(module) => wasm(module),
-            None => plain(404, "no such file\n"),
-        },
         HEADS => Response::bytes(b2p::embedded::HEADS, "application/octet-stream"),
         "streams.json" => {
             let names = streams.names().unwrap_or_default();
@@ -162,13 +158,8 @@ fn answer(request: &Request, streams: &Streams) -> Response {
     }
 }
 
-/// A module that is compressed.
-fn wasm(module: &'static [u8]) -> Response {
-    Response::bytes(module, "application/wasm").with("Content-Encoding", "gzip")
-}
-
 /// A stream, or the range of it that was asked for.
-fn stream(request: &Request, mut file: File) -> Response {
+fn stream(request: &Request, mut file: File) -> Response<'static> {
     let Ok(length) = file.metadata().map(|metadata| metadata.len()) else {
         return plain(500, "the file cannot be read\n");
     };
@@ -221,12 +212,12 @@ fn decoded(path: &str) -> Option<String> {
     String::from_utf8(bytes).ok().filter(|path| !path.contains('\0'))
 }
 
-fn plain(status: u16, text: &str) -> Response {
+fn plain(status: u16, text: &str) -> Response<'static> {
     Response::text(status, text.to_owned(), "text/plain; charset=utf-8")
 }
 
 /// What every answer says: that other sites get nothing, that the page may use threads, and that files may change.
-fn common(response: Response) -> Response {
+fn common(response: Response<'_>) -> Response<'_> {
     [
         ("Cross-Origin-Opener-Policy", "same-origin"),
         ("Cross-Origin-Embedder-Policy", "require-corp"),
