@@ -8,7 +8,7 @@ pub static HEADS: &[u8] = include_bytes!("../models/heads.safetensors");
 pub static SCENE: &[u8] = include_bytes!("../models/scene.b2p");
 
 #[cfg(feature = "embedded-learned")]
-pub use learned::{SAMPLE, model};
+pub use learned::{MODEL_ZLIB, SAMPLE, model};
 
 #[cfg(feature = "embedded-learned")]
 mod learned {
@@ -16,7 +16,7 @@ mod learned {
     use std::sync::OnceLock;
 
     /// [`model`], compressed by zlib: every other byte from the first on, then those between them.
-    static MODEL_ZLIB: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/lite.zlib"));
+    pub static MODEL_ZLIB: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/lite.zlib"));
 
     /// The model that learned streams (version 2) are coded with unless another is named, as a safetensors file. See
     /// `models/README.md`. The first call inflates it.

@@ -4,6 +4,7 @@
 //! program stays small: in `share/b2p` beside the program, beside the folder that it is in, or in `/usr`.
 
 use std::borrow::Cow;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use super::{Failure, Result};
@@ -39,6 +40,19 @@ pub fn model() -> Result<Cow<'static, [u8]>> {
                 )
             };
             Ok(std::fs::read(&path).map_err(|error| Failure(fail(error)))?.into())
+        }
+    }
+}
+
+/// Writes what tells [`model`] from others: the file, or what is inside the program as it is stored.
+pub fn identify_model(mut to: impl Write) -> Result<()> {
+    let fail = |error: std::io::Error| Failure(error.to_string());
+    match Source::find()? {
+        #[cfg(feature = "bundled")]
+        Source::Program => to.write_all(b2p::embedded::MODEL_ZLIB).map_err(fail),
+        Source::Folder(folder) => {
+            let mut file = std::fs::File::open(folder.join(MODEL)).map_err(fail)?;
+            std::io::copy(&mut file, &mut to).map(|_| ()).map_err(fail)
         }
     }
 }

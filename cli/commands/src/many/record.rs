@@ -125,11 +125,11 @@ impl Write for Hash {
 pub fn program() -> String {
     static PROGRAM: OnceLock<String> = OnceLock::new();
     let name = || {
-        let mut hash = Xxh3::new();
-        // Without it, learned streams give an error, which leaves no record.
-        hash.update(&data::model().unwrap_or_default());
-        hash.update(embedded::HEADS);
-        format!("{} {:032x}", env!("CARGO_PKG_VERSION"), hash.digest128())
+        let mut hash = Hash(Xxh3::new());
+        // Without a model, learned streams give an error, which leaves no record.
+        let _ = data::identify_model(&mut hash);
+        hash.0.update(embedded::HEADS);
+        format!("{} {:032x}", env!("CARGO_PKG_VERSION"), hash.0.digest128())
     };
     PROGRAM.get_or_init(name).clone()
 }
