@@ -3,7 +3,7 @@
 
 links  every relative link of a Markdown file leads to a file, and its anchor to a heading of it; links of the book stay
        within it, and its summary lists every chapter
-words  what the left column of docs/glossary.md replaces occurs in no tracked text file
+words  the words of docs/avoided-words.txt occur in no tracked text file
 size   the README has at most 150 lines; lines of all documents have at most 120 characters, tables, code and pictures aside
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BOOK = ROOT / "docs"
-GLOSSARY = "docs/glossary.md"
+AVOIDED = "docs/avoided-words.txt"
 # What may stand between the words of a phrase: the next line of a comment, or the underscores of a test's name.
 BREAK = r"(?:_|\s+(?:(?:///|//!|//|#|\*|>)\s*)?)"
 README_LINES, WIDTH = 150, 120
@@ -70,21 +70,20 @@ def links():
         yield f"docs/SUMMARY.md: lacks {chapter}"
 
 
-def replaced():
-    """What is in code marks in the left column of the second table."""
-    table = (ROOT / GLOSSARY).read_text().split("## Replaced names")[1]
-    for row in re.findall(r"^\| (.*?) \|", table, re.M):
-        yield from re.findall(r"`([^`]+)`", row)
+def avoided():
+    for line in (ROOT / AVOIDED).read_text().splitlines():
+        if line and not line.startswith("#"):
+            yield from line.split(" -> ")[0].split(", ")
 
 
 def words():
     patterns = []
-    for phrase in replaced():
+    for phrase in avoided():
         body = BREAK.join(re.escape(word) for word in phrase.split())
         code = re.search(r"[A-Z_.:*]", phrase)
         patterns.append((phrase, re.compile(rf"(?<![^\W_]){body}(?![^\W_])", 0 if code else re.I)))
     for name in tracked():
-        if name == GLOSSARY or name.startswith("fuzz/corpus/") or name.endswith((".lock", ".svg", ".json", ".txt")):
+        if name.startswith("fuzz/corpus/") or name.endswith((".lock", ".svg", ".json", ".txt")):
             continue
         try:
             text = (ROOT / name).read_text()
