@@ -166,6 +166,10 @@ fn every_damaged_stream_is_refused_for_the_clause_that_it_breaks() {
         // Lengths that the limits do not allow are wrong in another way first.
         let unlimited = decoder.clone().with_limits(Limits::unlimited());
         let refused = unlimited.whole(bytes).map(drop).expect_err(name);
+        // Nor does a processor allow more than it has addresses for.
+        if usize::BITS == 32 && matches!(refused, Error::LimitExceeded { .. }) {
+            continue;
+        }
         assert_eq!(refused.clause(), Some(&**clause), "{name}: {refused}");
     }
     println!("{} kinds of damage", damaged.len());
