@@ -14,6 +14,7 @@ program=${CARGO_TARGET_DIR:-target}/dist/b2p
 out=target/packaging
 rm -rf $out
 mkdir -p $out
+[ -f web/b2p.wasm ] || web/build.sh || echo "skipped: the module of the web page"
 packaging/data.sh $out/share/b2p
 $program -q man $out/man
 $program completions bash > $out/b2p.bash

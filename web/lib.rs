@@ -13,34 +13,29 @@ use lzma_rust2::LzmaReader;
 pub struct PageFile {
     /// Where the page expects it, from its root, without a slash in front.
     pub path: &'static str,
-    /// Its media type.
-    pub media_type: &'static str,
     /// Its content.
     pub bytes: &'static [u8],
 }
 
-const HTML: &str = "text/html; charset=utf-8";
-const SCRIPT: &str = "text/javascript; charset=utf-8";
-
 macro_rules! files {
-    ($($path:literal: $kind:ident),* $(,)?) => {
-        &[$(PageFile { path: $path, media_type: $kind, bytes: include_bytes!($path) }),*]
+    ($($path:literal),* $(,)?) => {
+        &[$(PageFile { path: $path, bytes: include_bytes!($path) }),*]
     };
 }
 
 /// All files but the WebAssembly modules.
 pub const FILES: &[PageFile] = files![
-    "index.html": HTML,
-    "src/b2p.js": SCRIPT,
-    "src/controls.js": SCRIPT,
-    "src/error.js": SCRIPT,
-    "src/page.js": SCRIPT,
-    "src/playing.js": SCRIPT,
-    "src/system.js": SCRIPT,
-    "src/thread.js": SCRIPT,
-    "src/threads.js": SCRIPT,
-    "src/viewer.js": SCRIPT,
-    "src/worker.js": SCRIPT,
+    "index.html",
+    "src/b2p.js",
+    "src/controls.js",
+    "src/error.js",
+    "src/page.js",
+    "src/playing.js",
+    "src/system.js",
+    "src/thread.js",
+    "src/threads.js",
+    "src/viewer.js",
+    "src/worker.js",
 ];
 
 /// Bytes of `b2p.wasm` and `b2p-threads.wasm`, none of those that were not built (`web/build.sh`) before this crate.
