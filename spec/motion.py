@@ -1,13 +1,18 @@
-"""What a frame is predicted from: motion and the moved frame, clauses 17.5 to 17.8 of docs/format.md."""
+"""What a frame is predicted from: motion and the moved frame, clauses 17.5 to 17.9 of docs/format.md."""
 
 from dataclasses import dataclass
+from itertools import groupby, product
 
-from base import Reader, clamp, require
+from base import Reader, clamp, quot, require
 from coefficients import RangeDecoder
 from octree import CELLS, Voxels, octant_xyz
 
 INTRA, INTER, SKIP = 0, 1, 2
 CORNERS_BELOW = [octant_xyz(o) for o in range(8)]
+# 17.9.4: steps to the blocks around one, those at faces first, then those at edges, then those at corners.
+AROUND = sorted(product((-1, 0, 1), repeat=3), key=lambda step: sum(map(abs, step)))[1:]
+# 17.9.5: the axes of steps to the blocks nearby a part.
+NEARBY = [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)]
 
 
 def half_up(a, b):
@@ -29,23 +34,34 @@ class Known:
 
 
 class Bits:
-    """17.5.2: adaptive decisions. The names of the states are those of the document."""
+    """17.5.2, 17.9.3: adaptive decisions. The names of the states are those of the document."""
 
-    def __init__(self):
-        self.states = {}
+    def __init__(self, counted):
+        self.states, self.counted = {}, counted
 
     def decide(self, decoder, *name):
-        p = self.states.get(name, 32768)
+        p, n = self.states.get(name, (32768, 0))
         bit = decoder.decide(clamp(p, 256, 65280))
-        self.states[name] = p + (65535 - p >> 4) if bit else p - (p >> 4)
+        if self.counted:
+            p += quot(2 * ((65535 if bit else 0) - p), 2 * n + 3)
+        else:
+            p = p + (65535 - p >> 4) if bit else p - (p >> 4)
+        self.states[name] = p, min(n + 1, 30)
         return bit
 
-    def component(self, decoder, axis):
-        """17.5.3: a component of a difference of vectors."""
-        if not self.decide(decoder, "some", axis):
+    def one_of(self, decoder, kind, vectors):
+        """17.9.4, 17.9.5: one of the first six of several vectors, None if it is none of them."""
+        return next((v for i, v in enumerate(vectors[:6]) if self.decide(decoder, kind, i)), None)
+
+    def difference(self, decoder, kind=""):
+        """17.5.3: a difference of vectors."""
+        return [self.component(decoder, kind, axis) for axis in range(3)]
+
+    def component(self, decoder, kind, axis):
+        if not self.decide(decoder, kind + "some", axis):
             return 0
-        negative, m = self.decide(decoder, "sign", axis), 1
-        while m < 15 and self.decide(decoder, "more", axis, m - 1):
+        negative, m = self.decide(decoder, kind + "sign", axis), 1
+        while m < 15 and self.decide(decoder, kind + "more", axis, m - 1):
             m += 1
         if m == 15:
             n, e = 0, 1
@@ -64,9 +80,11 @@ class Motion:
 
     def __init__(self, payloads, header, previous):
         reader = Reader(payloads[0], "17.5.1")
-        self.block_level, self.unit, self.reference, modes = reader.take(4)
+        first, self.unit, self.reference, modes = reader.take(4)
+        self.block_level, self.divided = first & 127, first > 127
         self.vector = tuple(reader.number("h") for _ in range(3))
-        require(self.block_level <= header.base and header.top <= self.unit <= 21, "17.5.1", "levels of the motion")
+        deepest = header.base - self.divided
+        require(self.block_level <= deepest and header.top <= self.unit <= 21, "17.5.1", "levels of the motion")
         furthest = min(header.top, self.block_level + 5)
         require(self.block_level <= self.reference <= furthest, "17.5.1", "reference level")
         self.above = (modes & 15, modes >> 4)
@@ -74,7 +92,7 @@ class Motion:
         self.check(self.vector)
         self.base, self.payloads, self.previous = header.base, payloads, previous
         self.decoder = RangeDecoder(payloads[0][reader.at :])
-        self.bits, self.modes = Bits(), {}
+        self.bits, self.modes = Bits(self.divided), {}
 
     def check(self, vector):
         """17.5.3"""
@@ -82,15 +100,23 @@ class Motion:
         require(all(least <= x <= most for x in vector), "17.5.3", "vector out of range")
 
     def reach(self, voxels):
-        """17.5.1: decodes the motion of level L once its blocks are known, the voxels of level B."""
+        """17.5.1: decodes the motion of level L once its blocks are known, the voxels of level B, and their parts."""
         if voxels.level == self.block_level:
-            self.blocks = voxels
+            self.blocks, self.above_blocks = voxels, [(3, 3)] * len(voxels)
             self.read_vectors()
-            self.modes[self.block_level] = [(3, 3)] * len(voxels)
-            for level in range(self.block_level + 1, self.base + 1):
+            last = min(self.base, self.block_level + 1) if self.divided else self.base
+            for level in range(self.block_level + 1, last + 1):
                 self.read_modes(level, self.decoder)
-            self.decoder.finish()
-            self.moved = self.move()
+            if last == self.base:
+                self.decoder.finish()
+            reference = min(self.reference, self.block_level + 3) if self.divided else self.reference
+            self.moved = self.move(self.blocks, self.vectors, reference)
+        elif self.divided and voxels.level == self.block_level + 1:
+            self.parts = voxels
+            if self.block_level + 2 <= self.base:
+                for level in range(self.block_level + 2, self.base + 1):
+                    self.read_modes(level, self.decoder)
+                self.decoder.finish()
 
     def read_finer(self, level):
         """17.5.1: the motion of a level below L."""
@@ -99,7 +125,7 @@ class Motion:
         decoder.finish()
 
     def read_vectors(self):
-        """17.5.3"""
+        """17.5.3, 17.9.4"""
         self.vectors, changed = [], 0
         for i, near in enumerate(self.blocks.near):
             around = [self.vectors[near[k]] for k in (12, 10, 4) if near[k] >= 0]
@@ -110,23 +136,74 @@ class Motion:
                 vector = around[0]
             else:
                 vector = self.vectors[-1] if i > 0 else self.vector
-            if self.bits.decide(self.decoder, "differs", changed, sure):
-                change = [self.bits.component(self.decoder, axis) for axis in range(3)]
-                vector = tuple(a + b for a, b in zip(vector, change))
-                changed = int(any(change))
-            else:
-                changed = 0
+            changed = self.bits.decide(self.decoder, "differs", changed, sure)
+            if changed:
+                around = self.around(near, vector) if self.divided else []
+                same = self.bits.one_of(self.decoder, "alike", around)
+                vector = same or tuple(a + b for a, b in zip(vector, self.bits.difference(self.decoder)))
             self.check(vector)
             self.vectors.append(vector)
 
+    def around(self, near, predicted):
+        """17.9.4: vectors of the blocks around one that come before it."""
+        found = []
+        for x, y, z in AROUND:
+            k = near[13 + x + 3 * y + 9 * z]
+            if 0 <= k < len(self.vectors) and self.vectors[k] not in [predicted, *found]:
+                found.append(self.vectors[k])
+        return found
+
+    def read_part_vectors(self, decoder):
+        """17.9.5"""
+        blocks = [self.blocks.places[tuple(c >> 1 for c in place)] for place in self.parts.coordinates]
+        self.part_vectors, several = [], 0
+        for block, parts in groupby(range(len(blocks)), key=lambda part: blocks[part]):
+            parts, common = list(parts), self.vectors[block]
+            several = self.bits.decide(decoder, "several", min(len(parts), 4), several)
+            other, own = None, []
+            for part in parts:
+                vector = common
+                if several:
+                    other = self.bits.decide(decoder, "other", other)
+                if several and other:
+                    nearby = self.nearby(block, self.parts.coordinates[part], own)
+                    vector = self.bits.one_of(decoder, "same", nearby)
+                    if vector is None:
+                        vector = tuple(a + b for a, b in zip(common, self.bits.difference(decoder, "part ")))
+                self.check(vector)
+                own.append(vector)
+            self.part_vectors += own
+        self.moved.update(self.move(self.parts, self.part_vectors, self.reference))
+
+    def nearby(self, block, place, before):
+        """17.9.5: vectors that a part may have: of parts before it, and of the blocks at its side."""
+        found, at = [], self.blocks.coordinates[block]
+        touching = [[a + (2 * (p & 1) - 1) * (i in axes) for i, (a, p) in enumerate(zip(at, place))] for axes in NEARBY]
+        numbers = [self.blocks.places.get(tuple(place)) for place in touching]
+        for vector in before[::-1] + [self.vectors[number] for number in numbers if number is not None]:
+            if vector not in [self.vectors[block], *found]:
+                found.append(vector)
+        return found
+
     def read_modes(self, level, decoder):
-        """17.5.4"""
+        """17.5.4, 17.9.6"""
+        if self.divided and level == self.block_level + 2:
+            self.read_part_vectors(decoder)
+            blocks = [self.blocks.places[tuple(c >> 1 for c in place)] for place in self.parts.coordinates]
+            all_above = [self.modes[level - 1][block] for block in blocks]
+        else:
+            all_above = self.modes.get(level - 1, self.above_blocks)
         modes, before = [], (0, 0)
-        for above in self.modes[level - 1]:
+        for above in all_above:
             own = []
             for kind in (0, 1):
-                name = kind, above[kind], before[kind]
-                if not self.bits.decide(decoder, "some", *name):
+                index = above[kind]
+                if self.divided and kind == 0 and index < 3:
+                    index += 4 * above[1]
+                elif self.divided and kind == 1:
+                    index += 4 * own[0]
+                name = kind, index, before[kind]
+                if not self.bits.decide(decoder, "any", *name):
                     own.append(INTRA)
                 else:
                     own.append(SKIP if self.bits.decide(decoder, "skip", *name) else INTER)
@@ -139,22 +216,22 @@ class Motion:
         shift = self.unit - level
         return tuple(v + (1 << shift >> 1) >> shift for v in vector)
 
-    def move(self):
+    def move(self, blocks, vectors, reference):
         """17.8: the moved frame's levels, R and those above it."""
-        if self.reference <= self.block_level + 1:
+        if reference <= blocks.level + 1:
             return {}
-        source, down = self.previous[self.reference], self.reference - self.block_level
+        source, down = self.previous[reference], reference - blocks.level
         most, found = 2 * len(source.voxels) + 64, {}
-        for vector in set(self.vectors):
-            d = self.rounded(vector, self.reference)
+        for vector in set(vectors):
+            d = self.rounded(vector, reference)
             for (x, y, z), value in zip(source.voxels.coordinates, source.values):
                 place = (x + d[0], y + d[1], z + d[2])
-                block = self.blocks.places.get(tuple(c >> down for c in place))
-                if block is not None and self.vectors[block] == vector:
+                block = blocks.places.get(tuple(c >> down for c in place))
+                if block is not None and vectors[block] == vector:
                     found[place] = value
                     require(len(found) <= most, "17.8.2", "voxels of the moved frame")
         moved = {}
-        for level in range(self.reference, self.block_level, -1):
+        for level in range(reference, blocks.level, -1):
             moved[level] = Known(Voxels(level, None, list(found)), list(found.values()))
             children = {}
             for place, value in found.items():
@@ -170,11 +247,13 @@ class Motion:
             self.read_finer(level)
         if level <= self.block_level:
             return [(self.above, self.vector)] * len(nodes), self.previous[level]
-        at = [tuple(c >> level - 1 - self.block_level for c in place) for place in nodes.coordinates]
-        blocks = [self.blocks.places[place] for place in at]
+        of_parts = self.divided and level > self.block_level + 1
+        own, vectors = (self.parts, self.part_vectors) if of_parts else (self.blocks, self.vectors)
+        at = [tuple(c >> level - 1 - own.level for c in place) for place in nodes.coordinates]
+        blocks = [own.places[place] for place in at]
         if level < self.reference:
             return [(self.modes[level][b], (0, 0, 0)) for b in blocks], self.moved[level]
-        return [(self.modes[level][b], self.vectors[b]) for b in blocks], self.previous[level]
+        return [(self.modes[level][b], vectors[b]) for b in blocks], self.previous[level]
 
     def occupancies(self, nodes):
         """17.6.1: mode and window of each node."""

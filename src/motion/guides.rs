@@ -20,10 +20,13 @@ pub struct Inter {
     head: Head,
     /// L, the first level with sections of its own.
     base: u8,
-    /// The motion's bytes behind the head, then of each level after L, until the blocks are read.
-    parts: Vec<Vec<u8>>,
+    /// The motion's bytes behind the head, then of each level after L, until they are read.
+    sections: Vec<Vec<u8>>,
     blocks: OnceLock<Blocks>,
-    moved: OnceLock<Moved>,
+    /// Of divided blocks.
+    parts: OnceLock<Blocks>,
+    /// The previous frame moved by the vectors of blocks, and of parts.
+    moved: [OnceLock<Moved>; 2],
 }
 
 /// What a previous frame tells of the occupancies of a level.
@@ -70,6 +73,8 @@ impl ColourGuide {
     }
 }
 
+/// How many levels after divided blocks the one is that is moved for the level after them.
+const COARSE_REACH: u8 = 3;
 /// Nodes per task.
 const CHUNK: usize = 4096;
 
@@ -81,27 +86,29 @@ impl Inter {
     /// [`Error::Malformed`] if the motion is damaged.
     pub fn new(previous: Arc<Previous>, motion: &[&[u8]], base: u8, top: u8) -> Result<Self> {
         let (head, first) = Head::parse(motion.first().copied().unwrap_or_default(), base, top)?;
-        let mut parts = vec![first.to_vec()];
-        parts.extend(motion.iter().skip(1).map(|part| part.to_vec()));
+        let mut sections = vec![first.to_vec()];
+        sections.extend(motion.iter().skip(1).map(|section| section.to_vec()));
         Ok(Inter {
             previous,
             head,
             base,
-            parts,
+            sections,
             blocks: OnceLock::new(),
-            moved: OnceLock::new(),
+            parts: OnceLock::new(),
+            moved: Default::default(),
         })
     }
 
     /// The same of motion that has been chosen.
-    pub fn of(previous: Arc<Previous>, head: Head, blocks: Blocks, base: u8) -> Self {
+    pub fn of(previous: Arc<Previous>, head: Head, [blocks, parts]: [Blocks; 2], base: u8) -> Self {
         Inter {
             previous,
             head,
             base,
-            parts: Vec::new(),
+            sections: Vec::new(),
             blocks: OnceLock::from(blocks),
-            moved: OnceLock::new(),
+            parts: OnceLock::from(parts),
+            moved: Default::default(),
         }
     }
 
@@ -193,16 +200,27 @@ impl Inter {
         if !(block_level + 1..reference_level).contains(&level) {
             return Ok((field, self.level(level)?));
         }
-        let moved = match self.moved.get() {
+        let of_parts = self.head.is_of_parts(level);
+        // One level needs no finer one.
+        let (block, reference) = match (self.head.divided, of_parts) {
+            (true, true) => (block_level + 1, reference_level),
+            (true, false) => (block_level, reference_level.min(block_level + COARSE_REACH)),
+            (false, _) => (block_level, reference_level),
+        };
+        let moved = match self.moved[usize::from(of_parts)].get() {
             Some(moved) => moved,
             None => {
-                let shifts: Vec<_> = { self.vectors().iter() }
-                    .map(|vector| Block::new(Modes::default(), *vector, unit_level, reference_level).shift)
+                let shifts: Vec<_> = { self.vectors(of_parts).iter() }
+                    .map(|vector| Block::new(Modes::default(), *vector, unit_level, reference).shift)
                     .collect();
-                let levels = [block_level, reference_level];
-                let moved = Moved::new(self.level(reference_level)?, levels, field.keys, |i| shifts[i]);
+                let moved = Moved::new(self.level(reference)?, [block, reference], field.keys, |i| shifts[i]);
                 let moved = moved.map_err(|error| of_level(error, self.base))?;
-                self.moved.get_or_init(|| moved)
+                let moved = if self.head.divided && !of_parts {
+                    moved.coarsest()
+                } else {
+                    moved
+                };
+                self.moved[usize::from(of_parts)].get_or_init(|| moved)
             }
         };
         field.blocks.iter_mut().for_each(Block::stop);
@@ -218,7 +236,11 @@ impl Inter {
     /// # Errors
     /// [`Error::Malformed`] if the motion is damaged.
     pub fn check(&self, octree: &Octree) -> Result<()> {
-        self.blocks(octree).map(drop)
+        let first = usize::from((self.head.block_level + 2).saturating_sub(self.base));
+        match self.head.divided && first < self.sections.len() {
+            true => self.parts(octree).map(drop),
+            false => self.blocks(octree).map(drop),
+        }
     }
 
     /// The blocks, read when they are first asked for. The octree has their level.
@@ -226,15 +248,30 @@ impl Inter {
         if let Some(blocks) = self.blocks.get() {
             return Ok(blocks);
         }
-        let parts: Vec<&[u8]> = self.parts.iter().map(Vec::as_slice).collect();
         let keys = octree.level(self.head.block_level).keys();
-        let blocks = self.head.blocks(self.base, keys, &parts)?;
+        let blocks = self.head.blocks(self.base, keys, &self.sections())?;
         Ok(self.blocks.get_or_init(|| blocks))
     }
 
-    /// Vectors of the blocks, once they are read.
-    fn vectors(&self) -> &[[i16; 3]] {
-        self.blocks.get().map_or(&[], |blocks| &blocks.vectors)
+    /// The parts of divided blocks, likewise.
+    fn parts(&self, octree: &Octree) -> Result<&Blocks> {
+        if let Some(parts) = self.parts.get() {
+            return Ok(parts);
+        }
+        let level = self.head.block_level;
+        let keys = [level, level + 1].map(|level| octree.level(level).keys());
+        let parts = self.head.parts(self.base, keys, &self.sections())?;
+        Ok(self.parts.get_or_init(|| parts))
+    }
+
+    fn sections(&self) -> Vec<&[u8]> {
+        self.sections.iter().map(Vec::as_slice).collect()
+    }
+
+    /// Vectors of the blocks or of their parts, once they are read.
+    fn vectors(&self, of_parts: bool) -> &[[i16; 3]] {
+        let blocks = if of_parts { &self.parts } else { &self.blocks };
+        blocks.get().map_or(&[], |blocks| &blocks.vectors)
     }
 
     /// The motion at `level`. The octree has the level above.
@@ -248,16 +285,19 @@ impl Inter {
                 blocks: vec![block(head.root, head.vector)],
             });
         }
-        let voxels = octree.level(head.block_level);
-        let blocks = self.blocks(octree)?;
-        let modes = blocks.modes.get(usize::from(level - head.block_level - 1));
+        let (own, blocks) = match head.is_of_parts(level) {
+            true => (head.block_level + 1, self.parts(octree)?),
+            false => (head.block_level, self.blocks(octree)?),
+        };
+        let voxels = octree.level(own);
+        let modes = blocks.modes.get(usize::from(level - own - 1));
         let Some(modes) = modes else {
             return Err(Error::Usage(format!("the motion of level {level} is not there")));
         };
         let vectors = blocks.vectors.iter();
         Ok(Field {
             keys: voxels.keys(),
-            down: u32::from(3 * (level - 1 - head.block_level)),
+            down: u32::from(3 * (level - 1 - own)),
             blocks: modes
                 .iter()
                 .zip(vectors)

@@ -79,6 +79,12 @@ impl Moved {
         })
     }
 
+    /// The same without the levels after the first.
+    pub fn coarsest(mut self) -> Self {
+        self.levels.truncate(1);
+        self
+    }
+
     /// A level. `None` if it is not between blocks and reference level.
     pub fn level(&self, level: u8) -> Option<&PreviousLevel> {
         self.levels.get(usize::from(level.checked_sub(self.first)?))

@@ -1,10 +1,10 @@
 //! What a predicted frame says of its blocks, as bytes (`docs/format.md`, clause 17.5).
 
+use super::models::{Groups, Models};
 use super::moved::REACH;
-use crate::coding::binary::{Coder, Decoder};
+use crate::coding::binary::Decoder;
 use crate::error::{Error, Result, Stage};
 use crate::geometry::codec::guide::Mode;
-use crate::geometry::morton;
 use crate::limits::MAX_DEPTH;
 
 /// Modes of a block at a level.
@@ -21,6 +21,9 @@ pub struct Modes {
 pub struct Head {
     /// B: the blocks are the nodes of this level.
     pub block_level: u8,
+    /// Whether the nodes of level B + 1, the *parts* of blocks, have vectors and modes of their own for the levels after
+    /// theirs.
+    pub divided: bool,
     /// U: vectors are in voxels of this level.
     pub unit_level: u8,
     /// R: the levels after B and before this one are predicted from the moved previous frame of level R, all others
@@ -32,24 +35,29 @@ pub struct Head {
     pub vector: [i16; 3],
 }
 
-/// Vectors and modes of the blocks.
+/// Vectors and modes of the blocks, or of their parts.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Blocks {
-    /// The vector of each block.
+    /// The vector of each.
     pub vectors: Vec<[i16; 3]>,
-    /// The modes of each block at the levels B + 1, B + 2, …
+    /// The modes of each at the level after its own, and the levels that follow; of divided blocks at that level only.
     pub modes: Vec<Vec<Modes>>,
 }
 
 /// Bytes of a head.
 const HEAD: usize = 10;
-/// Magnitudes from here on have an escape.
-const ESCAPE: usize = 14;
+/// The bit of the first byte that says that blocks are divided.
+const DIVIDED: u8 = 0x80;
 
 /// How errors name the motion of a level, whose place in the file is not known here.
 const PLACE: &str = "motion of level ";
 
-fn malformed(clause: &'static str, field: &'static str, value: impl ToString, expected: impl ToString) -> Error {
+pub(super) fn malformed(
+    clause: &'static str,
+    field: &'static str,
+    value: impl ToString,
+    expected: impl ToString,
+) -> Error {
     Error::malformed(Stage::Bitstream, "motion of the frame", field, value, expected).breaks(clause)
 }
 
@@ -100,13 +108,14 @@ impl Head {
             let value = format!("{} bytes", bytes.len());
             return Err(malformed("17.5.1", "length of the motion", value, "10 or more"));
         };
-        let (block_level, unit_level) = (head[0], head[1]);
-        if block_level > base {
+        let (divided, block_level, unit_level) = (head[0] & DIVIDED != 0, head[0] & !DIVIDED, head[1]);
+        let deepest = if divided { i16::from(base) - 1 } else { i16::from(base) };
+        if i16::from(block_level) > deepest {
             return Err(malformed(
                 "17.5.1",
                 "level of the blocks",
                 block_level,
-                format!("at most {base}"),
+                format!("at most {deepest}"),
             ));
         }
         if !(top..=MAX_DEPTH).contains(&unit_level) {
@@ -131,6 +140,7 @@ impl Head {
         let component = |i: usize| i16::from_le_bytes([head[4 + 2 * i], head[5 + 2 * i]]);
         let head = Head {
             block_level,
+            divided,
             unit_level,
             reference_level,
             root: Modes { geometry, colours },
@@ -143,7 +153,7 @@ impl Head {
     /// The head as bytes.
     pub fn to_bytes(self) -> Vec<u8> {
         let mut bytes = vec![
-            self.block_level,
+            self.block_level | if self.divided { DIVIDED } else { 0 },
             self.unit_level,
             self.reference_level,
             self.root.geometry as u8 | (self.root.colours as u8) << 4,
@@ -164,236 +174,119 @@ impl Head {
         }
     }
 
-    /// Reads vectors and modes of the blocks `keys`: `parts` are the bytes behind the head, then those of each level
+    /// Whether modes of this level are those of parts.
+    pub fn is_of_parts(&self, level: u8) -> bool {
+        self.divided && level > self.block_level + 1
+    }
+
+    /// Reads vectors and modes of the blocks `keys`: `sections` are the bytes behind the head, then those of each level
     /// after `base`.
     ///
     /// # Errors
     /// [`Error::Malformed`].
-    pub fn blocks(&self, base: u8, keys: &[u64], parts: &[&[u8]]) -> Result<Blocks> {
-        let count = keys.len();
-        let mut blocks = Blocks::default();
-        let mut models = Models::new();
-        for (level, part) in (base..).zip(parts) {
+    pub fn blocks(&self, base: u8, keys: &[u64], sections: &[&[u8]]) -> Result<Blocks> {
+        Ok(self.read(base, [keys, &[]], sections)?.0)
+    }
+
+    /// Reads vectors and modes of the parts `parts` of the blocks `keys`, which are divided.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`].
+    pub fn parts(&self, base: u8, [keys, parts]: [&[u64]; 2], sections: &[&[u8]]) -> Result<Blocks> {
+        Ok(self.read(base, [keys, parts], sections)?.1)
+    }
+
+    /// Reads blocks, and their parts if there are some.
+    fn read(&self, base: u8, [keys, part_keys]: [&[u64]; 2], sections: &[&[u8]]) -> Result<(Blocks, Blocks)> {
+        let (mut blocks, mut parts) = (Blocks::default(), Blocks::default());
+        let mut models = Models::new(self.divided);
+        let mut level = self.block_level + 1;
+        for (section, bytes) in (base..).zip(sections) {
             let mut read = || {
-                let mut coder = Decoder::new(part);
-                let levels = if level == base { base - self.block_level } else { 1 };
-                if level == base {
-                    let mut vectors = vec![[0; 3]; count];
-                    models.code_vectors(&mut coder, self.vector, keys, &mut vectors)?;
-                    for vector in &vectors {
-                        self.check(*vector)?;
-                    }
-                    blocks.vectors = vectors;
+                let mut coder = Decoder::new(bytes);
+                if section == base {
+                    blocks.vectors = vec![[0; 3]; keys.len()];
+                    models.code_vectors(&mut coder, self.vector, keys, &mut blocks.vectors)?;
+                    blocks.vectors.iter().try_for_each(|vector| self.check(*vector))?;
                 }
-                for _ in 0..levels {
-                    let mut modes = vec![Modes::default(); count];
-                    models.code_modes(&mut coder, blocks.modes.last().map(Vec::as_slice), &mut modes)?;
-                    blocks.modes.push(modes);
+                for level in std::mem::replace(&mut level, section + 1)..=section {
+                    if !self.is_of_parts(level) {
+                        let mut modes = vec![Modes::default(); keys.len()];
+                        models.code_modes(&mut coder, blocks.modes.last().map(Vec::as_slice), &mut modes)?;
+                        blocks.modes.push(modes);
+                        continue;
+                    }
+                    if part_keys.is_empty() {
+                        return Ok(());
+                    }
+                    let groups = Groups::new(keys, &blocks.vectors);
+                    if parts.modes.is_empty() {
+                        parts.vectors = vec![[0; 3]; part_keys.len()];
+                        models.code_parts(&mut coder, groups, part_keys, &mut parts.vectors)?;
+                        parts.vectors.iter().try_for_each(|vector| self.check(*vector))?;
+                    }
+                    let above = above(groups, &blocks, part_keys, &parts);
+                    let mut modes = vec![Modes::default(); part_keys.len()];
+                    models.code_modes(&mut coder, Some(&above), &mut modes)?;
+                    parts.modes.push(modes);
                 }
                 coder.finish(PLACE)
             };
-            read().map_err(|error| of_level(error, level))?;
+            read().map_err(|error| of_level(error, section))?;
         }
-        Ok(blocks)
+        Ok((blocks, parts))
     }
 
-    /// The motion of the level `base` and of each level after it, as bytes.
+    /// The motion of the level `base` and of each level after it, as bytes: of the blocks `keys[0]`, and of their parts
+    /// `keys[1]` if they are divided.
     ///
     /// # Errors
     /// [`Error::Malformed`] if a number has no code.
     #[cfg(feature = "encoder")]
-    pub fn write(&self, base: u8, keys: &[u64], blocks: &Blocks) -> Result<Vec<Vec<u8>>> {
-        let first = usize::from(base - self.block_level);
-        let mut models = Models::new();
-        let mut parts = Vec::new();
-        let mut above: Option<&[Modes]> = None;
-        for part in 0..=blocks.modes.len() - first {
+    pub fn write(&self, base: u8, keys: [&[u64]; 2], [blocks, parts]: [&Blocks; 2]) -> Result<Vec<Vec<u8>>> {
+        let mut models = Models::new(self.divided);
+        let first = self.block_level + 1;
+        let top = self.block_level + (blocks.modes.len() + parts.modes.len()) as u8;
+        let groups = Groups::new(keys[0], &blocks.vectors);
+        let mut sections = Vec::new();
+        for section in base..=top.max(base) {
             let mut coder = crate::coding::binary::Encoder::default();
-            if part == 0 {
-                models.code_vectors(&mut coder, self.vector, keys, &mut blocks.vectors.clone())?;
+            if section == base {
+                models.code_vectors(&mut coder, self.vector, keys[0], &mut blocks.vectors.clone())?;
             }
-            let levels = if part == 0 {
-                0..first
-            } else {
-                first + part - 1..first + part
-            };
-            for modes in &blocks.modes[levels] {
-                models.code_modes(&mut coder, above, &mut modes.clone())?;
-                above = Some(modes);
+            let from = if section == base { first } else { section };
+            for level in from..=section {
+                let i = usize::from(level - first);
+                if !self.is_of_parts(level) {
+                    let above = i.checked_sub(1).map(|i| blocks.modes[i].as_slice());
+                    models.code_modes(&mut coder, above, &mut blocks.modes[i].clone())?;
+                    continue;
+                }
+                let before = Blocks {
+                    vectors: Vec::new(),
+                    modes: parts.modes[..i - 1].to_vec(),
+                };
+                if i == 1 {
+                    models.code_parts(&mut coder, groups, keys[1], &mut parts.vectors.clone())?;
+                }
+                let above = above(groups, blocks, keys[1], &before);
+                models.code_modes(&mut coder, Some(&above), &mut parts.modes[i - 1].clone())?;
             }
-            let mut bytes = if part == 0 { self.to_bytes() } else { Vec::new() };
+            let mut bytes = if section == base { self.to_bytes() } else { Vec::new() };
             bytes.extend(coder.finish());
-            parts.push(bytes);
+            sections.push(bytes);
         }
-        Ok(parts)
+        Ok(sections)
     }
 }
 
-/// A probability that adapts.
-#[derive(Debug, Clone, Copy)]
-struct Bit(u16);
-
-impl Bit {
-    fn code(&mut self, coder: &mut impl Coder, bit: bool) -> bool {
-        let bit = coder.code(bit, u32::from(self.0).clamp(256, 65_280));
-        self.0 = match bit {
-            true => self.0 + ((u16::MAX - self.0) >> 4),
-            false => self.0 - (self.0 >> 4),
-        };
-        bit
+/// The modes of parts at the level above the one that is read: those of their blocks first.
+fn above(groups: Groups, blocks: &Blocks, part_keys: &[u64], parts: &Blocks) -> Vec<Modes> {
+    match (parts.modes.last(), blocks.modes.last()) {
+        (Some(modes), _) => modes.clone(),
+        (None, Some(modes)) => groups.of(part_keys).map(|block| modes[block]).collect(),
+        (None, None) => vec![Modes::default(); part_keys.len()],
     }
-}
-
-/// Adaptive probabilities of a frame's motion.
-struct Models {
-    /// Whether a vector differs from its prediction, by whether the one before did, and by how sure the prediction is.
-    differs: [[Bit; 3]; 2],
-    /// Of a component: whether it differs, its sign, and whether its magnitude is greater.
-    component: [[Bit; 2 + ESCAPE]; 3],
-    /// Whether a mode is not 0, and then whether it is 2: by kind, mode at the level above, and mode of the block before.
-    modes: [[[[Bit; 2]; 3]; 4]; 2],
-}
-
-impl Models {
-    fn new() -> Self {
-        let even = Bit(1 << 15);
-        Models {
-            differs: [[even; 3]; 2],
-            component: [[even; 2 + ESCAPE]; 3],
-            modes: [[[[even; 2]; 3]; 4]; 2],
-        }
-    }
-
-    /// Codes the vectors of the blocks `keys`, each from those of its neighbours, the first from `vector`.
-    fn code_vectors(
-        &mut self,
-        coder: &mut impl Coder,
-        vector: [i16; 3],
-        keys: &[u64],
-        vectors: &mut [[i16; 3]],
-    ) -> Result<()> {
-        let mut differed = false;
-        for i in 0..keys.len() {
-            let (predicted, sure) = predicted(keys, &vectors[..i], vector);
-            let target = vectors[i];
-            differed = self.differs[usize::from(differed)][sure].code(coder, target != predicted);
-            let mut found = predicted;
-            if differed {
-                for axis in 0..3 {
-                    let difference = i32::from(target[axis]) - i32::from(predicted[axis]);
-                    let difference = self.code_component(coder, axis, difference)?;
-                    let sum = i16::try_from(i32::from(predicted[axis]) + difference);
-                    found[axis] =
-                        sum.map_err(|_| malformed("17.5.3", "motion vector", difference, "a sum of 16 bits"))?;
-                }
-            }
-            vectors[i] = found;
-        }
-        Ok(())
-    }
-
-    fn code_component(&mut self, coder: &mut impl Coder, axis: usize, value: i32) -> Result<i32> {
-        let [differs, sign, more @ ..] = &mut self.component[axis];
-        if !differs.code(coder, value != 0) {
-            return Ok(0);
-        }
-        let negative = sign.code(coder, value < 0);
-        let target = value.unsigned_abs();
-        let mut magnitude = 1u32;
-        for bit in more.iter_mut() {
-            if !bit.code(coder, target > magnitude) {
-                break;
-            }
-            magnitude += 1;
-        }
-        if magnitude == 1 + ESCAPE as u32 {
-            magnitude += code_escape(coder, target.saturating_sub(magnitude))?;
-        }
-        Ok(if negative {
-            -(magnitude as i32)
-        } else {
-            magnitude as i32
-        })
-    }
-
-    /// Codes the modes of all blocks at a level. `above` are those at the level above, if they have some.
-    fn code_modes(&mut self, coder: &mut impl Coder, above: Option<&[Modes]>, modes: &mut [Modes]) -> Result<()> {
-        let mut before = Modes::default();
-        for (i, modes) in modes.iter_mut().enumerate() {
-            let above = above.map(|above| above[i]);
-            let mut code = |kind: usize, above: Option<Mode>, before: Mode, mode: Mode| {
-                let above = above.map_or(3, |mode| mode as usize);
-                let [some, skip] = &mut self.modes[kind][above][before as usize];
-                if !some.code(coder, mode != Mode::Intra) {
-                    return Mode::Intra;
-                }
-                match skip.code(coder, mode == Mode::Skip) {
-                    true => Mode::Skip,
-                    false => Mode::Inter,
-                }
-            };
-            *modes = Modes {
-                geometry: code(0, above.map(|m| m.geometry), before.geometry, modes.geometry),
-                colours: code(1, above.map(|m| m.colours), before.colours, modes.colours),
-            };
-            before = *modes;
-        }
-        Ok(())
-    }
-}
-
-/// The prediction of a block's vector from those before it, `vectors`, and how sure it is: 0 if no neighbour is there, 1
-/// if neighbours differ, 2 if all are alike. Blocks are those of the nodes `keys`. The prediction is the median of the
-/// neighbours before along each axis; of two of them it is the first, and of none the vector before, or `start`.
-pub fn predicted(keys: &[u64], vectors: &[[i16; 3]], start: [i16; 3]) -> ([i16; 3], usize) {
-    let at = morton::decode(keys[vectors.len()]);
-    let mut around = [[0; 3]; 3];
-    let mut count = 0;
-    for axis in 0..3 {
-        let mut place = at;
-        let Some(before) = place[axis].checked_sub(1) else {
-            continue;
-        };
-        place[axis] = before;
-        // All of them have lower keys.
-        if let Ok(i) = keys[..vectors.len()].binary_search(&morton::encode(place)) {
-            around[count] = vectors[i];
-            count += 1;
-        }
-    }
-    let alike = around[..count].iter().all(|vector| *vector == around[0]);
-    let median = |axis: usize| {
-        let [a, b, c] = around.map(|vector: [i16; 3]| vector[axis]);
-        a.max(b).min(a.min(b).max(c))
-    };
-    let vector = match count {
-        0 => vectors.last().copied().unwrap_or(start),
-        3 => [0, 1, 2].map(median),
-        _ => around[0],
-    };
-    (vector, if count == 0 { 0 } else { 1 + usize::from(alike) })
-}
-
-/// Codes a number of up to 16 bits: one less than the bits of the number and 1, then these bits, all even.
-fn code_escape(coder: &mut impl Coder, value: u32) -> Result<u32> {
-    let target = value + 1;
-    let mut bits = 0;
-    while coder.code(target >> (bits + 1) != 0, 1 << 15) {
-        bits += 1;
-        if bits > 16 {
-            return Err(malformed(
-                "17.5.3",
-                "escape of a motion vector",
-                "17 bits",
-                "at most 16",
-            ));
-        }
-    }
-    let mut number = 1u32;
-    for bit in (0..bits).rev() {
-        number = 2 * number + u32::from(coder.code(target >> bit & 1 == 1, 1 << 15));
-    }
-    Ok(number - 1)
 }
 
 #[cfg(all(test, feature = "encoder"))]
@@ -404,6 +297,7 @@ mod tests {
     fn head(block_level: u8) -> Head {
         Head {
             block_level,
+            divided: false,
             unit_level: 12,
             reference_level: block_level + 1,
             root: Modes {
@@ -421,33 +315,81 @@ mod tests {
         })
     }
 
+    /// Vectors of which many are alike.
+    fn vector() -> impl Strategy<Value = [i16; 3]> {
+        prop_oneof![
+            3 => prop::array::uniform3(0i16..2),
+            1 => prop::array::uniform3(-4096i16..=4096),
+        ]
+    }
+
+    /// The bytes behind the head, and those of the levels after the first.
+    fn sections(written: &[Vec<u8>], base: u8, top: u8, head: Head) -> Vec<&[u8]> {
+        let (read, first) = Head::parse(&written[0], base, top).unwrap();
+        assert_eq!(read, head);
+        let mut behind: Vec<&[u8]> = written.iter().map(Vec::as_slice).collect();
+        behind[0] = first;
+        behind
+    }
+
     proptest! {
         #[test]
         fn motion_is_read_as_it_was_written(
-            vectors in prop::collection::vec(prop::array::uniform3(-4096i16..=4096), 1..40),
+            vectors in prop::collection::vec(vector(), 1..40),
             all in prop::collection::vec(prop::collection::vec(modes(), 40), 2..6),
         ) {
             let (base, top) = (6, 6 + all.len() as u8 - 2);
-            let head = head(4);
-            let modes = all.iter().map(|modes| modes[..vectors.len()].to_vec()).collect();
-            let vectors_len = vectors.len();
+            let count = vectors.len();
+            let modes = all.iter().map(|modes| modes[..count].to_vec()).collect();
             let blocks = Blocks { vectors, modes };
-            let keys: Vec<u64> = (0..vectors_len as u64).map(|i| i * i / 2 + i).collect();
-            let parts = head.write(base, &keys, &blocks).unwrap();
-            prop_assert_eq!(parts.len(), usize::from(top - base) + 1);
-            let (read, first) = Head::parse(&parts[0], base, top).unwrap();
-            prop_assert_eq!(read, head);
-            let mut behind: Vec<&[u8]> = parts.iter().map(Vec::as_slice).collect();
-            behind[0] = first;
-            prop_assert_eq!(read.blocks(base, &keys, &behind).unwrap(), blocks);
+            let keys: Vec<u64> = (0..count as u64).map(|i| i * i / 2 + i).collect();
+            let written = head(4).write(base, [&keys, &[]], [&blocks, &Blocks::default()]).unwrap();
+            prop_assert_eq!(written.len(), usize::from(top - base) + 1);
+            let sections = sections(&written, base, top, head(4));
+            prop_assert_eq!(head(4).blocks(base, &keys, &sections).unwrap(), blocks);
+        }
+
+        #[test]
+        fn parts_are_read_as_they_were_written(
+            block_level in 3u8..6,
+            vectors in prop::collection::vec(vector(), 1..20),
+            part_vectors in prop::collection::vec(vector(), 160),
+            octants in prop::collection::vec(1u8.., 20),
+            all in prop::collection::vec(prop::collection::vec(modes(), 160), 5),
+        ) {
+            // Level L is 6: parts are coded with it, or with the level after it.
+            let (base, top) = (6, block_level + 5);
+            let head = Head { divided: true, ..head(block_level) };
+            let keys: Vec<u64> = (0..vectors.len() as u64).map(|i| i * i / 3 + i).collect();
+            let part_keys: Vec<u64> = { keys.iter().zip(&octants) }
+                .flat_map(|(key, mask)| (0..8).filter(move |octant| mask >> octant & 1 == 1).map(move |octant| *key << 3 | octant))
+                .collect();
+            let modes = |levels: std::ops::Range<usize>, count: usize| {
+                all[levels].iter().map(|modes| modes[..count].to_vec()).collect()
+            };
+            let blocks = Blocks { modes: modes(0..1, keys.len()), vectors };
+            let parts = Blocks {
+                vectors: part_vectors[..part_keys.len()].to_vec(),
+                modes: modes(1..5, part_keys.len()),
+            };
+            let written = head.write(base, [&keys, &part_keys], [&blocks, &parts]).unwrap();
+            prop_assert_eq!(written.len(), usize::from(top - base) + 1);
+            let sections = sections(&written, base, top, head);
+            prop_assert_eq!(head.blocks(base, &keys, &sections).unwrap(), blocks);
+            prop_assert_eq!(head.parts(base, [&keys, &part_keys], &sections).unwrap(), parts);
         }
 
         #[test]
         fn any_bytes_are_read_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..80), count in 1usize..50) {
-            if let Ok((head, rest)) = Head::parse(&bytes, 6, 9)
-                && let Ok(blocks) = head.blocks(6, &(0..count as u64).collect::<Vec<_>>(), &[rest])
-            {
-                prop_assert_eq!(blocks.vectors.len(), count);
+            if let Ok((head, rest)) = Head::parse(&bytes, 6, 9) {
+                let keys: Vec<u64> = (0..count as u64).collect();
+                let part_keys: Vec<u64> = (0..8 * count as u64).filter(|key| key % 3 > 0).collect();
+                if let Ok(blocks) = head.blocks(6, &keys, &[rest]) {
+                    prop_assert_eq!(blocks.vectors.len(), count);
+                }
+                if head.divided && let Ok(parts) = head.parts(6, [&keys, &part_keys], &[rest, rest]) {
+                    prop_assert_eq!(parts.vectors.len(), part_keys.len());
+                }
             }
         }
     }
@@ -460,6 +402,12 @@ mod tests {
         };
         assert!(clause(head(6)).is_ok());
         assert_eq!(clause(head(7)).err(), Some(Some("17.5.1")));
+        let divided = |block_level| Head {
+            divided: true,
+            ..head(block_level)
+        };
+        assert!(clause(divided(5)).is_ok());
+        assert_eq!(clause(divided(6)).err(), Some(Some("17.5.1")));
         let far = Head {
             vector: [0, 0, 4097],
             ..head(5)

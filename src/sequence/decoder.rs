@@ -198,13 +198,13 @@ impl SequenceDecoder {
     }
 
     /// Checks that a frame and the one before it fit the limits. Both have at most the voxels that the sequence states.
-    /// The moved frame has at most twice as many.
+    /// The frame moved by parts has at most twice as many, the level moved by blocks as many as a frame.
     fn check_memory(&self, header: &Header, group: &Group, top: u8) -> Result<()> {
         let most = group.common.voxels(top)?;
         // Levels above the last one have a third of its voxels, more or less; never more than each as many.
         let levels = u64::from(top) + 1;
         let voxels = u64::from(most).saturating_mul(levels.min(4));
-        let kept = voxels.saturating_mul(3 * Previous::bytes_per_voxel() as u64);
+        let kept = voxels.saturating_mul(4 * Previous::bytes_per_voxel() as u64);
         let bytes = self.decoder.memory(header, top)?.saturating_add(kept);
         self.decoder
             .limits()

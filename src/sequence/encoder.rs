@@ -68,9 +68,9 @@ type Coded = (FrameEntry, Vec<u8>);
 /// Factor of the steps of a group's first frame: the frames after it show what they keep of it.
 const FIRST_STEP: f32 = 0.7;
 /// Share of the bytes of the group's first frame above which a predicted frame is compared with a whole one.
-const LARGE: f64 = 0.65;
+const LARGE: f64 = 0.35;
 /// Bytes of a whole frame, over those of a predicted one, that its own voxels and colours are worth.
-const WORTH: f64 = 1.08;
+const WORTH: f64 = 1.2;
 
 /// A coded group.
 #[derive(Clone)]
@@ -145,6 +145,13 @@ impl SequenceEncoder {
     /// finest one, too. Default: not scalable.
     pub fn with_scalability(mut self, scalable: bool) -> Self {
         self.options.scalable = scalable;
+        self
+    }
+
+    /// The same encoder, which divides the blocks that move into parts with vectors of their own if `parts`. That takes
+    /// fewer bits; decoders of before 2026-11-28 refuse such frames. Default: it divides them.
+    pub fn with_parts(mut self, parts: bool) -> Self {
+        self.options.parts = parts;
         self
     }
 

@@ -121,12 +121,16 @@ fn root_alone(bytes: &[u8]) -> Vec<u8> {
         reference_level: 0,
         root: Modes::default(),
         vector: [-8, 3, 0],
+        divided: false,
     };
     let blocks = Blocks {
         vectors: vec![[7, 0, 8]],
         modes: Vec::new(),
     };
-    let motion = head.write(0, &[0], &blocks).expect("a small vector").concat();
+    let motion = head
+        .write(0, [&[0], &[]], [&blocks, &Blocks::default()])
+        .expect("a small vector")
+        .concat();
     let mut second = FrameEntry {
         kind: FrameKind::Predicted,
         ticks: 1,
@@ -145,7 +149,8 @@ fn root_alone(bytes: &[u8]) -> Vec<u8> {
 /// A sequence, what is unusual about it in its name, and whether no float had a part in it, so that every machine makes
 /// the same bytes.
 pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
-    let of = |levels, quality| SequenceEncoder::new().with_levels(levels).with_quality(quality);
+    let divided = |levels, quality| SequenceEncoder::new().with_levels(levels).with_quality(quality);
+    let of = |levels, quality| divided(levels, quality).with_parts(false);
     let (step, lossless) = (QualityTarget::Step, QualityTarget::Lossless);
     let slow = |frame| cloud(5, moving(frame, [1, 0, 0]));
     let fast = |frame| cloud(5, moving(frame, [2, 1, 3]));
@@ -156,6 +161,7 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         0 | 1 => slow(frame),
         _ => cloud_of(5, (0..420).map(|i| i * 77 + frame * 8).collect()),
     };
+    let vary = |frame| cloud(7, many(frame));
     let far = |i: u64, frame: u64| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 1 ^ (frame & i);
     let lone = |frame| cloud_of(21, (0..12).map(|i| far(i, frame)).collect());
     let axes = Axes {
@@ -166,6 +172,7 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         slice_voxels: 30,
         colour_slice: 25,
         filter: false,
+        parts: false,
         ..Options::default()
     };
     let groups = of(2..=4, step(30.0)).with_group(3);
@@ -189,11 +196,7 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
             retimed_and_cut(&code(&groups.with_scalability(true), 5, slow)),
             false,
         ),
-        (
-            "many-vectors",
-            code(&of(3..=6, step(60.0)), 3, |frame| cloud(7, many(frame))),
-            false,
-        ),
+        ("many-vectors", code(&of(3..=6, step(60.0)), 3, vary), false),
         (
             "slices-and-no-filter",
             code(&SequenceEncoder::new().with_options(sliced).with_levels(2..=5), 3, slow),
@@ -203,5 +206,18 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         ("root-alone", root_alone(&code(&of(0..=0, step(30.0)), 1, slow)), false),
         ("exact", code(&of(3..=5, lossless), 4, slow), false),
         ("exact-deepest", code(&of(20..=21, lossless), 3, lone), false),
+        ("parts", code(&divided(4..=6, step(40.0)), 4, vary), false),
+        (
+            "parts-of-the-base-level",
+            code(&divided(3..=6, step(60.0)), 3, vary),
+            false,
+        ),
+        (
+            "parts-scalable",
+            code(&divided(3..=5, step(30.0)).with_scalability(true), 3, fast),
+            false,
+        ),
+        ("parts-of-one-level", code(&divided(3..=3, step(30.0)), 3, fast), false),
+        ("parts-exact", code(&divided(3..=5, lossless), 4, vary), false),
     ]
 }

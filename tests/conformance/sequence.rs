@@ -76,6 +76,7 @@ fn the_suite_of_sequences_is_valid_and_has_frames_and_groups_of_all_kinds() {
 #[test]
 fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind() {
     let (mut modes, mut vectors, mut reach) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
+    let mut of_parts = BTreeSet::new();
     let limits = Limits::default();
     for name in names() {
         let bytes = stream(&name);
@@ -98,13 +99,27 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
                 parts[0] = first;
                 let decoded = decoder.frame(&sequence, number).expect("a frame");
                 let keys = decoded.points().expect("a level").voxels.keys();
-                let down = 3 * (header.base - head.block_level);
-                let mut keys: Vec<u64> = keys.iter().map(|key| key >> down).collect();
-                keys.dedup();
-                let blocks = head.blocks(header.base, &keys, &parts).expect("motion");
-                vectors.extend(blocks.vectors);
-                for Modes { geometry, colours } in blocks.modes.into_iter().flatten() {
-                    modes.extend([(0, geometry as u8), (1, colours as u8)]);
+                let nodes = |level: u8| {
+                    let down = 3 * (header.base - level);
+                    let mut keys: Vec<u64> = keys.iter().map(|key| key >> down).collect();
+                    keys.dedup();
+                    keys
+                };
+                let keys = nodes(head.block_level);
+                let mut found = vec![head.blocks(header.base, &keys, &parts).expect("motion")];
+                if head.divided && header.top > head.block_level + 1 {
+                    let part_keys = nodes(head.block_level + 1);
+                    let divided = head
+                        .parts(header.base, [&keys, &part_keys], &parts)
+                        .expect("motion of parts");
+                    of_parts.extend(divided.vectors.clone());
+                    found.push(divided);
+                }
+                for blocks in found {
+                    vectors.extend(blocks.vectors);
+                    for Modes { geometry, colours } in blocks.modes.into_iter().flatten() {
+                        modes.extend([(0, geometry as u8), (1, colours as u8)]);
+                    }
                 }
                 let above = head.unit_level - header.top;
                 reach.insert((above, head.reference_level.saturating_sub(head.block_level + 1)));
@@ -114,6 +129,7 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
     assert_eq!(modes.len(), 6, "modes {modes:?}");
     let far = vectors.iter().flatten().map(|x| x.unsigned_abs()).max();
     assert!(vectors.len() >= 10 && far >= Some(16), "{vectors:?}");
+    assert!(of_parts.len() >= 10, "vectors of parts: {of_parts:?}");
     assert!(reach.iter().any(|(above, _)| *above > 0), "{reach:?}");
     assert!(
         reach.iter().any(|(_, levels)| *levels == 0) && reach.iter().any(|(_, levels)| *levels >= 3),

@@ -23,12 +23,12 @@ use crate::motion::{Places, PreviousLevel};
 /// Voxels along the side of a cell.
 const CELL: i32 = 4;
 /// λ, and the mean squared error up to which coefficients are not coded, in squared steps.
-const LAMBDA: f32 = 0.06;
+const LAMBDA: f32 = 0.045;
 const FLOOR: f32 = 0.06;
 /// Squared error of luma, in 255ths, that stands for a squared voxel of displacement: about what pictures lose of both.
 const PLACE: f32 = 3000.0;
 /// Bits of a voxel that is not where it is predicted.
-const CHANGED_BITS: f32 = 3.0;
+const CHANGED_BITS: f32 = 2.5;
 /// What a voxel that is displaced by one costs, if it stays, as a share of what it costs to code it: at levels above the
 /// cloud's own one, and at that one. It may be chance, but roughens the surface, more from frame to frame.
 const ROUGH: [f32; 2] = [0.5, 0.75];
@@ -277,23 +277,28 @@ fn levels<'a>(search: &'a Search) -> Option<[&'a PreviousLevel; 2]> {
     Some([search.previous.level(search.top)?, search.current.level(search.top)?])
 }
 
-/// The least Lagrangian cost of a block whose vector is `vector`, without that of the vector.
-pub(super) fn cost(search: &Search, key: u64, vector: [i16; 3], weights: Weights) -> f32 {
-    let Some(levels) = levels(search) else {
-        return 0.0;
-    };
-    let [copy, coded] = Compared::new(search, key, vector, levels).costs(weights);
-    copy.min(coded)
+/// The Lagrangian costs of a block whose vector is `vector`, without that of the vector: if it is kept, and if not.
+pub(super) fn costs(search: &Search, key: u64, vector: [i16; 3], weights: Weights) -> [f32; 2] {
+    match levels(search) {
+        Some(levels) => Compared::new(search, key, vector, levels).costs(weights),
+        None => [0.0; 2],
+    }
 }
 
-/// Chooses what a block shows, and whether it is kept.
+/// The lesser of both.
+pub(super) fn cost(search: &Search, key: u64, vector: [i16; 3], weights: Weights) -> f32 {
+    let [kept, coded] = costs(search, key, vector, weights);
+    kept.min(coded)
+}
+
+/// Chooses what a block shows, and whether it is kept, unless that is known.
 pub(super) fn choose(search: &Search, block: &mut Block, weights: Weights) -> Shown {
     let Some(levels) = levels(search) else {
         return own(search, block);
     };
     let mut compared = Compared::new(search, block.key, block.vector, levels);
     let costs = compared.costs(weights);
-    block.keep = costs[0] <= costs[1] && !compared.copied.is_empty();
+    block.keep |= costs[0] <= costs[1] && !compared.copied.is_empty();
     let mut shown = Shown::new();
     let key = |at: [i32; 3]| morton::encode(at.map(|x| x as u32));
     for &(at, index, there) in &compared.copied {

@@ -7,7 +7,7 @@ use super::choice::{self, Weights};
 use super::noise::Sampled;
 use crate::colour::Ycc;
 use crate::geometry::{Octree, morton};
-use crate::motion::{Previous, PreviousLevel, predicted};
+use crate::motion::{Groups, Previous, PreviousLevel, predicted};
 
 /// How far vectors are searched at the coarsest of three levels, in its voxels.
 const REACH: i32 = 4;
@@ -21,6 +21,8 @@ const FAR_LUMA: f32 = 40.0 * 64.0;
 const SAMPLE: usize = 160;
 /// Vectors of a block whose costs in rate and distortion are compared.
 const PROMISING: usize = 8;
+/// How many times its bits a part's vector costs: it also costs those of parts that are predicted by it.
+const OTHERS: f32 = 2.0;
 /// The 3³ cells at the start of a window of 4³.
 pub(super) const AROUND: u64 = 0x0777_0777_0777;
 /// The cell in their middle.
@@ -52,15 +54,113 @@ pub(super) struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// All blocks that have voxels in either frame, in the order of their keys, with vectors of least cost.
-    pub fn blocks(&self, weights: Weights) -> Vec<Block> {
-        let own = self.octree.level(self.block_level).keys();
-        let mut keys = own.to_vec();
+    /// All parts of blocks that have voxels in either frame, in the order of their keys, with vectors of least cost.
+    /// `blocks` are those of `Search::blocks` a level above.
+    pub fn parts(&self, blocks: &[Block], weights: Weights) -> Vec<Block> {
+        let keys: Vec<u64> = blocks.iter().map(|block| block.key).collect();
+        let vectors: Vec<[i16; 3]> = blocks.iter().map(|block| block.vector).collect();
+        let groups = Groups::new(&keys, &vectors);
+        let parts = self.keys();
+        let numbers: Vec<usize> = groups.of(&parts).collect();
+        let mut of_blocks = Vec::new();
+        let mut first = 0;
+        for numbers in numbers.chunk_by(|a, b| a == b) {
+            of_blocks.push((numbers[0], &parts[first..first + numbers.len()]));
+            first += numbers.len();
+        }
+        let of_blocks = of_blocks.into_par_iter();
+        of_blocks
+            .flat_map_iter(|(block, parts)| {
+                let tried = candidates(&keys, &vectors, block);
+                self.parts_of(groups, block, parts, &tried, weights)
+            })
+            .collect()
+    }
+
+    /// The parts `keys` of a block, each with the vector of least cost. They have that of the block if this costs less in
+    /// all, and are kept if the block as a whole is: chance shows less in many voxels than in few.
+    fn parts_of(&self, groups: Groups, block: usize, keys: &[u64], tried: &[[i16; 3]], weights: Weights) -> Vec<Block> {
+        let common = groups.vector(block);
+        let (mut vectors, mut sum) = (Vec::new(), 0.0);
+        for key in keys {
+            let (vector, cost) = self.part(groups, (block, *key), tried, &vectors, weights);
+            vectors.push(vector);
+            sum += cost;
+        }
+        let whole = Search {
+            block_level: self.block_level - 1,
+            ..*self
+        };
+        let [kept, coded] = choice::costs(&whole, keys[0] >> 3, common, weights);
+        let undivided = kept.min(coded) <= sum;
+        if undivided {
+            vectors.fill(common);
+        }
+        let block = |(key, vector): (&u64, _)| Block {
+            key: *key,
+            vector,
+            keep: undivided && kept <= coded,
+        };
+        keys.iter().zip(vectors).map(block).collect()
+    }
+
+    /// The vector of least cost of a part of a block, and that cost. `before` are the vectors of parts before it.
+    fn part(
+        &self,
+        groups: Groups,
+        (block, key): (usize, u64),
+        tried: &[[i16; 3]],
+        before: &[[i16; 3]],
+        weights: Weights,
+    ) -> ([i16; 3], f32) {
+        let common = groups.vector(block);
+        let nearby = groups.nearby(block, key, before);
+        let mut all = vec![common];
+        if self.octree.level(self.block_level).keys().binary_search(&key).is_ok() {
+            let near = self.near(key, common, tried);
+            all.extend(self.promising(key, tried.iter().copied().chain([near]).collect()));
+            all.extend(before);
+            all.sort_unstable();
+            all.dedup();
+        }
+        let cost = |vector: [i16; 3]| {
+            let bits = OTHERS * apart_bits(vector, common, &nearby);
+            (vector, choice::cost(self, key, vector, weights) + weights.lambda * bits)
+        };
+        let best = all.into_iter().map(cost).min_by(|a, b| a.1.total_cmp(&b.1));
+        best.unwrap_or((common, 0.0))
+    }
+
+    /// Keys of the blocks that have voxels in either frame.
+    fn keys(&self) -> Vec<u64> {
+        let mut keys = self.octree.level(self.block_level).keys().to_vec();
         if let Some(level) = self.previous.level(self.top) {
             keys.extend(level.blocks(self.top, self.block_level));
         }
         keys.sort_unstable();
         keys.dedup();
+        keys
+    }
+
+    /// The best vector near `common` and `tried`.
+    fn near(&self, key: u64, common: [i16; 3], tried: &[[i16; 3]]) -> [i16; 3] {
+        let sample = self.sample(self.top, key);
+        let mut best = Best {
+            origin: common.map(i32::from),
+            ..Best::default()
+        };
+        best.consider(&sample, common.map(i32::from));
+        for vector in tried {
+            best.consider(&sample, vector.map(i32::from));
+        }
+        best.refine(&sample, &[2, 1, 1]);
+        best.vector.map(|x| x as i16)
+    }
+
+    /// All blocks that have voxels in either frame, in the order of their keys, with vectors of least cost.
+    pub fn blocks(&self, weights: Weights) -> Vec<Block> {
+        let own = self.octree.level(self.block_level).keys();
+        let keys = self.keys();
         let found: Vec<[i16; 3]> = own
             .par_iter()
             .map(|key| self.refined(*key, self.coarse(*key)))
@@ -129,13 +229,7 @@ impl Search<'_> {
         let mut best = Best::default();
         best.consider(&sample, [0; 3]);
         best.consider(&sample, coarse);
-        for step in [2, 1, 1] {
-            let around = best.vector;
-            for i in 0..27 {
-                let offset = [i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1];
-                best.consider(&sample, [0, 1, 2].map(|axis| around[axis] + step * offset[axis]));
-            }
-        }
+        best.refine(&sample, &[2, 1, 1]);
         best.vector.map(|x| x as i16)
     }
 
@@ -206,6 +300,8 @@ impl Sample<'_> {
 struct Best {
     cost: f32,
     vector: [i32; 3],
+    /// Of equally good vectors the one nearest to this one is the best.
+    origin: [i32; 3],
 }
 
 impl Default for Best {
@@ -213,6 +309,7 @@ impl Default for Best {
         Best {
             cost: f32::INFINITY,
             vector: [0; 3],
+            origin: [0; 3],
         }
     }
 }
@@ -220,11 +317,22 @@ impl Default for Best {
 impl Best {
     /// Of equal costs the first vector stays.
     fn consider(&mut self, sample: &Sample, vector: [i32; 3]) {
-        let length: i32 = vector.iter().map(|x| x.abs()).sum();
+        let length: i32 = (0..3).map(|axis| (vector[axis] - self.origin[axis]).abs()).sum();
         let length = 0.05 * length as f32;
         let cost = sample.cost(vector, self.cost - length) + length;
         if cost < self.cost {
             (self.cost, self.vector) = (cost, vector);
+        }
+    }
+
+    /// Tries the vectors around the best one, at these distances in turn.
+    fn refine(&mut self, sample: &Sample, steps: &[i32]) {
+        for step in steps {
+            let around = self.vector;
+            for i in 0..27 {
+                let offset = [i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1];
+                self.consider(sample, [0, 1, 2].map(|axis| around[axis] + step * offset[axis]));
+            }
         }
     }
 }
@@ -255,6 +363,21 @@ fn vector_bits(vector: [i16; 3], predicted: [i16; 3], sure: usize) -> f32 {
         0.8 + 2.0 * (1.0 + apart.abs()).log2()
     };
     [1.0, 1.0, 2.0][sure] + component(0) + component(1) + component(2)
+}
+
+/// Bits of a vector in a group of which most have another one, about.
+fn apart_bits(vector: [i16; 3], common: [i16; 3], nearby: &[[i16; 3]]) -> f32 {
+    if vector == common {
+        return 0.5;
+    }
+    if let Some(i) = nearby.iter().position(|other| *other == vector) {
+        return 3.0 + i as f32;
+    }
+    let component = |axis: usize| {
+        let apart = f32::from(vector[axis]) - f32::from(common[axis]);
+        0.8 + 2.0 * (1.0 + apart.abs()).log2()
+    };
+    5.0 + component(0) + component(1) + component(2)
 }
 
 /// Difference of luma, and half of those of chroma.

@@ -36,6 +36,9 @@ pub struct Options {
     pub colour_slice: u32,
     /// For frames of a sequence: whether a decoder of a level of all frames needs no finer level of any.
     pub scalable: bool,
+    /// For frames of a sequence: whether the blocks that move are divided into parts with vectors of their own. That takes
+    /// fewer bits; decoders of before 2026-11-28 refuse such frames.
+    pub parts: bool,
     /// What coded colours approach.
     pub tune: Tune,
     /// Heads that will draw the stream; `None` for surfels.
@@ -60,6 +63,7 @@ impl Default for Options {
             slice_voxels: MAX_SLICE_VOXELS,
             colour_slice: COLOUR_SLICE,
             scalable: false,
+            parts: true,
             tune: Tune::Visual,
             heads: None,
             head_maps: true,

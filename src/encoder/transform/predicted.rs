@@ -1,4 +1,4 @@
-//! Frames of a sequence that are predicted from the frame before (`docs/format.md`, clauses 17.5 to 17.7).
+//! Frames of a sequence that are predicted from the frame before (`docs/format.md`, clauses 17.5 to 17.9).
 
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ use crate::error::Result;
 use crate::geometry::{Octree, Voxels, codec};
 use crate::log::Log;
 use crate::motion::moved::{self, REACH};
-use crate::motion::{Blocks, GeometryGuide, Head, Inter, Mode, Modes, Previous, own};
+use crate::motion::{Blocks, GeometryGuide, Head, Inter, Mode, Modes, Previous, own as own_of};
 
 /// A coded frame that is predicted from the frame before.
 #[derive(Debug)]
@@ -28,12 +28,7 @@ pub struct PredictedFrame {
     pub motion: Vec<Vec<u8>>,
 }
 
-/// The level whose nodes are the blocks.
-fn block_level(base: u8, top: u8) -> u8 {
-    base.min(top.saturating_sub(BLOCK_DEPTH))
-}
-
-/// Levels from the blocks to the finest one: blocks have 16³ voxels, if the base level is not above them.
+/// Levels from the blocks to the finest one: blocks have 16³ voxels, and parts 8³, if the base level is not above them.
 const BLOCK_DEPTH: u8 = 4;
 /// Colours of a block are predicted from the previous frame if what is left is at most this share of the differences.
 const INTER_COLOURS: f32 = 0.9;
@@ -55,11 +50,16 @@ pub fn encode_predicted(
     let octree = octree_of(cloud, top, log)?;
     let trunk = trunk_depth(base, |level| octree.level(level).len());
     let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, trunk, top, steps.is_lossless());
-    let block_level = block_level(base, top);
+    let divided = options.parts && base > 0;
+    // Blocks, or their parts, are nodes of the base level or of one above it.
+    let block_level = (base - u8::from(divided)).min(top.saturating_sub(BLOCK_DEPTH));
     let isa = options.isa.unwrap_or_else(Isa::detect);
-    let mut target = Target::new(cloud, &octree, &truth, previous, [base, block_level, top], steps)?;
+    let part_level = block_level + u8::from(divided);
+    let levels_of_target = [base, block_level, part_level, top];
+    let mut target = Target::new(cloud, &octree, &truth, previous, levels_of_target, steps)?;
     let head = Head {
         block_level,
+        divided,
         unit_level: top,
         reference_level: if options.scalable { base } else { top }.min(block_level + REACH),
         root: target.root,
@@ -119,10 +119,11 @@ pub fn encode_predicted(
         points,
         guides: Some(guides),
     };
+    let keys = target.keys();
     let subject = subject.with_octree(target.octree, top, log)?;
     let stream = subject.code_towards(&target.truth, top, steps, None, log)?.bytes;
-    let keys: Vec<u64> = target.blocks.iter().map(|block| block.key).collect();
-    let motion = plan.head.write(base, &keys, &plan.blocks)?;
+    let keys = keys.each_ref().map(Vec::as_slice);
+    let motion = plan.head.write(base, keys, plan.blocks.each_ref())?;
     Ok(PredictedFrame { stream, motion })
 }
 
@@ -132,16 +133,20 @@ struct Target {
     truth: Truth,
     /// The blocks with voxels, in order.
     blocks: Vec<Block>,
+    /// Their parts, or the blocks themselves if they are not divided.
+    parts: Vec<Block>,
     root: Modes,
     top: u8,
     block_level: u8,
+    part_level: u8,
     lossless: bool,
 }
 
 /// The motion of a frame.
 struct Plan {
     head: Head,
-    blocks: Blocks,
+    /// The blocks, and their parts if they are divided.
+    blocks: [Blocks; 2],
 }
 
 impl Target {
@@ -150,7 +155,7 @@ impl Target {
         octree: &Octree,
         truth: &Truth,
         previous: &Arc<Previous>,
-        [base, block_level, top]: [u8; 3],
+        [base, block_level, part_level, top]: [u8; 4],
         steps: Steps,
     ) -> Result<Self> {
         let lossless = steps.is_lossless();
@@ -168,28 +173,45 @@ impl Target {
         };
         let weights = Weights::of_step(steps.luma_step(), top == cloud.voxels.depth());
         let mut blocks = search.blocks(weights);
+        let search = Search {
+            block_level: part_level,
+            ..search
+        };
+        let mut parts = match part_level > block_level {
+            true => search.parts(&blocks, weights),
+            false => blocks.clone(),
+        };
         let choose = |block: &mut Block| match lossless {
             true => choice::own(&search, block),
             false => choice::choose(&search, block, weights),
         };
-        let mut shown: Vec<Shown> = blocks.par_iter_mut().map(choose).collect();
+        let mut shown: Vec<Shown> = parts.par_iter_mut().map(choose).collect();
         if shown.iter().all(Vec::is_empty) {
             // A frame has at least one voxel.
-            for (shown, block) in shown.iter_mut().zip(&mut blocks) {
+            for (shown, block) in shown.iter_mut().zip(&mut parts) {
                 block.keep = false;
                 *shown = choice::own(&search, block);
             }
         }
         let mut all: Shown = shown.concat();
         if !lossless {
-            choice::close(&search, &blocks, &mut all);
+            choice::close(&search, &parts, &mut all);
         }
         let keys: Vec<u64> = all.iter().map(|voxel| voxel.0).collect();
-        let down = 3 * (top - block_level);
-        blocks.retain(|block| {
-            let first = keys.partition_point(|key| key >> down < block.key);
-            keys.get(first).is_some_and(|key| key >> down == block.key)
-        });
+        for (level, blocks) in [(block_level, &mut blocks), (part_level, &mut parts)] {
+            let down = 3 * (top - level);
+            blocks.retain(|block| {
+                let first = keys.partition_point(|key| key >> down < block.key);
+                keys.get(first).is_some_and(|key| key >> down == block.key)
+            });
+        }
+        // A block is kept if all of its parts are.
+        for block in &mut blocks {
+            let down = 3 * (part_level - block_level);
+            let first = parts.partition_point(|part| part.key >> down < block.key);
+            let mut own = parts[first..].iter().take_while(|part| part.key >> down == block.key);
+            block.keep = own.all(|part| part.keep);
+        }
         let octree = Octree::new(Voxels::from_sorted(top, keys))?;
         let trunk = trunk_depth(base, |level| octree.level(level).len());
         let own = Truth::finest(&cloud.voxels, &cloud.colours, &octree, top, lossless);
@@ -203,12 +225,14 @@ impl Target {
             octree,
             truth,
             blocks,
+            parts,
             root: Modes {
                 geometry: Mode::Inter,
                 colours: Mode::Inter,
             },
             top,
             block_level,
+            part_level,
             lossless,
         })
     }
@@ -246,52 +270,79 @@ impl Target {
         Ok(())
     }
 
+    fn is_divided(&self) -> bool {
+        self.part_level > self.block_level
+    }
+
+    /// Keys of the blocks, and of their parts.
+    fn keys(&self) -> [Vec<u64>; 2] {
+        [&self.blocks, &self.parts].map(|blocks| blocks.iter().map(|block| block.key).collect())
+    }
+
+    /// The blocks or parts whose modes are those of a level after the level of blocks.
+    fn blocks_of(&self, level: u8) -> &[Block] {
+        if level > self.part_level {
+            &self.parts
+        } else {
+            &self.blocks
+        }
+    }
+
+    /// Vectors of all blocks and parts, and everywhere the same modes.
+    fn even(&self, modes: Modes) -> [Blocks; 2] {
+        let [mut blocks, mut parts] = [&self.blocks, &self.parts].map(|blocks| Blocks {
+            vectors: blocks.iter().map(|block| block.vector).collect(),
+            modes: Vec::new(),
+        });
+        for level in self.block_level + 1..=self.top {
+            let of_parts = self.is_divided() && level > self.part_level;
+            let blocks = if of_parts { &mut parts } else { &mut blocks };
+            blocks.modes.push(vec![modes; blocks.vectors.len()]);
+        }
+        match self.is_divided() {
+            true => [blocks, parts],
+            false => [blocks, Blocks::default()],
+        }
+    }
+
     /// Chooses the modes of all levels.
     fn modes(&self, previous: &Arc<Previous>, head: Head, base: u8) -> Result<Plan> {
         let inter = Modes {
             geometry: Mode::Inter,
             colours: Mode::Inter,
         };
-        let levels = usize::from(self.top - self.block_level);
         let mut plan = Plan {
             head,
-            blocks: Blocks {
-                vectors: self.blocks.iter().map(|block| block.vector).collect(),
-                modes: vec![vec![inter; self.blocks.len()]; levels],
-            },
+            blocks: self.even(inter),
         };
         // Colours of skipped blocks are not interpolated.
         let still = Modes {
             colours: Mode::Skip,
             ..inter
         };
-        let kept = Blocks {
-            vectors: plan.blocks.vectors.clone(),
-            modes: vec![vec![still; self.blocks.len()]; levels],
-        };
-        let root_kept = Head { root: still, ..head };
-        let tried = [
-            Inter::of(Arc::clone(previous), head, plan.blocks.clone(), base),
-            Inter::of(Arc::clone(previous), root_kept, kept, base),
-        ];
-        let mut root = [Votes::default(), Votes::default()];
+        let tried = [(head, inter), (Head { root: still, ..head }, still)];
+        let tried = tried.map(|(head, modes)| Inter::of(Arc::clone(previous), head, self.even(modes), base));
+        let mut root = Votes::default();
+        let mut chosen = Vec::new();
         for level in 1..=self.top {
             let votes = self.votes(&tried, level)?;
-            match level.checked_sub(self.block_level + 1) {
-                None => root[1].add(votes[0]),
-                Some(i) => {
-                    for ((modes, votes), block) in plan.blocks.modes[usize::from(i)]
-                        .iter_mut()
-                        .zip(votes)
-                        .zip(&self.blocks)
-                    {
-                        *modes = votes.modes(block.keep, self.lossless);
-                    }
-                }
+            if level <= self.block_level {
+                root.add(votes[0]);
+                continue;
             }
+            let blocks = votes.iter().zip(self.blocks_of(level));
+            chosen.push(
+                blocks
+                    .map(|(votes, block)| votes.modes(block.keep, self.lossless))
+                    .collect(),
+            );
+        }
+        let [blocks, parts] = &mut plan.blocks;
+        for (modes, chosen) in blocks.modes.iter_mut().chain(&mut parts.modes).zip(chosen) {
+            *modes = chosen;
         }
         let all = self.blocks.iter().all(|block| block.keep);
-        plan.head.root = root[1].modes(all, self.lossless);
+        plan.head.root = root.modes(all, self.lossless);
         Ok(plan)
     }
 
@@ -305,15 +356,21 @@ impl Target {
         let nodes = self.octree.level(level - 1).keys();
         let (masks, first) = (self.octree.occupancy(level - 1), self.octree.first_child(level - 1));
         let blocks = level > self.block_level;
-        let down = 3 * (level - 1).saturating_sub(self.block_level);
-        let mut votes = vec![Votes::default(); if blocks { self.blocks.len() } else { 1 }];
+        let own = if level > self.part_level {
+            self.part_level
+        } else {
+            self.block_level
+        };
+        let of_level = self.blocks_of(level);
+        let down = 3 * (level - 1).saturating_sub(own);
+        let mut votes = vec![Votes::default(); if blocks { of_level.len() } else { 1 }];
         let mut block = 0;
         for (node, key) in nodes.iter().enumerate() {
-            while blocks && self.blocks[block].key < key >> down {
+            while blocks && of_level[block].key < key >> down {
                 block += 1;
             }
             let vote = &mut votes[block];
-            let (mask, moved) = (masks[node], own(geometry.windows()[node]));
+            let (mask, moved) = (masks[node], own_of(geometry.windows()[node]));
             vote.geometry(mask, moved);
             let first = first[node] as usize;
             let children = first..first + mask.count_ones() as usize;

@@ -12,6 +12,8 @@ use super::sequence_parts::Sequence;
 const MOVING: &str = "sequences/moving";
 /// One group, whose frames have the levels 3 to 6 and blocks of level 2.
 const MANY: &str = "sequences/many-vectors";
+/// One group, whose frames have the levels 4 to 6 and blocks of level 2 that are divided.
+const PARTS: &str = "sequences/parts";
 /// One group, whose frames are the root.
 const ROOT: &str = "sequences/root-alone";
 
@@ -43,7 +45,9 @@ pub fn all(read: impl Fn(&str) -> Vec<u8>) -> Vec<Kind> {
             });
         }],
     );
+    of(PARTS, &[divided]);
     kinds.extend(crowded(&read(MANY)));
+    kinds.extend(parts(&read(PARTS)));
     kinds
 }
 
@@ -289,7 +293,9 @@ fn with_blocks(sequence: &mut Sequence, change: impl Fn(&mut Blocks)) {
     let blocks = head.blocks(2, &[0], &[rest, &parts[1], &parts[2]]);
     let mut blocks = blocks.expect("motion of one block");
     change(&mut blocks);
-    let parts = head.write(2, &[0], &blocks).expect("motion of one block");
+    let parts = head
+        .write(2, [&[0], &[]], [&blocks, &Blocks::default()])
+        .expect("motion of one block");
     for (level, part) in parts.into_iter().enumerate() {
         *sequence.motion(level) = part;
     }
@@ -327,7 +333,10 @@ fn motion(add: &mut Add) {
             vectors: vec![[0, -17, 0]],
             modes: vec![vec![Modes::default()]; 4],
         };
-        *s.motion(0) = head.write(2, &[0], &blocks).expect("motion").swap_remove(0);
+        *s.motion(0) = head
+            .write(2, [&[0], &[]], [&blocks, &Blocks::default()])
+            .expect("motion")
+            .swap_remove(0);
     });
     add("vector-with-an-escape-of-17-bits", "17.5.3", &|s| {
         // All decisions are 1.
@@ -351,6 +360,54 @@ fn words(add: &mut Add) {
     });
 }
 
+fn divided(add: &mut Add) {
+    add("motion-of-parts-below-the-first-level", "17.5.1", &|s| {
+        s.motion(0)[0] = 0x84
+    });
+    add("motion-of-parts-goes-on", "5.4.3", &|s| s.motion(0).extend([0; 12]));
+    add("motion-of-parts-of-no-word", "17.5.3", &|s| {
+        s.motion(0).truncate(10);
+        s.motion(0).extend([0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0xff]);
+    });
+}
+
+/// Vectors of parts that are out of range.
+fn parts(bytes: &[u8]) -> Vec<Kind> {
+    let whole = Sequence::of(bytes);
+    let reader = SequenceReader::new(bytes, &Limits::unlimited()).expect("a sequence");
+    let frame = SequenceDecoder::new(Decoder::new().with_level(4)).frame(&reader, 1);
+    let frame = frame.expect("a frame");
+    let voxels = frame.points().expect("level 4").voxels.keys();
+    let nodes = |down: u32| {
+        let mut keys: Vec<u64> = voxels.iter().map(|key| key >> down).collect();
+        keys.dedup();
+        keys
+    };
+    let (blocks, parts) = (nodes(6), nodes(3));
+    let keys: [&[u64]; 2] = [&blocks, &parts];
+    let mut sequence = whole.clone();
+    let sections = [0, 1, 2].map(|level| sequence.motion(level).clone());
+    let (head, rest) = Head::parse(&sections[0], 4, 6).expect("a head");
+    let sections = [rest, &sections[1], &sections[2]];
+    let own = head.blocks(4, keys[0], &sections).expect("motion of blocks");
+    let mut divided = head.parts(4, keys, &sections).expect("motion of parts");
+    divided.vectors[0] = [0, 65, 0];
+    for (level, part) in head
+        .write(4, keys, [&own, &divided])
+        .expect("motion")
+        .into_iter()
+        .enumerate()
+    {
+        *sequence.motion(level) = part;
+    }
+    vec![Kind {
+        name: "motion-of-a-part-longer-than-the-cube",
+        stream: PARTS,
+        clause: "17.5.3",
+        tries: vec![sequence.bytes()],
+    }]
+}
+
 /// All blocks come from one place. Which one has enough voxels is found by trial.
 fn crowded(bytes: &[u8]) -> Vec<Kind> {
     let whole = Sequence::of(bytes);
@@ -369,7 +426,9 @@ fn crowded(bytes: &[u8]) -> Vec<Kind> {
             vectors: blocks.iter().map(vector).collect(),
             modes: vec![vec![Modes::default(); blocks.len()]; 4],
         };
-        let parts = head.write(3, &blocks, &own).expect("motion");
+        let parts = head
+            .write(3, [&blocks, &[]], [&own, &Blocks::default()])
+            .expect("motion");
         for (level, part) in parts.into_iter().enumerate() {
             *sequence.motion(level) = part;
         }
