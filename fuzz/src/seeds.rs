@@ -100,7 +100,7 @@ fn scenes() -> Vec<Vec<u8>> {
 }
 
 fn sequences() -> Vec<Vec<u8>> {
-    let coded = |depth: u8, moves: u64, group: u32, lossless: bool| {
+    let coded = |depth: u8, moves: u64, group: u32, lossless: bool, parts: bool| {
         let side = 1u64 << depth;
         let cloud = |frame: u64| {
             let key = |i: u64| {
@@ -115,7 +115,10 @@ fn sequences() -> Vec<Vec<u8>> {
                 placement: Placement::VOXEL_GRID,
             })
         };
-        let encoder = SequenceEncoder::new().with_group(group).with_levels(1..=depth);
+        let encoder = SequenceEncoder::new()
+            .with_group(group)
+            .with_levels(1..=depth)
+            .with_parts(parts);
         let encoder = match lossless {
             true => encoder.with_quality(transform::QualityTarget::Lossless),
             false => encoder,
@@ -123,10 +126,13 @@ fn sequences() -> Vec<Vec<u8>> {
         encoder.encode(4, cloud, |_| {}).expect("a few voxels are coded")
     };
     vec![
-        coded(3, 1, 4, false),
-        coded(4, 1, 2, false),
-        coded(4, 0, 4, false),
-        coded(3, 1, 4, true),
+        coded(3, 1, 4, false, false),
+        coded(4, 1, 2, false, false),
+        coded(4, 0, 4, false, false),
+        coded(3, 1, 4, true, false),
+        coded(4, 1, 4, false, true),
+        coded(4, 0, 4, false, true),
+        coded(3, 1, 4, true, true),
     ]
 }
 
