@@ -231,7 +231,8 @@ impl Models {
         for (i, modes) in modes.iter_mut().enumerate() {
             let [geometry, colours] =
                 above.map_or([3, 3], |above| [above[i].geometry as usize, above[i].colours as usize]);
-            // Of divided blocks and their parts, modes follow from both modes above, and those of colours from that of occupancies.
+            // Of divided blocks and their parts, modes follow from both modes above, and those of colours from that of
+            // occupancies.
             let context = if !self.divided || above.is_none() {
                 geometry
             } else {

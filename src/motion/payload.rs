@@ -362,7 +362,9 @@ mod tests {
             let head = Head { divided: true, ..head(block_level) };
             let keys: Vec<u64> = (0..vectors.len() as u64).map(|i| i * i / 3 + i).collect();
             let part_keys: Vec<u64> = { keys.iter().zip(&octants) }
-                .flat_map(|(key, mask)| (0..8).filter(move |octant| mask >> octant & 1 == 1).map(move |octant| *key << 3 | octant))
+                .flat_map(|(key, mask)| (0..8u64).filter_map(move |octant| {
+                    (mask >> octant & 1 == 1).then_some(*key << 3 | octant)
+                }))
                 .collect();
             let modes = |levels: std::ops::Range<usize>, count: usize| {
                 all[levels].iter().map(|modes| modes[..count].to_vec()).collect()
