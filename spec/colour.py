@@ -387,7 +387,7 @@ def decode_trunk(levels, payload, motion=None):
     weights = trunk_weights(levels, target)
     for n, steps in enumerate(steps_of[1:], 1):
         (nodes, children), height = levels[n - 1 : n + 1], min(max(target - n, 0), 3)
-        above, guides = coloured[-1], motion and motion.colours(nodes, children)
+        above, guides = coloured[-1], motion and motion.colours(nodes, children, levels[-1].level)
         own = (steps, gain, above.model, decoder, guides)
         part = SliceDecoder(nodes, children, weights[n], height, above, 0, len(nodes), *own)
         part.decode()
@@ -401,7 +401,7 @@ def decode_level(nodes, children, level, above, payloads, slice_nodes, motion=No
     up = max(above.target - level, 0)
     weights = estimates(children) if up else [1024] * len(children)
     values, energies, steps, model = [], [], None, None
-    guides = motion and motion.colours(nodes, children)
+    guides = motion and motion.colours(nodes, children, level)
     for number, payload in enumerate(payloads):
         reader = Reader(payload, "5.3")
         own = Steps(reader.number("B"), reader.number("B"))

@@ -81,18 +81,20 @@ class Motion:
     def __init__(self, payloads, header, previous):
         reader = Reader(payloads[0], "17.5.1")
         first, self.unit, self.reference, modes = reader.take(4)
-        self.block_level, self.divided = first & 127, first > 127
+        self.block_level, self.divided, self.moves_coarse = first & 63, first > 127, first >> 6 & 1
         self.vector = tuple(reader.number("h") for _ in range(3))
-        deepest = header.base - self.divided
+        require(self.divided or not self.moves_coarse, "17.5.1", "coarse colours that move")
+        deepest = header.base - self.divided - self.moves_coarse
         require(self.block_level <= deepest and header.top <= self.unit <= 21, "17.5.1", "levels of the motion")
         furthest = min(header.top, self.block_level + 5)
-        require(self.block_level <= self.reference <= furthest, "17.5.1", "reference level")
+        nearest = self.block_level + 2 * self.moves_coarse
+        require(nearest <= self.reference <= furthest, "17.5.1", "reference level")
         self.above = (modes & 15, modes >> 4)
         require(max(self.above) <= SKIP, "17.5.1", "modes of the motion")
         self.check(self.vector)
         self.base, self.payloads, self.previous = header.base, payloads, previous
         self.decoder = RangeDecoder(payloads[0][reader.at :])
-        self.bits, self.modes = Bits(self.divided), {}
+        self.bits, self.modes, self.coarse = Bits(self.divided), {}, {}
 
     def check(self, vector):
         """17.5.3"""
@@ -173,7 +175,10 @@ class Motion:
                 self.check(vector)
                 own.append(vector)
             self.part_vectors += own
-        self.moved.update(self.move(self.parts, self.part_vectors, self.reference))
+        moved = self.move(self.parts, self.part_vectors, self.reference, self.moves_coarse)
+        self.moved.update((level, known) for level, known in moved.items() if level > self.parts.level)
+        if self.moves_coarse:
+            self.coarse = moved
 
     def nearby(self, block, place, before):
         """17.9.5: vectors that a part may have: of parts before it, and of the blocks at its side."""
@@ -216,8 +221,9 @@ class Motion:
         shift = self.unit - level
         return tuple(v + (1 << shift >> 1) >> shift for v in vector)
 
-    def move(self, blocks, vectors, reference):
-        """17.8: the moved frame's levels, R and those above it."""
+    def move(self, blocks, vectors, reference, coarse=False):
+        """17.8: the moved frame's levels, R and those above it. 17.9.8: if `coarse`, all of them, each of means of level
+        R."""
         if reference <= blocks.level + 1:
             return {}
         source, down = self.previous[reference], reference - blocks.level
@@ -230,13 +236,17 @@ class Motion:
                 if block is not None and vectors[block] == vector:
                     found[place] = value
                     require(len(found) <= most, "17.8.2", "voxels of the moved frame")
-        moved = {}
-        for level in range(reference, blocks.level, -1):
-            moved[level] = Known(Voxels(level, None, list(found)), list(found.values()))
+        moved, sums = {}, {place: (value, 1) for place, value in found.items()}
+        for level in range(reference, 0 if coarse else blocks.level, -1):
+            means = [[half_up(v, n) for v in value] for value, n in sums.values()]
+            moved[level] = Known(Voxels(level, None, list(sums)), means)
             children = {}
-            for place, value in found.items():
-                children.setdefault(tuple(c >> 1 for c in place), []).append(value)
-            found = {place: [half_up(sum(v), len(v)) for v in zip(*values)] for place, values in children.items()}
+            for (place, (value, n)), mean in zip(sums.items(), means):
+                children.setdefault(tuple(c >> 1 for c in place), []).append((value, n) if coarse else (mean, 1))
+            sums = {
+                place: ([sum(v) for v in zip(*(value for value, _ in counted))], sum(n for _, n in counted))
+                for place, counted in children.items()
+            }
         return moved
 
     def of(self, nodes):
@@ -266,9 +276,12 @@ class Motion:
             guides.append((modes[0], window))
         return guides
 
-    def colours(self, nodes, children):
-        """17.7: mode of each node, and colours of its children."""
+    def colours(self, nodes, children, known):
+        """17.7, 17.9.8: mode of each node, and colours of its children. The voxels of level `known` are decoded before
+        these colours."""
         guides, (own, source) = [], self.of(nodes)
+        if self.moves_coarse and children.level <= self.block_level + 1 <= known:
+            own, source = [(modes, (0, 0, 0)) for modes, _ in own], self.coarse[children.level]
         for (modes, vector), first, mask in zip(own, nodes.first, nodes.masks):
             colour = {INTRA: lambda *_: None, INTER: self.between, SKIP: self.was}[modes[1]]
             places = children.coordinates[first : first + mask.bit_count()]

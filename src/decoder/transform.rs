@@ -311,7 +311,7 @@ impl Growing<'_> {
         self.decoder.cancel().check()?;
         let guides = match self.inter {
             Some(inter) => (1..=depth)
-                .map(|n| inter.colours(octree, n))
+                .map(|n| inter.colours(octree, n, depth))
                 .collect::<Result<Vec<_>>>()?,
             None => Vec::new(),
         };
@@ -367,7 +367,7 @@ impl Growing<'_> {
         let map = log.step(format!("neighbours of level {n}"), count, "voxels", || {
             Ok(octree.child_siblings(n - 1, above_map))
         })?;
-        let guide = self.inter.map(|inter| inter.colours(octree, n)).transpose()?;
+        let guide = self.inter.map(|inter| inter.colours(octree, n, n)).transpose()?;
         let name = self.named(format!("colours of level {n}"), n);
         let coloured = log.step(name, count, "voxels", || {
             let slice = header.colour_slice() as usize;

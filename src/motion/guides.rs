@@ -144,12 +144,20 @@ impl Inter {
         Ok(GeometryGuide { modes, windows })
     }
 
-    /// What the previous frame tells of the colours of `level`, which the octree has.
+    /// What the previous frame tells of the colours of `level`, which the octree has. `known` is the last level that a
+    /// decoder has the voxels of when it decodes these colours.
     ///
     /// # Errors
     /// Those of [`Inter::geometry`].
-    pub fn colours(&self, octree: &Octree, level: u8) -> Result<ColourGuide> {
-        let (field, previous) = self.source(octree, level)?;
+    pub fn colours(&self, octree: &Octree, level: u8, known: u8) -> Result<ColourGuide> {
+        let parts = self.head.block_level + 1;
+        let (field, previous) = match self.head.moves_coarse && level <= parts && parts <= known {
+            true => (
+                self.field(octree, level)?.stopped(),
+                self.moved_level(octree, true, level)?,
+            ),
+            false => self.source(octree, level)?,
+        };
         let nodes = octree.level(level - 1);
         let masks = octree.occupancy(level - 1);
         let mut cursor = field.cursor();
@@ -190,10 +198,9 @@ impl Inter {
 
     /// The motion at `level`, and what it moves. The octree has the level above.
     fn source<'a>(&'a self, octree: &'a Octree, level: u8) -> Result<(Field<'a>, &'a PreviousLevel)> {
-        let mut field = self.field(octree, level)?;
+        let field = self.field(octree, level)?;
         let Head {
             block_level,
-            unit_level,
             reference_level,
             ..
         } = self.head;
@@ -201,33 +208,55 @@ impl Inter {
             return Ok((field, self.level(level)?));
         }
         let of_parts = self.head.is_of_parts(level);
+        Ok((field.stopped(), self.moved_level(octree, of_parts, level)?))
+    }
+
+    /// A level of the frame moved by the vectors of blocks, or of parts, which is made when it is first asked for. The octree
+    /// has their level.
+    fn moved_level(&self, octree: &Octree, of_parts: bool, level: u8) -> Result<&PreviousLevel> {
+        let made = &self.moved[usize::from(of_parts)];
+        let moved = match made.get() {
+            Some(moved) => moved,
+            None => {
+                let moved = self.moved(octree, of_parts)?;
+                made.get_or_init(|| moved)
+            }
+        };
+        moved
+            .level(level)
+            .ok_or_else(|| Error::Usage(format!("level {level} was not moved")))
+    }
+
+    fn moved(&self, octree: &Octree, of_parts: bool) -> Result<Moved> {
+        let Head {
+            divided,
+            block_level,
+            unit_level,
+            reference_level,
+            ..
+        } = self.head;
         // One level needs no finer one.
-        let (block, reference) = match (self.head.divided, of_parts) {
+        let (level, reference) = match (divided, of_parts) {
             (true, true) => (block_level + 1, reference_level),
             (true, false) => (block_level, reference_level.min(block_level + COARSE_REACH)),
             (false, _) => (block_level, reference_level),
         };
-        let moved = match self.moved[usize::from(of_parts)].get() {
-            Some(moved) => moved,
-            None => {
-                let shifts: Vec<_> = { self.vectors(of_parts).iter() }
-                    .map(|vector| Block::new(Modes::default(), *vector, unit_level, reference).shift)
-                    .collect();
-                let moved = Moved::new(self.level(reference)?, [block, reference], field.keys, |i| shifts[i]);
-                let moved = moved.map_err(|error| of_level(error, self.base))?;
-                let moved = if self.head.divided && !of_parts {
-                    moved.coarsest()
-                } else {
-                    moved
-                };
-                self.moved[usize::from(of_parts)].get_or_init(|| moved)
-            }
+        let blocks = if of_parts {
+            self.parts(octree)?
+        } else {
+            self.blocks(octree)?
         };
-        field.blocks.iter_mut().for_each(Block::stop);
-        match moved.level(level) {
-            Some(level) => Ok((field, level)),
-            None => Err(Error::Usage(format!("level {level} was not moved"))),
-        }
+        let shifts: Vec<_> = { blocks.vectors.iter() }
+            .map(|vector| Block::new(Modes::default(), *vector, unit_level, reference).shift)
+            .collect();
+        let (previous, keys) = (self.level(reference)?, octree.level(level).keys());
+        let coarse = of_parts && self.head.moves_coarse;
+        let moved = Moved::new(previous, [level, reference], keys, |i| shifts[i], coarse);
+        let moved = moved.map_err(|error| of_level(error, self.base))?;
+        Ok(match divided && !of_parts {
+            true => moved.coarsest(),
+            false => moved,
+        })
     }
 
     /// Checks the motion of level L, of which the octree has all voxels. No level needs it if its blocks are the voxels
@@ -266,12 +295,6 @@ impl Inter {
 
     fn sections(&self) -> Vec<&[u8]> {
         self.sections.iter().map(Vec::as_slice).collect()
-    }
-
-    /// Vectors of the blocks or of their parts, once they are read.
-    fn vectors(&self, of_parts: bool) -> &[[i16; 3]] {
-        let blocks = if of_parts { &self.parts } else { &self.blocks };
-        blocks.get().map_or(&[], |blocks| &blocks.vectors)
     }
 
     /// The motion at `level`. The octree has the level above.
@@ -370,6 +393,12 @@ fn interpolated(previous: &PreviousLevel, near: &mut Near, at: [i32; 3], part: [
 }
 
 impl Field<'_> {
+    /// The same modes without motion.
+    fn stopped(mut self) -> Self {
+        self.blocks.iter_mut().for_each(Block::stop);
+        self
+    }
+
     /// Finds the blocks of nodes.
     fn cursor(&self) -> Cursor<'_> {
         Cursor { field: self, block: 0 }

@@ -15,7 +15,7 @@ pub const REACH: u8 = 5;
 /// The clause of more voxels than a moved frame may have.
 pub const TOO_MANY: &str = "17.8.2";
 
-/// The levels between blocks and reference level of the moved previous frame.
+/// Levels of the moved previous frame that are coarser than the reference level.
 #[derive(Debug, Clone)]
 pub(super) struct Moved {
     /// The first of them.
@@ -25,7 +25,8 @@ pub(super) struct Moved {
 
 impl Moved {
     /// Moves the voxels of `previous`, of level `reference`, into the blocks `keys` of level `block`, each by its shift,
-    /// and averages them up to the level after `block`.
+    /// and averages them up to the level after `block`: colours of children count alike. If `coarse`, up to level 1, and
+    /// all voxels of level `reference` count alike.
     ///
     /// # Errors
     /// [`Error::Malformed`] if the blocks take more than twice the previous frame's voxels.
@@ -34,6 +35,7 @@ impl Moved {
         [block, reference]: [u8; 2],
         keys: &[u64],
         shift: impl Fn(usize) -> [i32; 3] + Sync,
+        coarse: bool,
     ) -> Result<Self> {
         let side = 1i32 << (reference - block);
         let most = 2 * previous.values.len() + 64;
@@ -64,19 +66,18 @@ impl Moved {
             .breaks(TOO_MANY));
         }
         // Blocks are in the order of keys, and each has keys of its own.
-        let mut voxels: Vec<(u64, Ycc)> = parts.concat();
+        let voxels = parts.concat();
+        let first = if coarse { 1 } else { block + 1 };
+        let mut sums = parents(&voxels, Sum::of);
         let mut levels = Vec::new();
-        for level in (block + 1..reference).rev() {
-            voxels = means(&voxels);
-            let keys = voxels.iter().map(|voxel| voxel.0).collect();
-            let values = voxels.iter().map(|voxel| voxel.1).collect();
+        for level in (first..reference).rev() {
+            let keys = sums.iter().map(|sum| sum.0).collect();
+            let values = sums.iter().map(|sum| sum.1.mean()).collect();
             levels.push(PreviousLevel::new(&Voxels::from_sorted(level, keys), values));
+            sums = parents(&sums, |sum| if coarse { sum } else { Sum::of(sum.mean()) });
         }
         levels.reverse();
-        Ok(Moved {
-            first: block + 1,
-            levels,
-        })
+        Ok(Moved { first, levels })
     }
 
     /// The same without the levels after the first.
@@ -85,7 +86,7 @@ impl Moved {
         self
     }
 
-    /// A level. `None` if it is not between blocks and reference level.
+    /// A level. `None` if it was not made.
     pub fn level(&self, level: u8) -> Option<&PreviousLevel> {
         self.levels.get(usize::from(level.checked_sub(self.first)?))
     }
@@ -97,17 +98,42 @@ fn corner(key: u64, side: i32, shift: [i32; 3]) -> [i32; 3] {
     [0, 1, 2].map(|axis| at[axis] as i32 * side - shift[axis])
 }
 
-/// The parents of voxels, each with the mean colour of its children, rounded to the nearest, halves up.
-fn means(voxels: &[(u64, Ycc)]) -> Vec<(u64, Ycc)> {
-    let mean = |children: &[(u64, Ycc)]| {
-        let count = children.len() as i32;
-        let channel = |t: usize| {
-            let sum: i32 = children.iter().map(|(_, colour)| i32::from(colour[t])).sum();
-            (2 * sum + count).div_euclid(2 * count) as i16
+/// Colours of voxels, summed.
+#[derive(Debug, Clone, Copy)]
+struct Sum {
+    colours: [i64; 3],
+    count: i64,
+}
+
+impl Sum {
+    fn of(colour: Ycc) -> Self {
+        Sum {
+            colours: colour.map(i64::from),
+            count: 1,
+        }
+    }
+
+    /// The mean, rounded to the nearest, halves up.
+    fn mean(&self) -> Ycc {
+        self.colours
+            .map(|sum| (2 * sum + self.count).div_euclid(2 * self.count) as i16)
+    }
+}
+
+/// The parents of voxels, each with the sum of what its children count.
+fn parents<T: Copy>(voxels: &[(u64, T)], counted: impl Fn(T) -> Sum) -> Vec<(u64, Sum)> {
+    let sum = |children: &[(u64, T)]| {
+        let mut total = Sum {
+            colours: [0; 3],
+            count: 0,
         };
-        (children[0].0 >> 3, [0, 1, 2].map(channel))
+        for sum in children.iter().map(|child| counted(child.1)) {
+            (0..3).for_each(|t| total.colours[t] += sum.colours[t]);
+            total.count += sum.count;
+        }
+        (children[0].0 >> 3, total)
     };
-    voxels.chunk_by(|a, b| a.0 >> 3 == b.0 >> 3).map(mean).collect()
+    voxels.chunk_by(|a, b| a.0 >> 3 == b.0 >> 3).map(sum).collect()
 }
 
 #[cfg(test)]
@@ -133,7 +159,7 @@ mod tests {
             // The blocks of the lower half along z stay, the others move.
             let blocks: Vec<u64> = (0..64).collect();
             let shift_of = |block: u64| if morton::decode(block)[2] < 2 { [0; 3] } else { shift };
-            let moved = Moved::new(&previous, [2, 4], &blocks, |i| shift_of(blocks[i])).unwrap();
+            let moved = Moved::new(&previous, [2, 4], &blocks, |i| shift_of(blocks[i]), false).unwrap();
             let mut expected = BTreeMap::<u64, Vec<Ycc>>::new();
             for block in &blocks {
                 for &(key, colour) in &voxels {
@@ -162,11 +188,30 @@ mod tests {
     }
 
     #[test]
+    fn every_voxel_counts_alike_in_the_means_of_coarse_levels() {
+        // One voxel alone in a node of level 3, and eight in another; all in one node of level 2.
+        let keys: Vec<u64> = std::iter::once(0).chain(8..16).collect();
+        let previous = PreviousLevel::new(
+            &Voxels::new(4, keys),
+            std::iter::once([900, 9, 0]).chain([[0; 3]; 8]).collect(),
+        );
+        let moved = |coarse| Moved::new(&previous, [1, 4], &[0], |_| [0; 3], coarse).unwrap();
+        let colour = |moved: &Moved, level| Some(moved.level(level)?.values[0]);
+        let [alike, coarse] = [false, true].map(moved);
+        assert_eq!(colour(&alike, 2), Some([450, 5, 0]));
+        assert_eq!(colour(&coarse, 2), Some([100, 1, 0]));
+        assert_eq!(colour(&coarse, 3), Some([900, 9, 0]));
+        assert_eq!(colour(&coarse, 1), Some([100, 1, 0]));
+        assert!(colour(&alike, 1).is_none() && colour(&coarse, 0).is_none());
+    }
+
+    #[test]
     fn blocks_that_all_come_from_one_crowded_place_are_refused() {
         let (previous, _) = level(4, (0..64).collect());
         let blocks: Vec<u64> = (0..64).collect();
         let from_the_corner = |i: usize| morton::decode(blocks[i]).map(|x| 4 * x as i32);
-        let refused = Moved::new(&previous, [2, 4], &blocks, from_the_corner).expect_err("64 times as many voxels");
+        let refused =
+            Moved::new(&previous, [2, 4], &blocks, from_the_corner, false).expect_err("64 times as many voxels");
         assert_eq!(refused.clause(), Some(TOO_MANY));
     }
 }

@@ -24,6 +24,9 @@ pub struct Head {
     /// Whether the nodes of level B + 1, the *parts* of blocks, have vectors and modes of their own for the levels after
     /// theirs.
     pub divided: bool,
+    /// Whether the colours of the levels 1 to B + 1 are predicted from the frame moved by parts, as far as parts are known
+    /// then.
+    pub moves_coarse: bool,
     /// U: vectors are in voxels of this level.
     pub unit_level: u8,
     /// R: the levels after B and before this one are predicted from the moved previous frame of level R, all others
@@ -46,8 +49,9 @@ pub struct Blocks {
 
 /// Bytes of a head.
 const HEAD: usize = 10;
-/// The bit of the first byte that says that blocks are divided.
+/// Bits of the first byte: blocks are divided, and colours of coarse levels are predicted from the frame moved by parts.
 const DIVIDED: u8 = 0x80;
+const MOVES_COARSE: u8 = 0x40;
 
 /// How errors name the motion of a level, whose place in the file is not known here.
 const PLACE: &str = "motion of level ";
@@ -108,8 +112,14 @@ impl Head {
             let value = format!("{} bytes", bytes.len());
             return Err(malformed("17.5.1", "length of the motion", value, "10 or more"));
         };
-        let (divided, block_level, unit_level) = (head[0] & DIVIDED != 0, head[0] & !DIVIDED, head[1]);
-        let deepest = if divided { i16::from(base) - 1 } else { i16::from(base) };
+        let (divided, moves_coarse) = (head[0] & DIVIDED != 0, head[0] & MOVES_COARSE != 0);
+        let (block_level, unit_level) = (head[0] & !(DIVIDED | MOVES_COARSE), head[1]);
+        if moves_coarse && !divided {
+            let (value, expected) = ("of blocks that are not divided", "divided blocks");
+            return Err(malformed("17.5.1", "coarse colours that move", value, expected));
+        }
+        // Vectors of parts are read with level L, if coarser levels need them.
+        let deepest = i16::from(base) - i16::from(divided) - i16::from(moves_coarse);
         if i16::from(block_level) > deepest {
             return Err(malformed(
                 "17.5.1",
@@ -124,8 +134,9 @@ impl Head {
         }
         let reference_level = head[2];
         let deepest = top.min(block_level + REACH);
-        if !(block_level..=deepest).contains(&reference_level) {
-            let expected = format!("{block_level} to {deepest}");
+        let first = block_level + if moves_coarse { 2 } else { 0 };
+        if !(first..=deepest).contains(&reference_level) {
+            let expected = format!("{first} to {deepest}");
             return Err(malformed("17.5.1", "reference level", reference_level, expected));
         }
         let modes = (mode_of(head[3] & 15), mode_of(head[3] >> 4));
@@ -141,6 +152,7 @@ impl Head {
         let head = Head {
             block_level,
             divided,
+            moves_coarse,
             unit_level,
             reference_level,
             root: Modes { geometry, colours },
@@ -153,7 +165,9 @@ impl Head {
     /// The head as bytes.
     pub fn to_bytes(self) -> Vec<u8> {
         let mut bytes = vec![
-            self.block_level | if self.divided { DIVIDED } else { 0 },
+            self.block_level
+                | if self.divided { DIVIDED } else { 0 }
+                | if self.moves_coarse { MOVES_COARSE } else { 0 },
             self.unit_level,
             self.reference_level,
             self.root.geometry as u8 | (self.root.colours as u8) << 4,
@@ -298,6 +312,7 @@ mod tests {
         Head {
             block_level,
             divided: false,
+            moves_coarse: false,
             unit_level: 12,
             reference_level: block_level + 1,
             root: Modes {
@@ -410,6 +425,28 @@ mod tests {
         };
         assert!(clause(divided(5)).is_ok());
         assert_eq!(clause(divided(6)).err(), Some(Some("17.5.1")));
+        let coarse = |block_level| Head {
+            moves_coarse: true,
+            reference_level: block_level + 2,
+            ..divided(block_level)
+        };
+        assert_eq!(
+            Head::parse(&coarse(4).to_bytes(), 6, 9).ok().map(|(head, _)| head),
+            Some(coarse(4))
+        );
+        for head in [
+            coarse(5),
+            Head {
+                divided: false,
+                ..coarse(4)
+            },
+            Head {
+                reference_level: 5,
+                ..coarse(4)
+            },
+        ] {
+            assert_eq!(clause(head).err(), Some(Some("17.5.1")), "{head:?}");
+        }
         let far = Head {
             vector: [0, 0, 4097],
             ..head(5)

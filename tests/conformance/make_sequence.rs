@@ -71,6 +71,17 @@ fn many(frame: u64) -> impl Iterator<Item = Voxel> {
     })
 }
 
+/// Two balls of 7 bits that move in other directions.
+fn parting(frame: u64) -> impl Iterator<Item = Voxel> {
+    let moves = [([40, 42, 40], [2, 1, 1]), ([84, 80, 82], [-1, 2, -2])];
+    moves.into_iter().flat_map(move |(first, step)| {
+        let place =
+            move |at: [u32; 3], axis: usize| (first[axis] + step[axis] * frame as i32 + at[axis] as i32 - 32) as u32;
+        let moved = move |(at, colour): Voxel| ([0, 1, 2].map(|axis| place(at, axis)), colour);
+        Ball::new(6, 14.0).voxels().into_iter().map(moved)
+    })
+}
+
 fn code(encoder: &SequenceEncoder, frames: u64, cloud: impl Fn(u64) -> ColouredVoxels + Sync) -> Vec<u8> {
     let coded = encoder.encode(frames, |frame| Ok(cloud(frame)), |_| {});
     coded.expect("small clouds are coded")
@@ -122,6 +133,7 @@ fn root_alone(bytes: &[u8]) -> Vec<u8> {
         root: Modes::default(),
         vector: [-8, 3, 0],
         divided: false,
+        moves_coarse: false,
     };
     let blocks = Blocks {
         vectors: vec![[7, 0, 8]],
@@ -162,6 +174,7 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         _ => cloud_of(5, (0..420).map(|i| i * 77 + frame * 8).collect()),
     };
     let vary = |frame| cloud(7, many(frame));
+    let apart = |frame| cloud(7, parting(frame));
     let far = |i: u64, frame: u64| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 1 ^ (frame & i);
     let lone = |frame| cloud_of(21, (0..12).map(|i| far(i, frame)).collect());
     let axes = Axes {
@@ -219,5 +232,11 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         ),
         ("parts-of-one-level", code(&divided(3..=3, step(30.0)), 3, fast), false),
         ("parts-exact", code(&divided(3..=5, lossless), 4, vary), false),
+        ("coarse-colours", code(&divided(5..=6, step(24.0)), 4, apart), false),
+        (
+            "coarse-colours-scalable",
+            code(&divided(4..=6, step(30.0)).with_scalability(true), 3, apart),
+            false,
+        ),
     ]
 }

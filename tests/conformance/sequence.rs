@@ -77,6 +77,7 @@ fn the_suite_of_sequences_is_valid_and_has_frames_and_groups_of_all_kinds() {
 fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind() {
     let (mut modes, mut vectors, mut reach) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
     let mut of_parts = BTreeSet::new();
+    let mut coarse = [0; 2];
     let limits = Limits::default();
     for name in names() {
         let bytes = stream(&name);
@@ -105,6 +106,9 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
                     keys.dedup();
                     keys
                 };
+                if head.divided {
+                    coarse[usize::from(head.moves_coarse)] += 1;
+                }
                 let keys = nodes(head.block_level);
                 let mut found = vec![head.blocks(header.base, &keys, &parts).expect("motion")];
                 if head.divided && header.top > head.block_level + 1 {
@@ -130,6 +134,7 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
     let far = vectors.iter().flatten().map(|x| x.unsigned_abs()).max();
     assert!(vectors.len() >= 10 && far >= Some(16), "{vectors:?}");
     assert!(of_parts.len() >= 10, "vectors of parts: {of_parts:?}");
+    assert!(coarse.iter().all(|frames| *frames >= 3), "coarse colours: {coarse:?}");
     assert!(reach.iter().any(|(above, _)| *above > 0), "{reach:?}");
     assert!(
         reach.iter().any(|(_, levels)| *levels == 0) && reach.iter().any(|(_, levels)| *levels >= 3),

@@ -60,6 +60,8 @@ pub fn encode_predicted(
     let head = Head {
         block_level,
         divided,
+        // They are rounded: exact colours of what stands still would differ from their means.
+        moves_coarse: divided && block_level + 2 <= base && !steps.is_lossless(),
         unit_level: top,
         reference_level: if options.scalable { base } else { top }.min(block_level + REACH),
         root: target.root,
@@ -68,15 +70,12 @@ pub fn encode_predicted(
     let plan = match target.modes(previous, head, base) {
         // Blocks that come from the same place may together have too many voxels.
         Err(error) if error.clause() == Some(moved::TOO_MANY) => {
-            let reference_level = block_level;
-            target.modes(
-                previous,
-                Head {
-                    reference_level,
-                    ..head
-                },
-                base,
-            )?
+            let head = Head {
+                reference_level: block_level,
+                moves_coarse: false,
+                ..head
+            };
+            target.modes(previous, head, base)?
         }
         plan => plan?,
     };
@@ -87,16 +86,16 @@ pub fn encode_predicted(
         GeometryTarget::Visual if own && head_maps::is_sparse(cloud)? => 0,
         geometry => geometry.lambda(steps, own, true),
     };
-    if lambda > 0 && top > trunk {
+    if lambda > 0 && top > target.trunk {
         let guide = inter.geometry(&target.octree, top)?;
-        target.move_voxels(cloud, &guide, lambda, options.slice_voxels as usize, isa, trunk)?;
+        target.move_voxels(cloud, &guide, lambda, options.slice_voxels as usize, isa)?;
     }
     let guides = Guides {
         geometry: (1..=top)
             .map(|n| inter.geometry(&target.octree, n))
             .collect::<Result<_>>()?,
         colours: (1..=top)
-            .map(|n| inter.colours(&target.octree, n))
+            .map(|n| inter.colours(&target.octree, n, n.max(target.trunk)))
             .collect::<Result<_>>()?,
     };
     let count = target.octree.level(top).len() as u64;
@@ -137,6 +136,8 @@ struct Target {
     parts: Vec<Block>,
     root: Modes,
     top: u8,
+    /// Last level of the colour trunk.
+    trunk: u8,
     block_level: u8,
     part_level: u8,
     lossless: bool,
@@ -231,6 +232,7 @@ impl Target {
                 colours: Mode::Inter,
             },
             top,
+            trunk,
             block_level,
             part_level,
             lossless,
@@ -245,9 +247,8 @@ impl Target {
         lambda: u32,
         slice: usize,
         isa: Isa,
-        trunk: u8,
     ) -> Result<()> {
-        let top = self.top;
+        let (top, trunk) = (self.top, self.trunk);
         let points = points_in_children(cloud, &self.octree, top);
         let distortion = codec::Distortion {
             points: &points,
@@ -311,21 +312,35 @@ impl Target {
             geometry: Mode::Inter,
             colours: Mode::Inter,
         };
-        let mut plan = Plan {
-            head,
-            blocks: self.even(inter),
-        };
         // Colours of skipped blocks are not interpolated.
         let still = Modes {
             colours: Mode::Skip,
             ..inter
         };
-        let tried = [(head, inter), (Head { root: still, ..head }, still)];
-        let tried = tried.map(|(head, modes)| Inter::of(Arc::clone(previous), head, self.even(modes), base));
+        let tried = |head: Head| {
+            let tried = [(head, inter), (Head { root: still, ..head }, still)];
+            tried.map(|(head, modes)| Inter::of(Arc::clone(previous), head, self.even(modes), base))
+        };
+        let (mut head, mut tries) = (head, tried(head));
+        if head.moves_coarse {
+            // Where little moves, coarse levels are as they were.
+            let as_they_were = Head {
+                moves_coarse: false,
+                ..head
+            };
+            let others = tried(as_they_were);
+            if self.left_of_coarse(&others)? <= self.left_of_coarse(&tries)? {
+                (head, tries) = (as_they_were, others);
+            }
+        }
+        let mut plan = Plan {
+            head,
+            blocks: self.even(inter),
+        };
         let mut root = Votes::default();
         let mut chosen = Vec::new();
         for level in 1..=self.top {
-            let votes = self.votes(&tried, level)?;
+            let votes = self.votes(&tries, level)?;
             if level <= self.block_level {
                 root.add(votes[0]);
                 continue;
@@ -346,13 +361,24 @@ impl Target {
         Ok(plan)
     }
 
+    /// What prediction leaves of the colours of the levels 1 to B + 1. Steps halve from level to level.
+    fn left_of_coarse(&self, tried: &[Inter; 2]) -> Result<f32> {
+        let last = self.block_level + 1;
+        let left = |level: u8| {
+            let votes = self.votes(tried, level)?;
+            let sum: f32 = votes.iter().map(|votes| votes.inter + votes.new).sum();
+            Ok(sum * f32::from(last - level).exp2())
+        };
+        (1..=last).map(left).sum()
+    }
+
     /// How well each block of `level` is predicted; for levels of no blocks, the whole level.
     fn votes(&self, [inter, still]: &[Inter; 2], level: u8) -> Result<Vec<Votes>> {
         let (geometry, colours) = (
             inter.geometry(&self.octree, level)?,
-            inter.colours(&self.octree, level)?,
+            inter.colours(&self.octree, level, level.max(self.trunk))?,
         );
-        let exact = still.colours(&self.octree, level)?;
+        let exact = still.colours(&self.octree, level, level.max(self.trunk))?;
         let nodes = self.octree.level(level - 1).keys();
         let (masks, first) = (self.octree.occupancy(level - 1), self.octree.first_child(level - 1));
         let blocks = level > self.block_level;
@@ -397,6 +423,8 @@ struct Votes {
     /// Differences of luma to the parent, and those left by the prediction.
     intra: f32,
     inter: f32,
+    /// Differences of luma to the parent where nothing is predicted.
+    new: f32,
 }
 
 impl Votes {
@@ -420,6 +448,10 @@ impl Votes {
             count += 1;
         }
         let shift = shift as f32 / count.max(1) as f32;
+        let new = truth.iter().zip(moved).filter(|(_, moved)| moved.is_none());
+        self.new += new
+            .map(|(truth, _)| (f32::from(truth[0]) - f32::from(above[0])).abs())
+            .sum::<f32>();
         for (truth, moved) in there() {
             self.intra += (f32::from(truth[0]) - f32::from(above[0])).abs();
             self.inter += (f32::from(truth[0]) - f32::from(moved[0]) - shift).abs();
@@ -433,6 +465,7 @@ impl Votes {
         self.coloured += other.coloured;
         self.intra += other.intra;
         self.inter += other.inter;
+        self.new += other.new;
     }
 
     /// The modes for a block, which is to stay what it was if `keep`.

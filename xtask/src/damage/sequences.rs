@@ -364,6 +364,16 @@ fn divided(add: &mut Add) {
     add("motion-of-parts-below-the-first-level", "17.5.1", &|s| {
         s.motion(0)[0] = 0x84
     });
+    add("coarse-colours-of-blocks-without-parts", "17.5.1", &|s| {
+        s.motion(0)[0] = 0x42
+    });
+    add("coarse-colours-of-parts-below-the-first-level", "17.5.1", &|s| {
+        s.motion(0)[0] = 0xc3
+    });
+    add("coarse-colours-of-parts-of-the-reference-level", "17.5.1", &|s| {
+        s.motion(0)[0] = 0xc2;
+        s.motion(0)[2] = 3;
+    });
     add("motion-of-parts-goes-on", "5.4.3", &|s| s.motion(0).extend([0; 12]));
     add("motion-of-parts-of-no-word", "17.5.3", &|s| {
         s.motion(0).truncate(10);
