@@ -43,6 +43,25 @@ const KEYS: [u8; 64] = {
     keys
 };
 
+/// By axis, bits of all Morton keys in a brick whose coordinate is below n.
+const BELOW: [[u64; 5]; 3] = {
+    let mut below = [[0; 5]; 3];
+    let mut key = 0;
+    while key < 64 {
+        let mut axis = 0;
+        while axis < 3 {
+            let mut n = (CELLS[key] >> (2 * axis) & 3) as usize + 1;
+            while n < 5 {
+                below[axis][n] |= 1 << key;
+                n += 1;
+            }
+            axis += 1;
+        }
+        key += 1;
+    }
+    below
+};
+
 /// A brick: its place, its voxels as a mask by Morton key, as a mask by `x + 4y + 16z`, and the number of its first
 /// voxel.
 #[derive(Debug, Clone, Copy)]
@@ -153,22 +172,25 @@ impl Bricks {
     pub fn in_box(&self, first: [i32; 3], side: i32, mut each: impl FnMut([i32; 3], usize)) {
         let low = first.map(|x| (x >> 2).max(0));
         let high = first.map(|x| ((x + side - 1) >> 2).min(self.side - 1));
-        let inside = |here: &[i32; 3]| (0..3).all(|axis| (first[axis]..first[axis] + side).contains(&here[axis]));
+        // Of the brick with this number along an axis, the keys that are in the box.
+        let inside = |axis: usize, brick: i32| {
+            let below = |end: i32| BELOW[axis][(end - 4 * brick).clamp(0, 4) as usize];
+            below(first[axis] + side) & !below(first[axis])
+        };
         for z in low[2]..=high[2] {
             for y in low[1]..=high[1] {
+                let row = inside(2, z) & inside(1, y);
                 for x in low[0]..=high[0] {
                     let Some(brick) = self.brick([x, y, z]) else {
                         continue;
                     };
-                    let (mut cells, mut index) = (brick.mask, brick.first as usize);
-                    while cells != 0 {
-                        let cell = i32::from(CELLS[cells.trailing_zeros() as usize & 63]);
+                    let mut keys = brick.mask & row & inside(0, x);
+                    while keys != 0 {
+                        let key = keys.trailing_zeros() as usize & 63;
+                        let cell = i32::from(CELLS[key]);
                         let here = [4 * x + (cell & 3), 4 * y + (cell >> 2 & 3), 4 * z + (cell >> 4)];
-                        if inside(&here) {
-                            each(here, index);
-                        }
-                        cells &= cells - 1;
-                        index += 1;
+                        each(here, brick.number(key));
+                        keys &= keys - 1;
                     }
                 }
             }
@@ -185,8 +207,14 @@ impl Brick {
         if self.cells >> cell & 1 == 0 {
             return None;
         }
-        let before = self.mask & ((1 << KEYS[cell]) - 1);
-        Some(self.first as usize + before.count_ones() as usize)
+        Some(self.number(KEYS[cell].into()))
+    }
+
+    /// The number of the voxel with this key in the brick.
+    #[inline]
+    fn number(&self, key: usize) -> usize {
+        let before = self.mask & ((1 << key) - 1);
+        self.first as usize + before.count_ones() as usize
     }
 }
 

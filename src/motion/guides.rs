@@ -176,6 +176,10 @@ impl Inter {
                     let place = [0, 1, 2].map(|axis| own[axis] + octant[axis]);
                     found.push(match modes[node] {
                         Mode::Intra => None,
+                        // Between voxels of no distance lies the voxel itself.
+                        Mode::Inter if part == [0; 3] => {
+                            near.index(moved(place, low)).map(|index| previous.values[index])
+                        }
                         Mode::Skip => near.index(moved(place, shift)).map(|index| previous.values[index]),
                         Mode::Inter => interpolated(previous, &mut near, moved(place, low), part),
                     });

@@ -37,24 +37,31 @@ impl Moved {
         shift: impl Fn(usize) -> [i32; 3] + Sync,
         coarse: bool,
     ) -> Result<Self> {
+        assert!(reference > block, "moved voxels are averaged");
         let side = 1i32 << (reference - block);
         let most = 2 * previous.values.len() + 64;
         let count = AtomicUsize::new(0);
-        let voxels_of = |(i, key): (usize, &u64)| {
-            let (shift, mut found) = (shift(i), Vec::new());
+        let down = u32::from(reference - block - 1);
+        // Sums of the block's nodes of the level above, by Morton key.
+        let nodes = || vec![Sum::default(); 1 << (3 * down)];
+        let parents_of = |nodes: &mut Vec<Sum>, (i, key): (usize, &u64)| {
             // No more is kept than may be.
             if count.load(Ordering::Relaxed) > most {
-                return found;
+                return Vec::new();
             }
-            previous.in_box(corner(*key, side, shift), side, |from, index| {
-                let at = [0, 1, 2].map(|axis| (from[axis] + shift[axis]) as u32);
-                found.push((morton::encode(at), previous.values[index]));
+            let corner = corner(*key, side, shift(i));
+            let mut found = 0;
+            previous.in_box(corner, side, |from, index| {
+                let at = [0, 1, 2].map(|axis| (from[axis] - corner[axis]) as u32 >> 1);
+                nodes[morton::encode(at) as usize].add(Sum::of(previous.values[index]));
+                found += 1;
             });
-            count.fetch_add(found.len(), Ordering::Relaxed);
-            found.sort_unstable_by_key(|voxel| voxel.0);
-            found
+            count.fetch_add(found, Ordering::Relaxed);
+            let keys = (*key << (3 * down)..).zip(nodes);
+            let there = keys.filter(|(_, sum)| sum.count > 0);
+            there.map(|(key, sum)| (key, std::mem::take(sum))).collect()
         };
-        let parts: Vec<_> = keys.par_iter().enumerate().map(voxels_of).collect();
+        let parts: Vec<Vec<_>> = keys.par_iter().enumerate().map_init(nodes, parents_of).collect();
         if count.into_inner() > most {
             return Err(Error::malformed(
                 Stage::Bitstream,
@@ -66,15 +73,17 @@ impl Moved {
             .breaks(TOO_MANY));
         }
         // Blocks are in the order of keys, and each has keys of its own.
-        let voxels = parts.concat();
+        let mut sums = parts.concat();
         let first = if coarse { 1 } else { block + 1 };
-        let mut sums = parents(&voxels, Sum::of);
         let mut levels = Vec::new();
         for level in (first..reference).rev() {
             let keys = sums.iter().map(|sum| sum.0).collect();
             let values = sums.iter().map(|sum| sum.1.mean()).collect();
             levels.push(PreviousLevel::new(&Voxels::from_sorted(level, keys), values));
-            sums = parents(&sums, |sum| if coarse { sum } else { Sum::of(sum.mean()) });
+            if !coarse {
+                sums.iter_mut().for_each(|(_, sum)| *sum = Sum::of(sum.mean()));
+            }
+            sums = parents(&sums);
         }
         levels.reverse();
         Ok(Moved { first, levels })
@@ -99,7 +108,7 @@ fn corner(key: u64, side: i32, shift: [i32; 3]) -> [i32; 3] {
 }
 
 /// Colours of voxels, summed.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Sum {
     colours: [i64; 3],
     count: i64,
@@ -113,6 +122,11 @@ impl Sum {
         }
     }
 
+    fn add(&mut self, other: Sum) {
+        (0..3).for_each(|t| self.colours[t] += other.colours[t]);
+        self.count += other.count;
+    }
+
     /// The mean, rounded to the nearest, halves up.
     fn mean(&self) -> Ycc {
         self.colours
@@ -120,20 +134,14 @@ impl Sum {
     }
 }
 
-/// The parents of voxels, each with the sum of what its children count.
-fn parents<T: Copy>(voxels: &[(u64, T)], counted: impl Fn(T) -> Sum) -> Vec<(u64, Sum)> {
-    let sum = |children: &[(u64, T)]| {
-        let mut total = Sum {
-            colours: [0; 3],
-            count: 0,
-        };
-        for sum in children.iter().map(|child| counted(child.1)) {
-            (0..3).for_each(|t| total.colours[t] += sum.colours[t]);
-            total.count += sum.count;
-        }
+/// The parents of nodes, each with the sum of its children.
+fn parents(nodes: &[(u64, Sum)]) -> Vec<(u64, Sum)> {
+    let sum = |children: &[(u64, Sum)]| {
+        let mut total = Sum::default();
+        children.iter().for_each(|child| total.add(child.1));
         (children[0].0 >> 3, total)
     };
-    voxels.chunk_by(|a, b| a.0 >> 3 == b.0 >> 3).map(sum).collect()
+    nodes.chunk_by(|a, b| a.0 >> 3 == b.0 >> 3).map(sum).collect()
 }
 
 #[cfg(test)]
