@@ -21,6 +21,7 @@ README_LINES, WIDTH = 150, 120
 # Modules that implement no clause of the format.
 NO_CLAUSE = {
     "src/colour/encode.rs",
+    "src/colour/importance.rs",
     "src/gaussians/surfels/lanes.rs",
     "src/gaussians/surfels/passes.rs",
 }

@@ -92,6 +92,15 @@ impl Log {
         }
     }
 
+    /// A log that neither collects nor calls, and is cancelled as this one is.
+    #[cfg(feature = "encoder")]
+    pub(crate) fn quiet(&self) -> Self {
+        Log {
+            cancel: self.cancel.clone(),
+            ..Log::off()
+        }
+    }
+
     /// The same log, whose steps do not begin once `cancel` is thrown.
     #[doc(hidden)]
     pub fn with_cancel(mut self, cancel: Cancel) -> Self {

@@ -137,6 +137,7 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
             children: mask.count_ones() as usize,
             height: nodes.height,
         };
+        coder.start(node);
         let differences = block.code(simd, coder, target.as_ref());
         let (own, sums, done) = (block.own, block.sums, block.done);
         blocks[node - first] = own;

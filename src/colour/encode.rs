@@ -8,6 +8,7 @@ use rayon::prelude::*;
 
 use super::block::Coding;
 use super::filter::{Responses, TERMS, solve, terms, widen};
+use super::importance::Importance;
 use super::model::{BINS, CoefficientContext, Model};
 use super::node::{CoefficientCoder, Quantiser};
 use super::space::{FRACTION, from_rgb};
@@ -55,10 +56,12 @@ const GAINS: [u8; 3] = [190, 225, 255];
 const GAIN_LAMBDA: f64 = 0.08;
 
 /// Original colours by level: those of the finest coded level, and the transform's means for the levels above.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Truth {
     levels: Vec<Vec<Ycc>>,
     lossless: bool,
+    /// How errors count, unless all count alike.
+    importance: Option<Importance>,
 }
 
 impl Truth {
@@ -102,7 +105,23 @@ impl Truth {
         Truth {
             levels: means_above(octree, trunk, top, values),
             lossless,
+            importance: None,
         }
+    }
+
+    /// The same colours, whose errors below the trunk count by `importance`.
+    pub fn with_importance(self, importance: Importance) -> Truth {
+        Truth {
+            importance: Some(importance),
+            ..self
+        }
+    }
+
+    /// The factors of λ in the nodes of a level, if there are any.
+    fn factors(&self, level: u8) -> &[f32] {
+        self.importance
+            .as_ref()
+            .map_or(&[], |importance| importance.factors(level))
     }
 
     /// The colours of a level, in the units of [`LevelColours::values`].
@@ -252,6 +271,7 @@ pub fn encode_level(
     nodes.guide = guide;
     let encode = |range: Range<usize>, coding: Coding| {
         let (mut coder, mut model) = (RdoEncoder::new(options.lambda), above.model.clone());
+        coder.factors = truth.factors(level - 1);
         let first = nodes.first_child[range.start] as usize;
         let truth = Some(&truth.level(level)[first..]);
         let coded = isa.run(CodeSlice {
@@ -294,18 +314,24 @@ fn cost(error: f64, bytes: usize) -> f64 {
 const LARGE: f32 = 12.0;
 
 /// Encodes coefficients, each the candidate of least Lagrangian cost.
-struct RdoEncoder {
+struct RdoEncoder<'a> {
     encoder: Encoder,
+    /// λ, and that of the node at hand.
+    usual: f32,
     lambda: f32,
+    /// The factors of λ in all nodes of the level; if there are none, they are 1.
+    factors: &'a [f32],
     /// Sum of squared errors so far, in squared steps.
     error: f64,
 }
 
-impl RdoEncoder {
-    fn new(lambda: f32) -> RdoEncoder {
+impl RdoEncoder<'_> {
+    fn new(lambda: f32) -> Self {
         RdoEncoder {
             encoder: Encoder::default(),
+            usual: lambda,
             lambda,
+            factors: &[],
             error: 0.0,
         }
     }
@@ -347,7 +373,14 @@ fn estimate_bits<I: Instructions>(simd: I, model: &Model, c: &CoefficientContext
     }
 }
 
-impl CoefficientCoder for RdoEncoder {
+impl CoefficientCoder for RdoEncoder<'_> {
+    #[inline(always)]
+    fn start(&mut self, node: usize) {
+        if let Some(factor) = self.factors.get(node) {
+            self.lambda = factor * self.usual;
+        }
+    }
+
     #[inline(always)]
     fn coefficient<I: Instructions>(
         &mut self,

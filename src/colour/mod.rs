@@ -22,6 +22,8 @@ mod block;
 mod encode;
 mod energy;
 mod filter;
+#[cfg(feature = "encoder")]
+mod importance;
 mod model;
 mod node;
 mod prediction;
@@ -33,6 +35,8 @@ pub use block::Guide;
 #[cfg(feature = "encoder")]
 pub use encode::{Options, Truth, encode_level, encode_trunk};
 pub use filter::Filter;
+#[cfg(feature = "encoder")]
+pub use importance::Importance;
 #[cfg(feature = "encoder")]
 pub(crate) use space::from_rgb;
 pub use space::{Steps, Ycc};

@@ -9,6 +9,10 @@ use super::transform::{AXIS, Joins, Scale, UNSCALED, Weighting};
 
 /// Reads coefficients from an entropy stream, or chooses and writes them.
 pub(super) trait CoefficientCoder {
+    /// Called before the coefficients of a node.
+    #[inline(always)]
+    fn start(&mut self, _node: usize) {}
+
     /// Codes one coefficient in the context `c` and returns it. `target` is the prediction residual, in units of
     /// values, for which an encoder chooses the coefficient; a decoder ignores it.
     fn coefficient<I: Instructions>(

@@ -38,6 +38,17 @@ impl Steps {
         lossy || self == Steps::LOSSLESS
     }
 
+    /// Steps that are coarser by so many indices, as far as there are any; of lossy ones.
+    #[cfg(feature = "encoder")]
+    pub fn coarser(self, by: u8) -> Steps {
+        let coarser = |index: u8, most: u8| if index <= most { (index + by).min(most) } else { index };
+        Steps {
+            luma: coarser(self.luma, Steps::MAX),
+            // Co's index is greater by 2.
+            chroma: coarser(self.chroma, Steps::MAX - 2),
+        }
+    }
+
     /// Whether coding is lossless.
     pub fn is_lossless(self) -> bool {
         self == Steps::LOSSLESS

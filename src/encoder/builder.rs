@@ -74,6 +74,14 @@ impl Encoder {
         self
     }
 
+    /// The same encoder with so much effort, from 0 to 9, for fewer bits: of streams of version 3, what
+    /// [`Options::set_effort`](transform::Options::set_effort) sets. 8 and 9 compare pictures, which differ slightly between
+    /// instruction sets, so that streams may, too. Default: 7.
+    pub fn with_effort(mut self, effort: u8) -> Self {
+        self.options.set_effort(effort);
+        self
+    }
+
     /// The same encoder with or without filters, which the decoder runs on the colours of each level. Default: with.
     pub fn with_filter(mut self, filter: bool) -> Self {
         self.options.filter = filter;

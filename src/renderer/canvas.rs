@@ -4,15 +4,15 @@ use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use b2p_kernels::Isa;
-use b2p_kernels::splat::{Loop, Scene, Tile};
+use b2p_kernels::splat::{Loop, Scene, Share, Tile};
 use bytemuck::Zeroable;
 
 use super::Background;
 use crate::renderer::projection::Bounds;
 use crate::renderer::tiles::{Bins, Grid, Nearest, TILE};
 
-/// Side of the blocks that [`b2p_kernels::splat::Share`] is about.
-const SIDE: usize = 4;
+/// Side of the blocks that [`Share`] is about.
+pub(super) const SIDE: usize = 4;
 
 /// A picture's place and what is behind it.
 #[derive(Debug, Clone, Copy)]
@@ -64,8 +64,8 @@ pub(super) trait Output: Sync {
     /// Before anything is drawn on the tile.
     fn start(&self, _scratch: &mut Scratch) {}
 
-    /// After some splats were drawn on it.
-    fn look(&self, _scratch: &mut Scratch) {}
+    /// After some splats were drawn on it; `corner` is its first pixel's place in the whole picture.
+    fn look(&self, _scratch: &mut Scratch, _corner: [u32; 2]) {}
 
     /// Writes the wanted `part` of the tile into `rows` of `width` pixels each.
     fn write(
@@ -151,7 +151,7 @@ impl<F: Fn(usize) -> [f32; N] + Sync, const N: usize> Output for Mixed<F, N> {
         scratch.sums.resize((TILE * TILE) as usize * N, 0.0);
     }
 
-    fn look(&self, scratch: &mut Scratch) {
+    fn look(&self, scratch: &mut Scratch, _: [u32; 2]) {
         let (sums, _) = scratch.sums.as_chunks_mut::<N>();
         let mut last = None;
         for share in scratch.tile.shares() {
@@ -187,6 +187,11 @@ impl<F: Fn(usize) -> [f32; N] + Sync, const N: usize> Output for Mixed<F, N> {
 }
 
 impl Scratch {
+    /// How much the tile's pixels show of what was drawn last.
+    pub fn shares(&self) -> &[Share] {
+        self.tile.shares()
+    }
+
     /// Draws a tile into `band`, the pixels of its row of tiles.
     pub fn draw<O: Output>(
         &mut self,
@@ -216,7 +221,7 @@ impl Scratch {
         let nearest = std::mem::take(&mut self.nearest);
         nearest.each(|keys, next| {
             let open = self.tile.blend(isa, keys, next, scene);
-            output.look(self);
+            output.look(self, corner);
             open
         });
         self.nearest = nearest;

@@ -24,6 +24,7 @@ mod canvas;
 mod effects;
 mod exr;
 mod frame;
+mod gather;
 mod image;
 mod options;
 pub mod projection;

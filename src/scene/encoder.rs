@@ -192,7 +192,7 @@ impl SceneEncoder {
                 break;
             };
             let keys = voxels.iter().map(|voxel| voxel.0);
-            let coding = transform::memory_of(grid.bits - cube.level, keys, false);
+            let coding = transform::memory_of(grid.bits - cube.level, keys, &self.options, false);
             let copies = (COPIES * size_of::<Voxel>() * voxels.len()) as u64;
             bytes = bytes.saturating_add(coding).saturating_add(copies);
             if bytes > self.memory && !group.is_empty() {
@@ -385,7 +385,8 @@ mod tests {
             assert_eq!(groups.concat(), (0..7).collect::<Vec<_>>());
             groups.into_iter().map(|group| group.len()).collect::<Vec<_>>()
         };
-        let one = transform::memory_of(2, [0].into_iter(), false) + (COPIES * size_of::<Voxel>()) as u64;
+        let one =
+            transform::memory_of(2, [0].into_iter(), &Options::default(), false) + (COPIES * size_of::<Voxel>()) as u64;
         let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
         pool.install(|| {
             assert_eq!(sizes(u64::MAX), [3, 3, 1]);

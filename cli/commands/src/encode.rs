@@ -69,7 +69,8 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         None => axes,
     };
     if args.colours == Colours::Transform {
-        let memory = transform::encode_memory(&cloud.voxels, args.bits_per_point.is_some());
+        let options = transform_options(args, cloud.voxels.depth())?;
+        let memory = transform::encode_memory(&cloud.voxels, &options, args.bits_per_point.is_some());
         let checked = limits.check_bytes("bytes that encoding the voxels takes", memory);
         checked.map_err(&in_cloud)?;
     }

@@ -35,7 +35,7 @@ fn more_quality_takes_more_bytes_and_its_ends_are_coarse_and_lossless() {
 }
 
 #[test]
-fn little_effort_leaves_steps_out_and_all_effort_is_the_default() {
+fn little_effort_leaves_steps_out_and_7_is_the_default() {
     let folder = folder_with_cloud();
     let at = folder.path();
     let coded = |effort: &[&str]| {
@@ -45,8 +45,22 @@ fn little_effort_leaves_steps_out_and_all_effort_is_the_default() {
     };
     let tries = |said: &str| said.lines().filter(|line| line.starts_with("try ")).count();
     let (usual, _) = coded(&[]);
-    let (most, said) = coded(&["--effort", "9"]);
-    assert!(usual == most);
+    let (same, said) = coded(&["--effort", "7"]);
+    assert!(usual == same);
     let (least, quick) = coded(&["--effort", "0"]);
-    assert!(least != most && tries(&quick) <= tries(&said), "{quick}{said}");
+    assert!(least != usual && tries(&quick) <= tries(&said), "{quick}{said}");
+}
+
+#[test]
+fn most_effort_compares_pictures_from_all_sides() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    let encode = ["encode", "ball.ply", "e.b2p", "--step", "40", "-v", "--effort"];
+    for (effort, most) in [("7", 0), ("8", 3), ("9", 9)] {
+        let said = succeeds(at, &[&encode[..], &[effort]].concat());
+        let compared = said.lines().filter(|line| line.starts_with("compare from all sides"));
+        let compared = compared.count();
+        assert!(compared <= most && (compared > 0) == (most > 0), "{said}");
+        succeeds(at, &["check", "e.b2p"]);
+    }
 }

@@ -57,7 +57,8 @@ impl Options {
         self.levels = Some(levels.unwrap_or(bits.saturating_sub(3).min(top)..=top));
     }
 
-    /// Sets what an effort from 0 to 9 stands for.
+    /// Sets what an effort from 0 to 9 stands for; 7 is the default. Efforts above 7 draw the stream from all sides, and
+    /// move colours by the gradient of the squared error, in up to 2 or 8 [`rounds`](Options::rounds).
     pub fn set_effort(&mut self, effort: u8) {
         self.optimised = effort > 0;
         self.filter &= effort > 1;
@@ -65,8 +66,13 @@ impl Options {
             self.tune = Tune::Psnr;
         }
         self.tries = match effort {
-            9.. => usize::MAX,
+            7.. => usize::MAX,
             _ => 2 + usize::from(effort),
+        };
+        self.rounds = match effort {
+            9.. => 8,
+            8 => 2,
+            _ => 0,
         };
     }
 }
@@ -114,5 +120,18 @@ mod tests {
         options.levels = None;
         options.set_quality(90, 1);
         assert_eq!(options.levels, Some(0..=1));
+    }
+
+    #[test]
+    fn an_effort_of_7_is_the_default_and_more_has_rounds() {
+        let usual = Options::default();
+        let of = |effort| {
+            let mut options = Options::default();
+            options.set_effort(effort);
+            options
+        };
+        assert_eq!(format!("{:?}", of(7)), format!("{usual:?}"));
+        let rounds: Vec<usize> = (0..10).map(|effort| of(effort).rounds).collect();
+        assert_eq!(rounds, [0, 0, 0, 0, 0, 0, 0, 0, 2, 8]);
     }
 }

@@ -1,5 +1,6 @@
 //! What encoding holds in memory.
 
+use super::Options;
 use crate::geometry::Voxels;
 
 /// Pictures of the cloud and of its levels, for head maps, and adaptive contexts.
@@ -8,20 +9,31 @@ const FIXED: u64 = 64 << 20;
 const NODE: u64 = 320;
 /// The same where the encoder looks for a rate: what it found so far beside what it tries, and colours to try.
 const NODE_TO_RATE: u64 = 380;
+/// Pictures of the cloud from all sides, and of what is compared with them.
+const PICTURES: u64 = 88 << 20;
+/// Bytes for each node of what pictures tell.
+const NODE_OF_PICTURES: u64 = 60;
 /// Bytes of a voxel as it came and as a part of a cloud.
 const COPIES: u64 = 32;
 
 /// Bytes that [`encode`](super::encode) of these voxels holds at most, beside the cloud itself; with `to_rate`
 /// [`encode_to_rate`](super::encode_to_rate). The bytes of a node were measured; `cargo test --test memory` compares the
 /// bound with what the allocator gives out.
-pub fn encode_memory(voxels: &Voxels, to_rate: bool) -> u64 {
-    memory_of(voxels.depth(), voxels.keys().iter().copied(), to_rate)
+pub fn encode_memory(voxels: &Voxels, options: &Options, to_rate: bool) -> u64 {
+    memory_of(voxels.depth(), voxels.keys().iter().copied(), options, to_rate)
 }
 
 /// The same of keys of level `depth` in their order.
-pub(crate) fn memory_of(depth: u8, keys: impl Iterator<Item = u64>, to_rate: bool) -> u64 {
+pub(crate) fn memory_of(depth: u8, keys: impl Iterator<Item = u64>, options: &Options, to_rate: bool) -> u64 {
     let each = if to_rate { NODE_TO_RATE } else { NODE };
-    nodes(depth, keys).saturating_mul(each).saturating_add(FIXED)
+    let (pictures, more) = if options.rounds > 0 {
+        (PICTURES, NODE_OF_PICTURES)
+    } else {
+        (0, 0)
+    };
+    nodes(depth, keys)
+        .saturating_mul(each + more)
+        .saturating_add(FIXED + pictures)
 }
 
 /// Voxels of a surface that `bytes` of memory suffice to encode: of such, an octree has 1.4 times as many nodes, and of

@@ -1,6 +1,7 @@
 //! Streams of version 3: colours as transform coefficients.
 
 mod choice;
+mod descent;
 mod head_maps;
 mod knobs;
 mod memory;
@@ -16,7 +17,7 @@ mod shape;
 mod surfel_size;
 
 use std::ops::RangeInclusive;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use b2p_kernels::Isa;
 use rayon::prelude::*;
@@ -31,6 +32,7 @@ use crate::geometry::{Octree, SiblingMap, Voxels, codec};
 use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
+use descent::Pictures;
 pub(crate) use memory::memory_of;
 pub use memory::{encode_memory, surface_within};
 pub use options::{Options, Tune};
@@ -64,6 +66,7 @@ pub fn encode(cloud: &ColouredVoxels, options: &Options, log: &Log) -> Result<En
     let coded = subject.code(top, steps, shape, log)?;
     // They are needed no more, and are the largest part.
     subject.maps = Vec::new();
+    subject.pictures.take();
     subject.checked(coded, options.has_head_maps(), usize::MAX, log)
 }
 
@@ -95,6 +98,8 @@ struct EncoderInput<'a> {
     sparse: bool,
     /// Points that the header states.
     points: u64,
+    /// What descent compares with.
+    pictures: OnceLock<Pictures>,
     /// What the previous frame tells of the levels from 1 on, for a predicted frame of a sequence.
     guides: Option<Guides>,
 }
@@ -147,6 +152,7 @@ impl<'a> EncoderInput<'a> {
             sparse: (may_move || options.has_head_maps()) && head_maps::is_sparse(cloud)?,
             grey: cloud.colours.par_iter().all(|[r, g, b]| r == g && g == b),
             points: cloud.voxels.len() as u64,
+            pictures: OnceLock::new(),
             guides: None,
         };
         // What the format forbids is refused before anything is computed, as if of one voxel.
@@ -244,7 +250,9 @@ impl<'a> EncoderInput<'a> {
         let truth = log.step("colours to draw", voxels, "voxels", || {
             Ok(self.moved_truth(top, shape.as_deref(), &moves))
         })?;
-        self.code_towards(&truth, top, steps, shape, log)
+        let coded = self.code_towards(&truth, top, steps, shape, log)?;
+        drop(truth);
+        self.descended(coded, moves, steps, log)
     }
 
     /// The same, of colours that have been computed, without looking at what is drawn.

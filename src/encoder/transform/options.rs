@@ -41,13 +41,16 @@ pub struct Options {
     pub parts: bool,
     /// What coded colours approach.
     pub tune: Tune,
+    /// With [`Tune::Visual`], in how many rounds at most colours are moved further, by gradient descent through pictures.
+    /// Default: 0. One round takes about a second for a person, on two cores.
+    pub rounds: usize,
     /// Heads that will draw the stream; `None` for surfels.
     pub heads: Option<HeadsModel>,
     /// Whether pictures of the heads are compared with those of surfels, so that the stream says where surfels are
     /// better.
     pub head_maps: bool,
-    /// The instructions to use; any give the same stream, but for what is chosen by pictures: head maps, and which colours
-    /// [`encode_to_rate`] keeps where steps are coarse. Default: the best of this machine.
+    /// The instructions to use; any give the same stream, but for what is chosen by pictures: head maps, [`rounds`](Options::rounds), and
+    /// which colours [`encode_to_rate`] keeps where steps are coarse. Default: the best of this machine.
     pub isa: Option<Isa>,
 }
 
@@ -65,6 +68,7 @@ impl Default for Options {
             scalable: false,
             parts: true,
             tune: Tune::Visual,
+            rounds: 0,
             heads: None,
             head_maps: true,
             isa: None,

@@ -1,6 +1,6 @@
 //! Frames of a sequence that are predicted from the frame before (`docs/format.md`, clauses 17.5 to 17.9).
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use b2p_kernels::Isa;
 use rayon::prelude::*;
@@ -116,6 +116,7 @@ pub fn encode_predicted(
         // Predicted frames have no head maps.
         sparse: false,
         points,
+        pictures: OnceLock::new(),
         guides: Some(guides),
     };
     let keys = target.keys();

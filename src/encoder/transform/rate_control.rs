@@ -66,7 +66,7 @@ pub fn encode_to_rate(
     let depth = cloud.voxels.depth();
     let wanted = options.levels.clone();
     let levels = choose_levels(depth, wanted.or(Some(depth.saturating_sub(3)..=depth)))?;
-    let subject = EncoderInput::new(cloud, levels.clone(), options, log)?;
+    let mut subject = EncoderInput::new(cloud, levels.clone(), options, log)?;
     let room = bits_per_point * cloud.voxels.len() as f64 / 8.0;
     let mut search = Search {
         subject: &subject,
@@ -95,6 +95,7 @@ pub fn encode_to_rate(
         least: bits(search.least),
     })?;
     let maps = search.head_map_bytes(place.top) > 0;
+    subject.pictures.take();
     let encoded = subject.checked(coded, maps, room as usize, log)?;
     let chosen = Options {
         head_maps: maps,
@@ -253,7 +254,7 @@ impl Search<'_> {
         let points = self.subject.cloud.voxels.len();
         let shape = self.shape(top, steps, log)?;
         let coded = log.step(name, points, "points", || {
-            let log = &Log::off();
+            let log = &log.quiet();
             let coded = self.plain(place, shape, log)?;
             match refined {
                 true => self.subject.refined(coded, steps, log),

@@ -73,8 +73,8 @@ impl Reference {
     }
 }
 
-/// The cloud's voxels as surfels.
-fn closed(isa: Isa, cloud: &ColouredVoxels, sparse: bool) -> Result<Gaussians> {
+/// The cloud's voxels as surfels; those of a `sparse` cloud are wide enough to close.
+pub fn closed(isa: Isa, cloud: &ColouredVoxels, sparse: bool) -> Result<Gaussians> {
     let (_, _, map) = maps(cloud)?;
     let choice = SurfelSelection {
         size: if sparse {
@@ -134,11 +134,15 @@ impl Views {
         Camera::orbit(azimuth, elevation, DISTANCE, FIELD, side, side)
     }
 
+    /// A picture of the whole side.
+    pub fn large(&mut self, gaussians: &Gaussians, view: (f64, f64)) -> Result<Image> {
+        let camera = self.camera(view, 2)?;
+        self.renderer.render(gaussians, &camera)
+    }
+
     /// A picture averaged to half its size.
     pub fn half(&mut self, gaussians: &Gaussians, view: (f64, f64)) -> Result<Image> {
-        let camera = self.camera(view, 2)?;
-        let image = self.renderer.render(gaussians, &camera)?;
-        Ok(image.box_half())
+        Ok(self.large(gaussians, view)?.box_half())
     }
 
     /// Pictures of all views.

@@ -75,6 +75,15 @@ pub(super) struct Moves {
 }
 
 impl Moves {
+    /// Adds Y, Co and Cg in 255ths, voxel by voxel.
+    pub(super) fn follow(&mut self, more: impl IndexedParallelIterator<Item = [f32; 3]>) {
+        self.by.par_iter_mut().zip(more).for_each(|(by, more)| {
+            for (by, more) in by.iter_mut().zip(more) {
+                *by += UNITS * more;
+            }
+        });
+    }
+
     /// Adds them to the colours of these voxels; those that are not known stay.
     fn add(&self, voxels: &Voxels, values: &mut [Ycc]) {
         const LEAST: [f32; 3] = [0.0, -255.0 * UNITS, -255.0 * UNITS];
@@ -299,7 +308,7 @@ fn starts(counts: impl Iterator<Item = u32>) -> Vec<u32> {
 }
 
 /// The difference of Y, Co and Cg that one of red, green and blue makes.
-fn difference([r, g, b]: [f32; 3]) -> [f32; 3] {
+pub(super) fn difference([r, g, b]: [f32; 3]) -> [f32; 3] {
     let co = r - b;
     let t = b + co / 2.0;
     let cg = g - t;
@@ -329,7 +338,7 @@ fn splats_of(voxels: &Voxels, gaussians: &Gaussians) -> (Vec<Splat>, Vec<u32>) {
 }
 
 /// The voxel that a place is in, or the nearest around that.
-fn owner(voxels: &Voxels, place: [f32; 3]) -> Option<usize> {
+pub(super) fn owner(voxels: &Voxels, place: [f32; 3]) -> Option<usize> {
     let side = 1i64 << voxels.depth();
     let home = place.map(|x| x.floor().clamp(-2.0, side as f32 + 2.0) as i64);
     let find = |at: [i64; 3]| {

@@ -21,8 +21,17 @@ pub const SIZES: [u8; 3] = [54, 64, 74];
 /// Rows that heads work on at a time.
 const ROWS: usize = 1 << 16;
 
-/// Pictures of a cloud as the best heads draw it. `None` if it has no level but the root, or the model no best heads.
+/// Pictures of a cloud as the best heads draw it, if they do.
 pub fn pictures(isa: Isa, cloud: &ColouredVoxels, heads: &HeadsModel) -> Result<Option<Vec<Image>>> {
+    let level = cloud.voxels.depth();
+    let gaussians = with_heads(isa, cloud, heads)?;
+    gaussians
+        .map(|gaussians| Views::of_level(isa, level).all(&gaussians))
+        .transpose()
+}
+
+/// A cloud as the best heads draw it. `None` if it has no level but the root, or the model no best heads.
+pub fn with_heads(isa: Isa, cloud: &ColouredVoxels, heads: &HeadsModel) -> Result<Option<Gaussians>> {
     let best = heads.sets().filter(|set| set.0 == Heads::Best);
     let Some(best) = best.min_by_key(|set| set.1) else {
         return Ok(None);
@@ -44,7 +53,7 @@ pub fn pictures(isa: Isa, cloud: &ColouredVoxels, heads: &HeadsModel) -> Result<
     };
     let (precision, rows) = (Default::default(), (ROWS, true));
     let gaussians = heads.generate_in_parts(isa, precision, best, input, frame(cloud), rows, &mut |_| Ok(()))?;
-    Ok(Some(Views::of_level(isa, level).all(&gaussians)?))
+    Ok(Some(gaussians))
 }
 
 /// The map of the level that was decoded: it tells the size of surfels with which it looks most like these pictures, and

@@ -273,3 +273,39 @@ fn numbers_are_mixed_the_same_with_any_number_of_threads() {
     };
     assert!(with(1) == with(3));
 }
+
+#[test]
+fn gathering_is_the_transpose_of_mixing() {
+    let splats = random_splats(9, 300);
+    for distance in [4.0, 0.7] {
+        let camera = Camera::orbit(20.0, 10.0, distance, 50.0, 70, 45).unwrap();
+        let part = Bounds {
+            x0: 5,
+            y0: 7,
+            x1: 61,
+            y1: 42,
+        };
+        let crop = camera.crop(part).unwrap();
+        let both = |isa| [(isa, camera), (isa, crop)];
+        for (isa, camera) in isas().into_iter().flat_map(both) {
+            let scene = scene(splats.clone());
+            let (limits, mut renderer) = (Limits::default(), Renderer::new().with_isa(isa));
+            // ⟨mixed x, y⟩ = ⟨x, gathered y⟩
+            let x = |i: usize| [(i % 7) as f32 - 3.0];
+            let mut mixed = Vec::new();
+            renderer.mix_into(&scene, &camera, x, &limits, &mut mixed).unwrap();
+            let y: Vec<[f32; 1]> = (0..mixed.len()).map(|i| [(i % 11) as f32 - 4.0]).collect();
+            let left: f64 = mixed.iter().zip(&y).map(|(a, b)| f64::from(a[0] * b[0])).sum();
+            let right = std::sync::Mutex::new(0.0);
+            let add = |i: usize, [sum]: [f32; 1]| *right.lock().unwrap() += f64::from(x(i)[0] * sum);
+            renderer.gather(&scene, &camera, &y, &limits, add).unwrap();
+            let right = right.into_inner().unwrap();
+            assert!(
+                left != 0.0 && (left - right).abs() < 1e-4 * left.abs(),
+                "{isa}: {left} and {right}"
+            );
+            let few = renderer.gather(&scene, &camera, &y[1..], &limits, |_, _| ());
+            assert!(matches!(few, Err(crate::Error::Usage(_))));
+        }
+    }
+}

@@ -149,6 +149,8 @@ fn options(args: &Encode, bits: u8) -> Result<Options> {
     }
     if let Some(effort) = args.effort {
         options.set_effort(effort);
+        // Colours that are refined frame by frame would differ from one frame to the next.
+        options.rounds = 0;
     }
     options.tune = args.tune.unwrap_or(Tune::Psnr);
     match args.step {
