@@ -63,7 +63,8 @@ if [ "${1:-}" = renderer ]; then
     exit
 fi
 
-suite() { cargo test --locked --target $target -p b2p --no-default-features --test conformance "$@"; }
+# Emulation is slow, and other numbers of threads are tried without it.
+suite() { B2P_THREADS=2 cargo test --locked --target $target -p b2p --no-default-features --test conformance "$@"; }
 kernels() { cargo test --locked --target $target -p b2p-kernels --lib --test convolution "$@"; }
 half() { cargo test --locked --target $target -p b2p --no-default-features --lib "$@"; }
 

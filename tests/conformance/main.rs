@@ -92,7 +92,7 @@ fn pools_for<'a>(file: &str, pools: &'a [Pool]) -> &'a [Pool] {
     }
 }
 
-/// One, two and seven threads; targets without threads have the calling one alone.
+/// One, two and seven threads, or as many as `B2P_THREADS` says; targets without threads have the calling one alone.
 fn pools() -> Vec<Pool> {
     if cfg!(target_family = "wasm") {
         return vec![(1, None)];
@@ -101,7 +101,10 @@ fn pools() -> Vec<Pool> {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
         (threads, Some(pool.build().expect("threads start")))
     };
-    [1, 2, 7].map(pool).into()
+    match std::env::var("B2P_THREADS") {
+        Ok(threads) => vec![pool(threads.parse().expect("B2P_THREADS is a number"))],
+        Err(_) => [1, 2, 7].map(pool).into(),
+    }
 }
 
 /// What this machine has, but for what `B2P_SKIP_ISAS` names: `tests/aarch64.sh` tries that on another processor.
