@@ -53,8 +53,8 @@ struct Told {
     error: f64,
     /// Of red, green and blue, in 255ths, what each voxel should have more.
     missing: Vec<[f32; 3]>,
-    /// How many pixels each voxel has.
-    seen: Vec<f32>,
+    /// How many pixels each voxel has, in [`PARTS`].
+    seen: Vec<u64>,
 }
 
 /// Azimuth and elevation of the views, in degrees: on a spiral of equal steps in height.
@@ -105,7 +105,7 @@ impl EncoderInput<'_> {
     }
 
     /// Codes the shape of `coded` once more, with moved colours. If known, errors count by how much is `seen` of a voxel.
-    fn moved(&self, coded: &Coded, moves: &Moves, seen: Option<&[f32]>, steps: Steps, log: &Log) -> Result<Coded> {
+    fn moved(&self, coded: &Coded, moves: &Moves, seen: Option<&[u64]>, steps: Steps, log: &Log) -> Result<Coded> {
         let Coded { top, shape, .. } = coded;
         let mut truth = self.moved_truth(*top, shape.as_deref(), moves);
         if let Some(seen) = seen {
@@ -191,7 +191,10 @@ impl EncoderInput<'_> {
         Ok(Told {
             error,
             missing: sums.par_iter().map(missing).collect(),
-            seen: sums.par_iter().map(|sums| sum(sums, 3)).collect(),
+            seen: sums
+                .par_iter()
+                .map(|sums| sums[3].load(Ordering::Relaxed) as u64)
+                .collect(),
         })
     }
 

@@ -66,8 +66,8 @@ fn what_hides_behind_walls_is_seen_less() {
             let inside = at.iter().filter(|x| (10..22).contains(*x)).count();
             (inside == 2 && at.iter().any(|x| wall.contains(x))).then_some(*seen)
         });
-        let seen: Vec<f32> = seen.collect();
-        seen.iter().sum::<f32>() / seen.len() as f32
+        let seen: Vec<u64> = seen.collect();
+        seen.iter().sum::<u64>() as f64 / seen.len() as f64
     };
     let [outer, inner] = [mean_of([2, 29]), mean_of([8, 23])];
     assert!(inner < 0.05 * outer, "{inner} and {outer}");
