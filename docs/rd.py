@@ -31,11 +31,11 @@ LEVELS = {"s0.25": 8, "s0.5": 9, "s1": 10}
 # arguments of `b2p decode`. Items with equal encoder arguments share a stream.
 
 
-def at_rates(*heads):
-    """Streams of every rate that the tables compare at, drawn by these heads."""
+def at_rates(*heads, encode=()):
+    """Streams of every rate that the tables compare at, coded with these arguments, drawn by these heads."""
     file = os.environ.get("B2P_HEADS")
     decode = (*heads, *(("--model", Path(file).resolve()) if file and "surfels" not in heads else ()))
-    return lambda rates: [(f"{rate:.4f}", ("--bits-per-point", f"{rate:.4f}"), None, decode) for rate in rates]
+    return lambda rates: [(f"{rate:.4f}", ("--bits-per-point", f"{rate:.4f}", *encode), None, decode) for rate in rates]
 
 
 def learned(name):
@@ -46,6 +46,7 @@ def learned(name):
 
 SERIES = {
     "best": at_rates("--heads", "best"),
+    "effort-9": at_rates("--heads", "best", encode=("--effort", "9")),
     "quick": at_rates("--heads", "quick"),
     "surfels": at_rates("--heads", "surfels"),
     **{name: learned(name) for name in ("lite", "lite-low", "lite-least")},

@@ -50,18 +50,16 @@ impl Image {
 
     /// Half the size: each pixel is the mean of 2×2. A last odd column or row is the mean of the pixels that there are.
     pub fn box_half(&self) -> Image {
-        let mut half = Image {
-            width: self.width.div_ceil(2),
-            height: self.height.div_ceil(2),
-            pixels: Vec::new(),
-        };
-        half.pixels = quarters(self.width, self.height)
-            .map(|from| {
+        let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
+        let mut pixels = vec![[0.0; 4]; width as usize * height as usize];
+        let rows = pixels.par_chunks_mut(width.max(1) as usize).enumerate();
+        rows.with_min_len(8).for_each(|(y, row)| {
+            for (pixel, from) in row.iter_mut().zip(quarters(self.width, self.height, y)) {
                 let from = from.map(|i| self.pixels[i]);
-                std::array::from_fn(|k| 0.25 * ((from[0][k] + from[1][k]) + (from[2][k] + from[3][k])))
-            })
-            .collect();
-        half
+                *pixel = std::array::from_fn(|k| 0.25 * ((from[0][k] + from[1][k]) + (from[2][k] + from[3][k])));
+            }
+        });
+        Image { width, height, pixels }
     }
 
     /// Eight bits a channel, premultiplied: clamped (alpha to `[0, 1]`, colours to `[0, alpha]`), then rounded to the
@@ -282,7 +280,8 @@ pub(super) fn io_error(path: &Path) -> impl Fn(std::io::Error) -> Error + '_ {
 pub fn box_half(pixmap: &Pixmap) -> Result<Pixmap> {
     let (width, height) = (pixmap.width(), pixmap.height());
     let data = pixmap.data();
-    let bytes = quarters(width, height)
+    let bytes = (0..height.div_ceil(2) as usize)
+        .flat_map(|y| quarters(width, height, y))
         .flat_map(|from| -> [u8; 4] {
             std::array::from_fn(|k| {
                 let sum: u16 = from.iter().map(|i| u16::from(data[4 * i + k])).sum();
@@ -293,15 +292,13 @@ pub fn box_half(pixmap: &Pixmap) -> Result<Pixmap> {
     self::pixmap(bytes, width.div_ceil(2), height.div_ceil(2))
 }
 
-/// For every pixel of a picture of half the size, the four that it is the mean of; at an odd edge they repeat.
-fn quarters(width: u32, height: u32) -> impl Iterator<Item = [usize; 4]> {
+/// For every pixel of row `y` of a picture of half the size, the four that it is the mean of; at an odd edge they repeat.
+fn quarters(width: u32, height: u32, y: usize) -> impl Iterator<Item = [usize; 4]> {
     let (width, height) = (width as usize, height as usize);
-    (0..height).step_by(2).flat_map(move |y| {
-        let rows = [y * width, (y + 1).min(height - 1) * width];
-        (0..width).step_by(2).map(move |x| {
-            let next = (x + 1).min(width - 1);
-            [rows[0] + x, rows[0] + next, rows[1] + x, rows[1] + next]
-        })
+    let rows = [2 * y * width, (2 * y + 1).min(height - 1) * width];
+    (0..width).step_by(2).map(move |x| {
+        let next = (x + 1).min(width - 1);
+        [rows[0] + x, rows[0] + next, rows[1] + x, rows[1] + next]
     })
 }
 

@@ -43,7 +43,7 @@ impl Reference {
         let Some(&largest) = sides.last() else {
             return Ok(Reference { isa, pictures });
         };
-        let mut views = Views::new(isa, largest).all(&closed(isa, cloud, sparse)?)?;
+        let mut views = Views::new(isa, largest).first(VIEWS.len(), &closed(isa, cloud, sparse)?)?;
         // Each side is half of the next one.
         let mut at = largest;
         for &side in sides.iter().rev() {
@@ -112,6 +112,8 @@ fn side(level: u8) -> u32 {
 pub struct Views {
     pub renderer: Renderer,
     side: u32,
+    /// The memory of the last picture of the whole side.
+    large: Image,
 }
 
 impl Views {
@@ -125,7 +127,11 @@ impl Views {
             .with_isa(isa)
             .with_background(Background::Transparent)
             .with_limits(Limits::unlimited());
-        Views { renderer, side }
+        Views {
+            renderer,
+            side,
+            large: Image::default(),
+        }
     }
 
     /// A camera of `times` half the side, at this azimuth and elevation.
@@ -142,15 +148,18 @@ impl Views {
 
     /// A picture averaged to half its size.
     pub fn half(&mut self, gaussians: &Gaussians, view: (f64, f64)) -> Result<Image> {
-        Ok(self.large(gaussians, view)?.box_half())
+        let camera = self.camera(view, 2)?;
+        self.renderer.render_into(gaussians, &camera, &mut self.large)?;
+        Ok(self.large.box_half())
     }
 
-    /// Pictures of all views.
-    pub fn all(&mut self, gaussians: &Gaussians) -> Result<Vec<Image>> {
-        VIEWS.iter().map(|view| self.half(gaussians, *view)).collect()
+    /// Pictures of the first `count` views.
+    pub fn first(&mut self, count: usize, gaussians: &Gaussians) -> Result<Vec<Image>> {
+        VIEWS[..count].iter().map(|view| self.half(gaussians, *view)).collect()
     }
 
-    /// Squared errors of pictures of these Gaussians over whole pictures, and where the `truth` has something.
+    /// Squared errors of pictures of these Gaussians over whole pictures, and where the `truth` has something: pictures
+    /// of the first views.
     pub fn errors(&mut self, truth: &[Image], gaussians: &Gaussians) -> Result<Errors> {
         let mut errors = [0.0; 2];
         for (view, truth) in VIEWS.into_iter().zip(truth) {

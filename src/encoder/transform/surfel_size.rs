@@ -18,6 +18,8 @@ use super::reference::{Views, frame, maps};
 
 /// Sizes to choose from, in 64ths of the usual radius.
 pub const SIZES: [u8; 3] = [54, 64, 74];
+/// So many of the views are compared: two sides of an object ask for the same size as four.
+const VIEWS: usize = 2;
 /// Rows that heads work on at a time.
 const ROWS: usize = 1 << 16;
 
@@ -26,7 +28,7 @@ pub fn pictures(isa: Isa, cloud: &ColouredVoxels, heads: &HeadsModel) -> Result<
     let level = cloud.voxels.depth();
     let gaussians = with_heads(isa, cloud, heads)?;
     gaussians
-        .map(|gaussians| Views::of_level(isa, level).all(&gaussians))
+        .map(|gaussians| Views::of_level(isa, level).first(VIEWS, &gaussians))
         .transpose()
 }
 
@@ -72,7 +74,7 @@ pub fn of_level(
     let mut errors = [[0.0; 2]; SIZES.len()];
     for (errors, size) in errors.iter_mut().zip(SIZES) {
         scale(&mut surfels, &usual, f32::from(size) / 64.0);
-        *errors = views.errors(pictures, &surfels)?;
+        *errors = views.errors(&pictures[..VIEWS], &surfels)?;
     }
     // Whole pictures and the foreground count alike.
     let [whole, foreground] = errors[0].map(|sum: f64| sum.max(1e-12));
