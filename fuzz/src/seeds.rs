@@ -73,7 +73,6 @@ fn transformed() -> Vec<Vec<u8>> {
     ]
 }
 
-/// Sequences of a few voxels that move: in one group and in two, lossless, and of frames that are all alike.
 /// Scenes of a few voxels in several blocks.
 fn scenes() -> Vec<Vec<u8>> {
     let coded = |depth: u8, levels: std::ops::RangeInclusive<u8>, most: usize, lossless: bool| {
@@ -99,8 +98,11 @@ fn scenes() -> Vec<Vec<u8>> {
     ]
 }
 
+/// Sequences of a few voxels that move: in one group and in two, lossless, and of frames that are all alike; with
+/// blocks and with parts, whose motion the colours of the coarse levels follow in the last one.
 fn sequences() -> Vec<Vec<u8>> {
-    let coded = |depth: u8, moves: u64, group: u32, lossless: bool, parts: bool| {
+    let coded = |levels: std::ops::RangeInclusive<u8>, moves: u64, group: u32, lossless: bool, parts: bool| {
+        let depth = *levels.end();
         let side = 1u64 << depth;
         let cloud = |frame: u64| {
             let key = |i: u64| {
@@ -117,7 +119,7 @@ fn sequences() -> Vec<Vec<u8>> {
         };
         let encoder = SequenceEncoder::new()
             .with_group(group)
-            .with_levels(1..=depth)
+            .with_levels(levels)
             .with_parts(parts);
         let encoder = match lossless {
             true => encoder.with_quality(transform::QualityTarget::Lossless),
@@ -126,13 +128,14 @@ fn sequences() -> Vec<Vec<u8>> {
         encoder.encode(4, cloud, |_| {}).expect("a few voxels are coded")
     };
     vec![
-        coded(3, 1, 4, false, false),
-        coded(4, 1, 2, false, false),
-        coded(4, 0, 4, false, false),
-        coded(3, 1, 4, true, false),
-        coded(4, 1, 4, false, true),
-        coded(4, 0, 4, false, true),
-        coded(3, 1, 4, true, true),
+        coded(1..=3, 1, 4, false, false),
+        coded(1..=4, 1, 2, false, false),
+        coded(1..=4, 0, 4, false, false),
+        coded(1..=3, 1, 4, true, false),
+        coded(1..=4, 1, 4, false, true),
+        coded(1..=4, 0, 4, false, true),
+        coded(1..=3, 1, 4, true, true),
+        coded(2..=4, 1, 4, false, true),
     ]
 }
 
