@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use b2p::cloud::ColouredVoxels;
+use b2p::axes::Axes;
+use b2p::cloud::{ColouredVoxels, GridReport};
 use b2p::container;
 use b2p::encoder::transform::{self, GeometryTarget, QualityTarget};
 use b2p::encoder::{self, Encoded, Options, Rate, Residual};
@@ -58,12 +59,32 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         .map_err(&in_cloud)?;
     let axes = cloud.axes;
     drop((cloud.positions, cloud.colours));
-    let cloud = grid;
-    let voxels = cloud.voxels.len();
-    if scene::is_wanted(args, cloud.voxels.len()) {
-        let options = transform_options(args, cloud.voxels.depth())?;
-        return scene::encode(args, (&cloud, &found), axes, options, limits, progress);
+    if scene::is_wanted(args, grid.voxels.len()) {
+        let options = transform_options(args, grid.voxels.depth())?;
+        return scene::encode(args, (&grid, &found), axes, options, limits, progress);
     }
+    let coded = one_stream(args, &grid, axes, points, limits, &log)?;
+    let (bytes, to) = (&coded.encoded.bytes, &args.output);
+    manners::write(to, |w| {
+        w.write_all(bytes).map_err(|source| Error::Io {
+            path: to.to_path_buf(),
+            source,
+        })
+    })?;
+    decodable::warn(to, bytes, args.colours, &args.model, limits)?;
+    Ok(report(args, &grid, &found, points, &coded, &log).beside(to))
+}
+
+/// Codes the voxels of a cloud of so many points as one stream.
+fn one_stream(
+    args: &Encode,
+    cloud: &ColouredVoxels,
+    axes: Axes,
+    points: usize,
+    limits: &Limits,
+    log: &Log,
+) -> Result<Coded> {
+    let voxels = cloud.voxels.len();
     let axes = match args.bits_per_point {
         Some(most) => cloud::affordable(axes, most * voxels as f64 / 8.0),
         None => axes,
@@ -72,26 +93,29 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
         let options = transform_options(args, cloud.voxels.depth())?;
         let memory = transform::encode_memory(&cloud.voxels, &options, args.bits_per_point.is_some());
         let checked = limits.check_bytes("bytes that encoding the voxels takes", memory);
-        checked.map_err(&in_cloud)?;
+        checked.map_err(Failure::in_file(&args.cloud))?;
     }
     let merged = (points > voxels).then_some(points as u64);
     // The rate counts the whole file.
     let reserved = container::source_bytes(&axes, merged) as f64 * 8.0 / voxels as f64;
-    let coded = match args.colours {
-        Colours::Transform => transform(args, &cloud, reserved, &log)?,
-        Colours::Learned => learned(args, &cloud, reserved, &log)?,
+    let mut coded = match args.colours {
+        Colours::Transform => transform(args, cloud, reserved, log)?,
+        Colours::Learned => learned(args, cloud, reserved, log)?,
     };
-    let Coded { mut encoded, chosen } = coded;
-    encoded.bytes = container::with_source(&encoded.bytes, &axes, merged)?;
-    let to = &args.output;
-    manners::write(to, |w| {
-        w.write_all(&encoded.bytes).map_err(|source| Error::Io {
-            path: to.to_path_buf(),
-            source,
-        })
-    })?;
-    decodable::warn(to, &encoded.bytes, args.colours, &args.model, limits)?;
-    let depth = cloud.voxels.depth();
+    coded.encoded.bytes = container::with_source(&coded.encoded.bytes, &axes, merged)?;
+    Ok(coded)
+}
+
+/// What a stream of the voxels of a cloud of so many points cost.
+fn report(
+    args: &Encode,
+    cloud: &ColouredVoxels,
+    found: &GridReport,
+    points: usize,
+    Coded { encoded, chosen }: &Coded,
+    log: &Log,
+) -> Said {
+    let (voxels, depth) = (cloud.voxels.len(), cloud.voxels.depth());
     let json = || {
         let level = |rate: &Rate| {
             json!({
@@ -102,7 +126,7 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
             })
         };
         json!({
-            "output": to.display().to_string(),
+            "output": args.output.display().to_string(),
             "bytes": encoded.bytes.len(),
             "points": points,
             "voxels": voxels,
@@ -112,13 +136,9 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
             "steps": steps_json(&log.steps()),
         })
     };
-
     let bpp = |bytes: usize| format!("{:.4}", bytes as f64 * 8.0 / voxels as f64);
-    let mut rows = vec![
-        ["level", "voxels", "geometry bpp", "colour bpp"]
-            .map(String::from)
-            .to_vec(),
-    ];
+    let heading = ["level", "voxels", "geometry bpp", "colour bpp"];
+    let mut rows = vec![heading.map(String::from).to_vec()];
     for rate in &encoded.rates {
         rows.push(vec![
             rate.level.to_string(),
@@ -127,19 +147,19 @@ pub fn run(args: &Encode, limits: &Limits, progress: &Progress) -> Result<Said> 
             bpp(rate.colour_bytes),
         ]);
     }
-    let report = format!(
+    let text = format!(
         "{}\n{}\n{}{}: {} for {} at {}, {} bits per point{}\n",
         steps(&log.steps()),
         table(&rows),
-        cloud::describe(&found),
-        to.display(),
+        cloud::describe(found),
+        args.output.display(),
         counted(encoded.bytes.len() as u64, "byte"),
         counted(voxels as u64, "point"),
         counted(depth.into(), "bit"),
         bpp(encoded.bytes.len()),
         chosen,
     );
-    Ok(Said::report(report, json).beside(to))
+    Said::report(text, json)
 }
 
 /// A stream, and what was chosen about it in words.

@@ -123,68 +123,95 @@ pub fn each(
         }
     }
     if convert::may_be(&start) || cloud::is_cloud(&start) {
-        for piece in pieces {
-            start.extend(piece.map_err(broken)?);
-            let length = start.len() as u64;
-            let checked = limits.check_bytes("size of the input, as far as it was read,", length);
-            checked.map_err(Failure::in_file(path))?;
-        }
-        if let Some(loaded) = load::other(path, &start, detail, limits, log)? {
+        let bytes = rest(start, pieces, limits)?;
+        if let Some(loaded) = load::other(path, &bytes, detail, limits, log)? {
             return show(Shown::Gaussians(&loaded.gaussians), &loaded.axes, log);
         }
-        kinds::check_stream(path, &start)?;
+        kinds::check_stream(path, &bytes)?;
         let what = "neither a stream, nor Gaussians or points that are known by their contents";
         return Err(Failure(format!("standard input: {what}")));
     }
     kinds::check_stream(path, &start)?;
-    let mut decoding = decoder(&start)?.start();
-    let mut shown = None;
-    let in_pipe = Failure::in_file(path);
-    let mut piece = Some(start);
-    let mut length = 0;
-    let mut head = Vec::new();
-    while let Some(bytes) = piece {
-        if head.len() < HEAD {
-            head.extend(&bytes);
-        }
-        length += bytes.len() as u64;
-        decoding.push(&bytes);
-        while decoding.advance().map_err(&in_pipe)?.is_some() {}
-        if let Some(header) = decoding.header()
-            && length > header.stream_bytes()
-        {
-            // What follows the stream may have no end.
-            break;
-        }
-        piece = match pieces.try_recv() {
-            Err(TryRecvError::Empty) => {
-                if early && decoding.is_drawable() && shown != decoding.level() {
-                    shown = decoding.level();
-                    show(Shown::Level(&decoding), &cloud::axes(&head), log)?;
-                }
-                pieces.recv().ok()
+    let decoder = decoder(&start)?;
+    let arriving = Arriving { start, pieces };
+    arriving.show(decoder.start(), detail.level.is_none(), early, &mut |level, axes| {
+        show(Shown::Level(level), axes, log)
+    })
+}
+
+/// All of standard input, of which this is the start.
+fn rest(mut start: Vec<u8>, pieces: Receiver<Piece>, limits: &Limits) -> Result<Vec<u8>> {
+    for piece in pieces {
+        start.extend(piece.map_err(broken)?);
+        let length = start.len() as u64;
+        let checked = limits.check_bytes("size of the input, as far as it was read,", length);
+        checked.map_err(Failure::in_file(Path::new(PIPE)))?;
+    }
+    Ok(start)
+}
+
+/// A stream that arrives by standard input.
+struct Arriving {
+    start: Vec<u8>,
+    pieces: Receiver<Piece>,
+}
+
+impl Arriving {
+    /// Shows the finest level once all has arrived, and if `early`, coarser ones when nothing waits. Of a stream that is
+    /// cut that is the finest whole level if `any` will do.
+    fn show(
+        self,
+        mut decoding: Decoding<'_>,
+        any: bool,
+        early: bool,
+        show: &mut dyn FnMut(&Decoding<'_>, &Axes) -> Result<()>,
+    ) -> Result<()> {
+        let in_pipe = Failure::in_file(Path::new(PIPE));
+        let (mut shown, mut piece) = (None, Some(self.start));
+        let (mut length, mut head) = (0, Vec::new());
+        while let Some(bytes) = piece {
+            if head.len() < HEAD {
+                head.extend(&bytes);
             }
-            next => next.ok(),
+            length += bytes.len() as u64;
+            decoding.push(&bytes);
+            while decoding.advance().map_err(&in_pipe)?.is_some() {}
+            if let Some(header) = decoding.header()
+                && length > header.stream_bytes()
+            {
+                // What follows the stream may have no end.
+                break;
+            }
+            piece = match self.pieces.try_recv() {
+                Err(TryRecvError::Empty) => {
+                    if early && decoding.is_drawable() && shown != decoding.level() {
+                        shown = decoding.level();
+                        show(&decoding, &cloud::axes(&head))?;
+                    }
+                    self.pieces.recv().ok()
+                }
+                next => next.ok(),
+            }
+            .transpose()
+            .map_err(broken)?;
         }
-        .transpose()
-        .map_err(broken)?;
-    }
-    match decoding.finish() {
-        Err(
-            error @ Error::Truncated {
-                stage: Stage::Bitstream,
-                ..
-            },
-        ) if detail.level.is_none() && decoding.is_drawable() => {
-            let finest = decoding.level().unwrap_or_default();
-            let what = format!("what follows is level {finest}, the finest that is complete");
-            manners::warn(&format!("{}: {error}; {what}", path.display()));
+        match decoding.finish() {
+            Err(
+                error @ Error::Truncated {
+                    stage: Stage::Bitstream,
+                    ..
+                },
+            ) if any && decoding.is_drawable() => {
+                let finest = decoding.level().unwrap_or_default();
+                let what = format!("what follows is level {finest}, the finest that is complete");
+                manners::warn(&format!("{PIPE}: {error}; {what}"));
+            }
+            done => done.map_err(&in_pipe)?,
         }
-        done => done.map_err(&in_pipe)?,
-    }
-    match shown == decoding.level() {
-        true => Ok(()),
-        false => show(Shown::Level(&decoding), &cloud::axes(&head), log),
+        match shown == decoding.level() {
+            true => Ok(()),
+            false => show(&decoding, &cloud::axes(&head)),
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! Streams of version 3: colours as transform coefficients.
 
+mod checking;
 mod choice;
 mod descent;
 mod head_maps;
@@ -15,6 +16,7 @@ mod reference;
 mod refine;
 mod shape;
 mod surfel_size;
+mod writing;
 
 use std::ops::RangeInclusive;
 use std::sync::{Arc, OnceLock};
@@ -22,14 +24,13 @@ use std::sync::{Arc, OnceLock};
 use b2p_kernels::Isa;
 use rayon::prelude::*;
 
-use super::{Encoded, rates};
+use super::Encoded;
 use crate::cloud::ColouredVoxels;
-use crate::colour::{self, Filter, Steps, Truth};
+use crate::colour::{self, Filter, LevelColours, Steps, Truth};
 use crate::container::{Format, Header, Writer};
 use crate::decoder::{Decoder, colour_hash};
 use crate::error::{Error, Result};
 use crate::geometry::{Octree, SiblingMap, Voxels, codec};
-use crate::limits::Limits;
 use crate::log::Log;
 use crate::motion::{ColourGuide, GeometryGuide};
 use descent::Pictures;
@@ -40,9 +41,9 @@ pub use predicted::{PredictedFrame, encode_predicted};
 pub use quality::QualityTarget;
 
 pub use rate_control::encode_to_rate;
-use reference::Reference;
 pub use shape::GeometryTarget;
 use shape::Shape;
+use writing::{Coded, Layer, counted};
 
 /// Filters of levels that are not the finest may take one part in so many of a stream that ends there.
 const FILTER_SHARE: usize = 100;
@@ -109,32 +110,6 @@ struct EncoderInput<'a> {
 struct Guides {
     geometry: Vec<GeometryGuide>,
     colours: Vec<ColourGuide>,
-}
-
-/// A stream that has not been checked yet.
-struct Coded {
-    bytes: Vec<u8>,
-    top: u8,
-    /// Its geometry, unless that is exact.
-    shape: Option<Arc<Shape>>,
-    /// The colours of the finest level, filtered.
-    colours: Vec<[u8; 3]>,
-    /// Those of the level above before its filter, as heads read them.
-    colours_above: Vec<[u8; 3]>,
-    /// The step of luma that heads go by, in 255ths.
-    luma_step: f32,
-    /// Last level and payload of the colour trunk.
-    trunk: (u8, Vec<u8>),
-    layers: Vec<Layer>,
-}
-
-/// The colours of a level in a stream.
-struct Layer {
-    level: u8,
-    hash: u64,
-    filter: Option<Vec<u8>>,
-    head_map: Option<Vec<u8>>,
-    slices: Vec<(u32, Vec<u8>)>,
 }
 
 impl<'a> EncoderInput<'a> {
@@ -284,23 +259,19 @@ impl<'a> EncoderInput<'a> {
         })?;
         let mut layers = Vec::new();
         let mut bytes = payload.len();
-        let mut colours = Vec::new();
-        let mut colours_above = Vec::new();
+        let (mut colours, mut colours_above) = (Vec::new(), Vec::new());
         for level in trunk..=top {
-            let count = octree.level(level).len();
-            let mut slices = Vec::new();
             if level == top && level > trunk {
                 colours_above = coloured.rgb();
             } else if level == top && level > 0 {
                 colours_above = Decoder::colours_above(octree, level, &coloured.rgb());
             }
+            let (map, mut slices) = (map_of(level), Vec::new());
             if level > trunk {
-                let (above, map) = (map_of(level - 1), map_of(level));
+                let (above, count) = (map_of(level - 1), octree.level(level).len());
                 let coding = self.coding(steps, top, level);
-                let guide = self
-                    .guides
-                    .as_ref()
-                    .map(|guides| guides.colours[usize::from(level) - 1].guide());
+                let guides = self.guides.as_ref();
+                let guide = guides.map(|guides| guides.colours[usize::from(level) - 1].guide());
                 let name = format!("colours of level {level}");
                 let (payloads, next) = log.step(name, count, "voxels", || {
                     Ok(colour::encode_level(
@@ -311,23 +282,17 @@ impl<'a> EncoderInput<'a> {
                 slices = counted(above.len(), slice, payloads);
                 bytes += slices.iter().map(|slice| slice.1.len()).sum::<usize>();
             }
-            let mut filter = None;
-            // Predicted frames inherit the filters of the frame before.
-            if level >= base && self.options.filter && self.guides.is_none() {
-                let name = format!("filter of level {level}");
-                let most = match level == top {
-                    true => usize::MAX,
-                    false => (bytes + self.geometry_bytes(level, None)) / FILTER_SHARE,
-                };
-                filter = log.step(name, count, "voxels", || {
-                    let map = map_of(level);
-                    let filter = Filter::fit(isa, &coloured, map, truth.level(level));
-                    Ok(filter.filter(|filter| filter.to_bytes().len() <= most))
-                })?;
-            }
+            let most = match level == top {
+                true => usize::MAX,
+                false => (bytes + self.geometry_bytes(level, None)) / FILTER_SHARE,
+            };
+            let filter = match level >= base {
+                true => self.filter(&coloured, map, level, truth, most, log)?,
+                false => None,
+            };
             if level == top {
                 colours = match &filter {
-                    Some(filter) => filter.rgb(isa, &coloured, map_of(level), coloured.steps()),
+                    Some(filter) => filter.rgb(isa, &coloured, map, coloured.steps()),
                     None => coloured.rgb(),
                 };
             }
@@ -335,7 +300,7 @@ impl<'a> EncoderInput<'a> {
                 level,
                 hash: colour_hash(&coloured),
                 filter: filter.map(|filter| filter.to_bytes()),
-                head_map: self.closing_map(octree, level, map_of(level)),
+                head_map: self.closing_map(octree, level, map),
                 slices,
             });
         }
@@ -353,135 +318,24 @@ impl<'a> EncoderInput<'a> {
         Ok(coded)
     }
 
-    /// Bytes of the geometry of the levels 1 to `level`, which may have a shape.
-    fn geometry_bytes(&self, level: u8, shape: Option<&Shape>) -> usize {
-        let exact = usize::from(level) - usize::from(shape.is_some());
-        let last = shape.into_iter().flat_map(|shape| &shape.geometry);
-        let levels = self.geometry[..exact].iter().flatten();
-        levels.chain(last).map(|(_, bytes)| bytes.len()).sum()
-    }
-
-    /// The stream of what was coded.
-    fn written(&self, coded: &Coded) -> Result<Vec<u8>> {
-        let header = self.header(coded.top, |level| {
-            self.octree(coded.shape.as_deref()).level(level).len()
-        });
-        let base = header.base;
-        let mut writer = Writer::new(header)?;
-        self.write(&mut writer, base, coded)?;
-        writer.finish()
-    }
-
-    /// Writes the sections of all levels.
-    fn write(&self, writer: &mut Writer, base: u8, coded: &Coded) -> Result<()> {
-        let Coded {
-            trunk, layers, shape, ..
-        } = coded;
-        let (trunk, payload) = (trunk.0, &trunk.1);
-        let slice = self.options.slice_voxels as usize;
-        let voxels = |level: usize| self.octree.level(level as u8).len();
-        // Levels of one slice each.
-        let small = (1..=usize::from(base)).take_while(|level| voxels(level - 1) <= slice);
-        let small = small.count();
-        let geometry = |level: u8| match shape {
-            Some(shape) if level == coded.top => &shape.geometry,
-            _ => &self.geometry[usize::from(level) - 1],
-        };
-        let levels = (1..=small).flat_map(|level| geometry(level as u8));
-        let levels: Vec<_> = levels.map(|(count, bytes)| (*count, bytes)).collect();
-        writer.geometry_trunk(&levels)?;
-        let rest = small + 1..=usize::from(base);
-        for level in rest {
-            writer.geometry(level as u8, geometry(level as u8))?;
+    /// The colour filter of a level, if there is one of at most `most` bytes that pays.
+    fn filter(
+        &self,
+        coloured: &LevelColours,
+        map: &SiblingMap,
+        level: u8,
+        truth: &Truth,
+        most: usize,
+        log: &Log,
+    ) -> Result<Option<Filter>> {
+        // Predicted frames inherit the filters of the frame before.
+        if !self.options.filter || self.guides.is_some() {
+            return Ok(None);
         }
-        for layer in layers {
-            let level = layer.level;
-            if level > base {
-                writer.geometry(level, geometry(level))?;
-            }
-            if level == trunk {
-                let hash = layers[usize::from(base - trunk)].hash;
-                writer.colour_trunk(level, voxels(level.into()) as u32, hash, payload)?;
-            } else {
-                let hash = (level > base).then_some(layer.hash);
-                writer.colours(level, hash, &layer.slices)?;
-            }
-            if let Some(filter) = &layer.filter {
-                writer.post_filter(level, filter)?;
-            }
-            if let Some(map) = &layer.head_map {
-                writer.head_map(level, map)?;
-            }
-        }
-        Ok(())
-    }
-
-    /// The stream, once it has been decoded to what was encoded; if asked for with head maps, if the stream has
-    /// at most `most` bytes with them.
-    fn checked(&self, mut coded: Coded, head_maps: bool, most: usize, log: &Log) -> Result<Encoded> {
-        let top = coded.top;
-        let shape = coded.shape.clone();
-        let octree = self.octree(shape.as_deref());
-        let voxels = octree.level(top);
-        let decoder = Decoder::new().with_isa(self.isa).with_limits(Limits::unlimited());
-        let mut decoding = decoder.with_level(top).start();
-        decoding.push(&coded.bytes);
-        let wanted = head_maps && self.has_head_maps(top);
-        let (mut reference, mut finest) = (None, None);
-        if let Some(heads) = self.options.heads.as_ref().filter(|_| wanted) {
-            decoding.set_heads_model(heads.clone());
-            let levels = *self.levels.start().min(&top)..=top;
-            let (count, depth) = (self.cloud.voxels.len(), self.cloud.voxels.depth());
-            reference = Some(log.step("draw the cloud", count, "voxels", || {
-                let levels = levels.filter(|level| self.has_head_map(*level) && *level < depth);
-                Reference::new(self.isa, self.cloud, self.sparse, levels)
-            })?);
-            if top == depth && !self.sparse {
-                finest = log.step("draw the cloud with heads", count, "voxels", || {
-                    surfel_size::pictures(self.isa, self.cloud, heads)
-                })?;
-            }
-        }
-        let mut maps = Vec::new();
-        let same = log.step("decode again", voxels.len(), "voxels", || {
-            while let Some(level) = decoding.advance()? {
-                let Some(reference) = reference.as_ref().filter(|_| self.has_head_map(level)) else {
-                    continue;
-                };
-                let pictures = match level == self.cloud.voxels.depth() {
-                    true => finest.as_deref().unwrap_or_default(),
-                    false => reference.pictures(level),
-                };
-                if pictures.is_empty() {
-                    continue;
-                }
-                let map = match self.maps_blocks(level) {
-                    true => head_maps::of_level(octree, reference, &mut decoding, level)?,
-                    false => surfel_size::of_level(self.isa, octree, pictures, &mut decoding, level)?,
-                };
-                maps.push((level, map));
-            }
-            let points = decoding.points();
-            Ok(points.is_some_and(|points| points.voxels == voxels && points.colours == coded.colours))
-        })?;
-        if !same {
-            return Err(Error::Usage(
-                "the stream does not decode to what was encoded: this machine computes wrongly".into(),
-            ));
-        }
-        for (level, map) in maps {
-            let layer = coded.layers.iter_mut().find(|layer| layer.level == level);
-            layer
-                .into_iter()
-                .for_each(|layer| layer.head_map = Some(map.to_bytes()));
-        }
-        let mapped = self.written(&coded)?;
-        if mapped.len() <= most {
-            coded.bytes = mapped;
-        }
-        let bytes = coded.bytes;
-        let rates = rates(&Header::parse(&bytes, &Limits::unlimited())?);
-        Ok(Encoded { bytes, rates })
+        log.step(format!("filter of level {level}"), map.len(), "voxels", || {
+            let filter = Filter::fit(self.isa, coloured, map, truth.level(level));
+            Ok(filter.filter(|filter| filter.to_bytes().len() <= most))
+        })
     }
 }
 
@@ -504,11 +358,4 @@ fn octree_of(cloud: &ColouredVoxels, top: u8, log: &Log) -> Result<Octree> {
     log.step("octree", count, "voxels", || {
         Octree::new(Voxels::from_sorted(top, keys))
     })
-}
-
-/// Payloads with the numbers of their parents.
-fn counted(parents: usize, slice: usize, payloads: Vec<Vec<u8>>) -> Vec<(u32, Vec<u8>)> {
-    let count = |i: usize| (parents - i * slice).min(slice) as u32;
-    let payloads = payloads.into_iter().enumerate();
-    payloads.map(|(i, bytes)| (count(i), bytes)).collect()
 }
