@@ -84,7 +84,7 @@ pub fn encode_predicted(
     let lambda = match options.geometry {
         // As in frames that are coded by themselves.
         GeometryTarget::Visual if own && head_maps::is_sparse(cloud)? => 0,
-        geometry => geometry.lambda(steps, own, true),
+        geometry => geometry.lambda(steps, cloud.voxels.depth() - top, true),
     };
     if lambda > 0 && top > target.trunk {
         let guide = inter.geometry(&target.octree, top)?;

@@ -30,6 +30,9 @@ const LAMBDA: f32 = 4.2e-5;
 /// The greatest λ that follows from a step. Greater ones roughen smooth surfaces: at 0.25 a statue lost 13 SSIMULACRA2.
 const MOST_LAMBDA: f32 = 0.125;
 
+/// How many times as great λ is two levels above the cloud's own and further up: people lost 0.2 dB with all of it.
+const COARSE: f32 = 0.5;
+
 /// How many times as great λ is in predicted frames: steps of 34 gain as much from the greatest λ as steps of 68.
 const PREDICTED: f32 = 2.5;
 
@@ -39,18 +42,19 @@ const OWN_LAMBDA: f32 = 1.0 / 80.0;
 const MOST_OWN_LAMBDA: f32 = 0.5;
 
 impl GeometryTarget {
-    /// λ in units of 1/256, of the cloud's `own` level or one above it, in a frame that is coded by itself or `predicted`.
-    pub(super) fn lambda(self, steps: Steps, own: bool, predicted: bool) -> u32 {
+    /// λ in units of 1/256, so many levels `above` the cloud's own, in a frame that is coded by itself or `predicted`.
+    pub(super) fn lambda(self, steps: Steps, above: u8, predicted: bool) -> u32 {
         let step = steps.luma_step();
-        let scale = if predicted { PREDICTED } else { 1.0 };
         let lambda = match self {
             _ if steps.is_lossless() => 0.0,
             GeometryTarget::Exact => 0.0,
             // Of quarter octaves, so that streams with the same step of luma share an octree.
             GeometryTarget::Visual => {
-                let lambda = match own {
-                    true => (OWN_LAMBDA * step).min(MOST_OWN_LAMBDA),
-                    false => (scale * LAMBDA * step.powi(2)).min(MOST_LAMBDA),
+                let lambda = match above {
+                    0 => (OWN_LAMBDA * step).min(MOST_OWN_LAMBDA),
+                    _ if predicted => (PREDICTED * LAMBDA * step.powi(2)).min(MOST_LAMBDA),
+                    1 => (LAMBDA * step.powi(2)).min(MOST_LAMBDA),
+                    _ => COARSE * (LAMBDA * step.powi(2)).min(MOST_LAMBDA),
                 };
                 ((4.0 * lambda.log2()).round() / 4.0).exp2()
             }
@@ -73,10 +77,10 @@ impl EncoderInput<'_> {
     /// λ of streams with the last level `top` and these steps, in units of 1/256. A sparse cloud keeps its own voxels: few
     /// of them have the neighbours that tell noise from shape, and heads take what is left for a closed surface.
     pub(super) fn lambda(&self, top: u8, steps: Steps) -> u32 {
-        let own = top == self.cloud.voxels.depth();
+        let above = self.cloud.voxels.depth() - top;
         match self.options.geometry {
-            GeometryTarget::Visual if own && self.sparse => 0,
-            geometry => geometry.lambda(steps, own, false),
+            GeometryTarget::Visual if above == 0 && self.sparse => 0,
+            geometry => geometry.lambda(steps, above, false),
         }
     }
 
