@@ -14,6 +14,8 @@ OBJECTS = {
 }
 SCORES = {"psnr": ("PSNR", 2), "foreground_psnr": ("foreground PSNR", 2), "ms_ssim": ("MS-SSIM", 4), "ssimulacra2": ("SSIMULACRA2", 1)}
 OURS = ("best", "quick", "surfels")
+# Streams of the highest effort, drawn by `best`.
+REFINED = "effort-9"
 LEARNED = ("lite", "lite-low", "lite-least")
 # Mean differences are taken over these rates, and columns of the summary stand at these, in bits per input point.
 LOW, HIGH = 0.03, 1.0
@@ -127,17 +129,20 @@ def gains(rows, series, peer):
 
 def headline(rows, times):
     """Means over all objects of what each set of heads gains on the peer, and times."""
-    out = [cells([f"compared with {PEER}", *(f"`{who}`" for who in OURS)]), "|---|" + "---:|" * len(OURS)]
-    ours = {who: [(of(rows, name, who), of(rows, name, PEER)) for name in OBJECTS] for who in OURS}
+    columns = {"best": "`best`", REFINED: "`best`, `--effort 9`", "quick": "`quick`", "surfels": "`surfels`"}
+    out = [cells([f"compared with {PEER}", *columns.values()]), "|---|" + "---:|" * len(columns)]
+    ours = {who: [(of(rows, name, who), of(rows, name, PEER)) for name in OBJECTS] for who in columns}
     for score, (title, digits) in SCORES.items():
         unit = ", dB" if "psnr" in score else ""
-        found = [[differences(*pair, score) for pair in ours[who]] for who in OURS]
+        found = [[differences(*pair, score) for pair in pairs] for pairs in ours.values()]
         means = [signed(mean([both and both[0] for both in column]), digits) for column in found]
         out.append(cells([f"{title}{unit}", *means]))
-    logs = [mean([ratio and math.log(ratio) for ratio in (bits_ratio(*pair, "foreground_psnr") for pair in ours[who])]) for who in OURS]
+    ratios = [[bits_ratio(*pair, "foreground_psnr") for pair in pairs] for pairs in ours.values()]
+    logs = [mean([ratio and math.log(ratio) for ratio in column]) for column in ratios]
     out.append(cells(["bits at equal foreground PSNR", *("–" if log is None else f"× {math.exp(log):.2f}" for log in logs)]))
-    out.append(cells(["time to decode", *(f"{times['decode_ms'][who]} ms" for who in OURS)]))
-    return [*out, cells(["time to draw 1024×1024 pixels", f"{times['draw_ms']} ms", *[""] * len(OURS[1:])])]
+    out.append(cells(["time to encode", *(f"{times['encode_s'][who]} s" if who in times["encode_s"] else "" for who in columns)]))
+    out.append(cells(["time to decode", *(f"{times['decode_ms'][who]} ms" if who in times["decode_ms"] else "" for who in columns)]))
+    return [*out, cells(["time to draw 1024×1024 pixels", f"{times['draw_ms']} ms", *[""] * (len(columns) - 1)])]
 
 
 def cells(parts):
@@ -161,9 +166,9 @@ def summary(rows, series):
 def every_point(rows):
     """All series' points; of a peer's drawings the best, score by score."""
     out = [cells(["", "bits/point", "level", *(title for title, _ in SCORES.values())]), "|---|" + "---:|" * (2 + len(SCORES))]
+    order = ["best", REFINED, *OURS[1:], *LEARNED, PEER, VPCC]
     for name, title in OBJECTS.items():
-        own = [row for row in rows if row["object"] == name and row["series"] in (*OURS, *LEARNED, PEER, VPCC)]
-        order = [*OURS, *LEARNED, PEER, VPCC]
+        own = [row for row in rows if row["object"] == name and row["series"] in order]
         points = {}
         for row in sorted(own, key=lambda row: (order.index(row["series"]), row["rate"])):
             points.setdefault((row["series"], row["label"]), []).append(row)
@@ -189,7 +194,7 @@ def optional(rows, option, default, values):
 def shortfalls(rows):
     """Series by series, where a score is below TMC13's, the hybrid's or a learned model's at their rate, between our points."""
     out = {}
-    for series in OURS:
+    for series in (*OURS, REFINED):
         if not any(row["series"] == series for row in rows):
             continue
         lines = out.setdefault(series, [])
@@ -215,7 +220,8 @@ def shortfalls(rows):
 def tables(rows, times):
     """Lines by file and mark."""
     series = "best" if any(row["series"] == "best" for row in rows) else "lite"
-    more = [line for who in (*OURS[1:], *LEARNED) if any(row["series"] == who for row in rows) for line in (*gains(rows, who, PEER), "")]
+    more = [line for who in (REFINED, *OURS[1:], *LEARNED) if any(row["series"] == who for row in rows) for line in (*gains(rows, who, PEER), "")]
+    refined = ["", *gains(rows, REFINED, VPCC)] if any(row["series"] == REFINED for row in rows) else []
     short = shortfalls(rows)
     falls = [f"- `{series}`, {line}" for line in short.get(series, [])]
     falls += [f"- `{who}`: {len(lines)} scores, listed by `python3 docs/rd.py`." for who, lines in short.items() if who != series]
@@ -224,7 +230,7 @@ def tables(rows, times):
         "README.md": {"rd": headline(rows, times)},
         "docs/measurements.md": {
             "rd-summary": summary(rows, series),
-            "rd-gains": [*gains(rows, series, PEER), "", *gains(rows, series, VPCC), "", *more[:-1]],
+            "rd-gains": [*gains(rows, series, PEER), "", *gains(rows, series, VPCC), "", *more[:-1], *refined],
             "rd-short": falls or ["None."],
             "rd-all": every_point(rows),
         },

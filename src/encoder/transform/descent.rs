@@ -67,10 +67,16 @@ fn directions() -> impl Iterator<Item = (f64, f64)> {
 }
 
 impl EncoderInput<'_> {
-    /// Moves colours further than `moves`, for which `coded` was coded, in as many rounds as were asked for. Gives out what
-    /// has the least error and bytes, where a byte is worth the error that coarser steps would bring for it.
-    pub(super) fn descended(&self, coded: Coded, mut moves: Moves, steps: Steps, log: &Log) -> Result<Coded> {
-        let rounds = self.options.rounds;
+    /// Moves colours further than `moves`, for which `coded` was coded, in at most so many rounds. Gives out what has the
+    /// least error and bytes, where a byte is worth the error that coarser steps would bring for it.
+    pub(super) fn descended(
+        &self,
+        coded: Coded,
+        mut moves: Moves,
+        steps: Steps,
+        rounds: usize,
+        log: &Log,
+    ) -> Result<Coded> {
         if rounds == 0 {
             return Ok(coded);
         }

@@ -212,13 +212,13 @@ impl<'a> EncoderInput<'a> {
         let coded = self.code_towards(&truth, top, steps, shape, log)?;
         drop(truth);
         match self.is_refined(steps) {
-            true => self.refined(coded, steps, log),
+            true => self.refined(coded, steps, self.options.rounds, log),
             false => Ok(coded),
         }
     }
 
-    /// The same again, nearer to the cloud as it is drawn.
-    fn refined(&self, coded: Coded, steps: Steps, log: &Log) -> Result<Coded> {
+    /// The same again, nearer to the cloud as it is drawn, with so many `rounds` of descent through pictures.
+    fn refined(&self, coded: Coded, steps: Steps, rounds: usize, log: &Log) -> Result<Coded> {
         let (top, voxels) = (coded.top, coded.colours.len());
         let moves = log.step("compare what is drawn", voxels, "voxels", || self.moves(&coded))?;
         let shape = coded.shape;
@@ -227,7 +227,7 @@ impl<'a> EncoderInput<'a> {
         })?;
         let coded = self.code_towards(&truth, top, steps, shape, log)?;
         drop(truth);
-        self.descended(coded, moves, steps, log)
+        self.descended(coded, moves, steps, rounds, log)
     }
 
     /// The same, of colours that have been computed, without looking at what is drawn.

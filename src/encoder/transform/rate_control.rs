@@ -25,6 +25,9 @@ const COARSEST_OF_LOSSY: u8 = 108;
 /// Up to this step of luma, refined streams look better at equal sizes.
 const SURE: f32 = 32.0;
 
+/// Places that are tried with descent, from the one on that fits without: it adds some bytes.
+const DESCENTS: u8 = 4;
+
 /// Shapes that are kept: places next to each other mostly have the same.
 const SHAPES: usize = 2;
 
@@ -43,6 +46,8 @@ struct Place {
     steps: Steps,
     /// Whether what is drawn is compared with the cloud.
     refined: bool,
+    /// Rounds of descent through pictures, after that.
+    rounds: usize,
 }
 
 /// Codes a cloud as well as it can be with at most so many bits for each of its points, the whole stream counted, and
@@ -102,6 +107,7 @@ pub fn encode_to_rate(
         levels: Some(*levels.start().min(&place.top)..=place.top),
         fineness: QualityTarget::of(place.steps),
         tune: if place.refined { options.tune } else { Tune::Psnr },
+        rounds: place.rounds,
         ..options.clone()
     };
     Ok((encoded, chosen))
@@ -146,6 +152,7 @@ impl Search<'_> {
                 top,
                 steps: Steps::LOSSLESS,
                 refined: false,
+                rounds: 0,
             };
             if let (_, Some(found)) = self.attempt(exact, log)? {
                 return Ok(Some(found));
@@ -154,13 +161,32 @@ impl Search<'_> {
         // Refined streams are larger: of the places that are coarser, the finest that fits then.
         if self.subject.is_refined(best.0.steps) {
             let first = (at + 2).min(range.last);
-            if let Some((_, refined)) = self.finest(range, first, true, log)?
-                && self.looks_better(&refined, &best, log)?
-            {
-                best = refined;
+            if let Some((at, refined)) = self.finest(range, first, true, log)? {
+                let refined = self.descended(range, at, refined, log)?;
+                if self.looks_better(&refined, &best, log)? {
+                    best = refined;
+                }
             }
         }
         Ok(Some(best))
+    }
+
+    /// The finest place from `at` on whose stream fits with descent, if that is asked for; `refined`, which fits without,
+    /// if there is none.
+    fn descended(&mut self, range: LevelRange, at: u8, refined: (Place, Coded), log: &Log) -> Result<(Place, Coded)> {
+        let rounds = self.subject.options.rounds;
+        let tried = if rounds > 0 { DESCENTS } else { 0 };
+        for at in (at..=range.last).take(tried.into()) {
+            let place = Place {
+                steps: steps_at(at),
+                rounds,
+                ..refined.0
+            };
+            if let (_, Some(found)) = self.attempt(place, log)? {
+                return Ok(found);
+            }
+        }
+        Ok(refined)
     }
 
     /// Whether a refined stream looks more like the cloud than one of mean colours, in finer steps.
@@ -200,6 +226,7 @@ impl Search<'_> {
                 top,
                 steps: steps_at(at),
                 refined,
+                rounds: 0,
             };
             let (size, found) = self.attempt(place, log)?;
             let tried = Some(Candidate {
@@ -248,7 +275,12 @@ impl Search<'_> {
     /// Codes at a place: the bytes, and the stream if it fits.
     fn attempt(&mut self, place: Place, log: &Log) -> Result<(f64, Option<(Place, Coded)>)> {
         self.tries += 1;
-        let Place { top, steps, refined } = place;
+        let Place {
+            top,
+            steps,
+            refined,
+            rounds,
+        } = place;
         let how = QualityTarget::of(steps);
         let name = format!("try {}: level {top}, {how}", self.tries);
         let points = self.subject.cloud.voxels.len();
@@ -257,7 +289,7 @@ impl Search<'_> {
             let log = &log.quiet();
             let coded = self.plain(place, shape, log)?;
             match refined {
-                true => self.subject.refined(coded, steps, log),
+                true => self.subject.refined(coded, steps, rounds, log),
                 false => Ok(coded),
             }
         })?;

@@ -1,6 +1,6 @@
 use super::*;
 use crate::cloud::ColouredVoxels;
-use crate::encoder::transform::{Options, QualityTarget, Tune, encode};
+use crate::encoder::transform::{Options, QualityTarget, Tune, encode, encode_to_rate};
 use crate::geometry::morton;
 use crate::placement::Placement;
 
@@ -101,5 +101,19 @@ fn mean_and_exact_colours_have_no_rounds() {
         };
         let coded = |options| encode(&cloud, options, &Log::off()).unwrap().bytes;
         assert!(coded(&usual) == coded(&rounds));
+    }
+}
+
+#[test]
+fn a_stream_of_a_rate_fits_it_and_is_that_of_its_options() {
+    let cloud = walls();
+    let off = Log::off();
+    for most in [0.6, 1.2, 3.0] {
+        let (encoded, chosen) = encode_to_rate(&cloud, &options(2), most, &off).unwrap();
+        assert!(encoded.bytes.len() as f64 * 8.0 <= most * cloud.voxels.len() as f64);
+        assert!(
+            encode(&cloud, &chosen, &off).unwrap().bytes == encoded.bytes,
+            "{most}: {chosen:?}"
+        );
     }
 }
