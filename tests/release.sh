@@ -1,15 +1,25 @@
 #!/usr/bin/env bash
-# The program as it is released decodes the conformance suite to the same bytes as the program of the tests, whose
-# arithmetic is checked for overflow.
+# Builds the optimised program, which must be small enough, runs its demo, and decodes the conformance suite to the same
+# bytes as the program of the tests, whose arithmetic is checked for overflow.
 #
-#     tests/release.sh [RELEASED [TESTED]]    by default target/release/b2p and target/debug/b2p
+#     tests/release.sh [RELEASED [TESTED]]    programs to compare, which are not built then
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-released=${1:-target/release/b2p}
-tested=${2:-target/debug/b2p}
+target=${CARGO_TARGET_DIR:-target}
+released=${1:-$target/release/b2p}
+tested=${2:-$target/debug/b2p}
+most_bytes=21000000
 out=$(mktemp -d)
 trap 'rm -rf "$out"' EXIT
+
+[ $# -ge 1 ] || cargo build --locked --release -p b2p-cli
+[ $# -ge 2 ] || cargo build --locked -p b2p-cli
+
+size=$(stat -c %s "$released")
+echo "$released: $size bytes, at most $most_bytes are allowed"
+[ "$size" -le $most_bytes ]
+"$released" -q demo -o "$out/demo"
 
 count=0
 same() { # STREAM ARGUMENT …

@@ -1,6 +1,28 @@
-//! `b2p render` and `b2p bench --render`.
+//! `b2p demo`, `b2p render` and `b2p bench --render`.
 
 use super::*;
+
+#[test]
+fn the_demo_writes_gaussians_of_each_level_and_pictures_of_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let report = succeeds(at, &["demo"]);
+    let demo = at.join("b2p-demo");
+    for level in [7, 8, 9] {
+        let written = [".ply", "-front.png", "-close.png"].map(|end| format!("level-{level}{end}"));
+        for name in &written {
+            assert!(
+                report.contains(&format!("b2p-demo/{name}")),
+                "{name} should be reported: {report}"
+            );
+        }
+        let [front, close] = ["front", "close"].map(|view| png(&demo.join(format!("level-{level}-{view}.png"))));
+        assert!(front.data() != close.data());
+        // Gaussians are drawn like those of any file.
+        succeeds(&demo, &["render", &written[0], "-o", "again.png", "--size", "64x64"]);
+    }
+    assert_eq!(names_in(&demo).len(), 10);
+}
 
 #[test]
 fn several_views_are_numbered_and_differ() {
