@@ -41,7 +41,7 @@ class Level:
     colours: dict = field(default_factory=dict)  # level -> [payload]
     colour_hash: int = None
     filter: bytes = None
-    head_map: bytes = None
+    head_map: Chunk = None
 
 
 def check_counts(header, clause):
@@ -173,7 +173,7 @@ def read_geometry_trunk(chunks, header, counts, result):
 def read_colours(chunks, header, counts, result):
     """3.3"""
     level = result.level
-    maps = [chunk.payload for chunk in chunks.head_maps if chunk.level == level]
+    maps = [chunk for chunk in chunks.head_maps if chunk.level == level]
     result.head_map = maps[0] if maps else None
 
     def payload(chunk):

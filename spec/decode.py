@@ -73,16 +73,17 @@ class Decoder:
         drawn = self.drawn(level, part.head_map, shown_steps)
         return heads.Level(voxels, self.header.bits, displayed(values, steps), before, above, [drawn])
 
-    def drawn(self, level, payload, steps):
+    def drawn(self, level, chunk, steps):
         """7.2.3, 7.5: what the stream says of how a level is drawn."""
         up = min(level, 3)
         keys = self.levels[level].keys
         blocks = self.levels[level - up].keys
-        found = payload and head_map.parse(payload, len(blocks))
+        found = chunk and head_map.parse(chunk.payload, len(blocks))
         *sizes, how, bits = found or (64, 64, 0, [0] * len(blocks))
+        thickness = head_map.thickness(chunk.count) if found else (0, 0)
         is_disc = dict(zip(blocks, bits))
         discs = None if how == 1 else [is_disc[key >> 3 * up] for key in keys]
-        return heads.Part(range(len(keys)), steps.units(), sizes, discs)
+        return heads.Part(range(len(keys)), steps.units(), sizes, thickness, discs)
 
     def show(self, level, own_filter, steps):
         """17.4.3: the filter of a level, and the steps that it has for 5.11."""

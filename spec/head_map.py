@@ -4,6 +4,11 @@ from base import Refused, clamp
 from coefficients import RangeDecoder
 
 
+def thickness(count):
+    """7.5.5: of learned Gaussians and of surfels, in 128ths of a voxel."""
+    return count % 128, min(count // 128, 127)
+
+
 def parse(payload, blocks):
     """Both sizes in 64ths, `how`, and a bit for each block; None if the payload is no head map."""
     if len(payload) < 3 or 0 in payload[:2] or payload[2] > 2 or payload[2] < 2 and len(payload) > 3:

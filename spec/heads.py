@@ -21,6 +21,7 @@ class Part:
     rows: range
     units: tuple  # 5.3.4
     sizes: tuple  # 7.5.1: `mixed` and `alone`
+    thickness: tuple  # 7.5.5: of learned Gaussians and of surfels
     discs: list  # 7.5.2: for each of its voxels whether it is drawn as surfels; None for all
 
 
@@ -288,12 +289,15 @@ def gaussians(level, model=None, heads=None):
 
     mixed, alone = 0, 1
     for part in level.parts:
+        learned_by, discs_by = (F(T) / F(128) * (F(2) / F(1 << level.voxels.level)) for T in part.thickness)
         if nodes is None or part.discs is None or sparse(level, part.rows):
-            yield discs(alone).of([count * i + k for i in part.rows for k in range(count)])
+            drawn = discs(alone).of([count * i + k for i in part.rows for k in range(count)])
+            yield drawn.thicker(discs_by)
             continue
         network = model.network(heads, level.voxels.level, level.bits)
         parents, children = inputs(level, nodes, coarseness(part.units))
         raw = network.run(nodes, parents, level.voxels, children)
         learned = [i for i, disc in zip(part.rows, part.discs) if not disc]
         drawn = [count * i + k for i, disc in zip(part.rows, part.discs) if disc for k in range(count)]
-        yield activated(level, learned, raw[learned]).followed_by(discs(mixed).of(drawn))
+        drawn = discs(mixed).of(drawn).thicker(discs_by)
+        yield activated(level, learned, raw[learned]).thicker(learned_by).followed_by(drawn)

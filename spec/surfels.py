@@ -1,6 +1,6 @@
 """Closed-form Gaussians: clause 6 of docs/format.md."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,16 @@ class Gaussians:
     def of(self, rows):
         """Some of them."""
         return Gaussians(*(array[rows] for array in vars(self).values()))
+
+    def thicker(self, by):
+        """7.5.5: by so much in the cube frame."""
+        if by == 0:
+            return self
+        scale, rows = self.scale.copy(), np.arange(len(self.scale))
+        least = scale.argmin(axis=1)
+        s = scale[rows, least]
+        scale[rows, least] = np.sqrt(s * s + by * by)
+        return replace(self, scale=scale)
 
     def followed_by(self, others):
         both = zip(vars(self).values(), vars(others).values())

@@ -124,7 +124,9 @@ pub use cloud::{
 pub use container::{Format, Header};
 pub use decoder::{Decoder, Decoding, Points};
 #[cfg(feature = "encoder")]
-pub use encoder::{Encoded, Encoder, Rate, transform::GeometryTarget, transform::QualityTarget, transform::Tune};
+pub use encoder::{
+    Encoded, Encoder, Rate, transform::GeometryTarget, transform::Outline, transform::QualityTarget, transform::Tune,
+};
 pub use error::{Error, Result, Stage};
 pub use gaussians::learned::HeadsModel;
 pub use gaussians::{Frame, Gaussians, Harmonics, HeadSet};

@@ -6,9 +6,9 @@ use b2p::Decoder;
 use b2p::Limits;
 use b2p::cloud::ColouredVoxels;
 use b2p::container::Stream;
-use b2p::encoder::transform::{Options, QualityTarget, encode, encode_to_rate};
-use b2p::gaussians::HeadSet;
+use b2p::encoder::transform::{Options, Outline, QualityTarget, encode, encode_to_rate};
 use b2p::gaussians::learned::HeadsModel;
+use b2p::gaussians::{Gaussians, HeadSet};
 use b2p::log::Log;
 use common::{Ball, sparse_wall};
 
@@ -80,6 +80,55 @@ fn a_stream_with_head_maps_keeps_its_points_and_its_rate_and_mixes_surfels_with_
         most = f64::max(most, if learned < 1.0 { surfels } else { 0.0 });
     }
     assert!(most > 0.3, "{most}");
+}
+
+/// In single parts of a level.
+fn in_parts(decoder: &Decoder, bytes: &[u8]) -> Vec<[f32; 3]> {
+    let mut scales = Vec::new();
+    let parts = decoder.clone().with_gaussians_in_parts();
+    let done = parts.decode_in_parts(bytes, |part| {
+        scales.extend_from_slice(&part.scale);
+        Ok(())
+    });
+    done.unwrap();
+    scales
+}
+
+#[test]
+fn gaussians_that_reach_as_far_as_the_cloud_s_surfels_are_thicker_and_else_the_same() {
+    let cloud = Ball::new(8, 60.0).cloud();
+    let heads = heads();
+    let [surface, reaching] = [Outline::Surface, Outline::Cloud].map(|outline| {
+        let options = Options {
+            heads: Some(heads.clone()),
+            outline,
+            ..with(QualityTarget::Step(20.0))
+        };
+        stream(&cloud, &options)
+    });
+    assert_eq!(points(&surface, None), points(&reaching, None));
+    // A byte more for each of the three levels that has surfels which are thicker.
+    assert!((surface.len()..=surface.len() + 3).contains(&reaching.len()));
+    let mut thicker = [0, 0];
+    for level in 5..=7 {
+        for (thicker, heads_of) in thicker.iter_mut().zip([HeadSet::Best, HeadSet::Surfels]) {
+            let decoder = Decoder::new().with_heads_model(heads.clone());
+            let decoder = decoder.with_heads(heads_of).with_level(level);
+            let usual = decoder.decode(&surface).unwrap();
+            let drawn = decoder.decode(&reaching).unwrap();
+            for (usual, drawn) in usual.scale.iter().zip(&drawn.scale) {
+                let axis = (0..3).find(|&axis| usual[axis] != drawn[axis]);
+                *thicker += usize::from(axis.is_some());
+                let least = usual.iter().copied().fold(f32::INFINITY, f32::min);
+                assert!(axis.is_none_or(|axis| usual[axis] == least && drawn[axis] > least));
+                assert!((0..3).all(|other| Some(other) == axis || usual[other] == drawn[other]));
+            }
+            assert_eq!(in_parts(&decoder, &reaching), drawn.scale);
+            let scale = usual.scale.clone();
+            assert!(Gaussians { scale, ..drawn } == usual, "level {level}, {heads_of}");
+        }
+    }
+    assert!(thicker.iter().all(|&thicker| thicker > 1000), "{thicker:?}");
 }
 
 #[test]

@@ -199,6 +199,7 @@ def encode(
     levels: tuple[int, int] | None = None,
     effort: int | None = None,
     tune: str | None = None,
+    outline: str = "surface",
     filter: bool = True,
     head_maps: bool = True,
     block_size: int | None = None,

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use b2p::cloud::{voxelise, voxelise_closed};
-use b2p::encoder::transform::{self, GeometryTarget, Options, QualityTarget, Tune};
+use b2p::encoder::transform::{self, GeometryTarget, Options, Outline, QualityTarget, Tune};
 use b2p::scene::{BLOCK_VOXELS, ONE_PIECE};
 use b2p::{Cancel, Error, Limits, Log, PointCloud, Result, SceneEncoder, container};
 use pyo3::prelude::*;
@@ -24,6 +24,7 @@ struct Asked {
     quality: Option<u8>,
     effort: Option<u8>,
     tune: Option<Tune>,
+    outline: Outline,
     head_maps: bool,
     /// Voxels of a block at most, for clouds with more than that; by default those of the program.
     block_size: Option<usize>,
@@ -62,6 +63,9 @@ struct Asked {
 ///     0 (quick) to 9; 8 and 9 compare pictures from all sides, and take 3 and 5 times as long. Default: 7.
 /// tune : "visual" or "psnr"
 ///     What coded colours approach: those with which the cloud is drawn as it is, or the mean colours of voxels.
+/// outline : "surface" or "cloud"
+///     How far Gaussians reach: to the surface that the points sample, or as far as the cloud itself does when it is drawn
+///     as surfels, for captures.
 /// filter : bool
 ///     Whether the stream has the colour filter, which decoders apply before they draw.
 /// head_maps : bool
@@ -85,8 +89,8 @@ struct Asked {
 ///     The stream or scene, which `decode`, `decode_points`, `open`, `info` and `render` take.
 #[pyfunction]
 #[pyo3(signature = (xyz, rgb=None, *, bits=None, bits_per_point=None, quality=None, step=None, lossless=false,
-    geometry=None, levels=None, effort=None, tune=None, filter=true, head_maps=true, block_size=None, blocks=true,
-    up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
+    geometry=None, levels=None, effort=None, tune=None, outline="surface", filter=true, head_maps=true,
+    block_size=None, blocks=true, up=None, unit=None, crs=None, limits=None, threads=None, progress=None))]
 pub fn encode<'py>(
     py: Python<'py>,
     xyz: &Bound<'py, PyAny>,
@@ -100,6 +104,7 @@ pub fn encode<'py>(
     levels: Option<(u8, u8)>,
     effort: Option<u8>,
     tune: Option<&str>,
+    outline: &str,
     filter: bool,
     head_maps: bool,
     block_size: Option<usize>,
@@ -135,6 +140,7 @@ pub fn encode<'py>(
         quality,
         effort,
         tune: tune.map(|tune| tuned(py, tune)).transpose()?,
+        outline: outlined(py, outline)?,
         head_maps,
         block_size,
         blocks,
@@ -233,6 +239,18 @@ fn tuned(py: Python<'_>, tune: &str) -> PyResult<Tune> {
     }
 }
 
+/// How far Gaussians reach.
+fn outlined(py: Python<'_>, outline: &str) -> PyResult<Outline> {
+    match outline {
+        "surface" => Ok(Outline::Surface),
+        "cloud" => Ok(Outline::Cloud),
+        _ => Err(errors::usage(
+            py,
+            format!("outline is '{outline}', expected 'surface' or 'cloud'"),
+        )),
+    }
+}
+
 /// One step, or luma's and chroma's.
 fn steps(step: &Bound<'_, PyAny>) -> PyResult<QualityTarget> {
     if let Ok(luma) = step.extract() {
@@ -251,6 +269,7 @@ fn code(cloud: &PointCloud, asked: Asked, cancel: &Cancel, log: &Log) -> Result<
     let mut options = asked.options;
     options.heads = Some(source::embedded_heads()?);
     options.head_maps = asked.head_maps;
+    options.outline = asked.outline;
     if let Some(quality) = asked.quality {
         options.set_quality(quality, grid.voxels.depth());
     }

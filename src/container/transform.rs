@@ -21,7 +21,7 @@ pub struct Colours<'a> {
     pub hash: u64,
     /// The colour filter of this level.
     pub filter: Option<Slice<'a>>,
-    /// Where surfels take the place of learned Gaussians.
+    /// Where surfels take the place of learned Gaussians; in place of voxels, how much thicker Gaussians are.
     pub head_map: Option<Slice<'a>>,
 }
 

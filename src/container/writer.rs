@@ -159,13 +159,16 @@ impl Writer {
         self.extend_colours(section, start)
     }
 
-    /// Version 3: adds the head map of `level`, as the last chunk of its section.
+    /// Version 3: adds the head map of `level`, as the last chunk of its section, with learned Gaussians and
+    /// surfels that are thicker by so many 128ths of a voxel, at most 127.
     ///
     /// # Errors
     /// [`Error::Usage`] if the stream has no such level.
-    pub fn head_map(&mut self, level: u8, payload: &[u8]) -> Result<()> {
+    pub fn head_map(&mut self, level: u8, thickness: [u8; 2], payload: &[u8]) -> Result<()> {
+        let [learned, surfels] = thickness.map(u32::from);
+        let thickness = learned + 128 * surfels;
         let (section, start) = (self.header.index(level)?, self.body.len());
-        self.chunk(ChunkKind::HeadMap, level, 0, 0, &[], payload)?;
+        self.chunk(ChunkKind::HeadMap, level, 0, thickness, &[], payload)?;
         self.extend_colours(section, start)
     }
 

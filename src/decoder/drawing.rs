@@ -37,6 +37,8 @@ pub(crate) struct Advice {
     pub all_surfels: bool,
     /// Factors of the surfels' radii: among learned Gaussians, and where all voxels are surfels.
     pub sizes: [f32; 2],
+    /// Standard deviations, in the cube frame, by which learned Gaussians and surfels are thicker.
+    pub thickness: [f32; 2],
 }
 
 /// Called with the Gaussians of one part after the other.
@@ -85,10 +87,12 @@ impl LevelVoxels {
 
 impl Advice {
     fn of(reached: &Reached) -> Self {
+        let heads = reached.head_map.as_ref();
         Advice {
             luma_step: reached.luma_step(),
             all_surfels: reached.advises_surfels(),
-            sizes: reached.head_map.as_ref().map_or([1.0; 2], HeadMap::sizes),
+            sizes: heads.map_or([1.0; 2], HeadMap::sizes),
+            thickness: heads.map_or([0.0; 2], |heads| heads.thickness_at(reached.level)),
         }
     }
 }
@@ -170,6 +174,7 @@ impl Decoder {
         };
         let level = part.level;
         let [mixed, alone] = part.advice.sizes;
+        let [thickness, thickness_of_discs] = part.advice.thickness;
         let discs = |only: Option<&[bool]>, size: f32, blur: Option<f32>, each: Option<&mut Each<'_>>| {
             let range = Some(&part.range);
             let surfels = Surfels {
@@ -182,10 +187,13 @@ impl Decoder {
                 frame,
             };
             let Some(each) = each else {
-                return Ok(surfels.all());
+                let mut drawn = surfels.all();
+                drawn.thicken(thickness_of_discs);
+                return Ok(drawn);
             };
             surfels.in_parts(|mut drawn| {
                 self.cancel().check()?;
+                drawn.thicken(thickness_of_discs);
                 drawn.blur = blur.unwrap_or(drawn.blur);
                 each(&drawn)
             })?;
@@ -219,12 +227,14 @@ impl Decoder {
         let mut taken = |drawn: &mut Gaussians| {
             self.cancel().check()?;
             if let Some(each) = &mut each {
+                drawn.thicken(thickness);
                 each(drawn)?;
                 drawn.clear();
             }
             Ok(())
         };
         let mut gaussians = model.generate_in_parts(isa, precision, set, input, frame, rows, &mut taken)?;
+        gaussians.thicken(thickness);
         if part.surfels.is_some() {
             let chosen = part.chosen_that(is_surfels);
             gaussians.append(discs(Some(&chosen), mixed, Some(gaussians.blur), each)?);

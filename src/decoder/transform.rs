@@ -151,7 +151,9 @@ impl<'b> Transform<'b> {
                 });
                 let blocks = HeadMap::block_count(&octree, level);
                 let head_map = colours.head_map.as_ref();
-                let head_map = head_map.and_then(|map| HeadMap::parse(map.bytes, blocks));
+                let head_map = head_map.and_then(|map| {
+                    Some(HeadMap::parse(map.bytes, blocks)?.with_thickness(HeadMap::thickness_of(map.voxels)))
+                });
                 let own = coloured.steps();
                 let steps = inherited.filter(|steps| steps.is_lossless() == own.is_lossless());
                 let steps = steps.unwrap_or(own);

@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use b2p_kernels::Isa;
 
-use super::transform::{self, GeometryTarget, QualityTarget, Tune};
+use super::transform::{self, GeometryTarget, Outline, QualityTarget, Tune};
 use super::{Encoded, Options, encode, encode_to_rate};
 use crate::cancel::Cancel;
 use crate::cloud::ColouredVoxels;
@@ -71,6 +71,13 @@ impl Encoder {
     /// [`Tune::Visual`].
     pub fn with_tune(mut self, tune: Tune) -> Self {
         self.options.tune = tune;
+        self
+    }
+
+    /// The same encoder for Gaussians that reach as far as this. Without effect on streams of version 2, and without
+    /// [heads](Encoder::with_heads_model). Default: [`Outline::Surface`].
+    pub fn with_outline(mut self, outline: Outline) -> Self {
+        self.options.outline = outline;
         self
     }
 

@@ -11,6 +11,8 @@ use crate::geometry::Octree;
 const BLOCK: u8 = 3;
 /// A size of surfels that is the usual one.
 const USUAL: f32 = 64.0;
+/// Greatest thickness, in 128ths of a voxel.
+const THICKEST: u8 = 127;
 /// Shift of the adaptation of probabilities.
 const RATE: u32 = 4;
 
@@ -19,6 +21,9 @@ const RATE: u32 = 4;
 pub struct HeadMap {
     /// Factors of the surfels' radii, in 64ths, not 0: among learned Gaussians, and where all voxels are surfels.
     sizes: [u8; 2],
+    /// What is added to the least variance of learned Gaussians and of surfels, as a standard deviation in 128ths of a
+    /// voxel.
+    thickness: [u8; 2],
     blocks: Blocks,
 }
 
@@ -90,8 +95,22 @@ impl HeadMap {
         };
         HeadMap {
             sizes: [mixed, alone],
+            thickness: [0; 2],
             blocks,
         }
+    }
+
+    /// The same with learned Gaussians and surfels that are thicker by so many 128ths of a voxel, at most 127.
+    #[must_use]
+    pub fn with_thickness(self, thickness: [u8; 2]) -> Self {
+        let thickness = thickness.map(|thickness| thickness.min(THICKEST));
+        HeadMap { thickness, ..self }
+    }
+
+    /// The thickness that a chunk states in place of a number of voxels.
+    pub(crate) fn thickness_of(count: u32) -> [u8; 2] {
+        let base = u32::from(THICKEST) + 1;
+        [count % base, (count / base).min(THICKEST.into())].map(|thickness| thickness as u8)
     }
 
     /// Parses the payload of a level with so many blocks. `None` if it is none: a map is only advice.
@@ -110,7 +129,11 @@ impl HeadMap {
             _ => return None,
         };
         let sizes = [mixed, alone];
-        (!sizes.contains(&0)).then_some(HeadMap { sizes, blocks })
+        (!sizes.contains(&0)).then_some(HeadMap {
+            sizes,
+            thickness: [0; 2],
+            blocks,
+        })
     }
 
     /// The payload.
@@ -138,6 +161,17 @@ impl HeadMap {
     /// Factors of the surfels' radii: among learned Gaussians, and where all voxels are surfels.
     pub fn sizes(&self) -> [f32; 2] {
         self.sizes.map(|size| f32::from(size) / USUAL)
+    }
+
+    /// How much thicker learned Gaussians and surfels are, in 128ths of a voxel.
+    pub fn thickness(&self) -> [u8; 2] {
+        self.thickness
+    }
+
+    /// The same as lengths in the cube frame, of a map of this level.
+    pub fn thickness_at(&self, level: u8) -> [f32; 2] {
+        let voxel = 2.0 / (1u32 << level) as f32;
+        self.thickness.map(|thickness| f32::from(thickness) / 128.0 * voxel)
     }
 
     /// Bytes of a map that is the same for all blocks.
@@ -178,6 +212,21 @@ mod tests {
     use super::*;
     use crate::geometry::{Voxels, morton};
     use proptest::prelude::*;
+
+    #[test]
+    fn the_count_of_the_chunk_tells_how_thick_learned_gaussians_and_surfels_are() {
+        let map = HeadMap::new(54, 64, vec![true; 9]);
+        assert_eq!(map.clone().with_thickness(HeadMap::thickness_of(0)), map);
+        for thickness in [[0, 1], [3, 0], [127, 127]] {
+            let [learned, surfels] = thickness.map(u32::from);
+            assert_eq!(HeadMap::thickness_of(learned + 128 * surfels), thickness);
+        }
+        assert_eq!(HeadMap::thickness_of(u32::MAX), [127, 127]);
+        assert_eq!(
+            map.with_thickness([64, 200]).thickness_at(7),
+            [1.0 / 128.0, 127.0 / 8192.0]
+        );
+    }
 
     #[test]
     fn a_block_holds_the_voxels_below_a_voxel_three_levels_above() {

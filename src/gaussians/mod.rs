@@ -178,6 +178,18 @@ impl Gaussians {
         self.colour.clear();
     }
 
+    /// Adds the variance of this standard deviation, in cube-frame units, to the least one of each.
+    pub(crate) fn thicken(&mut self, by: f32) {
+        if by == 0.0 {
+            return;
+        }
+        for scale in &mut self.scale {
+            let [a, b, c] = *scale;
+            let least = if a <= b && a <= c { 0 } else { 2 - usize::from(b <= c) };
+            scale[least] = (scale[least] * scale[least] + by * by).sqrt();
+        }
+    }
+
     /// Appends other Gaussians of the same frame, without harmonics.
     pub(crate) fn append(&mut self, mut other: Gaussians) {
         self.position.append(&mut other.position);

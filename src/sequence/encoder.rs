@@ -1,5 +1,6 @@
 //! Clouds on one grid to a sequence.
 
+use std::borrow::Cow;
 use std::fmt::Debug;
 use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
@@ -14,7 +15,7 @@ use crate::cloud::ColouredVoxels;
 use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
 use crate::container::{Header, with_axes};
 use crate::decoder::Decoder;
-use crate::encoder::transform::{self, GeometryTarget, Options, PredictedFrame, QualityTarget, Tune};
+use crate::encoder::transform::{self, GeometryTarget, Options, Outline, PredictedFrame, QualityTarget, Tune};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -198,14 +199,46 @@ impl SequenceEncoder {
             let what = format!("a group lasts less than 2^32 ticks, not {longest}");
             return Err(Error::Usage(what));
         }
+        self.outlined(&cloud)?.encode_groups(count, &cloud, &done)
+    }
+
+    /// The same encoder, whose frames have Gaussians as thick as is chosen for the first one, if they are to reach as far
+    /// as the cloud.
+    fn outlined(&self, cloud: &(impl Fn(u64) -> Result<ColouredVoxels> + Sync)) -> Result<Cow<'_, Self>> {
+        if self.options.outline == Outline::Surface || !self.options.has_head_maps() {
+            return Ok(Cow::Borrowed(self));
+        }
+        let options = Options {
+            geometry: self.geometry,
+            ..self.options.clone()
+        };
+        let first = cloud(0).and_then(|cloud| transform::encode(&cloud, &options, &self.log()));
+        let first = first.map_err(|error| in_frame(0, error))?;
+        let mut encoder = self.clone();
+        encoder.options = Options {
+            thickness: transform::thickness_of(&first.bytes)?,
+            outline: Outline::Surface,
+            heads: None,
+            ..options
+        };
+        encoder.options.geometry = self.options.geometry;
+        Ok(Cow::Owned(encoder))
+    }
+
+    fn encode_groups(
+        &self,
+        count: u64,
+        cloud: &(impl Fn(u64) -> Result<ColouredVoxels> + Sync),
+        done: &(impl Fn(u64) + Sync),
+    ) -> Result<Vec<u8>> {
         let size = u64::from(self.group);
         let groups = (0..count.div_ceil(size)).into_par_iter().map(|group| {
             let frames = group * size..count.min((group + 1) * size);
             if let Some(kept) = self.kept_group(&frames) {
-                frames.for_each(&done);
+                frames.for_each(done);
                 return Ok(kept);
             }
-            let coded = self.code_group(frames.clone(), &cloud, &done)?;
+            let coded = self.code_group(frames.clone(), cloud, done)?;
             self.keep(frames, &coded)?;
             Ok(coded)
         });
@@ -227,13 +260,6 @@ impl SequenceEncoder {
         cloud: &(impl Fn(u64) -> Result<ColouredVoxels> + Sync),
         done: &(impl Fn(u64) + Sync),
     ) -> Result<Group> {
-        let in_frame = |frame, error| match error {
-            Error::Cancelled => Error::Cancelled,
-            source => Error::Frame {
-                frame,
-                source: Box::new(source),
-            },
-        };
         let mut common: Option<Header> = None;
         let (mut all, mut previous): (Vec<Coded>, _) = (Vec::new(), None);
         for frame in frames.clone() {
@@ -348,6 +374,17 @@ impl SequenceEncoder {
 
     fn log(&self) -> Log {
         Log::off().with_cancel(self.cancel.clone())
+    }
+}
+
+/// The error of a frame.
+fn in_frame(frame: u64, error: Error) -> Error {
+    match error {
+        Error::Cancelled => Error::Cancelled,
+        source => Error::Frame {
+            frame,
+            source: Box::new(source),
+        },
     }
 }
 

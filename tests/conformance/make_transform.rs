@@ -56,14 +56,20 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         ("exact-deepest", code(&lone, 21..=21, lossless, 16, true), true),
         (
             "exact-head-maps",
-            with_head_maps(&code(&large, 4..=6, lossless, 32_768, true), &large),
+            with_head_maps(&code(&large, 4..=6, lossless, 32_768, true), &large, [0; 2]),
+            true,
+        ),
+        (
+            "exact-thicker",
+            with_head_maps(&code(&large, 4..=6, lossless, 32_768, true), &large, [23, 101]),
             true,
         ),
     ]
 }
 
-/// The stream of a cloud with head maps: some blocks of its levels are surfels, and all of level 5.
-fn with_head_maps(bytes: &[u8], cloud: &ColouredVoxels) -> Vec<u8> {
+/// The stream of a cloud with head maps: some blocks of its levels are surfels, and all of level 5. Learned Gaussians and
+/// surfels are so much thicker.
+fn with_head_maps(bytes: &[u8], cloud: &ColouredVoxels, thickness: [u8; 2]) -> Vec<u8> {
     let stream = Stream::parse(bytes, &Limits::default()).expect("a stream of the encoder");
     let mut writer = Writer::new(stream.header().clone()).expect("the header of a stream");
     for level in stream.levels() {
@@ -73,7 +79,7 @@ fn with_head_maps(bytes: &[u8], cloud: &ColouredVoxels) -> Vec<u8> {
         blocks.dedup();
         let surfels = blocks.iter().map(|block| level.level == 5 || block % 3 == 0);
         let map = HeadMap::new(80, 70 - level.level, surfels.collect());
-        let added = writer.head_map(level.level, &map.to_bytes());
+        let added = writer.head_map(level.level, thickness, &map.to_bytes());
         added.expect("a level of the stream");
     }
     writer.finish().expect("all levels of a stream")

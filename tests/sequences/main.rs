@@ -6,6 +6,8 @@ mod kept;
 mod predicted;
 
 use b2p::cloud::ColouredVoxels;
+use b2p::encoder::transform::{Options, Outline};
+use b2p::gaussians::learned::HeadsModel;
 use b2p::geometry::{Voxels, morton};
 use b2p::sequence::{Rate, join};
 use b2p::{Decoder, Error, Limits, Placement, SequenceDecoder, SequenceEncoder, SequenceReader};
@@ -107,6 +109,50 @@ fn a_sequence_does_not_depend_on_the_number_of_threads() {
             .build()
             .expect("threads");
         assert!(pool.install(|| encoded(7)) == bytes);
+    }
+}
+
+#[test]
+fn frames_that_reach_as_far_as_the_cloud_are_all_as_thick_as_its_first() {
+    let coded = |outline| {
+        let heads = HeadsModel::from_bytes(include_bytes!("../../models/heads.safetensors"));
+        let options = Options {
+            // They make head maps of other kinds for single frames.
+            heads: heads.ok().filter(|_| outline == Outline::Cloud),
+            tune: b2p::Tune::Psnr,
+            outline,
+            ..Options::default()
+        };
+        let encoder = SequenceEncoder::new()
+            .with_options(options)
+            .with_levels(3..=5)
+            .with_group(3);
+        encoder
+            .encode(5, |frame| Ok(moving(frame)), |_| {})
+            .expect("a sequence")
+    };
+    let [surface, cloud] = [Outline::Surface, Outline::Cloud].map(coded);
+    for level in 3..=5 {
+        let mut variance = None;
+        for frame in 0..5 {
+            let [usual, drawn] = [&surface, &cloud].map(|bytes| {
+                let sequence = reader(bytes);
+                let mut decoder = SequenceDecoder::new(Decoder::new().with_level(level));
+                let mut gaussians = decoder.gaussians(&sequence, frame..frame + 1);
+                gaussians.next().expect("a frame").expect("Gaussians")
+            });
+            assert_eq!(usual.position, drawn.position);
+            let squares = |scale: &[f32; 3]| scale.iter().map(|s| f64::from(*s).powi(2)).sum::<f64>();
+            for (usual, drawn) in usual.scale.iter().zip(&drawn.scale) {
+                let added = squares(drawn) - squares(usual);
+                let first = *variance.get_or_insert(added);
+                assert!(
+                    (added - first).abs() < 1e-7,
+                    "level {level}, frame {frame}: {added}, {first}"
+                );
+            }
+        }
+        assert!(variance.is_some_and(|variance| variance > 1e-6), "level {level}");
     }
 }
 

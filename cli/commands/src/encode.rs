@@ -188,6 +188,7 @@ fn transform_options(args: &Encode, bits: u8) -> Result<transform::Options> {
         isa: Some(load::isa(model.isa.as_deref())?),
         heads: Some(load::heads(None)?),
         head_maps: !args.no_head_maps,
+        outline: args.outline.unwrap_or_default(),
         ..transform::Options::default()
     };
     if let Some(quality) = args.quality {
@@ -234,8 +235,8 @@ fn learned(args: &Encode, cloud: &ColouredVoxels, reserved: f64, log: &Log) -> R
         let what = "--step and --lossless are for --colours transform";
         return Err(Failure(what.into()));
     }
-    if args.quality.is_some() || args.effort.is_some() || args.tune.is_some() {
-        let what = "--quality, --effort and --tune are for --colours transform";
+    if args.quality.is_some() || args.effort.is_some() || args.tune.is_some() || args.outline.is_some() {
+        let what = "--quality, --effort, --tune and --outline are for --colours transform";
         return Err(Failure(what.into()));
     }
     let model = load::model(&args.model)?;

@@ -4,7 +4,7 @@ use std::num::NonZeroU8;
 use std::ops::RangeInclusive;
 
 use b2p::encoder::Residual;
-use b2p::encoder::transform::{GeometryTarget, QualityTarget, Tune};
+use b2p::encoder::transform::{GeometryTarget, Outline, QualityTarget, Tune};
 use b2p::latents::Steps;
 use b2p::renderer::{Background, Effect, EffectMode};
 
@@ -116,6 +116,14 @@ pub fn tune(text: &str) -> Result<Tune, String> {
         "visual" => Ok(Tune::Visual),
         "psnr" => Ok(Tune::Psnr),
         _ => Err("expected visual or psnr".into()),
+    }
+}
+
+pub fn outline(text: &str) -> Result<Outline, String> {
+    match text {
+        "surface" => Ok(Outline::Surface),
+        "cloud" => Ok(Outline::Cloud),
+        _ => Err("expected surface or cloud".into()),
     }
 }
 

@@ -1,15 +1,15 @@
 //! Decodes what was coded, and compares, before a stream is given out. Head maps are made meanwhile, as they need what
 //! decoders draw.
 
-use super::reference::Reference;
+use super::reference::{Reference, closed};
 use super::writing::Coded;
-use super::{EncoderInput, head_maps, surfel_size};
+use super::{EncoderInput, Outline, head_maps, surfel_size, thickness};
 use crate::container::Header;
 use crate::decoder::{Decoder, Decoding};
 use crate::encoder::{Encoded, rates};
 use crate::error::{Error, Result};
-use crate::gaussians::HeadMap;
 use crate::gaussians::learned::HeadsModel;
+use crate::gaussians::{Gaussians, HeadMap};
 use crate::geometry::Octree;
 use crate::limits::Limits;
 use crate::log::Log;
@@ -21,6 +21,8 @@ struct References {
     cloud: Reference,
     /// Of the cloud's own level, where surfels may have another size.
     own: Vec<Image>,
+    /// The cloud as surfels, if Gaussians are to reach as far.
+    outline: Option<Gaussians>,
 }
 
 impl EncoderInput<'_> {
@@ -35,7 +37,7 @@ impl EncoderInput<'_> {
         let mut decoding = decoder.with_level(top).start();
         decoding.push(&coded.bytes);
         let heads = self.options.heads.as_ref();
-        let references = match heads.filter(|_| head_maps && self.has_head_maps(top)) {
+        let mut references = match heads.filter(|_| head_maps && self.has_head_maps(top)) {
             Some(heads) => {
                 decoding.set_heads_model(heads.clone());
                 Some(self.references(top, heads, log)?)
@@ -45,7 +47,7 @@ impl EncoderInput<'_> {
         let mut maps = Vec::new();
         let same = log.step("decode again", voxels.len(), "voxels", || {
             while let Some(level) = decoding.advance()? {
-                if let Some(references) = &references {
+                if let Some(references) = &mut references {
                     let map = self.compared_map(octree, references, &mut decoding, level)?;
                     maps.extend(map.map(|map| (level, map)));
                 }
@@ -60,7 +62,7 @@ impl EncoderInput<'_> {
         }
         for (level, map) in maps {
             if let Some(layer) = coded.layers.iter_mut().find(|layer| layer.level == level) {
-                layer.head_map = Some(map.to_bytes());
+                layer.head_map = Some(map);
             }
         }
         let mapped = self.written(&coded)?;
@@ -86,9 +88,14 @@ impl EncoderInput<'_> {
             })?,
             false => None,
         };
+        let outline = match self.options.outline {
+            Outline::Surface => None,
+            Outline::Cloud => Some(closed(self.isa, self.cloud, self.sparse)?),
+        };
         Ok(References {
             cloud,
             own: own.unwrap_or_default(),
+            outline,
         })
     }
 
@@ -96,14 +103,14 @@ impl EncoderInput<'_> {
     fn compared_map(
         &self,
         octree: &Octree,
-        references: &References,
+        references: &mut References,
         decoding: &mut Decoding<'_>,
         level: u8,
     ) -> Result<Option<HeadMap>> {
         if !self.has_head_map(level) {
             return Ok(None);
         }
-        let References { cloud, own } = references;
+        let References { cloud, own, outline } = references;
         let pictures = match level == self.cloud.voxels.depth() {
             true => own,
             false => cloud.pictures(level),
@@ -111,9 +118,13 @@ impl EncoderInput<'_> {
         if pictures.is_empty() {
             return Ok(None);
         }
-        match self.maps_blocks(level) {
-            true => head_maps::of_level(octree, cloud, decoding, level).map(Some),
-            false => surfel_size::of_level(self.isa, octree, pictures, decoding, level).map(Some),
+        let map = match self.maps_blocks(level) {
+            true => head_maps::of_level(octree, cloud, decoding, level)?,
+            false => surfel_size::of_level(self.isa, octree, pictures, decoding, level)?,
+        };
+        match outline {
+            None => Ok(Some(map)),
+            Some(outline) => thickness::of_level(self.isa, map, outline, decoding, level).map(Some),
         }
     }
 }

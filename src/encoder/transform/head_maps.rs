@@ -93,11 +93,23 @@ impl Comparison<'_> {
 impl EncoderInput<'_> {
     /// The head map of a sparse level, which surfels draw: it says how wide they must be to close. `None` of other
     /// levels, and where the usual size does.
-    pub(super) fn closing_map(&self, octree: &Octree, level: u8, map: &SiblingMap) -> Option<Vec<u8>> {
+    pub(super) fn closing_map(&self, octree: &Octree, level: u8, map: &SiblingMap) -> Option<HeadMap> {
         let applies = self.options.has_head_maps() && level > 0 && is_for_surfels(map, 0..map.len());
         let size = applies.then(|| closing_size(map)).filter(|size| *size > 64)?;
         let surfels = vec![true; HeadMap::block_count(octree, level)];
-        Some(HeadMap::new(size, size, surfels).to_bytes())
+        Some(HeadMap::new(size, size, surfels))
+    }
+
+    /// The head map of a level that no picture chooses: that of a sparse level, or one that says how thick Gaussians are;
+    /// `None` if there is nothing to say.
+    pub(super) fn unseen_map(&self, octree: &Octree, level: u8, map: &SiblingMap) -> Option<HeadMap> {
+        let closing = self.closing_map(octree, level, map);
+        let thickness = self.options.thickness.iter().find(|(of, _)| *of == level);
+        let Some((_, thickness)) = thickness else {
+            return closing;
+        };
+        let usual = || HeadMap::new(64, 64, vec![false; HeadMap::block_count(octree, level)]);
+        Some(closing.unwrap_or_else(usual).with_thickness(*thickness))
     }
 
     /// Whether a level has a head map: heads read the level above, and sparse clouds tell nothing of their own level.
@@ -120,7 +132,7 @@ impl EncoderInput<'_> {
     /// Bytes to set aside for the head maps of a stream whose last level is `top`.
     pub(super) fn head_map_bytes(&self, top: u8) -> usize {
         /// Of a chunk without its payload.
-        const CHUNK: usize = 12;
+        const CHUNK: usize = 13;
         let levels = *self.levels.start().min(&top)..=top;
         let mapped = levels.filter(|level| self.has_head_map(*level));
         let bytes = |level| match self.maps_blocks(level) {

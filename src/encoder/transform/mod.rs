@@ -16,6 +16,7 @@ mod reference;
 mod refine;
 mod shape;
 mod surfel_size;
+mod thickness;
 mod writing;
 
 use std::ops::RangeInclusive;
@@ -36,9 +37,10 @@ use crate::motion::{ColourGuide, GeometryGuide};
 use descent::Pictures;
 pub(crate) use memory::memory_of;
 pub use memory::{encode_memory, surface_within};
-pub use options::{Options, Tune};
+pub use options::{Options, Outline, Tune};
 pub use predicted::{PredictedFrame, encode_predicted};
 pub use quality::QualityTarget;
+pub(crate) use thickness::of_stream as thickness_of;
 
 pub use rate_control::encode_to_rate;
 pub use shape::GeometryTarget;
@@ -300,7 +302,7 @@ impl<'a> EncoderInput<'a> {
                 level,
                 hash: colour_hash(&coloured),
                 filter: filter.map(|filter| filter.to_bytes()),
-                head_map: self.closing_map(octree, level, map),
+                head_map: self.unseen_map(octree, level, map),
                 slices,
             });
         }

@@ -44,6 +44,11 @@ pub struct Options {
     /// With [`Tune::Visual`], in how many rounds at most colours are moved further, by gradient descent through pictures.
     /// Default: 0. One round takes about a second for a person, on two cores.
     pub rounds: usize,
+    /// How far the Gaussians that the stream's head maps are for reach.
+    pub outline: Outline,
+    /// For frames of a sequence: levels, and how much thicker learned Gaussians and surfels of these are, in 128ths of a
+    /// voxel, at most 127. A sequence with [`Outline::Cloud`] sets what is chosen for its first frame.
+    pub thickness: Vec<(u8, [u8; 2])>,
     /// Heads that will draw the stream; `None` for surfels.
     pub heads: Option<HeadsModel>,
     /// Whether pictures of the heads are compared with those of surfels, so that the stream says where surfels are
@@ -69,6 +74,8 @@ impl Default for Options {
             parts: true,
             tune: Tune::Visual,
             rounds: 0,
+            outline: Outline::Surface,
+            thickness: Vec::new(),
             heads: None,
             head_maps: true,
             isa: None,
@@ -78,7 +85,7 @@ impl Default for Options {
 
 impl Options {
     /// Whether the stream has head maps, if its levels may have.
-    pub(super) fn has_head_maps(&self) -> bool {
+    pub(crate) fn has_head_maps(&self) -> bool {
         self.head_maps && self.heads.is_some()
     }
 }
@@ -93,6 +100,18 @@ pub enum Tune {
     Visual,
     /// The mean colours of voxels.
     Psnr,
+}
+
+/// How far the Gaussians of a stream reach.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Outline {
+    /// To the surface that the cloud's points sample, as the heads that ship learned it.
+    #[default]
+    Surface,
+    /// As far as the cloud's own surfels, which overlap and reach beyond the surface: Gaussians are thicker. For clouds
+    /// that pictures are compared with themselves, such as captures, of which no surface is known.
+    Cloud,
 }
 
 /// Parents per colour slice by default: two threads share level 8 of a person, eight level 9.

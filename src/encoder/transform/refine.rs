@@ -139,8 +139,7 @@ impl EncoderInput<'_> {
         let octree = self.octree(shape);
         let map = self.finest_map(level, shape);
         let head_map = coded.layers.last().and_then(|layer| layer.head_map.as_ref());
-        let head_map = head_map.and_then(|bytes| HeadMap::parse(bytes, HeadMap::block_count(octree, level)));
-        let surfels = head_map.as_ref().and_then(|heads| heads.surfels(octree, level));
+        let surfels = head_map.and_then(|heads| heads.surfels(octree, level));
         let part = Part {
             octree,
             level,
@@ -152,8 +151,9 @@ impl EncoderInput<'_> {
             surfels: surfels.as_deref(),
             advice: Advice {
                 luma_step: coded.luma_step,
-                all_surfels: head_map.as_ref().is_some_and(HeadMap::is_all_surfels),
-                sizes: head_map.as_ref().map_or([1.0; 2], HeadMap::sizes),
+                all_surfels: head_map.is_some_and(HeadMap::is_all_surfels),
+                sizes: head_map.map_or([1.0; 2], HeadMap::sizes),
+                thickness: [0.0; 2],
             },
         };
         let header = self.header(level, |level| octree.level(level).len());

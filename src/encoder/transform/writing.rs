@@ -6,6 +6,7 @@ use super::EncoderInput;
 use super::shape::Shape;
 use crate::container::Writer;
 use crate::error::Result;
+use crate::gaussians::HeadMap;
 
 /// A stream that has not been checked yet.
 pub(super) struct Coded {
@@ -29,7 +30,7 @@ pub(super) struct Layer {
     pub level: u8,
     pub hash: u64,
     pub filter: Option<Vec<u8>>,
-    pub head_map: Option<Vec<u8>>,
+    pub head_map: Option<HeadMap>,
     pub slices: Vec<(u32, Vec<u8>)>,
 }
 
@@ -91,7 +92,7 @@ impl EncoderInput<'_> {
                 writer.post_filter(level, filter)?;
             }
             if let Some(map) = &layer.head_map {
-                writer.head_map(level, map)?;
+                writer.head_map(level, map.thickness(), &map.to_bytes())?;
             }
         }
         Ok(())

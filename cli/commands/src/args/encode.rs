@@ -4,13 +4,13 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use b2p::encoder::Residual;
-use b2p::encoder::transform::{GeometryTarget, QualityTarget, Tune};
+use b2p::encoder::transform::{GeometryTarget, Outline, QualityTarget, Tune};
 use clap::{Args, ValueEnum};
 
 use super::ModelArg;
 use crate::cloud::ReadArgs;
 use crate::many::Files;
-use crate::values::{bits, bits_per_point, frame_rate, geometry, levels, price, residual, step, tune};
+use crate::values::{bits, bits_per_point, frame_rate, geometry, levels, outline, price, residual, step, tune};
 
 #[derive(Debug, Args)]
 #[command(override_usage = "b2p encode [OPTIONS] <IN>... <OUT>")]
@@ -51,6 +51,10 @@ pub struct Encode {
     /// compared with the cloud, and coded again. `psnr`: the mean colours of voxels [default: visual; psnr for sequences]
     #[arg(long, value_name = "visual|psnr", value_parser = tune, conflicts_with = "lossless")]
     pub tune: Option<Tune>,
+    /// How far Gaussians reach. `surface`: to the surface that the points sample; `cloud`: as far as the cloud itself does
+    /// when it is drawn as surfels, for captures, of which nothing else is known [default: surface]
+    #[arg(long, value_name = "surface|cloud", value_parser = outline, conflicts_with = "no_head_maps")]
+    pub outline: Option<Outline>,
     /// Bit depth N of the voxel grid, 1 to 21 [default: by the spacing of the points; at most what a cloud of integers
     /// needs]
     #[arg(long, help_heading = "Advanced", value_name = "N", value_parser = clap::value_parser!(u8).range(1..=21))]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use b2p::cloud::{ColouredVoxels, CommonGrid, GridNeed};
-use b2p::encoder::transform::{GeometryTarget, Options, QualityTarget, Tune};
+use b2p::encoder::transform::{GeometryTarget, Options, Outline, QualityTarget, Tune};
 use b2p::{Error, Limits, SequenceEncoder, SequenceReader};
 use serde_json::json;
 
@@ -153,6 +153,10 @@ fn options(args: &Encode, bits: u8) -> Result<Options> {
         options.rounds = 0;
     }
     options.tune = args.tune.unwrap_or(Tune::Psnr);
+    if args.outline == Some(Outline::Cloud) {
+        options.outline = Outline::Cloud;
+        options.heads = Some(load::heads(None)?);
+    }
     match args.step {
         Some(step) => options.fineness = step,
         None if args.lossless => {
