@@ -8,7 +8,7 @@ use std::sync::Mutex;
 use b2p::Decoder;
 use b2p::cloud::ColouredVoxels;
 use b2p::container::{Format, Header};
-use b2p::encoder::transform::{self, GeometryTarget, QualityTarget};
+use b2p::encoder::transform::{self, GeometryTarget, Outline, QualityTarget};
 use b2p::encoder::{Options, Residual, encode};
 use b2p::gaussians::Heads;
 use b2p::gaussians::learned::HeadsModel;
@@ -246,10 +246,15 @@ fn encoding_holds_no_more_than_is_said_of_so_many_voxels() {
     ];
     for (cloud, levels, rate) in clouds {
         let voxels = cloud.voxels.len();
-        for (heads, rounds) in [(None, 0), (Some(heads.clone()), 0), (Some(heads.clone()), 1)] {
+        for (with_heads, rounds, outline) in [
+            (false, 0, Outline::Surface),
+            (true, 0, Outline::Surface),
+            (true, 1, Outline::Cloud),
+        ] {
             let options = transform::Options {
-                heads,
+                heads: with_heads.then(|| heads.clone()),
                 rounds,
+                outline,
                 tries: 2,
                 geometry: GeometryTarget::Visual,
                 levels: levels.clone(),

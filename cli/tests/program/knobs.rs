@@ -64,3 +64,39 @@ fn most_effort_compares_pictures_from_all_sides() {
         succeeds(at, &["check", "e.b2p"]);
     }
 }
+
+#[test]
+fn gaussians_reach_as_far_as_the_cloud_if_asked_for_in_streams_and_sequences() {
+    let folder = folder_with_cloud();
+    let at = folder.path();
+    std::fs::create_dir(at.join("frames")).unwrap();
+    for frame in ["a.ply", "b.ply"] {
+        std::fs::copy(at.join("ball.ply"), at.join("frames").join(frame)).unwrap();
+    }
+    for input in ["ball.ply", "frames"] {
+        let gaussians = ["surface", "cloud"].map(|outline| {
+            let encode = ["encode", input, "-o", "o.b2p", "--bits", "7", "--outline", outline];
+            succeeds(at, &encode);
+            let decode = ["decode", "o.b2p", "-o", "o.ply", "--heads", "best"];
+            let frame: &[&str] = if input == "frames" { &["--frame", "1"] } else { &[] };
+            succeeds(at, &[&decode[..], frame].concat());
+            std::fs::read(at.join("o.ply")).unwrap()
+        });
+        assert_eq!(gaussians[0].len(), gaussians[1].len());
+        assert!(gaussians[0] != gaussians[1], "{input}");
+    }
+    let other = b2p(at, &["encode", "ball.ply", "-o", "o.b2p", "--outline", "mesh"]);
+    assert_eq!(other.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&other.stderr).contains("expected surface or cloud"));
+    let learned = [
+        "encode",
+        "ball.ply",
+        "-o",
+        "q.b2p",
+        "--colours",
+        "learned",
+        "--outline",
+        "cloud",
+    ];
+    fails(at, &learned, &["--outline", "--colours transform"]);
+}
