@@ -148,6 +148,15 @@ def test_clouds_of_every_dtype_and_layout_are_the_same(cloud):
     assert np.array_equal(b2p.PointCloud(voxels, np.zeros((64, 3), np.uint8)).xyz, voxels)
 
 
+def test_gaussians_reach_as_far_as_the_cloud_if_asked_for(cloud):
+    xyz, rgb = cloud
+    surface, wider = (b2p.decode(b2p.encode(xyz, rgb, bits=6, outline=outline)) for outline in ("surface", "cloud"))
+    assert np.array_equal(surface.positions, wider.positions)
+    assert (wider.scales >= surface.scales).all() and (wider.scales > surface.scales).any()
+    with pytest.raises(b2p.UsageError, match="'surface' or 'cloud'"):
+        b2p.encode(xyz, rgb, bits=6, outline="mesh")
+
+
 def test_arrays_that_are_no_cloud_are_refused(cloud):
     xyz, rgb = cloud
     for points, colours, message in [
