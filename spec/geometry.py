@@ -113,22 +113,26 @@ class Mixer:
 
 
 class Refined:
-    """17.6.4: how decisions follow the cells of the previous frame."""
+    """17.6.4, 17.10.8: how decisions follow the cells of the previous frame, in so many windows."""
 
-    def __init__(self):
-        starts = [[squash(45 * i - 720 + d) << 6 for i in range(33)] for d in (-96, 96)]
-        self.table = [list(starts[c % 2]) for c in range(126)]
-        self.seen = [[4] * 33 for _ in range(126)]
+    def __init__(self, windows):
+        offsets = (-96, -32, 96) if windows == 2 else (-96, 96)
+        starts = [[squash(45 * i - 720 + d) << 6 for i in range(33)] for d in offsets]
+        self.classes, self.faces = len(offsets), 6 * windows + 1
+        contexts = 9 * self.classes * self.faces
+        self.table = [list(starts[c % self.classes]) for c in range(contexts)]
+        self.seen = [[4] * 33 for _ in range(contexts)]
         self.state = 8192
 
-    def decide(self, decoder, logit, window, own, octant, mask):
-        """17.6.3"""
-        shifted = window >> CELL[OWN][octant].bit_length() - 22
-        there = shifted >> 21 & 1
-        faces = (shifted & FACE_BITS).bit_count()
+    def decide(self, decoder, logit, windows, own, octant, mask):
+        """17.6.3, 17.10.8"""
+        shifted = [window >> CELL[OWN][octant].bit_length() - 22 for window in windows]
+        there = shifted[0] >> 21 & 1
+        own_class = sum(cells >> 21 & 1 for cells in shifted)
+        faces = sum((cells & FACE_BITS).bit_count() for cells in shifted)
         wrong = min(2, ((mask ^ own) & (1 << octant) - 1).bit_count())
         errors = (self.state > 2048) + (self.state > 8192)
-        context = there + 2 * (faces + 7 * (wrong + 3 * errors))
+        context = own_class + self.classes * (faces + self.faces * (wrong + 3 * errors))
         i, r = divmod(min(logit + 720, 1439), 45)
         table, seen = self.table[context], self.seen[context]
         bit = decoder.decide(clamp((table[i] * (45 - r) + table[i + 1] * r) // 45 >> 6, 16, 65520))
@@ -140,11 +144,13 @@ class Refined:
 
 
 class Slice:
-    """The state of one slice (4.1). `guides`, in predicted frames: mode and window of each parent (17.6.1)."""
+    """The state of one slice (4.1). `guides`, in predicted frames: mode and windows of each parent (17.6.1,
+    17.10.8)."""
 
     def __init__(self, network, voxels, first, end, code, guides):
         self.network, self.voxels, self.first, self.end = network, voxels, first, end
-        self.guides, self.refined = guides, Refined()
+        self.guides = guides or [(0, [0])] * len(voxels)
+        self.refined = Refined(len(self.guides[0][1]))
         self.decoder = ArithmeticDecoder(code)
         self.mixer = Mixer(end - first)
         self.output, self.bias = network.output.copy(), list(network.bias)
@@ -163,8 +169,8 @@ class Slice:
 
     def parent(self, i):
         near, network = self.voxels.near[i], self.network
-        mode, window = self.guides[i] if self.guides else (0, 0)
-        own = sum(bool(window & cell) << octant for octant, cell in enumerate(CELL[OWN]))
+        mode, windows = self.guides[i]
+        own = sum(bool(windows[0] & cell) << octant for octant, cell in enumerate(CELL[OWN]))
         if mode == SKIP and own:
             return own
         known, unknown = {}, []
@@ -192,7 +198,7 @@ class Slice:
                 return 128
             node = 1 << octant | mask
             units = np.maximum(0, total + network.node[node])
-            guide = (window, own, octant, mask) if mode else None
+            guide = (windows, own, octant, mask) if mode else None
             bit = self.child(octant, units, words, occupied, hidden, node, guide)
             mask |= bit << octant
             hidden &= ~CELL[OWN][octant]

@@ -1,9 +1,10 @@
-"""What a frame is predicted from: motion and the moved frame, clauses 17.5 to 17.9 of docs/format.md."""
+"""What a frame is predicted from: motion, the moved and the warped frame, clauses 17.5 to 17.10 of docs/format.md."""
 
 from dataclasses import dataclass
 from itertools import groupby, product
+from math import prod
 
-from base import Reader, clamp, quot, require
+from base import Reader, clamp, ilog2, quot, require
 from coefficients import RangeDecoder
 from octree import CELLS, Voxels, octant_xyz
 
@@ -20,12 +21,31 @@ def half_up(a, b):
     return (2 * a + b) // (2 * b)
 
 
+def corner_weights(part, whole):
+    """17.7.2, 17.10.4, 17.10.5: for each d in {0, 1}³ the product over axes of part where d is 1, else whole − part."""
+    for d in CORNERS_BELOW:
+        yield d, prod(p if c else whole - p for c, p in zip(d, part))
+
+
+def mean_of_corners(corner, above):
+    """17.10.3: the prediction of a corner by the corners of the level above."""
+    found = [above[place] for place in product(*({x >> 1, x + 1 >> 1} for x in corner))]
+    n = len(found)
+    return tuple(sum(components) + (n >> 1) >> ilog2(n) for components in zip(*found))
+
+
 @dataclass
 class Known:
-    """A level of a frame that was decoded: its voxels, and their colours before the filter."""
+    """A level of a frame that was decoded: its voxels, and their colours before the filter. 17.10.6: of the warped
+    frame all near cells, and which of them are voxels."""
 
     voxels: Voxels
     values: list
+    inner: set = None
+
+    def layers(self):
+        """17.6.1, 17.10.8: the places of which windows are made: of voxels, in the warped frame then of near cells."""
+        return [self.voxels.places] if self.inner is None else [self.inner, self.voxels.places]
 
     def colour(self, place):
         """The colour at a place, None if it was not occupied."""
@@ -81,20 +101,25 @@ class Motion:
     def __init__(self, payloads, header, previous):
         reader = Reader(payloads[0], "17.5.1")
         first, self.unit, self.reference, modes = reader.take(4)
-        self.block_level, self.divided, self.moves_coarse = first & 63, first > 127, first >> 6 & 1
+        self.block_level, self.divided, self.moves_coarse = first & 31, first > 127, first >> 6 & 1
+        self.warped = first >> 5 & 1
         self.vector = tuple(reader.number("h") for _ in range(3))
         require(self.divided or not self.moves_coarse, "17.5.1", "coarse colours that move")
+        require(not (self.warped and self.divided), "17.5.1", "warped frame that is divided")
         deepest = header.base - self.divided - self.moves_coarse
         require(self.block_level <= deepest and header.top <= self.unit <= 21, "17.5.1", "levels of the motion")
-        furthest = min(header.top, self.block_level + 5)
-        nearest = self.block_level + 2 * self.moves_coarse
+        furthest = header.top if self.warped else min(header.top, self.block_level + 5)
+        nearest = header.top if self.warped else self.block_level + 2 * self.moves_coarse
         require(nearest <= self.reference <= furthest, "17.5.1", "reference level")
         self.above = (modes & 15, modes >> 4)
         require(max(self.above) <= SKIP, "17.5.1", "modes of the motion")
+        require(not (self.warped and any(self.vector)), "17.5.1", "vector of a warped frame")
         self.check(self.vector)
         self.base, self.payloads, self.previous = header.base, payloads, previous
+        self.bits, self.modes, self.coarse = Bits(self.divided or self.warped), {}, {}
+        if self.warped:
+            self.moved = self.warp(*self.read_lattice(reader, header.top), header.top)
         self.decoder = RangeDecoder(payloads[0][reader.at :])
-        self.bits, self.modes, self.coarse = Bits(self.divided), {}, {}
 
     def check(self, vector):
         """17.5.3"""
@@ -105,14 +130,18 @@ class Motion:
         """17.5.1: decodes the motion of level L once its blocks are known, the voxels of level B, and their parts."""
         if voxels.level == self.block_level:
             self.blocks, self.above_blocks = voxels, [(3, 3)] * len(voxels)
-            self.read_vectors()
+            if self.warped:
+                self.vectors = [(0, 0, 0)] * len(voxels)
+            else:
+                self.read_vectors()
             last = min(self.base, self.block_level + 1) if self.divided else self.base
             for level in range(self.block_level + 1, last + 1):
                 self.read_modes(level, self.decoder)
             if last == self.base:
                 self.decoder.finish()
             reference = min(self.reference, self.block_level + 3) if self.divided else self.reference
-            self.moved = self.move(self.blocks, self.vectors, reference)
+            if not self.warped:
+                self.moved = self.move(self.blocks, self.vectors, reference)
         elif self.divided and voxels.level == self.block_level + 1:
             self.parts = voxels
             if self.block_level + 2 <= self.base:
@@ -203,9 +232,9 @@ class Motion:
             own = []
             for kind in (0, 1):
                 index = above[kind]
-                if self.divided and kind == 0 and index < 3:
+                if self.bits.counted and kind == 0 and index < 3:
                     index += 4 * above[1]
-                elif self.divided and kind == 1:
+                elif self.bits.counted and kind == 1:
                     index += 4 * own[0]
                 name = kind, index, before[kind]
                 if not self.bits.decide(decoder, "any", *name):
@@ -249,31 +278,96 @@ class Motion:
             }
         return moved
 
+    def read_lattice(self, reader, top):
+        """17.10.1: the level of the lattice, the vectors of its corners, and T."""
+        reader.clause = "17.10.1"
+        lattice, least = reader.take(2)
+        length = reader.varint()
+        require(max(top - 8, 0) <= lattice <= top - 2, "17.10.1", "level of the lattice")
+        require(least >= 40, "17.10.1", "least weight of a voxel")
+        decoder, vectors = RangeDecoder(reader.take(length)), {}
+        for level in range(lattice + 1):
+            vectors = self.read_corners(level, min(lattice - level, 2), vectors, decoder)
+        decoder.finish()
+        return lattice, vectors, least
+
+    def read_corners(self, level, j, above, decoder):
+        """17.10.2, 17.10.3: the vectors of the corners of a level by their places, from those of the level above."""
+        nodes = self.previous[level].voxels.coordinates
+        corners = {tuple(a + b for a, b in zip(place, d)) for place in nodes for d in CORNERS_BELOW}
+        vectors, bent, vector = {}, set(), (0, 0, 0)
+        for x, y, z in sorted(corners, key=lambda corner: corner[::-1]):
+            predicted = mean_of_corners((x, y, z), above) if level > 0 else vector
+            near = sum(less in bent for less in ((x - 1, y, z), (x, y - 1, z), (x, y, z - 1)))
+            vector = predicted
+            if self.bits.decide(decoder, "bends", j, min(near, 2)):
+                difference = self.bits.difference(decoder, f"corner {j} ")
+                vector = tuple(a + b for a, b in zip(predicted, difference))
+            self.check(vector)
+            if vector != predicted:
+                bent.add((x, y, z))
+            vectors[x, y, z] = vector
+        return vectors
+
+    def warped_place(self, place, down, vectors, h):
+        """17.10.4: where a voxel moves to, in sixteenths of a voxel."""
+        node = [x >> down for x in place]
+        o, sums = [2 * (x - (c << down)) + 1 for x, c in zip(place, node)], [0, 0, 0]
+        for d, w in corner_weights(o, 2 << down):
+            vector = vectors[tuple(a + b for a, b in zip(node, d))]
+            sums = [s + w * v for s, v in zip(sums, vector)]
+        return [16 * x + (16 * s + (1 << h - 1) >> h) for x, s in zip(place, sums)]
+
+    def warp(self, lattice, vectors, least, top):
+        """17.10.4 to 17.10.6: the levels of the warped frame."""
+        source, down, cells = self.previous[top], top - lattice, {}
+        h = 3 * (down + 1) + self.unit - top
+        for place, value in zip(source.voxels.coordinates, source.values):
+            at = self.warped_place(place, down, vectors, h)
+            for d, w in corner_weights([x & 15 for x in at], 16):
+                cell = tuple((x >> 4) + c for x, c in zip(at, d))
+                if w > 0 and all(0 <= c < 1 << top for c in cell):
+                    weight, *sums = cells.get(cell, (0, 0, 0, 0))
+                    cells[cell] = weight + w, *(s + w * v for s, v in zip(sums, value))
+        near = {cell: counted for cell, counted in cells.items() if counted[0] >= 640}
+        require(len(near) <= 4 * len(source.voxels) + 64, "17.10.5", "near cells of the warped frame")
+        inner = {cell for cell, counted in near.items() if counted[0] >= 16 * least}
+        moved = {}
+        for level in range(top, 0, -1):
+            means = [[half_up(s, weight) for s in sums] for weight, *sums in near.values()]
+            moved[level] = Known(Voxels(level, None, list(near)), means, inner)
+            children = {}
+            for cell, counted in near.items():
+                children.setdefault(tuple(c >> 1 for c in cell), []).append(counted)
+            near = {cell: tuple(map(sum, zip(*counted))) for cell, counted in children.items()}
+            inner = {tuple(c >> 1 for c in cell) for cell in inner}
+        return moved
+
     def of(self, nodes):
-        """17.5.5, 17.5.6: for each node the modes and the vector that hold for its children; and what they are
-        predicted from."""
+        """17.5.5, 17.5.6, 17.10.7: for each node the modes and the vector that hold for its children; and what they
+        are predicted from."""
         level = nodes.level + 1
         if level > self.base and level not in self.modes:
             self.read_finer(level)
+        moved = self.warped or self.block_level < level < self.reference
+        source = (self.moved if moved else self.previous)[level]
         if level <= self.block_level:
-            return [(self.above, self.vector)] * len(nodes), self.previous[level]
+            return [(self.above, self.vector)] * len(nodes), source
         of_parts = self.divided and level > self.block_level + 1
         own, vectors = (self.parts, self.part_vectors) if of_parts else (self.blocks, self.vectors)
         at = [tuple(c >> level - 1 - own.level for c in place) for place in nodes.coordinates]
         blocks = [own.places[place] for place in at]
-        if level < self.reference:
-            return [(self.modes[level][b], (0, 0, 0)) for b in blocks], self.moved[level]
-        return [(self.modes[level][b], vectors[b]) for b in blocks], self.previous[level]
+        return [(self.modes[level][b], (0, 0, 0) if moved else vectors[b]) for b in blocks], source
 
     def occupancies(self, nodes):
-        """17.6.1: mode and window of each node."""
+        """17.6.1, 17.10.8: mode and windows of each node."""
         guides, (own, source) = [], self.of(nodes)
+        layers = source.layers()
         for (modes, vector), place in zip(own, nodes.coordinates):
-            d, window = self.rounded(vector, nodes.level + 1), 0
-            corner = [2 * c - v for c, v in zip(place, d)]
-            for bit, cell in enumerate(CELLS) if modes[0] else ():
-                window |= (tuple(a + b for a, b in zip(corner, cell)) in source.voxels.places) << bit
-            guides.append((modes[0], window))
+            corner = [2 * c - v for c, v in zip(place, self.rounded(vector, nodes.level + 1))]
+            cells = [tuple(a + b for a, b in zip(corner, cell)) for cell in CELLS] if modes[0] else []
+            windows = [sum((cell in layer) << bit for bit, cell in enumerate(cells)) for layer in layers]
+            guides.append((modes[0], windows))
         return guides
 
     def colours(self, nodes, children, known):
@@ -298,10 +392,7 @@ class Motion:
         shift = self.unit - source.voxels.level
         low, part = [v >> shift for v in vector], [(v << 4) >> shift & 15 for v in vector]
         sums, total = [0, 0, 0], 0
-        for corner in CORNERS_BELOW:
-            weight = 1
-            for c, p in zip(corner, part):
-                weight *= p if c else 16 - p
+        for corner, weight in corner_weights(part, 16):
             value = source.colour(tuple(x - v - c for x, v, c in zip(place, low, corner))) if weight else None
             if value is not None:
                 sums = [s + weight * x for s, x in zip(sums, value)]

@@ -125,7 +125,8 @@ pub use container::{Format, Header};
 pub use decoder::{Decoder, Decoding, Points};
 #[cfg(feature = "encoder")]
 pub use encoder::{
-    Encoded, Encoder, Rate, transform::GeometryTarget, transform::Outline, transform::QualityTarget, transform::Tune,
+    Encoded, Encoder, Rate, transform::GeometryTarget, transform::Motion, transform::Outline, transform::QualityTarget,
+    transform::Tune,
 };
 pub use error::{Error, Result, Stage};
 pub use gaussians::learned::HeadsModel;

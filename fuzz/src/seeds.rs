@@ -10,7 +10,7 @@ use b2p::geometry::Voxels;
 use b2p::latents::LatentDecoder;
 use b2p::latents::{COLOUR_INPUTS, ColourFilter, ColourResidual, ResidualSteps, Steps};
 use b2p::log::Log;
-use b2p::{Limits, Placement, SceneEncoder, SequenceEncoder};
+use b2p::{Limits, Motion, Placement, SceneEncoder, SequenceEncoder};
 use b2p_formats::splats::{Axes, Format, write};
 
 use crate::MODEL;
@@ -99,9 +99,9 @@ fn scenes() -> Vec<Vec<u8>> {
 }
 
 /// Sequences of a few voxels that move: in one group and in two, lossless, and of frames that are all alike; with
-/// blocks and with parts, whose motion the colours of the coarse levels follow in the last one.
+/// blocks, with parts, whose motion the colours of the coarse levels follow in the last one, and warped.
 fn sequences() -> Vec<Vec<u8>> {
-    let coded = |levels: std::ops::RangeInclusive<u8>, moves: u64, group: u32, lossless: bool, parts: bool| {
+    let coded = |levels: std::ops::RangeInclusive<u8>, moves: u64, group: u32, lossless: bool, motion: Motion| {
         let depth = *levels.end();
         let side = 1u64 << depth;
         let cloud = |frame: u64| {
@@ -120,7 +120,7 @@ fn sequences() -> Vec<Vec<u8>> {
         let encoder = SequenceEncoder::new()
             .with_group(group)
             .with_levels(levels)
-            .with_parts(parts);
+            .with_motion(motion);
         let encoder = match lossless {
             true => encoder.with_quality(transform::QualityTarget::Lossless),
             false => encoder,
@@ -128,14 +128,16 @@ fn sequences() -> Vec<Vec<u8>> {
         encoder.encode(4, cloud, |_| {}).expect("a few voxels are coded")
     };
     vec![
-        coded(1..=3, 1, 4, false, false),
-        coded(1..=4, 1, 2, false, false),
-        coded(1..=4, 0, 4, false, false),
-        coded(1..=3, 1, 4, true, false),
-        coded(1..=4, 1, 4, false, true),
-        coded(1..=4, 0, 4, false, true),
-        coded(1..=3, 1, 4, true, true),
-        coded(2..=4, 1, 4, false, true),
+        coded(1..=3, 1, 4, false, Motion::Blocks),
+        coded(1..=4, 1, 2, false, Motion::Blocks),
+        coded(1..=4, 0, 4, false, Motion::Blocks),
+        coded(1..=3, 1, 4, true, Motion::Blocks),
+        coded(1..=4, 1, 4, false, Motion::Parts),
+        coded(1..=4, 0, 4, false, Motion::Parts),
+        coded(1..=3, 1, 4, true, Motion::Parts),
+        coded(2..=4, 1, 4, false, Motion::Parts),
+        coded(1..=4, 1, 4, false, Motion::Warped),
+        coded(2..=5, 0, 3, false, Motion::Warped),
     ]
 }
 

@@ -146,7 +146,7 @@ pub(super) fn code<I: Instructions, S: CoefficientCoder>(
         let mean = [y, co, cg, 0, 0, 0, 0, 0];
         let values = butterflies::inverse(simd, &JOINS, fractions, mean, &differences);
         let fraction = coding.steps.fraction();
-        for octant in crate::geometry::ones(mask.into()) {
+        for octant in crate::geometry::ones(mask) {
             let [y, co, cg, ..] = values[octant];
             coded.push([y, co, cg].map(|x| clamp(x, fraction)));
         }
@@ -175,7 +175,7 @@ fn sum_blocks([a, b, c]: [&Block; 3]) -> ([u8; 32], [u8; 32]) {
 #[inline(always)]
 pub(super) fn spread(mask: u8, values: &[Ycc]) -> [[i32; 3]; 8] {
     let mut by_octant = [[0; 3]; 8];
-    for (octant, value) in crate::geometry::ones(mask.into()).zip(values) {
+    for (octant, value) in crate::geometry::ones(mask).zip(values) {
         by_octant[octant] = value.map(i32::from);
     }
     by_octant
@@ -187,7 +187,7 @@ pub(super) fn spread(mask: u8, values: &[Ycc]) -> [[i32; 3]; 8] {
 fn predict(nodes: Nodes<'_>, node: usize, around: &FaceNeighbours, coded: &Coded, window: &Window) -> [Lanes; 8] {
     let mut predicted = [[0; 8]; 8];
     let sums = around.sums();
-    for octant in crate::geometry::ones(nodes.masks[node].into()) {
+    for octant in crate::geometry::ones(nodes.masks[node]) {
         let far = [0, 1, 2, 3].map(|lane| sums[lane][octant]);
         let near = coded.sums(window.around(octant), far);
         let ([a, b, c], [d, e, f]) = (mean(near), mean(far));
@@ -218,7 +218,7 @@ fn predict_moved(predicted: &mut [Lanes; 8], nodes: Nodes<'_>, node: usize) {
     };
     let first = nodes.first_child[node] as usize;
     let (mut shifts, mut count) = ([0i32; 3], 0);
-    for (child, octant) in (first..).zip(crate::geometry::ones(nodes.masks[node].into())) {
+    for (child, octant) in (first..).zip(crate::geometry::ones(nodes.masks[node])) {
         if let Some(moved) = guide.moved[child] {
             for t in 0..3 {
                 shifts[t] += i32::from(moved[t]) - predicted[octant][t];
@@ -228,7 +228,7 @@ fn predict_moved(predicted: &mut [Lanes; 8], nodes: Nodes<'_>, node: usize) {
         }
     }
     let shifts = shifts.map(|shift| shift / count.max(1));
-    for (child, octant) in (first..).zip(crate::geometry::ones(nodes.masks[node].into())) {
+    for (child, octant) in (first..).zip(crate::geometry::ones(nodes.masks[node])) {
         if guide.moved[child].is_none() {
             (0..3).for_each(|t| predicted[octant][t] = (predicted[octant][t] + shifts[t]).clamp(-LARGEST, LARGEST));
         }

@@ -50,7 +50,7 @@ impl Weights<'_> {
     #[inline(always)]
     pub fn weighting<'w>(self, mask: u8, first: usize, window: &Window, own: &'w mut Weighting) -> &'w Weighting {
         let mut weights = [0; 8];
-        for (child, octant) in (first..).zip(ones(mask.into())) {
+        for (child, octant) in (first..).zip(ones(mask)) {
             weights[octant] = match self {
                 Weights::Even => return &EVEN[usize::from(mask)],
                 Weights::Estimated => estimate(window, octant).into(),
@@ -107,7 +107,7 @@ pub(super) fn estimates(octree: &Octree, level: u8, map: &SiblingMap) -> Vec<u16
     let parents = octree.occupancy(above).par_iter().enumerate();
     let weights = parents.flat_map_iter(|(parent, &mask)| {
         let window = map.window(parent);
-        ones(mask.into()).map(move |octant| estimate(&window, octant))
+        ones(mask).map(move |octant| estimate(&window, octant))
     });
     weights.collect()
 }

@@ -16,7 +16,8 @@ pub use voxels::Voxels;
 
 /// Positions of the set bits of a mask, ascending.
 #[inline(always)]
-pub(crate) fn ones(mut mask: u32) -> impl Iterator<Item = usize> {
+pub(crate) fn ones(mask: impl Into<u64>) -> impl Iterator<Item = usize> {
+    let mut mask = mask.into();
     std::iter::from_fn(move || {
         let position = mask.trailing_zeros() as usize;
         (mask != 0).then(|| {

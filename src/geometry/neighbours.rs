@@ -164,7 +164,7 @@ pub(super) fn of_children(map: &KernelMap, occupancy: &[u8], first_child: &[u32]
         let mut rows = block.chunks_exact_mut(27);
         for (parent, &mask) in parents.chunks_exact(27).zip(masks) {
             let window = window(parent, occupancy, first_child);
-            for (octant, row) in ones(mask.into()).zip(&mut rows) {
+            for (octant, row) in ones(mask).zip(&mut rows) {
                 copy_row(&window, octant, row);
             }
         }

@@ -122,6 +122,15 @@ impl Bricks {
         size_of::<Brick>() + 4 * size_of::<u32>()
     }
 
+    /// Each brick in turn: its place among bricks, its voxels as a mask by Morton key, and the number of its first voxel.
+    pub fn each(&self) -> impl Iterator<Item = ([u32; 3], u64, usize)> {
+        let each = |brick: &Brick| {
+            let place = [0, 21, 42].map(|bit| (brick.place >> bit) as u32 & 0x1f_ffff);
+            (place, brick.mask, brick.first as usize)
+        };
+        self.bricks.iter().map(each)
+    }
+
     /// Keys of the bricks without their `down` lowest bits, each once.
     pub fn nodes(&self, down: u32) -> Vec<u64> {
         let key = |brick: &Brick| morton::encode([0, 21, 42].map(|bit| (brick.place >> bit) as u32 & 0x1f_ffff));

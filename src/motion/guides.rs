@@ -1,13 +1,15 @@
-//! What a previous frame tells of each level (`docs/format.md`, clauses 17.6 and 17.7).
+//! What a previous frame tells of each level (`docs/format.md`, clauses 17.6, 17.7 and 17.10.7).
 
 use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 
-use super::bricks::Near;
+use super::bricks::{Bricks, Near};
+use super::lattice::Lattice;
 use super::moved::Moved;
 use super::payload::{Blocks, Head, Modes, of_level};
 use super::previous::{Previous, PreviousLevel};
+use super::warp::{Scattered, Warped};
 use crate::colour::{self, Ycc};
 use crate::error::{Error, Result};
 use crate::geometry::codec::guide::{Guide, Mode};
@@ -18,6 +20,8 @@ use crate::geometry::{Octree, ones};
 pub struct Inter {
     previous: Arc<Previous>,
     head: Head,
+    /// What a lattice makes of the previous frame, if the frame is warped.
+    warped: Option<Arc<Warped>>,
     /// L, the first level with sections of its own.
     base: u8,
     /// The motion's bytes behind the head, then of each level after L, until they are read.
@@ -34,6 +38,8 @@ pub struct Inter {
 pub struct GeometryGuide {
     modes: Vec<Mode>,
     windows: Vec<u64>,
+    /// Of a warped frame, those of near cells.
+    near: Option<Vec<u64>>,
 }
 
 /// What a previous frame tells of the colours of a level.
@@ -49,6 +55,7 @@ impl GeometryGuide {
         Guide {
             modes: &self.modes,
             windows: &self.windows,
+            near: self.near.as_deref(),
         }
     }
 
@@ -86,11 +93,16 @@ impl Inter {
     /// [`Error::Malformed`] if the motion is damaged.
     pub fn new(previous: Arc<Previous>, motion: &[&[u8]], base: u8, top: u8) -> Result<Self> {
         let (head, first) = Head::parse(motion.first().copied().unwrap_or_default(), base, top)?;
+        let (warped, first) = match head.warped {
+            true => Self::warped(&previous, head, base, first)?,
+            false => (None, first),
+        };
         let mut sections = vec![first.to_vec()];
         sections.extend(motion.iter().skip(1).map(|section| section.to_vec()));
         Ok(Inter {
             previous,
             head,
+            warped,
             base,
             sections,
             blocks: OnceLock::new(),
@@ -99,11 +111,42 @@ impl Inter {
         })
     }
 
-    /// The same of motion that has been chosen.
-    pub fn of(previous: Arc<Previous>, head: Head, [blocks, parts]: [Blocks; 2], base: u8) -> Self {
+    /// Reads the lattice of a warped frame, and makes what it makes of the previous frame.
+    fn warped<'a>(
+        previous: &Previous,
+        head: Head,
+        base: u8,
+        bytes: &'a [u8],
+    ) -> Result<(Option<Arc<Warped>>, &'a [u8])> {
+        let ([level, least], words, rest) = head.lattice(base, bytes)?;
+        let top = head.reference_level;
+        let source = previous.at(top)?;
+        let made = || {
+            let mut lattice = Lattice::of(&source.nodes(top, level), level);
+            lattice.read(words, "lattice", |vector| head.check(vector))?;
+            Ok(Scattered::new(source, &lattice, [top, head.unit_level])?.warped(least))
+        };
+        let warped = made().map_err(|error| of_level(error, base))?;
+        Ok((Some(Arc::new(warped)), rest))
+    }
+
+    /// The same of motion that has been chosen; of a warped frame, with what the previous frame was warped to.
+    pub fn of(
+        previous: Arc<Previous>,
+        head: Head,
+        warped: Option<Arc<Warped>>,
+        [blocks, parts]: [Blocks; 2],
+        base: u8,
+    ) -> Self {
+        assert_eq!(
+            head.warped,
+            warped.is_some(),
+            "a warped frame has a warped previous frame"
+        );
         Inter {
             previous,
             head,
+            warped,
             base,
             sections: Vec::new(),
             blocks: OnceLock::from(blocks),
@@ -122,26 +165,23 @@ impl Inter {
     /// # Errors
     /// [`Error::Malformed`] if the motion is damaged; [`Error::Usage`] if the previous frame lacks the level.
     pub fn geometry(&self, octree: &Octree, level: u8) -> Result<GeometryGuide> {
-        let (field, previous) = self.source(octree, level)?;
-        let voxels = octree.level(level - 1);
-        let parents = (0..voxels.len()).into_par_iter().with_min_len(CHUNK);
-        let (modes, windows) = parents
-            .map_init(
-                || (field.cursor(), previous.near()),
-                |(field, near), parent| {
-                    let Block { modes, shift, .. } = *field.at(voxels.keys()[parent]);
-                    let window = match modes.geometry {
-                        Mode::Intra => 0,
-                        _ => {
-                            let at = voxels.coordinate(parent).map(|x| 2 * x as i32 - 1);
-                            near.window(moved(at, shift))
-                        }
-                    };
-                    (modes.geometry, window)
-                },
-            )
-            .unzip();
-        Ok(GeometryGuide { modes, windows })
+        let Some(warped) = &self.warped else {
+            let (field, previous) = self.source(octree, level)?;
+            let (modes, windows) = windows(&field, octree, level, &previous.bricks);
+            return Ok(GeometryGuide {
+                modes,
+                windows,
+                near: None,
+            });
+        };
+        let (field, warped) = (self.field(octree, level)?, warped.at(level)?);
+        let (modes, windows_of_voxels) = windows(&field, octree, level, &warped.voxels);
+        let (_, near) = windows(&field, octree, level, &warped.near.bricks);
+        Ok(GeometryGuide {
+            modes,
+            windows: windows_of_voxels,
+            near: Some(near),
+        })
     }
 
     /// What the previous frame tells of the colours of `level`, which the octree has. `known` is the last level that a
@@ -171,7 +211,7 @@ impl Inter {
             for node in first..nodes.len().min(first + CHUNK) {
                 let Block { shift, low, part, .. } = *field.at(nodes.keys()[node]);
                 let own = nodes.coordinate(node).map(|x| 2 * x as i32);
-                for octant in ones(masks[node].into()) {
+                for octant in ones(masks[node]) {
                     let octant = [octant & 1, octant >> 1 & 1, octant >> 2].map(|x| x as i32);
                     let place = [0, 1, 2].map(|axis| own[axis] + octant[axis]);
                     found.push(match modes[node] {
@@ -194,22 +234,19 @@ impl Inter {
         })
     }
 
-    fn level(&self, level: u8) -> Result<&PreviousLevel> {
-        self.previous
-            .level(level)
-            .ok_or_else(|| Error::Usage(format!("level {level} of the previous frame was not decoded")))
-    }
-
     /// The motion at `level`, and what it moves. The octree has the level above.
     fn source<'a>(&'a self, octree: &'a Octree, level: u8) -> Result<(Field<'a>, &'a PreviousLevel)> {
         let field = self.field(octree, level)?;
+        if let Some(warped) = &self.warped {
+            return Ok((field, &warped.at(level)?.near));
+        }
         let Head {
             block_level,
             reference_level,
             ..
         } = self.head;
         if !(block_level + 1..reference_level).contains(&level) {
-            return Ok((field, self.level(level)?));
+            return Ok((field, self.previous.at(level)?));
         }
         let of_parts = self.head.is_of_parts(level);
         Ok((field.stopped(), self.moved_level(octree, of_parts, level)?))
@@ -253,7 +290,7 @@ impl Inter {
         let shifts: Vec<_> = { blocks.vectors.iter() }
             .map(|vector| Block::new(Modes::default(), *vector, unit_level, reference).shift)
             .collect();
-        let (previous, keys) = (self.level(reference)?, octree.level(level).keys());
+        let (previous, keys) = (self.previous.at(reference)?, octree.level(level).keys());
         let coarse = of_parts && self.head.moves_coarse;
         let moved = Moved::new(previous, [level, reference], keys, |i| shifts[i], coarse);
         let moved = moved.map_err(|error| of_level(error, self.base))?;
@@ -332,6 +369,25 @@ impl Inter {
                 .collect(),
         })
     }
+}
+
+/// The mode of every parent, and the cells of `level` that are there around where its children were; none in
+/// [`Mode::Intra`].
+fn windows(field: &Field, octree: &Octree, level: u8, there: &Bricks) -> (Vec<Mode>, Vec<u64>) {
+    let voxels = octree.level(level - 1);
+    let parents = (0..voxels.len()).into_par_iter().with_min_len(CHUNK);
+    let window = |(field, near): &mut (Cursor, Near), parent: usize| {
+        let Block { modes, shift, .. } = *field.at(voxels.keys()[parent]);
+        let window = match modes.geometry {
+            Mode::Intra => 0,
+            _ => {
+                let at = voxels.coordinate(parent).map(|x| 2 * x as i32 - 1);
+                near.window(moved(at, shift))
+            }
+        };
+        (modes.geometry, window)
+    };
+    parents.map_init(|| (field.cursor(), there.near()), window).unzip()
 }
 
 /// The motion of a level's nodes.

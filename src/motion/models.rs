@@ -1,4 +1,4 @@
-//! Adaptive probabilities of vectors and modes (`docs/format.md`, clauses 17.5.2 to 17.5.4 and 17.9).
+//! Adaptive probabilities of vectors and modes (`docs/format.md`, clauses 17.5.2 to 17.5.4, 17.9 and 17.10.3).
 
 use super::payload::{Modes, malformed};
 use crate::coding::binary::Coder;
@@ -44,8 +44,8 @@ type Component = [Bit; 2 + ESCAPE];
 
 /// Adaptive probabilities of a frame's motion.
 pub(super) struct Models {
-    /// Whether blocks are divided.
-    divided: bool,
+    /// Whether decisions are counted and modes follow from both kinds above, as where blocks are divided.
+    counted: bool,
     /// Whether a vector differs from its prediction, by whether the one before did, and by how sure the prediction is.
     differs: [[Bit; 3]; 2],
     /// Whether it is each of the vectors around it, where blocks are divided.
@@ -63,6 +63,10 @@ pub(super) struct Models {
     same: [Bit; NEARBY],
     /// Components of the difference if it is none of them.
     apart: [Component; 3],
+    /// Whether the vector of a corner of a lattice differs from its prediction, by its level and by those near it, and
+    /// components of the difference.
+    bends: [[Bit; 3]; 3],
+    bend: [[Component; 3]; 3],
 }
 
 /// Vectors around a block, and near a part, that it may have.
@@ -125,13 +129,13 @@ impl<'a> Groups<'a> {
 }
 
 impl Models {
-    pub fn new(divided: bool) -> Self {
+    pub fn new(counted: bool) -> Self {
         let even = Bit {
             one: 1 << 15,
-            count: if divided { 0 } else { UNCOUNTED },
+            count: if counted { 0 } else { UNCOUNTED },
         };
         Models {
-            divided,
+            counted,
             differs: [[even; 3]; 2],
             alike: [even; NEARBY],
             component: [[even; 2 + ESCAPE]; 3],
@@ -140,6 +144,8 @@ impl Models {
             other: [even; 3],
             same: [even; NEARBY],
             apart: [[even; 2 + ESCAPE]; 3],
+            bends: [[even; 3]; 3],
+            bend: [[[even; 2 + ESCAPE]; 3]; 3],
         }
     }
 
@@ -160,7 +166,7 @@ impl Models {
             if !differed {
                 continue;
             }
-            let around = if self.divided {
+            let around = if self.counted {
                 around(keys, &vectors[..i], predicted)
             } else {
                 Vec::new()
@@ -225,21 +231,34 @@ impl Models {
         Ok(())
     }
 
+    /// Codes the vector of a corner of a lattice.
+    pub fn code_corner(
+        &mut self,
+        coder: &mut impl Coder,
+        [kind, near]: [usize; 2],
+        predicted: [i16; 3],
+        target: [i16; 3],
+    ) -> Result<[i16; 3]> {
+        match self.bends[kind][near].code(coder, target != predicted) {
+            true => code_difference(&mut self.bend[kind], coder, predicted, target),
+            false => Ok(predicted),
+        }
+    }
+
     /// Codes the modes of all blocks at a level. `above` are those at the level above, if they have some.
     pub fn code_modes(&mut self, coder: &mut impl Coder, above: Option<&[Modes]>, modes: &mut [Modes]) -> Result<()> {
         let mut before = Modes::default();
         for (i, modes) in modes.iter_mut().enumerate() {
             let [geometry, colours] =
                 above.map_or([3, 3], |above| [above[i].geometry as usize, above[i].colours as usize]);
-            // Of divided blocks and their parts, modes follow from both modes above, and those of colours from that of
-            // occupancies.
-            let context = if !self.divided || above.is_none() {
+            // Modes follow from both modes above, and those of colours from that of occupancies, too.
+            let context = if !self.counted || above.is_none() {
                 geometry
             } else {
                 geometry + 4 * colours
             };
             let geometry = self.code_mode(coder, [0, context, before.geometry as usize], modes.geometry);
-            let context = if self.divided {
+            let context = if self.counted {
                 colours + 4 * (geometry as usize)
             } else {
                 colours

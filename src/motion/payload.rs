@@ -1,8 +1,15 @@
-//! What a predicted frame says of its blocks, as bytes (`docs/format.md`, clause 17.5).
+//! What a predicted frame says of its motion, as bytes (`docs/format.md`, clauses 17.5 and 17.10.1).
 
+use super::lattice::DEPTHS;
+#[cfg(feature = "encoder")]
+use super::lattice::Lattice;
 use super::models::{Groups, Models};
 use super::moved::REACH;
+use super::warp::LEAST;
 use crate::coding::binary::Decoder;
+use crate::container::Reader;
+#[cfg(feature = "encoder")]
+use crate::container::put_varint;
 use crate::error::{Error, Result, Stage};
 use crate::geometry::codec::guide::Mode;
 use crate::limits::MAX_DEPTH;
@@ -27,10 +34,12 @@ pub struct Head {
     /// Whether the colours of the levels 1 to B + 1 are predicted from the frame moved by parts, as far as parts are known
     /// then.
     pub moves_coarse: bool,
+    /// Whether the frame is predicted from the previous one as a lattice warps it; then blocks have no vectors.
+    pub warped: bool,
     /// U: vectors are in voxels of this level.
     pub unit_level: u8,
     /// R: the levels after B and before this one are predicted from the moved previous frame of level R, all others
-    /// from their own.
+    /// from their own. If the frame is warped, all are predicted from what level R = M makes.
     pub reference_level: u8,
     /// Modes of the levels 1 to B.
     pub root: Modes,
@@ -49,9 +58,11 @@ pub struct Blocks {
 
 /// Bytes of a head.
 const HEAD: usize = 10;
-/// Bits of the first byte: blocks are divided, and colours of coarse levels are predicted from the frame moved by parts.
+/// Bits of the first byte: blocks are divided; colours of coarse levels are predicted from the frame moved by parts; the
+/// frame is warped.
 const DIVIDED: u8 = 0x80;
 const MOVES_COARSE: u8 = 0x40;
+const WARPED: u8 = 0x20;
 
 /// How errors name the motion of a level, whose place in the file is not known here.
 const PLACE: &str = "motion of level ";
@@ -112,11 +123,15 @@ impl Head {
             let value = format!("{} bytes", bytes.len());
             return Err(malformed("17.5.1", "length of the motion", value, "10 or more"));
         };
-        let (divided, moves_coarse) = (head[0] & DIVIDED != 0, head[0] & MOVES_COARSE != 0);
-        let (block_level, unit_level) = (head[0] & !(DIVIDED | MOVES_COARSE), head[1]);
+        let [divided, moves_coarse, warped] = [DIVIDED, MOVES_COARSE, WARPED].map(|bit| head[0] & bit != 0);
+        let (block_level, unit_level) = (head[0] & !(DIVIDED | MOVES_COARSE | WARPED), head[1]);
         if moves_coarse && !divided {
             let (value, expected) = ("of blocks that are not divided", "divided blocks");
             return Err(malformed("17.5.1", "coarse colours that move", value, expected));
+        }
+        if warped && divided {
+            let (value, expected) = ("divided blocks", "blocks that are not divided");
+            return Err(malformed("17.5.1", "warped frame", value, expected));
         }
         // Vectors of parts are read with level L, if coarser levels need them.
         let deepest = i16::from(base) - i16::from(divided) - i16::from(moves_coarse);
@@ -133,8 +148,13 @@ impl Head {
             return Err(malformed("17.5.1", "level of the vectors", unit_level, expected));
         }
         let reference_level = head[2];
-        let deepest = top.min(block_level + REACH);
-        let first = block_level + if moves_coarse { 2 } else { 0 };
+        let (first, deepest) = match warped {
+            true => (top, top),
+            false => (
+                block_level + if moves_coarse { 2 } else { 0 },
+                top.min(block_level + REACH),
+            ),
+        };
         if !(first..=deepest).contains(&reference_level) {
             let expected = format!("{first} to {deepest}");
             return Err(malformed("17.5.1", "reference level", reference_level, expected));
@@ -153,12 +173,17 @@ impl Head {
             block_level,
             divided,
             moves_coarse,
+            warped,
             unit_level,
             reference_level,
             root: Modes { geometry, colours },
             vector: [0, 1, 2].map(component),
         };
         head.check(head.vector)?;
+        if warped && head.vector != [0; 3] {
+            let value = format!("{:?}", head.vector);
+            return Err(malformed("17.5.1", "vector of a warped frame", value, "0"));
+        }
         Ok((head, rest))
     }
 
@@ -167,7 +192,8 @@ impl Head {
         let mut bytes = vec![
             self.block_level
                 | if self.divided { DIVIDED } else { 0 }
-                | if self.moves_coarse { MOVES_COARSE } else { 0 },
+                | if self.moves_coarse { MOVES_COARSE } else { 0 }
+                | if self.warped { WARPED } else { 0 },
             self.unit_level,
             self.reference_level,
             self.root.geometry as u8 | (self.root.colours as u8) << 4,
@@ -176,8 +202,44 @@ impl Head {
         bytes
     }
 
+    /// Reads the lattice of a warped frame from the bytes behind the head: its level, the weight from which on cells are
+    /// voxels, and its words. Returns them with the bytes behind.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`].
+    pub fn lattice<'a>(&self, base: u8, bytes: &'a [u8]) -> Result<([u8; 2], &'a [u8], &'a [u8])> {
+        let malformed =
+            |field, value: String, expected: String| of_level(malformed("17.10.1", field, value, expected), base);
+        let top = self.reference_level;
+        let [least, most] = [DEPTHS[1], DEPTHS[0]].map(|depth| i16::from(top) - i16::from(depth));
+        let levels = least.max(0)..=most;
+        let Some((&level, rest)) = bytes
+            .split_first()
+            .filter(|(level, _)| levels.contains(&i16::from(**level)))
+        else {
+            let value = bytes.first().map_or("none".into(), u8::to_string);
+            let expected = format!("{} to {}", levels.start(), levels.end());
+            return Err(malformed("level of the lattice", value, expected));
+        };
+        let Some((&least, rest)) = rest.split_first().filter(|(least, _)| **least >= LEAST) else {
+            let value = rest.first().map_or("none".into(), u8::to_string);
+            return Err(malformed("least weight of voxels", value, format!("{LEAST} or more")));
+        };
+        let mut reader = Reader::new(rest, 0);
+        let length = reader.varint("bytes of the lattice").map_err(|error| match error {
+            Error::Truncated { .. } => malformed("bytes of the lattice", "none".into(), "a number".into()),
+            error => of_level(error, base),
+        })?;
+        let rest = &rest[reader.at()..];
+        let Some((words, rest)) = rest.split_at_checked(length as usize) else {
+            let expected = format!("at most {}", rest.len());
+            return Err(malformed("bytes of the lattice", length.to_string(), expected));
+        };
+        Ok(([level, least], words, rest))
+    }
+
     /// Checks that a vector is not longer than the cube along any axis.
-    fn check(&self, vector: [i16; 3]) -> Result<()> {
+    pub(super) fn check(&self, vector: [i16; 3]) -> Result<()> {
         let side = 1i32 << self.unit_level;
         match vector.iter().all(|x| i32::from(*x).abs() <= side) {
             true => Ok(()),
@@ -213,13 +275,15 @@ impl Head {
     /// Reads blocks, and their parts if there are some.
     fn read(&self, base: u8, [keys, part_keys]: [&[u64]; 2], sections: &[&[u8]]) -> Result<(Blocks, Blocks)> {
         let (mut blocks, mut parts) = (Blocks::default(), Blocks::default());
-        let mut models = Models::new(self.divided);
+        let mut models = Models::new(self.divided || self.warped);
         let mut level = self.block_level + 1;
         for (section, bytes) in (base..).zip(sections) {
             let mut read = || {
                 let mut coder = Decoder::new(bytes);
                 if section == base {
                     blocks.vectors = vec![[0; 3]; keys.len()];
+                }
+                if section == base && !self.warped {
                     models.code_vectors(&mut coder, self.vector, keys, &mut blocks.vectors)?;
                     blocks.vectors.iter().try_for_each(|vector| self.check(*vector))?;
                 }
@@ -252,20 +316,20 @@ impl Head {
     }
 
     /// The motion of the level `base` and of each level after it, as bytes: of the blocks `keys[0]`, and of their parts
-    /// `keys[1]` if they are divided.
+    /// `keys[1]` if they are divided. A warped frame needs a lattice, too ([`Head::put_lattice`]).
     ///
     /// # Errors
     /// [`Error::Malformed`] if a number has no code.
     #[cfg(feature = "encoder")]
     pub fn write(&self, base: u8, keys: [&[u64]; 2], [blocks, parts]: [&Blocks; 2]) -> Result<Vec<Vec<u8>>> {
-        let mut models = Models::new(self.divided);
+        let mut models = Models::new(self.divided || self.warped);
         let first = self.block_level + 1;
         let top = self.block_level + (blocks.modes.len() + parts.modes.len()) as u8;
         let groups = Groups::new(keys[0], &blocks.vectors);
         let mut sections = Vec::new();
         for section in base..=top.max(base) {
             let mut coder = crate::coding::binary::Encoder::default();
-            if section == base {
+            if section == base && !self.warped {
                 models.code_vectors(&mut coder, self.vector, keys[0], &mut blocks.vectors.clone())?;
             }
             let from = if section == base { first } else { section };
@@ -292,6 +356,20 @@ impl Head {
         }
         Ok(sections)
     }
+
+    /// Adds a lattice, and the least weight of voxels, to the motion of the base level.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if a number has no code.
+    #[cfg(feature = "encoder")]
+    pub fn put_lattice(motion: &mut Vec<u8>, lattice: &Lattice, least: u8) -> Result<()> {
+        let words = lattice.write()?;
+        let mut bytes = vec![lattice.levels().len() as u8 - 1, least];
+        put_varint(&mut bytes, words.len() as u32);
+        bytes.extend(words);
+        motion.splice(HEAD..HEAD, bytes);
+        Ok(())
+    }
 }
 
 /// The modes of parts at the level above the one that is read: those of their blocks first.
@@ -313,6 +391,7 @@ mod tests {
             block_level,
             divided: false,
             moves_coarse: false,
+            warped: false,
             unit_level: 12,
             reference_level: block_level + 1,
             root: Modes {

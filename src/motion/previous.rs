@@ -2,7 +2,10 @@
 
 use super::bricks::{Bricks, Near};
 use crate::colour::{Filter, Steps, Ycc};
+use crate::error::{Error, Result};
 use crate::geometry::{Octree, Voxels};
+#[cfg(feature = "encoder")]
+use crate::geometry::{morton, ones};
 use rayon::prelude::*;
 
 /// The levels of a decoded frame, from level 0 on, that the next frame is predicted from.
@@ -45,9 +48,27 @@ impl Previous {
         }
     }
 
+    /// A frame of its finest level alone.
+    #[cfg(feature = "encoder")]
+    pub fn of_finest(voxels: Voxels, values: Vec<Ycc>) -> Self {
+        let nothing = |level| PreviousLevel::new(&Voxels::from_sorted(level, Vec::new()), Vec::new());
+        let mut levels: Vec<_> = (0..voxels.depth()).map(nothing).collect();
+        levels.push(PreviousLevel::new(&voxels, values));
+        Previous { levels }
+    }
+
     /// A level. `None` if it was not decoded.
     pub fn level(&self, level: u8) -> Option<&PreviousLevel> {
         self.levels.get(usize::from(level))
+    }
+
+    /// A level.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if it was not decoded.
+    pub fn at(&self, level: u8) -> Result<&PreviousLevel> {
+        self.level(level)
+            .ok_or_else(|| Error::Usage(format!("level {level} of the previous frame was not decoded")))
     }
 
     /// Bytes of memory per voxel at most.
@@ -69,8 +90,18 @@ impl PreviousLevel {
 
     /// Keys of the nodes of level `block` with voxels; the level itself is `level`, at least two
     /// deeper.
-    pub fn blocks(&self, level: u8, block: u8) -> Vec<u64> {
+    pub fn nodes(&self, level: u8, block: u8) -> Vec<u64> {
         self.bricks.nodes(3 * u32::from(level.saturating_sub(2 + block)))
+    }
+
+    /// Keys of the voxels of the level.
+    #[cfg(feature = "encoder")]
+    pub fn keys(&self) -> Vec<u64> {
+        let keys = |(place, mask, _): ([u32; 3], u64, usize)| {
+            let brick = morton::encode(place) << 6;
+            ones(mask).map(move |key| brick | key as u64)
+        };
+        self.bricks.each().flat_map(keys).collect()
     }
 
     /// Calls `each` with the place and number of all voxels in a box of `side`³ cells from the place `first` on.

@@ -9,7 +9,7 @@ use crate::container::Header;
 use crate::decoder::{Decoder, Decoding, Points};
 use crate::error::{Error, Result};
 use crate::gaussians::Gaussians;
-use crate::motion::{Inter, Previous};
+use crate::motion::{Inter, Previous, Warped};
 
 /// Decodes frames of a sequence. It keeps what the frame that it decoded last leaves for the next one of its group: a
 /// frame that follows is decoded alone, any other one with the frames of its group before it.
@@ -198,13 +198,16 @@ impl SequenceDecoder {
     }
 
     /// Checks that a frame and the one before it fit the limits. Both have at most the voxels that the sequence states.
-    /// The frame moved by parts has at most twice as many, the level moved by blocks as many as a frame.
+    /// The frame moved by parts has at most twice as many, the level moved by blocks as many as a frame; a warped frame
+    /// takes more.
     fn check_memory(&self, header: &Header, group: &Group, top: u8) -> Result<()> {
         let most = group.common.voxels(top)?;
         // Levels above the last one have a third of its voxels, more or less; never more than each as many.
         let levels = u64::from(top) + 1;
         let voxels = u64::from(most).saturating_mul(levels.min(4));
-        let kept = voxels.saturating_mul(4 * Previous::bytes_per_voxel() as u64);
+        let moved = voxels.saturating_mul(3 * Previous::bytes_per_voxel() as u64);
+        let warped = u64::from(most).saturating_mul(Warped::bytes_per_voxel() as u64);
+        let kept = voxels.saturating_mul(Previous::bytes_per_voxel() as u64) + moved.max(warped);
         let bytes = self.decoder.memory(header, top)?.saturating_add(kept);
         self.decoder
             .limits()

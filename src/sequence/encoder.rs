@@ -15,7 +15,7 @@ use crate::cloud::ColouredVoxels;
 use crate::container::sequence::{FrameEntry, FrameKind, FrameLevel, MAX_GROUP_FRAMES};
 use crate::container::{Header, with_axes};
 use crate::decoder::Decoder;
-use crate::encoder::transform::{self, GeometryTarget, Options, Outline, PredictedFrame, QualityTarget, Tune};
+use crate::encoder::transform::{self, GeometryTarget, Motion, Options, Outline, PredictedFrame, QualityTarget, Tune};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::log::Log;
@@ -149,10 +149,11 @@ impl SequenceEncoder {
         self
     }
 
-    /// The same encoder, which divides the blocks that move into parts with vectors of their own if `parts`. That takes
-    /// fewer bits; decoders of before 2026-11-28 refuse such frames. Default: it divides them.
-    pub fn with_parts(mut self, parts: bool) -> Self {
-        self.options.parts = parts;
+    /// The same encoder, in which the previous frame moves in this way; [`Motion::Warped`] by default. Where levels are
+    /// predicted from themselves ([`SequenceEncoder::with_scalability`]), it moves in parts in place of that.
+    #[must_use]
+    pub fn with_motion(mut self, motion: Motion) -> Self {
+        self.options.motion = motion;
         self
     }
 

@@ -6,7 +6,7 @@ use b2p::container::sequence::{FrameEntry, FrameKind, GroupEntry, Index, parse_t
 use b2p::encoder::transform::{Options, QualityTarget};
 use b2p::geometry::{Voxels, morton};
 use b2p::motion::{Blocks, Head, Modes};
-use b2p::{Axes, Limits, Placement, SequenceEncoder, Up};
+use b2p::{Axes, Limits, Motion, Placement, SequenceEncoder, Up};
 
 use crate::common::{Ball, cloud_of};
 
@@ -68,6 +68,16 @@ fn many(frame: u64) -> impl Iterator<Item = Voxel> {
             )
         };
         Ball::new(4, 5.0).voxels().into_iter().map(moved)
+    })
+}
+
+/// A bar of 6 bits that turns, by an eighth of its length in each frame.
+fn turned(frame: u64) -> impl Iterator<Item = Voxel> {
+    (0..40 * 36).map(move |i| {
+        let (along, across, up) = (i % 40, i / 40 % 6, i / 240);
+        let side = 20 + across + (along * frame as u32) / 8;
+        let colour = [60 + 4 * along as u8, 20 * across as u8, 30 * up as u8];
+        ([12 + along, side, 24 + up], colour)
     })
 }
 
@@ -134,6 +144,7 @@ fn root_alone(bytes: &[u8]) -> Vec<u8> {
         vector: [-8, 3, 0],
         divided: false,
         moves_coarse: false,
+        warped: false,
     };
     let blocks = Blocks {
         vectors: vec![[7, 0, 8]],
@@ -161,11 +172,13 @@ fn root_alone(bytes: &[u8]) -> Vec<u8> {
 /// A sequence, what is unusual about it in its name, and whether no float had a part in it, so that every machine makes
 /// the same bytes.
 pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
-    let divided = |levels, quality| SequenceEncoder::new().with_levels(levels).with_quality(quality);
-    let of = |levels, quality| divided(levels, quality).with_parts(false);
+    let warped = |levels, quality| SequenceEncoder::new().with_levels(levels).with_quality(quality);
+    let divided = |levels, quality| warped(levels, quality).with_motion(Motion::Parts);
+    let of = |levels, quality| warped(levels, quality).with_motion(Motion::Blocks);
     let (step, lossless) = (QualityTarget::Step, QualityTarget::Lossless);
     let slow = |frame| cloud(5, moving(frame, [1, 0, 0]));
     let fast = |frame| cloud(5, moving(frame, [2, 1, 3]));
+    let turning = |frame| cloud(6, turned(frame));
     let grey = |frame| cloud(5, moving(frame, [0, 1, 0]).map(|(at, colour)| (at, [colour[1]; 3])));
     let kept = |frame| cloud(6, still(frame));
     // Nothing of the second half of the frames is like the first.
@@ -185,7 +198,7 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
         slice_voxels: 30,
         colour_slice: 25,
         filter: false,
-        parts: false,
+        motion: Motion::Blocks,
         ..Options::default()
     };
     let groups = of(2..=4, step(30.0)).with_group(3);
@@ -238,5 +251,22 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
             code(&divided(4..=6, step(30.0)).with_scalability(true), 3, apart),
             false,
         ),
+        ("warped", code(&warped(4..=6, step(40.0)), 4, apart), false),
+        (
+            "warped-from-the-first-level-on",
+            code(&warped(1..=5, step(30.0)).with_group(3), 5, slow),
+            false,
+        ),
+        (
+            "warped-with-much-that-is-new",
+            code(&warped(5..=7, step(60.0)), 3, vary),
+            false,
+        ),
+        (
+            "warped-of-one-level",
+            code(&warped(4..=4, step(30.0)), 3, turning),
+            false,
+        ),
+        ("warped-in-grey", code(&warped(2..=5, step(20.0)), 3, grey), false),
     ]
 }

@@ -78,6 +78,7 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
     let (mut modes, mut vectors, mut reach) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
     let mut of_parts = BTreeSet::new();
     let mut coarse = [0; 2];
+    let mut lattices = BTreeSet::new();
     let limits = Limits::default();
     for name in names() {
         let bytes = stream(&name);
@@ -98,6 +99,10 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
                 let mut parts: Vec<&[u8]> = frame.levels.iter().enumerate().map(part).collect();
                 let (head, first) = Head::parse(parts[0], header.base, header.top).expect("motion");
                 parts[0] = first;
+                if head.warped {
+                    lattices.insert(head.lattice(header.base, first).expect("a lattice").0);
+                    parts[0] = head.lattice(header.base, first).expect("a lattice").2;
+                }
                 let decoded = decoder.frame(&sequence, number).expect("a frame");
                 let keys = decoded.points().expect("a level").voxels.keys();
                 let nodes = |level: u8| {
@@ -134,6 +139,10 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
     let far = vectors.iter().flatten().map(|x| x.unsigned_abs()).max();
     assert!(vectors.len() >= 10 && far >= Some(16), "{vectors:?}");
     assert!(of_parts.len() >= 10, "vectors of parts: {of_parts:?}");
+    assert!(
+        lattices.len() >= 5,
+        "levels of lattices and least weights: {lattices:?}"
+    );
     assert!(coarse.iter().all(|frames| *frames >= 3), "coarse colours: {coarse:?}");
     assert!(reach.iter().any(|(above, _)| *above > 0), "{reach:?}");
     assert!(

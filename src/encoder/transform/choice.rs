@@ -22,8 +22,9 @@ use crate::motion::{Places, PreviousLevel};
 
 /// Voxels along the side of a cell.
 const CELL: i32 = 4;
-/// λ, and the mean squared error up to which coefficients are not coded, in squared steps.
-const LAMBDA: f32 = 0.045;
+/// λ of frames that move in blocks and of warped ones, and the mean squared error up to which coefficients are not coded,
+/// in squared steps.
+const LAMBDA: [f32; 2] = [0.045, 0.06];
 const FLOOR: f32 = 0.06;
 /// Squared error of luma, in 255ths, that stands for a squared voxel of displacement: about what pictures lose of both.
 const PLACE: f32 = 3000.0;
@@ -52,11 +53,12 @@ pub(super) struct Weights {
 }
 
 impl Weights {
-    /// Those of a quantisation step of luma, in 255ths, at the cloud's `own` level or one above it.
-    pub fn of_step(step: f32, own: bool) -> Self {
+    /// Those of a quantisation step of luma, in 255ths, at the cloud's `own` level or one above it, of a frame that is
+    /// `warped` or not.
+    pub fn of_step(step: f32, own: bool, warped: bool) -> Self {
         Weights {
             rough: ROUGH[usize::from(own)],
-            lambda: LAMBDA * step * step,
+            lambda: LAMBDA[usize::from(warped)] * step * step,
             floor: FLOOR * step * step,
         }
     }
@@ -433,7 +435,7 @@ mod tests {
 
     #[test]
     fn what_chance_explains_costs_nothing_and_changes_nothing() {
-        let weights = Weights::of_step(8.0, false);
+        let weights = Weights::of_step(8.0, false, false);
         let cell = |shift: f32| {
             let mut cell = Cell {
                 chance: 50.0,

@@ -3,6 +3,7 @@
 mod checking;
 mod choice;
 mod descent;
+mod field;
 mod head_maps;
 mod knobs;
 mod memory;
@@ -17,6 +18,8 @@ mod refine;
 mod shape;
 mod surfel_size;
 mod thickness;
+mod votes;
+mod warp;
 mod writing;
 
 use std::ops::RangeInclusive;
@@ -37,7 +40,7 @@ use crate::motion::{ColourGuide, GeometryGuide};
 use descent::Pictures;
 pub(crate) use memory::memory_of;
 pub use memory::{encode_memory, surface_within};
-pub use options::{Options, Outline, Tune};
+pub use options::{Motion, Options, Outline, Tune};
 pub use predicted::{PredictedFrame, encode_predicted};
 pub use quality::QualityTarget;
 pub(crate) use thickness::of_stream as thickness_of;

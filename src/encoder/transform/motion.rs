@@ -135,7 +135,7 @@ impl Search<'_> {
     fn keys(&self) -> Vec<u64> {
         let mut keys = self.octree.level(self.block_level).keys().to_vec();
         if let Some(level) = self.previous.level(self.top) {
-            keys.extend(level.blocks(self.top, self.block_level));
+            keys.extend(level.nodes(self.top, self.block_level));
         }
         keys.sort_unstable();
         keys.dedup();
@@ -155,6 +155,16 @@ impl Search<'_> {
         }
         best.refine(&sample, &[2, 1, 1]);
         best.vector.map(|x| x as i16)
+    }
+
+    /// All blocks that have voxels in either frame, in the order of their keys, without vectors.
+    pub fn still(&self) -> Vec<Block> {
+        let still = |key| Block {
+            key,
+            vector: [0; 3],
+            keep: false,
+        };
+        self.keys().into_iter().map(still).collect()
     }
 
     /// All blocks that have voxels in either frame, in the order of their keys, with vectors of least cost.

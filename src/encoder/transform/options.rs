@@ -36,9 +36,8 @@ pub struct Options {
     pub colour_slice: u32,
     /// For frames of a sequence: whether a decoder of a level of all frames needs no finer level of any.
     pub scalable: bool,
-    /// For frames of a sequence: whether the blocks that move are divided into parts with vectors of their own. That takes
-    /// fewer bits; decoders of before 2026-11-28 refuse such frames.
-    pub parts: bool,
+    /// For frames of a sequence: how the previous frame moves, unless `scalable`.
+    pub motion: Motion,
     /// What coded colours approach.
     pub tune: Tune,
     /// With [`Tune::Visual`], in how many rounds at most colours are moved further, by gradient descent through pictures.
@@ -71,7 +70,7 @@ impl Default for Options {
             slice_voxels: MAX_SLICE_VOXELS,
             colour_slice: COLOUR_SLICE,
             scalable: false,
-            parts: true,
+            motion: Motion::Warped,
             tune: Tune::Visual,
             rounds: 0,
             outline: Outline::Surface,
@@ -100,6 +99,19 @@ pub enum Tune {
     Visual,
     /// The mean colours of voxels.
     Psnr,
+}
+
+/// How the previous frame of a sequence moves (`docs/format.md`, 17.5, 17.9 and 17.10).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Motion {
+    /// In blocks of 16³ voxels.
+    Blocks,
+    /// In blocks, and in parts of 8³ voxels of them.
+    Parts,
+    /// By a smooth field of vectors.
+    #[default]
+    Warped,
 }
 
 /// How far the Gaussians of a stream reach.

@@ -10,14 +10,16 @@ use super::head_maps;
 use super::motion::{Block, Search};
 use super::noise;
 use super::shape::points_in_children;
-use super::{EncoderInput, GeometryTarget, Guides, Options, choose_levels, octree_of};
+use super::votes::Votes;
+use super::warp::{LATTICE_UNIT, Warp};
+use super::{EncoderInput, GeometryTarget, Guides, Motion, Options, choose_levels, octree_of};
 use crate::cloud::ColouredVoxels;
-use crate::colour::{Steps, Truth, Ycc, trunk_depth};
+use crate::colour::{Steps, Truth, trunk_depth};
 use crate::error::Result;
 use crate::geometry::{Octree, Voxels, codec};
 use crate::log::Log;
 use crate::motion::moved::{self, REACH};
-use crate::motion::{Blocks, GeometryGuide, Head, Inter, Mode, Modes, Previous, own as own_of};
+use crate::motion::{Blocks, GeometryGuide, Head, Inter, Mode, Modes, Previous, Warped, own as own_of};
 
 /// A coded frame that is predicted from the frame before.
 #[derive(Debug)]
@@ -30,8 +32,6 @@ pub struct PredictedFrame {
 
 /// Levels from the blocks to the finest one: blocks have 16³ voxels, and parts 8³, if the base level is not above them.
 const BLOCK_DEPTH: u8 = 4;
-/// Colours of a block are predicted from the previous frame if what is left is at most this share of the differences.
-const INTER_COLOURS: f32 = 0.9;
 
 /// Codes a cloud as a frame that is predicted from `previous`, the frame before as it was decoded, down to the last
 /// level of `options`.
@@ -50,24 +50,41 @@ pub fn encode_predicted(
     let octree = octree_of(cloud, top, log)?;
     let trunk = trunk_depth(base, |level| octree.level(level).len());
     let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, trunk, top, steps.is_lossless());
-    let divided = options.parts && base > 0;
+    let warp = match options.motion {
+        Motion::Warped if !options.scalable && !steps.is_lossless() => Warp::new(previous, &octree, &truth, top),
+        _ => None,
+    };
+    let divided = warp.is_none() && options.motion != Motion::Blocks && base > 0;
     // Blocks, or their parts, are nodes of the base level or of one above it.
     let block_level = (base - u8::from(divided)).min(top.saturating_sub(BLOCK_DEPTH));
     let isa = options.isa.unwrap_or_else(Isa::detect);
     let part_level = block_level + u8::from(divided);
     let levels_of_target = [base, block_level, part_level, top];
-    let mut target = Target::new(cloud, &octree, &truth, previous, levels_of_target, steps)?;
+    let mut target = Target::new(
+        cloud,
+        &octree,
+        &truth,
+        (previous, warp.as_ref()),
+        levels_of_target,
+        steps,
+    )?;
     let head = Head {
         block_level,
         divided,
         // They are rounded: exact colours of what stands still would differ from their means.
         moves_coarse: divided && block_level + 2 <= base && !steps.is_lossless(),
-        unit_level: top,
-        reference_level: if options.scalable { base } else { top }.min(block_level + REACH),
+        warped: warp.is_some(),
+        unit_level: if warp.is_some() { top + LATTICE_UNIT } else { top },
+        reference_level: match warp {
+            Some(_) => top,
+            None => if options.scalable { base } else { top }.min(block_level + REACH),
+        },
         root: target.root,
         vector: [0; 3],
     };
-    let plan = match target.modes(previous, head, base) {
+    let warped = warp.as_ref().map(|warp| &warp.warped);
+    let source = (previous, warped);
+    let plan = match target.modes(source, head, base) {
         // Blocks that come from the same place may together have too many voxels.
         Err(error) if error.clause() == Some(moved::TOO_MANY) => {
             let head = Head {
@@ -75,11 +92,17 @@ pub fn encode_predicted(
                 moves_coarse: false,
                 ..head
             };
-            target.modes(previous, head, base)?
+            target.modes(source, head, base)?
         }
         plan => plan?,
     };
-    let inter = Inter::of(Arc::clone(previous), plan.head, plan.blocks.clone(), base);
+    let inter = Inter::of(
+        Arc::clone(previous),
+        plan.head,
+        warped.cloned(),
+        plan.blocks.clone(),
+        base,
+    );
     let own = top == cloud.voxels.depth();
     let lambda = match options.geometry {
         // As in frames that are coded by themselves.
@@ -123,7 +146,10 @@ pub fn encode_predicted(
     let subject = subject.with_octree(target.octree, top, log)?;
     let stream = subject.code_towards(&target.truth, top, steps, None, log)?.bytes;
     let keys = keys.each_ref().map(Vec::as_slice);
-    let motion = plan.head.write(base, keys, plan.blocks.each_ref())?;
+    let mut motion = plan.head.write(base, keys, plan.blocks.each_ref())?;
+    if let Some(warp) = &warp {
+        Head::put_lattice(&mut motion[0], &warp.lattice, warp.least)?;
+    }
     Ok(PredictedFrame { stream, motion })
 }
 
@@ -142,6 +168,7 @@ struct Target {
     block_level: u8,
     part_level: u8,
     lossless: bool,
+    warped: bool,
 }
 
 /// The motion of a frame.
@@ -156,7 +183,7 @@ impl Target {
         cloud: &ColouredVoxels,
         octree: &Octree,
         truth: &Truth,
-        previous: &Arc<Previous>,
+        (previous, warp): (&Previous, Option<&Warp>),
         [base, block_level, part_level, top]: [u8; 4],
         steps: Steps,
     ) -> Result<Self> {
@@ -167,14 +194,17 @@ impl Target {
         let search = Search {
             octree,
             truth,
-            previous,
+            previous: warp.map_or(previous, |warp| &warp.frame),
             current: &current,
             samples: &samples,
             top,
             block_level,
         };
-        let weights = Weights::of_step(steps.luma_step(), top == cloud.voxels.depth());
-        let mut blocks = search.blocks(weights);
+        let weights = Weights::of_step(steps.luma_step(), top == cloud.voxels.depth(), warp.is_some());
+        let mut blocks = match warp {
+            Some(_) => search.still(),
+            None => search.blocks(weights),
+        };
         let search = Search {
             block_level: part_level,
             ..search
@@ -237,6 +267,7 @@ impl Target {
             block_level,
             part_level,
             lossless,
+            warped: warp.is_some(),
         })
     }
 
@@ -308,7 +339,7 @@ impl Target {
     }
 
     /// Chooses the modes of all levels.
-    fn modes(&self, previous: &Arc<Previous>, head: Head, base: u8) -> Result<Plan> {
+    fn modes(&self, (previous, warped): (&Arc<Previous>, Option<&Arc<Warped>>), head: Head, base: u8) -> Result<Plan> {
         let inter = Modes {
             geometry: Mode::Inter,
             colours: Mode::Inter,
@@ -320,7 +351,7 @@ impl Target {
         };
         let tried = |head: Head| {
             let tried = [(head, inter), (Head { root: still, ..head }, still)];
-            tried.map(|(head, modes)| Inter::of(Arc::clone(previous), head, self.even(modes), base))
+            tried.map(|(head, modes)| Inter::of(Arc::clone(previous), head, warped.cloned(), self.even(modes), base))
         };
         let (mut head, mut tries) = (head, tried(head));
         if head.moves_coarse {
@@ -349,7 +380,7 @@ impl Target {
             let blocks = votes.iter().zip(self.blocks_of(level));
             chosen.push(
                 blocks
-                    .map(|(votes, block)| votes.modes(block.keep, self.lossless))
+                    .map(|(votes, block)| votes.modes(block.keep, [self.lossless, self.warped]))
                     .collect(),
             );
         }
@@ -358,7 +389,7 @@ impl Target {
             *modes = chosen;
         }
         let all = self.blocks.iter().all(|block| block.keep);
-        plan.head.root = root.modes(all, self.lossless);
+        plan.head.root = root.modes(all, [self.lossless, self.warped]);
         Ok(plan)
     }
 
@@ -408,80 +439,5 @@ impl Target {
             vote.colours(truth, &colours.moved()[children], above);
         }
         Ok(votes)
-    }
-}
-
-/// How well the previous frame predicts a block at a level.
-#[derive(Debug, Clone, Copy, Default)]
-struct Votes {
-    /// Parents whose children are there, but not those of the window.
-    other: u64,
-    /// Children that are there in both frames, and in one of them.
-    hits: u64,
-    misses: u64,
-    /// Children without, or with other colours.
-    coloured: u64,
-    /// Differences of luma to the parent, and those left by the prediction.
-    intra: f32,
-    inter: f32,
-    /// Differences of luma to the parent where nothing is predicted.
-    new: f32,
-}
-
-impl Votes {
-    fn geometry(&mut self, mask: u8, moved: u8) {
-        self.other += u64::from(moved != 0 && moved != mask);
-        self.hits += u64::from((mask & moved).count_ones());
-        self.misses += u64::from((mask ^ moved).count_ones());
-    }
-
-    fn colours(&mut self, truth: &[Ycc], moved: &[Option<Ycc>], above: Ycc) {
-        let there = || {
-            truth
-                .iter()
-                .zip(moved)
-                .filter_map(|(truth, moved)| Some((truth, (*moved)?)))
-        };
-        let mut shift = 0;
-        let mut count = 0;
-        for (truth, moved) in there() {
-            shift += i32::from(truth[0]) - i32::from(moved[0]);
-            count += 1;
-        }
-        let shift = shift as f32 / count.max(1) as f32;
-        let new = truth.iter().zip(moved).filter(|(_, moved)| moved.is_none());
-        self.new += new
-            .map(|(truth, _)| (f32::from(truth[0]) - f32::from(above[0])).abs())
-            .sum::<f32>();
-        for (truth, moved) in there() {
-            self.intra += (f32::from(truth[0]) - f32::from(above[0])).abs();
-            self.inter += (f32::from(truth[0]) - f32::from(moved[0]) - shift).abs();
-        }
-    }
-
-    fn add(&mut self, other: Votes) {
-        self.other += other.other;
-        self.hits += other.hits;
-        self.misses += other.misses;
-        self.coloured += other.coloured;
-        self.intra += other.intra;
-        self.inter += other.inter;
-        self.new += other.new;
-    }
-
-    /// The modes for a block, which is to stay what it was if `keep`.
-    fn modes(&self, keep: bool, lossless: bool) -> Modes {
-        let geometry = match (self.other, self.hits > 0) {
-            (0, true) => Mode::Skip,
-            _ if 2 * self.hits >= self.misses => Mode::Inter,
-            _ => Mode::Intra,
-        };
-        let colours = match self.hits {
-            0 => Mode::Intra,
-            _ if self.coloured == 0 || (keep && !lossless) => Mode::Skip,
-            _ if self.inter <= INTER_COLOURS * self.intra => Mode::Inter,
-            _ => Mode::Intra,
-        };
-        Modes { geometry, colours }
     }
 }

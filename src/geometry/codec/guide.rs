@@ -1,9 +1,10 @@
-//! What a previous frame tells of a level's occupancies (`docs/format.md`, clause 17.6).
+//! What a previous frame tells of a level's occupancies (`docs/format.md`, clauses 17.6 and 17.10.8).
 //!
 //! Every parent has a *mode* and a *window*: the 4³ cells around its children that are occupied in the moved previous
 //! frame, numbered as in `contexts`. In the mode [`Mode::Skip`] a parent has the children that the window has, unless
 //! it has none. Else the window refines the probability of each child: a table by what the window has around the child
-//! and by the logit that was predicted without it. So a wrong window costs bits and nothing else.
+//! and by the logit that was predicted without it. So a wrong window costs bits and nothing else. A warped frame has a
+//! second window, of the cells that its voxels come near.
 
 use super::coder::Coder;
 use crate::coding::probability::{LIMIT, squash};
@@ -27,6 +28,16 @@ pub struct Guide<'a> {
     pub modes: &'a [Mode],
     /// The window of every parent; of no meaning in [`Mode::Intra`].
     pub windows: &'a [u64],
+    /// Of a warped frame: the window of near cells of every parent.
+    pub near: Option<&'a [u64]>,
+}
+
+/// What the previous frame has around a parent's children.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Window {
+    voxels: u64,
+    /// Near cells; of no meaning if the frame is not warped.
+    near: u64,
 }
 
 /// The cells of the children in octants 0 to 7.
@@ -46,8 +57,11 @@ impl Guide<'_> {
 
     /// The window of this parent, if it refines probabilities.
     #[inline(always)]
-    pub(super) fn window(&self, parent: usize) -> Option<u64> {
-        (self.modes[parent] != Mode::Intra).then(|| self.windows[parent])
+    pub(super) fn window(&self, parent: usize) -> Option<Window> {
+        (self.modes[parent] != Mode::Intra).then(|| Window {
+            voxels: self.windows[parent],
+            near: self.near.map_or(0, |near| near[parent]),
+        })
     }
 }
 
@@ -62,20 +76,24 @@ pub fn own(window: u64) -> u8 {
 const STEP: i32 = 45;
 /// Entries of a context: logits from −720 to 720.
 const ENTRIES: usize = (2 * LIMIT / STEP) as usize + 1;
-/// Contexts: the child in the window, its faces there, wrong siblings, and errors before.
-const CONTEXTS: usize = 2 * 7 * 3 * 3;
+/// Classes of children, and counts of their faces: in the window; of a warped frame, in both.
+const CLASSES: [usize; 2] = [2, 3];
+const FACES_THERE: [usize; 2] = [7, 13];
+/// How many times as many contexts wrong siblings and errors before make.
+const HISTORIES: usize = 3 * 3;
 /// Bits of a probability in the table.
 const BITS: u32 = 22;
 /// How often an entry is seen at first, and at most.
 const SEEN: [u32; 2] = [4, 250];
-/// Logits by which a child in the window, or none there, moves the initial probability.
-const INITIAL: i32 = 96;
+/// Logits by which the class of a child moves the initial probability.
+const INITIAL: [&[i32]; 2] = [&[-96, 96], &[-96, -32, 96]];
 
 /// Refines probabilities by the windows of a slice.
 #[derive(Debug)]
 pub(super) struct Refiner {
     /// Probabilities of a 1 in the upper bits, from bit 8 on; how often they were seen below.
     table: Vec<u32>,
+    warped: bool,
     /// A running mean of wrong children, in units of 2⁻¹⁶.
     wrong: u32,
 }
@@ -89,30 +107,44 @@ pub(super) struct Refined {
 }
 
 impl Refiner {
-    pub fn new() -> Self {
-        let mut table = Vec::with_capacity(CONTEXTS * ENTRIES);
-        for context in 0..CONTEXTS {
-            let shift = if context % 2 == 1 { INITIAL } else { -INITIAL };
+    pub fn new(warped: bool) -> Self {
+        let kind = usize::from(warped);
+        let contexts = CLASSES[kind] * FACES_THERE[kind] * HISTORIES;
+        let mut table = Vec::with_capacity(contexts * ENTRIES);
+        for context in 0..contexts {
+            let shift = INITIAL[kind][context % CLASSES[kind]];
             for entry in 0..ENTRIES as i32 {
                 let one = squash(entry * STEP - LIMIT + shift) << (BITS - 16);
                 table.push(one << 8 | SEEN[0]);
             }
         }
-        Refiner { table, wrong: 1 << 13 }
+        Refiner {
+            table,
+            warped,
+            wrong: 1 << 13,
+        }
     }
 
     /// The probability of the child in `octant`, whose lower siblings are `coded`, where `logit` was predicted without
     /// the window.
     #[inline(always)]
-    fn predict(&self, window: u64, octant: usize, coded: u8, logit: i32) -> Refined {
+    fn predict(&self, window: Window, octant: usize, coded: u8, logit: i32) -> Refined {
         let shift = OWN[octant] - OWN[0];
-        let around = window >> shift;
+        let around = window.voxels >> shift;
         let there = around >> OWN[0] & 1;
         let faces = (around & FACES).count_ones() as usize;
         let lower = (1u8 << octant).wrapping_sub(1);
-        let siblings = (((coded ^ own(window)) & lower).count_ones() as usize).min(2);
+        let siblings = (((coded ^ own(window.voxels)) & lower).count_ones() as usize).min(2);
         let errors = usize::from(self.wrong > 1 << 11) + usize::from(self.wrong > 1 << 13);
-        let context = there as usize + 2 * (faces + 7 * (siblings + 3 * errors));
+        let history = siblings + 3 * errors;
+        let context = match self.warped {
+            true => {
+                let near = window.near >> shift;
+                let class = (there + (near >> OWN[0] & 1)) as usize;
+                class + 3 * (faces + (near & FACES).count_ones() as usize + 13 * history)
+            }
+            false => there as usize + 2 * (faces + 7 * history),
+        };
         let place = (logit + LIMIT).clamp(0, 2 * LIMIT - 1);
         let (low, part) = (place / STEP, (place % STEP) as u32);
         let at = context * ENTRIES + low as usize;
@@ -128,7 +160,7 @@ impl Refiner {
     /// The refined probability alone, in units of 2⁻¹⁶.
     #[cfg(feature = "encoder")]
     #[inline(always)]
-    pub fn probability(&self, window: u64, octant: usize, coded: u8, logit: i32) -> u32 {
+    pub fn probability(&self, window: Window, octant: usize, coded: u8, logit: i32) -> u32 {
         self.predict(window, octant, coded, logit).one
     }
 
@@ -137,7 +169,7 @@ impl Refiner {
     pub fn code(
         &mut self,
         coder: &mut impl Coder,
-        window: u64,
+        window: Window,
         octant: usize,
         coded: u8,
         logit: i32,
@@ -201,6 +233,7 @@ mod tests {
             keys in prop::collection::vec(0u64..1 << 15, 1..600),
             wrong in prop::collection::vec(any::<u8>(), 600),
             modes in prop::collection::vec(0usize..3, 600),
+            warped: bool,
         ) {
             let octree = Octree::new(Voxels::new(5, keys)).unwrap();
             let (map, parents) = (octree.kernel_map(4), octree.occupancy(4).len());
@@ -210,7 +243,8 @@ mod tests {
                 Mode::Skip => 0,
                 _ => wrong[i % 600],
             });
-            let guide = Some(Guide { modes: &modes, windows: &windows });
+            let near: Option<Vec<u64>> = warped.then(|| windows.iter().map(|window| window | window << 1).collect());
+            let guide = Some(Guide { modes: &modes, windows: &windows, near: near.as_deref() });
             let isa = Isa::detect();
             let coded = encode_guided(isa, &octree, &map, 5, 90, guide);
             let masks = decode_masks(isa, 5, &map, &slices(&coded), 90, guide, &Cancel::default()).unwrap();
@@ -233,6 +267,7 @@ mod tests {
             let guide = Guide {
                 modes: &modes,
                 windows: &windows,
+                near: None,
             };
             encode_guided(Isa::detect(), &octree, &map, 6, 1 << 14, Some(guide))
         };

@@ -204,7 +204,7 @@ impl Work for Encode<'_> {
             masks,
             guide,
         } = self;
-        let mut predictor = Predictor::new(instructions, parents.len(), guide.is_some());
+        let mut predictor = Predictor::new(instructions, parents.len(), guide);
         let mut encoder = Encoder::new();
         let neighbourhoods = Neighbourhood::of_all(map, &parents);
         for ((parent, &mask), neighbourhood) in parents.clone().zip(masks).zip(neighbourhoods) {
@@ -242,7 +242,7 @@ impl Work for Decode<'_> {
             slice,
             guide,
         } = self;
-        let mut predictor = Predictor::new(instructions, parents.len(), guide.is_some());
+        let mut predictor = Predictor::new(instructions, parents.len(), guide);
         let mut decoder = Decoder::new(slice.bytes, slice.offset);
         let mut masks = Vec::with_capacity(parents.len());
         let mut found = 0;

@@ -64,7 +64,7 @@ pub fn features(map: &KernelMap, slice: &Range<usize>, voxel: usize, occupancy: 
         let known = PRESENCES + 9 * usize::from(BEFORE_INDEX[k]);
         emit(known);
         let mask = occupancy[map.row(voxel)[k] as usize - slice.start];
-        ones(mask.into()).for_each(|octant| emit(known + 1 + octant));
+        ones(mask).for_each(|octant| emit(known + 1 + octant));
     }
 }
 
@@ -220,7 +220,7 @@ mod tests {
             for mask in 0..=255u8 {
                 for unit in 0..WIDTH {
                     let at = |row: usize| i32::from(WEIGHTS[(PRESENCES + 9 * slot + row) * WIDTH + unit] as i8);
-                    let expected = at(0) + ones(mask.into()).map(|octant| at(1 + octant)).sum::<i32>();
+                    let expected = at(0) + ones(mask).map(|octant| at(1 + octant)).sum::<i32>();
                     let mut sum: i32 = network.children(k, mask).map(|row| row[unit].into()).iter().sum();
                     for remainder in network.remainders.iter().filter(|remainder| remainder.k == k) {
                         sum += i32::from(remainder.row(mask)[unit]);

@@ -11,7 +11,7 @@
 
 use super::coder::Coder;
 use super::contexts::Contexts;
-use super::guide::Refiner;
+use super::guide::{Guide, Refiner, Window};
 use super::mixer::Mixer;
 use super::neighbourhood::Neighbourhood;
 use super::network::Network;
@@ -44,7 +44,7 @@ pub(super) struct Predictor<I> {
 
 impl<I: Instructions> Predictor<I> {
     /// The initial state of a slice of `parents` parents.
-    pub fn new(instructions: I, parents: usize, guided: bool) -> Self {
+    pub fn new(instructions: I, parents: usize, guide: Option<Guide<'_>>) -> Self {
         let network = Network::get();
         Predictor {
             instructions,
@@ -52,7 +52,7 @@ impl<I: Instructions> Predictor<I> {
             mixer: Mixer::new(instructions, parents),
             output: network.output,
             bias: network.bias,
-            refiner: guided.then(Refiner::new),
+            refiner: guide.map(|guide| Refiner::new(guide.near.is_some())),
         }
     }
 
@@ -98,7 +98,7 @@ impl<I: Instructions> Predictor<I> {
         first: usize,
         occupancies: &[u8],
         occupancy: u8,
-        window: Option<u64>,
+        window: Option<Window>,
     ) -> u8 {
         let network = self.network;
         let (features, mut contexts) = self.gather(neighbours, row, first, occupancies);
@@ -161,7 +161,7 @@ impl<I: Instructions> Predictor<I> {
         occupancies: &[u8],
         surface: &Surface,
         lambda: u32,
-        window: Option<u64>,
+        window: Option<Window>,
     ) -> u8 {
         let lengths = optimise::code_lengths();
         let (features, contexts) = self.gather(neighbours, row, first, occupancies);
@@ -199,7 +199,14 @@ impl<I: Instructions> Predictor<I> {
     /// The probability, in units of 2⁻¹⁶, of the child in `octant`. `coded` are the children in lower octants.
     #[cfg(feature = "encoder")]
     #[inline(always)]
-    fn probability(&self, features: &Row, contexts: &Contexts, octant: usize, coded: u8, window: Option<u64>) -> u32 {
+    fn probability(
+        &self,
+        features: &Row,
+        contexts: &Contexts,
+        octant: usize,
+        coded: u8,
+        window: Option<Window>,
+    ) -> u32 {
         let node = 1 << octant | usize::from(coded);
         let row = self.network.node(node);
         let sum = hidden::sum(self.instructions, features, row, &self.output[octant]);

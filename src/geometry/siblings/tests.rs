@@ -48,7 +48,7 @@ fn check(voxels: Voxels) {
         let parents = octree.occupancy(above).iter().zip(octree.first_child(above));
         for (parent, (&mask, &first)) in parents.enumerate() {
             let window = map.window(parent);
-            for (child, octant) in (first as usize..).zip(crate::geometry::ones(mask.into())) {
+            for (child, octant) in (first as usize..).zip(crate::geometry::ones(mask)) {
                 let around = window.around(octant);
                 assert!((0..27).all(|k| around[place(k)] == table.row(child)[k]));
                 assert!((0..27).all(|k| window.has(octant, k) == (table.row(child)[k] != KernelMap::ABSENT)));

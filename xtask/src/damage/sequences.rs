@@ -14,6 +14,7 @@ const MOVING: &str = "sequences/moving";
 const MANY: &str = "sequences/many-vectors";
 /// One group, whose frames have the levels 4 to 6 and blocks of level 2 that are divided.
 const PARTS: &str = "sequences/parts";
+const WARPED: &str = "sequences/warped";
 /// One group, whose frames are the root.
 const ROOT: &str = "sequences/root-alone";
 
@@ -46,6 +47,7 @@ pub fn all(read: impl Fn(&str) -> Vec<u8>) -> Vec<Kind> {
         }],
     );
     of(PARTS, &[divided]);
+    of(WARPED, &[warped]);
     kinds.extend(crowded(&read(MANY)));
     kinds.extend(parts(&read(PARTS)));
     kinds
@@ -378,6 +380,45 @@ fn divided(add: &mut Add) {
     add("motion-of-parts-of-no-word", "17.5.3", &|s| {
         s.motion(0).truncate(10);
         s.motion(0).extend([0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0xff]);
+    });
+}
+
+/// The lattice follows the head of 10 bytes: its level, the least weight of voxels, the length of its words.
+fn warped(add: &mut Add) {
+    add("warped-frame-of-parts", "17.5.1", &|s| s.motion(0)[0] |= 0x80);
+    add("warped-frame-whose-coarse-colours-move", "17.5.1", &|s| {
+        s.motion(0)[0] |= 0x40
+    });
+    add("warped-frame-with-another-reference", "17.5.1", &|s| {
+        s.motion(0)[2] -= 1
+    });
+    add("warped-frame-with-a-vector", "17.5.1", &|s| s.motion(0)[6] = 1);
+    add("lattice-that-is-not-there", "17.10.1", &|s| s.motion(0).truncate(10));
+    add("lattice-of-the-level-above-the-finest", "17.10.1", &|s| {
+        s.motion(0)[10] = 5
+    });
+    add("lattice-of-level-255", "17.10.1", &|s| s.motion(0)[10] = 255);
+    add("lattice-without-a-least-weight", "17.10.1", &|s| {
+        s.motion(0).truncate(11)
+    });
+    add("lattice-whose-voxels-are-not-near", "17.10.1", &|s| {
+        s.motion(0)[11] = 39
+    });
+    add("lattice-without-a-length", "17.10.1", &|s| s.motion(0).truncate(12));
+    add("lattice-longer-than-the-motion", "17.10.1", &|s| {
+        s.motion(0).splice(12..13, [0xff, 0xff, 0x7f]);
+    });
+    add("lattice-with-a-length-not-shortest", "1.4.2", &|s| {
+        s.motion(0).splice(12..13, [0x80, 0x80, 0]);
+    });
+    add("lattice-of-a-byte-more", "5.4.3", &|s| s.motion(0)[12] += 1);
+    add("lattice-of-other-words", "17.5.3", &|s| {
+        // All decisions are 1.
+        s.motion(0).truncate(10);
+        s.motion(0).extend([2, 40, 8, 0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0xff]);
+    });
+    add("motion-of-a-warped-frame-goes-on", "5.4.3", &|s| {
+        s.motion(0).extend([0; 12])
     });
 }
 

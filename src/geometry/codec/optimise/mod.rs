@@ -114,7 +114,7 @@ impl Work for Optimise<'_> {
             distortion,
             guide,
         } = self;
-        let mut predictor = Predictor::new(instructions, parents.len(), guide.is_some());
+        let mut predictor = Predictor::new(instructions, parents.len(), guide);
         let mut encoder = Encoder::new();
         let neighbourhoods = Neighbourhood::of_all(map, &parents);
         let mut masks: Vec<u8> = Vec::with_capacity(parents.len());
@@ -169,7 +169,7 @@ impl Surface {
             coded: 0,
             added: [0; 8],
         };
-        for (octant, points) in ones(mask.into()).zip(points) {
+        for (octant, points) in ones(mask).zip(points) {
             surface.own[octant] = *points;
         }
         surface.add(KernelMap::CENTRE, mask, 0, points);
@@ -180,7 +180,7 @@ impl Surface {
     #[inline(always)]
     fn add(&mut self, k: usize, truth: u8, coded: u8, points: &[u8]) {
         self.coded |= cells(k, coded);
-        for (octant, points) in ones(truth.into()).zip(points) {
+        for (octant, points) in ones(truth).zip(points) {
             let cell = cells(k, 1 << octant);
             for (at, cells) in self.points.iter_mut().enumerate() {
                 *cells |= cell * u64::from(points >> at & 1);
@@ -191,7 +191,7 @@ impl Surface {
     /// Computes what children cost that are added, once all neighbours are there.
     #[inline(always)]
     fn finish(&mut self) {
-        for octant in ones((!self.mask).into()) {
+        for octant in ones(!self.mask) {
             let shift = shift_of(octant);
             let near = |half: usize| (0..8).any(|at| self.points[at] >> shift & AROUND[7 - at][half] != 0);
             let half = (1..FARTHEST).find(|half| near(*half)).unwrap_or(FARTHEST);
@@ -215,14 +215,14 @@ impl Surface {
     pub fn of(&self, mask: u8) -> u32 {
         let coded = self.coded | cells(KernelMap::CENTRE, mask);
         let mut sum = 0;
-        for octant in ones((self.mask & !mask).into()) {
+        for octant in ones(self.mask & !mask) {
             let around = coded >> shift_of(octant);
-            for at in ones(self.own[octant].into()) {
+            for at in ones(self.own[octant]) {
                 let half = (1..FARTHEST).find(|half| around & AROUND[at][*half] != 0);
                 sum += POINT * half.unwrap_or(FARTHEST) as u32;
             }
         }
-        for octant in ones((mask & !self.mask).into()) {
+        for octant in ones(mask & !self.mask) {
             sum += self.added[octant];
         }
         sum

@@ -153,6 +153,7 @@ fn what_a_previous_frame_tells_saves_bits_and_skipped_parents_keep_their_childre
     let guide = Guide {
         modes: &modes,
         windows: &windows,
+        near: None,
     };
     let exact = encode_guided(Isa::detect(), &octree, &octree.kernel_map(6), 7, 1000, Some(guide));
     assert_eq!(guided(&octree, 7, 0, Some(guide)), (exact, octree.clone()));
