@@ -1,5 +1,6 @@
 //! The previous frame, warped by a lattice (`docs/format.md`, clauses 17.10.4 to 17.10.6).
 
+use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -33,9 +34,8 @@ const SIDE: i32 = 1 << TILE;
 const CELLS: usize = 1 << (3 * TILE);
 /// Bricks per task that finds places.
 const BRICKS: usize = 512;
-/// Bits of a voxel's number in a chunk of voxels, beside which a tile's key fits into 64 bits.
-const CHUNK_BITS: u32 = 10;
-const CHUNK: usize = 1 << CHUNK_BITS;
+/// Voxels per task that finds tiles.
+const CHUNK: usize = 1 << 10;
 
 /// The levels of the previous frame as a lattice warps it.
 #[derive(Debug, Clone)]
@@ -134,7 +134,9 @@ impl Warped {
     /// many of all levels above, each in a brick of its own; places, and the tiles that each touches.
     pub const fn bytes_per_voxel() -> usize {
         let near = Previous::bytes_per_voxel() + Bricks::bytes_per_voxel() + 2 * size_of::<Cell>();
-        2 * MOST_NEAR * near + size_of::<Place>() + TOUCHED * size_of::<u64>()
+        2 * MOST_NEAR * near
+            + size_of::<Place>()
+            + TOUCHED * (size_of::<(u16, u16)>() + size_of::<u16>() + size_of::<Run>())
     }
 
     /// Keys and colours of the voxels of the finest level.
@@ -314,8 +316,8 @@ fn scattered(places: &[Place], values: &[Ycc], top: u8) -> Result<Vec<Cell>> {
 
 /// The voxels that give weight to each tile.
 struct Touched {
-    /// Of each chunk of voxels, for each tile that one touches, the tile's key and the voxel's number in the chunk.
-    chunks: Vec<Vec<u64>>,
+    /// Of each chunk of voxels their numbers in the chunk, by tiles.
+    chunks: Vec<Vec<u16>>,
     /// In the order of tiles.
     runs: Vec<Run>,
 }
@@ -327,51 +329,85 @@ struct Run {
     range: Range<usize>,
 }
 
+/// The tiles that the voxels of a chunk touch, in the order in which they are met.
+#[derive(Default)]
+struct Tiles {
+    places: Vec<[i32; 3]>,
+    numbers: HashMap<[i32; 3], usize>,
+    /// How many voxels touch each.
+    counts: Vec<usize>,
+    /// For each touch the tile's number here and the voxel's in the chunk.
+    touches: Vec<(u16, u16)>,
+}
+
+impl Tiles {
+    /// Of one voxel after the other; each mostly touches the tile of the one before.
+    fn touch(&mut self, tile: [i32; 3], last: &mut usize, voxel: usize) {
+        if self.places.get(*last) != Some(&tile) {
+            *last = *self.numbers.entry(tile).or_insert_with(|| {
+                self.places.push(tile);
+                self.counts.push(0);
+                self.places.len() - 1
+            });
+        }
+        self.counts[*last] += 1;
+        self.touches.push((*last as u16, voxel as u16));
+    }
+
+    /// The voxels by tiles, and where those of each tile are.
+    fn sorted(self, chunk: usize) -> (Vec<u16>, Vec<Run>) {
+        let mut end = 0;
+        let runs = { self.places.iter().zip(&self.counts) }.map(|(place, count)| {
+            let tile = morton::encode(place.map(|x| x as u32));
+            let range = end..end + count;
+            end = range.end;
+            Run { tile, chunk, range }
+        });
+        let runs: Vec<Run> = runs.collect();
+        let mut next: Vec<usize> = runs.iter().map(|run| run.range.start).collect();
+        let mut voxels = vec![0; self.touches.len()];
+        for (tile, voxel) in self.touches {
+            voxels[next[usize::from(tile)]] = voxel;
+            next[usize::from(tile)] += 1;
+        }
+        (voxels, runs)
+    }
+}
+
 impl Touched {
     fn new(places: &[Place], top: u8) -> Self {
         let tiles = 1i32 << u32::from(top).saturating_sub(TILE);
-        let of_chunk = |places: &[Place]| {
-            let mut touched = Vec::with_capacity(2 * places.len());
+        let of_chunk = |(chunk, places): (usize, &[Place])| {
+            let (mut found, mut last) = (Tiles::default(), [0; 8]);
             for (i, place) in places.iter().enumerate() {
                 let first = place.map(|x| x >> (4 + TILE));
                 // The last cell that has weight.
-                let last = place.map(|x| (x + 15) >> (4 + TILE));
-                for z in first[2]..=last[2] {
-                    for y in first[1]..=last[1] {
-                        for x in first[0]..=last[0] {
+                let end = place.map(|x| (x + 15) >> (4 + TILE));
+                for z in first[2]..=end[2] {
+                    for y in first[1]..=end[1] {
+                        for x in first[0]..=end[0] {
                             if [x, y, z].iter().all(|x| (0..tiles).contains(x)) {
-                                let tile = morton::encode([x, y, z].map(|x| x as u32));
-                                touched.push(tile << CHUNK_BITS | i as u64);
+                                let side = (x - first[0]) + 2 * (y - first[1]) + 4 * (z - first[2]);
+                                found.touch([x, y, z], &mut last[side as usize & 7], i);
                             }
                         }
                     }
                 }
             }
-            touched.sort_unstable();
-            touched
+            found.sorted(chunk)
         };
-        let chunks: Vec<Vec<u64>> = places.par_chunks(CHUNK).map(of_chunk).collect();
-        let mut runs = Vec::new();
-        for (chunk, touched) in chunks.iter().enumerate() {
-            let mut first = 0;
-            for run in touched.chunk_by(|a, b| a >> CHUNK_BITS == b >> CHUNK_BITS) {
-                let range = first..first + run.len();
-                first = range.end;
-                let tile = run[0] >> CHUNK_BITS;
-                runs.push(Run { tile, chunk, range });
-            }
-        }
+        let found: Vec<_> = places.par_chunks(CHUNK).enumerate().map(of_chunk).collect();
+        let (chunks, runs): (Vec<Vec<u16>>, Vec<Vec<Run>>) = found.into_iter().unzip();
+        let mut runs: Vec<Run> = runs.into_iter().flatten().collect();
         runs.sort_unstable_by_key(|run| (run.tile, run.chunk));
         Touched { chunks, runs }
     }
 
     /// The numbers of a run's voxels.
     fn voxels(&self, run: &Run) -> impl Iterator<Item = usize> {
-        let first = run.chunk << CHUNK_BITS;
+        let first = run.chunk * CHUNK;
         let touched = &self.chunks[run.chunk][run.range.clone()];
-        touched
-            .iter()
-            .map(move |touched| first | *touched as usize & (CHUNK - 1))
+        touched.iter().map(move |touched| first + usize::from(*touched))
     }
 }
 
@@ -433,19 +469,16 @@ fn sums<S: Sums>(grid: &mut [S], voxels: impl Iterator<Item = (Place, Ycc)>, cor
         let low = [0, 1, 2].map(|axis| (place[axis] >> 4) - corner[axis]);
         let shares = place.map(|x| [16 - (x & 15), x & 15]);
         let inside = low.iter().all(|x| (0..side - 1).contains(x));
-        for z in 0..2 {
-            for y in 0..2 {
-                let share = shares[1][y as usize] * shares[2][z as usize];
-                for x in 0..2 {
-                    let at = [low[0] + x, low[1] + y, low[2] + z];
-                    let weight = shares[0][x as usize] * share;
-                    if inside || (weight > 0 && at.iter().all(|x| (0..side).contains(x))) {
-                        let [x, y, z] = at.map(|x| SPREAD[x as usize & 7]);
-                        let cell = (x | y << 1 | z << 2) & (CELLS - 1);
-                        grid[cell].add(weight, value);
-                        given[cell >> 6] |= 1 << (cell & 63);
-                    }
-                }
+        // Of each axis, what both cells are in the number of a cell.
+        let cells = [0, 1, 2].map(|axis| [low[axis], low[axis] + 1].map(|x| SPREAD[x as usize & 7] << axis));
+        for i in 0..8 {
+            let step = [i & 1, i >> 1 & 1, i >> 2];
+            let weight = shares[0][step[0]] * shares[1][step[1]] * shares[2][step[2]];
+            let is_there = |axis: usize| (0..side).contains(&(low[axis] + step[axis] as i32));
+            if inside || (weight > 0 && is_there(0) && is_there(1) && is_there(2)) {
+                let cell = (cells[0][step[0]] | cells[1][step[1]] | cells[2][step[2]]) & (CELLS - 1);
+                grid[cell].add(weight, value);
+                given[cell >> 6] |= 1 << (cell & 63);
             }
         }
     }

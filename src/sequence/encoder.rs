@@ -149,8 +149,8 @@ impl SequenceEncoder {
         self
     }
 
-    /// The same encoder, in which the previous frame moves in this way; [`Motion::Warped`] by default. Where levels are
-    /// predicted from themselves ([`SequenceEncoder::with_scalability`]), it moves in parts in place of that.
+    /// The same encoder, in which the previous frame moves in this way; [`Motion::Best`] by default. Frames that are
+    /// lossless, or whose levels are predicted from themselves ([`SequenceEncoder::with_scalability`]), are not warped.
     #[must_use]
     pub fn with_motion(mut self, motion: Motion) -> Self {
         self.options.motion = motion;

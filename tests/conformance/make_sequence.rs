@@ -172,9 +172,13 @@ fn root_alone(bytes: &[u8]) -> Vec<u8> {
 /// A sequence, what is unusual about it in its name, and whether no float had a part in it, so that every machine makes
 /// the same bytes.
 pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
-    let warped = |levels, quality| SequenceEncoder::new().with_levels(levels).with_quality(quality);
-    let divided = |levels, quality| warped(levels, quality).with_motion(Motion::Parts);
-    let of = |levels, quality| warped(levels, quality).with_motion(Motion::Blocks);
+    let moved = |levels, quality, motion| {
+        let encoder = SequenceEncoder::new().with_levels(levels).with_quality(quality);
+        encoder.with_motion(motion)
+    };
+    let warped = |levels, quality| moved(levels, quality, Motion::Warped);
+    let divided = |levels, quality| moved(levels, quality, Motion::Parts);
+    let of = |levels, quality| moved(levels, quality, Motion::Blocks);
     let (step, lossless) = (QualityTarget::Step, QualityTarget::Lossless);
     let slow = |frame| cloud(5, moving(frame, [1, 0, 0]));
     let fast = |frame| cloud(5, moving(frame, [2, 1, 3]));

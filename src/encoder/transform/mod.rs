@@ -1,5 +1,6 @@
 //! Streams of version 3: colours as transform coefficients.
 
+mod candidates;
 mod checking;
 mod choice;
 mod descent;

@@ -70,7 +70,7 @@ impl Default for Options {
             slice_voxels: MAX_SLICE_VOXELS,
             colour_slice: COLOUR_SLICE,
             scalable: false,
-            motion: Motion::Warped,
+            motion: Motion::Best,
             tune: Tune::Visual,
             rounds: 0,
             outline: Outline::Surface,
@@ -110,8 +110,10 @@ pub enum Motion {
     /// In blocks, and in parts of 8³ voxels of them.
     Parts,
     /// By a smooth field of vectors.
-    #[default]
     Warped,
+    /// In parts or by a smooth field, as each frame takes less rate and distortion.
+    #[default]
+    Best,
 }
 
 /// How far the Gaussians of a stream reach.

@@ -5,20 +5,20 @@ use std::sync::{Arc, OnceLock};
 use b2p_kernels::Isa;
 use rayon::prelude::*;
 
-use super::choice::{self, Shown, Weights};
+use super::candidates::{Candidate, Frame};
+use super::choice::{self, Shown};
 use super::head_maps;
 use super::motion::{Block, Search};
 use super::noise;
 use super::shape::points_in_children;
 use super::votes::Votes;
-use super::warp::{LATTICE_UNIT, Warp};
-use super::{EncoderInput, GeometryTarget, Guides, Motion, Options, choose_levels, octree_of};
+use super::warp::Warp;
+use super::{EncoderInput, GeometryTarget, Guides, Options, choose_levels, octree_of};
 use crate::cloud::ColouredVoxels;
-use crate::colour::{Steps, Truth, trunk_depth};
+use crate::colour::{Truth, trunk_depth};
 use crate::error::Result;
 use crate::geometry::{Octree, Voxels, codec};
 use crate::log::Log;
-use crate::motion::moved::{self, REACH};
 use crate::motion::{Blocks, GeometryGuide, Head, Inter, Mode, Modes, Previous, Warped, own as own_of};
 
 /// A coded frame that is predicted from the frame before.
@@ -29,9 +29,6 @@ pub struct PredictedFrame {
     /// The motion of each level, from the base level on.
     pub motion: Vec<Vec<u8>>,
 }
-
-/// Levels from the blocks to the finest one: blocks have 16³ voxels, and parts 8³, if the base level is not above them.
-const BLOCK_DEPTH: u8 = 4;
 
 /// Codes a cloud as a frame that is predicted from `previous`, the frame before as it was decoded, down to the last
 /// level of `options`.
@@ -50,52 +47,19 @@ pub fn encode_predicted(
     let octree = octree_of(cloud, top, log)?;
     let trunk = trunk_depth(base, |level| octree.level(level).len());
     let truth = Truth::new(&cloud.voxels, &cloud.colours, &octree, trunk, top, steps.is_lossless());
-    let warp = match options.motion {
-        Motion::Warped if !options.scalable && !steps.is_lossless() => Warp::new(previous, &octree, &truth, top),
-        _ => None,
-    };
-    let divided = warp.is_none() && options.motion != Motion::Blocks && base > 0;
-    // Blocks, or their parts, are nodes of the base level or of one above it.
-    let block_level = (base - u8::from(divided)).min(top.saturating_sub(BLOCK_DEPTH));
     let isa = options.isa.unwrap_or_else(Isa::detect);
-    let part_level = block_level + u8::from(divided);
-    let levels_of_target = [base, block_level, part_level, top];
-    let mut target = Target::new(
+    let frame = Frame {
         cloud,
-        &octree,
-        &truth,
-        (previous, warp.as_ref()),
-        levels_of_target,
+        octree: &octree,
+        truth: &truth,
+        previous,
+        options,
         steps,
-    )?;
-    let head = Head {
-        block_level,
-        divided,
-        // They are rounded: exact colours of what stands still would differ from their means.
-        moves_coarse: divided && block_level + 2 <= base && !steps.is_lossless(),
-        warped: warp.is_some(),
-        unit_level: if warp.is_some() { top + LATTICE_UNIT } else { top },
-        reference_level: match warp {
-            Some(_) => top,
-            None => if options.scalable { base } else { top }.min(block_level + REACH),
-        },
-        root: target.root,
-        vector: [0; 3],
+        base,
+        top,
     };
+    let Candidate { warp, mut target, plan } = frame.best()?;
     let warped = warp.as_ref().map(|warp| &warp.warped);
-    let source = (previous, warped);
-    let plan = match target.modes(source, head, base) {
-        // Blocks that come from the same place may together have too many voxels.
-        Err(error) if error.clause() == Some(moved::TOO_MANY) => {
-            let head = Head {
-                reference_level: block_level,
-                moves_coarse: false,
-                ..head
-            };
-            target.modes(source, head, base)?
-        }
-        plan => plan?,
-    };
     let inter = Inter::of(
         Arc::clone(previous),
         plan.head,
@@ -145,23 +109,31 @@ pub fn encode_predicted(
     let keys = target.keys();
     let subject = subject.with_octree(target.octree, top, log)?;
     let stream = subject.code_towards(&target.truth, top, steps, None, log)?.bytes;
-    let keys = keys.each_ref().map(Vec::as_slice);
-    let mut motion = plan.head.write(base, keys, plan.blocks.each_ref())?;
-    if let Some(warp) = &warp {
-        Head::put_lattice(&mut motion[0], &warp.lattice, warp.least)?;
-    }
+    let motion = plan.write(base, &keys, warp.as_ref())?;
     Ok(PredictedFrame { stream, motion })
 }
 
+impl Plan {
+    /// The motion of each level, from `base` on, as bytes.
+    pub fn write(&self, base: u8, keys: &[Vec<u64>; 2], warp: Option<&Warp>) -> Result<Vec<Vec<u8>>> {
+        let keys = keys.each_ref().map(Vec::as_slice);
+        let mut motion = self.head.write(base, keys, self.blocks.each_ref())?;
+        if let Some(warp) = warp {
+            Head::put_lattice(&mut motion[0], &warp.lattice, warp.least)?;
+        }
+        Ok(motion)
+    }
+}
+
 /// What a frame is to decode to: its own voxels and those of the moved previous frame, as `choice` says.
-struct Target {
+pub(super) struct Target {
     octree: Octree,
     truth: Truth,
     /// The blocks with voxels, in order.
     blocks: Vec<Block>,
     /// Their parts, or the blocks themselves if they are not divided.
     parts: Vec<Block>,
-    root: Modes,
+    pub root: Modes,
     top: u8,
     /// Last level of the colour trunk.
     trunk: u8,
@@ -169,24 +141,29 @@ struct Target {
     part_level: u8,
     lossless: bool,
     warped: bool,
+    /// Rate and distortion, about, without the bits of motion.
+    pub cost: f32,
 }
 
 /// The motion of a frame.
-struct Plan {
+pub(super) struct Plan {
     head: Head,
     /// The blocks, and their parts if they are divided.
     blocks: [Blocks; 2],
 }
 
 impl Target {
-    fn new(
-        cloud: &ColouredVoxels,
-        octree: &Octree,
-        truth: &Truth,
-        (previous, warp): (&Previous, Option<&Warp>),
-        [base, block_level, part_level, top]: [u8; 4],
-        steps: Steps,
-    ) -> Result<Self> {
+    pub fn new(frame: &Frame, warp: Option<&Warp>, [block_level, part_level]: [u8; 2]) -> Result<Self> {
+        let Frame {
+            cloud,
+            octree,
+            truth,
+            previous,
+            steps,
+            base,
+            top,
+            ..
+        } = *frame;
         let lossless = steps.is_lossless();
         let levels = (0..=top).map(|level| (truth.level(level).to_vec(), None, None));
         let current = Previous::new(octree, levels.collect());
@@ -200,7 +177,7 @@ impl Target {
             top,
             block_level,
         };
-        let weights = Weights::of_step(steps.luma_step(), top == cloud.voxels.depth(), warp.is_some());
+        let weights = frame.weights(warp.is_some());
         let mut blocks = match warp {
             Some(_) => search.still(),
             None => search.blocks(weights),
@@ -213,6 +190,12 @@ impl Target {
             true => search.parts(&blocks, weights),
             false => blocks.clone(),
         };
+        // Alike for all candidates.
+        let common = frame.weights(true);
+        let costs = parts
+            .par_iter()
+            .map(|part| choice::cost(&search, part.key, part.vector, common));
+        let costs: Vec<f32> = costs.collect();
         let choose = |block: &mut Block| match lossless {
             true => choice::own(&search, block),
             false => choice::choose(&search, block, weights),
@@ -268,6 +251,7 @@ impl Target {
             part_level,
             lossless,
             warped: warp.is_some(),
+            cost: costs.iter().sum(),
         })
     }
 
@@ -308,7 +292,7 @@ impl Target {
     }
 
     /// Keys of the blocks, and of their parts.
-    fn keys(&self) -> [Vec<u64>; 2] {
+    pub fn keys(&self) -> [Vec<u64>; 2] {
         [&self.blocks, &self.parts].map(|blocks| blocks.iter().map(|block| block.key).collect())
     }
 
@@ -339,7 +323,12 @@ impl Target {
     }
 
     /// Chooses the modes of all levels.
-    fn modes(&self, (previous, warped): (&Arc<Previous>, Option<&Arc<Warped>>), head: Head, base: u8) -> Result<Plan> {
+    pub fn modes(
+        &self,
+        (previous, warped): (&Arc<Previous>, Option<&Arc<Warped>>),
+        head: Head,
+        base: u8,
+    ) -> Result<Plan> {
         let inter = Modes {
             geometry: Mode::Inter,
             colours: Mode::Inter,
