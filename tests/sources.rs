@@ -10,7 +10,7 @@ const STAGES: [(&str, &[&str]); 15] = [
     ("container", &[]),
     ("geometry", &["coding", "container"]),
     ("colour", &["coding", "container", "geometry"]),
-    ("motion", &["coding", "geometry", "colour"]),
+    ("motion", &["coding", "container", "geometry", "colour"]),
     ("layers", &[]),
     ("cloud", &["geometry"]),
     ("gaussians", &["coding", "geometry", "layers", "cloud"]),
