@@ -140,7 +140,7 @@ impl Warped {
     }
 
     /// Keys and colours of the voxels of the finest level.
-    #[cfg(feature = "encoder")]
+    #[cfg(any(test, feature = "encoder"))]
     pub fn finest(&self) -> (Vec<u64>, Vec<Ycc>) {
         let Some(level) = self.levels.last() else {
             return Default::default();
