@@ -255,6 +255,12 @@ impl Target {
         })
     }
 
+    /// Share of its blocks, or their parts, whose vectors are not 0.
+    pub fn moving(&self) -> f32 {
+        let moving = self.parts.iter().filter(|part| part.vector != [0; 3]).count();
+        moving as f32 / self.parts.len().max(1) as f32
+    }
+
     /// Moves voxels of the finest level by one where that saves bits (`codec::optimise_level`). What is skipped stays.
     fn move_voxels(
         &mut self,
