@@ -10,14 +10,16 @@ use b2p::latents::LatentDecoder;
 use b2p::latents::network::{Module, Shape, Work};
 use b2p::layers::Precision;
 use b2p::log::{Log, Step};
-use b2p::{Decoder, Gaussians, Isa, Limits, SceneDecoder, SceneReader, Wanted, embedded, peak_throughput};
+use b2p::{
+    Decoder, Gaussians, Isa, Limits, SceneDecoder, SceneReader, SequenceReader, Wanted, embedded, peak_throughput,
+};
 use serde_json::json;
 
 use super::args::Bench;
 use super::manners::{self, Said};
 use super::progress::Progress;
 use super::table::{count, milliseconds, table};
-use super::{Failure, Result, bench_render, load};
+use super::{Failure, Result, bench_render, load, sequence};
 
 /// One stage's figures.
 struct Line {
@@ -38,6 +40,9 @@ pub fn run(args: &Bench, limits: &Limits, progress: &Progress) -> Result<Said> {
         Some(path) => load::bytes(path, limits)?,
         None => embedded::SCENE.to_vec(),
     };
+    if SequenceReader::is_sequence(&bytes) {
+        return sequence::bench(bytes, args, limits, progress);
+    }
     let start = Instant::now();
     let decoder = load::decoder(&bytes, &args.detail, &args.model, limits)?;
     let loading = start.elapsed();

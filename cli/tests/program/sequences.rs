@@ -56,6 +56,32 @@ fn a_folder_a_pattern_and_a_list_of_files_make_the_same_sequence() {
 }
 
 #[test]
+fn bench_of_a_sequence_says_what_its_frames_take() {
+    let folder = frames();
+    let at = folder.path();
+    encode(at, &["frames"], "a.b2p", &[]);
+    let args = [
+        "bench", "a.b2p", "--repeat", "2", "--level", "4", "--heads", "surfels", "--json",
+    ];
+    let bench: Value = serde_json::from_str(&succeeds(at, &args)).unwrap();
+    assert_eq!(
+        (&bench["frames"], &bench["level"], &bench["heads"]),
+        (&6.into(), &4.into(), &"surfels".into())
+    );
+    let time = |name: &str| bench[name].as_f64().unwrap();
+    assert!(time("voxels_ms") > 0.0 && time("gaussians_ms") > 0.0, "{bench}");
+    assert!(bench["stages"].as_array().is_some_and(|stages| !stages.is_empty()));
+    let said = succeeds(at, &["bench", "a.b2p", "--repeat", "1"]);
+    assert!(said.contains("6 frames, level 5") && said.contains("a frame"), "{said}");
+    // Nothing is timed of a sequence with a fault.
+    let mut damaged = bytes(at, "a.b2p");
+    let last = damaged.len() - 3;
+    damaged[last] ^= 1;
+    std::fs::write(at.join("damaged.b2p"), damaged).unwrap();
+    fails(at, &["bench", "damaged.b2p"], &["damaged.b2p", "damaged"]);
+}
+
+#[test]
 fn a_check_of_a_damaged_sequence_names_the_clause_that_it_breaks() {
     let folder = frames();
     let at = folder.path();

@@ -31,7 +31,7 @@ pub struct Demo {
 
 #[derive(Debug, Args)]
 pub struct Bench {
-    /// Stream to decode, or, to render, PLY of Gaussians [default: the sample that comes with the program]
+    /// Stream or sequence to decode, or, to render, PLY of Gaussians [default: the sample that comes with the program]
     pub input: Option<PathBuf>,
     /// Time drawing instead, stage by stage, seen from the front
     #[arg(long)]

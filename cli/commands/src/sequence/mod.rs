@@ -1,5 +1,6 @@
 //! Sequences of frames: coding folders of clouds, decoding, cutting and joining.
 
+mod bench;
 mod decode;
 mod edit;
 mod encode;
@@ -11,6 +12,7 @@ use std::path::{Path, PathBuf};
 
 use b2p::{Limits, SequenceReader};
 
+pub use bench::run as bench;
 pub use decode::run as decode;
 pub use edit::{cut, join};
 pub use encode::run as encode;
