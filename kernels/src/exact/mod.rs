@@ -15,6 +15,7 @@ pub(crate) mod dot;
 pub(crate) mod double;
 mod epilogue;
 pub mod hidden;
+pub mod jacobi;
 mod kernel;
 pub mod mixing;
 #[cfg(target_arch = "aarch64")]

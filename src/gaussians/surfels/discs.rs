@@ -1,5 +1,7 @@
 //! The disc of a voxel: centre, radius, thickness and orientation (`docs/format.md`, clause 6.5).
 
+use b2p_kernels::Instructions;
+
 use super::lanes::{GROUP, Lane, axes, dot, lane};
 use super::moments::{CentredMoments, PAIRS};
 use super::normals::normals;
@@ -47,14 +49,19 @@ pub struct Disc {
 /// The discs of [`GROUP`] voxels, from their moments after one step (`near`) and after all steps (`far`). With a
 /// `reach`, `far` has the moments of windows in place of those of walks.
 #[inline(always)]
-pub fn discs(near: &CentredMoments, far: &CentredMoments, reach: Option<&Lane>) -> [Disc; GROUP] {
+pub fn discs<I: Instructions>(
+    instructions: I,
+    near: &CentredMoments,
+    far: &CentredMoments,
+    reach: Option<&Lane>,
+) -> [Disc; GROUP] {
     let mean = |m: &CentredMoments| axes(|axis| lane(|j| m.sum[axis][j] / m.count[j]));
     let (near, centre) = (mean(near), mean(far));
     let mut covariance = [[0.0; GROUP]; 6];
     for (k, (entry, (a, b))) in covariance.iter_mut().zip(PAIRS).enumerate() {
         *entry = lane(|j| far.square[k][j] / far.count[j] - centre[a][j] * centre[b][j]);
     }
-    let system = normals(covariance);
+    let system = normals(instructions, &covariance);
     let normal = system.normal;
     let (low, high) = (dot(&near, &normal), dot(&centre, &normal));
     let density = density(&normal);

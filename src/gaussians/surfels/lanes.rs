@@ -1,7 +1,7 @@
 //! Structure-of-arrays values of several voxels, so that the compiler vectorises the loops over them.
 
 /// Voxels per group.
-pub const GROUP: usize = 16;
+pub const GROUP: usize = b2p_kernels::jacobi::MATRICES;
 
 /// One value per voxel of a group.
 pub type Lane = [f32; GROUP];

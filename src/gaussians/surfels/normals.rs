@@ -1,11 +1,9 @@
-//! Eigenvectors of symmetric 3×3 matrices by Jacobi rotations in IEEE f32: without trigonometry or branches, and with a
-//! fixed number of sweeps (`docs/format.md`, clause 6.4).
+//! The normals of surfaces: eigenvectors of covariances (`docs/format.md`, clause 6.4).
+
+use b2p_kernels::Instructions;
+use b2p_kernels::jacobi::{Decomposed, decompose};
 
 use super::lanes::{GROUP, Lane, lane};
-
-/// Sweeps over the three off-diagonal entries. Convergence is cubic: after four sweeps the entries are below the
-/// resolution of f32 relative to the trace.
-const SWEEPS: usize = 4;
 
 /// The smallest eigenvalue with its eigenvector, and the middle eigenvalue.
 pub struct Normals {
@@ -17,54 +15,11 @@ pub struct Normals {
     pub middle: Lane,
 }
 
-/// Cosine, sine and tangent of the rotation that zeroes the off-diagonal entry `off`; the identity if it is zero
-/// already.
-#[inline(always)]
-fn rotation(p: f32, q: f32, off: f32) -> [f32; 3] {
-    let difference = q - p;
-    let double = 2.0 * off;
-    // tan θ = 2b / (d ± √(d² + 4b²)), the smaller of the two angles. TINY prevents 0 / 0.
-    let root = (difference * difference + double * double).sqrt();
-    let tangent = double / (difference + root.copysign(difference) + TINY.copysign(difference));
-    let cosine = 1.0 / (tangent * tangent + 1.0).sqrt();
-    [cosine, tangent * cosine, tangent]
-}
-
-/// Far below the difference of any two unequal variances, which are fractions of counts.
-const TINY: f32 = 1e-20;
-
 /// Decomposes covariances xx, yy, zz, xy, xz, yz.
 #[inline(always)]
-pub fn normals(covariance: [Lane; 6]) -> Normals {
-    let [xx, yy, zz, xy, xz, yz] = covariance;
-    let mut diagonal = [xx, yy, zz];
-    let mut off = [xy, xz, yz];
-    // Indexed by component, then by axis.
-    let mut axes = [[[0.0; GROUP]; 3]; 3];
-    for (k, component) in axes.iter_mut().enumerate() {
-        component[k] = [1.0; GROUP];
-    }
-    for _ in 0..SWEEPS {
-        // Each entry with its axes p, q, and the entries of p and q with the third axis.
-        for (entry, p, q, with_p, with_q) in [(0, 0, 1, 1, 2), (1, 0, 2, 0, 2), (2, 1, 2, 0, 1)] {
-            for j in 0..GROUP {
-                let [c, s, t] = rotation(diagonal[p][j], diagonal[q][j], off[entry][j]);
-                let shift = t * off[entry][j];
-                diagonal[p][j] -= shift;
-                diagonal[q][j] += shift;
-                off[entry][j] = 0.0;
-                let (x, y) = (off[with_p][j], off[with_q][j]);
-                off[with_p][j] = c * x - s * y;
-                off[with_q][j] = s * x + c * y;
-                for component in &mut axes {
-                    let (x, y) = (component[p][j], component[q][j]);
-                    component[p][j] = c * x - s * y;
-                    component[q][j] = s * x + c * y;
-                }
-            }
-        }
-    }
-    least(&diagonal, &axes)
+pub fn normals<I: Instructions>(instructions: I, covariance: &[Lane; 6]) -> Normals {
+    let Decomposed { values, axes } = decompose(instructions, covariance);
+    least(&values, &axes)
 }
 
 /// Selects the axis of the smallest variance: of equal ones z, then y.

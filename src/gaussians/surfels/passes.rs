@@ -140,11 +140,11 @@ impl Work for Fit<'_> {
     type Output = Vec<Disc>;
 
     #[inline(always)]
-    fn run<I: Instructions>(self, _: I) -> Vec<Disc> {
+    fn run<I: Instructions>(self, instructions: I) -> Vec<Disc> {
         let mut out = Vec::with_capacity(self.coordinates.len().next_multiple_of(GROUP));
         let groups = self.masks.chunks(GROUP).zip(self.far.chunks(GROUP));
         for (coordinates, (masks, far)) in self.coordinates.chunks(GROUP).zip(groups) {
-            out.extend(discs(&near(masks), &centred(far, coordinates), None));
+            out.extend(discs(instructions, &near(masks), &centred(far, coordinates), None));
         }
         out.truncate(self.coordinates.len());
         out
@@ -162,11 +162,11 @@ impl Work for FitWindows<'_> {
     type Output = Vec<Disc>;
 
     #[inline(always)]
-    fn run<I: Instructions>(self, _: I) -> Vec<Disc> {
+    fn run<I: Instructions>(self, instructions: I) -> Vec<Disc> {
         let mut out = Vec::with_capacity(self.masks.len().next_multiple_of(GROUP));
         for (masks, windows) in self.masks.chunks(GROUP).zip(self.windows.chunks(GROUP)) {
             let (far, reach) = gathered(windows);
-            out.extend(discs(&near(masks), &far, Some(&reach)));
+            out.extend(discs(instructions, &near(masks), &far, Some(&reach)));
         }
         out.truncate(self.masks.len());
         out
