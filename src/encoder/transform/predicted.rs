@@ -10,7 +10,7 @@ use super::choice::{self, Shown};
 use super::head_maps;
 use super::motion::{Block, Search};
 use super::noise;
-use super::shape::points_in_children;
+use super::shape::{points_in_children, points_within};
 use super::votes::Votes;
 use super::warp::Warp;
 use super::{EncoderInput, GeometryTarget, Guides, Options, choose_levels, octree_of};
@@ -271,14 +271,23 @@ impl Target {
         isa: Isa,
     ) -> Result<()> {
         let (top, trunk) = (self.top, self.trunk);
-        let points = points_in_children(cloud, &self.octree, top);
+        let map = self.octree.kernel_map(top - 1);
+        let guide = Some(guide.guide());
+        let above = top < cloud.voxels.depth();
+        let with_own = above.then(|| self.with_own(cloud)).transpose()?;
+        let (octree, points) = match &with_own {
+            Some(both) => {
+                let keys = both.level(top).keys().par_iter();
+                (both, keys.map(|key| points_within(cloud, *key, top)).collect())
+            }
+            None => (&self.octree, points_in_children(cloud, &self.octree, top)),
+        };
         let distortion = codec::Distortion {
             points: &points,
             lambda,
+            shown: with_own.as_ref().map(|_| self.octree.occupancy(top - 1)),
         };
-        let map = self.octree.kernel_map(top - 1);
-        let guide = Some(guide.guide());
-        let (masks, _) = codec::optimise_level(isa, &self.octree, &map, top, slice, distortion, guide);
+        let (masks, _) = codec::optimise_level(isa, octree, &map, top, slice, distortion, guide);
         let mut octree = self.octree.truncated(top - 1);
         octree.grow(masks)?;
         let (before, colours) = (self.octree.level(top).keys(), self.truth.level(top));
@@ -291,6 +300,19 @@ impl Target {
         self.truth = Truth::of_values(&octree, trunk, top, values.collect(), false);
         self.octree = octree;
         Ok(())
+    }
+
+    /// Its octree with all of the cloud's voxels that its parents of the finest level have room for.
+    fn with_own(&self, cloud: &ColouredVoxels) -> Result<Octree> {
+        let (top, parents) = (self.top, self.octree.level(self.top - 1).keys());
+        let shift = 3 * (cloud.voxels.depth() - top);
+        let mut keys = self.octree.level(top).keys().to_vec();
+        let own = cloud.voxels.keys().chunk_by(|a, b| a >> shift == b >> shift);
+        let own = own.filter_map(|voxels| Some(voxels.first()? >> shift));
+        keys.extend(own.filter(|key| parents.binary_search(&(key >> 3)).is_ok()));
+        keys.sort_unstable();
+        keys.dedup();
+        Octree::new(Voxels::from_sorted(top, keys))
     }
 
     fn is_divided(&self) -> bool {

@@ -97,6 +97,7 @@ impl EncoderInput<'_> {
             let distortion = codec::Distortion {
                 points: &points,
                 lambda,
+                shown: None,
             };
             let above = self.maps[level - 1].table();
             let (masks, geometry) = codec::optimise_level(self.isa, &self.octree, &above, top, slice, distortion, None);
@@ -123,20 +124,22 @@ impl EncoderInput<'_> {
 /// For each voxel of a level of `octree`, which of its children hold points of the cloud. Nothing is known of voxels of
 /// the cloud's own level and of those that hold none of its points: any child may.
 pub(super) fn points_in_children(cloud: &ColouredVoxels, octree: &Octree, level: u8) -> Vec<u8> {
-    let (voxels, keys) = (&cloud.voxels, octree.level(level).keys());
-    let deeper = voxels.depth() - level;
-    if deeper == 0 {
+    let keys = octree.level(level).keys();
+    if level == cloud.voxels.depth() {
         return vec![u8::MAX; keys.len()];
     }
-    let shift = 3 * deeper;
-    let mask = |key: &u64| {
-        let inside = voxels.keys()[voxels.within(*key, shift)].iter();
-        match inside.fold(0, |mask, k| mask | 1 << (k >> (shift - 3) & 7)) {
-            0 => u8::MAX,
-            mask => mask,
-        }
-    };
-    keys.par_iter().map(mask).collect()
+    let any = |mask| if mask == 0 { u8::MAX } else { mask };
+    keys.par_iter()
+        .map(|key| any(points_within(cloud, *key, level)))
+        .collect()
+}
+
+/// Which children of a voxel of a level above the cloud's own one hold points of the cloud.
+pub(super) fn points_within(cloud: &ColouredVoxels, key: u64, level: u8) -> u8 {
+    let voxels = &cloud.voxels;
+    let shift = 3 * (voxels.depth() - level);
+    let inside = voxels.keys()[voxels.within(key, shift)].iter();
+    inside.fold(0, |mask, k| mask | 1 << (k >> (shift - 3) & 7))
 }
 
 impl Shape {

@@ -21,8 +21,6 @@ use super::super::views::shots;
 use super::super::{Failure, Result, load};
 use super::Pattern;
 
-/// Frames that wait to be drawn while the next one is decoded.
-const WAITING: usize = 1;
 /// Bytes of a Gaussian of one colour: 14 numbers.
 const GAUSSIAN_BYTES: usize = 14 * size_of::<f32>();
 
@@ -96,7 +94,8 @@ fn ahead<T>(
     draw: impl FnOnce(Receiver<b2p::Result<Gaussians>>) -> Result<T>,
 ) -> Result<T> {
     std::thread::scope(|scope| {
-        let (sender, receiver) = sync_channel(WAITING);
+        // No frame waits: the next one is made, and the one behind it decoded, while a frame is drawn.
+        let (sender, receiver) = sync_channel(0);
         let decode = move || {
             for frame in decoder.gaussians(sequence, frames) {
                 // Nobody draws any more.
@@ -195,7 +194,7 @@ impl Film<'_> {
         };
         let mut artist = Artist::new(renderer, gaussians, self.limits, self.args, self.format);
         // Beside the frame that is drawn, one more was made that could not be handed over.
-        let others = (WAITING + 1) * gaussians.len() * GAUSSIAN_BYTES;
+        let others = gaussians.len() * GAUSSIAN_BYTES;
         artist.other_bytes = self.other_bytes.saturating_add(others as u64);
         artist.draw(&camera)?;
         use_picture(&mut artist)?;

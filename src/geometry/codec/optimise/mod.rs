@@ -13,6 +13,10 @@
 //! Points are the voxels of the next level, whose places in a voxel are known: ±¼ along each axis. Distances are in
 //! voxels.
 //!
+//! A frame of a sequence may show *copied* voxels of the previous frame, which hold no points, in place of some of its
+//! own: two samplings of one surface differ in many. So a copied voxel counts three eighths of one that is added, if a
+//! point is within one of it, and a true voxel that is not to be shown three sixteenths of one that is left out.
+//!
 //! Children of parents that are not coded yet count as true ones. Parents keep at least one child, and true voxels lie
 //! in them. So each true voxel has a coded voxel within one in each coordinate; each coded voxel has a true one there,
 //! since both have the same parent. The decoder is unchanged.
@@ -40,10 +44,12 @@ const UNLIKELIEST: u32 = 4 << 8;
 /// What the encoder may change about a level.
 #[derive(Debug, Clone, Copy)]
 pub struct Distortion<'a> {
-    /// For each voxel of the level, which of its eight children hold points.
+    /// For each voxel of the level, which of its eight children hold points: none if the voxel is copied.
     pub points: &'a [u8],
     /// The Lagrangian multiplier λ: squared distance, in squared voxels, that a bit must save, in units of 1/256.
     pub lambda: u32,
+    /// If the level has copied voxels, the occupancies that are to be shown, which have all of those.
+    pub shown: Option<&'a [u8]>,
 }
 
 /// Chooses and encodes the occupancies of the parents of level `level`, which `octree` has as they truly are. `guide` is
@@ -53,7 +59,7 @@ pub struct Distortion<'a> {
 ///
 /// # Panics
 /// If `level` is 0 or deeper than the octree, `map` belongs to another level, `slice` is 0, or there is not one
-/// mask of points for each voxel of the level.
+/// mask of points for each voxel of the level and one of shown children for each parent.
 pub fn optimise_level(
     isa: Isa,
     octree: &Octree,
@@ -70,12 +76,15 @@ pub fn optimise_level(
         distortion.points.len(),
         "one mask of points per voxel"
     );
+    let shown = distortion.shown.unwrap_or(truth);
+    assert_eq!(shown.len(), truth.len(), "one mask of shown children per parent");
     let ranges: Vec<_> = slices(truth.len(), slice).collect();
     let optimise = |parents: Range<usize>| {
         isa.run(Optimise {
             map,
             parents,
             truth,
+            shown,
             first_child: octree.first_child(level - 1),
             distortion,
             guide,
@@ -96,6 +105,7 @@ struct Optimise<'a> {
     map: &'a KernelMap,
     parents: Range<usize>,
     truth: &'a [u8],
+    shown: &'a [u8],
     first_child: &'a [u32],
     distortion: Distortion<'a>,
     guide: Option<Guide<'a>>,
@@ -110,6 +120,7 @@ impl Work for Optimise<'_> {
             map,
             parents,
             truth,
+            shown,
             first_child,
             distortion,
             guide,
@@ -127,12 +138,12 @@ impl Work for Optimise<'_> {
             let window = guide.and_then(|guide| guide.window(parent));
             let (row, first) = (map.row(parent), parents.start);
             let points = |parent: usize| &distortion.points[first_child[parent] as usize..];
-            let mut surface = Surface::new(truth[parent], points(parent));
+            let mut surface = Surface::new(truth[parent], shown[parent], points(parent));
             for k in ones(neighbourhood.there) {
                 let neighbour = row[k] as usize;
                 let coded = match neighbourhood.known >> k & 1 {
                     1 => masks[neighbour - first],
-                    _ => truth[neighbour],
+                    _ => shown[neighbour],
                 };
                 surface.add(k, truth[neighbour], coded, points(neighbour));
             }
@@ -148,8 +159,10 @@ impl Work for Optimise<'_> {
 /// The surface around a parent, as cells of its children's level (see `contexts`).
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Surface {
-    /// The parent's true children.
+    /// The parent's true children, those of them that are not to be shown, and copied ones.
     pub mask: u8,
+    hidden: u8,
+    copied: u8,
     /// Of each of them which of its children hold points.
     own: [u8; 8],
     /// For each octant the cells that hold a point in it.
@@ -161,18 +174,22 @@ pub(super) struct Surface {
 }
 
 impl Surface {
-    fn new(mask: u8, points: &[u8]) -> Self {
+    fn new(all: u8, shown: u8, points: &[u8]) -> Self {
+        let holds_points = |(octant, points): (usize, &u8)| u8::from(*points != 0) << octant;
+        let mask = ones(all).zip(points).map(holds_points).sum();
         let mut surface = Surface {
             mask,
+            hidden: mask & !shown,
+            copied: all & !mask,
             own: [0; 8],
             points: [0; 8],
             coded: 0,
             added: [0; 8],
         };
-        for (octant, points) in ones(mask).zip(points) {
+        for (octant, points) in ones(all).zip(points) {
             surface.own[octant] = *points;
         }
-        surface.add(KernelMap::CENTRE, mask, 0, points);
+        surface.add(KernelMap::CENTRE, all, 0, points);
         surface
     }
 
@@ -195,7 +212,18 @@ impl Surface {
             let shift = shift_of(octant);
             let near = |half: usize| (0..8).any(|at| self.points[at] >> shift & AROUND[7 - at][half] != 0);
             let half = (1..FARTHEST).find(|half| near(*half)).unwrap_or(FARTHEST);
-            self.added[octant] = ADDED * half as u32;
+            let is_near = self.copied >> octant & 1 == 1 && half < FARTHEST;
+            self.added[octant] = if is_near { COPIED } else { ADDED } * half as u32;
+        }
+    }
+
+    /// The distortion of a point in octant `octant` that is so many half squared voxels farther from a coded centre than
+    /// from its own, in sixteenths of a squared voxel.
+    #[inline(always)]
+    fn point(&self, octant: usize, half: u32) -> u32 {
+        match self.hidden >> octant & 1 {
+            0 => POINT * half,
+            _ => HIDDEN * half / 8,
         }
     }
 
@@ -204,7 +232,7 @@ impl Surface {
     #[inline(always)]
     pub fn least(&self, octant: usize, bit: bool) -> u32 {
         match (self.mask >> octant & 1 == 1, bit) {
-            (true, false) => POINT * self.own[octant].count_ones(),
+            (true, false) => self.point(octant, 1) * self.own[octant].count_ones(),
             (false, true) => self.added[octant],
             _ => 0,
         }
@@ -219,7 +247,7 @@ impl Surface {
             let around = coded >> shift_of(octant);
             for at in ones(self.own[octant]) {
                 let half = (1..FARTHEST).find(|half| around & AROUND[at][*half] != 0);
-                sum += POINT * half.unwrap_or(FARTHEST) as u32;
+                sum += self.point(octant, half.unwrap_or(FARTHEST) as u32);
             }
         }
         for octant in ones(mask & !self.mask) {
@@ -229,9 +257,12 @@ impl Surface {
     }
 }
 
-/// Distortion of a point, and of a voxel that is added, for each half squared voxel, in sixteenths of a squared voxel.
+/// Distortion of a point, of a voxel that is added, and of a copied voxel near a point, for each half squared voxel, in
+/// sixteenths of a squared voxel; that of a point in a voxel that is not to be shown, in 128ths.
 const POINT: u32 = 2;
 const ADDED: u32 = 8;
+const COPIED: u32 = 3;
+const HIDDEN: u32 = 3;
 
 /// Half squared voxels to the farthest of the cells around a cell.
 const FARTHEST: usize = 9;

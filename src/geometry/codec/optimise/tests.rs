@@ -40,6 +40,7 @@ fn guided(octree: &Octree, level: u8, lambda: u32, guide: Option<Guide>) -> (Vec
     let distortion = Distortion {
         points: &points,
         lambda,
+        shown: None,
     };
     let (masks, encoded) = optimise_level(Isa::detect(), octree, &map, level, 1000, distortion, guide);
     let slices: Vec<_> = encoded
@@ -105,6 +106,7 @@ fn every_number_of_threads_and_every_instruction_set_give_the_same_bytes() {
     let distortion = Distortion {
         points: &points,
         lambda: 200,
+        shown: None,
     };
     for isa in Isa::available() {
         assert_eq!(
@@ -182,23 +184,32 @@ proptest! {
     }
 
     #[test]
-    fn distortions_match_their_definition(keys in prop::collection::vec(0u64..1 << 12, 1..200), mask in 1u8..) {
+    fn distortions_match_their_definition(
+        keys in prop::collection::vec(0u64..1 << 12, 1..200),
+        mask in 1u8..,
+        // Whether voxels are true, copied, or true but not to be shown.
+        kinds in prop::collection::vec(0u8..4, 200),
+    ) {
         let octree = Octree::new(Voxels::new(4, keys)).unwrap();
         let (parents, truth) = (octree.level(2), octree.occupancy(2));
-        let points = octree.occupancy(3);
+        let voxels = octree.level(3).keys().iter().zip(octree.occupancy(3)).zip(kinds.into_iter().chain([0; 512]));
+        let voxels: Vec<_> = voxels.map(|((key, points), kind)| (*key, if kind == 1 { 0 } else { *points }, kind != 2)).collect();
+        let points: Vec<u8> = voxels.iter().map(|voxel| voxel.1).collect();
+        let shown_in = |parent: &u64| voxels.iter().filter(|v| v.0 >> 3 == *parent && v.2).map(|v| 1 << (v.0 & 7)).sum();
+        let shown: Vec<u8> = parents.keys().iter().map(shown_in).collect();
         let (map, first) = (octree.kernel_map(2), octree.first_child(2));
         for parent in 0..parents.len() {
             let of = |parent: usize| &points[first[parent] as usize..];
-            let mut surface = Surface::new(truth[parent], of(parent));
+            let mut surface = Surface::new(truth[parent], shown[parent], of(parent));
             for k in (0..27).filter(|k| *k != KernelMap::CENTRE) {
                 let neighbour = map.row(parent)[k];
                 if neighbour != KernelMap::ABSENT {
                     let neighbour = neighbour as usize;
-                    surface.add(k, truth[neighbour], truth[neighbour], of(neighbour));
+                    surface.add(k, truth[neighbour], shown[neighbour], of(neighbour));
                 }
             }
             surface.finish();
-            let want = by_definition(&octree, parent, mask);
+            let want = by_definition(&voxels, parents.keys()[parent], mask);
             prop_assert_eq!(surface.of(mask), want);
             let least = (0..8).map(|octant| surface.least(octant, mask >> octant & 1 == 1));
             prop_assert!(least.sum::<u32>() <= want);
@@ -206,9 +217,9 @@ proptest! {
     }
 }
 
-/// The distortion if a voxel of level 2 has these children and all others are exact, by coordinates in quarters of
-/// a voxel of level 3.
-fn by_definition(octree: &Octree, parent: usize, mask: u8) -> u32 {
+/// The distortion if a voxel of level 2 has these children and all others are as they are to be shown, by coordinates in
+/// quarters of a voxel of level 3. Of each of `voxels`: its key, which of its children hold points, whether it is shown.
+fn by_definition(voxels: &[(u64, u8, bool)], parent: u64, mask: u8) -> u32 {
     let centre = |key: u64| morton::decode(key).map(|x| 4 * i64::from(x) + 2);
     let point = |key: u64| morton::decode(key).map(|x| 2 * i64::from(x) + 1);
     let squared = |a: [i64; 3], b: [i64; 3]| (0..3).map(|c| (a[c] - b[c]).pow(2)).sum::<i64>();
@@ -216,30 +227,43 @@ fn by_definition(octree: &Octree, parent: usize, mask: u8) -> u32 {
         let (a, b) = (morton::decode(a), morton::decode(b));
         (0..3).all(|c| a[c].abs_diff(b[c]) <= 1)
     };
-    let key = octree.level(2).keys()[parent];
+    let of = |child: u64| voxels.iter().find(|voxel| voxel.0 == child);
     let coded: Vec<u64> = (0..512)
-        .filter(|child| match child >> 3 == key {
+        .filter(|child| match child >> 3 == parent {
             true => mask >> (child & 7) & 1 == 1,
-            false => octree.level(3).keys().binary_search(child).is_ok(),
+            false => of(*child).is_some_and(|voxel| voxel.2),
         })
         .collect();
+    let points_of = |voxel: &(u64, u8, bool)| {
+        ones(voxel.1)
+            .map(|octant| voxel.0 << 3 | octant as u64)
+            .collect::<Vec<_>>()
+    };
+    let points: Vec<u64> = voxels.iter().flat_map(points_of).collect();
+    // Half squared voxels more than within the voxel, or as far as nothing is seen.
+    let nearest = |distances: &mut dyn Iterator<Item = i64>| {
+        distances
+            .min()
+            .map_or(FARTHEST as u32, |nearest| (nearest - 3) as u32 / 8)
+    };
     let mut sum = 0;
-    for child in key << 3..=key << 3 | 7 {
-        let here = octree.level(3).keys().binary_search(&child).is_ok();
-        let points = octree.level(4).keys();
-        let nearest = |distances: &mut dyn Iterator<Item = i64>| (distances.min().unwrap() - 3) / 8;
-        match (here, mask >> (child & 7) & 1 == 1) {
+    for child in parent << 3..=parent << 3 | 7 {
+        let here = of(child);
+        let is_true = here.is_some_and(|voxel| voxel.1 != 0);
+        match (is_true, mask >> (child & 7) & 1 == 1) {
             (true, false) => {
                 for own in points.iter().filter(|point| *point >> 3 == child) {
                     let around = coded.iter().filter(|other| near(**other, child));
-                    let mut distances = around.map(|other| squared(centre(*other), point(*own)));
-                    sum += POINT * nearest(&mut distances) as u32;
+                    let half = nearest(&mut around.map(|other| squared(centre(*other), point(*own))));
+                    let is_shown = here.is_some_and(|voxel| voxel.2);
+                    sum += if is_shown { POINT * half } else { HIDDEN * half / 8 };
                 }
             }
             (false, true) => {
                 let around = points.iter().filter(|point| near(*point >> 3, child));
-                let mut distances = around.map(|other| squared(centre(child), point(*other)));
-                sum += ADDED * nearest(&mut distances) as u32;
+                let half = nearest(&mut around.map(|other| squared(centre(child), point(*other))));
+                let is_chance = here.is_some() && half < FARTHEST as u32;
+                sum += if is_chance { COPIED * half } else { ADDED * half };
             }
             _ => {}
         }
