@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from itertools import groupby, product
 from math import prod
+from operator import add
 
 from base import Reader, clamp, ilog2, quot, require
 from coefficients import RangeDecoder
@@ -53,6 +54,22 @@ class Known:
         return None if i is None else self.values[i]
 
 
+def surface_step(place, voxels):
+    """17.10.9: how far the surface near a voxel is from it, in sixteenths of a voxel."""
+    steps = [d for d in product((-1, 0, 1), repeat=3) if tuple(map(add, place, d)) in voxels]
+    n, m = len(steps), [sum(d[a] for d in steps) for a in range(3)]
+    s = [[n * sum(d[a] * d[b] for d in steps) - m[a] * m[b] for b in range(3)] for a in range(3)]
+
+    def minor(a, b):
+        (a, c), (b, d) = [((i + 1) % 3, (i + 2) % 3) for i in (a, b)]
+        return s[a][b] * s[c][d] - s[a][d] * s[c][b]
+
+    t = sum(minor(a, a) for a in range(3))
+    if t == 0:
+        return 0, 0, 0
+    return tuple((32 * sum(minor(a, b) * m[b] for b in range(3)) + n * t) // (2 * n * t) for a in range(3))
+
+
 class Bits:
     """17.5.2, 17.9.3: adaptive decisions. The names of the states are those of the document."""
 
@@ -101,11 +118,10 @@ class Motion:
     def __init__(self, payloads, header, previous):
         reader = Reader(payloads[0], "17.5.1")
         first, self.unit, self.reference, modes = reader.take(4)
-        self.block_level, self.divided, self.moves_coarse = first & 31, first > 127, first >> 6 & 1
-        self.warped = first >> 5 & 1
+        self.block_level, self.warped, self.moves_coarse = first & 31, first >> 5 & 1, first >> 6 & 1
+        self.divided, self.smooth = first > 127 and not self.warped, first > 127 and self.warped
         self.vector = tuple(reader.number("h") for _ in range(3))
         require(self.divided or not self.moves_coarse, "17.5.1", "coarse colours that move")
-        require(not (self.warped and self.divided), "17.5.1", "warped frame that is divided")
         deepest = header.base - self.divided - self.moves_coarse
         require(self.block_level <= deepest and header.top <= self.unit <= 21, "17.5.1", "levels of the motion")
         furthest = header.top if self.warped else min(header.top, self.block_level + 5)
@@ -309,21 +325,24 @@ class Motion:
             vectors[x, y, z] = vector
         return vectors
 
-    def warped_place(self, place, down, vectors, h):
-        """17.10.4: where a voxel moves to, in sixteenths of a voxel."""
+    def warped_place(self, place, level, down, vectors, h):
+        """17.10.4, 17.10.9: where a voxel moves to, in sixteenths of a voxel."""
         node = [x >> down for x in place]
         o, sums = [2 * (x - (c << down)) + 1 for x, c in zip(place, node)], [0, 0, 0]
         for d, w in corner_weights(o, 2 << down):
             vector = vectors[tuple(a + b for a, b in zip(node, d))]
             sums = [s + w * v for s, v in zip(sums, vector)]
-        return [16 * x + (16 * s + (1 << h - 1) >> h) for x, s in zip(place, sums)]
+        moved = [16 * x + (16 * s + (1 << h - 1) >> h) for x, s in zip(place, sums)]
+        if not self.smooth or all(x & 15 == 0 for x in moved):
+            return moved
+        return [x + step for x, step in zip(moved, surface_step(place, self.previous[level].voxels.places))]
 
     def warp(self, lattice, vectors, least, top):
         """17.10.4 to 17.10.6: the levels of the warped frame."""
         source, down, cells = self.previous[top], top - lattice, {}
         h = 3 * (down + 1) + self.unit - top
         for place, value in zip(source.voxels.coordinates, source.values):
-            at = self.warped_place(place, down, vectors, h)
+            at = self.warped_place(place, top, down, vectors, h)
             for d, w in corner_weights([x & 15 for x in at], 16):
                 cell = tuple((x >> 4) + c for x, c in zip(at, d))
                 if w > 0 and all(0 <= c < 1 << top for c in cell):

@@ -124,7 +124,7 @@ impl Inter {
         let made = || {
             let mut lattice = Lattice::of(&source.nodes(top, level), level);
             lattice.read(words, "lattice", |vector| head.check(vector))?;
-            Ok(Scattered::new(source, &lattice, [top, head.unit_level])?.warped(least))
+            Ok(Scattered::new(source, &lattice, [top, head.unit_level], head.smooth)?.warped(least))
         };
         let warped = made().map_err(|error| of_level(error, base))?;
         Ok((Some(Arc::new(warped)), rest))

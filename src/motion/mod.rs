@@ -29,8 +29,8 @@ pub use models::{Groups, predicted};
 pub(crate) use payload::level_of;
 pub use payload::{Blocks, Head, Modes};
 pub use previous::{Coloured, Previous, PreviousLevel};
-#[cfg(feature = "encoder")]
-pub use warp::Scattered;
 pub use warp::Warped;
+#[cfg(feature = "encoder")]
+pub use warp::{Scattered, offset};
 
 pub use crate::geometry::codec::guide::{Mode, own};

@@ -36,6 +36,8 @@ pub struct Head {
     pub moves_coarse: bool,
     /// Whether the frame is predicted from the previous one as a lattice warps it; then blocks have no vectors.
     pub warped: bool,
+    /// Whether the voxels of a warped frame start from the surface near them.
+    pub smooth: bool,
     /// U: vectors are in voxels of this level.
     pub unit_level: u8,
     /// R: the levels after B and before this one are predicted from the moved previous frame of level R, all others
@@ -58,9 +60,10 @@ pub struct Blocks {
 
 /// Bytes of a head.
 const HEAD: usize = 10;
-/// Bits of the first byte: blocks are divided; colours of coarse levels are predicted from the frame moved by parts; the
-/// frame is warped.
+/// Bits of the first byte: blocks are divided, or of a warped frame, voxels start from the surface; colours of coarse
+/// levels are predicted from the frame moved by parts; the frame is warped.
 const DIVIDED: u8 = 0x80;
+const SMOOTH: u8 = DIVIDED;
 const MOVES_COARSE: u8 = 0x40;
 const WARPED: u8 = 0x20;
 
@@ -123,15 +126,12 @@ impl Head {
             let value = format!("{} bytes", bytes.len());
             return Err(malformed("17.5.1", "length of the motion", value, "10 or more"));
         };
-        let [divided, moves_coarse, warped] = [DIVIDED, MOVES_COARSE, WARPED].map(|bit| head[0] & bit != 0);
+        let [moves_coarse, warped] = [MOVES_COARSE, WARPED].map(|bit| head[0] & bit != 0);
+        let [divided, smooth] = [!warped, warped].map(|meant| meant && head[0] & DIVIDED != 0);
         let (block_level, unit_level) = (head[0] & !(DIVIDED | MOVES_COARSE | WARPED), head[1]);
         if moves_coarse && !divided {
             let (value, expected) = ("of blocks that are not divided", "divided blocks");
             return Err(malformed("17.5.1", "coarse colours that move", value, expected));
-        }
-        if warped && divided {
-            let (value, expected) = ("divided blocks", "blocks that are not divided");
-            return Err(malformed("17.5.1", "warped frame", value, expected));
         }
         // Vectors of parts are read with level L, if coarser levels need them.
         let deepest = i16::from(base) - i16::from(divided) - i16::from(moves_coarse);
@@ -174,6 +174,7 @@ impl Head {
             divided,
             moves_coarse,
             warped,
+            smooth,
             unit_level,
             reference_level,
             root: Modes { geometry, colours },
@@ -193,7 +194,8 @@ impl Head {
             self.block_level
                 | if self.divided { DIVIDED } else { 0 }
                 | if self.moves_coarse { MOVES_COARSE } else { 0 }
-                | if self.warped { WARPED } else { 0 },
+                | if self.warped { WARPED } else { 0 }
+                | if self.smooth { SMOOTH } else { 0 },
             self.unit_level,
             self.reference_level,
             self.root.geometry as u8 | (self.root.colours as u8) << 4,
@@ -392,6 +394,7 @@ mod tests {
             divided: false,
             moves_coarse: false,
             warped: false,
+            smooth: false,
             unit_level: 12,
             reference_level: block_level + 1,
             root: Modes {
@@ -525,6 +528,22 @@ mod tests {
             },
         ] {
             assert_eq!(clause(head).err(), Some(Some("17.5.1")), "{head:?}");
+        }
+        let warped = |smooth| Head {
+            warped: true,
+            smooth,
+            reference_level: 9,
+            vector: [0; 3],
+            ..head(5)
+        };
+        for smooth in [false, true] {
+            let read = Head::parse(&warped(smooth).to_bytes(), 6, 9).map(|(head, _)| head);
+            assert_eq!(read.ok(), Some(warped(smooth)));
+            let moves_coarse = Head {
+                moves_coarse: true,
+                ..warped(smooth)
+            };
+            assert_eq!(clause(moves_coarse).err(), Some(Some("17.5.1")));
         }
         let far = Head {
             vector: [0, 0, 4097],

@@ -1,18 +1,26 @@
-//! The previous frame, warped by a lattice (`docs/format.md`, clauses 17.10.4 to 17.10.6).
+//! The previous frame, warped by a lattice (`docs/format.md`, clauses 17.10.4 to 17.10.6, 17.10.9).
 
-use std::collections::HashMap;
-use std::ops::Range;
+mod places;
+mod surface;
+#[cfg(test)]
+mod tests;
+mod touched;
+
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
 use super::bricks::Bricks;
-use super::lattice::{Corners, Lattice};
+use super::lattice::Lattice;
 use super::payload::malformed;
 use super::previous::{Previous, PreviousLevel};
 use crate::colour::Ycc;
 use crate::error::{Error, Result};
 use crate::geometry::{Voxels, morton, ones};
+use places::{Place, places};
+#[cfg(feature = "encoder")]
+pub use surface::offset;
+use touched::{Run, Touched};
 
 /// The clause of more near cells than a warped frame may have.
 pub const TOO_MANY: &str = "17.10.5";
@@ -23,8 +31,6 @@ const NEAR: u64 = 640;
 const UNIT: u64 = 16;
 pub const LEAST: u8 = (NEAR / UNIT) as u8;
 
-/// The most tiles that a voxel touches.
-const TOUCHED: usize = 8;
 /// The most near cells for each voxel of the previous frame.
 const MOST_NEAR: usize = 4;
 
@@ -32,10 +38,6 @@ const MOST_NEAR: usize = 4;
 const TILE: u32 = 3;
 const SIDE: i32 = 1 << TILE;
 const CELLS: usize = 1 << (3 * TILE);
-/// Bricks per task that finds places.
-const BRICKS: usize = 512;
-/// Voxels per task that finds tiles.
-const CHUNK: usize = 1 << 10;
 
 /// The levels of the previous frame as a lattice warps it.
 #[derive(Debug, Clone)]
@@ -67,16 +69,14 @@ struct Cell {
     sums: [i64; 3],
 }
 
-/// A voxel of the previous frame on its way: twice its place in sixteenths of a cell.
-type Place = [i32; 3];
-
 impl Scattered {
-    /// Moves the voxels of `previous`, of level `top`, by a lattice with vectors in voxels of level `unit`.
+    /// Moves the voxels of `previous`, of level `top`, by a lattice with vectors in voxels of level `unit`. If `smooth`,
+    /// they start from the surface that the voxels around them tell of.
     ///
     /// # Errors
     /// [`Error::Malformed`] if more cells are near than a frame may have.
-    pub fn new(previous: &PreviousLevel, lattice: &Lattice, [top, unit]: [u8; 2]) -> Result<Self> {
-        let places = places(previous, lattice, [top, unit]);
+    pub fn new(previous: &PreviousLevel, lattice: &Lattice, [top, unit]: [u8; 2], smooth: bool) -> Result<Self> {
+        let places = places(previous, lattice, [top, unit], smooth);
         let cells = scattered(&places, &previous.values, top)?;
         Ok(Scattered { top, cells })
     }
@@ -134,9 +134,7 @@ impl Warped {
     /// many of all levels above, each in a brick of its own; places, and the tiles that each touches.
     pub const fn bytes_per_voxel() -> usize {
         let near = Previous::bytes_per_voxel() + Bricks::bytes_per_voxel() + 2 * size_of::<Cell>();
-        2 * MOST_NEAR * near
-            + size_of::<Place>()
-            + TOUCHED * (size_of::<(u16, u16)>() + size_of::<u16>() + size_of::<Run>())
+        2 * MOST_NEAR * near + size_of::<Place>() + Touched::bytes_per_voxel()
     }
 
     /// Keys and colours of the voxels of the finest level.
@@ -194,83 +192,6 @@ impl Cell {
     }
 }
 
-/// Where each voxel moves to, in sixteenths of a cell.
-fn places(previous: &PreviousLevel, lattice: &Lattice, [top, unit]: [u8; 2]) -> Vec<Place> {
-    let corners = lattice.finest();
-    // Cells of a node along an axis, as a shift.
-    let depth = top + 1 - lattice.levels().len() as u8;
-    let field = Field {
-        corners,
-        depth,
-        shift: u32::from(3 * (depth + 1) + unit - top),
-    };
-    let bricks: Vec<_> = previous.bricks.each().collect();
-    let of_chunk = |bricks: &[([u32; 3], u64, usize)]| {
-        let mut places = Vec::with_capacity(bricks.len() * 16);
-        let mut node = Node::default();
-        for (place, mask, _) in bricks {
-            for key in ones(*mask) {
-                let [x, y, z] = [0, 1, 2].map(|axis| (key as u32 >> axis & 1) | (key as u32 >> (axis + 2) & 2));
-                let at = [4 * place[0] + x, 4 * place[1] + y, 4 * place[2] + z];
-                places.push(field.moved(&mut node, at));
-            }
-        }
-        places
-    };
-    let chunks: Vec<Vec<Place>> = bricks.par_chunks(BRICKS).map(of_chunk).collect();
-    chunks.concat()
-}
-
-/// A field of vectors between the corners of nodes.
-struct Field<'a> {
-    corners: &'a Corners,
-    /// A node has this many levels of voxels.
-    depth: u8,
-    /// From sums of weighted vectors to sixteenths of a voxel.
-    shift: u32,
-}
-
-/// A node that was looked up, with the vectors of its corners.
-#[derive(Default)]
-struct Node {
-    place: Option<[u32; 3]>,
-    vectors: [[i64; 3]; 8],
-    still: bool,
-}
-
-impl Field<'_> {
-    /// Where the voxel at this place moves to. `node` is the one of the voxel before.
-    #[inline]
-    fn moved(&self, node: &mut Node, at: [u32; 3]) -> Place {
-        let place = at.map(|x| x >> self.depth);
-        if node.place != Some(place) {
-            node.place = Some(place);
-            for (i, vector) in node.vectors.iter_mut().enumerate() {
-                let step = [i & 1, i >> 1 & 1, i >> 2].map(|x| x as u32);
-                let corner = self.corners.number([0, 1, 2].map(|axis| place[axis] + step[axis]));
-                *vector = self.corners.vectors[corner].map(i64::from);
-            }
-            node.still = node.vectors == [[0; 3]; 8];
-        }
-        if node.still {
-            return at.map(|x| 16 * x as i32);
-        }
-        let side = 2i64 << self.depth;
-        let offset = [0, 1, 2].map(|axis| 2 * i64::from(at[axis] - (place[axis] << self.depth)) + 1);
-        let mut sums = [0i64; 3];
-        for (i, vector) in node.vectors.iter().enumerate() {
-            let weight = |axis: usize| match i >> axis & 1 {
-                1 => offset[axis],
-                _ => side - offset[axis],
-            };
-            let weight = weight(0) * weight(1) * weight(2);
-            (0..3).for_each(|axis| sums[axis] += weight * vector[axis]);
-        }
-        let half = 1i64 << (self.shift - 1);
-        [0, 1, 2].map(|axis| 16 * at[axis] as i32 + ((16 * sums[axis] + half) >> self.shift) as i32)
-    }
-}
-
 /// Bits of a coordinate in a tile, spread as in a Morton key.
 const SPREAD: [usize; SIDE as usize] = [0, 1, 8, 9, 64, 65, 72, 73];
 
@@ -312,103 +233,6 @@ fn scattered(places: &[Place], values: &[Ycc], top: u8) -> Result<Vec<Cell>> {
         return Err(malformed(TOO_MANY, "near cells of the warped frame", "more", expected));
     }
     Ok(found.concat())
-}
-
-/// The voxels that give weight to each tile.
-struct Touched {
-    /// Of each chunk of voxels their numbers in the chunk, by tiles.
-    chunks: Vec<Vec<u16>>,
-    /// In the order of tiles.
-    runs: Vec<Run>,
-}
-
-/// Voxels of a chunk that touch a tile.
-struct Run {
-    tile: u64,
-    chunk: usize,
-    range: Range<usize>,
-}
-
-/// The tiles that the voxels of a chunk touch, in the order in which they are met.
-#[derive(Default)]
-struct Tiles {
-    places: Vec<[i32; 3]>,
-    numbers: HashMap<[i32; 3], usize>,
-    /// How many voxels touch each.
-    counts: Vec<usize>,
-    /// For each touch the tile's number here and the voxel's in the chunk.
-    touches: Vec<(u16, u16)>,
-}
-
-impl Tiles {
-    /// Of one voxel after the other; each mostly touches the tile of the one before.
-    fn touch(&mut self, tile: [i32; 3], last: &mut usize, voxel: usize) {
-        if self.places.get(*last) != Some(&tile) {
-            *last = *self.numbers.entry(tile).or_insert_with(|| {
-                self.places.push(tile);
-                self.counts.push(0);
-                self.places.len() - 1
-            });
-        }
-        self.counts[*last] += 1;
-        self.touches.push((*last as u16, voxel as u16));
-    }
-
-    /// The voxels by tiles, and where those of each tile are.
-    fn sorted(self, chunk: usize) -> (Vec<u16>, Vec<Run>) {
-        let mut end = 0;
-        let runs = { self.places.iter().zip(&self.counts) }.map(|(place, count)| {
-            let tile = morton::encode(place.map(|x| x as u32));
-            let range = end..end + count;
-            end = range.end;
-            Run { tile, chunk, range }
-        });
-        let runs: Vec<Run> = runs.collect();
-        let mut next: Vec<usize> = runs.iter().map(|run| run.range.start).collect();
-        let mut voxels = vec![0; self.touches.len()];
-        for (tile, voxel) in self.touches {
-            voxels[next[usize::from(tile)]] = voxel;
-            next[usize::from(tile)] += 1;
-        }
-        (voxels, runs)
-    }
-}
-
-impl Touched {
-    fn new(places: &[Place], top: u8) -> Self {
-        let tiles = 1i32 << u32::from(top).saturating_sub(TILE);
-        let of_chunk = |(chunk, places): (usize, &[Place])| {
-            let (mut found, mut last) = (Tiles::default(), [0; 8]);
-            for (i, place) in places.iter().enumerate() {
-                let first = place.map(|x| x >> (4 + TILE));
-                // The last cell that has weight.
-                let end = place.map(|x| (x + 15) >> (4 + TILE));
-                for z in first[2]..=end[2] {
-                    for y in first[1]..=end[1] {
-                        for x in first[0]..=end[0] {
-                            if [x, y, z].iter().all(|x| (0..tiles).contains(x)) {
-                                let side = (x - first[0]) + 2 * (y - first[1]) + 4 * (z - first[2]);
-                                found.touch([x, y, z], &mut last[side as usize & 7], i);
-                            }
-                        }
-                    }
-                }
-            }
-            found.sorted(chunk)
-        };
-        let found: Vec<_> = places.par_chunks(CHUNK).enumerate().map(of_chunk).collect();
-        let (chunks, runs): (Vec<Vec<u16>>, Vec<Vec<Run>>) = found.into_iter().unzip();
-        let mut runs: Vec<Run> = runs.into_iter().flatten().collect();
-        runs.sort_unstable_by_key(|run| (run.tile, run.chunk));
-        Touched { chunks, runs }
-    }
-
-    /// The numbers of a run's voxels.
-    fn voxels(&self, run: &Run) -> impl Iterator<Item = usize> {
-        let first = run.chunk * CHUNK;
-        let touched = &self.chunks[run.chunk][run.range.clone()];
-        touched.iter().map(move |touched| first + usize::from(*touched))
-    }
 }
 
 /// Sums of weights, and of weighted Y, Co and Cg.
@@ -520,205 +344,4 @@ fn parents(cells: &[Cell]) -> Vec<Cell> {
         }
     }
     parents
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::geometry::Octree;
-    use proptest::prelude::*;
-    use std::collections::{BTreeMap, BTreeSet};
-
-    /// A frame of `top` levels, with values that differ.
-    fn frame(top: u8, keys: Vec<u64>) -> (PreviousLevel, Voxels) {
-        let voxels = Voxels::new(top, keys);
-        let values = (0..voxels.len())
-            .map(|i| (i % 4000) as i16)
-            .map(|i| [i % 700 * 37 % 500, -i, i])
-            .collect();
-        (PreviousLevel::new(&voxels, values), voxels)
-    }
-
-    /// A lattice of that frame with vectors that `vector` makes of the places of corners.
-    fn lattice(voxels: &Voxels, level: u8, vector: impl Fn([u32; 3]) -> [i16; 3]) -> Lattice {
-        let octree = Octree::new(voxels.clone()).unwrap();
-        let mut lattice = Lattice::of(octree.level(level).keys(), level);
-        let corners = lattice.level_mut(level).1;
-        for i in 0..corners.vectors.len() {
-            corners.vectors[i] = vector(corners.at(i));
-        }
-        lattice
-    }
-
-    fn keys(level: &WarpedLevel) -> Vec<u64> {
-        let near = level.near.bricks.each();
-        near.flat_map(|(place, mask, _)| ones(mask).map(move |key| morton::encode(place) << 6 | key as u64))
-            .collect()
-    }
-
-    /// The warped frame as the clauses say it, cell by cell: of each near cell of the finest level its weight and sums.
-    fn plain(
-        previous: &PreviousLevel,
-        voxels: &Voxels,
-        lattice: &Lattice,
-        [top, unit]: [u8; 2],
-    ) -> BTreeMap<u64, (i64, [i64; 3])> {
-        let level = lattice.levels().len() as u8 - 1;
-        let side = 1i64 << (top - level);
-        let mut cells = BTreeMap::<u64, (i64, [i64; 3])>::new();
-        for (i, key) in voxels.keys().iter().enumerate() {
-            let at = morton::decode(*key).map(i64::from);
-            let node = at.map(|x| x / side);
-            let mut sums = [0i128; 3];
-            for d in 0..8i64 {
-                let d = [d & 1, d >> 1 & 1, d >> 2];
-                let offset = [0, 1, 2].map(|axis| 2 * (at[axis] - node[axis] * side) + 1);
-                let weights = [0, 1, 2].map(|axis| {
-                    if d[axis] == 1 {
-                        offset[axis]
-                    } else {
-                        2 * side - offset[axis]
-                    }
-                });
-                let corners = lattice.finest();
-                let corner = corners.number([0, 1, 2].map(|axis| (node[axis] + d[axis]) as u32));
-                let weight: i64 = weights.iter().product();
-                for (sum, x) in sums.iter_mut().zip(corners.vectors[corner]) {
-                    *sum += i128::from(weight) * i128::from(x);
-                }
-            }
-            let shift = 3 * (top - level + 1) + unit - top;
-            let moved =
-                [0, 1, 2].map(|axis| 16 * i128::from(at[axis]) + ((16 * sums[axis] + (1 << (shift - 1))) >> shift));
-            for d in 0..8i128 {
-                let d = [d & 1, d >> 1 & 1, d >> 2];
-                let share = |axis: usize| match d[axis] {
-                    1 => moved[axis].rem_euclid(16),
-                    _ => 16 - moved[axis].rem_euclid(16),
-                };
-                let weight = (share(0) * share(1) * share(2)) as i64;
-                let place = [0, 1, 2].map(|axis| moved[axis].div_euclid(16) + d[axis]);
-                if weight > 0 && place.iter().all(|x| (0..1 << top).contains(x)) {
-                    let cell = cells.entry(morton::encode(place.map(|x| x as u32))).or_default();
-                    cell.0 += weight;
-                    (0..3).for_each(|t| cell.1[t] += weight * i64::from(previous.values[i][t]));
-                }
-            }
-        }
-        cells.retain(|_, (weight, _)| *weight >= 640);
-        cells
-    }
-
-    proptest! {
-        #[test]
-        fn warped_frames_are_those_of_a_plain_search(
-            top in 2u8..6,
-            depth in 2u8..6,
-            keys_of in prop::collection::vec(0u64..1 << 15, 1..300),
-            turned in prop::array::uniform9(-3i16..4),
-            shift in prop::array::uniform3(-20i16..21),
-            least in LEAST..,
-        ) {
-            let (level, unit) = (top.saturating_sub(depth), top + 2);
-            let side = 1i32 << (top - level);
-            let (previous, voxels) = frame(top, keys_of.into_iter().map(|key| key & ((1 << (3 * top)) - 1)).collect());
-            let lattice = lattice(&voxels, level, |at| [0, 1, 2].map(|axis| {
-                let sum: i32 = (0..3).map(|i| i32::from(turned[3 * axis + i]) * at[i] as i32 * side / 8).sum();
-                sum as i16 + shift[axis]
-            }));
-            let expected = plain(&previous, &voxels, &lattice, [top, unit]);
-            match Scattered::new(&previous, &lattice, [top, unit]) {
-                Err(error) => {
-                    prop_assert_eq!(error.clause(), Some(TOO_MANY));
-                    prop_assert!(expected.len() > 4 * voxels.len() + 64);
-                }
-                Ok(scattered) => { let warped = scattered.warped(least); for level in 0..=top {
-                    let down = 3 * (top - level);
-                    let mut nodes = BTreeMap::<u64, (i64, [i64; 3])>::new();
-                    let mut there = BTreeSet::new();
-                    for (key, (weight, sums)) in &expected {
-                        let node = nodes.entry(key >> down).or_default();
-                        node.0 += weight;
-                        (0..3).for_each(|t| node.1[t] += sums[t]);
-                        if *weight >= 16 * i64::from(least) {
-                            there.insert(key >> down);
-                        }
-                    }
-                    let found = warped.at(level).unwrap();
-                    prop_assert_eq!(keys(found), nodes.keys().copied().collect::<Vec<_>>());
-                    for (i, (key, (weight, sums))) in nodes.iter().enumerate() {
-                        let colour = sums.map(|sum| (sum as f64 / *weight as f64 + 0.5).floor() as i16);
-                        prop_assert_eq!(found.near.values[i], colour);
-                        let place = morton::decode(*key).map(|x| x as i32);
-                        prop_assert_eq!(found.voxels.index(place).is_some(), there.contains(key));
-                    }
-                }},
-            }
-        }
-    }
-
-    #[test]
-    fn a_lattice_without_motion_leaves_all_as_it_is_and_whole_steps_move_it() {
-        let (previous, voxels) = frame(5, (0..4000).map(|i| i * 7 % 32_768).collect());
-        let still = Scattered::new(&previous, &lattice(&voxels, 3, |_| [0; 3]), [5, 7])
-            .unwrap()
-            .warped(128);
-        assert_eq!(keys(still.at(5).unwrap()), voxels.keys());
-        assert_eq!(still.at(5).unwrap().near.values, previous.values);
-        let moved = Scattered::new(&previous, &lattice(&voxels, 3, |_| [4, -8, 0]), [5, 7])
-            .unwrap()
-            .warped(128);
-        let (cells, colours) = moved.finest();
-        for (key, colour) in cells.iter().zip(colours) {
-            let [x, y, z] = morton::decode(*key).map(|x| x as i32);
-            let index = previous.index([x - 1, y + 2, z]).expect("a voxel was there");
-            assert_eq!(previous.values[index], colour);
-        }
-    }
-
-    #[test]
-    fn voxels_that_all_fall_apart_are_refused_by_their_number() {
-        // Eight cells are near each of them, a quarter of a weight each.
-        let (previous, voxels) = frame(6, (0..200).map(|i| i * 1237 % (1 << 18)).collect());
-        let apart = lattice(&voxels, 4, |_| [2, 2, 2]);
-        // An eighth of the weight for each of eight cells is less than makes them near; two axes give four of a quarter.
-        assert!(
-            keys(
-                Scattered::new(&previous, &apart, [6, 8])
-                    .unwrap()
-                    .warped(128)
-                    .at(6)
-                    .unwrap()
-            )
-            .is_empty()
-        );
-        let apart = lattice(&voxels, 4, |_| [2, 2, 0]);
-        let near = keys(
-            Scattered::new(&previous, &apart, [6, 8])
-                .unwrap()
-                .warped(128)
-                .at(6)
-                .unwrap(),
-        );
-        assert!(near.len() > 2 * voxels.len(), "{}", near.len());
-    }
-
-    #[test]
-    fn sums_that_leave_32_bits_are_added_in_64() {
-        let (mut narrow, mut wide) = (vec![[0i32; 4]; CELLS], vec![[0i64; 4]; CELLS]);
-        let voxels = |count: usize| std::iter::repeat_n(([35, 40, 48], [i16::MIN, i16::MAX, -7]), count);
-        for (count, fits) in [(1, true), (39, true), (400, false), (100_000, false)] {
-            let given = sums(&mut narrow, voxels(count), [0; 3], SIDE);
-            assert_eq!(within_32_bits(&narrow, &given), fits, "{count}");
-            assert_eq!(sums(&mut wide, voxels(count), [0; 3], SIDE), given);
-            let [a, b] = [near(&mut narrow, given, 0), near(&mut wide, given, 0)];
-            let sums = |cells: Vec<Cell>| {
-                cells
-                    .iter()
-                    .map(|cell| (cell.key, cell.weight, cell.sums))
-                    .collect::<Vec<_>>()
-            };
-            assert_eq!(sums(a) == sums(b), fits, "{count}");
-        }
-    }
 }

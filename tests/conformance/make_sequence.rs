@@ -145,6 +145,7 @@ fn root_alone(bytes: &[u8]) -> Vec<u8> {
         divided: false,
         moves_coarse: false,
         warped: false,
+        smooth: false,
     };
     let blocks = Blocks {
         vectors: vec![[7, 0, 8]],
@@ -272,5 +273,17 @@ pub fn cases() -> Vec<(&'static str, Vec<u8>, bool)> {
             false,
         ),
         ("warped-in-grey", code(&warped(2..=5, step(20.0)), 3, grey), false),
+        ("smooth", code(&warped(3..=6, step(50.0)), 4, apart), false),
+        (
+            "smooth-from-the-first-level-on",
+            code(&warped(1..=6, step(30.0)).with_group(3), 4, turning),
+            false,
+        ),
+        (
+            "smooth-with-much-that-is-new",
+            code(&warped(4..=7, step(70.0)), 3, vary),
+            false,
+        ),
+        ("smooth-of-one-level", code(&warped(5..=5, step(30.0)), 3, slow), false),
     ]
 }

@@ -77,7 +77,7 @@ fn the_suite_of_sequences_is_valid_and_has_frames_and_groups_of_all_kinds() {
 fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind() {
     let (mut modes, mut vectors, mut reach) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
     let mut of_parts = BTreeSet::new();
-    let mut coarse = [0; 2];
+    let (mut coarse, mut smooth) = ([0; 2], [0; 2]);
     let mut lattices = BTreeSet::new();
     let limits = Limits::default();
     for name in names() {
@@ -100,6 +100,7 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
                 let (head, first) = Head::parse(parts[0], header.base, header.top).expect("motion");
                 parts[0] = first;
                 if head.warped {
+                    smooth[usize::from(head.smooth)] += 1;
                     lattices.insert(head.lattice(header.base, first).expect("a lattice").0);
                     parts[0] = head.lattice(header.base, first).expect("a lattice").2;
                 }
@@ -144,6 +145,8 @@ fn the_suite_of_sequences_has_all_modes_of_prediction_and_vectors_of_every_kind(
         "levels of lattices and least weights: {lattices:?}"
     );
     assert!(coarse.iter().all(|frames| *frames >= 3), "coarse colours: {coarse:?}");
+    // The encoder makes smooth ones alone.
+    assert!(smooth.iter().all(|frames| *frames >= 5), "warped frames: {smooth:?}");
     assert!(reach.iter().any(|(above, _)| *above > 0), "{reach:?}");
     assert!(
         reach.iter().any(|(_, levels)| *levels == 0) && reach.iter().any(|(_, levels)| *levels >= 3),

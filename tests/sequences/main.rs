@@ -15,8 +15,13 @@ use common::Ball;
 
 /// A ball that moves by a voxel a frame, and starts again after eight frames.
 fn moving(frame: u64) -> ColouredVoxels {
+    ball(20.0, frame)
+}
+
+/// A ball of `radius` voxels that has moved to a place of `frame`.
+fn ball(radius: f32, frame: u64) -> ColouredVoxels {
     let moved = |([x, y, z], colour): ([u32; 3], [u8; 3])| (morton::encode([x + (frame % 8) as u32, y, z]), colour);
-    let mut voxels: Vec<_> = Ball::new(6, 20.0).voxels().into_iter().map(moved).collect();
+    let mut voxels: Vec<_> = Ball::new(6, radius).voxels().into_iter().map(moved).collect();
     voxels.sort_unstable();
     ColouredVoxels {
         voxels: Voxels::new(6, voxels.iter().map(|voxel| voxel.0).collect()),

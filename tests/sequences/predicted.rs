@@ -6,7 +6,7 @@ use b2p::geometry::{Voxels, morton};
 use b2p::{Decoder, Placement, SequenceDecoder, SequenceEncoder};
 
 use super::common::Ball;
-use super::{Frame, encoder, frame, moving, reader};
+use super::{Frame, ball, encoder, frame, moving, reader};
 
 /// A number that looks random (the last steps of SplitMix64).
 fn mixed(number: u64) -> u64 {
@@ -198,7 +198,7 @@ fn frames_that_a_group_is_predicted_from_have_exact_geometry_above_the_clouds_ow
             .with_prediction(predicted)
             .with_geometry(geometry);
         let bytes = encoder
-            .encode(2, |frame| Ok(moving(frame)), |_| {})
+            .encode(2, |frame| Ok(ball(20.0 - 6.0 * frame as f32, frame)), |_| {})
             .expect("a sequence");
         let sequence = reader(&bytes);
         let first = frame(&sequence, 0, None).expect("a frame").0;

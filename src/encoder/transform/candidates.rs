@@ -18,7 +18,7 @@ const BLOCK_DEPTH: u8 = 4;
 /// How much a warped frame may cost, in costs of blocks, if none of them moves and if all of them do. Costs count single
 /// voxels, of which it displaces more; its surface is smoother, and the frames after it take fewer bits. But what stands
 /// still is better copied.
-const WORTH: [f32; 2] = [0.7, 1.22];
+const WORTH: [f32; 2] = [0.5, 1.25];
 
 /// A frame and the one before it.
 pub(super) struct Frame<'a> {
@@ -90,6 +90,7 @@ impl Frame<'_> {
             // They are rounded: exact colours of what stands still would differ from their means.
             moves_coarse: divided && block_level + 2 <= base && !self.steps.is_lossless(),
             warped: warp.is_some(),
+            smooth: warp.is_some(),
             unit_level: if warp.is_some() { top + LATTICE_UNIT } else { top },
             reference_level: match warp {
                 Some(_) => top,

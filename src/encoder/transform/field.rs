@@ -143,10 +143,7 @@ impl<'a> Fit<'a> {
         let chunks: Vec<&[Sample]> = self.samples.samples.chunks(1024).collect();
         let cost = |vector: [i16; 3]| {
             let by = vector.map(|x| f32::from(x) * self.unit);
-            let energy = |sample: &Sample| {
-                let at = [0, 1, 2].map(|axis| sample.place[axis] + by[axis]);
-                sample.weight * self.map.smooth_energy(at, sample.luma)
-            };
+            let energy = |sample: &Sample| sample.weight * self.map.smooth_energy(sample.moved(by), sample.luma);
             let sums = chunks
                 .par_iter()
                 .map(|samples| samples.iter().step_by(self.stride).map(energy).sum::<f32>());
@@ -257,13 +254,14 @@ impl<'a> Fit<'a> {
                 if share < LITTLE {
                     continue;
                 }
-                // Where it is if the corner has no vector.
-                let mut rest = sample.place;
+                // How far it moves if the corner has no vector.
+                let mut rest = [0.0; 3];
                 for j in (0..8).filter(|j| j != corner) {
                     (0..3).for_each(|axis| rest[axis] += weights[j] * ends[j][axis]);
                 }
                 for (sum, vector) in sums.iter_mut().zip(tried) {
-                    let at = [0, 1, 2].map(|axis| rest[axis] + share * self.unit * f32::from(vector[axis]));
+                    let by = [0, 1, 2].map(|axis| rest[axis] + share * self.unit * f32::from(vector[axis]));
+                    let at = sample.moved(by);
                     let energy = if self.smooth {
                         self.map.smooth_energy(at, sample.luma)
                     } else {

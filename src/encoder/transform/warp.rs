@@ -39,7 +39,7 @@ impl Warp {
             values: truth.level(top),
         };
         let lattice = field::estimate(&from, &to, [level, top], unit);
-        let scattered = Scattered::new(source, &lattice, [top, unit]).ok()?;
+        let scattered = Scattered::new(source, &lattice, [top, unit], true).ok()?;
         let least = scattered.least((to.keys.len() as f32 * MORE_VOXELS) as usize);
         let warped = scattered.warped(least);
         let (keys, values) = warped.finest();

@@ -385,9 +385,11 @@ fn divided(add: &mut Add) {
 
 /// The lattice follows the head of 10 bytes: its level, the least weight of voxels, the length of its words.
 fn warped(add: &mut Add) {
-    add("warped-frame-of-parts", "17.5.1", &|s| s.motion(0)[0] |= 0x80);
     add("warped-frame-whose-coarse-colours-move", "17.5.1", &|s| {
         s.motion(0)[0] |= 0x40
+    });
+    add("smooth-frame-whose-coarse-colours-move", "17.5.1", &|s| {
+        s.motion(0)[0] |= 0xc0
     });
     add("warped-frame-with-another-reference", "17.5.1", &|s| {
         s.motion(0)[2] -= 1

@@ -5,7 +5,9 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::Frame;
-use super::map::{Map, Table, around, number, place, plus};
+use super::map::{Map, Table, around, floor, number, place, plus};
+use crate::geometry::Voxels;
+use crate::motion::{Places, offset};
 
 /// Levels from the blocks to the finest level, and samples of a block.
 pub(super) const BLOCK: u8 = 4;
@@ -15,15 +17,29 @@ const COARSE: u8 = 2;
 const REACH: i32 = 5;
 /// Large motions of a block that are refined.
 const PROMISING: usize = 3;
+/// A movement that is less than this from whole voxels is rounded to them, as sixteenths.
+const WHOLE: f32 = 1.0 / 32.0;
 /// Energy per voxel that a vector of a block costs, for each voxel of its length.
 const LENGTH: f32 = 0.01;
 
 /// A voxel of the previous frame that stands for some of its block.
 pub(super) struct Sample {
     pub(super) place: [f32; 3],
+    /// From there to the surface near it, where it starts from unless it moves by whole voxels.
+    step: [f32; 3],
     pub(super) luma: f32,
     /// How many it stands for.
     pub(super) weight: f32,
+}
+
+impl Sample {
+    /// Where it is when it has moved by so many voxels.
+    #[inline]
+    pub(super) fn moved(&self, by: [f32; 3]) -> [f32; 3] {
+        let is_whole = by.iter().all(|x| (x - floor(x + 0.5) as f32).abs() < WHOLE);
+        let step = if is_whole { [0.0; 3] } else { self.step };
+        [0, 1, 2].map(|axis| self.place[axis] + step[axis] + by[axis])
+    }
 }
 
 /// Samples in the order of their keys, and where those of each block are.
@@ -37,14 +53,18 @@ impl Samples {
     pub(super) fn of(frame: &Frame, top: u8) -> Self {
         let shift = 3 * BLOCK.min(top);
         let voxels = frame.voxels();
+        let places = Places::new(&Voxels::from_sorted(top, frame.keys.to_vec()));
+        let mut near = places.near();
         let (mut keys, mut samples, mut blocks) = (Vec::new(), Vec::new(), Vec::new());
         for voxels in voxels.chunk_by(|a, b| a.0 >> shift == b.0 >> shift) {
             let (first, count) = (keys.len(), voxels.len().min(SAMPLES));
             for i in 0..count {
                 let (key, luma) = voxels[(i * voxels.len() + voxels.len() / 2) / count];
                 keys.push(key);
+                let offset = offset(near.window(place(key).map(|x| x - 1)));
                 samples.push(Sample {
                     place: place(key).map(|x| x as f32),
+                    step: offset.map(|x| x as f32 / 16.0),
                     luma,
                     weight: voxels.len() as f32 / count as f32,
                 });
@@ -155,6 +175,7 @@ impl Blocks {
     fn promising(map: &Map, nodes: &[(u64, f32)], far: &[[i32; 3]], levels: u8) -> Vec<[i32; 3]> {
         let sample = |(key, luma): &(u64, f32)| Sample {
             place: place(*key).map(|x| x as f32),
+            step: [0.0; 3],
             luma: *luma,
             weight: 1.0,
         };

@@ -48,7 +48,7 @@ pub(super) fn around(reach: i32) -> impl Iterator<Item = [i32; 3]> {
 
 /// The integer below. The function of the standard library is a call on many machines.
 #[inline]
-fn floor(x: f32) -> i32 {
+pub(super) fn floor(x: f32) -> i32 {
     let near = x as i32;
     near - i32::from((near as f32) > x)
 }
