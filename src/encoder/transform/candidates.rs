@@ -18,7 +18,7 @@ const BLOCK_DEPTH: u8 = 4;
 /// How much a warped frame may cost, in costs of blocks, if none of them moves and if all of them do. Costs count single
 /// voxels, of which it displaces more; its surface is smoother, and the frames after it take fewer bits. But what stands
 /// still is better copied.
-const WORTH: [f32; 2] = [0.5, 1.25];
+const WORTH: [f32; 2] = [0.5, 1.7];
 
 /// A frame and the one before it.
 pub(super) struct Frame<'a> {
