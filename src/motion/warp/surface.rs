@@ -4,14 +4,52 @@
 //! around is nearer to it. Only the part of the step there that is across the surface is taken: along it, the mean is as
 //! far away as the voxels around are irregular.
 
-/// Of an axis, the cells of a window with an offset of −1, and those with 1, among the 3³ that are looked at.
-type Sides = [u64; 2];
+/// Sums over the cells of a layer of 3², as bytes: 1, and for steps x and y in −1 to 1: x, y, x², y², xy. Those that can be
+/// negative are [`BIAS`] more.
+type Sums = u64;
 
-/// The first three cells along each axis of a window of 4³.
-const ALL: u64 = 0x0777_0777_0777;
-const X: Sides = [0x0111_0111_0111, 0x0444_0444_0444];
-const Y: Sides = [0x0007_0007_0007, 0x0700_0700_0700];
-const Z: Sides = [0x0777, 0x0777_0000_0000];
+const BIAS: i32 = 8;
+
+/// The sums of each layer, which is a mask by `x + 3y`: looked up, since not all processors count bits.
+const LAYERS: [Sums; 512] = {
+    let mut layers = [0; 512];
+    let mut layer = 0;
+    while layer < 512 {
+        let (mut sums, mut cell) = ([0, BIAS, BIAS, 0, 0, BIAS], 0);
+        while cell < 9 {
+            if layer >> cell & 1 == 1 {
+                let (x, y) = (cell % 3 - 1, cell / 3 - 1);
+                let own = [1, x, y, x * x, y * y, x * y];
+                let mut i = 0;
+                while i < 6 {
+                    sums[i] += own[i];
+                    i += 1;
+                }
+            }
+            cell += 1;
+        }
+        let mut i = 0;
+        while i < 6 {
+            layers[layer] |= (sums[i] as Sums) << (8 * i);
+            i += 1;
+        }
+        layer += 1;
+    }
+    layers
+};
+
+/// The sums of the layer z of a window.
+#[inline]
+fn layer(window: u64, z: u32) -> Sums {
+    let rows = (window >> (16 * z)) as usize;
+    LAYERS[rows & 7 | rows >> 1 & 0o70 | rows >> 2 & 0o700]
+}
+
+/// One of sums that were added up, less the bias of so many layers.
+#[inline]
+fn sum(sums: Sums, which: u32, biases: i32) -> i32 {
+    ((sums >> (8 * which)) & 0xff) as i32 - biases * BIAS
+}
 
 /// The step from a voxel to the surface around it, in sixteenths of a voxel, less than one voxel along each axis.
 /// `window` has the cells from one before it on along each axis, as a mask by `x + 4y + 16z`.
@@ -19,21 +57,22 @@ const Z: Sides = [0x0777, 0x0777_0000_0000];
 /// The step to the mean is weighted by the adjugate of the covariance over its trace: along a principal axis, by how
 /// small the variance is there beside those along the other two.
 pub fn offset(window: u64) -> [i32; 3] {
-    let count = |cells: u64| (window & cells).count_ones() as i32;
-    let all = count(ALL);
-    let sum = |[less, more]: Sides| count(more) - count(less);
-    let square = |[less, more]: Sides| count(less | more);
-    let product = |a: Sides, b: Sides| count(a[0] & b[0] | a[1] & b[1]) - count(a[0] & b[1] | a[1] & b[0]);
-    let [x, y, z] = [X, Y, Z].map(sum);
+    let layers = [0, 1, 2].map(|z| layer(window, z));
+    let sums = layers[0] + layers[1] + layers[2];
+    let all = sum(sums, 0, 0);
+    let of_layers = |which: u32| [sum(layers[0], which, 0), sum(layers[2], which, 0)];
+    let [[n0, n2], [x0, x2], [y0, y2]] = [of_layers(0), of_layers(1), of_layers(2)];
+    let [x, y, z] = [sum(sums, 1, 3), sum(sums, 2, 3), n2 - n0];
+    let squares = [sum(sums, 3, 0), sum(sums, 4, 0), n0 + n2];
     let [xx, yy, zz] = [
-        all * square(X) - x * x,
-        all * square(Y) - y * y,
-        all * square(Z) - z * z,
+        all * squares[0] - x * x,
+        all * squares[1] - y * y,
+        all * squares[2] - z * z,
     ];
     let [xy, xz, yz] = [
-        all * product(X, Y) - x * y,
-        all * product(X, Z) - x * z,
-        all * product(Y, Z) - y * z,
+        all * sum(sums, 5, 3) - x * y,
+        all * (x2 - x0) - x * z,
+        all * (y2 - y0) - y * z,
     ];
     // The adjugate.
     let [axx, ayy, azz] = [yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy];
