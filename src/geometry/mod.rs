@@ -7,12 +7,14 @@ mod neighbours;
 mod octree;
 mod siblings;
 mod voxels;
+mod windows;
 
 pub use neighbours::KernelMap;
 pub use octree::{MAX_VOXELS, Octree};
 pub(crate) use siblings::{AROUND, Window, place};
 pub use siblings::{RowBuffer, SiblingMap};
 pub use voxels::Voxels;
+pub(crate) use windows::windows;
 
 /// Positions of the set bits of a mask, ascending.
 #[inline(always)]

@@ -9,7 +9,7 @@ use std::ops::Range;
 use b2p_kernels::MadeRows;
 use rayon::prelude::*;
 
-use super::KernelMap;
+use super::{KernelMap, windows};
 
 /// Parents of a block. The places of their windows fit 16 bits.
 const BLOCK: usize = 1024;
@@ -49,35 +49,6 @@ const OWN: u64 = 0b11_0011 << 21 | 0b11_0011 << 37;
 /// Position of the child in octant 0.
 const FIRST: u32 = 21;
 
-/// Of a neighbour of the parent: the octants that the window shows, and by how much their positions exceed those of the
-/// siblings in the same octants less [`FIRST`], modulo 64.
-const SEEN: [(u8, u32); 27] = {
-    let mut seen = [(0, 0); 27];
-    let mut k = 0;
-    while k < 27 {
-        let (mut octants, mut o) = (0, 0);
-        while o < 8 {
-            let axes = [(k % 3, o & 1), (k / 3 % 3, o >> 1 & 1), (k / 9, o >> 2)];
-            // Along an axis, the lower neighbour shows its upper octant, the upper neighbour its lower one.
-            let mut shown = true;
-            let mut axis = 0;
-            while axis < 3 {
-                let (step, octant) = axes[axis];
-                shown &= step == 1 || (step == 0 && octant == 1) || (step == 2 && octant == 0);
-                axis += 1;
-            }
-            octants |= (shown as u8) << o;
-            o += 1;
-        }
-        // Neighbour coordinate −1, 0, 1 begins at window position −1, 1, 3.
-        let [x, y, z] = [k % 3, k / 3 % 3, k / 9];
-        let turn = 2 * (x + 4 * y + 16 * z) + 64 - FIRST as usize;
-        seen[k] = (octants, (turn % 64) as u32);
-        k += 1;
-    }
-    seen
-};
-
 /// The positions of siblings of this occupancy, less [`FIRST`].
 const SPREAD: [u64; 256] = {
     let mut spread = [0; 256];
@@ -94,18 +65,45 @@ const SPREAD: [u64; 256] = {
     spread
 };
 
-/// Of each position the neighbour of the parent that it lies in, and the octants before it there.
+/// Of each position the neighbour of the parent that it lies in, as the [`place`] of its offset, and the octants before
+/// it there.
 const PLACE: [(u8, u8); 64] = {
     let mut places = [(0, 0); 64];
     let mut i = 0;
     while i < 64 {
         let (x, y, z) = (i & 3, i >> 2 & 3, i >> 4);
-        let neighbour = ((x + 1) >> 1) + 3 * ((y + 1) >> 1) + 9 * ((z + 1) >> 1);
+        let neighbour = ((x + 1) >> 1) + 4 * ((y + 1) >> 1) + 16 * ((z + 1) >> 1);
         let octant = ((x + 1) & 1) + 2 * ((y + 1) & 1) + 4 * ((z + 1) & 1);
         places[i] = (neighbour as u8, ((1u32 << octant) - 1) as u8);
         i += 1;
     }
     places
+};
+
+/// Of each position of a window of parents the brick of 4³ children that it lies in, of 3³ in 4³, and where its children
+/// begin there. The siblings are the brick in the middle.
+const BRICK: [(u8, u8); 64] = {
+    let mut bricks = [(0, 0); 64];
+    let mut i = 0;
+    while i < 64 {
+        let (x, y, z) = ((i & 3) + 1, (i >> 2 & 3) + 1, (i >> 4) + 1);
+        let brick = (x >> 1) + 4 * (y >> 1) + 16 * (z >> 1);
+        let first = 2 * ((x & 1) + 4 * (y & 1) + 16 * (z & 1));
+        bricks[i] = (brick as u8, first as u8);
+        i += 1;
+    }
+    bricks
+};
+
+/// How many octants are in a mask.
+const COUNT: [u8; 256] = {
+    let mut counts = [0; 256];
+    let mut mask = 0;
+    while mask < 256 {
+        counts[mask] = (mask as u8).count_ones() as u8;
+        mask += 1;
+    }
+    counts
 };
 
 /// Positions of the set bits of a mask, ascending.
@@ -148,11 +146,7 @@ impl SiblingMap {
         assert_eq!(map.len(), occupancy.len(), "one occupancy per voxel");
         assert_eq!(map.len(), first_child.len(), "one first child per voxel");
         let blocks = first_child.par_chunks(BLOCK).enumerate();
-        let blocks = blocks.map(|(i, firsts)| {
-            let mut rows = b2p_kernels::zeros(27 * firsts.len());
-            map.fill(i * BLOCK, &mut rows);
-            Block::new(&rows, firsts, occupancy, first_child)
-        });
+        let blocks = blocks.map(|(i, firsts)| Block::new(map, i * BLOCK, firsts, occupancy, first_child));
         SiblingMap {
             len: occupancy.iter().map(|mask| mask.count_ones() as usize).sum(),
             blocks: blocks.collect(),
@@ -312,7 +306,8 @@ impl Windows<'_> {
     pub fn next(&mut self) -> Option<(&Window, usize)> {
         while self.left == 0 {
             let (block, parent, children) = self.parents.next()?;
-            (self.window, self.left) = (block.window(parent), children);
+            block.show(parent, &mut self.window);
+            self.left = children;
         }
         let position = self.left.trailing_zeros();
         self.left &= self.left - 1;
@@ -358,29 +353,40 @@ fn corner(octant: usize) -> usize {
 }
 
 impl Block {
-    /// The windows of the parents with these rows and first children, among all parents.
-    fn new(rows: &[u32], firsts: &[u32], occupancy: &[u8], first_child: &[u32]) -> Block {
+    /// The windows of the parents from `first` on, with these first children. `map` is theirs.
+    fn new(map: &SiblingMap, first: usize, firsts: &[u32], occupancy: &[u8], first_child: &[u32]) -> Block {
         let mut there = Vec::with_capacity(firsts.len());
         let mut start = Vec::with_capacity(firsts.len());
         let mut voxels = Vec::with_capacity(32 * firsts.len());
-        for row in rows.chunks_exact(27) {
-            let (mut masks, mut children) = ([0u8; 27], [0u32; 27]);
-            let mut seen = 0;
-            for (k, &q) in row.iter().enumerate() {
-                // No branch: the presence of neighbours is unpredictable.
-                let present = q != KernelMap::ABSENT;
-                let q = if present { q as usize } else { 0 };
-                masks[k] = if present { occupancy[q] } else { 0 };
-                children[k] = first_child[q];
-                let (octants, turn) = SEEN[k];
-                seen |= SPREAD[usize::from(masks[k] & octants)].rotate_left(turn);
+        for (block, grandparent, siblings) in map.parents(first) {
+            let left = firsts.len() - there.len();
+            if left == 0 {
+                break;
             }
-            start.push(voxels.len() as u16);
-            there.push(seen);
-            for position in ones(seen) {
-                let (k, before) = PLACE[position as usize & 63];
-                let rank = (masks[usize::from(k)] & before).count_ones();
-                voxels.push(children[usize::from(k)] + rank);
+            // What is around the siblings: of each position, the children and the first of them.
+            let Window {
+                there: around,
+                voxels: parents,
+            } = block.window(grandparent);
+            let (mut masks, mut children, mut bricks) = ([0u8; 64], [0u32; 64], [0u64; 64]);
+            for position in ones(around) {
+                let position = position as usize & 63;
+                let parent = parents[position] as usize;
+                (masks[position], children[position]) = (occupancy[parent], first_child[parent]);
+                let (brick, first) = BRICK[position];
+                bricks[usize::from(brick) & 63] |= SPREAD[usize::from(masks[position])] << first;
+            }
+            let windows = windows(&bricks, 0);
+            for octant in ones(siblings).map(octant).take(left) {
+                let seen = windows[octant];
+                start.push(voxels.len() as u16);
+                there.push(seen);
+                for position in ones(seen) {
+                    let (neighbour, before) = PLACE[position as usize & 63];
+                    let parent = (corner(octant) + usize::from(neighbour)) & 63;
+                    let rank = COUNT[usize::from(masks[parent] & before)];
+                    voxels.push(children[parent] + u32::from(rank));
+                }
             }
         }
         Block {
@@ -393,13 +399,20 @@ impl Block {
 
     #[inline(always)]
     fn window(&self, parent: usize) -> Window {
-        let there = self.there[parent];
-        let mut window = Window { there, ..Window::EMPTY };
+        let mut window = Window::EMPTY;
+        self.show(parent, &mut window);
+        window
+    }
+
+    /// Makes `window` that of this parent.
+    #[inline(always)]
+    fn show(&self, parent: usize, window: &mut Window) {
+        window.there = self.there[parent];
+        window.voxels = Window::EMPTY.voxels;
         let voxels = &self.voxels[usize::from(self.start[parent])..];
-        for (position, &voxel) in ones(there).zip(voxels) {
+        for (position, &voxel) in ones(window.there).zip(voxels) {
             window.voxels[position as usize & 63] = voxel;
         }
-        window
     }
 }
 
@@ -425,8 +438,13 @@ impl Window {
     /// The voxels around the child in `octant`: the one at offset `k` of its row is at [`place`]`(k)`.
     #[inline(always)]
     pub fn around(&self, octant: usize) -> &[u32; AROUND] {
-        let start = corner(octant);
-        match self.voxels[start..start + AROUND].try_into() {
+        self.from(corner(octant))
+    }
+
+    /// The voxels around the child whose row begins at `corner`, likewise.
+    #[inline(always)]
+    pub fn from(&self, corner: usize) -> &[u32; AROUND] {
+        match self.voxels[corner..corner + AROUND].try_into() {
             Ok(around) => around,
             Err(_) => unreachable!("the length is that of the type"),
         }

@@ -1,6 +1,11 @@
-//! Voxels of a level in bricks of 4³, found by position.
+//! Voxels of a level in bricks of 4³ and tiles of 2³ bricks, found by position.
 
-use crate::geometry::{Voxels, morton};
+mod near;
+mod windows;
+
+use crate::geometry::{Voxels, morton, ones};
+pub use near::Near;
+pub use windows::Windows;
 
 /// Bits of all cells whose x, and y, is below n.
 const X_BELOW: [u64; 5] = [
@@ -62,49 +67,68 @@ const BELOW: [[u64; 5]; 3] = {
     below
 };
 
-/// A brick: its place, its voxels as a mask by Morton key, as a mask by `x + 4y + 16z`, and the number of its first
-/// voxel.
+/// A brick: its voxels as a mask by Morton key, as a mask by `x + 4y + 16z`, and the number of its first voxel.
 #[derive(Debug, Clone, Copy)]
 struct Brick {
-    /// Of 21 bits each, x lowest: made faster than a Morton key.
-    place: u64,
     mask: u64,
     cells: u64,
     first: u32,
 }
 
+/// 2³ bricks: their place among such, the number of the first that has voxels, and a bit for each of these, by octant.
+#[derive(Debug, Clone, Copy)]
+struct Tile {
+    /// Of 21 bits each, x lowest: made faster than a Morton key.
+    place: u64,
+    first: u32,
+    there: u8,
+}
+
 /// The voxels of a level by position.
 #[derive(Debug, Clone)]
 pub struct Bricks {
+    /// In the order of keys, as tiles are.
     bricks: Vec<Brick>,
-    /// Open addressing: a brick's number and 1, or 0. A power of two, at least twice as many as bricks.
+    tiles: Vec<Tile>,
+    /// Open addressing: a tile's number and 1, or 0. A power of two, at least twice as many as tiles.
     table: Vec<u32>,
-    /// Bricks along an axis.
+    /// Tiles along an axis.
     side: i32,
 }
 
 impl Bricks {
     pub fn new(voxels: &Voxels) -> Self {
-        let mut bricks: Vec<Brick> = Vec::new();
-        let mut last = None;
-        for (i, key) in voxels.keys().iter().enumerate() {
-            if last != Some(key >> 6) {
-                last = Some(key >> 6);
-                bricks.push(Brick {
-                    place: packed(morton::decode(key >> 6)),
-                    mask: 0,
-                    cells: 0,
-                    first: i as u32,
+        let bricks = voxels.keys().chunk_by(|a, b| a >> 6 == b >> 6);
+        let mask = |keys: &[u64]| keys.iter().fold(0, |mask, key| mask | 1 << (key & 63));
+        Self::of_masks(voxels.depth(), bricks.map(|keys| (keys[0] >> 6, mask(keys))))
+    }
+
+    /// Of bricks in the order of keys: the key of each, and its voxels as a mask by Morton key.
+    pub fn of_masks(depth: u8, masks: impl Iterator<Item = (u64, u64)>) -> Self {
+        let (mut bricks, mut tiles) = (Vec::new(), Vec::<Tile>::new());
+        let (mut last, mut voxels) = (None, 0);
+        for (key, mask) in masks {
+            if last != Some(key >> 3) {
+                last = Some(key >> 3);
+                tiles.push(Tile {
+                    place: packed(morton::decode(key >> 3)),
+                    first: bricks.len() as u32,
+                    there: 0,
                 });
             }
-            if let Some(brick) = bricks.last_mut() {
-                brick.mask |= 1 << (key & 63);
-                brick.cells |= 1 << CELLS[(key & 63) as usize];
+            if let Some(tile) = tiles.last_mut() {
+                tile.there |= 1 << (key & 7);
             }
+            bricks.push(Brick {
+                mask,
+                cells: cells(mask),
+                first: voxels,
+            });
+            voxels += mask.count_ones();
         }
-        let mut table = vec![0; (2 * bricks.len()).next_power_of_two().max(2)];
-        for (i, brick) in bricks.iter().enumerate() {
-            let mut at = slot(brick.place, table.len());
+        let mut table = vec![0; (2 * tiles.len()).next_power_of_two().max(2)];
+        for (i, tile) in tiles.iter().enumerate() {
+            let mut at = slot(tile.place, table.len());
             while table[at] != 0 {
                 at = (at + 1) & (table.len() - 1);
             }
@@ -112,48 +136,64 @@ impl Bricks {
         }
         Bricks {
             bricks,
+            tiles,
             table,
-            side: 1 << voxels.depth().saturating_sub(2),
+            side: 1 << depth.saturating_sub(3),
         }
     }
 
-    /// Bytes of memory per voxel at most: a brick for each.
+    /// Bytes of memory per voxel at most: a brick and a tile for each.
     pub const fn bytes_per_voxel() -> usize {
-        size_of::<Brick>() + 4 * size_of::<u32>()
+        size_of::<Brick>() + size_of::<Tile>() + 4 * size_of::<u32>()
+    }
+
+    /// How many bricks have voxels.
+    pub fn len(&self) -> usize {
+        self.bricks.len()
     }
 
     /// Each brick in turn: its place among bricks, its voxels as a mask by Morton key, and the number of its first voxel.
     pub fn each(&self) -> impl Iterator<Item = ([u32; 3], u64, usize)> {
-        let each = |brick: &Brick| {
-            let place = [0, 21, 42].map(|bit| (brick.place >> bit) as u32 & 0x1f_ffff);
-            (place, brick.mask, brick.first as usize)
+        let of_tile = |tile: &Tile| {
+            let at = [0, 21, 42].map(|bit| (tile.place >> bit) as u32 & 0x1f_ffff);
+            let bricks = &self.bricks[tile.first as usize..];
+            ones(tile.there).zip(bricks).map(move |(octant, brick)| {
+                let place = [0, 1, 2].map(|axis| 2 * at[axis] + (octant as u32 >> axis & 1));
+                (place, brick.mask, brick.first as usize)
+            })
         };
-        self.bricks.iter().map(each)
+        self.tiles.iter().flat_map(of_tile)
     }
 
     /// Keys of the bricks without their `down` lowest bits, each once.
     pub fn nodes(&self, down: u32) -> Vec<u64> {
-        let key = |brick: &Brick| morton::encode([0, 21, 42].map(|bit| (brick.place >> bit) as u32 & 0x1f_ffff));
-        let mut keys: Vec<u64> = self.bricks.iter().map(|brick| key(brick) >> down).collect();
+        let mut keys: Vec<u64> = self.each().map(|brick| morton::encode(brick.0) >> down).collect();
         keys.dedup();
         keys
     }
 
-    /// The brick at this place among bricks.
+    /// The number of the tile at this place among tiles.
     #[inline]
-    fn brick(&self, at: [i32; 3]) -> Option<&Brick> {
+    fn tile(&self, at: [i32; 3]) -> Option<usize> {
         if at.iter().any(|x| !(0..self.side).contains(x)) {
             return None;
         }
         let place = packed(at.map(|x| x as u32));
         let mut slot = slot(place, self.table.len());
         loop {
-            let brick = self.bricks.get((self.table[slot] as usize).checked_sub(1)?)?;
-            if brick.place == place {
-                return Some(brick);
+            let number = (self.table[slot] as usize).checked_sub(1)?;
+            if self.tiles[number].place == place {
+                return Some(number);
             }
             slot = (slot + 1) & (self.table.len() - 1);
         }
+    }
+
+    /// The brick at this place among bricks.
+    #[inline]
+    fn brick(&self, at: [i32; 3]) -> Option<&Brick> {
+        let tile = self.tile(at.map(|x| x >> 1))?;
+        Some(&self.bricks[self.tiles[tile].brick(at)?])
     }
 
     /// The number of the voxel at this place, if there is one.
@@ -167,20 +207,21 @@ impl Bricks {
         self.near().window(at)
     }
 
+    /// The voxels of a brick, as a mask by `x + 4y + 16z`.
+    #[inline]
+    pub fn cells(&self, brick: usize) -> u64 {
+        self.bricks[brick].cells
+    }
+
     /// For queries of which each is near the one before.
     pub fn near(&self) -> Near<'_> {
-        Near {
-            bricks: self,
-            base: [NOWHERE; 3],
-            known: 0,
-            found: [None; 27],
-        }
+        Near::new(self)
     }
 
     /// Calls `each` with the place and number of all voxels in a box of `side`³ cells from the place `first` on.
     pub fn in_box(&self, first: [i32; 3], side: i32, mut each: impl FnMut([i32; 3], usize)) {
         let low = first.map(|x| (x >> 2).max(0));
-        let high = first.map(|x| ((x + side - 1) >> 2).min(self.side - 1));
+        let high = first.map(|x| ((x + side - 1) >> 2).min(2 * self.side - 1));
         // Of the brick with this number along an axis, the keys that are in the box.
         let inside = |axis: usize, brick: i32| {
             let below = |end: i32| BELOW[axis][(end - 4 * brick).clamp(0, 4) as usize];
@@ -227,89 +268,57 @@ impl Brick {
     }
 }
 
-/// The 3³ bricks from a place on. They are kept from one query to the next.
-#[derive(Debug, Clone)]
-pub struct Near<'a> {
-    bricks: &'a Bricks,
-    /// The place of the first brick among pairs of bricks.
-    base: [i32; 3],
-    /// A bit for each brick that has been looked up.
-    known: u32,
-    found: [Option<&'a Brick>; 27],
-}
-
 /// Far from all voxels.
 const NOWHERE: i32 = i32::MIN / 4;
 
-impl<'a> Near<'a> {
-    /// Goes to the bricks around this place.
+impl Tile {
+    /// The number of the brick at this place among bricks, which is in the tile, if it has voxels.
     #[inline]
-    pub fn go(&mut self, at: [i32; 3]) {
-        let base = at.map(|x| x >> 3);
-        if base != self.base {
-            (self.base, self.known) = (base, 0);
+    fn brick(&self, at: [i32; 3]) -> Option<usize> {
+        let octant = at[0] & 1 | (at[1] & 1) << 1 | (at[2] & 1) << 2;
+        if self.there >> octant & 1 == 0 {
+            return None;
         }
-    }
-
-    /// The brick this many steps from the first one, 0 to 2 along each axis.
-    #[inline]
-    fn brick(&mut self, step: [i32; 3]) -> Option<&'a Brick> {
-        let slot = ((step[0] + 3 * step[1] + 9 * step[2]) as usize).min(26);
-        if self.known >> slot & 1 == 0 {
-            self.known |= 1 << slot;
-            self.found[slot] = self
-                .bricks
-                .brick([0, 1, 2].map(|axis| 2 * self.base[axis] + step[axis]));
-        }
-        self.found[slot]
-    }
-
-    /// The number of the voxel at this place, if there is one.
-    #[inline]
-    pub fn index(&mut self, at: [i32; 3]) -> Option<usize> {
-        let steps = |base: [i32; 3]| [0, 1, 2].map(|axis| (at[axis] >> 2).wrapping_sub(2 * base[axis]));
-        let mut step = steps(self.base);
-        if step.iter().any(|x| !(0..3).contains(x)) {
-            self.go(at);
-            step = steps(self.base);
-        }
-        self.brick(step)?.index(at)
-    }
-
-    /// The 4³ cells from this place on, as a mask by `x + 4y + 16z`.
-    #[inline]
-    pub fn window(&mut self, at: [i32; 3]) -> u64 {
-        self.go(at);
-        let first = at.map(|x| x >> 2 & 1);
-        let [ox, oy, oz] = at.map(|x| (x & 3) as usize);
-        let mut window = 0;
-        for i in 0..8 {
-            let [dx, dy, dz] = [i & 1, i >> 1 & 1, i >> 2];
-            if (dx == 1 && ox == 0) || (dy == 1 && oy == 0) || (dz == 1 && oz == 0) {
-                continue;
-            }
-            let Some(brick) = self.brick([first[0] + dx, first[1] + dy, first[2] + dz]) else {
-                continue;
-            };
-            let cells = brick.cells;
-            let cells = match dx {
-                0 => (cells & !X_BELOW[ox]) >> ox,
-                _ => (cells & X_BELOW[ox]) << (4 - ox),
-            };
-            let cells = match dy {
-                0 => (cells & !Y_BELOW[oy]) >> (4 * oy),
-                _ => (cells & Y_BELOW[oy]) << (4 * (4 - oy)),
-            };
-            window |= match dz {
-                0 => cells >> (16 * oz),
-                _ => cells << (16 * (4 - oz)),
-            };
-        }
-        window
+        let before = self.there & ((1 << octant) - 1);
+        Some(self.first as usize + before.count_ones() as usize)
     }
 }
 
-/// A place among bricks, as a number.
+/// A mask by Morton key as one by `x + 4y + 16z`.
+#[inline]
+pub fn cells(mask: u64) -> u64 {
+    // Bits of a key are x, y, z, x, y, z, those of a cell x, x, y, y, z, z: pairs of them change places.
+    let swapped = |mask: u64, moved: u64, by: u32| {
+        let changed = (mask ^ mask >> by) & moved;
+        mask ^ changed ^ changed << by
+    };
+    let mask = swapped(mask, SWAPS[0].0, SWAPS[0].1);
+    let mask = swapped(mask, SWAPS[1].0, SWAPS[1].1);
+    swapped(mask, SWAPS[2].0, SWAPS[2].1)
+}
+
+/// Of a Morton key in a brick the cell, `x + 4y + 16z`.
+#[cfg(any(test, feature = "encoder"))]
+pub fn cell(key: usize) -> u8 {
+    CELLS[key]
+}
+
+/// For each pair of bits of a key that change places, the lower one first: of the keys with only the lower one of both set,
+/// the bits; and how far the ones with only the higher one are from these.
+const SWAPS: [(u64, u32); 3] = [swap(1, 3), swap(2, 3), swap(3, 4)];
+
+const fn swap(low: u32, high: u32) -> (u64, u32) {
+    let (mut keys, mut key) = (0, 0);
+    while key < 64 {
+        if key >> low & 1 == 1 && key >> high & 1 == 0 {
+            keys |= 1 << key;
+        }
+        key += 1;
+    }
+    (keys, (1 << high) - (1 << low))
+}
+
+/// A place among tiles, as a number.
 #[inline]
 fn packed([x, y, z]: [u32; 3]) -> u64 {
     u64::from(x) | u64::from(y) << 21 | u64::from(z) << 42
@@ -325,6 +334,14 @@ fn slot(place: u64, size: usize) -> usize {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn masks_of_keys_become_masks_of_cells() {
+        for key in 0..64 {
+            assert_eq!(cells(1 << key), 1 << CELLS[key]);
+        }
+        assert_eq!(cells(0x0123_4567_89ab_cdef).count_ones(), 32);
+    }
 
     proptest! {
         #[test]
@@ -350,6 +367,17 @@ mod tests {
             }
             prop_assert_eq!(bricks.window(at), window);
             prop_assert_eq!(near.window(at), window);
+            let mut windows = Windows::new(&bricks, |brick| [bricks.cells(brick), !bricks.cells(brick)]);
+            for step in 0..27 {
+                let brick = [step % 3, step / 3 % 3, step / 9];
+                let brick = [0, 1, 2].map(|axis| (at[axis] >> 2) + brick[axis] - 1);
+                let [found, others] = *windows.of_brick(brick);
+                for octant in 0..8 {
+                    let node = [0, 1, 2].map(|axis| 4 * brick[axis] + 2 * (octant as i32 >> axis & 1));
+                    prop_assert_eq!(found[octant], near.window(node.map(|x| x - 1)));
+                    prop_assert_eq!(others[octant], near.window_of(node.map(|x| x - 1), |brick| !bricks.cells(brick)));
+                }
+            }
         }
 
         #[test]

@@ -4,7 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 
-use super::bricks::{Bricks, Near};
+use super::bricks::{Bricks, Near, Windows};
 use super::lattice::Lattice;
 use super::moved::Moved;
 use super::payload::{Blocks, Head, Modes, of_level};
@@ -124,7 +124,7 @@ impl Inter {
         let made = || {
             let mut lattice = Lattice::of(&source.nodes(top, level), level);
             lattice.read(words, "lattice", |vector| head.check(vector))?;
-            Ok(Scattered::new(source, &lattice, [top, head.unit_level], head.smooth)?.warped(least))
+            Scattered::new(source, &lattice, [top, head.unit_level], head.smooth).warped(least)
         };
         let warped = made().map_err(|error| of_level(error, base))?;
         Ok((Some(Arc::new(warped)), rest))
@@ -167,19 +167,23 @@ impl Inter {
     pub fn geometry(&self, octree: &Octree, level: u8) -> Result<GeometryGuide> {
         let Some(warped) = &self.warped else {
             let (field, previous) = self.source(octree, level)?;
-            let (modes, windows) = windows(&field, octree, level, &previous.bricks);
+            let bricks = &previous.bricks;
+            let (modes, found) = windows(&field, octree, level, bricks, |brick| [bricks.cells(brick)]);
             return Ok(GeometryGuide {
                 modes,
-                windows,
+                windows: found.into_iter().map(|[window]| window).collect(),
                 near: None,
             });
         };
         let (field, warped) = (self.field(octree, level)?, warped.at(level)?);
-        let (modes, windows_of_voxels) = windows(&field, octree, level, &warped.voxels);
-        let (_, near) = windows(&field, octree, level, &warped.near.bricks);
+        let bricks = &warped.near.bricks;
+        let (modes, found) = windows(&field, octree, level, bricks, |brick| {
+            [warped.voxels[brick], bricks.cells(brick)]
+        });
+        let (windows, near) = found.into_iter().map(|[voxels, near]| (voxels, near)).unzip();
         Ok(GeometryGuide {
             modes,
-            windows: windows_of_voxels,
+            windows,
             near: Some(near),
         })
     }
@@ -371,23 +375,36 @@ impl Inter {
     }
 }
 
-/// The mode of every parent, and the cells of `level` that are there around where its children were; none in
-/// [`Mode::Intra`].
-fn windows(field: &Field, octree: &Octree, level: u8, there: &Bricks) -> (Vec<Mode>, Vec<u64>) {
-    let voxels = octree.level(level - 1);
-    let parents = (0..voxels.len()).into_par_iter().with_min_len(CHUNK);
-    let window = |(field, near): &mut (Cursor, Near), parent: usize| {
-        let Block { modes, shift, .. } = *field.at(voxels.keys()[parent]);
-        let window = match modes.geometry {
-            Mode::Intra => 0,
-            _ => {
-                let at = voxels.coordinate(parent).map(|x| 2 * x as i32 - 1);
-                near.window(moved(at, shift))
+/// The mode of every parent, and what cells there are of `level` around where its children were; none in [`Mode::Intra`].
+/// `cells` tells those of a brick of `there`, of several kinds.
+fn windows<const N: usize>(
+    field: &Field,
+    octree: &Octree,
+    level: u8,
+    there: &Bricks,
+    cells: impl Fn(usize) -> [u64; N] + Sync,
+) -> (Vec<Mode>, Vec<[u64; N]>) {
+    let nodes = octree.level(level - 1);
+    let parents = (0..nodes.len()).into_par_iter().with_min_len(CHUNK);
+    let start = || (field.cursor(), there.near(), Windows::new(there, &cells));
+    let window = |(field, near, windows): &mut (Cursor, Near, Windows<N, _>), parent: usize| {
+        let Block { modes, shift, .. } = *field.at(nodes.keys()[parent]);
+        let mut window = [0; N];
+        if modes.geometry != Mode::Intra {
+            let node = nodes.coordinate(parent).map(|x| x as i32);
+            if shift == [0; 3] {
+                let octant = (node[0] & 1 | (node[1] & 1) << 1 | (node[2] & 1) << 2) as usize;
+                window = windows.of_brick(node.map(|x| x >> 1)).map(|windows| windows[octant]);
+            } else {
+                let at = moved(node.map(|x| 2 * x - 1), shift);
+                for (i, window) in window.iter_mut().enumerate() {
+                    *window = near.window_of(at, |brick| cells(brick)[i]);
+                }
             }
-        };
+        }
         (modes.geometry, window)
     };
-    parents.map_init(|| (field.cursor(), there.near()), window).unzip()
+    parents.map_init(start, window).unzip()
 }
 
 /// The motion of a level's nodes.

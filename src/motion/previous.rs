@@ -80,8 +80,12 @@ impl Previous {
 impl PreviousLevel {
     pub(super) fn new(voxels: &Voxels, values: Vec<Ycc>) -> Self {
         assert_eq!(voxels.len(), values.len(), "one colour per voxel");
+        Self::of_bricks(Bricks::new(voxels), values)
+    }
+
+    pub(super) fn of_bricks(bricks: Bricks, values: Vec<Ycc>) -> Self {
         PreviousLevel {
-            bricks: Bricks::new(voxels),
+            bricks,
             values,
             filter: None,
             steps: None,

@@ -39,9 +39,9 @@ impl Warp {
             values: truth.level(top),
         };
         let lattice = field::estimate(&from, &to, [level, top], unit);
-        let scattered = Scattered::new(source, &lattice, [top, unit], true).ok()?;
-        let least = scattered.least((to.keys.len() as f32 * MORE_VOXELS) as usize);
-        let warped = scattered.warped(least);
+        let scattered = Scattered::new(source, &lattice, [top, unit], true);
+        let least = scattered.least((to.keys.len() as f32 * MORE_VOXELS) as usize).ok()?;
+        let warped = scattered.warped(least).ok()?;
         let (keys, values) = warped.finest();
         Some(Warp {
             lattice,

@@ -6,7 +6,7 @@ use super::discs::{Disc, discs};
 use super::lanes::GROUP;
 use super::moments::{Moments, absolute, centred, near};
 use super::windows::{Window, gathered};
-use crate::geometry::{KernelMap, RowBuffer, SiblingMap};
+use crate::geometry::{KernelMap, SiblingMap};
 
 /// Sums the moments of all neighbours.
 pub struct Sum<'a> {
@@ -43,13 +43,21 @@ impl Work for SumOfLevel<'_> {
 
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
-        let mut buffer = RowBuffer::new();
-        for (i, to) in self.to.chunks_mut(RowBuffer::ROWS).enumerate() {
-            let first = self.first + i * RowBuffer::ROWS;
-            let rows = buffer.fill(self.map, first..first + to.len());
-            for (to, row) in to.iter_mut().zip(rows.as_chunks::<27>().0) {
-                *to = sum(self.from, row.iter().map(|&q| q as usize));
+        let mut windows = self.map.windows(self.first);
+        for to in self.to {
+            let Some((window, corner)) = windows.next() else {
+                return;
+            };
+            let around = window.from(corner);
+            let mut total = [0; 16];
+            for z in 0..3 {
+                for y in 0..3 {
+                    for q in &around[4 * y + 16 * z..][..3] {
+                        add(&mut total, self.from, *q as usize);
+                    }
+                }
             }
+            *to = total;
         }
     }
 }
@@ -57,15 +65,20 @@ impl Work for SumOfLevel<'_> {
 /// The sum of the moments of a row. Absent neighbours lie beyond the zeros that end the moments.
 #[inline(always)]
 fn sum(moments: &[Moments], row: impl Iterator<Item = usize>) -> Moments {
-    let absent = moments.len() - 1;
-    let mut sum = [0u16; 16];
+    let mut total = [0; 16];
     for q in row {
-        // No branch: the presence of neighbours is unpredictable.
-        for (sum, value) in sum.iter_mut().zip(&moments[absent.min(q)]) {
-            *sum = sum.wrapping_add(*value);
-        }
+        add(&mut total, moments, q);
     }
-    sum
+    total
+}
+
+#[inline(always)]
+fn add(total: &mut Moments, moments: &[Moments], q: usize) {
+    // No branch: the presence of neighbours is unpredictable.
+    let q = q.min(moments.len() - 1);
+    for (total, value) in total.iter_mut().zip(&moments[q]) {
+        *total = total.wrapping_add(*value);
+    }
 }
 
 /// Makes places in a range of rows of neighbours.

@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use super::surface::offset;
 use crate::geometry::ones;
+use crate::motion::bricks::Windows;
 use crate::motion::lattice::{Corners, Lattice};
 use crate::motion::previous::PreviousLevel;
 
@@ -27,14 +28,17 @@ pub(super) fn places(previous: &PreviousLevel, lattice: &Lattice, [top, unit]: [
     let of_chunk = |bricks: &[([u32; 3], u64, usize)]| {
         let mut places = Vec::with_capacity(bricks.len() * 16);
         let mut node = Node::default();
-        let mut near = previous.bricks.near();
+        let mut windows = Windows::new(&previous.bricks, |brick| [previous.bricks.cells(brick)]);
         for (place, mask, _) in bricks {
             for key in ones(*mask) {
                 let [x, y, z] = [0, 1, 2].map(|axis| (key as u32 >> axis & 1) | (key as u32 >> (axis + 2) & 2));
                 let at = [4 * place[0] + x, 4 * place[1] + y, 4 * place[2] + z];
                 let mut to = field.moved(&mut node, at);
                 if smooth && to.iter().any(|x| x & 15 != 0) {
-                    let offset = offset(near.window(at.map(|x| x as i32 - 1)));
+                    let [windows] = windows.of_brick(place.map(|x| x as i32));
+                    // From one cell before the voxel on.
+                    let window = windows[key >> 3] >> ((x & 1) + 4 * (y & 1) + 16 * (z & 1));
+                    let offset = offset(window);
                     to = [0, 1, 2].map(|axis| to[axis] + offset[axis]);
                 }
                 places.push(to);

@@ -86,10 +86,11 @@ pub fn offset(window: u64) -> [i32; 3] {
         axy * x + ayy * y + ayz * z,
         axz * x + ayz * y + azz * z,
     ];
-    // Quotients above 0 of numbers of less than 2³¹ are no nearer to a whole number than 2⁻²⁸: floats round them down
-    // correctly, and divide faster.
+    // Whole numbers and a half over one of less than 2³¹ are farther from whole numbers than 2⁻³³: floats round them down
+    // correctly.
     let whole = f64::from(2 * all) * f64::from(trace);
-    steps.map(|step| ((32.0 * f64::from(step) + 16.5 * whole) / whole) as i32 - 16)
+    let inverse = 1.0 / whole;
+    steps.map(|step| ((32.0 * f64::from(step) + 16.5 * whole + 0.5) * inverse) as i32 - 16)
 }
 
 #[cfg(test)]

@@ -29,11 +29,16 @@ pub(super) struct Run {
     pub(super) range: Range<usize>,
 }
 
+/// Tiles along an axis that the voxels of a chunk mostly touch.
+const NEAR: i32 = 4;
+const METS: usize = (NEAR * NEAR * NEAR) as usize;
+
 /// The tiles that the voxels of a chunk touch, in the order in which they are met.
-#[derive(Default)]
 struct Tiles {
     places: Vec<[i32; 3]>,
     numbers: HashMap<[i32; 3], usize>,
+    /// The number of the tile that was met last, of those with the same remainders modulo [`NEAR`].
+    met: [usize; METS],
     /// How many voxels touch each.
     counts: Vec<usize>,
     /// For each touch the tile's number here and the voxel's in the chunk.
@@ -41,17 +46,30 @@ struct Tiles {
 }
 
 impl Tiles {
-    /// Of one voxel after the other; each mostly touches the tile of the one before.
-    fn touch(&mut self, tile: [i32; 3], last: &mut usize, voxel: usize) {
-        if self.places.get(*last) != Some(&tile) {
-            *last = *self.numbers.entry(tile).or_insert_with(|| {
+    fn new() -> Self {
+        Tiles {
+            places: Vec::new(),
+            numbers: HashMap::new(),
+            met: [0; METS],
+            counts: Vec::new(),
+            touches: Vec::with_capacity(2 * CHUNK),
+        }
+    }
+
+    /// Of one voxel after the other.
+    #[inline]
+    fn touch(&mut self, tile: [i32; 3], voxel: usize) {
+        let [x, y, z] = tile.map(|x| x & (NEAR - 1));
+        let met = &mut self.met[(x + NEAR * (y + NEAR * z)) as usize];
+        if self.places.get(*met) != Some(&tile) {
+            *met = *self.numbers.entry(tile).or_insert_with(|| {
                 self.places.push(tile);
                 self.counts.push(0);
                 self.places.len() - 1
             });
         }
-        self.counts[*last] += 1;
-        self.touches.push((*last as u16, voxel as u16));
+        self.counts[*met] += 1;
+        self.touches.push((*met as u16, voxel as u16));
     }
 
     /// The voxels by tiles, and where those of each tile are.
@@ -84,17 +102,22 @@ impl Touched {
     pub(super) fn new(places: &[Place], top: u8) -> Self {
         let tiles = 1i32 << u32::from(top).saturating_sub(TILE);
         let of_chunk = |(chunk, places): (usize, &[Place])| {
-            let (mut found, mut last) = (Tiles::default(), [0; 8]);
+            let mut found = Tiles::new();
             for (i, place) in places.iter().enumerate() {
                 let first = place.map(|x| x >> (4 + TILE));
                 // The last cell that has weight.
                 let end = place.map(|x| (x + 15) >> (4 + TILE));
+                if first == end {
+                    if first.iter().all(|x| (0..tiles).contains(x)) {
+                        found.touch(first, i);
+                    }
+                    continue;
+                }
                 for z in first[2]..=end[2] {
                     for y in first[1]..=end[1] {
                         for x in first[0]..=end[0] {
                             if [x, y, z].iter().all(|x| (0..tiles).contains(x)) {
-                                let side = (x - first[0]) + 2 * (y - first[1]) + 4 * (z - first[2]);
-                                found.touch([x, y, z], &mut last[side as usize & 7], i);
+                                found.touch([x, y, z], i);
                             }
                         }
                     }
